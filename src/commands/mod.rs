@@ -1,0 +1,1 @@
+//! One file per subcommand; each `run` reads as a paragraph.

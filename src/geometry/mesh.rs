@@ -1,0 +1,212 @@
+//! Triangle meshes with vertex normals and colours, and axis-aligned boxes.
+
+use glam::Vec3;
+
+/// Triangles over shared vertices. `normals` and `colors` are per vertex; either is empty
+/// where it is not known, otherwise as long as `vertices`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct TriangleMesh {
+    /// Vertex positions [m].
+    pub vertices: Vec<Vec3>,
+    /// Unit vertex normals.
+    pub normals: Vec<Vec3>,
+    /// Vertex colours, red green blue.
+    pub colors: Vec<[u8; 3]>,
+    /// Vertex indices, counter-clockwise seen from the front.
+    pub triangles: Vec<[u32; 3]>,
+}
+
+impl TriangleMesh {
+    /// The three corners of a triangle.
+    #[inline]
+    pub fn corners(&self, triangle: usize) -> [Vec3; 3] {
+        self.triangles[triangle].map(|vertex| self.vertices[vertex as usize])
+    }
+
+    /// The normal of a triangle by the right-hand rule, not unit: its length is twice the area.
+    #[inline]
+    pub fn scaled_normal(&self, triangle: usize) -> Vec3 {
+        let [a, b, c] = self.corners(triangle);
+        (b - a).cross(c - a)
+    }
+
+    /// Appends another mesh; vertices are not welded. Normals and colours are kept where both have them.
+    pub fn append(&mut self, other: &Self) {
+        let had_vertices = !self.vertices.is_empty();
+        let offset = self.vertices.len() as u32;
+        let keep_normals = !had_vertices || self.normals.len() == self.vertices.len();
+        let keep_colors = !had_vertices || self.colors.len() == self.vertices.len();
+        self.vertices.extend_from_slice(&other.vertices);
+        self.triangles
+            .extend(other.triangles.iter().map(|t| t.map(|v| v + offset)));
+        if keep_normals {
+            self.normals.extend_from_slice(&other.normals);
+        }
+        if keep_colors {
+            self.colors.extend_from_slice(&other.colors);
+        }
+    }
+
+    /// Keeps the triangles whose index satisfies `keep` and drops the vertices that nothing uses any more.
+    pub fn retain_triangles(&mut self, keep: impl Fn(usize) -> bool) {
+        let mut index = 0;
+        self.triangles.retain(|_| {
+            index += 1;
+            keep(index - 1)
+        });
+        self.drop_unreferenced_vertices();
+    }
+
+    /// Drops the vertices that no triangle uses; the order of the others stays.
+    pub fn drop_unreferenced_vertices(&mut self) {
+        const UNUSED: u32 = u32::MAX;
+        let mut new_index = vec![UNUSED; self.vertices.len()];
+        for vertex in self.triangles.iter().flatten() {
+            new_index[*vertex as usize] = 0;
+        }
+        let mut kept = 0;
+        for (old, new) in new_index.iter_mut().enumerate() {
+            if *new == UNUSED {
+                continue;
+            }
+            *new = kept as u32;
+            self.vertices[kept] = self.vertices[old];
+            if !self.normals.is_empty() {
+                self.normals[kept] = self.normals[old];
+            }
+            if !self.colors.is_empty() {
+                self.colors[kept] = self.colors[old];
+            }
+            kept += 1;
+        }
+        self.vertices.truncate(kept);
+        self.normals.truncate(kept);
+        self.colors.truncate(kept);
+        for vertex in self.triangles.iter_mut().flatten() {
+            *vertex = new_index[*vertex as usize];
+        }
+    }
+
+    /// Area-weighted unit vertex normals from the triangles.
+    pub fn compute_normals(&mut self) {
+        let mut normals = vec![Vec3::ZERO; self.vertices.len()];
+        for triangle in 0..self.triangles.len() {
+            let normal = self.scaled_normal(triangle);
+            for vertex in self.triangles[triangle] {
+                normals[vertex as usize] += normal;
+            }
+        }
+        for normal in &mut normals {
+            *normal = normal.normalize_or(Vec3::Z);
+        }
+        self.normals = normals;
+    }
+
+    /// The box around all vertices; empty without vertices.
+    pub fn bounds(&self) -> Aabb {
+        Aabb::of(self.vertices.iter().copied())
+    }
+}
+
+/// An axis-aligned box; empty while `min > max`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Aabb {
+    /// Lower corner [m].
+    pub min: Vec3,
+    /// Upper corner [m].
+    pub max: Vec3,
+}
+
+impl Aabb {
+    /// The box that contains nothing.
+    pub const EMPTY: Self = Self {
+        min: Vec3::INFINITY,
+        max: Vec3::NEG_INFINITY,
+    };
+
+    /// The smallest box around points.
+    pub fn of(points: impl IntoIterator<Item = Vec3>) -> Self {
+        points.into_iter().fold(Self::EMPTY, Self::grown_to)
+    }
+
+    /// The smallest box around this box and a point.
+    #[must_use]
+    pub fn grown_to(self, point: Vec3) -> Self {
+        Self {
+            min: self.min.min(point),
+            max: self.max.max(point),
+        }
+    }
+
+    /// The smallest box around two boxes.
+    #[must_use]
+    pub fn union(self, other: Self) -> Self {
+        Self {
+            min: self.min.min(other.min),
+            max: self.max.max(other.max),
+        }
+    }
+
+    /// Whether no point is inside.
+    pub fn is_empty(&self) -> bool {
+        self.min.cmpgt(self.max).any()
+    }
+
+    /// Whether a point is inside or on the border.
+    pub fn contains(&self, point: Vec3) -> bool {
+        point.cmpge(self.min).all() && point.cmple(self.max).all()
+    }
+
+    /// Edge lengths [m].
+    pub fn size(&self) -> Vec3 {
+        self.max - self.min
+    }
+
+    /// The middle.
+    pub fn center(&self) -> Vec3 {
+        0.5 * (self.min + self.max)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn square() -> TriangleMesh {
+        TriangleMesh {
+            vertices: vec![Vec3::ZERO, Vec3::X, Vec3::X + Vec3::Y, Vec3::Y],
+            triangles: vec![[0, 1, 2], [0, 2, 3]],
+            ..TriangleMesh::default()
+        }
+    }
+
+    #[test]
+    fn the_normal_of_a_counter_clockwise_square_points_up() {
+        let mut mesh = square();
+        mesh.compute_normals();
+        assert!(mesh.normals.iter().all(|&normal| normal == Vec3::Z));
+    }
+
+    #[test]
+    fn removing_a_triangle_removes_its_own_vertex_only() {
+        let mut mesh = square();
+        mesh.retain_triangles(|triangle| triangle == 1);
+        assert_eq!(mesh.vertices, [Vec3::ZERO, Vec3::X + Vec3::Y, Vec3::Y]);
+        assert_eq!(mesh.triangles, [[0, 1, 2]]);
+    }
+
+    #[test]
+    fn appending_shifts_the_indices() {
+        let mut mesh = square();
+        mesh.append(&square());
+        assert_eq!(mesh.triangles[2], [4, 5, 6]);
+        assert_eq!(mesh.corners(2), square().corners(0));
+    }
+
+    #[test]
+    fn the_empty_box_contains_nothing() {
+        assert!(Aabb::EMPTY.is_empty());
+        assert!(!Aabb::EMPTY.contains(Vec3::ZERO));
+        assert_eq!(Aabb::EMPTY.grown_to(Vec3::X).center(), Vec3::X);
+    }
+}

@@ -1,0 +1,92 @@
+//! Poses in the plane and in space, and the way between them.
+
+use glam::{Mat3, Vec3};
+use nalgebra::{Isometry2, Isometry3, Translation3, UnitQuaternion};
+
+/// A pose or transform in the plane: x, y [m], heading [rad].
+pub type Pose2 = Isometry2<f64>;
+/// A pose or transform in space [m].
+pub type Pose3 = Isometry3<f64>;
+
+/// Heading of a pose about the vertical, `atan2(R₁₀, R₀₀)` [rad].
+pub fn yaw(pose: &Pose3) -> f64 {
+    let forward = pose.rotation * nalgebra::Vector3::x();
+    forward.y.atan2(forward.x)
+}
+
+/// The shadow of a pose on the x-y plane: x, y and heading.
+pub fn planar(pose: &Pose3) -> Pose2 {
+    Pose2::new(pose.translation.vector.xy(), yaw(pose))
+}
+
+/// The level pose at `height_m` above a planar one; [`planar`] is the inverse.
+pub fn spatial(pose: &Pose2, height_m: f64) -> Pose3 {
+    let t = pose.translation.vector;
+    Pose3::from_parts(
+        Translation3::new(t.x, t.y, height_m),
+        UnitQuaternion::from_euler_angles(0.0, 0.0, pose.rotation.angle()),
+    )
+}
+
+/// A rigid transform in `f32`, for moving many points: `p_a = a_from_b.apply(p_b)`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rigid3f {
+    /// Rotation matrix, columns are the axes of b in a.
+    pub rotation: Mat3,
+    /// Origin of b in a [m].
+    pub translation: Vec3,
+}
+
+impl Rigid3f {
+    /// A point of frame b in frame a.
+    #[inline]
+    pub fn apply(&self, point: Vec3) -> Vec3 {
+        self.rotation * point + self.translation
+    }
+
+    /// A direction of frame b in frame a.
+    #[inline]
+    pub fn rotate(&self, direction: Vec3) -> Vec3 {
+        self.rotation * direction
+    }
+}
+
+impl From<&Pose3> for Rigid3f {
+    fn from(pose: &Pose3) -> Self {
+        let rotation: nalgebra::Matrix3<f32> = pose.rotation.to_rotation_matrix().matrix().cast();
+        let translation: nalgebra::Vector3<f32> = pose.translation.vector.cast();
+        Self {
+            rotation: rotation.into(),
+            translation: translation.into(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+    use nalgebra::Vector2;
+
+    use super::*;
+
+    #[test]
+    fn planar_undoes_spatial() {
+        for heading in [-3.1, -1.0, 0.0, 0.5, 3.1] {
+            let pose = Pose2::new(Vector2::new(3.0, -2.0), heading);
+            assert_relative_eq!(planar(&spatial(&pose, 1.5)), pose, epsilon = 1e-12);
+        }
+    }
+
+    #[test]
+    fn single_and_double_precision_agree() {
+        let pose = Pose3::new(
+            nalgebra::Vector3::new(1.0, 2.0, 3.0),
+            nalgebra::Vector3::new(0.1, -0.2, 1.3),
+        );
+        let moved = Rigid3f::from(&pose).apply(Vec3::new(4.0, 5.0, 6.0));
+        let expected = pose * nalgebra::Point3::new(4.0, 5.0, 6.0);
+        assert_relative_eq!(f64::from(moved.x), expected.x, epsilon = 1e-5);
+        assert_relative_eq!(f64::from(moved.y), expected.y, epsilon = 1e-5);
+        assert_relative_eq!(f64::from(moved.z), expected.z, epsilon = 1e-5);
+    }
+}

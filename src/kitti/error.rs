@@ -1,0 +1,67 @@
+//! What can be wrong with a recording on disk.
+
+use std::path::PathBuf;
+
+/// Each names the file, quotes what stands there and says what to do.
+#[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages say it")]
+pub enum KittiError {
+    #[error("cannot read {}: {source}", path.display())]
+    Read {
+        path: PathBuf,
+        source: std::io::Error,
+    },
+    #[error("cannot write {}: {source}", path.display())]
+    Write {
+        path: PathBuf,
+        source: std::io::Error,
+    },
+    #[error("{} has {bytes} bytes, which is not a multiple of {record_bytes}; it looks truncated, copy it again", path.display())]
+    Truncated {
+        path: PathBuf,
+        bytes: u64,
+        record_bytes: usize,
+    },
+    #[error("{}, line {line}: `{word}` is not a finite number", path.display())]
+    NotANumber {
+        path: PathBuf,
+        line: usize,
+        word: String,
+    },
+    #[error("{}, line {line}: {found} numbers where {expected} belong ({layout})", path.display())]
+    WrongCount {
+        path: PathBuf,
+        line: usize,
+        found: usize,
+        expected: usize,
+        layout: &'static str,
+    },
+    #[error("{}, line {line}: the first three columns are not a rotation", path.display())]
+    NotARotation { path: PathBuf, line: usize },
+    #[error("{} has no line `Tr:` (cam0_from_lidar, 12 numbers); use the calib.txt of the odometry benchmark", path.display())]
+    NoTr { path: PathBuf },
+    #[error("{} holds no poses", path.display())]
+    NoPoses { path: PathBuf },
+    #[error("{} holds no scans (*.bin); point scan_folder at the velodyne folder of the recording", path.display())]
+    NoScans { path: PathBuf },
+    #[error("{} has no pose: {} has {poses} rows; check that both belong to one recording, or choose frames with n_scans", scan.display(), pose_file.display())]
+    ScanWithoutPose {
+        scan: PathBuf,
+        pose_file: PathBuf,
+        poses: usize,
+    },
+    #[error("{} has {times} times for {poses} poses; both need one row per frame", path.display())]
+    WrongTimes {
+        path: PathBuf,
+        times: usize,
+        poses: usize,
+    },
+    #[error("no frame is selected: start_idx {start_idx}, n_scans {n_scans}, frame_step {frame_step} of {scans} scans in {}", path.display())]
+    NothingSelected {
+        path: PathBuf,
+        start_idx: usize,
+        n_scans: i64,
+        frame_step: usize,
+        scans: usize,
+    },
+}

@@ -1,0 +1,19 @@
+//! Recordings in the layout of the KITTI odometry benchmark, read and written.
+//!
+//! Poses on disk are camera poses; [`poses`] holds the only conversion between them and the
+//! lidar poses that everything else uses:
+//!
+//! ```text
+//! map_from_lidar(i) = inv(Tr) · inv(P₀) · Pᵢ · Tr        Tr = cam0_from_lidar
+//! ```
+
+pub mod calibration;
+mod error;
+pub mod poses;
+pub mod sequence;
+mod table;
+pub mod velodyne;
+
+pub use calibration::Calibration;
+pub use error::KittiError;
+pub use sequence::{Frame, Selection, Sequence};

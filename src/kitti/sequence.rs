@@ -1,0 +1,286 @@
+//! A recording: which scan belongs to which pose, and which of them are wanted.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::poses::{CameraPoses, read_times};
+use super::{Calibration, KittiError, velodyne};
+use crate::geometry::{Pose3, StampedPose};
+use crate::lidar::Scan;
+
+/// Revolutions per second of the sensor where no `times.txt` says otherwise.
+const SCANS_PER_SECOND: f64 = 10.0;
+
+/// Which frames of a recording are used: `start_idx`, `start_idx + frame_step`, ...
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Selection {
+    /// First frame.
+    pub start_idx: usize,
+    /// How many scans of the recording are looked at from there on; -1 for all.
+    pub n_scans: i64,
+    /// Every how manieth of them is taken.
+    pub frame_step: usize,
+}
+
+impl Default for Selection {
+    /// Every frame.
+    fn default() -> Self {
+        Self {
+            start_idx: 0,
+            n_scans: -1,
+            frame_step: 1,
+        }
+    }
+}
+
+/// One frame of a recording; the scan stays on disk until [`read`](Self::read).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Frame {
+    /// Number in the recording.
+    pub number: usize,
+    /// The scan's file.
+    pub scan_path: PathBuf,
+    /// Time since the start of the recording [s].
+    pub time_s: f64,
+    /// `p_map = map_from_lidar * p_lidar`.
+    pub map_from_lidar: Pose3,
+}
+
+impl Frame {
+    /// Reads the scan.
+    pub fn read(&self) -> Result<Scan, KittiError> {
+        velodyne::read_scan(&self.scan_path)
+    }
+
+    /// The pose with its place in the recording.
+    pub fn stamped(&self) -> StampedPose {
+        StampedPose {
+            frame: self.number,
+            time_s: self.time_s,
+            map_from_lidar: self.map_from_lidar,
+        }
+    }
+}
+
+/// A recording with its selected frames.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Sequence {
+    /// The selected frames, ascending.
+    pub frames: Vec<Frame>,
+    /// All lidar poses of the recording in the frame of the first.
+    pub map_from_lidar: Vec<Pose3>,
+    /// Where the lidar sits on the camera.
+    pub calibration: Calibration,
+    /// The first camera pose, for writing poses in the recording's own convention.
+    pub world_from_first_cam0: Pose3,
+}
+
+impl Sequence {
+    /// Opens a recording without reading its scans.
+    ///
+    /// Scans are the `.bin` files below `scan_folder` in the order of their paths. Where their
+    /// names are numbers, the number is the row of the pose file, so that a part of a
+    /// recording keeps its poses; otherwise the position in the order is. Times come from
+    /// `times.txt` beside the pose file if there is one.
+    pub fn open(
+        scan_folder: &Path,
+        pose_file: &Path,
+        calib_file: &Path,
+        selection: &Selection,
+    ) -> Result<Self, KittiError> {
+        let calibration = Calibration::read(calib_file)?;
+        let camera_poses = CameraPoses::read(pose_file)?;
+        let map_from_lidar = camera_poses.map_from_lidar(&calibration);
+        let times_s = times_of(pose_file, map_from_lidar.len())?;
+        let scans = scan_paths(scan_folder)?;
+        let numbers = frame_numbers(&scans);
+
+        let mut frames = Vec::new();
+        let window = usize::try_from(selection.n_scans).unwrap_or(usize::MAX);
+        let window_end = selection.start_idx.saturating_add(window);
+        for (scan_path, number) in scans.iter().zip(numbers) {
+            let in_window = (selection.start_idx..window_end).contains(&number);
+            if !in_window || !(number - selection.start_idx).is_multiple_of(selection.frame_step) {
+                continue;
+            }
+            let Some(&pose) = map_from_lidar.get(number) else {
+                return Err(KittiError::ScanWithoutPose {
+                    scan: scan_path.clone(),
+                    pose_file: pose_file.to_owned(),
+                    poses: map_from_lidar.len(),
+                });
+            };
+            frames.push(Frame {
+                number,
+                scan_path: scan_path.clone(),
+                time_s: times_s[number],
+                map_from_lidar: pose,
+            });
+        }
+        if frames.is_empty() {
+            return Err(KittiError::NothingSelected {
+                path: scan_folder.to_owned(),
+                start_idx: selection.start_idx,
+                n_scans: selection.n_scans,
+                frame_step: selection.frame_step,
+                scans: scans.len(),
+            });
+        }
+        Ok(Self {
+            frames,
+            map_from_lidar,
+            calibration,
+            world_from_first_cam0: camera_poses.world_from_cam0[0],
+        })
+    }
+}
+
+/// All `.bin` files below a folder, sorted by path.
+pub fn scan_paths(folder: &Path) -> Result<Vec<PathBuf>, KittiError> {
+    let mut paths = Vec::new();
+    let mut folders = vec![folder.to_owned()];
+    while let Some(folder) = folders.pop() {
+        let read_error = |source| KittiError::Read {
+            path: folder.clone(),
+            source,
+        };
+        for entry in fs::read_dir(&folder).map_err(read_error)? {
+            let path = entry.map_err(read_error)?.path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|extension| extension == "bin") {
+                paths.push(path);
+            }
+        }
+    }
+    if paths.is_empty() {
+        return Err(KittiError::NoScans {
+            path: folder.to_owned(),
+        });
+    }
+    paths.sort();
+    Ok(paths)
+}
+
+/// The numbers in the names if every name is a number and none comes twice, else the positions.
+fn frame_numbers(scans: &[PathBuf]) -> Vec<usize> {
+    let named: Option<Vec<usize>> = scans
+        .iter()
+        .map(|path| path.file_stem()?.to_str()?.parse().ok())
+        .collect();
+    match named {
+        Some(numbers) if numbers.is_sorted_by(|a, b| a < b) => numbers,
+        _ => (0..scans.len()).collect(),
+    }
+}
+
+fn times_of(pose_file: &Path, poses: usize) -> Result<Vec<f64>, KittiError> {
+    let path = pose_file.with_file_name("times.txt");
+    if !path.exists() {
+        return Ok((0..poses).map(|i| i as f64 / SCANS_PER_SECOND).collect());
+    }
+    let times_s = read_times(&path)?;
+    if times_s.len() == poses {
+        Ok(times_s)
+    } else {
+        Err(KittiError::WrongTimes {
+            path,
+            times: times_s.len(),
+            poses,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn recording(scans: &[&str], poses: usize) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        let velodyne = folder.path().join("velodyne");
+        fs::create_dir(&velodyne).unwrap();
+        for name in scans {
+            fs::write(velodyne.join(name), []).unwrap();
+        }
+        let row = "1 0 0 0 0 1 0 0 0 0 1 0\n";
+        fs::write(folder.path().join("poses.txt"), row.repeat(poses)).unwrap();
+        fs::write(folder.path().join("calib.txt"), format!("Tr: {row}")).unwrap();
+        folder
+    }
+
+    fn open(folder: &Path, selection: &Selection) -> Result<Sequence, KittiError> {
+        Sequence::open(
+            &folder.join("velodyne"),
+            &folder.join("poses.txt"),
+            &folder.join("calib.txt"),
+            selection,
+        )
+    }
+
+    fn numbers(sequence: &Sequence) -> Vec<usize> {
+        sequence.frames.iter().map(|frame| frame.number).collect()
+    }
+
+    #[test]
+    fn even_and_odd_frames_share_nothing_and_leave_nothing() {
+        let names: Vec<String> = (0..9).map(|i| format!("{i:06}.bin")).collect();
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        let folder = recording(&names, 9);
+        let step = |start_idx| Selection {
+            start_idx,
+            frame_step: 2,
+            ..Selection::default()
+        };
+        let even = open(folder.path(), &step(0)).unwrap();
+        let odd = open(folder.path(), &step(1)).unwrap();
+        assert_eq!(numbers(&even), [0, 2, 4, 6, 8]);
+        assert_eq!(numbers(&odd), [1, 3, 5, 7]);
+    }
+
+    #[test]
+    fn a_part_of_a_recording_keeps_its_poses() {
+        let folder = recording(&["000005.bin", "000007.bin"], 10);
+        let sequence = open(folder.path(), &Selection::default()).unwrap();
+        assert_eq!(numbers(&sequence), [5, 7]);
+        assert_eq!(sequence.frames[0].time_s, 0.5);
+    }
+
+    #[test]
+    fn names_that_are_no_numbers_are_counted() {
+        let folder = recording(&["a.bin", "b.bin"], 2);
+        assert_eq!(
+            numbers(&open(folder.path(), &Selection::default()).unwrap()),
+            [0, 1]
+        );
+    }
+
+    #[test]
+    fn a_scan_without_a_pose_is_an_error_unless_it_is_not_selected() {
+        let folder = recording(&["000000.bin", "000001.bin"], 1);
+        let message = open(folder.path(), &Selection::default())
+            .unwrap_err()
+            .to_string();
+        assert!(message.contains("000001.bin has no pose"), "{message}");
+        let first = Selection {
+            n_scans: 1,
+            ..Selection::default()
+        };
+        assert_eq!(numbers(&open(folder.path(), &first).unwrap()), [0]);
+    }
+
+    #[test]
+    fn times_of_the_recording_are_used_and_checked() {
+        let folder = recording(&["000000.bin", "000001.bin"], 2);
+        fs::write(folder.path().join("times.txt"), "0.0\n0.104\n").unwrap();
+        let sequence = open(folder.path(), &Selection::default()).unwrap();
+        assert_eq!(sequence.frames[1].time_s, 0.104);
+        fs::write(folder.path().join("times.txt"), "0.0\n").unwrap();
+        let message = open(folder.path(), &Selection::default())
+            .unwrap_err()
+            .to_string();
+        assert!(message.contains("1 times for 2 poses"), "{message}");
+    }
+}

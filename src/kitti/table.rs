@@ -1,0 +1,92 @@
+//! Text files with numbers in rows.
+
+use std::fs;
+use std::path::Path;
+
+use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
+
+use super::KittiError;
+use crate::geometry::Pose3;
+
+/// The rows of a file that are not blank or comments, each with its line number.
+pub fn read_rows(path: &Path) -> Result<Vec<(usize, Vec<f64>)>, KittiError> {
+    let text = read_text(path)?;
+    text.lines()
+        .enumerate()
+        .map(|(index, line)| (index + 1, line.trim()))
+        .filter(|(_, line)| !line.is_empty() && !line.starts_with('#'))
+        .map(|(line, text)| Ok((line, parse_numbers(text, path, line)?)))
+        .collect()
+}
+
+/// The whole file as text.
+pub fn read_text(path: &Path) -> Result<String, KittiError> {
+    fs::read_to_string(path).map_err(|source| KittiError::Read {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+/// Finite numbers separated by white space.
+pub fn parse_numbers(text: &str, path: &Path, line: usize) -> Result<Vec<f64>, KittiError> {
+    text.split_whitespace()
+        .map(|word| match word.parse::<f64>() {
+            Ok(number) if number.is_finite() => Ok(number),
+            _ => Err(KittiError::NotANumber {
+                path: path.to_owned(),
+                line,
+                word: word.to_owned(),
+            }),
+        })
+        .collect()
+}
+
+/// A row-major 3x4 matrix as a transform. The rotation is made orthogonal; a matrix that is
+/// not close to one is an error.
+pub fn pose_from_row(row: &[f64], path: &Path, line: usize) -> Result<Pose3, KittiError> {
+    if row.len() != 12 {
+        return Err(KittiError::WrongCount {
+            path: path.to_owned(),
+            line,
+            found: row.len(),
+            expected: 12,
+            layout: "a row-major 3x4 matrix",
+        });
+    }
+    let matrix = Matrix3::new(
+        row[0], row[1], row[2], row[4], row[5], row[6], row[8], row[9], row[10],
+    );
+    let skew = (matrix.transpose() * matrix - Matrix3::identity())
+        .abs()
+        .max();
+    if skew > 0.01 || matrix.determinant() < 0.0 {
+        return Err(KittiError::NotARotation {
+            path: path.to_owned(),
+            line,
+        });
+    }
+    let rotation = nearest_rotation(matrix);
+    Ok(Isometry3::from_parts(
+        Translation3::new(row[3], row[7], row[11]),
+        UnitQuaternion::from_rotation_matrix(&rotation),
+    ))
+}
+
+/// The rotation nearest to a matrix, `U Vᵀ` of its singular value decomposition.
+fn nearest_rotation(matrix: Matrix3<f64>) -> Rotation3<f64> {
+    let svd = matrix.svd(true, true);
+    match (svd.u, svd.v_t) {
+        (Some(u), Some(v_t)) => Rotation3::from_matrix_unchecked(u * v_t),
+        _ => Rotation3::from_matrix_unchecked(matrix),
+    }
+}
+
+/// A transform as a row-major 3x4 matrix in KITTI's number format.
+pub fn row_from_pose(pose: &Pose3) -> String {
+    let matrix = pose.to_homogeneous();
+    let numbers: Vec<String> = (0..3)
+        .flat_map(|row| (0..4).map(move |column| (row, column)))
+        .map(|index| format!("{:.9e}", matrix[index]))
+        .collect();
+    numbers.join(" ")
+}

@@ -1,0 +1,193 @@
+//! The spherical projection of a spinning LiDAR, the only place where a direction becomes a pixel.
+//!
+//! ```text
+//! column = ½ (1 − azimuth / π) · width            azimuth   = atan2(y, x)
+//! row    = (1 − (elevation + |fov_down|) / fov) · height    elevation = asin(z / r)
+//! ```
+//!
+//! Column 0 looks straight back, the middle straight ahead, columns grow clockwise; row 0 is
+//! up. Chen et al., *Range Image-based LiDAR Localization for Autonomous Vehicles*, ICRA 2021,
+//! eq. 1. Unlike there, a direction outside the vertical field of view has no pixel.
+
+use std::f32::consts::PI;
+
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+
+/// Size, field of view and range limits of a range image.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LidarModel {
+    /// Rows.
+    pub height: usize,
+    /// Columns over 360 degrees.
+    pub width: usize,
+    /// Upper edge of the vertical field of view over the horizon [deg].
+    pub fov_up: f32,
+    /// Lower edge of the vertical field of view; below the horizon whatever its sign [deg].
+    pub fov_down: f32,
+    /// Returns at this range or farther are dropped [m].
+    pub max_range: f32,
+    /// Returns at this range or nearer are dropped [m].
+    pub min_range: f32,
+}
+
+impl Default for LidarModel {
+    /// A Velodyne HDL-64E as range-mcl images it.
+    fn default() -> Self {
+        Self {
+            height: 64,
+            width: 900,
+            fov_up: 3.0,
+            fov_down: -25.0,
+            max_range: 50.0,
+            min_range: 2.0,
+        }
+    }
+}
+
+/// Row and column in a range image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Pixel {
+    /// From the top.
+    pub row: usize,
+    /// Clockwise from straight back.
+    pub column: usize,
+}
+
+impl LidarModel {
+    /// Number of pixels.
+    pub fn len(&self) -> usize {
+        self.height * self.width
+    }
+
+    /// Whether there are no pixels.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Whether a point at this range counts; not so where the range is not finite.
+    pub fn accepts_range(&self, range_m: f32) -> bool {
+        self.min_range < range_m && range_m < self.max_range
+    }
+
+    /// The pixel that a direction (of any length) falls into; `None` above or below the field of view.
+    pub fn pixel_of(&self, direction: Vec3) -> Option<Pixel> {
+        let elevation_rad = (direction.z / direction.length()).asin();
+        let row = (self.fov_up_rad() - elevation_rad) / self.fov_rad() * self.height as f32;
+        if !(row >= 0.0 && row < self.height as f32) {
+            return None;
+        }
+        let azimuth_rad = direction.y.atan2(direction.x);
+        let column = 0.5 * (1.0 - azimuth_rad / PI) * self.width as f32;
+        Some(Pixel {
+            row: row as usize,
+            // An azimuth of exactly -π is straight back again.
+            column: column as usize % self.width,
+        })
+    }
+
+    /// The unit direction through the centre of a pixel.
+    pub fn direction_of(&self, pixel: Pixel) -> Vec3 {
+        let elevation_rad =
+            self.fov_up_rad() - (pixel.row as f32 + 0.5) / self.height as f32 * self.fov_rad();
+        let azimuth_rad = PI * (1.0 - 2.0 * (pixel.column as f32 + 0.5) / self.width as f32);
+        Vec3::new(
+            elevation_rad.cos() * azimuth_rad.cos(),
+            elevation_rad.cos() * azimuth_rad.sin(),
+            elevation_rad.sin(),
+        )
+    }
+
+    /// The directions of all pixels, row by row.
+    pub fn directions(&self) -> Vec<Vec3> {
+        (0..self.len())
+            .map(|index| self.direction_of(self.pixel_at(index)))
+            .collect()
+    }
+
+    /// Row-major index of a pixel.
+    #[inline]
+    pub fn index_of(&self, pixel: Pixel) -> usize {
+        pixel.row * self.width + pixel.column
+    }
+
+    /// The pixel at a row-major index.
+    #[inline]
+    pub fn pixel_at(&self, index: usize) -> Pixel {
+        Pixel {
+            row: index / self.width,
+            column: index % self.width,
+        }
+    }
+
+    /// Upper edge of the field of view [rad].
+    pub fn fov_up_rad(&self) -> f32 {
+        self.fov_up.to_radians()
+    }
+
+    /// Lower edge of the field of view, negative [rad].
+    pub fn fov_down_rad(&self) -> f32 {
+        -self.fov_down.abs().to_radians()
+    }
+
+    /// Vertical field of view [rad].
+    pub fn fov_rad(&self) -> f32 {
+        self.fov_up_rad() - self.fov_down_rad()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_centre_of_every_pixel_falls_into_that_pixel() {
+        let model = LidarModel::default();
+        for index in 0..model.len() {
+            let pixel = model.pixel_at(index);
+            assert_eq!(model.pixel_of(model.direction_of(pixel)), Some(pixel));
+        }
+    }
+
+    #[test]
+    fn ahead_is_the_middle_column_and_right_is_after_it() {
+        let model = LidarModel::default();
+        let column = |direction| model.pixel_of(direction).unwrap().column;
+        assert_eq!(column(Vec3::new(1.0, 0.0, 0.0)), 450);
+        assert_eq!(column(Vec3::new(0.0, -1.0, 0.0)), 675);
+        assert_eq!(column(Vec3::new(0.0, 1.0, 0.0)), 225);
+        assert_eq!(column(Vec3::new(-1.0, 0.0, 0.0)), 0);
+        assert_eq!(column(Vec3::new(-1.0, -0.0, 0.0)), 0);
+    }
+
+    #[test]
+    fn a_point_outside_the_field_of_view_is_dropped() {
+        let model = LidarModel::default();
+        let at = |elevation_deg: f32| {
+            let elevation = elevation_deg.to_radians();
+            model.pixel_of(Vec3::new(elevation.cos(), 0.0, elevation.sin()))
+        };
+        assert_eq!(at(3.1), None);
+        assert_eq!(at(2.99).unwrap().row, 0);
+        assert_eq!(at(-24.99).unwrap().row, 63);
+        assert_eq!(at(-25.1), None);
+    }
+
+    #[test]
+    fn no_pixel_for_what_is_no_direction() {
+        let model = LidarModel::default();
+        assert_eq!(model.pixel_of(Vec3::ZERO), None);
+        assert_eq!(model.pixel_of(Vec3::NAN), None);
+    }
+
+    #[test]
+    fn the_sign_of_the_lower_edge_does_not_matter() {
+        let below = LidarModel::default();
+        let unsigned = LidarModel {
+            fov_down: 25.0,
+            ..below
+        };
+        assert_eq!(below.fov_rad(), unsigned.fov_rad());
+    }
+}

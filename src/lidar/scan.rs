@@ -1,0 +1,81 @@
+//! One revolution of the sensor: points as they were measured.
+
+use glam::Vec3;
+
+use super::LidarModel;
+
+/// A direction and how far the sensor saw along it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Beam {
+    /// Unit direction in the lidar frame.
+    pub direction: Vec3,
+    /// Range of the return [m].
+    pub range_m: f32,
+}
+
+impl Beam {
+    /// The point where the beam was returned, lidar frame.
+    pub fn point(&self) -> Vec3 {
+        self.direction * self.range_m
+    }
+}
+
+/// Points of one revolution in the lidar frame.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Scan {
+    /// Positions [m], in the order of the file.
+    pub points: Vec<Vec3>,
+    /// Reflectance of each point, 0 to 1.
+    pub intensities: Vec<f32>,
+}
+
+impl Scan {
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.points.len()
+    }
+
+    /// Whether there are no points.
+    pub fn is_empty(&self) -> bool {
+        self.points.is_empty()
+    }
+
+    /// Drops points that are not finite or outside the range limits of the model.
+    /// Returns how many.
+    pub fn drop_invalid(&mut self, model: &LidarModel) -> usize {
+        let before = self.len();
+        let keep: Vec<bool> = self
+            .points
+            .iter()
+            .map(|point| point.is_finite() && model.accepts_range(point.length()))
+            .collect();
+        let mut flags = keep.iter();
+        self.points.retain(|_| flags.next() == Some(&true));
+        let mut flags = keep.iter();
+        self.intensities.retain(|_| flags.next() == Some(&true));
+        before - self.len()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_that_are_not_finite_or_out_of_limits_are_dropped_with_their_intensity() {
+        let mut scan = Scan {
+            points: vec![
+                Vec3::new(5.0, 0.0, 0.0),
+                Vec3::new(f32::NAN, 0.0, 0.0),
+                Vec3::new(f32::INFINITY, 0.0, 0.0),
+                Vec3::ZERO,
+                Vec3::new(0.0, 60.0, 0.0),
+                Vec3::new(0.0, 6.0, 0.0),
+            ],
+            intensities: vec![0.0, 0.1, 0.2, 0.3, 0.4, 0.5],
+        };
+        assert_eq!(scan.drop_invalid(&LidarModel::default()), 4);
+        assert_eq!(scan.intensities, [0.0, 0.5]);
+        assert_eq!(scan.points[1], Vec3::new(0.0, 6.0, 0.0));
+    }
+}

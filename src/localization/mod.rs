@@ -1,0 +1,1 @@
+//! Where the car is: Monte Carlo localization in the mesh map.

@@ -1,0 +1,3 @@
+//! The command line: parse, start logging, dispatch, exit code.
+
+fn main() {}

@@ -1,0 +1,289 @@
+//! The ground of the map: how high the road is and how it leans, and with it where in space a
+//! pose in the plane is.
+//!
+//! ```text
+//! map_from_lidar = map_from_road(x, y, heading) · road_from_lidar
+//! ```
+//!
+//! The road frame lies on the mapped ground under the sensor, z along the ground's normal, x
+//! forward. How the sensor stands over it (height, roll, pitch) is the car's own affair and
+//! comes from the scan.
+
+use glam::Vec3;
+use nalgebra::{Matrix3, Point2, Rotation3, Translation3, UnitQuaternion, Vector3};
+
+use crate::geometry::{Grid2, Pose2, Pose3, TriangleMesh};
+
+/// How the sensor stands over the road: height, roll and pitch.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Stance {
+    /// Height of the sensor over the road, along the road's normal [m].
+    pub height_m: f64,
+    /// About the forward axis [rad].
+    pub roll_rad: f64,
+    /// About the left axis; positive looks down [rad].
+    pub pitch_rad: f64,
+}
+
+impl Default for Stance {
+    /// KITTI's car on a level road.
+    fn default() -> Self {
+        Self {
+            height_m: 1.73,
+            roll_rad: 0.0,
+            pitch_rad: 0.0,
+        }
+    }
+}
+
+impl Stance {
+    /// `p_road = road_from_lidar * p_lidar`.
+    pub fn road_from_lidar(&self) -> Pose3 {
+        Pose3::from_parts(
+            Translation3::new(0.0, 0.0, self.height_m),
+            UnitQuaternion::from_euler_angles(self.roll_rad, self.pitch_rad, 0.0),
+        )
+    }
+
+    /// From the road's plane as the sensor sees it: unit normal (up) and distance of the sensor
+    /// over the plane [m].
+    pub fn from_plane(up_in_lidar: Vec3, height_m: f64) -> Self {
+        let up: Vector3<f64> = Vector3::new(up_in_lidar.x, up_in_lidar.y, up_in_lidar.z).cast();
+        // up = Rx(roll)ᵀ Ry(pitch)ᵀ z  (no yaw)  =  (-sin p, cos p sin r, cos p cos r)
+        Self {
+            height_m,
+            roll_rad: up.y.atan2(up.z),
+            pitch_rad: (-up.x).asin(),
+        }
+    }
+}
+
+/// The ground at one place.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GroundPatch {
+    /// Height in the map frame [m].
+    pub height_m: f64,
+    /// Unit normal, up.
+    pub normal: Vector3<f64>,
+}
+
+/// Height of the ground on a grid over the map.
+#[derive(Clone, Debug, PartialEq)]
+pub struct GroundMap {
+    grid: Grid2,
+    /// NaN where no ground is known.
+    heights_m: Vec<f32>,
+}
+
+impl GroundMap {
+    /// From the triangles for which `is_ground` holds, by their vertices, cells of `cell_m`.
+    pub fn from_mesh(mesh: &TriangleMesh, is_ground: impl Fn(usize) -> bool, cell_m: f64) -> Self {
+        let bounds = mesh.bounds();
+        let (min, max) = if bounds.is_empty() {
+            (Point2::origin(), Point2::origin())
+        } else {
+            (
+                Point2::new(f64::from(bounds.min.x), f64::from(bounds.min.y)),
+                Point2::new(f64::from(bounds.max.x), f64::from(bounds.max.y)),
+            )
+        };
+        let grid = Grid2::covering(min, max, cell_m);
+        let mut sums = vec![(0.0_f64, 0.0_f64); grid.len()];
+        for triangle in (0..mesh.triangles.len()).filter(|&triangle| is_ground(triangle)) {
+            rasterize(&grid, mesh.corners(triangle), &mut sums);
+        }
+        let heights_m = sums
+            .iter()
+            .map(|&(sum, count)| {
+                if count > 0.0 {
+                    (sum / count) as f32
+                } else {
+                    f32::NAN
+                }
+            })
+            .collect();
+        Self { grid, heights_m }
+    }
+
+    /// Flat ground everywhere in a rectangle, for tests and for maps whose ground is not marked.
+    pub fn flat(min: Point2<f64>, max: Point2<f64>, height_m: f64) -> Self {
+        let grid = Grid2::covering(min, max, 1.0);
+        Self {
+            grid,
+            heights_m: vec![height_m as f32; grid.len()],
+        }
+    }
+
+    /// The ground at a place: a plane fitted to the known cells within `radius_m`; `None` where
+    /// fewer than a third of them are known.
+    pub fn patch_at(&self, x: f64, y: f64, radius_m: f64) -> Option<GroundPatch> {
+        let (column, row) = self.grid.cell_at(x, y)?;
+        let reach = (radius_m / self.grid.cell_m).ceil() as usize;
+        let mut normal_matrix = Matrix3::zeros();
+        let mut right_side = Vector3::zeros();
+        let (mut known, mut all) = (0, 0);
+        for row in row.saturating_sub(reach)..=(row + reach).min(self.grid.rows - 1) {
+            for column in column.saturating_sub(reach)..=(column + reach).min(self.grid.columns - 1)
+            {
+                let center = self.grid.center(column, row);
+                let offset = Vector3::new(center.x - x, center.y - y, 1.0);
+                if offset.xy().norm() > radius_m {
+                    continue;
+                }
+                all += 1;
+                let height_m = f64::from(self.heights_m[row * self.grid.columns + column]);
+                if height_m.is_finite() {
+                    known += 1;
+                    normal_matrix += offset * offset.transpose();
+                    right_side += offset * height_m;
+                }
+            }
+        }
+        if known < 3 || 3 * known < all {
+            return None;
+        }
+        let plane = normal_matrix.cholesky()?.solve(&right_side);
+        Some(GroundPatch {
+            height_m: plane.z,
+            normal: Vector3::new(-plane.x, -plane.y, 1.0).normalize(),
+        })
+    }
+
+    /// Where in space a planar pose is, standing on the ground as `stance` says; `None` where
+    /// there is no ground. `map_from_lidar = map_from_road · road_from_lidar`, with the sensor at the
+    /// pose's x and y.
+    pub fn lift(&self, planar: &Pose2, stance: &Stance) -> Option<Pose3> {
+        const RADIUS_M: f64 = 2.0;
+        let t = planar.translation.vector;
+        let patch = self.patch_at(t.x, t.y, RADIUS_M)?;
+        Some(lift_onto(planar, &patch, stance))
+    }
+}
+
+/// The pose in space of a planar pose over a ground patch.
+fn lift_onto(planar: &Pose2, patch: &GroundPatch, stance: &Stance) -> Pose3 {
+    let t = planar.translation.vector;
+    let heading = planar.rotation.angle();
+    let up = patch.normal;
+    let forward = Vector3::new(heading.cos(), heading.sin(), 0.0);
+    let left = up.cross(&forward).normalize();
+    let rotation =
+        Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[left.cross(&up), left, up]));
+    let map_from_road = UnitQuaternion::from_rotation_matrix(&rotation);
+    // The road plane passes through the patch; the sensor hangs `height_m` along its normal over it.
+    let height_m = patch.height_m + stance.height_m / up.z;
+    Pose3::from_parts(
+        Translation3::new(t.x, t.y, height_m),
+        map_from_road * UnitQuaternion::from_euler_angles(stance.roll_rad, stance.pitch_rad, 0.0),
+    )
+}
+
+/// Adds the height of a triangle to the cells whose centre it covers, and of its corners to theirs.
+fn rasterize(grid: &Grid2, corners: [Vec3; 3], sums: &mut [(f64, f64)]) {
+    let [a, b, c] = corners.map(|corner| Vector3::new(corner.x, corner.y, corner.z).cast::<f64>());
+    for corner in [a, b, c] {
+        if let Some(index) = grid.index_at(corner.x, corner.y) {
+            sums[index].0 += corner.z;
+            sums[index].1 += 1.0;
+        }
+    }
+    let (ab, ac) = (b - a, c - a);
+    let area = ab.x * ac.y - ab.y * ac.x;
+    let lowest = |axis: usize| a[axis].min(b[axis]).min(c[axis]);
+    let highest = |axis: usize| a[axis].max(b[axis]).max(c[axis]);
+    let first = grid.cell_at(lowest(0).max(grid.origin.x), lowest(1).max(grid.origin.y));
+    let (Some((first_column, first_row)), true) = (first, area.abs() > 1e-12) else {
+        return;
+    };
+    let last = |highest_m: f64, origin_m: f64, cells: usize| {
+        (((highest_m - origin_m) / grid.cell_m) as usize).min(cells - 1)
+    };
+    for row in first_row..=last(highest(1), grid.origin.y, grid.rows) {
+        for column in first_column..=last(highest(0), grid.origin.x, grid.columns) {
+            let center = grid.center(column, row);
+            let (x, y) = (center.x - a.x, center.y - a.y);
+            let u = (x * ac.y - y * ac.x) / area;
+            let v = (ab.x * y - ab.y * x) / area;
+            if u >= 0.0 && v >= 0.0 && u + v <= 1.0 {
+                let index = row * grid.columns + column;
+                sums[index].0 += a.z + u * ab.z + v * ac.z;
+                sums[index].1 += 1.0;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+    use nalgebra::Vector2;
+
+    use super::*;
+    use crate::geometry::planar;
+
+    /// A square of 40 m that climbs along x.
+    fn slope(grade: f32) -> TriangleMesh {
+        let at = |x: f32, y: f32| Vec3::new(x, y, grade * x);
+        TriangleMesh {
+            vertices: vec![
+                at(-20.0, -20.0),
+                at(20.0, -20.0),
+                at(20.0, 20.0),
+                at(-20.0, 20.0),
+            ],
+            triangles: vec![[0, 1, 2], [0, 2, 3]],
+            ..TriangleMesh::default()
+        }
+    }
+
+    #[test]
+    fn a_patch_of_a_slope_has_its_height_and_its_normal() {
+        let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
+        let patch = ground.patch_at(3.0, -2.0, 2.0).unwrap();
+        assert_relative_eq!(patch.height_m, 0.3, epsilon = 1e-3);
+        let expected = Vector3::new(-0.1, 0.0, 1.0).normalize();
+        assert_relative_eq!(patch.normal, expected, epsilon = 1e-3);
+    }
+
+    #[test]
+    fn beside_the_map_there_is_no_ground() {
+        let ground = GroundMap::from_mesh(&slope(0.0), |_| true, 0.5);
+        assert_eq!(ground.patch_at(25.0, 0.0, 2.0), None);
+        let nothing = GroundMap::from_mesh(&TriangleMesh::default(), |_| true, 0.5);
+        assert_eq!(nothing.patch_at(0.0, 0.0, 2.0), None);
+    }
+
+    #[test]
+    fn on_level_ground_the_lifted_pose_is_the_stance_at_the_planar_pose() {
+        let ground = GroundMap::flat(Point2::new(-10.0, -10.0), Point2::new(10.0, 10.0), -1.73);
+        let pose = Pose2::new(Vector2::new(1.0, 2.0), 2.5);
+        let lifted = ground.lift(&pose, &Stance::default()).unwrap();
+        assert_relative_eq!(planar(&lifted), pose, epsilon = 1e-9);
+        assert_relative_eq!(lifted.translation.z, 0.0, epsilon = 1e-6);
+    }
+
+    #[test]
+    fn uphill_the_nose_points_up_and_downhill_down() {
+        let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
+        for (heading, sign) in [(0.0, 1.0), (std::f64::consts::PI, -1.0)] {
+            let pose = Pose2::new(Vector2::new(0.0, 0.0), heading);
+            let lifted = ground.lift(&pose, &Stance::default()).unwrap();
+            let nose = lifted.rotation * Vector3::x();
+            assert_relative_eq!(nose.z, sign * 0.1_f64.atan().sin(), epsilon = 1e-3);
+        }
+    }
+
+    #[test]
+    fn a_stance_from_the_plane_that_it_makes_is_itself() {
+        let stance = Stance {
+            height_m: 1.7,
+            roll_rad: 0.03,
+            pitch_rad: -0.02,
+        };
+        let up = stance.road_from_lidar().rotation.inverse() * Vector3::z();
+        let up = Vec3::new(up.x as f32, up.y as f32, up.z as f32);
+        let back = Stance::from_plane(up, 1.7);
+        assert_relative_eq!(back.roll_rad, stance.roll_rad, epsilon = 1e-6);
+        assert_relative_eq!(back.pitch_rad, stance.pitch_rad, epsilon = 1e-6);
+    }
+}

@@ -1,0 +1,1 @@
+//! Pictures: paths, errors, particles on the map, range images.

@@ -1,0 +1,1 @@
+//! A trajectory polished: a particle swarm over every pose, then smoothing.

@@ -1,0 +1,127 @@
+//! The map as the sensor would see it from any pose.
+//!
+//! Two ways to ask: range images at pixel centres (for pictures), and arbitrary beams (for
+//! weights): an observation is compared along the very directions that were measured.
+
+use crate::geometry::{Pose3, Vec3};
+use crate::lidar::{Beam, LidarModel};
+
+/// Shows the map from many poses at once. Ranges are infinite where there is no surface.
+pub trait RangeRenderer: Send + Sync {
+    /// What renders, for reports: backend and device.
+    fn name(&self) -> String;
+
+    /// Ranges along the centre rays of all pixels, row-major, one image per pose [m].
+    /// Ranges outside the limits of the model are infinite.
+    fn render(
+        &self,
+        map_from_lidar: &[Pose3],
+        model: &LidarModel,
+    ) -> Result<Vec<Vec<f32>>, RenderError>;
+
+    /// Ranges along unit directions of the lidar frame, one row per pose [m].
+    fn cast(
+        &self,
+        map_from_lidar: &[Pose3],
+        directions: &[Vec3],
+    ) -> Result<Vec<Vec<f32>>, RenderError>;
+
+    /// Mean [`RangeDifference::cost`] of the beams, one number per pose [m]; nothing is kept
+    /// per beam.
+    fn compare(
+        &self,
+        map_from_lidar: &[Pose3],
+        beams: &[Beam],
+        difference: &RangeDifference,
+    ) -> Result<Vec<f32>, RenderError>;
+}
+
+/// How much a rendered range that is not the measured one costs: |difference| up to a limit.
+///
+/// ```text
+/// cost = min(rendered − measured, short_m)       something stands in front of the map
+///        min(measured − rendered, long_m)        the beam went through the map
+///        min(measured, no_surface_m)             the map has nothing there
+/// ```
+///
+/// With infinite limits this is |measured − rendered| with 0 for "nothing there", as in
+/// range-mcl (Chen et al., ICRA 2021).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RangeDifference {
+    /// Limit for returns nearer than the map [m].
+    pub short_m: f32,
+    /// Limit for returns behind a surface of the map [m].
+    pub long_m: f32,
+    /// Limit where the map has no surface [m].
+    pub no_surface_m: f32,
+}
+
+impl RangeDifference {
+    /// No limits: the comparison of range-mcl.
+    pub const UNLIMITED: Self = Self {
+        short_m: f32::INFINITY,
+        long_m: f32::INFINITY,
+        no_surface_m: f32::INFINITY,
+    };
+
+    /// |difference| truncated at `limit_m`, whatever its reason.
+    pub const fn truncated(limit_m: f32) -> Self {
+        Self {
+            short_m: limit_m,
+            long_m: limit_m,
+            no_surface_m: limit_m,
+        }
+    }
+
+    /// The cost of one beam [m]; `rendered_m` is infinite where there is no surface.
+    #[inline]
+    pub fn cost(&self, measured_m: f32, rendered_m: f32) -> f32 {
+        if rendered_m == f32::INFINITY {
+            measured_m.min(self.no_surface_m)
+        } else if rendered_m >= measured_m {
+            (rendered_m - measured_m).min(self.short_m)
+        } else {
+            (measured_m - rendered_m).min(self.long_m)
+        }
+    }
+}
+
+/// Why nothing was rendered.
+#[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages say it")]
+pub enum RenderError {
+    #[error("there is no graphics adapter; use --backend cpu")]
+    NoAdapter,
+    #[error("the graphics device was lost ({reason}); run again, or use --backend cpu")]
+    DeviceLost { reason: String },
+    #[error(
+        "the map needs {needed} bytes on the graphics device, which binds at most {limit}; use --backend cpu"
+    )]
+    MapTooLarge { needed: u64, limit: u64 },
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn without_limits_the_cost_is_the_absolute_difference() {
+        let difference = RangeDifference::UNLIMITED;
+        assert_eq!(difference.cost(10.0, 13.0), 3.0);
+        assert_eq!(difference.cost(13.0, 10.0), 3.0);
+        assert_eq!(difference.cost(13.0, f32::INFINITY), 13.0);
+    }
+
+    #[test]
+    fn each_limit_holds_for_its_own_case() {
+        let difference = RangeDifference {
+            short_m: 1.0,
+            long_m: 2.0,
+            no_surface_m: 3.0,
+        };
+        assert_eq!(difference.cost(10.0, 15.0), 1.0);
+        assert_eq!(difference.cost(15.0, 10.0), 2.0);
+        assert_eq!(difference.cost(15.0, f32::INFINITY), 3.0);
+        assert_eq!(difference.cost(10.0, 10.5), 0.5);
+    }
+}

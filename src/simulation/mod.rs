@@ -1,0 +1,1 @@
+//! A street with a known answer: a procedural world, a drive through it, its scans.
