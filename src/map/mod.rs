@@ -1,5 +1,7 @@
 //! The map: built from scans, kept as a mesh, cut into tiles.
 
 pub mod elevation;
+pub mod ply;
 
 pub use elevation::{GroundMap, GroundPatch, Stance};
+pub use ply::PlyError;
