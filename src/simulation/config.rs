@@ -87,7 +87,10 @@ impl SimulationConfig {
         let ground = &self.street.ground;
         let positive = [
             ("street.lane_width_m", self.street.lane_width_m),
-            ("street.side_street_spacing_m", self.street.side_street_spacing_m),
+            (
+                "street.side_street_spacing_m",
+                self.street.side_street_spacing_m,
+            ),
             ("street.lamp_spacing_m", self.street.lamp_spacing_m),
             ("street.plants_per_100_m", self.street.plants_per_100_m),
             ("street.ground.cell_m", ground.cell_m),
@@ -109,9 +112,18 @@ impl SimulationConfig {
         let not_negative = [
             ("scanner.range_noise_m", scanner.range_noise_m),
             ("scanner.min_range_m", scanner.min_range_m),
-            ("traffic.oncoming_spacing_m", self.traffic.oncoming_spacing_m),
-            ("traffic.oncoming_speed_m_s", self.traffic.oncoming_speed_m_s),
-            ("traffic.cyclists_per_100_m", self.traffic.cyclists_per_100_m),
+            (
+                "traffic.oncoming_spacing_m",
+                self.traffic.oncoming_spacing_m,
+            ),
+            (
+                "traffic.oncoming_speed_m_s",
+                self.traffic.oncoming_speed_m_s,
+            ),
+            (
+                "traffic.cyclists_per_100_m",
+                self.traffic.cyclists_per_100_m,
+            ),
             (
                 "traffic.pedestrians_per_100_m",
                 self.traffic.pedestrians_per_100_m,
@@ -126,7 +138,10 @@ impl SimulationConfig {
         if let Some(bad) = shares.iter().find(|(_, v)| !(0.0..=1.0).contains(v)) {
             return refuse(bad, "a share from 0 to 1");
         }
-        if let Some(bad) = not_negative.iter().find(|(_, v)| !(*v >= 0.0 && v.is_finite())) {
+        if let Some(bad) = not_negative
+            .iter()
+            .find(|(_, v)| !(*v >= 0.0 && v.is_finite()))
+        {
             return refuse(bad, "0 or greater");
         }
         if scanner.min_range_m >= scanner.max_range_m {

@@ -154,9 +154,7 @@ fn standing_on(ground: &Ground, position: DVec2, forward: DVec2) -> Pose3 {
     let climb = (fl + fr - rl - rr) / (4.0 * HALF_WHEELBASE_M);
     let bank = (fl + rl - fr - rr) / (4.0 * HALF_TRACK_M);
     let along = Vector3::new(forward.x, forward.y, climb).normalize();
-    let up = along
-        .cross(&Vector3::new(left.x, left.y, bank))
-        .normalize();
+    let up = along.cross(&Vector3::new(left.x, left.y, bank)).normalize();
     let axes = Matrix3::from_columns(&[along, up.cross(&along), up]);
     Pose3::from_parts(
         Translation3::new(position.x, position.y, 0.25 * (fl + fr + rl + rr)),

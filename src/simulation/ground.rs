@@ -168,7 +168,10 @@ impl Ground {
         let (columns, rows) = self.cells();
         let (column, u) = along(position.x, self.grid.origin.x, columns);
         let (row, v) = along(position.y, self.grid.origin.y, rows);
-        let lower = self.node(column, row).1.lerp(self.node(column + 1, row).1, u);
+        let lower = self
+            .node(column, row)
+            .1
+            .lerp(self.node(column + 1, row).1, u);
         let upper = self
             .node(column, row + 1)
             .1
@@ -329,7 +332,8 @@ fn for_nodes_within(grid: &Grid2, min: DVec2, max: DVec2, mut visit: impl FnMut(
     let cell = |value: f64, origin: f64, cells: usize| {
         (((value - origin) / grid.cell_m).max(0.0) as usize).min(cells - 1)
     };
-    let columns = cell(min.x, grid.origin.x, grid.columns)..=cell(max.x, grid.origin.x, grid.columns);
+    let columns =
+        cell(min.x, grid.origin.x, grid.columns)..=cell(max.x, grid.origin.x, grid.columns);
     for row in cell(min.y, grid.origin.y, grid.rows)..=cell(max.y, grid.origin.y, grid.rows) {
         for column in columns.clone() {
             visit(row * grid.columns + column);

@@ -127,13 +127,12 @@ mod tests {
     use super::*;
 
     fn street() -> Ground {
-        let segments = [(40.0, 0.0), (20.0, 60.0), (40.0, 0.0)].map(|(length_m, turn_deg)| {
-            PathSegment {
+        let segments =
+            [(40.0, 0.0), (20.0, 60.0), (40.0, 0.0)].map(|(length_m, turn_deg)| PathSegment {
                 length_m,
                 turn_deg,
                 grade_percent: 5.0,
-            }
-        });
+            });
         let path = Path::from_segments(&segments, 0.0);
         let road = Paving::Road {
             path: path.clone(),

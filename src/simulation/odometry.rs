@@ -63,8 +63,8 @@ pub fn drifting_odometry(
         let shake = if is_moving { 1.0 } else { 0.0 };
         let drift = Vector3::z() * config.heading_drift_deg_per_m.to_radians() * driven_m;
         let turn = drift + shake * noise(config.turn_noise_deg.to_radians());
-        let translation =
-            step.translation.vector * (1.0 + config.scale_error) + shake * noise(config.step_noise_m);
+        let translation = step.translation.vector * (1.0 + config.scale_error)
+            + shake * noise(config.step_noise_m);
         let rotation = UnitQuaternion::from_scaled_axis(turn) * step.rotation;
         reported.push(previous * Pose3::from_parts(translation.into(), rotation));
     }

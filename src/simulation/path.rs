@@ -211,9 +211,8 @@ impl Path {
             + (t3 - 2.0 * t2 + t) * dp
             + (3.0 * t2 - 2.0 * t3) * q
             + (t3 - t2) * dq;
-        let derivative = 6.0 * (t2 - t) * (p - q)
-            + (3.0 * t2 - 4.0 * t + 1.0) * dp
-            + (3.0 * t2 - 2.0 * t) * dq;
+        let derivative =
+            6.0 * (t2 - t) * (p - q) + (3.0 * t2 - 4.0 * t + 1.0) * dp + (3.0 * t2 - 2.0 * t) * dq;
         let forward = derivative.normalize_or(DVec2::X);
         let height_m = self.heights_m[index] * (1.0 - t) + self.heights_m[index + 1] * t;
         PathPoint {

@@ -234,9 +234,7 @@ impl Scanner {
             let seen_m = self.seen_up_to_m(echo);
             let probability = 1.0 / (1.0 + ((echo.range_m - seen_m) / (0.05 * seen_m)).exp());
             let range_m = echo.range_m + config.range_noise_m as f32 * deviate;
-            if lost < config.dropout_share
-                || returned > probability
-                || !limits_m.contains(&range_m)
+            if lost < config.dropout_share || returned > probability || !limits_m.contains(&range_m)
             {
                 continue;
             }
@@ -283,8 +281,7 @@ fn nearest_echoes(targets: &[&Target], origin: Vec3, rays: &[Vec3]) -> Vec<Optio
         }
         target.scene.cast(origin, rays, &mut hits);
         for ((hit, ray), best) in hits.iter().zip(rays).zip(&mut nearest) {
-            let is_nearer =
-                hit.range_m < best.map_or(f32::INFINITY, |echo: Echo| echo.range_m);
+            let is_nearer = hit.range_m < best.map_or(f32::INFINITY, |echo: Echo| echo.range_m);
             if hit.triangle != Hit::NO_TRIANGLE && is_nearer {
                 let triangle = hit.triangle as usize;
                 let normal = target.mesh.scaled_normal(triangle).normalize_or_zero();

@@ -6,8 +6,8 @@ use rand::RngExt as _;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::buildings::{HouseShape, add_garage, add_house};
 use super::builder::{Builder, Paint, PaintedMesh};
+use super::buildings::{HouseShape, add_garage, add_house};
 use super::classes;
 use super::furniture::{Barrier, add_box, add_bush, add_lamp, add_monument, add_sign, add_tree};
 use super::ground::{Ground, GroundConfig};

@@ -152,7 +152,8 @@ impl Traffic {
             movers.push((Vehicle::Cyclist, track));
         }
         for _ in 0..pedestrians {
-            let speed_m_s = rng.random_range(0.9..1.7) * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
+            let speed_m_s =
+                rng.random_range(0.9..1.7) * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
             let track = Track::Pavement {
                 start_m: rng.random_range(0.0..length_m) - 0.5 * speed_m_s * duration_s,
                 speed_m_s,

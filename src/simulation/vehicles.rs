@@ -209,13 +209,29 @@ fn add_person(builder: &mut Builder, feet: Vec3, height_m: f32, stride: f32) {
         let foot = feet + Vec3::new(0.25 * swing, side, 0.0);
         let hip = feet + Vec3::new(0.0, side, leg_m);
         builder.frustum(
-            [foot - Vec3::splat(0.07) * (Vec3::X + Vec3::Y), foot + Vec3::splat(0.07) * (Vec3::X + Vec3::Y)],
-            [hip - Vec3::splat(0.09) * (Vec3::X + Vec3::Y), hip + Vec3::splat(0.09) * (Vec3::X + Vec3::Y)],
+            [
+                foot - Vec3::splat(0.07) * (Vec3::X + Vec3::Y),
+                foot + Vec3::splat(0.07) * (Vec3::X + Vec3::Y),
+            ],
+            [
+                hip - Vec3::splat(0.09) * (Vec3::X + Vec3::Y),
+                hip + Vec3::splat(0.09) * (Vec3::X + Vec3::Y),
+            ],
         );
     }
     builder.cylinder(feet + Vec3::Z * leg_m, [0.17, 0.22], 0.36 * height_m, 8);
-    builder.cylinder(feet + Vec3::Z * 0.83 * height_m, [0.07, 0.11], 0.1 * height_m, 8);
-    builder.cylinder(feet + Vec3::Z * 0.93 * height_m, [0.11, 0.05], 0.07 * height_m, 8);
+    builder.cylinder(
+        feet + Vec3::Z * 0.83 * height_m,
+        [0.07, 0.11],
+        0.1 * height_m,
+        8,
+    );
+    builder.cylinder(
+        feet + Vec3::Z * 0.93 * height_m,
+        [0.11, 0.05],
+        0.07 * height_m,
+        8,
+    );
 }
 
 fn add_cyclist(builder: &mut Builder, class: u16, stride: f32) {
@@ -227,5 +243,10 @@ fn add_cyclist(builder: &mut Builder, class: u16, stride: f32) {
     builder.cuboid(Vec3::new(-0.5, -0.03, 0.55), Vec3::new(0.5, 0.03, 0.65));
     builder.cuboid(Vec3::new(0.38, -0.28, 0.95), Vec3::new(0.45, 0.28, 1.02));
     builder.paint(class, 0.45);
-    add_person(builder, Vec3::new(-0.1, 0.0, 0.25), 1.55, 0.6 * stride.sin());
+    add_person(
+        builder,
+        Vec3::new(-0.1, 0.0, 0.25),
+        1.55,
+        0.6 * stride.sin(),
+    );
 }
