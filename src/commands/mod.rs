@@ -1,1 +1,2 @@
 //! One file per subcommand; each `run` reads as a paragraph.
+pub mod simulate;
