@@ -5,3 +5,5 @@ pub mod ply;
 
 pub use elevation::{GroundMap, GroundPatch, Stance};
 pub use ply::PlyError;
+pub mod tiles;
+pub use tiles::{TileConfig, TileGrid, TileIndex};
