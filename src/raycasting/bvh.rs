@@ -27,7 +27,7 @@ pub(super) const MAX_DEPTH: usize = HALVE_FROM_DEPTH + 32;
 
 /// A box and what lies in it.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Item {
+pub(crate) struct Item {
     pub bounds: Aabb,
     pub index: u32,
 }
@@ -41,7 +41,7 @@ impl Item {
 
 /// A reference to an inner node or to a leaf.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Child(u32);
+pub(crate) struct Child(u32);
 
 impl Child {
     const LEAF: u32 = 1 << 31;
@@ -79,7 +79,7 @@ impl Child {
 /// Two children and their boxes: one cache line.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
-pub(super) struct Node {
+pub(crate) struct Node {
     /// Of each child: lower corner x, y, z, then upper corner x, y, z.
     pub bounds: [[f32; 6]; 2],
     pub children: [Child; 2],
@@ -89,7 +89,7 @@ pub(super) struct Node {
 
 /// The hierarchy: [`Bvh::root`] leads to everything.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Bvh {
+pub(crate) struct Bvh {
     pub nodes: Vec<Node>,
     /// Which of [`Bvh::order`] are in each leaf.
     pub leaves: Vec<Range<u32>>,

@@ -1,7 +1,7 @@
 //! What a ray meets first: triangles in a bounding volume hierarchy, cast at in packets of rays
 //! that share their origin.
 
-mod bvh;
+pub(crate) mod bvh;
 mod packet;
 
 use glam::{DVec3, Vec3};
@@ -126,7 +126,7 @@ impl Scene {
 }
 
 /// Whether a triangle has finite corners and an area.
-fn is_proper(corners: [Vec3; 3]) -> bool {
+pub(crate) fn is_proper(corners: [Vec3; 3]) -> bool {
     let [a, b, c] = corners.map(|corner| corner.as_dvec3());
     let longest_squared = (b - a)
         .length_squared()
