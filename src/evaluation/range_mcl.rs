@@ -132,32 +132,11 @@ pub struct NoWeight {
 #[cfg(test)]
 mod tests {
     use std::f64::consts::PI;
-    use std::path::{Path, PathBuf};
 
     use approx::assert_relative_eq;
 
     use super::*;
-    use crate::geometry::planar;
-    use crate::kitti::{Calibration, poses::CameraPoses};
-
-    /// Lidar poses of KITTI 07 and the parent's own results there.
-    fn kitti_07() -> Option<(Vec<Pose2>, LocalizationResults)> {
-        let data = std::env::var_os("FPMCL_DATA").map_or_else(
-            || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
-            PathBuf::from,
-        );
-        let poses = data.join("kitti-odometry-poses");
-        let results = data.join("range-mcl/kitti07_demo_loc_results.npz");
-        if !results.exists() || !poses.exists() {
-            eprintln!("not run: {} is absent", results.display());
-            return None;
-        }
-        let calibration = Calibration::read(&poses.join("sequences/07/calib.txt")).unwrap();
-        let truth = CameraPoses::read(&poses.join("poses/07.txt")).unwrap();
-        let truth = truth.map_from_lidar(&calibration);
-        let results = LocalizationResults::read(&results).unwrap();
-        Some((truth.iter().map(planar).collect(), results))
-    }
+    use crate::evaluation::kitti_07::kitti_07;
 
     #[test]
     fn the_parents_run_on_kitti_07_is_judged_as_the_parent_judges_it() {

@@ -184,4 +184,9 @@ pub enum ResultsError {
         found: usize,
         expected: usize,
     },
+    #[error("{} is not a report of fpmcl: {source}; run evaluate again", path.display())]
+    BadReport {
+        path: PathBuf,
+        source: serde_json::Error,
+    },
 }
