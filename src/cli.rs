@@ -1,1 +1,258 @@
-//! The command line as types.
+//! The command line as types; nothing else.
+
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+
+use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
+
+/// Finds a car's pose to the centimetre from one spinning LiDAR and a mesh map that it builds itself.
+#[derive(Clone, Debug, Parser)]
+#[command(name = "fpmcl", version, arg_required_else_help = true, after_help = EXAMPLES)]
+pub struct Cli {
+    /// Say nothing but errors and results.
+    #[arg(short, long, global = true, conflicts_with = "verbose")]
+    pub quiet: bool,
+
+    /// Say more; twice for everything.
+    #[arg(short, long, global = true, action = ArgAction::Count)]
+    pub verbose: u8,
+
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  fpmcl demo                                  all of it on a street that it makes itself
+  fpmcl build-map config/build_map.yml        from a recording to a mesh map
+  fpmcl localize --set numParticles=1000      find the car in it, with one key changed
+  fpmcl refine && fpmcl evaluate              polish the trajectory and measure it";
+
+/// The subcommands, in the order of their use.
+#[derive(Clone, Debug, Subcommand)]
+pub enum Command {
+    /// Turn recorded scans with poses into a triangle-mesh map.
+    #[command(after_help = "\
+Examples:
+  fpmcl build-map config/build_map.yml
+  fpmcl build-map --set mesh_file=results/even.ply --set frame_step=2 --force")]
+    BuildMap(RunArgs),
+
+    /// Find the car in a map, scan by scan.
+    #[command(after_help = "\
+Examples:
+  fpmcl localize config/localization.yml
+  fpmcl localize --set pose_tracking=False --set range_image.width=1024 --seed 7")]
+    Localize(RunArgs),
+
+    /// Polish the trajectory that `localize` found.
+    #[command(after_help = "\
+Examples:
+  fpmcl refine config/refinement.yml
+  fpmcl refine --set result_file=results/localization.npz --backend cpu")]
+    Refine(RunArgs),
+
+    /// Measure a result against the truth.
+    #[command(after_help = "\
+Examples:
+  fpmcl evaluate config/evaluation.yml
+  fpmcl evaluate --set result_file=results/localization.npz")]
+    Evaluate(ConfigArgs),
+
+    /// Make a street with a known answer and drive through it.
+    #[command(after_help = "\
+Examples:
+  fpmcl simulate config/simulation.yml
+  fpmcl simulate --set drive=2 --seed 7")]
+    Simulate(RunArgs),
+
+    /// Simulate, build a map, localize, refine, evaluate: all of it in one command.
+    #[command(after_help = "\
+Examples:
+  fpmcl demo
+  fpmcl demo --output results/small --frames 40")]
+    Demo(DemoArgs),
+
+    /// Show what this machine offers: instruction sets, threads, graphics adapters.
+    Doctor,
+}
+
+/// Where the configuration comes from.
+#[derive(Clone, Debug, Args)]
+pub struct ConfigArgs {
+    /// YAML file; the command's own under config/ if not given.
+    pub config: Option<PathBuf>,
+
+    /// Override one key, such as range_image.width=1024; may be given often.
+    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
+    pub settings: Vec<(String, String)>,
+
+    /// How the work is done.
+    #[command(flatten)]
+    pub machine: MachineArgs,
+}
+
+/// Everything about a run of a stage.
+#[derive(Clone, Debug, Args)]
+pub struct RunArgs {
+    /// Where the configuration comes from.
+    #[command(flatten)]
+    pub source: ConfigArgs,
+
+    /// Same seed, same result; overrides the key `seed`.
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+
+    /// Replace existing output; sets the key `force`.
+    #[arg(long)]
+    pub force: bool,
+}
+
+/// How large the demonstration is and where it goes.
+#[derive(Clone, Debug, Args)]
+pub struct DemoArgs {
+    /// Folder for everything that it makes.
+    #[arg(long, value_name = "FOLDER", default_value = "results/demo")]
+    pub output: PathBuf,
+
+    /// Scans per drive; all of the simulated path if not given.
+    #[arg(long, value_name = "N")]
+    pub frames: Option<NonZeroUsize>,
+
+    /// Same seed, same result.
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+
+    /// How the work is done.
+    #[command(flatten)]
+    pub machine: MachineArgs,
+}
+
+/// What does the work; results do not depend on the number of threads.
+#[derive(Clone, Copy, Debug, Default, Args)]
+pub struct MachineArgs {
+    /// What renders the map.
+    #[arg(long, value_enum, default_value_t)]
+    pub backend: BackendArg,
+
+    /// Threads; as many as there are processors if not given.
+    #[arg(long, value_name = "N")]
+    pub threads: Option<NonZeroUsize>,
+}
+
+/// What renders the map.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum BackendArg {
+    /// A graphics card if there is one, else the processor.
+    #[default]
+    Auto,
+    /// The processor.
+    Cpu,
+    /// A graphics adapter; an error without one.
+    Gpu,
+}
+
+/// How much is said on standard error.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verbosity {
+    /// Errors only.
+    Quiet,
+    /// What happens.
+    Normal,
+    /// Details, for those who look into something.
+    Verbose,
+    /// Everything.
+    Everything,
+}
+
+impl Cli {
+    /// How much is said on standard error.
+    pub fn verbosity(&self) -> Verbosity {
+        match (self.quiet, self.verbose) {
+            (true, _) => Verbosity::Quiet,
+            (false, 0) => Verbosity::Normal,
+            (false, 1) => Verbosity::Verbose,
+            (false, _) => Verbosity::Everything,
+        }
+    }
+}
+
+impl Command {
+    /// What does the work of this command.
+    pub fn machine(&self) -> MachineArgs {
+        match self {
+            Self::BuildMap(args)
+            | Self::Localize(args)
+            | Self::Refine(args)
+            | Self::Simulate(args) => args.source.machine,
+            Self::Evaluate(args) => args.machine,
+            Self::Demo(args) => args.machine,
+            Self::Doctor => MachineArgs::default(),
+        }
+    }
+}
+
+impl RunArgs {
+    /// All overrides of keys, those with a flag of their own last.
+    pub fn settings(&self) -> Vec<(String, String)> {
+        let seed = self.seed.map(|seed| ("seed".to_owned(), seed.to_string()));
+        let force = self.force.then(|| ("force".to_owned(), "true".to_owned()));
+        self.source
+            .settings
+            .iter()
+            .cloned()
+            .chain(seed)
+            .chain(force)
+            .collect()
+    }
+}
+
+/// Splits `key=value` at the first `=`.
+fn setting(text: &str) -> Result<(String, String), &'static str> {
+    match text.split_once('=') {
+        Some((key, value)) if !key.trim().is_empty() => {
+            Ok((key.trim().to_owned(), value.to_owned()))
+        }
+        _ => Err("write it as key=value, such as range_image.width=1024"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+
+    fn run_args(arguments: &[&str]) -> RunArgs {
+        let all = ["fpmcl", "localize"].iter().chain(arguments);
+        match Cli::try_parse_from(all).unwrap().command {
+            Command::Localize(args) => args,
+            other => unreachable!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn the_definition_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn flags_override_the_same_keys_given_with_set() {
+        let args = run_args(&["own.yml", "--seed", "7", "--set", "seed=3", "--force"]);
+        let settings = args.settings();
+        let pairs: Vec<(&str, &str)> = settings
+            .iter()
+            .map(|(key, value)| (key.as_str(), value.as_str()))
+            .collect();
+        assert_eq!(pairs, [("seed", "3"), ("seed", "7"), ("force", "true")]);
+    }
+
+    #[test]
+    fn a_setting_is_split_at_its_first_equals_sign() {
+        assert_eq!(setting("a.b=c=d"), Ok(("a.b".into(), "c=d".into())));
+        assert_eq!(setting("a="), Ok(("a".into(), String::new())));
+        assert!(setting("a").is_err());
+        assert!(setting("=a").is_err());
+    }
+}

@@ -1,1 +1,167 @@
 //! One file per subcommand; each `run` reads as a paragraph.
+
+// The subcommands.
+mod doctor;
+pub mod simulate;
+// What they share.
+pub mod interrupt;
+mod logging;
+pub mod output;
+pub mod progress;
+
+use std::io::Write as _;
+use std::path::Path;
+use std::process::ExitCode;
+
+use anyhow::{Context as _, bail};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::cli::{BackendArg, Command, ConfigArgs, MachineArgs, RunArgs, Verbosity};
+use crate::config::{
+    self, BuildMapConfig, Check, ConfigError, EvaluationConfig, LocalizationConfig,
+    RefinementConfig,
+};
+use interrupt::{Interrupt, Interrupted};
+use progress::Progress;
+
+/// What every command is given beside its configuration.
+#[derive(Clone, Debug)]
+pub struct Context {
+    /// Threads that share the work.
+    pub threads: usize,
+    /// What renders the map.
+    pub backend: BackendArg,
+    /// How much is said on standard error.
+    pub verbosity: Verbosity,
+    /// Whether the user wants to stop.
+    pub interrupt: Interrupt,
+    /// How far the work has come, for the user to see.
+    pub progress: Progress,
+}
+
+impl Context {
+    /// Starts logging, the threads and the handling of Ctrl-C; once per process.
+    pub fn new(verbosity: Verbosity, machine: MachineArgs) -> anyhow::Result<Self> {
+        let progress = Progress::new(verbosity);
+        logging::start(verbosity, &progress);
+        let threads = machine.threads.map_or(0, usize::from);
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build_global()
+            .context("starting the threads; choose fewer with --threads")?;
+        Ok(Self {
+            threads: rayon::current_num_threads(),
+            backend: machine.backend,
+            verbosity,
+            interrupt: Interrupt::install().context("listening for Ctrl-C")?,
+            progress,
+        })
+    }
+}
+
+/// Runs a command.
+pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
+    match command {
+        Command::BuildMap(args) => {
+            let _: BuildMapConfig = load_run(args, "config/build_map.yml")?;
+            bail!("this version cannot build maps yet")
+        }
+        Command::Localize(args) => {
+            let _: LocalizationConfig = load_run(args, "config/localization.yml")?;
+            bail!("this version cannot localize yet")
+        }
+        Command::Refine(args) => {
+            let _: RefinementConfig = load_run(args, "config/refinement.yml")?;
+            bail!("this version cannot refine yet")
+        }
+        Command::Evaluate(args) => {
+            let _: EvaluationConfig = load(args, "config/evaluation.yml", &args.settings)?;
+            bail!("this version cannot evaluate yet")
+        }
+        Command::Simulate(_) => bail!("this version cannot simulate yet"),
+        Command::Demo(_) => bail!("this version has no demonstration yet"),
+        Command::Doctor => doctor::run(context),
+    }
+}
+
+/// Tells an error once, on standard error: what failed, then each cause that says more.
+pub fn report(error: &anyhow::Error) {
+    // Standard error may be closed; there is nowhere else to say so.
+    let _ = std::io::stderr().write_all(told(error).as_bytes());
+}
+
+/// 130 for an interrupted run, as shells have it, else 1; 2 is wrong usage.
+pub fn exit_code(error: &anyhow::Error) -> ExitCode {
+    ExitCode::from(if error.is::<Interrupted>() { 130 } else { 1 })
+}
+
+/// Loads the configuration of a stage, with `--seed` and `--force`.
+fn load_run<T>(args: &RunArgs, default_path: &str) -> Result<T, ConfigError>
+where
+    T: Check + Serialize + DeserializeOwned,
+{
+    load(&args.source, default_path, &args.settings())
+}
+
+fn load<T>(
+    args: &ConfigArgs,
+    default_path: &str,
+    settings: &[(String, String)],
+) -> Result<T, ConfigError>
+where
+    T: Check + Serialize + DeserializeOwned,
+{
+    config::load(args.config.as_deref(), Path::new(default_path), settings)
+}
+
+/// The chain of an error without what was said already.
+fn told(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain() {
+        let cause = cause.to_string();
+        if text.contains(&cause) {
+            continue;
+        }
+        text.push_str(if text.is_empty() {
+            "error: "
+        } else {
+            "  because: "
+        });
+        text.push_str(&cause);
+        text.push('\n');
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kitti::KittiError;
+
+    #[test]
+    fn a_cause_is_told_once() {
+        let source = std::io::Error::new(std::io::ErrorKind::NotFound, "no such file");
+        let error = anyhow::Error::new(KittiError::Read {
+            path: "poses.txt".into(),
+            source,
+        })
+        .context("while building the map");
+        assert_eq!(
+            told(&error),
+            "error: while building the map\n  because: cannot read poses.txt: no such file\n"
+        );
+    }
+
+    #[test]
+    fn an_interrupted_run_has_an_exit_code_of_its_own() {
+        let interrupted = anyhow::Error::new(Interrupted {
+            kept: "12 scans are in results/map.ply".to_owned(),
+        });
+        assert_eq!(
+            exit_code(&interrupted.context("while building the map")),
+            ExitCode::from(130)
+        );
+        assert_eq!(exit_code(&anyhow::anyhow!("else")), ExitCode::from(1));
+    }
+}

@@ -8,6 +8,7 @@ pub mod angle;
 pub mod cloud;
 pub mod grid;
 pub mod mesh;
+pub mod plane;
 pub mod pose;
 pub mod trajectory;
 
@@ -15,6 +16,7 @@ pub use angle::{circular_mean, wrap_angle};
 pub use cloud::PointCloud;
 pub use grid::Grid2;
 pub use mesh::{Aabb, TriangleMesh};
+pub use plane::{PlaneFit, PlaneSums};
 pub use pose::{Pose2, Pose3, Rigid3f, planar, spatial, yaw};
 pub use trajectory::{StampedPose, Trajectory};
 

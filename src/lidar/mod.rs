@@ -1,9 +1,11 @@
 //! The sensor: which pixel a direction falls into, scans, range images and their normals.
 
 pub mod model;
+pub mod normals;
 pub mod range_image;
 pub mod scan;
 
 pub use model::{LidarModel, Pixel};
+pub use normals::{NormalConfig, normals};
 pub use range_image::{NO_RETURN, RangeImage};
 pub use scan::{Beam, Scan};

@@ -1,7 +1,14 @@
 //! The map: built from scans, kept as a mesh, cut into tiles.
 
 pub mod elevation;
+pub mod plan;
+pub mod ply;
+pub mod quality;
+pub mod scan_cloud;
 pub mod tiles;
+pub mod visibility;
 
 pub use elevation::{GroundMap, GroundPatch, Stance};
+pub use ply::PlyError;
+pub use quality::MapQuality;
 pub use tiles::{TileConfig, TileGrid, TileIndex};

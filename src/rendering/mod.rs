@@ -3,6 +3,10 @@
 //! Two ways to ask: range images at pixel centres (for pictures), and arbitrary beams (for
 //! weights): an observation is compared along the very directions that were measured.
 
+pub mod backend;
+#[cfg(feature = "gpu")]
+pub mod gpu;
+
 use crate::geometry::{Pose3, Vec3};
 use crate::lidar::{Beam, LidarModel};
 
@@ -94,6 +98,8 @@ pub enum RenderError {
     NoAdapter,
     #[error("the graphics device was lost ({reason}); run again, or use --backend cpu")]
     DeviceLost { reason: String },
+    #[error("the graphics device refused the work ({reason}); use --backend cpu")]
+    DeviceRefused { reason: String },
     #[error(
         "the map needs {needed} bytes on the graphics device, which binds at most {limit}; use --backend cpu"
     )]

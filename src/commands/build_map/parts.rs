@@ -1,0 +1,153 @@
+//! Finished local maps on disk, so that an interrupted build goes on where it was.
+//!
+//! Beside the map lies, while it is being built, the folder `<map>.parts`: per local map a mesh and
+//! its counts, and `inputs.txt`, which says what they were made from. Parts of other inputs are
+//! thrown away. A part counts as finished once its counts are there, which are written last.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context as _, Result};
+
+use crate::geometry::TriangleMesh;
+use crate::map::{LocalMapCounts, ply};
+
+/// The folder of finished local maps of one build.
+pub struct Parts {
+    folder: PathBuf,
+}
+
+impl Parts {
+    /// Opens the folder beside `mesh_file`; keeps what is in it if it was made from the same inputs.
+    pub fn open(mesh_file: &Path, inputs: &str) -> Result<Self> {
+        let mut name = mesh_file.file_name().unwrap_or_default().to_owned();
+        name.push(".parts");
+        let folder = mesh_file.with_file_name(name);
+        let inputs_file = folder.join("inputs.txt");
+        let same = fs::read_to_string(&inputs_file).is_ok_and(|found| found == inputs);
+        if !same {
+            if folder.exists() {
+                fs::remove_dir_all(&folder)
+                    .with_context(|| format!("cannot remove {}", folder.display()))?;
+            }
+            fs::create_dir_all(&folder)
+                .with_context(|| format!("cannot create {}", folder.display()))?;
+            write_whole(&inputs_file, inputs.as_bytes())?;
+        }
+        Ok(Self { folder })
+    }
+
+    /// Where the parts lie.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// The counts of a local map if it is finished.
+    pub fn finished(&self, number: usize) -> Option<LocalMapCounts> {
+        let text = fs::read_to_string(self.counts_file(number)).ok()?;
+        serde_json::from_str(&text).ok()
+    }
+
+    /// Keeps a finished local map.
+    pub fn save(&self, number: usize, mesh: &TriangleMesh, counts: &LocalMapCounts) -> Result<()> {
+        if !mesh.triangles.is_empty() {
+            let temporary = self.folder.join("unfinished.ply");
+            ply::write(&temporary, mesh)?;
+            fs::rename(&temporary, self.mesh_file(number))
+                .with_context(|| format!("cannot rename {}", temporary.display()))?;
+        }
+        write_whole(
+            &self.counts_file(number),
+            serde_json::to_string_pretty(counts)?.as_bytes(),
+        )
+    }
+
+    /// All local maps 0..count as one mesh.
+    pub fn join(&self, count: usize) -> Result<TriangleMesh> {
+        let mut whole = TriangleMesh::default();
+        for number in 0..count {
+            let file = self.mesh_file(number);
+            if file.exists() {
+                whole.append(&ply::read(&file)?);
+            }
+        }
+        Ok(whole)
+    }
+
+    /// Removes the folder.
+    pub fn remove(self) -> Result<()> {
+        fs::remove_dir_all(&self.folder)
+            .with_context(|| format!("cannot remove {}", self.folder.display()))
+    }
+
+    fn mesh_file(&self, number: usize) -> PathBuf {
+        self.folder.join(format!("{number:04}.ply"))
+    }
+
+    fn counts_file(&self, number: usize) -> PathBuf {
+        self.folder.join(format!("{number:04}.json"))
+    }
+}
+
+/// Writes a file under a temporary name and renames it, so that it is there whole or not at all.
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
+    let temporary = path.with_extension("unfinished");
+    fs::write(&temporary, bytes)
+        .and_then(|()| fs::rename(&temporary, path))
+        .with_context(|| format!("cannot write {}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+
+    use super::*;
+
+    fn triangle(x: f32) -> TriangleMesh {
+        TriangleMesh {
+            vertices: vec![Vec3::new(x, 0.0, 0.0), Vec3::X, Vec3::Y],
+            normals: vec![Vec3::Z; 3],
+            colors: vec![[255, 0, 0]; 3],
+            triangles: vec![[0, 1, 2]],
+        }
+    }
+
+    #[test]
+    fn finished_parts_are_found_again_and_joined_in_order() {
+        let folder = tempfile::tempdir().unwrap();
+        let map = folder.path().join("map.ply");
+        let counts = LocalMapCounts {
+            scans: 7,
+            ..LocalMapCounts::default()
+        };
+        let parts = Parts::open(&map, "inputs").unwrap();
+        parts.save(1, &triangle(1.5), &counts).unwrap();
+        parts.save(0, &triangle(0.5), &counts).unwrap();
+
+        let again = Parts::open(&map, "inputs").unwrap();
+        assert_eq!(again.finished(1), Some(counts));
+        assert_eq!(again.finished(2), None);
+        let whole = again.join(2).unwrap();
+        assert_eq!(whole.vertices[0].x, 0.5);
+        assert_eq!(whole.vertices[3].x, 1.5);
+    }
+
+    #[test]
+    fn parts_of_other_inputs_are_thrown_away() {
+        let folder = tempfile::tempdir().unwrap();
+        let map = folder.path().join("map.ply");
+        let parts = Parts::open(&map, "inputs").unwrap();
+        parts.save(0, &triangle(0.5), &LocalMapCounts::default()).unwrap();
+        assert_eq!(Parts::open(&map, "others").unwrap().finished(0), None);
+    }
+
+    #[test]
+    fn a_mesh_without_its_counts_is_not_finished() {
+        let folder = tempfile::tempdir().unwrap();
+        let map = folder.path().join("map.ply");
+        let parts = Parts::open(&map, "inputs").unwrap();
+        parts.save(0, &triangle(0.5), &LocalMapCounts::default()).unwrap();
+        fs::remove_file(parts.counts_file(0)).unwrap();
+        assert_eq!(parts.finished(0), None);
+    }
+}

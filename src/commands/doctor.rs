@@ -1,0 +1,72 @@
+//! `doctor`: what this machine offers.
+
+use std::fmt::Write as _;
+use std::thread::available_parallelism;
+
+use super::{Context, output};
+
+/// Prints what this machine offers, line by line.
+pub(super) fn run(context: &Context) -> anyhow::Result<()> {
+    let mut table = String::new();
+    for (what, value) in [
+        ("fpmcl", env!("CARGO_PKG_VERSION").to_owned()),
+        ("system", system()),
+        ("instruction sets", instruction_sets()),
+        ("processors", processors()),
+        ("threads in use", context.threads.to_string()),
+        ("graphics support", graphics_support().to_owned()),
+    ] {
+        writeln!(table, "{what:<18}{value}")?;
+    }
+    output::print(&table)
+}
+
+fn system() -> String {
+    format!("{} on {}", std::env::consts::OS, std::env::consts::ARCH)
+}
+
+fn processors() -> String {
+    available_parallelism().map_or_else(|_| "unknown".to_owned(), |count| count.to_string())
+}
+
+/// The vector instructions that the ray caster can use.
+fn instruction_sets() -> String {
+    let found: Vec<&str> = candidates()
+        .into_iter()
+        .filter_map(|(name, is_there)| is_there.then_some(name))
+        .collect();
+    if found.is_empty() {
+        "none that the ray caster uses".to_owned()
+    } else {
+        found.join(", ")
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+fn candidates() -> Vec<(&'static str, bool)> {
+    vec![
+        ("sse4.2", is_x86_feature_detected!("sse4.2")),
+        ("avx", is_x86_feature_detected!("avx")),
+        ("avx2", is_x86_feature_detected!("avx2")),
+        ("fma", is_x86_feature_detected!("fma")),
+        ("avx512f", is_x86_feature_detected!("avx512f")),
+    ]
+}
+
+#[cfg(target_arch = "aarch64")]
+fn candidates() -> Vec<(&'static str, bool)> {
+    vec![("neon", std::arch::is_aarch64_feature_detected!("neon"))]
+}
+
+#[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+fn candidates() -> Vec<(&'static str, bool)> {
+    Vec::new()
+}
+
+fn graphics_support() -> &'static str {
+    if cfg!(feature = "gpu") {
+        "built in"
+    } else {
+        "not built in; build with the feature gpu"
+    }
+}

@@ -1,0 +1,50 @@
+//! Ctrl-C: the first asks a command to stop where it loses nothing, the second kills it.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Whether the user wants to stop; loops poll it. The default is never requested.
+#[derive(Clone, Debug, Default)]
+pub struct Interrupt {
+    requested: Arc<AtomicBool>,
+}
+
+/// The user stopped the run.
+#[derive(Debug, thiserror::Error)]
+#[error("interrupted; {kept}")]
+pub struct Interrupted {
+    /// What is finished, and where it is.
+    pub kept: String,
+}
+
+impl Interrupt {
+    /// Listens for Ctrl-C; once per process.
+    pub fn install() -> Result<Self, ctrlc::Error> {
+        let interrupt = Self::default();
+        let requested = Arc::clone(&interrupt.requested);
+        ctrlc::set_handler(move || {
+            if requested.swap(true, Ordering::Relaxed) {
+                kill();
+            }
+            tracing::warn!(
+                "interrupted: keeping what is finished; press Ctrl-C again to stop at once"
+            );
+        })?;
+        Ok(interrupt)
+    }
+
+    /// Whether Ctrl-C was pressed.
+    pub fn requested(&self) -> bool {
+        self.requested.load(Ordering::Relaxed)
+    }
+
+    /// As if Ctrl-C had been pressed.
+    pub fn request(&self) {
+        self.requested.store(true, Ordering::Relaxed);
+    }
+}
+
+#[expect(clippy::exit, reason = "the user asked a second time")]
+fn kill() {
+    std::process::exit(130)
+}

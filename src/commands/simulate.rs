@@ -1,0 +1,204 @@
+//! `simulate`: a drive through a procedural street, written in the layout of KITTI.
+//!
+//! A drive becomes
+//!
+//! ```text
+//! drive_1/velodyne/000000.bin ...   points
+//! drive_1/labels/000000.label ...   a SemanticKITTI class per point
+//! drive_1/calib.txt times.txt odometry.txt simulation.yml
+//! drive_1/poses.txt                 written last: where it is, the drive is complete
+//! ```
+//!
+//! Every file is written under a temporary name and renamed. A drive that was interrupted goes on
+//! where it was when it is simulated again with the same configuration.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use anyhow::{Context as _, Result, bail};
+use rayon::prelude::*;
+
+use crate::geometry::Pose3;
+use crate::kitti::poses::{CameraPoses, write_kitti, write_times};
+use crate::kitti::velodyne::{write_labels, write_scan};
+use crate::kitti::{Calibration, KittiError};
+use crate::simulation::{Simulation, SimulationConfig, calibration};
+
+/// What a run did.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SimulationReport {
+    /// The folder of the drive.
+    pub folder: PathBuf,
+    /// Scans of the drive.
+    pub frames: usize,
+    /// Scans that were there already.
+    pub kept: usize,
+    /// Triangles of the street.
+    pub triangles: usize,
+    /// Length of the drive [m].
+    pub driven_m: f64,
+}
+
+/// Simulates a drive. `progress` is told how many scans are done, of how many.
+///
+/// A complete drive with the same configuration is kept as it is; one with another
+/// configuration is an error unless `force`.
+pub fn run(
+    config: &SimulationConfig,
+    force: bool,
+    progress: &(dyn Fn(usize, usize) + Sync),
+) -> Result<SimulationReport> {
+    let simulation = prepare(config)?;
+    let folder = config.drive_folder();
+    let recipe = serde_yaml::to_string(config).context("writing the configuration as YAML")?;
+    let poses = simulation.poses();
+    let report = |kept| SimulationReport {
+        folder: folder.clone(),
+        frames: simulation.frames(),
+        kept,
+        triangles: simulation.street.mesh.triangles.len(),
+        driven_m: length_m(&poses),
+    };
+    match state_of(&folder, &recipe)? {
+        State::Complete if !force => return Ok(report(simulation.frames())),
+        State::Foreign if !force => bail!(
+            "{} holds something else, such as a drive of another configuration; choose another output_folder, or overwrite it with --force",
+            folder.display()
+        ),
+        State::Complete | State::Foreign => clear(&folder)?,
+        State::Empty | State::Interrupted => {}
+    }
+    for name in ["velodyne", "labels"] {
+        let path = folder.join(name);
+        fs::create_dir_all(&path).with_context(|| format!("cannot create {}", path.display()))?;
+    }
+    write_whole(&folder.join("simulation.yml"), |path| {
+        fs::write(path, &recipe).with_context(|| format!("cannot write {}", path.display()))
+    })?;
+    let kept = write_scans(&simulation, &folder, progress)?;
+    write_poses(&simulation, &folder, &poses)?;
+    Ok(report(kept))
+}
+
+/// The street and the drive of a configuration, without writing anything.
+pub fn prepare(config: &SimulationConfig) -> Result<Simulation> {
+    let recorded = match &config.path_pose_file {
+        Some(pose_file) => Some(recorded_path(pose_file, config.path_calib_file.as_deref())?),
+        None => None,
+    };
+    Ok(Simulation::new(config, recorded.as_deref())?)
+}
+
+fn recorded_path(pose_file: &Path, calib_file: Option<&Path>) -> Result<Vec<Pose3>> {
+    let beside = pose_file.with_file_name("calib.txt");
+    let calibration = Calibration::read(calib_file.unwrap_or(&beside))
+        .context("path_pose_file needs its calibration; name it with path_calib_file")?;
+    Ok(CameraPoses::read(pose_file)?.map_from_lidar(&calibration))
+}
+
+/// What lies in the folder of a drive.
+enum State {
+    Empty,
+    /// A part of this very drive.
+    Interrupted,
+    /// All of this very drive.
+    Complete,
+    /// Anything else.
+    Foreign,
+}
+
+fn state_of(folder: &Path, recipe: &str) -> Result<State> {
+    let Ok(mut entries) = fs::read_dir(folder) else {
+        return Ok(State::Empty);
+    };
+    match fs::read_to_string(folder.join("simulation.yml")) {
+        Ok(found) if found == recipe && folder.join("poses.txt").exists() => Ok(State::Complete),
+        Ok(found) if found == recipe => Ok(State::Interrupted),
+        Err(_) if entries.next().is_none() => Ok(State::Empty),
+        _ => Ok(State::Foreign),
+    }
+}
+
+/// Removes what a drive consists of, and nothing else; the mark of completeness first.
+fn clear(folder: &Path) -> Result<()> {
+    let mut paths = vec![folder.join("poses.txt"), folder.join("simulation.yml")];
+    for (name, extension) in [("velodyne", "bin"), ("labels", "label")] {
+        for entry in fs::read_dir(folder.join(name)).into_iter().flatten() {
+            let path = entry?.path();
+            if path.extension().is_some_and(|found| found == extension) {
+                paths.push(path);
+            }
+        }
+    }
+    for path in paths.iter().filter(|path| path.exists()) {
+        fs::remove_file(path).with_context(|| format!("cannot remove {}", path.display()))?;
+    }
+    Ok(())
+}
+
+/// Writes the scans that are missing; returns how many were there.
+fn write_scans(
+    simulation: &Simulation,
+    folder: &Path,
+    progress: &(dyn Fn(usize, usize) + Sync),
+) -> Result<usize> {
+    let done = AtomicUsize::new(0);
+    let kept = AtomicUsize::new(0);
+    (0..simulation.frames())
+        .into_par_iter()
+        .try_for_each(|frame| -> Result<()> {
+            let scan_path = folder.join(format!("velodyne/{frame:06}.bin"));
+            if scan_path.exists() {
+                kept.fetch_add(1, Ordering::Relaxed);
+            } else {
+                let labelled = simulation.scan(frame);
+                // The labels first: where a scan is, its labels are.
+                let label_path = folder.join(format!("labels/{frame:06}.label"));
+                write_whole(&label_path, |path| {
+                    Ok(write_labels(path, &labelled.classes)?)
+                })?;
+                write_whole(&scan_path, |path| Ok(write_scan(path, &labelled.scan)?))?;
+            }
+            progress(
+                done.fetch_add(1, Ordering::Relaxed) + 1,
+                simulation.frames(),
+            );
+            Ok(())
+        })?;
+    Ok(kept.into_inner())
+}
+
+fn write_poses(simulation: &Simulation, folder: &Path, poses: &[Pose3]) -> Result<()> {
+    let calibration = calibration();
+    let origin = Pose3::identity();
+    let kitti = |path: &Path, poses: &[Pose3]| -> Result<(), KittiError> {
+        write_kitti(path, poses, &origin, &calibration)
+    };
+    write_whole(&folder.join("calib.txt"), |path| {
+        Ok(calibration.write(path)?)
+    })?;
+    write_whole(&folder.join("times.txt"), |path| {
+        Ok(write_times(path, &simulation.times_s())?)
+    })?;
+    write_whole(&folder.join("odometry.txt"), |path| {
+        Ok(kitti(path, &simulation.odometry())?)
+    })?;
+    write_whole(&folder.join("poses.txt"), |path| Ok(kitti(path, poses)?))
+}
+
+/// Writes under a temporary name and renames, so that a file is whole or not there.
+fn write_whole(path: &Path, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".part");
+    let part = path.with_file_name(name);
+    write(&part)?;
+    fs::rename(&part, path).with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn length_m(poses: &[Pose3]) -> f64 {
+    poses
+        .windows(2)
+        .map(|pair| (pair[1].translation.vector - pair[0].translation.vector).norm())
+        .sum()
+}

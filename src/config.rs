@@ -1,1 +1,0 @@
-//! What a user configures: one struct per command, composed of the stages' own.

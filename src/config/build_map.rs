@@ -1,0 +1,175 @@
+//! `build-map`: from scans with poses to a triangle mesh.
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use super::check::{
+    Check, Problem, at_least_one, nested, not_negative, path, positive, require, selection, within,
+};
+use crate::kitti::Selection;
+use crate::lidar::LidarModel;
+
+/// The keys of range-mcl's `build_map.yml`, and below them new ones.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct BuildMapConfig {
+    /// Folder of the scans, `NNNNNN.bin`.
+    pub scan_folder: PathBuf,
+    /// Camera poses of the recording.
+    pub pose_file: PathBuf,
+    /// Calibration of the recording, with its line `Tr`.
+    pub calib_file: PathBuf,
+    /// Where the map is written.
+    pub mesh_file: PathBuf,
+    /// How many scans of the recording are looked at; -1 for all.
+    pub n_scans: i64,
+    /// Counted scans in a local map.
+    pub local_map_size: usize,
+    /// Whether the map is drawn from above.
+    pub visualize: bool,
+    /// Depth of the octree of the Poisson reconstruction.
+    pub depth: u32,
+    /// The share of vertices with the least density that is removed, unitless.
+    pub min_density: f64,
+    /// Edge of the voxels that scans are thinned with [m].
+    pub voxel_size: f64,
+    /// Half the crop box ahead and behind [m].
+    pub crop_x: f64,
+    /// Half the crop box to the sides [m].
+    pub crop_y: f64,
+    /// Half the crop box up and down [m].
+    pub crop_z: f64,
+    /// Largest distance of ground from the RANSAC plane [m].
+    pub distance_threshold: f64,
+    /// Points that a RANSAC plane is laid through.
+    pub ransac_n: usize,
+    /// RANSAC planes that are tried.
+    pub num_iterations: usize,
+    /// Edge of the cells that ground vertices are gathered in [m].
+    pub simplify_resolution: f64,
+    /// How often the ground is smoothed.
+    pub number_of_iterations: usize,
+    /// Red, green and blue of the ground, 0 to 1.
+    pub ground_color: [f64; 3],
+    /// Red, green and blue of everything else, 0 to 1.
+    pub rest_color: [f64; 3],
+    /// Size and limits of the range images that normals are computed in.
+    pub range_image: LidarModel,
+
+    /// First frame of the recording.
+    pub start_idx: usize,
+    /// Every how manieth frame is taken.
+    pub frame_step: usize,
+    /// A scan counts if the car moved farther than this since the last that counted [m].
+    pub displacement_threshold_m: f64,
+    /// How ground is told from the rest.
+    pub ground_method: GroundMethod,
+    /// What random choices follow from.
+    pub seed: u64,
+    /// Whether an existing map is replaced.
+    pub force: bool,
+}
+
+/// How ground is told from the rest.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum GroundMethod {
+    /// Fuzzy inference on slope, height variance and curvature.
+    #[default]
+    Fuzzy,
+    /// Normal against the vertical, and height.
+    Pca,
+    /// The plane of range-mcl.
+    Ransac,
+}
+
+impl Default for BuildMapConfig {
+    /// The values of range-mcl.
+    fn default() -> Self {
+        Self {
+            scan_folder: "data/kitti/velodyne".into(),
+            pose_file: "data/kitti/poses.txt".into(),
+            calib_file: "data/kitti/calib.txt".into(),
+            mesh_file: "results/map.ply".into(),
+            n_scans: -1,
+            local_map_size: 100,
+            visualize: false,
+            depth: 9,
+            min_density: 0.1,
+            voxel_size: 0.1,
+            crop_x: 30.0,
+            crop_y: 30.0,
+            crop_z: 5.0,
+            distance_threshold: 0.3,
+            ransac_n: 3,
+            num_iterations: 100,
+            simplify_resolution: 1.0,
+            number_of_iterations: 1,
+            ground_color: [1.0, 0.0, 0.0],
+            rest_color: [0.0, 0.0, 1.0],
+            range_image: LidarModel::default(),
+            start_idx: 0,
+            frame_step: 1,
+            displacement_threshold_m: 0.2,
+            ground_method: GroundMethod::default(),
+            seed: 0,
+            force: false,
+        }
+    }
+}
+
+impl BuildMapConfig {
+    /// The frames that the map is built from.
+    pub fn selection(&self) -> Selection {
+        Selection {
+            start_idx: self.start_idx,
+            n_scans: self.n_scans,
+            frame_step: self.frame_step,
+        }
+    }
+}
+
+impl Check for BuildMapConfig {
+    fn check(&self) -> Result<(), Problem> {
+        path("scan_folder", &self.scan_folder)?;
+        path("pose_file", &self.pose_file)?;
+        path("calib_file", &self.calib_file)?;
+        path("mesh_file", &self.mesh_file)?;
+        selection(self.n_scans, self.frame_step)?;
+        at_least_one("local_map_size", self.local_map_size)?;
+        within("depth", self.depth, 4..=14)?;
+        require(
+            (0.0..1.0).contains(&self.min_density),
+            "min_density",
+            self.min_density,
+            "it is the share of vertices to remove, 0 or greater and less than 1",
+        )?;
+        positive("voxel_size", self.voxel_size)?;
+        positive("crop_x", self.crop_x)?;
+        positive("crop_y", self.crop_y)?;
+        positive("crop_z", self.crop_z)?;
+        positive("distance_threshold", self.distance_threshold)?;
+        require(
+            self.ransac_n >= 3,
+            "ransac_n",
+            self.ransac_n,
+            "a plane needs 3 points or more",
+        )?;
+        at_least_one("num_iterations", self.num_iterations)?;
+        positive("simplify_resolution", self.simplify_resolution)?;
+        color("ground_color", self.ground_color)?;
+        color("rest_color", self.rest_color)?;
+        not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
+        nested("range_image", self.range_image.check())
+    }
+}
+
+fn color(key: &str, rgb: [f64; 3]) -> Result<(), Problem> {
+    require(
+        rgb.iter().all(|share| (0.0..=1.0).contains(share)),
+        key,
+        format_args!("{rgb:?}"),
+        "red, green and blue must lie between 0 and 1",
+    )
+}

@@ -1,0 +1,212 @@
+//! What can be wrong with a configuration, told with its place.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use super::check::Problem;
+use super::outline::Outline;
+
+/// Each names the place, quotes what stands there and says what to do.
+#[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages say it")]
+pub enum ConfigError {
+    #[error("cannot read the configuration {}: {source}; give the path of a YAML file like those under config/", path.display())]
+    Read {
+        path: PathBuf,
+        source: std::io::Error,
+    },
+    #[error("cannot write the configuration {}: {source}", path.display())]
+    Write {
+        path: PathBuf,
+        source: std::io::Error,
+    },
+    #[error("{place}: unknown key `{key}`{}", suggestion(nearest.as_deref()))]
+    UnknownKey {
+        place: Place,
+        key: String,
+        nearest: Option<String>,
+    },
+    #[error("{place}: `{value}` is not a value for {key}: {expected}")]
+    WrongValue {
+        place: Place,
+        key: String,
+        value: String,
+        expected: String,
+    },
+    #[error("{place}: {problem}")]
+    Unusable { place: Place, problem: Problem },
+    #[error("{place}: {source}")]
+    Syntax {
+        place: Place,
+        source: Box<serde_yaml::Error>,
+    },
+    #[error("the configuration cannot be written as YAML: {0}")]
+    Serialize(serde_yaml::SerializeError),
+}
+
+/// Where a value was given.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// In a file, at a line counted from 1 where it is known.
+    File {
+        /// The file.
+        path: PathBuf,
+        /// The line.
+        line: Option<usize>,
+    },
+    /// On the command line.
+    Setting {
+        /// The dotted key.
+        key: String,
+        /// The value as given.
+        value: String,
+    },
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::File { path, line: None } => write!(f, "{}", path.display()),
+            Self::File {
+                path,
+                line: Some(line),
+            } => write!(f, "{}, line {line}", path.display()),
+            Self::Setting { key, value } => write!(f, "--set {key}={value}"),
+        }
+    }
+}
+
+/// The error of a YAML file, with the key and the value that it is about.
+pub(super) fn in_file(path: &Path, text: &str, source: &serde_yaml::Error) -> ConfigError {
+    let location = source.location();
+    let line = location.map(|location| location.line() as usize);
+    let place = Place::File {
+        path: path.to_owned(),
+        line,
+    };
+    let outline = Outline::of(text);
+    let key = line.and_then(|line| outline.key_at(line));
+    let value = location.and_then(|location| quoted(text, location));
+    describe(place, key, value, source)
+}
+
+/// The error of a value on the command line.
+pub(super) fn in_setting(
+    place: Place,
+    key: &str,
+    value: &str,
+    source: &serde_yaml::Error,
+) -> ConfigError {
+    describe(place, Some(key), Some(value), source)
+}
+
+/// A value that was read and cannot be used, at the place where it was given last.
+pub(super) fn unusable(
+    path: &Path,
+    text: &str,
+    overrides: &[(String, String)],
+    problem: Problem,
+) -> ConfigError {
+    let setting = overrides.iter().rfind(|(key, _)| *key == problem.key);
+    let place = match setting {
+        Some((key, value)) => Place::Setting {
+            key: key.clone(),
+            value: value.clone(),
+        },
+        None => Place::File {
+            path: path.to_owned(),
+            line: Outline::of(text).line_of(&problem.key),
+        },
+    };
+    ConfigError::Unusable { place, problem }
+}
+
+/// The key that was probably meant: the nearest in spelling, by itself or as the last part of
+/// a dotted key; `None` where nothing is near.
+pub(super) fn nearest<'a>(key: &str, known: impl Iterator<Item = &'a str>) -> Option<String> {
+    let distance = |candidate: &str| {
+        let last = candidate.rsplit('.').next().unwrap_or(candidate);
+        strsim::damerau_levenshtein(key, candidate).min(strsim::damerau_levenshtein(key, last))
+    };
+    let limit = (key.chars().count() / 3).max(2);
+    known
+        .map(|candidate| (distance(candidate), candidate))
+        .min_by_key(|(distance, _)| *distance)
+        .filter(|(distance, _)| *distance <= limit)
+        .map(|(_, candidate)| candidate.to_owned())
+}
+
+fn describe(
+    place: Place,
+    key: Option<&str>,
+    value: Option<&str>,
+    source: &serde_yaml::Error,
+) -> ConfigError {
+    use serde_yaml::Error as Yaml;
+    if let Yaml::SerdeUnknownField {
+        field, expected, ..
+    } = source
+    {
+        return ConfigError::UnknownKey {
+            place,
+            key: field.clone(),
+            nearest: nearest(field, expected.iter().copied()),
+        };
+    }
+    let expected = match source {
+        Yaml::InvalidScalar { ty, .. } => format!("it must be {}", article(ty)),
+        Yaml::SerdeInvalidType { expected, .. }
+        | Yaml::SerdeInvalidValue { expected, .. }
+        | Yaml::SerdeInvalidLength { expected, .. } => format!("it must be {expected}"),
+        Yaml::SerdeUnknownVariant { expected, .. } => {
+            format!("it must be one of {}", expected.join(", "))
+        }
+        Yaml::Unexpected { expected, .. } => format!("it must be {expected}"),
+        _ => String::new(),
+    };
+    match (key, value) {
+        (Some(key), Some(value)) if !expected.is_empty() => ConfigError::WrongValue {
+            place,
+            key: key.to_owned(),
+            value: value.to_owned(),
+            expected,
+        },
+        _ => ConfigError::Syntax {
+            place,
+            source: Box::new(Yaml::Message {
+                msg: source.to_string(),
+                location: serde_yaml::Location::UNKNOWN,
+            }),
+        },
+    }
+}
+
+/// The type names of the parser as a user reads them.
+fn article(ty: &str) -> &str {
+    match ty {
+        "f32" | "f64" | "float" | "floating point" => "a number",
+        "bool" | "boolean" => "True or False",
+        _ if ty.starts_with('u') => "a whole number, not negative",
+        _ if ty.starts_with('i') => "a whole number",
+        _ => ty,
+    }
+}
+
+/// The text at a location, or the rest of its line.
+fn quoted(text: &str, location: serde_yaml::Location) -> Option<&str> {
+    let span = location.span();
+    let start = usize::try_from(span.byte_offset()?).ok()?;
+    let length = usize::try_from(span.byte_len()?).ok()?;
+    let exact = text.get(start..start + length)?.trim();
+    if !exact.is_empty() && !exact.contains('\n') {
+        return Some(exact);
+    }
+    text.get(start..)?.lines().next().map(str::trim)
+}
+
+fn suggestion(nearest: Option<&str>) -> String {
+    match nearest {
+        Some(key) => format!("; did you mean `{key}`?"),
+        None => "; the files under config/ show every key".to_owned(),
+    }
+}

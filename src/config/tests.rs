@@ -1,0 +1,255 @@
+use std::path::PathBuf;
+
+use super::*;
+
+/// Loads a configuration from a text.
+fn load_text<T>(text: &str, settings: &[(&str, &str)]) -> Result<T, ConfigError>
+where
+    T: Check + Serialize + DeserializeOwned,
+{
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("own.yml");
+    fs::write(&path, text).unwrap();
+    let overrides: Vec<(String, String)> = settings
+        .iter()
+        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
+        .collect();
+    load(Some(&path), Path::new("default.yml"), &overrides)
+}
+
+fn message_of(text: &str, settings: &[(&str, &str)]) -> String {
+    load_text::<LocalizationConfig>(text, settings)
+        .unwrap_err()
+        .to_string()
+}
+
+#[track_caller]
+fn assert_says(message: &str, parts: &[&str]) {
+    for part in parts {
+        assert!(message.contains(part), "`{part}` is not in: {message}");
+    }
+}
+
+#[test]
+fn an_empty_file_is_the_default_configuration() {
+    assert_eq!(
+        load_text::<BuildMapConfig>("", &[]).unwrap(),
+        BuildMapConfig::default()
+    );
+    assert_eq!(
+        load_text::<EvaluationConfig>("# nothing but a comment\n", &[]).unwrap(),
+        EvaluationConfig::default()
+    );
+}
+
+#[test]
+fn every_default_configuration_passes_its_own_check() {
+    BuildMapConfig::default().check().unwrap();
+    LocalizationConfig::default().check().unwrap();
+    RefinementConfig::default().check().unwrap();
+    EvaluationConfig::default().check().unwrap();
+}
+
+#[test]
+fn what_is_written_loads_to_an_equal_configuration() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("effective.yml");
+    for name in [
+        "map.ply",
+        "007",
+        "no",
+        "~",
+        "- a: b # c",
+        "it's \"q\"",
+        "a\nb",
+    ] {
+        let config = LocalizationConfig {
+            map_file: PathBuf::from(name),
+            odometry_file: Some(PathBuf::from(name)),
+            odometry: OdometrySource::File,
+            initialization: Some(Initialization::Extent),
+            move_thres: 0.1 + 0.2,
+            seed: u64::MAX,
+            range_image: RenderedRangeImage {
+                fov_up: 0.1,
+                max_range: 1.0e6,
+                ..RenderedRangeImage::default()
+            },
+            ..LocalizationConfig::default()
+        };
+        write(&path, &config).unwrap();
+        let loaded: LocalizationConfig = load(Some(&path), Path::new(""), &[]).unwrap();
+        assert_eq!(loaded, config);
+    }
+}
+
+#[test]
+fn writing_makes_the_folder_and_leaves_nothing_else_in_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a/b/effective.yml");
+    write(&path, &EvaluationConfig::default()).unwrap();
+    assert_eq!(fs::read_dir(path.parent().unwrap()).unwrap().count(), 1);
+}
+
+#[test]
+fn an_unknown_key_is_told_with_its_line_and_the_nearest_key() {
+    let message = message_of("seed: 1\nnumparticles: 100\n", &[]);
+    assert_says(
+        &message,
+        &["own.yml, line 2", "`numparticles`", "`numParticles`"],
+    );
+    let message = message_of("range_image:\n  height: 64\n  widht: 900\n", &[]);
+    assert_says(&message, &["line 3", "`widht`", "did you mean `width`?"]);
+}
+
+#[test]
+fn a_word_where_a_number_belongs_is_told_with_line_key_and_value() {
+    let message = message_of("seed: 1\n\nmove_thres: far\n", &[]);
+    assert_says(
+        &message,
+        &["own.yml, line 3", "move_thres", "`far`", "a number"],
+    );
+    let message = message_of("range_image:\n  # rows\n  height: tall # so\n", &[]);
+    assert_says(
+        &message,
+        &["line 3", "range_image.height", "`tall`", "a whole number"],
+    );
+    let message = message_of("pose_tracking: perhaps\n", &[]);
+    assert_says(&message, &["line 1", "pose_tracking", "True or False"]);
+    let message = message_of("odometry: guess\n", &[]);
+    assert_says(&message, &["line 1", "`guess`", "ground_truth, file, none"]);
+}
+
+#[test]
+fn text_that_is_no_yaml_is_told_with_its_line() {
+    assert_says(&message_of("seed: 1\nmap_file: [\n", &[]), &["own.yml"]);
+    assert_says(&message_of("seed: 1\nseed: 2\n", &[]), &["line 2", "seed"]);
+    assert_says(&message_of("just words\n", &[]), &["own.yml, line 1"]);
+}
+
+#[test]
+fn a_setting_replaces_one_key_and_the_last_one_wins() {
+    let config: LocalizationConfig = load_text(
+        "numParticles: 50\nrange_image:\n  height: 32\n",
+        &[
+            ("range_image.width", "512"),
+            ("range_image.width", "1024"),
+            ("scan_folder", "07"),
+            ("odometry_file", "odometry.txt"),
+            ("odometry", "file"),
+        ],
+    )
+    .unwrap();
+    let expected = LocalizationConfig {
+        num_particles: 50,
+        scan_folder: "07".into(),
+        odometry_file: Some("odometry.txt".into()),
+        odometry: OdometrySource::File,
+        range_image: RenderedRangeImage {
+            height: 32,
+            width: 1024,
+            ..RenderedRangeImage::default()
+        },
+        ..LocalizationConfig::default()
+    };
+    assert_eq!(config, expected);
+}
+
+#[test]
+fn a_setting_may_be_a_list_and_take_a_key_back() {
+    let config: BuildMapConfig =
+        load_text("", &[("ground_color", "[0, 1, 0.5]"), ("seed", "3")]).unwrap();
+    assert_eq!(config.ground_color, [0.0, 1.0, 0.5]);
+    assert_eq!(config.rest_color, [0.0, 0.0, 1.0]);
+    assert_eq!(config.seed, 3);
+    let config: LocalizationConfig =
+        load_text("initialization: extent\n", &[("initialization", "null")]).unwrap();
+    assert_eq!(config.initialization(), Initialization::Tracking);
+}
+
+#[test]
+fn a_setting_that_does_not_fit_is_told_as_it_was_given() {
+    let message = message_of("", &[("range_image.widht", "3")]);
+    assert_says(
+        &message,
+        &["--set range_image.widht=3", "`range_image.width`"],
+    );
+    let message = message_of("", &[("width", "3")]);
+    assert_says(&message, &["did you mean `range_image.width`?"]);
+    let message = message_of("", &[("seed", "many")]);
+    assert_says(&message, &["--set seed=many", "whole number"]);
+    let message = message_of("", &[("range_image", "[1")]);
+    assert_says(&message, &["--set range_image=[1"]);
+    let message = message_of("", &[("seed", "-1")]);
+    assert_says(&message, &["--set seed=-1", "not negative"]);
+}
+
+#[test]
+fn a_contradiction_is_told_with_key_value_and_remedy() {
+    let message = message_of("range_image:\n  min_range: 60\n", &[]);
+    assert_says(
+        &message,
+        &[
+            "line 2",
+            "range_image.min_range is 60",
+            "max_range, which is 50",
+        ],
+    );
+    for (key, value) in [
+        ("range_image.width", "0"),
+        ("range_image.fov_up", "-30"),
+        ("range_image.max_range", ".nan"),
+        ("range_image.max_instance", "0"),
+        ("numParticles", "0"),
+        ("num_reduced", "0"),
+        ("frame_step", "0"),
+        ("n_scans", "0"),
+        ("n_scans", "-2"),
+        ("grid_res", "-1"),
+        ("move_thres", ".inf"),
+        ("odometry", "file"),
+        ("map_file", "''"),
+    ] {
+        let message = message_of("", &[(key, value)]);
+        assert_says(&message, &[&format!("--set {key}={value}: {key} is ")]);
+    }
+    for (key, value) in [
+        ("depth", "3"),
+        ("depth", "15"),
+        ("voxel_size", "-0.1"),
+        ("min_density", "1"),
+        ("crop_x", "0"),
+        ("ransac_n", "2"),
+        ("ground_color", "[2, 0, 0]"),
+    ] {
+        let message = load_text::<BuildMapConfig>("", &[(key, value)])
+            .unwrap_err()
+            .to_string();
+        assert_says(&message, &[&format!("--set {key}={value}: {key} is ")]);
+    }
+    let message = load_text::<EvaluationConfig>("particle_select_ratio: 0\n", &[])
+        .unwrap_err()
+        .to_string();
+    assert_says(&message, &["line 1", "particle_select_ratio is 0"]);
+}
+
+#[test]
+fn a_missing_file_is_named() {
+    let missing: Result<EvaluationConfig, _> = load(None, Path::new("nowhere/own.yml"), &[]);
+    assert_says(&missing.unwrap_err().to_string(), &["nowhere/own.yml"]);
+}
+
+#[test]
+fn the_start_follows_from_pose_tracking_unless_it_is_told() {
+    let start = |text| {
+        load_text::<LocalizationConfig>(text, &[])
+            .unwrap()
+            .initialization()
+    };
+    assert_eq!(start("pose_tracking: True\n"), Initialization::Tracking);
+    assert_eq!(start("pose_tracking: False\n"), Initialization::Corridor);
+    assert_eq!(
+        start("pose_tracking: True\ninitialization: extent\n"),
+        Initialization::Extent
+    );
+}

@@ -1,0 +1,384 @@
+//! Everything that is told of one trajectory, each number with its unit and its definition.
+//!
+//! Frames at the beginning, in which the filter still searches, are left out of all but
+//! convergence. Nothing is aligned.
+
+use serde::{Deserialize, Serialize};
+
+use super::convergence::{Convergence, StrictSuccess};
+use super::planar::{PlanarError, distances_m, planar_errors};
+use super::pose_error::{Pairs, SegmentErrors, kitti_segment_errors, relative_pose_error};
+use super::smoothness::{jitter_m, log_dimensionless_jerk, mean_pose_change};
+use super::statistics::{Summary, mean, rms, slope};
+use crate::geometry::{Pose2, Pose3, spatial};
+
+/// What is measured, and from where on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct MetricsConfig {
+    /// How many frames at the beginning do not count.
+    pub skip_frames: usize,
+    /// What counts as found.
+    pub success: StrictSuccess,
+    /// Which poses the relative pose error compares.
+    pub rpe_pairs: Pairs,
+}
+
+impl Default for MetricsConfig {
+    /// Ten frames to converge; relative errors from frame to frame.
+    fn default() -> Self {
+        Self {
+            skip_frames: 10,
+            success: StrictSuccess::default(),
+            rpe_pairs: Pairs::Frames(1),
+        }
+    }
+}
+
+/// A trajectory to be judged, one entry of each per frame.
+#[derive(Clone, Copy, Debug)]
+pub struct Judged<'a> {
+    /// The estimates.
+    pub estimates: &'a [Pose2],
+    /// The truth.
+    pub ground_truth: &'a [Pose2],
+    /// Times of the frames [s], ascending.
+    pub times_s: Option<&'a [f64]>,
+    /// Time that was spent on each frame [s].
+    pub runtimes_s: Option<&'a [f64]>,
+}
+
+/// Error along and across the true heading [m].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct AxisError {
+    /// Root of the mean square [m].
+    pub rmse_m: f64,
+    /// Mean with its sign [m].
+    pub bias_m: f64,
+}
+
+/// Smoothness of the estimate, and of the truth for comparison.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Smoothness {
+    /// RMS difference of consecutive planar error vectors [m].
+    pub jitter_m: Option<f64>,
+    /// Log dimensionless jerk of the estimate.
+    pub log_jerk: Option<f64>,
+    /// Log dimensionless jerk of the truth.
+    pub log_jerk_of_truth: Option<f64>,
+    /// Mean length of a step of the estimate [m].
+    pub mean_step_m: Option<f64>,
+    /// Mean turn of a step of the estimate [rad].
+    pub mean_turn_rad: Option<f64>,
+    /// Mean length of a step of the truth [m].
+    pub mean_step_of_truth_m: Option<f64>,
+}
+
+/// All that is told of one trajectory.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TrajectoryMetrics {
+    /// Frames that count.
+    pub frames: usize,
+    /// Distance driven in them, by the truth [m].
+    pub distance_m: f64,
+    /// Planar distance to the true position [m]; without alignment this is evo's APE in the plane.
+    pub position_m: Summary,
+    /// RMSE of x in the map frame [m].
+    pub x_rmse_m: f64,
+    /// RMSE of y in the map frame [m].
+    pub y_rmse_m: f64,
+    /// Along the true heading.
+    pub along: AxisError,
+    /// Across the true heading.
+    pub across: AxisError,
+    /// Magnitude of the heading error [rad].
+    pub heading_rad: Summary,
+    /// When the run found the car; absent where it never did.
+    pub convergence: Option<Convergence>,
+    /// How smooth the trajectory is.
+    pub smoothness: Smoothness,
+    /// Slope of the position error against the distance driven [m/m]; absent where the car stands.
+    pub drift: Option<f64>,
+    /// Relative pose error, translation [m].
+    pub rpe_translation_m: Option<Summary>,
+    /// Relative pose error, rotation [rad].
+    pub rpe_rotation_rad: Option<Summary>,
+    /// KITTI's segment errors; absent on a path under 100 m.
+    pub segments: Option<SegmentErrors>,
+    /// Time per frame [s]; absent where it was not measured.
+    pub runtime_s: Option<Summary>,
+    /// Time of the first frame of the run [s].
+    pub first_runtime_s: Option<f64>,
+}
+
+/// Why there are no metrics.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages say it")]
+pub enum MetricsError {
+    #[error(
+        "{frames} frames are too few: the first {skip_frames} (skip_frames) do not count and one is needed after them"
+    )]
+    TooFewFrames { frames: usize, skip_frames: usize },
+    #[error("there are {found} {what} for {frames} frames; they belong to different runs")]
+    LengthMismatch {
+        what: &'static str,
+        found: usize,
+        frames: usize,
+    },
+}
+
+impl TrajectoryMetrics {
+    /// Measures one trajectory.
+    pub fn of(judged: &Judged, config: &MetricsConfig) -> Result<Self, MetricsError> {
+        judged.check(config)?;
+        let whole_errors = planar_errors(judged.estimates, judged.ground_truth);
+        let whole_distances_m = distances_m(judged.ground_truth);
+        let convergence =
+            (config.success).convergence(&whole_errors, &whole_distances_m, judged.times_s);
+
+        let counted = judged.from(config.skip_frames);
+        let errors = &whole_errors[config.skip_frames..];
+        let driven_m = distances_m(counted.ground_truth);
+        let column =
+            |number: fn(&PlanarError) -> f64| -> Vec<f64> { errors.iter().map(number).collect() };
+        let distance = column(PlanarError::distance_m);
+        let turn = column(|error| error.turn_rad);
+        let x = column(|error| error.offset_in_map.x);
+        let y = column(|error| error.offset_in_map.y);
+        let nothing = || MetricsError::TooFewFrames {
+            frames: judged.estimates.len(),
+            skip_frames: config.skip_frames,
+        };
+        let (estimates, truth) = (level(counted.estimates), level(counted.ground_truth));
+        let relative = relative_pose_error(&estimates, &truth, config.rpe_pairs);
+        Ok(Self {
+            frames: errors.len(),
+            distance_m: driven_m.last().copied().unwrap_or(0.0),
+            position_m: Summary::of(&distance).ok_or_else(nothing)?,
+            x_rmse_m: rms(&x).ok_or_else(nothing)?,
+            y_rmse_m: rms(&y).ok_or_else(nothing)?,
+            along: AxisError::of(&column(|error| error.along_m)).ok_or_else(nothing)?,
+            across: AxisError::of(&column(|error| error.across_m)).ok_or_else(nothing)?,
+            heading_rad: Summary::of(&turn).ok_or_else(nothing)?,
+            convergence,
+            smoothness: Smoothness::of(&counted, errors),
+            drift: slope(&driven_m, &distance),
+            rpe_translation_m: relative.translation(),
+            rpe_rotation_rad: relative.rotation(),
+            segments: kitti_segment_errors(&estimates, &truth),
+            runtime_s: counted.runtimes_s.and_then(Summary::of),
+            first_runtime_s: judged.runtimes_s.and_then(|all| all.first().copied()),
+        })
+    }
+}
+
+impl Judged<'_> {
+    fn check(&self, config: &MetricsConfig) -> Result<(), MetricsError> {
+        let frames = self.estimates.len();
+        for (what, found) in [
+            ("true poses", Some(self.ground_truth.len())),
+            ("times", self.times_s.map(<[f64]>::len)),
+            ("runtimes", self.runtimes_s.map(<[f64]>::len)),
+        ] {
+            if let Some(found) = found.filter(|&found| found != frames) {
+                return Err(MetricsError::LengthMismatch {
+                    what,
+                    found,
+                    frames,
+                });
+            }
+        }
+        if frames <= config.skip_frames {
+            return Err(MetricsError::TooFewFrames {
+                frames,
+                skip_frames: config.skip_frames,
+            });
+        }
+        Ok(())
+    }
+
+    fn from(&self, skip: usize) -> Self {
+        Self {
+            estimates: &self.estimates[skip..],
+            ground_truth: &self.ground_truth[skip..],
+            times_s: self.times_s.map(|times| &times[skip..]),
+            runtimes_s: self.runtimes_s.map(|times| &times[skip..]),
+        }
+    }
+}
+
+impl AxisError {
+    fn of(errors_m: &[f64]) -> Option<Self> {
+        Some(Self {
+            rmse_m: rms(errors_m)?,
+            bias_m: mean(errors_m)?,
+        })
+    }
+}
+
+impl Smoothness {
+    fn of(judged: &Judged, errors: &[PlanarError]) -> Self {
+        // Dimensionless jerk does not depend on the unit of time, so frames will do.
+        let numbers: Vec<f64> = (0..errors.len()).map(|frame| frame as f64).collect();
+        let times = judged.times_s.unwrap_or(&numbers);
+        let change = mean_pose_change(judged.estimates);
+        Self {
+            jitter_m: jitter_m(errors),
+            log_jerk: log_dimensionless_jerk(judged.estimates, times),
+            log_jerk_of_truth: log_dimensionless_jerk(judged.ground_truth, times),
+            mean_step_m: change.map(|(step_m, _)| step_m),
+            mean_turn_rad: change.map(|(_, turn_rad)| turn_rad),
+            mean_step_of_truth_m: mean_pose_change(judged.ground_truth).map(|(step_m, _)| step_m),
+        }
+    }
+}
+
+fn level(poses: &[Pose2]) -> Vec<Pose3> {
+    poses.iter().map(|pose| spatial(pose, 0.0)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+    use nalgebra::Vector2;
+
+    use super::*;
+    use crate::evaluation::RangeMclRules;
+    use crate::evaluation::kitti_07::kitti_07;
+
+    fn circle(frames: usize) -> Vec<Pose2> {
+        (0..frames)
+            .map(|k| Pose2::rotation(0.02 * k as f64) * Pose2::translation(50.0, 0.0))
+            .map(|pose| pose * Pose2::rotation(std::f64::consts::FRAC_PI_2))
+            .collect()
+    }
+
+    fn in_the_car(truth: &[Pose2], error: impl Fn(usize) -> Pose2) -> Vec<Pose2> {
+        let pairs = truth.iter().enumerate();
+        pairs.map(|(frame, pose)| pose * error(frame)).collect()
+    }
+
+    fn measure(estimates: &[Pose2], ground_truth: &[Pose2]) -> TrajectoryMetrics {
+        let judged = Judged {
+            estimates,
+            ground_truth,
+            times_s: None,
+            runtimes_s: None,
+        };
+        TrajectoryMetrics::of(&judged, &MetricsConfig::default()).unwrap()
+    }
+
+    #[test]
+    fn the_truth_has_no_error_and_is_found_at_once() {
+        let truth = circle(200);
+        let metrics = measure(&truth, &truth);
+        assert_eq!(metrics.position_m.max, 0.0);
+        assert_eq!(metrics.heading_rad.max, 0.0);
+        assert_eq!(metrics.smoothness.jitter_m, Some(0.0));
+        assert_eq!(
+            metrics.smoothness.log_jerk,
+            metrics.smoothness.log_jerk_of_truth
+        );
+        let found = metrics.convergence.unwrap();
+        assert_eq!((found.row, found.kept), (0, true));
+        assert_relative_eq!(
+            metrics.segments.unwrap().translation_percent,
+            0.0,
+            epsilon = 1e-9
+        );
+    }
+
+    #[test]
+    fn an_error_in_the_axes_of_the_car_is_told_in_them() {
+        let truth = circle(200);
+        let error = Pose2::new(Vector2::new(0.3, -0.4), 0.01);
+        let metrics = measure(&in_the_car(&truth, |_| error), &truth);
+        assert_relative_eq!(metrics.position_m.rmse, 0.5, epsilon = 1e-12);
+        assert_relative_eq!(metrics.along.bias_m, 0.3, epsilon = 1e-12);
+        assert_relative_eq!(metrics.across.bias_m, -0.4, epsilon = 1e-12);
+        assert_relative_eq!(metrics.heading_rad.rmse, 0.01, epsilon = 1e-12);
+        let both = f64::hypot(metrics.x_rmse_m, metrics.y_rmse_m);
+        assert_relative_eq!(both, metrics.position_m.rmse, epsilon = 1e-12);
+    }
+
+    #[test]
+    fn an_error_that_grows_with_the_distance_drifts_by_its_rate() {
+        let truth = circle(200);
+        let driven_m = distances_m(&truth);
+        let estimates = in_the_car(&truth, |frame| {
+            Pose2::translation(0.0, 0.1 + 0.002 * driven_m[frame])
+        });
+        assert_relative_eq!(
+            measure(&estimates, &truth).drift.unwrap(),
+            0.002,
+            epsilon = 1e-9
+        );
+    }
+
+    #[test]
+    fn the_search_at_the_beginning_does_not_count() {
+        let truth = circle(200);
+        let estimates = in_the_car(&truth, |frame| {
+            Pose2::translation(if frame < 10 { 30.0 } else { 0.1 }, 0.0)
+        });
+        let metrics = measure(&estimates, &truth);
+        assert_relative_eq!(metrics.position_m.max, 0.1, epsilon = 1e-12);
+        assert_eq!(metrics.frames, 190);
+        assert_eq!(metrics.convergence.unwrap().row, 10);
+    }
+
+    /// Against an independent script in NumPy, which reads camera poses and knows nothing of ours.
+    #[test]
+    fn on_kitti_07_the_numbers_are_those_of_another_program() {
+        let Some((truth, results)) = kitti_07() else {
+            return;
+        };
+        let estimates = RangeMclRules::default().estimates(&results).unwrap();
+        let judged = Judged {
+            estimates: &estimates,
+            ground_truth: &truth,
+            times_s: None,
+            runtimes_s: None,
+        };
+        let config = MetricsConfig {
+            skip_frames: 20,
+            ..MetricsConfig::default()
+        };
+        let metrics = TrajectoryMetrics::of(&judged, &config).unwrap();
+        let position = metrics.position_m;
+        let heading = metrics.heading_rad;
+        for (ours, theirs, half_digit) in [
+            (position.rmse, 0.3694, 6e-5),
+            (position.mean, 0.3293, 6e-5),
+            (position.p95, 0.6793, 6e-5),
+            (position.max, 0.8621, 6e-5),
+            (heading.rmse.to_degrees(), 2.1095, 6e-5),
+            (heading.max.to_degrees(), 9.214, 6e-4),
+            (metrics.smoothness.jitter_m.unwrap(), 0.0287, 6e-5),
+        ] {
+            assert_relative_eq!(ours, theirs, epsilon = half_digit);
+        }
+        assert_eq!(metrics.frames, 1081);
+    }
+
+    #[test]
+    fn too_few_frames_and_lengths_that_differ_are_said() {
+        let truth = circle(10);
+        let mut judged = Judged {
+            estimates: &truth,
+            ground_truth: &truth,
+            times_s: None,
+            runtimes_s: None,
+        };
+        let config = MetricsConfig::default();
+        let message = TrajectoryMetrics::of(&judged, &config)
+            .unwrap_err()
+            .to_string();
+        assert!(message.contains("10 frames are too few"), "{message}");
+        judged.ground_truth = &truth[1..];
+        let message = TrajectoryMetrics::of(&judged, &config)
+            .unwrap_err()
+            .to_string();
+        assert!(message.contains("9 true poses for 10 frames"), "{message}");
+    }
+}

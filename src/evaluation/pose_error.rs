@@ -1,0 +1,268 @@
+//! Absolute and relative pose error in space, and the segment errors of the KITTI benchmark.
+//!
+//! With Q the true and P the estimated poses:
+//!
+//! ```text
+//! APE   Fᵢ = Qᵢ⁻¹ Pᵢ
+//! RPE   Eᵢ = (Qᵢ⁻¹ Qᵢ₊δ)⁻¹ (Pᵢ⁻¹ Pᵢ₊δ)
+//! ```
+//!
+//! of which the length of the translation and the angle of the rotation are told. Sturm et al.,
+//! *A Benchmark for the Evaluation of RGB-D SLAM Systems*, IROS 2012, eq. 1 and 3; pairs are
+//! chosen as evo (Grupp 2017) chooses them, without alignment. Segments: Geiger, Lenz and
+//! Urtasun, *Are we ready for autonomous driving?*, CVPR 2012, as the benchmark's devkit does it.
+
+use serde::{Deserialize, Serialize};
+
+use super::statistics::{Summary, mean};
+use crate::geometry::Pose3;
+
+/// Errors of many poses or pairs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PoseErrors {
+    /// Lengths of the translations [m].
+    pub translations_m: Vec<f64>,
+    /// Angles of the rotations, 0 to π [rad].
+    pub rotations_rad: Vec<f64>,
+}
+
+impl PoseErrors {
+    fn of(errors: impl Iterator<Item = Pose3>) -> Self {
+        let (translations_m, rotations_rad) = errors
+            .map(|error| (error.translation.vector.norm(), error.rotation.angle()))
+            .unzip();
+        Self {
+            translations_m,
+            rotations_rad,
+        }
+    }
+
+    /// Summary of the translations [m]; `None` without errors.
+    pub fn translation(&self) -> Option<Summary> {
+        Summary::of(&self.translations_m)
+    }
+
+    /// Summary of the rotations [rad]; `None` without errors.
+    pub fn rotation(&self) -> Option<Summary> {
+        Summary::of(&self.rotations_rad)
+    }
+}
+
+/// Which poses are compared by the relative pose error.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Pairs {
+    /// Poses this many frames apart, one pair after the other.
+    Frames(usize),
+    /// Poses this many frames apart, from every pose on.
+    AllFrames(usize),
+    /// One pair after the other, each as soon as the *estimate* has gone this far [m].
+    Meters(f64),
+}
+
+impl Pairs {
+    /// First and second pose of each pair.
+    pub fn of(self, estimates: &[Pose3]) -> Vec<(usize, usize)> {
+        let chain = |ids: Vec<usize>| ids.windows(2).map(|pair| (pair[0], pair[1])).collect();
+        match self {
+            Self::Frames(delta) => chain((0..estimates.len()).step_by(delta.max(1)).collect()),
+            Self::AllFrames(delta) => (delta..estimates.len()).map(|j| (j - delta, j)).collect(),
+            Self::Meters(delta_m) => {
+                let mut ids = vec![0];
+                let mut gone_m = 0.0;
+                for (i, pair) in estimates.windows(2).enumerate() {
+                    gone_m += (pair[1].translation.vector - pair[0].translation.vector).norm();
+                    if gone_m >= delta_m {
+                        ids.push(i + 1);
+                        gone_m = 0.0;
+                    }
+                }
+                chain(ids)
+            }
+        }
+    }
+}
+
+/// APE of every pose.
+pub fn absolute_pose_error(estimates: &[Pose3], ground_truth: &[Pose3]) -> PoseErrors {
+    let pairs = estimates.iter().zip(ground_truth);
+    PoseErrors::of(pairs.map(|(estimate, truth)| truth.inverse() * estimate))
+}
+
+/// RPE of every pair.
+pub fn relative_pose_error(
+    estimates: &[Pose3],
+    ground_truth: &[Pose3],
+    pairs: Pairs,
+) -> PoseErrors {
+    PoseErrors::of(pairs.of(estimates).into_iter().map(|(i, j)| {
+        let true_step = ground_truth[i].inverse() * ground_truth[j];
+        let estimated_step = estimates[i].inverse() * estimates[j];
+        true_step.inverse() * estimated_step
+    }))
+}
+
+/// Mean error per distance over segments of 100, 200, .. 800 m.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SegmentErrors {
+    /// Of translation, per distance driven [%].
+    pub translation_percent: f64,
+    /// Of rotation, per distance driven [deg/m].
+    pub rotation_deg_per_m: f64,
+    /// How many segments the means are over.
+    pub segments: usize,
+}
+
+/// KITTI's segment errors, a segment from every tenth pose on; `None` on a path under 100 m.
+pub fn kitti_segment_errors(estimates: &[Pose3], ground_truth: &[Pose3]) -> Option<SegmentErrors> {
+    const EVERY: usize = 10;
+    let mut driven_m = vec![0.0];
+    for pair in ground_truth.windows(2) {
+        let step_m = (pair[1].translation.vector - pair[0].translation.vector).norm();
+        driven_m.push(driven_m[driven_m.len() - 1] + step_m);
+    }
+    let (mut translations, mut rotations) = (Vec::new(), Vec::new());
+    for first in (0..ground_truth.len()).step_by(EVERY) {
+        for length_m in (1..=8).map(|hundreds| 100.0 * f64::from(hundreds)) {
+            let end_m = driven_m[first] + length_m;
+            let last = driven_m.partition_point(|&driven_m| driven_m <= end_m);
+            if last >= ground_truth.len() {
+                break;
+            }
+            let true_step = ground_truth[first].inverse() * ground_truth[last];
+            let error = (estimates[first].inverse() * estimates[last]).inverse() * true_step;
+            translations.push(error.translation.vector.norm() / length_m);
+            rotations.push(error.rotation.angle() / length_m);
+        }
+    }
+    Some(SegmentErrors {
+        translation_percent: 100.0 * mean(&translations)?,
+        rotation_deg_per_m: mean(&rotations)?.to_degrees(),
+        segments: translations.len(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use approx::assert_relative_eq;
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::kitti::poses::CameraPoses;
+
+    /// Commands of evo 1.38.1 and what they print, run in the folder of the two trajectories.
+    const EVO_ANSWERS: &str = include_str!("evo/answers.txt");
+
+    fn fixture(name: &str) -> Vec<Pose3> {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/evaluation/evo");
+        CameraPoses::read(&folder.join(name))
+            .unwrap()
+            .world_from_cam0
+    }
+
+    /// What a command line of evo asks for, by our functions.
+    fn ours(command: &str, estimates: &[Pose3], truth: &[Pose3]) -> Summary {
+        let words: Vec<&str> = command.split_whitespace().collect();
+        let option = |flag: &str| {
+            let place = words.iter().position(|word| *word == flag)?;
+            Some(words[place + 1])
+        };
+        let errors = if words[1] == "evo_ape" {
+            absolute_pose_error(estimates, truth)
+        } else {
+            let delta: usize = option("-d").unwrap().parse().unwrap();
+            let pairs = match (option("-u").unwrap(), words.contains(&"--all_pairs")) {
+                ("m", false) => Pairs::Meters(delta as f64),
+                ("f", false) => Pairs::Frames(delta),
+                ("f", true) => Pairs::AllFrames(delta),
+                other => panic!("{other:?}"),
+            };
+            relative_pose_error(estimates, truth, pairs)
+        };
+        match option("-r").unwrap() {
+            "trans_part" => errors.translation().unwrap(),
+            "angle_rad" => errors.rotation().unwrap(),
+            other => panic!("{other}"),
+        }
+    }
+
+    #[test]
+    fn ape_and_rpe_are_those_of_evo() {
+        let (truth, estimates) = (
+            fixture("reference_kitti.txt"),
+            fixture("estimate_kitti.txt"),
+        );
+        let mut summary = None;
+        let mut compared = 0;
+        for line in EVO_ANSWERS.lines() {
+            if line.starts_with('$') {
+                summary = Some(ours(line, &estimates, &truth));
+                continue;
+            }
+            let (name, value) = line.trim().split_once('\t').unwrap();
+            let summary = summary.unwrap();
+            let ours = match name {
+                "max" => summary.max,
+                "mean" => summary.mean,
+                "median" => summary.median,
+                "rmse" => summary.rmse,
+                other => panic!("{other}"),
+            };
+            assert_relative_eq!(ours, value.parse().unwrap(), epsilon = 1e-6);
+            compared += 1;
+        }
+        assert_eq!(compared, 32);
+    }
+
+    /// A straight path of 1 m steps, the estimate of which is `scale` times as long and turns by
+    /// `turn_rad` at every step.
+    fn straight(count: usize, scale: f64, turn_rad: f64) -> Vec<Pose3> {
+        let step = Pose3::new(
+            Vector3::new(scale, 0.0, 0.0),
+            Vector3::new(0.0, 0.0, turn_rad),
+        );
+        let mut pose = Pose3::identity();
+        (0..count)
+            .map(|_| {
+                let here = pose;
+                pose *= step;
+                here
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_path_that_is_one_percent_too_long_has_a_segment_error_of_one_percent() {
+        let truth = straight(1000, 1.0, 0.0);
+        let errors = kitti_segment_errors(&straight(1000, 1.01, 0.0), &truth).unwrap();
+        // A segment ends at the first pose beyond its length: 101 m of 100 m.
+        assert_relative_eq!(errors.translation_percent, 1.0, epsilon = 0.01);
+        assert_relative_eq!(errors.rotation_deg_per_m, 0.0, epsilon = 1e-12);
+        let turned = kitti_segment_errors(&straight(1000, 1.0, 1e-4), &truth).unwrap();
+        let expected = 1e-4_f64.to_degrees();
+        assert_relative_eq!(turned.rotation_deg_per_m, expected, max_relative = 0.01);
+    }
+
+    #[test]
+    fn a_path_under_a_hundred_metres_has_no_segments() {
+        let path = straight(100, 1.0, 0.0);
+        assert_eq!(kitti_segment_errors(&path, &path), None);
+    }
+
+    #[test]
+    fn relative_errors_do_not_see_where_the_estimate_began() {
+        let (truth, estimates) = (
+            fixture("reference_kitti.txt"),
+            fixture("estimate_kitti.txt"),
+        );
+        let elsewhere = Pose3::new(Vector3::new(4.0, 5.0, 6.0), Vector3::new(0.3, 0.2, 0.1));
+        let moved: Vec<Pose3> = estimates.iter().map(|pose| elsewhere * pose).collect();
+        let here = relative_pose_error(&estimates, &truth, Pairs::Frames(1));
+        let there = relative_pose_error(&moved, &truth, Pairs::Frames(1));
+        for (a, b) in here.translations_m.iter().zip(&there.translations_m) {
+            assert_relative_eq!(a, b, epsilon = 1e-9);
+        }
+    }
+}

@@ -1,0 +1,237 @@
+//! The parent's own judgement of a run: success, and the RMSE after the time it has to converge.
+//!
+//! ```text
+//! estimate  = Σ w (x, y, θ) / Σ w        over the top 80 % of the stored rows by weight
+//! success   = dₖ < 5 m at every 100th row k from start + 100 on
+//! RMSE      = √ mean dₖ²                 over all rows k from start + 100 on
+//! ```
+//!
+//! dₖ is the planar distance to the ground truth. Chen et al., *Range Image-based LiDAR
+//! Localization for Autonomous Vehicles*, ICRA 2021, as their evaluation script has it.
+
+use nalgebra::Vector2;
+use serde::{Deserialize, Serialize};
+
+use super::results::{LocalizationResults, ParticleRow};
+use crate::geometry::{Pose2, wrap_angle};
+
+/// The rules of the parent.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RangeMclRules {
+    /// Every how many rows the error is looked at, and after how many rows it counts.
+    pub convergence_interval: usize,
+    /// An error below this is a success [m].
+    pub converge_thres: f64,
+    /// Share of the rows, from the heaviest on, that the estimate is made of.
+    pub particle_select_ratio: f64,
+}
+
+impl Default for RangeMclRules {
+    /// The values of range-mcl's `evaluation.yml`.
+    fn default() -> Self {
+        Self {
+            convergence_interval: 100,
+            converge_thres: 5.0,
+            particle_select_ratio: 0.8,
+        }
+    }
+}
+
+/// The judgement.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct RangeMclVerdict {
+    /// Whether the error was small at every row that is looked at.
+    pub success: bool,
+    /// RMSE of the planar position [m]; absent without success, or without rows to count.
+    pub rmse_location_m: Option<f64>,
+    /// RMSE of the heading [deg]; absent without success, or without rows to count.
+    pub rmse_yaw_deg: Option<f64>,
+}
+
+impl RangeMclRules {
+    /// Judges estimates against the ground truth, both one pose per row from the start on.
+    pub fn judge(&self, estimates: &[Pose2], ground_truth: &[Pose2]) -> RangeMclVerdict {
+        let errors: Vec<(f64, f64)> = estimates
+            .iter()
+            .zip(ground_truth)
+            .map(|(estimate, truth)| {
+                let offset = estimate.translation.vector - truth.translation.vector;
+                let turn_rad = estimate.rotation.angle() - truth.rotation.angle();
+                (offset.norm(), wrap_angle(turn_rad).to_degrees())
+            })
+            .collect();
+        let counted = errors.get(self.convergence_interval..).unwrap_or_default();
+        let success = counted
+            .iter()
+            .step_by(self.convergence_interval.max(1))
+            .all(|(distance_m, _)| *distance_m < self.converge_thres);
+        let rmse = |error: fn(&(f64, f64)) -> f64| {
+            let sum: f64 = counted.iter().map(|pair| error(pair).powi(2)).sum();
+            (success && !counted.is_empty()).then(|| (sum / counted.len() as f64).sqrt())
+        };
+        RangeMclVerdict {
+            success,
+            rmse_location_m: rmse(|(distance_m, _)| *distance_m),
+            rmse_yaw_deg: rmse(|(_, turn_deg)| *turn_deg),
+        }
+    }
+
+    /// The estimate of one frame of `capacity` stored rows; `None` without weight.
+    ///
+    /// Rows of zeros count among the share, as in the parent: of 10,000 rows with 100 particles,
+    /// all 100 are selected. Headings are averaged as numbers, but around the heaviest particle,
+    /// so that ±π is no border.
+    pub fn estimate(&self, particles: &[ParticleRow], capacity: usize) -> Option<Pose2> {
+        let selected = (self.particle_select_ratio * capacity as f64) as usize;
+        let mut order: Vec<[f64; 4]> = particles.iter().map(|row| row.map(f64::from)).collect();
+        order.sort_by(|a, b| b[3].total_cmp(&a[3]));
+        order.truncate(selected);
+        let heaviest = order.first()?;
+        let mut sum = [0.0; 4];
+        for [x, y, heading, weight] in &order {
+            sum[0] += weight * x;
+            sum[1] += weight * y;
+            sum[2] += weight * wrap_angle(heading - heaviest[2]);
+            sum[3] += weight;
+        }
+        let [x, y, turn_rad, weight] = sum;
+        (weight > 0.0).then(|| {
+            let heading = heaviest[2] + turn_rad / weight;
+            Pose2::new(Vector2::new(x / weight, y / weight), heading)
+        })
+    }
+
+    /// The estimates that a file holds, or those that its particles make.
+    pub fn estimates(&self, results: &LocalizationResults) -> Result<Vec<Pose2>, NoWeight> {
+        if let Some(estimates) = &results.estimates {
+            return Ok(estimates.clone());
+        }
+        let capacity = results.particles.capacity();
+        (0..results.particles.len())
+            .map(|row| {
+                self.estimate(results.particles.frame(row), capacity)
+                    .ok_or(NoWeight {
+                        frame: results.frames[row],
+                    })
+            })
+            .collect()
+    }
+}
+
+/// There is nothing to make an estimate of.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+#[error(
+    "the particles of frame {frame} have no weight, and the file holds no estimates; run localize again"
+)]
+pub struct NoWeight {
+    /// Number of the frame in its recording.
+    pub frame: usize,
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::PI;
+
+    use approx::assert_relative_eq;
+
+    use super::*;
+    use crate::evaluation::kitti_07::kitti_07;
+
+    #[test]
+    fn the_parents_run_on_kitti_07_is_judged_as_the_parent_judges_it() {
+        let Some((truth, results)) = kitti_07() else {
+            return;
+        };
+        assert_eq!(results.len(), 1101);
+        assert_eq!(results.particles.capacity(), 10_000);
+        let rules = RangeMclRules::default();
+        let estimates = rules.estimates(&results).unwrap();
+        let verdict = rules.judge(&estimates, &truth);
+        // What the parent prints to four digits. Its rotations are those of the file, which are
+        // orthogonal to four digits only; ours are made so.
+        assert!(verdict.success);
+        assert_relative_eq!(verdict.rmse_location_m.unwrap(), 0.379_644, epsilon = 5e-6);
+        assert_relative_eq!(verdict.rmse_yaw_deg.unwrap(), 2.164_483, epsilon = 5e-6);
+
+        let all: f64 = (estimates.iter().zip(&truth))
+            .map(|(a, b)| (a.translation.vector - b.translation.vector).norm_squared())
+            .sum();
+        assert_relative_eq!((all / 1101.0).sqrt(), 0.379_799, epsilon = 5e-6);
+    }
+
+    fn straight(rows: usize) -> Vec<Pose2> {
+        (0..rows)
+            .map(|row| Pose2::new(Vector2::new(row as f64, 0.0), 0.0))
+            .collect()
+    }
+
+    fn beside(poses: &[Pose2], left_m: f64, turn_rad: f64) -> Vec<Pose2> {
+        poses
+            .iter()
+            .map(|pose| pose * Pose2::new(Vector2::new(0.0, left_m), turn_rad))
+            .collect()
+    }
+
+    #[test]
+    fn a_constant_offset_is_the_rmse() {
+        let truth = straight(301);
+        let verdict = RangeMclRules::default().judge(&beside(&truth, 0.3, 0.02), &truth);
+        assert!(verdict.success);
+        assert_relative_eq!(verdict.rmse_location_m.unwrap(), 0.3, epsilon = 1e-12);
+        let expected_deg = 0.02_f64.to_degrees();
+        assert_relative_eq!(verdict.rmse_yaw_deg.unwrap(), expected_deg, epsilon = 1e-12);
+    }
+
+    #[test]
+    fn only_every_hundredth_row_decides_and_the_first_hundred_do_not_count() {
+        let truth = straight(301);
+        let rules = RangeMclRules::default();
+        let mut estimates = truth.clone();
+        estimates[99].translation.y = 50.0;
+        assert_eq!(rules.judge(&estimates, &truth).rmse_location_m, Some(0.0));
+        estimates[150].translation.y = 5.1;
+        assert!(rules.judge(&estimates, &truth).success);
+        estimates[200].translation.y = 5.1;
+        let verdict = rules.judge(&estimates, &truth);
+        assert_eq!((verdict.success, verdict.rmse_location_m), (false, None));
+    }
+
+    #[test]
+    fn a_run_shorter_than_the_interval_has_no_rmse() {
+        let truth = straight(100);
+        let verdict = RangeMclRules::default().judge(&truth, &truth);
+        assert_eq!((verdict.success, verdict.rmse_location_m), (true, None));
+    }
+
+    #[test]
+    fn the_estimate_ignores_the_lightest_fifth_and_the_scale_of_the_weights() {
+        let rules = RangeMclRules::default();
+        let mut particles: Vec<ParticleRow> = (0..4).map(|i| [i as f32, 1.0, 0.1, 2.0]).collect();
+        particles.push([1000.0, 1.0, 0.1, 1.0]);
+        let estimate = rules.estimate(&particles, 5).unwrap();
+        assert_relative_eq!(estimate.translation.x, 1.5, epsilon = 1e-12);
+        for particle in &mut particles {
+            particle[3] *= 1e-6;
+        }
+        assert_relative_eq!(
+            rules.estimate(&particles, 5).unwrap(),
+            estimate,
+            epsilon = 1e-6
+        );
+    }
+
+    #[test]
+    fn headings_on_both_sides_of_pi_average_to_pi() {
+        let particles = [[0.0, 0.0, 3.1, 1.0], [0.0, 0.0, -3.1, 1.0]];
+        let estimate = RangeMclRules::default().estimate(&particles, 10).unwrap();
+        assert_relative_eq!(estimate.rotation.angle().abs(), PI, epsilon = 1e-6);
+    }
+
+    #[test]
+    fn particles_without_weight_make_no_estimate() {
+        let rules = RangeMclRules::default();
+        assert_eq!(rules.estimate(&[[1.0, 2.0, 3.0, 0.0]], 10), None);
+        assert_eq!(rules.estimate(&[], 10), None);
+    }
+}

@@ -1,0 +1,268 @@
+//! The judgement of a run, as a file for programs and as tables for people.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::io::Write as _;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::metrics::TrajectoryMetrics;
+use super::range_mcl::RangeMclVerdict;
+use super::results::ResultsError;
+use super::rows::{MetricRow, Value};
+use super::write_atomically;
+
+/// What is said of one trajectory.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TrajectoryReport {
+    /// By the parent's rules.
+    pub range_mcl: RangeMclVerdict,
+    /// By those of the literature.
+    pub metrics: TrajectoryMetrics,
+}
+
+/// What is said of a run: `report.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Report {
+    /// What was run, by name: the recording, the map, the odometry and where it came from, the
+    /// seed, the backend.
+    pub about: BTreeMap<String, String>,
+    /// The filter's estimates.
+    pub mcl: TrajectoryReport,
+    /// The refined trajectory, where there is one.
+    pub refined: Option<TrajectoryReport>,
+}
+
+impl TrajectoryReport {
+    /// All rows: the parent's verdict first.
+    pub fn rows(&self) -> Vec<MetricRow> {
+        let verdict = [
+            MetricRow {
+                name: "range-mcl success",
+                value: Value::Flag(self.range_mcl.success),
+                unit: "",
+                definition: "position error under converge_thres at every convergence_interval-th row",
+            },
+            MetricRow {
+                name: "range-mcl RMSE location",
+                value: self.range_mcl.rmse_location_m.into(),
+                unit: "m",
+                definition: "position RMSE from row convergence_interval on, as range-mcl tells it",
+            },
+            MetricRow {
+                name: "range-mcl RMSE yaw",
+                value: self.range_mcl.rmse_yaw_deg.into(),
+                unit: "deg",
+                definition: "heading RMSE from row convergence_interval on, as range-mcl tells it",
+            },
+        ];
+        [verdict.to_vec(), self.metrics.rows()].concat()
+    }
+}
+
+impl Report {
+    /// Writes `report.json`.
+    pub fn write_json(&self, path: &Path) -> Result<(), ResultsError> {
+        let json = serde_json::to_string_pretty(self)
+            .map_err(std::io::Error::other)
+            .map_err(|source| ResultsError::Write {
+                path: path.to_owned(),
+                source,
+            })?;
+        write_text(path, &(json + "\n"))
+    }
+
+    /// Reads `report.json`.
+    pub fn read_json(path: &Path) -> Result<Self, ResultsError> {
+        let text = std::fs::read_to_string(path).map_err(|source| ResultsError::Read {
+            path: path.to_owned(),
+            source,
+        })?;
+        serde_json::from_str(&text).map_err(|source| ResultsError::BadReport {
+            path: path.to_owned(),
+            source,
+        })
+    }
+
+    /// A table for the terminal: one column per trajectory, numbers to the right.
+    pub fn to_text(&self) -> String {
+        let rows = self.joined_rows();
+        let width = rows
+            .iter()
+            .map(|(row, _)| row.name.len())
+            .max()
+            .unwrap_or(0);
+        let mut text = self.about_lines("", ": ", "");
+        if !text.is_empty() {
+            text.push('\n');
+        }
+        let refined_title = self.refined.as_ref().map_or("", |_| "refined");
+        let _ = writeln!(
+            text,
+            "{:width$}  {:>10}  {refined_title:>10}  unit",
+            "", "MCL"
+        );
+        for (row, refined) in &rows {
+            let refined = refined.map_or(String::new(), |value| value.to_string());
+            let line = format!(
+                "{:width$}  {:>10}  {refined:>10}  {}",
+                row.name, row.value, row.unit
+            );
+            text.push_str(line.trim_end());
+            text.push('\n');
+        }
+        text
+    }
+
+    /// The same table in Markdown, with definitions.
+    pub fn to_markdown(&self) -> String {
+        let mut text = self.about_lines("- ", ": ", "");
+        let refined_title = self.refined.as_ref().map_or("", |_| " refined |");
+        let refined_rule = self.refined.as_ref().map_or("", |_| "---:|");
+        let _ = writeln!(
+            text,
+            "\n| | MCL |{refined_title} unit | definition |\n|---|---:|{refined_rule}---|---|"
+        );
+        for (row, refined) in self.joined_rows() {
+            let refined = refined.map_or(String::new(), |value| format!(" {value} |"));
+            // A bar inside a cell would end it.
+            let definition = row.definition.replace('|', "\\|");
+            let _ = writeln!(
+                text,
+                "| {} | {} |{refined} {} | {definition} |",
+                row.name, row.value, row.unit
+            );
+        }
+        text
+    }
+
+    /// Writes the Markdown table.
+    pub fn write_markdown(&self, path: &Path) -> Result<(), ResultsError> {
+        write_text(path, &self.to_markdown())
+    }
+
+    /// Each row of the filter with the value of the same row of the refined trajectory.
+    fn joined_rows(&self) -> Vec<(MetricRow, Option<Value>)> {
+        let refined = self.refined.as_ref().map(TrajectoryReport::rows);
+        self.mcl
+            .rows()
+            .into_iter()
+            .enumerate()
+            .map(|(index, row)| (row, refined.as_ref().map(|rows| rows[index].value)))
+            .collect()
+    }
+
+    fn about_lines(&self, before: &str, between: &str, after: &str) -> String {
+        self.about
+            .iter()
+            .map(|(name, value)| format!("{before}{name}{between}{value}{after}\n"))
+            .collect()
+    }
+}
+
+fn write_text(path: &Path, text: &str) -> Result<(), ResultsError> {
+    write_atomically(path, |file| file.write_all(text.as_bytes())).map_err(|source| {
+        ResultsError::Write {
+            path: path.to_owned(),
+            source,
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::metrics::{Judged, MetricsConfig};
+    use super::super::range_mcl::RangeMclRules;
+    use super::*;
+    use crate::geometry::Pose2;
+
+    fn trajectory(error_m: f64) -> TrajectoryReport {
+        let truth: Vec<Pose2> = (0..300)
+            .map(|k| Pose2::translation(f64::from(k), 0.0))
+            .collect();
+        let shift = Pose2::translation(0.0, error_m);
+        let estimates: Vec<Pose2> = truth.iter().map(|pose| shift * pose).collect();
+        let judged = Judged {
+            estimates: &estimates,
+            ground_truth: &truth,
+            times_s: None,
+            runtimes_s: Some(&[0.0125; 300]),
+        };
+        TrajectoryReport {
+            range_mcl: RangeMclRules::default().judge(&estimates, &truth),
+            metrics: TrajectoryMetrics::of(&judged, &MetricsConfig::default()).unwrap(),
+        }
+    }
+
+    fn report() -> Report {
+        Report {
+            about: [("odometry".to_owned(), "from file".to_owned())].into(),
+            mcl: trajectory(0.25),
+            refined: Some(trajectory(0.02)),
+        }
+    }
+
+    #[test]
+    fn a_report_reads_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("report.json");
+        report().write_json(&path).unwrap();
+        let back = Report::read_json(&path).unwrap();
+        // JSON may cost the last digit of a number, which the tables do not show.
+        assert_eq!(back.to_markdown(), report().to_markdown());
+        std::fs::write(&path, "{\"mcl\": 3}").unwrap();
+        let message = Report::read_json(&path).unwrap_err().to_string();
+        assert!(message.contains("report.json is not a report"), "{message}");
+    }
+
+    #[test]
+    fn columns_are_aligned_and_units_stand_beside_the_numbers() {
+        let text = report().to_text();
+        let line = |name: &str| text.lines().find(|line| line.starts_with(name)).unwrap();
+        let words: Vec<&str> = line("position RMSE").split_whitespace().collect();
+        assert_eq!(words, ["position", "RMSE", "0.2500", "0.0200", "m"]);
+        let ends: Vec<usize> = text
+            .lines()
+            .filter(|line| line.contains("RMSE") && line.ends_with(" m"))
+            .map(str::len)
+            .collect();
+        assert!(
+            ends.len() >= 6 && ends.iter().all(|end| *end == ends[0]),
+            "{text}"
+        );
+        assert!(line("runtime p50").ends_with("ms"), "{text}");
+    }
+
+    #[test]
+    fn every_row_of_the_markdown_table_has_as_many_cells() {
+        let mut both = report();
+        for cells in [5, 4] {
+            let markdown = both.to_markdown();
+            let table: Vec<&str> = markdown
+                .lines()
+                .filter(|line| line.starts_with('|'))
+                .collect();
+            assert!(table.len() > 30);
+            for line in table {
+                let bars = line.replace("\\|", "").matches('|').count();
+                assert_eq!(bars, cells + 1, "{line}");
+            }
+            both.refined = None;
+        }
+    }
+
+    #[test]
+    fn numbers_keep_four_digits() {
+        for (number, text) in [
+            (0.018_93, "0.0189"),
+            (1.234_56, "1.235"),
+            (123.456, "123.5"),
+            (12_345.6, "12346"),
+            (-0.5, "-0.5000"),
+            (0.0, "0.0000"),
+        ] {
+            assert_eq!(Value::Number(number).to_string(), text);
+        }
+    }
+}

@@ -1,0 +1,330 @@
+//! Surface normals from a range image: the plane that most of a pixel's neighbours agree on.
+//!
+//! Around a pixel lie 5 x 5 pixels. Near the sensor, where they are closer together than the
+//! noise allows, they are taken every second, third or fourth pixel. Planes through the pixel
+//! and two of its outer neighbours are tried; the one with the largest support
+//!
+//! ```text
+//! Σᵢ max(0, 1 − |n · (pᵢ − p)| / tolerance)        tolerance = tolerance_m + relative · range
+//!                                                   but at most beam_tolerance_m · |n · beam|
+//! ```
+//!
+//! wins (MSAC, Torr and Zisserman 2000, over a fixed set of hypotheses), and principal components of its
+//! supporters give the normal. So a neighbour beyond a depth discontinuity takes no part, a
+//! missing one does no harm, and where no plane finds enough support there is no normal.
+
+use glam::Vec3;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::RangeImage;
+use crate::geometry::PlaneSums;
+
+/// When a neighbourhood counts as a surface.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NormalConfig {
+    /// Distance between neighbouring samples that is sought near the sensor [m].
+    pub spacing_m: f32,
+    /// How far a supporter may lie from the plane at range 0 [m].
+    pub tolerance_m: f32,
+    /// How much farther it may lie per metre of range, unitless.
+    pub relative_tolerance: f32,
+    /// How far it may lie from the plane along the beam [m]; the stricter limit where the
+    /// plane is seen edge-on.
+    pub beam_tolerance_m: f32,
+    /// Supporters that a plane needs, the pixel itself not counted.
+    pub min_support: usize,
+    /// Share of the neighbours that must support it, 0 to 1.
+    pub min_share: f32,
+    /// Least cosine between normal and beam: a plane seen more edge-on is the gap between two surfaces.
+    pub min_incidence: f32,
+}
+
+impl Default for NormalConfig {
+    /// For sensors with about 2 cm of noise.
+    fn default() -> Self {
+        Self {
+            spacing_m: 0.12,
+            tolerance_m: 0.05,
+            relative_tolerance: 0.001,
+            beam_tolerance_m: 1.0,
+            min_support: 5,
+            min_share: 0.35,
+            min_incidence: 0.02,
+        }
+    }
+}
+
+/// Pixels on each side of the middle one.
+const REACH: isize = 2;
+/// The largest step between pixels that are looked at.
+const MAX_STRIDE: isize = 4;
+/// Columns and rows towards the eight outer neighbours, clockwise.
+const OUTER: [(isize, isize); 8] = [
+    (0, -1),
+    (1, -1),
+    (1, 0),
+    (1, 1),
+    (0, 1),
+    (-1, 1),
+    (-1, 0),
+    (-1, -1),
+];
+
+/// Unit normals in the lidar frame, towards the sensor, one per pixel, row-major; `None` where
+/// there is no return or no plane with enough support.
+pub fn normals(image: &RangeImage, config: &NormalConfig) -> Vec<Option<Vec3>> {
+    (0..image.model.height)
+        .into_par_iter()
+        .flat_map_iter(|row| {
+            (0..image.model.width).map(move |column| normal_at(image, config, row, column))
+        })
+        .collect()
+}
+
+/// The neighbours of a pixel that have a return.
+struct Neighbours {
+    points: [Vec3; 24],
+    count: usize,
+    outer: [Option<Vec3>; 8],
+}
+
+fn normal_at(image: &RangeImage, config: &NormalConfig, row: usize, column: usize) -> Option<Vec3> {
+    let index = row * image.model.width + column;
+    if !image.has_return(index) {
+        return None;
+    }
+    let (point, range_m) = (image.points[index], image.ranges[index]);
+    let neighbours = Neighbours::gather(image, config, row as isize, column as isize);
+    let points = &neighbours.points[..neighbours.count];
+    let tolerance_m = |normal: Vec3| {
+        let cosine = normal.dot(point).abs() / range_m;
+        let across_m = config.tolerance_m + config.relative_tolerance * range_m;
+        across_m.min(config.beam_tolerance_m * cosine)
+    };
+    let first_guess = neighbours.best_plane(point, tolerance_m)?;
+    let tolerance_m = tolerance_m(first_guess);
+    let min_support = config
+        .min_support
+        .max((config.min_share * points.len() as f32) as usize);
+
+    let mut sums = PlaneSums::about(point);
+    sums.add(point, 1.0);
+    let mut support = 0;
+    for &neighbour in points {
+        if first_guess.dot(neighbour - point).abs() < tolerance_m {
+            sums.add(neighbour, 1.0);
+            support += 1;
+        }
+    }
+    let plane = sums.fit().filter(|_| support >= min_support)?;
+    // A strip hardly wider than the noise says nothing about its tilt.
+    if plane.variances[1] < 4.0 * plane.variances[0] {
+        return None;
+    }
+    let cosine = -plane.normal.dot(point) / range_m;
+    (cosine.abs() >= config.min_incidence).then_some(plane.normal * cosine.signum())
+}
+
+impl Neighbours {
+    fn gather(image: &RangeImage, config: &NormalConfig, row: isize, column: isize) -> Self {
+        let model = &image.model;
+        let (height, width) = (model.height as isize, model.width as isize);
+        let range_m = image.ranges[(row * width + column) as usize];
+        let stride = |angle_rad: f32| {
+            ((config.spacing_m / (range_m * angle_rad)).round() as isize).clamp(1, MAX_STRIDE)
+        };
+        let column_stride = stride(std::f32::consts::TAU / model.width as f32);
+        let row_stride = stride(model.fov_rad() / model.height as f32);
+
+        let mut found = Self {
+            points: [Vec3::ZERO; 24],
+            count: 0,
+            outer: [None; 8],
+        };
+        let point_at = |down: isize, right: isize| {
+            let row = row + down * row_stride;
+            if !(0..height).contains(&row) {
+                return None;
+            }
+            let column = (column + right * column_stride).rem_euclid(width);
+            let index = (row * width + column) as usize;
+            image.has_return(index).then(|| image.points[index])
+        };
+        for down in -REACH..=REACH {
+            for right in -REACH..=REACH {
+                if let (Some(point), false) = (point_at(down, right), (down, right) == (0, 0)) {
+                    found.points[found.count] = point;
+                    found.count += 1;
+                }
+            }
+        }
+        for (outer, (right, down)) in found.outer.iter_mut().zip(OUTER) {
+            *outer = point_at(REACH * down, REACH * right).or_else(|| point_at(down, right));
+        }
+        found
+    }
+
+    /// The unit normal of the plane through `point` that has the largest support.
+    fn best_plane(&self, point: Vec3, tolerance_m: impl Fn(Vec3) -> f32) -> Option<Vec3> {
+        let mut best = (0.0, None);
+        for first in 0..8 {
+            let (Some(a), Some(b)) = (self.outer[first], self.outer[(first + 2) % 8]) else {
+                continue;
+            };
+            let Some(normal) = (a - point).cross(b - point).try_normalize() else {
+                continue;
+            };
+            let tolerance_m = tolerance_m(normal);
+            let support: f32 = self.points[..self.count]
+                .iter()
+                .map(|&other| (1.0 - normal.dot(other - point).abs() / tolerance_m).max(0.0))
+                .sum();
+            if support > best.0 {
+                best = (support, Some(normal));
+            }
+        }
+        best.1
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+    use crate::lidar::{LidarModel, NO_RETURN};
+
+    /// The image of a scene given as the range along a unit direction.
+    fn image_of(range_along: impl Fn(Vec3) -> f32) -> RangeImage {
+        let model = LidarModel::default();
+        let ranges = model
+            .directions()
+            .into_iter()
+            .map(|direction| {
+                let range_m = range_along(direction);
+                if model.accepts_range(range_m) {
+                    range_m
+                } else {
+                    NO_RETURN
+                }
+            })
+            .collect();
+        RangeImage::from_ranges(ranges, &model)
+    }
+
+    /// Range to the plane `normal · p = offset`, infinite behind.
+    fn plane_range(direction: Vec3, normal: Vec3, offset: f32) -> f32 {
+        let range_m = offset / normal.dot(direction);
+        if range_m > 0.0 {
+            range_m
+        } else {
+            f32::INFINITY
+        }
+    }
+
+    fn ground_and_wall(direction: Vec3) -> f32 {
+        plane_range(direction, Vec3::Z, -1.73).min(plane_range(direction, Vec3::X, 12.0))
+    }
+
+    #[test]
+    fn on_ground_and_wall_every_normal_is_theirs_and_looks_at_the_sensor() {
+        let image = image_of(ground_and_wall);
+        let normals = normals(&image, &NormalConfig::default());
+        let (mut returns, mut found) = (0, 0);
+        for (index, normal) in normals.iter().enumerate() {
+            returns += usize::from(image.has_return(index));
+            let Some(normal) = *normal else { continue };
+            found += 1;
+            let best = normal.dot(Vec3::Z).max(normal.dot(-Vec3::X));
+            assert!(best > 0.99, "{normal} at {:?}", image.model.pixel_at(index));
+            assert!(normal.dot(image.points[index]) < 0.0);
+        }
+        assert!(found as f32 > 0.97 * returns as f32, "{found} of {returns}");
+    }
+
+    #[test]
+    fn across_a_depth_discontinuity_no_normal_is_invented() {
+        // Two walls across the view, one 6 m behind the other, side by side.
+        let image = image_of(|direction| {
+            let near = plane_range(direction, Vec3::X, 8.0);
+            let far = plane_range(direction, Vec3::X, 14.0);
+            if direction.y > 0.0 { near } else { far }
+        });
+        let normals = normals(&image, &NormalConfig::default());
+        assert!(normals.iter().flatten().count() > 10_000);
+        for normal in normals.iter().flatten() {
+            assert!(normal.dot(-Vec3::X) > 0.999, "{normal}");
+        }
+    }
+
+    #[test]
+    fn missing_neighbours_do_no_harm() {
+        let full = image_of(ground_and_wall);
+        let ranges = full
+            .ranges
+            .iter()
+            .enumerate()
+            // Every third pixel is missing, along the rows and down the columns.
+            .map(|(index, &range_m)| {
+                if (index + index / 900) % 3 == 0 {
+                    NO_RETURN
+                } else {
+                    range_m
+                }
+            })
+            .collect();
+        let holed = RangeImage::from_ranges(ranges, &full.model);
+        let normals = normals(&holed, &NormalConfig::default());
+        let returns = holed.beams().count();
+        let found = normals.iter().flatten().count();
+        assert!(found as f32 > 0.9 * returns as f32, "{found} of {returns}");
+        for normal in normals.iter().flatten() {
+            assert!(
+                normal.dot(Vec3::Z).max(normal.dot(-Vec3::X)) > 0.99,
+                "{normal}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_scatter_of_points_has_no_normals() {
+        let model = LidarModel::default();
+        // No two neighbours belong together.
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let ranges = (0..model.len())
+            .map(|_| rng.random_range(5.0..40.0))
+            .collect();
+        let image = RangeImage::from_ranges(ranges, &model);
+        let found = normals(&image, &NormalConfig::default())
+            .iter()
+            .flatten()
+            .count();
+        assert!((found as f32) < 0.03 * model.len() as f32, "{found}");
+    }
+
+    #[test]
+    fn a_lone_pixel_and_an_empty_image_have_none() {
+        let model = LidarModel::default();
+        let mut ranges = vec![NO_RETURN; model.len()];
+        ranges[30 * model.width + 7] = 9.0;
+        let image = RangeImage::from_ranges(ranges, &model);
+        assert!(
+            normals(&image, &NormalConfig::default())
+                .iter()
+                .all(Option::is_none)
+        );
+    }
+
+    #[test]
+    fn the_seam_straight_back_is_no_edge() {
+        let image = image_of(|direction| plane_range(direction, Vec3::Z, -1.73));
+        let normals = normals(&image, &NormalConfig::default());
+        let row = 50 * image.model.width;
+        for column in [0, 1, 898, 899] {
+            assert!(normals[row + column].is_some_and(|normal| normal.z > 0.999));
+        }
+    }
+}

@@ -1,0 +1,306 @@
+//! A local map: the scans of a stretch of road turned into a mesh.
+
+use std::collections::HashMap;
+
+use glam::{IVec3, Vec3};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::plan::{LocalMapPlan, Ownership};
+use super::scan_cloud::{PointCounts, ScanCloud, ScanSettings};
+use super::visibility::{self, VisibilityConfig};
+use crate::geometry::{PointCloud, TriangleMesh};
+use crate::ground::GroundClassifier;
+use crate::kitti::{Frame, KittiError};
+use crate::meshing::{self, MeshingError, PoissonConfig};
+
+/// How scans become a mesh.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LocalMapSettings {
+    /// What of a scan is used.
+    pub scan: ScanSettings,
+    /// Surface reconstruction.
+    pub poisson: PoissonConfig,
+    /// Vertices below this quantile of density are dropped (unitless).
+    pub min_density: f64,
+    /// Surface farther than this from every point is invented and dropped [m].
+    pub max_distance_m: f32,
+    /// Free-space votes.
+    pub visibility: VisibilityConfig,
+    /// A vertex is ground from this confidence on (unitless).
+    pub ground_threshold: f32,
+    /// Longest edge of simplified ground [m]; 0 leaves the ground as it is.
+    pub simplify_resolution_m: f32,
+    /// Rounds of smoothing of the simplified ground.
+    pub smoothing_iterations: usize,
+    /// Colour of ground.
+    pub ground_color: [u8; 3],
+    /// Colour of the rest.
+    pub rest_color: [u8; 3],
+}
+
+impl Default for LocalMapSettings {
+    /// range-mcl's values where it has them.
+    fn default() -> Self {
+        Self {
+            scan: ScanSettings::default(),
+            poisson: PoissonConfig::default(),
+            min_density: 0.1,
+            max_distance_m: 0.25,
+            visibility: VisibilityConfig::default(),
+            ground_threshold: 0.5,
+            simplify_resolution_m: 1.0,
+            smoothing_iterations: 1,
+            ground_color: [255, 0, 0],
+            rest_color: [0, 0, 255],
+        }
+    }
+}
+
+/// What happened to the points and triangles of a local map.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct LocalMapCounts {
+    /// Scans meshed.
+    pub scans: usize,
+    /// Points, summed over the scans.
+    pub points: PointCounts,
+    /// Points that moved.
+    pub dynamic_points: usize,
+    /// Triangles as reconstructed.
+    pub reconstructed_triangles: usize,
+    /// Triangles dropped for few points around them.
+    pub sparse_triangles: usize,
+    /// Triangles dropped for distance to all points.
+    pub distant_triangles: usize,
+    /// Triangles that beams pass through, per round.
+    pub crossed_triangles: Vec<usize>,
+    /// Triangles saved by simplifying the ground.
+    pub simplified_triangles: usize,
+    /// Triangles left to neighbouring local maps.
+    pub foreign_triangles: usize,
+    /// Triangles of the finished local map.
+    pub triangles: usize,
+}
+
+/// Who watches a build and may stop it.
+#[derive(Clone, Copy)]
+pub struct Watcher<'a> {
+    /// Called after each scan that was read.
+    pub scan_done: &'a (dyn Fn() + Sync),
+    /// Called with the name of each stage that begins.
+    pub stage: &'a (dyn Fn(&'static str) + Sync),
+    /// Asked between steps; the build ends with [`LocalMapError::Interrupted`] once it says so.
+    pub cancelled: &'a (dyn Fn() -> bool + Sync),
+}
+
+impl Watcher<'_> {
+    fn check(&self) -> Result<(), LocalMapError> {
+        if (self.cancelled)() {
+            Err(LocalMapError::Interrupted)
+        } else {
+            Ok(())
+        }
+    }
+
+    fn begin(&self, stage: &'static str) -> Result<(), LocalMapError> {
+        (self.stage)(stage);
+        self.check()
+    }
+}
+
+/// Why a local map could not be made.
+#[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages say it")]
+pub enum LocalMapError {
+    #[error("interrupted")]
+    Interrupted,
+    #[error(transparent)]
+    Scan(#[from] KittiError),
+    #[error("local map {number} (frames {first} to {last}): {source}")]
+    Meshing {
+        number: usize,
+        first: usize,
+        last: usize,
+        source: MeshingError,
+    },
+}
+
+/// Reads, cleans, meshes and colours the scans of one local map.
+pub fn build(
+    frames: &[Frame],
+    plan: &LocalMapPlan,
+    ownership: &Ownership,
+    settings: &LocalMapSettings,
+    classifier: &dyn GroundClassifier,
+    watcher: &Watcher,
+) -> Result<(TriangleMesh, LocalMapCounts), LocalMapError> {
+    let mut counts = LocalMapCounts::default();
+    watcher.begin("scans")?;
+    let scans = prepare_scans(&frames[plan.used.clone()], settings, classifier, watcher)?;
+    counts.scans = scans.len();
+    scans.iter().for_each(|scan| counts.points.add(&scan.counts));
+
+    watcher.begin("moving points")?;
+    let cloud = static_cloud(&scans, settings, &mut counts);
+
+    watcher.begin("surface")?;
+    let surface = meshing::reconstruct(&cloud, None, &settings.poisson).map_err(|source| {
+        LocalMapError::Meshing {
+            number: plan.number,
+            first: frames[plan.own.start].number,
+            last: frames[plan.own.end - 1].number,
+            source,
+        }
+    })?;
+    counts.reconstructed_triangles = surface.mesh.triangles.len();
+    let (mut mesh, sparse) = meshing::trim_by_density(surface, settings.min_density);
+    counts.sparse_triangles = sparse;
+    counts.distant_triangles =
+        meshing::trim_by_distance(&mut mesh, &cloud.positions, settings.max_distance_m);
+
+    watcher.begin("false surfaces")?;
+    if settings.visibility.enabled {
+        counts.crossed_triangles =
+            visibility::remove_crossed_triangles(&mut mesh, &scans, &settings.visibility);
+    }
+    drop(scans);
+
+    watcher.begin("ground")?;
+    keep_own(&mut mesh, plan, ownership, &mut counts);
+    let ground = vertex_ground(&mesh.vertices, &cloud, settings);
+    paint(&mut mesh, &ground, settings);
+    simplify(&mut mesh, &ground, settings, &mut counts);
+    counts.triangles = mesh.triangles.len();
+    Ok((mesh, counts))
+}
+
+fn prepare_scans(
+    frames: &[Frame],
+    settings: &LocalMapSettings,
+    classifier: &dyn GroundClassifier,
+    watcher: &Watcher,
+) -> Result<Vec<ScanCloud>, LocalMapError> {
+    frames
+        .par_iter()
+        .map(|frame| {
+            watcher.check()?;
+            let scan = ScanCloud::prepare(frame, &settings.scan, classifier)?;
+            (watcher.scan_done)();
+            Ok(scan)
+        })
+        .collect()
+}
+
+/// All points that did not move, of all scans.
+fn static_cloud(
+    scans: &[ScanCloud],
+    settings: &LocalMapSettings,
+    counts: &mut LocalMapCounts,
+) -> PointCloud {
+    let model = &settings.scan.range_image;
+    let is_static = settings
+        .visibility
+        .enabled
+        .then(|| visibility::static_points(scans, model, &settings.visibility));
+    let mut all = PointCloud::default();
+    for (number, scan) in scans.iter().enumerate() {
+        let mut cloud = scan.cloud.clone();
+        if let Some(is_static) = &is_static {
+            cloud.retain(|index| is_static[number][index]);
+            counts.dynamic_points += scan.cloud.len() - cloud.len();
+        }
+        all.append(cloud);
+    }
+    all
+}
+
+/// Keeps the triangles whose centre lies in the region that this local map owns.
+fn keep_own(
+    mesh: &mut TriangleMesh,
+    plan: &LocalMapPlan,
+    ownership: &Ownership,
+    counts: &mut LocalMapCounts,
+) {
+    let own: Vec<bool> = (0..mesh.triangles.len())
+        .map(|triangle| {
+            let [a, b, c] = mesh.corners(triangle);
+            let center = (a + b + c) / 3.0;
+            ownership.owner_at(f64::from(center.x), f64::from(center.y)) == Some(plan.number)
+        })
+        .collect();
+    counts.foreign_triangles = own.iter().filter(|&&own| !own).count();
+    mesh.retain_triangles(|triangle| own[triangle]);
+}
+
+/// The mean ground confidence of the points around each vertex.
+fn vertex_ground(vertices: &[Vec3], cloud: &PointCloud, settings: &LocalMapSettings) -> Vec<f32> {
+    let cell_m = settings
+        .max_distance_m
+        .max(2.0 * settings.scan.voxel_size_m);
+    let cell_of = |point: Vec3| (point / cell_m).floor().as_ivec3();
+    let mut cells: HashMap<IVec3, (f32, f32)> = HashMap::with_capacity(cloud.len() / 4);
+    for (&position, &ground) in cloud.positions.iter().zip(&cloud.ground) {
+        let cell = cells.entry(cell_of(position)).or_default();
+        cell.0 += ground;
+        cell.1 += 1.0;
+    }
+    let around: Vec<IVec3> = (0..27)
+        .map(|i| IVec3::new(i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1))
+        .collect();
+    vertices
+        .par_iter()
+        .map(|&vertex| {
+            let center = cell_of(vertex);
+            let own = cells.get(&center).copied();
+            let (sum, count) = own.unwrap_or_else(|| {
+                around
+                    .iter()
+                    .filter_map(|offset| cells.get(&(center + offset)))
+                    .fold((0.0, 0.0), |sum, cell| (sum.0 + cell.0, sum.1 + cell.1))
+            });
+            if count > 0.0 { sum / count } else { 0.0 }
+        })
+        .collect()
+}
+
+/// Colours from ground to rest, decided at the threshold.
+fn paint(mesh: &mut TriangleMesh, ground: &[f32], settings: &LocalMapSettings) {
+    mesh.colors = ground
+        .iter()
+        .map(|&confidence| {
+            if confidence >= settings.ground_threshold {
+                settings.ground_color
+            } else {
+                settings.rest_color
+            }
+        })
+        .collect();
+}
+
+fn simplify(
+    mesh: &mut TriangleMesh,
+    ground: &[f32],
+    settings: &LocalMapSettings,
+    counts: &mut LocalMapCounts,
+) {
+    if settings.simplify_resolution_m <= 0.0 {
+        return;
+    }
+    let is_ground: Vec<bool> = mesh
+        .triangles
+        .iter()
+        .map(|triangle| {
+            triangle
+                .iter()
+                .all(|&vertex| ground[vertex as usize] >= settings.ground_threshold)
+        })
+        .collect();
+    let before = mesh.triangles.len();
+    *mesh = meshing::simplify_ground(
+        mesh,
+        &is_ground,
+        settings.simplify_resolution_m,
+        settings.smoothing_iterations,
+    );
+    counts.simplified_triangles = before.saturating_sub(mesh.triangles.len());
+}

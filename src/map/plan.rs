@@ -1,0 +1,172 @@
+//! Which scans make which local map, and which local map owns which place.
+//!
+//! A scan counts if the car has moved since the last one that counted. Every
+//! `local_map_size` counted scans, and at the end of the recording, a local map is closed. It is
+//! meshed from its own scans and those a few metres before and after; of its mesh it keeps
+//! what lies nearer to its own scans than to those of any other local map, so that
+//! neighbours meet and no wall stands twice, also where the car comes by again.
+
+use std::ops::Range;
+
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use nalgebra::Point2;
+
+use crate::geometry::Grid2;
+use crate::kitti::Frame;
+
+/// Edge of the cells in which ownership is decided [m].
+const OWNER_CELL_M: f64 = 0.5;
+
+/// One local map.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LocalMapPlan {
+    /// From 0, in the order of the recording.
+    pub number: usize,
+    /// The scans it is made of, as indices into the counted frames; no two local maps share one.
+    pub own: Range<usize>,
+    /// Those and its neighbours', from which it is meshed.
+    pub used: Range<usize>,
+}
+
+/// The frames that count: the first, and each that is `displacement_m` or more away from the
+/// last one that counts.
+pub fn counted_frames(frames: &[Frame], displacement_m: f64) -> Vec<Frame> {
+    let mut counted: Vec<Frame> = Vec::with_capacity(frames.len());
+    for frame in frames {
+        let moved = counted
+            .last()
+            .is_none_or(|last| distance_m(last, frame) >= displacement_m);
+        if moved {
+            counted.push(frame.clone());
+        }
+    }
+    counted
+}
+
+/// Cuts counted frames into local maps of `local_map_size` scans, the last with what is left,
+/// each meshed with the frames within `overlap_m` of path before and after.
+pub fn local_maps(frames: &[Frame], local_map_size: usize, overlap_m: f64) -> Vec<LocalMapPlan> {
+    (0..frames.len())
+        .step_by(local_map_size)
+        .enumerate()
+        .map(|(number, start)| {
+            let own = start..(start + local_map_size).min(frames.len());
+            let near = |a: usize, b: usize| distance_m(&frames[a], &frames[b]) <= overlap_m;
+            let mut used = own.clone();
+            while used.start > 0 && near(used.start - 1, own.start) {
+                used.start -= 1;
+            }
+            while used.end < frames.len() && near(used.end, own.end - 1) {
+                used.end += 1;
+            }
+            LocalMapPlan { number, own, used }
+        })
+        .collect()
+}
+
+fn distance_m(a: &Frame, b: &Frame) -> f64 {
+    (a.map_from_lidar.translation.vector - b.map_from_lidar.translation.vector).norm()
+}
+
+/// Which local map owns a place: that of the nearest counted scan.
+#[derive(Clone, Debug)]
+pub struct Ownership {
+    grid: Grid2,
+    owners: Vec<u32>,
+}
+
+impl Ownership {
+    /// Over all places within `reach_m` of a counted scan.
+    pub fn new(frames: &[Frame], plans: &[LocalMapPlan], reach_m: f64) -> Self {
+        let positions: Vec<[f64; 2]> = frames
+            .iter()
+            .map(|frame| {
+                let t = frame.map_from_lidar.translation.vector;
+                [t.x, t.y]
+            })
+            .collect();
+        let corner = |pick: fn(f64, f64) -> f64, start: f64, margin_m: f64| {
+            let along =
+                |axis: usize| positions.iter().map(|p| p[axis]).fold(start, pick) + margin_m;
+            Point2::new(along(0), along(1))
+        };
+        let grid = Grid2::covering(
+            corner(f64::min, f64::INFINITY, -reach_m),
+            corner(f64::max, f64::NEG_INFINITY, reach_m),
+            OWNER_CELL_M,
+        );
+        let mut owner_of_frame = vec![0; frames.len()];
+        for plan in plans {
+            owner_of_frame[plan.own.clone()].fill(plan.number as u32);
+        }
+        let tree: ImmutableKdTree<f64, 2> = ImmutableKdTree::new_from_slice(&positions)
+            .expect("positions of frames are finite and at least one");
+        let owners = (0..grid.len())
+            .map(|index| {
+                let center = grid.center(index % grid.columns, index / grid.columns);
+                let nearest = tree
+                    .query(&[center.x, center.y])
+                    .nearest_one::<SquaredEuclidean<f64>>()
+                    .execute();
+                owner_of_frame[nearest.item as usize]
+            })
+            .collect();
+        Self { grid, owners }
+    }
+
+    /// The number of the local map that owns a place; `None` out of reach of all.
+    pub fn owner_at(&self, x: f64, y: f64) -> Option<usize> {
+        self.grid
+            .index_at(x, y)
+            .map(|index| self.owners[index] as usize)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Pose3;
+
+    fn drive(positions_m: impl IntoIterator<Item = f64>) -> Vec<Frame> {
+        positions_m
+            .into_iter()
+            .enumerate()
+            .map(|(number, x)| Frame {
+                number,
+                scan_path: String::new().into(),
+                time_s: 0.0,
+                map_from_lidar: Pose3::translation(x, 0.0, 0.0),
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_standing_car_adds_one_scan_and_a_creeping_one_some() {
+        let standing = drive([0.0; 50]);
+        assert_eq!(counted_frames(&standing, 0.2).len(), 1);
+        let creeping = drive((0..50).map(|i| 0.05 * f64::from(i)));
+        assert_eq!(counted_frames(&creeping, 0.199).len(), 13);
+    }
+
+    #[test]
+    fn every_counted_scan_is_in_exactly_one_local_map() {
+        let frames = drive((0..23).map(f64::from));
+        let plans = local_maps(&frames, 10, 2.0);
+        let owned: Vec<usize> = plans.iter().flat_map(|plan| plan.own.clone()).collect();
+        assert_eq!(owned, (0..23).collect::<Vec<_>>());
+        assert_eq!(plans[1].used, 8..22);
+        assert_eq!(plans[2].used, 18..23);
+    }
+
+    #[test]
+    fn a_place_belongs_to_the_local_map_of_the_nearest_scan() {
+        let frames = drive((0..20).map(f64::from));
+        let plans = local_maps(&frames, 10, 2.0);
+        let ownership = Ownership::new(&frames, &plans, 30.0);
+        assert_eq!(ownership.owner_at(3.0, 20.0), Some(0));
+        assert_eq!(ownership.owner_at(9.1, -20.0), Some(0));
+        assert_eq!(ownership.owner_at(9.9, -20.0), Some(1));
+        assert_eq!(ownership.owner_at(40.0, 0.0), Some(1));
+        assert_eq!(ownership.owner_at(60.0, 0.0), None);
+    }
+}

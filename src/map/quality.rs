@@ -1,0 +1,204 @@
+//! How good a map is, along the beams of scans that did not build it.
+//!
+//! A map whose points all lie on surfaces can still be useless: what counts is what a beam
+//! from the sensor meets first. For every beam
+//!
+//! ```text
+//! residual   = mapped range − measured range
+//! beam-plane = |residual| · |cos(incidence)|      the distance to the plane that was hit
+//! ```
+//!
+//! early: residual < −0.5 m (ghosts, trails, invented surfaces); late: > 0.5 m (a moving object in
+//! the scan, or a hole); miss: nothing there.
+
+use glam::Vec3;
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::scan_cloud::ScanSettings;
+use crate::geometry::{Rigid3f, TriangleMesh};
+use crate::kitti::{Frame, KittiError};
+use crate::raycasting::{Hit, Scene};
+
+/// A residual beyond this is early or late [m].
+const GROSS_M: f32 = 0.5;
+/// A beam-plane distance below this counts as "within" [m].
+const NEAR_M: f32 = 0.1;
+/// Beams shorter than this are the own car's surroundings and not judged [m].
+const NEAREST_M: f32 = 3.0;
+/// Every how manieth beam is judged.
+const BEAM_STEP: usize = 7;
+
+/// Shares of all judged beams (unitless), and medians over those that hit [m].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct MapQuality {
+    /// Judged beams.
+    pub beams: usize,
+    /// Share stopped half a metre or more too early.
+    pub early: f64,
+    /// Share stopped half a metre or more too late.
+    pub late: f64,
+    /// Share that meets nothing.
+    pub miss: f64,
+    /// Median distance to the plane that was hit [m].
+    pub beam_plane_median_m: f64,
+    /// Share whose beam-plane distance is under 10 cm.
+    pub beam_plane_within_10cm: f64,
+    /// Median |residual| [m].
+    pub ray_median_m: f64,
+    /// Median residual [m].
+    pub bias_m: f64,
+}
+
+/// A judged beam.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BeamResidual {
+    /// Where the beam was returned, map frame.
+    pub point_in_map: Vec3,
+    /// Mapped minus measured range [m]; infinite where the map has nothing.
+    pub residual_m: f32,
+    /// |residual| times cosine of incidence [m].
+    pub beam_plane_m: f32,
+}
+
+/// Judges a map along the beams of frames, inside the crop box of the settings.
+pub fn residuals(
+    mesh: &TriangleMesh,
+    frames: &[Frame],
+    settings: &ScanSettings,
+) -> Result<Vec<BeamResidual>, KittiError> {
+    let scene = Scene::new(mesh);
+    let per_frame = frames
+        .par_iter()
+        .map(|frame| {
+            let mut scan = frame.read()?;
+            scan.drop_invalid(&settings.range_image);
+            let points: Vec<Vec3> = scan
+                .points
+                .into_iter()
+                .filter(|point| point.length() > NEAREST_M)
+                .step_by(BEAM_STEP)
+                .filter(|point| point.abs().cmplt(settings.crop_m).all())
+                .collect();
+            let map_from_lidar = Rigid3f::from(&frame.map_from_lidar);
+            Ok(judge(mesh, &scene, &map_from_lidar, &points))
+        })
+        .collect::<Result<Vec<_>, KittiError>>()?;
+    Ok(per_frame.into_iter().flatten().collect())
+}
+
+fn judge(
+    mesh: &TriangleMesh,
+    scene: &Scene,
+    map_from_lidar: &Rigid3f,
+    points: &[Vec3],
+) -> Vec<BeamResidual> {
+    let directions: Vec<Vec3> = points
+        .iter()
+        .map(|&point| map_from_lidar.rotate(point.normalize()))
+        .collect();
+    let mut hits = vec![Hit::MISS; points.len()];
+    scene.cast(map_from_lidar.translation, &directions, &mut hits);
+    points
+        .iter()
+        .zip(&directions)
+        .zip(&hits)
+        .map(|((&point, &direction), hit)| {
+            let residual_m = hit.range_m - point.length();
+            let beam_plane_m = if hit.triangle == Hit::NO_TRIANGLE {
+                f32::INFINITY
+            } else {
+                let normal = mesh
+                    .scaled_normal(hit.triangle as usize)
+                    .normalize_or_zero();
+                residual_m.abs() * normal.dot(direction).abs()
+            };
+            BeamResidual {
+                point_in_map: map_from_lidar.apply(point),
+                residual_m,
+                beam_plane_m,
+            }
+        })
+        .collect()
+}
+
+impl MapQuality {
+    /// Sums residuals up; `None` without any.
+    pub fn of(residuals: &[BeamResidual]) -> Option<Self> {
+        let hits: Vec<&BeamResidual> = residuals
+            .iter()
+            .filter(|beam| beam.residual_m.is_finite())
+            .collect();
+        if hits.is_empty() {
+            return None;
+        }
+        let share = |count: usize| count as f64 / residuals.len() as f64;
+        let count =
+            |of: &dyn Fn(&BeamResidual) -> bool| share(hits.iter().filter(|beam| of(beam)).count());
+        Some(Self {
+            beams: residuals.len(),
+            early: count(&|beam| beam.residual_m < -GROSS_M),
+            late: count(&|beam| beam.residual_m > GROSS_M),
+            miss: share(residuals.len() - hits.len()),
+            beam_plane_median_m: median(hits.iter().map(|beam| beam.beam_plane_m)),
+            beam_plane_within_10cm: count(&|beam| beam.beam_plane_m < NEAR_M),
+            ray_median_m: median(hits.iter().map(|beam| beam.residual_m.abs())),
+            bias_m: median(hits.iter().map(|beam| beam.residual_m)),
+        })
+    }
+}
+
+fn median(values: impl Iterator<Item = f32>) -> f64 {
+    let mut values: Vec<f32> = values.collect();
+    let middle = values.len() / 2;
+    let (_, median, _) = values.select_nth_unstable_by(middle, f32::total_cmp);
+    f64::from(*median)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A wall across the x axis.
+    fn wall(x: f32) -> TriangleMesh {
+        TriangleMesh {
+            vertices: vec![
+                Vec3::new(x, -50.0, -50.0),
+                Vec3::new(x, 50.0, -50.0),
+                Vec3::new(x, 0.0, 50.0),
+            ],
+            triangles: vec![[0, 1, 2]],
+            ..TriangleMesh::default()
+        }
+    }
+
+    fn judged(wall_x: f32, points: &[Vec3]) -> MapQuality {
+        let mesh = wall(wall_x);
+        let identity = Rigid3f::from(&crate::geometry::Pose3::identity());
+        MapQuality::of(&judge(&mesh, &Scene::new(&mesh), &identity, points)).unwrap()
+    }
+
+    #[test]
+    fn early_late_and_missing_are_told_apart() {
+        let points = [
+            Vec3::new(10.0, 0.0, 0.0),
+            Vec3::new(12.0, 0.0, 0.0),
+            Vec3::new(8.0, 0.0, 0.0),
+            Vec3::new(-10.0, 0.0, 0.0),
+        ];
+        let quality = judged(10.0, &points);
+        assert_eq!(
+            (quality.early, quality.late, quality.miss),
+            (0.25, 0.25, 0.25)
+        );
+    }
+
+    #[test]
+    fn a_grazing_beam_counts_by_its_distance_to_the_plane() {
+        // 45 degrees of incidence, the wall 5 cm behind the point.
+        let quality = judged(10.05, &[Vec3::new(10.0, 10.0, 0.0)]);
+        assert!((quality.beam_plane_median_m - 0.05).abs() < 1e-4);
+        assert!((quality.ray_median_m - 0.05 * 2.0_f64.sqrt()).abs() < 1e-4);
+        assert!((quality.bias_m - quality.ray_median_m).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,42 @@
+//! Several batches of work in flight, their results taken in the order in which they were given.
+
+use std::collections::VecDeque;
+
+use super::device::{Gpu, InFlight};
+use crate::rendering::RenderError;
+
+/// While one is read back, one runs and one waits.
+const IN_FLIGHT: usize = 3;
+
+/// Starts every batch and finishes it once so many others have been started after it.
+pub(super) fn run<B>(
+    gpu: &Gpu,
+    batches: impl IntoIterator<Item = B>,
+    mut start: impl FnMut(&B) -> InFlight,
+    mut finish: impl FnMut(B, Vec<f32>),
+) -> Result<(), RenderError> {
+    let mut started: VecDeque<(B, InFlight)> = VecDeque::new();
+    for batch in batches {
+        if started.len() == IN_FLIGHT {
+            finish_first(gpu, &mut started, &mut finish)?;
+        }
+        let work = start(&batch);
+        gpu.check()?;
+        started.push_back((batch, work));
+    }
+    while !started.is_empty() {
+        finish_first(gpu, &mut started, &mut finish)?;
+    }
+    Ok(())
+}
+
+fn finish_first<B>(
+    gpu: &Gpu,
+    started: &mut VecDeque<(B, InFlight)>,
+    finish: &mut impl FnMut(B, Vec<f32>),
+) -> Result<(), RenderError> {
+    if let Some((batch, work)) = started.pop_front() {
+        finish(batch, gpu.fetch(&work)?);
+    }
+    Ok(())
+}

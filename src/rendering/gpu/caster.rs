@@ -1,0 +1,373 @@
+//! Rays and beams cast by compute shaders; twin of `caster.wgsl` and `reduce.wgsl`.
+
+use std::f32::consts::PI;
+use std::ops::Range;
+
+use wgpu::{BindGroup, Buffer, BufferUsages, CommandEncoder, ComputePipeline};
+
+use super::batches;
+use super::device::{Gpu, InFlight};
+use super::layout::{BEAMS_PER_GROUP, FAR, LANES, Pose, Query, Reduction};
+use super::scene::Scene;
+use super::shaders;
+use crate::geometry::Vec3;
+use crate::lidar::Beam;
+use crate::rendering::{RangeDifference, RenderError};
+
+/// How much is given to the device at once.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct BatchSizes {
+    /// Rays whose ranges are read back.
+    pub ranges: usize,
+    /// Beams that are compared.
+    pub beams: usize,
+    /// Directions, which are counted in work groups of one dimension (65,535 of 64).
+    pub directions: usize,
+    /// Poses, which are the work groups of the other dimension.
+    pub poses: usize,
+}
+
+impl Default for BatchSizes {
+    /// 16 MB of ranges; as many beams as take a fraction of a second on a slow card.
+    fn default() -> Self {
+        Self {
+            ranges: 1 << 22,
+            beams: 1 << 24,
+            directions: 1 << 20,
+            poses: 65_535,
+        }
+    }
+}
+
+/// Pipelines over a map.
+pub(super) struct Caster {
+    pub batch_sizes: BatchSizes,
+    cast: Kernel,
+    compare: Kernel,
+    add_up: ComputePipeline,
+}
+
+/// A pipeline and the map bound to it.
+struct Kernel {
+    pipeline: ComputePipeline,
+    scene: BindGroup,
+}
+
+/// Part of the poses against part of the directions.
+struct Batch {
+    poses: Range<usize>,
+    rays: usize,
+    /// Index of that part of the directions.
+    part: usize,
+}
+
+impl Caster {
+    pub fn new(gpu: &Gpu, scene: &Scene) -> Self {
+        let source = shaders::caster(scene.depth);
+        let kernel = |entry_point| {
+            let pipeline = pipeline(gpu, &source, entry_point);
+            let buffers = [&scene.nodes, &scene.triangles];
+            let scene = bind(gpu, &pipeline, 0, &buffers);
+            Kernel { pipeline, scene }
+        };
+        Self {
+            batch_sizes: BatchSizes::default(),
+            cast: kernel("cast_rays"),
+            compare: kernel("compare_beams"),
+            add_up: pipeline(gpu, shaders::REDUCE, "add_up"),
+        }
+    }
+
+    /// Ranges along directions of the lidar frame, one row per pose; [`FAR`] or more where no
+    /// surface is nearer than `far_m`.
+    pub fn cast(
+        &self,
+        gpu: &Gpu,
+        scene: &Scene,
+        poses: &[Pose],
+        (directions, far_m): (&[Vec3], f32),
+    ) -> Result<Vec<Vec<f32>>, RenderError> {
+        let parts = self.parts(gpu, directions, |_, place| f32::from_bits(place));
+        let query = Query {
+            far_m: far_m.min(FAR),
+            ..Query::new(scene, &RangeDifference::UNLIMITED)
+        };
+        let mut rows = vec![Vec::with_capacity(directions.len()); poses.len()];
+        batches::run(
+            gpu,
+            self.batches(poses.len(), &parts, self.batch_sizes.ranges),
+            |batch| {
+                let rays = (&parts[batch.part].buffer, batch.rays);
+                self.start_cast(gpu, query, &poses[batch.poses.clone()], rays)
+            },
+            |batch, ranges| {
+                for (pose, row) in batch.poses.zip(ranges.chunks(batch.rays)) {
+                    rows[pose].extend_from_slice(row);
+                }
+            },
+        )?;
+        Ok(rows)
+    }
+
+    /// Mean cost of the beams, one number per pose; 0 without beams.
+    pub fn compare(
+        &self,
+        gpu: &Gpu,
+        scene: &Scene,
+        poses: &[Pose],
+        (beams, difference): (&[Beam], &RangeDifference),
+    ) -> Result<Vec<f32>, RenderError> {
+        let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
+        let parts = self.parts(gpu, &directions, |index, _| beams[index].range_m);
+        let query = Query::new(scene, difference);
+        let mut totals = vec![0.0_f64; poses.len()];
+        batches::run(
+            gpu,
+            self.batches(poses.len(), &parts, self.batch_sizes.beams),
+            |batch| {
+                let rays = (&parts[batch.part].buffer, batch.rays);
+                self.start_compare(gpu, query, &poses[batch.poses.clone()], rays)
+            },
+            |batch, sums| {
+                for (pose, sum) in batch.poses.zip(sums) {
+                    totals[pose] += f64::from(sum);
+                }
+            },
+        )?;
+        let count = beams.len().max(1) as f64;
+        Ok(totals.iter().map(|total| (total / count) as f32).collect())
+    }
+
+    /// Sends directions in parts, each in an order in which neighbours look the same way. `fourth`
+    /// makes the fourth number of a direction from its index and its place in its part.
+    fn parts(
+        &self,
+        gpu: &Gpu,
+        directions: &[Vec3],
+        fourth: impl Fn(usize, u32) -> f32,
+    ) -> Vec<Part> {
+        let size = self
+            .batch_sizes
+            .directions
+            .min((gpu.max_binding_bytes() / 16) as usize);
+        let part = |(number, part): (usize, &[Vec3])| {
+            let rays: Vec<[f32; 4]> = coherent_order(part)
+                .into_iter()
+                .map(|place| {
+                    let fourth = fourth(number * size + place as usize, place);
+                    part[place as usize].extend(fourth).to_array()
+                })
+                .collect();
+            Part {
+                buffer: gpu.upload("rays", &rays, BufferUsages::STORAGE),
+                rays: rays.len(),
+            }
+        };
+        directions.chunks(size).enumerate().map(part).collect()
+    }
+
+    /// All poses against all parts, `rays_per_batch` at most unless a single pose has more.
+    fn batches(&self, poses: usize, parts: &[Part], rays_per_batch: usize) -> Vec<Batch> {
+        let mut batches = Vec::new();
+        for (number, part) in parts.iter().enumerate() {
+            let step = (rays_per_batch / part.rays).clamp(1, self.batch_sizes.poses);
+            for first in (0..poses).step_by(step) {
+                batches.push(Batch {
+                    poses: first..poses.min(first + step),
+                    rays: part.rays,
+                    part: number,
+                });
+            }
+        }
+        batches
+    }
+
+    fn start_cast(
+        &self,
+        gpu: &Gpu,
+        query: Query,
+        poses: &[Pose],
+        (rays, count): (&Buffer, usize),
+    ) -> InFlight {
+        let groups = (count as u32).div_ceil(LANES);
+        let bytes = (poses.len() * count * size_of::<f32>()) as u64;
+        let ranges = results(gpu, bytes);
+        let query = Query {
+            rays: count as u32,
+            groups,
+            ..query
+        };
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        self.cast
+            .encode(gpu, &mut encoder, query, poses, [rays, &ranges]);
+        read_back(gpu, encoder, &ranges, bytes)
+    }
+
+    fn start_compare(
+        &self,
+        gpu: &Gpu,
+        query: Query,
+        poses: &[Pose],
+        (rays, count): (&Buffer, usize),
+    ) -> InFlight {
+        let groups = (count as u32).div_ceil(BEAMS_PER_GROUP);
+        let per_number = size_of::<f32>() as u64;
+        let sums = results(gpu, poses.len() as u64 * u64::from(groups) * per_number);
+        let bytes = poses.len() as u64 * per_number;
+        let totals = results(gpu, bytes);
+        let query = Query {
+            rays: count as u32,
+            groups,
+            ..query
+        };
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        self.compare
+            .encode(gpu, &mut encoder, query, poses, [rays, &sums]);
+        let reduction = Reduction {
+            terms: groups,
+            unused: [0; 3],
+        };
+        let reduction = gpu.upload("reduction", &[reduction], BufferUsages::UNIFORM);
+        let bound = bind(gpu, &self.add_up, 0, &[&reduction, &sums, &totals]);
+        let mut pass = encoder.begin_compute_pass(&Default::default());
+        pass.set_pipeline(&self.add_up);
+        pass.set_bind_group(0, &bound, &[]);
+        pass.dispatch_workgroups(poses.len() as u32, 1, 1);
+        drop(pass);
+        read_back(gpu, encoder, &totals, bytes)
+    }
+}
+
+impl Kernel {
+    /// One work group of the query per pose and group.
+    fn encode(
+        &self,
+        gpu: &Gpu,
+        encoder: &mut CommandEncoder,
+        query: Query,
+        poses: &[Pose],
+        [rays, results]: [&Buffer; 2],
+    ) {
+        let groups = query.groups;
+        let query = gpu.upload("query", &[query], BufferUsages::UNIFORM);
+        let buffer = gpu.upload("poses", poses, BufferUsages::STORAGE);
+        let bound = bind(gpu, &self.pipeline, 1, &[&query, &buffer, rays, results]);
+        let mut pass = encoder.begin_compute_pass(&Default::default());
+        pass.set_pipeline(&self.pipeline);
+        pass.set_bind_group(0, &self.scene, &[]);
+        pass.set_bind_group(1, &bound, &[]);
+        pass.dispatch_workgroups(groups, poses.len() as u32, 1);
+    }
+}
+
+impl Query {
+    fn new(scene: &Scene, difference: &RangeDifference) -> Self {
+        Self {
+            rays: 0,
+            groups: 0,
+            root: scene.root,
+            unused: 0,
+            far_m: FAR,
+            short_m: difference.short_m.min(FAR),
+            long_m: difference.long_m.min(FAR),
+            no_surface_m: difference.no_surface_m.min(FAR),
+        }
+    }
+}
+
+/// Some of the directions, on the device.
+struct Part {
+    buffer: Buffer,
+    rays: usize,
+}
+
+/// Places of directions along a Z-curve over azimuth and elevation: threads that run side by side
+/// then go the same way through the hierarchy.
+fn coherent_order(directions: &[Vec3]) -> Vec<u32> {
+    let key = |direction: Vec3| {
+        let azimuth = (direction.y.atan2(direction.x) / PI + 1.0) * 511.0;
+        let height = (direction.z + 1.0) * 511.0;
+        spread(azimuth as u32) | spread(height as u32) << 1
+    };
+    let mut order: Vec<u32> = (0..directions.len() as u32).collect();
+    order.sort_by_cached_key(|&place| key(directions[place as usize]));
+    order
+}
+
+/// Puts a zero before each of the lowest 16 bits.
+fn spread(mut bits: u32) -> u32 {
+    bits = (bits | bits << 8) & 0x00ff_00ff;
+    bits = (bits | bits << 4) & 0x0f0f_0f0f;
+    bits = (bits | bits << 2) & 0x3333_3333;
+    (bits | bits << 1) & 0x5555_5555
+}
+
+fn pipeline(gpu: &Gpu, source: &str, entry_point: &str) -> ComputePipeline {
+    let module = shaders::module(gpu, source);
+    gpu.device
+        .create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(entry_point),
+            layout: None,
+            module: &module,
+            entry_point: Some(entry_point),
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            cache: None,
+        })
+}
+
+/// Binds buffers to 0, 1, 2 … of a group.
+fn bind(gpu: &Gpu, pipeline: &ComputePipeline, group: u32, buffers: &[&Buffer]) -> BindGroup {
+    let layout = pipeline.get_bind_group_layout(group);
+    shaders::bind(gpu, &layout, buffers)
+}
+
+fn results(gpu: &Gpu, bytes: u64) -> Buffer {
+    let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC;
+    gpu.buffer("results", bytes, usage)
+}
+
+fn read_back(gpu: &Gpu, mut encoder: CommandEncoder, results: &Buffer, bytes: u64) -> InFlight {
+    let staging = gpu.staging(bytes);
+    encoder.copy_buffer_to_buffer(results, 0, &staging, 0, bytes);
+    gpu.submit(encoder, staging, bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lidar::LidarModel;
+
+    #[test]
+    fn the_coherent_order_is_a_permutation_in_which_neighbours_look_the_same_way() {
+        let directions = LidarModel::default().directions();
+        let order = coherent_order(&directions);
+        let mut sorted = order.clone();
+        sorted.sort_unstable();
+        assert!(
+            sorted
+                .iter()
+                .enumerate()
+                .all(|(i, &place)| i == place as usize)
+        );
+
+        let widest = |order: &[u32]| -> f32 {
+            let groups = order.chunks(32);
+            let widths = groups.map(|group| {
+                let first = directions[group[0] as usize];
+                group
+                    .iter()
+                    .map(|&place| first.angle_between(directions[place as usize]))
+                    .fold(0.0, f32::max)
+            });
+            widths.sum()
+        };
+        let row_by_row: Vec<u32> = (0..order.len() as u32).collect();
+        assert!(widest(&order) < 0.7 * widest(&row_by_row));
+    }
+
+    #[test]
+    fn spreading_leaves_room_for_another_number() {
+        assert_eq!(spread(0b1011), 0b100_0101);
+        assert_eq!(spread(0xffff) & spread(0xffff) << 1, 0);
+    }
+}

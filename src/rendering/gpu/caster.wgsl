@@ -1,0 +1,174 @@
+// Rays through a bounding volume hierarchy, nearer child first; what they met is written down
+// (`cast_rays`) or compared with what was measured (`compare_beams`).
+//
+// `ray.wgsl` stands before this text. Keep in sync with `layout.rs`: `Node`, `Query`, `LEAF`,
+// `LANES`, `BEAMS_PER_GROUP`, and the bits of a child; `STACK_SIZE` is replaced by `caster.rs`
+// with the depth of the hierarchy.
+
+const STACK_SIZE: u32 = 64u;
+const LANES: u32 = 64u;
+const BEAMS_PER_GROUP: u32 = 256u;
+
+// A child is the index of a node, or LEAF | number of triangles << 28 | first triangle.
+const LEAF: u32 = 0x80000000u;
+
+struct Node {
+    left_min: vec3f,
+    left: u32,
+    left_max: vec3f,
+    right: u32,
+    right_min: vec3f,
+    unused_0: u32,
+    right_max: vec3f,
+    unused_1: u32,
+}
+
+struct Query {
+    // Number of rays or beams.
+    rays: u32,
+    // Work groups per pose.
+    groups: u32,
+    // The child that leads to everything.
+    root: u32,
+    unused: u32,
+    // Surfaces at this range or farther are not met [m].
+    far_m: f32,
+    // As in `RangeDifference` [m].
+    short_m: f32,
+    long_m: f32,
+    no_surface_m: f32,
+}
+
+@group(0) @binding(0) var<storage, read> nodes: array<Node>;
+@group(0) @binding(1) var<storage, read> triangles: array<Triangle>;
+@group(1) @binding(0) var<uniform> query: Query;
+@group(1) @binding(1) var<storage, read> poses: array<Pose>;
+// Direction in the lidar frame; then where its result goes, or the measured range [m].
+@group(1) @binding(2) var<storage, read> rays: array<vec4f>;
+@group(1) @binding(3) var<storage, read_write> results: array<f32>;
+
+// Where a ray enters a box, FAR where it does not before `far_m`. The way out is put back by more
+// than divisions are rounded (2.5 units in the last place): a ray along a face enters the box.
+fn entry(low: vec3f, high: vec3f, origin: vec3f, inverse: vec3f, far_m: f32) -> f32 {
+    let one = (low - origin) * inverse;
+    let other = (high - origin) * inverse;
+    let near = min(one, other);
+    let far = max(one, other);
+    let enters = max(max(near.x, near.y), max(near.z, 0.0));
+    let leaves = min(min(far.x, far.y), far.z) * 1.000002;
+    return select(FAR, enters, enters <= min(leaves, far_m));
+}
+
+// 1 / direction, finite.
+fn inverse_of(direction: vec3f) -> vec3f {
+    let tiny = vec3f(1.0e-20);
+    return 1.0 / select(direction, tiny, abs(direction) < tiny);
+}
+
+// Range of the nearest surface before `far_m`; any that is at most `enough_m` will do.
+fn nearest(origin: vec3f, direction: vec3f, far_m: f32, enough_m: f32) -> f32 {
+    let inverse = inverse_of(direction);
+    var best = far_m;
+    var waiting: array<u32, STACK_SIZE>;
+    var waiting_from: array<f32, STACK_SIZE>;
+    var depth = 0u;
+    var child = query.root;
+    loop {
+        if (child & LEAF) != 0u {
+            let first = child & 0x0fffffffu;
+            let end = first + ((child >> 28u) & 7u);
+            for (var i = first; i < end; i++) {
+                best = min(best, range_to(triangles[i], origin, direction));
+            }
+            if best <= enough_m {
+                return best;
+            }
+        } else {
+            let node = nodes[child];
+            let left = entry(node.left_min, node.left_max, origin, inverse, best);
+            let right = entry(node.right_min, node.right_max, origin, inverse, best);
+            let left_first = left <= right;
+            if min(left, right) < FAR {
+                if max(left, right) < FAR {
+                    waiting[depth] = select(node.left, node.right, left_first);
+                    waiting_from[depth] = max(left, right);
+                    depth++;
+                }
+                child = select(node.right, node.left, left_first);
+                continue;
+            }
+        }
+        // The next one that can still hold something nearer.
+        var found = false;
+        while depth > 0u && !found {
+            depth--;
+            found = waiting_from[depth] < best;
+        }
+        if !found {
+            break;
+        }
+        child = waiting[depth];
+    }
+    return select(best, FAR, best >= far_m);
+}
+
+@compute @workgroup_size(64)
+fn cast_rays(@builtin(global_invocation_id) id: vec3u) {
+    if id.x >= query.rays {
+        return;
+    }
+    let pose = poses[id.y];
+    let ray = rays[id.x];
+    let direction = direction_in_map(pose, ray.xyz);
+    let range_m = nearest(pose.origin.xyz, direction, query.far_m, -1.0);
+    results[id.y * query.rays + bitcast<u32>(ray.w)] = range_m;
+}
+
+// Keep in sync with `RangeDifference::cost` in `mod.rs` of `rendering`.
+fn cost(measured_m: f32, rendered_m: f32) -> f32 {
+    if rendered_m >= FAR {
+        return min(measured_m, query.no_surface_m);
+    }
+    if rendered_m >= measured_m {
+        return min(rendered_m - measured_m, query.short_m);
+    }
+    return min(measured_m - rendered_m, query.long_m);
+}
+
+// A ray is followed only as far as it can change the cost: what is nearer than
+// measured - long_m costs long_m wherever it is; what is farther than measured + short_m costs
+// short_m, and where nothing at all costs as much, it does not matter whether it is there.
+fn cost_of(pose: Pose, beam: vec4f) -> f32 {
+    let measured_m = beam.w;
+    let nothing_is_short = min(measured_m, query.no_surface_m) == query.short_m;
+    let far_m = select(query.far_m, measured_m + query.short_m, nothing_is_short);
+    let direction = direction_in_map(pose, beam.xyz);
+    let enough_m = measured_m - query.long_m;
+    return cost(measured_m, nearest(pose.origin.xyz, direction, far_m, enough_m));
+}
+
+var<workgroup> sums: array<f32, LANES>;
+
+@compute @workgroup_size(64)
+fn compare_beams(
+    @builtin(workgroup_id) group: vec3u,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let first = group.x * BEAMS_PER_GROUP + lane;
+    let end = min(query.rays, (group.x + 1u) * BEAMS_PER_GROUP);
+    var sum = 0.0;
+    for (var i = first; i < end; i += LANES) {
+        sum += cost_of(poses[group.y], rays[i]);
+    }
+    sums[lane] = sum;
+    workgroupBarrier();
+    for (var half = LANES / 2u; half > 0u; half /= 2u) {
+        if lane < half {
+            sums[lane] += sums[lane + half];
+        }
+        workgroupBarrier();
+    }
+    if lane == 0u {
+        results[group.y * query.groups + group.x] = sums[0];
+    }
+}

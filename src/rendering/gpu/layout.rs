@@ -1,0 +1,117 @@
+//! What the shaders read, byte for byte.
+//!
+//! Keep in sync with `ray.wgsl`, `caster.wgsl`, `reduce.wgsl` and `raster.wgsl`; a test compares
+//! the sizes, and the parity tests the rest.
+
+use bytemuck::{Pod, Zeroable};
+
+use crate::geometry::{Pose3, Vec3};
+
+/// Farther than everything: "there is no surface". Shaders know no infinity.
+pub(super) const FAR: f32 = 3.0e38;
+/// Threads per work group.
+pub(super) const LANES: u32 = 64;
+/// Beams that one work group compares.
+pub(super) const BEAMS_PER_GROUP: u32 = 256;
+/// Two rectangles of two triangles: one in the image, one for what lies beyond its seam.
+pub(super) const VERTICES_PER_TRIANGLE: u32 = 12;
+/// Marks a child that is a leaf.
+pub(super) const LEAF: u32 = 1 << 31;
+/// Most triangles in a leaf.
+pub(super) const MAX_LEAF: usize = 7;
+
+/// The number by which a node refers to a leaf.
+pub(super) fn leaf(first: usize, count: usize) -> u32 {
+    debug_assert!(count <= MAX_LEAF && first < 1 << 28);
+    LEAF | (count as u32) << 28 | first as u32
+}
+
+/// Two children of the hierarchy and their boxes.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub(super) struct Node {
+    pub left_min: [f32; 3],
+    pub left: u32,
+    pub left_max: [f32; 3],
+    pub right: u32,
+    pub right_min: [f32; 3],
+    pub unused_0: u32,
+    pub right_max: [f32; 3],
+    pub unused_1: u32,
+}
+
+/// Corners relative to the centre of the map [m].
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub(super) struct Triangle {
+    pub corners: [[f32; 4]; 3],
+}
+
+impl Triangle {
+    pub fn new(corners: [Vec3; 3]) -> Self {
+        Self {
+            corners: corners.map(|corner| corner.extend(0.0).to_array()),
+        }
+    }
+}
+
+/// A pose relative to the centre of the map: the axes of the lidar frame, and its origin [m].
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub(super) struct Pose {
+    pub axes: [[f32; 4]; 3],
+    pub origin: [f32; 4],
+}
+
+impl Pose {
+    /// Subtracts the centre in `f64`, so that a pose far from the origin of the map keeps its digits.
+    pub fn new(map_from_lidar: &Pose3, center: nalgebra::Vector3<f64>) -> Self {
+        let rotation = map_from_lidar.rotation.to_rotation_matrix();
+        let four = |v: nalgebra::Vector3<f64>| [v.x as f32, v.y as f32, v.z as f32, 0.0];
+        Self {
+            axes: [0, 1, 2].map(|axis| four(rotation.matrix().column(axis).into_owned())),
+            origin: four(map_from_lidar.translation.vector - center),
+        }
+    }
+}
+
+/// What the caster is asked.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub(super) struct Query {
+    /// Number of rays or beams.
+    pub rays: u32,
+    /// Work groups per pose.
+    pub groups: u32,
+    /// The child that leads to everything.
+    pub root: u32,
+    pub unused: u32,
+    /// Surfaces at this range or farther are not met [m].
+    pub far_m: f32,
+    pub short_m: f32,
+    pub long_m: f32,
+    pub no_surface_m: f32,
+}
+
+/// How many numbers are added up per pose.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub(super) struct Reduction {
+    pub terms: u32,
+    pub unused: [u32; 3],
+}
+
+/// How images lie in the texture that they are drawn to.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub(super) struct Atlas {
+    pub width: u32,
+    pub height: u32,
+    pub columns: u32,
+    pub unused: u32,
+    pub atlas_size: [f32; 2],
+    pub fov_up_rad: f32,
+    pub fov_rad: f32,
+    pub far_m: f32,
+    pub unused_end: [u32; 3],
+}

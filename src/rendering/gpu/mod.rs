@@ -1,0 +1,164 @@
+//! The map as the sensor would see it, on a graphics card through wgpu (Vulkan, OpenGL).
+//!
+//! Two ways to a range image, which find the same ranges:
+//!
+//! - *cast*: a compute shader sends the rays through a bounding volume hierarchy. A ray costs
+//!   some dozens of boxes and a few triangles, however large the map is.
+//! - *draw*: the tiles that a pose can see are drawn, an instance per pose, on an atlas of
+//!   images; every triangle is a rectangle of pixels whose centre rays are then asked one by one.
+//!   Every triangle costs twelve vertices in every image.
+//!
+//! A range image has some 10⁴ to 10⁵ rays, the tiles around a car 10⁶ triangles: casting is the
+//! rule, drawing is there to be compared with. Arbitrary beams can only be cast. Comparisons are
+//! added up on the device; one number per pose is read back.
+//!
+//! Ranges are those of the plane of the triangle that the ray meets, by one text (`ray.wgsl`),
+//! whichever the way.
+
+mod batches;
+mod caster;
+mod device;
+mod forest;
+mod layout;
+mod raster;
+mod scene;
+mod shaders;
+
+use super::backend::{AdapterChoice, AdapterReport};
+use super::{RangeDifference, RangeRenderer, RenderError};
+use crate::geometry::{Pose3, TriangleMesh, Vec3};
+use crate::lidar::{Beam, LidarModel};
+
+use caster::Caster;
+use device::Gpu;
+use layout::FAR;
+use raster::Rasterizer;
+use scene::Scene;
+
+pub use device::adapters;
+
+/// How range images are made.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ImageMethod {
+    /// Rays through a hierarchy, by a compute shader.
+    Cast,
+    /// Triangles on an atlas, by the rasterizer.
+    Draw,
+}
+
+/// Renders on a graphics device that holds the whole map.
+pub struct GpuRenderer {
+    gpu: Gpu,
+    scene: Scene,
+    caster: Caster,
+    rasterizer: Option<Rasterizer>,
+}
+
+impl GpuRenderer {
+    /// Opens the best adapter that may be taken and sends it the map.
+    ///
+    /// # Errors
+    /// [`RenderError::NoAdapter`] where none may be taken, [`RenderError::MapTooLarge`] where the
+    /// map does not fit what the device binds, and the device's own faults.
+    pub fn new(tiles: &[TriangleMesh], choice: AdapterChoice) -> Result<Self, RenderError> {
+        let gpu = Gpu::open(choice)?;
+        let scene = Scene::upload(&gpu, tiles)?;
+        let caster = Caster::new(&gpu, &scene);
+        let rasterizer = gpu.can_rasterize.then(|| Rasterizer::new(&gpu));
+        gpu.check()?;
+        Ok(Self {
+            gpu,
+            scene,
+            caster,
+            rasterizer,
+        })
+    }
+
+    /// The adapter that renders.
+    pub fn adapter(&self) -> &AdapterReport {
+        &self.gpu.report
+    }
+
+    /// What the map takes on the device [bytes].
+    pub fn map_bytes(&self) -> u64 {
+        self.scene.bytes
+    }
+
+    /// [`RangeRenderer::render`] in a given way.
+    ///
+    /// # Errors
+    /// The device's faults; [`RenderError::DeviceRefused`] where images are to be drawn that fit
+    /// no texture, or on a device that cannot draw.
+    pub fn render_by(
+        &self,
+        method: ImageMethod,
+        map_from_lidar: &[Pose3],
+        model: &LidarModel,
+    ) -> Result<Vec<Vec<f32>>, RenderError> {
+        let (gpu, scene) = (&self.gpu, &self.scene);
+        let poses = scene.poses(map_from_lidar);
+        let mut images = match (method, &self.rasterizer) {
+            (ImageMethod::Cast, _) => {
+                let rays = model.directions();
+                self.caster
+                    .cast(gpu, scene, &poses, (&rays, model.max_range))?
+            }
+            (ImageMethod::Draw, Some(rasterizer)) => rasterizer.draw(gpu, scene, &poses, model)?,
+            (ImageMethod::Draw, None) => {
+                return Err(RenderError::DeviceRefused {
+                    reason: "its drawing stages read no storage buffers".to_owned(),
+                });
+            }
+        };
+        for range_m in images.iter_mut().flatten() {
+            if *range_m >= FAR || !model.accepts_range(*range_m) {
+                *range_m = f32::INFINITY;
+            }
+        }
+        Ok(images)
+    }
+}
+
+impl RangeRenderer for GpuRenderer {
+    fn name(&self) -> String {
+        format!("gpu: {}", self.gpu.report)
+    }
+
+    fn render(
+        &self,
+        map_from_lidar: &[Pose3],
+        model: &LidarModel,
+    ) -> Result<Vec<Vec<f32>>, RenderError> {
+        self.render_by(ImageMethod::Cast, map_from_lidar, model)
+    }
+
+    fn cast(
+        &self,
+        map_from_lidar: &[Pose3],
+        directions: &[Vec3],
+    ) -> Result<Vec<Vec<f32>>, RenderError> {
+        let poses = self.scene.poses(map_from_lidar);
+        let rays = (directions, f32::INFINITY);
+        let mut rows = self.caster.cast(&self.gpu, &self.scene, &poses, rays)?;
+        for range_m in rows.iter_mut().flatten() {
+            if *range_m >= FAR {
+                *range_m = f32::INFINITY;
+            }
+        }
+        Ok(rows)
+    }
+
+    fn compare(
+        &self,
+        map_from_lidar: &[Pose3],
+        beams: &[Beam],
+        difference: &RangeDifference,
+    ) -> Result<Vec<f32>, RenderError> {
+        let poses = self.scene.poses(map_from_lidar);
+        self.caster
+            .compare(&self.gpu, &self.scene, &poses, (beams, difference))
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,340 @@
+//! Range images by drawing, one instance per pose and tile; twin of `raster.wgsl`.
+
+use std::ops::Range;
+
+use wgpu::{BufferUsages, RenderPipeline, TextureFormat, TextureUsages};
+
+use super::batches;
+use super::device::{Gpu, InFlight};
+use super::layout::{self, FAR, Pose, VERTICES_PER_TRIANGLE};
+use super::scene::Scene;
+use super::shaders;
+use crate::geometry::Vec3;
+use crate::lidar::LidarModel;
+use crate::rendering::RenderError;
+
+/// Most images in an atlas.
+const IMAGES_PER_ATLAS: usize = 64;
+/// Most pixels in an atlas, unless a single image has more: 64 MB of ranges.
+const PIXELS_PER_ATLAS: usize = 1 << 24;
+/// Rows of a texture are copied in multiples of 256 bytes.
+const ROW_PIXELS: u32 = wgpu::COPY_BYTES_PER_ROW_ALIGNMENT / 4;
+const RANGES: TextureFormat = TextureFormat::R32Uint;
+const DEPTH: TextureFormat = TextureFormat::Depth32Float;
+/// Depth is range / limit; as large a limit as any keeps it a normal number.
+const LARGEST_LIMIT_M: f32 = 1e30;
+
+/// The pipeline.
+pub(super) struct Rasterizer {
+    pipeline: RenderPipeline,
+}
+
+/// How images lie in a texture.
+#[derive(Clone, Copy, Debug)]
+struct Sheet {
+    columns: usize,
+    rows: usize,
+    /// Of the texture [pixels].
+    width: u32,
+    height: u32,
+}
+
+impl Sheet {
+    /// A texture for as many of the images as fit; `None` where not even one does.
+    fn fitting(images: usize, model: &LidarModel, largest: u32) -> Option<Self> {
+        let largest_row = (largest - largest % ROW_PIXELS) as usize;
+        let most = (PIXELS_PER_ATLAS / model.len().max(1)).clamp(1, IMAGES_PER_ATLAS);
+        let most = most.min(images.max(1));
+        let columns = (largest_row / model.width.max(1)).min(most);
+        let rows = (largest as usize / model.height.max(1)).min(most.div_ceil(columns.max(1)));
+        (columns > 0 && rows > 0).then(|| Self {
+            columns,
+            rows,
+            width: ((columns * model.width) as u32).next_multiple_of(ROW_PIXELS),
+            height: (rows * model.height) as u32,
+        })
+    }
+
+    fn images(&self) -> usize {
+        self.columns * self.rows
+    }
+
+    fn pixels(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
+    /// Cuts an image out of the texels of the texture.
+    fn image(&self, texels: &[f32], slot: usize, model: &LidarModel) -> Vec<f32> {
+        let left = slot % self.columns * model.width;
+        let top = slot / self.columns * model.height;
+        (top..top + model.height)
+            .flat_map(|row| {
+                let start = row * self.width as usize + left;
+                &texels[start..start + model.width]
+            })
+            .copied()
+            .collect()
+    }
+}
+
+/// Tiles and the poses of a batch that see them.
+struct Instances {
+    /// Slots in the atlas, tile by tile.
+    slots: Vec<u32>,
+    /// Vertices and instances of each draw.
+    draws: Vec<(Range<u32>, Range<u32>)>,
+}
+
+impl Instances {
+    fn of(scene: &Scene, poses: &[Pose], far_m: f32) -> Self {
+        let mut slots = Vec::new();
+        let mut draws = Vec::new();
+        for tile in &scene.tiles {
+            let first = slots.len() as u32;
+            let sees = |pose: &Pose| {
+                let [x, y, z, _] = pose.origin;
+                tile.distance_to(Vec3::new(x, y, z)) <= far_m
+            };
+            slots.extend(
+                (0..)
+                    .zip(poses)
+                    .filter(|(_, p)| sees(p))
+                    .map(|(slot, _)| slot),
+            );
+            let vertices = tile.triangles.start * VERTICES_PER_TRIANGLE
+                ..tile.triangles.end * VERTICES_PER_TRIANGLE;
+            draws.push((vertices, first..slots.len() as u32));
+        }
+        Self { slots, draws }
+    }
+}
+
+impl Rasterizer {
+    pub fn new(gpu: &Gpu) -> Self {
+        let module = shaders::module(gpu, shaders::RASTER);
+        let slot = wgpu::VertexBufferLayout {
+            array_stride: 4,
+            step_mode: wgpu::VertexStepMode::Instance,
+            attributes: &wgpu::vertex_attr_array![0 => Uint32],
+        };
+        let pipeline = gpu
+            .device
+            .create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+                label: Some("range images"),
+                layout: None,
+                vertex: wgpu::VertexState {
+                    module: &module,
+                    entry_point: Some("cover"),
+                    compilation_options: wgpu::PipelineCompilationOptions::default(),
+                    buffers: &[Some(slot)],
+                },
+                primitive: wgpu::PrimitiveState::default(),
+                depth_stencil: Some(wgpu::DepthStencilState {
+                    format: DEPTH,
+                    depth_write_enabled: Some(true),
+                    depth_compare: Some(wgpu::CompareFunction::Less),
+                    stencil: wgpu::StencilState::default(),
+                    bias: wgpu::DepthBiasState::default(),
+                }),
+                multisample: wgpu::MultisampleState::default(),
+                fragment: Some(wgpu::FragmentState {
+                    module: &module,
+                    entry_point: Some("ask_ray"),
+                    compilation_options: wgpu::PipelineCompilationOptions::default(),
+                    targets: &[Some(RANGES.into())],
+                }),
+                multiview_mask: None,
+                cache: None,
+            });
+        Self { pipeline }
+    }
+
+    /// Ranges of all pixels, one image per pose; [`FAR`] or more where no surface is nearer than
+    /// the upper limit of the model.
+    pub fn draw(
+        &self,
+        gpu: &Gpu,
+        scene: &Scene,
+        poses: &[Pose],
+        model: &LidarModel,
+    ) -> Result<Vec<Vec<f32>>, RenderError> {
+        let largest = gpu.limits.max_texture_dimension_2d;
+        let sheet = Sheet::fitting(poses.len(), model, largest).ok_or_else(|| {
+            let (width, height) = (model.width, model.height);
+            RenderError::DeviceRefused {
+                reason: format!("images of {width}x{height} pixels, textures have {largest}"),
+            }
+        })?;
+        let directions: Vec<[f32; 4]> = model
+            .directions()
+            .iter()
+            .map(|direction| direction.extend(0.0).to_array())
+            .collect();
+        let directions = gpu.upload("directions", &directions, BufferUsages::STORAGE);
+        let mut images = Vec::with_capacity(poses.len());
+        batches::run(
+            gpu,
+            poses.chunks(sheet.images()),
+            |batch| self.start(gpu, scene, batch, (model, &sheet, &directions)),
+            |batch, texels| {
+                images.extend((0..batch.len()).map(|slot| sheet.image(&texels, slot, model)));
+            },
+        )?;
+        Ok(images)
+    }
+
+    fn start(
+        &self,
+        gpu: &Gpu,
+        scene: &Scene,
+        poses: &[Pose],
+        (model, sheet, directions): (&LidarModel, &Sheet, &wgpu::Buffer),
+    ) -> InFlight {
+        let far_m = model.max_range.min(LARGEST_LIMIT_M);
+        let instances = Instances::of(scene, poses, far_m);
+        let slots = gpu.upload("slots", &instances.slots, BufferUsages::VERTEX);
+        let atlas = layout::Atlas::new(model, sheet.columns, [sheet.width, sheet.height], far_m);
+        let atlas = gpu.upload("atlas", &[atlas], BufferUsages::UNIFORM);
+        let poses = gpu.upload("poses", poses, BufferUsages::STORAGE);
+        let buffers = [&scene.triangles, &atlas, &poses, directions];
+        let bound = shaders::bind(gpu, &self.pipeline.get_bind_group_layout(0), &buffers);
+
+        let ranges = texture(gpu, sheet, RANGES);
+        let depths = texture(gpu, sheet, DEPTH);
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        {
+            let mut pass = begin(&mut encoder, &ranges, &depths);
+            pass.set_pipeline(&self.pipeline);
+            pass.set_bind_group(0, &bound, &[]);
+            pass.set_vertex_buffer(0, slots.slice(..));
+            for (vertices, slots) in instances.draws {
+                if !slots.is_empty() {
+                    pass.draw(vertices, slots);
+                }
+            }
+        }
+        let bytes = (sheet.pixels() * size_of::<f32>()) as u64;
+        let staging = gpu.staging(bytes);
+        encoder.copy_texture_to_buffer(
+            ranges.as_image_copy(),
+            wgpu::TexelCopyBufferInfo {
+                buffer: &staging,
+                layout: wgpu::TexelCopyBufferLayout {
+                    offset: 0,
+                    bytes_per_row: Some(sheet.width * 4),
+                    rows_per_image: None,
+                },
+            },
+            ranges.size(),
+        );
+        gpu.submit(encoder, staging, bytes)
+    }
+}
+
+impl layout::Atlas {
+    fn new(model: &LidarModel, columns: usize, size: [u32; 2], far_m: f32) -> Self {
+        Self {
+            width: model.width as u32,
+            height: model.height as u32,
+            columns: columns as u32,
+            unused: 0,
+            atlas_size: size.map(|pixels| pixels as f32),
+            fov_up_rad: model.fov_up_rad(),
+            fov_rad: model.fov_rad(),
+            far_m,
+            unused_end: [0; 3],
+        }
+    }
+}
+
+fn texture(gpu: &Gpu, sheet: &Sheet, format: TextureFormat) -> wgpu::Texture {
+    gpu.device.create_texture(&wgpu::TextureDescriptor {
+        label: Some("atlas"),
+        size: wgpu::Extent3d {
+            width: sheet.width,
+            height: sheet.height,
+            depth_or_array_layers: 1,
+        },
+        mip_level_count: 1,
+        sample_count: 1,
+        dimension: wgpu::TextureDimension::D2,
+        format,
+        usage: TextureUsages::RENDER_ATTACHMENT | TextureUsages::COPY_SRC,
+        view_formats: &[],
+    })
+}
+
+/// Starts to draw on an atlas in which nothing is anywhere.
+fn begin<'a>(
+    encoder: &'a mut wgpu::CommandEncoder,
+    ranges: &wgpu::Texture,
+    depths: &wgpu::Texture,
+) -> wgpu::RenderPass<'a> {
+    let nothing = wgpu::Color {
+        r: f64::from(FAR.to_bits()),
+        ..wgpu::Color::BLACK
+    };
+    let (ranges, depths) = (
+        ranges.create_view(&Default::default()),
+        depths.create_view(&Default::default()),
+    );
+    encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+        label: None,
+        color_attachments: &[Some(wgpu::RenderPassColorAttachment {
+            view: &ranges,
+            depth_slice: None,
+            resolve_target: None,
+            ops: wgpu::Operations {
+                load: wgpu::LoadOp::Clear(nothing),
+                store: wgpu::StoreOp::Store,
+            },
+        })],
+        depth_stencil_attachment: Some(wgpu::RenderPassDepthStencilAttachment {
+            view: &depths,
+            depth_ops: Some(wgpu::Operations {
+                load: wgpu::LoadOp::Clear(1.0),
+                store: wgpu::StoreOp::Discard,
+            }),
+            stencil_ops: None,
+        }),
+        timestamp_writes: None,
+        occlusion_query_set: None,
+        multiview_mask: None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sheet_fits_its_texture_and_holds_all_images_where_that_is_possible() {
+        let model = LidarModel::default();
+        for images in [1, 2, 9, 10, 64] {
+            let sheet = Sheet::fitting(images, &model, 8192).unwrap();
+            assert!(sheet.images() >= images && sheet.images() < images + 9);
+            assert!(sheet.width <= 8192 && sheet.height <= 8192);
+            assert_eq!(sheet.width % 64, 0);
+        }
+        let wide = LidarModel {
+            width: 8193,
+            ..model
+        };
+        assert!(Sheet::fitting(1, &wide, 8192).is_none());
+    }
+
+    #[test]
+    fn images_are_cut_out_where_they_were_put() {
+        let model = LidarModel {
+            height: 2,
+            width: 3,
+            ..LidarModel::default()
+        };
+        let sheet = Sheet::fitting(4, &model, 64).unwrap();
+        let texels: Vec<f32> = (0..sheet.pixels()).map(|texel| texel as f32).collect();
+        assert_eq!(
+            sheet.image(&texels, 1, &model),
+            [3.0, 4.0, 5.0, 67.0, 68.0, 69.0]
+        );
+    }
+}

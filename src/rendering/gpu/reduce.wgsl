@@ -1,0 +1,42 @@
+// Adds up what the work groups of a pose found, one pose per work group, always in the same order.
+//
+// Keep in sync with `layout.rs`: `Reduction`, `LANES`.
+
+const LANES: u32 = 64u;
+
+struct Reduction {
+    // Numbers per pose.
+    terms: u32,
+    unused_0: u32,
+    unused_1: u32,
+    unused_2: u32,
+}
+
+@group(0) @binding(0) var<uniform> reduction: Reduction;
+@group(0) @binding(1) var<storage, read> terms: array<f32>;
+@group(0) @binding(2) var<storage, read_write> totals: array<f32>;
+
+var<workgroup> sums: array<f32, LANES>;
+
+@compute @workgroup_size(64)
+fn add_up(
+    @builtin(workgroup_id) group: vec3u,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let start = group.x * reduction.terms;
+    var sum = 0.0;
+    for (var i = lane; i < reduction.terms; i += LANES) {
+        sum += terms[start + i];
+    }
+    sums[lane] = sum;
+    workgroupBarrier();
+    for (var half = LANES / 2u; half > 0u; half /= 2u) {
+        if lane < half {
+            sums[lane] += sums[lane + half];
+        }
+        workgroupBarrier();
+    }
+    if lane == 0u {
+        totals[group.x] = sums[0];
+    }
+}

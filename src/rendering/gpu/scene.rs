@@ -1,0 +1,55 @@
+//! The map on the device.
+
+use nalgebra::Vector3;
+use wgpu::{Buffer, BufferUsages};
+
+use super::device::Gpu;
+use super::forest::{Forest, Tile};
+use super::layout::Pose;
+use crate::geometry::{Pose3, TriangleMesh};
+use crate::rendering::RenderError;
+
+/// Buffers of the map and what is known about them here.
+pub(super) struct Scene {
+    pub nodes: Buffer,
+    pub triangles: Buffer,
+    pub tiles: Vec<Tile>,
+    pub root: u32,
+    pub depth: usize,
+    pub bytes: u64,
+    center: Vector3<f64>,
+}
+
+impl Scene {
+    /// Grows the hierarchy and sends it to the device.
+    pub fn upload(gpu: &Gpu, tiles: &[TriangleMesh]) -> Result<Self, RenderError> {
+        let forest = Forest::grow(tiles);
+        let sizes = [
+            size_of_val(forest.triangles.as_slice()) as u64,
+            size_of_val(forest.nodes.as_slice()) as u64,
+        ];
+        let limit = gpu.max_binding_bytes();
+        if let Some(&needed) = sizes.iter().find(|&&size| size > limit) {
+            return Err(RenderError::MapTooLarge { needed, limit });
+        }
+        let scene = Self {
+            nodes: gpu.upload("nodes", &forest.nodes, BufferUsages::STORAGE),
+            triangles: gpu.upload("triangles", &forest.triangles, BufferUsages::STORAGE),
+            tiles: forest.tiles,
+            root: forest.root,
+            depth: forest.depth,
+            bytes: sizes.iter().sum(),
+            center: Vector3::new(forest.center.x, forest.center.y, forest.center.z),
+        };
+        gpu.check()?;
+        Ok(scene)
+    }
+
+    /// Poses as the shaders read them, relative to the centre of the map.
+    pub fn poses(&self, map_from_lidar: &[Pose3]) -> Vec<Pose> {
+        map_from_lidar
+            .iter()
+            .map(|pose| Pose::new(pose, self.center))
+            .collect()
+    }
+}

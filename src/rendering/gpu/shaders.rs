@@ -1,0 +1,112 @@
+//! The texts of the shaders, put together.
+
+use wgpu::{BindGroup, BindGroupDescriptor, BindGroupEntry, BindGroupLayout, Buffer};
+
+use super::device::Gpu;
+
+/// Casts rays and compares beams.
+const CASTER: &str = concat!(include_str!("ray.wgsl"), include_str!("caster.wgsl"));
+/// Adds up.
+pub(super) const REDUCE: &str = include_str!("reduce.wgsl");
+/// Draws range images.
+pub(super) const RASTER: &str = concat!(include_str!("ray.wgsl"), include_str!("raster.wgsl"));
+
+/// What `caster.rs` replaces.
+const STACK_SIZE: &str = "const STACK_SIZE: u32 = 64u;";
+
+/// Casts rays through a hierarchy of that depth.
+pub(super) fn caster(depth: usize) -> String {
+    let stack_size = format!("const STACK_SIZE: u32 = {}u;", depth.max(1));
+    CASTER.replace(STACK_SIZE, &stack_size)
+}
+
+pub(super) fn module(gpu: &Gpu, source: &str) -> wgpu::ShaderModule {
+    gpu.device
+        .create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: None,
+            source: wgpu::ShaderSource::Wgsl(source.into()),
+        })
+}
+
+/// Binds buffers to 0, 1, 2 …
+pub(super) fn bind(gpu: &Gpu, layout: &BindGroupLayout, buffers: &[&Buffer]) -> BindGroup {
+    let entries: Vec<BindGroupEntry> = (0..)
+        .zip(buffers)
+        .map(|(binding, buffer)| BindGroupEntry {
+            binding,
+            resource: buffer.as_entire_binding(),
+        })
+        .collect();
+    gpu.device.create_bind_group(&BindGroupDescriptor {
+        label: None,
+        layout,
+        entries: &entries,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::layout;
+    use super::*;
+
+    #[test]
+    fn the_depth_of_the_hierarchy_is_put_into_the_shader() {
+        assert!(CASTER.contains(STACK_SIZE));
+        assert!(caster(23).contains("const STACK_SIZE: u32 = 23u;"));
+    }
+
+    #[test]
+    fn structures_are_as_large_in_the_shaders_as_here() {
+        let sizes = [
+            (CASTER, "Node", size_of::<layout::Node>()),
+            (CASTER, "Triangle", size_of::<layout::Triangle>()),
+            (CASTER, "Pose", size_of::<layout::Pose>()),
+            (CASTER, "Query", size_of::<layout::Query>()),
+            (REDUCE, "Reduction", size_of::<layout::Reduction>()),
+            (RASTER, "Atlas", size_of::<layout::Atlas>()),
+        ];
+        for (source, name, size) in sizes {
+            let module = naga::front::wgsl::parse_str(source).unwrap();
+            let twin = module.types.iter().find_map(|(_, kind)| match kind.inner {
+                naga::TypeInner::Struct { span, .. } if kind.name.as_deref() == Some(name) => {
+                    Some(span as usize)
+                }
+                _ => None,
+            });
+            assert_eq!(twin, Some(size), "{name}");
+        }
+    }
+
+    #[test]
+    fn rays_start_as_far_from_surfaces_as_on_the_processor() {
+        let line = "const NEAREST_M: f32 = 1.0e-4;";
+        assert!(CASTER.contains(line) && crate::raycasting::NEAREST_M == 1.0e-4);
+    }
+
+    #[test]
+    fn constants_are_the_same_in_the_shaders_as_here() {
+        let lines = [
+            (CASTER, "const FAR: f32 = 3.0e38;", layout::FAR == 3.0e38),
+            (CASTER, "const LANES: u32 = 64u;", layout::LANES == 64),
+            (REDUCE, "const LANES: u32 = 64u;", layout::LANES == 64),
+            (
+                CASTER,
+                "const BEAMS_PER_GROUP: u32 = 256u;",
+                layout::BEAMS_PER_GROUP == 256,
+            ),
+            (
+                RASTER,
+                "const VERTICES_PER_TRIANGLE: u32 = 12u;",
+                layout::VERTICES_PER_TRIANGLE == 12,
+            ),
+            (
+                CASTER,
+                "const LEAF: u32 = 0x80000000u;",
+                layout::LEAF == 0x8000_0000,
+            ),
+        ];
+        for (source, line, same) in lines {
+            assert!(same && source.contains(line), "{line}");
+        }
+    }
+}

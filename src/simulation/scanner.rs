@@ -1,0 +1,298 @@
+//! A spinning LiDAR: beams at the elevations of an HDL-64E, range noise, lost returns,
+//! intensities.
+//!
+//! A surface of reflectance ρ that a beam meets at an angle α to its normal is seen up to
+//!
+//! ```text
+//! r_seen = reach · √(ρ |cos α|^¼ / 0.8)        P(return at r) = 1 / (1 + exp((r − r_seen) / 0.05 r_seen))
+//! ```
+//!
+//! The square root is the radar equation of an extended target; the weak power of the cosine
+//! stands for rough surfaces (asphalt at 60 m is met at 2 degrees and still returns). Beam
+//! elevations: Velodyne, *HDL-64E S2 user's manual*: 32 lasers in steps of 1/3 degree from +2
+//! to -8.33, 32 in steps of 1/2 degree from -8.83 to -24.33.
+
+use glam::{Vec2, Vec3};
+use rand::{Rng, RngExt as _};
+use rand_distr::{Distribution as _, StandardNormal};
+use serde::{Deserialize, Serialize};
+
+use super::builder::PaintedMesh;
+use super::drive::SCAN_PERIOD_S;
+use super::street::Street;
+use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
+use crate::lidar::Scan;
+use crate::raycasting::{Hit, Scene};
+
+/// Steps of a revolution that share one origin when the car moves during the revolution.
+const STEPS_PER_ORIGIN: usize = 8;
+
+/// The sensor.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ScannerConfig {
+    /// Number of beams of the HDL-64E that are used, evenly chosen: 64, 32, 16, ...
+    pub beams: usize,
+    /// Elevations of the beams instead of those, from the top; empty for those [deg].
+    pub elevations_deg: Vec<f64>,
+    /// Measurements of each beam per revolution.
+    pub azimuth_steps: usize,
+    /// Nothing nearer returns [m].
+    pub min_range_m: f64,
+    /// Nothing farther returns [m].
+    pub max_range_m: f64,
+    /// Range at which half the beams return from a surface of reflectance 0.8 met head-on [m].
+    pub reach_m: f64,
+    /// Standard deviation of a range [m].
+    pub range_noise_m: f64,
+    /// Share of returns that are lost whatever they met.
+    pub dropout_share: f64,
+    /// Whether the car moves during a revolution. Off: scans as if compensated.
+    pub rolling_shutter: bool,
+}
+
+impl Default for ScannerConfig {
+    /// A Velodyne HDL-64E at 10 revolutions per second.
+    fn default() -> Self {
+        Self {
+            beams: 64,
+            elevations_deg: Vec::new(),
+            azimuth_steps: 1900,
+            min_range_m: 2.0,
+            max_range_m: 90.0,
+            reach_m: 140.0,
+            range_noise_m: 0.02,
+            dropout_share: 0.02,
+            rolling_shutter: false,
+        }
+    }
+}
+
+/// A scan with the SemanticKITTI class of every point.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct LabelledScan {
+    /// The points, beam by beam from the top, each counter-clockwise from straight back.
+    pub scan: Scan,
+    /// One per point.
+    pub classes: Vec<u16>,
+}
+
+/// The sensor with its beams.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scanner {
+    config: ScannerConfig,
+    elevations_rad: Vec<f32>,
+}
+
+/// A surface that can be scanned: triangles found by rays, what they are made of.
+pub struct Target {
+    scene: Scene,
+    mesh: TriangleMesh,
+    classes: Vec<u16>,
+    reflectances: Vec<f32>,
+}
+
+impl Target {
+    /// The static street.
+    pub fn of_street(street: &Street) -> Self {
+        Self {
+            scene: Scene::new(&street.mesh),
+            mesh: street.mesh.clone(),
+            classes: street.classes.clone(),
+            reflectances: street.reflectances.clone(),
+        }
+    }
+
+    /// A painted surface, such as the traffic at one time.
+    pub fn of_surface(surface: PaintedMesh) -> Self {
+        Self {
+            scene: Scene::new(&surface.mesh),
+            classes: surface.paints.iter().map(|p| p.class).collect(),
+            reflectances: surface.paints.iter().map(|p| p.reflectance).collect(),
+            mesh: surface.mesh,
+        }
+    }
+}
+
+/// Where a ray ended.
+#[derive(Clone, Copy, Debug)]
+struct Echo {
+    range_m: f32,
+    class: u16,
+    reflectance: f32,
+    /// |cos α|.
+    incidence: f32,
+}
+
+impl Scanner {
+    /// A sensor as configured.
+    pub fn new(config: &ScannerConfig) -> Self {
+        let elevations_deg = if config.elevations_deg.is_empty() {
+            hdl64_elevations_deg(config.beams)
+        } else {
+            config.elevations_deg.clone()
+        };
+        Self {
+            config: config.clone(),
+            elevations_rad: elevations_deg
+                .iter()
+                .map(|deg| deg.to_radians() as f32)
+                .collect(),
+        }
+    }
+
+    /// Elevations of the beams over the horizon, from the top [rad].
+    pub fn elevations_rad(&self) -> &[f32] {
+        &self.elevations_rad
+    }
+
+    /// One revolution among targets. `world_from_lidar` gives the pose at a time after the one
+    /// of the scan [s]; half a revolution before that time the sensor looks back, then to the
+    /// right, at that time ahead, as KITTI's does.
+    pub fn scan(
+        &self,
+        targets: &[&Target],
+        world_from_lidar: impl Fn(f64) -> Pose3,
+        rng: &mut impl Rng,
+    ) -> LabelledScan {
+        let directions = self.directions();
+        let echoes = if self.config.rolling_shutter {
+            self.cast_while_moving(targets, &directions, world_from_lidar)
+        } else {
+            let world_from_lidar = Rigid3f::from(&world_from_lidar(0.0));
+            let rays: Vec<Vec3> = directions
+                .iter()
+                .map(|&direction| world_from_lidar.rotate(direction))
+                .collect();
+            nearest_echoes(targets, world_from_lidar.translation, &rays)
+        };
+        self.measure(&directions, &echoes, rng)
+    }
+
+    /// Unit directions in the lidar frame, beam by beam.
+    fn directions(&self) -> Vec<Vec3> {
+        let steps = self.config.azimuth_steps;
+        let azimuths: Vec<Vec2> = (0..steps)
+            .map(|step| {
+                let turn = (step as f32 + 0.5) / steps as f32 - 0.5;
+                Vec2::from_angle(std::f32::consts::TAU * turn)
+            })
+            .collect();
+        self.elevations_rad
+            .iter()
+            .flat_map(|elevation_rad| {
+                let (sin, cos) = elevation_rad.sin_cos();
+                azimuths
+                    .iter()
+                    .map(move |azimuth| Vec3::new(cos * azimuth.x, cos * azimuth.y, sin))
+            })
+            .collect()
+    }
+
+    fn cast_while_moving(
+        &self,
+        targets: &[&Target],
+        directions: &[Vec3],
+        world_from_lidar: impl Fn(f64) -> Pose3,
+    ) -> Vec<Option<Echo>> {
+        let steps = self.config.azimuth_steps;
+        let mut echoes = vec![None; directions.len()];
+        for first in (0..steps).step_by(STEPS_PER_ORIGIN) {
+            let columns = first..(first + STEPS_PER_ORIGIN).min(steps);
+            let turn = 0.5 * (columns.start + columns.end) as f64 / steps as f64 - 0.5;
+            let pose = Rigid3f::from(&world_from_lidar(turn * SCAN_PERIOD_S));
+            let indices: Vec<usize> = (0..self.elevations_rad.len())
+                .flat_map(|beam| columns.clone().map(move |column| beam * steps + column))
+                .collect();
+            let rays: Vec<Vec3> = indices
+                .iter()
+                .map(|&index| pose.rotate(directions[index]))
+                .collect();
+            let found = nearest_echoes(targets, pose.translation, &rays);
+            for (index, echo) in indices.into_iter().zip(found) {
+                echoes[index] = echo;
+            }
+        }
+        echoes
+    }
+
+    /// What the sensor makes of the echoes: lost ones are left out, ranges are noisy.
+    fn measure(
+        &self,
+        directions: &[Vec3],
+        echoes: &[Option<Echo>],
+        rng: &mut impl Rng,
+    ) -> LabelledScan {
+        let config = &self.config;
+        let limits_m = config.min_range_m as f32..config.max_range_m as f32;
+        let mut labelled = LabelledScan::default();
+        for (&direction, echo) in directions.iter().zip(echoes) {
+            let Some(echo) = echo else { continue };
+            let lost: f64 = rng.random();
+            let returned: f32 = rng.random();
+            let deviate: f32 = StandardNormal.sample(rng);
+            let seen_m = self.seen_up_to_m(echo);
+            let probability = 1.0 / (1.0 + ((echo.range_m - seen_m) / (0.05 * seen_m)).exp());
+            let range_m = echo.range_m + config.range_noise_m as f32 * deviate;
+            if lost < config.dropout_share || returned > probability || !limits_m.contains(&range_m)
+            {
+                continue;
+            }
+            let brightness = echo.reflectance * echo.incidence.sqrt();
+            labelled.scan.points.push(direction * range_m);
+            labelled
+                .scan
+                .intensities
+                .push((brightness * (1.0 + 0.1 * deviate)).clamp(0.0, 1.0));
+            labelled.classes.push(echo.class);
+        }
+        labelled
+    }
+
+    fn seen_up_to_m(&self, echo: &Echo) -> f32 {
+        const REFERENCE_REFLECTANCE: f32 = 0.8;
+        let power = echo.reflectance * echo.incidence.powf(0.25) / REFERENCE_REFLECTANCE;
+        // Nothing is so dark that it is not seen at two metres.
+        (self.config.reach_m as f32 * power.sqrt()).max(2.0)
+    }
+}
+
+/// `count` of the elevations of the HDL-64E, evenly chosen, from the top [deg].
+pub fn hdl64_elevations_deg(count: usize) -> Vec<f64> {
+    let all: Vec<f64> = (0..64)
+        .map(|laser| {
+            if laser < 32 {
+                2.0 - f64::from(laser) / 3.0
+            } else {
+                -8.83 - 0.5 * f64::from(laser - 32)
+            }
+        })
+        .collect();
+    let count = count.clamp(1, 64);
+    (0..count).map(|beam| all[beam * 64 / count]).collect()
+}
+
+fn nearest_echoes(targets: &[&Target], origin: Vec3, rays: &[Vec3]) -> Vec<Option<Echo>> {
+    let mut nearest = vec![None; rays.len()];
+    let mut hits = vec![Hit::MISS; rays.len()];
+    for target in targets {
+        if target.mesh.triangles.is_empty() {
+            continue;
+        }
+        target.scene.cast(origin, rays, &mut hits);
+        for ((hit, ray), best) in hits.iter().zip(rays).zip(&mut nearest) {
+            let is_nearer = hit.range_m < best.map_or(f32::INFINITY, |echo: Echo| echo.range_m);
+            if hit.triangle != Hit::NO_TRIANGLE && is_nearer {
+                let triangle = hit.triangle as usize;
+                let normal = target.mesh.scaled_normal(triangle).normalize_or_zero();
+                *best = Some(Echo {
+                    range_m: hit.range_m,
+                    class: target.classes[triangle],
+                    reflectance: target.reflectances[triangle],
+                    incidence: normal.dot(*ray).abs(),
+                });
+            }
+        }
+    }
+    nearest
+}

@@ -1,0 +1,78 @@
+//! The shaders are valid, which needs no graphics adapter, and know their Rust twins.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use naga::valid::{Capabilities, ValidationFlags, Validator};
+
+fn folder() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("src/rendering/gpu")
+}
+
+/// Name and text of every shader, in the order of the names.
+fn shaders() -> Vec<(String, String)> {
+    let mut shaders: Vec<(String, String)> = fs::read_dir(folder())
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|entry| entry.file_name().to_string_lossy().into_owned())
+        .filter(|name| name.ends_with(".wgsl"))
+        .map(|name| {
+            let text = fs::read_to_string(folder().join(&name)).unwrap_or_default();
+            (name, text)
+        })
+        .collect();
+    shaders.sort();
+    shaders
+}
+
+/// A shader behind those that it says stand before it.
+fn composed(text: &str, shaders: &[(String, String)]) -> String {
+    let needed = shaders
+        .iter()
+        .filter(|(name, _)| text.contains(&format!("`{name}` stands before this text")));
+    needed
+        .map(|(_, text)| text.as_str())
+        .chain([text])
+        .collect()
+}
+
+#[test]
+fn every_shader_is_valid() {
+    let shaders = shaders();
+    assert!(shaders.len() >= 4, "{shaders:?}");
+    for (name, text) in &shaders {
+        let source = composed(text, &shaders);
+        let module = naga::front::wgsl::parse_str(&source)
+            .unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(&source)));
+        Validator::new(ValidationFlags::all(), Capabilities::empty())
+            .validate(&module)
+            .unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(&source)));
+    }
+}
+
+#[test]
+fn every_shader_and_its_rust_twin_name_each_other() {
+    for (name, text) in shaders() {
+        let twin = "Keep in sync with `layout.rs`";
+        assert!(text.contains(twin), "{name} does not say: {twin}");
+    }
+    let layout = fs::read_to_string(folder().join("layout.rs")).unwrap();
+    for (name, _) in shaders() {
+        assert!(
+            layout.contains(&format!("`{name}`")),
+            "layout.rs does not name {name}"
+        );
+    }
+}
+
+#[test]
+fn every_shader_is_used() {
+    let rust = fs::read_to_string(folder().join("shaders.rs")).unwrap();
+    for (name, _) in shaders() {
+        assert!(
+            rust.contains(&format!("include_str!(\"{name}\")")),
+            "{name}"
+        );
+    }
+}
