@@ -7,6 +7,9 @@ pub mod backend;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 
+#[cfg(test)]
+pub(crate) mod test_world;
+
 use crate::geometry::{Pose3, Vec3};
 use crate::lidar::{Beam, LidarModel};
 
