@@ -153,29 +153,42 @@ impl GroundMap {
     /// there is no ground. `map_from_lidar = map_from_road · road_from_lidar`, with the sensor at the
     /// pose's x and y.
     pub fn lift(&self, planar: &Pose2, stance: &Stance) -> Option<Pose3> {
+        Some(self.patch_under(planar)?.lift(planar, stance))
+    }
+
+    /// The ground that a car at a planar pose stands on; `None` where there is none.
+    pub fn patch_under(&self, planar: &Pose2) -> Option<GroundPatch> {
+        /// About the wheelbase and track of a car.
         const RADIUS_M: f64 = 2.0;
         let t = planar.translation.vector;
-        let patch = self.patch_at(t.x, t.y, RADIUS_M)?;
-        Some(lift_onto(planar, &patch, stance))
+        self.patch_at(t.x, t.y, RADIUS_M)
     }
 }
 
-/// The pose in space of a planar pose over a ground patch.
-fn lift_onto(planar: &Pose2, patch: &GroundPatch, stance: &Stance) -> Pose3 {
-    let t = planar.translation.vector;
-    let heading = planar.rotation.angle();
-    let up = patch.normal;
-    let forward = Vector3::new(heading.cos(), heading.sin(), 0.0);
-    let left = up.cross(&forward).normalize();
-    let rotation =
-        Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[left.cross(&up), left, up]));
-    let map_from_road = UnitQuaternion::from_rotation_matrix(&rotation);
-    // The road plane passes through the patch; the sensor hangs `height_m` along its normal over it.
-    let height_m = patch.height_m + stance.height_m / up.z;
-    Pose3::from_parts(
-        Translation3::new(t.x, t.y, height_m),
-        map_from_road * UnitQuaternion::from_euler_angles(stance.roll_rad, stance.pitch_rad, 0.0),
-    )
+impl GroundPatch {
+    /// Where in space a planar pose is, standing on the plane of this patch as `stance` says.
+    /// [`planar`](crate::geometry::planar) gives the planar pose back, on every slope.
+    pub fn lift(&self, planar: &Pose2, stance: &Stance) -> Pose3 {
+        let t = planar.translation.vector;
+        let heading = planar.rotation.angle();
+        let up = self.normal;
+        let forward = Vector3::new(heading.cos(), heading.sin(), 0.0);
+        let left = up.cross(&forward).normalize();
+        let rotation =
+            Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[left.cross(&up), left, up]));
+        let map_from_road = UnitQuaternion::from_rotation_matrix(&rotation);
+        let tilted = map_from_road
+            * UnitQuaternion::from_euler_angles(stance.roll_rad, stance.pitch_rad, 0.0);
+        // Leaning on a slope turns the nose a little; the heading is the one that was asked for.
+        let nose = tilted * Vector3::x();
+        let turn_rad = heading - nose.y.atan2(nose.x);
+        // The road plane passes through the patch; the sensor hangs `height_m` along its normal over it.
+        let height_m = self.height_m + stance.height_m / up.z;
+        Pose3::from_parts(
+            Translation3::new(t.x, t.y, height_m),
+            UnitQuaternion::from_euler_angles(0.0, 0.0, turn_rad) * tilted,
+        )
+    }
 }
 
 /// Adds the height of a triangle to the cells whose centre it covers, and of its corners to theirs.
@@ -260,6 +273,24 @@ mod tests {
         let lifted = ground.lift(&pose, &Stance::default()).unwrap();
         assert_relative_eq!(planar(&lifted), pose, epsilon = 1e-9);
         assert_relative_eq!(lifted.translation.z, 0.0, epsilon = 1e-6);
+    }
+
+    #[test]
+    fn a_lifted_pose_casts_its_planar_pose_as_shadow_on_every_slope() {
+        let patch = GroundPatch {
+            height_m: 4.0,
+            normal: Vector3::new(-0.1, 0.08, 1.0).normalize(),
+        };
+        let stance = Stance {
+            height_m: 1.7,
+            roll_rad: 0.04,
+            pitch_rad: -0.05,
+        };
+        for heading in [-3.0, -1.0, 0.0, 0.7, 2.5] {
+            let pose = Pose2::new(Vector2::new(1.0, 2.0), heading);
+            let shadow = planar(&patch.lift(&pose, &stance));
+            assert_relative_eq!(shadow, pose, epsilon = 1e-12);
+        }
     }
 
     #[test]

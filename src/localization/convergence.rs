@@ -1,0 +1,135 @@
+//! When a few particles are enough: they stand in few tiles and close together.
+//!
+//! ```text
+//! converged  ⇔  0 < occupied valid tiles < converge_thres  ∧  √(σ_x² + σ_y²) < s  ∧  σ_θ < s_θ
+//! ```
+//!
+//! The first is range-mcl's criterion (Chen et al., ICRA 2021, section III-D), which holds from
+//! the first frame on a map of one tile; hence the spread.
+
+use std::collections::BTreeSet;
+
+use serde::{Deserialize, Serialize};
+
+use super::particles::{ParticleSet, spread};
+use crate::map::TileGrid;
+
+/// What counts as converged.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ConvergenceConfig {
+    /// The particles stand in fewer valid tiles than this.
+    pub converge_thres: usize,
+    /// Their standard deviation in position is below this; infinite for range-mcl's criterion alone [m].
+    pub max_spread_m: f64,
+    /// Their standard deviation in heading is below this [rad].
+    pub max_spread_rad: f64,
+}
+
+impl Default for ConvergenceConfig {
+    /// range-mcl's two tiles; half a metre and five degrees.
+    fn default() -> Self {
+        Self {
+            converge_thres: 2,
+            max_spread_m: 0.5,
+            max_spread_rad: 5.0_f64.to_radians(),
+        }
+    }
+}
+
+/// How many valid tiles the particles stand in.
+pub fn occupied_tiles(particles: &ParticleSet, tiles: &TileGrid) -> usize {
+    let occupied: BTreeSet<_> = particles
+        .poses()
+        .filter_map(|pose| tiles.valid_tile_of(pose))
+        .collect();
+    occupied.len()
+}
+
+/// Whether the belief is narrow enough for few particles.
+pub fn is_converged(particles: &ParticleSet, tiles: &TileGrid, config: &ConvergenceConfig) -> bool {
+    let occupied = occupied_tiles(particles, tiles);
+    let (position_m, heading_rad) = spread(&particles.covariance_about(&particles.mean()));
+    occupied > 0
+        && occupied < config.converge_thres
+        && position_m < config.max_spread_m
+        && heading_rad < config.max_spread_rad
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector2;
+
+    use super::*;
+    use crate::geometry::{Pose2, Pose3};
+    use crate::map::TileConfig;
+
+    fn tiles() -> TileGrid {
+        let poses: Vec<Pose3> = (0..200)
+            .map(|i| Pose3::translation(f64::from(i), 0.0, 0.0))
+            .collect();
+        TileGrid::around(&poses, &TileConfig::default())
+    }
+
+    fn at(places: &[(f64, f64)]) -> ParticleSet {
+        ParticleSet::uniform(
+            places
+                .iter()
+                .map(|&(x, heading)| Pose2::new(Vector2::new(x, 0.0), heading)),
+        )
+    }
+
+    #[test]
+    fn particles_in_one_tile_and_close_together_are_converged() {
+        let config = ConvergenceConfig::default();
+        assert!(is_converged(
+            &at(&[(0.0, 0.0), (0.1, 0.01)]),
+            &tiles(),
+            &config
+        ));
+        assert!(!is_converged(
+            &at(&[(0.0, 0.0), (10.0, 0.0)]),
+            &tiles(),
+            &config
+        ));
+        assert!(!is_converged(
+            &at(&[(0.0, 0.0), (0.1, 1.0)]),
+            &tiles(),
+            &config
+        ));
+    }
+
+    #[test]
+    fn without_limits_on_the_spread_only_tiles_count() {
+        let config = ConvergenceConfig {
+            max_spread_m: f64::INFINITY,
+            max_spread_rad: f64::INFINITY,
+            ..ConvergenceConfig::default()
+        };
+        assert!(is_converged(
+            &at(&[(-40.0, 0.0), (40.0, 3.0)]),
+            &tiles(),
+            &config
+        ));
+        assert!(!is_converged(
+            &at(&[(40.0, 0.0), (60.0, 0.0)]),
+            &tiles(),
+            &config
+        ));
+        assert_eq!(
+            occupied_tiles(&at(&[(40.0, 0.0), (60.0, 0.0)]), &tiles()),
+            2
+        );
+    }
+
+    #[test]
+    fn particles_that_stand_nowhere_have_not_converged() {
+        let lost = at(&[(-900.0, 0.0), (-900.0, 0.0)]);
+        assert_eq!(occupied_tiles(&lost, &tiles()), 0);
+        assert!(!is_converged(
+            &lost,
+            &tiles(),
+            &ConvergenceConfig::default()
+        ));
+    }
+}

@@ -1,0 +1,504 @@
+//! The loop of Monte Carlo localization: move, weigh, resample, and say where the car is.
+//!
+//! ```text
+//! propagate      x ~ p(x | x_before, odometry)           motion
+//! reweight       w ∝ w · p(scan | x, map)ᵝ               observation, tempering
+//! estimate       weighted mean, covariance, state        particles, vigilance
+//! resample       where few particles carry the weight    resampling
+//! ```
+//!
+//! While the car searches, reweighting and resampling alternate several times within one frame,
+//! from a blunt to a sharp likelihood (annealing). Once the belief is narrow, `num_reduced`
+//! particles are enough.
+
+use nalgebra::Matrix3;
+use rand::Rng;
+use serde::{Deserialize, Serialize};
+
+use super::convergence::{ConvergenceConfig, is_converged};
+use super::motion::{OdometryNoise, TurnDriveTurn};
+use super::observation::{Fit, ObservationConfig, above_road, choose_beams, costs, place_on_map};
+use super::odometry::Odometry;
+use super::panorama::PanoramaIndex;
+use super::particles::ParticleSet;
+use super::resampling::{
+    KldConfig, ResamplingConfig, jitter, kld_sample_size, occupied_bins, systematic,
+};
+use super::tempering::exponent;
+use super::vigilance::{State, Vigilance, VigilanceConfig};
+use crate::geometry::{Pose2, Pose3};
+use crate::lidar::{Beam, RangeImage};
+use crate::map::{GroundMap, GroundPatch, Stance, TileGrid};
+use crate::rendering::{RangeRenderer, RenderError};
+
+/// How the likelihood is sharpened within a frame.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TemperingConfig {
+    /// A frame never leaves a smaller share of effective particles than this; 0 takes the
+    /// likelihood at its word, as range-mcl does.
+    pub min_effective_fraction: f64,
+    /// Rounds of reweighting and resampling per frame while searching.
+    pub searching_rounds: usize,
+    /// The same while tracking.
+    pub tracking_rounds: usize,
+}
+
+impl Default for TemperingConfig {
+    /// Our own values.
+    fn default() -> Self {
+        Self {
+            min_effective_fraction: 0.2,
+            searching_rounds: 4,
+            tracking_rounds: 1,
+        }
+    }
+}
+
+/// Everything that can be set about the filter.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LocalizerConfig {
+    /// Particles while searching, at most.
+    pub num_particles: usize,
+    /// Particles once converged.
+    pub num_reduced: usize,
+    /// The weights are updated after this much motion [m].
+    pub move_thres_m: f64,
+    /// Or after this much turning [rad].
+    pub turn_thres_rad: f64,
+    /// Noise of the odometry, per update.
+    pub motion: OdometryNoise,
+    /// Noise of the guess that the car goes on as it went, where there is no odometry.
+    pub constant_velocity: OdometryNoise,
+    /// The likelihood.
+    pub observation: ObservationConfig,
+    /// Its sharpness.
+    pub tempering: TemperingConfig,
+    /// Resampling.
+    pub resampling: ResamplingConfig,
+    /// Number of particles while searching.
+    pub kld: KldConfig,
+    /// When a few particles are enough.
+    pub convergence: ConvergenceConfig,
+    /// When the map disagrees.
+    pub vigilance: VigilanceConfig,
+}
+
+impl Default for LocalizerConfig {
+    /// range-mcl's numbers of particles and threshold of motion.
+    fn default() -> Self {
+        Self {
+            num_particles: 10_000,
+            num_reduced: 100,
+            move_thres_m: 0.2,
+            turn_thres_rad: 0.05,
+            motion: OdometryNoise::default(),
+            constant_velocity: OdometryNoise {
+                turn_rad: 0.02,
+                drive_m: 0.2,
+            },
+            observation: ObservationConfig::default(),
+            tempering: TemperingConfig::default(),
+            resampling: ResamplingConfig::default(),
+            kld: KldConfig::default(),
+            convergence: ConvergenceConfig::default(),
+            vigilance: VigilanceConfig::default(),
+        }
+    }
+}
+
+/// What the filter knows of the map.
+#[derive(Clone, Copy)]
+pub struct Surroundings<'a> {
+    /// Shows the map.
+    pub renderer: &'a dyn RangeRenderer,
+    /// Carries the poses.
+    pub ground: &'a GroundMap,
+    /// Where the map is.
+    pub tiles: &'a TileGrid,
+    /// Where to begin anew when lost; without it, the filter says that it is lost and stays so.
+    pub panoramas: Option<&'a PanoramaIndex>,
+}
+
+/// What the filter says about a frame.
+#[derive(Clone, Debug)]
+pub struct FrameEstimate {
+    /// Weighted mean of the particles, `p_map = pose * p_lidar` seen from above.
+    pub pose: Pose2,
+    /// The same pose standing on the map's ground, `p_map = lifted * p_lidar`.
+    pub lifted: Pose3,
+    /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
+    pub covariance: Matrix3<f64>,
+    /// Effective number of particles after weighing, before resampling.
+    pub effective_sample_size: f64,
+    /// Weighted mean of the particles' cost; `None` where the frame was not weighed or no
+    /// particle was on the map [m].
+    pub mean_cost_m: Option<f64>,
+    /// Share of beams above the road that meet the map at the estimate; `None` where unknown.
+    pub agreement: Option<f64>,
+    /// Searching, tracking or lost.
+    pub state: State,
+    /// Whether the scan was weighed; not so before the car moved far enough.
+    pub updated: bool,
+    /// Whether there is mapped ground under the estimate; if not, it stands on the last ground
+    /// that there was.
+    pub on_mapped_ground: bool,
+    /// The particles with their weights, before resampling.
+    pub particles: ParticleSet,
+}
+
+/// A belief about where the car is, frame by frame.
+pub struct Localizer<'a> {
+    /// The settings.
+    pub config: LocalizerConfig,
+    surroundings: Surroundings<'a>,
+    particles: ParticleSet,
+    /// Motion since the last update, `updated_from_current`.
+    pending: Pose2,
+    /// The last estimate and the motion into it, for frames without odometry.
+    estimate: Pose2,
+    last_increment: Pose2,
+    patch: Option<GroundPatch>,
+    state: State,
+    vigilance: Vigilance,
+    updates_in_state: usize,
+    is_first: bool,
+}
+
+/// What one round of weighing found.
+struct Weighing {
+    effective_sample_size: f64,
+    mean_cost_m: Option<f64>,
+}
+
+impl<'a> Localizer<'a> {
+    /// Begins with a belief; see [`initialization`](super::initialization) and
+    /// [`PanoramaIndex::sample`] for where to get it.
+    pub fn new(
+        config: LocalizerConfig,
+        surroundings: Surroundings<'a>,
+        particles: ParticleSet,
+    ) -> Self {
+        let estimate = particles.mean();
+        Self {
+            config,
+            surroundings,
+            particles,
+            pending: Pose2::identity(),
+            estimate,
+            last_increment: Pose2::identity(),
+            patch: surroundings.ground.patch_under(&estimate),
+            state: State::Searching,
+            vigilance: Vigilance::default(),
+            updates_in_state: 0,
+            is_first: true,
+        }
+    }
+
+    /// Takes in a frame: how the car moved since the frame before, what it sees and how the
+    /// sensor stands over the road. The odometry of the first frame does not count.
+    pub fn step(
+        &mut self,
+        odometry: Odometry,
+        scan: &RangeImage,
+        stance: &Stance,
+        rng: &mut impl Rng,
+    ) -> Result<FrameEstimate, RenderError> {
+        if !self.is_first {
+            self.pending *= self.increment(odometry);
+        }
+        if !self.is_update_due(odometry) {
+            return Ok(self.coast(stance));
+        }
+        self.propagate(odometry, rng);
+        let (weighing, beams) = self.weigh_in_rounds(scan, stance, rng)?;
+        let mut frame = self.conclude(&weighing, stance);
+        frame.agreement = self.agreement(&frame.lifted, &beams, stance)?;
+        self.change_state(frame.agreement);
+        frame.state = self.state;
+        self.prepare_next(scan, stance, rng);
+        Ok(frame)
+    }
+
+    /// What the filter believes about itself.
+    pub fn state(&self) -> State {
+        self.state
+    }
+
+    /// The belief as it goes into the next frame.
+    pub fn particles(&self) -> &ParticleSet {
+        &self.particles
+    }
+
+    fn increment(&self, odometry: Odometry) -> Pose2 {
+        match odometry {
+            Odometry::Increment(previous_from_current) => previous_from_current,
+            Odometry::Unknown => self.last_increment,
+        }
+    }
+
+    /// Without odometry only the scan can tell whether the car moves.
+    fn is_update_due(&self, odometry: Odometry) -> bool {
+        self.is_first
+            || odometry == Odometry::Unknown
+            || self.pending.translation.vector.norm() > self.config.move_thres_m
+            || self.pending.rotation.angle().abs() > self.config.turn_thres_rad
+    }
+
+    /// A frame in which the car hardly moved: the last estimate, carried along.
+    fn coast(&mut self, stance: &Stance) -> FrameEstimate {
+        let mut particles = self.particles.clone();
+        particles.propagate(|pose| pose * self.pending);
+        let pose = particles.mean();
+        FrameEstimate {
+            pose,
+            lifted: self.lift_estimate(&pose, stance).0,
+            covariance: particles.covariance_about(&pose),
+            effective_sample_size: particles.effective_sample_size(),
+            mean_cost_m: None,
+            agreement: None,
+            state: self.state,
+            updated: false,
+            on_mapped_ground: self.surroundings.ground.patch_under(&pose).is_some(),
+            particles,
+        }
+    }
+
+    fn propagate(&mut self, odometry: Odometry, rng: &mut impl Rng) {
+        if !self.is_first {
+            let noise = match odometry {
+                Odometry::Increment(_) => &self.config.motion,
+                Odometry::Unknown => &self.config.constant_velocity,
+            };
+            let motion = TurnDriveTurn::decompose(&self.pending);
+            self.particles
+                .propagate(|pose| pose * motion.sample(noise, rng).compose());
+        }
+        self.is_first = false;
+        self.pending = Pose2::identity();
+    }
+
+    /// Weighs the particles by the scan, in one round or several; returns the beams of the last.
+    fn weigh_in_rounds(
+        &mut self,
+        scan: &RangeImage,
+        stance: &Stance,
+        rng: &mut impl Rng,
+    ) -> Result<(Weighing, Vec<Beam>), RenderError> {
+        let rounds = match self.state {
+            State::Tracking => self.config.tempering.tracking_rounds,
+            State::Searching | State::Lost => self.config.tempering.searching_rounds,
+        };
+        let (mut left, mut round) = (1.0, 1);
+        loop {
+            let observation = &self.config.observation;
+            let count = observation.beams_for(self.particles.len());
+            let beams = choose_beams(scan, count, observation.road_share, stance, rng);
+            let (weighing, used) = self.weigh(&beams, stance, left)?;
+            left -= used;
+            if round >= rounds || left <= 0.0 || used <= 0.0 {
+                return Ok((weighing, beams));
+            }
+            self.resample(rng);
+            round += 1;
+        }
+    }
+
+    /// One round: multiplies the weights by a power of the likelihood, at most `most`. Returns the power.
+    fn weigh(
+        &mut self,
+        beams: &[Beam],
+        stance: &Stance,
+        most: f64,
+    ) -> Result<(Weighing, f64), RenderError> {
+        let Surroundings {
+            renderer,
+            ground,
+            tiles,
+            ..
+        } = self.surroundings;
+        let remembered = self.patch.filter(|_| self.state == State::Tracking);
+        let poses: Vec<Option<Pose3>> = self
+            .particles
+            .poses()
+            .map(|pose| place_on_map(pose, stance, ground, tiles, remembered.as_ref()))
+            .collect();
+        let observation = &self.config.observation;
+        let costs = costs(renderer, &poses, beams, &observation.difference())?;
+        let logs: Vec<f64> = costs
+            .iter()
+            .map(|cost| {
+                cost.map_or(observation.floor_log_likelihood(), |cost_m| {
+                    observation.log_likelihood(cost_m)
+                })
+            })
+            .collect();
+        let min_effective =
+            self.config.tempering.min_effective_fraction * self.particles.len() as f64;
+        let power = exponent(&self.particles.weights(), &logs, min_effective, most);
+        let tempered: Vec<f64> = logs.iter().map(|log| power * log).collect();
+        self.particles.reweight(&tempered);
+        let weighing = Weighing {
+            effective_sample_size: self.particles.effective_sample_size(),
+            mean_cost_m: weighted_mean(&self.particles, &costs),
+        };
+        Ok((weighing, power))
+    }
+
+    /// The estimate of a weighed frame, which becomes what the filter remembers.
+    fn conclude(&mut self, weighing: &Weighing, stance: &Stance) -> FrameEstimate {
+        let pose = self.particles.mean();
+        self.last_increment = match self.state {
+            State::Tracking => self.estimate.inverse() * pose,
+            // A belief that jumps is no motion.
+            State::Searching | State::Lost => self.last_increment,
+        };
+        self.estimate = pose;
+        let (lifted, on_mapped_ground) = self.lift_estimate(&pose, stance);
+        FrameEstimate {
+            pose,
+            lifted,
+            covariance: self.particles.covariance_about(&pose),
+            effective_sample_size: weighing.effective_sample_size,
+            mean_cost_m: weighing.mean_cost_m,
+            agreement: None,
+            state: self.state,
+            updated: true,
+            on_mapped_ground,
+            particles: self.particles.clone(),
+        }
+    }
+
+    /// Lifts the estimate onto the ground, or onto the last ground that there was; says which.
+    fn lift_estimate(&mut self, pose: &Pose2, stance: &Stance) -> (Pose3, bool) {
+        let found = self.surroundings.ground.patch_under(pose);
+        self.patch = found.or(self.patch);
+        let level = GroundPatch {
+            height_m: 0.0,
+            normal: nalgebra::Vector3::z(),
+        };
+        let patch = self.patch.unwrap_or(level);
+        (patch.lift(pose, stance), found.is_some())
+    }
+
+    fn agreement(
+        &self,
+        lifted: &Pose3,
+        beams: &[Beam],
+        stance: &Stance,
+    ) -> Result<Option<f64>, RenderError> {
+        /// Kerbs and low plants are not what tells places apart [m].
+        const CLEARANCE_M: f32 = 0.5;
+        let beams = above_road(beams, stance, CLEARANCE_M);
+        let directions: Vec<_> = beams.iter().map(|beam| beam.direction).collect();
+        let rendered = self.surroundings.renderer.cast(&[*lifted], &directions)?;
+        let tolerance_m = self.config.vigilance.tolerance_m;
+        Ok(rendered
+            .first()
+            .and_then(|rendered_m| Fit::of(&beams, rendered_m, tolerance_m).agreement()))
+    }
+
+    fn change_state(&mut self, agreement: Option<f64>) {
+        let converged = is_converged(
+            &self.particles,
+            self.surroundings.tiles,
+            &self.config.convergence,
+        );
+        if converged || self.state == State::Tracking {
+            self.vigilance.observe(agreement, &self.config.vigilance);
+        }
+        let is_lost = self.vigilance.is_lost(&self.config.vigilance);
+        let is_stuck = self.updates_in_state >= self.config.vigilance.patience;
+        let next = match self.state {
+            _ if is_lost => State::Lost,
+            State::Searching if converged => State::Tracking,
+            State::Searching if is_stuck => State::Lost,
+            State::Lost if converged => State::Tracking,
+            state => state,
+        };
+        self.updates_in_state = if next == self.state {
+            self.updates_in_state + 1
+        } else {
+            0
+        };
+        self.state = next;
+    }
+
+    /// Gets the particles ready for the next frame: begins anew when lost, else resamples.
+    fn prepare_next(&mut self, scan: &RangeImage, stance: &Stance, rng: &mut impl Rng) {
+        if self.state == State::Lost && self.begin_anew(scan, stance, rng) {
+            return;
+        }
+        let size = self.particles.len();
+        let threshold = self.config.resampling.min_effective_fraction * size as f64;
+        let shrinks = self.state == State::Tracking && size != self.config.num_reduced;
+        if shrinks || self.particles.effective_sample_size() < threshold {
+            self.resample(rng);
+        }
+    }
+
+    /// Spreads the particles over the places where the scan may have been taken.
+    fn begin_anew(&mut self, scan: &RangeImage, stance: &Stance, rng: &mut impl Rng) -> bool {
+        let Some(panoramas) = self.surroundings.panoramas else {
+            return false;
+        };
+        let poses = panoramas.sample(scan, stance, self.config.num_particles, rng);
+        if poses.is_empty() {
+            return false;
+        }
+        self.particles = ParticleSet::uniform(poses);
+        self.vigilance = Vigilance::default();
+        self.updates_in_state = 0;
+        self.state = State::Searching;
+        true
+    }
+
+    fn resample(&mut self, rng: &mut impl Rng) {
+        let count = match self.state {
+            State::Tracking => self.config.num_reduced,
+            State::Searching | State::Lost => self.searching_size(),
+        };
+        let covariance = self.particles.covariance_about(&self.particles.mean());
+        let members = systematic(&self.particles.weights(), count, rng);
+        self.particles = self.particles.selected(&members);
+        jitter(
+            &mut self.particles,
+            &covariance,
+            &self.config.resampling,
+            rng,
+        );
+    }
+
+    /// How many particles the belief needs while it is wide.
+    fn searching_size(&self) -> usize {
+        let average = 1.0 / self.particles.len() as f64;
+        // A particle that weighs nothing occupies nothing.
+        let alive = self
+            .particles
+            .particles()
+            .iter()
+            .filter(|particle| particle.weight > 0.1 * average)
+            .map(|particle| &particle.map_from_lidar);
+        let bins = occupied_bins(alive, &self.config.kld);
+        let most = self.particles.len().max(self.config.num_reduced);
+        kld_sample_size(bins, &self.config.kld).clamp(self.config.num_reduced.min(most), most)
+    }
+}
+
+/// The weighted mean of the costs of the particles that have one [m].
+fn weighted_mean(particles: &ParticleSet, costs: &[Option<f64>]) -> Option<f64> {
+    let (sum, weight) = particles
+        .particles()
+        .iter()
+        .zip(costs)
+        .filter_map(|(particle, cost)| cost.map(|cost_m| (particle.weight, cost_m)))
+        .fold((0.0, 0.0), |(sum, weight), (w, cost_m)| {
+            (sum + w * cost_m, weight + w)
+        });
+    (weight > 0.0).then(|| sum / weight)
+}
+
+#[cfg(test)]
+#[path = "localizer_tests.rs"]
+mod tests;

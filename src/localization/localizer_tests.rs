@@ -1,0 +1,353 @@
+//! The filter as a whole, in a street of boxes.
+
+use approx::assert_relative_eq;
+use nalgebra::Vector2;
+use rand::{SeedableRng, rngs::StdRng};
+
+use super::super::initialization::{Cells, ROAD_HALF_WIDTH_M, StartSpread, around};
+use super::super::motion::OdometryNoise;
+use super::super::odometry::{Odometry, increments, with_noise};
+use super::super::panorama::{PanoramaConfig, PanoramaIndex};
+use super::super::test_world::TestWorld;
+use super::*;
+use crate::geometry::wrap_angle;
+use crate::lidar::LidarModel;
+
+/// Small enough for a test, else the defaults.
+fn config(num_particles: usize) -> LocalizerConfig {
+    LocalizerConfig {
+        num_particles,
+        observation: ObservationConfig {
+            beams: 600,
+            min_beams: 150,
+            ray_budget: 60_000,
+            ..ObservationConfig::default()
+        },
+        ..LocalizerConfig::default()
+    }
+}
+
+/// A drive along the street, swaying a little, 0.8 m per frame, in the map.
+fn drive(world: &TestWorld, from_x: f64, frames: usize) -> Vec<Pose2> {
+    (0..frames)
+        .map(|frame| {
+            let x = from_x + 0.8 * frame as f64;
+            world.pose_at(x, 0.5 * (0.1 * x).sin(), 0.05 * (0.1 * x).cos())
+        })
+        .collect()
+}
+
+/// Odometry with a centimetre and a tenth of a degree of noise per frame.
+fn odometry(truth: &[Pose2], seed: u64) -> Vec<Pose2> {
+    let poses: Vec<Pose3> = truth
+        .iter()
+        .map(|pose| crate::geometry::spatial(pose, 0.0))
+        .collect();
+    let noise = OdometryNoise {
+        turn_rad: 0.002,
+        drive_m: 0.01,
+    };
+    with_noise(
+        &increments(&poses),
+        &noise,
+        &mut StdRng::seed_from_u64(seed),
+    )
+}
+
+fn run(
+    localizer: &mut Localizer<'_>,
+    world: &TestWorld,
+    truth: &[Pose2],
+    has_odometry: bool,
+    rng: &mut StdRng,
+) -> Vec<FrameEstimate> {
+    let increments = odometry(truth, 99);
+    truth
+        .iter()
+        .zip(increments)
+        .map(|(pose, increment)| {
+            let odometry = if has_odometry {
+                Odometry::Increment(increment)
+            } else {
+                Odometry::Unknown
+            };
+            localizer
+                .step(odometry, &world.scan(pose), &Stance::default(), rng)
+                .unwrap()
+        })
+        .collect()
+}
+
+fn track(world: &TestWorld, truth: &[Pose2], seed: u64) -> Vec<FrameEstimate> {
+    let mut rng = StdRng::seed_from_u64(seed);
+    let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+    let mut localizer = Localizer::new(
+        config(500),
+        world.surroundings(),
+        ParticleSet::uniform(start),
+    );
+    run(&mut localizer, world, truth, true, &mut rng)
+}
+
+/// Root mean square of position [m] and heading [rad].
+fn rmse(frames: &[FrameEstimate], truth: &[Pose2]) -> (f64, f64) {
+    let errors = frames.iter().zip(truth).map(|(frame, truth)| {
+        let position = (frame.pose.translation.vector - truth.translation.vector).norm_squared();
+        let turn = wrap_angle(frame.pose.rotation.angle() - truth.rotation.angle());
+        (position, turn * turn)
+    });
+    let (position, turn) = errors.fold((0.0, 0.0), |sum, e| (sum.0 + e.0, sum.1 + e.1));
+    let n = frames.len() as f64;
+    ((position / n).sqrt(), (turn / n).sqrt())
+}
+
+#[test]
+fn from_five_metres_and_thirty_degrees_it_converges_to_centimetres() {
+    let world = TestWorld::street();
+    let truth = drive(&world, 0.0, 30);
+    for seed in 0..3 {
+        let frames = track(&world, &truth, seed);
+        let (position_m, heading_rad) = rmse(&frames[10..], &truth[10..]);
+        assert!(position_m < 0.03, "seed {seed}: {position_m} m");
+        assert!(
+            heading_rad.to_degrees() < 0.1,
+            "seed {seed}: {} deg",
+            heading_rad.to_degrees()
+        );
+        assert!(
+            frames[10..]
+                .iter()
+                .all(|frame| frame.state == State::Tracking)
+        );
+        assert!(
+            frames[12..]
+                .iter()
+                .all(|frame| frame.particles.len() == 100)
+        );
+    }
+}
+
+#[test]
+fn a_street_elsewhere_and_turned_gives_the_same_accuracy() {
+    let world = TestWorld::moved_street(Pose2::new(Vector2::new(120.0, -80.0), 2.0));
+    let truth = drive(&world, 0.0, 20);
+    let frames = track(&world, &truth, 1);
+    let (position_m, heading_rad) = rmse(&frames[10..], &truth[10..]);
+    assert!(
+        position_m < 0.03 && heading_rad.to_degrees() < 0.1,
+        "{position_m} {heading_rad}"
+    );
+}
+
+#[test]
+fn a_street_shifted_by_a_tile_shifts_the_estimates() {
+    let (here, there) = (
+        TestWorld::street(),
+        TestWorld::moved_street(Pose2::translation(100.0, 0.0)),
+    );
+    let (a, b) = (drive(&here, 0.0, 12), drive(&there, 0.0, 12));
+    let (a, b) = (track(&here, &a, 4), track(&there, &b, 4));
+    let (a, b) = (a.last().unwrap(), b.last().unwrap());
+    // Rounding decides some resampling pointers: the runs agree to the width of the belief.
+    assert_relative_eq!(
+        a.pose.translation.x + 100.0,
+        b.pose.translation.x,
+        epsilon = 0.03
+    );
+    assert_relative_eq!(a.pose.translation.y, b.pose.translation.y, epsilon = 0.03);
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bytes_on_one_thread_and_on_two() {
+    let world = TestWorld::street();
+    let truth = drive(&world, 20.0, 6);
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build()
+            .unwrap();
+        pool.install(|| track(&world, &truth, 7))
+    };
+    let (one, two) = (on(1), on(2));
+    for (one, two) in one.iter().zip(&two) {
+        assert_eq!(one.particles, two.particles);
+        assert_eq!(one.pose, two.pose);
+    }
+    assert_ne!(
+        track(&world, &truth, 8).last().unwrap().pose,
+        one.last().unwrap().pose
+    );
+}
+
+#[test]
+fn it_tracks_without_any_odometry() {
+    let world = TestWorld::street();
+    let truth = drive(&world, 0.0, 30);
+    let mut rng = StdRng::seed_from_u64(3);
+    let start = StartSpread {
+        position_m: 1.0,
+        heading_rad: 0.1,
+        ..StartSpread::default()
+    };
+    let start = ParticleSet::uniform(around(&truth[0], 500, &start, &mut rng));
+    let mut localizer = Localizer::new(config(500), world.surroundings(), start);
+    let frames = run(&mut localizer, &world, &truth, false, &mut rng);
+    let (position_m, heading_rad) = rmse(&frames[10..], &truth[10..]);
+    assert!(
+        position_m < 0.1 && heading_rad.to_degrees() < 0.5,
+        "{position_m} {heading_rad}"
+    );
+}
+
+#[test]
+fn a_car_that_stands_is_not_weighed_and_its_belief_does_not_spread() {
+    let world = TestWorld::street();
+    let truth = drive(&world, 0.0, 10);
+    let mut rng = StdRng::seed_from_u64(5);
+    let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+    let mut localizer = Localizer::new(
+        config(500),
+        world.surroundings(),
+        ParticleSet::uniform(start),
+    );
+    let last = run(&mut localizer, &world, &truth, true, &mut rng)
+        .pop()
+        .unwrap();
+    let scan = world.scan(&truth[9]);
+    for _ in 0..20 {
+        let creep = Odometry::Increment(Pose2::translation(0.001, 0.0));
+        let frame = localizer
+            .step(creep, &scan, &Stance::default(), &mut rng)
+            .unwrap();
+        assert!(!frame.updated);
+        assert!(frame.covariance.trace() < 4.0 * last.covariance.trace() + 1e-6);
+        assert!((frame.pose.translation.vector - last.pose.translation.vector).norm() < 0.05);
+    }
+}
+
+fn panoramas(world: &TestWorld) -> PanoramaIndex {
+    let config = PanoramaConfig::default();
+    let cells = Cells::along_road(&world.road(), ROAD_HALF_WIDTH_M, config.cell_m);
+    PanoramaIndex::build(
+        &cells,
+        &world.surroundings(),
+        &LidarModel::default(),
+        1.73,
+        &config,
+    )
+    .unwrap()
+}
+
+#[test]
+fn carried_elsewhere_it_notices_within_five_frames_and_finds_itself_again() {
+    let world = TestWorld::street();
+    let index = panoramas(&world);
+    let surroundings = Surroundings {
+        panoramas: Some(&index),
+        ..world.surroundings()
+    };
+    let before = drive(&world, -30.0, 12);
+    let after = drive(&world, 47.0, 25);
+    let mut rng = StdRng::seed_from_u64(6);
+    let start = around(&before[0], 500, &StartSpread::default(), &mut rng);
+    let mut localizer = Localizer::new(config(500), surroundings, ParticleSet::uniform(start));
+    let frames = run(&mut localizer, &world, &before, true, &mut rng);
+    assert_eq!(frames.last().unwrap().state, State::Tracking);
+    let frames = run(&mut localizer, &world, &after, true, &mut rng);
+    let noticed = frames.iter().position(|frame| frame.state == State::Lost);
+    assert!(noticed.is_some_and(|frame| frame < 5), "{noticed:?}");
+    let (position_m, heading_rad) = rmse(&frames[20..], &after[20..]);
+    assert!(
+        position_m < 0.05 && heading_rad.to_degrees() < 0.2,
+        "{position_m} {heading_rad}"
+    );
+    assert_eq!(frames.last().unwrap().state, State::Tracking);
+}
+
+#[test]
+fn it_finds_itself_from_nowhere() {
+    let world = TestWorld::street();
+    let index = panoramas(&world);
+    for (seed, from_x) in [(1, -40.0), (2, 3.3), (3, 71.7)] {
+        let truth = drive(&world, from_x, 20);
+        let mut rng = StdRng::seed_from_u64(seed);
+        let start = index.sample(&world.scan(&truth[0]), &Stance::default(), 1000, &mut rng);
+        let surroundings = Surroundings {
+            panoramas: Some(&index),
+            ..world.surroundings()
+        };
+        let mut localizer = Localizer::new(config(1000), surroundings, ParticleSet::uniform(start));
+        let frames = run(&mut localizer, &world, &truth, true, &mut rng);
+        let (position_m, heading_rad) = rmse(&frames[15..], &truth[15..]);
+        assert!(
+            position_m < 0.05 && heading_rad.to_degrees() < 0.2,
+            "{from_x}: {position_m} {heading_rad}"
+        );
+    }
+}
+
+#[test]
+fn a_lorry_beside_the_car_raises_no_alarm() {
+    let map = TestWorld::street();
+    let mut seen = TestWorld::street();
+    // As long as the drive: it hides the left side of the street in every frame.
+    seen.put_box((-60.0, 140.0), (2.0, 2.5), 4.0);
+    let truth = drive(&map, 0.0, 30);
+    let mut rng = StdRng::seed_from_u64(8);
+    let start = StartSpread {
+        position_m: 0.5,
+        heading_rad: 0.05,
+        ..StartSpread::default()
+    };
+    let start = ParticleSet::uniform(around(&truth[0], 500, &start, &mut rng));
+    let mut localizer = Localizer::new(config(500), map.surroundings(), start);
+    let frames = run(&mut localizer, &seen, &truth, true, &mut rng);
+    let (position_m, _) = rmse(&frames[10..], &truth[10..]);
+    assert!(position_m < 0.05, "{position_m}");
+    assert!(frames.iter().all(|frame| frame.state != State::Lost));
+}
+
+#[test]
+fn particles_that_are_nowhere_on_the_map_do_no_harm() {
+    let world = TestWorld::street();
+    let truth = world.pose_at(0.0, 0.0, 0.0);
+    let nowhere = Pose2::translation(1e6, f64::MAX.sqrt());
+    let start = ParticleSet::uniform([nowhere, truth, nowhere]);
+    let mut localizer = Localizer::new(config(3), world.surroundings(), start);
+    let mut rng = StdRng::seed_from_u64(1);
+    let scan = world.scan(&truth);
+    let odometry = Odometry::Increment(Pose2::identity());
+    let frame = localizer
+        .step(odometry, &scan, &Stance::default(), &mut rng)
+        .unwrap();
+    assert!(frame.mean_cost_m.is_some());
+    let start = ParticleSet::uniform([nowhere; 3]);
+    let mut localizer = Localizer::new(config(3), world.surroundings(), start);
+    let frame = localizer
+        .step(odometry, &scan, &Stance::default(), &mut rng)
+        .unwrap();
+    assert_eq!(frame.mean_cost_m, None);
+    assert_ne!(frame.state, State::Tracking);
+}
+
+#[test]
+fn a_scan_without_returns_changes_nothing_and_breaks_nothing() {
+    let world = TestWorld::street();
+    let truth = drive(&world, 0.0, 10);
+    let mut rng = StdRng::seed_from_u64(9);
+    let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+    let mut localizer = Localizer::new(
+        config(500),
+        world.surroundings(),
+        ParticleSet::uniform(start),
+    );
+    run(&mut localizer, &world, &truth, true, &mut rng);
+    let empty = RangeImage::project(&[], &LidarModel::default());
+    let step = Odometry::Increment(Pose2::translation(0.8, 0.0));
+    let frame = localizer
+        .step(step, &empty, &Stance::default(), &mut rng)
+        .unwrap();
+    assert_relative_eq!(frame.pose.translation.x, 8.0, epsilon = 0.1);
+    assert_eq!(frame.agreement, None);
+    assert_eq!(frame.state, State::Tracking);
+}

@@ -1,0 +1,280 @@
+//! Odometry motion model: where a pose hypothesis goes when the vehicle moves.
+//!
+//! An odometry increment is read as *turn, drive, turn*, u = (δ₁, d, δ₂), and every
+//! hypothesis follows its own noisy copy of it:
+//!
+//! ```text
+//! δ̂₁ ~ N(δ₁, σ_turn²)    d̂ ~ N(d, σ_drive²)    δ̂₂ ~ N(δ₂, σ_turn²)
+//! T_map_current = T_map_previous · Rot(δ̂₁) · Trans(d̂, 0) · Rot(δ̂₂)
+//! ```
+//!
+//! Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), table 5.6, with a noise that
+//! does not grow with the motion, as in range-mcl (Chen et al., ICRA 2021). A vehicle that
+//! reports its speeds (v, ω) over a duration Δt instead drives an arc (table 5.3):
+//!
+//! ```text
+//! v̂ ~ N(v, σ_v²)    ω̂ ~ N(ω, σ_ω²)    T_map_current = T_map_previous · exp(v̂ Δt, 0, ω̂ Δt)
+//! ```
+
+use std::time::Duration;
+
+use nalgebra::Vector2;
+use rand::Rng;
+use rand_distr::{Distribution, StandardNormal};
+use serde::{Deserialize, Serialize};
+
+use crate::geometry::Pose2;
+
+/// Standard deviations of the odometry noise, per increment.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct OdometryNoise {
+    /// Of each of the two turns [rad].
+    pub turn_rad: f64,
+    /// Of the distance driven [m].
+    pub drive_m: f64,
+}
+
+impl Default for OdometryNoise {
+    /// The values of range-mcl.
+    fn default() -> Self {
+        Self {
+            turn_rad: 0.01,
+            drive_m: 0.05,
+        }
+    }
+}
+
+/// An odometry increment as three moves.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TurnDriveTurn {
+    /// From the old heading towards the goal [rad].
+    pub first_turn_rad: f64,
+    /// Straight ahead [m].
+    pub drive_m: f64,
+    /// From there into the new heading [rad].
+    pub second_turn_rad: f64,
+}
+
+impl TurnDriveTurn {
+    /// Splits an increment into its three moves; [`compose`](Self::compose) is the inverse.
+    pub fn decompose(previous_from_current: &Pose2) -> Self {
+        let step = previous_from_current.translation.vector;
+        let first_turn_rad = step.y.atan2(step.x);
+        let second_turn_rad = previous_from_current.rotation.angle() - first_turn_rad;
+        Self {
+            first_turn_rad,
+            drive_m: step.norm(),
+            second_turn_rad,
+        }
+    }
+
+    /// The increment `previous_from_current` that the three moves add up to.
+    pub fn compose(&self) -> Pose2 {
+        Pose2::rotation(self.first_turn_rad)
+            * Pose2::translation(self.drive_m, 0.0)
+            * Pose2::rotation(self.second_turn_rad)
+    }
+
+    /// Draws a noisy copy of the increment.
+    pub fn sample(&self, noise: &OdometryNoise, rng: &mut impl Rng) -> Self {
+        let mut gaussian = |mean: f64, sigma: f64| {
+            let deviate: f64 = StandardNormal.sample(rng);
+            mean + sigma * deviate
+        };
+        Self {
+            first_turn_rad: gaussian(self.first_turn_rad, noise.turn_rad),
+            drive_m: gaussian(self.drive_m, noise.drive_m),
+            second_turn_rad: gaussian(self.second_turn_rad, noise.turn_rad),
+        }
+    }
+}
+
+/// Standard deviations of commanded velocities, constant over a command.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct VelocityNoise {
+    /// Of the speed ahead [m/s].
+    pub speed_m_per_s: f64,
+    /// Of the turn rate [rad/s].
+    pub turn_rate_rad_per_s: f64,
+    /// Of the rate of a last turn on the spot, without which the poses would lie on a surface
+    /// (γ̂ of table 5.3) [rad/s].
+    pub final_turn_rate_rad_per_s: f64,
+}
+
+impl Default for VelocityNoise {
+    /// At ten commands a second as much as [`OdometryNoise`].
+    fn default() -> Self {
+        Self {
+            speed_m_per_s: 0.5,
+            turn_rate_rad_per_s: 0.1,
+            final_turn_rate_rad_per_s: 0.1,
+        }
+    }
+}
+
+/// A velocity command [v, ω] that is held for some time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VelocityCommand {
+    /// Ahead, v [m/s].
+    pub speed_m_per_s: f64,
+    /// To the left, ω [rad/s].
+    pub turn_rate_rad_per_s: f64,
+    /// How long it is held, Δt.
+    pub duration: Duration,
+}
+
+impl VelocityCommand {
+    /// The increment `previous_from_current` along the arc; a straight line where ω is 0.
+    pub fn compose(&self) -> Pose2 {
+        let seconds = self.duration.as_secs_f64();
+        let turn_rad = self.turn_rate_rad_per_s * seconds;
+        let drive_m = self.speed_m_per_s * seconds;
+        // sin α / α and (1 − cos α) / α, by their series where α is small.
+        let (ahead, aside) = if turn_rad.abs() < 1e-6 {
+            (1.0, 0.5 * turn_rad)
+        } else {
+            (turn_rad.sin() / turn_rad, (1.0 - turn_rad.cos()) / turn_rad)
+        };
+        Pose2::new(Vector2::new(ahead, aside) * drive_m, turn_rad)
+    }
+
+    /// Draws the increment of a noisy copy of the command.
+    pub fn sample(&self, noise: &VelocityNoise, rng: &mut impl Rng) -> Pose2 {
+        let mut gaussian = |sigma: f64| {
+            let deviate: f64 = StandardNormal.sample(rng);
+            sigma * deviate
+        };
+        let noisy = Self {
+            speed_m_per_s: self.speed_m_per_s + gaussian(noise.speed_m_per_s),
+            turn_rate_rad_per_s: self.turn_rate_rad_per_s + gaussian(noise.turn_rate_rad_per_s),
+            duration: self.duration,
+        };
+        let seconds = self.duration.as_secs_f64();
+        let last_turn_rad = gaussian(noise.final_turn_rate_rad_per_s) * seconds;
+        noisy.compose() * Pose2::rotation(last_turn_rad)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::{FRAC_PI_2, PI};
+
+    use approx::assert_relative_eq;
+    use nalgebra::Vector2;
+    use rand::{SeedableRng, rngs::StdRng};
+
+    use super::*;
+
+    #[test]
+    fn composing_undoes_decomposing() {
+        let forward = Pose2::new(Vector2::new(1.2, 0.1), 0.05);
+        let reverse = Pose2::new(Vector2::new(-0.8, 0.0), -0.02);
+        let turn_in_place = Pose2::new(Vector2::zeros(), FRAC_PI_2);
+        let half_turn = Pose2::new(Vector2::new(0.0, 2.0), PI);
+        for increment in [
+            forward,
+            reverse,
+            turn_in_place,
+            half_turn,
+            Pose2::identity(),
+        ] {
+            let round_trip = TurnDriveTurn::decompose(&increment).compose();
+            assert_relative_eq!(round_trip, increment, epsilon = 1e-12);
+        }
+    }
+
+    #[test]
+    fn samples_have_the_configured_spread() {
+        let odometry = TurnDriveTurn {
+            first_turn_rad: 0.3,
+            drive_m: 1.0,
+            second_turn_rad: -0.1,
+        };
+        let noise = OdometryNoise {
+            turn_rad: 0.02,
+            drive_m: 0.2,
+        };
+        let mut rng = StdRng::seed_from_u64(7);
+        let drives: Vec<f64> = (0..20_000)
+            .map(|_| odometry.sample(&noise, &mut rng).drive_m)
+            .collect();
+
+        let n = drives.len() as f64;
+        let mean = drives.iter().sum::<f64>() / n;
+        let variance = drives
+            .iter()
+            .map(|drive| (drive - mean).powi(2))
+            .sum::<f64>()
+            / n;
+        // Four standard errors of the mean and of the standard deviation.
+        assert_relative_eq!(mean, 1.0, epsilon = 4.0 * 0.2 / n.sqrt());
+        assert_relative_eq!(variance.sqrt(), 0.2, epsilon = 4.0 * 0.2 / (2.0 * n).sqrt());
+    }
+
+    #[test]
+    fn a_velocity_command_drives_an_arc_of_radius_v_over_omega() {
+        let quarter = VelocityCommand {
+            speed_m_per_s: 2.0,
+            turn_rate_rad_per_s: 0.5,
+            duration: Duration::from_secs_f64(PI),
+        };
+        let expected = Pose2::new(Vector2::new(4.0, 4.0), FRAC_PI_2);
+        // A duration is a whole number of nanoseconds.
+        assert_relative_eq!(quarter.compose(), expected, epsilon = 1e-8);
+        let straight = VelocityCommand {
+            turn_rate_rad_per_s: 0.0,
+            ..quarter
+        };
+        let expected = Pose2::translation(2.0 * PI, 0.0);
+        assert_relative_eq!(straight.compose(), expected, epsilon = 1e-8);
+    }
+
+    #[test]
+    fn two_halves_of_a_velocity_command_are_the_whole() {
+        let whole = VelocityCommand {
+            speed_m_per_s: 7.0,
+            turn_rate_rad_per_s: -0.3,
+            duration: Duration::from_millis(200),
+        };
+        let half = VelocityCommand {
+            duration: Duration::from_millis(100),
+            ..whole
+        };
+        let twice = half.compose() * half.compose();
+        assert_relative_eq!(twice, whole.compose(), epsilon = 1e-12);
+    }
+
+    #[test]
+    fn velocity_samples_spread_with_the_duration() {
+        let command = VelocityCommand {
+            speed_m_per_s: 5.0,
+            turn_rate_rad_per_s: 0.0,
+            duration: Duration::from_millis(100),
+        };
+        let noise = VelocityNoise {
+            speed_m_per_s: 0.5,
+            turn_rate_rad_per_s: 0.0,
+            final_turn_rate_rad_per_s: 0.2,
+        };
+        let mut rng = StdRng::seed_from_u64(3);
+        let n = 20_000.0_f64;
+        let (mut drive, mut turn) = (0.0, 0.0);
+        for _ in 0..20_000 {
+            let step = command.sample(&noise, &mut rng);
+            drive += (step.translation.x - 0.5).powi(2) / n;
+            turn += step.rotation.angle().powi(2) / n;
+        }
+        // σ Δt, four standard errors of the standard deviation.
+        assert_relative_eq!(drive.sqrt(), 0.05, epsilon = 4.0 * 0.05 / (2.0 * n).sqrt());
+        assert_relative_eq!(turn.sqrt(), 0.02, epsilon = 4.0 * 0.02 / (2.0 * n).sqrt());
+    }
+
+    #[test]
+    fn a_mistyped_key_is_an_error() {
+        let result: Result<OdometryNoise, _> = serde_yaml::from_str("turn_red: 0.02\n");
+        let message = result.unwrap_err().to_string();
+        assert!(message.contains("turn_red"), "{message}");
+    }
+}

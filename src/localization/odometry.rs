@@ -1,0 +1,120 @@
+//! How the car moved between two frames, as a transform `previous_from_current` in the plane.
+//!
+//! ```text
+//! u_k = T_world_lidar(k−1)⁻¹ · T_world_lidar(k)
+//! ```
+//!
+//! The world frame cancels out: a recorded odometry may start anywhere and drift. From the
+//! ground truth with noise, as range-mcl does for demonstration, from a file, or not at all: then
+//! the car goes on as it went.
+
+use rand::Rng;
+
+use super::motion::{OdometryNoise, TurnDriveTurn};
+use crate::geometry::{Pose2, Pose3, planar};
+
+/// One increment per pose, the first of them the identity; in the plane of the car.
+pub fn increments(world_from_lidar: &[Pose3]) -> Vec<Pose2> {
+    let first = world_from_lidar.first().map(|_| Pose2::identity());
+    let steps = world_from_lidar
+        .windows(2)
+        .map(|pair| planar(&(pair[0].inverse() * pair[1])));
+    first.into_iter().chain(steps).collect()
+}
+
+/// Increments with noise on each of their three moves, except where the first says that nothing
+/// came before. With the ground truth's increments this is range-mcl's demonstration, and a
+/// report has to name it so.
+pub fn with_noise(increments: &[Pose2], noise: &OdometryNoise, rng: &mut impl Rng) -> Vec<Pose2> {
+    increments
+        .iter()
+        .enumerate()
+        .map(|(frame, increment)| match frame {
+            0 => *increment,
+            _ => TurnDriveTurn::decompose(increment)
+                .sample(noise, rng)
+                .compose(),
+        })
+        .collect()
+}
+
+/// The noise that range-mcl puts on the true increments: 0.01 rad, 0.01 m.
+pub fn demonstration_noise() -> OdometryNoise {
+    OdometryNoise {
+        turn_rad: 0.01,
+        drive_m: 0.01,
+    }
+}
+
+/// What is known about the motion into a frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Odometry {
+    /// Measured: `previous_from_current`.
+    Increment(Pose2),
+    /// Nothing: the car went on as in the frame before (constant velocity).
+    Unknown,
+}
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+    use nalgebra::Vector3;
+    use rand::{SeedableRng, rngs::StdRng};
+
+    use super::*;
+
+    fn drive() -> Vec<Pose3> {
+        let step = Pose3::new(Vector3::new(1.0, 0.02, 0.0), Vector3::new(0.0, 0.0, 0.03));
+        let mut pose = Pose3::new(Vector3::new(3.0, -4.0, 0.5), Vector3::new(0.0, 0.0, 1.0));
+        (0..50)
+            .map(|_| {
+                pose *= step;
+                pose
+            })
+            .collect()
+    }
+
+    #[test]
+    fn increments_chained_from_the_first_pose_give_the_trajectory() {
+        let poses = drive();
+        let mut pose = planar(&poses[0]);
+        for (increment, expected) in increments(&poses).iter().zip(&poses) {
+            pose *= increment;
+            assert_relative_eq!(pose, planar(expected), epsilon = 1e-9);
+        }
+    }
+
+    #[test]
+    fn increments_do_not_depend_on_the_world_frame() {
+        let poses = drive();
+        let other_from_world = Pose3::new(Vector3::new(9.0, 8.0, 7.0), Vector3::new(0.3, 0.2, 2.0));
+        let moved: Vec<Pose3> = poses.iter().map(|pose| other_from_world * pose).collect();
+        for (a, b) in increments(&poses).iter().zip(&increments(&moved)) {
+            assert_relative_eq!(a, b, epsilon = 1e-9);
+        }
+    }
+
+    #[test]
+    fn no_poses_have_no_increments() {
+        assert_eq!(increments(&[]), []);
+    }
+
+    #[test]
+    fn noise_of_zero_changes_nothing_and_the_first_frame_never_has_any() {
+        let increments = increments(&drive());
+        let mut rng = StdRng::seed_from_u64(1);
+        let silent = OdometryNoise {
+            turn_rad: 0.0,
+            drive_m: 0.0,
+        };
+        for (a, b) in with_noise(&increments, &silent, &mut rng)
+            .iter()
+            .zip(&increments)
+        {
+            assert_relative_eq!(a, b, epsilon = 1e-12);
+        }
+        let noisy = with_noise(&increments, &demonstration_noise(), &mut rng);
+        assert_eq!(noisy[0], Pose2::identity());
+        assert_ne!(noisy[1], increments[1]);
+    }
+}

@@ -1,0 +1,240 @@
+//! The belief: weighted pose hypotheses.
+//!
+//! ```text
+//! Σ wᵢ = 1        N_eff = 1 / Σ wᵢ²        mean = (Σ wᵢ xᵢ, Σ wᵢ yᵢ, arg Σ wᵢ e^{iθᵢ})
+//! ```
+//!
+//! Every operation keeps the weights summing to one. Thrun, Burgard and Fox, *Probabilistic
+//! Robotics* (2005), chapter 4.3; Kong, Liu and Wong (1994) for the effective sample size.
+
+use nalgebra::{Matrix3, Vector2, Vector3};
+
+use crate::geometry::{Pose2, circular_mean, wrap_angle};
+
+/// A pose hypothesis of the filter.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Particle {
+    /// `p_map = map_from_lidar * p_lidar`, seen from above.
+    pub map_from_lidar: Pose2,
+    /// Share of the belief, 0 to 1.
+    pub weight: f64,
+}
+
+/// Particles whose weights sum to one.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ParticleSet {
+    particles: Vec<Particle>,
+}
+
+impl ParticleSet {
+    /// Equally weighted hypotheses; at least one.
+    pub fn uniform(poses: impl IntoIterator<Item = Pose2>) -> Self {
+        let mut particles: Vec<Particle> = poses
+            .into_iter()
+            .map(|map_from_lidar| Particle {
+                map_from_lidar,
+                weight: 1.0,
+            })
+            .collect();
+        debug_assert!(!particles.is_empty(), "a belief needs a hypothesis");
+        let weight = 1.0 / particles.len() as f64;
+        for particle in &mut particles {
+            particle.weight = weight;
+        }
+        Self { particles }
+    }
+
+    /// Number of particles.
+    pub fn len(&self) -> usize {
+        self.particles.len()
+    }
+
+    /// Whether there are no particles.
+    pub fn is_empty(&self) -> bool {
+        self.particles.is_empty()
+    }
+
+    /// The particles, in a fixed order.
+    pub fn particles(&self) -> &[Particle] {
+        &self.particles
+    }
+
+    /// The hypotheses without their weights.
+    pub fn poses(&self) -> impl ExactSizeIterator<Item = &Pose2> {
+        self.particles
+            .iter()
+            .map(|particle| &particle.map_from_lidar)
+    }
+
+    /// The weights in the order of the particles.
+    pub fn weights(&self) -> Vec<f64> {
+        self.particles.iter().map(|p| p.weight).collect()
+    }
+
+    /// Replaces every pose by what `moved` makes of it, in order.
+    pub fn propagate(&mut self, mut moved: impl FnMut(&Pose2) -> Pose2) {
+        for particle in &mut self.particles {
+            particle.map_from_lidar = moved(&particle.map_from_lidar);
+        }
+    }
+
+    /// Multiplies every weight by its likelihood and normalizes (Bayes' rule). Logarithms, so
+    /// that nothing underflows; only differences between them matter.
+    pub fn reweight(&mut self, log_likelihoods: &[f64]) {
+        debug_assert_eq!(log_likelihoods.len(), self.len());
+        let highest = self
+            .particles
+            .iter()
+            .zip(log_likelihoods)
+            .filter(|(particle, _)| particle.weight > 0.0)
+            .map(|(_, &log)| log)
+            .fold(f64::NEG_INFINITY, f64::max);
+        if !highest.is_finite() {
+            return;
+        }
+        for (particle, log) in self.particles.iter_mut().zip(log_likelihoods) {
+            particle.weight *= (log - highest).exp();
+        }
+        let sum: f64 = self.particles.iter().map(|p| p.weight).sum();
+        for particle in &mut self.particles {
+            particle.weight /= sum;
+        }
+    }
+
+    /// How many equally weighted particles would be worth as much: 1 to N (unitless).
+    pub fn effective_sample_size(&self) -> f64 {
+        1.0 / self.particles.iter().map(|p| p.weight.powi(2)).sum::<f64>()
+    }
+
+    /// The equally weighted set of the given members, some of them more than once.
+    #[must_use]
+    pub fn selected(&self, members: &[usize]) -> Self {
+        Self::uniform(members.iter().map(|&i| self.particles[i].map_from_lidar))
+    }
+
+    /// The particle with the largest weight, of equals the first.
+    pub fn best(&self) -> Particle {
+        self.particles
+            .iter()
+            .copied()
+            .reduce(|best, next| {
+                if next.weight > best.weight {
+                    next
+                } else {
+                    best
+                }
+            })
+            .unwrap_or(Particle {
+                map_from_lidar: Pose2::identity(),
+                weight: 0.0,
+            })
+    }
+
+    /// The weighted mean, with the circular mean of the headings; where the headings cancel out,
+    /// the heading of the best particle.
+    pub fn mean(&self) -> Pose2 {
+        let position: Vector2<f64> = self
+            .particles
+            .iter()
+            .map(|p| p.weight * p.map_from_lidar.translation.vector)
+            .sum();
+        let headings = self
+            .particles
+            .iter()
+            .map(|p| (p.map_from_lidar.rotation.angle(), p.weight));
+        let heading_rad =
+            circular_mean(headings).unwrap_or_else(|| self.best().map_from_lidar.rotation.angle());
+        Pose2::new(position, heading_rad)
+    }
+
+    /// Weighted covariance of (x, y, heading) about a pose, in the map frame [m², m·rad, rad²].
+    pub fn covariance_about(&self, center: &Pose2) -> Matrix3<f64> {
+        self.particles
+            .iter()
+            .map(|particle| {
+                let offset = deviation(&particle.map_from_lidar, center);
+                particle.weight * offset * offset.transpose()
+            })
+            .sum()
+    }
+}
+
+/// How far a pose is from another: Δx, Δy [m] in the map frame and the turn in [-π, π) [rad].
+pub fn deviation(pose: &Pose2, center: &Pose2) -> Vector3<f64> {
+    let offset = pose.translation.vector - center.translation.vector;
+    let turn_rad = wrap_angle(pose.rotation.angle() - center.rotation.angle());
+    Vector3::new(offset.x, offset.y, turn_rad)
+}
+
+/// Standard deviations of a covariance of (x, y, heading): position as √(σ_x² + σ_y²) [m], heading [rad].
+pub fn spread(covariance: &Matrix3<f64>) -> (f64, f64) {
+    (
+        (covariance[(0, 0)] + covariance[(1, 1)]).max(0.0).sqrt(),
+        covariance[(2, 2)].max(0.0).sqrt(),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::PI;
+
+    use approx::assert_relative_eq;
+
+    use super::*;
+
+    fn pose(x: f64, y: f64, heading: f64) -> Pose2 {
+        Pose2::new(Vector2::new(x, y), heading)
+    }
+
+    fn total(set: &ParticleSet) -> f64 {
+        set.particles().iter().map(|p| p.weight).sum()
+    }
+
+    #[test]
+    fn weights_sum_to_one_after_every_operation() {
+        let mut set = ParticleSet::uniform((0..7).map(|i| pose(f64::from(i), 0.0, 0.0)));
+        assert_relative_eq!(total(&set), 1.0, epsilon = 1e-12);
+        for logs in [
+            [0.0; 7],
+            [-1e4; 7],
+            [-1.0, -2.0, -900.0, 3.0, 0.0, 0.5, -1e9],
+        ] {
+            set.reweight(&logs);
+            assert_relative_eq!(total(&set), 1.0, epsilon = 1e-12);
+        }
+        set.propagate(|p| pose(1.0, 0.0, 0.0) * p);
+        assert_relative_eq!(total(&set), 1.0, epsilon = 1e-12);
+        assert_relative_eq!(total(&set.selected(&[1, 1, 4])), 1.0, epsilon = 1e-12);
+    }
+
+    #[test]
+    fn only_likelihood_ratios_matter() {
+        let start = ParticleSet::uniform((0..3).map(|i| pose(f64::from(i), 0.0, 0.0)));
+        let (mut a, mut b) = (start.clone(), start);
+        a.reweight(&[0.0, 1.0, 2.0]);
+        b.reweight(&[-5000.0, -4999.0, -4998.0]);
+        for (a, b) in a.particles().iter().zip(b.particles()) {
+            assert_relative_eq!(a.weight, b.weight, epsilon = 1e-12);
+        }
+        let ratio = a.particles()[2].weight / a.particles()[1].weight;
+        assert_relative_eq!(ratio, 1.0_f64.exp(), epsilon = 1e-9);
+    }
+
+    #[test]
+    fn the_effective_sample_size_is_all_of_equals_and_one_of_a_single_survivor() {
+        let mut set = ParticleSet::uniform((0..5).map(|i| pose(f64::from(i), 0.0, 0.0)));
+        assert_relative_eq!(set.effective_sample_size(), 5.0, epsilon = 1e-9);
+        set.reweight(&[0.0, -1e6, -1e6, -1e6, -1e6]);
+        assert_relative_eq!(set.effective_sample_size(), 1.0, epsilon = 1e-9);
+    }
+
+    #[test]
+    fn the_mean_heading_around_pi_is_pi() {
+        let set = ParticleSet::uniform([pose(0.0, 0.0, PI - 0.1), pose(2.0, 0.0, -PI + 0.1)]);
+        assert_relative_eq!(set.mean().translation.x, 1.0, epsilon = 1e-12);
+        assert_relative_eq!(set.mean().rotation.angle().abs(), PI, epsilon = 1e-9);
+        let covariance = set.covariance_about(&set.mean());
+        assert_relative_eq!(covariance[(2, 2)], 0.01, epsilon = 1e-9);
+        assert_relative_eq!(covariance[(0, 0)], 1.0, epsilon = 1e-9);
+    }
+}

@@ -1,0 +1,254 @@
+//! Particles where the belief is: systematic resampling, the number of particles that a belief
+//! needs, and a jitter that keeps copies apart.
+//!
+//! ```text
+//! pointers  r + k/N,  r ~ U(0, 1/N)                      E[copies of i] = N wᵢ
+//! KLD       n = (k−1)/(2ε) · (1 − 2/(9(k−1)) + √(2/(9(k−1))) z)³      k occupied bins
+//! jitter    x ← x + h · L ξ,  L Lᵀ = Cov,  h = (4 / (N (d + 2)))^(1/(d+4)),  d = 3
+//! ```
+//!
+//! Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), table 4.4; Fox, *Adapting the Sample
+//! Size in Particle Filters Through KLD-Sampling*, IJRR 2003, eq. 7; Musso, Oudjane and Le Gland,
+//! *Improving Regularised Particle Filters* (2001), eq. 12.2.7.
+
+use std::collections::BTreeSet;
+
+use nalgebra::{Matrix3, Vector3};
+use rand::{Rng, RngExt as _};
+use rand_distr::{Distribution, StandardNormal};
+use serde::{Deserialize, Serialize};
+
+use super::particles::{ParticleSet, spread};
+use crate::geometry::{Pose2, wrap_angle};
+
+/// When to resample, and how far copies of a particle are set apart.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ResamplingConfig {
+    /// Resample when the effective sample size is below this share of the particles.
+    pub min_effective_fraction: f64,
+    /// The jitter as a multiple of the kernel width h; 0 for none, as in range-mcl.
+    pub jitter: f64,
+    /// The jitter never exceeds this in x and y, however wide the belief [m].
+    pub max_jitter_m: f64,
+    /// And this in heading [rad].
+    pub max_jitter_rad: f64,
+}
+
+impl Default for ResamplingConfig {
+    /// range-mcl's 0.75; half the optimal kernel, since a belief is narrower than the Gaussian of
+    /// its covariance.
+    fn default() -> Self {
+        Self {
+            min_effective_fraction: 0.75,
+            jitter: 0.5,
+            max_jitter_m: 0.3,
+            max_jitter_rad: 0.05,
+        }
+    }
+}
+
+/// How many particles a belief needs while it is wide.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct KldConfig {
+    /// Bound on the Kullback-Leibler distance between the particles and the belief, ε (unitless).
+    pub max_distance: f64,
+    /// Quantile of the standard normal distribution, z: how surely the bound holds.
+    pub quantile: f64,
+    /// Side of a bin in x and y [m].
+    pub bin_m: f64,
+    /// Width of a bin in heading [rad].
+    pub bin_rad: f64,
+}
+
+impl Default for KldConfig {
+    /// ε and z of Fox (2003), section 4: 0.05 with probability 0.99; bins of 0.5 m and 10 degrees.
+    fn default() -> Self {
+        Self {
+            max_distance: 0.05,
+            quantile: 2.33,
+            bin_m: 0.5,
+            bin_rad: 10.0_f64.to_radians(),
+        }
+    }
+}
+
+/// Draws `count` members with one random number: each is drawn as often as its weight says,
+/// rounded up or down, and on average exactly that often. `weights` sum to one.
+pub fn systematic(weights: &[f64], count: usize, rng: &mut impl Rng) -> Vec<usize> {
+    let step = 1.0 / count as f64;
+    let offset = rng.random::<f64>() * step;
+    let mut members = Vec::with_capacity(count);
+    let mut index = 0;
+    let mut cumulative = weights[0];
+    for k in 0..count {
+        let pointer = offset + k as f64 * step;
+        while pointer >= cumulative && index + 1 < weights.len() {
+            index += 1;
+            cumulative += weights[index];
+        }
+        members.push(index);
+    }
+    members
+}
+
+/// The number of particles after which the belief is known well enough (unitless).
+pub fn kld_sample_size(occupied_bins: usize, config: &KldConfig) -> usize {
+    if occupied_bins < 2 {
+        return 1;
+    }
+    let degrees = (occupied_bins - 1) as f64;
+    let ninth = 2.0 / (9.0 * degrees);
+    let cube = (1.0 - ninth + ninth.sqrt() * config.quantile).powi(3);
+    (degrees / (2.0 * config.max_distance) * cube).ceil() as usize
+}
+
+/// How many bins of (x, y, heading) the particles occupy.
+pub fn occupied_bins<'a>(poses: impl IntoIterator<Item = &'a Pose2>, config: &KldConfig) -> usize {
+    let bin = |pose: &Pose2| {
+        let place = pose.translation.vector / config.bin_m;
+        let heading = wrap_angle(pose.rotation.angle()) / config.bin_rad;
+        [place.x, place.y, heading].map(|coordinate| coordinate.floor() as i64)
+    };
+    let bins: BTreeSet<[i64; 3]> = poses.into_iter().map(bin).collect();
+    bins.len()
+}
+
+/// Sets particles apart by a small share of the belief's own covariance, so that copies of one
+/// particle explore its surroundings. `covariance` is that of the belief before resampling.
+pub fn jitter(
+    particles: &mut ParticleSet,
+    covariance: &Matrix3<f64>,
+    config: &ResamplingConfig,
+    rng: &mut impl Rng,
+) {
+    let kernel = config.jitter * kernel_width(particles.len());
+    let Some(root) = capped_root(covariance, kernel, config) else {
+        return;
+    };
+    particles.propagate(|pose| {
+        let deviates: [f64; 3] = std::array::from_fn(|_| StandardNormal.sample(rng));
+        let offset = root * Vector3::from(deviates);
+        Pose2::new(
+            pose.translation.vector + offset.xy(),
+            pose.rotation.angle() + offset.z,
+        )
+    });
+}
+
+/// Width of the optimal Gaussian kernel for `count` samples of a Gaussian in three dimensions, in
+/// standard deviations.
+fn kernel_width(count: usize) -> f64 {
+    (4.0 / (5.0 * count as f64)).powf(1.0 / 7.0)
+}
+
+/// A square root of kernel² · covariance, with its spread cut to the caps; `None` where the
+/// covariance is not positive definite (all particles alike).
+fn capped_root(
+    covariance: &Matrix3<f64>,
+    kernel: f64,
+    config: &ResamplingConfig,
+) -> Option<Matrix3<f64>> {
+    let (position_m, heading_rad) = spread(covariance);
+    let cap = |sigma: f64, most: f64| {
+        if sigma * kernel > most {
+            most / sigma
+        } else {
+            kernel
+        }
+    };
+    let scale_m = cap(position_m, config.max_jitter_m);
+    let scale_rad = cap(heading_rad, config.max_jitter_rad);
+    let scale = Matrix3::from_diagonal(&Vector3::new(scale_m, scale_m, scale_rad));
+    Some(scale * covariance.cholesky()?.l())
+}
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+    use rand::{SeedableRng, rngs::StdRng};
+
+    use super::*;
+
+    #[test]
+    fn a_member_is_drawn_as_often_as_its_weight_says_up_to_rounding() {
+        let weights = [0.05, 0.4, 0.0, 0.33, 0.22];
+        let mut rng = StdRng::seed_from_u64(1);
+        for _ in 0..200 {
+            let members = systematic(&weights, 10, &mut rng);
+            for (index, weight) in weights.iter().enumerate() {
+                let copies = members.iter().filter(|&&m| m == index).count() as f64;
+                assert!(
+                    (copies - 10.0 * weight).abs() < 1.0 + 1e-9,
+                    "{copies} {weight}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn resampling_is_unbiased() {
+        let weights = [0.05, 0.4, 0.33, 0.22];
+        let mut rng = StdRng::seed_from_u64(2);
+        let rounds = 20_000;
+        let mut copies = [0.0; 4];
+        for _ in 0..rounds {
+            for member in systematic(&weights, 3, &mut rng) {
+                copies[member] += 1.0 / f64::from(3 * rounds);
+            }
+        }
+        for (share, weight) in copies.iter().zip(weights) {
+            // The number of copies is within one of its mean: standard deviation at most 1/2.
+            assert_relative_eq!(
+                *share,
+                weight,
+                epsilon = 4.0 * 0.5 / 3.0 / f64::from(rounds).sqrt()
+            );
+        }
+    }
+
+    #[test]
+    fn equal_weights_are_a_copy() {
+        let mut rng = StdRng::seed_from_u64(3);
+        let members = systematic(&[0.125; 8], 8, &mut rng);
+        assert_eq!(members, (0..8).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_wider_belief_needs_more_particles() {
+        let config = KldConfig::default();
+        assert_eq!(kld_sample_size(0, &config), 1);
+        let sizes: Vec<usize> = [2, 10, 100, 1000]
+            .iter()
+            .map(|&bins| kld_sample_size(bins, &config))
+            .collect();
+        assert!(sizes.is_sorted(), "{sizes:?}");
+        // χ²₀.₉₉ with 99 degrees of freedom is 134.64 (Fox 2003, eq. 5).
+        assert_relative_eq!(sizes[2] as f64, 134.64 / 0.1, epsilon = 10.0);
+    }
+
+    #[test]
+    fn jitter_has_the_spread_of_the_kernel_and_no_more_than_the_cap() {
+        let covariance = Matrix3::from_diagonal(&Vector3::new(0.04, 0.01, 1.0));
+        let config = ResamplingConfig {
+            jitter: 1.0,
+            max_jitter_m: 1.0,
+            max_jitter_rad: 0.05,
+            ..ResamplingConfig::default()
+        };
+        let n = 20_000;
+        let mut set = ParticleSet::uniform(std::iter::repeat_n(Pose2::identity(), n));
+        jitter(
+            &mut set,
+            &covariance,
+            &config,
+            &mut StdRng::seed_from_u64(4),
+        );
+        let found = set.covariance_about(&Pose2::identity());
+        let expected = 0.2 * kernel_width(n);
+        let error = 4.0 / (2.0 * n as f64).sqrt();
+        assert_relative_eq!(found[(0, 0)].sqrt(), expected, epsilon = expected * error);
+        assert_relative_eq!(found[(2, 2)].sqrt(), 0.05, epsilon = 0.05 * error);
+    }
+}

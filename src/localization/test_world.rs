@@ -1,0 +1,223 @@
+//! A street of boxes with a renderer that needs no mesh: for tests only.
+
+use glam::Vec3;
+use nalgebra::{Point2, Vector2};
+
+use crate::geometry::{Pose2, Pose3, Rigid3f};
+use crate::lidar::{Beam, LidarModel, RangeImage};
+use crate::map::{GroundMap, Stance, TileConfig, TileGrid};
+use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
+
+/// Axis-aligned boxes on flat ground, seen in a frame that may be turned and shifted.
+pub struct TestWorld {
+    /// Lower and upper corners, street frame.
+    boxes: Vec<(Vec3, Vec3)>,
+    /// `p_map = map_from_street * p_street`.
+    pub map_from_street: Pose2,
+    pub ground: GroundMap,
+    pub tiles: TileGrid,
+    model: LidarModel,
+}
+
+/// Height of the ground in the map [m].
+const GROUND_M: f64 = -1.73;
+
+impl TestWorld {
+    /// 200 m of street along x with houses, gaps, parked cars and poles at irregular places.
+    pub fn street() -> Self {
+        Self::moved_street(Pose2::identity())
+    }
+
+    /// The same street elsewhere in the map.
+    pub fn moved_street(map_from_street: Pose2) -> Self {
+        let mut boxes = Vec::new();
+        let mut state = 12345_u32;
+        let mut random = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) as f32 / (1 << 24) as f32
+        };
+        for side in [-1.0_f32, 1.0] {
+            let mut x = -60.0;
+            while x < 140.0 {
+                let (length, setback, gap) = (
+                    6.0 + 9.0 * random(),
+                    7.0 + 3.0 * random(),
+                    1.0 + 5.0 * random(),
+                );
+                boxes.push(footprint(
+                    x,
+                    x + length,
+                    side * setback,
+                    side * (setback + 8.0),
+                    8.0,
+                ));
+                x += length + gap;
+                if random() < 0.6 {
+                    let car = x + 4.0 * random();
+                    boxes.push(footprint(car, car + 4.2, side * 3.6, side * 5.3, 1.5));
+                }
+                let pole = x + 6.0 * random();
+                boxes.push(footprint(pole, pole + 0.3, side * 5.8, side * 6.1, 6.0));
+            }
+        }
+        let mapping: Vec<Pose3> = (-50..130)
+            .map(|x| {
+                let pose = map_from_street * Pose2::translation(f64::from(x), 0.0);
+                crate::geometry::spatial(&pose, 0.0)
+            })
+            .collect();
+        Self {
+            boxes,
+            map_from_street,
+            ground: GroundMap::flat(
+                Point2::new(-400.0, -400.0),
+                Point2::new(400.0, 400.0),
+                GROUND_M,
+            ),
+            tiles: TileGrid::around(&mapping, &TileConfig::default()),
+            model: LidarModel {
+                height: 32,
+                width: 360,
+                ..LidarModel::default()
+            },
+        }
+    }
+
+    /// The mapping poses, one per metre, in the map.
+    pub fn road(&self) -> Vec<Pose2> {
+        (-50..130)
+            .map(|x| self.map_from_street * Pose2::translation(f64::from(x), 0.0))
+            .collect()
+    }
+
+    /// A pose of the street in the map.
+    pub fn pose_at(&self, x: f64, y: f64, heading: f64) -> Pose2 {
+        self.map_from_street * Pose2::new(Vector2::new(x, y), heading)
+    }
+
+    /// What the sensor sees from a pose.
+    pub fn scan(&self, pose: &Pose2) -> RangeImage {
+        let map_from_lidar = self.ground.lift(pose, &Stance::default()).unwrap();
+        let ranges = self.ranges(&map_from_lidar, &self.model.directions());
+        let limited = ranges
+            .into_iter()
+            .map(|range| {
+                if self.model.accepts_range(range) {
+                    range
+                } else {
+                    f32::INFINITY
+                }
+            })
+            .collect();
+        RangeImage::from_ranges(limited, &self.model)
+    }
+
+    /// Adds a box of the street that the ground and tiles know nothing of.
+    pub fn put_box(&mut self, x: (f32, f32), y: (f32, f32), height: f32) {
+        self.boxes.push(footprint(x.0, x.1, y.0, y.1, height));
+    }
+
+    fn ranges(&self, map_from_lidar: &Pose3, directions: &[Vec3]) -> Vec<f32> {
+        let map_from_street = crate::geometry::spatial(&self.map_from_street, 0.0);
+        let street_from_lidar = Rigid3f::from(&(map_from_street.inverse() * map_from_lidar));
+        let origin = street_from_lidar.translation;
+        directions
+            .iter()
+            .map(|&direction| {
+                let ray = street_from_lidar.rotate(direction);
+                let ground = (GROUND_M as f32 - origin.z) / ray.z;
+                let nearest = self
+                    .boxes
+                    .iter()
+                    .map(|corners| enter(corners, origin, ray))
+                    .fold(f32::INFINITY, f32::min);
+                if ground > 0.0 {
+                    nearest.min(ground)
+                } else {
+                    nearest
+                }
+            })
+            .collect()
+    }
+}
+
+fn footprint(x0: f32, x1: f32, y0: f32, y1: f32, height: f32) -> (Vec3, Vec3) {
+    let (a, b) = (
+        Vec3::new(x0, y0, GROUND_M as f32),
+        Vec3::new(x1, y1, GROUND_M as f32 + height),
+    );
+    (a.min(b), a.max(b))
+}
+
+/// Where a ray enters a box from outside; infinite where it does not.
+fn enter(corners: &(Vec3, Vec3), origin: Vec3, ray: Vec3) -> f32 {
+    let (a, b) = ((corners.0 - origin) / ray, (corners.1 - origin) / ray);
+    let (enter, exit) = (a.min(b).max_element(), a.max(b).min_element());
+    if enter > 0.0 && enter <= exit {
+        enter
+    } else {
+        f32::INFINITY
+    }
+}
+
+impl RangeRenderer for TestWorld {
+    fn name(&self) -> String {
+        "boxes".into()
+    }
+
+    fn render(&self, poses: &[Pose3], model: &LidarModel) -> Result<Vec<Vec<f32>>, RenderError> {
+        let images = self.cast(poses, &model.directions())?;
+        let limit = |range: f32| {
+            if model.accepts_range(range) {
+                range
+            } else {
+                f32::INFINITY
+            }
+        };
+        Ok(images
+            .into_iter()
+            .map(|image| image.into_iter().map(limit).collect())
+            .collect())
+    }
+
+    fn cast(&self, poses: &[Pose3], directions: &[Vec3]) -> Result<Vec<Vec<f32>>, RenderError> {
+        use rayon::prelude::*;
+        Ok(poses
+            .par_iter()
+            .map(|pose| self.ranges(pose, directions))
+            .collect())
+    }
+
+    fn compare(
+        &self,
+        poses: &[Pose3],
+        beams: &[Beam],
+        difference: &RangeDifference,
+    ) -> Result<Vec<f32>, RenderError> {
+        let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
+        let mean = |ranges: Vec<f32>| {
+            let costs = beams
+                .iter()
+                .zip(ranges)
+                .map(|(beam, range)| difference.cost(beam.range_m, range));
+            costs.sum::<f32>() / beams.len().max(1) as f32
+        };
+        Ok(self
+            .cast(poses, &directions)?
+            .into_iter()
+            .map(mean)
+            .collect())
+    }
+}
+
+impl TestWorld {
+    /// The street as the localizer sees it.
+    pub fn surroundings(&self) -> super::Surroundings<'_> {
+        super::Surroundings {
+            renderer: self,
+            ground: &self.ground,
+            tiles: &self.tiles,
+            panoramas: None,
+        }
+    }
+}

@@ -1,0 +1,133 @@
+//! Searching, tracking or lost: whether the estimate deserves belief.
+//!
+//! Of the beams that reach the map from the estimated pose, how many meet it where it is? That
+//! share is followed by a fast and a slow average,
+//!
+//! ```text
+//! fast ← fast + α_fast (a − fast)      slow ← slow + α_slow (a − slow)
+//! lost  ⇔  fast < min_agreement  ∨  fast < lost_fraction · slow
+//! ```
+//!
+//! Augmented MCL (Thrun, Burgard and Fox, *Probabilistic Robotics*, 2005, table 8.3) does so with
+//! the likelihood; here traffic in front of the map must not raise an alarm, so that beams that
+//! end before the map are left out.
+
+use serde::{Deserialize, Serialize};
+
+/// What the filter believes about itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum State {
+    /// The belief is still wide.
+    Searching,
+    /// The belief is narrow and the map agrees.
+    Tracking,
+    /// The belief is narrow and the map disagrees: the estimate is not to be used.
+    Lost,
+}
+
+/// When the map disagrees.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct VigilanceConfig {
+    /// A beam meets the map where it is within this [m].
+    pub tolerance_m: f32,
+    /// Weight of a new frame in the fast average, α_fast.
+    pub fast_rate: f64,
+    /// Weight of a new frame in the slow average, α_slow.
+    pub slow_rate: f64,
+    /// Lost below this share of agreeing beams, whatever is usual here.
+    pub min_agreement: f64,
+    /// Lost below this fraction of what is usual here.
+    pub lost_fraction: f64,
+    /// Updates without convergence after which the search begins anew.
+    pub patience: usize,
+}
+
+impl Default for VigilanceConfig {
+    /// Our own values.
+    fn default() -> Self {
+        Self {
+            tolerance_m: 0.3,
+            fast_rate: 0.4,
+            slow_rate: 0.02,
+            min_agreement: 0.5,
+            lost_fraction: 0.75,
+            patience: 25,
+        }
+    }
+}
+
+/// The two averages.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Vigilance {
+    fast: Option<f64>,
+    slow: Option<f64>,
+}
+
+impl Vigilance {
+    /// Follows the agreement of a frame; a frame that cannot tell changes nothing.
+    pub fn observe(&mut self, agreement: Option<f64>, config: &VigilanceConfig) {
+        let Some(agreement) = agreement else {
+            return;
+        };
+        let follow = |average: &mut Option<f64>, rate: f64| {
+            let before = average.unwrap_or(agreement);
+            *average = Some(before + rate * (agreement - before));
+        };
+        follow(&mut self.fast, config.fast_rate);
+        follow(&mut self.slow, config.slow_rate);
+    }
+
+    /// Whether the map disagrees with the estimate.
+    pub fn is_lost(&self, config: &VigilanceConfig) -> bool {
+        let (Some(fast), Some(slow)) = (self.fast, self.slow) else {
+            return false;
+        };
+        fast < config.min_agreement || fast < config.lost_fraction * slow
+    }
+
+    /// The share of agreeing beams that is usual here; `None` before the first frame.
+    pub fn expected(&self) -> Option<f64> {
+        self.slow
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn after(agreements: &[f64]) -> bool {
+        let config = VigilanceConfig::default();
+        let mut vigilance = Vigilance::default();
+        for &agreement in agreements {
+            vigilance.observe(Some(agreement), &config);
+        }
+        vigilance.is_lost(&config)
+    }
+
+    #[test]
+    fn an_agreeing_map_raises_no_alarm_and_a_map_that_never_agrees_does() {
+        assert!(!after(&[0.9; 50]));
+        assert!(!after(&[0.7; 50]));
+        assert!(after(&[0.3; 1]));
+    }
+
+    #[test]
+    fn one_bad_frame_is_no_alarm_and_five_are() {
+        let mut frames = vec![0.95; 30];
+        frames.push(0.5);
+        assert!(!after(&frames));
+        frames.extend([0.5; 4]);
+        assert!(after(&frames));
+    }
+
+    #[test]
+    fn frames_that_cannot_tell_change_nothing() {
+        let config = VigilanceConfig::default();
+        let mut vigilance = Vigilance::default();
+        vigilance.observe(None, &config);
+        assert_eq!(vigilance, Vigilance::default());
+        assert!(!vigilance.is_lost(&config));
+    }
+}
