@@ -3,6 +3,10 @@
 //! Two ways to ask: range images at pixel centres (for pictures), and arbitrary beams (for
 //! weights): an observation is compared along the very directions that were measured.
 
+pub mod cpu;
+
+pub use cpu::{CpuRenderer, SurfaceHit};
+
 use crate::geometry::{Pose3, Vec3};
 use crate::lidar::{Beam, LidarModel};
 
