@@ -117,9 +117,11 @@ impl Bvh {
 
 /// What lies in each leaf.
 #[derive(Default)]
-pub(super) struct Leaves {
-    ranges: Vec<Range<u32>>,
-    order: Vec<u32>,
+pub struct Leaves {
+    /// Where the items of each leaf stand in `order`.
+    pub ranges: Vec<Range<u32>>,
+    /// Indices of the items, leaf by leaf.
+    pub order: Vec<u32>,
 }
 
 impl Leaves {

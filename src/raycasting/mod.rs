@@ -10,6 +10,7 @@ pub(crate) mod bvh;
 mod packet;
 mod scene;
 
+pub(crate) use scene::is_proper;
 pub use scene::{Reach, Scene};
 
 /// Surfaces nearer to the origin of a ray are not met [m]: a ray does not meet the surface that

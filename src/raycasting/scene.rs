@@ -318,7 +318,7 @@ fn padded_item(bounds: Aabb, whole: &Aabb, index: u32) -> Item {
 }
 
 /// Whether a triangle has finite corners and an area.
-fn is_proper(corners: [Vec3; 3]) -> bool {
+pub(crate) fn is_proper(corners: [Vec3; 3]) -> bool {
     let [a, b, c] = corners.map(|corner| corner.as_dvec3());
     let longest_squared = (b - a)
         .length_squared()
