@@ -5,6 +5,8 @@ use std::path::PathBuf;
 
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
 
+use crate::rendering::backend::Backend;
+
 /// Finds a car's pose to the centimetre from one spinning LiDAR and a mesh map that it builds itself.
 #[derive(Clone, Debug, Parser)]
 #[command(name = "fpmcl", version, arg_required_else_help = true, after_help = EXAMPLES)]
@@ -151,6 +153,16 @@ pub enum BackendArg {
     Cpu,
     /// A graphics adapter; an error without one.
     Gpu,
+}
+
+impl From<BackendArg> for Backend {
+    fn from(argument: BackendArg) -> Self {
+        match argument {
+            BackendArg::Auto => Self::Auto,
+            BackendArg::Cpu => Self::Cpu,
+            BackendArg::Gpu => Self::Gpu,
+        }
+    }
 }
 
 /// How much is said on standard error.

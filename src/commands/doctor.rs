@@ -4,21 +4,42 @@ use std::fmt::Write as _;
 use std::thread::available_parallelism;
 
 use super::{Context, output};
+use crate::rendering::backend::{self, AdapterReport, Backend};
 
 /// Prints what this machine offers, line by line.
 pub(super) fn run(context: &Context) -> anyhow::Result<()> {
-    let mut table = String::new();
-    for (what, value) in [
+    let choice = backend::choose(Backend::Auto)?;
+    let mut rows = vec![
         ("fpmcl", env!("CARGO_PKG_VERSION").to_owned()),
         ("system", system()),
         ("instruction sets", instruction_sets()),
         ("processors", processors()),
         ("threads in use", context.threads.to_string()),
         ("graphics support", graphics_support().to_owned()),
-    ] {
+    ];
+    rows.extend(choice.adapters.iter().map(|it| ("adapter", adapter(it))));
+    rows.push((
+        "backend auto",
+        format!("{}, because {}", choice.name, choice.reason),
+    ));
+    let mut table = String::new();
+    for (what, value) in rows {
         writeln!(table, "{what:<18}{value}")?;
     }
     output::print(&table)
+}
+
+/// An adapter, its driver, and why it cannot be used if so.
+fn adapter(report: &AdapterReport) -> String {
+    let obstacle = report
+        .obstacle
+        .map(|obstacle| format!("; not usable: {obstacle}"));
+    format!(
+        "{report}, driver {}, {} MiB per binding{}",
+        report.driver,
+        report.max_binding_bytes >> 20,
+        obstacle.unwrap_or_default()
+    )
 }
 
 fn system() -> String {

@@ -17,11 +17,12 @@ use anyhow::{Context as _, bail};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::cli::{BackendArg, Command, ConfigArgs, MachineArgs, RunArgs, Verbosity};
+use crate::cli::{Command, ConfigArgs, MachineArgs, RunArgs, Verbosity};
 use crate::config::{
     self, BuildMapConfig, Check, ConfigError, EvaluationConfig, LocalizationConfig,
     RefinementConfig,
 };
+use crate::rendering::backend::Backend;
 use interrupt::{Interrupt, Interrupted};
 use progress::Progress;
 
@@ -31,7 +32,7 @@ pub struct Context {
     /// Threads that share the work.
     pub threads: usize,
     /// What renders the map.
-    pub backend: BackendArg,
+    pub backend: Backend,
     /// How much is said on standard error.
     pub verbosity: Verbosity,
     /// Whether the user wants to stop.
@@ -52,7 +53,7 @@ impl Context {
             .context("starting the threads; choose fewer with --threads")?;
         Ok(Self {
             threads: rayon::current_num_threads(),
-            backend: machine.backend,
+            backend: machine.backend.into(),
             verbosity,
             interrupt: Interrupt::install().context("listening for Ctrl-C")?,
             progress,

@@ -5,7 +5,8 @@ use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use anyhow::{Context as _, bail};
-use tempfile::NamedTempFile;
+
+use crate::config::new_file_beside;
 
 /// Makes sure, before any work is done, that `path` can be written: an existing file needs
 /// `--force`, and its folder is made and must take new files. `key` is the configuration key
@@ -66,22 +67,6 @@ pub fn print(text: &str) -> anyhow::Result<()> {
         }
         _ => Ok(()),
     }
-}
-
-/// A temporary file in the folder of `path`, readable by whom the umask allows.
-fn new_file_beside(path: &Path) -> io::Result<NamedTempFile> {
-    let folder = match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
-    fs::create_dir_all(folder)?;
-    let mut builder = tempfile::Builder::new();
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt as _;
-        builder.permissions(fs::Permissions::from_mode(0o666));
-    }
-    builder.prefix(".fpmcl-").tempfile_in(folder)
 }
 
 #[cfg(test)]

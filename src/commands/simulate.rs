@@ -202,3 +202,150 @@ fn length_m(poses: &[Pose3]) -> f64 {
         .map(|pair| (pair[1].translation.vector - pair[0].translation.vector).norm())
         .sum()
 }
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+
+    use super::*;
+    use crate::kitti::{Selection, Sequence, velodyne};
+    use crate::simulation::{PathSegment, ScannerConfig};
+
+    fn small(folder: &Path) -> SimulationConfig {
+        SimulationConfig {
+            output_folder: folder.to_owned(),
+            n_scans: 6,
+            path: vec![PathSegment {
+                length_m: 30.0,
+                turn_deg: 20.0,
+                grade_percent: 2.0,
+            }],
+            scanner: ScannerConfig {
+                beams: 16,
+                azimuth_steps: 90,
+                ..ScannerConfig::default()
+            },
+            ..SimulationConfig::default()
+        }
+    }
+
+    fn quietly(config: &SimulationConfig, force: bool) -> Result<SimulationReport> {
+        run(config, force, &|_, _| {})
+    }
+
+    /// Every file of a drive with its bytes, except the recipe, which names the folder.
+    fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+        let mut files = Vec::new();
+        for part in ["", "velodyne", "labels"] {
+            for entry in fs::read_dir(folder.join(part)).unwrap() {
+                let path = entry.unwrap().path();
+                if path.is_file() && !path.ends_with("simulation.yml") {
+                    let name = path.strip_prefix(folder).unwrap().to_owned();
+                    files.push((name, fs::read(&path).unwrap()));
+                }
+            }
+        }
+        files.sort();
+        files
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_bytes_at_any_number_of_threads() {
+        let written = [1, 2, 5].map(|threads| {
+            let folder = tempfile::tempdir().unwrap();
+            let pool = rayon::ThreadPoolBuilder::new()
+                .num_threads(threads)
+                .build()
+                .unwrap();
+            pool.install(|| quietly(&small(folder.path()), false))
+                .unwrap();
+            contents(&folder.path().join("drive_1"))
+        });
+        assert_eq!(written[0].len(), 4 + 2 * 6);
+        assert_eq!(written[0], written[1]);
+        assert_eq!(written[0], written[2]);
+    }
+
+    #[test]
+    fn an_interrupted_drive_goes_on_and_ends_with_the_same_bytes() {
+        let folder = tempfile::tempdir().unwrap();
+        let config = small(folder.path());
+        let drive = config.drive_folder();
+        assert_eq!(quietly(&config, false).unwrap().kept, 0);
+        let whole = contents(&drive);
+        // As after a crash in the middle: no poses yet, scans missing, one half written.
+        fs::remove_file(drive.join("poses.txt")).unwrap();
+        fs::remove_file(drive.join("velodyne/000004.bin")).unwrap();
+        fs::remove_file(drive.join("velodyne/000005.bin")).unwrap();
+        fs::write(drive.join("velodyne/000004.bin.part"), [1, 2, 3]).unwrap();
+        assert_eq!(quietly(&config, false).unwrap().kept, 4);
+        assert_eq!(contents(&drive), whole);
+    }
+
+    #[test]
+    fn what_exists_is_kept_without_force_and_replaced_with_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let config = small(folder.path());
+        quietly(&config, false).unwrap();
+        let before = contents(&config.drive_folder());
+        assert_eq!(quietly(&config, false).unwrap().kept, 6);
+
+        let mut other = config.clone();
+        other.seed = 2;
+        other.n_scans = 3;
+        let message = quietly(&other, false).unwrap_err().to_string();
+        assert!(message.contains("--force"), "{message}");
+        assert_eq!(contents(&config.drive_folder()), before);
+
+        quietly(&other, true).unwrap();
+        let after = contents(&config.drive_folder());
+        assert_eq!(after.len(), 4 + 2 * 3, "scans of the old drive are gone");
+    }
+
+    #[test]
+    fn drives_are_read_back_in_the_frames_that_the_documentation_promises() {
+        let folder = tempfile::tempdir().unwrap();
+        let mapping = small(folder.path());
+        let query = SimulationConfig {
+            drive: 2,
+            ..mapping.clone()
+        };
+        let [map, query] = [mapping, query].map(|config| {
+            quietly(&config, false).unwrap();
+            let drive = config.drive_folder();
+            let sequence = Sequence::open(
+                &drive.join("velodyne"),
+                &drive.join("poses.txt"),
+                &drive.join("calib.txt"),
+                &Selection::default(),
+            )
+            .unwrap();
+            let poses = CameraPoses::read(&drive.join("poses.txt")).unwrap();
+            (prepare(&config).unwrap().poses(), sequence, poses, drive)
+        });
+        let (truth, sequence, ..) = &map;
+        for (frame, pose) in sequence.frames.iter().zip(truth) {
+            let expected = truth[0].inverse() * pose;
+            assert_relative_eq!(frame.map_from_lidar, expected, epsilon = 1e-6);
+        }
+        let calibration = sequence.calibration;
+        for (pose, world_from_cam0) in query.0.iter().zip(&query.2.world_from_cam0) {
+            let in_map = calibration.map_from_lidar(&map.2.world_from_cam0[0], world_from_cam0);
+            assert_relative_eq!(in_map, truth[0].inverse() * pose, epsilon = 1e-6);
+        }
+        let labels = velodyne::read_labels(&query.3.join("labels/000003.label")).unwrap();
+        assert_eq!(labels.len(), query.1.frames[3].read().unwrap().len());
+        // Two drives start in different places.
+        assert!((map.0[0].inverse() * query.0[0]).translation.vector.norm() > 0.2);
+    }
+
+    #[test]
+    fn a_missing_pose_file_is_told_by_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut config = small(folder.path());
+        config.path_pose_file = Some(folder.path().join("07.txt"));
+        let message = format!("{:#}", quietly(&config, false).unwrap_err());
+        assert!(message.contains("calib.txt"), "{message}");
+        assert!(message.contains("path_calib_file"), "{message}");
+    }
+}

@@ -35,6 +35,8 @@ pub enum ConfigError {
     },
     #[error("{place}: {problem}")]
     Unusable { place: Place, problem: Problem },
+    #[error("{place}: key `{key}` is given twice; remove one of them")]
+    DuplicateKey { place: Place, key: String },
     #[error("{place}: {source}")]
     Syntax {
         place: Place,
@@ -63,6 +65,16 @@ pub enum Place {
     },
 }
 
+impl Place {
+    /// The file as a whole, where the line is told otherwise.
+    fn without_line(self) -> Self {
+        match self {
+            Self::File { path, .. } => Self::File { path, line: None },
+            setting @ Self::Setting { .. } => setting,
+        }
+    }
+}
+
 impl fmt::Display for Place {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -77,7 +89,7 @@ impl fmt::Display for Place {
 }
 
 /// The error of a YAML file, with the key and the value that it is about.
-pub(super) fn in_file(path: &Path, text: &str, source: &serde_yaml::Error) -> ConfigError {
+pub(super) fn in_file(path: &Path, text: &str, source: serde_yaml::Error) -> ConfigError {
     let location = source.location();
     let line = location.map(|location| location.line() as usize);
     let place = Place::File {
@@ -95,7 +107,7 @@ pub(super) fn in_setting(
     place: Place,
     key: &str,
     value: &str,
-    source: &serde_yaml::Error,
+    source: serde_yaml::Error,
 ) -> ConfigError {
     describe(place, Some(key), Some(value), source)
 }
@@ -140,68 +152,86 @@ fn describe(
     place: Place,
     key: Option<&str>,
     value: Option<&str>,
-    source: &serde_yaml::Error,
+    source: serde_yaml::Error,
 ) -> ConfigError {
     use serde_yaml::Error as Yaml;
-    if let Yaml::SerdeUnknownField {
-        field, expected, ..
-    } = source
-    {
-        return ConfigError::UnknownKey {
-            place,
-            key: field.clone(),
-            nearest: nearest(field, expected.iter().copied()),
-        };
-    }
-    let expected = match source {
-        Yaml::InvalidScalar { ty, .. } => format!("it must be {}", article(ty)),
-        Yaml::SerdeInvalidType { expected, .. }
-        | Yaml::SerdeInvalidValue { expected, .. }
-        | Yaml::SerdeInvalidLength { expected, .. } => format!("it must be {expected}"),
-        Yaml::SerdeUnknownVariant { expected, .. } => {
-            format!("it must be one of {}", expected.join(", "))
+    match &source {
+        Yaml::SerdeUnknownField {
+            field, expected, ..
+        } => {
+            return ConfigError::UnknownKey {
+                place,
+                key: field.clone(),
+                nearest: nearest(field, expected.iter().copied()),
+            };
         }
-        Yaml::Unexpected { expected, .. } => format!("it must be {expected}"),
-        _ => String::new(),
-    };
-    match (key, value) {
-        (Some(key), Some(value)) if !expected.is_empty() => ConfigError::WrongValue {
+        Yaml::DuplicateMappingKey { key: Some(key), .. } => {
+            return ConfigError::DuplicateKey {
+                place,
+                key: key.clone(),
+            };
+        }
+        _ => {}
+    }
+    match (key, value, expected(&source)) {
+        (Some(key), Some(value), Some(expected)) => ConfigError::WrongValue {
             place,
             key: key.to_owned(),
-            value: value.to_owned(),
+            value: if value.is_empty() { "null" } else { value }.to_owned(),
             expected,
         },
         _ => ConfigError::Syntax {
-            place,
-            source: Box::new(Yaml::Message {
-                msg: source.to_string(),
-                location: serde_yaml::Location::UNKNOWN,
-            }),
+            place: place.without_line(),
+            source: Box::new(source),
         },
     }
 }
 
-/// The type names of the parser as a user reads them.
-fn article(ty: &str) -> &str {
+/// What belongs in the place of a wrong value.
+fn expected(source: &serde_yaml::Error) -> Option<String> {
+    use serde_yaml::Error as Yaml;
+    let expected = match source {
+        Yaml::InvalidScalar { ty, .. } => in_words(ty).to_owned(),
+        Yaml::Unexpected { expected, .. } => in_words(expected).to_owned(),
+        Yaml::SerdeInvalidType { expected, .. } | Yaml::SerdeInvalidValue { expected, .. } => {
+            expected.clone()
+        }
+        Yaml::SerdeInvalidLength { expected, .. } => expected
+            .replace("a tuple of size", "a list of length")
+            .replace("an array of length", "a list of length"),
+        Yaml::SerdeUnknownVariant { expected, .. } => format!("one of {}", expected.join(", ")),
+        _ => return None,
+    };
+    Some(format!("it must be {expected}"))
+}
+
+/// The parser's words for what it expects, as a user reads them.
+fn in_words(ty: &str) -> &str {
     match ty {
-        "f32" | "f64" | "float" | "floating point" => "a number",
-        "bool" | "boolean" => "True or False",
-        _ if ty.starts_with('u') => "a whole number, not negative",
-        _ if ty.starts_with('i') => "a whole number",
+        "floating point" => "a number",
+        "boolean" => "True or False",
+        "mapping start" => "a block of keys",
+        "sequence start" => "a list",
+        "string scalar" => "a text",
+        "u8" | "u16" | "u32" | "u64" => "a whole number, not negative",
+        "i8" | "i16" | "i32" | "i64" => "a whole number",
         _ => ty,
     }
 }
 
-/// The text at a location, or the rest of its line.
+/// The value at a location: its text if it is a plain one, else what follows the key.
 fn quoted(text: &str, location: serde_yaml::Location) -> Option<&str> {
+    let line = text
+        .lines()
+        .nth((location.line() as usize).checked_sub(1)?)?;
+    let whole = line.split_once(':').map_or(line, |(_, value)| value);
+    let whole = whole.split(" #").next()?.trim();
     let span = location.span();
     let start = usize::try_from(span.byte_offset()?).ok()?;
     let length = usize::try_from(span.byte_len()?).ok()?;
     let exact = text.get(start..start + length)?.trim();
-    if !exact.is_empty() && !exact.contains('\n') {
-        return Some(exact);
-    }
-    text.get(start..)?.lines().next().map(str::trim)
+    let is_part = exact.chars().any(char::is_alphanumeric) && whole.contains(exact);
+    Some(if is_part { exact } else { whole })
 }
 
 fn suggestion(nearest: Option<&str>) -> String {

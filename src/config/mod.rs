@@ -52,7 +52,7 @@ where
         path: path.to_owned(),
         source,
     })?;
-    let mut config: T = parse(&text).map_err(|source| error::in_file(path, &text, &source))?;
+    let mut config: T = parse(&text).map_err(|source| error::in_file(path, &text, source))?;
     for (key, value) in overrides {
         config = override_key(&config, key, value)?;
     }
@@ -71,12 +71,7 @@ pub fn write<T: Serialize>(path: &Path, config: &T) -> Result<(), ConfigError> {
         path: path.to_owned(),
         source,
     };
-    let folder = match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
-    fs::create_dir_all(folder).map_err(write_error)?;
-    let mut file = new_file_beside(folder).map_err(write_error)?;
+    let mut file = new_file_beside(path).map_err(write_error)?;
     file.write_all(text.as_bytes()).map_err(write_error)?;
     file.persist(path)
         .map_err(|failed| write_error(failed.error))?;
@@ -111,11 +106,17 @@ where
             place,
         });
     };
-    parse(&replaced).map_err(|source| error::in_setting(place, key, value, &source))
+    parse(&replaced).map_err(|source| error::in_setting(place, key, value, source))
 }
 
-/// A temporary file in `folder`, readable by whom the umask allows, as other files are.
-fn new_file_beside(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {
+/// A temporary file in the folder of `path`, which is made if need be; readable by whom the
+/// umask allows, as other files are.
+pub(crate) fn new_file_beside(path: &Path) -> std::io::Result<tempfile::NamedTempFile> {
+    let folder = match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    };
+    fs::create_dir_all(folder)?;
     let mut builder = tempfile::Builder::new();
     #[cfg(unix)]
     {

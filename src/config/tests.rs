@@ -121,10 +121,38 @@ fn a_word_where_a_number_belongs_is_told_with_line_key_and_value() {
 }
 
 #[test]
+fn a_value_of_the_wrong_shape_is_quoted_as_it_stands() {
+    let message = message_of("range_image: [1]  # rows\n", &[]);
+    assert_says(&message, &["line 1", "`[1]`", "a block of keys"]);
+    let message = message_of("seed: 1\nscan_folder: {a: b}\n", &[]);
+    assert_says(&message, &["line 2", "`{a: b}`", "a text"]);
+    let message = message_of("start_idx:\n", &[]);
+    assert_says(
+        &message,
+        &["line 1", "`null`", "start_idx", "a whole number"],
+    );
+    for text in [
+        "ground_color: [1, 2]\n",
+        "seed: 0\nground_color: [1, 2, 3, 4]\n",
+    ] {
+        let message = load_text::<BuildMapConfig>(text, &[])
+            .unwrap_err()
+            .to_string();
+        assert_says(&message, &["`[1, 2", "ground_color", "a list of length 3"]);
+    }
+}
+
+#[test]
 fn text_that_is_no_yaml_is_told_with_its_line() {
-    assert_says(&message_of("seed: 1\nmap_file: [\n", &[]), &["own.yml"]);
-    assert_says(&message_of("seed: 1\nseed: 2\n", &[]), &["line 2", "seed"]);
-    assert_says(&message_of("just words\n", &[]), &["own.yml, line 1"]);
+    let message = message_of("seed: 1\nmap_file: [\n", &[]);
+    assert_says(&message, &["own.yml", "line 2", "map_file"]);
+    assert_says(&message_of("just words\n", &[]), &["own.yml: ", "line 1"]);
+}
+
+#[test]
+fn a_key_that_is_given_twice_is_told() {
+    let message = message_of("seed: 1\nseed: 2\n", &[]);
+    assert_says(&message, &["own.yml, line 2", "`seed` is given twice"]);
 }
 
 #[test]

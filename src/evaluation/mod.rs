@@ -7,7 +7,7 @@
 // What a run left on disk.
 mod atomic;
 #[cfg(test)]
-mod kitti_07;
+pub(crate) mod kitti_07;
 mod npy;
 mod npz;
 pub mod results;

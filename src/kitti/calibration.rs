@@ -4,6 +4,7 @@ use std::fs;
 use std::path::Path;
 
 use super::KittiError;
+use super::poses::CameraPoses;
 use super::table::{parse_numbers, pose_from_row, read_text, row_from_pose};
 use crate::geometry::Pose3;
 
@@ -61,6 +62,34 @@ impl Calibration {
     }
 }
 
+/// The frame of a map: that of the first lidar pose of the recording that it was built from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MapFrame {
+    /// The calibration of that recording.
+    pub calibration: Calibration,
+    /// Its first camera pose.
+    pub world_from_first_cam0: Pose3,
+}
+
+impl MapFrame {
+    /// Reads where a map lies from the poses and the calibration that it was built with.
+    pub fn read(pose_file: &Path, calib_file: &Path) -> Result<Self, KittiError> {
+        Ok(Self {
+            calibration: Calibration::read(calib_file)?,
+            world_from_first_cam0: CameraPoses::read(pose_file)?.world_from_cam0[0],
+        })
+    }
+
+    /// `p_map = map_from_world_lidar * p`, where p is a point in the frame of the first lidar pose
+    /// of another recording whose camera poses are given in the same world.
+    pub fn map_from_recording(&self, recording: &Self) -> Pose3 {
+        let world_from_lidar =
+            recording.world_from_first_cam0 * recording.calibration.cam0_from_lidar;
+        let world_from_map = self.world_from_first_cam0 * self.calibration.cam0_from_lidar;
+        world_from_map.inverse() * world_from_lidar
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use approx::assert_relative_eq;
@@ -80,6 +109,24 @@ mod tests {
         assert_relative_eq!(back, pose, epsilon = 1e-12);
         let origin = calibration.map_from_lidar(&first, &first);
         assert_relative_eq!(origin, Pose3::identity(), epsilon = 1e-12);
+    }
+
+    #[test]
+    fn a_recording_that_starts_elsewhere_lies_in_the_map_where_it_is_in_the_world() {
+        let calibration = Calibration {
+            cam0_from_lidar: Pose3::new(Vector3::new(0.1, -0.2, 0.3), Vector3::new(1.2, -1.2, 1.2)),
+        };
+        let frame = |world_from_first_cam0| MapFrame {
+            calibration,
+            world_from_first_cam0,
+        };
+        let first = Pose3::new(Vector3::new(5.0, 6.0, 7.0), Vector3::new(0.3, 0.2, 0.1));
+        let later = Pose3::new(Vector3::new(9.0, 6.5, 7.0), Vector3::new(0.4, 0.2, 0.1));
+        let map_from_recording = frame(first).map_from_recording(&frame(later));
+        let expected = calibration.map_from_lidar(&first, &later);
+        assert_relative_eq!(map_from_recording, expected, epsilon = 1e-12);
+        let same = frame(first).map_from_recording(&frame(first));
+        assert_relative_eq!(same, Pose3::identity(), epsilon = 1e-12);
     }
 
     #[test]

@@ -14,6 +14,6 @@ pub mod sequence;
 mod table;
 pub mod velodyne;
 
-pub use calibration::Calibration;
+pub use calibration::{Calibration, MapFrame};
 pub use error::KittiError;
 pub use sequence::{Frame, Selection, Sequence};

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::poses::{CameraPoses, read_times};
-use super::{Calibration, KittiError, velodyne};
+use super::{Calibration, KittiError, MapFrame, velodyne};
 use crate::geometry::{Pose3, StampedPose};
 use crate::lidar::Scan;
 
@@ -72,10 +72,9 @@ pub struct Sequence {
     pub frames: Vec<Frame>,
     /// All lidar poses of the recording in the frame of the first.
     pub map_from_lidar: Vec<Pose3>,
-    /// Where the lidar sits on the camera.
-    pub calibration: Calibration,
-    /// The first camera pose, for writing poses in the recording's own convention.
-    pub world_from_first_cam0: Pose3,
+    /// The frame that all poses of this sequence are given in, and with it the way back to the
+    /// camera poses of its files.
+    pub frame: MapFrame,
 }
 
 impl Sequence {
@@ -132,9 +131,26 @@ impl Sequence {
         Ok(Self {
             frames,
             map_from_lidar,
-            calibration,
-            world_from_first_cam0: camera_poses.world_from_cam0[0],
+            frame: MapFrame {
+                calibration,
+                world_from_first_cam0: camera_poses.world_from_cam0[0],
+            },
         })
+    }
+
+    /// The same sequence with its poses in the frame of a map that was built from another (or the
+    /// same) recording in the same world.
+    #[must_use]
+    pub fn in_map(mut self, map: &MapFrame) -> Self {
+        let map_from_recording = map.map_from_recording(&self.frame);
+        for pose in &mut self.map_from_lidar {
+            *pose = map_from_recording * *pose;
+        }
+        for frame in &mut self.frames {
+            frame.map_from_lidar = map_from_recording * frame.map_from_lidar;
+        }
+        self.frame = *map;
+        self
     }
 }
 

@@ -11,12 +11,14 @@
 //! from a blunt to a sharp likelihood (annealing). Once the belief is narrow, `num_reduced`
 //! particles are enough.
 
+use std::time::Duration;
+
 use nalgebra::Matrix3;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
 use super::convergence::{ConvergenceConfig, is_converged};
-use super::motion::{OdometryNoise, TurnDriveTurn};
+use super::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand, VelocityNoise};
 use super::observation::{Fit, ObservationConfig, above_road, choose_beams, costs, place_on_map};
 use super::odometry::Odometry;
 use super::panorama::PanoramaIndex;
@@ -69,6 +71,8 @@ pub struct LocalizerConfig {
     pub turn_thres_rad: f64,
     /// Noise of the odometry, per update.
     pub motion: OdometryNoise,
+    /// Noise of velocity commands.
+    pub velocity: VelocityNoise,
     /// Noise of the guess that the car goes on as it went, where there is no odometry.
     pub constant_velocity: OdometryNoise,
     /// The likelihood.
@@ -94,6 +98,7 @@ impl Default for LocalizerConfig {
             move_thres_m: 0.2,
             turn_thres_rad: 0.05,
             motion: OdometryNoise::default(),
+            velocity: VelocityNoise::default(),
             constant_velocity: OdometryNoise {
                 turn_rad: 0.02,
                 drive_m: 0.2,
@@ -156,6 +161,8 @@ pub struct Localizer<'a> {
     particles: ParticleSet,
     /// Motion since the last update, `updated_from_current`.
     pending: Pose2,
+    /// How long velocity commands have been held since then.
+    pending_duration: Duration,
     /// The last estimate and the motion into it, for frames without odometry.
     estimate: Pose2,
     last_increment: Pose2,
@@ -186,6 +193,7 @@ impl<'a> Localizer<'a> {
             surroundings,
             particles,
             pending: Pose2::identity(),
+            pending_duration: Duration::ZERO,
             estimate,
             last_increment: Pose2::identity(),
             patch: surroundings.ground.patch_under(&estimate),
@@ -207,6 +215,9 @@ impl<'a> Localizer<'a> {
     ) -> Result<FrameEstimate, RenderError> {
         if !self.is_first {
             self.pending *= self.increment(odometry);
+            if let Odometry::Velocity(command) = odometry {
+                self.pending_duration += command.duration;
+            }
         }
         if !self.is_update_due(odometry) {
             return Ok(self.coast(stance));
@@ -234,6 +245,7 @@ impl<'a> Localizer<'a> {
     fn increment(&self, odometry: Odometry) -> Pose2 {
         match odometry {
             Odometry::Increment(previous_from_current) => previous_from_current,
+            Odometry::Velocity(command) => command.compose(),
             Odometry::Unknown => self.last_increment,
         }
     }
@@ -267,16 +279,25 @@ impl<'a> Localizer<'a> {
 
     fn propagate(&mut self, odometry: Odometry, rng: &mut impl Rng) {
         if !self.is_first {
-            let noise = match odometry {
-                Odometry::Increment(_) => &self.config.motion,
-                Odometry::Unknown => &self.config.constant_velocity,
-            };
             let motion = TurnDriveTurn::decompose(&self.pending);
-            self.particles
-                .propagate(|pose| pose * motion.sample(noise, rng).compose());
+            let config = &self.config;
+            match odometry {
+                Odometry::Increment(_) => self
+                    .particles
+                    .propagate(|pose| pose * motion.sample(&config.motion, rng).compose()),
+                Odometry::Unknown => self.particles.propagate(|pose| {
+                    pose * motion.sample(&config.constant_velocity, rng).compose()
+                }),
+                Odometry::Velocity(_) => {
+                    let held = VelocityCommand::driving(&self.pending, self.pending_duration);
+                    self.particles
+                        .propagate(|pose| pose * held.sample(&config.velocity, rng));
+                }
+            }
         }
         self.is_first = false;
         self.pending = Pose2::identity();
+        self.pending_duration = Duration::ZERO;
     }
 
     /// Weighs the particles by the scan, in one round or several; returns the beams of the last.

@@ -126,6 +126,27 @@ pub struct VelocityCommand {
 }
 
 impl VelocityCommand {
+    /// The command whose arc ends where an increment does, as far as an arc can: its length is the
+    /// distance driven (backwards where that is behind), its turn that of the increment.
+    pub fn driving(previous_from_current: &Pose2, duration: Duration) -> Self {
+        let seconds = duration.as_secs_f64().max(f64::MIN_POSITIVE);
+        let turn_rad = previous_from_current.rotation.angle();
+        let step = previous_from_current.translation.vector;
+        // The chord of an arc is shorter than the arc by sin(α/2) / (α/2).
+        let half_rad = 0.5 * turn_rad;
+        let chord_per_arc = if half_rad.abs() < 1e-6 {
+            1.0
+        } else {
+            half_rad.sin() / half_rad
+        };
+        let drive_m = step.norm().copysign(step.x) / chord_per_arc;
+        Self {
+            speed_m_per_s: drive_m / seconds,
+            turn_rate_rad_per_s: turn_rad / seconds,
+            duration,
+        }
+    }
+
     /// The increment `previous_from_current` along the arc; a straight line where ω is 0.
     pub fn compose(&self) -> Pose2 {
         let seconds = self.duration.as_secs_f64();
@@ -229,6 +250,21 @@ mod tests {
         };
         let expected = Pose2::translation(2.0 * PI, 0.0);
         assert_relative_eq!(straight.compose(), expected, epsilon = 1e-8);
+    }
+
+    #[test]
+    fn the_command_of_an_arc_is_the_command_that_drives_it() {
+        let duration = Duration::from_millis(100);
+        for (speed, turn_rate) in [(10.0, 0.3), (-2.0, 0.1), (5.0, 0.0), (0.0, 0.0)] {
+            let command = VelocityCommand {
+                speed_m_per_s: speed,
+                turn_rate_rad_per_s: turn_rate,
+                duration,
+            };
+            let back = VelocityCommand::driving(&command.compose(), duration);
+            assert_relative_eq!(back.speed_m_per_s, speed, epsilon = 1e-9);
+            assert_relative_eq!(back.turn_rate_rad_per_s, turn_rate, epsilon = 1e-9);
+        }
     }
 
     #[test]

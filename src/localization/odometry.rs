@@ -10,7 +10,7 @@
 
 use rand::Rng;
 
-use super::motion::{OdometryNoise, TurnDriveTurn};
+use super::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand};
 use crate::geometry::{Pose2, Pose3, planar};
 
 /// One increment per pose, the first of them the identity; in the plane of the car.
@@ -51,6 +51,8 @@ pub fn demonstration_noise() -> OdometryNoise {
 pub enum Odometry {
     /// Measured: `previous_from_current`.
     Increment(Pose2),
+    /// Commanded: speed and turn rate, held from the frame before to this one.
+    Velocity(VelocityCommand),
     /// Nothing: the car went on as in the frame before (constant velocity).
     Unknown,
 }

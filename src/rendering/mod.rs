@@ -4,9 +4,11 @@
 //! weights): an observation is compared along the very directions that were measured.
 
 pub mod backend;
+pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 
+pub use cpu::{CpuRenderer, SurfaceHit};
 #[cfg(test)]
 pub(crate) mod test_world;
 

@@ -132,6 +132,12 @@ impl SimulationConfig {
         let refuse = |&(key, value): &(&'static str, f64), wanted| {
             Err(SimulationError::BadValue { key, value, wanted })
         };
+        let lengths: Vec<(&'static str, f64)> = self
+            .path
+            .iter()
+            .map(|segment| ("path: length_m", segment.length_m))
+            .collect();
+        let positive = [&positive[..], &lengths].concat();
         if let Some(bad) = positive.iter().find(|(_, v)| !(*v > 0.0 && v.is_finite())) {
             return refuse(bad, "greater than 0");
         }

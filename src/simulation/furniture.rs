@@ -44,10 +44,15 @@ pub fn add_sign(builder: &mut Builder, rng: &mut impl Rng) {
     }
 }
 
-/// A tree with a stem, a few limbs' worth of lumps for a crown.
-pub fn add_tree(builder: &mut Builder, rng: &mut impl Rng) {
+/// A tree: a stem and lumps for a crown. Beside the street the crown begins over the roofs of cars.
+pub fn add_tree(builder: &mut Builder, is_beside_street: bool, rng: &mut impl Rng) {
     let size = rng.random_range(0.7..1.6_f32);
-    let stem_m = size * rng.random_range(1.6..2.6);
+    let free_stem_m = size * rng.random_range(1.6..2.6);
+    let stem_m = if is_beside_street {
+        free_stem_m.max(3.0 + 0.8 * size)
+    } else {
+        free_stem_m
+    };
     let radius_m = 0.13 * size;
     builder.paint(classes::TRUNK, 0.3);
     builder.cylinder(
@@ -57,7 +62,7 @@ pub fn add_tree(builder: &mut Builder, rng: &mut impl Rng) {
         9,
     );
     builder.paint(classes::VEGETATION, rng.random_range(0.35..0.6));
-    let is_conifer = rng.random_bool(0.2);
+    let is_conifer = rng.random_bool(0.2) && !is_beside_street;
     if is_conifer {
         for tier in 0..4 {
             let share = tier as f32 / 4.0;

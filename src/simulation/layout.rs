@@ -120,7 +120,7 @@ fn bay_rows(road: &Road, side: f64, mouths_m: &[f64], rng: &mut impl Rng) -> Vec
                 path: road.path.section(from_m, to_m, lateral_m),
             });
         }
-        from_m = to_m + rng.random_range(6.0..30.0);
+        from_m = to_m + rng.random_range(4.0..18.0);
     }
     rows
 }

@@ -35,6 +35,9 @@ mod scanner;
 mod scenes;
 mod traffic;
 
+#[cfg(test)]
+mod tests;
+
 use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion};
 
 pub use builder::{Paint, PaintedMesh};
@@ -82,11 +85,14 @@ impl Simulation {
                 let (path, stations_m) = followed.ok_or(too_short(0.0))?;
                 (path, Some(stations_m))
             }
-            None => (Path::from_segments(&config.path, -sensor_height_m), None),
+            None => {
+                let length_m = config.path.iter().map(|segment| segment.length_m).sum();
+                if length_m < SHORTEST_PATH_M {
+                    return Err(too_short(length_m));
+                }
+                (Path::from_segments(&config.path, -sensor_height_m), None)
+            }
         };
-        if path.length_m() < SHORTEST_PATH_M {
-            return Err(too_short(path.length_m()));
-        }
         let street = Street::new(&path, &config.street, config.seed);
         let mut drive = Drive::new(
             &path,
@@ -95,9 +101,6 @@ impl Simulation {
             config.seed,
             config.drive,
         );
-        if let Ok(n_scans) = usize::try_from(config.n_scans) {
-            drive.truncate(n_scans);
-        }
         let traffic = Traffic::new(
             &drive,
             &path,
@@ -105,6 +108,10 @@ impl Simulation {
             &config.traffic,
             (config.seed, config.drive),
         );
+        // After the traffic, so that fewer scans are the start of the same drive.
+        if let Ok(n_scans) = usize::try_from(config.n_scans) {
+            drive.truncate(n_scans);
+        }
         Ok(Self {
             target: Target::of_street(&street),
             scanner: Scanner::new(&config.scanner),

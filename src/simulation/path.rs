@@ -14,6 +14,9 @@ pub const KNOT_SPACING_M: f64 = 2.0;
 /// Spread of the Gaussian that rounds the joints of segments and the noise of recorded poses [m].
 const SMOOTHING_M: f64 = 4.0;
 
+/// Shortest recorded drive that makes a path [m].
+const SHORTEST_M: f64 = 10.0;
+
 /// A piece of a path: an arc (straight where `turn_deg` is 0) of constant grade.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -116,7 +119,7 @@ impl Path {
                 raw_stations_m.push(raw_m + step_m.unwrap_or(0.0));
             }
         }
-        if raw_m < 4.0 * KNOT_SPACING_M {
+        if raw_m < SHORTEST_M {
             return None;
         }
         let mut highest_m = 0.0_f64;

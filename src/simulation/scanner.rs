@@ -296,3 +296,184 @@ fn nearest_echoes(targets: &[&Target], origin: Vec3, rays: &[Vec3]) -> Vec<Optio
     }
     nearest
 }
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+    use rand::{SeedableRng as _, rngs::StdRng};
+
+    use super::super::builder::{Builder, Paint};
+    use super::*;
+
+    /// A bright room of 20 m with the sensor in its middle.
+    fn room() -> Target {
+        let mut surface = PaintedMesh::default();
+        let still = Rigid3f::from(&Pose3::identity());
+        let paint = Paint {
+            class: 50,
+            reflectance: 1.0,
+        };
+        let half = Vec3::splat(10.0);
+        Builder::new(&mut surface, still, paint).cuboid(-half, half);
+        Target::of_surface(surface)
+    }
+
+    fn scan(config: &ScannerConfig, world_from_lidar: impl Fn(f64) -> Pose3) -> LabelledScan {
+        let mut rng = StdRng::seed_from_u64(5);
+        Scanner::new(config).scan(&[&room()], world_from_lidar, &mut rng)
+    }
+
+    const EXACT: ScannerConfig = ScannerConfig {
+        beams: 64,
+        elevations_deg: Vec::new(),
+        azimuth_steps: 360,
+        min_range_m: 0.5,
+        max_range_m: 100.0,
+        reach_m: 1e4,
+        range_noise_m: 0.0,
+        dropout_share: 0.0,
+        rolling_shutter: false,
+    };
+
+    #[test]
+    fn without_noise_every_beam_ends_on_a_wall() {
+        let labelled = scan(&EXACT, |_| Pose3::identity());
+        assert_eq!(labelled.scan.len(), 64 * 360);
+        for point in &labelled.scan.points {
+            assert_relative_eq!(point.abs().max_element(), 10.0, epsilon = 1e-4);
+        }
+        assert!(labelled.classes.iter().all(|&class| class == 50));
+    }
+
+    #[test]
+    fn beams_have_the_elevations_of_the_sensor() {
+        for beams in [64, 32, 16] {
+            let config = ScannerConfig { beams, ..EXACT };
+            let labelled = scan(&config, |_| Pose3::identity());
+            for (beam, row) in labelled.scan.points.chunks(360).enumerate() {
+                let laser = beam * 64 / beams;
+                let expected_deg = if laser < 32 {
+                    2.0 - laser as f32 / 3.0
+                } else {
+                    -8.83 - 0.5 * (laser - 32) as f32
+                };
+                for point in row {
+                    let elevation_deg = (point.z / point.length()).asin().to_degrees();
+                    assert_relative_eq!(elevation_deg, expected_deg, epsilon = 1e-3);
+                }
+            }
+        }
+        let config = ScannerConfig {
+            elevations_deg: vec![10.0, -10.0],
+            ..EXACT
+        };
+        assert_eq!(scan(&config, |_| Pose3::identity()).scan.len(), 720);
+    }
+
+    #[test]
+    fn ranges_have_the_configured_noise() {
+        let exact = scan(&EXACT, |_| Pose3::identity());
+        let config = ScannerConfig {
+            range_noise_m: 0.02,
+            ..EXACT
+        };
+        let noisy = scan(&config, |_| Pose3::identity());
+        let errors: Vec<f64> = exact
+            .scan
+            .points
+            .iter()
+            .zip(&noisy.scan.points)
+            .map(|(a, b)| f64::from(b.length() - a.length()))
+            .collect();
+        let n = errors.len() as f64;
+        let mean = errors.iter().sum::<f64>() / n;
+        let sigma = (errors.iter().map(|e| e * e).sum::<f64>() / n).sqrt();
+        // Four standard errors.
+        assert_relative_eq!(mean, 0.0, epsilon = 4.0 * 0.02 / n.sqrt());
+        assert_relative_eq!(sigma, 0.02, epsilon = 4.0 * 0.02 / (2.0 * n).sqrt());
+    }
+
+    #[test]
+    fn the_configured_share_of_returns_is_lost() {
+        let config = ScannerConfig {
+            dropout_share: 0.1,
+            ..EXACT
+        };
+        let n = (64 * 360) as f64;
+        let kept = scan(&config, |_| Pose3::identity()).scan.len() as f64 / n;
+        // Four standard errors of a share.
+        assert_relative_eq!(kept, 0.9, epsilon = 4.0 * (0.09 / n).sqrt());
+    }
+
+    #[test]
+    fn half_of_the_returns_are_lost_at_the_reach_of_the_sensor() {
+        // Head-on, reflectance 1 instead of 0.8: seen to reach √(1 / 0.8) = 10 m.
+        let config = ScannerConfig {
+            elevations_deg: vec![0.0; 4000],
+            azimuth_steps: 4,
+            reach_m: 10.0 * 0.8_f64.sqrt(),
+            ..EXACT
+        };
+        let towards_walls =
+            |_| Pose3::rotation(nalgebra::Vector3::z() * std::f64::consts::FRAC_PI_4);
+        let share = scan(&config, towards_walls).scan.len() as f64 / 16_000.0;
+        assert_relative_eq!(share, 0.5, epsilon = 4.0 * (0.25_f64 / 16_000.0).sqrt());
+    }
+
+    #[test]
+    fn nothing_is_seen_beyond_the_range_limits() {
+        for (min_range_m, max_range_m) in [(0.5, 9.9), (18.0, 100.0)] {
+            let config = ScannerConfig {
+                min_range_m,
+                max_range_m,
+                ..EXACT
+            };
+            assert!(scan(&config, |_| Pose3::identity()).scan.is_empty());
+        }
+    }
+
+    #[test]
+    fn a_revolution_of_a_moving_car_is_distorted_by_half_its_way_before_and_after() {
+        let config = ScannerConfig {
+            rolling_shutter: true,
+            elevations_deg: vec![0.0],
+            azimuth_steps: 3600,
+            ..EXACT
+        };
+        let moving = |delay_s: f64| Pose3::translation(10.0 * delay_s, 0.0, 0.0);
+        let labelled = scan(&config, moving);
+        let points = &labelled.scan.points;
+        // Straight back half a revolution early: half a metre behind, half a metre nearer.
+        assert_relative_eq!(points[0].x, -9.5, epsilon = 0.02);
+        assert_relative_eq!(points[1800].x, 10.0, epsilon = 0.02);
+        assert_relative_eq!(points[3599].x, -10.5, epsilon = 0.02);
+
+        let standing = scan(&config, |_| Pose3::identity());
+        let still = ScannerConfig {
+            rolling_shutter: false,
+            ..config
+        };
+        assert_eq!(standing, scan(&still, |_| Pose3::identity()));
+    }
+
+    #[test]
+    fn the_nearer_of_two_targets_is_seen() {
+        let mut surface = PaintedMesh::default();
+        let still = Rigid3f::from(&Pose3::identity());
+        let paint = Paint {
+            class: 252,
+            reflectance: 1.0,
+        };
+        Builder::new(&mut surface, still, paint)
+            .cuboid(Vec3::new(4.0, -5.0, -5.0), Vec3::splat(5.0));
+        let car = Target::of_surface(surface);
+        for targets in [[&room(), &car], [&car, &room()]] {
+            let mut rng = StdRng::seed_from_u64(5);
+            let labelled = Scanner::new(&EXACT).scan(&targets, |_| Pose3::identity(), &mut rng);
+            for (point, &class) in labelled.scan.points.iter().zip(&labelled.classes) {
+                let is_on_car = (point.x - 4.0).abs() < 0.01 && point.y.abs() <= 5.0;
+                assert_eq!(class == 252, is_on_car, "{point} {class}");
+            }
+        }
+    }
+}

@@ -62,3 +62,90 @@ fn scene(
         &mut rng,
     )
 }
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+
+    use super::super::classes;
+    use super::*;
+
+    fn road_ahead(scene: &LabelledScan) -> Vec<Vec3> {
+        let points = scene.scan.points.iter().zip(&scene.classes);
+        points
+            .filter(|(point, class)| {
+                **class == classes::ROAD && point.x > 0.0 && point.y.abs() < 1.0
+            })
+            .map(|(point, _)| *point)
+            .collect()
+    }
+
+    /// Mean slope of the road between two distances ahead.
+    fn slope_between(points: &[Vec3], near_m: f32, far_m: f32) -> f32 {
+        let mean_around = |x: f32| {
+            let around: Vec<f32> = points
+                .iter()
+                .filter(|point| (point.x - x).abs() < 2.0)
+                .map(|point| point.z)
+                .collect();
+            assert!(!around.is_empty(), "no road {x} m ahead");
+            around.iter().sum::<f32>() / around.len() as f32
+        };
+        (mean_around(far_m) - mean_around(near_m)) / (far_m - near_m)
+    }
+
+    #[test]
+    fn a_slope_scene_climbs_as_it_was_asked_to() {
+        for grade in [0.05_f32, 0.10, 0.15] {
+            let scene = slope_scene(f64::from(grade), &ScannerConfig::default(), 3);
+            assert_eq!(scene.scan.len(), scene.classes.len());
+            let road = road_ahead(&scene);
+            // The car nods by up to 0.3 degrees, that is 0.005.
+            let slope = slope_between(&road, 14.0, 24.0);
+            assert!((slope - grade).abs() < 0.02, "{slope} instead of {grade}");
+        }
+    }
+
+    #[test]
+    fn a_crest_hides_what_is_behind_it() {
+        let scene = crest_scene(0.10, &ScannerConfig::default(), 3);
+        let road = road_ahead(&scene);
+        let farthest_m = road.iter().map(|point| point.x).fold(0.0, f32::max);
+        assert!(farthest_m > 10.0 && farthest_m < 32.0, "{farthest_m}");
+        let level = kerb_scene(0.12, &ScannerConfig::default(), 3);
+        let level_m = road_ahead(&level).iter().map(|p| p.x).fold(0.0, f32::max);
+        assert!(level_m > 40.0, "{level_m}");
+    }
+
+    #[test]
+    fn a_pavement_is_as_high_as_its_kerb() {
+        // The car leans as the crown of the road does.
+        const BANK: f32 = 0.025;
+        for kerb_m in [0.05_f32, 0.12, 0.2] {
+            let scene = kerb_scene(f64::from(kerb_m), &ScannerConfig::default(), 3);
+            let height_m = |class: u16, near_m: f32, far_m: f32, quantile: f32| {
+                let mut heights: Vec<f32> = scene
+                    .scan
+                    .points
+                    .iter()
+                    .zip(&scene.classes)
+                    .filter(|(p, c)| {
+                        **c == class && p.x.abs() < 6.0 && p.y < -near_m && p.y > -far_m
+                    })
+                    .map(|(point, _)| point.z + BANK * point.y)
+                    .collect();
+                assert!(heights.len() > 50, "{} points", heights.len());
+                heights.sort_by(f32::total_cmp);
+                heights[(heights.len() as f32 * quantile) as usize]
+            };
+            // The kerb is 2.05 m to the right of the lidar, or behind bays; its face, which is
+            // pavement too, lies lower than the upper quartile.
+            let step_m = height_m(classes::SIDEWALK, 2.2, 6.0, 0.75)
+                - height_m(classes::ROAD, 1.7, 2.05, 0.5);
+            assert!(
+                (step_m - kerb_m).abs() < 0.025,
+                "{step_m} instead of {kerb_m}"
+            );
+        }
+    }
+}

@@ -50,8 +50,8 @@ impl Default for StreetConfig {
             lane_width_m: 3.3,
             side_street_spacing_m: 75.0,
             has_square: true,
-            built_share: 0.85,
-            parked_share: 0.7,
+            built_share: 0.93,
+            parked_share: 0.75,
             lamp_spacing_m: 32.0,
             plants_per_100_m: 16.0,
             ground: GroundConfig::default(),
@@ -146,7 +146,7 @@ impl Site<'_> {
             }
             match rng.random_range(0..4) {
                 0 if self.taken.claim_around(position, 0.8) => {
-                    add_tree(&mut self.upright(position, forward), rng);
+                    add_tree(&mut self.upright(position, forward), true, rng);
                 }
                 1 if self.taken.claim_around(position, 1.0) => {
                     add_box(&mut self.upright(position, forward), rng);
@@ -220,7 +220,7 @@ impl Site<'_> {
             let setback_m = rng.random_range(0.4..6.0);
             let size_m = DVec2::new(width_m, depth_m);
             let Some(front) = self.claim_lot(road, &point, side, setback_m, size_m) else {
-                station_m += 3.0;
+                station_m += 2.0;
                 continue;
             };
             let jitter = DVec2::from_angle(rng.random_range(-0.04..0.04));
@@ -366,7 +366,7 @@ impl Site<'_> {
                 if is_bush {
                     add_bush(&mut builder, rng);
                 } else {
-                    add_tree(&mut builder, rng);
+                    add_tree(&mut builder, kerb_m < 6.0, rng);
                 }
             }
             station_m += spacing_m * rng.random_range(0.4..1.6);

@@ -14,34 +14,8 @@ use crate::geometry::Vec3;
 use crate::lidar::Beam;
 use crate::rendering::{RangeDifference, RenderError};
 
-/// How much is given to the device at once.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct BatchSizes {
-    /// Rays whose ranges are read back.
-    pub ranges: usize,
-    /// Beams that are compared.
-    pub beams: usize,
-    /// Directions, which are counted in work groups of one dimension (65,535 of 64).
-    pub directions: usize,
-    /// Poses, which are the work groups of the other dimension.
-    pub poses: usize,
-}
-
-impl Default for BatchSizes {
-    /// 16 MB of ranges; as many beams as take a fraction of a second on a slow card.
-    fn default() -> Self {
-        Self {
-            ranges: 1 << 22,
-            beams: 1 << 24,
-            directions: 1 << 20,
-            poses: 65_535,
-        }
-    }
-}
-
 /// Pipelines over a map.
 pub(super) struct Caster {
-    pub batch_sizes: BatchSizes,
     cast: Kernel,
     compare: Kernel,
     add_up: ComputePipeline,
@@ -71,7 +45,6 @@ impl Caster {
             Kernel { pipeline, scene }
         };
         Self {
-            batch_sizes: BatchSizes::default(),
             cast: kernel("cast_rays"),
             compare: kernel("compare_beams"),
             add_up: pipeline(gpu, shaders::REDUCE, "add_up"),
@@ -87,7 +60,7 @@ impl Caster {
         poses: &[Pose],
         (directions, far_m): (&[Vec3], f32),
     ) -> Result<Vec<Vec<f32>>, RenderError> {
-        let parts = self.parts(gpu, directions, |_, place| f32::from_bits(place));
+        let parts = parts(gpu, directions, |_, place| f32::from_bits(place));
         let query = Query {
             far_m: far_m.min(FAR),
             ..Query::new(scene, &RangeDifference::UNLIMITED)
@@ -95,7 +68,7 @@ impl Caster {
         let mut rows = vec![Vec::with_capacity(directions.len()); poses.len()];
         batches::run(
             gpu,
-            self.batches(poses.len(), &parts, self.batch_sizes.ranges),
+            batches_of(gpu, poses.len(), &parts, gpu.batch_sizes.ranges),
             |batch| {
                 let rays = (&parts[batch.part].buffer, batch.rays);
                 self.start_cast(gpu, query, &poses[batch.poses.clone()], rays)
@@ -118,12 +91,12 @@ impl Caster {
         (beams, difference): (&[Beam], &RangeDifference),
     ) -> Result<Vec<f32>, RenderError> {
         let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
-        let parts = self.parts(gpu, &directions, |index, _| beams[index].range_m);
+        let parts = parts(gpu, &directions, |index, _| beams[index].range_m);
         let query = Query::new(scene, difference);
         let mut totals = vec![0.0_f64; poses.len()];
         batches::run(
             gpu,
-            self.batches(poses.len(), &parts, self.batch_sizes.beams),
+            batches_of(gpu, poses.len(), &parts, gpu.batch_sizes.beams),
             |batch| {
                 let rays = (&parts[batch.part].buffer, batch.rays);
                 self.start_compare(gpu, query, &poses[batch.poses.clone()], rays)
@@ -136,50 +109,6 @@ impl Caster {
         )?;
         let count = beams.len().max(1) as f64;
         Ok(totals.iter().map(|total| (total / count) as f32).collect())
-    }
-
-    /// Sends directions in parts, each in an order in which neighbours look the same way. `fourth`
-    /// makes the fourth number of a direction from its index and its place in its part.
-    fn parts(
-        &self,
-        gpu: &Gpu,
-        directions: &[Vec3],
-        fourth: impl Fn(usize, u32) -> f32,
-    ) -> Vec<Part> {
-        let size = self
-            .batch_sizes
-            .directions
-            .min((gpu.max_binding_bytes() / 16) as usize);
-        let part = |(number, part): (usize, &[Vec3])| {
-            let rays: Vec<[f32; 4]> = coherent_order(part)
-                .into_iter()
-                .map(|place| {
-                    let fourth = fourth(number * size + place as usize, place);
-                    part[place as usize].extend(fourth).to_array()
-                })
-                .collect();
-            Part {
-                buffer: gpu.upload("rays", &rays, BufferUsages::STORAGE),
-                rays: rays.len(),
-            }
-        };
-        directions.chunks(size).enumerate().map(part).collect()
-    }
-
-    /// All poses against all parts, `rays_per_batch` at most unless a single pose has more.
-    fn batches(&self, poses: usize, parts: &[Part], rays_per_batch: usize) -> Vec<Batch> {
-        let mut batches = Vec::new();
-        for (number, part) in parts.iter().enumerate() {
-            let step = (rays_per_batch / part.rays).clamp(1, self.batch_sizes.poses);
-            for first in (0..poses).step_by(step) {
-                batches.push(Batch {
-                    poses: first..poses.min(first + step),
-                    rays: part.rays,
-                    part: number,
-                });
-            }
-        }
-        batches
     }
 
     fn start_cast(
@@ -279,6 +208,45 @@ impl Query {
 struct Part {
     buffer: Buffer,
     rays: usize,
+}
+
+/// Sends directions in parts, each in an order in which neighbours look the same way. `fourth`
+/// makes the fourth number of a direction from its index and its place in its part.
+fn parts(gpu: &Gpu, directions: &[Vec3], fourth: impl Fn(usize, u32) -> f32) -> Vec<Part> {
+    let size = gpu
+        .batch_sizes
+        .directions
+        .min((gpu.max_binding_bytes() / 16) as usize);
+    let part = |(number, part): (usize, &[Vec3])| {
+        let rays: Vec<[f32; 4]> = coherent_order(part)
+            .into_iter()
+            .map(|place| {
+                let fourth = fourth(number * size + place as usize, place);
+                part[place as usize].extend(fourth).to_array()
+            })
+            .collect();
+        Part {
+            buffer: gpu.upload("rays", &rays, BufferUsages::STORAGE),
+            rays: rays.len(),
+        }
+    };
+    directions.chunks(size).enumerate().map(part).collect()
+}
+
+/// All poses against all parts, `rays_per_batch` at most unless a single pose has more.
+fn batches_of(gpu: &Gpu, poses: usize, parts: &[Part], rays_per_batch: usize) -> Vec<Batch> {
+    let mut batches = Vec::new();
+    for (number, part) in parts.iter().enumerate() {
+        let step = (rays_per_batch / part.rays).clamp(1, gpu.batch_sizes.poses);
+        for first in (0..poses).step_by(step) {
+            batches.push(Batch {
+                poses: first..poses.min(first + step),
+                rays: part.rays,
+                part: number,
+            });
+        }
+    }
+    batches
 }
 
 /// Places of directions along a Z-curve over azimuth and elevation: threads that run side by side

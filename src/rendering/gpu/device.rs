@@ -11,6 +11,7 @@ use std::time::Duration;
 use bytemuck::{NoUninit, Pod};
 use wgpu::{Buffer, BufferUsages};
 
+use super::batches::BatchSizes;
 use crate::rendering::RenderError;
 use crate::rendering::backend::{self, AdapterChoice, AdapterKind, AdapterReport};
 
@@ -104,6 +105,7 @@ pub(super) struct Gpu {
     pub queue: wgpu::Queue,
     pub report: AdapterReport,
     pub limits: wgpu::Limits,
+    pub batch_sizes: BatchSizes,
     /// Whether the stages of the rasterizer can read the map.
     pub can_rasterize: bool,
     faults: Arc<Faults>,
@@ -138,6 +140,7 @@ impl Gpu {
         Ok(Self {
             device,
             queue,
+            batch_sizes: BatchSizes::of(report.kind),
             report,
             limits,
             can_rasterize: adapter.get_downlevel_capabilities().flags.contains(stages),

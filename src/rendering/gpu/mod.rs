@@ -9,7 +9,9 @@
 //!   Every triangle costs twelve vertices in every image.
 //!
 //! A range image has some 10⁴ to 10⁵ rays, the tiles around a car 10⁶ triangles: casting is the
-//! rule, drawing is there to be compared with. Arbitrary beams can only be cast. Comparisons are
+//! rule, drawing is there to be compared with (images of 57,600 rays on a software adapter: as
+//! fast with 20,000 triangles, casting 40 times faster with 1.6 million). Arbitrary beams can
+//! only be cast. Comparisons are
 //! added up on the device; one number per pose is read back.
 //!
 //! Ranges are those of the plane of the triangle that the ray meets, by one text (`ray.wgsl`),

@@ -13,8 +13,6 @@ use crate::geometry::Vec3;
 use crate::lidar::LidarModel;
 use crate::rendering::RenderError;
 
-/// Most images in an atlas.
-const IMAGES_PER_ATLAS: usize = 64;
 /// Most pixels in an atlas, unless a single image has more: 64 MB of ranges.
 const PIXELS_PER_ATLAS: usize = 1 << 24;
 /// Rows of a texture are copied in multiples of 256 bytes.
@@ -43,8 +41,7 @@ impl Sheet {
     /// A texture for as many of the images as fit; `None` where not even one does.
     fn fitting(images: usize, model: &LidarModel, largest: u32) -> Option<Self> {
         let largest_row = (largest - largest % ROW_PIXELS) as usize;
-        let most = (PIXELS_PER_ATLAS / model.len().max(1)).clamp(1, IMAGES_PER_ATLAS);
-        let most = most.min(images.max(1));
+        let most = images.min(PIXELS_PER_ATLAS / model.len().max(1)).max(1);
         let columns = (largest_row / model.width.max(1)).min(most);
         let rows = (largest as usize / model.height.max(1)).min(most.div_ceil(columns.max(1)));
         (columns > 0 && rows > 0).then(|| Self {
@@ -159,7 +156,9 @@ impl Rasterizer {
         model: &LidarModel,
     ) -> Result<Vec<Vec<f32>>, RenderError> {
         let largest = gpu.limits.max_texture_dimension_2d;
-        let sheet = Sheet::fitting(poses.len(), model, largest).ok_or_else(|| {
+        let vertices = scene.triangle_count() * VERTICES_PER_TRIANGLE as usize;
+        let images = (gpu.batch_sizes.vertices / vertices.max(1)).min(gpu.batch_sizes.images);
+        let sheet = Sheet::fitting(images.min(poses.len()), model, largest).ok_or_else(|| {
             let (width, height) = (model.width, model.height);
             RenderError::DeviceRefused {
                 reason: format!("images of {width}x{height} pixels, textures have {largest}"),

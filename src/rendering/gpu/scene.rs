@@ -45,6 +45,11 @@ impl Scene {
         Ok(scene)
     }
 
+    /// Number of triangles of all tiles.
+    pub fn triangle_count(&self) -> usize {
+        self.tiles.iter().map(|tile| tile.triangles.len()).sum()
+    }
+
     /// Poses as the shaders read them, relative to the centre of the map.
     pub fn poses(&self, map_from_lidar: &[Pose3]) -> Vec<Pose> {
         map_from_lidar

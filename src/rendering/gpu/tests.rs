@@ -5,7 +5,7 @@
 
 use nalgebra::Vector3;
 
-use super::caster::BatchSizes;
+use super::batches::BatchSizes;
 use super::*;
 
 /// A floor of 30 m by 30 m with steps up.
@@ -69,24 +69,29 @@ fn an_image_is_the_same_whichever_batch_it_was_in() {
     let Some(mut renderer) = renderer() else {
         return;
     };
-    // More than fit one atlas, with a last batch that is not full.
-    let poses = poses(130);
+    // The last batch is not full.
+    let poses = poses(50);
     for method in [ImageMethod::Cast, ImageMethod::Draw] {
         let together = renderer.render_by(method, &poses, &model()).unwrap();
-        let rendered = |pose| renderer.render_by(method, std::slice::from_ref(pose), &model());
-        for (pose, image) in poses.iter().zip(&together) {
-            assert_eq!(rendered(pose).unwrap()[0], *image, "{method:?}");
-        }
         assert!(together.iter().flatten().any(|range_m| range_m.is_finite()));
+        let sizes = renderer.gpu.batch_sizes;
+        renderer.gpu.batch_sizes = BatchSizes {
+            ranges: 1000,
+            directions: 100,
+            poses: 7,
+            images: 8,
+            ..sizes
+        };
+        assert_eq!(
+            renderer.render_by(method, &poses, &model()).unwrap(),
+            together
+        );
+        renderer.gpu.batch_sizes = sizes;
+        for (pose, image) in poses.iter().zip(&together) {
+            let alone = renderer.render_by(method, std::slice::from_ref(pose), &model());
+            assert_eq!(alone.unwrap()[0], *image, "{method:?}");
+        }
     }
-    let whole = renderer.render(&poses, &model()).unwrap();
-    renderer.caster.batch_sizes = BatchSizes {
-        ranges: 1000,
-        beams: 1000,
-        directions: 100,
-        poses: 7,
-    };
-    assert_eq!(renderer.render(&poses, &model()).unwrap(), whole);
 }
 
 #[test]
@@ -104,13 +109,13 @@ fn costs_do_not_depend_on_how_the_poses_are_cut_into_batches() {
         .collect();
     let difference = RangeDifference::truncated(2.0);
     let costs = renderer.compare(&poses, &beams, &difference).unwrap();
-    renderer.caster.batch_sizes.poses = 3;
+    renderer.gpu.batch_sizes.poses = 3;
     assert_eq!(
         renderer.compare(&poses, &beams, &difference).unwrap(),
         costs
     );
     // Beams in parts are added up in another order.
-    renderer.caster.batch_sizes.directions = 256;
+    renderer.gpu.batch_sizes.directions = 256;
     let in_parts = renderer.compare(&poses, &beams, &difference).unwrap();
     for (one, other) in costs.iter().zip(in_parts) {
         assert!((one - other).abs() < 1e-5, "{one} {other}");

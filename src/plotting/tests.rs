@@ -1,0 +1,530 @@
+//! Every picture drawn of a made-up run: it has its size, is not blank, and shows its colours.
+//!
+//! With `FPMCL_PICTURES=folder` the pictures stay there to be looked at.
+
+use std::path::{Path, PathBuf};
+
+use image::RgbImage;
+use nalgebra::Vector2;
+use rand::rngs::StdRng;
+use rand::{RngExt as _, SeedableRng as _};
+use rand_distr::{Distribution as _, StandardNormal};
+
+use super::color::{Colormap, MCL, MISSING, REFINED, Rgb, TRUTH};
+use super::*;
+use crate::evaluation::{RangeMclRules, planar_errors};
+use crate::geometry::{Pose2, TriangleMesh, Vec3};
+use crate::lidar::LidarModel;
+
+/// Where pictures go: a folder that was asked for, or one that goes away.
+struct Gallery {
+    folder: PathBuf,
+    _temporary: Option<tempfile::TempDir>,
+}
+
+impl Gallery {
+    fn open() -> Self {
+        match std::env::var_os("FPMCL_PICTURES") {
+            Some(folder) => Self {
+                folder: folder.into(),
+                _temporary: None,
+            },
+            None => {
+                let temporary = tempfile::tempdir().unwrap();
+                Self {
+                    folder: temporary.path().to_owned(),
+                    _temporary: Some(temporary),
+                }
+            }
+        }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.join(name)
+    }
+}
+
+/// A picture that is large, not blank, and has each colour in at least so many pixels.
+fn assert_picture(path: &Path, colors: &[(Rgb, usize)]) -> RgbImage {
+    let image = image::open(path).unwrap().into_rgb8();
+    assert!(image.width() >= 1200 && image.height() >= 400);
+    let white = image.pixels().filter(|pixel| pixel.0 == [255; 3]).count();
+    assert!(white < image.pixels().len() * 99 / 100, "blank");
+    for (color, at_least) in colors {
+        let found = image.pixels().filter(|pixel| pixel.0 == *color).count();
+        assert!(found >= *at_least, "{color:?}: {found}");
+    }
+    image
+}
+
+/// A street that bends, at 0.8 m a frame.
+fn street(frames: usize) -> Vec<Pose2> {
+    let mut pose = Pose2::identity();
+    (0..frames)
+        .map(|k| {
+            let here = pose;
+            let turn = if (80..130).contains(&(k % 200)) {
+                0.03
+            } else {
+                0.001
+            };
+            pose *= Pose2::new(Vector2::new(0.8, 0.0), turn);
+            here
+        })
+        .collect()
+}
+
+/// Estimates with noise, and for some frames at the beginning far away.
+fn noisy(truth: &[Pose2], noise_m: f64, lost: usize) -> Vec<Pose2> {
+    let mut rng = StdRng::seed_from_u64(5);
+    let mut slow = Vector2::zeros();
+    (truth.iter().enumerate())
+        .map(|(k, pose)| {
+            let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+            slow = 0.9 * slow + 0.4 * noise_m * Vector2::new(normal(), normal());
+            let far = if k < lost { 12.0 - k as f64 } else { 0.0 };
+            let offset = slow + Vector2::new(far, 0.3 * far);
+            pose * Pose2::new(offset, 0.03 * noise_m * normal() + 0.05 * far)
+        })
+        .collect()
+}
+
+/// Houses along the street on a hilly ground, coloured as build-map colours them.
+fn town(truth: &[Pose2]) -> TriangleMesh {
+    let mut mesh = TriangleMesh::default();
+    let mut rng = StdRng::seed_from_u64(3);
+    let mut quad = |corners: [Vec3; 4], color: Rgb| {
+        mesh.append(&TriangleMesh {
+            vertices: corners.to_vec(),
+            colors: vec![color; 4],
+            triangles: vec![[0, 1, 2], [0, 2, 3]],
+            ..TriangleMesh::default()
+        });
+    };
+    for pair in truth.windows(3).step_by(2) {
+        let at = |pose: &Pose2, left: f64, z: f64| {
+            let p = pose * nalgebra::Point2::new(0.0, left);
+            let hill = 0.5 * (0.1 * p.x).sin() + 0.3 * (0.13 * p.y).cos();
+            Vec3::new(p.x as f32, p.y as f32, (z + hill - 1.7) as f32)
+        };
+        let (a, b) = (&pair[0], &pair[2]);
+        for lane in -7..7 {
+            let (low, high) = (f64::from(lane), f64::from(lane) + 1.0);
+            quad(
+                [
+                    at(a, low, 0.0),
+                    at(b, low, 0.0),
+                    at(b, high, 0.0),
+                    at(a, high, 0.0),
+                ],
+                [255, 0, 0],
+            );
+        }
+        for side in [-1.0, 1.0] {
+            if rng.random_bool(0.75) {
+                let (near, far) = (side * 7.0, side * (8.5 + rng.random_range(0.0..2.0)));
+                quad(
+                    [
+                        at(a, near, 6.0),
+                        at(b, near, 6.0),
+                        at(b, far, 8.0),
+                        at(a, far, 8.0),
+                    ],
+                    [0, 0, 255],
+                );
+                quad(
+                    [
+                        at(a, near, 0.0),
+                        at(b, near, 0.0),
+                        at(b, near, 6.0),
+                        at(a, near, 6.0),
+                    ],
+                    [0, 0, 255],
+                );
+            }
+        }
+    }
+    mesh
+}
+
+fn cloud(around: &Pose2, spread_m: f64, count: usize) -> Vec<[f32; 4]> {
+    let mut rng = StdRng::seed_from_u64(9);
+    (0..count)
+        .map(|_| {
+            let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+            let (dx, dy, turn) = (spread_m * normal(), spread_m * normal(), 0.1 * normal());
+            let weight = (-0.5 * (dx * dx + dy * dy) / (spread_m * spread_m)).exp();
+            let t = around.translation;
+            let heading = around.rotation.angle() + turn;
+            [
+                (t.x + dx) as f32,
+                (t.y + dy) as f32,
+                heading as f32,
+                weight as f32,
+            ]
+        })
+        .collect()
+}
+
+#[test]
+fn the_path_is_drawn_over_the_truth_and_over_the_map() {
+    let gallery = Gallery::open();
+    let truth = street(400);
+    let (mcl, refined) = (noisy(&truth, 0.5, 8), noisy(&truth, 0.1, 0));
+    let paths = [Path2::mcl(&mcl), Path2::refined(&refined)];
+    let map = MapImage::of_colors(&town(&truth), 2000);
+    let plot = PathPlot {
+        title: "Path against ground truth",
+        ground_truth: Some(&truth),
+        paths: &paths,
+        map: Some(&map),
+    };
+    plot.save(&gallery.path("path_on_map.png")).unwrap();
+    let colors = [(REFINED, 300), (TRUTH, 300), (MCL, 50)];
+    assert_picture(&gallery.path("path_on_map.png"), &colors);
+
+    // A short straight drive: thirty metres by two.
+    let path = gallery.path("path_short.png");
+    let short = PathPlot {
+        ground_truth: Some(&truth[..36]),
+        paths: &[Path2::mcl(&mcl[..36]), Path2::refined(&refined[..36])],
+        map: None,
+        ..plot
+    };
+    short.save(&path).unwrap();
+    assert_picture(&path, &[(MCL, 300), (TRUTH, 300)]);
+}
+
+#[test]
+fn the_parents_run_on_kitti_07_is_drawn() {
+    let Some((truth, results)) = crate::evaluation::kitti_07::kitti_07() else {
+        return;
+    };
+    let gallery = Gallery::open();
+    let estimates = RangeMclRules::default().estimates(&results).unwrap();
+    let path = gallery.path("path_kitti07.png");
+    PathPlot {
+        title: "KITTI 07, range-mcl against ground truth",
+        ground_truth: Some(&truth),
+        paths: &[Path2::mcl(&estimates)],
+        map: None,
+    }
+    .save(&path)
+    .unwrap();
+    assert_picture(&path, &[(MCL, 1000), (TRUTH, 1000)]);
+
+    let errors = planar_errors(&estimates, &truth);
+    let frames: Vec<f64> = (0..truth.len()).map(|frame| frame as f64).collect();
+    let path = gallery.path("errors_kitti07.png");
+    ErrorPlot {
+        title: "KITTI 07, error of range-mcl",
+        x_name: "frame",
+        x: &frames,
+        errors: &[("MCL", MCL, &errors)],
+    }
+    .save(&path)
+    .unwrap();
+    assert_picture(&path, &[(MCL, 1000)]);
+}
+
+#[test]
+fn errors_are_drawn_for_both_trajectories() {
+    let gallery = Gallery::open();
+    let truth = street(400);
+    let mcl = planar_errors(&noisy(&truth, 0.5, 6), &truth);
+    let refined = planar_errors(&noisy(&truth, 0.1, 0), &truth);
+    let times: Vec<f64> = (0..400).map(|k| 0.1 * f64::from(k)).collect();
+    let path = gallery.path("errors.png");
+    let plot = ErrorPlot {
+        title: "Error over time",
+        x_name: "time [s]",
+        x: &times,
+        errors: &[("MCL", MCL, &mcl), ("refined", REFINED, &refined)],
+    };
+    plot.save(&path).unwrap();
+    assert_picture(&path, &[(MCL, 1000), (REFINED, 1000)]);
+
+    let message = ErrorPlot {
+        x: &times[1..],
+        ..plot
+    }
+    .save(&path)
+    .unwrap_err()
+    .to_string();
+    assert!(message.contains("400 errors where 399 belong"), "{message}");
+}
+
+#[test]
+fn particles_are_drawn_on_the_map_when_spread_and_when_together() {
+    let gallery = Gallery::open();
+    let truth = street(300);
+    let map = MapImage::of_colors(&town(&truth), 2500);
+    for (name, spread_m, count) in [
+        ("spread", 18.0, 10_000),
+        ("start", 3.0, 1000),
+        ("tracking", 0.4, 100),
+    ] {
+        let here = truth[150];
+        let particles = cloud(&(here * Pose2::translation(0.5, 0.3)), spread_m, count);
+        let path = gallery.path(&format!("particles_{name}.png"));
+        LocalizationPicture {
+            title: &format!("frame 150, {name}"),
+            map: Some(&map),
+            particles: &particles,
+            estimate: Some(here * Pose2::new(Vector2::new(0.5, 0.3), 0.1)),
+            refined: None,
+            ground_truth: Some(here),
+            driven: &truth[..=150],
+            window: None,
+        }
+        .save(&path)
+        .unwrap();
+        assert_picture(&path, &[(MCL, 100), (TRUTH, 100)]);
+    }
+}
+
+#[test]
+fn frames_become_an_animation_of_one_size() {
+    let gallery = Gallery::open();
+    let truth = street(120);
+    let map = MapImage::of_colors(&town(&truth), 1500);
+    let pictures: Vec<PathBuf> = (0..120)
+        .step_by(30)
+        .map(|k| {
+            let path = gallery.path(&format!("loc_plots/{k:06}.png"));
+            let t = truth[k].translation;
+            LocalizationPicture {
+                title: &format!("frame {k}"),
+                map: Some(&map),
+                particles: &cloud(&truth[k], 3.0 / (1.0 + k as f64 / 30.0), 300),
+                estimate: Some(truth[k] * Pose2::translation(0.3, 0.2)),
+                ground_truth: Some(truth[k]),
+                driven: &truth[..=k],
+                window: Some(([t.x, t.y], 60.0)),
+                ..LocalizationPicture::default()
+            }
+            .save(&path)
+            .unwrap();
+            path
+        })
+        .collect();
+    let path = gallery.path("localization.gif");
+    Animation::default().save(&path, &pictures).unwrap();
+    let gif = std::fs::read(&path).unwrap();
+    let decoder = image::codecs::gif::GifDecoder::new(std::io::Cursor::new(gif)).unwrap();
+    let frames: Vec<image::Frame> = image::AnimationDecoder::into_frames(decoder)
+        .collect::<Result<_, _>>()
+        .unwrap();
+    assert_eq!(frames.len(), 4);
+    assert!(frames.iter().all(|frame| frame.buffer().width() == 1200));
+    assert_ne!(frames[0].buffer(), frames[3].buffer());
+
+    let missing = [gallery.path("no_such.png")];
+    let message = Animation::default()
+        .save(&path, &missing)
+        .unwrap_err()
+        .to_string();
+    assert!(message.contains("no_such.png"), "{message}");
+}
+
+#[test]
+fn range_images_show_what_is_missing_and_where_the_map_differs() {
+    let gallery = Gallery::open();
+    let model = LidarModel::default();
+    let mut rng = StdRng::seed_from_u64(1);
+    let range_at = |index: usize, car: bool| {
+        let direction = model.direction_of(model.pixel_at(index));
+        let azimuth = direction.y.atan2(direction.x);
+        let ground = if direction.z < 0.0 {
+            -1.73 / direction.z
+        } else {
+            f32::INFINITY
+        };
+        let wall = 7.0 / direction.y.abs().max(1e-3);
+        let front = if car && (azimuth - 0.2).abs() < 0.15 && direction.z < 0.02 {
+            8.0
+        } else {
+            f32::INFINITY
+        };
+        let range = ground.min(wall).min(front);
+        if range < model.max_range {
+            range
+        } else {
+            f32::INFINITY
+        }
+    };
+    let rendered: Vec<f32> = (0..model.len())
+        .map(|index| range_at(index, false))
+        .collect();
+    let observed: Vec<f32> = (0..model.len())
+        .map(|index| {
+            let noise = rng.random_range(-0.1..0.1);
+            if rng.random_bool(0.05) {
+                f32::INFINITY
+            } else {
+                range_at(index, true) + noise
+            }
+        })
+        .collect();
+    let path = gallery.path("range_images.png");
+    let strip = RangeImageStrip {
+        title: "Frame 12: range images",
+        model: &model,
+        observed: &observed,
+        rendered: &rendered,
+        difference_limit_m: 2.0,
+    };
+    strip.save(&path).unwrap();
+    assert_picture(
+        &path,
+        &[(MISSING, 2000), (Colormap::Diverging.at(0.0), 100)],
+    );
+    let message = RangeImageStrip {
+        observed: &observed[1..],
+        ..strip
+    }
+    .save(&path)
+    .unwrap_err();
+    assert!(
+        message.to_string().contains("57599 observed ranges"),
+        "{message}"
+    );
+}
+
+#[test]
+fn the_map_is_drawn_in_its_colours_and_by_a_number() {
+    let gallery = Gallery::open();
+    let truth = street(300);
+    let mesh = town(&truth);
+    let path = gallery.path("map.png");
+    MapPlot {
+        title: "Map from above",
+        mesh: &mesh,
+        trajectory: Some(&truth),
+        ground_color: [255, 0, 0],
+        rest_color: [0, 0, 255],
+    }
+    .save(&path)
+    .unwrap();
+    let image = assert_picture(&path, &[(TRUTH, 300)]);
+    let reddish = image
+        .pixels()
+        .filter(|p| p.0[0] > 120 && p.0[1] < 90 && p.0[2] < 90)
+        .count();
+    let bluish = image
+        .pixels()
+        .filter(|p| p.0[2] > 100 && p.0[0] < 90 && p.0[1] < 90)
+        .count();
+    assert!(reddish > 10_000 && bluish > 1000, "{reddish} {bluish}");
+
+    let residual = |vertex: &Vec3| {
+        if vertex.x > 120.0 {
+            f32::NAN
+        } else {
+            0.05 * (0.2 * vertex.y).sin()
+        }
+    };
+    let values: Vec<f32> = mesh.vertices.iter().map(residual).collect();
+    let path = gallery.path("map_residual.png");
+    ScalarMapPlot {
+        title: "Residual of the map",
+        mesh: &mesh,
+        values: &values,
+        value_name: "residual [m]",
+        limits: (-0.05, 0.05),
+        colormap: Colormap::Diverging,
+        trajectory: None,
+    }
+    .save(&path)
+    .unwrap();
+    assert_picture(&path, &[]);
+
+    let nothing = MapPlot {
+        title: "",
+        mesh: &TriangleMesh::default(),
+        trajectory: None,
+        ground_color: [255, 0, 0],
+        rest_color: [0, 0, 255],
+    };
+    let message = nothing.save(&path).unwrap_err().to_string();
+    assert!(message.contains("the mesh has no triangles"), "{message}");
+}
+
+#[test]
+fn runtimes_and_other_lines_are_drawn() {
+    let gallery = Gallery::open();
+    let frames: Vec<usize> = (0..200).collect();
+    let mut rng = StdRng::seed_from_u64(2);
+    let mut times = |usual_s: f64| -> Vec<f64> {
+        (0..200)
+            .map(|k| if k < 20 { 12.0 } else { 1.0 } * usual_s * rng.random_range(0.8..1.3))
+            .collect()
+    };
+    let (mcl, refine) = (times(0.02), times(0.03));
+    let path = gallery.path("runtime.png");
+    RuntimePlot {
+        title: "Time per frame",
+        frames: &frames,
+        stages: &[("MCL", MCL, &mcl), ("refine", REFINED, &refine)],
+        converged_row: Some(20),
+    }
+    .save(&path)
+    .unwrap();
+    assert_picture(&path, &[(MCL, 500), (REFINED, 500)]);
+
+    let peak = |width: f64| {
+        (-40..=40)
+            .map(move |k| 0.05 * f64::from(k))
+            .map(move |x| (x, (-0.5 * (x / width).powi(2)).exp()))
+    };
+    let path = gallery.path("peaks.png");
+    LineChart {
+        title: "Likelihood around the true pose".to_owned(),
+        x_name: "offset along [m]".to_owned(),
+        panels: vec![Panel {
+            y_name: "likelihood / peak".to_owned(),
+            series: vec![
+                Series::line("ours", REFINED, peak(0.1)),
+                Series {
+                    mark: Mark::Dashes,
+                    ..Series::line("range-mcl", MCL, peak(1.2))
+                },
+                Series {
+                    mark: Mark::Dots,
+                    ..Series::line("measured", color::PARTICLES, peak(0.3).step_by(4))
+                },
+            ],
+            from_zero: true,
+            clip_outliers: false,
+        }],
+        marks: vec![(0.0, "truth".to_owned())],
+    }
+    .save(&path)
+    .unwrap();
+    assert_picture(&path, &[(MCL, 300), (REFINED, 300)]);
+}
+
+#[test]
+fn a_folder_that_cannot_be_written_is_named() {
+    let gallery = Gallery::open();
+    let file = gallery.path("a_file");
+    std::fs::create_dir_all(&gallery.folder).unwrap();
+    std::fs::write(&file, "").unwrap();
+    let truth = street(10);
+    let plot = PathPlot {
+        title: "",
+        ground_truth: Some(&truth),
+        paths: &[],
+        map: None,
+    };
+    let message = plot.save(&file.join("path.png")).unwrap_err().to_string();
+    assert!(message.contains("path.png"), "{message}");
+    let message = PathPlot {
+        ground_truth: None,
+        ..plot
+    }
+    .save(&file)
+    .unwrap_err()
+    .to_string();
+    assert!(message.contains("nothing to draw"), "{message}");
+}

@@ -1,0 +1,350 @@
+//! Laws of the whole simulation: street, drive, traffic and scans together.
+
+use std::path::PathBuf;
+
+use approx::assert_relative_eq;
+use glam::{DVec2, Vec3};
+
+use super::*;
+
+/// 60 m with a bend and a slope, seen by a coarse sensor.
+fn small() -> SimulationConfig {
+    SimulationConfig {
+        path: [(25.0, 0.0, 0.0), (35.0, 40.0, 6.0)]
+            .map(|(length_m, turn_deg, grade_percent)| PathSegment {
+                length_m,
+                turn_deg,
+                grade_percent,
+            })
+            .to_vec(),
+        scanner: ScannerConfig {
+            beams: 32,
+            azimuth_steps: 500,
+            ..ScannerConfig::default()
+        },
+        ..SimulationConfig::default()
+    }
+}
+
+fn simulate(config: &SimulationConfig) -> Simulation {
+    Simulation::new(config, None).unwrap()
+}
+
+/// The poses of KITTI 07, where the real data is.
+fn kitti_07() -> Option<Vec<Pose3>> {
+    let data = std::env::var_os("FPMCL_DATA")
+        .map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from)
+        .join("kitti-odometry-poses");
+    let poses = crate::kitti::poses::CameraPoses::read(&data.join("poses/07.txt"));
+    let calibration = Calibration::read(&data.join("sequences/07/calib.txt"));
+    match (poses, calibration) {
+        (Ok(poses), Ok(calibration)) => Some(poses.map_from_lidar(&calibration)),
+        _ => {
+            eprintln!("skipped: no KITTI 07 poses in {}", data.display());
+            None
+        }
+    }
+}
+
+fn in_world(simulation: &Simulation, frame: usize) -> (Vec<Vec3>, Vec<u16>) {
+    let world_from_lidar = Rigid3f::from(&simulation.world_from_lidar(frame));
+    let labelled = simulation.scan(frame);
+    let points = labelled.scan.points.iter();
+    (
+        points.map(|&p| world_from_lidar.apply(p)).collect(),
+        labelled.classes,
+    )
+}
+
+#[test]
+fn ground_points_lie_on_the_ground_of_their_class_within_noise() {
+    let simulation = simulate(&small());
+    let ground = &simulation.street.ground;
+    let mut counts = [0; 3];
+    for frame in [0, 30, 60] {
+        let (points, classes) = in_world(&simulation, frame);
+        for (point, class) in points.iter().zip(classes) {
+            let node = ground.at(DVec2::new(point.x.into(), point.y.into()));
+            let (surface, index) = match class {
+                classes::ROAD | classes::PARKING => (Surface::Carriageway, 0),
+                classes::SIDEWALK if node.kerb_m > 0.2 => (Surface::Sidewalk, 1),
+                classes::TERRAIN => (Surface::Terrain, 2),
+                _ => continue,
+            };
+            counts[index] += 1;
+            // Five sigma of the range along the beam, and what the plane of a cell leaves out.
+            let error_m = point.z - ground.surface_height_m(&node, surface);
+            assert!(error_m.abs() < 0.1 + 0.02, "{class}: {error_m}");
+        }
+    }
+    assert!(counts.iter().all(|&count| count > 1000), "{counts:?}");
+}
+
+#[test]
+fn everything_a_street_needs_is_seen() {
+    let simulation = simulate(&SimulationConfig::default());
+    let mut seen = std::collections::BTreeSet::new();
+    for frame in (0..simulation.frames()).step_by(25) {
+        seen.extend(simulation.scan(frame).classes);
+    }
+    for class in [10, 40, 44, 48, 50, 51, 52, 70, 71, 72, 80, 81, 252, 254] {
+        assert!(seen.contains(&class), "no {class} in {seen:?}");
+    }
+}
+
+#[test]
+fn nothing_stands_where_the_car_drives() {
+    for (seed, drive) in [(1, 1), (2, 2), (3, 3)] {
+        let simulation = simulate(&SimulationConfig {
+            seed,
+            drive,
+            ..SimulationConfig::default()
+        });
+        let poses: Vec<Pose3> = simulation.poses().into_iter().step_by(4).collect();
+        let street = &simulation.street;
+        for (triangle, &class) in street.classes.iter().enumerate() {
+            if classes::is_ground(class) {
+                continue;
+            }
+            let [a, b, c] = street.mesh.corners(triangle);
+            let middle = (a + b + c) / 3.0;
+            for pose in &poses {
+                let t = pose.translation.vector;
+                let offset = middle - Vec3::new(t.x as f32, t.y as f32, t.z as f32);
+                let is_free = offset.truncate().length() > 1.5 || offset.z > 0.5;
+                assert!(is_free, "class {class} {offset} from the lidar");
+            }
+        }
+    }
+}
+
+#[test]
+fn two_drives_share_the_street_and_nothing_else() {
+    let first = simulate(&small());
+    let second = simulate(&SimulationConfig {
+        drive: 2,
+        ..small()
+    });
+    assert_eq!(first.street.mesh, second.street.mesh);
+    assert_eq!(first.street.classes, second.street.classes);
+    assert_ne!(first.scan(10), second.scan(10));
+    assert_ne!(first.traffic_at(10).mesh, second.traffic_at(10).mesh);
+
+    // The second drives 0.4 m farther left, weaving apart.
+    let line = &first.street.path;
+    let mean_offset_m = |simulation: &Simulation| {
+        let offsets_m: Vec<f64> = (0..simulation.frames())
+            .map(|frame| {
+                let t = simulation.world_from_lidar(frame).translation.vector;
+                let point = line.at(simulation.drive.station_m(frame as f64 * SCAN_PERIOD_S));
+                (DVec2::new(t.x, t.y) - point.position).dot(point.left())
+            })
+            .collect();
+        offsets_m.iter().sum::<f64>() / offsets_m.len() as f64
+    };
+    assert_relative_eq!(
+        mean_offset_m(&second) - mean_offset_m(&first),
+        0.4,
+        epsilon = 0.12
+    );
+}
+
+#[test]
+fn another_seed_is_another_street() {
+    let other = SimulationConfig { seed: 9, ..small() };
+    assert_ne!(simulate(&small()).street.mesh, simulate(&other).street.mesh);
+}
+
+#[test]
+fn oncoming_cars_come_nearer_at_their_speed() {
+    let config = SimulationConfig {
+        traffic: TrafficConfig {
+            oncoming_spacing_m: 30.0,
+            oncoming_speed_m_s: 10.0,
+            ..TrafficConfig::NONE
+        },
+        ..small()
+    };
+    let simulation = simulate(&config);
+    let before = simulation.traffic_at(0).mesh;
+    let after = simulation.traffic_at(1).mesh;
+    assert!(!before.vertices.is_empty());
+    let shared = before.vertices.len().min(after.vertices.len());
+    let mut moved = 0;
+    for (a, b) in before.vertices[..shared].iter().zip(&after.vertices) {
+        // A metre in a tenth of a second; a little more or less beside the path in a bend.
+        if (a.distance(*b) - 1.0).abs() < 0.2 {
+            moved += 1;
+        }
+    }
+    assert!(moved > shared / 2, "{moved} of {shared}");
+}
+
+#[test]
+fn an_empty_street_has_no_moving_points() {
+    let simulation = simulate(&SimulationConfig {
+        traffic: TrafficConfig::NONE,
+        ..small()
+    });
+    for frame in [0, 40] {
+        let labelled = simulation.scan(frame);
+        assert!(!labelled.classes.iter().any(|&c| classes::is_moving(c)));
+    }
+}
+
+#[test]
+fn the_lidar_hangs_over_the_road_and_leans_with_it() {
+    let config = SimulationConfig {
+        motion: MotionConfig {
+            nodding_deg: 0.0,
+            rolling_deg: 0.0,
+            heaving_m: 0.0,
+            ..MotionConfig::default()
+        },
+        ..small()
+    };
+    let simulation = simulate(&config);
+    let ground = &simulation.street.ground;
+    for (frame, pose) in simulation.poses().iter().enumerate() {
+        let up = pose.rotation * nalgebra::Vector3::z();
+        let foot = pose.translation.vector - 1.73 * up;
+        let height_m = f64::from(ground.point_at(DVec2::new(foot.x, foot.y)).z);
+        assert_relative_eq!(foot.z, height_m, epsilon = 0.03);
+        // The slope of 6 % begins at 25 m, rounded over a few metres.
+        let nose = (pose.rotation * nalgebra::Vector3::x()).z;
+        let station_m = simulation.drive.station_m(frame as f64 * SCAN_PERIOD_S);
+        if station_m < 10.0 {
+            assert_relative_eq!(nose, 0.0, epsilon = 0.01);
+        } else if station_m > 38.0 && station_m < 50.0 {
+            assert_relative_eq!(nose, 0.06, epsilon = 0.015);
+        }
+    }
+}
+
+#[test]
+fn a_path_that_crosses_itself_has_one_ground() {
+    // A loop of 400 degrees that climbs one metre: the crossing is where both heights meet.
+    let path = Path::from_segments(
+        &[PathSegment {
+            length_m: 260.0,
+            turn_deg: 400.0,
+            grade_percent: 0.4,
+        }],
+        0.0,
+    );
+    let ground = Street::new(&path, &StreetConfig::default(), 1).ground;
+    let mut previous = ground.at(path.at(0.0).position).height_m;
+    for step in 1..=5200 {
+        let height_m = ground.at(path.at(0.05 * f64::from(step)).position).height_m;
+        let rise = (height_m - previous).abs() / 0.05;
+        assert!(rise < 0.15, "a step of {rise} at {step}");
+        previous = height_m;
+    }
+}
+
+#[test]
+fn kitti_07_closes_its_loop() {
+    let Some(recorded) = kitti_07() else { return };
+    let config = SimulationConfig {
+        motion: MotionConfig {
+            nodding_deg: 0.0,
+            rolling_deg: 0.0,
+            heaving_m: 0.0,
+            ..MotionConfig::default()
+        },
+        ..SimulationConfig::default()
+    };
+    let simulation = Simulation::new(&config, Some(&recorded)).unwrap();
+    assert_eq!(simulation.frames(), 1101);
+    let poses = simulation.poses();
+    for (simulated, recorded) in poses.iter().zip(&recorded) {
+        let apart = simulated.translation.vector - recorded.translation.vector;
+        assert!(apart.xy().norm() < 2.0, "{apart}");
+        assert!(apart.z.abs() < 0.4, "{apart}");
+    }
+    let mut meetings = 0;
+    for i in (0..poses.len()).step_by(3) {
+        for j in (i + 300..poses.len()).step_by(3) {
+            let apart = poses[i].translation.vector - poses[j].translation.vector;
+            if apart.xy().norm() < 4.0 {
+                meetings += 1;
+                assert!(apart.z.abs() < 0.1 * apart.xy().norm() + 0.05, "{apart}");
+            }
+        }
+    }
+    assert!(meetings > 20, "{meetings}");
+}
+
+#[test]
+fn a_second_drive_along_a_recorded_path_has_another_rhythm() {
+    let recorded: Vec<Pose3> = (0..200)
+        .map(|frame| Pose3::translation(0.6 * f64::from(frame), 0.0, 0.0))
+        .collect();
+    let drive = |drive| {
+        let config = SimulationConfig { drive, ..small() };
+        Simulation::new(&config, Some(&recorded)).unwrap()
+    };
+    let (first, second) = (drive(1), drive(2));
+    assert_eq!(first.frames(), second.frames());
+    let apart_m: Vec<f64> = (0..200)
+        .map(|frame| {
+            let time_s = f64::from(frame) * SCAN_PERIOD_S;
+            first.drive.station_m(time_s) - second.drive.station_m(time_s)
+        })
+        .collect();
+    assert!(apart_m.iter().any(|apart_m| apart_m.abs() > 1.0));
+    assert!(second.poses().windows(2).all(|pair| {
+        let step = pair[0].inverse() * pair[1];
+        step.translation.x > -1e-3 && step.translation.x < 0.9
+    }));
+}
+
+#[test]
+fn the_truth_in_the_map_frame_is_seen_by_the_first_scan() {
+    let simulation = simulate(&small());
+    let scene = crate::raycasting::Scene::new(&simulation.truth_in_map());
+    let labelled = simulation.scan(0);
+    let directions: Vec<Vec3> = labelled.scan.points.iter().map(|p| p.normalize()).collect();
+    let mut hits = vec![crate::raycasting::Hit::MISS; directions.len()];
+    scene.cast(Vec3::ZERO, &directions, &mut hits);
+    for ((point, hit), &class) in labelled
+        .scan
+        .points
+        .iter()
+        .zip(&hits)
+        .zip(&labelled.classes)
+    {
+        if !classes::is_moving(class) {
+            let difference_m = (point.length() - hit.range_m).abs();
+            // Six sigma, but for beams that graze an edge after rounding.
+            assert!(difference_m < 0.12 || hit.range_m > 20.0, "{difference_m}");
+        }
+    }
+}
+
+#[test]
+fn contradictions_are_told_with_their_key() {
+    let mut config = small();
+    config.scanner.min_range_m = 100.0;
+    let message = config.check().unwrap_err().to_string();
+    assert!(message.contains("scanner.min_range_m: 100"), "{message}");
+    config = small();
+    config.street.parked_share = 1.5;
+    let message = config.check().unwrap_err().to_string();
+    assert!(message.contains("street.parked_share: 1.5"), "{message}");
+    config = small();
+    config.path[1].length_m = -5.0;
+    let message = config.check().unwrap_err().to_string();
+    assert!(message.contains("path: length_m: -5"), "{message}");
+    config = small();
+    config.path.clear();
+    let message = Simulation::new(&config, None).err().unwrap().to_string();
+    assert!(message.contains("the path is"), "{message}");
+}
+
+#[test]
+fn the_default_configuration_is_the_published_file() {
+    let published: SimulationConfig =
+        serde_yaml::from_str(include_str!("../../config/simulation.yml")).unwrap();
+    assert_eq!(published, SimulationConfig::default());
+}
