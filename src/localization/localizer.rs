@@ -19,7 +19,9 @@ use serde::{Deserialize, Serialize};
 
 use super::convergence::{ConvergenceConfig, is_converged};
 use super::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand, VelocityNoise};
-use super::observation::{Fit, ObservationConfig, above_road, choose_beams, costs, place_on_map};
+use super::observation::{
+    Fit, ObservationConfig, above_road, choose_beams, costs, near_points, place_on_map,
+};
 use super::odometry::Odometry;
 use super::panorama::PanoramaIndex;
 use super::particles::ParticleSet;
@@ -224,8 +226,9 @@ impl<'a> Localizer<'a> {
         }
         self.propagate(odometry, rng);
         let (weighing, beams) = self.weigh_in_rounds(scan, stance, rng)?;
-        let mut frame = self.conclude(&weighing, stance);
-        frame.agreement = self.agreement(&frame.lifted, &beams, stance)?;
+        let settled = self.settled(scan, stance);
+        let mut frame = self.conclude(&weighing, &settled);
+        frame.agreement = self.agreement(&frame.lifted, &beams, &settled)?;
         self.change_state(frame.agreement);
         frame.state = self.state;
         self.prepare_next(scan, stance, rng);
@@ -316,7 +319,8 @@ impl<'a> Localizer<'a> {
             let observation = &self.config.observation;
             let count = observation.beams_for(self.particles.len());
             let beams = choose_beams(scan, count, observation.road_share, stance, rng);
-            let (weighing, used) = self.weigh(&beams, stance, left)?;
+            let settled = self.settled(scan, stance);
+            let (weighing, used) = self.weigh(&beams, &settled, left)?;
             left -= used;
             if round >= rounds || left <= 0.0 || used <= 0.0 {
                 return Ok((weighing, beams));
@@ -324,6 +328,19 @@ impl<'a> Localizer<'a> {
             self.resample(rng);
             round += 1;
         }
+    }
+
+    /// How the sensor stands over the road: where the belief is narrow, as the returns from the
+    /// road lie on the mapped ground; else as the scan alone says.
+    fn settled(&self, scan: &RangeImage, stance: &Stance) -> Stance {
+        let Surroundings { ground, tiles, .. } = self.surroundings;
+        if !is_converged(&self.particles, tiles, &self.config.convergence) {
+            return *stance;
+        }
+        let points = near_points(scan);
+        ground
+            .stance_at(&self.particles.mean(), stance, &points)
+            .unwrap_or(*stance)
     }
 
     /// One round: multiplies the weights by a power of the likelihood, at most `most`. Returns the power.

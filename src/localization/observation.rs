@@ -162,6 +162,20 @@ fn stratified(list: &[usize], count: usize, rng: &mut impl Rng) -> Vec<usize> {
         .collect()
 }
 
+/// A few thousand of the returns near the car, most of them from the road: for
+/// [`GroundMap::stance_at`].
+pub fn near_points(image: &RangeImage) -> Vec<Vec3> {
+    /// As far as the rings on the road are dense [m].
+    const NEAR_M: f32 = 20.0;
+    /// Coprime to the widths of images, so that no column is left out.
+    const EVERY: usize = 7;
+    (0..image.ranges.len())
+        .step_by(EVERY)
+        .filter(|&index| image.ranges[index] < NEAR_M)
+        .map(|index| image.points[index])
+        .collect()
+}
+
 /// Mean cost of the beams from each pose [m]; `None` for poses that are not on the map.
 pub fn costs(
     renderer: &dyn RangeRenderer,

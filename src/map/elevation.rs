@@ -7,7 +7,8 @@
 //!
 //! The road frame lies on the mapped ground under the sensor, z along the ground's normal, x
 //! forward. How the sensor stands over it (height, roll, pitch) is the car's own affair and
-//! comes from the scan.
+//! comes from the scan: from the plane of its road, or, where the place is known, better from the
+//! distances of its returns to the mapped ground ([`GroundMap::stance_at`]).
 
 use glam::Vec3;
 use nalgebra::{Matrix3, Point2, Rotation3, Translation3, UnitQuaternion, Vector3};
@@ -156,6 +157,58 @@ impl GroundMap {
         Some(self.patch_under(planar)?.lift(planar, stance))
     }
 
+    /// Height of the ground at a place [m]; `None` where it is not known there.
+    pub fn height_at(&self, x: f64, y: f64) -> Option<f64> {
+        let height_m = self.heights_m[self.grid.index_at(x, y)?];
+        height_m.is_finite().then_some(f64::from(height_m))
+    }
+
+    /// How the sensor stands over the road at a planar pose: the stance with which the returns
+    /// from the road (`points`, lidar frame; others among them do no harm) lie on the mapped
+    /// ground. Robust least squares from `start`; `None` where too few returns meet known ground.
+    ///
+    /// The plane of the road that a scan sees and the patch of the map under the car are fitted to
+    /// different stretches of a road that is not flat; this asks one surface only.
+    pub fn stance_at(&self, planar: &Pose2, start: &Stance, points: &[Vec3]) -> Option<Stance> {
+        /// What lies farther off the ground than this is none of it, from blunt to sharp [m].
+        const GATES_M: [f64; 4] = [0.4, 0.2, 0.1, 0.1];
+        /// Fewer returns on the ground than this do not tell.
+        const ENOUGH: usize = 50;
+        let patch = self.patch_under(planar)?;
+        let mut stance = *start;
+        for gate_m in GATES_M {
+            let map_from_lidar = patch.lift(planar, &stance);
+            let mut normal_matrix = Matrix3::zeros();
+            let mut right_side = Vector3::zeros();
+            let mut used = 0;
+            for point in points {
+                let in_lidar = nalgebra::Point3::new(point.x, point.y, point.z).cast::<f64>();
+                let in_map = map_from_lidar * in_lidar;
+                let Some(ground_m) = self.height_at(in_map.x, in_map.y) else {
+                    continue;
+                };
+                let above_m = in_map.z - ground_m;
+                if above_m.abs() > gate_m {
+                    continue;
+                }
+                // Slopes of the height of the point: by the height of the sensor, roll and pitch.
+                let slopes = Vector3::new(1.0, in_lidar.y, -in_lidar.x);
+                let weight = (1.0 - (above_m / gate_m).powi(2)).powi(2);
+                normal_matrix += weight * slopes * slopes.transpose();
+                right_side -= weight * above_m * slopes;
+                used += 1;
+            }
+            if used < ENOUGH {
+                return None;
+            }
+            let step = normal_matrix.cholesky()?.solve(&right_side);
+            stance.height_m += step.x;
+            stance.roll_rad += step.y;
+            stance.pitch_rad += step.z;
+        }
+        Some(stance)
+    }
+
     /// The ground that a car at a planar pose stands on; `None` where there is none.
     pub fn patch_under(&self, planar: &Pose2) -> Option<GroundPatch> {
         /// About the wheelbase and track of a car.
@@ -291,6 +344,32 @@ mod tests {
             let shadow = planar(&patch.lift(&pose, &stance));
             assert_relative_eq!(shadow, pose, epsilon = 1e-12);
         }
+    }
+
+    #[test]
+    fn the_stance_is_found_from_returns_off_a_slope_among_others_that_are_not_off_it() {
+        let ground = GroundMap::from_mesh(&slope(0.06), |_| true, 0.5);
+        let pose = Pose2::new(Vector2::new(1.0, 2.0), 0.6);
+        let truth = Stance {
+            height_m: 1.65,
+            roll_rad: 0.015,
+            pitch_rad: -0.02,
+        };
+        let lidar_from_map = ground.lift(&pose, &truth).unwrap().inverse();
+        let points: Vec<Vec3> = (0..900)
+            .map(|i| {
+                let (x, y) = (f64::from(i % 30) - 14.0, f64::from(i / 30) - 14.0);
+                let above = if i % 4 == 0 { 0.5 } else { 0.0 };
+                let point = lidar_from_map * nalgebra::Point3::new(x, y, 0.06 * x + above);
+                Vec3::new(point.x as f32, point.y as f32, point.z as f32)
+            })
+            .collect();
+        let start = Stance::default();
+        let found = ground.stance_at(&pose, &start, &points).unwrap();
+        assert_relative_eq!(found.height_m, truth.height_m, epsilon = 5e-3);
+        assert_relative_eq!(found.roll_rad, truth.roll_rad, epsilon = 5e-4);
+        assert_relative_eq!(found.pitch_rad, truth.pitch_rad, epsilon = 5e-4);
+        assert_eq!(ground.stance_at(&pose, &start, &points[..40]), None);
     }
 
     #[test]

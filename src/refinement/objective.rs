@@ -9,7 +9,7 @@
 
 use nalgebra::{Matrix3, SymmetricEigen, Vector2, Vector3};
 
-use crate::geometry::{Pose2, Pose3};
+use crate::geometry::{Pose2, Pose3, Vec3};
 use crate::lidar::Beam;
 use crate::map::{GroundMap, GroundPatch, Stance};
 use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
@@ -34,6 +34,18 @@ impl FrameObjective<'_> {
     pub fn lift(&self, pose: &Pose2, remembered: Option<&GroundPatch>) -> Option<Pose3> {
         let patch = self.ground.patch_under(pose);
         Some(patch.as_ref().or(remembered)?.lift(pose, &self.stance))
+    }
+
+    /// The same objective with the stance with which the beams that hit the road end on the mapped
+    /// ground, seen from a pose; unchanged where too few of them do.
+    #[must_use]
+    pub fn settled(&self, pose: &Pose2) -> Self {
+        let points: Vec<Vec3> = self.beams.iter().map(Beam::point).collect();
+        let stance = self.ground.stance_at(pose, &self.stance, &points);
+        Self {
+            stance: stance.unwrap_or(self.stance),
+            ..*self
+        }
     }
 
     /// The mean cost from each pose [m]; infinite where a pose has no ground to stand on.

@@ -89,7 +89,8 @@ pub struct RefinedFrame {
     pub rays: usize,
 }
 
-/// Refines an estimate with its covariance of (x, y, heading). `None` where there is no ground
+/// Refines an estimate with its covariance of (x, y, heading). The stance of the objective is only
+/// where it starts: the sensor is settled onto the mapped ground first. `None` where there is no ground
 /// under the estimate or the scan has no beams: then nothing is known that could be better.
 pub fn refine_frame(
     objective: &FrameObjective<'_>,
