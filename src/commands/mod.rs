@@ -1,19 +1,27 @@
 //! One file per subcommand; each `run` reads as a paragraph.
 
-// The subcommands.
+// The subcommands, in the order of their use.
+pub mod build_map;
+mod demo;
 mod doctor;
+pub mod evaluate;
+pub mod localize;
+pub mod refine;
 pub mod simulate;
 // What they share.
 pub mod interrupt;
 mod logging;
+mod odometry;
 pub mod output;
 pub mod progress;
+mod run_output;
+mod stages;
 
 use std::io::Write as _;
 use std::path::Path;
 use std::process::ExitCode;
 
-use anyhow::{Context as _, bail};
+use anyhow::Context as _;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -23,6 +31,7 @@ use crate::config::{
     RefinementConfig,
 };
 use crate::rendering::backend::Backend;
+use crate::simulation::SimulationConfig;
 use interrupt::{Interrupt, Interrupted};
 use progress::Progress;
 
@@ -65,23 +74,34 @@ impl Context {
 pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
     match command {
         Command::BuildMap(args) => {
-            let _: BuildMapConfig = load_run(args, "config/build_map.yml")?;
-            bail!("this version cannot build maps yet")
+            let config: BuildMapConfig = load_run(args, "config/build_map.yml")?;
+            output::print(&build_map::run(&config, context)?.table())
         }
         Command::Localize(args) => {
-            let _: LocalizationConfig = load_run(args, "config/localization.yml")?;
-            bail!("this version cannot localize yet")
+            let config: LocalizationConfig = load_run(args, "config/localization.yml")?;
+            output::print(&localize::run(&config, context)?.to_text())
         }
         Command::Refine(args) => {
-            let _: RefinementConfig = load_run(args, "config/refinement.yml")?;
-            bail!("this version cannot refine yet")
+            let config: RefinementConfig = load_run(args, "config/refinement.yml")?;
+            output::print(&refine::run(&config, context)?.to_text())
         }
         Command::Evaluate(args) => {
-            let _: EvaluationConfig = load(args, "config/evaluation.yml", &args.settings)?;
-            bail!("this version cannot evaluate yet")
+            let config: EvaluationConfig = load(args, "config/evaluation.yml", &args.settings)?;
+            output::print(&evaluate::run(&config)?.to_text())
         }
-        Command::Simulate(_) => bail!("this version cannot simulate yet"),
-        Command::Demo(_) => bail!("this version has no demonstration yet"),
+        Command::Simulate(args) => {
+            // `force` is no key of a simulation.
+            let settings = args.settings();
+            let (force, settings): (Vec<_>, Vec<_>) =
+                settings.into_iter().partition(|(key, _)| key == "force");
+            let config: SimulationConfig = load(&args.source, "config/simulation.yml", &settings)?;
+            output::print(&simulate::run_with_progress(
+                &config,
+                !force.is_empty(),
+                context,
+            )?)
+        }
+        Command::Demo(args) => output::print(&demo::run(args, context)?),
         Command::Doctor => doctor::run(context),
     }
 }

@@ -24,7 +24,7 @@ use std::path::Path;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-pub use build_map::{BuildMapConfig, GroundMethod};
+pub use build_map::BuildMapConfig;
 pub use check::{Check, Problem};
 pub use error::{ConfigError, Place};
 pub use evaluation::EvaluationConfig;

@@ -138,7 +138,9 @@ pub fn build(
     watcher.begin("scans")?;
     let scans = prepare_scans(&frames[plan.used.clone()], settings, classifier, watcher)?;
     counts.scans = scans.len();
-    scans.iter().for_each(|scan| counts.points.add(&scan.counts));
+    scans
+        .iter()
+        .for_each(|scan| counts.points.add(&scan.counts));
 
     watcher.begin("moving points")?;
     let cloud = static_cloud(&scans, settings, &mut counts);
