@@ -62,6 +62,12 @@ where
     Ok(config)
 }
 
+/// Whether a configuration has a key at its top level.
+pub fn has_key<T: Default + Serialize>(key: &str) -> Result<bool, ConfigError> {
+    let text = to_yaml(&T::default())?;
+    Ok(Outline::of(&text).line_of(key).is_some())
+}
+
 /// Writes the effective configuration; loading it gives an equal one.
 ///
 /// The file appears whole under its name or not at all.
