@@ -25,7 +25,6 @@
     clippy::print_stdout,
     reason = "a bench stops at the first error and prints what it measured"
 )]
-#![expect(missing_docs, reason = "divan makes public functions")]
 
 use std::io::{BufWriter, Write};
 use std::time::Instant;

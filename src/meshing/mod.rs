@@ -3,6 +3,7 @@
 
 // The method.
 pub mod poisson;
+pub mod simplify;
 pub mod trimming;
 // What it stands on, in the order in which it is needed.
 mod base_grid;
@@ -16,6 +17,7 @@ mod samples;
 mod solver;
 
 pub use poisson::{MeshingError, PoissonConfig, Surface, reconstruct};
+pub use simplify::simplify_ground;
 pub use trimming::{trim_by_density, trim_by_distance};
 
 #[cfg(test)]

@@ -35,11 +35,7 @@ pub fn trim_by_density(surface: &mut Surface, quantile: f64) -> usize {
 
 /// Drops the triangles with a vertex farther than `max_distance_m` from every sample. Returns
 /// their number.
-pub fn trim_by_distance(
-    mesh: &mut TriangleMesh,
-    samples: &[Vec3],
-    max_distance_m: f32,
-) -> usize {
+pub fn trim_by_distance(mesh: &mut TriangleMesh, samples: &[Vec3], max_distance_m: f32) -> usize {
     let near = Neighborhood::new(samples, max_distance_m);
     let is_near: Vec<bool> = mesh
         .vertices
@@ -76,7 +72,12 @@ impl<'a> Neighborhood<'a> {
             .par_iter()
             .enumerate()
             .filter(|(_, sample)| sample.is_finite())
-            .map(|(index, sample)| ((sample / reach_m).floor().as_ivec3().to_array(), index as u32))
+            .map(|(index, sample)| {
+                (
+                    (sample / reach_m).floor().as_ivec3().to_array(),
+                    index as u32,
+                )
+            })
             .collect();
         keyed.par_sort_unstable();
         let mut ranges = HashMap::new();
@@ -98,12 +99,16 @@ impl<'a> Neighborhood<'a> {
         let cell = (point / self.reach_m).floor().as_ivec3();
         (0..27).any(|i| {
             let offset = IVec3::new(i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1);
-            self.ranges.get(&(cell + offset)).is_some_and(|&(begin, end)| {
-                self.order[begin as usize..end as usize].iter().any(|&index| {
-                    let limit = self.reach_m * self.reach_m;
-                    self.samples[index as usize].distance_squared(point) <= limit
+            self.ranges
+                .get(&(cell + offset))
+                .is_some_and(|&(begin, end)| {
+                    self.order[begin as usize..end as usize]
+                        .iter()
+                        .any(|&index| {
+                            let limit = self.reach_m * self.reach_m;
+                            self.samples[index as usize].distance_squared(point) <= limit
+                        })
                 })
-            })
         })
     }
 }
@@ -119,7 +124,13 @@ mod tests {
                 .map(|i| Vec3::new((i / 2) as f32, (i % 2) as f32, 0.0))
                 .collect(),
             triangles: (0..2 * length - 2)
-                .map(|i| if i % 2 == 0 { [i, i + 2, i + 1] } else { [i, i + 1, i + 2] })
+                .map(|i| {
+                    if i % 2 == 0 {
+                        [i, i + 2, i + 1]
+                    } else {
+                        [i, i + 1, i + 2]
+                    }
+                })
                 .collect(),
             ..TriangleMesh::default()
         }
@@ -137,7 +148,14 @@ mod tests {
         // Vertices at x < 4.9 go: of the 98 triangles those of the first five metres.
         assert_eq!(dropped, 10);
         assert_eq!(surface.mesh.vertices.len(), 90);
-        assert!(surface.mesh.vertices.iter().zip(&surface.densities).all(|(v, d)| v.x == *d));
+        assert!(
+            surface
+                .mesh
+                .vertices
+                .iter()
+                .zip(&surface.densities)
+                .all(|(v, d)| v.x == *d)
+        );
     }
 
     #[test]
