@@ -91,28 +91,45 @@ pub(crate) struct Node {
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Bvh {
     pub nodes: Vec<Node>,
-    /// Which of [`Bvh::order`] are in each leaf.
-    pub leaves: Vec<Range<u32>>,
-    /// The indices of the items, leaf by leaf.
-    pub order: Vec<u32>,
     /// Nothing where there are no items.
     pub root: Option<Child>,
 }
 
 impl Bvh {
-    /// Grows the hierarchy over items, at most `leaf_size` to a leaf.
-    pub fn build(mut items: Vec<Item>, leaf_size: usize) -> Self {
-        let Some(subtree) =
-            (!items.is_empty()).then(|| Grower { leaf_size }.grow_parallel(&mut items, 0, 0))
-        else {
-            return Self::default();
-        };
-        Self {
-            nodes: subtree.nodes,
-            leaves: subtree.leaves,
-            order: items.iter().map(|item| item.index).collect(),
-            root: Some(subtree.root),
+    /// Grows the hierarchy over items, at most `leaf_size` to a leaf; also gives the indices of
+    /// the items in each leaf.
+    pub fn build(mut items: Vec<Item>, leaf_size: usize) -> (Self, Leaves) {
+        if items.is_empty() {
+            return Default::default();
         }
+        let tree = Grower { leaf_size }.grow_parallel(&mut items, 0, 0);
+        let leaves = Leaves {
+            ranges: tree.leaves,
+            order: items.iter().map(|item| item.index).collect(),
+        };
+        let bvh = Self {
+            nodes: tree.nodes,
+            root: Some(tree.root),
+        };
+        (bvh, leaves)
+    }
+}
+
+/// What lies in each leaf.
+#[derive(Default)]
+pub struct Leaves {
+    /// Where the items of each leaf stand in `order`.
+    pub ranges: Vec<Range<u32>>,
+    /// Indices of the items, leaf by leaf.
+    pub order: Vec<u32>,
+}
+
+impl Leaves {
+    /// The indices of the items, leaf by leaf.
+    pub fn iter(&self) -> impl Iterator<Item = &[u32]> {
+        self.ranges
+            .iter()
+            .map(|range| &self.order[range.start as usize..range.end as usize])
     }
 }
 

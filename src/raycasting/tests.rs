@@ -2,6 +2,7 @@ use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
+use crate::geometry::{TriangleMesh, Vec3};
 
 /// Random triangles in a cube of 20 m.
 fn soup(triangles: usize, size_m: f32, rng: &mut ChaCha8Rng) -> TriangleMesh {

@@ -4,8 +4,11 @@
 //! weights): an observation is compared along the very directions that were measured.
 
 pub mod backend;
+pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;
+
+pub use cpu::{CpuRenderer, SurfaceHit};
 
 use crate::geometry::{Pose3, Vec3};
 use crate::lidar::{Beam, LidarModel};

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use super::layout::{self, Node, Triangle};
 use crate::geometry::{Aabb, TriangleMesh};
-use crate::raycasting::bvh::{Bvh, Child, Item};
+use crate::raycasting::bvh::{Bvh, Child, Item, Leaves};
 use crate::raycasting::is_proper;
 
 /// Most triangles in a leaf: a test costs the device about as much as a node.
@@ -78,7 +78,7 @@ impl Forest {
         let (first_node, first) = (self.nodes.len(), self.triangles.len());
         let refer = |child: Child| {
             if child.is_leaf() {
-                let range = &tree.bvh.leaves[child.index()];
+                let range = &tree.leaves.ranges[child.index()];
                 layout::leaf(first + range.start as usize, range.len())
             } else {
                 (first_node + child.index()) as u32
@@ -87,7 +87,7 @@ impl Forest {
         let nodes = tree.bvh.nodes.iter();
         self.nodes
             .extend(nodes.map(|n| node(n.bounds, n.children.map(refer))));
-        let order = tree.bvh.order.iter();
+        let order = tree.leaves.order.iter();
         self.triangles
             .extend(order.map(|&index| Triangle::new(tree.corners[index as usize])));
         self.tiles.push(Tile {
@@ -103,15 +103,15 @@ impl Forest {
             bounds: self.tiles[index].bounds,
             index: index as u32,
         });
-        let over = Bvh::build(items.collect(), 1);
+        let (over, leaves) = Bvh::build(items.collect(), 1);
         let Some(root) = over.root else {
             return;
         };
         let first_node = self.nodes.len();
         let refer = |child: Child| {
             if child.is_leaf() {
-                let place = over.leaves[child.index()].start as usize;
-                roots[over.order[place] as usize]
+                let place = leaves.ranges[child.index()].start as usize;
+                roots[leaves.order[place] as usize]
             } else {
                 (first_node + child.index()) as u32
             }
@@ -141,6 +141,7 @@ impl Forest {
 /// The hierarchy of a tile that counts its own triangles from zero.
 struct Tree {
     bvh: Bvh,
+    leaves: Leaves,
     corners: Vec<[Vec3; 3]>,
 }
 
@@ -155,8 +156,10 @@ impl Tree {
             bounds: Aabb::of(*corners),
             index: index as u32,
         });
+        let (bvh, leaves) = Bvh::build(items.collect(), LEAF_SIZE);
         Self {
-            bvh: Bvh::build(items.collect(), LEAF_SIZE),
+            bvh,
+            leaves,
             corners,
         }
     }

@@ -1,0 +1,166 @@
+//! Rays per second of the CPU renderer in a street of 1.3 million triangles, what comparing costs,
+//! and how long its hierarchy takes to build.
+//!
+//! ```text
+//! cargo bench --bench rendering
+//! ```
+//!
+//! Beside Embree, on the same rays: with `FPMCL_BENCH_PLY=street.ply` the street is written to a
+//! file first, poses are at `on_the_road(0.1 + 0.1 i, 0.7 i - 2)` for i from 0 to 7 as in
+//! [`poses`], and in Python, with Open3D, with `directions` from the pixel centres of the default
+//! `LidarModel`,
+//!
+//! ```text
+//! scene = open3d.t.geometry.RaycastingScene(nthreads=1)
+//! scene.add_triangles(open3d.t.io.read_triangle_mesh("street.ply"))
+//! rays = [numpy.hstack([numpy.tile(origin, (len(directions), 1)), directions]) for origin in origins]
+//! [scene.cast_rays(open3d.core.Tensor(r.astype("float32")), nthreads=1) for r in rays]   # time this
+//! ```
+//!
+//! run in turns, A B A B, on an otherwise idle machine.
+
+mod street;
+
+use std::io::Write as _;
+
+use divan::counter::ItemsCount;
+use divan::{Bencher, black_box};
+use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
+use fpmcl::lidar::{Beam, LidarModel};
+use fpmcl::raycasting::Scene;
+use fpmcl::rendering::{CpuRenderer, RangeDifference, RangeRenderer as _};
+use rayon::{ThreadPool, ThreadPoolBuilder};
+
+const SEED: u64 = 7;
+const THREADS: [usize; 2] = [1, 2];
+
+fn main() -> std::io::Result<()> {
+    if let Some(path) = std::env::var_os("FPMCL_BENCH_PLY") {
+        std::fs::write(path, ply(&street::street(SEED))?)?;
+    }
+    divan::main();
+    Ok(())
+}
+
+/// Whole images from eight poses.
+#[divan::bench(args = THREADS, sample_count = 10)]
+fn images(bencher: Bencher, threads: usize) {
+    let (renderer, poses, model) = (renderer(), poses(), LidarModel::default());
+    let pool = pool(threads);
+    bencher
+        .counter(ItemsCount::new(poses.len() * model.len()))
+        .bench(|| pool.install(|| renderer.render(black_box(&poses), &model)));
+}
+
+/// Every fourth row and column.
+#[divan::bench(args = THREADS, sample_count = 10)]
+fn strided_images(bencher: Bencher, threads: usize) {
+    let model = LidarModel {
+        height: 16,
+        width: 225,
+        ..LidarModel::default()
+    };
+    let (renderer, poses) = (renderer(), poses());
+    let pool = pool(threads);
+    bencher
+        .counter(ItemsCount::new(poses.len() * model.len()))
+        .bench(|| pool.install(|| renderer.render(black_box(&poses), &model)));
+}
+
+/// A frame of tracking: poses around the truth.
+#[divan::bench(args = THREADS, sample_count = 10)]
+fn compare_100_poses_3600_beams(bencher: Bencher, threads: usize) {
+    compare(bencher, threads, &around(100, 1.0), 3600);
+}
+
+/// The first frame of a global start: poses over the whole street.
+#[divan::bench(args = THREADS, sample_count = 3)]
+fn compare_10000_poses_500_beams(bencher: Bencher, threads: usize) {
+    compare(bencher, threads, &around(10_000, 100.0), 500);
+}
+
+#[divan::bench(args = THREADS, sample_count = 3)]
+fn build(bencher: Bencher, threads: usize) {
+    let mesh = street::street(SEED);
+    let pool = pool(threads);
+    bencher
+        .counter(ItemsCount::new(mesh.triangles.len()))
+        .bench(|| pool.install(|| Scene::new(black_box(&mesh))));
+}
+
+fn compare(bencher: Bencher, threads: usize, poses: &[Pose3], count: usize) {
+    let renderer = renderer();
+    let truth = street::on_the_road(0.5, 0.0);
+    let beams = beams(&renderer, truth, count);
+    let difference = RangeDifference::truncated(0.5);
+    let pool = pool(threads);
+    bencher
+        .counter(ItemsCount::new(poses.len() * beams.len()))
+        .bench(|| pool.install(|| renderer.compare(black_box(poses), &beams, &difference)));
+}
+
+fn pool(threads: usize) -> ThreadPool {
+    let pool = ThreadPoolBuilder::new().num_threads(threads);
+    pool.build().expect("threads can be started")
+}
+
+fn renderer() -> CpuRenderer {
+    CpuRenderer::new(&street::tiles(&street::street(SEED), 100.0))
+}
+
+fn at(place: Vec3) -> Pose3 {
+    Pose3::translation(place.x.into(), place.y.into(), place.z.into())
+}
+
+fn poses() -> Vec<Pose3> {
+    (0..8_u8)
+        .map(f32::from)
+        .map(|i| at(street::on_the_road(0.1 + 0.1 * i, 0.7 * i - 2.0)))
+        .collect()
+}
+
+/// Poses within `along_m` of the middle of the street, in a sequence without gaps (Weyl).
+fn around(count: usize, along_m: f64) -> Vec<Pose3> {
+    let spread = |number: usize, step: f64| (number as f64 * step).fract() - 0.5;
+    (0..count)
+        .map(|number| {
+            let along = 0.5 + 2.0 * along_m / 300.0 * spread(number, 0.754_877_666);
+            let aside_m = 2.0 * spread(number, 0.569_840_291);
+            at(street::on_the_road(along as f32, aside_m as f32))
+                * Pose3::rotation(nalgebra::Vector3::z() * spread(number, 0.618_033_989))
+        })
+        .collect()
+}
+
+/// About as many beams as asked for, evenly over the image that is seen from a place.
+fn beams(renderer: &CpuRenderer, place: Vec3, count: usize) -> Vec<Beam> {
+    let columns = (count as f32 * 900.0 / 64.0).sqrt();
+    let model = LidarModel {
+        width: columns as usize,
+        height: (count as f32 / columns) as usize,
+        ..LidarModel::default()
+    };
+    let image = renderer.render(&[at(place)], &model);
+    let ranges = image.expect("the CPU always renders").concat();
+    std::iter::zip(model.directions(), ranges)
+        .filter(|(_, range_m)| range_m.is_finite())
+        .map(|(direction, range_m)| Beam { direction, range_m })
+        .collect()
+}
+
+fn ply(mesh: &TriangleMesh) -> std::io::Result<Vec<u8>> {
+    let mut file = Vec::new();
+    writeln!(file, "ply\nformat binary_little_endian 1.0")?;
+    writeln!(file, "element vertex {}", mesh.vertices.len())?;
+    writeln!(file, "property float x\nproperty float y\nproperty float z")?;
+    writeln!(file, "element face {}", mesh.triangles.len())?;
+    writeln!(file, "property list uchar int vertex_indices\nend_header")?;
+    for coordinate in mesh.vertices.iter().flat_map(|v| v.to_array()) {
+        file.extend(coordinate.to_le_bytes());
+    }
+    for triangle in &mesh.triangles {
+        file.push(3);
+        file.extend(triangle.iter().flat_map(|vertex| vertex.to_le_bytes()));
+    }
+    Ok(file)
+}

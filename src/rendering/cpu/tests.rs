@@ -1,0 +1,206 @@
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use rand::{RngExt as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
+
+use super::*;
+
+/// A wavy ground of 40 m in two tiles, the border in the middle.
+fn hills(middle: Vec3) -> Vec<TriangleMesh> {
+    const STEPS: u32 = 80;
+    let mut mesh = TriangleMesh::default();
+    for row in 0..=STEPS {
+        for column in 0..=STEPS {
+            let (x, y) = (0.5 * column as f32 - 20.0, 0.5 * row as f32 - 20.0);
+            mesh.vertices
+                .push(middle + Vec3::new(x, y, 0.5 * (0.7 * x).sin() * (0.5 * y).cos()));
+        }
+    }
+    for row in 0..STEPS {
+        for column in 0..STEPS {
+            let a = row * (STEPS + 1) + column;
+            let [b, c, d] = [a + 1, a + STEPS + 2, a + STEPS + 1];
+            mesh.triangles.extend([[a, b, c], [a, c, d]]);
+        }
+    }
+    let is_left = |triangle: usize| mesh.corners(triangle)[0].x < middle.x;
+    let [mut left, mut right] = [mesh.clone(), mesh.clone()];
+    left.retain_triangles(is_left);
+    right.retain_triangles(|triangle| !is_left(triangle));
+    vec![left, TriangleMesh::default(), right]
+}
+
+fn poses(count: usize) -> Vec<Pose3> {
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    (0..count)
+        .map(|_| {
+            let at = [0, 1].map(|_| rng.random_range(-15.0..15.0));
+            let turn = [0.1, 0.1, 3.0].map(|most: f64| rng.random_range(-most..most));
+            Pose3::new(Vector3::new(at[0], at[1], 2.5), Vector3::from(turn))
+        })
+        .collect()
+}
+
+fn beams(count: usize) -> Vec<Beam> {
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    (0..count)
+        .map(|_| Beam {
+            direction: Vec3::new(
+                rng.random_range(-1.0..1.0),
+                rng.random_range(-1.0..1.0),
+                rng.random_range(-0.4..0.05),
+            )
+            .normalize(),
+            range_m: rng.random_range(2.0..20.0),
+        })
+        .collect()
+}
+
+fn on_threads<T: Send>(threads: usize, work: impl FnOnce() -> T + Send) -> T {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+    pool.build().unwrap().install(work)
+}
+
+#[test]
+fn tiles_look_like_the_whole() {
+    let tiles = hills(Vec3::ZERO);
+    let mut whole = tiles[0].clone();
+    whole.append(&tiles[2]);
+    let model = LidarModel::default();
+    let tiled = CpuRenderer::new(&tiles).render(&poses(3), &model).unwrap();
+    let whole = CpuRenderer::new(&[whole])
+        .render(&poses(3), &model)
+        .unwrap();
+    for (a, b) in tiled.iter().flatten().zip(whole.iter().flatten()) {
+        assert!(a == b || (a - b).abs() < 1e-4, "{a} {b}");
+    }
+    assert!(tiled[0].iter().filter(|range| range.is_finite()).count() > 10_000);
+}
+
+#[test]
+fn five_kilometres_from_the_origin_nothing_looks_different() {
+    let far = Vec3::new(4096.0, -3072.0, 128.0);
+    let there = |pose: &Pose3| Translation3::new(4096.0, -3072.0, 128.0) * pose;
+    let model = LidarModel::default();
+    let near = CpuRenderer::new(&hills(Vec3::ZERO))
+        .render(&poses(2), &model)
+        .unwrap();
+    let moved: Vec<Pose3> = poses(2).iter().map(there).collect();
+    let moved = CpuRenderer::new(&hills(far))
+        .render(&moved, &model)
+        .unwrap();
+    // The vertices themselves move by up to a quarter of a millimetre, which a flat view magnifies.
+    let mut differences: Vec<f32> = std::iter::zip(near.iter().flatten(), moved.iter().flatten())
+        .filter(|(a, b)| a.is_finite() && b.is_finite())
+        .map(|(a, b)| (a - b).abs())
+        .collect();
+    differences.sort_by(f32::total_cmp);
+    assert!(differences[differences.len() / 2] < 1e-3);
+    assert!(differences[differences.len() * 99 / 100] < 2e-2);
+}
+
+#[test]
+fn the_number_of_threads_does_not_change_a_bit() {
+    let renderer = CpuRenderer::new(&hills(Vec3::ZERO));
+    let work = || {
+        let difference = RangeDifference::truncated(0.5);
+        let model = LidarModel::default();
+        let images = renderer.render(&poses(2), &model).unwrap();
+        let costs = renderer
+            .compare(&poses(50), &beams(3600), &difference)
+            .unwrap();
+        (images, costs)
+    };
+    assert_eq!(on_threads(1, work), on_threads(3, work));
+}
+
+#[test]
+fn comparing_is_casting_and_counting_the_cost() {
+    let renderer = CpuRenderer::new(&hills(Vec3::ZERO));
+    let (poses, beams) = (poses(20), beams(1000));
+    let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
+    let rows = renderer.cast(&poses, &directions).unwrap();
+    let differences = [
+        RangeDifference::UNLIMITED,
+        RangeDifference::truncated(0.5),
+        RangeDifference {
+            short_m: 0.5,
+            long_m: 1.0,
+            no_surface_m: 0.7,
+        },
+    ];
+    for difference in differences {
+        let means = renderer.compare(&poses, &beams, &difference).unwrap();
+        for (row, mean) in rows.iter().zip(means) {
+            let costs = row.iter().zip(&beams);
+            let sum: f64 = costs
+                .map(|(&range_m, beam)| f64::from(difference.cost(beam.range_m, range_m)))
+                .sum();
+            let expected = sum / beams.len() as f64;
+            assert!(
+                (f64::from(mean) - expected).abs() < 1e-6 * expected,
+                "{mean} {expected}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_cast_along_the_pixels_is_the_image() {
+    let renderer = CpuRenderer::new(&hills(Vec3::ZERO));
+    let model = LidarModel {
+        min_range: 0.0,
+        max_range: f32::INFINITY,
+        ..LidarModel::default()
+    };
+    let image = renderer.render(&poses(2), &model).unwrap();
+    assert_eq!(
+        image,
+        renderer.cast(&poses(2), &model.directions()).unwrap()
+    );
+}
+
+#[test]
+fn a_wall_is_seen_with_its_range_and_its_normal_towards_the_sensor() {
+    let corners = [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)];
+    let wall = TriangleMesh {
+        vertices: corners.map(|(y, z)| Vec3::new(5.0, y, z)).to_vec(),
+        triangles: vec![[0, 1, 2], [0, 2, 3]],
+        ..TriangleMesh::default()
+    };
+    let renderer = CpuRenderer::new(&[wall]);
+    let quarter = UnitQuaternion::from_euler_angles(0.0, 0.0, std::f64::consts::FRAC_PI_2);
+    let pose = Isometry3::from_parts(Translation3::new(1.0, 0.5, 0.0), quarter);
+    // Ahead of the turned sensor is +y of the map, so +x is on its right.
+    let surfaces = renderer.surfaces(&pose, &[Vec3::NEG_Y, Vec3::Y]);
+    let met = surfaces[0].unwrap();
+    assert!((met.range_m - 4.0).abs() < 1e-6);
+    assert!((met.normal_in_map - Vec3::NEG_X).length() < 1e-6);
+    assert_eq!(surfaces[1], None);
+}
+
+#[test]
+fn out_of_the_map_there_is_nothing() {
+    let renderer = CpuRenderer::new(&hills(Vec3::ZERO));
+    let model = LidarModel::default();
+    let far = Pose3::translation(1e5, 0.0, 0.0);
+    let empty = CpuRenderer::new(&[]);
+    for images in [
+        renderer.render(&[far], &model),
+        empty.render(&[far], &model),
+    ] {
+        assert!(
+            images.unwrap()[0]
+                .iter()
+                .all(|&range| range == f32::INFINITY)
+        );
+    }
+    let costs = empty.compare(&[far], &beams(7), &RangeDifference::truncated(0.5));
+    assert_eq!(costs.unwrap(), [0.5]);
+    assert!(renderer.cast(&[far], &[]).unwrap()[0].is_empty());
+    assert_eq!(
+        renderer
+            .compare(&[far], &[], &RangeDifference::UNLIMITED)
+            .unwrap(),
+        [0.0]
+    );
+}
