@@ -34,7 +34,7 @@ pub struct TerrainConfig {
 }
 
 impl Default for TerrainConfig {
-    /// Fixed on the simulated street and on half of the labelled scans.
+    /// Chosen on the even-numbered of 21 labelled scans.
     fn default() -> Self {
         Self {
             step_m: 0.15,
