@@ -8,10 +8,10 @@ use super::super::initialization::{Cells, ROAD_HALF_WIDTH_M, StartSpread, around
 use super::super::motion::OdometryNoise;
 use super::super::odometry::{Odometry, increments, with_noise};
 use super::super::panorama::{PanoramaConfig, PanoramaIndex};
-use super::super::test_world::TestWorld;
 use super::*;
 use crate::geometry::wrap_angle;
 use crate::lidar::LidarModel;
+use crate::rendering::test_world::TestWorld;
 
 /// Small enough for a test, else the defaults.
 fn config(num_particles: usize) -> LocalizerConfig {

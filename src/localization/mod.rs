@@ -27,9 +27,19 @@ pub mod vigilance;
 // The loop.
 pub mod localizer;
 
-#[cfg(test)]
-mod test_world;
-
 pub use localizer::{FrameEstimate, Localizer, LocalizerConfig, Surroundings};
 pub use particles::{Particle, ParticleSet};
 pub use vigilance::State;
+
+#[cfg(test)]
+impl crate::rendering::test_world::TestWorld {
+    /// The street as the localizer sees it.
+    fn surroundings(&self) -> Surroundings<'_> {
+        Surroundings {
+            renderer: self,
+            ground: &self.ground,
+            tiles: &self.tiles,
+            panoramas: None,
+        }
+    }
+}

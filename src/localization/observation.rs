@@ -254,9 +254,9 @@ mod tests {
     use approx::assert_relative_eq;
     use rand::{SeedableRng, rngs::StdRng};
 
-    use super::super::test_world::TestWorld;
     use super::*;
     use crate::lidar::LidarModel;
+    use crate::rendering::test_world::TestWorld;
 
     #[test]
     fn the_reference_likelihood_is_the_published_one() {

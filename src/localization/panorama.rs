@@ -303,8 +303,8 @@ mod tests {
     use rand::{SeedableRng, rngs::StdRng};
 
     use super::super::initialization::ROAD_HALF_WIDTH_M;
-    use super::super::test_world::TestWorld;
     use super::*;
+    use crate::rendering::test_world::TestWorld;
 
     fn index(world: &TestWorld) -> PanoramaIndex {
         let config = PanoramaConfig::default();

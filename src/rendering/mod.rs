@@ -9,6 +9,8 @@ pub mod cpu;
 pub mod gpu;
 
 pub use cpu::{CpuRenderer, SurfaceHit};
+#[cfg(test)]
+pub(crate) mod test_world;
 
 use crate::geometry::{Pose3, Vec3};
 use crate::lidar::{Beam, LidarModel};

@@ -3,10 +3,10 @@
 use glam::Vec3;
 use nalgebra::{Point2, Vector2};
 
+use super::{RangeDifference, RangeRenderer, RenderError};
 use crate::geometry::{Pose2, Pose3, Rigid3f};
 use crate::lidar::{Beam, LidarModel, RangeImage};
 use crate::map::{GroundMap, Stance, TileConfig, TileGrid};
-use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
 
 /// Axis-aligned boxes on flat ground, seen in a frame that may be turned and shifted.
 pub struct TestWorld {
@@ -207,17 +207,5 @@ impl RangeRenderer for TestWorld {
             .into_iter()
             .map(mean)
             .collect())
-    }
-}
-
-impl TestWorld {
-    /// The street as the localizer sees it.
-    pub fn surroundings(&self) -> super::Surroundings<'_> {
-        super::Surroundings {
-            renderer: self,
-            ground: &self.ground,
-            tiles: &self.tiles,
-            panoramas: None,
-        }
     }
 }

@@ -1,0 +1,190 @@
+//! What refinement minimizes: the range difference between a scan and the map from a pose.
+//!
+//! ```text
+//! f(x, y, θ) = mean over the beams of cost(measured, rendered from lift(x, y, θ))      [m]
+//! Σ ≈ s · H⁻¹        H: second differences of f;  s: the scale of exp(−f / s)
+//! ```
+//!
+//! The pose stands on the map's ground, as in localization, so that only x, y and heading are free.
+
+use nalgebra::{Matrix3, SymmetricEigen, Vector2, Vector3};
+
+use crate::geometry::{Pose2, Pose3};
+use crate::lidar::Beam;
+use crate::map::{GroundMap, GroundPatch, Stance};
+use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
+
+/// The objective of one frame.
+#[derive(Clone, Copy)]
+pub struct FrameObjective<'a> {
+    /// Shows the map.
+    pub renderer: &'a dyn RangeRenderer,
+    /// Carries the poses.
+    pub ground: &'a GroundMap,
+    /// The beams of the frame, lidar frame.
+    pub beams: &'a [Beam],
+    /// How the sensor stands over the road.
+    pub stance: Stance,
+    /// What a difference costs.
+    pub difference: RangeDifference,
+}
+
+impl FrameObjective<'_> {
+    /// Where in space a pose is; where the map has no ground there, it stands on `remembered`.
+    pub fn lift(&self, pose: &Pose2, remembered: Option<&GroundPatch>) -> Option<Pose3> {
+        let patch = self.ground.patch_under(pose);
+        Some(patch.as_ref().or(remembered)?.lift(pose, &self.stance))
+    }
+
+    /// The mean cost from each pose [m]; infinite where a pose has no ground to stand on.
+    pub fn costs(
+        &self,
+        poses: &[Pose2],
+        remembered: Option<&GroundPatch>,
+    ) -> Result<Vec<f64>, RenderError> {
+        let lifted: Vec<Option<Pose3>> = poses
+            .iter()
+            .map(|pose| self.lift(pose, remembered))
+            .collect();
+        let standing: Vec<Pose3> = lifted.iter().flatten().copied().collect();
+        let mut costs = self.costs_in_space(&standing)?.into_iter();
+        Ok(lifted
+            .iter()
+            .map(|pose| pose.and_then(|_| costs.next()).unwrap_or(f64::INFINITY))
+            .collect())
+    }
+
+    /// The mean cost from poses in space [m].
+    pub fn costs_in_space(&self, map_from_lidar: &[Pose3]) -> Result<Vec<f64>, RenderError> {
+        let costs = self
+            .renderer
+            .compare(map_from_lidar, self.beams, &self.difference)?;
+        Ok(costs.into_iter().map(f64::from).collect())
+    }
+
+    /// How well the frame alone knows its pose: covariance of (x, y, heading) in the axes of the
+    /// map [m², m·rad, rad²], from the curvature of the objective around a minimum. `scale_m` is
+    /// the cost that makes a pose e times less likely.
+    ///
+    /// A direction in which the objective is flat has a standard deviation of `MAX_SIGMA`.
+    pub fn covariance(
+        &self,
+        pose: &Pose2,
+        remembered: Option<&GroundPatch>,
+        scale_m: f64,
+    ) -> Result<Matrix3<f64>, RenderError> {
+        /// Of a direction of which the frame knows nothing, in steps.
+        const MAX_SIGMA: f64 = 10.0;
+        let offsets = stencil();
+        let poses: Vec<Pose2> = offsets.iter().map(|offset| shifted(pose, offset)).collect();
+        let costs = self.costs(&poses, remembered)?;
+        let curvature = hessian(&costs) / scale_m;
+        let SymmetricEigen {
+            eigenvectors,
+            eigenvalues,
+        } = curvature.symmetric_eigen();
+        let variances = eigenvalues.map(|value| {
+            if value.is_finite() {
+                1.0 / value.max(MAX_SIGMA.powi(-2))
+            } else {
+                MAX_SIGMA.powi(2)
+            }
+        });
+        let step = Matrix3::from_diagonal(&STEP);
+        let covariance =
+            eigenvectors * Matrix3::from_diagonal(&variances) * eigenvectors.transpose();
+        Ok(step * covariance * step)
+    }
+}
+
+/// Steps of the second differences: x, y [m], heading [rad]. About the width of the minimum.
+const STEP: Vector3<f64> = Vector3::new(0.05, 0.05, 0.005);
+
+/// The places of the second differences in steps: the middle, both ways along every axis, and both ways
+/// along the diagonals of every pair of axes.
+fn stencil() -> Vec<Vector3<f64>> {
+    let mut offsets = vec![Vector3::zeros()];
+    for axis in 0..3 {
+        offsets.extend([Vector3::ith(axis, 1.0), Vector3::ith(axis, -1.0)]);
+    }
+    for (a, b) in [(0, 1), (0, 2), (1, 2)] {
+        for (sign_a, sign_b) in [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)] {
+            offsets.push(Vector3::ith(a, sign_a) + Vector3::ith(b, sign_b));
+        }
+    }
+    offsets
+}
+
+/// Second differences of the values on the [`stencil`], per step².
+fn hessian(values: &[f64]) -> Matrix3<f64> {
+    let mut hessian = Matrix3::zeros();
+    for axis in 0..3 {
+        hessian[(axis, axis)] = values[1 + 2 * axis] + values[2 + 2 * axis] - 2.0 * values[0];
+    }
+    for (pair, (a, b)) in [(0, 1), (0, 2), (1, 2)].into_iter().enumerate() {
+        let corner = |number: usize| values[7 + 4 * pair + number];
+        let mixed = 0.25 * (corner(0) - corner(1) - corner(2) + corner(3));
+        hessian[(a, b)] = mixed;
+        hessian[(b, a)] = mixed;
+    }
+    hessian
+}
+
+/// A pose moved by a number of steps.
+fn shifted(pose: &Pose2, steps: &Vector3<f64>) -> Pose2 {
+    let offset = STEP.component_mul(steps);
+    Pose2::new(
+        pose.translation.vector + Vector2::new(offset.x, offset.y),
+        pose.rotation.angle() + offset.z,
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+
+    use super::*;
+    use crate::rendering::test_world::TestWorld;
+
+    #[test]
+    fn second_differences_of_a_quadratic_are_its_matrix() {
+        let matrix = Matrix3::new(4.0, 0.5, -0.2, 0.5, 2.0, 0.1, -0.2, 0.1, 1.0);
+        let values: Vec<f64> = stencil()
+            .iter()
+            .map(|x| 0.5 * x.dot(&(matrix * x)) + 3.0)
+            .collect();
+        assert_relative_eq!(hessian(&values), matrix, epsilon = 1e-12);
+    }
+
+    #[test]
+    fn the_covariance_is_symmetric_and_grows_with_the_scale() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(12.0, 0.1, 0.05);
+        let image = world.scan(&truth);
+        let beams: Vec<Beam> = image.beams().collect();
+        let objective = world.objective(&beams);
+        let one = objective.covariance(&truth, None, 0.002).unwrap();
+        let two = objective.covariance(&truth, None, 0.004).unwrap();
+        assert_relative_eq!(one, one.transpose(), epsilon = 1e-15);
+        assert_relative_eq!(2.0 * one, two, max_relative = 1e-6);
+        assert!(one.cholesky().is_some());
+        assert!(
+            one[(0, 0)].sqrt() < 0.05 && one[(2, 2)].sqrt() < 0.01,
+            "{one}"
+        );
+    }
+
+    #[test]
+    fn where_there_is_no_ground_the_cost_is_infinite_unless_ground_is_remembered() {
+        let world = TestWorld::street();
+        let image = world.scan(&world.pose_at(0.0, 0.0, 0.0));
+        let beams: Vec<Beam> = image.beams().collect();
+        let objective = world.objective(&beams);
+        let off = [Pose2::translation(5e3, 0.0), world.pose_at(0.0, 0.0, 0.0)];
+        let costs = objective.costs(&off, None).unwrap();
+        assert_eq!(costs[0], f64::INFINITY);
+        assert!(costs[1] < 1e-3);
+        let patch = world.ground.patch_under(&off[1]);
+        assert!(objective.costs(&off, patch.as_ref()).unwrap()[0].is_finite());
+    }
+}

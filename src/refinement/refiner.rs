@@ -1,0 +1,310 @@
+//! One frame refined: the swarm searches around the estimate, Gauss-Newton finishes.
+//!
+//! Each is optional, each is taken only where it lowers the objective. Frames before convergence
+//! are not for this: their estimate is no estimate yet.
+
+use nalgebra::{Matrix3, Matrix6};
+use rand::Rng;
+use serde::{Deserialize, Serialize};
+
+use super::gauss_newton::{Finish, GaussNewtonConfig, finish};
+use super::objective::FrameObjective;
+use super::smoothing::SmoothingConfig;
+use super::swarm::{Dimension, SwarmConfig, minimize};
+use crate::geometry::{Pose2, Pose3, planar};
+use crate::rendering::RenderError;
+
+/// Which steps polish a frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Method {
+    /// The estimate stays as it is.
+    None,
+    /// The swarm.
+    Swarm,
+    /// Gauss-Newton.
+    GaussNewton,
+    /// The swarm, then Gauss-Newton.
+    Both,
+}
+
+/// Everything that can be set about refinement.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RefinementConfig {
+    /// Which steps polish a frame.
+    pub method: Method,
+    /// The swarm.
+    pub swarm: SwarmConfig,
+    /// The finishing step.
+    pub gauss_newton: GaussNewtonConfig,
+    /// The smoothing of the whole trajectory.
+    pub smoothing: SmoothingConfig,
+    /// The swarm searches this many standard deviations around the estimate (unitless).
+    pub reach_sigmas: f64,
+    /// And at least this far in x and y [m].
+    pub min_reach_m: f64,
+    /// And at least this far in heading [rad].
+    pub min_reach_rad: f64,
+    /// And at most this far in x and y [m].
+    pub max_reach_m: f64,
+    /// And at most this far in heading [rad].
+    pub max_reach_rad: f64,
+    /// A mean cost that is larger by this makes a pose e times less likely: for covariances [m].
+    pub scale_m: f64,
+}
+
+impl Default for RefinementConfig {
+    /// Both steps; the bounds are ours.
+    fn default() -> Self {
+        Self {
+            method: Method::Both,
+            swarm: SwarmConfig::default(),
+            gauss_newton: GaussNewtonConfig::default(),
+            smoothing: SmoothingConfig::default(),
+            reach_sigmas: 3.0,
+            min_reach_m: 0.1,
+            min_reach_rad: 0.01,
+            max_reach_m: 1.0,
+            max_reach_rad: 0.1,
+            scale_m: 0.001,
+        }
+    }
+}
+
+/// A frame after refinement.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RefinedFrame {
+    /// `map_from_lidar` seen from above.
+    pub pose: Pose2,
+    /// `map_from_lidar` in space.
+    pub lifted: Pose3,
+    /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
+    pub covariance: Matrix3<f64>,
+    /// Objective at the estimate [m].
+    pub cost_before_m: f64,
+    /// Objective at the result, never larger [m].
+    pub cost_after_m: f64,
+    /// Rays that were cast.
+    pub rays: usize,
+}
+
+/// Refines an estimate with its covariance of (x, y, heading). `None` where there is no ground
+/// under the estimate or the scan has no beams: then nothing is known that could be better.
+pub fn refine_frame(
+    objective: &FrameObjective<'_>,
+    estimate: &Pose2,
+    covariance: &Matrix3<f64>,
+    config: &RefinementConfig,
+    rng: &mut impl Rng,
+) -> Result<Option<RefinedFrame>, RenderError> {
+    let Some(lifted) = objective
+        .lift(estimate, None)
+        .filter(|_| !objective.beams.is_empty())
+    else {
+        return Ok(None);
+    };
+    let cost_before_m = objective.costs_in_space(&[lifted])?[0];
+    let mut frame = RefinedFrame {
+        pose: *estimate,
+        lifted,
+        covariance: *covariance,
+        cost_before_m,
+        cost_after_m: cost_before_m,
+        rays: objective.beams.len(),
+    };
+    if matches!(config.method, Method::Swarm | Method::Both) {
+        search(objective, &mut frame, config, rng)?;
+    }
+    let finished = match config.method {
+        Method::GaussNewton | Method::Both => polish(objective, &mut frame, config)?,
+        Method::None | Method::Swarm => None,
+    };
+    if config.method != Method::None {
+        frame.covariance = match finished {
+            Some(finish) => planar_covariance(&finish),
+            None => objective.covariance(&frame.pose, None, config.scale_m)?,
+        };
+    }
+    Ok(Some(frame))
+}
+
+/// Lets the swarm look for a better pose.
+fn search(
+    objective: &FrameObjective<'_>,
+    frame: &mut RefinedFrame,
+    config: &RefinementConfig,
+    rng: &mut impl Rng,
+) -> Result<(), RenderError> {
+    let dimensions = search_space(&frame.pose, &frame.covariance, config);
+    let patch = objective.ground.patch_under(&frame.pose);
+    let batch = |positions: &[Vec<f64>]| {
+        let poses: Vec<Pose2> = positions.iter().map(|p| pose_of(p)).collect();
+        objective.costs(&poses, patch.as_ref())
+    };
+    let minimum = minimize(&dimensions, &config.swarm, batch, rng)?;
+    frame.rays += minimum.evaluations * objective.beams.len();
+    let pose = pose_of(&minimum.position);
+    if let Some(lifted) = objective.lift(&pose, patch.as_ref())
+        && minimum.value < frame.cost_after_m
+    {
+        frame.pose = pose;
+        frame.lifted = lifted;
+        frame.cost_after_m = minimum.value;
+    }
+    Ok(())
+}
+
+/// x, y and heading around the estimate, as wide as it is uncertain.
+fn search_space(
+    pose: &Pose2,
+    covariance: &Matrix3<f64>,
+    config: &RefinementConfig,
+) -> [Dimension; 3] {
+    let reach = |axis: usize, least: f64, most: f64| {
+        let sigma = covariance[(axis, axis)].max(0.0).sqrt();
+        (config.reach_sigmas * sigma).clamp(least, most)
+    };
+    let dimension = |start: f64, reach: f64, is_circular: bool| Dimension {
+        start,
+        spread: 0.5 * reach,
+        reach,
+        is_circular,
+    };
+    let (least, most) = (config.min_reach_m, config.max_reach_m);
+    let turn = reach(2, config.min_reach_rad, config.max_reach_rad);
+    [
+        dimension(pose.translation.x, reach(0, least, most), false),
+        dimension(pose.translation.y, reach(1, least, most), false),
+        dimension(pose.rotation.angle(), turn, true),
+    ]
+}
+
+fn pose_of(position: &[f64]) -> Pose2 {
+    Pose2::new(
+        nalgebra::Vector2::new(position[0], position[1]),
+        position[2],
+    )
+}
+
+/// Lets Gauss-Newton finish; what it did where that lowered the objective.
+fn polish(
+    objective: &FrameObjective<'_>,
+    frame: &mut RefinedFrame,
+    config: &RefinementConfig,
+) -> Result<Option<Finish>, RenderError> {
+    /// Casts per iteration: here and both ways along six axes.
+    const CASTS: usize = 13;
+    frame.rays += CASTS * config.gauss_newton.iterations * objective.beams.len();
+    let Some(finish) = finish(objective, &frame.lifted, &config.gauss_newton)? else {
+        return Ok(None);
+    };
+    let cost_m = objective.costs_in_space(&[finish.map_from_lidar])?[0];
+    if cost_m > frame.cost_after_m {
+        return Ok(None);
+    }
+    frame.lifted = finish.map_from_lidar;
+    frame.pose = planar(&finish.map_from_lidar);
+    frame.cost_after_m = cost_m;
+    Ok(Some(finish))
+}
+
+/// The covariance of a finishing step, seen from above, in the axes of the map.
+fn planar_covariance(finish: &Finish) -> Matrix3<f64> {
+    let rotation = finish.map_from_lidar.rotation.to_rotation_matrix();
+    let mut map_from_lidar = Matrix6::zeros();
+    map_from_lidar
+        .fixed_view_mut::<3, 3>(0, 0)
+        .copy_from(rotation.matrix());
+    map_from_lidar
+        .fixed_view_mut::<3, 3>(3, 3)
+        .copy_from(rotation.matrix());
+    let in_map = map_from_lidar * finish.covariance * map_from_lidar.transpose();
+    Matrix3::from_fn(|row, column| {
+        let axes = [0, 1, 5];
+        in_map[(axes[row], axes[column])]
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Vector2, Vector3};
+    use rand::{SeedableRng, rngs::StdRng};
+
+    use super::*;
+    use crate::lidar::Beam;
+    use crate::rendering::test_world::TestWorld;
+
+    fn refine(method: Method, off: &Pose2, seed: u64) -> (RefinedFrame, Pose2) {
+        let world = TestWorld::street();
+        let truth = world.pose_at(18.0, 0.2, 0.05);
+        let beams: Vec<Beam> = world.scan(&truth).beams().step_by(7).collect();
+        let objective = world.objective(&beams);
+        let covariance = Matrix3::from_diagonal(&Vector3::new(0.0025, 0.0025, 1e-4));
+        let config = RefinementConfig {
+            method,
+            ..RefinementConfig::default()
+        };
+        let mut rng = StdRng::seed_from_u64(seed);
+        let frame = refine_frame(&objective, &(truth * off), &covariance, &config, &mut rng);
+        (frame.unwrap().unwrap(), truth)
+    }
+
+    fn error(frame: &RefinedFrame, truth: &Pose2) -> f64 {
+        (frame.pose.translation.vector - truth.translation.vector).norm()
+    }
+
+    #[test]
+    fn every_method_comes_nearer_and_none_stays() {
+        let off = Pose2::new(Vector2::new(0.08, -0.06), 0.006);
+        for (method, tolerance_m) in [
+            (Method::Swarm, 0.02),
+            (Method::GaussNewton, 0.005),
+            (Method::Both, 0.005),
+        ] {
+            for seed in 0..3 {
+                let (frame, truth) = refine(method, &off, seed);
+                assert!(
+                    error(&frame, &truth) < tolerance_m,
+                    "{method:?}: {}",
+                    error(&frame, &truth)
+                );
+                assert!(frame.cost_after_m < frame.cost_before_m);
+                assert!(frame.covariance.cholesky().is_some());
+            }
+        }
+        let (frame, truth) = refine(Method::None, &off, 0);
+        assert!((error(&frame, &truth) - 0.1).abs() < 1e-9);
+        assert_eq!(frame.cost_after_m, frame.cost_before_m);
+    }
+
+    #[test]
+    fn an_estimate_that_is_right_gets_no_worse() {
+        for seed in 0..3 {
+            let (frame, truth) = refine(Method::Both, &Pose2::identity(), seed);
+            assert!(frame.cost_after_m <= frame.cost_before_m);
+            assert!(error(&frame, &truth) < 0.005);
+        }
+    }
+
+    #[test]
+    fn without_beams_or_ground_there_is_nothing_to_refine() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(0.0, 0.0, 0.0);
+        let beams: Vec<Beam> = world.scan(&truth).beams().collect();
+        let config = RefinementConfig::default();
+        let mut rng = StdRng::seed_from_u64(1);
+        let covariance = Matrix3::identity();
+        let empty = world.objective(&[]);
+        assert_eq!(
+            refine_frame(&empty, &truth, &covariance, &config, &mut rng).unwrap(),
+            None
+        );
+        let off = Pose2::translation(1e5, 0.0);
+        let objective = world.objective(&beams);
+        assert_eq!(
+            refine_frame(&objective, &off, &covariance, &config, &mut rng).unwrap(),
+            None
+        );
+    }
+}
