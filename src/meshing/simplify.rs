@@ -121,7 +121,7 @@ struct Collapse {
     around: Vec<Vec<u32>>,
     locked: Vec<bool>,
     quadrics: Vec<Quadric>,
-    /// Where the vertices of the ground lie over their own, to bound the drift.
+    /// Counts the changes around each vertex: older candidates are void.
     stamps: Vec<u32>,
     resolution_m: f32,
     /// Where quadrics are accumulated around; keeps them exact far from the map's origin.
