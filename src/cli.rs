@@ -60,7 +60,7 @@ Examples:
 Examples:
   fpmcl evaluate config/evaluation.yml
   fpmcl evaluate --set result_file=results/localization.npz")]
-    Evaluate(ConfigArgs),
+    Evaluate(RunArgs),
 
     /// Make a street with a known answer and drive through it.
     #[command(after_help = "\
@@ -102,11 +102,11 @@ pub struct RunArgs {
     #[command(flatten)]
     pub source: ConfigArgs,
 
-    /// Same seed, same result; overrides the key `seed`.
+    /// Same seed, same result; overrides the key `seed` where there is one.
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
 
-    /// Replace existing output; sets the key `force`.
+    /// Replace existing output; sets the key `force` where there is one.
     #[arg(long)]
     pub force: bool,
 }
@@ -197,8 +197,8 @@ impl Command {
             Self::BuildMap(args)
             | Self::Localize(args)
             | Self::Refine(args)
+            | Self::Evaluate(args)
             | Self::Simulate(args) => args.source.machine,
-            Self::Evaluate(args) => args.machine,
             Self::Demo(args) => args.machine,
             Self::Doctor => MachineArgs::default(),
         }
@@ -206,17 +206,11 @@ impl Command {
 }
 
 impl RunArgs {
-    /// All overrides of keys, those with a flag of their own last.
-    pub fn settings(&self) -> Vec<(String, String)> {
+    /// The keys that have a flag of their own, as far as it is given.
+    pub fn flags(&self) -> Vec<(String, String)> {
         let seed = self.seed.map(|seed| ("seed".to_owned(), seed.to_string()));
         let force = self.force.then(|| ("force".to_owned(), "true".to_owned()));
-        self.source
-            .settings
-            .iter()
-            .cloned()
-            .chain(seed)
-            .chain(force)
-            .collect()
+        seed.into_iter().chain(force).collect()
     }
 }
 
@@ -236,28 +230,22 @@ mod tests {
 
     use super::*;
 
-    fn run_args(arguments: &[&str]) -> RunArgs {
-        let all = ["fpmcl", "localize"].iter().chain(arguments);
-        match Cli::try_parse_from(all).unwrap().command {
-            Command::Localize(args) => args,
-            other => unreachable!("{other:?}"),
-        }
-    }
-
     #[test]
     fn the_definition_is_consistent() {
         Cli::command().debug_assert();
     }
 
     #[test]
-    fn flags_override_the_same_keys_given_with_set() {
-        let args = run_args(&["own.yml", "--seed", "7", "--set", "seed=3", "--force"]);
-        let settings = args.settings();
-        let pairs: Vec<(&str, &str)> = settings
-            .iter()
-            .map(|(key, value)| (key.as_str(), value.as_str()))
-            .collect();
-        assert_eq!(pairs, [("seed", "3"), ("seed", "7"), ("force", "true")]);
+    fn flags_are_settings_of_their_keys() {
+        let arguments = ["fpmcl", "localize", "--seed", "7", "--force"];
+        let Command::Localize(args) = Cli::parse_from(arguments).command else {
+            unreachable!("it says localize")
+        };
+        let expected = [("seed", "7"), ("force", "true")];
+        assert_eq!(
+            args.flags(),
+            expected.map(|(key, value)| (key.to_owned(), value.to_owned()))
+        );
     }
 
     #[test]

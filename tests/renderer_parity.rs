@@ -7,8 +7,9 @@
 mod brute_force;
 
 use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
-use fpmcl::lidar::{Beam, LidarModel};
+use fpmcl::lidar::{Beam, LidarModel, RangeImage};
 use fpmcl::rendering::backend::AdapterChoice;
+use fpmcl::rendering::cpu::CpuRenderer;
 use fpmcl::rendering::gpu::{GpuRenderer, ImageMethod};
 use fpmcl::rendering::{RangeDifference, RangeRenderer, RenderError};
 
@@ -71,8 +72,7 @@ fn assert_same(truth: &BruteForce, pose: &Pose3, directions: &[Vec3], ranges: &[
             continue;
         }
         differ += 1;
-        let turned = [Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z]
-            .map(|aside| truth.range(pose, (direction + 2e-5 * aside).normalize()));
+        let turned = sideways(truth, pose, direction);
         assert!(
             turned.iter().any(|&near| same(near, range_m)),
             "{what}: {range_m} m instead of {expected} m along {direction}, no edge"
@@ -83,6 +83,12 @@ fn assert_same(truth: &BruteForce, pose: &Pose3, directions: &[Vec3], ranges: &[
         "{what}: {differ} of {}",
         ranges.len()
     );
+}
+
+/// Ranges along six directions a hair (0.02 mrad) beside one.
+fn sideways(truth: &BruteForce, pose: &Pose3, direction: Vec3) -> [f64; 6] {
+    [Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z]
+        .map(|aside| truth.range(pose, (direction + 2e-5 * aside).normalize()))
 }
 
 fn same(expected: f64, range_m: f32) -> bool {
@@ -268,6 +274,91 @@ fn costs_and_the_weights_that_follow_agree() {
             );
         }
         assert!(costs[0] < 1e-3 && costs[3] > 0.03, "{costs:?}");
+    }
+}
+
+#[test]
+fn the_processor_and_the_device_show_the_same_street() {
+    let tiles = street();
+    let Some(renderer) = renderer(&tiles) else {
+        return;
+    };
+    let cpu = CpuRenderer::new(&tiles);
+    let model = LidarModel::default();
+    let poses = street_poses();
+    let expected = cpu.render(&poses, &model).unwrap();
+    let truth = BruteForce::new(&tiles).between(model.min_range, model.max_range);
+    let directions = model.directions();
+    for method in METHODS {
+        let images = renderer.render_by(method, &poses, &model).unwrap();
+        for ((pose, image), expected) in poses.iter().zip(&images).zip(&expected) {
+            let differ: Vec<usize> = (0..image.len())
+                .filter(|&pixel| !same(f64::from(expected[pixel]), image[pixel]))
+                .collect();
+            assert!(
+                differ.len() * 1000 <= image.len(),
+                "{method:?}: {}",
+                differ.len()
+            );
+            for pixel in differ {
+                let near = sideways(&truth, pose, directions[pixel]);
+                assert!(near.iter().any(|&range_m| same(range_m, image[pixel])));
+                assert!(near.iter().any(|&range_m| same(range_m, expected[pixel])));
+            }
+        }
+    }
+}
+
+#[test]
+fn the_processor_and_the_device_give_particles_the_same_weights() {
+    let tiles = street();
+    let Some(renderer) = renderer(&tiles) else {
+        return;
+    };
+    let cpu = CpuRenderer::new(&tiles);
+    let at = pose(3.1, -1.2, 1.76, [0.02, -0.03, 1.1]);
+    let model = small_model();
+    let image = cpu.render(&[at], &model).unwrap().remove(0);
+    let beams: Vec<Beam> = RangeImage::from_ranges(image, &model)
+        .beams()
+        .step_by(3)
+        .collect();
+    let particles: Vec<Pose3> = (0..60)
+        .map(|i| {
+            let i = f64::from(i);
+            let aside = pose(
+                i.sin(),
+                (1.7 * i).cos(),
+                0.0,
+                [0.0, 0.0, 0.02 * (0.9 * i).sin()],
+            );
+            at * aside
+        })
+        .collect();
+    for (difference, sigma) in [
+        (RangeDifference::UNLIMITED, 2.0),
+        (RangeDifference::truncated(0.5), 0.05),
+    ] {
+        let weights = |costs: Vec<f32>| -> Vec<f64> {
+            let likelihood = |cost: &f32| (-0.5 * (f64::from(*cost) / sigma).powi(2)).exp();
+            let likelihoods: Vec<f64> = costs.iter().map(likelihood).collect();
+            let sum: f64 = likelihoods.iter().sum();
+            likelihoods
+                .iter()
+                .map(|likelihood| likelihood / sum)
+                .collect()
+        };
+        let ours = weights(renderer.compare(&particles, &beams, &difference).unwrap());
+        let theirs = weights(cpu.compare(&particles, &beams, &difference).unwrap());
+        for (ours, theirs) in ours.iter().zip(&theirs) {
+            assert!(
+                (ours - theirs).abs() < 1e-4,
+                "{difference:?}: {ours} {theirs}"
+            );
+        }
+        let least = theirs.iter().copied().fold(f64::INFINITY, f64::min);
+        let most = theirs.iter().copied().fold(0.0, f64::max);
+        assert!(most > 1.2 * least, "all particles weigh the same");
     }
 }
 

@@ -48,3 +48,26 @@ impl Interrupt {
 fn kill() {
     std::process::exit(130)
 }
+
+#[cfg(all(test, unix))]
+mod tests {
+    use std::process::Command;
+    use std::time::{Duration, Instant};
+
+    use super::*;
+
+    #[test]
+    fn ctrl_c_is_seen_by_every_copy() {
+        let interrupt = Interrupt::install().unwrap();
+        let copy = interrupt.clone();
+        assert!(!copy.requested());
+        let pid = std::process::id().to_string();
+        let sent = Command::new("kill").args(["-INT", &pid]).status().unwrap();
+        assert!(sent.success());
+        let start = Instant::now();
+        while !copy.requested() && start.elapsed() < Duration::from_secs(20) {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        assert!(copy.requested() && interrupt.requested());
+    }
+}

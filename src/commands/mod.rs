@@ -1,28 +1,37 @@
 //! One file per subcommand; each `run` reads as a paragraph.
 
-// The subcommands.
+// The subcommands, in the order of their use.
+pub mod build_map;
+mod demo;
 mod doctor;
+pub mod evaluate;
+pub mod localize;
+pub mod refine;
 pub mod simulate;
 // What they share.
 pub mod interrupt;
 mod logging;
+mod odometry;
 pub mod output;
 pub mod progress;
+mod run_output;
+mod stages;
 
 use std::io::Write as _;
 use std::path::Path;
 use std::process::ExitCode;
 
-use anyhow::{Context as _, bail};
+use anyhow::Context as _;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::cli::{Command, ConfigArgs, MachineArgs, RunArgs, Verbosity};
+use crate::cli::{Command, MachineArgs, RunArgs, Verbosity};
 use crate::config::{
     self, BuildMapConfig, Check, ConfigError, EvaluationConfig, LocalizationConfig,
     RefinementConfig,
 };
 use crate::rendering::backend::Backend;
+use crate::simulation::SimulationConfig;
 use interrupt::{Interrupt, Interrupted};
 use progress::Progress;
 
@@ -65,23 +74,26 @@ impl Context {
 pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
     match command {
         Command::BuildMap(args) => {
-            let _: BuildMapConfig = load_run(args, "config/build_map.yml")?;
-            bail!("this version cannot build maps yet")
+            let config: BuildMapConfig = load(args, "config/build_map.yml")?;
+            output::print(&build_map::run(&config, context)?.table())
         }
         Command::Localize(args) => {
-            let _: LocalizationConfig = load_run(args, "config/localization.yml")?;
-            bail!("this version cannot localize yet")
+            let config: LocalizationConfig = load(args, "config/localization.yml")?;
+            output::print(&localize::run(&config, context)?.to_text())
         }
         Command::Refine(args) => {
-            let _: RefinementConfig = load_run(args, "config/refinement.yml")?;
-            bail!("this version cannot refine yet")
+            let config: RefinementConfig = load(args, "config/refinement.yml")?;
+            output::print(&refine::run(&config, context)?.to_text())
         }
         Command::Evaluate(args) => {
-            let _: EvaluationConfig = load(args, "config/evaluation.yml", &args.settings)?;
-            bail!("this version cannot evaluate yet")
+            let config: EvaluationConfig = load(args, "config/evaluation.yml")?;
+            output::print(&evaluate::run(&config)?.to_text())
         }
-        Command::Simulate(_) => bail!("this version cannot simulate yet"),
-        Command::Demo(_) => bail!("this version has no demonstration yet"),
+        Command::Simulate(args) => {
+            let config: SimulationConfig = load(args, "config/simulation.yml")?;
+            output::print(&simulate::run_with_progress(&config, args.force, context)?)
+        }
+        Command::Demo(args) => output::print(&demo::run(args, context)?),
         Command::Doctor => doctor::run(context),
     }
 }
@@ -97,23 +109,20 @@ pub fn exit_code(error: &anyhow::Error) -> ExitCode {
     ExitCode::from(if error.is::<Interrupted>() { 130 } else { 1 })
 }
 
-/// Loads the configuration of a stage, with `--seed` and `--force`.
-fn load_run<T>(args: &RunArgs, default_path: &str) -> Result<T, ConfigError>
+/// Loads the configuration of a command; `--seed` and `--force` count as the last settings of
+/// a configuration that has these keys.
+fn load<T>(args: &RunArgs, default_path: &str) -> Result<T, ConfigError>
 where
-    T: Check + Serialize + DeserializeOwned,
+    T: Check + Default + Serialize + DeserializeOwned,
 {
-    load(&args.source, default_path, &args.settings())
-}
-
-fn load<T>(
-    args: &ConfigArgs,
-    default_path: &str,
-    settings: &[(String, String)],
-) -> Result<T, ConfigError>
-where
-    T: Check + Serialize + DeserializeOwned,
-{
-    config::load(args.config.as_deref(), Path::new(default_path), settings)
+    let mut settings = args.source.settings.clone();
+    for (key, value) in args.flags() {
+        if config::has_key::<T>(&key)? {
+            settings.push((key, value));
+        }
+    }
+    let path = args.source.config.as_deref();
+    config::load(path, Path::new(default_path), &settings)
 }
 
 /// The chain of an error without what was said already.
@@ -137,8 +146,36 @@ fn told(error: &anyhow::Error) -> String {
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser as _;
+
     use super::*;
+    use crate::cli::Cli;
     use crate::kitti::KittiError;
+
+    fn loaded<T>(arguments: &[&str]) -> T
+    where
+        T: Check + Default + Serialize + DeserializeOwned,
+    {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("own.yml");
+        std::fs::write(&path, "").unwrap();
+        let start = ["fpmcl", "localize", path.to_str().unwrap()];
+        let Command::Localize(args) = Cli::parse_from(start.iter().chain(arguments)).command else {
+            unreachable!("it says localize")
+        };
+        load(&args, "").unwrap()
+    }
+
+    #[test]
+    fn flags_come_after_settings_and_pass_by_a_configuration_without_their_keys() {
+        let arguments = ["--seed", "7", "--set", "n_scans=5", "--force"];
+        let config: LocalizationConfig = loaded(&arguments);
+        assert_eq!((config.seed, config.n_scans, config.force), (7, 5, true));
+        let config: LocalizationConfig = loaded(&["--seed", "7", "--set", "seed=3"]);
+        assert_eq!(config.seed, 7);
+        let config: EvaluationConfig = loaded(&arguments);
+        assert_eq!(config.n_scans, 5);
+    }
 
     #[test]
     fn a_cause_is_told_once() {

@@ -5,6 +5,7 @@ use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use anyhow::{Context as _, bail};
+use serde::Serialize;
 
 use crate::config::new_file_beside;
 
@@ -53,6 +54,14 @@ where
         .map_err(|failed| failed.error)
         .with_context(writing)?;
     Ok(())
+}
+
+/// Writes a report as JSON, whole or not at all.
+pub fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
+    write_whole(path, |file| -> anyhow::Result<()> {
+        serde_json::to_writer_pretty(&mut *file, report)?;
+        Ok(writeln!(file)?)
+    })
 }
 
 /// Prints to standard output; a reader that has gone away is no error.

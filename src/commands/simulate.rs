@@ -15,10 +15,13 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, OnceLock};
 
 use anyhow::{Context as _, Result, bail};
 use rayon::prelude::*;
 
+use super::Context;
+use super::progress::Task;
 use crate::geometry::Pose3;
 use crate::kitti::poses::{CameraPoses, write_kitti, write_times};
 use crate::kitti::velodyne::{write_labels, write_scan};
@@ -79,6 +82,32 @@ pub fn run(
     let kept = write_scans(&simulation, &folder, progress)?;
     write_poses(&simulation, &folder, &poses)?;
     Ok(report(kept))
+}
+
+/// As [`run`], shown to the user; returns the table for standard output.
+pub fn run_with_progress(
+    config: &SimulationConfig,
+    force: bool,
+    context: &Context,
+) -> Result<String> {
+    let task: OnceLock<Arc<Task>> = OnceLock::new();
+    let progress = |_done: usize, all: usize| {
+        task.get_or_init(|| context.progress.task("simulate", all))
+            .advance(1);
+    };
+    let report = run(config, force, &progress)?;
+    drop(task);
+    let rows = [
+        ("folder", report.folder.display().to_string()),
+        ("scans", report.frames.to_string()),
+        ("of them kept", report.kept.to_string()),
+        ("path", format!("{:.1} m", report.driven_m)),
+        ("triangles of the street", report.triangles.to_string()),
+    ];
+    Ok(rows
+        .iter()
+        .map(|(name, value)| format!("{name:<24} {value:>14}\n"))
+        .collect())
 }
 
 /// The street and the drive of a configuration, without writing anything.

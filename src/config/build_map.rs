@@ -2,13 +2,20 @@
 
 use std::path::PathBuf;
 
+use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::check::{
     Check, Problem, at_least_one, nested, not_negative, path, positive, require, selection, within,
 };
+use crate::ground::{FuzzyConfig, GroundMethod, PcaGround, RansacGround};
 use crate::kitti::Selection;
 use crate::lidar::LidarModel;
+use crate::lidar::normals::NormalConfig;
+use crate::map::LocalMapSettings;
+use crate::map::scan_cloud::ScanSettings;
+use crate::map::visibility::VisibilityConfig;
+use crate::meshing::PoissonConfig;
 
 /// The keys of range-mcl's `build_map.yml`, and below them new ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -65,28 +72,37 @@ pub struct BuildMapConfig {
     pub displacement_threshold_m: f64,
     /// How ground is told from the rest.
     pub ground_method: GroundMethod,
+    /// Neighbouring local maps are meshed with this much of each other's path [m].
+    pub overlap_m: f64,
+    /// Every n-th counted scan is held back, and the map is judged along its beams; 0 for none.
+    pub holdout_step: usize,
+    /// Surface farther than this from every point was invented by the reconstruction and is
+    /// removed [m].
+    pub max_distance_m: f64,
+    /// A vertex is ground from this confidence on, unitless.
+    pub ground_threshold: f32,
+    /// The own car in the lidar frame: x_min, x_max, y_min, y_max [m].
+    pub own_car_m: [f32; 4],
+    /// Surface reconstruction, beside `depth`.
+    pub poisson: PoissonConfig,
+    /// How normals are found in range images.
+    pub normals: NormalConfig,
+    /// Free-space votes: what beams pass through is not there.
+    pub visibility: VisibilityConfig,
+    /// Sets and rules of `ground_method: fuzzy`.
+    pub fuzzy: FuzzyConfig,
+    /// `ground_method: pca`.
+    pub pca: PcaGround,
     /// What random choices follow from.
     pub seed: u64,
     /// Whether an existing map is replaced.
     pub force: bool,
 }
 
-/// How ground is told from the rest.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum GroundMethod {
-    /// Fuzzy inference on slope, height variance and curvature.
-    #[default]
-    Fuzzy,
-    /// Normal against the vertical, and height.
-    Pca,
-    /// The plane of range-mcl.
-    Ransac,
-}
-
 impl Default for BuildMapConfig {
     /// The values of range-mcl.
     fn default() -> Self {
+        let settings = LocalMapSettings::default();
         Self {
             scan_folder: "data/kitti/velodyne".into(),
             pose_file: "data/kitti/poses.txt".into(),
@@ -113,6 +129,16 @@ impl Default for BuildMapConfig {
             frame_step: 1,
             displacement_threshold_m: 0.2,
             ground_method: GroundMethod::default(),
+            overlap_m: 5.0,
+            holdout_step: 0,
+            max_distance_m: f64::from(settings.max_distance_m),
+            ground_threshold: settings.ground_threshold,
+            own_car_m: settings.scan.own_car_m,
+            poisson: settings.poisson,
+            normals: settings.scan.normals,
+            visibility: settings.visibility,
+            fuzzy: FuzzyConfig::default(),
+            pca: PcaGround::default(),
             seed: 0,
             force: false,
         }
@@ -128,6 +154,45 @@ impl BuildMapConfig {
             frame_step: self.frame_step,
         }
     }
+
+    /// How scans become local maps.
+    pub fn local_map_settings(&self) -> LocalMapSettings {
+        LocalMapSettings {
+            scan: ScanSettings {
+                range_image: self.range_image,
+                normals: self.normals.clone(),
+                voxel_size_m: self.voxel_size as f32,
+                crop_m: Vec3::new(self.crop_x as f32, self.crop_y as f32, self.crop_z as f32),
+                own_car_m: self.own_car_m,
+            },
+            poisson: PoissonConfig {
+                depth: self.depth,
+                ..self.poisson.clone()
+            },
+            min_density: self.min_density,
+            max_distance_m: self.max_distance_m as f32,
+            visibility: self.visibility.clone(),
+            ground_threshold: self.ground_threshold,
+            simplify_resolution_m: self.simplify_resolution as f32,
+            smoothing_iterations: self.number_of_iterations,
+            ground_color: bytes(self.ground_color),
+            rest_color: bytes(self.rest_color),
+        }
+    }
+
+    /// The plane of `ground_method: ransac`.
+    pub fn ransac(&self) -> RansacGround {
+        RansacGround {
+            distance_threshold: self.distance_threshold as f32,
+            ransac_n: self.ransac_n,
+            num_iterations: self.num_iterations,
+            seed: self.seed,
+        }
+    }
+}
+
+fn bytes(rgb: [f64; 3]) -> [u8; 3] {
+    rgb.map(|share| (255.0 * share).round() as u8)
 }
 
 impl Check for BuildMapConfig {
@@ -161,6 +226,15 @@ impl Check for BuildMapConfig {
         color("ground_color", self.ground_color)?;
         color("rest_color", self.rest_color)?;
         not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
+        not_negative("overlap_m", self.overlap_m)?;
+        positive("max_distance_m", self.max_distance_m)?;
+        within("ground_threshold", self.ground_threshold, 0.0..=1.0)?;
+        require(
+            self.holdout_step != 1,
+            "holdout_step",
+            self.holdout_step,
+            "1 holds every scan back; 0 holds none, 10 every tenth",
+        )?;
         nested("range_image", self.range_image.check())
     }
 }

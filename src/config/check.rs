@@ -7,6 +7,7 @@ use std::fmt::Display;
 use std::ops::RangeInclusive;
 
 use crate::lidar::LidarModel;
+use crate::simulation::{SimulationConfig, SimulationError};
 
 /// A configuration that knows which of its values cannot be used.
 pub trait Check {
@@ -123,5 +124,22 @@ impl Check for LidarModel {
                 self.max_range
             ),
         )
+    }
+}
+
+impl Check for SimulationConfig {
+    fn check(&self) -> Result<(), Problem> {
+        Self::check(self).map_err(|error| match error {
+            SimulationError::BadValue { key, value, wanted } => Problem {
+                key: key.to_owned(),
+                value: value.to_string(),
+                remedy: format!("it must be {wanted}"),
+            },
+            SimulationError::PathTooShort { length_m, least_m } => Problem {
+                key: "path".to_owned(),
+                value: format!("{length_m:.1} m long"),
+                remedy: format!("at least {least_m} m are needed; add segments"),
+            },
+        })
     }
 }

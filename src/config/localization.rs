@@ -9,6 +9,16 @@ use super::check::{
 };
 use crate::kitti::Selection;
 use crate::lidar::LidarModel;
+use crate::localization::LocalizerConfig;
+use crate::localization::convergence::ConvergenceConfig;
+use crate::localization::initialization::StartSpread;
+use crate::localization::localizer::TemperingConfig;
+use crate::localization::motion::{OdometryNoise, VelocityNoise};
+use crate::localization::observation::ObservationConfig;
+use crate::localization::panorama::PanoramaConfig;
+use crate::localization::resampling::{KldConfig, ResamplingConfig};
+use crate::localization::vigilance::VigilanceConfig;
+use crate::map::scan_cloud::ScanSettings;
 
 /// The keys of range-mcl's `localization.yml`, and below them new ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -66,6 +76,26 @@ pub struct LocalizationConfig {
     pub odometry_file: Option<PathBuf>,
     /// How particles follow the odometry.
     pub motion_model: MotionModel,
+    /// The own car in the lidar frame: x_min, x_max, y_min, y_max [m].
+    pub own_car_m: [f32; 4],
+    /// How particles are spread around a known start.
+    pub start: StartSpread,
+    /// Noise of turn, drive, turn, per increment.
+    pub odometry_noise: OdometryNoise,
+    /// Noise of velocity commands.
+    pub velocity_noise: VelocityNoise,
+    /// Which beams are compared, and what a difference means.
+    pub observation: ObservationConfig,
+    /// How the likelihood is sharpened within a frame.
+    pub tempering: TemperingConfig,
+    /// When few particles carry the weight.
+    pub resampling: ResamplingConfig,
+    /// How many particles a wide belief needs.
+    pub kld: KldConfig,
+    /// When the map disagrees.
+    pub vigilance: VigilanceConfig,
+    /// The search for a start.
+    pub panorama: PanoramaConfig,
     /// What random choices follow from.
     pub seed: u64,
     /// Whether an existing result is replaced.
@@ -159,6 +189,16 @@ impl Default for LocalizationConfig {
             odometry: OdometrySource::default(),
             odometry_file: None,
             motion_model: MotionModel::default(),
+            own_car_m: ScanSettings::default().own_car_m,
+            start: StartSpread::default(),
+            odometry_noise: OdometryNoise::default(),
+            velocity_noise: VelocityNoise::default(),
+            observation: ObservationConfig::default(),
+            tempering: TemperingConfig::default(),
+            resampling: ResamplingConfig::default(),
+            kld: KldConfig::default(),
+            vigilance: VigilanceConfig::default(),
+            panorama: PanoramaConfig::default(),
             seed: 0,
             force: false,
         }
@@ -196,6 +236,36 @@ impl LocalizationConfig {
             start_idx: self.start_idx,
             n_scans: self.n_scans,
             frame_step: self.frame_step,
+        }
+    }
+
+    /// The filter.
+    pub fn localizer(&self) -> LocalizerConfig {
+        LocalizerConfig {
+            num_particles: self.num_particles,
+            num_reduced: self.num_reduced,
+            move_thres_m: self.move_thres,
+            motion: self.odometry_noise.clone(),
+            velocity: self.velocity_noise.clone(),
+            observation: self.observation.clone(),
+            tempering: self.tempering.clone(),
+            resampling: self.resampling.clone(),
+            kld: self.kld.clone(),
+            convergence: ConvergenceConfig {
+                converge_thres: self.converge_thres,
+                ..ConvergenceConfig::default()
+            },
+            vigilance: self.vigilance.clone(),
+            ..LocalizerConfig::default()
+        }
+    }
+
+    /// The search for a start, on cells of `grid_res`, with headings spread by `yaw_sigma`.
+    pub fn panorama_config(&self) -> PanoramaConfig {
+        PanoramaConfig {
+            cell_m: self.grid_res,
+            yaw_sigma_rad: self.yaw_sigma.to_radians(),
+            ..self.panorama.clone()
         }
     }
 

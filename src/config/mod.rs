@@ -24,7 +24,7 @@ use std::path::Path;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-pub use build_map::{BuildMapConfig, GroundMethod};
+pub use build_map::BuildMapConfig;
 pub use check::{Check, Problem};
 pub use error::{ConfigError, Place};
 pub use evaluation::EvaluationConfig;
@@ -60,6 +60,12 @@ where
         .check()
         .map_err(|problem| error::unusable(path, &text, overrides, problem))?;
     Ok(config)
+}
+
+/// Whether a configuration has a key at its top level.
+pub fn has_key<T: Default + Serialize>(key: &str) -> Result<bool, ConfigError> {
+    let text = to_yaml(&T::default())?;
+    Ok(Outline::of(&text).line_of(key).is_some())
 }
 
 /// Writes the effective configuration; loading it gives an equal one.

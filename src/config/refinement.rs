@@ -8,6 +8,8 @@ use super::check::{Check, Problem, nested, path, require, selection};
 use super::localization::OdometrySource;
 use crate::kitti::Selection;
 use crate::lidar::LidarModel;
+use crate::localization::observation::ObservationConfig;
+use crate::refinement;
 
 /// What `refine` reads, and how it refines.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -41,6 +43,12 @@ pub struct RefinementConfig {
     pub odometry_file: Option<PathBuf>,
     /// Size and limits of the range images.
     pub range_image: LidarModel,
+    /// The own car in the lidar frame: x_min, x_max, y_min, y_max [m].
+    pub own_car_m: [f32; 4],
+    /// Which beams are compared, and what a difference means.
+    pub observation: ObservationConfig,
+    /// Swarm, finishing step and smoothing.
+    pub refinement: refinement::RefinementConfig,
     /// What random choices follow from.
     pub seed: u64,
     /// Whether existing refined poses are replaced.
@@ -66,6 +74,9 @@ impl Default for RefinementConfig {
             odometry: OdometrySource::default(),
             odometry_file: None,
             range_image: LidarModel::default(),
+            own_car_m: localization.own_car_m,
+            observation: localization.observation,
+            refinement: refinement::RefinementConfig::default(),
             seed: 0,
             force: false,
         }

@@ -60,6 +60,14 @@ impl ParticleLog {
         &self.rows[begin..self.ends[row]]
     }
 
+    /// Multiplies the positions of all particles.
+    pub fn scale_positions(&mut self, factor: f32) {
+        for row in &mut self.rows {
+            row[0] *= factor;
+            row[1] *= factor;
+        }
+    }
+
     /// Number of frames.
     pub fn len(&self) -> usize {
         self.ends.len()
@@ -112,6 +120,34 @@ impl LocalizationResults {
     /// Whether there are no frames.
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()
+    }
+
+    /// The results of some of the frames, by their rows.
+    #[must_use]
+    pub fn rows(&self, rows: &[usize]) -> Self {
+        fn pick<T: Clone>(column: &Option<Vec<T>>, rows: &[usize]) -> Option<Vec<T>> {
+            let column = column.as_ref()?;
+            Some(rows.iter().map(|&row| column[row].clone()).collect())
+        }
+        let mut particles = ParticleLog::new(self.particles.capacity());
+        if !self.particles.is_empty() {
+            for &row in rows {
+                particles.push_frame(self.particles.frame(row).iter().copied());
+            }
+        }
+        Self {
+            frames: rows.iter().map(|&row| self.frames[row]).collect(),
+            particles,
+            estimates: pick(&self.estimates, rows),
+            refined: pick(&self.refined, rows),
+            ground_truth: pick(&self.ground_truth, rows),
+            odometry: pick(&self.odometry, rows),
+            covariances: pick(&self.covariances, rows),
+            times_s: pick(&self.times_s, rows),
+            runtimes_s: pick(&self.runtimes_s, rows),
+            refine_runtimes_s: pick(&self.refine_runtimes_s, rows),
+            states: pick(&self.states, rows),
+        }
     }
 
     /// Names and lengths of the arrays that are there, to check that all have one row per frame.

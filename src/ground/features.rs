@@ -16,7 +16,7 @@ use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::polar::{DirectionImage, PolarGrid, SECTORS, coarse_atan2};
+use super::polar::{DirectionImage, PolarGrid, coarse_atan2};
 use super::terrain::{Placed, Terrain, TerrainConfig};
 
 /// How features are computed.
@@ -34,7 +34,7 @@ pub struct FeatureConfig {
 impl Default for FeatureConfig {
     fn default() -> Self {
         Self {
-            spacing_m: 0.2,
+            spacing_m: 0.15,
             min_distance_m: 2.0,
             terrain: TerrainConfig::default(),
         }
@@ -72,27 +72,47 @@ impl Features {
     }
 }
 
-/// Features of all points of a scan in the lidar frame; `None` for points that are not finite,
-/// on the own car or too far away.
-pub fn features(points: &[Vec3], config: &FeatureConfig) -> Vec<Option<Features>> {
-    let index = ScanIndex::new(points, config);
-    let shapes: Vec<Shape> = index.shapes(points, config);
-    let terrain = Terrain::estimate(&index.grid, &index.places, &shapes, &config.terrain);
-    index
-        .places
-        .par_iter()
-        .zip(&shapes)
-        .with_min_len(1024)
-        .map(|(place, shape)| {
-            place.is_somewhere().then(|| Features {
-                slope_deg: shape.slope_rad.to_degrees(),
-                curvature_deg: shape.curvature_rad.to_degrees(),
-                height_variance_m: rise_over_lows(&terrain, place),
-                height_m: place.z - terrain.height_at(place.ring, place.sector),
-            })
-        })
-        .collect()
+/// A scan from which the features of its points are read.
+pub(super) struct Scene {
+    places: Vec<Placed>,
+    shapes: Vec<Shape>,
+    terrain: Terrain,
 }
+
+impl Scene {
+    /// Of all points of a scan in the lidar frame.
+    pub(super) fn new(points: &[Vec3], config: &FeatureConfig) -> Self {
+        let index = ScanIndex::new(points, config);
+        let shapes = index.shapes(points, config);
+        let terrain = Terrain::estimate(&index.grid, &index.places, &shapes, &config.terrain);
+        Self {
+            places: index.places,
+            shapes,
+            terrain,
+        }
+    }
+
+    /// Calls `judge` with the features of every point, in parallel; `None` for points that are
+    /// not finite, on the own car or too far away.
+    pub(super) fn map<T: Send>(&self, judge: impl Fn(Option<Features>) -> T + Sync) -> Vec<T> {
+        self.places
+            .par_iter()
+            .zip(&self.shapes)
+            .with_min_len(MIN_SHARE)
+            .map(|(place, shape)| {
+                judge(place.is_somewhere().then(|| Features {
+                    slope_deg: shape.slope_rad.to_degrees(),
+                    curvature_deg: shape.curvature_rad.to_degrees(),
+                    height_variance_m: self.terrain.rise_over_lows(place),
+                    height_m: place.z - self.terrain.height_at(place.ring, place.sector),
+                }))
+            })
+            .collect()
+    }
+}
+
+/// Points that are worth a thread.
+const MIN_SHARE: usize = 1024;
 
 /// Unit surface normals of all points of a scan, of arbitrary sign; `None` without neighbours.
 pub(super) fn surface_normals(points: &[Vec3]) -> Vec<Option<Vec3>> {
@@ -101,10 +121,10 @@ pub(super) fn surface_normals(points: &[Vec3]) -> Vec<Option<Vec3>> {
     points
         .par_iter()
         .zip(&index.pixels)
-        .with_min_len(1024)
+        .with_min_len(MIN_SHARE)
         .map(|(&point, &pixel)| {
             let pixel = pixel?.get() as usize - 1;
-            Neighbours::of(&index.image, pixel, point, config.spacing_m).normal(point)
+            Neighbours::of(&index.image, points, pixel, point, config.spacing_m).normal(point)
         })
         .collect()
 }
@@ -141,7 +161,7 @@ impl ScanIndex {
             places: Vec::with_capacity(points.len()),
             pixels: Vec::with_capacity(points.len()),
         };
-        for &point in points {
+        for (number, &point) in points.iter().enumerate() {
             let distance_m = point.truncate().length();
             let azimuth_rad = coarse_atan2(point.y, point.x);
             let near_or_nan = !(distance_m >= config.min_distance_m && point.z.is_finite());
@@ -152,14 +172,12 @@ impl ScanIndex {
             };
             let pixel = place.and_then(|_| DirectionImage::index(point.z, distance_m, azimuth_rad));
             if let Some(pixel) = pixel {
-                index.image.insert(pixel, point, distance_m);
+                index.image.insert(pixel, points, number);
             }
             index
                 .places
-                .push(place.map_or(Placed::NOWHERE, |(ring, sector)| Placed {
-                    ring,
-                    sector,
-                    z: point.z,
+                .push(place.map_or(Placed::NOWHERE, |(ring, sector)| {
+                    Placed::new(ring, sector, point.z)
                 }));
             index
                 .pixels
@@ -168,36 +186,52 @@ impl ScanIndex {
         index
     }
 
+    /// The shapes of the surface at all points: computed for the nearest point of every
+    /// direction, and taken over by points right beside it.
     fn shapes(&self, points: &[Vec3], config: &FeatureConfig) -> Vec<Shape> {
-        points
-            .par_iter()
-            .zip(&self.pixels)
-            .with_min_len(1024)
-            .map(|(&point, &pixel)| match pixel {
-                Some(pixel) => {
-                    let pixel = pixel.get() as usize - 1;
-                    Neighbours::of(&self.image, pixel, point, config.spacing_m).shape(point)
-                }
-                None => Shape::UNKNOWN,
+        let shape_at = |pixel: usize, point: Vec3| {
+            Neighbours::of(&self.image, points, pixel, point, config.spacing_m).shape(point)
+        };
+        let holders: Vec<(u32, Shape)> = (0..DirectionImage::COLUMNS)
+            .into_par_iter()
+            .with_min_len(64)
+            .flat_map_iter(|column| {
+                self.image
+                    .holders(column)
+                    .map(|(pixel, number)| (number as u32, shape_at(pixel, points[number])))
             })
-            .collect()
-    }
-}
-
-/// Root mean square of the height over the low points of the cells around.
-fn rise_over_lows(terrain: &Terrain, place: &Placed) -> f32 {
-    let (ring, sector) = (place.ring as usize, place.sector as usize);
-    let (mut sum, mut count) = (0.0, 0.0);
-    for ring in ring.saturating_sub(1)..=ring + 1 {
-        for side in [SECTORS - 1, SECTORS, SECTORS + 1] {
-            let low = terrain.low(ring, (sector + side) % SECTORS);
-            if low.is_finite() {
-                sum += (place.z - low) * (place.z - low);
-                count += 1.0;
-            }
+            .collect();
+        let mut shapes = vec![Shape::UNKNOWN; points.len()];
+        for (number, shape) in holders {
+            shapes[number as usize] = shape;
         }
+        let others: Vec<(u32, Shape)> = self
+            .pixels
+            .par_iter()
+            .enumerate()
+            .with_min_len(MIN_SHARE)
+            .filter_map(|(number, pixel)| {
+                let pixel = pixel.as_ref()?.get() as usize - 1;
+                let holder = self.image.holder(pixel)?;
+                if holder == number {
+                    return None;
+                }
+                let point = points[number];
+                let squared_gap = (points[holder] - point).length_squared();
+                let same = squared_gap < 0.25 * config.spacing_m * config.spacing_m;
+                let shape = if same {
+                    shapes[holder]
+                } else {
+                    shape_at(pixel, point)
+                };
+                Some((number as u32, shape))
+            })
+            .collect();
+        for (number, shape) in others {
+            shapes[number as usize] = shape;
+        }
+        shapes
     }
-    (sum / f32::max(count, 1.0)).sqrt()
 }
 
 /// Vectors from a point to its neighbours on the same surface, as far as there are any.
@@ -209,20 +243,29 @@ struct Neighbours {
 }
 
 /// How many rows up and down a neighbour is looked for.
-const MAX_ROWS: isize = 8;
+const MAX_ROWS: usize = 8;
 /// How many columns to the sides.
 const MAX_COLUMNS: f32 = 5.0;
 
 impl Neighbours {
-    fn of(image: &DirectionImage, pixel: usize, point: Vec3, spacing_m: f32) -> Self {
+    #[inline]
+    fn of(
+        image: &DirectionImage,
+        points: &[Vec3],
+        pixel: usize,
+        point: Vec3,
+        spacing_m: f32,
+    ) -> Self {
         let distance_m = point.truncate().length();
         let columns = spacing_m / (distance_m * DirectionImage::COLUMN_RAD);
         let columns = columns.clamp(1.0, MAX_COLUMNS) as isize;
+        let (above, below) = image.above_and_below(pixel, MAX_ROWS);
+        let beside = |left| beside(points, image.beside(pixel, left), point, distance_m);
         Self {
-            up: above(image, pixel, point, spacing_m, 1),
-            down: above(image, pixel, point, spacing_m, -1),
-            left: beside(image, pixel, point, distance_m, columns),
-            right: beside(image, pixel, point, distance_m, -columns),
+            up: first_spaced(points, above.iter(), point, spacing_m),
+            down: first_spaced(points, below.iter().rev(), point, spacing_m),
+            left: beside(columns),
+            right: beside(-columns),
         }
     }
 
@@ -264,19 +307,18 @@ fn difference(ahead: Option<Vec3>, behind: Option<Vec3>) -> Option<Vec3> {
     }
 }
 
-/// The nearest return `sign` up that is `spacing_m` away, or the farthest nearer one.
+/// Towards the first return that is `spacing_m` away, or the last nearer one.
 #[inline]
-fn above(
-    image: &DirectionImage,
-    pixel: usize,
+fn first_spaced<'a>(
+    points: &[Vec3],
+    cells: impl Iterator<Item = &'a u32>,
     point: Vec3,
     spacing_m: f32,
-    sign: isize,
 ) -> Option<Vec3> {
     let mut found = None;
-    for step in 1..=MAX_ROWS {
-        if let Some(other) = image.near(pixel, sign * step, 0) {
-            let delta = other - point;
+    for &cell in cells {
+        if cell != 0 {
+            let delta = points[cell as usize - 1] - point;
             found = Some(delta);
             if delta.length_squared() > spacing_m * spacing_m {
                 break;
@@ -286,21 +328,18 @@ fn above(
     found
 }
 
-/// The return `left` columns beside a point if it is about as far away.
+/// Towards the first of the returns that is about as far away as the point.
 #[inline]
-fn beside(
-    image: &DirectionImage,
-    pixel: usize,
-    point: Vec3,
-    distance_m: f32,
-    left: isize,
-) -> Option<Vec3> {
+fn beside(points: &[Vec3], cells: [u32; 3], point: Vec3, distance_m: f32) -> Option<Vec3> {
     let gate_m = 0.3 + 0.02 * distance_m;
-    [0, 1, -1].into_iter().find_map(|up| {
-        let other = image.near(pixel, up, left)?;
-        let jump_m = other.truncate().length() - distance_m;
-        (jump_m.abs() < gate_m).then(|| other - point)
-    })
+    cells
+        .into_iter()
+        .filter(|&cell| cell != 0)
+        .find_map(|cell| {
+            let other = points[cell as usize - 1];
+            let jump_m = other.truncate().length() - distance_m;
+            (jump_m.abs() < gate_m).then(|| other - point)
+        })
 }
 
 /// Angle over the horizontal [rad].

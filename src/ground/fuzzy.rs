@@ -4,11 +4,10 @@
 use std::fmt;
 
 use glam::Vec3;
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::GroundClassifier;
-use super::features::{FeatureConfig, Features, features};
+use super::features::{FeatureConfig, Features, Scene};
 use super::inference::{FuzzySystem, Inference, Operators};
 use super::membership::Membership;
 use super::rules::{RuleError, Vocabulary};
@@ -45,25 +44,28 @@ impl Default for FuzzyConfig {
             operators: Operators::MinMax,
             inference: Inference::Mamdani,
             variables: vocabulary(&[
-                ("slope", "gentle", Membership::LeftShoulder([15.0, 35.0])),
-                ("slope", "moderate", Membership::Triangle([15.0, 35.0, 60.0])),
-                ("slope", "steep", Membership::RightShoulder([35.0, 60.0])),
-                ("height_variance", "low", Membership::LeftShoulder([0.06, 0.2])),
-                ("height_variance", "medium", Membership::Triangle([0.06, 0.2, 0.4])),
-                ("height_variance", "high", Membership::RightShoulder([0.2, 0.4])),
-                ("curvature", "flat", Membership::LeftShoulder([10.0, 30.0])),
-                ("curvature", "curved", Membership::Triangle([10.0, 30.0, 60.0])),
-                ("curvature", "sharp", Membership::RightShoulder([30.0, 60.0])),
-                ("height", "level", Membership::LeftShoulder([0.06, 0.15])),
-                ("height", "raised", Membership::Triangle([0.06, 0.15, 0.35])),
-                ("height", "above", Membership::RightShoulder([0.15, 0.35])),
+                ("slope", "gentle", Membership::LeftShoulder([15.0, 19.0])),
+                ("slope", "moderate", Membership::Triangle([15.0, 19.0, 80.0])),
+                ("slope", "steep", Membership::RightShoulder([19.0, 80.0])),
+                ("height_variance", "low", Membership::LeftShoulder([0.015, 0.1])),
+                ("height_variance", "medium", Membership::Triangle([0.015, 0.1, 0.19])),
+                ("height_variance", "high", Membership::RightShoulder([0.1, 0.19])),
+                ("curvature", "flat", Membership::LeftShoulder([19.0, 24.5])),
+                ("curvature", "curved", Membership::Triangle([19.0, 24.5, 72.0])),
+                ("curvature", "sharp", Membership::RightShoulder([24.5, 72.0])),
+                ("height", "level", Membership::LeftShoulder([0.025, 0.093])),
+                ("height", "raised", Membership::Triangle([0.025, 0.093, 0.6])),
+                ("height", "above", Membership::RightShoulder([0.093, 0.6])),
             ]),
             rules: [
                 "IF height IS level AND slope IS gentle THEN ground IS high",
                 "IF height IS level AND slope IS moderate AND curvature IS NOT sharp THEN ground IS high",
                 "IF height IS level AND slope IS moderate AND curvature IS sharp THEN ground IS medium",
-                "IF height IS level AND slope IS steep THEN ground IS low",
-                "IF height IS raised AND slope IS gentle AND height_variance IS NOT high THEN ground IS medium",
+                "IF height IS level AND slope IS steep AND height_variance IS low THEN ground IS high",
+                "IF height IS level AND slope IS steep AND height_variance IS NOT low THEN ground IS low",
+                "IF height IS level AND slope IS gentle AND height_variance IS high THEN ground IS high",
+                "IF height IS raised AND slope IS gentle AND curvature IS flat THEN ground IS high",
+                "IF height IS raised AND slope IS gentle AND curvature IS NOT flat THEN ground IS low",
                 "IF height IS raised AND slope IS NOT gentle THEN ground IS low",
                 "IF height IS above THEN ground IS low",
             ]
@@ -80,15 +82,15 @@ impl FuzzyConfig {
     pub fn three_features() -> Self {
         Self {
             variables: vocabulary(&[
-                ("slope", "gentle", Membership::LeftShoulder([15.0, 35.0])),
-                ("slope", "moderate", Membership::Triangle([15.0, 35.0, 60.0])),
-                ("slope", "steep", Membership::RightShoulder([35.0, 60.0])),
-                ("height_variance", "low", Membership::LeftShoulder([0.06, 0.2])),
-                ("height_variance", "medium", Membership::Triangle([0.06, 0.2, 0.4])),
-                ("height_variance", "high", Membership::RightShoulder([0.2, 0.4])),
-                ("curvature", "flat", Membership::LeftShoulder([10.0, 30.0])),
-                ("curvature", "curved", Membership::Triangle([10.0, 30.0, 60.0])),
-                ("curvature", "sharp", Membership::RightShoulder([30.0, 60.0])),
+                ("slope", "gentle", Membership::LeftShoulder([6.0, 16.0])),
+                ("slope", "moderate", Membership::Triangle([6.0, 16.0, 75.0])),
+                ("slope", "steep", Membership::RightShoulder([16.0, 75.0])),
+                ("height_variance", "low", Membership::LeftShoulder([0.05, 0.18])),
+                ("height_variance", "medium", Membership::Triangle([0.05, 0.18, 1.2])),
+                ("height_variance", "high", Membership::RightShoulder([0.18, 1.2])),
+                ("curvature", "flat", Membership::LeftShoulder([11.0, 29.0])),
+                ("curvature", "curved", Membership::Triangle([11.0, 29.0, 75.0])),
+                ("curvature", "sharp", Membership::RightShoulder([29.0, 75.0])),
             ]),
             rules: [
                 "IF slope IS gentle AND height_variance IS low THEN ground IS high",
@@ -195,7 +197,7 @@ impl FuzzyGround {
     /// The features of every point; `None` for points that are not finite, under the car or too
     /// far away.
     pub fn features(&self, points: &[Vec3]) -> Vec<Option<Features>> {
-        features(points, &self.config.features)
+        Scene::new(points, &self.config.features).map(|features| features)
     }
 
     /// The confidence that a point with these features is ground, 0 to 1.
@@ -277,11 +279,8 @@ impl FuzzyGround {
 
 impl GroundClassifier for FuzzyGround {
     fn ground_confidence(&self, points: &[Vec3]) -> Vec<f32> {
-        self.features(points)
-            .par_iter()
-            .with_min_len(1024)
+        Scene::new(points, &self.config.features)
             .map(|features| features.map_or(0.0, |features| self.confidence(&features)))
-            .collect()
     }
 }
 

@@ -40,6 +40,10 @@ pub enum Inference {
 const MAX_SETS: usize = 32;
 /// Intervals of the output's universe, 0 to 1, over which a centroid is integrated.
 const INTERVALS: usize = 64;
+/// Strengths along each axis of the table of centroids.
+const NODES: usize = 33;
+/// Below this greatest strength the centroid changes too fast for a table.
+const MIN_TABLED: f32 = 0.1;
 /// The result where no rule fires: nothing is known.
 const UNKNOWN: f32 = 0.5;
 
@@ -50,12 +54,30 @@ pub struct FuzzySystem {
     output: (String, Vec<String>),
     /// Input index and shape of every set, in the order in which clauses count them.
     sets: Vec<(usize, Membership)>,
-    rules: Vec<Rule>,
+    steps: Vec<Step>,
     operators: Operators,
     inference: Inference,
     /// Degrees of the output sets over the universe.
     curves: Vec<[f32; INTERVALS + 1]>,
     peaks: Vec<f32>,
+    /// The centroid by the strengths of three output sets, on a grid of `NODES`³; empty for
+    /// another number of sets.
+    centroids: Vec<f32>,
+}
+
+/// A clause of the rules, all of which stand in one list so that nothing is chased in memory.
+#[derive(Clone, Copy, Debug)]
+struct Step {
+    set: usize,
+    negated: bool,
+    then: Then,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Then {
+    And,
+    Or,
+    Output(usize),
 }
 
 impl FuzzySystem {
@@ -105,11 +127,12 @@ impl FuzzySystem {
         if rules.is_empty() {
             return Err(RuleError::NoRules);
         }
-        Ok(Self {
+        let mut system = Self {
             sets,
-            rules,
+            steps: rules.iter().flat_map(steps_of).collect(),
             operators,
             inference,
+            centroids: Vec::new(),
             curves: outputs
                 .iter()
                 .map(|shape| std::array::from_fn(|i| shape.degree(i as f32 / INTERVALS as f32)))
@@ -120,7 +143,9 @@ impl FuzzySystem {
                 .collect(),
             inputs,
             output,
-        })
+        };
+        system.tabulate();
+        Ok(system)
     }
 
     /// The result for inputs in the order of the names, 0 to 1; 0.5 where no rule fires.
@@ -159,43 +184,46 @@ impl FuzzySystem {
         for (degree, (input, shape)) in degrees.iter_mut().zip(&self.sets) {
             *degree = shape.degree(inputs[*input]);
         }
-        self.rules
-            .iter()
-            .map(|rule| {
-                let set = self.output.1[rule.output].as_str();
-                (self.strength(rule, &degrees), set)
-            })
-            .collect()
+        let mut strengths = Vec::new();
+        self.fire(&degrees, |output, strength| {
+            strengths.push((strength, self.output.1[output].as_str()));
+        });
+        strengths
     }
 
+    /// Calls `speak` with the output set and the strength of every rule, in order.
     #[inline]
-    fn strength(&self, rule: &Rule, degrees: &[f32; MAX_SETS]) -> f32 {
-        let mut any = 0.0_f32;
-        for clauses in &rule.condition {
-            let mut all = 1.0_f32;
-            for clause in clauses {
-                let degree = degrees[clause.set % MAX_SETS];
-                let degree = if clause.negated { 1.0 - degree } else { degree };
-                all = match self.operators {
-                    Operators::MinMax => all.min(degree),
-                    Operators::Product => all * degree,
-                };
+    fn fire(&self, degrees: &[f32; MAX_SETS], mut speak: impl FnMut(usize, f32)) {
+        let (mut any, mut all) = (0.0_f32, 1.0_f32);
+        for step in &self.steps {
+            let degree = degrees[step.set % MAX_SETS];
+            let degree = if step.negated { 1.0 - degree } else { degree };
+            all = match self.operators {
+                Operators::MinMax => all.min(degree),
+                Operators::Product => all * degree,
+            };
+            if let Then::And = step.then {
+                continue;
             }
             any = match self.operators {
                 Operators::MinMax => any.max(all),
                 Operators::Product => any + all - any * all,
             };
+            all = 1.0;
+            if let Then::Output(output) = step.then {
+                speak(output, any);
+                any = 0.0;
+            }
         }
-        any
     }
 
+    #[inline]
     fn weighted_peaks(&self, degrees: &[f32; MAX_SETS]) -> f32 {
         let (mut sum, mut strengths) = (0.0, 0.0);
-        for rule in &self.rules {
-            let strength = self.strength(rule, degrees);
-            sum += strength * self.peaks[rule.output];
+        self.fire(degrees, |output, strength| {
+            sum += strength * self.peaks[output];
             strengths += strength;
-        }
+        });
         if strengths > 0.0 {
             sum / strengths
         } else {
@@ -203,20 +231,27 @@ impl FuzzySystem {
         }
     }
 
+    #[inline]
     fn centroid(&self, degrees: &[f32; MAX_SETS]) -> f32 {
         let mut strongest = [0.0_f32; MAX_SETS];
-        for rule in &self.rules {
-            let strength = self.strength(rule, degrees);
-            let output = rule.output % MAX_SETS;
-            // Rules of one output set are joined by max before the sets are clipped: the same,
-            // because clipping and scaling are monotone.
-            strongest[output] = strongest[output].max(strength);
+        // Rules of one output set are joined by max before the set is clipped: the same as
+        // after, because clipping and scaling are monotone.
+        self.fire(degrees, |output, strength| {
+            let strongest = &mut strongest[output % MAX_SETS];
+            *strongest = strongest.max(strength);
+        });
+        let [a, b, c, ..] = strongest;
+        if self.centroids.is_empty() || a.max(b).max(c) < MIN_TABLED {
+            self.integrate(&strongest)
+        } else {
+            self.look_up([a, b, c])
         }
+    }
+
+    /// The centroid of the union of the clipped output sets.
+    fn integrate(&self, strengths: &[f32; MAX_SETS]) -> f32 {
         let mut union = [0.0_f32; INTERVALS + 1];
-        for (curve, &strength) in self.curves.iter().zip(&strongest) {
-            if strength <= 0.0 {
-                continue;
-            }
+        for (curve, &strength) in self.curves.iter().zip(strengths) {
             for (joined, &degree) in union.iter_mut().zip(curve) {
                 let implied = match self.operators {
                     Operators::MinMax => degree.min(strength),
@@ -227,6 +262,66 @@ impl FuzzySystem {
         }
         center_of_area(&union)
     }
+
+    /// Fills the table of centroids.
+    fn tabulate(&mut self) {
+        if self.curves.len() != 3 || self.inference != Inference::Mamdani {
+            return;
+        }
+        let node = |index: usize| (index % NODES) as f32 / (NODES - 1) as f32;
+        self.centroids = (0..NODES * NODES * NODES)
+            .map(|index| {
+                let mut strengths = [0.0; MAX_SETS];
+                strengths[0] = node(index / (NODES * NODES));
+                strengths[1] = node(index / NODES);
+                strengths[2] = node(index);
+                self.integrate(&strengths)
+            })
+            .collect();
+    }
+
+    /// The centroid between the eight nearest nodes of the table.
+    #[inline]
+    fn look_up(&self, strengths: [f32; 3]) -> f32 {
+        let mut base = 0;
+        let mut share = [0.0; 3];
+        for (share, strength) in share.iter_mut().zip(strengths) {
+            let position = strength * (NODES - 1) as f32;
+            let node = (position as usize).min(NODES - 2);
+            *share = position - node as f32;
+            base = base * NODES + node;
+        }
+        let along = |base: usize| {
+            let (low, high) = (self.centroids[base], self.centroids[base + 1]);
+            low + share[2] * (high - low)
+        };
+        let across = |base: usize| {
+            let (low, high) = (along(base), along(base + NODES));
+            low + share[1] * (high - low)
+        };
+        let (low, high) = (across(base), across(base + NODES * NODES));
+        low + share[0] * (high - low)
+    }
+}
+
+/// The clauses of a rule, each with what follows it.
+fn steps_of(rule: &Rule) -> impl Iterator<Item = Step> {
+    let groups = rule.condition.len();
+    rule.condition
+        .iter()
+        .enumerate()
+        .flat_map(move |(group, clauses)| {
+            let count = clauses.len();
+            clauses.iter().enumerate().map(move |(index, clause)| Step {
+                set: clause.set,
+                negated: clause.negated,
+                then: match (index + 1 < count, group + 1 < groups) {
+                    (true, _) => Then::And,
+                    (false, true) => Then::Or,
+                    (false, false) => Then::Output(rule.output),
+                },
+            })
+        })
 }
 
 /// The centroid of a curve that is straight between its samples over 0 to 1.
@@ -369,6 +464,23 @@ mod tests {
         "IF a IS small THEN ground IS low",
         "IF a IS large THEN ground IS high",
     ];
+
+    #[test]
+    fn the_table_of_centroids_agrees_with_the_integral() {
+        let line = include_str!("scikit_fuzzy.txt").lines().next().unwrap();
+        let (system, ..) = from_table(line);
+        let mut worst: f32 = 0.0;
+        for index in 0..1000 {
+            let digit = |divisor: usize| (index / divisor % 10) as f32 / 9.0;
+            let strengths = [digit(1), digit(10), digit(100)];
+            if strengths.iter().any(|&strength| strength >= MIN_TABLED) {
+                let mut all = [0.0; MAX_SETS];
+                all[..3].copy_from_slice(&strengths);
+                worst = worst.max((system.look_up(strengths) - system.integrate(&all)).abs());
+            }
+        }
+        assert!(worst < 6e-3, "{worst}");
+    }
 
     #[test]
     fn sugeno_inference_is_the_weighted_mean_of_the_peaks() {

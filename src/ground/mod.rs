@@ -13,8 +13,12 @@ mod polar;
 mod ransac;
 mod road;
 mod rules;
+#[cfg(test)]
+mod scenes;
 mod score;
 mod terrain;
+#[cfg(test)]
+mod tests;
 
 pub use features::{FeatureConfig, Features};
 pub use fuzzy::{Explanation, FiredRule, FuzzyConfig, FuzzyGround, MembershipCurve, Verdict};

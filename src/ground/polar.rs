@@ -61,6 +61,11 @@ impl PolarGrid {
         0.5 * (self.edges_m[ring] + self.edges_m[ring + 1])
     }
 
+    /// Width of a ring [m].
+    pub(super) fn width_m(&self, ring: usize) -> f32 {
+        self.edges_m[ring + 1] - self.edges_m[ring]
+    }
+
     /// Position in rings and sectors, both with fraction; `None` beyond the last ring.
     #[inline]
     pub(super) fn locate(&self, distance_m: f32, azimuth_rad: f32) -> Option<(f32, f32)> {
@@ -99,55 +104,83 @@ pub(super) fn coarse_atan2(y: f32, x: f32) -> f32 {
 /// tangent of elevation: finer than any sensor's rings, so that it needs to know none.
 #[derive(Clone, Debug)]
 pub(super) struct DirectionImage {
-    /// Points and their horizontal distances, row-major; the distance is infinite where nothing was seen.
-    cells: Vec<(Vec3, f32)>,
+    /// One more than the number of the nearest point, 0 where nothing was seen. Column by
+    /// column, because neighbours are mostly looked for up and down.
+    cells: Vec<u32>,
 }
 
 impl DirectionImage {
+    /// Columns over 360 degrees.
     pub(super) const COLUMNS: usize = 1024;
     /// Width of a column [rad].
     pub(super) const COLUMN_RAD: f32 = TAU / Self::COLUMNS as f32;
+    /// Rows, counted upwards.
+    const ROWS: usize = 208;
     const TAN_BOTTOM: f32 = -1.0;
-    const TAN_TOP: f32 = 0.45;
     const ROWS_PER_TAN: f32 = 1.0 / 0.007;
-    pub(super) const ROWS: usize =
-        ((Self::TAN_TOP - Self::TAN_BOTTOM) * Self::ROWS_PER_TAN) as usize;
 
     pub(super) fn new() -> Self {
         Self {
-            cells: vec![(Vec3::ZERO, f32::INFINITY); Self::ROWS * Self::COLUMNS],
+            cells: vec![0; Self::ROWS * Self::COLUMNS],
         }
     }
 
     /// The cell of a direction; `None` where it is steeper than any ground is seen at.
-    /// Rows count upwards.
     #[inline]
     pub(super) fn index(z: f32, distance_m: f32, azimuth_rad: f32) -> Option<usize> {
         let row = (z / distance_m - Self::TAN_BOTTOM) * Self::ROWS_PER_TAN;
         if !(row >= 0.0 && row < Self::ROWS as f32) {
             return None;
         }
-        let column = (azimuth_rad + PI) * (Self::COLUMNS as f32 / TAU);
-        Some(row as usize * Self::COLUMNS + (column as usize).min(Self::COLUMNS - 1))
+        let column = ((azimuth_rad + PI) / Self::COLUMN_RAD) as usize;
+        Some(column.min(Self::COLUMNS - 1) * Self::ROWS + row as usize)
     }
 
+    /// Enters `points[number]`, unless a nearer point is there.
     #[inline]
-    pub(super) fn insert(&mut self, index: usize, point: Vec3, distance_m: f32) {
-        if distance_m < self.cells[index].1 {
-            self.cells[index] = (point, distance_m);
+    pub(super) fn insert(&mut self, index: usize, points: &[Vec3], number: usize) {
+        let holder = &mut self.cells[index];
+        let distance = |number: usize| points[number].truncate().length_squared();
+        if *holder == 0 || distance(number) < distance(*holder as usize - 1) {
+            *holder = number as u32 + 1;
         }
     }
 
-    /// The return `up` rows over and `left` columns beside a cell.
+    /// The number of the point that holds a cell.
     #[inline]
-    pub(super) fn near(&self, index: usize, up: isize, left: isize) -> Option<Vec3> {
-        let row = (index / Self::COLUMNS) as isize + up;
-        if !(0..Self::ROWS as isize).contains(&row) {
-            return None;
-        }
-        let column = (index % Self::COLUMNS) as isize + left;
-        let column = column.rem_euclid(Self::COLUMNS as isize);
-        let (point, distance_m) = self.cells[row as usize * Self::COLUMNS + column as usize];
-        (distance_m < f32::INFINITY).then_some(point)
+    pub(super) fn holder(&self, index: usize) -> Option<usize> {
+        (self.cells[index] as usize).checked_sub(1)
+    }
+
+    /// The cells of a column in which something was seen, with the number of the point.
+    pub(super) fn holders(&self, column: usize) -> impl Iterator<Item = (usize, usize)> {
+        let cells = column * Self::ROWS..(column + 1) * Self::ROWS;
+        cells.filter_map(|index| Some((index, self.holder(index)?)))
+    }
+
+    /// The cells over and under one, nearest first: at most `most` of each.
+    #[inline]
+    pub(super) fn above_and_below(&self, index: usize, most: usize) -> (&[u32], &[u32]) {
+        let row = index % Self::ROWS;
+        let above = most.min(Self::ROWS - 1 - row);
+        let below = most.min(row);
+        (
+            &self.cells[index + 1..=index + above],
+            &self.cells[index - below..index],
+        )
+    }
+
+    /// The number of the return `left` columns beside a cell, in its row or the next up or down.
+    #[inline]
+    pub(super) fn beside(&self, index: usize, left: isize) -> [u32; 3] {
+        let (column, row) = (index / Self::ROWS, index % Self::ROWS);
+        let column = (column as isize + left) as usize % Self::COLUMNS;
+        let first = column * Self::ROWS;
+        let at = |row: usize| self.cells[first + row];
+        [
+            at(row),
+            at((row + 1).min(Self::ROWS - 1)),
+            at(row.saturating_sub(1)),
+        ]
     }
 }

@@ -34,17 +34,20 @@ pub struct TerrainConfig {
 }
 
 impl Default for TerrainConfig {
-    /// Fixed on the simulated street and on half of the labelled scans.
+    /// Chosen on the even-numbered of 21 labelled scans.
     fn default() -> Self {
         Self {
             step_m: 0.15,
-            max_slope: 0.12,
+            max_slope: 0.08,
             max_jump_m: 0.6,
             start_radius_m: 10.0,
             max_low_slope_rad: 0.8,
         }
     }
 }
+
+/// Distance over which the slope of known ground is averaged [m].
+const SLOPE_MEMORY_M: f32 = 2.5;
 
 /// A point with its place in the polar grid.
 #[derive(Clone, Copy, Debug)]
@@ -55,6 +58,7 @@ pub(super) struct Placed {
     pub(super) sector: f32,
     /// Height in the lidar frame [m].
     pub(super) z: f32,
+    cell: u32,
 }
 
 impl Placed {
@@ -63,24 +67,38 @@ impl Placed {
         ring: -1.0,
         sector: 0.0,
         z: f32::NAN,
+        cell: u32::MAX,
     };
 
     #[inline]
+    pub(super) fn new(ring: f32, sector: f32, z: f32) -> Self {
+        let cell = PolarGrid::index(ring, sector) as u32;
+        Self {
+            ring,
+            sector,
+            z,
+            cell,
+        }
+    }
+
+    #[inline]
     pub(super) fn is_somewhere(&self) -> bool {
-        self.ring >= 0.0
+        self.cell != u32::MAX
     }
 }
 
 /// Ground heights and low points per cell of a polar grid, in the lidar frame [m].
 #[derive(Clone, Debug)]
 pub(super) struct Terrain {
-    /// Lowest supported point of the cell; NaN where there is none.
+    /// Lowest supported point of gentle slope in the cell; NaN where there is none.
     lows: Vec<f32>,
-    /// The same among points of gentle slope.
-    gentle_lows: Vec<f32>,
+    /// Mean and variance of the lowest points, of whatever slope, in the nine cells around.
+    surroundings: Vec<(f32, f32)>,
     /// Height of the ground; NaN only where the scan has no ground at all.
     heights: Vec<f32>,
     known: Vec<bool>,
+    /// Slope outwards, unitless.
+    slopes: Vec<f32>,
     rings: usize,
 }
 
@@ -91,29 +109,29 @@ impl Terrain {
         shapes: &[Shape],
         config: &TerrainConfig,
     ) -> Self {
-        let gentle = |shape: &Shape| shape.slope_rad < config.max_low_slope_rad;
+        let gentle = |index: usize| shapes[index].slope_rad < config.max_low_slope_rad;
+        let (all_lows, lows) = low_points(grid.len(), placed, gentle);
         let mut terrain = Self {
-            lows: low_points(grid, placed, |_| true),
-            gentle_lows: low_points(grid, placed, |index| gentle(&shapes[index])),
+            lows,
+            surroundings: surroundings(&all_lows, grid.rings()),
             heights: vec![f32::NAN; grid.len()],
             known: vec![false; grid.len()],
+            slopes: vec![0.0; grid.len()],
             rings: grid.rings(),
         };
         if let Some(plane) = terrain.start_plane(grid, config) {
             terrain.grow(grid, config, plane);
-            terrain.level(placed, config);
+            terrain.level(grid, placed, config);
             terrain.fill();
         }
         terrain
     }
 
-    /// The lowest supported point of a cell; NaN where there is none.
+    /// Root mean square of a point's height over the low points of the nine cells around [m].
     #[inline]
-    pub(super) fn low(&self, ring: usize, sector: usize) -> f32 {
-        self.lows
-            .get(ring * SECTORS + sector)
-            .copied()
-            .unwrap_or(f32::NAN)
+    pub(super) fn rise_over_lows(&self, place: &Placed) -> f32 {
+        let (mean, variance) = self.surroundings[place.cell as usize];
+        ((place.z - mean).powi(2) + variance).sqrt()
     }
 
     /// Height of the ground at a place, between the middles of the cells [m].
@@ -142,7 +160,7 @@ impl Terrain {
                 break;
             }
             for sector in 0..SECTORS {
-                let low = self.gentle_lows[ring * SECTORS + sector];
+                let low = self.lows[ring * SECTORS + sector];
                 if low.is_finite() {
                     let (sin, cos) = direction(sector);
                     lows.push(Vec3::new(distance_m * cos, distance_m * sin, low));
@@ -172,9 +190,11 @@ impl Terrain {
         Some(plane)
     }
 
+    /// From ring to ring outwards; see the module.
     fn grow(&mut self, grid: &PolarGrid, config: &TerrainConfig, [a, b, c]: [f32; 3]) {
-        // Distance of the last known ground, per sector.
+        // Distance and height of the last known ground, per sector.
         let mut last_m = [0.0_f32; SECTORS];
+        let mut last_height = [a; SECTORS];
         // Slope along the sector, from known ground.
         let mut slope = [0.0_f32; SECTORS];
         for (sector, slope) in slope.iter_mut().enumerate() {
@@ -205,7 +225,7 @@ impl Terrain {
                     }
                     sum / weights
                 };
-                let low = self.gentle_lows[index];
+                let low = self.lows[index];
                 let gap_m = middle_m - last_m[sector].max(last_m[before]).max(last_m[after]);
                 let allowed_m = (config.step_m + config.max_slope * gap_m).min(config.max_jump_m);
                 if (low - predicted).abs() < allowed_m {
@@ -213,11 +233,12 @@ impl Terrain {
                     self.known[index] = true;
                     now_m[sector] = middle_m;
                     if !near {
-                        let inner = self.heights[index - SECTORS];
-                        let width_m = middle_m - grid.middle_m(ring - 1);
-                        let seen = ((low - inner) / width_m).clamp(-0.3, 0.3);
-                        new_slope[sector] = 0.8 * slope[sector] + 0.2 * seen;
+                        let run_m = middle_m - last_m[sector];
+                        let seen = ((low - last_height[sector]) / run_m).clamp(-0.3, 0.3);
+                        let gain = (run_m / SLOPE_MEMORY_M).min(0.7);
+                        new_slope[sector] = slope[sector] + gain * (seen - slope[sector]);
                     }
+                    last_height[sector] = low;
                 } else {
                     self.heights[index] = predicted;
                     new_slope[sector] = 0.9 * slope[sector];
@@ -228,24 +249,29 @@ impl Terrain {
                 slope[sector] =
                     0.25 * (new_slope[before] + 2.0 * new_slope[sector] + new_slope[after]);
             }
+            self.slopes[ring * SECTORS..][..SECTORS].copy_from_slice(&slope);
             last_m = now_m;
         }
     }
 
-    /// Moves known ground from the lowest point of a cell to the mean of the points about it.
-    fn level(&mut self, placed: &[Placed], config: &TerrainConfig) {
-        let mut sums = vec![(0.0_f32, 0.0_f32); self.heights.len()];
+    /// Moves known ground from the lowest point of a cell to the mean of the points about it,
+    /// and along its slope to the middle of the cell.
+    fn level(&mut self, grid: &PolarGrid, placed: &[Placed], config: &TerrainConfig) {
+        let mut sums = vec![[0.0_f32; 3]; self.heights.len()];
         for point in placed.iter().filter(|point| point.is_somewhere()) {
-            let index = PolarGrid::index(point.ring, point.sector);
-            let over_low_m = point.z - self.gentle_lows[index];
+            let index = point.cell as usize;
+            let over_low_m = point.z - self.lows[index];
             if over_low_m.abs() < config.step_m {
-                sums[index].0 += over_low_m;
-                sums[index].1 += 1.0;
+                let sums = &mut sums[index];
+                sums[0] += 1.0;
+                sums[1] += over_low_m;
+                sums[2] += point.ring.fract() - 0.5;
             }
         }
-        for (index, (sum, count)) in sums.into_iter().enumerate() {
+        for (index, [count, over_low_m, outward]) in sums.into_iter().enumerate() {
             if self.known[index] && count > 0.0 {
-                self.heights[index] += sum / count;
+                let run_m = outward / count * grid.width_m(index / SECTORS);
+                self.heights[index] += over_low_m / count - self.slopes[index] * run_m;
             }
         }
     }
@@ -280,31 +306,87 @@ impl Terrain {
     }
 }
 
-/// Per cell the lowest point that is not alone: where the second lowest lies far over the
-/// lowest, the lowest is a reflection from below the ground and the second is taken.
-fn low_points(grid: &PolarGrid, placed: &[Placed], counts: impl Fn(usize) -> bool) -> Vec<f32> {
-    const ALONE_M: f32 = 0.3;
-    let mut lows = vec![(f32::INFINITY, f32::INFINITY); grid.len()];
+/// Per cell the lowest point that is not alone: among all points, and among those that are
+/// `gentle`. NaN where there is none.
+fn low_points(
+    cells: usize,
+    placed: &[Placed],
+    gentle: impl Fn(usize) -> bool,
+) -> (Vec<f32>, Vec<f32>) {
+    let mut lows = vec![[Lowest::NONE; 2]; cells];
     for (index, point) in placed.iter().enumerate() {
-        if !point.is_somewhere() || !counts(index) {
+        if !point.is_somewhere() {
             continue;
         }
-        let low = &mut lows[PolarGrid::index(point.ring, point.sector)];
-        if point.z < low.0 {
-            *low = (point.z, low.0);
-        } else if point.z < low.1 {
-            low.1 = point.z;
+        let [all, among_gentle] = &mut lows[point.cell as usize];
+        all.add(point.z);
+        if gentle(index) {
+            among_gentle.add(point.z);
         }
     }
-    lows.into_iter()
-        .map(
-            |(first, second)| match (first.is_finite(), second.is_finite()) {
-                (false, _) => f32::NAN,
-                (true, true) if second - first > ALONE_M => second,
-                _ => first,
-            },
-        )
-        .collect()
+    lows.iter()
+        .map(|[all, among_gentle]| (all.supported(), among_gentle.supported()))
+        .unzip()
+}
+
+/// The two lowest heights of a cell.
+#[derive(Clone, Copy)]
+struct Lowest {
+    first: f32,
+    second: f32,
+}
+
+impl Lowest {
+    const NONE: Self = Self {
+        first: f32::INFINITY,
+        second: f32::INFINITY,
+    };
+
+    #[inline]
+    fn add(&mut self, z: f32) {
+        self.second = self.second.min(self.first.max(z));
+        self.first = self.first.min(z);
+    }
+
+    /// The lowest, or the second where it lies far above: then the lowest is a reflection from
+    /// below the ground.
+    fn supported(&self) -> f32 {
+        const ALONE_M: f32 = 0.3;
+        if self.first == f32::INFINITY {
+            f32::NAN
+        } else if self.second < f32::INFINITY && self.second - self.first > ALONE_M {
+            self.second
+        } else {
+            self.first
+        }
+    }
+}
+
+/// Mean and variance of the low points of each cell with its eight neighbours; meaningless for
+/// cells without points.
+fn surroundings(lows: &[f32], rings: usize) -> Vec<(f32, f32)> {
+    let mut result = vec![(0.0, 0.0); lows.len()];
+    for (index, result) in result.iter_mut().enumerate() {
+        if lows[index].is_nan() {
+            continue;
+        }
+        let (ring, sector) = (index / SECTORS, index % SECTORS);
+        let (mut sum, mut squares, mut count) = (0.0, 0.0, 0.0);
+        for ring in ring.saturating_sub(1)..=(ring + 1).min(rings - 1) {
+            for side in [SECTORS - 1, SECTORS, SECTORS + 1] {
+                // Relative to the middle cell, lest squares of heights cancel.
+                let low = lows[ring * SECTORS + (sector + side) % SECTORS] - lows[index];
+                if low.is_finite() {
+                    sum += low;
+                    squares += low * low;
+                    count += 1.0;
+                }
+            }
+        }
+        let mean = sum / count;
+        *result = (lows[index] + mean, (squares / count - mean * mean).max(0.0));
+    }
+    result
 }
 
 /// Sine and cosine of the middle of a sector.

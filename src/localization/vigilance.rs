@@ -26,6 +26,17 @@ pub enum State {
     Lost,
 }
 
+impl State {
+    /// For people.
+    pub fn word(self) -> &'static str {
+        match self {
+            Self::Searching => "searching",
+            Self::Tracking => "tracking",
+            Self::Lost => "lost",
+        }
+    }
+}
+
 /// When the map disagrees.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]

@@ -138,13 +138,15 @@ pub fn build(
     watcher.begin("scans")?;
     let scans = prepare_scans(&frames[plan.used.clone()], settings, classifier, watcher)?;
     counts.scans = scans.len();
-    scans.iter().for_each(|scan| counts.points.add(&scan.counts));
+    scans
+        .iter()
+        .for_each(|scan| counts.points.add(&scan.counts));
 
     watcher.begin("moving points")?;
     let cloud = static_cloud(&scans, settings, &mut counts);
 
     watcher.begin("surface")?;
-    let surface = meshing::reconstruct(&cloud, None, &settings.poisson).map_err(|source| {
+    let mut surface = meshing::reconstruct(&cloud, None, &settings.poisson).map_err(|source| {
         LocalMapError::Meshing {
             number: plan.number,
             first: frames[plan.own.start].number,
@@ -153,8 +155,8 @@ pub fn build(
         }
     })?;
     counts.reconstructed_triangles = surface.mesh.triangles.len();
-    let (mut mesh, sparse) = meshing::trim_by_density(surface, settings.min_density);
-    counts.sparse_triangles = sparse;
+    counts.sparse_triangles = meshing::trim_by_density(&mut surface, settings.min_density);
+    let mut mesh = surface.mesh;
     counts.distant_triangles =
         meshing::trim_by_distance(&mut mesh, &cloud.positions, settings.max_distance_m);
 

@@ -1,6 +1,7 @@
 //! The map: built from scans, kept as a mesh, cut into tiles.
 
 pub mod elevation;
+pub mod local_map;
 pub mod plan;
 pub mod ply;
 pub mod quality;
@@ -9,6 +10,7 @@ pub mod tiles;
 pub mod visibility;
 
 pub use elevation::{GroundMap, GroundPatch, Stance};
+pub use local_map::{LocalMapCounts, LocalMapError, LocalMapSettings};
 pub use ply::PlyError;
 pub use quality::MapQuality;
 pub use tiles::{TileConfig, TileGrid, TileIndex};

@@ -11,7 +11,7 @@ const WIDTH: f64 = 1400.0;
 const LEFT: f64 = 118.0;
 const RIGHT: f64 = 30.0;
 const HEADER: f64 = 60.0;
-const LEGEND: f64 = 34.0;
+const LEGEND: f64 = 46.0;
 const PANEL: f64 = 300.0;
 const BELOW_PANEL: f64 = 78.0;
 
@@ -115,7 +115,7 @@ impl LineChart {
             series.draw(sheet, &view)?;
         }
         if let Some(highest) = above {
-            let text = format!("some values are above, up to {highest:.3}");
+            let text = format!("some values are above, up to {highest:.1}");
             let lettering = Lettering::new(TICK, HPos::Right, VPos::Top).color(INK);
             sheet.text(&text, (rect.right - 10.0, rect.top + 8.0), lettering)?;
         }
@@ -127,8 +127,8 @@ impl LineChart {
             let (column, bottom) = view.at(*x, view.y.min);
             let ends = [(column, view.rect.top), (column, bottom)];
             sheet.dashes(&ends, &view.rect, Pen::new(INK, 1.5), (6.0, 5.0))?;
-            let lettering = Lettering::new(TICK, HPos::Left, VPos::Top);
-            sheet.text(word, (column + 6.0, view.rect.top + 8.0), lettering)?;
+            let lettering = Lettering::new(TICK, HPos::Center, VPos::Center);
+            sheet.text(word, (column, view.rect.top - 12.0), lettering)?;
         }
         Ok(())
     }

@@ -73,20 +73,21 @@ impl LocalizationPicture<'_> {
     fn draw(&self, sheet: &Sheet, view: &View) -> Result<(), DrawError> {
         title(sheet, self.title, view.rect.left)?;
         legend(sheet, &self.keys(), (view.rect.left, 70.0), view.rect.right)?;
+        view.grid(sheet)?;
         if let Some(map) = self.map {
             map.draw(sheet, view, 0.65)?;
         }
-        view.grid(sheet)?;
         let driven = places(self.driven, view);
         sheet.dashes(&driven, &view.rect, Pen::new(TRUTH, 2.5), (8.0, 6.0))?;
         let weights = self.draw_particles(sheet, view)?;
-        for (pose, color, length) in [
-            (self.ground_truth, TRUTH, 64.0),
-            (self.estimate, MCL, 52.0),
-            (self.refined, REFINED, 40.0),
+        // The thinner ones on top, so that all are seen where they agree.
+        for (pose, pen, length) in [
+            (self.ground_truth, Pen::new(TRUTH, 11.0), 68.0),
+            (self.estimate, Pen::new(MCL, 6.0), 52.0),
+            (self.refined, Pen::new(REFINED, 2.5), 40.0),
         ] {
             if let Some(pose) = pose {
-                arrow(sheet, view, &pose, color, length)?;
+                arrow(sheet, view, &pose, pen, length)?;
             }
         }
         view.frame(sheet, "x [m]", "y [m]")?;
@@ -150,13 +151,7 @@ impl LocalizationPicture<'_> {
 }
 
 /// An arrow of a length in pixels, whose tail is at the pose, with a white rim.
-fn arrow(
-    sheet: &Sheet,
-    view: &View,
-    pose: &Pose2,
-    color: Rgb,
-    length: f64,
-) -> Result<(), DrawError> {
+fn arrow(sheet: &Sheet, view: &View, pose: &Pose2, pen: Pen, length: f64) -> Result<(), DrawError> {
     let tail = view.at(pose.translation.x, pose.translation.y);
     if !view.rect.holds(tail) {
         return Ok(());
@@ -169,19 +164,17 @@ fn arrow(
             tail.1 - forward * sin - left * cos,
         )
     };
-    for (color, rim) in [(WHITE, 2.5), (color, 0.0)] {
-        sheet.line(
-            tail,
-            at(length - 14.0, 0.0),
-            Pen::new(color, 5.0 + 2.0 * rim),
-        )?;
+    let half = 5.0 + 0.6 * pen.width;
+    for (color, rim) in [(WHITE, 1.2), (pen.color, 0.0)] {
+        let stem = Pen::new(color, pen.width + 2.0 * rim);
+        sheet.line(tail, at(length - 14.0, 0.0), stem)?;
         let head = [
-            at(length + 1.6 * rim, 0.0),
-            at(length - 20.0 - rim, 9.0 + 1.2 * rim),
-            at(length - 20.0 - rim, -9.0 - 1.2 * rim),
+            at(length + 2.0 * rim, 0.0),
+            at(length - 20.0 - rim, half + 1.5 * rim),
+            at(length - 20.0 - rim, -half - 1.5 * rim),
         ];
         sheet.polygon(&head, color)?;
-        sheet.dot(tail, 6.0 + rim, color, 1.0)?;
+        sheet.dot(tail, 3.0 + 0.5 * pen.width + rim, color, 1.0)?;
     }
     Ok(())
 }

@@ -190,9 +190,11 @@ impl Sheet<'_> {
         for pair in points.windows(2) {
             if let Some((from, to)) = clipped(pair[0], pair[1], clip) {
                 self.line(from, to, pen)?;
-                if pen.width > 1.5 {
-                    self.dot(to, 0.5 * pen.width, pen.color, pen.alpha)?;
-                }
+                // A round joint, no wider than the line itself.
+                let style = pen.style(true);
+                let radius = (scaled(pen.width) - 1) / 2;
+                self.root
+                    .draw(&Circle::new(scaled_point(to), radius, style))?;
             }
         }
         Ok(())
@@ -322,8 +324,13 @@ impl Sheet<'_> {
         let style = TextStyle::from(lettering.font().transform(transform))
             .color(&color)
             .pos(Pos::new(lettering.horizontal, lettering.vertical));
-        let text = Text::new(text.to_owned(), scaled_point(at), style);
-        self.root.draw(&text)
+        // The library centres the box of a line, in which letters sit high.
+        let down = match (lettering.vertical, lettering.upwards) {
+            (VPos::Center, false) => 0.14 * lettering.size,
+            _ => 0.0,
+        };
+        let place = scaled_point((at.0, at.1 + down));
+        self.root.draw(&Text::new(text.to_owned(), place, style))
     }
 }
 

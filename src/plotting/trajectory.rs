@@ -69,10 +69,10 @@ impl PathPlot<'_> {
         sheet::save(path, size, |sheet| {
             title(sheet, self.title, view.rect.left)?;
             legend(sheet, &self.keys(), (view.rect.left, 70.0), view.rect.right)?;
+            view.grid(sheet)?;
             if let Some(map) = self.map {
                 map.draw(sheet, &view, 0.6)?;
             }
-            view.grid(sheet)?;
             self.draw_paths(sheet, &view)?;
             view.frame(sheet, "x [m]", "y [m]")?;
             view.scale_bar(sheet)
@@ -100,10 +100,10 @@ impl PathPlot<'_> {
 
     fn draw_paths(&self, sheet: &Sheet, view: &View) -> Result<(), super::error::DrawError> {
         if let Some(truth) = self.ground_truth {
-            sheet.polyline(&places(truth, view), &view.rect, Pen::new(TRUTH, 7.0))?;
+            sheet.polyline(&places(truth, view), &view.rect, Pen::new(TRUTH, 6.0))?;
         }
         for (number, path) in self.paths.iter().enumerate() {
-            let width = if number == 0 { 3.5 } else { 2.0 };
+            let width = if number == 0 { 3.0 } else { 2.0 };
             let pen = Pen::new(path.color, width);
             sheet.polyline(&places(path.poses, view), &view.rect, pen)?;
         }

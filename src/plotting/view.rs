@@ -1,6 +1,6 @@
 //! Where numbers lie on the sheet: axes with round ticks, equal scales, legends, colour bars.
 
-use super::color::{Colormap, FRAME, GRID, Rgb, WHITE};
+use super::color::{Colormap, FRAME, GRID, INK, Rgb};
 use super::error::DrawError;
 use super::sheet::{HPos, LABEL, Lettering, Pen, Point, Rect, Sheet, TICK, VPos, text_width};
 
@@ -104,7 +104,7 @@ impl View {
     ) -> Result<(), DrawError> {
         let ticks = Ticks {
             places: (-3..=3).map(|k| 60.0 * f64::from(k)).collect(),
-            decimals: 0,
+            step: 60.0,
         };
         self.frame_with(sheet, &ticks, x_name, y_name)
     }
@@ -148,27 +148,26 @@ impl View {
     }
 
     fn y_ticks(&self) -> Ticks {
+        // On a map both axes have ticks at the same distance.
+        let y_scale = self.rect.height() / self.y.length();
+        if (self.scale() / y_scale - 1.0).abs() < 1e-6 {
+            return Ticks::every(self.x_ticks().step, self.y);
+        }
         Ticks::of(self.y, self.rect.height() / 60.0)
     }
 
-    /// A bar of a round length in the lower right corner, for maps.
+    /// A bar of a round length over the upper right corner, outside the data, for maps.
     pub fn scale_bar(&self, sheet: &Sheet) -> Result<(), DrawError> {
-        let length = round_step(0.18 * self.x.length());
-        let width = length * self.scale();
-        let (right, bottom) = (self.rect.right - 24.0, self.rect.bottom - 20.0);
-        let backdrop = Rect {
-            left: right - width - 14.0,
-            top: bottom - 36.0,
-            right: right + 14.0,
-            bottom: bottom + 10.0,
-        };
-        sheet.fill(&backdrop, WHITE)?;
-        sheet.outline(&backdrop, Pen::new(GRID, 1.0))?;
-        let pen = Pen::new([0, 0, 0], 4.0);
-        sheet.line((right - width, bottom), (right, bottom), pen)?;
-        let above = Lettering::new(TICK, HPos::Center, VPos::Bottom);
-        let text = format!("{length} m");
-        sheet.text(&text, (right - 0.5 * width, bottom - 8.0), above)
+        let length = round_step(0.12 * self.x.length());
+        let (right, row) = (self.rect.right, self.rect.top - 26.0);
+        let left = right - length * self.scale();
+        let pen = Pen::new(INK, 3.0);
+        sheet.line((left, row), (right, row), pen)?;
+        for end in [left, right] {
+            sheet.line((end, row - 6.0), (end, row + 6.0), Pen::new(INK, 2.0))?;
+        }
+        let beside = Lettering::new(TICK, HPos::Right, VPos::Center);
+        sheet.text(&format!("{length} m"), (left - 10.0, row), beside)
     }
 }
 
@@ -176,28 +175,33 @@ impl View {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ticks {
     pub places: Vec<f64>,
-    decimals: usize,
+    step: f64,
 }
 
 impl Ticks {
     /// About `count` of them, at least two.
     pub fn of(span: Span, count: f64) -> Self {
-        let step = round_step(span.length() / count.max(2.0));
+        Self::every(round_step(span.length() / count.max(2.0)), span)
+    }
+
+    /// At the multiples of a step.
+    fn every(step: f64, span: Span) -> Self {
         let first = (span.min / step - 1e-6).ceil() as i64;
         let last = (span.max / step + 1e-6).floor() as i64;
         Self {
             // At most a hundred, whatever the numbers.
             places: (first..=last).take(100).map(|k| k as f64 * step).collect(),
-            decimals: (-step.log10().floor()).clamp(0.0, 9.0) as usize,
+            step,
         }
     }
 
     /// Places with their labels.
     pub fn labelled(&self) -> impl Iterator<Item = (f64, String)> {
-        self.places.iter().map(|&place| {
+        let decimals = (-self.step.log10().floor()).clamp(0.0, 9.0) as usize;
+        self.places.iter().map(move |&place| {
             // Not "-0".
             let place = place + 0.0;
-            (place, format!("{place:.*}", self.decimals))
+            (place, format!("{place:.decimals$}"))
         })
     }
 }
@@ -301,13 +305,15 @@ pub fn color_bar(
         y: span,
     };
     let beside = Lettering::new(TICK, HPos::Left, VPos::Center);
-    for (y, text) in Ticks::of(span, rect.height() / 50.0).labelled() {
+    let mut widest = 0.0_f64;
+    for (y, text) in Ticks::of(span, (rect.height() / 50.0).min(10.0)).labelled() {
         let (_, row) = view.at(0.0, y);
         sheet.line((rect.right, row), (rect.right + 5.0, row), pen)?;
         sheet.text(&text, (rect.right + 9.0, row), beside)?;
+        widest = widest.max(text_width(&text, beside));
     }
     let lettering = Lettering::new(TICK + 1.0, HPos::Center, VPos::Center);
-    let middle = (rect.right + 66.0, 0.5 * (rect.top + rect.bottom));
+    let middle = (rect.right + widest + 28.0, 0.5 * (rect.top + rect.bottom));
     sheet.text(name, middle, lettering.upwards())
 }
 

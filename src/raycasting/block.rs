@@ -95,3 +95,20 @@ pub(super) fn edge(p: &Corner, q: &Corner) -> Corner {
     }
     edge
 }
+
+/// What rounding can do to the side of an edge of each triangle that a ray passes on.
+#[inline(always)]
+pub(super) fn rounding(a: &Corner, b: &Corner, c: &Corner) -> [f32; TRIANGLES] {
+    let mut rounding = [0.0; TRIANGLES];
+    for (place, rounding) in rounding.iter_mut().enumerate() {
+        let mut distance = 0.0;
+        let mut length = 0.0;
+        for axis in 0..3 {
+            let (a, b, c) = (a[axis][place], b[axis][place], c[axis][place]);
+            distance += a.abs();
+            length += (b - a).abs() + (c - a).abs();
+        }
+        *rounding = 4.0 * f32::EPSILON * length * (distance + length);
+    }
+    rounding
+}

@@ -4,7 +4,7 @@
 //! Built from above by the surface area heuristic over binned centroids,
 //!
 //! ```text
-//! cost(split) = traversal + (area(left) · |left| + area(right) · |right|) / area(node)
+//! cost(split) = area(left) · |left| + area(right) · |right|
 //! ```
 //!
 //! Wald, *On fast Construction of SAH-based Bounding Volume Hierarchies*, RT 2007. Large subtrees
@@ -16,8 +16,6 @@ use crate::geometry::{Aabb, Vec3};
 
 /// Candidate borders per axis.
 const BINS: usize = 16;
-/// What visiting a node costs, in tests of one item.
-const TRAVERSAL_COST: f32 = 1.0;
 /// Subtrees with fewer items are grown by one thread.
 const PARALLEL_FROM: usize = 4096;
 /// From this depth on nodes are halved by count, which bounds the depth of the whole tree.
@@ -236,18 +234,15 @@ fn half_area(bounds: &Aabb) -> f32 {
     size.x * size.y + size.y * size.z + size.z * size.x
 }
 
-/// Orders the items of a node by side of its best border; `None` where a leaf is as good and allowed.
+/// Orders the items of a node by side of its best border; `None` where they fit into a leaf.
 fn cut(items: &mut [Item], depth: usize, leaf_size: usize) -> Option<Cut> {
-    if items.len() <= 1 {
+    // A full leaf takes hardly longer to test than one that is half full, and less memory.
+    if items.len() <= leaf_size.max(1) {
         return None;
     }
-    let leaf_cost = items.len() as f32;
     let border = (depth < HALVE_FROM_DEPTH)
         .then(|| best_border(items))
         .flatten();
-    if items.len() <= leaf_size && border.as_ref().is_none_or(|b| b.cost >= leaf_cost) {
-        return None;
-    }
     let Some(border) = border else {
         return Some(Cut {
             middle: items.len() / 2,
@@ -316,7 +311,6 @@ struct Border {
     bins: Binning,
     axis: usize,
     bin: usize,
-    cost: f32,
 }
 
 /// The border of least cost over all axes; `None` where no border has items on both its sides.
@@ -330,7 +324,6 @@ fn best_border(items: &[Item]) -> Option<Border> {
             counts[axis][bin] += 1;
         }
     }
-    let whole = bounds[0].iter().copied().fold(Aabb::EMPTY, Aabb::union);
     let mut best: Option<(f32, usize, usize)> = None;
     for axis in 0..3 {
         for (bin, cost) in border_costs(&bounds[axis], &counts[axis])
@@ -342,11 +335,10 @@ fn best_border(items: &[Item]) -> Option<Border> {
             }
         }
     }
-    best.map(|(cost, axis, bin)| Border {
+    best.map(|(_, axis, bin)| Border {
         bins: binning,
         axis,
         bin,
-        cost: TRAVERSAL_COST + cost / half_area(&whole).max(f32::MIN_POSITIVE),
     })
 }
 

@@ -9,13 +9,14 @@
 //!
 //! have one sign: three dot products per ray, and the vectors are the same for all rays of the
 //! packet. Seen from the neighbour, an edge gives exactly the negative number, so that no ray
-//! slips between two triangles. After Davidovič, Engelhardt, Georgiev, Slusallek and
+//! slips between two triangles; where rounding decides, both are met, so that none slips through
+//! a corner either. After Davidovič, Engelhardt, Georgiev, Slusallek and
 //! Dachsbacher, *3D Rasterization: A Bridge between Rasterization and Ray Casting*, GI 2012.
 //!
 //! Plain loops over arrays that the compiler turns into vector instructions. Products and sums
 //! are rounded one by one, so that every instruction set gives the same bits.
 
-use super::block::{Block, Corner, TRIANGLES, edge};
+use super::block::{Block, Corner, edge, rounding};
 use super::bvh::{Bvh, Child, MAX_DEPTH};
 use super::{NEAREST_M, Reach};
 use crate::geometry::Vec3;
@@ -43,7 +44,7 @@ pub(super) struct Packet {
     enough_m: Rays,
     /// The nearest hit so far [m].
     pub range_m: Rays,
-    /// The place of the triangle: its block times [`TRIANGLES`] plus its place there.
+    /// The place of the triangle: its block times the triangles of a block plus its place there.
     pub slot: [u32; RAYS],
     /// Per axis, whether the first ray runs downwards.
     backwards: [bool; 3],
@@ -130,7 +131,7 @@ impl Packet {
     pub fn meet(&mut self, origin: Vec3, block: &Block, first_slot: u32) {
         let [a, b, c] = block.corners_from(origin);
         let (ab, bc, ca) = (edge(&a, &b), edge(&b, &c), edge(&c, &a));
-        for triangle in 0..TRIANGLES {
+        for (triangle, rounding) in rounding(&a, &b, &c).into_iter().enumerate() {
             if !block.has(triangle) {
                 break;
             }
@@ -144,7 +145,7 @@ impl Packet {
             for ray in 0..RAYS {
                 let least = min(min(u[ray], v[ray]), w[ray]);
                 let most = max(max(u[ray], v[ray]), w[ray]);
-                inside[ray] = (least >= 0.0) | (most <= 0.0);
+                inside[ray] = (least >= -rounding) | (most <= rounding);
                 any |= inside[ray];
             }
             if !any {
@@ -160,6 +161,9 @@ impl Packet {
             for ray in 0..RAYS {
                 let range_m = (u[ray] * a[ray] + v[ray] * b[ray] + w[ray] * c[ray])
                     / (u[ray] + v[ray] + w[ray]);
+                // Seen edge-on, the quotient may be anything.
+                let range_m = max(min(min(a[ray], b[ray]), c[ray]), range_m);
+                let range_m = min(max(max(a[ray], b[ray]), c[ray]), range_m);
                 let is_met = inside[ray] & (range_m < self.until_m[ray]) & (range_m > NEAREST_M);
                 let is_enough = range_m < self.enough_m[ray];
                 let until_m = if is_enough { 0.0 } else { range_m };

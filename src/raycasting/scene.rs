@@ -13,7 +13,7 @@ use crate::geometry::{Aabb, TriangleMesh};
 const THINNEST: f64 = 1e-7;
 /// By this part of the extent of the scene boxes are larger than what is in them: more than
 /// rounding moves an edge.
-const PADDING: f32 = 4.0 * f32::EPSILON;
+const PADDING: f32 = 16.0 * f32::EPSILON;
 
 /// How far a ray looks.
 #[derive(Clone, Copy, Debug, PartialEq)]

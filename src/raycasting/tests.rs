@@ -127,3 +127,249 @@ fn the_walls_of_a_cube_are_where_they_are_from_inside_and_outside() {
         assert_eq!(cast_one(&scene, 10.0 * direction, direction), Hit::MISS);
     }
 }
+
+/// A closed ball of triangles around the origin.
+fn ball(radius_m: f32, rows: u32, columns: u32) -> TriangleMesh {
+    let mut mesh = TriangleMesh::default();
+    for row in 0..=rows {
+        for column in 0..columns {
+            let up = std::f32::consts::PI * (row as f32 / rows as f32 - 0.5);
+            let around = std::f32::consts::TAU * column as f32 / columns as f32;
+            let (ring, height) = match row {
+                0 => (0.0, -1.0),
+                last if last == rows => (0.0, 1.0),
+                _ => (up.cos(), up.sin()),
+            };
+            let place = Vec3::new(ring * around.cos(), ring * around.sin(), height);
+            mesh.vertices.push(radius_m * place);
+        }
+    }
+    for row in 0..rows {
+        for column in 0..columns {
+            let next = (column + 1) % columns;
+            let [a, b] = [row * columns + column, row * columns + next];
+            let [c, d] = [b + columns, a + columns];
+            mesh.triangles.extend([[a, b, c], [a, c, d]]);
+        }
+    }
+    mesh
+}
+
+#[test]
+fn a_ball_is_round_to_its_sagitta() {
+    let (radius_m, rows, columns) = (3.0, 60, 120);
+    let scene = Scene::new(&ball(radius_m, rows, columns));
+    // Half the diagonal of a quad, seen from the middle.
+    let half = 0.5 * std::f32::consts::PI / rows as f32 * std::f32::consts::SQRT_2;
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    for _ in 0..500 {
+        let range_m = cast_one(&scene, Vec3::ZERO, direction(&mut rng)).range_m;
+        assert!(range_m <= radius_m * (1.0 + 1e-6));
+        assert!(range_m >= radius_m * half.cos() - 1e-6, "{range_m}");
+    }
+}
+
+#[test]
+fn no_ray_slips_out_of_a_closed_surface_along_its_edges_and_corners() {
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    for (mesh, inside_m) in [
+        (cube(0.5), 0.2),
+        (cube(77.7), 60.0),
+        (ball(3.0, 20, 40), 1.0),
+    ] {
+        let scene = Scene::new(&mesh);
+        for _ in 0..20 {
+            let origin = inside_m * in_cube(&mut rng) * std::f32::consts::FRAC_1_SQRT_2;
+            let mut directions = Vec::new();
+            for triangle in 0..mesh.triangles.len() {
+                let [a, b, c] = mesh.corners(triangle);
+                for (p, q) in [(a, b), (b, c), (c, a)] {
+                    for part in [0.0, 0.1, 1.0 / 3.0, 0.5, rng.random_range(0.0..1.0)] {
+                        directions.push((p.lerp(q, part) - origin).normalize());
+                    }
+                }
+            }
+            let mut hits = vec![Hit::MISS; directions.len()];
+            scene.cast(origin, &directions, &mut hits);
+            let misses = hits.iter().filter(|&&hit| hit == Hit::MISS).count();
+            assert_eq!(misses, 0, "of {} rays at edges", hits.len());
+        }
+    }
+}
+
+#[test]
+fn rays_along_the_axes_meet_a_floor_of_squares_also_between_them() {
+    let mut mesh = TriangleMesh::default();
+    for (x, y) in (-4..4).flat_map(|x| (-4..4).map(move |y| (x as f32, y as f32))) {
+        let first = mesh.vertices.len() as u32;
+        let corners = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)];
+        mesh.vertices
+            .extend(corners.map(|(right, up)| Vec3::new(x + right, y + up, -1.0)));
+        mesh.triangles
+            .extend([[0, 1, 2], [0, 2, 3]].map(|triangle| triangle.map(|v: u32| v + first)));
+    }
+    let scene = Scene::new(&mesh);
+    for (x, y) in (-3..4).flat_map(|x| (-6..7).map(move |y| (x as f32, 0.5 * y as f32))) {
+        for slope in [Vec3::ZERO, Vec3::X, Vec3::NEG_X] {
+            let direction = Vec3::NEG_Z + 0.5 * slope;
+            let range_m = cast_one(&scene, Vec3::new(x, y, 0.0), direction).range_m;
+            assert!(
+                (range_m - direction.length()).abs() < 1e-6,
+                "{x} {y} {slope}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_ray_that_starts_on_a_surface_meets_the_next_one() {
+    let mesh = cube(0.5);
+    let scene = Scene::new(&mesh);
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    for _ in 0..200 {
+        let (y, z) = (rng.random_range(-0.4..0.4), rng.random_range(-0.4..0.4));
+        let start = Vec3::new(-0.5, y, z);
+        let across = cast_one(&scene, start, Vec3::X);
+        assert!((across.range_m - 1.0).abs() < 1e-6, "{across:?}");
+        assert_eq!(cast_one(&scene, start, Vec3::NEG_X), Hit::MISS);
+    }
+}
+
+#[test]
+fn triangles_that_are_none_are_never_met() {
+    let mut mesh = cube(0.5);
+    let proper = mesh.triangles.len() as u32;
+    let nan = mesh.vertices.len() as u32;
+    let bad = [
+        Vec3::NAN,
+        Vec3::INFINITY,
+        Vec3::new(0.0, 0.0, f32::NEG_INFINITY),
+    ];
+    mesh.vertices.extend(bad);
+    let line = mesh.vertices.len() as u32;
+    mesh.vertices.extend([0.1, 0.2, 0.3].map(Vec3::splat));
+    for vertex in nan..line {
+        mesh.triangles.push([0, 1, vertex]);
+    }
+    mesh.triangles
+        .extend([[0, 0, 1], [2, 2, 2], [line, line + 1, line + 2]]);
+    let scene = Scene::new(&mesh);
+    for target in [0.1, 0.2, 0.3].map(Vec3::splat) {
+        let origin = Vec3::new(0.4, -0.3, 0.2);
+        assert!(cast_one(&scene, origin, target - origin).triangle < proper);
+    }
+    assert_eq!(scene.normal(proper), None);
+    assert!((scene.normal(0).unwrap().abs().max_element() - 1.0).abs() < 1e-6);
+}
+
+#[test]
+fn nothing_is_met_where_nothing_is() {
+    let scenes = [
+        Scene::new(&TriangleMesh::default()),
+        Scene::of_tiles(&[]),
+        Scene::of_tiles(&[TriangleMesh::default(), TriangleMesh::default()]),
+    ];
+    for scene in scenes {
+        assert_eq!(cast_one(&scene, Vec3::ZERO, Vec3::X), Hit::MISS);
+        scene.cast(Vec3::ZERO, &[], &mut []);
+    }
+}
+
+#[test]
+fn the_triangles_of_tiles_are_counted_one_after_the_other() {
+    let mut small = cube(1.0);
+    small.triangles.truncate(2);
+    let scene = Scene::of_tiles(&[small, TriangleMesh::default(), cube(2.0)]);
+    let below = cast_one(&scene, Vec3::ZERO, Vec3::new(0.1, 0.2, -1.0));
+    assert!(below.triangle < 2 && below.range_m < 1.1, "{below:?}");
+    let above = cast_one(&scene, Vec3::ZERO, Vec3::new(0.1, 0.2, 1.0));
+    assert!((4..6).contains(&above.triangle), "{above:?}");
+}
+
+#[test]
+fn a_ray_looks_no_farther_than_it_should() {
+    let scene = Scene::new(&cube(2.0));
+    for (max_range_m, is_met) in [(1.9, false), (2.0, false), (2.1, true)] {
+        let mut hits = [Hit::MISS];
+        scene.cast_until(Vec3::ZERO, &[Vec3::X], max_range_m, &mut hits);
+        assert_eq!(hits[0] != Hit::MISS, is_met);
+    }
+}
+
+#[test]
+fn where_any_near_surface_is_enough_one_is_found() {
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    let scene = Scene::new(&soup(500, 2.0, &mut rng));
+    let directions: Vec<Vec3> = (0..800).map(|_| direction(&mut rng)).collect();
+    let mut nearest = vec![Hit::MISS; directions.len()];
+    scene.cast(Vec3::ZERO, &directions, &mut nearest);
+    let reach = Reach {
+        until_m: f32::INFINITY,
+        enough_m: 6.0,
+    };
+    let mut hits = nearest.clone();
+    let reaches = vec![reach; directions.len()];
+    scene.cast_within(Vec3::ZERO.as_dvec3(), &directions, &reaches, &mut hits);
+    for (hit, nearest) in hits.iter().zip(&nearest) {
+        if nearest.range_m < reach.enough_m {
+            assert!((nearest.range_m..reach.enough_m).contains(&hit.range_m));
+        } else {
+            assert_eq!(hit, nearest);
+        }
+    }
+    assert_ne!(hits, nearest);
+}
+
+#[test]
+fn every_instruction_set_gives_the_same_bits() {
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    let scene = Scene::of_tiles(&[soup(3000, 0.7, &mut rng), soup(300, 2.0, &mut rng)]);
+    for _ in 0..20 {
+        let origin = 10.0 * in_cube(&mut rng).as_dvec3();
+        let directions: Vec<Vec3> = (0..333).map(|_| direction(&mut rng)).collect();
+        let reach = vec![Reach::UNLIMITED; directions.len()];
+        let mut fast = vec![Hit::MISS; directions.len()];
+        let mut portable = fast.clone();
+        scene.cast_within(origin, &directions, &reach, &mut fast);
+        scene.cast_portable(origin, &directions, &reach, &mut portable);
+        let bits = |hits: &[Hit]| -> Vec<(u32, u32)> {
+            hits.iter()
+                .map(|hit| (hit.range_m.to_bits(), hit.triangle))
+                .collect()
+        };
+        assert_eq!(bits(&fast), bits(&portable));
+    }
+}
+
+#[test]
+fn what_a_ray_meets_does_not_depend_on_its_neighbours() {
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    let scene = Scene::new(&soup(2000, 1.0, &mut rng));
+    let directions: Vec<Vec3> = (0..400).map(|_| direction(&mut rng)).collect();
+    let mut hits = vec![Hit::MISS; directions.len()];
+    scene.cast(Vec3::ONE, &directions, &mut hits);
+    for (&direction, &hit) in directions.iter().zip(&hits) {
+        let mut alone = [Hit::MISS];
+        scene.cast(Vec3::ONE, &[direction], &mut alone);
+        assert_eq!(alone[0], hit);
+    }
+}
+
+#[test]
+fn centroids_that_coincide_or_lie_ever_closer_make_no_tree_too_deep() {
+    let mut mesh = TriangleMesh::default();
+    for number in 0..300 {
+        let scale = if number < 150 {
+            1.0
+        } else {
+            0.5_f32.powi(number - 150)
+        };
+        let first = mesh.vertices.len() as u32;
+        let corners = [Vec3::X, Vec3::Y, Vec3::Z];
+        mesh.vertices.extend(corners.map(|corner| scale * corner));
+        mesh.triangles.push([first, first + 1, first + 2]);
+    }
+    let scene = Scene::new(&mesh);
+    let hit = cast_one(&scene, Vec3::ONE, -Vec3::ONE);
+    assert!((hit.range_m - 2.0 / 3.0_f32.sqrt()).abs() < 1e-6);
+}

@@ -218,11 +218,12 @@ fn deciding_reach(measured_m: f32, difference: &RangeDifference) -> Reach {
     }
 }
 
-/// Pixels in blocks of four columns and two rows.
+/// Pixels in blocks of four columns and two rows, the blocks column by column: what lies in one
+/// direction stays in the cache.
 fn pixel_order(model: &LidarModel) -> Vec<u32> {
     let mut order: Vec<u32> = Vec::with_capacity(model.len());
-    for top in (0..model.height).step_by(2) {
-        for left in (0..model.width).step_by(4) {
+    for left in (0..model.width).step_by(4) {
+        for top in (0..model.height).step_by(2) {
             for row in top..model.height.min(top + 2) {
                 for column in left..model.width.min(left + 4) {
                     order.push(model.index_of(Pixel { row, column }) as u32);

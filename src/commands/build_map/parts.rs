@@ -137,7 +137,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
         let parts = Parts::open(&map, "inputs").unwrap();
-        parts.save(0, &triangle(0.5), &LocalMapCounts::default()).unwrap();
+        parts
+            .save(0, &triangle(0.5), &LocalMapCounts::default())
+            .unwrap();
         assert_eq!(Parts::open(&map, "others").unwrap().finished(0), None);
     }
 
@@ -146,7 +148,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
         let parts = Parts::open(&map, "inputs").unwrap();
-        parts.save(0, &triangle(0.5), &LocalMapCounts::default()).unwrap();
+        parts
+            .save(0, &triangle(0.5), &LocalMapCounts::default())
+            .unwrap();
         fs::remove_file(parts.counts_file(0)).unwrap();
         assert_eq!(parts.finished(0), None);
     }

@@ -1,0 +1,313 @@
+//! `build-map`: from scans with poses to a triangle-mesh map.
+
+mod parts;
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::time::Instant;
+
+use anyhow::{Context as _, Result};
+use serde::Serialize;
+
+use self::parts::Parts;
+use super::interrupt::Interrupted;
+use super::{Context, output, stages};
+use crate::config::{self, BuildMapConfig};
+use crate::geometry::{TriangleMesh, planar};
+
+use crate::kitti::{Frame, Sequence};
+use crate::map::local_map::{self, LocalMapCounts, LocalMapError, Watcher};
+use crate::map::plan::{self, LocalMapPlan, Ownership};
+use crate::map::ply;
+use crate::map::quality::{self, MapQuality};
+use crate::plotting::MapPlot;
+
+/// What a build did, as it stands in the report.
+#[derive(Debug, Serialize)]
+pub struct BuildReport {
+    /// Frames that were looked at.
+    pub frames: usize,
+    /// Frames in which the car had moved, and which are not held back.
+    pub mapped_frames: usize,
+    /// Frames held back for judging the map.
+    pub held_out_frames: usize,
+    /// Path of the mapped frames [m].
+    pub path_m: f64,
+    /// Triangles of the map.
+    pub triangles: usize,
+    /// Size of the map's file [MB].
+    pub map_mb: f64,
+    /// Wall time of the whole build [s].
+    pub seconds: f64,
+    /// Wall time per stage, summed over the local maps made in this run [s].
+    pub stage_seconds: BTreeMap<String, f64>,
+    /// The map along the beams of the frames held back.
+    pub quality: Option<MapQuality>,
+    /// What happened to points and triangles, per local map.
+    pub local_maps: Vec<LocalMapCounts>,
+}
+
+/// Builds the map that a configuration describes.
+pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
+    let started = Instant::now();
+    output::prepare(&config.mesh_file, "mesh_file", config.force)?;
+    let sequence = Sequence::open(
+        &config.scan_folder,
+        &config.pose_file,
+        &config.calib_file,
+        &config.selection(),
+    )?;
+    let (mapped, held_out) = hold_out(&sequence.frames, config);
+    let plans = plan::local_maps(&mapped, config.local_map_size, config.overlap_m);
+    let parts = Parts::open(&config.mesh_file, &inputs(config, &mapped)?)?;
+
+    let clock = StageClock::default();
+    let local_maps = build_parts(config, context, &mapped, &plans, &parts, &clock)?;
+    let mesh = clock.time("join", || parts.join(plans.len()))?;
+    let settings = config.local_map_settings();
+    let residuals = clock.time("quality", || {
+        quality::residuals(&mesh, &held_out, &settings.scan)
+    })?;
+    write_map(config, &mesh)?;
+    if config.visualize {
+        let picture = beside(&config.mesh_file, "png");
+        let driven: Vec<_> = mapped.iter().map(|f| planar(&f.map_from_lidar)).collect();
+        MapPlot {
+            title: "Map from above",
+            mesh: &mesh,
+            trajectory: Some(&driven),
+            ground_color: settings.ground_color,
+            rest_color: settings.rest_color,
+        }
+        .save(&picture)?;
+        tracing::info!("drew {}", picture.display());
+    }
+    let report = BuildReport {
+        frames: sequence.frames.len(),
+        mapped_frames: mapped.len(),
+        held_out_frames: held_out.len(),
+        path_m: path_m(&mapped),
+        triangles: mesh.triangles.len(),
+        map_mb: std::fs::metadata(&config.mesh_file).map_or(0.0, |meta| meta.len() as f64 / 1e6),
+        seconds: started.elapsed().as_secs_f64(),
+        stage_seconds: clock.seconds(),
+        quality: MapQuality::of(&residuals),
+        local_maps,
+    };
+    output::write_json(&beside(&config.mesh_file, "report.json"), &report)?;
+    config::write(&beside(&config.mesh_file, "yml"), config)?;
+    parts.remove()?;
+    Ok(report)
+}
+
+/// Builds the local maps that are not finished yet; returns the counts of all.
+fn build_parts(
+    config: &BuildMapConfig,
+    context: &Context,
+    frames: &[Frame],
+    plans: &[LocalMapPlan],
+    parts: &Parts,
+    clock: &StageClock,
+) -> Result<Vec<LocalMapCounts>> {
+    let settings = config.local_map_settings();
+    let classifier = stages::ground_classifier(config)?;
+    let reach_m = f64::from(settings.scan.crop_m.length());
+    let ownership = Ownership::new(frames, plans, reach_m);
+    let scans = plans.iter().map(|plan| plan.used.len()).sum();
+    let task = context.progress.task("build-map", scans);
+    let mut all = Vec::with_capacity(plans.len());
+    for plan in plans {
+        if let Some(counts) = parts.finished(plan.number) {
+            tracing::info!(
+                "local map {} of {} is there already",
+                plan.number + 1,
+                plans.len()
+            );
+            task.advance(counts.scans);
+            all.push(counts);
+            continue;
+        }
+        let stage = |name: &'static str| {
+            task.note(name);
+            clock.begin(name);
+        };
+        let watcher = Watcher {
+            scan_done: &|| task.advance(1),
+            stage: &stage,
+            cancelled: &|| context.interrupt.requested(),
+        };
+        let built = local_map::build(frames, plan, &ownership, &settings, &*classifier, &watcher);
+        clock.end();
+        let (mesh, counts) = built.map_err(|error| told(error, all.len(), plans.len(), parts))?;
+        parts.save(plan.number, &mesh, &counts)?;
+        all.push(counts);
+    }
+    Ok(all)
+}
+
+/// An interrupted build says what it keeps.
+fn told(error: LocalMapError, finished: usize, all: usize, parts: &Parts) -> anyhow::Error {
+    match error {
+        LocalMapError::Interrupted => anyhow::Error::new(Interrupted {
+            kept: format!(
+                "{finished} of {all} local maps are finished and kept in {}; run the same command again to go on from there",
+                parts.folder().display()
+            ),
+        }),
+        error => error.into(),
+    }
+}
+
+/// The frames that build the map, and those that judge it.
+fn hold_out(frames: &[Frame], config: &BuildMapConfig) -> (Vec<Frame>, Vec<Frame>) {
+    let counted = plan::counted_frames(frames, config.displacement_threshold_m);
+    let is_held = |index: usize| {
+        config.holdout_step > 0 && index % config.holdout_step == config.holdout_step - 1
+    };
+    let (held, mapped): (Vec<_>, Vec<_>) = counted
+        .into_iter()
+        .enumerate()
+        .partition(|(index, _)| is_held(*index));
+    let strip = |frames: Vec<(usize, Frame)>| frames.into_iter().map(|(_, frame)| frame).collect();
+    (strip(mapped), strip(held))
+}
+
+/// What the local maps depend on: the configuration without where results go, and the scans.
+fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
+    let relevant = BuildMapConfig {
+        mesh_file: PathBuf::new(),
+        visualize: false,
+        force: false,
+        ..config.clone()
+    };
+    let mut text = config::to_yaml(&relevant)?;
+    for frame in frames {
+        let bytes = std::fs::metadata(&frame.scan_path).map_or(0, |meta| meta.len());
+        let t = frame.map_from_lidar.translation.vector;
+        writeln!(
+            text,
+            "{} {bytes} {} {} {}",
+            frame.scan_path.display(),
+            t.x,
+            t.y,
+            t.z
+        )?;
+    }
+    Ok(text)
+}
+
+/// Writes the map under a temporary name and renames it.
+fn write_map(config: &BuildMapConfig, mesh: &TriangleMesh) -> Result<()> {
+    anyhow::ensure!(
+        !mesh.triangles.is_empty(),
+        "the map has no triangles: nothing of the scans in {} was left to mesh; check range_image, crop_x, crop_y and crop_z",
+        config.scan_folder.display()
+    );
+    let temporary = beside(&config.mesh_file, "unfinished.ply");
+    ply::write(&temporary, mesh)?;
+    std::fs::rename(&temporary, &config.mesh_file)
+        .with_context(|| format!("cannot write {}", config.mesh_file.display()))
+}
+
+/// `results/map.ply` -> `results/map.<extension>`.
+fn beside(mesh_file: &Path, extension: &str) -> PathBuf {
+    mesh_file.with_extension(extension)
+}
+
+fn path_m(frames: &[Frame]) -> f64 {
+    let position = |frame: &Frame| frame.map_from_lidar.translation.vector;
+    frames
+        .windows(2)
+        .map(|pair| (position(&pair[1]) - position(&pair[0])).norm())
+        .sum()
+}
+
+/// Wall time per stage.
+#[derive(Default)]
+struct StageClock {
+    state: Mutex<ClockState>,
+}
+
+#[derive(Default)]
+struct ClockState {
+    running: Option<(&'static str, Instant)>,
+    seconds: BTreeMap<String, f64>,
+}
+
+impl ClockState {
+    fn stop(&mut self) {
+        if let Some((name, since)) = self.running.take() {
+            *self.seconds.entry(name.to_owned()).or_default() += since.elapsed().as_secs_f64();
+        }
+    }
+}
+
+impl StageClock {
+    fn begin(&self, name: &'static str) {
+        if let Ok(mut state) = self.state.lock() {
+            state.stop();
+            state.running = Some((name, Instant::now()));
+        }
+    }
+
+    fn end(&self) {
+        if let Ok(mut state) = self.state.lock() {
+            state.stop();
+        }
+    }
+
+    fn time<T>(&self, name: &'static str, work: impl FnOnce() -> T) -> T {
+        self.begin(name);
+        let result = work();
+        self.end();
+        result
+    }
+
+    fn seconds(&self) -> BTreeMap<String, f64> {
+        self.state
+            .lock()
+            .map_or_else(|_poisoned| BTreeMap::new(), |state| state.seconds.clone())
+    }
+}
+
+impl BuildReport {
+    /// The table on standard output.
+    pub fn table(&self) -> String {
+        let mut rows = vec![
+            (
+                "scans",
+                format!("{} of {}", self.mapped_frames, self.frames),
+            ),
+            ("path", format!("{:.1} m", self.path_m)),
+            ("time", format!("{:.1} s", self.seconds)),
+            (
+                "rate",
+                format!("{:.1} scans/s", self.mapped_frames as f64 / self.seconds),
+            ),
+            ("triangles", self.triangles.to_string()),
+            ("size", format!("{:.1} MB", self.map_mb)),
+        ];
+        if let Some(quality) = &self.quality {
+            let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+            rows.extend([
+                ("beams judged", quality.beams.to_string()),
+                ("early", percent(quality.early)),
+                ("late", percent(quality.late)),
+                ("miss", percent(quality.miss)),
+                (
+                    "beam-plane median",
+                    format!("{:.1} cm", 100.0 * quality.beam_plane_median_m),
+                ),
+                (
+                    "beam-plane within 10 cm",
+                    percent(quality.beam_plane_within_10cm),
+                ),
+            ]);
+        }
+        rows.iter()
+            .map(|(name, value)| format!("{name:<24} {value:>14}\n"))
+            .collect()
+    }
+}

@@ -1,0 +1,278 @@
+//! `refine`: the trajectory of `localize` polished frame by frame, then smoothed as a whole.
+
+use std::time::Instant;
+
+use anyhow::{Context as _, Result, ensure};
+use nalgebra::Matrix3;
+use rand::SeedableRng as _;
+use rand_chacha::ChaCha8Rng;
+
+use super::interrupt::Interrupted;
+use super::run_output::{self, RunFiles};
+use super::stages::{LoadedMap, Observer};
+use super::{Context, odometry};
+use crate::config::{self, OdometrySource, RefinementConfig};
+use crate::evaluation::{LocalizationResults, RangeMclRules, Report};
+use crate::geometry::{Pose2, Pose3};
+use crate::ground::{FuzzyConfig, FuzzyGround};
+use crate::kitti::{Frame, Sequence};
+use crate::localization::State;
+use crate::localization::observation::choose_beams;
+use crate::map::Stance;
+use crate::refinement::{FrameObjective, FramePrior, refine_frame, smooth};
+
+/// Refines the result that a configuration names, and adds the refined trajectory to it.
+pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
+    let mut results = LocalizationResults::read(&config.result_file)?;
+    ensure!(
+        results.refined.is_none() || config.force,
+        "{} has refined poses already; add --force to replace them",
+        config.result_file.display()
+    );
+    let map = LoadedMap::load(
+        &config.map_file,
+        &config.map_pose_file,
+        &config.map_calib_file,
+        context,
+    )?;
+    let sequence = matching(
+        map.sequence(
+            &config.scan_folder,
+            &config.pose_file,
+            &config.calib_file,
+            &config.selection(),
+        )?,
+        &results,
+        config,
+    )?;
+    let estimates = match results.estimates.take() {
+        Some(estimates) => estimates,
+        None => RangeMclRules::default().estimates(&results)?,
+    };
+    let polished = polish_all(config, context, &map, &sequence, &results, &estimates)?;
+    let smoothed = smooth_all(config, &sequence, &results, &polished)?;
+    let lifted = lift_all(&map, &smoothed, &polished);
+
+    results.estimates = Some(estimates);
+    results.refined = Some(smoothed);
+    results.refine_runtimes_s = Some(polished.iter().map(|frame| frame.seconds).collect());
+    let files = RunFiles::beside(&config.result_file);
+    run_output::write_results(&files, &results)?;
+    run_output::write_trajectory(&files, "refined", &sequence, &lifted)?;
+    config::write(&files.file("refinement.yml"), config)?;
+    let about = [
+        ("recording", config.scan_folder.display().to_string()),
+        ("map", config.map_file.display().to_string()),
+        ("renderer", map.renderer.name()),
+        ("seed", config.seed.to_string()),
+    ]
+    .map(|(key, value)| (key.to_owned(), value));
+    let report = run_output::judge(&results, &RangeMclRules::default(), about.into())?;
+    run_output::write_report(&files, &results, &report)?;
+    if config.plot_loc_results {
+        run_output::draw_run(&files, Some(&map), &results)?;
+    }
+    Ok(report)
+}
+
+/// The frames of the sequence that the result has, in its order.
+fn matching(
+    mut sequence: Sequence,
+    results: &LocalizationResults,
+    config: &RefinementConfig,
+) -> Result<Sequence> {
+    sequence
+        .frames
+        .retain(|frame| results.frames.binary_search(&frame.number).is_ok());
+    ensure!(
+        sequence.frames.len() == results.len(),
+        "{} has {} frames, of which {} are selected by start_idx, n_scans and frame_step; choose the frames that were localized",
+        config.result_file.display(),
+        results.len(),
+        sequence.frames.len()
+    );
+    Ok(sequence)
+}
+
+/// A frame after the swarm and the finishing step.
+struct Polished {
+    pose: Pose2,
+    /// What the frame says about its pose; nothing before convergence.
+    prior: Option<FramePrior>,
+    stance: Stance,
+    seconds: f64,
+}
+
+fn polish_all(
+    config: &RefinementConfig,
+    context: &Context,
+    map: &LoadedMap,
+    sequence: &Sequence,
+    results: &LocalizationResults,
+    estimates: &[Pose2],
+) -> Result<Vec<Polished>> {
+    let classifier = FuzzyGround::new(FuzzyConfig::default())?;
+    let observer = Observer {
+        model: config.range_image,
+        own_car_m: config.own_car_m,
+        classifier: &classifier,
+    };
+    let task = context.progress.task("refine", sequence.frames.len());
+    let mut polished: Vec<Polished> = Vec::with_capacity(sequence.frames.len());
+    let mut skipped = 0;
+    for (row, frame) in sequence.frames.iter().enumerate() {
+        if context.interrupt.requested() {
+            let kept = format!(
+                "{} is as it was: a trajectory is refined whole or not at all",
+                config.result_file.display()
+            );
+            return Err(Interrupted { kept }.into());
+        }
+        let before = polished
+            .last()
+            .map_or_else(Stance::default, |last| last.stance);
+        let start = Start {
+            estimate: estimates[row],
+            covariance: results.covariances.as_ref().map(|all| all[row]),
+            is_found: is_found(results, row),
+        };
+        skipped += usize::from(!start.is_found);
+        let seed = ChaCha8Rng::seed_from_u64(config.seed);
+        polished.push(polish(
+            config, map, &observer, frame, &start, before, seed, row,
+        )?);
+        task.advance(1);
+    }
+    if skipped > 0 {
+        tracing::info!("{skipped} frames before convergence are not refined, only smoothed");
+    }
+    Ok(polished)
+}
+
+/// Where a frame's refinement begins.
+struct Start {
+    estimate: Pose2,
+    covariance: Option<Matrix3<f64>>,
+    is_found: bool,
+}
+
+/// Whether the filter was sure; results that do not say are taken at their word.
+fn is_found(results: &LocalizationResults, row: usize) -> bool {
+    results
+        .states
+        .as_ref()
+        .is_none_or(|states| states[row] == State::Tracking as u8)
+}
+
+#[expect(
+    clippy::too_many_arguments,
+    reason = "one frame with all that it needs"
+)]
+fn polish(
+    config: &RefinementConfig,
+    map: &LoadedMap,
+    observer: &Observer,
+    frame: &Frame,
+    start: &Start,
+    stance_before: Stance,
+    mut rng: ChaCha8Rng,
+    row: usize,
+) -> Result<Polished> {
+    rng.set_stream(row as u64);
+    let points = observer.read(frame)?;
+    let started = Instant::now();
+    let observed = observer.observe(points);
+    let stance = observed.stance.unwrap_or(stance_before);
+    let refined = if start.is_found {
+        let observation = &config.observation;
+        let beams = choose_beams(
+            &observed.image,
+            observation.beams,
+            observation.road_share,
+            &stance,
+            &mut rng,
+        );
+        let objective = FrameObjective {
+            renderer: &*map.renderer,
+            ground: &map.ground,
+            beams: &beams,
+            stance,
+            difference: observation.difference(),
+        };
+        let covariance = start
+            .covariance
+            .unwrap_or_else(|| Matrix3::from_diagonal(&nalgebra::Vector3::new(0.04, 0.04, 1e-4)));
+        refine_frame(
+            &objective,
+            &start.estimate,
+            &covariance,
+            &config.refinement,
+            &mut rng,
+        )?
+    } else {
+        None
+    };
+    Ok(Polished {
+        pose: refined.as_ref().map_or(start.estimate, |frame| frame.pose),
+        prior: refined.map(|frame| FramePrior {
+            pose: frame.pose,
+            covariance: frame.covariance,
+        }),
+        stance,
+        seconds: started.elapsed().as_secs_f64(),
+    })
+}
+
+/// Smooths the whole trajectory with the odometry between its frames; without odometry every frame
+/// stays where its scan puts it.
+fn smooth_all(
+    config: &RefinementConfig,
+    sequence: &Sequence,
+    results: &LocalizationResults,
+    polished: &[Polished],
+) -> Result<Vec<Pose2>> {
+    let poses: Vec<Pose2> = polished.iter().map(|frame| frame.pose).collect();
+    let increments = match (&results.odometry, config.odometry) {
+        (_, OdometrySource::None) => return Ok(poses),
+        (Some(recorded), OdometrySource::GroundTruth) => recorded.clone(),
+        _ => {
+            let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
+            rng.set_stream(u64::MAX);
+            odometry::read_increments(
+                config.odometry,
+                config.odometry_file.as_deref(),
+                sequence,
+                &mut rng,
+            )?
+            .into_iter()
+            .collect::<Option<Vec<_>>>()
+            .context("the odometry has gaps")?
+        }
+    };
+    let priors: Vec<Option<FramePrior>> = polished.iter().map(|frame| frame.prior).collect();
+    if priors.iter().all(Option::is_none) {
+        return Ok(poses);
+    }
+    Ok(smooth(
+        &poses,
+        &priors,
+        &increments,
+        &config.refinement.smoothing,
+    ))
+}
+
+/// The refined poses standing on the map's ground, or on the last ground that there was.
+fn lift_all(map: &LoadedMap, poses: &[Pose2], polished: &[Polished]) -> Vec<Pose3> {
+    let mut patch = None;
+    poses
+        .iter()
+        .zip(polished)
+        .map(|(pose, frame)| {
+            patch = map.ground.patch_under(pose).or(patch);
+            match &patch {
+                Some(patch) => patch.lift(pose, &frame.stance),
+                None => crate::geometry::spatial(pose, 0.0),
+            }
+        })
+        .collect()
+}

@@ -1,0 +1,176 @@
+//! What several commands begin with: the map with its renderer, and a recording seen in it.
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result};
+
+use super::Context;
+use crate::config::BuildMapConfig;
+use crate::geometry::{Pose3, TriangleMesh, Vec3};
+use crate::ground::{GroundClassifier, road_plane};
+use crate::kitti::{Frame, KittiError, MapFrame, Sequence};
+use crate::lidar::{LidarModel, RangeImage};
+use crate::map::{GroundMap, Stance, TileConfig, TileGrid, ply, tiles};
+#[cfg(feature = "gpu")]
+use crate::rendering::backend::AdapterChoice;
+use crate::rendering::backend::{self, Backend, Target};
+#[cfg(feature = "gpu")]
+use crate::rendering::gpu::GpuRenderer;
+use crate::rendering::{CpuRenderer, RangeRenderer};
+
+/// Edge of the cells of the ground's elevation [m].
+const GROUND_CELL_M: f64 = 0.5;
+
+/// The classifier that a configuration names.
+pub fn ground_classifier(config: &BuildMapConfig) -> Result<Box<dyn GroundClassifier>> {
+    let classifier = config
+        .ground_method
+        .classifier(&config.fuzzy, &config.pca, &config.ransac());
+    classifier.context("fuzzy: the rules of the ground")
+}
+
+/// A map ready to be looked at.
+pub struct LoadedMap {
+    /// All of it.
+    pub mesh: TriangleMesh,
+    /// Where it is.
+    pub frame: MapFrame,
+    /// The poses that it was built with, `map_from_lidar`.
+    pub mapping_poses: Vec<Pose3>,
+    /// Its tiles.
+    pub grid: TileGrid,
+    /// Its ground.
+    pub ground: GroundMap,
+    /// Shows it.
+    pub renderer: Box<dyn RangeRenderer>,
+}
+
+impl LoadedMap {
+    /// Reads a map and the poses that it was built with, and makes it ready on the backend that the
+    /// user asked for.
+    pub fn load(
+        map_file: &Path,
+        map_pose_file: &Path,
+        map_calib_file: &Path,
+        context: &Context,
+    ) -> Result<Self> {
+        let mesh = ply::read(map_file)?;
+        let frame = MapFrame::read(map_pose_file, map_calib_file)
+            .context("map_pose_file and map_calib_file say where the map is")?;
+        let mapping_poses = crate::kitti::poses::CameraPoses::read(map_pose_file)?
+            .map_from_lidar(&frame.calibration);
+        let grid = TileGrid::around(&mapping_poses, &TileConfig::default());
+        let ground = ground_of(&mesh);
+        let renderer = renderer(&tiles::cut(&mesh, &grid), context)?;
+        tracing::info!(
+            "map {}: {} triangles in {} tiles, rendered by {}",
+            map_file.display(),
+            mesh.triangles.len(),
+            grid.len(),
+            renderer.name()
+        );
+        Ok(Self {
+            mesh,
+            frame,
+            mapping_poses,
+            grid,
+            ground,
+            renderer,
+        })
+    }
+
+    /// The selected frames of a recording with their poses in this map.
+    pub fn sequence(
+        &self,
+        scan_folder: &Path,
+        pose_file: &Path,
+        calib_file: &Path,
+        selection: &crate::kitti::Selection,
+    ) -> Result<Sequence> {
+        Ok(Sequence::open(scan_folder, pose_file, calib_file, selection)?.in_map(&self.frame))
+    }
+}
+
+/// The ground of a map: its red triangles; in a map without colours, all that look up.
+fn ground_of(mesh: &TriangleMesh) -> GroundMap {
+    let is_red = |triangle: usize| {
+        mesh.triangles[triangle].iter().all(|&vertex| {
+            mesh.colors
+                .get(vertex as usize)
+                .is_some_and(|[red, _, blue]| red > blue)
+        })
+    };
+    if (0..mesh.triangles.len()).any(is_red) {
+        return GroundMap::from_mesh(mesh, is_red, GROUND_CELL_M);
+    }
+    tracing::warn!("no ground is marked in the map (red); taking every level surface for ground");
+    let is_level =
+        |triangle: usize| mesh.scaled_normal(triangle).normalize_or_zero().z.abs() > 0.97;
+    GroundMap::from_mesh(mesh, is_level, GROUND_CELL_M)
+}
+
+fn renderer(tiles: &[TriangleMesh], context: &Context) -> Result<Box<dyn RangeRenderer>> {
+    let choice = backend::choose(context.backend)?;
+    tracing::info!("rendering on {} because {}", choice.name, choice.reason);
+    match choice.target {
+        Target::Cpu => Ok(Box::new(CpuRenderer::new(tiles))),
+        Target::Gpu(_) => on_graphics_adapter(tiles, context.backend),
+    }
+}
+
+#[cfg(feature = "gpu")]
+fn on_graphics_adapter(tiles: &[TriangleMesh], wanted: Backend) -> Result<Box<dyn RangeRenderer>> {
+    let adapters = match wanted {
+        Backend::Gpu => AdapterChoice::Any,
+        Backend::Auto | Backend::Cpu => AdapterChoice::Hardware,
+    };
+    Ok(Box::new(GpuRenderer::new(tiles, adapters)?))
+}
+
+#[cfg(not(feature = "gpu"))]
+fn on_graphics_adapter(_: &[TriangleMesh], _: Backend) -> Result<Box<dyn RangeRenderer>> {
+    Err(crate::rendering::RenderError::NoAdapter.into())
+}
+
+/// What a frame shows: its range image, and how the sensor stands over the road.
+pub struct Observed {
+    /// The scan as an image.
+    pub image: RangeImage,
+    /// From the scan's own ground; `None` where too little of it is seen.
+    pub stance: Option<Stance>,
+}
+
+/// Makes scans into observations.
+pub struct Observer<'a> {
+    /// Projection and limits.
+    pub model: LidarModel,
+    /// The own car, as in [`ScanSettings`](crate::map::scan_cloud::ScanSettings).
+    pub own_car_m: [f32; 4],
+    /// Tells the road.
+    pub classifier: &'a dyn GroundClassifier,
+}
+
+impl Observer<'_> {
+    /// Reads a frame without looking at it.
+    pub fn read(&self, frame: &Frame) -> Result<Vec<Vec3>, KittiError> {
+        Ok(frame.read()?.points)
+    }
+
+    /// Looks at the points of a scan.
+    pub fn observe(&self, mut points: Vec<Vec3>) -> Observed {
+        let [x_min, x_max, y_min, y_max] = self.own_car_m;
+        points.retain(|p| {
+            let on_own_car = p.x > x_min && p.x < x_max && p.y > y_min && p.y < y_max;
+            p.is_finite() && self.model.accepts_range(p.length()) && !on_own_car
+        });
+        let image = RangeImage::project(&points, &self.model);
+        let seen: Vec<Vec3> = (0..image.ranges.len())
+            .filter(|&index| image.has_return(index))
+            .map(|index| image.points[index])
+            .collect();
+        let ground = self.classifier.ground_confidence(&seen);
+        let stance =
+            road_plane(&seen, &ground).map(|plane| Stance::from_plane(plane.up, plane.height_m));
+        Observed { image, stance }
+    }
+}

@@ -1,0 +1,141 @@
+//! The oriented points as the solver sees them: inside the unit cube and in Morton order.
+
+use glam::Vec3;
+use rayon::prelude::*;
+
+use super::{MeshingError, morton};
+use crate::geometry::{Aabb, PointCloud};
+
+/// Where the unit cube of the solver lies in the frame of the cloud.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Domain {
+    /// Lower corner [m].
+    pub origin: Vec3,
+    /// Edge [m].
+    pub side_m: f32,
+}
+
+impl Domain {
+    /// A point of the unit cube in the frame of the cloud [m].
+    pub fn to_metres(self, unit: [f32; 3]) -> Vec3 {
+        self.origin + self.side_m * Vec3::from(unit)
+    }
+}
+
+/// Points in the unit cube, sorted by the Morton code of their cell.
+pub struct Samples {
+    /// Number of halvings of the cube down to the cells of the codes.
+    pub depth: u32,
+    /// Morton codes, ascending.
+    pub codes: Vec<u64>,
+    /// Positions in the unit cube.
+    pub positions: Vec<[f32; 3]>,
+    /// Unit normals.
+    pub normals: Vec<[f32; 3]>,
+    /// How many points each stands for.
+    pub weights: Vec<f32>,
+    /// Where the cube lies.
+    pub domain: Domain,
+    /// Points that were left out: not finite, without a normal, or without weight.
+    pub dropped: usize,
+}
+
+impl Samples {
+    /// Below this many points there is no surface to speak of.
+    const MIN_POINTS: usize = 4;
+
+    /// Takes the usable points of a cloud; the cube is `scale` times their bounding box.
+    pub fn new(
+        cloud: &PointCloud,
+        weights: Option<&[f32]>,
+        depth: u32,
+        scale: f32,
+    ) -> Result<Self, MeshingError> {
+        if let Some(weights) = weights
+            && weights.len() != cloud.len()
+        {
+            return Err(MeshingError::WeightsDoNotMatch {
+                points: cloud.len(),
+                weights: weights.len(),
+            });
+        }
+        let weight = |index: usize| weights.map_or(1.0, |weights| weights[index]);
+        let usable: Vec<u32> = (0..cloud.len())
+            .filter(|&index| is_usable(cloud, index, weight(index)))
+            .map(|index| index as u32)
+            .collect();
+        let at = |index: u32| cloud.positions[index as usize];
+        let bounds = Aabb::of(usable.iter().map(|&index| at(index)));
+        let extent_m = bounds.size().max_element();
+        if usable.len() < Self::MIN_POINTS || extent_m <= 0.0 {
+            return Err(MeshingError::TooFewPoints {
+                usable: usable.len(),
+                given: cloud.len(),
+                needed: Self::MIN_POINTS,
+            });
+        }
+        let side_m = scale * extent_m;
+        let domain = Domain {
+            origin: bounds.center() - Vec3::splat(0.5 * side_m),
+            side_m,
+        };
+        let unit = |index: u32| (at(index) - domain.origin) / side_m;
+        let cells = (1_u32 << depth) as f32;
+        let mut order: Vec<(u64, u32)> = usable
+            .par_iter()
+            .map(|&index| {
+                let cell = (unit(index) * cells).as_uvec3();
+                (morton::encode(cell.to_array()), index)
+            })
+            .collect();
+        order.par_sort_unstable();
+        Ok(Self {
+            depth,
+            codes: order.iter().map(|&(code, _)| code).collect(),
+            positions: order
+                .par_iter()
+                .map(|&(_, index)| unit(index).to_array())
+                .collect(),
+            normals: order
+                .par_iter()
+                .map(|&(_, index)| cloud.normals[index as usize].normalize().to_array())
+                .collect(),
+            weights: order
+                .par_iter()
+                .map(|&(_, index)| weight(index as usize))
+                .collect(),
+            domain,
+            dropped: cloud.len() - usable.len(),
+        })
+    }
+
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.codes.len()
+    }
+
+    /// The cell of a point at a depth, and where in the cell it is, 0 to 1 per axis.
+    #[inline]
+    pub fn cell(&self, index: usize, depth: u32) -> ([i32; 3], [f32; 3]) {
+        let cells = (1_u32 << depth) as f32;
+        let scaled = self.positions[index].map(|x| x * cells);
+        let cell = scaled.map(|x| x as i32);
+        (
+            cell,
+            [
+                scaled[0] - cell[0] as f32,
+                scaled[1] - cell[1] as f32,
+                scaled[2] - cell[2] as f32,
+            ],
+        )
+    }
+}
+
+fn is_usable(cloud: &PointCloud, index: usize, weight: f32) -> bool {
+    let normal = cloud.normals[index];
+    cloud.positions[index].is_finite()
+        && normal.is_finite()
+        && normal.length_squared() > 1e-12
+        && weight.is_finite()
+        && weight > 0.0
+}

@@ -1,0 +1,200 @@
+//! Laws of the reconstruction.
+
+use approx::assert_relative_eq;
+use glam::{Quat, Vec3};
+
+use super::shapes::{Topology, sphere, street};
+use super::*;
+use crate::geometry::PointCloud;
+
+fn at_depth(depth: u32) -> PoissonConfig {
+    PoissonConfig {
+        depth,
+        ..PoissonConfig::default()
+    }
+}
+
+fn reconstructed(cloud: &PointCloud, depth: u32) -> Surface {
+    reconstruct(cloud, None, &at_depth(depth)).unwrap()
+}
+
+fn median(mut values: Vec<f32>) -> f32 {
+    values.sort_by(f32::total_cmp);
+    values[values.len() / 2]
+}
+
+#[test]
+fn a_sphere_becomes_one_closed_manifold_without_holes_of_its_radius() {
+    for depth in [4, 6, 7] {
+        // At least one point per face of the finest cells.
+        let surface = reconstructed(&sphere(3.0, 80_000), depth);
+        let topology = Topology::of(&surface.mesh);
+        assert!(topology.is_closed_manifold(), "{depth} {topology:?}");
+        assert_eq!(topology.euler, 2);
+        let cell_m = 6.6 / f32::from(1_u16 << depth);
+        let mut cosines = Vec::new();
+        for (vertex, normal) in surface.mesh.vertices.iter().zip(&surface.mesh.normals) {
+            assert_relative_eq!(vertex.length(), 3.0, epsilon = 0.1 * cell_m);
+            cosines.push(normal.dot(vertex.normalize()));
+        }
+        // Single vertices between slivers lean by up to 20 degrees; half of all by less than 3.
+        let least = cosines.iter().copied().fold(1.0, f32::min);
+        assert!(least > 0.9, "{depth} {least}");
+        let typical = median(cosines);
+        assert!(typical > 3.0_f32.to_radians().cos(), "{depth} {typical}");
+    }
+}
+
+#[test]
+fn a_street_is_manifold_and_lies_within_a_fraction_of_its_noise() {
+    let surface = reconstructed(&street(100_000, 0.02, 1), 8);
+    let topology = Topology::of(&surface.mesh);
+    assert!(topology.is_manifold(), "{topology:?}");
+    let heights = (surface.mesh.vertices.iter())
+        .filter(|v| v.x.abs() < 18.0 && v.y.abs() < 4.0 && v.z.abs() < 0.2)
+        .map(|v| v.z.abs())
+        .collect();
+    assert!(median(heights) < 0.01);
+}
+
+/// A sphere whose lower half has one point where the upper has forty.
+fn unevenly_sampled_sphere() -> PointCloud {
+    let mut cloud = sphere(3.0, 60_000);
+    let low: Vec<bool> = cloud.positions.iter().map(|p| p.z < 0.0).collect();
+    cloud.retain(|index| !low[index] || index % 40 == 0);
+    cloud
+}
+
+#[test]
+fn cells_of_different_size_meet_without_cracks() {
+    for depth in [7, 8] {
+        let surface = reconstructed(&unevenly_sampled_sphere(), depth);
+        let topology = Topology::of(&surface.mesh);
+        assert!(topology.is_closed_manifold(), "{depth} {topology:?}");
+        assert_eq!(topology.euler, 2);
+        // The sparse half has larger triangles: it was not divided as far.
+        let upper = surface.mesh.vertices.iter().filter(|v| v.z > 0.0).count();
+        assert!(surface.mesh.vertices.len() - upper < upper / 2);
+        for vertex in &surface.mesh.vertices {
+            assert_relative_eq!(vertex.length(), 3.0, epsilon = 0.03);
+        }
+    }
+}
+
+#[test]
+fn densities_grow_by_one_where_there_are_four_times_the_points() {
+    let density = |count| median(reconstructed(&sphere(3.0, count), 6).densities);
+    assert_relative_eq!(density(40_000) - density(10_000), 1.0, epsilon = 0.05);
+    // The area of a cell's face at that depth holds `samples_per_node` points.
+    let (radius_m, side_m) = (3.0_f32, 6.6_f32);
+    let per_area = 40_000.0 / (4.0 * std::f32::consts::PI * radius_m * radius_m);
+    let depth = (per_area * side_m * side_m / 1.5).log(4.0);
+    assert_relative_eq!(density(40_000), depth, epsilon = 0.1);
+}
+
+#[test]
+fn the_hole_in_a_plane_has_a_lower_density_and_is_trimmed_with_it() {
+    let mut cloud = PointCloud::default();
+    for i in 0..200 {
+        for j in 0..200 {
+            let position = Vec3::new(0.05 * i as f32 - 5.0, 0.05 * j as f32 - 5.0, 0.0);
+            if position.length() > 1.5 {
+                cloud.push(position, Vec3::Z, 1.0);
+            }
+        }
+    }
+    let mut surface = reconstructed(&cloud, 7);
+    let in_hole = |v: &&Vec3| v.length() < 0.8;
+    assert!(surface.mesh.vertices.iter().filter(in_hole).count() > 10);
+    let dropped = trim_by_distance(&mut surface.mesh, &cloud.positions, 0.2);
+    assert!(dropped > 0);
+    assert_eq!(surface.mesh.vertices.iter().filter(in_hole).count(), 0);
+    assert!(surface.mesh.vertices.iter().all(|v| v.z.abs() < 0.01));
+    assert!(Topology::of(&surface.mesh).bad_edges == 0);
+}
+
+#[test]
+fn a_rotated_street_gives_the_rotated_surface_within_a_tenth_of_a_cell() {
+    let cloud = street(100_000, 0.0, 3);
+    let rotation = Quat::from_euler(glam::EulerRot::ZYX, 0.7, 0.1, -0.2);
+    let mut turned = cloud.clone();
+    for (position, normal) in turned.positions.iter_mut().zip(&mut turned.normals) {
+        (*position, *normal) = (rotation * *position, rotation * *normal);
+    }
+    let off_ground = |cloud: &PointCloud, rotation: Quat| {
+        let surface = reconstructed(cloud, 8);
+        let back = surface
+            .mesh
+            .vertices
+            .iter()
+            .map(|v| rotation.inverse() * *v);
+        let errors: Vec<f32> = back
+            .filter(|v| v.x.abs() < 18.0 && v.y.abs() < 4.0 && v.z.abs() < 0.5)
+            .map(|v| v.z.abs())
+            .collect();
+        assert!(errors.len() > 1000);
+        median(errors)
+    };
+    let cell_m = 44.0 / 256.0;
+    assert!(off_ground(&cloud, Quat::IDENTITY) < 0.1 * cell_m);
+    assert!(off_ground(&turned, rotation) < 0.1 * cell_m);
+}
+
+#[test]
+fn one_thread_and_two_give_the_same_bytes() {
+    let cloud = street(30_000, 0.02, 4);
+    let with_threads = |count: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(count).build();
+        pool.unwrap().install(|| reconstructed(&cloud, 8))
+    };
+    let (one, two) = (with_threads(1), with_threads(2));
+    assert_eq!(one, two);
+}
+
+#[test]
+fn a_weight_of_two_is_the_point_twice() {
+    let once = sphere(2.0, 5_000);
+    let mut twice = once.clone();
+    twice.append(once.clone());
+    let heavy = reconstruct(&once, Some(&vec![2.0; once.len()]), &at_depth(6)).unwrap();
+    let double = reconstructed(&twice, 6);
+    assert_eq!(heavy.mesh.triangles.len(), double.mesh.triangles.len());
+    for (a, b) in heavy.mesh.vertices.iter().zip(&double.mesh.vertices) {
+        assert!((a - b).length() < 1e-4, "{a} {b}");
+    }
+}
+
+#[test]
+fn points_that_are_no_points_are_left_out_and_counted() {
+    let clean = sphere(2.0, 5_000);
+    let mut dirty = clean.clone();
+    dirty.push(Vec3::new(f32::NAN, 0.0, 0.0), Vec3::X, 0.0);
+    dirty.push(Vec3::new(1.0, f32::INFINITY, 0.0), Vec3::X, 0.0);
+    dirty.push(Vec3::new(9.0, 0.0, 0.0), Vec3::ZERO, 0.0);
+    dirty.push(Vec3::new(9.0, 0.0, 0.0), Vec3::splat(f32::NAN), 0.0);
+    let (clean, dirty) = (reconstructed(&clean, 6), reconstructed(&dirty, 6));
+    assert_eq!(dirty.dropped_points, 4);
+    assert_eq!(dirty.mesh, clean.mesh);
+}
+
+#[test]
+fn too_little_to_mesh_and_wrong_settings_are_errors_that_say_so() {
+    let error = |cloud: &PointCloud, depth| reconstruct(cloud, None, &at_depth(depth)).unwrap_err();
+    let nothing = error(&PointCloud::default(), 8).to_string();
+    assert!(nothing.contains("only 0 of 0 points"), "{nothing}");
+    let mut one_place = PointCloud::default();
+    (0..100).for_each(|_| one_place.push(Vec3::ONE, Vec3::Z, 0.0));
+    assert!(matches!(
+        error(&one_place, 8),
+        MeshingError::TooFewPoints { .. }
+    ));
+    let ball = sphere(1.0, 100);
+    assert_eq!(error(&ball, 2), MeshingError::Depth(2));
+    assert_eq!(error(&ball, 20), MeshingError::Depth(20));
+    let short = reconstruct(&ball, Some(&[1.0]), &at_depth(6)).unwrap_err();
+    assert!(
+        short
+            .to_string()
+            .contains("1 weights were given for 100 points")
+    );
+}

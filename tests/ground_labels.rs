@@ -1,0 +1,61 @@
+//! Ground against the labels of SemanticKITTI, where the data is there.
+
+#![expect(
+    clippy::unwrap_used,
+    clippy::print_stderr,
+    reason = "a test helper that says why it skips"
+)]
+
+use std::path::PathBuf;
+
+use fpmcl::ground::{
+    FuzzyConfig, FuzzyGround, GroundClassifier, GroundScore, PcaGround, Protocol, RansacGround,
+    ReportRule,
+};
+use fpmcl::kitti::velodyne::{read_labels, read_scan};
+
+/// The classifier's score on scans with odd numbers, which no parameter was fixed on.
+fn held_out_score(classifier: &dyn GroundClassifier) -> Option<GroundScore> {
+    let root = std::env::var_os("FPMCL_DATA").map_or_else(
+        || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
+        PathBuf::from,
+    );
+    let folder = root.join("semantickitti-00-labels");
+    if !folder.is_dir() {
+        eprintln!("skipped: {} is absent", folder.display());
+        return None;
+    }
+    let mut score = GroundScore::default();
+    for number in (1..21).step_by(2) {
+        let scan = read_scan(&folder.join(format!("velodyne/{number:06}.bin"))).unwrap();
+        let classes = read_labels(&folder.join(format!("labels/{number:06}.label"))).unwrap();
+        let confidences = classifier.ground_confidence(&scan.points);
+        for ((point, class), confidence) in scan.points.iter().zip(classes).zip(confidences) {
+            if let Some(truth) = Protocol::PatchworkPlusPlus.truth(class, point.z) {
+                score.add(confidence > 0.5, truth);
+            }
+        }
+    }
+    Some(score)
+}
+
+#[test]
+fn four_features_reach_the_specialists_and_three_come_close() {
+    let fuzzy = |config| held_out_score(&FuzzyGround::new(config).unwrap());
+    let (Some(four), Some(three)) = (
+        fuzzy(FuzzyConfig::default()),
+        fuzzy(FuzzyConfig::three_features()),
+    ) else {
+        return;
+    };
+    assert!(four.f1() >= 0.989, "{four:?} {}", four.f1());
+    assert!(four.precision() > 0.98 && four.recall() > 0.98, "{four:?}");
+    assert!(three.f1() >= 0.970, "{three:?} {}", three.f1());
+
+    let baselines: [&dyn GroundClassifier; 3] =
+        [&PcaGround::default(), &RansacGround::default(), &ReportRule];
+    for baseline in baselines {
+        let score = held_out_score(baseline).unwrap();
+        assert!(score.f1() < four.f1(), "{score:?}");
+    }
+}
