@@ -85,7 +85,6 @@ fn localization_config(
         num_particles: 1000,
         odometry: OdometrySource::File,
         odometry_file: Some(drive.join("odometry.txt")),
-        plot_loc_results: false,
         seed,
         force: true,
         ..LocalizationConfig::default()

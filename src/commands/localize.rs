@@ -36,6 +36,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         &config.map_file,
         &config.map_pose_file,
         &config.map_calib_file,
+        Some(config.range_image.batch_size()),
         context,
     )?;
     let sequence = map.sequence(

@@ -18,8 +18,9 @@ use crate::ground::{FuzzyConfig, FuzzyGround};
 use crate::kitti::{Frame, Sequence};
 use crate::localization::State;
 use crate::localization::observation::choose_beams;
+use crate::localization::odometry::demonstration_noise;
 use crate::map::Stance;
-use crate::refinement::{FrameObjective, FramePrior, refine_frame, smooth};
+use crate::refinement::{FrameObjective, FramePrior, SmoothingConfig, refine_frame, smooth};
 
 /// Refines the result that a configuration names, and adds the refined trajectory to it.
 pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
@@ -33,6 +34,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
         &config.map_file,
         &config.map_pose_file,
         &config.map_calib_file,
+        None,
         context,
     )?;
     let sequence = matching(
@@ -63,6 +65,10 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let about = [
         ("recording", config.scan_folder.display().to_string()),
         ("map", config.map_file.display().to_string()),
+        (
+            "odometry",
+            odometry::description(config.odometry, config.odometry_file.as_deref()),
+        ),
         ("renderer", map.renderer.name()),
         ("seed", config.seed.to_string()),
     ]
@@ -253,12 +259,24 @@ fn smooth_all(
     if priors.iter().all(Option::is_none) {
         return Ok(poses);
     }
-    Ok(smooth(
-        &poses,
-        &priors,
-        &increments,
-        &config.refinement.smoothing,
-    ))
+    Ok(smooth(&poses, &priors, &increments, &trusted(config)))
+}
+
+/// How far the odometry is to be trusted: with the noise that the demonstration puts on the truth,
+/// no farther than that noise.
+fn trusted(config: &RefinementConfig) -> SmoothingConfig {
+    let smoothing = config.refinement.smoothing.clone();
+    if config.odometry != OdometrySource::GroundTruth {
+        return smoothing;
+    }
+    let noise = demonstration_noise();
+    let turn_rad = std::f64::consts::SQRT_2 * noise.turn_rad;
+    SmoothingConfig {
+        odometry_ahead_m: smoothing.odometry_ahead_m.max(noise.drive_m),
+        odometry_aside_m: smoothing.odometry_aside_m.max(noise.turn_rad),
+        odometry_turn_rad: smoothing.odometry_turn_rad.max(turn_rad),
+        ..smoothing
+    }
 }
 
 /// The refined poses standing on the map's ground, or on the last ground that there was.

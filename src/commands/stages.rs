@@ -16,7 +16,7 @@ use crate::rendering::backend::AdapterChoice;
 use crate::rendering::backend::{self, Backend, Target};
 #[cfg(feature = "gpu")]
 use crate::rendering::gpu::GpuRenderer;
-use crate::rendering::{CpuRenderer, RangeRenderer};
+use crate::rendering::{Batched, CpuRenderer, RangeRenderer};
 
 /// Edge of the cells of the ground's elevation [m].
 const GROUND_CELL_M: f64 = 0.5;
@@ -47,11 +47,12 @@ pub struct LoadedMap {
 
 impl LoadedMap {
     /// Reads a map and the poses that it was built with, and makes it ready on the backend that the
-    /// user asked for.
+    /// user asked for, with at most `batch` poses rendered at once.
     pub fn load(
         map_file: &Path,
         map_pose_file: &Path,
         map_calib_file: &Path,
+        batch: Option<usize>,
         context: &Context,
     ) -> Result<Self> {
         let mesh = ply::read(map_file)?;
@@ -61,7 +62,13 @@ impl LoadedMap {
             .map_from_lidar(&frame.calibration);
         let grid = TileGrid::around(&mapping_poses, &TileConfig::default());
         let ground = ground_of(&mesh);
-        let renderer = renderer(&tiles::cut(&mesh, &grid), context)?;
+        let mut renderer = renderer(&tiles::cut(&mesh, &grid), context)?;
+        if let Some(max_poses) = batch {
+            renderer = Box::new(Batched {
+                renderer,
+                max_poses,
+            });
+        }
         tracing::info!(
             "map {}: {} triangles in {} tiles, rendered by {}",
             map_file.display(),

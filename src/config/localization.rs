@@ -206,7 +206,7 @@ impl Default for LocalizationConfig {
 }
 
 impl Default for RenderedRangeImage {
-    /// The sensor of [`LidarModel`] in batches of range-mcl.
+    /// The sensor of [`LidarModel`]; batches large enough for every renderer.
     fn default() -> Self {
         let LidarModel {
             height,
@@ -224,7 +224,7 @@ impl Default for RenderedRangeImage {
             max_range,
             min_range,
             render_instanced: true,
-            max_instance: 50,
+            max_instance: 1024,
         }
     }
 }

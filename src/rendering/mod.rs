@@ -4,10 +4,12 @@
 //! weights): an observation is compared along the very directions that were measured.
 
 pub mod backend;
+pub mod batched;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 
+pub use batched::Batched;
 pub use cpu::{CpuRenderer, SurfaceHit};
 #[cfg(test)]
 pub(crate) mod test_world;
