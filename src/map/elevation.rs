@@ -157,10 +157,23 @@ impl GroundMap {
         Some(self.patch_under(planar)?.lift(planar, stance))
     }
 
-    /// Height of the ground at a place [m]; `None` where it is not known there.
+    /// Height of the ground at a place, between the middles of the four cells around it [m];
+    /// `None` where one of them is not known.
     pub fn height_at(&self, x: f64, y: f64) -> Option<f64> {
-        let height_m = self.heights_m[self.grid.index_at(x, y)?];
-        height_m.is_finite().then_some(f64::from(height_m))
+        let cell_m = self.grid.cell_m;
+        let (column, row) = self.grid.cell_at(x - 0.5 * cell_m, y - 0.5 * cell_m)?;
+        if column + 1 >= self.grid.columns || row + 1 >= self.grid.rows {
+            return None;
+        }
+        let center = self.grid.center(column, row);
+        let (right, up) = ((x - center.x) / cell_m, (y - center.y) / cell_m);
+        let known =
+            |column: usize, row: usize| f64::from(self.heights_m[row * self.grid.columns + column]);
+        let lower = (1.0 - right) * known(column, row) + right * known(column + 1, row);
+        let upper = (1.0 - right) * known(column, row + 1) + right * known(column + 1, row + 1);
+        let height_m = (1.0 - up) * lower + up * upper;
+        // What is not known is not a number, and so is every sum with it.
+        height_m.is_finite().then_some(height_m)
     }
 
     /// How the sensor stands over the road at a planar pose: the stance with which the returns
@@ -309,6 +322,16 @@ mod tests {
         assert_relative_eq!(patch.height_m, 0.3, epsilon = 1e-3);
         let expected = Vector3::new(-0.1, 0.0, 1.0).normalize();
         assert_relative_eq!(patch.normal, expected, epsilon = 1e-3);
+    }
+
+    #[test]
+    fn between_cells_the_height_follows_the_slope() {
+        let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
+        for (x, y) in [(0.0, 0.0), (3.13, -2.2), (-7.5, 4.99)] {
+            assert_relative_eq!(ground.height_at(x, y).unwrap(), 0.1 * x, epsilon = 1e-3);
+        }
+        assert_eq!(ground.height_at(20.5, 0.0), None);
+        assert_eq!(ground.height_at(f64::NAN, 0.0), None);
     }
 
     #[test]
