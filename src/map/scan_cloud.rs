@@ -150,7 +150,7 @@ impl ScanCloud {
 
 /// Per pixel the smallest range among it and its eight neighbours: nearer than that is surely
 /// free. 0 where the pixel itself saw nothing, for "nothing came back" is no proof of free space.
-fn free_ranges(image: &RangeImage) -> Vec<f32> {
+pub(super) fn free_ranges(image: &RangeImage) -> Vec<f32> {
     let (width, height) = (image.model.width, image.model.height);
     let row_minimum = |row: usize, column: usize| {
         let at = |column: usize| image.ranges[row * width + column];

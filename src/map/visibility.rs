@@ -198,3 +198,125 @@ fn votes_of(scan: &ScanCloud, scene: &Scene, config: &VisibilityConfig) -> Vec<(
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{PointCloud, Pose3, Rigid3f};
+    use crate::lidar::RangeImage;
+    use crate::map::scan_cloud::PointCounts;
+
+    fn model() -> LidarModel {
+        LidarModel {
+            height: 32,
+            width: 360,
+            fov_up: 20.0,
+            fov_down: -20.0,
+            ..LidarModel::default()
+        }
+    }
+
+    /// A rectangle in the plane x = `x`, of patches of half a metre.
+    fn panel(x: f32, y: [f32; 2], z: [f32; 2]) -> TriangleMesh {
+        const PATCH_M: f32 = 0.5;
+        let mut mesh = TriangleMesh::default();
+        let count = |[from, to]: [f32; 2]| ((to - from) / PATCH_M).round() as usize;
+        for row in 0..count(z) {
+            for column in 0..count(y) {
+                let (y, z) = (y[0] + PATCH_M * column as f32, z[0] + PATCH_M * row as f32);
+                let first = mesh.vertices.len() as u32;
+                for (dy, dz) in [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)] {
+                    mesh.vertices.push(Vec3::new(x, y + dy * PATCH_M, z + dz * PATCH_M));
+                }
+                mesh.triangles.push([first, first + 1, first + 2]);
+                mesh.triangles.push([first, first + 2, first + 3]);
+            }
+        }
+        mesh
+    }
+
+    /// A scan of a mesh from a place, level and looking along x.
+    fn scan(world: &TriangleMesh, place: Vec3) -> ScanCloud {
+        let model = model();
+        let directions = model.directions();
+        let mut hits = vec![Hit::MISS; directions.len()];
+        Scene::new(world).cast(place, &directions, &mut hits);
+        let ranges = hits.iter().map(|hit| hit.range_m).collect();
+        let image = RangeImage::from_ranges(ranges, &model);
+        let mut cloud = PointCloud::default();
+        let beams: Vec<_> = image.beams().collect();
+        for beam in &beams {
+            cloud.push(place + beam.point(), Vec3::NEG_X, 0.0);
+        }
+        let mut map_from_lidar = Rigid3f::from(&Pose3::identity());
+        map_from_lidar.translation = place;
+        ScanCloud {
+            map_from_lidar,
+            cloud,
+            beams,
+            free_range_m: crate::map::scan_cloud::free_ranges(&image),
+            counts: PointCounts::default(),
+        }
+    }
+
+    fn wall() -> TriangleMesh {
+        panel(20.0, [-10.0, 10.0], [-3.0, 3.0])
+    }
+
+    fn three_scans(world: &TriangleMesh) -> Vec<ScanCloud> {
+        [-2.0, 0.0, 2.0].map(|y| scan(world, Vec3::new(0.0, y, 0.0))).into()
+    }
+
+    #[test]
+    fn an_invented_surface_goes_and_what_beams_end_on_stays() {
+        let scans = three_scans(&wall());
+        let mut mesh = wall();
+        let true_triangles = mesh.triangles.len();
+        mesh.append(&panel(10.0, [-2.0, 2.0], [-1.0, 1.0]));
+        // Another ghost in the shadow of the first.
+        mesh.append(&panel(12.0, [-1.0, 1.0], [-0.5, 0.5]));
+        let removed = remove_crossed_triangles(&mut mesh, &scans, &VisibilityConfig::default());
+        assert!(removed.len() > 1, "one ghost hides the other: {removed:?}");
+        assert!(mesh.vertices.iter().all(|vertex| vertex.x > 19.0));
+        assert_eq!(mesh.triangles.len(), true_triangles);
+    }
+
+    #[test]
+    fn a_true_mesh_loses_nothing() {
+        let mut mesh = wall();
+        // A pole of a third of a metre before the wall.
+        mesh.append(&panel(10.0, [0.0, 0.5], [-3.0, 3.0]));
+        let scans = three_scans(&mesh);
+        let before = mesh.clone();
+        let removed = remove_crossed_triangles(&mut mesh, &scans, &VisibilityConfig::default());
+        assert!(removed.is_empty(), "{removed:?}");
+        assert_eq!(mesh, before);
+    }
+
+    #[test]
+    fn points_of_what_has_moved_on_are_dynamic_and_walls_are_not() {
+        let mut with_van = wall();
+        with_van.append(&panel(10.0, [-2.0, 2.0], [-1.0, 1.0]));
+        let mut scans = three_scans(&wall());
+        scans.push(scan(&with_van, Vec3::new(0.0, 1.0, 0.0)));
+        let is_static = static_points(&scans, &model(), &VisibilityConfig::default());
+        for (scan, is_static) in scans.iter().zip(&is_static) {
+            for (position, &is_static) in scan.cloud.positions.iter().zip(is_static) {
+                // The rim of the van is seen past by pixels that see the wall beside it.
+                let on_rim = position.y.abs() > 1.7 || position.z.abs() > 0.7;
+                if position.x > 19.0 {
+                    assert!(is_static, "a wall stands: {position}");
+                } else if !on_rim {
+                    assert!(!is_static, "the van has gone: {position}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn voters_are_spread_over_all_scans() {
+        assert_eq!(spread(100, 4), [12, 37, 62, 87]);
+        assert_eq!(spread(3, 24), [0, 1, 2]);
+        assert!(spread(0, 4).is_empty());
+    }
+}
