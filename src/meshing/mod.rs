@@ -9,7 +9,9 @@ pub mod trimming;
 mod base_grid;
 mod block;
 mod cell_table;
+mod collapse;
 mod density;
+mod fan;
 mod isosurface;
 mod morton;
 mod octree;
@@ -22,5 +24,7 @@ pub use trimming::{trim_by_density, trim_by_distance};
 
 #[cfg(test)]
 mod shapes;
+#[cfg(test)]
+mod simplify_tests;
 #[cfg(test)]
 mod tests;

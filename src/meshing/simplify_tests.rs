@@ -1,0 +1,257 @@
+//! Laws of the simplified ground.
+
+use std::collections::BTreeSet;
+
+use glam::Vec3;
+
+use super::shapes::{Topology, street};
+use super::{PoissonConfig, reconstruct, simplify_ground};
+use crate::geometry::{Aabb, TriangleMesh};
+
+/// A square of 20 m over `height`, its cells as wide as 20 m over their number.
+fn square(cells: u32, height: impl Fn(f32, f32) -> f32) -> TriangleMesh {
+    let side = cells + 1;
+    let mut mesh = TriangleMesh::default();
+    for i in 0..side * side {
+        let [x, y] = [i % side, i / side].map(|k| k as f32 * 20.0 / cells as f32);
+        mesh.vertices.push(Vec3::new(x, y, height(x, y)));
+        mesh.colors.push([(i % 256) as u8, 0, 0]);
+    }
+    for a in (0..side * cells).filter(|a| a % side != cells) {
+        mesh.triangles.push([a, a + 1, a + side + 1]);
+        mesh.triangles.push([a, a + side + 1, a + side]);
+    }
+    mesh.compute_normals();
+    mesh
+}
+
+/// A field with a crown of 10 cm and ripples of 5 mm, and a step to a platform that is no ground.
+fn field(cells: u32) -> (TriangleMesh, Vec<bool>) {
+    let mesh = square(cells, |x, y| {
+        let step = if y > 15.0 { 0.5 } else { 0.0 };
+        step - 0.001 * (x - 10.0).powi(2) + 0.005 * (3.0 * x).sin() * (4.0 * y).cos()
+    });
+    let is_ground = (0..mesh.triangles.len())
+        .map(|t| mesh.corners(t).iter().all(|v| v.y < 15.0))
+        .collect();
+    (mesh, is_ground)
+}
+
+/// The surface that is reconstructed from a street with a centimetre of noise, and its ground.
+fn noisy_street() -> (TriangleMesh, Vec<bool>) {
+    let config = PoissonConfig {
+        depth: 8,
+        ..PoissonConfig::default()
+    };
+    let mesh = reconstruct(&street(100_000, 0.01, 5), None, &config)
+        .unwrap()
+        .mesh;
+    let is_ground = (0..mesh.triangles.len())
+        .map(|t| {
+            let is_low = |v: &Vec3| v.x.abs() < 18.0 && v.y.abs() < 7.5 && v.z.abs() < 0.1;
+            mesh.corners(t).iter().all(is_low)
+        })
+        .collect();
+    (mesh, is_ground)
+}
+
+fn ground_vertices(mesh: &TriangleMesh, is_ground: &[bool]) -> Vec<Vec3> {
+    let of_ground = |(_, is_ground): &(_, &bool)| **is_ground;
+    let indices: BTreeSet<u32> = (mesh.triangles.iter().zip(is_ground))
+        .filter(of_ground)
+        .flat_map(|(triangle, _)| *triangle)
+        .collect();
+    indices.iter().map(|&v| mesh.vertices[v as usize]).collect()
+}
+
+#[test]
+fn the_ground_loses_four_fifths_of_its_triangles_and_every_vertex_stays_within_a_centimetre() {
+    for (name, (mesh, is_ground)) in [("field", field(100)), ("street", noisy_street())] {
+        for smoothing in [0, 1, 4] {
+            let simple = simplify_ground(&mesh, &is_ground, 1.0, smoothing);
+            let ground = is_ground.iter().filter(|&&is_ground| is_ground).count();
+            let left = simple.triangles.len() + ground - mesh.triangles.len();
+            assert!(5 * left <= ground, "{name} {smoothing}: {left} of {ground}");
+            let surface = Surface::new(&simple);
+            for vertex in ground_vertices(&mesh, &is_ground) {
+                let distance_m = surface.distance_m(vertex);
+                assert!(distance_m < 0.01001, "{name} {vertex} {distance_m}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_rest_the_border_and_the_topology_stay_as_they_were() {
+    for (mesh, is_ground) in [field(60), noisy_street()] {
+        let simple = simplify_ground(&mesh, &is_ground, 1.0, 1);
+        assert_eq!(Topology::of(&mesh), Topology::of(&simple));
+        let corners =
+            |mesh: &TriangleMesh, t: usize| mesh.corners(t).map(|v| v.to_array().map(f32::to_bits));
+        let kept: BTreeSet<_> = (0..simple.triangles.len())
+            .map(|t| corners(&simple, t))
+            .collect();
+        for triangle in (0..mesh.triangles.len()).filter(|&t| !is_ground[t]) {
+            assert!(kept.contains(&corners(&mesh, triangle)));
+        }
+        let referenced: BTreeSet<u32> = simple.triangles.iter().flatten().copied().collect();
+        assert_eq!(referenced.len(), simple.vertices.len());
+        assert_eq!(simple.colors.len(), mesh.colors.len().min(referenced.len()));
+    }
+}
+
+#[test]
+fn a_new_triangle_is_as_level_as_the_street_and_has_no_longer_edges_than_asked() {
+    let (mesh, is_ground) = noisy_street();
+    let bits = |[a, b, c]: [Vec3; 3]| [a, b, c].map(|v| v.to_array().map(f32::to_bits));
+    let old: BTreeSet<_> = (0..mesh.triangles.len())
+        .map(|triangle| bits(mesh.corners(triangle)))
+        .collect();
+    for resolution_m in [0.5, 1.0] {
+        let simple = simplify_ground(&mesh, &is_ground, resolution_m, 0);
+        let new: Vec<usize> = (0..simple.triangles.len())
+            .filter(|&triangle| !old.contains(&bits(simple.corners(triangle))))
+            .collect();
+        assert!(new.len() > 500);
+        for triangle in new {
+            let [a, b, c] = simple.corners(triangle);
+            let up = simple.scaled_normal(triangle).normalize().z;
+            assert!(up > 0.7, "{a} {b} {c} {up}");
+            let longest_m = a.distance(b).max(b.distance(c)).max(c.distance(a));
+            assert!(longest_m < 1.0001 * resolution_m, "{longest_m}");
+        }
+    }
+}
+
+#[test]
+fn smoothing_turns_no_triangle_over() {
+    let (mesh, is_ground) = noisy_street();
+    let turned = |mesh: &TriangleMesh| {
+        let is_inside = |v: &Vec3| v.x.abs() < 17.0 && v.y.abs() < 7.0 && v.z.abs() < 0.1;
+        (0..mesh.triangles.len())
+            .filter(|&t| mesh.corners(t).iter().all(is_inside) && mesh.scaled_normal(t).z <= 0.0)
+            .count()
+    };
+    for iterations in [1, 4] {
+        let simple = simplify_ground(&mesh, &is_ground, 1.0, iterations);
+        assert!(
+            turned(&simple) <= turned(&mesh),
+            "{} {}",
+            turned(&simple),
+            turned(&mesh)
+        );
+    }
+}
+
+#[test]
+fn a_plane_has_no_denser_seams_inside() {
+    let mesh = square(160, |_, _| 0.0);
+    let simple = simplify_ground(&mesh, &vec![true; mesh.triangles.len()], 1.0, 0);
+    // In squares of 1 m away from the border, which stays.
+    let mut counts = [[0; 16]; 16];
+    for triangle in 0..simple.triangles.len() {
+        let [a, b, c] = simple.corners(triangle);
+        let [x, y, _] = ((a + b + c) / 3.0 - 2.0).to_array();
+        if (0.0..16.0).contains(&x) && (0.0..16.0).contains(&y) {
+            counts[y as usize][x as usize] += 1;
+        }
+    }
+    // 128 before.
+    assert!(
+        counts.iter().flatten().all(|&count| count < 16),
+        "{counts:?}"
+    );
+}
+
+#[test]
+fn a_bump_higher_than_a_centimetre_stays() {
+    let is_bump = |x: f32, y: f32| (x - 7.0).abs() < 0.01 && (y - 12.0).abs() < 0.01;
+    let mesh = square(100, |x, y| if is_bump(x, y) { 0.03 } else { 0.0 });
+    let simple = simplify_ground(&mesh, &vec![true; mesh.triangles.len()], 1.0, 0);
+    assert!(simple.triangles.len() < mesh.triangles.len() / 5);
+    assert!(simple.vertices.iter().any(|v| is_bump(v.x, v.y)));
+}
+
+#[test]
+fn one_thread_and_two_give_the_same_bytes() {
+    let (mesh, is_ground) = field(80);
+    let with_threads = |count: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(count).build();
+        let simplified = || simplify_ground(&mesh, &is_ground, 1.0, 1);
+        pool.unwrap().install(simplified)
+    };
+    assert_eq!(with_threads(1), with_threads(2));
+}
+
+#[test]
+fn without_ground_nothing_changes() {
+    let (mesh, is_ground) = field(10);
+    assert_eq!(
+        simplify_ground(&mesh, &vec![false; is_ground.len()], 1.0, 3),
+        mesh
+    );
+}
+
+/// Distances to a mesh that lies mostly level.
+struct Surface<'a> {
+    mesh: &'a TriangleMesh,
+    bounds: Aabb,
+    /// The triangles over each square metre, row by row.
+    cells: Vec<Vec<usize>>,
+    columns: usize,
+}
+
+impl<'a> Surface<'a> {
+    fn new(mesh: &'a TriangleMesh) -> Self {
+        let bounds = mesh.bounds();
+        let columns = bounds.size().x as usize + 1;
+        let rows = bounds.size().y as usize + 1;
+        let mut surface = Self {
+            mesh,
+            bounds,
+            cells: vec![Vec::new(); columns * rows],
+            columns,
+        };
+        for triangle in 0..mesh.triangles.len() {
+            let extent = Aabb::of(mesh.corners(triangle));
+            let [low, high] = [extent.min, extent.max].map(|corner| surface.cell(corner));
+            for row in low.1..=high.1 {
+                for column in low.0..=high.0 {
+                    surface.cells[row * columns + column].push(triangle);
+                }
+            }
+        }
+        surface
+    }
+
+    fn cell(&self, place: Vec3) -> (usize, usize) {
+        let place = place - self.bounds.min;
+        (place.x as usize, place.y as usize)
+    }
+
+    /// Distance to the nearest triangle over the same square metre: never less than the true one.
+    fn distance_m(&self, place: Vec3) -> f32 {
+        let (column, row) = self.cell(place);
+        (self.cells[row * self.columns + column].iter())
+            .map(|&triangle| distance_m(place, self.mesh.corners(triangle)))
+            .fold(f32::INFINITY, f32::min)
+    }
+}
+
+/// Distance to a triangle: to its plane if the foot is inside, otherwise to its edges.
+fn distance_m(place: Vec3, corners: [Vec3; 3]) -> f32 {
+    let [a, b, c] = corners;
+    let normal = (b - a).cross(c - a).normalize_or_zero();
+    let is_left = |from: Vec3, to: Vec3| (to - from).cross(place - from).dot(normal) >= 0.0;
+    if normal != Vec3::ZERO && is_left(a, b) && is_left(b, c) && is_left(c, a) {
+        return (place - a).dot(normal).abs();
+    }
+    [(a, b), (b, c), (c, a)]
+        .map(|(from, to)| {
+            let edge = to - from;
+            let share = (place - from).dot(edge) / edge.length_squared().max(1e-12);
+            place.distance(from + share.clamp(0.0, 1.0) * edge)
+        })
+        .into_iter()
+        .fold(f32::INFINITY, f32::min)
+}
