@@ -226,7 +226,8 @@ mod tests {
                 let (y, z) = (y[0] + PATCH_M * column as f32, z[0] + PATCH_M * row as f32);
                 let first = mesh.vertices.len() as u32;
                 for (dy, dz) in [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)] {
-                    mesh.vertices.push(Vec3::new(x, y + dy * PATCH_M, z + dz * PATCH_M));
+                    mesh.vertices
+                        .push(Vec3::new(x, y + dy * PATCH_M, z + dz * PATCH_M));
                 }
                 mesh.triangles.push([first, first + 1, first + 2]);
                 mesh.triangles.push([first, first + 2, first + 3]);
@@ -264,7 +265,9 @@ mod tests {
     }
 
     fn three_scans(world: &TriangleMesh) -> Vec<ScanCloud> {
-        [-2.0, 0.0, 2.0].map(|y| scan(world, Vec3::new(0.0, y, 0.0))).into()
+        [-2.0, 0.0, 2.0]
+            .map(|y| scan(world, Vec3::new(0.0, y, 0.0)))
+            .into()
     }
 
     #[test]
