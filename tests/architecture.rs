@@ -32,7 +32,7 @@ struct Absence {
     reason: &'static str,
 }
 
-const ABSENCES: [Absence; 6] = [
+const ABSENCES: [Absence; 7] = [
     Absence {
         words: &["wgpu::", "use wgpu", "pollster::"],
         allowed: &["rendering/gpu"],
@@ -70,6 +70,18 @@ const ABSENCES: [Absence; 6] = [
         ],
         allowed: &["commands"],
         reason: "randomness that no seed gives, and printing, stay in commands",
+    },
+    Absence {
+        words: &["SeedableRng", "seed_from_u64", "from_seed("],
+        allowed: &[
+            "commands",
+            // Streets, drives and scans are made by many threads at once: every piece draws from
+            // a stream of its own that follows from the seed, the purpose and the piece's number.
+            "simulation/random.rs",
+            // A classifier is shared by threads: it must say the same of a scan whoever asks.
+            "ground/ransac.rs",
+        ],
+        reason: "generators are made in commands and handed down, or the seed's streams in one place",
     },
     Absence {
         words: &[
@@ -151,13 +163,27 @@ fn test_modules_of(path: &Path, text: &str) -> Vec<PathBuf> {
     } else {
         path.with_extension("")
     };
-    let lines: Vec<&str> = text.lines().map(str::trim).collect();
-    lines
-        .windows(2)
-        .filter(|pair| pair[0] == "#[cfg(test)]")
-        .filter_map(|pair| pair[1].strip_prefix("mod ")?.strip_suffix(';'))
-        .map(|name| folder.join(name))
-        .collect()
+    let mut lines = text.lines().map(str::trim);
+    let mut modules = Vec::new();
+    while lines.by_ref().any(|line| line == "#[cfg(test)]") {
+        let mut item = lines.next().unwrap_or_default();
+        let elsewhere = item
+            .strip_prefix("#[path = \"")
+            .and_then(|rest| rest.strip_suffix(".rs\"]"));
+        if elsewhere.is_some() {
+            item = lines.next().unwrap_or_default();
+        }
+        let declared = item
+            .strip_suffix(';')
+            .and_then(|item| item.rsplit_once("mod "));
+        if let Some((_, name)) = declared {
+            modules.push(match elsewhere {
+                Some(file) => path.with_file_name(file),
+                None => folder.join(name),
+            });
+        }
+    }
+    modules
 }
 
 /// The numbered lines of a file without comments and without what is compiled for tests only.
@@ -313,6 +339,20 @@ fn a_wrong_import_is_told_with_file_and_line() {
     );
     assert!(told("rendering/mod.rs", "use crate::map::Tiles;").is_empty());
     assert!(told("map/mod.rs", "// as crate::commands does\n").is_empty());
+}
+
+#[test]
+fn modules_for_tests_are_found_wherever_they_lie() {
+    let text = "mod a;\n#[cfg(test)]\npub(crate) mod b;\n\n#[cfg(test)]\n\
+                #[path = \"elsewhere.rs\"]\nmod c;\n#[cfg(test)]\nmod d {}\n";
+    assert_eq!(
+        test_modules_of(Path::new("map/tiles.rs"), text),
+        [Path::new("map/tiles/b"), Path::new("map/elsewhere")]
+    );
+    assert_eq!(
+        test_modules_of(Path::new("map/mod.rs"), text)[0],
+        Path::new("map/b")
+    );
 }
 
 #[test]

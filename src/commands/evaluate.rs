@@ -2,6 +2,7 @@
 
 use anyhow::{Result, ensure};
 
+use super::input;
 use super::run_output::{self, RunFiles};
 use crate::config::{self, EvaluationConfig};
 use crate::evaluation::{LocalizationResults, RangeMclRules, Report};
@@ -11,6 +12,7 @@ use crate::kitti::poses::CameraPoses;
 
 /// Judges a result of `localize`, of `refine` or of range-mcl.
 pub fn run(config: &EvaluationConfig) -> Result<Report> {
+    input::require_file("result_file", &config.result_file)?;
     let mut results = LocalizationResults::read(&config.result_file)?;
     scale(&mut results, config.grid_resolution);
     if results.ground_truth.is_none() {
@@ -63,6 +65,8 @@ fn scale(results: &mut LocalizationResults, grid_resolution_m: f64) {
 
 /// The true poses of the frames of a result, in the frame of the recording's first pose.
 fn truth(config: &EvaluationConfig, results: &LocalizationResults) -> Result<Vec<Pose2>> {
+    input::require_file("pose_file", &config.pose_file)?;
+    input::require_file("calib_file", &config.calib_file)?;
     let calibration = Calibration::read(&config.calib_file)?;
     let poses = CameraPoses::read(&config.pose_file)?.map_from_lidar(&calibration);
     let last = results.frames.last().copied().unwrap_or_default();

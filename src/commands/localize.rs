@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use super::interrupt::Interrupted;
 use super::run_output::{self, Movie, RunFiles};
 use super::stages::{LoadedMap, Observer};
-use super::{Context, odometry, output};
+use super::{Context, input, odometry, output};
 use crate::config::{self, Initialization, LocalizationConfig, MotionModel};
 use crate::evaluation::{LocalizationResults, ParticleLog, RangeMclRules, Report};
 use crate::geometry::{Pose2, Pose3, planar};
@@ -31,6 +31,12 @@ const FIRST_FRAME_STREAM: u64 = 2;
 
 /// Localizes the frames that a configuration selects.
 pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
+    input::require_file("map_file", &config.map_file)?;
+    input::require_file("map_pose_file", &config.map_pose_file)?;
+    input::require_file("map_calib_file", &config.map_calib_file)?;
+    input::require_folder("scan_folder", &config.scan_folder)?;
+    input::require_file("pose_file", &config.pose_file)?;
+    input::require_file("calib_file", &config.calib_file)?;
     output::prepare(&config.result_path, "result_path", config.force)?;
     let map = LoadedMap::load(
         &config.map_file,

@@ -9,6 +9,7 @@ pub mod localize;
 pub mod refine;
 pub mod simulate;
 // What they share.
+mod input;
 pub mod interrupt;
 mod logging;
 mod odometry;

@@ -5,6 +5,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result, ensure};
 use rand::Rng;
 
+use super::input;
 use crate::config::OdometrySource;
 use crate::geometry::{Pose2, Pose3};
 use crate::kitti::poses::{CameraPoses, read_tum};
@@ -21,6 +22,7 @@ pub fn read_increments(
     let known = match (source, file) {
         (OdometrySource::None, _) => return Ok(vec![None; sequence.frames.len()]),
         (OdometrySource::File, Some(file)) => {
+            input::require_file("odometry_file", file)?;
             let poses = recorded(file, sequence)?;
             let numbers = sequence.frames.iter().map(|frame| frame.number);
             let last = sequence.frames.last().map_or(0, |frame| frame.number);

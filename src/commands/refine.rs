@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use super::interrupt::Interrupted;
 use super::run_output::{self, RunFiles};
 use super::stages::{LoadedMap, Observer};
-use super::{Context, odometry};
+use super::{Context, input, odometry};
 use crate::config::{self, OdometrySource, RefinementConfig};
 use crate::evaluation::{LocalizationResults, RangeMclRules, Report};
 use crate::geometry::{Pose2, Pose3};
@@ -23,6 +23,13 @@ use crate::refinement::{FrameObjective, FramePrior, refine_frame, smooth};
 
 /// Refines the result that a configuration names, and adds the refined trajectory to it.
 pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
+    input::require_file("result_file", &config.result_file)?;
+    input::require_file("map_file", &config.map_file)?;
+    input::require_file("map_pose_file", &config.map_pose_file)?;
+    input::require_file("map_calib_file", &config.map_calib_file)?;
+    input::require_folder("scan_folder", &config.scan_folder)?;
+    input::require_file("pose_file", &config.pose_file)?;
+    input::require_file("calib_file", &config.calib_file)?;
     let mut results = LocalizationResults::read(&config.result_file)?;
     ensure!(
         results.refined.is_none() || config.force,

@@ -357,7 +357,7 @@ mod tests {
             let expected = truth[0].inverse() * pose;
             assert_relative_eq!(frame.map_from_lidar, expected, epsilon = 1e-6);
         }
-        let calibration = sequence.calibration;
+        let calibration = sequence.frame.calibration;
         for (pose, world_from_cam0) in query.0.iter().zip(&query.2.world_from_cam0) {
             let in_map = calibration.map_from_lidar(&map.2.world_from_cam0[0], world_from_cam0);
             assert_relative_eq!(in_map, truth[0].inverse() * pose, epsilon = 1e-6);

@@ -5,8 +5,10 @@ use std::path::PathBuf;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
+use super::blocks::own_car;
 use super::check::{
-    Check, Problem, at_least_one, nested, not_negative, path, positive, require, selection, within,
+    Check, Problem, at_least_one, nested, not_negative, path, positive, require, selection, share,
+    within,
 };
 use crate::ground::{FuzzyConfig, GroundMethod, PcaGround, RansacGround};
 use crate::kitti::Selection;
@@ -160,7 +162,7 @@ impl BuildMapConfig {
         LocalMapSettings {
             scan: ScanSettings {
                 range_image: self.range_image,
-                normals: self.normals.clone(),
+                normals: self.normals,
                 voxel_size_m: self.voxel_size as f32,
                 crop_m: Vec3::new(self.crop_x as f32, self.crop_y as f32, self.crop_z as f32),
                 own_car_m: self.own_car_m,
@@ -203,7 +205,7 @@ impl Check for BuildMapConfig {
         path("mesh_file", &self.mesh_file)?;
         selection(self.n_scans, self.frame_step)?;
         at_least_one("local_map_size", self.local_map_size)?;
-        within("depth", self.depth, 4..=14)?;
+        within("depth", self.depth, 3..=12)?;
         require(
             (0.0..1.0).contains(&self.min_density),
             "min_density",
@@ -228,7 +230,13 @@ impl Check for BuildMapConfig {
         not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
         not_negative("overlap_m", self.overlap_m)?;
         positive("max_distance_m", self.max_distance_m)?;
-        within("ground_threshold", self.ground_threshold, 0.0..=1.0)?;
+        share("ground_threshold", self.ground_threshold)?;
+        own_car("own_car_m", self.own_car_m)?;
+        nested("poisson", self.poisson.check())?;
+        nested("normals", self.normals.check())?;
+        nested("visibility", self.visibility.check())?;
+        nested("fuzzy", self.fuzzy.check())?;
+        nested("pca", self.pca.check())?;
         require(
             self.holdout_step != 1,
             "holdout_step",

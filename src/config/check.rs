@@ -1,7 +1,7 @@
 //! Ranges of values, checked once, when a configuration is loaded.
 //!
-//! A stage's own struct gets its check here, beside those of the commands, and a command
-//! calls it as `nested("block", self.block.check())`.
+//! A stage's own struct has its check in `blocks`, and a command calls it as
+//! `nested("block", self.block.check())`.
 
 use std::fmt::Display;
 use std::ops::RangeInclusive;
@@ -53,14 +53,19 @@ pub(super) fn require(
 }
 
 /// Finite and greater than zero.
-pub(super) fn positive(key: &str, value: f64) -> Result<(), Problem> {
-    let holds = value.is_finite() && value > 0.0;
+pub(super) fn positive<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), Problem> {
+    let number: f64 = value.into();
+    let holds = number.is_finite() && number > 0.0;
     require(holds, key, value, "it must be greater than 0")
 }
 
 /// Finite and not below zero.
-pub(super) fn not_negative(key: &str, value: f64) -> Result<(), Problem> {
-    let holds = value.is_finite() && value >= 0.0;
+pub(super) fn not_negative<N: Into<f64> + Copy + Display>(
+    key: &str,
+    value: N,
+) -> Result<(), Problem> {
+    let number: f64 = value.into();
+    let holds = number.is_finite() && number >= 0.0;
     require(holds, key, value, "it must be 0 or greater")
 }
 
@@ -72,6 +77,12 @@ pub(super) fn within<N: PartialOrd + Display>(
 ) -> Result<(), Problem> {
     let remedy = format!("it must lie between {} and {}", range.start(), range.end());
     require(range.contains(&value), key, value, remedy)
+}
+
+/// From nothing to all, 0 to 1.
+pub(super) fn share<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), Problem> {
+    let holds = (0.0..=1.0).contains(&value.into());
+    require(holds, key, value, "it must lie between 0 and 1")
 }
 
 /// At least one.
@@ -113,8 +124,8 @@ impl Check for LidarModel {
             self.fov_up,
             format!("it must lie above fov_down, which is {}", self.fov_down),
         )?;
-        not_negative("min_range", f64::from(self.min_range))?;
-        positive("max_range", f64::from(self.max_range))?;
+        not_negative("min_range", self.min_range)?;
+        positive("max_range", self.max_range)?;
         require(
             self.min_range < self.max_range,
             "min_range",

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use super::blocks::own_car;
 use super::check::{
     Check, Problem, at_least_one, nested, not_negative, path, positive, require, selection,
 };
@@ -325,6 +326,16 @@ impl Check for LocalizationConfig {
             "file",
             "name the file in odometry_file, or choose ground_truth or none",
         )?;
+        own_car("own_car_m", self.own_car_m)?;
+        nested("start", self.start.check())?;
+        nested("odometry_noise", self.odometry_noise.check())?;
+        nested("velocity_noise", self.velocity_noise.check())?;
+        nested("observation", self.observation.check())?;
+        nested("tempering", self.tempering.check())?;
+        nested("resampling", self.resampling.check())?;
+        nested("kld", self.kld.check())?;
+        nested("vigilance", self.vigilance.check())?;
+        nested("panorama", self.panorama.check())?;
         nested("range_image", self.range_image.check())
     }
 }

@@ -9,6 +9,7 @@
 //! them. Nothing is ignored: an unknown key, a word where a number belongs and a contradiction
 //! are errors that name the file and the line, or the `--set`.
 
+mod blocks;
 mod build_map;
 mod check;
 mod error;

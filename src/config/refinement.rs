@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use super::blocks::own_car;
 use super::check::{Check, Problem, nested, path, require, selection};
 use super::localization::OdometrySource;
 use crate::kitti::Selection;
@@ -110,6 +111,9 @@ impl Check for RefinementConfig {
             "file",
             "name the file in odometry_file, or choose ground_truth or none",
         )?;
+        own_car("own_car_m", self.own_car_m)?;
+        nested("observation", self.observation.check())?;
+        nested("refinement", self.refinement.check())?;
         nested("range_image", self.range_image.check())
     }
 }

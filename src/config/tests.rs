@@ -242,8 +242,8 @@ fn a_contradiction_is_told_with_key_value_and_remedy() {
         assert_says(&message, &[&format!("--set {key}={value}: {key} is ")]);
     }
     for (key, value) in [
-        ("depth", "3"),
-        ("depth", "15"),
+        ("depth", "2"),
+        ("depth", "13"),
         ("voxel_size", "-0.1"),
         ("min_density", "1"),
         ("crop_x", "0"),

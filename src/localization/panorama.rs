@@ -34,7 +34,8 @@ use crate::rendering::RenderError;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PanoramaConfig {
-    /// Side of a cell: one panorama each [m].
+    /// Side of a cell: one panorama each [m]; `grid_res` of `localization.yml`.
+    #[serde(skip)]
     pub cell_m: f64,
     /// Rows of a panorama.
     pub rows: usize,
@@ -50,7 +51,9 @@ pub struct PanoramaConfig {
     pub refined_share: f64,
     /// A cell whose mean cost is larger by this gets e times fewer particles [m].
     pub scale_m: f64,
-    /// Standard deviation of the headings around the best heading of a cell [rad].
+    /// Standard deviation of the headings around the best heading of a cell [rad]; `yaw_sigma` of
+    /// `localization.yml`.
+    #[serde(skip)]
     pub yaw_sigma_rad: f64,
 }
 

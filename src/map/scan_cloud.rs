@@ -109,14 +109,14 @@ impl ScanCloud {
         let normals = normals(&image, &settings.normals);
         let mut cloud = PointCloud::with_capacity(image.ranges.len());
         let mut beams = Vec::with_capacity(image.ranges.len());
-        for index in 0..image.ranges.len() {
+        for (index, normal) in normals.iter().enumerate() {
             let (Some(beam), Some(number)) = (image.beam(index), image.point_number(index)) else {
                 continue;
             };
             if image.points[index].abs().cmple(settings.crop_m).all() {
                 beams.push(beam);
             }
-            match normals[index] {
+            match *normal {
                 Some(normal) => cloud.push(image.points[index], normal, ground[number]),
                 None => counts.without_normal += 1,
             }

@@ -27,7 +27,8 @@ use crate::geometry::{PointCloud, TriangleMesh};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PoissonConfig {
-    /// Halvings of the cube down to the finest cells, 3 to 12.
+    /// Halvings of the cube down to the finest cells, 3 to 12; `depth` of `build_map.yml`.
+    #[serde(skip)]
     pub depth: u32,
     /// Edge of the cube over the longest edge of the points' bounding box, above 1.
     pub scale: f32,

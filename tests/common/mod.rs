@@ -3,6 +3,8 @@
 
 #![allow(dead_code, reason = "each test file uses its own part")]
 
+pub mod picture;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -126,6 +128,7 @@ impl Recording {
         recording.write("calib.txt", "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n");
         recording.write("build_map.yml", BUILD_MAP);
         recording.write("localization.yml", LOCALIZATION);
+        recording.write("refinement.yml", REFINEMENT);
         recording
     }
 
@@ -166,12 +169,19 @@ impl Recording {
 
     /// A subcommand with its configuration, run in the folder of the recording.
     pub fn fpmcl(&self, subcommand: &str) -> Fpmcl {
-        let config = match subcommand {
-            "build-map" => "build_map.yml",
-            "localize" => "localization.yml",
+        let call = fpmcl(subcommand).in_folder(self.folder());
+        match subcommand {
+            "build-map" => call.with("build_map.yml"),
+            "localize" => call.with("localization.yml").with("--backend=cpu"),
+            "refine" => call.with("refinement.yml").with("--backend=cpu"),
             other => panic!("no configuration for {other}"),
-        };
-        fpmcl(subcommand).with(config).in_folder(self.folder())
+        }
+    }
+
+    /// The bytes of a file in the recording.
+    pub fn bytes(&self, name: &str) -> Vec<u8> {
+        let path = self.path(name);
+        fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
     }
 }
 
@@ -197,6 +207,19 @@ result_path: results/localization.npz
 numParticles: 50
 num_reduced: 20
 plot_loc_results: False
+range_image: {height: 32, width: 360, fov_up: 3, fov_down: -25, max_range: 50, min_range: 1}
+";
+
+const REFINEMENT: &str = "\
+scan_folder: velodyne
+map_file: map.ply
+map_pose_file: poses.txt
+map_calib_file: calib.txt
+pose_file: poses.txt
+calib_file: calib.txt
+result_file: results/localization.npz
+plot_loc_results: False
+refinement: {swarm: {iterations: 5}}
 range_image: {height: 32, width: 360, fov_up: 3, fov_down: -25, max_range: 50, min_range: 1}
 ";
 

@@ -13,7 +13,7 @@ use serde::Serialize;
 
 use self::parts::Parts;
 use super::interrupt::Interrupted;
-use super::{Context, output, stages};
+use super::{Context, input, output, stages};
 use crate::config::{self, BuildMapConfig};
 use crate::geometry::{TriangleMesh, planar};
 
@@ -52,6 +52,9 @@ pub struct BuildReport {
 /// Builds the map that a configuration describes.
 pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
     let started = Instant::now();
+    input::require_folder("scan_folder", &config.scan_folder)?;
+    input::require_file("pose_file", &config.pose_file)?;
+    input::require_file("calib_file", &config.calib_file)?;
     output::prepare(&config.mesh_file, "mesh_file", config.force)?;
     let sequence = Sequence::open(
         &config.scan_folder,
