@@ -9,8 +9,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use fpmcl::config::{
-    self, BuildMapConfig, Check, EvaluationConfig, Initialization, LocalizationConfig,
-    RefinementConfig,
+    self, BuildMapConfig, Check, EvaluationConfig, GroundConfig, Initialization,
+    LocalizationConfig, RefinementConfig,
 };
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -48,6 +48,7 @@ fn keys_of(path: &Path) -> BTreeSet<String> {
         "localization.yml" => round_trip::<LocalizationConfig>(path),
         "refinement.yml" => round_trip::<RefinementConfig>(path),
         "evaluation.yml" => round_trip::<EvaluationConfig>(path),
+        "ground.yml" => round_trip::<GroundConfig>(path),
         _ => panic!("{} belongs to no command", path.display()),
     }
 }
@@ -89,6 +90,7 @@ fn every_key_stands_in_the_file_of_its_command_with_a_comment() {
         "localization.yml",
         "refinement.yml",
         "evaluation.yml",
+        "ground.yml",
     ] {
         let path = root().join("config").join(name);
         let text = fs::read_to_string(&path).unwrap();
@@ -102,7 +104,10 @@ fn every_key_stands_in_the_file_of_its_command_with_a_comment() {
             let explained = line.contains(" # ") || commented;
             assert!(explained, "{name} does not explain {key}");
             commented = false;
-            keys.remove(key);
+            // With those that stand in braces behind it.
+            for key in line.split(['{', ',']).filter_map(key_of) {
+                keys.remove(key);
+            }
         }
         assert!(keys.is_empty(), "{name} does not show {keys:?}");
     }
@@ -174,5 +179,9 @@ fn the_delivered_files_say_what_the_defaults_say() {
     assert_eq!(
         load::<EvaluationConfig>(&config("evaluation.yml")),
         EvaluationConfig::default()
+    );
+    assert_eq!(
+        load::<GroundConfig>(&config("ground.yml")),
+        GroundConfig::default()
     );
 }
