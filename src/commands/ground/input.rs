@@ -181,7 +181,7 @@ pub fn keep_truth_safe(config: &GroundConfig, source: &Source) -> Result<()> {
     let truth: Vec<PathBuf> = source
         .scans(config)?
         .into_iter()
-        .filter_map(|scan| Some(scan.label_path?.parent()?.canonicalize().ok()?))
+        .filter_map(|scan| scan.label_path?.parent()?.canonicalize().ok())
         .collect();
     let collides = written
         .canonicalize()

@@ -99,10 +99,9 @@ fn explain(config: &GroundConfig, source: &Source, position: Vec3) -> Result<Str
         point.z,
         point.distance(position)
     );
-    if let Some(classes) = input::labels_of(scan_file, config.label_folder.as_deref(), None)? {
-        if let Some(class) = classes.get(index) {
-            writeln!(text, "its label is class {class}")?;
-        }
+    let classes = input::labels_of(scan_file, config.label_folder.as_deref(), None)?;
+    if let Some(class) = classes.iter().flatten().nth(index) {
+        writeln!(text, "its label is class {class}")?;
     }
     match classifier.features(&points)[index] {
         Some(features) => writeln!(text, "\n{}", classifier.explain(&features))?,
