@@ -76,6 +76,14 @@ Examples:
   fpmcl demo --output results/small --frames 40")]
     Demo(DemoArgs),
 
+    /// Tell ground from the rest: scan by scan, and why.
+    #[command(after_help = "\
+Examples:
+  fpmcl ground data/kitti                     a recording, or a folder of scans
+  fpmcl ground data/kitti/velodyne/000000.bin --explain 10.2 -1.5 -1.7
+  fpmcl ground --simulated                    slopes, crests and kerbs with exact answers")]
+    Ground(GroundArgs),
+
     /// Show what this machine offers: instruction sets, threads, graphics adapters.
     Doctor,
 }
@@ -125,6 +133,44 @@ pub struct DemoArgs {
     /// Same seed, same result.
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
+
+    /// How the work is done.
+    #[command(flatten)]
+    pub machine: MachineArgs,
+}
+
+/// Which scans, and what is asked about them.
+#[derive(Clone, Debug, Args)]
+pub struct GroundArgs {
+    /// Scan (.bin), folder of scans, recording with velodyne/ and labels/, or configuration (.yml);
+    /// the configuration's scan_folder if not given.
+    pub input: Option<PathBuf>,
+
+    /// Explain the point nearest to X Y Z in the lidar frame [m]; needs a scan.
+    #[arg(
+        long,
+        value_names = ["X", "Y", "Z"],
+        num_args = 3,
+        allow_negative_numbers = true,
+        requires = "input"
+    )]
+    pub explain: Option<Vec<f32>>,
+
+    /// Compare the methods on simulated slopes, crests, kerbs and drives, whose truth is exact.
+    #[arg(long, conflicts_with = "explain")]
+    pub simulated: bool,
+
+    /// YAML file; config/ground.yml if not given, and the defaults where that is not there.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+
+    /// Override one key, such as ground_method=pca; may be given often.
+    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
+    pub settings: Vec<(String, String)>,
+
+    /// Replace existing output; sets the key `force`.
+    #[arg(long)]
+    pub force: bool,
 
     /// How the work is done.
     #[command(flatten)]
@@ -200,6 +246,7 @@ impl Command {
             | Self::Evaluate(args)
             | Self::Simulate(args) => args.source.machine,
             Self::Demo(args) => args.machine,
+            Self::Ground(args) => args.machine,
             Self::Doctor => MachineArgs::default(),
         }
     }

@@ -8,13 +8,14 @@ use std::path::Path;
 
 use common::{Recording, fpmcl};
 
-const COMMANDS: [&str; 7] = [
+const COMMANDS: [&str; 8] = [
     "build-map",
     "localize",
     "refine",
     "evaluate",
     "simulate",
     "demo",
+    "ground",
     "doctor",
 ];
 

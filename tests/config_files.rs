@@ -9,8 +9,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use fpmcl::config::{
-    self, BuildMapConfig, Check, EvaluationConfig, Initialization, LocalizationConfig,
-    RefinementConfig,
+    self, BuildMapConfig, Check, EvaluationConfig, GroundConfig, Initialization,
+    LocalizationConfig, RefinementConfig,
 };
 use fpmcl::simulation::SimulationConfig;
 use serde::Serialize;
@@ -50,6 +50,7 @@ fn keys_of(path: &Path) -> BTreeSet<String> {
         "refinement.yml" | "refinement_stereo.yml" => round_trip::<RefinementConfig>(path),
         "evaluation.yml" => round_trip::<EvaluationConfig>(path),
         "simulation.yml" => round_trip::<SimulationConfig>(path),
+        "ground.yml" => round_trip::<GroundConfig>(path),
         _ => panic!("{} belongs to no command", path.display()),
     }
 }
@@ -97,6 +98,7 @@ fn every_key_stands_in_the_file_of_its_command_with_a_comment() {
         "localization.yml",
         "refinement.yml",
         "evaluation.yml",
+        "ground.yml",
     ] {
         let path = root().join("config").join(name);
         let text = fs::read_to_string(&path).unwrap();
@@ -185,5 +187,9 @@ fn the_delivered_files_say_what_the_defaults_say() {
     assert_eq!(
         load::<EvaluationConfig>(&config("evaluation.yml")),
         EvaluationConfig::default()
+    );
+    assert_eq!(
+        load::<GroundConfig>(&config("ground.yml")),
+        GroundConfig::default()
     );
 }

@@ -5,6 +5,7 @@ pub mod build_map;
 mod demo;
 mod doctor;
 pub mod evaluate;
+pub mod ground;
 pub mod localize;
 pub mod refine;
 pub mod simulate;
@@ -95,6 +96,7 @@ pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
             output::print(&simulate::run_with_progress(&config, args.force, context)?)
         }
         Command::Demo(args) => output::print(&demo::run(args, context)?),
+        Command::Ground(args) => output::print(&ground::run(args, context)?),
         Command::Doctor => doctor::run(context),
     }
 }

@@ -56,6 +56,16 @@ where
     Ok(())
 }
 
+/// Lets `write` make a file under another name beside `path` and renames it, for writers that
+/// take a path: `path` is either as it was or complete.
+pub fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<()>) -> anyhow::Result<()> {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".part");
+    let part = path.with_file_name(name);
+    write(&part)?;
+    fs::rename(&part, path).with_context(|| format!("cannot write {}", path.display()))
+}
+
 /// Writes a report as JSON, whole or not at all.
 pub fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
     write_whole(path, |file| -> anyhow::Result<()> {

@@ -21,6 +21,7 @@ use anyhow::{Context as _, Result, bail};
 use rayon::prelude::*;
 
 use super::Context;
+use super::output::replace as write_whole;
 use super::progress::Task;
 use crate::geometry::Pose3;
 use crate::kitti::poses::{CameraPoses, write_kitti, write_times};
@@ -214,15 +215,6 @@ fn write_poses(simulation: &Simulation, folder: &Path, poses: &[Pose3]) -> Resul
         Ok(kitti(path, &simulation.odometry())?)
     })?;
     write_whole(&folder.join("poses.txt"), |path| Ok(kitti(path, poses)?))
-}
-
-/// Writes under a temporary name and renames, so that a file is whole or not there.
-fn write_whole(path: &Path, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".part");
-    let part = path.with_file_name(name);
-    write(&part)?;
-    fs::rename(&part, path).with_context(|| format!("cannot write {}", path.display()))
 }
 
 fn length_m(poses: &[Pose3]) -> f64 {

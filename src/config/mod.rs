@@ -14,6 +14,7 @@ mod build_map;
 mod check;
 mod error;
 mod evaluation;
+mod ground;
 mod localization;
 mod outline;
 mod refinement;
@@ -29,6 +30,7 @@ pub use build_map::BuildMapConfig;
 pub use check::{Check, Problem};
 pub use error::{ConfigError, Place};
 pub use evaluation::EvaluationConfig;
+pub use ground::GroundConfig;
 pub use localization::{
     Initialization, LocalizationConfig, MotionModel, OdometrySource, RenderedRangeImage,
 };
@@ -53,13 +55,34 @@ where
         path: path.to_owned(),
         source,
     })?;
-    let mut config: T = parse(&text).map_err(|source| error::in_file(path, &text, source))?;
+    let config: T = parse(&text).map_err(|source| error::in_file(path, &text, source))?;
+    overridden(config, path, &text, overrides)
+}
+
+/// The default configuration with overrides, checked, for commands that need no file.
+pub fn defaults<T>(overrides: &[(String, String)]) -> Result<T, ConfigError>
+where
+    T: Check + Default + Serialize + DeserializeOwned,
+{
+    overridden(T::default(), Path::new("defaults"), "", overrides)
+}
+
+/// Applies the overrides in order and checks the result.
+fn overridden<T>(
+    mut config: T,
+    path: &Path,
+    text: &str,
+    overrides: &[(String, String)],
+) -> Result<T, ConfigError>
+where
+    T: Check + Serialize + DeserializeOwned,
+{
     for (key, value) in overrides {
         config = override_key(&config, key, value)?;
     }
     config
         .check()
-        .map_err(|problem| error::unusable(path, &text, overrides, problem))?;
+        .map_err(|problem| error::unusable(path, text, overrides, problem))?;
     Ok(config)
 }
 

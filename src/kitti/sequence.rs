@@ -94,38 +94,20 @@ impl Sequence {
         let camera_poses = CameraPoses::read(pose_file)?;
         let map_from_lidar = camera_poses.map_from_lidar(&calibration);
         let times_s = times_of(pose_file, map_from_lidar.len())?;
-        let scans = scan_paths(scan_folder)?;
-        let numbers = frame_numbers(&scans);
-
         let mut frames = Vec::new();
-        let window = usize::try_from(selection.n_scans).unwrap_or(usize::MAX);
-        let window_end = selection.start_idx.saturating_add(window);
-        for (scan_path, number) in scans.iter().zip(numbers) {
-            let in_window = (selection.start_idx..window_end).contains(&number);
-            if !in_window || !(number - selection.start_idx).is_multiple_of(selection.frame_step) {
-                continue;
-            }
+        for (number, scan_path) in selected_scans(scan_folder, selection)? {
             let Some(&pose) = map_from_lidar.get(number) else {
                 return Err(KittiError::ScanWithoutPose {
-                    scan: scan_path.clone(),
+                    scan: scan_path,
                     pose_file: pose_file.to_owned(),
                     poses: map_from_lidar.len(),
                 });
             };
             frames.push(Frame {
                 number,
-                scan_path: scan_path.clone(),
+                scan_path,
                 time_s: times_s[number],
                 map_from_lidar: pose,
-            });
-        }
-        if frames.is_empty() {
-            return Err(KittiError::NothingSelected {
-                path: scan_folder.to_owned(),
-                start_idx: selection.start_idx,
-                n_scans: selection.n_scans,
-                frame_step: selection.frame_step,
-                scans: scans.len(),
             });
         }
         Ok(Self {
@@ -152,6 +134,35 @@ impl Sequence {
         self.frame = *map;
         self
     }
+}
+
+/// The selected scans below a folder with their numbers, ascending; see [`Sequence::open`].
+pub fn selected_scans(
+    folder: &Path,
+    selection: &Selection,
+) -> Result<Vec<(usize, PathBuf)>, KittiError> {
+    let scans = scan_paths(folder)?;
+    let count = scans.len();
+    let window = usize::try_from(selection.n_scans).unwrap_or(usize::MAX);
+    let window_end = selection.start_idx.saturating_add(window);
+    let selected: Vec<(usize, PathBuf)> = frame_numbers(&scans)
+        .into_iter()
+        .zip(scans)
+        .filter(|(number, _)| {
+            let in_window = (selection.start_idx..window_end).contains(number);
+            in_window && (number - selection.start_idx).is_multiple_of(selection.frame_step)
+        })
+        .collect();
+    if selected.is_empty() {
+        return Err(KittiError::NothingSelected {
+            path: folder.to_owned(),
+            start_idx: selection.start_idx,
+            n_scans: selection.n_scans,
+            frame_step: selection.frame_step,
+            scans: count,
+        });
+    }
+    Ok(selected)
 }
 
 /// All `.bin` files below a folder, sorted by path.

@@ -78,6 +78,44 @@ pub fn write(path: &Path, mesh: &TriangleMesh) -> Result<(), PlyError> {
     file.sync_all().map_err(write_error)
 }
 
+/// Writes points as binary little-endian PLY: x y z, red green blue, and the number `confidence`,
+/// which viewers show as a scalar field. Points that are not finite are left out.
+///
+/// Colours and confidences are one per point.
+pub fn write_points(
+    path: &Path,
+    points: &[Vec3],
+    colors: &[[u8; 3]],
+    confidences: &[f32],
+) -> Result<(), PlyError> {
+    debug_assert!(points.len() == colors.len() && points.len() == confidences.len());
+    let rows = || {
+        let numbers = colors.iter().zip(confidences);
+        points
+            .iter()
+            .zip(numbers)
+            .filter(|(point, _)| point.is_finite())
+    };
+    let mut bytes = format!(
+        "ply\nformat binary_little_endian 1.0\nelement vertex {}\n\
+         property float x\nproperty float y\nproperty float z\n\
+         property uchar red\nproperty uchar green\nproperty uchar blue\n\
+         property float confidence\nend_header\n",
+        rows().count()
+    )
+    .into_bytes();
+    for (point, (color, confidence)) in rows() {
+        bytes.extend(point.to_array().into_iter().flat_map(f32::to_le_bytes));
+        bytes.extend(color);
+        bytes.extend(confidence.to_le_bytes());
+    }
+    let written = File::create(path).and_then(|mut file| file.write_all(&bytes));
+    written.map_err(|source| PlyError::Write {
+        path: path.to_owned(),
+        source,
+    })
+}
+
 /// Reads a mesh. Normals and colours are empty where the file has none.
 pub fn read(path: &Path) -> Result<TriangleMesh, PlyError> {
     let read_error = |source| PlyError::Read {

@@ -56,6 +56,8 @@ impl Series {
 pub struct Panel {
     /// Name of the y axis with its unit.
     pub y_name: String,
+    /// Name of an x axis of its own, as wide as the panel's series; none for the common one.
+    pub own_x_name: Option<String>,
     /// What is drawn.
     pub series: Vec<Series>,
     /// Whether the y axis begins at zero.
@@ -64,7 +66,7 @@ pub struct Panel {
     pub clip_outliers: bool,
 }
 
-/// Panels over a common x axis.
+/// Panels over a common x axis, except those that have their own.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LineChart {
     /// Above everything.
@@ -107,6 +109,8 @@ impl LineChart {
             right: WIDTH - RIGHT,
             bottom: top + LEGEND + PANEL,
         };
+        let own_x = panel.own_x_name.as_ref().and_then(|_| panel.x_span());
+        let x = own_x.unwrap_or(x);
         let (y, above) = panel.y_span();
         let view = View { rect, x, y };
         view.grid(sheet)?;
@@ -119,7 +123,8 @@ impl LineChart {
             let lettering = Lettering::new(TICK, HPos::Right, VPos::Top).color(INK);
             sheet.text(&text, (rect.right - 10.0, rect.top + 8.0), lettering)?;
         }
-        view.frame(sheet, &self.x_name, &panel.y_name)
+        let x_name = panel.own_x_name.as_ref().unwrap_or(&self.x_name);
+        view.frame(sheet, x_name, &panel.y_name)
     }
 
     fn draw_marks(&self, sheet: &Sheet, view: &View) -> Result<(), DrawError> {
@@ -135,6 +140,12 @@ impl LineChart {
 }
 
 impl Panel {
+    /// The range of its own x axis; `None` without numbers.
+    fn x_span(&self) -> Option<Span> {
+        let points = self.series.iter().flat_map(|series| &series.points);
+        Span::of(points.map(|point| point.0)).map(|span| span.at_least(1e-9))
+    }
+
     /// The range of the y axis, and the highest value where some are above it.
     fn y_span(&self) -> (Span, Option<f64>) {
         let mut numbers: Vec<f64> = self
@@ -213,6 +224,7 @@ mod tests {
             series: vec![Series::line("error", [213, 94, 0], points)],
             from_zero: true,
             clip_outliers: true,
+            ..Panel::default()
         }
     }
 

@@ -11,6 +11,7 @@ mod view;
 // The pictures.
 pub mod animation;
 pub mod chart;
+pub mod ground_plot;
 pub mod map_image;
 pub mod map_plot;
 pub mod particles;
@@ -23,6 +24,7 @@ mod tests;
 pub use animation::Animation;
 pub use chart::{LineChart, Mark, Panel, Series};
 pub use error::PlotError;
+pub use ground_plot::GroundPlot;
 pub use map_image::MapImage;
 pub use map_plot::{MapPlot, ScalarMapPlot};
 pub use particles::LocalizationPicture;

@@ -496,6 +496,7 @@ fn runtimes_and_other_lines_are_drawn() {
             ],
             from_zero: true,
             clip_outliers: false,
+            ..Panel::default()
         }],
         marks: vec![(0.0, "truth".to_owned())],
     }

@@ -193,6 +193,7 @@ impl ErrorPlot<'_> {
                 .collect(),
             from_zero: true,
             clip_outliers: true,
+            ..Panel::default()
         };
         LineChart {
             title: self.title.to_owned(),
@@ -242,6 +243,7 @@ impl RuntimePlot<'_> {
                 series: self.stages.iter().map(series).collect(),
                 from_zero: true,
                 clip_outliers: true,
+                ..Panel::default()
             }],
             marks: converged
                 .map(|&frame| (frame as f64, "converged".to_owned()))
