@@ -47,6 +47,12 @@ impl Block {
         self.indices[place]
     }
 
+    /// One coordinate of a corner of a triangle.
+    #[inline(always)]
+    pub fn coordinate(&self, corner: usize, axis: usize, place: usize) -> f32 {
+        self.corners[corner][axis][place]
+    }
+
     /// The unit normal of a triangle by the right-hand rule.
     pub fn normal(&self, place: usize) -> Vec3 {
         let [a, b, c] = self

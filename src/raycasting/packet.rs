@@ -26,12 +26,12 @@ pub(super) const RAYS: usize = 8;
 /// No triangle was met.
 pub(super) const NO_SLOT: u32 = u32::MAX;
 /// Rounding of the slab test, see Ize, *Robust BVH Ray Traversal*, JCGT 2013.
-const FARTHER: f32 = 1.0 + 8.0 * f32::EPSILON;
+pub(super) const FARTHER: f32 = 1.0 + 8.0 * f32::EPSILON;
 /// One over a coordinate of a direction is never more than this, so that 0 · ∞ does not occur.
 const STEEPEST: f32 = 1e18;
 
 /// One number per ray.
-type Rays = [f32; RAYS];
+pub(super) type Rays = [f32; RAYS];
 
 /// Directions of a packet and what its rays met so far.
 pub(super) struct Packet {
@@ -61,17 +61,7 @@ impl Packet {
         let reach: [Reach; RAYS] = std::array::from_fn(|ray| reach[ray.min(last)]);
         let direction: [Rays; 3] =
             std::array::from_fn(|axis| std::array::from_fn(|ray| rays[ray][axis]));
-        let inverse = direction.map(|axis| {
-            axis.map(|d| {
-                let inverse = 1.0 / d;
-                let is_small = inverse.abs() < STEEPEST;
-                if is_small {
-                    inverse
-                } else {
-                    STEEPEST.copysign(d)
-                }
-            })
-        });
+        let inverse = direction.map(inverse_of);
         let backwards = inverse.map(|axis| axis[0] < 0.0);
         let mut is_coherent = true;
         for axis in 0..3 {
@@ -247,14 +237,28 @@ impl<'a, const COHERENT: bool> Walk<'a, COHERENT> {
     }
 }
 
+/// One over each coordinate, and never too much.
+#[inline(always)]
+pub(super) fn inverse_of(direction: Rays) -> Rays {
+    direction.map(|d| {
+        let inverse = 1.0 / d;
+        let is_small = inverse.abs() < STEEPEST;
+        if is_small {
+            inverse
+        } else {
+            STEEPEST.copysign(d)
+        }
+    })
+}
+
 /// As the instruction does it: without the care of [`f32::min`] for what is no number.
 #[inline(always)]
-fn min(a: f32, b: f32) -> f32 {
+pub(super) fn min(a: f32, b: f32) -> f32 {
     if a < b { a } else { b }
 }
 
 /// As the instruction does it: without the care of [`f32::max`] for what is no number.
 #[inline(always)]
-fn max(a: f32, b: f32) -> f32 {
+pub(super) fn max(a: f32, b: f32) -> f32 {
     if a > b { a } else { b }
 }

@@ -5,8 +5,10 @@ use rayon::prelude::*;
 
 use super::Hit;
 use super::block::{Block, TRIANGLES};
+use super::bundle::{Bundle, Origins, Waiting, WideWalk};
 use super::bvh::{Bvh, Item};
 use super::packet::{NO_SLOT, Packet, RAYS, Walk};
+use super::wide::WideBvh;
 use crate::geometry::{Aabb, TriangleMesh};
 
 /// A triangle is degenerate where its height is less than this part of its longest edge.
@@ -46,6 +48,7 @@ pub struct Scene {
     middle: DVec3,
     /// Its leaves are the tiles.
     top: Bvh,
+    wide_top: WideBvh,
     tiles: Vec<Tile>,
     /// One per leaf of each tile.
     blocks: Vec<Block>,
@@ -59,6 +62,7 @@ struct Tile {
     /// The origin of its coordinates in the frame of the scene [m].
     middle: DVec3,
     bvh: Bvh,
+    wide_bvh: WideBvh,
     first_block: usize,
 }
 
@@ -118,12 +122,14 @@ impl Scene {
                 Tile {
                     middle: part.middle,
                     bvh: std::mem::take(&mut part.bvh),
+                    wide_bvh: std::mem::take(&mut part.wide_bvh),
                     first_block,
                 }
             })
             .collect();
         Self {
             middle: middle.as_dvec3(),
+            wide_top: WideBvh::of(&top),
             top,
             tiles,
             slots: slots_of(&blocks, triangles),
@@ -236,6 +242,84 @@ impl Scene {
         }
     }
 
+    /// Casts bundles of eight rays, each from its own origin, which should be close to each other
+    /// in origin and direction, in the frame of the mesh, and writes the range of what each meets
+    /// first. A ray meets the same range, bit by bit, as with [`Scene::cast_within`], with two
+    /// exceptions: of surfaces nearer than [`Reach::enough_m`] it may be another, and so it may be
+    /// of the triangles at an edge that the ray passes within rounding. Runs on the calling thread
+    /// alone.
+    ///
+    /// # Panics
+    /// Where there are not as many reaches or ranges as directions.
+    pub fn cast_bundles(
+        &self,
+        origins: &[DVec3; RAYS],
+        directions: &[[Vec3; RAYS]],
+        reach: &[Reach],
+        ranges_m: &mut [[f32; RAYS]],
+    ) {
+        assert_eq!(directions.len(), ranges_m.len(), "one range per direction");
+        assert_eq!(directions.len(), reach.len(), "one reach per bundle");
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            #[expect(unsafe_code, reason = "the line above has found the instructions")]
+            unsafe {
+                self.cast_bundles_avx2(origins, directions, reach, ranges_m);
+            }
+            return;
+        }
+        self.cast_bundles_portable(origins, directions, reach, ranges_m);
+    }
+
+    /// [`Scene::cast_bundles_portable`], compiled for eight numbers per instruction.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn cast_bundles_avx2(
+        &self,
+        origins: &[DVec3; RAYS],
+        directions: &[[Vec3; RAYS]],
+        reach: &[Reach],
+        ranges_m: &mut [[f32; RAYS]],
+    ) {
+        self.cast_bundles_portable(origins, directions, reach, ranges_m);
+    }
+
+    #[inline(always)]
+    pub(super) fn cast_bundles_portable(
+        &self,
+        origins: &[DVec3; RAYS],
+        directions: &[[Vec3; RAYS]],
+        reach: &[Reach],
+        ranges_m: &mut [[f32; RAYS]],
+    ) {
+        let origins = std::array::from_fn(|axis| origins.map(|origin| origin[axis]));
+        let over_tiles = Origins::from(self.middle, &origins);
+        let (mut waiting_tiles, mut waiting) = (Vec::new(), Vec::new());
+        for ((directions, reach), ranges_m) in directions.iter().zip(reach).zip(ranges_m) {
+            let mut bundle = Bundle::new(directions, *reach);
+            let mut tiles = WideWalk::new(&bundle, &self.wide_top, &over_tiles, &mut waiting_tiles);
+            while let Some(tile) = tiles.next_leaf(&bundle) {
+                self.cast_bundle_at(&self.tiles[tile], &origins, &mut bundle, &mut waiting);
+            }
+            *ranges_m = bundle.range_m;
+        }
+    }
+
+    #[inline(always)]
+    fn cast_bundle_at(
+        &self,
+        tile: &Tile,
+        origins: &[[f64; RAYS]; 3],
+        bundle: &mut Bundle,
+        waiting: &mut Vec<Waiting>,
+    ) {
+        let origins = Origins::from(tile.middle, origins);
+        let mut leaves = WideWalk::new(bundle, &tile.wide_bvh, &origins, waiting);
+        while let Some(leaf) = leaves.next_leaf(bundle) {
+            bundle.meet(&origins, &self.blocks[tile.first_block + leaf]);
+        }
+    }
+
     #[inline(always)]
     fn hit(&self, range_m: f32, slot: u32) -> Hit {
         if slot == NO_SLOT {
@@ -266,6 +350,7 @@ struct Part {
     bounds: Aabb,
     middle: DVec3,
     bvh: Bvh,
+    wide_bvh: WideBvh,
     blocks: Vec<Block>,
 }
 
@@ -295,6 +380,7 @@ impl Part {
         Some(Self {
             bounds,
             middle: middle.as_dvec3(),
+            wide_bvh: WideBvh::of(&bvh),
             bvh,
             blocks,
         })

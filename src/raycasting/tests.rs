@@ -373,3 +373,94 @@ fn centroids_that_coincide_or_lie_ever_closer_make_no_tree_too_deep() {
     let hit = cast_one(&scene, Vec3::ONE, -Vec3::ONE);
     assert!((hit.range_m - 2.0 / 3.0_f32.sqrt()).abs() < 1e-6);
 }
+
+/// Eight origins and, per bundle, eight directions about as close to each other as `spread`.
+fn bundles(
+    count: usize,
+    spread: f32,
+    rng: &mut ChaCha8Rng,
+) -> ([glam::DVec3; RAYS], Vec<[Vec3; RAYS]>) {
+    let middle = 10.0 * in_cube(rng);
+    let origins = [(); RAYS].map(|()| (middle + spread * in_cube(rng)).as_dvec3());
+    let mut directions: Vec<[Vec3; RAYS]> = (0..count)
+        .map(|_| {
+            let middle = direction(rng);
+            [(); RAYS].map(|()| (middle + 0.1 * spread * in_cube(rng)).normalize())
+        })
+        .collect();
+    // Some run along the axes, up and down at once.
+    for axis in Vec3::AXES {
+        directions.push([(); RAYS].map(|()| (axis + 0.1 * spread * in_cube(rng)).normalize()));
+        directions.push([axis; RAYS]);
+    }
+    (origins, directions)
+}
+
+#[test]
+fn a_ray_in_a_bundle_meets_what_it_meets_alone() {
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    let scene = Scene::of_tiles(&[soup(3000, 0.7, &mut rng), soup(300, 2.0, &mut rng)]);
+    let mut met = 0;
+    for spread in [0.0, 0.01, 0.1, 1.0, 10.0] {
+        for until_m in [f32::INFINITY, 8.0] {
+            let (origins, directions) = bundles(200, spread, &mut rng);
+            let reaches = vec![Reach::until(until_m); directions.len()];
+            let mut ranges_m = vec![[0.0; RAYS]; directions.len()];
+            scene.cast_bundles(&origins, &directions, &reaches, &mut ranges_m);
+            for (directions, ranges_m) in directions.iter().zip(&ranges_m) {
+                for ray in 0..RAYS {
+                    let mut alone = [Hit::MISS];
+                    let reach = [Reach::until(until_m)];
+                    scene.cast_within(origins[ray], &[directions[ray]], &reach, &mut alone);
+                    assert_eq!(ranges_m[ray].to_bits(), alone[0].range_m.to_bits());
+                    met += usize::from(alone[0] != Hit::MISS);
+                }
+            }
+        }
+    }
+    assert!(met > 1000, "{met}");
+}
+
+#[test]
+fn bundles_in_a_soup_meet_what_testing_all_triangles_finds() {
+    let mut rng = ChaCha8Rng::seed_from_u64(10);
+    for (triangles, size_m) in [(0, 1.0), (1, 9.0), (30, 4.0), (500, 2.0)] {
+        let mesh = soup(triangles, size_m, &mut rng);
+        let scene = Scene::new(&mesh);
+        let (origins, directions) = bundles(50, 0.3, &mut rng);
+        let reaches = vec![Reach::UNLIMITED; directions.len()];
+        let mut ranges_m = vec![[0.0; RAYS]; directions.len()];
+        scene.cast_bundles(&origins, &directions, &reaches, &mut ranges_m);
+        for (directions, ranges_m) in directions.iter().zip(&ranges_m) {
+            for ray in 0..RAYS {
+                let nearest = (0..triangles)
+                    .map(|t| {
+                        range_by_hand(origins[ray].as_vec3(), directions[ray], mesh.corners(t))
+                    })
+                    .fold(f64::INFINITY, f64::min);
+                let range_m = f64::from(ranges_m[ray]);
+                assert!(
+                    range_m == nearest || (range_m - nearest).abs() < 1e-4,
+                    "{range_m} {nearest}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn every_instruction_set_gives_bundles_the_same_bits() {
+    let mut rng = ChaCha8Rng::seed_from_u64(11);
+    let scene = Scene::new(&soup(3000, 0.7, &mut rng));
+    let (origins, directions) = bundles(300, 0.2, &mut rng);
+    let reach = Reach {
+        until_m: 12.0,
+        enough_m: 3.0,
+    };
+    let reaches = vec![reach; directions.len()];
+    let mut fast = vec![[0.0; RAYS]; directions.len()];
+    let mut portable = fast.clone();
+    scene.cast_bundles(&origins, &directions, &reaches, &mut fast);
+    scene.cast_bundles_portable(&origins, &directions, &reaches, &mut portable);
+    assert_eq!(fast, portable);
+}

@@ -3,14 +3,22 @@
 //! Rays are put in an order once in which neighbours in the list are neighbours in space, and cut
 //! into pieces that do not depend on the number of threads; sums are made piece by piece in that
 //! order. So the result is the same, byte for byte, on every machine.
+//!
+//! Poses that are close to each other are cast together (`groups`). A ray meets the same bits as
+//! alone, unless it passes an edge within rounding: then it may meet either of the triangles there,
+//! whose ranges differ by a fraction of a millimetre where they are seen at a flat angle.
 
-use glam::DVec3;
+mod groups;
+
+use glam::{DVec3, Mat3};
 use rayon::prelude::*;
+
+use groups::groups_of;
 
 use super::{RangeDifference, RangeRenderer, RenderError};
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh, Vec3};
 use crate::lidar::{Beam, LidarModel, Pixel};
-use crate::raycasting::{Hit, Reach, Scene};
+use crate::raycasting::{Hit, RAYS, Reach, Scene};
 
 /// Rays that are cast without asking for another thread.
 const RAYS_PER_PIECE: usize = 512;
@@ -43,10 +51,21 @@ impl CpuRenderer {
     /// What rays along unit directions of the lidar frame meet first, and how it is turned.
     pub fn surfaces(&self, map_from_lidar: &Pose3, directions: &[Vec3]) -> Vec<Option<SurfaceHit>> {
         let order = coherent_order(directions);
-        let pose = std::slice::from_ref(map_from_lidar);
-        let pieces = self.cast_pieces(pose, &order, |ray| directions[ray], |_| Reach::UNLIMITED);
+        let (rotation, origin) = (rotation_of(map_from_lidar), origin_of(map_from_lidar));
+        let pieces: Vec<Vec<Hit>> = order
+            .par_chunks(RAYS_PER_PIECE)
+            .map(|rays| {
+                let turned: Vec<Vec3> = rays
+                    .iter()
+                    .map(|&ray| rotation * directions[ray as usize])
+                    .collect();
+                let mut hits = vec![Hit::MISS; rays.len()];
+                let reaches = vec![Reach::UNLIMITED; rays.len()];
+                self.scene.cast_within(origin, &turned, &reaches, &mut hits);
+                hits
+            })
+            .collect();
         let mut surfaces = vec![None; directions.len()];
-        let rotation = Rigid3f::from(map_from_lidar).rotation;
         for (&ray, hit) in order.iter().zip(pieces.into_iter().flatten()) {
             surfaces[ray as usize] = self.scene.normal(hit.triangle).map(|normal| {
                 let against = rotation * directions[ray as usize];
@@ -63,80 +82,126 @@ impl CpuRenderer {
         surfaces
     }
 
-    /// Casts the rays of every pose piece by piece; the pieces of a pose follow each other.
-    fn cast_pieces(
-        &self,
-        map_from_lidar: &[Pose3],
-        order: &[u32],
-        direction: impl Fn(usize) -> Vec3 + Sync,
-        reach: impl Fn(usize) -> Reach + Sync,
-    ) -> Vec<Vec<Hit>> {
-        self.each_piece(map_from_lidar, order, direction, reach, |_, hits| {
-            hits.to_vec()
-        })
-    }
-
-    /// Casts the rays of every pose piece by piece, and keeps what `summarize` makes of the
-    /// numbers of the rays of each piece and what they met.
+    /// Casts the beams of every pose piece by piece, and keeps, per pose, what `summarize` makes
+    /// of the numbers of the beams of each piece and the ranges that they met.
     fn each_piece<T: Send>(
         &self,
         map_from_lidar: &[Pose3],
-        order: &[u32],
-        direction: impl Fn(usize) -> Vec3 + Sync,
-        reach: impl Fn(usize) -> Reach + Sync,
-        summarize: impl Fn(&[u32], &[Hit]) -> T + Sync,
-    ) -> Vec<T> {
-        let pieces_per_pose = order.len().div_ceil(RAYS_PER_PIECE);
-        (0..map_from_lidar.len() * pieces_per_pose)
+        beams: &Beams,
+        summarize: impl Fn(&[u32], &[f32]) -> T + Sync,
+    ) -> Vec<Vec<T>> {
+        let groups = groups_of(map_from_lidar, &beams.directions, &beams.order);
+        let pieces: Vec<&[u32]> = beams.order.chunks(RAYS_PER_PIECE).collect();
+        let summaries: Vec<Vec<T>> = (0..groups.len() * pieces.len())
             .into_par_iter()
             .map(|number| {
-                let pose = &map_from_lidar[number / pieces_per_pose];
-                let first = number % pieces_per_pose * RAYS_PER_PIECE;
-                let rays = &order[first..order.len().min(first + RAYS_PER_PIECE)];
-                let mut directions = [Vec3::ZERO; RAYS_PER_PIECE];
-                let mut reaches = [Reach::UNLIMITED; RAYS_PER_PIECE];
-                let mut hits = [Hit::MISS; RAYS_PER_PIECE];
-                let rotation = Rigid3f::from(pose).rotation;
-                for (place, &ray) in rays.iter().enumerate() {
-                    directions[place] = rotation * direction(ray as usize);
-                    reaches[place] = reach(ray as usize);
-                }
-                let t = pose.translation.vector;
-                let (origin, hits) = (DVec3::new(t.x, t.y, t.z), &mut hits[..rays.len()]);
-                self.scene.cast_within(
-                    origin,
-                    &directions[..rays.len()],
-                    &reaches[..rays.len()],
-                    hits,
-                );
-                summarize(rays, hits)
+                let group = &groups[number / pieces.len()];
+                let rays = pieces[number % pieces.len()];
+                let poses = group
+                    .poses
+                    .iter()
+                    .map(|&pose| &map_from_lidar[pose as usize]);
+                let ranges = if group.is_bundled {
+                    self.cast_bundles(&poses.collect::<Vec<_>>(), rays, beams)
+                } else {
+                    poses
+                        .map(|pose| self.cast_packets(pose, rays, beams))
+                        .collect()
+                };
+                ranges
+                    .iter()
+                    .map(|ranges| summarize(rays, ranges))
+                    .collect()
             })
+            .collect();
+        let mut per_pose: Vec<Vec<T>> = map_from_lidar
+            .iter()
+            .map(|_| Vec::with_capacity(pieces.len()))
+            .collect();
+        for (number, summaries) in summaries.into_iter().enumerate() {
+            let poses = &groups[number / pieces.len()].poses;
+            for (&pose, summary) in poses.iter().zip(summaries) {
+                per_pose[pose as usize].push(summary);
+            }
+        }
+        per_pose
+    }
+
+    /// Ranges of some beams of one pose.
+    fn cast_packets(&self, map_from_lidar: &Pose3, rays: &[u32], beams: &Beams) -> Vec<f32> {
+        let mut directions = [Vec3::ZERO; RAYS_PER_PIECE];
+        let mut reaches = [Reach::UNLIMITED; RAYS_PER_PIECE];
+        let mut hits = [Hit::MISS; RAYS_PER_PIECE];
+        let rotation = rotation_of(map_from_lidar);
+        for (place, &ray) in rays.iter().enumerate() {
+            directions[place] = rotation * beams.directions[ray as usize];
+            reaches[place] = beams.reaches[ray as usize];
+        }
+        self.scene.cast_within(
+            origin_of(map_from_lidar),
+            &directions[..rays.len()],
+            &reaches[..rays.len()],
+            &mut hits[..rays.len()],
+        );
+        hits[..rays.len()].iter().map(|hit| hit.range_m).collect()
+    }
+
+    /// Ranges of some beams of up to eight poses, a row per pose.
+    fn cast_bundles(&self, poses: &[&Pose3], rays: &[u32], beams: &Beams) -> Vec<Vec<f32>> {
+        // The last pose fills the empty places.
+        let pose_of = |place: usize| poses[place.min(poses.len() - 1)];
+        let origins = std::array::from_fn(|place| origin_of(pose_of(place)));
+        let rotations: [_; RAYS] = std::array::from_fn(|place| rotation_of(pose_of(place)));
+        let mut directions = [[Vec3::ZERO; RAYS]; RAYS_PER_PIECE];
+        let mut reaches = [Reach::UNLIMITED; RAYS_PER_PIECE];
+        let mut ranges_m = [[f32::INFINITY; RAYS]; RAYS_PER_PIECE];
+        for (place, &ray) in rays.iter().enumerate() {
+            directions[place] = rotations.map(|rotation| rotation * beams.directions[ray as usize]);
+            reaches[place] = beams.reaches[ray as usize];
+        }
+        let ranges_m = &mut ranges_m[..rays.len()];
+        self.scene.cast_bundles(
+            &origins,
+            &directions[..rays.len()],
+            &reaches[..rays.len()],
+            ranges_m,
+        );
+        (0..poses.len())
+            .map(|place| ranges_m.iter().map(|ranges_m| ranges_m[place]).collect())
             .collect()
     }
 
     /// Ranges of every pose, ray by ray in the order of their numbers.
-    fn ranges(
-        &self,
-        map_from_lidar: &[Pose3],
-        order: &[u32],
-        direction: impl Fn(usize) -> Vec3 + Sync,
-        reach: Reach,
-    ) -> Vec<Vec<f32>> {
-        if order.is_empty() {
-            return vec![Vec::new(); map_from_lidar.len()];
-        }
-        let pieces = self.cast_pieces(map_from_lidar, order, direction, |_| reach);
-        pieces
-            .par_chunks(order.len().div_ceil(RAYS_PER_PIECE))
+    fn ranges(&self, map_from_lidar: &[Pose3], beams: &Beams) -> Vec<Vec<f32>> {
+        self.each_piece(map_from_lidar, beams, |_, ranges| ranges.to_vec())
+            .into_par_iter()
             .map(|pieces| {
-                let mut ranges = vec![f32::INFINITY; order.len()];
-                for (&ray, hit) in order.iter().zip(pieces.iter().flatten()) {
-                    ranges[ray as usize] = hit.range_m;
+                let mut ranges = vec![f32::INFINITY; beams.order.len()];
+                for (&ray, range_m) in beams.order.iter().zip(pieces.into_iter().flatten()) {
+                    ranges[ray as usize] = range_m;
                 }
                 ranges
             })
             .collect()
     }
+}
+
+/// What is cast from every pose.
+struct Beams {
+    /// Unit, lidar frame.
+    directions: Vec<Vec3>,
+    reaches: Vec<Reach>,
+    /// Numbers of the beams such that neighbours in the list are neighbours in space.
+    order: Vec<u32>,
+}
+
+fn rotation_of(map_from_lidar: &Pose3) -> Mat3 {
+    Rigid3f::from(map_from_lidar).rotation
+}
+
+fn origin_of(map_from_lidar: &Pose3) -> DVec3 {
+    let place = map_from_lidar.translation.vector;
+    DVec3::new(place.x, place.y, place.z)
 }
 
 impl RangeRenderer for CpuRenderer {
@@ -149,10 +214,12 @@ impl RangeRenderer for CpuRenderer {
         map_from_lidar: &[Pose3],
         model: &LidarModel,
     ) -> Result<Vec<Vec<f32>>, RenderError> {
-        let directions = model.directions();
-        let reach = Reach::until(model.max_range);
-        let order = pixel_order(model);
-        let mut images = self.ranges(map_from_lidar, &order, |ray| directions[ray], reach);
+        let beams = Beams {
+            directions: model.directions(),
+            reaches: vec![Reach::until(model.max_range); model.len()],
+            order: pixel_order(model),
+        };
+        let mut images = self.ranges(map_from_lidar, &beams);
         for range_m in images.iter_mut().flatten() {
             if !model.accepts_range(*range_m) {
                 *range_m = f32::INFINITY;
@@ -166,9 +233,12 @@ impl RangeRenderer for CpuRenderer {
         map_from_lidar: &[Pose3],
         directions: &[Vec3],
     ) -> Result<Vec<Vec<f32>>, RenderError> {
-        let order = coherent_order(directions);
-        let direction = |ray: usize| directions[ray];
-        Ok(self.ranges(map_from_lidar, &order, direction, Reach::UNLIMITED))
+        let beams = Beams {
+            directions: directions.to_vec(),
+            reaches: vec![Reach::UNLIMITED; directions.len()],
+            order: coherent_order(directions),
+        };
+        Ok(self.ranges(map_from_lidar, &beams))
     }
 
     fn compare(
@@ -181,26 +251,23 @@ impl RangeRenderer for CpuRenderer {
             return Ok(vec![0.0; map_from_lidar.len()]);
         }
         let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
-        let order = coherent_order(&directions);
-        let reaches: Vec<Reach> = beams
+        let reaches = beams
             .iter()
             .map(|beam| deciding_reach(beam.range_m, difference))
             .collect();
-        let sums = self.each_piece(
-            map_from_lidar,
-            &order,
-            |ray| directions[ray],
-            |ray| reaches[ray],
-            |rays, hits| {
-                let costs = rays.iter().zip(hits).map(|(&ray, hit)| {
-                    f64::from(difference.cost(beams[ray as usize].range_m, hit.range_m))
-                });
-                costs.sum::<f64>()
-            },
-        );
-        let mean = |sums: &[f64]| (sums.iter().sum::<f64>() / beams.len() as f64) as f32;
-        let pieces_per_pose = order.len().div_ceil(RAYS_PER_PIECE);
-        Ok(sums.chunks(pieces_per_pose).map(mean).collect())
+        let to_cast = Beams {
+            order: coherent_order(&directions),
+            directions,
+            reaches,
+        };
+        let sums = self.each_piece(map_from_lidar, &to_cast, |rays, ranges| {
+            let costs = rays.iter().zip(ranges).map(|(&ray, &range_m)| {
+                f64::from(difference.cost(beams[ray as usize].range_m, range_m))
+            });
+            costs.sum::<f64>()
+        });
+        let mean = |sums: Vec<f64>| (sums.iter().sum::<f64>() / beams.len() as f64) as f32;
+        Ok(sums.into_iter().map(mean).collect())
     }
 }
 

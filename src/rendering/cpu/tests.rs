@@ -108,7 +108,8 @@ fn the_number_of_threads_does_not_change_a_bit() {
         let costs = renderer
             .compare(&poses(50), &beams(3600), &difference)
             .unwrap();
-        (images, costs)
+        let swarm = renderer.compare(&swarm(50, 0.05), &beams(3600), &difference);
+        (images, costs, swarm.unwrap())
     };
     assert_eq!(on_threads(1, work), on_threads(3, work));
 }
@@ -203,4 +204,54 @@ fn out_of_the_map_there_is_nothing() {
             .unwrap(),
         [0.0]
     );
+}
+
+/// Poses about as far from each other as `spread_m`, in steps of the heading of a tenth of that.
+fn swarm(count: usize, spread_m: f64) -> Vec<Pose3> {
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    (0..count)
+        .map(|_| {
+            let [x, y, turn] = [0; 3].map(|_| spread_m * rng.random_range(-1.0..1.0));
+            Pose3::new(Vector3::new(1.0 + x, y, 2.5), Vector3::z() * 0.1 * turn)
+        })
+        .collect()
+}
+
+#[test]
+fn a_pose_sees_the_same_alone_as_in_a_swarm_but_for_rays_at_edges() {
+    let renderer = CpuRenderer::new(&hills(Vec3::ZERO));
+    let (difference, beams) = (RangeDifference::truncated(0.5), beams(1000));
+    let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
+    let mut at_edges = 0;
+    for (count, spread_m) in [(7, 0.05), (100, 0.05), (61, 1.0), (30, 10.0)] {
+        let poses = swarm(count, spread_m);
+        let together = renderer.compare(&poses, &beams, &difference).unwrap();
+        let rows = renderer.cast(&poses, &directions).unwrap();
+        for ((pose, cost), row) in poses.iter().zip(together).zip(rows) {
+            let alone = renderer.compare(&[*pose], &beams, &difference).unwrap();
+            assert!((alone[0] - cost).abs() < 2e-6, "{} {cost}", alone[0]);
+            let alone = renderer.cast(&[*pose], &directions).unwrap();
+            for (a, b) in alone[0].iter().zip(row).filter(|&(&a, b)| a != b) {
+                at_edges += 1;
+                assert!((a - b).abs() < 1e-3, "{a} {b}");
+            }
+        }
+    }
+    assert!(at_edges < 20, "{at_edges} of 198,000");
+}
+
+#[test]
+fn a_swarm_is_bundled_and_poses_far_from_each_other_are_not() {
+    let directions: Vec<Vec3> = beams(500).iter().map(|beam| beam.direction).collect();
+    let order = coherent_order(&directions);
+    let bundled_of = |poses: &[Pose3]| -> Vec<bool> {
+        let groups = groups_of(poses, &directions, &order);
+        let mut numbers: Vec<u32> = groups.iter().flat_map(|g| g.poses.clone()).collect();
+        numbers.sort_unstable();
+        assert!(numbers.into_iter().eq(0..poses.len() as u32));
+        groups.iter().map(|group| group.is_bundled).collect()
+    };
+    assert!(bundled_of(&swarm(64, 0.05)).into_iter().all(|is| is));
+    assert!(bundled_of(&poses(64)).into_iter().all(|is| !is));
+    assert_eq!(bundled_of(&swarm(1, 0.05)), [false]);
 }
