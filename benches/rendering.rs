@@ -67,16 +67,28 @@ fn strided_images(bencher: Bencher, threads: usize) {
         .bench(|| pool.install(|| renderer.render(black_box(&poses), &model)));
 }
 
-/// A frame of tracking: poses around the truth.
+/// A frame of tracking: poses within centimetres of the truth.
+#[divan::bench(args = THREADS, sample_count = 10)]
+fn compare_100_close_poses_3600_beams(bencher: Bencher, threads: usize) {
+    compare(bencher, threads, &around(100, 0.1, 0.2, 0.03), 3600);
+}
+
+/// Poses within a metre of the truth.
 #[divan::bench(args = THREADS, sample_count = 10)]
 fn compare_100_poses_3600_beams(bencher: Bencher, threads: usize) {
-    compare(bencher, threads, &around(100, 1.0), 3600);
+    compare(bencher, threads, &around(100, 1.0, 2.0, 1.0), 3600);
+}
+
+/// A start whose place is known to a few metres.
+#[divan::bench(args = THREADS, sample_count = 3)]
+fn compare_10000_near_poses_500_beams(bencher: Bencher, threads: usize) {
+    compare(bencher, threads, &around(10_000, 5.0, 10.0, 1.0), 500);
 }
 
 /// The first frame of a global start: poses over the whole street.
 #[divan::bench(args = THREADS, sample_count = 3)]
 fn compare_10000_poses_500_beams(bencher: Bencher, threads: usize) {
-    compare(bencher, threads, &around(10_000, 100.0), 500);
+    compare(bencher, threads, &around(10_000, 100.0, 2.0, 1.0), 500);
 }
 
 #[divan::bench(args = THREADS, sample_count = 3)]
@@ -119,15 +131,18 @@ fn poses() -> Vec<Pose3> {
         .collect()
 }
 
-/// Poses within `along_m` of the middle of the street, in a sequence without gaps (Weyl).
-fn around(count: usize, along_m: f64) -> Vec<Pose3> {
+/// Poses within `along_m` of the middle of the street, in a strip of `width_m`, with headings
+/// over `turn_rad`, in a sequence without gaps (Weyl).
+fn around(count: usize, along_m: f64, width_m: f64, turn_rad: f64) -> Vec<Pose3> {
     let spread = |number: usize, step: f64| (number as f64 * step).fract() - 0.5;
     (0..count)
         .map(|number| {
             let along = 0.5 + 2.0 * along_m / 300.0 * spread(number, 0.754_877_666);
-            let aside_m = 2.0 * spread(number, 0.569_840_291);
+            let aside_m = width_m * spread(number, 0.569_840_291);
             at(street::on_the_road(along as f32, aside_m as f32))
-                * Pose3::rotation(nalgebra::Vector3::z() * spread(number, 0.618_033_989))
+                * Pose3::rotation(
+                    nalgebra::Vector3::z() * (turn_rad * spread(number, 0.618_033_989)),
+                )
         })
         .collect()
 }

@@ -141,9 +141,9 @@ impl Bundle {
         (near, u64::from_le_bytes(is_entered))
     }
 
-    /// Whether any ray enters the box of a child before its nearest hit.
+    /// Which rays enter the box of a child before their nearest hit; `None` where none does.
     #[inline(always)]
-    fn enters(&self, origins: &Origins, node: &WideNode, child: usize) -> bool {
+    fn enters(&self, origins: &Origins, node: &WideNode, child: usize) -> Option<[bool; RAYS]> {
         let mut near = [0.0; RAYS];
         let mut far = self.until_m;
         for axis in 0..3 {
@@ -155,17 +155,20 @@ impl Bundle {
                 far[ray] = min(far[ray], max(a, b));
             }
         }
+        let mut is_entering = [false; RAYS];
         let mut any = false;
         for ray in 0..RAYS {
-            any |= near[ray] <= far[ray] * FARTHER;
+            is_entering[ray] = near[ray] <= far[ray] * FARTHER;
+            any |= is_entering[ray];
         }
-        any
+        any.then_some(is_entering)
     }
 
     /// Takes the hits of a block that are nearer than what was known, as
-    /// [`super::packet::Packet::meet`] does.
+    /// [`super::packet::Packet::meet`] does, for the rays that enter its box: others would see
+    /// triangles from their edge that they pass.
     #[inline(always)]
-    pub fn meet(&mut self, origins: &Origins, block: &Block) {
+    pub fn meet(&mut self, origins: &Origins, block: &Block, is_entering: [bool; RAYS]) {
         for triangle in 0..TRIANGLES {
             if !block.has(triangle) {
                 break;
@@ -178,7 +181,8 @@ impl Bundle {
             for ray in 0..RAYS {
                 let least = min(min(u[ray], v[ray]), w[ray]);
                 let most = max(max(u[ray], v[ray]), w[ray]);
-                inside[ray] = (least >= -rounding[ray]) | (most <= rounding[ray]);
+                inside[ray] =
+                    is_entering[ray] & ((least >= -rounding[ray]) | (most <= rounding[ray]));
                 any |= inside[ray];
             }
             if !any {
@@ -301,9 +305,9 @@ impl<'a> WideWalk<'a> {
         walk
     }
 
-    /// The next leaf that a ray of the bundle may find something in.
+    /// The next leaf that a ray of the bundle may find something in, and which rays may.
     #[inline(always)]
-    pub fn next_leaf(&mut self, bundle: &Bundle) -> Option<usize> {
+    pub fn next_leaf(&mut self, bundle: &Bundle) -> Option<(usize, [bool; RAYS])> {
         while let Some(next) = self.waiting.pop() {
             if next.near_m > bundle.farthest_m * FARTHER {
                 continue;
@@ -314,8 +318,8 @@ impl<'a> WideWalk<'a> {
             }
             let place = next.place as usize;
             let node = &self.bvh.nodes[place / CHILDREN];
-            if bundle.enters(self.origins, node, place % CHILDREN) {
-                return Some(next.child.index());
+            if let Some(is_entering) = bundle.enters(self.origins, node, place % CHILDREN) {
+                return Some((next.child.index(), is_entering));
             }
         }
         None

@@ -298,7 +298,7 @@ impl Scene {
         for ((directions, reach), ranges_m) in directions.iter().zip(reach).zip(ranges_m) {
             let mut bundle = Bundle::new(directions, *reach);
             let mut tiles = WideWalk::new(&bundle, &self.wide_top, &over_tiles, &mut waiting_tiles);
-            while let Some(tile) = tiles.next_leaf(&bundle) {
+            while let Some((tile, _)) = tiles.next_leaf(&bundle) {
                 self.cast_bundle_at(&self.tiles[tile], &origins, &mut bundle, &mut waiting);
             }
             *ranges_m = bundle.range_m;
@@ -315,8 +315,9 @@ impl Scene {
     ) {
         let origins = Origins::from(tile.middle, origins);
         let mut leaves = WideWalk::new(bundle, &tile.wide_bvh, &origins, waiting);
-        while let Some(leaf) = leaves.next_leaf(bundle) {
-            bundle.meet(&origins, &self.blocks[tile.first_block + leaf]);
+        while let Some((leaf, is_entering)) = leaves.next_leaf(bundle) {
+            let block = &self.blocks[tile.first_block + leaf];
+            bundle.meet(&origins, block, is_entering);
         }
     }
 

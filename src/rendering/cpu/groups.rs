@@ -15,7 +15,7 @@ const LEVER_M: f64 = 10.0;
 const BITS_PER_AXIS: u32 = 20;
 /// How much wider than a packet of beams a bundle may be and still take no longer: measured with
 /// `benches/rendering.rs`.
-const WORTHWHILE: f64 = 0.9;
+const WORTHWHILE: f64 = 0.4;
 
 /// Up to eight poses.
 pub(super) struct Group {
