@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use fpmcl::config::{
     self, BuildMapConfig, Check, EvaluationConfig, GroundConfig, Initialization,
-    LocalizationConfig, RefinementConfig,
+    LocalizationConfig, RefinementConfig, RenderedRangeImage,
 };
 use fpmcl::simulation::SimulationConfig;
 use serde::Serialize;
@@ -147,6 +147,10 @@ fn the_localization_file_of_range_mcl_loads_unchanged() {
         calib_file: "../data/07/calib.txt".into(),
         result_path: "../results/demo_loc_results.npz".into(),
         pose_tracking: false,
+        range_image: RenderedRangeImage {
+            max_instance: 50,
+            ..RenderedRangeImage::default()
+        },
         ..LocalizationConfig::default()
     };
     assert_eq!(config, expected);
