@@ -185,8 +185,8 @@ pub struct MachineArgs {
     pub backend: BackendArg,
 
     /// Threads; as many as there are processors if not given.
-    #[arg(long, value_name = "N")]
-    pub threads: Option<NonZeroUsize>,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    pub threads: Option<u16>,
 }
 
 /// What renders the map.

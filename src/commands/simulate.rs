@@ -21,6 +21,7 @@ use anyhow::{Context as _, Result, bail};
 use rayon::prelude::*;
 
 use super::Context;
+use super::interrupt::{Interrupt, Interrupted};
 use super::output::replace as write_whole;
 use super::progress::Task;
 use crate::geometry::Pose3;
@@ -44,7 +45,8 @@ pub struct SimulationReport {
     pub driven_m: f64,
 }
 
-/// Simulates a drive. `progress` is told how many scans are done, of how many.
+/// Simulates a drive. `progress` is told how many scans are done, of how many. When `interrupt` is
+/// requested, the scans that are being made are finished, and the rest is left for the next run.
 ///
 /// A complete drive with the same configuration is kept as it is; one with another
 /// configuration is an error unless `force`.
@@ -52,6 +54,7 @@ pub fn run(
     config: &SimulationConfig,
     force: bool,
     progress: &(dyn Fn(usize, usize) + Sync),
+    interrupt: &Interrupt,
 ) -> Result<SimulationReport> {
     let simulation = prepare(config)?;
     let folder = config.drive_folder();
@@ -80,7 +83,7 @@ pub fn run(
     write_whole(&folder.join("simulation.yml"), |path| {
         fs::write(path, &recipe).with_context(|| format!("cannot write {}", path.display()))
     })?;
-    let kept = write_scans(&simulation, &folder, progress)?;
+    let kept = write_scans(&simulation, &folder, progress, interrupt)?;
     write_poses(&simulation, &folder, &poses)?;
     Ok(report(kept))
 }
@@ -96,7 +99,7 @@ pub fn run_with_progress(
         task.get_or_init(|| context.progress.task("simulate", all))
             .advance(1);
     };
-    let report = run(config, force, &progress)?;
+    let report = run(config, force, &progress, &context.interrupt)?;
     drop(task);
     let rows = [
         ("folder", report.folder.display().to_string()),
@@ -172,12 +175,16 @@ fn write_scans(
     simulation: &Simulation,
     folder: &Path,
     progress: &(dyn Fn(usize, usize) + Sync),
+    interrupt: &Interrupt,
 ) -> Result<usize> {
     let done = AtomicUsize::new(0);
     let kept = AtomicUsize::new(0);
     (0..simulation.frames())
         .into_par_iter()
         .try_for_each(|frame| -> Result<()> {
+            if interrupt.requested() {
+                return Ok(());
+            }
             let scan_path = folder.join(format!("velodyne/{frame:06}.bin"));
             if scan_path.exists() {
                 kept.fetch_add(1, Ordering::Relaxed);
@@ -196,6 +203,14 @@ fn write_scans(
             );
             Ok(())
         })?;
+    let (done, frames) = (done.into_inner(), simulation.frames());
+    if done < frames {
+        let kept = format!(
+            "{done} of {frames} scans are kept in {}; the same command goes on from there",
+            folder.display()
+        );
+        return Err(Interrupted { kept }.into());
+    }
     Ok(kept.into_inner())
 }
 
@@ -251,7 +266,7 @@ mod tests {
     }
 
     fn quietly(config: &SimulationConfig, force: bool) -> Result<SimulationReport> {
-        run(config, force, &|_, _| {})
+        run(config, force, &|_, _| {}, &Interrupt::default())
     }
 
     /// Every file of a drive with its bytes, except the recipe, which names the folder.
@@ -301,6 +316,27 @@ mod tests {
         fs::write(drive.join("velodyne/000004.bin.part"), [1, 2, 3]).unwrap();
         assert_eq!(quietly(&config, false).unwrap().kept, 4);
         assert_eq!(contents(&drive), whole);
+    }
+
+    #[test]
+    fn an_interrupt_keeps_the_scans_that_are_done_and_says_how_many() {
+        let folder = tempfile::tempdir().unwrap();
+        let config = small(folder.path());
+        let interrupt = Interrupt::default();
+        let after_two = |done: usize, _all: usize| {
+            if done == 2 {
+                interrupt.request();
+            }
+        };
+        let one_thread = rayon::ThreadPoolBuilder::new()
+            .num_threads(1)
+            .build()
+            .unwrap();
+        let stopped = one_thread.install(|| run(&config, false, &after_two, &interrupt));
+        let message = stopped.unwrap_err().to_string();
+        assert!(message.contains("2 of 6 scans are kept"), "{message}");
+        assert!(!config.drive_folder().join("poses.txt").exists());
+        assert_eq!(quietly(&config, false).unwrap().kept, 2);
     }
 
     #[test]

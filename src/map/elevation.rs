@@ -13,7 +13,8 @@
 use glam::Vec3;
 use nalgebra::{Matrix3, Point2, Rotation3, Translation3, UnitQuaternion, Vector3};
 
-use crate::geometry::{Grid2, Pose2, Pose3, TriangleMesh};
+use super::heights::Heights;
+use crate::geometry::{Pose2, Pose3, TriangleMesh};
 
 /// How the sensor stands over the road: height, roll and pitch.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -71,68 +72,43 @@ pub struct GroundPatch {
 /// Height of the ground on a grid over the map.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GroundMap {
-    grid: Grid2,
-    /// NaN where no ground is known.
-    heights_m: Vec<f32>,
+    heights: Heights,
 }
 
 impl GroundMap {
-    /// From the triangles for which `is_ground` holds, by their vertices, cells of `cell_m`.
+    /// From the triangles for which `is_ground` holds, in cells of `cell_m`.
     pub fn from_mesh(mesh: &TriangleMesh, is_ground: impl Fn(usize) -> bool, cell_m: f64) -> Self {
-        let bounds = mesh.bounds();
-        let (min, max) = if bounds.is_empty() {
-            (Point2::origin(), Point2::origin())
-        } else {
-            (
-                Point2::new(f64::from(bounds.min.x), f64::from(bounds.min.y)),
-                Point2::new(f64::from(bounds.max.x), f64::from(bounds.max.y)),
-            )
-        };
-        let grid = Grid2::covering(min, max, cell_m);
-        let mut sums = vec![(0.0_f64, 0.0_f64); grid.len()];
-        for triangle in (0..mesh.triangles.len()).filter(|&triangle| is_ground(triangle)) {
-            rasterize(&grid, mesh.corners(triangle), &mut sums);
+        let ground = (0..mesh.triangles.len()).filter(|&triangle| is_ground(triangle));
+        Self {
+            heights: Heights::of_triangles(ground.map(|triangle| mesh.corners(triangle)), cell_m),
         }
-        let heights_m = sums
-            .iter()
-            .map(|&(sum, count)| {
-                if count > 0.0 {
-                    (sum / count) as f32
-                } else {
-                    f32::NAN
-                }
-            })
-            .collect();
-        Self { grid, heights_m }
     }
 
     /// Flat ground everywhere in a rectangle, for tests and for maps whose ground is not marked.
     pub fn flat(min: Point2<f64>, max: Point2<f64>, height_m: f64) -> Self {
-        let grid = Grid2::covering(min, max, 1.0);
         Self {
-            grid,
-            heights_m: vec![height_m as f32; grid.len()],
+            heights: Heights::flat(min, max, height_m, 1.0),
         }
     }
 
     /// The ground at a place: a plane fitted to the known cells within `radius_m`; `None` where
     /// fewer than a third of them are known.
     pub fn patch_at(&self, x: f64, y: f64, radius_m: f64) -> Option<GroundPatch> {
-        let (column, row) = self.grid.cell_at(x, y)?;
-        let reach = (radius_m / self.grid.cell_m).ceil() as usize;
+        let (column, row) = self.heights.cell_at(x, y)?;
+        let reach = (radius_m / self.heights.cell_m).ceil() as i64;
+        let mut heights = self.heights.reader();
         let mut normal_matrix = Matrix3::zeros();
         let mut right_side = Vector3::zeros();
         let (mut known, mut all) = (0, 0);
-        for row in row.saturating_sub(reach)..=(row + reach).min(self.grid.rows - 1) {
-            for column in column.saturating_sub(reach)..=(column + reach).min(self.grid.columns - 1)
-            {
-                let center = self.grid.center(column, row);
+        for row in row - reach..=row + reach {
+            for column in column - reach..=column + reach {
+                let center = self.heights.center((column, row));
                 let offset = Vector3::new(center.x - x, center.y - y, 1.0);
                 if offset.xy().norm() > radius_m {
                     continue;
                 }
                 all += 1;
-                let height_m = f64::from(self.heights_m[row * self.grid.columns + column]);
+                let height_m = heights.height_m((column, row));
                 if height_m.is_finite() {
                     known += 1;
                     normal_matrix += offset * offset.transpose();
@@ -160,18 +136,16 @@ impl GroundMap {
     /// Height of the ground at a place, between the middles of the four cells around it [m];
     /// `None` where one of them is not known.
     pub fn height_at(&self, x: f64, y: f64) -> Option<f64> {
-        let cell_m = self.grid.cell_m;
-        let (column, row) = self.grid.cell_at(x - 0.5 * cell_m, y - 0.5 * cell_m)?;
-        if column + 1 >= self.grid.columns || row + 1 >= self.grid.rows {
-            return None;
-        }
-        let center = self.grid.center(column, row);
+        let cell_m = self.heights.cell_m;
+        let (column, row) = self.heights.cell_at(x - 0.5 * cell_m, y - 0.5 * cell_m)?;
+        let center = self.heights.center((column, row));
         let (right, up) = ((x - center.x) / cell_m, (y - center.y) / cell_m);
-        let known =
-            |column: usize, row: usize| f64::from(self.heights_m[row * self.grid.columns + column]);
-        let lower = (1.0 - right) * known(column, row) + right * known(column + 1, row);
-        let upper = (1.0 - right) * known(column, row + 1) + right * known(column + 1, row + 1);
-        let height_m = (1.0 - up) * lower + up * upper;
+        let mut heights = self.heights.reader();
+        let mut between = |row: i64| {
+            (1.0 - right) * heights.height_m((column, row))
+                + right * heights.height_m((column + 1, row))
+        };
+        let height_m = (1.0 - up) * between(row) + up * between(row + 1);
         // What is not known is not a number, and so is every sum with it.
         height_m.is_finite().then_some(height_m)
     }
@@ -254,41 +228,6 @@ impl GroundPatch {
             Translation3::new(t.x, t.y, height_m),
             UnitQuaternion::from_euler_angles(0.0, 0.0, turn_rad) * tilted,
         )
-    }
-}
-
-/// Adds the height of a triangle to the cells whose centre it covers, and of its corners to theirs.
-fn rasterize(grid: &Grid2, corners: [Vec3; 3], sums: &mut [(f64, f64)]) {
-    let [a, b, c] = corners.map(|corner| Vector3::new(corner.x, corner.y, corner.z).cast::<f64>());
-    for corner in [a, b, c] {
-        if let Some(index) = grid.index_at(corner.x, corner.y) {
-            sums[index].0 += corner.z;
-            sums[index].1 += 1.0;
-        }
-    }
-    let (ab, ac) = (b - a, c - a);
-    let area = ab.x * ac.y - ab.y * ac.x;
-    let lowest = |axis: usize| a[axis].min(b[axis]).min(c[axis]);
-    let highest = |axis: usize| a[axis].max(b[axis]).max(c[axis]);
-    let first = grid.cell_at(lowest(0).max(grid.origin.x), lowest(1).max(grid.origin.y));
-    let (Some((first_column, first_row)), true) = (first, area.abs() > 1e-12) else {
-        return;
-    };
-    let last = |highest_m: f64, origin_m: f64, cells: usize| {
-        (((highest_m - origin_m) / grid.cell_m) as usize).min(cells - 1)
-    };
-    for row in first_row..=last(highest(1), grid.origin.y, grid.rows) {
-        for column in first_column..=last(highest(0), grid.origin.x, grid.columns) {
-            let center = grid.center(column, row);
-            let (x, y) = (center.x - a.x, center.y - a.y);
-            let u = (x * ac.y - y * ac.x) / area;
-            let v = (ab.x * y - ab.y * x) / area;
-            if u >= 0.0 && v >= 0.0 && u + v <= 1.0 {
-                let index = row * grid.columns + column;
-                sums[index].0 += a.z + u * ab.z + v * ac.z;
-                sums[index].1 += 1.0;
-            }
-        }
     }
 }
 

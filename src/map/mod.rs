@@ -1,6 +1,7 @@
 //! The map: built from scans, kept as a mesh, cut into tiles.
 
 pub mod elevation;
+mod heights;
 pub mod local_map;
 pub mod plan;
 pub mod ply;

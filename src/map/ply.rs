@@ -61,7 +61,16 @@ pub enum PlyError {
     },
     #[error("{}: vertex {vertex} is not finite", path.display())]
     NotFinite { path: PathBuf, vertex: usize },
+    #[error("{}: vertex {vertex} is at {position}, which is farther from the origin than any place on Earth; the file is damaged, or its unit is not the metre", path.display())]
+    TooFar {
+        path: PathBuf,
+        vertex: usize,
+        position: Vec3,
+    },
 }
+
+/// The circumference of the Earth [m]: no coordinate of a map is larger.
+const FARTHEST_M: f32 = 4.0e7;
 
 /// Writes a mesh as binary little-endian PLY. Missing normals are computed, missing colours grey.
 pub fn write(path: &Path, mesh: &TriangleMesh) -> Result<(), PlyError> {
@@ -180,13 +189,23 @@ pub fn read(path: &Path) -> Result<TriangleMesh, PlyError> {
             path: path.to_owned(),
         });
     }
-    match mesh.vertices.iter().position(|vertex| !vertex.is_finite()) {
-        Some(vertex) => Err(PlyError::NotFinite {
-            path: path.to_owned(),
-            vertex,
-        }),
-        None => Ok(mesh),
+    let path = || path.to_owned();
+    for (vertex, &position) in mesh.vertices.iter().enumerate() {
+        if !position.is_finite() {
+            return Err(PlyError::NotFinite {
+                path: path(),
+                vertex,
+            });
+        }
+        if position.abs().max_element() > FARTHEST_M {
+            return Err(PlyError::TooFar {
+                path: path(),
+                vertex,
+                position,
+            });
+        }
     }
+    Ok(mesh)
 }
 
 #[derive(Debug, Default)]
@@ -500,6 +519,20 @@ mod tests {
         )
         .unwrap_err();
         assert!(matches!(error, PlyError::NoTriangles { .. }), "{error}");
+    }
+
+    #[test]
+    fn a_vertex_that_is_nowhere_on_earth_is_refused() {
+        let error = read_text(
+            "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n\
+             property float z\nelement face 1\nproperty list uchar int vertex_indices\n\
+             end_header\n0 0 0\n0 1e30 0\n1 0 0\n3 0 1 2\n",
+        )
+        .unwrap_err();
+        assert!(
+            matches!(error, PlyError::TooFar { vertex: 1, .. }),
+            "{error}"
+        );
     }
 
     #[test]
