@@ -111,12 +111,22 @@ fn interrupted(
     arguments: &[&str],
     scan: &HeldScan,
 ) -> (Option<i32>, String) {
+    signalled("-INT", recording, arguments, scan)
+}
+
+/// As [`interrupted`], by another signal.
+fn signalled(
+    signal: &str,
+    recording: &Recording,
+    arguments: &[&str],
+    scan: &HeldScan,
+) -> (Option<i32>, String) {
     let asked = scan.asked_for();
     let mut child = start(recording, arguments);
     let mut pipe = wait(&asked, &mut child);
     let mut stderr = BufReader::new(child.stderr.take().unwrap());
     let pressed = Command::new("kill")
-        .args(["-INT", &child.id().to_string()])
+        .args([signal, &child.id().to_string()])
         .status()
         .unwrap();
     assert!(pressed.success());
@@ -240,11 +250,12 @@ fn an_interrupted_localization_keeps_the_frames_it_has() {
 }
 
 #[test]
-fn a_localization_that_is_interrupted_in_its_first_frame_finishes_that_frame() {
+fn a_localization_that_is_ended_in_its_first_frame_finishes_that_frame() {
     let recording = Recording::street(6);
     recording.fpmcl("build-map").succeeds();
     let scan = HeldScan::of(&recording, 0);
-    let (code, said) = interrupted(&recording, LOCALIZE, &scan);
+    // What a batch system or a service manager sends.
+    let (code, said) = signalled("-TERM", &recording, LOCALIZE, &scan);
     assert_eq!(code, Some(130), "{said}");
     let kept = "interrupted; 1 of 6 frames are localized and kept in results/localization.npz";
     assert!(said.contains(kept), "{said}");
