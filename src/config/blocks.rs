@@ -18,9 +18,9 @@ use crate::localization::vigilance::VigilanceConfig;
 use crate::map::visibility::VisibilityConfig;
 use crate::meshing::PoissonConfig;
 use crate::refinement::RefinementConfig;
-use crate::refinement::gauss_newton::GaussNewtonConfig;
 use crate::refinement::smoothing::SmoothingConfig;
 use crate::refinement::swarm::SwarmConfig;
+use crate::registration::RegistrationConfig;
 
 /// The box of the own car: x_min, x_max, y_min, y_max [m].
 pub(super) fn own_car(key: &str, limits_m: [f32; 4]) -> Result<(), Problem> {
@@ -280,12 +280,10 @@ impl Check for SwarmConfig {
     }
 }
 
-impl Check for GaussNewtonConfig {
+impl Check for RegistrationConfig {
     fn check(&self) -> Result<(), Problem> {
         at_least_one("iterations", self.iterations)?;
         positive("kernel_m", self.kernel_m)?;
-        positive("step_m", self.step_m)?;
-        positive("step_rad", self.step_rad)?;
         not_negative("tolerance_m", self.tolerance_m)?;
         positive("independence", self.independence)
     }
