@@ -9,11 +9,12 @@ use super::check::{
 use crate::ground::{FeatureConfig, FuzzyConfig, FuzzyGround, PcaGround, RuleError};
 use crate::lidar::normals::NormalConfig;
 use crate::localization::initialization::StartSpread;
-use crate::localization::localizer::TemperingConfig;
 use crate::localization::motion::{OdometryNoise, VelocityNoise};
 use crate::localization::observation::ObservationConfig;
 use crate::localization::panorama::PanoramaConfig;
+use crate::localization::proposal::ProposalConfig;
 use crate::localization::resampling::{KldConfig, ResamplingConfig};
+use crate::localization::settings::TemperingConfig;
 use crate::localization::vigilance::VigilanceConfig;
 use crate::map::visibility::VisibilityConfig;
 use crate::meshing::PoissonConfig;
@@ -183,6 +184,22 @@ impl Check for TemperingConfig {
         share("min_effective_fraction", self.min_effective_fraction)?;
         at_least_one("searching_rounds", self.searching_rounds)?;
         at_least_one("tracking_rounds", self.tracking_rounds)
+    }
+}
+
+impl Check for ProposalConfig {
+    fn check(&self) -> Result<(), Problem> {
+        at_least_one("beams", self.beams)?;
+        share("road_share", self.road_share)?;
+        at_least_one("weighed_beams", self.weighed_beams)?;
+        nested("registration", self.registration.check())?;
+        require(
+            self.widening >= 1.0 && self.widening.is_finite(),
+            "widening",
+            self.widening,
+            "it must be 1 or greater",
+        )?;
+        positive("max_sigmas", self.max_sigmas)
     }
 }
 
