@@ -1,9 +1,9 @@
 //! Finds a car's pose to the centimetre from one spinning LiDAR and a mesh map that it builds itself.
 //!
 //! > A [`kitti`] sequence gives [`lidar`] scans; [`ground`] tells road from rest; [`meshing`]
-//! > turns points into surfaces, [`map`] tiles them; [`rendering`] shows the map from any pose;
-//! > [`localization`] finds the pose; [`refinement`] polishes it; [`evaluation`] measures it;
-//! > [`plotting`] draws it.
+//! > turns points into surfaces, [`map`] tiles them; [`rendering`] shows the map from any pose,
+//! > [`registration`] lays a scan onto it; [`localization`] finds the pose; [`refinement`]
+//! > polishes it; [`evaluation`] measures it; [`plotting`] draws it.
 //!
 //! | frame | origin and axes | appears in |
 //! |---|---|---|
@@ -26,6 +26,7 @@ pub mod kitti;
 pub mod meshing;
 // From surfaces to a map, and back to what the sensor would see in it.
 pub mod map;
+pub mod registration;
 pub mod rendering;
 pub mod simulation;
 // Where the car is, and how well that is known.

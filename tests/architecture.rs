@@ -9,13 +9,14 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Each layer may import those before it; the modules of one layer do not know each other.
-const LAYERS: [&[&str]; 10] = [
+const LAYERS: [&[&str]; 11] = [
     &["geometry"],
     &["lidar"],
     &["raycasting"],
     &["kitti", "ground", "meshing"],
     &["map"],
     &["rendering", "simulation"],
+    &["registration"],
     &["localization", "refinement", "evaluation"],
     &["plotting"],
     &["config"],

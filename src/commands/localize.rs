@@ -52,7 +52,15 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         &config.selection(),
     )?;
     let files = RunFiles::beside(&config.result_path);
-    let (results, lifted, finished) = localize(config, context, &map, &sequence, &files)?;
+    let increments = odometry::read_increments(
+        config.odometry,
+        config.odometry_file.as_deref(),
+        &sequence,
+        &mut stream(config.seed, ODOMETRY_STREAM),
+    )?;
+    let sequence = odometry::compensated(sequence, config.motion_compensation, &increments);
+    let run = localize(config, context, &map, &sequence, &increments, &files)?;
+    let (results, lifted, finished) = run;
     let about = about(config, context, &map);
     if config.save_result {
         run_output::write_results(&files, &results)?;
@@ -88,6 +96,7 @@ fn localize(
     context: &Context,
     map: &LoadedMap,
     sequence: &Sequence,
+    increments: &[Option<Pose2>],
     files: &RunFiles,
 ) -> Result<(LocalizationResults, Vec<Pose3>, bool)> {
     let classifier = FuzzyGround::new(FuzzyConfig::default())?;
@@ -96,12 +105,6 @@ fn localize(
         own_car_m: config.own_car_m,
         classifier: &classifier,
     };
-    let increments = odometry::read_increments(
-        config.odometry,
-        config.odometry_file.as_deref(),
-        sequence,
-        &mut stream(config.seed, ODOMETRY_STREAM),
-    )?;
     let mut recorder = Recorder::new(config, map, files);
     let mut localizer: Option<Localizer> = None;
     let panoramas = panoramas(config, map)?;
@@ -113,8 +116,9 @@ fn localize(
         }
         let points = observer.read(frame)?;
         let started = Instant::now();
-        let observed = observer.observe(points);
-        stance = observed.stance.unwrap_or(stance);
+        let image = observer.image(points);
+        let known = localizer.as_ref().and_then(Localizer::stance);
+        stance = known.or_else(|| observer.stance(&image)).unwrap_or(stance);
         let mut rng = stream(config.seed, FIRST_FRAME_STREAM + row as u64);
         if localizer.is_none() {
             let surroundings = Surroundings {
@@ -123,21 +127,14 @@ fn localize(
                 tiles: &map.grid,
                 panoramas: panoramas.as_ref(),
             };
-            let start = initial_particles(
-                config,
-                map,
-                frame,
-                &observed.image,
-                &stance,
-                panoramas.as_ref(),
-            )?;
+            let start = initial_particles(config, map, frame, &image, &stance, panoramas.as_ref())?;
             localizer = Some(Localizer::new(config.localizer(), surroundings, start));
         }
         let Some(localizer) = &mut localizer else {
             continue;
         };
         let moved = motion(config.motion_model, increments[row], sequence, row);
-        let estimate = localizer.step(moved, &observed.image, &stance, &mut rng)?;
+        let estimate = localizer.step(moved, &image, &stance, &mut rng)?;
         recorder.record(frame, increments[row], &estimate, started.elapsed())?;
         task.advance(1);
     }

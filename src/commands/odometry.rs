@@ -7,9 +7,10 @@ use rand::Rng;
 
 use super::input;
 use crate::config::OdometrySource;
-use crate::geometry::{Pose2, Pose3};
+use crate::geometry::{Pose2, Pose3, spatial};
 use crate::kitti::poses::{CameraPoses, read_tum};
 use crate::kitti::{KittiError, Sequence};
+use crate::lidar::Spin;
 use crate::localization::odometry::{demonstration_noise, increments, with_noise};
 
 /// `previous_from_current` into each frame of the sequence; `None` where nothing is known.
@@ -57,6 +58,19 @@ fn recorded(file: &Path, sequence: &Sequence) -> Result<Vec<Pose3>> {
         }
         Err(error) => Err(error).with_context(context),
     }
+}
+
+/// The sequence with its scans compensated by an odometry, where that is wanted.
+pub fn compensated(
+    sequence: Sequence,
+    spin: Option<Spin>,
+    increments: &[Option<Pose2>],
+) -> Sequence {
+    let Some(spin) = spin else {
+        return sequence;
+    };
+    let in_space = |increment: &Option<Pose2>| increment.map(|motion| spatial(&motion, 0.0));
+    sequence.compensated_by(spin, &increments.iter().map(in_space).collect::<Vec<_>>())
 }
 
 /// For reports.

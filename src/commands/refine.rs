@@ -58,8 +58,10 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
         Some(estimates) => estimates,
         None => RangeMclRules::default().estimates(&results)?,
     };
+    let increments = increments(config, &sequence, &results)?;
+    let sequence = odometry::compensated(sequence, config.motion_compensation, &increments);
     let polished = polish_all(config, context, &map, &sequence, &results, &estimates)?;
-    let smoothed = smooth_all(config, &sequence, &results, &polished)?;
+    let smoothed = smooth_all(config, &increments, &polished)?;
     let lifted = lift_all(&map, &smoothed, &polished);
 
     results.estimates = Some(estimates);
@@ -194,12 +196,12 @@ fn polish(
     rng.set_stream(row as u64);
     let points = observer.read(frame)?;
     let started = Instant::now();
-    let observed = observer.observe(points);
-    let stance = observed.stance.unwrap_or(stance_before);
+    let image = observer.image(points);
+    let stance = observer.stance(&image).unwrap_or(stance_before);
     let refined = if start.is_found {
         let observation = &config.observation;
         let beams = choose_beams(
-            &observed.image,
+            &image,
             observation.beams,
             observation.road_share,
             &stance,
@@ -236,18 +238,16 @@ fn polish(
     })
 }
 
-/// Smooths the whole trajectory with the odometry between its frames; without odometry every frame
-/// stays where its scan puts it.
-fn smooth_all(
+/// The odometry into each frame: the one that was localized with, where that is kept.
+fn increments(
     config: &RefinementConfig,
     sequence: &Sequence,
     results: &LocalizationResults,
-    polished: &[Polished],
-) -> Result<Vec<Pose2>> {
-    let poses: Vec<Pose2> = polished.iter().map(|frame| frame.pose).collect();
-    let increments = match (&results.odometry, config.odometry) {
-        (_, OdometrySource::None) => return Ok(poses),
-        (Some(recorded), OdometrySource::GroundTruth) => recorded.clone(),
+) -> Result<Vec<Option<Pose2>>> {
+    match (&results.odometry, config.odometry) {
+        (Some(recorded), OdometrySource::GroundTruth) => {
+            Ok(recorded.iter().copied().map(Some).collect())
+        }
         _ => {
             let mut rng = ChaCha8Rng::seed_from_u64(config.seed);
             rng.set_stream(u64::MAX);
@@ -256,16 +256,28 @@ fn smooth_all(
                 config.odometry_file.as_deref(),
                 sequence,
                 &mut rng,
-            )?
-            .into_iter()
-            .collect::<Option<Vec<_>>>()
-            .context("the odometry has gaps")?
+            )
         }
-    };
+    }
+}
+
+/// Smooths the whole trajectory with the odometry between its frames; without odometry every frame
+/// stays where its scan puts it.
+fn smooth_all(
+    config: &RefinementConfig,
+    increments: &[Option<Pose2>],
+    polished: &[Polished],
+) -> Result<Vec<Pose2>> {
+    let poses: Vec<Pose2> = polished.iter().map(|frame| frame.pose).collect();
     let priors: Vec<Option<FramePrior>> = polished.iter().map(|frame| frame.prior).collect();
-    if priors.iter().all(Option::is_none) {
+    if config.odometry == OdometrySource::None || priors.iter().all(Option::is_none) {
         return Ok(poses);
     }
+    let increments = increments
+        .iter()
+        .copied()
+        .collect::<Option<Vec<_>>>()
+        .context("the odometry has gaps")?;
     Ok(smooth(&poses, &priors, &increments, &trusted(config)))
 }
 

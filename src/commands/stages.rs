@@ -139,14 +139,6 @@ fn on_graphics_adapter(_: &[TriangleMesh], _: Backend) -> Result<Box<dyn RangeRe
     Err(crate::rendering::RenderError::NoAdapter.into())
 }
 
-/// What a frame shows: its range image, and how the sensor stands over the road.
-pub struct Observed {
-    /// The scan as an image.
-    pub image: RangeImage,
-    /// From the scan's own ground; `None` where too little of it is seen.
-    pub stance: Option<Stance>,
-}
-
 /// Makes scans into observations.
 pub struct Observer<'a> {
     /// Projection and limits.
@@ -163,21 +155,23 @@ impl Observer<'_> {
         Ok(frame.read()?.points)
     }
 
-    /// Looks at the points of a scan.
-    pub fn observe(&self, mut points: Vec<Vec3>) -> Observed {
+    /// The points of a scan as an image, without the own car and what is out of range.
+    pub fn image(&self, mut points: Vec<Vec3>) -> RangeImage {
         let [x_min, x_max, y_min, y_max] = self.own_car_m;
         points.retain(|p| {
             let on_own_car = p.x > x_min && p.x < x_max && p.y > y_min && p.y < y_max;
-            p.is_finite() && self.model.accepts_range(p.length()) && !on_own_car
+            !on_own_car
         });
-        let image = RangeImage::project(&points, &self.model);
+        RangeImage::project(&points, &self.model)
+    }
+
+    /// How the sensor stands over the ground that it sees; `None` where it sees too little.
+    pub fn stance(&self, image: &RangeImage) -> Option<Stance> {
         let seen: Vec<Vec3> = (0..image.ranges.len())
             .filter(|&index| image.has_return(index))
             .map(|index| image.points[index])
             .collect();
         let ground = self.classifier.ground_confidence(&seen);
-        let stance =
-            road_plane(&seen, &ground).map(|plane| Stance::from_plane(plane.up, plane.height_m));
-        Observed { image, stance }
+        road_plane(&seen, &ground).map(|plane| Stance::from_plane(plane.up, plane.height_m))
     }
 }

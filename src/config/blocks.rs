@@ -9,18 +9,19 @@ use super::check::{
 use crate::ground::{FeatureConfig, FuzzyConfig, FuzzyGround, PcaGround, RuleError};
 use crate::lidar::normals::NormalConfig;
 use crate::localization::initialization::StartSpread;
-use crate::localization::localizer::TemperingConfig;
 use crate::localization::motion::{OdometryNoise, VelocityNoise};
 use crate::localization::observation::ObservationConfig;
 use crate::localization::panorama::PanoramaConfig;
+use crate::localization::proposal::ProposalConfig;
 use crate::localization::resampling::{KldConfig, ResamplingConfig};
+use crate::localization::settings::TemperingConfig;
 use crate::localization::vigilance::VigilanceConfig;
 use crate::map::visibility::VisibilityConfig;
 use crate::meshing::PoissonConfig;
 use crate::refinement::RefinementConfig;
-use crate::refinement::gauss_newton::GaussNewtonConfig;
 use crate::refinement::smoothing::SmoothingConfig;
 use crate::refinement::swarm::SwarmConfig;
+use crate::registration::RegistrationConfig;
 
 /// The box of the own car: x_min, x_max, y_min, y_max [m].
 pub(super) fn own_car(key: &str, limits_m: [f32; 4]) -> Result<(), Problem> {
@@ -186,6 +187,22 @@ impl Check for TemperingConfig {
     }
 }
 
+impl Check for ProposalConfig {
+    fn check(&self) -> Result<(), Problem> {
+        at_least_one("beams", self.beams)?;
+        share("road_share", self.road_share)?;
+        at_least_one("weighed_beams", self.weighed_beams)?;
+        nested("registration", self.registration.check())?;
+        require(
+            self.widening >= 1.0 && self.widening.is_finite(),
+            "widening",
+            self.widening,
+            "it must be 1 or greater",
+        )?;
+        positive("max_sigmas", self.max_sigmas)
+    }
+}
+
 impl Check for ResamplingConfig {
     fn check(&self) -> Result<(), Problem> {
         share("min_effective_fraction", self.min_effective_fraction)?;
@@ -280,12 +297,10 @@ impl Check for SwarmConfig {
     }
 }
 
-impl Check for GaussNewtonConfig {
+impl Check for RegistrationConfig {
     fn check(&self) -> Result<(), Problem> {
         at_least_one("iterations", self.iterations)?;
         positive("kernel_m", self.kernel_m)?;
-        positive("step_m", self.step_m)?;
-        positive("step_rad", self.step_rad)?;
         not_negative("tolerance_m", self.tolerance_m)?;
         positive("independence", self.independence)
     }

@@ -12,8 +12,8 @@ use super::check::{
 };
 use crate::ground::{FuzzyConfig, GroundMethod, PcaGround, RansacGround};
 use crate::kitti::Selection;
-use crate::lidar::LidarModel;
 use crate::lidar::normals::NormalConfig;
+use crate::lidar::{LidarModel, Spin};
 use crate::map::LocalMapSettings;
 use crate::map::scan_cloud::ScanSettings;
 use crate::map::visibility::VisibilityConfig;
@@ -95,6 +95,9 @@ pub struct BuildMapConfig {
     pub fuzzy: FuzzyConfig,
     /// `ground_method: pca`.
     pub pca: PcaGround,
+    /// The sense in which the sensor spins, where the motion of the car during a scan is to be
+    /// compensated; not so for scans that are compensated already, as those of KITTI odometry.
+    pub motion_compensation: Option<Spin>,
     /// What random choices follow from.
     pub seed: u64,
     /// Whether an existing map is replaced.
@@ -141,6 +144,7 @@ impl Default for BuildMapConfig {
             visibility: settings.visibility,
             fuzzy: FuzzyConfig::default(),
             pca: PcaGround::default(),
+            motion_compensation: None,
             seed: 0,
             force: false,
         }

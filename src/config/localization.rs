@@ -9,15 +9,16 @@ use super::check::{
     Check, Problem, at_least_one, nested, not_negative, path, positive, require, selection,
 };
 use crate::kitti::Selection;
-use crate::lidar::LidarModel;
+use crate::lidar::{LidarModel, Spin};
 use crate::localization::LocalizerConfig;
 use crate::localization::convergence::ConvergenceConfig;
 use crate::localization::initialization::StartSpread;
-use crate::localization::localizer::TemperingConfig;
 use crate::localization::motion::{OdometryNoise, VelocityNoise};
 use crate::localization::observation::ObservationConfig;
 use crate::localization::panorama::PanoramaConfig;
+use crate::localization::proposal::ProposalConfig;
 use crate::localization::resampling::{KldConfig, ResamplingConfig};
+use crate::localization::settings::TemperingConfig;
 use crate::localization::vigilance::VigilanceConfig;
 use crate::map::scan_cloud::ScanSettings;
 
@@ -89,6 +90,8 @@ pub struct LocalizationConfig {
     pub observation: ObservationConfig,
     /// How the likelihood is sharpened within a frame.
     pub tempering: TemperingConfig,
+    /// Where particles are drawn while tracking.
+    pub proposal: ProposalConfig,
     /// When few particles carry the weight.
     pub resampling: ResamplingConfig,
     /// How many particles a wide belief needs.
@@ -97,6 +100,9 @@ pub struct LocalizationConfig {
     pub vigilance: VigilanceConfig,
     /// The search for a start.
     pub panorama: PanoramaConfig,
+    /// The sense in which the sensor spins, where the motion of the car during a scan is to be
+    /// compensated; not so for scans that are compensated already, as those of KITTI odometry.
+    pub motion_compensation: Option<Spin>,
     /// What random choices follow from.
     pub seed: u64,
     /// Whether an existing result is replaced.
@@ -196,10 +202,12 @@ impl Default for LocalizationConfig {
             velocity_noise: VelocityNoise::default(),
             observation: ObservationConfig::default(),
             tempering: TemperingConfig::default(),
+            proposal: ProposalConfig::default(),
             resampling: ResamplingConfig::default(),
             kld: KldConfig::default(),
             vigilance: VigilanceConfig::default(),
             panorama: PanoramaConfig::default(),
+            motion_compensation: None,
             seed: 0,
             force: false,
         }
@@ -250,6 +258,7 @@ impl LocalizationConfig {
             velocity: self.velocity_noise.clone(),
             observation: self.observation.clone(),
             tempering: self.tempering.clone(),
+            proposal: self.proposal.clone(),
             resampling: self.resampling.clone(),
             kld: self.kld.clone(),
             convergence: ConvergenceConfig {
@@ -332,6 +341,7 @@ impl Check for LocalizationConfig {
         nested("velocity_noise", self.velocity_noise.check())?;
         nested("observation", self.observation.check())?;
         nested("tempering", self.tempering.check())?;
+        nested("proposal", self.proposal.check())?;
         nested("resampling", self.resampling.check())?;
         nested("kld", self.kld.check())?;
         nested("vigilance", self.vigilance.check())?;

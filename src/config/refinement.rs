@@ -8,7 +8,7 @@ use super::blocks::own_car;
 use super::check::{Check, Problem, nested, path, require, selection};
 use super::localization::OdometrySource;
 use crate::kitti::Selection;
-use crate::lidar::LidarModel;
+use crate::lidar::{LidarModel, Spin};
 use crate::localization::observation::ObservationConfig;
 use crate::refinement;
 
@@ -50,6 +50,9 @@ pub struct RefinementConfig {
     pub observation: ObservationConfig,
     /// Swarm, finishing step and smoothing.
     pub refinement: refinement::RefinementConfig,
+    /// The sense in which the sensor spins, where the motion of the car during a scan is to be
+    /// compensated; not so for scans that are compensated already, as those of KITTI odometry.
+    pub motion_compensation: Option<Spin>,
     /// What random choices follow from.
     pub seed: u64,
     /// Whether existing refined poses are replaced.
@@ -78,6 +81,7 @@ impl Default for RefinementConfig {
             own_car_m: localization.own_car_m,
             observation: localization.observation,
             refinement: refinement::RefinementConfig::default(),
+            motion_compensation: None,
             seed: 0,
             force: false,
         }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::poses::{CameraPoses, read_times};
 use super::{Calibration, KittiError, MapFrame, velodyne};
 use crate::geometry::{Pose3, StampedPose};
-use crate::lidar::Scan;
+use crate::lidar::{Revolution, Scan, Spin, share_of};
 
 /// Revolutions per second of the sensor where no `times.txt` says otherwise.
 const SCANS_PER_SECOND: f64 = 10.0;
@@ -47,12 +47,18 @@ pub struct Frame {
     pub time_s: f64,
     /// `p_map = map_from_lidar * p_lidar`.
     pub map_from_lidar: Pose3,
+    /// How the sensor moved during the scan, where that is to be compensated.
+    pub revolution: Option<Revolution>,
 }
 
 impl Frame {
-    /// Reads the scan.
+    /// Reads the scan; its points are compensated where the motion is known.
     pub fn read(&self) -> Result<Scan, KittiError> {
-        velodyne::read_scan(&self.scan_path)
+        let mut scan = velodyne::read_scan(&self.scan_path)?;
+        if let Some(revolution) = &self.revolution {
+            revolution.compensate(&mut scan.points);
+        }
+        Ok(scan)
     }
 
     /// The pose with its place in the recording.
@@ -108,6 +114,7 @@ impl Sequence {
                 scan_path,
                 time_s: times_s[number],
                 map_from_lidar: pose,
+                revolution: None,
             });
         }
         Ok(Self {
@@ -118,6 +125,42 @@ impl Sequence {
                 world_from_first_cam0: camera_poses.world_from_cam0[0],
             },
         })
+    }
+
+    /// The same sequence with scans compensated by the poses of the recording: the motion of a
+    /// frame is half of that from the frame before to the frame after it.
+    #[must_use]
+    pub fn compensated_by_poses(mut self, spin: Spin) -> Self {
+        for frame in &mut self.frames {
+            let before = frame.number.saturating_sub(1);
+            let after = (frame.number + 1).min(self.map_from_lidar.len() - 1);
+            let motion = self.map_from_lidar[before].inverse() * self.map_from_lidar[after];
+            let frames = (after - before).max(1) as f64;
+            frame.revolution = Some(Revolution {
+                spin,
+                motion: share_of(&motion, 1.0 / frames),
+            });
+        }
+        self
+    }
+
+    /// The same sequence with scans compensated by an odometry, `previous_from_current` into each
+    /// frame; frames of which it says nothing stay as they are. The first moves as the second.
+    #[must_use]
+    pub fn compensated_by(mut self, spin: Spin, increments: &[Option<Pose3>]) -> Self {
+        let numbers: Vec<usize> = self.frames.iter().map(|frame| frame.number).collect();
+        for (row, frame) in self.frames.iter_mut().enumerate() {
+            let row = row.max(1);
+            let Some(&Some(motion)) = increments.get(row) else {
+                continue;
+            };
+            let frames = (numbers[row] - numbers[row - 1]) as f64;
+            frame.revolution = Some(Revolution {
+                spin,
+                motion: share_of(&motion, 1.0 / frames),
+            });
+        }
+        self
     }
 
     /// The same sequence with its poses in the frame of a map that was built from another (or the

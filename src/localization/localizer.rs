@@ -9,111 +9,29 @@
 //!
 //! While the car searches, reweighting and resampling alternate several times within one frame,
 //! from a blunt to a sharp likelihood (annealing). Once the belief is narrow, `num_reduced`
-//! particles are enough.
+//! particles are enough; they are drawn where odometry and scan agree ([`proposal`](super::proposal)).
 
 use std::time::Duration;
 
-use nalgebra::Matrix3;
 use rand::Rng;
-use serde::{Deserialize, Serialize};
 
-use super::convergence::{ConvergenceConfig, is_converged};
-use super::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand, VelocityNoise};
-use super::observation::{
-    Fit, ObservationConfig, above_road, choose_beams, costs, near_points, place_on_map,
-};
+use super::convergence::is_converged;
+use super::estimate::FrameEstimate;
+use super::motion::{TurnDriveTurn, VelocityCommand};
+use super::observation::{Fit, above_road, choose_beams, costs, near_points, place_on_map};
 use super::odometry::Odometry;
 use super::panorama::PanoramaIndex;
 use super::particles::ParticleSet;
-use super::resampling::{
-    KldConfig, ResamplingConfig, jitter, kld_sample_size, occupied_bins, systematic,
-};
+use super::proposal::{Gaussian, regular};
+use super::resampling::{jitter, kld_sample_size, occupied_bins, systematic};
+use super::settings::LocalizerConfig;
 use super::tempering::exponent;
-use super::vigilance::{State, Vigilance, VigilanceConfig};
-use crate::geometry::{Pose2, Pose3};
+use super::vigilance::{State, Vigilance};
+use crate::geometry::{Pose2, Pose3, planar};
 use crate::lidar::{Beam, RangeImage};
 use crate::map::{GroundMap, GroundPatch, Stance, TileGrid};
+use crate::registration::register;
 use crate::rendering::{RangeRenderer, RenderError};
-
-/// How the likelihood is sharpened within a frame.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct TemperingConfig {
-    /// A frame never leaves a smaller share of effective particles than this; 0 takes the
-    /// likelihood at its word, as range-mcl does.
-    pub min_effective_fraction: f64,
-    /// Rounds of reweighting and resampling per frame while searching.
-    pub searching_rounds: usize,
-    /// The same while tracking.
-    pub tracking_rounds: usize,
-}
-
-impl Default for TemperingConfig {
-    /// Our own values.
-    fn default() -> Self {
-        Self {
-            min_effective_fraction: 0.2,
-            searching_rounds: 4,
-            tracking_rounds: 1,
-        }
-    }
-}
-
-/// Everything that can be set about the filter.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct LocalizerConfig {
-    /// Particles while searching, at most.
-    pub num_particles: usize,
-    /// Particles once converged.
-    pub num_reduced: usize,
-    /// The weights are updated after this much motion [m].
-    pub move_thres_m: f64,
-    /// Or after this much turning [rad].
-    pub turn_thres_rad: f64,
-    /// Noise of the odometry, per update.
-    pub motion: OdometryNoise,
-    /// Noise of velocity commands.
-    pub velocity: VelocityNoise,
-    /// Noise of the guess that the car goes on as it went, where there is no odometry.
-    pub constant_velocity: OdometryNoise,
-    /// The likelihood.
-    pub observation: ObservationConfig,
-    /// Its sharpness.
-    pub tempering: TemperingConfig,
-    /// Resampling.
-    pub resampling: ResamplingConfig,
-    /// Number of particles while searching.
-    pub kld: KldConfig,
-    /// When a few particles are enough.
-    pub convergence: ConvergenceConfig,
-    /// When the map disagrees.
-    pub vigilance: VigilanceConfig,
-}
-
-impl Default for LocalizerConfig {
-    /// range-mcl's numbers of particles and threshold of motion.
-    fn default() -> Self {
-        Self {
-            num_particles: 10_000,
-            num_reduced: 100,
-            move_thres_m: 0.2,
-            turn_thres_rad: 0.05,
-            motion: OdometryNoise::default(),
-            velocity: VelocityNoise::default(),
-            constant_velocity: OdometryNoise {
-                turn_rad: 0.02,
-                drive_m: 0.2,
-            },
-            observation: ObservationConfig::default(),
-            tempering: TemperingConfig::default(),
-            resampling: ResamplingConfig::default(),
-            kld: KldConfig::default(),
-            convergence: ConvergenceConfig::default(),
-            vigilance: VigilanceConfig::default(),
-        }
-    }
-}
 
 /// What the filter knows of the map.
 #[derive(Clone, Copy)]
@@ -126,33 +44,6 @@ pub struct Surroundings<'a> {
     pub tiles: &'a TileGrid,
     /// Where to begin anew when lost; without it, the filter says that it is lost and stays so.
     pub panoramas: Option<&'a PanoramaIndex>,
-}
-
-/// What the filter says about a frame.
-#[derive(Clone, Debug)]
-pub struct FrameEstimate {
-    /// Weighted mean of the particles, `p_map = pose * p_lidar` seen from above.
-    pub pose: Pose2,
-    /// The same pose standing on the map's ground, `p_map = lifted * p_lidar`.
-    pub lifted: Pose3,
-    /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
-    pub covariance: Matrix3<f64>,
-    /// Effective number of particles after weighing, before resampling.
-    pub effective_sample_size: f64,
-    /// Weighted mean of the particles' cost; `None` where the frame was not weighed or no
-    /// particle was on the map [m].
-    pub mean_cost_m: Option<f64>,
-    /// Share of beams above the road that meet the map at the estimate; `None` where unknown.
-    pub agreement: Option<f64>,
-    /// Searching, tracking or lost.
-    pub state: State,
-    /// Whether the scan was weighed; not so before the car moved far enough.
-    pub updated: bool,
-    /// Whether there is mapped ground under the estimate; if not, it stands on the last ground
-    /// that there was.
-    pub on_mapped_ground: bool,
-    /// The particles with their weights, before resampling.
-    pub particles: ParticleSet,
 }
 
 /// A belief about where the car is, frame by frame.
@@ -169,16 +60,30 @@ pub struct Localizer<'a> {
     estimate: Pose2,
     last_increment: Pose2,
     patch: Option<GroundPatch>,
+    stance: Option<Stance>,
     state: State,
     vigilance: Vigilance,
     updates_in_state: usize,
     is_first: bool,
 }
 
-/// What one round of weighing found.
+/// What weighing found.
 struct Weighing {
     effective_sample_size: f64,
     mean_cost_m: Option<f64>,
+    /// The beams of the last round.
+    beams: Vec<Beam>,
+    /// How the sensor stands over the road, as well as the frame can tell.
+    stance: Stance,
+}
+
+/// Where the particles of a frame are drawn, and from what they are weighed.
+struct Proposal {
+    prior: Gaussian,
+    /// Already as wide as it shall be.
+    proposal: Gaussian,
+    beams: Vec<Beam>,
+    stance: Stance,
 }
 
 impl<'a> Localizer<'a> {
@@ -199,6 +104,7 @@ impl<'a> Localizer<'a> {
             estimate,
             last_increment: Pose2::identity(),
             patch: surroundings.ground.patch_under(&estimate),
+            stance: None,
             state: State::Searching,
             vigilance: Vigilance::default(),
             updates_in_state: 0,
@@ -225,10 +131,13 @@ impl<'a> Localizer<'a> {
             return Ok(self.coast(stance));
         }
         self.propagate(odometry, rng);
-        let (weighing, beams) = self.weigh_in_rounds(scan, stance, rng)?;
-        let settled = self.settled(scan, stance);
-        let mut frame = self.conclude(&weighing, &settled);
-        frame.agreement = self.agreement(&frame.lifted, &beams, &settled)?;
+        let weighing = match self.propose(scan, stance, rng)? {
+            Some(proposal) => self.weigh_drawn(proposal, rng)?,
+            None => self.weigh_in_rounds(scan, stance, rng)?,
+        };
+        let mut frame = self.conclude(&weighing);
+        frame.agreement = self.agreement(&frame.lifted, &weighing.beams, &weighing.stance)?;
+        self.stance = Some(weighing.stance);
         self.change_state(frame.agreement);
         frame.state = self.state;
         self.prepare_next(scan, stance, rng);
@@ -243,6 +152,13 @@ impl<'a> Localizer<'a> {
     /// The belief as it goes into the next frame.
     pub fn particles(&self) -> &ParticleSet {
         &self.particles
+    }
+
+    /// How the sensor stood over the road in the last frame, where the next can begin from there:
+    /// while tracking, the map tells more than the plane of the road that a scan sees.
+    pub fn stance(&self) -> Option<Stance> {
+        let proposes = self.config.proposal.scan && self.state == State::Tracking;
+        self.stance.filter(|_| proposes)
     }
 
     fn increment(&self, odometry: Odometry) -> Pose2 {
@@ -303,13 +219,84 @@ impl<'a> Localizer<'a> {
         self.pending_duration = Duration::ZERO;
     }
 
-    /// Weighs the particles by the scan, in one round or several; returns the beams of the last.
+    /// Lays the scan onto the map, for particles to be drawn where it came to lie; `None` while the
+    /// belief is wide and where the scan does not tell, or tells what cannot be.
+    fn propose(
+        &self,
+        scan: &RangeImage,
+        stance: &Stance,
+        rng: &mut impl Rng,
+    ) -> Result<Option<Proposal>, RenderError> {
+        let config = &self.config.proposal;
+        if !config.scan || self.state != State::Tracking {
+            return Ok(None);
+        }
+        let mean = self.particles.mean();
+        let Some(patch) = self.surroundings.ground.patch_under(&mean).or(self.patch) else {
+            return Ok(None);
+        };
+        let beams = choose_beams(scan, config.beams, config.road_share, stance, rng);
+        let start = patch.lift(&mean, stance);
+        let renderer = self.surroundings.renderer;
+        let Some(found) = register(renderer, &beams, &start, &config.registration)? else {
+            return Ok(None);
+        };
+        let prior = Gaussian::new(mean, regular(&self.particles.covariance_about(&mean)));
+        let pose = planar(&found.map_from_lidar);
+        let seen = Gaussian::new(pose, regular(&found.planar_covariance()));
+        let (Some(prior), Some(seen)) = (prior, seen) else {
+            return Ok(None);
+        };
+        if prior.squared_distance(&seen.mean) > config.max_sigmas.powi(2) {
+            return Ok(None);
+        }
+        let fused = prior.fused(&seen);
+        Ok(fused
+            .and_then(|fused| fused.widened(config.widening))
+            .map(|proposal| Proposal {
+                prior,
+                proposal,
+                beams,
+                stance: patch.stance_of(&found.map_from_lidar),
+            }))
+    }
+
+    /// Draws the particles from a proposal and weighs them by the scan, and by how much likelier the
+    /// motion is to lead there than the proposal.
+    fn weigh_drawn(
+        &mut self,
+        drawn: Proposal,
+        rng: &mut impl Rng,
+    ) -> Result<Weighing, RenderError> {
+        let Proposal {
+            prior,
+            proposal,
+            beams,
+            stance,
+        } = drawn;
+        self.particles = ParticleSet::uniform(proposal.sample(self.config.num_reduced, rng));
+        let step = beams.len().div_ceil(self.config.proposal.weighed_beams);
+        let weighed: Vec<Beam> = beams.iter().step_by(step.max(1)).copied().collect();
+        let (mut logs, costs) = self.log_likelihoods(&weighed, &stance)?;
+        for (log, pose) in logs.iter_mut().zip(self.particles.poses()) {
+            *log += prior.log_density(pose) - proposal.log_density(pose);
+        }
+        self.reweight(&logs, 1.0);
+        Ok(Weighing {
+            effective_sample_size: self.particles.effective_sample_size(),
+            mean_cost_m: weighted_mean(&self.particles, &costs),
+            beams,
+            stance,
+        })
+    }
+
+    /// Weighs the particles by the scan, in one round or several.
     fn weigh_in_rounds(
         &mut self,
         scan: &RangeImage,
         stance: &Stance,
         rng: &mut impl Rng,
-    ) -> Result<(Weighing, Vec<Beam>), RenderError> {
+    ) -> Result<Weighing, RenderError> {
         let rounds = match self.state {
             State::Tracking => self.config.tempering.tracking_rounds,
             State::Searching | State::Lost => self.config.tempering.searching_rounds,
@@ -320,10 +307,16 @@ impl<'a> Localizer<'a> {
             let count = observation.beams_for(self.particles.len());
             let beams = choose_beams(scan, count, observation.road_share, stance, rng);
             let settled = self.settled(scan, stance);
-            let (weighing, used) = self.weigh(&beams, &settled, left)?;
+            let (logs, costs) = self.log_likelihoods(&beams, &settled)?;
+            let used = self.reweight(&logs, left);
             left -= used;
             if round >= rounds || left <= 0.0 || used <= 0.0 {
-                return Ok((weighing, beams));
+                return Ok(Weighing {
+                    effective_sample_size: self.particles.effective_sample_size(),
+                    mean_cost_m: weighted_mean(&self.particles, &costs),
+                    beams,
+                    stance: self.settled(scan, stance),
+                });
             }
             self.resample(rng);
             round += 1;
@@ -343,13 +336,13 @@ impl<'a> Localizer<'a> {
             .unwrap_or(*stance)
     }
 
-    /// One round: multiplies the weights by a power of the likelihood, at most `most`. Returns the power.
-    fn weigh(
-        &mut self,
+    /// Logarithms of the likelihood of the particles, up to a constant, and the mean costs that they
+    /// come from [m].
+    fn log_likelihoods(
+        &self,
         beams: &[Beam],
         stance: &Stance,
-        most: f64,
-    ) -> Result<(Weighing, f64), RenderError> {
+    ) -> Result<(Vec<f64>, Vec<Option<f64>>), RenderError> {
         let Surroundings {
             renderer,
             ground,
@@ -364,28 +357,27 @@ impl<'a> Localizer<'a> {
             .collect();
         let observation = &self.config.observation;
         let costs = costs(renderer, &poses, beams, &observation.difference())?;
-        let logs: Vec<f64> = costs
-            .iter()
-            .map(|cost| {
-                cost.map_or(observation.floor_log_likelihood(), |cost_m| {
-                    observation.log_likelihood(cost_m)
-                })
+        let log = |cost: &Option<f64>| {
+            cost.map_or(observation.floor_log_likelihood(), |cost_m| {
+                observation.log_likelihood(cost_m)
             })
-            .collect();
+        };
+        Ok((costs.iter().map(log).collect(), costs))
+    }
+
+    /// Multiplies the weights by a power of what the logarithms say, at most `most`. Returns the
+    /// power.
+    fn reweight(&mut self, logs: &[f64], most: f64) -> f64 {
         let min_effective =
             self.config.tempering.min_effective_fraction * self.particles.len() as f64;
-        let power = exponent(&self.particles.weights(), &logs, min_effective, most);
+        let power = exponent(&self.particles.weights(), logs, min_effective, most);
         let tempered: Vec<f64> = logs.iter().map(|log| power * log).collect();
         self.particles.reweight(&tempered);
-        let weighing = Weighing {
-            effective_sample_size: self.particles.effective_sample_size(),
-            mean_cost_m: weighted_mean(&self.particles, &costs),
-        };
-        Ok((weighing, power))
+        power
     }
 
     /// The estimate of a weighed frame, which becomes what the filter remembers.
-    fn conclude(&mut self, weighing: &Weighing, stance: &Stance) -> FrameEstimate {
+    fn conclude(&mut self, weighing: &Weighing) -> FrameEstimate {
         let pose = self.particles.mean();
         self.last_increment = match self.state {
             State::Tracking => self.estimate.inverse() * pose,
@@ -393,7 +385,7 @@ impl<'a> Localizer<'a> {
             State::Searching | State::Lost => self.last_increment,
         };
         self.estimate = pose;
-        let (lifted, on_mapped_ground) = self.lift_estimate(&pose, stance);
+        let (lifted, on_mapped_ground) = self.lift_estimate(&pose, &weighing.stance);
         FrameEstimate {
             pose,
             lifted,

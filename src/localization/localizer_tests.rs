@@ -6,6 +6,7 @@ use rand::{SeedableRng, rngs::StdRng};
 
 use super::super::initialization::{Cells, ROAD_HALF_WIDTH_M, StartSpread, around};
 use super::super::motion::OdometryNoise;
+use super::super::observation::ObservationConfig;
 use super::super::odometry::{Odometry, increments, with_noise};
 use super::super::panorama::{PanoramaConfig, PanoramaIndex};
 use super::*;

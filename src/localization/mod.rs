@@ -18,6 +18,7 @@ pub mod particles;
 // One step of the filter.
 pub mod motion;
 pub mod observation;
+pub mod proposal;
 pub mod resampling;
 pub mod tempering;
 // Knowing how sure it is.
@@ -25,10 +26,14 @@ pub mod convergence;
 pub mod panorama;
 pub mod vigilance;
 // The loop.
+pub mod estimate;
 pub mod localizer;
+pub mod settings;
 
-pub use localizer::{FrameEstimate, Localizer, LocalizerConfig, Surroundings};
+pub use estimate::FrameEstimate;
+pub use localizer::{Localizer, Surroundings};
 pub use particles::{Particle, ParticleSet};
+pub use settings::LocalizerConfig;
 pub use vigilance::State;
 
 #[cfg(test)]

@@ -229,6 +229,17 @@ impl GroundPatch {
             UnitQuaternion::from_euler_angles(0.0, 0.0, turn_rad) * tilted,
         )
     }
+
+    /// How a sensor at a pose in space stands over the plane of this patch; [`lift`](Self::lift) of
+    /// the same pose seen from above undoes it, but for the turn of the nose on a slope.
+    pub fn stance_of(&self, map_from_lidar: &Pose3) -> Stance {
+        let up = map_from_lidar.rotation.inverse() * self.normal;
+        let above_m = map_from_lidar.translation.z - self.height_m;
+        Stance::from_plane(
+            Vec3::new(up.x as f32, up.y as f32, up.z as f32),
+            above_m * self.normal.z,
+        )
+    }
 }
 
 #[cfg(test)]

@@ -1,12 +1,11 @@
 //! A trajectory polished: a particle swarm over every pose, a finishing step, then smoothing.
 //!
 //! > [`refiner`] takes the estimate of a frame, lets a [`swarm`] look for a better one by the
-//! > [`objective`], and [`gauss_newton`] finishes; [`smoothing`] fits the whole trajectory to what
+//! > [`objective`], and Gauss-Newton ([`registration`](crate::registration)) finishes; [`smoothing`] fits the whole trajectory to what
 //! > the frames and the odometry say.
 //!
 //! No step makes an estimate worse by its own measure: what does not improve is not taken.
 
-pub mod gauss_newton;
 pub mod objective;
 pub mod refiner;
 pub mod smoothing;

@@ -3,15 +3,15 @@
 //! Each is optional, each is taken only where it lowers the objective. Frames before convergence
 //! are not for this: their estimate is no estimate yet.
 
-use nalgebra::{Matrix3, Matrix6};
+use nalgebra::Matrix3;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 
-use super::gauss_newton::{Finish, GaussNewtonConfig, finish};
 use super::objective::FrameObjective;
 use super::smoothing::SmoothingConfig;
 use super::swarm::{Dimension, SwarmConfig, minimize};
 use crate::geometry::{Pose2, Pose3, planar};
+use crate::registration::{Registration, RegistrationConfig, register};
 use crate::rendering::RenderError;
 
 /// Which steps polish a frame.
@@ -37,7 +37,7 @@ pub struct RefinementConfig {
     /// The swarm.
     pub swarm: SwarmConfig,
     /// The finishing step.
-    pub gauss_newton: GaussNewtonConfig,
+    pub gauss_newton: RegistrationConfig,
     /// The smoothing of the whole trajectory.
     pub smoothing: SmoothingConfig,
     /// The swarm searches this many standard deviations around the estimate (unitless).
@@ -60,7 +60,7 @@ impl Default for RefinementConfig {
         Self {
             method: Method::Both,
             swarm: SwarmConfig::default(),
-            gauss_newton: GaussNewtonConfig::default(),
+            gauss_newton: RegistrationConfig::default(),
             smoothing: SmoothingConfig::default(),
             reach_sigmas: 3.0,
             min_reach_m: 0.1,
@@ -123,7 +123,7 @@ pub fn refine_frame(
     };
     if config.method != Method::None {
         frame.covariance = match finished {
-            Some(finish) => planar_covariance(&finish),
+            Some(registered) => registered.planar_covariance(),
             None => objective.covariance(&frame.pose, None, config.scale_m)?,
         };
     }
@@ -193,38 +193,26 @@ fn polish(
     objective: &FrameObjective<'_>,
     frame: &mut RefinedFrame,
     config: &RefinementConfig,
-) -> Result<Option<Finish>, RenderError> {
-    /// Casts per iteration: here and both ways along six axes.
-    const CASTS: usize = 13;
-    frame.rays += CASTS * config.gauss_newton.iterations * objective.beams.len();
-    let Some(finish) = finish(objective, &frame.lifted, &config.gauss_newton)? else {
+) -> Result<Option<Registration>, RenderError> {
+    let found = register(
+        objective.renderer,
+        objective.beams,
+        &frame.lifted,
+        &config.gauss_newton,
+    )?;
+    let Some(registered) = found else {
         return Ok(None);
     };
-    let cost_m = objective.costs_in_space(&[finish.map_from_lidar])?[0];
+    // One more to see whether it is better.
+    frame.rays += (registered.iterations + 1) * objective.beams.len();
+    let cost_m = objective.costs_in_space(&[registered.map_from_lidar])?[0];
     if cost_m > frame.cost_after_m {
         return Ok(None);
     }
-    frame.lifted = finish.map_from_lidar;
-    frame.pose = planar(&finish.map_from_lidar);
+    frame.lifted = registered.map_from_lidar;
+    frame.pose = planar(&registered.map_from_lidar);
     frame.cost_after_m = cost_m;
-    Ok(Some(finish))
-}
-
-/// The covariance of a finishing step, seen from above, in the axes of the map.
-fn planar_covariance(finish: &Finish) -> Matrix3<f64> {
-    let rotation = finish.map_from_lidar.rotation.to_rotation_matrix();
-    let mut map_from_lidar = Matrix6::zeros();
-    map_from_lidar
-        .fixed_view_mut::<3, 3>(0, 0)
-        .copy_from(rotation.matrix());
-    map_from_lidar
-        .fixed_view_mut::<3, 3>(3, 3)
-        .copy_from(rotation.matrix());
-    let in_map = map_from_lidar * finish.covariance * map_from_lidar.transpose();
-    Matrix3::from_fn(|row, column| {
-        let axes = [0, 1, 5];
-        in_map[(axes[row], axes[column])]
-    })
+    Ok(Some(registered))
 }
 
 #[cfg(test)]

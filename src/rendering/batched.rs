@@ -1,6 +1,6 @@
 //! At most so many poses in one call: the memory of a renderer bounded, whatever is asked of it.
 
-use super::{RangeDifference, RangeRenderer, RenderError};
+use super::{RangeDifference, RangeRenderer, RenderError, SurfaceHit};
 use crate::geometry::{Pose3, Vec3};
 use crate::lidar::{Beam, LidarModel};
 
@@ -47,6 +47,14 @@ impl RangeRenderer for Batched {
         self.in_batches(map_from_lidar, |poses| {
             self.renderer.cast(poses, directions)
         })
+    }
+
+    fn surfaces(
+        &self,
+        map_from_lidar: &Pose3,
+        directions: &[Vec3],
+    ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
+        self.renderer.surfaces(map_from_lidar, directions)
     }
 
     fn compare(

@@ -16,7 +16,7 @@ use rayon::prelude::*;
 
 use groups::groups_of;
 
-use super::{RangeDifference, RangeRenderer, RenderError};
+use super::{RangeDifference, RangeRenderer, RenderError, SurfaceHit};
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh, Vec3};
 use crate::lidar::{Beam, LidarModel, Pixel};
 use crate::raycasting::{Hit, RAYS, Reach, Scene};
@@ -25,15 +25,6 @@ use crate::raycasting::{Hit, RAYS, Reach, Scene};
 const RAYS_PER_PIECE: usize = 512;
 /// Rounding of sums and differences of ranges.
 const ROUNDING: f32 = 1e-6;
-
-/// A surface of the map that a ray met.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SurfaceHit {
-    /// Distance along the unit direction [m].
-    pub range_m: f32,
-    /// Unit normal of the triangle, map frame, on the side that the ray comes from.
-    pub normal_in_map: Vec3,
-}
 
 /// Casts rays at the tiles of a map.
 #[derive(Clone, Debug)]
@@ -47,40 +38,6 @@ impl CpuRenderer {
         Self {
             scene: Scene::of_tiles(tiles),
         }
-    }
-
-    /// What rays along unit directions of the lidar frame meet first, and how it is turned.
-    pub fn surfaces(&self, map_from_lidar: &Pose3, directions: &[Vec3]) -> Vec<Option<SurfaceHit>> {
-        let order = coherent_order(directions);
-        let (rotation, origin) = (rotation_of(map_from_lidar), origin_of(map_from_lidar));
-        let pieces: Vec<Vec<Hit>> = order
-            .par_chunks(RAYS_PER_PIECE)
-            .map(|rays| {
-                let turned: Vec<Vec3> = rays
-                    .iter()
-                    .map(|&ray| rotation * directions[ray as usize])
-                    .collect();
-                let mut hits = vec![Hit::MISS; rays.len()];
-                let reaches = vec![Reach::UNLIMITED; rays.len()];
-                self.scene.cast_within(origin, &turned, &reaches, &mut hits);
-                hits
-            })
-            .collect();
-        let mut surfaces = vec![None; directions.len()];
-        for (&ray, hit) in order.iter().zip(pieces.into_iter().flatten()) {
-            surfaces[ray as usize] = self.scene.normal(hit.triangle).map(|normal| {
-                let against = rotation * directions[ray as usize];
-                SurfaceHit {
-                    range_m: hit.range_m,
-                    normal_in_map: if normal.dot(against) > 0.0 {
-                        -normal
-                    } else {
-                        normal
-                    },
-                }
-            });
-        }
-        surfaces
     }
 
     /// Casts the beams of every pose piece by piece, and keeps, per pose, what `summarize` makes
@@ -240,6 +197,44 @@ impl RangeRenderer for CpuRenderer {
             order: coherent_order(directions),
         };
         Ok(self.ranges(map_from_lidar, &beams))
+    }
+
+    /// The normals are those of the triangles themselves.
+    fn surfaces(
+        &self,
+        map_from_lidar: &Pose3,
+        directions: &[Vec3],
+    ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
+        let order = coherent_order(directions);
+        let (rotation, origin) = (rotation_of(map_from_lidar), origin_of(map_from_lidar));
+        let pieces: Vec<Vec<Hit>> = order
+            .par_chunks(RAYS_PER_PIECE)
+            .map(|rays| {
+                let turned: Vec<Vec3> = rays
+                    .iter()
+                    .map(|&ray| rotation * directions[ray as usize])
+                    .collect();
+                let mut hits = vec![Hit::MISS; rays.len()];
+                let reaches = vec![Reach::UNLIMITED; rays.len()];
+                self.scene.cast_within(origin, &turned, &reaches, &mut hits);
+                hits
+            })
+            .collect();
+        let mut surfaces = vec![None; directions.len()];
+        for (&ray, hit) in order.iter().zip(pieces.into_iter().flatten()) {
+            surfaces[ray as usize] = self.scene.normal(hit.triangle).map(|normal| {
+                let against = rotation * directions[ray as usize];
+                SurfaceHit {
+                    range_m: hit.range_m,
+                    normal_in_map: if normal.dot(against) > 0.0 {
+                        -normal
+                    } else {
+                        normal
+                    },
+                }
+            });
+        }
+        Ok(surfaces)
     }
 
     fn compare(

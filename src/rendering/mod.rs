@@ -10,11 +10,11 @@ pub mod cpu;
 pub mod gpu;
 
 pub use batched::Batched;
-pub use cpu::{CpuRenderer, SurfaceHit};
+pub use cpu::CpuRenderer;
 #[cfg(test)]
 pub(crate) mod test_world;
 
-use crate::geometry::{Pose3, Vec3};
+use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::{Beam, LidarModel};
 
 /// Shows the map from many poses at once. Ranges are infinite where there is no surface.
@@ -37,6 +37,48 @@ pub trait RangeRenderer: Send + Sync {
         directions: &[Vec3],
     ) -> Result<Vec<Vec<f32>>, RenderError>;
 
+    /// What rays along unit directions of the lidar frame meet first, and how it is turned.
+    ///
+    /// Unless a renderer knows its triangles, the plane through the ends of three rays that lie
+    /// close together; rays whose neighbours meet nothing meet nothing here.
+    fn surfaces(
+        &self,
+        map_from_lidar: &Pose3,
+        directions: &[Vec3],
+    ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
+        /// Between the three rays [rad]: two millimetres at two metres.
+        const APART_RAD: f32 = 1e-3;
+        let mut bundles = Vec::with_capacity(3 * directions.len());
+        for direction in directions {
+            let (aside, above) = direction.any_orthonormal_pair();
+            bundles.push(*direction);
+            bundles.push((direction + APART_RAD * aside).normalize());
+            bundles.push((direction + APART_RAD * above).normalize());
+        }
+        let ranges = self.cast(&[*map_from_lidar], &bundles)?;
+        let map_from_lidar = Rigid3f::from(map_from_lidar);
+        let surface = |(rays, ranges_m): (&[Vec3], &[f32])| {
+            let end = |ray: usize| rays[ray] * ranges_m[ray];
+            let across = (end(1) - end(0)).cross(end(2) - end(0));
+            let normal = across.try_normalize()?;
+            let against = if normal.dot(rays[0]) > 0.0 {
+                -normal
+            } else {
+                normal
+            };
+            Some(SurfaceHit {
+                range_m: ranges_m[0],
+                normal_in_map: map_from_lidar.rotate(against),
+            })
+        };
+        let ranges = ranges.first().map_or(&[][..], Vec::as_slice);
+        Ok(bundles
+            .chunks(3)
+            .zip(ranges.chunks(3))
+            .map(surface)
+            .collect())
+    }
+
     /// Mean [`RangeDifference::cost`] of the beams, one number per pose [m]; nothing is kept
     /// per beam.
     fn compare(
@@ -45,6 +87,15 @@ pub trait RangeRenderer: Send + Sync {
         beams: &[Beam],
         difference: &RangeDifference,
     ) -> Result<Vec<f32>, RenderError>;
+}
+
+/// A surface of the map that a ray met.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SurfaceHit {
+    /// Distance along the unit direction [m].
+    pub range_m: f32,
+    /// Unit normal of the surface, map frame, on the side that the ray comes from.
+    pub normal_in_map: Vec3,
 }
 
 /// How much a rendered range that is not the measured one costs: |difference| up to a limit.

@@ -56,12 +56,15 @@ pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
     input::require_file("pose_file", &config.pose_file)?;
     input::require_file("calib_file", &config.calib_file)?;
     output::prepare(&config.mesh_file, "mesh_file", config.force)?;
-    let sequence = Sequence::open(
+    let mut sequence = Sequence::open(
         &config.scan_folder,
         &config.pose_file,
         &config.calib_file,
         &config.selection(),
     )?;
+    if let Some(spin) = config.motion_compensation {
+        sequence = sequence.compensated_by_poses(spin);
+    }
     let (mapped, held_out) = hold_out(&sequence.frames, config);
     let plans = plan::local_maps(&mapped, config.local_map_size, config.overlap_m);
     let parts = Parts::open(&config.mesh_file, &inputs(config, &mapped)?)?;

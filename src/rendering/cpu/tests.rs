@@ -172,11 +172,62 @@ fn a_wall_is_seen_with_its_range_and_its_normal_towards_the_sensor() {
     let quarter = UnitQuaternion::from_euler_angles(0.0, 0.0, std::f64::consts::FRAC_PI_2);
     let pose = Isometry3::from_parts(Translation3::new(1.0, 0.5, 0.0), quarter);
     // Ahead of the turned sensor is +y of the map, so +x is on its right.
-    let surfaces = renderer.surfaces(&pose, &[Vec3::NEG_Y, Vec3::Y]);
+    let surfaces = renderer.surfaces(&pose, &[Vec3::NEG_Y, Vec3::Y]).unwrap();
     let met = surfaces[0].unwrap();
     assert!((met.range_m - 4.0).abs() < 1e-6);
     assert!((met.normal_in_map - Vec3::NEG_X).length() < 1e-6);
     assert_eq!(surfaces[1], None);
+}
+
+#[test]
+fn normals_from_three_rays_are_those_of_the_triangles() {
+    /// Casts as another renderer does, and knows nothing of triangles.
+    struct WithoutTriangles(CpuRenderer);
+    impl RangeRenderer for WithoutTriangles {
+        fn name(&self) -> String {
+            self.0.name()
+        }
+        fn render(
+            &self,
+            poses: &[Pose3],
+            model: &LidarModel,
+        ) -> Result<Vec<Vec<f32>>, RenderError> {
+            self.0.render(poses, model)
+        }
+        fn cast(&self, poses: &[Pose3], directions: &[Vec3]) -> Result<Vec<Vec<f32>>, RenderError> {
+            self.0.cast(poses, directions)
+        }
+        fn compare(
+            &self,
+            poses: &[Pose3],
+            beams: &[Beam],
+            difference: &RangeDifference,
+        ) -> Result<Vec<f32>, RenderError> {
+            self.0.compare(poses, beams, difference)
+        }
+    }
+    let corners = [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)];
+    let wall = TriangleMesh {
+        vertices: corners.map(|(y, z)| Vec3::new(5.0, y, z)).to_vec(),
+        triangles: vec![[0, 1, 2], [0, 2, 3]],
+        ..TriangleMesh::default()
+    };
+    let renderer = CpuRenderer::new(&[wall]);
+    let turned = UnitQuaternion::from_euler_angles(0.1, -0.2, 0.3);
+    let pose = Isometry3::from_parts(Translation3::new(1.0, 0.5, 0.0), turned);
+    let directions = [Vec3::X, Vec3::new(0.8, 0.6, 0.0), Vec3::NEG_X, Vec3::Y];
+    let exact = renderer.surfaces(&pose, &directions).unwrap();
+    let rough = WithoutTriangles(renderer)
+        .surfaces(&pose, &directions)
+        .unwrap();
+    assert_eq!(exact.iter().flatten().count(), 2);
+    for (exact, rough) in exact.iter().zip(&rough) {
+        assert_eq!(exact.is_some(), rough.is_some());
+        if let (Some(exact), Some(rough)) = (exact, rough) {
+            assert!((exact.range_m - rough.range_m).abs() < 1e-5);
+            assert!((exact.normal_in_map - rough.normal_in_map).length() < 2e-3);
+        }
+    }
 }
 
 #[test]
