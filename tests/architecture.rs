@@ -9,7 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Each layer may import those before it; the modules of one layer do not know each other.
-const LAYERS: [&[&str]; 10] = [
+const LAYERS: [&[&str]; 11] = [
     &["geometry"],
     &["lidar"],
     &["raycasting"],
@@ -18,6 +18,7 @@ const LAYERS: [&[&str]; 10] = [
     &["rendering", "simulation"],
     &["localization", "refinement", "evaluation"],
     &["plotting"],
+    &["reporting"],
     &["config"],
     &["cli", "commands", "main"],
 ];

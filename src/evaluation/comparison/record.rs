@@ -61,6 +61,8 @@ pub struct RunRecord {
     pub id: RunId,
     /// Hash of all that it follows from: configuration, inputs, version.
     pub key: String,
+    /// Hash of its effective configuration and the version alone.
+    pub settings: String,
     /// Program and version.
     pub program: String,
     /// Processor, threads and renderer.

@@ -35,6 +35,7 @@ fn run(sequence: &str, configuration: &str, seed: u64, error_m: f64) -> RunRecor
             seed,
         },
         key: String::new(),
+        settings: String::new(),
         program: String::new(),
         machine: [].into(),
         stage_seconds: [].into(),
@@ -84,8 +85,16 @@ fn the_mean_of_a_configuration_is_over_sequences_and_its_claim_stands_beside() {
         panic!("{table:?}")
     };
     assert_relative_eq!(error.mean, 0.23, epsilon = 1e-9);
-    assert_relative_eq!(error.over_seeds.unwrap(), 0.02 / 2_f64.sqrt(), epsilon = 1e-9);
-    assert_relative_eq!(error.over_sequences.unwrap(), 0.2 / 2_f64.sqrt(), epsilon = 1e-9);
+    assert_relative_eq!(
+        error.over_seeds.unwrap(),
+        0.02 / 2_f64.sqrt(),
+        epsilon = 1e-9
+    );
+    assert_relative_eq!(
+        error.over_sequences.unwrap(),
+        0.2 / 2_f64.sqrt(),
+        epsilon = 1e-9
+    );
     let claim = "claimed by the report: average positional error";
     assert_eq!(cell(&table, 0, claim), &Cell::Number(1.45));
     assert_eq!(cell(&table, 1, claim), &Cell::Absent);
