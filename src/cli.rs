@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
 
+use crate::evaluation::comparison::RunId;
 use crate::rendering::backend::Backend;
 
 /// Finds a car's pose to the centimetre from one spinning LiDAR and a mesh map that it builds itself.
@@ -61,6 +62,14 @@ Examples:
   fpmcl evaluate config/evaluation.yml
   fpmcl evaluate --set result_file=results/localization.npz")]
     Evaluate(RunArgs),
+
+    /// Measure configurations against each other: sequences x configurations x seeds.
+    #[command(after_help = "\
+Examples:
+  fpmcl compare                               all that config/comparison.yml asks for
+  fpmcl compare --list-jobs | parallel -j1 --sshlogin a,b --workdir .
+  fpmcl compare --collect                     tables of the runs that are there")]
+    Compare(CompareArgs),
 
     /// Make a street with a known answer and drive through it.
     #[command(after_help = "\
@@ -137,6 +146,30 @@ pub struct DemoArgs {
     /// How the work is done.
     #[command(flatten)]
     pub machine: MachineArgs,
+}
+
+/// What is compared, and which part of the work is done now.
+#[derive(Clone, Debug, Args)]
+pub struct CompareArgs {
+    /// Where the configuration comes from.
+    #[command(flatten)]
+    pub source: ConfigArgs,
+
+    /// Print one independent command per run, and do nothing.
+    #[arg(long, group = "part")]
+    pub list_jobs: bool,
+
+    /// Make sequences and maps only, before runs are distributed.
+    #[arg(long, group = "part")]
+    pub prepare: bool,
+
+    /// Do one run only: SEQUENCE/CONFIGURATION/SEED.
+    #[arg(long, value_name = "RUN", group = "part")]
+    pub job: Option<RunId>,
+
+    /// Make tables and pages of the runs that are there, and run nothing.
+    #[arg(long, group = "part")]
+    pub collect: bool,
 }
 
 /// Which scans, and what is asked about them.
@@ -245,6 +278,7 @@ impl Command {
             | Self::Refine(args)
             | Self::Evaluate(args)
             | Self::Simulate(args) => args.source.machine,
+            Self::Compare(args) => args.source.machine,
             Self::Demo(args) => args.machine,
             Self::Ground(args) => args.machine,
             Self::Doctor => MachineArgs::default(),

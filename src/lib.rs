@@ -3,7 +3,7 @@
 //! > A [`kitti`] sequence gives [`lidar`] scans; [`ground`] tells road from rest; [`meshing`]
 //! > turns points into surfaces, [`map`] tiles them; [`rendering`] shows the map from any pose,
 //! > [`registration`] lays a scan onto it; [`localization`] finds the pose; [`refinement`]
-//! > polishes it; [`evaluation`] measures it; [`plotting`] draws it.
+//! > polishes it; [`evaluation`] measures it; [`plotting`] draws it; [`reporting`] tells it.
 //!
 //! | frame | origin and axes | appears in |
 //! |---|---|---|
@@ -38,3 +38,4 @@ pub mod cli;
 pub mod commands;
 pub mod config;
 pub mod plotting;
+pub mod reporting;

@@ -19,6 +19,7 @@ const LAYERS: [&[&str]; 11] = [
     &["registration"],
     &["localization", "refinement", "evaluation"],
     &["plotting"],
+    &["reporting"],
     &["config"],
     &["cli", "commands", "main"],
 ];

@@ -9,7 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use fpmcl::config::{
-    self, BuildMapConfig, Check, EvaluationConfig, GroundConfig, Initialization,
+    self, BuildMapConfig, Check, ComparisonConfig, EvaluationConfig, GroundConfig, Initialization,
     LocalizationConfig, RefinementConfig, RenderedRangeImage,
 };
 use fpmcl::simulation::SimulationConfig;
@@ -50,6 +50,7 @@ fn keys_of(path: &Path) -> BTreeSet<String> {
         "refinement.yml" | "refinement_stereo.yml" => round_trip::<RefinementConfig>(path),
         "evaluation.yml" => round_trip::<EvaluationConfig>(path),
         "simulation.yml" => round_trip::<SimulationConfig>(path),
+        "comparison.yml" | "comparison_kitti.yml" => round_trip::<ComparisonConfig>(path),
         "ground.yml" => round_trip::<GroundConfig>(path),
         _ => panic!("{} belongs to no command", path.display()),
     }

@@ -1,14 +1,18 @@
 //! `evaluate`: how far a result is from the truth.
 
+use std::collections::BTreeMap;
+
 use anyhow::{Result, ensure};
 
 use super::input;
 use super::run_output::{self, RunFiles};
-use crate::config::{self, EvaluationConfig};
+use super::run_page;
+use crate::config::{self, EvaluationConfig, LocalizationConfig};
 use crate::evaluation::{LocalizationResults, RangeMclRules, Report};
-use crate::geometry::{Pose2, planar};
+use crate::geometry::{Pose2, TriangleMesh, planar};
 use crate::kitti::Calibration;
 use crate::kitti::poses::CameraPoses;
+use crate::map::ply;
 
 /// Judges a result of `localize`, of `refine` or of range-mcl.
 pub fn run(config: &EvaluationConfig) -> Result<Report> {
@@ -37,18 +41,49 @@ pub fn run(config: &EvaluationConfig) -> Result<Report> {
     if results.estimates.is_none() {
         results.estimates = Some(rules.estimates(&results)?);
     }
-    let about = [("result", config.result_file.display().to_string())]
-        .map(|(key, value)| (key.to_owned(), value));
-    let report = run_output::judge(&results, &rules, about.into())?;
     let files = RunFiles::beside(&config.result_file);
+    let report = run_output::judge(&results, &rules, about(config, &files)?)?;
     if config.save_evaluation_results {
         run_output::write_report(&files, &results, &report)?;
         config::write(&files.file("evaluation.yml"), config)?;
     }
     if config.plot_loc_traj {
-        run_output::draw_run(&files, None, &results)?;
+        run_output::draw_run_on(&files, map_of(&files)?.as_ref(), &results)?;
+    }
+    if config.save_evaluation_results {
+        run_page::write(&files, &report)?;
     }
     Ok(report)
+}
+
+/// What the run said of itself, and what is judged.
+fn about(config: &EvaluationConfig, files: &RunFiles) -> Result<BTreeMap<String, String>> {
+    let told = files.file("report.json");
+    let mut about = if told.exists() {
+        Report::read_json(&told)?.about
+    } else {
+        BTreeMap::new()
+    };
+    let result = config.result_file.display().to_string();
+    about.insert("result".to_owned(), result);
+    Ok(about)
+}
+
+/// The map that the run was localized in, where its configuration names one that is still there.
+fn map_of(files: &RunFiles) -> Result<Option<TriangleMesh>> {
+    let effective = files.file("localization.yml");
+    if !effective.exists() {
+        return Ok(None);
+    }
+    let localized: LocalizationConfig = config::load(Some(&effective), &effective, &[])?;
+    if !localized.map_file.exists() {
+        tracing::info!(
+            "drawn without the map: {} is not there any more",
+            localized.map_file.display()
+        );
+        return Ok(None);
+    }
+    Ok(Some(ply::read(&localized.map_file)?))
 }
 
 /// Positions in metres, for results that are in cells.

@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use super::interrupt::Interrupted;
 use super::run_output::{self, Movie, RunFiles};
 use super::stages::{LoadedMap, Observer};
-use super::{Context, input, odometry, output};
+use super::{Context, input, odometry, output, run_page};
 use crate::config::{self, Initialization, LocalizationConfig, MotionModel};
 use crate::evaluation::{LocalizationResults, ParticleLog, RangeMclRules, Report};
 use crate::geometry::{Pose2, Pose3, planar};
@@ -74,6 +74,9 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     if config.plot_loc_results {
         run_output::draw_run(&files, Some(&map), &results)?;
         draw_example(config, &files, &map, &sequence, &lifted)?;
+    }
+    if config.save_result {
+        run_page::write(&files, &report)?;
     }
     if finished {
         Ok(report)

@@ -1,14 +1,21 @@
-//! What the program says on standard error, above the progress bars.
+//! What the program says: on standard error above the progress bars, and into the log of a run.
 
+use std::fs::File;
 use std::io::{self, Write};
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
 
+use anyhow::Context as _;
 use tracing::level_filters::LevelFilter;
+use tracing_subscriber::layer::SubscriberExt as _;
+use tracing_subscriber::util::SubscriberInitExt as _;
+use tracing_subscriber::{EnvFilter, Layer as _, fmt};
 
 use super::progress::Progress;
 use crate::cli::Verbosity;
 
 /// Starts logging; a second call in a process changes nothing.
-pub(super) fn start(verbosity: Verbosity, progress: &Progress) {
+pub(super) fn start(verbosity: Verbosity, progress: &Progress, log: &RunLog) {
     let level = match verbosity {
         Verbosity::Quiet => LevelFilter::ERROR,
         Verbosity::Normal => LevelFilter::INFO,
@@ -16,19 +23,34 @@ pub(super) fn start(verbosity: Verbosity, progress: &Progress) {
         Verbosity::Everything => LevelFilter::TRACE,
     };
     let detailed = level > LevelFilter::INFO;
-    // Graphics libraries talk a lot about what is of no interest here.
-    let filter = tracing_subscriber::EnvFilter::builder()
-        .with_default_directive(LevelFilter::ERROR.into())
-        .parse_lossy(format!("error,fpmcl={level}"));
     let progress = progress.clone();
-    // It fails only where logging was started before.
-    let _ = tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let colored = progress.is_terminal();
+    let shown = fmt::layer()
         .with_target(detailed)
         .without_time()
-        .with_ansi(progress.is_terminal())
+        .with_ansi(colored)
         .with_writer(move || AboveBars(progress.clone()))
+        .with_filter(filter(level));
+    let log = log.clone();
+    let written = fmt::layer()
+        .with_target(detailed)
+        .without_time()
+        .with_ansi(false)
+        .with_writer(move || log.clone())
+        // A log is complete however quiet the terminal is.
+        .with_filter(filter(level.max(LevelFilter::INFO)));
+    // It fails only where logging was started before.
+    let _ = tracing_subscriber::registry()
+        .with(shown)
+        .with(written)
         .try_init();
+}
+
+/// Graphics libraries talk a lot about what is of no interest here.
+fn filter(level: LevelFilter) -> EnvFilter {
+    EnvFilter::builder()
+        .with_default_directive(LevelFilter::ERROR.into())
+        .parse_lossy(format!("error,fpmcl={level}"))
 }
 
 /// Standard error, with the progress bars out of the way while something is written.
@@ -41,5 +63,67 @@ impl Write for AboveBars {
 
     fn flush(&mut self) -> io::Result<()> {
         io::stderr().flush()
+    }
+}
+
+/// The log of the run that is going on, if it has one.
+#[derive(Clone, Debug, Default)]
+pub struct RunLog {
+    file: Arc<Mutex<Option<File>>>,
+}
+
+/// Until it is dropped, what is said is written into a file, too.
+#[derive(Debug)]
+pub struct Writing(RunLog);
+
+impl RunLog {
+    /// Writes what is said from now on into a file, from its beginning.
+    pub fn write_to(&self, path: &Path) -> anyhow::Result<Writing> {
+        let file =
+            File::create(path).with_context(|| format!("cannot create {}", path.display()))?;
+        self.set(Some(file));
+        Ok(Writing(self.clone()))
+    }
+
+    fn set(&self, file: Option<File>) {
+        *self.file.lock().unwrap_or_else(PoisonError::into_inner) = file;
+    }
+}
+
+impl Drop for Writing {
+    fn drop(&mut self) {
+        self.0.set(None);
+    }
+}
+
+impl Write for RunLog {
+    fn write(&mut self, text: &[u8]) -> io::Result<usize> {
+        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+        match file.as_mut() {
+            Some(file) => file.write(text),
+            None => Ok(text.len()),
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_run_has_what_was_said_during_it_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log.txt");
+        let mut log = RunLog::default();
+        log.write_all(b"before\n").unwrap();
+        let writing = log.write_to(&path).unwrap();
+        log.clone().write_all(b"during\n").unwrap();
+        drop(writing);
+        log.write_all(b"after\n").unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), b"during\n");
     }
 }

@@ -2,6 +2,7 @@
 
 // The subcommands, in the order of their use.
 pub mod build_map;
+mod compare;
 mod demo;
 mod doctor;
 pub mod evaluate;
@@ -17,6 +18,7 @@ mod odometry;
 pub mod output;
 pub mod progress;
 mod run_output;
+mod run_page;
 mod stages;
 
 use std::io::Write as _;
@@ -35,6 +37,7 @@ use crate::config::{
 use crate::rendering::backend::Backend;
 use crate::simulation::SimulationConfig;
 use interrupt::{Interrupt, Interrupted};
+use logging::RunLog;
 use progress::Progress;
 
 /// What every command is given beside its configuration.
@@ -50,13 +53,16 @@ pub struct Context {
     pub interrupt: Interrupt,
     /// How far the work has come, for the user to see.
     pub progress: Progress,
+    /// Where what is said is written down, too.
+    pub log: RunLog,
 }
 
 impl Context {
     /// Starts logging, the threads and the handling of Ctrl-C; once per process.
     pub fn new(verbosity: Verbosity, machine: MachineArgs) -> anyhow::Result<Self> {
         let progress = Progress::new(verbosity);
-        logging::start(verbosity, &progress);
+        let log = RunLog::default();
+        logging::start(verbosity, &progress, &log);
         let threads = machine.threads.map_or(0, usize::from);
         rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
@@ -68,6 +74,7 @@ impl Context {
             verbosity,
             interrupt: Interrupt::install().context("listening for Ctrl-C")?,
             progress,
+            log,
         })
     }
 }
@@ -95,6 +102,7 @@ pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
             let config: SimulationConfig = load(args, "config/simulation.yml")?;
             output::print(&simulate::run_with_progress(&config, args.force, context)?)
         }
+        Command::Compare(args) => output::print(&compare::run(args, context)?),
         Command::Demo(args) => output::print(&demo::run(args, context)?),
         Command::Ground(args) => output::print(&ground::run(args, context)?),
         Command::Doctor => doctor::run(context),

@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use super::interrupt::Interrupted;
 use super::run_output::{self, RunFiles};
 use super::stages::{LoadedMap, Observer};
-use super::{Context, input, odometry};
+use super::{Context, input, odometry, run_page};
 use crate::config::{self, OdometrySource, RefinementConfig};
 use crate::evaluation::{LocalizationResults, RangeMclRules, Report};
 use crate::geometry::{Pose2, Pose3};
@@ -87,6 +87,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     if config.plot_loc_results {
         run_output::draw_run(&files, Some(&map), &results)?;
     }
+    run_page::write(&files, &report)?;
     Ok(report)
 }
 

@@ -181,7 +181,16 @@ pub fn draw_run(
     map: Option<&LoadedMap>,
     results: &LocalizationResults,
 ) -> Result<()> {
-    let image = map.map(|map| MapImage::of_colors(&map.mesh, MAP_CELLS));
+    draw_run_on(files, map.map(|map| &map.mesh), results)
+}
+
+/// The same with the map as it is in its file.
+pub fn draw_run_on(
+    files: &RunFiles,
+    mesh: Option<&TriangleMesh>,
+    results: &LocalizationResults,
+) -> Result<()> {
+    let image = mesh.map(|mesh| MapImage::of_colors(mesh, MAP_CELLS));
     let truth = results.ground_truth.as_deref();
     let estimates = results.estimates.as_deref().unwrap_or_default();
     let mut paths = vec![Path2::mcl(estimates)];
@@ -198,10 +207,10 @@ pub fn draw_run(
     }
     draw_runtimes(files, results)?;
     draw_particles(files, image.as_ref(), results, estimates)?;
-    if let Some(map) = map {
+    if let Some(mesh) = mesh {
         MapPlot {
             title: "Map from above: ground red, rest blue",
-            mesh: &map.mesh,
+            mesh,
             trajectory: truth,
             ground_color: [255, 0, 0],
             rest_color: [0, 0, 255],

@@ -12,6 +12,7 @@
 mod blocks;
 mod build_map;
 mod check;
+mod comparison;
 mod error;
 mod evaluation;
 mod ground;
@@ -28,6 +29,10 @@ use serde::de::DeserializeOwned;
 
 pub use build_map::BuildMapConfig;
 pub use check::{Check, Problem};
+pub use comparison::{
+    ComparisonConfig, Overrides, ParticleSweep, SequenceConfig, StageOverrides, VariantConfig,
+    settings,
+};
 pub use error::{ConfigError, Place};
 pub use evaluation::EvaluationConfig;
 pub use ground::GroundConfig;
@@ -64,7 +69,15 @@ pub fn defaults<T>(overrides: &[(String, String)]) -> Result<T, ConfigError>
 where
     T: Check + Default + Serialize + DeserializeOwned,
 {
-    overridden(T::default(), Path::new("defaults"), "", overrides)
+    with_overrides(T::default(), overrides)
+}
+
+/// A configuration with overrides, checked.
+pub fn with_overrides<T>(config: T, overrides: &[(String, String)]) -> Result<T, ConfigError>
+where
+    T: Check + Serialize + DeserializeOwned,
+{
+    overridden(config, Path::new("defaults"), "", overrides)
 }
 
 /// Applies the overrides in order and checks the result.

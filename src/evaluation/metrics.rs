@@ -99,6 +99,8 @@ pub struct TrajectoryMetrics {
     pub smoothness: Smoothness,
     /// Slope of the position error against the distance driven [m/m]; absent where the car stands.
     pub drift: Option<f64>,
+    /// Slope of the position error against time [m/s]; absent without times.
+    pub drift_m_per_s: Option<f64>,
     /// Relative pose error, translation [m].
     pub rpe_translation_m: Option<Summary>,
     /// Relative pose error, rotation [rad].
@@ -163,6 +165,7 @@ impl TrajectoryMetrics {
             convergence,
             smoothness: Smoothness::of(&counted, errors),
             drift: slope(&driven_m, &distance),
+            drift_m_per_s: counted.times_s.and_then(|times| slope(times, &distance)),
             rpe_translation_m: relative.translation(),
             rpe_rotation_rad: relative.rotation(),
             segments: kitti_segment_errors(&estimates, &truth),

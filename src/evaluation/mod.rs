@@ -19,7 +19,8 @@ pub mod pose_error;
 pub mod range_mcl;
 pub mod smoothness;
 pub mod statistics;
-// What is told of it.
+// What is told of it, and of many beside each other.
+pub mod comparison;
 pub mod frames;
 pub mod report;
 pub mod rows;

@@ -227,6 +227,12 @@ impl TrajectoryMetrics {
                 "slope of the position error against the distance driven (least squares)",
             ),
             row(
+                "drift over time",
+                self.drift_m_per_s.map(|drift| 1e3 * drift),
+                "mm/s",
+                "slope of the position error against time (least squares)",
+            ),
+            row(
                 "mean pose change",
                 smoothness.mean_step_m,
                 "m",
