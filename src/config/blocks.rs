@@ -76,7 +76,9 @@ impl Check for VisibilityConfig {
         at_least_one("point_votes", self.point_votes as usize)?;
         not_negative("triangle_margin_m", self.triangle_margin_m)?;
         not_negative("triangle_margin_per_range", self.triangle_margin_per_range)?;
+        not_negative("crossing_m", self.crossing_m)?;
         not_negative("support_m", self.support_m)?;
+        not_negative("support_range_m", self.support_range_m)?;
         at_least_one("triangle_votes", self.triangle_votes as usize)?;
         require(
             self.beam_step >= 1,

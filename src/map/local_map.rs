@@ -72,8 +72,8 @@ pub struct LocalMapCounts {
     pub sparse_triangles: usize,
     /// Triangles dropped for distance to all points.
     pub distant_triangles: usize,
-    /// Triangles that beams pass through, per round.
-    pub crossed_triangles: Vec<usize>,
+    /// Triangles that beams pass through.
+    pub crossed_triangles: usize,
     /// Triangles saved by simplifying the ground.
     pub simplified_triangles: usize,
     /// Triangles left to neighbouring local maps.

@@ -8,7 +8,7 @@ use crate::geometry::{PointCloud, Rigid3f};
 use crate::ground::GroundClassifier;
 use crate::kitti::{Frame, KittiError};
 use crate::lidar::normals::{NormalConfig, normals};
-use crate::lidar::{Beam, LidarModel, RangeImage};
+use crate::lidar::{LidarModel, RangeImage};
 
 /// What of a scan goes into the map.
 #[derive(Clone, Debug, PartialEq)]
@@ -77,8 +77,10 @@ pub struct ScanCloud {
     pub map_from_lidar: Rigid3f,
     /// Oriented points in the map frame.
     pub cloud: PointCloud,
-    /// Beams with a return inside the crop box, lidar frame.
-    pub beams: Vec<Beam>,
+    /// All valid returns, lidar frame [m]: the ends of the beams that vote on free space. The image
+    /// would not do, for of two returns in a pixel it keeps the nearer one, and so forgets the
+    /// beams that pass close by an edge.
+    pub returns: Vec<Vec3>,
     /// Per pixel of the range image the range up to which space is surely free [m]; 0 where unknown.
     pub free_range_m: Vec<f32>,
     /// What was dropped on the way.
@@ -108,14 +110,10 @@ impl ScanCloud {
         let ground = classifier.ground_confidence(&scan.points);
         let normals = normals(&image, &settings.normals);
         let mut cloud = PointCloud::with_capacity(image.ranges.len());
-        let mut beams = Vec::with_capacity(image.ranges.len());
         for (index, normal) in normals.iter().enumerate() {
-            let (Some(beam), Some(number)) = (image.beam(index), image.point_number(index)) else {
+            let Some(number) = image.point_number(index) else {
                 continue;
             };
-            if image.points[index].abs().cmple(settings.crop_m).all() {
-                beams.push(beam);
-            }
             match *normal {
                 Some(normal) => cloud.push(image.points[index], normal, ground[number]),
                 None => counts.without_normal += 1,
@@ -141,7 +139,7 @@ impl ScanCloud {
         Ok(Self {
             map_from_lidar,
             cloud,
-            beams,
+            returns: scan.points,
             free_range_m: free_ranges(&image),
             counts,
         })

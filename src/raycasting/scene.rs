@@ -1,5 +1,7 @@
 //! Tiles of triangles under one hierarchy, and the ways to cast rays at them.
 
+mod through;
+
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
