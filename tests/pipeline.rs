@@ -126,11 +126,28 @@ fn a_car_is_found_and_refined_in_the_map_of_another_drive() {
     picture("range_images.png").shows(&[]);
     Picture::read(&folder.join("results/map.png")).shows(&[]);
 
-    let evaluated = run(folder, &["evaluate", "evaluation.yml"]);
-    assert!(evaluated.contains("range-mcl success"), "{evaluated}");
+    judging_loses_nothing(folder);
     the_report_has_small_errors(&folder.join("results"));
     the_result_has_a_row_per_frame(&folder.join("results"));
     the_trajectories_lie_on_the_truth(folder);
+}
+
+/// What the run said of itself and the map behind its pictures stay as they were.
+fn judging_loses_nothing(folder: &Path) {
+    let results = folder.join("results");
+    let pictures =
+        ["path.png", "particles.png", "map.png"].map(|name| results.join("plots").join(name));
+    let drawn = pictures.each_ref().map(|path| fs::read(path).unwrap());
+    let before = json(&results.join("report.json"));
+    let evaluated = run(folder, &["evaluate", "evaluation.yml"]);
+    assert!(evaluated.contains("range-mcl success"), "{evaluated}");
+    assert!(drawn == pictures.each_ref().map(|path| fs::read(path).unwrap()));
+    let after = json(&results.join("report.json"));
+    for (key, told) in before["about"].as_object().unwrap() {
+        assert_eq!(after["about"][key], *told, "{key}");
+    }
+    assert_eq!(after["about"]["result"], "results/localization.npz");
+    assert!(results.join("report.html").exists());
 }
 
 fn the_report_has_small_errors(results: &Path) {

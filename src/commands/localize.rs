@@ -19,10 +19,12 @@ use crate::kitti::{Frame, Sequence};
 use crate::lidar::RangeImage;
 use crate::localization::initialization::{Cells, ROAD_HALF_WIDTH_M, around};
 use crate::localization::motion::VelocityCommand;
+use crate::localization::observation::choose_beams;
 use crate::localization::odometry::Odometry;
 use crate::localization::panorama::PanoramaIndex;
-use crate::localization::{FrameEstimate, Localizer, ParticleSet, Surroundings};
+use crate::localization::{FrameEstimate, Localizer, ParticleSet, State, Surroundings};
 use crate::map::Stance;
+use crate::refinement::{FrameObjective, RefinedFrame, refine_frame};
 
 /// Which random stream belongs to what; the streams of frames follow.
 const INITIALIZATION_STREAM: u64 = 0;
@@ -60,11 +62,19 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     )?;
     let sequence = odometry::compensated(sequence, config.motion_compensation, &increments);
     let run = localize(config, context, &map, &sequence, &increments, &files)?;
-    let (results, lifted, finished) = run;
+    let Run {
+        results,
+        lifted,
+        refined,
+        failure,
+    } = run;
     let about = about(config, context, &map);
     if config.save_result {
         run_output::write_results(&files, &results)?;
         run_output::write_trajectory(&files, "mcl", &sequence, &lifted)?;
+        if config.refine {
+            run_output::write_trajectory(&files, "refined", &sequence, &refined)?;
+        }
         config::write(&files.file("localization.yml"), config)?;
     }
     let report = run_output::judge(&results, &RangeMclRules::default(), about)?;
@@ -78,22 +88,34 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     if config.save_result {
         run_page::write(&files, &report)?;
     }
-    if finished {
-        Ok(report)
-    } else {
-        Err(Interrupted {
-            kept: format!(
-                "{} of {} frames are localized and kept in {}",
-                results.len(),
-                sequence.frames.len(),
-                config.result_path.display()
-            ),
-        }
-        .into())
+    if results.len() == sequence.frames.len() {
+        return Ok(report);
     }
+    let (found, all) = (results.len(), sequence.frames.len());
+    let kept = if config.save_result {
+        let path = config.result_path.display();
+        format!("{found} of {all} frames are localized and kept in {path}")
+    } else {
+        format!("{found} of {all} frames were localized, and nothing is kept: save_result is False")
+    };
+    Err(match failure {
+        Some(failure) => failure.context(kept),
+        None => Interrupted { kept }.into(),
+    })
 }
 
-/// Runs the filter over the frames; whether it came to the end.
+/// What the filter made of the frames up to where it came.
+struct Run {
+    results: LocalizationResults,
+    /// The estimates in space.
+    lifted: Vec<Pose3>,
+    /// The refined poses in space; none unless frames are refined.
+    refined: Vec<Pose3>,
+    /// Why it did not come to the end, unless that was wished.
+    failure: Option<anyhow::Error>,
+}
+
+/// Runs the filter over the frames, as far as it comes; an error only where no frame was finished.
 fn localize(
     config: &LocalizationConfig,
     context: &Context,
@@ -101,54 +123,152 @@ fn localize(
     sequence: &Sequence,
     increments: &[Option<Pose2>],
     files: &RunFiles,
-) -> Result<(LocalizationResults, Vec<Pose3>, bool)> {
+) -> Result<Run> {
     let classifier = FuzzyGround::new(FuzzyConfig::default())?;
     let observer = Observer {
         model: config.range_image.model(),
         own_car_m: config.own_car_m,
         classifier: &classifier,
     };
-    let mut recorder = Recorder::new(config, map, files);
-    let mut localizer: Option<Localizer> = None;
     let panoramas = panoramas(config, map)?;
-    let mut stance = Stance::default();
+    let mut recorder = Recorder::new(config, map, files);
+    let mut drive = Drive {
+        config,
+        map,
+        observer: &observer,
+        panoramas: panoramas.as_ref(),
+        localizer: None,
+        stance: Stance::default(),
+    };
+    let mut failure = None;
     let task = context.progress.task("localize", sequence.frames.len());
     for (row, frame) in sequence.frames.iter().enumerate() {
         if context.interrupt.requested() {
             break;
         }
-        let points = observer.read(frame)?;
-        let started = Instant::now();
-        let image = observer.image(points);
-        let known = localizer.as_ref().and_then(Localizer::stance);
-        stance = known.or_else(|| observer.stance(&image)).unwrap_or(stance);
-        let mut rng = stream(config.seed, FIRST_FRAME_STREAM + row as u64);
-        if localizer.is_none() {
-            let surroundings = Surroundings {
-                renderer: &*map.renderer,
-                ground: &map.ground,
-                tiles: &map.grid,
-                panoramas: panoramas.as_ref(),
-            };
-            let start = initial_particles(config, map, frame, &image, &stance, panoramas.as_ref())?;
-            localizer = Some(Localizer::new(config.localizer(), surroundings, start));
-        }
-        let Some(localizer) = &mut localizer else {
-            continue;
-        };
         let moved = motion(config.motion_model, increments[row], sequence, row);
-        let estimate = localizer.step(moved, &image, &stance, &mut rng)?;
-        recorder.record(frame, increments[row], &estimate, started.elapsed())?;
+        let said = drive
+            .take_in(row, frame, moved)
+            .and_then(|said| recorder.record(frame, increments[row], said));
+        if let Err(error) = said {
+            failure = Some(error);
+            break;
+        }
         task.advance(1);
     }
     drop(task);
-    let (results, lifted) = recorder.finish()?;
-    if results.is_empty() {
-        let kept = "no frame was finished".to_owned();
-        return Err(Interrupted { kept }.into());
+    let run = recorder.finish(failure)?;
+    match (run.results.is_empty(), run.failure) {
+        (false, failure) => Ok(Run { failure, ..run }),
+        (true, Some(failure)) => Err(failure),
+        (true, None) => {
+            let kept = "no frame was finished".to_owned();
+            Err(Interrupted { kept }.into())
+        }
     }
-    let finished = results.len() == sequence.frames.len();
-    Ok((results, lifted, finished))
+}
+
+/// The filter on its way through the frames.
+struct Drive<'a> {
+    config: &'a LocalizationConfig,
+    map: &'a LoadedMap,
+    observer: &'a Observer<'a>,
+    panoramas: Option<&'a PanoramaIndex>,
+    localizer: Option<Localizer<'a>>,
+    /// The last that was known.
+    stance: Stance,
+}
+
+/// What is known of a frame in the end.
+struct Said {
+    estimate: FrameEstimate,
+    runtime: Duration,
+    /// With the time that it took.
+    refined: Option<(RefinedFrame, Duration)>,
+}
+
+impl<'a> Drive<'a> {
+    /// Localizes a frame and, where that is wanted, refines it.
+    fn take_in(&mut self, row: usize, frame: &Frame, moved: Odometry) -> Result<Said> {
+        let points = self.observer.read(frame)?;
+        let started = Instant::now();
+        let image = self.observer.image(points);
+        let known = self.localizer.as_ref().and_then(Localizer::stance);
+        self.stance = known
+            .or_else(|| self.observer.stance(&image))
+            .unwrap_or(self.stance);
+        let mut rng = stream(self.config.seed, FIRST_FRAME_STREAM + row as u64);
+        let stance = self.stance;
+        let localizer = match &mut self.localizer {
+            Some(localizer) => localizer,
+            empty => {
+                let begun = begin(
+                    self.config,
+                    self.map,
+                    frame,
+                    &image,
+                    &stance,
+                    self.panoramas,
+                )?;
+                empty.insert(begun)
+            }
+        };
+        let estimate = localizer.step(moved, &image, &stance, &mut rng)?;
+        let runtime = started.elapsed();
+        let stance = localizer.stance().unwrap_or(stance);
+        let refined = self.refined(&image, &estimate, stance, &mut rng)?;
+        let elapsed = started.elapsed() - runtime;
+        Ok(Said {
+            estimate,
+            runtime,
+            refined: refined.map(|refined| (refined, elapsed)),
+        })
+    }
+
+    /// The frame refined, if it shall be and the filter knows where it is.
+    fn refined(
+        &self,
+        image: &RangeImage,
+        estimate: &FrameEstimate,
+        stance: Stance,
+        rng: &mut ChaCha8Rng,
+    ) -> Result<Option<RefinedFrame>> {
+        if !self.config.refine || estimate.state != State::Tracking {
+            return Ok(None);
+        }
+        let observation = &self.config.observation;
+        let (count, road_share) = (observation.beams, observation.road_share);
+        let beams = choose_beams(image, count, road_share, &stance, rng);
+        let objective = FrameObjective {
+            renderer: &*self.map.renderer,
+            ground: &self.map.ground,
+            beams: &beams,
+            stance,
+            difference: observation.difference(),
+        };
+        let (pose, covariance) = (&estimate.pose, &estimate.covariance);
+        let refined = refine_frame(&objective, pose, covariance, &self.config.refinement, rng)?;
+        Ok(refined)
+    }
+}
+
+/// The filter with its first belief.
+fn begin<'a>(
+    config: &LocalizationConfig,
+    map: &'a LoadedMap,
+    first: &Frame,
+    scan: &RangeImage,
+    stance: &Stance,
+    panoramas: Option<&'a PanoramaIndex>,
+) -> Result<Localizer<'a>> {
+    let surroundings = Surroundings {
+        renderer: &*map.renderer,
+        ground: &map.ground,
+        tiles: &map.grid,
+        panoramas,
+    };
+    let start = initial_particles(config, map, first, scan, stance, panoramas)?;
+    Ok(Localizer::new(config.localizer(), surroundings, start))
 }
 
 /// The motion into a frame, as the motion model wants it.
@@ -253,6 +373,7 @@ fn stream(seed: u64, stream: u64) -> ChaCha8Rng {
 struct Recorder {
     results: LocalizationResults,
     lifted: Vec<Pose3>,
+    refined: Vec<Pose3>,
     movie: Option<Movie>,
 }
 
@@ -269,25 +390,27 @@ impl Recorder {
                 times_s: Some(Vec::new()),
                 runtimes_s: Some(Vec::new()),
                 states: Some(Vec::new()),
+                refined: config.refine.then(Vec::new),
+                refine_runtimes_s: config.refine.then(Vec::new),
                 ..LocalizationResults::default()
             },
             lifted: Vec::new(),
+            refined: Vec::new(),
             movie: config.visualize.then(|| Movie::begin(files, &map.mesh)),
         }
     }
 
-    fn record(
-        &mut self,
-        frame: &Frame,
-        increment: Option<Pose2>,
-        estimate: &FrameEstimate,
-        runtime: Duration,
-    ) -> Result<()> {
+    fn record(&mut self, frame: &Frame, increment: Option<Pose2>, said: Said) -> Result<()> {
         fn push<T>(column: &mut Option<Vec<T>>, value: T) {
             if let Some(column) = column {
                 column.push(value);
             }
         }
+        let Said {
+            estimate,
+            runtime,
+            refined,
+        } = &said;
         let results = &mut self.results;
         results.frames.push(frame.number);
         results
@@ -303,6 +426,13 @@ impl Recorder {
         push(&mut results.times_s, frame.time_s);
         push(&mut results.runtimes_s, runtime.as_secs_f64());
         push(&mut results.states, estimate.state as u8);
+        let (pose, lifted, seconds) = match refined {
+            Some((refined, runtime)) => (refined.pose, refined.lifted, runtime.as_secs_f64()),
+            None => (estimate.pose, estimate.lifted, 0.0),
+        };
+        push(&mut results.refined, pose);
+        push(&mut results.refine_runtimes_s, seconds);
+        self.refined.push(lifted);
         self.lifted.push(estimate.lifted);
         if let Some(movie) = &mut self.movie {
             movie.add(results, estimate)?;
@@ -310,11 +440,16 @@ impl Recorder {
         Ok(())
     }
 
-    fn finish(self) -> Result<(LocalizationResults, Vec<Pose3>)> {
-        if let Some(movie) = self.movie {
+    fn finish(self, failure: Option<anyhow::Error>) -> Result<Run> {
+        if let Some(movie) = self.movie.filter(|_| !self.lifted.is_empty()) {
             movie.finish()?;
         }
-        Ok((self.results, self.lifted))
+        Ok(Run {
+            results: self.results,
+            lifted: self.lifted,
+            refined: self.refined,
+            failure,
+        })
     }
 }
 

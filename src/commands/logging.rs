@@ -72,27 +72,43 @@ pub struct RunLog {
     file: Arc<Mutex<Option<File>>>,
 }
 
-/// Until it is dropped, what is said is written into a file, too.
+/// Until it is dropped, what is said is written into a file, too; then into the one before it.
 #[derive(Debug)]
-pub struct Writing(RunLog);
+pub struct Writing {
+    log: RunLog,
+    before: Option<File>,
+}
 
 impl RunLog {
     /// Writes what is said from now on into a file, from its beginning.
     pub fn write_to(&self, path: &Path) -> anyhow::Result<Writing> {
         let file =
             File::create(path).with_context(|| format!("cannot create {}", path.display()))?;
-        self.set(Some(file));
-        Ok(Writing(self.clone()))
+        let before = self.replace(Some(file));
+        let log = self.clone();
+        Ok(Writing { log, before })
     }
 
-    fn set(&self, file: Option<File>) {
-        *self.file.lock().unwrap_or_else(PoisonError::into_inner) = file;
+    /// Writes down what was said elsewhere, as far as that was written down.
+    pub fn repeat(&mut self, path: &Path) -> anyhow::Result<()> {
+        if path.exists() {
+            let said =
+                std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+            self.write_all(&said)
+                .context("cannot write the log of the run")?;
+        }
+        Ok(())
+    }
+
+    fn replace(&self, file: Option<File>) -> Option<File> {
+        let mut own = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::replace(&mut *own, file)
     }
 }
 
 impl Drop for Writing {
     fn drop(&mut self) {
-        self.0.set(None);
+        self.log.replace(self.before.take());
     }
 }
 
@@ -122,8 +138,15 @@ mod tests {
         log.write_all(b"before\n").unwrap();
         let writing = log.write_to(&path).unwrap();
         log.clone().write_all(b"during\n").unwrap();
+        let part = folder.path().join("part.txt");
+        let writing_part = log.write_to(&part).unwrap();
+        log.clone().write_all(b"in a part\n").unwrap();
+        drop(writing_part);
+        assert_eq!(std::fs::read(&path).unwrap(), b"during\n");
+        log.repeat(&part).unwrap();
+        log.repeat(&folder.path().join("never written")).unwrap();
         drop(writing);
         log.write_all(b"after\n").unwrap();
-        assert_eq!(std::fs::read(&path).unwrap(), b"during\n");
+        assert_eq!(std::fs::read(&path).unwrap(), b"during\nin a part\n");
     }
 }

@@ -146,7 +146,7 @@ fn polish_all(
         }
         let before = polished
             .last()
-            .map_or_else(Stance::default, |last| last.stance);
+            .map(|last| (last.stance, last.prior.is_some()));
         let start = Start {
             estimate: estimates[row],
             covariance: results.covariances.as_ref().map(|all| all[row]),
@@ -190,7 +190,7 @@ fn polish(
     observer: &Observer,
     frame: &Frame,
     start: &Start,
-    stance_before: Stance,
+    before: Option<(Stance, bool)>,
     mut rng: ChaCha8Rng,
     row: usize,
 ) -> Result<Polished> {
@@ -198,7 +198,12 @@ fn polish(
     let points = observer.read(frame)?;
     let started = Instant::now();
     let image = observer.image(points);
-    let stance = observer.stance(&image).unwrap_or(stance_before);
+    // A frame that was laid onto the map knows better than the plane of the road that a scan sees.
+    let stance = match before {
+        Some((stance, true)) => stance,
+        Some((stance, false)) => observer.stance(&image).unwrap_or(stance),
+        None => observer.stance(&image).unwrap_or_default(),
+    };
     let refined = if start.is_found {
         let observation = &config.observation;
         let beams = choose_beams(
@@ -229,12 +234,12 @@ fn polish(
         None
     };
     Ok(Polished {
+        stance: refined.as_ref().map_or(stance, |frame| frame.stance),
         pose: refined.as_ref().map_or(start.estimate, |frame| frame.pose),
         prior: refined.map(|frame| FramePrior {
             pose: frame.pose,
             covariance: frame.covariance,
         }),
-        stance,
         seconds: started.elapsed().as_secs_f64(),
     })
 }

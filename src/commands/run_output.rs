@@ -147,22 +147,16 @@ pub fn judge(
         Some(estimates) => estimates.clone(),
         None => rules.estimates(results)?,
     };
-    let one = |estimates: &[Pose2], runtimes_s: Option<&[f64]>| -> Result<TrajectoryReport> {
-        let judged = Judged {
-            estimates,
-            ground_truth: truth,
-            times_s: results.times_s.as_deref(),
-            runtimes_s,
-        };
-        let config = MetricsConfig {
-            // A short run is judged from where it can be.
-            skip_frames: MetricsConfig::default().skip_frames.min(truth.len() / 2),
-            ..MetricsConfig::default()
-        };
-        Ok(TrajectoryReport {
-            range_mcl: rules.judge(estimates, truth),
-            metrics: TrajectoryMetrics::of(&judged, &config)?,
-        })
+    let one = |estimates: &[Pose2], runtimes_s: Option<&[f64]>| {
+        judge_one(
+            &Judged {
+                estimates,
+                ground_truth: truth,
+                times_s: results.times_s.as_deref(),
+                runtimes_s,
+            },
+            rules,
+        )
     };
     Ok(Report {
         about,
@@ -172,6 +166,21 @@ pub fn judge(
             .as_deref()
             .map(|refined| one(refined, results.refine_runtimes_s.as_deref()))
             .transpose()?,
+    })
+}
+
+/// Judges one trajectory.
+pub fn judge_one(judged: &Judged, rules: &RangeMclRules) -> Result<TrajectoryReport> {
+    let config = MetricsConfig {
+        // A short run is judged from where it can be.
+        skip_frames: MetricsConfig::default()
+            .skip_frames
+            .min(judged.ground_truth.len() / 2),
+        ..MetricsConfig::default()
+    };
+    Ok(TrajectoryReport {
+        range_mcl: rules.judge(judged.estimates, judged.ground_truth),
+        metrics: TrajectoryMetrics::of(judged, &config)?,
     })
 }
 

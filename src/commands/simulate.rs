@@ -6,6 +6,7 @@
 //! drive_1/velodyne/000000.bin ...   points
 //! drive_1/labels/000000.label ...   a SemanticKITTI class per point
 //! drive_1/calib.txt times.txt odometry.txt simulation.yml
+//! drive_1/street.ply                what stands still, in the map frame: the truth of a map
 //! drive_1/poses.txt                 written last: where it is, the drive is complete
 //! ```
 //!
@@ -28,6 +29,7 @@ use crate::geometry::Pose3;
 use crate::kitti::poses::{CameraPoses, write_kitti, write_times};
 use crate::kitti::velodyne::{write_labels, write_scan};
 use crate::kitti::{Calibration, KittiError};
+use crate::map::ply;
 use crate::simulation::{Simulation, SimulationConfig, calibration};
 
 /// What a run did.
@@ -82,6 +84,9 @@ pub fn run(
     }
     write_whole(&folder.join("simulation.yml"), |path| {
         fs::write(path, &recipe).with_context(|| format!("cannot write {}", path.display()))
+    })?;
+    write_whole(&folder.join("street.ply"), |path| {
+        Ok(ply::write(path, &simulation.truth_in_map())?)
     })?;
     let kept = write_scans(&simulation, &folder, progress, interrupt)?;
     write_poses(&simulation, &folder, &poses)?;
@@ -155,7 +160,9 @@ fn state_of(folder: &Path, recipe: &str) -> Result<State> {
 
 /// Removes what a drive consists of, and nothing else; the mark of completeness first.
 fn clear(folder: &Path) -> Result<()> {
-    let mut paths = vec![folder.join("poses.txt"), folder.join("simulation.yml")];
+    let mut paths = ["poses.txt", "simulation.yml", "street.ply"]
+        .map(|name| folder.join(name))
+        .to_vec();
     for (name, extension) in [("velodyne", "bin"), ("labels", "label")] {
         for entry in fs::read_dir(folder.join(name)).into_iter().flatten() {
             let path = entry?.path();
@@ -297,7 +304,7 @@ mod tests {
                 .unwrap();
             contents(&folder.path().join("drive_1"))
         });
-        assert_eq!(written[0].len(), 4 + 2 * 6);
+        assert_eq!(written[0].len(), 5 + 2 * 6);
         assert_eq!(written[0], written[1]);
         assert_eq!(written[0], written[2]);
     }
@@ -356,7 +363,7 @@ mod tests {
 
         quietly(&other, true).unwrap();
         let after = contents(&config.drive_folder());
-        assert_eq!(after.len(), 4 + 2 * 3, "scans of the old drive are gone");
+        assert_eq!(after.len(), 5 + 2 * 3, "scans of the old drive are gone");
     }
 
     #[test]

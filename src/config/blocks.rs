@@ -265,6 +265,7 @@ impl Check for PanoramaConfig {
 impl Check for RefinementConfig {
     fn check(&self) -> Result<(), Problem> {
         nested("swarm", self.swarm.check())?;
+        at_least_one("swarm_beams", self.swarm_beams)?;
         nested("gauss_newton", self.gauss_newton.check())?;
         nested("smoothing", self.smoothing.check())?;
         not_negative("reach_sigmas", self.reach_sigmas)?;

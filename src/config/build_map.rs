@@ -78,6 +78,9 @@ pub struct BuildMapConfig {
     pub overlap_m: f64,
     /// Every n-th counted scan is held back, and the map is judged along its beams; 0 for none.
     pub holdout_step: usize,
+    /// Mesh of the true surface in the map frame, to measure accuracy and completeness with;
+    /// `street.ply` of a simulated drive is one.
+    pub truth_mesh: Option<PathBuf>,
     /// Surface farther than this from every point was invented by the reconstruction and is
     /// removed [m].
     pub max_distance_m: f64,
@@ -136,6 +139,7 @@ impl Default for BuildMapConfig {
             ground_method: GroundMethod::default(),
             overlap_m: 5.0,
             holdout_step: 0,
+            truth_mesh: None,
             max_distance_m: f64::from(settings.max_distance_m),
             ground_threshold: settings.ground_threshold,
             own_car_m: settings.scan.own_car_m,

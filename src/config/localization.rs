@@ -21,6 +21,7 @@ use crate::localization::resampling::{KldConfig, ResamplingConfig};
 use crate::localization::settings::TemperingConfig;
 use crate::localization::vigilance::VigilanceConfig;
 use crate::map::scan_cloud::ScanSettings;
+use crate::refinement::RefinementConfig;
 
 /// The keys of range-mcl's `localization.yml`, and below them new ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -103,6 +104,10 @@ pub struct LocalizationConfig {
     /// The sense in which the sensor spins, where the motion of the car during a scan is to be
     /// compensated; not so for scans that are compensated already, as those of KITTI odometry.
     pub motion_compensation: Option<Spin>,
+    /// Whether every frame is refined as it comes, while tracking.
+    pub refine: bool,
+    /// How.
+    pub refinement: RefinementConfig,
     /// What random choices follow from.
     pub seed: u64,
     /// Whether an existing result is replaced.
@@ -208,6 +213,8 @@ impl Default for LocalizationConfig {
             vigilance: VigilanceConfig::default(),
             panorama: PanoramaConfig::default(),
             motion_compensation: None,
+            refine: false,
+            refinement: RefinementConfig::default(),
             seed: 0,
             force: false,
         }
@@ -346,6 +353,7 @@ impl Check for LocalizationConfig {
         nested("kld", self.kld.check())?;
         nested("vigilance", self.vigilance.check())?;
         nested("panorama", self.panorama.check())?;
+        nested("refinement", self.refinement.check())?;
         nested("range_image", self.range_image.check())
     }
 }

@@ -80,6 +80,9 @@ pub struct LocalMapCounts {
     pub foreign_triangles: usize,
     /// Triangles of the finished local map.
     pub triangles: usize,
+    /// Whether it was left out because it had too few points to mesh.
+    #[serde(default)]
+    pub is_empty: bool,
 }
 
 /// Who watches a build and may stop it.
@@ -146,14 +149,22 @@ pub fn build(
     let cloud = static_cloud(&scans, settings, &mut counts);
 
     watcher.begin("surface")?;
-    let mut surface = meshing::reconstruct(&cloud, None, &settings.poisson).map_err(|source| {
-        LocalMapError::Meshing {
-            number: plan.number,
-            first: frames[plan.own.start].number,
-            last: frames[plan.own.end - 1].number,
-            source,
+    let mut surface = match meshing::reconstruct(&cloud, None, &settings.poisson) {
+        Ok(surface) => surface,
+        // A stretch in which nothing was seen is a hole in the map, and no reason to have no map.
+        Err(MeshingError::TooFewPoints { .. }) => {
+            counts.is_empty = true;
+            return Ok((TriangleMesh::default(), counts));
         }
-    })?;
+        Err(source) => {
+            return Err(LocalMapError::Meshing {
+                number: plan.number,
+                first: frames[plan.own.start].number,
+                last: frames[plan.own.end - 1].number,
+                source,
+            });
+        }
+    };
     counts.reconstructed_triangles = surface.mesh.triangles.len();
     counts.sparse_triangles = meshing::trim_by_density(&mut surface, settings.min_density);
     let mut mesh = surface.mesh;

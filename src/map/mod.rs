@@ -7,7 +7,9 @@ pub mod plan;
 pub mod ply;
 pub mod quality;
 pub mod scan_cloud;
+mod surface_distance;
 pub mod tiles;
+pub mod truth;
 pub mod visibility;
 
 pub use elevation::{GroundMap, GroundPatch, Stance};
@@ -15,3 +17,4 @@ pub use local_map::{LocalMapCounts, LocalMapError, LocalMapSettings};
 pub use ply::PlyError;
 pub use quality::MapQuality;
 pub use tiles::{TileConfig, TileGrid, TileIndex};
+pub use truth::TruthAgreement;

@@ -9,23 +9,29 @@
 //! ```
 //!
 //! early: residual < −0.5 m (ghosts, trails, invented surfaces); late: > 0.5 m (a moving object in
-//! the scan, or a hole); miss: nothing there.
+//! the scan, or a hole); miss: nothing there. Beside it stands the distance of the returns to the
+//! nearest surface, which says whether the world is in the map at all.
 
-use glam::Vec3;
+use std::collections::HashMap;
+
+use glam::{IVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
 
 use super::scan_cloud::ScanSettings;
+use super::surface_distance::distances_m;
 use crate::geometry::{Rigid3f, TriangleMesh};
 use crate::kitti::{Frame, KittiError};
 use crate::raycasting::{Hit, Scene};
 
 /// A residual beyond this is early or late [m].
 const GROSS_M: f32 = 0.5;
-/// A beam-plane distance below this counts as "within" [m].
+/// A distance below this counts as "within" [m].
 const NEAR_M: f32 = 0.1;
 /// Beams shorter than this are the own car's surroundings and not judged [m].
 const NEAREST_M: f32 = 3.0;
+/// Edge of the cells in which residuals are averaged for a picture [m].
+const PICTURE_CELL_M: f32 = 0.5;
 /// Every how manieth beam is judged.
 const BEAM_STEP: usize = 7;
 
@@ -44,6 +50,10 @@ pub struct MapQuality {
     pub beam_plane_median_m: f64,
     /// Share whose beam-plane distance is under 10 cm.
     pub beam_plane_within_10cm: f64,
+    /// Median distance of the returns to the nearest surface [m]; infinite if over 10 cm.
+    pub point_median_m: f64,
+    /// Share of the returns within 10 cm of a surface.
+    pub point_within_10cm: f64,
     /// Median |residual| [m].
     pub ray_median_m: f64,
     /// Median residual [m].
@@ -59,6 +69,10 @@ pub struct BeamResidual {
     pub residual_m: f32,
     /// |residual| times cosine of incidence [m].
     pub beam_plane_m: f32,
+    /// Distance of the return to the nearest surface [m]; infinite if over 10 cm.
+    pub point_m: f32,
+    /// Where the map stops the beam, map frame; `None` where it has nothing.
+    pub stopped_at: Option<Vec3>,
 }
 
 /// Judges a map along the beams of frames, inside the crop box of the settings.
@@ -84,7 +98,35 @@ pub fn residuals(
             Ok(judge(mesh, &scene, &map_from_lidar, &points))
         })
         .collect::<Result<Vec<_>, KittiError>>()?;
-    Ok(per_frame.into_iter().flatten().collect())
+    let mut beams: Vec<BeamResidual> = per_frame.into_iter().flatten().collect();
+    let points: Vec<Vec3> = beams.iter().map(|beam| beam.point_in_map).collect();
+    for (beam, point_m) in beams.iter_mut().zip(distances_m(&points, mesh, NEAR_M)) {
+        beam.point_m = point_m;
+    }
+    Ok(beams)
+}
+
+/// Per vertex the mean distance of beams to the plane that they hit around it, for a picture [m];
+/// not a number where no beam was judged. A beam that is far too early or too late counts as
+/// half a metre.
+pub fn vertex_residuals(mesh: &TriangleMesh, beams: &[BeamResidual]) -> Vec<f32> {
+    let cell_of = |point: Vec3| (point / PICTURE_CELL_M).floor().as_ivec3();
+    let mut cells: HashMap<IVec3, (f32, f32)> = HashMap::new();
+    for beam in beams {
+        if let Some(place) = beam.stopped_at {
+            let (sum, count) = cells.entry(cell_of(place)).or_default();
+            *sum += beam.beam_plane_m.min(GROSS_M);
+            *count += 1.0;
+        }
+    }
+    mesh.vertices
+        .iter()
+        .map(|&vertex| {
+            cells
+                .get(&cell_of(vertex))
+                .map_or(f32::NAN, |(sum, count)| sum / count)
+        })
+        .collect()
 }
 
 fn judge(
@@ -117,6 +159,9 @@ fn judge(
                 point_in_map: map_from_lidar.apply(point),
                 residual_m,
                 beam_plane_m,
+                point_m: f32::INFINITY,
+                stopped_at: (hit.triangle != Hit::NO_TRIANGLE)
+                    .then(|| map_from_lidar.translation + hit.range_m * direction),
             }
         })
         .collect()
@@ -142,6 +187,13 @@ impl MapQuality {
             miss: share(residuals.len() - hits.len()),
             beam_plane_median_m: median(hits.iter().map(|beam| beam.beam_plane_m)),
             beam_plane_within_10cm: count(&|beam| beam.beam_plane_m < NEAR_M),
+            point_median_m: median(residuals.iter().map(|beam| beam.point_m)),
+            point_within_10cm: share(
+                residuals
+                    .iter()
+                    .filter(|beam| beam.point_m < NEAR_M)
+                    .count(),
+            ),
             ray_median_m: median(hits.iter().map(|beam| beam.residual_m.abs())),
             bias_m: median(hits.iter().map(|beam| beam.residual_m)),
         })
@@ -191,6 +243,25 @@ mod tests {
             (quality.early, quality.late, quality.miss),
             (0.25, 0.25, 0.25)
         );
+    }
+
+    #[test]
+    fn a_picture_shows_residuals_where_beams_were_stopped_and_nothing_elsewhere() {
+        let mesh = TriangleMesh {
+            vertices: vec![Vec3::new(10.2, 0.1, 0.1), Vec3::new(10.2, 30.0, 0.0)],
+            ..TriangleMesh::default()
+        };
+        let beam = |beam_plane_m, x| BeamResidual {
+            point_in_map: Vec3::ZERO,
+            residual_m: 0.0,
+            beam_plane_m,
+            point_m: 0.0,
+            stopped_at: Some(Vec3::new(x, 0.2, 0.2)),
+        };
+        let beams = [beam(0.1, 10.1), beam(9.0, 10.3), beam(0.2, 12.0)];
+        let values = vertex_residuals(&mesh, &beams);
+        assert!((values[0] - 0.3).abs() < 1e-6);
+        assert!(values[1].is_nan());
     }
 
     #[test]

@@ -12,7 +12,7 @@ pub mod smoothing;
 pub mod swarm;
 
 pub use objective::FrameObjective;
-pub use refiner::{RefinedFrame, RefinementConfig, refine_frame};
+pub use refiner::{Method, RefinedFrame, RefinementConfig, refine_frame};
 pub use smoothing::{FramePrior, SmoothingConfig, smooth};
 
 #[cfg(test)]

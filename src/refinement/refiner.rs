@@ -11,6 +11,8 @@ use super::objective::FrameObjective;
 use super::smoothing::SmoothingConfig;
 use super::swarm::{Dimension, SwarmConfig, minimize};
 use crate::geometry::{Pose2, Pose3, planar};
+use crate::lidar::Beam;
+use crate::map::Stance;
 use crate::registration::{Registration, RegistrationConfig, register};
 use crate::rendering::RenderError;
 
@@ -36,6 +38,9 @@ pub struct RefinementConfig {
     pub method: Method,
     /// The swarm.
     pub swarm: SwarmConfig,
+    /// Beams that the swarm compares, of those of the frame: it looks for the right place, the
+    /// finishing step for the last centimetres.
+    pub swarm_beams: usize,
     /// The finishing step.
     pub gauss_newton: RegistrationConfig,
     /// The smoothing of the whole trajectory.
@@ -60,6 +65,7 @@ impl Default for RefinementConfig {
         Self {
             method: Method::Both,
             swarm: SwarmConfig::default(),
+            swarm_beams: 300,
             gauss_newton: RegistrationConfig::default(),
             smoothing: SmoothingConfig::default(),
             reach_sigmas: 3.0,
@@ -81,6 +87,8 @@ pub struct RefinedFrame {
     pub lifted: Pose3,
     /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
+    /// How the sensor stands over the mapped ground.
+    pub stance: Stance,
     /// Objective at the estimate [m].
     pub cost_before_m: f64,
     /// Objective at the result, never larger [m].
@@ -99,6 +107,7 @@ pub fn refine_frame(
     config: &RefinementConfig,
     rng: &mut impl Rng,
 ) -> Result<Option<RefinedFrame>, RenderError> {
+    let objective = &objective.settled(estimate);
     let Some(lifted) = objective
         .lift(estimate, None)
         .filter(|_| !objective.beams.is_empty())
@@ -110,6 +119,7 @@ pub fn refine_frame(
         pose: *estimate,
         lifted,
         covariance: *covariance,
+        stance: objective.stance,
         cost_before_m,
         cost_after_m: cost_before_m,
         rays: objective.beams.len(),
@@ -121,6 +131,9 @@ pub fn refine_frame(
         Method::GaussNewton | Method::Both => polish(objective, &mut frame, config)?,
         Method::None | Method::Swarm => None,
     };
+    if let Some(patch) = objective.ground.patch_under(&frame.pose) {
+        frame.stance = patch.stance_of(&frame.lifted);
+    }
     if config.method != Method::None {
         frame.covariance = match finished {
             Some(registered) => registered.planar_covariance(),
@@ -139,19 +152,27 @@ fn search(
 ) -> Result<(), RenderError> {
     let dimensions = search_space(&frame.pose, &frame.covariance, config);
     let patch = objective.ground.patch_under(&frame.pose);
+    let step = objective.beams.len().div_ceil(config.swarm_beams).max(1);
+    let beams: Vec<Beam> = objective.beams.iter().step_by(step).copied().collect();
+    let coarse = FrameObjective {
+        beams: &beams,
+        ..*objective
+    };
     let batch = |positions: &[Vec<f64>]| {
         let poses: Vec<Pose2> = positions.iter().map(|p| pose_of(p)).collect();
-        objective.costs(&poses, patch.as_ref())
+        coarse.costs(&poses, patch.as_ref())
     };
     let minimum = minimize(&dimensions, &config.swarm, batch, rng)?;
-    frame.rays += minimum.evaluations * objective.beams.len();
     let pose = pose_of(&minimum.position);
-    if let Some(lifted) = objective.lift(&pose, patch.as_ref())
-        && minimum.value < frame.cost_after_m
-    {
+    frame.rays += minimum.evaluations * beams.len() + objective.beams.len();
+    let Some(lifted) = objective.lift(&pose, patch.as_ref()) else {
+        return Ok(());
+    };
+    let cost_m = objective.costs_in_space(&[lifted])?[0];
+    if cost_m < frame.cost_after_m {
         frame.pose = pose;
         frame.lifted = lifted;
-        frame.cost_after_m = minimum.value;
+        frame.cost_after_m = cost_m;
     }
     Ok(())
 }
@@ -221,7 +242,6 @@ mod tests {
     use rand::{SeedableRng, rngs::StdRng};
 
     use super::*;
-    use crate::lidar::Beam;
     use crate::rendering::test_world::TestWorld;
 
     fn refine(method: Method, off: &Pose2, seed: u64) -> (RefinedFrame, Pose2) {

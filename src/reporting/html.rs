@@ -19,9 +19,12 @@ pub fn table(table: &Table) -> String {
     let head: String = table
         .columns
         .iter()
-        .map(|column| {
+        .enumerate()
+        .map(|(index, column)| {
+            let has_numbers = table.rows.iter().any(|row| row[index].number().is_some());
+            let class = if has_numbers { " class=\"number\"" } else { "" };
             format!(
-                "<th scope=\"col\" title=\"{}\"><button type=\"button\">{}</button></th>",
+                "<th scope=\"col\"{class} title=\"{}\"><button type=\"button\">{}</button></th>",
                 escaped(&column.definition),
                 escaped(&column.head())
             )

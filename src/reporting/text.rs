@@ -96,12 +96,15 @@ mod tests {
     fn numbers_stand_below_each_other_and_their_scatter_below_them() {
         let text = table(&example());
         let lines: Vec<&str> = text.lines().collect();
-        let place = |line: usize, word: &str| lines[line].find(word).unwrap() + word.len();
+        let place = |line: usize, word: &str| {
+            let start = lines[line].find(word);
+            start.unwrap_or_else(|| panic!("{word} is not in line {line}:\n{text}")) + word.len()
+        };
         assert!(lines[0].starts_with("Table 1"));
-        // Two lines of head, a rule, then two lines per row with scatter.
-        assert_eq!(place(3, "[m]"), place(5, "0.0230"), "{text}");
-        assert_eq!(lines[6].trim(), "±0.0020");
-        assert_eq!(place(5, "0.0230"), place(7, "0.5000"));
+        // Three lines of head, a rule, then two lines per row with scatter.
+        assert_eq!(place(4, "[m]"), place(6, "0.0230"), "{text}");
+        assert!(lines[7].trim().starts_with("±0.0020"), "{text}");
+        assert_eq!(place(6, "0.0230"), place(8, "0.5000"));
     }
 
     #[test]

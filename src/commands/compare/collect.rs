@@ -19,7 +19,7 @@ use crate::reporting::{Block, Page, Section, csv, markdown, text};
 struct Collected<'a> {
     program: String,
     tables: &'a [Table],
-    runs: &'a [RunRecord],
+    runs: &'a [&'a RunRecord],
 }
 
 /// Writes what the runs say that are there; returns the tables for standard output.
@@ -48,7 +48,8 @@ pub fn collect(config: &ComparisonConfig, runs: &[PlannedRun], layout: &Layout) 
         tables.insert(tables.len() - 1, particle_table(&sweep));
     }
     write_tables(&tables, layout)?;
-    let all: Vec<RunRecord> = comparison.records.iter().cloned().collect::<Vec<_>>();
+    let swept_records = swept.iter().map(|(_, record)| record);
+    let all: Vec<&RunRecord> = comparison.records.iter().chain(swept_records).collect();
     output::write_json(
         &layout.root.join("comparison.json"),
         &Collected {

@@ -1,6 +1,7 @@
 //! One run: its drives, its map, its localization, and what it does with them.
 
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::fs;
 use std::path::Path;
 use std::time::Instant;
@@ -12,19 +13,17 @@ use super::fingerprint::{self, Fingerprints, Keys};
 use super::plan::PlannedRun;
 use super::shared::{self, Shared};
 use crate::commands::interrupt::Interrupted;
-use crate::commands::run_output::RunFiles;
+use crate::commands::run_output::{self, RunFiles};
 use crate::commands::run_page::RunPage;
 use crate::commands::{Context, build_map, localize, refine, simulate};
 use crate::config::{self, BuildMapConfig, LocalizationConfig, RefinementConfig};
 use crate::evaluation::comparison::{Outcome, RunRecord};
-use crate::evaluation::{
-    Judged, LocalizationResults, MetricsConfig, RangeMclRules, Report, TrajectoryMetrics,
-    TrajectoryReport,
-};
+use crate::evaluation::{Judged, LocalizationResults, RangeMclRules, Report, TrajectoryReport};
 
 /// What a run has from its configuration, the same in every run.
 const MAP_FILE: &str = "map.ply";
 const RESULT_FILE: &str = "localization.npz";
+const LOG_FILE: &str = "log.txt";
 
 /// The record of a run; `None` where there is none, or one of another version of the program.
 pub fn read_record(folder: &Path) -> Result<Option<RunRecord>> {
@@ -53,7 +52,7 @@ pub fn execute(
     let keys = fingerprints.of(run)?;
     let folder = layout.run(&run.id);
     fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
-    let _writing = context.log.write_to(&folder.join("log.txt"))?;
+    let _writing = context.log.write_to(&folder.join(LOG_FILE))?;
     let mut stages = Stages::default();
     let outcome = match stages.run(run, layout, &keys, context) {
         Ok(judgement) => Outcome::Finished(Box::new(judgement)),
@@ -116,11 +115,13 @@ impl Stages {
         simulate_drives(run, layout, context).context("while simulating")?;
         let map = shared_map(run, layout, keys, context).context("while building the map")?;
         self.note("1 build-map", map.seconds);
+        context.log.clone().repeat(&map.folder.join(LOG_FILE))?;
         copy_file(&map.folder.join("map.yml"), &folder.join("build_map.yml"))?;
 
         let found =
             shared_localization(run, layout, keys, &map, context).context("while localizing")?;
         self.note("2 localize", found.seconds);
+        context.log.clone().repeat(&found.folder.join(LOG_FILE))?;
         copy_all(&found.folder, &folder)?;
         let result = folder.join(RESULT_FILE);
         self.report = Some(Report::read_json(&folder.join("report.json"))?);
@@ -158,6 +159,11 @@ fn simulate_drives(run: &PlannedRun, layout: &Layout, context: &Context) -> Resu
 
 fn shared_map(run: &PlannedRun, layout: &Layout, keys: &Keys, context: &Context) -> Result<Shared> {
     shared::get(&layout.shared("maps"), &keys.map, |folder| {
+        let _writing = context.log.write_to(&folder.join(LOG_FILE))?;
+        tracing::info!(
+            "building the map of {}",
+            run.build_map.scan_folder.display()
+        );
         let config = BuildMapConfig {
             mesh_file: folder.join(MAP_FILE),
             force: true,
@@ -178,6 +184,7 @@ fn shared_localization(
         &layout.shared("localizations"),
         &keys.localization,
         |folder| {
+            let _writing = context.log.write_to(&folder.join(LOG_FILE))?;
             let config = LocalizationConfig {
                 map_file: map.folder.join(MAP_FILE),
                 result_path: folder.join(RESULT_FILE),
@@ -215,10 +222,7 @@ fn judgement(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
         times_s: results.times_s.as_deref(),
         runtimes_s: runtimes_s.as_deref(),
     };
-    Ok(TrajectoryReport {
-        range_mcl: RangeMclRules::default().judge(poses, truth),
-        metrics: TrajectoryMetrics::of(&judged, &MetricsConfig::default())?,
-    })
+    run_output::judge_one(&judged, &RangeMclRules::default())
 }
 
 /// What the run was done on, for its record.
@@ -250,12 +254,13 @@ fn processor() -> String {
     name.unwrap_or_else(|| "unknown".to_owned())
 }
 
-/// Copies a folder with what is in it, but for the mark that it is finished.
+/// Copies a folder with what is in it, but for the mark that it is finished and its log.
 fn copy_all(from: &Path, to: &Path) -> Result<()> {
     fs::create_dir_all(to).with_context(|| format!("cannot create {}", to.display()))?;
     for entry in fs::read_dir(from).with_context(|| format!("cannot read {}", from.display()))? {
         let path = entry?.path();
-        let Some(name) = path.file_name().filter(|name| *name != shared::MARK) else {
+        let is_own = |name: &&OsStr| **name != *shared::MARK && **name != *LOG_FILE;
+        let Some(name) = path.file_name().filter(is_own) else {
             continue;
         };
         if path.is_dir() {

@@ -6,7 +6,7 @@ use anyhow::{Context as _, Result};
 
 use super::Layout;
 use crate::evaluation::comparison::tables::rate;
-use crate::evaluation::comparison::{Comparison, RunRecord};
+use crate::evaluation::comparison::{Comparison, RunRecord, SuccessRate};
 use crate::evaluation::{LocalizationResults, planar_errors};
 use crate::plotting::color::SERIES;
 use crate::plotting::{LineChart, Mark, Panel, Series};
@@ -42,7 +42,7 @@ pub fn draw(
     };
     save(
         "runs.png",
-        "Average positional error of every run: a dot per seed",
+        "Average positional error of every run over its seed",
         dots(comparison),
     )?;
     save(
@@ -58,35 +58,27 @@ pub fn draw(
     Ok(drawn)
 }
 
-/// A panel per sequence, a column of dots per configuration.
+/// A panel per sequence, a dot per run over its seed.
 fn dots(comparison: &Comparison) -> LineChart {
     let panel = |sequence: &String| {
-        let series = comparison
-            .variants
-            .iter()
-            .enumerate()
-            .map(|(index, variant)| {
-                let errors = comparison.records.iter().filter_map(|record| {
-                    let is_own =
-                        record.id.sequence == *sequence && record.id.configuration == variant.name;
-                    let judgement = record.judgement().filter(|_| is_own)?;
-                    Some(judgement.metrics.position_m.mean)
-                });
-                let errors: Vec<f64> = errors.collect();
-                // Side by side, so that equal runs do not hide each other.
-                let place =
-                    |seed: usize| index as f64 + 0.06 * (seed as f64 - 0.5 * errors.len() as f64);
-                Series {
-                    name: variant.name.clone(),
-                    color: SERIES[index % SERIES.len()],
-                    mark: Mark::Dots,
-                    points: errors
-                        .iter()
-                        .enumerate()
-                        .map(|(seed, e)| (place(seed), *e))
-                        .collect(),
-                }
+        let variants = comparison.variants.iter().enumerate();
+        let series = variants.map(|(index, variant)| {
+            // Side by side, so that equal runs do not hide each other.
+            let aside = 0.05 * (index as f64 - 0.5 * (comparison.variants.len() - 1) as f64);
+            let points = comparison.records.iter().filter_map(|record| {
+                let is_own =
+                    record.id.sequence == *sequence && record.id.configuration == variant.name;
+                let judgement = record.judgement().filter(|_| is_own)?;
+                let seed = record.id.seed as f64 + aside;
+                Some((seed, judgement.metrics.position_m.mean))
             });
+            Series {
+                name: variant.name.clone(),
+                color: SERIES[index % SERIES.len()],
+                mark: Mark::Dots,
+                points: points.collect(),
+            }
+        });
         Panel {
             y_name: format!("{sequence}: error [m]"),
             series: series.filter(|series| !series.points.is_empty()).collect(),
@@ -96,7 +88,7 @@ fn dots(comparison: &Comparison) -> LineChart {
     };
     LineChart {
         title: "Average positional error of every run".to_owned(),
-        x_name: "configuration".to_owned(),
+        x_name: "seed".to_owned(),
         panels: filled(comparison.sequences.iter().map(panel)),
         marks: Vec::new(),
     }
@@ -158,24 +150,23 @@ fn success(sweep: &[(usize, Vec<&RunRecord>)]) -> LineChart {
         .filter_map(|(count, records)| Some((*count, rate(records)?)))
         .collect();
     let place = |count: usize| (count as f64).log10();
-    let line =
-        |name: &str,
-         color,
-         mark,
-         number: fn(&crate::evaluation::comparison::SuccessRate) -> f64| Series {
-            name: name.to_owned(),
-            color,
-            mark,
-            points: rates
-                .iter()
-                .map(|(count, rate)| (place(*count), 100.0 * number(rate)))
-                .collect(),
-        };
+    let line = |name: &str, color, mark, number: fn(&SuccessRate) -> f64| Series {
+        name: name.to_owned(),
+        color,
+        mark,
+        points: rates
+            .iter()
+            .map(|(count, rate)| (place(*count), 100.0 * number(rate)))
+            .collect(),
+    };
     let series = vec![
         line("success", SERIES[0], Mark::Line, |rate| rate.rate),
-        line("", SERIES[0], Mark::Dots, |rate| rate.rate),
-        line("95 % interval", SERIES[1], Mark::Dashes, |rate| rate.low),
-        line("", SERIES[1], Mark::Dashes, |rate| rate.high),
+        line("95 % interval, low", SERIES[1], Mark::Dashes, |rate| {
+            rate.low
+        }),
+        line("95 % interval, high", SERIES[2], Mark::Dashes, |rate| {
+            rate.high
+        }),
     ];
     LineChart {
         title: "Success against the number of particles".to_owned(),

@@ -43,7 +43,7 @@ pub struct Comparison {
     pub records: Vec<RunRecord>,
 }
 
-const SPREAD: &str = "Mean over sequences ± standard deviation over seeds ± standard deviation over sequences; frames before convergence (the first ten) do not count.";
+const SPREAD: &str = "Mean over sequences ± standard deviation over seeds ± standard deviation over sequences; the first ten frames (half of a run that is shorter than twenty) do not count.";
 
 impl Comparison {
     /// All tables, most important first.
@@ -65,9 +65,9 @@ impl Comparison {
             "{SPREAD} The last column repeats what the report says of its own, unpublished runs; nothing of it was measured here."
         );
         table.columns.push(Column {
-            name: "claimed by the report: average positional error".to_owned(),
+            name: "claimed by the report".to_owned(),
             unit: "m".to_owned(),
-            definition: "unverified; on which sequence and from how many runs is not said"
+            definition: "average positional error, unverified; on which sequence and from how many runs is not said"
                 .to_owned(),
         });
         for (row, variant) in table.rows.iter_mut().zip(&self.variants) {

@@ -95,7 +95,7 @@ fn the_mean_of_a_configuration_is_over_sequences_and_its_claim_stands_beside() {
         0.2 / 2_f64.sqrt(),
         epsilon = 1e-9
     );
-    let claim = "claimed by the report: average positional error";
+    let claim = "claimed by the report";
     assert_eq!(cell(&table, 0, claim), &Cell::Number(1.45));
     assert_eq!(cell(&table, 1, claim), &Cell::Absent);
     assert_eq!(cell(&table, 0, "runs"), &Cell::from("4 of 4"));

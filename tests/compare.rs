@@ -1,0 +1,268 @@
+//! A comparison from outside, on a street of a few scans: what is finished is kept, what is shared
+//! is made once, and the tables say what the runs say.
+
+#![allow(clippy::unwrap_used, reason = "a failing test may panic")]
+
+mod common;
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use common::{Fpmcl, Recording, fpmcl};
+use serde_json::Value;
+
+const FRAMES: usize = 12;
+
+const COMPARISON: &str = "\
+output_folder: out
+seeds: [1, 2]
+base:
+  build_map: {depth: 6, voxel_size: 0.2, displacement_threshold_m: 0}
+  localization: {numParticles: 50, num_reduced: 20}
+  refinement: {refinement: {method: swarm, swarm: {iterations: 3}}}
+sequences:
+- name: street
+  build_map:
+    scan_folder: velodyne
+    pose_file: poses.txt
+    calib_file: calib.txt
+    range_image: {height: 32, width: 360, min_range: 1}
+  localization:
+    scan_folder: velodyne
+    pose_file: poses.txt
+    calib_file: calib.txt
+    range_image: {height: 32, width: 360, min_range: 1}
+- {name: elsewhere, optional: True, build_map: {scan_folder: nowhere}}
+configurations:
+- {name: PCA-MCL, claimed_m: 1.45, build_map: {ground_method: pca}}
+- {name: Fuzzy-MCL, claimed_m: 1.02}
+- {name: Fuzzy-PSO-MCL, claimed_m: 0.71, refine: True}
+particles: {configuration: Fuzzy-MCL, sequences: [street], counts: [10, 40], seeds: [1]}
+";
+
+fn recording() -> Recording {
+    let recording = Recording::street(FRAMES);
+    recording.write("comparison.yml", COMPARISON);
+    recording
+}
+
+fn compare(recording: &Recording) -> Fpmcl {
+    fpmcl("compare")
+        .in_folder(recording.folder())
+        .with("comparison.yml")
+        .with("--backend=cpu")
+}
+
+fn json(path: &Path) -> Value {
+    serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
+}
+
+/// The folders with a key as their name, that is, without the locks.
+fn shared(recording: &Recording, what: &str) -> Vec<PathBuf> {
+    let entries = fs::read_dir(recording.path(&format!("out/shared/{what}"))).unwrap();
+    let paths = entries.map(|entry| entry.unwrap().path());
+    paths.filter(|path| path.is_dir()).collect()
+}
+
+/// The record of each run with its bytes.
+fn records(recording: &Recording) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut found = Vec::new();
+    for configuration in fs::read_dir(recording.path("out/runs/street")).unwrap() {
+        for seed in fs::read_dir(configuration.unwrap().path()).unwrap() {
+            let path = seed.unwrap().path().join("run.json");
+            if path.exists() {
+                let bytes = fs::read(&path).unwrap();
+                found.push((path, bytes));
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+#[test]
+fn a_comparison_is_done_once_and_goes_on_where_it_was() {
+    let recording = recording();
+    let job = compare(&recording).with("--job=street/Fuzzy-PSO-MCL/2");
+    let said = job.succeeds().stdout;
+    assert!(said.contains("average positional error"), "{said}");
+    let first = records(&recording);
+    assert_eq!(first.len(), 1);
+    let collected = compare(&recording).with("--collect").succeeds().stdout;
+    assert!(collected.contains("1 of 2"), "{collected}");
+
+    let said = compare(&recording).succeeds();
+    let all = records(&recording);
+    assert_eq!(all.len(), 3 * 2 + 2);
+    assert!(all.contains(&first[0]), "a finished run was done again");
+    assert!(
+        said.stderr.contains("elsewhere is left out"),
+        "{}",
+        said.stderr
+    );
+    // Two ways to find the ground; two seeds in each map, and two numbers of particles.
+    assert_eq!(shared(&recording, "maps").len(), 2);
+    assert_eq!(shared(&recording, "localizations").len(), 2 * 2 + 2);
+
+    // As after a crash: a run without its record, and a map that was not finished.
+    fs::remove_file(&all[0].0).unwrap();
+    fs::remove_file(shared(&recording, "maps")[0].join("finished.json")).unwrap();
+    compare(&recording).succeeds();
+    let again = records(&recording);
+    assert_eq!(again.len(), all.len());
+    assert_eq!(again[1..], all[1..], "finished runs were done again");
+
+    the_tables_say_what_the_runs_say(&recording);
+    every_run_can_be_repeated(&recording);
+    the_pages_need_nothing_else(&recording);
+
+    // Another configuration is another run, and tables do not mix the two.
+    let other = compare(&recording)
+        .set("seeds", "[1]")
+        .set("base.localization.numParticles", "60");
+    other
+        .with("--collect")
+        .fails_saying(&["no run is finished"]);
+}
+
+fn the_tables_say_what_the_runs_say(recording: &Recording) {
+    let comparison = json(&recording.path("out/comparison.json"));
+    let table = &comparison["tables"][0];
+    let column = |name: &str| {
+        let columns = table["columns"].as_array().unwrap();
+        columns
+            .iter()
+            .position(|column| column["name"] == name)
+            .unwrap()
+    };
+    let (error, claim) = (
+        column("average positional error"),
+        column("claimed by the report"),
+    );
+    let name = column("configuration");
+    for (row, claimed_m) in table["rows"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .zip([1.45, 1.02, 0.71])
+    {
+        let configuration = row[name]["text"].as_str().unwrap();
+        let of_runs: Vec<f64> = [1, 2]
+            .map(|seed| {
+                let folder = format!("out/runs/street/{configuration}/{seed}");
+                let record = json(&recording.path(&format!("{folder}/run.json")));
+                let pointer = "/outcome/finished/metrics/position_m/mean";
+                let told = record.pointer(pointer).unwrap().as_f64().unwrap();
+                let report = json(&recording.path(&format!("{folder}/report.json")));
+                let who = if configuration.contains("PSO") {
+                    "refined"
+                } else {
+                    "mcl"
+                };
+                let pointer = format!("/{who}/metrics/position_m/mean");
+                assert_eq!(report.pointer(&pointer).unwrap().as_f64(), Some(told));
+                told
+            })
+            .into();
+        let mean = row[error]["estimate"]["mean"].as_f64().unwrap();
+        assert!((mean - 0.5 * (of_runs[0] + of_runs[1])).abs() < 1e-12);
+        assert_eq!(row[claim]["number"].as_f64(), Some(claimed_m));
+    }
+    for name in [
+        "table_1",
+        "table_2",
+        "differences",
+        "by_sequence",
+        "particles",
+        "runs",
+    ] {
+        let text = fs::read_to_string(recording.path(&format!("out/{name}.csv"))).unwrap();
+        assert!(text.lines().count() > 1, "{name}");
+    }
+    let markdown = fs::read_to_string(recording.path("out/tables.md")).unwrap();
+    assert!(markdown.contains("claimed by the report [m]"), "{markdown}");
+}
+
+/// The effective configuration of a run gives the run's trajectory again.
+fn every_run_can_be_repeated(recording: &Recording) {
+    let folder = "out/runs/street/Fuzzy-MCL/2";
+    let again = fpmcl("localize")
+        .in_folder(recording.folder())
+        .with(format!("{folder}/localization.yml"))
+        .with("--backend=cpu")
+        .set("result_path", "again/localization.npz");
+    again.succeeds();
+    let name = "mcl_kitti.txt";
+    let whole = recording.bytes(&format!("{folder}/{name}"));
+    assert!(whole == recording.bytes(&format!("again/{name}")));
+    let log = String::from_utf8(recording.bytes(&format!("{folder}/log.txt"))).unwrap();
+    assert!(log.contains("triangles"), "{log}");
+}
+
+fn the_pages_need_nothing_else(recording: &Recording) {
+    let of_run = "out/runs/street/Fuzzy-PSO-MCL/1/report.html";
+    for (page, pictures) in [("out/report.html", 3), (of_run, 6)] {
+        let html = String::from_utf8(recording.bytes(page)).unwrap();
+        for word in ["src=\"http", "href=\"http", "<link", "@import"] {
+            assert!(!html.contains(word), "{page} has {word}");
+        }
+        let found = html.matches("src=\"data:image/png;base64,iVBOR").count();
+        assert_eq!(found, pictures, "{page}");
+    }
+    let html = String::from_utf8(recording.bytes("out/report.html")).unwrap();
+    let links: Vec<&str> = html.split("href=\"runs/").skip(1).collect();
+    assert_eq!(links.len(), 6);
+    for link in links {
+        let (path, _) = link.split_once('"').unwrap();
+        assert!(
+            recording.path(&format!("out/runs/{path}")).exists(),
+            "{path}"
+        );
+    }
+}
+
+#[test]
+fn every_run_is_a_job_of_its_own() {
+    let recording = recording();
+    let listed = compare(&recording)
+        .set("seeds", "[1, 5]")
+        .with("--list-jobs")
+        .succeeds()
+        .stdout;
+    let jobs: Vec<&str> = listed.lines().collect();
+    assert_eq!(jobs.len(), 3 * 2 + 2);
+    assert_eq!(jobs.iter().collect::<BTreeSet<_>>().len(), jobs.len());
+    for job in &jobs {
+        assert!(
+            job.contains(" compare comparison.yml --set 'seeds=[1, 5]'"),
+            "{job}"
+        );
+        assert!(job.contains(" --backend=cpu --job street/"), "{job}");
+    }
+    assert!(!recording.path("out").exists(), "listing does nothing");
+}
+
+#[test]
+fn what_cannot_be_is_told_before_any_work() {
+    let recording = recording();
+    let told = |call: Fpmcl, parts: &[&str]| {
+        call.fails_saying(parts);
+    };
+    told(
+        compare(&recording).with("--job=street/Fuzzy/1"),
+        &["there is no run street/Fuzzy/1", "--list-jobs"],
+    );
+    told(
+        compare(&recording).with("--collect"),
+        &["no run is finished below out"],
+    );
+    recording.write(
+        "comparison.yml",
+        &COMPARISON.replace("ground_method: pca", "ground_method: pcb"),
+    );
+    told(compare(&recording), &["PCA-MCL", "ground_method", "pcb"]);
+    compare(&recording)
+        .with("--job=street")
+        .misuse_saying(&["SEQUENCE/CONFIGURATION/SEED"]);
+}
