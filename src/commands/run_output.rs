@@ -15,11 +15,12 @@ use crate::geometry::{Pose2, Pose3, StampedPose, Trajectory, TriangleMesh};
 use crate::kitti::Sequence;
 use crate::kitti::poses::{write_kitti, write_tum};
 use crate::lidar::RangeImage;
+use crate::localization::likelihood::{Direction, width_at_half};
 use crate::localization::{FrameEstimate, ParticleSet};
-use crate::plotting::color::{MCL, REFINED};
+use crate::plotting::color::{MCL, REFINED, Rgb};
 use crate::plotting::{
-    Animation, ErrorPlot, LocalizationPicture, MapImage, MapPlot, Path2, PathPlot, RangeImageStrip,
-    RuntimePlot,
+    Animation, ErrorPlot, LineChart, LocalizationPicture, MapImage, MapPlot, Panel, Path2,
+    PathPlot, RangeImageStrip, RuntimePlot, Series,
 };
 
 /// Cells along the longer side of the map behind a picture.
@@ -366,6 +367,46 @@ pub fn draw_range_images(
         difference_limit_m: 1.0,
     }
     .save(&files.plot("range_images.png")?)?;
+    Ok(())
+}
+
+/// A named line with its colour: (offset, likelihood).
+pub type NamedProfile = (&'static str, Rgb, Vec<(f64, f64)>);
+
+/// Draws likelihoods around the true pose of a frame, a panel per direction.
+pub fn draw_likelihood(
+    files: &RunFiles,
+    frame: usize,
+    profiles: Vec<(Direction, Vec<NamedProfile>)>,
+) -> Result<()> {
+    let panels = profiles.into_iter().map(|(direction, profiles)| {
+        let (name, unit) = match direction {
+            Direction::Along => ("along", "m"),
+            Direction::Across => ("across", "m"),
+            Direction::Heading => ("heading", "deg"),
+        };
+        let series = profiles.into_iter().map(|(model, color, points)| {
+            let width = match width_at_half(&points) {
+                Some(width) => format!("{width:.3} {unit} wide at half height"),
+                None => "wider than shown at half height".to_owned(),
+            };
+            Series::line(&format!("{model}: {width}"), color, points)
+        });
+        Panel {
+            y_name: "likelihood / peak".to_owned(),
+            own_x_name: Some(format!("offset {name} [{unit}]")),
+            series: series.collect(),
+            from_zero: true,
+            clip_outliers: false,
+        }
+    });
+    LineChart {
+        title: format!("Frame {frame}: likelihood around the true pose"),
+        x_name: String::new(),
+        panels: panels.collect(),
+        marks: vec![(0.0, "truth".to_owned())],
+    }
+    .save(&files.plot("likelihood.png")?)?;
     Ok(())
 }
 

@@ -4,7 +4,7 @@
 //! > moves every particle so, [`observation`] weighs them by what the map would look like from
 //! > there, [`resampling`] keeps the good ones, [`convergence`] says when a few are enough and
 //! > [`vigilance`] when none is right; [`panorama`] finds the places to begin (again) at;
-//! > [`localizer`] is the loop.
+//! > [`localizer`] is the loop. [`likelihood`] shows how sharp the peak is.
 //!
 //! Poses are `map_from_lidar` in the plane; the map's ground lifts them into space.
 //!
@@ -23,6 +23,7 @@ pub mod resampling;
 pub mod tempering;
 // Knowing how sure it is.
 pub mod convergence;
+pub mod likelihood;
 pub mod panorama;
 pub mod vigilance;
 // The loop.

@@ -1,0 +1,222 @@
+//! The filter on its way through the frames.
+
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use rand_chacha::ChaCha8Rng;
+
+use super::{FIRST_FRAME_STREAM, INITIALIZATION_STREAM, stream};
+use crate::commands::stages::{LoadedMap, Observer};
+use crate::config::{Initialization, LocalizationConfig, MotionModel};
+use crate::geometry::{Pose2, planar};
+use crate::kitti::{Frame, Sequence};
+use crate::lidar::RangeImage;
+use crate::localization::initialization::{Cells, ROAD_HALF_WIDTH_M, around};
+use crate::localization::motion::VelocityCommand;
+use crate::localization::observation::choose_beams;
+use crate::localization::odometry::Odometry;
+use crate::localization::panorama::PanoramaIndex;
+use crate::localization::{FrameEstimate, Localizer, ParticleSet, State, Surroundings};
+use crate::map::Stance;
+use crate::refinement::{FrameObjective, RefinedFrame, refine_frame};
+
+/// The filter on its way through the frames.
+pub struct Drive<'a> {
+    /// What is wanted.
+    pub config: &'a LocalizationConfig,
+    /// Where.
+    pub map: &'a LoadedMap,
+    /// Makes scans into observations.
+    pub observer: &'a Observer<'a>,
+    /// For a start anywhere.
+    pub panoramas: Option<&'a PanoramaIndex>,
+    /// None before the first frame.
+    pub localizer: Option<Localizer<'a>>,
+    /// The last that was known.
+    pub stance: Stance,
+}
+
+/// What is known of a frame in the end.
+pub struct Said {
+    /// By the filter.
+    pub estimate: FrameEstimate,
+    /// Time that the filter took.
+    pub runtime: Duration,
+    /// With the time that it took.
+    pub refined: Option<(RefinedFrame, Duration)>,
+}
+
+impl<'a> Drive<'a> {
+    /// Localizes a frame and, where that is wanted, refines it.
+    pub fn take_in(&mut self, row: usize, frame: &Frame, moved: Odometry) -> Result<Said> {
+        let points = self.observer.read(frame)?;
+        let started = Instant::now();
+        let image = self.observer.image(points);
+        let known = self.localizer.as_ref().and_then(Localizer::stance);
+        self.stance = known
+            .or_else(|| self.observer.stance(&image))
+            .unwrap_or(self.stance);
+        let mut rng = stream(self.config.seed, FIRST_FRAME_STREAM + row as u64);
+        let stance = self.stance;
+        let localizer = match &mut self.localizer {
+            Some(localizer) => localizer,
+            empty => {
+                let begun = begin(
+                    self.config,
+                    self.map,
+                    frame,
+                    &image,
+                    &stance,
+                    self.panoramas,
+                )?;
+                empty.insert(begun)
+            }
+        };
+        let estimate = localizer.step(moved, &image, &stance, &mut rng)?;
+        let runtime = started.elapsed();
+        let stance = localizer.stance().unwrap_or(stance);
+        let refined = self.refined(&image, &estimate, stance, &mut rng)?;
+        let elapsed = started.elapsed() - runtime;
+        Ok(Said {
+            estimate,
+            runtime,
+            refined: refined.map(|refined| (refined, elapsed)),
+        })
+    }
+
+    /// The frame refined, if it shall be and the filter knows where it is.
+    fn refined(
+        &self,
+        image: &RangeImage,
+        estimate: &FrameEstimate,
+        stance: Stance,
+        rng: &mut ChaCha8Rng,
+    ) -> Result<Option<RefinedFrame>> {
+        if !self.config.refine || estimate.state != State::Tracking {
+            return Ok(None);
+        }
+        let observation = &self.config.observation;
+        let (count, road_share) = (observation.beams, observation.road_share);
+        let beams = choose_beams(image, count, road_share, &stance, rng);
+        let objective = FrameObjective {
+            renderer: &*self.map.renderer,
+            ground: &self.map.ground,
+            beams: &beams,
+            stance,
+            difference: observation.difference(),
+        };
+        let (pose, covariance) = (&estimate.pose, &estimate.covariance);
+        let refined = refine_frame(&objective, pose, covariance, &self.config.refinement, rng)?;
+        Ok(refined)
+    }
+}
+
+/// The filter with its first belief.
+fn begin<'a>(
+    config: &LocalizationConfig,
+    map: &'a LoadedMap,
+    first: &Frame,
+    scan: &RangeImage,
+    stance: &Stance,
+    panoramas: Option<&'a PanoramaIndex>,
+) -> Result<Localizer<'a>> {
+    let surroundings = Surroundings {
+        renderer: &*map.renderer,
+        ground: &map.ground,
+        tiles: &map.grid,
+        panoramas,
+    };
+    let start = initial_particles(config, map, first, scan, stance, panoramas)?;
+    Ok(Localizer::new(config.localizer(), surroundings, start))
+}
+
+/// The motion into a frame, as the motion model wants it.
+pub fn motion(
+    model: MotionModel,
+    increment: Option<Pose2>,
+    sequence: &Sequence,
+    row: usize,
+) -> Odometry {
+    let Some(increment) = increment else {
+        return Odometry::Unknown;
+    };
+    match model {
+        MotionModel::TurnDriveTurn => Odometry::Increment(increment),
+        MotionModel::Velocity => {
+            let frames = &sequence.frames;
+            let before_s = frames[row.saturating_sub(1)].time_s;
+            let seconds = (frames[row].time_s - before_s).max(0.0);
+            let duration = Duration::from_secs_f64(seconds);
+            Odometry::Velocity(VelocityCommand::driving(&increment, duration))
+        }
+    }
+}
+
+/// The panoramas of a global start; none where the start is known.
+pub fn panoramas(config: &LocalizationConfig, map: &LoadedMap) -> Result<Option<PanoramaIndex>> {
+    let panorama = config.panorama_config();
+    let cells = match config.initialization() {
+        Initialization::Tracking => return Ok(None),
+        Initialization::Corridor => {
+            let poses: Vec<Pose2> = map.mapping_poses.iter().map(planar).collect();
+            Cells::along_road(&poses, ROAD_HALF_WIDTH_M, panorama.cell_m)
+        }
+        Initialization::Extent => Cells::over_map(&map.grid, &map.ground, panorama.cell_m),
+    };
+    let started = Instant::now();
+    let surroundings = Surroundings {
+        renderer: &*map.renderer,
+        ground: &map.ground,
+        tiles: &map.grid,
+        panoramas: None,
+    };
+    let index = PanoramaIndex::build(
+        &cells,
+        &surroundings,
+        &config.range_image.model(),
+        Stance::default().height_m,
+        &panorama,
+    )?;
+    tracing::info!(
+        "{} panoramas, {:.1} MB, rendered in {:.1} s",
+        index.len(),
+        index.size_bytes() as f64 / 1e6,
+        started.elapsed().as_secs_f64()
+    );
+    anyhow::ensure!(
+        !index.is_empty(),
+        "no place of the map is fit for a start: it has no ground in {}; check map_pose_file, or build the map again",
+        config.map_file.display()
+    );
+    Ok(Some(index))
+}
+
+fn initial_particles(
+    config: &LocalizationConfig,
+    map: &LoadedMap,
+    first: &Frame,
+    scan: &RangeImage,
+    stance: &Stance,
+    panoramas: Option<&PanoramaIndex>,
+) -> Result<ParticleSet> {
+    let mut rng = stream(config.seed, INITIALIZATION_STREAM);
+    let count = config.num_particles;
+    let poses = match panoramas {
+        None => around(
+            &planar(&first.map_from_lidar),
+            count,
+            &config.start,
+            &mut rng,
+        ),
+        Some(index) => index.sample(scan, stance, count, &mut rng),
+    };
+    anyhow::ensure!(
+        poses
+            .iter()
+            .any(|pose| map.grid.valid_tile_of(pose).is_some()),
+        "the start at frame {} lies outside the map {}; check that map_pose_file and pose_file are given in the same world",
+        first.number,
+        config.map_file.display()
+    );
+    Ok(ParticleSet::uniform(poses))
+}

@@ -1,0 +1,94 @@
+//! What the filter said, frame by frame.
+
+use anyhow::Result;
+
+use super::Run;
+use super::drive::Said;
+use crate::commands::run_output::{self, Movie, RunFiles};
+use crate::commands::stages::LoadedMap;
+use crate::config::LocalizationConfig;
+use crate::evaluation::{LocalizationResults, ParticleLog};
+use crate::geometry::{Pose2, Pose3, planar};
+use crate::kitti::Frame;
+
+/// Collects what the filter says.
+pub struct Recorder {
+    results: LocalizationResults,
+    lifted: Vec<Pose3>,
+    refined: Vec<Pose3>,
+    movie: Option<Movie>,
+}
+
+impl Recorder {
+    pub fn new(config: &LocalizationConfig, map: &LoadedMap, files: &RunFiles) -> Self {
+        let empty = || Some(Vec::new());
+        Self {
+            results: LocalizationResults {
+                particles: ParticleLog::new(config.num_particles),
+                estimates: empty(),
+                ground_truth: empty(),
+                odometry: empty(),
+                covariances: Some(Vec::new()),
+                times_s: Some(Vec::new()),
+                runtimes_s: Some(Vec::new()),
+                states: Some(Vec::new()),
+                refined: config.refine.then(Vec::new),
+                refine_runtimes_s: config.refine.then(Vec::new),
+                ..LocalizationResults::default()
+            },
+            lifted: Vec::new(),
+            refined: Vec::new(),
+            movie: config.visualize.then(|| Movie::begin(files, &map.mesh)),
+        }
+    }
+
+    pub fn record(&mut self, frame: &Frame, increment: Option<Pose2>, said: Said) -> Result<()> {
+        fn push<T>(column: &mut Option<Vec<T>>, value: T) {
+            if let Some(column) = column {
+                column.push(value);
+            }
+        }
+        let Said {
+            estimate,
+            runtime,
+            refined,
+        } = &said;
+        let results = &mut self.results;
+        results.frames.push(frame.number);
+        results
+            .particles
+            .push_frame(run_output::rows_of(&estimate.particles));
+        push(&mut results.estimates, estimate.pose);
+        push(&mut results.ground_truth, planar(&frame.map_from_lidar));
+        push(
+            &mut results.odometry,
+            increment.unwrap_or_else(Pose2::identity),
+        );
+        push(&mut results.covariances, estimate.covariance);
+        push(&mut results.times_s, frame.time_s);
+        push(&mut results.runtimes_s, runtime.as_secs_f64());
+        push(&mut results.states, estimate.state as u8);
+        let (pose, lifted, seconds) = match refined {
+            Some((refined, runtime)) => (refined.pose, refined.lifted, runtime.as_secs_f64()),
+            None => (estimate.pose, estimate.lifted, 0.0),
+        };
+        push(&mut results.refined, pose);
+        push(&mut results.refine_runtimes_s, seconds);
+        self.refined.push(lifted);
+        self.lifted.push(estimate.lifted);
+        if let Some(movie) = &mut self.movie {
+            movie.add(results, estimate)?;
+        }
+        Ok(())
+    }
+
+    pub fn finish(self, failure: Option<anyhow::Error>) -> Run {
+        Run {
+            results: self.results,
+            lifted: self.lifted,
+            refined: self.refined,
+            failure,
+            movie: self.movie,
+        }
+    }
+}
