@@ -13,6 +13,7 @@ mod packet;
 mod scene;
 mod wide;
 
+#[cfg(feature = "gpu")]
 pub(crate) use scene::is_proper;
 pub use scene::{Reach, Scene};
 
