@@ -151,6 +151,12 @@ impl Check for SimulationConfig {
                 value: format!("{length_m:.1} m long"),
                 remedy: format!("at least {least_m} m are needed; add segments"),
             },
+            // Known only when the drive is planned.
+            SimulationError::NowhereToBeSet { frame, .. } => Problem {
+                key: "motion.kidnapped_at_frame".to_owned(),
+                value: frame.to_string(),
+                remedy: error.to_string(),
+            },
         })
     }
 }

@@ -103,6 +103,7 @@ impl SimulationConfig {
             ("scanner.azimuth_steps", scanner.azimuth_steps as f64),
             ("scanner.beams", scanner.beams as f64),
             ("drive", f64::from(self.drive)),
+            ("motion.kidnapped_by_m", self.motion.kidnapped_by_m),
         ];
         let shares = [
             ("street.built_share", self.street.built_share),
@@ -110,6 +111,7 @@ impl SimulationConfig {
             ("scanner.dropout_share", scanner.dropout_share),
         ];
         let not_negative = [
+            ("traffic.lorry_for_s", self.traffic.lorry_for_s),
             ("scanner.range_noise_m", scanner.range_noise_m),
             ("scanner.min_range_m", scanner.min_range_m),
             (
@@ -174,4 +176,12 @@ pub enum SimulationError {
         "the path is {length_m:.1} m long, at least {least_m} m are needed; add segments to `path`, or choose another `path_pose_file`"
     )]
     PathTooShort { length_m: f64, least_m: f64 },
+    #[error(
+        "motion.kidnapped_at_frame: {frame} and motion.kidnapped_by_m: {by_m} lead beyond the drive, whose path is {path_m:.1} m long; the frame must be 2 or greater, and the car must be set where the drive still comes to"
+    )]
+    NowhereToBeSet {
+        frame: usize,
+        by_m: f64,
+        path_m: f64,
+    },
 }

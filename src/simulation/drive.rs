@@ -41,6 +41,11 @@ pub struct MotionConfig {
     pub rolling_deg: f64,
     /// Amplitude of the heaving of the car [m].
     pub heaving_m: f64,
+    /// From this frame on the car is somewhere else, and its odometry did not notice: a trial for
+    /// a localization; null: never.
+    pub kidnapped_at_frame: Option<usize>,
+    /// How far ahead on the path it is set then [m].
+    pub kidnapped_by_m: f64,
 }
 
 impl Default for MotionConfig {
@@ -54,6 +59,8 @@ impl Default for MotionConfig {
             nodding_deg: 0.3,
             rolling_deg: 0.2,
             heaving_m: 0.01,
+            kidnapped_at_frame: None,
+            kidnapped_by_m: 150.0,
         }
     }
 }
@@ -66,6 +73,8 @@ pub struct Drive {
     lane_offset_m: f64,
     /// Station at every scan [m].
     stations_m: Vec<f64>,
+    /// The first frame after the car was set somewhere else.
+    kidnapped_at: Option<usize>,
     phases: [f64; 8],
 }
 
@@ -81,18 +90,27 @@ impl Drive {
     ) -> Self {
         let mut rng = stream(seed, Purpose::Drive, u64::from(drive));
         let phases = std::array::from_fn(|_| rng.random_range(0.0..TAU));
-        let stations_m = match recorded_m {
+        let mut stations_m = match recorded_m {
             Some(recorded_m) => replayed(recorded_m, drive, phases[0]),
             None => cruising(path.length_m(), motion.speed_m_s, phases[0]),
         };
+        let kidnapped_at = motion
+            .kidnapped_at_frame
+            .filter(|&frame| leap(&mut stations_m, frame, motion.kidnapped_by_m));
         let default_m = LANE_OFFSETS_M[(drive.max(1) as usize - 1) % LANE_OFFSETS_M.len()];
         Self {
             path: path.clone(),
             motion: motion.clone(),
             lane_offset_m: motion.lane_offset_m.unwrap_or(default_m),
             stations_m,
+            kidnapped_at,
             phases,
         }
+    }
+
+    /// The first frame after the car was set somewhere else, if it was.
+    pub fn kidnapped_at(&self) -> Option<usize> {
+        self.kidnapped_at
     }
 
     /// Number of scans.
@@ -107,6 +125,15 @@ impl Drive {
 
     /// Station of the car on the path [m]; before the first and after the last scan it stands.
     pub fn station_m(&self, time_s: f64) -> f64 {
+        let index = time_s / SCAN_PERIOD_S;
+        if let Some(leap) = self.kidnapped_at
+            && index > (leap - 1) as f64
+            && index < leap as f64
+        {
+            // It drives on as before until it is taken away.
+            let [before_m, last_m] = [leap - 2, leap - 1].map(|frame| self.stations_m[frame]);
+            return last_m + (index - (leap - 1) as f64) * (last_m - before_m);
+        }
         interpolated(&self.stations_m, time_s / SCAN_PERIOD_S)
     }
 
@@ -160,6 +187,22 @@ fn standing_on(ground: &Ground, position: DVec2, forward: DVec2) -> Pose3 {
         Translation3::new(position.x, position.y, 0.25 * (fl + fr + rl + rr)),
         UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes)),
     )
+}
+
+/// Leaves out what lies `by_m` ahead from `frame` on; `false`, and nothing done, where the path
+/// ends before that or the drive has not begun.
+fn leap(stations_m: &mut Vec<f64>, frame: usize, by_m: f64) -> bool {
+    let Some(&last_m) = frame.checked_sub(1).and_then(|last| stations_m.get(last)) else {
+        return false;
+    };
+    let landing = (frame..stations_m.len()).find(|&later| stations_m[later] >= last_m + by_m);
+    match landing {
+        Some(landing) if frame >= 2 => {
+            stations_m.drain(frame..landing);
+            true
+        }
+        _ => false,
+    }
 }
 
 /// Stations of a car that goes along the whole path, a little faster and slower by turns.

@@ -108,6 +108,13 @@ impl Simulation {
             &config.traffic,
             (config.seed, config.drive),
         );
+        if let (Some(frame), None) = (config.motion.kidnapped_at_frame, drive.kidnapped_at()) {
+            return Err(SimulationError::NowhereToBeSet {
+                frame,
+                by_m: config.motion.kidnapped_by_m,
+                path_m: path.length_m(),
+            });
+        }
         // After the traffic, so that fewer scans are the start of the same drive.
         if let Ok(n_scans) = usize::try_from(config.n_scans) {
             drive.truncate(n_scans);
@@ -150,7 +157,16 @@ impl Simulation {
     /// The poses that odometry reports, in the world frame, starting at the true first pose.
     pub fn odometry(&self) -> Vec<Pose3> {
         let key = (self.config.seed, self.config.drive);
-        drifting_odometry(&self.poses(), &self.config.odometry, key)
+        let mut felt = self.poses();
+        if let Some(leap) = self.drive.kidnapped_at() {
+            // As if it had driven on as before.
+            let step = felt[leap - 2].inverse() * felt[leap - 1];
+            let felt_from_true = felt[leap - 1] * step * felt[leap].inverse();
+            for pose in &mut felt[leap..] {
+                *pose = felt_from_true * *pose;
+            }
+        }
+        drifting_odometry(&felt, &self.config.odometry, key)
     }
 
     /// The traffic at a scan, world frame.

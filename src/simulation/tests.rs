@@ -193,6 +193,78 @@ fn an_empty_street_has_no_moving_points() {
 }
 
 #[test]
+fn a_kidnapped_car_is_elsewhere_and_its_odometry_does_not_know() {
+    let kidnapped_at = |frame| SimulationConfig {
+        motion: MotionConfig {
+            kidnapped_at_frame: frame,
+            kidnapped_by_m: 20.0,
+            ..MotionConfig::default()
+        },
+        odometry: OdometryConfig {
+            scale_error: 0.0,
+            heading_drift_deg_per_m: 0.0,
+            step_noise_m: 0.0,
+            turn_noise_deg: 0.0,
+        },
+        ..small()
+    };
+    let simulation = simulate(&kidnapped_at(Some(10)));
+    let step_m = |poses: &[Pose3], frame: usize| {
+        (poses[frame].translation.vector - poses[frame - 1].translation.vector).norm()
+    };
+    let (poses, felt) = (simulation.poses(), simulation.odometry());
+    assert!(step_m(&poses, 10) > 18.0);
+    for frame in 1..poses.len() {
+        assert!(step_m(&felt, frame) < 1.5, "frame {frame}");
+        if frame != 10 {
+            assert!(step_m(&poses, frame) < 1.5, "frame {frame}");
+        }
+    }
+    // Until then, it is the drive that it is without.
+    let undisturbed = simulate(&kidnapped_at(None)).poses();
+    assert_eq!(poses[..10], undisturbed[..10]);
+    // While the sensor turns, the car is still where it was.
+    let last_s = 9.0 * SCAN_PERIOD_S;
+    let drive = &simulation.drive;
+    assert!(drive.station_m(last_s + 0.09) - drive.station_m(last_s) < 1.5);
+    let beyond = Simulation::new(&kidnapped_at(Some(70)), None);
+    assert!(matches!(
+        beyond,
+        Err(SimulationError::NowhereToBeSet { frame: 70, .. })
+    ));
+}
+
+#[test]
+fn a_lorry_hides_what_is_to_the_left_for_its_time() {
+    let simulation = simulate(&SimulationConfig {
+        traffic: TrafficConfig {
+            lorry_from_s: Some(1.0),
+            lorry_for_s: 2.0,
+            ..TrafficConfig::NONE
+        },
+        ..small()
+    });
+    let share_of_lorry = |frame: usize| {
+        let labelled = simulation.scan(frame);
+        let to_the_left = labelled
+            .scan
+            .points
+            .iter()
+            .zip(&labelled.classes)
+            .filter(|(p, _)| p.y > 0.6 * p.x.abs() && p.z > -0.5);
+        let (all, hidden) = to_the_left.fold((0, 0), |(all, hidden), (_, &class)| {
+            (all + 1, hidden + usize::from(classes::is_moving(class)))
+        });
+        hidden as f64 / all.max(1) as f64
+    };
+    assert_eq!(share_of_lorry(9), 0.0);
+    for frame in [10, 20, 29] {
+        assert!(share_of_lorry(frame) > 0.8, "{}", share_of_lorry(frame));
+    }
+    assert_eq!(share_of_lorry(30), 0.0);
+}
+
+#[test]
 fn the_lidar_hangs_over_the_road_and_leans_with_it() {
     let config = SimulationConfig {
         motion: MotionConfig {

@@ -30,6 +30,11 @@ pub struct TrafficConfig {
     pub cyclists_per_100_m: f64,
     /// Pedestrians per 100 m of path.
     pub pedestrians_per_100_m: f64,
+    /// From this time on a lorry drives close on the left and hides half of the view [s]: a trial
+    /// for a localization; null: never.
+    pub lorry_from_s: Option<f64>,
+    /// For how long [s].
+    pub lorry_for_s: f64,
 }
 
 impl Default for TrafficConfig {
@@ -41,6 +46,8 @@ impl Default for TrafficConfig {
             oncoming_speed_m_s: 9.0,
             cyclists_per_100_m: 1.0,
             pedestrians_per_100_m: 3.0,
+            lorry_from_s: None,
+            lorry_for_s: 3.0,
         }
     }
 }
@@ -53,6 +60,8 @@ impl TrafficConfig {
         oncoming_speed_m_s: 0.0,
         cyclists_per_100_m: 0.0,
         pedestrians_per_100_m: 0.0,
+        lorry_from_s: None,
+        lorry_for_s: 0.0,
     };
 }
 
@@ -67,6 +76,12 @@ enum Track {
         speed_m_s: f64,
         lateral_m: f64,
     },
+    /// Beside the car for some time, to its left.
+    Beside {
+        from_s: f64,
+        until_s: f64,
+        lateral_m: f64,
+    },
     /// On the pavement of a side, beyond the kerb.
     Pavement {
         start_m: f64,
@@ -75,6 +90,15 @@ enum Track {
         kerb_m: f64,
     },
 }
+
+/// Hides what is left of the car up to 75 degrees from its side.
+const LORRY: Vehicle = Vehicle::Van {
+    length_m: 17.0,
+    height_m: 4.0,
+    reflectance: 0.6,
+};
+/// Where it drives, from the path [m].
+const LORRY_LATERAL_M: f64 = 3.4;
 
 /// Everything that moves during a drive.
 #[derive(Clone, Debug)]
@@ -107,6 +131,14 @@ impl Traffic {
                 gap_m: rng.random_range(8.0..14.0),
             };
             movers.push((vehicle, track));
+        }
+        if let Some(from_s) = config.lorry_from_s {
+            let track = Track::Beside {
+                from_s,
+                until_s: from_s + config.lorry_for_s,
+                lateral_m: LORRY_LATERAL_M,
+            };
+            movers.push((LORRY, track));
         }
         if config.oncoming_spacing_m > 0.0 {
             let mut start_m = rng.random_range(0.2..1.0) * config.oncoming_spacing_m;
@@ -208,6 +240,14 @@ impl Traffic {
     ) -> Option<(DVec2, DVec2)> {
         let (station_m, sense) = match *track {
             Track::Ahead { ahead_s, gap_m } => (drive.station_m(time_s + ahead_s) + gap_m, 1.0),
+            Track::Beside {
+                from_s, until_s, ..
+            } => {
+                if !(from_s..until_s).contains(&time_s) {
+                    return None;
+                }
+                (drive.station_m(time_s), 1.0)
+            }
             Track::Lane {
                 start_m, speed_m_s, ..
             }
@@ -222,7 +262,9 @@ impl Traffic {
         let point = self.path.at(station_m);
         let position = match *track {
             Track::Ahead { .. } => point.position,
-            Track::Lane { lateral_m, .. } => point.beside(lateral_m),
+            Track::Lane { lateral_m, .. } | Track::Beside { lateral_m, .. } => {
+                point.beside(lateral_m)
+            }
             Track::Pavement { side, kerb_m, .. } => {
                 self.on_pavement(ground, station_m, side, kerb_m)?
             }
