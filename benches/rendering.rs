@@ -5,41 +5,83 @@
 //! cargo bench --bench rendering
 //! ```
 //!
-//! Beside Embree, on the same rays: with `FPMCL_BENCH_PLY=street.ply` the street is written to a
-//! file first, poses are at `on_the_road(0.1 + 0.1 i, 0.7 i - 2)` for i from 0 to 7 as in
-//! [`poses`], and in Python, with Open3D, with `directions` from the pixel centres of the default
-//! `LidarModel`,
+//! Beside Embree, on the same mesh and the same rays: with `FPMCL_BENCH_DIR` set the bench writes
+//! them there first, and Open3D casts them,
 //!
 //! ```text
-//! scene = open3d.t.geometry.RaycastingScene(nthreads=1)
-//! scene.add_triangles(open3d.t.io.read_triangle_mesh("street.ply"))
-//! rays = [numpy.hstack([numpy.tile(origin, (len(directions), 1)), directions]) for origin in origins]
-//! [scene.cast_rays(open3d.core.Tensor(r.astype("float32")), nthreads=1) for r in rays]   # time this
+//! FPMCL_BENCH_DIR=/tmp/rays cargo bench --bench rendering -- images
+//! python benches/embree.py /tmp/rays
 //! ```
 //!
-//! run in turns, A B A B, on an otherwise idle machine.
+//! run in turns, A B A B, on an otherwise idle machine. Embree is given the rays in the order of
+//! the beams, and finds the nearest surface of each; comparing needs less, and takes it.
 
 mod street;
 
 use std::io::Write as _;
+use std::path::Path;
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
-use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
+use fpmcl::geometry::{Pose3, Rigid3f, TriangleMesh, Vec3};
 use fpmcl::lidar::{Beam, LidarModel};
 use fpmcl::raycasting::Scene;
 use fpmcl::rendering::{CpuRenderer, RangeDifference, RangeRenderer as _};
+use ndarray::Array2;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
 const SEED: u64 = 7;
 const THREADS: [usize; 2] = [1, 2];
 
-fn main() -> std::io::Result<()> {
-    if let Some(path) = std::env::var_os("FPMCL_BENCH_PLY") {
-        std::fs::write(path, ply(&street::street(SEED))?)?;
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    if let Some(folder) = std::env::var_os("FPMCL_BENCH_DIR") {
+        write_rays(Path::new(&folder))?;
     }
     divan::main();
     Ok(())
+}
+
+/// The street and the rays of the benches, an origin and a direction each, for another ray caster.
+fn write_rays(folder: &Path) -> Result<(), Box<dyn std::error::Error>> {
+    let renderer = renderer();
+    std::fs::create_dir_all(folder)?;
+    std::fs::write(folder.join("street.ply"), ply(&street::street(SEED))?)?;
+    let pixels = LidarModel::default().directions();
+    let few = directions_of(&beams(&renderer, truth(), 500));
+    let many = directions_of(&beams(&renderer, truth(), 3600));
+    for (name, poses, directions) in [
+        ("images", poses(), &pixels),
+        ("compare_100_close_poses_3600_beams", close_poses(), &many),
+        ("compare_100_poses_3600_beams", tracked_poses(), &many),
+        ("compare_10000_near_poses_500_beams", near_poses(), &few),
+        ("compare_10000_poses_500_beams", all_poses(), &few),
+    ] {
+        let rays = rays(&poses, directions);
+        ndarray_npy::write_npy(folder.join(format!("{name}.npy")), &rays)?;
+    }
+    Ok(())
+}
+
+fn directions_of(beams: &[Beam]) -> Vec<Vec3> {
+    beams.iter().map(|beam| beam.direction).collect()
+}
+
+/// A row per ray, pose by pose: origin, then unit direction.
+fn rays(poses: &[Pose3], directions: &[Vec3]) -> Array2<f32> {
+    let mut rays = Array2::zeros((poses.len() * directions.len(), 6));
+    let mut rows = rays.rows_mut().into_iter();
+    for pose in poses {
+        let map_from_lidar = Rigid3f::from(pose);
+        let origin = pose.translation.vector.cast::<f32>();
+        for (direction, mut row) in directions.iter().zip(rows.by_ref()) {
+            let direction = map_from_lidar.rotate(*direction);
+            for axis in 0..3 {
+                row[axis] = origin[axis];
+                row[axis + 3] = direction[axis];
+            }
+        }
+    }
+    rays
 }
 
 /// Whole images from eight poses.
@@ -70,25 +112,25 @@ fn strided_images(bencher: Bencher, threads: usize) {
 /// A frame of tracking: poses within centimetres of the truth.
 #[divan::bench(args = THREADS, sample_count = 10)]
 fn compare_100_close_poses_3600_beams(bencher: Bencher, threads: usize) {
-    compare(bencher, threads, &around(100, 0.1, 0.2, 0.03), 3600);
+    compare(bencher, threads, &close_poses(), 3600);
 }
 
 /// Poses within a metre of the truth.
 #[divan::bench(args = THREADS, sample_count = 10)]
 fn compare_100_poses_3600_beams(bencher: Bencher, threads: usize) {
-    compare(bencher, threads, &around(100, 1.0, 2.0, 1.0), 3600);
+    compare(bencher, threads, &tracked_poses(), 3600);
 }
 
 /// A start whose place is known to a few metres.
 #[divan::bench(args = THREADS, sample_count = 3)]
 fn compare_10000_near_poses_500_beams(bencher: Bencher, threads: usize) {
-    compare(bencher, threads, &around(10_000, 5.0, 10.0, 1.0), 500);
+    compare(bencher, threads, &near_poses(), 500);
 }
 
 /// The first frame of a global start: poses over the whole street.
 #[divan::bench(args = THREADS, sample_count = 3)]
 fn compare_10000_poses_500_beams(bencher: Bencher, threads: usize) {
-    compare(bencher, threads, &around(10_000, 100.0, 2.0, 1.0), 500);
+    compare(bencher, threads, &all_poses(), 500);
 }
 
 #[divan::bench(args = THREADS, sample_count = 3)]
@@ -102,8 +144,7 @@ fn build(bencher: Bencher, threads: usize) {
 
 fn compare(bencher: Bencher, threads: usize, poses: &[Pose3], count: usize) {
     let renderer = renderer();
-    let truth = street::on_the_road(0.5, 0.0);
-    let beams = beams(&renderer, truth, count);
+    let beams = beams(&renderer, truth(), count);
     let difference = RangeDifference::truncated(0.5);
     let pool = pool(threads);
     bencher
@@ -129,6 +170,27 @@ fn poses() -> Vec<Pose3> {
         .map(f32::from)
         .map(|i| at(street::on_the_road(0.1 + 0.1 * i, 0.7 * i - 2.0)))
         .collect()
+}
+
+fn close_poses() -> Vec<Pose3> {
+    around(100, 0.1, 0.2, 0.03)
+}
+
+fn tracked_poses() -> Vec<Pose3> {
+    around(100, 1.0, 2.0, 1.0)
+}
+
+fn near_poses() -> Vec<Pose3> {
+    around(10_000, 5.0, 10.0, 1.0)
+}
+
+fn all_poses() -> Vec<Pose3> {
+    around(10_000, 100.0, 2.0, 1.0)
+}
+
+/// Where the beams are measured.
+fn truth() -> Vec3 {
+    street::on_the_road(0.5, 0.0)
 }
 
 /// Poses within `along_m` of the middle of the street, in a strip of `width_m`, with headings

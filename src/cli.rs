@@ -93,8 +93,16 @@ Examples:
   fpmcl ground --simulated                    slopes, crests and kerbs with exact answers")]
     Ground(GroundArgs),
 
-    /// Show what this machine offers: instruction sets, threads, graphics adapters.
-    Doctor,
+    /// Show what this machine offers: instruction sets, graphics adapters, rays per second.
+    Doctor(DoctorArgs),
+}
+
+/// What `doctor` is to do.
+#[derive(Clone, Debug, Args)]
+pub struct DoctorArgs {
+    /// How long rays are cast to measure how many there are per second; 0 casts none
+    #[arg(long, value_name = "SECONDS", default_value_t = 10)]
+    pub measure: u64,
 }
 
 /// Where the configuration comes from.
@@ -281,7 +289,7 @@ impl Command {
             Self::Compare(args) => args.source.machine,
             Self::Demo(args) => args.machine,
             Self::Ground(args) => args.machine,
-            Self::Doctor => MachineArgs::default(),
+            Self::Doctor(_) => MachineArgs::default(),
         }
     }
 }

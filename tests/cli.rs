@@ -79,10 +79,19 @@ fn wrong_usage_has_its_own_exit_code() {
 
 #[test]
 fn the_doctor_tells_threads_and_backend() {
-    let said = fpmcl("doctor").succeeds();
+    let said = fpmcl("doctor").with("--measure=0").succeeds();
     for row in ["instruction sets", "threads in use", "backend auto"] {
         assert!(said.stdout.contains(row), "{}", said.stdout);
     }
+    assert!(!said.stdout.contains("per second"), "{}", said.stdout);
+}
+
+#[test]
+fn the_doctor_measures_rays_per_second() {
+    let said = fpmcl("doctor").with("--measure=1").succeeds();
+    let row = said.stdout.lines().find(|line| line.starts_with("rays "));
+    let number = row.and_then(|row| row.split_whitespace().nth(1)).unwrap();
+    assert!(number.parse::<f64>().unwrap() > 0.0, "{}", said.stdout);
 }
 
 // Configurations.

@@ -5,6 +5,10 @@
 #![cfg(feature = "gpu")]
 
 mod brute_force;
+#[expect(clippy::unwrap_used, reason = "a failing test may panic")]
+mod common;
+
+use std::path::{Path, PathBuf};
 
 use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
 use fpmcl::lidar::{Beam, LidarModel, RangeImage};
@@ -306,6 +310,65 @@ fn the_processor_and_the_device_show_the_same_street() {
                 assert!(near.iter().any(|&range_m| same(range_m, expected[pixel])));
             }
         }
+    }
+}
+
+/// A map of a few scans of drive 0005 in one tile; `None`, and said so, where the data is not.
+#[expect(
+    clippy::print_stderr,
+    clippy::unwrap_used,
+    reason = "a test that did not run must not look like one that did, a failing one may panic"
+)]
+fn drive_0005() -> Option<TriangleMesh> {
+    let project = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let data = std::env::var_os("FPMCL_DATA")
+        .map_or_else(|| project.join("../shared/data"), PathBuf::from)
+        .join("kitti-0926-drive-0005");
+    if !data.is_dir() {
+        eprintln!("not run: {} is absent", data.display());
+        return None;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let map = folder.path().join("map.ply");
+    let path = |path: &Path| path.display().to_string();
+    common::fpmcl("build-map")
+        .with(project.join("config/build_map.yml"))
+        .set("scan_folder", &path(&data.join("velodyne")))
+        .set("pose_file", &path(&data.join("poses.txt")))
+        .set("calib_file", &path(&data.join("calib.txt")))
+        .set("mesh_file", &path(&map))
+        .set("n_scans", "6")
+        .set("visualize", "False")
+        .succeeds();
+    Some(fpmcl::map::ply::read(&map).unwrap())
+}
+
+#[test]
+fn the_processor_and_the_device_show_the_same_map_of_drive_0005() {
+    let Some(mesh) = drive_0005() else {
+        return;
+    };
+    let tiles = [mesh];
+    let Some(renderer) = renderer(&tiles) else {
+        return;
+    };
+    let model = LidarModel::default();
+    let poses = [
+        pose(0.0, 0.0, 0.0, [0.0, 0.0, 0.0]),
+        pose(2.1, 0.4, 0.05, [0.01, -0.02, 0.7]),
+    ];
+    let expected = CpuRenderer::new(&tiles).render(&poses, &model).unwrap();
+    let images = renderer.render(&poses, &model).unwrap();
+    for (image, expected) in images.iter().zip(&expected) {
+        let seen = expected
+            .iter()
+            .filter(|range_m| range_m.is_finite())
+            .count();
+        let differ = std::iter::zip(image, expected)
+            .filter(|&(&range_m, &expected)| !same(f64::from(expected), range_m))
+            .count();
+        assert!(differ * 1000 <= image.len(), "{differ}");
+        assert!(seen * 4 > image.len(), "{seen}");
     }
 }
 

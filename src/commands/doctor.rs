@@ -2,12 +2,20 @@
 
 use std::fmt::Write as _;
 use std::thread::available_parallelism;
+use std::time::{Duration, Instant};
 
-use super::{Context, output};
+use super::{Context, output, stages};
+use crate::cli::DoctorArgs;
+use crate::lidar::LidarModel;
+use crate::map::{TileConfig, TileGrid, tiles};
 use crate::rendering::backend::{self, AdapterReport, Backend};
+use crate::simulation::{Simulation, SimulationConfig};
+
+/// Poses whose images are rendered at once, as many as the bench has.
+const POSES: usize = 8;
 
 /// Prints what this machine offers, line by line.
-pub(super) fn run(context: &Context) -> anyhow::Result<()> {
+pub(super) fn run(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
     let choice = backend::choose(Backend::Auto)?;
     let mut rows = vec![
         ("fpmcl", env!("CARGO_PKG_VERSION").to_owned()),
@@ -22,6 +30,10 @@ pub(super) fn run(context: &Context) -> anyhow::Result<()> {
         "backend auto",
         format!("{}, because {}", choice.name, choice.reason),
     ));
+    if args.measure > 0 {
+        let time = Duration::from_secs(args.measure);
+        rows.push(("rays", rays_per_second(time, context)?));
+    }
     let mut table = String::new();
     for (what, value) in rows {
         writeln!(table, "{what:<18}{value}")?;
@@ -35,11 +47,37 @@ fn adapter(report: &AdapterReport) -> String {
         .obstacle
         .map(|obstacle| format!("; not usable: {obstacle}"));
     format!(
-        "{report}, driver {}, {} MiB per binding{}",
+        "{report}, driver {}, {} MiB per binding, {} MiB per buffer, textures of {} pixels{}",
         report.driver,
         report.max_binding_bytes >> 20,
+        report.max_buffer_bytes >> 20,
+        report.max_texture_size,
         obstacle.unwrap_or_default()
     )
+}
+
+/// Images of the simulated street by the renderer that `auto` takes.
+fn rays_per_second(time: Duration, context: &Context) -> anyhow::Result<String> {
+    let simulation = Simulation::new(&SimulationConfig::default(), None)?;
+    let street = &simulation.street.mesh;
+    let (poses, model) = (simulation.poses(), LidarModel::default());
+    let grid = TileGrid::around(&poses, &TileConfig::default());
+    let renderer = stages::renderer(&tiles::cut(street, &grid), context)?;
+    let step = poses.len().div_ceil(POSES);
+    let poses: Vec<_> = poses.into_iter().step_by(step).collect();
+    let (start, mut rays) = (Instant::now(), 0);
+    while start.elapsed() < time {
+        renderer.render(&poses, &model)?;
+        rays += poses.len() * model.len();
+    }
+    Ok(format!(
+        "{:.2} M per second, images of {} x {} in a street of {} triangles by {}",
+        rays as f64 / start.elapsed().as_secs_f64() * 1e-6,
+        model.height,
+        model.width,
+        street.triangles.len(),
+        renderer.name()
+    ))
 }
 
 fn system() -> String {

@@ -105,7 +105,7 @@ pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
         Command::Compare(args) => output::print(&compare::run(args, context)?),
         Command::Demo(args) => output::print(&demo::run(args, context)?),
         Command::Ground(args) => output::print(&ground::run(args, context)?),
-        Command::Doctor => doctor::run(context),
+        Command::Doctor(args) => doctor::run(args, context),
     }
 }
 

@@ -123,7 +123,11 @@ fn ground_of(mesh: &TriangleMesh) -> GroundMap {
     GroundMap::from_mesh(mesh, is_level, GROUND_CELL_M)
 }
 
-fn renderer(tiles: &[TriangleMesh], context: &Context) -> Result<Box<dyn RangeRenderer>> {
+/// The renderer that the user asks for.
+pub(super) fn renderer(
+    tiles: &[TriangleMesh],
+    context: &Context,
+) -> Result<Box<dyn RangeRenderer>> {
     let choice = backend::choose(context.backend)?;
     tracing::info!("rendering on {} because {}", choice.name, choice.reason);
     match choice.target {

@@ -47,10 +47,10 @@ impl Block {
         self.indices[place]
     }
 
-    /// One coordinate of a corner of a triangle.
+    /// All coordinates, corner by corner.
     #[inline(always)]
-    pub fn coordinate(&self, corner: usize, axis: usize, place: usize) -> f32 {
-        self.corners[corner][axis][place]
+    pub fn corners(&self) -> &[Corner; 3] {
+        &self.corners
     }
 
     /// The unit normal of a triangle by the right-hand rule.

@@ -240,15 +240,19 @@ impl<'a, const COHERENT: bool> Walk<'a, COHERENT> {
 /// One over each coordinate, and never too much.
 #[inline(always)]
 pub(super) fn inverse_of(direction: Rays) -> Rays {
-    direction.map(|d| {
-        let inverse = 1.0 / d;
-        let is_small = inverse.abs() < STEEPEST;
-        if is_small {
-            inverse
-        } else {
-            STEEPEST.copysign(d)
-        }
-    })
+    direction.map(inverse_of_one)
+}
+
+/// One over a coordinate, and never too much.
+#[inline(always)]
+pub(super) fn inverse_of_one(d: f32) -> f32 {
+    let inverse = 1.0 / d;
+    let is_small = inverse.abs() < STEEPEST;
+    if is_small {
+        inverse
+    } else {
+        STEEPEST.copysign(d)
+    }
 }
 
 /// As the instruction does it: without the care of [`f32::min`] for what is no number.

@@ -1,5 +1,6 @@
 //! Tiles of triangles under one hierarchy, and the ways to cast rays at them.
 
+mod alone;
 mod through;
 
 use glam::{DVec3, Vec3};
@@ -7,7 +8,6 @@ use rayon::prelude::*;
 
 use super::Hit;
 use super::block::{Block, TRIANGLES};
-use super::bundle::{Bundle, Origins, Waiting, WideWalk};
 use super::bvh::{Bvh, Item};
 use super::packet::{NO_SLOT, Packet, RAYS, Walk};
 use super::wide::WideBvh;
@@ -26,6 +26,9 @@ pub struct Reach {
     pub until_m: f32,
     /// Of surfaces nearer than this any may be reported, not only the nearest [m].
     pub enough_m: f32,
+    /// Whether it does not matter if there is a surface nearer than `enough_m` where there is none
+    /// from there to `until_m`: then it need not be reported.
+    pub is_window: bool,
 }
 
 impl Reach {
@@ -37,6 +40,7 @@ impl Reach {
         Self {
             until_m,
             enough_m: 0.0,
+            is_window: false,
         }
     }
 }
@@ -241,85 +245,6 @@ impl Scene {
                 let block = tile.first_block + leaf;
                 packet.meet(origin, &self.blocks[block], (block * TRIANGLES) as u32);
             }
-        }
-    }
-
-    /// Casts bundles of eight rays, each from its own origin, which should be close to each other
-    /// in origin and direction, in the frame of the mesh, and writes the range of what each meets
-    /// first. A ray meets the same range, bit by bit, as with [`Scene::cast_within`], with two
-    /// exceptions: of surfaces nearer than [`Reach::enough_m`] it may be another, and so it may be
-    /// of the triangles at an edge that the ray passes within rounding. Runs on the calling thread
-    /// alone.
-    ///
-    /// # Panics
-    /// Where there are not as many reaches or ranges as directions.
-    pub fn cast_bundles(
-        &self,
-        origins: &[DVec3; RAYS],
-        directions: &[[Vec3; RAYS]],
-        reach: &[Reach],
-        ranges_m: &mut [[f32; RAYS]],
-    ) {
-        assert_eq!(directions.len(), ranges_m.len(), "one range per direction");
-        assert_eq!(directions.len(), reach.len(), "one reach per bundle");
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
-            #[expect(unsafe_code, reason = "the line above has found the instructions")]
-            unsafe {
-                self.cast_bundles_avx2(origins, directions, reach, ranges_m);
-            }
-            return;
-        }
-        self.cast_bundles_portable(origins, directions, reach, ranges_m);
-    }
-
-    /// [`Scene::cast_bundles_portable`], compiled for eight numbers per instruction.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2")]
-    fn cast_bundles_avx2(
-        &self,
-        origins: &[DVec3; RAYS],
-        directions: &[[Vec3; RAYS]],
-        reach: &[Reach],
-        ranges_m: &mut [[f32; RAYS]],
-    ) {
-        self.cast_bundles_portable(origins, directions, reach, ranges_m);
-    }
-
-    #[inline(always)]
-    pub(super) fn cast_bundles_portable(
-        &self,
-        origins: &[DVec3; RAYS],
-        directions: &[[Vec3; RAYS]],
-        reach: &[Reach],
-        ranges_m: &mut [[f32; RAYS]],
-    ) {
-        let origins = std::array::from_fn(|axis| origins.map(|origin| origin[axis]));
-        let over_tiles = Origins::from(self.middle, &origins);
-        let (mut waiting_tiles, mut waiting) = (Vec::new(), Vec::new());
-        for ((directions, reach), ranges_m) in directions.iter().zip(reach).zip(ranges_m) {
-            let mut bundle = Bundle::new(directions, *reach);
-            let mut tiles = WideWalk::new(&bundle, &self.wide_top, &over_tiles, &mut waiting_tiles);
-            while let Some((tile, _)) = tiles.next_leaf(&bundle) {
-                self.cast_bundle_at(&self.tiles[tile], &origins, &mut bundle, &mut waiting);
-            }
-            *ranges_m = bundle.range_m;
-        }
-    }
-
-    #[inline(always)]
-    fn cast_bundle_at(
-        &self,
-        tile: &Tile,
-        origins: &[[f64; RAYS]; 3],
-        bundle: &mut Bundle,
-        waiting: &mut Vec<Waiting>,
-    ) {
-        let origins = Origins::from(tile.middle, origins);
-        let mut leaves = WideWalk::new(bundle, &tile.wide_bvh, &origins, waiting);
-        while let Some((leaf, is_entering)) = leaves.next_leaf(bundle) {
-            let block = &self.blocks[tile.first_block + leaf];
-            bundle.meet(&origins, block, is_entering);
         }
     }
 

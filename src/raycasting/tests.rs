@@ -306,6 +306,7 @@ fn where_any_near_surface_is_enough_one_is_found() {
     let reach = Reach {
         until_m: f32::INFINITY,
         enough_m: 6.0,
+        is_window: false,
     };
     let mut hits = nearest.clone();
     let reaches = vec![reach; directions.len()];
@@ -374,47 +375,32 @@ fn centroids_that_coincide_or_lie_ever_closer_make_no_tree_too_deep() {
     assert!((hit.range_m - 2.0 / 3.0_f32.sqrt()).abs() < 1e-6);
 }
 
-/// Eight origins and, per bundle, eight directions about as close to each other as `spread`.
-fn bundles(
-    count: usize,
-    spread: f32,
-    rng: &mut ChaCha8Rng,
-) -> ([glam::DVec3; RAYS], Vec<[Vec3; RAYS]>) {
-    let middle = 10.0 * in_cube(rng);
-    let origins = [(); RAYS].map(|()| (middle + spread * in_cube(rng)).as_dvec3());
-    let mut directions: Vec<[Vec3; RAYS]> = (0..count)
-        .map(|_| {
-            let middle = direction(rng);
-            [(); RAYS].map(|()| (middle + 0.1 * spread * in_cube(rng)).normalize())
-        })
-        .collect();
-    // Some run along the axes, up and down at once.
-    for axis in Vec3::AXES {
-        directions.push([(); RAYS].map(|()| (axis + 0.1 * spread * in_cube(rng)).normalize()));
-        directions.push([axis; RAYS]);
-    }
-    (origins, directions)
+/// Ranges of rays from one origin, one by one.
+fn cast_lone(scene: &Scene, origin: Vec3, directions: &[Vec3], reach: Reach) -> Vec<f32> {
+    let mut ranges_m = vec![0.0; directions.len()];
+    let reaches = vec![reach; directions.len()];
+    scene.cast_lone(origin.as_dvec3(), directions, &reaches, &mut ranges_m);
+    ranges_m
 }
 
 #[test]
-fn a_ray_in_a_bundle_meets_what_it_meets_alone() {
-    let mut rng = ChaCha8Rng::seed_from_u64(9);
+fn a_lone_ray_meets_what_it_meets_in_a_packet() {
+    let mut rng = ChaCha8Rng::seed_from_u64(12);
     let scene = Scene::of_tiles(&[soup(3000, 0.7, &mut rng), soup(300, 2.0, &mut rng)]);
     let mut met = 0;
-    for spread in [0.0, 0.01, 0.1, 1.0, 10.0] {
-        for until_m in [f32::INFINITY, 8.0] {
-            let (origins, directions) = bundles(200, spread, &mut rng);
-            let reaches = vec![Reach::until(until_m); directions.len()];
-            let mut ranges_m = vec![[0.0; RAYS]; directions.len()];
-            scene.cast_bundles(&origins, &directions, &reaches, &mut ranges_m);
-            for (directions, ranges_m) in directions.iter().zip(&ranges_m) {
-                for ray in 0..RAYS {
-                    let mut alone = [Hit::MISS];
-                    let reach = [Reach::until(until_m)];
-                    scene.cast_within(origins[ray], &[directions[ray]], &reach, &mut alone);
-                    assert_eq!(ranges_m[ray].to_bits(), alone[0].range_m.to_bits());
-                    met += usize::from(alone[0] != Hit::MISS);
-                }
+    for until_m in [f32::INFINITY, 8.0] {
+        for _ in 0..10 {
+            let origin = 10.0 * in_cube(&mut rng);
+            let directions: Vec<Vec3> = (0..300)
+                .map(|_| direction(&mut rng))
+                .chain(Vec3::AXES)
+                .collect();
+            let mut hits = vec![Hit::MISS; directions.len()];
+            scene.cast_until(origin, &directions, until_m, &mut hits);
+            let ranges_m = cast_lone(&scene, origin, &directions, Reach::until(until_m));
+            for (range_m, hit) in ranges_m.iter().zip(&hits) {
+                assert_eq!(range_m.to_bits(), hit.range_m.to_bits());
+                met += usize::from(*hit != Hit::MISS);
             }
         }
     }
@@ -422,45 +408,91 @@ fn a_ray_in_a_bundle_meets_what_it_meets_alone() {
 }
 
 #[test]
-fn bundles_in_a_soup_meet_what_testing_all_triangles_finds() {
-    let mut rng = ChaCha8Rng::seed_from_u64(10);
+fn lone_rays_in_a_soup_meet_what_testing_all_triangles_finds() {
+    let mut rng = ChaCha8Rng::seed_from_u64(13);
     for (triangles, size_m) in [(0, 1.0), (1, 9.0), (30, 4.0), (500, 2.0)] {
         let mesh = soup(triangles, size_m, &mut rng);
         let scene = Scene::new(&mesh);
-        let (origins, directions) = bundles(50, 0.3, &mut rng);
-        let reaches = vec![Reach::UNLIMITED; directions.len()];
-        let mut ranges_m = vec![[0.0; RAYS]; directions.len()];
-        scene.cast_bundles(&origins, &directions, &reaches, &mut ranges_m);
-        for (directions, ranges_m) in directions.iter().zip(&ranges_m) {
-            for ray in 0..RAYS {
-                let nearest = (0..triangles)
-                    .map(|t| {
-                        range_by_hand(origins[ray].as_vec3(), directions[ray], mesh.corners(t))
-                    })
-                    .fold(f64::INFINITY, f64::min);
-                let range_m = f64::from(ranges_m[ray]);
-                assert!(
-                    range_m == nearest || (range_m - nearest).abs() < 1e-4,
-                    "{range_m} {nearest}"
-                );
-            }
+        let origin = 3.0 * in_cube(&mut rng);
+        let directions: Vec<Vec3> = (0..400).map(|_| direction(&mut rng)).collect();
+        let ranges_m = cast_lone(&scene, origin, &directions, Reach::UNLIMITED);
+        for (&direction, range_m) in directions.iter().zip(ranges_m) {
+            let nearest = (0..triangles)
+                .map(|t| range_by_hand(origin, direction, mesh.corners(t)))
+                .fold(f64::INFINITY, f64::min);
+            let range_m = f64::from(range_m);
+            assert!(
+                range_m == nearest || (range_m - nearest).abs() < 1e-4,
+                "{range_m} {nearest}"
+            );
         }
     }
 }
 
 #[test]
-fn every_instruction_set_gives_bundles_the_same_bits() {
-    let mut rng = ChaCha8Rng::seed_from_u64(11);
-    let scene = Scene::new(&soup(3000, 0.7, &mut rng));
-    let (origins, directions) = bundles(300, 0.2, &mut rng);
-    let reach = Reach {
-        until_m: 12.0,
-        enough_m: 3.0,
+fn no_lone_ray_slips_through_an_edge_or_a_corner() {
+    let scene = Scene::new(&cube(2.0));
+    // Towards corners, edges and diagonals of the walls, where two or more triangles meet.
+    let steps = [-1.0, -0.5, 0.0, 0.5, 1.0];
+    let mut directions = Vec::new();
+    for x in steps {
+        for y in steps {
+            for wall in [-1.0, 1.0] {
+                let at = Vec3::new(x, y, wall).normalize();
+                directions.extend([at, Vec3::new(at.y, at.z, at.x), Vec3::new(at.z, at.x, at.y)]);
+            }
+        }
+    }
+    let ranges_m = cast_lone(&scene, Vec3::ZERO, &directions, Reach::UNLIMITED);
+    for (direction, range_m) in directions.iter().zip(ranges_m) {
+        let expected = 2.0 / direction.abs().max_element();
+        assert!((range_m - expected).abs() < 1e-5, "{direction} {range_m}");
+    }
+}
+
+#[test]
+fn in_a_window_only_what_is_near_its_range_is_told_from_nothing() {
+    let mut rng = ChaCha8Rng::seed_from_u64(14);
+    let scene = Scene::new(&soup(500, 2.0, &mut rng));
+    let directions: Vec<Vec3> = (0..2000).map(|_| direction(&mut rng)).collect();
+    let nearest = cast_lone(&scene, Vec3::ZERO, &directions, Reach::UNLIMITED);
+    let window = Reach {
+        until_m: 6.0,
+        enough_m: 4.0,
+        is_window: true,
     };
-    let reaches = vec![reach; directions.len()];
-    let mut fast = vec![[0.0; RAYS]; directions.len()];
-    let mut portable = fast.clone();
-    scene.cast_bundles(&origins, &directions, &reaches, &mut fast);
-    scene.cast_bundles_portable(&origins, &directions, &reaches, &mut portable);
-    assert_eq!(fast, portable);
+    let in_window = cast_lone(&scene, Vec3::ZERO, &directions, window);
+    let (mut hidden, mut left_out) = (0, 0);
+    for (nearest, range_m) in nearest.into_iter().zip(in_window) {
+        if nearest < window.enough_m {
+            hidden += usize::from(range_m < window.enough_m);
+            left_out += usize::from(range_m == f32::INFINITY);
+            assert!(range_m < window.enough_m || range_m == f32::INFINITY);
+        } else if nearest < window.until_m {
+            assert_eq!(range_m, nearest);
+        } else {
+            assert_eq!(range_m, f32::INFINITY);
+        }
+    }
+    assert!(hidden > 50 && left_out > 50, "{hidden} {left_out}");
+}
+
+#[test]
+fn every_instruction_set_gives_lone_rays_the_same_bits() {
+    let mut rng = ChaCha8Rng::seed_from_u64(15);
+    let scene = Scene::of_tiles(&[soup(3000, 0.7, &mut rng), soup(300, 2.0, &mut rng)]);
+    for is_window in [false, true] {
+        let reach = Reach {
+            until_m: 12.0,
+            enough_m: 3.0,
+            is_window,
+        };
+        let origin = in_cube(&mut rng);
+        let directions: Vec<Vec3> = (0..2000).map(|_| direction(&mut rng)).collect();
+        let fast = cast_lone(&scene, origin, &directions, reach);
+        let mut portable = fast.clone();
+        let reaches = vec![reach; directions.len()];
+        scene.cast_lone_portable(origin.as_dvec3(), &directions, &reaches, &mut portable);
+        assert_eq!(fast, portable);
+    }
 }

@@ -1,5 +1,4 @@
-//! A hierarchy whose nodes have eight children: one ray, or several that are nearly one, against
-//! eight boxes at once.
+//! A hierarchy whose nodes have eight children: one ray against eight boxes at once.
 //!
 //! It is the binary one with nodes left out: of the children of a node the one with the largest
 //! surface is replaced by its own two, until there are eight. After Wald, Benthin and Boulos,

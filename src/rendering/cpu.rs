@@ -4,25 +4,31 @@
 //! into pieces that do not depend on the number of threads; sums are made piece by piece in that
 //! order. So the result is the same, byte for byte, on every machine.
 //!
-//! Poses that are close to each other are cast together (`groups`). A ray meets the same bits as
-//! alone, unless it passes an edge within rounding: then it may meet either of the triangles there,
-//! whose ranges differ by about a millimetre where they are seen at a flat angle: some rays in ten
-//! million on the street of the bench.
+//! Beams that are close to each other, as those of an image, go through the scene in packets, others
+//! one by one. Both meet the same bits, unless a ray passes an edge within rounding: then it may
+//! meet either of the triangles there, whose ranges differ by about a millimetre where they are
+//! seen at a flat angle. What a pose sees never depends on the other poses.
 
-mod groups;
+mod order;
 
 use glam::{DVec3, Mat3};
 use rayon::prelude::*;
 
-use groups::groups_of;
+use order::{coherent_order, mean_width_m, order_of_places, pixel_order};
 
 use super::{RangeDifference, RangeRenderer, RenderError, SurfaceHit};
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh, Vec3};
-use crate::lidar::{Beam, LidarModel, Pixel};
-use crate::raycasting::{Hit, RAYS, Reach, Scene};
+use crate::lidar::{Beam, LidarModel};
+use crate::raycasting::{Hit, Reach, Scene};
 
 /// Rays that are cast without asking for another thread.
 const RAYS_PER_PIECE: usize = 512;
+/// What ends lower than this below the sensor has the ground about its end from almost any pose:
+/// it does not pay to look there first [m].
+const HIGHEST_GROUND_M: f32 = -1.0;
+/// Packets that are wider than this where they end go slower than their rays one by one: measured
+/// with `benches/rendering.rs` [m].
+const WIDEST_PACKET_M: f64 = 0.8;
 /// Rounding of sums and differences of ranges.
 const ROUNDING: f32 = 1e-6;
 
@@ -48,39 +54,26 @@ impl CpuRenderer {
         beams: &Beams,
         summarize: impl Fn(&[u32], &[f32]) -> T + Sync,
     ) -> Vec<Vec<T>> {
-        let groups = groups_of(map_from_lidar, &beams.directions, &beams.order);
+        let poses = order_of_places(map_from_lidar);
         let pieces: Vec<&[u32]> = beams.order.chunks(RAYS_PER_PIECE).collect();
-        let summaries: Vec<Vec<T>> = (0..groups.len() * pieces.len())
+        let is_dense = mean_width_m(&beams.directions, &beams.order) < WIDEST_PACKET_M;
+        let summaries: Vec<T> = (0..poses.len() * pieces.len())
             .into_par_iter()
             .map(|number| {
-                let group = &groups[number / pieces.len()];
+                let pose = &map_from_lidar[poses[number / pieces.len()] as usize];
                 let rays = pieces[number % pieces.len()];
-                let poses = group
-                    .poses
-                    .iter()
-                    .map(|&pose| &map_from_lidar[pose as usize]);
-                let ranges = if group.is_bundled {
-                    self.cast_bundles(&poses.collect::<Vec<_>>(), rays, beams)
+                let ranges = if is_dense {
+                    self.cast_packets(pose, rays, beams)
                 } else {
-                    poses
-                        .map(|pose| self.cast_packets(pose, rays, beams))
-                        .collect()
+                    self.cast_lone(pose, rays, beams)
                 };
-                ranges
-                    .iter()
-                    .map(|ranges| summarize(rays, ranges))
-                    .collect()
+                summarize(rays, &ranges)
             })
             .collect();
-        let mut per_pose: Vec<Vec<T>> = map_from_lidar
-            .iter()
-            .map(|_| Vec::with_capacity(pieces.len()))
-            .collect();
-        for (number, summaries) in summaries.into_iter().enumerate() {
-            let poses = &groups[number / pieces.len()].poses;
-            for (&pose, summary) in poses.iter().zip(summaries) {
-                per_pose[pose as usize].push(summary);
-            }
+        let mut summaries = summaries.into_iter();
+        let mut per_pose: Vec<Vec<T>> = map_from_lidar.iter().map(|_| Vec::new()).collect();
+        for pose in poses {
+            per_pose[pose as usize] = summaries.by_ref().take(pieces.len()).collect();
         }
         per_pose
     }
@@ -104,29 +97,19 @@ impl CpuRenderer {
         hits[..rays.len()].iter().map(|hit| hit.range_m).collect()
     }
 
-    /// Ranges of some beams of up to eight poses, a row per pose.
-    fn cast_bundles(&self, poses: &[&Pose3], rays: &[u32], beams: &Beams) -> Vec<Vec<f32>> {
-        // The last pose fills the empty places.
-        let pose_of = |place: usize| poses[place.min(poses.len() - 1)];
-        let origins = std::array::from_fn(|place| origin_of(pose_of(place)));
-        let rotations: [_; RAYS] = std::array::from_fn(|place| rotation_of(pose_of(place)));
-        let mut directions = [[Vec3::ZERO; RAYS]; RAYS_PER_PIECE];
-        let mut reaches = [Reach::UNLIMITED; RAYS_PER_PIECE];
-        let mut ranges_m = [[f32::INFINITY; RAYS]; RAYS_PER_PIECE];
-        for (place, &ray) in rays.iter().enumerate() {
-            directions[place] = rotations.map(|rotation| rotation * beams.directions[ray as usize]);
-            reaches[place] = beams.reaches[ray as usize];
-        }
-        let ranges_m = &mut ranges_m[..rays.len()];
-        self.scene.cast_bundles(
-            &origins,
-            &directions[..rays.len()],
-            &reaches[..rays.len()],
-            ranges_m,
-        );
-        (0..poses.len())
-            .map(|place| ranges_m.iter().map(|ranges_m| ranges_m[place]).collect())
-            .collect()
+    /// Ranges of some beams of one pose.
+    fn cast_lone(&self, map_from_lidar: &Pose3, rays: &[u32], beams: &Beams) -> Vec<f32> {
+        let rotation = rotation_of(map_from_lidar);
+        let (directions, reaches): (Vec<Vec3>, Vec<Reach>) = rays
+            .iter()
+            .map(|&ray| ray as usize)
+            .map(|ray| (rotation * beams.directions[ray], beams.reaches[ray]))
+            .unzip();
+        let mut ranges = vec![f32::INFINITY; rays.len()];
+        let origin = origin_of(map_from_lidar);
+        self.scene
+            .cast_lone(origin, &directions, &reaches, &mut ranges);
+        ranges
     }
 
     /// Ranges of every pose, ray by ray in the order of their numbers.
@@ -249,7 +232,7 @@ impl RangeRenderer for CpuRenderer {
         let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
         let reaches = beams
             .iter()
-            .map(|beam| deciding_reach(beam.range_m, difference))
+            .map(|beam| deciding_reach(beam, difference))
             .collect();
         let to_cast = Beams {
             order: coherent_order(&directions),
@@ -267,10 +250,13 @@ impl RangeRenderer for CpuRenderer {
     }
 }
 
-/// How far a ray must look for its exact cost: no surface matters at whose range the cost has
-/// reached its limit.
-fn deciding_reach(measured_m: f32, difference: &RangeDifference) -> Reach {
+/// Where a ray must look for its exact cost: no surface matters at whose range the cost has reached
+/// its limit. Where all limits are one, a ray that meets nothing about its measured range costs
+/// that limit, whatever stands before.
+fn deciding_reach(beam: &Beam, difference: &RangeDifference) -> Reach {
+    let measured_m = beam.range_m;
     let nothing_costs_as_far = measured_m.min(difference.no_surface_m) == difference.short_m;
+    let is_of_the_ground = beam.direction.z * measured_m < HIGHEST_GROUND_M;
     Reach {
         until_m: if nothing_costs_as_far {
             (measured_m + difference.short_m) * (1.0 + ROUNDING)
@@ -278,55 +264,10 @@ fn deciding_reach(measured_m: f32, difference: &RangeDifference) -> Reach {
             f32::INFINITY
         },
         enough_m: (measured_m - difference.long_m) * (1.0 - ROUNDING),
+        is_window: nothing_costs_as_far
+            && difference.long_m == difference.short_m
+            && !is_of_the_ground,
     }
-}
-
-/// Pixels in blocks of four columns and two rows, the blocks column by column: what lies in one
-/// direction stays in the cache.
-fn pixel_order(model: &LidarModel) -> Vec<u32> {
-    let mut order: Vec<u32> = Vec::with_capacity(model.len());
-    for left in (0..model.width).step_by(4) {
-        for top in (0..model.height).step_by(2) {
-            for row in top..model.height.min(top + 2) {
-                for column in left..model.width.min(left + 4) {
-                    order.push(model.index_of(Pixel { row, column }) as u32);
-                }
-            }
-        }
-    }
-    order
-}
-
-/// Directions along a Z-shaped curve over azimuth and elevation (Morton 1966).
-fn coherent_order(directions: &[Vec3]) -> Vec<u32> {
-    let mut keyed: Vec<(u32, u32)> = directions
-        .iter()
-        .enumerate()
-        .map(|(ray, direction)| {
-            // Grows with the azimuth, from -2 to 2.
-            let along = direction.x / (direction.x.abs() + direction.y.abs());
-            let turn = if direction.y < 0.0 {
-                along - 1.0
-            } else {
-                1.0 - along
-            };
-            // As fine in elevation as in azimuth: half a turn is a half of both.
-            let key = spread(((turn + 2.0) * 4096.0) as u32)
-                | spread(((direction.z + 1.0) * 4096.0) as u32) << 1;
-            (key, ray as u32)
-        })
-        .collect();
-    keyed.sort_unstable();
-    keyed.into_iter().map(|(_, ray)| ray).collect()
-}
-
-/// Puts a zero before each of the lower 16 bits.
-fn spread(bits: u32) -> u32 {
-    let bits = bits & 0xffff;
-    let bits = (bits | bits << 8) & 0x00ff_00ff;
-    let bits = (bits | bits << 4) & 0x0f0f_0f0f;
-    let bits = (bits | bits << 2) & 0x3333_3333;
-    (bits | bits << 1) & 0x5555_5555
 }
 
 #[cfg(test)]

@@ -108,8 +108,8 @@ fn the_number_of_threads_does_not_change_a_bit() {
         let costs = renderer
             .compare(&poses(50), &beams(3600), &difference)
             .unwrap();
-        let swarm = renderer.compare(&swarm(50, 0.05), &beams(3600), &difference);
-        (images, costs, swarm.unwrap())
+        let dense = renderer.compare(&poses(2), &beams(20_000), &difference);
+        (images, costs, dense.unwrap())
     };
     assert_eq!(on_threads(1, work), on_threads(3, work));
 }
@@ -257,52 +257,73 @@ fn out_of_the_map_there_is_nothing() {
     );
 }
 
-/// Poses about as far from each other as `spread_m`, in steps of the heading of a tenth of that.
-fn swarm(count: usize, spread_m: f64) -> Vec<Pose3> {
-    let mut rng = ChaCha8Rng::seed_from_u64(5);
-    (0..count)
-        .map(|_| {
-            let [x, y, turn] = [0; 3].map(|_| spread_m * rng.random_range(-1.0..1.0));
-            Pose3::new(Vector3::new(1.0 + x, y, 2.5), Vector3::z() * 0.1 * turn)
-        })
-        .collect()
-}
-
 #[test]
-fn a_pose_sees_the_same_alone_as_in_a_swarm_but_for_rays_at_edges() {
+fn a_pose_sees_the_same_bits_alone_as_among_others() {
     let renderer = CpuRenderer::new(&hills(Vec3::ZERO));
-    let (difference, beams) = (RangeDifference::truncated(0.5), beams(1000));
-    let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
-    let mut at_edges = 0;
-    for (count, spread_m) in [(7, 0.05), (100, 0.05), (61, 1.0), (30, 10.0)] {
-        let poses = swarm(count, spread_m);
+    let difference = RangeDifference::truncated(0.5);
+    for (count, beams) in [(100, beams(600)), (3, beams(20_000))] {
+        let poses = poses(count);
         let together = renderer.compare(&poses, &beams, &difference).unwrap();
-        let rows = renderer.cast(&poses, &directions).unwrap();
-        for ((pose, cost), row) in poses.iter().zip(together).zip(rows) {
+        for (pose, cost) in poses.iter().zip(together) {
             let alone = renderer.compare(&[*pose], &beams, &difference).unwrap();
-            assert!((alone[0] - cost).abs() < 2e-6, "{} {cost}", alone[0]);
-            let alone = renderer.cast(&[*pose], &directions).unwrap();
-            for (a, b) in alone[0].iter().zip(row).filter(|&(&a, b)| a != b) {
-                at_edges += 1;
-                assert!((a - b).abs() < 1e-3, "{a} {b}");
-            }
+            assert_eq!(alone, [cost]);
         }
     }
-    assert!(at_edges < 20, "{at_edges} of 198,000");
 }
 
 #[test]
-fn a_swarm_is_bundled_and_poses_far_from_each_other_are_not() {
-    let directions: Vec<Vec3> = beams(500).iter().map(|beam| beam.direction).collect();
-    let order = coherent_order(&directions);
-    let bundled_of = |poses: &[Pose3]| -> Vec<bool> {
-        let groups = groups_of(poses, &directions, &order);
-        let mut numbers: Vec<u32> = groups.iter().flat_map(|g| g.poses.clone()).collect();
-        numbers.sort_unstable();
-        assert!(numbers.into_iter().eq(0..poses.len() as u32));
-        groups.iter().map(|group| group.is_bundled).collect()
+fn neighbours_in_the_order_of_places_are_near_and_every_pose_is_in_it_once() {
+    let poses = poses(1000);
+    let order = order_of_places(&poses);
+    let place = |pose: u32| poses[pose as usize].translation.vector;
+    let mean_step_m = |order: &[u32]| {
+        let steps = order.windows(2).map(|p| (place(p[0]) - place(p[1])).norm());
+        steps.sum::<f64>() / order.len() as f64
     };
-    assert!(bundled_of(&swarm(64, 0.05)).into_iter().all(|is| is));
-    assert!(bundled_of(&poses(64)).into_iter().all(|is| !is));
-    assert_eq!(bundled_of(&swarm(1, 0.05)), [false]);
+    let mut sorted = order.clone();
+    sorted.sort_unstable();
+    assert!(sorted.iter().copied().eq(0..1000));
+    assert!(mean_step_m(&order) < 0.2 * mean_step_m(&sorted));
+    assert_eq!(order_of_places(&[]), Vec::<u32>::new());
+}
+
+#[test]
+fn beams_that_are_far_from_each_other_are_cast_alone_and_neighbours_in_packets() {
+    let is_dense = |count: usize| {
+        let directions: Vec<Vec3> = beams(count).iter().map(|beam| beam.direction).collect();
+        mean_width_m(&directions, &coherent_order(&directions)) < WIDEST_PACKET_M
+    };
+    assert!(!is_dense(500));
+    assert!(is_dense(100_000));
+}
+
+#[test]
+fn looking_at_the_end_of_a_beam_first_changes_no_cost() {
+    let renderer = CpuRenderer::new(&hills(Vec3::new(0.0, 0.0, 1.7)));
+    // As one of the poses sees the hills, some a little off and some far, above the ground.
+    let directions: Vec<Vec3> = beams(2000).iter().map(|beam| beam.direction).collect();
+    let seen = renderer.cast(&poses(1), &directions).unwrap().concat();
+    let beams: Vec<Beam> = std::iter::zip(directions, seen)
+        .zip([0.0, 0.2, -0.2, 0.6, -0.6, 3.0].into_iter().cycle())
+        .map(|((direction, range_m), off_m)| Beam {
+            direction,
+            range_m: range_m + off_m,
+        })
+        .filter(|beam| beam.range_m.is_finite() && beam.range_m > 1.0)
+        .filter(|beam| beam.direction.z * beam.range_m > HIGHEST_GROUND_M)
+        .collect();
+    let together = RangeDifference::truncated(0.5);
+    // Hardly another cost, but no window.
+    let apart = RangeDifference {
+        long_m: 0.500_000_1,
+        ..together
+    };
+    assert!(beams.iter().all(|b| deciding_reach(b, &together).is_window));
+    assert!(beams.iter().all(|b| !deciding_reach(b, &apart).is_window));
+    let in_window = renderer.compare(&poses(20), &beams, &together).unwrap();
+    let whole = renderer.compare(&poses(20), &beams, &apart).unwrap();
+    for (a, b) in in_window.iter().zip(whole) {
+        assert!((a - b).abs() < 1e-6, "{a} {b}");
+    }
+    assert!(beams.len() > 200 && in_window[0] < 0.3, "{}", in_window[0]);
 }

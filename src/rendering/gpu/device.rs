@@ -27,7 +27,8 @@ pub fn adapters() -> Vec<AdapterReport> {
 }
 
 /// Best first. OpenGL is only asked where Vulkan knows no adapter: it would name the same ones
-/// again, and its libraries complain on standard error where there is no display.
+/// again. Where there is no display, Mesa's libraries complain on standard error; for Vulkan that
+/// is its layer that chooses among devices, which `NODEVICE_SELECT=1` leaves out.
 fn found_adapters() -> Vec<wgpu::Adapter> {
     let mut found = found_through(wgpu::Backends::PRIMARY);
     if found.is_empty() {

@@ -28,10 +28,7 @@ impl Scene {
             size_of_val(forest.triangles.as_slice()) as u64,
             size_of_val(forest.nodes.as_slice()) as u64,
         ];
-        let limit = gpu.max_binding_bytes();
-        if let Some(&needed) = sizes.iter().find(|&&size| size > limit) {
-            return Err(RenderError::MapTooLarge { needed, limit });
-        }
+        check_sizes(&sizes, gpu.max_binding_bytes())?;
         let scene = Self {
             nodes: gpu.upload("nodes", &forest.nodes, BufferUsages::STORAGE),
             triangles: gpu.upload("triangles", &forest.triangles, BufferUsages::STORAGE),
@@ -56,5 +53,36 @@ impl Scene {
             .iter()
             .map(|pose| Pose::new(pose, self.center))
             .collect()
+    }
+}
+
+/// An error where a shader could not read one of the buffers as a whole [bytes].
+fn check_sizes(sizes: &[u64], limit: u64) -> Result<(), RenderError> {
+    match sizes.iter().copied().max() {
+        Some(needed) if needed > limit => Err(RenderError::MapTooLarge { needed, limit }),
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_largest_buffer_decides_whether_a_map_can_be_bound() {
+        assert!(check_sizes(&[100, 128], 128).is_ok());
+        assert!(check_sizes(&[], 128).is_ok());
+        let error = check_sizes(&[129, 300], 128).unwrap_err();
+        assert!(matches!(
+            error,
+            RenderError::MapTooLarge {
+                needed: 300,
+                limit: 128
+            }
+        ));
+        let told = error.to_string();
+        for part in ["300 bytes", "at most 128", "--backend cpu"] {
+            assert!(told.contains(part), "{told}");
+        }
     }
 }
