@@ -8,10 +8,12 @@ use serde::{Deserialize, Serialize};
 
 use super::GroundClassifier;
 use super::features::{FeatureConfig, Features, Scene};
-use super::inference::{FuzzySystem, Inference, Operators};
-use super::membership::Membership;
+use super::inference::{FuzzySystem, Inference};
+use super::membership::{Membership, Operators};
 use super::rules::{RuleError, Vocabulary};
 
+/// Points that are judged together.
+const BLOCK: usize = 32;
 /// The output variable of the rules.
 const OUTPUT: &str = "ground";
 
@@ -197,7 +199,7 @@ impl FuzzyGround {
     /// The features of every point; `None` for points that are not finite, under the car or too
     /// far away.
     pub fn features(&self, points: &[Vec3]) -> Vec<Option<Features>> {
-        Scene::new(points, &self.config.features).map(|features| features)
+        Scene::new(points, &self.config.features).features()
     }
 
     /// The confidence that a point with these features is ground, 0 to 1.
@@ -279,8 +281,8 @@ impl FuzzyGround {
 
 impl GroundClassifier for FuzzyGround {
     fn ground_confidence(&self, points: &[Vec3]) -> Vec<f32> {
-        Scene::new(points, &self.config.features)
-            .map(|features| features.map_or(0.0, |features| self.confidence(&features)))
+        let scene = Scene::new(points, &self.config.features);
+        scene.judge::<BLOCK>(|features| self.system.infer_block(features))
     }
 }
 
