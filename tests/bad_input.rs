@@ -7,6 +7,8 @@ mod common;
 
 use std::fs;
 
+use ::fpmcl::evaluation::LocalizationResults;
+use ::fpmcl::localization::State;
 use common::{Recording, fpmcl};
 
 /// A recording with its map.
@@ -105,8 +107,9 @@ fn a_recording_of_nothing_but_empty_scans_is_told() {
     }
     recording.fpmcl("build-map").fails_saying(&[
         "frames 0 to 2",
-        "0 points",
-        "check crop box and ranges",
+        "too few points",
+        "no triangles",
+        "check range_image",
     ]);
     assert!(!recording.path("map.ply").exists());
 }
@@ -280,4 +283,106 @@ fn refining_other_frames_than_were_localized_is_told() {
         .fpmcl("refine")
         .set("frame_step", "2")
         .fails_saying(&["4 frames, of which 2 are selected", "frame_step"]);
+}
+
+#[test]
+fn a_broken_scan_in_the_middle_loses_no_frame_before_it() {
+    let recording = mapped(8);
+    fs::write(recording.path("velodyne/000005.bin"), [0; 21]).unwrap();
+    let said = recording.fpmcl("localize").exits_with(1);
+    for part in [
+        "000005.bin",
+        "5 of 8 frames are localized and kept in results",
+    ] {
+        assert!(said.stderr.contains(part), "{}", said.stderr);
+    }
+    let rows = String::from_utf8(recording.bytes("results/mcl_tum.txt")).unwrap();
+    assert_eq!(rows.lines().count(), 5);
+}
+
+#[test]
+fn a_picture_that_cannot_be_drawn_costs_no_frame() {
+    let recording = mapped(4);
+    fs::create_dir(recording.path("results")).unwrap();
+    recording.write("results/loc_plots", "a file where a folder belongs");
+    let said = recording
+        .fpmcl("localize")
+        .set("visualize", "True")
+        .exits_with(1);
+    for part in [
+        "loc_plots",
+        "1 of 4 frames are localized and kept in results",
+    ] {
+        assert!(said.stderr.contains(part), "{}", said.stderr);
+    }
+    assert!(recording.path(RESULT).exists());
+}
+
+#[test]
+fn a_result_beside_another_is_told_and_a_new_one_takes_all_of_the_old_away() {
+    let recording = localized(4);
+    recording
+        .fpmcl("localize")
+        .set("result_path", "results/other.npz")
+        .fails_saying(&["report.json", "another result", "result_path", "--force"]);
+    recording.fpmcl("refine").succeeds();
+    assert!(recording.path("results/refined_tum.txt").exists());
+    recording.fpmcl("localize").with("--force").succeeds();
+    for name in ["refined_tum.txt", "refined_kitti.txt", "refinement.yml"] {
+        assert!(!recording.path("results").join(name).exists(), "{name}");
+    }
+}
+
+#[test]
+fn frames_without_ground_below_keep_what_the_filter_said() {
+    let recording = localized(6);
+    let map = recording.bytes("map.ply");
+    fs::write(recording.path("elsewhere.ply"), moved_aside(&map)).unwrap();
+    let said = recording
+        .fpmcl("refine")
+        .set("map_file", "elsewhere.ply")
+        .succeeds();
+    let told = "frames are as they were localized, only smoothed";
+    assert!(said.stderr.contains(told), "{}", said.stderr);
+    let results = LocalizationResults::read(&recording.path(RESULT)).unwrap();
+    let (estimates, refined) = (results.estimates.unwrap(), results.refined.unwrap());
+    let sure = results
+        .states
+        .unwrap()
+        .into_iter()
+        .map(|state| state == State::Tracking as u8);
+    let off_m: Vec<f64> = (estimates.iter().zip(&refined))
+        .map(|(estimate, refined)| {
+            (estimate.translation.vector - refined.translation.vector).norm()
+        })
+        .zip(sure)
+        .filter_map(|(off_m, is_sure)| is_sure.then_some(off_m))
+        .collect();
+    assert!(off_m.len() >= 2, "{off_m:?}");
+    assert!(off_m.iter().all(|&off_m| off_m < 0.1), "{off_m:?}");
+}
+
+/// A map of our own making 500 m to the left of where it is.
+fn moved_aside(ply: &[u8]) -> Vec<u8> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("map.ply");
+    fs::write(&path, ply).unwrap();
+    let mut mesh = ::fpmcl::map::ply::read(&path).unwrap();
+    for vertex in &mut mesh.vertices {
+        vertex.y += 500.0;
+    }
+    ::fpmcl::map::ply::write(&path, &mesh).unwrap();
+    fs::read(&path).unwrap()
+}
+
+#[test]
+fn a_map_without_any_surface_is_refused() {
+    let recording = mapped(3);
+    recording.write(
+        "map.ply",
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n2 0 0\n3 0 1 2\n",
+    );
+    recording
+        .fpmcl("localize")
+        .fails_saying(&["map_file is map.ply", "none of its 1 triangles has an area"]);
 }

@@ -8,11 +8,12 @@ use std::path::Path;
 
 use common::{Recording, fpmcl};
 
-const COMMANDS: [&str; 8] = [
+const COMMANDS: [&str; 9] = [
     "build-map",
     "localize",
     "refine",
     "evaluate",
+    "compare",
     "simulate",
     "demo",
     "ground",

@@ -120,7 +120,7 @@ fn a_comparison_is_done_once_and_goes_on_where_it_was() {
     // Another configuration is another run, and tables do not mix the two.
     let other = compare(&recording)
         .set("seeds", "[1]")
-        .set("base.localization.numParticles", "60");
+        .set("base.build_map.voxel_size", "0.25");
     other
         .with("--collect")
         .fails_saying(&["no run is finished"]);

@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use super::interrupt::Interrupted;
 use super::run_output::{self, Movie, RunFiles};
 use super::stages::{LoadedMap, Observer};
-use super::{Context, input, odometry, output, run_page};
+use super::{Context, input, odometry, run_page};
 use crate::config::{self, Initialization, LocalizationConfig, MotionModel};
 use crate::evaluation::{LocalizationResults, ParticleLog, RangeMclRules, Report};
 use crate::geometry::{Pose2, Pose3, planar};
@@ -39,7 +39,10 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     input::require_folder("scan_folder", &config.scan_folder)?;
     input::require_file("pose_file", &config.pose_file)?;
     input::require_file("calib_file", &config.calib_file)?;
-    output::prepare(&config.result_path, "result_path", config.force)?;
+    let files = RunFiles::beside(&config.result_path);
+    if config.save_result {
+        run_output::prepare(&files, "result_path", config.force)?;
+    }
     let map = LoadedMap::load(
         &config.map_file,
         &config.map_pose_file,
@@ -53,7 +56,6 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         &config.calib_file,
         &config.selection(),
     )?;
-    let files = RunFiles::beside(&config.result_path);
     let increments = odometry::read_increments(
         config.odometry,
         config.odometry_file.as_deref(),
@@ -66,7 +68,8 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         results,
         lifted,
         refined,
-        failure,
+        movie,
+        mut failure,
     } = run;
     let about = about(config, context, &map);
     if config.save_result {
@@ -74,9 +77,12 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         run_output::write_trajectory(&files, "mcl", &sequence, &lifted)?;
         if config.refine {
             run_output::write_trajectory(&files, "refined", &sequence, &refined)?;
+        } else {
+            run_output::remove_refined(&files)?;
         }
         config::write(&files.file("localization.yml"), config)?;
     }
+    tell_of_doubt(&results);
     let report = run_output::judge(&results, &RangeMclRules::default(), about)?;
     if config.save_result {
         run_output::write_report(&files, &results, &report)?;
@@ -88,7 +94,13 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     if config.save_result {
         run_page::write(&files, &report)?;
     }
-    if results.len() == sequence.frames.len() {
+    if let Some(movie) = movie
+        && let Err(error) = movie.finish()
+    {
+        failure.get_or_insert(error);
+    }
+    let is_whole = results.len() == sequence.frames.len();
+    if is_whole && failure.is_none() {
         return Ok(report);
     }
     let (found, all) = (results.len(), sequence.frames.len());
@@ -113,6 +125,32 @@ struct Run {
     refined: Vec<Pose3>,
     /// Why it did not come to the end, unless that was wished.
     failure: Option<anyhow::Error>,
+    /// The pictures of the frames, if they are wanted.
+    movie: Option<Movie>,
+}
+
+/// Says where the filter was not sure.
+fn tell_of_doubt(results: &LocalizationResults) {
+    let states = results.states.as_deref().unwrap_or_default();
+    let is_sure = |state: &u8| *state == State::Tracking as u8;
+    match states.iter().position(is_sure) {
+        None => tracing::warn!(
+            "the filter was not sure of any of {} frames: the car is perhaps not in the map, or did not drive far enough to tell",
+            states.len()
+        ),
+        Some(first) => {
+            let doubtful = states[first..]
+                .iter()
+                .filter(|&state| !is_sure(state))
+                .count();
+            if doubtful > 0 {
+                tracing::warn!(
+                    "the filter lost its way in {doubtful} of {} frames; frames.csv has the state of each",
+                    states.len()
+                );
+            }
+        }
+    }
 }
 
 /// Runs the filter over the frames, as far as it comes; an error only where no frame was finished.
@@ -157,7 +195,7 @@ fn localize(
         task.advance(1);
     }
     drop(task);
-    let run = recorder.finish(failure)?;
+    let run = recorder.finish(failure);
     match (run.results.is_empty(), run.failure) {
         (false, failure) => Ok(Run { failure, ..run }),
         (true, Some(failure)) => Err(failure),
@@ -440,16 +478,14 @@ impl Recorder {
         Ok(())
     }
 
-    fn finish(self, failure: Option<anyhow::Error>) -> Result<Run> {
-        if let Some(movie) = self.movie.filter(|_| !self.lifted.is_empty()) {
-            movie.finish()?;
-        }
-        Ok(Run {
+    fn finish(self, failure: Option<anyhow::Error>) -> Run {
+        Run {
             results: self.results,
             lifted: self.lifted,
             refined: self.refined,
             failure,
-        })
+            movie: self.movie,
+        }
     }
 }
 

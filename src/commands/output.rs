@@ -62,7 +62,11 @@ pub fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<()>) -> 
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(".part");
     let part = path.with_file_name(name);
-    write(&part)?;
+    if let Err(error) = write(&part) {
+        // What is left of it is worth nothing, and may be what fills the disk.
+        let _ = fs::remove_file(&part);
+        return Err(error).with_context(|| format!("writing {}", path.display()));
+    }
     fs::rename(&part, path).with_context(|| format!("cannot write {}", path.display()))
 }
 

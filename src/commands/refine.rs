@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use anyhow::{Context as _, Result, ensure};
-use nalgebra::Matrix3;
+use nalgebra::{Matrix3, Vector3};
 use rand::SeedableRng as _;
 use rand_chacha::ChaCha8Rng;
 
@@ -113,8 +113,10 @@ fn matching(
 /// A frame after the swarm and the finishing step.
 struct Polished {
     pose: Pose2,
-    /// What the frame says about its pose; nothing before convergence.
+    /// What the frame says about its pose; nothing where the filter was not sure.
     prior: Option<FramePrior>,
+    /// Whether the scan was laid onto the map.
+    is_refined: bool,
     stance: Stance,
     seconds: f64,
 }
@@ -144,9 +146,7 @@ fn polish_all(
             );
             return Err(Interrupted { kept }.into());
         }
-        let before = polished
-            .last()
-            .map(|last| (last.stance, last.prior.is_some()));
+        let before = polished.last().map(|last| (last.stance, last.is_refined));
         let start = Start {
             estimate: estimates[row],
             covariance: results.covariances.as_ref().map(|all| all[row]),
@@ -160,7 +160,16 @@ fn polish_all(
         task.advance(1);
     }
     if skipped > 0 {
-        tracing::info!("{skipped} frames before convergence are not refined, only smoothed");
+        tracing::info!(
+            "{skipped} frames in which the filter was not sure are not refined, only smoothed"
+        );
+    }
+    let refined = polished.iter().filter(|frame| frame.is_refined).count();
+    let unmapped = polished.len() - refined - skipped;
+    if unmapped > 0 {
+        tracing::warn!(
+            "{unmapped} frames are as they were localized, only smoothed: there is no ground of the map under the car, or nothing to see in the scan"
+        );
     }
     Ok(polished)
 }
@@ -170,6 +179,14 @@ struct Start {
     estimate: Pose2,
     covariance: Option<Matrix3<f64>>,
     is_found: bool,
+}
+
+impl Start {
+    /// What the filter said; where it says nothing, 0.2 m and 0.6 degrees.
+    fn covariance(&self) -> Matrix3<f64> {
+        self.covariance
+            .unwrap_or_else(|| Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 1e-4)))
+    }
 }
 
 /// Whether the filter was sure; results that do not say are taken at their word.
@@ -220,26 +237,30 @@ fn polish(
             stance,
             difference: observation.difference(),
         };
-        let covariance = start
-            .covariance
-            .unwrap_or_else(|| Matrix3::from_diagonal(&nalgebra::Vector3::new(0.04, 0.04, 1e-4)));
         refine_frame(
             &objective,
             &start.estimate,
-            &covariance,
+            &start.covariance(),
             &config.refinement,
             &mut rng,
         )?
     } else {
         None
     };
+    // Where there was nothing to refine with, the filter's word stands.
+    let localized = FramePrior {
+        pose: start.estimate,
+        covariance: start.covariance(),
+    };
+    let refined_prior = refined.as_ref().map(|frame| FramePrior {
+        pose: frame.pose,
+        covariance: frame.covariance,
+    });
     Ok(Polished {
+        is_refined: refined.is_some(),
         stance: refined.as_ref().map_or(stance, |frame| frame.stance),
         pose: refined.as_ref().map_or(start.estimate, |frame| frame.pose),
-        prior: refined.map(|frame| FramePrior {
-            pose: frame.pose,
-            covariance: frame.covariance,
-        }),
+        prior: refined_prior.or(start.is_found.then_some(localized)),
         seconds: started.elapsed().as_secs_f64(),
     })
 }

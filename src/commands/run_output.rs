@@ -3,8 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, bail};
 
+use super::output;
 use super::stages::LoadedMap;
 use crate::evaluation::{
     Judged, LocalizationResults, MetricsConfig, ParticleRow, PlanarError, RangeMclRules, Report,
@@ -63,6 +64,45 @@ impl RunFiles {
     }
 }
 
+/// What lies beside a result under the same name whatever the result is called.
+const OF_A_RESULT: [&str; 3] = ["report.json", "mcl_tum.txt", "frames.csv"];
+
+/// What `refine` adds to a result.
+const OF_REFINED: [&str; 4] = [
+    "refined_tum.txt",
+    "refined_kitti.txt",
+    "refined_poses.npy",
+    "refinement.yml",
+];
+
+/// Makes sure, before any work is done, that a result can be written without losing another one:
+/// neither its own file nor those beside it, of a result with another name.
+pub fn prepare(files: &RunFiles, key: &str, force: bool) -> Result<()> {
+    output::prepare(&files.result, key, force)?;
+    let foreign = OF_A_RESULT
+        .iter()
+        .map(|name| files.file(name))
+        .find(|path| path.exists());
+    match foreign {
+        Some(path) if !force && !files.result.exists() => bail!(
+            "{} exists and belongs to another result; give {key} a folder of its own, or add --force to replace what lies there",
+            path.display()
+        ),
+        _ => Ok(()),
+    }
+}
+
+/// Removes what `refine` said of an earlier result.
+pub fn remove_refined(files: &RunFiles) -> Result<()> {
+    for path in OF_REFINED.map(|name| files.file(name)) {
+        if path.exists() {
+            std::fs::remove_file(&path)
+                .with_context(|| format!("cannot remove {}", path.display()))?;
+        }
+    }
+    Ok(())
+}
+
 /// Particles as they are stored.
 pub fn rows_of(particles: &ParticleSet) -> Vec<ParticleRow> {
     particles
@@ -97,14 +137,17 @@ pub fn write_trajectory(
             ..frame.stamped()
         })
         .collect();
-    write_tum(&files.file(&format!("{name}_tum.txt")), &trajectory)?;
-    write_kitti(
-        &files.file(&format!("{name}_kitti.txt")),
-        map_from_lidar,
-        &sequence.frame.world_from_first_cam0,
-        &sequence.frame.calibration,
-    )?;
-    Ok(())
+    output::replace(&files.file(&format!("{name}_tum.txt")), |path| {
+        Ok(write_tum(path, &trajectory)?)
+    })?;
+    output::replace(&files.file(&format!("{name}_kitti.txt")), |path| {
+        Ok(write_kitti(
+            path,
+            map_from_lidar,
+            &sequence.frame.world_from_first_cam0,
+            &sequence.frame.calibration,
+        )?)
+    })
 }
 
 /// Writes the `.npz`, and the poses as plain arrays for other programs.

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, ensure};
 
 use super::Context;
 use crate::config::BuildMapConfig;
@@ -60,6 +60,13 @@ impl LoadedMap {
             .context("map_pose_file and map_calib_file say where the map is")?;
         let mapping_poses = crate::kitti::poses::CameraPoses::read(map_pose_file)?
             .map_from_lidar(&frame.calibration);
+        ensure!(
+            (0..mesh.triangles.len())
+                .any(|triangle| mesh.scaled_normal(triangle) != glam::Vec3::ZERO),
+            "map_file is {}, and none of its {} triangles has an area: there is nothing that a beam could meet",
+            map_file.display(),
+            mesh.triangles.len()
+        );
         let grid = TileGrid::around(&mapping_poses, &TileConfig::default());
         let ground = ground_of(&mesh);
         let mut renderer = renderer(&tiles::cut(&mesh, &grid), context)?;

@@ -13,9 +13,9 @@ use crate::kitti::Selection;
 pub struct EvaluationConfig {
     /// The result of `localize`, of `refine` or of range-mcl.
     pub result_file: PathBuf,
-    /// Camera poses of the recording.
+    /// Camera poses of the recording, for results that hold no ground truth, as those of range-mcl.
     pub pose_file: PathBuf,
-    /// Calibration of the recording, with its line `Tr`.
+    /// Calibration of the recording, with its line `Tr`, for the same results.
     pub calib_file: PathBuf,
     /// Whether the trajectory is drawn.
     pub plot_loc_traj: bool,

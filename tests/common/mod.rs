@@ -91,8 +91,9 @@ impl Fpmcl {
         said
     }
 
+    /// Runs and expects an exit code.
     #[track_caller]
-    fn exits_with(mut self, code: i32) -> Said {
+    pub fn exits_with(mut self, code: i32) -> Said {
         let folder = self.in_folder.as_deref().unwrap_or(self.folder.path());
         let output = self.command.current_dir(folder).output().unwrap();
         let said = Said {

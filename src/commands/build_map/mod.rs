@@ -1,6 +1,7 @@
 //! `build-map`: from scans with poses to a triangle-mesh map.
 
 mod parts;
+mod report;
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -9,45 +10,24 @@ use std::sync::Mutex;
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
-use serde::Serialize;
 
 use self::parts::Parts;
+pub use self::report::BuildReport;
 use super::interrupt::Interrupted;
 use super::{Context, input, output, stages};
 use crate::config::{self, BuildMapConfig};
-use crate::geometry::{TriangleMesh, planar};
-
+use crate::geometry::{Pose2, TriangleMesh, planar};
 use crate::kitti::{Frame, Sequence};
 use crate::map::local_map::{self, LocalMapCounts, LocalMapError, Watcher};
 use crate::map::plan::{self, LocalMapPlan, Ownership};
 use crate::map::ply;
-use crate::map::quality::{self, MapQuality};
-use crate::plotting::MapPlot;
+use crate::map::quality::{self, BeamResidual, MapQuality};
+use crate::map::truth::TruthAgreement;
+use crate::plotting::color::Colormap;
+use crate::plotting::{MapPlot, ScalarMapPlot};
 
-/// What a build did, as it stands in the report.
-#[derive(Debug, Serialize)]
-pub struct BuildReport {
-    /// Frames that were looked at.
-    pub frames: usize,
-    /// Frames in which the car had moved, and which are not held back.
-    pub mapped_frames: usize,
-    /// Frames held back for judging the map.
-    pub held_out_frames: usize,
-    /// Path of the mapped frames [m].
-    pub path_m: f64,
-    /// Triangles of the map.
-    pub triangles: usize,
-    /// Size of the map's file [MB].
-    pub map_mb: f64,
-    /// Wall time of the whole build [s].
-    pub seconds: f64,
-    /// Wall time per stage, summed over the local maps made in this run [s].
-    pub stage_seconds: BTreeMap<String, f64>,
-    /// The map along the beams of the frames held back.
-    pub quality: Option<MapQuality>,
-    /// What happened to points and triangles, per local map.
-    pub local_maps: Vec<LocalMapCounts>,
-}
+/// Residual at the end of the colour bar [m].
+const PICTURE_LIMIT_M: f64 = 0.2;
 
 /// Builds the map that a configuration describes.
 pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
@@ -55,6 +35,9 @@ pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
     input::require_folder("scan_folder", &config.scan_folder)?;
     input::require_file("pose_file", &config.pose_file)?;
     input::require_file("calib_file", &config.calib_file)?;
+    if let Some(path) = &config.truth_mesh {
+        input::require_file("truth_mesh", path)?;
+    }
     output::prepare(&config.mesh_file, "mesh_file", config.force)?;
     let mut sequence = Sequence::open(
         &config.scan_folder,
@@ -77,29 +60,32 @@ pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
         quality::residuals(&mesh, &held_out, &settings.scan)
     })?;
     write_map(config, &mesh)?;
+    let truth = match &config.truth_mesh {
+        Some(path) => clock.time("truth", || -> Result<_> {
+            let surface = ply::read(path)?;
+            Ok(TruthAgreement::of(&mesh, &surface, &mapped, &settings.scan))
+        })?,
+        None => None,
+    };
     if config.visualize {
-        let picture = beside(&config.mesh_file, "png");
-        let driven: Vec<_> = mapped.iter().map(|f| planar(&f.map_from_lidar)).collect();
-        MapPlot {
-            title: "Map from above",
-            mesh: &mesh,
-            trajectory: Some(&driven),
-            ground_color: settings.ground_color,
-            rest_color: settings.rest_color,
-        }
-        .save(&picture)?;
-        tracing::info!("drew {}", picture.display());
+        draw(config, &mesh, &mapped, &residuals)?;
     }
+    let path_m = path_m(&mapped);
+    let map_mb = std::fs::metadata(&config.mesh_file).map_or(0.0, |meta| meta.len() as f64 / 1e6);
+    let per_100m = |amount: f64| 100.0 * amount / path_m.max(1.0);
     let report = BuildReport {
         frames: sequence.frames.len(),
         mapped_frames: mapped.len(),
         held_out_frames: held_out.len(),
-        path_m: path_m(&mapped),
+        path_m,
         triangles: mesh.triangles.len(),
-        map_mb: std::fs::metadata(&config.mesh_file).map_or(0.0, |meta| meta.len() as f64 / 1e6),
+        map_mb,
+        triangles_per_100m: per_100m(mesh.triangles.len() as f64),
+        mb_per_100m: per_100m(map_mb),
         seconds: started.elapsed().as_secs_f64(),
         stage_seconds: clock.seconds(),
         quality: MapQuality::of(&residuals),
+        truth,
         local_maps,
     };
     output::write_json(&beside(&config.mesh_file, "report.json"), &report)?;
@@ -147,6 +133,13 @@ fn build_parts(
         let built = local_map::build(frames, plan, &ownership, &settings, &*classifier, &watcher);
         clock.end();
         let (mesh, counts) = built.map_err(|error| told(error, all.len(), plans.len(), parts))?;
+        if counts.is_empty {
+            tracing::warn!(
+                "frames {} to {} have too few points to mesh: the map has a hole there",
+                frames[plan.own.start].number,
+                frames[plan.own.end - 1].number
+            );
+        }
         parts.save(plan.number, &mesh, &counts)?;
         all.push(counts);
     }
@@ -184,6 +177,7 @@ fn hold_out(frames: &[Frame], config: &BuildMapConfig) -> (Vec<Frame>, Vec<Frame
 fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
     let relevant = BuildMapConfig {
         mesh_file: PathBuf::new(),
+        truth_mesh: None,
         visualize: false,
         force: false,
         ..config.clone()
@@ -202,6 +196,43 @@ fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
         )?;
     }
     Ok(text)
+}
+
+/// Draws the map from above, and where beams were judged also how well they agree with it.
+fn draw(
+    config: &BuildMapConfig,
+    mesh: &TriangleMesh,
+    mapped: &[Frame],
+    residuals: &[BeamResidual],
+) -> Result<()> {
+    let settings = config.local_map_settings();
+    let driven: Vec<Pose2> = mapped.iter().map(|f| planar(&f.map_from_lidar)).collect();
+    let picture = beside(&config.mesh_file, "png");
+    MapPlot {
+        title: "Map from above",
+        mesh,
+        trajectory: Some(&driven),
+        ground_color: settings.ground_color,
+        rest_color: settings.rest_color,
+    }
+    .save(&picture)?;
+    tracing::info!("drew {}", picture.display());
+    if residuals.is_empty() {
+        return Ok(());
+    }
+    let picture = beside(&config.mesh_file, "residuals.png");
+    ScalarMapPlot {
+        title: "Distance of held-back beams to the surface that they hit",
+        mesh,
+        values: &quality::vertex_residuals(mesh, residuals),
+        value_name: "mean beam-plane distance [m]",
+        limits: (0.0, PICTURE_LIMIT_M),
+        colormap: Colormap::Viridis,
+        trajectory: Some(&driven),
+    }
+    .save(&picture)?;
+    tracing::info!("drew {}", picture.display());
+    Ok(())
 }
 
 /// Writes the map under a temporary name and renames it.
@@ -275,45 +306,5 @@ impl StageClock {
         self.state
             .lock()
             .map_or_else(|_poisoned| BTreeMap::new(), |state| state.seconds.clone())
-    }
-}
-
-impl BuildReport {
-    /// The table on standard output.
-    pub fn table(&self) -> String {
-        let mut rows = vec![
-            (
-                "scans",
-                format!("{} of {}", self.mapped_frames, self.frames),
-            ),
-            ("path", format!("{:.1} m", self.path_m)),
-            ("time", format!("{:.1} s", self.seconds)),
-            (
-                "rate",
-                format!("{:.1} scans/s", self.mapped_frames as f64 / self.seconds),
-            ),
-            ("triangles", self.triangles.to_string()),
-            ("size", format!("{:.1} MB", self.map_mb)),
-        ];
-        if let Some(quality) = &self.quality {
-            let percent = |share: f64| format!("{:.1} %", 100.0 * share);
-            rows.extend([
-                ("beams judged", quality.beams.to_string()),
-                ("early", percent(quality.early)),
-                ("late", percent(quality.late)),
-                ("miss", percent(quality.miss)),
-                (
-                    "beam-plane median",
-                    format!("{:.1} cm", 100.0 * quality.beam_plane_median_m),
-                ),
-                (
-                    "beam-plane within 10 cm",
-                    percent(quality.beam_plane_within_10cm),
-                ),
-            ]);
-        }
-        rows.iter()
-            .map(|(name, value)| format!("{name:<24} {value:>14}\n"))
-            .collect()
     }
 }
