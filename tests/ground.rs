@@ -67,7 +67,9 @@ fn a_point_is_explained_by_the_rules_that_fired() {
         said
     };
     let road = explained(fpmcl::simulation::classes::ROAD, -3.0);
-    assert!(road.contains("IF height IS level AND slope IS gentle THEN ground IS high"));
+    assert!(road.contains(
+        "IF height IS level AND slope IS gentle AND curvature IS NOT sharp THEN ground IS high"
+    ));
     assert!(
         road.contains("ly ground") && !road.contains("not ground"),
         "{road}"

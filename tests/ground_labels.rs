@@ -40,7 +40,7 @@ fn held_out_score(classifier: &dyn GroundClassifier) -> Option<GroundScore> {
 }
 
 #[test]
-fn four_features_reach_the_specialists_and_three_come_close() {
+fn four_features_surpass_the_specialists_and_three_come_close() {
     let fuzzy = |config| held_out_score(&FuzzyGround::new(config).unwrap());
     let (Some(four), Some(three)) = (
         fuzzy(FuzzyConfig::default()),
@@ -48,9 +48,9 @@ fn four_features_reach_the_specialists_and_three_come_close() {
     ) else {
         return;
     };
-    assert!(four.f1() >= 0.989, "{four:?} {}", four.f1());
+    assert!(four.f1() >= 0.990, "{four:?} {}", four.f1());
     assert!(four.precision() > 0.98 && four.recall() > 0.98, "{four:?}");
-    assert!(three.f1() >= 0.970, "{three:?} {}", three.f1());
+    assert!(three.f1() >= 0.973, "{three:?} {}", three.f1());
 
     let baselines: [&dyn GroundClassifier; 3] =
         [&PcaGround::default(), &RansacGround::default(), &ReportRule];

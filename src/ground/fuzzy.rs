@@ -8,10 +8,12 @@ use serde::{Deserialize, Serialize};
 
 use super::GroundClassifier;
 use super::features::{FeatureConfig, Features, Scene};
-use super::inference::{FuzzySystem, Inference, Operators};
-use super::membership::Membership;
+use super::inference::{FuzzySystem, Inference};
+use super::membership::{Membership, Operators};
 use super::rules::{RuleError, Vocabulary};
 
+/// Points that are judged together.
+const BLOCK: usize = 32;
 /// The output variable of the rules.
 const OUTPUT: &str = "ground";
 
@@ -37,35 +39,39 @@ pub struct FuzzyConfig {
 }
 
 impl Default for FuzzyConfig {
-    /// Four features; fixed on the even-numbered of 21 labelled scans.
+    /// Four features; fixed on the even-numbered of 21 labelled scans and on simulated streets.
     fn default() -> Self {
         Self {
             features: FeatureConfig::default(),
             operators: Operators::MinMax,
             inference: Inference::Mamdani,
             variables: vocabulary(&[
-                ("slope", "gentle", Membership::LeftShoulder([15.0, 19.0])),
-                ("slope", "moderate", Membership::Triangle([15.0, 19.0, 80.0])),
-                ("slope", "steep", Membership::RightShoulder([19.0, 80.0])),
-                ("height_variance", "low", Membership::LeftShoulder([0.015, 0.1])),
-                ("height_variance", "medium", Membership::Triangle([0.015, 0.1, 0.19])),
-                ("height_variance", "high", Membership::RightShoulder([0.1, 0.19])),
-                ("curvature", "flat", Membership::LeftShoulder([19.0, 24.5])),
-                ("curvature", "curved", Membership::Triangle([19.0, 24.5, 72.0])),
-                ("curvature", "sharp", Membership::RightShoulder([24.5, 72.0])),
-                ("height", "level", Membership::LeftShoulder([0.025, 0.093])),
-                ("height", "raised", Membership::Triangle([0.025, 0.093, 0.6])),
-                ("height", "above", Membership::RightShoulder([0.093, 0.6])),
+                ("slope", "gentle", Membership::LeftShoulder([13.0, 23.0])),
+                ("slope", "moderate", Membership::Triangle([13.0, 23.0, 100.0])),
+                ("slope", "steep", Membership::RightShoulder([23.0, 100.0])),
+                ("height_variance", "low", Membership::LeftShoulder([0.01, 0.11])),
+                ("height_variance", "medium", Membership::Triangle([0.01, 0.11, 0.4])),
+                ("height_variance", "high", Membership::RightShoulder([0.11, 0.4])),
+                ("curvature", "flat", Membership::LeftShoulder([12.0, 55.0])),
+                ("curvature", "curved", Membership::Triangle([12.0, 55.0, 65.0])),
+                ("curvature", "sharp", Membership::RightShoulder([55.0, 65.0])),
+                ("height", "sunken", Membership::LeftShoulder([-0.45, -0.15])),
+                ("height", "level", Membership::Trapezoid([-0.45, -0.15, 0.03, 0.11])),
+                ("height", "raised", Membership::Triangle([0.03, 0.11, 0.22])),
+                ("height", "above", Membership::RightShoulder([0.11, 0.22])),
             ]),
             rules: [
-                "IF height IS level AND slope IS gentle THEN ground IS high",
-                "IF height IS level AND slope IS moderate AND curvature IS NOT sharp THEN ground IS high",
-                "IF height IS level AND slope IS moderate AND curvature IS sharp THEN ground IS medium",
+                "IF height IS level AND slope IS gentle AND curvature IS NOT sharp THEN ground IS high",
+                "IF height IS level AND slope IS moderate AND curvature IS flat THEN ground IS high",
+                "IF height IS level AND slope IS moderate AND curvature IS curved THEN ground IS medium",
                 "IF height IS level AND slope IS steep AND height_variance IS low THEN ground IS high",
                 "IF height IS level AND slope IS steep AND height_variance IS NOT low THEN ground IS low",
-                "IF height IS level AND slope IS gentle AND height_variance IS high THEN ground IS high",
-                "IF height IS raised AND slope IS gentle AND curvature IS flat THEN ground IS high",
-                "IF height IS raised AND slope IS gentle AND curvature IS NOT flat THEN ground IS low",
+                "IF height IS level AND curvature IS sharp THEN ground IS low",
+                "IF height IS sunken AND slope IS gentle THEN ground IS high",
+                "IF height IS sunken AND slope IS NOT gentle THEN ground IS low",
+                "IF height IS raised AND slope IS gentle AND curvature IS flat AND height_variance IS NOT high THEN ground IS high",
+                "IF height IS raised AND height_variance IS high THEN ground IS low",
+                "IF height IS raised AND curvature IS NOT flat THEN ground IS low",
                 "IF height IS raised AND slope IS NOT gentle THEN ground IS low",
                 "IF height IS above THEN ground IS low",
             ]
@@ -82,24 +88,25 @@ impl FuzzyConfig {
     pub fn three_features() -> Self {
         Self {
             variables: vocabulary(&[
-                ("slope", "gentle", Membership::LeftShoulder([6.0, 16.0])),
-                ("slope", "moderate", Membership::Triangle([6.0, 16.0, 75.0])),
-                ("slope", "steep", Membership::RightShoulder([16.0, 75.0])),
-                ("height_variance", "low", Membership::LeftShoulder([0.05, 0.18])),
-                ("height_variance", "medium", Membership::Triangle([0.05, 0.18, 1.2])),
-                ("height_variance", "high", Membership::RightShoulder([0.18, 1.2])),
-                ("curvature", "flat", Membership::LeftShoulder([11.0, 29.0])),
-                ("curvature", "curved", Membership::Triangle([11.0, 29.0, 75.0])),
-                ("curvature", "sharp", Membership::RightShoulder([29.0, 75.0])),
+                ("slope", "gentle", Membership::LeftShoulder([3.0, 16.0])),
+                ("slope", "moderate", Membership::Triangle([3.0, 16.0, 100.0])),
+                ("slope", "steep", Membership::RightShoulder([16.0, 100.0])),
+                ("height_variance", "low", Membership::LeftShoulder([0.08, 0.21])),
+                ("height_variance", "medium", Membership::Triangle([0.08, 0.21, 0.9])),
+                ("height_variance", "high", Membership::RightShoulder([0.21, 0.9])),
+                ("curvature", "flat", Membership::LeftShoulder([25.0, 50.0])),
+                ("curvature", "curved", Membership::Triangle([25.0, 50.0, 65.0])),
+                ("curvature", "sharp", Membership::RightShoulder([50.0, 65.0])),
             ]),
             rules: [
-                "IF slope IS gentle AND height_variance IS low THEN ground IS high",
-                "IF slope IS moderate AND height_variance IS low AND curvature IS NOT sharp THEN ground IS high",
-                "IF slope IS moderate AND height_variance IS low AND curvature IS sharp THEN ground IS medium",
-                "IF slope IS steep THEN ground IS low",
-                "IF slope IS gentle AND curvature IS flat AND height_variance IS medium THEN ground IS high",
+                "IF slope IS gentle AND height_variance IS low AND curvature IS NOT sharp THEN ground IS high",
+                "IF slope IS moderate AND height_variance IS low AND curvature IS flat THEN ground IS high",
+                "IF slope IS moderate AND height_variance IS low AND curvature IS NOT flat THEN ground IS medium",
+                "IF slope IS gentle AND height_variance IS medium AND curvature IS flat THEN ground IS high",
                 "IF slope IS moderate AND height_variance IS medium THEN ground IS low",
                 "IF curvature IS NOT flat AND height_variance IS medium THEN ground IS low",
+                "IF curvature IS sharp THEN ground IS low",
+                "IF slope IS steep THEN ground IS low",
                 "IF height_variance IS high THEN ground IS low",
             ]
             .map(str::to_owned)
@@ -197,7 +204,7 @@ impl FuzzyGround {
     /// The features of every point; `None` for points that are not finite, under the car or too
     /// far away.
     pub fn features(&self, points: &[Vec3]) -> Vec<Option<Features>> {
-        Scene::new(points, &self.config.features).map(|features| features)
+        Scene::new(points, &self.config.features).features()
     }
 
     /// The confidence that a point with these features is ground, 0 to 1.
@@ -279,8 +286,8 @@ impl FuzzyGround {
 
 impl GroundClassifier for FuzzyGround {
     fn ground_confidence(&self, points: &[Vec3]) -> Vec<f32> {
-        Scene::new(points, &self.config.features)
-            .map(|features| features.map_or(0.0, |features| self.confidence(&features)))
+        let scene = Scene::new(points, &self.config.features);
+        scene.judge::<BLOCK>(|features| self.system.infer_block(features))
     }
 }
 

@@ -11,19 +11,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::membership::Membership;
+use super::centroid::{Centroids, UNKNOWN};
+use super::membership::{Membership, Operators};
 use super::rules::{self, Names, Rule, RuleError, Vocabulary};
-
-/// How AND, OR and implication are computed.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Operators {
-    /// AND is the smaller degree, OR the larger.
-    #[default]
-    MinMax,
-    /// AND is the product, OR the probabilistic sum.
-    Product,
-}
 
 /// How the rules' strengths become a number.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -38,14 +28,6 @@ pub enum Inference {
 
 /// The most sets that all inputs together, or the output, may have.
 const MAX_SETS: usize = 32;
-/// Intervals of the output's universe, 0 to 1, over which a centroid is integrated.
-const INTERVALS: usize = 64;
-/// Strengths along each axis of the table of centroids.
-const NODES: usize = 33;
-/// Below this greatest strength the centroid changes too fast for a table.
-const MIN_TABLED: f32 = 0.1;
-/// The result where no rule fires: nothing is known.
-const UNKNOWN: f32 = 0.5;
 
 /// A fuzzy system over named inputs with one output between 0 and 1.
 #[derive(Clone, Debug)]
@@ -57,12 +39,8 @@ pub struct FuzzySystem {
     steps: Vec<Step>,
     operators: Operators,
     inference: Inference,
-    /// Degrees of the output sets over the universe.
-    curves: Vec<[f32; INTERVALS + 1]>,
+    pub(super) centroids: Centroids,
     peaks: Vec<f32>,
-    /// The centroid by the strengths of three output sets, on a grid of `NODES`³; empty for
-    /// another number of sets.
-    centroids: Vec<f32>,
 }
 
 /// A clause of the rules, all of which stand in one list so that nothing is chased in memory.
@@ -127,39 +105,46 @@ impl FuzzySystem {
         if rules.is_empty() {
             return Err(RuleError::NoRules);
         }
-        let mut system = Self {
+        Ok(Self {
             sets,
             steps: rules.iter().flat_map(steps_of).collect(),
             operators,
             inference,
-            centroids: Vec::new(),
-            curves: outputs
-                .iter()
-                .map(|shape| std::array::from_fn(|i| shape.degree(i as f32 / INTERVALS as f32)))
-                .collect(),
+            centroids: Centroids::new(&outputs, operators),
             peaks: outputs
                 .iter()
                 .map(Membership::peak_in_unit_interval)
                 .collect(),
             inputs,
             output,
-        };
-        system.tabulate();
-        Ok(system)
+        })
     }
 
     /// The result for inputs in the order of the names, 0 to 1; 0.5 where no rule fires.
-    #[inline]
     pub fn infer(&self, inputs: &[f32]) -> f32 {
+        let columns: Vec<[f32; 1]> = inputs.iter().map(|&input| [input]).collect();
+        self.infer_block(&columns)[0]
+    }
+
+    /// The same for `N` times the inputs, `inputs[i]` holding those of name `i`. Loops run over
+    /// the block inside, so that they are vectorized; nothing is allocated.
+    #[inline]
+    pub fn infer_block<const N: usize>(&self, inputs: &[[f32; N]]) -> [f32; N] {
         debug_assert_eq!(inputs.len(), self.inputs.len());
-        let mut degrees = [0.0; MAX_SETS];
-        for (degree, (input, shape)) in degrees.iter_mut().zip(&self.sets) {
-            *degree = shape.degree(inputs[*input]);
-        }
+        let degrees = self.degrees(inputs);
         match self.inference {
-            Inference::Mamdani => self.centroid(&degrees),
+            Inference::Mamdani => self.centers(&degrees),
             Inference::Sugeno => self.weighted_peaks(&degrees),
         }
+    }
+
+    #[inline]
+    fn degrees<const N: usize>(&self, inputs: &[[f32; N]]) -> [[f32; N]; MAX_SETS] {
+        let mut degrees = [[0.0; N]; MAX_SETS];
+        for (degrees, (input, shape)) in degrees.iter_mut().zip(&self.sets) {
+            shape.degrees(&inputs[*input], degrees);
+        }
+        degrees
     }
 
     /// Degrees of every input's sets: per input its name, and per set name and degree.
@@ -180,128 +165,92 @@ impl FuzzySystem {
 
     /// How strongly each rule fires, with the name of its output set.
     pub fn strengths(&self, inputs: &[f32]) -> Vec<(f32, &str)> {
-        let mut degrees = [0.0; MAX_SETS];
-        for (degree, (input, shape)) in degrees.iter_mut().zip(&self.sets) {
-            *degree = shape.degree(inputs[*input]);
-        }
+        let columns: Vec<[f32; 1]> = inputs.iter().map(|&input| [input]).collect();
         let mut strengths = Vec::new();
-        self.fire(&degrees, |output, strength| {
+        self.fire(&self.degrees(&columns), |output, &[strength]| {
             strengths.push((strength, self.output.1[output].as_str()));
         });
         strengths
     }
 
-    /// Calls `speak` with the output set and the strength of every rule, in order.
+    /// Calls `speak` with the output set and the strengths of every rule, in order.
     #[inline]
-    fn fire(&self, degrees: &[f32; MAX_SETS], mut speak: impl FnMut(usize, f32)) {
-        let (mut any, mut all) = (0.0_f32, 1.0_f32);
+    fn fire<const N: usize>(
+        &self,
+        degrees: &[[f32; N]; MAX_SETS],
+        mut speak: impl FnMut(usize, &[f32; N]),
+    ) {
+        let (mut any, mut all) = ([0.0_f32; N], [1.0_f32; N]);
         for step in &self.steps {
-            let degree = degrees[step.set % MAX_SETS];
-            let degree = if step.negated { 1.0 - degree } else { degree };
-            all = match self.operators {
-                Operators::MinMax => all.min(degree),
-                Operators::Product => all * degree,
+            let (offset, sign) = if step.negated {
+                (1.0, -1.0)
+            } else {
+                (0.0, 1.0)
             };
+            let degrees = &degrees[step.set % MAX_SETS];
+            for (all, &degree) in all.iter_mut().zip(degrees) {
+                let degree = offset + sign * degree;
+                *all = match self.operators {
+                    Operators::MinMax => smaller(*all, degree),
+                    Operators::Product => *all * degree,
+                };
+            }
             if let Then::And = step.then {
                 continue;
             }
-            any = match self.operators {
-                Operators::MinMax => any.max(all),
-                Operators::Product => any + all - any * all,
-            };
-            all = 1.0;
+            for (any, &all) in any.iter_mut().zip(&all) {
+                *any = match self.operators {
+                    Operators::MinMax => larger(*any, all),
+                    Operators::Product => *any + all - *any * all,
+                };
+            }
+            all = [1.0; N];
             if let Then::Output(output) = step.then {
-                speak(output, any);
-                any = 0.0;
+                speak(output, &any);
+                any = [0.0; N];
             }
         }
     }
 
     #[inline]
-    fn weighted_peaks(&self, degrees: &[f32; MAX_SETS]) -> f32 {
-        let (mut sum, mut strengths) = (0.0, 0.0);
-        self.fire(degrees, |output, strength| {
-            sum += strength * self.peaks[output];
-            strengths += strength;
+    fn weighted_peaks<const N: usize>(&self, degrees: &[[f32; N]; MAX_SETS]) -> [f32; N] {
+        let (mut sums, mut weights) = ([0.0_f32; N], [0.0_f32; N]);
+        self.fire(degrees, |output, strengths| {
+            let peak = self.peaks[output];
+            for ((sum, weight), &strength) in sums.iter_mut().zip(&mut weights).zip(strengths) {
+                *sum += strength * peak;
+                *weight += strength;
+            }
         });
-        if strengths > 0.0 {
-            sum / strengths
-        } else {
-            UNKNOWN
-        }
+        let mean = |i: usize| sums[i] / weights[i];
+        std::array::from_fn(|i| if weights[i] > 0.0 { mean(i) } else { UNKNOWN })
     }
 
     #[inline]
-    fn centroid(&self, degrees: &[f32; MAX_SETS]) -> f32 {
-        let mut strongest = [0.0_f32; MAX_SETS];
+    fn centers<const N: usize>(&self, degrees: &[[f32; N]; MAX_SETS]) -> [f32; N] {
+        let mut strongest = [[0.0_f32; N]; MAX_SETS];
         // Rules of one output set are joined by max before the set is clipped: the same as
         // after, because clipping and scaling are monotone.
-        self.fire(degrees, |output, strength| {
+        self.fire(degrees, |output, strengths| {
             let strongest = &mut strongest[output % MAX_SETS];
-            *strongest = strongest.max(strength);
-        });
-        let [a, b, c, ..] = strongest;
-        if self.centroids.is_empty() || a.max(b).max(c) < MIN_TABLED {
-            self.integrate(&strongest)
-        } else {
-            self.look_up([a, b, c])
-        }
-    }
-
-    /// The centroid of the union of the clipped output sets.
-    fn integrate(&self, strengths: &[f32; MAX_SETS]) -> f32 {
-        let mut union = [0.0_f32; INTERVALS + 1];
-        for (curve, &strength) in self.curves.iter().zip(strengths) {
-            for (joined, &degree) in union.iter_mut().zip(curve) {
-                let implied = match self.operators {
-                    Operators::MinMax => degree.min(strength),
-                    Operators::Product => degree * strength,
-                };
-                *joined = joined.max(implied);
+            for (strongest, &strength) in strongest.iter_mut().zip(strengths) {
+                *strongest = larger(*strongest, strength);
             }
-        }
-        center_of_area(&union)
+        });
+        self.centroids.of(&strongest[..self.peaks.len()])
     }
+}
 
-    /// Fills the table of centroids.
-    fn tabulate(&mut self) {
-        if self.curves.len() != 3 || self.inference != Inference::Mamdani {
-            return;
-        }
-        let node = |index: usize| (index % NODES) as f32 / (NODES - 1) as f32;
-        self.centroids = (0..NODES * NODES * NODES)
-            .map(|index| {
-                let mut strengths = [0.0; MAX_SETS];
-                strengths[0] = node(index / (NODES * NODES));
-                strengths[1] = node(index / NODES);
-                strengths[2] = node(index);
-                self.integrate(&strengths)
-            })
-            .collect();
-    }
+/// The smaller of two numbers that are numbers: one instruction, unlike `f32::min`.
+#[inline]
+fn smaller(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
 
-    /// The centroid between the eight nearest nodes of the table.
-    #[inline]
-    fn look_up(&self, strengths: [f32; 3]) -> f32 {
-        let mut base = 0;
-        let mut share = [0.0; 3];
-        for (share, strength) in share.iter_mut().zip(strengths) {
-            let position = strength * (NODES - 1) as f32;
-            let node = (position as usize).min(NODES - 2);
-            *share = position - node as f32;
-            base = base * NODES + node;
-        }
-        let along = |base: usize| {
-            let (low, high) = (self.centroids[base], self.centroids[base + 1]);
-            low + share[2] * (high - low)
-        };
-        let across = |base: usize| {
-            let (low, high) = (along(base), along(base + NODES));
-            low + share[1] * (high - low)
-        };
-        let (low, high) = (across(base), across(base + NODES * NODES));
-        low + share[0] * (high - low)
-    }
+/// The larger of two numbers that are numbers.
+#[inline]
+fn larger(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
 }
 
 /// The clauses of a rule, each with what follows it.
@@ -322,22 +271,6 @@ fn steps_of(rule: &Rule) -> impl Iterator<Item = Step> {
                 },
             })
         })
-}
-
-/// The centroid of a curve that is straight between its samples over 0 to 1.
-fn center_of_area(curve: &[f32; INTERVALS + 1]) -> f32 {
-    let (mut area, mut moment) = (0.0, 0.0);
-    for (interval, ends) in curve.windows(2).enumerate() {
-        let (a, b) = (ends[0], ends[1]);
-        area += 0.5 * (a + b);
-        // ∫ t (a + (b − a) t) dt = a/2 + (b − a)/3 over the interval, from its left end.
-        moment += interval as f32 * 0.5 * (a + b) + a / 6.0 + b / 3.0;
-    }
-    if area > 0.0 {
-        moment / area / INTERVALS as f32
-    } else {
-        UNKNOWN
-    }
 }
 
 fn check(vocabulary: &Vocabulary, inputs: &[&str], output: &str) -> Result<(), RuleError> {
@@ -368,157 +301,5 @@ fn check(vocabulary: &Vocabulary, inputs: &[&str], output: &str) -> Result<(), R
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn system(rules: &[&str], operators: Operators, inference: Inference) -> FuzzySystem {
-        let rules: Vec<String> = rules.iter().map(|&rule| rule.to_owned()).collect();
-        let sets = |names: [&str; 2]| {
-            [
-                (names[0].to_owned(), Membership::LeftShoulder([0.0, 1.0])),
-                (names[1].to_owned(), Membership::RightShoulder([0.0, 1.0])),
-            ]
-            .into()
-        };
-        let vocabulary = [
-            ("a".to_owned(), sets(["small", "large"])),
-            ("b".to_owned(), sets(["small", "large"])),
-            ("ground".to_owned(), sets(["low", "high"])),
-        ]
-        .into();
-        FuzzySystem::new(
-            &vocabulary,
-            &rules,
-            &["a", "b"],
-            "ground",
-            operators,
-            inference,
-        )
-        .unwrap()
-    }
-
-    /// A line of the table: see scikit_fuzzy.py.
-    fn from_table(line: &str) -> (FuzzySystem, [f32; 2], f32) {
-        let words: Vec<&str> = line.split(' ').collect();
-        let numbers =
-            |text: &str| -> Vec<f32> { text.split(',').map(|x| x.parse().unwrap()).collect() };
-        let shape = |word: &str| {
-            let (kind, corners) = word.split_once(':').unwrap();
-            match (kind, &numbers(corners)[..]) {
-                ("trapezoid", &[a, b, c, d]) => Membership::Trapezoid([a, b, c, d]),
-                ("triangle", &[a, b, c]) => Membership::Triangle([a, b, c]),
-                ("gaussian", &[mean, sigma]) => Membership::Gaussian([mean, sigma]),
-                other => panic!("{other:?}"),
-            }
-        };
-        let sets = |first: usize| {
-            (0..3)
-                .map(|set| (format!("s{set}"), shape(words[first + set])))
-                .collect()
-        };
-        let vocabulary = [
-            ("a".to_owned(), sets(1)),
-            ("b".to_owned(), sets(4)),
-            ("out".to_owned(), sets(7)),
-        ]
-        .into();
-        let rules: Vec<String> = words[10..14]
-            .iter()
-            .map(|rule| {
-                let parts: Vec<&str> = rule.split(',').collect();
-                let [a, b, out, joint] = parts[..] else {
-                    panic!("{rule}")
-                };
-                format!("IF a IS s{a} {joint} b IS s{b} THEN out IS s{out}")
-            })
-            .collect();
-        let operators = match words[0] {
-            "product" => Operators::Product,
-            _ => Operators::MinMax,
-        };
-        let system = FuzzySystem::new(
-            &vocabulary,
-            &rules,
-            &["a", "b"],
-            "out",
-            operators,
-            Inference::Mamdani,
-        );
-        let number = |index: usize| words[index].parse().unwrap();
-        (system.unwrap(), [number(14), number(15)], number(16))
-    }
-
-    #[test]
-    fn random_systems_infer_what_scikit_fuzzy_infers() {
-        let table = include_str!("scikit_fuzzy.txt");
-        assert!(table.lines().count() > 50);
-        for line in table.lines() {
-            let (system, inputs, expected) = from_table(line);
-            let result = system.infer(&inputs);
-            // The table integrates over 2000 intervals, this module over 64.
-            assert!((result - expected).abs() < 2e-3, "{result} for {line}");
-        }
-    }
-
-    const OPPOSITE: [&str; 2] = [
-        "IF a IS small THEN ground IS low",
-        "IF a IS large THEN ground IS high",
-    ];
-
-    #[test]
-    fn the_table_of_centroids_agrees_with_the_integral() {
-        let line = include_str!("scikit_fuzzy.txt").lines().next().unwrap();
-        let (system, ..) = from_table(line);
-        let mut worst: f32 = 0.0;
-        for index in 0..1000 {
-            let digit = |divisor: usize| (index / divisor % 10) as f32 / 9.0;
-            let strengths = [digit(1), digit(10), digit(100)];
-            if strengths.iter().any(|&strength| strength >= MIN_TABLED) {
-                let mut all = [0.0; MAX_SETS];
-                all[..3].copy_from_slice(&strengths);
-                worst = worst.max((system.look_up(strengths) - system.integrate(&all)).abs());
-            }
-        }
-        assert!(worst < 6e-3, "{worst}");
-    }
-
-    #[test]
-    fn sugeno_inference_is_the_weighted_mean_of_the_peaks() {
-        let system = system(&OPPOSITE, Operators::MinMax, Inference::Sugeno);
-        for a in [0.0, 0.25, 0.5, 1.0] {
-            assert!((system.infer(&[a, 0.3]) - a).abs() < 1e-6);
-        }
-    }
-
-    #[test]
-    fn swapping_every_set_for_its_opposite_mirrors_the_result() {
-        for operators in [Operators::MinMax, Operators::Product] {
-            let system = system(&OPPOSITE, operators, Inference::Mamdani);
-            for a in [0.0, 0.1, 0.4, 0.9] {
-                let sum = system.infer(&[a, 0.0]) + system.infer(&[1.0 - a, 0.0]);
-                assert!((sum - 1.0).abs() < 1e-5, "{a}");
-            }
-        }
-    }
-
-    #[test]
-    fn where_no_rule_fires_nothing_is_known() {
-        for inference in [Inference::Mamdani, Inference::Sugeno] {
-            let system = system(&OPPOSITE[1..], Operators::MinMax, inference);
-            assert_eq!(system.infer(&[0.0, 0.0]), 0.5);
-            assert_eq!(system.infer(&[f32::NAN, 0.0]), 0.5);
-        }
-    }
-
-    #[test]
-    fn or_and_and_differ_as_their_operators_say() {
-        let strength = |joint: &str, operators| {
-            let rule = format!("IF a IS large {joint} b IS NOT small THEN ground IS high");
-            system(&[&rule], operators, Inference::Sugeno).strengths(&[0.4, 0.5])[0].0
-        };
-        assert_eq!(strength("AND", Operators::MinMax), 0.4);
-        assert_eq!(strength("OR", Operators::MinMax), 0.5);
-        assert_eq!(strength("AND", Operators::Product), 0.2);
-        assert!((strength("OR", Operators::Product) - 0.7).abs() < 1e-6);
-    }
-}
+#[path = "inference_tests.rs"]
+mod tests;

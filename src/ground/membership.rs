@@ -4,6 +4,17 @@
 
 use serde::{Deserialize, Serialize};
 
+/// How AND, OR and implication are computed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Operators {
+    /// AND is the smaller degree, OR the larger.
+    #[default]
+    MinMax,
+    /// AND is the product, OR the probabilistic sum.
+    Product,
+}
+
 /// The shape of a linguistic set over its variable. Corners ascend.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -37,6 +48,21 @@ impl Membership {
                     (-0.5 * deviation * deviation).exp()
                 }
             }
+        }
+    }
+
+    /// The degrees of `N` numbers.
+    #[inline]
+    pub(super) fn degrees<const N: usize>(&self, xs: &[f32; N], degrees: &mut [f32; N]) {
+        let pairs = degrees.iter_mut().zip(xs);
+        // The shape is told apart outside of the loops, so that these are vectorized.
+        match *self {
+            Self::LeftShoulder([c, d]) => pairs.for_each(|(degree, &x)| *degree = rise(-x, -d, -c)),
+            Self::RightShoulder([a, b]) => pairs.for_each(|(degree, &x)| *degree = rise(x, a, b)),
+            Self::Triangle([a, b, c]) => {
+                pairs.for_each(|(degree, &x)| *degree = rise(x, a, b).min(rise(-x, -c, -b)))
+            }
+            shape => pairs.for_each(|(degree, &x)| *degree = shape.degree(x)),
         }
     }
 
@@ -78,10 +104,12 @@ impl Membership {
 /// 0 up to `a`, 1 from `b` on, straight between; a step where both are the same; 0 for NaN.
 #[inline]
 fn rise(x: f32, a: f32, b: f32) -> f32 {
+    // Not a number where a = b, but then it is not asked for.
+    let between = (x - a) / (b - a);
     if x >= b {
         1.0
     } else if x > a {
-        (x - a) / (b - a)
+        between
     } else {
         0.0
     }

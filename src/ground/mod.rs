@@ -4,6 +4,7 @@
 //! them, and the answer is soft and can be explained ([`FuzzyGround`]). Two plain methods stand
 //! beside it for comparison ([`PcaGround`], [`RansacGround`]).
 
+mod centroid;
 mod features;
 mod fuzzy;
 mod inference;
@@ -16,14 +17,15 @@ mod rules;
 #[cfg(test)]
 mod scenes;
 mod score;
+mod surface;
 mod terrain;
 #[cfg(test)]
 mod tests;
 
 pub use features::{FeatureConfig, Features};
 pub use fuzzy::{Explanation, FiredRule, FuzzyConfig, FuzzyGround, MembershipCurve, Verdict};
-pub use inference::{FuzzySystem, Inference, Operators};
-pub use membership::Membership;
+pub use inference::{FuzzySystem, Inference};
+pub use membership::{Membership, Operators};
 pub use pca::{PcaGround, ReportRule};
 pub use ransac::RansacGround;
 pub use road::{RoadPlane, road_plane};

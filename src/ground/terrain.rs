@@ -14,8 +14,8 @@
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use super::features::Shape;
-use super::polar::{PolarGrid, SECTORS};
+use super::polar::{Placed, PolarGrid, SECTORS};
+use super::surface::Shape;
 
 /// How the ground may change from cell to cell.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -48,44 +48,6 @@ impl Default for TerrainConfig {
 
 /// Distance over which the slope of known ground is averaged [m].
 const SLOPE_MEMORY_M: f32 = 2.5;
-
-/// A point with its place in the polar grid.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Placed {
-    /// Position in rings, with fraction; negative for a point that has no place.
-    pub(super) ring: f32,
-    /// Position in sectors, with fraction.
-    pub(super) sector: f32,
-    /// Height in the lidar frame [m].
-    pub(super) z: f32,
-    cell: u32,
-}
-
-impl Placed {
-    /// Of a point without a place.
-    pub(super) const NOWHERE: Self = Self {
-        ring: -1.0,
-        sector: 0.0,
-        z: f32::NAN,
-        cell: u32::MAX,
-    };
-
-    #[inline]
-    pub(super) fn new(ring: f32, sector: f32, z: f32) -> Self {
-        let cell = PolarGrid::index(ring, sector) as u32;
-        Self {
-            ring,
-            sector,
-            z,
-            cell,
-        }
-    }
-
-    #[inline]
-    pub(super) fn is_somewhere(&self) -> bool {
-        self.cell != u32::MAX
-    }
-}
 
 /// Ground heights and low points per cell of a polar grid, in the lidar frame [m].
 #[derive(Clone, Debug)]

@@ -241,7 +241,7 @@ fn a_configuration_survives_yaml_and_a_mistyped_rule_is_told() {
 fn membership_curves_stay_within_0_and_1_and_cover_every_set() {
     let [classifier, _] = fuzzy();
     let curves = classifier.membership_curves(101);
-    assert_eq!(curves.len(), 4 * 3 + 3);
+    assert_eq!(curves.len(), 3 * 3 + 4 + 3);
     for curve in curves {
         assert_eq!(curve.points.len(), 101);
         let degrees = || curve.points.iter().map(|&(_, degree)| degree);

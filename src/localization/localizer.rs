@@ -20,7 +20,7 @@ use super::estimate::FrameEstimate;
 use super::motion::{TurnDriveTurn, VelocityCommand};
 use super::observation::{Fit, above_road, choose_beams, costs, near_points, place_on_map};
 use super::odometry::Odometry;
-use super::panorama::PanoramaIndex;
+use super::panorama::Panoramas;
 use super::particles::ParticleSet;
 use super::proposal::{Gaussian, regular};
 use super::resampling::{jitter, kld_sample_size, occupied_bins, systematic};
@@ -43,7 +43,7 @@ pub struct Surroundings<'a> {
     /// Where the map is.
     pub tiles: &'a TileGrid,
     /// Where to begin anew when lost; without it, the filter says that it is lost and stays so.
-    pub panoramas: Option<&'a PanoramaIndex>,
+    pub panoramas: Option<&'a Panoramas<'a>>,
 }
 
 /// A belief about where the car is, frame by frame.
@@ -140,7 +140,7 @@ impl<'a> Localizer<'a> {
         self.stance = Some(weighing.stance);
         self.change_state(frame.agreement);
         frame.state = self.state;
-        self.prepare_next(scan, stance, rng);
+        self.prepare_next(scan, stance, rng)?;
         Ok(frame)
     }
 
@@ -456,9 +456,14 @@ impl<'a> Localizer<'a> {
     }
 
     /// Gets the particles ready for the next frame: begins anew when lost, else resamples.
-    fn prepare_next(&mut self, scan: &RangeImage, stance: &Stance, rng: &mut impl Rng) {
-        if self.state == State::Lost && self.begin_anew(scan, stance, rng) {
-            return;
+    fn prepare_next(
+        &mut self,
+        scan: &RangeImage,
+        stance: &Stance,
+        rng: &mut impl Rng,
+    ) -> Result<(), RenderError> {
+        if self.state == State::Lost && self.begin_anew(scan, stance, rng)? {
+            return Ok(());
         }
         let size = self.particles.len();
         let threshold = self.config.resampling.min_effective_fraction * size as f64;
@@ -466,22 +471,33 @@ impl<'a> Localizer<'a> {
         if shrinks || self.particles.effective_sample_size() < threshold {
             self.resample(rng);
         }
+        Ok(())
     }
 
-    /// Spreads the particles over the places where the scan may have been taken.
-    fn begin_anew(&mut self, scan: &RangeImage, stance: &Stance, rng: &mut impl Rng) -> bool {
+    /// Spreads particles over the places where the scan may have been taken; those that there were
+    /// stay among them, for an alarm may be false. `false` without panoramas.
+    fn begin_anew(
+        &mut self,
+        scan: &RangeImage,
+        stance: &Stance,
+        rng: &mut impl Rng,
+    ) -> Result<bool, RenderError> {
         let Some(panoramas) = self.surroundings.panoramas else {
-            return false;
+            return Ok(false);
         };
-        let poses = panoramas.sample(scan, stance, self.config.num_particles, rng);
+        let index = panoramas.index()?;
+        let mut poses = index.sample(scan, stance, self.config.num_particles, rng);
         if poses.is_empty() {
-            return false;
+            return Ok(false);
         }
+        let kept = systematic(&self.particles.weights(), self.config.num_reduced, rng);
+        let before: Vec<Pose2> = self.particles.poses().copied().collect();
+        poses.extend(kept.into_iter().map(|index| before[index]));
         self.particles = ParticleSet::uniform(poses);
         self.vigilance = Vigilance::default();
         self.updates_in_state = 0;
         self.state = State::Searching;
-        true
+        Ok(true)
     }
 
     fn resample(&mut self, rng: &mut impl Rng) {

@@ -1,5 +1,7 @@
 //! The filter as a whole, in a street of boxes.
 
+use std::cell::OnceCell;
+
 use approx::assert_relative_eq;
 use nalgebra::Vector2;
 use rand::{SeedableRng, rngs::StdRng};
@@ -8,7 +10,7 @@ use super::super::initialization::{Cells, ROAD_HALF_WIDTH_M, StartSpread, around
 use super::super::motion::OdometryNoise;
 use super::super::observation::ObservationConfig;
 use super::super::odometry::{Odometry, increments, with_noise};
-use super::super::panorama::{PanoramaConfig, PanoramaIndex};
+use super::super::panorama::{PanoramaConfig, Panoramas};
 use super::*;
 use crate::geometry::wrap_angle;
 use crate::lidar::LidarModel;
@@ -226,17 +228,16 @@ fn a_car_that_stands_is_not_weighed_and_its_belief_does_not_spread() {
     }
 }
 
-fn panoramas(world: &TestWorld) -> PanoramaIndex {
+fn panoramas(world: &TestWorld) -> Panoramas<'_> {
     let config = PanoramaConfig::default();
-    let cells = Cells::along_road(&world.road(), ROAD_HALF_WIDTH_M, config.cell_m);
-    PanoramaIndex::build(
-        &cells,
-        &world.surroundings(),
-        &LidarModel::default(),
-        1.73,
-        &config,
-    )
-    .unwrap()
+    Panoramas {
+        cells: Cells::along_road(&world.road(), ROAD_HALF_WIDTH_M, config.cell_m),
+        surroundings: world.surroundings(),
+        lidar: LidarModel::default(),
+        height_m: 1.73,
+        config,
+        index: OnceCell::new(),
+    }
 }
 
 #[test]
@@ -254,6 +255,7 @@ fn carried_elsewhere_it_notices_within_five_frames_and_finds_itself_again() {
     let mut localizer = Localizer::new(config(500), surroundings, ParticleSet::uniform(start));
     let frames = run(&mut localizer, &world, &before, true, &mut rng);
     assert_eq!(frames.last().unwrap().state, State::Tracking);
+    assert!(index.index.get().is_none(), "rendered without need");
     let frames = run(&mut localizer, &world, &after, true, &mut rng);
     let noticed = frames.iter().position(|frame| frame.state == State::Lost);
     assert!(noticed.is_some_and(|frame| frame < 5), "{noticed:?}");
@@ -272,7 +274,12 @@ fn it_finds_itself_from_nowhere() {
     for (seed, from_x) in [(1, -40.0), (2, 3.3), (3, 71.7)] {
         let truth = drive(&world, from_x, 20);
         let mut rng = StdRng::seed_from_u64(seed);
-        let start = index.sample(&world.scan(&truth[0]), &Stance::default(), 1000, &mut rng);
+        let start = index.index().unwrap().sample(
+            &world.scan(&truth[0]),
+            &Stance::default(),
+            1000,
+            &mut rng,
+        );
         let surroundings = Surroundings {
             panoramas: Some(&index),
             ..world.surroundings()

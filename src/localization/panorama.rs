@@ -12,6 +12,7 @@
 //! columns and headings, then the best of them at all. The memory is 4 · rows · columns bytes per
 //! cell: with the defaults 4.3 kB, 12 MB for 700 m of road in cells of one metre.
 
+use std::cell::OnceCell;
 use std::f32::consts::{PI, TAU};
 
 use glam::Vec3;
@@ -84,6 +85,40 @@ pub struct PanoramaIndex {
     cell_m: f64,
     /// One panorama per cell, row-major; [`FAR_M`] where there is no surface.
     images: Vec<Vec<f32>>,
+}
+
+/// Panoramas that are rendered when they are first asked for: a filter that knows where it begins
+/// and is never lost needs none.
+pub struct Panoramas<'a> {
+    /// The places, and what is rendered there.
+    pub cells: Cells,
+    /// The map; its own panoramas are not asked for.
+    pub surroundings: Surroundings<'a>,
+    /// The sensor whose scans will be looked up.
+    pub lidar: LidarModel,
+    /// Its height over the road [m].
+    pub height_m: f64,
+    /// Size of the panoramas and of the search.
+    pub config: PanoramaConfig,
+    /// Empty until asked for.
+    pub index: OnceCell<PanoramaIndex>,
+}
+
+impl Panoramas<'_> {
+    /// The panoramas, rendered now if they were not yet.
+    pub fn index(&self) -> Result<&PanoramaIndex, RenderError> {
+        if let Some(index) = self.index.get() {
+            return Ok(index);
+        }
+        let index = PanoramaIndex::build(
+            &self.cells,
+            &self.surroundings,
+            &self.lidar,
+            self.height_m,
+            &self.config,
+        )?;
+        Ok(self.index.get_or_init(|| index))
+    }
 }
 
 /// A place where the car may be.

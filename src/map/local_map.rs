@@ -1,13 +1,11 @@
 //! A local map: the scans of a stretch of road turned into a mesh.
 
-use std::collections::HashMap;
-
-use glam::{IVec3, Vec3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::plan::{LocalMapPlan, Ownership};
 use super::scan_cloud::{PointCounts, ScanCloud, ScanSettings};
+use super::vertex_ground;
 use super::visibility::{self, VisibilityConfig};
 use crate::geometry::{PointCloud, TriangleMesh};
 use crate::ground::GroundClassifier;
@@ -33,9 +31,9 @@ pub struct LocalMapSettings {
     pub simplify_resolution_m: f32,
     /// Rounds of smoothing of the simplified ground.
     pub smoothing_iterations: usize,
-    /// Colour of ground.
+    /// Colour of what is surely ground; the less sure, the nearer to `rest_color`.
     pub ground_color: [u8; 3],
-    /// Colour of the rest.
+    /// Colour of what surely is none.
     pub rest_color: [u8; 3],
 }
 
@@ -180,9 +178,7 @@ pub fn build(
 
     watcher.begin("ground")?;
     keep_own(&mut mesh, plan, ownership, &mut counts);
-    let ground = vertex_ground(&mesh.vertices, &cloud, settings);
-    paint(&mut mesh, &ground, settings);
-    simplify(&mut mesh, &ground, settings, &mut counts);
+    finish_ground(&mut mesh, &cloud, settings, &mut counts);
     counts.triangles = mesh.triangles.len();
     Ok((mesh, counts))
 }
@@ -245,73 +241,30 @@ fn keep_own(
     mesh.retain_triangles(|triangle| own[triangle]);
 }
 
-/// The mean ground confidence of the points around each vertex.
-fn vertex_ground(vertices: &[Vec3], cloud: &PointCloud, settings: &LocalMapSettings) -> Vec<f32> {
-    let cell_m = settings
-        .max_distance_m
-        .max(2.0 * settings.scan.voxel_size_m);
-    let cell_of = |point: Vec3| (point / cell_m).floor().as_ivec3();
-    let mut cells: HashMap<IVec3, (f32, f32)> = HashMap::with_capacity(cloud.len() / 4);
-    for (&position, &ground) in cloud.positions.iter().zip(&cloud.ground) {
-        let cell = cells.entry(cell_of(position)).or_default();
-        cell.0 += ground;
-        cell.1 += 1.0;
-    }
-    let around: Vec<IVec3> = (0..27)
-        .map(|i| IVec3::new(i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1))
-        .collect();
-    vertices
-        .par_iter()
-        .map(|&vertex| {
-            let center = cell_of(vertex);
-            let own = cells.get(&center).copied();
-            let (sum, count) = own.unwrap_or_else(|| {
-                around
-                    .iter()
-                    .filter_map(|offset| cells.get(&(center + offset)))
-                    .fold((0.0, 0.0), |sum, cell| (sum.0 + cell.0, sum.1 + cell.1))
-            });
-            if count > 0.0 { sum / count } else { 0.0 }
-        })
-        .collect()
-}
-
-/// Colours from ground to rest, decided at the threshold.
-fn paint(mesh: &mut TriangleMesh, ground: &[f32], settings: &LocalMapSettings) {
-    mesh.colors = ground
-        .iter()
-        .map(|&confidence| {
-            if confidence >= settings.ground_threshold {
-                settings.ground_color
-            } else {
-                settings.rest_color
-            }
-        })
-        .collect();
-}
-
-fn simplify(
+/// Colours the mesh by confidence and simplifies what is ground.
+fn finish_ground(
     mesh: &mut TriangleMesh,
-    ground: &[f32],
+    cloud: &PointCloud,
     settings: &LocalMapSettings,
     counts: &mut LocalMapCounts,
 ) {
+    let cell_m = settings
+        .max_distance_m
+        .max(2.0 * settings.scan.voxel_size_m);
+    let confidences = vertex_ground::mean_confidences(&mesh.vertices, cloud, cell_m);
+    let threshold = settings.ground_threshold;
+    let (rest, ground) = (settings.rest_color, settings.ground_color);
+    mesh.colors = confidences
+        .iter()
+        .map(|&confidence| vertex_ground::color(confidence, threshold, rest, ground))
+        .collect();
     if settings.simplify_resolution_m <= 0.0 {
         return;
     }
-    let is_ground: Vec<bool> = mesh
-        .triangles
-        .iter()
-        .map(|triangle| {
-            triangle
-                .iter()
-                .all(|&vertex| ground[vertex as usize] >= settings.ground_threshold)
-        })
-        .collect();
     let before = mesh.triangles.len();
     *mesh = meshing::simplify_ground(
         mesh,
-        &is_ground,
+        &vertex_ground::ground_triangles(mesh, &confidences, threshold),
         settings.simplify_resolution_m,
         settings.smoothing_iterations,
     );

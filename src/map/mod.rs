@@ -10,6 +10,7 @@ pub mod scan_cloud;
 mod surface_distance;
 pub mod tiles;
 pub mod truth;
+mod vertex_ground;
 pub mod visibility;
 
 pub use elevation::{GroundMap, GroundPatch, Stance};

@@ -1,5 +1,6 @@
 //! The filter on its way through the frames.
 
+use std::cell::OnceCell;
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
@@ -15,7 +16,7 @@ use crate::localization::initialization::{Cells, ROAD_HALF_WIDTH_M, around};
 use crate::localization::motion::VelocityCommand;
 use crate::localization::observation::choose_beams;
 use crate::localization::odometry::Odometry;
-use crate::localization::panorama::PanoramaIndex;
+use crate::localization::panorama::{PanoramaIndex, Panoramas};
 use crate::localization::{FrameEstimate, Localizer, ParticleSet, State, Surroundings};
 use crate::map::Stance;
 use crate::refinement::{FrameObjective, RefinedFrame, refine_frame};
@@ -29,7 +30,9 @@ pub struct Drive<'a> {
     /// Makes scans into observations.
     pub observer: &'a Observer<'a>,
     /// For a start anywhere.
-    pub panoramas: Option<&'a PanoramaIndex>,
+    pub panoramas: &'a Panoramas<'a>,
+    /// Rendered already, where the start is not known.
+    pub global_start: Option<&'a PanoramaIndex>,
     /// None before the first frame.
     pub localizer: Option<Localizer<'a>>,
     /// The last that was known.
@@ -68,6 +71,7 @@ impl<'a> Drive<'a> {
                     &image,
                     &stance,
                     self.panoramas,
+                    self.global_start,
                 )?;
                 empty.insert(begun)
             }
@@ -118,15 +122,16 @@ fn begin<'a>(
     first: &Frame,
     scan: &RangeImage,
     stance: &Stance,
-    panoramas: Option<&'a PanoramaIndex>,
+    panoramas: &'a Panoramas<'a>,
+    global_start: Option<&PanoramaIndex>,
 ) -> Result<Localizer<'a>> {
     let surroundings = Surroundings {
         renderer: &*map.renderer,
         ground: &map.ground,
         tiles: &map.grid,
-        panoramas,
+        panoramas: Some(panoramas),
     };
-    let start = initial_particles(config, map, first, scan, stance, panoramas)?;
+    let start = initial_particles(config, map, first, scan, stance, global_start)?;
     Ok(Localizer::new(config.localizer(), surroundings, start))
 }
 
@@ -152,31 +157,41 @@ pub fn motion(
     }
 }
 
-/// The panoramas of a global start; none where the start is known.
-pub fn panoramas(config: &LocalizationConfig, map: &LoadedMap) -> Result<Option<PanoramaIndex>> {
+/// The places where a scan may have been taken: to begin at, or to begin anew at when lost.
+pub fn panoramas<'a>(config: &LocalizationConfig, map: &'a LoadedMap) -> Panoramas<'a> {
     let panorama = config.panorama_config();
     let cells = match config.initialization() {
-        Initialization::Tracking => return Ok(None),
-        Initialization::Corridor => {
+        Initialization::Tracking | Initialization::Corridor => {
             let poses: Vec<Pose2> = map.mapping_poses.iter().map(planar).collect();
             Cells::along_road(&poses, ROAD_HALF_WIDTH_M, panorama.cell_m)
         }
         Initialization::Extent => Cells::over_map(&map.grid, &map.ground, panorama.cell_m),
     };
+    Panoramas {
+        cells,
+        surroundings: Surroundings {
+            renderer: &*map.renderer,
+            ground: &map.ground,
+            tiles: &map.grid,
+            panoramas: None,
+        },
+        lidar: config.range_image.model(),
+        height_m: Stance::default().height_m,
+        config: panorama,
+        index: OnceCell::new(),
+    }
+}
+
+/// The panoramas of a global start, rendered; none where the start is known.
+pub fn global_start<'a>(
+    config: &LocalizationConfig,
+    panoramas: &'a Panoramas<'_>,
+) -> Result<Option<&'a PanoramaIndex>> {
+    if config.initialization() == Initialization::Tracking {
+        return Ok(None);
+    }
     let started = Instant::now();
-    let surroundings = Surroundings {
-        renderer: &*map.renderer,
-        ground: &map.ground,
-        tiles: &map.grid,
-        panoramas: None,
-    };
-    let index = PanoramaIndex::build(
-        &cells,
-        &surroundings,
-        &config.range_image.model(),
-        Stance::default().height_m,
-        &panorama,
-    )?;
+    let index = panoramas.index()?;
     tracing::info!(
         "{} panoramas, {:.1} MB, rendered in {:.1} s",
         index.len(),

@@ -10,7 +10,7 @@ use anyhow::Result;
 use rand::SeedableRng as _;
 use rand_chacha::ChaCha8Rng;
 
-use self::drive::{Drive, motion, panoramas};
+use self::drive::{Drive, global_start, motion, panoramas};
 use self::pictures::draw_example;
 use self::recorder::Recorder;
 use super::interrupt::Interrupted;
@@ -167,13 +167,15 @@ fn localize(
         own_car_m: config.own_car_m,
         classifier: &classifier,
     };
-    let panoramas = panoramas(config, map)?;
+    let panoramas = panoramas(config, map);
+    let global_start = global_start(config, &panoramas)?;
     let mut recorder = Recorder::new(config, map, files);
     let mut drive = Drive {
         config,
         map,
         observer: &observer,
-        panoramas: panoramas.as_ref(),
+        panoramas: &panoramas,
+        global_start,
         localizer: None,
         stance: Stance::default(),
     };
