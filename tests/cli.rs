@@ -162,7 +162,7 @@ fn a_setting_that_names_no_key_is_told_with_the_nearest() {
 #[test]
 fn values_that_would_stop_a_stage_are_told_before_any_work() {
     for (command, file, key, value) in [
-        ("build-map", "build_map.yml", "visibility.beam_step", "0"),
+        ("build-map", "build_map.yml", "visibility.max_beams", "0"),
         ("build-map", "build_map.yml", "poisson.scale", "1"),
         ("build-map", "build_map.yml", "normals.min_support", "0"),
         ("build-map", "build_map.yml", "own_car_m", "[1, 0, 0, 1]"),

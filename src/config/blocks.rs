@@ -80,12 +80,7 @@ impl Check for VisibilityConfig {
         not_negative("support_m", self.support_m)?;
         not_negative("support_range_m", self.support_range_m)?;
         at_least_one("triangle_votes", self.triangle_votes as usize)?;
-        require(
-            self.beam_step >= 1,
-            "beam_step",
-            self.beam_step,
-            "1 lets every beam vote, 2 every other one",
-        )
+        at_least_one("max_beams", self.max_beams)
     }
 }
 

@@ -55,8 +55,9 @@ pub struct VisibilityConfig {
     pub support_range_m: f32,
     /// So many beams at least must pass through a triangle, and more than support it.
     pub triangle_votes: u32,
-    /// Every how manieth beam of a scan votes on triangles.
-    pub beam_step: usize,
+    /// Beams of a local map that vote on its triangles, at most; where there are more, every second
+    /// or third of them votes.
+    pub max_beams: usize,
 }
 
 impl Default for VisibilityConfig {
@@ -74,7 +75,7 @@ impl Default for VisibilityConfig {
             support_m: 0.1,
             support_range_m: 1.0,
             triangle_votes: 2,
-            beam_step: 1,
+            max_beams: 5_000_000,
         }
     }
 }
@@ -174,9 +175,11 @@ fn crossed_triangles(
             .collect()
     };
     let (passed, supported) = (counters(), counters());
+    let beams: usize = scans.iter().map(|scan| scan.returns.len()).sum();
+    let step = beams.div_ceil(config.max_beams).max(1);
     scans.par_iter().for_each(|scan| {
         let origin = scan.map_from_lidar.translation;
-        for &end in scan.returns.iter().step_by(config.beam_step.max(1)) {
+        for &end in scan.returns.iter().step_by(step) {
             let range_m = end.length();
             let direction = scan.map_from_lidar.rotate(end / range_m);
             scene.for_each_hit(origin, direction, range_m + config.support_range_m, |hit| {

@@ -77,7 +77,7 @@ fn for_each_leaf(bvh: &Bvh, ray: &Ray, mut visit: impl FnMut(usize)) {
             visit(current.index());
         } else {
             let node = &bvh.nodes[current.index()];
-            let [first, second] = [0, 1].map(|child| ray.enters(&node.bounds[child]));
+            let (first, second) = (ray.enters(&node.bounds[0]), ray.enters(&node.bounds[1]));
             if first & second {
                 waiting[count] = node.children[1];
                 count += 1;
