@@ -389,7 +389,7 @@ impl<'a> Localizer<'a> {
         FrameEstimate {
             pose,
             lifted,
-            covariance: self.particles.covariance_about(&pose),
+            covariance: self.particles.covariance_of_estimate(),
             effective_sample_size: weighing.effective_sample_size,
             mean_cost_m: weighing.mean_cost_m,
             agreement: None,

@@ -157,6 +157,19 @@ impl ParticleSet {
             })
             .sum()
     }
+
+    /// Covariance of (x, y, heading) of the mean as an estimate of the pose, in the map frame
+    /// [m², m·rad, rad²]: that of the belief, and that of a mean of so few draws,
+    ///
+    /// ```text
+    /// Σ = Σ_weighted + Σ_drawn / ESS        Σ_drawn: of the particles without their weights
+    /// ```
+    pub fn covariance_of_estimate(&self) -> Matrix3<f64> {
+        let mean = self.mean();
+        let drawn = Self::uniform(self.poses().copied());
+        let of_drawing = drawn.covariance_about(&drawn.mean()) / self.effective_sample_size();
+        self.covariance_about(&mean) + of_drawing
+    }
 }
 
 /// How far a pose is from another: Δx, Δy [m] in the map frame and the turn in [-π, π) [rad].
@@ -179,6 +192,8 @@ mod tests {
     use std::f64::consts::PI;
 
     use approx::assert_relative_eq;
+    use rand::{SeedableRng as _, rngs::StdRng};
+    use rand_distr::{Distribution as _, StandardNormal};
 
     use super::*;
 
@@ -188,6 +203,29 @@ mod tests {
 
     fn total(set: &ParticleSet) -> f64 {
         set.particles().iter().map(|p| p.weight).sum()
+    }
+
+    #[test]
+    fn the_covariance_of_an_estimate_of_few_draws_covers_its_errors() {
+        let mut rng = StdRng::seed_from_u64(3);
+        let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
+        let trials = 3000;
+        let mut squared = 0.0;
+        for _ in 0..trials {
+            let truth_m = normal();
+            // Drawn twice as wide as what the weights then say.
+            let mut set = ParticleSet::uniform((0..8).map(|_| pose(2.0 * normal(), 0.0, 0.0)));
+            let logs: Vec<f64> = set
+                .poses()
+                .map(|pose| pose.translation.x.powi(2) * (0.125 - 0.5))
+                .collect();
+            set.reweight(&logs);
+            let error_m = set.mean().translation.x - truth_m;
+            squared += error_m.powi(2) / set.covariance_of_estimate()[(0, 0)];
+        }
+        // On the safe side; the covariance of the weighted particles alone gives 1.1.
+        let normalized = squared / f64::from(trials);
+        assert!((0.7..1.1).contains(&normalized), "{normalized}");
     }
 
     #[test]
