@@ -202,7 +202,7 @@ fn every_run_can_be_repeated(recording: &Recording) {
 
 fn the_pages_need_nothing_else(recording: &Recording) {
     let of_run = "out/runs/street/Fuzzy-PSO-MCL/1/report.html";
-    for (page, pictures) in [("out/report.html", 3), (of_run, 6)] {
+    for (page, pictures) in [("out/report.html", 3), (of_run, 7)] {
         let html = String::from_utf8(recording.bytes(page)).unwrap();
         for word in ["src=\"http", "href=\"http", "<link", "@import"] {
             assert!(!html.contains(word), "{page} has {word}");
