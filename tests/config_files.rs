@@ -50,7 +50,9 @@ fn keys_of(path: &Path) -> BTreeSet<String> {
         "refinement.yml" | "refinement_stereo.yml" => round_trip::<RefinementConfig>(path),
         "evaluation.yml" => round_trip::<EvaluationConfig>(path),
         "simulation.yml" => round_trip::<SimulationConfig>(path),
-        "comparison.yml" | "comparison_kitti.yml" | "comparison_refiners.yml" => round_trip::<ComparisonConfig>(path),
+        "comparison.yml" | "comparison_kitti.yml" | "comparison_refiners.yml" => {
+            round_trip::<ComparisonConfig>(path)
+        }
         "ground.yml" => round_trip::<GroundConfig>(path),
         _ => panic!("{} belongs to no command", path.display()),
     }

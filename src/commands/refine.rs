@@ -117,6 +117,8 @@ struct Polished {
     prior: Option<FramePrior>,
     /// Whether the scan was laid onto the map.
     is_refined: bool,
+    /// Whether the filter knew that it was wrong.
+    is_lost: bool,
     stance: Stance,
     seconds: f64,
 }
@@ -151,6 +153,8 @@ fn polish_all(
             estimate: estimates[row],
             covariance: results.covariances.as_ref().map(|all| all[row]),
             is_found: is_found(results, row),
+            is_lost: (results.states.as_ref())
+                .is_some_and(|states| states[row] == State::Lost as u8),
         };
         skipped += usize::from(!start.is_found);
         let seed = ChaCha8Rng::seed_from_u64(config.seed);
@@ -179,6 +183,7 @@ struct Start {
     estimate: Pose2,
     covariance: Option<Matrix3<f64>>,
     is_found: bool,
+    is_lost: bool,
 }
 
 impl Start {
@@ -258,6 +263,7 @@ fn polish(
     });
     Ok(Polished {
         is_refined: refined.is_some(),
+        is_lost: start.is_lost,
         stance: refined.as_ref().map_or(stance, |frame| frame.stance),
         pose: refined.as_ref().map_or(start.estimate, |frame| frame.pose),
         prior: refined_prior.or(start.is_found.then_some(localized)),
@@ -288,7 +294,8 @@ fn increments(
     }
 }
 
-/// Smooths the whole trajectory with the odometry between its frames; without odometry every frame
+/// Smooths the trajectory with the odometry between its frames, each stretch between frames in which
+/// the filter was lost; without odometry every frame
 /// stays where its scan puts it.
 fn smooth_all(
     config: &RefinementConfig,
@@ -305,7 +312,20 @@ fn smooth_all(
         .copied()
         .collect::<Option<Vec<_>>>()
         .context("the odometry has gaps")?;
-    Ok(smooth(&poses, &priors, &increments, &trusted(config)))
+    // Where the filter was lost, the odometry may not know how the car came from before to after.
+    let config = trusted(config);
+    let mut smoothed = Vec::with_capacity(poses.len());
+    for stretch in polished.chunk_by(|before, after| before.is_lost == after.is_lost) {
+        let rows = smoothed.len()..smoothed.len() + stretch.len();
+        let is_known = !stretch[0].is_lost && priors[rows.clone()].iter().any(Option::is_some);
+        if is_known {
+            let [poses, increments] = [&poses, &increments].map(|all| &all[rows.clone()]);
+            smoothed.extend(smooth(poses, &priors[rows.clone()], increments, &config));
+        } else {
+            smoothed.extend_from_slice(&poses[rows]);
+        }
+    }
+    Ok(smoothed)
 }
 
 /// How far the odometry is to be trusted: with the noise that the demonstration puts on the truth,
@@ -339,4 +359,40 @@ fn lift_all(map: &LoadedMap, poses: &[Pose2], polished: &[Polished]) -> Vec<Pose
             }
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_leap_at_which_the_filter_was_lost_bends_nothing_beside_it() {
+        let config = RefinementConfig {
+            odometry: OdometrySource::File,
+            ..RefinementConfig::default()
+        };
+        let polished: Vec<Polished> = (0..20)
+            .map(|row| {
+                let is_lost = row == 10;
+                let leap_m = if row > 10 { 50.0 } else { 0.0 };
+                let pose = Pose2::translation(f64::from(row) + leap_m, 0.0);
+                let covariance = Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-6));
+                Polished {
+                    pose,
+                    prior: (!is_lost).then_some(FramePrior { pose, covariance }),
+                    is_refined: !is_lost,
+                    is_lost,
+                    stance: Stance::default(),
+                    seconds: 0.0,
+                }
+            })
+            .collect();
+        let increments = vec![Some(Pose2::translation(1.0, 0.0)); 20];
+        let smoothed = smooth_all(&config, &increments, &polished).unwrap();
+        assert_eq!(smoothed.len(), 20);
+        for (frame, smoothed) in polished.iter().zip(&smoothed) {
+            let off_m = (smoothed.translation.vector - frame.pose.translation.vector).norm();
+            assert!(off_m < 1e-6, "{off_m}");
+        }
+    }
 }

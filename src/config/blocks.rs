@@ -234,7 +234,8 @@ impl Check for VigilanceConfig {
         )?;
         share("min_agreement", self.min_agreement)?;
         share("lost_fraction", self.lost_fraction)?;
-        at_least_one("patience", self.patience)
+        at_least_one("patience", self.patience)?;
+        positive("max_spread_m", self.max_spread_m)
     }
 }
 

@@ -21,7 +21,7 @@ use super::motion::{TurnDriveTurn, VelocityCommand};
 use super::observation::{Fit, above_road, choose_beams, costs, near_points, place_on_map};
 use super::odometry::Odometry;
 use super::panorama::Panoramas;
-use super::particles::ParticleSet;
+use super::particles::{ParticleSet, spread};
 use super::proposal::{Gaussian, regular};
 use super::resampling::{jitter, kld_sample_size, occupied_bins, systematic};
 use super::settings::LocalizerConfig;
@@ -438,7 +438,10 @@ impl<'a> Localizer<'a> {
         if converged || self.state == State::Tracking {
             self.vigilance.observe(agreement, &self.config.vigilance);
         }
-        let is_lost = self.vigilance.is_lost(&self.config.vigilance);
+        let covariance = self.particles.covariance_about(&self.particles.mean());
+        let is_spread = self.state == State::Tracking
+            && spread(&covariance).0 > self.config.vigilance.max_spread_m;
+        let is_lost = is_spread || self.vigilance.is_lost(&self.config.vigilance);
         let is_stuck = self.updates_in_state >= self.config.vigilance.patience;
         let next = match self.state {
             _ if is_lost => State::Lost,

@@ -359,3 +359,29 @@ fn a_scan_without_returns_changes_nothing_and_breaks_nothing() {
     assert_eq!(frame.agreement, None);
     assert_eq!(frame.state, State::Tracking);
 }
+
+#[test]
+fn where_nothing_can_be_seen_it_does_not_go_on_saying_that_it_knows() {
+    let world = TestWorld::street();
+    let truth = drive(&world, 0.0, 8);
+    let mut rng = StdRng::seed_from_u64(9);
+    let start = around(&truth[0], 300, &StartSpread::default(), &mut rng);
+    let mut localizer = Localizer::new(
+        config(300),
+        world.surroundings(),
+        ParticleSet::uniform(start),
+    );
+    let frames = run(&mut localizer, &world, &truth, true, &mut rng);
+    assert_eq!(frames.last().unwrap().state, State::Tracking);
+    let nothing = RangeImage::project(&[], &LidarModel::default());
+    let step = Odometry::Increment(Pose2::translation(2.0, 0.0));
+    let mut after_m = 0.0;
+    while localizer.state() == State::Tracking {
+        localizer
+            .step(step, &nothing, &Stance::default(), &mut rng)
+            .unwrap();
+        after_m += 2.0;
+        assert!(after_m < 600.0, "still sure after {after_m} m in the dark");
+    }
+    assert!(after_m > 4.0, "a metre or two in the dark is no reason");
+}

@@ -53,6 +53,9 @@ pub struct VigilanceConfig {
     pub lost_fraction: f64,
     /// Updates without convergence after which the search begins anew.
     pub patience: usize,
+    /// Lost, too, where the belief has grown wider than this, as beyond the map, where nothing
+    /// agrees and nothing disagrees: √(σ_x² + σ_y²) [m].
+    pub max_spread_m: f64,
 }
 
 impl Default for VigilanceConfig {
@@ -65,6 +68,7 @@ impl Default for VigilanceConfig {
             min_agreement: 0.5,
             lost_fraction: 0.75,
             patience: 25,
+            max_spread_m: 2.0,
         }
     }
 }

@@ -41,12 +41,12 @@ fn parts_of(column: &Column, cells: &[&Cell]) -> Vec<Part> {
     if has(|cell| matches!(cell, Cell::Difference(_) | Cell::Rate(_))) {
         add("low", |cell| match cell {
             Cell::Difference(difference) => full(difference.interval.map(|ends| ends.0)),
-            Cell::Rate(rate) => full(Some(rate.low)),
+            Cell::Rate(rate) => full(Some(100.0 * rate.low)),
             _ => String::new(),
         });
         add("high", |cell| match cell {
             Cell::Difference(difference) => full(difference.interval.map(|ends| ends.1)),
-            Cell::Rate(rate) => full(Some(rate.high)),
+            Cell::Rate(rate) => full(Some(100.0 * rate.high)),
             _ => String::new(),
         });
     }
@@ -56,6 +56,8 @@ fn parts_of(column: &Column, cells: &[&Cell]) -> Vec<Part> {
 fn first(cell: &Cell) -> String {
     match cell {
         Cell::Text(text) | Cell::Link { text, .. } => text.clone(),
+        // Its column is in percent.
+        Cell::Rate(rate) => full(Some(100.0 * rate.rate)),
         cell => full(cell.number()),
     }
 }

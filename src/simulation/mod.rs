@@ -158,7 +158,9 @@ impl Simulation {
     pub fn odometry(&self) -> Vec<Pose3> {
         let key = (self.config.seed, self.config.drive);
         let mut felt = self.poses();
-        if let Some(leap) = self.drive.kidnapped_at() {
+        // A drive that ends before knows nothing of it.
+        let leap = self.drive.kidnapped_at();
+        if let Some(leap) = leap.filter(|&leap| leap < felt.len()) {
             // As if it had driven on as before.
             let step = felt[leap - 2].inverse() * felt[leap - 1];
             let felt_from_true = felt[leap - 1] * step * felt[leap].inverse();

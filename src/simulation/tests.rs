@@ -227,6 +227,12 @@ fn a_kidnapped_car_is_elsewhere_and_its_odometry_does_not_know() {
     let last_s = 9.0 * SCAN_PERIOD_S;
     let drive = &simulation.drive;
     assert!(drive.station_m(last_s + 0.09) - drive.station_m(last_s) < 1.5);
+    // A drive that is cut off before it knows nothing of it.
+    let short = SimulationConfig {
+        n_scans: 8,
+        ..kidnapped_at(Some(10))
+    };
+    assert_eq!(simulate(&short).odometry().len(), 8);
     let beyond = Simulation::new(&kidnapped_at(Some(70)), None);
     assert!(matches!(
         beyond,

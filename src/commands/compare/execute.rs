@@ -122,8 +122,10 @@ impl Stages {
             shared_localization(run, layout, keys, &map, context).context("while localizing")?;
         self.note("2 localize", found.seconds);
         context.log.clone().repeat(&found.folder.join(LOG_FILE))?;
-        copy_all(&found.folder, &folder)?;
         let result = folder.join(RESULT_FILE);
+        // Another run of this name may have refined.
+        run_output::remove_refined(&RunFiles::beside(&result))?;
+        copy_all(&found.folder, &folder)?;
         self.report = Some(Report::read_json(&folder.join("report.json"))?);
 
         if let Some(refinement) = &run.refinement {

@@ -40,39 +40,47 @@ pub struct Fingerprints {
 impl Fingerprints {
     /// The keys of a run.
     pub fn of(&mut self, run: &PlannedRun) -> Result<Keys> {
-        let (mapped, query) = match &run.drives {
-            Some([first, second]) => (self.recipe(first)?, self.recipe(second)?),
-            None => {
-                let map = &run.build_map;
-                let query = &run.localization;
-                let mapped = self.recording(
-                    &map.scan_folder,
-                    &map.pose_file,
-                    &map.calib_file,
-                    &map.selection(),
-                )?;
-                let query = self.recording(
-                    &query.scan_folder,
-                    &query.pose_file,
-                    &query.calib_file,
-                    &query.selection(),
-                )?;
-                (mapped, query)
-            }
+        let (map, query) = (&run.build_map, &run.localization);
+        let [first, second] = drives_of(run);
+        let mapped = match first {
+            Some(drive) => self.recipe(drive)?,
+            None => self.recording(
+                &map.scan_folder,
+                &map.pose_file,
+                &map.calib_file,
+                &map.selection(),
+            )?,
         };
-        let odometry = match &run.localization.odometry_file {
-            Some(file) if run.drives.is_none() => self.file(file)?,
-            _ => String::new(),
+        let query = match second {
+            Some(drive) => self.recipe(drive)?,
+            None => self.recording(
+                &query.scan_folder,
+                &query.pose_file,
+                &query.calib_file,
+                &query.selection(),
+            )?,
         };
+        let odometry = self.odometry(run, run.localization.odometry_file.as_deref())?;
+        let refined_with =
+            (run.refinement.as_ref()).and_then(|refinement| refinement.odometry_file.as_deref());
+        let refined_with = self.odometry(run, refined_with)?;
         let [build_map, localization, refinement] = effective(run)?;
         let map = hash(&["map", version(), &build_map, &mapped]);
         let localization = hash(&["localization", &map, &localization, &query, &odometry]);
-        let run = hash(&["run", &localization, &refinement]);
+        let run = hash(&["run", &localization, &refinement, &refined_with]);
         Ok(Keys {
             map,
             localization,
             run,
         })
+    }
+
+    /// Of an odometry file; nothing for that of a simulated drive, which follows from its recipe.
+    fn odometry(&mut self, run: &PlannedRun, file: Option<&Path>) -> Result<String> {
+        match file {
+            Some(file) if !is_simulated(run, file) => self.file(file),
+            _ => Ok(String::new()),
+        }
     }
 
     fn recipe(&mut self, drive: &SimulationConfig) -> Result<String> {
@@ -131,6 +139,58 @@ impl Fingerprints {
     }
 }
 
+/// The simulated drives that a run maps and is localized on; none where its configuration names
+/// other files.
+fn drives_of(run: &PlannedRun) -> [Option<&SimulationConfig>; 2] {
+    let Some([first, second]) = &run.drives else {
+        return [None, None];
+    };
+    let (map, query) = (&run.build_map, &run.localization);
+    let files = [
+        [&map.scan_folder, &map.pose_file, &map.calib_file],
+        [&query.scan_folder, &query.pose_file, &query.calib_file],
+    ];
+    let of = |drive: &'_ SimulationConfig, files: [&PathBuf; 3]| {
+        let folder = drive.drive_folder();
+        (files.into_iter()).all(|file| file.parent() == Some(folder.as_path()))
+    };
+    [
+        of(first, files[0]).then_some(first),
+        of(second, files[1]).then_some(second),
+    ]
+}
+
+/// Whether an odometry is the one that its simulated drive comes with.
+fn is_simulated(run: &PlannedRun, odometry: &Path) -> bool {
+    (run.drives.as_ref())
+        .is_some_and(|[_, second]| odometry == second.drive_folder().join("odometry.txt"))
+}
+
+/// The files that a run reads, but for those that follow from recipes.
+fn inputs_of(run: &PlannedRun) -> String {
+    let (map, query) = (&run.build_map, &run.localization);
+    let [mapped, found] = drives_of(run).map(|drive| drive.is_some());
+    let mut files = Vec::new();
+    if !mapped {
+        files.extend([&map.scan_folder, &map.pose_file, &map.calib_file]);
+    }
+    if !found {
+        files.extend([&query.scan_folder, &query.pose_file, &query.calib_file]);
+    }
+    let refined_with = run
+        .refinement
+        .as_ref()
+        .and_then(|r| r.odometry_file.as_ref());
+    let odometry = [query.odometry_file.as_ref(), refined_with];
+    files.extend(
+        odometry
+            .into_iter()
+            .flatten()
+            .filter(|file| !is_simulated(run, file)),
+    );
+    format!("{files:?}")
+}
+
 /// The effective configurations without where things lie and what is drawn: build_map,
 /// localization, refinement.
 fn effective(run: &PlannedRun) -> Result<[String; 3]> {
@@ -182,7 +242,8 @@ fn effective(run: &PlannedRun) -> Result<[String; 3]> {
     ])
 }
 
-/// What a run was asked to do, without a look at its inputs, for collecting where they are not.
+/// What a run was asked to do, with the names of its inputs and without a look at them, for
+/// collecting where they are not.
 pub fn settings_of(run: &PlannedRun) -> Result<String> {
     let [build_map, localization, refinement] = effective(run)?;
     let drives = match &run.drives {
@@ -201,6 +262,7 @@ pub fn settings_of(run: &PlannedRun) -> Result<String> {
         &localization,
         &refinement,
         &drives,
+        &inputs_of(run),
     ]))
 }
 
@@ -231,18 +293,31 @@ mod tests {
     use crate::evaluation::comparison::RunId;
 
     fn simulated() -> PlannedRun {
+        let drives = [1, 2].map(|drive| SimulationConfig {
+            drive,
+            ..SimulationConfig::default()
+        });
+        let [first, second] = drives.each_ref().map(SimulationConfig::drive_folder);
         PlannedRun {
             id: RunId {
                 sequence: "town".to_owned(),
                 configuration: "A".to_owned(),
                 seed: 1,
             },
-            drives: Some([1, 2].map(|drive| SimulationConfig {
-                drive,
-                ..SimulationConfig::default()
-            })),
-            build_map: BuildMapConfig::default(),
-            localization: LocalizationConfig::default(),
+            drives: Some(drives),
+            build_map: BuildMapConfig {
+                scan_folder: first.join("velodyne"),
+                pose_file: first.join("poses.txt"),
+                calib_file: first.join("calib.txt"),
+                ..BuildMapConfig::default()
+            },
+            localization: LocalizationConfig {
+                scan_folder: second.join("velodyne"),
+                pose_file: second.join("poses.txt"),
+                calib_file: second.join("calib.txt"),
+                odometry_file: Some(second.join("odometry.txt")),
+                ..LocalizationConfig::default()
+            },
             refinement: Some(RefinementConfig::default()),
             particles: None,
         }
@@ -308,6 +383,30 @@ mod tests {
         fs::write(path("velodyne/000000.bin"), [1; 16]).unwrap();
         let after = Fingerprints::default().of(&run).unwrap();
         assert!(after.map != before.map && after.run != before.run);
+    }
+
+    #[test]
+    fn another_odometry_is_another_run_and_one_that_is_not_there_is_told() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("other.txt");
+        fs::write(&path, "1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
+        let (before, own) = (simulated(), keys(|_| ()));
+        let other = keys(|run| run.localization.odometry_file = Some(path.clone()));
+        assert!(other.map == own.map && other.localization != own.localization);
+        let refined = keys(|run| {
+            if let Some(refinement) = &mut run.refinement {
+                refinement.odometry_file = Some(path.clone());
+            }
+        });
+        assert!(refined.localization == own.localization && refined.run != own.run);
+        let mut missing = simulated();
+        missing.localization.odometry_file = Some("nowhere.txt".into());
+        assert!(Fingerprints::default().of(&missing).is_err());
+        // Without a look at the files, too.
+        assert_ne!(
+            settings_of(&missing).unwrap(),
+            settings_of(&before).unwrap()
+        );
     }
 
     #[test]

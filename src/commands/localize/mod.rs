@@ -39,7 +39,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     input::require_file("pose_file", &config.pose_file)?;
     input::require_file("calib_file", &config.calib_file)?;
     let files = RunFiles::beside(&config.result_path);
-    if config.save_result {
+    if config.save_result || config.plot_loc_results || config.visualize {
         run_output::prepare(&files, "result_path", config.force)?;
     }
     let map = LoadedMap::load(

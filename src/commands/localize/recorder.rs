@@ -17,6 +17,8 @@ pub struct Recorder {
     lifted: Vec<Pose3>,
     refined: Vec<Pose3>,
     movie: Option<Movie>,
+    /// Frames with no ground of the map below the estimate.
+    off_ground: usize,
 }
 
 impl Recorder {
@@ -39,6 +41,7 @@ impl Recorder {
             lifted: Vec::new(),
             refined: Vec::new(),
             movie: config.visualize.then(|| Movie::begin(files, &map.mesh)),
+            off_ground: 0,
         }
     }
 
@@ -58,6 +61,7 @@ impl Recorder {
         results
             .particles
             .push_frame(run_output::rows_of(&estimate.particles));
+        self.off_ground += usize::from(!estimate.on_mapped_ground);
         push(&mut results.estimates, estimate.pose);
         push(&mut results.ground_truth, planar(&frame.map_from_lidar));
         push(
@@ -83,6 +87,13 @@ impl Recorder {
     }
 
     pub fn finish(self, failure: Option<anyhow::Error>) -> Run {
+        if self.off_ground > 0 {
+            tracing::warn!(
+                "{} of {} frames have no ground of the map below them and stand on the last that there was",
+                self.off_ground,
+                self.results.len()
+            );
+        }
         Run {
             results: self.results,
             lifted: self.lifted,
