@@ -88,7 +88,7 @@ mod tests {
             "configuration,average positional error [m],\"average positional error [m], deviation over seeds\",\"average positional error [m], deviation over sequences\",success [%],\"success [%], low\",\"success [%], high\""
         );
         assert!(
-            lines[1].starts_with("\"A, \"\"first\"\"\",0.023,0.002,,1,0.56"),
+            lines[1].starts_with("\"A, \"\"first\"\"\",0.023,0.002,,100,56.5"),
             "{text}"
         );
         assert_eq!(lines[2], "B|C,0.5,,,,,");

@@ -186,13 +186,18 @@ fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
     for frame in frames {
         let bytes = std::fs::metadata(&frame.scan_path).map_or(0, |meta| meta.len());
         let t = frame.map_from_lidar.translation.vector;
+        let q = frame.map_from_lidar.rotation.coords;
         writeln!(
             text,
-            "{} {bytes} {} {} {}",
+            "{} {bytes} {} {} {} {} {} {} {}",
             frame.scan_path.display(),
             t.x,
             t.y,
-            t.z
+            t.z,
+            q.x,
+            q.y,
+            q.z,
+            q.w
         )?;
     }
     Ok(text)

@@ -293,8 +293,13 @@ mod tests {
     use crate::evaluation::comparison::RunId;
 
     fn simulated() -> PlannedRun {
+        lying_in("here")
+    }
+
+    fn lying_in(folder: &str) -> PlannedRun {
         let drives = [1, 2].map(|drive| SimulationConfig {
             drive,
+            output_folder: folder.into(),
             ..SimulationConfig::default()
         });
         let [first, second] = drives.each_ref().map(SimulationConfig::drive_folder);
@@ -336,11 +341,10 @@ mod tests {
             run.build_map.mesh_file = "elsewhere.ply".into();
             run.localization.result_path = "elsewhere.npz".into();
             run.localization.force = true;
-            for drive in run.drives.iter_mut().flatten() {
-                drive.output_folder = "elsewhere".into();
-            }
         });
         assert_eq!(moved, keys(|_| ()));
+        let elsewhere = Fingerprints::default().of(&lying_in("elsewhere"));
+        assert_eq!(elsewhere.unwrap(), moved);
     }
 
     #[test]
@@ -378,6 +382,7 @@ mod tests {
         run.localization.scan_folder = path("velodyne");
         run.localization.pose_file = path("poses.txt");
         run.localization.calib_file = path("calib.txt");
+        run.localization.odometry_file = None;
         let before = Fingerprints::default().of(&run).unwrap();
         assert_eq!(Fingerprints::default().of(&run).unwrap(), before);
         fs::write(path("velodyne/000000.bin"), [1; 16]).unwrap();
