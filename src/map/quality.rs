@@ -26,8 +26,8 @@ use crate::raycasting::{Hit, Scene};
 
 /// A residual beyond this is early or late [m].
 const GROSS_M: f32 = 0.5;
-/// A distance below this counts as "within" [m].
-const NEAR_M: f32 = 0.1;
+/// A distance below this counts as "within", here and against the truth [m].
+pub(super) const NEAR_M: f32 = 0.1;
 /// Beams shorter than this are the own car's surroundings and not judged [m].
 const NEAREST_M: f32 = 3.0;
 /// Edge of the cells in which residuals are averaged for a picture [m].

@@ -15,14 +15,13 @@ use std::collections::HashSet;
 use glam::{IVec3, Vec3};
 use serde::Serialize;
 
+use super::quality::NEAR_M;
 use super::scan_cloud::ScanSettings;
 use super::surface_distance::distances_m;
 use crate::geometry::{Rigid3f, TriangleMesh};
 use crate::kitti::Frame;
 use crate::raycasting::{Hit, Scene};
 
-/// What counts as the same place [m].
-const NEAR_M: f32 = 0.1;
 /// The truth is judged at one point per voxel of this edge [m].
 const VOXEL_M: f32 = 0.1;
 /// One point of the map is judged per so much of its area [m²].

@@ -3,7 +3,7 @@
 //! ```text
 //! map          = H(version, build_map without paths, scans, poses, calibration)
 //! localization = H(map, localization without paths, scans, poses, calibration, odometry)
-//! run          = H(localization, refinement without paths)
+//! run          = H(localization, refinement without paths, its odometry)
 //! ```
 //!
 //! H is BLAKE3. Of a simulated drive the recipe stands for the scans, which follow from it.
@@ -42,24 +42,16 @@ impl Fingerprints {
     pub fn of(&mut self, run: &PlannedRun) -> Result<Keys> {
         let (map, query) = (&run.build_map, &run.localization);
         let [first, second] = drives_of(run);
-        let mapped = match first {
-            Some(drive) => self.recipe(drive)?,
-            None => self.recording(
-                &map.scan_folder,
-                &map.pose_file,
-                &map.calib_file,
-                &map.selection(),
-            )?,
-        };
-        let query = match second {
-            Some(drive) => self.recipe(drive)?,
-            None => self.recording(
-                &query.scan_folder,
-                &query.pose_file,
-                &query.calib_file,
-                &query.selection(),
-            )?,
-        };
+        let mapped = self.scans(
+            first,
+            [&map.scan_folder, &map.pose_file, &map.calib_file],
+            &map.selection(),
+        )?;
+        let query = self.scans(
+            second,
+            [&query.scan_folder, &query.pose_file, &query.calib_file],
+            &query.selection(),
+        )?;
         let odometry = self.odometry(run, run.localization.odometry_file.as_deref())?;
         let refined_with =
             (run.refinement.as_ref()).and_then(|refinement| refinement.odometry_file.as_deref());
@@ -73,6 +65,19 @@ impl Fingerprints {
             localization,
             run,
         })
+    }
+
+    /// Of what is mapped or localized: a simulated drive, or scans, poses and calibration.
+    fn scans(
+        &mut self,
+        simulated: Option<&SimulationConfig>,
+        [scans, poses, calibration]: [&Path; 3],
+        selection: &Selection,
+    ) -> Result<String> {
+        match simulated {
+            Some(drive) => self.recipe(drive),
+            None => self.recording(scans, poses, calibration, selection),
+        }
     }
 
     /// Of an odometry file; nothing for that of a simulated drive, which follows from its recipe.
