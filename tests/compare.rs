@@ -116,6 +116,7 @@ fn a_comparison_is_done_once_and_goes_on_where_it_was() {
     the_tables_say_what_the_runs_say(&recording);
     every_run_can_be_repeated(&recording);
     the_pages_need_nothing_else(&recording);
+    the_page_is_made_of_whatever_is_there(&recording);
 
     // Another configuration is another run, and tables do not mix the two.
     let other = compare(&recording)
@@ -202,7 +203,8 @@ fn every_run_can_be_repeated(recording: &Recording) {
 
 fn the_pages_need_nothing_else(recording: &Recording) {
     let of_run = "out/runs/street/Fuzzy-PSO-MCL/1/report.html";
-    for (page, pictures) in [("out/report.html", 3), (of_run, 7)] {
+    // Of the comparison: runs, success, paths and errors, and five of one run.
+    for (page, pictures) in [("out/report.html", 4 + 5), (of_run, 7)] {
         let html = String::from_utf8(recording.bytes(page)).unwrap();
         for word in ["src=\"http", "href=\"http", "<link", "@import"] {
             assert!(!html.contains(word), "{page} has {word}");
@@ -212,7 +214,7 @@ fn the_pages_need_nothing_else(recording: &Recording) {
     }
     let html = String::from_utf8(recording.bytes("out/report.html")).unwrap();
     let links: Vec<&str> = html.split("href=\"runs/").skip(1).collect();
-    assert_eq!(links.len(), 6);
+    assert_eq!(links.len(), 3 * 2 + 2);
     for link in links {
         let (path, _) = link.split_once('"').unwrap();
         assert!(
@@ -220,6 +222,59 @@ fn the_pages_need_nothing_else(recording: &Recording) {
             "{path}"
         );
     }
+}
+
+/// Records that came without their runs, and one that did not come.
+fn the_page_is_made_of_whatever_is_there(recording: &Recording) {
+    let page = || String::from_utf8(recording.bytes("out/report.html")).unwrap();
+    let whole = page();
+    assert!(!whole.contains("What is missing") && !whole.contains("left out"));
+    for told in [
+        "One run with all its pictures: street/Fuzzy-PSO-MCL/1",
+        "street/Fuzzy-PSO-MCL/1: Likelihood around the true pose",
+        "numbers of particles, Fuzzy-MCL",
+        "build_map.ground_method: &quot;pca&quot;",
+        "localization.yml of street/Fuzzy-PSO-MCL/1",
+        "(source ",
+    ] {
+        assert!(whole.contains(told), "{told}");
+    }
+    let runs = recording.path("out/runs/street");
+    let aside = recording.path("out/runs/aside");
+    fs::rename(&runs, &aside).unwrap();
+    let keep = |run: &str, names: &[&str]| {
+        fs::create_dir_all(runs.join(run).join("plots")).unwrap();
+        for name in names {
+            fs::copy(aside.join(run).join(name), runs.join(run).join(name)).unwrap();
+        }
+    };
+    keep("PCA-MCL/1", &["run.json"]);
+    compare(recording).with("--collect").succeeds();
+    let html = page();
+    for told in [
+        "7 of 8 runs are not there",
+        "street/PCA-MCL/2, street/Fuzzy-MCL/1",
+        "No result of its runs is here",
+        "No folder of its runs is here",
+    ] {
+        assert!(html.contains(told), "{told}");
+    }
+    keep(
+        "Fuzzy-MCL/2",
+        &["run.json", "localization.npz", "plots/map.png"],
+    );
+    fs::write(runs.join("Fuzzy-MCL/2/plots/likelihood.png"), "half a").unwrap();
+    compare(recording).with("--collect").succeeds();
+    let html = page();
+    for told in [
+        "One run with all its pictures: street/Fuzzy-MCL/2",
+        "Not there, or not readable: particles.png, range_images.png, cannot read",
+        "(Fuzzy-MCL seed 2)",
+    ] {
+        assert!(html.contains(told), "{told}");
+    }
+    fs::remove_dir_all(&runs).unwrap();
+    fs::rename(&aside, &runs).unwrap();
 }
 
 #[test]

@@ -20,6 +20,7 @@ pub mod progress;
 mod run_output;
 mod run_page;
 mod stages;
+mod version;
 
 use std::io::Write as _;
 use std::path::Path;

@@ -262,15 +262,32 @@ pub fn draw_run_on(
     draw_particles(files, image.as_ref(), results, estimates)?;
     if let Some(mesh) = mesh {
         MapPlot {
-            title: "Map from above: ground red, rest blue",
+            title: "Map from above",
             mesh,
-            trajectory: truth,
-            ground_color: [255, 0, 0],
-            rest_color: [0, 0, 255],
+            path: truth.map(|truth| ("path of the car to be found", truth)),
+            keys: &map_colors(mesh),
         }
         .save(&files.plot("map.png")?)?;
     }
     Ok(())
+}
+
+/// The most frequent colours of ground (more red than blue) and rest; none of a map without
+/// colours.
+fn map_colors(mesh: &TriangleMesh) -> Vec<(&'static str, Rgb)> {
+    let most_frequent = |is_ground: bool| {
+        let mut counts = BTreeMap::<Rgb, usize>::new();
+        for &color in &mesh.colors {
+            if (color[0] > color[2]) == is_ground {
+                *counts.entry(color).or_default() += 1;
+            }
+        }
+        let most = counts.into_iter().max_by_key(|&(_, count)| count);
+        most.map(|(color, _)| color)
+    };
+    let ground = most_frequent(true).map(|color| ("ground", color));
+    let rest = most_frequent(false).map(|color| ("rest", color));
+    ground.into_iter().chain(rest).collect()
 }
 
 fn draw_errors(

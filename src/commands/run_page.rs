@@ -6,10 +6,11 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result};
 
-use super::output;
 use super::run_output::RunFiles;
+use super::{output, version};
 use crate::evaluation::comparison::{Cell, Column, Table};
 use crate::evaluation::{Report, TrajectoryReport, Value};
+use crate::plotting::palette;
 use crate::reporting::{Block, Page, Section};
 
 /// What is told of a run; the rest lies beside its result.
@@ -27,7 +28,7 @@ pub struct RunPage<'a> {
 }
 
 /// The pictures of a run, each with its section and what it shows.
-const PICTURES: [(&str, &str, &str); 7] = [
+pub const PICTURES: [(&str, &str, &str); 7] = [
     ("Trajectory", "path.png", "Path against ground truth"),
     (
         "Errors",
@@ -43,7 +44,7 @@ const PICTURES: [(&str, &str, &str); 7] = [
     (
         "Map",
         "map.png",
-        "The map from above: ground red, rest blue",
+        "The map from above, and the path of the car to be found",
     ),
     (
         "Likelihood",
@@ -54,7 +55,7 @@ const PICTURES: [(&str, &str, &str); 7] = [
 ];
 
 /// Configurations and texts that may lie beside a result.
-const TEXTS: [&str; 5] = [
+pub const TEXTS: [&str; 5] = [
     "build_map.yml",
     "localization.yml",
     "refinement.yml",
@@ -95,13 +96,8 @@ impl RunPage<'_> {
             ],
         }];
         for (title, name, caption) in PICTURES {
-            let mut blocks: Vec<Block> = read(&self.files.file("plots").join(name))?
-                .map(|png| Block::Picture {
-                    png,
-                    caption: caption.to_owned(),
-                })
-                .into_iter()
-                .collect();
+            let path = self.files.file("plots").join(name);
+            let mut blocks: Vec<Block> = picture(&path, caption)?.into_iter().collect();
             if title == "Timing" && !self.stage_seconds.is_empty() {
                 blocks.push(Block::Table(stages(self.stage_seconds)));
             }
@@ -113,18 +109,13 @@ impl RunPage<'_> {
             }
         }
         let mut blocks = vec![Block::Facts(
-            [("program".to_owned(), program())]
+            [("program".to_owned(), version::program())]
                 .into_iter()
                 .chain(facts(self.machine))
                 .collect(),
         )];
         for name in TEXTS {
-            if let Some(bytes) = read(&self.files.file(name))? {
-                blocks.push(Block::Folded {
-                    name: name.to_owned(),
-                    text: String::from_utf8_lossy(&bytes).into_owned(),
-                });
-            }
+            blocks.extend(folded(&self.files.file(name), name)?);
         }
         sections.push(Section {
             title: "Configuration and versions".to_owned(),
@@ -190,15 +181,25 @@ fn facts(map: &BTreeMap<String, String>) -> Vec<(String, String)> {
     map.iter().map(|(k, v)| (k.clone(), v.clone())).collect()
 }
 
-fn program() -> String {
-    format!("fpmcl {}", env!("CARGO_PKG_VERSION"))
+/// A picture of a page; `None` where there is none.
+pub fn picture(path: &Path, caption: &str) -> Result<Option<Block>> {
+    if !path.exists() {
+        return Ok(None);
+    }
+    Ok(Some(Block::Picture {
+        png: palette::with_palette(path)?,
+        caption: caption.to_owned(),
+    }))
 }
 
-/// A file; `None` where there is none.
-fn read(path: &Path) -> Result<Option<Vec<u8>>> {
+/// A text that is folded away under a name; `None` where there is none.
+pub fn folded(path: &Path, name: &str) -> Result<Option<Block>> {
     if !path.exists() {
         return Ok(None);
     }
     let bytes = fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-    Ok(Some(bytes))
+    Ok(Some(Block::Folded {
+        name: name.to_owned(),
+        text: String::from_utf8_lossy(&bytes).into_owned(),
+    }))
 }

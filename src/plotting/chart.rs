@@ -29,7 +29,7 @@ pub enum Mark {
 /// Named numbers over numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Series {
-    /// What the legend calls it.
+    /// What the legend calls it; empty where it belongs to another.
     pub name: String,
     /// Of line or dots.
     pub color: Rgb,
@@ -101,7 +101,8 @@ impl LineChart {
     }
 
     fn draw_panel(&self, sheet: &Sheet, panel: &Panel, x: Span, top: f64) -> Result<(), DrawError> {
-        let keys: Vec<Key> = panel.series.iter().map(Series::key).collect();
+        let named = panel.series.iter().filter(|series| !series.name.is_empty());
+        let keys: Vec<Key> = named.map(Series::key).collect();
         legend(sheet, &keys, (LEFT, top + 12.0), WIDTH - RIGHT)?;
         let rect = Rect {
             left: LEFT,

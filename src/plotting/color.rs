@@ -15,13 +15,11 @@ pub const MCL: Rgb = [213, 94, 0];
 pub const REFINED: Rgb = [0, 114, 178];
 /// Odometry alone.
 pub const ODOMETRY: Rgb = [204, 121, 167];
-/// Particles.
-pub const PARTICLES: Rgb = [0, 158, 115];
 /// Further series, in this order.
 pub const SERIES: [Rgb; 6] = [
     REFINED,
     MCL,
-    PARTICLES,
+    [0, 158, 115],
     ODOMETRY,
     [86, 180, 233],
     [230, 159, 0],

@@ -19,6 +19,11 @@ pub enum PlotError {
         path: PathBuf,
         source: image::ImageError,
     },
+    #[error("cannot give {} a palette: {source}", path.display())]
+    Encode {
+        path: PathBuf,
+        source: png::EncodingError,
+    },
     #[error("cannot draw {}: {source}", path.display())]
     Draw {
         path: PathBuf,

@@ -13,19 +13,17 @@ use crate::geometry::{Pose2, TriangleMesh};
 /// Columns or rows of the raster: as many as the picture is drawn with.
 const RASTER: usize = 2500;
 
-/// The map from above, ground red and the rest blue, as its vertices are coloured.
+/// The map from above, as its vertices are coloured.
 #[derive(Clone, Copy, Debug)]
 pub struct MapPlot<'a> {
     /// Above everything.
     pub title: &'a str,
     /// The map.
     pub mesh: &'a TriangleMesh,
-    /// The mapping trajectory, where it is to be drawn.
-    pub trajectory: Option<&'a [Pose2]>,
-    /// Colour of ground and rest, for the legend.
-    pub ground_color: Rgb,
-    /// Colour of the rest.
-    pub rest_color: Rgb,
+    /// A path with its name, where it is to be drawn.
+    pub path: Option<(&'a str, &'a [Pose2])>,
+    /// What the colours of the map are called.
+    pub keys: &'a [(&'a str, Rgb)],
 }
 
 impl MapPlot<'_> {
@@ -34,28 +32,21 @@ impl MapPlot<'_> {
         let (x, y) = extent(self.mesh, path)?;
         let image = MapImage::of_colors(self.mesh, RASTER);
         let (view, size) = map_view(x, y, 96.0, 30.0);
-        let square = |name: &str, color: Rgb| Key {
+        let key = |name: &str, color: Rgb, shape: KeyShape| Key {
             name: name.to_owned(),
             color,
-            shape: KeyShape::Square,
+            shape,
         };
-        let mut keys = vec![
-            square("ground", self.ground_color),
-            square("rest", self.rest_color),
-        ];
-        if self.trajectory.is_some() {
-            keys.push(Key {
-                name: "mapping trajectory".to_owned(),
-                color: TRUTH,
-                shape: KeyShape::Line,
-            });
-        }
+        let colors = self.keys.iter();
+        let colors = colors.map(|(name, color)| key(name, *color, KeyShape::Square));
+        let driven = self.path.map(|(name, _)| key(name, TRUTH, KeyShape::Line));
+        let keys: Vec<Key> = colors.chain(driven).collect();
         sheet::save(path, size, |sheet| {
             title(sheet, self.title, view.rect.left)?;
             legend(sheet, &keys, (view.rect.left, 70.0), view.rect.right)?;
             view.grid(sheet)?;
             image.draw(sheet, &view, 0.0)?;
-            draw_trajectory(sheet, &view, self.trajectory)?;
+            draw_trajectory(sheet, &view, self.path.map(|(_, poses)| poses))?;
             view.frame(sheet, "x [m]", "y [m]")?;
             view.scale_bar(sheet)
         })

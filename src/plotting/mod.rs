@@ -6,6 +6,7 @@
 // What pictures are drawn with.
 pub mod color;
 mod error;
+pub mod palette;
 mod sheet;
 mod view;
 // The pictures.

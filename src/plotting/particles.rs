@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::MapImage;
-use super::color::{Colormap, MCL, PARTICLES, REFINED, Rgb, TRUTH, WHITE};
+use super::color::{Colormap, MCL, REFINED, Rgb, TRUTH, WHITE};
 use super::error::{DrawError, PlotError};
 use super::sheet::{self, Pen, Point, Rect, Sheet};
 use super::trajectory::{map_view, places};
@@ -109,9 +109,9 @@ impl LocalizationPicture<'_> {
             color,
             shape,
         };
-        let count = format!("{} particles", self.particles.len());
+        let count = format!("{} particles, coloured by weight", self.particles.len());
         [
-            Some(key(&count, PARTICLES, KeyShape::Dot)),
+            Some(key(&count, Colormap::Viridis.at(0.0), KeyShape::Dot)),
             (self.ground_truth).map(|_| key("ground truth", TRUTH, KeyShape::Line)),
             self.estimate.map(|_| key("MCL", MCL, KeyShape::Line)),
             self.refined

@@ -400,9 +400,8 @@ fn the_map_is_drawn_in_its_colours_and_by_a_number() {
     MapPlot {
         title: "Map from above",
         mesh: &mesh,
-        trajectory: Some(&truth),
-        ground_color: [255, 0, 0],
-        rest_color: [0, 0, 255],
+        path: Some(("mapping trajectory", &truth)),
+        keys: &[("ground", [255, 0, 0]), ("rest", [0, 0, 255])],
     }
     .save(&path)
     .unwrap();
@@ -442,9 +441,8 @@ fn the_map_is_drawn_in_its_colours_and_by_a_number() {
     let nothing = MapPlot {
         title: "",
         mesh: &TriangleMesh::default(),
-        trajectory: None,
-        ground_color: [255, 0, 0],
-        rest_color: [0, 0, 255],
+        path: None,
+        keys: &[],
     };
     let message = nothing.save(&path).unwrap_err().to_string();
     assert!(message.contains("the mesh has no triangles"), "{message}");
@@ -491,7 +489,7 @@ fn runtimes_and_other_lines_are_drawn() {
                 },
                 Series {
                     mark: Mark::Dots,
-                    ..Series::line("measured", color::PARTICLES, peak(0.3).step_by(4))
+                    ..Series::line("measured", color::SERIES[2], peak(0.3).step_by(4))
                 },
             ],
             from_zero: true,

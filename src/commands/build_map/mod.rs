@@ -216,9 +216,11 @@ fn draw(
     MapPlot {
         title: "Map from above",
         mesh,
-        trajectory: Some(&driven),
-        ground_color: settings.ground_color,
-        rest_color: settings.rest_color,
+        path: Some(("mapping trajectory", &driven)),
+        keys: &[
+            ("ground", settings.ground_color),
+            ("rest", settings.rest_color),
+        ],
     }
     .save(&picture)?;
     tracing::info!("drew {}", picture.display());

@@ -1,18 +1,17 @@
 //! Tables, pictures and a page of the runs that are there.
 
-use std::fs;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Result, ensure};
 use serde::Serialize;
 
 use super::plan::PlannedRun;
-use super::{Layout, execute, fingerprint, pictures};
-use crate::commands::output;
-use crate::config::{self, ComparisonConfig};
-use crate::evaluation::comparison::tables::particle_table;
+use super::{Layout, execute, fingerprint, page};
+use crate::commands::{output, version};
+use crate::config::ComparisonConfig;
 use crate::evaluation::comparison::{Comparison, RunRecord, Table};
-use crate::reporting::{Block, Page, Section, csv, markdown, text};
+use crate::reporting::{csv, markdown, text};
 
 /// `comparison.json`.
 #[derive(Serialize)]
@@ -31,35 +30,28 @@ pub fn collect(config: &ComparisonConfig, runs: &[PlannedRun], layout: &Layout) 
         layout.root.display()
     );
     tracing::info!("{} of {} runs are there", records.len(), runs.len());
-    execute::write_config(config, layout)?;
-    let (compared, swept) = records
-        .into_iter()
-        .partition::<Vec<_>, _>(|(run, _)| run.particles.is_none());
-    let comparison = Comparison {
-        sequences: sequences_of(runs),
-        variants: config.variants(),
-        contrasts: config.contrasts(),
-        seeds: config.seeds.len(),
-        records: compared.into_iter().map(|(_, record)| record).collect(),
-    };
-    let sweep = by_particles(&swept);
-    let mut tables = comparison.tables();
-    if !sweep.is_empty() {
-        tables.insert(tables.len() - 1, particle_table(&sweep));
+    let programs: BTreeSet<&str> = records.iter().map(|(_, r)| r.program.as_str()).collect();
+    if programs.len() > 1 {
+        let programs: Vec<&str> = programs.into_iter().collect();
+        tracing::warn!(
+            "the runs are of different programs: {}",
+            programs.join(", ")
+        );
     }
+    execute::write_config(config, layout)?;
+    let comparison = comparison(config, runs, records);
+    let tables = comparison.tables();
     write_tables(&tables, layout)?;
-    let swept_records = swept.iter().map(|(_, record)| record);
-    let all: Vec<&RunRecord> = comparison.records.iter().chain(swept_records).collect();
+    let all: Vec<&RunRecord> = comparison.all_records().collect();
     output::write_json(
         &layout.root.join("comparison.json"),
         &Collected {
-            program: program(),
+            program: version::program(),
             tables: &tables,
             runs: &all,
         },
     )?;
-    let drawn = pictures::draw(&comparison, &sweep, layout)?;
-    let page = page(config, &comparison, &tables, &drawn)?;
+    let page = page::page(config, runs, &comparison, &tables, layout)?;
     write(&layout.root.join("report.html"), &page.to_html())?;
     Ok(shown(&tables))
 }
@@ -97,15 +89,27 @@ fn sequences_of(runs: &[PlannedRun]) -> Vec<String> {
     names
 }
 
-/// The runs for each number of particles, ascending.
-fn by_particles<'a>(records: &'a [(&PlannedRun, RunRecord)]) -> Vec<(usize, Vec<&'a RunRecord>)> {
-    let mut groups = std::collections::BTreeMap::<usize, Vec<&RunRecord>>::new();
-    for (run, record) in records {
-        if let Some(particles) = run.particles {
-            groups.entry(particles).or_default().push(record);
+fn comparison(
+    config: &ComparisonConfig,
+    runs: &[PlannedRun],
+    found: Vec<(&PlannedRun, RunRecord)>,
+) -> Comparison {
+    let mut records = Vec::new();
+    let mut sweep = BTreeMap::<usize, Vec<RunRecord>>::new();
+    for (run, record) in found {
+        match run.particles {
+            Some(count) => sweep.entry(count).or_default().push(record),
+            None => records.push(record),
         }
     }
-    groups.into_iter().collect()
+    Comparison {
+        sequences: sequences_of(runs),
+        variants: config.variants(),
+        contrasts: config.contrasts(),
+        seeds: config.seeds.len(),
+        records,
+        sweep: sweep.into_iter().collect(),
+    }
 }
 
 fn write_tables(tables: &[Table], layout: &Layout) -> Result<()> {
@@ -124,82 +128,6 @@ fn write_tables(tables: &[Table], layout: &Layout) -> Result<()> {
 fn shown(tables: &[Table]) -> String {
     let summaries = tables.iter().filter(|table| table.name != "runs");
     summaries.map(text::table).collect::<Vec<_>>().join("\n")
-}
-
-fn page(
-    config: &ComparisonConfig,
-    comparison: &Comparison,
-    tables: &[Table],
-    drawn: &[pictures::Drawn],
-) -> Result<Page> {
-    let section = |title: &str, blocks: Vec<Block>| Section {
-        title: title.to_owned(),
-        blocks,
-    };
-    let of = |names: &[&str]| -> Vec<Block> {
-        let found = tables.iter().filter(|t| names.contains(&t.name.as_str()));
-        found.cloned().map(Block::Table).collect()
-    };
-    let mut sections = vec![
-        section("Tables", of(&["table_1", "table_2"])),
-        section("Differences", of(&["differences"])),
-        section("Sequences", of(&["by_sequence"])),
-    ];
-    let mut pictures = Vec::new();
-    for picture in drawn {
-        let png = fs::read(&picture.path)
-            .with_context(|| format!("cannot read {}", picture.path.display()))?;
-        pictures.push(Block::Picture {
-            png,
-            caption: picture.caption.clone(),
-        });
-    }
-    sections.push(section("Pictures", pictures));
-    let swept = of(&["particles"]);
-    if !swept.is_empty() {
-        sections.push(section("Numbers of particles", swept));
-    }
-    sections.push(section("Runs", of(&["runs"])));
-    sections.push(section(
-        "Configuration and versions",
-        vec![
-            Block::Facts(versions(comparison)),
-            Block::Folded {
-                name: "comparison.yml".to_owned(),
-                text: config::to_yaml(config)?,
-            },
-        ],
-    ));
-    Ok(Page {
-        title: "Comparison".to_owned(),
-        subtitle: format!(
-            "{} configurations, sequences {}; {} runs.",
-            comparison.variants.len(),
-            comparison.sequences.join(", "),
-            comparison.records.len()
-        ),
-        sections,
-    })
-}
-
-/// Programs and machines that took part, each once.
-fn versions(comparison: &Comparison) -> Vec<(String, String)> {
-    let mut facts: Vec<(String, String)> = vec![("collected by".to_owned(), program())];
-    for record in &comparison.records {
-        let machine: Vec<&str> = record.machine.values().map(String::as_str).collect();
-        let fact = (
-            "run by".to_owned(),
-            format!("{}, {}", record.program, machine.join(", ")),
-        );
-        if !facts.contains(&fact) {
-            facts.push(fact);
-        }
-    }
-    facts
-}
-
-fn program() -> String {
-    format!("fpmcl {}", env!("CARGO_PKG_VERSION"))
 }
 
 fn write(path: &Path, text: &str) -> Result<()> {

@@ -15,7 +15,7 @@ use super::shared::{self, Shared};
 use crate::commands::interrupt::Interrupted;
 use crate::commands::run_output::{self, RunFiles};
 use crate::commands::run_page::RunPage;
-use crate::commands::{Context, build_map, localize, refine, simulate};
+use crate::commands::{Context, build_map, localize, refine, simulate, version};
 use crate::config::{self, BuildMapConfig, LocalizationConfig, RefinementConfig};
 use crate::evaluation::comparison::{Outcome, RunRecord};
 use crate::evaluation::{Judged, LocalizationResults, RangeMclRules, Report, TrajectoryReport};
@@ -66,7 +66,7 @@ pub fn execute(
         id: run.id.clone(),
         key: keys.run,
         settings: fingerprint::settings_of(run)?,
-        program: format!("fpmcl {}", env!("CARGO_PKG_VERSION")),
+        program: version::program(),
         machine: machine(context, &stages),
         stage_seconds: stages.seconds,
         outcome,

@@ -1,12 +1,14 @@
 //! What a result depends on, as a short text that is the same exactly where the result is.
 //!
 //! ```text
-//! map          = H(version, build_map without paths, scans, poses, calibration)
+//! map          = H(source, build_map without paths, scans, poses, calibration)
 //! localization = H(map, localization without paths, scans, poses, calibration, odometry)
 //! run          = H(localization, refinement without paths, its odometry)
 //! ```
 //!
-//! H is BLAKE3. Of a simulated drive the recipe stands for the scans, which follow from it.
+//! H is BLAKE3. Of a simulated drive the recipe stands for the scans, which follow from it. The source
+//! is that of the program ([`version::SOURCE`]): rebuilt with another behaviour, it does not take what
+//! an older one made.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -16,6 +18,7 @@ use anyhow::{Context as _, Result};
 use rayon::prelude::*;
 
 use super::plan::PlannedRun;
+use crate::commands::version;
 use crate::config::{self, BuildMapConfig, LocalizationConfig, RefinementConfig};
 use crate::kitti::{Selection, Sequence};
 use crate::simulation::SimulationConfig;
@@ -57,7 +60,7 @@ impl Fingerprints {
             (run.refinement.as_ref()).and_then(|refinement| refinement.odometry_file.as_deref());
         let refined_with = self.odometry(run, refined_with)?;
         let [build_map, localization, refinement] = effective(run)?;
-        let map = hash(&["map", version(), &build_map, &mapped]);
+        let map = hash(&["map", version::SOURCE, &build_map, &mapped]);
         let localization = hash(&["localization", &map, &localization, &query, &odometry]);
         let run = hash(&["run", &localization, &refinement, &refined_with]);
         Ok(Keys {
@@ -248,7 +251,8 @@ fn effective(run: &PlannedRun) -> Result<[String; 3]> {
 }
 
 /// What a run was asked to do, with the names of its inputs and without a look at them, for
-/// collecting where they are not.
+/// collecting where they are not. Of the program only the version: tables may be made by a later
+/// build of it, and say which ones the runs are of.
 pub fn settings_of(run: &PlannedRun) -> Result<String> {
     let [build_map, localization, refinement] = effective(run)?;
     let drives = match &run.drives {
@@ -262,17 +266,13 @@ pub fn settings_of(run: &PlannedRun) -> Result<String> {
     };
     Ok(hash(&[
         "settings",
-        version(),
+        version::VERSION,
         &build_map,
         &localization,
         &refinement,
         &drives,
         &inputs_of(run),
     ]))
-}
-
-fn version() -> &'static str {
-    env!("CARGO_PKG_VERSION")
 }
 
 fn content(path: &Path) -> Result<String> {

@@ -6,7 +6,7 @@
 //!   |             defaults <- base <- sequence <- configuration <- seed
 //!   v
 //! sequences/NAME/drive_1, drive_2          what is simulated
-//!   | fingerprint what a stage depends on: configuration without paths, inputs, version (BLAKE3)
+//!   | fingerprint what a stage depends on: configuration without paths, inputs, source (BLAKE3)
 //!   v
 //! shared/maps/KEY/map.ply                  one per ground method, whoever asks
 //! shared/localizations/KEY/...             one per map, filter and seed: refined runs start from it
@@ -27,6 +27,7 @@ mod collect;
 mod execute;
 mod fingerprint;
 mod jobs;
+mod page;
 mod pictures;
 mod plan;
 mod shared;

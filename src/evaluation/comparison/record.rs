@@ -59,11 +59,11 @@ pub enum Outcome {
 pub struct RunRecord {
     /// Which run.
     pub id: RunId,
-    /// Hash of all that it follows from: configuration, inputs, version.
+    /// Hash of all that it follows from: configuration, inputs, source of the program.
     pub key: String,
     /// Hash of its effective configuration and the version alone.
     pub settings: String,
-    /// Program and version.
+    /// Program, version and source.
     pub program: String,
     /// Processor, threads and renderer.
     pub machine: BTreeMap<String, String>,
@@ -79,6 +79,14 @@ impl RunRecord {
         match &self.outcome {
             Outcome::Finished(judgement) => Some(judgement),
             Outcome::Failed(_) => None,
+        }
+    }
+
+    /// Why the run failed; `None` where it did not.
+    pub fn failure(&self) -> Option<&str> {
+        match &self.outcome {
+            Outcome::Finished(_) => None,
+            Outcome::Failed(why) => Some(why),
         }
     }
 

@@ -1,5 +1,7 @@
 //! The tables of a comparison, from its runs.
 
+use std::collections::BTreeSet;
+
 use serde::{Deserialize, Serialize};
 
 use super::measures::{CONTRASTED, Measure, TABLE_1, TABLE_2};
@@ -41,6 +43,8 @@ pub struct Comparison {
     pub seeds: usize,
     /// The runs that are there, in any order.
     pub records: Vec<RunRecord>,
+    /// Runs for each number of particles, ascending; they are in no mean of the others.
+    pub sweep: Vec<(usize, Vec<RunRecord>)>,
 }
 
 const SPREAD: &str = "Mean over sequences ± standard deviation over seeds ± standard deviation over sequences; the first ten frames (half of a run that is shorter than twenty) do not count.";
@@ -48,13 +52,24 @@ const SPREAD: &str = "Mean over sequences ± standard deviation over seeds ± st
 impl Comparison {
     /// All tables, most important first.
     pub fn tables(&self) -> Vec<Table> {
-        vec![
+        let mut tables = vec![
             self.table_1(),
             self.table_2(),
             self.differences(),
             self.by_sequence(),
-            self.runs(),
-        ]
+            self.timing(),
+        ];
+        if !self.sweep.is_empty() {
+            tables.push(particle_table(&self.sweep));
+        }
+        tables.push(self.runs());
+        tables
+    }
+
+    /// All runs that are there, of the sweep too.
+    pub fn all_records(&self) -> impl Iterator<Item = &RunRecord> {
+        let swept = self.sweep.iter().flat_map(|(_, records)| records);
+        self.records.iter().chain(swept)
     }
 
     fn table_1(&self) -> Table {
@@ -95,7 +110,7 @@ impl Comparison {
             let begin = [
                 name.into(),
                 Cell::Text(format!("{} of {planned}", found.len())),
-                rate(&found).into(),
+                rate(found.iter().copied()).into(),
             ];
             let numbers = measures
                 .iter()
@@ -142,7 +157,11 @@ impl Comparison {
             for variant in &self.variants {
                 let name = variant.name.as_str();
                 let found: Vec<&RunRecord> = self.of(Some(sequence), name).collect();
-                let begin = [sequence.as_str().into(), name.into(), rate(&found).into()];
+                let begin = [
+                    sequence.as_str().into(),
+                    name.into(),
+                    rate(found.iter().copied()).into(),
+                ];
                 let numbers = measures.iter().map(|measure| {
                     let numbers = found.iter().filter_map(|run| number(run, measure));
                     Estimate::of(&[numbers.collect()]).into()
@@ -163,12 +182,54 @@ impl Comparison {
         }
     }
 
+    /// A row per sequence and configuration, a column per stage.
+    fn timing(&self) -> Table {
+        let stages: BTreeSet<&String> = self
+            .records
+            .iter()
+            .flat_map(|record| record.stage_seconds.keys())
+            .collect();
+        let seconds = |stage: &&String| Column {
+            name: (*stage).clone(),
+            unit: "s".to_owned(),
+            definition: "wall time of the whole drive, reading and drawing included".to_owned(),
+        };
+        let per_frame = TABLE_1[5];
+        let head = ["sequence", "configuration"].map(Column::named);
+        let mut rows = Vec::new();
+        for sequence in &self.sequences {
+            for variant in &self.variants {
+                let found: Vec<&RunRecord> = self.of(Some(sequence), &variant.name).collect();
+                let begin = [sequence.as_str().into(), variant.name.as_str().into()];
+                let times = stages.iter().map(|stage| {
+                    let times = found.iter().filter_map(|run| run.stage_seconds.get(*stage));
+                    Estimate::of(&[times.copied().collect()]).into()
+                });
+                let of_frames = found.iter().filter_map(|run| number(run, &per_frame));
+                let of_frames = Estimate::of(&[of_frames.collect()]).into();
+                rows.push(begin.into_iter().chain(times).chain([of_frames]).collect());
+            }
+        }
+        Table {
+            name: "timing".to_owned(),
+            title: "Time per stage".to_owned(),
+            note: "Mean ± standard deviation over seeds. What several runs share, such as a map, was made once and is told with the time that it took then.".to_owned(),
+            columns: head
+                .into_iter()
+                .chain(stages.iter().map(seconds))
+                .chain([column(&per_frame)])
+                .collect(),
+            rows,
+        }
+    }
+
     /// A row per run.
     fn runs(&self) -> Table {
         let measures: Vec<Measure> = [TABLE_1, TABLE_2].concat();
         let head = ["run", "success"].map(Column::named);
         let mut records: Vec<&RunRecord> = self.records.iter().collect();
         records.sort_by_key(|record| (self.place(record), record.id.seed));
+        records.extend(self.sweep.iter().flat_map(|(_, records)| records));
         let row = |record: &&RunRecord| {
             let link = Cell::Link {
                 text: record.id.to_string(),
@@ -201,7 +262,7 @@ impl Comparison {
     }
 
     /// The runs of a configuration, in one sequence or in all.
-    fn of<'a>(
+    pub fn of<'a>(
         &'a self,
         sequence: Option<&'a str>,
         variant: &'a str,
@@ -242,16 +303,16 @@ impl Comparison {
 }
 
 /// How often the car was found for so many particles: a row per number.
-pub fn particle_table(rows: &[(usize, Vec<&RunRecord>)]) -> Table {
+fn particle_table(rows: &[(usize, Vec<RunRecord>)]) -> Table {
     let measures = [TABLE_1[0], TABLE_2[2], TABLE_1[5]];
     let head = [Column::named("particles"), runs_column(), success()];
-    let row = |(count, records): &(usize, Vec<&RunRecord>)| {
+    let row = |(count, records): &(usize, Vec<RunRecord>)| {
         let begin = [
             Cell::Number(*count as f64),
             Cell::Text(records.len().to_string()),
             rate(records).into(),
         ];
-        let found: Vec<&&RunRecord> = records.iter().filter(|run| run.is_success()).collect();
+        let found: Vec<&RunRecord> = records.iter().filter(|run| run.is_success()).collect();
         let numbers = measures.iter().map(|measure| {
             let numbers = found.iter().filter_map(|run| number(run, measure));
             Estimate::of(&[numbers.collect()]).into()
@@ -268,9 +329,10 @@ pub fn particle_table(rows: &[(usize, Vec<&RunRecord>)]) -> Table {
 }
 
 /// The share of runs in which the car was found and kept.
-pub fn rate(records: &[&RunRecord]) -> Option<SuccessRate> {
-    let successes = records.iter().filter(|record| record.is_success()).count();
-    success_rate(successes, records.len())
+pub fn rate<'a>(records: impl IntoIterator<Item = &'a RunRecord>) -> Option<SuccessRate> {
+    let outcomes: Vec<bool> = records.into_iter().map(RunRecord::is_success).collect();
+    let successes = outcomes.iter().filter(|is_success| **is_success).count();
+    success_rate(successes, outcomes.len())
 }
 
 fn number(record: &RunRecord, measure: &Measure) -> Option<f64> {

@@ -57,6 +57,7 @@ fn comparison(records: Vec<RunRecord>) -> Comparison {
         }],
         seeds: 2,
         records,
+        sweep: Vec::new(),
     }
 }
 
@@ -148,7 +149,7 @@ fn every_row_has_a_cell_per_column_and_every_run_a_row() {
             assert_eq!(row.len(), table.columns.len(), "{}", table.name);
         }
     }
-    let names: Vec<&Cell> = tables[4].rows.iter().map(|row| &row[0]).collect();
+    let names: Vec<&Cell> = tables[5].rows.iter().map(|row| &row[0]).collect();
     let Cell::Link { text, .. } = names[0] else {
         panic!("{names:?}")
     };
@@ -158,8 +159,48 @@ fn every_row_has_a_cell_per_column_and_every_run_a_row() {
 #[test]
 fn more_particles_are_more_rows() {
     let runs = eight_runs();
-    let some: Vec<&RunRecord> = runs.iter().take(3).collect();
+    let some: Vec<RunRecord> = runs.iter().take(3).cloned().collect();
     let table = particle_table(&[(100, vec![]), (1000, some)]);
     assert_eq!(cell(&table, 0, "success"), &Cell::Absent);
     assert_eq!(cell(&table, 1, "success").number(), Some(1.0));
+}
+
+#[test]
+fn runs_of_the_sweep_are_in_the_list_of_runs_and_in_no_mean() {
+    let mut swept = run("town", "A-100-particles", 1, 9.0);
+    swept.id.seed = 7;
+    let mut comparison = comparison(eight_runs());
+    let without = comparison.tables();
+    comparison.sweep = vec![(100, vec![swept])];
+    let tables = comparison.tables();
+    for (before, after) in without.iter().zip(&tables).take(5) {
+        assert_eq!(before, after);
+    }
+    let runs = tables.last().unwrap();
+    let Cell::Link { text, .. } = &runs.rows[8][0] else {
+        panic!("{runs:?}")
+    };
+    assert_eq!(
+        (runs.rows.len(), text.as_str()),
+        (9, "town/A-100-particles/7")
+    );
+}
+
+#[test]
+fn every_stage_has_a_column_and_what_was_not_done_no_time() {
+    let mut runs = eight_runs();
+    for run in &mut runs {
+        let seconds = run.id.seed as f64;
+        run.stage_seconds.insert("1 map".to_owned(), seconds);
+        if run.id.configuration == "B" {
+            run.stage_seconds.insert("2 refine".to_owned(), 5.0);
+        }
+    }
+    let table = comparison(runs).timing();
+    assert_eq!(table.rows.len(), 4);
+    assert_eq!(cell(&table, 0, "1 map").number(), Some(1.5));
+    assert_eq!(cell(&table, 0, "2 refine"), &Cell::Absent);
+    assert_eq!(cell(&table, 1, "2 refine").number(), Some(5.0));
+    let per_frame_ms = cell(&table, 1, "runtime per frame").number().unwrap();
+    assert_relative_eq!(per_frame_ms, 100.0, epsilon = 1e-9);
 }
