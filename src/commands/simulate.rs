@@ -50,8 +50,9 @@ pub struct SimulationReport {
 /// Simulates a drive. `progress` is told how many scans are done, of how many. When `interrupt` is
 /// requested, the scans that are being made are finished, and the rest is left for the next run.
 ///
-/// A complete drive with the same configuration is kept as it is; one with another
-/// configuration is an error unless `force`.
+/// A complete drive with the same configuration is kept as it is, also where it was moved to; one
+/// with another configuration is an error unless `force`. Where a part of it is missing, that part
+/// is made.
 pub fn run(
     config: &SimulationConfig,
     force: bool,
@@ -69,7 +70,7 @@ pub fn run(
         triangles: simulation.street.mesh.triangles.len(),
         driven_m: length_m(&poses),
     };
-    match state_of(&folder, &recipe)? {
+    match state_of(config, &simulation)? {
         State::Complete if !force => return Ok(report(simulation.frames())),
         State::Foreign if !force => bail!(
             "{} holds something else, such as a drive of another configuration; choose another output_folder, or overwrite it with --force",
@@ -146,16 +147,72 @@ enum State {
     Foreign,
 }
 
-fn state_of(folder: &Path, recipe: &str) -> Result<State> {
-    let Ok(mut entries) = fs::read_dir(folder) else {
+fn state_of(config: &SimulationConfig, simulation: &Simulation) -> Result<State> {
+    let folder = config.drive_folder();
+    let Ok(mut entries) = fs::read_dir(&folder) else {
         return Ok(State::Empty);
     };
-    match fs::read_to_string(folder.join("simulation.yml")) {
-        Ok(found) if found == recipe && folder.join("poses.txt").exists() => Ok(State::Complete),
-        Ok(found) if found == recipe => Ok(State::Interrupted),
-        Err(_) if entries.next().is_none() => Ok(State::Empty),
-        _ => Ok(State::Foreign),
+    let Ok(text) = fs::read_to_string(folder.join("simulation.yml")) else {
+        let is_empty = entries.next().is_none();
+        return Ok(if is_empty {
+            State::Empty
+        } else {
+            State::Foreign
+        });
+    };
+    let Ok(found) = serde_yaml::from_str::<SimulationConfig>(&text) else {
+        return Ok(State::Foreign);
+    };
+    if recipe_anywhere(&found)? != recipe_anywhere(config)? {
+        return Ok(State::Foreign);
     }
+    let paths = |config: &SimulationConfig| {
+        let SimulationConfig {
+            path_pose_file,
+            path_calib_file,
+            ..
+        } = config.clone();
+        [path_pose_file, path_calib_file]
+    };
+    Ok(match fs::read(folder.join("poses.txt")) {
+        // A recorded path is the same where the drive follows it, wherever it lies.
+        Ok(poses) if poses != poses_text(simulation)? => State::Foreign,
+        Ok(_) if is_whole(&folder, simulation.frames()) => State::Complete,
+        Ok(_) => State::Interrupted,
+        Err(_) if paths(&found) == paths(config) => State::Interrupted,
+        Err(_) => State::Foreign,
+    })
+}
+
+/// What a drive follows from, wherever it and its recorded path lie.
+fn recipe_anywhere(config: &SimulationConfig) -> Result<String> {
+    let nowhere = SimulationConfig {
+        output_folder: PathBuf::new(),
+        path_pose_file: None,
+        path_calib_file: None,
+        ..config.clone()
+    };
+    serde_yaml::to_string(&nowhere).context("writing the configuration as YAML")
+}
+
+/// What `poses.txt` has.
+fn poses_text(simulation: &Simulation) -> Result<Vec<u8>> {
+    let file = tempfile::NamedTempFile::new().context("cannot create a temporary file")?;
+    let origin = Pose3::identity();
+    write_kitti(file.path(), &simulation.poses(), &origin, &calibration())?;
+    fs::read(file.path()).with_context(|| format!("cannot read {}", file.path().display()))
+}
+
+/// Whether every file of a drive is there.
+fn is_whole(folder: &Path, frames: usize) -> bool {
+    let tables = ["street.ply", "calib.txt", "times.txt", "odometry.txt"].map(str::to_owned);
+    let scans = (0..frames).flat_map(|frame| {
+        [
+            format!("velodyne/{frame:06}.bin"),
+            format!("labels/{frame:06}.label"),
+        ]
+    });
+    (tables.into_iter().chain(scans)).all(|name| folder.join(name).exists())
 }
 
 /// Removes what a drive consists of, and nothing else; the mark of completeness first.
@@ -193,12 +250,11 @@ fn write_scans(
                 return Ok(());
             }
             let scan_path = folder.join(format!("velodyne/{frame:06}.bin"));
-            if scan_path.exists() {
+            let label_path = folder.join(format!("labels/{frame:06}.label"));
+            if scan_path.exists() && label_path.exists() {
                 kept.fetch_add(1, Ordering::Relaxed);
             } else {
                 let labelled = simulation.scan(frame);
-                // The labels first: where a scan is, its labels are.
-                let label_path = folder.join(format!("labels/{frame:06}.label"));
                 write_whole(&label_path, |path| {
                     Ok(write_labels(path, &labelled.classes)?)
                 })?;
@@ -364,6 +420,55 @@ mod tests {
         quietly(&other, true).unwrap();
         let after = contents(&config.drive_folder());
         assert_eq!(after.len(), 5 + 2 * 3, "scans of the old drive are gone");
+    }
+
+    #[test]
+    fn a_drive_of_which_only_the_poses_are_left_is_made_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let config = small(folder.path());
+        let drive = config.drive_folder();
+        quietly(&config, false).unwrap();
+        let whole = contents(&drive);
+        for part in ["velodyne/000002.bin", "labels/000003.label", "odometry.txt"] {
+            fs::remove_file(drive.join(part)).unwrap();
+        }
+        assert_eq!(quietly(&config, false).unwrap().kept, 4);
+        assert_eq!(contents(&drive), whole);
+        fs::remove_dir_all(drive.join("velodyne")).unwrap();
+        fs::remove_dir_all(drive.join("labels")).unwrap();
+        assert_eq!(quietly(&config, false).unwrap().kept, 0);
+        assert_eq!(contents(&drive), whole);
+    }
+
+    #[test]
+    fn a_drive_that_was_moved_is_kept_and_one_along_another_path_is_not() {
+        let folder = tempfile::tempdir().unwrap();
+        let poses = folder.path().join("path.txt");
+        let straight = |step_m: f64| {
+            let row = |k| format!("1 0 0 0 0 1 0 0 0 0 1 {}\n", step_m * f64::from(k));
+            (0..12).map(row).collect::<String>()
+        };
+        fs::write(&poses, straight(3.0)).unwrap();
+        let calib = folder.path().join("calib.txt");
+        fs::write(&calib, "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n").unwrap();
+        let here = SimulationConfig {
+            path_pose_file: Some(poses.clone()),
+            path: Vec::new(),
+            ..small(&folder.path().join("here"))
+        };
+        quietly(&here, false).unwrap();
+        fs::rename(folder.path().join("here"), folder.path().join("there")).unwrap();
+        let moved_poses = folder.path().join("moved.txt");
+        fs::rename(&poses, &moved_poses).unwrap();
+        let there = SimulationConfig {
+            output_folder: folder.path().join("there"),
+            path_pose_file: Some(moved_poses.clone()),
+            ..here
+        };
+        assert_eq!(quietly(&there, false).unwrap().kept, 6);
+        fs::write(&moved_poses, straight(2.7)).unwrap();
+        let message = quietly(&there, false).unwrap_err().to_string();
+        assert!(message.contains("--force"), "{message}");
     }
 
     #[test]

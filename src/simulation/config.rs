@@ -111,6 +111,10 @@ impl SimulationConfig {
             ("scanner.dropout_share", scanner.dropout_share),
         ];
         let not_negative = [
+            (
+                "traffic.lorry_from_s",
+                self.traffic.lorry_from_s.unwrap_or_default(),
+            ),
             ("traffic.lorry_for_s", self.traffic.lorry_for_s),
             ("scanner.range_noise_m", scanner.range_noise_m),
             ("scanner.min_range_m", scanner.min_range_m),

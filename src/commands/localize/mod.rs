@@ -100,6 +100,9 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     }
     let is_whole = results.len() == sequence.frames.len();
     if is_whole && failure.is_none() {
+        if !config.save_result {
+            tracing::warn!("the result is not kept: save_result is False");
+        }
         return Ok(report);
     }
     let (found, all) = (results.len(), sequence.frames.len());
