@@ -133,7 +133,7 @@ impl RunPage<'_> {
 fn numbers(report: &Report) -> Table {
     let mcl = report.mcl.rows();
     let refined = report.refined.as_ref().map(TrajectoryReport::rows);
-    let heads = ["", "MCL", "refined", "unit", "definition"];
+    let heads = ["metric", "MCL", "refined", "unit", "definition"];
     let cell = |value: Value| match value {
         Value::Number(number) => Cell::Number(number),
         Value::Count(count) => Cell::Number(count as f64),
