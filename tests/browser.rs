@@ -5,6 +5,7 @@
 //! and that is said.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
+#![allow(clippy::print_stderr, reason = "what is not tried is said")]
 
 use std::collections::BTreeSet;
 use std::fs;

@@ -237,3 +237,17 @@ fn the_same_seed_gives_the_same_bytes_with_one_thread_and_with_two() {
     assert!(one.1 == two.1, "the trajectories differ");
     assert!(one.2 == two.2, "the results differ");
 }
+
+#[test]
+fn a_result_that_is_not_kept_is_told() {
+    let recording = Recording::street(4);
+    recording.fpmcl("build-map").succeeds();
+    let call = recording.fpmcl("localize").set("save_result", "False");
+    let said = call.set("plot_loc_results", "False").succeeds();
+    assert!(
+        said.stderr.contains("save_result is False"),
+        "{}",
+        said.stderr
+    );
+    assert!(!recording.path("results").exists());
+}

@@ -20,7 +20,7 @@ use crate::localization::{FrameEstimate, ParticleSet};
 use crate::plotting::color::{MCL, REFINED, Rgb};
 use crate::plotting::{
     Animation, ErrorPlot, LineChart, LocalizationPicture, MapImage, MapPlot, Panel, Path2,
-    PathPlot, RangeImageStrip, RuntimePlot, Series,
+    PathPlot, RangeImageStrip, RuntimePlot, Series, map_plot,
 };
 
 /// Cells along the longer side of the map behind a picture.
@@ -265,29 +265,11 @@ pub fn draw_run_on(
             title: "Map from above",
             mesh,
             path: truth.map(|truth| ("path of the car to be found", truth)),
-            keys: &map_colors(mesh),
+            keys: &map_plot::ground_and_rest(mesh),
         }
         .save(&files.plot("map.png")?)?;
     }
     Ok(())
-}
-
-/// The most frequent colours of ground (more red than blue) and rest; none of a map without
-/// colours.
-fn map_colors(mesh: &TriangleMesh) -> Vec<(&'static str, Rgb)> {
-    let most_frequent = |is_ground: bool| {
-        let mut counts = BTreeMap::<Rgb, usize>::new();
-        for &color in &mesh.colors {
-            if (color[0] > color[2]) == is_ground {
-                *counts.entry(color).or_default() += 1;
-            }
-        }
-        let most = counts.into_iter().max_by_key(|&(_, count)| count);
-        most.map(|(color, _)| color)
-    };
-    let ground = most_frequent(true).map(|color| ("ground", color));
-    let rest = most_frequent(false).map(|color| ("rest", color));
-    ground.into_iter().chain(rest).collect()
 }
 
 fn draw_errors(

@@ -1,5 +1,6 @@
 //! The map from above, in its own colours or coloured by a number.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::MapImage;
@@ -51,6 +52,25 @@ impl MapPlot<'_> {
             view.scale_bar(sheet)
         })
     }
+}
+
+/// The most frequent colours of ground (more red than blue) and rest, by which a map from anywhere
+/// is told; none of a map without colours.
+pub fn ground_and_rest(mesh: &TriangleMesh) -> Vec<(&'static str, Rgb)> {
+    let most_frequent = |is_ground: bool| {
+        let mut counts = BTreeMap::<Rgb, usize>::new();
+        for &color in &mesh.colors {
+            if (color[0] > color[2]) == is_ground {
+                *counts.entry(color).or_default() += 1;
+            }
+        }
+        let most = counts.into_iter().max_by_key(|&(_, count)| count);
+        most.map(|(color, _)| color)
+    };
+    [("ground", true), ("rest", false)]
+        .into_iter()
+        .filter_map(|(name, is_ground)| Some((name, most_frequent(is_ground)?)))
+        .collect()
 }
 
 /// The map from above, coloured by a number per vertex, such as a residual.
@@ -142,4 +162,23 @@ fn extent(mesh: &TriangleMesh, path: &Path) -> Result<(Span, Span), PlotError> {
         span(bounds.min.x, bounds.max.x),
         span(bounds.min.y, bounds.max.y),
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_legend_of_a_map_has_the_colours_that_the_map_has() {
+        let colored = |colors: &[Rgb]| TriangleMesh {
+            colors: colors.to_vec(),
+            ..TriangleMesh::default()
+        };
+        let (earth, wall) = ([120, 80, 30], [40, 40, 90]);
+        let map = colored(&[earth, wall, earth, [200, 0, 0], wall]);
+        let expected = vec![("ground", earth), ("rest", wall)];
+        assert_eq!(ground_and_rest(&map), expected);
+        assert_eq!(ground_and_rest(&colored(&[wall])), expected[1..]);
+        assert_eq!(ground_and_rest(&colored(&[])), []);
+    }
 }

@@ -271,6 +271,16 @@ fn a_lorry_hides_what_is_to_the_left_for_its_time() {
 }
 
 #[test]
+fn a_lorry_before_the_beginning_or_at_no_time_is_refused() {
+    for lorry_from_s in [-1.0, f64::NAN, f64::INFINITY] {
+        let mut config = small();
+        config.traffic.lorry_from_s = Some(lorry_from_s);
+        let message = config.check().unwrap_err().to_string();
+        assert!(message.contains("traffic.lorry_from_s"), "{message}");
+    }
+}
+
+#[test]
 fn the_lidar_hangs_over_the_road_and_leans_with_it() {
     let config = SimulationConfig {
         motion: MotionConfig {
