@@ -1,6 +1,7 @@
 //! Tiles of triangles under one hierarchy, and the ways to cast rays at them.
 
 mod alone;
+mod bundled;
 mod through;
 
 use glam::{DVec3, Vec3};
@@ -236,11 +237,11 @@ impl Scene {
 
     #[inline(always)]
     fn cast_packet<const COHERENT: bool>(&self, origin: DVec3, packet: &mut Packet) {
-        let mut tiles = Walk::<COHERENT>::new(&self.top, (origin - self.middle).as_vec3());
+        let mut tiles = Walk::<_, COHERENT>::new(&self.top, (origin - self.middle).as_vec3());
         while let Some(tile) = tiles.next_leaf(packet) {
             let tile = &self.tiles[tile];
             let origin = (origin - tile.middle).as_vec3();
-            let mut leaves = Walk::<COHERENT>::new(&tile.bvh, origin);
+            let mut leaves = Walk::<_, COHERENT>::new(&tile.bvh, origin);
             while let Some(leaf) = leaves.next_leaf(packet) {
                 let block = tile.first_block + leaf;
                 packet.meet(origin, &self.blocks[block], (block * TRIANGLES) as u32);
