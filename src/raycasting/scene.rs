@@ -117,7 +117,7 @@ impl Scene {
             };
             padded_item(relative, &whole, index as u32)
         });
-        let (top, leaves) = Bvh::build(items.collect(), 1);
+        let (top, leaves) = Bvh::build(&items.collect::<Vec<_>>(), 1);
         let mut blocks = Vec::with_capacity(parts.iter().map(|part| part.blocks.len()).sum());
         let tiles = leaves
             .iter()
@@ -301,15 +301,16 @@ impl Part {
         let items = usable
             .into_par_iter()
             .map(|index| padded_item(Aabb::of(local(index)), &bounds, index));
-        let (bvh, leaves) = Bvh::build(items.collect(), TRIANGLES);
-        let blocks = leaves
-            .iter()
-            .map(|leaf| Block::new(leaf.iter().map(|&t| (local(t), first_triangle + t))))
-            .collect();
+        let (bvh, leaves) = Bvh::build(&items.collect::<Vec<_>>(), TRIANGLES);
+        let block = |leaf: &[u32]| Block::new(leaf.iter().map(|&t| (local(t), first_triangle + t)));
+        let (blocks, wide_bvh) = rayon::join(
+            || leaves.par_iter().map(block).collect(),
+            || WideBvh::of(&bvh),
+        );
         Some(Self {
             bounds,
             middle: middle.as_dvec3(),
-            wide_bvh: WideBvh::of(&bvh),
+            wide_bvh,
             bvh,
             blocks,
         })
