@@ -186,11 +186,59 @@ fn values_that_would_stop_a_stage_are_told_before_any_work() {
 }
 
 #[test]
-fn a_rule_that_cannot_be_read_is_told_with_its_number_and_the_nearest_word() {
+fn a_rule_that_cannot_be_read_is_told_with_its_line_and_the_nearest_word() {
+    for (command, file) in [("build-map", "build_map.yml"), ("ground", "ground.yml")] {
+        let text = std::fs::read_to_string(delivered(file)).expect("the file is there");
+        for (right, wrong, key, told) in [
+            (
+                "raised AND height_variance IS high",
+                "raised AND hight_variance IS high",
+                "fuzzy.rules[10]",
+                "unknown variable `hight_variance`; the nearest is `height_variance`",
+            ),
+            (
+                "IF height IS above THEN",
+                "IF height above THEN",
+                "fuzzy.rules[13]",
+                "`above` where IS belongs",
+            ),
+            (
+                "{trapezoid: [-0.45, -0.15,",
+                "{trapezoid: [-0.1, -0.15,",
+                "fuzzy.variables.height.level",
+                "{trapezoid: [-0.1, -0.15, 0.03, 0.11]}: its corners must be finite and ascend",
+            ),
+            (
+                "    ground:\n      low",
+                "    grund:\n      low",
+                "fuzzy.variables.grund",
+                "no feature: the nearest is `ground`",
+            ),
+        ] {
+            let faulty = text.replace(right, wrong);
+            let line = 1 + std::iter::zip(text.lines(), faulty.lines())
+                .position(|(before, after)| before != after)
+                .expect("the file has the words");
+            let folder = tempfile::tempdir().expect("a folder");
+            let path = folder.path().join("faulty.yml");
+            std::fs::write(&path, faulty).expect("it is written");
+            let place = format!("faulty.yml, line {line}: {key} is ");
+            fpmcl(command).with(path).fails_saying(&[&place, told]);
+        }
+    }
+}
+
+#[test]
+fn a_rule_on_the_command_line_is_told_there() {
     fpmcl("build-map")
         .with(delivered("build_map.yml"))
         .set("fuzzy.rules", "[IF height IS hight THEN ground IS low]")
-        .fails_saying(&["fuzzy.rules is not usable", "rule 1", "`hight`", "nearest"]);
+        .fails_saying(&[
+            "--set fuzzy.rules=[IF height IS hight",
+            "fuzzy.rules[1] is",
+            "`height` has no set `hight`",
+            "nearest",
+        ]);
 }
 
 #[test]

@@ -87,26 +87,48 @@ impl Check for VisibilityConfig {
 impl Check for FuzzyConfig {
     fn check(&self) -> Result<(), Problem> {
         nested("features", self.features.check())?;
-        share("definitely", self.definitely)?;
-        share("probably", self.probably)?;
-        FuzzyGround::new(self.clone()).map(drop).map_err(|error| {
-            let key = match error {
-                RuleError::Grammar { .. }
-                | RuleError::UnknownVariable { .. }
-                | RuleError::UnknownSet { .. }
-                | RuleError::NoRules => "rules",
-                RuleError::UnknownFeature { .. }
-                | RuleError::NoOutput { .. }
-                | RuleError::BadSet { .. }
-                | RuleError::TooManySets { .. } => "variables",
-            };
-            Problem {
-                key: key.to_owned(),
-                value: "not usable".to_owned(),
-                remedy: error.to_string(),
-            }
-        })
+        within("definitely", self.definitely, 0.5..=1.0)?;
+        within("probably", self.probably, 0.5..=self.definitely)?;
+        FuzzyGround::new(self.clone())
+            .map(drop)
+            .map_err(problem_of_rules)
     }
+}
+
+/// Tells the rule or the set that is wrong by its own key, so that its line is found.
+fn problem_of_rules(error: RuleError) -> Problem {
+    let (key, value, remedy) = match error {
+        RuleError::Rule {
+            number,
+            rule,
+            fault,
+        } => (
+            format!("rules[{number}]"),
+            format!("`{rule}`"),
+            fault.to_string(),
+        ),
+        RuleError::BadSet {
+            variable,
+            set,
+            membership,
+        } => (
+            format!("variables.{variable}.{set}"),
+            membership.to_string(),
+            membership.law().to_owned(),
+        ),
+        RuleError::UnknownFeature { name, nearest } => (
+            format!("variables.{name}"),
+            "no feature".to_owned(),
+            format!("the nearest is `{nearest}`"),
+        ),
+        RuleError::NoRules => ("rules".to_owned(), "empty".to_owned(), error.to_string()),
+        RuleError::NoOutput { .. } | RuleError::TooManySets { .. } => (
+            "variables".to_owned(),
+            "not usable".to_owned(),
+            error.to_string(),
+        ),
+    };
+    Problem { key, value, remedy }
 }
 
 impl Check for FeatureConfig {

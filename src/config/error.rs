@@ -119,7 +119,9 @@ pub(super) fn unusable(
     overrides: &[(String, String)],
     problem: Problem,
 ) -> ConfigError {
-    let setting = overrides.iter().rfind(|(key, _)| *key == problem.key);
+    let setting = overrides
+        .iter()
+        .rfind(|(key, _)| is_within(&problem.key, key));
     let place = match setting {
         Some((key, value)) => Place::Setting {
             key: key.clone(),
@@ -131,6 +133,12 @@ pub(super) fn unusable(
         },
     };
     ConfigError::Unusable { place, problem }
+}
+
+/// Whether a key is a block, a part of it, or an item of that list.
+fn is_within(key: &str, block: &str) -> bool {
+    let rest = key.strip_prefix(block);
+    rest.is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']))
 }
 
 /// The key that was probably meant: the nearest in spelling, by itself or as the last part of

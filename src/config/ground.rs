@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::check::{Check, Problem, not_negative, path, positive, require, selection, within};
+use super::check::{Check, Problem, nested, path, positive, require, selection, within};
 use crate::ground::{FuzzyConfig, GroundMethod, PcaGround, RansacGround};
 use crate::kitti::Selection;
 
@@ -87,18 +87,8 @@ impl Check for GroundConfig {
         path("output_folder", &self.output_folder)?;
         selection(self.n_scans, self.frame_step)?;
         within("ground_threshold", self.ground_threshold, 0.0..=1.0)?;
-        let features = &self.fuzzy.features;
-        positive("fuzzy.features.spacing_m", f64::from(features.spacing_m))?;
-        not_negative(
-            "fuzzy.features.min_distance_m",
-            f64::from(features.min_distance_m),
-        )?;
-        within("fuzzy.definitely", self.fuzzy.definitely, 0.5..=1.0)?;
-        within(
-            "fuzzy.probably",
-            self.fuzzy.probably,
-            0.5..=self.fuzzy.definitely,
-        )?;
+        nested("fuzzy", self.fuzzy.check())?;
+        nested("pca", self.pca.check())?;
         positive(
             "ransac.distance_threshold",
             f64::from(self.ransac.distance_threshold),

@@ -16,6 +16,8 @@ struct Entry {
     line: usize,
     /// One after the last line of the value.
     end: usize,
+    /// The lines of the items, where the value is a list.
+    items: Vec<usize>,
 }
 
 impl<'a> Outline<'a> {
@@ -32,7 +34,12 @@ impl<'a> Outline<'a> {
             }
             let indent = line.len() - content.len();
             if content.starts_with("- ") || content == "-" {
-                list_indent = list_indent.or(Some(indent));
+                let list = *list_indent.get_or_insert(indent);
+                if let Some(&innermost) = open.last()
+                    && indent == list
+                {
+                    entries[innermost].items.push(number);
+                }
                 continue;
             }
             if list_indent.is_some_and(|list| indent > list) {
@@ -55,6 +62,7 @@ impl<'a> Outline<'a> {
                 indent,
                 line: number,
                 end: lines.len(),
+                items: Vec::new(),
             });
         }
         Self { lines, entries }
@@ -74,10 +82,13 @@ impl<'a> Outline<'a> {
         Some(&innermost.key)
     }
 
-    /// The line (counted from 1) of a key.
+    /// The line (counted from 1) of a key; of the item of a list where the key ends in its number
+    /// (`fuzzy.rules[2]`, counted from 1).
     pub(super) fn line_of(&self, key: &str) -> Option<usize> {
-        let entry = self.entries.iter().find(|entry| entry.key == key)?;
-        Some(entry.line + 1)
+        let (name, item) = item_of(key);
+        let entry = self.entries.iter().find(|entry| entry.key == name)?;
+        let line = item.and_then(|item| entry.items.get(item.checked_sub(1)?));
+        Some(line.unwrap_or(&entry.line) + 1)
     }
 
     /// The text with another value for a key; `None` where there is no such key.
@@ -93,6 +104,15 @@ impl<'a> Outline<'a> {
             .collect();
         Some(lines.join("\n"))
     }
+}
+
+/// A key without the number of an item at its end, and that number.
+fn item_of(key: &str) -> (&str, Option<usize>) {
+    let item = || {
+        let (name, number) = key.strip_suffix(']')?.rsplit_once('[')?;
+        Some((name, Some(number.parse().ok()?)))
+    };
+    item().unwrap_or((key, None))
 }
 
 /// The key that a line begins with.
@@ -148,6 +168,17 @@ last: 'x: y'
             assert_eq!(outline.key_at(outline.line_of(key).unwrap()), Some(key));
         }
         assert_eq!(outline.key_at(8), Some("block.list"));
+    }
+
+    #[test]
+    fn the_items_of_a_list_have_lines_of_their_own() {
+        let outline = Outline::of(TEXT);
+        assert_eq!(outline.line_of("block.list[1]"), Some(7));
+        assert_eq!(outline.line_of("block.list[2]"), Some(9));
+        // What is not there is told at the list.
+        assert_eq!(outline.line_of("block.list[3]"), Some(6));
+        assert_eq!(outline.line_of("block.list[0]"), Some(6));
+        assert_eq!(outline.line_of("nothing[1]"), None);
     }
 
     #[test]

@@ -276,7 +276,8 @@ fn steps_of(rule: &Rule) -> impl Iterator<Item = Step> {
 fn check(vocabulary: &Vocabulary, inputs: &[&str], output: &str) -> Result<(), RuleError> {
     for (variable, sets) in vocabulary {
         if variable != output && !inputs.contains(&variable.as_str()) {
-            let known: Vec<String> = inputs.iter().map(|&name| name.to_owned()).collect();
+            let known = inputs.iter().chain([&output]);
+            let known: Vec<String> = known.map(|&name| name.to_owned()).collect();
             return Err(RuleError::UnknownFeature {
                 name: variable.clone(),
                 nearest: rules::nearest(variable, &known),

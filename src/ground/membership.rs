@@ -2,6 +2,8 @@
 //!
 //! Zadeh, *Fuzzy Sets* (1965); shapes as in scikit-fuzzy and MATLAB.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 /// How AND, OR and implication are computed.
@@ -76,6 +78,14 @@ impl Membership {
         }
     }
 
+    /// What [`is_valid`](Self::is_valid) asks for, as a remedy.
+    pub fn law(&self) -> &'static str {
+        match self {
+            Self::Gaussian(_) => "its mean must be finite and its sigma greater than 0",
+            _ => "its corners must be finite and ascend",
+        }
+    }
+
     /// Where the degree changes: from the first corner to the last, three sigmas for a Gaussian.
     pub fn span(&self) -> (f32, f32) {
         match *self {
@@ -98,6 +108,19 @@ impl Membership {
             Self::Gaussian([mean, _]) => (mean, mean),
         };
         (0.5 * (from + to)).clamp(0.0, 1.0)
+    }
+}
+
+/// As it is written in a configuration.
+impl fmt::Display for Membership {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            Self::Trapezoid(corners) => write!(f, "{{trapezoid: {corners:?}}}"),
+            Self::Triangle(corners) => write!(f, "{{triangle: {corners:?}}}"),
+            Self::LeftShoulder(corners) => write!(f, "{{left_shoulder: {corners:?}}}"),
+            Self::RightShoulder(corners) => write!(f, "{{right_shoulder: {corners:?}}}"),
+            Self::Gaussian(corners) => write!(f, "{{gaussian: {corners:?}}}"),
+        }
     }
 }
 

@@ -29,7 +29,7 @@ pub use membership::{Membership, Operators};
 pub use pca::{PcaGround, ReportRule};
 pub use ransac::RansacGround;
 pub use road::{RoadPlane, road_plane};
-pub use rules::{RuleError, Vocabulary};
+pub use rules::{RuleError, RuleFault, Vocabulary};
 pub use score::{GroundScore, Protocol};
 pub use terrain::TerrainConfig;
 

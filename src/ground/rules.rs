@@ -19,35 +19,18 @@ pub type Vocabulary = BTreeMap<String, BTreeMap<String, Membership>>;
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[expect(missing_docs, reason = "the messages say it")]
 pub enum RuleError {
-    #[error("rule {number} `{rule}`: `{found}` where {expected} belongs")]
-    Grammar {
+    /// Rules are counted from 1.
+    #[error("rule {number} `{rule}`: {fault}")]
+    Rule {
         number: usize,
         rule: String,
-        found: String,
-        expected: &'static str,
-    },
-    #[error("rule {number} `{rule}`: unknown variable `{name}`; the nearest is `{nearest}`")]
-    UnknownVariable {
-        number: usize,
-        rule: String,
-        name: String,
-        nearest: String,
-    },
-    #[error("rule {number} `{rule}`: `{variable}` has no set `{name}`; the nearest is `{nearest}`")]
-    UnknownSet {
-        number: usize,
-        rule: String,
-        variable: String,
-        name: String,
-        nearest: String,
+        fault: RuleFault,
     },
     #[error("variables: `{name}` is no feature; the nearest is `{nearest}`")]
     UnknownFeature { name: String, nearest: String },
     #[error("variables: the output `{name}` is missing; give it sets such as low, medium and high")]
     NoOutput { name: String },
-    #[error(
-        "variables: set `{set}` of `{variable}` must have finite, ascending corners (and sigma > 0), not {membership:?}"
-    )]
+    #[error("variables: set `{set}` of `{variable}` is {membership}: {}", membership.law())]
     BadSet {
         variable: String,
         set: String,
@@ -63,6 +46,25 @@ pub enum RuleError {
     },
     #[error("rules: there are none; write at least one")]
     NoRules,
+}
+
+/// What is wrong with a rule.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages say it")]
+pub enum RuleFault {
+    #[error("`{found}` where {expected} belongs")]
+    Grammar {
+        found: String,
+        expected: &'static str,
+    },
+    #[error("unknown variable `{name}`; the nearest is `{nearest}`")]
+    UnknownVariable { name: String, nearest: String },
+    #[error("`{variable}` has no set `{name}`; the nearest is `{nearest}`")]
+    UnknownSet {
+        variable: String,
+        name: String,
+        nearest: String,
+    },
 }
 
 /// `variable IS set`, by position of the set among all sets.
@@ -89,52 +91,56 @@ pub(super) struct Names<'a> {
 
 /// Reads a rule; `number` counts from 1, for messages.
 pub(super) fn parse(text: &str, number: usize, names: &Names) -> Result<Rule, RuleError> {
-    let mut reader = Reader {
+    let reader = Reader {
         words: text.split_whitespace().peekable(),
-        text,
-        number,
         names,
     };
-    reader.keyword("IF")?;
-    let mut condition = vec![vec![reader.clause()?]];
-    loop {
-        let word = reader.next("AND, OR or THEN")?;
-        if is(word, "AND") {
-            let clause = reader.clause()?;
-            if let Some(all) = condition.last_mut() {
-                all.push(clause);
-            }
-        } else if is(word, "OR") {
-            condition.push(vec![reader.clause()?]);
-        } else if is(word, "THEN") {
-            break;
-        } else {
-            return Err(reader.grammar(word, "AND, OR or THEN"));
-        }
-    }
-    let output = reader.consequence()?;
-    match reader.words.next() {
-        None => Ok(Rule { condition, output }),
-        Some(word) => Err(reader.grammar(word, "the end of the rule")),
-    }
+    reader.rule().map_err(|fault| RuleError::Rule {
+        number,
+        rule: text.to_owned(),
+        fault,
+    })
 }
 
 struct Reader<'a> {
     words: std::iter::Peekable<std::str::SplitWhitespace<'a>>,
-    text: &'a str,
-    number: usize,
     names: &'a Names<'a>,
 }
 
 impl<'a> Reader<'a> {
-    fn next(&mut self, expected: &'static str) -> Result<&'a str, RuleError> {
+    fn rule(mut self) -> Result<Rule, RuleFault> {
+        self.keyword("IF")?;
+        let mut condition = vec![vec![self.clause()?]];
+        loop {
+            let word = self.next("AND, OR or THEN")?;
+            if is(word, "AND") {
+                let clause = self.clause()?;
+                if let Some(all) = condition.last_mut() {
+                    all.push(clause);
+                }
+            } else if is(word, "OR") {
+                condition.push(vec![self.clause()?]);
+            } else if is(word, "THEN") {
+                break;
+            } else {
+                return Err(self.grammar(word, "AND, OR or THEN"));
+            }
+        }
+        let output = self.consequence()?;
+        match self.words.next() {
+            None => Ok(Rule { condition, output }),
+            Some(word) => Err(self.grammar(word, "the end of the rule")),
+        }
+    }
+
+    fn next(&mut self, expected: &'static str) -> Result<&'a str, RuleFault> {
         match self.words.next() {
             Some(word) => Ok(word),
             None => Err(self.grammar("the end of the rule", expected)),
         }
     }
 
-    fn keyword(&mut self, keyword: &'static str) -> Result<(), RuleError> {
+    fn keyword(&mut self, keyword: &'static str) -> Result<(), RuleFault> {
         let word = self.next(keyword)?;
         if is(word, keyword) {
             Ok(())
@@ -143,7 +149,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    fn clause(&mut self) -> Result<Clause, RuleError> {
+    fn clause(&mut self) -> Result<Clause, RuleFault> {
         let variable = self.next("a variable")?;
         self.keyword("IS")?;
         let negated = self.words.peek().is_some_and(|word| is(word, "NOT"));
@@ -162,7 +168,7 @@ impl<'a> Reader<'a> {
         Err(self.unknown_variable(variable, self.names.inputs.iter().map(|(name, _)| name)))
     }
 
-    fn consequence(&mut self) -> Result<usize, RuleError> {
+    fn consequence(&mut self) -> Result<usize, RuleFault> {
         let variable = self.next("the output")?;
         let (name, sets) = self.names.output;
         if name != variable {
@@ -173,12 +179,10 @@ impl<'a> Reader<'a> {
         self.position(variable, set, sets)
     }
 
-    fn position(&self, variable: &str, set: &str, sets: &[String]) -> Result<usize, RuleError> {
+    fn position(&self, variable: &str, set: &str, sets: &[String]) -> Result<usize, RuleFault> {
         sets.iter()
             .position(|name| name == set)
-            .ok_or_else(|| RuleError::UnknownSet {
-                number: self.number,
-                rule: self.text.to_owned(),
+            .ok_or_else(|| RuleFault::UnknownSet {
                 variable: variable.to_owned(),
                 name: set.to_owned(),
                 nearest: nearest(set, sets),
@@ -189,19 +193,15 @@ impl<'a> Reader<'a> {
         &self,
         name: &str,
         known: impl IntoIterator<Item = &'n String>,
-    ) -> RuleError {
-        RuleError::UnknownVariable {
-            number: self.number,
-            rule: self.text.to_owned(),
+    ) -> RuleFault {
+        RuleFault::UnknownVariable {
             name: name.to_owned(),
             nearest: nearest(name, known),
         }
     }
 
-    fn grammar(&self, found: &str, expected: &'static str) -> RuleError {
-        RuleError::Grammar {
-            number: self.number,
-            rule: self.text.to_owned(),
+    fn grammar(&self, found: &str, expected: &'static str) -> RuleFault {
+        RuleFault::Grammar {
             found: found.to_owned(),
             expected,
         }

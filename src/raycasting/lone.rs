@@ -5,10 +5,11 @@
 //! ray alone opens its own. The sums and products are those of [`super::packet`], and so are the
 //! bits of what is met, unless the ray passes an edge within rounding.
 
-use super::block::{Block, Corner, TRIANGLES};
+use super::block::{Block, TRIANGLES};
 use super::bvh::{Child, MAX_DEPTH};
 use super::lanes::Lanes;
 use super::packet::{FARTHER, inverse_of_one};
+use super::triangle::{meet, minus, spread};
 use super::wide::{CHILDREN, WideBvh, WideNode};
 use super::{NEAREST_M, Reach};
 use crate::geometry::Vec3;
@@ -91,26 +92,13 @@ impl LoneRay {
     #[inline(always)]
     pub fn meet<L: Lanes<TRIANGLES>>(&mut self, origin: Vec3, block: &Block) {
         let origin = spread(origin.to_array());
-        let direction: [L; 3] = spread(self.direction);
-        let [a, b, c] = block.corners();
-        let (a, b, c) = (from(origin, a), from(origin, b), from(origin, c));
-        let w = dot(direction, edge(a, b));
-        let u = dot(direction, edge(b, c));
-        let v = dot(direction, edge(c, a));
-        let rounding = rounding(a, b, c);
-        let least = u.or_less(v).or_less(w);
-        let most = u.or_more(v).or_more(w);
-        let mut inside = L::splat(0.0).minus(rounding).at_most(least) | most.at_most(rounding);
-        if inside == 0 {
+        let corners = block
+            .corners()
+            .map(|corner| minus(corner.map(|axis| L::load(&axis)), origin));
+        let Some((mut inside, range_m)) = meet(spread(self.direction), corners) else {
             return;
-        }
-        // Each side weighs the corner that lies opposite.
-        let (a, b, c) = (dot(direction, a), dot(direction, b), dot(direction, c));
-        let range_m = u.times(a).plus(v.times(b)).plus(w.times(c));
-        let range_m = range_m.over(u.plus(v).plus(w));
-        // Seen edge-on, the quotient may be anything.
-        let range_m = a.or_less(b).or_less(c).or_more(range_m);
-        let range_m = a.or_more(b).or_more(c).or_less(range_m).to_array();
+        };
+        let range_m = range_m.to_array();
         while inside != 0 {
             let range_m = range_m[inside.trailing_zeros() as usize % TRIANGLES];
             inside &= inside - 1;
@@ -124,58 +112,6 @@ impl LoneRay {
             }
         }
     }
-}
-
-#[inline(always)]
-fn spread<const N: usize, L: Lanes<N>>([x, y, z]: [f32; 3]) -> [L; 3] {
-    [L::splat(x), L::splat(y), L::splat(z)]
-}
-
-#[inline(always)]
-fn from<L: Lanes<TRIANGLES>>(origin: [L; 3], corner: &Corner) -> [L; 3] {
-    let [x, y, z] = corner;
-    minus([L::load(x), L::load(y), L::load(z)], origin)
-}
-
-#[inline(always)]
-fn minus<L: Lanes<TRIANGLES>>(p: [L; 3], q: [L; 3]) -> [L; 3] {
-    [p[0].minus(q[0]), p[1].minus(q[1]), p[2].minus(q[2])]
-}
-
-/// As [`super::block::edge`].
-#[inline(always)]
-fn edge<L: Lanes<TRIANGLES>>(p: [L; 3], q: [L; 3]) -> [L; 3] {
-    let sum = [p[0].plus(q[0]), p[1].plus(q[1]), p[2].plus(q[2])];
-    let difference = minus(q, p);
-    cross(sum, difference)
-}
-
-#[inline(always)]
-fn cross<L: Lanes<TRIANGLES>>(p: [L; 3], q: [L; 3]) -> [L; 3] {
-    [
-        p[1].times(q[2]).minus(p[2].times(q[1])),
-        p[2].times(q[0]).minus(p[0].times(q[2])),
-        p[0].times(q[1]).minus(p[1].times(q[0])),
-    ]
-}
-
-#[inline(always)]
-fn dot<L: Lanes<TRIANGLES>>(p: [L; 3], q: [L; 3]) -> L {
-    (p[0].times(q[0]).plus(p[1].times(q[1]))).plus(p[2].times(q[2]))
-}
-
-/// As [`super::block::rounding`].
-#[inline(always)]
-fn rounding<L: Lanes<TRIANGLES>>(a: [L; 3], b: [L; 3], c: [L; 3]) -> L {
-    let (to_b, to_c) = (minus(b, a), minus(c, a));
-    let mut distance = L::splat(0.0);
-    let mut length = L::splat(0.0);
-    for axis in 0..3 {
-        distance = distance.plus(a[axis].magnitude());
-        length = length.plus(to_b[axis].magnitude().plus(to_c[axis].magnitude()));
-    }
-    let scale = L::splat(4.0 * f32::EPSILON);
-    scale.times(length).times(distance.plus(length))
 }
 
 /// A child that waits for its turn.

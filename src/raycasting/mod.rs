@@ -1,16 +1,18 @@
 //! What a ray meets first: triangles in bounding volume hierarchies, cast at in packets of rays
-//! that share their origin, or one by one.
+//! that share their origin, in bundles of rays of one course, or one by one.
 //!
 //! A [`Scene`] has a hierarchy per tile, in coordinates relative to the middle of the tile, under
 //! one hierarchy over the boxes of the tiles. A triangle lies in one tile, and rays go from tile
 //! to tile, so that the borders of tiles cannot be seen. It takes about 97 bytes per triangle.
 
 mod block;
+mod bundle;
 pub(crate) mod bvh;
 mod lanes;
 mod lone;
 mod packet;
 mod scene;
+mod triangle;
 mod wide;
 
 #[cfg(feature = "gpu")]

@@ -81,40 +81,6 @@ impl Packet {
         }
     }
 
-    /// Whether any ray enters a box before its nearest hit.
-    #[inline(always)]
-    fn enters<const COHERENT: bool>(&self, origin: Vec3, bounds: &[f32; 6]) -> bool {
-        let mut near = [0.0; RAYS];
-        let mut far = self.until_m;
-        for axis in 0..3 {
-            // Where all rays run alike, the side that they come in through is known.
-            let is_swapped = COHERENT && self.backwards[axis];
-            let (first, second) = if is_swapped {
-                (axis + 3, axis)
-            } else {
-                (axis, axis + 3)
-            };
-            let first = bounds[first] - origin[axis];
-            let second = bounds[second] - origin[axis];
-            for ray in 0..RAYS {
-                let a = first * self.inverse[axis][ray];
-                let b = second * self.inverse[axis][ray];
-                let (a, b) = if COHERENT {
-                    (a, b)
-                } else {
-                    (min(a, b), max(a, b))
-                };
-                near[ray] = max(near[ray], a);
-                far[ray] = min(far[ray], b);
-            }
-        }
-        let mut any = false;
-        for ray in 0..RAYS {
-            any |= near[ray] <= far[ray] * FARTHER;
-        }
-        any
-    }
-
     /// Takes the hits of a block that are nearer than what was known; `first_slot` is the place
     /// of its first triangle.
     #[inline(always)]
@@ -186,20 +152,74 @@ impl Packet {
     }
 }
 
-/// The way of a packet through a hierarchy, from leaf to leaf, near ones first.
+impl Together for Packet {
+    type Origin = Vec3;
+
+    #[inline(always)]
+    fn enters<const COHERENT: bool>(&self, origin: Vec3, bounds: &[f32; 6]) -> bool {
+        let mut near = [0.0; RAYS];
+        let mut far = self.until_m;
+        for axis in 0..3 {
+            // Where all rays run alike, the side that they come in through is known.
+            let is_swapped = COHERENT && self.backwards[axis];
+            let (first, second) = if is_swapped {
+                (axis + 3, axis)
+            } else {
+                (axis, axis + 3)
+            };
+            let first = bounds[first] - origin[axis];
+            let second = bounds[second] - origin[axis];
+            for ray in 0..RAYS {
+                let a = first * self.inverse[axis][ray];
+                let b = second * self.inverse[axis][ray];
+                let (a, b) = if COHERENT {
+                    (a, b)
+                } else {
+                    (min(a, b), max(a, b))
+                };
+                near[ray] = max(near[ray], a);
+                far[ray] = min(far[ray], b);
+            }
+        }
+        let mut any = false;
+        for ray in 0..RAYS {
+            any |= near[ray] <= far[ray] * FARTHER;
+        }
+        any
+    }
+
+    #[inline(always)]
+    fn is_backwards(&self, axis: u32) -> bool {
+        self.backwards[axis as usize]
+    }
+}
+
+/// Rays that go through a hierarchy together.
+pub(super) trait Together {
+    /// Where they start, in the frame of the hierarchy.
+    type Origin: Copy;
+
+    /// Whether any ray enters a box before its nearest hit.
+    fn enters<const COHERENT: bool>(&self, origin: Self::Origin, bounds: &[f32; 6]) -> bool;
+
+    /// Whether the first ray runs downwards along an axis.
+    fn is_backwards(&self, axis: u32) -> bool;
+}
+
+/// The way of rays through a hierarchy, from leaf to leaf, near ones first.
 ///
-/// `COHERENT` says that the packet is: then the side that the rays enter a box through is known.
-pub(super) struct Walk<'a, const COHERENT: bool> {
+/// `COHERENT` says that all run alike: then the side that the rays enter a box through is known.
+pub(super) struct Walk<'a, O, const COHERENT: bool> {
     bvh: &'a Bvh,
     /// In the frame of the hierarchy.
-    origin: Vec3,
+    origin: O,
     waiting: [Child; MAX_DEPTH],
     count: usize,
 }
 
-impl<'a, const COHERENT: bool> Walk<'a, COHERENT> {
+impl<'a, O: Copy, const COHERENT: bool> Walk<'a, O, COHERENT> {
     #[inline(always)]
-    pub fn new(bvh: &'a Bvh, origin: Vec3) -> Self {
+    pub fn new(bvh: &'a Bvh, origin: O) -> Self {
         Self {
             bvh,
             origin,
@@ -208,9 +228,9 @@ impl<'a, const COHERENT: bool> Walk<'a, COHERENT> {
         }
     }
 
-    /// The next leaf that a ray of the packet may find something in.
+    /// The next leaf that one of the rays may find something in.
     #[inline(always)]
-    pub fn next_leaf(&mut self, packet: &Packet) -> Option<usize> {
+    pub fn next_leaf(&mut self, rays: &impl Together<Origin = O>) -> Option<usize> {
         while self.count > 0 {
             self.count -= 1;
             let mut current = self.waiting[self.count];
@@ -219,9 +239,9 @@ impl<'a, const COHERENT: bool> Walk<'a, COHERENT> {
                     return Some(current.index());
                 }
                 let node = &self.bvh.nodes[current.index()];
-                let near = usize::from(packet.backwards[node.axis as usize]);
-                let into_near = packet.enters::<COHERENT>(self.origin, &node.bounds[near]);
-                let into_far = packet.enters::<COHERENT>(self.origin, &node.bounds[1 - near]);
+                let near = usize::from(rays.is_backwards(node.axis));
+                let into_near = rays.enters::<COHERENT>(self.origin, &node.bounds[near]);
+                let into_far = rays.enters::<COHERENT>(self.origin, &node.bounds[1 - near]);
                 if into_near & into_far {
                     self.waiting[self.count] = node.children[1 - near];
                     self.count += 1;

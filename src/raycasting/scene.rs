@@ -1,6 +1,7 @@
 //! Tiles of triangles under one hierarchy, and the ways to cast rays at them.
 
 mod alone;
+mod bundled;
 mod through;
 
 use glam::{DVec3, Vec3};
@@ -116,7 +117,7 @@ impl Scene {
             };
             padded_item(relative, &whole, index as u32)
         });
-        let (top, leaves) = Bvh::build(items.collect(), 1);
+        let (top, leaves) = Bvh::build(&items.collect::<Vec<_>>(), 1);
         let mut blocks = Vec::with_capacity(parts.iter().map(|part| part.blocks.len()).sum());
         let tiles = leaves
             .iter()
@@ -236,11 +237,11 @@ impl Scene {
 
     #[inline(always)]
     fn cast_packet<const COHERENT: bool>(&self, origin: DVec3, packet: &mut Packet) {
-        let mut tiles = Walk::<COHERENT>::new(&self.top, (origin - self.middle).as_vec3());
+        let mut tiles = Walk::<_, COHERENT>::new(&self.top, (origin - self.middle).as_vec3());
         while let Some(tile) = tiles.next_leaf(packet) {
             let tile = &self.tiles[tile];
             let origin = (origin - tile.middle).as_vec3();
-            let mut leaves = Walk::<COHERENT>::new(&tile.bvh, origin);
+            let mut leaves = Walk::<_, COHERENT>::new(&tile.bvh, origin);
             while let Some(leaf) = leaves.next_leaf(packet) {
                 let block = tile.first_block + leaf;
                 packet.meet(origin, &self.blocks[block], (block * TRIANGLES) as u32);
@@ -300,15 +301,16 @@ impl Part {
         let items = usable
             .into_par_iter()
             .map(|index| padded_item(Aabb::of(local(index)), &bounds, index));
-        let (bvh, leaves) = Bvh::build(items.collect(), TRIANGLES);
-        let blocks = leaves
-            .iter()
-            .map(|leaf| Block::new(leaf.iter().map(|&t| (local(t), first_triangle + t))))
-            .collect();
+        let (bvh, leaves) = Bvh::build(&items.collect::<Vec<_>>(), TRIANGLES);
+        let block = |leaf: &[u32]| Block::new(leaf.iter().map(|&t| (local(t), first_triangle + t)));
+        let (blocks, wide_bvh) = rayon::join(
+            || leaves.par_iter().map(block).collect(),
+            || WideBvh::of(&bvh),
+        );
         Some(Self {
             bounds,
             middle: middle.as_dvec3(),
-            wide_bvh: WideBvh::of(&bvh),
+            wide_bvh,
             bvh,
             blocks,
         })

@@ -496,3 +496,124 @@ fn every_instruction_set_gives_lone_rays_the_same_bits() {
         assert_eq!(fast, portable);
     }
 }
+
+/// Eight origins within `spread_m` of one, and bundles of rays from them within `turn` of some
+/// directions.
+fn bundles(
+    middle: Vec3,
+    spread_m: f32,
+    turn: f32,
+    rng: &mut ChaCha8Rng,
+) -> ([Vec3; RAYS], Vec<[Vec3; RAYS]>) {
+    let origins = [0; RAYS].map(|_| middle + spread_m * in_cube(rng));
+    let courses: Vec<Vec3> = (0..200).map(|_| direction(rng)).collect();
+    let directions = courses
+        .into_iter()
+        .chain(Vec3::AXES)
+        .map(|course| [0; RAYS].map(|_| (course + turn * in_cube(rng)).normalize()))
+        .collect();
+    (origins, directions)
+}
+
+#[test]
+fn a_ray_in_a_bundle_meets_what_it_meets_alone() {
+    let mut rng = ChaCha8Rng::seed_from_u64(16);
+    let scene = Scene::of_tiles(&[soup(3000, 0.7, &mut rng), soup(300, 2.0, &mut rng)]);
+    let mut met = 0;
+    for (until_m, spread_m, turn) in [(f32::INFINITY, 0.1, 0.01), (8.0, 5.0, 1.5), (8.0, 0.0, 0.0)]
+    {
+        for _ in 0..10 {
+            let middle = 10.0 * in_cube(&mut rng);
+            let (origins, directions) = bundles(middle, spread_m, turn, &mut rng);
+            let reach = Reach::until(until_m);
+            let mut ranges_m = vec![[0.0; RAYS]; directions.len()];
+            scene.cast_bundles(
+                &origins.map(|origin| origin.as_dvec3()),
+                &directions,
+                &vec![reach; directions.len()],
+                &mut ranges_m,
+            );
+            for (ray, &origin) in origins.iter().enumerate() {
+                let of_one: Vec<Vec3> = directions.iter().map(|bundle| bundle[ray]).collect();
+                let alone = cast_lone(&scene, origin, &of_one, reach);
+                for (bundle, alone) in ranges_m.iter().zip(alone) {
+                    assert_eq!(bundle[ray].to_bits(), alone.to_bits());
+                    met += usize::from(alone.is_finite());
+                }
+            }
+        }
+    }
+    assert!(met > 1000, "{met}");
+}
+
+#[test]
+fn no_ray_of_a_bundle_slips_through_an_edge_or_a_corner() {
+    let scene = Scene::new(&cube(2.0));
+    let corners: Vec<Vec3> = cube(2.0).vertices;
+    let origins = [0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 0.4].map(|x| Vec3::new(x, -x, 0.5 * x));
+    // From every origin exactly towards the same place on an edge or a diagonal.
+    let ends: Vec<Vec3> = corners
+        .iter()
+        .flat_map(|&a| corners.iter().map(move |&b| a.lerp(b, 0.3)))
+        .filter(|end| end.abs().max_element() > 1.99)
+        .collect();
+    let directions: Vec<[Vec3; RAYS]> = ends
+        .iter()
+        .map(|&end| origins.map(|origin| (end - origin).normalize()))
+        .collect();
+    let mut ranges_m = vec![[0.0; RAYS]; directions.len()];
+    let reach = vec![Reach::UNLIMITED; directions.len()];
+    let from = origins.map(|origin| origin.as_dvec3());
+    scene.cast_bundles(&from, &directions, &reach, &mut ranges_m);
+    for (end, ranges_m) in ends.iter().zip(ranges_m) {
+        for (origin, range_m) in origins.iter().zip(ranges_m) {
+            assert!((range_m - end.distance(*origin)).abs() < 1e-5, "{range_m}");
+        }
+    }
+    assert!(ends.len() > 30);
+}
+
+#[test]
+fn where_any_near_surface_is_enough_a_bundle_finds_one_where_there_is_one() {
+    let mut rng = ChaCha8Rng::seed_from_u64(17);
+    let scene = Scene::new(&soup(500, 2.0, &mut rng));
+    let (origins, directions) = bundles(Vec3::ZERO, 0.2, 0.02, &mut rng);
+    let from = origins.map(|origin| origin.as_dvec3());
+    let [nearest, enough] = [0.0, 5.0].map(|enough_m| {
+        let reach = Reach {
+            until_m: 8.0,
+            enough_m,
+            is_window: false,
+        };
+        let mut ranges_m = vec![[0.0; RAYS]; directions.len()];
+        let reaches = vec![reach; directions.len()];
+        scene.cast_bundles(&from, &directions, &reaches, &mut ranges_m);
+        ranges_m.concat()
+    });
+    let mut near = 0;
+    for (nearest, enough) in nearest.into_iter().zip(enough) {
+        if nearest < 5.0 {
+            near += 1;
+            assert!((nearest..5.0).contains(&enough), "{nearest} {enough}");
+        } else {
+            assert_eq!(nearest, enough);
+        }
+    }
+    assert!(near > 50, "{near}");
+}
+
+#[test]
+fn every_instruction_set_gives_bundles_the_same_bits() {
+    let mut rng = ChaCha8Rng::seed_from_u64(18);
+    let scene = Scene::of_tiles(&[soup(3000, 0.7, &mut rng), soup(300, 2.0, &mut rng)]);
+    for (spread_m, turn) in [(0.1, 0.01), (4.0, 1.0)] {
+        let (origins, directions) = bundles(in_cube(&mut rng), spread_m, turn, &mut rng);
+        let from = origins.map(|origin| origin.as_dvec3());
+        let reach = vec![Reach::until(12.0); directions.len()];
+        let mut fast = vec![[0.0; RAYS]; directions.len()];
+        let mut portable = fast.clone();
+        scene.cast_bundles(&from, &directions, &reach, &mut fast);
+        scene.cast_bundles_portable(&from, &directions, &reach, &mut portable);
+        assert_eq!(fast, portable);
+    }
+}

@@ -4,31 +4,39 @@
 //! into pieces that do not depend on the number of threads; sums are made piece by piece in that
 //! order. So the result is the same, byte for byte, on every machine.
 //!
-//! Beams that are close to each other, as those of an image, go through the scene in packets, others
-//! one by one. Both meet the same bits, unless a ray passes an edge within rounding: then it may
-//! meet either of the triangles there, whose ranges differ by about a millimetre where they are
-//! seen at a flat angle. What a pose sees never depends on the other poses.
+//! Beams that are close to each other, as those of an image, go through the scene in packets; where
+//! poses are closer to each other than beams, as those of particles that agree, each beam goes
+//! through it in bundles, from eight poses at once; others go one by one. All meet the same bits,
+//! unless a ray passes an edge within rounding: then it may meet either of the triangles there,
+//! whose ranges differ by about a millimetre where they are seen at a flat angle. Otherwise what a
+//! pose sees never depends on the other poses.
 
 mod order;
 
 use glam::{DVec3, Mat3};
 use rayon::prelude::*;
 
-use order::{coherent_order, mean_width_m, order_of_places, pixel_order};
+use order::{coherent_order, order_of_poses, pixel_order, width_of_bundles_m, width_of_packets_m};
 
 use super::{RangeDifference, RangeRenderer, RenderError, SurfaceHit};
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh, Vec3};
 use crate::lidar::{Beam, LidarModel};
-use crate::raycasting::{Hit, Reach, Scene};
+use crate::raycasting::{Hit, RAYS, Reach, Scene};
 
-/// Rays that are cast without asking for another thread.
-const RAYS_PER_PIECE: usize = 512;
+/// Beams that are cast without asking for another thread.
+const RAYS_PER_PIECE: usize = 64;
 /// What ends lower than this below the sensor has the ground about its end from almost any pose:
 /// it does not pay to look there first [m].
 const HIGHEST_GROUND_M: f32 = -1.0;
 /// Packets that are wider than this where they end go slower than their rays one by one: measured
 /// with `benches/rendering.rs` [m].
 const WIDEST_PACKET_M: f64 = 0.8;
+/// Bundles that are wider than this where they end go slower than their rays one by one: measured
+/// likewise [m].
+const WIDEST_BUNDLE_M: f64 = 0.6;
+/// A bundle is slower than a packet that is wider by this, because its rays do not share their
+/// origin: measured likewise, unitless.
+const BUNDLE_PER_PACKET: f64 = 0.5;
 /// Rounding of sums and differences of ranges.
 const ROUNDING: f32 = 1e-6;
 
@@ -54,26 +62,37 @@ impl CpuRenderer {
         beams: &Beams,
         summarize: impl Fn(&[u32], &[f32]) -> T + Sync,
     ) -> Vec<Vec<T>> {
-        let poses = order_of_places(map_from_lidar);
+        let order = order_of_poses(map_from_lidar);
+        let poses: Vec<Pose3> = order
+            .iter()
+            .map(|&pose| map_from_lidar[pose as usize])
+            .collect();
+        let way = Way::of(&poses, beams);
+        let groups: Vec<&[Pose3]> = poses.chunks(way.poses_at_once()).collect();
         let pieces: Vec<&[u32]> = beams.order.chunks(RAYS_PER_PIECE).collect();
-        let is_dense = mean_width_m(&beams.directions, &beams.order) < WIDEST_PACKET_M;
-        let summaries: Vec<T> = (0..poses.len() * pieces.len())
+        // Pose by pose for a few beams: what these pass through stays in the cache.
+        let summaries: Vec<Vec<T>> = (0..groups.len() * pieces.len())
             .into_par_iter()
             .map(|number| {
-                let pose = &map_from_lidar[poses[number / pieces.len()] as usize];
-                let rays = pieces[number % pieces.len()];
-                let ranges = if is_dense {
-                    self.cast_packets(pose, rays, beams)
-                } else {
-                    self.cast_lone(pose, rays, beams)
+                let rays = pieces[number / groups.len()];
+                let group = groups[number % groups.len()];
+                let ranges = match way {
+                    Way::Packets => vec![self.cast_packets(&group[0], rays, beams)],
+                    Way::Bundles => self.cast_bundles(group, rays, beams),
+                    Way::Alone => vec![self.cast_lone(&group[0], rays, beams)],
                 };
-                summarize(rays, &ranges)
+                ranges
+                    .iter()
+                    .map(|ranges| summarize(rays, ranges))
+                    .collect()
             })
             .collect();
-        let mut summaries = summaries.into_iter();
         let mut per_pose: Vec<Vec<T>> = map_from_lidar.iter().map(|_| Vec::new()).collect();
-        for pose in poses {
-            per_pose[pose as usize] = summaries.by_ref().take(pieces.len()).collect();
+        for (number, summaries) in summaries.into_iter().enumerate() {
+            let first = number % groups.len() * way.poses_at_once();
+            for (&pose, summary) in order[first..].iter().zip(summaries) {
+                per_pose[pose as usize].push(summary);
+            }
         }
         per_pose
     }
@@ -112,6 +131,29 @@ impl CpuRenderer {
         ranges
     }
 
+    /// Ranges of some beams of up to [`RAYS`] poses, pose by pose.
+    fn cast_bundles(&self, map_from_lidar: &[Pose3], rays: &[u32], beams: &Beams) -> Vec<Vec<f32>> {
+        // The last pose fills the empty places.
+        let last = map_from_lidar.len() - 1;
+        let poses: [&Pose3; RAYS] = std::array::from_fn(|place| &map_from_lidar[place.min(last)]);
+        let rotations = poses.map(rotation_of);
+        let (directions, reaches): (Vec<[Vec3; RAYS]>, Vec<Reach>) = rays
+            .iter()
+            .map(|&ray| ray as usize)
+            .map(|ray| {
+                let direction = beams.directions[ray];
+                (rotations.map(|r| r * direction), beams.reaches[ray])
+            })
+            .unzip();
+        let mut ranges = vec![[f32::INFINITY; RAYS]; rays.len()];
+        let origins = poses.map(origin_of);
+        self.scene
+            .cast_bundles(&origins, &directions, &reaches, &mut ranges);
+        (0..map_from_lidar.len())
+            .map(|place| ranges.iter().map(|ranges| ranges[place]).collect())
+            .collect()
+    }
+
     /// Ranges of every pose, ray by ray in the order of their numbers.
     fn ranges(&self, map_from_lidar: &[Pose3], beams: &Beams) -> Vec<Vec<f32>> {
         self.each_piece(map_from_lidar, beams, |_, ranges| ranges.to_vec())
@@ -124,6 +166,39 @@ impl CpuRenderer {
                 ranges
             })
             .collect()
+    }
+}
+
+/// Which rays go through the scene together.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Way {
+    /// Neighbouring beams of one pose.
+    Packets,
+    /// One beam of neighbouring poses.
+    Bundles,
+    /// None.
+    Alone,
+}
+
+impl Way {
+    /// The way for poses and beams, in their order.
+    fn of(poses: &[Pose3], beams: &Beams) -> Self {
+        let packet_m = width_of_packets_m(&beams.directions, &beams.order);
+        let bundle_m = width_of_bundles_m(poses);
+        if bundle_m < WIDEST_BUNDLE_M.min(BUNDLE_PER_PACKET * packet_m) {
+            Self::Bundles
+        } else if packet_m < WIDEST_PACKET_M {
+            Self::Packets
+        } else {
+            Self::Alone
+        }
+    }
+
+    fn poses_at_once(self) -> usize {
+        match self {
+            Self::Bundles => RAYS,
+            Self::Packets | Self::Alone => 1,
+        }
     }
 }
 

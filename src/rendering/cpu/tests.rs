@@ -2,6 +2,7 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
+use super::order::place_and_turn_m;
 use super::*;
 
 /// A wavy ground of 40 m in two tiles, the border in the middle.
@@ -272,10 +273,10 @@ fn a_pose_sees_the_same_bits_alone_as_among_others() {
 }
 
 #[test]
-fn neighbours_in_the_order_of_places_are_near_and_every_pose_is_in_it_once() {
+fn neighbours_in_the_order_of_poses_are_near_and_every_pose_is_in_it_once() {
     let poses = poses(1000);
-    let order = order_of_places(&poses);
-    let place = |pose: u32| poses[pose as usize].translation.vector;
+    let order = order_of_poses(&poses);
+    let place = |pose: u32| place_and_turn_m(&poses[pose as usize]);
     let mean_step_m = |order: &[u32]| {
         let steps = order.windows(2).map(|p| (place(p[0]) - place(p[1])).norm());
         steps.sum::<f64>() / order.len() as f64
@@ -283,18 +284,57 @@ fn neighbours_in_the_order_of_places_are_near_and_every_pose_is_in_it_once() {
     let mut sorted = order.clone();
     sorted.sort_unstable();
     assert!(sorted.iter().copied().eq(0..1000));
-    assert!(mean_step_m(&order) < 0.2 * mean_step_m(&sorted));
-    assert_eq!(order_of_places(&[]), Vec::<u32>::new());
+    assert!(mean_step_m(&order) < 0.3 * mean_step_m(&sorted));
+    assert_eq!(order_of_poses(&[]), Vec::<u32>::new());
+}
+
+/// Poses within centimetres of one.
+fn close_poses(count: usize) -> Vec<Pose3> {
+    let near = |number: usize, step: f64| 0.05 * ((number as f64 * step).fract() - 0.5);
+    (0..count)
+        .map(|number| {
+            let [x, y, turn] = [0.755, 0.570, 0.618].map(|step| near(number, step));
+            Pose3::new(
+                Vector3::new(3.0 + x, y, 2.5),
+                Vector3::new(0.0, 0.0, 0.1 * turn),
+            )
+        })
+        .collect()
 }
 
 #[test]
-fn beams_that_are_far_from_each_other_are_cast_alone_and_neighbours_in_packets() {
-    let is_dense = |count: usize| {
+fn what_is_close_to_each_other_is_cast_together() {
+    let way = |poses: &[Pose3], count: usize| {
         let directions: Vec<Vec3> = beams(count).iter().map(|beam| beam.direction).collect();
-        mean_width_m(&directions, &coherent_order(&directions)) < WIDEST_PACKET_M
+        let beams = Beams {
+            order: coherent_order(&directions),
+            reaches: vec![Reach::UNLIMITED; count],
+            directions,
+        };
+        Way::of(poses, &beams)
     };
-    assert!(!is_dense(500));
-    assert!(is_dense(100_000));
+    assert_eq!(way(&poses(100), 500), Way::Alone);
+    assert_eq!(way(&poses(100), 100_000), Way::Packets);
+    assert_eq!(way(&close_poses(100), 500), Way::Bundles);
+    assert_eq!(way(&close_poses(1), 500), Way::Alone);
+}
+
+#[test]
+fn the_poses_about_it_do_not_change_what_a_pose_sees() {
+    let renderer = CpuRenderer::new(&hills(Vec3::ZERO));
+    let difference = RangeDifference::truncated(0.5);
+    let beams = beams(600);
+    // A number that leaves the last bundle half empty.
+    let poses = close_poses(21);
+    let together = renderer.compare(&poses, &beams, &difference).unwrap();
+    let mut other = 0;
+    for (pose, cost) in poses.iter().zip(together) {
+        let alone = renderer.compare(&[*pose], &beams, &difference).unwrap()[0];
+        assert!((alone - cost).abs() < 1e-5, "{alone} {cost}");
+        other += usize::from(alone != cost);
+    }
+    // Only where a ray passes an edge within rounding.
+    assert!(other <= 2, "{other}");
 }
 
 #[test]

@@ -103,7 +103,7 @@ impl Forest {
             bounds: self.tiles[index].bounds,
             index: index as u32,
         });
-        let (over, leaves) = Bvh::build(items.collect(), 1);
+        let (over, leaves) = Bvh::build(&items.collect::<Vec<_>>(), 1);
         let Some(root) = over.root else {
             return;
         };
@@ -156,7 +156,7 @@ impl Tree {
             bounds: Aabb::of(*corners),
             index: index as u32,
         });
-        let (bvh, leaves) = Bvh::build(items.collect(), LEAF_SIZE);
+        let (bvh, leaves) = Bvh::build(&items.collect::<Vec<_>>(), LEAF_SIZE);
         Self {
             bvh,
             leaves,
