@@ -1,16 +1,18 @@
 //! A local map: the scans of a stretch of road turned into a mesh.
 
+use blake3::Hash;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::plan::{LocalMapPlan, Ownership};
 use super::scan_cloud::{PointCounts, ScanCloud, ScanSettings};
+use super::seam;
 use super::vertex_ground;
 use super::visibility::{self, VisibilityConfig};
 use crate::geometry::{PointCloud, TriangleMesh};
 use crate::ground::GroundClassifier;
-use crate::kitti::{Frame, KittiError};
-use crate::meshing::{self, MeshingError, PoissonConfig};
+use crate::kitti::{Frame, KittiError, velodyne};
+use crate::meshing::{self, MeshingError, PoissonConfig, Surface};
 
 /// How scans become a mesh.
 #[derive(Clone, Debug, PartialEq)]
@@ -64,6 +66,8 @@ pub struct LocalMapCounts {
     pub points: PointCounts,
     /// Points that moved.
     pub dynamic_points: usize,
+    /// Points that the reconstruction could not use: merged from opposite normals, they have none.
+    pub unusable_points: usize,
     /// Triangles as reconstructed.
     pub reconstructed_triangles: usize,
     /// Triangles dropped for few points around them.
@@ -81,6 +85,17 @@ pub struct LocalMapCounts {
     /// Whether it was left out because it had too few points to mesh.
     #[serde(default)]
     pub is_empty: bool,
+}
+
+/// A finished local map.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct LocalMap {
+    /// What it owns of the surface; empty where there were too few points.
+    pub mesh: TriangleMesh,
+    /// What happened to its points and triangles.
+    pub counts: LocalMapCounts,
+    /// Hash of the scans that it was made of, see [`scans_hash`].
+    pub scans_hash: String,
 }
 
 /// Who watches a build and may stop it.
@@ -134,7 +149,7 @@ pub fn build(
     settings: &LocalMapSettings,
     classifier: &dyn GroundClassifier,
     watcher: &Watcher,
-) -> Result<(TriangleMesh, LocalMapCounts), LocalMapError> {
+) -> Result<LocalMap, LocalMapError> {
     let mut counts = LocalMapCounts::default();
     watcher.begin("scans")?;
     let scans = prepare_scans(&frames[plan.used.clone()], settings, classifier, watcher)?;
@@ -142,26 +157,26 @@ pub fn build(
     scans
         .iter()
         .for_each(|scan| counts.points.add(&scan.counts));
+    let scans_hash = joint_hash(scans.iter().map(|scan| scan.hash));
 
     watcher.begin("moving points")?;
     let cloud = static_cloud(&scans, settings, &mut counts);
 
     watcher.begin("surface")?;
-    let mut surface = match meshing::reconstruct(&cloud, None, &settings.poisson) {
-        Ok(surface) => surface,
-        // A stretch in which nothing was seen is a hole in the map, and no reason to have no map.
-        Err(MeshingError::TooFewPoints { .. }) => {
-            counts.is_empty = true;
-            return Ok((TriangleMesh::default(), counts));
-        }
-        Err(source) => {
-            return Err(LocalMapError::Meshing {
-                number: plan.number,
-                first: frames[plan.own.start].number,
-                last: frames[plan.own.end - 1].number,
-                source,
-            });
-        }
+    let surface = reconstruct(&cloud, settings, &mut counts);
+    let surface = surface.map_err(|source| LocalMapError::Meshing {
+        number: plan.number,
+        first: frames[plan.own.start].number,
+        last: frames[plan.own.end - 1].number,
+        source,
+    })?;
+    let Some(mut surface) = surface else {
+        let mesh = TriangleMesh::default();
+        return Ok(LocalMap {
+            mesh,
+            counts,
+            scans_hash,
+        });
     };
     counts.reconstructed_triangles = surface.mesh.triangles.len();
     counts.sparse_triangles = meshing::trim_by_density(&mut surface, settings.min_density);
@@ -177,10 +192,31 @@ pub fn build(
     drop(scans);
 
     watcher.begin("ground")?;
-    keep_own(&mut mesh, plan, ownership, &mut counts);
+    counts.foreign_triangles = seam::keep_own(&mut mesh, ownership, plan.number);
     finish_ground(&mut mesh, &cloud, settings, &mut counts);
     counts.triangles = mesh.triangles.len();
-    Ok((mesh, counts))
+    Ok(LocalMap {
+        mesh,
+        counts,
+        scans_hash,
+    })
+}
+
+/// The hash that a local map has if it is made of these frames as they lie on disk now.
+pub fn scans_hash(frames: &[Frame], plan: &LocalMapPlan) -> Result<String, KittiError> {
+    let hashes: Vec<Hash> = frames[plan.used.clone()]
+        .par_iter()
+        .map(|frame| velodyne::hash_of_scan(&frame.scan_path))
+        .collect::<Result<_, _>>()?;
+    Ok(joint_hash(hashes))
+}
+
+fn joint_hash(hashes: impl IntoIterator<Item = Hash>) -> String {
+    let mut hasher = blake3::Hasher::new();
+    for hash in hashes {
+        hasher.update(hash.as_bytes());
+    }
+    hasher.finalize().to_hex().to_string()
 }
 
 fn prepare_scans(
@@ -223,22 +259,25 @@ fn static_cloud(
     all
 }
 
-/// Keeps the triangles whose centre lies in the region that this local map owns.
-fn keep_own(
-    mesh: &mut TriangleMesh,
-    plan: &LocalMapPlan,
-    ownership: &Ownership,
+/// The surface through the points; `None` where there are too few, which is a hole in the map, and
+/// no reason to have no map.
+fn reconstruct(
+    cloud: &PointCloud,
+    settings: &LocalMapSettings,
     counts: &mut LocalMapCounts,
-) {
-    let own: Vec<bool> = (0..mesh.triangles.len())
-        .map(|triangle| {
-            let [a, b, c] = mesh.corners(triangle);
-            let center = (a + b + c) / 3.0;
-            ownership.owner_at(f64::from(center.x), f64::from(center.y)) == Some(plan.number)
-        })
-        .collect();
-    counts.foreign_triangles = own.iter().filter(|&&own| !own).count();
-    mesh.retain_triangles(|triangle| own[triangle]);
+) -> Result<Option<Surface>, MeshingError> {
+    match meshing::reconstruct(cloud, None, &settings.poisson) {
+        Ok(surface) => {
+            counts.unusable_points = surface.dropped_points;
+            Ok(Some(surface))
+        }
+        Err(MeshingError::TooFewPoints { usable, given, .. }) => {
+            counts.unusable_points = given - usable;
+            counts.is_empty = true;
+            Ok(None)
+        }
+        Err(other) => Err(other),
+    }
 }
 
 /// Colours the mesh by confidence and simplifies what is ground.
@@ -269,4 +308,47 @@ fn finish_ground(
         settings.smoothing_iterations,
     );
     counts.simplified_triangles = before.saturating_sub(mesh.triangles.len());
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+
+    use super::*;
+
+    /// A floor of 4 m x 4 m, of which some points have no normal.
+    fn floor(without_normal: usize) -> PointCloud {
+        let mut cloud = PointCloud::default();
+        for i in 0..1600 {
+            let normal = if i < without_normal {
+                Vec3::ZERO
+            } else {
+                Vec3::Z
+            };
+            let place = Vec3::new((i % 40) as f32, (i / 40) as f32, 0.0);
+            cloud.push(0.1 * place, normal, 1.0);
+        }
+        cloud
+    }
+
+    fn unusable(cloud: &PointCloud) -> (bool, usize) {
+        let mut counts = LocalMapCounts::default();
+        let settings = LocalMapSettings {
+            poisson: PoissonConfig {
+                depth: 5,
+                ..PoissonConfig::default()
+            },
+            ..LocalMapSettings::default()
+        };
+        let surface = reconstruct(cloud, &settings, &mut counts).unwrap();
+        assert_eq!(surface.is_none(), counts.is_empty);
+        (counts.is_empty, counts.unusable_points)
+    }
+
+    #[test]
+    fn points_that_the_reconstruction_cannot_use_are_counted_also_where_nothing_is_left() {
+        assert_eq!(unusable(&floor(0)), (false, 0));
+        assert_eq!(unusable(&floor(7)), (false, 7));
+        assert_eq!(unusable(&floor(1597)), (true, 1597));
+    }
 }

@@ -7,6 +7,7 @@ pub mod plan;
 pub mod ply;
 pub mod quality;
 pub mod scan_cloud;
+mod seam;
 mod surface_distance;
 pub mod tiles;
 pub mod truth;
