@@ -4,6 +4,7 @@ use blake3::Hash;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::confidence::{self, ConfidenceConfig};
 use super::plan::{LocalMapPlan, Ownership};
 use super::scan_cloud::{PointCounts, ScanCloud, ScanSettings};
 use super::seam;
@@ -14,11 +15,16 @@ use crate::ground::GroundClassifier;
 use crate::kitti::{Frame, KittiError, velodyne};
 use crate::meshing::{self, MeshingError, PoissonConfig, Surface};
 
+/// Vertices that are gathered in neighbouring cells are less than two cells apart along an axis.
+const CELLS_PER_EDGE: f32 = 2.0;
+
 /// How scans become a mesh.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LocalMapSettings {
     /// What of a scan is used.
     pub scan: ScanSettings,
+    /// How much each point counts.
+    pub confidence: ConfidenceConfig,
     /// Surface reconstruction.
     pub poisson: PoissonConfig,
     /// Vertices below this quantile of density are dropped (unitless).
@@ -29,7 +35,8 @@ pub struct LocalMapSettings {
     pub visibility: VisibilityConfig,
     /// A vertex is ground from this confidence on (unitless).
     pub ground_threshold: f32,
-    /// Longest edge of simplified ground [m]; 0 leaves the ground as it is.
+    /// The ground is simplified as if its vertices were gathered in cells of this edge [m]: no new
+    /// edge is longer than two of them; 0 leaves the ground as it is.
     pub simplify_resolution_m: f32,
     /// Rounds of smoothing of the simplified ground.
     pub smoothing_iterations: usize,
@@ -44,6 +51,7 @@ impl Default for LocalMapSettings {
     fn default() -> Self {
         Self {
             scan: ScanSettings::default(),
+            confidence: ConfidenceConfig::default(),
             poisson: PoissonConfig::default(),
             min_density: 0.1,
             max_distance_m: 0.25,
@@ -160,10 +168,10 @@ pub fn build(
     let scans_hash = joint_hash(scans.iter().map(|scan| scan.hash));
 
     watcher.begin("moving points")?;
-    let cloud = static_cloud(&scans, settings, &mut counts);
+    let (cloud, weights) = static_cloud(&scans, settings, &mut counts);
 
     watcher.begin("surface")?;
-    let surface = reconstruct(&cloud, settings, &mut counts);
+    let surface = reconstruct(&cloud, weights.as_deref(), settings, &mut counts);
     let surface = surface.map_err(|source| LocalMapError::Meshing {
         number: plan.number,
         first: frames[plan.own.start].number,
@@ -193,7 +201,9 @@ pub fn build(
 
     watcher.begin("ground")?;
     counts.foreign_triangles = seam::keep_own(&mut mesh, ownership, plan.number);
-    finish_ground(&mut mesh, &cloud, settings, &mut counts);
+    meshing::split_fans(&mut mesh);
+    let is_held = seam::on_border(&mesh.vertices, ownership, plan.number);
+    finish_ground(&mut mesh, &cloud, &is_held, settings, &mut counts);
     counts.triangles = mesh.triangles.len();
     Ok(LocalMap {
         mesh,
@@ -236,37 +246,52 @@ fn prepare_scans(
         .collect()
 }
 
-/// All points that did not move, of all scans.
+/// All points that did not move, of all scans, and how much they count.
 fn static_cloud(
     scans: &[ScanCloud],
     settings: &LocalMapSettings,
     counts: &mut LocalMapCounts,
-) -> PointCloud {
+) -> (PointCloud, Option<Vec<f32>>) {
     let model = &settings.scan.range_image;
     let is_static = settings
         .visibility
         .enabled
         .then(|| visibility::static_points(scans, model, &settings.visibility));
     let mut all = PointCloud::default();
+    let mut weights: Option<Vec<f32>> = None;
     for (number, scan) in scans.iter().enumerate() {
         let mut cloud = scan.cloud.clone();
-        if let Some(is_static) = &is_static {
-            cloud.retain(|index| is_static[number][index]);
+        let is_kept = |index: usize| is_static.as_ref().is_none_or(|all| all[number][index]);
+        if let Some(confidences) = settings.confidence.of(scan) {
+            let kept = confidences
+                .into_iter()
+                .enumerate()
+                .filter(|(index, _)| is_kept(*index));
+            weights
+                .get_or_insert_default()
+                .extend(kept.map(|(_, confidence)| confidence));
+        }
+        if is_static.is_some() {
+            cloud.retain(is_kept);
             counts.dynamic_points += scan.cloud.len() - cloud.len();
         }
         all.append(cloud);
     }
-    all
+    if let Some(weights) = &mut weights {
+        confidence::balance(weights);
+    }
+    (all, weights)
 }
 
 /// The surface through the points; `None` where there are too few, which is a hole in the map, and
 /// no reason to have no map.
 fn reconstruct(
     cloud: &PointCloud,
+    weights: Option<&[f32]>,
     settings: &LocalMapSettings,
     counts: &mut LocalMapCounts,
 ) -> Result<Option<Surface>, MeshingError> {
-    match meshing::reconstruct(cloud, None, &settings.poisson) {
+    match meshing::reconstruct(cloud, weights, &settings.poisson) {
         Ok(surface) => {
             counts.unusable_points = surface.dropped_points;
             Ok(Some(surface))
@@ -280,10 +305,12 @@ fn reconstruct(
     }
 }
 
-/// Colours the mesh by confidence and simplifies what is ground.
+/// Colours the mesh by confidence and simplifies what is ground, apart from the vertices that are
+/// held.
 fn finish_ground(
     mesh: &mut TriangleMesh,
     cloud: &PointCloud,
+    is_held: &[bool],
     settings: &LocalMapSettings,
     counts: &mut LocalMapCounts,
 ) {
@@ -304,7 +331,8 @@ fn finish_ground(
     *mesh = meshing::simplify_ground(
         mesh,
         &vertex_ground::ground_triangles(mesh, &confidences, threshold),
-        settings.simplify_resolution_m,
+        is_held,
+        CELLS_PER_EDGE * settings.simplify_resolution_m,
         settings.smoothing_iterations,
     );
     counts.simplified_triangles = before.saturating_sub(mesh.triangles.len());
@@ -340,7 +368,7 @@ mod tests {
             },
             ..LocalMapSettings::default()
         };
-        let surface = reconstruct(cloud, &settings, &mut counts).unwrap();
+        let surface = reconstruct(cloud, None, &settings, &mut counts).unwrap();
         assert_eq!(surface.is_none(), counts.is_empty);
         (counts.is_empty, counts.unusable_points)
     }

@@ -1,5 +1,6 @@
 //! The map: built from scans, kept as a mesh, cut into tiles.
 
+pub mod confidence;
 pub mod elevation;
 mod heights;
 pub mod local_map;
@@ -13,6 +14,9 @@ pub mod tiles;
 pub mod truth;
 mod vertex_ground;
 pub mod visibility;
+
+#[cfg(test)]
+mod seam_tests;
 
 pub use elevation::{GroundMap, GroundPatch, Stance};
 pub use local_map::{LocalMapCounts, LocalMapError, LocalMapSettings};
