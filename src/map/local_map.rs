@@ -343,6 +343,7 @@ mod tests {
     use glam::Vec3;
 
     use super::*;
+    use crate::geometry::{Pose3, Rigid3f};
 
     /// A floor of 4 m x 4 m, of which some points have no normal.
     fn floor(without_normal: usize) -> PointCloud {
@@ -371,6 +372,44 @@ mod tests {
         let surface = reconstruct(cloud, None, &settings, &mut counts).unwrap();
         assert_eq!(surface.is_none(), counts.is_empty);
         (counts.is_empty, counts.unusable_points)
+    }
+
+    /// Sees a point at 5 m, through which its own beams pass, and two behind it.
+    fn scan() -> ScanCloud {
+        let mut cloud = PointCloud::default();
+        for range_m in [5.0, 10.0, 20.0] {
+            cloud.push(range_m * Vec3::X, Vec3::NEG_X, 0.0);
+        }
+        ScanCloud {
+            map_from_lidar: Rigid3f::from(&Pose3::identity()),
+            cloud,
+            returns: Vec::new(),
+            free_range_m: vec![7.0; ScanSettings::default().range_image.len()],
+            hash: blake3::hash(&[]),
+            counts: PointCounts::default(),
+        }
+    }
+
+    #[test]
+    fn weights_go_with_the_points_that_did_not_move() {
+        let scans = [scan(), scan(), scan()];
+        let mut settings = LocalMapSettings::default();
+        let mut counts = LocalMapCounts::default();
+        let (_, weights) = static_cloud(&scans, &settings, &mut counts);
+        assert_eq!(weights, None);
+
+        settings.confidence.half_range_m = Some(10.0);
+        counts.dynamic_points = 0;
+        let (cloud, weights) = static_cloud(&scans, &settings, &mut counts);
+        assert_eq!((cloud.len(), counts.dynamic_points), (6, 3));
+        // 1/2 and 1/5 with a mean of 1.
+        let expected = [10.0 / 7.0, 4.0 / 7.0].repeat(3);
+        for (weight, expected) in weights.unwrap().into_iter().zip(&expected) {
+            assert!(
+                (weight - expected).abs() < 1e-5_f32,
+                "{weight} for {expected}"
+            );
+        }
     }
 
     #[test]

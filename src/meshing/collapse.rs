@@ -15,7 +15,7 @@ use std::ops::Range;
 
 use glam::Vec3;
 
-use super::fan::{Fan, Planes};
+use super::fan::{Fan, Planes, distance_squared};
 
 /// How far a removed vertex may be from the surface, sweep after sweep [m].
 const TOLERANCES_M: [f32; 3] = [0.0025, 0.005, MAX_ERROR_M];
@@ -349,13 +349,6 @@ fn rim_neighbors(chain: &[(u32, u32)]) -> Option<[u32; 2]> {
         .iter()
         .find(|(_, to)| chain.iter().all(|(from, _)| from != to))?;
     Some([first.0, last.1])
-}
-
-/// Squared distance of a place to the line between two others.
-fn distance_squared(place: Vec3, a: Vec3, b: Vec3) -> f32 {
-    let edge = b - a;
-    let share = (place - a).dot(edge) / edge.length_squared().max(f32::MIN_POSITIVE);
-    place.distance_squared(a + share.clamp(0.0, 1.0) * edge)
 }
 
 /// The members of a list.
