@@ -18,7 +18,7 @@ const COMPARISON: &str = "\
 output_folder: out
 seeds: [1, 2]
 base:
-  build_map: {depth: 6, voxel_size: 0.2, displacement_threshold_m: 0}
+  build_map: {depth: 6, voxel_size: 0.2, displacement_threshold_m: 0, simplify_resolution: 0.5}
   localization: {numParticles: 50, num_reduced: 20}
   refinement: {refinement: {method: swarm, swarm: {iterations: 3}}}
 sequences:

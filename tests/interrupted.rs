@@ -210,6 +210,32 @@ fn a_killed_build_goes_on_and_ends_with_the_same_bytes() {
 }
 
 #[test]
+fn a_scan_that_is_replaced_by_one_of_the_same_size_is_meshed_again() {
+    let recording = Recording::street(12);
+    let scan = HeldScan::of(&recording, 7);
+    killed(&recording, BUILD_MAP, &scan);
+    // Of the two local maps that are finished only the first has seen it.
+    let shifted: Vec<[f32; 3]> = (recording.scan(0).into_iter())
+        .map(|[x, y, z]| [x, y, z + 0.05])
+        .collect();
+    recording.write_scan(0, &shifted);
+    let said = resumed(&recording, BUILD_MAP, &scan);
+    assert!(!said.contains("local map 1 of 4 is there"), "{said}");
+    assert!(said.contains("local map 2 of 4 is there"), "{said}");
+
+    let undisturbed = Recording::street(12);
+    undisturbed.write_scan(0, &shifted);
+    undisturbed
+        .fpmcl("build-map")
+        .with(BUILD_MAP[2])
+        .with(BUILD_MAP[3])
+        .succeeds();
+    let bytes = recording.bytes("map.ply");
+    assert!(bytes == undisturbed.bytes("map.ply"));
+    assert!(bytes != whole_map());
+}
+
+#[test]
 fn parts_of_another_configuration_are_not_taken() {
     let recording = Recording::street(12);
     let scan = HeldScan::of(&recording, 7);

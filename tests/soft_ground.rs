@@ -74,7 +74,7 @@ fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMap
         large,
         border,
     };
-    local_map::build(
+    let built = local_map::build(
         &frames,
         &plans[0],
         &ownership,
@@ -82,7 +82,8 @@ fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMap
         &classifier,
         &watcher,
     )
-    .unwrap()
+    .unwrap();
+    (built.mesh, built.counts)
 }
 
 fn mean_red(mesh: &TriangleMesh) -> f32 {

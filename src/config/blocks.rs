@@ -16,6 +16,7 @@ use crate::localization::proposal::ProposalConfig;
 use crate::localization::resampling::{KldConfig, ResamplingConfig};
 use crate::localization::settings::TemperingConfig;
 use crate::localization::vigilance::VigilanceConfig;
+use crate::map::confidence::ConfidenceConfig;
 use crate::map::visibility::VisibilityConfig;
 use crate::meshing::PoissonConfig;
 use crate::refinement::RefinementConfig;
@@ -65,6 +66,14 @@ impl Check for NormalConfig {
         )?;
         share("min_share", self.min_share)?;
         share("min_incidence", self.min_incidence)
+    }
+}
+
+impl Check for ConfidenceConfig {
+    fn check(&self) -> Result<(), Problem> {
+        not_negative("incidence_power", self.incidence_power)?;
+        self.half_range_m
+            .map_or(Ok(()), |half| positive("half_range_m", half))
     }
 }
 

@@ -15,6 +15,7 @@ use crate::kitti::Selection;
 use crate::lidar::normals::NormalConfig;
 use crate::lidar::{LidarModel, Spin};
 use crate::map::LocalMapSettings;
+use crate::map::confidence::ConfidenceConfig;
 use crate::map::scan_cloud::ScanSettings;
 use crate::map::visibility::VisibilityConfig;
 use crate::meshing::PoissonConfig;
@@ -88,6 +89,8 @@ pub struct BuildMapConfig {
     pub ground_threshold: f32,
     /// The own car in the lidar frame: x_min, x_max, y_min, y_max [m].
     pub own_car_m: [f32; 4],
+    /// How much each point counts in it. Off as it comes: it made no map better.
+    pub confidence: ConfidenceConfig,
     /// Surface reconstruction, beside `depth`.
     pub poisson: PoissonConfig,
     /// How normals are found in range images.
@@ -143,6 +146,7 @@ impl Default for BuildMapConfig {
             max_distance_m: f64::from(settings.max_distance_m),
             ground_threshold: settings.ground_threshold,
             own_car_m: settings.scan.own_car_m,
+            confidence: settings.confidence,
             poisson: settings.poisson,
             normals: settings.scan.normals,
             visibility: settings.visibility,
@@ -175,6 +179,7 @@ impl BuildMapConfig {
                 crop_m: Vec3::new(self.crop_x as f32, self.crop_y as f32, self.crop_z as f32),
                 own_car_m: self.own_car_m,
             },
+            confidence: self.confidence.clone(),
             poisson: PoissonConfig {
                 depth: self.depth,
                 ..self.poisson.clone()
@@ -240,6 +245,7 @@ impl Check for BuildMapConfig {
         positive("max_distance_m", self.max_distance_m)?;
         share("ground_threshold", self.ground_threshold)?;
         own_car("own_car_m", self.own_car_m)?;
+        nested("confidence", self.confidence.check())?;
         nested("poisson", self.poisson.check())?;
         nested("normals", self.normals.check())?;
         nested("visibility", self.visibility.check())?;

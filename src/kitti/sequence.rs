@@ -54,11 +54,20 @@ pub struct Frame {
 impl Frame {
     /// Reads the scan; its points are compensated where the motion is known.
     pub fn read(&self) -> Result<Scan, KittiError> {
-        let mut scan = velodyne::read_scan(&self.scan_path)?;
+        Ok(self.compensated(velodyne::read_scan(&self.scan_path)?))
+    }
+
+    /// As [`read`](Self::read), with the hash of the file as it was read.
+    pub fn read_and_hash(&self) -> Result<(Scan, blake3::Hash), KittiError> {
+        let (scan, hash) = velodyne::read_scan_and_hash(&self.scan_path)?;
+        Ok((self.compensated(scan), hash))
+    }
+
+    fn compensated(&self, mut scan: Scan) -> Scan {
         if let Some(revolution) = &self.revolution {
             revolution.compensate(&mut scan.points);
         }
-        Ok(scan)
+        scan
     }
 
     /// The pose with its place in the recording.

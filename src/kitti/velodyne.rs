@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::Path;
 
+use blake3::Hash;
 use glam::Vec3;
 
 use super::KittiError;
@@ -10,12 +11,27 @@ use crate::lidar::Scan;
 
 /// Reads a scan whole, with all its points, also the invalid ones.
 pub fn read_scan(path: &Path) -> Result<Scan, KittiError> {
-    let records = read_records::<16>(path)?;
+    parse_scan(path, &read_bytes(path)?)
+}
+
+/// Reads a scan and the BLAKE3 hash of its very bytes.
+pub fn read_scan_and_hash(path: &Path) -> Result<(Scan, Hash), KittiError> {
+    let bytes = read_bytes(path)?;
+    Ok((parse_scan(path, &bytes)?, blake3::hash(&bytes)))
+}
+
+/// The BLAKE3 hash of a scan's file.
+pub fn hash_of_scan(path: &Path) -> Result<Hash, KittiError> {
+    Ok(blake3::hash(&read_bytes(path)?))
+}
+
+fn parse_scan(path: &Path, bytes: &[u8]) -> Result<Scan, KittiError> {
+    let records = records::<16>(path, bytes)?;
     let mut scan = Scan {
         points: Vec::with_capacity(records.len()),
         intensities: Vec::with_capacity(records.len()),
     };
-    for record in &records {
+    for record in records {
         let [x, y, z, intensity] = floats(record);
         scan.points.push(Vec3::new(x, y, z));
         scan.intensities.push(intensity);
@@ -37,7 +53,8 @@ pub fn write_scan(path: &Path, scan: &Scan) -> Result<(), KittiError> {
 
 /// Reads the semantic class of every point: the low 16 bits, without the instance.
 pub fn read_labels(path: &Path) -> Result<Vec<u16>, KittiError> {
-    let records = read_records::<4>(path)?;
+    let bytes = read_bytes(path)?;
+    let records = records::<4>(path, &bytes)?;
     Ok(records
         .iter()
         .map(|&[low, high, ..]| u16::from_le_bytes([low, high]))
@@ -53,14 +70,20 @@ pub fn write_labels(path: &Path, classes: &[u16]) -> Result<(), KittiError> {
     write_bytes(path, &bytes)
 }
 
-fn read_records<const SIZE: usize>(path: &Path) -> Result<Vec<[u8; SIZE]>, KittiError> {
-    let bytes = fs::read(path).map_err(|source| KittiError::Read {
+fn read_bytes(path: &Path) -> Result<Vec<u8>, KittiError> {
+    fs::read(path).map_err(|source| KittiError::Read {
         path: path.to_owned(),
         source,
-    })?;
+    })
+}
+
+fn records<'a, const SIZE: usize>(
+    path: &Path,
+    bytes: &'a [u8],
+) -> Result<&'a [[u8; SIZE]], KittiError> {
     let (records, rest) = bytes.as_chunks::<SIZE>();
     if rest.is_empty() {
-        Ok(records.to_vec())
+        Ok(records)
     } else {
         Err(KittiError::Truncated {
             path: path.to_owned(),
@@ -96,6 +119,23 @@ mod tests {
         };
         write_scan(&path, &scan).unwrap();
         assert_eq!(read_scan(&path).unwrap(), scan);
+    }
+
+    #[test]
+    fn the_hash_of_a_scan_is_that_of_its_file_and_tells_one_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("000000.bin");
+        let mut scan = Scan {
+            points: vec![Vec3::X, Vec3::Y],
+            intensities: vec![0.3, 0.9],
+        };
+        write_scan(&path, &scan).unwrap();
+        let (read, hash) = read_scan_and_hash(&path).unwrap();
+        assert_eq!(read, scan);
+        assert_eq!(hash_of_scan(&path).unwrap(), hash);
+        scan.points[1].y = f32::from_bits(scan.points[1].y.to_bits() ^ 1);
+        write_scan(&path, &scan).unwrap();
+        assert_ne!(hash_of_scan(&path).unwrap(), hash);
     }
 
     #[test]

@@ -3,8 +3,9 @@
 //! A scan counts if the car has moved since the last one that counted. Every
 //! `local_map_size` counted scans, and at the end of the recording, a local map is closed. It is
 //! meshed from its own scans and those a few metres before and after; of its mesh it keeps
-//! what lies nearer to its own scans than to those of any other local map, so that
-//! neighbours meet and no wall stands twice, also where the car comes by again.
+//! what lies nearer to its own scans than to those of any other local map, cut off at the very
+//! border, see [`super::seam`]: neighbours meet and no wall stands twice, also where the car comes
+//! by again.
 
 use std::ops::Range;
 
@@ -114,11 +115,17 @@ impl Ownership {
         Self { grid, owners }
     }
 
-    /// The number of the local map that owns a place; `None` out of reach of all.
-    pub fn owner_at(&self, x: f64, y: f64) -> Option<usize> {
-        self.grid
-            .index_at(x, y)
-            .map(|index| self.owners[index] as usize)
+    /// The cells in which ownership is decided.
+    pub fn grid(&self) -> &Grid2 {
+        &self.grid
+    }
+
+    /// The number of the local map that owns a cell; `None` out of reach of all.
+    pub fn owner_of(&self, column: isize, row: isize) -> Option<usize> {
+        let column = usize::try_from(column).ok()?;
+        let row = usize::try_from(row).ok()?;
+        let is_inside = column < self.grid.columns && row < self.grid.rows;
+        is_inside.then(|| self.owners[row * self.grid.columns + column] as usize)
     }
 }
 
@@ -164,10 +171,14 @@ mod tests {
         let frames = drive((0..20).map(f64::from));
         let plans = local_maps(&frames, 10, 2.0);
         let ownership = Ownership::new(&frames, &plans, 30.0);
-        assert_eq!(ownership.owner_at(3.0, 20.0), Some(0));
-        assert_eq!(ownership.owner_at(9.1, -20.0), Some(0));
-        assert_eq!(ownership.owner_at(9.9, -20.0), Some(1));
-        assert_eq!(ownership.owner_at(40.0, 0.0), Some(1));
-        assert_eq!(ownership.owner_at(60.0, 0.0), None);
+        let owner_at = |x: f64, y: f64| {
+            let (column, row) = ownership.grid().cell_at(x, y)?;
+            ownership.owner_of(column as isize, row as isize)
+        };
+        assert_eq!(owner_at(3.0, 20.0), Some(0));
+        assert_eq!(owner_at(9.1, -20.0), Some(0));
+        assert_eq!(owner_at(9.9, -20.0), Some(1));
+        assert_eq!(owner_at(40.0, 0.0), Some(1));
+        assert_eq!(owner_at(60.0, 0.0), None);
     }
 }

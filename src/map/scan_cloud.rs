@@ -83,6 +83,8 @@ pub struct ScanCloud {
     pub returns: Vec<Vec3>,
     /// Per pixel of the range image the range up to which space is surely free [m]; 0 where unknown.
     pub free_range_m: Vec<f32>,
+    /// Of the bytes that the scan was read from.
+    pub hash: blake3::Hash,
     /// What was dropped on the way.
     pub counts: PointCounts,
 }
@@ -94,7 +96,7 @@ impl ScanCloud {
         settings: &ScanSettings,
         classifier: &dyn GroundClassifier,
     ) -> Result<Self, KittiError> {
-        let mut scan = frame.read()?;
+        let (mut scan, hash) = frame.read_and_hash()?;
         let mut counts = PointCounts {
             read: scan.len(),
             ..PointCounts::default()
@@ -141,6 +143,7 @@ impl ScanCloud {
             cloud,
             returns: scan.points,
             free_range_m: free_ranges(&image),
+            hash,
             counts,
         })
     }

@@ -1,4 +1,5 @@
-//! One block of ground with fewer triangles: vertices are drawn onto a neighbour, one by one.
+//! One block of ground with fewer triangles: vertices are drawn onto a neighbour, one by one; those
+//! on the rim of the ground along the rim.
 //!
 //! ```text
 //! cost of drawing v onto w = Σ over the triangles around v of  A (n·(w − v))²,  plus a little A |w − v|²
@@ -14,12 +15,15 @@ use std::ops::Range;
 
 use glam::Vec3;
 
-use super::fan::{Fan, Planes};
+use super::fan::{Fan, Planes, distance_squared};
 
 /// How far a removed vertex may be from the surface, sweep after sweep [m].
 const TOLERANCES_M: [f32; 3] = [0.0025, 0.005, MAX_ERROR_M];
 /// No removed vertex gets farther from the surface than this [m].
 const MAX_ERROR_M: f32 = 0.01;
+/// How far the rim may be from where it was, over the tolerance (unitless): where a dent is filled
+/// no vertex is left behind, and the dent may be the deeper.
+const RIM_FACTOR: f32 = 2.0;
 /// Weight of the length of the edge beside the distance to the planes (unitless): among equally
 /// flat ways the short one is taken.
 const LENGTH_WEIGHT: f32 = 1e-4;
@@ -28,14 +32,28 @@ const MAX_TRIES: usize = 4;
 /// The end of a list.
 const NONE: u32 = u32::MAX;
 
+/// Where a vertex may go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Freedom {
+    /// Nowhere.
+    Fixed,
+    /// Onto any neighbour: triangles are all around it.
+    Inner,
+    /// Onto the neighbours along the open border that it is on.
+    Rim,
+}
+
 /// A piece of a mesh in which vertices are numbered from 0.
 pub struct Block {
     /// The vertices [m].
     vertices: Vec<Vec3>,
     /// Where the vertices were measured, then the removed ones [m].
     measured: Vec<Vec3>,
-    /// Vertices that may go. All triangles around them and around their neighbours are here.
-    is_free: Vec<bool>,
+    /// Where the vertices may go. All triangles around the free ones and around their neighbours are
+    /// here.
+    freedom: Vec<Freedom>,
+    /// Whether a measured place was on the rim.
+    is_rim: Vec<bool>,
     triangles: Vec<[u32; 3]>,
     /// First removed vertex on each triangle, and the next one on the same triangle.
     first_point: Vec<u32>,
@@ -51,29 +69,31 @@ pub const DEAD: [u32; 3] = [NONE; 3];
 
 impl Block {
     /// A block of vertices; `measured` are the places that must stay near the surface: those of
-    /// the vertices, then those of removed vertices, and `lies_on` the triangles of the latter.
+    /// the vertices, then those of removed vertices, `is_rim` says whether they were on the rim, and
+    /// `lies_on` has the triangles of the removed ones.
     pub fn new(
         vertices: Vec<Vec3>,
-        measured: Vec<Vec3>,
-        is_free: Vec<bool>,
+        (measured, is_rim): (Vec<Vec3>, Vec<bool>),
+        freedom: Vec<Freedom>,
         triangles: Vec<[u32; 3]>,
         lies_on: &[u32],
     ) -> Self {
         let mut block = Self {
             first_point: vec![NONE; triangles.len()],
             next_point: vec![NONE; measured.len()],
-            first_corner: vec![NONE; is_free.len()],
+            first_corner: vec![NONE; freedom.len()],
             next_corner: vec![NONE; 3 * triangles.len()],
             vertices,
             measured,
-            is_free,
+            freedom,
+            is_rim,
             triangles,
         };
         for corner in 0..block.next_corner.len() {
             block.push_corner(corner as u32);
         }
         for (index, &triangle) in lies_on.iter().enumerate() {
-            block.push_point((block.is_free.len() + index) as u32, triangle);
+            block.push_point((block.freedom.len() + index) as u32, triangle);
         }
         block
     }
@@ -86,16 +106,17 @@ impl Block {
     /// Draws free vertices onto their neighbours as long as one can go; no edge gets longer than
     /// `resolution_m`.
     pub fn simplify(&mut self, resolution_m: f32) {
-        let mut scratch = Scratch::new(self.is_free.len(), resolution_m);
-        let mut rests_until = vec![0_u32; self.is_free.len()];
+        let mut scratch = Scratch::new(self.freedom.len(), resolution_m);
+        let mut rests_until = vec![0_u32; self.freedom.len()];
         let mut sweep = 0;
         for tolerance_m in TOLERANCES_M {
-            let mut is_waiting = self.is_free.clone();
+            let mut is_waiting: Vec<bool> =
+                (0..self.freedom.len()).map(|v| self.is_free(v)).collect();
             let mut has_changed = true;
             while has_changed {
                 has_changed = false;
                 sweep += 1;
-                for vertex in 0..self.is_free.len() {
+                for vertex in 0..self.freedom.len() {
                     if !is_waiting[vertex] || rests_until[vertex] == sweep {
                         continue;
                     }
@@ -104,7 +125,7 @@ impl Block {
                         has_changed = true;
                         for &(neighbor, _) in &scratch.ring {
                             rests_until[neighbor as usize] = sweep;
-                            is_waiting[neighbor as usize] = self.is_free[neighbor as usize];
+                            is_waiting[neighbor as usize] = self.is_free(neighbor as usize);
                         }
                     }
                 }
@@ -147,23 +168,33 @@ impl Block {
             planes.add((self.at(b) - origin).cross(self.at(c) - origin));
         }
         scratch.normal = planes.normal.normalize_or_zero();
-        scratch.targets.clear();
+        let mut targets = std::mem::take(&mut scratch.targets);
+        targets.clear();
         if scratch.normal == Vec3::ZERO {
+            scratch.targets = targets;
             return;
         }
-        for &(to, _) in &scratch.ring {
+        scratch.rim = match self.freedom[from as usize] {
+            Freedom::Rim => rim_neighbors(&scratch.ring),
+            Freedom::Fixed | Freedom::Inner => None,
+        };
+        let allowed = |to: u32| scratch.rim.is_none_or(|rim| rim.contains(&to));
+        let ends = scratch.rim.into_iter().flatten().skip(1);
+        let starts = scratch.ring.iter().map(|&(to, _)| to);
+        for to in starts.chain(ends).filter(|&to| allowed(to)) {
             let edge = self.at(to) - origin;
             let cost = planes.cost(edge);
             if cost <= 4.0 * tolerance_m * tolerance_m {
                 let cost = cost + LENGTH_WEIGHT * edge.length_squared();
-                scratch.targets.push((cost, to));
+                targets.push((cost, to));
             }
         }
+        scratch.targets = targets;
         (scratch.targets).sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     }
 
-    /// Whether the two vertices have only the two neighbours in common that the edge faces, and
-    /// no triangle with both of them is left over.
+    /// Whether the two vertices have only those neighbours in common that the edge faces, two or, on
+    /// the rim, one, and no triangle with both of them is left over.
     fn stays_a_surface(&self, from: u32, to: u32, scratch: &mut Scratch) -> bool {
         scratch.round += 2;
         let (unseen, seen) = (scratch.round, scratch.round + 1);
@@ -184,7 +215,7 @@ impl Block {
                 }
             }
         }
-        common == 2
+        common == if scratch.rim.is_some() { 1 } else { 2 }
     }
 
     /// Spreads the new triangles in the plane of the old ones. Whether all of them may be.
@@ -202,12 +233,22 @@ impl Block {
         !scratch.fan.is_empty()
     }
 
-    /// Finds the new triangle of each point. Whether all are within the tolerance.
+    /// Finds the new triangle of each point. Whether all are within the tolerance, and those of the
+    /// rim near the new rim.
     fn is_within(&self, tolerance_m: f32, from: u32, scratch: &mut Scratch) -> bool {
         scratch.places.clear();
+        let rim = (scratch.rim).map(|[a, b]| [self.at(a), self.at(b)]);
+        let off_rim_m = RIM_FACTOR * tolerance_m;
         let points = (scratch.around.iter()).flat_map(|&triangle| self.points_on(triangle));
         for point in std::iter::once(from).chain(points) {
-            let (blade, distance_squared) = scratch.fan.nearest(self.measured[point as usize]);
+            let place = self.measured[point as usize];
+            if let Some([a, b]) = rim
+                && self.is_rim[point as usize]
+                && distance_squared(place, a, b) > off_rim_m * off_rim_m
+            {
+                return false;
+            }
+            let (blade, distance_squared) = scratch.fan.nearest(place);
             if distance_squared > tolerance_m * tolerance_m {
                 return false;
             }
@@ -235,10 +276,14 @@ impl Block {
             }
         }
         self.first_corner[from as usize] = NONE;
-        self.is_free[from as usize] = false;
+        self.freedom[from as usize] = Freedom::Fixed;
         for &(point, triangle) in &scratch.places {
             self.push_point(point, triangle);
         }
+    }
+
+    fn is_free(&self, vertex: usize) -> bool {
+        self.freedom[vertex] != Freedom::Fixed
     }
 
     fn at(&self, vertex: u32) -> Vec3 {
@@ -295,6 +340,17 @@ fn corners_of(triangle: usize) -> Range<u32> {
     3 * triangle as u32..3 * triangle as u32 + 3
 }
 
+/// The ends of the chain around a vertex on the rim; `None` if it is no chain.
+fn rim_neighbors(chain: &[(u32, u32)]) -> Option<[u32; 2]> {
+    let first = chain
+        .iter()
+        .find(|(from, _)| chain.iter().all(|(_, to)| to != from))?;
+    let last = chain
+        .iter()
+        .find(|(_, to)| chain.iter().all(|(from, _)| from != to))?;
+    Some([first.0, last.1])
+}
+
 /// The members of a list.
 fn walk(next: &[u32], first: u32) -> impl Iterator<Item = u32> {
     let some = |index: u32| (index != NONE).then_some(index);
@@ -306,6 +362,8 @@ struct Scratch {
     max_edge_m: f32,
     /// Next and last corner of each triangle around the vertex.
     ring: Vec<(u32, u32)>,
+    /// On the rim: its two neighbours along it.
+    rim: Option<[u32; 2]>,
     /// These triangles.
     around: Vec<u32>,
     /// Their mean normal.
@@ -324,6 +382,7 @@ impl Scratch {
         Self {
             max_edge_m: resolution_m,
             ring: Vec::new(),
+            rim: None,
             around: Vec::new(),
             normal: Vec3::ZERO,
             targets: Vec::new(),

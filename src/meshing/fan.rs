@@ -7,6 +7,13 @@ const MIN_COSINE: f32 = 0.9;
 /// No new triangle is thinner than this: twice its area over its longest edge squared.
 const MIN_SHAPE: f32 = 0.05;
 
+/// Squared distance of a place to the line between two others [m²].
+pub fn distance_squared(place: Vec3, a: Vec3, b: Vec3) -> f32 {
+    let edge = b - a;
+    let share = (place - a).dot(edge) / edge.length_squared().max(f32::MIN_POSITIVE);
+    place.distance_squared(a + share.clamp(0.0, 1.0) * edge)
+}
+
 /// The planes through one vertex, weighted by area.
 #[derive(Default)]
 pub struct Planes {

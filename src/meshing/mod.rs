@@ -13,11 +13,13 @@ mod collapse;
 mod density;
 mod fan;
 mod isosurface;
+mod manifold;
 mod morton;
 mod octree;
 mod samples;
 mod solver;
 
+pub use manifold::split_fans;
 pub use poisson::{MeshingError, PoissonConfig, Surface, reconstruct};
 pub use simplify::simplify_ground;
 pub use trimming::{trim_by_density, trim_by_distance};

@@ -2,13 +2,13 @@
 //!
 //! The plane is cut into square blocks that are simplified independently of each other, see
 //! [`super::collapse`]; then again with the cuts a third and two thirds of a block farther on, so
-//! every place is away from the cuts at least once. Vertices that touch other triangles or the
-//! border stay where they are: no crack opens.
+//! every place is away from the cuts at least once. Vertices that touch other triangles stay where
+//! they are: no crack opens. Those on the open border go where it is almost straight.
 
 use glam::{IVec2, Vec3};
 use rayon::prelude::*;
 
-use super::collapse::{Block, DEAD};
+use super::collapse::{Block, DEAD, Freedom};
 use crate::geometry::TriangleMesh;
 
 /// Edge of the blocks [m].
@@ -23,15 +23,17 @@ const NOWHERE: u32 = u32::MAX;
 /// vertices are drawn `smoothing_iterations` times halfway to the mean of their neighbours along
 /// their normals, by at most five millimetres in all; the centimetre includes that.
 ///
-/// `is_ground` is per triangle. Vertices of other triangles, and of the open border, are not
-/// touched; normals and colours are kept; no vertex is left without a triangle.
+/// `is_ground` is per triangle. Vertices of other triangles are not touched, nor are those that
+/// `is_held` has, per vertex; both count as false where they end early. The open border moves by at
+/// most two centimetres. Normals and colours are kept; no vertex is left without a triangle.
 pub fn simplify_ground(
     mesh: &TriangleMesh,
     is_ground: &[bool],
+    is_held: &[bool],
     resolution_m: f32,
     smoothing_iterations: usize,
 ) -> TriangleMesh {
-    let mut ground = Ground::new(mesh.clone(), is_ground);
+    let mut ground = Ground::new(mesh.clone(), is_ground, is_held);
     ground.smooth(smoothing_iterations);
     for third in 0..3 {
         ground.simplify_blocks(third as f32 / 3.0 * BLOCK_M, resolution_m);
@@ -43,8 +45,10 @@ struct Ground {
     mesh: TriangleMesh,
     /// Vertices of ground triangles.
     is_ground: Vec<bool>,
-    /// Vertices that may move and go: a ring of ground triangles is around them.
-    is_free: Vec<bool>,
+    /// Vertices that may go: only ground triangles are around them.
+    freedom: Vec<Freedom>,
+    /// Vertices that were on the rim of the ground, and could go.
+    is_rim: Vec<bool>,
     /// The vertices before smoothing.
     measured: Vec<Vec3>,
     /// The triangle on which each removed vertex lies.
@@ -52,7 +56,7 @@ struct Ground {
 }
 
 impl Ground {
-    fn new(mesh: TriangleMesh, is_ground: &[bool]) -> Self {
+    fn new(mesh: TriangleMesh, is_ground: &[bool], is_held: &[bool]) -> Self {
         let count = mesh.vertices.len();
         let (mut in_ground, mut in_rest) = (vec![false; count], vec![false; count]);
         for (index, triangle) in mesh.triangles.iter().enumerate() {
@@ -62,11 +66,14 @@ impl Ground {
                 in_rest[vertex as usize] |= !is_ground;
             }
         }
-        let is_pure = (in_ground.iter().zip(&in_rest))
-            .map(|(&ground, &rest)| ground && !rest)
+        let is_held = is_held.iter().copied().chain(std::iter::repeat(false));
+        let is_pure: Vec<bool> = (in_ground.iter().zip(&in_rest).zip(is_held))
+            .map(|((&ground, &rest), held)| ground && !rest && !held)
             .collect();
+        let freedom = freedom(&mesh.triangles, &is_pure);
         Self {
-            is_free: ringed(&mesh.triangles, is_pure),
+            is_rim: freedom.iter().map(|&f| f == Freedom::Rim).collect(),
+            freedom,
             is_ground: in_ground,
             measured: mesh.vertices.clone(),
             lies_on: vec![NOWHERE; count],
@@ -81,7 +88,8 @@ impl Ground {
         }
         for _ in 0..iterations {
             let means = self.neighbor_means();
-            for vertex in (0..before.len()).filter(|&vertex| self.is_free[vertex]) {
+            for vertex in (0..before.len()).filter(|&vertex| self.freedom[vertex] == Freedom::Inner)
+            {
                 let now = self.mesh.vertices[vertex];
                 let normal = self.mesh.normals[vertex];
                 let rise = (means[vertex] - now).dot(normal);
@@ -98,7 +106,7 @@ impl Ground {
         for (index, triangle) in self.mesh.triangles.iter().enumerate() {
             let corners = self.mesh.corners(index);
             for (k, &vertex) in triangle.iter().enumerate() {
-                if self.is_free[vertex as usize] {
+                if self.freedom[vertex as usize] == Freedom::Inner {
                     let sum = &mut sums[vertex as usize];
                     // In a ring every neighbour is once the next one.
                     sum.0 += corners[(k + 1) % 3];
@@ -170,12 +178,15 @@ impl Ground {
         vertices.dedup();
         let local = |vertex: u32| vertices.partition_point(|&other| other < vertex) as u32;
         let locals: Vec<_> = triangles.iter().map(|t| corners(t).map(local)).collect();
-        let mut is_free: Vec<bool> = vertices.iter().map(|&v| self.is_free[v as usize]).collect();
+        let mut freedom: Vec<Freedom> =
+            vertices.iter().map(|&v| self.freedom[v as usize]).collect();
         // A triangle that reaches into two blocks must stay as it is, and so its corners.
         for (triangle, local) in triangles.iter().map(corners).zip(&locals) {
             let [a, b, c] = triangle.map(|v| block_of[v as usize]);
             if a != b || b != c {
-                local.iter().for_each(|&v| is_free[v as usize] = false);
+                local
+                    .iter()
+                    .for_each(|&v| freedom[v as usize] = Freedom::Fixed);
             }
         }
         let mut lies_on = Vec::new();
@@ -191,10 +202,11 @@ impl Ground {
         }
         let positions = |of: &[Vec3]| vertices.iter().map(|&v| of[v as usize]).collect();
         let measured = positions(&self.measured);
+        let is_rim = vertices.iter().map(|&v| self.is_rim[v as usize]).collect();
         let block = Block::new(
             positions(&self.mesh.vertices),
-            measured,
-            is_free,
+            (measured, is_rim),
+            freedom,
             locals,
             &lies_on,
         );
@@ -215,7 +227,7 @@ impl Ground {
         }
         for (point, triangle) in piece.block.points() {
             let vertex = piece.vertices[point as usize] as usize;
-            self.is_free[vertex] = false;
+            self.freedom[vertex] = Freedom::Fixed;
             self.lies_on[vertex] = piece.triangles[triangle];
         }
     }
@@ -234,8 +246,9 @@ struct Piece {
     triangles: Vec<u32>,
 }
 
-/// Which of the candidates have one closed ring of triangles around them.
-fn ringed(triangles: &[[u32; 3]], mut is_candidate: Vec<bool>) -> Vec<bool> {
+/// What is around each candidate: one closed ring of triangles, one fan that begins and ends on the
+/// open border, or anything else.
+fn freedom(triangles: &[[u32; 3]], is_candidate: &[bool]) -> Vec<Freedom> {
     let mut ends = vec![0_usize; is_candidate.len() + 1];
     let corners =
         || (triangles.iter()).flat_map(|&[a, b, c]| [(a, (b, c)), (b, (c, a)), (c, (a, b))]);
@@ -251,23 +264,29 @@ fn ringed(triangles: &[[u32; 3]], mut is_candidate: Vec<bool>) -> Vec<bool> {
         links[ends[vertex as usize]] = link;
         ends[vertex as usize] += 1;
     }
-    (is_candidate.par_iter_mut().enumerate()).for_each(|(vertex, is_ringed)| {
-        *is_ringed = *is_ringed && is_ring(&links[starts[vertex]..starts[vertex + 1]]);
-    });
-    is_candidate
+    (0..is_candidate.len())
+        .into_par_iter()
+        .map(|vertex| freedom_within(&links[starts[vertex]..starts[vertex + 1]]))
+        .collect()
 }
 
-/// Whether the edges opposite to a vertex form one ring.
-fn is_ring(links: &[(u32, u32)]) -> bool {
-    let Some(&(start, mut end)) = links.first() else {
-        return false;
+/// Whether the edges opposite to a vertex form one ring or one chain.
+fn freedom_within(links: &[(u32, u32)]) -> Freedom {
+    let is_start = |&&(from, _): &&(u32, u32)| links.iter().all(|(_, to)| *to != from);
+    let chain = links.iter().find(is_start);
+    let Some(&(start, mut end)) = chain.or(links.first()) else {
+        return Freedom::Fixed;
     };
     let mut reached = 1;
     while end != start && reached <= links.len() {
         match links.iter().find(|(from, _)| *from == end) {
             Some(next) => (reached, end) = (reached + 1, next.1),
-            None => return false,
+            None => break,
         }
     }
-    reached >= 3 && reached == links.len()
+    match (reached == links.len(), end == start) {
+        (true, true) if reached >= 3 => Freedom::Inner,
+        (true, false) if reached >= 2 => Freedom::Rim,
+        _ => Freedom::Fixed,
+    }
 }

@@ -193,6 +193,7 @@ calib_file: calib.txt
 mesh_file: map.ply
 depth: 6
 voxel_size: 0.2
+simplify_resolution: 0.5
 displacement_threshold_m: 0
 range_image: {height: 32, width: 360, fov_up: 3, fov_down: -25, max_range: 50, min_range: 1}
 ";

@@ -111,7 +111,7 @@ fn build_parts(
     let task = context.progress.task("build-map", scans);
     let mut all = Vec::with_capacity(plans.len());
     for plan in plans {
-        if let Some(counts) = parts.finished(plan.number) {
+        if let Some(counts) = finished(parts, frames, plan) {
             tracing::info!(
                 "local map {} of {} is there already",
                 plan.number + 1,
@@ -132,18 +132,26 @@ fn build_parts(
         };
         let built = local_map::build(frames, plan, &ownership, &settings, &*classifier, &watcher);
         clock.end();
-        let (mesh, counts) = built.map_err(|error| told(error, all.len(), plans.len(), parts))?;
-        if counts.is_empty {
+        let built = built.map_err(|error| told(error, all.len(), plans.len(), parts))?;
+        if built.counts.is_empty {
             tracing::warn!(
                 "frames {} to {} have too few points to mesh: the map has a hole there",
                 frames[plan.own.start].number,
                 frames[plan.own.end - 1].number
             );
         }
-        parts.save(plan.number, &mesh, &counts)?;
-        all.push(counts);
+        parts.save(plan.number, &built)?;
+        all.push(built.counts);
     }
     Ok(all)
+}
+
+/// The counts of a local map that is there already, made of the scans as they are now.
+fn finished(parts: &Parts, frames: &[Frame], plan: &LocalMapPlan) -> Option<LocalMapCounts> {
+    let part = parts.finished(plan.number)?;
+    // A scan that cannot be read is told of by the build.
+    let is_same = local_map::scans_hash(frames, plan).is_ok_and(|now| now == part.scans_hash);
+    is_same.then_some(part.counts)
 }
 
 /// An interrupted build says what it keeps.
@@ -173,7 +181,8 @@ fn hold_out(frames: &[Frame], config: &BuildMapConfig) -> (Vec<Frame>, Vec<Frame
     (strip(mapped), strip(held))
 }
 
-/// What the local maps depend on: the configuration without where results go, and the scans.
+/// What all local maps depend on: the program, the configuration without where results go, and
+/// the poses. The scans each of them knows itself.
 fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
     let relevant = BuildMapConfig {
         mesh_file: PathBuf::new(),
@@ -182,14 +191,14 @@ fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
         force: false,
         ..config.clone()
     };
-    let mut text = config::to_yaml(&relevant)?;
+    let mut text = format!("# fpmcl {}\n", env!("CARGO_PKG_VERSION"));
+    text += &config::to_yaml(&relevant)?;
     for frame in frames {
-        let bytes = std::fs::metadata(&frame.scan_path).map_or(0, |meta| meta.len());
         let t = frame.map_from_lidar.translation.vector;
         let q = frame.map_from_lidar.rotation.coords;
         writeln!(
             text,
-            "{} {bytes} {} {} {} {} {} {} {}",
+            "{} {} {} {} {} {} {} {} {:?}",
             frame.scan_path.display(),
             t.x,
             t.y,
@@ -197,7 +206,8 @@ fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
             q.x,
             q.y,
             q.z,
-            q.w
+            q.w,
+            frame.revolution
         )?;
     }
     Ok(text)

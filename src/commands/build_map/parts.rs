@@ -1,16 +1,29 @@
 //! Finished local maps on disk, so that an interrupted build goes on where it was.
 //!
-//! Beside the map lies, while it is being built, the folder `<map>.parts`: per local map a mesh and
-//! its counts, and `inputs.txt`, which says what they were made from. Parts of other inputs are
-//! thrown away. A part counts as finished once its counts are there, which are written last.
+//! Beside the map lies, while it is being built, the folder `<map>.parts`: per local map a mesh,
+//! its counts and the hash of its scans, and `inputs.txt`, which says what else they were made from.
+//! Parts of other inputs are thrown away. A part counts as finished once its counts are there, which
+//! are written last.
 
 use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
+use serde::{Deserialize, Serialize};
 
 use crate::geometry::TriangleMesh;
+use crate::map::local_map::LocalMap;
 use crate::map::{LocalMapCounts, ply};
+
+/// What is known of a finished local map beside its mesh.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Part {
+    /// Hash of the scans that it was made of.
+    pub scans_hash: String,
+    /// What happened to its points and triangles.
+    pub counts: LocalMapCounts,
+}
 
 /// The folder of finished local maps of one build.
 pub struct Parts {
@@ -42,24 +55,42 @@ impl Parts {
         &self.folder
     }
 
-    /// The counts of a local map if it is finished.
-    pub fn finished(&self, number: usize) -> Option<LocalMapCounts> {
+    /// What is known of a local map if it is finished.
+    pub fn finished(&self, number: usize) -> Option<Part> {
         let text = fs::read_to_string(self.counts_file(number)).ok()?;
         serde_json::from_str(&text).ok()
     }
 
     /// Keeps a finished local map.
-    pub fn save(&self, number: usize, mesh: &TriangleMesh, counts: &LocalMapCounts) -> Result<()> {
-        if !mesh.triangles.is_empty() {
+    pub fn save(&self, number: usize, local_map: &LocalMap) -> Result<()> {
+        self.discard(number)?;
+        if !local_map.mesh.triangles.is_empty() {
             let temporary = self.folder.join("unfinished.ply");
-            ply::write(&temporary, mesh)?;
+            ply::write(&temporary, &local_map.mesh)?;
             fs::rename(&temporary, self.mesh_file(number))
                 .with_context(|| format!("cannot rename {}", temporary.display()))?;
         }
+        let part = Part {
+            scans_hash: local_map.scans_hash.clone(),
+            counts: local_map.counts.clone(),
+        };
         write_whole(
             &self.counts_file(number),
-            serde_json::to_string_pretty(counts)?.as_bytes(),
+            serde_json::to_string_pretty(&part)?.as_bytes(),
         )
+    }
+
+    /// Removes what there is of a part that was made of other scans, its counts first.
+    fn discard(&self, number: usize) -> Result<()> {
+        for file in [self.counts_file(number), self.mesh_file(number)] {
+            match fs::remove_file(&file) {
+                Err(error) if error.kind() != ErrorKind::NotFound => {
+                    return Err(error).with_context(|| format!("cannot remove {}", file.display()));
+                }
+                _ => {}
+            }
+        }
+        Ok(())
     }
 
     /// All local maps 0..count as one mesh.
@@ -103,12 +134,19 @@ mod tests {
 
     use super::*;
 
-    fn triangle(x: f32) -> TriangleMesh {
-        TriangleMesh {
-            vertices: vec![Vec3::new(x, 0.0, 0.0), Vec3::X, Vec3::Y],
-            normals: vec![Vec3::Z; 3],
-            colors: vec![[255, 0, 0]; 3],
-            triangles: vec![[0, 1, 2]],
+    fn local_map(x: f32) -> LocalMap {
+        LocalMap {
+            mesh: TriangleMesh {
+                vertices: vec![Vec3::new(x, 0.0, 0.0), Vec3::X, Vec3::Y],
+                normals: vec![Vec3::Z; 3],
+                colors: vec![[255, 0, 0]; 3],
+                triangles: vec![[0, 1, 2]],
+            },
+            counts: LocalMapCounts {
+                scans: 7,
+                ..LocalMapCounts::default()
+            },
+            scans_hash: "0123abcd".to_owned(),
         }
     }
 
@@ -116,16 +154,14 @@ mod tests {
     fn finished_parts_are_found_again_and_joined_in_order() {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
-        let counts = LocalMapCounts {
-            scans: 7,
-            ..LocalMapCounts::default()
-        };
         let parts = Parts::open(&map, "inputs").unwrap();
-        parts.save(1, &triangle(1.5), &counts).unwrap();
-        parts.save(0, &triangle(0.5), &counts).unwrap();
+        parts.save(1, &local_map(1.5)).unwrap();
+        parts.save(0, &local_map(0.5)).unwrap();
 
         let again = Parts::open(&map, "inputs").unwrap();
-        assert_eq!(again.finished(1), Some(counts));
+        let part = again.finished(1).unwrap();
+        assert_eq!(part.scans_hash, "0123abcd");
+        assert_eq!(part.counts.scans, 7);
         assert_eq!(again.finished(2), None);
         let whole = again.join(2).unwrap();
         assert_eq!(whole.vertices[0].x, 0.5);
@@ -137,9 +173,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
         let parts = Parts::open(&map, "inputs").unwrap();
-        parts
-            .save(0, &triangle(0.5), &LocalMapCounts::default())
-            .unwrap();
+        parts.save(0, &local_map(0.5)).unwrap();
         assert_eq!(Parts::open(&map, "others").unwrap().finished(0), None);
     }
 
@@ -148,10 +182,18 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
         let parts = Parts::open(&map, "inputs").unwrap();
-        parts
-            .save(0, &triangle(0.5), &LocalMapCounts::default())
-            .unwrap();
+        parts.save(0, &local_map(0.5)).unwrap();
         fs::remove_file(parts.counts_file(0)).unwrap();
         assert_eq!(parts.finished(0), None);
+    }
+
+    #[test]
+    fn a_part_that_has_become_empty_leaves_nothing_of_what_it_was() {
+        let folder = tempfile::tempdir().unwrap();
+        let parts = Parts::open(&folder.path().join("map.ply"), "inputs").unwrap();
+        parts.save(0, &local_map(0.5)).unwrap();
+        parts.save(0, &LocalMap::default()).unwrap();
+        assert_eq!(parts.finished(0).unwrap().scans_hash, "");
+        assert!(parts.join(1).unwrap().triangles.is_empty());
     }
 }

@@ -1,0 +1,186 @@
+//! Laws of the cut between local maps.
+
+use std::collections::HashSet;
+
+use glam::Vec3;
+use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
+
+use super::plan::{Ownership, counted_frames, local_maps};
+use super::seam::{keep_own, on_border};
+use crate::geometry::{Pose3, TriangleMesh};
+use crate::kitti::Frame;
+use crate::raycasting::Scene;
+
+const LOCAL_MAPS: usize = 4;
+
+/// Scans along an arc of 12 m, three to a local map.
+fn ownership() -> Ownership {
+    let frames: Vec<Frame> = (0..3 * LOCAL_MAPS)
+        .map(|number| {
+            let turn = number as f64 * 0.25;
+            Frame {
+                number,
+                scan_path: String::new().into(),
+                time_s: 0.0,
+                map_from_lidar: Pose3::translation(4.0 * turn.sin(), 4.0 * turn.cos(), 0.0),
+                revolution: None,
+            }
+        })
+        .collect();
+    let frames = counted_frames(&frames, 0.2);
+    Ownership::new(&frames, &local_maps(&frames, 3, 1.0), 20.0)
+}
+
+/// Bumpy ground of 16 m x 16 m with corners where chance puts them.
+fn bumpy(seed: u64) -> TriangleMesh {
+    const CELLS: u32 = 53;
+    let mut rng = StdRng::seed_from_u64(seed);
+    let step = 16.0 / CELLS as f32;
+    let mut mesh = TriangleMesh::default();
+    for i in 0..(CELLS + 1) * (CELLS + 1) {
+        let (column, row) = (i % (CELLS + 1), i / (CELLS + 1));
+        let mut jitter = |spread: f32| spread * (rng.random::<f32>() - 0.5);
+        mesh.vertices.push(Vec3::new(
+            step * column as f32 - 8.0 + jitter(0.5 * step),
+            step * row as f32 - 8.0 + jitter(0.5 * step),
+            jitter(0.05),
+        ));
+        mesh.normals.push(Vec3::Z);
+    }
+    for i in (0..CELLS * (CELLS + 1)).filter(|i| i % (CELLS + 1) < CELLS) {
+        let up = i + CELLS + 1;
+        mesh.triangles.push([i, i + 1, up + 1]);
+        mesh.triangles.push([i, up + 1, up]);
+    }
+    mesh
+}
+
+fn pieces(whole: &TriangleMesh, ownership: &Ownership) -> Vec<TriangleMesh> {
+    (0..LOCAL_MAPS)
+        .map(|number| {
+            let mut piece = whole.clone();
+            keep_own(&mut piece, ownership, number);
+            piece
+        })
+        .collect()
+}
+
+fn area(mesh: &TriangleMesh) -> f32 {
+    (0..mesh.triangles.len())
+        .map(|triangle| 0.5 * mesh.scaled_normal(triangle).length())
+        .sum()
+}
+
+#[test]
+fn neighbours_of_other_meshes_of_one_ground_leave_no_gap_and_cover_nothing_twice() {
+    let ownership = ownership();
+    let mut joined = TriangleMesh::default();
+    for (number, seed) in (0..LOCAL_MAPS).zip(1..) {
+        let mut mesh = bumpy(seed);
+        keep_own(&mut mesh, &ownership, number);
+        joined.append(&mesh);
+    }
+    let scene = Scene::new(&joined);
+    let mut rng = StdRng::seed_from_u64(0);
+    for _ in 0..50_000 {
+        let mut place = || 15.0 * (rng.random::<f32>() - 0.5);
+        let above = Vec3::new(place(), place(), 1.0);
+        let mut heights_m = Vec::new();
+        scene.for_each_hit(above, Vec3::NEG_Z, 2.0, |hit| heights_m.push(hit.range_m));
+        // An edge belongs to both of its triangles.
+        heights_m.sort_unstable_by(f32::total_cmp);
+        heights_m.dedup_by(|a, b| (*a - *b).abs() < 1e-5);
+        assert_eq!(heights_m.len(), 1, "under {above}: {heights_m:?}");
+    }
+}
+
+#[test]
+fn the_pieces_of_a_mesh_have_its_area_and_lie_on_it() {
+    let whole = bumpy(1);
+    let pieces = pieces(&whole, &ownership());
+    let sum: f32 = pieces.iter().map(area).sum();
+    assert!((sum - area(&whole)).abs() < 1e-4 * sum, "{sum}");
+    assert!(
+        pieces
+            .iter()
+            .all(|piece| piece.normals.len() == piece.vertices.len())
+    );
+    let scene = Scene::new(&whole);
+    for vertex in pieces.iter().flat_map(|piece| &piece.vertices) {
+        let mut least_m = f32::INFINITY;
+        scene.for_each_hit(vertex + Vec3::Z, Vec3::NEG_Z, 2.0, |hit| {
+            least_m = least_m.min((hit.range_m - 1.0).abs());
+        });
+        let on_rim = vertex.x.abs().max(vertex.y.abs()) > 7.8;
+        assert!(on_rim || least_m < 1e-5, "{vertex}: {least_m}");
+    }
+}
+
+#[test]
+fn a_piece_is_open_only_where_it_was_and_along_the_border() {
+    let ownership = ownership();
+    let whole = bumpy(1);
+    for piece in pieces(&whole, &ownership) {
+        let edges: HashSet<[u32; 2]> = piece
+            .triangles
+            .iter()
+            .flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]])
+            .collect();
+        assert_eq!(edges.len(), 3 * piece.triangles.len(), "an edge twice");
+        let grid = ownership.grid();
+        for [from, to] in piece
+            .triangles
+            .iter()
+            .flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]])
+        {
+            let [a, b] = [from, to].map(|v| piece.vertices[v as usize]);
+            let on_rim = a.min(b).abs().max(a.max(b).abs()).truncate().max_element() > 7.8;
+            if on_rim || edges.contains(&[to, from]) {
+                continue;
+            }
+            let middle = 0.5 * (a + b).truncate();
+            let across = (b - a).truncate().perp().normalize() * 0.01;
+            let [left, right] = [middle + across, middle - across].map(|place| {
+                let (column, row) = grid.cell_at(place.x.into(), place.y.into()).unwrap();
+                ownership.owner_of(column as isize, row as isize)
+            });
+            assert_ne!(left, right, "a crack from {a} to {b}");
+        }
+    }
+}
+
+#[test]
+fn the_vertices_on_the_border_are_those_that_the_cut_made() {
+    let ownership = ownership();
+    let whole = bumpy(1);
+    let old: HashSet<_> = (whole.vertices.iter())
+        .map(|vertex| vertex.to_array().map(f32::to_bits))
+        .collect();
+    for (number, piece) in pieces(&whole, &ownership).iter().enumerate() {
+        let on_border = on_border(&piece.vertices, &ownership, number);
+        assert!(on_border.contains(&true));
+        for (vertex, on_border) in piece.vertices.iter().zip(on_border) {
+            // Lines between own cells are cut along where a triangle reaches over the border.
+            let is_new = !old.contains(&vertex.to_array().map(f32::to_bits));
+            assert!(is_new || !on_border, "{vertex}");
+        }
+    }
+}
+
+#[test]
+fn what_is_not_near_the_border_stays_as_it_is() {
+    let frames: Vec<Frame> = Vec::from_iter((0..1).map(|number| Frame {
+        number,
+        scan_path: String::new().into(),
+        time_s: 0.0,
+        map_from_lidar: Pose3::identity(),
+        revolution: None,
+    }));
+    let ownership = Ownership::new(&frames, &local_maps(&frames, 3, 1.0), 20.0);
+    let whole = bumpy(1);
+    let mut own = whole.clone();
+    assert_eq!(keep_own(&mut own, &ownership, 0), 0);
+    assert!(own == whole);
+    assert_eq!(keep_own(&mut own, &ownership, 1), whole.triangles.len());
+    assert!(own.vertices.is_empty());
+}
