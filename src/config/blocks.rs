@@ -152,6 +152,7 @@ impl Check for OdometryNoise {
 impl Check for VelocityNoise {
     fn check(&self) -> Result<(), Problem> {
         not_negative("speed_m_per_s", self.speed_m_per_s)?;
+        not_negative("side_speed_m_per_s", self.side_speed_m_per_s)?;
         not_negative("turn_rate_rad_per_s", self.turn_rate_rad_per_s)?;
         not_negative("final_turn_rate_rad_per_s", self.final_turn_rate_rad_per_s)
     }

@@ -56,9 +56,11 @@ pub struct Localizer<'a> {
     pending: Pose2,
     /// How long velocity commands have been held since then.
     pending_duration: Duration,
-    /// The last estimate and the motion into it, for frames without odometry.
+    /// The last estimate, whether the belief around it was narrow, and the motion into it, once
+    /// that is known: for frames without odometry.
     estimate: Pose2,
-    last_increment: Pose2,
+    is_narrow: bool,
+    last_increment: Option<Pose2>,
     patch: Option<GroundPatch>,
     stance: Option<Stance>,
     state: State,
@@ -102,7 +104,8 @@ impl<'a> Localizer<'a> {
             pending: Pose2::identity(),
             pending_duration: Duration::ZERO,
             estimate,
-            last_increment: Pose2::identity(),
+            is_narrow: false,
+            last_increment: None,
             patch: surroundings.ground.patch_under(&estimate),
             stance: None,
             state: State::Searching,
@@ -138,7 +141,7 @@ impl<'a> Localizer<'a> {
         let mut frame = self.conclude(&weighing);
         frame.agreement = self.agreement(&frame.lifted, &weighing.beams, &weighing.stance)?;
         self.stance = Some(weighing.stance);
-        self.change_state(frame.agreement);
+        self.change_state(frame.agreement, odometry);
         frame.state = self.state;
         self.prepare_next(scan, stance, rng)?;
         Ok(frame)
@@ -165,7 +168,7 @@ impl<'a> Localizer<'a> {
         match odometry {
             Odometry::Increment(previous_from_current) => previous_from_current,
             Odometry::Velocity(command) => command.compose(),
-            Odometry::Unknown => self.last_increment,
+            Odometry::Unknown => self.last_increment.unwrap_or_else(Pose2::identity),
         }
     }
 
@@ -198,20 +201,26 @@ impl<'a> Localizer<'a> {
 
     fn propagate(&mut self, odometry: Odometry, rng: &mut impl Rng) {
         if !self.is_first {
+            if odometry == Odometry::Unknown && self.last_increment.is_none() {
+                // The belief will be as wide as at the start, and needs as many particles.
+                let weights = self.particles.weights();
+                let members = systematic(&weights, self.config.num_particles, rng);
+                self.particles = self.particles.selected(&members);
+            }
             let motion = TurnDriveTurn::decompose(&self.pending);
             let config = &self.config;
-            match odometry {
-                Odometry::Increment(_) => self
-                    .particles
-                    .propagate(|pose| pose * motion.sample(&config.motion, rng).compose()),
-                Odometry::Unknown => self.particles.propagate(|pose| {
-                    pose * motion.sample(&config.constant_velocity, rng).compose()
-                }),
-                Odometry::Velocity(_) => {
-                    let held = VelocityCommand::driving(&self.pending, self.pending_duration);
-                    self.particles
-                        .propagate(|pose| pose * held.sample(&config.velocity, rng));
-                }
+            let noise = match (odometry, self.last_increment) {
+                (Odometry::Unknown, None) => &config.unknown_velocity,
+                (Odometry::Unknown, Some(_)) => &config.constant_velocity,
+                _ => &config.motion,
+            };
+            if let Odometry::Velocity(_) = odometry {
+                let held = VelocityCommand::driving(&self.pending, self.pending_duration);
+                self.particles
+                    .propagate(|pose| pose * held.sample(&config.velocity, rng));
+            } else {
+                self.particles
+                    .propagate(|pose| pose * motion.sample(noise, rng).compose());
             }
         }
         self.is_first = false;
@@ -326,12 +335,12 @@ impl<'a> Localizer<'a> {
     /// How the sensor stands over the road: where the belief is narrow, as the returns from the
     /// road lie on the mapped ground; else as the scan alone says.
     fn settled(&self, scan: &RangeImage, stance: &Stance) -> Stance {
-        let Surroundings { ground, tiles, .. } = self.surroundings;
-        if !is_converged(&self.particles, tiles, &self.config.convergence) {
+        if !self.is_converged() {
             return *stance;
         }
         let points = near_points(scan);
-        ground
+        self.surroundings
+            .ground
             .stance_at(&self.particles.mean(), stance, &points)
             .unwrap_or(*stance)
     }
@@ -379,11 +388,12 @@ impl<'a> Localizer<'a> {
     /// The estimate of a weighed frame, which becomes what the filter remembers.
     fn conclude(&mut self, weighing: &Weighing) -> FrameEstimate {
         let pose = self.particles.mean();
-        self.last_increment = match self.state {
-            State::Tracking => self.estimate.inverse() * pose,
-            // A belief that jumps is no motion.
-            State::Searching | State::Lost => self.last_increment,
-        };
+        let is_narrow = self.is_converged();
+        let was_narrow = std::mem::replace(&mut self.is_narrow, is_narrow);
+        // A wide belief that jumps is no motion.
+        if was_narrow && is_narrow {
+            self.last_increment = Some(self.estimate.inverse() * pose);
+        }
         self.estimate = pose;
         let (lifted, on_mapped_ground) = self.lift_estimate(&pose, &weighing.stance);
         FrameEstimate {
@@ -429,12 +439,15 @@ impl<'a> Localizer<'a> {
             .and_then(|rendered_m| Fit::of(&beams, rendered_m, tolerance_m).agreement()))
     }
 
-    fn change_state(&mut self, agreement: Option<f64>) {
-        let converged = is_converged(
-            &self.particles,
-            self.surroundings.tiles,
-            &self.config.convergence,
-        );
+    fn is_converged(&self) -> bool {
+        let convergence = &self.config.convergence;
+        is_converged(&self.particles, self.surroundings.tiles, convergence)
+    }
+
+    fn change_state(&mut self, agreement: Option<f64>, odometry: Odometry) {
+        // Who does not know how the car moves does not know where it will be in the next frame.
+        let knows_motion = odometry != Odometry::Unknown || self.last_increment.is_some();
+        let converged = self.is_narrow && knows_motion;
         if converged || self.state == State::Tracking {
             self.vigilance.observe(agreement, &self.config.vigilance);
         }
@@ -497,6 +510,8 @@ impl<'a> Localizer<'a> {
         let before: Vec<Pose2> = self.particles.poses().copied().collect();
         poses.extend(kept.into_iter().map(|index| before[index]));
         self.particles = ParticleSet::uniform(poses);
+        self.is_narrow = false;
+        self.last_increment = None;
         self.vigilance = Vigilance::default();
         self.updates_in_state = 0;
         self.state = State::Searching;
