@@ -120,6 +120,8 @@ struct Polished {
     /// Whether the filter knew that it was wrong.
     is_lost: bool,
     stance: Stance,
+    /// Height of the ground below it, where that is known [m].
+    level_m: Option<f64>,
     seconds: f64,
 }
 
@@ -148,7 +150,6 @@ fn polish_all(
             );
             return Err(Interrupted { kept }.into());
         }
-        let before = polished.last().map(|last| (last.stance, last.is_refined));
         let start = Start {
             estimate: estimates[row],
             covariance: results.covariances.as_ref().map(|all| all[row]),
@@ -159,7 +160,14 @@ fn polish_all(
         skipped += usize::from(!start.is_found);
         let seed = ChaCha8Rng::seed_from_u64(config.seed);
         polished.push(polish(
-            config, map, &observer, frame, &start, before, seed, row,
+            config,
+            map,
+            &observer,
+            frame,
+            &start,
+            polished.last(),
+            seed,
+            row,
         )?);
         task.advance(1);
     }
@@ -212,7 +220,7 @@ fn polish(
     observer: &Observer,
     frame: &Frame,
     start: &Start,
-    before: Option<(Stance, bool)>,
+    before: Option<&Polished>,
     mut rng: ChaCha8Rng,
     row: usize,
 ) -> Result<Polished> {
@@ -222,10 +230,13 @@ fn polish(
     let image = observer.image(points);
     // A frame that was laid onto the map knows better than the plane of the road that a scan sees.
     let stance = match before {
-        Some((stance, true)) => stance,
-        Some((stance, false)) => observer.stance(&image).unwrap_or(stance),
+        Some(before) if before.is_refined => before.stance,
+        Some(before) => observer.stance(&image).unwrap_or(before.stance),
         None => observer.stance(&image).unwrap_or_default(),
     };
+    let level_m = before
+        .filter(|_| !start.is_lost)
+        .and_then(|before| before.level_m);
     let refined = if start.is_found {
         let observation = &config.observation;
         let beams = choose_beams(
@@ -235,13 +246,17 @@ fn polish(
             &stance,
             &mut rng,
         );
-        let objective = FrameObjective {
+        let mut objective = FrameObjective {
             renderer: &*map.renderer,
             ground: &map.ground,
             beams: &beams,
+            level_m,
             stance,
             difference: observation.difference(),
         };
+        if level_m.is_none() {
+            objective = objective.on_best_level(&start.estimate)?;
+        }
         refine_frame(
             &objective,
             &start.estimate,
@@ -265,6 +280,9 @@ fn polish(
         is_refined: refined.is_some(),
         is_lost: start.is_lost,
         stance: refined.as_ref().map_or(stance, |frame| frame.stance),
+        level_m: (refined.as_ref())
+            .and_then(|frame| frame.level_m)
+            .or(level_m),
         pose: refined.as_ref().map_or(start.estimate, |frame| frame.pose),
         prior: refined_prior.or(start.is_found.then_some(localized)),
         seconds: started.elapsed().as_secs_f64(),
@@ -352,7 +370,7 @@ fn lift_all(map: &LoadedMap, poses: &[Pose2], polished: &[Polished]) -> Vec<Pose
         .iter()
         .zip(polished)
         .map(|(pose, frame)| {
-            patch = map.ground.patch_under(pose).or(patch);
+            patch = map.ground.patch_under(pose, frame.level_m).or(patch);
             match &patch {
                 Some(patch) => patch.lift(pose, &frame.stance),
                 None => crate::geometry::spatial(pose, 0.0),
@@ -383,6 +401,7 @@ mod tests {
                     is_refined: !is_lost,
                     is_lost,
                     stance: Stance::default(),
+                    level_m: None,
                     seconds: 0.0,
                 }
             })

@@ -18,10 +18,10 @@ use rand::Rng;
 use super::convergence::is_converged;
 use super::estimate::FrameEstimate;
 use super::motion::{TurnDriveTurn, VelocityCommand};
-use super::observation::{Fit, above_road, choose_beams, costs, near_points, place_on_map};
+use super::observation::{Fit, above_road, choose_beams, costs, footing, near_points};
 use super::odometry::Odometry;
 use super::panorama::Panoramas;
-use super::particles::{ParticleSet, spread};
+use super::particles::{Hypothesis, Particle, ParticleSet, spread};
 use super::proposal::{Gaussian, regular};
 use super::resampling::{jitter, kld_sample_size, occupied_bins, systematic};
 use super::settings::LocalizerConfig;
@@ -85,6 +85,8 @@ struct Proposal {
     /// Already as wide as it shall be.
     proposal: Gaussian,
     beams: Vec<Beam>,
+    /// Height of the ground [m].
+    level_m: f64,
     stance: Stance,
 }
 
@@ -97,6 +99,7 @@ impl<'a> Localizer<'a> {
         particles: ParticleSet,
     ) -> Self {
         let estimate = particles.mean();
+        let level_m = particles.best().level_m;
         Self {
             config,
             surroundings,
@@ -106,7 +109,7 @@ impl<'a> Localizer<'a> {
             estimate,
             is_narrow: false,
             last_increment: None,
-            patch: surroundings.ground.patch_under(&estimate),
+            patch: surroundings.ground.patch_under(&estimate, level_m),
             stance: None,
             state: State::Searching,
             vigilance: Vigilance::default(),
@@ -188,13 +191,14 @@ impl<'a> Localizer<'a> {
         FrameEstimate {
             pose,
             lifted: self.lift_estimate(&pose, stance).0,
+            level_m: self.patch.map(|patch| patch.height_m),
             covariance: particles.covariance_about(&pose),
             effective_sample_size: particles.effective_sample_size(),
             mean_cost_m: None,
             agreement: None,
             state: self.state,
             updated: false,
-            on_mapped_ground: self.surroundings.ground.patch_under(&pose).is_some(),
+            on_mapped_ground: self.patch_at(&pose).is_some(),
             particles,
         }
     }
@@ -241,7 +245,7 @@ impl<'a> Localizer<'a> {
             return Ok(None);
         }
         let mean = self.particles.mean();
-        let Some(patch) = self.surroundings.ground.patch_under(&mean).or(self.patch) else {
+        let Some(patch) = self.patch_at(&mean).or(self.patch) else {
             return Ok(None);
         };
         let beams = choose_beams(scan, config.beams, config.road_share, stance, rng);
@@ -266,6 +270,7 @@ impl<'a> Localizer<'a> {
                 prior,
                 proposal,
                 beams,
+                level_m: patch.height_m,
                 stance: patch.stance_of(&found.map_from_lidar),
             }))
     }
@@ -281,9 +286,14 @@ impl<'a> Localizer<'a> {
             prior,
             proposal,
             beams,
+            level_m,
             stance,
         } = drawn;
-        self.particles = ParticleSet::uniform(proposal.sample(self.config.num_reduced, rng));
+        let poses = proposal.sample(self.config.num_reduced, rng);
+        self.particles = ParticleSet::uniform(poses.into_iter().map(|pose| Hypothesis {
+            map_from_lidar: pose,
+            level_m: Some(level_m),
+        }));
         let step = beams.len().div_ceil(self.config.proposal.weighed_beams);
         let weighed: Vec<Beam> = beams.iter().step_by(step.max(1)).copied().collect();
         let (mut logs, costs) = self.log_likelihoods(&weighed, &stance)?;
@@ -341,31 +351,51 @@ impl<'a> Localizer<'a> {
         let points = near_points(scan);
         self.surroundings
             .ground
-            .stance_at(&self.particles.mean(), stance, &points)
+            .stance_at(&self.particles.mean(), self.level_m(), stance, &points)
             .unwrap_or(*stance)
+    }
+
+    /// The ground under a pose of about where the particles are.
+    fn patch_at(&self, pose: &Pose2) -> Option<GroundPatch> {
+        self.surroundings.ground.patch_under(pose, self.level_m())
+    }
+
+    /// Height of the ground that the best particle stands on [m].
+    fn level_m(&self) -> Option<f64> {
+        self.particles.best().level_m
+    }
+
+    /// Puts the particles onto the map's ground; returns where in space they are.
+    fn stand(&mut self, stance: &Stance) -> Vec<Option<Pose3>> {
+        let Surroundings { ground, tiles, .. } = self.surroundings;
+        let remembered = self.patch.filter(|_| self.state == State::Tracking);
+        let members = self.particles.particles();
+        let patches: Vec<Option<GroundPatch>> = members
+            .iter()
+            .map(|particle| footing(&particle.hypothesis(), ground, tiles, remembered.as_ref()))
+            .collect();
+        let lift = |(particle, patch): (&Particle, &Option<GroundPatch>)| {
+            Some(patch.as_ref()?.lift(&particle.map_from_lidar, stance))
+        };
+        let poses = members.iter().zip(&patches).map(lift).collect();
+        let levels_m = patches
+            .iter()
+            .map(|patch| patch.map(|patch| patch.height_m));
+        self.particles.stand(levels_m);
+        poses
     }
 
     /// Logarithms of the likelihood of the particles, up to a constant, and the mean costs that they
     /// come from [m].
     fn log_likelihoods(
-        &self,
+        &mut self,
         beams: &[Beam],
         stance: &Stance,
     ) -> Result<(Vec<f64>, Vec<Option<f64>>), RenderError> {
-        let Surroundings {
-            renderer,
-            ground,
-            tiles,
-            ..
-        } = self.surroundings;
-        let remembered = self.patch.filter(|_| self.state == State::Tracking);
-        let poses: Vec<Option<Pose3>> = self
-            .particles
-            .poses()
-            .map(|pose| place_on_map(pose, stance, ground, tiles, remembered.as_ref()))
-            .collect();
+        let poses = self.stand(stance);
         let observation = &self.config.observation;
-        let costs = costs(renderer, &poses, beams, &observation.difference())?;
+        let difference = observation.difference();
+        let costs = costs(self.surroundings.renderer, &poses, beams, &difference)?;
         let log = |cost: &Option<f64>| {
             cost.map_or(observation.floor_log_likelihood(), |cost_m| {
                 observation.log_likelihood(cost_m)
@@ -399,6 +429,7 @@ impl<'a> Localizer<'a> {
         FrameEstimate {
             pose,
             lifted,
+            level_m: self.patch.map(|patch| patch.height_m),
             covariance: self.particles.covariance_of_estimate(),
             effective_sample_size: weighing.effective_sample_size,
             mean_cost_m: weighing.mean_cost_m,
@@ -412,7 +443,7 @@ impl<'a> Localizer<'a> {
 
     /// Lifts the estimate onto the ground, or onto the last ground that there was; says which.
     fn lift_estimate(&mut self, pose: &Pose2, stance: &Stance) -> (Pose3, bool) {
-        let found = self.surroundings.ground.patch_under(pose);
+        let found = self.patch_at(pose);
         self.patch = found.or(self.patch);
         let level = GroundPatch {
             height_m: 0.0,
@@ -502,14 +533,14 @@ impl<'a> Localizer<'a> {
             return Ok(false);
         };
         let index = panoramas.index()?;
-        let mut poses = index.sample(scan, stance, self.config.num_particles, rng);
-        if poses.is_empty() {
+        let mut hypotheses = index.sample(scan, stance, self.config.num_particles, rng);
+        if hypotheses.is_empty() {
             return Ok(false);
         }
         let kept = systematic(&self.particles.weights(), self.config.num_reduced, rng);
-        let before: Vec<Pose2> = self.particles.poses().copied().collect();
-        poses.extend(kept.into_iter().map(|index| before[index]));
-        self.particles = ParticleSet::uniform(poses);
+        let before = self.particles.particles();
+        hypotheses.extend(kept.into_iter().map(|index| before[index].hypothesis()));
+        self.particles = ParticleSet::uniform(hypotheses);
         self.is_narrow = false;
         self.last_increment = None;
         self.vigilance = Vigilance::default();
@@ -566,3 +597,7 @@ fn weighted_mean(particles: &ParticleSet, costs: &[Option<f64>]) -> Option<f64> 
 #[cfg(test)]
 #[path = "localizer_tests.rs"]
 mod tests;
+
+#[cfg(test)]
+#[path = "level_tests.rs"]
+mod level_tests;
