@@ -335,7 +335,10 @@ fn smooth_all(
         .collect::<Option<Vec<_>>>()
         .context("the odometry has gaps")?;
     // Where the filter was lost, the odometry may not know how the car came from before to after.
-    let config = trusted(config);
+    let smoothing = trusted(config);
+    // No smoothing takes away what the map is off by in all frames.
+    let variance = config.refinement.gauss_newton.map_error_m.powi(2);
+    let of_map = Matrix3::from_diagonal(&Vector3::new(variance, variance, 0.0));
     let mut begin = 0;
     for stretch in polished.chunk_by(|before, after| before.is_lost == after.is_lost) {
         let rows = begin..begin + stretch.len();
@@ -344,8 +347,18 @@ fn smooth_all(
         if stretch[0].is_lost || priors.iter().all(Option::is_none) {
             continue;
         }
-        let poses = smooth(&smoothed.poses[rows.clone()], priors, increments, &config);
-        if let Some(covariances) = smoothing::covariances(&poses, priors, increments, &config) {
+        let poses = smooth(
+            &smoothed.poses[rows.clone()],
+            priors,
+            increments,
+            &smoothing,
+        );
+        if let Some(mut covariances) =
+            smoothing::covariances(&poses, priors, increments, &smoothing)
+        {
+            for covariance in &mut covariances {
+                *covariance += of_map;
+            }
             smoothed.covariances[rows.clone()].copy_from_slice(&covariances);
         }
         smoothed.poses[rows].copy_from_slice(&poses);

@@ -145,7 +145,8 @@ impl Check for StartSpread {
 impl Check for OdometryNoise {
     fn check(&self) -> Result<(), Problem> {
         not_negative("turn_rad", self.turn_rad)?;
-        not_negative("drive_m", self.drive_m)
+        not_negative("drive_m", self.drive_m)?;
+        not_negative("side_m", self.side_m)
     }
 }
 
@@ -302,7 +303,8 @@ impl Check for RegistrationConfig {
         at_least_one("iterations", self.iterations)?;
         positive("kernel_m", self.kernel_m)?;
         not_negative("tolerance_m", self.tolerance_m)?;
-        positive("independence", self.independence)
+        at_least_one("sectors", self.sectors)?;
+        not_negative("map_error_m", self.map_error_m)
     }
 }
 

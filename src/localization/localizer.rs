@@ -13,6 +13,7 @@
 
 use std::time::Duration;
 
+use nalgebra::Matrix3;
 use rand::Rng;
 
 use super::convergence::is_converged;
@@ -61,6 +62,8 @@ pub struct Localizer<'a> {
     estimate: Pose2,
     is_narrow: bool,
     last_increment: Option<Pose2>,
+    /// Covariance of the last estimate of a weighed frame [m², m·rad, rad²].
+    covariance: Matrix3<f64>,
     patch: Option<GroundPatch>,
     stance: Option<Stance>,
     state: State,
@@ -100,9 +103,11 @@ impl<'a> Localizer<'a> {
     ) -> Self {
         let estimate = particles.mean();
         let level_m = particles.best().level_m;
+        let covariance = particles.covariance_about(&estimate);
         Self {
             config,
             surroundings,
+            covariance,
             particles,
             pending: Pose2::identity(),
             pending_duration: Duration::ZERO,
@@ -188,11 +193,12 @@ impl<'a> Localizer<'a> {
         let mut particles = self.particles.clone();
         particles.propagate(|pose| pose * self.pending);
         let pose = particles.mean();
+        let covariance = self.covariance_after_pending();
         FrameEstimate {
             pose,
             lifted: self.lift_estimate(&pose, stance).0,
             level_m: self.patch.map(|patch| patch.height_m),
-            covariance: particles.covariance_about(&pose),
+            covariance,
             effective_sample_size: particles.effective_sample_size(),
             mean_cost_m: None,
             agreement: None,
@@ -201,6 +207,39 @@ impl<'a> Localizer<'a> {
             on_mapped_ground: self.patch_at(&pose).is_some(),
             particles,
         }
+    }
+
+    /// Covariance of the last estimate carried along by the motion since then [m², m·rad, rad²]:
+    ///
+    /// ```text
+    /// Σ = J Σ_last Jᵀ + s R N Rᵀ        J: how turns of the last pose move this one
+    /// ```
+    ///
+    /// N is the noise of one update in the axes of the car, of which a motion that is due for none
+    /// yet has made the share s: a car that stands becomes no less sure of where it is.
+    fn covariance_after_pending(&self) -> Matrix3<f64> {
+        let config = &self.config;
+        let moved_m = self.pending.translation.vector.norm();
+        let turned_rad = self.pending.rotation.angle().abs();
+        let share = (moved_m / config.move_thres_m).max(turned_rad / config.turn_thres_rad);
+        let noise = config
+            .motion
+            .covariance(&TurnDriveTurn::decompose(&self.pending));
+        let turn = self.estimate.rotation;
+        let step = turn * self.pending.translation.vector;
+        let carried = Matrix3::new(1.0, 0.0, -step.y, 0.0, 1.0, step.x, 0.0, 0.0, 1.0);
+        let mut rotation = Matrix3::identity();
+        rotation
+            .fixed_view_mut::<2, 2>(0, 0)
+            .copy_from(turn.to_rotation_matrix().matrix());
+        // Thresholds of zero mean that every motion is weighed: nothing is ever pending.
+        let share = if share.is_finite() {
+            share.min(1.0)
+        } else {
+            0.0
+        };
+        carried * self.covariance * carried.transpose()
+            + share * rotation * noise * rotation.transpose()
     }
 
     fn propagate(&mut self, odometry: Odometry, rng: &mut impl Rng) {
@@ -224,7 +263,7 @@ impl<'a> Localizer<'a> {
                     .propagate(|pose| pose * held.sample(&config.velocity, rng));
             } else {
                 self.particles
-                    .propagate(|pose| pose * motion.sample(noise, rng).compose());
+                    .propagate(|pose| pose * motion.sample(noise, rng));
             }
         }
         self.is_first = false;
@@ -425,12 +464,13 @@ impl<'a> Localizer<'a> {
             self.last_increment = Some(self.estimate.inverse() * pose);
         }
         self.estimate = pose;
+        self.covariance = self.particles.covariance_of_estimate();
         let (lifted, on_mapped_ground) = self.lift_estimate(&pose, &weighing.stance);
         FrameEstimate {
             pose,
             lifted,
             level_m: self.patch.map(|patch| patch.height_m),
-            covariance: self.particles.covariance_of_estimate(),
+            covariance: self.covariance,
             effective_sample_size: weighing.effective_sample_size,
             mean_cost_m: weighing.mean_cost_m,
             agreement: None,

@@ -82,11 +82,13 @@ impl Default for LocalizerConfig {
             constant_velocity: OdometryNoise {
                 turn_rad: 0.02,
                 drive_m: 0.2,
+                side_m: 0.03,
             },
             // Up to 100 km/h at ten frames a second within two standard deviations.
             unknown_velocity: OdometryNoise {
                 turn_rad: 0.03,
                 drive_m: 1.4,
+                side_m: 0.05,
             },
             observation: ObservationConfig::default(),
             tempering: TemperingConfig::default(),
