@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::interrupt::Interrupted;
 use super::run_output::{self, RunFiles};
-use super::stages::{LoadedMap, Observer};
+use super::stages::{Inputs, LoadedMap, Observer};
 use super::{Context, input, odometry, run_page};
 use crate::config::{self, OdometrySource, RefinementConfig};
 use crate::evaluation::{LocalizationResults, RangeMclRules, Report};
@@ -20,40 +20,30 @@ use crate::localization::State;
 use crate::localization::observation::choose_beams;
 use crate::localization::odometry::demonstration_noise;
 use crate::map::Stance;
-use crate::refinement::{FrameObjective, FramePrior, SmoothingConfig, refine_frame, smooth};
+use crate::refinement::smoothing::{self, FramePrior, SmoothingConfig, smooth};
+use crate::refinement::{FrameObjective, refine_frame};
 
 /// Refines the result that a configuration names, and adds the refined trajectory to it.
 pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
-    input::require_file("map_file", &config.map_file)?;
-    input::require_file("map_pose_file", &config.map_pose_file)?;
-    input::require_file("map_calib_file", &config.map_calib_file)?;
-    input::require_folder("scan_folder", &config.scan_folder)?;
-    input::require_file("pose_file", &config.pose_file)?;
-    input::require_file("calib_file", &config.calib_file)?;
+    let inputs = Inputs {
+        map_file: &config.map_file,
+        map_pose_file: &config.map_pose_file,
+        map_calib_file: &config.map_calib_file,
+        scan_folder: &config.scan_folder,
+        pose_file: &config.pose_file,
+        calib_file: &config.calib_file,
+    };
+    inputs.require()?;
     let mut results = LocalizationResults::read(&config.result_file)?;
     ensure!(
         results.refined.is_none() || config.force,
         "{} has refined poses already; add --force to replace them",
         config.result_file.display()
     );
-    let map = LoadedMap::load(
-        &config.map_file,
-        &config.map_pose_file,
-        &config.map_calib_file,
-        None,
-        context,
-    )?;
-    let sequence = matching(
-        map.sequence(
-            &config.scan_folder,
-            &config.pose_file,
-            &config.calib_file,
-            &config.selection(),
-        )?,
-        &results,
-        config,
-    )?;
+    let map = LoadedMap::load(&inputs, None, context)?;
+    let sequence = map.sequence(&inputs, &config.selection())?;
+    let sequence = matching(sequence, &results, config)?;
     let estimates = match results.estimates.take() {
         Some(estimates) => estimates,
         None => RangeMclRules::default().estimates(&results)?,
@@ -62,10 +52,11 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let sequence = odometry::compensated(sequence, config.motion_compensation, &increments);
     let polished = polish_all(config, context, &map, &sequence, &results, &estimates)?;
     let smoothed = smooth_all(config, &increments, &polished)?;
-    let lifted = lift_all(&map, &smoothed, &polished);
+    let lifted = lift_all(&map, &smoothed.poses, &polished);
 
     results.estimates = Some(estimates);
-    results.refined = Some(smoothed);
+    results.refined = Some(smoothed.poses);
+    results.refined_covariances = Some(smoothed.covariances);
     results.refine_runtimes_s = Some(polished.iter().map(|frame| frame.seconds).collect());
     let files = RunFiles::beside(&config.result_file);
     run_output::write_results(&files, &results)?;
@@ -113,6 +104,8 @@ fn matching(
 /// A frame after the swarm and the finishing step.
 struct Polished {
     pose: Pose2,
+    /// How well that is known before smoothing [m², m·rad, rad²].
+    covariance: Matrix3<f64>,
     /// What the frame says about its pose; nothing where the filter was not sure.
     prior: Option<FramePrior>,
     /// Whether the scan was laid onto the map.
@@ -120,6 +113,8 @@ struct Polished {
     /// Whether the filter knew that it was wrong.
     is_lost: bool,
     stance: Stance,
+    /// Height of the ground below it, where that is known [m].
+    level_m: Option<f64>,
     seconds: f64,
 }
 
@@ -148,7 +143,6 @@ fn polish_all(
             );
             return Err(Interrupted { kept }.into());
         }
-        let before = polished.last().map(|last| (last.stance, last.is_refined));
         let start = Start {
             estimate: estimates[row],
             covariance: results.covariances.as_ref().map(|all| all[row]),
@@ -159,7 +153,14 @@ fn polish_all(
         skipped += usize::from(!start.is_found);
         let seed = ChaCha8Rng::seed_from_u64(config.seed);
         polished.push(polish(
-            config, map, &observer, frame, &start, before, seed, row,
+            config,
+            map,
+            &observer,
+            frame,
+            &start,
+            polished.last(),
+            seed,
+            row,
         )?);
         task.advance(1);
     }
@@ -212,7 +213,7 @@ fn polish(
     observer: &Observer,
     frame: &Frame,
     start: &Start,
-    before: Option<(Stance, bool)>,
+    before: Option<&Polished>,
     mut rng: ChaCha8Rng,
     row: usize,
 ) -> Result<Polished> {
@@ -222,10 +223,13 @@ fn polish(
     let image = observer.image(points);
     // A frame that was laid onto the map knows better than the plane of the road that a scan sees.
     let stance = match before {
-        Some((stance, true)) => stance,
-        Some((stance, false)) => observer.stance(&image).unwrap_or(stance),
+        Some(before) if before.is_refined => before.stance,
+        Some(before) => observer.stance(&image).unwrap_or(before.stance),
         None => observer.stance(&image).unwrap_or_default(),
     };
+    let level_m = before
+        .filter(|_| !start.is_lost)
+        .and_then(|before| before.level_m);
     let refined = if start.is_found {
         let observation = &config.observation;
         let beams = choose_beams(
@@ -235,13 +239,17 @@ fn polish(
             &stance,
             &mut rng,
         );
-        let objective = FrameObjective {
+        let mut objective = FrameObjective {
             renderer: &*map.renderer,
             ground: &map.ground,
             beams: &beams,
+            level_m,
             stance,
             difference: observation.difference(),
         };
+        if level_m.is_none() {
+            objective = objective.on_best_level(&start.estimate)?;
+        }
         refine_frame(
             &objective,
             &start.estimate,
@@ -265,7 +273,11 @@ fn polish(
         is_refined: refined.is_some(),
         is_lost: start.is_lost,
         stance: refined.as_ref().map_or(stance, |frame| frame.stance),
+        level_m: (refined.as_ref())
+            .and_then(|frame| frame.level_m)
+            .or(level_m),
         pose: refined.as_ref().map_or(start.estimate, |frame| frame.pose),
+        covariance: (refined.as_ref()).map_or_else(|| start.covariance(), |frame| frame.covariance),
         prior: refined_prior.or(start.is_found.then_some(localized)),
         seconds: started.elapsed().as_secs_f64(),
     })
@@ -294,6 +306,13 @@ fn increments(
     }
 }
 
+/// A trajectory and how well its poses are known.
+struct Smoothed {
+    poses: Vec<Pose2>,
+    /// Of (x, y, heading) in the axes of the map [m², m·rad, rad²].
+    covariances: Vec<Matrix3<f64>>,
+}
+
 /// Smooths the trajectory with the odometry between its frames, each stretch between frames in which
 /// the filter was lost; without odometry every frame
 /// stays where its scan puts it.
@@ -301,11 +320,14 @@ fn smooth_all(
     config: &RefinementConfig,
     increments: &[Option<Pose2>],
     polished: &[Polished],
-) -> Result<Vec<Pose2>> {
-    let poses: Vec<Pose2> = polished.iter().map(|frame| frame.pose).collect();
+) -> Result<Smoothed> {
+    let mut smoothed = Smoothed {
+        poses: polished.iter().map(|frame| frame.pose).collect(),
+        covariances: polished.iter().map(|frame| frame.covariance).collect(),
+    };
     let priors: Vec<Option<FramePrior>> = polished.iter().map(|frame| frame.prior).collect();
     if config.odometry == OdometrySource::None || priors.iter().all(Option::is_none) {
-        return Ok(poses);
+        return Ok(smoothed);
     }
     let increments = increments
         .iter()
@@ -313,17 +335,33 @@ fn smooth_all(
         .collect::<Option<Vec<_>>>()
         .context("the odometry has gaps")?;
     // Where the filter was lost, the odometry may not know how the car came from before to after.
-    let config = trusted(config);
-    let mut smoothed = Vec::with_capacity(poses.len());
+    let smoothing = trusted(config);
+    // No smoothing takes away what the map is off by in all frames.
+    let variance = config.refinement.gauss_newton.map_error_m.powi(2);
+    let of_map = Matrix3::from_diagonal(&Vector3::new(variance, variance, 0.0));
+    let mut begin = 0;
     for stretch in polished.chunk_by(|before, after| before.is_lost == after.is_lost) {
-        let rows = smoothed.len()..smoothed.len() + stretch.len();
-        let is_known = !stretch[0].is_lost && priors[rows.clone()].iter().any(Option::is_some);
-        if is_known {
-            let [poses, increments] = [&poses, &increments].map(|all| &all[rows.clone()]);
-            smoothed.extend(smooth(poses, &priors[rows.clone()], increments, &config));
-        } else {
-            smoothed.extend_from_slice(&poses[rows]);
+        let rows = begin..begin + stretch.len();
+        begin = rows.end;
+        let (priors, increments) = (&priors[rows.clone()], &increments[rows.clone()]);
+        if stretch[0].is_lost || priors.iter().all(Option::is_none) {
+            continue;
         }
+        let poses = smooth(
+            &smoothed.poses[rows.clone()],
+            priors,
+            increments,
+            &smoothing,
+        );
+        if let Some(mut covariances) =
+            smoothing::covariances(&poses, priors, increments, &smoothing)
+        {
+            for covariance in &mut covariances {
+                *covariance += of_map;
+            }
+            smoothed.covariances[rows.clone()].copy_from_slice(&covariances);
+        }
+        smoothed.poses[rows].copy_from_slice(&poses);
     }
     Ok(smoothed)
 }
@@ -352,7 +390,7 @@ fn lift_all(map: &LoadedMap, poses: &[Pose2], polished: &[Polished]) -> Vec<Pose
         .iter()
         .zip(polished)
         .map(|(pose, frame)| {
-            patch = map.ground.patch_under(pose).or(patch);
+            patch = map.ground.patch_under(pose, frame.level_m).or(patch);
             match &patch {
                 Some(patch) => patch.lift(pose, &frame.stance),
                 None => crate::geometry::spatial(pose, 0.0),
@@ -379,18 +417,20 @@ mod tests {
                 let covariance = Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-6));
                 Polished {
                     pose,
+                    covariance,
                     prior: (!is_lost).then_some(FramePrior { pose, covariance }),
                     is_refined: !is_lost,
                     is_lost,
                     stance: Stance::default(),
+                    level_m: None,
                     seconds: 0.0,
                 }
             })
             .collect();
         let increments = vec![Some(Pose2::translation(1.0, 0.0)); 20];
         let smoothed = smooth_all(&config, &increments, &polished).unwrap();
-        assert_eq!(smoothed.len(), 20);
-        for (frame, smoothed) in polished.iter().zip(&smoothed) {
+        assert_eq!(smoothed.covariances.len(), 20);
+        for (frame, smoothed) in polished.iter().zip(&smoothed.poses) {
             let off_m = (smoothed.translation.vector - frame.pose.translation.vector).norm();
             assert!(off_m < 1e-6, "{off_m}");
         }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 
-use super::Context;
+use super::{Context, input};
 use crate::config::BuildMapConfig;
 use crate::geometry::{Pose3, TriangleMesh, Vec3};
 use crate::ground::{GroundClassifier, road_plane};
@@ -29,6 +29,28 @@ pub fn ground_classifier(config: &BuildMapConfig) -> Result<Box<dyn GroundClassi
     classifier.context("fuzzy: the rules of the ground")
 }
 
+/// What localize and refine read: a map with the poses that it was built with, and a recording.
+pub struct Inputs<'a> {
+    pub map_file: &'a Path,
+    pub map_pose_file: &'a Path,
+    pub map_calib_file: &'a Path,
+    pub scan_folder: &'a Path,
+    pub pose_file: &'a Path,
+    pub calib_file: &'a Path,
+}
+
+impl Inputs<'_> {
+    /// Makes sure that all of them are there, before any work is done.
+    pub fn require(&self) -> Result<()> {
+        input::require_file("map_file", self.map_file)?;
+        input::require_file("map_pose_file", self.map_pose_file)?;
+        input::require_file("map_calib_file", self.map_calib_file)?;
+        input::require_folder("scan_folder", self.scan_folder)?;
+        input::require_file("pose_file", self.pose_file)?;
+        input::require_file("calib_file", self.calib_file)
+    }
+}
+
 /// A map ready to be looked at.
 pub struct LoadedMap {
     /// All of it.
@@ -48,13 +70,13 @@ pub struct LoadedMap {
 impl LoadedMap {
     /// Reads a map and the poses that it was built with, and makes it ready on the backend that the
     /// user asked for, with at most `batch` poses rendered at once.
-    pub fn load(
-        map_file: &Path,
-        map_pose_file: &Path,
-        map_calib_file: &Path,
-        batch: Option<usize>,
-        context: &Context,
-    ) -> Result<Self> {
+    pub fn load(inputs: &Inputs, batch: Option<usize>, context: &Context) -> Result<Self> {
+        let Inputs {
+            map_file,
+            map_pose_file,
+            map_calib_file,
+            ..
+        } = *inputs;
         let mesh = ply::read(map_file)?;
         let frame = MapFrame::read(map_pose_file, map_calib_file)
             .context("map_pose_file and map_calib_file say where the map is")?;
@@ -96,11 +118,15 @@ impl LoadedMap {
     /// The selected frames of a recording with their poses in this map.
     pub fn sequence(
         &self,
-        scan_folder: &Path,
-        pose_file: &Path,
-        calib_file: &Path,
+        inputs: &Inputs,
         selection: &crate::kitti::Selection,
     ) -> Result<Sequence> {
+        let Inputs {
+            scan_folder,
+            pose_file,
+            calib_file,
+            ..
+        } = *inputs;
         Ok(Sequence::open(scan_folder, pose_file, calib_file, selection)?.in_map(&self.frame))
     }
 }

@@ -176,13 +176,15 @@ impl Check for StartSpread {
 impl Check for OdometryNoise {
     fn check(&self) -> Result<(), Problem> {
         not_negative("turn_rad", self.turn_rad)?;
-        not_negative("drive_m", self.drive_m)
+        not_negative("drive_m", self.drive_m)?;
+        not_negative("side_m", self.side_m)
     }
 }
 
 impl Check for VelocityNoise {
     fn check(&self) -> Result<(), Problem> {
         not_negative("speed_m_per_s", self.speed_m_per_s)?;
+        not_negative("side_speed_m_per_s", self.side_speed_m_per_s)?;
         not_negative("turn_rate_rad_per_s", self.turn_rate_rad_per_s)?;
         not_negative("final_turn_rate_rad_per_s", self.final_turn_rate_rad_per_s)
     }
@@ -332,7 +334,8 @@ impl Check for RegistrationConfig {
         at_least_one("iterations", self.iterations)?;
         positive("kernel_m", self.kernel_m)?;
         not_negative("tolerance_m", self.tolerance_m)?;
-        positive("independence", self.independence)
+        at_least_one("sectors", self.sectors)?;
+        not_negative("map_error_m", self.map_error_m)
     }
 }
 

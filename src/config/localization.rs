@@ -87,6 +87,10 @@ pub struct LocalizationConfig {
     pub odometry_noise: OdometryNoise,
     /// Noise of velocity commands.
     pub velocity_noise: VelocityNoise,
+    /// Noise of going on as before, without odometry, per frame.
+    pub constant_velocity_noise: OdometryNoise,
+    /// Noise of standing, without odometry and before the velocity is known, per frame.
+    pub unknown_velocity_noise: OdometryNoise,
     /// Which beams are compared, and what a difference means.
     pub observation: ObservationConfig,
     /// How the likelihood is sharpened within a frame.
@@ -205,6 +209,8 @@ impl Default for LocalizationConfig {
             start: StartSpread::default(),
             odometry_noise: OdometryNoise::default(),
             velocity_noise: VelocityNoise::default(),
+            constant_velocity_noise: LocalizerConfig::default().constant_velocity,
+            unknown_velocity_noise: LocalizerConfig::default().unknown_velocity,
             observation: ObservationConfig::default(),
             tempering: TemperingConfig::default(),
             proposal: ProposalConfig::default(),
@@ -263,6 +269,8 @@ impl LocalizationConfig {
             move_thres_m: self.move_thres,
             motion: self.odometry_noise.clone(),
             velocity: self.velocity_noise.clone(),
+            constant_velocity: self.constant_velocity_noise.clone(),
+            unknown_velocity: self.unknown_velocity_noise.clone(),
             observation: self.observation.clone(),
             tempering: self.tempering.clone(),
             proposal: self.proposal.clone(),
@@ -346,6 +354,14 @@ impl Check for LocalizationConfig {
         nested("start", self.start.check())?;
         nested("odometry_noise", self.odometry_noise.check())?;
         nested("velocity_noise", self.velocity_noise.check())?;
+        nested(
+            "constant_velocity_noise",
+            self.constant_velocity_noise.check(),
+        )?;
+        nested(
+            "unknown_velocity_noise",
+            self.unknown_velocity_noise.check(),
+        )?;
         nested("observation", self.observation.check())?;
         nested("tempering", self.tempering.check())?;
         nested("proposal", self.proposal.check())?;

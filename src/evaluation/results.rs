@@ -11,7 +11,7 @@
 //! | `numParticles` | () | int64 | N |
 //! | `frames` | (rows) | int64 | number of the frame in its recording |
 //! | `estimates`, `refined`, `ground_truth`, `odometry` | (rows, 3) | float64 | x, y [m], heading [rad] |
-//! | `covariances` | (rows, 9) | float64 | of x, y, heading, row-major [m², m rad, rad²] |
+//! | `covariances`, `refined_covariances` | (rows, 9) | float64 | of x, y, heading, row-major [m², m rad, rad²] |
 //! | `times_s`, `runtimes_s`, `refine_runtimes_s` | (rows) | float64 | time of the frame; time spent on it [s] |
 //! | `states` | (rows) | uint8 | what the filter said about itself |
 //!
@@ -101,6 +101,8 @@ pub struct LocalizationResults {
     pub odometry: Option<Vec<Pose2>>,
     /// Covariance of the estimate in x, y [m], heading [rad].
     pub covariances: Option<Vec<Matrix3<f64>>>,
+    /// Covariance of the refined pose.
+    pub refined_covariances: Option<Vec<Matrix3<f64>>>,
     /// Times of the frames [s].
     pub times_s: Option<Vec<f64>>,
     /// Time that localization spent on each frame [s].
@@ -143,6 +145,7 @@ impl LocalizationResults {
             ground_truth: pick(&self.ground_truth, rows),
             odometry: pick(&self.odometry, rows),
             covariances: pick(&self.covariances, rows),
+            refined_covariances: pick(&self.refined_covariances, rows),
             times_s: pick(&self.times_s, rows),
             runtimes_s: pick(&self.runtimes_s, rows),
             refine_runtimes_s: pick(&self.refine_runtimes_s, rows),
@@ -162,6 +165,7 @@ impl LocalizationResults {
             ("ground_truth", length(&self.ground_truth)),
             ("odometry", length(&self.odometry)),
             ("covariances", length(&self.covariances)),
+            ("refined_covariances", length(&self.refined_covariances)),
             ("times_s", length(&self.times_s)),
             ("runtimes_s", length(&self.runtimes_s)),
             ("refine_runtimes_s", length(&self.refine_runtimes_s)),

@@ -13,6 +13,8 @@ pub struct FrameEstimate {
     pub pose: Pose2,
     /// The same pose standing on the map's ground, `p_map = lifted * p_lidar`.
     pub lifted: Pose3,
+    /// Height of the ground below it; `None` where there never was any [m].
+    pub level_m: Option<f64>,
     /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
     /// Effective number of particles after weighing, before resampling.

@@ -102,7 +102,8 @@ impl Cells {
             for column in 0..count(max.x - min.x) {
                 let offset = Vector2::new(column as f64 + 0.5, row as f64 + 0.5) * cell_m;
                 let pose = Pose2::from(min.coords + offset);
-                if tiles.valid_tile_of(&pose).is_some() && ground.patch_under(&pose).is_some() {
+                if tiles.valid_tile_of(&pose).is_some() && ground.patch_under(&pose, None).is_some()
+                {
                     centers.push(min + offset);
                 }
             }
@@ -241,7 +242,8 @@ mod tests {
         assert!(!cells.centers.is_empty());
         for center in &cells.centers {
             let pose = Pose2::from(center.coords);
-            assert!(ground.patch_under(&pose).is_some() && tiles.valid_tile_of(&pose).is_some());
+            assert!(ground.patch_under(&pose, None).is_some());
+            assert!(tiles.valid_tile_of(&pose).is_some());
         }
         let area = cells.centers.len() as f64;
         assert_relative_eq!(area, 80.0 * 40.0, max_relative = 0.05);

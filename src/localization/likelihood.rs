@@ -55,6 +55,8 @@ pub struct View<'a> {
     pub renderer: &'a dyn RangeRenderer,
     /// Carries the poses.
     pub ground: &'a GroundMap,
+    /// About the height of the ground; needed where there are several levels [m].
+    pub level_m: Option<f64>,
     /// How the sensor stands over the road.
     pub stance: Stance,
     /// The beams of the scan, lidar frame.
@@ -79,7 +81,8 @@ pub fn profile(
         .iter()
         .map(|&offset| {
             let moved = direction.moved(pose, offset);
-            Some(view.ground.patch_under(&moved)?.lift(&moved, &view.stance))
+            let patch = view.ground.patch_under(&moved, view.level_m)?;
+            Some(patch.lift(&moved, &view.stance))
         })
         .collect();
     let costs_m = costs(view.renderer, &lifted, view.beams, &config.difference())?;
@@ -165,6 +168,7 @@ mod tests {
         let view = View {
             renderer: surroundings.renderer,
             ground: surroundings.ground,
+            level_m: None,
             stance: Stance::default(),
             beams: &beams,
         };

@@ -13,15 +13,16 @@
 
 use std::time::Duration;
 
+use nalgebra::Matrix3;
 use rand::Rng;
 
 use super::convergence::is_converged;
 use super::estimate::FrameEstimate;
 use super::motion::{TurnDriveTurn, VelocityCommand};
-use super::observation::{Fit, above_road, choose_beams, costs, near_points, place_on_map};
+use super::observation::{Fit, above_road, choose_beams, costs, footing, near_points};
 use super::odometry::Odometry;
 use super::panorama::Panoramas;
-use super::particles::{ParticleSet, spread};
+use super::particles::{Hypothesis, Particle, ParticleSet, spread};
 use super::proposal::{Gaussian, regular};
 use super::resampling::{jitter, kld_sample_size, occupied_bins, systematic};
 use super::settings::LocalizerConfig;
@@ -56,9 +57,13 @@ pub struct Localizer<'a> {
     pending: Pose2,
     /// How long velocity commands have been held since then.
     pending_duration: Duration,
-    /// The last estimate and the motion into it, for frames without odometry.
+    /// The last estimate, whether the belief around it was narrow, and the motion into it, once
+    /// that is known: for frames without odometry.
     estimate: Pose2,
-    last_increment: Pose2,
+    is_narrow: bool,
+    last_increment: Option<Pose2>,
+    /// Covariance of the last estimate of a weighed frame [m², m·rad, rad²].
+    covariance: Matrix3<f64>,
     patch: Option<GroundPatch>,
     stance: Option<Stance>,
     state: State,
@@ -83,6 +88,8 @@ struct Proposal {
     /// Already as wide as it shall be.
     proposal: Gaussian,
     beams: Vec<Beam>,
+    /// Height of the ground [m].
+    level_m: f64,
     stance: Stance,
 }
 
@@ -95,15 +102,19 @@ impl<'a> Localizer<'a> {
         particles: ParticleSet,
     ) -> Self {
         let estimate = particles.mean();
+        let level_m = particles.best().level_m;
+        let covariance = particles.covariance_about(&estimate);
         Self {
             config,
             surroundings,
+            covariance,
             particles,
             pending: Pose2::identity(),
             pending_duration: Duration::ZERO,
             estimate,
-            last_increment: Pose2::identity(),
-            patch: surroundings.ground.patch_under(&estimate),
+            is_narrow: false,
+            last_increment: None,
+            patch: surroundings.ground.patch_under(&estimate, level_m),
             stance: None,
             state: State::Searching,
             vigilance: Vigilance::default(),
@@ -138,7 +149,7 @@ impl<'a> Localizer<'a> {
         let mut frame = self.conclude(&weighing);
         frame.agreement = self.agreement(&frame.lifted, &weighing.beams, &weighing.stance)?;
         self.stance = Some(weighing.stance);
-        self.change_state(frame.agreement);
+        self.change_state(frame.agreement, odometry);
         frame.state = self.state;
         self.prepare_next(scan, stance, rng)?;
         Ok(frame)
@@ -165,7 +176,7 @@ impl<'a> Localizer<'a> {
         match odometry {
             Odometry::Increment(previous_from_current) => previous_from_current,
             Odometry::Velocity(command) => command.compose(),
-            Odometry::Unknown => self.last_increment,
+            Odometry::Unknown => self.last_increment.unwrap_or_else(Pose2::identity),
         }
     }
 
@@ -182,36 +193,77 @@ impl<'a> Localizer<'a> {
         let mut particles = self.particles.clone();
         particles.propagate(|pose| pose * self.pending);
         let pose = particles.mean();
+        let covariance = self.covariance_after_pending();
         FrameEstimate {
             pose,
             lifted: self.lift_estimate(&pose, stance).0,
-            covariance: particles.covariance_about(&pose),
+            level_m: self.patch.map(|patch| patch.height_m),
+            covariance,
             effective_sample_size: particles.effective_sample_size(),
             mean_cost_m: None,
             agreement: None,
             state: self.state,
             updated: false,
-            on_mapped_ground: self.surroundings.ground.patch_under(&pose).is_some(),
+            on_mapped_ground: self.patch_at(&pose).is_some(),
             particles,
         }
     }
 
+    /// Covariance of the last estimate carried along by the motion since then [m², m·rad, rad²]:
+    ///
+    /// ```text
+    /// Σ = J Σ_last Jᵀ + s R N Rᵀ        J: how turns of the last pose move this one
+    /// ```
+    ///
+    /// N is the noise of one update in the axes of the car, of which a motion that is due for none
+    /// yet has made the share s: a car that stands becomes no less sure of where it is.
+    fn covariance_after_pending(&self) -> Matrix3<f64> {
+        let config = &self.config;
+        let moved_m = self.pending.translation.vector.norm();
+        let turned_rad = self.pending.rotation.angle().abs();
+        let share = (moved_m / config.move_thres_m).max(turned_rad / config.turn_thres_rad);
+        let noise = config
+            .motion
+            .covariance(&TurnDriveTurn::decompose(&self.pending));
+        let turn = self.estimate.rotation;
+        let step = turn * self.pending.translation.vector;
+        let carried = Matrix3::new(1.0, 0.0, -step.y, 0.0, 1.0, step.x, 0.0, 0.0, 1.0);
+        let mut rotation = Matrix3::identity();
+        rotation
+            .fixed_view_mut::<2, 2>(0, 0)
+            .copy_from(turn.to_rotation_matrix().matrix());
+        // Thresholds of zero mean that every motion is weighed: nothing is ever pending.
+        let share = if share.is_finite() {
+            share.min(1.0)
+        } else {
+            0.0
+        };
+        carried * self.covariance * carried.transpose()
+            + share * rotation * noise * rotation.transpose()
+    }
+
     fn propagate(&mut self, odometry: Odometry, rng: &mut impl Rng) {
         if !self.is_first {
+            if odometry == Odometry::Unknown && self.last_increment.is_none() {
+                // The belief will be as wide as at the start, and needs as many particles.
+                let weights = self.particles.weights();
+                let members = systematic(&weights, self.config.num_particles, rng);
+                self.particles = self.particles.selected(&members);
+            }
             let motion = TurnDriveTurn::decompose(&self.pending);
             let config = &self.config;
-            match odometry {
-                Odometry::Increment(_) => self
-                    .particles
-                    .propagate(|pose| pose * motion.sample(&config.motion, rng).compose()),
-                Odometry::Unknown => self.particles.propagate(|pose| {
-                    pose * motion.sample(&config.constant_velocity, rng).compose()
-                }),
-                Odometry::Velocity(_) => {
-                    let held = VelocityCommand::driving(&self.pending, self.pending_duration);
-                    self.particles
-                        .propagate(|pose| pose * held.sample(&config.velocity, rng));
-                }
+            let noise = match (odometry, self.last_increment) {
+                (Odometry::Unknown, None) => &config.unknown_velocity,
+                (Odometry::Unknown, Some(_)) => &config.constant_velocity,
+                _ => &config.motion,
+            };
+            if let Odometry::Velocity(_) = odometry {
+                let held = VelocityCommand::driving(&self.pending, self.pending_duration);
+                self.particles
+                    .propagate(|pose| pose * held.sample(&config.velocity, rng));
+            } else {
+                self.particles
+                    .propagate(|pose| pose * motion.sample(noise, rng));
             }
         }
         self.is_first = false;
@@ -232,7 +284,7 @@ impl<'a> Localizer<'a> {
             return Ok(None);
         }
         let mean = self.particles.mean();
-        let Some(patch) = self.surroundings.ground.patch_under(&mean).or(self.patch) else {
+        let Some(patch) = self.patch_at(&mean).or(self.patch) else {
             return Ok(None);
         };
         let beams = choose_beams(scan, config.beams, config.road_share, stance, rng);
@@ -257,6 +309,7 @@ impl<'a> Localizer<'a> {
                 prior,
                 proposal,
                 beams,
+                level_m: patch.height_m,
                 stance: patch.stance_of(&found.map_from_lidar),
             }))
     }
@@ -272,9 +325,14 @@ impl<'a> Localizer<'a> {
             prior,
             proposal,
             beams,
+            level_m,
             stance,
         } = drawn;
-        self.particles = ParticleSet::uniform(proposal.sample(self.config.num_reduced, rng));
+        let poses = proposal.sample(self.config.num_reduced, rng);
+        self.particles = ParticleSet::uniform(poses.into_iter().map(|pose| Hypothesis {
+            map_from_lidar: pose,
+            level_m: Some(level_m),
+        }));
         let step = beams.len().div_ceil(self.config.proposal.weighed_beams);
         let weighed: Vec<Beam> = beams.iter().step_by(step.max(1)).copied().collect();
         let (mut logs, costs) = self.log_likelihoods(&weighed, &stance)?;
@@ -326,37 +384,57 @@ impl<'a> Localizer<'a> {
     /// How the sensor stands over the road: where the belief is narrow, as the returns from the
     /// road lie on the mapped ground; else as the scan alone says.
     fn settled(&self, scan: &RangeImage, stance: &Stance) -> Stance {
-        let Surroundings { ground, tiles, .. } = self.surroundings;
-        if !is_converged(&self.particles, tiles, &self.config.convergence) {
+        if !self.is_converged() {
             return *stance;
         }
         let points = near_points(scan);
-        ground
-            .stance_at(&self.particles.mean(), stance, &points)
+        self.surroundings
+            .ground
+            .stance_at(&self.particles.mean(), self.level_m(), stance, &points)
             .unwrap_or(*stance)
+    }
+
+    /// The ground under a pose of about where the particles are.
+    fn patch_at(&self, pose: &Pose2) -> Option<GroundPatch> {
+        self.surroundings.ground.patch_under(pose, self.level_m())
+    }
+
+    /// Height of the ground that the best particle stands on [m].
+    fn level_m(&self) -> Option<f64> {
+        self.particles.best().level_m
+    }
+
+    /// Puts the particles onto the map's ground; returns where in space they are.
+    fn stand(&mut self, stance: &Stance) -> Vec<Option<Pose3>> {
+        let Surroundings { ground, tiles, .. } = self.surroundings;
+        let remembered = self.patch.filter(|_| self.state == State::Tracking);
+        let members = self.particles.particles();
+        let patches: Vec<Option<GroundPatch>> = members
+            .iter()
+            .map(|particle| footing(&particle.hypothesis(), ground, tiles, remembered.as_ref()))
+            .collect();
+        let lift = |(particle, patch): (&Particle, &Option<GroundPatch>)| {
+            Some(patch.as_ref()?.lift(&particle.map_from_lidar, stance))
+        };
+        let poses = members.iter().zip(&patches).map(lift).collect();
+        let levels_m = patches
+            .iter()
+            .map(|patch| patch.map(|patch| patch.height_m));
+        self.particles.stand(levels_m);
+        poses
     }
 
     /// Logarithms of the likelihood of the particles, up to a constant, and the mean costs that they
     /// come from [m].
     fn log_likelihoods(
-        &self,
+        &mut self,
         beams: &[Beam],
         stance: &Stance,
     ) -> Result<(Vec<f64>, Vec<Option<f64>>), RenderError> {
-        let Surroundings {
-            renderer,
-            ground,
-            tiles,
-            ..
-        } = self.surroundings;
-        let remembered = self.patch.filter(|_| self.state == State::Tracking);
-        let poses: Vec<Option<Pose3>> = self
-            .particles
-            .poses()
-            .map(|pose| place_on_map(pose, stance, ground, tiles, remembered.as_ref()))
-            .collect();
+        let poses = self.stand(stance);
         let observation = &self.config.observation;
-        let costs = costs(renderer, &poses, beams, &observation.difference())?;
+        let difference = observation.difference();
+        let costs = costs(self.surroundings.renderer, &poses, beams, &difference)?;
         let log = |cost: &Option<f64>| {
             cost.map_or(observation.floor_log_likelihood(), |cost_m| {
                 observation.log_likelihood(cost_m)
@@ -379,17 +457,20 @@ impl<'a> Localizer<'a> {
     /// The estimate of a weighed frame, which becomes what the filter remembers.
     fn conclude(&mut self, weighing: &Weighing) -> FrameEstimate {
         let pose = self.particles.mean();
-        self.last_increment = match self.state {
-            State::Tracking => self.estimate.inverse() * pose,
-            // A belief that jumps is no motion.
-            State::Searching | State::Lost => self.last_increment,
-        };
+        let is_narrow = self.is_converged();
+        let was_narrow = std::mem::replace(&mut self.is_narrow, is_narrow);
+        // A wide belief that jumps is no motion.
+        if was_narrow && is_narrow {
+            self.last_increment = Some(self.estimate.inverse() * pose);
+        }
         self.estimate = pose;
+        self.covariance = self.particles.covariance_of_estimate();
         let (lifted, on_mapped_ground) = self.lift_estimate(&pose, &weighing.stance);
         FrameEstimate {
             pose,
             lifted,
-            covariance: self.particles.covariance_of_estimate(),
+            level_m: self.patch.map(|patch| patch.height_m),
+            covariance: self.covariance,
             effective_sample_size: weighing.effective_sample_size,
             mean_cost_m: weighing.mean_cost_m,
             agreement: None,
@@ -402,7 +483,7 @@ impl<'a> Localizer<'a> {
 
     /// Lifts the estimate onto the ground, or onto the last ground that there was; says which.
     fn lift_estimate(&mut self, pose: &Pose2, stance: &Stance) -> (Pose3, bool) {
-        let found = self.surroundings.ground.patch_under(pose);
+        let found = self.patch_at(pose);
         self.patch = found.or(self.patch);
         let level = GroundPatch {
             height_m: 0.0,
@@ -429,12 +510,15 @@ impl<'a> Localizer<'a> {
             .and_then(|rendered_m| Fit::of(&beams, rendered_m, tolerance_m).agreement()))
     }
 
-    fn change_state(&mut self, agreement: Option<f64>) {
-        let converged = is_converged(
-            &self.particles,
-            self.surroundings.tiles,
-            &self.config.convergence,
-        );
+    fn is_converged(&self) -> bool {
+        let convergence = &self.config.convergence;
+        is_converged(&self.particles, self.surroundings.tiles, convergence)
+    }
+
+    fn change_state(&mut self, agreement: Option<f64>, odometry: Odometry) {
+        // Who does not know how the car moves does not know where it will be in the next frame.
+        let knows_motion = odometry != Odometry::Unknown || self.last_increment.is_some();
+        let converged = self.is_narrow && knows_motion;
         if converged || self.state == State::Tracking {
             self.vigilance.observe(agreement, &self.config.vigilance);
         }
@@ -489,14 +573,16 @@ impl<'a> Localizer<'a> {
             return Ok(false);
         };
         let index = panoramas.index()?;
-        let mut poses = index.sample(scan, stance, self.config.num_particles, rng);
-        if poses.is_empty() {
+        let mut hypotheses = index.sample(scan, stance, self.config.num_particles, rng);
+        if hypotheses.is_empty() {
             return Ok(false);
         }
         let kept = systematic(&self.particles.weights(), self.config.num_reduced, rng);
-        let before: Vec<Pose2> = self.particles.poses().copied().collect();
-        poses.extend(kept.into_iter().map(|index| before[index]));
-        self.particles = ParticleSet::uniform(poses);
+        let before = self.particles.particles();
+        hypotheses.extend(kept.into_iter().map(|index| before[index].hypothesis()));
+        self.particles = ParticleSet::uniform(hypotheses);
+        self.is_narrow = false;
+        self.last_increment = None;
         self.vigilance = Vigilance::default();
         self.updates_in_state = 0;
         self.state = State::Searching;
@@ -551,3 +637,7 @@ fn weighted_mean(particles: &ParticleSet, costs: &[Option<f64>]) -> Option<f64> 
 #[cfg(test)]
 #[path = "localizer_tests.rs"]
 mod tests;
+
+#[cfg(test)]
+#[path = "level_tests.rs"]
+mod level_tests;

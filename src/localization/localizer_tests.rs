@@ -49,6 +49,7 @@ fn odometry(truth: &[Pose2], seed: u64) -> Vec<Pose2> {
     let noise = OdometryNoise {
         turn_rad: 0.002,
         drive_m: 0.01,
+        side_m: 0.0,
     };
     with_noise(
         &increments(&poses),
@@ -57,11 +58,19 @@ fn odometry(truth: &[Pose2], seed: u64) -> Vec<Pose2> {
     )
 }
 
+/// What the filter is told about the motion.
+#[derive(Clone, Copy)]
+enum Sense {
+    Odometry,
+    Velocity,
+    Nothing,
+}
+
 fn run(
     localizer: &mut Localizer<'_>,
     world: &TestWorld,
     truth: &[Pose2],
-    has_odometry: bool,
+    sense: Sense,
     rng: &mut StdRng,
 ) -> Vec<FrameEstimate> {
     let increments = odometry(truth, 99);
@@ -69,10 +78,13 @@ fn run(
         .iter()
         .zip(increments)
         .map(|(pose, increment)| {
-            let odometry = if has_odometry {
-                Odometry::Increment(increment)
-            } else {
-                Odometry::Unknown
+            let odometry = match sense {
+                Sense::Odometry => Odometry::Increment(increment),
+                Sense::Velocity => {
+                    let duration = Duration::from_millis(100);
+                    Odometry::Velocity(VelocityCommand::driving(&increment, duration))
+                }
+                Sense::Nothing => Odometry::Unknown,
             };
             localizer
                 .step(odometry, &world.scan(pose), &Stance::default(), rng)
@@ -89,7 +101,7 @@ fn track(world: &TestWorld, truth: &[Pose2], seed: u64) -> Vec<FrameEstimate> {
         world.surroundings(),
         ParticleSet::uniform(start),
     );
-    run(&mut localizer, world, truth, true, &mut rng)
+    run(&mut localizer, world, truth, Sense::Odometry, &mut rng)
 }
 
 /// Root mean square of position [m] and heading [rad].
@@ -183,23 +195,55 @@ fn the_same_seed_gives_the_same_bytes_on_one_thread_and_on_two() {
 }
 
 #[test]
-fn it_tracks_without_any_odometry() {
+fn without_odometry_it_finds_out_how_fast_the_car_is_and_raises_no_alarm() {
     let world = TestWorld::street();
-    let truth = drive(&world, 0.0, 30);
-    let mut rng = StdRng::seed_from_u64(3);
-    let start = StartSpread {
-        position_m: 1.0,
-        heading_rad: 0.1,
-        ..StartSpread::default()
+    // Walking pace, a town, a road outside of it: metres per frame.
+    for (step_m, seed) in [(0.1, 1), (0.8, 2), (1.9, 3)] {
+        let truth: Vec<Pose2> = (0..30)
+            .map(|frame| {
+                let x = step_m * f64::from(frame);
+                world.pose_at(x, 0.5 * (0.1 * x).sin(), 0.05 * (0.1 * x).cos())
+            })
+            .collect();
+        let mut rng = StdRng::seed_from_u64(seed);
+        let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+        let start = ParticleSet::uniform(start);
+        let mut localizer = Localizer::new(config(500), world.surroundings(), start);
+        let frames = run(&mut localizer, &world, &truth, Sense::Nothing, &mut rng);
+        let (position_m, heading_rad) = rmse(&frames[10..], &truth[10..]);
+        assert!(
+            position_m < 0.05 && heading_rad.to_degrees() < 0.2,
+            "{step_m}: {position_m} {heading_rad}"
+        );
+        let states: Vec<State> = frames.iter().map(|frame| frame.state).collect();
+        assert!(!states.contains(&State::Lost), "{step_m}: {states:?}");
+        assert!(states[10..].iter().all(|&state| state == State::Tracking));
+    }
+}
+
+#[test]
+fn velocities_of_a_car_that_moves_a_little_sideways_lead_no_farther_aside() {
+    let world = TestWorld::street();
+    // A sensor that is mounted a degree askew: every frame drifts to the same side.
+    let truth: Vec<Pose2> = (0..30)
+        .map(|frame| {
+            let x = 0.8 * f64::from(frame);
+            world.pose_at(x, 0.2 + 0.0175 * x, 0.0)
+        })
+        .collect();
+    let frames = {
+        let mut rng = StdRng::seed_from_u64(4);
+        let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+        let start = ParticleSet::uniform(start);
+        let mut localizer = Localizer::new(config(500), world.surroundings(), start);
+        run(&mut localizer, &world, &truth, Sense::Velocity, &mut rng)
     };
-    let start = ParticleSet::uniform(around(&truth[0], 500, &start, &mut rng));
-    let mut localizer = Localizer::new(config(500), world.surroundings(), start);
-    let frames = run(&mut localizer, &world, &truth, false, &mut rng);
-    let (position_m, heading_rad) = rmse(&frames[10..], &truth[10..]);
-    assert!(
-        position_m < 0.1 && heading_rad.to_degrees() < 0.5,
-        "{position_m} {heading_rad}"
-    );
+    let aside: f64 = frames[10..]
+        .iter()
+        .zip(&truth[10..])
+        .map(|(frame, truth)| (truth.inverse() * frame.pose).translation.y / 20.0)
+        .sum();
+    assert!(aside.abs() < 0.003, "{aside} m");
 }
 
 #[test]
@@ -213,7 +257,7 @@ fn a_car_that_stands_is_not_weighed_and_its_belief_does_not_spread() {
         world.surroundings(),
         ParticleSet::uniform(start),
     );
-    let last = run(&mut localizer, &world, &truth, true, &mut rng)
+    let last = run(&mut localizer, &world, &truth, Sense::Odometry, &mut rng)
         .pop()
         .unwrap();
     let scan = world.scan(&truth[9]);
@@ -223,7 +267,12 @@ fn a_car_that_stands_is_not_weighed_and_its_belief_does_not_spread() {
             .step(creep, &scan, &Stance::default(), &mut rng)
             .unwrap();
         assert!(!frame.updated);
-        assert!(frame.covariance.trace() < 4.0 * last.covariance.trace() + 1e-6);
+        // Two centimetres are a tenth of an update, with a tenth of its variance.
+        assert!(frame.covariance.trace() >= last.covariance.trace());
+        let noise = config(500)
+            .motion
+            .covariance(&TurnDriveTurn::decompose(&Pose2::identity()));
+        assert!(frame.covariance.trace() < last.covariance.trace() + 0.15 * noise.trace());
         assert!((frame.pose.translation.vector - last.pose.translation.vector).norm() < 0.05);
     }
 }
@@ -253,10 +302,10 @@ fn carried_elsewhere_it_notices_within_five_frames_and_finds_itself_again() {
     let mut rng = StdRng::seed_from_u64(6);
     let start = around(&before[0], 500, &StartSpread::default(), &mut rng);
     let mut localizer = Localizer::new(config(500), surroundings, ParticleSet::uniform(start));
-    let frames = run(&mut localizer, &world, &before, true, &mut rng);
+    let frames = run(&mut localizer, &world, &before, Sense::Odometry, &mut rng);
     assert_eq!(frames.last().unwrap().state, State::Tracking);
     assert!(index.index.get().is_none(), "rendered without need");
-    let frames = run(&mut localizer, &world, &after, true, &mut rng);
+    let frames = run(&mut localizer, &world, &after, Sense::Odometry, &mut rng);
     let noticed = frames.iter().position(|frame| frame.state == State::Lost);
     assert!(noticed.is_some_and(|frame| frame < 5), "{noticed:?}");
     let (position_m, heading_rad) = rmse(&frames[20..], &after[20..]);
@@ -285,7 +334,7 @@ fn it_finds_itself_from_nowhere() {
             ..world.surroundings()
         };
         let mut localizer = Localizer::new(config(1000), surroundings, ParticleSet::uniform(start));
-        let frames = run(&mut localizer, &world, &truth, true, &mut rng);
+        let frames = run(&mut localizer, &world, &truth, Sense::Odometry, &mut rng);
         let (position_m, heading_rad) = rmse(&frames[15..], &truth[15..]);
         assert!(
             position_m < 0.05 && heading_rad.to_degrees() < 0.2,
@@ -309,7 +358,7 @@ fn a_lorry_beside_the_car_raises_no_alarm() {
     };
     let start = ParticleSet::uniform(around(&truth[0], 500, &start, &mut rng));
     let mut localizer = Localizer::new(config(500), map.surroundings(), start);
-    let frames = run(&mut localizer, &seen, &truth, true, &mut rng);
+    let frames = run(&mut localizer, &seen, &truth, Sense::Odometry, &mut rng);
     let (position_m, _) = rmse(&frames[10..], &truth[10..]);
     assert!(position_m < 0.05, "{position_m}");
     assert!(frames.iter().all(|frame| frame.state != State::Lost));
@@ -349,7 +398,7 @@ fn a_scan_without_returns_changes_nothing_and_breaks_nothing() {
         world.surroundings(),
         ParticleSet::uniform(start),
     );
-    run(&mut localizer, &world, &truth, true, &mut rng);
+    run(&mut localizer, &world, &truth, Sense::Odometry, &mut rng);
     let empty = RangeImage::project(&[], &LidarModel::default());
     let step = Odometry::Increment(Pose2::translation(0.8, 0.0));
     let frame = localizer
@@ -371,7 +420,7 @@ fn where_nothing_can_be_seen_it_does_not_go_on_saying_that_it_knows() {
         world.surroundings(),
         ParticleSet::uniform(start),
     );
-    let frames = run(&mut localizer, &world, &truth, true, &mut rng);
+    let frames = run(&mut localizer, &world, &truth, Sense::Odometry, &mut rng);
     assert_eq!(frames.last().unwrap().state, State::Tracking);
     let nothing = RangeImage::project(&[], &LidarModel::default());
     let step = Odometry::Increment(Pose2::translation(2.0, 0.0));

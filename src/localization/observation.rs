@@ -13,7 +13,8 @@
 use rand::{Rng, RngExt as _};
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::{Pose2, Pose3, Rigid3f, Vec3};
+use super::particles::Hypothesis;
+use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::{Beam, RangeImage};
 use crate::map::{GroundMap, GroundPatch, Stance, TileGrid};
 use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
@@ -194,18 +195,18 @@ pub fn costs(
         .collect())
 }
 
-/// Where in space a pose on the map is; `None` outside the tiles that were mapped and where
-/// there is no ground. `remembered` is a patch to stand on where the map has a gap.
-pub fn place_on_map(
-    pose: &Pose2,
-    stance: &Stance,
+/// The ground that a hypothesis on the map stands on; `None` outside the tiles that were mapped and
+/// where there is no ground. `remembered` is a patch to stand on where the map has a gap.
+pub fn footing(
+    hypothesis: &Hypothesis,
     ground: &GroundMap,
     tiles: &TileGrid,
     remembered: Option<&GroundPatch>,
-) -> Option<Pose3> {
+) -> Option<GroundPatch> {
+    let pose = &hypothesis.map_from_lidar;
     tiles.valid_tile_of(pose)?;
-    let patch = ground.patch_under(pose);
-    Some(patch.as_ref().or(remembered)?.lift(pose, stance))
+    let patch = ground.patch_under(pose, hypothesis.level_m);
+    patch.or(remembered.copied())
 }
 
 /// How the beams of a scan meet the map from one pose, as counts. Beams that look at the road
@@ -269,6 +270,7 @@ mod tests {
     use rand::{SeedableRng, rngs::StdRng};
 
     use super::*;
+    use crate::geometry::Pose2;
     use crate::lidar::LidarModel;
     use crate::rendering::test_world::TestWorld;
 
@@ -333,7 +335,8 @@ mod tests {
         let beams = choose_beams(&image, 2000, 0.2, &Stance::default(), &mut rng);
         let place = |x: f64, y: f64, heading: f64| {
             let pose = Pose2::new(nalgebra::Vector2::new(x, y), heading);
-            place_on_map(&pose, &Stance::default(), &world.ground, &world.tiles, None)
+            let patch = footing(&pose.into(), &world.ground, &world.tiles, None);
+            patch.map(|patch| patch.lift(&pose, &Stance::default()))
         };
         let poses = [
             place(3.0, 0.2, 0.1),

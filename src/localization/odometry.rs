@@ -31,18 +31,17 @@ pub fn with_noise(increments: &[Pose2], noise: &OdometryNoise, rng: &mut impl Rn
         .enumerate()
         .map(|(frame, increment)| match frame {
             0 => *increment,
-            _ => TurnDriveTurn::decompose(increment)
-                .sample(noise, rng)
-                .compose(),
+            _ => TurnDriveTurn::decompose(increment).sample(noise, rng),
         })
         .collect()
 }
 
-/// The noise that range-mcl puts on the true increments: 0.01 rad, 0.01 m.
+/// The noise that range-mcl puts on the true increments: 0.01 rad, 0.01 m, none to the side.
 pub fn demonstration_noise() -> OdometryNoise {
     OdometryNoise {
         turn_rad: 0.01,
         drive_m: 0.01,
+        side_m: 0.0,
     }
 }
 
@@ -108,6 +107,7 @@ mod tests {
         let silent = OdometryNoise {
             turn_rad: 0.0,
             drive_m: 0.0,
+            side_m: 0.0,
         };
         for (a, b) in with_noise(&increments, &silent, &mut rng)
             .iter()

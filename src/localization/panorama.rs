@@ -10,7 +10,8 @@
 //!
 //! so that every heading costs one comparison and no rendering. First all cells at a part of the
 //! columns and headings, then the best of them at all. The memory is 4 · rows · columns bytes per
-//! cell: with the defaults 4.3 kB, 12 MB for 700 m of road in cells of one metre.
+//! cell: with the defaults 4.3 kB, 12 MB for 700 m of road in cells of one metre. Where roads cross
+//! above one another, a cell has a panorama on each level.
 
 use std::cell::OnceCell;
 use std::f32::consts::{PI, TAU};
@@ -24,7 +25,7 @@ use serde::{Deserialize, Serialize};
 
 use super::initialization::{Cells, uniform_in_cell};
 use super::localizer::Surroundings;
-use super::observation::place_on_map;
+use super::particles::Hypothesis;
 use super::resampling::systematic;
 use crate::geometry::{Pose2, Pose3, Rigid3f, wrap_angle};
 use crate::lidar::{LidarModel, RangeImage};
@@ -80,8 +81,8 @@ impl Default for PanoramaConfig {
 pub struct PanoramaIndex {
     config: PanoramaConfig,
     model: LidarModel,
-    /// Cells that are on the map.
-    centers: Vec<Point2<f64>>,
+    /// Cells that are on the map: middle and height of the ground [m].
+    places: Vec<(Point2<f64>, f64)>,
     cell_m: f64,
     /// One panorama per cell, row-major; [`FAR_M`] where there is no surface.
     images: Vec<Vec<f32>>,
@@ -126,6 +127,8 @@ impl Panoramas<'_> {
 pub struct Seed {
     /// Middle of the cell [m].
     pub center: Point2<f64>,
+    /// Height of the ground there [m].
+    pub level_m: f64,
     /// The heading that fits best there [rad].
     pub heading_rad: f64,
     /// Mean truncated difference [m].
@@ -147,18 +150,25 @@ impl PanoramaIndex {
     ) -> Result<Self, RenderError> {
         /// Panoramas per call: what a renderer makes at once is kept only as thumbnails.
         const BATCH: usize = 512;
-        let level = Stance {
+        let upright = Stance {
             height_m,
             roll_rad: 0.0,
             pitch_rad: 0.0,
         };
-        let lift = |center: &Point2<f64>| {
+        let Surroundings { ground, tiles, .. } = surroundings;
+        let on_map = |center: &&Point2<f64>| {
             let pose = Pose2::from(center.coords);
-            let lifted = place_on_map(&pose, &level, surroundings.ground, surroundings.tiles, None);
-            lifted.map(|lifted| (*center, lifted))
+            tiles.valid_tile_of(&pose).is_some()
         };
-        let (centers, poses): (Vec<Point2<f64>>, Vec<Pose3>) =
-            cells.centers.iter().filter_map(lift).unzip();
+        let levels = |center: &Point2<f64>| {
+            let (center, pose) = (*center, Pose2::from(center.coords));
+            let patches = ground.levels_at(center.x, center.y);
+            patches
+                .into_iter()
+                .map(move |patch| ((center, patch.height_m), patch.lift(&pose, &upright)))
+        };
+        let (places, poses): (Vec<(Point2<f64>, f64)>, Vec<Pose3>) =
+            cells.centers.iter().filter(on_map).flat_map(levels).unzip();
         let model = panorama_model(lidar, config);
         let mut images = Vec::with_capacity(poses.len());
         for batch in poses.chunks(BATCH) {
@@ -170,7 +180,7 @@ impl PanoramaIndex {
         Ok(Self {
             config: config.clone(),
             model,
-            centers,
+            places,
             cell_m: cells.cell_m,
             images,
         })
@@ -214,7 +224,8 @@ impl PanoramaIndex {
             .map(|&(_, cell)| {
                 let (cost_m, shift) = best_shift(&self.images[cell], &scan, limit_m);
                 Seed {
-                    center: self.centers[cell],
+                    center: self.places[cell].0,
+                    level_m: self.places[cell].1,
                     heading_rad: wrap_angle(
                         f64::from(TAU) * shift as f64 / self.model.width as f64,
                     ),
@@ -227,14 +238,14 @@ impl PanoramaIndex {
         seeds
     }
 
-    /// Poses in the cells of the search, the more the better a cell fits. None without cells.
+    /// Hypotheses in the cells of the search, the more the better a cell fits. None without cells.
     pub fn sample(
         &self,
         scan: &RangeImage,
         stance: &Stance,
         count: usize,
         rng: &mut impl Rng,
-    ) -> Vec<Pose2> {
+    ) -> Vec<Hypothesis> {
         let seeds = self.search(scan, stance);
         let Some(best) = seeds.first() else {
             return Vec::new();
@@ -252,6 +263,7 @@ impl PanoramaIndex {
             .map(|seed| {
                 let Seed {
                     center,
+                    level_m,
                     heading_rad,
                     ..
                 } = seeds[seed];
@@ -259,7 +271,10 @@ impl PanoramaIndex {
                 let deviate: f64 = StandardNormal.sample(rng);
                 let turn_rad = self.config.yaw_sigma_rad * deviate
                     + rng.random_range(-half_column_rad..=half_column_rad);
-                Pose2::new(place, heading_rad + turn_rad)
+                Hypothesis {
+                    map_from_lidar: Pose2::new(place, heading_rad + turn_rad),
+                    level_m: Some(level_m),
+                }
             })
             .collect()
     }
@@ -426,7 +441,8 @@ mod tests {
         let poses = index(&world).sample(&world.scan(&truth), &Stance::default(), 1000, &mut rng);
         let near = poses
             .iter()
-            .filter(|pose| (pose.translation.vector - truth.translation.vector).norm() < 1.5)
+            .map(|hypothesis| hypothesis.map_from_lidar.translation.vector)
+            .filter(|place| (place - truth.translation.vector).norm() < 1.5)
             .count();
         assert!(near > 300, "{near} of {}", poses.len());
     }

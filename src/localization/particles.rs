@@ -11,13 +11,45 @@ use nalgebra::{Matrix3, Vector2, Vector3};
 
 use crate::geometry::{Pose2, circular_mean, wrap_angle};
 
+/// Where the car may be.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Hypothesis {
+    /// `p_map = map_from_lidar * p_lidar`, seen from above.
+    pub map_from_lidar: Pose2,
+    /// Height of the ground that it stands on, which tells levels above one another apart; `None`
+    /// where it never stood on any [m].
+    pub level_m: Option<f64>,
+}
+
+impl From<Pose2> for Hypothesis {
+    /// Without a level.
+    fn from(map_from_lidar: Pose2) -> Self {
+        Self {
+            map_from_lidar,
+            level_m: None,
+        }
+    }
+}
+
 /// A pose hypothesis of the filter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Particle {
     /// `p_map = map_from_lidar * p_lidar`, seen from above.
     pub map_from_lidar: Pose2,
+    /// Height of the ground that it stands on, as in [`Hypothesis`] [m].
+    pub level_m: Option<f64>,
     /// Share of the belief, 0 to 1.
     pub weight: f64,
+}
+
+impl Particle {
+    /// The particle without its weight.
+    pub fn hypothesis(&self) -> Hypothesis {
+        Hypothesis {
+            map_from_lidar: self.map_from_lidar,
+            level_m: self.level_m,
+        }
+    }
 }
 
 /// Particles whose weights sum to one.
@@ -28,11 +60,13 @@ pub struct ParticleSet {
 
 impl ParticleSet {
     /// Equally weighted hypotheses; at least one.
-    pub fn uniform(poses: impl IntoIterator<Item = Pose2>) -> Self {
-        let mut particles: Vec<Particle> = poses
+    pub fn uniform(hypotheses: impl IntoIterator<Item = impl Into<Hypothesis>>) -> Self {
+        let mut particles: Vec<Particle> = hypotheses
             .into_iter()
-            .map(|map_from_lidar| Particle {
-                map_from_lidar,
+            .map(Into::into)
+            .map(|hypothesis: Hypothesis| Particle {
+                map_from_lidar: hypothesis.map_from_lidar,
+                level_m: hypothesis.level_m,
                 weight: 1.0,
             })
             .collect();
@@ -78,6 +112,13 @@ impl ParticleSet {
         }
     }
 
+    /// Says on which ground the particles stand, in order; those that stand on none remember the last.
+    pub fn stand(&mut self, levels_m: impl IntoIterator<Item = Option<f64>>) {
+        for (particle, level_m) in self.particles.iter_mut().zip(levels_m) {
+            particle.level_m = level_m.or(particle.level_m);
+        }
+    }
+
     /// Multiplies every weight by its likelihood and normalizes (Bayes' rule). Logarithms, so
     /// that nothing underflows; only differences between them matter.
     pub fn reweight(&mut self, log_likelihoods: &[f64]) {
@@ -109,7 +150,7 @@ impl ParticleSet {
     /// The equally weighted set of the given members, some of them more than once.
     #[must_use]
     pub fn selected(&self, members: &[usize]) -> Self {
-        Self::uniform(members.iter().map(|&i| self.particles[i].map_from_lidar))
+        Self::uniform(members.iter().map(|&i| self.particles[i].hypothesis()))
     }
 
     /// The particle with the largest weight, of equals the first.
@@ -126,6 +167,7 @@ impl ParticleSet {
             })
             .unwrap_or(Particle {
                 map_from_lidar: Pose2::identity(),
+                level_m: None,
                 weight: 0.0,
             })
     }

@@ -52,8 +52,13 @@ impl Default for ProposalConfig {
             scan: true,
             beams: 2400,
             road_share: 0.4,
-            weighed_beams: 600,
-            registration: RegistrationConfig::default(),
+            weighed_beams: 300,
+            // Drawing and weighing add a width of their own, into which the rest of the map's error
+            // fits: with more, the covariances of simulated drives are too large.
+            registration: RegistrationConfig {
+                map_error_m: 0.001,
+                ..RegistrationConfig::default()
+            },
             widening: 1.5,
             max_sigmas: 6.0,
         }

@@ -51,6 +51,8 @@ pub struct LocalizerConfig {
     pub velocity: VelocityNoise,
     /// Noise of the guess that the car goes on as it went, where there is no odometry.
     pub constant_velocity: OdometryNoise,
+    /// Noise of the guess that it stands, where there is none and it is not known how it went.
+    pub unknown_velocity: OdometryNoise,
     /// The likelihood.
     pub observation: ObservationConfig,
     /// Its sharpness.
@@ -80,6 +82,13 @@ impl Default for LocalizerConfig {
             constant_velocity: OdometryNoise {
                 turn_rad: 0.02,
                 drive_m: 0.2,
+                side_m: 0.03,
+            },
+            // Up to 100 km/h at ten frames a second within two standard deviations.
+            unknown_velocity: OdometryNoise {
+                turn_rad: 0.03,
+                drive_m: 1.4,
+                side_m: 0.05,
             },
             observation: ObservationConfig::default(),
             tempering: TemperingConfig::default(),

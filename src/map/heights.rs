@@ -7,6 +7,9 @@
 //! Cells lie in square blocks that are made when the first height falls into them: the memory
 //! goes with the mapped area, not with the rectangle around it, which one stray vertex could make
 //! as large as the Earth.
+//!
+//! A cell may have several levels, as where a bridge crosses a road: heights that lie farther apart
+//! than a car is high are of different levels (single linkage), each of which is their mean.
 
 use std::collections::HashMap;
 
@@ -20,6 +23,10 @@ const BLOCK_CELLS: i64 = 64;
 /// A longer edge than this is no edge of a road's surface, but a damaged map's [m].
 const LONGEST_EDGE_M: f64 = 500.0;
 
+/// Nothing drives where there is less room than this above the road: heights that are nearer to each
+/// other belong to one level [m].
+pub(super) const LEVEL_GAP_M: f64 = 2.0;
+
 /// Column and row of a cell.
 type Cell = (i64, i64);
 
@@ -29,7 +36,7 @@ struct Blocks<T> {
     of: HashMap<Cell, Box<[T]>>,
 }
 
-impl<T: Copy> Blocks<T> {
+impl<T: Clone> Blocks<T> {
     fn address((column, row): Cell) -> (Cell, usize) {
         let block = (column.div_euclid(BLOCK_CELLS), row.div_euclid(BLOCK_CELLS));
         let within = row.rem_euclid(BLOCK_CELLS) * BLOCK_CELLS + column.rem_euclid(BLOCK_CELLS);
@@ -43,35 +50,77 @@ impl<T: Copy> Blocks<T> {
     }
 }
 
-/// A height per cell; many cells have none.
+/// The heights of a block of cells: the lowest of each cell, those above it, and so on; not a number
+/// where a cell has no such level [m].
+type Levels = Vec<Box<[f32]>>;
+
+/// Heights of cells; many cells have none, a few have several.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Heights {
     /// Edge of a cell [m].
     pub cell_m: f64,
-    /// NaN where no height is known [m].
-    blocks: Blocks<f32>,
+    blocks: HashMap<Cell, Levels>,
+}
+
+/// Heights of a cell that belong together.
+#[derive(Clone, Debug)]
+struct Level {
+    low_m: f64,
+    high_m: f64,
+    sum_m: f64,
+    count: f64,
+}
+
+impl Level {
+    /// Adds a height to the levels of a cell: to the one that it is near to, or as a new one. Levels
+    /// that a height brings together become one.
+    fn add(levels: &mut Vec<Self>, height_m: f64) {
+        let mut added = Self {
+            low_m: height_m,
+            high_m: height_m,
+            sum_m: height_m,
+            count: 1.0,
+        };
+        levels.retain(|level| {
+            let is_near =
+                level.low_m - LEVEL_GAP_M < height_m && height_m < level.high_m + LEVEL_GAP_M;
+            if is_near {
+                added.low_m = added.low_m.min(level.low_m);
+                added.high_m = added.high_m.max(level.high_m);
+                added.sum_m += level.sum_m;
+                added.count += level.count;
+            }
+            !is_near
+        });
+        let place = levels.partition_point(|level| level.high_m < added.low_m);
+        levels.insert(place, added);
+    }
 }
 
 impl Heights {
     /// The mean height of the surface of triangles in each cell whose centre they cover, and of
-    /// their corners in the cells of those.
+    /// their corners in the cells of those; of every level of its own.
     pub fn of_triangles(corners: impl Iterator<Item = [Vec3; 3]>, cell_m: f64) -> Self {
-        let mut sums = Blocks { of: HashMap::new() };
+        let mut levels = Blocks { of: HashMap::new() };
         for corners in corners {
             rasterize(corners, cell_m, |cell, height_m| {
-                let sum: &mut (f64, f64) = sums.entry(cell, (0.0, 0.0));
-                sum.0 += height_m;
-                sum.1 += 1.0;
+                Level::add(levels.entry(cell, Vec::new()), height_m);
             });
         }
-        let mean = |&(sum, count): &(f64, f64)| (sum / count) as f32;
-        let means =
-            |(block, sums): (Cell, Box<[(f64, f64)]>)| (block, sums.iter().map(mean).collect());
+        let means = |(block, cells): (Cell, Box<[Vec<Level>]>)| {
+            let most = cells.iter().map(Vec::len).max().unwrap_or(0);
+            let mean = |level: &Level| (level.sum_m / level.count) as f32;
+            let of_level = |number: usize| {
+                let heights = cells
+                    .iter()
+                    .map(|levels| levels.get(number).map_or(f32::NAN, mean));
+                heights.collect()
+            };
+            (block, (0..most).map(of_level).collect())
+        };
         Self {
             cell_m,
-            blocks: Blocks {
-                of: sums.of.into_iter().map(means).collect(),
-            },
+            blocks: levels.of.into_iter().map(means).collect(),
         }
     }
 
@@ -84,7 +133,12 @@ impl Heights {
                 *blocks.entry((column, row), f32::NAN) = height_m as f32;
             }
         }
-        Self { cell_m, blocks }
+        Self {
+            cell_m,
+            blocks: (blocks.of.into_iter())
+                .map(|(block, heights)| (block, vec![heights]))
+                .collect(),
+        }
     }
 
     /// The cell that a place falls into; `None` where there is no such place.
@@ -109,22 +163,35 @@ impl Heights {
 /// Remembers the block that it read last: neighbours mostly lie in the same one.
 pub(super) struct Reader<'a> {
     heights: &'a Heights,
-    block: Option<(Cell, Option<&'a [f32]>)>,
+    block: Option<(Cell, &'a [Box<[f32]>])>,
 }
 
 impl Reader<'_> {
-    /// The height of a cell [m]; not a number where it is not known.
-    pub fn height_m(&mut self, cell: Cell) -> f64 {
+    /// The heights of a cell, from the lowest level up [m].
+    pub fn levels_m(&mut self, cell: Cell) -> impl Iterator<Item = f64> {
         let (block, within) = Blocks::<f32>::address(cell);
-        let cells = match self.block {
-            Some((last, cells)) if last == block => cells,
+        let levels = match self.block {
+            Some((last, levels)) if last == block => levels,
             _ => {
-                let cells = self.heights.blocks.of.get(&block).map(AsRef::as_ref);
-                self.block = Some((block, cells));
-                cells
+                let levels = self
+                    .heights
+                    .blocks
+                    .get(&block)
+                    .map_or(&[][..], Vec::as_slice);
+                self.block = Some((block, levels));
+                levels
             }
         };
-        cells.map_or(f64::NAN, |cells| f64::from(cells[within]))
+        levels
+            .iter()
+            .map(move |cells| f64::from(cells[within]))
+            .take_while(|height_m| !height_m.is_nan())
+    }
+
+    /// The level of a cell that is nearest to a height [m]; `None` where no height is known.
+    pub fn nearest_m(&mut self, cell: Cell, height_m: f64) -> Option<f64> {
+        self.levels_m(cell)
+            .min_by(|a, b| (a - height_m).abs().total_cmp(&(b - height_m).abs()))
     }
 }
 
@@ -186,9 +253,23 @@ mod tests {
         let far = near.map(|corner| corner + Vec3::new(1.0e9, -1.0e9, 0.0));
         let endless = [Vec3::ZERO, Vec3::X, Vec3::new(0.0, 1.0e30, 0.0)];
         let heights = Heights::of_triangles([near, far, endless].into_iter(), 0.25);
-        assert_eq!(heights.blocks.of.len(), 2);
-        assert_eq!(heights.reader().height_m((1, 1)), 0.0);
-        assert!(heights.reader().height_m((1000, 1)).is_nan());
+        assert_eq!(heights.blocks.len(), 2);
+        assert_eq!(heights.reader().nearest_m((1, 1), 5.0), Some(0.0));
+        assert_eq!(heights.reader().nearest_m((1000, 1), 0.0), None);
+    }
+
+    #[test]
+    fn heights_a_car_apart_are_levels_and_what_lies_between_brings_them_together() {
+        let slab =
+            |height: f32| [Vec3::ZERO, Vec3::X, Vec3::Y].map(|corner| corner + Vec3::Z * height);
+        let levels = |heights_m: &[f32]| {
+            let heights = Heights::of_triangles(heights_m.iter().map(|&height| slab(height)), 0.25);
+            heights.reader().levels_m((0, 0)).collect::<Vec<_>>()
+        };
+        assert_eq!(levels(&[6.0, 0.0, 6.5, 0.5]), [0.25, 6.25]);
+        assert_eq!(levels(&[12.0, 6.0, 0.0]), [0.0, 6.0, 12.0]);
+        assert_eq!(levels(&[0.0, 3.0, 1.5]), [1.5]);
+        assert_eq!(levels(&[1.5, 3.0, 0.0]), [1.5]);
     }
 
     #[test]
@@ -201,10 +282,10 @@ mod tests {
         let heights = Heights::of_triangles([climbing].into_iter(), 0.5);
         let mut reader = heights.reader();
         for cell in [(-1, -1), (63, -70), (-70, 63), (-1, -1), (900, 900)] {
-            let fresh = heights.reader().height_m(cell);
-            assert_eq!(reader.height_m(cell).to_bits(), fresh.to_bits());
+            let fresh = heights.reader().nearest_m(cell, 0.0);
+            assert_eq!(reader.nearest_m(cell, 0.0), fresh);
         }
         let expected_m = 0.1 * heights.center((63, -70)).x;
-        assert!((reader.height_m((63, -70)) - expected_m).abs() < 1e-6);
+        assert!((reader.nearest_m((63, -70), 0.0).unwrap() - expected_m).abs() < 1e-6);
     }
 }

@@ -23,6 +23,7 @@ impl crate::rendering::test_world::TestWorld {
             renderer: self,
             ground: &self.ground,
             beams,
+            level_m: None,
             stance: crate::map::Stance::default(),
             difference: crate::rendering::RangeDifference::truncated(0.5),
         }

@@ -23,6 +23,9 @@ pub struct FrameObjective<'a> {
     pub ground: &'a GroundMap,
     /// The beams of the frame, lidar frame.
     pub beams: &'a [Beam],
+    /// About the height of the ground, which says on which of several levels the car is; `None`: on
+    /// the lowest [m].
+    pub level_m: Option<f64>,
     /// How the sensor stands over the road.
     pub stance: Stance,
     /// What a difference costs.
@@ -32,7 +35,7 @@ pub struct FrameObjective<'a> {
 impl FrameObjective<'_> {
     /// Where in space a pose is; where the map has no ground there, it stands on `remembered`.
     pub fn lift(&self, pose: &Pose2, remembered: Option<&GroundPatch>) -> Option<Pose3> {
-        let patch = self.ground.patch_under(pose);
+        let patch = self.ground.patch_under(pose, self.level_m);
         Some(patch.as_ref().or(remembered)?.lift(pose, &self.stance))
     }
 
@@ -41,11 +44,34 @@ impl FrameObjective<'_> {
     #[must_use]
     pub fn settled(&self, pose: &Pose2) -> Self {
         let points: Vec<Vec3> = self.beams.iter().map(Beam::point).collect();
-        let stance = self.ground.stance_at(pose, &self.stance, &points);
+        let stance = self
+            .ground
+            .stance_at(pose, self.level_m, &self.stance, &points);
         Self {
             stance: stance.unwrap_or(self.stance),
             ..*self
         }
+    }
+
+    /// The same objective on the level of the ground on which it is least, seen from a pose: for who
+    /// does not know on which one the car is.
+    pub fn on_best_level(&self, pose: &Pose2) -> Result<Self, RenderError> {
+        let place = pose.translation.vector;
+        let levels = self.ground.levels_at(place.x, place.y);
+        let mut best = (f64::INFINITY, *self);
+        for patch in &levels {
+            let level_m = Some(patch.height_m);
+            let on_level = Self { level_m, ..*self };
+            if levels.len() == 1 {
+                return Ok(on_level);
+            }
+            let lifted = patch.lift(pose, &on_level.settled(pose).stance);
+            let cost_m = self.costs_in_space(&[lifted])?[0];
+            if cost_m < best.0 {
+                best = (cost_m, on_level);
+            }
+        }
+        Ok(best.1)
     }
 
     /// The mean cost from each pose [m]; infinite where a pose has no ground to stand on.
@@ -196,7 +222,7 @@ mod tests {
         let costs = objective.costs(&off, None).unwrap();
         assert_eq!(costs[0], f64::INFINITY);
         assert!(costs[1] < 1e-3);
-        let patch = world.ground.patch_under(&off[1]);
+        let patch = world.ground.patch_under(&off[1], None);
         assert!(objective.costs(&off, patch.as_ref()).unwrap()[0].is_finite());
     }
 }

@@ -89,6 +89,8 @@ pub struct RefinedFrame {
     pub covariance: Matrix3<f64>,
     /// How the sensor stands over the mapped ground.
     pub stance: Stance,
+    /// Height of that ground [m].
+    pub level_m: Option<f64>,
     /// Objective at the estimate [m].
     pub cost_before_m: f64,
     /// Objective at the result, never larger [m].
@@ -120,6 +122,7 @@ pub fn refine_frame(
         lifted,
         covariance: *covariance,
         stance: objective.stance,
+        level_m: objective.level_m,
         cost_before_m,
         cost_after_m: cost_before_m,
         rays: objective.beams.len(),
@@ -131,8 +134,9 @@ pub fn refine_frame(
         Method::GaussNewton | Method::Both => polish(objective, &mut frame, config)?,
         Method::None | Method::Swarm => None,
     };
-    if let Some(patch) = objective.ground.patch_under(&frame.pose) {
+    if let Some(patch) = objective.ground.patch_under(&frame.pose, objective.level_m) {
         frame.stance = patch.stance_of(&frame.lifted);
+        frame.level_m = Some(patch.height_m);
     }
     if config.method != Method::None {
         frame.covariance = match finished {
@@ -151,7 +155,7 @@ fn search(
     rng: &mut impl Rng,
 ) -> Result<(), RenderError> {
     let dimensions = search_space(&frame.pose, &frame.covariance, config);
-    let patch = objective.ground.patch_under(&frame.pose);
+    let patch = objective.ground.patch_under(&frame.pose, objective.level_m);
     let step = objective.beams.len().div_ceil(config.swarm_beams).max(1);
     let beams: Vec<Beam> = objective.beams.iter().step_by(step).copied().collect();
     let coarse = FrameObjective {

@@ -7,7 +7,8 @@
 //!
 //! pᵢ, Rᵢ: pose and covariance of a frame; zᵢ, Qᵢ: odometry between neighbours. The odometry
 //! turns where the car turned, so that corners stay corners. The normal equations are block
-//! tridiagonal: a step costs one pass forth and one back. Grisetti et al., *A Tutorial on
+//! tridiagonal: a step costs one pass forth and one back, and so do the diagonal blocks of their
+//! inverse, the covariances of the smoothed poses (Rauch, Tung and Striebel, 1965). Grisetti et al., *A Tutorial on
 //! Graph-Based SLAM* (2010), with the robust kernel of Cauchy.
 
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
@@ -91,6 +92,27 @@ pub fn smooth(
         }
     }
     poses
+}
+
+/// Covariances of (x, y, heading) in the axes of the map [m², m·rad, rad²] of the poses of a smoothed
+/// trajectory, each with all others unknown (marginal); `None` where they are not determined, because
+/// no frame says anything. The arguments are those of [`smooth`], of which `smoothed` is the result.
+///
+/// They take the frames' errors for independent: what all frames have in common, as an error of the
+/// map, is not in them.
+pub fn covariances(
+    smoothed: &[Pose2],
+    priors: &[Option<FramePrior>],
+    increments: &[Pose2],
+    config: &SmoothingConfig,
+) -> Option<Vec<Matrix3<f64>>> {
+    let problem = Problem::new(priors, increments, config);
+    let in_cars = problem.linearize(smoothed, 0.0).diagonal_of_inverse()?;
+    let in_map = smoothed.iter().zip(&in_cars).map(|(pose, in_car)| {
+        let map_from_car = rotating(pose.rotation.angle());
+        map_from_car * in_car * map_from_car.transpose()
+    });
+    Some(in_map.collect())
 }
 
 /// The measurements with their information matrices.
@@ -211,6 +233,29 @@ impl NormalEquations {
             self.right_side[frame] -= gains[frame] * next;
         }
         Some(self.right_side)
+    }
+
+    /// The diagonal blocks of the inverse. `None` where a pivot is not positive definite.
+    ///
+    /// ```text
+    /// Dᵢ = Aᵢ − Uᵢ₋₁ᵀ Dᵢ₋₁⁻¹ Uᵢ₋₁        Gᵢ = Dᵢ⁻¹ Uᵢ        Σᵢ = Dᵢ⁻¹ + Gᵢ Σᵢ₊₁ Gᵢᵀ
+    /// ```
+    fn diagonal_of_inverse(mut self) -> Option<Vec<Matrix3<f64>>> {
+        let count = self.diagonal.len();
+        let mut inverses: Vec<Matrix3<f64>> = Vec::with_capacity(count);
+        for frame in 0..count {
+            let pivot = self.diagonal[frame].cholesky()?;
+            inverses.push(pivot.inverse());
+            if let Some(upper) = self.upper.get(frame) {
+                self.diagonal[frame + 1] -= upper.transpose() * pivot.solve(upper);
+            }
+        }
+        for frame in (0..count.saturating_sub(1)).rev() {
+            let gain = inverses[frame] * self.upper[frame];
+            let carried = gain * inverses[frame + 1] * gain.transpose();
+            inverses[frame] += carried;
+        }
+        Some(inverses)
     }
 }
 
@@ -414,6 +459,74 @@ mod tests {
             covariance: Matrix3::zeros(),
         });
         assert_eq!(smooth(&[pose], &[useless], &[pose], &config), [pose]);
+    }
+
+    #[test]
+    fn the_covariances_are_the_blocks_of_the_inverse() {
+        let truth: Vec<Pose2> = corner()[26..34].to_vec();
+        let mut some = priors(&truth, 0.05, 0.004);
+        some[2] = None;
+        let config = SmoothingConfig::default();
+        let (priors, increments) = (some, increments(&truth));
+        let found = covariances(&truth, &priors, &increments, &config).unwrap();
+        let equations = Problem::new(&priors, &increments, &config).linearize(&truth, 0.0);
+        let size = 3 * truth.len();
+        let mut dense = nalgebra::DMatrix::zeros(size, size);
+        for (frame, block) in equations.diagonal.iter().enumerate() {
+            dense
+                .view_mut((3 * frame, 3 * frame), (3, 3))
+                .copy_from(block);
+        }
+        for (frame, block) in equations.upper.iter().enumerate() {
+            let (row, column) = (3 * frame, 3 * frame + 3);
+            dense.view_mut((row, column), (3, 3)).copy_from(block);
+            dense
+                .view_mut((column, row), (3, 3))
+                .copy_from(&block.transpose());
+        }
+        let inverse = dense.try_inverse().unwrap();
+        for (frame, (found, pose)) in found.iter().zip(&truth).enumerate() {
+            let turn = rotating(pose.rotation.angle());
+            let block = inverse.fixed_view::<3, 3>(3 * frame, 3 * frame);
+            let expected = turn * block * turn.transpose();
+            assert_relative_eq!(*found, expected, max_relative = 1e-9, epsilon = 1e-12);
+        }
+    }
+
+    #[test]
+    fn errors_of_smoothed_poses_are_as_large_as_their_covariances_say() {
+        let truth = corner();
+        let config = SmoothingConfig {
+            odometry_ahead_m: 0.01,
+            odometry_aside_m: 0.01,
+            odometry_turn_rad: 0.001,
+            robust_sigmas: 1e3,
+            ..SmoothingConfig::default()
+        };
+        let mut squares = Vec::new();
+        for seed in 0..20 {
+            let noisy = disturbed(&truth, 0.05, 0.005, seed);
+            let odometry = disturbed(&increments(&truth), 0.01, 0.001, seed + 100);
+            let priors = priors(&noisy, 0.05, 0.005);
+            let smoothed = smooth(&noisy, &priors, &odometry, &config);
+            let found = covariances(&smoothed, &priors, &odometry, &config).unwrap();
+            for ((pose, truth), covariance) in smoothed.iter().zip(&truth).zip(found) {
+                let error = offset(pose, truth);
+                squares.push(error.dot(&(covariance.try_inverse().unwrap() * error)));
+            }
+        }
+        // Three degrees of freedom; neighbours err together, so that 1200 poses count as about 100.
+        let mean = squares.iter().sum::<f64>() / squares.len() as f64;
+        assert_relative_eq!(mean, 3.0, epsilon = 4.0 * (6.0_f64 / 100.0).sqrt());
+    }
+
+    #[test]
+    fn without_a_word_from_any_frame_there_is_no_covariance() {
+        let truth = corner();
+        let config = SmoothingConfig::default();
+        let silent = vec![None; truth.len()];
+        let found = covariances(&truth, &silent, &increments(&truth), &config);
+        assert!(found.is_none_or(|all| all[0][(0, 0)] > 1e6));
     }
 
     #[test]

@@ -17,6 +17,7 @@ use crate::localization::motion::VelocityCommand;
 use crate::localization::observation::choose_beams;
 use crate::localization::odometry::Odometry;
 use crate::localization::panorama::{PanoramaIndex, Panoramas};
+use crate::localization::particles::Hypothesis;
 use crate::localization::{FrameEstimate, Localizer, ParticleSet, State, Surroundings};
 use crate::map::Stance;
 use crate::refinement::{FrameObjective, RefinedFrame, refine_frame};
@@ -106,6 +107,7 @@ impl<'a> Drive<'a> {
             renderer: &*self.map.renderer,
             ground: &self.map.ground,
             beams: &beams,
+            level_m: estimate.level_m,
             stance,
             difference: observation.difference(),
         };
@@ -216,22 +218,28 @@ fn initial_particles(
 ) -> Result<ParticleSet> {
     let mut rng = stream(config.seed, INITIALIZATION_STREAM);
     let count = config.num_particles;
-    let poses = match panoramas {
-        None => around(
-            &planar(&first.map_from_lidar),
-            count,
-            &config.start,
-            &mut rng,
-        ),
+    let hypotheses = match panoramas {
+        None => {
+            // The start is known in space, and with it the level of the road.
+            let level_m = Some(first.map_from_lidar.translation.z - stance.height_m);
+            let start = planar(&first.map_from_lidar);
+            let poses = around(&start, count, &config.start, &mut rng).into_iter();
+            poses
+                .map(|map_from_lidar| Hypothesis {
+                    map_from_lidar,
+                    level_m,
+                })
+                .collect()
+        }
         Some(index) => index.sample(scan, stance, count, &mut rng),
     };
     anyhow::ensure!(
-        poses
+        hypotheses
             .iter()
-            .any(|pose| map.grid.valid_tile_of(pose).is_some()),
+            .any(|start| map.grid.valid_tile_of(&start.map_from_lidar).is_some()),
         "the start at frame {} lies outside the map {}; check that map_pose_file and pose_file are given in the same world",
         first.number,
         config.map_file.display()
     );
-    Ok(ParticleSet::uniform(poses))
+    Ok(ParticleSet::uniform(hypotheses))
 }

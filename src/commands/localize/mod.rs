@@ -15,8 +15,8 @@ use self::pictures::draw_example;
 use self::recorder::Recorder;
 use super::interrupt::Interrupted;
 use super::run_output::{self, Movie, RunFiles};
-use super::stages::{LoadedMap, Observer};
-use super::{Context, input, odometry, run_page};
+use super::stages::{Inputs, LoadedMap, Observer};
+use super::{Context, odometry, run_page};
 use crate::config::{self, LocalizationConfig};
 use crate::evaluation::{LocalizationResults, RangeMclRules, Report};
 use crate::geometry::{Pose2, Pose3};
@@ -32,29 +32,21 @@ const FIRST_FRAME_STREAM: u64 = 2;
 
 /// Localizes the frames that a configuration selects.
 pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
-    input::require_file("map_file", &config.map_file)?;
-    input::require_file("map_pose_file", &config.map_pose_file)?;
-    input::require_file("map_calib_file", &config.map_calib_file)?;
-    input::require_folder("scan_folder", &config.scan_folder)?;
-    input::require_file("pose_file", &config.pose_file)?;
-    input::require_file("calib_file", &config.calib_file)?;
+    let inputs = Inputs {
+        map_file: &config.map_file,
+        map_pose_file: &config.map_pose_file,
+        map_calib_file: &config.map_calib_file,
+        scan_folder: &config.scan_folder,
+        pose_file: &config.pose_file,
+        calib_file: &config.calib_file,
+    };
+    inputs.require()?;
     let files = RunFiles::beside(&config.result_path);
     if config.save_result || config.plot_loc_results || config.visualize {
         run_output::prepare(&files, "result_path", config.force)?;
     }
-    let map = LoadedMap::load(
-        &config.map_file,
-        &config.map_pose_file,
-        &config.map_calib_file,
-        Some(config.range_image.batch_size()),
-        context,
-    )?;
-    let sequence = map.sequence(
-        &config.scan_folder,
-        &config.pose_file,
-        &config.calib_file,
-        &config.selection(),
-    )?;
+    let map = LoadedMap::load(&inputs, Some(config.range_image.batch_size()), context)?;
+    let sequence = map.sequence(&inputs, &config.selection())?;
     let increments = odometry::read_increments(
         config.odometry,
         config.odometry_file.as_deref(),

@@ -11,6 +11,7 @@ use crate::kitti::{Frame, Sequence};
 use crate::lidar::RangeImage;
 use crate::localization::likelihood::{Direction, View, profile};
 use crate::localization::observation::{Likelihood, ObservationConfig, choose_beams};
+use crate::map::Stance;
 use crate::plotting::color::{MCL, REFINED};
 
 /// Draws one frame's range image beside the map's from the estimate.
@@ -40,7 +41,8 @@ fn draw_likelihood(
     scan: &RangeImage,
 ) -> Result<()> {
     let truth = planar(&frame.map_from_lidar);
-    let Some(patch) = map.ground.patch_under(&truth) else {
+    let below_m = frame.map_from_lidar.translation.z - Stance::default().height_m;
+    let Some(patch) = map.ground.patch_under(&truth, Some(below_m)) else {
         tracing::info!(
             "frame {}: no ground below the true pose, no likelihood drawn",
             frame.number
@@ -60,6 +62,7 @@ fn draw_likelihood(
     let view = View {
         renderer: &*map.renderer,
         ground: &map.ground,
+        level_m: Some(patch.height_m),
         stance,
         beams: &beams,
     };

@@ -35,6 +35,7 @@ impl Recorder {
                 runtimes_s: Some(Vec::new()),
                 states: Some(Vec::new()),
                 refined: config.refine.then(Vec::new),
+                refined_covariances: config.refine.then(Vec::new),
                 refine_runtimes_s: config.refine.then(Vec::new),
                 ..LocalizationResults::default()
             },
@@ -72,11 +73,15 @@ impl Recorder {
         push(&mut results.times_s, frame.time_s);
         push(&mut results.runtimes_s, runtime.as_secs_f64());
         push(&mut results.states, estimate.state as u8);
-        let (pose, lifted, seconds) = match refined {
-            Some((refined, runtime)) => (refined.pose, refined.lifted, runtime.as_secs_f64()),
-            None => (estimate.pose, estimate.lifted, 0.0),
+        let (pose, lifted, covariance, seconds) = match refined {
+            Some((refined, runtime)) => {
+                let seconds = runtime.as_secs_f64();
+                (refined.pose, refined.lifted, refined.covariance, seconds)
+            }
+            None => (estimate.pose, estimate.lifted, estimate.covariance, 0.0),
         };
         push(&mut results.refined, pose);
+        push(&mut results.refined_covariances, covariance);
         push(&mut results.refine_runtimes_s, seconds);
         self.refined.push(lifted);
         self.lifted.push(estimate.lifted);

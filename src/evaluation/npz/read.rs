@@ -43,7 +43,14 @@ impl ResultsReader<'_> {
     fn read(mut self) -> Result<LocalizationResults, ResultsError> {
         let (rows, start_idx, particles) = self.read_particles()?;
         let frames = self.read_frames(rows, start_idx)?;
-        let covariances = self.table::<9>("covariances", rows, start_idx)?;
+        let mut covariances = |name: &'static str| {
+            let table = self.table::<9>(name, rows, start_idx)?;
+            Ok::<_, ResultsError>(table.map(|rows| rows.iter().map(matrix_of).collect()))
+        };
+        let (localized, refined) = (
+            covariances("covariances")?,
+            covariances("refined_covariances")?,
+        );
         let states = self.table::<1>("states", rows, start_idx)?;
         let results = LocalizationResults {
             frames,
@@ -52,7 +59,8 @@ impl ResultsReader<'_> {
             refined: self.poses("refined", rows, start_idx)?,
             ground_truth: self.poses("ground_truth", rows, start_idx)?,
             odometry: self.poses("odometry", rows, start_idx)?,
-            covariances: covariances.map(|rows| rows.iter().map(matrix_of).collect()),
+            covariances: localized,
+            refined_covariances: refined,
             times_s: self.column("times_s", rows, start_idx)?,
             runtimes_s: self.column("runtimes_s", rows, start_idx)?,
             refine_runtimes_s: self.column("refine_runtimes_s", rows, start_idx)?,

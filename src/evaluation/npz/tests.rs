@@ -28,6 +28,7 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
         ground_truth: poses(0.3),
         odometry: poses(0.4),
         covariances: Some(frames.iter().map(matrix).collect()),
+        refined_covariances: Some(frames.iter().map(|frame| 0.5 * matrix(frame)).collect()),
         times_s: numbers(0.1),
         runtimes_s: numbers(0.01),
         refine_runtimes_s: numbers(0.02),

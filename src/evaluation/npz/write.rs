@@ -69,8 +69,13 @@ impl LocalizationResults {
                 npz.add_array(name, &table(leading, poses, pose_row))?;
             }
         }
-        if let Some(covariances) = &self.covariances {
-            npz.add_array("covariances", &table(leading, covariances, matrix_row))?;
+        for (name, covariances) in [
+            ("covariances", &self.covariances),
+            ("refined_covariances", &self.refined_covariances),
+        ] {
+            if let Some(covariances) = covariances {
+                npz.add_array(name, &table(leading, covariances, matrix_row))?;
+            }
         }
         for (name, numbers) in [
             ("times_s", &self.times_s),

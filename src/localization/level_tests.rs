@@ -1,0 +1,265 @@
+//! The filter where a road crosses another one on a bridge.
+
+use std::cell::OnceCell;
+
+use glam::Vec3;
+use nalgebra::Vector2;
+use rand::{SeedableRng, rngs::StdRng};
+
+use super::super::initialization::{Cells, ROAD_HALF_WIDTH_M, StartSpread, around};
+use super::super::observation::ObservationConfig;
+use super::super::odometry::Odometry;
+use super::super::panorama::{PanoramaConfig, Panoramas};
+use super::*;
+use crate::geometry::{TriangleMesh, planar};
+use crate::lidar::LidarModel;
+use crate::map::TileConfig;
+use crate::rendering::CpuRenderer;
+
+/// Height of the deck over the road below [m].
+const DECK_M: f64 = 6.0;
+/// The ramps begin this far from the middle of the bridge [m].
+const FOOT_M: f64 = 60.0;
+/// And end this far from it [m].
+const HEAD_M: f64 = 10.0;
+
+/// One road along y on the ground, another one along x that a ramp leads over it and down again.
+struct Crossing {
+    renderer: CpuRenderer,
+    ground: GroundMap,
+    tiles: TileGrid,
+}
+
+/// Height of the upper road [m].
+fn upper_m(x: f64) -> f64 {
+    (DECK_M * (FOOT_M - x.abs()) / (FOOT_M - HEAD_M)).clamp(0.0, DECK_M)
+}
+
+fn quad(mesh: &mut TriangleMesh, corners: [Vec3; 4]) {
+    mesh.append(&TriangleMesh {
+        vertices: corners.to_vec(),
+        triangles: vec![[0, 1, 2], [0, 2, 3]],
+        ..TriangleMesh::default()
+    });
+}
+
+/// The four walls of a house.
+fn walls(mesh: &mut TriangleMesh, low: Vec3, high: Vec3) {
+    let corners = [
+        (low.x, low.y),
+        (high.x, low.y),
+        (high.x, high.y),
+        (low.x, high.y),
+    ];
+    for (k, (x0, y0)) in corners.into_iter().enumerate() {
+        let (x1, y1) = corners[(k + 1) % 4];
+        quad(
+            mesh,
+            [
+                Vec3::new(x0, y0, low.z),
+                Vec3::new(x1, y1, low.z),
+                Vec3::new(x1, y1, high.z),
+                Vec3::new(x0, y0, high.z),
+            ],
+        );
+    }
+}
+
+impl Crossing {
+    fn new() -> Self {
+        let mut mesh = TriangleMesh::default();
+        // The ramps are embankments: there is no ground below them, but there is below the deck.
+        let (foot, head) = (FOOT_M as f32, HEAD_M as f32);
+        for (x0, x1, y0, y1) in [
+            (-90.0, 90.0, -90.0, -4.0),
+            (-90.0, 90.0, 4.0, 90.0),
+            (-90.0, -foot, -4.0, 4.0),
+            (-head, head, -4.0, 4.0),
+            (foot, 90.0, -4.0, 4.0),
+        ] {
+            let corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)];
+            quad(&mut mesh, corners.map(|(x, y)| Vec3::new(x, y, 0.0)));
+        }
+        let heads = [-FOOT_M, -HEAD_M, HEAD_M, FOOT_M];
+        for pair in heads.windows(2) {
+            let at = |x: f64, y: f32| Vec3::new(x as f32, y, upper_m(x) as f32);
+            let [x0, x1] = [pair[0], pair[1]];
+            quad(
+                &mut mesh,
+                [at(x0, -4.0), at(x1, -4.0), at(x1, 4.0), at(x0, 4.0)],
+            );
+        }
+        let of_ground = mesh.triangles.len();
+        // Houses in the four corners and parapets, all of different sizes.
+        let mut state = 7_u32;
+        let mut random = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) as f32 / (1 << 24) as f32
+        };
+        for (x_side, y_side) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)] {
+            for along_x in [true, false] {
+                let mut along = 14.0;
+                while along < 75.0 {
+                    let (length, setback) = (4.0 + 7.0 * random(), 8.0 + 4.0 * random());
+                    let (x0, y0) = if along_x {
+                        (along, setback)
+                    } else {
+                        (setback, along)
+                    };
+                    let (x1, y1) = if along_x {
+                        (along + length, setback + 3.0)
+                    } else {
+                        (setback + 3.0, along + length)
+                    };
+                    let (a, b) = (
+                        Vec3::new(x_side * x0, y_side * y0, 0.0),
+                        Vec3::new(x_side * x1, y_side * y1, 9.0 + 8.0 * random()),
+                    );
+                    walls(&mut mesh, a.min(b), a.max(b));
+                    along += length + 1.0 + 5.0 * random();
+                }
+            }
+        }
+        let drives = upper_drive().into_iter().chain(lower_drive());
+        let tiles = TileGrid::around(&drives.collect::<Vec<_>>(), &TileConfig::default());
+        Self {
+            renderer: CpuRenderer::new(std::slice::from_ref(&mesh)),
+            ground: GroundMap::from_mesh(&mesh, |triangle| triangle < of_ground, 0.5),
+            tiles,
+        }
+    }
+
+    fn surroundings(&self) -> Surroundings<'_> {
+        Surroundings {
+            renderer: &self.renderer,
+            ground: &self.ground,
+            tiles: &self.tiles,
+            panoramas: None,
+        }
+    }
+
+    fn scan(&self, map_from_lidar: &Pose3) -> RangeImage {
+        let model = LidarModel {
+            height: 32,
+            width: 360,
+            ..LidarModel::default()
+        };
+        let images = self.renderer.render(&[*map_from_lidar], &model).unwrap();
+        RangeImage::from_ranges(images.into_iter().next().unwrap(), &model)
+    }
+}
+
+/// Where the sensor is on the upper road, tilted with it.
+fn upper_drive() -> Vec<Pose3> {
+    let pose = |frame: i32| {
+        let x = -70.0 + 1.5 * f64::from(frame);
+        let slope = (upper_m(x + 0.5) - upper_m(x - 0.5)).atan();
+        let normal = nalgebra::Vector3::new(-slope.sin(), 0.0, slope.cos());
+        let patch = GroundPatch {
+            height_m: upper_m(x),
+            normal,
+        };
+        patch.lift(&Pose2::new(Vector2::new(x, 0.5), 0.02), &Stance::default())
+    };
+    (0..90).map(pose).collect()
+}
+
+/// Where it is on the lower one.
+fn lower_drive() -> Vec<Pose3> {
+    let patch = GroundPatch {
+        height_m: 0.0,
+        normal: nalgebra::Vector3::z(),
+    };
+    let pose = |frame: i32| {
+        let place = Vector2::new(-0.6, -50.0 + 1.5 * f64::from(frame));
+        patch.lift(&Pose2::new(place, 1.55), &Stance::default())
+    };
+    (0..65).map(pose).collect()
+}
+
+fn config() -> LocalizerConfig {
+    LocalizerConfig {
+        num_particles: 500,
+        observation: ObservationConfig {
+            beams: 600,
+            min_beams: 150,
+            ray_budget: 60_000,
+            ..ObservationConfig::default()
+        },
+        ..LocalizerConfig::default()
+    }
+}
+
+/// Runs the filter and asks that it is near the truth, in space, from the tenth frame on.
+fn follow(crossing: &Crossing, mut localizer: Localizer<'_>, truth: &[Pose3], rng: &mut StdRng) {
+    let mut before = planar(&truth[0]);
+    for (frame, truth) in truth.iter().enumerate() {
+        let increment = before.inverse() * planar(truth);
+        before = planar(truth);
+        let odometry = Odometry::Increment(increment);
+        let scan = crossing.scan(truth);
+        let found = localizer
+            .step(odometry, &scan, &Stance::default(), rng)
+            .unwrap();
+        let off = found.lifted.translation.vector - truth.translation.vector;
+        assert!(
+            frame < 10 || (off.xy().norm() < 0.1 && off.z.abs() < 0.2),
+            "frame {frame} at {}: off by {off}",
+            truth.translation.vector
+        );
+        assert!(
+            frame < 10 || found.state == State::Tracking,
+            "frame {frame}"
+        );
+    }
+}
+
+#[test]
+fn the_car_above_and_the_car_below_keep_their_level_also_on_the_ramp() {
+    let crossing = Crossing::new();
+    for (seed, truth) in [(1, upper_drive()), (2, lower_drive())] {
+        let mut rng = StdRng::seed_from_u64(seed);
+        let start = around(&planar(&truth[0]), 500, &StartSpread::default(), &mut rng);
+        let level_m = Some(truth[0].translation.z - Stance::default().height_m);
+        let start = ParticleSet::uniform(start.into_iter().map(|map_from_lidar| Hypothesis {
+            map_from_lidar,
+            level_m,
+        }));
+        let localizer = Localizer::new(config(), crossing.surroundings(), start);
+        follow(&crossing, localizer, &truth, &mut rng);
+    }
+}
+
+#[test]
+fn who_does_not_know_where_it_is_finds_its_level_too() {
+    let crossing = Crossing::new();
+    let panoramas = Panoramas {
+        cells: Cells::along_road(
+            &upper_drive()
+                .iter()
+                .chain(&lower_drive())
+                .map(planar)
+                .collect::<Vec<_>>(),
+            ROAD_HALF_WIDTH_M,
+            1.0,
+        ),
+        surroundings: crossing.surroundings(),
+        lidar: LidarModel::default(),
+        height_m: Stance::default().height_m,
+        config: PanoramaConfig::default(),
+        index: OnceCell::new(),
+    };
+    let index = panoramas.index().unwrap();
+    // On the deck and right below it.
+    for (seed, truth) in [(3, &upper_drive()[44..]), (4, &lower_drive()[31..])] {
+        let mut rng = StdRng::seed_from_u64(seed);
+        let scan = crossing.scan(&truth[0]);
+        let start = index.sample(&scan, &Stance::default(), 500, &mut rng);
+        let localizer = Localizer::new(
+            config(),
+            crossing.surroundings(),
+            ParticleSet::uniform(start),
+        );
+        follow(&crossing, localizer, truth, &mut rng);
+    }
+}
