@@ -130,7 +130,7 @@ impl<'a> Localizer<'a> {
             }
         }
         if !self.is_update_due(odometry) {
-            return Ok(self.coast(stance));
+            return Ok(self.coast(odometry, stance));
         }
         self.propagate(odometry, rng);
         let weighing = match self.propose(scan, stance, rng)? {

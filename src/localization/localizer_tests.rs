@@ -277,6 +277,37 @@ fn a_car_that_stands_is_not_weighed_and_its_belief_does_not_spread() {
     }
 }
 
+#[test]
+fn a_car_that_creeps_is_as_unsure_as_what_tells_its_motion() {
+    let world = TestWorld::street();
+    let truth = world.pose_at(0.0, 0.0, 0.0);
+    let mut config = config(3);
+    config.velocity.speed_m_per_s = 4.0;
+    // A hundredth of what makes an update due.
+    let command = VelocityCommand {
+        speed_m_per_s: 0.1 * config.move_thres_m,
+        turn_rate_rad_per_s: 0.0,
+        duration: Duration::from_millis(100),
+    };
+    let of_velocity = config.velocity.covariance(&command);
+    let motion = TurnDriveTurn::decompose(&command.compose());
+    let of_motion = config.motion.covariance(&motion);
+    for (odometry, noise) in [
+        (Odometry::Velocity(command), of_velocity),
+        (Odometry::Increment(command.compose()), of_motion),
+    ] {
+        // All alike: what they are unsure of is the motion.
+        let start = ParticleSet::uniform([truth; 3]);
+        let mut localizer = Localizer::new(config.clone(), world.surroundings(), start);
+        let (scan, stance) = (world.scan(&truth), Stance::default());
+        let mut rng = StdRng::seed_from_u64(1);
+        localizer.step(odometry, &scan, &stance, &mut rng).unwrap();
+        let frame = localizer.step(odometry, &scan, &stance, &mut rng).unwrap();
+        assert!(!frame.updated);
+        assert_relative_eq!(frame.covariance, 0.01 * noise, epsilon = 1e-9);
+    }
+}
+
 fn panoramas(world: &TestWorld) -> Panoramas<'_> {
     let config = PanoramaConfig::default();
     Panoramas {

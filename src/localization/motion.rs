@@ -152,6 +152,43 @@ impl Default for VelocityNoise {
     }
 }
 
+impl VelocityNoise {
+    /// Covariance of (x, y, heading) of a command's motion in the axes of the car before it
+    /// [m², m·rad, rad²], to first order in the noise. Taken for an arc that is hardly longer than its
+    /// chord, which points along the middle of the turn.
+    pub fn covariance(&self, command: &VelocityCommand) -> Matrix3<f64> {
+        let seconds = command.duration.as_secs_f64();
+        let turn_rad = command.turn_rate_rad_per_s * seconds;
+        let (middle_sin, middle_cos) = (0.5 * turn_rad).sin_cos();
+        let (sin, cos) = turn_rad.sin_cos();
+        // A turn moves the end of the arc half as far aside as the whole arc lies ahead.
+        let half_drive_m = 0.5 * command.speed_m_per_s * seconds;
+        let slopes = Matrix4x3::new(
+            middle_cos,
+            middle_sin,
+            0.0,
+            -half_drive_m * middle_sin,
+            half_drive_m * middle_cos,
+            1.0,
+            -sin,
+            cos,
+            0.0,
+            0.0,
+            0.0,
+            1.0,
+        );
+        let sigmas = seconds
+            * Vector4::new(
+                self.speed_m_per_s,
+                self.turn_rate_rad_per_s,
+                self.side_speed_m_per_s,
+                self.final_turn_rate_rad_per_s,
+            );
+        let variances = Matrix4::from_diagonal(&sigmas.map(|sigma| sigma.powi(2)));
+        slopes.transpose() * variances * slopes
+    }
+}
+
 /// A velocity command [v, ω] that is held for some time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VelocityCommand {

@@ -141,6 +141,38 @@ fn velocity_samples_spread_with_the_duration() {
 }
 
 #[test]
+fn samples_of_a_velocity_have_the_covariance_of_its_noise() {
+    let noise = VelocityNoise {
+        speed_m_per_s: 1.0,
+        side_speed_m_per_s: 0.4,
+        turn_rate_rad_per_s: 0.5,
+        final_turn_rate_rad_per_s: 0.2,
+    };
+    for (speed_m_per_s, turn_rate_rad_per_s) in [(8.0, 1.0), (-3.0, -0.5), (0.0, 0.0)] {
+        let command = VelocityCommand {
+            speed_m_per_s,
+            turn_rate_rad_per_s,
+            duration: Duration::from_millis(200),
+        };
+        let mut rng = StdRng::seed_from_u64(5);
+        let n = 20_000.0_f64;
+        let noiseless = command.compose();
+        let mut found = Matrix3::zeros();
+        for _ in 0..20_000 {
+            let step = command.sample(&noise, &mut rng);
+            let off = step.translation.vector - noiseless.translation.vector;
+            let turn = step.rotation.angle() - noiseless.rotation.angle();
+            let off = Vector3::new(off.x, off.y, turn);
+            found += off * off.transpose() / n;
+        }
+        let expected = noise.covariance(&command);
+        // Four standard errors of the largest variance.
+        let error = 4.0 * expected.diagonal().max() * (2.0 / n).sqrt();
+        assert_relative_eq!(found, expected, epsilon = error);
+    }
+}
+
+#[test]
 fn a_mistyped_key_is_an_error() {
     let result: Result<OdometryNoise, _> = serde_yaml::from_str("turn_red: 0.02\n");
     let message = result.unwrap_err().to_string();

@@ -3,17 +3,18 @@
 use nalgebra::Matrix3;
 
 use super::super::estimate::FrameEstimate;
-use super::super::motion::TurnDriveTurn;
+use super::super::motion::{TurnDriveTurn, VelocityCommand};
+use super::super::odometry::Odometry;
 use super::Localizer;
 use crate::map::Stance;
 
 impl Localizer<'_> {
     /// A frame in which the car hardly moved: the last estimate, carried along.
-    pub(super) fn coast(&mut self, stance: &Stance) -> FrameEstimate {
+    pub(super) fn coast(&mut self, odometry: Odometry, stance: &Stance) -> FrameEstimate {
         let mut particles = self.particles.clone();
         particles.propagate(|pose| pose * self.pending);
         let pose = particles.mean();
-        let covariance = self.covariance_after_pending();
+        let covariance = self.covariance_after_pending(odometry);
         FrameEstimate {
             pose,
             lifted: self.lift_estimate(&pose, stance).0,
@@ -35,16 +36,20 @@ impl Localizer<'_> {
     /// Σ = J Σ_last Jᵀ + s R N Rᵀ        J: how turns of the last pose move this one
     /// ```
     ///
-    /// N is the noise of one update in the axes of the car, of which a motion that is due for none
+    /// N is the noise of one update by its source, in the axes of the car, of which a motion that is due for none
     /// yet has made the share s: a car that stands becomes no less sure of where it is.
-    fn covariance_after_pending(&self) -> Matrix3<f64> {
+    fn covariance_after_pending(&self, odometry: Odometry) -> Matrix3<f64> {
         let config = &self.config;
         let moved_m = self.pending.translation.vector.norm();
         let turned_rad = self.pending.rotation.angle().abs();
         let share = (moved_m / config.move_thres_m).max(turned_rad / config.turn_thres_rad);
-        let noise = config
-            .motion
-            .covariance(&TurnDriveTurn::decompose(&self.pending));
+        let noise = if let Odometry::Velocity(_) = odometry {
+            let held = VelocityCommand::driving(&self.pending, self.pending_duration);
+            config.velocity.covariance(&held)
+        } else {
+            let motion = TurnDriveTurn::decompose(&self.pending);
+            config.motion.covariance(&motion)
+        };
         let turn = self.estimate.rotation;
         let step = turn * self.pending.translation.vector;
         let carried = Matrix3::new(1.0, 0.0, -step.y, 0.0, 1.0, step.x, 0.0, 0.0, 1.0);
