@@ -348,6 +348,42 @@ fn carried_elsewhere_it_notices_within_five_frames_and_finds_itself_again() {
 }
 
 #[test]
+fn who_has_just_begun_anew_says_how_little_it_knows_also_where_it_stands_still() {
+    let world = TestWorld::street();
+    let index = panoramas(&world);
+    let surroundings = Surroundings {
+        panoramas: Some(&index),
+        ..world.surroundings()
+    };
+    let before = drive(&world, -30.0, 12);
+    let mut rng = StdRng::seed_from_u64(6);
+    let start = around(&before[0], 500, &StartSpread::default(), &mut rng);
+    let mut localizer = Localizer::new(config(500), surroundings, ParticleSet::uniform(start));
+    run(&mut localizer, &world, &before, Sense::Odometry, &mut rng);
+    let after = drive(&world, 47.0, 8);
+    let lost = after.iter().find(|pose| {
+        let odometry = Odometry::Increment(Pose2::translation(0.8, 0.0));
+        let frame = localizer
+            .step(odometry, &world.scan(pose), &Stance::default(), &mut rng)
+            .unwrap();
+        frame.state == State::Lost
+    });
+    let stays = Odometry::Increment(Pose2::identity());
+    let frame = localizer
+        .step(
+            stays,
+            &world.scan(lost.unwrap()),
+            &Stance::default(),
+            &mut rng,
+        )
+        .unwrap();
+    assert!(!frame.updated);
+    let spread = frame.particles.covariance_about(&frame.pose);
+    assert_relative_eq!(frame.covariance, spread, max_relative = 1e-6);
+    assert!(spread.trace() > 1.0, "{spread}");
+}
+
+#[test]
 fn it_finds_itself_from_nowhere() {
     let world = TestWorld::street();
     let index = panoramas(&world);

@@ -50,6 +50,9 @@ impl Localizer<'_> {
         let before = self.particles.particles();
         hypotheses.extend(kept.into_iter().map(|index| before[index].hypothesis()));
         self.particles = ParticleSet::uniform(hypotheses);
+        // Until the next frame is weighed, this is all that is known.
+        self.estimate = self.particles.mean();
+        self.covariance = self.particles.covariance_about(&self.estimate);
         self.is_narrow = false;
         self.last_increment = None;
         self.vigilance = Vigilance::default();
