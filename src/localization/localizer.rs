@@ -16,7 +16,7 @@ use std::time::Duration;
 use nalgebra::Matrix3;
 use rand::Rng;
 
-use super::convergence::is_converged;
+use super::convergence::{is_converged, is_narrow};
 use super::estimate::FrameEstimate;
 use super::motion::{TurnDriveTurn, VelocityCommand};
 use super::observation::{Fit, above_road, choose_beams, costs, footing, near_points};
@@ -244,7 +244,7 @@ impl<'a> Localizer<'a> {
     /// How the sensor stands over the road: where the belief is narrow, as the returns from the
     /// road lie on the mapped ground; else as the scan alone says.
     fn settled(&self, scan: &RangeImage, stance: &Stance) -> Stance {
-        if !self.is_converged() {
+        if !self.is_narrow() {
             return *stance;
         }
         let points = near_points(scan);
@@ -317,7 +317,7 @@ impl<'a> Localizer<'a> {
     /// The estimate of a weighed frame, which becomes what the filter remembers.
     fn conclude(&mut self, weighing: &Weighing) -> FrameEstimate {
         let pose = self.particles.mean();
-        let is_narrow = self.is_converged();
+        let is_narrow = self.is_narrow();
         let was_narrow = std::mem::replace(&mut self.is_narrow, is_narrow);
         // A wide belief that jumps is no motion.
         if was_narrow && is_narrow {
@@ -370,6 +370,10 @@ impl<'a> Localizer<'a> {
             .and_then(|rendered_m| Fit::of(&beams, rendered_m, tolerance_m).agreement()))
     }
 
+    fn is_narrow(&self) -> bool {
+        is_narrow(&self.particles, &self.config.convergence)
+    }
+
     fn is_converged(&self) -> bool {
         let convergence = &self.config.convergence;
         is_converged(&self.particles, self.surroundings.tiles, convergence)
@@ -378,7 +382,7 @@ impl<'a> Localizer<'a> {
     fn change_state(&mut self, agreement: Option<f64>, odometry: Odometry) {
         // Who does not know how the car moves does not know where it will be in the next frame.
         let knows_motion = odometry != Odometry::Unknown || self.last_increment.is_some();
-        let converged = self.is_narrow && knows_motion;
+        let converged = self.is_converged() && knows_motion;
         if converged || self.state == State::Tracking {
             self.vigilance.observe(agreement, &self.config.vigilance);
         }

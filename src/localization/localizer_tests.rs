@@ -308,6 +308,43 @@ fn a_car_that_creeps_is_as_unsure_as_what_tells_its_motion() {
     }
 }
 
+#[test]
+fn across_a_border_of_tiles_it_knows_how_fast_the_car_is() {
+    let world = TestWorld::street();
+    let config = config(500);
+    let border = Vector2::new(50.0, 0.2);
+    let tile = |x: f64| world.tiles.tile_at(x, border.y);
+    assert_ne!(tile(border.x - 0.01), tile(border.x + 0.01));
+    // Brakes by 0.2 m a frame, and stops on the border.
+    let mut places_m = vec![border.x; 4];
+    for frame in 0..20 {
+        places_m.push(places_m.last().unwrap() - (0.1 + 0.2 * f64::from(frame)).min(1.9));
+    }
+    let truth: Vec<Pose2> = (places_m.iter().rev())
+        .map(|&x| world.pose_at(x, border.y, 0.0))
+        .collect();
+    let mut rng = StdRng::seed_from_u64(3);
+    let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+    let start = ParticleSet::uniform(start);
+    let mut localizer = Localizer::new(config, world.surroundings(), start);
+    run(
+        &mut localizer,
+        &world,
+        &truth[..10],
+        Sense::Nothing,
+        &mut rng,
+    );
+    for frame in 10..truth.len() {
+        let scan = world.scan(&truth[frame]);
+        localizer
+            .step(Odometry::Unknown, &scan, &Stance::default(), &mut rng)
+            .unwrap();
+        let found_m = localizer.last_increment.unwrap().translation.x;
+        let step_m = (truth[frame - 1].inverse() * truth[frame]).translation.x;
+        assert_relative_eq!(found_m, step_m, epsilon = 0.08);
+    }
+}
+
 fn panoramas(world: &TestWorld) -> Panoramas<'_> {
     let config = PanoramaConfig::default();
     Panoramas {
