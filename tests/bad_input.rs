@@ -8,7 +8,6 @@ mod common;
 use std::fs;
 
 use ::fpmcl::evaluation::LocalizationResults;
-use ::fpmcl::localization::State;
 use common::{Recording, fpmcl};
 
 /// A recording with its map.
@@ -346,6 +345,7 @@ fn frames_without_ground_below_keep_what_the_filter_said() {
         .succeeds();
     let told = "frames are as they were localized";
     assert!(said.stderr.contains(told), "{}", said.stderr);
+    assert!(!said.stderr.contains("smoothed"), "{}", said.stderr);
     let results = LocalizationResults::read(&recording.path(RESULT)).unwrap();
     let (estimates, refined) = (results.estimates.unwrap(), results.refined.unwrap());
     assert_eq!(estimates.len(), refined.len());

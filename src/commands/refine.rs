@@ -164,16 +164,21 @@ fn polish_all(
         )?);
         task.advance(1);
     }
+    let smoothed = if is_smoothed(config, &polished) {
+        ", only smoothed"
+    } else {
+        ""
+    };
     if skipped > 0 {
         tracing::info!(
-            "{skipped} frames in which the filter was not sure are not refined, only smoothed"
+            "{skipped} frames in which the filter was not sure are not refined{smoothed}"
         );
     }
     let refined = polished.iter().filter(|frame| frame.is_refined).count();
     let unmapped = polished.len() - refined - skipped;
     if unmapped > 0 {
         tracing::warn!(
-            "{unmapped} frames are as they were localized, only smoothed: there is no ground of the map under the car, or nothing to see in the scan"
+            "{unmapped} frames are as they were localized{smoothed}: there is no ground of the map under the car, or nothing to see in the scan"
         );
     }
     Ok(polished)
@@ -313,6 +318,11 @@ struct Smoothed {
     covariances: Vec<Matrix3<f64>>,
 }
 
+/// Whether there is anything to smooth, and to smooth it with.
+fn is_smoothed(config: &RefinementConfig, polished: &[Polished]) -> bool {
+    config.odometry != OdometrySource::None && polished.iter().any(|frame| frame.prior.is_some())
+}
+
 /// Smooths the trajectory with the odometry between its frames, each stretch between frames in which
 /// the filter was lost; without odometry every frame
 /// stays where its scan puts it.
@@ -326,7 +336,7 @@ fn smooth_all(
         covariances: polished.iter().map(|frame| frame.covariance).collect(),
     };
     let priors: Vec<Option<FramePrior>> = polished.iter().map(|frame| frame.prior).collect();
-    if config.odometry == OdometrySource::None || priors.iter().all(Option::is_none) {
+    if !is_smoothed(config, polished) {
         return Ok(smoothed);
     }
     let increments = increments

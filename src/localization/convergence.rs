@@ -46,14 +46,16 @@ pub fn occupied_tiles(particles: &ParticleSet, tiles: &TileGrid) -> usize {
     occupied.len()
 }
 
+/// Whether the particles stand close together, wherever that is: also astride a border of tiles.
+pub fn is_narrow(particles: &ParticleSet, config: &ConvergenceConfig) -> bool {
+    let (position_m, heading_rad) = spread(&particles.covariance_about(&particles.mean()));
+    position_m < config.max_spread_m && heading_rad < config.max_spread_rad
+}
+
 /// Whether the belief is narrow enough for few particles.
 pub fn is_converged(particles: &ParticleSet, tiles: &TileGrid, config: &ConvergenceConfig) -> bool {
     let occupied = occupied_tiles(particles, tiles);
-    let (position_m, heading_rad) = spread(&particles.covariance_about(&particles.mean()));
-    occupied > 0
-        && occupied < config.converge_thres
-        && position_m < config.max_spread_m
-        && heading_rad < config.max_spread_rad
+    occupied > 0 && occupied < config.converge_thres && is_narrow(particles, config)
 }
 
 #[cfg(test)]

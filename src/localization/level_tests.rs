@@ -10,6 +10,7 @@ use super::super::initialization::{Cells, ROAD_HALF_WIDTH_M, StartSpread, around
 use super::super::observation::ObservationConfig;
 use super::super::odometry::Odometry;
 use super::super::panorama::{PanoramaConfig, Panoramas};
+use super::super::particles::Hypothesis;
 use super::*;
 use crate::geometry::{TriangleMesh, planar};
 use crate::lidar::LidarModel;

@@ -16,23 +16,25 @@ use std::time::Duration;
 use nalgebra::Matrix3;
 use rand::Rng;
 
-use super::convergence::is_converged;
+use super::convergence::{is_converged, is_narrow};
 use super::estimate::FrameEstimate;
 use super::motion::{TurnDriveTurn, VelocityCommand};
 use super::observation::{Fit, above_road, choose_beams, costs, footing, near_points};
 use super::odometry::Odometry;
 use super::panorama::Panoramas;
-use super::particles::{Hypothesis, Particle, ParticleSet, spread};
-use super::proposal::{Gaussian, regular};
-use super::resampling::{jitter, kld_sample_size, occupied_bins, systematic};
+use super::particles::{Particle, ParticleSet, spread};
+use super::resampling::systematic;
 use super::settings::LocalizerConfig;
 use super::tempering::exponent;
 use super::vigilance::{State, Vigilance};
-use crate::geometry::{Pose2, Pose3, planar};
+use crate::geometry::{Pose2, Pose3};
 use crate::lidar::{Beam, RangeImage};
 use crate::map::{GroundMap, GroundPatch, Stance, TileGrid};
-use crate::registration::register;
 use crate::rendering::{RangeRenderer, RenderError};
+
+mod coasting;
+mod drawing;
+mod renewal;
 
 /// What the filter knows of the map.
 #[derive(Clone, Copy)]
@@ -82,17 +84,6 @@ struct Weighing {
     stance: Stance,
 }
 
-/// Where the particles of a frame are drawn, and from what they are weighed.
-struct Proposal {
-    prior: Gaussian,
-    /// Already as wide as it shall be.
-    proposal: Gaussian,
-    beams: Vec<Beam>,
-    /// Height of the ground [m].
-    level_m: f64,
-    stance: Stance,
-}
-
 impl<'a> Localizer<'a> {
     /// Begins with a belief; see [`initialization`](super::initialization) and
     /// [`PanoramaIndex::sample`] for where to get it.
@@ -139,7 +130,7 @@ impl<'a> Localizer<'a> {
             }
         }
         if !self.is_update_due(odometry) {
-            return Ok(self.coast(stance));
+            return Ok(self.coast(odometry, stance));
         }
         self.propagate(odometry, rng);
         let weighing = match self.propose(scan, stance, rng)? {
@@ -188,60 +179,6 @@ impl<'a> Localizer<'a> {
             || self.pending.rotation.angle().abs() > self.config.turn_thres_rad
     }
 
-    /// A frame in which the car hardly moved: the last estimate, carried along.
-    fn coast(&mut self, stance: &Stance) -> FrameEstimate {
-        let mut particles = self.particles.clone();
-        particles.propagate(|pose| pose * self.pending);
-        let pose = particles.mean();
-        let covariance = self.covariance_after_pending();
-        FrameEstimate {
-            pose,
-            lifted: self.lift_estimate(&pose, stance).0,
-            level_m: self.patch.map(|patch| patch.height_m),
-            covariance,
-            effective_sample_size: particles.effective_sample_size(),
-            mean_cost_m: None,
-            agreement: None,
-            state: self.state,
-            updated: false,
-            on_mapped_ground: self.patch_at(&pose).is_some(),
-            particles,
-        }
-    }
-
-    /// Covariance of the last estimate carried along by the motion since then [m², m·rad, rad²]:
-    ///
-    /// ```text
-    /// Σ = J Σ_last Jᵀ + s R N Rᵀ        J: how turns of the last pose move this one
-    /// ```
-    ///
-    /// N is the noise of one update in the axes of the car, of which a motion that is due for none
-    /// yet has made the share s: a car that stands becomes no less sure of where it is.
-    fn covariance_after_pending(&self) -> Matrix3<f64> {
-        let config = &self.config;
-        let moved_m = self.pending.translation.vector.norm();
-        let turned_rad = self.pending.rotation.angle().abs();
-        let share = (moved_m / config.move_thres_m).max(turned_rad / config.turn_thres_rad);
-        let noise = config
-            .motion
-            .covariance(&TurnDriveTurn::decompose(&self.pending));
-        let turn = self.estimate.rotation;
-        let step = turn * self.pending.translation.vector;
-        let carried = Matrix3::new(1.0, 0.0, -step.y, 0.0, 1.0, step.x, 0.0, 0.0, 1.0);
-        let mut rotation = Matrix3::identity();
-        rotation
-            .fixed_view_mut::<2, 2>(0, 0)
-            .copy_from(turn.to_rotation_matrix().matrix());
-        // Thresholds of zero mean that every motion is weighed: nothing is ever pending.
-        let share = if share.is_finite() {
-            share.min(1.0)
-        } else {
-            0.0
-        };
-        carried * self.covariance * carried.transpose()
-            + share * rotation * noise * rotation.transpose()
-    }
-
     fn propagate(&mut self, odometry: Odometry, rng: &mut impl Rng) {
         if !self.is_first {
             if odometry == Odometry::Unknown && self.last_increment.is_none() {
@@ -269,83 +206,6 @@ impl<'a> Localizer<'a> {
         self.is_first = false;
         self.pending = Pose2::identity();
         self.pending_duration = Duration::ZERO;
-    }
-
-    /// Lays the scan onto the map, for particles to be drawn where it came to lie; `None` while the
-    /// belief is wide and where the scan does not tell, or tells what cannot be.
-    fn propose(
-        &self,
-        scan: &RangeImage,
-        stance: &Stance,
-        rng: &mut impl Rng,
-    ) -> Result<Option<Proposal>, RenderError> {
-        let config = &self.config.proposal;
-        if !config.scan || self.state != State::Tracking {
-            return Ok(None);
-        }
-        let mean = self.particles.mean();
-        let Some(patch) = self.patch_at(&mean).or(self.patch) else {
-            return Ok(None);
-        };
-        let beams = choose_beams(scan, config.beams, config.road_share, stance, rng);
-        let start = patch.lift(&mean, stance);
-        let renderer = self.surroundings.renderer;
-        let Some(found) = register(renderer, &beams, &start, &config.registration)? else {
-            return Ok(None);
-        };
-        let prior = Gaussian::new(mean, regular(&self.particles.covariance_about(&mean)));
-        let pose = planar(&found.map_from_lidar);
-        let seen = Gaussian::new(pose, regular(&found.planar_covariance()));
-        let (Some(prior), Some(seen)) = (prior, seen) else {
-            return Ok(None);
-        };
-        if prior.squared_distance(&seen.mean) > config.max_sigmas.powi(2) {
-            return Ok(None);
-        }
-        let fused = prior.fused(&seen);
-        Ok(fused
-            .and_then(|fused| fused.widened(config.widening))
-            .map(|proposal| Proposal {
-                prior,
-                proposal,
-                beams,
-                level_m: patch.height_m,
-                stance: patch.stance_of(&found.map_from_lidar),
-            }))
-    }
-
-    /// Draws the particles from a proposal and weighs them by the scan, and by how much likelier the
-    /// motion is to lead there than the proposal.
-    fn weigh_drawn(
-        &mut self,
-        drawn: Proposal,
-        rng: &mut impl Rng,
-    ) -> Result<Weighing, RenderError> {
-        let Proposal {
-            prior,
-            proposal,
-            beams,
-            level_m,
-            stance,
-        } = drawn;
-        let poses = proposal.sample(self.config.num_reduced, rng);
-        self.particles = ParticleSet::uniform(poses.into_iter().map(|pose| Hypothesis {
-            map_from_lidar: pose,
-            level_m: Some(level_m),
-        }));
-        let step = beams.len().div_ceil(self.config.proposal.weighed_beams);
-        let weighed: Vec<Beam> = beams.iter().step_by(step.max(1)).copied().collect();
-        let (mut logs, costs) = self.log_likelihoods(&weighed, &stance)?;
-        for (log, pose) in logs.iter_mut().zip(self.particles.poses()) {
-            *log += prior.log_density(pose) - proposal.log_density(pose);
-        }
-        self.reweight(&logs, 1.0);
-        Ok(Weighing {
-            effective_sample_size: self.particles.effective_sample_size(),
-            mean_cost_m: weighted_mean(&self.particles, &costs),
-            beams,
-            stance,
-        })
     }
 
     /// Weighs the particles by the scan, in one round or several.
@@ -384,7 +244,7 @@ impl<'a> Localizer<'a> {
     /// How the sensor stands over the road: where the belief is narrow, as the returns from the
     /// road lie on the mapped ground; else as the scan alone says.
     fn settled(&self, scan: &RangeImage, stance: &Stance) -> Stance {
-        if !self.is_converged() {
+        if !self.is_narrow() {
             return *stance;
         }
         let points = near_points(scan);
@@ -457,7 +317,7 @@ impl<'a> Localizer<'a> {
     /// The estimate of a weighed frame, which becomes what the filter remembers.
     fn conclude(&mut self, weighing: &Weighing) -> FrameEstimate {
         let pose = self.particles.mean();
-        let is_narrow = self.is_converged();
+        let is_narrow = self.is_narrow();
         let was_narrow = std::mem::replace(&mut self.is_narrow, is_narrow);
         // A wide belief that jumps is no motion.
         if was_narrow && is_narrow {
@@ -510,6 +370,10 @@ impl<'a> Localizer<'a> {
             .and_then(|rendered_m| Fit::of(&beams, rendered_m, tolerance_m).agreement()))
     }
 
+    fn is_narrow(&self) -> bool {
+        is_narrow(&self.particles, &self.config.convergence)
+    }
+
     fn is_converged(&self) -> bool {
         let convergence = &self.config.convergence;
         is_converged(&self.particles, self.surroundings.tiles, convergence)
@@ -518,7 +382,7 @@ impl<'a> Localizer<'a> {
     fn change_state(&mut self, agreement: Option<f64>, odometry: Odometry) {
         // Who does not know how the car moves does not know where it will be in the next frame.
         let knows_motion = odometry != Odometry::Unknown || self.last_increment.is_some();
-        let converged = self.is_narrow && knows_motion;
+        let converged = self.is_converged() && knows_motion;
         if converged || self.state == State::Tracking {
             self.vigilance.observe(agreement, &self.config.vigilance);
         }
@@ -540,84 +404,6 @@ impl<'a> Localizer<'a> {
             0
         };
         self.state = next;
-    }
-
-    /// Gets the particles ready for the next frame: begins anew when lost, else resamples.
-    fn prepare_next(
-        &mut self,
-        scan: &RangeImage,
-        stance: &Stance,
-        rng: &mut impl Rng,
-    ) -> Result<(), RenderError> {
-        if self.state == State::Lost && self.begin_anew(scan, stance, rng)? {
-            return Ok(());
-        }
-        let size = self.particles.len();
-        let threshold = self.config.resampling.min_effective_fraction * size as f64;
-        let shrinks = self.state == State::Tracking && size != self.config.num_reduced;
-        if shrinks || self.particles.effective_sample_size() < threshold {
-            self.resample(rng);
-        }
-        Ok(())
-    }
-
-    /// Spreads particles over the places where the scan may have been taken; those that there were
-    /// stay among them, for an alarm may be false. `false` without panoramas.
-    fn begin_anew(
-        &mut self,
-        scan: &RangeImage,
-        stance: &Stance,
-        rng: &mut impl Rng,
-    ) -> Result<bool, RenderError> {
-        let Some(panoramas) = self.surroundings.panoramas else {
-            return Ok(false);
-        };
-        let index = panoramas.index()?;
-        let mut hypotheses = index.sample(scan, stance, self.config.num_particles, rng);
-        if hypotheses.is_empty() {
-            return Ok(false);
-        }
-        let kept = systematic(&self.particles.weights(), self.config.num_reduced, rng);
-        let before = self.particles.particles();
-        hypotheses.extend(kept.into_iter().map(|index| before[index].hypothesis()));
-        self.particles = ParticleSet::uniform(hypotheses);
-        self.is_narrow = false;
-        self.last_increment = None;
-        self.vigilance = Vigilance::default();
-        self.updates_in_state = 0;
-        self.state = State::Searching;
-        Ok(true)
-    }
-
-    fn resample(&mut self, rng: &mut impl Rng) {
-        let count = match self.state {
-            State::Tracking => self.config.num_reduced,
-            State::Searching | State::Lost => self.searching_size(),
-        };
-        let covariance = self.particles.covariance_about(&self.particles.mean());
-        let members = systematic(&self.particles.weights(), count, rng);
-        self.particles = self.particles.selected(&members);
-        jitter(
-            &mut self.particles,
-            &covariance,
-            &self.config.resampling,
-            rng,
-        );
-    }
-
-    /// How many particles the belief needs while it is wide.
-    fn searching_size(&self) -> usize {
-        let average = 1.0 / self.particles.len() as f64;
-        // A particle that weighs nothing occupies nothing.
-        let alive = self
-            .particles
-            .particles()
-            .iter()
-            .filter(|particle| particle.weight > 0.1 * average)
-            .map(|particle| &particle.map_from_lidar);
-        let bins = occupied_bins(alive, &self.config.kld);
-        let most = self.particles.len().max(self.config.num_reduced);
-        kld_sample_size(bins, &self.config.kld).clamp(self.config.num_reduced.min(most), most)
     }
 }
 

@@ -277,6 +277,74 @@ fn a_car_that_stands_is_not_weighed_and_its_belief_does_not_spread() {
     }
 }
 
+#[test]
+fn a_car_that_creeps_is_as_unsure_as_what_tells_its_motion() {
+    let world = TestWorld::street();
+    let truth = world.pose_at(0.0, 0.0, 0.0);
+    let mut config = config(3);
+    config.velocity.speed_m_per_s = 4.0;
+    // A hundredth of what makes an update due.
+    let command = VelocityCommand {
+        speed_m_per_s: 0.1 * config.move_thres_m,
+        turn_rate_rad_per_s: 0.0,
+        duration: Duration::from_millis(100),
+    };
+    let of_velocity = config.velocity.covariance(&command);
+    let motion = TurnDriveTurn::decompose(&command.compose());
+    let of_motion = config.motion.covariance(&motion);
+    for (odometry, noise) in [
+        (Odometry::Velocity(command), of_velocity),
+        (Odometry::Increment(command.compose()), of_motion),
+    ] {
+        // All alike: what they are unsure of is the motion.
+        let start = ParticleSet::uniform([truth; 3]);
+        let mut localizer = Localizer::new(config.clone(), world.surroundings(), start);
+        let (scan, stance) = (world.scan(&truth), Stance::default());
+        let mut rng = StdRng::seed_from_u64(1);
+        localizer.step(odometry, &scan, &stance, &mut rng).unwrap();
+        let frame = localizer.step(odometry, &scan, &stance, &mut rng).unwrap();
+        assert!(!frame.updated);
+        assert_relative_eq!(frame.covariance, 0.01 * noise, epsilon = 1e-9);
+    }
+}
+
+#[test]
+fn across_a_border_of_tiles_it_knows_how_fast_the_car_is() {
+    let world = TestWorld::street();
+    let config = config(500);
+    let border = Vector2::new(50.0, 0.2);
+    let tile = |x: f64| world.tiles.tile_at(x, border.y);
+    assert_ne!(tile(border.x - 0.01), tile(border.x + 0.01));
+    // Brakes by 0.2 m a frame, and stops on the border.
+    let mut places_m = vec![border.x; 4];
+    for frame in 0..20 {
+        places_m.push(places_m.last().unwrap() - (0.1 + 0.2 * f64::from(frame)).min(1.9));
+    }
+    let truth: Vec<Pose2> = (places_m.iter().rev())
+        .map(|&x| world.pose_at(x, border.y, 0.0))
+        .collect();
+    let mut rng = StdRng::seed_from_u64(3);
+    let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+    let start = ParticleSet::uniform(start);
+    let mut localizer = Localizer::new(config, world.surroundings(), start);
+    run(
+        &mut localizer,
+        &world,
+        &truth[..10],
+        Sense::Nothing,
+        &mut rng,
+    );
+    for frame in 10..truth.len() {
+        let scan = world.scan(&truth[frame]);
+        localizer
+            .step(Odometry::Unknown, &scan, &Stance::default(), &mut rng)
+            .unwrap();
+        let found_m = localizer.last_increment.unwrap().translation.x;
+        let step_m = (truth[frame - 1].inverse() * truth[frame]).translation.x;
+        assert_relative_eq!(found_m, step_m, epsilon = 0.08);
+    }
+}
+
 fn panoramas(world: &TestWorld) -> Panoramas<'_> {
     let config = PanoramaConfig::default();
     Panoramas {
@@ -314,6 +382,42 @@ fn carried_elsewhere_it_notices_within_five_frames_and_finds_itself_again() {
         "{position_m} {heading_rad}"
     );
     assert_eq!(frames.last().unwrap().state, State::Tracking);
+}
+
+#[test]
+fn who_has_just_begun_anew_says_how_little_it_knows_also_where_it_stands_still() {
+    let world = TestWorld::street();
+    let index = panoramas(&world);
+    let surroundings = Surroundings {
+        panoramas: Some(&index),
+        ..world.surroundings()
+    };
+    let before = drive(&world, -30.0, 12);
+    let mut rng = StdRng::seed_from_u64(6);
+    let start = around(&before[0], 500, &StartSpread::default(), &mut rng);
+    let mut localizer = Localizer::new(config(500), surroundings, ParticleSet::uniform(start));
+    run(&mut localizer, &world, &before, Sense::Odometry, &mut rng);
+    let after = drive(&world, 47.0, 8);
+    let lost = after.iter().find(|pose| {
+        let odometry = Odometry::Increment(Pose2::translation(0.8, 0.0));
+        let frame = localizer
+            .step(odometry, &world.scan(pose), &Stance::default(), &mut rng)
+            .unwrap();
+        frame.state == State::Lost
+    });
+    let stays = Odometry::Increment(Pose2::identity());
+    let frame = localizer
+        .step(
+            stays,
+            &world.scan(lost.unwrap()),
+            &Stance::default(),
+            &mut rng,
+        )
+        .unwrap();
+    assert!(!frame.updated);
+    let spread = frame.particles.covariance_about(&frame.pose);
+    assert_relative_eq!(frame.covariance, spread, max_relative = 1e-6);
+    assert!(spread.trace() > 1.0, "{spread}");
 }
 
 #[test]

@@ -152,6 +152,43 @@ impl Default for VelocityNoise {
     }
 }
 
+impl VelocityNoise {
+    /// Covariance of (x, y, heading) of a command's motion in the axes of the car before it
+    /// [m², m·rad, rad²], to first order in the noise. Taken for an arc that is hardly longer than its
+    /// chord, which points along the middle of the turn.
+    pub fn covariance(&self, command: &VelocityCommand) -> Matrix3<f64> {
+        let seconds = command.duration.as_secs_f64();
+        let turn_rad = command.turn_rate_rad_per_s * seconds;
+        let (middle_sin, middle_cos) = (0.5 * turn_rad).sin_cos();
+        let (sin, cos) = turn_rad.sin_cos();
+        // A turn moves the end of the arc half as far aside as the whole arc lies ahead.
+        let half_drive_m = 0.5 * command.speed_m_per_s * seconds;
+        let slopes = Matrix4x3::new(
+            middle_cos,
+            middle_sin,
+            0.0,
+            -half_drive_m * middle_sin,
+            half_drive_m * middle_cos,
+            1.0,
+            -sin,
+            cos,
+            0.0,
+            0.0,
+            0.0,
+            1.0,
+        );
+        let sigmas = seconds
+            * Vector4::new(
+                self.speed_m_per_s,
+                self.turn_rate_rad_per_s,
+                self.side_speed_m_per_s,
+                self.final_turn_rate_rad_per_s,
+            );
+        let variances = Matrix4::from_diagonal(&sigmas.map(|sigma| sigma.powi(2)));
+        slopes.transpose() * variances * slopes
+    }
+}
+
 /// A velocity command [v, ω] that is held for some time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VelocityCommand {
@@ -218,151 +255,5 @@ impl VelocityCommand {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::f64::consts::{FRAC_PI_2, PI};
-
-    use approx::assert_relative_eq;
-    use nalgebra::Vector3;
-    use rand::{SeedableRng, rngs::StdRng};
-
-    use super::*;
-
-    #[test]
-    fn composing_undoes_decomposing() {
-        let forward = Pose2::new(Vector2::new(1.2, 0.1), 0.05);
-        let reverse = Pose2::new(Vector2::new(-0.8, 0.0), -0.02);
-        let turn_in_place = Pose2::new(Vector2::zeros(), FRAC_PI_2);
-        let half_turn = Pose2::new(Vector2::new(0.0, 2.0), PI);
-        for increment in [
-            forward,
-            reverse,
-            turn_in_place,
-            half_turn,
-            Pose2::identity(),
-        ] {
-            let round_trip = TurnDriveTurn::decompose(&increment).compose();
-            assert_relative_eq!(round_trip, increment, epsilon = 1e-12);
-        }
-    }
-
-    #[test]
-    fn samples_have_the_configured_spread() {
-        let odometry = TurnDriveTurn {
-            first_turn_rad: 0.3,
-            drive_m: 1.0,
-            second_turn_rad: -0.1,
-        };
-        let noise = OdometryNoise {
-            turn_rad: 0.02,
-            drive_m: 0.2,
-            side_m: 0.1,
-        };
-        let mut rng = StdRng::seed_from_u64(7);
-        let n = 20_000.0_f64;
-        let noiseless = odometry.compose();
-        let mut found = Matrix3::zeros();
-        for _ in 0..20_000 {
-            let step = odometry.sample(&noise, &mut rng);
-            let off = step.translation.vector - noiseless.translation.vector;
-            let turn = step.rotation.angle() - noiseless.rotation.angle();
-            let off = Vector3::new(off.x, off.y, turn);
-            found += off * off.transpose() / n;
-        }
-        // Four standard errors of a variance.
-        let expected = noise.covariance(&odometry);
-        assert_relative_eq!(found, expected, epsilon = 4.0 * 0.04 * (2.0 / n).sqrt());
-        let ahead = Vector3::new(0.3_f64.cos(), 0.3_f64.sin(), 0.0);
-        let aside = Vector3::new(-ahead.y, ahead.x, 0.0);
-        for (axis, variance) in [
-            (ahead, 0.04),
-            (aside, 0.01 + 0.0004),
-            (Vector3::z(), 2.0 * 0.0004),
-        ] {
-            let found = axis.dot(&(found * axis));
-            assert_relative_eq!(found, variance, max_relative = 4.0 * (2.0 / n).sqrt());
-        }
-    }
-
-    #[test]
-    fn a_velocity_command_drives_an_arc_of_radius_v_over_omega() {
-        let quarter = VelocityCommand {
-            speed_m_per_s: 2.0,
-            turn_rate_rad_per_s: 0.5,
-            duration: Duration::from_secs_f64(PI),
-        };
-        let expected = Pose2::new(Vector2::new(4.0, 4.0), FRAC_PI_2);
-        // A duration is a whole number of nanoseconds.
-        assert_relative_eq!(quarter.compose(), expected, epsilon = 1e-8);
-        let straight = VelocityCommand {
-            turn_rate_rad_per_s: 0.0,
-            ..quarter
-        };
-        let expected = Pose2::translation(2.0 * PI, 0.0);
-        assert_relative_eq!(straight.compose(), expected, epsilon = 1e-8);
-    }
-
-    #[test]
-    fn the_command_of_an_arc_is_the_command_that_drives_it() {
-        let duration = Duration::from_millis(100);
-        for (speed, turn_rate) in [(10.0, 0.3), (-2.0, 0.1), (5.0, 0.0), (0.0, 0.0)] {
-            let command = VelocityCommand {
-                speed_m_per_s: speed,
-                turn_rate_rad_per_s: turn_rate,
-                duration,
-            };
-            let back = VelocityCommand::driving(&command.compose(), duration);
-            assert_relative_eq!(back.speed_m_per_s, speed, epsilon = 1e-9);
-            assert_relative_eq!(back.turn_rate_rad_per_s, turn_rate, epsilon = 1e-9);
-        }
-    }
-
-    #[test]
-    fn two_halves_of_a_velocity_command_are_the_whole() {
-        let whole = VelocityCommand {
-            speed_m_per_s: 7.0,
-            turn_rate_rad_per_s: -0.3,
-            duration: Duration::from_millis(200),
-        };
-        let half = VelocityCommand {
-            duration: Duration::from_millis(100),
-            ..whole
-        };
-        let twice = half.compose() * half.compose();
-        assert_relative_eq!(twice, whole.compose(), epsilon = 1e-12);
-    }
-
-    #[test]
-    fn velocity_samples_spread_with_the_duration() {
-        let command = VelocityCommand {
-            speed_m_per_s: 5.0,
-            turn_rate_rad_per_s: 0.0,
-            duration: Duration::from_millis(100),
-        };
-        let noise = VelocityNoise {
-            speed_m_per_s: 0.5,
-            side_speed_m_per_s: 0.1,
-            turn_rate_rad_per_s: 0.0,
-            final_turn_rate_rad_per_s: 0.2,
-        };
-        let mut rng = StdRng::seed_from_u64(3);
-        let n = 20_000.0_f64;
-        let (mut drive, mut aside, mut turn) = (0.0, 0.0, 0.0);
-        for _ in 0..20_000 {
-            let step = command.sample(&noise, &mut rng);
-            drive += (step.translation.x - 0.5).powi(2) / n;
-            aside += step.translation.y.powi(2) / n;
-            turn += step.rotation.angle().powi(2) / n;
-        }
-        // σ Δt, four standard errors of the standard deviation.
-        assert_relative_eq!(drive.sqrt(), 0.05, epsilon = 4.0 * 0.05 / (2.0 * n).sqrt());
-        assert_relative_eq!(aside.sqrt(), 0.01, epsilon = 4.0 * 0.01 / (2.0 * n).sqrt());
-        assert_relative_eq!(turn.sqrt(), 0.02, epsilon = 4.0 * 0.02 / (2.0 * n).sqrt());
-    }
-
-    #[test]
-    fn a_mistyped_key_is_an_error() {
-        let result: Result<OdometryNoise, _> = serde_yaml::from_str("turn_red: 0.02\n");
-        let message = result.unwrap_err().to_string();
-        assert!(message.contains("turn_red"), "{message}");
-    }
-}
+#[path = "motion_tests.rs"]
+mod tests;

@@ -97,9 +97,11 @@ impl GroundMap {
         }
     }
 
-    /// The ground at a place: a plane fitted to the known cells within `radius_m`; `None` where
-    /// fewer than a third of them are known. Of several levels it is the one at about `level_m`, or
-    /// where there is none the one nearest to it; the lowest where that is not known.
+    /// The ground at a place: a plane fitted to the known cells within `radius_m`. Of several levels
+    /// it is the one at about `level_m`, or where there is none the nearest to it that enough cells
+    /// have; the lowest such where that is not known. `None` where no level has a third of the
+    /// cells, and where the one at `level_m` has fewer: nobody falls from a bridge through a gap in
+    /// its map.
     pub fn patch_at(
         &self,
         x: f64,
@@ -108,31 +110,52 @@ impl GroundMap {
         level_m: Option<f64>,
     ) -> Option<GroundPatch> {
         let on_level = level_m.and_then(|level_m| self.patch_on_level(x, y, radius_m, level_m));
-        on_level.or_else(|| {
-            let levels = self.cells_around(x, y, radius_m)?;
-            let mut heights = self.heights.reader();
-            let levels_m = levels.flat_map(|(cell, _)| heights.levels_m(cell).collect::<Vec<_>>());
-            let off =
-                |height_m: f64| level_m.map_or(height_m, |level_m| (height_m - level_m).abs());
-            let nearest_m = levels_m.min_by(|&a, &b| off(a).total_cmp(&off(b)))?;
-            self.patch_on_level(x, y, radius_m, nearest_m)
-        })
+        on_level.or_else(|| self.patch_on_fitting_level(x, y, radius_m, level_m))
     }
 
-    /// The patches of all levels at a place, from the lowest up.
+    /// The patch of the level nearest to a height, or the lowest one, among those that enough cells
+    /// have; where some cells are at about that height, the level is one of theirs.
+    fn patch_on_fitting_level(
+        &self,
+        x: f64,
+        y: f64,
+        radius_m: f64,
+        level_m: Option<f64>,
+    ) -> Option<GroundPatch> {
+        let mut heights = self.heights.reader();
+        let mut known_m = Vec::new();
+        let mut all = 0;
+        for (cell, _) in self.cells_around(x, y, radius_m)? {
+            all += 1;
+            known_m.extend(heights.levels_m(cell));
+        }
+        let near = |height_m: f64| known_m.iter().filter(move |&&m| is_near(m, height_m));
+        let off = |height_m: f64| level_m.map_or(height_m, |level_m| (height_m - level_m).abs());
+        let mut levels_m = match level_m {
+            Some(level_m) if near(level_m).next().is_some() => near(level_m).copied().collect(),
+            _ => known_m.clone(),
+        };
+        levels_m.sort_unstable_by(|&a, &b| off(a).total_cmp(&off(b)));
+        levels_m.dedup();
+        (levels_m.into_iter())
+            .filter(|&level_m| is_enough(near(level_m).count(), all))
+            .find_map(|level_m| self.patch_on_level(x, y, radius_m, level_m))
+    }
+
+    /// The patches of all levels at a place, from the lowest up; where its own cell has none that
+    /// enough others share, the one around it.
     pub fn levels_at(&self, x: f64, y: f64) -> Vec<GroundPatch> {
         let Some(cell) = self.heights.cell_at(x, y) else {
             return Vec::new();
         };
-        let levels_m: Vec<f64> = self.heights.reader().levels_m(cell).collect();
-        if levels_m.len() < 2 {
-            // One level, or a gap in what may be one.
+        let mut heights = self.heights.reader();
+        let own: Vec<GroundPatch> = (heights.levels_m(cell))
+            .filter_map(|level_m| self.patch_on_level(x, y, RADIUS_M, level_m))
+            .collect();
+        if own.is_empty() {
             return self.patch_at(x, y, RADIUS_M, None).into_iter().collect();
         }
-        levels_m
-            .into_iter()
-            .filter_map(|level_m| self.patch_on_level(x, y, RADIUS_M, level_m))
-            .collect()
+        own
     }
 
     /// The cells within a radius of a place, each with the offset of its middle.
@@ -158,9 +181,6 @@ impl GroundMap {
 
     /// The plane through the cells whose ground is at about a height.
     fn patch_on_level(&self, x: f64, y: f64, radius_m: f64, level_m: f64) -> Option<GroundPatch> {
-        /// Up or down to here the ground may lead within the radius and since the level was known:
-        /// the level above begins no nearer than twice this.
-        const REACH_M: f64 = 0.5 * LEVEL_GAP_M;
         let mut heights = self.heights.reader();
         let mut normal_matrix = Matrix3::zeros();
         let mut right_side = Vector3::zeros();
@@ -170,14 +190,14 @@ impl GroundMap {
             let Some(height_m) = heights.nearest_m(cell, level_m) else {
                 continue;
             };
-            if (height_m - level_m).abs() <= REACH_M {
+            if is_near(height_m, level_m) {
                 known += 1;
                 let offset = offset.push(1.0);
                 normal_matrix += offset * offset.transpose();
                 right_side += offset * height_m;
             }
         }
-        if known < 3 || 3 * known < all {
+        if !is_enough(known, all) {
             return None;
         }
         let plane = normal_matrix.cholesky()?.solve(&right_side);
@@ -275,6 +295,19 @@ impl GroundMap {
     }
 }
 
+/// Whether a height within the radius is of the ground at a level.
+fn is_near(height_m: f64, level_m: f64) -> bool {
+    /// Up or down to here the ground may lead within the radius and since the level was known:
+    /// the level above begins no nearer than twice this.
+    const REACH_M: f64 = 0.5 * LEVEL_GAP_M;
+    (height_m - level_m).abs() <= REACH_M
+}
+
+/// Whether so many known cells of all tell where the plane of the ground is.
+fn is_enough(known: usize, all: usize) -> bool {
+    known >= 3 && 3 * known >= all
+}
+
 impl GroundPatch {
     /// Where in space a planar pose is, standing on the plane of this patch as `stance` says.
     /// [`planar`](crate::geometry::planar) gives the planar pose back, on every slope.
@@ -313,185 +346,5 @@ impl GroundPatch {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::geometry::planar;
-    use approx::assert_relative_eq;
-
-    /// A square of 40 m that climbs along x.
-    fn slope(grade: f32) -> TriangleMesh {
-        let at = |x: f32, y: f32| Vec3::new(x, y, grade * x);
-        TriangleMesh {
-            vertices: vec![
-                at(-20.0, -20.0),
-                at(20.0, -20.0),
-                at(20.0, 20.0),
-                at(-20.0, 20.0),
-            ],
-            triangles: vec![[0, 1, 2], [0, 2, 3]],
-            ..TriangleMesh::default()
-        }
-    }
-
-    #[test]
-    fn a_patch_of_a_slope_has_its_height_and_its_normal() {
-        let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
-        let patch = ground.patch_at(3.0, -2.0, 2.0, None).unwrap();
-        assert_relative_eq!(patch.height_m, 0.3, epsilon = 1e-3);
-        let expected = Vector3::new(-0.1, 0.0, 1.0).normalize();
-        assert_relative_eq!(patch.normal, expected, epsilon = 1e-3);
-    }
-
-    #[test]
-    fn between_cells_the_height_follows_the_slope() {
-        let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
-        for (x, y) in [(0.0, 0.0), (3.13, -2.2), (-7.5, 4.99)] {
-            let height_m = ground.height_at(x, y, 0.0).unwrap();
-            assert_relative_eq!(height_m, 0.1 * x, epsilon = 1e-3);
-        }
-        assert_eq!(ground.height_at(20.5, 0.0, 0.0), None);
-        assert_eq!(ground.height_at(f64::NAN, 0.0, 0.0), None);
-    }
-
-    #[test]
-    fn beside_the_map_there_is_no_ground() {
-        let ground = GroundMap::from_mesh(&slope(0.0), |_| true, 0.5);
-        assert_eq!(ground.patch_at(25.0, 0.0, 2.0, None), None);
-        let nothing = GroundMap::from_mesh(&TriangleMesh::default(), |_| true, 0.5);
-        assert_eq!(nothing.patch_at(0.0, 0.0, 2.0, None), None);
-        assert_eq!(nothing.levels_at(0.0, 0.0), []);
-    }
-
-    /// Two squares above one another, the upper one climbing from the lower by a ramp.
-    fn bridge() -> TriangleMesh {
-        let mut mesh = slope(0.0);
-        let deck = |x0: f32, z0: f32, x1: f32, z1: f32| TriangleMesh {
-            vertices: vec![
-                Vec3::new(x0, -4.0, z0),
-                Vec3::new(x1, -4.0, z1),
-                Vec3::new(x1, 4.0, z1),
-                Vec3::new(x0, 4.0, z0),
-            ],
-            triangles: vec![[0, 1, 2], [0, 2, 3]],
-            ..TriangleMesh::default()
-        };
-        mesh.append(&deck(-70.0, 0.0, -10.0, 6.0));
-        mesh.append(&deck(-10.0, 6.0, 15.0, 6.0));
-        mesh
-    }
-
-    #[test]
-    fn who_drives_up_a_ramp_stays_above_and_who_drives_below_stays_below() {
-        let ground = GroundMap::from_mesh(&bridge(), |_| true, 0.5);
-        let mut above_m = 0.0;
-        for step in 0..170 {
-            let x = -70.0 + 0.5 * f64::from(step);
-            let expected_m = (0.1 * (x + 70.0)).min(6.0);
-            let pose = Pose2::translation(x, 0.3);
-            above_m = ground.patch_under(&pose, Some(above_m)).unwrap().height_m;
-            // Where the ramp ends, the patch rounds the edge.
-            assert_relative_eq!(above_m, expected_m, epsilon = 0.1);
-        }
-        let mut below_m = 0.0;
-        for step in 0..70 {
-            let pose = Pose2::translation(0.0, -17.0 + 0.5 * f64::from(step));
-            below_m = ground.patch_under(&pose, Some(below_m)).unwrap().height_m;
-            assert_relative_eq!(below_m, 0.0, epsilon = 1e-6);
-        }
-        let levels = ground.levels_at(0.0, 0.0);
-        let heights: Vec<f64> = levels.iter().map(|patch| patch.height_m).collect();
-        assert_relative_eq!(heights[..], [0.0, 6.0][..], epsilon = 1e-6);
-        assert_eq!(ground.levels_at(0.0, 12.0).len(), 1);
-    }
-
-    #[test]
-    fn a_height_that_was_told_wrong_leads_to_the_nearest_ground_that_there_is() {
-        let ground = GroundMap::from_mesh(&bridge(), |_| true, 0.5);
-        let height_m = |level_m: Option<f64>| {
-            let patch = ground.patch_under(&Pose2::identity(), level_m);
-            patch.unwrap().height_m
-        };
-        assert_relative_eq!(height_m(Some(30.0)), 6.0, epsilon = 1e-6);
-        assert_relative_eq!(height_m(Some(4.0)), 6.0, epsilon = 1e-6);
-        assert_relative_eq!(height_m(Some(-9.0)), 0.0, epsilon = 1e-6);
-        assert_relative_eq!(height_m(None), 0.0, epsilon = 1e-6);
-    }
-
-    #[test]
-    fn on_level_ground_the_lifted_pose_is_the_stance_at_the_planar_pose() {
-        let ground = GroundMap::flat(Point2::new(-10.0, -10.0), Point2::new(10.0, 10.0), -1.73);
-        let pose = Pose2::new(Vector2::new(1.0, 2.0), 2.5);
-        let lifted = ground.lift(&pose, &Stance::default()).unwrap();
-        assert_relative_eq!(planar(&lifted), pose, epsilon = 1e-9);
-        assert_relative_eq!(lifted.translation.z, 0.0, epsilon = 1e-6);
-    }
-
-    #[test]
-    fn a_lifted_pose_casts_its_planar_pose_as_shadow_on_every_slope() {
-        let patch = GroundPatch {
-            height_m: 4.0,
-            normal: Vector3::new(-0.1, 0.08, 1.0).normalize(),
-        };
-        let stance = Stance {
-            height_m: 1.7,
-            roll_rad: 0.04,
-            pitch_rad: -0.05,
-        };
-        for heading in [-3.0, -1.0, 0.0, 0.7, 2.5] {
-            let pose = Pose2::new(Vector2::new(1.0, 2.0), heading);
-            let shadow = planar(&patch.lift(&pose, &stance));
-            assert_relative_eq!(shadow, pose, epsilon = 1e-12);
-        }
-    }
-
-    #[test]
-    fn the_stance_is_found_from_returns_off_a_slope_among_others_that_are_not_off_it() {
-        let ground = GroundMap::from_mesh(&slope(0.06), |_| true, 0.5);
-        let pose = Pose2::new(Vector2::new(1.0, 2.0), 0.6);
-        let truth = Stance {
-            height_m: 1.65,
-            roll_rad: 0.015,
-            pitch_rad: -0.02,
-        };
-        let lidar_from_map = ground.lift(&pose, &truth).unwrap().inverse();
-        let points: Vec<Vec3> = (0..900)
-            .map(|i| {
-                let (x, y) = (f64::from(i % 30) - 14.0, f64::from(i / 30) - 14.0);
-                let above = if i % 4 == 0 { 0.5 } else { 0.0 };
-                let point = lidar_from_map * nalgebra::Point3::new(x, y, 0.06 * x + above);
-                Vec3::new(point.x as f32, point.y as f32, point.z as f32)
-            })
-            .collect();
-        let start = Stance::default();
-        let found = ground.stance_at(&pose, None, &start, &points).unwrap();
-        assert_relative_eq!(found.height_m, truth.height_m, epsilon = 5e-3);
-        assert_relative_eq!(found.roll_rad, truth.roll_rad, epsilon = 5e-4);
-        assert_relative_eq!(found.pitch_rad, truth.pitch_rad, epsilon = 5e-4);
-        assert_eq!(ground.stance_at(&pose, None, &start, &points[..40]), None);
-    }
-
-    #[test]
-    fn uphill_the_nose_points_up_and_downhill_down() {
-        let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
-        for (heading, sign) in [(0.0, 1.0), (std::f64::consts::PI, -1.0)] {
-            let pose = Pose2::new(Vector2::new(0.0, 0.0), heading);
-            let lifted = ground.lift(&pose, &Stance::default()).unwrap();
-            let nose = lifted.rotation * Vector3::x();
-            assert_relative_eq!(nose.z, sign * 0.1_f64.atan().sin(), epsilon = 1e-3);
-        }
-    }
-
-    #[test]
-    fn a_stance_from_the_plane_that_it_makes_is_itself() {
-        let stance = Stance {
-            height_m: 1.7,
-            roll_rad: 0.03,
-            pitch_rad: -0.02,
-        };
-        let up = stance.road_from_lidar().rotation.inverse() * Vector3::z();
-        let up = Vec3::new(up.x as f32, up.y as f32, up.z as f32);
-        let back = Stance::from_plane(up, 1.7);
-        assert_relative_eq!(back.roll_rad, stance.roll_rad, epsilon = 1e-6);
-        assert_relative_eq!(back.pitch_rad, stance.pitch_rad, epsilon = 1e-6);
-    }
-}
+#[path = "elevation_tests.rs"]
+mod tests;
