@@ -15,7 +15,8 @@ use super::shared::{self, Shared};
 use crate::commands::interrupt::Interrupted;
 use crate::commands::run_output::{self, RunFiles};
 use crate::commands::run_page::RunPage;
-use crate::commands::{Context, build_map, localize, refine, simulate, version};
+use crate::commands::simulate::{self, Existing};
+use crate::commands::{Context, build_map, localize, refine, version};
 use crate::config::{self, BuildMapConfig, LocalizationConfig, RefinementConfig};
 use crate::evaluation::comparison::{Outcome, RunRecord};
 use crate::evaluation::{Judged, LocalizationResults, RangeMclRules, Report, TrajectoryReport};
@@ -154,7 +155,7 @@ fn simulate_drives(run: &PlannedRun, layout: &Layout, context: &Context) -> Resu
     let folder = layout.root.join("sequences");
     let _alone = shared::lock(&folder, &run.id.sequence)?;
     for drive in drives {
-        simulate::run_with_progress(drive, false, context)?;
+        simulate::run_with_progress(drive, Existing::Renew, context)?;
     }
     Ok(())
 }
