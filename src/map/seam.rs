@@ -3,7 +3,9 @@
 //! Ownership is decided per cell of a grid, so a border runs along vertical planes x = const and
 //! y = const. Triangles that reach over it are cut along these very planes, in the one local map
 //! and in the other: seen from above there is neither a gap between the two nor a place that both
-//! cover. What is left of the seam is the difference of their heights.
+//! cover. What is left of the seam is the difference of their surfaces, of a road a step of
+//! millimetres. A wall that stands on the very plane, to within that difference, may be in both
+//! maps or in neither for as long as it runs along it.
 //!
 //! Each polygon is cut as in Sutherland and Hodgman, *Reentrant Polygon Clipping* (1974), first into
 //! columns of the grid, then into rows. An edge is cut in the same order in both of its triangles, so

@@ -146,7 +146,7 @@ impl Block {
             let to = scratch.targets[index].1;
             if self.stays_a_surface(from, to, scratch)
                 && self.lay_fan(to, scratch)
-                && self.is_within(tolerance_m, from, scratch)
+                && self.is_within(tolerance_m, from, to, scratch)
             {
                 self.collapse(from, to, scratch);
                 return true;
@@ -234,23 +234,30 @@ impl Block {
     }
 
     /// Finds the new triangle of each point. Whether all are within the tolerance, and those of the
-    /// rim near the new rim.
-    fn is_within(&self, tolerance_m: f32, from: u32, scratch: &mut Scratch) -> bool {
+    /// rim near the new rim. These are kept with the triangle at the rim, so that they are asked again
+    /// when the rim changes once more.
+    fn is_within(&self, tolerance_m: f32, from: u32, to: u32, scratch: &mut Scratch) -> bool {
         scratch.places.clear();
+        let is_end = |vertex: u32| vertex != to && scratch.rim.is_some_and(|r| r.contains(&vertex));
+        let rim_blade = (scratch.ring.iter())
+            .position(|&(b, c)| b != to && c != to && (is_end(b) || is_end(c)));
         let rim = (scratch.rim).map(|[a, b]| [self.at(a), self.at(b)]);
         let off_rim_m = RIM_FACTOR * tolerance_m;
         let points = (scratch.around.iter()).flat_map(|&triangle| self.points_on(triangle));
         for point in std::iter::once(from).chain(points) {
             let place = self.measured[point as usize];
-            if let Some([a, b]) = rim
-                && self.is_rim[point as usize]
-                && distance_squared(place, a, b) > off_rim_m * off_rim_m
-            {
+            let (nearest, off_surface_squared) = scratch.fan.nearest(place);
+            if off_surface_squared > tolerance_m * tolerance_m {
                 return false;
             }
-            let (blade, distance_squared) = scratch.fan.nearest(place);
-            if distance_squared > tolerance_m * tolerance_m {
-                return false;
+            let mut blade = nearest;
+            if let Some([a, b]) = rim
+                && self.is_rim[point as usize]
+            {
+                if distance_squared(place, a, b) > off_rim_m * off_rim_m {
+                    return false;
+                }
+                blade = rim_blade.unwrap_or(nearest);
             }
             scratch.places.push((point, scratch.around[blade]));
         }

@@ -14,6 +14,7 @@ use anyhow::{Context as _, Result};
 use self::parts::Parts;
 pub use self::report::BuildReport;
 use super::interrupt::Interrupted;
+use super::version::{SOURCE, VERSION};
 use super::{Context, input, output, stages};
 use crate::config::{self, BuildMapConfig};
 use crate::geometry::{Pose2, TriangleMesh, planar};
@@ -191,7 +192,7 @@ fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
         force: false,
         ..config.clone()
     };
-    let mut text = format!("# fpmcl {}\n", env!("CARGO_PKG_VERSION"));
+    let mut text = format!("# fpmcl {VERSION}, source {SOURCE}\n");
     text += &config::to_yaml(&relevant)?;
     for frame in frames {
         let t = frame.map_from_lidar.translation.vector;

@@ -55,10 +55,12 @@ impl Parts {
         &self.folder
     }
 
-    /// What is known of a local map if it is finished.
+    /// What is known of a local map if it is finished, and its mesh is there.
     pub fn finished(&self, number: usize) -> Option<Part> {
         let text = fs::read_to_string(self.counts_file(number)).ok()?;
-        serde_json::from_str(&text).ok()
+        let part: Part = serde_json::from_str(&text).ok()?;
+        let is_whole = part.counts.triangles == 0 || self.mesh_file(number).exists();
+        is_whole.then_some(part)
     }
 
     /// Keeps a finished local map.
@@ -144,6 +146,7 @@ mod tests {
             },
             counts: LocalMapCounts {
                 scans: 7,
+                triangles: 1,
                 ..LocalMapCounts::default()
             },
             scans_hash: "0123abcd".to_owned(),
@@ -184,6 +187,15 @@ mod tests {
         let parts = Parts::open(&map, "inputs").unwrap();
         parts.save(0, &local_map(0.5)).unwrap();
         fs::remove_file(parts.counts_file(0)).unwrap();
+        assert_eq!(parts.finished(0), None);
+    }
+
+    #[test]
+    fn counts_without_their_mesh_are_not_finished() {
+        let folder = tempfile::tempdir().unwrap();
+        let parts = Parts::open(&folder.path().join("map.ply"), "inputs").unwrap();
+        parts.save(0, &local_map(0.5)).unwrap();
+        fs::remove_file(parts.mesh_file(0)).unwrap();
         assert_eq!(parts.finished(0), None);
     }
 
