@@ -10,7 +10,8 @@
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
 
 /// Widths of a desk's and a phone's window [pixels].
 const WIDTHS: [u32; 2] = [1280, 390];
@@ -20,6 +21,9 @@ const NARROWEST: u32 = 500;
 
 /// The browser does not paint a window that is higher [pixels].
 const HIGHEST: u32 = 8000;
+
+/// After this the browser hangs; it takes seconds.
+const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Chromium with pages to look at.
 struct Browser {
@@ -45,7 +49,7 @@ impl Browser {
                 .arg("--version")
                 .stdout(Stdio::null())
                 .stderr(Stdio::null());
-            asked.status().is_ok_and(|status| status.success())
+            finished_within(PATIENCE, &mut asked).is_ok_and(|status| status.success())
         };
         let Some(program) = programs.into_iter().find(is_there) else {
             eprintln!("not run: there is no Chromium");
@@ -62,7 +66,10 @@ impl Browser {
     /// What the browser writes to standard output about an address.
     fn visit(&self, address: &str, arguments: &[String]) -> String {
         let profile = tempfile::tempdir().unwrap();
-        let output = Command::new(self.program)
+        let said = profile.path().join("said.txt");
+        let complained = profile.path().join("complained.txt");
+        let mut visiting = Command::new(self.program);
+        visiting
             .args([
                 "--headless",
                 "--no-sandbox",
@@ -78,11 +85,13 @@ impl Browser {
             .arg(format!("--user-data-dir={}", profile.path().display()))
             .args(arguments)
             .arg(address)
-            .output()
-            .unwrap();
-        let told = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.success(), "{address}: {told}");
-        String::from_utf8_lossy(&output.stdout).into_owned()
+            .stdout(fs::File::create(&said).unwrap())
+            .stderr(fs::File::create(&complained).unwrap());
+        let finished = finished_within(PATIENCE, &mut visiting);
+        let read = |path| String::from_utf8_lossy(&fs::read(path).unwrap()).into_owned();
+        let is_well = finished.as_ref().is_ok_and(ExitStatus::success);
+        assert!(is_well, "{address}: {finished:?}: {}", read(&complained));
+        read(&said)
     }
 
     /// What a script says of a page in a window of some width.
@@ -114,6 +123,34 @@ impl Browser {
         }
         whole
     }
+}
+
+/// How a program ended; one that takes longer is killed, and that is told.
+fn finished_within(limit: Duration, command: &mut Command) -> Result<ExitStatus, String> {
+    let child = command.spawn();
+    let told = |error: std::io::Error| format!("{command:?}: {error}");
+    let mut child = child.map_err(told)?;
+    let started = Instant::now();
+    loop {
+        if let Some(status) = child.try_wait().map_err(told)? {
+            return Ok(status);
+        }
+        if started.elapsed() > limit {
+            child.kill().and_then(|()| child.wait()).map_err(told)?;
+            return Err(format!("{command:?} hung and was killed after {limit:?}"));
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn a_program_that_hangs_is_killed_and_told() {
+    let mut hanging = Command::new("sleep");
+    let told = finished_within(Duration::from_millis(50), hanging.arg("3600")).unwrap_err();
+    assert!(told.contains("sleep") && told.contains("hung"), "{told}");
+    let status = finished_within(PATIENCE, &mut Command::new("true")).unwrap();
+    assert!(status.success());
 }
 
 /// A page in a frame of its own, which may be narrower than the browser's windows.

@@ -278,6 +278,30 @@ fn the_page_is_made_of_whatever_is_there(recording: &Recording) {
 }
 
 #[test]
+fn numbers_of_before_do_not_stand_beside_what_a_later_run_made() {
+    let recording = recording();
+    let job = || compare(&recording).with("--job=street/Fuzzy-MCL/1");
+    job().succeeds();
+    assert_eq!(records(&recording).len(), 1);
+    let trajectory = "out/runs/street/Fuzzy-MCL/1/mcl_kitti.txt";
+    let before = recording.bytes(trajectory);
+
+    // Asked the same of another recording, it ends when everything but the record is written: a
+    // folder lies where a text of its page is looked for.
+    let mut points = recording.scan(0);
+    points.truncate(points.len() / 2);
+    recording.write_scan(0, &points);
+    let text = recording.path("out/runs/street/Fuzzy-MCL/1/evaluation.yml");
+    fs::create_dir(&text).unwrap();
+    job().fails_saying(&["evaluation.yml"]);
+    assert_ne!(recording.bytes(trajectory), before);
+    assert!(records(&recording).is_empty());
+    compare(&recording)
+        .with("--collect")
+        .fails_saying(&["no run is finished"]);
+}
+
+#[test]
 fn every_run_is_a_job_of_its_own() {
     let recording = recording();
     let listed = compare(&recording)

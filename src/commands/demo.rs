@@ -5,7 +5,8 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 
-use super::{Context, build_map, localize, refine, simulate};
+use super::simulate::{self, Existing};
+use super::{Context, build_map, localize, refine};
 use crate::cli::DemoArgs;
 use crate::config::{BuildMapConfig, LocalizationConfig, OdometrySource, RefinementConfig};
 use crate::simulation::SimulationConfig;
@@ -28,7 +29,8 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<String> {
     };
     for number in [1, 2] {
         tracing::info!("simulating drive {number}");
-        simulate::run_with_progress(&drive(number), false, context).context("while simulating")?;
+        simulate::run_with_progress(&drive(number), Existing::Renew, context)
+            .context("while simulating")?;
     }
     let (first, second) = (drive(1).drive_folder(), drive(2).drive_folder());
 

@@ -101,7 +101,11 @@ pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
         }
         Command::Simulate(args) => {
             let config: SimulationConfig = load(args, "config/simulation.yml")?;
-            output::print(&simulate::run_with_progress(&config, args.force, context)?)
+            let existing = match args.force {
+                true => simulate::Existing::Replace,
+                false => simulate::Existing::Keep,
+            };
+            output::print(&simulate::run_with_progress(&config, existing, context)?)
         }
         Command::Compare(args) => output::print(&compare::run(args, context)?),
         Command::Demo(args) => output::print(&demo::run(args, context)?),

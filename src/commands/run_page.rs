@@ -97,7 +97,7 @@ impl RunPage<'_> {
         }];
         for (title, name, caption) in PICTURES {
             let path = self.files.file("plots").join(name);
-            let mut blocks: Vec<Block> = picture(&path, caption)?.into_iter().collect();
+            let mut blocks: Vec<Block> = picture_or_word(&path, caption).into_iter().collect();
             if title == "Timing" && !self.stage_seconds.is_empty() {
                 blocks.push(Block::Table(stages(self.stage_seconds)));
             }
@@ -192,6 +192,14 @@ pub fn picture(path: &Path, caption: &str) -> Result<Option<Block>> {
     }))
 }
 
+/// A picture of a page, or why it is left out: one that is damaged costs no run its page.
+fn picture_or_word(path: &Path, caption: &str) -> Option<Block> {
+    picture(path, caption).unwrap_or_else(|error| {
+        tracing::warn!("{} is left out of the page: {error:#}", path.display());
+        Some(Block::Paragraph(format!("Left out: {error:#}.")))
+    })
+}
+
 /// A text that is folded away under a name; `None` where there is none.
 pub fn folded(path: &Path, name: &str) -> Result<Option<Block>> {
     if !path.exists() {
@@ -202,4 +210,24 @@ pub fn folded(path: &Path, name: &str) -> Result<Option<Block>> {
         name: name.to_owned(),
         text: String::from_utf8_lossy(&bytes).into_owned(),
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_damaged_picture_is_left_out_and_told() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.png");
+        assert!(picture_or_word(&path, "The map").is_none());
+        fs::write(&path, "half a").unwrap();
+        let Some(Block::Paragraph(told)) = picture_or_word(&path, "The map") else {
+            panic!("nothing is said of it");
+        };
+        assert!(told.contains("map.png"), "{told}");
+        image::RgbImage::new(2, 2).save(&path).unwrap();
+        let shown = picture_or_word(&path, "The map");
+        assert!(matches!(shown, Some(Block::Picture { .. })));
+    }
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::fs;
+use std::io;
 use std::path::Path;
 use std::time::Instant;
 
@@ -15,10 +16,14 @@ use super::shared::{self, Shared};
 use crate::commands::interrupt::Interrupted;
 use crate::commands::run_output::{self, RunFiles};
 use crate::commands::run_page::RunPage;
-use crate::commands::{Context, build_map, localize, refine, simulate, version};
+use crate::commands::simulate::{self, Existing};
+use crate::commands::{Context, build_map, localize, refine, version};
 use crate::config::{self, BuildMapConfig, LocalizationConfig, RefinementConfig};
 use crate::evaluation::comparison::{Outcome, RunRecord};
 use crate::evaluation::{Judged, LocalizationResults, RangeMclRules, Report, TrajectoryReport};
+
+/// Name of a run's record, written last.
+pub const RECORD_FILE: &str = "run.json";
 
 /// What a run has from its configuration, the same in every run.
 const MAP_FILE: &str = "map.ply";
@@ -27,7 +32,7 @@ const LOG_FILE: &str = "log.txt";
 
 /// The record of a run; `None` where there is none, or one of another version of the program.
 pub fn read_record(folder: &Path) -> Result<Option<RunRecord>> {
-    let path = folder.join("run.json");
+    let path = folder.join(RECORD_FILE);
     if !path.exists() {
         return Ok(None);
     }
@@ -42,7 +47,18 @@ pub fn read_record(folder: &Path) -> Result<Option<RunRecord>> {
     }
 }
 
-/// Does a run. A failure is its outcome; only an interruption is an error.
+fn remove_record(folder: &Path) -> Result<()> {
+    let path = folder.join(RECORD_FILE);
+    match fs::remove_file(&path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            Err(error).with_context(|| format!("cannot remove {}", path.display()))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Does a run, whose record, if there is one, is removed first: numbers of before never stand beside
+/// what it makes. A failure is its outcome; only an interruption is an error.
 pub fn execute(
     run: &PlannedRun,
     layout: &Layout,
@@ -52,6 +68,7 @@ pub fn execute(
     let keys = fingerprints.of(run)?;
     let folder = layout.run(&run.id);
     fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
+    remove_record(&folder)?;
     let _writing = context.log.write_to(&folder.join(LOG_FILE))?;
     let mut stages = Stages::default();
     let outcome = match stages.run(run, layout, &keys, context) {
@@ -154,7 +171,7 @@ fn simulate_drives(run: &PlannedRun, layout: &Layout, context: &Context) -> Resu
     let folder = layout.root.join("sequences");
     let _alone = shared::lock(&folder, &run.id.sequence)?;
     for drive in drives {
-        simulate::run_with_progress(drive, false, context)?;
+        simulate::run_with_progress(drive, Existing::Renew, context)?;
     }
     Ok(())
 }

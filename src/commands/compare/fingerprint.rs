@@ -6,9 +6,10 @@
 //! run          = H(localization, refinement without paths, its odometry)
 //! ```
 //!
-//! H is BLAKE3. Of a simulated drive the recipe stands for the scans, which follow from it. The source
-//! is that of the program ([`version::SOURCE`]): rebuilt with another behaviour, it does not take what
-//! an older one made.
+//! H is BLAKE3. The source is that of the program ([`version::SOURCE`]): rebuilt with another
+//! behaviour, it does not take what an older one made. Of a simulated drive the recipe stands for the
+//! scans, which follow from it and the source: a drive that other source made is made anew before it is
+//! used ([`Existing::Renew`](crate::commands::simulate::Existing::Renew)).
 
 use std::collections::BTreeMap;
 use std::fs;

@@ -152,7 +152,7 @@ fn finish(
         return Ok((record, false));
     }
     let record = execute::execute(run, layout, fingerprints, context)?;
-    output::write_json(&folder.join("run.json"), &record)?;
+    output::write_json(&folder.join(execute::RECORD_FILE), &record)?;
     Ok((record, true))
 }
 
