@@ -88,7 +88,7 @@ impl<L: Lanes<RAYS>> Together for Bundle<L> {
     fn enters<const COHERENT: bool>(&self, origin: Vectors<L>, bounds: &[f32; 6]) -> bool {
         let mut near = L::splat(0.0);
         let mut far = L::load(&self.until_m);
-        for axis in 0..3 {
+        for (axis, (&origin, &inverse)) in origin.iter().zip(&self.inverse).enumerate() {
             // Where all rays run alike, the side that they come in through is known.
             let is_swapped = COHERENT && self.backwards[axis];
             let (first, second) = if is_swapped {
@@ -96,9 +96,8 @@ impl<L: Lanes<RAYS>> Together for Bundle<L> {
             } else {
                 (axis, axis + 3)
             };
-            let a = L::splat(bounds[first]).minus(origin[axis]);
-            let b = L::splat(bounds[second]).minus(origin[axis]);
-            let (a, b) = (a.times(self.inverse[axis]), b.times(self.inverse[axis]));
+            let a = L::splat(bounds[first]).minus(origin).times(inverse);
+            let b = L::splat(bounds[second]).minus(origin).times(inverse);
             let (a, b) = if COHERENT {
                 (a, b)
             } else {
