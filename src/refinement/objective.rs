@@ -104,7 +104,8 @@ impl FrameObjective<'_> {
     /// map [m², m·rad, rad²], from the curvature of the objective around a minimum. `scale_m` is
     /// the cost that makes a pose e times less likely.
     ///
-    /// A direction in which the objective is flat has a standard deviation of `MAX_SIGMA`.
+    /// A direction in which the objective is flat has a standard deviation of `MAX_SIGMA`, and so has
+    /// every direction where some pose around has no ground to stand on.
     pub fn covariance(
         &self,
         pose: &Pose2,
@@ -116,19 +117,16 @@ impl FrameObjective<'_> {
         let offsets = stencil();
         let poses: Vec<Pose2> = offsets.iter().map(|offset| shifted(pose, offset)).collect();
         let costs = self.costs(&poses, remembered)?;
+        let step = Matrix3::from_diagonal(&STEP);
         let curvature = hessian(&costs) / scale_m;
+        if !curvature.iter().all(|entry| entry.is_finite()) {
+            return Ok(MAX_SIGMA.powi(2) * step * step);
+        }
         let SymmetricEigen {
             eigenvectors,
             eigenvalues,
         } = curvature.symmetric_eigen();
-        let variances = eigenvalues.map(|value| {
-            if value.is_finite() {
-                1.0 / value.max(MAX_SIGMA.powi(-2))
-            } else {
-                MAX_SIGMA.powi(2)
-            }
-        });
-        let step = Matrix3::from_diagonal(&STEP);
+        let variances = eigenvalues.map(|value| 1.0 / value.max(MAX_SIGMA.powi(-2)));
         let covariance =
             eigenvectors * Matrix3::from_diagonal(&variances) * eigenvectors.transpose();
         Ok(step * covariance * step)
@@ -222,6 +220,9 @@ mod tests {
         let costs = objective.costs(&off, None).unwrap();
         assert_eq!(costs[0], f64::INFINITY);
         assert!(costs[1] < 1e-3);
+        // Nothing is known of the pose where the poses around it cannot be told apart.
+        let unknown = objective.covariance(&off[0], None, 0.002).unwrap();
+        assert!(unknown.iter().all(|entry| entry.is_finite()) && unknown[(0, 0)] > 0.1);
         let patch = world.ground.patch_under(&off[1], None);
         assert!(objective.costs(&off, patch.as_ref()).unwrap()[0].is_finite());
     }

@@ -134,14 +134,15 @@ pub fn refine_frame(
         Method::GaussNewton | Method::Both => polish(objective, &mut frame, config)?,
         Method::None | Method::Swarm => None,
     };
-    if let Some(patch) = objective.ground.patch_under(&frame.pose, objective.level_m) {
+    let patch = objective.ground.patch_under(&frame.pose, objective.level_m);
+    if let Some(patch) = &patch {
         frame.stance = patch.stance_of(&frame.lifted);
         frame.level_m = Some(patch.height_m);
     }
     if config.method != Method::None {
         frame.covariance = match finished {
             Some(registered) => registered.planar_covariance(),
-            None => objective.covariance(&frame.pose, None, config.scale_m)?,
+            None => objective.covariance(&frame.pose, patch.as_ref(), config.scale_m)?,
         };
     }
     Ok(Some(frame))
