@@ -1,9 +1,9 @@
 //! Finds a car's pose to the centimetre from one spinning LiDAR and a mesh map that it builds itself.
 //!
-//! > A [`kitti`] sequence gives [`lidar`] scans; [`ground`] tells road from rest; [`meshing`]
+//! > A [`recording`] sequence gives [`lidar`] scans; [`ground`] tells road from rest; [`meshing`]
 //! > turns points into surfaces, [`map`] tiles them; [`rendering`] shows the map from any pose,
 //! > [`registration`] lays a scan onto it; [`localization`] finds the pose; [`refinement`]
-//! > polishes it; [`evaluation`] measures it; [`plotting`] draws it; [`reporting`] tells it.
+//! > polishes it; [`evaluation`] measures it; the program around it is `app`.
 //!
 //! | frame | origin and axes | appears in |
 //! |---|---|---|
@@ -22,8 +22,8 @@ pub mod lidar;
 pub mod raycasting;
 // From a recording to surfaces.
 pub mod ground;
-pub mod kitti;
 pub mod meshing;
+pub mod recording;
 // From surfaces to a map, and back to what the sensor would see in it.
 pub mod map;
 pub mod registration;
@@ -33,9 +33,6 @@ pub mod simulation;
 pub mod evaluation;
 pub mod localization;
 pub mod refinement;
-// What a person reads and writes.
-pub mod cli;
-pub mod commands;
-pub mod config;
-pub mod plotting;
-pub mod reporting;
+// The program.
+#[cfg(feature = "cli")]
+pub mod app;

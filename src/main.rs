@@ -3,8 +3,8 @@
 use std::process::ExitCode;
 
 use clap::Parser as _;
-use fpmcl::cli::Cli;
-use fpmcl::commands::{self, Context};
+use fpmcl::app::cli::Cli;
+use fpmcl::app::commands::{self, Context};
 
 fn main() -> ExitCode {
     let cli = Cli::parse();

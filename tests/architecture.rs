@@ -9,23 +9,20 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Each layer may import those before it; the modules of one layer do not know each other.
-const LAYERS: [&[&str]; 12] = [
+const LAYERS: [&[&str]; 9] = [
     &["geometry"],
     &["lidar"],
     &["raycasting"],
-    &["kitti", "ground", "meshing"],
+    &["recording", "ground", "meshing"],
     &["map"],
     &["rendering", "simulation"],
     &["registration"],
     &["localization", "refinement", "evaluation"],
-    &["plotting"],
-    &["reporting"],
-    &["config"],
-    &["cli", "commands", "main"],
+    &["app", "main"],
 ];
 
 /// Who belongs together on top and may see each other.
-const TOP: &[&str] = &["cli", "commands", "main"];
+const TOP: &[&str] = &["app", "main"];
 
 /// A text that only some files may contain, and why.
 struct Absence {
@@ -42,17 +39,17 @@ const ABSENCES: [Absence; 7] = [
     },
     Absence {
         words: &["plotters::", "use plotters"],
-        allowed: &["plotting"],
+        allowed: &["app/plotting"],
         reason: "drawing stays in plotting",
     },
     Absence {
         words: &["clap::", "use clap"],
-        allowed: &["cli.rs", "main.rs"],
+        allowed: &["app/cli.rs", "main.rs"],
         reason: "the command line stays in cli.rs and main.rs",
     },
     Absence {
         words: &["anyhow::", "use anyhow", "anyhow!"],
-        allowed: &["commands", "main.rs"],
+        allowed: &["app", "main.rs"],
         reason: "the library has typed errors",
     },
     Absence {
@@ -70,13 +67,13 @@ const ABSENCES: [Absence; 7] = [
             "OsRng",
             "SysRng",
         ],
-        allowed: &["commands"],
+        allowed: &["app/commands"],
         reason: "randomness that no seed gives, and printing, stay in commands",
     },
     Absence {
         words: &["SeedableRng", "seed_from_u64", "from_seed("],
         allowed: &[
-            "commands",
+            "app/commands",
             // Streets, drives and scans are made by many threads at once: every piece draws from
             // a stream of its own that follows from the seed, the purpose and the piece's number.
             "simulation/random.rs",
@@ -96,14 +93,7 @@ const ABSENCES: [Absence; 7] = [
             "NamedTempFile",
             "tempfile_in",
         ],
-        allowed: &[
-            "kitti",
-            "map/ply.rs",
-            "config",
-            "evaluation",
-            "plotting",
-            "commands",
-        ],
+        allowed: &["recording", "map/ply.rs", "evaluation", "app"],
         reason: "files are opened only at the edges",
     },
 ];
@@ -328,8 +318,8 @@ fn every_module_of_the_library_has_a_layer() {
 fn a_wrong_import_is_told_with_file_and_line() {
     let told = |path, text| layer_violations(&[source(path, text)]);
     assert_eq!(
-        told("kitti/poses.rs", "\nuse crate::ground::Fuzzy;\n"),
-        ["src/kitti/poses.rs:2: kitti may not know ground: use crate::ground::Fuzzy;"]
+        told("recording/poses.rs", "\nuse crate::ground::Fuzzy;\n"),
+        ["src/recording/poses.rs:2: recording may not know ground: use crate::ground::Fuzzy;"]
     );
     assert_eq!(
         told("map/mod.rs", "use crate::{lidar::Scan, rendering::X};").len(),
@@ -340,7 +330,7 @@ fn a_wrong_import_is_told_with_file_and_line() {
         1
     );
     assert!(told("rendering/mod.rs", "use crate::map::Tiles;").is_empty());
-    assert!(told("map/mod.rs", "// as crate::commands does\n").is_empty());
+    assert!(told("map/mod.rs", "// as crate::app::commands does\n").is_empty());
 }
 
 #[test]

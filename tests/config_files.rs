@@ -8,7 +8,7 @@ use std::fmt::Debug;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use fpmcl::config::{
+use fpmcl::app::config::{
     self, BuildMapConfig, Check, ComparisonConfig, EvaluationConfig, GroundConfig, Initialization,
     LocalizationConfig, RefinementConfig, RenderedRangeImage,
 };

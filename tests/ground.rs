@@ -8,7 +8,7 @@ use std::fs;
 use std::path::Path;
 
 use common::fpmcl;
-use fpmcl::kitti::velodyne::{read_labels, write_labels, write_scan};
+use fpmcl::recording::velodyne::{read_labels, write_labels, write_scan};
 use fpmcl::simulation::{LabelledScan, ScannerConfig, slope_scene};
 use tempfile::TempDir;
 

@@ -12,7 +12,7 @@ use fpmcl::ground::{
     FuzzyConfig, FuzzyGround, GroundClassifier, GroundScore, PcaGround, Protocol, RansacGround,
     ReportRule,
 };
-use fpmcl::kitti::velodyne::{read_labels, read_scan};
+use fpmcl::recording::velodyne::{read_labels, read_scan};
 
 /// The classifier's score on scans with odd numbers, which no parameter was fixed on.
 fn held_out_score(classifier: &dyn GroundClassifier) -> Option<GroundScore> {

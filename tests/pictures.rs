@@ -10,7 +10,7 @@ mod common;
 use std::path::Path;
 
 use common::picture::Picture;
-use fpmcl::plotting::color::{MCL, REFINED};
+use fpmcl::app::plotting::color::{MCL, REFINED};
 
 #[test]
 fn the_pictures_of_finished_runs_show_the_paths() {

@@ -11,10 +11,10 @@ use std::path::Path;
 use assert_cmd::Command;
 use common::Recording;
 use common::picture::Picture;
+use fpmcl::app::plotting::color::{MCL, REFINED, TRUTH};
 use fpmcl::evaluation::LocalizationResults;
-use fpmcl::kitti::Calibration;
-use fpmcl::kitti::poses::{CameraPoses, read_tum};
-use fpmcl::plotting::color::{MCL, REFINED, TRUTH};
+use fpmcl::recording::Calibration;
+use fpmcl::recording::poses::{CameraPoses, read_tum};
 use serde_json::Value;
 use tempfile::TempDir;
 

@@ -4,10 +4,10 @@
 
 use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
 use fpmcl::ground::GroundClassifier;
-use fpmcl::kitti::Frame;
-use fpmcl::kitti::velodyne::write_scan;
 use fpmcl::map::local_map::{self, LocalMapCounts, LocalMapSettings, Watcher};
 use fpmcl::map::plan::{self, Ownership};
+use fpmcl::recording::Frame;
+use fpmcl::recording::velodyne::write_scan;
 use fpmcl::simulation::{ScannerConfig, kerb_scene};
 
 /// As sure of every point of a scan as of the others: of small scans otherwise than of large.

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::results::LocalizationResults;
 use crate::geometry::{Pose2, planar};
-use crate::kitti::{Calibration, poses::CameraPoses};
+use crate::recording::{Calibration, poses::CameraPoses};
 
 /// The true lidar poses and the results of range-mcl; `None`, saying so, where they are absent.
 pub fn kitti_07() -> Option<(Vec<Pose2>, LocalizationResults)> {

@@ -20,7 +20,6 @@ pub mod range_mcl;
 pub mod smoothness;
 pub mod statistics;
 // What is told of it, and of many beside each other.
-pub mod comparison;
 pub mod frames;
 pub mod report;
 pub mod rows;

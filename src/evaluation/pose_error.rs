@@ -150,7 +150,7 @@ mod tests {
     use nalgebra::Vector3;
 
     use super::*;
-    use crate::kitti::poses::CameraPoses;
+    use crate::recording::poses::CameraPoses;
 
     /// Commands of evo 1.38.1 and what they print, run in the folder of the two trajectories.
     const EVO_ANSWERS: &str = include_str!("evo/answers.txt");

@@ -12,8 +12,8 @@ use super::vertex_ground;
 use super::visibility::{self, VisibilityConfig};
 use crate::geometry::{PointCloud, TriangleMesh};
 use crate::ground::GroundClassifier;
-use crate::kitti::{Frame, KittiError, velodyne};
 use crate::meshing::{self, MeshingError, PoissonConfig, Surface};
+use crate::recording::{Frame, KittiError, velodyne};
 
 /// Vertices that are gathered in neighbouring cells are less than two cells apart along an axis.
 const CELLS_PER_EDGE: f32 = 2.0;

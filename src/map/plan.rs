@@ -13,7 +13,7 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::Point2;
 
 use crate::geometry::Grid2;
-use crate::kitti::Frame;
+use crate::recording::Frame;
 
 /// Edge of the cells in which ownership is decided [m].
 const OWNER_CELL_M: f64 = 0.5;

@@ -21,8 +21,8 @@ use serde::Serialize;
 use super::scan_cloud::ScanSettings;
 use super::surface_distance::distances_m;
 use crate::geometry::{Rigid3f, TriangleMesh};
-use crate::kitti::{Frame, KittiError};
 use crate::raycasting::{Hit, Scene};
+use crate::recording::{Frame, KittiError};
 
 /// A residual beyond this is early or late [m].
 const GROSS_M: f32 = 0.5;

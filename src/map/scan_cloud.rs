@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::geometry::{PointCloud, Rigid3f};
 use crate::ground::GroundClassifier;
-use crate::kitti::{Frame, KittiError};
 use crate::lidar::normals::{NormalConfig, normals};
 use crate::lidar::{LidarModel, RangeImage};
+use crate::recording::{Frame, KittiError};
 
 /// What of a scan goes into the map.
 #[derive(Clone, Debug, PartialEq)]

@@ -8,8 +8,8 @@ use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 use super::plan::{Ownership, counted_frames, local_maps};
 use super::seam::{keep_own, on_border};
 use crate::geometry::{Pose3, TriangleMesh};
-use crate::kitti::Frame;
 use crate::raycasting::Scene;
+use crate::recording::Frame;
 
 const LOCAL_MAPS: usize = 4;
 

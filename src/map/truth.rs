@@ -19,8 +19,8 @@ use super::quality::NEAR_M;
 use super::scan_cloud::ScanSettings;
 use super::surface_distance::distances_m;
 use crate::geometry::{Rigid3f, TriangleMesh};
-use crate::kitti::Frame;
 use crate::raycasting::{Hit, Scene};
+use crate::recording::Frame;
 
 /// The truth is judged at one point per voxel of this edge [m].
 const VOXEL_M: f32 = 0.1;

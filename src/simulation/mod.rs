@@ -52,7 +52,7 @@ pub use street::{Street, StreetConfig};
 pub use traffic::{Traffic, TrafficConfig};
 
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
-use crate::kitti::Calibration;
+use crate::recording::Calibration;
 use random::{Purpose, stream};
 
 /// Shortest path that can be driven [m].

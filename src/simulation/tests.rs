@@ -35,7 +35,7 @@ fn kitti_07() -> Option<Vec<Pose3>> {
     let data = std::env::var_os("FPMCL_DATA")
         .map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from)
         .join("kitti-odometry-poses");
-    let poses = crate::kitti::poses::CameraPoses::read(&data.join("poses/07.txt"));
+    let poses = crate::recording::poses::CameraPoses::read(&data.join("poses/07.txt"));
     let calibration = Calibration::read(&data.join("sequences/07/calib.txt"));
     match (poses, calibration) {
         (Ok(poses), Ok(calibration)) => Some(poses.map_from_lidar(&calibration)),

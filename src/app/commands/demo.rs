@@ -1,0 +1,111 @@
+//! `demo`: all of it in one command, on a street that the program makes itself.
+
+use std::path::Path;
+use std::time::Instant;
+
+use anyhow::{Context as _, Result};
+
+use super::simulate::{self, Existing};
+use super::{Context, build_map, localize, refine};
+use crate::app::cli::DemoArgs;
+use crate::app::config::{BuildMapConfig, LocalizationConfig, OdometrySource, RefinementConfig};
+use crate::simulation::SimulationConfig;
+
+/// Frames per drive of a whole demonstration.
+const FRAMES: usize = 160;
+
+/// Simulates two drives through one street, maps it with the first, finds the car of the second in
+/// it, polishes and measures; returns the table for standard output.
+pub fn run(args: &DemoArgs, context: &Context) -> Result<String> {
+    let started = Instant::now();
+    let seed = args.seed.unwrap_or(1);
+    let street = args.output.join("street");
+    let drive = |number: u32| SimulationConfig {
+        output_folder: street.clone(),
+        seed,
+        drive: number,
+        n_scans: args.frames.map_or(FRAMES, usize::from) as i64,
+        ..SimulationConfig::default()
+    };
+    for number in [1, 2] {
+        tracing::info!("simulating drive {number}");
+        simulate::run_with_progress(&drive(number), Existing::Renew, context)
+            .context("while simulating")?;
+    }
+    let (first, second) = (drive(1).drive_folder(), drive(2).drive_folder());
+
+    tracing::info!("building the map from drive 1");
+    let map = build_map_config(&args.output, &first, seed);
+    let build = build_map::run(&map, context).context("while building the map")?;
+
+    tracing::info!("finding the car of drive 2 in it");
+    let localization = localization_config(&args.output, &map, &second, seed);
+    localize::run(&localization, context).context("while localizing")?;
+
+    tracing::info!("refining the trajectory");
+    let refinement = refinement_config(&localization);
+    let report = refine::run(&refinement, context).context("while refining")?;
+
+    Ok(format!(
+        "{}\n{}\n{:<24} {:>13.1} s\n{:<24} {}\n",
+        build.table(),
+        report.to_text(),
+        "all of it took",
+        started.elapsed().as_secs_f64(),
+        "pictures",
+        args.output.join("plots").display()
+    ))
+}
+
+fn build_map_config(output: &Path, drive: &Path, seed: u64) -> BuildMapConfig {
+    BuildMapConfig {
+        scan_folder: drive.join("velodyne"),
+        pose_file: drive.join("poses.txt"),
+        calib_file: drive.join("calib.txt"),
+        mesh_file: output.join("map.ply"),
+        holdout_step: 10,
+        seed,
+        force: true,
+        ..BuildMapConfig::default()
+    }
+}
+
+fn localization_config(
+    output: &Path,
+    map: &BuildMapConfig,
+    drive: &Path,
+    seed: u64,
+) -> LocalizationConfig {
+    LocalizationConfig {
+        scan_folder: drive.join("velodyne"),
+        pose_file: drive.join("poses.txt"),
+        calib_file: drive.join("calib.txt"),
+        map_file: map.mesh_file.clone(),
+        map_pose_file: map.pose_file.clone(),
+        map_calib_file: map.calib_file.clone(),
+        result_path: output.join("localization.npz"),
+        num_particles: 1000,
+        odometry: OdometrySource::File,
+        odometry_file: Some(drive.join("odometry.txt")),
+        seed,
+        force: true,
+        ..LocalizationConfig::default()
+    }
+}
+
+fn refinement_config(localization: &LocalizationConfig) -> RefinementConfig {
+    RefinementConfig {
+        scan_folder: localization.scan_folder.clone(),
+        pose_file: localization.pose_file.clone(),
+        calib_file: localization.calib_file.clone(),
+        map_file: localization.map_file.clone(),
+        map_pose_file: localization.map_pose_file.clone(),
+        map_calib_file: localization.map_calib_file.clone(),
+        result_file: localization.result_path.clone(),
+        odometry: localization.odometry,
+        odometry_file: localization.odometry_file.clone(),
+        seed: localization.seed,
+        force: true,
+        ..RefinementConfig::default()
+    }
+}

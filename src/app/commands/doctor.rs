@@ -1,0 +1,131 @@
+//! `doctor`: what this machine offers.
+
+use std::fmt::Write as _;
+use std::thread::available_parallelism;
+use std::time::{Duration, Instant};
+
+use super::{Context, output, stages};
+use crate::app::cli::DoctorArgs;
+use crate::lidar::LidarModel;
+use crate::map::{TileConfig, TileGrid, tiles};
+use crate::rendering::backend::{self, AdapterReport, Backend};
+use crate::simulation::{Simulation, SimulationConfig};
+
+/// Poses whose images are rendered at once, as many as the bench has.
+const POSES: usize = 8;
+
+/// Prints what this machine offers, line by line.
+pub(super) fn run(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
+    let choice = backend::choose(Backend::Auto)?;
+    let mut rows = vec![
+        ("fpmcl", env!("CARGO_PKG_VERSION").to_owned()),
+        ("system", system()),
+        ("instruction sets", instruction_sets()),
+        ("processors", processors()),
+        ("threads in use", context.threads.to_string()),
+        ("graphics support", graphics_support().to_owned()),
+    ];
+    rows.extend(choice.adapters.iter().map(|it| ("adapter", adapter(it))));
+    rows.push((
+        "backend auto",
+        format!("{}, because {}", choice.name, choice.reason),
+    ));
+    if args.measure > 0 {
+        let time = Duration::from_secs(args.measure);
+        rows.push(("rays", rays_per_second(time, context)?));
+    }
+    let mut table = String::new();
+    for (what, value) in rows {
+        writeln!(table, "{what:<18}{value}")?;
+    }
+    output::print(&table)
+}
+
+/// An adapter, its driver, and why it cannot be used if so.
+fn adapter(report: &AdapterReport) -> String {
+    let obstacle = report
+        .obstacle
+        .map(|obstacle| format!("; not usable: {obstacle}"));
+    format!(
+        "{report}, driver {}, {} MiB per binding, {} MiB per buffer, textures of {} pixels{}",
+        report.driver,
+        report.max_binding_bytes >> 20,
+        report.max_buffer_bytes >> 20,
+        report.max_texture_size,
+        obstacle.unwrap_or_default()
+    )
+}
+
+/// Images of the simulated street by the renderer that `auto` takes.
+fn rays_per_second(time: Duration, context: &Context) -> anyhow::Result<String> {
+    let simulation = Simulation::new(&SimulationConfig::default(), None)?;
+    let street = &simulation.street.mesh;
+    let (poses, model) = (simulation.poses(), LidarModel::default());
+    let grid = TileGrid::around(&poses, &TileConfig::default());
+    let renderer = stages::renderer(&tiles::cut(street, &grid), context)?;
+    let step = poses.len().div_ceil(POSES);
+    let poses: Vec<_> = poses.into_iter().step_by(step).collect();
+    let (start, mut rays) = (Instant::now(), 0);
+    while start.elapsed() < time {
+        renderer.render(&poses, &model)?;
+        rays += poses.len() * model.len();
+    }
+    Ok(format!(
+        "{:.2} M per second, images of {} x {} in a street of {} triangles by {}",
+        rays as f64 / start.elapsed().as_secs_f64() * 1e-6,
+        model.height,
+        model.width,
+        street.triangles.len(),
+        renderer.name()
+    ))
+}
+
+fn system() -> String {
+    format!("{} on {}", std::env::consts::OS, std::env::consts::ARCH)
+}
+
+fn processors() -> String {
+    available_parallelism().map_or_else(|_| "unknown".to_owned(), |count| count.to_string())
+}
+
+/// The vector instructions that the ray caster can use.
+fn instruction_sets() -> String {
+    let found: Vec<&str> = candidates()
+        .into_iter()
+        .filter_map(|(name, is_there)| is_there.then_some(name))
+        .collect();
+    if found.is_empty() {
+        "none that the ray caster uses".to_owned()
+    } else {
+        found.join(", ")
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+fn candidates() -> Vec<(&'static str, bool)> {
+    vec![
+        ("sse4.2", is_x86_feature_detected!("sse4.2")),
+        ("avx", is_x86_feature_detected!("avx")),
+        ("avx2", is_x86_feature_detected!("avx2")),
+        ("fma", is_x86_feature_detected!("fma")),
+        ("avx512f", is_x86_feature_detected!("avx512f")),
+    ]
+}
+
+#[cfg(target_arch = "aarch64")]
+fn candidates() -> Vec<(&'static str, bool)> {
+    vec![("neon", std::arch::is_aarch64_feature_detected!("neon"))]
+}
+
+#[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+fn candidates() -> Vec<(&'static str, bool)> {
+    Vec::new()
+}
+
+fn graphics_support() -> &'static str {
+    if cfg!(feature = "gpu") {
+        "built in"
+    } else {
+        "not built in; build with the feature gpu"
+    }
+}

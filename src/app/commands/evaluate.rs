@@ -1,0 +1,137 @@
+//! `evaluate`: how far a result is from the truth.
+
+use std::collections::BTreeMap;
+
+use anyhow::{Result, ensure};
+
+use super::input;
+use super::run_output::{self, RunFiles};
+use super::run_page;
+use crate::app::config::{self, EvaluationConfig, LocalizationConfig};
+use crate::evaluation::{LocalizationResults, RangeMclRules, Report};
+use crate::geometry::{Pose2, TriangleMesh, planar};
+use crate::map::ply;
+use crate::recording::Calibration;
+use crate::recording::poses::CameraPoses;
+
+/// Judges a result of `localize`, of `refine` or of range-mcl.
+pub fn run(config: &EvaluationConfig) -> Result<Report> {
+    input::require_file("result_file", &config.result_file)?;
+    let mut results = LocalizationResults::read(&config.result_file)?;
+    scale(&mut results, config.grid_resolution);
+    if results.ground_truth.is_none() {
+        results.ground_truth = Some(truth(config, &results)?);
+    } else {
+        tracing::info!(
+            "the ground truth in {} is used",
+            config.result_file.display()
+        );
+    }
+    let mut results = selected(results, config);
+    ensure!(
+        !results.is_empty(),
+        "no frame of {} is selected; check start_idx, n_scans and frame_step",
+        config.result_file.display()
+    );
+    let rules = RangeMclRules {
+        convergence_interval: config.convergence_interval,
+        converge_thres: config.converge_thres,
+        particle_select_ratio: config.particle_select_ratio,
+    };
+    if results.estimates.is_none() {
+        results.estimates = Some(rules.estimates(&results)?);
+    }
+    let files = RunFiles::beside(&config.result_file);
+    let report = run_output::judge(&results, &rules, about(config, &files)?)?;
+    if config.save_evaluation_results {
+        run_output::write_report(&files, &results, &report)?;
+        config::write(&files.file("evaluation.yml"), config)?;
+    }
+    if config.plot_loc_traj {
+        run_output::draw_run_on(&files, map_of(&files)?.as_ref(), &results)?;
+    }
+    if config.save_evaluation_results {
+        run_page::write(&files, &report)?;
+    }
+    Ok(report)
+}
+
+/// What the run said of itself, and what is judged.
+fn about(config: &EvaluationConfig, files: &RunFiles) -> Result<BTreeMap<String, String>> {
+    let told = files.file("report.json");
+    let mut about = if told.exists() {
+        Report::read_json(&told)?.about
+    } else {
+        BTreeMap::new()
+    };
+    let result = config.result_file.display().to_string();
+    about.insert("result".to_owned(), result);
+    Ok(about)
+}
+
+/// The map that the run was localized in, where its configuration names one that is still there.
+fn map_of(files: &RunFiles) -> Result<Option<TriangleMesh>> {
+    let effective = files.file("localization.yml");
+    if !effective.exists() {
+        return Ok(None);
+    }
+    let localized: LocalizationConfig = config::load(Some(&effective), &effective, &[])?;
+    if !localized.map_file.exists() {
+        tracing::info!(
+            "drawn without the map: {} is not there any more",
+            localized.map_file.display()
+        );
+        return Ok(None);
+    }
+    Ok(Some(ply::read(&localized.map_file)?))
+}
+
+/// Positions in metres, for results that are in cells.
+fn scale(results: &mut LocalizationResults, grid_resolution_m: f64) {
+    if grid_resolution_m == 1.0 {
+        return;
+    }
+    let columns = [&mut results.estimates, &mut results.refined];
+    for pose in columns.into_iter().flatten().flatten() {
+        pose.translation.vector *= grid_resolution_m;
+    }
+    results.particles.scale_positions(grid_resolution_m as f32);
+}
+
+/// The true poses of the frames of a result, in the frame of the recording's first pose.
+fn truth(config: &EvaluationConfig, results: &LocalizationResults) -> Result<Vec<Pose2>> {
+    input::require_file("pose_file", &config.pose_file)?;
+    input::require_file("calib_file", &config.calib_file)?;
+    let calibration = Calibration::read(&config.calib_file)?;
+    let poses = CameraPoses::read(&config.pose_file)?.map_from_lidar(&calibration);
+    let last = results.frames.last().copied().unwrap_or_default();
+    ensure!(
+        last < poses.len(),
+        "{} has {} poses, but the result reaches frame {last}; pose_file and result_file belong to different recordings",
+        config.pose_file.display(),
+        poses.len()
+    );
+    Ok(results
+        .frames
+        .iter()
+        .map(|&frame| planar(&poses[frame]))
+        .collect())
+}
+
+/// The frames that the configuration selects.
+fn selected(results: LocalizationResults, config: &EvaluationConfig) -> LocalizationResults {
+    let window = usize::try_from(config.n_scans).unwrap_or(usize::MAX);
+    let end = config.start_idx.saturating_add(window);
+    let rows: Vec<usize> = (0..results.len())
+        .filter(|&row| {
+            let frame = results.frames[row];
+            (config.start_idx..end).contains(&frame)
+        })
+        .step_by(config.frame_step)
+        .collect();
+    if rows.len() == results.len() {
+        results
+    } else {
+        results.rows(&rows)
+    }
+}

@@ -1,0 +1,88 @@
+//! One frame looked at closely.
+
+use anyhow::{Context as _, Result};
+
+use super::{FIRST_FRAME_STREAM, stream};
+use crate::app::commands::run_output::{self, RunFiles};
+use crate::app::commands::stages::LoadedMap;
+use crate::app::config::LocalizationConfig;
+use crate::app::plotting::color::{MCL, REFINED};
+use crate::geometry::{Pose3, planar};
+use crate::lidar::RangeImage;
+use crate::localization::likelihood::{Direction, View, profile};
+use crate::localization::observation::{Likelihood, ObservationConfig, choose_beams};
+use crate::map::Stance;
+use crate::recording::{Frame, Sequence};
+
+/// Draws one frame's range image beside the map's from the estimate.
+pub fn draw_example(
+    config: &LocalizationConfig,
+    files: &RunFiles,
+    map: &LoadedMap,
+    sequence: &Sequence,
+    lifted: &[Pose3],
+) -> Result<()> {
+    let row = lifted.len() / 2;
+    let model = config.range_image.model();
+    let scan = sequence.frames[row].read()?;
+    let observed = RangeImage::project(&scan.points, &model);
+    let rendered = map.renderer.render(&lifted[row..=row], &model)?;
+    let rendered = rendered.first().context("one pose gives one image")?;
+    run_output::draw_range_images(files, &observed, rendered, sequence.frames[row].number)?;
+    draw_likelihood(config, files, map, &sequence.frames[row], &observed)
+}
+
+/// Draws the likelihood around the true pose of a frame: ours and range-mcl's.
+fn draw_likelihood(
+    config: &LocalizationConfig,
+    files: &RunFiles,
+    map: &LoadedMap,
+    frame: &Frame,
+    scan: &RangeImage,
+) -> Result<()> {
+    let truth = planar(&frame.map_from_lidar);
+    let below_m = frame.map_from_lidar.translation.z - Stance::default().height_m;
+    let Some(patch) = map.ground.patch_under(&truth, Some(below_m)) else {
+        tracing::info!(
+            "frame {}: no ground below the true pose, no likelihood drawn",
+            frame.number
+        );
+        return Ok(());
+    };
+    let observation = &config.observation;
+    let stance = patch.stance_of(&frame.map_from_lidar);
+    let mut rng = stream(config.seed, FIRST_FRAME_STREAM);
+    let beams = choose_beams(
+        scan,
+        observation.beams,
+        observation.road_share,
+        &stance,
+        &mut rng,
+    );
+    let view = View {
+        renderer: &*map.renderer,
+        ground: &map.ground,
+        level_m: Some(patch.height_m),
+        stance,
+        beams: &beams,
+    };
+    let reference = ObservationConfig {
+        likelihood: Likelihood::Reference,
+        ..observation.clone()
+    };
+    let models = [
+        ("range-mcl", MCL, &reference),
+        ("this run", REFINED, observation),
+    ];
+    let mut panels = Vec::new();
+    for direction in Direction::ALL {
+        let profiles = models
+            .into_iter()
+            .map(|(name, color, model)| {
+                Ok((name, color, profile(&view, &truth, direction, model)?))
+            })
+            .collect::<Result<Vec<_>>>()?;
+        panels.push((direction, profiles));
+    }
+    run_output::draw_likelihood(files, frame.number, panels)
+}

@@ -1,0 +1,221 @@
+//! One file per subcommand; each `run` reads as a paragraph.
+
+// The subcommands, in the order of their use.
+pub mod build_map;
+mod compare;
+mod demo;
+mod doctor;
+pub mod evaluate;
+pub mod ground;
+pub mod localize;
+pub mod refine;
+pub mod simulate;
+// What they share.
+mod input;
+pub mod interrupt;
+mod logging;
+mod odometry;
+pub mod output;
+pub mod progress;
+mod run_output;
+mod run_page;
+mod stages;
+mod version;
+
+use std::io::Write as _;
+use std::path::Path;
+use std::process::ExitCode;
+
+use anyhow::Context as _;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::app::cli::{Command, MachineArgs, RunArgs, Verbosity};
+use crate::app::config::{
+    self, BuildMapConfig, Check, ConfigError, EvaluationConfig, LocalizationConfig,
+    RefinementConfig,
+};
+use crate::rendering::backend::Backend;
+use crate::simulation::SimulationConfig;
+use interrupt::{Interrupt, Interrupted};
+use logging::RunLog;
+use progress::Progress;
+
+/// What every command is given beside its configuration.
+#[derive(Clone, Debug)]
+pub struct Context {
+    /// Threads that share the work.
+    pub threads: usize,
+    /// What renders the map.
+    pub backend: Backend,
+    /// How much is said on standard error.
+    pub verbosity: Verbosity,
+    /// Whether the user wants to stop.
+    pub interrupt: Interrupt,
+    /// How far the work has come, for the user to see.
+    pub progress: Progress,
+    /// Where what is said is written down, too.
+    pub log: RunLog,
+}
+
+impl Context {
+    /// Starts logging, the threads and the handling of Ctrl-C; once per process.
+    pub fn new(verbosity: Verbosity, machine: MachineArgs) -> anyhow::Result<Self> {
+        let progress = Progress::new(verbosity);
+        let log = RunLog::default();
+        logging::start(verbosity, &progress, &log);
+        let threads = machine.threads.map_or(0, usize::from);
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build_global()
+            .context("starting the threads; choose fewer with --threads")?;
+        Ok(Self {
+            threads: rayon::current_num_threads(),
+            backend: machine.backend.into(),
+            verbosity,
+            interrupt: Interrupt::install().context("listening for Ctrl-C")?,
+            progress,
+            log,
+        })
+    }
+}
+
+/// Runs a command.
+pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
+    match command {
+        Command::BuildMap(args) => {
+            let config: BuildMapConfig = load(args, "config/build_map.yml")?;
+            output::print(&build_map::run(&config, context)?.table())
+        }
+        Command::Localize(args) => {
+            let config: LocalizationConfig = load(args, "config/localization.yml")?;
+            output::print(&localize::run(&config, context)?.to_text())
+        }
+        Command::Refine(args) => {
+            let config: RefinementConfig = load(args, "config/refinement.yml")?;
+            output::print(&refine::run(&config, context)?.to_text())
+        }
+        Command::Evaluate(args) => {
+            let config: EvaluationConfig = load(args, "config/evaluation.yml")?;
+            output::print(&evaluate::run(&config)?.to_text())
+        }
+        Command::Simulate(args) => {
+            let config: SimulationConfig = load(args, "config/simulation.yml")?;
+            let existing = match args.force {
+                true => simulate::Existing::Replace,
+                false => simulate::Existing::Keep,
+            };
+            output::print(&simulate::run_with_progress(&config, existing, context)?)
+        }
+        Command::Compare(args) => output::print(&compare::run(args, context)?),
+        Command::Demo(args) => output::print(&demo::run(args, context)?),
+        Command::Ground(args) => output::print(&ground::run(args, context)?),
+        Command::Doctor(args) => doctor::run(args, context),
+    }
+}
+
+/// Tells an error once, on standard error: what failed, then each cause that says more.
+pub fn report(error: &anyhow::Error) {
+    // Standard error may be closed; there is nowhere else to say so.
+    let _ = std::io::stderr().write_all(told(error).as_bytes());
+}
+
+/// 130 for an interrupted run, as shells have it, else 1; 2 is wrong usage.
+pub fn exit_code(error: &anyhow::Error) -> ExitCode {
+    ExitCode::from(if error.is::<Interrupted>() { 130 } else { 1 })
+}
+
+/// Loads the configuration of a command; `--seed` and `--force` count as the last settings of
+/// a configuration that has these keys.
+fn load<T>(args: &RunArgs, default_path: &str) -> Result<T, ConfigError>
+where
+    T: Check + Default + Serialize + DeserializeOwned,
+{
+    let mut settings = args.source.settings.clone();
+    for (key, value) in args.flags() {
+        if config::has_key::<T>(&key)? {
+            settings.push((key, value));
+        }
+    }
+    let path = args.source.config.as_deref();
+    config::load(path, Path::new(default_path), &settings)
+}
+
+/// The chain of an error without what was said already.
+fn told(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain() {
+        let cause = cause.to_string();
+        if text.contains(&cause) {
+            continue;
+        }
+        text.push_str(if text.is_empty() {
+            "error: "
+        } else {
+            "  because: "
+        });
+        text.push_str(&cause);
+        text.push('\n');
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser as _;
+
+    use super::*;
+    use crate::app::cli::Cli;
+    use crate::recording::KittiError;
+
+    fn loaded<T>(arguments: &[&str]) -> T
+    where
+        T: Check + Default + Serialize + DeserializeOwned,
+    {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("own.yml");
+        std::fs::write(&path, "").unwrap();
+        let start = ["fpmcl", "localize", path.to_str().unwrap()];
+        let Command::Localize(args) = Cli::parse_from(start.iter().chain(arguments)).command else {
+            unreachable!("it says localize")
+        };
+        load(&args, "").unwrap()
+    }
+
+    #[test]
+    fn flags_come_after_settings_and_pass_by_a_configuration_without_their_keys() {
+        let arguments = ["--seed", "7", "--set", "n_scans=5", "--force"];
+        let config: LocalizationConfig = loaded(&arguments);
+        assert_eq!((config.seed, config.n_scans, config.force), (7, 5, true));
+        let config: LocalizationConfig = loaded(&["--seed", "7", "--set", "seed=3"]);
+        assert_eq!(config.seed, 7);
+        let config: EvaluationConfig = loaded(&arguments);
+        assert_eq!(config.n_scans, 5);
+    }
+
+    #[test]
+    fn a_cause_is_told_once() {
+        let source = std::io::Error::new(std::io::ErrorKind::NotFound, "no such file");
+        let error = anyhow::Error::new(KittiError::Read {
+            path: "poses.txt".into(),
+            source,
+        })
+        .context("while building the map");
+        assert_eq!(
+            told(&error),
+            "error: while building the map\n  because: cannot read poses.txt: no such file\n"
+        );
+    }
+
+    #[test]
+    fn an_interrupted_run_has_an_exit_code_of_its_own() {
+        let interrupted = anyhow::Error::new(Interrupted {
+            kept: "12 scans are in results/map.ply".to_owned(),
+        });
+        assert_eq!(
+            exit_code(&interrupted.context("while building the map")),
+            ExitCode::from(130)
+        );
+        assert_eq!(exit_code(&anyhow::anyhow!("else")), ExitCode::from(1));
+    }
+}

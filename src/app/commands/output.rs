@@ -1,0 +1,135 @@
+//! Files that appear whole or not at all, and the table on standard output.
+
+use std::fs;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+use anyhow::{Context as _, bail};
+use serde::Serialize;
+
+use crate::app::config::new_file_beside;
+
+/// Makes sure, before any work is done, that `path` can be written: an existing file needs
+/// `--force`, and its folder is made and must take new files. `key` is the configuration key
+/// that names the file.
+pub fn prepare(path: &Path, key: &str, force: bool) -> anyhow::Result<()> {
+    if path.is_dir() {
+        bail!(
+            "{} is a folder; give {key} the name of a file",
+            path.display()
+        );
+    }
+    if path.exists() && !force {
+        bail!(
+            "{} exists; add --force to replace it, or choose another {key}",
+            path.display()
+        );
+    }
+    new_file_beside(path).map(drop).with_context(|| {
+        format!(
+            "{key} is {}, and nothing can be written there; choose another {key}",
+            path.display()
+        )
+    })
+}
+
+/// Writes a file under a temporary name beside `path` and renames it: whatever goes wrong,
+/// `path` is either as it was or complete.
+pub fn write_whole<E>(
+    path: &Path,
+    write: impl FnOnce(&mut BufWriter<&fs::File>) -> Result<(), E>,
+) -> anyhow::Result<()>
+where
+    E: Into<anyhow::Error>,
+{
+    let writing = || format!("writing {}", path.display());
+    let file = new_file_beside(path).with_context(writing)?;
+    let mut buffered = BufWriter::new(file.as_file());
+    write(&mut buffered)
+        .map_err(Into::into)
+        .with_context(writing)?;
+    buffered.flush().with_context(writing)?;
+    drop(buffered);
+    file.persist(path)
+        .map_err(|failed| failed.error)
+        .with_context(writing)?;
+    Ok(())
+}
+
+/// Lets `write` make a file under another name beside `path` and renames it, for writers that
+/// take a path: `path` is either as it was or complete.
+pub fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<()>) -> anyhow::Result<()> {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".part");
+    let part = path.with_file_name(name);
+    if let Err(error) = write(&part) {
+        // What is left of it is worth nothing, and may be what fills the disk.
+        let _ = fs::remove_file(&part);
+        return Err(error).with_context(|| format!("writing {}", path.display()));
+    }
+    fs::rename(&part, path).with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Writes a report as JSON, whole or not at all.
+pub fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
+    write_whole(path, |file| -> anyhow::Result<()> {
+        serde_json::to_writer_pretty(&mut *file, report)?;
+        Ok(writeln!(file)?)
+    })
+}
+
+/// Prints to standard output; a reader that has gone away is no error.
+pub fn print(text: &str) -> anyhow::Result<()> {
+    let mut stdout = io::stdout().lock();
+    match stdout
+        .write_all(text.as_bytes())
+        .and_then(|()| stdout.flush())
+    {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
+            Err(error).context("writing to standard output")
+        }
+        _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_is_replaced_whole_or_not_at_all() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("out.txt");
+        write_whole(&path, |file| file.write_all(b"first")).unwrap();
+        let failed = write_whole(&path, |file| {
+            file.write_all(b"second")?;
+            Err(io::Error::other("disk full"))
+        });
+        assert!(format!("{:#}", failed.unwrap_err()).contains("disk full"));
+        assert_eq!(fs::read(&path).unwrap(), b"first");
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn an_existing_file_needs_force() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.ply");
+        prepare(&path, "mesh_file", false).unwrap();
+        fs::write(&path, "kept").unwrap();
+        let message = prepare(&path, "mesh_file", false).unwrap_err().to_string();
+        assert!(message.contains("map.ply exists; add --force"), "{message}");
+        prepare(&path, "mesh_file", true).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"kept");
+    }
+
+    #[test]
+    fn a_folder_that_cannot_be_is_told_before_the_work() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("file");
+        fs::write(&file, "").unwrap();
+        let message = prepare(&file.join("map.ply"), "mesh_file", false)
+            .unwrap_err()
+            .to_string();
+        assert!(message.contains("choose another mesh_file"), "{message}");
+    }
+}

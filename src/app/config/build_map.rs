@@ -1,0 +1,271 @@
+//! `build-map`: from scans with poses to a triangle mesh.
+
+use std::path::PathBuf;
+
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+
+use super::blocks::own_car;
+use super::check::{
+    Check, Problem, at_least_one, nested, not_negative, path, positive, require, selection, share,
+    within,
+};
+use crate::ground::{FuzzyConfig, GroundMethod, PcaGround, RansacGround};
+use crate::lidar::normals::NormalConfig;
+use crate::lidar::{LidarModel, Spin};
+use crate::map::LocalMapSettings;
+use crate::map::confidence::ConfidenceConfig;
+use crate::map::scan_cloud::ScanSettings;
+use crate::map::visibility::VisibilityConfig;
+use crate::meshing::PoissonConfig;
+use crate::recording::Selection;
+
+/// The keys of range-mcl's `build_map.yml`, and below them new ones.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct BuildMapConfig {
+    /// Folder of the scans, `NNNNNN.bin`.
+    pub scan_folder: PathBuf,
+    /// Camera poses of the recording.
+    pub pose_file: PathBuf,
+    /// Calibration of the recording, with its line `Tr`.
+    pub calib_file: PathBuf,
+    /// Where the map is written.
+    pub mesh_file: PathBuf,
+    /// How many scans of the recording are looked at; -1 for all.
+    pub n_scans: i64,
+    /// Counted scans in a local map.
+    pub local_map_size: usize,
+    /// Whether the map is drawn from above.
+    pub visualize: bool,
+    /// Depth of the octree of the Poisson reconstruction.
+    pub depth: u32,
+    /// The share of vertices with the least density that is removed, unitless.
+    pub min_density: f64,
+    /// Edge of the voxels that scans are thinned with [m].
+    pub voxel_size: f64,
+    /// Half the crop box ahead and behind [m].
+    pub crop_x: f64,
+    /// Half the crop box to the sides [m].
+    pub crop_y: f64,
+    /// Half the crop box up and down [m].
+    pub crop_z: f64,
+    /// Largest distance of ground from the RANSAC plane [m].
+    pub distance_threshold: f64,
+    /// Points that a RANSAC plane is laid through.
+    pub ransac_n: usize,
+    /// RANSAC planes that are tried.
+    pub num_iterations: usize,
+    /// Edge of the cells that ground vertices are gathered in [m].
+    pub simplify_resolution: f64,
+    /// How often the ground is smoothed.
+    pub number_of_iterations: usize,
+    /// Red, green and blue of the ground, 0 to 1.
+    pub ground_color: [f64; 3],
+    /// Red, green and blue of everything else, 0 to 1.
+    pub rest_color: [f64; 3],
+    /// Size and limits of the range images that normals are computed in.
+    pub range_image: LidarModel,
+
+    /// First frame of the recording.
+    pub start_idx: usize,
+    /// Every how manieth frame is taken.
+    pub frame_step: usize,
+    /// A scan counts if the car moved farther than this since the last that counted [m].
+    pub displacement_threshold_m: f64,
+    /// How ground is told from the rest.
+    pub ground_method: GroundMethod,
+    /// Neighbouring local maps are meshed with this much of each other's path [m].
+    pub overlap_m: f64,
+    /// Every n-th counted scan is held back, and the map is judged along its beams; 0 for none.
+    pub holdout_step: usize,
+    /// Mesh of the true surface in the map frame, to measure accuracy and completeness with;
+    /// `street.ply` of a simulated drive is one.
+    pub truth_mesh: Option<PathBuf>,
+    /// Surface farther than this from every point was invented by the reconstruction and is
+    /// removed [m].
+    pub max_distance_m: f64,
+    /// A vertex is ground from this confidence on, unitless.
+    pub ground_threshold: f32,
+    /// The own car in the lidar frame: x_min, x_max, y_min, y_max [m].
+    pub own_car_m: [f32; 4],
+    /// How much each point counts in it. Off as it comes: it made no map better.
+    pub confidence: ConfidenceConfig,
+    /// Surface reconstruction, beside `depth`.
+    pub poisson: PoissonConfig,
+    /// How normals are found in range images.
+    pub normals: NormalConfig,
+    /// Free-space votes: what beams pass through is not there.
+    pub visibility: VisibilityConfig,
+    /// Sets and rules of `ground_method: fuzzy`.
+    pub fuzzy: FuzzyConfig,
+    /// `ground_method: pca`.
+    pub pca: PcaGround,
+    /// The sense in which the sensor spins, where the motion of the car during a scan is to be
+    /// compensated; not so for scans that are compensated already, as those of KITTI odometry.
+    pub motion_compensation: Option<Spin>,
+    /// What random choices follow from.
+    pub seed: u64,
+    /// Whether an existing map is replaced.
+    pub force: bool,
+}
+
+impl Default for BuildMapConfig {
+    /// The values of range-mcl.
+    fn default() -> Self {
+        let settings = LocalMapSettings::default();
+        Self {
+            scan_folder: "data/kitti/velodyne".into(),
+            pose_file: "data/kitti/poses.txt".into(),
+            calib_file: "data/kitti/calib.txt".into(),
+            mesh_file: "results/map.ply".into(),
+            n_scans: -1,
+            local_map_size: 100,
+            visualize: false,
+            depth: 9,
+            min_density: 0.1,
+            voxel_size: 0.1,
+            crop_x: 30.0,
+            crop_y: 30.0,
+            crop_z: 5.0,
+            distance_threshold: 0.3,
+            ransac_n: 3,
+            num_iterations: 100,
+            simplify_resolution: 1.0,
+            number_of_iterations: 1,
+            ground_color: [1.0, 0.0, 0.0],
+            rest_color: [0.0, 0.0, 1.0],
+            range_image: LidarModel::default(),
+            start_idx: 0,
+            frame_step: 1,
+            displacement_threshold_m: 0.2,
+            ground_method: GroundMethod::default(),
+            overlap_m: 5.0,
+            holdout_step: 0,
+            truth_mesh: None,
+            max_distance_m: f64::from(settings.max_distance_m),
+            ground_threshold: settings.ground_threshold,
+            own_car_m: settings.scan.own_car_m,
+            confidence: settings.confidence,
+            poisson: settings.poisson,
+            normals: settings.scan.normals,
+            visibility: settings.visibility,
+            fuzzy: FuzzyConfig::default(),
+            pca: PcaGround::default(),
+            motion_compensation: None,
+            seed: 0,
+            force: false,
+        }
+    }
+}
+
+impl BuildMapConfig {
+    /// The frames that the map is built from.
+    pub fn selection(&self) -> Selection {
+        Selection {
+            start_idx: self.start_idx,
+            n_scans: self.n_scans,
+            frame_step: self.frame_step,
+        }
+    }
+
+    /// How scans become local maps.
+    pub fn local_map_settings(&self) -> LocalMapSettings {
+        LocalMapSettings {
+            scan: ScanSettings {
+                range_image: self.range_image,
+                normals: self.normals,
+                voxel_size_m: self.voxel_size as f32,
+                crop_m: Vec3::new(self.crop_x as f32, self.crop_y as f32, self.crop_z as f32),
+                own_car_m: self.own_car_m,
+            },
+            confidence: self.confidence.clone(),
+            poisson: PoissonConfig {
+                depth: self.depth,
+                ..self.poisson.clone()
+            },
+            min_density: self.min_density,
+            max_distance_m: self.max_distance_m as f32,
+            visibility: self.visibility.clone(),
+            ground_threshold: self.ground_threshold,
+            simplify_resolution_m: self.simplify_resolution as f32,
+            smoothing_iterations: self.number_of_iterations,
+            ground_color: bytes(self.ground_color),
+            rest_color: bytes(self.rest_color),
+        }
+    }
+
+    /// The plane of `ground_method: ransac`.
+    pub fn ransac(&self) -> RansacGround {
+        RansacGround {
+            distance_threshold: self.distance_threshold as f32,
+            ransac_n: self.ransac_n,
+            num_iterations: self.num_iterations,
+            seed: self.seed,
+        }
+    }
+}
+
+fn bytes(rgb: [f64; 3]) -> [u8; 3] {
+    rgb.map(|share| (255.0 * share).round() as u8)
+}
+
+impl Check for BuildMapConfig {
+    fn check(&self) -> Result<(), Problem> {
+        path("scan_folder", &self.scan_folder)?;
+        path("pose_file", &self.pose_file)?;
+        path("calib_file", &self.calib_file)?;
+        path("mesh_file", &self.mesh_file)?;
+        selection(self.n_scans, self.frame_step)?;
+        at_least_one("local_map_size", self.local_map_size)?;
+        within("depth", self.depth, 3..=12)?;
+        require(
+            (0.0..1.0).contains(&self.min_density),
+            "min_density",
+            self.min_density,
+            "it is the share of vertices to remove, 0 or greater and less than 1",
+        )?;
+        positive("voxel_size", self.voxel_size)?;
+        positive("crop_x", self.crop_x)?;
+        positive("crop_y", self.crop_y)?;
+        positive("crop_z", self.crop_z)?;
+        positive("distance_threshold", self.distance_threshold)?;
+        require(
+            self.ransac_n >= 3,
+            "ransac_n",
+            self.ransac_n,
+            "a plane needs 3 points or more",
+        )?;
+        at_least_one("num_iterations", self.num_iterations)?;
+        positive("simplify_resolution", self.simplify_resolution)?;
+        color("ground_color", self.ground_color)?;
+        color("rest_color", self.rest_color)?;
+        not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
+        not_negative("overlap_m", self.overlap_m)?;
+        positive("max_distance_m", self.max_distance_m)?;
+        share("ground_threshold", self.ground_threshold)?;
+        own_car("own_car_m", self.own_car_m)?;
+        nested("confidence", self.confidence.check())?;
+        nested("poisson", self.poisson.check())?;
+        nested("normals", self.normals.check())?;
+        nested("visibility", self.visibility.check())?;
+        nested("fuzzy", self.fuzzy.check())?;
+        nested("pca", self.pca.check())?;
+        require(
+            self.holdout_step != 1,
+            "holdout_step",
+            self.holdout_step,
+            "1 holds every scan back; 0 holds none, 10 every tenth",
+        )?;
+        nested("range_image", self.range_image.check())
+    }
+}
+
+fn color(key: &str, rgb: [f64; 3]) -> Result<(), Problem> {
+    require(
+        rgb.iter().all(|share| (0.0..=1.0).contains(share)),
+        key,
+        format_args!("{rgb:?}"),
+        "red, green and blue must lie between 0 and 1",
+    )
+}
