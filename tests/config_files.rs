@@ -9,8 +9,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use fpmcl::app::config::{
-    self, BuildMapConfig, Check, ComparisonConfig, EvaluationConfig, GroundConfig, Initialization,
-    LocalizationConfig, RefinementConfig, RenderedRangeImage,
+    self, BuildMapConfig, Check, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
+    Initialization, LocalizationConfig, RefinementConfig, RenderedRangeImage,
 };
 use fpmcl::simulation::SimulationConfig;
 use serde::Serialize;
@@ -53,7 +53,7 @@ fn keys_of(path: &Path) -> BTreeSet<String> {
         "comparison.yml" | "comparison_kitti.yml" | "comparison_refiners.yml" => {
             round_trip::<ComparisonConfig>(path)
         }
-        "ground.yml" => round_trip::<GroundConfig>(path),
+        "ground.yml" => round_trip::<GroundCommandConfig>(path),
         _ => panic!("{} belongs to no command", path.display()),
     }
 }
@@ -196,7 +196,7 @@ fn the_delivered_files_say_what_the_defaults_say() {
         EvaluationConfig::default()
     );
     assert_eq!(
-        load::<GroundConfig>(&config("ground.yml")),
-        GroundConfig::default()
+        load::<GroundCommandConfig>(&config("ground.yml")),
+        GroundCommandConfig::default()
     );
 }

@@ -6,7 +6,7 @@ use std::fmt;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use super::GroundClassifier;
+use super::classifier::GroundClassifier;
 use super::features::{FeatureConfig, Features, Scene};
 use super::inference::{FuzzySystem, Inference};
 use super::membership::{Membership, Operators};

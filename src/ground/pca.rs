@@ -7,7 +7,7 @@
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use super::GroundClassifier;
+use super::classifier::GroundClassifier;
 use super::features::surface_normals;
 use crate::geometry::PlaneSums;
 

@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::GroundClassifier;
+use super::classifier::GroundClassifier;
 use crate::geometry::PlaneSums;
 
 /// Ground by the dominant plane.

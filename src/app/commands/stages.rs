@@ -5,7 +5,6 @@ use std::path::Path;
 use anyhow::{Context as _, Result, ensure};
 
 use super::{Context, input};
-use crate::app::config::BuildMapConfig;
 use crate::geometry::{Pose3, TriangleMesh, Vec3};
 use crate::ground::{GroundClassifier, road_plane};
 use crate::lidar::{LidarModel, RangeImage};
@@ -20,14 +19,6 @@ use crate::rendering::{Batched, CpuRenderer, RangeRenderer};
 
 /// Edge of the cells of the ground's elevation [m].
 const GROUND_CELL_M: f64 = 0.5;
-
-/// The classifier that a configuration names.
-pub fn ground_classifier(config: &BuildMapConfig) -> Result<Box<dyn GroundClassifier>> {
-    let classifier = config
-        .ground_method
-        .classifier(&config.fuzzy, &config.pca, &config.ransac());
-    classifier.context("fuzzy: the rules of the ground")
-}
 
 /// What localize and refine read: a map with the poses that it was built with, and a recording.
 pub struct Inputs<'a> {

@@ -10,7 +10,7 @@ use super::check::{
     Check, Problem, at_least_one, nested, not_negative, path, positive, require, selection, share,
     within,
 };
-use crate::ground::{FuzzyConfig, GroundMethod, PcaGround, RansacGround};
+use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::lidar::normals::NormalConfig;
 use crate::lidar::{LidarModel, Spin};
 use crate::map::LocalMapSettings;
@@ -195,13 +195,18 @@ impl BuildMapConfig {
         }
     }
 
-    /// The plane of `ground_method: ransac`.
-    pub fn ransac(&self) -> RansacGround {
-        RansacGround {
-            distance_threshold: self.distance_threshold as f32,
-            ransac_n: self.ransac_n,
-            num_iterations: self.num_iterations,
-            seed: self.seed,
+    /// The ground classifier and its parameters.
+    pub fn ground(&self) -> GroundConfig {
+        GroundConfig {
+            method: self.ground_method,
+            fuzzy: self.fuzzy.clone(),
+            pca: self.pca,
+            ransac: RansacGround {
+                distance_threshold: self.distance_threshold as f32,
+                ransac_n: self.ransac_n,
+                num_iterations: self.num_iterations,
+                seed: self.seed,
+            },
         }
     }
 }

@@ -5,13 +5,13 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::check::{Check, Problem, nested, path, positive, require, selection, within};
-use crate::ground::{FuzzyConfig, GroundMethod, PcaGround, RansacGround};
+use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::recording::Selection;
 
 /// What `ground` reads, how it judges and what it writes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct GroundConfig {
+pub struct GroundCommandConfig {
     /// Folder of the scans, `NNNNNN.bin`.
     pub scan_folder: PathBuf,
     /// Folder of their true classes, `NNNNNN.label`; null: `labels` beside the scans, if it is
@@ -47,7 +47,7 @@ pub struct GroundConfig {
     pub force: bool,
 }
 
-impl Default for GroundConfig {
+impl Default for GroundCommandConfig {
     fn default() -> Self {
         Self {
             scan_folder: "data/kitti/velodyne".into(),
@@ -70,7 +70,7 @@ impl Default for GroundConfig {
     }
 }
 
-impl GroundConfig {
+impl GroundCommandConfig {
     /// The frames that are judged.
     pub fn selection(&self) -> Selection {
         Selection {
@@ -79,9 +79,19 @@ impl GroundConfig {
             frame_step: self.frame_step,
         }
     }
+
+    /// The ground classifier and its parameters.
+    pub fn ground(&self) -> GroundConfig {
+        GroundConfig {
+            method: self.ground_method,
+            fuzzy: self.fuzzy.clone(),
+            pca: self.pca,
+            ransac: self.ransac,
+        }
+    }
 }
 
-impl Check for GroundConfig {
+impl Check for GroundCommandConfig {
     fn check(&self) -> Result<(), Problem> {
         path("scan_folder", &self.scan_folder)?;
         path("output_folder", &self.output_folder)?;

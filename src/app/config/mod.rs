@@ -35,7 +35,7 @@ pub use comparison::{
 };
 pub use error::{ConfigError, Place};
 pub use evaluation::EvaluationConfig;
-pub use ground::GroundConfig;
+pub use ground::GroundCommandConfig;
 pub use localization::{
     Initialization, LocalizationConfig, MotionModel, OdometrySource, RenderedRangeImage,
 };

@@ -48,7 +48,7 @@ fn every_default_configuration_passes_its_own_check() {
     LocalizationConfig::default().check().unwrap();
     RefinementConfig::default().check().unwrap();
     EvaluationConfig::default().check().unwrap();
-    GroundConfig::default().check().unwrap();
+    GroundCommandConfig::default().check().unwrap();
 }
 
 #[test]

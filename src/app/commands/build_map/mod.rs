@@ -15,7 +15,7 @@ use self::parts::Parts;
 pub use self::report::BuildReport;
 use super::interrupt::Interrupted;
 use super::version;
-use super::{Context, input, output, stages};
+use super::{Context, input, output};
 use crate::app::config::{self, BuildMapConfig};
 use crate::app::plotting::color::Colormap;
 use crate::app::plotting::{MapPlot, ScalarMapPlot};
@@ -105,7 +105,10 @@ fn build_parts(
     clock: &StageClock,
 ) -> Result<Vec<LocalMapCounts>> {
     let settings = config.local_map_settings();
-    let classifier = stages::ground_classifier(config)?;
+    let classifier = config
+        .ground()
+        .classifier()
+        .context("cannot build the ground classifier")?;
     let reach_m = f64::from(settings.scan.crop_m.length());
     let ownership = Ownership::new(frames, plans, reach_m);
     let scans = plans.iter().map(|plan| plan.used.len()).sum();

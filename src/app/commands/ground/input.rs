@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail, ensure};
 
 use crate::app::cli::GroundArgs;
-use crate::app::config::{self, GroundConfig};
+use crate::app::config::{self, GroundCommandConfig};
 use crate::geometry::Vec3;
 use crate::recording::sequence::selected_scans;
 use crate::recording::velodyne;
@@ -43,7 +43,7 @@ pub struct LabelledPoints {
 }
 
 /// The configuration, with the input of the command line in it, and what is to be judged.
-pub fn load(args: &GroundArgs) -> Result<(GroundConfig, Source)> {
+pub fn load(args: &GroundArgs) -> Result<(GroundCommandConfig, Source)> {
     let mut settings = args.settings.clone();
     if args.force {
         settings.push(("force".to_owned(), "true".to_owned()));
@@ -60,7 +60,7 @@ pub fn load(args: &GroundArgs) -> Result<(GroundConfig, Source)> {
     let input = args.input.as_ref().filter(|path| !is_config(path));
     let default = Path::new(DEFAULT_CONFIG);
     let needs_none = input.is_some() || args.simulated;
-    let mut config: GroundConfig = match own.or(args.config.as_ref()) {
+    let mut config: GroundCommandConfig = match own.or(args.config.as_ref()) {
         None if needs_none && !default.exists() => config::defaults(&settings)?,
         path => config::load(path.map(PathBuf::as_path), default, &settings)?,
     };
@@ -97,7 +97,7 @@ impl Source {
     }
 
     /// The selected scans in order.
-    pub fn scans(&self, config: &GroundConfig) -> Result<Vec<ScanFiles>> {
+    pub fn scans(&self, config: &GroundCommandConfig) -> Result<Vec<ScanFiles>> {
         let folder = match self {
             Self::Scan(path) => {
                 let label_path = label_path(path, config.label_folder.as_deref(), None);
@@ -176,7 +176,7 @@ fn label_path(
 }
 
 /// Refuses to write labels over the true ones.
-pub fn keep_truth_safe(config: &GroundConfig, source: &Source) -> Result<()> {
+pub fn keep_truth_safe(config: &GroundCommandConfig, source: &Source) -> Result<()> {
     let written = config.output_folder.join("labels");
     let truth: Vec<PathBuf> = source
         .scans(config)?

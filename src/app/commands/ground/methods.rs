@@ -7,7 +7,7 @@ use anyhow::{Context as _, Result};
 use serde::Serialize;
 
 use super::input::LabelledPoints;
-use crate::app::config::GroundConfig;
+use crate::app::config::GroundCommandConfig;
 use crate::ground::{
     FuzzyConfig, FuzzyGround, GroundClassifier, GroundMethod, GroundScore, Protocol, ReportRule,
 };
@@ -73,7 +73,7 @@ impl Scores {
 }
 
 /// The chosen method first, then the others.
-pub fn all(config: &GroundConfig) -> Result<Vec<Method>> {
+pub fn all(config: &GroundCommandConfig) -> Result<Vec<Method>> {
     let fuzzy = |config: FuzzyConfig| -> Result<Box<dyn GroundClassifier>> {
         let classifier = FuzzyGround::new(config).context("fuzzy: the rules of the ground")?;
         Ok(Box::new(classifier))
@@ -223,9 +223,9 @@ mod tests {
             (GroundMethod::Pca, "PCA"),
             (GroundMethod::Ransac, "RANSAC plane"),
         ] {
-            let config = GroundConfig {
+            let config = GroundCommandConfig {
                 ground_method,
-                ..GroundConfig::default()
+                ..GroundCommandConfig::default()
             };
             let names: Vec<&str> = all(&config).unwrap().iter().map(|m| m.name).collect();
             assert_eq!((names[0], names.len()), (first, 5));

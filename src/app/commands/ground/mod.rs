@@ -28,7 +28,7 @@ use self::methods::{Method, MethodReport, Tally, tally_table};
 use super::interrupt::Interrupted;
 use super::{Context, output};
 use crate::app::cli::GroundArgs;
-use crate::app::config::{self, GroundConfig};
+use crate::app::config::{self, GroundCommandConfig};
 use crate::app::plotting::color::Colormap;
 use crate::geometry::Vec3;
 use crate::ground::{FuzzyGround, GroundMethod};
@@ -70,7 +70,7 @@ pub fn run(args: &GroundArgs, context: &Context) -> Result<String> {
 }
 
 /// Why the point nearest to a position has its confidence.
-fn explain(config: &GroundConfig, source: &Source, position: Vec3) -> Result<String> {
+fn explain(config: &GroundCommandConfig, source: &Source, position: Vec3) -> Result<String> {
     let scan_file = match source {
         Source::Scan(path) => path,
         Source::Folder(folder) => anyhow::bail!(
@@ -115,7 +115,7 @@ fn explain(config: &GroundConfig, source: &Source, position: Vec3) -> Result<Str
 }
 
 /// Judges all scans of a source.
-fn judge(config: &GroundConfig, source: &Source, context: &Context) -> Result<GroundReport> {
+fn judge(config: &GroundCommandConfig, source: &Source, context: &Context) -> Result<GroundReport> {
     let scans = source.scans(config)?;
     let report_file = config.output_folder.join("ground.json");
     output::prepare(&report_file, "output_folder", config.force)?;
@@ -188,7 +188,7 @@ fn judge_scan(
 
 /// Writes what is to be written of a scan.
 fn write_scan(
-    config: &GroundConfig,
+    config: &GroundCommandConfig,
     name: &Path,
     scan: &LabelledPoints,
     confidences: &[f32],
@@ -221,7 +221,12 @@ fn write_scan(
 }
 
 /// A file of a scan in the output folder; its folder is made.
-fn output_path(config: &GroundConfig, kind: &str, name: &Path, extension: &str) -> Result<PathBuf> {
+fn output_path(
+    config: &GroundCommandConfig,
+    kind: &str,
+    name: &Path,
+    extension: &str,
+) -> Result<PathBuf> {
     let path = config
         .output_folder
         .join(kind)
@@ -232,7 +237,7 @@ fn output_path(config: &GroundConfig, kind: &str, name: &Path, extension: &str) 
     Ok(path)
 }
 
-fn fuzzy(config: &GroundConfig) -> Result<FuzzyGround> {
+fn fuzzy(config: &GroundCommandConfig) -> Result<FuzzyGround> {
     FuzzyGround::new(config.fuzzy.clone()).context("fuzzy: the rules of the ground")
 }
 

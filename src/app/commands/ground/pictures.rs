@@ -6,7 +6,7 @@ use anyhow::Result;
 
 use super::input::LabelledPoints;
 use super::methods::score;
-use crate::app::config::GroundConfig;
+use crate::app::config::GroundCommandConfig;
 use crate::app::plotting::color::SERIES;
 use crate::app::plotting::{GroundPlot, LineChart, Panel, Series};
 use crate::ground::{Features, FuzzyGround, Protocol};
@@ -56,7 +56,7 @@ fn name_with_unit(variable: &str) -> String {
 
 /// Draws a scan from above.
 pub fn draw_scan(
-    config: &GroundConfig,
+    config: &GroundCommandConfig,
     name: &Path,
     scan: &LabelledPoints,
     confidences: &[f32],

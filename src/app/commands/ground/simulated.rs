@@ -9,7 +9,7 @@ use super::input::LabelledPoints;
 use super::methods::{self, Method, score};
 use crate::app::commands::Context;
 use crate::app::commands::interrupt::Interrupted;
-use crate::app::config::GroundConfig;
+use crate::app::config::GroundCommandConfig;
 use crate::ground::{GroundScore, Protocol};
 use crate::simulation::{
     LabelledScan, ScannerConfig, Simulation, SimulationConfig, crest_scene, kerb_scene, slope_scene,
@@ -29,7 +29,7 @@ struct Scene {
 }
 
 /// The table for standard output.
-pub fn run(config: &GroundConfig, context: &Context) -> Result<String> {
+pub fn run(config: &GroundCommandConfig, context: &Context) -> Result<String> {
     let methods = methods::all(config)?;
     let scenes = scenes();
     let task = context.progress.task("ground", scenes.len());
