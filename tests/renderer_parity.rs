@@ -12,10 +12,9 @@ use std::path::{Path, PathBuf};
 
 use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
 use fpmcl::lidar::{Beam, LidarModel, RangeImage};
-use fpmcl::rendering::backend::AdapterChoice;
 use fpmcl::rendering::cpu::CpuRenderer;
 use fpmcl::rendering::gpu::{GpuRenderer, ImageMethod};
-use fpmcl::rendering::{RangeDifference, RangeRenderer, RenderError};
+use fpmcl::rendering::{Backend, RangeDifference, RangeRenderer, RenderError};
 
 use brute_force::{BruteForce, room, street};
 
@@ -27,7 +26,7 @@ const METHODS: [ImageMethod; 2] = [ImageMethod::Cast, ImageMethod::Draw];
     reason = "a test that did not run must not look like one that did"
 )]
 fn renderer(tiles: &[TriangleMesh]) -> Option<GpuRenderer> {
-    match GpuRenderer::new(tiles, AdapterChoice::Any) {
+    match GpuRenderer::new(tiles, Backend::Gpu) {
         Ok(renderer) => Some(renderer),
         Err(RenderError::NoAdapter) => {
             let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|value| value == "1");

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
 
 use crate::app::comparison::RunId;
-use crate::rendering::backend::Backend;
+use crate::rendering::Backend;
 
 /// Finds a car's pose to the centimetre from one spinning LiDAR and a mesh map that it builds itself.
 #[derive(Clone, Debug, Parser)]

@@ -8,9 +8,12 @@ pub mod batched;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;
+pub mod selection;
 
+pub use backend::Backend;
 pub use batched::Batched;
 pub use cpu::CpuRenderer;
+pub use selection::renderer;
 #[cfg(test)]
 pub(crate) mod test_world;
 

@@ -4,11 +4,12 @@ use std::fmt::Write as _;
 use std::thread::available_parallelism;
 use std::time::{Duration, Instant};
 
-use super::{Context, output, stages};
+use super::{Context, output};
 use crate::app::cli::DoctorArgs;
 use crate::lidar::LidarModel;
 use crate::map::{TileConfig, TileGrid, tiles};
-use crate::rendering::backend::{self, AdapterReport, Backend};
+use crate::rendering::backend::AdapterReport;
+use crate::rendering::{Backend, renderer, selection};
 use crate::simulation::{Simulation, SimulationConfig};
 
 /// Poses whose images are rendered at once, as many as the bench has.
@@ -16,7 +17,7 @@ const POSES: usize = 8;
 
 /// Prints what this machine offers, line by line.
 pub(super) fn run(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
-    let choice = backend::choose(Backend::Auto)?;
+    let choice = selection::choose(Backend::Auto)?;
     let mut rows = vec![
         ("fpmcl", env!("CARGO_PKG_VERSION").to_owned()),
         ("system", system()),
@@ -28,7 +29,7 @@ pub(super) fn run(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
     rows.extend(choice.adapters.iter().map(|it| ("adapter", adapter(it))));
     rows.push((
         "backend auto",
-        format!("{}, because {}", choice.name, choice.reason),
+        format!("{}, because {}", choice.name(), choice.reason),
     ));
     if args.measure > 0 {
         let time = Duration::from_secs(args.measure);
@@ -62,7 +63,7 @@ fn rays_per_second(time: Duration, context: &Context) -> anyhow::Result<String> 
     let street = &simulation.street.mesh;
     let (poses, model) = (simulation.poses(), LidarModel::default());
     let grid = TileGrid::around(&poses, &TileConfig::default());
-    let renderer = stages::renderer(&tiles::cut(street, &grid), context)?;
+    let renderer = renderer(&tiles::cut(street, &grid), context.backend)?;
     let step = poses.len().div_ceil(POSES);
     let poses: Vec<_> = poses.into_iter().step_by(step).collect();
     let (start, mut rays) = (Instant::now(), 0);

@@ -35,7 +35,7 @@ use crate::app::config::{
     self, BuildMapConfig, Check, ConfigError, EvaluationConfig, LocalizationConfig,
     RefinementConfig,
 };
-use crate::rendering::backend::Backend;
+use crate::rendering::Backend;
 use crate::simulation::SimulationConfig;
 use interrupt::{Interrupt, Interrupted};
 use logging::RunLog;

@@ -10,12 +10,7 @@ use crate::ground::{GroundClassifier, road_plane};
 use crate::lidar::{LidarModel, RangeImage};
 use crate::map::{GroundMap, Stance, TileConfig, TileGrid, ply, tiles};
 use crate::recording::{Frame, KittiError, MapFrame, Sequence};
-#[cfg(feature = "gpu")]
-use crate::rendering::backend::AdapterChoice;
-use crate::rendering::backend::{self, Backend, Target};
-#[cfg(feature = "gpu")]
-use crate::rendering::gpu::GpuRenderer;
-use crate::rendering::{Batched, CpuRenderer, RangeRenderer};
+use crate::rendering::{Batched, RangeRenderer, renderer};
 
 /// Edge of the cells of the ground's elevation [m].
 const GROUND_CELL_M: f64 = 0.5;
@@ -82,7 +77,7 @@ impl LoadedMap {
         );
         let grid = TileGrid::around(&mapping_poses, &TileConfig::default());
         let ground = ground_of(&mesh);
-        let mut renderer = renderer(&tiles::cut(&mesh, &grid), context)?;
+        let mut renderer = renderer(&tiles::cut(&mesh, &grid), context.backend)?;
         if let Some(max_poses) = batch {
             renderer = Box::new(Batched {
                 renderer,
@@ -138,33 +133,6 @@ fn ground_of(mesh: &TriangleMesh) -> GroundMap {
     let is_level =
         |triangle: usize| mesh.scaled_normal(triangle).normalize_or_zero().z.abs() > 0.97;
     GroundMap::from_mesh(mesh, is_level, GROUND_CELL_M)
-}
-
-/// The renderer that the user asks for.
-pub(super) fn renderer(
-    tiles: &[TriangleMesh],
-    context: &Context,
-) -> Result<Box<dyn RangeRenderer>> {
-    let choice = backend::choose(context.backend)?;
-    tracing::info!("rendering on {} because {}", choice.name, choice.reason);
-    match choice.target {
-        Target::Cpu => Ok(Box::new(CpuRenderer::new(tiles))),
-        Target::Gpu(_) => on_graphics_adapter(tiles, context.backend),
-    }
-}
-
-#[cfg(feature = "gpu")]
-fn on_graphics_adapter(tiles: &[TriangleMesh], wanted: Backend) -> Result<Box<dyn RangeRenderer>> {
-    let adapters = match wanted {
-        Backend::Gpu => AdapterChoice::Any,
-        Backend::Auto | Backend::Cpu => AdapterChoice::Hardware,
-    };
-    Ok(Box::new(GpuRenderer::new(tiles, adapters)?))
-}
-
-#[cfg(not(feature = "gpu"))]
-fn on_graphics_adapter(_: &[TriangleMesh], _: Backend) -> Result<Box<dyn RangeRenderer>> {
-    Err(crate::rendering::RenderError::NoAdapter.into())
 }
 
 /// Makes scans into observations.

@@ -13,7 +13,7 @@ use wgpu::{Buffer, BufferUsages};
 
 use super::batches::BatchSizes;
 use crate::rendering::RenderError;
-use crate::rendering::backend::{self, AdapterChoice, AdapterKind, AdapterReport};
+use crate::rendering::backend::{AdapterKind, AdapterReport, Backend, best_adapter};
 
 /// After this long a batch is taken for lost; each is meant to take a fraction of a second.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -113,11 +113,11 @@ pub(super) struct Gpu {
 }
 
 impl Gpu {
-    /// Opens the best adapter that may be taken, with all that it can bind.
-    pub fn open(choice: AdapterChoice) -> Result<Self, RenderError> {
+    /// Opens the best adapter that the backend allows, with all that it can bind.
+    pub fn open(backend: Backend) -> Result<Self, RenderError> {
         let adapters = found_adapters();
         let reports: Vec<AdapterReport> = adapters.iter().map(report).collect();
-        let index = backend::best(&reports, choice).ok_or(RenderError::NoAdapter)?;
+        let index = best_adapter(&reports, backend).ok_or(RenderError::NoAdapter)?;
         let (adapter, report) = (&adapters[index], reports[index].clone());
         let limits = adapter.limits();
         let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {

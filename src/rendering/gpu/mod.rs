@@ -26,7 +26,7 @@ mod raster;
 mod scene;
 mod shaders;
 
-use super::backend::{AdapterChoice, AdapterReport};
+use super::backend::{AdapterReport, Backend};
 use super::{RangeDifference, RangeRenderer, RenderError};
 use crate::geometry::{Pose3, TriangleMesh, Vec3};
 use crate::lidar::{Beam, LidarModel};
@@ -57,13 +57,13 @@ pub struct GpuRenderer {
 }
 
 impl GpuRenderer {
-    /// Opens the best adapter that may be taken and sends it the map.
+    /// Opens the best adapter that the backend allows and uploads the map.
     ///
     /// # Errors
-    /// [`RenderError::NoAdapter`] where none may be taken, [`RenderError::MapTooLarge`] where the
+    /// [`RenderError::NoAdapter`] where there is none, [`RenderError::MapTooLarge`] where the
     /// map does not fit what the device binds, and the device's own faults.
-    pub fn new(tiles: &[TriangleMesh], choice: AdapterChoice) -> Result<Self, RenderError> {
-        let gpu = Gpu::open(choice)?;
+    pub fn new(tiles: &[TriangleMesh], backend: Backend) -> Result<Self, RenderError> {
+        let gpu = Gpu::open(backend)?;
         let scene = Scene::upload(&gpu, tiles)?;
         let caster = Caster::new(&gpu, &scene);
         let rasterizer = gpu.can_rasterize.then(|| Rasterizer::new(&gpu));

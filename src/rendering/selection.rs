@@ -1,0 +1,164 @@
+//! Selection of the renderer: CPU or graphics adapter, and the reason.
+//!
+//! `auto` takes a discrete graphics card, else an integrated one, else the CPU. It never takes a
+//! software adapter (a graphics driver that runs on the CPU): the ray packets of the CPU renderer
+//! do the same work many times faster.
+
+use super::backend::{AdapterReport, Backend, best_adapter};
+use super::{CpuRenderer, RangeRenderer, RenderError};
+use crate::geometry::TriangleMesh;
+
+/// Selected renderer, the adapters that were considered, and the reason.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BackendChoice {
+    /// Index of the selected adapter; `None` for the CPU.
+    pub adapter: Option<usize>,
+    /// Reason, to be read after "because".
+    pub reason: String,
+    /// All graphics adapters of this machine, best first.
+    pub adapters: Vec<AdapterReport>,
+}
+
+impl BackendChoice {
+    /// Name of the selected renderer: `cpu`, or that of the adapter.
+    pub fn name(&self) -> String {
+        self.adapter.map_or_else(
+            || "cpu".to_owned(),
+            |index| self.adapters[index].to_string(),
+        )
+    }
+}
+
+/// Prepares the tiles of a map, in the map frame, for rendering on the requested backend.
+///
+/// # Errors
+/// [`RenderError::NoAdapter`] if a graphics adapter is requested and there is none, and the errors
+/// of the graphics device.
+pub fn renderer(
+    tiles: &[TriangleMesh],
+    backend: Backend,
+) -> Result<Box<dyn RangeRenderer>, RenderError> {
+    let choice = choose(backend)?;
+    tracing::info!("rendering on {} because {}", choice.name(), choice.reason);
+    #[cfg(feature = "gpu")]
+    if choice.adapter.is_some() {
+        return Ok(Box::new(super::gpu::GpuRenderer::new(tiles, backend)?));
+    }
+    Ok(Box::new(CpuRenderer::new(tiles)))
+}
+
+/// Selects one of the graphics adapters of this machine, or the CPU.
+///
+/// # Errors
+/// [`RenderError::NoAdapter`] if a graphics adapter is requested and there is none.
+pub fn choose(backend: Backend) -> Result<BackendChoice, RenderError> {
+    let adapters = match backend {
+        Backend::Cpu => Vec::new(),
+        Backend::Auto | Backend::Gpu => adapters(),
+    };
+    choose_among(adapters, backend)
+}
+
+/// All graphics adapters of this machine, best first; none without the feature `gpu`.
+fn adapters() -> Vec<AdapterReport> {
+    #[cfg(feature = "gpu")]
+    return super::gpu::adapters();
+    #[cfg(not(feature = "gpu"))]
+    return Vec::new();
+}
+
+fn choose_among(
+    adapters: Vec<AdapterReport>,
+    backend: Backend,
+) -> Result<BackendChoice, RenderError> {
+    let adapter = best_adapter(&adapters, backend);
+    let reason = match (backend, adapter) {
+        (Backend::Cpu, _) => "it was requested".to_owned(),
+        (Backend::Gpu, None) => return Err(RenderError::NoAdapter),
+        (Backend::Gpu, Some(_)) => {
+            "a graphics adapter was requested, and it is the best".to_owned()
+        }
+        (Backend::Auto, Some(index)) => format!("it is the best {}", adapters[index].kind),
+        (Backend::Auto, None) => reason_for_cpu(&adapters),
+    };
+    Ok(BackendChoice {
+        adapter,
+        reason,
+        adapters,
+    })
+}
+
+/// Why `auto` takes none of the adapters.
+fn reason_for_cpu(adapters: &[AdapterReport]) -> String {
+    match adapters.first() {
+        None if cfg!(feature = "gpu") => "there is no graphics adapter".to_owned(),
+        None => "this program was built without the feature `gpu`".to_owned(),
+        Some(AdapterReport {
+            obstacle: Some(obstacle),
+            ..
+        }) => format!("{} cannot render: {obstacle}", adapters[0]),
+        Some(first) => {
+            format!("{first} is no graphics card of this machine, so the CPU is faster or safer")
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rendering::backend::AdapterKind;
+
+    fn adapter(name: &str, kind: AdapterKind) -> AdapterReport {
+        AdapterReport {
+            name: name.to_owned(),
+            kind,
+            api: "vulkan".to_owned(),
+            driver: "1.0".to_owned(),
+            max_binding_bytes: 1 << 27,
+            max_buffer_bytes: 1 << 28,
+            max_texture_size: 8192,
+            obstacle: None,
+        }
+    }
+
+    #[test]
+    fn auto_selects_the_discrete_card_at_any_position_of_the_list() {
+        let card = adapter("card", AdapterKind::Discrete);
+        let chip = adapter("chip", AdapterKind::Integrated);
+        let software = adapter("software", AdapterKind::Software);
+        let choice = choose_among(vec![software, chip, card], Backend::Auto).unwrap();
+        assert_eq!(choice.adapter, Some(2));
+        assert!(choice.reason.contains("discrete"), "{}", choice.reason);
+    }
+
+    #[test]
+    fn auto_never_selects_a_software_adapter_and_names_it() {
+        let software = adapter("llvmpipe", AdapterKind::Software);
+        let choice = choose_among(vec![software], Backend::Auto).unwrap();
+        assert_eq!(choice.adapter, None);
+        assert!(choice.reason.contains("llvmpipe"), "{}", choice.reason);
+    }
+
+    #[test]
+    fn a_requested_graphics_adapter_may_be_a_software_adapter() {
+        let software = adapter("llvmpipe", AdapterKind::Software);
+        let choice = choose_among(vec![software], Backend::Gpu).unwrap();
+        assert_eq!(choice.adapter, Some(0));
+        assert!(matches!(
+            choose_among(Vec::new(), Backend::Gpu),
+            Err(RenderError::NoAdapter)
+        ));
+    }
+
+    #[test]
+    fn an_adapter_with_an_obstacle_is_never_selected() {
+        let old = AdapterReport {
+            obstacle: Some("it has no compute shaders"),
+            ..adapter("old", AdapterKind::Discrete)
+        };
+        let choice = choose_among(vec![old.clone()], Backend::Auto).unwrap();
+        assert_eq!(choice.adapter, None);
+        assert!(choice.reason.contains("compute"), "{}", choice.reason);
+        assert!(choose_among(vec![old], Backend::Gpu).is_err());
+    }
+}
