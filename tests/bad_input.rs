@@ -7,7 +7,7 @@ mod common;
 
 use std::fs;
 
-use ::fpmcl::evaluation::LocalizationResults;
+use ::fpmcl::app::results::LocalizationResults;
 use common::{Recording, fpmcl};
 
 /// A recording with its map.

@@ -8,7 +8,7 @@ use std::fs;
 use std::path::Path;
 
 use assert_cmd::Command;
-use fpmcl::evaluation::LocalizationResults;
+use fpmcl::app::results::LocalizationResults;
 use nalgebra::Vector3;
 
 const SIMULATION: &str = "\

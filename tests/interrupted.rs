@@ -17,7 +17,7 @@ use std::thread;
 use std::time::Duration;
 
 use common::Recording;
-use fpmcl::evaluation::LocalizationResults;
+use fpmcl::app::results::LocalizationResults;
 
 /// Longer than this nothing here takes; a limit only so that a hanging program ends.
 const PATIENCE: Duration = Duration::from_secs(120);

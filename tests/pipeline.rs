@@ -12,7 +12,7 @@ use assert_cmd::Command;
 use common::Recording;
 use common::picture::Picture;
 use fpmcl::app::plotting::color::{MCL, REFINED, TRUTH};
-use fpmcl::evaluation::LocalizationResults;
+use fpmcl::app::results::LocalizationResults;
 use fpmcl::recording::Calibration;
 use fpmcl::recording::poses::{CameraPoses, read_tum};
 use serde_json::Value;

@@ -6,3 +6,4 @@ pub mod comparison;
 pub mod config;
 pub mod plotting;
 pub mod reporting;
+pub mod results;

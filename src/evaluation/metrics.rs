@@ -35,9 +35,9 @@ impl Default for MetricsConfig {
     }
 }
 
-/// A trajectory to be judged, one entry of each per frame.
+/// A trajectory to be trajectory, one entry of each per frame.
 #[derive(Clone, Copy, Debug)]
-pub struct Judged<'a> {
+pub struct EvaluatedTrajectory<'a> {
     /// The estimates.
     pub estimates: &'a [Pose2],
     /// The truth.
@@ -131,14 +131,17 @@ pub enum MetricsError {
 
 impl TrajectoryMetrics {
     /// Measures one trajectory.
-    pub fn of(judged: &Judged, config: &MetricsConfig) -> Result<Self, MetricsError> {
-        judged.check(config)?;
-        let whole_errors = planar_errors(judged.estimates, judged.ground_truth);
-        let whole_distances_m = distances_m(judged.ground_truth);
+    pub fn of(
+        trajectory: &EvaluatedTrajectory,
+        config: &MetricsConfig,
+    ) -> Result<Self, MetricsError> {
+        trajectory.check(config)?;
+        let whole_errors = planar_errors(trajectory.estimates, trajectory.ground_truth);
+        let whole_distances_m = distances_m(trajectory.ground_truth);
         let convergence =
-            (config.success).convergence(&whole_errors, &whole_distances_m, judged.times_s);
+            (config.success).convergence(&whole_errors, &whole_distances_m, trajectory.times_s);
 
-        let counted = judged.from(config.skip_frames);
+        let counted = trajectory.from(config.skip_frames);
         let errors = &whole_errors[config.skip_frames..];
         let driven_m = distances_m(counted.ground_truth);
         let column =
@@ -148,7 +151,7 @@ impl TrajectoryMetrics {
         let x = column(|error| error.offset_in_map.x);
         let y = column(|error| error.offset_in_map.y);
         let nothing = || MetricsError::TooFewFrames {
-            frames: judged.estimates.len(),
+            frames: trajectory.estimates.len(),
             skip_frames: config.skip_frames,
         };
         let (estimates, truth) = (level(counted.estimates), level(counted.ground_truth));
@@ -170,12 +173,12 @@ impl TrajectoryMetrics {
             rpe_rotation_rad: relative.rotation(),
             segments: kitti_segment_errors(&estimates, &truth),
             runtime_s: counted.runtimes_s.and_then(Summary::of),
-            first_runtime_s: judged.runtimes_s.and_then(|all| all.first().copied()),
+            first_runtime_s: trajectory.runtimes_s.and_then(|all| all.first().copied()),
         })
     }
 }
 
-impl Judged<'_> {
+impl EvaluatedTrajectory<'_> {
     fn check(&self, config: &MetricsConfig) -> Result<(), MetricsError> {
         let frames = self.estimates.len();
         for (what, found) in [
@@ -220,18 +223,19 @@ impl AxisError {
 }
 
 impl Smoothness {
-    fn of(judged: &Judged, errors: &[PlanarError]) -> Self {
+    fn of(trajectory: &EvaluatedTrajectory, errors: &[PlanarError]) -> Self {
         // Dimensionless jerk does not depend on the unit of time, so frames will do.
         let numbers: Vec<f64> = (0..errors.len()).map(|frame| frame as f64).collect();
-        let times = judged.times_s.unwrap_or(&numbers);
-        let change = mean_pose_change(judged.estimates);
+        let times = trajectory.times_s.unwrap_or(&numbers);
+        let change = mean_pose_change(trajectory.estimates);
         Self {
             jitter_m: jitter_m(errors),
-            log_jerk: log_dimensionless_jerk(judged.estimates, times),
-            log_jerk_of_truth: log_dimensionless_jerk(judged.ground_truth, times),
+            log_jerk: log_dimensionless_jerk(trajectory.estimates, times),
+            log_jerk_of_truth: log_dimensionless_jerk(trajectory.ground_truth, times),
             mean_step_m: change.map(|(step_m, _)| step_m),
             mean_turn_rad: change.map(|(_, turn_rad)| turn_rad),
-            mean_step_of_truth_m: mean_pose_change(judged.ground_truth).map(|(step_m, _)| step_m),
+            mean_step_of_truth_m: mean_pose_change(trajectory.ground_truth)
+                .map(|(step_m, _)| step_m),
         }
     }
 }
@@ -246,8 +250,6 @@ mod tests {
     use nalgebra::Vector2;
 
     use super::*;
-    use crate::evaluation::RangeMclRules;
-    use crate::evaluation::kitti_07::kitti_07;
 
     fn circle(frames: usize) -> Vec<Pose2> {
         (0..frames)
@@ -262,13 +264,13 @@ mod tests {
     }
 
     fn measure(estimates: &[Pose2], ground_truth: &[Pose2]) -> TrajectoryMetrics {
-        let judged = Judged {
+        let trajectory = EvaluatedTrajectory {
             estimates,
             ground_truth,
             times_s: None,
             runtimes_s: None,
         };
-        TrajectoryMetrics::of(&judged, &MetricsConfig::default()).unwrap()
+        TrajectoryMetrics::of(&trajectory, &MetricsConfig::default()).unwrap()
     }
 
     #[test]
@@ -330,56 +332,22 @@ mod tests {
         assert_eq!(metrics.convergence.unwrap().row, 10);
     }
 
-    /// Against an independent script in NumPy, which reads camera poses and knows nothing of ours.
-    #[test]
-    fn on_kitti_07_the_numbers_are_those_of_another_program() {
-        let Some((truth, results)) = kitti_07() else {
-            return;
-        };
-        let estimates = RangeMclRules::default().estimates(&results).unwrap();
-        let judged = Judged {
-            estimates: &estimates,
-            ground_truth: &truth,
-            times_s: None,
-            runtimes_s: None,
-        };
-        let config = MetricsConfig {
-            skip_frames: 20,
-            ..MetricsConfig::default()
-        };
-        let metrics = TrajectoryMetrics::of(&judged, &config).unwrap();
-        let position = metrics.position_m;
-        let heading = metrics.heading_rad;
-        for (ours, theirs, half_digit) in [
-            (position.rmse, 0.3694, 6e-5),
-            (position.mean, 0.3293, 6e-5),
-            (position.p95, 0.6793, 6e-5),
-            (position.max, 0.8621, 6e-5),
-            (heading.rmse.to_degrees(), 2.1095, 6e-5),
-            (heading.max.to_degrees(), 9.214, 6e-4),
-            (metrics.smoothness.jitter_m.unwrap(), 0.0287, 6e-5),
-        ] {
-            assert_relative_eq!(ours, theirs, epsilon = half_digit);
-        }
-        assert_eq!(metrics.frames, 1081);
-    }
-
     #[test]
     fn too_few_frames_and_lengths_that_differ_are_said() {
         let truth = circle(10);
-        let mut judged = Judged {
+        let mut trajectory = EvaluatedTrajectory {
             estimates: &truth,
             ground_truth: &truth,
             times_s: None,
             runtimes_s: None,
         };
         let config = MetricsConfig::default();
-        let message = TrajectoryMetrics::of(&judged, &config)
+        let message = TrajectoryMetrics::of(&trajectory, &config)
             .unwrap_err()
             .to_string();
         assert!(message.contains("10 frames are too few"), "{message}");
-        judged.ground_truth = &truth[1..];
-        let message = TrajectoryMetrics::of(&judged, &config)
+        trajectory.ground_truth = &truth[1..];
+        let message = TrajectoryMetrics::of(&trajectory, &config)
             .unwrap_err()
             .to_string();
         assert!(message.contains("9 true poses for 10 frames"), "{message}");

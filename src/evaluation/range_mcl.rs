@@ -12,8 +12,10 @@
 use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};
 
-use super::results::{LocalizationResults, ParticleRow};
 use crate::geometry::{Pose2, wrap_angle};
+
+/// A particle: x, y [m], heading [rad], weight.
+pub type ParticleRow = [f32; 4];
 
 /// The rules of the parent.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -40,7 +42,7 @@ impl Default for RangeMclRules {
 
 /// The judgement.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct RangeMclVerdict {
+pub struct RangeMclErrors {
     /// Whether the error was small at every row that is looked at.
     pub success: bool,
     /// RMSE of the planar position [m]; absent without success, or without rows to count.
@@ -51,7 +53,7 @@ pub struct RangeMclVerdict {
 
 impl RangeMclRules {
     /// Judges estimates against the ground truth, both one pose per row from the start on.
-    pub fn judge(&self, estimates: &[Pose2], ground_truth: &[Pose2]) -> RangeMclVerdict {
+    pub fn evaluate(&self, estimates: &[Pose2], ground_truth: &[Pose2]) -> RangeMclErrors {
         let errors: Vec<(f64, f64)> = estimates
             .iter()
             .zip(ground_truth)
@@ -70,7 +72,7 @@ impl RangeMclRules {
             let sum: f64 = counted.iter().map(|pair| error(pair).powi(2)).sum();
             (success && !counted.is_empty()).then(|| (sum / counted.len() as f64).sqrt())
         };
-        RangeMclVerdict {
+        RangeMclErrors {
             success,
             rmse_location_m: rmse(|(distance_m, _)| *distance_m),
             rmse_yaw_deg: rmse(|(_, turn_deg)| *turn_deg),
@@ -101,32 +103,6 @@ impl RangeMclRules {
             Pose2::new(Vector2::new(x / weight, y / weight), heading)
         })
     }
-
-    /// The estimates that a file holds, or those that its particles make.
-    pub fn estimates(&self, results: &LocalizationResults) -> Result<Vec<Pose2>, NoWeight> {
-        if let Some(estimates) = &results.estimates {
-            return Ok(estimates.clone());
-        }
-        let capacity = results.particles.capacity();
-        (0..results.particles.len())
-            .map(|row| {
-                self.estimate(results.particles.frame(row), capacity)
-                    .ok_or(NoWeight {
-                        frame: results.frames[row],
-                    })
-            })
-            .collect()
-    }
-}
-
-/// There is nothing to make an estimate of.
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-#[error(
-    "the particles of frame {frame} have no weight, and the file holds no estimates; run localize again"
-)]
-pub struct NoWeight {
-    /// Number of the frame in its recording.
-    pub frame: usize,
 }
 
 #[cfg(test)]
@@ -136,29 +112,6 @@ mod tests {
     use approx::assert_relative_eq;
 
     use super::*;
-    use crate::evaluation::kitti_07::kitti_07;
-
-    #[test]
-    fn the_parents_run_on_kitti_07_is_judged_as_the_parent_judges_it() {
-        let Some((truth, results)) = kitti_07() else {
-            return;
-        };
-        assert_eq!(results.len(), 1101);
-        assert_eq!(results.particles.capacity(), 10_000);
-        let rules = RangeMclRules::default();
-        let estimates = rules.estimates(&results).unwrap();
-        let verdict = rules.judge(&estimates, &truth);
-        // What the parent prints to four digits. Its rotations are those of the file, which are
-        // orthogonal to four digits only; ours are made so.
-        assert!(verdict.success);
-        assert_relative_eq!(verdict.rmse_location_m.unwrap(), 0.379_644, epsilon = 5e-6);
-        assert_relative_eq!(verdict.rmse_yaw_deg.unwrap(), 2.164_483, epsilon = 5e-6);
-
-        let all: f64 = (estimates.iter().zip(&truth))
-            .map(|(a, b)| (a.translation.vector - b.translation.vector).norm_squared())
-            .sum();
-        assert_relative_eq!((all / 1101.0).sqrt(), 0.379_799, epsilon = 5e-6);
-    }
 
     fn straight(rows: usize) -> Vec<Pose2> {
         (0..rows)
@@ -176,7 +129,7 @@ mod tests {
     #[test]
     fn a_constant_offset_is_the_rmse() {
         let truth = straight(301);
-        let verdict = RangeMclRules::default().judge(&beside(&truth, 0.3, 0.02), &truth);
+        let verdict = RangeMclRules::default().evaluate(&beside(&truth, 0.3, 0.02), &truth);
         assert!(verdict.success);
         assert_relative_eq!(verdict.rmse_location_m.unwrap(), 0.3, epsilon = 1e-12);
         let expected_deg = 0.02_f64.to_degrees();
@@ -189,18 +142,21 @@ mod tests {
         let rules = RangeMclRules::default();
         let mut estimates = truth.clone();
         estimates[99].translation.y = 50.0;
-        assert_eq!(rules.judge(&estimates, &truth).rmse_location_m, Some(0.0));
+        assert_eq!(
+            rules.evaluate(&estimates, &truth).rmse_location_m,
+            Some(0.0)
+        );
         estimates[150].translation.y = 5.1;
-        assert!(rules.judge(&estimates, &truth).success);
+        assert!(rules.evaluate(&estimates, &truth).success);
         estimates[200].translation.y = 5.1;
-        let verdict = rules.judge(&estimates, &truth);
+        let verdict = rules.evaluate(&estimates, &truth);
         assert_eq!((verdict.success, verdict.rmse_location_m), (false, None));
     }
 
     #[test]
     fn a_run_shorter_than_the_interval_has_no_rmse() {
         let truth = straight(100);
-        let verdict = RangeMclRules::default().judge(&truth, &truth);
+        let verdict = RangeMclRules::default().evaluate(&truth, &truth);
         assert_eq!((verdict.success, verdict.rmse_location_m), (true, None));
     }
 

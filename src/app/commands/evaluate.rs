@@ -8,7 +8,8 @@ use super::input;
 use super::run_output::{self, RunFiles};
 use super::run_page;
 use crate::app::config::{self, EvaluationConfig, LocalizationConfig};
-use crate::evaluation::{LocalizationResults, RangeMclRules, Report};
+use crate::app::results::{LocalizationResults, Report};
+use crate::evaluation::RangeMclRules;
 use crate::geometry::{Pose2, TriangleMesh, planar};
 use crate::map::ply;
 use crate::recording::Calibration;
@@ -39,10 +40,10 @@ pub fn run(config: &EvaluationConfig) -> Result<Report> {
         particle_select_ratio: config.particle_select_ratio,
     };
     if results.estimates.is_none() {
-        results.estimates = Some(rules.estimates(&results)?);
+        results.estimates = Some(results.estimates_or_particle_means(&rules)?);
     }
     let files = RunFiles::beside(&config.result_file);
-    let report = run_output::judge(&results, &rules, about(config, &files)?)?;
+    let report = run_output::evaluate(&results, &rules, about(config, &files)?)?;
     if config.save_evaluation_results {
         run_output::write_report(&files, &results, &report)?;
         config::write(&files.file("evaluation.yml"), config)?;

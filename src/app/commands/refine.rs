@@ -12,7 +12,8 @@ use super::run_output::{self, RunFiles};
 use super::stages::{Inputs, LoadedMap, Observer};
 use super::{Context, input, odometry, run_page};
 use crate::app::config::{self, OdometrySource, RefinementConfig};
-use crate::evaluation::{LocalizationResults, RangeMclRules, Report};
+use crate::app::results::{LocalizationResults, Report};
+use crate::evaluation::RangeMclRules;
 use crate::geometry::{Pose2, Pose3};
 use crate::ground::{FuzzyConfig, FuzzyGround};
 use crate::localization::State;
@@ -44,10 +45,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let map = LoadedMap::load(&inputs, None, context)?;
     let sequence = map.sequence(&inputs, &config.selection())?;
     let sequence = matching(sequence, &results, config)?;
-    let estimates = match results.estimates.take() {
-        Some(estimates) => estimates,
-        None => RangeMclRules::default().estimates(&results)?,
-    };
+    let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
     let increments = increments(config, &sequence, &results)?;
     let sequence = odometry::compensated(sequence, config.motion_compensation, &increments);
     let polished = polish_all(config, context, &map, &sequence, &results, &estimates)?;
@@ -73,7 +71,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
         ("seed", config.seed.to_string()),
     ]
     .map(|(key, value)| (key.to_owned(), value));
-    let report = run_output::judge(&results, &RangeMclRules::default(), about.into())?;
+    let report = run_output::evaluate(&results, &RangeMclRules::default(), about.into())?;
     run_output::write_report(&files, &results, &report)?;
     if config.plot_loc_results {
         run_output::draw_run(&files, Some(&map), &results)?;

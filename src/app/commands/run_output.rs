@@ -12,9 +12,12 @@ use crate::app::plotting::{
     Animation, ErrorPlot, LineChart, LocalizationPicture, MapImage, MapPlot, Panel, Path2,
     PathPlot, RangeImageStrip, RuntimePlot, Series, map_plot,
 };
+use crate::app::results::{
+    LocalizationResults, Report, TrajectoryReport, write_frames_csv, write_poses_npy,
+};
 use crate::evaluation::{
-    Judged, LocalizationResults, MetricsConfig, ParticleRow, PlanarError, RangeMclRules, Report,
-    TrajectoryMetrics, TrajectoryReport, planar_errors, write_frames_csv, write_poses_npy,
+    EvaluatedTrajectory, MetricsConfig, ParticleRow, PlanarError, RangeMclRules, TrajectoryMetrics,
+    planar_errors,
 };
 use crate::geometry::{Pose2, Pose3, StampedPose, Trajectory, TriangleMesh};
 use crate::lidar::RangeImage;
@@ -178,7 +181,7 @@ pub fn write_report(
 }
 
 /// Judges the estimates, and the refined trajectory where there is one, against the ground truth.
-pub fn judge(
+pub fn evaluate(
     results: &LocalizationResults,
     rules: &RangeMclRules,
     about: BTreeMap<String, String>,
@@ -187,13 +190,10 @@ pub fn judge(
         .ground_truth
         .as_deref()
         .context("there is no ground truth to compare with; name its pose_file")?;
-    let estimates = match &results.estimates {
-        Some(estimates) => estimates.clone(),
-        None => rules.estimates(results)?,
-    };
+    let estimates = results.estimates_or_particle_means(rules)?;
     let one = |estimates: &[Pose2], runtimes_s: Option<&[f64]>| {
-        judge_one(
-            &Judged {
+        evaluate_trajectory(
+            &EvaluatedTrajectory {
                 estimates,
                 ground_truth: truth,
                 times_s: results.times_s.as_deref(),
@@ -214,17 +214,20 @@ pub fn judge(
 }
 
 /// Judges one trajectory.
-pub fn judge_one(judged: &Judged, rules: &RangeMclRules) -> Result<TrajectoryReport> {
+pub fn evaluate_trajectory(
+    trajectory: &EvaluatedTrajectory,
+    rules: &RangeMclRules,
+) -> Result<TrajectoryReport> {
     let config = MetricsConfig {
         // A short run is judged from where it can be.
         skip_frames: MetricsConfig::default()
             .skip_frames
-            .min(judged.ground_truth.len() / 2),
+            .min(trajectory.ground_truth.len() / 2),
         ..MetricsConfig::default()
     };
     Ok(TrajectoryReport {
-        range_mcl: rules.judge(judged.estimates, judged.ground_truth),
-        metrics: TrajectoryMetrics::of(judged, &config)?,
+        range_mcl: rules.evaluate(trajectory.estimates, trajectory.ground_truth),
+        metrics: TrajectoryMetrics::of(trajectory, &config)?,
     })
 }
 

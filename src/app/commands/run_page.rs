@@ -11,7 +11,7 @@ use super::{output, version};
 use crate::app::comparison::{Cell, Column, Table};
 use crate::app::plotting::palette;
 use crate::app::reporting::{Block, Page, Section};
-use crate::evaluation::{Report, TrajectoryReport, Value};
+use crate::app::results::{Report, TrajectoryReport, Value};
 
 /// What is told of a run; the rest lies beside its result.
 pub struct RunPage<'a> {

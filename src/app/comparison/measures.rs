@@ -4,7 +4,7 @@
 //! report gives no definition, the literature's is taken. All numbers are of the frames that
 //! [`MetricsConfig`](crate::evaluation::MetricsConfig) counts, without alignment.
 
-use crate::evaluation::TrajectoryReport;
+use crate::app::results::TrajectoryReport;
 
 /// One number of a run.
 #[derive(Clone, Copy, Debug)]

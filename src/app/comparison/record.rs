@@ -6,7 +6,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::evaluation::TrajectoryReport;
+use crate::app::results::TrajectoryReport;
 
 /// Which run: the drive, how it was localized, and the seed.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]

@@ -4,9 +4,8 @@ use approx::assert_relative_eq;
 
 use super::*;
 use crate::app::comparison::record::{Outcome, RunId};
-use crate::evaluation::{
-    Judged, MetricsConfig, RangeMclRules, TrajectoryMetrics, TrajectoryReport,
-};
+use crate::app::results::TrajectoryReport;
+use crate::evaluation::{EvaluatedTrajectory, MetricsConfig, RangeMclRules, TrajectoryMetrics};
 use crate::geometry::Pose2;
 
 /// A run that is `error_m` to the left of the truth all the way.
@@ -18,15 +17,15 @@ fn run(sequence: &str, configuration: &str, seed: u64, error_m: f64) -> RunRecor
         .iter()
         .map(|pose| pose * Pose2::translation(0.0, error_m))
         .collect();
-    let judged = Judged {
+    let trajectory = EvaluatedTrajectory {
         estimates: &estimates,
         ground_truth: &truth,
         times_s: None,
         runtimes_s: Some(&[0.1; 40]),
     };
     let judgement = TrajectoryReport {
-        range_mcl: RangeMclRules::default().judge(&estimates, &truth),
-        metrics: TrajectoryMetrics::of(&judged, &MetricsConfig::default()).unwrap(),
+        range_mcl: RangeMclRules::default().evaluate(&estimates, &truth),
+        metrics: TrajectoryMetrics::of(&trajectory, &MetricsConfig::default()).unwrap(),
     };
     RunRecord {
         id: RunId {

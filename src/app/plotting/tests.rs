@@ -197,11 +197,13 @@ fn the_path_is_drawn_over_the_truth_and_over_the_map() {
 
 #[test]
 fn the_parents_run_on_kitti_07_is_drawn() {
-    let Some((truth, results)) = crate::evaluation::kitti_07::kitti_07() else {
+    let Some((truth, results)) = crate::app::results::kitti_07::kitti_07() else {
         return;
     };
     let gallery = Gallery::open();
-    let estimates = RangeMclRules::default().estimates(&results).unwrap();
+    let estimates = results
+        .estimates_or_particle_means(&RangeMclRules::default())
+        .unwrap();
     let path = gallery.path("path_kitti07.png");
     PathPlot {
         title: "KITTI 07, range-mcl against ground truth",

@@ -1,7 +1,7 @@
 //! How a cell is told in words.
 
 use crate::app::comparison::Cell;
-use crate::evaluation::Value;
+use crate::app::results::Value;
 
 /// A number with four digits.
 pub fn number(number: f64) -> String {

@@ -20,7 +20,8 @@ use crate::app::commands::simulate::{self, Existing};
 use crate::app::commands::{Context, build_map, localize, refine, version};
 use crate::app::comparison::{Outcome, RunRecord};
 use crate::app::config::{self, BuildMapConfig, LocalizationConfig, RefinementConfig};
-use crate::evaluation::{Judged, LocalizationResults, RangeMclRules, Report, TrajectoryReport};
+use crate::app::results::{LocalizationResults, Report, TrajectoryReport};
+use crate::evaluation::{EvaluatedTrajectory, RangeMclRules};
 
 /// Name of a run's record, written last.
 pub const RECORD_FILE: &str = "run.json";
@@ -235,13 +236,13 @@ fn judgement(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
             .map(|row| filtering[row] + refining(row))
             .collect()
     });
-    let judged = Judged {
+    let trajectory = EvaluatedTrajectory {
         estimates: poses,
         ground_truth: truth,
         times_s: results.times_s.as_deref(),
         runtimes_s: runtimes_s.as_deref(),
     };
-    run_output::judge_one(&judged, &RangeMclRules::default())
+    run_output::evaluate_trajectory(&trajectory, &RangeMclRules::default())
 }
 
 /// What the run was done on, for its record.

@@ -9,7 +9,8 @@ use crate::app::comparison::tables::rate;
 use crate::app::comparison::{Comparison, RunRecord, SuccessRate};
 use crate::app::plotting::color::{Rgb, SERIES};
 use crate::app::plotting::{LineChart, Mark, Panel, Path2, PathPlot, Series};
-use crate::evaluation::{LocalizationResults, PlanarError, planar_errors};
+use crate::app::results::LocalizationResults;
+use crate::evaluation::{PlanarError, planar_errors};
 use crate::geometry::Pose2;
 
 /// A picture and what it shows.

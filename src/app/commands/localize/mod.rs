@@ -18,7 +18,8 @@ use super::run_output::{self, Movie, RunFiles};
 use super::stages::{Inputs, LoadedMap, Observer};
 use super::{Context, odometry, run_page};
 use crate::app::config::{self, LocalizationConfig};
-use crate::evaluation::{LocalizationResults, RangeMclRules, Report};
+use crate::app::results::{LocalizationResults, Report};
+use crate::evaluation::RangeMclRules;
 use crate::geometry::{Pose2, Pose3};
 use crate::ground::{FuzzyConfig, FuzzyGround};
 use crate::localization::State;
@@ -74,7 +75,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         config::write(&files.file("localization.yml"), config)?;
     }
     tell_of_doubt(&results);
-    let report = run_output::judge(&results, &RangeMclRules::default(), about)?;
+    let report = run_output::evaluate(&results, &RangeMclRules::default(), about)?;
     if config.save_result {
         run_output::write_report(&files, &results, &report)?;
     }

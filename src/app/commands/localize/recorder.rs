@@ -7,7 +7,7 @@ use super::drive::Said;
 use crate::app::commands::run_output::{self, Movie, RunFiles};
 use crate::app::commands::stages::LoadedMap;
 use crate::app::config::LocalizationConfig;
-use crate::evaluation::{LocalizationResults, ParticleLog};
+use crate::app::results::{LocalizationResults, ParticleLog};
 use crate::geometry::{Pose2, Pose3, planar};
 use crate::recording::Frame;
 

@@ -7,7 +7,6 @@ use std::io::{self, Read};
 
 /// What is wrong with an array.
 #[derive(Debug, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages say it")]
 pub enum NpyError {
     #[error("it does not begin as a NumPy array")]
     NotNpy,

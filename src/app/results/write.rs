@@ -9,8 +9,8 @@ use ndarray_npy::{NpzWriter, WriteNpyError, WriteNpyExt, WriteNpzError};
 use zip::result::ZipError;
 use zip::write::SimpleFileOptions;
 
-use crate::evaluation::npy::header_bytes;
-use crate::evaluation::results::{LocalizationResults, ParticleLog, ResultsError};
+use super::localization_results::{LocalizationResults, ParticleLog, ResultsError};
+use super::npy::header_bytes;
 use crate::evaluation::write_atomically;
 use crate::geometry::Pose2;
 

@@ -5,7 +5,7 @@ use nalgebra::Matrix3;
 use ndarray::{Array3, arr0};
 use ndarray_npy::{NpzReader, NpzWriter};
 
-use crate::evaluation::results::{LocalizationResults, ParticleLog};
+use super::{LocalizationResults, ParticleLog};
 use crate::geometry::Pose2;
 
 fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {

@@ -7,17 +7,15 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::metrics::TrajectoryMetrics;
-use super::range_mcl::RangeMclVerdict;
-use super::results::ResultsError;
-use super::rows::{MetricRow, Value};
-use super::write_atomically;
+use super::localization_results::ResultsError;
+use super::rows::{MetricRow, Value, metric_rows};
+use crate::evaluation::{RangeMclErrors, TrajectoryMetrics, write_atomically};
 
 /// What is said of one trajectory.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrajectoryReport {
     /// By the parent's rules.
-    pub range_mcl: RangeMclVerdict,
+    pub range_mcl: RangeMclErrors,
     /// By those of the literature.
     pub metrics: TrajectoryMetrics,
 }
@@ -37,27 +35,21 @@ pub struct Report {
 impl TrajectoryReport {
     /// All rows: the parent's verdict first.
     pub fn rows(&self) -> Vec<MetricRow> {
-        let verdict = [
-            MetricRow {
-                name: "range-mcl success",
-                value: Value::Flag(self.range_mcl.success),
-                unit: "",
-                definition: "position error under converge_thres at every convergence_interval-th row",
-            },
-            MetricRow {
-                name: "range-mcl RMSE location",
-                value: self.range_mcl.rmse_location_m.into(),
-                unit: "m",
-                definition: "position RMSE from row convergence_interval on, as range-mcl tells it",
-            },
-            MetricRow {
-                name: "range-mcl RMSE yaw",
-                value: self.range_mcl.rmse_yaw_deg.into(),
-                unit: "deg",
-                definition: "heading RMSE from row convergence_interval on, as range-mcl tells it",
-            },
+        let range_mcl = [
+            MetricRow::new(
+                "range-mcl success: position error under converge_thres at every convergence_interval-th row",
+                Value::Flag(self.range_mcl.success),
+            ),
+            MetricRow::new(
+                "range-mcl RMSE location [m]: position RMSE from row convergence_interval on, as range-mcl computes it",
+                self.range_mcl.rmse_location_m,
+            ),
+            MetricRow::new(
+                "range-mcl RMSE yaw [deg]: heading RMSE from row convergence_interval on, as range-mcl computes it",
+                self.range_mcl.rmse_yaw_deg,
+            ),
         ];
-        [verdict.to_vec(), self.metrics.rows()].concat()
+        [range_mcl.to_vec(), metric_rows(&self.metrics)].concat()
     }
 }
 
@@ -172,9 +164,8 @@ fn write_text(path: &Path, text: &str) -> Result<(), ResultsError> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::metrics::{Judged, MetricsConfig};
-    use super::super::range_mcl::RangeMclRules;
     use super::*;
+    use crate::evaluation::{EvaluatedTrajectory, MetricsConfig, RangeMclRules};
     use crate::geometry::Pose2;
 
     fn trajectory(error_m: f64) -> TrajectoryReport {
@@ -183,15 +174,15 @@ mod tests {
             .collect();
         let shift = Pose2::translation(0.0, error_m);
         let estimates: Vec<Pose2> = truth.iter().map(|pose| shift * pose).collect();
-        let judged = Judged {
+        let trajectory = EvaluatedTrajectory {
             estimates: &estimates,
             ground_truth: &truth,
             times_s: None,
             runtimes_s: Some(&[0.0125; 300]),
         };
         TrajectoryReport {
-            range_mcl: RangeMclRules::default().judge(&estimates, &truth),
-            metrics: TrajectoryMetrics::of(&judged, &MetricsConfig::default()).unwrap(),
+            range_mcl: RangeMclRules::default().evaluate(&estimates, &truth),
+            metrics: TrajectoryMetrics::of(&trajectory, &MetricsConfig::default()).unwrap(),
         }
     }
 

@@ -22,10 +22,8 @@ use std::path::PathBuf;
 use nalgebra::Matrix3;
 
 use super::npy::NpyError;
+use crate::evaluation::{ParticleRow, RangeMclRules};
 use crate::geometry::Pose2;
-
-/// A particle as it is stored: x, y [m], heading [rad], weight.
-pub type ParticleRow = [f32; 4];
 
 /// Particles of many frames; as much memory as there were particles, however many there may be.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -153,6 +151,26 @@ impl LocalizationResults {
         }
     }
 
+    /// The stored estimates; where the file has none, those that `rules` make of the particles.
+    pub fn estimates_or_particle_means(
+        &self,
+        rules: &RangeMclRules,
+    ) -> Result<Vec<Pose2>, ResultsError> {
+        if let Some(estimates) = &self.estimates {
+            return Ok(estimates.clone());
+        }
+        let capacity = self.particles.capacity();
+        self.frames
+            .iter()
+            .enumerate()
+            .map(|(row, &frame)| {
+                rules
+                    .estimate(self.particles.frame(row), capacity)
+                    .ok_or(ResultsError::ZeroWeights { frame })
+            })
+            .collect()
+    }
+
     /// Names and lengths of the arrays that are there, to check that all have one row per frame.
     pub(super) fn lengths(&self) -> Vec<(&'static str, usize)> {
         fn length<T>(column: &Option<Vec<T>>) -> Option<usize> {
@@ -224,6 +242,10 @@ pub enum ResultsError {
         found: usize,
         expected: usize,
     },
+    #[error(
+        "the particles of frame {frame} have no weight, and the file holds no estimates; run localize again"
+    )]
+    ZeroWeights { frame: usize },
     #[error("{} is not a report of fpmcl: {source}; run evaluate again", path.display())]
     BadReport {
         path: PathBuf,

@@ -8,8 +8,8 @@ use nalgebra::Matrix3;
 use zip::ZipArchive;
 use zip::result::ZipError;
 
-use crate::evaluation::npy::{NpyError, NpyReader};
-use crate::evaluation::results::{LocalizationResults, ParticleLog, ResultsError};
+use super::localization_results::{LocalizationResults, ParticleLog, ResultsError};
+use super::npy::{NpyError, NpyReader};
 use crate::geometry::Pose2;
 
 impl LocalizationResults {

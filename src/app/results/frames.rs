@@ -3,9 +3,8 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use super::planar::{PlanarError, distances_m};
-use super::results::{LocalizationResults, ResultsError};
-use super::write_atomically;
+use super::localization_results::{LocalizationResults, ResultsError};
+use crate::evaluation::{PlanarError, distances_m, write_atomically};
 use crate::geometry::Pose2;
 
 /// One column: its title and what stands in a row.
@@ -129,7 +128,7 @@ fn write_rows(file: &mut impl Write, columns: &[Column], rows: usize) -> io::Res
 
 #[cfg(test)]
 mod tests {
-    use super::super::results::ParticleLog;
+    use super::super::ParticleLog;
     use super::*;
 
     #[test]

@@ -1,0 +1,270 @@
+//! The metrics of a trajectory as rows of a table: name, value, unit and definition.
+
+use std::fmt;
+
+use crate::evaluation::{Summary, TrajectoryMetrics};
+
+/// The value of a metric.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Value {
+    /// A number in the unit of its row.
+    Number(f64),
+    /// A count.
+    Count(usize),
+    /// Yes or no.
+    Flag(bool),
+    /// Not measured, or not defined for this run.
+    Absent,
+}
+
+impl fmt::Display for Value {
+    /// With four significant digits and at most four decimals.
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::Number(number) => {
+                let digits = number.abs().max(1e-9).log10().floor() as i32;
+                let decimals = (3 - digits).clamp(0, 4) as usize;
+                formatter.pad(&format!("{number:.decimals$}"))
+            }
+            Self::Count(count) => formatter.pad(&count.to_string()),
+            Self::Flag(true) => formatter.pad("yes"),
+            Self::Flag(false) => formatter.pad("no"),
+            Self::Absent => formatter.pad("-"),
+        }
+    }
+}
+
+impl From<f64> for Value {
+    fn from(number: f64) -> Self {
+        Self::Number(number)
+    }
+}
+
+impl From<Option<f64>> for Value {
+    fn from(number: Option<f64>) -> Self {
+        number.map_or(Self::Absent, Self::Number)
+    }
+}
+
+/// One row of a table.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MetricRow {
+    /// Name of the metric.
+    pub name: &'static str,
+    /// Value for this trajectory.
+    pub value: Value,
+    /// Unit of the value; empty for flags, counts and unitless numbers.
+    pub unit: &'static str,
+    /// What the number is, in a sentence.
+    pub definition: &'static str,
+}
+
+impl MetricRow {
+    /// A row described by `name [unit]: definition`; the unit may be left out.
+    pub fn new(description: &'static str, value: impl Into<Value>) -> Self {
+        let (head, definition) = description.split_once(": ").unwrap_or((description, ""));
+        let (name, unit) = head.split_once(" [").unwrap_or((head, ""));
+        Self {
+            name,
+            value: value.into(),
+            unit: unit.trim_end_matches(']'),
+            definition,
+        }
+    }
+}
+
+/// The rows, most important first; the same rows in the same order for every trajectory.
+pub fn metric_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
+    [
+        position_rows(metrics),
+        heading_rows(&metrics.heading_rad),
+        success_rows(metrics),
+        smoothness_rows(metrics),
+        relative_rows(metrics),
+        runtime_rows(metrics),
+    ]
+    .concat()
+}
+
+fn position_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
+    let position = &metrics.position_m;
+    let (along, across) = (&metrics.along, &metrics.across);
+    vec![
+        MetricRow::new(
+            "position RMSE [m]: root mean square of the planar distance to the true position",
+            position.rmse,
+        ),
+        MetricRow::new(
+            "position mean [m]: mean of the planar distance (average positional error)",
+            position.mean,
+        ),
+        MetricRow::new(
+            "position median [m]: half of the frames are nearer",
+            position.median,
+        ),
+        MetricRow::new(
+            "position p95 [m]: 95 % of the frames are nearer",
+            position.p95,
+        ),
+        MetricRow::new("position max [m]: the worst frame", position.max),
+        MetricRow::new(
+            "x RMSE [m]: root mean square of the x difference in the map frame",
+            metrics.x_rmse_m,
+        ),
+        MetricRow::new(
+            "y RMSE [m]: root mean square of the y difference in the map frame",
+            metrics.y_rmse_m,
+        ),
+        MetricRow::new(
+            "along RMSE [m]: root mean square of the error along the true heading",
+            along.rmse_m,
+        ),
+        MetricRow::new(
+            "along bias [m]: mean error along the true heading; positive is ahead",
+            along.bias_m,
+        ),
+        MetricRow::new(
+            "across RMSE [m]: root mean square of the error across the true heading",
+            across.rmse_m,
+        ),
+        MetricRow::new(
+            "across bias [m]: mean error across the true heading; positive is left",
+            across.bias_m,
+        ),
+    ]
+}
+
+fn heading_rows(heading: &Summary) -> Vec<MetricRow> {
+    vec![
+        MetricRow::new(
+            "heading RMSE [deg]: root mean square of the wrapped heading difference",
+            heading.rmse.to_degrees(),
+        ),
+        MetricRow::new(
+            "heading mean [deg]: mean magnitude of the wrapped heading difference",
+            heading.mean.to_degrees(),
+        ),
+        MetricRow::new(
+            "heading median [deg]: half of the frames are nearer",
+            heading.median.to_degrees(),
+        ),
+        MetricRow::new(
+            "heading p95 [deg]: 95 % of the frames are nearer",
+            heading.p95.to_degrees(),
+        ),
+        MetricRow::new(
+            "heading max [deg]: the worst frame",
+            heading.max.to_degrees(),
+        ),
+    ]
+}
+
+fn success_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
+    let found = metrics.convergence;
+    vec![
+        MetricRow::new(
+            "strict success: converged, and every frame from there to the end is within the limits (default 0.5 m and 2 deg)",
+            Value::Flag(found.is_some_and(|found| found.kept)),
+        ),
+        MetricRow::new(
+            "time to convergence [frames]: frames before the first of ten good frames in a row",
+            found.map_or(Value::Absent, |found| Value::Count(found.row)),
+        ),
+        MetricRow::new(
+            "time to convergence [m]: distance driven until then",
+            found.map(|found| found.distance_m),
+        ),
+        MetricRow::new(
+            "time to convergence [s]: time passed until then",
+            found.and_then(|found| found.time_s),
+        ),
+    ]
+}
+
+fn smoothness_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
+    let smoothness = &metrics.smoothness;
+    vec![
+        MetricRow::new(
+            "jitter [m]: root mean square difference of consecutive planar error vectors",
+            smoothness.jitter_m,
+        ),
+        MetricRow::new(
+            "log dimensionless jerk: -ln(T³ / v²peak · ∫|jerk|² dt); nearer to zero is smoother (Hogan and Sternad 2009)",
+            smoothness.log_jerk,
+        ),
+        MetricRow::new(
+            "log dimensionless jerk of truth: the same of the ground truth",
+            smoothness.log_jerk_of_truth,
+        ),
+        MetricRow::new(
+            "drift [mm/m]: slope of the position error against the distance driven (least squares)",
+            metrics.drift.map(|drift| 1e3 * drift),
+        ),
+        MetricRow::new(
+            "drift over time [mm/s]: slope of the position error against time (least squares)",
+            metrics.drift_m_per_s.map(|drift| 1e3 * drift),
+        ),
+        MetricRow::new(
+            "mean pose change [m]: mean length of a step from frame to frame",
+            smoothness.mean_step_m,
+        ),
+        MetricRow::new(
+            "mean pose change of truth [m]: the same of the ground truth",
+            smoothness.mean_step_of_truth_m,
+        ),
+        MetricRow::new(
+            "mean heading change [deg]: mean magnitude of the turn from frame to frame",
+            smoothness.mean_turn_rad.map(f64::to_degrees),
+        ),
+    ]
+}
+
+fn relative_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
+    let segments = metrics.segments;
+    vec![
+        MetricRow::new(
+            "RPE translation RMSE [m]: relative pose error from frame to frame, translation (Sturm et al. 2012, as evo)",
+            metrics.rpe_translation_m.map(|rpe| rpe.rmse),
+        ),
+        MetricRow::new(
+            "RPE rotation RMSE [deg]: relative pose error from frame to frame, rotation",
+            metrics.rpe_rotation_rad.map(|rpe| rpe.rmse.to_degrees()),
+        ),
+        MetricRow::new(
+            "KITTI segments, translation [%]: mean error over segments of 100 to 800 m per distance (Geiger et al. 2012)",
+            segments.map(|segments| segments.translation_percent),
+        ),
+        MetricRow::new(
+            "KITTI segments, rotation [deg/m]: the same for rotation",
+            segments.map(|segments| segments.rotation_deg_per_m),
+        ),
+    ]
+}
+
+fn runtime_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
+    let runtime_ms =
+        |number: fn(&Summary) -> f64| metrics.runtime_s.as_ref().map(|time| 1e3 * number(time));
+    vec![
+        MetricRow::new(
+            "runtime p50 [ms]: time per counted frame: half are faster",
+            runtime_ms(|time| time.median),
+        ),
+        MetricRow::new(
+            "runtime p95 [ms]: time per counted frame: 95 % are faster",
+            runtime_ms(|time| time.p95),
+        ),
+        MetricRow::new(
+            "runtime max [ms]: the slowest counted frame",
+            runtime_ms(|time| time.max),
+        ),
+        MetricRow::new(
+            "runtime of first frame [ms]: the first frame of the run, with the start in it",
+            metrics.first_runtime_s.map(|time_s| 1e3 * time_s),
+        ),
+        MetricRow::new("frames: frames that count", Value::Count(metrics.frames)),
+        MetricRow::new(
+            "distance [m]: distance driven in them, by the truth",
+            metrics.distance_m,
+        ),
+    ]
+}
