@@ -9,7 +9,6 @@
 
 use std::ops::Range;
 
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::Point2;
 
 use crate::geometry::Grid2;
@@ -79,12 +78,9 @@ pub struct Ownership {
 impl Ownership {
     /// Over all places within `reach_m` of a counted scan.
     pub fn new(frames: &[Frame], plans: &[LocalMapPlan], reach_m: f64) -> Self {
-        let positions: Vec<[f64; 2]> = frames
+        let positions: Vec<Point2<f64>> = frames
             .iter()
-            .map(|frame| {
-                let t = frame.map_from_lidar.translation.vector;
-                [t.x, t.y]
-            })
+            .map(|frame| frame.map_from_lidar.translation.vector.xy().into())
             .collect();
         let corner = |pick: fn(f64, f64) -> f64, start: f64, margin_m: f64| {
             let along =
@@ -100,17 +96,9 @@ impl Ownership {
         for plan in plans {
             owner_of_frame[plan.own.clone()].fill(plan.number as u32);
         }
-        let tree: ImmutableKdTree<f64, 2> = ImmutableKdTree::new_from_slice(&positions)
-            .expect("positions of frames are finite and at least one");
-        let owners = (0..grid.len())
-            .map(|index| {
-                let center = grid.center(index % grid.columns, index / grid.columns);
-                let nearest = tree
-                    .query(&[center.x, center.y])
-                    .nearest_one::<SquaredEuclidean<f64>>()
-                    .execute();
-                owner_of_frame[nearest.item as usize]
-            })
+        let owners = nearest_positions(&grid, &positions)
+            .into_iter()
+            .map(|frame| owner_of_frame[frame])
             .collect();
         Self { grid, owners }
     }
@@ -127,6 +115,43 @@ impl Ownership {
         let is_inside = column < self.grid.columns && row < self.grid.rows;
         is_inside.then(|| self.owners[row * self.grid.columns + column] as usize)
     }
+}
+
+/// For each cell of a grid the index of the position nearest to its center, the first among
+/// equals; there must be at least one position.
+///
+/// Only positions that are nearest to some point of a block of cells are compared: by the
+/// triangle inequality they lie within the least distance from the center of the block plus the
+/// block's diameter.
+fn nearest_positions(grid: &Grid2, positions: &[Point2<f64>]) -> Vec<usize> {
+    const BLOCK_CELLS: usize = 16;
+    // Of the circle around a block, rounded up.
+    let block_diameter_m = 1.5 * BLOCK_CELLS as f64 * grid.cell_m;
+    let mut nearest = vec![0; grid.len()];
+    for first_row in (0..grid.rows).step_by(BLOCK_CELLS) {
+        for first_column in (0..grid.columns).step_by(BLOCK_CELLS) {
+            let corner = grid.center(first_column, first_row);
+            let center = corner.map(|m| m + 0.5 * (BLOCK_CELLS - 1) as f64 * grid.cell_m);
+            let distances_m: Vec<f64> = positions.iter().map(|p| (p - center).norm()).collect();
+            let reach_m =
+                distances_m.iter().copied().fold(f64::INFINITY, f64::min) + block_diameter_m;
+            let candidates: Vec<usize> = (0..positions.len())
+                .filter(|&i| distances_m[i] <= reach_m)
+                .collect();
+            for row in first_row..grid.rows.min(first_row + BLOCK_CELLS) {
+                for column in first_column..grid.columns.min(first_column + BLOCK_CELLS) {
+                    let cell = grid.center(column, row);
+                    let squared = |i: usize| (positions[i] - cell).norm_squared();
+                    nearest[row * grid.columns + column] = candidates
+                        .iter()
+                        .copied()
+                        .min_by(|&a, &b| squared(a).total_cmp(&squared(b)))
+                        .unwrap_or(0);
+                }
+            }
+        }
+    }
+    nearest
 }
 
 #[cfg(test)]
@@ -180,5 +205,23 @@ mod tests {
         assert_eq!(owner_at(9.9, -20.0), Some(1));
         assert_eq!(owner_at(40.0, 0.0), Some(1));
         assert_eq!(owner_at(60.0, 0.0), None);
+    }
+
+    #[test]
+    fn nearest_positions_agree_with_comparing_all() {
+        let positions: Vec<Point2<f64>> = (0..60)
+            .map(|i| Point2::new(f64::from(i).sin() * 40.0, f64::from(i) * 0.9))
+            .collect();
+        let grid = Grid2::covering(Point2::new(-50.0, -10.0), Point2::new(49.0, 70.0), 0.7);
+        let nearest = nearest_positions(&grid, &positions);
+        for (index, &found) in nearest.iter().enumerate() {
+            let center = grid.center(index % grid.columns, index / grid.columns);
+            let squared = |p: &Point2<f64>| (p - center).norm_squared();
+            assert!(
+                positions
+                    .iter()
+                    .all(|p| squared(p) >= squared(&positions[found]))
+            );
+        }
     }
 }
