@@ -13,6 +13,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
+use fpmcl::app::plotting::Bitmap;
+
 /// Widths of a desk's and a phone's window [pixels].
 const WIDTHS: [u32; 2] = [1280, 390];
 
@@ -107,8 +109,8 @@ impl Browser {
     }
 
     /// The page from its top to its end, in one picture.
-    fn screenshot(&self, html: &str, width: u32, height: u32) -> image::RgbImage {
-        let mut whole = image::RgbImage::new(width, height);
+    fn screenshot(&self, html: &str, width: u32, height: u32) -> Bitmap {
+        let mut pixels = Vec::new();
         for top in (0..height).step_by(HIGHEST as usize) {
             let style = format!("<style>body {{ margin-top: -{top}px }}</style></head>");
             let rows = HIGHEST.min(height - top);
@@ -117,11 +119,16 @@ impl Browser {
             let size = format!("--window-size={},{rows}", width.max(NARROWEST));
             let shot = format!("--screenshot={}", picture.display());
             self.visit(&window.address, &[shot, size]);
-            let part = image::open(&picture).unwrap().to_rgb8();
-            let part = image::imageops::crop_imm(&part, 0, 0, width, rows).to_image();
-            image::imageops::replace(&mut whole, &part, 0, i64::from(top));
+            let part = Bitmap::read_png(&picture).unwrap();
+            for row in part.pixels.chunks(part.width as usize).take(rows as usize) {
+                pixels.extend(&row[..width as usize]);
+            }
         }
-        whole
+        Bitmap {
+            width,
+            height,
+            pixels,
+        }
     }
 }
 
@@ -208,7 +215,8 @@ fn pages_are_seen_whole_on_a_desk_and_on_a_phone() {
             );
             let pixels = browser.screenshot(&html, width, height.parse().unwrap());
             let name = format!("{}_{width}.png", name_of(page));
-            pixels.save(browser.kept.join(&name)).unwrap();
+            let kept = fs::File::create(browser.kept.join(&name)).unwrap();
+            pixels.write_png(kept).unwrap();
             if let Some(objection) = objection_to_page(&pixels) {
                 panic!("{place}: {objection}");
             }
@@ -274,18 +282,17 @@ const LEAST_COLORS: usize = 50;
 const ENDS: u32 = 300;
 
 /// What speaks against a page as a browser showed it.
-fn objection_to_page(pixels: &image::RgbImage) -> Option<String> {
-    let colors: BTreeSet<[u8; 3]> = pixels.pixels().map(|pixel| pixel.0).collect();
+fn objection_to_page(pixels: &Bitmap) -> Option<String> {
+    let colors: BTreeSet<[u8; 3]> = pixels.pixels.iter().copied().collect();
     if colors.len() < LEAST_COLORS {
         return Some(format!("only {} colours", colors.len()));
     }
-    let (width, height) = pixels.dimensions();
     let band = |from: u32, to: u32| {
-        let places = (from..to).flat_map(|y| (0..width).map(move |x| (x, y)));
-        places
-            .filter(|&(x, y)| pixels.get_pixel(x, y).0 != [255; 3])
-            .count()
+        let [from, to] = [from, to].map(|row| (row * pixels.width) as usize);
+        let rows = pixels.pixels[from..to].iter();
+        rows.filter(|pixel| **pixel != [255; 3]).count()
     };
+    let height = pixels.height;
     let top = band(0, ENDS.min(height));
     let middle = band(ENDS.min(height), height);
     let end = band(height.saturating_sub(ENDS), height);
@@ -295,12 +302,12 @@ fn objection_to_page(pixels: &image::RgbImage) -> Option<String> {
 
 #[test]
 fn a_blank_page_and_one_that_ends_early_are_none() {
-    let mut pixels = image::RgbImage::from_pixel(400, 900, image::Rgb([255; 3]));
+    let mut pixels = Bitmap::from_fn(400, 900, |_, _| [255; 3]);
     assert_eq!(objection_to_page(&pixels).unwrap(), "only 1 colours");
-    let mut paint = |rows: std::ops::Range<u32>| {
+    let mut paint = |rows: std::ops::Range<usize>| {
         for y in rows {
             for x in 0..200 {
-                pixels.put_pixel(x, y, image::Rgb([x as u8, 0, 0]));
+                pixels.pixels[y * 400 + x] = [x as u8, 0, 0];
             }
         }
         objection_to_page(&pixels)

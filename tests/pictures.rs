@@ -10,6 +10,7 @@ mod common;
 use std::path::Path;
 
 use common::picture::Picture;
+use fpmcl::app::plotting::Bitmap;
 use fpmcl::app::plotting::color::{MCL, REFINED};
 
 #[test]
@@ -34,24 +35,21 @@ fn the_pictures_of_finished_runs_show_the_paths() {
 #[test]
 fn a_blank_or_a_small_picture_or_one_without_the_line_is_none() {
     let line = [213, 94, 0];
-    let mut pixels = image::RgbImage::from_pixel(1300, 400, image::Rgb([255; 3]));
-    let objection = |pixels: &image::RgbImage| {
+    let mut pixels = Bitmap::from_fn(1300, 400, |_, _| [255; 3]);
+    let objection = |pixels: &Bitmap| {
         let picture = Picture::of("own".to_owned(), pixels);
         picture.objection(40, &[line]).unwrap_or_default()
     };
     assert_eq!(objection(&pixels), "blank");
-    for x in 0..1300 {
+    pixels = Bitmap::from_fn(1300, 400, |x, y| match y {
         // The legend is no line.
-        pixels.put_pixel(x, 60, image::Rgb(line));
-        for y in 0..20 {
-            pixels.put_pixel(x, 150 + y, image::Rgb([x as u8, 40, y as u8]));
-        }
-    }
+        60 => line,
+        150..170 => [x as u8, 40, (y - 150) as u8],
+        _ => [255; 3],
+    });
     assert!(objection(&pixels).starts_with("nothing is drawn in"));
-    for x in 0..60 {
-        pixels.put_pixel(x, 200, image::Rgb(line));
-    }
+    pixels.pixels[200 * 1300..][..60].fill(line);
     assert_eq!(objection(&pixels), "");
-    let small = image::imageops::crop_imm(&pixels, 0, 0, 800, 400).to_image();
+    let small = Bitmap::from_fn(800, 400, |x, y| pixels.pixel(x, y));
     assert!(objection(&small).starts_with("only 800"));
 }

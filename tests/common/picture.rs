@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use fpmcl::app::plotting::Bitmap;
+
 /// Least width that is readable on a screen and on paper [pixels].
 const LEAST_WIDTH: u32 = 1200;
 
@@ -25,22 +27,23 @@ impl Picture {
     #[track_caller]
     pub fn read(path: &Path) -> Self {
         let name = path.display().to_string();
-        let pixels = match image::open(path) {
-            Ok(picture) => picture.to_rgb8(),
+        let pixels = match Bitmap::read_png(path) {
+            Ok(pixels) => pixels,
             Err(error) => panic!("{name}: {error}"),
         };
         Self::of(name, &pixels)
     }
 
     /// The picture that some pixels make.
-    pub fn of(name: String, pixels: &image::RgbImage) -> Self {
+    pub fn of(name: String, pixels: &Bitmap) -> Self {
         let mut colors = BTreeMap::new();
-        for (_, _, pixel) in pixels.enumerate_pixels().filter(|&(_, y, _)| y >= HEADING) {
-            *colors.entry(pixel.0).or_default() += 1;
+        let heading = (HEADING * pixels.width) as usize;
+        for pixel in pixels.pixels.iter().skip(heading) {
+            *colors.entry(*pixel).or_default() += 1;
         }
         Self {
             name,
-            width: pixels.width(),
+            width: pixels.width,
             colors,
         }
     }

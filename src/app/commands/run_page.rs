@@ -215,6 +215,7 @@ pub fn folded(path: &Path, name: &str) -> Result<Option<Block>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::app::plotting::Bitmap;
 
     #[test]
     fn a_damaged_picture_is_left_out_and_told() {
@@ -226,7 +227,8 @@ mod tests {
             panic!("nothing is said of it");
         };
         assert!(told.contains("map.png"), "{told}");
-        image::RgbImage::new(2, 2).save(&path).unwrap();
+        let pixels = Bitmap::from_fn(2, 2, |_, _| [0; 3]);
+        pixels.write_png(fs::File::create(&path).unwrap()).unwrap();
         let shown = picture_or_word(&path, "The map");
         assert!(matches!(shown, Some(Block::Picture { .. })));
     }

@@ -1,30 +1,27 @@
-//! Frames of localization as a moving picture.
+//! Animated GIF from the pictures of single frames.
 
-use std::fs::File;
-use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use image::codecs::gif::{GifEncoder, Repeat};
-use image::imageops::FilterType;
-use image::{Delay, DynamicImage, Frame, ImageError};
+use rayon::prelude::*;
 
+use super::bitmap::Bitmap;
 use super::error::PlotError;
 use crate::evaluation::write_atomically;
 
-/// How a folder of pictures becomes a GIF.
+/// Settings of an animated GIF.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Animation {
-    /// Width of the pictures in it [px]; they are shrunk to it.
+    /// Largest width [px]; wider pictures are scaled down.
     pub width: u32,
-    /// At most so many pictures, evenly chosen, the last one always.
+    /// Maximum number of pictures; they are chosen evenly and always include the last one.
     pub max_frames: usize,
-    /// How long the whole takes.
+    /// Total duration.
     pub duration: Duration,
 }
 
 impl Default for Animation {
-    /// 1,200 pixels wide, up to 150 pictures, ten a second.
+    /// 1,200 pixels wide, up to 150 pictures, 10 per second.
     fn default() -> Self {
         Self {
             width: 1200,
@@ -35,26 +32,27 @@ impl Default for Animation {
 }
 
 impl Animation {
-    /// Makes a GIF that repeats for ever of pictures on disk, which all have one size.
+    /// Writes a GIF that repeats forever from PNG files, all of one size.
     pub fn save(&self, path: &Path, pictures: &[PathBuf]) -> Result<(), PlotError> {
         let chosen = self.choose(pictures);
-        if chosen.is_empty() {
-            return Err(PlotError::Nothing {
-                path: path.to_owned(),
-                what: "there are no pictures to animate",
-            });
-        }
-        // GIF counts in hundredths of a second, and viewers do not show less than two.
-        let delay = (self.duration / chosen.len() as u32).max(Duration::from_millis(20));
-        write_atomically(path, |file| self.encode(file, &chosen, delay)).map_err(
-            |source: PictureError| match source {
-                PictureError::Read { path, source } => PlotError::Read { path, source },
-                PictureError::Write(source) => PlotError::Write {
-                    path: path.to_owned(),
-                    source,
-                },
-            },
-        )
+        let frames = chosen
+            .par_iter()
+            .map(|picture| self.frame(picture, chosen.len()))
+            .collect::<Result<Vec<gif::Frame>, PlotError>>()?;
+        let first = frames.first().ok_or_else(|| PlotError::Nothing {
+            path: path.to_owned(),
+            what: "there are no pictures to animate",
+        })?;
+        write_atomically(path, |file| {
+            let mut encoder = gif::Encoder::new(file, first.width, first.height, &[])?;
+            encoder.set_repeat(gif::Repeat::Infinite)?;
+            let mut frames = frames.iter();
+            frames.try_for_each(|frame| encoder.write_lzw_pre_encoded_frame(frame))
+        })
+        .map_err(|source: gif::EncodingError| PlotError::Write {
+            path: path.to_owned(),
+            source: std::io::Error::other(source),
+        })
     }
 
     fn choose<'a>(&self, pictures: &'a [PathBuf]) -> Vec<&'a PathBuf> {
@@ -64,52 +62,26 @@ impl Animation {
             .collect()
     }
 
-    fn encode(
-        &self,
-        file: &mut BufWriter<&mut File>,
-        pictures: &[&PathBuf],
-        delay: Duration,
-    ) -> Result<(), PictureError> {
-        // The fastest search for a palette; our pictures have few colours.
+    /// Reads, scales, quantizes and compresses one of `count` pictures.
+    fn frame(&self, picture: &Path, count: usize) -> Result<gif::Frame<'static>, PlotError> {
+        // The fastest search for a palette; our pictures have few colors.
         const SPEED: i32 = 30;
-        let mut encoder = GifEncoder::new_with_speed(file, SPEED);
-        encoder.set_repeat(Repeat::Infinite)?;
-        for &picture in pictures {
-            let image = image::open(picture).map_err(|source| PictureError::Read {
-                path: picture.clone(),
-                source,
-            })?;
-            let pixels = self.shrink(image).into_rgba8();
-            let delay = Delay::from_saturating_duration(delay);
-            encoder.encode_frame(Frame::from_parts(pixels, 0, 0, delay))?;
+        let mut image = Bitmap::read_png(picture).map_err(|source| PlotError::Read {
+            path: picture.to_owned(),
+            source,
+        })?;
+        if image.width > self.width {
+            let height = (image.height * self.width).div_ceil(image.width);
+            image = image.resized(self.width, height);
         }
-        Ok(())
-    }
-
-    fn shrink(&self, image: DynamicImage) -> DynamicImage {
-        if image.width() <= self.width {
-            return image;
-        }
-        let height = (image.height() * self.width).div_ceil(image.width());
-        image.resize_exact(self.width, height, FilterType::Triangle)
-    }
-}
-
-/// Which side of the work failed.
-enum PictureError {
-    Read { path: PathBuf, source: ImageError },
-    Write(ImageError),
-}
-
-impl From<std::io::Error> for PictureError {
-    fn from(error: std::io::Error) -> Self {
-        Self::Write(ImageError::IoError(error))
-    }
-}
-
-impl From<ImageError> for PictureError {
-    fn from(error: ImageError) -> Self {
-        Self::Write(error)
+        let (width, height) = (image.width as u16, image.height as u16);
+        let pixels = image.pixels.as_flattened();
+        let mut frame = gif::Frame::from_rgb_speed(width, height, pixels, SPEED);
+        frame.make_lzw_pre_encoded();
+        // GIF counts hundredths of a second, and viewers do not show less than two.
+        let delay = self.duration.as_millis() / 10 / count as u128;
+        frame.delay = u16::try_from(delay.max(2)).unwrap_or(u16::MAX);
+        Ok(frame)
     }
 }
 

@@ -12,17 +12,17 @@ pub enum PlotError {
     #[error("cannot read {}: {source}", path.display())]
     Read {
         path: PathBuf,
-        source: image::ImageError,
+        source: std::io::Error,
     },
     #[error("cannot write {}: {source}", path.display())]
     Write {
         path: PathBuf,
-        source: image::ImageError,
+        source: std::io::Error,
     },
     #[error("cannot give {} a palette: {source}", path.display())]
     Encode {
         path: PathBuf,
-        source: png::EncodingError,
+        source: std::io::Error,
     },
     #[error("cannot draw {}: {source}", path.display())]
     Draw {

@@ -106,6 +106,7 @@ impl GroundPlot<'_> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::bitmap::Bitmap;
     use super::*;
 
     #[test]
@@ -123,9 +124,9 @@ mod tests {
             reach_m: (10.0, 5.0),
         };
         plot.save(&path).unwrap();
-        let image = image::open(&path).unwrap().to_rgb8();
+        let image = Bitmap::read_png(&path).unwrap();
         // In the legend and in the picture.
-        let count = |color: Rgb| image.pixels().filter(|pixel| pixel.0 == color).count();
+        let count = |color: Rgb| image.pixels.iter().filter(|pixel| **pixel == color).count();
         let with_errors = [GROUND, REST, MISSED, FALSE].map(count);
         assert!(
             with_errors.iter().all(|&count| count > 0),
@@ -136,8 +137,8 @@ mod tests {
             ..plot
         };
         right.save(&path).unwrap();
-        let image = image::open(&path).unwrap().to_rgb8();
-        let count = |color: Rgb| image.pixels().filter(|pixel| pixel.0 == color).count();
+        let image = Bitmap::read_png(&path).unwrap();
+        let count = |color: Rgb| image.pixels.iter().filter(|pixel| **pixel == color).count();
         let without = [GROUND, REST, MISSED, FALSE].map(count);
         assert!(without[0] > with_errors[0] && without[2] < with_errors[2]);
     }

@@ -4,6 +4,7 @@
 //! equal scales on both axes, axes have units, and legends stand outside the data.
 
 // What pictures are drawn with.
+pub mod bitmap;
 pub mod color;
 mod error;
 pub mod palette;
@@ -23,6 +24,7 @@ pub mod trajectory;
 mod tests;
 
 pub use animation::Animation;
+pub use bitmap::Bitmap;
 pub use chart::{LineChart, Mark, Panel, Series};
 pub use error::PlotError;
 pub use ground_plot::GroundPlot;

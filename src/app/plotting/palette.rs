@@ -8,8 +8,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use image::RgbImage;
-
+use super::bitmap::Bitmap;
 use super::color::Rgb;
 use super::error::PlotError;
 
@@ -22,17 +21,17 @@ pub fn with_palette(path: &Path) -> Result<Vec<u8>, PlotError> {
         path: path.to_owned(),
         source,
     };
-    let image = image::open(path).map_err(read)?.into_rgb8();
+    let image = Bitmap::read_png(path).map_err(read)?;
     encoded(&image).map_err(|source| PlotError::Encode {
         path: path.to_owned(),
         source,
     })
 }
 
-fn encoded(image: &RgbImage) -> Result<Vec<u8>, png::EncodingError> {
+fn encoded(image: &Bitmap) -> Result<Vec<u8>, std::io::Error> {
     let (palette, place) = palette_of(image);
     let mut bytes = Vec::new();
-    let mut encoder = png::Encoder::new(&mut bytes, image.width(), image.height());
+    let mut encoder = png::Encoder::new(&mut bytes, image.width, image.height);
     encoder.set_color(png::ColorType::Indexed);
     encoder.set_depth(png::BitDepth::Eight);
     encoder.set_compression(png::Compression::High);
@@ -40,17 +39,17 @@ fn encoded(image: &RgbImage) -> Result<Vec<u8>, png::EncodingError> {
     encoder.set_filter(png::Filter::NoFilter);
     encoder.set_palette(palette.concat());
     let mut writer = encoder.write_header()?;
-    let pixels: Vec<u8> = image.pixels().map(|pixel| place[&pixel.0]).collect();
+    let pixels: Vec<u8> = image.pixels.iter().map(|pixel| place[pixel]).collect();
     writer.write_image_data(&pixels)?;
     writer.finish()?;
     Ok(bytes)
 }
 
 /// The palette, and for every colour of the picture its place in it.
-fn palette_of(image: &RgbImage) -> (Vec<Rgb>, BTreeMap<Rgb, u8>) {
+fn palette_of(image: &Bitmap) -> (Vec<Rgb>, BTreeMap<Rgb, u8>) {
     let mut counts = BTreeMap::<Rgb, usize>::new();
-    for pixel in image.pixels() {
-        *counts.entry(pixel.0).or_default() += 1;
+    for &pixel in &image.pixels {
+        *counts.entry(pixel).or_default() += 1;
     }
     let mut colors: Vec<(Rgb, usize)> = counts.into_iter().collect();
     colors.sort_by_key(|&(color, count)| (std::cmp::Reverse(count), color));
@@ -94,40 +93,40 @@ mod tests {
     use super::super::color::{Colormap, MCL, REFINED};
     use super::*;
 
-    fn decoded(image: &RgbImage) -> RgbImage {
-        let bytes = encoded(image).unwrap();
-        image::load_from_memory(&bytes).unwrap().into_rgb8()
+    fn decoded(image: &Bitmap) -> Bitmap {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("palette.png");
+        std::fs::write(&path, encoded(image).unwrap()).unwrap();
+        Bitmap::read_png(&path).unwrap()
     }
 
     #[test]
     fn a_picture_of_few_colours_stays_as_it_is() {
-        let image = RgbImage::from_fn(40, 30, |x, y| image::Rgb([x as u8, (y / 6) as u8, 9]));
+        let image = Bitmap::from_fn(40, 30, |x, y| [x as u8, (y / 6) as u8, 9]);
         assert_eq!(decoded(&image), image);
     }
 
     #[test]
     fn lines_keep_their_colours_and_no_pixel_moves_far() {
-        let image = RgbImage::from_fn(300, 300, |x, y| {
-            image::Rgb(match (x, y) {
-                (_, 100) => MCL,
-                (_, 101) => REFINED,
-                _ => {
-                    let [red, green, blue] = Colormap::Viridis.at(f64::from(x) / 300.0);
-                    [red, green, blue / 2 + (y / 3) as u8]
-                }
-            })
+        let image = Bitmap::from_fn(300, 300, |x, y| match (x, y) {
+            (_, 100) => MCL,
+            (_, 101) => REFINED,
+            _ => {
+                let [red, green, blue] = Colormap::Viridis.at(f64::from(x) / 300.0);
+                [red, green, blue / 2 + (y / 3) as u8]
+            }
         });
-        let colors = |image: &RgbImage| {
-            let all: std::collections::BTreeSet<Rgb> = image.pixels().map(|p| p.0).collect();
+        let colors = |image: &Bitmap| {
+            let all: std::collections::BTreeSet<&Rgb> = image.pixels.iter().collect();
             all.len()
         };
         assert!(colors(&image) > 10 * COLORS);
         let found = decoded(&image);
         assert!(colors(&found) <= COLORS);
-        assert_eq!(found.get_pixel(7, 100).0, MCL);
-        assert_eq!(found.get_pixel(7, 101).0, REFINED);
-        let farthest = image.pixels().zip(found.pixels());
-        let farthest = farthest.map(|(a, b)| distance(a.0, b.0)).max().unwrap();
+        assert_eq!(found.pixel(7, 100), MCL);
+        assert_eq!(found.pixel(7, 101), REFINED);
+        let farthest = image.pixels.iter().zip(&found.pixels);
+        let farthest = farthest.map(|(a, b)| distance(*a, *b)).max().unwrap();
         assert!(farthest <= 12, "{farthest}");
     }
 }

@@ -1,11 +1,9 @@
 //! A sheet of paper: lines, text and pixels in a bitmap that is drawn twice as large and shrunk,
 //! which smooths every edge.
 
-use std::io::BufWriter;
 use std::path::Path;
 use std::sync::Once;
 
-use image::{ImageEncoder as _, RgbImage};
 use plotters::backend::BitMapBackend;
 use plotters::coord::Shift;
 use plotters::drawing::{DrawingArea, IntoDrawingArea as _};
@@ -18,6 +16,7 @@ use plotters::style::{
 
 pub use plotters::style::text_anchor::{HPos, VPos};
 
+use super::bitmap::Bitmap;
 use super::color::{INK, Rgb, WHITE};
 use super::error::{DrawError, PlotError};
 use crate::evaluation::write_atomically;
@@ -145,16 +144,16 @@ impl Lettering {
 pub fn draw(
     (width, height): (u32, u32),
     picture: impl FnOnce(&Sheet) -> Result<(), DrawError>,
-) -> Result<RgbImage, DrawError> {
+) -> Result<Bitmap, DrawError> {
     let size = (width * SCALE, height * SCALE);
-    let mut pixels = vec![255; 3 * size.0 as usize * size.1 as usize];
+    let mut large = Bitmap::from_fn(size.0, size.1, |_, _| WHITE);
     let sheet = Sheet {
-        root: BitMapBackend::with_buffer(&mut pixels, size).into_drawing_area(),
+        root: BitMapBackend::with_buffer(large.pixels.as_flattened_mut(), size).into_drawing_area(),
     };
     picture(&sheet)?;
     sheet.root.present()?;
     drop(sheet);
-    Ok(shrink(&pixels, width, height))
+    Ok(large.resized(width, height))
 }
 
 /// Draws a picture and writes it as PNG.
@@ -164,21 +163,7 @@ pub fn save(
     picture: impl FnOnce(&Sheet) -> Result<(), DrawError>,
 ) -> Result<(), PlotError> {
     let image = draw(size, picture).map_err(PlotError::draw(path))?;
-    write_png(path, &image)
-}
-
-/// Writes a PNG, whole or not at all.
-pub fn write_png(path: &Path, image: &RgbImage) -> Result<(), PlotError> {
-    write_atomically(path, |file: &mut BufWriter<&mut std::fs::File>| {
-        let (width, height) = image.dimensions();
-        image::codecs::png::PngEncoder::new(file).write_image(
-            image.as_raw(),
-            width,
-            height,
-            image::ExtendedColorType::Rgb8,
-        )
-    })
-    .map_err(|source: image::ImageError| PlotError::Write {
+    write_atomically(path, |file| image.write_png(file)).map_err(|source| PlotError::Write {
         path: path.to_owned(),
         source,
     })
@@ -355,25 +340,6 @@ fn register_fonts() {
     });
 }
 
-/// Mean of each square of pixels.
-fn shrink(pixels: &[u8], width: u32, height: u32) -> RgbImage {
-    let stride = (width * SCALE) as usize;
-    let mut image = RgbImage::from_pixel(width, height, image::Rgb(WHITE));
-    for (x, y, pixel) in image.enumerate_pixels_mut() {
-        let mut sum = [0_u32; 3];
-        for row in 0..SCALE {
-            let begin = (y * SCALE + row) as usize * stride + (x * SCALE) as usize;
-            for color in pixels[3 * begin..3 * (begin + SCALE as usize)].chunks_exact(3) {
-                for channel in 0..3 {
-                    sum[channel] += u32::from(color[channel]);
-                }
-            }
-        }
-        *pixel = image::Rgb(sum.map(|sum| ((sum + SCALE * SCALE / 2) / (SCALE * SCALE)) as u8));
-    }
-    image
-}
-
 /// The part of a line inside a rectangle (Liang and Barsky 1984); `None` where it is outside.
 fn clipped(from: Point, to: Point, rect: &Rect) -> Option<(Point, Point)> {
     let (dx, dy) = (to.0 - from.0, to.1 - from.1);
@@ -428,10 +394,10 @@ mod tests {
             sheet.polyline(&[(-500.0, 50.0), (500.0, 50.0)], &SQUARE, pen)
         })
         .unwrap();
-        assert_eq!(image.get_pixel(50, 50).0, [200, 0, 0]);
-        assert_eq!(image.get_pixel(5, 50).0, WHITE);
-        assert_eq!(image.get_pixel(95, 50).0, WHITE);
-        assert_eq!(image.get_pixel(50, 60).0, WHITE);
+        assert_eq!(image.pixel(50, 50), [200, 0, 0]);
+        assert_eq!(image.pixel(5, 50), WHITE);
+        assert_eq!(image.pixel(95, 50), WHITE);
+        assert_eq!(image.pixel(50, 60), WHITE);
     }
 
     #[test]
@@ -449,7 +415,7 @@ mod tests {
             sheet.text("error [m]", (5.0, 5.0), lettering)
         })
         .unwrap();
-        let dark = image.pixels().filter(|pixel| pixel.0[0] < 120).count();
+        let dark = image.pixels.iter().filter(|pixel| pixel[0] < 120).count();
         assert!(dark > 100, "{dark}");
         assert!(text_width("error [m]", lettering) > text_width("[m]", lettering));
     }

@@ -4,7 +4,6 @@
 
 use std::path::{Path, PathBuf};
 
-use image::RgbImage;
 use nalgebra::Vector2;
 use rand::rngs::StdRng;
 use rand::{RngExt as _, SeedableRng as _};
@@ -45,13 +44,17 @@ impl Gallery {
 }
 
 /// A picture that is large, not blank, and has each colour in at least so many pixels.
-fn assert_picture(path: &Path, colors: &[(Rgb, usize)]) -> RgbImage {
-    let image = image::open(path).unwrap().into_rgb8();
-    assert!(image.width() >= 1200 && image.height() >= 400);
-    let white = image.pixels().filter(|pixel| pixel.0 == [255; 3]).count();
-    assert!(white < image.pixels().len() * 99 / 100, "blank");
+fn assert_picture(path: &Path, colors: &[(Rgb, usize)]) -> Bitmap {
+    let image = Bitmap::read_png(path).unwrap();
+    assert!(image.width >= 1200 && image.height >= 400);
+    let white = image
+        .pixels
+        .iter()
+        .filter(|pixel| **pixel == [255; 3])
+        .count();
+    assert!(white < image.pixels.len() * 99 / 100, "blank");
     for (color, at_least) in colors {
-        let found = image.pixels().filter(|pixel| pixel.0 == *color).count();
+        let found = image.pixels.iter().filter(|pixel| *pixel == color).count();
         assert!(found >= *at_least, "{color:?}: {found}");
     }
     image
@@ -312,14 +315,13 @@ fn frames_become_an_animation_of_one_size() {
         .collect();
     let path = gallery.path("localization.gif");
     Animation::default().save(&path, &pictures).unwrap();
-    let gif = std::fs::read(&path).unwrap();
-    let decoder = image::codecs::gif::GifDecoder::new(std::io::Cursor::new(gif)).unwrap();
-    let frames: Vec<image::Frame> = image::AnimationDecoder::into_frames(decoder)
-        .collect::<Result<_, _>>()
-        .unwrap();
+    let mut options = gif::DecodeOptions::new();
+    options.set_color_output(gif::ColorOutput::RGBA);
+    let decoder = options.read_info(std::fs::File::open(&path).unwrap());
+    let frames: Vec<gif::Frame> = decoder.unwrap().into_iter().map(Result::unwrap).collect();
     assert_eq!(frames.len(), 4);
-    assert!(frames.iter().all(|frame| frame.buffer().width() == 1200));
-    assert_ne!(frames[0].buffer(), frames[3].buffer());
+    assert!(frames.iter().all(|frame| frame.width == 1200));
+    assert_ne!(frames[0].buffer, frames[3].buffer);
 
     let missing = [gallery.path("no_such.png")];
     let message = Animation::default()
@@ -409,12 +411,14 @@ fn the_map_is_drawn_in_its_colours_and_by_a_number() {
     .unwrap();
     let image = assert_picture(&path, &[(TRUTH, 300)]);
     let reddish = image
-        .pixels()
-        .filter(|p| p.0[0] > 120 && p.0[1] < 90 && p.0[2] < 90)
+        .pixels
+        .iter()
+        .filter(|p| p[0] > 120 && p[1] < 90 && p[2] < 90)
         .count();
     let bluish = image
-        .pixels()
-        .filter(|p| p.0[2] > 100 && p.0[0] < 90 && p.0[1] < 90)
+        .pixels
+        .iter()
+        .filter(|p| p[2] > 100 && p[0] < 90 && p[1] < 90)
         .count();
     assert!(reddish > 10_000 && bluish > 1000, "{reddish} {bluish}");
 
