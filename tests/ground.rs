@@ -5,7 +5,7 @@
 mod common;
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use common::fpmcl;
 use fpmcl::recording::velodyne::{read_labels, write_labels, write_scan};
@@ -25,8 +25,13 @@ fn recording() -> (TempDir, Vec<LabelledScan>) {
     let scenes: Vec<LabelledScan> = [3, 4].map(|seed| slope_scene(0.1, &scanner, seed)).into();
     for (number, scene) in scenes.iter().enumerate() {
         let path = |kind: &str| folder.path().join(format!("{kind}/{number:06}"));
-        write_scan(&path("velodyne").with_extension("bin"), &scene.scan).unwrap();
-        write_labels(&path("labels").with_extension("label"), &scene.classes).unwrap();
+        let create = |path: PathBuf| fs::File::create(path).unwrap();
+        write_scan(create(path("velodyne").with_extension("bin")), &scene.scan).unwrap();
+        write_labels(
+            create(path("labels").with_extension("label")),
+            &scene.classes,
+        )
+        .unwrap();
     }
     (folder, scenes)
 }
@@ -214,7 +219,7 @@ fn bad_input_is_told_with_a_remedy() {
         .fails_saying(&["ransac.ransac_n", "3 points"]);
 
     let labels = folder.path().join("labels/000001.label");
-    write_labels(&labels, &[40; 7]).unwrap();
+    write_labels(fs::File::create(&labels).unwrap(), &[40; 7]).unwrap();
     fpmcl("ground")
         .with(folder.path())
         .fails_saying(&["000001.label has 7 labels", "label_folder"]);

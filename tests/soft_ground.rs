@@ -45,7 +45,7 @@ fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMap
         .enumerate()
         .map(|(number, scan)| {
             let scan_path = folder.path().join(format!("{number}.bin"));
-            write_scan(&scan_path, scan).unwrap();
+            write_scan(std::fs::File::create(&scan_path).unwrap(), scan).unwrap();
             Frame {
                 number,
                 scan_path,

@@ -3,7 +3,6 @@
 //! [`metrics`] computes the errors of the literature, [`range_mcl`] those of range-mcl's
 //! evaluation script. Everything here works on values; files are read and written elsewhere.
 
-mod atomic;
 pub mod convergence;
 pub mod metrics;
 pub mod planar;
@@ -12,7 +11,6 @@ pub mod range_mcl;
 pub mod smoothness;
 pub mod statistics;
 
-pub use atomic::write_atomically;
 pub use convergence::{Convergence, StrictSuccess};
 pub use metrics::{EvaluatedTrajectory, MetricsConfig, MetricsError, TrajectoryMetrics};
 pub use planar::{PlanarError, distances_m, planar_errors};

@@ -1,6 +1,6 @@
 //! `calib.txt`: where the lidar sits on the camera.
 
-use std::fs;
+use std::io::{self, Write};
 use std::path::Path;
 
 use super::KittiError;
@@ -36,12 +36,8 @@ impl Calibration {
     }
 
     /// Writes a `calib.txt` with the line `Tr` alone.
-    pub fn write(&self, path: &Path) -> Result<(), KittiError> {
-        let text = format!("Tr: {}\n", row_from_pose(&self.cam0_from_lidar));
-        fs::write(path, text).map_err(|source| KittiError::Write {
-            path: path.to_owned(),
-            source,
-        })
+    pub fn write(&self, mut writer: impl Write) -> io::Result<()> {
+        writeln!(writer, "Tr: {}", row_from_pose(&self.cam0_from_lidar))
     }
 
     /// The pose of the lidar relative to its first pose, from camera poses:
@@ -136,7 +132,9 @@ mod tests {
         let calibration = Calibration {
             cam0_from_lidar: Pose3::new(Vector3::new(0.1, -0.2, 0.3), Vector3::new(1.2, -1.2, 1.2)),
         };
-        calibration.write(&path).unwrap();
+        calibration
+            .write(std::fs::File::create(&path).unwrap())
+            .unwrap();
         let back = Calibration::read(&path).unwrap();
         assert_relative_eq!(
             back.cam0_from_lidar,

@@ -11,11 +11,6 @@ pub enum KittiError {
         path: PathBuf,
         source: std::io::Error,
     },
-    #[error("cannot write {}: {source}", path.display())]
-    Write {
-        path: PathBuf,
-        source: std::io::Error,
-    },
     #[error("{} has {bytes} bytes, which is not a multiple of {record_bytes}; it looks truncated, copy it again", path.display())]
     Truncated {
         path: PathBuf,

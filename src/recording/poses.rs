@@ -1,6 +1,6 @@
 //! `poses.txt` (camera poses, 3x4 rows), `times.txt`, and TUM trajectories.
 
-use std::fs;
+use std::io::{self, Write};
 use std::path::Path;
 
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
@@ -43,20 +43,20 @@ impl CameraPoses {
 /// Writes lidar poses as camera poses in the convention of the recording's `poses.txt`
 /// whose first pose is `world_from_first_cam0`.
 pub fn write_kitti(
-    path: &Path,
+    mut writer: impl Write,
     map_from_lidar: &[Pose3],
     world_from_first_cam0: &Pose3,
     calibration: &Calibration,
-) -> Result<(), KittiError> {
+) -> io::Result<()> {
     let rows: String = map_from_lidar
         .iter()
         .map(|pose| row_from_pose(&calibration.world_from_cam0(world_from_first_cam0, pose)) + "\n")
         .collect();
-    write_text(path, &rows)
+    writer.write_all(rows.as_bytes())
 }
 
 /// Writes `time x y z qx qy qz qw` rows of lidar poses in the map frame.
-pub fn write_tum(path: &Path, trajectory: &Trajectory) -> Result<(), KittiError> {
+pub fn write_tum(mut writer: impl Write, trajectory: &Trajectory) -> io::Result<()> {
     let rows: String = trajectory
         .poses
         .iter()
@@ -69,7 +69,7 @@ pub fn write_tum(path: &Path, trajectory: &Trajectory) -> Result<(), KittiError>
             )
         })
         .collect();
-    write_text(path, &rows)
+    writer.write_all(rows.as_bytes())
 }
 
 /// Reads a TUM trajectory; frames are numbered by row.
@@ -124,20 +124,15 @@ pub fn read_times(path: &Path) -> Result<Vec<f64>, KittiError> {
 }
 
 /// Writes `times.txt` [s].
-pub fn write_times(path: &Path, times_s: &[f64]) -> Result<(), KittiError> {
+pub fn write_times(mut writer: impl Write, times_s: &[f64]) -> io::Result<()> {
     let rows: String = times_s.iter().map(|time| format!("{time:.6e}\n")).collect();
-    write_text(path, &rows)
-}
-
-fn write_text(path: &Path, text: &str) -> Result<(), KittiError> {
-    fs::write(path, text).map_err(|source| KittiError::Write {
-        path: path.to_owned(),
-        source,
-    })
+    writer.write_all(rows.as_bytes())
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use approx::assert_relative_eq;
     use nalgebra::Vector3;
 
@@ -166,7 +161,13 @@ mod tests {
             ),
         };
         let first = Pose3::new(Vector3::new(1.0, 2.0, 3.0), Vector3::new(0.1, 0.2, 0.3));
-        write_kitti(&path, &poses(), &first, &calibration).unwrap();
+        write_kitti(
+            fs::File::create(&path).unwrap(),
+            &poses(),
+            &first,
+            &calibration,
+        )
+        .unwrap();
         let back = CameraPoses::read(&path)
             .unwrap()
             .map_from_lidar(&calibration);
@@ -188,7 +189,7 @@ mod tests {
                 map_from_lidar,
             })
             .collect();
-        write_tum(&path, &trajectory).unwrap();
+        write_tum(fs::File::create(&path).unwrap(), &trajectory).unwrap();
         let back = read_tum(&path).unwrap();
         for (a, b) in trajectory.poses.iter().zip(&back.poses) {
             assert_relative_eq!(a.map_from_lidar, b.map_from_lidar, epsilon = 1e-5);

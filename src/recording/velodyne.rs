@@ -1,6 +1,7 @@
 //! Velodyne scans (`.bin`: float32 x, y, z, intensity) and SemanticKITTI labels (`.label`: u32).
 
 use std::fs;
+use std::io::{self, Write};
 use std::path::Path;
 
 use blake3::Hash;
@@ -40,7 +41,7 @@ fn parse_scan(path: &Path, bytes: &[u8]) -> Result<Scan, KittiError> {
 }
 
 /// Writes a scan.
-pub fn write_scan(path: &Path, scan: &Scan) -> Result<(), KittiError> {
+pub fn write_scan(mut writer: impl Write, scan: &Scan) -> io::Result<()> {
     let bytes: Vec<u8> = scan
         .points
         .iter()
@@ -48,7 +49,7 @@ pub fn write_scan(path: &Path, scan: &Scan) -> Result<(), KittiError> {
         .flat_map(|(point, &intensity)| [point.x, point.y, point.z, intensity])
         .flat_map(f32::to_le_bytes)
         .collect();
-    write_bytes(path, &bytes)
+    writer.write_all(&bytes)
 }
 
 /// Reads the semantic class of every point: the low 16 bits, without the instance.
@@ -62,12 +63,12 @@ pub fn read_labels(path: &Path) -> Result<Vec<u16>, KittiError> {
 }
 
 /// Writes semantic classes, instance 0.
-pub fn write_labels(path: &Path, classes: &[u16]) -> Result<(), KittiError> {
+pub fn write_labels(mut writer: impl Write, classes: &[u16]) -> io::Result<()> {
     let bytes: Vec<u8> = classes
         .iter()
         .flat_map(|&class| u32::from(class).to_le_bytes())
         .collect();
-    write_bytes(path, &bytes)
+    writer.write_all(&bytes)
 }
 
 fn read_bytes(path: &Path) -> Result<Vec<u8>, KittiError> {
@@ -98,13 +99,6 @@ fn floats(record: &[u8; 16]) -> [f32; 4] {
     [words[0], words[1], words[2], words[3]].map(f32::from_le_bytes)
 }
 
-fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), KittiError> {
-    fs::write(path, bytes).map_err(|source| KittiError::Write {
-        path: path.to_owned(),
-        source,
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -117,7 +111,7 @@ mod tests {
             points: vec![Vec3::new(1.5, -2.25, 0.1), Vec3::INFINITY],
             intensities: vec![0.3, 0.9],
         };
-        write_scan(&path, &scan).unwrap();
+        write_scan(fs::File::create(&path).unwrap(), &scan).unwrap();
         assert_eq!(read_scan(&path).unwrap(), scan);
     }
 
@@ -129,12 +123,12 @@ mod tests {
             points: vec![Vec3::X, Vec3::Y],
             intensities: vec![0.3, 0.9],
         };
-        write_scan(&path, &scan).unwrap();
+        write_scan(fs::File::create(&path).unwrap(), &scan).unwrap();
         let (read, hash) = read_scan_and_hash(&path).unwrap();
         assert_eq!(read, scan);
         assert_eq!(hash_of_scan(&path).unwrap(), hash);
         scan.points[1].y = f32::from_bits(scan.points[1].y.to_bits() ^ 1);
-        write_scan(&path, &scan).unwrap();
+        write_scan(fs::File::create(&path).unwrap(), &scan).unwrap();
         assert_ne!(hash_of_scan(&path).unwrap(), hash);
     }
 

@@ -1,13 +1,13 @@
 //! Files that appear whole or not at all, and the table on standard output.
 
-use std::fs;
+use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
 use anyhow::{Context as _, bail};
 use serde::Serialize;
 
-use crate::app::config::new_file_beside;
+use crate::app::output::{temporary_beside, write_atomically};
 
 /// Makes sure, before any work is done, that `path` can be written: an existing file needs
 /// `--force`, and its folder is made and must take new files. `key` is the configuration key
@@ -25,7 +25,7 @@ pub fn prepare(path: &Path, key: &str, force: bool) -> anyhow::Result<()> {
             path.display()
         );
     }
-    new_file_beside(path).map(drop).with_context(|| {
+    temporary_beside(path).map(drop).with_context(|| {
         format!(
             "{key} is {}, and nothing can be written there; choose another {key}",
             path.display()
@@ -33,27 +33,18 @@ pub fn prepare(path: &Path, key: &str, force: bool) -> anyhow::Result<()> {
     })
 }
 
-/// Writes a file under a temporary name beside `path` and renames it: whatever goes wrong,
-/// `path` is either as it was or complete.
-pub fn write_whole<E>(
+/// Writes a file atomically.
+pub fn write_file<E: Into<anyhow::Error>>(
     path: &Path,
-    write: impl FnOnce(&mut BufWriter<&fs::File>) -> Result<(), E>,
-) -> anyhow::Result<()>
-where
-    E: Into<anyhow::Error>,
-{
-    let writing = || format!("writing {}", path.display());
-    let file = new_file_beside(path).with_context(writing)?;
-    let mut buffered = BufWriter::new(file.as_file());
-    write(&mut buffered)
-        .map_err(Into::into)
-        .with_context(writing)?;
-    buffered.flush().with_context(writing)?;
-    drop(buffered);
-    file.persist(path)
-        .map_err(|failed| failed.error)
-        .with_context(writing)?;
-    Ok(())
+    write: impl FnOnce(&mut BufWriter<&mut File>) -> Result<(), E>,
+) -> anyhow::Result<()> {
+    write_atomically(path, |file| write(file).map_err(Into::into))
+        .with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Writes a text file atomically.
+pub fn write_text(path: &Path, text: &str) -> anyhow::Result<()> {
+    write_file(path, |file| file.write_all(text.as_bytes()))
 }
 
 /// Lets `write` make a file under another name beside `path` and renames it, for writers that
@@ -70,12 +61,11 @@ pub fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<()>) -> 
     fs::rename(&part, path).with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// Writes a report as JSON, whole or not at all.
+/// Writes a report as JSON atomically.
 pub fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
-    write_whole(path, |file| -> anyhow::Result<()> {
-        serde_json::to_writer_pretty(&mut *file, report)?;
-        Ok(writeln!(file)?)
-    })
+    let json = serde_json::to_string_pretty(report)
+        .with_context(|| format!("cannot serialize {}", path.display()))?;
+    write_text(path, &(json + "\n"))
 }
 
 /// Prints to standard output; a reader that has gone away is no error.
@@ -95,20 +85,6 @@ pub fn print(text: &str) -> anyhow::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_file_is_replaced_whole_or_not_at_all() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("out.txt");
-        write_whole(&path, |file| file.write_all(b"first")).unwrap();
-        let failed = write_whole(&path, |file| {
-            file.write_all(b"second")?;
-            Err(io::Error::other("disk full"))
-        });
-        assert!(format!("{:#}", failed.unwrap_err()).contains("disk full"));
-        assert_eq!(fs::read(&path).unwrap(), b"first");
-        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
-    }
 
     #[test]
     fn an_existing_file_needs_force() {

@@ -141,16 +141,16 @@ pub fn write_trajectory(
             ..frame.stamped()
         })
         .collect();
-    output::replace(&files.file(&format!("{name}_tum.txt")), |path| {
-        Ok(write_tum(path, &trajectory)?)
+    output::write_file(&files.file(&format!("{name}_tum.txt")), |file| {
+        write_tum(file, &trajectory)
     })?;
-    output::replace(&files.file(&format!("{name}_kitti.txt")), |path| {
-        Ok(write_kitti(
-            path,
+    output::write_file(&files.file(&format!("{name}_kitti.txt")), |file| {
+        write_kitti(
+            file,
             map_from_lidar,
             &sequence.frame.world_from_first_cam0,
             &sequence.frame.calibration,
-        )?)
+        )
     })
 }
 

@@ -82,9 +82,7 @@ impl RunPage<'_> {
     /// Writes `report.html` beside the result.
     pub fn write(&self) -> Result<()> {
         let page = self.page()?;
-        output::write_whole(&self.files.file("report.html"), |file| {
-            std::io::Write::write_all(file, page.to_html().as_bytes())
-        })
+        output::write_text(&self.files.file("report.html"), &page.to_html())
     }
 
     fn page(&self) -> Result<Page> {

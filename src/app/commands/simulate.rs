@@ -25,14 +25,14 @@ use anyhow::{Context as _, Result, bail};
 use rayon::prelude::*;
 
 use super::interrupt::{Interrupt, Interrupted};
-use super::output::replace as write_whole;
+use super::output::{self, write_file};
 use super::progress::Task;
 use super::{Context, version};
 use crate::geometry::Pose3;
 use crate::map::ply;
+use crate::recording::Calibration;
 use crate::recording::poses::{CameraPoses, write_kitti, write_times};
 use crate::recording::velodyne::{write_labels, write_scan};
-use crate::recording::{Calibration, KittiError};
 use crate::simulation::{Simulation, SimulationConfig, calibration};
 
 /// What becomes of a drive that is there already.
@@ -113,14 +113,9 @@ pub fn run(
         let path = folder.join(name);
         fs::create_dir_all(&path).with_context(|| format!("cannot create {}", path.display()))?;
     }
-    write_whole(&folder.join("simulation.yml"), |path| {
-        fs::write(path, &recipe).with_context(|| format!("cannot write {}", path.display()))
-    })?;
-    write_whole(&folder.join(EXECUTABLE_FILE), |path| {
-        fs::write(path, version::executable_hash()?)
-            .with_context(|| format!("cannot write {}", path.display()))
-    })?;
-    write_whole(&folder.join("street.ply"), |path| {
+    output::write_text(&folder.join("simulation.yml"), &recipe)?;
+    output::write_text(&folder.join(EXECUTABLE_FILE), &version::executable_hash()?)?;
+    output::replace(&folder.join("street.ply"), |path| {
         Ok(ply::write(path, &simulation.truth_in_map())?)
     })?;
     let kept = write_scans(&simulation, &folder, progress, interrupt)?;
@@ -240,10 +235,10 @@ fn recipe_anywhere(config: &SimulationConfig) -> Result<String> {
 
 /// What `poses.txt` has.
 fn poses_text(simulation: &Simulation) -> Result<Vec<u8>> {
-    let file = tempfile::NamedTempFile::new().context("cannot create a temporary file")?;
+    let mut text = Vec::new();
     let origin = Pose3::identity();
-    write_kitti(file.path(), &simulation.poses(), &origin, &calibration())?;
-    fs::read(file.path()).with_context(|| format!("cannot read {}", file.path().display()))
+    write_kitti(&mut text, &simulation.poses(), &origin, &calibration())?;
+    Ok(text)
 }
 
 /// Whether every file of a drive is there.
@@ -299,10 +294,8 @@ fn write_scans(
                 kept.fetch_add(1, Ordering::Relaxed);
             } else {
                 let labelled = simulation.scan(frame);
-                write_whole(&label_path, |path| {
-                    Ok(write_labels(path, &labelled.classes)?)
-                })?;
-                write_whole(&scan_path, |path| Ok(write_scan(path, &labelled.scan)?))?;
+                write_file(&label_path, |file| write_labels(file, &labelled.classes))?;
+                write_file(&scan_path, |file| write_scan(file, &labelled.scan))?;
             }
             progress(
                 done.fetch_add(1, Ordering::Relaxed) + 1,
@@ -324,19 +317,17 @@ fn write_scans(
 fn write_poses(simulation: &Simulation, folder: &Path, poses: &[Pose3]) -> Result<()> {
     let calibration = calibration();
     let origin = Pose3::identity();
-    let kitti = |path: &Path, poses: &[Pose3]| -> Result<(), KittiError> {
-        write_kitti(path, poses, &origin, &calibration)
+    let write_poses = |name: &str, poses: &[Pose3]| {
+        write_file(&folder.join(name), |file| {
+            write_kitti(file, poses, &origin, &calibration)
+        })
     };
-    write_whole(&folder.join("calib.txt"), |path| {
-        Ok(calibration.write(path)?)
+    write_file(&folder.join("calib.txt"), |file| calibration.write(file))?;
+    write_file(&folder.join("times.txt"), |file| {
+        write_times(file, &simulation.times_s())
     })?;
-    write_whole(&folder.join("times.txt"), |path| {
-        Ok(write_times(path, &simulation.times_s())?)
-    })?;
-    write_whole(&folder.join("odometry.txt"), |path| {
-        Ok(kitti(path, &simulation.odometry())?)
-    })?;
-    write_whole(&folder.join("poses.txt"), |path| Ok(kitti(path, poses)?))
+    write_poses("odometry.txt", &simulation.odometry())?;
+    write_poses("poses.txt", poses)
 }
 
 fn length_m(poses: &[Pose3]) -> f64 {

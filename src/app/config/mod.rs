@@ -43,6 +43,8 @@ pub use refinement::RefinementConfig;
 
 use outline::Outline;
 
+use crate::app::output::write_atomically;
+
 /// Loads the configuration of a command from `path`, or from `default_path` where none is
 /// given, applies the overrides (dotted key, YAML value) in order, and checks the result.
 ///
@@ -110,15 +112,12 @@ pub fn has_key<T: Default + Serialize>(key: &str) -> Result<bool, ConfigError> {
 /// The file appears whole under its name or not at all.
 pub fn write<T: Serialize>(path: &Path, config: &T) -> Result<(), ConfigError> {
     let text = to_yaml(config)?;
-    let write_error = |source| ConfigError::Write {
-        path: path.to_owned(),
-        source,
-    };
-    let mut file = new_file_beside(path).map_err(write_error)?;
-    file.write_all(text.as_bytes()).map_err(write_error)?;
-    file.persist(path)
-        .map_err(|failed| write_error(failed.error))?;
-    Ok(())
+    write_atomically(path, |file| file.write_all(text.as_bytes())).map_err(|source| {
+        ConfigError::Write {
+            path: path.to_owned(),
+            source,
+        }
+    })
 }
 
 /// The effective configuration as YAML, each key on a line of its own.
@@ -150,23 +149,6 @@ where
         });
     };
     parse(&replaced).map_err(|source| error::in_setting(place, key, value, source))
-}
-
-/// A temporary file in the folder of `path`, which is made if need be; readable by whom the
-/// umask allows, as other files are.
-pub(crate) fn new_file_beside(path: &Path) -> std::io::Result<tempfile::NamedTempFile> {
-    let folder = match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
-    fs::create_dir_all(folder)?;
-    let mut builder = tempfile::Builder::new();
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt as _;
-        builder.permissions(fs::Permissions::from_mode(0o666));
-    }
-    builder.prefix(".fpmcl-").tempfile_in(folder)
 }
 
 #[cfg(test)]

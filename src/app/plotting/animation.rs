@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::bitmap::Bitmap;
 use super::error::PlotError;
-use crate::evaluation::write_atomically;
+use crate::app::output::write_atomically;
 
 /// Settings of an animated GIF.
 #[derive(Clone, Copy, Debug, PartialEq)]

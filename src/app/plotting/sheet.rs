@@ -19,7 +19,7 @@ pub use plotters::style::text_anchor::{HPos, VPos};
 use super::bitmap::Bitmap;
 use super::color::{INK, Rgb, WHITE};
 use super::error::{DrawError, PlotError};
-use crate::evaluation::write_atomically;
+use crate::app::output::write_atomically;
 
 /// How much larger the bitmap is drawn than it is saved.
 pub const SCALE: u32 = 2;

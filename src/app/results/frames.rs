@@ -4,7 +4,8 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use super::localization_results::{LocalizationResults, ResultsError};
-use crate::evaluation::{PlanarError, distances_m, write_atomically};
+use crate::app::output::write_atomically;
+use crate::evaluation::{PlanarError, distances_m};
 use crate::geometry::Pose2;
 
 /// One column: its title and what stands in a row.

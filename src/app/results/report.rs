@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 
 use super::localization_results::ResultsError;
 use super::rows::{MetricRow, Value, metric_rows};
-use crate::evaluation::{RangeMclErrors, TrajectoryMetrics, write_atomically};
+use crate::app::output::write_atomically;
+use crate::evaluation::{RangeMclErrors, TrajectoryMetrics};
 
 /// What is said of one trajectory.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

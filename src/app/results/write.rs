@@ -11,7 +11,7 @@ use zip::write::SimpleFileOptions;
 
 use super::localization_results::{LocalizationResults, ParticleLog, ResultsError};
 use super::npy::header_bytes;
-use crate::evaluation::write_atomically;
+use crate::app::output::write_atomically;
 use crate::geometry::Pose2;
 
 /// Largest entry of a zip file without 64-bit extensions [bytes].

@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result};
 use serde::{Deserialize, Serialize};
 
+use crate::app::commands::output;
 use crate::geometry::TriangleMesh;
 use crate::map::local_map::LocalMap;
 use crate::map::{LocalMapCounts, ply};
@@ -45,7 +46,7 @@ impl Parts {
             }
             fs::create_dir_all(&folder)
                 .with_context(|| format!("cannot create {}", folder.display()))?;
-            write_whole(&inputs_file, inputs.as_bytes())?;
+            output::write_text(&inputs_file, inputs)?;
         }
         Ok(Self { folder })
     }
@@ -76,10 +77,7 @@ impl Parts {
             scans_hash: local_map.scans_hash.clone(),
             counts: local_map.counts.clone(),
         };
-        write_whole(
-            &self.counts_file(number),
-            serde_json::to_string_pretty(&part)?.as_bytes(),
-        )
+        output::write_json(&self.counts_file(number), &part)
     }
 
     /// Removes what there is of a part that was made of other scans, its counts first.
@@ -120,14 +118,6 @@ impl Parts {
     fn counts_file(&self, number: usize) -> PathBuf {
         self.folder.join(format!("{number:04}.json"))
     }
-}
-
-/// Writes a file under a temporary name and renames it, so that it is there whole or not at all.
-fn write_whole(path: &Path, bytes: &[u8]) -> Result<()> {
-    let temporary = path.with_extension("unfinished");
-    fs::write(&temporary, bytes)
-        .and_then(|()| fs::rename(&temporary, path))
-        .with_context(|| format!("cannot write {}", path.display()))
 }
 
 #[cfg(test)]

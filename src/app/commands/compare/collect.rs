@@ -1,7 +1,6 @@
 //! Tables, pictures and a page of the runs that are there.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 
 use anyhow::{Result, ensure};
 use serde::Serialize;
@@ -52,7 +51,7 @@ pub fn collect(config: &ComparisonConfig, runs: &[PlannedRun], layout: &Layout) 
         },
     )?;
     let page = page::page(config, runs, &comparison, &tables, layout)?;
-    write(&layout.root.join("report.html"), &page.to_html())?;
+    output::write_text(&layout.root.join("report.html"), &page.to_html())?;
     Ok(shown(&tables))
 }
 
@@ -114,12 +113,12 @@ fn comparison(
 
 fn write_tables(tables: &[Table], layout: &Layout) -> Result<()> {
     let all: Vec<String> = tables.iter().map(text::table).collect();
-    write(&layout.root.join("tables.txt"), &all.join("\n"))?;
+    output::write_text(&layout.root.join("tables.txt"), &all.join("\n"))?;
     let all: Vec<String> = tables.iter().map(markdown::table).collect();
-    write(&layout.root.join("tables.md"), &all.join("\n"))?;
+    output::write_text(&layout.root.join("tables.md"), &all.join("\n"))?;
     for table in tables {
         let path = layout.root.join(format!("{}.csv", table.name));
-        write(&path, &csv::table(table))?;
+        output::write_text(&path, &csv::table(table))?;
     }
     Ok(())
 }
@@ -128,10 +127,4 @@ fn write_tables(tables: &[Table], layout: &Layout) -> Result<()> {
 fn shown(tables: &[Table]) -> String {
     let summaries = tables.iter().filter(|table| table.name != "runs");
     summaries.map(text::table).collect::<Vec<_>>().join("\n")
-}
-
-fn write(path: &Path, text: &str) -> Result<()> {
-    output::write_whole(path, |file| {
-        std::io::Write::write_all(file, text.as_bytes())
-    })
 }

@@ -205,7 +205,7 @@ fn write_scan(
             })
             .collect();
         let path = output_path(config, "labels", name, "label")?;
-        output::replace(&path, |part| Ok(velodyne::write_labels(part, &classes)?))?;
+        output::write_file(&path, |file| velodyne::write_labels(file, &classes))?;
     }
     if config.write_plys {
         let colors: Vec<[u8; 3]> = confidences

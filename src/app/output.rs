@@ -1,23 +1,16 @@
-//! Files that are either whole or not there.
+//! Atomic writing of files: a file is complete or does not exist.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
-/// Writes a file under a temporary name in the same folder and renames it to `path` when it is
-/// whole, so that neither an error nor an interruption costs a file that was there before.
-///
-/// The folder is made where it is missing. Where anything fails, the temporary file is removed.
+/// Writes a temporary file in the folder of `path`, which is created if necessary, and renames it
+/// to `path` once it is complete. On an error or an interruption, `path` is unchanged.
 pub fn write_atomically<T, E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<&mut File>) -> Result<T, E>,
 ) -> Result<T, E> {
-    let folder = match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    };
-    std::fs::create_dir_all(folder)?;
-    let mut temporary = new_temporary(folder)?;
+    let mut temporary = temporary_beside(path)?;
     let mut writer = BufWriter::new(temporary.as_file_mut());
     let outcome = write(&mut writer)?;
     writer.flush()?;
@@ -26,18 +19,24 @@ pub fn write_atomically<T, E: From<io::Error>>(
     Ok(outcome)
 }
 
-/// A temporary file that others may read once it is whole, as far as the user's umask lets them.
-fn new_temporary(folder: &Path) -> io::Result<tempfile::NamedTempFile> {
+/// Creates a temporary file in the folder of `path`, and that folder if necessary. Its permissions
+/// are those that the umask allows, as of other files.
+pub fn temporary_beside(path: &Path) -> io::Result<tempfile::NamedTempFile> {
+    let folder = match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    std::fs::create_dir_all(folder)?;
     let mut builder = tempfile::Builder::new();
-    builder.prefix(".fpmcl-").suffix(".part");
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt as _;
         builder.permissions(std::fs::Permissions::from_mode(0o666));
-        builder.tempfile_in(folder)
     }
-    #[cfg(not(unix))]
-    builder.tempfile_in(folder)
+    builder
+        .prefix(".fpmcl-")
+        .suffix(".part")
+        .tempfile_in(folder)
 }
 
 #[cfg(test)]
