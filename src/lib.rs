@@ -20,6 +20,7 @@
 pub mod geometry;
 pub mod lidar;
 pub mod raycasting;
+pub mod validation;
 // From a recording to surfaces.
 pub mod ground;
 pub mod meshing;

@@ -9,10 +9,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use fpmcl::app::config::{
-    self, BuildMapConfig, Check, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
-    Initialization, LocalizationConfig, RefinementConfig, RenderedRangeImage,
+    self, BuildMapConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig, Initialization,
+    LocalizationConfig, RefinementConfig, RenderedRangeImage,
 };
 use fpmcl::simulation::SimulationConfig;
+use fpmcl::validation::Validate;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -20,7 +21,7 @@ fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-fn load<T: Check + Serialize + DeserializeOwned>(path: &Path) -> T {
+fn load<T: Validate + Serialize + DeserializeOwned>(path: &Path) -> T {
     config::load(Some(path), Path::new(""), &[]).unwrap_or_else(|error| panic!("{error}"))
 }
 
@@ -60,7 +61,7 @@ fn keys_of(path: &Path) -> BTreeSet<String> {
 
 fn round_trip<T>(path: &Path) -> BTreeSet<String>
 where
-    T: Check + Serialize + DeserializeOwned + PartialEq + Debug,
+    T: Validate + Serialize + DeserializeOwned + PartialEq + Debug,
 {
     let config: T = load(path);
     let folder = tempfile::tempdir().unwrap();

@@ -7,6 +7,7 @@ use super::fuzzy::{FuzzyConfig, FuzzyGround};
 use super::pca::PcaGround;
 use super::ransac::RansacGround;
 use super::rules::RuleError;
+use crate::validation::{InvalidValue, Validate, nested};
 
 /// Method of ground segmentation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -43,5 +44,13 @@ impl GroundConfig {
             GroundMethod::Pca => Box::new(self.pca),
             GroundMethod::Ransac => Box::new(self.ransac),
         })
+    }
+}
+
+impl Validate for GroundConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        nested("fuzzy", &self.fuzzy)?;
+        nested("pca", &self.pca)?;
+        nested("ransac", &self.ransac)
     }
 }

@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use super::polar::Placed;
 use super::surface::{ScanIndex, Shape};
 use super::terrain::{Terrain, TerrainConfig};
+use crate::validation::{InvalidValue, Validate, not_negative, positive};
 
 /// How features are computed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -35,6 +36,18 @@ impl Default for FeatureConfig {
             min_distance_m: 2.0,
             terrain: TerrainConfig::default(),
         }
+    }
+}
+
+impl Validate for FeatureConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        positive("spacing_m", self.spacing_m)?;
+        not_negative("min_distance_m", self.min_distance_m)?;
+        positive("terrain.step_m", self.terrain.step_m)?;
+        not_negative("terrain.max_slope", self.terrain.max_slope)?;
+        positive("terrain.max_jump_m", self.terrain.max_jump_m)?;
+        positive("terrain.start_radius_m", self.terrain.start_radius_m)?;
+        positive("terrain.max_low_slope_rad", self.terrain.max_low_slope_rad)
     }
 }
 

@@ -11,6 +11,7 @@ use super::features::{FeatureConfig, Features, Scene};
 use super::inference::{FuzzySystem, Inference};
 use super::membership::{Membership, Operators};
 use super::rules::{RuleError, Vocabulary};
+use crate::validation::{InvalidValue, Validate, in_range, nested};
 
 /// Points that are judged together.
 const BLOCK: usize = 32;
@@ -80,6 +81,16 @@ impl Default for FuzzyConfig {
             definitely: 0.8,
             probably: 0.65,
         }
+    }
+}
+
+impl Validate for FuzzyConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        nested("features", &self.features)?;
+        in_range("definitely", self.definitely, 0.5..=1.0)?;
+        in_range("probably", self.probably, 0.5..=self.definitely)?;
+        FuzzyGround::new(self.clone())?;
+        Ok(())
     }
 }
 

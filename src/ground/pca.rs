@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::classifier::GroundClassifier;
 use super::features::surface_normals;
 use crate::geometry::PlaneSums;
+use crate::validation::{InvalidValue, Validate, fraction, require};
 
 /// Ground by principal components.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -28,6 +29,18 @@ impl Default for PcaGround {
             min_cosine: 0.8,
             max_height_m: -1.1,
         }
+    }
+}
+
+impl Validate for PcaGround {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        fraction("min_cosine", self.min_cosine)?;
+        require(
+            self.max_height_m.is_finite(),
+            "max_height_m",
+            self.max_height_m,
+            "it must be a height in the lidar frame, such as -1.1",
+        )
     }
 }
 

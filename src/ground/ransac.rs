@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::classifier::GroundClassifier;
 use crate::geometry::PlaneSums;
+use crate::validation::{InvalidValue, Validate, in_range, positive, require};
 
 /// Ground by the dominant plane.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -35,6 +36,19 @@ impl Default for RansacGround {
             num_iterations: 100,
             seed: 0,
         }
+    }
+}
+
+impl Validate for RansacGround {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        positive("distance_threshold", self.distance_threshold)?;
+        require(
+            self.ransac_n >= 3,
+            "ransac_n",
+            self.ransac_n,
+            "a plane needs 3 points or more",
+        )?;
+        in_range("num_iterations", self.num_iterations, 1..=1_000_000)
     }
 }
 

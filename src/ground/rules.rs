@@ -12,6 +12,8 @@ use std::collections::BTreeMap;
 
 use super::membership::Membership;
 
+use crate::validation::InvalidValue;
+
 /// The linguistic sets of each variable.
 pub type Vocabulary = BTreeMap<String, BTreeMap<String, Membership>>;
 
@@ -46,6 +48,41 @@ pub enum RuleError {
     },
     #[error("rules: there are none; write at least one")]
     NoRules,
+}
+
+impl From<RuleError> for InvalidValue {
+    /// Names the rule or the set by its own key, so that its line can be found.
+    fn from(error: RuleError) -> Self {
+        match &error {
+            RuleError::Rule {
+                number,
+                rule,
+                fault,
+            } => Self::new(
+                &format!("rules[{number}]"),
+                format_args!("`{rule}`"),
+                fault.to_string(),
+            ),
+            RuleError::BadSet {
+                variable,
+                set,
+                membership,
+            } => Self::new(
+                &format!("variables.{variable}.{set}"),
+                membership,
+                membership.law(),
+            ),
+            RuleError::UnknownFeature { name, nearest } => Self::new(
+                &format!("variables.{name}"),
+                "no feature",
+                format!("the nearest is `{nearest}`"),
+            ),
+            RuleError::NoRules => Self::new("rules", "empty", error.to_string()),
+            RuleError::NoOutput { .. } | RuleError::TooManySets { .. } => {
+                Self::new("variables", "not usable", error.to_string())
+            }
+        }
+    }
 }
 
 /// What is wrong with a rule.

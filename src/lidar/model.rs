@@ -11,6 +11,7 @@
 
 use std::f32::consts::PI;
 
+use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive, require};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
@@ -43,6 +44,32 @@ impl Default for LidarModel {
             max_range: 50.0,
             min_range: 2.0,
         }
+    }
+}
+
+impl Validate for LidarModel {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        in_range("height", self.height, 1..=4096)?;
+        in_range("width", self.width, 1..=65_536)?;
+        in_range("fov_up", self.fov_up, -90.0..=90.0)?;
+        in_range("fov_down", self.fov_down, -90.0..=90.0)?;
+        require(
+            self.fov_rad() > 0.0,
+            "fov_up",
+            self.fov_up,
+            format!("it must lie above fov_down, which is {}", self.fov_down),
+        )?;
+        not_negative("min_range", self.min_range)?;
+        positive("max_range", self.max_range)?;
+        require(
+            self.min_range < self.max_range,
+            "min_range",
+            self.min_range,
+            format!(
+                "it must be less than max_range, which is {}",
+                self.max_range
+            ),
+        )
     }
 }
 

@@ -19,6 +19,7 @@ use serde::{Deserialize, Serialize};
 
 use super::RangeImage;
 use crate::geometry::PlaneSums;
+use crate::validation::{InvalidValue, Validate, fraction, not_negative, positive, require};
 
 /// When a neighbourhood counts as a surface.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -53,6 +54,23 @@ impl Default for NormalConfig {
             min_share: 0.35,
             min_incidence: 0.02,
         }
+    }
+}
+
+impl Validate for NormalConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        positive("spacing_m", self.spacing_m)?;
+        positive("tolerance_m", self.tolerance_m)?;
+        not_negative("relative_tolerance", self.relative_tolerance)?;
+        positive("beam_tolerance_m", self.beam_tolerance_m)?;
+        require(
+            self.min_support >= 2,
+            "min_support",
+            self.min_support,
+            "a plane needs a pixel and 2 supporters or more",
+        )?;
+        fraction("min_share", self.min_share)?;
+        fraction("min_incidence", self.min_incidence)
     }
 }
 

@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::particles::{ParticleSet, spread};
 use crate::map::TileGrid;
+use crate::validation::{InvalidValue, Validate, at_least_one, positive_or_infinite};
 
 /// What counts as converged.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -34,6 +35,14 @@ impl Default for ConvergenceConfig {
             max_spread_m: 0.5,
             max_spread_rad: 5.0_f64.to_radians(),
         }
+    }
+}
+
+impl Validate for ConvergenceConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        at_least_one("converge_thres", self.converge_thres)?;
+        positive_or_infinite("max_spread_m", self.max_spread_m)?;
+        positive_or_infinite("max_spread_rad", self.max_spread_rad)
     }
 }
 

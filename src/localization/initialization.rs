@@ -17,6 +17,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::geometry::Pose2;
 use crate::map::{GroundMap, TileGrid};
+use crate::validation::{InvalidValue, Validate, not_negative};
 
 /// The shape of a spread.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,6 +49,13 @@ impl Default for StartSpread {
             position_m: 5.0,
             heading_rad: 30.0_f64.to_radians(),
         }
+    }
+}
+
+impl Validate for StartSpread {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        not_negative("position_m", self.position_m)?;
+        not_negative("heading_rad", self.heading_rad)
     }
 }
 

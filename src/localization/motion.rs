@@ -28,6 +28,7 @@ use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::Pose2;
+use crate::validation::{InvalidValue, Validate, not_negative};
 
 /// Standard deviations of the odometry noise, per increment.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -49,6 +50,14 @@ impl Default for OdometryNoise {
             drive_m: 0.05,
             side_m: 0.02,
         }
+    }
+}
+
+impl Validate for OdometryNoise {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        not_negative("turn_rad", self.turn_rad)?;
+        not_negative("drive_m", self.drive_m)?;
+        not_negative("side_m", self.side_m)
     }
 }
 
@@ -149,6 +158,15 @@ impl Default for VelocityNoise {
             turn_rate_rad_per_s: 0.1,
             final_turn_rate_rad_per_s: 0.1,
         }
+    }
+}
+
+impl Validate for VelocityNoise {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        not_negative("speed_m_per_s", self.speed_m_per_s)?;
+        not_negative("side_speed_m_per_s", self.side_speed_m_per_s)?;
+        not_negative("turn_rate_rad_per_s", self.turn_rate_rad_per_s)?;
+        not_negative("final_turn_rate_rad_per_s", self.final_turn_rate_rad_per_s)
     }
 }
 

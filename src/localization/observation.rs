@@ -18,6 +18,9 @@ use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::{Beam, RangeImage};
 use crate::map::{GroundMap, GroundPatch, Stance, TileGrid};
 use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
+use crate::validation::{
+    InvalidValue, Validate, at_least_one, fraction, positive, positive_or_infinite,
+};
 
 /// From the mean cost of the beams to a likelihood.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -70,6 +73,20 @@ impl Default for ObservationConfig {
             ray_budget: 1_000_000,
             road_share: 0.2,
         }
+    }
+}
+
+impl Validate for ObservationConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        positive("reference_sigma_m", self.reference_sigma_m)?;
+        positive("scale_m", self.scale_m)?;
+        positive_or_infinite("short_m", self.short_m)?;
+        positive_or_infinite("long_m", self.long_m)?;
+        positive_or_infinite("no_surface_m", self.no_surface_m)?;
+        at_least_one("beams", self.beams)?;
+        at_least_one("min_beams", self.min_beams)?;
+        at_least_one("ray_budget", self.ray_budget)?;
+        fraction("road_share", self.road_share)
     }
 }
 

@@ -31,6 +31,7 @@ use crate::geometry::{Pose2, Pose3, Rigid3f, wrap_angle};
 use crate::lidar::{LidarModel, RangeImage};
 use crate::map::Stance;
 use crate::rendering::RenderError;
+use crate::validation::{InvalidValue, Validate, fraction, in_range, positive, require};
 
 /// Size of the panoramas and of the search.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -73,6 +74,23 @@ impl Default for PanoramaConfig {
             scale_m: 0.03,
             yaw_sigma_rad: 2.0_f64.to_radians(),
         }
+    }
+}
+
+impl Validate for PanoramaConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        in_range("rows", self.rows, 1..=4096)?;
+        in_range("columns", self.columns, 1..=65_536)?;
+        require(
+            self.lowest_rad.is_finite(),
+            "lowest_rad",
+            self.lowest_rad,
+            "it must be an angle below the horizon, such as 0.12",
+        )?;
+        positive("limit_m", self.limit_m)?;
+        in_range("coarse_step", self.coarse_step, 1..=self.columns)?;
+        fraction("refined_share", self.refined_share)?;
+        positive("scale_m", self.scale_m)
     }
 }
 

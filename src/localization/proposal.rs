@@ -24,6 +24,9 @@ use serde::{Deserialize, Serialize};
 use super::particles::deviation;
 use crate::geometry::{Pose2, wrap_angle};
 use crate::registration::RegistrationConfig;
+use crate::validation::{
+    InvalidValue, Validate, at_least_one, fraction, nested, positive, require,
+};
 
 /// Whether and how the scan takes part in the proposal.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -62,6 +65,22 @@ impl Default for ProposalConfig {
             widening: 1.5,
             max_sigmas: 6.0,
         }
+    }
+}
+
+impl Validate for ProposalConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        at_least_one("beams", self.beams)?;
+        fraction("road_share", self.road_share)?;
+        at_least_one("weighed_beams", self.weighed_beams)?;
+        nested("registration", &self.registration)?;
+        require(
+            self.widening >= 1.0 && self.widening.is_finite(),
+            "widening",
+            self.widening,
+            "it must be 1 or greater",
+        )?;
+        positive("max_sigmas", self.max_sigmas)
     }
 }
 

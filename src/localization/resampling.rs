@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 
 use super::particles::{ParticleSet, spread};
 use crate::geometry::{Pose2, wrap_angle};
+use crate::validation::{InvalidValue, Validate, fraction, not_negative, positive};
 
 /// When to resample, and how far copies of a particle are set apart.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -48,6 +49,15 @@ impl Default for ResamplingConfig {
     }
 }
 
+impl Validate for ResamplingConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        fraction("min_effective_fraction", self.min_effective_fraction)?;
+        not_negative("jitter", self.jitter)?;
+        not_negative("max_jitter_m", self.max_jitter_m)?;
+        not_negative("max_jitter_rad", self.max_jitter_rad)
+    }
+}
+
 /// How many particles a belief needs while it is wide.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -71,6 +81,15 @@ impl Default for KldConfig {
             bin_m: 0.5,
             bin_rad: 10.0_f64.to_radians(),
         }
+    }
+}
+
+impl Validate for KldConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        positive("max_distance", self.max_distance)?;
+        not_negative("quantile", self.quantile)?;
+        positive("bin_m", self.bin_m)?;
+        positive("bin_rad", self.bin_rad)
     }
 }
 

@@ -8,6 +8,7 @@ use super::observation::ObservationConfig;
 use super::proposal::ProposalConfig;
 use super::resampling::{KldConfig, ResamplingConfig};
 use super::vigilance::VigilanceConfig;
+use crate::validation::{InvalidValue, Validate, at_least_one, fraction};
 
 /// How the likelihood is sharpened within a frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -30,6 +31,14 @@ impl Default for TemperingConfig {
             searching_rounds: 4,
             tracking_rounds: 1,
         }
+    }
+}
+
+impl Validate for TemperingConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        fraction("min_effective_fraction", self.min_effective_fraction)?;
+        at_least_one("searching_rounds", self.searching_rounds)?;
+        at_least_one("tracking_rounds", self.tracking_rounds)
     }
 }
 

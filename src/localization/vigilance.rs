@@ -12,6 +12,7 @@
 //! the likelihood; here traffic in front of the map must not raise an alarm, so that beams that
 //! end before the map are left out.
 
+use crate::validation::{InvalidValue, Validate, at_least_one, fraction, positive, require};
 use serde::{Deserialize, Serialize};
 
 /// What the filter believes about itself.
@@ -70,6 +71,27 @@ impl Default for VigilanceConfig {
             patience: 25,
             max_spread_m: 2.0,
         }
+    }
+}
+
+impl Validate for VigilanceConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        positive("tolerance_m", self.tolerance_m)?;
+        fraction("fast_rate", self.fast_rate)?;
+        fraction("slow_rate", self.slow_rate)?;
+        require(
+            self.slow_rate <= self.fast_rate,
+            "slow_rate",
+            self.slow_rate,
+            format!(
+                "it must not be greater than fast_rate, which is {}",
+                self.fast_rate
+            ),
+        )?;
+        fraction("min_agreement", self.min_agreement)?;
+        fraction("lost_fraction", self.lost_fraction)?;
+        at_least_one("patience", self.patience)?;
+        positive("max_spread_m", self.max_spread_m)
     }
 }
 

@@ -14,6 +14,7 @@ use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::scan_cloud::ScanCloud;
+use crate::validation::{InvalidValue, Validate, not_negative, positive};
 
 /// How confidence falls. As it comes, every point counts alike.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -23,6 +24,14 @@ pub struct ConfidenceConfig {
     pub half_range_m: Option<f32>,
     /// k: power of the cosine of incidence (unitless); 0: incidence does not matter.
     pub incidence_power: f32,
+}
+
+impl Validate for ConfidenceConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        not_negative("incidence_power", self.incidence_power)?;
+        self.half_range_m
+            .map_or(Ok(()), |half| positive("half_range_m", half))
+    }
 }
 
 impl ConfidenceConfig {

@@ -28,6 +28,7 @@ use super::scan_cloud::ScanCloud;
 use crate::geometry::TriangleMesh;
 use crate::lidar::LidarModel;
 use crate::raycasting::Scene;
+use crate::validation::{InvalidValue, Validate, at_least_one, not_negative};
 
 /// How free space votes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -77,6 +78,22 @@ impl Default for VisibilityConfig {
             triangle_votes: 2,
             max_beams: 5_000_000,
         }
+    }
+}
+
+impl Validate for VisibilityConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        at_least_one("point_voters", self.point_voters)?;
+        not_negative("point_margin_m", self.point_margin_m)?;
+        not_negative("point_margin_per_range", self.point_margin_per_range)?;
+        at_least_one("point_votes", self.point_votes as usize)?;
+        not_negative("triangle_margin_m", self.triangle_margin_m)?;
+        not_negative("triangle_margin_per_range", self.triangle_margin_per_range)?;
+        not_negative("crossing_m", self.crossing_m)?;
+        not_negative("support_m", self.support_m)?;
+        not_negative("support_range_m", self.support_range_m)?;
+        at_least_one("triangle_votes", self.triangle_votes as usize)?;
+        at_least_one("max_beams", self.max_beams)
     }
 }
 

@@ -10,6 +10,8 @@
 //! normals, so the front of the surface is where the normals point. Kazhdan and Hoppe, *Screened
 //! Poisson Surface Reconstruction*, ACM Transactions on Graphics 32(3), 2013.
 
+use std::ops::RangeInclusive;
+
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -22,6 +24,7 @@ use super::octree::Octree;
 use super::samples::Samples;
 use super::solver::{self, CoarseField, ScreeningWeights};
 use crate::geometry::{PointCloud, TriangleMesh};
+use crate::validation::{InvalidValue, Validate, at_least_one, in_range, not_negative, positive};
 
 /// Settings of the reconstruction.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -30,7 +33,7 @@ pub struct PoissonConfig {
     /// Halvings of the cube down to the finest cells, 3 to 12; `depth` of `build_map.yml`.
     #[serde(skip)]
     pub depth: u32,
-    /// Edge of the cube over the longest edge of the points' bounding box, above 1.
+    /// Edge of the cube over the longest edge of the points' bounding box, 1.05 to 10.
     pub scale: f32,
     /// α: how strongly the samples pull the surface to themselves, 0 or more; unitless.
     pub point_weight: f32,
@@ -51,6 +54,21 @@ impl Default for PoissonConfig {
             samples_per_node: 1.5,
             iterations: 8,
         }
+    }
+}
+
+impl PoissonConfig {
+    /// Depths that can be reconstructed.
+    pub const DEPTHS: RangeInclusive<u32> = 3..=12;
+}
+
+impl Validate for PoissonConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        in_range("depth", self.depth, Self::DEPTHS)?;
+        in_range("scale", self.scale, 1.05..=10.0)?;
+        not_negative("point_weight", self.point_weight)?;
+        positive("samples_per_node", self.samples_per_node)?;
+        at_least_one("iterations", self.iterations)
     }
 }
 
@@ -81,16 +99,8 @@ pub enum MeshingError {
     },
     #[error("{weights} weights were given for {points} points; give one per point")]
     WeightsDoNotMatch { points: usize, weights: usize },
-    #[error("`depth` is {0}; use 3 to 12")]
-    Depth(u32),
-    #[error("`scale` is {0}; use 1.05 to 10")]
-    Scale(f32),
-    #[error("`{name}` is {value}; use {allowed}")]
-    Setting {
-        name: &'static str,
-        value: f32,
-        allowed: &'static str,
-    },
+    #[error(transparent)]
+    InvalidValue(#[from] InvalidValue),
 }
 
 /// Levels between the finest cells and the kernel that counts samples, as in Kazhdan's program.
@@ -108,7 +118,7 @@ pub fn reconstruct(
     weights: Option<&[f32]>,
     config: &PoissonConfig,
 ) -> Result<Surface, MeshingError> {
-    config.check()?;
+    config.validate()?;
     let samples = Samples::new(cloud, weights, config.depth, config.scale)?;
     let density = DensityField::new(
         &samples,
@@ -127,35 +137,6 @@ pub fn reconstruct(
     let iso = mean_at_samples(&samples, &function);
     let unit = isosurface::extract(&function, iso);
     Ok(surface(&unit, &samples, &density))
-}
-
-impl PoissonConfig {
-    fn check(&self) -> Result<(), MeshingError> {
-        if !(3..=12).contains(&self.depth) {
-            return Err(MeshingError::Depth(self.depth));
-        }
-        if !(1.05..=10.0).contains(&self.scale) {
-            return Err(MeshingError::Scale(self.scale));
-        }
-        let allowed = "a number from 0";
-        for (name, value, is_fine) in [
-            ("point_weight", self.point_weight, self.point_weight >= 0.0),
-            (
-                "samples_per_node",
-                self.samples_per_node,
-                self.samples_per_node > 0.0,
-            ),
-        ] {
-            if !is_fine || !value.is_finite() {
-                return Err(MeshingError::Setting {
-                    name,
-                    value,
-                    allowed,
-                });
-            }
-        }
-        Ok(())
-    }
 }
 
 /// The values of χ at the closed corners of all nodes, per level.

@@ -9,6 +9,7 @@ use super::poses::{CameraPoses, read_times};
 use super::{Calibration, KittiError, MapFrame, velodyne};
 use crate::geometry::{Pose3, StampedPose};
 use crate::lidar::{Revolution, Scan, Spin, share_of};
+use crate::validation::{InvalidValue, Validate, require};
 
 /// Revolutions per second of the sensor where no `times.txt` says otherwise.
 const SCANS_PER_SECOND: f64 = 10.0;
@@ -33,6 +34,23 @@ impl Default for Selection {
             n_scans: -1,
             frame_step: 1,
         }
+    }
+}
+
+impl Validate for Selection {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        require(
+            self.n_scans == -1 || self.n_scans >= 1,
+            "n_scans",
+            self.n_scans,
+            "it must be 1 or greater, or -1 for all scans",
+        )?;
+        require(
+            self.frame_step >= 1,
+            "frame_step",
+            self.frame_step,
+            "1 takes every frame, 2 every other one",
+        )
     }
 }
 

@@ -15,6 +15,9 @@ use crate::lidar::Beam;
 use crate::map::Stance;
 use crate::registration::{Registration, RegistrationConfig, register};
 use crate::rendering::RenderError;
+use crate::validation::{
+    InvalidValue, Validate, at_least_one, nested, not_negative, positive, require,
+};
 
 /// Which steps polish a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -75,6 +78,37 @@ impl Default for RefinementConfig {
             max_reach_rad: 0.1,
             scale_m: 0.001,
         }
+    }
+}
+
+impl Validate for RefinementConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        nested("swarm", &self.swarm)?;
+        at_least_one("swarm_beams", self.swarm_beams)?;
+        nested("gauss_newton", &self.gauss_newton)?;
+        nested("smoothing", &self.smoothing)?;
+        not_negative("reach_sigmas", self.reach_sigmas)?;
+        positive("min_reach_m", self.min_reach_m)?;
+        positive("min_reach_rad", self.min_reach_rad)?;
+        require(
+            self.max_reach_m.is_finite() && self.max_reach_m >= self.min_reach_m,
+            "max_reach_m",
+            self.max_reach_m,
+            format!(
+                "it must not be less than min_reach_m, which is {}",
+                self.min_reach_m
+            ),
+        )?;
+        require(
+            self.max_reach_rad.is_finite() && self.max_reach_rad >= self.min_reach_rad,
+            "max_reach_rad",
+            self.max_reach_rad,
+            format!(
+                "it must not be less than min_reach_rad, which is {}",
+                self.min_reach_rad
+            ),
+        )?;
+        positive("scale_m", self.scale_m)
     }
 }
 

@@ -15,6 +15,7 @@ use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Pose2, wrap_angle};
+use crate::validation::{InvalidValue, Validate, at_least_one, positive};
 
 /// How much the odometry and the frames are trusted.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -42,6 +43,16 @@ impl Default for SmoothingConfig {
             robust_sigmas: 3.0,
             iterations: 20,
         }
+    }
+}
+
+impl Validate for SmoothingConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        positive("odometry_ahead_m", self.odometry_ahead_m)?;
+        positive("odometry_aside_m", self.odometry_aside_m)?;
+        positive("odometry_turn_rad", self.odometry_turn_rad)?;
+        positive("robust_sigmas", self.robust_sigmas)?;
+        at_least_one("iterations", self.iterations)
     }
 }
 

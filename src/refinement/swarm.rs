@@ -16,6 +16,7 @@ use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::wrap_angle;
+use crate::validation::{InvalidValue, Validate, at_least_one, not_negative, positive};
 
 /// How the swarm moves.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -55,6 +56,19 @@ impl Default for SwarmConfig {
             patience: 0,
             tolerance: 1e-5,
         }
+    }
+}
+
+impl Validate for SwarmConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        at_least_one("candidates", self.candidates)?;
+        at_least_one("iterations", self.iterations)?;
+        not_negative("inertia", self.inertia)?;
+        not_negative("final_inertia", self.final_inertia)?;
+        not_negative("cognitive", self.cognitive)?;
+        not_negative("social", self.social)?;
+        positive("max_velocity", self.max_velocity)?;
+        not_negative("tolerance", self.tolerance)
     }
 }
 

@@ -32,6 +32,7 @@ use serde::{Deserialize, Serialize};
 use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::Beam;
 use crate::rendering::{RangeRenderer, RenderError, SurfaceHit};
+use crate::validation::{InvalidValue, Validate, at_least_one, not_negative, positive};
 
 /// What registration may change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -74,6 +75,16 @@ impl Default for RegistrationConfig {
             sectors: 24,
             map_error_m: 0.003,
         }
+    }
+}
+
+impl Validate for RegistrationConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        at_least_one("iterations", self.iterations)?;
+        positive("kernel_m", self.kernel_m)?;
+        not_negative("tolerance_m", self.tolerance_m)?;
+        at_least_one("sectors", self.sectors)?;
+        not_negative("map_error_m", self.map_error_m)
     }
 }
 

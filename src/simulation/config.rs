@@ -10,6 +10,7 @@ use super::path::PathSegment;
 use super::scanner::ScannerConfig;
 use super::street::StreetConfig;
 use super::traffic::TrafficConfig;
+use crate::validation::{InvalidValue, Validate};
 
 /// A drive along a street: what `simulate` reads.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -163,6 +164,18 @@ impl SimulationConfig {
             );
         }
         Ok(())
+    }
+}
+
+impl Validate for SimulationConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        self.check().map_err(|error| match error {
+            SimulationError::BadValue { key, value, wanted } => {
+                InvalidValue::new(key, value, format!("it must be {wanted}"))
+            }
+            // The others are known only when the drive is planned.
+            _ => InvalidValue::new("path", "not usable", error.to_string()),
+        })
     }
 }
 

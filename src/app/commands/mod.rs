@@ -32,11 +32,11 @@ use serde::de::DeserializeOwned;
 
 use crate::app::cli::{Command, MachineArgs, RunArgs, Verbosity};
 use crate::app::config::{
-    self, BuildMapConfig, Check, ConfigError, EvaluationConfig, LocalizationConfig,
-    RefinementConfig,
+    self, BuildMapConfig, ConfigError, EvaluationConfig, LocalizationConfig, RefinementConfig,
 };
 use crate::rendering::Backend;
 use crate::simulation::SimulationConfig;
+use crate::validation::Validate;
 use interrupt::{Interrupt, Interrupted};
 use logging::RunLog;
 use progress::Progress;
@@ -129,7 +129,7 @@ pub fn exit_code(error: &anyhow::Error) -> ExitCode {
 /// a configuration that has these keys.
 fn load<T>(args: &RunArgs, default_path: &str) -> Result<T, ConfigError>
 where
-    T: Check + Default + Serialize + DeserializeOwned,
+    T: Validate + Default + Serialize + DeserializeOwned,
 {
     let mut settings = args.source.settings.clone();
     for (key, value) in args.flags() {
@@ -170,7 +170,7 @@ mod tests {
 
     fn loaded<T>(arguments: &[&str]) -> T
     where
-        T: Check + Default + Serialize + DeserializeOwned,
+        T: Validate + Default + Serialize + DeserializeOwned,
     {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("own.yml");

@@ -5,11 +5,7 @@ use std::path::PathBuf;
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use super::blocks::own_car;
-use super::check::{
-    Check, Problem, at_least_one, nested, not_negative, path, positive, require, selection, share,
-    within,
-};
+use super::check::{own_car, path};
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::lidar::normals::NormalConfig;
 use crate::lidar::{LidarModel, Spin};
@@ -19,6 +15,10 @@ use crate::map::scan_cloud::ScanSettings;
 use crate::map::visibility::VisibilityConfig;
 use crate::meshing::PoissonConfig;
 use crate::recording::Selection;
+use crate::validation::{
+    InvalidValue, Validate, at_least_one, fraction, in_range, nested, not_negative, positive,
+    require,
+};
 
 /// The keys of range-mcl's `build_map.yml`, and below them new ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -215,15 +215,15 @@ fn bytes(rgb: [f64; 3]) -> [u8; 3] {
     rgb.map(|share| (255.0 * share).round() as u8)
 }
 
-impl Check for BuildMapConfig {
-    fn check(&self) -> Result<(), Problem> {
+impl Validate for BuildMapConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
         path("scan_folder", &self.scan_folder)?;
         path("pose_file", &self.pose_file)?;
         path("calib_file", &self.calib_file)?;
         path("mesh_file", &self.mesh_file)?;
-        selection(self.n_scans, self.frame_step)?;
+        self.selection().validate()?;
         at_least_one("local_map_size", self.local_map_size)?;
-        within("depth", self.depth, 3..=12)?;
+        in_range("depth", self.depth, PoissonConfig::DEPTHS)?;
         require(
             (0.0..1.0).contains(&self.min_density),
             "min_density",
@@ -234,39 +234,32 @@ impl Check for BuildMapConfig {
         positive("crop_x", self.crop_x)?;
         positive("crop_y", self.crop_y)?;
         positive("crop_z", self.crop_z)?;
-        positive("distance_threshold", self.distance_threshold)?;
-        require(
-            self.ransac_n >= 3,
-            "ransac_n",
-            self.ransac_n,
-            "a plane needs 3 points or more",
-        )?;
-        at_least_one("num_iterations", self.num_iterations)?;
+        self.ground().ransac.validate()?;
         positive("simplify_resolution", self.simplify_resolution)?;
         color("ground_color", self.ground_color)?;
         color("rest_color", self.rest_color)?;
         not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
         not_negative("overlap_m", self.overlap_m)?;
         positive("max_distance_m", self.max_distance_m)?;
-        share("ground_threshold", self.ground_threshold)?;
+        fraction("ground_threshold", self.ground_threshold)?;
         own_car("own_car_m", self.own_car_m)?;
-        nested("confidence", self.confidence.check())?;
-        nested("poisson", self.poisson.check())?;
-        nested("normals", self.normals.check())?;
-        nested("visibility", self.visibility.check())?;
-        nested("fuzzy", self.fuzzy.check())?;
-        nested("pca", self.pca.check())?;
+        nested("confidence", &self.confidence)?;
+        nested("poisson", &self.poisson)?;
+        nested("normals", &self.normals)?;
+        nested("visibility", &self.visibility)?;
+        nested("fuzzy", &self.fuzzy)?;
+        nested("pca", &self.pca)?;
         require(
             self.holdout_step != 1,
             "holdout_step",
             self.holdout_step,
             "1 holds every scan back; 0 holds none, 10 every tenth",
         )?;
-        nested("range_image", self.range_image.check())
+        nested("range_image", &self.range_image)
     }
 }
 
-fn color(key: &str, rgb: [f64; 3]) -> Result<(), Problem> {
+fn color(key: &str, rgb: [f64; 3]) -> Result<(), InvalidValue> {
     require(
         rgb.iter().all(|share| (0.0..=1.0).contains(share)),
         key,

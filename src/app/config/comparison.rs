@@ -5,8 +5,9 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::check::{Check, Problem, at_least_one, path, require};
+use super::check::path;
 use crate::app::comparison::{Contrast, Variant};
+use crate::validation::{InvalidValue, Validate, at_least_one, require};
 
 /// Keys of a stage's configuration with their values, as `--set` has them: `range_image.width: 450`.
 /// A block of keys stands for each of its keys.
@@ -160,8 +161,8 @@ pub fn settings(overrides: &Overrides) -> Vec<(String, String)> {
     found
 }
 
-impl Check for ComparisonConfig {
-    fn check(&self) -> Result<(), Problem> {
+impl Validate for ComparisonConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
         path("output_folder", &self.output_folder)?;
         at_least_one("seeds", self.seeds.len())?;
         let sequences: Vec<&str> = self.sequences.iter().map(|s| s.name.as_str()).collect();
@@ -205,7 +206,7 @@ impl Check for ComparisonConfig {
 }
 
 /// At least one name, each once, and each fit for a folder.
-fn names(key: &str, names: &[&str]) -> Result<(), Problem> {
+fn names(key: &str, names: &[&str]) -> Result<(), InvalidValue> {
     at_least_one(key, names.len())?;
     for (index, name) in names.iter().enumerate() {
         let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_+.".contains(c);
@@ -225,7 +226,7 @@ fn names(key: &str, names: &[&str]) -> Result<(), Problem> {
     Ok(())
 }
 
-fn known(key: &str, name: &str, names: &[&str]) -> Result<(), Problem> {
+fn known(key: &str, name: &str, names: &[&str]) -> Result<(), InvalidValue> {
     let remedy = format!("it must be one of {}", names.join(", "));
     require(names.contains(&name), key, name, remedy)
 }

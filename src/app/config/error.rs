@@ -3,8 +3,8 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use super::check::Problem;
 use super::outline::Outline;
+use crate::validation::InvalidValue;
 
 /// Each names the place, quotes what stands there and says what to do.
 #[derive(Debug, thiserror::Error)]
@@ -34,7 +34,7 @@ pub enum ConfigError {
         expected: String,
     },
     #[error("{place}: {problem}")]
-    Unusable { place: Place, problem: Problem },
+    Unusable { place: Place, problem: InvalidValue },
     #[error("{place}: key `{key}` is given twice; remove one of them")]
     DuplicateKey { place: Place, key: String },
     #[error("{place}: {source}")]
@@ -117,7 +117,7 @@ pub(super) fn unusable(
     path: &Path,
     text: &str,
     overrides: &[(String, String)],
-    problem: Problem,
+    problem: InvalidValue,
 ) -> ConfigError {
     let setting = overrides
         .iter()

@@ -4,8 +4,9 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::check::{Check, Problem, at_least_one, path, positive, require, selection};
+use super::check::path;
 use crate::recording::Selection;
+use crate::validation::{InvalidValue, Validate, at_least_one, positive, require};
 
 /// The keys of range-mcl's `evaluation.yml`, and below them new ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -69,12 +70,12 @@ impl EvaluationConfig {
     }
 }
 
-impl Check for EvaluationConfig {
-    fn check(&self) -> Result<(), Problem> {
+impl Validate for EvaluationConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
         path("result_file", &self.result_file)?;
         path("pose_file", &self.pose_file)?;
         path("calib_file", &self.calib_file)?;
-        selection(self.n_scans, self.frame_step)?;
+        self.selection().validate()?;
         positive("grid_resolution", self.grid_resolution)?;
         positive("converge_thres", self.converge_thres)?;
         require(

@@ -4,9 +4,10 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::check::{Check, Problem, nested, path, positive, require, selection, within};
+use super::check::path;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::recording::Selection;
+use crate::validation::{InvalidValue, Validate, in_range};
 
 /// What `ground` reads, how it judges and what it writes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -91,28 +92,12 @@ impl GroundCommandConfig {
     }
 }
 
-impl Check for GroundCommandConfig {
-    fn check(&self) -> Result<(), Problem> {
+impl Validate for GroundCommandConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
         path("scan_folder", &self.scan_folder)?;
         path("output_folder", &self.output_folder)?;
-        selection(self.n_scans, self.frame_step)?;
-        within("ground_threshold", self.ground_threshold, 0.0..=1.0)?;
-        nested("fuzzy", self.fuzzy.check())?;
-        nested("pca", self.pca.check())?;
-        positive(
-            "ransac.distance_threshold",
-            f64::from(self.ransac.distance_threshold),
-        )?;
-        require(
-            self.ransac.ransac_n >= 3,
-            "ransac.ransac_n",
-            self.ransac.ransac_n,
-            "a plane needs 3 points or more",
-        )?;
-        within(
-            "ransac.num_iterations",
-            self.ransac.num_iterations,
-            1..=1_000_000,
-        )
+        self.selection().validate()?;
+        in_range("ground_threshold", self.ground_threshold, 0.0..=1.0)?;
+        self.ground().validate()
     }
 }

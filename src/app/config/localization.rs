@@ -4,10 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::blocks::own_car;
-use super::check::{
-    Check, Problem, at_least_one, nested, not_negative, path, positive, require, selection,
-};
+use super::check::{own_car, path};
 use crate::lidar::{LidarModel, Spin};
 use crate::localization::LocalizerConfig;
 use crate::localization::convergence::ConvergenceConfig;
@@ -22,6 +19,9 @@ use crate::localization::vigilance::VigilanceConfig;
 use crate::map::scan_cloud::ScanSettings;
 use crate::recording::Selection;
 use crate::refinement::RefinementConfig;
+use crate::validation::{
+    InvalidValue, Validate, at_least_one, nested, not_negative, positive, require,
+};
 
 /// The keys of range-mcl's `localization.yml`, and below them new ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -328,8 +328,8 @@ impl RenderedRangeImage {
     }
 }
 
-impl Check for LocalizationConfig {
-    fn check(&self) -> Result<(), Problem> {
+impl Validate for LocalizationConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
         path("scan_folder", &self.scan_folder)?;
         path("map_file", &self.map_file)?;
         path("map_pose_file", &self.map_pose_file)?;
@@ -337,7 +337,7 @@ impl Check for LocalizationConfig {
         path("pose_file", &self.pose_file)?;
         path("calib_file", &self.calib_file)?;
         path("result_path", &self.result_path)?;
-        selection(self.n_scans, self.frame_step)?;
+        self.selection().validate()?;
         positive("grid_res", self.grid_res)?;
         at_least_one("numParticles", self.num_particles)?;
         at_least_one("converge_thres", self.converge_thres)?;
@@ -351,32 +351,26 @@ impl Check for LocalizationConfig {
             "name the file in odometry_file, or choose ground_truth or none",
         )?;
         own_car("own_car_m", self.own_car_m)?;
-        nested("start", self.start.check())?;
-        nested("odometry_noise", self.odometry_noise.check())?;
-        nested("velocity_noise", self.velocity_noise.check())?;
-        nested(
-            "constant_velocity_noise",
-            self.constant_velocity_noise.check(),
-        )?;
-        nested(
-            "unknown_velocity_noise",
-            self.unknown_velocity_noise.check(),
-        )?;
-        nested("observation", self.observation.check())?;
-        nested("tempering", self.tempering.check())?;
-        nested("proposal", self.proposal.check())?;
-        nested("resampling", self.resampling.check())?;
-        nested("kld", self.kld.check())?;
-        nested("vigilance", self.vigilance.check())?;
-        nested("panorama", self.panorama.check())?;
-        nested("refinement", self.refinement.check())?;
-        nested("range_image", self.range_image.check())
+        nested("start", &self.start)?;
+        nested("odometry_noise", &self.odometry_noise)?;
+        nested("velocity_noise", &self.velocity_noise)?;
+        nested("constant_velocity_noise", &self.constant_velocity_noise)?;
+        nested("unknown_velocity_noise", &self.unknown_velocity_noise)?;
+        nested("observation", &self.observation)?;
+        nested("tempering", &self.tempering)?;
+        nested("proposal", &self.proposal)?;
+        nested("resampling", &self.resampling)?;
+        nested("kld", &self.kld)?;
+        nested("vigilance", &self.vigilance)?;
+        nested("panorama", &self.panorama)?;
+        nested("refinement", &self.refinement)?;
+        nested("range_image", &self.range_image)
     }
 }
 
-impl Check for RenderedRangeImage {
-    fn check(&self) -> Result<(), Problem> {
+impl Validate for RenderedRangeImage {
+    fn validate(&self) -> Result<(), InvalidValue> {
         at_least_one("max_instance", self.max_instance)?;
-        self.model().check()
+        self.model().validate()
     }
 }

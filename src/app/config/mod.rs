@@ -9,7 +9,6 @@
 //! them. Nothing is ignored: an unknown key, a word where a number belongs and a contradiction
 //! are errors that name the file and the line, or the `--set`.
 
-mod blocks;
 mod build_map;
 mod check;
 mod comparison;
@@ -28,7 +27,6 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 pub use build_map::BuildMapConfig;
-pub use check::{Check, Problem};
 pub use comparison::{
     ComparisonConfig, Overrides, ParticleSweep, SequenceConfig, StageOverrides, VariantConfig,
     settings,
@@ -41,6 +39,7 @@ pub use localization::{
 };
 pub use refinement::RefinementConfig;
 
+use crate::validation::Validate;
 use outline::Outline;
 
 use crate::app::output::write_atomically;
@@ -55,7 +54,7 @@ pub fn load<T>(
     overrides: &[(String, String)],
 ) -> Result<T, ConfigError>
 where
-    T: Check + Serialize + DeserializeOwned,
+    T: Validate + Serialize + DeserializeOwned,
 {
     let path = path.unwrap_or(default_path);
     let text = fs::read_to_string(path).map_err(|source| ConfigError::Read {
@@ -69,7 +68,7 @@ where
 /// The default configuration with overrides, checked, for commands that need no file.
 pub fn defaults<T>(overrides: &[(String, String)]) -> Result<T, ConfigError>
 where
-    T: Check + Default + Serialize + DeserializeOwned,
+    T: Validate + Default + Serialize + DeserializeOwned,
 {
     with_overrides(T::default(), overrides)
 }
@@ -77,7 +76,7 @@ where
 /// A configuration with overrides, checked.
 pub fn with_overrides<T>(config: T, overrides: &[(String, String)]) -> Result<T, ConfigError>
 where
-    T: Check + Serialize + DeserializeOwned,
+    T: Validate + Serialize + DeserializeOwned,
 {
     overridden(config, Path::new("defaults"), "", overrides)
 }
@@ -90,13 +89,13 @@ fn overridden<T>(
     overrides: &[(String, String)],
 ) -> Result<T, ConfigError>
 where
-    T: Check + Serialize + DeserializeOwned,
+    T: Validate + Serialize + DeserializeOwned,
 {
     for (key, value) in overrides {
         config = override_key(&config, key, value)?;
     }
     config
-        .check()
+        .validate()
         .map_err(|problem| error::unusable(path, text, overrides, problem))?;
     Ok(config)
 }

@@ -4,13 +4,13 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::blocks::own_car;
-use super::check::{Check, Problem, nested, path, require, selection};
+use super::check::{own_car, path};
 use super::localization::OdometrySource;
 use crate::lidar::{LidarModel, Spin};
 use crate::localization::observation::ObservationConfig;
 use crate::recording::Selection;
 use crate::refinement;
+use crate::validation::{InvalidValue, Validate, nested, require};
 
 /// What `refine` reads, and how it refines.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -99,8 +99,8 @@ impl RefinementConfig {
     }
 }
 
-impl Check for RefinementConfig {
-    fn check(&self) -> Result<(), Problem> {
+impl Validate for RefinementConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
         path("scan_folder", &self.scan_folder)?;
         path("map_file", &self.map_file)?;
         path("map_pose_file", &self.map_pose_file)?;
@@ -108,7 +108,7 @@ impl Check for RefinementConfig {
         path("pose_file", &self.pose_file)?;
         path("calib_file", &self.calib_file)?;
         path("result_file", &self.result_file)?;
-        selection(self.n_scans, self.frame_step)?;
+        self.selection().validate()?;
         require(
             self.odometry != OdometrySource::File || self.odometry_file.is_some(),
             "odometry",
@@ -116,8 +116,8 @@ impl Check for RefinementConfig {
             "name the file in odometry_file, or choose ground_truth or none",
         )?;
         own_car("own_car_m", self.own_car_m)?;
-        nested("observation", self.observation.check())?;
-        nested("refinement", self.refinement.check())?;
-        nested("range_image", self.range_image.check())
+        nested("observation", &self.observation)?;
+        nested("refinement", &self.refinement)?;
+        nested("range_image", &self.range_image)
     }
 }

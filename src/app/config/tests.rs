@@ -5,7 +5,7 @@ use super::*;
 /// Loads a configuration from a text.
 fn load_text<T>(text: &str, settings: &[(&str, &str)]) -> Result<T, ConfigError>
 where
-    T: Check + Serialize + DeserializeOwned,
+    T: Validate + Serialize + DeserializeOwned,
 {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("own.yml");
@@ -44,11 +44,11 @@ fn an_empty_file_is_the_default_configuration() {
 
 #[test]
 fn every_default_configuration_passes_its_own_check() {
-    BuildMapConfig::default().check().unwrap();
-    LocalizationConfig::default().check().unwrap();
-    RefinementConfig::default().check().unwrap();
-    EvaluationConfig::default().check().unwrap();
-    GroundCommandConfig::default().check().unwrap();
+    BuildMapConfig::default().validate().unwrap();
+    LocalizationConfig::default().validate().unwrap();
+    RefinementConfig::default().validate().unwrap();
+    EvaluationConfig::default().validate().unwrap();
+    GroundCommandConfig::default().validate().unwrap();
 }
 
 #[test]

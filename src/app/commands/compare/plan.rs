@@ -4,10 +4,11 @@ use anyhow::{Context as _, Result};
 
 use crate::app::comparison::RunId;
 use crate::app::config::{
-    self, BuildMapConfig, Check, ComparisonConfig, LocalizationConfig, OdometrySource, Overrides,
+    self, BuildMapConfig, ComparisonConfig, LocalizationConfig, OdometrySource, Overrides,
     RefinementConfig, SequenceConfig, VariantConfig, settings,
 };
 use crate::simulation::SimulationConfig;
+use crate::validation::Validate;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
@@ -201,7 +202,7 @@ fn following(localization: &LocalizationConfig) -> RefinementConfig {
 /// A configuration with overrides, the later ones on top.
 fn applied<T>(config: T, block: &str, overrides: &[&Overrides]) -> Result<T>
 where
-    T: Check + Serialize + DeserializeOwned,
+    T: Validate + Serialize + DeserializeOwned,
 {
     let all: Vec<(String, String)> = overrides.iter().flat_map(|keys| settings(keys)).collect();
     config::with_overrides(config, &all).with_context(|| format!("among the keys of {block}"))
