@@ -51,7 +51,7 @@ fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMap
                 scan_path,
                 time_s: 0.1 * number as f64,
                 map_from_lidar: Pose3::identity(),
-                revolution: None,
+                sweep: None,
             }
         })
         .collect();

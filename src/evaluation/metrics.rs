@@ -10,7 +10,7 @@ use super::planar::{PlanarError, distances_m, planar_errors};
 use super::pose_error::{Pairs, SegmentErrors, kitti_segment_errors, relative_pose_error};
 use super::smoothness::{jitter_m, log_dimensionless_jerk, mean_pose_change};
 use super::statistics::{Summary, mean, rms, slope};
-use crate::geometry::{Pose2, Pose3, spatial};
+use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
 
 /// What is measured, and from where on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -241,7 +241,10 @@ impl Smoothness {
 }
 
 fn level(poses: &[Pose2]) -> Vec<Pose3> {
-    poses.iter().map(|pose| spatial(pose, 0.0)).collect()
+    poses
+        .iter()
+        .map(|pose| pose3_from_pose2(pose, 0.0))
+        .collect()
 }
 
 #[cfg(test)]

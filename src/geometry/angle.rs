@@ -1,27 +1,24 @@
-//! Angles on the circle: wrapped to [-π, π), averaged as unit vectors.
+//! Angles: wrapping to [-π, π) and the circular mean.
 
 use std::f64::consts::{PI, TAU};
 
-/// The same direction as `angle_rad`, in [-π, π) [rad].
+/// Wraps an angle to [-π, π) [rad].
 pub fn wrap_angle(angle_rad: f64) -> f64 {
     let wrapped = (angle_rad + PI).rem_euclid(TAU) - PI;
     // `rem_euclid` may round up to the modulus itself.
     if wrapped >= PI { -PI } else { wrapped }
 }
 
-/// The direction of the weighted sum of unit vectors [rad]; `None` where they cancel out.
+/// Circular mean of (angle, weight), the direction of the weighted sum of unit vectors [rad]; `None`
+/// if the sum vanishes.
 ///
 /// Mardia and Jupp, *Directional Statistics* (2000), eq. 2.2.4.
 pub fn circular_mean(weighted_angles: impl IntoIterator<Item = (f64, f64)>) -> Option<f64> {
-    let (sin, cos) =
-        weighted_angles
-            .into_iter()
-            .fold((0.0, 0.0), |(sin, cos), (angle_rad, weight)| {
-                (
-                    sin + weight * angle_rad.sin(),
-                    cos + weight * angle_rad.cos(),
-                )
-            });
+    let (mut sin, mut cos) = (0.0, 0.0);
+    for (angle_rad, weight) in weighted_angles {
+        sin += weight * angle_rad.sin();
+        cos += weight * angle_rad.cos();
+    }
     (f64::hypot(sin, cos) > 1e-12).then(|| f64::atan2(sin, cos))
 }
 

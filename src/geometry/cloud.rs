@@ -1,4 +1,4 @@
-//! A point cloud as columns: positions, normals and how sure we are that each point is ground.
+//! Point clouds with normals and ground confidences.
 
 use std::collections::HashMap;
 
@@ -6,19 +6,19 @@ use glam::{IVec3, Vec3};
 
 use super::Rigid3f;
 
-/// Points with unit normals and ground confidences, one entry of each per point.
+/// Points with unit normals and ground confidences; all columns have one entry per point.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointCloud {
     /// Positions [m].
     pub positions: Vec<Vec3>,
-    /// Unit normals, towards the sensor that saw the point.
+    /// Unit normals that face the sensor.
     pub normals: Vec<Vec3>,
-    /// Confidence that the point is ground, 0 to 1.
+    /// Confidence that the point is ground, 0 to 1 (unitless).
     pub ground: Vec<f32>,
 }
 
 impl PointCloud {
-    /// An empty cloud with room for `capacity` points.
+    /// An empty cloud with capacity for `capacity` points.
     pub fn with_capacity(capacity: usize) -> Self {
         Self {
             positions: Vec::with_capacity(capacity),
@@ -67,7 +67,7 @@ impl PointCloud {
         self.ground.truncate(kept);
     }
 
-    /// Moves all points from frame b to frame a.
+    /// Transforms all points from frame b to frame a.
     pub fn transform(&mut self, a_from_b: &Rigid3f) {
         for position in &mut self.positions {
             *position = a_from_b.apply(*position);
@@ -77,10 +77,10 @@ impl PointCloud {
         }
     }
 
-    /// One point per occupied voxel: mean position, mean normal made unit, mean confidence.
+    /// Voxel grid filter: mean position, normalized mean normal and mean confidence per voxel.
     ///
-    /// Voxels come in the order in which their first point comes. A voxel whose normals
-    /// cancel out (two sides of a sheet) takes the normal of its first point.
+    /// Voxels are in the order of their first points. A voxel whose normals cancel out (two sides
+    /// of a sheet) has the normal of its first point.
     pub fn downsample(&self, voxel_m: f32) -> Self {
         let mut voxel_of: HashMap<IVec3, usize> = HashMap::with_capacity(self.len());
         let mut sums = Self::with_capacity(self.len());
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn a_voxel_keeps_the_mean_of_its_points_with_a_unit_normal() {
+    fn a_voxel_becomes_the_mean_of_its_points_with_a_unit_normal() {
         let thin = two_points_in_one_voxel_and_one_elsewhere().downsample(0.1);
         assert_eq!(thin.len(), 2);
         assert!((thin.positions[0] - Vec3::splat(0.02)).length() < 1e-6);
@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn downsampling_again_changes_nothing() {
+    fn downsampling_is_idempotent() {
         let once = two_points_in_one_voxel_and_one_elsewhere().downsample(0.1);
         let twice = once.downsample(0.1);
         assert_eq!(twice.positions, once.positions);

@@ -1,4 +1,4 @@
-//! A regular grid over the x-y plane: cells that a position falls into.
+//! Regular grids over the x-y plane.
 
 use nalgebra::Point2;
 
@@ -7,7 +7,7 @@ use nalgebra::Point2;
 pub struct Grid2 {
     /// Lower corner of cell (0, 0) [m].
     pub origin: Point2<f64>,
-    /// Edge of a cell [m].
+    /// Edge length of a cell [m].
     pub cell_m: f64,
     /// Number of cells along x.
     pub columns: usize,
@@ -16,7 +16,7 @@ pub struct Grid2 {
 }
 
 impl Grid2 {
-    /// The grid that covers a rectangle; at least one cell.
+    /// The grid that covers a rectangle with at least one cell.
     pub fn covering(min: Point2<f64>, max: Point2<f64>, cell_m: f64) -> Self {
         let cells = |extent_m: f64| ((extent_m / cell_m).ceil() as usize).max(1);
         Self {
@@ -46,13 +46,7 @@ impl Grid2 {
         inside.then_some((column as usize, row as usize))
     }
 
-    /// Index of a position's cell in row-major order; `None` outside.
-    pub fn index_at(&self, x: f64, y: f64) -> Option<usize> {
-        self.cell_at(x, y)
-            .map(|(column, row)| row * self.columns + column)
-    }
-
-    /// The middle of a cell.
+    /// Center of a cell.
     pub fn center(&self, column: usize, row: usize) -> Point2<f64> {
         Point2::new(
             self.origin.x + (column as f64 + 0.5) * self.cell_m,
@@ -66,7 +60,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_centre_falls_into_its_own_cell() {
+    fn every_cell_contains_its_center() {
         let grid = Grid2::covering(Point2::new(-3.0, 2.0), Point2::new(4.1, 5.0), 0.5);
         for row in 0..grid.rows {
             for column in 0..grid.columns {
@@ -77,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn outside_is_none() {
+    fn positions_outside_have_no_cell() {
         let grid = Grid2::covering(Point2::origin(), Point2::new(1.0, 1.0), 0.5);
         for (x, y) in [
             (-0.01, 0.5),

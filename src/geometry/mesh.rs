@@ -1,16 +1,16 @@
-//! Triangle meshes with vertex normals and colours, and axis-aligned boxes.
+//! Triangle meshes with vertex normals and colors, and axis-aligned boxes.
 
 use glam::Vec3;
 
 /// Triangles over shared vertices. `normals` and `colors` are per vertex; either is empty
-/// where it is not known, otherwise as long as `vertices`.
+/// if unknown, otherwise as long as `vertices`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TriangleMesh {
     /// Vertex positions [m].
     pub vertices: Vec<Vec3>,
     /// Unit vertex normals.
     pub normals: Vec<Vec3>,
-    /// Vertex colours, red green blue.
+    /// Vertex colors, red green blue.
     pub colors: Vec<[u8; 3]>,
     /// Vertex indices, counter-clockwise seen from the front.
     pub triangles: Vec<[u32; 3]>,
@@ -23,14 +23,14 @@ impl TriangleMesh {
         self.triangles[triangle].map(|vertex| self.vertices[vertex as usize])
     }
 
-    /// The normal of a triangle by the right-hand rule, not unit: its length is twice the area.
+    /// Normal of a triangle by the right-hand rule; its length is twice the area.
     #[inline]
     pub fn scaled_normal(&self, triangle: usize) -> Vec3 {
         let [a, b, c] = self.corners(triangle);
         (b - a).cross(c - a)
     }
 
-    /// Appends another mesh; vertices are not welded. Normals and colours are kept where both have them.
+    /// Appends another mesh without merging vertices. Normals and colors are kept if both have them.
     pub fn append(&mut self, other: &Self) {
         let had_vertices = !self.vertices.is_empty();
         let offset = self.vertices.len() as u32;
@@ -47,7 +47,7 @@ impl TriangleMesh {
         }
     }
 
-    /// Keeps the triangles whose index satisfies `keep` and drops the vertices that nothing uses any more.
+    /// Keeps the triangles whose index satisfies `keep` and removes unreferenced vertices.
     pub fn retain_triangles(&mut self, keep: impl Fn(usize) -> bool) {
         let mut index = 0;
         self.triangles.retain(|_| {
@@ -57,7 +57,7 @@ impl TriangleMesh {
         self.drop_unreferenced_vertices();
     }
 
-    /// Drops the vertices that no triangle uses; the order of the others stays.
+    /// Removes the vertices without a triangle and keeps the order of the others.
     pub fn drop_unreferenced_vertices(&mut self) {
         const UNUSED: u32 = u32::MAX;
         let mut new_index = vec![UNUSED; self.vertices.len()];
@@ -87,7 +87,7 @@ impl TriangleMesh {
         }
     }
 
-    /// Area-weighted unit vertex normals from the triangles.
+    /// Computes area-weighted unit vertex normals.
     pub fn compute_normals(&mut self) {
         let mut normals = vec![Vec3::ZERO; self.vertices.len()];
         for triangle in 0..self.triangles.len() {
@@ -102,13 +102,13 @@ impl TriangleMesh {
         self.normals = normals;
     }
 
-    /// The box around all vertices; empty without vertices.
+    /// Bounding box of all vertices.
     pub fn bounds(&self) -> Aabb {
         Aabb::of(self.vertices.iter().copied())
     }
 }
 
-/// An axis-aligned box; empty while `min > max`.
+/// An axis-aligned bounding box; empty if `min > max`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Aabb {
     /// Lower corner [m].
@@ -118,18 +118,18 @@ pub struct Aabb {
 }
 
 impl Aabb {
-    /// The box that contains nothing.
+    /// The empty box.
     pub const EMPTY: Self = Self {
         min: Vec3::INFINITY,
         max: Vec3::NEG_INFINITY,
     };
 
-    /// The smallest box around points.
+    /// Bounding box of points.
     pub fn of(points: impl IntoIterator<Item = Vec3>) -> Self {
         points.into_iter().fold(Self::EMPTY, Self::grown_to)
     }
 
-    /// The smallest box around this box and a point.
+    /// Bounding box of this box and a point.
     #[must_use]
     pub fn grown_to(self, point: Vec3) -> Self {
         Self {
@@ -138,7 +138,7 @@ impl Aabb {
         }
     }
 
-    /// The smallest box around two boxes.
+    /// Bounding box of two boxes.
     #[must_use]
     pub fn union(self, other: Self) -> Self {
         Self {
@@ -147,12 +147,12 @@ impl Aabb {
         }
     }
 
-    /// Whether no point is inside.
+    /// Whether the box contains no point.
     pub fn is_empty(&self) -> bool {
         self.min.cmpgt(self.max).any()
     }
 
-    /// Whether a point is inside or on the border.
+    /// Whether a point is inside or on the boundary.
     pub fn contains(&self, point: Vec3) -> bool {
         point.cmpge(self.min).all() && point.cmple(self.max).all()
     }
@@ -162,7 +162,7 @@ impl Aabb {
         self.max - self.min
     }
 
-    /// The middle.
+    /// Center [m].
     pub fn center(&self) -> Vec3 {
         0.5 * (self.min + self.max)
     }
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn removing_a_triangle_removes_its_own_vertex_only() {
+    fn removing_a_triangle_removes_only_its_unshared_vertex() {
         let mut mesh = square();
         mesh.retain_triangles(|triangle| triangle == 1);
         assert_eq!(mesh.vertices, [Vec3::ZERO, Vec3::X + Vec3::Y, Vec3::Y]);

@@ -1,8 +1,8 @@
-//! Poses, angles, points and meshes: the words that every other module speaks.
+//! Poses, angles, grids, point clouds, planes and meshes.
 //!
-//! Poses are `f64` (nalgebra), points and directions are `f32` (glam): a map of five
-//! kilometres keeps half a millimetre in `f32`, and half the memory is twice the speed.
-//! A transform says both its frames, `p_map = map_from_lidar * p_lidar`.
+//! Poses are `f64` (nalgebra), points and directions are `f32` (glam): at five kilometers from the
+//! origin `f32` resolves half a millimeter, and half the memory is twice the speed. Names of
+//! transforms contain both frames, `p_map = map_from_lidar * p_lidar`.
 
 pub mod angle;
 pub mod cloud;
@@ -17,7 +17,7 @@ pub use cloud::PointCloud;
 pub use grid::Grid2;
 pub use mesh::{Aabb, TriangleMesh};
 pub use plane::{PlaneFit, PlaneSums};
-pub use pose::{Pose2, Pose3, Rigid3f, planar, spatial, yaw};
+pub use pose::{Pose2, Pose3, Rigid3f, pose2_from_pose3, pose3_from_pose2, yaw};
 pub use trajectory::{StampedPose, Trajectory};
 
 pub use glam::Vec3;

@@ -1,4 +1,4 @@
-//! Planes fitted to points by principal components.
+//! Least-squares planes by principal component analysis.
 //!
 //! ```text
 //! C = Σ wᵢ (pᵢ − p̄)(pᵢ − p̄)ᵀ / Σ wᵢ        λ₀ ≤ λ₁ ≤ λ₂
@@ -9,14 +9,14 @@
 
 use glam::{DMat3, DVec3, Vec3};
 
-/// Weighted sums of points from which a plane follows. They are taken about an anchor near the
-/// points, so that nothing is lost far from the origin.
+/// Weighted first and second moments of points, relative to an anchor near the points for numerical
+/// accuracy far from the origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PlaneSums {
     anchor: DVec3,
     weight: f64,
     first: DVec3,
-    /// xx, xy, xz, yy, yz, zz.
+    /// Second moments xx, xy, xz, yy, yz, zz.
     second: [f64; 6],
 }
 
@@ -32,7 +32,7 @@ pub struct PlaneFit {
 }
 
 impl PlaneSums {
-    /// No points yet; `anchor` is any place near them.
+    /// Empty sums relative to `anchor`, any position near the points.
     pub fn about(anchor: Vec3) -> Self {
         Self {
             anchor: anchor.as_dvec3(),
@@ -62,8 +62,7 @@ impl PlaneSums {
         }
     }
 
-    /// The plane through the points; `None` without any weight or where the points lie on a
-    /// line.
+    /// The least-squares plane; `None` without weight or if the points are collinear.
     pub fn fit(&self) -> Option<PlaneFit> {
         if self.weight <= 0.0 || self.weight.is_nan() {
             return None;
@@ -91,7 +90,7 @@ impl PlaneSums {
     }
 }
 
-/// Of a symmetric matrix, ascending.
+/// Eigenvalues of a symmetric matrix, ascending.
 fn eigenvalues(matrix: &DMat3) -> [f64; 3] {
     let [a, b, c] = [matrix.x_axis, matrix.y_axis, matrix.z_axis];
     let mean = (a.x + b.y + c.z) / 3.0;
@@ -108,7 +107,7 @@ fn eigenvalues(matrix: &DMat3) -> [f64; 3] {
     [smallest, 3.0 * mean - largest - smallest, largest]
 }
 
-/// The unit eigenvector of the smallest eigenvalue; `None` where the two smallest are the same
+/// The unit eigenvector of the smallest eigenvalue; `None` if the two smallest eigenvalues are equal
 /// to the accuracy of the closed form.
 fn eigenvector(matrix: &DMat3, [smallest, middle, largest]: [f64; 3]) -> Option<DVec3> {
     if middle - smallest <= 1e-6 * largest {
@@ -142,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn points_of_a_plane_give_back_its_normal_wherever_it_is() {
+    fn the_normal_of_a_plane_is_recovered_at_any_offset() {
         for offset in [Vec3::ZERO, Vec3::new(1000.0, -2000.0, 30.0)] {
             let normal = Vec3::new(0.2, -0.3, 1.0).normalize();
             let (u, v) = normal.any_orthonormal_pair();
@@ -156,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn the_variances_are_those_along_the_axes() {
+    fn the_variances_are_those_along_the_principal_axes() {
         let points: Vec<Vec3> = [-1.0, 1.0]
             .iter()
             .flat_map(|&x| [-2.0, 2.0].map(|y| [-0.5, 0.5].map(|z| Vec3::new(x, y, z))))
@@ -167,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_and_a_single_point_have_no_plane() {
+    fn collinear_points_have_no_plane() {
         let line: Vec<Vec3> = (0..5).map(|i| Vec3::new(i as f32, 0.0, 1.0)).collect();
         assert_eq!(fit(&line), None);
         assert_eq!(fit(&line[..1]), None);

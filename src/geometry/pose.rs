@@ -1,4 +1,4 @@
-//! Poses in the plane and in space, and the way between them.
+//! Poses in the plane and in space, and the conversions between them.
 
 use glam::{Mat3, Vec3};
 use nalgebra::{Isometry2, Isometry3, Translation3, UnitQuaternion};
@@ -8,19 +8,19 @@ pub type Pose2 = Isometry2<f64>;
 /// A pose or transform in space [m].
 pub type Pose3 = Isometry3<f64>;
 
-/// Heading of a pose about the vertical, `atan2(R₁₀, R₀₀)` [rad].
+/// Heading of a pose, `atan2(R₁₀, R₀₀)` [rad].
 pub fn yaw(pose: &Pose3) -> f64 {
     let forward = pose.rotation * nalgebra::Vector3::x();
     forward.y.atan2(forward.x)
 }
 
-/// The shadow of a pose on the x-y plane: x, y and heading.
-pub fn planar(pose: &Pose3) -> Pose2 {
+/// Projects a pose onto the x-y plane: x, y and heading.
+pub fn pose2_from_pose3(pose: &Pose3) -> Pose2 {
     Pose2::new(pose.translation.vector.xy(), yaw(pose))
 }
 
-/// The level pose at `height_m` above a planar one; [`planar`] is the inverse.
-pub fn spatial(pose: &Pose2, height_m: f64) -> Pose3 {
+/// The pose at `height_m` without roll and pitch; [`pose2_from_pose3`] is the inverse.
+pub fn pose3_from_pose2(pose: &Pose2, height_m: f64) -> Pose3 {
     let t = pose.translation.vector;
     Pose3::from_parts(
         Translation3::new(t.x, t.y, height_m),
@@ -28,23 +28,23 @@ pub fn spatial(pose: &Pose2, height_m: f64) -> Pose3 {
     )
 }
 
-/// A rigid transform in `f32`, for moving many points: `p_a = a_from_b.apply(p_b)`.
+/// A rigid transform in `f32` for many points: `p_a = a_from_b.apply(p_b)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rigid3f {
-    /// Rotation matrix, columns are the axes of b in a.
+    /// Rotation matrix; its columns are the axes of frame b in frame a.
     pub rotation: Mat3,
-    /// Origin of b in a [m].
+    /// Origin of frame b in frame a [m].
     pub translation: Vec3,
 }
 
 impl Rigid3f {
-    /// A point of frame b in frame a.
+    /// Transforms a point from frame b to frame a.
     #[inline]
     pub fn apply(&self, point: Vec3) -> Vec3 {
         self.rotation * point + self.translation
     }
 
-    /// A direction of frame b in frame a.
+    /// Rotates a direction from frame b to frame a.
     #[inline]
     pub fn rotate(&self, direction: Vec3) -> Vec3 {
         self.rotation * direction
@@ -70,10 +70,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn planar_undoes_spatial() {
+    fn projection_inverts_pose3_from_pose2() {
         for heading in [-3.1, -1.0, 0.0, 0.5, 3.1] {
             let pose = Pose2::new(Vector2::new(3.0, -2.0), heading);
-            assert_relative_eq!(planar(&spatial(&pose, 1.5)), pose, epsilon = 1e-12);
+            assert_relative_eq!(
+                pose2_from_pose3(&pose3_from_pose2(&pose, 1.5)),
+                pose,
+                epsilon = 1e-12
+            );
         }
     }
 

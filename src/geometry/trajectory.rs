@@ -1,11 +1,11 @@
-//! A trajectory: poses of one body over time.
+//! Trajectories.
 
 use super::Pose3;
 
-/// A pose with its place in the recording.
+/// A pose with its frame number and time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StampedPose {
-    /// Number of the frame in its recording.
+    /// Frame number in the recording.
     pub frame: usize,
     /// Time since the first frame of the recording [s].
     pub time_s: f64,
@@ -13,28 +13,24 @@ pub struct StampedPose {
     pub map_from_lidar: Pose3,
 }
 
-/// Poses in the order of their frames.
+/// Poses in ascending order of their frames.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Trajectory {
-    /// Ascending in frame.
+    /// Stamped poses.
     pub poses: Vec<StampedPose>,
 }
 
 impl Trajectory {
-    /// Distance driven up to each pose, starting at 0 [m].
+    /// Path length from the first pose to each pose [m].
     pub fn distances_m(&self) -> Vec<f64> {
-        let mut driven_m = 0.0;
-        let mut previous: Option<&StampedPose> = None;
-        self.poses
-            .iter()
-            .map(|pose| {
-                if let Some(previous) = previous {
-                    driven_m += (pose.map_from_lidar.translation.vector
-                        - previous.map_from_lidar.translation.vector)
-                        .norm();
+        let position = |index: usize| self.poses[index].map_from_lidar.translation.vector;
+        let mut length_m = 0.0;
+        (0..self.poses.len())
+            .map(|index| {
+                if index > 0 {
+                    length_m += (position(index) - position(index - 1)).norm();
                 }
-                previous = Some(pose);
-                driven_m
+                length_m
             })
             .collect()
     }
@@ -53,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn distance_adds_up_along_the_path_and_not_along_the_chord() {
+    fn path_length_accumulates_along_the_path() {
         let corners = [(0.0, 0.0), (3.0, 0.0), (3.0, 4.0)];
         let trajectory: Trajectory = corners
             .iter()

@@ -1,13 +1,13 @@
-//! The spherical projection of a spinning LiDAR, the only place where a direction becomes a pixel.
+//! The spherical projection of a spinning LiDAR.
 //!
 //! ```text
 //! column = ½ (1 − azimuth / π) · width            azimuth   = atan2(y, x)
 //! row    = (1 − (elevation + |fov_down|) / fov) · height    elevation = asin(z / r)
 //! ```
 //!
-//! Column 0 looks straight back, the middle straight ahead, columns grow clockwise; row 0 is
-//! up. Chen et al., *Range Image-based LiDAR Localization for Autonomous Vehicles*, ICRA 2021,
-//! eq. 1. Unlike there, a direction outside the vertical field of view has no pixel.
+//! Column 0 faces backward, the middle column forward, columns increase clockwise; row 0 is the top.
+//! Chen et al., *Range Image-based LiDAR Localization for Autonomous Vehicles*, ICRA 2021, eq. 1.
+//! Unlike there, a direction outside the vertical field of view has no pixel.
 
 use std::f32::consts::PI;
 
@@ -19,22 +19,22 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LidarModel {
-    /// Rows.
+    /// Number of rows.
     pub height: usize,
-    /// Columns over 360 degrees.
+    /// Number of columns over 360 degrees.
     pub width: usize,
-    /// Upper edge of the vertical field of view over the horizon [deg].
+    /// Upper limit of the vertical field of view, above the horizon [deg].
     pub fov_up: f32,
-    /// Lower edge of the vertical field of view; below the horizon whatever its sign [deg].
+    /// Lower limit of the vertical field of view, below the horizon whatever its sign [deg].
     pub fov_down: f32,
-    /// Returns at this range or farther are dropped [m].
+    /// Maximum range, exclusive [m].
     pub max_range: f32,
-    /// Returns at this range or nearer are dropped [m].
+    /// Minimum range, exclusive [m].
     pub min_range: f32,
 }
 
 impl Default for LidarModel {
-    /// A Velodyne HDL-64E as range-mcl images it.
+    /// A Velodyne HDL-64E with the values of range-mcl.
     fn default() -> Self {
         Self {
             height: 64,
@@ -76,9 +76,9 @@ impl Validate for LidarModel {
 /// Row and column in a range image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Pixel {
-    /// From the top.
+    /// Row, from the top.
     pub row: usize,
-    /// Clockwise from straight back.
+    /// Column, clockwise from backward.
     pub column: usize,
 }
 
@@ -93,12 +93,12 @@ impl LidarModel {
         self.len() == 0
     }
 
-    /// Whether a point at this range counts; not so where the range is not finite.
+    /// Whether a range is within the limits; false if it is not finite.
     pub fn accepts_range(&self, range_m: f32) -> bool {
         self.min_range < range_m && range_m < self.max_range
     }
 
-    /// The pixel that a direction (of any length) falls into; `None` above or below the field of view.
+    /// The pixel of a direction of any length; `None` above or below the field of view.
     pub fn pixel_of(&self, direction: Vec3) -> Option<Pixel> {
         let elevation_rad = (direction.z / direction.length()).asin();
         let row = (self.fov_up_rad() - elevation_rad) / self.fov_rad() * self.height as f32;
@@ -109,12 +109,12 @@ impl LidarModel {
         let column = 0.5 * (1.0 - azimuth_rad / PI) * self.width as f32;
         Some(Pixel {
             row: row as usize,
-            // An azimuth of exactly -π is straight back again.
+            // An azimuth of exactly -π wraps to column 0.
             column: column as usize % self.width,
         })
     }
 
-    /// The unit direction through the centre of a pixel.
+    /// The unit direction through the center of a pixel.
     pub fn direction_of(&self, pixel: Pixel) -> Vec3 {
         let elevation_rad =
             self.fov_up_rad() - (pixel.row as f32 + 0.5) / self.height as f32 * self.fov_rad();
@@ -126,7 +126,7 @@ impl LidarModel {
         )
     }
 
-    /// The directions of all pixels, row by row.
+    /// The directions of all pixels, row-major.
     pub fn directions(&self) -> Vec<Vec3> {
         (0..self.len())
             .map(|index| self.direction_of(self.pixel_at(index)))
@@ -148,12 +148,12 @@ impl LidarModel {
         }
     }
 
-    /// Upper edge of the field of view [rad].
+    /// Upper limit of the field of view [rad].
     pub fn fov_up_rad(&self) -> f32 {
         self.fov_up.to_radians()
     }
 
-    /// Lower edge of the field of view, negative [rad].
+    /// Lower limit of the field of view, negative [rad].
     pub fn fov_down_rad(&self) -> f32 {
         -self.fov_down.abs().to_radians()
     }
@@ -169,7 +169,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_centre_of_every_pixel_falls_into_that_pixel() {
+    fn every_pixel_center_projects_into_its_pixel() {
         let model = LidarModel::default();
         for index in 0..model.len() {
             let pixel = model.pixel_at(index);
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn ahead_is_the_middle_column_and_right_is_after_it() {
+    fn columns_increase_clockwise_from_backward() {
         let model = LidarModel::default();
         let column = |direction| model.pixel_of(direction).unwrap().column;
         assert_eq!(column(Vec3::new(1.0, 0.0, 0.0)), 450);
@@ -202,14 +202,14 @@ mod tests {
     }
 
     #[test]
-    fn no_pixel_for_what_is_no_direction() {
+    fn an_invalid_direction_has_no_pixel() {
         let model = LidarModel::default();
         assert_eq!(model.pixel_of(Vec3::ZERO), None);
         assert_eq!(model.pixel_of(Vec3::NAN), None);
     }
 
     #[test]
-    fn the_sign_of_the_lower_edge_does_not_matter() {
+    fn the_sign_of_the_lower_limit_does_not_matter() {
         let below = LidarModel::default();
         let unsigned = LidarModel {
             fov_down: 25.0,

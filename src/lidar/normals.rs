@@ -1,49 +1,49 @@
-//! Surface normals from a range image: the plane that most of a pixel's neighbours agree on.
+//! Surface normals from a range image by robust plane fitting in a 5 x 5 neighborhood.
 //!
-//! Around a pixel lie 5 x 5 pixels. Near the sensor, where they are closer together than the
-//! noise allows, they are taken every second, third or fourth pixel. Planes through the pixel
-//! and two of its outer neighbours are tried; the one with the largest support
+//! Near the sensor, where neighboring pixels are closer together than the noise allows, the
+//! neighborhood takes every second, third or fourth pixel. The hypotheses are the planes through the
+//! pixel and two of its outer neighbors; the one with the largest support
 //!
 //! ```text
 //! Σᵢ max(0, 1 − |n · (pᵢ − p)| / tolerance)        tolerance = tolerance_m + relative · range
 //!                                                   but at most beam_tolerance_m · |n · beam|
 //! ```
 //!
-//! wins (MSAC, Torr and Zisserman 2000, over a fixed set of hypotheses), and principal components of its
-//! supporters give the normal. So a neighbour beyond a depth discontinuity takes no part, a
-//! missing one does no harm, and where no plane finds enough support there is no normal.
+//! is selected (MSAC, Torr and Zisserman 2000, over a fixed set of hypotheses), and the principal
+//! components of its inliers give the normal. So neighbors beyond a range discontinuity are outliers,
+//! missing neighbors are tolerated, and without enough inliers there is no normal.
 
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::RangeImage;
+use super::range_image::RangeImage;
 use crate::geometry::PlaneSums;
 use crate::validation::{InvalidValue, Validate, fraction, not_negative, positive, require};
 
-/// When a neighbourhood counts as a surface.
+/// Settings of the normal estimation.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct NormalConfig {
-    /// Distance between neighbouring samples that is sought near the sensor [m].
+    /// Desired distance between the pixels of a neighborhood near the sensor [m].
     pub spacing_m: f32,
-    /// How far a supporter may lie from the plane at range 0 [m].
+    /// Inlier distance to the plane at range 0 [m].
     pub tolerance_m: f32,
-    /// How much farther it may lie per metre of range, unitless.
+    /// Increase of the inlier distance per meter of range (unitless).
     pub relative_tolerance: f32,
-    /// How far it may lie from the plane along the beam [m]; the stricter limit where the
-    /// plane is seen edge-on.
+    /// Inlier distance along the beam [m]; the stricter limit at grazing incidence.
     pub beam_tolerance_m: f32,
-    /// Supporters that a plane needs, the pixel itself not counted.
+    /// Minimum number of inliers, without the pixel itself.
     pub min_support: usize,
-    /// Share of the neighbours that must support it, 0 to 1.
+    /// Minimum share of inliers among the neighbors, 0 to 1 (unitless).
     pub min_share: f32,
-    /// Least cosine between normal and beam: a plane seen more edge-on is the gap between two surfaces.
+    /// Minimum cosine between normal and beam (unitless): a plane at a more grazing incidence is the
+    /// gap between two surfaces.
     pub min_incidence: f32,
 }
 
 impl Default for NormalConfig {
-    /// For sensors with about 2 cm of noise.
+    /// Values for sensors with about 2 cm of noise.
     fn default() -> Self {
         Self {
             spacing_m: 0.12,
@@ -67,18 +67,18 @@ impl Validate for NormalConfig {
             self.min_support >= 2,
             "min_support",
             self.min_support,
-            "a plane needs a pixel and 2 supporters or more",
+            "a plane needs a pixel and 2 inliers or more",
         )?;
         fraction("min_share", self.min_share)?;
         fraction("min_incidence", self.min_incidence)
     }
 }
 
-/// Pixels on each side of the middle one.
-const REACH: isize = 2;
-/// The largest step between pixels that are looked at.
+/// Pixels of the neighborhood on each side of its center.
+const RADIUS: isize = 2;
+/// Largest stride between the pixels of a neighborhood.
 const MAX_STRIDE: isize = 4;
-/// Columns and rows towards the eight outer neighbours, clockwise.
+/// Column and row offsets of the eight outer neighbors, clockwise.
 const OUTER: [(isize, isize); 8] = [
     (0, -1),
     (1, -1),
@@ -91,8 +91,8 @@ const OUTER: [(isize, isize); 8] = [
 ];
 
 /// Unit normals in the lidar frame, towards the sensor, one per pixel, row-major; `None` where
-/// there is no return or no plane with enough support.
-pub fn normals(image: &RangeImage, config: &NormalConfig) -> Vec<Option<Vec3>> {
+/// there is no return or no plane with enough inliers.
+pub fn estimate_normals(image: &RangeImage, config: &NormalConfig) -> Vec<Option<Vec3>> {
     (0..image.model.height)
         .into_par_iter()
         .flat_map_iter(|row| {
@@ -101,8 +101,8 @@ pub fn normals(image: &RangeImage, config: &NormalConfig) -> Vec<Option<Vec3>> {
         .collect()
 }
 
-/// The neighbours of a pixel that have a return.
-struct Neighbours {
+/// The returns around a pixel.
+struct Neighborhood {
     points: [Vec3; 24],
     count: usize,
     outer: [Option<Vec3>; 8],
@@ -114,30 +114,30 @@ fn normal_at(image: &RangeImage, config: &NormalConfig, row: usize, column: usiz
         return None;
     }
     let (point, range_m) = (image.points[index], image.ranges[index]);
-    let neighbours = Neighbours::gather(image, config, row as isize, column as isize);
-    let points = &neighbours.points[..neighbours.count];
+    let neighborhood = Neighborhood::gather(image, config, row as isize, column as isize);
+    let points = &neighborhood.points[..neighborhood.count];
     let tolerance_m = |normal: Vec3| {
         let cosine = normal.dot(point).abs() / range_m;
         let across_m = config.tolerance_m + config.relative_tolerance * range_m;
         across_m.min(config.beam_tolerance_m * cosine)
     };
-    let first_guess = neighbours.best_plane(point, tolerance_m)?;
-    let tolerance_m = tolerance_m(first_guess);
-    let min_support = config
+    let hypothesis = neighborhood.best_plane(point, tolerance_m)?;
+    let tolerance_m = tolerance_m(hypothesis);
+    let min_inliers = config
         .min_support
         .max((config.min_share * points.len() as f32) as usize);
 
     let mut sums = PlaneSums::about(point);
     sums.add(point, 1.0);
-    let mut support = 0;
-    for &neighbour in points {
-        if first_guess.dot(neighbour - point).abs() < tolerance_m {
-            sums.add(neighbour, 1.0);
-            support += 1;
+    let mut inliers = 0;
+    for &neighbor in points {
+        if hypothesis.dot(neighbor - point).abs() < tolerance_m {
+            sums.add(neighbor, 1.0);
+            inliers += 1;
         }
     }
-    let plane = sums.fit().filter(|_| support >= min_support)?;
-    // A strip hardly wider than the noise says nothing about its tilt.
+    let plane = sums.fit().filter(|_| inliers >= min_inliers)?;
+    // The tilt of a strip hardly wider than the noise is undetermined.
     if plane.variances[1] < 4.0 * plane.variances[0] {
         return None;
     }
@@ -145,7 +145,7 @@ fn normal_at(image: &RangeImage, config: &NormalConfig, row: usize, column: usiz
     (cosine.abs() >= config.min_incidence).then_some(plane.normal * cosine.signum())
 }
 
-impl Neighbours {
+impl Neighborhood {
     fn gather(image: &RangeImage, config: &NormalConfig, row: isize, column: isize) -> Self {
         let model = &image.model;
         let (height, width) = (model.height as isize, model.width as isize);
@@ -170,8 +170,8 @@ impl Neighbours {
             let index = (row * width + column) as usize;
             image.has_return(index).then(|| image.points[index])
         };
-        for down in -REACH..=REACH {
-            for right in -REACH..=REACH {
+        for down in -RADIUS..=RADIUS {
+            for right in -RADIUS..=RADIUS {
                 if let (Some(point), false) = (point_at(down, right), (down, right) == (0, 0)) {
                     found.points[found.count] = point;
                     found.count += 1;
@@ -179,7 +179,7 @@ impl Neighbours {
             }
         }
         for (outer, (right, down)) in found.outer.iter_mut().zip(OUTER) {
-            *outer = point_at(REACH * down, REACH * right).or_else(|| point_at(down, right));
+            *outer = point_at(RADIUS * down, RADIUS * right).or_else(|| point_at(down, right));
         }
         found
     }
@@ -248,9 +248,9 @@ mod tests {
     }
 
     #[test]
-    fn on_ground_and_wall_every_normal_is_theirs_and_looks_at_the_sensor() {
+    fn normals_of_ground_and_wall_are_correct_and_face_the_sensor() {
         let image = image_of(ground_and_wall);
-        let normals = normals(&image, &NormalConfig::default());
+        let normals = estimate_normals(&image, &NormalConfig::default());
         let (mut returns, mut found) = (0, 0);
         for (index, normal) in normals.iter().enumerate() {
             returns += usize::from(image.has_return(index));
@@ -264,14 +264,14 @@ mod tests {
     }
 
     #[test]
-    fn across_a_depth_discontinuity_no_normal_is_invented() {
+    fn a_range_discontinuity_gives_no_false_normals() {
         // Two walls across the view, one 6 m behind the other, side by side.
         let image = image_of(|direction| {
             let near = plane_range(direction, Vec3::X, 8.0);
             let far = plane_range(direction, Vec3::X, 14.0);
             if direction.y > 0.0 { near } else { far }
         });
-        let normals = normals(&image, &NormalConfig::default());
+        let normals = estimate_normals(&image, &NormalConfig::default());
         assert!(normals.iter().flatten().count() > 10_000);
         for normal in normals.iter().flatten() {
             assert!(normal.dot(-Vec3::X) > 0.999, "{normal}");
@@ -279,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn missing_neighbours_do_no_harm() {
+    fn missing_neighbors_are_tolerated() {
         let full = image_of(ground_and_wall);
         let ranges = full
             .ranges
@@ -295,7 +295,7 @@ mod tests {
             })
             .collect();
         let holed = RangeImage::from_ranges(ranges, &full.model);
-        let normals = normals(&holed, &NormalConfig::default());
+        let normals = estimate_normals(&holed, &NormalConfig::default());
         let returns = holed.beams().count();
         let found = normals.iter().flatten().count();
         assert!(found as f32 > 0.9 * returns as f32, "{found} of {returns}");
@@ -310,13 +310,13 @@ mod tests {
     #[test]
     fn a_scatter_of_points_has_no_normals() {
         let model = LidarModel::default();
-        // No two neighbours belong together.
+        // Independent ranges: no two neighbors share a surface.
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let ranges = (0..model.len())
             .map(|_| rng.random_range(5.0..40.0))
             .collect();
         let image = RangeImage::from_ranges(ranges, &model);
-        let found = normals(&image, &NormalConfig::default())
+        let found = estimate_normals(&image, &NormalConfig::default())
             .iter()
             .flatten()
             .count();
@@ -324,22 +324,22 @@ mod tests {
     }
 
     #[test]
-    fn a_lone_pixel_and_an_empty_image_have_none() {
+    fn an_isolated_pixel_has_no_normal() {
         let model = LidarModel::default();
         let mut ranges = vec![NO_RETURN; model.len()];
         ranges[30 * model.width + 7] = 9.0;
         let image = RangeImage::from_ranges(ranges, &model);
         assert!(
-            normals(&image, &NormalConfig::default())
+            estimate_normals(&image, &NormalConfig::default())
                 .iter()
                 .all(Option::is_none)
         );
     }
 
     #[test]
-    fn the_seam_straight_back_is_no_edge() {
+    fn the_neighborhood_wraps_around_the_last_column() {
         let image = image_of(|direction| plane_range(direction, Vec3::Z, -1.73));
-        let normals = normals(&image, &NormalConfig::default());
+        let normals = estimate_normals(&image, &NormalConfig::default());
         let row = 50 * image.model.width;
         for column in [0, 1, 898, 899] {
             assert!(normals[row + column].is_some_and(|normal| normal.z > 0.999));

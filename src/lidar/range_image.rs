@@ -1,38 +1,39 @@
-//! A scan as an image: per pixel the nearest return, its range and the beam that it came along.
+//! Range images: per pixel the range of the nearest return and its measured beam.
 
 use glam::Vec3;
 
-use super::{Beam, LidarModel};
+use super::model::LidarModel;
+use super::scan::Beam;
 
-/// The range of a pixel in which nothing was seen: farther than everything.
+/// Range of a pixel without a return.
 pub const NO_RETURN: f32 = f32::INFINITY;
 
-/// Which point of the scan won a pixel where none did.
+/// Point index of a pixel without a point.
 const NO_POINT: u32 = u32::MAX;
 
-/// Ranges and points per pixel, row-major.
+/// Range and point per pixel, row-major.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RangeImage {
-    /// The projection that the image was made with.
+    /// Projection of the image.
     pub model: LidarModel,
     /// Range of the nearest return [m], or [`NO_RETURN`].
     pub ranges: Vec<f32>,
-    /// The nearest return itself, lidar frame [m]; zero where there is none.
+    /// Nearest return in the lidar frame [m]; zero without one.
     pub points: Vec<Vec3>,
-    winners: Vec<u32>,
+    point_indices: Vec<u32>,
 }
 
 impl RangeImage {
-    /// Projects points of the lidar frame; the nearest wins, and of two as near the first.
-    /// Points outside the field of view or the range limits, or not finite, are left out.
+    /// Projects points of the lidar frame; a pixel keeps the nearest, the first among equals. Points
+    /// that are not finite or are outside the field of view or the range limits are ignored.
     pub fn project(points: &[Vec3], model: &LidarModel) -> Self {
         let mut image = Self {
             model: *model,
             ranges: vec![NO_RETURN; model.len()],
             points: vec![Vec3::ZERO; model.len()],
-            winners: vec![NO_POINT; model.len()],
+            point_indices: vec![NO_POINT; model.len()],
         };
-        for (number, &point) in points.iter().enumerate() {
+        for (point_index, &point) in points.iter().enumerate() {
             let range_m = point.length();
             if !model.accepts_range(range_m) {
                 continue;
@@ -44,13 +45,13 @@ impl RangeImage {
             if range_m < image.ranges[index] {
                 image.ranges[index] = range_m;
                 image.points[index] = point;
-                image.winners[index] = number as u32;
+                image.point_indices[index] = point_index as u32;
             }
         }
         image
     }
 
-    /// An image of ranges without points, such as a renderer makes: the points lie on the pixels' centre rays.
+    /// An image of rendered ranges, with points on the rays through the pixel centers.
     pub fn from_ranges(ranges: Vec<f32>, model: &LidarModel) -> Self {
         debug_assert_eq!(ranges.len(), model.len());
         let points = ranges
@@ -66,25 +67,25 @@ impl RangeImage {
             .collect();
         Self {
             model: *model,
-            winners: vec![NO_POINT; ranges.len()],
+            point_indices: vec![NO_POINT; ranges.len()],
             ranges,
             points,
         }
     }
 
-    /// Whether something was seen in the pixel at a row-major index.
+    /// Whether the pixel at a row-major index has a return.
     #[inline]
     pub fn has_return(&self, index: usize) -> bool {
         self.ranges[index] != NO_RETURN
     }
 
-    /// Which of the projected points won the pixel at a row-major index.
-    pub fn point_number(&self, index: usize) -> Option<usize> {
-        let number = self.winners[index];
-        (number != NO_POINT).then_some(number as usize)
+    /// Index of the projected point in the pixel at a row-major index.
+    pub fn point_index(&self, index: usize) -> Option<usize> {
+        let point = self.point_indices[index];
+        (point != NO_POINT).then_some(point as usize)
     }
 
-    /// The beam whose return won the pixel, along the direction that was really measured.
+    /// The beam of a pixel along its measured direction; `None` without a return.
     pub fn beam(&self, index: usize) -> Option<Beam> {
         self.has_return(index).then(|| Beam {
             direction: self.points[index] / self.ranges[index],
@@ -92,7 +93,7 @@ impl RangeImage {
         })
     }
 
-    /// All beams with a return, row by row.
+    /// All beams with a return, row-major.
     pub fn beams(&self) -> impl Iterator<Item = Beam> {
         (0..self.ranges.len()).filter_map(|index| self.beam(index))
     }
@@ -103,7 +104,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_nearest_return_wins_whatever_the_order() {
+    fn a_pixel_keeps_the_nearest_return_in_any_order() {
         let model = LidarModel::default();
         let near = Vec3::new(10.0, 0.0, 0.0);
         let far = Vec3::new(20.0, 0.0, 0.0);
@@ -117,13 +118,13 @@ mod tests {
     }
 
     #[test]
-    fn a_pixel_knows_its_point_and_the_direction_of_its_beam() {
+    fn a_pixel_keeps_the_index_and_the_direction_of_its_point() {
         let model = LidarModel::default();
         let points = [Vec3::new(8.0, 3.0, -1.0), Vec3::new(-7.0, 1.0, 0.1)];
         let image = RangeImage::project(&points, &model);
         for (number, &point) in points.iter().enumerate() {
             let index = model.index_of(model.pixel_of(point).unwrap());
-            assert_eq!(image.point_number(index), Some(number));
+            assert_eq!(image.point_index(index), Some(number));
             let beam = image.beam(index).unwrap();
             assert!((beam.point() - point).length() < 1e-5);
             assert!((beam.direction.length() - 1.0).abs() < 1e-6);
@@ -131,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn invalid_points_leave_no_trace() {
+    fn invalid_points_are_ignored() {
         let model = LidarModel::default();
         let points = [
             Vec3::NAN,
@@ -145,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn projecting_the_points_of_an_image_gives_the_image_back() {
+    fn projecting_the_points_of_an_image_reproduces_the_image() {
         let model = LidarModel::default();
         let ranges: Vec<f32> = (0..model.len()).map(|i| 3.0 + (i % 37) as f32).collect();
         let image = RangeImage::from_ranges(ranges.clone(), &model);

@@ -1,10 +1,10 @@
-//! One revolution of the sensor: points as they were measured.
+//! Scans: the points of one sweep.
 
 use glam::Vec3;
 
-use super::LidarModel;
+use super::model::LidarModel;
 
-/// A direction and how far the sensor saw along it.
+/// A measured direction and range.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Beam {
     /// Unit direction in the lidar frame.
@@ -14,18 +14,18 @@ pub struct Beam {
 }
 
 impl Beam {
-    /// The point where the beam was returned, lidar frame.
+    /// The measured point in the lidar frame [m].
     pub fn point(&self) -> Vec3 {
         self.direction * self.range_m
     }
 }
 
-/// Points of one revolution in the lidar frame.
+/// Points of one sweep in the lidar frame.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scan {
     /// Positions [m], in the order of the file.
     pub points: Vec<Vec3>,
-    /// Reflectance of each point, 0 to 1.
+    /// Reflectance of each point, 0 to 1 (unitless).
     pub intensities: Vec<f32>,
 }
 
@@ -40,8 +40,8 @@ impl Scan {
         self.points.is_empty()
     }
 
-    /// Drops points that are not finite or outside the range limits of the model.
-    /// Returns how many.
+    /// Removes points that are not finite or outside the range limits of the model; returns their
+    /// number.
     pub fn drop_invalid(&mut self, model: &LidarModel) -> usize {
         let before = self.len();
         let keep: Vec<bool> = self
@@ -62,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn points_that_are_not_finite_or_out_of_limits_are_dropped_with_their_intensity() {
+    fn invalid_points_are_removed_with_their_intensities() {
         let mut scan = Scan {
             points: vec![
                 Vec3::new(5.0, 0.0, 0.0),

@@ -12,7 +12,7 @@ use super::super::odometry::Odometry;
 use super::super::panorama::{PanoramaConfig, Panoramas};
 use super::super::particles::Hypothesis;
 use super::*;
-use crate::geometry::{TriangleMesh, planar};
+use crate::geometry::{TriangleMesh, pose2_from_pose3};
 use crate::lidar::LidarModel;
 use crate::map::TileConfig;
 use crate::rendering::CpuRenderer;
@@ -193,10 +193,10 @@ fn config() -> LocalizerConfig {
 
 /// Runs the filter and asks that it is near the truth, in space, from the tenth frame on.
 fn follow(crossing: &Crossing, mut localizer: Localizer<'_>, truth: &[Pose3], rng: &mut StdRng) {
-    let mut before = planar(&truth[0]);
+    let mut before = pose2_from_pose3(&truth[0]);
     for (frame, truth) in truth.iter().enumerate() {
-        let increment = before.inverse() * planar(truth);
-        before = planar(truth);
+        let increment = before.inverse() * pose2_from_pose3(truth);
+        before = pose2_from_pose3(truth);
         let odometry = Odometry::Increment(increment);
         let scan = crossing.scan(truth);
         let found = localizer
@@ -220,7 +220,12 @@ fn the_car_above_and_the_car_below_keep_their_level_also_on_the_ramp() {
     let crossing = Crossing::new();
     for (seed, truth) in [(1, upper_drive()), (2, lower_drive())] {
         let mut rng = StdRng::seed_from_u64(seed);
-        let start = around(&planar(&truth[0]), 500, &StartSpread::default(), &mut rng);
+        let start = around(
+            &pose2_from_pose3(&truth[0]),
+            500,
+            &StartSpread::default(),
+            &mut rng,
+        );
         let level_m = Some(truth[0].translation.z - Stance::default().height_m);
         let start = ParticleSet::uniform(start.into_iter().map(|map_from_lidar| Hypothesis {
             map_from_lidar,
@@ -239,7 +244,7 @@ fn who_does_not_know_where_it_is_finds_its_level_too() {
             &upper_drive()
                 .iter()
                 .chain(&lower_drive())
-                .map(planar)
+                .map(pose2_from_pose3)
                 .collect::<Vec<_>>(),
             ROAD_HALF_WIDTH_M,
             1.0,

@@ -44,7 +44,7 @@ fn drive(world: &TestWorld, from_x: f64, frames: usize) -> Vec<Pose2> {
 fn odometry(truth: &[Pose2], seed: u64) -> Vec<Pose2> {
     let poses: Vec<Pose3> = truth
         .iter()
-        .map(|pose| crate::geometry::spatial(pose, 0.0))
+        .map(|pose| crate::geometry::pose3_from_pose2(pose, 0.0))
         .collect();
     let noise = OdometryNoise {
         turn_rad: 0.002,

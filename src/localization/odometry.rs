@@ -11,14 +11,14 @@
 use rand::Rng;
 
 use super::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand};
-use crate::geometry::{Pose2, Pose3, planar};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 
 /// One increment per pose, the first of them the identity; in the plane of the car.
 pub fn increments(world_from_lidar: &[Pose3]) -> Vec<Pose2> {
     let first = world_from_lidar.first().map(|_| Pose2::identity());
     let steps = world_from_lidar
         .windows(2)
-        .map(|pair| planar(&(pair[0].inverse() * pair[1])));
+        .map(|pair| pose2_from_pose3(&(pair[0].inverse() * pair[1])));
     first.into_iter().chain(steps).collect()
 }
 
@@ -78,10 +78,10 @@ mod tests {
     #[test]
     fn increments_chained_from_the_first_pose_give_the_trajectory() {
         let poses = drive();
-        let mut pose = planar(&poses[0]);
+        let mut pose = pose2_from_pose3(&poses[0]);
         for (increment, expected) in increments(&poses).iter().zip(&poses) {
             pose *= increment;
-            assert_relative_eq!(pose, planar(expected), epsilon = 1e-9);
+            assert_relative_eq!(pose, pose2_from_pose3(expected), epsilon = 1e-9);
         }
     }
 

@@ -310,7 +310,7 @@ fn is_enough(known: usize, all: usize) -> bool {
 
 impl GroundPatch {
     /// Where in space a planar pose is, standing on the plane of this patch as `stance` says.
-    /// [`planar`](crate::geometry::planar) gives the planar pose back, on every slope.
+    /// [`planar`](crate::geometry::pose2_from_pose3) gives the planar pose back, on every slope.
     pub fn lift(&self, planar: &Pose2, stance: &Stance) -> Pose3 {
         let t = planar.translation.vector;
         let heading = planar.rotation.angle();

@@ -3,7 +3,7 @@
 use approx::assert_relative_eq;
 
 use super::*;
-use crate::geometry::planar;
+use crate::geometry::pose2_from_pose3;
 
 /// A square of 40 m that climbs along x.
 fn slope(grade: f32) -> TriangleMesh {
@@ -186,7 +186,7 @@ fn on_level_ground_the_lifted_pose_is_the_stance_at_the_planar_pose() {
     let ground = GroundMap::flat(Point2::new(-10.0, -10.0), Point2::new(10.0, 10.0), -1.73);
     let pose = Pose2::new(Vector2::new(1.0, 2.0), 2.5);
     let lifted = ground.lift(&pose, &Stance::default()).unwrap();
-    assert_relative_eq!(planar(&lifted), pose, epsilon = 1e-9);
+    assert_relative_eq!(pose2_from_pose3(&lifted), pose, epsilon = 1e-9);
     assert_relative_eq!(lifted.translation.z, 0.0, epsilon = 1e-6);
 }
 
@@ -203,7 +203,7 @@ fn a_lifted_pose_casts_its_planar_pose_as_shadow_on_every_slope() {
     };
     for heading in [-3.0, -1.0, 0.0, 0.7, 2.5] {
         let pose = Pose2::new(Vector2::new(1.0, 2.0), heading);
-        let shadow = planar(&patch.lift(&pose, &stance));
+        let shadow = pose2_from_pose3(&patch.lift(&pose, &stance));
         assert_relative_eq!(shadow, pose, epsilon = 1e-12);
     }
 }

@@ -168,7 +168,7 @@ mod tests {
                 scan_path: String::new().into(),
                 time_s: 0.0,
                 map_from_lidar: Pose3::translation(x, 0.0, 0.0),
-                revolution: None,
+                sweep: None,
             })
             .collect()
     }

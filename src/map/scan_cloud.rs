@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::geometry::{PointCloud, Rigid3f};
 use crate::ground::GroundClassifier;
-use crate::lidar::normals::{NormalConfig, normals};
 use crate::lidar::{LidarModel, RangeImage};
+use crate::lidar::{NormalConfig, estimate_normals};
 use crate::recording::{Frame, KittiError};
 
 /// What of a scan goes into the map.
@@ -110,10 +110,10 @@ impl ScanCloud {
 
         let image = RangeImage::project(&scan.points, &settings.range_image);
         let ground = classifier.ground_confidence(&scan.points);
-        let normals = normals(&image, &settings.normals);
+        let normals = estimate_normals(&image, &settings.normals);
         let mut cloud = PointCloud::with_capacity(image.ranges.len());
         for (index, normal) in normals.iter().enumerate() {
-            let Some(number) = image.point_number(index) else {
+            let Some(number) = image.point_index(index) else {
                 continue;
             };
             match *normal {

@@ -23,7 +23,7 @@ fn ownership() -> Ownership {
                 scan_path: String::new().into(),
                 time_s: 0.0,
                 map_from_lidar: Pose3::translation(4.0 * turn.sin(), 4.0 * turn.cos(), 0.0),
-                revolution: None,
+                sweep: None,
             }
         })
         .collect();
@@ -174,7 +174,7 @@ fn what_is_not_near_the_border_stays_as_it_is() {
         scan_path: String::new().into(),
         time_s: 0.0,
         map_from_lidar: Pose3::identity(),
-        revolution: None,
+        sweep: None,
     }));
     let ownership = Ownership::new(&frames, &local_maps(&frames, 3, 1.0), 20.0);
     let whole = bumpy(1);

@@ -169,7 +169,7 @@ mod tests {
             scan_path: String::new().into(),
             time_s: 0.0,
             map_from_lidar: Pose3::identity(),
-            revolution: None,
+            sweep: None,
         };
         let truth = floor(10.0, -1.7);
         TruthAgreement::of(mesh, &truth, &[frame], &ScanSettings::default()).unwrap()

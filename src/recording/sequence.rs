@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::poses::{CameraPoses, read_times};
 use super::{Calibration, KittiError, MapFrame, velodyne};
 use crate::geometry::{Pose3, StampedPose};
-use crate::lidar::{Revolution, Scan, Spin, share_of};
+use crate::lidar::{RotationDirection, Scan, SweepMotion, interpolate_motion};
 use crate::validation::{InvalidValue, Validate, require};
 
 /// Revolutions per second of the sensor where no `times.txt` says otherwise.
@@ -66,7 +66,7 @@ pub struct Frame {
     /// `p_map = map_from_lidar * p_lidar`.
     pub map_from_lidar: Pose3,
     /// How the sensor moved during the scan, where that is to be compensated.
-    pub revolution: Option<Revolution>,
+    pub sweep: Option<SweepMotion>,
 }
 
 impl Frame {
@@ -82,8 +82,8 @@ impl Frame {
     }
 
     fn compensated(&self, mut scan: Scan) -> Scan {
-        if let Some(revolution) = &self.revolution {
-            revolution.compensate(&mut scan.points);
+        if let Some(sweep) = &self.sweep {
+            sweep.deskew(&mut scan.points);
         }
         scan
     }
@@ -141,7 +141,7 @@ impl Sequence {
                 scan_path,
                 time_s: times_s[number],
                 map_from_lidar: pose,
-                revolution: None,
+                sweep: None,
             });
         }
         Ok(Self {
@@ -157,15 +157,15 @@ impl Sequence {
     /// The same sequence with scans compensated by the poses of the recording: the motion of a
     /// frame is half of that from the frame before to the frame after it.
     #[must_use]
-    pub fn compensated_by_poses(mut self, spin: Spin) -> Self {
+    pub fn compensated_by_poses(mut self, direction: RotationDirection) -> Self {
         for frame in &mut self.frames {
             let before = frame.number.saturating_sub(1);
             let after = (frame.number + 1).min(self.map_from_lidar.len() - 1);
             let motion = self.map_from_lidar[before].inverse() * self.map_from_lidar[after];
             let frames = (after - before).max(1) as f64;
-            frame.revolution = Some(Revolution {
-                spin,
-                motion: share_of(&motion, 1.0 / frames),
+            frame.sweep = Some(SweepMotion {
+                direction,
+                previous_from_current: interpolate_motion(&motion, 1.0 / frames),
             });
         }
         self
@@ -174,7 +174,11 @@ impl Sequence {
     /// The same sequence with scans compensated by an odometry, `previous_from_current` into each
     /// frame; frames of which it says nothing stay as they are. The first moves as the second.
     #[must_use]
-    pub fn compensated_by(mut self, spin: Spin, increments: &[Option<Pose3>]) -> Self {
+    pub fn compensated_by(
+        mut self,
+        direction: RotationDirection,
+        increments: &[Option<Pose3>],
+    ) -> Self {
         let numbers: Vec<usize> = self.frames.iter().map(|frame| frame.number).collect();
         for (row, frame) in self.frames.iter_mut().enumerate() {
             let row = row.max(1);
@@ -182,9 +186,9 @@ impl Sequence {
                 continue;
             };
             let frames = (numbers[row] - numbers[row - 1]) as f64;
-            frame.revolution = Some(Revolution {
-                spin,
-                motion: share_of(&motion, 1.0 / frames),
+            frame.sweep = Some(SweepMotion {
+                direction,
+                previous_from_current: interpolate_motion(&motion, 1.0 / frames),
             });
         }
         self

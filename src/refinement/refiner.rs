@@ -10,10 +10,10 @@ use serde::{Deserialize, Serialize};
 use super::objective::FrameObjective;
 use super::smoothing::SmoothingConfig;
 use super::swarm::{Dimension, SwarmConfig, minimize};
-use crate::geometry::{Pose2, Pose3, planar};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::Beam;
 use crate::map::Stance;
-use crate::registration::{Registration, RegistrationConfig, register};
+use crate::registration::{RegistrationConfig, RegistrationResult, register};
 use crate::rendering::RenderError;
 use crate::validation::{
     InvalidValue, Validate, at_least_one, nested, not_negative, positive, require,
@@ -253,7 +253,7 @@ fn polish(
     objective: &FrameObjective<'_>,
     frame: &mut RefinedFrame,
     config: &RefinementConfig,
-) -> Result<Option<Registration>, RenderError> {
+) -> Result<Option<RegistrationResult>, RenderError> {
     let found = register(
         objective.renderer,
         objective.beams,
@@ -270,7 +270,7 @@ fn polish(
         return Ok(None);
     }
     frame.lifted = registered.map_from_lidar;
-    frame.pose = planar(&registered.map_from_lidar);
+    frame.pose = pose2_from_pose3(&registered.map_from_lidar);
     frame.cost_after_m = cost_m;
     Ok(Some(registered))
 }

@@ -63,7 +63,7 @@ impl TestWorld {
         let mapping: Vec<Pose3> = (-50..130)
             .map(|x| {
                 let pose = map_from_street * Pose2::translation(f64::from(x), 0.0);
-                crate::geometry::spatial(&pose, 0.0)
+                crate::geometry::pose3_from_pose2(&pose, 0.0)
             })
             .collect();
         Self {
@@ -118,7 +118,7 @@ impl TestWorld {
     }
 
     fn ranges(&self, map_from_lidar: &Pose3, directions: &[Vec3]) -> Vec<f32> {
-        let map_from_street = crate::geometry::spatial(&self.map_from_street, 0.0);
+        let map_from_street = crate::geometry::pose3_from_pose2(&self.map_from_street, 0.0);
         let street_from_lidar = Rigid3f::from(&(map_from_street.inverse() * map_from_lidar));
         let origin = street_from_lidar.translation;
         directions

@@ -10,7 +10,7 @@ use super::run_page;
 use crate::app::config::{self, EvaluationConfig, LocalizationConfig};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
-use crate::geometry::{Pose2, TriangleMesh, planar};
+use crate::geometry::{Pose2, TriangleMesh, pose2_from_pose3};
 use crate::map::ply;
 use crate::recording::Calibration;
 use crate::recording::poses::CameraPoses;
@@ -115,7 +115,7 @@ fn truth(config: &EvaluationConfig, results: &LocalizationResults) -> Result<Vec
     Ok(results
         .frames
         .iter()
-        .map(|&frame| planar(&poses[frame]))
+        .map(|&frame| pose2_from_pose3(&poses[frame]))
         .collect())
 }
 

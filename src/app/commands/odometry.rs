@@ -7,8 +7,8 @@ use rand::Rng;
 
 use super::input;
 use crate::app::config::OdometrySource;
-use crate::geometry::{Pose2, Pose3, spatial};
-use crate::lidar::Spin;
+use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
+use crate::lidar::RotationDirection;
 use crate::localization::odometry::{demonstration_noise, increments, with_noise};
 use crate::recording::poses::{CameraPoses, read_tum};
 use crate::recording::{KittiError, Sequence};
@@ -63,14 +63,18 @@ fn recorded(file: &Path, sequence: &Sequence) -> Result<Vec<Pose3>> {
 /// The sequence with its scans compensated by an odometry, where that is wanted.
 pub fn compensated(
     sequence: Sequence,
-    spin: Option<Spin>,
+    direction: Option<RotationDirection>,
     increments: &[Option<Pose2>],
 ) -> Sequence {
-    let Some(spin) = spin else {
+    let Some(direction) = direction else {
         return sequence;
     };
-    let in_space = |increment: &Option<Pose2>| increment.map(|motion| spatial(&motion, 0.0));
-    sequence.compensated_by(spin, &increments.iter().map(in_space).collect::<Vec<_>>())
+    let in_space =
+        |increment: &Option<Pose2>| increment.map(|motion| pose3_from_pose2(&motion, 0.0));
+    sequence.compensated_by(
+        direction,
+        &increments.iter().map(in_space).collect::<Vec<_>>(),
+    )
 }
 
 /// For reports.

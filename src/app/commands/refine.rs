@@ -401,7 +401,7 @@ fn lift_all(map: &LoadedMap, poses: &[Pose2], polished: &[Polished]) -> Vec<Pose
             patch = map.ground.patch_under(pose, frame.level_m).or(patch);
             match &patch {
                 Some(patch) => patch.lift(pose, &frame.stance),
-                None => crate::geometry::spatial(pose, 0.0),
+                None => crate::geometry::pose3_from_pose2(pose, 0.0),
             }
         })
         .collect()

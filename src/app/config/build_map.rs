@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use super::check::{own_car, path};
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
-use crate::lidar::normals::NormalConfig;
-use crate::lidar::{LidarModel, Spin};
+use crate::lidar::NormalConfig;
+use crate::lidar::{LidarModel, RotationDirection};
 use crate::map::LocalMapSettings;
 use crate::map::confidence::ConfidenceConfig;
 use crate::map::scan_cloud::ScanSettings;
@@ -103,7 +103,7 @@ pub struct BuildMapConfig {
     pub pca: PcaGround,
     /// The sense in which the sensor spins, where the motion of the car during a scan is to be
     /// compensated; not so for scans that are compensated already, as those of KITTI odometry.
-    pub motion_compensation: Option<Spin>,
+    pub motion_compensation: Option<RotationDirection>,
     /// What random choices follow from.
     pub seed: u64,
     /// Whether an existing map is replaced.

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::check::{own_car, path};
-use crate::lidar::{LidarModel, Spin};
+use crate::lidar::{LidarModel, RotationDirection};
 use crate::localization::LocalizerConfig;
 use crate::localization::convergence::ConvergenceConfig;
 use crate::localization::initialization::StartSpread;
@@ -107,7 +107,7 @@ pub struct LocalizationConfig {
     pub panorama: PanoramaConfig,
     /// The sense in which the sensor spins, where the motion of the car during a scan is to be
     /// compensated; not so for scans that are compensated already, as those of KITTI odometry.
-    pub motion_compensation: Option<Spin>,
+    pub motion_compensation: Option<RotationDirection>,
     /// Whether every frame is refined as it comes, while tracking.
     pub refine: bool,
     /// How.

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::check::{own_car, path};
 use super::localization::OdometrySource;
-use crate::lidar::{LidarModel, Spin};
+use crate::lidar::{LidarModel, RotationDirection};
 use crate::localization::observation::ObservationConfig;
 use crate::recording::Selection;
 use crate::refinement;
@@ -52,7 +52,7 @@ pub struct RefinementConfig {
     pub refinement: refinement::RefinementConfig,
     /// The sense in which the sensor spins, where the motion of the car during a scan is to be
     /// compensated; not so for scans that are compensated already, as those of KITTI odometry.
-    pub motion_compensation: Option<Spin>,
+    pub motion_compensation: Option<RotationDirection>,
     /// What random choices follow from.
     pub seed: u64,
     /// Whether existing refined poses are replaced.

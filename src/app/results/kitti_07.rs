@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::LocalizationResults;
-use crate::geometry::{Pose2, planar};
+use crate::geometry::{Pose2, pose2_from_pose3};
 use crate::recording::{Calibration, poses::CameraPoses};
 
 /// The true lidar poses and the results of range-mcl; `None`, saying so, where they are absent.
@@ -22,7 +22,7 @@ pub fn kitti_07() -> Option<(Vec<Pose2>, LocalizationResults)> {
     let truth = CameraPoses::read(&poses.join("poses/07.txt")).unwrap();
     let truth = truth.map_from_lidar(&calibration);
     let results = LocalizationResults::read(&results).unwrap();
-    Some((truth.iter().map(planar).collect(), results))
+    Some((truth.iter().map(pose2_from_pose3).collect(), results))
 }
 
 mod tests {

@@ -8,7 +8,7 @@ use super::super::particles::{Hypothesis, ParticleSet};
 use super::super::proposal::{Gaussian, regular};
 use super::super::vigilance::State;
 use super::{Localizer, Weighing, weighted_mean};
-use crate::geometry::planar;
+use crate::geometry::pose2_from_pose3;
 use crate::lidar::{Beam, RangeImage};
 use crate::map::Stance;
 use crate::registration::register;
@@ -49,7 +49,7 @@ impl Localizer<'_> {
             return Ok(None);
         };
         let prior = Gaussian::new(mean, regular(&self.particles.covariance_about(&mean)));
-        let pose = planar(&found.map_from_lidar);
+        let pose = pose2_from_pose3(&found.map_from_lidar);
         let seen = Gaussian::new(pose, regular(&found.planar_covariance()));
         let (Some(prior), Some(seen)) = (prior, seen) else {
             return Ok(None);

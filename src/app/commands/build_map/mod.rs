@@ -19,7 +19,7 @@ use super::{Context, input, output};
 use crate::app::config::{self, BuildMapConfig};
 use crate::app::plotting::color::Colormap;
 use crate::app::plotting::{MapPlot, ScalarMapPlot};
-use crate::geometry::{Pose2, TriangleMesh, planar};
+use crate::geometry::{Pose2, TriangleMesh, pose2_from_pose3};
 use crate::map::local_map::{self, LocalMapCounts, LocalMapError, Watcher};
 use crate::map::plan::{self, LocalMapPlan, Ownership};
 use crate::map::ply;
@@ -46,8 +46,8 @@ pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
         &config.calib_file,
         &config.selection(),
     )?;
-    if let Some(spin) = config.motion_compensation {
-        sequence = sequence.compensated_by_poses(spin);
+    if let Some(direction) = config.motion_compensation {
+        sequence = sequence.compensated_by_poses(direction);
     }
     let (mapped, held_out) = hold_out(&sequence.frames, config);
     let plans = plan::local_maps(&mapped, config.local_map_size, config.overlap_m);
@@ -211,7 +211,7 @@ fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
             q.y,
             q.z,
             q.w,
-            frame.revolution
+            frame.sweep
         )?;
     }
     Ok(text)
@@ -225,7 +225,10 @@ fn draw(
     residuals: &[BeamResidual],
 ) -> Result<()> {
     let settings = config.local_map_settings();
-    let driven: Vec<Pose2> = mapped.iter().map(|f| planar(&f.map_from_lidar)).collect();
+    let driven: Vec<Pose2> = mapped
+        .iter()
+        .map(|f| pose2_from_pose3(&f.map_from_lidar))
+        .collect();
     let picture = beside(&config.mesh_file, "png");
     MapPlot {
         title: "Map from above",

@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use super::{FIRST_FRAME_STREAM, INITIALIZATION_STREAM, stream};
 use crate::app::commands::stages::{LoadedMap, Observer};
 use crate::app::config::{Initialization, LocalizationConfig, MotionModel};
-use crate::geometry::{Pose2, planar};
+use crate::geometry::{Pose2, pose2_from_pose3};
 use crate::lidar::RangeImage;
 use crate::localization::initialization::{Cells, ROAD_HALF_WIDTH_M, around};
 use crate::localization::motion::VelocityCommand;
@@ -164,7 +164,7 @@ pub fn panoramas<'a>(config: &LocalizationConfig, map: &'a LoadedMap) -> Panoram
     let panorama = config.panorama_config();
     let cells = match config.initialization() {
         Initialization::Tracking | Initialization::Corridor => {
-            let poses: Vec<Pose2> = map.mapping_poses.iter().map(planar).collect();
+            let poses: Vec<Pose2> = map.mapping_poses.iter().map(pose2_from_pose3).collect();
             Cells::along_road(&poses, ROAD_HALF_WIDTH_M, panorama.cell_m)
         }
         Initialization::Extent => Cells::over_map(&map.grid, &map.ground, panorama.cell_m),
@@ -222,7 +222,7 @@ fn initial_particles(
         None => {
             // The start is known in space, and with it the level of the road.
             let level_m = Some(first.map_from_lidar.translation.z - stance.height_m);
-            let start = planar(&first.map_from_lidar);
+            let start = pose2_from_pose3(&first.map_from_lidar);
             let poses = around(&start, count, &config.start, &mut rng).into_iter();
             poses
                 .map(|map_from_lidar| Hypothesis {

@@ -7,7 +7,7 @@ use crate::app::commands::run_output::{self, RunFiles};
 use crate::app::commands::stages::LoadedMap;
 use crate::app::config::LocalizationConfig;
 use crate::app::plotting::color::{MCL, REFINED};
-use crate::geometry::{Pose3, planar};
+use crate::geometry::{Pose3, pose2_from_pose3};
 use crate::lidar::RangeImage;
 use crate::localization::likelihood::{Direction, View, profile};
 use crate::localization::observation::{Likelihood, ObservationConfig, choose_beams};
@@ -40,7 +40,7 @@ fn draw_likelihood(
     frame: &Frame,
     scan: &RangeImage,
 ) -> Result<()> {
-    let truth = planar(&frame.map_from_lidar);
+    let truth = pose2_from_pose3(&frame.map_from_lidar);
     let below_m = frame.map_from_lidar.translation.z - Stance::default().height_m;
     let Some(patch) = map.ground.patch_under(&truth, Some(below_m)) else {
         tracing::info!(

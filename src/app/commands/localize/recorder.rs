@@ -8,7 +8,7 @@ use crate::app::commands::run_output::{self, Movie, RunFiles};
 use crate::app::commands::stages::LoadedMap;
 use crate::app::config::LocalizationConfig;
 use crate::app::results::{LocalizationResults, ParticleLog};
-use crate::geometry::{Pose2, Pose3, planar};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::recording::Frame;
 
 /// Collects what the filter says.
@@ -64,7 +64,10 @@ impl Recorder {
             .push_frame(run_output::rows_of(&estimate.particles));
         self.off_ground += usize::from(!estimate.on_mapped_ground);
         push(&mut results.estimates, estimate.pose);
-        push(&mut results.ground_truth, planar(&frame.map_from_lidar));
+        push(
+            &mut results.ground_truth,
+            pose2_from_pose3(&frame.map_from_lidar),
+        );
         push(
             &mut results.odometry,
             increment.unwrap_or_else(Pose2::identity),
