@@ -1,4 +1,4 @@
-//! A run as one page to look at: numbers, pictures, timing, configuration.
+//! The page of a run: metrics, pictures, timing, configuration.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,26 +8,25 @@ use anyhow::{Context as _, Result};
 
 use super::run_output::RunFiles;
 use super::{output, version};
-use crate::app::comparison::{Cell, Column, Table};
 use crate::app::plotting::palette;
-use crate::app::reporting::{Block, Page, Section};
+use crate::app::reporting::{Cell, Column, Page, PageElement, Section, Table};
 use crate::app::results::{Report, TrajectoryReport, Value};
 
-/// What is told of a run; the rest lies beside its result.
+/// Content of the page, apart from the files of the run.
 pub struct RunPage<'a> {
-    /// Where everything is.
+    /// Files of the run.
     pub files: &'a RunFiles,
-    /// Above everything.
+    /// Title.
     pub title: &'a str,
-    /// The numbers.
+    /// Metrics.
     pub report: &'a Report,
     /// Wall time per stage [s]; may be empty.
     pub stage_seconds: &'a BTreeMap<String, f64>,
-    /// What it was run on; may be empty.
+    /// Properties of the machine; may be empty.
     pub machine: &'a BTreeMap<String, String>,
 }
 
-/// The pictures of a run, each with its section and what it shows.
+/// Pictures of a run: section, file name and caption.
 pub const PICTURES: [(&str, &str, &str); 7] = [
     ("Trajectory", "path.png", "Path against ground truth"),
     (
@@ -41,11 +40,7 @@ pub const PICTURES: [(&str, &str, &str); 7] = [
         "range_images.png",
         "Observed, rendered from the estimate, and their difference",
     ),
-    (
-        "Map",
-        "map.png",
-        "The map from above, and the path of the car to be found",
-    ),
+    ("Map", "map.png", "Map from above with the path of the car"),
     (
         "Likelihood",
         "likelihood.png",
@@ -54,7 +49,7 @@ pub const PICTURES: [(&str, &str, &str); 7] = [
     ("Timing", "runtime.png", "Time per frame"),
 ];
 
-/// Configurations and texts that may lie beside a result.
+/// Configuration and log files of a run, where they exist.
 pub const TEXTS: [&str; 5] = [
     "build_map.yml",
     "localization.yml",
@@ -63,14 +58,15 @@ pub const TEXTS: [&str; 5] = [
     "log.txt",
 ];
 
-/// Writes the page of a run that is nothing but its files and its numbers.
+/// Writes the page of a run without timing and machine.
 pub fn write(files: &RunFiles, report: &Report) -> Result<()> {
-    let of = report.about.get("recording");
+    let recording = report
+        .about
+        .get("recording")
+        .map_or("a run", String::as_str);
     RunPage {
         files,
-        title: &of.map_or("A run".to_owned(), |recording| {
-            format!("The car in {recording}")
-        }),
+        title: &format!("Localization in {recording}"),
         report,
         stage_seconds: &BTreeMap::new(),
         machine: &BTreeMap::new(),
@@ -81,44 +77,35 @@ pub fn write(files: &RunFiles, report: &Report) -> Result<()> {
 impl RunPage<'_> {
     /// Writes `report.html` beside the result.
     pub fn write(&self) -> Result<()> {
-        let page = self.page()?;
-        output::write_text(&self.files.file("report.html"), &page.to_html())
+        output::write_text(&self.files.file("report.html"), &self.page()?.to_html())
     }
 
     fn page(&self) -> Result<Page> {
-        let mut sections = vec![Section {
-            title: "Numbers".to_owned(),
-            blocks: vec![
-                Block::Facts(facts(&self.report.about)),
-                Block::Table(numbers(self.report)),
-            ],
-        }];
+        let section = |title: &str, elements| Section {
+            title: title.to_owned(),
+            elements,
+        };
+        let about = PageElement::Facts(facts(&self.report.about));
+        let metrics = PageElement::Table(metrics(self.report));
+        let mut sections = vec![section("Metrics", vec![about, metrics])];
         for (title, name, caption) in PICTURES {
             let path = self.files.file("plots").join(name);
-            let mut blocks: Vec<Block> = picture_or_word(&path, caption).into_iter().collect();
+            let mut elements: Vec<PageElement> =
+                picture_or_error(&path, caption).into_iter().collect();
             if title == "Timing" && !self.stage_seconds.is_empty() {
-                blocks.push(Block::Table(stages(self.stage_seconds)));
+                elements.push(PageElement::Table(stages(self.stage_seconds)));
             }
-            if !blocks.is_empty() {
-                sections.push(Section {
-                    title: title.to_owned(),
-                    blocks,
-                });
+            if !elements.is_empty() {
+                sections.push(section(title, elements));
             }
         }
-        let mut blocks = vec![Block::Facts(
-            [("program".to_owned(), version::program()?)]
-                .into_iter()
-                .chain(facts(self.machine))
-                .collect(),
-        )];
+        let mut versions = vec![("program".to_owned(), version::program()?)];
+        versions.extend(facts(self.machine));
+        let mut elements = vec![PageElement::Facts(versions)];
         for name in TEXTS {
-            blocks.extend(folded(&self.files.file(name), name)?);
+            elements.extend(collapsed(&self.files.file(name), name)?);
         }
-        sections.push(Section {
-            title: "Configuration and versions".to_owned(),
-            blocks,
-        });
+        sections.push(section("Configuration and versions", elements));
         Ok(Page {
             title: self.title.to_owned(),
             subtitle: format!("Result: {}", self.files.result.display()),
@@ -127,11 +114,11 @@ impl RunPage<'_> {
     }
 }
 
-/// The metrics of both trajectories with their definitions.
-fn numbers(report: &Report) -> Table {
+/// Metrics of both trajectories with their definitions.
+fn metrics(report: &Report) -> Table {
     let mcl = report.mcl.rows();
     let refined = report.refined.as_ref().map(TrajectoryReport::rows);
-    let heads = ["metric", "MCL", "refined", "unit", "definition"];
+    let titles = ["metric", "MCL", "refined", "unit", "definition"];
     let cell = |value: Value| match value {
         Value::Number(number) => Cell::Number(number),
         Value::Count(count) => Cell::Number(count as f64),
@@ -139,20 +126,18 @@ fn numbers(report: &Report) -> Table {
     };
     let row = |index: usize| {
         let row = &mcl[index];
-        let refined = refined.as_ref().map(|rows| cell(rows[index].value));
-        [Some(Cell::from(row.name)), Some(cell(row.value)), refined]
-            .into_iter()
-            .flatten()
-            .chain([row.unit.into(), row.definition.into()])
-            .collect()
+        let mut cells = vec![row.name.into(), cell(row.value)];
+        cells.extend(refined.as_ref().map(|rows| cell(rows[index].value)));
+        cells.extend([row.unit.into(), row.definition.into()]);
+        cells
     };
     Table {
         name: "numbers".to_owned(),
         title: "Errors from the tenth frame on, without alignment".to_owned(),
         note: String::new(),
-        columns: heads
+        columns: titles
             .into_iter()
-            .filter(|head| report.refined.is_some() || *head != "refined")
+            .filter(|title| refined.is_some() || *title != "refined")
             .map(Column::named)
             .collect(),
         rows: (0..mcl.len()).map(row).collect(),
@@ -162,49 +147,49 @@ fn numbers(report: &Report) -> Table {
 fn stages(seconds: &BTreeMap<String, f64>) -> Table {
     let mut time = Column::named("wall time");
     time.unit = "s".to_owned();
+    let rows = seconds.iter();
     Table {
         name: "stages".to_owned(),
         title: "Time per stage".to_owned(),
-        note: "Stages that several runs share are told with the time that they took once."
+        note: "Stages shared by several runs are listed with the time of their single execution."
             .to_owned(),
         columns: vec![Column::named("stage"), time],
-        rows: seconds
-            .iter()
-            .map(|(stage, &time_s)| vec![stage.as_str().into(), Cell::Number(time_s)])
+        rows: rows
+            .map(|(stage, &time_s)| vec![stage.as_str().into(), time_s.into()])
             .collect(),
     }
 }
 
 fn facts(map: &BTreeMap<String, String>) -> Vec<(String, String)> {
-    map.iter().map(|(k, v)| (k.clone(), v.clone())).collect()
+    map.clone().into_iter().collect()
 }
 
-/// A picture of a page; `None` where there is none.
-pub fn picture(path: &Path, caption: &str) -> Result<Option<Block>> {
+/// Picture for a page; `None` if the file does not exist.
+pub fn picture(path: &Path, caption: &str) -> Result<Option<PageElement>> {
     if !path.exists() {
         return Ok(None);
     }
-    Ok(Some(Block::Picture {
+    Ok(Some(PageElement::Picture {
         png: palette::with_palette(path)?,
         caption: caption.to_owned(),
     }))
 }
 
-/// A picture of a page, or why it is left out: one that is damaged costs no run its page.
-fn picture_or_word(path: &Path, caption: &str) -> Option<Block> {
+/// Picture for a page, or the reason why it is left out: a damaged file must not prevent the page.
+fn picture_or_error(path: &Path, caption: &str) -> Option<PageElement> {
     picture(path, caption).unwrap_or_else(|error| {
         tracing::warn!("{} is left out of the page: {error:#}", path.display());
-        Some(Block::Paragraph(format!("Left out: {error:#}.")))
+        Some(PageElement::Paragraph(format!("Left out: {error:#}.")))
     })
 }
 
-/// A text that is folded away under a name; `None` where there is none.
-pub fn folded(path: &Path, name: &str) -> Result<Option<Block>> {
+/// Collapsed text of a file; `None` if it does not exist.
+pub fn collapsed(path: &Path, name: &str) -> Result<Option<PageElement>> {
     if !path.exists() {
         return Ok(None);
     }
     let bytes = fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-    Ok(Some(Block::Folded {
+    Ok(Some(PageElement::Collapsed {
         name: name.to_owned(),
         text: String::from_utf8_lossy(&bytes).into_owned(),
     }))
@@ -216,18 +201,18 @@ mod tests {
     use crate::app::plotting::Bitmap;
 
     #[test]
-    fn a_damaged_picture_is_left_out_and_told() {
+    fn a_damaged_picture_is_replaced_by_the_reason() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("map.png");
-        assert!(picture_or_word(&path, "The map").is_none());
+        assert!(picture_or_error(&path, "The map").is_none());
         fs::write(&path, "half a").unwrap();
-        let Some(Block::Paragraph(told)) = picture_or_word(&path, "The map") else {
-            panic!("nothing is said of it");
+        let Some(PageElement::Paragraph(reason)) = picture_or_error(&path, "The map") else {
+            panic!("there is no reason");
         };
-        assert!(told.contains("map.png"), "{told}");
+        assert!(reason.contains("map.png"), "{reason}");
         let pixels = Bitmap::from_fn(2, 2, |_, _| [0; 3]);
         pixels.write_png(fs::File::create(&path).unwrap()).unwrap();
-        let shown = picture_or_word(&path, "The map");
-        assert!(matches!(shown, Some(Block::Picture { .. })));
+        let shown = picture_or_error(&path, "The map");
+        assert!(matches!(shown, Some(PageElement::Picture { .. })));
     }
 }

@@ -72,8 +72,9 @@ fn an_interrupted_drive_goes_on_and_ends_with_the_same_bytes() {
     fs::remove_file(drive.join("poses.txt")).unwrap();
     fs::remove_file(drive.join("velodyne/000004.bin")).unwrap();
     fs::remove_file(drive.join("velodyne/000005.bin")).unwrap();
-    fs::write(drive.join("velodyne/000004.bin.part"), [1, 2, 3]).unwrap();
+    fs::write(drive.join("velodyne/.fpmcl-1.part"), [1, 2, 3]).unwrap();
     assert_eq!(quietly(&config, Existing::Keep).unwrap().kept, 4);
+    fs::remove_file(drive.join("velodyne/.fpmcl-1.part")).unwrap();
     assert_eq!(contents(&drive), whole);
 }
 
@@ -136,7 +137,7 @@ fn a_drive_that_other_source_made_is_told_or_made_anew() {
             fs::remove_file(drive.join("poses.txt")).unwrap();
         }
         let message = quietly(&config, Existing::Keep).unwrap_err().to_string();
-        for told in ["other source", "remove that folder", "--force"] {
+        for told in ["another build", "remove that folder", "--force"] {
             assert!(message.contains(told), "{message}");
         }
         assert_eq!(quietly(&config, Existing::Renew).unwrap().kept, 0);

@@ -29,13 +29,11 @@ pub mod paired;
 pub mod record;
 pub mod spread;
 pub mod success;
-pub mod table;
 pub mod tables;
 
 pub use measures::Measure;
-pub use paired::{PairedDifference, paired_difference};
+pub use paired::paired_difference;
 pub use record::{Outcome, RunId, RunRecord};
-pub use spread::Estimate;
-pub use success::{SuccessRate, success_rate};
-pub use table::{Cell, Column, Table};
+pub use spread::mean_with_spread;
+pub use success::success_rate;
 pub use tables::{Comparison, Contrast, Variant};

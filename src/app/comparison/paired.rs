@@ -11,32 +11,14 @@
 //! each sequence a stratum. It speaks of other seeds on these sequences, not of other sequences,
 //! and it is not corrected for looking at many differences at once.
 
-use serde::{Deserialize, Serialize};
 use statrs::distribution::{ContinuousCDF as _, StudentsT};
 
 use super::spread::variance;
+use crate::app::reporting::PairedDifference;
 use crate::evaluation::statistics::mean;
 
 /// Probability that the interval holds the mean difference.
 pub const CONFIDENCE: f64 = 0.95;
-
-/// A mean difference, and how sure it is.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct PairedDifference {
-    /// Mean of the sequences' mean differences.
-    pub mean: f64,
-    /// Ends of the interval of 95 %; absent where no sequence has two pairs.
-    pub interval: Option<(f64, f64)>,
-    /// Pairs that it is made of.
-    pub pairs: usize,
-}
-
-impl PairedDifference {
-    /// Whether the interval leaves zero out; `None` where there is no interval.
-    pub fn is_one(&self) -> Option<bool> {
-        self.interval.map(|(low, high)| low > 0.0 || high < 0.0)
-    }
-}
 
 /// From the differences of each sequence, one per seed; `None` without differences.
 ///
@@ -90,7 +72,7 @@ mod tests {
         assert_relative_eq!(found.mean, 0.2, epsilon = 1e-12);
         assert_relative_eq!(low, -0.077_644_51, epsilon = 1e-7);
         assert_relative_eq!(high, 0.477_644_51, epsilon = 1e-7);
-        assert_eq!(found.is_one(), Some(false));
+        assert_eq!(found.is_significant(), Some(false));
     }
 
     #[test]
@@ -100,7 +82,7 @@ mod tests {
         // t(0.975, 4) = 2.776445, standard error √(2 · 1 / 3 / 4)
         let reach = 2.776_445_1 * (2.0_f64 / 12.0).sqrt();
         assert_relative_eq!(found.interval.unwrap().1, 2.0 + reach, epsilon = 1e-6);
-        assert_eq!((found.is_one(), found.pairs), (Some(true), 6));
+        assert_eq!((found.is_significant(), found.pairs), (Some(true), 6));
     }
 
     #[test]
@@ -118,9 +100,12 @@ mod tests {
 
     #[test]
     fn one_pair_says_nothing_and_the_same_numbers_do_not_differ() {
-        assert_eq!(paired_difference(&[vec![0.7]]).unwrap().is_one(), None);
+        assert_eq!(
+            paired_difference(&[vec![0.7]]).unwrap().is_significant(),
+            None
+        );
         let same = paired_difference(&[vec![0.0; 5]]).unwrap();
-        assert_eq!(same.is_one(), Some(false));
+        assert_eq!(same.is_significant(), Some(false));
         assert_eq!(paired_difference(&[vec![], vec![]]), None);
     }
 }

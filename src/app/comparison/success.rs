@@ -7,22 +7,7 @@
 //! Wilson, *Probable inference, the law of succession, and statistical inference*, JASA 1927:
 //! an interval that stays within 0 and 1, also of five successes in five.
 
-use serde::{Deserialize, Serialize};
-
-/// A share of successes with its interval of 95 %.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct SuccessRate {
-    /// Runs that succeeded.
-    pub successes: usize,
-    /// All runs.
-    pub runs: usize,
-    /// Their share, 0 to 1.
-    pub rate: f64,
-    /// Lower end of the interval.
-    pub low: f64,
-    /// Upper end of the interval.
-    pub high: f64,
-}
+use crate::app::reporting::SuccessRate;
 
 /// Of so many successes in so many runs; `None` of no runs.
 pub fn success_rate(successes: usize, runs: usize) -> Option<SuccessRate> {

@@ -7,9 +7,9 @@ use serde::{Deserialize, Serialize};
 use super::measures::{CONTRASTED, Measure, TABLE_1, TABLE_2};
 use super::paired::paired_difference;
 use super::record::RunRecord;
-use super::spread::Estimate;
-use super::success::{SuccessRate, success_rate};
-use super::table::{Cell, Column, Table};
+use super::spread::mean_with_spread;
+use super::success::success_rate;
+use crate::app::reporting::{Cell, Column, SuccessRate, Table};
 
 /// A configuration that takes part.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -114,7 +114,7 @@ impl Comparison {
             ];
             let numbers = measures
                 .iter()
-                .map(|measure| Estimate::of(&self.numbers(name, measure)).into());
+                .map(|measure| mean_with_spread(&self.numbers(name, measure)).into());
             begin.into_iter().chain(numbers).collect()
         };
         Table {
@@ -164,7 +164,7 @@ impl Comparison {
                 ];
                 let numbers = measures.iter().map(|measure| {
                     let numbers = found.iter().filter_map(|run| number(run, measure));
-                    Estimate::of(&[numbers.collect()]).into()
+                    mean_with_spread(&[numbers.collect()]).into()
                 });
                 rows.push(begin.into_iter().chain(numbers).collect());
             }
@@ -203,10 +203,10 @@ impl Comparison {
                 let begin = [sequence.as_str().into(), variant.name.as_str().into()];
                 let times = stages.iter().map(|stage| {
                     let times = found.iter().filter_map(|run| run.stage_seconds.get(*stage));
-                    Estimate::of(&[times.copied().collect()]).into()
+                    mean_with_spread(&[times.copied().collect()]).into()
                 });
                 let of_frames = found.iter().filter_map(|run| number(run, &per_frame));
-                let of_frames = Estimate::of(&[of_frames.collect()]).into();
+                let of_frames = mean_with_spread(&[of_frames.collect()]).into();
                 rows.push(begin.into_iter().chain(times).chain([of_frames]).collect());
             }
         }
@@ -315,7 +315,7 @@ fn particle_table(rows: &[(usize, Vec<RunRecord>)]) -> Table {
         let found: Vec<&RunRecord> = records.iter().filter(|run| run.is_success()).collect();
         let numbers = measures.iter().map(|measure| {
             let numbers = found.iter().filter_map(|run| number(run, measure));
-            Estimate::of(&[numbers.collect()]).into()
+            mean_with_spread(&[numbers.collect()]).into()
         });
         begin.into_iter().chain(numbers).collect()
     };

@@ -81,7 +81,7 @@ fn cell<'a>(table: &'a Table, row: usize, name: &str) -> &'a Cell {
 #[test]
 fn the_mean_of_a_configuration_is_over_sequences_and_its_claim_stands_beside() {
     let table = comparison(eight_runs()).table_1();
-    let Cell::Estimate(error) = cell(&table, 0, "average positional error") else {
+    let Cell::Mean(error) = cell(&table, 0, "average positional error") else {
         panic!("{table:?}")
     };
     assert_relative_eq!(error.mean, 0.23, epsilon = 1e-9);
@@ -108,7 +108,7 @@ fn a_small_difference_in_every_pair_is_one_however_wide_the_runs_scatter() {
         panic!("{table:?}")
     };
     assert_relative_eq!(error.mean, -0.01, epsilon = 1e-9);
-    assert_eq!((error.is_one(), error.pairs), (Some(true), 4));
+    assert_eq!((error.is_significant(), error.pairs), (Some(true), 4));
 }
 
 #[test]
@@ -132,7 +132,7 @@ fn a_failed_run_counts_against_success_and_has_no_error() {
         panic!("{table:?}")
     };
     assert_eq!((rate.successes, rate.runs), (3, 5));
-    let Cell::Estimate(error) = cell(&table, 0, "average positional error") else {
+    let Cell::Mean(error) = cell(&table, 0, "average positional error") else {
         panic!("{table:?}")
     };
     assert_eq!(error.runs, 4);

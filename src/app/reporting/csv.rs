@@ -1,87 +1,87 @@
-//! Tables for other programs: every number in full, what is uncertain in columns of its own
-//! (RFC 4180).
+//! Tables as CSV (RFC 4180): numbers in full precision, uncertainties in columns of their own.
 
-use crate::app::comparison::{Cell, Column, Table};
+use std::io::{self, Write};
 
-/// The table with a line of titles.
-pub fn table(table: &Table) -> String {
-    let mut lines = vec![Vec::new(); 1 + table.rows.len()];
-    for (index, column) in table.columns.iter().enumerate() {
-        let cells: Vec<&Cell> = table.rows.iter().map(|row| &row[index]).collect();
-        for (title, value) in parts_of(column, &cells) {
-            lines[0].push(quoted(&title));
-            for (line, cell) in lines[1..].iter_mut().zip(&cells) {
-                line.push(quoted(&value(cell)));
-            }
-        }
+use csv::Writer;
+
+use super::{Cell, Column, Table};
+
+/// A column of the file: its title and the value that it takes from a cell.
+type CsvColumn = (String, fn(&Cell) -> String);
+
+/// Writes a header line and one line per row.
+pub fn write(table: &Table, writer: impl Write) -> io::Result<()> {
+    let cells = |index: usize| table.rows.iter().map(move |row| &row[index]);
+    let columns: Vec<Vec<CsvColumn>> = (table.columns.iter().enumerate())
+        .map(|(index, column)| csv_columns(column, cells(index)))
+        .collect();
+    let mut writer = Writer::from_writer(writer);
+    writer.write_record(columns.iter().flatten().map(|(title, _)| title))?;
+    for row in &table.rows {
+        let cells = row.iter().zip(&columns);
+        let values = cells.flat_map(|(cell, columns)| columns.iter().map(|(_, value)| value(cell)));
+        writer.write_record(values)?;
     }
-    lines.iter().map(|line| line.join(",") + "\n").collect()
+    writer.flush()
 }
 
-type Part = (String, fn(&Cell) -> String);
-
-/// The columns that a column of the table becomes.
-fn parts_of(column: &Column, cells: &[&Cell]) -> Vec<Part> {
-    let head = column.head();
-    let mut parts: Vec<Part> = vec![(head.clone(), first)];
-    let mut add = |what: &str, value: fn(&Cell) -> String| {
-        parts.push((format!("{head}, {what}"), value));
-    };
-    let has = |is: fn(&Cell) -> bool| cells.iter().any(|cell| is(cell));
-    if has(|cell| matches!(cell, Cell::Estimate(_))) {
+/// The columns of the file for one column of the table, by the kinds of its cells.
+fn csv_columns<'a>(
+    column: &Column,
+    mut cells: impl Iterator<Item = &'a Cell> + Clone,
+) -> Vec<CsvColumn> {
+    let title = column.title();
+    let mut columns: Vec<CsvColumn> = vec![(title.clone(), value)];
+    let mut add =
+        |part: &str, value: fn(&Cell) -> String| columns.push((format!("{title}, {part}"), value));
+    if cells.clone().any(|cell| matches!(cell, Cell::Mean(_))) {
         add("deviation over seeds", |cell| match cell {
-            Cell::Estimate(estimate) => full(estimate.over_seeds),
+            Cell::Mean(mean) => number(mean.over_seeds),
             _ => String::new(),
         });
         add("deviation over sequences", |cell| match cell {
-            Cell::Estimate(estimate) => full(estimate.over_sequences),
+            Cell::Mean(mean) => number(mean.over_sequences),
             _ => String::new(),
         });
     }
-    if has(|cell| matches!(cell, Cell::Difference(_) | Cell::Rate(_))) {
-        add("low", |cell| match cell {
-            Cell::Difference(difference) => full(difference.interval.map(|ends| ends.0)),
-            Cell::Rate(rate) => full(Some(100.0 * rate.low)),
-            _ => String::new(),
-        });
-        add("high", |cell| match cell {
-            Cell::Difference(difference) => full(difference.interval.map(|ends| ends.1)),
-            Cell::Rate(rate) => full(Some(100.0 * rate.high)),
-            _ => String::new(),
-        });
+    if cells.any(|cell| matches!(cell, Cell::Difference(_) | Cell::Rate(_))) {
+        add("low", |cell| number(interval(cell).map(|ends| ends.0)));
+        add("high", |cell| number(interval(cell).map(|ends| ends.1)));
     }
-    parts
+    columns
 }
 
-fn first(cell: &Cell) -> String {
+fn value(cell: &Cell) -> String {
     match cell {
         Cell::Text(text) | Cell::Link { text, .. } => text.clone(),
-        // Its column is in percent.
-        Cell::Rate(rate) => full(Some(100.0 * rate.rate)),
-        cell => full(cell.number()),
+        // In percent, as its interval.
+        Cell::Rate(rate) => (100.0 * rate.rate).to_string(),
+        cell => number(cell.number()),
     }
 }
 
-fn full(number: Option<f64>) -> String {
+fn interval(cell: &Cell) -> Option<(f64, f64)> {
+    match cell {
+        Cell::Difference(difference) => difference.interval,
+        Cell::Rate(rate) => Some((100.0 * rate.low, 100.0 * rate.high)),
+        _ => None,
+    }
+}
+
+fn number(number: Option<f64>) -> String {
     number.map_or(String::new(), |number| number.to_string())
-}
-
-fn quoted(text: &str) -> String {
-    if text.contains([',', '"', '\n']) {
-        format!("\"{}\"", text.replace('"', "\"\""))
-    } else {
-        text.to_owned()
-    }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::markdown::tests::example;
+    use super::super::example::example;
     use super::*;
 
     #[test]
-    fn every_number_has_a_column_and_words_with_commas_are_quoted() {
-        let text = table(&example());
+    fn every_number_has_a_column_and_text_with_commas_is_quoted() {
+        let mut text = Vec::new();
+        write(&example(), &mut text).unwrap();
+        let text = String::from_utf8(text).unwrap();
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(
             lines[0],

@@ -1,105 +1,71 @@
-//! Pieces of HTML: text made safe, tables that sort, pictures inside the page.
+//! Tables in HTML, which a click on a column title sorts, with the definitions below.
 
-use base64::Engine as _;
-use base64::engine::general_purpose::STANDARD;
+use maud::{Markup, html};
 
-use super::words::parts;
-use crate::app::comparison::{Cell, Table};
+use super::format::value_and_uncertainty;
+use super::{Cell, Table};
 
-/// Text that is nothing but text.
-pub fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;")
-        .replace('<', "&lt;")
-        .replace('>', "&gt;")
-        .replace('"', "&quot;")
-}
-
-/// A table whose heads sort it, with its definitions below.
-pub fn table(table: &Table) -> String {
-    let head: String = table
-        .columns
-        .iter()
-        .enumerate()
-        .map(|(index, column)| {
-            let has_numbers = table.rows.iter().any(|row| row[index].number().is_some());
-            let class = if has_numbers { " class=\"number\"" } else { "" };
-            format!(
-                "<th scope=\"col\"{class} title=\"{}\"><button type=\"button\">{}</button></th>",
-                escaped(&column.definition),
-                escaped(&column.head())
-            )
-        })
-        .collect();
-    let row = |row: &Vec<Cell>| -> String {
-        let cells: String = row.iter().map(cell).collect();
-        format!("<tr>{cells}</tr>\n")
-    };
-    let rows: String = table.rows.iter().map(row).collect();
-    let note = if table.note.is_empty() {
-        String::new()
-    } else {
-        format!("<p class=\"note\">{}</p>\n", escaped(&table.note))
-    };
-    format!(
-        "<div class=\"wide\"><table id=\"{}\">\n<thead><tr>{head}</tr></thead>\n<tbody>\n{rows}</tbody></table></div>\n{note}{}",
-        escaped(&table.name),
-        definitions(table)
-    )
-}
-
-fn cell(cell: &Cell) -> String {
-    let (first, second) = parts(cell);
-    let first = match cell {
-        Cell::Link { text, to } => {
-            format!("<a href=\"{}\">{}</a>", escaped(to), escaped(text))
+/// Renders the table, its note and its definitions.
+pub fn table(table: &Table) -> Markup {
+    html! {
+        div.wide {
+            table id=(table.name) {
+                thead {
+                    tr {
+                        @for (index, column) in table.columns.iter().enumerate() {
+                            th scope="col" class=[table.is_numeric(index).then_some("number")] title=(column.definition) {
+                                button type="button" { (column.title()) }
+                            }
+                        }
+                    }
+                }
+                tbody {
+                    @for row in &table.rows {
+                        tr {
+                            @for cell in row { (td(cell)) }
+                        }
+                    }
+                }
+            }
         }
-        _ => escaped(&first),
-    };
-    let Some(number) = cell.number() else {
-        return format!("<td>{first}</td>");
-    };
-    let second = if second.is_empty() {
-        second
-    } else {
-        format!("<small>{}</small>", escaped(&second))
-    };
-    format!("<td class=\"number\" data-value=\"{number}\">{first}{second}</td>")
-}
-
-fn definitions(table: &Table) -> String {
-    let defined = table.columns.iter().filter(|c| !c.definition.is_empty());
-    let items: String = defined
-        .map(|column| {
-            format!(
-                "<dt>{}</dt><dd>{}</dd>\n",
-                escaped(&column.head()),
-                escaped(&column.definition)
-            )
-        })
-        .collect();
-    if items.is_empty() {
-        return items;
+        @if !table.note.is_empty() { p.note { (table.note) } }
+        @if table.defined_columns().next().is_some() {
+            details {
+                summary { "Definitions" }
+                dl {
+                    @for column in table.defined_columns() {
+                        dt { (column.title()) }
+                        dd { (column.definition) }
+                    }
+                }
+            }
+        }
     }
-    format!("<details><summary>Definitions</summary><dl>\n{items}</dl></details>\n")
 }
 
-/// A picture whose bytes are in the page.
-pub fn picture(png: &[u8], caption: &str) -> String {
-    let caption = escaped(caption);
-    format!(
-        "<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{}\"><figcaption>{caption}</figcaption></figure>\n",
-        STANDARD.encode(png)
-    )
+fn td(cell: &Cell) -> Markup {
+    let (value, uncertainty) = value_and_uncertainty(cell);
+    html! {
+        @if let Some(number) = cell.number() {
+            td.number data-value=(number) {
+                (value)
+                @if !uncertainty.is_empty() { small { (uncertainty) } }
+            }
+        } @else if let Cell::Link { text, to } = cell {
+            td { a href=(to) { (text) } }
+        } @else {
+            td { (value) }
+        }
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::markdown::tests::example;
-    use super::*;
+    use super::super::example::example;
 
     #[test]
-    fn a_table_has_its_numbers_to_sort_by_and_nothing_of_it_is_markup() {
-        let html = table(&example());
+    fn a_table_has_its_numbers_to_sort_by_and_none_of_its_text_is_markup() {
+        let html = super::table(&example()).into_string();
         assert!(
             html.contains("data-value=\"0.023\">0.0230<small>±0.0020</small>"),
             "{html}"
@@ -111,15 +77,5 @@ mod tests {
         );
         assert_eq!(html.matches("<tr>").count(), 3);
         assert_eq!(html.matches("<th ").count(), 3);
-    }
-
-    #[test]
-    fn the_bytes_of_a_picture_come_back_from_the_page() {
-        let bytes: Vec<u8> = (0..=255).collect();
-        let html = picture(&bytes, "\"<path>\"");
-        let (_, rest) = html.split_once("base64,").unwrap();
-        let (encoded, _) = rest.split_once('"').unwrap();
-        assert_eq!(STANDARD.decode(encoded).unwrap(), bytes);
-        assert!(!html.contains("<path>"));
     }
 }

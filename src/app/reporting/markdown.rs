@@ -2,18 +2,22 @@
 
 use std::fmt::Write as _;
 
-use super::words::parts;
-use crate::app::comparison::{Cell, Table};
+use super::format::value_and_uncertainty;
+use super::{Cell, Table};
 
-/// The table under a heading.
+/// Formats the table under a heading.
 pub fn table(table: &Table) -> String {
     let mut text = format!("## {}\n\n", table.title);
     let line = |cells: Vec<String>| format!("| {} |\n", cells.join(" | "));
-    let heads = table.columns.iter().map(|column| escaped(&column.head()));
-    text.push_str(&line(heads.collect()));
+    let titles = table.columns.iter().map(|c| escape(&c.title()));
+    text.push_str(&line(titles.collect()));
     let rules = (0..table.columns.len()).map(|column| {
-        let has_numbers = table.rows.iter().any(|row| row[column].number().is_some());
-        if has_numbers { "---:" } else { "---" }.to_owned()
+        let rule = if table.is_numeric(column) {
+            "---:"
+        } else {
+            "---"
+        };
+        rule.to_owned()
     });
     text.push_str(&line(rules.collect()));
     for row in &table.rows {
@@ -22,8 +26,8 @@ pub fn table(table: &Table) -> String {
     if !table.note.is_empty() {
         let _ = write!(text, "\n{}\n", table.note);
     }
-    let defined = table.columns.iter().filter(|c| !c.definition.is_empty());
-    let definitions: String = defined
+    let definitions: String = table
+        .defined_columns()
         .map(|column| format!("- **{}**: {}\n", column.name, column.definition))
         .collect();
     if !definitions.is_empty() {
@@ -33,66 +37,24 @@ pub fn table(table: &Table) -> String {
 }
 
 fn cell(cell: &Cell) -> String {
-    if let Cell::Link { text, to } = cell {
-        return format!("[{}]({to})", escaped(text));
-    }
-    let (first, second) = parts(cell);
+    let (value, uncertainty) = value_and_uncertainty(cell);
     match cell {
-        _ if second.is_empty() => escaped(&first),
-        Cell::Estimate(_) => format!("{first} {second}"),
-        _ => format!("{first} ({second})"),
+        Cell::Link { text, to } => format!("[{}]({to})", escape(text)),
+        _ if uncertainty.is_empty() => escape(&value),
+        Cell::Mean(_) => format!("{value} {uncertainty}"),
+        _ => format!("{value} ({uncertainty})"),
     }
 }
 
-/// A bar inside a cell would end it.
-fn escaped(text: &str) -> String {
+/// Escapes the bar, which would end the cell.
+fn escape(text: &str) -> String {
     text.replace('|', "\\|")
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+mod tests {
+    use super::super::example::example;
     use super::*;
-    use crate::app::comparison::{Column, Estimate, success_rate};
-
-    /// Two rows with everything that a cell may be.
-    pub fn example() -> Table {
-        let column = |name: &str, unit: &str| Column {
-            name: name.to_owned(),
-            unit: unit.to_owned(),
-            definition: "a | b <c>".to_owned(),
-        };
-        let estimate = Estimate {
-            mean: 0.023,
-            over_seeds: Some(0.002),
-            over_sequences: None,
-            runs: 5,
-        };
-        Table {
-            name: "table_1".to_owned(),
-            title: "Table 1: errors".to_owned(),
-            note: "What <b> means.".to_owned(),
-            columns: vec![
-                Column::named("configuration"),
-                column("average positional error", "m"),
-                column("success", "%"),
-            ],
-            rows: vec![
-                vec![
-                    Cell::from("A, \"first\""),
-                    Some(estimate).into(),
-                    success_rate(5, 5).into(),
-                ],
-                vec![
-                    Cell::Link {
-                        text: "B|C".to_owned(),
-                        to: "runs/b.html".to_owned(),
-                    },
-                    Cell::Number(0.5),
-                    Cell::Absent,
-                ],
-            ],
-        }
-    }
 
     #[test]
     fn every_line_has_as_many_cells_and_every_column_its_definition() {

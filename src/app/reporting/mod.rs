@@ -1,15 +1,20 @@
-//! What people are told: tables as text, Markdown, CSV, and pages to look at.
+//! Reports: tables as plain text, Markdown and CSV, and HTML pages.
 //!
-//! Everything here makes a text of what it is given; who calls it writes the file. A page is one
-//! self-contained HTML file: pictures are embedded, nothing is loaded from anywhere.
+//! Everything here renders values that it is given; the caller writes the file. A page is one
+//! self-contained HTML file: pictures are embedded, nothing is loaded from a network.
 
 // Tables.
 pub mod csv;
+mod format;
 pub mod markdown;
+mod table;
 pub mod text;
-mod words;
 // Pages.
-pub mod html;
-pub mod page;
+mod html;
+mod page;
 
-pub use page::{Block, Page, Section};
+#[cfg(test)]
+mod example;
+
+pub use page::{Page, PageElement, Section};
+pub use table::{Cell, Column, MeanWithSpread, PairedDifference, SuccessRate, Table};

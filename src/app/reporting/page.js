@@ -1,6 +1,6 @@
 "use strict";
-// A click on a head sorts by that column, a second one the other way round. The address then leads
-// to the table as it is sorted: #sort=TABLE/COLUMN, and #sort=TABLE/-COLUMN for the other way.
+// A click on a column title sorts ascending by that column, a second click descending. The address
+// then links to the sorted table: #sort=TABLE/COLUMN, descending #sort=TABLE/-COLUMN.
 function sort(head, up) {
   const body = head.closest("table").tBodies[0];
   const column = head.cellIndex;
@@ -13,7 +13,7 @@ function sort(head, up) {
   };
   const before = (a, b) => {
     const [x, y] = [key(a), key(b)];
-    // What is not measured comes last.
+    // Cells without a number come last.
     if (typeof x !== typeof y) return typeof x === "number" ? -1 : 1;
     const order = typeof x === "number" ? x - y : x.localeCompare(y, "en", { numeric: true });
     return up ? order : -order;
@@ -38,7 +38,7 @@ function follow() {
 }
 addEventListener("hashchange", follow);
 follow();
-// Paper cannot unfold anything.
+// Collapsed texts are expanded for printing.
 addEventListener("beforeprint", () => {
   for (const folded of document.querySelectorAll("details")) folded.open = true;
 });

@@ -1,10 +1,12 @@
-//! A page: sections of facts, tables, pictures and texts in one file that needs no network.
+//! HTML page: sections of facts, tables, pictures and texts in one self-contained file.
 //!
-//! On a phone wide tables scroll inside their own frame; in print everything that is folded away
-//! is unfolded.
+//! On a phone, wide tables scroll inside their own frame; in print, collapsed texts are expanded.
 
-use super::html::{escaped, picture, table};
-use crate::app::comparison::Table;
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use maud::{DOCTYPE, Markup, PreEscaped, html};
+
+use super::{Table, html};
 
 const STYLE: &str = include_str!("page.css");
 const SCRIPT: &str = include_str!("page.js");
@@ -12,119 +14,118 @@ const SCRIPT: &str = include_str!("page.js");
 /// One HTML file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Page {
-    /// Of the window and above everything.
+    /// Title of the window and of the page.
     pub title: String,
-    /// Below it, in a sentence.
+    /// Sentence below the title.
     pub subtitle: String,
-    /// From the top; the contents are made of their titles.
+    /// Sections from the top; their titles make the table of contents.
     pub sections: Vec<Section>,
 }
 
-/// A part of a page.
+/// Section of a page.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Section {
-    /// Its heading.
+    /// Heading.
     pub title: String,
-    /// From the top.
-    pub blocks: Vec<Block>,
+    /// Elements from the top.
+    pub elements: Vec<PageElement>,
 }
 
-/// What a section is made of.
+/// Element of a section.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Block {
-    /// A sentence or more.
+pub enum PageElement {
+    /// Text.
     Paragraph(String),
-    /// Names with what they are.
+    /// Names with their values.
     Facts(Vec<(String, String)>),
-    /// A table.
+    /// Table.
     Table(Table),
-    /// A picture.
+    /// Picture.
     Picture {
-        /// The bytes of the PNG.
+        /// Bytes of the PNG file.
         png: Vec<u8>,
-        /// What it shows.
+        /// Caption.
         caption: String,
     },
-    /// A text as it is, folded away under its name.
-    Folded {
-        /// Its name.
+    /// Preformatted text, collapsed under its name.
+    Collapsed {
+        /// Name, always visible.
         name: String,
-        /// The text.
+        /// Text.
         text: String,
     },
 }
 
 impl Page {
-    /// The file.
+    /// Renders the file.
     pub fn to_html(&self) -> String {
-        let title = escaped(&self.title);
-        let contents: String = self
-            .sections
-            .iter()
-            .enumerate()
-            .map(|(index, section)| {
-                format!(
-                    "<a href=\"#section-{index}\">{}</a>\n",
-                    escaped(&section.title)
-                )
-            })
-            .collect();
-        let sections: String = self
-            .sections
-            .iter()
-            .enumerate()
-            .map(|(index, section)| section.to_html(index))
-            .collect();
-        format!(
-            "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-             <title>{title}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n\
-             <header><h1>{title}</h1>\n<p>{}</p>\n<nav>{contents}</nav></header>\n\
-             {sections}</main>\n<script>\n{SCRIPT}</script>\n</body>\n</html>\n",
-            escaped(&self.subtitle)
-        )
+        let page = html! {
+            (DOCTYPE)
+            html lang="en" {
+                head {
+                    meta charset="utf-8";
+                    meta name="viewport" content="width=device-width, initial-scale=1";
+                    title { (self.title) }
+                    style { (PreEscaped(STYLE)) }
+                }
+                body {
+                    main {
+                        header {
+                            h1 { (self.title) }
+                            p { (self.subtitle) }
+                            nav {
+                                @for (index, section) in self.sections.iter().enumerate() {
+                                    a href={ "#section-" (index) } { (section.title) }
+                                }
+                            }
+                        }
+                        @for (index, section) in self.sections.iter().enumerate() {
+                            section id={ "section-" (index) } {
+                                h2 { (section.title) }
+                                @for element in &section.elements { (element.to_html()) }
+                            }
+                        }
+                    }
+                    script { (PreEscaped(SCRIPT)) }
+                }
+            }
+        };
+        page.into_string()
     }
 }
 
-impl Section {
-    fn to_html(&self, index: usize) -> String {
-        let blocks: String = self.blocks.iter().map(Block::to_html).collect();
-        format!(
-            "<section id=\"section-{index}\">\n<h2>{}</h2>\n{blocks}</section>\n",
-            escaped(&self.title)
-        )
-    }
-}
-
-impl Block {
-    fn to_html(&self) -> String {
+impl PageElement {
+    fn to_html(&self) -> Markup {
         match self {
-            Self::Paragraph(text) => format!("<p>{}</p>\n", escaped(text)),
-            Self::Facts(facts) => {
-                let items: String = facts
-                    .iter()
-                    .map(|(name, value)| {
-                        format!("<dt>{}</dt><dd>{}</dd>\n", escaped(name), escaped(value))
-                    })
-                    .collect();
-                format!("<dl class=\"facts\">\n{items}</dl>\n")
-            }
-            Self::Table(found) => {
-                format!("<h3>{}</h3>\n{}", escaped(&found.title), table(found))
-            }
-            Self::Picture { png, caption } => picture(png, caption),
-            Self::Folded { name, text } => format!(
-                "<details><summary>{}</summary><pre>{}</pre></details>\n",
-                escaped(name),
-                escaped(text)
-            ),
+            Self::Paragraph(text) => html! { p { (text) } },
+            Self::Facts(facts) => html! {
+                dl.facts {
+                    @for (name, value) in facts { dt { (name) } dd { (value) } }
+                }
+            },
+            Self::Table(table) => html! {
+                h3 { (table.title) }
+                (html::table(table))
+            },
+            Self::Picture { png, caption } => html! {
+                figure {
+                    img alt=(caption) src={ "data:image/png;base64," (STANDARD.encode(png)) };
+                    figcaption { (caption) }
+                }
+            },
+            Self::Collapsed { name, text } => html! {
+                details {
+                    summary { (name) }
+                    pre { (text) }
+                }
+            },
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::markdown::tests::example;
+    use super::super::example::example;
     use super::*;
 
     fn page() -> Page {
@@ -134,19 +135,19 @@ mod tests {
             sections: vec![
                 Section {
                     title: "Errors".to_owned(),
-                    blocks: vec![
-                        Block::Facts(vec![("seed".to_owned(), "1 & 2".to_owned())]),
-                        Block::Table(example()),
+                    elements: vec![
+                        PageElement::Facts(vec![("seed".to_owned(), "1 & 2".to_owned())]),
+                        PageElement::Table(example()),
                     ],
                 },
                 Section {
                     title: "Pictures".to_owned(),
-                    blocks: vec![
-                        Block::Picture {
+                    elements: vec![
+                        PageElement::Picture {
                             png: vec![1, 2, 3],
                             caption: "path".to_owned(),
                         },
-                        Block::Folded {
+                        PageElement::Collapsed {
                             name: "log".to_owned(),
                             text: "</pre><script>alert()</script>".to_owned(),
                         },
@@ -157,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_opened_is_closed() {
+    fn every_tag_that_is_opened_is_closed() {
         let html = page().to_html();
         for tag in [
             "html", "head", "body", "main", "section", "table", "tr", "td", "th", "dl", "details",
@@ -172,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_loaded_from_anywhere_and_no_text_becomes_a_script() {
+    fn nothing_is_loaded_and_no_text_becomes_a_script() {
         let html = page().to_html();
         for word in ["http://", "https://", "src=\"/", "<link", "@import", "url("] {
             assert!(!html.contains(word), "{word}");
@@ -182,11 +183,26 @@ mod tests {
     }
 
     #[test]
-    fn every_section_is_in_the_contents() {
+    fn every_section_is_in_the_table_of_contents() {
         let html = page().to_html();
         for index in 0..2 {
             assert!(html.contains(&format!("href=\"#section-{index}\"")));
             assert!(html.contains(&format!("id=\"section-{index}\"")));
         }
+    }
+
+    #[test]
+    fn the_bytes_of_a_picture_are_embedded() {
+        let png: Vec<u8> = (0..=255).collect();
+        let caption = "\"<path>\"".to_owned();
+        let picture = PageElement::Picture {
+            png: png.clone(),
+            caption,
+        };
+        let html = picture.to_html().into_string();
+        let (_, rest) = html.split_once("base64,").unwrap();
+        let (encoded, _) = rest.split_once('"').unwrap();
+        assert_eq!(STANDARD.decode(encoded).unwrap(), png);
+        assert!(!html.contains("<path>"));
     }
 }

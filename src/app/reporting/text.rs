@@ -1,79 +1,76 @@
-//! Tables for the terminal: what is uncertain stands below its number, so that rows stay short.
+//! Tables for the terminal: the uncertainty is below its value, so that rows stay short.
 
-use super::words::parts;
-use crate::app::comparison::Table;
+use super::Table;
+use super::format::value_and_uncertainty;
 
-/// Widest line of a head before it is broken [characters].
-const HEAD_WIDTH: usize = 16;
-/// Between columns.
+/// Maximum width of a line of a column title [characters].
+const TITLE_WIDTH: usize = 16;
+/// Maximum width of a line of the note [characters].
+const NOTE_WIDTH: usize = 100;
+/// Space between columns.
 const GAP: &str = "  ";
 
-/// The table as lines.
+/// Formats the table as aligned lines.
 pub fn table(table: &Table) -> String {
-    let heads: Vec<Vec<String>> = table
+    let titles = table
         .columns
         .iter()
-        .map(|column| broken(&column.head(), HEAD_WIDTH))
-        .collect();
-    let mut bands = vec![heads];
-    for row in &table.rows {
-        let cell = |cell| {
-            let (first, second) = parts(cell);
-            if second.is_empty() {
-                vec![first]
-            } else {
-                vec![first, second]
-            }
-        };
-        bands.push(row.iter().map(cell).collect());
+        .map(|c| wrapped(&c.title(), TITLE_WIDTH));
+    let mut titles: Vec<Vec<String>> = titles.collect();
+    // Titles are aligned at the bottom.
+    let height = titles.iter().map(Vec::len).max().unwrap_or(0);
+    for title in &mut titles {
+        title.splice(0..0, vec![String::new(); height - title.len()]);
     }
+    let rows = table.rows.iter().map(|row| -> Vec<Vec<String>> {
+        let cells = row.iter().map(value_and_uncertainty);
+        cells
+            .map(|(value, below)| {
+                if below.is_empty() {
+                    vec![value]
+                } else {
+                    vec![value, below]
+                }
+            })
+            .collect()
+    });
+    let rows: Vec<Vec<Vec<String>>> = rows.collect();
     let widths: Vec<usize> = (0..table.columns.len())
         .map(|column| {
-            let lines = bands.iter().flat_map(|band| &band[column]);
-            lines.map(|line| line.chars().count()).max().unwrap_or(0)
+            let cells = rows.iter().chain([&titles]).flat_map(|row| &row[column]);
+            cells.map(|line| line.chars().count()).max().unwrap_or(0)
         })
         .collect();
-    let words: Vec<bool> = (0..table.columns.len())
-        .map(|column| table.rows.iter().all(|row| row[column].number().is_none()))
-        .collect();
-    let mut text = format!("{}\n\n", table.title);
-    for (index, band) in bands.iter().enumerate() {
-        let height = band.iter().map(Vec::len).max().unwrap_or(0);
-        for line in 0..height {
-            let cells = band.iter().enumerate().map(|(column, lines)| {
-                // Heads stand on their numbers.
-                let skipped = if index == 0 { height - lines.len() } else { 0 };
-                let found = line.checked_sub(skipped).and_then(|line| lines.get(line));
-                let found = found.map_or("", String::as_str);
-                let width = widths[column];
-                if words[column] {
-                    format!("{found:<width$}")
-                } else {
-                    format!("{found:>width$}")
-                }
-            });
-            let joined = cells.collect::<Vec<String>>().join(GAP);
-            text.push_str(joined.trim_end());
-            text.push('\n');
-        }
-        if index == 0 {
-            let rules: Vec<String> = widths.iter().map(|width| "-".repeat(*width)).collect();
-            text.push_str(&rules.join(GAP));
-            text.push('\n');
-        }
+    let line = |cells: &[Vec<String>], line: usize| {
+        let cells = cells.iter().zip(&widths).enumerate();
+        let cells = cells.map(|(column, (cell, &width))| {
+            let text = cell.get(line).map_or("", String::as_str);
+            if table.is_numeric(column) {
+                format!("{text:>width$}")
+            } else {
+                format!("{text:<width$}")
+            }
+        });
+        let joined = cells.collect::<Vec<String>>().join(GAP);
+        joined.trim_end().to_owned()
+    };
+    let mut lines = vec![table.title.clone(), String::new()];
+    lines.extend((0..height).map(|number| line(&titles, number)));
+    let rules: Vec<String> = widths.iter().map(|&width| "-".repeat(width)).collect();
+    lines.push(rules.join(GAP));
+    for row in &rows {
+        let height = row.iter().map(Vec::len).max().unwrap_or(0);
+        lines.extend((0..height).map(|number| line(row, number)));
     }
     if !table.note.is_empty() {
-        text.push('\n');
-        for line in broken(&table.note, 100) {
-            text.push_str(&line);
-            text.push('\n');
-        }
+        lines.push(String::new());
+        lines.extend(wrapped(&table.note, NOTE_WIDTH));
     }
-    text
+    lines.join("\n") + "\n"
 }
 
-/// Words in lines of at most `width`, where they allow it.
-fn broken(text: &str, width: usize) -> Vec<String> {
+/// Wraps text between words into lines of at most `width` characters.
+fn wrapped(text: &str, width: usize) -> Vec<String> {
     let mut lines: Vec<String> = Vec::new();
     for word in text.split_whitespace() {
         match lines.last_mut() {
@@ -89,11 +86,11 @@ fn broken(text: &str, width: usize) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::markdown::tests::example;
+    use super::super::example::example;
     use super::*;
 
     #[test]
-    fn numbers_stand_below_each_other_and_their_scatter_below_them() {
+    fn numbers_are_aligned_and_their_spread_is_below_them() {
         let text = table(&example());
         let lines: Vec<&str> = text.lines().collect();
         let place = |line: usize, word: &str| {
@@ -101,18 +98,18 @@ mod tests {
             start.unwrap_or_else(|| panic!("{word} is not in line {line}:\n{text}")) + word.len()
         };
         assert!(lines[0].starts_with("Table 1"));
-        // Three lines of head, a rule, then two lines per row with scatter.
+        // Three lines of titles, a rule, then two lines per row with a spread.
         assert_eq!(place(4, "[m]"), place(6, "0.0230"), "{text}");
         assert!(lines[7].trim().starts_with("±0.0020"), "{text}");
         assert_eq!(place(6, "0.0230"), place(8, "0.5000"));
     }
 
     #[test]
-    fn long_heads_are_broken_between_words() {
-        let lines = broken("drift over distance [mm/m]", 16);
+    fn long_titles_are_wrapped_between_words() {
+        let lines = wrapped("drift over distance [mm/m]", 16);
         assert_eq!(lines, ["drift over", "distance [mm/m]"]);
         assert_eq!(
-            broken("incomprehensibilities", 5),
+            wrapped("incomprehensibilities", 5),
             ["incomprehensibilities"]
         );
     }

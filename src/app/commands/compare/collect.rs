@@ -8,9 +8,9 @@ use serde::Serialize;
 use super::plan::PlannedRun;
 use super::{Layout, execute, fingerprint, page};
 use crate::app::commands::{output, version};
-use crate::app::comparison::{Comparison, RunRecord, Table};
+use crate::app::comparison::{Comparison, RunRecord};
 use crate::app::config::ComparisonConfig;
-use crate::app::reporting::{csv, markdown, text};
+use crate::app::reporting::{Table, csv, markdown, text};
 
 /// `comparison.json`.
 #[derive(Serialize)]
@@ -118,7 +118,7 @@ fn write_tables(tables: &[Table], layout: &Layout) -> Result<()> {
     output::write_text(&layout.root.join("tables.md"), &all.join("\n"))?;
     for table in tables {
         let path = layout.root.join(format!("{}.csv", table.name));
-        output::write_text(&path, &csv::table(table))?;
+        output::write_file(&path, |file| csv::write(table, file))?;
     }
     Ok(())
 }

@@ -26,32 +26,8 @@ pub fn lines(runs: &[PlannedRun], args: &CompareArgs) -> String {
         BackendArg::Cpu => words.push("--backend=cpu".to_owned()),
         BackendArg::Gpu => words.push("--backend=gpu".to_owned()),
     }
-    let command: Vec<String> = words.iter().map(|word| quoted(word)).collect();
-    let command = command.join(" ");
+    let command = shell_words::join(&words);
     runs.iter()
         .map(|run| format!("{command} --job {}\n", run.id))
         .collect()
-}
-
-/// A word as a shell reads it.
-fn quoted(word: &str) -> String {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_+./=:,@%".contains(c);
-    if !word.is_empty() && word.chars().all(is_plain) {
-        word.to_owned()
-    } else {
-        format!("'{}'", word.replace('\'', "'\\''"))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_a_shell_would_read_otherwise_is_quoted() {
-        assert_eq!(quoted("config/comparison.yml"), "config/comparison.yml");
-        assert_eq!(quoted("seeds=[1, 2]"), "'seeds=[1, 2]'");
-        assert_eq!(quoted("it's"), "'it'\\''s'");
-        assert_eq!(quoted(""), "''");
-    }
 }

@@ -6,9 +6,9 @@ use super::plan::PlannedRun;
 use super::{Layout, pictures};
 use crate::app::commands::run_page::{self, PICTURES, TEXTS};
 use crate::app::commands::version;
-use crate::app::comparison::{Cell, Column, Comparison, RunRecord, Table};
+use crate::app::comparison::{Comparison, RunRecord};
 use crate::app::config::{self, ComparisonConfig, Overrides, settings};
-use crate::app::reporting::{Block, Page, Section};
+use crate::app::reporting::{Cell, Column, Page, PageElement, Section, Table};
 
 /// Pictures of a run that are told apart by configuration already.
 const SHOWN_FOR_ALL: [&str; 2] = ["path.png", "errors.png"];
@@ -24,9 +24,9 @@ pub fn page(
     tables: &[Table],
     layout: &Layout,
 ) -> Result<Page> {
-    let of = |names: &[&str]| -> Vec<Block> {
+    let of = |names: &[&str]| -> Vec<PageElement> {
         let found = tables.iter().filter(|t| names.contains(&t.name.as_str()));
-        found.cloned().map(Block::Table).collect()
+        found.cloned().map(PageElement::Table).collect()
     };
     let mut sections = vec![
         section("What is missing", missing(planned, comparison)),
@@ -41,13 +41,13 @@ pub fn page(
         sections.push(section(&format!("Sequence {sequence}"), blocks));
     }
     sections.push(section("Time", of(&["timing"])));
-    let mut particles: Vec<Block> = of(&["particles"]);
+    let mut particles: Vec<PageElement> = of(&["particles"]);
     particles.extend(drawn(pictures::success(comparison, layout)?)?);
     sections.push(section("Numbers of particles", particles));
     sections.push(section("Runs", of(&["runs"])));
     let configuration = configuration(config, comparison, layout)?;
     sections.push(section("Configuration and versions", configuration));
-    sections.retain(|section| !section.blocks.is_empty());
+    sections.retain(|section| !section.elements.is_empty());
     Ok(Page {
         title: "Comparison".to_owned(),
         subtitle: format!(
@@ -61,14 +61,14 @@ pub fn page(
     })
 }
 
-fn section(title: &str, blocks: Vec<Block>) -> Section {
+fn section(title: &str, blocks: Vec<PageElement>) -> Section {
     Section {
         title: title.to_owned(),
-        blocks,
+        elements: blocks,
     }
 }
 
-fn drawn(drawn: impl IntoIterator<Item = pictures::Drawn>) -> Result<Vec<Block>> {
+fn drawn(drawn: impl IntoIterator<Item = pictures::Drawn>) -> Result<Vec<PageElement>> {
     let mut blocks = Vec::new();
     for picture in drawn {
         blocks.extend(run_page::picture(&picture.path, &picture.caption)?);
@@ -77,7 +77,7 @@ fn drawn(drawn: impl IntoIterator<Item = pictures::Drawn>) -> Result<Vec<Block>>
 }
 
 /// Runs that are planned and not there, and those that failed; nothing where all is well.
-fn missing(planned: &[PlannedRun], comparison: &Comparison) -> Vec<Block> {
+fn missing(planned: &[PlannedRun], comparison: &Comparison) -> Vec<PageElement> {
     let is_there = |run: &PlannedRun| comparison.all_records().any(|record| record.id == run.id);
     let absent = planned.iter().filter(|run| !is_there(run));
     let absent: Vec<String> = absent.map(|run| run.id.to_string()).collect();
@@ -93,34 +93,38 @@ fn missing(planned: &[PlannedRun], comparison: &Comparison) -> Vec<Block> {
             more => format!(" and {more} more"),
         };
         let named = absent[..absent.len().min(NAMED)].join(", ");
-        blocks.push(Block::Paragraph(format!(
+        blocks.push(PageElement::Paragraph(format!(
             "{} of {} runs are not there, or were run with another configuration: {named}{more}.",
             absent.len(),
             planned.len()
         )));
     }
     if !failed.is_empty() {
-        blocks.push(Block::Facts(failed));
+        blocks.push(PageElement::Facts(failed));
     }
     blocks
 }
 
 /// All configurations in a sequence, and one run of it with all its pictures.
-fn of_sequence(comparison: &Comparison, sequence: &str, layout: &Layout) -> Result<Vec<Block>> {
+fn of_sequence(
+    comparison: &Comparison,
+    sequence: &str,
+    layout: &Layout,
+) -> Result<Vec<PageElement>> {
     let mut blocks = drawn(pictures::sequence(comparison, sequence, layout)?)?;
     if blocks.is_empty() {
-        blocks.push(Block::Paragraph(
+        blocks.push(PageElement::Paragraph(
             "No result of its runs is here: paths and errors over time are left out.".to_owned(),
         ));
     }
     let Some(shown) = shown_run(comparison, sequence, layout) else {
-        blocks.push(Block::Paragraph(
+        blocks.push(PageElement::Paragraph(
             "No folder of its runs is here: particles, range images, map, likelihood and time per frame are left out."
                 .to_owned(),
         ));
         return Ok(blocks);
     };
-    blocks.push(Block::Paragraph(format!(
+    blocks.push(PageElement::Paragraph(format!(
         "One run with all its pictures: {}, the first seed of the last configuration whose pictures are here. Every other run has a page of its own beside this one (Runs).",
         shown.id
     )));
@@ -137,7 +141,7 @@ fn of_sequence(comparison: &Comparison, sequence: &str, layout: &Layout) -> Resu
         }
     }
     if !left_out.is_empty() {
-        blocks.push(Block::Paragraph(format!(
+        blocks.push(PageElement::Paragraph(format!(
             "Not there, or not readable: {}.",
             left_out.join(", ")
         )));
@@ -169,11 +173,11 @@ fn configuration(
     config: &ComparisonConfig,
     comparison: &Comparison,
     layout: &Layout,
-) -> Result<Vec<Block>> {
+) -> Result<Vec<PageElement>> {
     let mut blocks = vec![
-        Block::Facts(versions(comparison)?),
-        Block::Table(differing(config)),
-        Block::Folded {
+        PageElement::Facts(versions(comparison)?),
+        PageElement::Table(differing(config)),
+        PageElement::Collapsed {
             name: "comparison.yml".to_owned(),
             text: config::to_yaml(config)?,
         },
@@ -187,7 +191,7 @@ fn configuration(
     };
     for name in TEXTS.iter().filter(|name| name.ends_with(".yml")) {
         let path = layout.run(&shown.id).join(name);
-        if let Some(text) = run_page::folded(&path, &format!("{name} of {}", shown.id))? {
+        if let Some(text) = run_page::collapsed(&path, &format!("{name} of {}", shown.id))? {
             blocks.push(text);
         }
     }

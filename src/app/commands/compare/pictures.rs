@@ -6,9 +6,10 @@ use anyhow::{Context as _, Result};
 
 use super::Layout;
 use crate::app::comparison::tables::rate;
-use crate::app::comparison::{Comparison, RunRecord, SuccessRate};
+use crate::app::comparison::{Comparison, RunRecord};
 use crate::app::plotting::color::{Rgb, SERIES};
 use crate::app::plotting::{LineChart, Mark, Panel, Path2, PathPlot, Series};
+use crate::app::reporting::SuccessRate;
 use crate::app::results::LocalizationResults;
 use crate::evaluation::{PlanarError, planar_errors};
 use crate::geometry::Pose2;
