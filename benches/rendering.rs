@@ -27,7 +27,7 @@ use fpmcl::geometry::{Pose3, Rigid3f, TriangleMesh, Vec3};
 use fpmcl::lidar::{Beam, LidarModel};
 use fpmcl::raycasting::Scene;
 use fpmcl::rendering::{CpuRenderer, RangeDifference, RangeRenderer as _};
-use ndarray::Array2;
+use npyz::WriterBuilder as _;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
 const SEED: u64 = 7;
@@ -56,8 +56,13 @@ fn write_rays(folder: &Path) -> Result<(), Box<dyn std::error::Error>> {
         ("compare_10000_near_poses_500_beams", near_poses(), &few),
         ("compare_10000_poses_500_beams", all_poses(), &few),
     ] {
-        let rays = rays(&poses, directions);
-        ndarray_npy::write_npy(folder.join(format!("{name}.npy")), &rays)?;
+        let file = std::fs::File::create(folder.join(format!("{name}.npy")))?;
+        let mut array = npyz::WriteOptions::new()
+            .default_dtype()
+            .writer(std::io::BufWriter::new(file))
+            .begin_2d(6)?;
+        array.extend(rays(&poses, directions).into_flattened())?;
+        array.finish()?;
     }
     Ok(())
 }
@@ -67,19 +72,15 @@ fn directions_of(beams: &[Beam]) -> Vec<Vec3> {
 }
 
 /// A row per ray, pose by pose: origin, then unit direction.
-fn rays(poses: &[Pose3], directions: &[Vec3]) -> Array2<f32> {
-    let mut rays = Array2::zeros((poses.len() * directions.len(), 6));
-    let mut rows = rays.rows_mut().into_iter();
+fn rays(poses: &[Pose3], directions: &[Vec3]) -> Vec<[f32; 6]> {
+    let mut rays = Vec::with_capacity(poses.len() * directions.len());
     for pose in poses {
         let map_from_lidar = Rigid3f::from(pose);
-        let origin = pose.translation.vector.cast::<f32>();
-        for (direction, mut row) in directions.iter().zip(rows.by_ref()) {
-            let direction = map_from_lidar.rotate(*direction);
-            for axis in 0..3 {
-                row[axis] = origin[axis];
-                row[axis + 3] = direction[axis];
-            }
-        }
+        let t = pose.translation.vector.cast::<f32>();
+        rays.extend(directions.iter().map(|direction| {
+            let d = map_from_lidar.rotate(*direction);
+            [t.x, t.y, t.z, d.x, d.y, d.z]
+        }));
     }
     rays
 }

@@ -1,22 +1,21 @@
-//! When a run has found the car, and whether it keeps it.
+//! Convergence of global localization, and strict success.
 //!
-//! A frame is good when its position and its heading are within limits. The run has converged at
-//! the first frame that begins so many good frames in a row; it is a strict success when every
-//! frame from there to the end is good.
+//! A run converges at the first of `hold_frames` consecutive frames whose position and heading
+//! errors are within the limits. It is a strict success if all later frames are, too.
 
 use serde::{Deserialize, Serialize};
 
 use super::planar::PlanarError;
 
-/// What counts as found.
+/// Limits of the errors after convergence.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct StrictSuccess {
-    /// Largest position error of a good frame [m].
+    /// Largest position error [m].
     pub position_m: f64,
-    /// Largest heading error of a good frame [rad].
+    /// Largest heading error [rad].
     pub heading_rad: f64,
-    /// How many good frames in a row are convergence.
+    /// Number of consecutive frames within the limits that count as convergence.
     pub hold_frames: usize,
 }
 
@@ -31,25 +30,25 @@ impl Default for StrictSuccess {
     }
 }
 
-/// When a run converged.
+/// Convergence of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Convergence {
-    /// Row of the first frame that counts as found.
+    /// Row of the first frame after convergence.
     pub row: usize,
-    /// Distance driven until then [m].
+    /// Distance driven before [m].
     pub distance_m: f64,
-    /// Time passed until then [s]; absent without times.
+    /// Time passed before [s]; absent without times.
     pub time_s: Option<f64>,
-    /// Whether every frame from there to the end is good.
+    /// Whether all later frames are within the limits.
     pub kept: bool,
 }
 
 impl StrictSuccess {
-    fn is_good(&self, error: &PlanarError) -> bool {
+    fn is_within_limits(&self, error: &PlanarError) -> bool {
         error.distance_m() <= self.position_m && error.turn_rad.abs() <= self.heading_rad
     }
 
-    /// When the run converged; `None` where it never did.
+    /// The convergence of a run; `None` if it never converged.
     pub fn convergence(
         &self,
         errors: &[PlanarError],
@@ -59,12 +58,14 @@ impl StrictSuccess {
         let hold = self.hold_frames.max(1);
         let row = errors
             .windows(hold)
-            .position(|frames| frames.iter().all(|error| self.is_good(error)))?;
+            .position(|frames| frames.iter().all(|error| self.is_within_limits(error)))?;
         Some(Convergence {
             row,
             distance_m: distances_m[row] - distances_m[0],
             time_s: times_s.map(|times_s| times_s[row] - times_s[0]),
-            kept: errors[row..].iter().all(|error| self.is_good(error)),
+            kept: errors[row..]
+                .iter()
+                .all(|error| self.is_within_limits(error)),
         })
     }
 }
@@ -92,26 +93,26 @@ mod tests {
     }
 
     #[test]
-    fn a_good_frame_alone_is_chance_and_three_are_convergence() {
+    fn convergence_needs_consecutive_frames_within_the_limits() {
         let found = converged(&[9.0, 0.1, 9.0, 0.1, 0.1, 0.1, 0.1]).unwrap();
         assert_eq!((found.row, found.time_s, found.kept), (3, Some(3.0), true));
         assert!((found.distance_m - 2.4).abs() < 1e-12);
     }
 
     #[test]
-    fn a_run_that_loses_the_car_again_converged_but_did_not_keep_it() {
+    fn a_run_with_a_later_error_converged_without_strict_success() {
         let found = converged(&[0.1, 0.1, 0.1, 0.6, 0.1]).unwrap();
         assert_eq!((found.row, found.kept), (0, false));
     }
 
     #[test]
-    fn a_run_that_is_never_good_long_enough_never_converges() {
+    fn a_run_that_is_never_within_the_limits_long_enough_does_not_converge() {
         assert_eq!(converged(&[0.1, 0.1, 9.0, 0.1, 0.1]), None);
         assert_eq!(converged(&[]), None);
     }
 
     #[test]
-    fn a_wrong_heading_is_not_good() {
+    fn a_wrong_heading_prevents_convergence() {
         let turned = PlanarError::between(&Pose2::rotation(0.05), &Pose2::identity());
         let rules = StrictSuccess::default();
         assert_eq!(rules.convergence(&[turned; 20], &[0.0; 20], None), None);

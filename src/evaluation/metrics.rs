@@ -1,7 +1,7 @@
-//! Everything that is told of one trajectory, each number with its unit and its definition.
+//! Metrics of one trajectory against the ground truth.
 //!
-//! Frames at the beginning, in which the filter still searches, are left out of all but
-//! convergence. Nothing is aligned.
+//! The first frames, in which the filter converges, are excluded from all metrics but
+//! convergence. Trajectories are not aligned.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,15 +12,15 @@ use super::smoothness::{jitter_m, log_dimensionless_jerk, mean_pose_change};
 use super::statistics::{Summary, mean, rms, slope};
 use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
 
-/// What is measured, and from where on.
+/// Parameters of the metrics.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MetricsConfig {
-    /// How many frames at the beginning do not count.
+    /// Number of frames at the beginning that are excluded.
     pub skip_frames: usize,
-    /// What counts as found.
+    /// Limits of the errors after convergence.
     pub success: StrictSuccess,
-    /// Which poses the relative pose error compares.
+    /// Pairs of poses that the relative pose error compares.
     pub rpe_pairs: Pairs,
 }
 
@@ -35,25 +35,25 @@ impl Default for MetricsConfig {
     }
 }
 
-/// A trajectory to be trajectory, one entry of each per frame.
+/// A trajectory with its ground truth, one entry of each per frame.
 #[derive(Clone, Copy, Debug)]
 pub struct EvaluatedTrajectory<'a> {
     /// The estimates.
     pub estimates: &'a [Pose2],
-    /// The truth.
+    /// The ground truth.
     pub ground_truth: &'a [Pose2],
     /// Times of the frames [s], ascending.
     pub times_s: Option<&'a [f64]>,
-    /// Time that was spent on each frame [s].
+    /// Computing time per frame [s].
     pub runtimes_s: Option<&'a [f64]>,
 }
 
 /// Error along and across the true heading [m].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct AxisError {
-    /// Root of the mean square [m].
+    /// Root mean square [m].
     pub rmse_m: f64,
-    /// Mean with its sign [m].
+    /// Signed mean [m].
     pub bias_m: f64,
 }
 
@@ -74,30 +74,30 @@ pub struct Smoothness {
     pub mean_step_of_truth_m: Option<f64>,
 }
 
-/// All that is told of one trajectory.
+/// Metrics of one trajectory.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrajectoryMetrics {
-    /// Frames that count.
+    /// Number of evaluated frames.
     pub frames: usize,
-    /// Distance driven in them, by the truth [m].
+    /// Distance driven in them, along the ground truth [m].
     pub distance_m: f64,
-    /// Planar distance to the true position [m]; without alignment this is evo's APE in the plane.
+    /// Planar distance to the true position [m]: the absolute pose error in the plane.
     pub position_m: Summary,
     /// RMSE of x in the map frame [m].
     pub x_rmse_m: f64,
     /// RMSE of y in the map frame [m].
     pub y_rmse_m: f64,
-    /// Along the true heading.
+    /// Position error along the true heading.
     pub along: AxisError,
-    /// Across the true heading.
+    /// Position error across the true heading.
     pub across: AxisError,
     /// Magnitude of the heading error [rad].
     pub heading_rad: Summary,
-    /// When the run found the car; absent where it never did.
+    /// Convergence; absent if the run never converged.
     pub convergence: Option<Convergence>,
-    /// How smooth the trajectory is.
+    /// Smoothness of the trajectory.
     pub smoothness: Smoothness,
-    /// Slope of the position error against the distance driven [m/m]; absent where the car stands.
+    /// Slope of the position error against the distance driven [m/m]; absent if the car stands.
     pub drift: Option<f64>,
     /// Slope of the position error against time [m/s]; absent without times.
     pub drift_m_per_s: Option<f64>,
@@ -105,20 +105,20 @@ pub struct TrajectoryMetrics {
     pub rpe_translation_m: Option<Summary>,
     /// Relative pose error, rotation [rad].
     pub rpe_rotation_rad: Option<Summary>,
-    /// KITTI's segment errors; absent on a path under 100 m.
+    /// KITTI's segment errors; absent for a path under 100 m.
     pub segments: Option<SegmentErrors>,
-    /// Time per frame [s]; absent where it was not measured.
+    /// Computing time per frame [s]; absent if not measured.
     pub runtime_s: Option<Summary>,
-    /// Time of the first frame of the run [s].
+    /// Computing time of the first frame of the run [s].
     pub first_runtime_s: Option<f64>,
 }
 
-/// Why there are no metrics.
+/// An error of the input.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[expect(missing_docs, reason = "the messages say it")]
 pub enum MetricsError {
     #[error(
-        "{frames} frames are too few: the first {skip_frames} (skip_frames) do not count and one is needed after them"
+        "{frames} frames are too few: the first {skip_frames} (skip_frames) are excluded and one is needed after them"
     )]
     TooFewFrames { frames: usize, skip_frames: usize },
     #[error("there are {found} {what} for {frames} frames; they belong to different runs")]
@@ -130,42 +130,43 @@ pub enum MetricsError {
 }
 
 impl TrajectoryMetrics {
-    /// Measures one trajectory.
+    /// Computes the metrics of a trajectory.
     pub fn of(
         trajectory: &EvaluatedTrajectory,
         config: &MetricsConfig,
     ) -> Result<Self, MetricsError> {
-        trajectory.check(config)?;
-        let whole_errors = planar_errors(trajectory.estimates, trajectory.ground_truth);
-        let whole_distances_m = distances_m(trajectory.ground_truth);
-        let convergence =
-            (config.success).convergence(&whole_errors, &whole_distances_m, trajectory.times_s);
+        trajectory.check_lengths()?;
+        Self::after_skipping(trajectory, config).ok_or(MetricsError::TooFewFrames {
+            frames: trajectory.estimates.len(),
+            skip_frames: config.skip_frames,
+        })
+    }
 
-        let counted = trajectory.from(config.skip_frames);
-        let errors = &whole_errors[config.skip_frames..];
+    /// `None` if no frames are left after the skipped ones.
+    fn after_skipping(whole: &EvaluatedTrajectory, config: &MetricsConfig) -> Option<Self> {
+        let counted = whole.skip(config.skip_frames)?;
+        let all_errors = planar_errors(whole.estimates, whole.ground_truth);
+        let all_distances_m = distances_m(whole.ground_truth);
+        let errors = &all_errors[config.skip_frames..];
         let driven_m = distances_m(counted.ground_truth);
         let column =
             |number: fn(&PlanarError) -> f64| -> Vec<f64> { errors.iter().map(number).collect() };
         let distance = column(PlanarError::distance_m);
-        let turn = column(|error| error.turn_rad);
-        let x = column(|error| error.offset_in_map.x);
-        let y = column(|error| error.offset_in_map.y);
-        let nothing = || MetricsError::TooFewFrames {
-            frames: trajectory.estimates.len(),
-            skip_frames: config.skip_frames,
-        };
-        let (estimates, truth) = (level(counted.estimates), level(counted.ground_truth));
+        let (estimates, truth) = (
+            level_poses(counted.estimates),
+            level_poses(counted.ground_truth),
+        );
         let relative = relative_pose_error(&estimates, &truth, config.rpe_pairs);
-        Ok(Self {
+        Some(Self {
             frames: errors.len(),
-            distance_m: driven_m.last().copied().unwrap_or(0.0),
-            position_m: Summary::of(&distance).ok_or_else(nothing)?,
-            x_rmse_m: rms(&x).ok_or_else(nothing)?,
-            y_rmse_m: rms(&y).ok_or_else(nothing)?,
-            along: AxisError::of(&column(|error| error.along_m)).ok_or_else(nothing)?,
-            across: AxisError::of(&column(|error| error.across_m)).ok_or_else(nothing)?,
-            heading_rad: Summary::of(&turn).ok_or_else(nothing)?,
-            convergence,
+            distance_m: *driven_m.last()?,
+            position_m: Summary::of(&distance)?,
+            x_rmse_m: rms(&column(|error| error.offset_in_map.x))?,
+            y_rmse_m: rms(&column(|error| error.offset_in_map.y))?,
+            along: AxisError::of(&column(|error| error.along_m))?,
+            across: AxisError::of(&column(|error| error.across_m))?,
+            heading_rad: Summary::of(&column(|error| error.turn_rad))?,
+            convergence: (config.success).convergence(&all_errors, &all_distances_m, whole.times_s),
             smoothness: Smoothness::of(&counted, errors),
             drift: slope(&driven_m, &distance),
             drift_m_per_s: counted.times_s.and_then(|times| slope(times, &distance)),
@@ -173,13 +174,13 @@ impl TrajectoryMetrics {
             rpe_rotation_rad: relative.rotation(),
             segments: kitti_segment_errors(&estimates, &truth),
             runtime_s: counted.runtimes_s.and_then(Summary::of),
-            first_runtime_s: trajectory.runtimes_s.and_then(|all| all.first().copied()),
+            first_runtime_s: whole.runtimes_s.and_then(|all| all.first().copied()),
         })
     }
 }
 
 impl EvaluatedTrajectory<'_> {
-    fn check(&self, config: &MetricsConfig) -> Result<(), MetricsError> {
+    fn check_lengths(&self) -> Result<(), MetricsError> {
         let frames = self.estimates.len();
         for (what, found) in [
             ("true poses", Some(self.ground_truth.len())),
@@ -194,22 +195,17 @@ impl EvaluatedTrajectory<'_> {
                 });
             }
         }
-        if frames <= config.skip_frames {
-            return Err(MetricsError::TooFewFrames {
-                frames,
-                skip_frames: config.skip_frames,
-            });
-        }
         Ok(())
     }
 
-    fn from(&self, skip: usize) -> Self {
-        Self {
-            estimates: &self.estimates[skip..],
-            ground_truth: &self.ground_truth[skip..],
-            times_s: self.times_s.map(|times| &times[skip..]),
-            runtimes_s: self.runtimes_s.map(|times| &times[skip..]),
-        }
+    /// The trajectory without its first frames; `None` if it is shorter.
+    fn skip(&self, frames: usize) -> Option<Self> {
+        Some(Self {
+            estimates: self.estimates.get(frames..)?,
+            ground_truth: self.ground_truth.get(frames..)?,
+            times_s: self.times_s.map(|times| &times[frames..]),
+            runtimes_s: self.runtimes_s.map(|times| &times[frames..]),
+        })
     }
 }
 
@@ -224,7 +220,7 @@ impl AxisError {
 
 impl Smoothness {
     fn of(trajectory: &EvaluatedTrajectory, errors: &[PlanarError]) -> Self {
-        // Dimensionless jerk does not depend on the unit of time, so frames will do.
+        // Dimensionless jerk does not depend on the unit of time: without times, frames are used.
         let numbers: Vec<f64> = (0..errors.len()).map(|frame| frame as f64).collect();
         let times = trajectory.times_s.unwrap_or(&numbers);
         let change = mean_pose_change(trajectory.estimates);
@@ -240,7 +236,8 @@ impl Smoothness {
     }
 }
 
-fn level(poses: &[Pose2]) -> Vec<Pose3> {
+/// Planar poses as level poses in space.
+fn level_poses(poses: &[Pose2]) -> Vec<Pose3> {
     poses
         .iter()
         .map(|pose| pose3_from_pose2(pose, 0.0))
@@ -277,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn the_truth_has_no_error_and_is_found_at_once() {
+    fn the_ground_truth_has_no_error_and_converges_at_once() {
         let truth = circle(200);
         let metrics = measure(&truth, &truth);
         assert_eq!(metrics.position_m.max, 0.0);
@@ -297,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_in_the_axes_of_the_car_is_told_in_them() {
+    fn an_error_in_the_car_frame_is_split_into_along_and_across() {
         let truth = circle(200);
         let error = Pose2::new(Vector2::new(0.3, -0.4), 0.01);
         let metrics = measure(&in_the_car(&truth, |_| error), &truth);
@@ -310,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn an_error_that_grows_with_the_distance_drifts_by_its_rate() {
+    fn an_error_that_grows_with_the_distance_is_drift() {
         let truth = circle(200);
         let driven_m = distances_m(&truth);
         let estimates = in_the_car(&truth, |frame| {
@@ -324,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn the_search_at_the_beginning_does_not_count() {
+    fn skipped_frames_count_for_convergence_alone() {
         let truth = circle(200);
         let estimates = in_the_car(&truth, |frame| {
             Pose2::translation(if frame < 10 { 30.0 } else { 0.1 }, 0.0)
@@ -336,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn too_few_frames_and_lengths_that_differ_are_said() {
+    fn too_few_frames_and_different_lengths_are_errors() {
         let truth = circle(10);
         let mut trajectory = EvaluatedTrajectory {
             estimates: &truth,

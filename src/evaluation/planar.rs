@@ -1,31 +1,31 @@
-//! Errors in the plane, frame by frame, in the axes of the map and in those of the car.
+//! Errors in the plane per frame, along the axes of the map and of the car.
 //!
 //! ```text
 //! e = t_estimate − t_truth          (along, across) = R(θ_truth)ᵀ e
 //! turn = wrap(θ_estimate − θ_truth)
 //! ```
 //!
-//! Nothing is aligned: estimate and truth are in the map frame.
+//! Trajectories are not aligned: estimate and truth are both in the map frame.
 
-use nalgebra::Vector2;
+use nalgebra::{Isometry, Vector2};
 
 use crate::geometry::{Pose2, wrap_angle};
 
-/// How far one estimate is from the truth.
+/// Error of one estimate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PlanarError {
-    /// In the axes of the map [m].
+    /// Position error in the map frame [m].
     pub offset_in_map: Vector2<f64>,
-    /// Ahead of the true pose [m].
+    /// Position error along the true heading, positive ahead [m].
     pub along_m: f64,
-    /// To the left of the true pose [m].
+    /// Position error across the true heading, positive to the left [m].
     pub across_m: f64,
-    /// Counter-clockwise from the true heading, in [-π, π) [rad].
+    /// Heading error, counter-clockwise positive, in [-π, π) [rad].
     pub turn_rad: f64,
 }
 
 impl PlanarError {
-    /// Of one estimate.
+    /// The error of an estimate.
     pub fn between(estimate: &Pose2, truth: &Pose2) -> Self {
         let offset_in_map = estimate.translation.vector - truth.translation.vector;
         let offset_in_car = truth.rotation.inverse() * offset_in_map;
@@ -43,7 +43,7 @@ impl PlanarError {
     }
 }
 
-/// One error per pair of poses.
+/// The error of each estimate.
 pub fn planar_errors(estimates: &[Pose2], ground_truth: &[Pose2]) -> Vec<PlanarError> {
     estimates
         .iter()
@@ -53,16 +53,14 @@ pub fn planar_errors(estimates: &[Pose2], ground_truth: &[Pose2]) -> Vec<PlanarE
 }
 
 /// Distance driven up to each pose, starting at 0 [m].
-pub fn distances_m(poses: &[Pose2]) -> Vec<f64> {
+pub fn distances_m<R, const D: usize>(poses: &[Isometry<f64, R, D>]) -> Vec<f64> {
+    let steps_m = poses
+        .windows(2)
+        .map(|pair| (pair[1].translation.vector - pair[0].translation.vector).norm());
     let mut driven_m = 0.0;
-    let mut previous: Option<&Pose2> = None;
-    poses
-        .iter()
-        .map(|pose| {
-            if let Some(previous) = previous {
-                driven_m += (pose.translation.vector - previous.translation.vector).norm();
-            }
-            previous = Some(pose);
+    (poses.iter().take(1).map(|_| 0.0).chain(steps_m))
+        .map(|step_m| {
+            driven_m += step_m;
             driven_m
         })
         .collect()
@@ -77,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn along_is_ahead_of_the_true_car_and_across_is_to_its_left() {
+    fn along_is_positive_ahead_and_across_is_positive_to_the_left() {
         let truth = Pose2::new(Vector2::new(5.0, 5.0), FRAC_PI_2);
         let estimate = truth * Pose2::new(Vector2::new(0.3, 0.1), 0.02);
         let error = PlanarError::between(&estimate, &truth);
@@ -92,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn headings_on_both_sides_of_pi_are_near() {
+    fn heading_errors_are_wrapped_at_pi() {
         let left = Pose2::rotation(PI - 0.1);
         let right = Pose2::rotation(-PI + 0.1);
         assert_relative_eq!(
@@ -103,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn moving_the_whole_world_changes_no_error() {
+    fn errors_are_invariant_under_a_transform_of_the_map() {
         let world = Pose2::new(Vector2::new(100.0, -40.0), 2.2);
         let truth = Pose2::new(Vector2::new(5.0, 5.0), 3.0);
         let estimate = Pose2::new(Vector2::new(5.5, 4.0), -3.0);

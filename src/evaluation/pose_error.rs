@@ -7,17 +7,18 @@
 //! RPE   Eᵢ = (Qᵢ⁻¹ Qᵢ₊δ)⁻¹ (Pᵢ⁻¹ Pᵢ₊δ)
 //! ```
 //!
-//! of which the length of the translation and the angle of the rotation are told. Sturm et al.,
+//! of which the length of the translation and the angle of the rotation are reported. Sturm et al.,
 //! *A Benchmark for the Evaluation of RGB-D SLAM Systems*, IROS 2012, eq. 1 and 3; pairs are
-//! chosen as evo (Grupp 2017) chooses them, without alignment. Segments: Geiger, Lenz and
-//! Urtasun, *Are we ready for autonomous driving?*, CVPR 2012, as the benchmark's devkit does it.
+//! chosen as in evo (Grupp 2017), without alignment. Segments: Geiger, Lenz and
+//! Urtasun, *Are we ready for autonomous driving?*, CVPR 2012, as in the benchmark's devkit.
 
 use serde::{Deserialize, Serialize};
 
+use super::planar::distances_m;
 use super::statistics::{Summary, mean};
 use crate::geometry::Pose3;
 
-/// Errors of many poses or pairs.
+/// Errors of poses or of pairs of poses.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PoseErrors {
     /// Lengths of the translations [m].
@@ -48,15 +49,15 @@ impl PoseErrors {
     }
 }
 
-/// Which poses are compared by the relative pose error.
+/// Pairs of poses that the relative pose error compares.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Pairs {
-    /// Poses this many frames apart, one pair after the other.
+    /// Poses this many frames apart, without overlap of the pairs.
     Frames(usize),
-    /// Poses this many frames apart, from every pose on.
+    /// Poses this many frames apart, starting at every pose.
     AllFrames(usize),
-    /// One pair after the other, each as soon as the *estimate* has gone this far [m].
+    /// Poses this far apart along the *estimate*, without overlap of the pairs [m].
     Meters(f64),
 }
 
@@ -69,12 +70,12 @@ impl Pairs {
             Self::AllFrames(delta) => (delta..estimates.len()).map(|j| (j - delta, j)).collect(),
             Self::Meters(delta_m) => {
                 let mut ids = vec![0];
-                let mut gone_m = 0.0;
+                let mut driven_m = 0.0;
                 for (i, pair) in estimates.windows(2).enumerate() {
-                    gone_m += (pair[1].translation.vector - pair[0].translation.vector).norm();
-                    if gone_m >= delta_m {
+                    driven_m += (pair[1].translation.vector - pair[0].translation.vector).norm();
+                    if driven_m >= delta_m {
                         ids.push(i + 1);
-                        gone_m = 0.0;
+                        driven_m = 0.0;
                     }
                 }
                 chain(ids)
@@ -102,27 +103,23 @@ pub fn relative_pose_error(
     }))
 }
 
-/// Mean error per distance over segments of 100, 200, .. 800 m.
+/// Mean error per distance over segments of 100, 200, ..., 800 m.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SegmentErrors {
-    /// Of translation, per distance driven [%].
+    /// Translation error per distance driven [%].
     pub translation_percent: f64,
-    /// Of rotation, per distance driven [deg/m].
+    /// Rotation error per distance driven [deg/m].
     pub rotation_deg_per_m: f64,
-    /// How many segments the means are over.
+    /// Number of segments.
     pub segments: usize,
 }
 
-/// KITTI's segment errors, a segment from every tenth pose on; `None` on a path under 100 m.
+/// KITTI's segment errors, starting at every tenth pose; `None` for a path under 100 m.
 pub fn kitti_segment_errors(estimates: &[Pose3], ground_truth: &[Pose3]) -> Option<SegmentErrors> {
-    const EVERY: usize = 10;
-    let mut driven_m = vec![0.0];
-    for pair in ground_truth.windows(2) {
-        let step_m = (pair[1].translation.vector - pair[0].translation.vector).norm();
-        driven_m.push(driven_m[driven_m.len() - 1] + step_m);
-    }
+    const FRAME_STEP: usize = 10;
+    let driven_m = distances_m(ground_truth);
     let (mut translations, mut rotations) = (Vec::new(), Vec::new());
-    for first in (0..ground_truth.len()).step_by(EVERY) {
+    for first in (0..ground_truth.len()).step_by(FRAME_STEP) {
         for length_m in (1..=8).map(|hundreds| 100.0 * f64::from(hundreds)) {
             let end_m = driven_m[first] + length_m;
             let last = driven_m.partition_point(|&driven_m| driven_m <= end_m);
@@ -152,8 +149,8 @@ mod tests {
     use super::*;
     use crate::recording::poses::CameraPoses;
 
-    /// Commands of evo 1.38.1 and what they print, run in the folder of the two trajectories.
-    const EVO_ANSWERS: &str = include_str!("evo/answers.txt");
+    /// Commands of evo 1.38.1 with their output, run in the folder of the two trajectories.
+    const EVO_OUTPUT: &str = include_str!("evo/answers.txt");
 
     fn fixture(name: &str) -> Vec<Pose3> {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/evaluation/evo");
@@ -162,7 +159,7 @@ mod tests {
             .world_from_cam0
     }
 
-    /// What a command line of evo asks for, by our functions.
+    /// The errors that a command line of evo requests, computed here.
     fn ours(command: &str, estimates: &[Pose3], truth: &[Pose3]) -> Summary {
         let words: Vec<&str> = command.split_whitespace().collect();
         let option = |flag: &str| {
@@ -189,14 +186,14 @@ mod tests {
     }
 
     #[test]
-    fn ape_and_rpe_are_those_of_evo() {
+    fn ape_and_rpe_equal_those_of_evo() {
         let (truth, estimates) = (
             fixture("reference_kitti.txt"),
             fixture("estimate_kitti.txt"),
         );
         let mut summary = None;
         let mut compared = 0;
-        for line in EVO_ANSWERS.lines() {
+        for line in EVO_OUTPUT.lines() {
             if line.starts_with('$') {
                 summary = Some(ours(line, &estimates, &truth));
                 continue;
@@ -252,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn relative_errors_do_not_see_where_the_estimate_began() {
+    fn relative_errors_do_not_depend_on_the_first_pose() {
         let (truth, estimates) = (
             fixture("reference_kitti.txt"),
             fixture("estimate_kitti.txt"),

@@ -1,4 +1,4 @@
-//! The parent's own judgement of a run: success, and the RMSE after the time it has to converge.
+//! Evaluation as in range-mcl: success, and the RMSE after the frames granted for convergence.
 //!
 //! ```text
 //! estimate  = Σ w (x, y, θ) / Σ w        over the top 80 % of the stored rows by weight
@@ -12,20 +12,22 @@
 use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};
 
+use super::planar::{PlanarError, planar_errors};
 use crate::geometry::{Pose2, wrap_angle};
 
 /// A particle: x, y [m], heading [rad], weight.
 pub type ParticleRow = [f32; 4];
 
-/// The rules of the parent.
+/// Parameters of range-mcl's evaluation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RangeMclRules {
-    /// Every how many rows the error is looked at, and after how many rows it counts.
+    /// Interval of the rows whose error decides on success, and number of rows before the first
+    /// (frames).
     pub convergence_interval: usize,
-    /// An error below this is a success [m].
+    /// Position error below which a row is a success [m].
     pub converge_thres: f64,
-    /// Share of the rows, from the heaviest on, that the estimate is made of.
+    /// Share of the stored rows, by descending weight, that the estimate averages (unitless).
     pub particle_select_ratio: f64,
 }
 
@@ -40,50 +42,43 @@ impl Default for RangeMclRules {
     }
 }
 
-/// The judgement.
+/// Errors of a trajectory by range-mcl's rules.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RangeMclErrors {
-    /// Whether the error was small at every row that is looked at.
+    /// Whether the position error was below the threshold at every checked row.
     pub success: bool,
-    /// RMSE of the planar position [m]; absent without success, or without rows to count.
+    /// RMSE of the planar position [m]; absent without success, or without counted rows.
     pub rmse_location_m: Option<f64>,
-    /// RMSE of the heading [deg]; absent without success, or without rows to count.
+    /// RMSE of the heading [deg]; absent without success, or without counted rows.
     pub rmse_yaw_deg: Option<f64>,
 }
 
 impl RangeMclRules {
-    /// Judges estimates against the ground truth, both one pose per row from the start on.
+    /// Compares estimates with the ground truth, both one pose per row from the start on.
     pub fn evaluate(&self, estimates: &[Pose2], ground_truth: &[Pose2]) -> RangeMclErrors {
-        let errors: Vec<(f64, f64)> = estimates
-            .iter()
-            .zip(ground_truth)
-            .map(|(estimate, truth)| {
-                let offset = estimate.translation.vector - truth.translation.vector;
-                let turn_rad = estimate.rotation.angle() - truth.rotation.angle();
-                (offset.norm(), wrap_angle(turn_rad).to_degrees())
-            })
-            .collect();
+        let errors = planar_errors(estimates, ground_truth);
         let counted = errors.get(self.convergence_interval..).unwrap_or_default();
         let success = counted
             .iter()
             .step_by(self.convergence_interval.max(1))
-            .all(|(distance_m, _)| *distance_m < self.converge_thres);
-        let rmse = |error: fn(&(f64, f64)) -> f64| {
-            let sum: f64 = counted.iter().map(|pair| error(pair).powi(2)).sum();
+            .all(|error| error.distance_m() < self.converge_thres);
+        let rmse = |number: fn(&PlanarError) -> f64| {
+            let sum: f64 = counted.iter().map(|error| number(error).powi(2)).sum();
             (success && !counted.is_empty()).then(|| (sum / counted.len() as f64).sqrt())
         };
         RangeMclErrors {
             success,
-            rmse_location_m: rmse(|(distance_m, _)| *distance_m),
-            rmse_yaw_deg: rmse(|(_, turn_deg)| *turn_deg),
+            rmse_location_m: rmse(PlanarError::distance_m),
+            rmse_yaw_deg: rmse(|error| error.turn_rad.to_degrees()),
         }
     }
 
-    /// The estimate of one frame of `capacity` stored rows; `None` without weight.
+    /// The weighted mean of the particles of a frame with `capacity` stored rows; `None` if all
+    /// weights are zero.
     ///
-    /// Rows of zeros count among the share, as in the parent: of 10,000 rows with 100 particles,
-    /// all 100 are selected. Headings are averaged as numbers, but around the heaviest particle,
-    /// so that ±π is no border.
+    /// Rows of zeros count towards the share, as in range-mcl: of 10,000 rows with 100 particles,
+    /// all 100 are selected. Headings are averaged relative to that of the heaviest particle, so
+    /// that the mean is continuous at ±π.
     pub fn estimate(&self, particles: &[ParticleRow], capacity: usize) -> Option<Pose2> {
         let selected = (self.particle_select_ratio * capacity as f64) as usize;
         let mut order: Vec<[f64; 4]> = particles.iter().map(|row| row.map(f64::from)).collect();
@@ -129,15 +124,15 @@ mod tests {
     #[test]
     fn a_constant_offset_is_the_rmse() {
         let truth = straight(301);
-        let verdict = RangeMclRules::default().evaluate(&beside(&truth, 0.3, 0.02), &truth);
-        assert!(verdict.success);
-        assert_relative_eq!(verdict.rmse_location_m.unwrap(), 0.3, epsilon = 1e-12);
+        let errors = RangeMclRules::default().evaluate(&beside(&truth, 0.3, 0.02), &truth);
+        assert!(errors.success);
+        assert_relative_eq!(errors.rmse_location_m.unwrap(), 0.3, epsilon = 1e-12);
         let expected_deg = 0.02_f64.to_degrees();
-        assert_relative_eq!(verdict.rmse_yaw_deg.unwrap(), expected_deg, epsilon = 1e-12);
+        assert_relative_eq!(errors.rmse_yaw_deg.unwrap(), expected_deg, epsilon = 1e-12);
     }
 
     #[test]
-    fn only_every_hundredth_row_decides_and_the_first_hundred_do_not_count() {
+    fn every_hundredth_row_decides_on_success_and_the_first_hundred_are_skipped() {
         let truth = straight(301);
         let rules = RangeMclRules::default();
         let mut estimates = truth.clone();
@@ -149,15 +144,15 @@ mod tests {
         estimates[150].translation.y = 5.1;
         assert!(rules.evaluate(&estimates, &truth).success);
         estimates[200].translation.y = 5.1;
-        let verdict = rules.evaluate(&estimates, &truth);
-        assert_eq!((verdict.success, verdict.rmse_location_m), (false, None));
+        let errors = rules.evaluate(&estimates, &truth);
+        assert_eq!((errors.success, errors.rmse_location_m), (false, None));
     }
 
     #[test]
     fn a_run_shorter_than_the_interval_has_no_rmse() {
         let truth = straight(100);
-        let verdict = RangeMclRules::default().evaluate(&truth, &truth);
-        assert_eq!((verdict.success, verdict.rmse_location_m), (true, None));
+        let errors = RangeMclRules::default().evaluate(&truth, &truth);
+        assert_eq!((errors.success, errors.rmse_location_m), (true, None));
     }
 
     #[test]
@@ -185,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn particles_without_weight_make_no_estimate() {
+    fn particles_without_weight_have_no_mean() {
         let rules = RangeMclRules::default();
         assert_eq!(rules.estimate(&[[1.0, 2.0, 3.0, 0.0]], 10), None);
         assert_eq!(rules.estimate(&[], 10), None);

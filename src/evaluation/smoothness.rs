@@ -1,13 +1,12 @@
-//! How smooth a trajectory is.
+//! Smoothness of a trajectory.
 //!
 //! ```text
 //! jitter = √ mean |eₖ − eₖ₋₁|²                      e: planar error vectors, map axes
 //! LDLJ   = −ln( (T³ / v²_peak) ∫ |d³p/dt³|² dt )    T: duration, p: position
 //! ```
 //!
-//! Jitter is 0 for a trajectory that is merely shifted. The log dimensionless jerk does not know
-//! the truth, is the same at any speed and scale, and is larger (less negative) the smoother the
-//! path: Hogan and Sternad, *Sensitivity of smoothness measures to movement duration, amplitude,
+//! Jitter is 0 for a trajectory with a constant offset. The log dimensionless jerk needs no ground
+//! truth, is invariant to speed and scale, and is larger (less negative) for a smoother path: Hogan and Sternad, *Sensitivity of smoothness measures to movement duration, amplitude,
 //! and arrests*, J. Motor Behavior 2009; Balasubramanian et al., IEEE Trans. Biomed. Eng. 2012.
 
 use nalgebra::Vector2;
@@ -16,7 +15,7 @@ use super::planar::PlanarError;
 use super::statistics::{mean, rms};
 use crate::geometry::{Pose2, wrap_angle};
 
-/// RMS difference of consecutive planar error vectors [m]; `None` of fewer than two.
+/// RMS difference of consecutive planar error vectors [m]; `None` for fewer than two.
 pub fn jitter_m(errors: &[PlanarError]) -> Option<f64> {
     let steps: Vec<f64> = errors
         .windows(2)
@@ -25,11 +24,11 @@ pub fn jitter_m(errors: &[PlanarError]) -> Option<f64> {
     rms(&steps)
 }
 
-/// Log dimensionless jerk, unitless; `None` of fewer than four poses, of poses that do not move,
-/// and of a motion without any jerk, which is infinitely smooth.
+/// Log dimensionless jerk, unitless; `None` for fewer than four poses, for poses that do not move,
+/// and for a motion without jerk, which is infinitely smooth.
 ///
 /// `times_s` ascend strictly, one per pose. Derivatives are differences of neighbours, each at
-/// the middle of the two.
+/// their mean time.
 pub fn log_dimensionless_jerk(poses: &[Pose2], times_s: &[f64]) -> Option<f64> {
     let positions: Vec<Vector2<f64>> = poses.iter().map(|pose| pose.translation.vector).collect();
     let (velocity_times, velocities) = derivative(times_s, &positions);
@@ -54,8 +53,8 @@ fn derivative(times: &[f64], values: &[Vector2<f64>]) -> (Vec<f64>, Vec<Vector2<
         .unzip()
 }
 
-/// Mean length of the steps from frame to frame [m], and mean magnitude of the turns [rad];
-/// `None` of fewer than two poses. The report's "average delta pose", with its two units apart.
+/// Mean length of the steps between frames [m] and mean magnitude of the turns [rad]; `None` for
+/// fewer than two poses. The "average delta pose" of the report, by unit.
 pub fn mean_pose_change(poses: &[Pose2]) -> Option<(f64, f64)> {
     let (steps_m, turns_rad): (Vec<f64>, Vec<f64>) = poses
         .windows(2)
@@ -91,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shifted_trajectory_has_no_jitter_and_a_zigzag_has_its_stroke() {
+    fn a_constant_offset_has_no_jitter_and_a_zigzag_has_its_amplitude() {
         let truth = arc(50, 0.0);
         let shift = Pose2::translation(3.0, -2.0);
         let shifted: Vec<Pose2> = truth.iter().map(|pose| shift * pose).collect();
@@ -102,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn jerk_knows_neither_speed_nor_scale_but_the_wobble() {
+    fn jerk_is_invariant_to_speed_and_scale_and_grows_with_the_wobble() {
         let poses = arc(60, 0.01);
         let jerk = log_dimensionless_jerk(&poses, &times(60, 0.1)).unwrap();
         let slower = log_dimensionless_jerk(&poses, &times(60, 0.7)).unwrap();
@@ -118,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn on_a_circle_jerk_is_what_the_integral_says() {
+    fn the_jerk_of_a_circle_equals_the_integral() {
         // |jerk| = r ω³, v = r ω:  T³ / v² · r² ω⁶ T = (ω T)⁴
         let poses = arc(2001, 0.0);
         let jerk = log_dimensionless_jerk(&poses, &times(2001, 1.0)).unwrap();
@@ -127,14 +126,14 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_or_is_too_short_has_no_jerk() {
+    fn a_standing_or_too_short_trajectory_has_no_jerk() {
         let standing = vec![Pose2::identity(); 10];
         assert_eq!(log_dimensionless_jerk(&standing, &times(10, 0.1)), None);
         assert_eq!(log_dimensionless_jerk(&arc(3, 0.0), &times(3, 0.1)), None);
     }
 
     #[test]
-    fn the_mean_change_of_an_arc_is_its_chord_and_its_turn() {
+    fn the_mean_pose_change_of_an_arc_is_its_chord_and_turn() {
         let (step_m, turn_rad) = mean_pose_change(&arc(10, 0.0)).unwrap();
         assert_relative_eq!(step_m, 2.0 * 20.0 * 0.01_f64.sin(), epsilon = 1e-12);
         assert_relative_eq!(turn_rad, 0.02, epsilon = 1e-12);

@@ -1,24 +1,24 @@
-//! Numbers that describe many numbers.
+//! Summary statistics.
 
 use serde::{Deserialize, Serialize};
 
-/// What is told of a column of errors or times, all in the unit of the column.
+/// Statistics of the magnitudes of errors or times, all in their unit.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
-    /// Root of the mean square.
+    /// Root mean square.
     pub rmse: f64,
-    /// Arithmetic mean of the magnitudes.
+    /// Arithmetic mean.
     pub mean: f64,
-    /// 50th percentile of the magnitudes.
+    /// 50th percentile.
     pub median: f64,
-    /// 95th percentile of the magnitudes.
+    /// 95th percentile.
     pub p95: f64,
-    /// Largest magnitude.
+    /// Maximum.
     pub max: f64,
 }
 
 impl Summary {
-    /// Of the magnitudes of some numbers; `None` of no numbers.
+    /// The statistics of the magnitudes of numbers; `None` without numbers.
     pub fn of(numbers: &[f64]) -> Option<Self> {
         let mut magnitudes: Vec<f64> = numbers.iter().map(|number| number.abs()).collect();
         magnitudes.sort_by(f64::total_cmp);
@@ -32,19 +32,18 @@ impl Summary {
     }
 }
 
-/// Arithmetic mean; `None` of no numbers.
+/// Arithmetic mean; `None` without numbers.
 pub fn mean(numbers: &[f64]) -> Option<f64> {
     (!numbers.is_empty()).then(|| numbers.iter().sum::<f64>() / numbers.len() as f64)
 }
 
-/// Root of the mean square; `None` of no numbers.
+/// Root mean square; `None` without numbers.
 pub fn rms(numbers: &[f64]) -> Option<f64> {
     let squares: f64 = numbers.iter().map(|number| number * number).sum();
     (!numbers.is_empty()).then(|| (squares / numbers.len() as f64).sqrt())
 }
 
-/// Percentile of ascending numbers, interpolated between its neighbours as NumPy does; `None` of
-/// no numbers.
+/// Percentile of ascending numbers, interpolated linearly as in NumPy; `None` without numbers.
 pub fn percentile_of_sorted(ascending: &[f64], percent: f64) -> Option<f64> {
     let last = ascending.len().checked_sub(1)?;
     let place = percent / 100.0 * last as f64;
@@ -53,7 +52,7 @@ pub fn percentile_of_sorted(ascending: &[f64], percent: f64) -> Option<f64> {
     Some(low + (place - place.floor()) * (high - low))
 }
 
-/// Slope of the line `y = a + b x` of least squares; `None` where all x are the same.
+/// Slope of the least-squares line `y = a + b x`; `None` if all x are equal.
 pub fn slope(x: &[f64], y: &[f64]) -> Option<f64> {
     let (x_mean, y_mean) = (mean(x)?, mean(y)?);
     let (mut covariance, mut variance) = (0.0, 0.0);
@@ -71,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn signs_do_not_matter_and_neither_does_the_order() {
+    fn a_summary_does_not_depend_on_signs_or_order() {
         let summary = Summary::of(&[3.0, -4.0, 0.0]).unwrap();
         assert_eq!(summary, Summary::of(&[0.0, 4.0, -3.0]).unwrap());
         assert_relative_eq!(summary.rmse, (25.0_f64 / 3.0).sqrt(), epsilon = 1e-15);
@@ -90,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn the_slope_of_a_line_is_its_slope_and_a_point_has_none() {
+    fn the_slope_of_a_line_is_found_and_a_point_has_none() {
         let x = [0.0, 1.0, 5.0];
         let y = x.map(|x| 3.0 - 0.25 * x);
         assert_relative_eq!(slope(&x, &y).unwrap(), -0.25, epsilon = 1e-15);

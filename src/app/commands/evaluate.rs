@@ -133,6 +133,6 @@ fn selected(results: LocalizationResults, config: &EvaluationConfig) -> Localiza
     if rows.len() == results.len() {
         results
     } else {
-        results.rows(&rows)
+        results.select(&rows)
     }
 }

@@ -1,18 +1,13 @@
-//! `frames.csv`: one tidy row per frame, units in the header, empty where nothing is known.
+//! `frames.csv`: one row per frame, units in the header, empty cells where nothing is known.
 
 use std::io::{self, Write};
 use std::path::Path;
 
-use super::localization_results::{LocalizationResults, ResultsError};
+use super::error::ResultsError;
+use super::localization_results::LocalizationResults;
 use crate::app::output::write_atomically;
-use crate::evaluation::{PlanarError, distances_m};
+use crate::evaluation::{PlanarError, distances_m, planar_errors};
 use crate::geometry::Pose2;
-
-/// One column: its title and what stands in a row.
-struct Column<'a> {
-    title: String,
-    cell: Box<dyn Fn(usize) -> Option<String> + 'a>,
-}
 
 /// Writes the table; `estimates` are those of the filter, one per frame.
 pub fn write_frames_csv(
@@ -28,103 +23,113 @@ pub fn write_frames_csv(
             expected: results.len(),
         });
     }
-    let columns = columns(results, estimates);
-    write_atomically(path, |file| write_rows(file, &columns, results.len())).map_err(|source| {
-        ResultsError::Write {
-            path: path.to_owned(),
-            source,
-        }
-    })
+    let table = FrameTable::new(results, estimates);
+    write_atomically(path, |file| table.write(file)).map_err(ResultsError::write(path))
 }
 
-fn columns<'a>(results: &'a LocalizationResults, estimates: &'a [Pose2]) -> Vec<Column<'a>> {
-    let truth = results.ground_truth.as_deref();
-    let driven_m = distances_m(truth.unwrap_or(estimates));
-    let mut columns = vec![
-        column("frame", |row| Some(results.frames[row].to_string())),
-        number("time_s", results.times_s.as_deref(), 1.0),
-        column("distance_m", move |row| {
-            Some(format!("{:.4}", driven_m[row]))
-        }),
-    ];
-    columns.extend(pose_columns("truth", truth));
-    columns.extend(pose_columns("mcl", Some(estimates)));
-    columns.extend(error_columns("mcl", Some(estimates), truth));
-    columns.extend(pose_columns("refined", results.refined.as_deref()));
-    columns.extend(error_columns("refined", results.refined.as_deref(), truth));
-    columns.extend([
-        column("particles", |row| {
-            (!results.particles.is_empty()).then(|| results.particles.frame(row).len().to_string())
-        }),
-        column("state", |row| {
-            Some(results.states.as_ref()?[row].to_string())
-        }),
-        number("runtime_ms", results.runtimes_s.as_deref(), 1e3),
-        number(
+/// Columns with a title and one cell per frame.
+struct FrameTable {
+    rows: usize,
+    columns: Vec<(String, Vec<String>)>,
+}
+
+impl FrameTable {
+    fn new(results: &LocalizationResults, estimates: &[Pose2]) -> Self {
+        let truth = results.ground_truth.as_deref();
+        let refined = results.refined.as_deref();
+        let driven_m = distances_m(truth.unwrap_or(estimates));
+        let particles: Vec<usize> = (0..results.particles.len())
+            .map(|row| results.particles.frame(row).len())
+            .collect();
+        let particles = (!particles.is_empty()).then_some(particles);
+        let mut table = Self {
+            rows: results.len(),
+            columns: Vec::new(),
+        };
+        table.add("frame", Some(&results.frames), usize::to_string);
+        table.add_numbers("time_s", results.times_s.as_deref(), |time_s| *time_s);
+        table.add_numbers("distance_m", Some(&driven_m), |distance_m| *distance_m);
+        table.add_poses("truth", truth);
+        table.add_poses("mcl", Some(estimates));
+        table.add_errors("mcl", Some(estimates), truth);
+        table.add_poses("refined", refined);
+        table.add_errors("refined", refined, truth);
+        table.add("particles", particles.as_deref(), usize::to_string);
+        table.add("state", results.states.as_deref(), u8::to_string);
+        table.add_numbers("runtime_ms", results.runtimes_s.as_deref(), |time_s| {
+            1e3 * time_s
+        });
+        table.add_numbers(
             "refine_runtime_ms",
             results.refine_runtimes_s.as_deref(),
-            1e3,
-        ),
-    ]);
-    columns
-}
-
-fn column<'a>(title: &str, cell: impl Fn(usize) -> Option<String> + 'a) -> Column<'a> {
-    Column {
-        title: title.to_owned(),
-        cell: Box::new(cell),
+            |time_s| 1e3 * time_s,
+        );
+        table
     }
-}
 
-fn number<'a>(title: &str, numbers: Option<&'a [f64]>, scale: f64) -> Column<'a> {
-    column(title, move |row| {
-        Some(format!("{:.4}", scale * numbers?[row]))
-    })
-}
+    /// Adds a column with a cell per item, or with empty cells.
+    fn add<T>(
+        &mut self,
+        title: impl Into<String>,
+        items: Option<&[T]>,
+        cell: impl Fn(&T) -> String,
+    ) {
+        let cells = match items {
+            Some(items) => items.iter().map(cell).collect(),
+            None => vec![String::new(); self.rows],
+        };
+        self.columns.push((title.into(), cells));
+    }
 
-fn pose_columns<'a>(name: &str, poses: Option<&'a [Pose2]>) -> [Column<'a>; 3] {
-    let of = |title: &str, part: fn(&Pose2) -> f64| {
-        column(&format!("{name}_{title}"), move |row| {
-            Some(format!("{:.4}", part(&poses?[row])))
-        })
-    };
-    [
-        of("x_m", |pose| pose.translation.x),
-        of("y_m", |pose| pose.translation.y),
-        of("heading_deg", |pose| pose.rotation.angle().to_degrees()),
-    ]
-}
+    fn add_numbers<T>(
+        &mut self,
+        title: impl Into<String>,
+        items: Option<&[T]>,
+        number: impl Fn(&T) -> f64,
+    ) {
+        self.add(title, items, |item| format!("{:.4}", number(item)));
+    }
 
-fn error_columns<'a>(
-    name: &str,
-    estimates: Option<&'a [Pose2]>,
-    truth: Option<&'a [Pose2]>,
-) -> [Column<'a>; 4] {
-    let of = |title: &str, part: fn(&PlanarError) -> f64| {
-        column(&format!("{name}_{title}"), move |row| {
-            let error = PlanarError::between(&estimates?[row], &truth?[row]);
-            Some(format!("{:.4}", part(&error)))
-        })
-    };
-    [
-        of("position_error_m", PlanarError::distance_m),
-        of("along_error_m", |error| error.along_m),
-        of("across_error_m", |error| error.across_m),
-        of("heading_error_deg", |error| error.turn_rad.to_degrees()),
-    ]
-}
+    fn add_poses(&mut self, name: &str, poses: Option<&[Pose2]>) {
+        self.add_numbers(format!("{name}_x_m"), poses, |pose| pose.translation.x);
+        self.add_numbers(format!("{name}_y_m"), poses, |pose| pose.translation.y);
+        self.add_numbers(format!("{name}_heading_deg"), poses, |pose| {
+            pose.rotation.angle().to_degrees()
+        });
+    }
 
-fn write_rows(file: &mut impl Write, columns: &[Column], rows: usize) -> io::Result<()> {
-    let titles: Vec<&str> = columns.iter().map(|column| column.title.as_str()).collect();
-    writeln!(file, "{}", titles.join(","))?;
-    for row in 0..rows {
-        let cells: Vec<String> = columns
+    fn add_errors(&mut self, name: &str, poses: Option<&[Pose2]>, truth: Option<&[Pose2]>) {
+        let errors = poses
+            .zip(truth)
+            .map(|(poses, truth)| planar_errors(poses, truth));
+        let errors = errors.as_deref();
+        self.add_numbers(
+            format!("{name}_position_error_m"),
+            errors,
+            PlanarError::distance_m,
+        );
+        self.add_numbers(format!("{name}_along_error_m"), errors, |e| e.along_m);
+        self.add_numbers(format!("{name}_across_error_m"), errors, |e| e.across_m);
+        self.add_numbers(format!("{name}_heading_error_deg"), errors, |e| {
+            e.turn_rad.to_degrees()
+        });
+    }
+
+    fn write(&self, file: &mut impl Write) -> io::Result<()> {
+        let titles: Vec<&str> = self
+            .columns
             .iter()
-            .map(|column| (column.cell)(row).unwrap_or_default())
+            .map(|column| column.0.as_str())
             .collect();
-        writeln!(file, "{}", cells.join(","))?;
+        writeln!(file, "{}", titles.join(","))?;
+        for row in 0..self.rows {
+            let cells: Vec<&str> = (self.columns.iter())
+                .map(|column| column.1[row].as_str())
+                .collect();
+            writeln!(file, "{}", cells.join(","))?;
+        }
+        Ok(())
     }
-    Ok(())
 }
 
 #[cfg(test)]

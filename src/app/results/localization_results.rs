@@ -1,37 +1,34 @@
-//! What a localization run leaves on disk: particles, estimates and truth, one row per frame.
+//! Results of localization and refinement: particles, estimates and ground truth, one row per frame.
 //!
-//! The file is a NumPy `.npz`. Its first three arrays are those of range-mcl (Chen et al., ICRA
-//! 2021), so that the parent's evaluation reads our files, and files that hold nothing but these
-//! three are read here:
+//! Stored as a NumPy `.npz` file. Its first three arrays are those of range-mcl (Chen et al., ICRA
+//! 2021): range-mcl's evaluation script reads our files, and its files are read here.
 //!
 //! | array | shape | type | content |
 //! |---|---|---|---|
-//! | `particles` | (rows, N, 4) | float32 | x, y [m], heading [rad], weight; rows of zeros after the last particle |
-//! | `start_idx` | () | int64 | first row that was localized; the rows before it are zero |
+//! | `particles` | (rows, N, 4) | float32 | x, y [m], heading [rad], weight; zeros after the last particle |
+//! | `start_idx` | () | int64 | first localized row; the rows before it are zero |
 //! | `numParticles` | () | int64 | N |
 //! | `frames` | (rows) | int64 | number of the frame in its recording |
 //! | `estimates`, `refined`, `ground_truth`, `odometry` | (rows, 3) | float64 | x, y [m], heading [rad] |
 //! | `covariances`, `refined_covariances` | (rows, 9) | float64 | of x, y, heading, row-major [m², m rad, rad²] |
-//! | `times_s`, `runtimes_s`, `refine_runtimes_s` | (rows) | float64 | time of the frame; time spent on it [s] |
-//! | `states` | (rows) | uint8 | what the filter said about itself |
+//! | `times_s`, `runtimes_s`, `refine_runtimes_s` | (rows) | float64 | time of the frame; computing time [s] |
+//! | `states` | (rows) | uint8 | state of the filter |
 //!
-//! All but the first three may be absent. In rows before `start_idx` they are NaN.
-
-use std::path::PathBuf;
+//! All but the first three are optional. In rows before `start_idx` they are NaN.
 
 use nalgebra::Matrix3;
 
-use super::npy::NpyError;
+use super::error::ResultsError;
 use crate::evaluation::{ParticleRow, RangeMclRules};
 use crate::geometry::Pose2;
 
-/// Particles of many frames; as much memory as there were particles, however many there may be.
+/// Particles of many frames, without the padding of the stored array.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ParticleLog {
-    /// Most particles that a frame may have.
+    /// Largest number of particles per frame: `numParticles`, the extent of the stored array.
     capacity: usize,
     rows: Vec<ParticleRow>,
-    /// Where the particles of each frame end in `rows`.
+    /// Index in `rows` after the last particle of each frame.
     ends: Vec<usize>,
 }
 
@@ -44,12 +41,12 @@ impl ParticleLog {
         }
     }
 
-    /// Appends the particles of the next frame; where there are more than the capacity, it grows.
+    /// Appends the particles of the next frame; the capacity grows if they exceed it.
     pub fn push_frame(&mut self, particles: impl IntoIterator<Item = ParticleRow>) {
-        let before = self.rows.len();
+        let begin = self.rows.len();
         self.rows.extend(particles);
         self.ends.push(self.rows.len());
-        self.capacity = self.capacity.max(self.rows.len() - before);
+        self.capacity = self.capacity.max(self.rows.len() - begin);
     }
 
     /// The particles of a frame by its row.
@@ -60,9 +57,9 @@ impl ParticleLog {
 
     /// Multiplies the positions of all particles.
     pub fn scale_positions(&mut self, factor: f32) {
-        for row in &mut self.rows {
-            row[0] *= factor;
-            row[1] *= factor;
+        for [x, y, ..] in &mut self.rows {
+            *x *= factor;
+            *y *= factor;
         }
     }
 
@@ -76,38 +73,38 @@ impl ParticleLog {
         self.ends.is_empty()
     }
 
-    /// `numParticles`: the extent of the stored array.
+    /// Largest number of particles per frame.
     pub fn capacity(&self) -> usize {
         self.capacity
     }
 }
 
-/// One row per localized frame; what is absent was not asked for or is not known.
+/// Results of a run, one row per localized frame; `None` if not computed or not known.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LocalizationResults {
     /// Numbers of the frames in their recording, ascending.
     pub frames: Vec<usize>,
     /// Particles after motion, weighting and resampling.
     pub particles: ParticleLog,
-    /// The filter's estimate.
+    /// The filter's estimates.
     pub estimates: Option<Vec<Pose2>>,
     /// The refined trajectory.
     pub refined: Option<Vec<Pose2>>,
     /// The ground truth.
     pub ground_truth: Option<Vec<Pose2>>,
-    /// The odometry that came to each frame, `previous_from_current`.
+    /// The odometry increment into each frame, `previous_from_current`.
     pub odometry: Option<Vec<Pose2>>,
-    /// Covariance of the estimate in x, y [m], heading [rad].
+    /// Covariances of the estimates in x, y [m], heading [rad].
     pub covariances: Option<Vec<Matrix3<f64>>>,
-    /// Covariance of the refined pose.
+    /// Covariances of the refined poses.
     pub refined_covariances: Option<Vec<Matrix3<f64>>>,
     /// Times of the frames [s].
     pub times_s: Option<Vec<f64>>,
-    /// Time that localization spent on each frame [s].
+    /// Computing time of localization per frame [s].
     pub runtimes_s: Option<Vec<f64>>,
-    /// Time that refinement spent on each frame [s].
+    /// Computing time of refinement per frame [s].
     pub refine_runtimes_s: Option<Vec<f64>>,
-    /// What the filter said about itself, as a number.
+    /// State of the filter as a number.
     pub states: Option<Vec<u8>>,
 }
 
@@ -122,9 +119,9 @@ impl LocalizationResults {
         self.frames.is_empty()
     }
 
-    /// The results of some of the frames, by their rows.
+    /// The results of a subset of the rows.
     #[must_use]
-    pub fn rows(&self, rows: &[usize]) -> Self {
+    pub fn select(&self, rows: &[usize]) -> Self {
         fn pick<T: Clone>(column: &Option<Vec<T>>, rows: &[usize]) -> Option<Vec<T>> {
             let column = column.as_ref()?;
             Some(rows.iter().map(|&row| column[row].clone()).collect())
@@ -151,7 +148,7 @@ impl LocalizationResults {
         }
     }
 
-    /// The stored estimates; where the file has none, those that `rules` make of the particles.
+    /// The stored estimates, or if there are none, weighted means of the particles.
     pub fn estimates_or_particle_means(
         &self,
         rules: &RangeMclRules,
@@ -160,19 +157,17 @@ impl LocalizationResults {
             return Ok(estimates.clone());
         }
         let capacity = self.particles.capacity();
-        self.frames
-            .iter()
-            .enumerate()
-            .map(|(row, &frame)| {
-                rules
-                    .estimate(self.particles.frame(row), capacity)
-                    .ok_or(ResultsError::ZeroWeights { frame })
+        (0..self.particles.len())
+            .map(|row| {
+                let mean = rules.estimate(self.particles.frame(row), capacity);
+                let frame = self.frames[row];
+                mean.ok_or(ResultsError::ZeroWeights { frame })
             })
             .collect()
     }
 
-    /// Names and lengths of the arrays that are there, to check that all have one row per frame.
-    pub(super) fn lengths(&self) -> Vec<(&'static str, usize)> {
+    /// The first array that does not have one row per frame, and its number of rows.
+    pub(super) fn incomplete_array(&self) -> Option<(&'static str, usize)> {
         fn length<T>(column: &Option<Vec<T>>) -> Option<usize> {
             column.as_ref().map(Vec::len)
         }
@@ -191,64 +186,6 @@ impl LocalizationResults {
         ]
         .into_iter()
         .filter_map(|(name, length)| Some((name, length?)))
-        .collect()
+        .find(|(_, length)| *length != self.len())
     }
-}
-
-/// What can be wrong with a result file.
-#[derive(Debug, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages say it")]
-pub enum ResultsError {
-    #[error("cannot read {}: {source}", path.display())]
-    Read {
-        path: PathBuf,
-        source: std::io::Error,
-    },
-    #[error("cannot write {}: {source}", path.display())]
-    Write {
-        path: PathBuf,
-        source: std::io::Error,
-    },
-    #[error("{} is not a result file (.npz) or is cut off: {source}; run localize again", path.display())]
-    NotNpz {
-        path: PathBuf,
-        source: zip::result::ZipError,
-    },
-    #[error("{} has no array `{array}`; it needs `particles` and `start_idx`, as localize and range-mcl write them", path.display())]
-    MissingArray { path: PathBuf, array: &'static str },
-    #[error("{}, array `{array}`: {source}", path.display())]
-    BadArray {
-        path: PathBuf,
-        array: &'static str,
-        source: NpyError,
-    },
-    #[error("{}, array `{array}`, row {row}: {value} is not a number that can stand there", path.display())]
-    BadNumber {
-        path: PathBuf,
-        array: &'static str,
-        row: usize,
-        value: f64,
-    },
-    #[error("{}: start_idx is {start_idx}, but there are {rows} rows", path.display())]
-    StartBehindEnd {
-        path: PathBuf,
-        start_idx: f64,
-        rows: usize,
-    },
-    #[error("{}: `{array}` has {found} rows for {expected} frames", path.display())]
-    WrongLength {
-        path: PathBuf,
-        array: &'static str,
-        found: usize,
-        expected: usize,
-    },
-    #[error(
-        "the particles of frame {frame} have no weight, and the file holds no estimates; run localize again"
-    )]
-    ZeroWeights { frame: usize },
-    #[error("{} is not a report of fpmcl: {source}; run evaluate again", path.display())]
-    BadReport {
-        path: PathBuf,
-        source: serde_json::Error,
-    },
 }

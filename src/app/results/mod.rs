@@ -1,12 +1,12 @@
-//! Result files of a run: `results.npz`, `frames.csv`, `report.json` and `report.md`.
+//! Result files of a run: `localization.npz`, `frames.csv`, `report.json` and `report.md`.
 
-// The `.npz` file.
+// The results of a run and their `.npz` file.
+mod error;
 mod localization_results;
-mod npy;
+mod npz;
+mod results_file;
 #[cfg(test)]
-mod npz_tests;
-mod read;
-mod write;
+mod results_file_tests;
 // Tables and reports.
 mod frames;
 mod report;
@@ -15,8 +15,9 @@ mod rows;
 #[cfg(test)]
 pub(crate) mod kitti_07;
 
+pub use error::{ArrayError, ResultsError};
 pub use frames::write_frames_csv;
-pub use localization_results::{LocalizationResults, ParticleLog, ResultsError};
+pub use localization_results::{LocalizationResults, ParticleLog};
 pub use report::{Report, TrajectoryReport};
+pub use results_file::write_poses_npy;
 pub use rows::{MetricRow, Value};
-pub use write::write_poses_npy;

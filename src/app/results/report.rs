@@ -1,45 +1,33 @@
-//! The judgement of a run, as a file for programs and as tables for people.
+//! The report of a run: a JSON file for programs, tables for people.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::io::Write as _;
+use std::io::{self, Write as _};
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::localization_results::ResultsError;
+use super::error::ResultsError;
 use super::rows::{MetricRow, Value, metric_rows};
 use crate::app::output::write_atomically;
 use crate::evaluation::{RangeMclErrors, TrajectoryMetrics};
 
-/// What is said of one trajectory.
+/// Errors of one trajectory.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrajectoryReport {
-    /// By the parent's rules.
+    /// Errors as range-mcl's evaluation script computes them.
     pub range_mcl: RangeMclErrors,
-    /// By those of the literature.
+    /// Errors as defined in the literature.
     pub metrics: TrajectoryMetrics,
 }
 
-/// What is said of a run: `report.json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Report {
-    /// What was run, by name: the recording, the map, the odometry and where it came from, the
-    /// seed, the backend.
-    pub about: BTreeMap<String, String>,
-    /// The filter's estimates.
-    pub mcl: TrajectoryReport,
-    /// The refined trajectory, where there is one.
-    pub refined: Option<TrajectoryReport>,
-}
-
 impl TrajectoryReport {
-    /// All rows: the parent's verdict first.
+    /// All rows: those of range-mcl first.
     pub fn rows(&self) -> Vec<MetricRow> {
-        let range_mcl = [
+        let range_mcl = vec![
             MetricRow::new(
                 "range-mcl success: position error under converge_thres at every convergence_interval-th row",
-                Value::Flag(self.range_mcl.success),
+                self.range_mcl.success,
             ),
             MetricRow::new(
                 "range-mcl RMSE location [m]: position RMSE from row convergence_interval on, as range-mcl computes it",
@@ -50,67 +38,65 @@ impl TrajectoryReport {
                 self.range_mcl.rmse_yaw_deg,
             ),
         ];
-        [range_mcl.to_vec(), metric_rows(&self.metrics)].concat()
+        [range_mcl, metric_rows(&self.metrics)].concat()
     }
+}
+
+/// Errors of a run: `report.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Report {
+    /// Inputs and settings by name: the recording, the map, the odometry and its source, the
+    /// seed, the renderer.
+    pub about: BTreeMap<String, String>,
+    /// The filter's estimates.
+    pub mcl: TrajectoryReport,
+    /// The refined trajectory, if there is one.
+    pub refined: Option<TrajectoryReport>,
 }
 
 impl Report {
     /// Writes `report.json`.
     pub fn write_json(&self, path: &Path) -> Result<(), ResultsError> {
         let json = serde_json::to_string_pretty(self)
-            .map_err(std::io::Error::other)
-            .map_err(|source| ResultsError::Write {
-                path: path.to_owned(),
-                source,
-            })?;
+            .map_err(|error| ResultsError::write(path)(io::Error::other(error)))?;
         write_text(path, &(json + "\n"))
     }
 
     /// Reads `report.json`.
     pub fn read_json(path: &Path) -> Result<Self, ResultsError> {
-        let text = std::fs::read_to_string(path).map_err(|source| ResultsError::Read {
-            path: path.to_owned(),
-            source,
-        })?;
+        let text = std::fs::read_to_string(path).map_err(ResultsError::read(path))?;
         serde_json::from_str(&text).map_err(|source| ResultsError::BadReport {
             path: path.to_owned(),
             source,
         })
     }
 
-    /// A table for the terminal: one column per trajectory, numbers to the right.
+    /// A table for the terminal: one column per trajectory, numbers right-aligned.
     pub fn to_text(&self) -> String {
         let rows = self.joined_rows();
-        let width = rows
-            .iter()
-            .map(|(row, _)| row.name.len())
-            .max()
-            .unwrap_or(0);
-        let mut text = self.about_lines("", ": ", "");
+        let width = rows.iter().map(|(row, _)| row.name.len()).max();
+        let width = width.unwrap_or(0);
+        let mut text = self.about_lines("");
         if !text.is_empty() {
             text.push('\n');
         }
-        let refined_title = self.refined.as_ref().map_or("", |_| "refined");
-        let _ = writeln!(
-            text,
-            "{:width$}  {:>10}  {refined_title:>10}  unit",
-            "", "MCL"
-        );
-        for (row, refined) in &rows {
-            let refined = refined.map_or(String::new(), |value| value.to_string());
-            let line = format!(
-                "{:width$}  {:>10}  {refined:>10}  {}",
-                row.name, row.value, row.unit
-            );
+        let mut add_line = |name: &str, mcl: &str, refined: &str, unit: &str| {
+            let line = format!("{name:width$}  {mcl:>10}  {refined:>10}  {unit}");
             text.push_str(line.trim_end());
             text.push('\n');
+        };
+        let refined_title = self.refined.as_ref().map_or("", |_| "refined");
+        add_line("", "MCL", refined_title, "unit");
+        for (row, refined) in &rows {
+            let refined = refined.map_or(String::new(), |value| value.to_string());
+            add_line(row.name, &row.value.to_string(), &refined, row.unit);
         }
         text
     }
 
     /// The same table in Markdown, with definitions.
     pub fn to_markdown(&self) -> String {
-        let mut text = self.about_lines("- ", ": ", "");
+        let mut text = self.about_lines("- ");
         let refined_title = self.refined.as_ref().map_or("", |_| " refined |");
         let refined_rule = self.refined.as_ref().map_or("", |_| "---:|");
         let _ = writeln!(
@@ -119,7 +105,7 @@ impl Report {
         );
         for (row, refined) in self.joined_rows() {
             let refined = refined.map_or(String::new(), |value| format!(" {value} |"));
-            // A bar inside a cell would end it.
+            // A bar inside a cell would end the cell.
             let definition = row.definition.replace('|', "\\|");
             let _ = writeln!(
                 text,
@@ -137,30 +123,22 @@ impl Report {
 
     /// Each row of the filter with the value of the same row of the refined trajectory.
     fn joined_rows(&self) -> Vec<(MetricRow, Option<Value>)> {
-        let refined = self.refined.as_ref().map(TrajectoryReport::rows);
-        self.mcl
-            .rows()
-            .into_iter()
-            .enumerate()
-            .map(|(index, row)| (row, refined.as_ref().map(|rows| rows[index].value)))
+        let mut refined = self.refined.iter().flat_map(TrajectoryReport::rows);
+        (self.mcl.rows().into_iter())
+            .map(|row| (row, refined.next().map(|row| row.value)))
             .collect()
     }
 
-    fn about_lines(&self, before: &str, between: &str, after: &str) -> String {
-        self.about
-            .iter()
-            .map(|(name, value)| format!("{before}{name}{between}{value}{after}\n"))
+    fn about_lines(&self, prefix: &str) -> String {
+        (self.about.iter())
+            .map(|(name, value)| format!("{prefix}{name}: {value}\n"))
             .collect()
     }
 }
 
 fn write_text(path: &Path, text: &str) -> Result<(), ResultsError> {
-    write_atomically(path, |file| file.write_all(text.as_bytes())).map_err(|source| {
-        ResultsError::Write {
-            path: path.to_owned(),
-            source,
-        }
-    })
+    write_atomically(path, |file| file.write_all(text.as_bytes()))
+        .map_err(ResultsError::write(path))
 }
 
 #[cfg(test)]

@@ -40,9 +40,21 @@ impl From<f64> for Value {
     }
 }
 
-impl From<Option<f64>> for Value {
-    fn from(number: Option<f64>) -> Self {
-        number.map_or(Self::Absent, Self::Number)
+impl From<usize> for Value {
+    fn from(count: usize) -> Self {
+        Self::Count(count)
+    }
+}
+
+impl From<bool> for Value {
+    fn from(flag: bool) -> Self {
+        Self::Flag(flag)
+    }
+}
+
+impl<T: Into<Value>> From<Option<T>> for Value {
+    fn from(value: Option<T>) -> Self {
+        value.map_or(Self::Absent, Into::into)
     }
 }
 
@@ -164,11 +176,11 @@ fn success_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
     vec![
         MetricRow::new(
             "strict success: converged, and every frame from there to the end is within the limits (default 0.5 m and 2 deg)",
-            Value::Flag(found.is_some_and(|found| found.kept)),
+            found.is_some_and(|found| found.kept),
         ),
         MetricRow::new(
             "time to convergence [frames]: frames before the first of ten good frames in a row",
-            found.map_or(Value::Absent, |found| Value::Count(found.row)),
+            found.map(|found| found.row),
         ),
         MetricRow::new(
             "time to convergence [m]: distance driven until then",
@@ -261,7 +273,7 @@ fn runtime_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
             "runtime of first frame [ms]: the first frame of the run, with the start in it",
             metrics.first_runtime_s.map(|time_s| 1e3 * time_s),
         ),
-        MetricRow::new("frames: frames that count", Value::Count(metrics.frames)),
+        MetricRow::new("frames: frames that count", metrics.frames),
         MetricRow::new(
             "distance [m]: distance driven in them, by the truth",
             metrics.distance_m,

@@ -1,0 +1,250 @@
+//! Arrays of a `.npz` file, read as streams of numbers and written from iterators.
+//!
+//! Memory grows with the data that a file holds, not with what its headers claim.
+
+use std::fs::File;
+use std::io::{self, BufReader, BufWriter, Read, Seek, Write};
+use std::path::Path;
+
+use npyz::{AutoSerialize, DType, Deserialize, NpyFile, NpyHeader, Order, TypeChar, WriterBuilder};
+use zip::result::ZipError;
+use zip::write::SimpleFileOptions;
+use zip::{ZipArchive, ZipWriter};
+
+use super::error::{ArrayError, ResultsError};
+
+/// Size of the buffer between decompression and numbers [bytes].
+const BUFFER_BYTES: usize = 1 << 16;
+
+/// Largest array that is written without the 64-bit extensions of the zip format [bytes].
+const ZIP32_LIMIT: usize = u32::MAX as usize - BUFFER_BYTES;
+
+/// A `.npz` file that is open for reading.
+pub struct NpzReader<'a> {
+    path: &'a Path,
+    archive: ZipArchive<BufReader<File>>,
+}
+
+impl<'a> NpzReader<'a> {
+    /// Opens a file.
+    pub fn open(path: &'a Path) -> Result<Self, ResultsError> {
+        let file = File::open(path).map_err(ResultsError::read(path))?;
+        let archive = ZipArchive::new(BufReader::new(file)).map_err(|error| match error {
+            ZipError::Io(source) => ResultsError::read(path)(source),
+            source => ResultsError::NotNpz {
+                path: path.to_owned(),
+                source,
+            },
+        })?;
+        Ok(Self { path, archive })
+    }
+
+    /// Opens an array; `None` if the file has none of this name.
+    pub fn array(&mut self, name: &'static str) -> Result<Option<Array<'_>>, ResultsError> {
+        let entry = match self.archive.by_name(&format!("{name}.npy")) {
+            Ok(entry) => entry,
+            Err(ZipError::FileNotFound) => return Ok(None),
+            Err(source) => {
+                return Err(ResultsError::NotNpz {
+                    path: self.path.to_owned(),
+                    source,
+                });
+            }
+        };
+        let bytes = entry.size();
+        let entry = BufReader::with_capacity(BUFFER_BYTES, entry).take(bytes);
+        let (shape, numbers) = open_array(entry).map_err(|source| ResultsError::BadArray {
+            path: self.path.to_owned(),
+            array: name,
+            source,
+        })?;
+        Ok(Some(Array {
+            path: self.path,
+            name,
+            shape,
+            numbers,
+        }))
+    }
+
+    /// Opens an array that must be there.
+    pub fn required(&mut self, name: &'static str) -> Result<Array<'_>, ResultsError> {
+        let path = self.path;
+        self.array(name)?.ok_or_else(|| ResultsError::MissingArray {
+            path: path.to_owned(),
+            array: name,
+        })
+    }
+}
+
+/// Numbers of any type in row-major order, converted to `f64`.
+type Numbers<'a> = Box<dyn Iterator<Item = io::Result<f64>> + 'a>;
+
+/// An array whose numbers are still to be read.
+pub struct Array<'a> {
+    path: &'a Path,
+    name: &'static str,
+    /// Extent of each axis; empty for a scalar.
+    pub shape: Vec<usize>,
+    numbers: Numbers<'a>,
+}
+
+impl Array<'_> {
+    /// Checks the shape against a pattern, in which `None` is any extent.
+    pub fn expect_shape(
+        &self,
+        pattern: &[Option<usize>],
+        expected: &'static str,
+    ) -> Result<(), ResultsError> {
+        let is_expected = self.shape.len() == pattern.len()
+            && (self.shape.iter().zip(pattern))
+                .all(|(&found, expected)| expected.is_none_or(|expected| expected == found));
+        if is_expected {
+            return Ok(());
+        }
+        Err(self.error(ArrayError::WrongShape {
+            found: self.shape.clone(),
+            expected,
+        }))
+    }
+
+    /// Reads the next `N` numbers; integers beyond 2⁵³ are rounded.
+    pub fn next_row<const N: usize>(&mut self) -> Result<[f64; N], ResultsError> {
+        let mut row = [0.0; N];
+        for number in &mut row {
+            let next = self.numbers.next();
+            *number = next
+                .unwrap_or_else(|| Err(io::ErrorKind::UnexpectedEof.into()))
+                .map_err(|source| self.error(source.into()))?;
+        }
+        Ok(row)
+    }
+
+    /// As [`next_row`](Self::next_row), of finite numbers; `row` is its index for the message.
+    pub fn next_finite_row<const N: usize>(
+        &mut self,
+        row: usize,
+    ) -> Result<[f64; N], ResultsError> {
+        let numbers = self.next_row()?;
+        match numbers.iter().find(|number| !number.is_finite()) {
+            Some(&value) => Err(ResultsError::BadNumber {
+                path: self.path.to_owned(),
+                array: self.name,
+                row,
+                value,
+            }),
+            None => Ok(numbers),
+        }
+    }
+
+    fn error(&self, source: ArrayError) -> ResultsError {
+        ResultsError::BadArray {
+            path: self.path.to_owned(),
+            array: self.name,
+            source,
+        }
+    }
+}
+
+/// Reads the header of an array and checks that the bytes after it are those that it claims.
+fn open_array<'a>(
+    mut entry: io::Take<impl Read + 'a>,
+) -> Result<(Vec<usize>, Numbers<'a>), ArrayError> {
+    let header = NpyHeader::from_reader(&mut entry)?;
+    let DType::Plain(element) = header.dtype() else {
+        return Err(ArrayError::NotNumbers {
+            found: header.dtype().descr(),
+        });
+    };
+    if header.order() == Order::Fortran && header.shape().len() > 1 {
+        return Err(ArrayError::FortranOrder);
+    }
+    let bytes = u128::from(element.size_field());
+    let needed = (header.shape().iter()).fold(bytes, |product, &extent| {
+        product.saturating_mul(u128::from(extent))
+    });
+    if needed != u128::from(entry.limit()) {
+        return Err(ArrayError::WrongSize {
+            shape: header.shape().to_vec(),
+            needed,
+            found: entry.limit(),
+        });
+    }
+    let shape = header
+        .shape()
+        .iter()
+        .map(|&extent| extent as usize)
+        .collect();
+    let file = NpyFile::with_header(header, entry);
+    let numbers = match (element.type_char(), element.size_field()) {
+        (TypeChar::Float, 4) => numbers::<f32>(file, f64::from),
+        (TypeChar::Float, 8) => numbers::<f64>(file, |number| number),
+        (TypeChar::Int, 4) => numbers::<i32>(file, f64::from),
+        (TypeChar::Int, 8) => numbers::<i64>(file, |number| number as f64),
+        (TypeChar::Uint, 1) => numbers::<u8>(file, f64::from),
+        (TypeChar::Bool, 1) => numbers::<bool>(file, f64::from),
+        _ => {
+            return Err(ArrayError::NotNumbers {
+                found: file.dtype().descr(),
+            });
+        }
+    };
+    Ok((shape, numbers?))
+}
+
+fn numbers<'a, T: Deserialize + 'a>(
+    file: NpyFile<impl Read + 'a>,
+    convert: impl Fn(T) -> f64 + 'a,
+) -> Result<Numbers<'a>, ArrayError> {
+    let elements = file.data::<T>().map_err(io::Error::other)?;
+    Ok(Box::new(elements.map(move |element| element.map(&convert))))
+}
+
+/// A compressed `.npz` file that is being written.
+pub struct NpzWriter<W: Write + Seek> {
+    archive: ZipWriter<W>,
+}
+
+impl<W: Write + Seek> NpzWriter<W> {
+    /// Starts a file.
+    pub fn new(writer: W) -> Self {
+        Self {
+            archive: ZipWriter::new(writer),
+        }
+    }
+
+    /// Adds an array of a shape with all its numbers in row-major order.
+    pub fn add<T: AutoSerialize>(
+        &mut self,
+        name: &str,
+        shape: &[usize],
+        numbers: impl IntoIterator<Item = T>,
+    ) -> io::Result<()> {
+        let options = SimpleFileOptions::default()
+            .compression_method(zip::CompressionMethod::Deflated)
+            .large_file(shape.iter().product::<usize>() * size_of::<T>() > ZIP32_LIMIT);
+        self.archive.start_file(format!("{name}.npy"), options)?;
+        write_npy(&mut self.archive, shape, numbers)
+    }
+
+    /// Writes the directory of the file.
+    pub fn finish(self) -> io::Result<()> {
+        self.archive.finish()?;
+        Ok(())
+    }
+}
+
+/// Writes one array in NumPy's format.
+pub fn write_npy<T: AutoSerialize>(
+    writer: impl Write,
+    shape: &[usize],
+    numbers: impl IntoIterator<Item = T>,
+) -> io::Result<()> {
+    let shape: Vec<u64> = shape.iter().map(|&extent| extent as u64).collect();
+    let mut array = npyz::WriteOptions::new()
+        .default_dtype()
+        .shape(&shape)
+        .writer(BufWriter::new(writer))
+        .begin_nd()?;
+    array.extend(numbers)?;
+    array.finish()
+}

@@ -1,0 +1,274 @@
+//! [`LocalizationResults`] as a `.npz` file.
+
+use std::io::{self, Seek, Write};
+use std::iter::repeat_n;
+use std::path::Path;
+
+use nalgebra::{Matrix3, Vector2};
+
+use super::error::ResultsError;
+use super::localization_results::{LocalizationResults, ParticleLog};
+use super::npz::{Array, NpzReader, NpzWriter, write_npy};
+use crate::app::output::write_atomically;
+use crate::evaluation::ParticleRow;
+use crate::geometry::Pose2;
+
+impl LocalizationResults {
+    /// Reads a file of fpmcl or of range-mcl.
+    pub fn read(path: &Path) -> Result<Self, ResultsError> {
+        let mut npz = NpzReader::open(path)?;
+        let (rows, first, particles) = read_particles(path, &mut npz)?;
+        let mut file = RowReader {
+            path,
+            npz,
+            rows,
+            first,
+        };
+        let frames = file.frames()?;
+        let mut poses = |name| file.rows(name, pose_from_row);
+        let (estimates, refined) = (poses("estimates")?, poses("refined")?);
+        let (ground_truth, odometry) = (poses("ground_truth")?, poses("odometry")?);
+        let mut matrices = |name| file.rows(name, |row: [f64; 9]| Matrix3::from_row_slice(&row));
+        let (covariances, refined_covariances) =
+            (matrices("covariances")?, matrices("refined_covariances")?);
+        Ok(Self {
+            frames,
+            particles,
+            estimates,
+            refined,
+            ground_truth,
+            odometry,
+            covariances,
+            refined_covariances,
+            times_s: file.rows("times_s", |[time_s]| time_s)?,
+            runtimes_s: file.rows("runtimes_s", |[time_s]| time_s)?,
+            refine_runtimes_s: file.rows("refine_runtimes_s", |[time_s]| time_s)?,
+            states: file.rows("states", |[state]| state as u8)?,
+        })
+    }
+
+    /// Writes the file, replacing an existing one only when the new one is complete.
+    ///
+    /// Row k is frame k, as in range-mcl, if the frames are consecutive; otherwise there is one
+    /// row per localized frame.
+    pub fn write(&self, path: &Path) -> Result<(), ResultsError> {
+        if let Some((array, found)) = self.incomplete_array() {
+            return Err(ResultsError::WrongLength {
+                path: path.to_owned(),
+                array,
+                found,
+                expected: self.len(),
+            });
+        }
+        write_atomically(path, |file| self.write_to(file)).map_err(ResultsError::write(path))
+    }
+
+    fn write_to(&self, file: impl Write + Seek) -> io::Result<()> {
+        let leading = self.leading_rows();
+        let rows = leading + self.len();
+        let capacity = self.particles.capacity();
+        let mut npz = NpzWriter::new(file);
+        npz.add(
+            "particles",
+            &[rows, capacity, 4],
+            repeat_n([0.0; 4], leading * capacity)
+                .chain((0..self.len()).flat_map(|row| self.padded_particles(row)))
+                .flatten(),
+        )?;
+        npz.add("start_idx", &[], [leading as i64])?;
+        npz.add("numParticles", &[], [capacity as i64])?;
+        let frames = (0..leading).chain(self.frames.iter().copied());
+        npz.add("frames", &[rows], frames.map(|frame| frame as i64))?;
+        let mut file = RowWriter { npz, leading };
+        file.rows("estimates", &self.estimates, row_from_pose)?;
+        file.rows("refined", &self.refined, row_from_pose)?;
+        file.rows("ground_truth", &self.ground_truth, row_from_pose)?;
+        file.rows("odometry", &self.odometry, row_from_pose)?;
+        file.rows("covariances", &self.covariances, row_from_matrix)?;
+        file.rows(
+            "refined_covariances",
+            &self.refined_covariances,
+            row_from_matrix,
+        )?;
+        file.numbers("times_s", &self.times_s, f64::NAN)?;
+        file.numbers("runtimes_s", &self.runtimes_s, f64::NAN)?;
+        file.numbers("refine_runtimes_s", &self.refine_runtimes_s, f64::NAN)?;
+        file.numbers("states", &self.states, 0)?;
+        file.npz.finish()
+    }
+
+    /// The number of empty rows before the first frame that make row k frame k.
+    fn leading_rows(&self) -> usize {
+        let first = self.frames.first().copied().unwrap_or(0);
+        let is_consecutive =
+            (self.frames.iter().enumerate()).all(|(row, &frame)| frame == first + row);
+        if is_consecutive { first } else { 0 }
+    }
+
+    /// The particles of a frame, padded with zeros to the capacity.
+    fn padded_particles(&self, row: usize) -> impl Iterator<Item = ParticleRow> {
+        let particles = self.particles.frame(row);
+        let padding = self.particles.capacity() - particles.len();
+        particles.iter().copied().chain(repeat_n([0.0; 4], padding))
+    }
+}
+
+/// Writes poses as a NumPy array (rows, 3) of x, y [m] and heading [rad].
+pub fn write_poses_npy(path: &Path, poses: &[Pose2]) -> Result<(), ResultsError> {
+    let numbers = poses.iter().flat_map(row_from_pose);
+    write_atomically(path, |file| write_npy(file, &[poses.len(), 3], numbers))
+        .map_err(ResultsError::write(path))
+}
+
+fn pose_from_row([x, y, heading]: [f64; 3]) -> Pose2 {
+    Pose2::new(Vector2::new(x, y), heading)
+}
+
+fn row_from_pose(pose: &Pose2) -> [f64; 3] {
+    let t = pose.translation;
+    [t.x, t.y, pose.rotation.angle()]
+}
+
+fn row_from_matrix(matrix: &Matrix3<f64>) -> [f64; 9] {
+    std::array::from_fn(|index| matrix[(index / 3, index % 3)])
+}
+
+/// Writes arrays of one row per frame after `leading` empty rows.
+struct RowWriter<W: Write + Seek> {
+    npz: NpzWriter<W>,
+    leading: usize,
+}
+
+impl<W: Write + Seek> RowWriter<W> {
+    fn rows<T, const N: usize>(
+        &mut self,
+        name: &str,
+        items: &Option<Vec<T>>,
+        row: impl Fn(&T) -> [f64; N],
+    ) -> io::Result<()> {
+        let Some(items) = items else { return Ok(()) };
+        let numbers = repeat_n([f64::NAN; N], self.leading).chain(items.iter().map(row));
+        let shape = [self.leading + items.len(), N];
+        self.npz.add(name, &shape, numbers.flatten())
+    }
+
+    fn numbers<T: npyz::AutoSerialize + Copy>(
+        &mut self,
+        name: &str,
+        items: &Option<Vec<T>>,
+        empty: T,
+    ) -> io::Result<()> {
+        let Some(items) = items else { return Ok(()) };
+        let numbers = repeat_n(empty, self.leading).chain(items.iter().copied());
+        self.npz.add(name, &[self.leading + items.len()], numbers)
+    }
+}
+
+/// Reads the number of rows, the first row that was localized, and the particles from there on.
+fn read_particles(
+    path: &Path,
+    npz: &mut NpzReader,
+) -> Result<(usize, usize, ParticleLog), ResultsError> {
+    let [start_idx] = {
+        let mut array = npz.required("start_idx")?;
+        array.expect_shape(&[], "one number ()")?;
+        array.next_row()?
+    };
+    let mut array = npz.required("particles")?;
+    array.expect_shape(&[None, None, Some(4)], "(frames, N, 4)")?;
+    let (rows, capacity) = (array.shape[0], array.shape[1]);
+    if !(start_idx >= 0.0 && (start_idx as usize) < rows.max(1)) {
+        return Err(ResultsError::StartBehindEnd {
+            path: path.to_owned(),
+            start_idx,
+            rows,
+        });
+    }
+    let first = start_idx as usize;
+    let mut log = ParticleLog::new(capacity);
+    for row in 0..rows {
+        let particles = next_particles(&mut array, row, capacity)?;
+        if row >= first {
+            log.push_frame(particles);
+        }
+    }
+    Ok((rows, first, log))
+}
+
+/// Reads the particles of a frame without the padding after the last.
+fn next_particles(
+    array: &mut Array,
+    row: usize,
+    capacity: usize,
+) -> Result<Vec<ParticleRow>, ResultsError> {
+    let mut particles = Vec::new();
+    let mut zeros = 0;
+    for _ in 0..capacity {
+        let particle: [f64; 4] = array.next_finite_row(row)?;
+        if particle == [0.0; 4] {
+            zeros += 1;
+        } else {
+            particles.resize(particles.len() + zeros, [0.0; 4]);
+            zeros = 0;
+            particles.push(particle.map(|number| number as f32));
+        }
+    }
+    Ok(particles)
+}
+
+/// Reads arrays of one row per frame without the rows before the first localized frame.
+struct RowReader<'a> {
+    path: &'a Path,
+    npz: NpzReader<'a>,
+    rows: usize,
+    first: usize,
+}
+
+impl RowReader<'_> {
+    /// Reads an array of `N` finite numbers per row. `None` if it is missing, or empty, which
+    /// means the same in range-mcl.
+    fn rows<const N: usize, T>(
+        &mut self,
+        name: &'static str,
+        item: impl Fn([f64; N]) -> T,
+    ) -> Result<Option<Vec<T>>, ResultsError> {
+        let Some(mut array) = self.npz.array(name)? else {
+            return Ok(None);
+        };
+        if array.shape.first() == Some(&0) && self.rows > 0 {
+            return Ok(None);
+        }
+        if N == 1 {
+            array.expect_shape(&[Some(self.rows)], "one number per frame")?;
+        } else {
+            array.expect_shape(&[Some(self.rows), Some(N)], "one row per frame")?;
+        }
+        for _ in 0..self.first {
+            array.next_row::<N>()?;
+        }
+        (self.first..self.rows)
+            .map(|row| Ok(item(array.next_finite_row(row)?)))
+            .collect::<Result<_, _>>()
+            .map(Some)
+    }
+
+    /// Reads the frame of each row: the row itself if the file does not contain `frames`.
+    fn frames(&mut self) -> Result<Vec<usize>, ResultsError> {
+        let Some(frames) = self.rows("frames", |[frame]| frame)? else {
+            return Ok((self.first..self.rows).collect());
+        };
+        let mut previous = -1.0;
+        for (row, &frame) in (self.first..).zip(&frames) {
+            if frame <= previous || frame.fract() != 0.0 {
+                return Err(ResultsError::BadNumber {
+                    path: self.path.to_owned(),
+                    array: "frames",
+                    row,
+                    value: frame,
+                });
+            }
+            previous = frame;
+        }
+        Ok(frames.iter().map(|&frame| frame as usize).collect())
+    }
+}

@@ -1,0 +1,301 @@
+use std::fs::{self, File};
+use std::io::Write as _;
+use std::path::Path;
+
+use approx::assert_relative_eq;
+use nalgebra::Matrix3;
+use npyz::{DType, NpyFile, WriterBuilder as _};
+use zip::write::SimpleFileOptions;
+
+use super::npz::NpzWriter;
+use super::{LocalizationResults, ParticleLog};
+use crate::geometry::Pose2;
+
+fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
+    let frames: Vec<usize> = frames.collect();
+    let mut particles = ParticleLog::new(5);
+    for row in 0..frames.len() {
+        // The second particle of each frame is at the origin and has no weight.
+        particles.push_frame([[row as f32, 1.0, 2.0, 0.5], [0.0; 4], [3.0, 4.0, 5.0, 0.5]]);
+    }
+    let poses = |offset: f64| {
+        let pose = |&frame: &usize| Pose2::new([frame as f64, offset].into(), 3.0 - offset);
+        Some(frames.iter().map(pose).collect::<Vec<_>>())
+    };
+    let numbers = |scale: f64| Some(frames.iter().map(|&f| scale * f as f64).collect());
+    let matrix = |&frame: &usize| Matrix3::from_diagonal_element(1.0 + frame as f64);
+    LocalizationResults {
+        particles,
+        estimates: poses(0.1),
+        refined: poses(0.2),
+        ground_truth: poses(0.3),
+        odometry: poses(0.4),
+        covariances: Some(frames.iter().map(matrix).collect()),
+        refined_covariances: Some(frames.iter().map(|frame| 0.5 * matrix(frame)).collect()),
+        times_s: numbers(0.1),
+        runtimes_s: numbers(0.01),
+        refine_runtimes_s: numbers(0.02),
+        states: Some(frames.iter().map(|&frame| frame as u8 % 3).collect()),
+        frames,
+    }
+}
+
+fn assert_same(a: &LocalizationResults, b: &LocalizationResults) {
+    let poses = |results: &LocalizationResults| -> Vec<Pose2> {
+        [
+            &results.estimates,
+            &results.refined,
+            &results.ground_truth,
+            &results.odometry,
+        ]
+        .into_iter()
+        .flat_map(|poses| poses.clone().unwrap())
+        .collect()
+    };
+    for (a, b) in poses(a).iter().zip(&poses(b)) {
+        assert_relative_eq!(a, b, epsilon = 1e-15);
+    }
+    let without_poses = |results: &LocalizationResults| LocalizationResults {
+        estimates: None,
+        refined: None,
+        ground_truth: None,
+        odometry: None,
+        ..results.clone()
+    };
+    assert_eq!(without_poses(a), without_poses(b));
+}
+
+#[test]
+fn results_are_read_back_from_the_start_from_later_and_with_gaps() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("results.npz");
+    for written in [
+        results(0..4),
+        results(7..11),
+        results((1..20).step_by(2)),
+        results(0..0),
+    ] {
+        written.write(&path).unwrap();
+        assert_same(&LocalizationResults::read(&path).unwrap(), &written);
+    }
+}
+
+#[test]
+fn arrays_have_the_shapes_and_types_of_range_mcl() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("results.npz");
+    results(2..4).write(&path).unwrap();
+    let mut archive = zip::ZipArchive::new(File::open(&path).unwrap()).unwrap();
+    let particles = NpyFile::new(archive.by_name("particles.npy").unwrap()).unwrap();
+    assert_eq!(particles.shape(), [4, 5, 4]);
+    let particles: Vec<f32> = particles.into_vec().unwrap();
+    assert!(particles[..2 * 5 * 4].iter().all(|&x| x == 0.0));
+    assert_eq!(particles[3 * 5 * 4], 1.0);
+    for (name, number) in [("start_idx.npy", 2), ("numParticles.npy", 5)] {
+        let scalar = NpyFile::new(archive.by_name(name).unwrap()).unwrap();
+        assert!(scalar.shape().is_empty());
+        assert_eq!(scalar.into_vec::<i64>().unwrap(), [number]);
+    }
+}
+
+#[test]
+fn the_same_results_give_the_same_bytes() {
+    let folder = tempfile::tempdir().unwrap();
+    let (first, second) = (folder.path().join("a.npz"), folder.path().join("b.npz"));
+    results(2..4).write(&first).unwrap();
+    results(2..4).write(&second).unwrap();
+    assert_eq!(fs::read(&first).unwrap(), fs::read(&second).unwrap());
+}
+
+#[test]
+fn a_file_of_range_mcl_alone_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("results.npz");
+    let mut npz = NpzWriter::new(File::create(&path).unwrap());
+    // The first particle of each frame from frame 1 on.
+    let particles = [[0.0; 16], [1.0; 16], [1.0; 16]].map(|mut frame: [f64; 16]| {
+        frame[4..].fill(0.0);
+        frame
+    });
+    npz.add("particles", &[3, 4, 4], particles.into_iter().flatten())
+        .unwrap();
+    npz.add("start_idx", &[], [1_i64]).unwrap();
+    npz.add("numParticles", &[], [4_i64]).unwrap();
+    npz.finish().unwrap();
+    let results = LocalizationResults::read(&path).unwrap();
+    assert_eq!(results.frames, [1, 2]);
+    assert_eq!(results.particles.frame(1), [[1.0; 4]]);
+    assert_eq!(results.estimates, None);
+}
+
+/// Writes a file whose `particles` have a header of this type and shape and these bytes after it.
+fn write_particles(
+    path: &Path,
+    element: &str,
+    shape: &[u64],
+    bytes: &[u8],
+    options: SimpleFileOptions,
+) {
+    let header = || {
+        let element = DType::new_scalar(element.parse().unwrap());
+        npyz::WriteOptions::new_header_only()
+            .dtype(element)
+            .shape(shape)
+    };
+    let mut archive = zip::ZipWriter::new(File::create(path).unwrap());
+    archive.start_file("start_idx.npy", options).unwrap();
+    super::npz::write_npy(&mut archive, &[], [0_i64]).unwrap();
+    archive.start_file("particles.npy", options).unwrap();
+    header().writer(&mut archive).write_header_only().unwrap();
+    archive.write_all(bytes).unwrap();
+    archive.finish().unwrap();
+}
+
+#[test]
+fn stored_deflated_and_zip64_entries_of_any_number_type_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("results.npz");
+    let floats = [1.0_f32; 4].map(f32::to_le_bytes).concat();
+    let doubles = [1.0_f64; 4].map(f64::to_be_bytes).concat();
+    let integers = [1_i32; 4].map(i32::to_le_bytes).concat();
+    let bytes = [1; 4].to_vec();
+    for method in [
+        zip::CompressionMethod::Stored,
+        zip::CompressionMethod::Deflated,
+    ] {
+        for is_large in [false, true] {
+            let options = SimpleFileOptions::default()
+                .compression_method(method)
+                .large_file(is_large);
+            for (element, bytes) in [
+                ("<f4", &floats),
+                (">f8", &doubles),
+                ("<i4", &integers),
+                ("|u1", &bytes),
+                ("|b1", &bytes),
+            ] {
+                write_particles(&path, element, &[1, 1, 4], bytes, options);
+                let results = LocalizationResults::read(&path).unwrap();
+                assert_eq!(results.particles.frame(0), [[1.0; 4]]);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_shape_without_data_is_an_error_and_is_not_allocated() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("results.npz");
+    for shape in [[1_000_000_000, 10_000, 4], [u64::MAX, 1 << 40, 4]] {
+        write_particles(&path, "<f8", &shape, &[0; 32], SimpleFileOptions::default());
+        let message = LocalizationResults::read(&path).unwrap_err().to_string();
+        assert!(
+            message.contains("results.npz, array `particles`"),
+            "{message}"
+        );
+        assert!(message.contains("but there are 32"), "{message}");
+    }
+}
+
+#[test]
+fn arrays_that_are_not_numbers_are_rejected_with_their_type() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("results.npz");
+    for element in ["|O", "<c16", "<U3"] {
+        write_particles(
+            &path,
+            element,
+            &[1, 1, 4],
+            &[0; 64],
+            SimpleFileOptions::default(),
+        );
+        let message = LocalizationResults::read(&path).unwrap_err().to_string();
+        assert!(message.contains("array `particles`"), "{message}");
+        assert!(
+            message.contains(&format!("of type '{element}'")),
+            "{message}"
+        );
+    }
+    let mut archive = zip::ZipWriter::new(File::create(&path).unwrap());
+    archive
+        .start_file("start_idx.npy", SimpleFileOptions::default())
+        .unwrap();
+    archive.write_all(b"{\"a json\": 1}").unwrap();
+    archive.finish().unwrap();
+    let message = LocalizationResults::read(&path).unwrap_err().to_string();
+    assert!(
+        message.contains("array `start_idx`: it cannot be read"),
+        "{message}"
+    );
+}
+
+#[test]
+fn a_file_that_is_cut_off_anywhere_is_an_error_that_names_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("results.npz");
+    results(0..4).write(&path).unwrap();
+    let whole = fs::read(&path).unwrap();
+    for length in (0..whole.len()).step_by(97) {
+        fs::write(&path, &whole[..length]).unwrap();
+        let message = LocalizationResults::read(&path).unwrap_err().to_string();
+        assert!(message.contains("results.npz"), "{length}: {message}");
+    }
+}
+
+#[test]
+fn a_flipped_byte_is_never_a_panic() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("results.npz");
+    results(0..4).write(&path).unwrap();
+    let whole = fs::read(&path).unwrap();
+    for position in (0..whole.len()).step_by(41) {
+        let mut broken = whole.clone();
+        broken[position] ^= 0x55;
+        fs::write(&path, &broken).unwrap();
+        if let Err(error) = LocalizationResults::read(&path) {
+            assert!(error.to_string().contains("results.npz"));
+        }
+    }
+}
+
+#[test]
+fn inconsistent_arrays_are_errors_that_name_the_array() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("results.npz");
+    let write = |shape: [usize; 3], number: f32, start_idx: i64| {
+        let mut npz = NpzWriter::new(File::create(&path).unwrap());
+        let numbers = std::iter::repeat_n(number, shape.iter().product());
+        npz.add("particles", &shape, numbers).unwrap();
+        npz.add("start_idx", &[], [start_idx]).unwrap();
+        npz.finish().unwrap();
+        LocalizationResults::read(&path).unwrap_err().to_string()
+    };
+    let message = write([2, 2, 3], 0.0, 0);
+    assert!(
+        message.contains("`particles`: its shape is [2, 2, 3]"),
+        "{message}"
+    );
+    let message = write([2, 2, 4], 0.0, 2);
+    assert!(
+        message.contains("start_idx is 2, but there are 2 rows"),
+        "{message}"
+    );
+    let message = write([2, 2, 4], 0.0, -1);
+    assert!(message.contains("start_idx is -1"), "{message}");
+    let message = write([2, 2, 4], f32::NAN, 0);
+    assert!(message.contains("`particles`, row 0: NaN"), "{message}");
+
+    let mut disordered = results(0..3);
+    disordered.frames = vec![4, 6, 5];
+    disordered.write(&path).unwrap();
+    let message = LocalizationResults::read(&path).unwrap_err().to_string();
+    assert!(message.contains("`frames`, row 2: 5"), "{message}");
+
+    let mut short = results(0..3);
+    short.estimates = short.estimates.map(|poses| poses[..2].to_vec());
+    let message = short.write(&path).unwrap_err().to_string();
+    assert!(
+        message.contains("`estimates` has 2 rows for 3 frames"),
+        "{message}"
+    );
+}
