@@ -13,7 +13,7 @@ use super::visibility::{self, VisibilityConfig};
 use crate::geometry::{PointCloud, TriangleMesh};
 use crate::ground::GroundClassifier;
 use crate::meshing::{self, MeshingError, PoissonConfig, Surface};
-use crate::recording::{Frame, KittiError, velodyne};
+use crate::recording::{Frame, RecordingError, velodyne};
 
 /// Vertices that are gathered in neighbouring cells are less than two cells apart along an axis.
 const CELLS_PER_EDGE: f32 = 2.0;
@@ -139,7 +139,7 @@ pub enum LocalMapError {
     #[error("interrupted")]
     Interrupted,
     #[error(transparent)]
-    Scan(#[from] KittiError),
+    Scan(#[from] RecordingError),
     #[error("local map {number} (frames {first} to {last}): {source}")]
     Meshing {
         number: usize,
@@ -213,7 +213,7 @@ pub fn build(
 }
 
 /// The hash that a local map has if it is made of these frames as they lie on disk now.
-pub fn scans_hash(frames: &[Frame], plan: &LocalMapPlan) -> Result<String, KittiError> {
+pub fn scans_hash(frames: &[Frame], plan: &LocalMapPlan) -> Result<String, RecordingError> {
     let hashes: Vec<Hash> = frames[plan.used.clone()]
         .par_iter()
         .map(|frame| velodyne::hash_of_scan(&frame.scan_path))

@@ -22,7 +22,7 @@ use super::scan_cloud::ScanSettings;
 use super::surface_distance::distances_m;
 use crate::geometry::{Rigid3f, TriangleMesh};
 use crate::raycasting::{Hit, Scene};
-use crate::recording::{Frame, KittiError};
+use crate::recording::{Frame, RecordingError};
 
 /// A residual beyond this is early or late [m].
 const GROSS_M: f32 = 0.5;
@@ -80,7 +80,7 @@ pub fn residuals(
     mesh: &TriangleMesh,
     frames: &[Frame],
     settings: &ScanSettings,
-) -> Result<Vec<BeamResidual>, KittiError> {
+) -> Result<Vec<BeamResidual>, RecordingError> {
     let scene = Scene::new(mesh);
     let per_frame = frames
         .par_iter()
@@ -97,7 +97,7 @@ pub fn residuals(
             let map_from_lidar = Rigid3f::from(&frame.map_from_lidar);
             Ok(judge(mesh, &scene, &map_from_lidar, &points))
         })
-        .collect::<Result<Vec<_>, KittiError>>()?;
+        .collect::<Result<Vec<_>, RecordingError>>()?;
     let mut beams: Vec<BeamResidual> = per_frame.into_iter().flatten().collect();
     let points: Vec<Vec3> = beams.iter().map(|beam| beam.point_in_map).collect();
     for (beam, point_m) in beams.iter_mut().zip(distances_m(&points, mesh, NEAR_M)) {

@@ -8,7 +8,7 @@ use crate::geometry::{PointCloud, Rigid3f};
 use crate::ground::GroundClassifier;
 use crate::lidar::{LidarModel, RangeImage};
 use crate::lidar::{NormalConfig, estimate_normals};
-use crate::recording::{Frame, KittiError};
+use crate::recording::{Frame, RecordingError};
 
 /// What of a scan goes into the map.
 #[derive(Clone, Debug, PartialEq)]
@@ -95,7 +95,7 @@ impl ScanCloud {
         frame: &Frame,
         settings: &ScanSettings,
         classifier: &dyn GroundClassifier,
-    ) -> Result<Self, KittiError> {
+    ) -> Result<Self, RecordingError> {
         let (mut scan, hash) = frame.read_and_hash()?;
         let mut counts = PointCounts {
             read: scan.len(),

@@ -1,16 +1,14 @@
-//! What can be wrong with a recording on disk.
+//! Errors of reading recordings.
 
-use std::path::PathBuf;
+use std::io;
+use std::path::{Path, PathBuf};
 
-/// Each names the file, quotes what stands there and says what to do.
+/// A file of a recording that cannot be read or used.
 #[derive(Debug, thiserror::Error)]
 #[expect(missing_docs, reason = "the messages say it")]
-pub enum KittiError {
+pub enum RecordingError {
     #[error("cannot read {}: {source}", path.display())]
-    Read {
-        path: PathBuf,
-        source: std::io::Error,
-    },
+    Read { path: PathBuf, source: io::Error },
     #[error("{} has {bytes} bytes, which is not a multiple of {record_bytes}; it looks truncated, copy it again", path.display())]
     Truncated {
         path: PathBuf,
@@ -23,7 +21,7 @@ pub enum KittiError {
         line: usize,
         word: String,
     },
-    #[error("{}, line {line}: {found} numbers where {expected} belong ({layout})", path.display())]
+    #[error("{}, line {line}: {found} numbers where {expected} are needed ({layout})", path.display())]
     WrongCount {
         path: PathBuf,
         line: usize,
@@ -35,11 +33,11 @@ pub enum KittiError {
     NotARotation { path: PathBuf, line: usize },
     #[error("{} has no line `Tr:` (cam0_from_lidar, 12 numbers); use the calib.txt of the odometry benchmark", path.display())]
     NoTr { path: PathBuf },
-    #[error("{} holds no poses", path.display())]
+    #[error("{} contains no poses", path.display())]
     NoPoses { path: PathBuf },
-    #[error("{} holds no scans (*.bin); point scan_folder at the velodyne folder of the recording", path.display())]
+    #[error("{} contains no scans (*.bin); set scan_folder to the velodyne folder of the recording", path.display())]
     NoScans { path: PathBuf },
-    #[error("{} has no pose: {} has {poses} rows; check that both belong to one recording, or choose frames with n_scans", scan.display(), pose_file.display())]
+    #[error("{} has no pose: {} has {poses} rows; check that both belong to one recording, or select fewer frames with n_scans", scan.display(), pose_file.display())]
     ScanWithoutPose {
         scan: PathBuf,
         pose_file: PathBuf,
@@ -59,4 +57,14 @@ pub enum KittiError {
         frame_step: usize,
         scans: usize,
     },
+}
+
+impl RecordingError {
+    /// Adds the file to an error of reading.
+    pub(super) fn read(path: &Path) -> impl FnOnce(io::Error) -> Self {
+        |source| Self::Read {
+            path: path.to_owned(),
+            source,
+        }
+    }
 }

@@ -1,7 +1,7 @@
-//! Recordings in the layout of the KITTI odometry benchmark, read and written.
+//! Recordings in the layout of the KITTI odometry benchmark.
 //!
-//! Poses on disk are camera poses; [`poses`] holds the only conversion between them and the
-//! lidar poses that everything else uses:
+//! Poses on disk are camera poses; [`MapFrame`] converts between them and the lidar poses that
+//! everything else uses:
 //!
 //! ```text
 //! map_from_lidar(i) = inv(Tr) · inv(P₀) · Pᵢ · Tr        Tr = cam0_from_lidar
@@ -14,6 +14,7 @@ pub mod sequence;
 mod table;
 pub mod velodyne;
 
-pub use calibration::{Calibration, MapFrame};
-pub use error::KittiError;
+pub use calibration::Calibration;
+pub use error::RecordingError;
+pub use poses::MapFrame;
 pub use sequence::{Frame, Selection, Sequence};

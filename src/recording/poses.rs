@@ -1,95 +1,128 @@
-//! `poses.txt` (camera poses, 3x4 rows), `times.txt`, and TUM trajectories.
+//! Camera poses (`poses.txt`), times (`times.txt`) and TUM trajectories.
 
 use std::io::{self, Write};
 use std::path::Path;
 
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
-use super::table::{pose_from_row, read_rows, row_from_pose};
-use super::{Calibration, KittiError};
+use super::calibration::Calibration;
+use super::error::RecordingError;
+use super::table::{pose_from_row, read_rows, row_array, row_from_pose};
 use crate::geometry::{Pose3, StampedPose, Trajectory};
 
 /// Camera poses of a recording, one per frame: `p_world = world_from_cam0 * p_cam0`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraPoses {
-    /// One per frame, at least one.
+    /// One pose per frame, at least one.
     pub world_from_cam0: Vec<Pose3>,
 }
 
 impl CameraPoses {
     /// Reads rows of twelve numbers.
-    pub fn read(path: &Path) -> Result<Self, KittiError> {
+    pub fn read(path: &Path) -> Result<Self, RecordingError> {
         let world_from_cam0 = read_rows(path)?
             .iter()
             .map(|(line, row)| pose_from_row(row, path, *line))
             .collect::<Result<Vec<_>, _>>()?;
         if world_from_cam0.is_empty() {
-            return Err(KittiError::NoPoses {
+            return Err(RecordingError::NoPoses {
                 path: path.to_owned(),
             });
         }
         Ok(Self { world_from_cam0 })
     }
 
-    /// The lidar poses in the frame of the first one; see [`Calibration::map_from_lidar`].
+    /// The lidar poses in the frame of the first one; see [`MapFrame::map_from_lidar`].
     pub fn map_from_lidar(&self, calibration: &Calibration) -> Vec<Pose3> {
+        let frame = MapFrame {
+            calibration: *calibration,
+            world_from_first_cam0: self.world_from_cam0[0],
+        };
         self.world_from_cam0
             .iter()
-            .map(|pose| calibration.map_from_lidar(&self.world_from_cam0[0], pose))
+            .map(|pose| frame.map_from_lidar(pose))
             .collect()
     }
 }
 
-/// Writes lidar poses as camera poses in the convention of the recording's `poses.txt`
-/// whose first pose is `world_from_first_cam0`.
+/// The frame of a map: that of the first lidar pose of the recording that it was built from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MapFrame {
+    /// The calibration of that recording.
+    pub calibration: Calibration,
+    /// Its first camera pose.
+    pub world_from_first_cam0: Pose3,
+}
+
+impl MapFrame {
+    /// Reads the frame of a map from the poses and the calibration that it was built with.
+    pub fn read(pose_file: &Path, calib_file: &Path) -> Result<Self, RecordingError> {
+        Ok(Self {
+            calibration: Calibration::read(calib_file)?,
+            world_from_first_cam0: CameraPoses::read(pose_file)?.world_from_cam0[0],
+        })
+    }
+
+    /// The lidar pose of a camera pose: `map_from_lidar = inv(Tr) * inv(P₀) * P * Tr`.
+    pub fn map_from_lidar(&self, world_from_cam0: &Pose3) -> Pose3 {
+        let cam0_from_lidar = self.calibration.cam0_from_lidar;
+        cam0_from_lidar.inverse()
+            * self.world_from_first_cam0.inverse()
+            * world_from_cam0
+            * cam0_from_lidar
+    }
+
+    /// The camera pose of a lidar pose; the inverse of [`map_from_lidar`](Self::map_from_lidar).
+    pub fn world_from_cam0(&self, map_from_lidar: &Pose3) -> Pose3 {
+        let cam0_from_lidar = self.calibration.cam0_from_lidar;
+        self.world_from_first_cam0 * cam0_from_lidar * map_from_lidar * cam0_from_lidar.inverse()
+    }
+
+    /// `p_map = map_from_recording * p`, where p is a point in the frame of another recording with
+    /// camera poses in the same world.
+    pub fn map_from_recording(&self, recording: &Self) -> Pose3 {
+        let world_from_lidar =
+            recording.world_from_first_cam0 * recording.calibration.cam0_from_lidar;
+        let world_from_map = self.world_from_first_cam0 * self.calibration.cam0_from_lidar;
+        world_from_map.inverse() * world_from_lidar
+    }
+}
+
+/// Writes lidar poses in the frame of a map as camera poses, in the format of `poses.txt`.
 pub fn write_kitti(
     mut writer: impl Write,
     map_from_lidar: &[Pose3],
-    world_from_first_cam0: &Pose3,
-    calibration: &Calibration,
+    frame: &MapFrame,
 ) -> io::Result<()> {
-    let rows: String = map_from_lidar
+    map_from_lidar
         .iter()
-        .map(|pose| row_from_pose(&calibration.world_from_cam0(world_from_first_cam0, pose)) + "\n")
-        .collect();
-    writer.write_all(rows.as_bytes())
+        .try_for_each(|pose| writeln!(writer, "{}", row_from_pose(&frame.world_from_cam0(pose))))
 }
 
 /// Writes `time x y z qx qy qz qw` rows of lidar poses in the map frame.
 pub fn write_tum(mut writer: impl Write, trajectory: &Trajectory) -> io::Result<()> {
-    let rows: String = trajectory
-        .poses
-        .iter()
-        .map(|pose| {
-            let t = pose.map_from_lidar.translation.vector;
-            let q = pose.map_from_lidar.rotation.coords;
-            format!(
-                "{:.6} {:.6} {:.6} {:.6} {:.9} {:.9} {:.9} {:.9}\n",
-                pose.time_s, t.x, t.y, t.z, q.x, q.y, q.z, q.w
-            )
-        })
-        .collect();
-    writer.write_all(rows.as_bytes())
+    trajectory.poses.iter().try_for_each(|pose| {
+        let t = pose.map_from_lidar.translation.vector;
+        let q = pose.map_from_lidar.rotation.coords;
+        writeln!(
+            writer,
+            "{:.6} {:.6} {:.6} {:.6} {:.9} {:.9} {:.9} {:.9}",
+            pose.time_s, t.x, t.y, t.z, q.x, q.y, q.z, q.w
+        )
+    })
 }
 
 /// Reads a TUM trajectory; frames are numbered by row.
-pub fn read_tum(path: &Path) -> Result<Trajectory, KittiError> {
+pub fn read_tum(path: &Path) -> Result<Trajectory, RecordingError> {
     read_rows(path)?
         .iter()
         .enumerate()
         .map(|(frame, (line, row))| {
-            let &[time_s, x, y, z, qx, qy, qz, qw] = &row[..] else {
-                return Err(KittiError::WrongCount {
-                    path: path.to_owned(),
-                    line: *line,
-                    found: row.len(),
-                    expected: 8,
-                    layout: "time x y z qx qy qz qw",
-                });
-            };
+            let [time_s, x, y, z, qx, qy, qz, qw] =
+                row_array(row, path, *line, "time x y z qx qy qz qw")?;
             let quaternion = Quaternion::new(qw, qx, qy, qz);
             if (quaternion.norm() - 1.0).abs() > 0.01 {
-                return Err(KittiError::NotARotation {
+                return Err(RecordingError::NotARotation {
                     path: path.to_owned(),
                     line: *line,
                 });
@@ -106,27 +139,20 @@ pub fn read_tum(path: &Path) -> Result<Trajectory, KittiError> {
         .collect()
 }
 
-/// Reads `times.txt`, one number a row [s].
-pub fn read_times(path: &Path) -> Result<Vec<f64>, KittiError> {
+/// Reads `times.txt`, one number per row [s].
+pub fn read_times(path: &Path) -> Result<Vec<f64>, RecordingError> {
     read_rows(path)?
         .iter()
-        .map(|(line, row)| match row[..] {
-            [time_s] => Ok(time_s),
-            _ => Err(KittiError::WrongCount {
-                path: path.to_owned(),
-                line: *line,
-                found: row.len(),
-                expected: 1,
-                layout: "seconds",
-            }),
+        .map(|(line, row)| {
+            let [time_s] = row_array(row, path, *line, "seconds")?;
+            Ok(time_s)
         })
         .collect()
 }
 
 /// Writes `times.txt` [s].
 pub fn write_times(mut writer: impl Write, times_s: &[f64]) -> io::Result<()> {
-    let rows: String = times_s.iter().map(|time| format!("{time:.6e}\n")).collect();
-    writer.write_all(rows.as_bytes())
+    (times_s.iter()).try_for_each(|time_s| writeln!(writer, "{time_s:.6e}"))
 }
 
 #[cfg(test)]
@@ -151,6 +177,42 @@ mod tests {
     }
 
     #[test]
+    fn camera_poses_and_lidar_poses_are_inverse_conversions() {
+        let calibration = Calibration {
+            cam0_from_lidar: Pose3::new(Vector3::new(0.1, -0.2, 0.3), Vector3::new(1.2, -1.2, 1.2)),
+        };
+        let first = Pose3::new(Vector3::new(5.0, 6.0, 7.0), Vector3::new(0.3, 0.2, 0.1));
+        let pose = Pose3::new(Vector3::new(9.0, 6.5, 7.0), Vector3::new(0.4, 0.2, 0.1));
+        let frame = MapFrame {
+            calibration,
+            world_from_first_cam0: first,
+        };
+        let map_from_lidar = frame.map_from_lidar(&pose);
+        let back = frame.world_from_cam0(&map_from_lidar);
+        assert_relative_eq!(back, pose, epsilon = 1e-12);
+        let origin = frame.map_from_lidar(&first);
+        assert_relative_eq!(origin, Pose3::identity(), epsilon = 1e-12);
+    }
+
+    #[test]
+    fn recordings_with_different_first_poses_share_the_world_frame() {
+        let calibration = Calibration {
+            cam0_from_lidar: Pose3::new(Vector3::new(0.1, -0.2, 0.3), Vector3::new(1.2, -1.2, 1.2)),
+        };
+        let frame = |world_from_first_cam0| MapFrame {
+            calibration,
+            world_from_first_cam0,
+        };
+        let first = Pose3::new(Vector3::new(5.0, 6.0, 7.0), Vector3::new(0.3, 0.2, 0.1));
+        let later = Pose3::new(Vector3::new(9.0, 6.5, 7.0), Vector3::new(0.4, 0.2, 0.1));
+        let map_from_recording = frame(first).map_from_recording(&frame(later));
+        let expected = frame(first).map_from_lidar(&later);
+        assert_relative_eq!(map_from_recording, expected, epsilon = 1e-12);
+        let same = frame(first).map_from_recording(&frame(first));
+        assert_relative_eq!(same, Pose3::identity(), epsilon = 1e-12);
+    }
+
+    #[test]
     fn kitti_rows_read_back_as_the_lidar_poses_that_were_written() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("poses.txt");
@@ -161,13 +223,11 @@ mod tests {
             ),
         };
         let first = Pose3::new(Vector3::new(1.0, 2.0, 3.0), Vector3::new(0.1, 0.2, 0.3));
-        write_kitti(
-            fs::File::create(&path).unwrap(),
-            &poses(),
-            &first,
-            &calibration,
-        )
-        .unwrap();
+        let frame = MapFrame {
+            calibration,
+            world_from_first_cam0: first,
+        };
+        write_kitti(fs::File::create(&path).unwrap(), &poses(), &frame).unwrap();
         let back = CameraPoses::read(&path)
             .unwrap()
             .map_from_lidar(&calibration);
@@ -198,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn a_word_where_a_number_belongs_is_told_with_file_and_line() {
+    fn a_word_in_place_of_a_number_is_an_error_with_file_and_line() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("poses.txt");
         fs::write(

@@ -1,28 +1,30 @@
-//! A recording: which scan belongs to which pose, and which of them are wanted.
+//! A recording: its selected scans with their poses and times.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::poses::{CameraPoses, read_times};
-use super::{Calibration, KittiError, MapFrame, velodyne};
+use super::calibration::Calibration;
+use super::error::RecordingError;
+use super::poses::{CameraPoses, MapFrame, read_times};
+use super::velodyne;
 use crate::geometry::{Pose3, StampedPose};
 use crate::lidar::{RotationDirection, Scan, SweepMotion, interpolate_motion};
 use crate::validation::{InvalidValue, Validate, require};
 
-/// Revolutions per second of the sensor where no `times.txt` says otherwise.
+/// Revolutions per second of the sensor, for recordings without `times.txt`.
 const SCANS_PER_SECOND: f64 = 10.0;
 
-/// Which frames of a recording are used: `start_idx`, `start_idx + frame_step`, ...
+/// Selected frames of a recording: `start_idx`, `start_idx + frame_step`, ...
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Selection {
     /// First frame.
     pub start_idx: usize,
-    /// How many scans of the recording are looked at from there on; -1 for all.
+    /// Number of consecutive scans to select from; -1 for all.
     pub n_scans: i64,
-    /// Every how manieth of them is taken.
+    /// Every n-th of them is selected.
     pub frame_step: usize,
 }
 
@@ -54,7 +56,7 @@ impl Validate for Selection {
     }
 }
 
-/// One frame of a recording; the scan stays on disk until [`read`](Self::read).
+/// One frame of a recording; the scan is read by [`read`](Self::read).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
     /// Number in the recording.
@@ -65,30 +67,30 @@ pub struct Frame {
     pub time_s: f64,
     /// `p_map = map_from_lidar * p_lidar`.
     pub map_from_lidar: Pose3,
-    /// How the sensor moved during the scan, where that is to be compensated.
+    /// Motion of the sensor during the scan; `None` if the scan is not deskewed.
     pub sweep: Option<SweepMotion>,
 }
 
 impl Frame {
-    /// Reads the scan; its points are compensated where the motion is known.
-    pub fn read(&self) -> Result<Scan, KittiError> {
-        Ok(self.compensated(velodyne::read_scan(&self.scan_path)?))
+    /// Reads the scan and deskews it by the motion, if that is known.
+    pub fn read(&self) -> Result<Scan, RecordingError> {
+        Ok(self.deskewed(velodyne::read_scan(&self.scan_path)?))
     }
 
-    /// As [`read`](Self::read), with the hash of the file as it was read.
-    pub fn read_and_hash(&self) -> Result<(Scan, blake3::Hash), KittiError> {
+    /// As [`read`](Self::read), with the hash of the file.
+    pub fn read_and_hash(&self) -> Result<(Scan, blake3::Hash), RecordingError> {
         let (scan, hash) = velodyne::read_scan_and_hash(&self.scan_path)?;
-        Ok((self.compensated(scan), hash))
+        Ok((self.deskewed(scan), hash))
     }
 
-    fn compensated(&self, mut scan: Scan) -> Scan {
+    fn deskewed(&self, mut scan: Scan) -> Scan {
         if let Some(sweep) = &self.sweep {
             sweep.deskew(&mut scan.points);
         }
         scan
     }
 
-    /// The pose with its place in the recording.
+    /// The pose with its frame number and time.
     pub fn stamped(&self) -> StampedPose {
         StampedPose {
             frame: self.number,
@@ -105,32 +107,31 @@ pub struct Sequence {
     pub frames: Vec<Frame>,
     /// All lidar poses of the recording in the frame of the first.
     pub map_from_lidar: Vec<Pose3>,
-    /// The frame that all poses of this sequence are given in, and with it the way back to the
-    /// camera poses of its files.
+    /// The frame of all poses of this sequence, which converts them to camera poses.
     pub frame: MapFrame,
 }
 
 impl Sequence {
     /// Opens a recording without reading its scans.
     ///
-    /// Scans are the `.bin` files below `scan_folder` in the order of their paths. Where their
-    /// names are numbers, the number is the row of the pose file, so that a part of a
-    /// recording keeps its poses; otherwise the position in the order is. Times come from
-    /// `times.txt` beside the pose file if there is one.
+    /// Scans are the `.bin` files below `scan_folder` in the order of their paths. If their names
+    /// are numbers, the number is the row of the pose file, so that a part of a recording keeps
+    /// its poses; otherwise the position in the order is. Times are read from `times.txt` beside
+    /// the pose file if it exists.
     pub fn open(
         scan_folder: &Path,
         pose_file: &Path,
         calib_file: &Path,
         selection: &Selection,
-    ) -> Result<Self, KittiError> {
+    ) -> Result<Self, RecordingError> {
         let calibration = Calibration::read(calib_file)?;
         let camera_poses = CameraPoses::read(pose_file)?;
         let map_from_lidar = camera_poses.map_from_lidar(&calibration);
-        let times_s = times_of(pose_file, map_from_lidar.len())?;
+        let times_s = frame_times(pose_file, map_from_lidar.len())?;
         let mut frames = Vec::new();
         for (number, scan_path) in selected_scans(scan_folder, selection)? {
             let Some(&pose) = map_from_lidar.get(number) else {
-                return Err(KittiError::ScanWithoutPose {
+                return Err(RecordingError::ScanWithoutPose {
                     scan: scan_path,
                     pose_file: pose_file.to_owned(),
                     poses: map_from_lidar.len(),
@@ -154,25 +155,22 @@ impl Sequence {
         })
     }
 
-    /// The same sequence with scans compensated by the poses of the recording: the motion of a
-    /// frame is half of that from the frame before to the frame after it.
+    /// The same sequence with scans deskewed by the poses of the recording: the motion of a frame
+    /// is half of that from the previous to the next frame.
     #[must_use]
     pub fn compensated_by_poses(mut self, direction: RotationDirection) -> Self {
         for frame in &mut self.frames {
             let before = frame.number.saturating_sub(1);
             let after = (frame.number + 1).min(self.map_from_lidar.len() - 1);
             let motion = self.map_from_lidar[before].inverse() * self.map_from_lidar[after];
-            let frames = (after - before).max(1) as f64;
-            frame.sweep = Some(SweepMotion {
-                direction,
-                previous_from_current: interpolate_motion(&motion, 1.0 / frames),
-            });
+            frame.sweep = Some(sweep_motion(direction, &motion, (after - before).max(1)));
         }
         self
     }
 
-    /// The same sequence with scans compensated by an odometry, `previous_from_current` into each
-    /// frame; frames of which it says nothing stay as they are. The first moves as the second.
+    /// The same sequence with scans deskewed by odometry increments `previous_from_current` into
+    /// each frame. The first frame uses the motion of the second; frames without an increment are
+    /// not deskewed.
     #[must_use]
     pub fn compensated_by(
         mut self,
@@ -185,17 +183,14 @@ impl Sequence {
             let Some(&Some(motion)) = increments.get(row) else {
                 continue;
             };
-            let frames = (numbers[row] - numbers[row - 1]) as f64;
-            frame.sweep = Some(SweepMotion {
-                direction,
-                previous_from_current: interpolate_motion(&motion, 1.0 / frames),
-            });
+            let revolutions = numbers[row] - numbers[row - 1];
+            frame.sweep = Some(sweep_motion(direction, &motion, revolutions));
         }
         self
     }
 
     /// The same sequence with its poses in the frame of a map that was built from another (or the
-    /// same) recording in the same world.
+    /// same) recording in the same world frame.
     #[must_use]
     pub fn in_map(mut self, map: &MapFrame) -> Self {
         let map_from_recording = map.map_from_recording(&self.frame);
@@ -210,11 +205,19 @@ impl Sequence {
     }
 }
 
+/// The motion over one of several revolutions.
+fn sweep_motion(direction: RotationDirection, motion: &Pose3, revolutions: usize) -> SweepMotion {
+    SweepMotion {
+        direction,
+        previous_from_current: interpolate_motion(motion, 1.0 / revolutions as f64),
+    }
+}
+
 /// The selected scans below a folder with their numbers, ascending; see [`Sequence::open`].
 pub fn selected_scans(
     folder: &Path,
     selection: &Selection,
-) -> Result<Vec<(usize, PathBuf)>, KittiError> {
+) -> Result<Vec<(usize, PathBuf)>, RecordingError> {
     let scans = scan_paths(folder)?;
     let count = scans.len();
     let window = usize::try_from(selection.n_scans).unwrap_or(usize::MAX);
@@ -228,7 +231,7 @@ pub fn selected_scans(
         })
         .collect();
     if selected.is_empty() {
-        return Err(KittiError::NothingSelected {
+        return Err(RecordingError::NothingSelected {
             path: folder.to_owned(),
             start_idx: selection.start_idx,
             n_scans: selection.n_scans,
@@ -240,16 +243,12 @@ pub fn selected_scans(
 }
 
 /// All `.bin` files below a folder, sorted by path.
-pub fn scan_paths(folder: &Path) -> Result<Vec<PathBuf>, KittiError> {
+pub fn scan_paths(folder: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     let mut paths = Vec::new();
     let mut folders = vec![folder.to_owned()];
     while let Some(folder) = folders.pop() {
-        let read_error = |source| KittiError::Read {
-            path: folder.clone(),
-            source,
-        };
-        for entry in fs::read_dir(&folder).map_err(read_error)? {
-            let path = entry.map_err(read_error)?.path();
+        for entry in fs::read_dir(&folder).map_err(RecordingError::read(&folder))? {
+            let path = entry.map_err(RecordingError::read(&folder))?.path();
             if path.is_dir() {
                 folders.push(path);
             } else if path.extension().is_some_and(|extension| extension == "bin") {
@@ -258,7 +257,7 @@ pub fn scan_paths(folder: &Path) -> Result<Vec<PathBuf>, KittiError> {
         }
     }
     if paths.is_empty() {
-        return Err(KittiError::NoScans {
+        return Err(RecordingError::NoScans {
             path: folder.to_owned(),
         });
     }
@@ -266,7 +265,7 @@ pub fn scan_paths(folder: &Path) -> Result<Vec<PathBuf>, KittiError> {
     Ok(paths)
 }
 
-/// The numbers in the names if every name is a number and none comes twice, else the positions.
+/// The numbers in the names if all names are distinct numbers, else the positions.
 fn frame_numbers(scans: &[PathBuf]) -> Vec<usize> {
     let named: Option<Vec<usize>> = scans
         .iter()
@@ -278,7 +277,7 @@ fn frame_numbers(scans: &[PathBuf]) -> Vec<usize> {
     }
 }
 
-fn times_of(pose_file: &Path, poses: usize) -> Result<Vec<f64>, KittiError> {
+fn frame_times(pose_file: &Path, poses: usize) -> Result<Vec<f64>, RecordingError> {
     let path = pose_file.with_file_name("times.txt");
     if !path.exists() {
         return Ok((0..poses).map(|i| i as f64 / SCANS_PER_SECOND).collect());
@@ -287,7 +286,7 @@ fn times_of(pose_file: &Path, poses: usize) -> Result<Vec<f64>, KittiError> {
     if times_s.len() == poses {
         Ok(times_s)
     } else {
-        Err(KittiError::WrongTimes {
+        Err(RecordingError::WrongTimes {
             path,
             times: times_s.len(),
             poses,
@@ -312,7 +311,7 @@ mod tests {
         folder
     }
 
-    fn open(folder: &Path, selection: &Selection) -> Result<Sequence, KittiError> {
+    fn open(folder: &Path, selection: &Selection) -> Result<Sequence, RecordingError> {
         Sequence::open(
             &folder.join("velodyne"),
             &folder.join("poses.txt"),
@@ -326,7 +325,7 @@ mod tests {
     }
 
     #[test]
-    fn even_and_odd_frames_share_nothing_and_leave_nothing() {
+    fn even_and_odd_frames_partition_the_recording() {
         let names: Vec<String> = (0..9).map(|i| format!("{i:06}.bin")).collect();
         let names: Vec<&str> = names.iter().map(String::as_str).collect();
         let folder = recording(&names, 9);
@@ -342,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_of_a_recording_keeps_its_poses() {
+    fn scans_with_numbers_as_names_keep_their_poses() {
         let folder = recording(&["000005.bin", "000007.bin"], 10);
         let sequence = open(folder.path(), &Selection::default()).unwrap();
         assert_eq!(numbers(&sequence), [5, 7]);
@@ -350,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn names_that_are_no_numbers_are_counted() {
+    fn scans_without_numbers_as_names_are_numbered_by_position() {
         let folder = recording(&["a.bin", "b.bin"], 2);
         assert_eq!(
             numbers(&open(folder.path(), &Selection::default()).unwrap()),
@@ -359,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scan_without_a_pose_is_an_error_unless_it_is_not_selected() {
+    fn a_selected_scan_without_a_pose_is_an_error() {
         let folder = recording(&["000000.bin", "000001.bin"], 1);
         let message = open(folder.path(), &Selection::default())
             .unwrap_err()
@@ -373,7 +372,7 @@ mod tests {
     }
 
     #[test]
-    fn times_of_the_recording_are_used_and_checked() {
+    fn times_are_read_and_their_number_is_checked() {
         let folder = recording(&["000000.bin", "000001.bin"], 2);
         fs::write(folder.path().join("times.txt"), "0.0\n0.104\n").unwrap();
         let sequence = open(folder.path(), &Selection::default()).unwrap();

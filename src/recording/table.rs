@@ -1,38 +1,33 @@
-//! Text files with numbers in rows.
+//! Text files with rows of numbers.
 
 use std::fs;
 use std::path::Path;
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
 
-use super::KittiError;
+use super::error::RecordingError;
 use crate::geometry::Pose3;
 
-/// The rows of a file that are not blank or comments, each with its line number.
-pub fn read_rows(path: &Path) -> Result<Vec<(usize, Vec<f64>)>, KittiError> {
-    let text = read_text(path)?;
-    text.lines()
-        .enumerate()
-        .map(|(index, line)| (index + 1, line.trim()))
-        .filter(|(_, line)| !line.is_empty() && !line.starts_with('#'))
+/// Reads the rows of a file with their line numbers, without blank lines and comments (`#`).
+pub fn read_rows(path: &Path) -> Result<Vec<(usize, Vec<f64>)>, RecordingError> {
+    (1..)
+        .zip(read_text(path)?.lines().map(str::trim))
+        .filter(|(_, text)| !text.is_empty() && !text.starts_with('#'))
         .map(|(line, text)| Ok((line, parse_numbers(text, path, line)?)))
         .collect()
 }
 
-/// The whole file as text.
-pub fn read_text(path: &Path) -> Result<String, KittiError> {
-    fs::read_to_string(path).map_err(|source| KittiError::Read {
-        path: path.to_owned(),
-        source,
-    })
+/// Reads a whole file as text.
+pub fn read_text(path: &Path) -> Result<String, RecordingError> {
+    fs::read_to_string(path).map_err(RecordingError::read(path))
 }
 
-/// Finite numbers separated by white space.
-pub fn parse_numbers(text: &str, path: &Path, line: usize) -> Result<Vec<f64>, KittiError> {
+/// Parses finite numbers separated by white space.
+pub fn parse_numbers(text: &str, path: &Path, line: usize) -> Result<Vec<f64>, RecordingError> {
     text.split_whitespace()
         .map(|word| match word.parse::<f64>() {
             Ok(number) if number.is_finite() => Ok(number),
-            _ => Err(KittiError::NotANumber {
+            _ => Err(RecordingError::NotANumber {
                 path: path.to_owned(),
                 line,
                 word: word.to_owned(),
@@ -41,18 +36,27 @@ pub fn parse_numbers(text: &str, path: &Path, line: usize) -> Result<Vec<f64>, K
         .collect()
 }
 
-/// A row-major 3x4 matrix as a transform. The rotation is made orthogonal; a matrix that is
-/// not close to one is an error.
-pub fn pose_from_row(row: &[f64], path: &Path, line: usize) -> Result<Pose3, KittiError> {
-    if row.len() != 12 {
-        return Err(KittiError::WrongCount {
+/// The numbers of a row as an array of a known length.
+pub fn row_array<const N: usize>(
+    row: &[f64],
+    path: &Path,
+    line: usize,
+    layout: &'static str,
+) -> Result<[f64; N], RecordingError> {
+    row.try_into()
+        .map_err(|_length| RecordingError::WrongCount {
             path: path.to_owned(),
             line,
             found: row.len(),
-            expected: 12,
-            layout: "a row-major 3x4 matrix",
-        });
-    }
+            expected: N,
+            layout,
+        })
+}
+
+/// A row-major 3x4 matrix as a transform. Its rotation is orthogonalized; a matrix that is not
+/// close to a rotation is an error.
+pub fn pose_from_row(row: &[f64], path: &Path, line: usize) -> Result<Pose3, RecordingError> {
+    let row: [f64; 12] = row_array(row, path, line, "a row-major 3x4 matrix")?;
     let matrix = Matrix3::new(
         row[0], row[1], row[2], row[4], row[5], row[6], row[8], row[9], row[10],
     );
@@ -60,7 +64,7 @@ pub fn pose_from_row(row: &[f64], path: &Path, line: usize) -> Result<Pose3, Kit
         .abs()
         .max();
     if skew > 0.01 || matrix.determinant() < 0.0 {
-        return Err(KittiError::NotARotation {
+        return Err(RecordingError::NotARotation {
             path: path.to_owned(),
             line,
         });

@@ -7,37 +7,38 @@ use std::path::Path;
 use blake3::Hash;
 use glam::Vec3;
 
-use super::KittiError;
+use super::error::RecordingError;
 use crate::lidar::Scan;
 
-/// Reads a scan whole, with all its points, also the invalid ones.
-pub fn read_scan(path: &Path) -> Result<Scan, KittiError> {
+/// Reads a scan with all its points, including invalid ones.
+pub fn read_scan(path: &Path) -> Result<Scan, RecordingError> {
     parse_scan(path, &read_bytes(path)?)
 }
 
-/// Reads a scan and the BLAKE3 hash of its very bytes.
-pub fn read_scan_and_hash(path: &Path) -> Result<(Scan, Hash), KittiError> {
+/// Reads a scan and the BLAKE3 hash of its file.
+pub fn read_scan_and_hash(path: &Path) -> Result<(Scan, Hash), RecordingError> {
     let bytes = read_bytes(path)?;
     Ok((parse_scan(path, &bytes)?, blake3::hash(&bytes)))
 }
 
 /// The BLAKE3 hash of a scan's file.
-pub fn hash_of_scan(path: &Path) -> Result<Hash, KittiError> {
+pub fn hash_of_scan(path: &Path) -> Result<Hash, RecordingError> {
     Ok(blake3::hash(&read_bytes(path)?))
 }
 
-fn parse_scan(path: &Path, bytes: &[u8]) -> Result<Scan, KittiError> {
-    let records = records::<16>(path, bytes)?;
-    let mut scan = Scan {
-        points: Vec::with_capacity(records.len()),
-        intensities: Vec::with_capacity(records.len()),
-    };
-    for record in records {
-        let [x, y, z, intensity] = floats(record);
-        scan.points.push(Vec3::new(x, y, z));
-        scan.intensities.push(intensity);
-    }
-    Ok(scan)
+fn parse_scan(path: &Path, bytes: &[u8]) -> Result<Scan, RecordingError> {
+    let (points, intensities) = records::<16>(path, bytes)?
+        .iter()
+        .map(|record| {
+            let (words, _) = record.as_chunks::<4>();
+            let [x, y, z, intensity] = [0, 1, 2, 3].map(|word| f32::from_le_bytes(words[word]));
+            (Vec3::new(x, y, z), intensity)
+        })
+        .unzip();
+    Ok(Scan {
+        points,
+        intensities,
+    })
 }
 
 /// Writes a scan.
@@ -52,17 +53,16 @@ pub fn write_scan(mut writer: impl Write, scan: &Scan) -> io::Result<()> {
     writer.write_all(&bytes)
 }
 
-/// Reads the semantic class of every point: the low 16 bits, without the instance.
-pub fn read_labels(path: &Path) -> Result<Vec<u16>, KittiError> {
+/// Reads the semantic class of each point: the low 16 bits, without the instance.
+pub fn read_labels(path: &Path) -> Result<Vec<u16>, RecordingError> {
     let bytes = read_bytes(path)?;
-    let records = records::<4>(path, &bytes)?;
-    Ok(records
+    Ok(records::<4>(path, &bytes)?
         .iter()
         .map(|&[low, high, ..]| u16::from_le_bytes([low, high]))
         .collect())
 }
 
-/// Writes semantic classes, instance 0.
+/// Writes semantic classes, with instance 0.
 pub fn write_labels(mut writer: impl Write, classes: &[u16]) -> io::Result<()> {
     let bytes: Vec<u8> = classes
         .iter()
@@ -71,22 +71,19 @@ pub fn write_labels(mut writer: impl Write, classes: &[u16]) -> io::Result<()> {
     writer.write_all(&bytes)
 }
 
-fn read_bytes(path: &Path) -> Result<Vec<u8>, KittiError> {
-    fs::read(path).map_err(|source| KittiError::Read {
-        path: path.to_owned(),
-        source,
-    })
+fn read_bytes(path: &Path) -> Result<Vec<u8>, RecordingError> {
+    fs::read(path).map_err(RecordingError::read(path))
 }
 
 fn records<'a, const SIZE: usize>(
     path: &Path,
     bytes: &'a [u8],
-) -> Result<&'a [[u8; SIZE]], KittiError> {
+) -> Result<&'a [[u8; SIZE]], RecordingError> {
     let (records, rest) = bytes.as_chunks::<SIZE>();
     if rest.is_empty() {
         Ok(records)
     } else {
-        Err(KittiError::Truncated {
+        Err(RecordingError::Truncated {
             path: path.to_owned(),
             bytes: bytes.len() as u64,
             record_bytes: SIZE,
@@ -94,17 +91,12 @@ fn records<'a, const SIZE: usize>(
     }
 }
 
-fn floats(record: &[u8; 16]) -> [f32; 4] {
-    let (words, _) = record.as_chunks::<4>();
-    [words[0], words[1], words[2], words[3]].map(f32::from_le_bytes)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn a_written_scan_reads_back_bit_by_bit() {
+    fn a_written_scan_reads_back_exactly() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("000000.bin");
         let scan = Scan {
@@ -116,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn the_hash_of_a_scan_is_that_of_its_file_and_tells_one_bit() {
+    fn the_hash_of_a_scan_is_that_of_its_file_and_changes_with_one_bit() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("000000.bin");
         let mut scan = Scan {
@@ -133,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn a_truncated_scan_is_an_error_that_says_so() {
+    fn a_truncated_scan_is_an_error_with_its_size() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("000000.bin");
         fs::write(&path, [0; 33]).unwrap();
@@ -143,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn labels_lose_their_instance_only() {
+    fn labels_are_read_without_their_instance() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("000000.label");
         fs::write(&path, 0x0007_0028_u32.to_le_bytes()).unwrap();

@@ -1,4 +1,4 @@
-//! `evaluate`: how far a result is from the truth.
+//! `evaluate`: the errors of a result.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +15,7 @@ use crate::map::ply;
 use crate::recording::Calibration;
 use crate::recording::poses::CameraPoses;
 
-/// Judges a result of `localize`, of `refine` or of range-mcl.
+/// Compares a result of `localize`, `refine` or range-mcl with the ground truth.
 pub fn run(config: &EvaluationConfig) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
     let mut results = LocalizationResults::read(&config.result_file)?;
@@ -23,10 +23,7 @@ pub fn run(config: &EvaluationConfig) -> Result<Report> {
     if results.ground_truth.is_none() {
         results.ground_truth = Some(truth(config, &results)?);
     } else {
-        tracing::info!(
-            "the ground truth in {} is used",
-            config.result_file.display()
-        );
+        tracing::info!("using the ground truth in {}", config.result_file.display());
     }
     let mut results = selected(results, config);
     ensure!(
@@ -39,9 +36,7 @@ pub fn run(config: &EvaluationConfig) -> Result<Report> {
         converge_thres: config.converge_thres,
         particle_select_ratio: config.particle_select_ratio,
     };
-    if results.estimates.is_none() {
-        results.estimates = Some(results.estimates_or_particle_means(&rules)?);
-    }
+    results.estimates = Some(results.estimates_or_particle_means(&rules)?);
     let files = RunFiles::beside(&config.result_file);
     let report = run_output::evaluate(&results, &rules, about(config, &files)?)?;
     if config.save_evaluation_results {
@@ -49,7 +44,7 @@ pub fn run(config: &EvaluationConfig) -> Result<Report> {
         config::write(&files.file("evaluation.yml"), config)?;
     }
     if config.plot_loc_traj {
-        run_output::draw_run_on(&files, map_of(&files)?.as_ref(), &results)?;
+        run_output::draw_run(&files, map_of(&files)?.as_ref(), &results)?;
     }
     if config.save_evaluation_results {
         run_page::write(&files, &report)?;
@@ -57,11 +52,11 @@ pub fn run(config: &EvaluationConfig) -> Result<Report> {
     Ok(report)
 }
 
-/// What the run said of itself, and what is judged.
+/// The inputs and settings of the run from its report, and the evaluated file.
 fn about(config: &EvaluationConfig, files: &RunFiles) -> Result<BTreeMap<String, String>> {
-    let told = files.file("report.json");
-    let mut about = if told.exists() {
-        Report::read_json(&told)?.about
+    let report = files.file("report.json");
+    let mut about = if report.exists() {
+        Report::read_json(&report)?.about
     } else {
         BTreeMap::new()
     };
@@ -70,7 +65,7 @@ fn about(config: &EvaluationConfig, files: &RunFiles) -> Result<BTreeMap<String,
     Ok(about)
 }
 
-/// The map that the run was localized in, where its configuration names one that is still there.
+/// The map of the run; `None` if its configuration or its map file does not exist.
 fn map_of(files: &RunFiles) -> Result<Option<TriangleMesh>> {
     let effective = files.file("localization.yml");
     if !effective.exists() {
@@ -79,7 +74,7 @@ fn map_of(files: &RunFiles) -> Result<Option<TriangleMesh>> {
     let localized: LocalizationConfig = config::load(Some(&effective), &effective, &[])?;
     if !localized.map_file.exists() {
         tracing::info!(
-            "drawn without the map: {} is not there any more",
+            "drawing without the map: {} does not exist",
             localized.map_file.display()
         );
         return Ok(None);
@@ -87,7 +82,7 @@ fn map_of(files: &RunFiles) -> Result<Option<TriangleMesh>> {
     Ok(Some(ply::read(&localized.map_file)?))
 }
 
-/// Positions in metres, for results that are in cells.
+/// Converts positions in grid cells to metres.
 fn scale(results: &mut LocalizationResults, grid_resolution_m: f64) {
     if grid_resolution_m == 1.0 {
         return;
@@ -99,7 +94,7 @@ fn scale(results: &mut LocalizationResults, grid_resolution_m: f64) {
     results.particles.scale_positions(grid_resolution_m as f32);
 }
 
-/// The true poses of the frames of a result, in the frame of the recording's first pose.
+/// The true poses of the frames of a result, in the frame of the first pose of the recording.
 fn truth(config: &EvaluationConfig, results: &LocalizationResults) -> Result<Vec<Pose2>> {
     input::require_file("pose_file", &config.pose_file)?;
     input::require_file("calib_file", &config.calib_file)?;
@@ -119,7 +114,7 @@ fn truth(config: &EvaluationConfig, results: &LocalizationResults) -> Result<Vec
         .collect())
 }
 
-/// The frames that the configuration selects.
+/// The results of the frames that the configuration selects.
 fn selected(results: LocalizationResults, config: &EvaluationConfig) -> LocalizationResults {
     let window = usize::try_from(config.n_scans).unwrap_or(usize::MAX);
     let end = config.start_idx.saturating_add(window);

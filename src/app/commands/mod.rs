@@ -166,7 +166,7 @@ mod tests {
 
     use super::*;
     use crate::app::cli::Cli;
-    use crate::recording::KittiError;
+    use crate::recording::RecordingError;
 
     fn loaded<T>(arguments: &[&str]) -> T
     where
@@ -196,7 +196,7 @@ mod tests {
     #[test]
     fn a_cause_is_told_once() {
         let source = std::io::Error::new(std::io::ErrorKind::NotFound, "no such file");
-        let error = anyhow::Error::new(KittiError::Read {
+        let error = anyhow::Error::new(RecordingError::Read {
             path: "poses.txt".into(),
             source,
         })

@@ -11,7 +11,7 @@ use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
 use crate::lidar::RotationDirection;
 use crate::localization::odometry::{demonstration_noise, increments, with_noise};
 use crate::recording::poses::{CameraPoses, read_tum};
-use crate::recording::{KittiError, Sequence};
+use crate::recording::{RecordingError, Sequence};
 
 /// `previous_from_current` into each frame of the sequence; `None` where nothing is known.
 pub fn read_increments(
@@ -48,7 +48,7 @@ fn recorded(file: &Path, sequence: &Sequence) -> Result<Vec<Pose3>> {
     let context = || format!("odometry_file is {}", file.display());
     match CameraPoses::read(file) {
         Ok(poses) => Ok(poses.map_from_lidar(&sequence.frame.calibration)),
-        Err(KittiError::WrongCount { found: 8, .. }) => {
+        Err(RecordingError::WrongCount { found: 8, .. }) => {
             let trajectory = read_tum(file).with_context(context)?;
             Ok(trajectory
                 .poses

@@ -74,7 +74,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let report = run_output::evaluate(&results, &RangeMclRules::default(), about.into())?;
     run_output::write_report(&files, &results, &report)?;
     if config.plot_loc_results {
-        run_output::draw_run(&files, Some(&map), &results)?;
+        run_output::draw_run(&files, Some(&map.mesh), &results)?;
     }
     run_page::write(&files, &report)?;
     Ok(report)

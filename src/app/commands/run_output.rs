@@ -1,4 +1,4 @@
-//! What a run leaves on disk: results, trajectories, tables, pictures.
+//! Output files of a run: results, trajectories, reports and plots.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result, bail};
 
 use super::output;
-use super::stages::LoadedMap;
 use crate::app::plotting::color::{MCL, REFINED, Rgb};
 use crate::app::plotting::{
     Animation, ErrorPlot, LineChart, LocalizationPicture, MapImage, MapPlot, Panel, Path2,
@@ -16,7 +15,7 @@ use crate::app::results::{
     LocalizationResults, Report, TrajectoryReport, write_frames_csv, write_poses_npy,
 };
 use crate::evaluation::{
-    EvaluatedTrajectory, MetricsConfig, ParticleRow, PlanarError, RangeMclRules, TrajectoryMetrics,
+    EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, TrajectoryMetrics,
     planar_errors,
 };
 use crate::geometry::{Pose2, Pose3, StampedPose, Trajectory, TriangleMesh};
@@ -26,13 +25,13 @@ use crate::localization::{FrameEstimate, ParticleSet};
 use crate::recording::Sequence;
 use crate::recording::poses::{write_kitti, write_tum};
 
-/// Cells along the longer side of the map behind a picture.
+/// Cells along the longer side of the map image in plots.
 const MAP_CELLS: usize = 1400;
 
-/// Names of the files of a run, all beside its result.
+/// Paths of the output files of a run, all in the folder of its result.
 #[derive(Clone, Debug)]
 pub struct RunFiles {
-    /// The `.npz`.
+    /// The `.npz` file.
     pub result: PathBuf,
     folder: PathBuf,
 }
@@ -50,12 +49,12 @@ impl RunFiles {
         }
     }
 
-    /// A file beside the result.
+    /// The path of a file beside the result.
     pub fn file(&self, name: &str) -> PathBuf {
         self.folder.join(name)
     }
 
-    /// A picture under `plots/`, whose folder is made.
+    /// The path of a plot in `plots/`, which is created if necessary.
     pub fn plot(&self, name: &str) -> Result<PathBuf> {
         self.in_folder("plots", name)
     }
@@ -68,37 +67,37 @@ impl RunFiles {
     }
 }
 
-/// What lies beside a result under the same name whatever the result is called.
-const OF_A_RESULT: [&str; 3] = ["report.json", "mcl_tum.txt", "frames.csv"];
+/// Files beside a result whose names do not depend on that of the result.
+const FIXED_NAMES: [&str; 3] = ["report.json", "mcl_tum.txt", "frames.csv"];
 
-/// What `refine` adds to a result.
-const OF_REFINED: [&str; 4] = [
+/// Files that refinement adds to a result.
+const REFINEMENT_FILES: [&str; 4] = [
     "refined_tum.txt",
     "refined_kitti.txt",
     "refined_poses.npy",
     "refinement.yml",
 ];
 
-/// Makes sure, before any work is done, that a result can be written without losing another one:
-/// neither its own file nor those beside it, of a result with another name.
+/// Checks before the computation that writing a result will not overwrite another one: neither
+/// its own file nor those of a result with a different name in the same folder.
 pub fn prepare(files: &RunFiles, key: &str, force: bool) -> Result<()> {
     output::prepare(&files.result, key, force)?;
-    let foreign = OF_A_RESULT
+    let foreign = FIXED_NAMES
         .iter()
         .map(|name| files.file(name))
         .find(|path| path.exists());
     match foreign {
         Some(path) if !force && !files.result.exists() => bail!(
-            "{} exists and belongs to another result; give {key} a folder of its own, or add --force to replace what lies there",
+            "{} exists and belongs to another result; set {key} to a path in a folder of its own, or add --force to overwrite it",
             path.display()
         ),
         _ => Ok(()),
     }
 }
 
-/// Removes what `refine` said of an earlier result.
+/// Removes the files that refinement added to an earlier result.
 pub fn remove_refined(files: &RunFiles) -> Result<()> {
-    for path in OF_REFINED.map(|name| files.file(name)) {
+    for path in REFINEMENT_FILES.map(|name| files.file(name)) {
         if path.exists() {
             std::fs::remove_file(&path)
                 .with_context(|| format!("cannot remove {}", path.display()))?;
@@ -107,34 +106,26 @@ pub fn remove_refined(files: &RunFiles) -> Result<()> {
     Ok(())
 }
 
-/// Particles as they are stored.
-pub fn rows_of(particles: &ParticleSet) -> Vec<ParticleRow> {
-    particles
-        .particles()
-        .iter()
-        .map(|particle| {
-            let pose = &particle.map_from_lidar;
-            [
-                pose.translation.x as f32,
-                pose.translation.y as f32,
-                pose.rotation.angle() as f32,
-                particle.weight as f32,
-            ]
-        })
+/// Particles in the layout of the results.
+pub fn particle_rows(particles: &ParticleSet) -> Vec<ParticleRow> {
+    let row = |pose: &Pose2, weight: f64| {
+        let t = pose.translation;
+        [t.x, t.y, pose.rotation.angle(), weight].map(|number| number as f32)
+    };
+    (particles.particles().iter())
+        .map(|particle| row(&particle.map_from_lidar, particle.weight))
         .collect()
 }
 
 /// Writes `<name>_tum.txt` (map frame, seconds) and `<name>_kitti.txt` (the convention of the
-/// recording's `poses.txt`); rows are the first frames of the sequence.
+/// recording's `poses.txt`); the poses are those of the first frames of the sequence.
 pub fn write_trajectory(
     files: &RunFiles,
     name: &str,
     sequence: &Sequence,
     map_from_lidar: &[Pose3],
 ) -> Result<()> {
-    let trajectory: Trajectory = sequence
-        .frames
-        .iter()
+    let trajectory: Trajectory = (sequence.frames.iter())
         .zip(map_from_lidar)
         .map(|(frame, &map_from_lidar)| StampedPose {
             map_from_lidar,
@@ -145,16 +136,11 @@ pub fn write_trajectory(
         write_tum(file, &trajectory)
     })?;
     output::write_file(&files.file(&format!("{name}_kitti.txt")), |file| {
-        write_kitti(
-            file,
-            map_from_lidar,
-            &sequence.frame.world_from_first_cam0,
-            &sequence.frame.calibration,
-        )
+        write_kitti(file, map_from_lidar, &sequence.frame)
     })
 }
 
-/// Writes the `.npz`, and the poses as plain arrays for other programs.
+/// Writes the `.npz` file, and poses as `.npy` files for other programs.
 pub fn write_results(files: &RunFiles, results: &LocalizationResults) -> Result<()> {
     results.write(&files.result)?;
     if let Some(truth) = &results.ground_truth {
@@ -180,50 +166,46 @@ pub fn write_report(
     Ok(())
 }
 
-/// Judges the estimates, and the refined trajectory where there is one, against the ground truth.
+/// Compares the estimates and, if there is one, the refined trajectory with the ground truth.
 pub fn evaluate(
     results: &LocalizationResults,
     rules: &RangeMclRules,
     about: BTreeMap<String, String>,
 ) -> Result<Report> {
-    let truth = results
+    let ground_truth = results
         .ground_truth
         .as_deref()
-        .context("there is no ground truth to compare with; name its pose_file")?;
-    let estimates = results.estimates_or_particle_means(rules)?;
-    let one = |estimates: &[Pose2], runtimes_s: Option<&[f64]>| {
-        evaluate_trajectory(
-            &EvaluatedTrajectory {
-                estimates,
-                ground_truth: truth,
-                times_s: results.times_s.as_deref(),
-                runtimes_s,
-            },
-            rules,
-        )
+        .context("there is no ground truth to compare with; set pose_file")?;
+    let report = |estimates: &[Pose2], runtimes_s: &Option<Vec<f64>>| {
+        let trajectory = EvaluatedTrajectory {
+            estimates,
+            ground_truth,
+            times_s: results.times_s.as_deref(),
+            runtimes_s: runtimes_s.as_deref(),
+        };
+        evaluate_trajectory(&trajectory, rules)
     };
+    let estimates = results.estimates_or_particle_means(rules)?;
     Ok(Report {
         about,
-        mcl: one(&estimates, results.runtimes_s.as_deref())?,
-        refined: results
-            .refined
-            .as_deref()
-            .map(|refined| one(refined, results.refine_runtimes_s.as_deref()))
-            .transpose()?,
+        mcl: report(&estimates, &results.runtimes_s)?,
+        refined: match &results.refined {
+            Some(refined) => Some(report(refined, &results.refine_runtimes_s)?),
+            None => None,
+        },
     })
 }
 
-/// Judges one trajectory.
+/// Computes the errors of one trajectory.
 pub fn evaluate_trajectory(
     trajectory: &EvaluatedTrajectory,
     rules: &RangeMclRules,
 ) -> Result<TrajectoryReport> {
+    let defaults = MetricsConfig::default();
     let config = MetricsConfig {
-        // A short run is judged from where it can be.
-        skip_frames: MetricsConfig::default()
-            .skip_frames
-            .min(trajectory.ground_truth.len() / 2),
-        ..MetricsConfig::default()
+        // At least half of a short run is evaluated.
+        skip_frames: (defaults.skip_frames).min(trajectory.ground_truth.len() / 2),
+        ..defaults
     };
     Ok(TrajectoryReport {
         range_mcl: rules.evaluate(trajectory.estimates, trajectory.ground_truth),
@@ -231,17 +213,8 @@ pub fn evaluate_trajectory(
     })
 }
 
-/// Draws everything about a run under `plots/`.
+/// Draws the plots of a run in `plots/`.
 pub fn draw_run(
-    files: &RunFiles,
-    map: Option<&LoadedMap>,
-    results: &LocalizationResults,
-) -> Result<()> {
-    draw_run_on(files, map.map(|map| &map.mesh), results)
-}
-
-/// The same with the map as it is in its file.
-pub fn draw_run_on(
     files: &RunFiles,
     mesh: Option<&TriangleMesh>,
     results: &LocalizationResults,
@@ -262,7 +235,7 @@ pub fn draw_run_on(
         draw_errors(files, results, estimates, truth)?;
     }
     draw_runtimes(files, results)?;
-    draw_particles(files, image.as_ref(), results, estimates)?;
+    draw_particles(files, image.as_ref(), results)?;
     if let Some(mesh) = mesh {
         MapPlot {
             title: "Map from above",
@@ -281,21 +254,14 @@ fn draw_errors(
     estimates: &[Pose2],
     truth: &[Pose2],
 ) -> Result<()> {
-    let mcl: Vec<PlanarError> = planar_errors(estimates, truth);
-    let refined = results
-        .refined
-        .as_deref()
-        .map(|refined| planar_errors(refined, truth));
+    let mcl = planar_errors(estimates, truth);
+    let refined = (results.refined.as_deref()).map(|refined| planar_errors(refined, truth));
     let mut errors = vec![("MCL", MCL, mcl.as_slice())];
-    errors.extend(
-        refined
-            .as_deref()
-            .map(|refined| ("refined", REFINED, refined)),
-    );
+    errors.extend((refined.as_deref()).map(|refined| ("refined", REFINED, refined)));
     let by_frame: Vec<f64> = results.frames.iter().map(|&frame| frame as f64).collect();
     let (x_name, x) = match &results.times_s {
-        Some(times_s) => ("time [s]", times_s.as_slice()),
-        None => ("frame", by_frame.as_slice()),
+        Some(times_s) => ("time [s]", times_s),
+        None => ("frame", &by_frame),
     };
     ErrorPlot {
         title: "Errors over time",
@@ -308,14 +274,13 @@ fn draw_errors(
 }
 
 fn draw_runtimes(files: &RunFiles, results: &LocalizationResults) -> Result<()> {
-    let mut stages = Vec::new();
-    stages.extend(results.runtimes_s.as_deref().map(|s| ("localize", MCL, s)));
-    stages.extend(
-        results
-            .refine_runtimes_s
-            .as_deref()
-            .map(|s| ("refine", REFINED, s)),
-    );
+    let stages: Vec<_> = [
+        ("localize", MCL, &results.runtimes_s),
+        ("refine", REFINED, &results.refine_runtimes_s),
+    ]
+    .into_iter()
+    .filter_map(|(stage, color, times_s)| Some((stage, color, times_s.as_deref()?)))
+    .collect();
     if stages.is_empty() {
         return Ok(());
     }
@@ -329,32 +294,29 @@ fn draw_runtimes(files: &RunFiles, results: &LocalizationResults) -> Result<()> 
     Ok(())
 }
 
-/// The particles of the first frame, where they are spread most.
+/// Draws the particles of the first frame, which are spread most.
 fn draw_particles(
     files: &RunFiles,
     image: Option<&MapImage>,
     results: &LocalizationResults,
-    estimates: &[Pose2],
 ) -> Result<()> {
+    let first = |poses: &Option<Vec<Pose2>>| poses.as_ref()?.first().copied();
     if results.particles.is_empty() {
         return Ok(());
     }
-    let truth = results.ground_truth.as_deref().unwrap_or_default();
     LocalizationPicture {
         title: &format!("Particles in frame {}", results.frames[0]),
         map: image,
         particles: results.particles.frame(0),
-        estimate: estimates.first().copied(),
-        refined: None,
-        ground_truth: truth.first().copied(),
-        driven: &[],
-        window: None,
+        estimate: first(&results.estimates),
+        ground_truth: first(&results.ground_truth),
+        ..LocalizationPicture::default()
     }
     .save(&files.plot("particles.png")?)?;
     Ok(())
 }
 
-/// Draws a scan beside what the map shows from the estimate.
+/// Draws a measured range image, the one rendered at the estimate, and their difference.
 pub fn draw_range_images(
     files: &RunFiles,
     observed: &RangeImage,
@@ -372,10 +334,10 @@ pub fn draw_range_images(
     Ok(())
 }
 
-/// A named line with its colour: (offset, likelihood).
+/// Name and colour of a line through (offset, likelihood).
 pub type NamedProfile = (&'static str, Rgb, Vec<(f64, f64)>);
 
-/// Draws likelihoods around the true pose of a frame, a panel per direction.
+/// Draws the likelihood around the true pose of a frame, one panel per direction.
 pub fn draw_likelihood(
     files: &RunFiles,
     frame: usize,
@@ -412,7 +374,7 @@ pub fn draw_likelihood(
     Ok(())
 }
 
-/// A picture per frame, and in the end a moving one.
+/// A picture per frame, and an animation of them.
 pub struct Movie {
     files: RunFiles,
     map: MapImage,
@@ -420,7 +382,7 @@ pub struct Movie {
 }
 
 impl Movie {
-    /// Prepares the map behind the pictures.
+    /// Prepares the map image of the pictures.
     pub fn begin(files: &RunFiles, mesh: &TriangleMesh) -> Self {
         Self {
             files: files.clone(),
@@ -431,7 +393,7 @@ impl Movie {
 
     /// Draws the last frame of the results.
     pub fn add(&mut self, results: &LocalizationResults, estimate: &FrameEstimate) -> Result<()> {
-        /// Width of what is shown around the estimate [m].
+        /// Width of the window around the estimate [m].
         const WINDOW_M: f64 = 80.0;
         let Some(&number) = results.frames.last() else {
             return Ok(());
@@ -446,17 +408,17 @@ impl Movie {
             map: Some(&self.map),
             particles: results.particles.frame(results.len() - 1),
             estimate: Some(estimate.pose),
-            refined: None,
             ground_truth: truth.last().copied(),
             driven: truth,
             window: Some(([t.x, t.y], WINDOW_M)),
+            ..LocalizationPicture::default()
         }
         .save(&path)?;
         self.pictures.push(path);
         Ok(())
     }
 
-    /// Makes the GIF.
+    /// Writes the animation.
     pub fn finish(self) -> Result<()> {
         Animation::default().save(&self.files.file("localization.gif"), &self.pictures)?;
         Ok(())

@@ -30,9 +30,9 @@ use super::progress::Task;
 use super::{Context, version};
 use crate::geometry::Pose3;
 use crate::map::ply;
-use crate::recording::Calibration;
 use crate::recording::poses::{CameraPoses, write_kitti, write_times};
 use crate::recording::velodyne::{write_labels, write_scan};
+use crate::recording::{Calibration, MapFrame};
 use crate::simulation::{Simulation, SimulationConfig, calibration};
 
 /// What becomes of a drive that is there already.
@@ -236,9 +236,16 @@ fn recipe_anywhere(config: &SimulationConfig) -> Result<String> {
 /// What `poses.txt` has.
 fn poses_text(simulation: &Simulation) -> Result<Vec<u8>> {
     let mut text = Vec::new();
-    let origin = Pose3::identity();
-    write_kitti(&mut text, &simulation.poses(), &origin, &calibration())?;
+    write_kitti(&mut text, &simulation.poses(), &map_frame())?;
     Ok(text)
+}
+
+/// The frame of the poses of a drive; its world frame is that of the street.
+fn map_frame() -> MapFrame {
+    MapFrame {
+        calibration: calibration(),
+        world_from_first_cam0: Pose3::identity(),
+    }
 }
 
 /// Whether every file of a drive is there.
@@ -315,14 +322,13 @@ fn write_scans(
 }
 
 fn write_poses(simulation: &Simulation, folder: &Path, poses: &[Pose3]) -> Result<()> {
-    let calibration = calibration();
-    let origin = Pose3::identity();
+    let frame = map_frame();
     let write_poses = |name: &str, poses: &[Pose3]| {
-        write_file(&folder.join(name), |file| {
-            write_kitti(file, poses, &origin, &calibration)
-        })
+        write_file(&folder.join(name), |file| write_kitti(file, poses, &frame))
     };
-    write_file(&folder.join("calib.txt"), |file| calibration.write(file))?;
+    write_file(&folder.join("calib.txt"), |file| {
+        frame.calibration.write(file)
+    })?;
     write_file(&folder.join("times.txt"), |file| {
         write_times(file, &simulation.times_s())
     })?;

@@ -9,7 +9,7 @@ use crate::geometry::{Pose3, TriangleMesh, Vec3};
 use crate::ground::{GroundClassifier, road_plane};
 use crate::lidar::{LidarModel, RangeImage};
 use crate::map::{GroundMap, Stance, TileConfig, TileGrid, ply, tiles};
-use crate::recording::{Frame, KittiError, MapFrame, Sequence};
+use crate::recording::{Frame, MapFrame, RecordingError, Sequence};
 use crate::rendering::{Batched, RangeRenderer, renderer};
 
 /// Edge of the cells of the ground's elevation [m].
@@ -147,7 +147,7 @@ pub struct Observer<'a> {
 
 impl Observer<'_> {
     /// Reads a frame without looking at it.
-    pub fn read(&self, frame: &Frame) -> Result<Vec<Vec3>, KittiError> {
+    pub fn read(&self, frame: &Frame) -> Result<Vec<Vec3>, RecordingError> {
         Ok(frame.read()?.points)
     }
 

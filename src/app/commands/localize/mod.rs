@@ -80,7 +80,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         run_output::write_report(&files, &results, &report)?;
     }
     if config.plot_loc_results {
-        run_output::draw_run(&files, Some(&map), &results)?;
+        run_output::draw_run(&files, Some(&map.mesh), &results)?;
         draw_example(config, &files, &map, &sequence, &lifted)?;
     }
     if config.save_result {

@@ -61,7 +61,7 @@ impl Recorder {
         results.frames.push(frame.number);
         results
             .particles
-            .push_frame(run_output::rows_of(&estimate.particles));
+            .push_frame(run_output::particle_rows(&estimate.particles));
         self.off_ground += usize::from(!estimate.on_mapped_ground);
         push(&mut results.estimates, estimate.pose);
         push(
