@@ -200,7 +200,7 @@ fn the_path_is_drawn_over_the_truth_and_over_the_map() {
 
 #[test]
 fn the_parents_run_on_kitti_07_is_drawn() {
-    let Some((truth, results)) = crate::app::results::kitti_07::kitti_07() else {
+    let Some((truth, results)) = crate::app::results::kitti_07_tests::kitti_07() else {
         return;
     };
     let gallery = Gallery::open();

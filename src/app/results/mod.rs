@@ -13,7 +13,7 @@ mod report;
 mod rows;
 
 #[cfg(test)]
-pub(crate) mod kitti_07;
+pub(crate) mod kitti_07_tests;
 
 pub use error::{ArrayError, ResultsError};
 pub use frames::write_frames_csv;
