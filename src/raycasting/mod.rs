@@ -1,49 +1,77 @@
-//! What a ray meets first: triangles in bounding volume hierarchies, cast at in packets of rays
-//! that share their origin, in bundles of rays of one course, or one by one.
+//! Ray casting: the nearest triangles along rays, by bounding volume hierarchies that are traversed
+//! by packets of rays or by single rays.
 //!
 //! A [`Scene`] has a hierarchy per tile, in coordinates relative to the middle of the tile, under
 //! one hierarchy over the boxes of the tiles. A triangle lies in one tile, and rays go from tile
 //! to tile, so that the borders of tiles cannot be seen. It takes about 97 bytes per triangle.
 
-mod block;
-mod bundle;
+mod all_hits;
 pub(crate) mod bvh;
-mod lanes;
-mod lone;
 mod packet;
 mod scene;
+mod simd;
+mod single;
+mod traversal;
 mod triangle;
 mod wide;
 
+pub use scene::Scene;
 #[cfg(feature = "gpu")]
-pub(crate) use scene::is_proper;
-pub use scene::{Reach, Scene};
+pub(crate) use triangle::is_proper;
 
-/// Rays that go through the scene together.
-pub const RAYS: usize = packet::RAYS;
+/// Rays per packet.
+pub const RAYS: usize = 8;
 
-/// Surfaces nearer to the origin of a ray are not met [m]: a ray does not meet the surface that
-/// it starts on.
+/// Nearest range at which a surface is hit [m]: a ray does not hit the surface that it starts on.
 pub const NEAREST_M: f32 = 1e-4;
 
-/// What a ray met first.
+/// Slot of no triangle.
+const NO_SLOT: u32 = u32::MAX;
+
+/// Nearest hit of a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
-    /// Distance along the unit direction [m]; infinite where nothing was met.
+    /// Distance along the unit direction [m]; infinite without a hit.
     pub range_m: f32,
     /// Index of the triangle in the mesh, or [`Hit::NO_TRIANGLE`].
     pub triangle: u32,
 }
 
 impl Hit {
-    /// The triangle of a ray that met nothing.
+    /// The triangle of a ray without a hit.
     pub const NO_TRIANGLE: u32 = u32::MAX;
 
-    /// The ray met nothing.
+    /// The ray hits nothing.
     pub const MISS: Self = Self {
         range_m: f32::INFINITY,
         triangle: Self::NO_TRIANGLE,
     };
+}
+
+/// Range interval in which a ray looks for surfaces.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Reach {
+    /// Surfaces at this range or farther are not hit [m].
+    pub until_m: f32,
+    /// Of surfaces nearer than this any may be reported, not only the nearest [m].
+    pub enough_m: f32,
+    /// Whether surfaces nearer than `enough_m` need not be reported if there is none from there to
+    /// `until_m`.
+    pub is_window: bool,
+}
+
+impl Reach {
+    /// The nearest surface at any range.
+    pub const UNLIMITED: Self = Self::until(f32::INFINITY);
+
+    /// The nearest surface that is nearer than a range [m].
+    pub const fn until(until_m: f32) -> Self {
+        Self {
+            until_m,
+            enough_m: 0.0,
+            is_window: false,
+        }
+    }
 }
 
 #[cfg(test)]

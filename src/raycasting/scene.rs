@@ -1,72 +1,40 @@
-//! Tiles of triangles under one hierarchy, and the ways to cast rays at them.
+//! Tiles of triangles under one hierarchy.
 
-mod alone;
-mod bundled;
-mod through;
+mod cast;
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-use super::Hit;
-use super::block::{Block, TRIANGLES};
-use super::bvh::{Bvh, Item};
-use super::packet::{NO_SLOT, Packet, RAYS, Walk};
+use super::NO_SLOT;
+use super::bvh::{Bvh, PrimRef};
+use super::triangle::{TRIANGLES, TriangleBlock, is_proper};
 use super::wide::WideBvh;
 use crate::geometry::{Aabb, TriangleMesh};
 
-/// A triangle is degenerate where its height is less than this part of its longest edge.
-const THINNEST: f64 = 1e-7;
-/// By this part of the extent of the scene boxes are larger than what is in them: more than
-/// rounding moves an edge.
+/// Boxes are enlarged by this part of the extent of the scene: more than rounding moves an edge.
 const PADDING: f32 = 16.0 * f32::EPSILON;
-
-/// How far a ray looks.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Reach {
-    /// Surfaces at this range or farther are not met [m].
-    pub until_m: f32,
-    /// Of surfaces nearer than this any may be reported, not only the nearest [m].
-    pub enough_m: f32,
-    /// Whether it does not matter if there is a surface nearer than `enough_m` where there is none
-    /// from there to `until_m`: then it need not be reported.
-    pub is_window: bool,
-}
-
-impl Reach {
-    /// The nearest surface, however far.
-    pub const UNLIMITED: Self = Self::until(f32::INFINITY);
-
-    /// The nearest surface that is nearer than a range [m].
-    pub const fn until(until_m: f32) -> Self {
-        Self {
-            until_m,
-            enough_m: 0.0,
-            is_window: false,
-        }
-    }
-}
 
 /// Triangles that rays can be cast at, from both sides.
 ///
-/// Triangles that are degenerate or not finite are never met.
+/// Triangles that are degenerate or not finite are never hit.
 #[derive(Clone, Debug)]
 pub struct Scene {
-    /// The origin of the boxes of the tiles, in the frame of the scene [m].
+    /// Origin of the boxes of the tiles, in the frame of the scene [m].
     middle: DVec3,
-    /// Its leaves are the tiles.
+    /// Hierarchy over the tiles.
     top: Bvh,
     wide_top: WideBvh,
-    tiles: Vec<Tile>,
+    tiles: Vec<TileBvh>,
     /// One per leaf of each tile.
-    blocks: Vec<Block>,
-    /// Where each triangle is: its block times [`TRIANGLES`] plus its place there.
+    blocks: Vec<TriangleBlock>,
+    /// Slot of each triangle: its block times [`TRIANGLES`] plus its lane; or [`NO_SLOT`].
     slots: Vec<u32>,
 }
 
-/// A hierarchy and where its blocks are.
-#[derive(Clone, Debug)]
-struct Tile {
-    /// The origin of its coordinates in the frame of the scene [m].
+/// Hierarchy over the triangles of a tile.
+#[derive(Clone, Debug, Default)]
+struct TileBvh {
+    /// Origin of its coordinates in the frame of the scene [m].
     middle: DVec3,
     bvh: Bvh,
     wide_bvh: WideBvh,
@@ -80,25 +48,23 @@ impl Scene {
     }
 
     /// Builds a hierarchy per mesh and one over all, on all threads of the current pool.
-    /// [`Hit::triangle`] counts the triangles of all meshes one after the other.
+    /// [`Hit::triangle`](super::Hit::triangle) counts the triangles of all meshes one after the
+    /// other.
     pub fn of_tiles(meshes: &[TriangleMesh]) -> Self {
-        let mut first_triangle = 0;
+        let mut triangles = 0;
         let numbered: Vec<(&TriangleMesh, u32)> = meshes
             .iter()
             .map(|mesh| {
-                let first = first_triangle;
-                first_triangle += mesh.triangles.len() as u32;
-                (mesh, first)
+                let first = triangles;
+                triangles += mesh.triangles.len();
+                (mesh, first as u32)
             })
             .collect();
-        let parts: Vec<Option<Part>> = numbered
+        let parts: Vec<Part> = numbered
             .into_par_iter()
-            .map(|(mesh, first_triangle)| Part::build(mesh, first_triangle))
+            .filter_map(|(mesh, first_triangle)| Part::build(mesh, first_triangle))
             .collect();
-        Self::join(
-            parts.into_iter().flatten().collect(),
-            first_triangle as usize,
-        )
+        Self::join(parts, triangles)
     }
 
     fn join(mut parts: Vec<Part>, triangles: usize) -> Self {
@@ -110,28 +76,23 @@ impl Scene {
         } else {
             middle_of(&whole)
         };
-        let items = parts.iter().enumerate().map(|(index, part)| {
+        let prims = parts.iter().zip(0..).map(|(part, index)| {
             let relative = Aabb {
                 min: part.bounds.min - middle,
                 max: part.bounds.max - middle,
             };
-            padded_item(relative, &whole, index as u32)
+            padded_prim(relative, &whole, index)
         });
-        let (top, leaves) = Bvh::build(&items.collect::<Vec<_>>(), 1);
+        let (top, leaves) = Bvh::build(prims.collect(), 1);
         let mut blocks = Vec::with_capacity(parts.iter().map(|part| part.blocks.len()).sum());
         let tiles = leaves
+            .order
             .iter()
-            .flatten()
             .map(|&index| {
                 let part = &mut parts[index as usize];
-                let first_block = blocks.len();
+                part.tile.first_block = blocks.len();
                 blocks.append(&mut part.blocks);
-                Tile {
-                    middle: part.middle,
-                    bvh: std::mem::take(&mut part.bvh),
-                    wide_bvh: std::mem::take(&mut part.wide_bvh),
-                    first_block,
-                }
+                std::mem::take(&mut part.tile)
             })
             .collect();
         Self {
@@ -144,7 +105,7 @@ impl Scene {
         }
     }
 
-    /// The unit normal of a triangle by the right-hand rule; `None` where it is never met.
+    /// The unit normal of a triangle by the right-hand rule; `None` if it is never hit.
     pub fn normal(&self, triangle: u32) -> Option<Vec3> {
         let slot = *self.slots.get(triangle as usize)?;
         (slot != NO_SLOT).then(|| {
@@ -152,122 +113,13 @@ impl Scene {
             self.blocks[slot / TRIANGLES].normal(slot % TRIANGLES)
         })
     }
-
-    /// Casts rays from one origin along unit directions, all in the frame of the mesh, and writes
-    /// what each meets first. Runs on the calling thread alone; directions that are neighbours in
-    /// the list should be neighbours in space.
-    ///
-    /// # Panics
-    /// Where there are not as many hits as directions.
-    pub fn cast(&self, origin: Vec3, directions: &[Vec3], hits: &mut [Hit]) {
-        self.cast_until(origin, directions, f32::INFINITY, hits);
-    }
-
-    /// Like [`Scene::cast`], but what is at `max_range_m` or farther is not met.
-    pub fn cast_until(
-        &self,
-        origin: Vec3,
-        directions: &[Vec3],
-        max_range_m: f32,
-        hits: &mut [Hit],
-    ) {
-        const AT_ONCE: usize = 32 * RAYS;
-        assert_eq!(directions.len(), hits.len(), "one hit per direction");
-        let reach = [Reach::until(max_range_m); AT_ONCE];
-        let chunks = directions.chunks(AT_ONCE).zip(hits.chunks_mut(AT_ONCE));
-        for (directions, hits) in chunks {
-            let reach = &reach[..directions.len()];
-            self.cast_within(origin.as_dvec3(), directions, reach, hits);
-        }
-    }
-
-    /// Like [`Scene::cast`], but each ray has its own reach, and the origin keeps its precision
-    /// far from the origin of the frame.
-    ///
-    /// # Panics
-    /// Where there are not as many reaches or hits as directions.
-    pub fn cast_within(
-        &self,
-        origin: DVec3,
-        directions: &[Vec3],
-        reach: &[Reach],
-        hits: &mut [Hit],
-    ) {
-        assert_eq!(directions.len(), hits.len(), "one hit per direction");
-        assert_eq!(directions.len(), reach.len(), "one reach per direction");
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
-            #[expect(unsafe_code, reason = "the line above has found the instructions")]
-            unsafe {
-                self.cast_avx2(origin, directions, reach, hits);
-            }
-            return;
-        }
-        self.cast_portable(origin, directions, reach, hits);
-    }
-
-    /// [`Scene::cast_portable`], compiled for eight numbers per instruction.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2")]
-    fn cast_avx2(&self, origin: DVec3, directions: &[Vec3], reach: &[Reach], hits: &mut [Hit]) {
-        self.cast_portable(origin, directions, reach, hits);
-    }
-
-    #[inline(always)]
-    pub(super) fn cast_portable(
-        &self,
-        origin: DVec3,
-        directions: &[Vec3],
-        reach: &[Reach],
-        hits: &mut [Hit],
-    ) {
-        let chunks = directions.chunks(RAYS).zip(reach.chunks(RAYS));
-        for ((directions, reach), hits) in chunks.zip(hits.chunks_mut(RAYS)) {
-            let mut packet = Packet::new(directions, reach);
-            if packet.is_coherent {
-                self.cast_packet::<true>(origin, &mut packet);
-            } else {
-                self.cast_packet::<false>(origin, &mut packet);
-            }
-            for (ray, hit) in hits.iter_mut().enumerate() {
-                *hit = self.hit(packet.range_m[ray], packet.slot[ray]);
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn cast_packet<const COHERENT: bool>(&self, origin: DVec3, packet: &mut Packet) {
-        let mut tiles = Walk::<_, COHERENT>::new(&self.top, (origin - self.middle).as_vec3());
-        while let Some(tile) = tiles.next_leaf(packet) {
-            let tile = &self.tiles[tile];
-            let origin = (origin - tile.middle).as_vec3();
-            let mut leaves = Walk::<_, COHERENT>::new(&tile.bvh, origin);
-            while let Some(leaf) = leaves.next_leaf(packet) {
-                let block = tile.first_block + leaf;
-                packet.meet(origin, &self.blocks[block], (block * TRIANGLES) as u32);
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn hit(&self, range_m: f32, slot: u32) -> Hit {
-        if slot == NO_SLOT {
-            return Hit::MISS;
-        }
-        let slot = slot as usize;
-        Hit {
-            range_m,
-            triangle: self.blocks[slot / TRIANGLES].index(slot % TRIANGLES),
-        }
-    }
 }
 
-/// The slot of each triangle, [`NO_SLOT`] for those that are never met.
-fn slots_of(blocks: &[Block], triangles: usize) -> Vec<u32> {
+fn slots_of(blocks: &[TriangleBlock], triangles: usize) -> Vec<u32> {
     let mut slots = vec![NO_SLOT; triangles];
     for (number, block) in blocks.iter().enumerate() {
-        for place in (0..TRIANGLES).filter(|&place| block.has(place)) {
-            slots[block.index(place) as usize] = (number * TRIANGLES + place) as u32;
+        for lane in (0..TRIANGLES).filter(|&lane| block.has(lane)) {
+            slots[block.indices[lane] as usize] = (number * TRIANGLES + lane) as u32;
         }
     }
     slots
@@ -277,14 +129,12 @@ fn slots_of(blocks: &[Block], triangles: usize) -> Vec<u32> {
 struct Part {
     /// In the frame of the scene.
     bounds: Aabb,
-    middle: DVec3,
-    bvh: Bvh,
-    wide_bvh: WideBvh,
-    blocks: Vec<Block>,
+    tile: TileBvh,
+    blocks: Vec<TriangleBlock>,
 }
 
 impl Part {
-    /// Nothing where there is nothing to meet.
+    /// `None` if no triangle of the mesh can be hit.
     fn build(mesh: &TriangleMesh, first_triangle: u32) -> Option<Self> {
         let usable: Vec<u32> = (0..mesh.triangles.len())
             .into_par_iter()
@@ -298,20 +148,24 @@ impl Part {
         }
         let middle = middle_of(&bounds);
         let local = |triangle: u32| corners(triangle).map(|corner| corner - middle);
-        let items = usable
+        let prims = usable
             .into_par_iter()
-            .map(|index| padded_item(Aabb::of(local(index)), &bounds, index));
-        let (bvh, leaves) = Bvh::build(&items.collect::<Vec<_>>(), TRIANGLES);
-        let block = |leaf: &[u32]| Block::new(leaf.iter().map(|&t| (local(t), first_triangle + t)));
+            .map(|triangle| padded_prim(Aabb::of(local(triangle)), &bounds, triangle));
+        let (bvh, leaves) = Bvh::build(prims.collect(), TRIANGLES);
+        let block =
+            |leaf: &[u32]| TriangleBlock::new(leaf.iter().map(|&t| (local(t), first_triangle + t)));
         let (blocks, wide_bvh) = rayon::join(
             || leaves.par_iter().map(block).collect(),
             || WideBvh::of(&bvh),
         );
         Some(Self {
             bounds,
-            middle: middle.as_dvec3(),
-            wide_bvh,
-            bvh,
+            tile: TileBvh {
+                middle: middle.as_dvec3(),
+                bvh,
+                wide_bvh,
+                first_block: 0,
+            },
             blocks,
         })
     }
@@ -321,25 +175,12 @@ fn middle_of(bounds: &Aabb) -> Vec3 {
     bounds.min.midpoint(bounds.max)
 }
 
-/// An item whose box is larger by what rounding can do in a scene of this size.
-fn padded_item(bounds: Aabb, whole: &Aabb, index: u32) -> Item {
+/// A primitive whose box is enlarged by the rounding errors in a scene of this size.
+fn padded_prim(bounds: Aabb, whole: &Aabb, index: u32) -> PrimRef {
     let padding = Vec3::splat(PADDING * whole.size().max_element());
-    Item {
-        bounds: Aabb {
-            min: bounds.min - padding,
-            max: bounds.max + padding,
-        },
-        index,
-    }
-}
-
-/// Whether a triangle has finite corners and an area.
-pub(crate) fn is_proper(corners: [Vec3; 3]) -> bool {
-    let [a, b, c] = corners.map(|corner| corner.as_dvec3());
-    let longest_squared = (b - a)
-        .length_squared()
-        .max((c - b).length_squared())
-        .max((a - c).length_squared());
-    let twice_area = (b - a).cross(c - a).length();
-    twice_area.is_finite() && twice_area > THINNEST * longest_squared
+    let padded = Aabb {
+        min: bounds.min - padding,
+        max: bounds.max + padding,
+    };
+    PrimRef::new(padded, index)
 }

@@ -1,6 +1,7 @@
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
+use super::simd::{Baseline, SimdTask as _};
 use super::*;
 use crate::geometry::{TriangleMesh, Vec3};
 
@@ -57,12 +58,12 @@ fn range_by_hand(origin: Vec3, direction: Vec3, corners: [Vec3; 3]) -> f64 {
 }
 
 #[test]
-fn a_soup_of_triangles_is_seen_as_by_testing_all_of_them() {
+fn random_triangles_are_hit_as_by_testing_all_of_them() {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     for (triangles, size_m) in [(1, 5.0), (3, 5.0), (30, 4.0), (500, 2.0), (3000, 0.5)] {
         let mesh = soup(triangles, size_m, &mut rng);
         let scene = Scene::new(&mesh);
-        let mut met = 0;
+        let mut hit_count = 0;
         for _ in 0..20 {
             let origin = 10.0 * in_cube(&mut rng);
             let directions: Vec<Vec3> = (0..37).map(|_| direction(&mut rng)).collect();
@@ -75,7 +76,7 @@ fn a_soup_of_triangles_is_seen_as_by_testing_all_of_them() {
                 if hit == Hit::MISS {
                     assert_eq!(nearest, f64::INFINITY);
                 } else {
-                    met += 1;
+                    hit_count += 1;
                     let corners = mesh.corners(hit.triangle as usize);
                     let own = range_by_hand(origin, direction, corners);
                     assert!((own - nearest).abs() < 1e-4, "{own} {nearest}");
@@ -83,7 +84,7 @@ fn a_soup_of_triangles_is_seen_as_by_testing_all_of_them() {
                 }
             }
         }
-        assert!(triangles < 30 || met > 10);
+        assert!(triangles < 30 || hit_count > 10);
     }
 }
 
@@ -170,7 +171,7 @@ fn a_ball_is_round_to_its_sagitta() {
 }
 
 #[test]
-fn no_ray_slips_out_of_a_closed_surface_along_its_edges_and_corners() {
+fn no_ray_leaves_a_closed_surface_along_its_edges_and_corners() {
     let mut rng = ChaCha8Rng::seed_from_u64(4);
     for (mesh, inside_m) in [
         (cube(0.5), 0.2),
@@ -198,7 +199,7 @@ fn no_ray_slips_out_of_a_closed_surface_along_its_edges_and_corners() {
 }
 
 #[test]
-fn rays_along_the_axes_meet_a_floor_of_squares_also_between_them() {
+fn rays_along_the_axes_hit_a_floor_of_squares_also_between_them() {
     let mut mesh = TriangleMesh::default();
     for (x, y) in (-4..4).flat_map(|x| (-4..4).map(move |y| (x as f32, y as f32))) {
         let first = mesh.vertices.len() as u32;
@@ -222,7 +223,7 @@ fn rays_along_the_axes_meet_a_floor_of_squares_also_between_them() {
 }
 
 #[test]
-fn a_ray_that_starts_on_a_surface_meets_the_next_one() {
+fn a_ray_that_starts_on_a_surface_hits_the_next_one() {
     let mesh = cube(0.5);
     let scene = Scene::new(&mesh);
     let mut rng = ChaCha8Rng::seed_from_u64(5);
@@ -236,7 +237,7 @@ fn a_ray_that_starts_on_a_surface_meets_the_next_one() {
 }
 
 #[test]
-fn triangles_that_are_none_are_never_met() {
+fn degenerate_triangles_are_never_hit() {
     let mut mesh = cube(0.5);
     let proper = mesh.triangles.len() as u32;
     let nan = mesh.vertices.len() as u32;
@@ -263,7 +264,7 @@ fn triangles_that_are_none_are_never_met() {
 }
 
 #[test]
-fn nothing_is_met_where_nothing_is() {
+fn rays_miss_an_empty_scene() {
     let scenes = [
         Scene::new(&TriangleMesh::default()),
         Scene::of_tiles(&[]),
@@ -287,17 +288,17 @@ fn the_triangles_of_tiles_are_counted_one_after_the_other() {
 }
 
 #[test]
-fn a_ray_looks_no_farther_than_it_should() {
+fn a_ray_hits_nothing_beyond_its_limit() {
     let scene = Scene::new(&cube(2.0));
-    for (max_range_m, is_met) in [(1.9, false), (2.0, false), (2.1, true)] {
+    for (max_range_m, is_hit) in [(1.9, false), (2.0, false), (2.1, true)] {
         let mut hits = [Hit::MISS];
         scene.cast_until(Vec3::ZERO, &[Vec3::X], max_range_m, &mut hits);
-        assert_eq!(hits[0] != Hit::MISS, is_met);
+        assert_eq!(hits[0] != Hit::MISS, is_hit);
     }
 }
 
 #[test]
-fn where_any_near_surface_is_enough_one_is_found() {
+fn if_any_near_surface_is_enough_one_is_found() {
     let mut rng = ChaCha8Rng::seed_from_u64(6);
     let scene = Scene::new(&soup(500, 2.0, &mut rng));
     let directions: Vec<Vec3> = (0..800).map(|_| direction(&mut rng)).collect();
@@ -310,7 +311,7 @@ fn where_any_near_surface_is_enough_one_is_found() {
     };
     let mut hits = nearest.clone();
     let reaches = vec![reach; directions.len()];
-    scene.cast_within(Vec3::ZERO.as_dvec3(), &directions, &reaches, &mut hits);
+    scene.cast_packets(Vec3::ZERO.as_dvec3(), &directions, &reaches, &mut hits);
     for (hit, nearest) in hits.iter().zip(&nearest) {
         if nearest.range_m < reach.enough_m {
             assert!((nearest.range_m..reach.enough_m).contains(&hit.range_m));
@@ -331,8 +332,10 @@ fn every_instruction_set_gives_the_same_bits() {
         let reach = vec![Reach::UNLIMITED; directions.len()];
         let mut fast = vec![Hit::MISS; directions.len()];
         let mut portable = fast.clone();
-        scene.cast_within(origin, &directions, &reach, &mut fast);
-        scene.cast_portable(origin, &directions, &reach, &mut portable);
+        scene.cast_packets(origin, &directions, &reach, &mut fast);
+        scene
+            .task(origin, &directions, &reach, &mut portable)
+            .run(Baseline);
         let bits = |hits: &[Hit]| -> Vec<(u32, u32)> {
             hits.iter()
                 .map(|hit| (hit.range_m.to_bits(), hit.triangle))
@@ -343,7 +346,7 @@ fn every_instruction_set_gives_the_same_bits() {
 }
 
 #[test]
-fn what_a_ray_meets_does_not_depend_on_its_neighbours() {
+fn the_hit_of_a_ray_does_not_depend_on_its_neighbours() {
     let mut rng = ChaCha8Rng::seed_from_u64(8);
     let scene = Scene::new(&soup(2000, 1.0, &mut rng));
     let directions: Vec<Vec3> = (0..400).map(|_| direction(&mut rng)).collect();
@@ -357,7 +360,7 @@ fn what_a_ray_meets_does_not_depend_on_its_neighbours() {
 }
 
 #[test]
-fn centroids_that_coincide_or_lie_ever_closer_make_no_tree_too_deep() {
+fn coinciding_or_converging_centroids_do_not_exceed_the_depth_limit() {
     let mut mesh = TriangleMesh::default();
     for number in 0..300 {
         let scale = if number < 150 {
@@ -375,19 +378,19 @@ fn centroids_that_coincide_or_lie_ever_closer_make_no_tree_too_deep() {
     assert!((hit.range_m - 2.0 / 3.0_f32.sqrt()).abs() < 1e-6);
 }
 
-/// Ranges of rays from one origin, one by one.
-fn cast_lone(scene: &Scene, origin: Vec3, directions: &[Vec3], reach: Reach) -> Vec<f32> {
+/// Ranges of single rays from one origin.
+fn cast_single(scene: &Scene, origin: Vec3, directions: &[Vec3], reach: Reach) -> Vec<f32> {
     let mut ranges_m = vec![0.0; directions.len()];
     let reaches = vec![reach; directions.len()];
-    scene.cast_lone(origin.as_dvec3(), directions, &reaches, &mut ranges_m);
+    scene.cast_single(origin.as_dvec3(), directions, &reaches, &mut ranges_m);
     ranges_m
 }
 
 #[test]
-fn a_lone_ray_meets_what_it_meets_in_a_packet() {
+fn a_single_ray_hits_what_it_hits_in_a_packet() {
     let mut rng = ChaCha8Rng::seed_from_u64(12);
     let scene = Scene::of_tiles(&[soup(3000, 0.7, &mut rng), soup(300, 2.0, &mut rng)]);
-    let mut met = 0;
+    let mut hit_count = 0;
     for until_m in [f32::INFINITY, 8.0] {
         for _ in 0..10 {
             let origin = 10.0 * in_cube(&mut rng);
@@ -397,25 +400,25 @@ fn a_lone_ray_meets_what_it_meets_in_a_packet() {
                 .collect();
             let mut hits = vec![Hit::MISS; directions.len()];
             scene.cast_until(origin, &directions, until_m, &mut hits);
-            let ranges_m = cast_lone(&scene, origin, &directions, Reach::until(until_m));
+            let ranges_m = cast_single(&scene, origin, &directions, Reach::until(until_m));
             for (range_m, hit) in ranges_m.iter().zip(&hits) {
                 assert_eq!(range_m.to_bits(), hit.range_m.to_bits());
-                met += usize::from(*hit != Hit::MISS);
+                hit_count += usize::from(*hit != Hit::MISS);
             }
         }
     }
-    assert!(met > 1000, "{met}");
+    assert!(hit_count > 1000, "{hit_count}");
 }
 
 #[test]
-fn lone_rays_in_a_soup_meet_what_testing_all_triangles_finds() {
+fn single_rays_hit_random_triangles_as_by_testing_all_of_them() {
     let mut rng = ChaCha8Rng::seed_from_u64(13);
     for (triangles, size_m) in [(0, 1.0), (1, 9.0), (30, 4.0), (500, 2.0)] {
         let mesh = soup(triangles, size_m, &mut rng);
         let scene = Scene::new(&mesh);
         let origin = 3.0 * in_cube(&mut rng);
         let directions: Vec<Vec3> = (0..400).map(|_| direction(&mut rng)).collect();
-        let ranges_m = cast_lone(&scene, origin, &directions, Reach::UNLIMITED);
+        let ranges_m = cast_single(&scene, origin, &directions, Reach::UNLIMITED);
         for (&direction, range_m) in directions.iter().zip(ranges_m) {
             let nearest = (0..triangles)
                 .map(|t| range_by_hand(origin, direction, mesh.corners(t)))
@@ -430,7 +433,7 @@ fn lone_rays_in_a_soup_meet_what_testing_all_triangles_finds() {
 }
 
 #[test]
-fn no_lone_ray_slips_through_an_edge_or_a_corner() {
+fn no_single_ray_passes_through_an_edge_or_a_corner() {
     let scene = Scene::new(&cube(2.0));
     // Towards corners, edges and diagonals of the walls, where two or more triangles meet.
     let steps = [-1.0, -0.5, 0.0, 0.5, 1.0];
@@ -443,7 +446,7 @@ fn no_lone_ray_slips_through_an_edge_or_a_corner() {
             }
         }
     }
-    let ranges_m = cast_lone(&scene, Vec3::ZERO, &directions, Reach::UNLIMITED);
+    let ranges_m = cast_single(&scene, Vec3::ZERO, &directions, Reach::UNLIMITED);
     for (direction, range_m) in directions.iter().zip(ranges_m) {
         let expected = 2.0 / direction.abs().max_element();
         assert!((range_m - expected).abs() < 1e-5, "{direction} {range_m}");
@@ -451,17 +454,17 @@ fn no_lone_ray_slips_through_an_edge_or_a_corner() {
 }
 
 #[test]
-fn in_a_window_only_what_is_near_its_range_is_told_from_nothing() {
+fn in_a_window_only_surfaces_inside_it_must_be_reported() {
     let mut rng = ChaCha8Rng::seed_from_u64(14);
     let scene = Scene::new(&soup(500, 2.0, &mut rng));
     let directions: Vec<Vec3> = (0..2000).map(|_| direction(&mut rng)).collect();
-    let nearest = cast_lone(&scene, Vec3::ZERO, &directions, Reach::UNLIMITED);
+    let nearest = cast_single(&scene, Vec3::ZERO, &directions, Reach::UNLIMITED);
     let window = Reach {
         until_m: 6.0,
         enough_m: 4.0,
         is_window: true,
     };
-    let in_window = cast_lone(&scene, Vec3::ZERO, &directions, window);
+    let in_window = cast_single(&scene, Vec3::ZERO, &directions, window);
     let (mut hidden, mut left_out) = (0, 0);
     for (nearest, range_m) in nearest.into_iter().zip(in_window) {
         if nearest < window.enough_m {
@@ -478,7 +481,7 @@ fn in_a_window_only_what_is_near_its_range_is_told_from_nothing() {
 }
 
 #[test]
-fn every_instruction_set_gives_lone_rays_the_same_bits() {
+fn every_instruction_set_gives_single_rays_the_same_bits() {
     let mut rng = ChaCha8Rng::seed_from_u64(15);
     let scene = Scene::of_tiles(&[soup(3000, 0.7, &mut rng), soup(300, 2.0, &mut rng)]);
     for is_window in [false, true] {
@@ -489,15 +492,17 @@ fn every_instruction_set_gives_lone_rays_the_same_bits() {
         };
         let origin = in_cube(&mut rng);
         let directions: Vec<Vec3> = (0..2000).map(|_| direction(&mut rng)).collect();
-        let fast = cast_lone(&scene, origin, &directions, reach);
+        let fast = cast_single(&scene, origin, &directions, reach);
         let mut portable = fast.clone();
         let reaches = vec![reach; directions.len()];
-        scene.cast_lone_portable(origin.as_dvec3(), &directions, &reaches, &mut portable);
+        scene
+            .task(origin.as_dvec3(), &directions, &reaches, &mut portable)
+            .run(Baseline);
         assert_eq!(fast, portable);
     }
 }
 
-/// Eight origins within `spread_m` of one, and bundles of rays from them within `turn` of some
+/// Eight origins within `spread_m` of one, and bundles of rays from them within `turn` of random
 /// directions.
 fn bundles(
     middle: Vec3,
@@ -506,20 +511,20 @@ fn bundles(
     rng: &mut ChaCha8Rng,
 ) -> ([Vec3; RAYS], Vec<[Vec3; RAYS]>) {
     let origins = [0; RAYS].map(|_| middle + spread_m * in_cube(rng));
-    let courses: Vec<Vec3> = (0..200).map(|_| direction(rng)).collect();
-    let directions = courses
+    let middles: Vec<Vec3> = (0..200).map(|_| direction(rng)).collect();
+    let directions = middles
         .into_iter()
         .chain(Vec3::AXES)
-        .map(|course| [0; RAYS].map(|_| (course + turn * in_cube(rng)).normalize()))
+        .map(|middle| [0; RAYS].map(|_| (middle + turn * in_cube(rng)).normalize()))
         .collect();
     (origins, directions)
 }
 
 #[test]
-fn a_ray_in_a_bundle_meets_what_it_meets_alone() {
+fn a_ray_in_a_bundle_hits_what_it_hits_as_single_ray() {
     let mut rng = ChaCha8Rng::seed_from_u64(16);
     let scene = Scene::of_tiles(&[soup(3000, 0.7, &mut rng), soup(300, 2.0, &mut rng)]);
-    let mut met = 0;
+    let mut hit_count = 0;
     for (until_m, spread_m, turn) in [(f32::INFINITY, 0.1, 0.01), (8.0, 5.0, 1.5), (8.0, 0.0, 0.0)]
     {
         for _ in 0..10 {
@@ -535,19 +540,19 @@ fn a_ray_in_a_bundle_meets_what_it_meets_alone() {
             );
             for (ray, &origin) in origins.iter().enumerate() {
                 let of_one: Vec<Vec3> = directions.iter().map(|bundle| bundle[ray]).collect();
-                let alone = cast_lone(&scene, origin, &of_one, reach);
-                for (bundle, alone) in ranges_m.iter().zip(alone) {
-                    assert_eq!(bundle[ray].to_bits(), alone.to_bits());
-                    met += usize::from(alone.is_finite());
+                let single = cast_single(&scene, origin, &of_one, reach);
+                for (bundle, single) in ranges_m.iter().zip(single) {
+                    assert_eq!(bundle[ray].to_bits(), single.to_bits());
+                    hit_count += usize::from(single.is_finite());
                 }
             }
         }
     }
-    assert!(met > 1000, "{met}");
+    assert!(hit_count > 1000, "{hit_count}");
 }
 
 #[test]
-fn no_ray_of_a_bundle_slips_through_an_edge_or_a_corner() {
+fn no_ray_of_a_bundle_passes_through_an_edge_or_a_corner() {
     let scene = Scene::new(&cube(2.0));
     let corners: Vec<Vec3> = cube(2.0).vertices;
     let origins = [0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 0.4].map(|x| Vec3::new(x, -x, 0.5 * x));
@@ -574,7 +579,7 @@ fn no_ray_of_a_bundle_slips_through_an_edge_or_a_corner() {
 }
 
 #[test]
-fn where_any_near_surface_is_enough_a_bundle_finds_one_where_there_is_one() {
+fn if_any_near_surface_is_enough_a_bundle_finds_one() {
     let mut rng = ChaCha8Rng::seed_from_u64(17);
     let scene = Scene::new(&soup(500, 2.0, &mut rng));
     let (origins, directions) = bundles(Vec3::ZERO, 0.2, 0.02, &mut rng);
@@ -613,7 +618,9 @@ fn every_instruction_set_gives_bundles_the_same_bits() {
         let mut fast = vec![[0.0; RAYS]; directions.len()];
         let mut portable = fast.clone();
         scene.cast_bundles(&from, &directions, &reach, &mut fast);
-        scene.cast_bundles_portable(&from, &directions, &reach, &mut portable);
+        scene
+            .task(from, &directions, &reach, &mut portable)
+            .run(Baseline);
         assert_eq!(fast, portable);
     }
 }

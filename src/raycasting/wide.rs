@@ -1,14 +1,15 @@
-//! A hierarchy whose nodes have eight children: one ray against eight boxes at once.
+//! Wide bounding volume hierarchy: one ray against the boxes of eight children at once.
 //!
-//! It is the binary one with nodes left out: of the children of a node the one with the largest
-//! surface is replaced by its own two, until there are eight. After Wald, Benthin and Boulos,
+//! Made from the binary hierarchy: of the children of a node the one with the largest surface is
+//! replaced by its own two, until there are eight. After Wald, Benthin and Boulos,
 //! *Getting Rid of Packets: Efficient SIMD Single-Ray Traversal using Multi-branching BVHs*,
 //! RT 2008.
 
-use super::bvh::{Bvh, Child};
+use super::bvh::{Bvh, NodeRef};
+use super::simd::WIDTH;
 
 /// Children of a node.
-pub(super) const CHILDREN: usize = 8;
+pub(super) const CHILDREN: usize = WIDTH;
 /// Lower corner x, y, z, then upper corner x, y, z.
 type Bounds = [f32; 6];
 
@@ -18,8 +19,8 @@ type Bounds = [f32; 6];
 pub(super) struct WideNode {
     /// Lower x of each child, lower y, …, upper z.
     pub bounds: [[f32; CHILDREN]; 6],
-    /// Behind a box that is turned inside out there is no child.
-    pub children: [Child; CHILDREN],
+    /// An inverted box marks an absent child.
+    pub children: [NodeRef; CHILDREN],
 }
 
 /// The hierarchy; its root is the first node.
@@ -29,7 +30,7 @@ pub(super) struct WideBvh {
 }
 
 impl WideBvh {
-    /// The same leaves under fewer nodes.
+    /// The hierarchy of the same leaves with fewer nodes.
     pub fn of(bvh: &Bvh) -> Self {
         let mut wide = Self::default();
         match bvh.root {
@@ -45,8 +46,8 @@ impl WideBvh {
         wide
     }
 
-    /// Adds an inner node of the binary hierarchy and what is below.
-    fn add(&mut self, bvh: &Bvh, inner: Child) -> Child {
+    /// Adds an inner node of the binary hierarchy and all below it.
+    fn add(&mut self, bvh: &Bvh, inner: NodeRef) -> NodeRef {
         let mut children = descendants(bvh, inner);
         let index = self.nodes.len();
         self.nodes.push(node(&[]));
@@ -56,17 +57,17 @@ impl WideBvh {
             }
         }
         self.nodes[index] = node(&children);
-        Child::node(index)
+        NodeRef::inner(index)
     }
 }
 
 /// Up to eight descendants that together hold all leaves of an inner node.
-fn descendants(bvh: &Bvh, inner: Child) -> Vec<(Bounds, Child)> {
-    let children_of = |child: Child| {
+fn descendants(bvh: &Bvh, inner: NodeRef) -> Vec<(Bounds, NodeRef)> {
+    let children_of = |child: NodeRef| {
         let node = &bvh.nodes[child.index()];
         std::iter::zip(node.bounds, node.children)
     };
-    let mut found: Vec<(Bounds, Child)> = children_of(inner).collect();
+    let mut found: Vec<(Bounds, NodeRef)> = children_of(inner).collect();
     while found.len() < CHILDREN {
         let largest = (0..found.len())
             .filter(|&place| !found[place].1.is_leaf())
@@ -80,11 +81,11 @@ fn descendants(bvh: &Bvh, inner: Child) -> Vec<(Bounds, Child)> {
     found
 }
 
-fn node(children: &[(Bounds, Child)]) -> WideNode {
-    let inside_out = bounds_of([[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]]);
+fn node(children: &[(Bounds, NodeRef)]) -> WideNode {
+    let inverted = bounds_of([[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]]);
     let mut node = WideNode {
-        bounds: inside_out.map(|side| [side; CHILDREN]),
-        children: [Child::leaf(0); CHILDREN],
+        bounds: inverted.map(|side| [side; CHILDREN]),
+        children: [NodeRef::leaf(0); CHILDREN],
     };
     for (place, (bounds, child)) in children.iter().enumerate() {
         for (side, bound) in bounds.iter().enumerate() {

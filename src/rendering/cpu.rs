@@ -107,7 +107,7 @@ impl CpuRenderer {
             directions[place] = rotation * beams.directions[ray as usize];
             reaches[place] = beams.reaches[ray as usize];
         }
-        self.scene.cast_within(
+        self.scene.cast_packets(
             origin_of(map_from_lidar),
             &directions[..rays.len()],
             &reaches[..rays.len()],
@@ -127,7 +127,7 @@ impl CpuRenderer {
         let mut ranges = vec![f32::INFINITY; rays.len()];
         let origin = origin_of(map_from_lidar);
         self.scene
-            .cast_lone(origin, &directions, &reaches, &mut ranges);
+            .cast_single(origin, &directions, &reaches, &mut ranges);
         ranges
     }
 
@@ -274,7 +274,8 @@ impl RangeRenderer for CpuRenderer {
                     .collect();
                 let mut hits = vec![Hit::MISS; rays.len()];
                 let reaches = vec![Reach::UNLIMITED; rays.len()];
-                self.scene.cast_within(origin, &turned, &reaches, &mut hits);
+                self.scene
+                    .cast_packets(origin, &turned, &reaches, &mut hits);
                 hits
             })
             .collect();

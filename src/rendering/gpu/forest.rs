@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use super::layout::{self, Node, Triangle};
 use crate::geometry::{Aabb, TriangleMesh};
-use crate::raycasting::bvh::{Bvh, Child, Item, Leaves};
+use crate::raycasting::bvh::{Bvh, Leaves, NodeRef, PrimRef};
 use crate::raycasting::is_proper;
 
 /// Most triangles in a leaf: a test costs the device about as much as a node.
@@ -76,7 +76,7 @@ impl Forest {
     fn plant(&mut self, tree: Tree) -> Option<u32> {
         let root = tree.bvh.root?;
         let (first_node, first) = (self.nodes.len(), self.triangles.len());
-        let refer = |child: Child| {
+        let refer = |child: NodeRef| {
             if child.is_leaf() {
                 let range = &tree.leaves.ranges[child.index()];
                 layout::leaf(first + range.start as usize, range.len())
@@ -99,16 +99,14 @@ impl Forest {
 
     /// Puts one hierarchy over those of all tiles.
     fn join(&mut self, roots: &[u32]) {
-        let items = (0..roots.len()).map(|index| Item {
-            bounds: self.tiles[index].bounds,
-            index: index as u32,
-        });
-        let (over, leaves) = Bvh::build(&items.collect::<Vec<_>>(), 1);
+        let tiles = self.tiles.iter().zip(0..);
+        let prims = tiles.map(|(tile, index)| PrimRef::new(tile.bounds, index));
+        let (over, leaves) = Bvh::build(prims.collect(), 1);
         let Some(root) = over.root else {
             return;
         };
         let first_node = self.nodes.len();
-        let refer = |child: Child| {
+        let refer = |child: NodeRef| {
             if child.is_leaf() {
                 let place = leaves.ranges[child.index()].start as usize;
                 roots[leaves.order[place] as usize]
@@ -152,11 +150,9 @@ impl Tree {
             .filter(|&corners| is_proper(corners))
             .map(|corners| corners.map(|corner| (corner.as_dvec3() - center).as_vec3()))
             .collect();
-        let items = corners.iter().enumerate().map(|(index, corners)| Item {
-            bounds: Aabb::of(*corners),
-            index: index as u32,
-        });
-        let (bvh, leaves) = Bvh::build(&items.collect::<Vec<_>>(), LEAF_SIZE);
+        let triangles = corners.iter().zip(0..);
+        let prims = triangles.map(|(corners, index)| PrimRef::new(Aabb::of(*corners), index));
+        let (bvh, leaves) = Bvh::build(prims.collect(), LEAF_SIZE);
         Self {
             bvh,
             leaves,

@@ -1,0 +1,253 @@
+//! The ways to cast rays at a scene: in packets, in bundles, singly, and through all surfaces.
+
+use glam::{DVec3, Vec3};
+
+use super::Scene;
+use crate::raycasting::all_hits::AllHits;
+use crate::raycasting::packet::{Origin, Packet};
+use crate::raycasting::simd::{Simd, SimdTask, dispatch};
+use crate::raycasting::single::{SingleRay, Stack, WideTraversal};
+use crate::raycasting::traversal::{Traversal, Traverse};
+use crate::raycasting::triangle::TRIANGLES;
+use crate::raycasting::{Hit, NO_SLOT, RAYS, Reach};
+
+impl Scene {
+    /// Casts rays from one origin along unit directions, all in the frame of the mesh, and writes
+    /// the nearest hit of each. Runs on the calling thread; directions that are neighbours in the
+    /// list should be neighbours in space.
+    ///
+    /// # Panics
+    /// If there are not as many hits as directions.
+    pub fn cast(&self, origin: Vec3, directions: &[Vec3], hits: &mut [Hit]) {
+        self.cast_until(origin, directions, f32::INFINITY, hits);
+    }
+
+    /// Like [`Scene::cast`], but surfaces at `max_range_m` or farther are not hit.
+    pub fn cast_until(
+        &self,
+        origin: Vec3,
+        directions: &[Vec3],
+        max_range_m: f32,
+        hits: &mut [Hit],
+    ) {
+        const AT_ONCE: usize = 32 * RAYS;
+        assert_eq!(directions.len(), hits.len(), "one hit per direction");
+        let reaches = [Reach::until(max_range_m); AT_ONCE];
+        let chunks = directions.chunks(AT_ONCE).zip(hits.chunks_mut(AT_ONCE));
+        for (directions, hits) in chunks {
+            let reaches = &reaches[..directions.len()];
+            self.cast_packets(origin.as_dvec3(), directions, reaches, hits);
+        }
+    }
+
+    /// Like [`Scene::cast`], but each ray has its own reach, and the origin keeps its precision
+    /// far from the origin of the frame.
+    ///
+    /// # Panics
+    /// If there are not as many reaches or hits as directions.
+    pub fn cast_packets(
+        &self,
+        origin: DVec3,
+        directions: &[Vec3],
+        reaches: &[Reach],
+        hits: &mut [Hit],
+    ) {
+        dispatch(self.task(origin, directions, reaches, hits));
+    }
+
+    /// Casts bundles of rays from the same origins, which is faster than [`Scene::cast_single`] if
+    /// the rays of a bundle stay close to each other, and writes the ranges of their nearest hits:
+    /// the same, bit by bit, with the exceptions that are named there. All rays of a bundle have
+    /// one reach. Runs on the calling thread.
+    ///
+    /// # Panics
+    /// If there are not as many reaches or ranges as bundles.
+    pub fn cast_bundles(
+        &self,
+        origins: &[DVec3; RAYS],
+        directions: &[[Vec3; RAYS]],
+        reaches: &[Reach],
+        ranges_m: &mut [[f32; RAYS]],
+    ) {
+        dispatch(self.task(*origins, directions, reaches, ranges_m));
+    }
+
+    /// Casts single rays from one origin, which is faster than [`Scene::cast_packets`] if they
+    /// diverge, and writes the range of the nearest hit of each: the same, bit by bit, with two
+    /// exceptions: of surfaces nearer than [`Reach::enough_m`] it may be another, and so it may be
+    /// of the triangles at an edge that the ray passes within rounding. Runs on the calling thread.
+    ///
+    /// # Panics
+    /// If there are not as many reaches or ranges as directions.
+    pub fn cast_single(
+        &self,
+        origin: DVec3,
+        directions: &[Vec3],
+        reaches: &[Reach],
+        ranges_m: &mut [f32],
+    ) {
+        dispatch(self.task(origin, directions, reaches, ranges_m));
+    }
+
+    /// Visits every triangle that a ray hits nearer than `until_m`, in no particular order but
+    /// always the same. If the ray passes an edge within rounding, both triangles are visited.
+    ///
+    /// `origin` and the unit `direction` are in the frame of the mesh.
+    pub fn for_each_hit(
+        &self,
+        origin: Vec3,
+        direction: Vec3,
+        until_m: f32,
+        visit: impl FnMut(Hit),
+    ) {
+        self.traverse::<_, true>(&mut AllHits {
+            origin: origin.as_dvec3(),
+            ray: SingleRay::new(direction, Reach::until(until_m)),
+            visit,
+        });
+    }
+
+    pub(in crate::raycasting) fn task<'a, O, D, R>(
+        &'a self,
+        origin: O,
+        directions: &'a [D],
+        reaches: &'a [Reach],
+        results: &'a mut [R],
+    ) -> CastTask<'a, O, D, R> {
+        assert_eq!(directions.len(), results.len(), "one result per direction");
+        assert_eq!(directions.len(), reaches.len(), "one reach per direction");
+        CastTask {
+            scene: self,
+            origin,
+            directions,
+            reaches,
+            results,
+        }
+    }
+
+    #[inline(always)]
+    fn cast_packet<S: Simd, O: Origin<S>>(&self, packet: &mut Packet<S, O>) {
+        if packet.is_coherent {
+            self.traverse::<_, true>(packet);
+        } else {
+            self.traverse::<_, false>(packet);
+        }
+    }
+
+    #[inline(always)]
+    fn traverse<R: Traverse, const COHERENT: bool>(&self, rays: &mut R) {
+        let origin = rays.relative_to(self.middle);
+        let mut tiles = Traversal::<R, COHERENT>::new(&self.top, origin);
+        while let Some(tile) = tiles.next_leaf(rays) {
+            let tile = &self.tiles[tile];
+            let origin = rays.relative_to(tile.middle);
+            let mut leaves = Traversal::<R, COHERENT>::new(&tile.bvh, origin);
+            while let Some(leaf) = leaves.next_leaf(rays) {
+                let block = tile.first_block + leaf;
+                rays.intersect(origin, &self.blocks[block], (block * TRIANGLES) as u32);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn cast_ray<S: Simd>(
+        &self,
+        simd: S,
+        origin: DVec3,
+        ray: &mut SingleRay,
+        [top_stack, tile_stack]: &mut [Stack; 2],
+    ) {
+        let from_middle = (origin - self.middle).as_vec3();
+        let mut tiles = WideTraversal::new(simd, ray, &self.wide_top, from_middle, top_stack);
+        while let Some(tile) = tiles.next_leaf(ray) {
+            let tile = &self.tiles[tile];
+            let origin = (origin - tile.middle).as_vec3();
+            let mut leaves = WideTraversal::new(simd, ray, &tile.wide_bvh, origin, tile_stack);
+            while let Some(leaf) = leaves.next_leaf(ray) {
+                ray.intersect(origin, &self.blocks[tile.first_block + leaf]);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn hit(&self, range_m: f32, slot: u32) -> Hit {
+        if slot == NO_SLOT {
+            return Hit::MISS;
+        }
+        let slot = slot as usize;
+        Hit {
+            range_m,
+            triangle: self.blocks[slot / TRIANGLES].indices[slot % TRIANGLES],
+        }
+    }
+}
+
+/// Rays to cast, and where their results go.
+pub(in crate::raycasting) struct CastTask<'a, O, D, R> {
+    scene: &'a Scene,
+    origin: O,
+    directions: &'a [D],
+    reaches: &'a [Reach],
+    results: &'a mut [R],
+}
+
+/// Packets of neighbouring directions.
+impl SimdTask for CastTask<'_, DVec3, Vec3, Hit> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let chunks = self.directions.chunks(RAYS).zip(self.reaches.chunks(RAYS));
+        for ((directions, reaches), hits) in chunks.zip(self.results.chunks_mut(RAYS)) {
+            // The last ray fills the empty places.
+            let last = directions.len() - 1;
+            let mut packet = Packet::new(
+                simd,
+                &self.origin,
+                &std::array::from_fn(|ray| directions[ray.min(last)]),
+                &std::array::from_fn(|ray| reaches[ray.min(last)]),
+            );
+            self.scene.cast_packet(&mut packet);
+            for (ray, hit) in hits.iter_mut().enumerate() {
+                *hit = self.scene.hit(packet.range_m[ray], packet.slot[ray]);
+            }
+        }
+    }
+}
+
+/// Bundles.
+impl SimdTask for CastTask<'_, [DVec3; RAYS], [Vec3; RAYS], [f32; RAYS]> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let bundles = self.directions.iter().zip(self.reaches);
+        for ((directions, &reach), ranges_m) in bundles.zip(self.results) {
+            let mut packet = Packet::new(simd, &self.origin, directions, &[reach; RAYS]);
+            self.scene.cast_packet(&mut packet);
+            *ranges_m = packet.range_m;
+        }
+    }
+}
+
+/// Single rays.
+impl SimdTask for CastTask<'_, DVec3, Vec3, f32> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let mut stacks = [Stack::new(), Stack::new()];
+        let rays = self.directions.iter().zip(self.reaches);
+        for ((&direction, &reach), range_m) in rays.zip(self.results) {
+            let mut ray = SingleRay::new(direction, reach);
+            if reach.is_window {
+                ray = ray.between(reach.enough_m, reach.until_m);
+            }
+            let mut is_last = !reach.is_window;
+            loop {
+                (self.scene).cast_ray(simd, self.origin, &mut ray, &mut stacks);
+                if is_last || ray.range_m == f32::INFINITY {
+                    break;
+                }
+                // The surface in the window may be hidden by a nearer one.
+                ray = ray.between(0.0, reach.enough_m);
+                is_last = true;
+            }
+            *range_m = ray.range_m;
+        }
+    }
+}
