@@ -102,6 +102,18 @@ pub fn at_least_one(key: &str, count: usize) -> Result<(), InvalidValue> {
     require(count >= 1, key, count, "it must be 1 or greater")
 }
 
+/// Requires a rectangle `[x_min, x_max, y_min, y_max]`.
+pub fn rectangle(key: &str, limits_m: [f32; 4]) -> Result<(), InvalidValue> {
+    let [x_min, x_max, y_min, y_max] = limits_m;
+    require(
+        limits_m.iter().all(|limit| limit.is_finite()) && x_min <= x_max && y_min <= y_max,
+        key,
+        format_args!("{limits_m:?}"),
+        "it must be x_min, x_max, y_min, y_max with x_min <= x_max and y_min <= y_max; \
+         [0, 0, 0, 0] is empty",
+    )
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

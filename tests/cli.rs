@@ -1,4 +1,4 @@
-//! The program from outside: its manners, and what it says about configurations.
+//! The program from outside: help, exit codes and errors of configurations.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
@@ -8,7 +8,7 @@ use std::path::Path;
 
 use common::{Recording, fpmcl};
 
-const COMMANDS: [&str; 9] = [
+const COMMANDS: [&str; 10] = [
     "build-map",
     "localize",
     "refine",
@@ -17,6 +17,7 @@ const COMMANDS: [&str; 9] = [
     "simulate",
     "demo",
     "ground",
+    "config",
     "doctor",
 ];
 
@@ -78,7 +79,7 @@ fn wrong_usage_has_its_own_exit_code() {
 }
 
 #[test]
-fn the_doctor_tells_threads_and_backend() {
+fn the_doctor_prints_threads_and_backend() {
     let said = fpmcl("doctor").with("--measure=0").succeeds();
     for row in ["instruction sets", "threads in use", "backend auto"] {
         assert!(said.stdout.contains(row), "{}", said.stdout);
@@ -98,14 +99,47 @@ fn the_doctor_measures_rays_per_second() {
 
 #[test]
 fn a_missing_configuration_is_named() {
-    fpmcl("build-map").fails_saying(&["config/build_map.yml", "give the path"]);
     fpmcl("evaluate")
         .with("own.yml")
-        .fails_saying(&["cannot read", "own.yml"]);
+        .fails_saying(&["cannot read", "own.yml", "give the path"]);
 }
 
 #[test]
-fn an_unknown_key_is_told_with_line_and_nearest_key() {
+fn without_a_file_the_built_in_configuration_is_used() {
+    fpmcl("build-map").fails_saying(&["scan_folder is data/kitti/velodyne"]);
+    fpmcl("ground").fails_saying(&["data/kitti/velodyne"]);
+    fpmcl("evaluate").fails_saying(&["result_file is results/localization.npz"]);
+    let runs = fpmcl("compare").with("--list-jobs").succeeds().stdout;
+    assert!(runs.contains("town/Fuzzy-PSO-MCL/5"), "{runs}");
+}
+
+#[test]
+fn config_prints_the_short_file_and_the_full_one() {
+    for (command, file) in [
+        ("build-map", "build_map.yml"),
+        ("localize", "localization.yml"),
+        ("refine", "refinement.yml"),
+        ("evaluate", "evaluation.yml"),
+        ("ground", "ground.yml"),
+        ("simulate", "simulation.yml"),
+        ("compare", "comparison.yml"),
+    ] {
+        let short = fpmcl("config").with(command).succeeds().stdout;
+        assert_eq!(short, std::fs::read_to_string(delivered(file)).unwrap());
+        let full = fpmcl("config")
+            .with(command)
+            .with("--full")
+            .succeeds()
+            .stdout;
+        assert!(full.len() >= short.len(), "{command}");
+    }
+    fpmcl("config")
+        .with("demo")
+        .misuse_saying(&["demo", "localize"]);
+}
+
+#[test]
+fn an_unknown_key_is_reported_with_line_and_nearest_key() {
     let recording = Recording::street(0);
     recording.write("build_map.yml", "depth: 8\nvoxel_sise: 0.1\n");
     recording.fpmcl("build-map").fails_saying(&[
@@ -116,7 +150,7 @@ fn an_unknown_key_is_told_with_line_and_nearest_key() {
 }
 
 #[test]
-fn a_word_where_a_number_belongs_is_told_with_its_line() {
+fn a_value_of_the_wrong_type_is_reported_with_its_line() {
     let recording = Recording::street(0);
     recording.write("localization.yml", "# start\n\nnumParticles: many\n");
     recording.fpmcl("localize").fails_saying(&[
@@ -127,7 +161,7 @@ fn a_word_where_a_number_belongs_is_told_with_its_line() {
 }
 
 #[test]
-fn contradictory_values_are_told_with_a_remedy() {
+fn contradictory_values_are_reported_with_a_remedy() {
     for command in ["build-map", "localize"] {
         Recording::street(0)
             .fpmcl(command)
@@ -152,7 +186,7 @@ fn contradictory_values_are_told_with_a_remedy() {
 }
 
 #[test]
-fn a_setting_that_names_no_key_is_told_with_the_nearest() {
+fn a_setting_of_an_unknown_key_is_reported_with_the_nearest() {
     fpmcl("localize")
         .with(delivered("localization.yml"))
         .set("range_image.widht", "512")
@@ -160,7 +194,7 @@ fn a_setting_that_names_no_key_is_told_with_the_nearest() {
 }
 
 #[test]
-fn values_that_would_stop_a_stage_are_told_before_any_work() {
+fn invalid_values_are_reported_before_any_work() {
     for (command, file, key, value) in [
         ("build-map", "build_map.yml", "visibility.max_beams", "0"),
         ("build-map", "build_map.yml", "poisson.scale", "1"),
@@ -186,11 +220,12 @@ fn values_that_would_stop_a_stage_are_told_before_any_work() {
 }
 
 #[test]
-fn a_rule_that_cannot_be_read_is_told_with_its_line_and_the_nearest_word() {
+fn an_invalid_rule_is_reported_with_its_line_and_the_nearest_word() {
     // Both commands have this block.
-    let ground = std::fs::read_to_string(delivered("ground.yml")).expect("the file is there");
+    let ground = fpmcl("config").with("ground").with("--full");
+    let ground = ground.succeeds().stdout;
     let fuzzy = &ground[ground.find("\nfuzzy:").expect("it has the block")..];
-    let fuzzy = &fuzzy[..fuzzy.find("\npca:").unwrap_or(fuzzy.len())];
+    let fuzzy = &fuzzy[..fuzzy.find("\nransac:").unwrap_or(fuzzy.len())];
     for (command, text) in [("build-map", fuzzy), ("ground", ground.as_str())] {
         for (right, wrong, key, told) in [
             (
@@ -232,7 +267,7 @@ fn a_rule_that_cannot_be_read_is_told_with_its_line_and_the_nearest_word() {
 }
 
 #[test]
-fn a_rule_on_the_command_line_is_told_there() {
+fn an_invalid_rule_on_the_command_line_is_reported_there() {
     fpmcl("build-map")
         .with(delivered("build_map.yml"))
         .set("fuzzy.rules", "[IF height IS hight THEN ground IS low]")

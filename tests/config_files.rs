@@ -1,5 +1,5 @@
-//! The configurations that are delivered: each loads, says what the defaults say, explains
-//! every key, and comes back from disk as it was; and those of range-mcl load unchanged.
+//! The configuration files: each loads and survives a round trip, the built-in texts have the
+//! defaults and explain every key, and the files of range-mcl load unchanged.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
@@ -9,20 +9,25 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use fpmcl::app::config::{
-    self, BuildMapConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig, Initialization,
-    LocalizationConfig, RefinementConfig, RenderedRangeImage,
+    self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
+    Initialization, LocalizationConfig, RefinementConfig, RenderedRangeImage,
 };
 use fpmcl::simulation::SimulationConfig;
-use fpmcl::validation::Validate;
-use serde::Serialize;
-use serde::de::DeserializeOwned;
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-fn load<T: Validate + Serialize + DeserializeOwned>(path: &Path) -> T {
-    config::load(Some(path), Path::new(""), &[]).unwrap_or_else(|error| panic!("{error}"))
+fn load<T: CommandConfig>(path: &Path) -> T {
+    config::load(Some(path), &[]).unwrap_or_else(|error| panic!("{error}"))
+}
+
+/// Loads a configuration from a text.
+fn parse<T: CommandConfig>(text: &str) -> T {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("own.yml");
+    fs::write(&path, text).unwrap();
+    load(&path)
 }
 
 /// The configuration files below a folder, all of them.
@@ -40,11 +45,9 @@ fn files_below(folder: &Path) -> Vec<PathBuf> {
     files
 }
 
-/// Loads a file as the configuration of the command that its name tells and checks that it
-/// comes back; the keys that it should have had.
-fn keys_of(path: &Path) -> BTreeSet<String> {
+/// Loads a file as the configuration of the command in its name and checks the round trip.
+fn check_round_trip(path: &Path) {
     let name = path.file_name().unwrap().to_str().unwrap();
-    // One arm per command: a file that belongs to none is a mistake.
     match name {
         "build_map.yml" => round_trip::<BuildMapConfig>(path),
         "localization.yml" | "localization_stereo.yml" => round_trip::<LocalizationConfig>(path),
@@ -52,27 +55,60 @@ fn keys_of(path: &Path) -> BTreeSet<String> {
         "evaluation.yml" => round_trip::<EvaluationConfig>(path),
         "simulation.yml" => round_trip::<SimulationConfig>(path),
         "comparison.yml" | "comparison_kitti.yml" | "comparison_refiners.yml" => {
-            round_trip::<ComparisonConfig>(path)
+            round_trip::<ComparisonConfig>(path);
         }
         "ground.yml" => round_trip::<GroundCommandConfig>(path),
         _ => panic!("{} belongs to no command", path.display()),
     }
 }
 
-fn round_trip<T>(path: &Path) -> BTreeSet<String>
-where
-    T: Validate + Serialize + DeserializeOwned + PartialEq + Debug,
-{
+fn round_trip<T: CommandConfig + PartialEq + Debug>(path: &Path) {
     let config: T = load(path);
     let folder = tempfile::tempdir().unwrap();
     let effective = folder.path().join("effective.yml");
     config::write(&effective, &config).unwrap();
     assert_eq!(load::<T>(&effective), config, "{}", path.display());
-    let text = fs::read_to_string(&effective).unwrap();
-    text.lines().filter_map(key_of).map(str::to_owned).collect()
 }
 
-/// The key that a line begins with.
+/// Checks that a text has a comment for each of its keys; returns the keys.
+fn explained_keys(name: &str, text: &str) -> BTreeSet<String> {
+    let mut keys = BTreeSet::new();
+    let mut is_commented = false;
+    for line in text.lines() {
+        let Some(key) = key_of(line) else {
+            is_commented = line.trim_start().starts_with('#') || is_commented && !line.is_empty();
+            continue;
+        };
+        // A comment above explains the block or the keys of the same indentation below it.
+        assert!(line.contains(" # ") || is_commented, "{name}: {key}");
+        is_commented &= !line.contains(" # ") && !line.trim_end().ends_with(':');
+        keys.insert(key.to_owned());
+        keys.extend(keys_in_braces(line).map(str::to_owned));
+    }
+    keys
+}
+
+/// Checks the texts of a command: both have the defaults, the full one every key, the short one few.
+fn check_texts<T: CommandConfig + PartialEq + Debug>() {
+    assert_eq!(parse::<T>(T::FULL), T::default(), "{}", T::PATH);
+    assert_eq!(parse::<T>(T::SHORT), T::default(), "{}", T::PATH);
+    let effective = config::to_yaml(&T::default()).unwrap();
+    let every_key: BTreeSet<String> = effective
+        .lines()
+        .map(|line| line.replace("- ", "  "))
+        .filter_map(|line| key_of(&line).map(str::to_owned))
+        .collect();
+    assert_eq!(explained_keys(T::PATH, T::FULL), every_key, "{}", T::PATH);
+    explained_keys(T::PATH, T::SHORT);
+    let is_leaf = |line: &&str| {
+        let code = line.split(" #").next().unwrap_or_default();
+        key_of(code).is_some() && !code.trim_end().ends_with(':')
+    };
+    let leaves = T::SHORT.lines().filter(is_leaf).count();
+    assert!(leaves <= 30, "{} has {leaves} keys", T::PATH);
+}
+
+/// The key at the start of a line.
 fn key_of(line: &str) -> Option<&str> {
     let (key, _) = line.trim_start().split_once(':')?;
     key.chars()
@@ -80,49 +116,29 @@ fn key_of(line: &str) -> Option<&str> {
         .then_some(key)
 }
 
-/// The keys that a line has in braces.
+/// The keys in the braces of a line.
 fn keys_in_braces(line: &str) -> impl Iterator<Item = &str> {
     let value = line.split(" # ").next().unwrap_or_default();
     value.split(['{', ',']).skip(1).filter_map(key_of)
 }
 
 #[test]
-fn every_file_loads_and_its_effective_configuration_comes_back() {
+fn every_file_loads_and_its_effective_configuration_loads_to_an_equal_one() {
     let files = files_below(&root().join("config"));
     assert!(files.len() >= 4);
     for path in files {
-        keys_of(&path);
+        check_round_trip(&path);
     }
 }
 
 #[test]
-fn every_key_stands_in_the_file_of_its_command_with_a_comment() {
-    for name in [
-        "build_map.yml",
-        "localization.yml",
-        "refinement.yml",
-        "evaluation.yml",
-        "ground.yml",
-    ] {
-        let path = root().join("config").join(name);
-        let text = fs::read_to_string(&path).unwrap();
-        let mut keys = keys_of(&path);
-        let mut commented = false;
-        for line in text.lines() {
-            let Some(key) = key_of(line) else {
-                commented = line.trim_start().starts_with('#') || commented && !line.is_empty();
-                continue;
-            };
-            let explained = line.contains(" # ") || commented;
-            assert!(explained, "{name} does not explain {key}");
-            commented = false;
-            keys.remove(key);
-            for inner in keys_in_braces(line) {
-                keys.remove(inner);
-            }
-        }
-        assert!(keys.is_empty(), "{name} does not show {keys:?}");
-    }
+fn the_built_in_texts_have_the_defaults_and_explain_every_key() {
+    check_texts::<BuildMapConfig>();
+    check_texts::<LocalizationConfig>();
+    check_texts::<RefinementConfig>();
+    check_texts::<EvaluationConfig>();
+    check_texts::<GroundCommandConfig>();
+    check_texts::<SimulationConfig>();
 }
 
 #[test]
@@ -133,7 +149,6 @@ fn the_build_map_file_of_range_mcl_loads_unchanged() {
         pose_file: "../data/07/poses.txt".into(),
         calib_file: "../data/07/calib.txt".into(),
         mesh_file: "../data/mesh_kitti_07.ply".into(),
-        visualize: true,
         ..BuildMapConfig::default()
     };
     assert_eq!(config, expected);
@@ -145,8 +160,8 @@ fn the_localization_file_of_range_mcl_loads_unchanged() {
     let expected = LocalizationConfig {
         scan_folder: "../data/07/velodyne".into(),
         map_file: "../data/mesh_kitti_07.ply".into(),
-        map_pose_file: "../data/07/poses.txt".into(),
-        map_calib_file: "../data/07/calib.txt".into(),
+        map_pose_file: Some("../data/07/poses.txt".into()),
+        map_calib_file: Some("../data/07/calib.txt".into()),
         pose_file: "../data/07/poses.txt".into(),
         calib_file: "../data/07/calib.txt".into(),
         result_path: "../results/demo_loc_results.npz".into(),
@@ -171,33 +186,4 @@ fn the_evaluation_file_of_range_mcl_loads_unchanged() {
         ..EvaluationConfig::default()
     };
     assert_eq!(config, expected);
-}
-
-#[test]
-fn the_delivered_files_say_what_the_defaults_say() {
-    let config = |name: &str| root().join("config").join(name);
-    // The map is drawn, since it is the picture that one wants to see first.
-    assert_eq!(
-        load::<BuildMapConfig>(&config("build_map.yml")),
-        BuildMapConfig {
-            visualize: true,
-            ..BuildMapConfig::default()
-        }
-    );
-    assert_eq!(
-        load::<LocalizationConfig>(&config("localization.yml")),
-        LocalizationConfig::default()
-    );
-    assert_eq!(
-        load::<RefinementConfig>(&config("refinement.yml")),
-        RefinementConfig::default()
-    );
-    assert_eq!(
-        load::<EvaluationConfig>(&config("evaluation.yml")),
-        EvaluationConfig::default()
-    );
-    assert_eq!(
-        load::<GroundCommandConfig>(&config("ground.yml")),
-        GroundCommandConfig::default()
-    );
 }

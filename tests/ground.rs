@@ -198,7 +198,7 @@ fn existing_output_and_true_labels_are_not_overwritten() {
 #[test]
 fn bad_input_is_told_with_a_remedy() {
     let (folder, _) = recording();
-    fpmcl("ground").fails_saying(&["config/ground.yml", "give the path"]);
+    fpmcl("ground").fails_saying(&["data/kitti/velodyne"]);
     fpmcl("ground")
         .with("absent.bin")
         .fails_saying(&["cannot read", "absent.bin"]);

@@ -12,182 +12,215 @@ use crate::rendering::Backend;
 #[derive(Clone, Debug, Parser)]
 #[command(name = "fpmcl", version, arg_required_else_help = true, after_help = EXAMPLES)]
 pub struct Cli {
-    /// Say nothing but errors and results.
+    /// Print errors and results only.
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     pub quiet: bool,
 
-    /// Say more; twice for everything.
+    /// Print details; twice for everything.
     #[arg(short, long, global = true, action = ArgAction::Count)]
     pub verbose: u8,
 
-    /// What to do.
+    /// The command.
     #[command(subcommand)]
     pub command: Command,
 }
 
 const EXAMPLES: &str = "\
 Examples:
-  fpmcl demo                                  all of it on a street that it makes itself
-  fpmcl build-map config/build_map.yml        from a recording to a mesh map
-  fpmcl localize --set numParticles=1000      find the car in it, with one key changed
-  fpmcl refine && fpmcl evaluate              polish the trajectory and measure it";
+  fpmcl demo                                  the whole pipeline on a simulated street
+  fpmcl config build-map > my.yml             write a configuration file to edit
+  fpmcl build-map my.yml                      build a mesh map from a recording
+  fpmcl localize --set numParticles=1000      localize in it, with one key changed
+  fpmcl refine && fpmcl evaluate              refine the trajectory and evaluate it";
 
 /// The subcommands, in the order of their use.
 #[derive(Clone, Debug, Subcommand)]
 pub enum Command {
-    /// Turn recorded scans with poses into a triangle-mesh map.
+    /// Build a triangle-mesh map from scans with poses.
     #[command(after_help = "\
 Examples:
   fpmcl build-map config/build_map.yml
   fpmcl build-map --set mesh_file=results/even.ply --set frame_step=2 --force")]
     BuildMap(RunArgs),
 
-    /// Find the car in a map, scan by scan.
+    /// Localize a recording in a map, scan by scan.
     #[command(after_help = "\
 Examples:
   fpmcl localize config/localization.yml
   fpmcl localize --set pose_tracking=False --set range_image.width=1024 --seed 7")]
     Localize(RunArgs),
 
-    /// Polish the trajectory that `localize` found.
+    /// Refine the trajectory that `localize` found.
     #[command(after_help = "\
 Examples:
   fpmcl refine config/refinement.yml
   fpmcl refine --set result_file=results/localization.npz --backend cpu")]
     Refine(RunArgs),
 
-    /// Measure a result against the truth.
+    /// Compute the errors of a result against the ground truth.
     #[command(after_help = "\
 Examples:
   fpmcl evaluate config/evaluation.yml
   fpmcl evaluate --set result_file=results/localization.npz")]
     Evaluate(RunArgs),
 
-    /// Measure configurations against each other: sequences x configurations x seeds.
+    /// Compare configurations: sequences x configurations x seeds.
     #[command(after_help = "\
 Examples:
-  fpmcl compare                               all that config/comparison.yml asks for
+  fpmcl compare                               every run of config/comparison.yml
   fpmcl compare --list-jobs | parallel -j1 --sshlogin a,b --workdir .
-  fpmcl compare --collect                     tables of the runs that are there")]
+  fpmcl compare --collect                     tables of the finished runs")]
     Compare(CompareArgs),
 
-    /// Make a street with a known answer and drive through it.
+    /// Simulate a drive through a procedural street with ground truth.
     #[command(after_help = "\
 Examples:
   fpmcl simulate config/simulation.yml
   fpmcl simulate --set drive=2 --seed 7")]
     Simulate(RunArgs),
 
-    /// Simulate, build a map, localize, refine, evaluate: all of it in one command.
+    /// Simulate, build a map, localize, refine and evaluate in one command.
     #[command(after_help = "\
 Examples:
   fpmcl demo
   fpmcl demo --output results/small --frames 40")]
     Demo(DemoArgs),
 
-    /// Tell ground from the rest: scan by scan, and why.
+    /// Segment the ground of scans and explain decisions.
     #[command(after_help = "\
 Examples:
   fpmcl ground data/kitti                     a recording, or a folder of scans
   fpmcl ground data/kitti/velodyne/000000.bin --explain 10.2 -1.5 -1.7
-  fpmcl ground --simulated                    slopes, crests and kerbs with exact answers")]
+  fpmcl ground --simulated                    slopes, crests and kerbs with exact labels")]
     Ground(GroundArgs),
 
-    /// Show what this machine offers: instruction sets, graphics adapters, rays per second.
+    /// Print the configuration file of a command.
+    #[command(after_help = "\
+Examples:
+  fpmcl config localize > my.yml              the keys that people change
+  fpmcl config localize --full                every key with its default and a comment")]
+    Config(ConfigurationArgs),
+
+    /// Show instruction sets, graphics adapters and ray-casting speed of this machine.
     Doctor(DoctorArgs),
 }
 
-/// What `doctor` is to do.
+/// Arguments of `config`.
+#[derive(Clone, Debug, Args)]
+pub struct ConfigurationArgs {
+    /// The command.
+    #[arg(value_enum)]
+    pub command: ConfiguredCommand,
+
+    /// Print every key with its default and a comment.
+    #[arg(long)]
+    pub full: bool,
+}
+
+/// A command with a configuration file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+#[expect(missing_docs, reason = "they are named as the commands")]
+pub enum ConfiguredCommand {
+    BuildMap,
+    Localize,
+    Refine,
+    Evaluate,
+    Compare,
+    Simulate,
+    Ground,
+}
+
+/// Arguments of `doctor`.
 #[derive(Clone, Debug, Args)]
 pub struct DoctorArgs {
-    /// How long rays are cast to measure how many there are per second; 0 casts none
+    /// Duration of the ray-casting measurement; 0 for none
     #[arg(long, value_name = "SECONDS", default_value_t = 10)]
     pub measure: u64,
 }
 
-/// Where the configuration comes from.
+/// Configuration and machine.
 #[derive(Clone, Debug, Args)]
 pub struct ConfigArgs {
-    /// YAML file; the command's own under config/ if not given.
+    /// YAML file; by default the command's file under config/ or, without one, built-in values.
     pub config: Option<PathBuf>,
 
-    /// Override one key, such as range_image.width=1024; may be given often.
+    /// Override a key, such as range_image.width=1024; repeatable.
     #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
     pub settings: Vec<(String, String)>,
 
-    /// How the work is done.
+    /// Renderer and threads.
     #[command(flatten)]
     pub machine: MachineArgs,
 }
 
-/// Everything about a run of a stage.
+/// Arguments of a stage.
 #[derive(Clone, Debug, Args)]
 pub struct RunArgs {
-    /// Where the configuration comes from.
+    /// Configuration and machine.
     #[command(flatten)]
     pub source: ConfigArgs,
 
-    /// Same seed, same result; overrides the key `seed` where there is one.
+    /// Seed of all random choices; overrides the key `seed` where it exists.
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
 
-    /// Replace existing output; sets the key `force` where there is one.
+    /// Replace existing output; sets the key `force` where it exists.
     #[arg(long)]
     pub force: bool,
 }
 
-/// How large the demonstration is and where it goes.
+/// Arguments of `demo`.
 #[derive(Clone, Debug, Args)]
 pub struct DemoArgs {
-    /// Folder for everything that it makes.
+    /// Output folder.
     #[arg(long, value_name = "FOLDER", default_value = "results/demo")]
     pub output: PathBuf,
 
-    /// Scans per drive; all of the simulated path if not given.
+    /// Scans per drive; 160 by default.
     #[arg(long, value_name = "N")]
     pub frames: Option<NonZeroUsize>,
 
-    /// Same seed, same result.
+    /// Seed of all random choices.
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
 
-    /// How the work is done.
+    /// Renderer and threads.
     #[command(flatten)]
     pub machine: MachineArgs,
 }
 
-/// What is compared, and which part of the work is done now.
+/// Arguments of `compare`.
 #[derive(Clone, Debug, Args)]
 pub struct CompareArgs {
-    /// Where the configuration comes from.
+    /// Configuration and machine.
     #[command(flatten)]
     pub source: ConfigArgs,
 
-    /// Print one independent command per run, and do nothing.
+    /// Print one independent command per run and exit.
     #[arg(long, group = "part")]
     pub list_jobs: bool,
 
-    /// Make sequences and maps only, before runs are distributed.
+    /// Build sequences and maps only, before runs are distributed.
     #[arg(long, group = "part")]
     pub prepare: bool,
 
-    /// Do one run only: SEQUENCE/CONFIGURATION/SEED.
+    /// Execute one run only: SEQUENCE/CONFIGURATION/SEED.
     #[arg(long, value_name = "RUN", group = "part")]
     pub job: Option<RunId>,
 
-    /// Make tables and pages of the runs that are there, and run nothing.
+    /// Write tables and pages of the finished runs only.
     #[arg(long, group = "part")]
     pub collect: bool,
 }
 
-/// Which scans, and what is asked about them.
+/// Arguments of `ground`.
 #[derive(Clone, Debug, Args)]
 pub struct GroundArgs {
     /// Scan (.bin), folder of scans, recording with velodyne/ and labels/, or configuration (.yml);
-    /// the configuration's scan_folder if not given.
+    /// by default the configuration's scan_folder.
     pub input: Option<PathBuf>,
 
-    /// Explain the point nearest to X Y Z in the lidar frame [m]; needs a scan.
+    /// Explain the decision at the point nearest to X Y Z in the lidar frame [m]; needs a scan.
     #[arg(
         long,
         value_names = ["X", "Y", "Z"],
@@ -197,15 +230,15 @@ pub struct GroundArgs {
     )]
     pub explain: Option<Vec<f32>>,
 
-    /// Compare the methods on simulated slopes, crests, kerbs and drives, whose truth is exact.
+    /// Compare the methods on simulated slopes, crests, kerbs and drives with exact labels.
     #[arg(long, conflicts_with = "explain")]
     pub simulated: bool,
 
-    /// YAML file; config/ground.yml if not given, and the defaults where that is not there.
+    /// YAML file; by default config/ground.yml or, without one, built-in values.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
 
-    /// Override one key, such as ground_method=pca; may be given often.
+    /// Override a key, such as ground_method=pca; repeatable.
     #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
     pub settings: Vec<(String, String)>,
 
@@ -213,32 +246,32 @@ pub struct GroundArgs {
     #[arg(long)]
     pub force: bool,
 
-    /// How the work is done.
+    /// Renderer and threads.
     #[command(flatten)]
     pub machine: MachineArgs,
 }
 
-/// What does the work; results do not depend on the number of threads.
+/// Renderer and threads; results do not depend on the number of threads.
 #[derive(Clone, Copy, Debug, Default, Args)]
 pub struct MachineArgs {
-    /// What renders the map.
+    /// Renderer of the map.
     #[arg(long, value_enum, default_value_t)]
     pub backend: BackendArg,
 
-    /// Threads; as many as there are processors if not given.
+    /// Number of threads; by default one per processor.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub threads: Option<u16>,
 }
 
-/// What renders the map.
+/// Renderer of the map.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum BackendArg {
-    /// A graphics card if there is one, else the processor.
+    /// The graphics adapter if available, else the processor.
     #[default]
     Auto,
     /// The processor.
     Cpu,
-    /// A graphics adapter; an error without one.
+    /// The graphics adapter; an error without one.
     Gpu,
 }
 
@@ -252,21 +285,21 @@ impl From<BackendArg> for Backend {
     }
 }
 
-/// How much is said on standard error.
+/// Amount of output on standard error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verbosity {
     /// Errors only.
     Quiet,
-    /// What happens.
+    /// Progress and warnings.
     Normal,
-    /// Details, for those who look into something.
+    /// Details.
     Verbose,
     /// Everything.
     Everything,
 }
 
 impl Cli {
-    /// How much is said on standard error.
+    /// Amount of output on standard error.
     pub fn verbosity(&self) -> Verbosity {
         match (self.quiet, self.verbose) {
             (true, _) => Verbosity::Quiet,
@@ -278,7 +311,7 @@ impl Cli {
 }
 
 impl Command {
-    /// What does the work of this command.
+    /// Renderer and threads of this command.
     pub fn machine(&self) -> MachineArgs {
         match self {
             Self::BuildMap(args)
@@ -289,13 +322,13 @@ impl Command {
             Self::Compare(args) => args.source.machine,
             Self::Demo(args) => args.machine,
             Self::Ground(args) => args.machine,
-            Self::Doctor(_) => MachineArgs::default(),
+            Self::Config(_) | Self::Doctor(_) => MachineArgs::default(),
         }
     }
 }
 
 impl RunArgs {
-    /// The keys that have a flag of their own, as far as it is given.
+    /// Settings of the flags that stand for a key.
     pub fn flags(&self) -> Vec<(String, String)> {
         let seed = self.seed.map(|seed| ("seed".to_owned(), seed.to_string()));
         let force = self.force.then(|| ("force".to_owned(), "true".to_owned()));

@@ -6,7 +6,6 @@ use super::classifier::GroundClassifier;
 use super::fuzzy::{FuzzyConfig, FuzzyGround};
 use super::pca::PcaGround;
 use super::ransac::RansacGround;
-use super::rules::RuleError;
 use crate::validation::{InvalidValue, Validate, nested};
 
 /// Method of ground segmentation.
@@ -38,7 +37,8 @@ pub struct GroundConfig {
 
 impl GroundConfig {
     /// Builds the configured classifier.
-    pub fn classifier(&self) -> Result<Box<dyn GroundClassifier>, RuleError> {
+    pub fn classifier(&self) -> Result<Box<dyn GroundClassifier>, InvalidValue> {
+        self.validate()?;
         Ok(match self.method {
             GroundMethod::Fuzzy => Box::new(FuzzyGround::new(self.fuzzy.clone())?),
             GroundMethod::Pca => Box::new(self.pca),

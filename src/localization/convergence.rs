@@ -13,13 +13,14 @@ use serde::{Deserialize, Serialize};
 
 use super::particles::{ParticleSet, spread};
 use crate::map::TileGrid;
-use crate::validation::{InvalidValue, Validate, at_least_one, positive_or_infinite};
+use crate::validation::{InvalidValue, Validate, positive_or_infinite};
 
 /// What counts as converged.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ConvergenceConfig {
-    /// The particles stand in fewer valid tiles than this.
+    /// The particles stand in fewer valid tiles than this; `converge_thres` of `localization.yml`.
+    #[serde(skip)]
     pub converge_thres: usize,
     /// Their standard deviation in position is below this; infinite for range-mcl's criterion alone [m].
     pub max_spread_m: f64,
@@ -40,7 +41,6 @@ impl Default for ConvergenceConfig {
 
 impl Validate for ConvergenceConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        at_least_one("converge_thres", self.converge_thres)?;
         positive_or_infinite("max_spread_m", self.max_spread_m)?;
         positive_or_infinite("max_spread_rad", self.max_spread_rad)
     }

@@ -8,7 +8,7 @@ use super::observation::ObservationConfig;
 use super::proposal::ProposalConfig;
 use super::resampling::{KldConfig, ResamplingConfig};
 use super::vigilance::VigilanceConfig;
-use crate::validation::{InvalidValue, Validate, at_least_one, fraction};
+use crate::validation::{InvalidValue, Validate, at_least_one, fraction, nested, not_negative};
 
 /// How the likelihood is sharpened within a frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -107,5 +107,27 @@ impl Default for LocalizerConfig {
             convergence: ConvergenceConfig::default(),
             vigilance: VigilanceConfig::default(),
         }
+    }
+}
+
+impl Validate for LocalizerConfig {
+    /// With the keys of `localization.yml`.
+    fn validate(&self) -> Result<(), InvalidValue> {
+        at_least_one("numParticles", self.num_particles)?;
+        at_least_one("num_reduced", self.num_reduced)?;
+        not_negative("move_thres", self.move_thres_m)?;
+        not_negative("turn_thres_rad", self.turn_thres_rad)?;
+        nested("odometry_noise", &self.motion)?;
+        nested("velocity_noise", &self.velocity)?;
+        nested("constant_velocity_noise", &self.constant_velocity)?;
+        nested("unknown_velocity_noise", &self.unknown_velocity)?;
+        nested("observation", &self.observation)?;
+        nested("tempering", &self.tempering)?;
+        nested("proposal", &self.proposal)?;
+        nested("resampling", &self.resampling)?;
+        nested("kld", &self.kld)?;
+        at_least_one("converge_thres", self.convergence.converge_thres)?;
+        nested("convergence", &self.convergence)?;
+        nested("vigilance", &self.vigilance)
     }
 }

@@ -14,6 +14,9 @@ use crate::geometry::{PointCloud, TriangleMesh};
 use crate::ground::GroundClassifier;
 use crate::meshing::{self, MeshingError, PoissonConfig, Surface};
 use crate::recording::{Frame, RecordingError, velodyne};
+use crate::validation::{
+    InvalidValue, Validate, fraction, nested, not_negative, positive, require,
+};
 
 /// Vertices that are gathered in neighbouring cells are less than two cells apart along an axis.
 const CELLS_PER_EDGE: f32 = 2.0;
@@ -62,6 +65,25 @@ impl Default for LocalMapSettings {
             ground_color: [255, 0, 0],
             rest_color: [0, 0, 255],
         }
+    }
+}
+
+impl Validate for LocalMapSettings {
+    /// With the keys of `build_map.yml`.
+    fn validate(&self) -> Result<(), InvalidValue> {
+        self.scan.validate()?;
+        nested("confidence", &self.confidence)?;
+        nested("poisson", &self.poisson)?;
+        require(
+            (0.0..1.0).contains(&self.min_density),
+            "min_density",
+            self.min_density,
+            "it is the fraction of the vertices to remove, 0 or greater and less than 1",
+        )?;
+        positive("max_distance_m", self.max_distance_m)?;
+        nested("visibility", &self.visibility)?;
+        fraction("ground_threshold", self.ground_threshold)?;
+        not_negative("simplify_resolution", self.simplify_resolution_m)
     }
 }
 

@@ -6,9 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::geometry::{PointCloud, Rigid3f};
 use crate::ground::GroundClassifier;
-use crate::lidar::{LidarModel, RangeImage};
-use crate::lidar::{NormalConfig, estimate_normals};
+use crate::lidar::{LidarModel, NormalConfig, RangeImage, estimate_normals};
 use crate::recording::{Frame, RecordingError};
+use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 
 /// What of a scan goes into the map.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,6 +35,19 @@ impl Default for ScanSettings {
             crop_m: Vec3::new(30.0, 30.0, 5.0),
             own_car_m: [-2.5, 2.7, -1.2, 1.2],
         }
+    }
+}
+
+impl Validate for ScanSettings {
+    /// With the keys of `build_map.yml`.
+    fn validate(&self) -> Result<(), InvalidValue> {
+        nested("range_image", &self.range_image)?;
+        nested("normals", &self.normals)?;
+        positive("voxel_size", self.voxel_size_m)?;
+        positive("crop_x", self.crop_m.x)?;
+        positive("crop_y", self.crop_m.y)?;
+        positive("crop_z", self.crop_m.z)?;
+        rectangle("own_car_m", self.own_car_m)
     }
 }
 

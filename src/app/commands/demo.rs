@@ -43,7 +43,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<String> {
     localize::run(&localization, context).context("while localizing")?;
 
     tracing::info!("refining the trajectory");
-    let refinement = refinement_config(&localization);
+    let refinement = RefinementConfig::of(localization);
     let report = refine::run(&refinement, context).context("while refining")?;
 
     Ok(format!(
@@ -63,6 +63,7 @@ fn build_map_config(output: &Path, drive: &Path, seed: u64) -> BuildMapConfig {
         pose_file: drive.join("poses.txt"),
         calib_file: drive.join("calib.txt"),
         mesh_file: output.join("map.ply"),
+        visualize: false,
         holdout_step: 10,
         seed,
         force: true,
@@ -81,8 +82,8 @@ fn localization_config(
         pose_file: drive.join("poses.txt"),
         calib_file: drive.join("calib.txt"),
         map_file: map.mesh_file.clone(),
-        map_pose_file: map.pose_file.clone(),
-        map_calib_file: map.calib_file.clone(),
+        map_pose_file: Some(map.pose_file.clone()),
+        map_calib_file: Some(map.calib_file.clone()),
         result_path: output.join("localization.npz"),
         num_particles: 1000,
         odometry: OdometrySource::File,
@@ -90,22 +91,5 @@ fn localization_config(
         seed,
         force: true,
         ..LocalizationConfig::default()
-    }
-}
-
-fn refinement_config(localization: &LocalizationConfig) -> RefinementConfig {
-    RefinementConfig {
-        scan_folder: localization.scan_folder.clone(),
-        pose_file: localization.pose_file.clone(),
-        calib_file: localization.calib_file.clone(),
-        map_file: localization.map_file.clone(),
-        map_pose_file: localization.map_pose_file.clone(),
-        map_calib_file: localization.map_calib_file.clone(),
-        result_file: localization.result_path.clone(),
-        odometry: localization.odometry,
-        odometry_file: localization.odometry_file.clone(),
-        seed: localization.seed,
-        force: true,
-        ..RefinementConfig::default()
     }
 }

@@ -71,7 +71,7 @@ fn map_of(files: &RunFiles) -> Result<Option<TriangleMesh>> {
     if !effective.exists() {
         return Ok(None);
     }
-    let localized: LocalizationConfig = config::load(Some(&effective), &effective, &[])?;
+    let localized: LocalizationConfig = config::load(Some(&effective), &[])?;
     if !localized.map_file.exists() {
         tracing::info!(
             "drawing without the map: {} does not exist",

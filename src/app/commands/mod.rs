@@ -23,20 +23,19 @@ mod stages;
 mod version;
 
 use std::io::Write as _;
-use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::Context as _;
-use serde::Serialize;
-use serde::de::DeserializeOwned;
 
-use crate::app::cli::{Command, MachineArgs, RunArgs, Verbosity};
+use crate::app::cli::{
+    Command, ConfigurationArgs, ConfiguredCommand, MachineArgs, RunArgs, Verbosity,
+};
 use crate::app::config::{
-    self, BuildMapConfig, ConfigError, EvaluationConfig, LocalizationConfig, RefinementConfig,
+    self, BuildMapConfig, CommandConfig, ComparisonConfig, ConfigError, EvaluationConfig,
+    GroundCommandConfig, LocalizationConfig, RefinementConfig,
 };
 use crate::rendering::Backend;
 use crate::simulation::SimulationConfig;
-use crate::validation::Validate;
 use interrupt::{Interrupt, Interrupted};
 use logging::RunLog;
 use progress::Progress;
@@ -84,23 +83,23 @@ impl Context {
 pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
     match command {
         Command::BuildMap(args) => {
-            let config: BuildMapConfig = load(args, "config/build_map.yml")?;
+            let config: BuildMapConfig = load(args)?;
             output::print(&build_map::run(&config, context)?.table())
         }
         Command::Localize(args) => {
-            let config: LocalizationConfig = load(args, "config/localization.yml")?;
+            let config: LocalizationConfig = load(args)?;
             output::print(&localize::run(&config, context)?.to_text())
         }
         Command::Refine(args) => {
-            let config: RefinementConfig = load(args, "config/refinement.yml")?;
+            let config: RefinementConfig = load(args)?;
             output::print(&refine::run(&config, context)?.to_text())
         }
         Command::Evaluate(args) => {
-            let config: EvaluationConfig = load(args, "config/evaluation.yml")?;
+            let config: EvaluationConfig = load(args)?;
             output::print(&evaluate::run(&config)?.to_text())
         }
         Command::Simulate(args) => {
-            let config: SimulationConfig = load(args, "config/simulation.yml")?;
+            let config: SimulationConfig = load(args)?;
             let existing = match args.force {
                 true => simulate::Existing::Replace,
                 false => simulate::Existing::Keep,
@@ -110,7 +109,24 @@ pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
         Command::Compare(args) => output::print(&compare::run(args, context)?),
         Command::Demo(args) => output::print(&demo::run(args, context)?),
         Command::Ground(args) => output::print(&ground::run(args, context)?),
+        Command::Config(args) => output::print(configuration(args)),
         Command::Doctor(args) => doctor::run(args, context),
+    }
+}
+
+/// The configuration file of a command: the keys that people change, or all of them.
+fn configuration(args: &ConfigurationArgs) -> &'static str {
+    fn text<T: CommandConfig>(full: bool) -> &'static str {
+        if full { T::FULL } else { T::SHORT }
+    }
+    match args.command {
+        ConfiguredCommand::BuildMap => text::<BuildMapConfig>(args.full),
+        ConfiguredCommand::Localize => text::<LocalizationConfig>(args.full),
+        ConfiguredCommand::Refine => text::<RefinementConfig>(args.full),
+        ConfiguredCommand::Evaluate => text::<EvaluationConfig>(args.full),
+        ConfiguredCommand::Compare => text::<ComparisonConfig>(args.full),
+        ConfiguredCommand::Simulate => text::<SimulationConfig>(args.full),
+        ConfiguredCommand::Ground => text::<GroundCommandConfig>(args.full),
     }
 }
 
@@ -125,20 +141,16 @@ pub fn exit_code(error: &anyhow::Error) -> ExitCode {
     ExitCode::from(if error.is::<Interrupted>() { 130 } else { 1 })
 }
 
-/// Loads the configuration of a command; `--seed` and `--force` count as the last settings of
-/// a configuration that has these keys.
-fn load<T>(args: &RunArgs, default_path: &str) -> Result<T, ConfigError>
-where
-    T: Validate + Default + Serialize + DeserializeOwned,
-{
+/// Loads the configuration of a command; `--seed` and `--force` are the last settings of a
+/// configuration that has these keys.
+fn load<T: CommandConfig>(args: &RunArgs) -> Result<T, ConfigError> {
     let mut settings = args.source.settings.clone();
     for (key, value) in args.flags() {
         if config::has_key::<T>(&key)? {
             settings.push((key, value));
         }
     }
-    let path = args.source.config.as_deref();
-    config::load(path, Path::new(default_path), &settings)
+    config::load(args.source.config.as_deref(), &settings)
 }
 
 /// The chain of an error without what was said already.
@@ -168,10 +180,7 @@ mod tests {
     use crate::app::cli::Cli;
     use crate::recording::RecordingError;
 
-    fn loaded<T>(arguments: &[&str]) -> T
-    where
-        T: Validate + Default + Serialize + DeserializeOwned,
-    {
+    fn loaded<T: CommandConfig>(arguments: &[&str]) -> T {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("own.yml");
         std::fs::write(&path, "").unwrap();
@@ -179,7 +188,7 @@ mod tests {
         let Command::Localize(args) = Cli::parse_from(start.iter().chain(arguments)).command else {
             unreachable!("it says localize")
         };
-        load(&args, "").unwrap()
+        load(&args).unwrap()
     }
 
     #[test]

@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::interrupt::Interrupted;
 use super::run_output::{self, RunFiles};
-use super::stages::{Inputs, LoadedMap, Observer};
+use super::stages::{Inputs, LoadedMap, Observer, mapping_file};
 use super::{Context, input, odometry, run_page};
 use crate::app::config::{self, OdometrySource, RefinementConfig};
 use crate::app::results::{LocalizationResults, Report};
@@ -29,8 +29,8 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
     let inputs = Inputs {
         map_file: &config.map_file,
-        map_pose_file: &config.map_pose_file,
-        map_calib_file: &config.map_calib_file,
+        map_pose_file: mapping_file("map_pose_file", config.map_pose_file.as_deref())?,
+        map_calib_file: mapping_file("map_calib_file", config.map_calib_file.as_deref())?,
         scan_folder: &config.scan_folder,
         pose_file: &config.pose_file,
         calib_file: &config.calib_file,

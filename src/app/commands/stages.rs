@@ -25,6 +25,11 @@ pub struct Inputs<'a> {
     pub calib_file: &'a Path,
 }
 
+/// A file of the mapping drive, which every map needs.
+pub fn mapping_file<'a>(key: &str, path: Option<&'a Path>) -> Result<&'a Path> {
+    path.with_context(|| format!("{key} is null; give the file of the drive that was mapped"))
+}
+
 impl Inputs<'_> {
     /// Makes sure that all of them are there, before any work is done.
     pub fn require(&self) -> Result<()> {

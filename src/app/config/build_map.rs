@@ -1,26 +1,22 @@
-//! `build-map`: from scans with poses to a triangle mesh.
+//! Configuration of `build-map`: from scans with poses to a triangle mesh.
 
 use std::path::PathBuf;
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use super::check::{own_car, path};
+use super::check::{ground, path};
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
-use crate::lidar::NormalConfig;
-use crate::lidar::{LidarModel, RotationDirection};
+use crate::lidar::{LidarModel, NormalConfig, RotationDirection};
 use crate::map::LocalMapSettings;
 use crate::map::confidence::ConfidenceConfig;
 use crate::map::scan_cloud::ScanSettings;
 use crate::map::visibility::VisibilityConfig;
 use crate::meshing::PoissonConfig;
 use crate::recording::Selection;
-use crate::validation::{
-    InvalidValue, Validate, at_least_one, fraction, in_range, nested, not_negative, positive,
-    require,
-};
+use crate::validation::{InvalidValue, Validate, at_least_one, in_range, not_negative, require};
 
-/// The keys of range-mcl's `build_map.yml`, and below them new ones.
+/// Configuration of `build-map`: the keys of range-mcl's `build_map.yml`, then new ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct BuildMapConfig {
@@ -30,83 +26,82 @@ pub struct BuildMapConfig {
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`.
     pub calib_file: PathBuf,
-    /// Where the map is written.
+    /// Output path of the map.
     pub mesh_file: PathBuf,
-    /// How many scans of the recording are looked at; -1 for all.
+    /// Number of scans from `start_idx` on; -1 for all.
     pub n_scans: i64,
-    /// Counted scans in a local map.
+    /// Number of counted scans in a local map.
     pub local_map_size: usize,
-    /// Whether the map is drawn from above.
+    /// Whether to draw the map from above.
     pub visualize: bool,
-    /// Depth of the octree of the Poisson reconstruction.
+    /// Octree depth of the Poisson reconstruction.
     pub depth: u32,
-    /// The share of vertices with the least density that is removed, unitless.
+    /// Quantile of the vertex density below which vertices are removed, unitless.
     pub min_density: f64,
-    /// Edge of the voxels that scans are thinned with [m].
+    /// Voxel edge of the downsampling [m].
     pub voxel_size: f64,
-    /// Half the crop box ahead and behind [m].
+    /// Half length of the crop box [m].
     pub crop_x: f64,
-    /// Half the crop box to the sides [m].
+    /// Half width of the crop box [m].
     pub crop_y: f64,
-    /// Half the crop box up and down [m].
+    /// Half height of the crop box [m].
     pub crop_z: f64,
-    /// Largest distance of ground from the RANSAC plane [m].
+    /// Inlier distance of the RANSAC plane [m].
     pub distance_threshold: f64,
-    /// Points that a RANSAC plane is laid through.
+    /// Sample size of a RANSAC plane.
     pub ransac_n: usize,
-    /// RANSAC planes that are tried.
+    /// Number of RANSAC planes.
     pub num_iterations: usize,
-    /// Edge of the cells that ground vertices are gathered in [m].
+    /// Cell edge of the ground simplification [m].
     pub simplify_resolution: f64,
-    /// How often the ground is smoothed.
+    /// Smoothing iterations of the ground.
     pub number_of_iterations: usize,
     /// Red, green and blue of the ground, 0 to 1.
     pub ground_color: [f64; 3],
     /// Red, green and blue of everything else, 0 to 1.
     pub rest_color: [f64; 3],
-    /// Size and limits of the range images that normals are computed in.
+    /// Size and limits of the range images for the normals.
     pub range_image: LidarModel,
 
     /// First frame of the recording.
     pub start_idx: usize,
-    /// Every how manieth frame is taken.
+    /// Step between frames: n uses every n-th frame.
     pub frame_step: usize,
-    /// A scan counts if the car moved farther than this since the last that counted [m].
+    /// Motion since the last counted scan above which a scan counts [m].
     pub displacement_threshold_m: f64,
-    /// How ground is told from the rest.
+    /// Method of ground segmentation.
     pub ground_method: GroundMethod,
-    /// Neighbouring local maps are meshed with this much of each other's path [m].
+    /// Length of path that neighbouring local maps share [m].
     pub overlap_m: f64,
-    /// Every n-th counted scan is held back, and the map is judged along its beams; 0 for none.
+    /// Step between counted scans that are excluded from the map and used to evaluate it; 0 for none.
     pub holdout_step: usize,
-    /// Mesh of the true surface in the map frame, to measure accuracy and completeness with;
-    /// `street.ply` of a simulated drive is one.
+    /// Mesh of the true surface in the map frame, for accuracy and completeness; `street.ply` of a
+    /// simulated drive is one.
     pub truth_mesh: Option<PathBuf>,
-    /// Surface farther than this from every point was invented by the reconstruction and is
-    /// removed [m].
+    /// Distance to the nearest point above which reconstructed surface is removed [m].
     pub max_distance_m: f64,
-    /// A vertex is ground from this confidence on, unitless.
+    /// Confidence above which a vertex is ground, unitless.
     pub ground_threshold: f32,
-    /// The own car in the lidar frame: x_min, x_max, y_min, y_max [m].
+    /// Box of the own car in the lidar frame: x_min, x_max, y_min, y_max [m].
     pub own_car_m: [f32; 4],
-    /// How much each point counts in it. Off as it comes: it made no map better.
+    /// Weight of each point. Off by default: it improved no map.
     pub confidence: ConfidenceConfig,
     /// Surface reconstruction, beside `depth`.
     pub poisson: PoissonConfig,
-    /// How normals are found in range images.
+    /// Normals from range images.
     pub normals: NormalConfig,
-    /// Free-space votes: what beams pass through is not there.
+    /// Free-space votes, which remove moving objects.
     pub visibility: VisibilityConfig,
-    /// Sets and rules of `ground_method: fuzzy`.
+    /// Linguistic sets and rules of `ground_method: fuzzy`.
     pub fuzzy: FuzzyConfig,
-    /// `ground_method: pca`.
+    /// Parameters of `ground_method: pca`.
     pub pca: PcaGround,
-    /// The sense in which the sensor spins, where the motion of the car during a scan is to be
-    /// compensated; not so for scans that are compensated already, as those of KITTI odometry.
+    /// Direction of rotation of the sensor for motion compensation; `None` for scans that are
+    /// compensated already, such as those of KITTI odometry.
     pub motion_compensation: Option<RotationDirection>,
-    /// What random choices follow from.
+    /// Seed of all random choices.
     pub seed: u64,
-    /// Whether an existing map is replaced.
+    /// Whether to replace an existing map.
     pub force: bool,
 }
 
@@ -121,7 +116,7 @@ impl Default for BuildMapConfig {
             mesh_file: "results/map.ply".into(),
             n_scans: -1,
             local_map_size: 100,
-            visualize: false,
+            visualize: true,
             depth: 9,
             min_density: 0.1,
             voxel_size: 0.1,
@@ -160,7 +155,7 @@ impl Default for BuildMapConfig {
 }
 
 impl BuildMapConfig {
-    /// The frames that the map is built from.
+    /// Selection of the mapping frames.
     pub fn selection(&self) -> Selection {
         Selection {
             start_idx: self.start_idx,
@@ -169,7 +164,7 @@ impl BuildMapConfig {
         }
     }
 
-    /// How scans become local maps.
+    /// Settings of the local maps.
     pub fn local_map_settings(&self) -> LocalMapSettings {
         LocalMapSettings {
             scan: ScanSettings {
@@ -224,38 +219,18 @@ impl Validate for BuildMapConfig {
         self.selection().validate()?;
         at_least_one("local_map_size", self.local_map_size)?;
         in_range("depth", self.depth, PoissonConfig::DEPTHS)?;
-        require(
-            (0.0..1.0).contains(&self.min_density),
-            "min_density",
-            self.min_density,
-            "it is the share of vertices to remove, 0 or greater and less than 1",
-        )?;
-        positive("voxel_size", self.voxel_size)?;
-        positive("crop_x", self.crop_x)?;
-        positive("crop_y", self.crop_y)?;
-        positive("crop_z", self.crop_z)?;
-        self.ground().ransac.validate()?;
-        positive("simplify_resolution", self.simplify_resolution)?;
         color("ground_color", self.ground_color)?;
         color("rest_color", self.rest_color)?;
         not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
         not_negative("overlap_m", self.overlap_m)?;
-        positive("max_distance_m", self.max_distance_m)?;
-        fraction("ground_threshold", self.ground_threshold)?;
-        own_car("own_car_m", self.own_car_m)?;
-        nested("confidence", &self.confidence)?;
-        nested("poisson", &self.poisson)?;
-        nested("normals", &self.normals)?;
-        nested("visibility", &self.visibility)?;
-        nested("fuzzy", &self.fuzzy)?;
-        nested("pca", &self.pca)?;
         require(
             self.holdout_step != 1,
             "holdout_step",
             self.holdout_step,
-            "1 holds every scan back; 0 holds none, 10 every tenth",
+            "1 would exclude every scan; 0 excludes none, 10 every tenth",
         )?;
-        nested("range_image", &self.range_image)
+        ground(&self.ground())?;
+        self.local_map_settings().validate()
     }
 }
 

@@ -2,22 +2,23 @@
 
 use std::path::Path;
 
-use crate::validation::{InvalidValue, require};
+use crate::ground::GroundConfig;
+use crate::validation::{InvalidValue, Validate as _, nested, require};
 
 /// Requires a path that is not empty.
 pub(super) fn path(key: &str, value: &Path) -> Result<(), InvalidValue> {
-    let given = !value.as_os_str().is_empty();
-    require(given, key, "empty", "give a path")
+    let is_given = !value.as_os_str().is_empty();
+    require(is_given, key, "empty", "give a path")
 }
 
-/// Requires a box `[x_min, x_max, y_min, y_max]` [m].
-pub(super) fn own_car(key: &str, limits_m: [f32; 4]) -> Result<(), InvalidValue> {
-    let [x_min, x_max, y_min, y_max] = limits_m;
-    require(
-        limits_m.iter().all(|limit| limit.is_finite()) && x_min <= x_max && y_min <= y_max,
-        key,
-        format_args!("{limits_m:?}"),
-        "it must be x_min, x_max, y_min, y_max with x_min up to x_max and y_min up to y_max; \
-         [0, 0, 0, 0] keeps every point",
-    )
+/// Requires a path that is not empty, where one is given.
+pub(super) fn optional_path(key: &str, value: Option<&Path>) -> Result<(), InvalidValue> {
+    value.map_or(Ok(()), |value| path(key, value))
+}
+
+/// Validates a ground classifier whose RANSAC keys are at the top level.
+pub(super) fn ground(config: &GroundConfig) -> Result<(), InvalidValue> {
+    nested("fuzzy", &config.fuzzy)?;
+    nested("pca", &config.pca)?;
+    config.ransac.validate()
 }

@@ -254,7 +254,7 @@ configurations:
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("comparison.yml");
         std::fs::write(&path, text).unwrap();
-        config::load(Some(&path), &path, &[]).map_err(|error| error.to_string())
+        config::load(Some(&path), &[]).map_err(|error| error.to_string())
     }
 
     #[test]

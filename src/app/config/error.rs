@@ -1,16 +1,18 @@
-//! What can be wrong with a configuration, told with its place.
+//! Errors of configurations, with the file and line or the `--set` that they are about.
 
-use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use super::outline::Outline;
+use super::yaml::{is_within, keys};
 use crate::validation::InvalidValue;
 
-/// Each names the place, quotes what stands there and says what to do.
+/// Why a configuration cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[expect(missing_docs, reason = "the messages say it")]
 pub enum ConfigError {
-    #[error("cannot read the configuration {}: {source}; give the path of a YAML file like those under config/", path.display())]
+    #[error(
+        "cannot read the configuration {}: {source}; give the path of a YAML file, such as one that `fpmcl config` prints",
+        path.display()
+    )]
     Read {
         path: PathBuf,
         source: std::io::Error,
@@ -22,128 +24,105 @@ pub enum ConfigError {
     },
     #[error("{place}: unknown key `{key}`{}", suggestion(nearest.as_deref()))]
     UnknownKey {
-        place: Place,
+        place: String,
         key: String,
         nearest: Option<String>,
     },
-    #[error("{place}: `{value}` is not a value for {key}: {expected}")]
-    WrongValue {
-        place: Place,
-        key: String,
-        value: String,
-        expected: String,
+    #[error("{place}: {invalid}")]
+    InvalidValue {
+        place: String,
+        invalid: InvalidValue,
     },
-    #[error("{place}: {problem}")]
-    Unusable { place: Place, problem: InvalidValue },
     #[error("{place}: key `{key}` is given twice; remove one of them")]
-    DuplicateKey { place: Place, key: String },
+    DuplicateKey { place: String, key: String },
     #[error("{place}: {source}")]
     Syntax {
-        place: Place,
+        place: String,
         source: Box<serde_yaml::Error>,
     },
-    #[error("the configuration cannot be written as YAML: {0}")]
-    Serialize(serde_yaml::SerializeError),
+    #[error("cannot write the configuration as YAML: {0}")]
+    Serialize(#[from] serde_yaml::SerializeError),
 }
 
-/// Where a value was given.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Place {
-    /// In a file, at a line counted from 1 where it is known.
-    File {
-        /// The file.
-        path: PathBuf,
-        /// The line.
-        line: Option<usize>,
-    },
-    /// On the command line.
-    Setting {
-        /// The dotted key.
-        key: String,
-        /// The value as given.
-        value: String,
-    },
-}
-
-impl Place {
-    /// The file as a whole, where the line is told otherwise.
-    fn without_line(self) -> Self {
-        match self {
-            Self::File { path, .. } => Self::File { path, line: None },
-            setting @ Self::Setting { .. } => setting,
-        }
-    }
-}
-
-impl fmt::Display for Place {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::File { path, line: None } => write!(f, "{}", path.display()),
-            Self::File {
-                path,
-                line: Some(line),
-            } => write!(f, "{}, line {line}", path.display()),
-            Self::Setting { key, value } => write!(f, "--set {key}={value}"),
-        }
-    }
-}
-
-/// The error of a YAML file, with the key and the value that it is about.
-pub(super) fn in_file(path: &Path, text: &str, source: serde_yaml::Error) -> ConfigError {
-    let location = source.location();
-    let line = location.map(|location| location.line() as usize);
-    let place = Place::File {
-        path: path.to_owned(),
-        line,
+/// The error of a YAML file, with the key and the value of its line.
+pub(super) fn in_file(name: &str, text: &str, source: serde_yaml::Error) -> ConfigError {
+    let Some(line) = source
+        .location()
+        .map(|location| location.line() as usize - 1)
+    else {
+        return describe(name.to_owned(), None, source);
     };
-    let outline = Outline::of(text);
-    let key = line.and_then(|line| outline.key_at(line));
-    let value = location.and_then(|location| quoted(text, location));
-    describe(place, key, value, source)
+    let key = keys(text).into_iter().rfind(|key| key.line <= line);
+    let value = text.lines().nth(line).map(value_of).unwrap_or_default();
+    let at_line = key.map(|key| (key.name, value));
+    describe(place(name, Some(line)), at_line, source)
 }
 
-/// The error of a value on the command line.
-pub(super) fn in_setting(
-    place: Place,
+/// The error of a `--set`.
+pub(super) fn in_setting(key: &str, value: &str, source: serde_yaml::Error) -> ConfigError {
+    describe(
+        setting(key, value),
+        Some((key.to_owned(), value.to_owned())),
+        source,
+    )
+}
+
+/// The error of a `--set` of a key that does not exist.
+pub(super) fn unknown_setting<'a>(
     key: &str,
     value: &str,
-    source: serde_yaml::Error,
+    known: impl Iterator<Item = &'a str>,
 ) -> ConfigError {
-    describe(place, Some(key), Some(value), source)
+    ConfigError::UnknownKey {
+        place: setting(key, value),
+        nearest: nearest(key, known),
+        key: key.to_owned(),
+    }
 }
 
-/// A value that was read and cannot be used, at the place where it was given last.
-pub(super) fn unusable(
-    path: &Path,
+/// The error of an invalid value, at the place where it was given last.
+pub(super) fn invalid(
+    name: &str,
     text: &str,
-    overrides: &[(String, String)],
-    problem: InvalidValue,
+    settings: &[(String, String)],
+    invalid: InvalidValue,
 ) -> ConfigError {
-    let setting = overrides
+    let set = settings
         .iter()
-        .rfind(|(key, _)| is_within(&problem.key, key));
-    let place = match setting {
-        Some((key, value)) => Place::Setting {
-            key: key.clone(),
-            value: value.clone(),
-        },
-        None => Place::File {
-            path: path.to_owned(),
-            line: Outline::of(text).line_of(&problem.key),
-        },
+        .rfind(|(key, _)| is_within(&invalid.key, key));
+    let place = match set {
+        Some((key, value)) => setting(key, value),
+        None => {
+            let keys = keys(text);
+            let innermost = keys.iter().rfind(|key| is_within(&invalid.key, &key.name));
+            place(name, innermost.map(|key| key.line))
+        }
     };
-    ConfigError::Unusable { place, problem }
+    ConfigError::InvalidValue { place, invalid }
 }
 
-/// Whether a key is a block, a part of it, or an item of that list.
-fn is_within(key: &str, block: &str) -> bool {
-    let rest = key.strip_prefix(block);
-    rest.is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']))
+/// A file and a line of it, from 0.
+fn place(name: &str, line: Option<usize>) -> String {
+    match line {
+        Some(line) => format!("{name}, line {}", line + 1),
+        None => name.to_owned(),
+    }
 }
 
-/// The key that was probably meant: the nearest in spelling, by itself or as the last part of
-/// a dotted key; `None` where nothing is near.
-pub(super) fn nearest<'a>(key: &str, known: impl Iterator<Item = &'a str>) -> Option<String> {
+fn setting(key: &str, value: &str) -> String {
+    format!("--set {key}={value}")
+}
+
+fn suggestion(nearest: Option<&str>) -> String {
+    match nearest {
+        Some(key) => format!("; did you mean `{key}`?"),
+        None => "; `fpmcl config COMMAND --full` prints every key".to_owned(),
+    }
+}
+
+/// The known key that is most similar, by itself or as the last part of a dotted key; `None` where
+/// none is similar.
+fn nearest<'a>(key: &str, known: impl Iterator<Item = &'a str>) -> Option<String> {
     let distance = |candidate: &str| {
         let last = candidate.rsplit('.').next().unwrap_or(candidate);
         strsim::damerau_levenshtein(key, candidate).min(strsim::damerau_levenshtein(key, last))
@@ -157,45 +136,41 @@ pub(super) fn nearest<'a>(key: &str, known: impl Iterator<Item = &'a str>) -> Op
 }
 
 fn describe(
-    place: Place,
-    key: Option<&str>,
-    value: Option<&str>,
+    place: String,
+    key_and_value: Option<(String, String)>,
     source: serde_yaml::Error,
 ) -> ConfigError {
     use serde_yaml::Error as Yaml;
-    match &source {
-        Yaml::SerdeUnknownField {
-            field, expected, ..
-        } => {
-            return ConfigError::UnknownKey {
-                place,
-                key: field.clone(),
-                nearest: nearest(field, expected.iter().copied()),
-            };
-        }
-        Yaml::DuplicateMappingKey { key: Some(key), .. } => {
-            return ConfigError::DuplicateKey {
-                place,
-                key: key.clone(),
-            };
-        }
-        _ => {}
-    }
-    match (key, value, expected(&source)) {
-        (Some(key), Some(value), Some(expected)) => ConfigError::WrongValue {
+    match (&source, expected(&source), key_and_value) {
+        (
+            Yaml::SerdeUnknownField {
+                field, expected, ..
+            },
+            ..,
+        ) => ConfigError::UnknownKey {
             place,
-            key: key.to_owned(),
-            value: if value.is_empty() { "null" } else { value }.to_owned(),
-            expected,
+            key: field.clone(),
+            nearest: nearest(field, expected.iter().copied()),
         },
+        (Yaml::DuplicateMappingKey { key: Some(key), .. }, ..) => ConfigError::DuplicateKey {
+            place,
+            key: key.clone(),
+        },
+        (_, Some(expected), Some((key, value))) => {
+            let value = if value.is_empty() { "null" } else { &value };
+            ConfigError::InvalidValue {
+                place,
+                invalid: InvalidValue::new(&key, format_args!("`{value}`"), expected),
+            }
+        }
         _ => ConfigError::Syntax {
-            place: place.without_line(),
+            place,
             source: Box::new(source),
         },
     }
 }
 
-/// What belongs in the place of a wrong value.
+/// What a value must be.
 fn expected(source: &serde_yaml::Error) -> Option<String> {
     use serde_yaml::Error as Yaml;
     let expected = match source {
@@ -213,7 +188,7 @@ fn expected(source: &serde_yaml::Error) -> Option<String> {
     Some(format!("it must be {expected}"))
 }
 
-/// The parser's words for what it expects, as a user reads them.
+/// The parser's type names in words.
 fn in_words(ty: &str) -> &str {
     match ty {
         "floating point" => "a number",
@@ -227,24 +202,9 @@ fn in_words(ty: &str) -> &str {
     }
 }
 
-/// The value at a location: its text if it is a plain one, else what follows the key.
-fn quoted(text: &str, location: serde_yaml::Location) -> Option<&str> {
-    let line = text
-        .lines()
-        .nth((location.line() as usize).checked_sub(1)?)?;
-    let whole = line.split_once(':').map_or(line, |(_, value)| value);
-    let whole = whole.split(" #").next()?.trim();
-    let span = location.span();
-    let start = usize::try_from(span.byte_offset()?).ok()?;
-    let length = usize::try_from(span.byte_len()?).ok()?;
-    let exact = text.get(start..start + length)?.trim();
-    let is_part = exact.chars().any(char::is_alphanumeric) && whole.contains(exact);
-    Some(if is_part { exact } else { whole })
-}
-
-fn suggestion(nearest: Option<&str>) -> String {
-    match nearest {
-        Some(key) => format!("; did you mean `{key}`?"),
-        None => "; the files under config/ show every key".to_owned(),
-    }
+/// The value on a line, without its key and its comment.
+fn value_of(line: &str) -> String {
+    let value = line.split_once(':').map_or(line, |(_, value)| value);
+    let value = value.split(" #").next().unwrap_or_default();
+    value.trim().to_owned()
 }

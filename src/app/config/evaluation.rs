@@ -1,4 +1,4 @@
-//! `evaluate`: how far a result is from the truth.
+//! Configuration of `evaluate`: errors of a result against the ground truth.
 
 use std::path::PathBuf;
 
@@ -8,34 +8,34 @@ use super::check::path;
 use crate::recording::Selection;
 use crate::validation::{InvalidValue, Validate, at_least_one, positive, require};
 
-/// The keys of range-mcl's `evaluation.yml`, and below them new ones.
+/// Configuration of `evaluate`: the keys of range-mcl's `evaluation.yml`, then new ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct EvaluationConfig {
-    /// The result of `localize`, of `refine` or of range-mcl.
+    /// Result of `localize`, `refine` or range-mcl.
     pub result_file: PathBuf,
-    /// Camera poses of the recording, for results that hold no ground truth, as those of range-mcl.
+    /// Camera poses of the recording, for results without ground truth, such as those of range-mcl.
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`, for the same results.
     pub calib_file: PathBuf,
-    /// Whether the trajectory is drawn.
+    /// Whether to draw the trajectory.
     pub plot_loc_traj: bool,
-    /// Whether the measures are written beside the result.
+    /// Whether to write the metrics beside the result.
     pub save_evaluation_results: bool,
     /// Metres per unit of the result's positions.
     pub grid_resolution: f64,
-    /// A checked frame farther from the truth than this is a failure [m].
+    /// Position error above which a checked frame is a failure [m].
     pub converge_thres: f64,
-    /// The share of particles, the heaviest, that an estimate is made of.
+    /// Fraction of the particles, by descending weight, that an estimate is computed from, unitless.
     pub particle_select_ratio: f64,
-    /// Frames until convergence is asked for, and between checks from there on.
+    /// Number of frames before the first check of convergence, and between checks.
     pub convergence_interval: usize,
 
-    /// First frame of the result that counts.
+    /// First frame of the result.
     pub start_idx: usize,
-    /// How many frames of the result are looked at; -1 for all.
+    /// Number of frames from `start_idx` on; -1 for all.
     pub n_scans: i64,
-    /// Every how manieth frame is taken.
+    /// Step between frames: n uses every n-th frame.
     pub frame_step: usize,
 }
 
@@ -60,7 +60,7 @@ impl Default for EvaluationConfig {
 }
 
 impl EvaluationConfig {
-    /// The frames that are measured.
+    /// Selection of the frames.
     pub fn selection(&self) -> Selection {
         Selection {
             start_idx: self.start_idx,

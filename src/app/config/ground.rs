@@ -1,4 +1,4 @@
-//! `ground`: which points of a recording are ground.
+//! Configuration of `ground`: ground segmentation of a recording.
 
 use std::path::PathBuf;
 
@@ -9,42 +9,42 @@ use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGr
 use crate::recording::Selection;
 use crate::validation::{InvalidValue, Validate, in_range};
 
-/// What `ground` reads, how it judges and what it writes.
+/// Configuration of `ground`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct GroundCommandConfig {
     /// Folder of the scans, `NNNNNN.bin`.
     pub scan_folder: PathBuf,
-    /// Folder of their true classes, `NNNNNN.label`; null: `labels` beside the scans, if it is
-    /// there.
+    /// Folder of the true classes, `NNNNNN.label`; `None`: `labels` beside the scans, where it
+    /// exists.
     pub label_folder: Option<PathBuf>,
-    /// Where labels, points, pictures and the report go.
+    /// Folder of the labels, points, pictures and the report.
     pub output_folder: PathBuf,
     /// First frame of the recording.
     pub start_idx: usize,
-    /// How many scans of the recording are looked at; -1 for all.
+    /// Number of scans from `start_idx` on; -1 for all.
     pub n_scans: i64,
-    /// Every how manieth frame is taken.
+    /// Step between frames: n uses every n-th frame.
     pub frame_step: usize,
-    /// How ground is told from the rest.
+    /// Method of ground segmentation.
     pub ground_method: GroundMethod,
-    /// A point with more confidence than this is called ground, unitless.
+    /// Confidence above which a point is ground, unitless.
     pub ground_threshold: f32,
-    /// Whether all methods are judged beside the chosen one, where there are labels.
+    /// Whether to evaluate all methods, where labels exist.
     pub compare: bool,
-    /// Whether the answer is written as SemanticKITTI labels.
+    /// Whether to write the result as SemanticKITTI labels.
     pub write_labels: bool,
-    /// Whether the points are written coloured by confidence.
+    /// Whether to write the points, coloured by confidence.
     pub write_plys: bool,
-    /// Every how manieth selected scan is drawn from above; 0 for none.
+    /// Step between the scans that are drawn from above; 0 for none.
     pub plot_step: usize,
-    /// Sets and rules of `ground_method: fuzzy`.
+    /// Linguistic sets and rules of `ground_method: fuzzy`.
     pub fuzzy: FuzzyConfig,
-    /// `ground_method: pca`.
+    /// Parameters of `ground_method: pca`.
     pub pca: PcaGround,
-    /// `ground_method: ransac`.
+    /// Parameters of `ground_method: ransac`.
     pub ransac: RansacGround,
-    /// Whether existing output is replaced.
+    /// Whether to replace existing output.
     pub force: bool,
 }
 
@@ -72,7 +72,7 @@ impl Default for GroundCommandConfig {
 }
 
 impl GroundCommandConfig {
-    /// The frames that are judged.
+    /// Selection of the frames.
     pub fn selection(&self) -> Selection {
         Selection {
             start_idx: self.start_idx,

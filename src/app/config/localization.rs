@@ -1,10 +1,12 @@
-//! `localize`: where the car is in a map.
+//! Configuration of `localize`: the pose of the car in a map.
 
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::check::{own_car, path};
+use super::check::{ground, optional_path, path};
+use super::odometry::OdometrySource;
+use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::lidar::{LidarModel, RotationDirection};
 use crate::localization::LocalizerConfig;
 use crate::localization::convergence::ConvergenceConfig;
@@ -20,105 +22,123 @@ use crate::map::scan_cloud::ScanSettings;
 use crate::recording::Selection;
 use crate::refinement::RefinementConfig;
 use crate::validation::{
-    InvalidValue, Validate, at_least_one, nested, not_negative, positive, require,
+    InvalidValue, Validate, at_least_one, nested, not_negative, positive, rectangle,
 };
 
-/// The keys of range-mcl's `localization.yml`, and below them new ones.
+/// Configuration of `localize`: the keys of range-mcl's `localization.yml`, then new ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LocalizationConfig {
     /// Folder of the scans, `NNNNNN.bin`.
     pub scan_folder: PathBuf,
-    /// The map, as `build-map` or range-mcl wrote it.
+    /// Map of `build-map` or range-mcl.
     pub map_file: PathBuf,
-    /// Camera poses that the map was built with.
-    pub map_pose_file: PathBuf,
-    /// Calibration that the map was built with.
-    pub map_calib_file: PathBuf,
+    /// Camera poses of the mapping drive; `None`: the map carries its own frame.
+    pub map_pose_file: Option<PathBuf>,
+    /// Calibration of the mapping drive; `None`: the map carries its own frame.
+    pub map_calib_file: Option<PathBuf>,
     /// Camera poses of the recording.
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`.
     pub calib_file: PathBuf,
-    /// Where the result is written; everything else of the run lies beside it.
+    /// Output path of the result; all other output is written beside it.
     pub result_path: PathBuf,
-    /// Whether the final plots are drawn.
+    /// Whether to draw the final plots.
     pub plot_loc_results: bool,
-    /// Whether the start is known; `initialization` says it more precisely.
+    /// Whether the start is known; `initialization` takes precedence.
     pub pose_tracking: bool,
     /// First frame of the recording.
     pub start_idx: usize,
-    /// Cells of the grid for initialization [m].
+    /// Cell edge of the grid for initialization [m].
     pub grid_res: f64,
-    /// Particles at the start.
+    /// Number of particles at the start.
     #[serde(rename = "numParticles")]
     pub num_particles: usize,
-    /// Fewer occupied tiles than this are convergence.
+    /// Number of occupied tiles below which the filter has converged.
     pub converge_thres: usize,
-    /// Particles after convergence.
+    /// Number of particles after convergence.
     pub num_reduced: usize,
-    /// Weights change only after this much motion [m].
+    /// Motion after which the weights are updated [m].
     pub move_thres: f64,
-    /// Spread of headings around the best of a cell when particles are seeded [deg].
+    /// Standard deviation of the initial headings around the best heading of a cell [deg].
     pub yaw_sigma: f64,
-    /// Whether a picture per frame and an animation are drawn.
+    /// Whether to draw a picture per frame and an animation.
     pub visualize: bool,
-    /// Whether the result is written.
+    /// Whether to write the result.
     pub save_result: bool,
-    /// Size and limits of the range images, and how they are rendered.
+    /// Size and limits of the range images, and their rendering.
     pub range_image: RenderedRangeImage,
 
-    /// How many scans of the recording are looked at; -1 for all.
+    /// Number of scans from `start_idx` on; -1 for all.
     pub n_scans: i64,
-    /// Every how manieth frame is taken.
+    /// Step between frames: n uses every n-th frame.
     pub frame_step: usize,
-    /// Where particles start; follows from `pose_tracking` where it is not given.
+    /// Initial distribution of the particles; `None`: it follows from `pose_tracking`.
     pub initialization: Option<Initialization>,
-    /// Where the motion between frames comes from.
+    /// Source of the motion between frames.
     pub odometry: OdometrySource,
-    /// Poses of the odometry, in KITTI or TUM format; for `odometry: file`.
+    /// Odometry poses in KITTI or TUM format, for `odometry: file`.
     pub odometry_file: Option<PathBuf>,
-    /// How particles follow the odometry.
+    /// Motion model.
     pub motion_model: MotionModel,
-    /// The own car in the lidar frame: x_min, x_max, y_min, y_max [m].
+    /// Box of the own car in the lidar frame: x_min, x_max, y_min, y_max [m].
     pub own_car_m: [f32; 4],
-    /// How particles are spread around a known start.
+    /// Height of the sensor above the road [m]; `None`: estimated from the scans.
+    pub sensor_height_m: Option<f64>,
+    /// Method of ground segmentation of the scans.
+    pub ground_method: GroundMethod,
+    /// Inlier distance of the RANSAC plane [m].
+    pub distance_threshold: f32,
+    /// Sample size of a RANSAC plane.
+    pub ransac_n: usize,
+    /// Number of RANSAC planes.
+    pub num_iterations: usize,
+    /// Parameters of `ground_method: pca`.
+    pub pca: PcaGround,
+    /// Linguistic sets and rules of `ground_method: fuzzy`.
+    pub fuzzy: FuzzyConfig,
+    /// Turn after which the weights are updated [rad].
+    pub turn_thres_rad: f64,
+    /// Spread below which the filter has converged.
+    pub convergence: ConvergenceConfig,
+    /// Spread of the particles around a known start.
     pub start: StartSpread,
-    /// Noise of turn, drive, turn, per increment.
+    /// Noise of the turn-drive-turn model, per increment.
     pub odometry_noise: OdometryNoise,
-    /// Noise of velocity commands.
+    /// Noise of the velocity model.
     pub velocity_noise: VelocityNoise,
-    /// Noise of going on as before, without odometry, per frame.
+    /// Noise of constant velocity, without odometry, per frame.
     pub constant_velocity_noise: OdometryNoise,
-    /// Noise of standing, without odometry and before the velocity is known, per frame.
+    /// The same before the velocity is known, per frame.
     pub unknown_velocity_noise: OdometryNoise,
-    /// Which beams are compared, and what a difference means.
+    /// Observation model.
     pub observation: ObservationConfig,
-    /// How the likelihood is sharpened within a frame.
+    /// Tempering of the likelihood within a frame.
     pub tempering: TemperingConfig,
-    /// Where particles are drawn while tracking.
+    /// Proposal distribution while tracking.
     pub proposal: ProposalConfig,
-    /// When few particles carry the weight.
+    /// Resampling.
     pub resampling: ResamplingConfig,
-    /// How many particles a wide belief needs.
+    /// Adaptive number of particles.
     pub kld: KldConfig,
-    /// When the map disagrees.
+    /// Detection of tracking loss.
     pub vigilance: VigilanceConfig,
-    /// The search for a start.
+    /// Search for the start with panoramas.
     pub panorama: PanoramaConfig,
-    /// The sense in which the sensor spins, where the motion of the car during a scan is to be
-    /// compensated; not so for scans that are compensated already, as those of KITTI odometry.
+    /// Direction of rotation of the sensor for motion compensation; `None` for scans that are
+    /// compensated already, such as those of KITTI odometry.
     pub motion_compensation: Option<RotationDirection>,
-    /// Whether every frame is refined as it comes, while tracking.
+    /// Whether to refine every frame while tracking.
     pub refine: bool,
-    /// How.
+    /// Parameters of the refinement.
     pub refinement: RefinementConfig,
-    /// What random choices follow from.
+    /// Seed of all random choices.
     pub seed: u64,
-    /// Whether an existing result is replaced.
+    /// Whether to replace an existing result.
     pub force: bool,
 }
 
-/// The range images of `localize`: the sensor, and how many of them are rendered at once.
+/// Range images of `localize`: the sensor model and the number of images per batch.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RenderedRangeImage {
@@ -130,42 +150,29 @@ pub struct RenderedRangeImage {
     pub fov_up: f32,
     /// Lower edge of the vertical field of view; below the horizon whatever its sign [deg].
     pub fov_down: f32,
-    /// Returns at this range or farther are dropped [m].
+    /// Range from which on returns are dropped [m].
     pub max_range: f32,
-    /// Returns at this range or nearer are dropped [m].
+    /// Range up to which returns are dropped [m].
     pub min_range: f32,
-    /// Whether particles are rendered together or one by one.
+    /// Whether to render the particles in batches instead of one by one.
     pub render_instanced: bool,
-    /// How many particles are rendered together.
+    /// Number of particles per batch.
     pub max_instance: usize,
 }
 
-/// Where particles start.
+/// Initial distribution of the particles.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Initialization {
     /// Around a known pose.
     Tracking,
-    /// Along the road that the map was built from.
+    /// Along the mapped road.
     Corridor,
-    /// Anywhere in the map.
+    /// Over the whole map.
     Extent,
 }
 
-/// Where the motion between frames comes from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum OdometrySource {
-    /// From the poses of the recording, with noise, as range-mcl does for demonstration.
-    #[default]
-    GroundTruth,
-    /// From `odometry_file`.
-    File,
-    /// Nowhere: particles only spread.
-    None,
-}
-
-/// How particles follow the odometry.
+/// Motion model.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MotionModel {
@@ -177,13 +184,15 @@ pub enum MotionModel {
 }
 
 impl Default for LocalizationConfig {
-    /// The values of range-mcl.
+    /// The values of range-mcl, whose map and recording are the same drive here.
     fn default() -> Self {
+        let localizer = LocalizerConfig::default();
+        let ransac = RansacGround::default();
         Self {
             scan_folder: "data/kitti/velodyne".into(),
             map_file: "results/map.ply".into(),
-            map_pose_file: "data/kitti/poses.txt".into(),
-            map_calib_file: "data/kitti/calib.txt".into(),
+            map_pose_file: None,
+            map_calib_file: None,
             pose_file: "data/kitti/poses.txt".into(),
             calib_file: "data/kitti/calib.txt".into(),
             result_path: "results/localization.npz".into(),
@@ -191,10 +200,10 @@ impl Default for LocalizationConfig {
             pose_tracking: true,
             start_idx: 0,
             grid_res: 1.0,
-            num_particles: 10_000,
-            converge_thres: 2,
-            num_reduced: 100,
-            move_thres: 0.2,
+            num_particles: localizer.num_particles,
+            converge_thres: localizer.convergence.converge_thres,
+            num_reduced: localizer.num_reduced,
+            move_thres: localizer.move_thres_m,
             yaw_sigma: 2.0,
             visualize: false,
             save_result: true,
@@ -206,17 +215,26 @@ impl Default for LocalizationConfig {
             odometry_file: None,
             motion_model: MotionModel::default(),
             own_car_m: ScanSettings::default().own_car_m,
+            sensor_height_m: None,
+            ground_method: GroundMethod::default(),
+            distance_threshold: ransac.distance_threshold,
+            ransac_n: ransac.ransac_n,
+            num_iterations: ransac.num_iterations,
+            pca: PcaGround::default(),
+            fuzzy: FuzzyConfig::default(),
+            turn_thres_rad: localizer.turn_thres_rad,
+            convergence: localizer.convergence,
             start: StartSpread::default(),
-            odometry_noise: OdometryNoise::default(),
-            velocity_noise: VelocityNoise::default(),
-            constant_velocity_noise: LocalizerConfig::default().constant_velocity,
-            unknown_velocity_noise: LocalizerConfig::default().unknown_velocity,
-            observation: ObservationConfig::default(),
-            tempering: TemperingConfig::default(),
-            proposal: ProposalConfig::default(),
-            resampling: ResamplingConfig::default(),
-            kld: KldConfig::default(),
-            vigilance: VigilanceConfig::default(),
+            odometry_noise: localizer.motion,
+            velocity_noise: localizer.velocity,
+            constant_velocity_noise: localizer.constant_velocity,
+            unknown_velocity_noise: localizer.unknown_velocity,
+            observation: localizer.observation,
+            tempering: localizer.tempering,
+            proposal: localizer.proposal,
+            resampling: localizer.resampling,
+            kld: localizer.kld,
+            vigilance: localizer.vigilance,
             panorama: PanoramaConfig::default(),
             motion_compensation: None,
             refine: false,
@@ -252,7 +270,7 @@ impl Default for RenderedRangeImage {
 }
 
 impl LocalizationConfig {
-    /// The frames that are localized.
+    /// Selection of the frames.
     pub fn selection(&self) -> Selection {
         Selection {
             start_idx: self.start_idx,
@@ -261,12 +279,13 @@ impl LocalizationConfig {
         }
     }
 
-    /// The filter.
+    /// Configuration of the filter.
     pub fn localizer(&self) -> LocalizerConfig {
         LocalizerConfig {
             num_particles: self.num_particles,
             num_reduced: self.num_reduced,
             move_thres_m: self.move_thres,
+            turn_thres_rad: self.turn_thres_rad,
             motion: self.odometry_noise.clone(),
             velocity: self.velocity_noise.clone(),
             constant_velocity: self.constant_velocity_noise.clone(),
@@ -278,14 +297,13 @@ impl LocalizationConfig {
             kld: self.kld.clone(),
             convergence: ConvergenceConfig {
                 converge_thres: self.converge_thres,
-                ..ConvergenceConfig::default()
+                ..self.convergence.clone()
             },
             vigilance: self.vigilance.clone(),
-            ..LocalizerConfig::default()
         }
     }
 
-    /// The search for a start, on cells of `grid_res`, with headings spread by `yaw_sigma`.
+    /// Configuration of the search for the start, with `grid_res` and `yaw_sigma`.
     pub fn panorama_config(&self) -> PanoramaConfig {
         PanoramaConfig {
             cell_m: self.grid_res,
@@ -294,8 +312,23 @@ impl LocalizationConfig {
         }
     }
 
-    /// Where particles start: as told, or around the start for pose tracking, or else along
-    /// the road.
+    /// The ground classifier of the scans and its parameters.
+    pub fn ground(&self) -> GroundConfig {
+        GroundConfig {
+            method: self.ground_method,
+            fuzzy: self.fuzzy.clone(),
+            pca: self.pca,
+            ransac: RansacGround {
+                distance_threshold: self.distance_threshold,
+                ransac_n: self.ransac_n,
+                num_iterations: self.num_iterations,
+                seed: self.seed,
+            },
+        }
+    }
+
+    /// Initial distribution of the particles: `initialization`, else around the known start for
+    /// `pose_tracking`, else along the road.
     pub fn initialization(&self) -> Initialization {
         self.initialization.unwrap_or(if self.pose_tracking {
             Initialization::Tracking
@@ -306,7 +339,7 @@ impl LocalizationConfig {
 }
 
 impl RenderedRangeImage {
-    /// The sensor alone.
+    /// The sensor model.
     pub fn model(&self) -> LidarModel {
         LidarModel {
             height: self.height,
@@ -318,7 +351,7 @@ impl RenderedRangeImage {
         }
     }
 
-    /// How many particles are rendered together.
+    /// Number of particles that are rendered at once.
     pub fn batch_size(&self) -> usize {
         if self.render_instanced {
             self.max_instance
@@ -332,36 +365,21 @@ impl Validate for LocalizationConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         path("scan_folder", &self.scan_folder)?;
         path("map_file", &self.map_file)?;
-        path("map_pose_file", &self.map_pose_file)?;
-        path("map_calib_file", &self.map_calib_file)?;
+        optional_path("map_pose_file", self.map_pose_file.as_deref())?;
+        optional_path("map_calib_file", self.map_calib_file.as_deref())?;
         path("pose_file", &self.pose_file)?;
         path("calib_file", &self.calib_file)?;
         path("result_path", &self.result_path)?;
         self.selection().validate()?;
+        self.odometry.validate(self.odometry_file.as_deref())?;
+        rectangle("own_car_m", self.own_car_m)?;
+        self.sensor_height_m
+            .map_or(Ok(()), |height| positive("sensor_height_m", height))?;
+        ground(&self.ground())?;
         positive("grid_res", self.grid_res)?;
-        at_least_one("numParticles", self.num_particles)?;
-        at_least_one("converge_thres", self.converge_thres)?;
-        at_least_one("num_reduced", self.num_reduced)?;
-        not_negative("move_thres", self.move_thres)?;
         not_negative("yaw_sigma", self.yaw_sigma)?;
-        require(
-            self.odometry != OdometrySource::File || self.odometry_file.is_some(),
-            "odometry",
-            "file",
-            "name the file in odometry_file, or choose ground_truth or none",
-        )?;
-        own_car("own_car_m", self.own_car_m)?;
         nested("start", &self.start)?;
-        nested("odometry_noise", &self.odometry_noise)?;
-        nested("velocity_noise", &self.velocity_noise)?;
-        nested("constant_velocity_noise", &self.constant_velocity_noise)?;
-        nested("unknown_velocity_noise", &self.unknown_velocity_noise)?;
-        nested("observation", &self.observation)?;
-        nested("tempering", &self.tempering)?;
-        nested("proposal", &self.proposal)?;
-        nested("resampling", &self.resampling)?;
-        nested("kld", &self.kld)?;
-        nested("vigilance", &self.vigilance)?;
+        self.localizer().validate()?;
         nested("panorama", &self.panorama)?;
         nested("refinement", &self.refinement)?;
         nested("range_image", &self.range_image)

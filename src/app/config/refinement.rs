@@ -1,69 +1,86 @@
-//! `refine`: a trajectory polished by a particle swarm, then smoothed.
+//! Configuration of `refine`: swarm, Gauss-Newton and smoothing of a trajectory.
 
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::check::{own_car, path};
-use super::localization::OdometrySource;
+use super::check::{ground, optional_path, path};
+use super::localization::LocalizationConfig;
+use super::odometry::OdometrySource;
+use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::lidar::{LidarModel, RotationDirection};
 use crate::localization::observation::ObservationConfig;
 use crate::recording::Selection;
 use crate::refinement;
-use crate::validation::{InvalidValue, Validate, nested, require};
+use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 
-/// What `refine` reads, and how it refines.
+/// Configuration of `refine`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RefinementConfig {
     /// Folder of the scans, `NNNNNN.bin`.
     pub scan_folder: PathBuf,
-    /// The map, as `build-map` or range-mcl wrote it.
+    /// Map of `build-map` or range-mcl.
     pub map_file: PathBuf,
-    /// Camera poses that the map was built with.
-    pub map_pose_file: PathBuf,
-    /// Calibration that the map was built with.
-    pub map_calib_file: PathBuf,
+    /// Camera poses of the mapping drive; `None`: the map carries its own frame.
+    pub map_pose_file: Option<PathBuf>,
+    /// Calibration of the mapping drive; `None`: the map carries its own frame.
+    pub map_calib_file: Option<PathBuf>,
     /// Camera poses of the recording.
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`.
     pub calib_file: PathBuf,
-    /// The result of `localize`, to which the refined poses are added.
+    /// Result of `localize`, to which the refined poses are added.
     pub result_file: PathBuf,
-    /// Whether the final plots are drawn.
+    /// Whether to draw the final plots.
     pub plot_loc_results: bool,
     /// First frame of the recording.
     pub start_idx: usize,
-    /// How many scans of the recording are looked at; -1 for all.
+    /// Number of scans from `start_idx` on; -1 for all.
     pub n_scans: i64,
-    /// Every how manieth frame is taken.
+    /// Step between frames: n uses every n-th frame.
     pub frame_step: usize,
-    /// Where the motion between frames comes from, for smoothing.
+    /// Source of the motion between frames, for smoothing.
     pub odometry: OdometrySource,
-    /// Poses of the odometry, in KITTI or TUM format; for `odometry: file`.
+    /// Odometry poses in KITTI or TUM format, for `odometry: file`.
     pub odometry_file: Option<PathBuf>,
     /// Size and limits of the range images.
     pub range_image: LidarModel,
-    /// The own car in the lidar frame: x_min, x_max, y_min, y_max [m].
+    /// Box of the own car in the lidar frame: x_min, x_max, y_min, y_max [m].
     pub own_car_m: [f32; 4],
-    /// Which beams are compared, and what a difference means.
+    /// Height of the sensor above the road [m]; `None`: estimated from the scans.
+    pub sensor_height_m: Option<f64>,
+    /// Method of ground segmentation of the scans.
+    pub ground_method: GroundMethod,
+    /// Inlier distance of the RANSAC plane [m].
+    pub distance_threshold: f32,
+    /// Sample size of a RANSAC plane.
+    pub ransac_n: usize,
+    /// Number of RANSAC planes.
+    pub num_iterations: usize,
+    /// Parameters of `ground_method: pca`.
+    pub pca: PcaGround,
+    /// Linguistic sets and rules of `ground_method: fuzzy`.
+    pub fuzzy: FuzzyConfig,
+    /// Observation model.
     pub observation: ObservationConfig,
-    /// Swarm, finishing step and smoothing.
+    /// Swarm, Gauss-Newton and smoothing.
     pub refinement: refinement::RefinementConfig,
-    /// The sense in which the sensor spins, where the motion of the car during a scan is to be
-    /// compensated; not so for scans that are compensated already, as those of KITTI odometry.
+    /// Direction of rotation of the sensor for motion compensation; `None` for scans that are
+    /// compensated already, such as those of KITTI odometry.
     pub motion_compensation: Option<RotationDirection>,
-    /// What random choices follow from.
+    /// Seed of all random choices.
     pub seed: u64,
-    /// Whether existing refined poses are replaced.
+    /// Whether to replace existing refined poses.
     pub force: bool,
 }
 
-impl Default for RefinementConfig {
-    /// The files that `localize` reads and writes by default.
-    fn default() -> Self {
-        let localization = super::LocalizationConfig::default();
+impl RefinementConfig {
+    /// The refinement of the result of a localization: its files, frames, odometry, ground
+    /// classifier and observation model.
+    pub fn of(localization: LocalizationConfig) -> Self {
         Self {
+            range_image: localization.range_image.model(),
             scan_folder: localization.scan_folder,
             map_file: localization.map_file,
             map_pose_file: localization.map_pose_file,
@@ -72,24 +89,28 @@ impl Default for RefinementConfig {
             calib_file: localization.calib_file,
             result_file: localization.result_path,
             plot_loc_results: true,
-            start_idx: 0,
-            n_scans: -1,
-            frame_step: 1,
-            odometry: OdometrySource::default(),
-            odometry_file: None,
-            range_image: LidarModel::default(),
+            start_idx: localization.start_idx,
+            n_scans: localization.n_scans,
+            frame_step: localization.frame_step,
+            odometry: localization.odometry,
+            odometry_file: localization.odometry_file,
             own_car_m: localization.own_car_m,
+            sensor_height_m: localization.sensor_height_m,
+            ground_method: localization.ground_method,
+            distance_threshold: localization.distance_threshold,
+            ransac_n: localization.ransac_n,
+            num_iterations: localization.num_iterations,
+            pca: localization.pca,
+            fuzzy: localization.fuzzy,
             observation: localization.observation,
             refinement: refinement::RefinementConfig::default(),
-            motion_compensation: None,
-            seed: 0,
-            force: false,
+            motion_compensation: localization.motion_compensation,
+            seed: localization.seed,
+            force: localization.force,
         }
     }
-}
 
-impl RefinementConfig {
-    /// The frames that are refined.
+    /// Selection of the frames.
     pub fn selection(&self) -> Selection {
         Selection {
             start_idx: self.start_idx,
@@ -97,25 +118,45 @@ impl RefinementConfig {
             frame_step: self.frame_step,
         }
     }
+
+    /// The ground classifier of the scans and its parameters.
+    pub fn ground(&self) -> GroundConfig {
+        GroundConfig {
+            method: self.ground_method,
+            fuzzy: self.fuzzy.clone(),
+            pca: self.pca,
+            ransac: RansacGround {
+                distance_threshold: self.distance_threshold,
+                ransac_n: self.ransac_n,
+                num_iterations: self.num_iterations,
+                seed: self.seed,
+            },
+        }
+    }
+}
+
+impl Default for RefinementConfig {
+    /// The refinement of what `localize` finds by default.
+    fn default() -> Self {
+        Self::of(LocalizationConfig::default())
+    }
 }
 
 impl Validate for RefinementConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         path("scan_folder", &self.scan_folder)?;
         path("map_file", &self.map_file)?;
-        path("map_pose_file", &self.map_pose_file)?;
-        path("map_calib_file", &self.map_calib_file)?;
+        optional_path("map_pose_file", self.map_pose_file.as_deref())?;
+        optional_path("map_calib_file", self.map_calib_file.as_deref())?;
         path("pose_file", &self.pose_file)?;
         path("calib_file", &self.calib_file)?;
         path("result_file", &self.result_file)?;
         self.selection().validate()?;
-        require(
-            self.odometry != OdometrySource::File || self.odometry_file.is_some(),
-            "odometry",
-            "file",
-            "name the file in odometry_file, or choose ground_truth or none",
-        )?;
-        own_car("own_car_m", self.own_car_m)?;
+        self.odometry.validate(self.odometry_file.as_deref())?;
+        rectangle("own_car_m", self.own_car_m)?;
+        self.sensor_height_m
+            .map_or(Ok(()), |height| positive("sensor_height_m", height))?;
+        ground(&self.ground())?;
         nested("observation", &self.observation)?;
         nested("refinement", &self.refinement)?;
         nested("range_image", &self.range_image)

@@ -216,8 +216,8 @@ fn effective(run: &PlannedRun) -> Result<[String; 3]> {
     let localization = LocalizationConfig {
         scan_folder: nowhere(),
         map_file: nowhere(),
-        map_pose_file: nowhere(),
-        map_calib_file: nowhere(),
+        map_pose_file: None,
+        map_calib_file: None,
         pose_file: nowhere(),
         calib_file: nowhere(),
         result_path: nowhere(),
@@ -230,8 +230,8 @@ fn effective(run: &PlannedRun) -> Result<[String; 3]> {
     let refinement = run.refinement.clone().map(|refinement| RefinementConfig {
         scan_folder: nowhere(),
         map_file: nowhere(),
-        map_pose_file: nowhere(),
-        map_calib_file: nowhere(),
+        map_pose_file: None,
+        map_calib_file: None,
         pose_file: nowhere(),
         calib_file: nowhere(),
         result_file: nowhere(),

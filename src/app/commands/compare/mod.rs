@@ -32,7 +32,7 @@ mod pictures;
 mod plan;
 mod shared;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context as _, Result, bail, ensure};
 
@@ -63,8 +63,7 @@ impl Layout {
 /// Runs what is missing, or a part of it, and returns what belongs on standard output.
 pub fn run(args: &CompareArgs, context: &Context) -> Result<String> {
     let path = args.source.config.as_deref();
-    let default_path = Path::new("config/comparison.yml");
-    let config: ComparisonConfig = config::load(path, default_path, &args.source.settings)?;
+    let config: ComparisonConfig = config::load(path, &args.source.settings)?;
     let runs = plan::runs(&config)?;
     let layout = Layout {
         root: config.output_folder.clone(),

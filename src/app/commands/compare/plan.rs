@@ -94,7 +94,10 @@ fn planned(
     variant: &VariantConfig,
     drives: Option<&[SimulationConfig; 2]>,
 ) -> Result<PlannedRun> {
-    let mut build_map = BuildMapConfig::default();
+    let mut build_map = BuildMapConfig {
+        visualize: false,
+        ..BuildMapConfig::default()
+    };
     let mut localization = LocalizationConfig::default();
     if let Some([first, second]) = drives.map(|drives| drives.each_ref().map(|d| d.drive_folder()))
     {
@@ -119,13 +122,13 @@ fn planned(
         &[&base.localization, &own.localization, &asked.localization],
     )?;
     let localization = LocalizationConfig {
-        map_pose_file: build_map.pose_file.clone(),
-        map_calib_file: build_map.calib_file.clone(),
+        map_pose_file: Some(build_map.pose_file.clone()),
+        map_calib_file: Some(build_map.calib_file.clone()),
         ..localization
     };
     let refinement = if variant.refine {
         Some(applied(
-            following(&localization),
+            RefinementConfig::of(localization.clone()),
             "refinement",
             &[&base.refinement, &own.refinement, &asked.refinement],
         )?)
@@ -178,34 +181,13 @@ fn particle_runs(config: &ComparisonConfig, like: &PlannedRun) -> Result<Vec<Pla
     Ok(runs)
 }
 
-/// A refinement of what a localization finds: the same files, frames and odometry.
-fn following(localization: &LocalizationConfig) -> RefinementConfig {
-    RefinementConfig {
-        scan_folder: localization.scan_folder.clone(),
-        map_file: localization.map_file.clone(),
-        map_pose_file: localization.map_pose_file.clone(),
-        map_calib_file: localization.map_calib_file.clone(),
-        pose_file: localization.pose_file.clone(),
-        calib_file: localization.calib_file.clone(),
-        start_idx: localization.start_idx,
-        n_scans: localization.n_scans,
-        frame_step: localization.frame_step,
-        odometry: localization.odometry,
-        odometry_file: localization.odometry_file.clone(),
-        range_image: localization.range_image.model(),
-        own_car_m: localization.own_car_m,
-        observation: localization.observation.clone(),
-        ..RefinementConfig::default()
-    }
-}
-
 /// A configuration with overrides, the later ones on top.
 fn applied<T>(config: T, block: &str, overrides: &[&Overrides]) -> Result<T>
 where
     T: Validate + Serialize + DeserializeOwned,
 {
     let all: Vec<(String, String)> = overrides.iter().flat_map(|keys| settings(keys)).collect();
-    config::with_overrides(config, &all).with_context(|| format!("among the keys of {block}"))
+    config::with_settings(config, &all).with_context(|| format!("among the keys of {block}"))
 }
 
 #[cfg(test)]
@@ -239,7 +221,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
         let folder = tempfile::tempdir()?;
         let path = folder.path().join("comparison.yml");
         std::fs::write(&path, text)?;
-        runs(&config::load(Some(&path), &path, &[])?)
+        runs(&config::load(Some(&path), &[])?)
     }
 
     fn find<'a>(runs: &'a [PlannedRun], id: &str) -> &'a PlannedRun {
@@ -284,10 +266,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
             .unwrap();
         assert_eq!(refinement.scan_folder, std::path::Path::new("b/velodyne"));
         assert_eq!(refinement.start_idx, 1);
-        assert_eq!(
-            refinement.map_pose_file,
-            std::path::Path::new("a/poses.txt")
-        );
+        assert_eq!(refinement.map_pose_file, Some("a/poses.txt".into()));
     }
 
     #[test]

@@ -10,9 +10,6 @@ use crate::geometry::Vec3;
 use crate::recording::sequence::selected_scans;
 use crate::recording::velodyne;
 
-/// Where the configuration is looked for.
-const DEFAULT_CONFIG: &str = "config/ground.yml";
-
 /// Where scans come from.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Source {
@@ -58,12 +55,8 @@ pub fn load(args: &GroundArgs) -> Result<(GroundCommandConfig, Source)> {
         "two configurations are given; leave out --config or the first argument"
     );
     let input = args.input.as_ref().filter(|path| !is_config(path));
-    let default = Path::new(DEFAULT_CONFIG);
-    let needs_none = input.is_some() || args.simulated;
-    let mut config: GroundCommandConfig = match own.or(args.config.as_ref()) {
-        None if needs_none && !default.exists() => config::defaults(&settings)?,
-        path => config::load(path.map(PathBuf::as_path), default, &settings)?,
-    };
+    let path = own.or(args.config.as_ref()).map(PathBuf::as_path);
+    let mut config: GroundCommandConfig = config::load(path, &settings)?;
     let Some(path) = input else {
         let folder = config.scan_folder.clone();
         return Ok((config, Source::Folder(folder)));

@@ -15,7 +15,7 @@ use self::pictures::draw_example;
 use self::recorder::Recorder;
 use super::interrupt::Interrupted;
 use super::run_output::{self, Movie, RunFiles};
-use super::stages::{Inputs, LoadedMap, Observer};
+use super::stages::{Inputs, LoadedMap, Observer, mapping_file};
 use super::{Context, odometry, run_page};
 use crate::app::config::{self, LocalizationConfig};
 use crate::app::results::{LocalizationResults, Report};
@@ -35,8 +35,8 @@ const FIRST_FRAME_STREAM: u64 = 2;
 pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     let inputs = Inputs {
         map_file: &config.map_file,
-        map_pose_file: &config.map_pose_file,
-        map_calib_file: &config.map_calib_file,
+        map_pose_file: mapping_file("map_pose_file", config.map_pose_file.as_deref())?,
+        map_calib_file: mapping_file("map_calib_file", config.map_calib_file.as_deref())?,
         scan_folder: &config.scan_folder,
         pose_file: &config.pose_file,
         calib_file: &config.calib_file,

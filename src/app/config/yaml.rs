@@ -1,0 +1,157 @@
+//! YAML text of configurations, and the lines of its keys.
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+/// Serializes a configuration in block style, each key on a line of its own.
+pub fn to_yaml<T: Serialize>(config: &T) -> Result<String, serde_yaml::SerializeError> {
+    let options = serde_yaml::ser_options! { prefer_block_scalars: false };
+    serde_yaml::to_string_with_options(config, options)
+}
+
+/// Reads a configuration; keys that are missing have their defaults.
+pub(super) fn parse<T: DeserializeOwned>(text: &str) -> Result<T, serde_yaml::Error> {
+    serde_yaml::from_str_with_options(text, serde_yaml::options! { with_snippet: false })
+}
+
+/// A key of a YAML text in block style, or an item of a list.
+pub(super) struct Key {
+    /// Dotted (`range_image.width`); an item has its number, from 1 (`fuzzy.rules[2]`).
+    pub(super) name: String,
+    /// The line that it starts on, from 0.
+    pub(super) line: usize,
+    /// Twice the indentation, and one more for an item, which may stand below its list unindented.
+    depth: usize,
+    items: usize,
+}
+
+/// Lists the keys and the items of a text in order; what stands in braces is part of a value.
+pub(super) fn keys(text: &str) -> Vec<Key> {
+    let mut keys: Vec<Key> = Vec::new();
+    let mut open: Vec<usize> = Vec::new();
+    for (line, text) in text.lines().enumerate() {
+        let content = text.trim_start();
+        let is_item = content == "-" || content.starts_with("- ");
+        let name = key_of(content);
+        if !is_item && name.is_none() {
+            continue;
+        }
+        let depth = 2 * (text.len() - content.len()) + usize::from(is_item);
+        open.retain(|&parent| keys[parent].depth < depth);
+        let parent = open.last().map(|&parent| &mut keys[parent]);
+        let name = match (name, parent) {
+            (Some(name), None) => name.to_owned(),
+            (Some(name), Some(parent)) => format!("{}.{name}", parent.name),
+            (None, Some(list)) => {
+                list.items += 1;
+                format!("{}[{}]", list.name, list.items)
+            }
+            (None, None) => continue,
+        };
+        open.push(keys.len());
+        keys.push(Key {
+            name,
+            line,
+            depth,
+            items: 0,
+        });
+    }
+    keys
+}
+
+/// Replaces the value of a key in a text of [`to_yaml`]; `None` where the key does not exist.
+pub(super) fn with_value(text: &str, key: &str, value: &str) -> Option<String> {
+    let keys = keys(text);
+    let is_item = key.contains('[');
+    let index = keys.iter().position(|it| it.name == key && !is_item)?;
+    let Key { line, depth, .. } = keys[index];
+    let next = keys[index..].iter().find(|it| !is_within(&it.name, key));
+    let lines: Vec<&str> = text.lines().collect();
+    let end = next.map_or(lines.len(), |next| next.line);
+    let name = key.rsplit('.').next()?;
+    let replaced = format!("{}{name}: {value}", " ".repeat(depth / 2));
+    Some(
+        [&lines[..line], &[replaced.as_str()], &lines[end..]]
+            .concat()
+            .join("\n"),
+    )
+}
+
+/// Whether a key is `block`, a key of that block or an item of that list.
+pub(super) fn is_within(key: &str, block: &str) -> bool {
+    let rest = key.strip_prefix(block);
+    rest.is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']))
+}
+
+/// The key that a line without its indentation starts with.
+fn key_of(content: &str) -> Option<&str> {
+    let (name, rest) = content.split_once(':')?;
+    let is_name = |c: char| c.is_alphanumeric() || c == '_' || c == '-';
+    let is_key = !name.is_empty() && name.chars().all(is_name);
+    (is_key && (rest.is_empty() || rest.starts_with(' '))).then_some(name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TEXT: &str = "\
+# a comment: not a key
+first: 1
+
+block:
+  inner: 2
+  list:
+  - name: a
+    other: b
+  - name: c
+  deep:
+    deepest: 3
+last: 'x: y'
+";
+
+    fn line_of(key: &str) -> Option<usize> {
+        let keys = keys(TEXT);
+        Some(keys.iter().find(|it| it.name == key)?.line)
+    }
+
+    #[test]
+    fn every_key_and_every_item_has_its_path() {
+        let keys = keys(TEXT);
+        let names: Vec<&str> = keys.iter().map(|key| key.name.as_str()).collect();
+        assert_eq!(
+            names,
+            [
+                "first",
+                "block",
+                "block.inner",
+                "block.list",
+                "block.list[1]",
+                "block.list[1].other",
+                "block.list[2]",
+                "block.deep",
+                "block.deep.deepest",
+                "last"
+            ]
+        );
+    }
+
+    #[test]
+    fn keys_and_items_have_their_lines() {
+        assert_eq!(line_of("block.list"), Some(5));
+        assert_eq!(line_of("block.list[1]"), Some(6));
+        assert_eq!(line_of("block.list[2]"), Some(8));
+        assert_eq!(line_of("inner"), None);
+    }
+
+    #[test]
+    fn replacing_a_value_leaves_every_other_line() {
+        let replaced = with_value(TEXT, "block.list", "[]").unwrap();
+        let expected = TEXT.replace(
+            "  list:\n  - name: a\n    other: b\n  - name: c\n",
+            "  list: []\n",
+        );
+        assert_eq!(replaced.trim_end(), expected.trim_end());
+        assert_eq!(with_value(TEXT, "inner", "3"), None);
+    }
+}
