@@ -1,43 +1,40 @@
-//! The ground as triangles: the squares of the grid, cut exactly along the kerb, the back of the
-//! pavement and the line between road and bays. A vertical face closes the step at the kerb.
+//! Triangulation of the ground: the cells of the grid, clipped exactly at the kerb, the back of the
+//! sidewalk and the line between road and bays. A vertical face closes the step at the kerb.
 
 use glam::{DVec2, Vec3};
 
-use super::builder::{Paint, PaintedMesh};
+use super::builder::{LabelledMesh, Material};
 use super::classes;
-use super::ground::{Ground, Node, Surface};
+use super::ground::{GroundField, GroundSample, GroundZone};
 
-/// A corner of a piece of ground.
-type Corner = (DVec2, Node);
+/// A vertex of a polygon on the ground.
+type GroundVertex = (DVec2, GroundSample);
 
-const ROAD: Paint = Paint {
+const ROAD: Material = Material {
     class: classes::ROAD,
     reflectance: 0.22,
 };
-const PARKING: Paint = Paint {
+const PARKING: Material = Material {
     class: classes::PARKING,
     reflectance: 0.28,
 };
-const SIDEWALK: Paint = Paint {
+const SIDEWALK: Material = Material {
     class: classes::SIDEWALK,
     reflectance: 0.35,
 };
-const TERRAIN: Paint = Paint {
+const TERRAIN: Material = Material {
     class: classes::TERRAIN,
     reflectance: 0.45,
 };
 
 /// Triangles of all ground within reach of the carriageway.
-pub fn ground_mesh(ground: &Ground) -> PaintedMesh {
-    let mut target = PaintedMesh::default();
+pub fn ground_mesh(ground: &GroundField) -> LabelledMesh {
+    let mut target = LabelledMesh::default();
     let (columns, rows) = ground.cells();
     for row in 0..rows {
         for column in 0..columns {
-            let [a, b] = [ground.node(column, row), ground.node(column + 1, row)];
-            let [c, d] = [
-                ground.node(column + 1, row + 1),
-                ground.node(column, row + 1),
-            ];
+            let [a, b, c, d] = [(0, 0), (1, 0), (1, 1), (0, 1)]
+                .map(|(right, up)| ground.node(column + right, row + up));
             let farthest_m = [a, b, c, d].iter().fold(0.0, |m, n| n.1.kerb_m.max(m));
             if f64::from(farthest_m) < ground.config.reach_m {
                 add_triangle(ground, [a, b, c], &mut target);
@@ -48,105 +45,97 @@ pub fn ground_mesh(ground: &Ground) -> PaintedMesh {
     target
 }
 
-fn add_triangle(ground: &Ground, corners: [Corner; 3], target: &mut PaintedMesh) {
-    let kerb = split(&corners, |node| node.kerb_m);
-    let road = split(&kerb.below, |node| node.road_m);
-    let width_m = ground.config.sidewalk_width_m as f32;
-    let pavement = split(&kerb.above, |node| node.kerb_m - width_m);
-    let mut fan = |outline: &[Corner], surface: Surface, paint: Paint| {
-        let at = |corner: &Corner| point(ground, corner, surface);
-        for pair in outline.windows(2).skip(1) {
-            target.push([at(&outline[0]), at(&pair[0]), at(&pair[1])], paint);
+fn add_triangle(ground: &GroundField, corners: [GroundVertex; 3], target: &mut LabelledMesh) {
+    let sidewalk_m = ground.config.sidewalk_width_m as f32;
+    let kerb = clip(&corners, |sample| sample.kerb_m);
+    let road = clip(&kerb.negative, |sample| sample.road_m);
+    let sidewalk = clip(&kerb.positive, |sample| sample.kerb_m - sidewalk_m);
+    let point = |(position, sample): &GroundVertex, zone: GroundZone| {
+        let height_m = ground.zone_height_m(sample, zone);
+        Vec3::new(position.x as f32, position.y as f32, height_m)
+    };
+    let mut fan = |polygon: &[GroundVertex], zone: GroundZone, material: Material| {
+        for pair in polygon.windows(2).skip(1) {
+            let corners = [&polygon[0], &pair[0], &pair[1]];
+            target.push(corners.map(|vertex| point(vertex, zone)), material);
         }
     };
-    fan(&road.below, Surface::Carriageway, ROAD);
-    fan(&road.above, Surface::Carriageway, PARKING);
-    fan(&pavement.below, Surface::Sidewalk, SIDEWALK);
-    fan(&pavement.above, Surface::Terrain, TERRAIN);
-    if let Some([a, b]) = kerb.cut {
-        // The cut runs with the carriageway on its left, towards which the face looks.
-        let low = [a, b].map(|corner| point(ground, &corner, Surface::Carriageway));
-        let high = [a, b].map(|corner| point(ground, &corner, Surface::Sidewalk));
+    fan(&road.negative, GroundZone::Carriageway, ROAD);
+    fan(&road.positive, GroundZone::Carriageway, PARKING);
+    fan(&sidewalk.negative, GroundZone::Sidewalk, SIDEWALK);
+    fan(&sidewalk.positive, GroundZone::Terrain, TERRAIN);
+    if let Some(cut) = kerb.cut {
+        // The cut runs with the carriageway on its left, which the face is towards.
+        let low = cut.map(|vertex| point(&vertex, GroundZone::Carriageway));
+        let high = cut.map(|vertex| point(&vertex, GroundZone::Sidewalk));
         target.push([low[1], low[0], high[0]], SIDEWALK);
         target.push([low[1], high[0], high[1]], SIDEWALK);
     }
 }
 
-fn point(ground: &Ground, (position, node): &Corner, surface: Surface) -> Vec3 {
-    let height_m = ground.surface_height_m(node, surface);
-    Vec3::new(position.x as f32, position.y as f32, height_m)
+/// A convex polygon clipped where a value changes its sign.
+#[derive(Default)]
+struct ClippedPolygon {
+    negative: Vec<GroundVertex>,
+    positive: Vec<GroundVertex>,
+    /// Ends of the cut, `negative` on its left.
+    cut: Option<[GroundVertex; 2]>,
 }
 
-/// A convex outline cut in two where a value changes its sign.
-struct Split {
-    below: Vec<Corner>,
-    above: Vec<Corner>,
-    /// Ends of the cut, `below` on its left.
-    cut: Option<[Corner; 2]>,
-}
-
-fn split(outline: &[Corner], value: impl Fn(&Node) -> f32) -> Split {
-    let mut parts = Split {
-        below: Vec::with_capacity(outline.len() + 1),
-        above: Vec::with_capacity(outline.len() + 1),
-        cut: None,
-    };
-    let (mut leaves_below, mut enters_below) = (None, None);
-    for (index, corner) in outline.iter().enumerate() {
-        let next = &outline[(index + 1) % outline.len()];
-        let (here, there) = (value(&corner.1), value(&next.1));
+fn clip(polygon: &[GroundVertex], value: impl Fn(&GroundSample) -> f32) -> ClippedPolygon {
+    let mut parts = ClippedPolygon::default();
+    let (mut leaves_negative, mut enters_negative) = (None, None);
+    for (index, vertex) in polygon.iter().enumerate() {
+        let next = &polygon[(index + 1) % polygon.len()];
+        let (here, there) = (value(&vertex.1), value(&next.1));
         if here < 0.0 {
-            parts.below.push(*corner);
+            parts.negative.push(*vertex);
         } else {
-            parts.above.push(*corner);
+            parts.positive.push(*vertex);
         }
         if (here < 0.0) != (there < 0.0) {
             let t = here / (here - there);
-            let crossing = (
-                corner.0.lerp(next.0, f64::from(t)),
-                corner.1.lerp(next.1, t),
-            );
-            parts.below.push(crossing);
-            parts.above.push(crossing);
+            let position = vertex.0.lerp(next.0, f64::from(t));
+            let crossing = (position, vertex.1.lerp(next.1, t));
+            parts.negative.push(crossing);
+            parts.positive.push(crossing);
             if here < 0.0 {
-                leaves_below = Some(crossing);
+                leaves_negative = Some(crossing);
             } else {
-                enters_below = Some(crossing);
+                enters_negative = Some(crossing);
             }
         }
     }
-    // Walking around `below` counter-clockwise, its border leaves along the cut.
-    parts.cut = leaves_below.zip(enters_below).map(|(a, b)| [a, b]);
+    // Counter-clockwise around `negative`, its boundary leaves along the cut.
+    parts.cut = leaves_negative.zip(enters_negative).map(|(a, b)| [a, b]);
     parts
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::ground::{GroundConfig, Paving};
-    use super::super::path::{Path, PathSegment};
+    use super::super::centreline::{Centreline, PathSegment};
+    use super::super::layout::{StreetLayout, Strip};
+    use super::super::street_config::CrossSectionConfig;
     use super::*;
 
-    fn street() -> Ground {
-        let segments =
-            [(40.0, 0.0), (20.0, 60.0), (40.0, 0.0)].map(|(length_m, turn_deg)| PathSegment {
-                length_m,
-                turn_deg,
-                grade_percent: 5.0,
-            });
-        let path = Path::from_segments(&segments, 0.0);
-        let road = Paving::Road {
-            path: path.clone(),
-            half_width_m: 3.5,
+    fn street() -> GroundField {
+        let segments = [(40.0, 0.0), (20.0, 60.0), (40.0, 0.0)]
+            .map(|(length_m, turn_deg)| PathSegment::new(length_m, turn_deg, 5.0));
+        let centreline = Centreline::from_segments(&segments, 0.0);
+        let strip = |lateral_m, half_width_m| Strip {
+            centreline: centreline.shifted(lateral_m),
+            half_width_m,
         };
-        let bays = Paving::Bays {
-            path: path.shifted(-4.5),
-            half_width_m: 1.1,
+        let layout = StreetLayout {
+            roads: vec![strip(0.0, 3.5)],
+            bays: vec![strip(-4.5, 1.1)],
+            square: None,
         };
-        Ground::new(&[path], &[road, bays], &GroundConfig::default(), 1)
+        GroundField::new(&centreline, &layout, &CrossSectionConfig::default(), 1)
     }
 
     #[test]
-    fn every_piece_of_ground_has_the_class_of_its_place() {
+    fn every_triangle_of_the_ground_has_the_class_of_its_zone() {
         let ground = street();
         let mesh = ground_mesh(&ground);
         let mut seen = std::collections::BTreeSet::new();
@@ -155,25 +144,25 @@ mod tests {
             if normal.z.abs() < 0.5 * normal.length() || normal.length() < 1e-3 {
                 continue; // The face of the kerb, or a sliver.
             }
-            assert!(normal.z > 0.0, "ground looks up");
+            assert!(normal.z > 0.0, "the ground faces up");
             let [a, b, c] = mesh.mesh.corners(triangle);
             let middle = (a + b + c) / 3.0;
-            let node = ground.at(DVec2::new(middle.x.into(), middle.y.into()));
-            // Within the width of a cell of a border the field is not linear.
-            let class = mesh.paints[triangle].class;
+            let sample = ground.at(DVec2::new(middle.x.into(), middle.y.into()));
+            // Within the width of a cell of a boundary the field is not linear.
+            let class = mesh.materials[triangle].class;
             seen.insert(class);
-            let expected = match ground.surface_of(node.kerb_m) {
-                Surface::Carriageway if node.road_m < 0.0 => classes::ROAD,
-                Surface::Carriageway => classes::PARKING,
-                Surface::Sidewalk => classes::SIDEWALK,
-                Surface::Terrain => classes::TERRAIN,
+            let expected = match ground.zone_of(sample.kerb_m) {
+                GroundZone::Carriageway if sample.road_m < 0.0 => classes::ROAD,
+                GroundZone::Carriageway => classes::PARKING,
+                GroundZone::Sidewalk => classes::SIDEWALK,
+                GroundZone::Terrain => classes::TERRAIN,
             };
             let width_m = ground.config.sidewalk_width_m as f32;
-            let border_m = [node.kerb_m, node.road_m, node.kerb_m - width_m]
+            let boundary_m = [sample.kerb_m, sample.road_m, sample.kerb_m - width_m]
                 .map(f32::abs)
                 .into_iter()
                 .fold(f32::INFINITY, f32::min);
-            assert!(class == expected || border_m < 0.15, "{class} {expected}");
+            assert!(class == expected || boundary_m < 0.15, "{class} {expected}");
         }
         assert_eq!(
             seen.into_iter().collect::<Vec<_>>(),
@@ -187,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn the_ground_has_no_gap_at_the_kerb_and_its_face_looks_at_the_road() {
+    fn the_ground_has_no_gap_at_the_kerb_whose_face_is_towards_the_road() {
         let ground = street();
         let mesh = ground_mesh(&ground).mesh;
         let mut kerb_area = 0.0;

@@ -1,69 +1,70 @@
-//! What is where, before anything has a shape: roads, bays, the square, and the places taken.
+//! Layout of the street before anything has a shape: roads, parking bays, the square, and the
+//! occupied ground.
 
 use glam::DVec2;
 use rand::{Rng, RngExt as _};
 
-use super::ground::Paving;
-use super::path::{Path, PathPoint};
-use super::street::StreetConfig;
+use super::centreline::Centreline;
+use super::street_config::StreetConfig;
 
 /// Width of a parking bay [m].
 pub const BAY_WIDTH_M: f64 = 2.2;
 
-/// A road with houses on both sides.
+/// Length by which the street extends beyond both ends of the driven path [m].
+pub const EXTENSION_M: f64 = 40.0;
+
+/// A paved strip of constant width: a road, or a row of parking bays.
 #[derive(Clone, Debug)]
-pub struct Road {
-    /// Its middle.
-    pub path: Path,
-    /// From the middle to the kerb [m].
+pub struct Strip {
+    /// Its centreline.
+    pub centreline: Centreline,
+    /// From the centreline to the edge [m].
     pub half_width_m: f64,
 }
 
-/// A row of parking bays beside the main road.
+/// Positions of everything that is paved.
 #[derive(Clone, Debug)]
-pub struct BayRow {
-    /// The middle of the row.
-    pub path: Path,
-}
-
-/// The plan of the street.
-#[derive(Clone, Debug)]
-pub struct Layout {
+pub struct StreetLayout {
     /// The main road first, then the side streets.
-    pub roads: Vec<Road>,
-    /// Rows of bays.
-    pub bays: Vec<BayRow>,
-    /// Frame of the open square: its middle and the direction of its long side; half sizes.
-    pub square: Option<(PathPoint, DVec2)>,
+    pub roads: Vec<Strip>,
+    /// Rows of parking bays beside the main road.
+    pub bays: Vec<Strip>,
+    /// The open square, its longer side along the main road.
+    pub square: Option<Footprint>,
 }
 
-impl Layout {
-    /// Plans a street along the line that is driven.
-    pub fn new(line: &Path, config: &StreetConfig, rng: &mut impl Rng) -> Self {
+impl StreetLayout {
+    /// Lays out a street whose right lane has a centreline.
+    pub fn new(lane: &Centreline, config: &StreetConfig, rng: &mut impl Rng) -> Self {
         let half_width_m = config.lane_width_m + 0.4;
-        let main = Road {
-            path: line.shifted(0.5 * config.lane_width_m),
+        let main = Strip {
+            centreline: lane.shifted(0.5 * config.lane_width_m),
             half_width_m,
         };
-        let length_m = main.path.length_m();
+        let length_m = main.centreline.length_m();
         let mut roads = vec![main];
-        let mut mouths_m = Vec::new();
+        let mut junctions_m = Vec::new();
         let mut station_m = config.side_street_spacing_m * rng.random_range(0.5..0.9);
         while station_m < length_m - 20.0 {
-            roads.push(side_street(&roads[0].path, station_m, rng));
-            mouths_m.push(station_m);
+            roads.push(side_street(&roads[0].centreline, station_m, rng));
+            junctions_m.push(station_m);
             station_m += config.side_street_spacing_m * rng.random_range(0.6..1.4);
         }
         let square = config.has_square.then(|| {
-            let half_size_m = DVec2::new(rng.random_range(14.0..19.0), rng.random_range(9.0..13.0));
-            let mut point = roads[0].path.at(length_m * rng.random_range(0.55..0.65));
-            let side = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
-            point.position = point.beside(side * (half_width_m + half_size_m.y - 0.5));
-            (point, half_size_m)
+            let half_m = DVec2::new(rng.random_range(14.0..19.0), rng.random_range(9.0..13.0));
+            let point = roads[0]
+                .centreline
+                .at(length_m * rng.random_range(0.55..0.65));
+            let side = random_side(rng);
+            Footprint {
+                center: point.beside(side * (half_width_m + half_m.y - 0.5)),
+                forward: point.forward,
+                half_m,
+            }
         });
         let bays = [-1.0, 1.0]
             .into_iter()
-            .flat_map(|side| bay_rows(&roads[0], side, &mouths_m, rng))
+            .flat_map(|side| bay_rows(&roads[0], side, &junctions_m, rng))
             .collect();
         Self {
             roads,
@@ -71,53 +72,37 @@ impl Layout {
             square,
         }
     }
-
-    /// The shapes that the carriageway consists of.
-    pub fn pavings(&self) -> Vec<Paving> {
-        let roads = self.roads.iter().map(|road| Paving::Road {
-            path: road.path.clone(),
-            half_width_m: road.half_width_m,
-        });
-        let bays = self.bays.iter().map(|row| Paving::Bays {
-            path: row.path.clone(),
-            half_width_m: 0.5 * BAY_WIDTH_M,
-        });
-        let square = self
-            .square
-            .iter()
-            .map(|(point, half_size_m)| Paving::Square {
-                center: point.position,
-                forward: point.forward,
-                half_size_m: *half_size_m,
-            });
-        roads.chain(bays).chain(square).collect()
-    }
 }
 
-fn side_street(main: &Path, station_m: f64, rng: &mut impl Rng) -> Road {
+/// Left (+1) or right (-1) with equal probability.
+pub fn random_side(rng: &mut impl Rng) -> f64 {
+    if rng.random_bool(0.5) { 1.0 } else { -1.0 }
+}
+
+fn side_street(main: &Centreline, station_m: f64, rng: &mut impl Rng) -> Strip {
     let point = main.at(station_m);
-    let side = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
-    let turn_rad = side * rng.random_range(65.0..115.0_f64).to_radians();
+    let turn_rad = random_side(rng) * rng.random_range(65.0..115.0_f64).to_radians();
     let direction = DVec2::from_angle(turn_rad).rotate(point.forward);
     let end = point.position + rng.random_range(38.0..60.0) * direction;
-    Road {
-        path: Path::straight(point.position, end),
+    Strip {
+        centreline: Centreline::straight(point.position, end),
         half_width_m: rng.random_range(2.5..3.3),
     }
 }
 
-fn bay_rows(road: &Road, side: f64, mouths_m: &[f64], rng: &mut impl Rng) -> Vec<BayRow> {
+fn bay_rows(road: &Strip, side: f64, junctions_m: &[f64], rng: &mut impl Rng) -> Vec<Strip> {
     let lateral_m = side * (road.half_width_m + 0.5 * BAY_WIDTH_M - 0.02);
     let mut rows = Vec::new();
     let mut from_m = rng.random_range(5.0..15.0);
-    while from_m < road.path.length_m() - 12.0 {
+    while from_m < road.centreline.length_m() - 12.0 {
         let to_m = from_m + rng.random_range(9.0..32.0);
-        let is_clear = mouths_m
+        let is_clear = junctions_m
             .iter()
-            .all(|&mouth_m| mouth_m < from_m - 12.0 || mouth_m > to_m + 12.0);
-        if is_clear && to_m < road.path.length_m() {
-            rows.push(BayRow {
-                path: road.path.section(from_m, to_m, lateral_m),
+            .all(|&junction_m| junction_m < from_m - 12.0 || junction_m > to_m + 12.0);
+        if is_clear && to_m < road.centreline.length_m() {
+            rows.push(Strip {
+                centreline: road.centreline.section(from_m, to_m, lateral_m),
+                half_width_m: 0.5 * BAY_WIDTH_M,
             });
         }
         from_m = to_m + rng.random_range(4.0..18.0);
@@ -125,10 +110,10 @@ fn bay_rows(road: &Road, side: f64, mouths_m: &[f64], rng: &mut impl Rng) -> Vec
     rows
 }
 
-/// A rectangle in the plane that something stands on.
+/// An oriented rectangle in the plane.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Footprint {
-    /// Middle [m].
+    /// Centre [m].
     pub center: DVec2,
     /// Unit direction of its length.
     pub forward: DVec2,
@@ -137,13 +122,10 @@ pub struct Footprint {
 }
 
 impl Footprint {
-    /// The corners, and the middles of the sides.
-    pub fn border(&self) -> impl Iterator<Item = DVec2> {
-        let (along, across) = (
-            self.half_m.x * self.forward,
-            self.half_m.y * self.forward.perp(),
-        );
-        let center = self.center;
+    /// The corners and the midpoints of the sides.
+    pub fn outline(&self) -> [DVec2; 8] {
+        let along = self.half_m.x * self.forward;
+        let across = self.half_m.y * self.forward.perp();
         [
             (-1.0, -1.0),
             (0.0, -1.0),
@@ -154,43 +136,37 @@ impl Footprint {
             (-1.0, 1.0),
             (-1.0, 0.0),
         ]
-        .into_iter()
-        .map(move |(u, v)| center + u * along + v * across)
+        .map(|(u, v)| self.center + u * along + v * across)
     }
 
     /// Whether two rectangles overlap, by the separating axis theorem.
     pub fn overlaps(&self, other: &Self) -> bool {
-        let axes = [
-            self.forward,
-            self.forward.perp(),
-            other.forward,
-            other.forward.perp(),
-        ];
-        axes.into_iter().all(|axis| {
+        let axes = [self, other].map(|it| [it.forward, it.forward.perp()]);
+        axes.as_flattened().iter().all(|axis| {
             let radius_m = |footprint: &Self| {
-                footprint.half_m.x * footprint.forward.dot(axis).abs()
-                    + footprint.half_m.y * footprint.forward.perp().dot(axis).abs()
+                footprint.half_m.x * footprint.forward.dot(*axis).abs()
+                    + footprint.half_m.y * footprint.forward.perp().dot(*axis).abs()
             };
-            (other.center - self.center).dot(axis).abs() < radius_m(self) + radius_m(other)
+            (other.center - self.center).dot(*axis).abs() < radius_m(self) + radius_m(other)
         })
     }
 }
 
-/// The places that are taken.
+/// The occupied parts of the ground.
 #[derive(Clone, Debug, Default)]
 pub struct Occupancy(Vec<Footprint>);
 
 impl Occupancy {
-    /// Takes a place unless something stands there.
+    /// Occupies a rectangle if it is free; returns whether it was.
     pub fn claim(&mut self, footprint: Footprint) -> bool {
-        let is_free = !self.0.iter().any(|taken| taken.overlaps(&footprint));
+        let is_free = !self.0.iter().any(|occupied| occupied.overlaps(&footprint));
         if is_free {
             self.0.push(footprint);
         }
         is_free
     }
 
-    /// Takes a square place of `half_m` around a point unless something stands there.
+    /// Occupies a square with edges of twice `half_m` if it is free; returns whether it was.
     pub fn claim_around(&mut self, center: DVec2, half_m: f64) -> bool {
         self.claim(Footprint {
             center,
@@ -219,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_is_given_once() {
+    fn an_occupied_place_is_not_free() {
         let mut occupancy = Occupancy::default();
         assert!(occupancy.claim_around(DVec2::ZERO, 1.0));
         assert!(!occupancy.claim_around(DVec2::ONE, 0.5));

@@ -1,34 +1,35 @@
-//! Odometry with drift: what the wheels and a gyroscope would say.
+//! Odometry drift model: the poses that wheel encoders and a gyroscope report.
 //!
-//! Each increment of the true poses is stretched, turned and shaken, then they are chained:
+//! Each increment of the true poses gets a scale error, a heading drift and noise, then the
+//! increments are composed:
 //!
 //! ```text
 //! Δ̂ₖ = Exp(ω_drift dₖ + ε_ω) · Δₖ(with translation (1 + s) tₖ + ε_t)        P̂ₖ = P̂ₖ₋₁ Δ̂ₖ
 //! ```
 
 use nalgebra::{UnitQuaternion, Vector3};
+use rand::Rng;
 use rand_distr::{Distribution as _, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::random::{Purpose, stream};
 use crate::geometry::Pose3;
 
-/// The errors of the odometry.
+/// Errors of the odometry.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct OdometryConfig {
-    /// Share by which distances come out too long.
+    /// Relative error of distances (s), positive if they are too long.
     pub scale_error: f64,
-    /// Turn to the left per metre that did not happen [deg/m].
+    /// Heading drift to the left per metre (ω_drift) [deg/m].
     pub heading_drift_deg_per_m: f64,
-    /// Standard deviation of each component of a step [m].
+    /// Standard deviation of each component of a translation (ε_t) [m].
     pub step_noise_m: f64,
-    /// Standard deviation of each component of a turn, per scan [deg].
+    /// Standard deviation of each component of a rotation, per scan (ε_ω) [deg].
     pub turn_noise_deg: f64,
 }
 
 impl Default for OdometryConfig {
-    /// A decent wheel odometry: 1 % too long, a degree in 100 m.
+    /// A good wheel odometry: 1 % too long, one degree in 100 m.
     fn default() -> Self {
         Self {
             scale_error: 0.01,
@@ -43,33 +44,24 @@ impl Default for OdometryConfig {
 pub fn drifting_odometry(
     true_poses: &[Pose3],
     config: &OdometryConfig,
-    (seed, drive): (u64, u32),
+    rng: &mut impl Rng,
 ) -> Vec<Pose3> {
-    let mut rng = stream(seed, Purpose::Odometry, u64::from(drive));
     let mut noise = |sigma: f64| {
-        let mut deviate = || -> f64 { StandardNormal.sample(&mut rng) };
+        let mut deviate = || -> f64 { StandardNormal.sample(rng) };
         sigma * Vector3::new(deviate(), deviate(), deviate())
     };
-    let mut reported: Vec<Pose3> = Vec::with_capacity(true_poses.len());
-    for pair in true_poses.windows(2) {
-        let previous = *reported.last().unwrap_or(&pair[0]);
-        if reported.is_empty() {
-            reported.push(previous);
-        }
+    let mut reported: Vec<Pose3> = true_poses.first().copied().into_iter().collect();
+    for (index, pair) in true_poses.windows(2).enumerate() {
         let step = pair[0].inverse() * pair[1];
         let driven_m = step.translation.vector.norm();
-        // A car that stands reports that it stands.
-        let is_moving = driven_m > 0.005;
-        let shake = if is_moving { 1.0 } else { 0.0 };
+        // The odometry of a stationary vehicle has no noise.
+        let noise_scale = if driven_m > 0.005 { 1.0 } else { 0.0 };
         let drift = Vector3::z() * config.heading_drift_deg_per_m.to_radians() * driven_m;
-        let turn = drift + shake * noise(config.turn_noise_deg.to_radians());
+        let turn = drift + noise_scale * noise(config.turn_noise_deg.to_radians());
         let translation = step.translation.vector * (1.0 + config.scale_error)
-            + shake * noise(config.step_noise_m);
+            + noise_scale * noise(config.step_noise_m);
         let rotation = UnitQuaternion::from_scaled_axis(turn) * step.rotation;
-        reported.push(previous * Pose3::from_parts(translation.into(), rotation));
-    }
-    if reported.is_empty() {
-        reported.extend(true_poses.first());
+        reported.push(reported[index] * Pose3::from_parts(translation.into(), rotation));
     }
     reported
 }
@@ -78,6 +70,7 @@ pub fn drifting_odometry(
 mod tests {
     use approx::assert_relative_eq;
 
+    use super::super::random::{Purpose, stream};
     use super::*;
     use crate::geometry::yaw;
 
@@ -85,6 +78,10 @@ mod tests {
         (0..frames)
             .map(|frame| Pose3::translation(3.0 + frame as f64, 2.0, 0.5))
             .collect()
+    }
+
+    fn odometry(true_poses: &[Pose3], config: &OdometryConfig) -> Vec<Pose3> {
+        drifting_odometry(true_poses, config, &mut stream(1, Purpose::Odometry, 1))
     }
 
     const EXACT: OdometryConfig = OdometryConfig {
@@ -95,7 +92,7 @@ mod tests {
     };
 
     #[test]
-    fn without_errors_odometry_is_the_truth() {
+    fn without_errors_odometry_is_exact() {
         let truth: Vec<Pose3> = (0..50)
             .map(|frame| {
                 let angle = 0.1 * f64::from(frame);
@@ -105,7 +102,7 @@ mod tests {
                 )
             })
             .collect();
-        for (a, b) in truth.iter().zip(drifting_odometry(&truth, &EXACT, (1, 1))) {
+        for (a, b) in truth.iter().zip(odometry(&truth, &EXACT)) {
             assert_relative_eq!(*a, b, epsilon = 1e-9);
         }
     }
@@ -117,7 +114,7 @@ mod tests {
             heading_drift_deg_per_m: 0.05,
             ..EXACT
         };
-        let reported = drifting_odometry(&straight(101), &config, (1, 1));
+        let reported = odometry(&straight(101), &config);
         let length_m: f64 = reported
             .windows(2)
             .map(|p| (p[1].translation.vector - p[0].translation.vector).norm())
@@ -133,7 +130,7 @@ mod tests {
             step_noise_m: 0.03,
             ..EXACT
         };
-        let reported = drifting_odometry(&straight(5001), &config, (1, 1));
+        let reported = odometry(&straight(5001), &config);
         let squares: f64 = reported
             .windows(2)
             .map(|p| (p[1].translation.x - p[0].translation.x - 1.0).powi(2))
@@ -144,9 +141,9 @@ mod tests {
     }
 
     #[test]
-    fn a_standing_car_does_not_drift() {
-        let still = vec![straight(1)[0]; 100];
-        let reported = drifting_odometry(&still, &OdometryConfig::default(), (1, 1));
-        assert_relative_eq!(reported[99], still[0], epsilon = 1e-12);
+    fn a_stationary_vehicle_does_not_drift() {
+        let stationary = vec![straight(1)[0]; 100];
+        let reported = odometry(&stationary, &OdometryConfig::default());
+        assert_relative_eq!(reported[99], stationary[0], epsilon = 1e-12);
     }
 }

@@ -1,10 +1,10 @@
-//! Counter-based random streams: what a stream yields depends on the seed, its purpose and its
+//! Counter-based random streams: the numbers of a stream depend on the seed, its purpose and its
 //! index alone, never on the thread that draws or on what was drawn elsewhere.
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-/// What numbers are drawn for; each purpose has streams of its own.
+/// Purpose of random numbers; each has its own streams.
 #[derive(Clone, Copy, Debug)]
 #[repr(u8)]
 pub(super) enum Purpose {
@@ -21,7 +21,7 @@ pub(super) enum Purpose {
     Square = 11,
 }
 
-/// The stream number `index` for a purpose. Generators are made by nobody else in this module.
+/// Stream number `index` of a purpose: the only source of generators in this module.
 pub(super) fn stream(seed: u64, purpose: Purpose, index: u64) -> ChaCha8Rng {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     rng.set_stream(((purpose as u64) << 56) | index);

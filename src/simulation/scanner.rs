@@ -1,31 +1,34 @@
-//! A spinning LiDAR: beams at the elevations of an HDL-64E, range noise, lost returns,
-//! intensities.
+//! LiDAR scan simulation: beams of a spinning sensor, range noise, dropout and intensities.
 //!
-//! A surface of reflectance ρ that a beam meets at an angle α to its normal is seen up to
+//! A surface of reflectance ρ that a beam hits at an angle α to its normal is detected up to
 //!
 //! ```text
-//! r_seen = reach · √(ρ |cos α|^¼ / 0.8)        P(return at r) = 1 / (1 + exp((r − r_seen) / 0.05 r_seen))
+//! r_max = reach · √(ρ |cos α|^¼ / 0.8)        P(return at r) = 1 / (1 + exp((r − r_max) / 0.05 r_max))
 //! ```
 //!
 //! The square root is the radar equation of an extended target; the weak power of the cosine
-//! stands for rough surfaces (asphalt at 60 m is met at 2 degrees and still returns). Beam
+//! stands for rough surfaces (asphalt at 60 m is hit at 2 degrees and still returns). Beam
 //! elevations: Velodyne, *HDL-64E S2 user's manual*: 32 lasers in steps of 1/3 degree from +2
 //! to -8.33, 32 in steps of 1/2 degree from -8.83 to -24.33.
+
+use std::f32::consts::TAU;
 
 use glam::{Vec2, Vec3};
 use rand::{Rng, RngExt as _};
 use rand_distr::{Distribution as _, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::builder::PaintedMesh;
-use super::drive::SCAN_PERIOD_S;
-use super::street::Street;
-use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
+use super::builder::LabelledMesh;
+use super::ego_motion::SCAN_PERIOD_S;
+use crate::geometry::{Pose3, Rigid3f};
 use crate::lidar::Scan;
 use crate::raycasting::{Hit, Scene};
+use crate::validation::{
+    InvalidValue, Validate, at_least_one, fraction, not_negative, positive, require,
+};
 
-/// Steps of a revolution that share one origin when the car moves during the revolution.
-const STEPS_PER_ORIGIN: usize = 8;
+/// Azimuth steps that share one sensor pose under a rolling shutter.
+const STEPS_PER_POSE: usize = 8;
 
 /// The sensor.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -33,21 +36,23 @@ const STEPS_PER_ORIGIN: usize = 8;
 pub struct ScannerConfig {
     /// Number of beams of the HDL-64E that are used, evenly chosen: 64, 32, 16, ...
     pub beams: usize,
-    /// Elevations of the beams instead of those, from the top; empty for those [deg].
+    /// Elevations of the beams from the top, instead of those of the HDL-64E; empty for
+    /// those [deg].
     pub elevations_deg: Vec<f64>,
     /// Measurements of each beam per revolution.
     pub azimuth_steps: usize,
-    /// Nothing nearer returns [m].
+    /// Least measured range [m].
     pub min_range_m: f64,
-    /// Nothing farther returns [m].
+    /// Greatest measured range [m].
     pub max_range_m: f64,
-    /// Range at which half the beams return from a surface of reflectance 0.8 met head-on [m].
+    /// Range at which half the beams return from a surface of reflectance 0.8 at normal
+    /// incidence [m].
     pub reach_m: f64,
     /// Standard deviation of a range [m].
     pub range_noise_m: f64,
-    /// Share of returns that are lost whatever they met.
+    /// Share of all returns that is lost at random, 0 to 1.
     pub dropout_share: f64,
-    /// Whether the car moves during a revolution. Off: scans as if compensated.
+    /// Whether the sensor moves during a revolution; `false` gives motion-compensated scans.
     pub rolling_shutter: bool,
 }
 
@@ -68,53 +73,53 @@ impl Default for ScannerConfig {
     }
 }
 
+impl Validate for ScannerConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        at_least_one("beams", self.beams)?;
+        at_least_one("azimuth_steps", self.azimuth_steps)?;
+        not_negative("min_range_m", self.min_range_m)?;
+        positive("max_range_m", self.max_range_m)?;
+        require(
+            self.min_range_m < self.max_range_m,
+            "min_range_m",
+            self.min_range_m,
+            format!(
+                "it must be less than max_range_m, which is {}",
+                self.max_range_m
+            ),
+        )?;
+        positive("reach_m", self.reach_m)?;
+        not_negative("range_noise_m", self.range_noise_m)?;
+        fraction("dropout_share", self.dropout_share)
+    }
+}
+
 /// A scan with the SemanticKITTI class of every point.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LabelledScan {
     /// The points, beam by beam from the top, each counter-clockwise from straight back.
     pub scan: Scan,
-    /// One per point.
+    /// Class of each point.
     pub classes: Vec<u16>,
 }
 
-/// The sensor with its beams.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Scanner {
-    config: ScannerConfig,
-    elevations_rad: Vec<f32>,
-}
-
-/// A surface that can be scanned: triangles found by rays, what they are made of.
-pub struct Target {
+/// A labelled mesh prepared for ray casting.
+pub struct ScanTarget {
     scene: Scene,
-    mesh: TriangleMesh,
-    classes: Vec<u16>,
-    reflectances: Vec<f32>,
+    surface: LabelledMesh,
 }
 
-impl Target {
-    /// The static street.
-    pub fn of_street(street: &Street) -> Self {
-        Self {
-            scene: Scene::new(&street.mesh),
-            mesh: street.mesh.clone(),
-            classes: street.classes.clone(),
-            reflectances: street.reflectances.clone(),
-        }
-    }
-
-    /// A painted surface, such as the traffic at one time.
-    pub fn of_surface(surface: PaintedMesh) -> Self {
+impl ScanTarget {
+    /// Builds the acceleration structure.
+    pub fn new(surface: LabelledMesh) -> Self {
         Self {
             scene: Scene::new(&surface.mesh),
-            classes: surface.paints.iter().map(|p| p.class).collect(),
-            reflectances: surface.paints.iter().map(|p| p.reflectance).collect(),
-            mesh: surface.mesh,
+            surface,
         }
     }
 }
 
-/// Where a ray ended.
+/// The hit of a beam.
 #[derive(Clone, Copy, Debug)]
 struct Echo {
     range_m: f32,
@@ -122,6 +127,13 @@ struct Echo {
     reflectance: f32,
     /// |cos α|.
     incidence: f32,
+}
+
+/// The sensor with its beams.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scanner {
+    config: ScannerConfig,
+    elevations_rad: Vec<f32>,
 }
 
 impl Scanner {
@@ -141,31 +153,39 @@ impl Scanner {
         }
     }
 
-    /// Elevations of the beams over the horizon, from the top [rad].
-    pub fn elevations_rad(&self) -> &[f32] {
-        &self.elevations_rad
-    }
-
-    /// One revolution among targets. `world_from_lidar` gives the pose at a time after the one
-    /// of the scan [s]; half a revolution before that time the sensor looks back, then to the
-    /// right, at that time ahead, as KITTI's does.
+    /// Simulates one revolution. `world_from_lidar` gives the pose at a time relative to that of
+    /// the scan [s]: the sensor faces backwards half a revolution before, to the right a quarter
+    /// before, and forwards at that time, as KITTI's does.
     pub fn scan(
         &self,
-        targets: &[&Target],
+        targets: &[&ScanTarget],
         world_from_lidar: impl Fn(f64) -> Pose3,
         rng: &mut impl Rng,
     ) -> LabelledScan {
-        let directions = self.directions();
-        let echoes = if self.config.rolling_shutter {
-            self.cast_while_moving(targets, &directions, world_from_lidar)
+        let steps = self.config.azimuth_steps;
+        let steps_per_pose = if self.config.rolling_shutter {
+            STEPS_PER_POSE
         } else {
-            let world_from_lidar = Rigid3f::from(&world_from_lidar(0.0));
-            let rays: Vec<Vec3> = directions
-                .iter()
-                .map(|&direction| world_from_lidar.rotate(direction))
-                .collect();
-            nearest_echoes(targets, world_from_lidar.translation, &rays)
+            steps.max(1)
         };
+        let directions = self.directions();
+        let mut echoes = vec![None; directions.len()];
+        for first in (0..steps).step_by(steps_per_pose) {
+            let columns = first..(first + steps_per_pose).min(steps);
+            let turn = 0.5 * (columns.start + columns.end) as f64 / steps as f64 - 0.5;
+            let world_from_lidar = Rigid3f::from(&world_from_lidar(turn * SCAN_PERIOD_S));
+            let indices: Vec<usize> = (0..self.elevations_rad.len())
+                .flat_map(|beam| columns.clone().map(move |column| beam * steps + column))
+                .collect();
+            let rays: Vec<Vec3> = indices
+                .iter()
+                .map(|&index| world_from_lidar.rotate(directions[index]))
+                .collect();
+            let nearest = nearest_echoes(targets, world_from_lidar.translation, &rays);
+            for (index, echo) in indices.into_iter().zip(nearest) {
+                echoes[index] = echo;
+            }
+        }
         self.measure(&directions, &echoes, rng)
     }
 
@@ -175,7 +195,7 @@ impl Scanner {
         let azimuths: Vec<Vec2> = (0..steps)
             .map(|step| {
                 let turn = (step as f32 + 0.5) / steps as f32 - 0.5;
-                Vec2::from_angle(std::f32::consts::TAU * turn)
+                Vec2::from_angle(TAU * turn)
             })
             .collect();
         self.elevations_rad
@@ -189,34 +209,7 @@ impl Scanner {
             .collect()
     }
 
-    fn cast_while_moving(
-        &self,
-        targets: &[&Target],
-        directions: &[Vec3],
-        world_from_lidar: impl Fn(f64) -> Pose3,
-    ) -> Vec<Option<Echo>> {
-        let steps = self.config.azimuth_steps;
-        let mut echoes = vec![None; directions.len()];
-        for first in (0..steps).step_by(STEPS_PER_ORIGIN) {
-            let columns = first..(first + STEPS_PER_ORIGIN).min(steps);
-            let turn = 0.5 * (columns.start + columns.end) as f64 / steps as f64 - 0.5;
-            let pose = Rigid3f::from(&world_from_lidar(turn * SCAN_PERIOD_S));
-            let indices: Vec<usize> = (0..self.elevations_rad.len())
-                .flat_map(|beam| columns.clone().map(move |column| beam * steps + column))
-                .collect();
-            let rays: Vec<Vec3> = indices
-                .iter()
-                .map(|&index| pose.rotate(directions[index]))
-                .collect();
-            let found = nearest_echoes(targets, pose.translation, &rays);
-            for (index, echo) in indices.into_iter().zip(found) {
-                echoes[index] = echo;
-            }
-        }
-        echoes
-    }
-
-    /// What the sensor makes of the echoes: lost ones are left out, ranges are noisy.
+    /// Measurements of the echoes, with dropout and range noise.
     fn measure(
         &self,
         directions: &[Vec3],
@@ -228,67 +221,64 @@ impl Scanner {
         let mut labelled = LabelledScan::default();
         for (&direction, echo) in directions.iter().zip(echoes) {
             let Some(echo) = echo else { continue };
-            let lost: f64 = rng.random();
-            let returned: f32 = rng.random();
+            let dropout: f64 = rng.random();
+            let detection: f32 = rng.random();
             let deviate: f32 = StandardNormal.sample(rng);
-            let seen_m = self.seen_up_to_m(echo);
-            let probability = 1.0 / (1.0 + ((echo.range_m - seen_m) / (0.05 * seen_m)).exp());
+            let detectable_m = self.detectable_up_to_m(echo);
+            let probability =
+                1.0 / (1.0 + ((echo.range_m - detectable_m) / (0.05 * detectable_m)).exp());
             let range_m = echo.range_m + config.range_noise_m as f32 * deviate;
-            if lost < config.dropout_share || returned > probability || !limits_m.contains(&range_m)
-            {
+            let is_lost = dropout < config.dropout_share || detection > probability;
+            if is_lost || !limits_m.contains(&range_m) {
                 continue;
             }
             let brightness = echo.reflectance * echo.incidence.sqrt();
+            let intensity = (brightness * (1.0 + 0.1 * deviate)).clamp(0.0, 1.0);
             labelled.scan.points.push(direction * range_m);
-            labelled
-                .scan
-                .intensities
-                .push((brightness * (1.0 + 0.1 * deviate)).clamp(0.0, 1.0));
+            labelled.scan.intensities.push(intensity);
             labelled.classes.push(echo.class);
         }
         labelled
     }
 
-    fn seen_up_to_m(&self, echo: &Echo) -> f32 {
+    /// r_max of a surface [m].
+    fn detectable_up_to_m(&self, echo: &Echo) -> f32 {
         const REFERENCE_REFLECTANCE: f32 = 0.8;
         let power = echo.reflectance * echo.incidence.powf(0.25) / REFERENCE_REFLECTANCE;
-        // Nothing is so dark that it is not seen at two metres.
+        // Even the darkest surface is detected up to two metres.
         (self.config.reach_m as f32 * power.sqrt()).max(2.0)
     }
 }
 
 /// `count` of the elevations of the HDL-64E, evenly chosen, from the top [deg].
 pub fn hdl64_elevations_deg(count: usize) -> Vec<f64> {
-    let all: Vec<f64> = (0..64)
-        .map(|laser| {
-            if laser < 32 {
-                2.0 - f64::from(laser) / 3.0
-            } else {
-                -8.83 - 0.5 * f64::from(laser - 32)
-            }
-        })
-        .collect();
     let count = count.clamp(1, 64);
-    (0..count).map(|beam| all[beam * 64 / count]).collect()
+    (0..count)
+        .map(|beam| match (beam * 64 / count) as u8 {
+            laser @ 0..32 => 2.0 - f64::from(laser) / 3.0,
+            laser => -8.83 - 0.5 * f64::from(laser - 32),
+        })
+        .collect()
 }
 
-fn nearest_echoes(targets: &[&Target], origin: Vec3, rays: &[Vec3]) -> Vec<Option<Echo>> {
-    let mut nearest = vec![None; rays.len()];
+fn nearest_echoes(targets: &[&ScanTarget], origin: Vec3, rays: &[Vec3]) -> Vec<Option<Echo>> {
+    let mut nearest: Vec<Option<Echo>> = vec![None; rays.len()];
     let mut hits = vec![Hit::MISS; rays.len()];
-    for target in targets {
-        if target.mesh.triangles.is_empty() {
+    for ScanTarget { scene, surface } in targets {
+        if surface.mesh.triangles.is_empty() {
             continue;
         }
-        target.scene.cast(origin, rays, &mut hits);
+        scene.cast(origin, rays, &mut hits);
         for ((hit, ray), best) in hits.iter().zip(rays).zip(&mut nearest) {
-            let is_nearer = hit.range_m < best.map_or(f32::INFINITY, |echo: Echo| echo.range_m);
+            let is_nearer = hit.range_m < best.map_or(f32::INFINITY, |echo| echo.range_m);
             if hit.triangle != Hit::NO_TRIANGLE && is_nearer {
                 let triangle = hit.triangle as usize;
-                let normal = target.mesh.scaled_normal(triangle).normalize_or_zero();
+                let normal = surface.mesh.scaled_normal(triangle).normalize_or_zero();
+                let material = surface.materials[triangle];
                 *best = Some(Echo {
                     range_m: hit.range_m,
-                    class: target.classes[triangle],
-                    reflectance: target.reflectances[triangle],
+                    class: material.class,
+                    reflectance: material.reflectance,
                     incidence: normal.dot(*ray).abs(),
                 });
             }
@@ -302,20 +292,22 @@ mod tests {
     use approx::assert_relative_eq;
     use rand::{SeedableRng as _, rngs::StdRng};
 
-    use super::super::builder::{Builder, Paint};
+    use super::super::builder::MeshBuilder;
     use super::*;
 
-    /// A bright room of 20 m with the sensor in its middle.
-    fn room() -> Target {
-        let mut surface = PaintedMesh::default();
-        let still = Rigid3f::from(&Pose3::identity());
-        let paint = Paint {
-            class: 50,
-            reflectance: 1.0,
-        };
-        let half = Vec3::splat(10.0);
-        Builder::new(&mut surface, still, paint).cuboid(-half, half);
-        Target::of_surface(surface)
+    /// A bright box with its extents along x, y and z.
+    fn bright_box(class: u16, x: [f32; 2], y: [f32; 2], z: [f32; 2]) -> ScanTarget {
+        let mut surface = LabelledMesh::default();
+        let identity = Rigid3f::from(&Pose3::identity());
+        let mut builder = MeshBuilder::new(&mut surface, identity);
+        builder.set_material(class, 1.0);
+        builder.cuboid(x, y, z);
+        ScanTarget::new(surface)
+    }
+
+    /// A room of 20 m with the sensor in its middle.
+    fn room() -> ScanTarget {
+        bright_box(50, [-10.0, 10.0], [-10.0, 10.0], [-10.0, 10.0])
     }
 
     fn scan(config: &ScannerConfig, world_from_lidar: impl Fn(f64) -> Pose3) -> LabelledScan {
@@ -407,7 +399,7 @@ mod tests {
 
     #[test]
     fn half_of_the_returns_are_lost_at_the_reach_of_the_sensor() {
-        // Head-on, reflectance 1 instead of 0.8: seen to reach √(1 / 0.8) = 10 m.
+        // Normal incidence, reflectance 1 instead of 0.8: r_max = reach · √(1 / 0.8) = 10 m.
         let config = ScannerConfig {
             elevations_deg: vec![0.0; 4000],
             azimuth_steps: 4,
@@ -421,7 +413,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_seen_beyond_the_range_limits() {
+    fn nothing_is_measured_beyond_the_range_limits() {
         for (min_range_m, max_range_m) in [(0.5, 9.9), (18.0, 100.0)] {
             let config = ScannerConfig {
                 min_range_m,
@@ -433,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn a_revolution_of_a_moving_car_is_distorted_by_half_its_way_before_and_after() {
+    fn a_revolution_of_a_moving_sensor_is_distorted_by_half_its_motion_before_and_after() {
         let config = ScannerConfig {
             rolling_shutter: true,
             elevations_deg: vec![0.0],
@@ -449,24 +441,16 @@ mod tests {
         assert_relative_eq!(points[3599].x, -10.5, epsilon = 0.02);
 
         let standing = scan(&config, |_| Pose3::identity());
-        let still = ScannerConfig {
+        let compensated = ScannerConfig {
             rolling_shutter: false,
             ..config
         };
-        assert_eq!(standing, scan(&still, |_| Pose3::identity()));
+        assert_eq!(standing, scan(&compensated, |_| Pose3::identity()));
     }
 
     #[test]
-    fn the_nearer_of_two_targets_is_seen() {
-        let mut surface = PaintedMesh::default();
-        let still = Rigid3f::from(&Pose3::identity());
-        let paint = Paint {
-            class: 252,
-            reflectance: 1.0,
-        };
-        Builder::new(&mut surface, still, paint)
-            .cuboid(Vec3::new(4.0, -5.0, -5.0), Vec3::splat(5.0));
-        let car = Target::of_surface(surface);
+    fn the_nearer_of_two_targets_is_measured() {
+        let car = bright_box(252, [4.0, 5.0], [-5.0, 5.0], [-5.0, 5.0]);
         for targets in [[&room(), &car], [&car, &room()]] {
             let mut rng = StdRng::seed_from_u64(5);
             let labelled = Scanner::new(&EXACT).scan(&targets, |_| Pose3::identity(), &mut rng);

@@ -1,42 +1,35 @@
-//! Small scenes with exact labels for ground segmentation: one scan each, from a car that
-//! stands on a straight street whose ground has the shape in question.
+//! Scenes with exact labels for the evaluation of ground segmentation: one scan each, from a
+//! vehicle on a straight street with a slope, a crest or kerbs.
 
-use super::drive::{Drive, MotionConfig};
-use super::path::{Path, PathSegment};
+use super::centreline::{Centreline, PathSegment};
+use super::ego_motion::{EgoMotion, MotionConfig};
 use super::random::{Purpose, stream};
-use super::scanner::{LabelledScan, Scanner, ScannerConfig, Target};
-use super::street::{Street, StreetConfig};
+use super::scanner::{LabelledScan, ScanTarget, Scanner, ScannerConfig};
+use super::street::Street;
+use super::street_config::StreetConfig;
 
-/// Level ground from behind the car to 6 m before it, then a climb of `grade` (0.1 for 10 %;
-/// negative downhill).
+/// Level ground from behind the vehicle to 6 m ahead of it, then a slope of `grade` (0.1 for
+/// 10 %; negative downhill).
 pub fn slope_scene(grade: f64, scanner: &ScannerConfig, seed: u64) -> LabelledScan {
-    scene(
-        &[(66.0, 0.0), (60.0, grade)],
-        &StreetConfig::default(),
-        scanner,
-        seed,
-    )
+    let pieces = [(66.0, 0.0), (60.0, grade)];
+    straight_street_scene(&pieces, &StreetConfig::default(), scanner, seed)
 }
 
-/// A climb of `grade` up to a crest 15 m before the car, and down again as steeply.
+/// A slope of `grade` up to a crest 15 m ahead of the vehicle, and down again as steeply.
 pub fn crest_scene(grade: f64, scanner: &ScannerConfig, seed: u64) -> LabelledScan {
-    scene(
-        &[(75.0, grade), (60.0, -grade)],
-        &StreetConfig::default(),
-        scanner,
-        seed,
-    )
+    let pieces = [(75.0, grade), (60.0, -grade)];
+    straight_street_scene(&pieces, &StreetConfig::default(), scanner, seed)
 }
 
-/// A level street with kerbs of a height.
+/// A level street with kerbs of a height [m].
 pub fn kerb_scene(height_m: f64, scanner: &ScannerConfig, seed: u64) -> LabelledScan {
     let mut street = StreetConfig::default();
     street.ground.kerb_height_m = height_m;
-    scene(&[(120.0, 0.0)], &street, scanner, seed)
+    straight_street_scene(&[(120.0, 0.0)], &street, scanner, seed)
 }
 
-/// The scan at 60 m of a straight street of pieces (length, grade).
-fn scene(
+/// The scan at 60 m along a straight street of pieces (length [m], grade).
+fn straight_street_scene(
     pieces: &[(f64, f64)],
     street: &StreetConfig,
     scanner: &ScannerConfig,
@@ -45,21 +38,15 @@ fn scene(
     const STATION_M: f64 = 60.0;
     let segments: Vec<PathSegment> = pieces
         .iter()
-        .map(|&(length_m, grade)| PathSegment {
-            length_m,
-            turn_deg: 0.0,
-            grade_percent: 100.0 * grade,
-        })
+        .map(|&(length_m, grade)| PathSegment::new(length_m, 0.0, 100.0 * grade))
         .collect();
-    let path = Path::from_segments(&segments, 0.0);
-    let street = Street::new(&path, street, seed);
-    let drive = Drive::new(&path, Some(&[STATION_M]), &MotionConfig::default(), seed, 1);
-    let target = Target::of_street(&street);
-    let mut rng = stream(seed, Purpose::Scan, 0);
+    let path = Centreline::from_segments(&segments, 0.0);
+    let Street { surface, ground } = Street::new(&path, street, seed);
+    let ego = EgoMotion::new(path, Some(&[STATION_M]), &MotionConfig::default(), seed, 1);
     Scanner::new(scanner).scan(
-        &[&target],
-        |delay_s| drive.world_from_lidar(&street.ground, delay_s),
-        &mut rng,
+        &[&ScanTarget::new(surface)],
+        |delay_s| ego.world_from_lidar(&ground, delay_s),
+        &mut stream(seed, Purpose::Scan, 0),
     )
 }
 
@@ -95,19 +82,19 @@ mod tests {
     }
 
     #[test]
-    fn a_slope_scene_climbs_as_it_was_asked_to() {
+    fn a_slope_scene_has_the_requested_grade() {
         for grade in [0.05_f32, 0.10, 0.15] {
             let scene = slope_scene(f64::from(grade), &ScannerConfig::default(), 3);
             assert_eq!(scene.scan.len(), scene.classes.len());
             let road = road_ahead(&scene);
-            // The car nods by up to 0.3 degrees, that is 0.005.
+            // The suspension pitches by up to 0.3 degrees, that is 0.005.
             let slope = slope_between(&road, 14.0, 24.0);
             assert!((slope - grade).abs() < 0.02, "{slope} instead of {grade}");
         }
     }
 
     #[test]
-    fn a_crest_hides_what_is_behind_it() {
+    fn a_crest_occludes_what_is_behind_it() {
         let scene = crest_scene(0.10, &ScannerConfig::default(), 3);
         let road = road_ahead(&scene);
         let farthest_m = road.iter().map(|point| point.x).fold(0.0, f32::max);
@@ -118,8 +105,8 @@ mod tests {
     }
 
     #[test]
-    fn a_pavement_is_as_high_as_its_kerb() {
-        // The car leans as the crown of the road does.
+    fn a_sidewalk_is_as_high_as_its_kerb() {
+        // The vehicle has the roll angle of the cross slope.
         const BANK: f32 = 0.025;
         for kerb_m in [0.05_f32, 0.12, 0.2] {
             let scene = kerb_scene(f64::from(kerb_m), &ScannerConfig::default(), 3);
@@ -139,7 +126,7 @@ mod tests {
                 heights[(heights.len() as f32 * quantile) as usize]
             };
             // The kerb is 2.05 m to the right of the lidar, or behind bays; its face, which is
-            // pavement too, lies lower than the upper quartile.
+            // sidewalk too, lies lower than the upper quartile.
             let step_m = height_m(classes::SIDEWALK, 2.2, 6.0, 0.75)
                 - height_m(classes::ROAD, 1.7, 2.05, 0.5);
             assert!(

@@ -7,16 +7,13 @@ use glam::{DVec2, Vec3};
 
 use super::*;
 
-/// 60 m with a bend and a slope, seen by a coarse sensor.
+/// 60 m with a bend and a slope, scanned by a coarse sensor.
 fn small() -> SimulationConfig {
     SimulationConfig {
-        path: [(25.0, 0.0, 0.0), (35.0, 40.0, 6.0)]
-            .map(|(length_m, turn_deg, grade_percent)| PathSegment {
-                length_m,
-                turn_deg,
-                grade_percent,
-            })
-            .to_vec(),
+        path: vec![
+            PathSegment::new(25.0, 0.0, 0.0),
+            PathSegment::new(35.0, 40.0, 6.0),
+        ],
         scanner: ScannerConfig {
             beams: 32,
             azimuth_steps: 500,
@@ -30,7 +27,7 @@ fn simulate(config: &SimulationConfig) -> Simulation {
     Simulation::new(config, None).unwrap()
 }
 
-/// The poses of KITTI 07, where the real data is.
+/// The poses of KITTI 07, if the recorded data is there.
 fn kitti_07() -> Option<Vec<Pose3>> {
     let data = std::env::var_os("FPMCL_DATA")
         .map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from)
@@ -47,7 +44,7 @@ fn kitti_07() -> Option<Vec<Pose3>> {
 }
 
 fn in_world(simulation: &Simulation, frame: usize) -> (Vec<Vec3>, Vec<u16>) {
-    let world_from_lidar = Rigid3f::from(&simulation.world_from_lidar(frame));
+    let world_from_lidar = Rigid3f::from(&simulation.poses()[frame]);
     let labelled = simulation.scan(frame);
     let points = labelled.scan.points.iter();
     (
@@ -64,16 +61,16 @@ fn ground_points_lie_on_the_ground_of_their_class_within_noise() {
     for frame in [0, 30, 60] {
         let (points, classes) = in_world(&simulation, frame);
         for (point, class) in points.iter().zip(classes) {
-            let node = ground.at(DVec2::new(point.x.into(), point.y.into()));
-            let (surface, index) = match class {
-                classes::ROAD | classes::PARKING => (Surface::Carriageway, 0),
-                classes::SIDEWALK if node.kerb_m > 0.2 => (Surface::Sidewalk, 1),
-                classes::TERRAIN => (Surface::Terrain, 2),
+            let sample = ground.at(DVec2::new(point.x.into(), point.y.into()));
+            let (zone, index) = match class {
+                classes::ROAD | classes::PARKING => (GroundZone::Carriageway, 0),
+                classes::SIDEWALK if sample.kerb_m > 0.2 => (GroundZone::Sidewalk, 1),
+                classes::TERRAIN => (GroundZone::Terrain, 2),
                 _ => continue,
             };
             counts[index] += 1;
             // Five sigma of the range along the beam, and what the plane of a cell leaves out.
-            let error_m = point.z - ground.surface_height_m(&node, surface);
+            let error_m = point.z - ground.zone_height_m(&sample, zone);
             assert!(error_m.abs() < 0.1 + 0.02, "{class}: {error_m}");
         }
     }
@@ -81,7 +78,7 @@ fn ground_points_lie_on_the_ground_of_their_class_within_noise() {
 }
 
 #[test]
-fn everything_a_street_needs_is_seen() {
+fn all_classes_of_a_street_are_scanned() {
     let simulation = simulate(&SimulationConfig::default());
     let mut seen = std::collections::BTreeSet::new();
     for frame in (0..simulation.frames()).step_by(25) {
@@ -93,7 +90,7 @@ fn everything_a_street_needs_is_seen() {
 }
 
 #[test]
-fn nothing_stands_where_the_car_drives() {
+fn no_static_object_is_on_the_driven_path() {
     for (seed, drive) in [(1, 1), (2, 2), (3, 3)] {
         let simulation = simulate(&SimulationConfig {
             seed,
@@ -101,9 +98,9 @@ fn nothing_stands_where_the_car_drives() {
             ..SimulationConfig::default()
         });
         let poses: Vec<Pose3> = simulation.poses().into_iter().step_by(4).collect();
-        let street = &simulation.street;
-        for (triangle, &class) in street.classes.iter().enumerate() {
-            if classes::is_ground(class) {
+        let street = &simulation.street.surface;
+        for (triangle, Material { class, .. }) in street.materials.iter().enumerate() {
+            if classes::is_ground(*class) {
                 continue;
             }
             let [a, b, c] = street.mesh.corners(triangle);
@@ -125,18 +122,18 @@ fn two_drives_share_the_street_and_nothing_else() {
         drive: 2,
         ..small()
     });
-    assert_eq!(first.street.mesh, second.street.mesh);
-    assert_eq!(first.street.classes, second.street.classes);
+    assert_eq!(first.street.surface, second.street.surface);
     assert_ne!(first.scan(10), second.scan(10));
     assert_ne!(first.traffic_at(10).mesh, second.traffic_at(10).mesh);
 
-    // The second drives 0.4 m farther left, weaving apart.
-    let line = &first.street.path;
+    // The second drives 0.4 m farther left, apart from weaving.
+    let line = &first.ego_motion.centreline;
     let mean_offset_m = |simulation: &Simulation| {
-        let offsets_m: Vec<f64> = (0..simulation.frames())
-            .map(|frame| {
-                let t = simulation.world_from_lidar(frame).translation.vector;
-                let point = line.at(simulation.drive.station_m(frame as f64 * SCAN_PERIOD_S));
+        let poses = simulation.poses();
+        let offsets_m: Vec<f64> = (poses.iter().zip(&simulation.ego_motion.stations_m))
+            .map(|(pose, station_m)| {
+                let t = pose.translation.vector;
+                let point = line.at(*station_m);
                 (DVec2::new(t.x, t.y) - point.position).dot(point.left())
             })
             .collect();
@@ -152,7 +149,10 @@ fn two_drives_share_the_street_and_nothing_else() {
 #[test]
 fn another_seed_is_another_street() {
     let other = SimulationConfig { seed: 9, ..small() };
-    assert_ne!(simulate(&small()).street.mesh, simulate(&other).street.mesh);
+    assert_ne!(
+        simulate(&small()).street.surface,
+        simulate(&other).street.surface
+    );
 }
 
 #[test]
@@ -193,7 +193,7 @@ fn an_empty_street_has_no_moving_points() {
 }
 
 #[test]
-fn a_kidnapped_car_is_elsewhere_and_its_odometry_does_not_know() {
+fn a_kidnapped_vehicle_is_displaced_without_its_odometry_noticing() {
     let kidnapped_at = |frame| SimulationConfig {
         motion: MotionConfig {
             kidnapped_at_frame: frame,
@@ -212,22 +212,22 @@ fn a_kidnapped_car_is_elsewhere_and_its_odometry_does_not_know() {
     let step_m = |poses: &[Pose3], frame: usize| {
         (poses[frame].translation.vector - poses[frame - 1].translation.vector).norm()
     };
-    let (poses, felt) = (simulation.poses(), simulation.odometry());
+    let (poses, reported) = (simulation.poses(), simulation.odometry());
     assert!(step_m(&poses, 10) > 18.0);
     for frame in 1..poses.len() {
-        assert!(step_m(&felt, frame) < 1.5, "frame {frame}");
+        assert!(step_m(&reported, frame) < 1.5, "frame {frame}");
         if frame != 10 {
             assert!(step_m(&poses, frame) < 1.5, "frame {frame}");
         }
     }
-    // Until then, it is the drive that it is without.
+    // Before, the drive is the same as without.
     let undisturbed = simulate(&kidnapped_at(None)).poses();
     assert_eq!(poses[..10], undisturbed[..10]);
-    // While the sensor turns, the car is still where it was.
+    // During the last revolution before, the vehicle continues at its speed.
     let last_s = 9.0 * SCAN_PERIOD_S;
-    let drive = &simulation.drive;
+    let drive = &simulation.ego_motion;
     assert!(drive.station_m(last_s + 0.09) - drive.station_m(last_s) < 1.5);
-    // A drive that is cut off before it knows nothing of it.
+    // A drive that ends before is not affected.
     let short = SimulationConfig {
         n_scans: 8,
         ..kidnapped_at(Some(10))
@@ -236,12 +236,12 @@ fn a_kidnapped_car_is_elsewhere_and_its_odometry_does_not_know() {
     let beyond = Simulation::new(&kidnapped_at(Some(70)), None);
     assert!(matches!(
         beyond,
-        Err(SimulationError::NowhereToBeSet { frame: 70, .. })
+        Err(SimulationError::KidnappedBeyondPath { frame: 70, .. })
     ));
 }
 
 #[test]
-fn a_lorry_hides_what_is_to_the_left_for_its_time() {
+fn a_lorry_occludes_the_left_side_for_its_duration() {
     let simulation = simulate(&SimulationConfig {
         traffic: TrafficConfig {
             lorry_from_s: Some(1.0),
@@ -271,22 +271,22 @@ fn a_lorry_hides_what_is_to_the_left_for_its_time() {
 }
 
 #[test]
-fn a_lorry_before_the_beginning_or_at_no_time_is_refused() {
+fn a_lorry_before_the_start_or_at_no_finite_time_is_an_error() {
     for lorry_from_s in [-1.0, f64::NAN, f64::INFINITY] {
         let mut config = small();
         config.traffic.lorry_from_s = Some(lorry_from_s);
-        let message = config.check().unwrap_err().to_string();
+        let message = config.validate().unwrap_err().to_string();
         assert!(message.contains("traffic.lorry_from_s"), "{message}");
     }
 }
 
 #[test]
-fn the_lidar_hangs_over_the_road_and_leans_with_it() {
+fn the_lidar_has_its_height_above_the_road_and_the_slope_of_it() {
     let config = SimulationConfig {
         motion: MotionConfig {
-            nodding_deg: 0.0,
-            rolling_deg: 0.0,
-            heaving_m: 0.0,
+            pitch_amplitude_deg: 0.0,
+            roll_amplitude_deg: 0.0,
+            heave_amplitude_m: 0.0,
             ..MotionConfig::default()
         },
         ..small()
@@ -300,7 +300,9 @@ fn the_lidar_hangs_over_the_road_and_leans_with_it() {
         assert_relative_eq!(foot.z, height_m, epsilon = 0.03);
         // The slope of 6 % begins at 25 m, rounded over a few metres.
         let nose = (pose.rotation * nalgebra::Vector3::x()).z;
-        let station_m = simulation.drive.station_m(frame as f64 * SCAN_PERIOD_S);
+        let station_m = simulation
+            .ego_motion
+            .station_m(frame as f64 * SCAN_PERIOD_S);
         if station_m < 10.0 {
             assert_relative_eq!(nose, 0.0, epsilon = 0.01);
         } else if station_m > 38.0 && station_m < 50.0 {
@@ -312,14 +314,7 @@ fn the_lidar_hangs_over_the_road_and_leans_with_it() {
 #[test]
 fn a_path_that_crosses_itself_has_one_ground() {
     // A loop of 400 degrees that climbs one metre: the crossing is where both heights meet.
-    let path = Path::from_segments(
-        &[PathSegment {
-            length_m: 260.0,
-            turn_deg: 400.0,
-            grade_percent: 0.4,
-        }],
-        0.0,
-    );
+    let path = Centreline::from_segments(&[PathSegment::new(260.0, 400.0, 0.4)], 0.0);
     let ground = Street::new(&path, &StreetConfig::default(), 1).ground;
     let mut previous = ground.at(path.at(0.0).position).height_m;
     for step in 1..=5200 {
@@ -335,9 +330,9 @@ fn kitti_07_closes_its_loop() {
     let Some(recorded) = kitti_07() else { return };
     let config = SimulationConfig {
         motion: MotionConfig {
-            nodding_deg: 0.0,
-            rolling_deg: 0.0,
-            heaving_m: 0.0,
+            pitch_amplitude_deg: 0.0,
+            roll_amplitude_deg: 0.0,
+            heave_amplitude_m: 0.0,
             ..MotionConfig::default()
         },
         ..SimulationConfig::default()
@@ -350,21 +345,21 @@ fn kitti_07_closes_its_loop() {
         assert!(apart.xy().norm() < 2.0, "{apart}");
         assert!(apart.z.abs() < 0.4, "{apart}");
     }
-    let mut meetings = 0;
+    let mut crossings = 0;
     for i in (0..poses.len()).step_by(3) {
         for j in (i + 300..poses.len()).step_by(3) {
             let apart = poses[i].translation.vector - poses[j].translation.vector;
             if apart.xy().norm() < 4.0 {
-                meetings += 1;
+                crossings += 1;
                 assert!(apart.z.abs() < 0.1 * apart.xy().norm() + 0.05, "{apart}");
             }
         }
     }
-    assert!(meetings > 20, "{meetings}");
+    assert!(crossings > 20, "{crossings}");
 }
 
 #[test]
-fn a_second_drive_along_a_recorded_path_has_another_rhythm() {
+fn a_second_drive_along_a_recorded_path_varies_in_speed() {
     let recorded: Vec<Pose3> = (0..200)
         .map(|frame| Pose3::translation(0.6 * f64::from(frame), 0.0, 0.0))
         .collect();
@@ -377,7 +372,7 @@ fn a_second_drive_along_a_recorded_path_has_another_rhythm() {
     let apart_m: Vec<f64> = (0..200)
         .map(|frame| {
             let time_s = f64::from(frame) * SCAN_PERIOD_S;
-            first.drive.station_m(time_s) - second.drive.station_m(time_s)
+            first.ego_motion.station_m(time_s) - second.ego_motion.station_m(time_s)
         })
         .collect();
     assert!(apart_m.iter().any(|apart_m| apart_m.abs() > 1.0));
@@ -388,9 +383,9 @@ fn a_second_drive_along_a_recorded_path_has_another_rhythm() {
 }
 
 #[test]
-fn the_truth_in_the_map_frame_is_seen_by_the_first_scan() {
+fn the_street_in_the_map_frame_has_the_ranges_of_the_first_scan() {
     let simulation = simulate(&small());
-    let scene = crate::raycasting::Scene::new(&simulation.truth_in_map());
+    let scene = crate::raycasting::Scene::new(&simulation.street_in_map());
     let labelled = simulation.scan(0);
     let directions: Vec<Vec3> = labelled.scan.points.iter().map(|p| p.normalize()).collect();
     let mut hits = vec![crate::raycasting::Hit::MISS; directions.len()];
@@ -411,19 +406,19 @@ fn the_truth_in_the_map_frame_is_seen_by_the_first_scan() {
 }
 
 #[test]
-fn contradictions_are_told_with_their_key() {
+fn invalid_values_are_reported_with_their_key() {
     let mut config = small();
     config.scanner.min_range_m = 100.0;
-    let message = config.check().unwrap_err().to_string();
-    assert!(message.contains("scanner.min_range_m: 100"), "{message}");
+    let message = config.validate().unwrap_err().to_string();
+    assert!(message.contains("scanner.min_range_m is 100"), "{message}");
     config = small();
     config.street.parked_share = 1.5;
-    let message = config.check().unwrap_err().to_string();
-    assert!(message.contains("street.parked_share: 1.5"), "{message}");
+    let message = config.validate().unwrap_err().to_string();
+    assert!(message.contains("street.parked_share is 1.5"), "{message}");
     config = small();
     config.path[1].length_m = -5.0;
-    let message = config.check().unwrap_err().to_string();
-    assert!(message.contains("path: length_m: -5"), "{message}");
+    let message = config.validate().unwrap_err().to_string();
+    assert!(message.contains("path.2.length_m is -5"), "{message}");
     config = small();
     config.path.clear();
     let message = Simulation::new(&config, None).err().unwrap().to_string();
@@ -431,8 +426,8 @@ fn contradictions_are_told_with_their_key() {
 }
 
 #[test]
-fn the_default_configuration_is_the_published_file() {
-    let published: SimulationConfig =
+fn the_default_configuration_is_the_file_in_config() {
+    let file: SimulationConfig =
         serde_yaml::from_str(include_str!("../../config/simulation.yml")).unwrap();
-    assert_eq!(published, SimulationConfig::default());
+    assert_eq!(file, SimulationConfig::default());
 }

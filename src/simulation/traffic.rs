@@ -1,39 +1,40 @@
-//! What moves on the street while the sensor passes; every drive has its own.
+//! Traffic: everything that moves along the street during a drive; every drive has its own.
+
+use std::f64::consts::TAU;
+use std::ops::Range;
 
 use glam::DVec2;
-use rand::RngExt as _;
+use rand::{Rng, RngExt as _};
 use serde::{Deserialize, Serialize};
 
-use super::builder::{Builder, Paint, PaintedMesh};
-use super::classes;
-use super::drive::{Drive, SCAN_PERIOD_S};
-use super::ground::Ground;
-use super::path::Path;
-use super::random::{Purpose, stream};
-use super::street::{PROLONGATION_M, lying_on};
+use super::builder::{LabelledMesh, MeshBuilder};
+use super::ego_motion::{EgoMotion, SCAN_PERIOD_S};
+use super::ground::GroundField;
+use super::layout::{EXTENSION_M, random_side};
 use super::vehicles::Vehicle;
+use crate::validation::{InvalidValue, Validate, not_negative};
 
-/// Things farther from the lidar are not simulated [m].
+/// Distance from the lidar beyond which road users are not simulated [m].
 const VISIBLE_M: f64 = 90.0;
 
-/// How much traffic there is.
+/// Density of the traffic.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrafficConfig {
-    /// Whether a vehicle drives ahead all the way.
+    /// Whether a vehicle drives ahead during the whole drive.
     pub has_lead_vehicle: bool,
     /// Mean distance between oncoming vehicles [m]; 0 for none.
     pub oncoming_spacing_m: f64,
-    /// Of oncoming vehicles [m/s].
+    /// Speed of oncoming vehicles [m/s].
     pub oncoming_speed_m_s: f64,
     /// Cyclists per 100 m of path.
     pub cyclists_per_100_m: f64,
     /// Pedestrians per 100 m of path.
     pub pedestrians_per_100_m: f64,
-    /// From this time on a lorry drives close on the left and hides half of the view [s]: a trial
-    /// for a localization; null: never.
+    /// Time from which a lorry drives close on the left and occludes half of the view, a test of
+    /// localization [s]; null: never.
     pub lorry_from_s: Option<f64>,
-    /// For how long [s].
+    /// Duration for which it does [s].
     pub lorry_for_s: f64,
 }
 
@@ -52,6 +53,17 @@ impl Default for TrafficConfig {
     }
 }
 
+impl Validate for TrafficConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        not_negative("lorry_from_s", self.lorry_from_s.unwrap_or_default())?;
+        not_negative("lorry_for_s", self.lorry_for_s)?;
+        not_negative("oncoming_spacing_m", self.oncoming_spacing_m)?;
+        not_negative("oncoming_speed_m_s", self.oncoming_speed_m_s)?;
+        not_negative("cyclists_per_100_m", self.cyclists_per_100_m)?;
+        not_negative("pedestrians_per_100_m", self.pedestrians_per_100_m)
+    }
+}
+
 impl TrafficConfig {
     /// An empty street.
     pub const NONE: Self = Self {
@@ -65,95 +77,92 @@ impl TrafficConfig {
     };
 }
 
-/// How something moves along the path.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Track {
-    /// Where the car will be `ahead_s` later, and `gap_m` farther.
-    Ahead { ahead_s: f64, gap_m: f64 },
-    /// From a station at a speed (negative: oncoming), to the left of the path.
-    Lane {
-        start_m: f64,
-        speed_m_s: f64,
-        lateral_m: f64,
+/// Motion along the path.
+#[derive(Clone, Debug, PartialEq)]
+enum AlongPath {
+    /// `gap_m` ahead of where the ego vehicle will be `headway_s` later, during a time interval.
+    WithEgo {
+        headway_s: f64,
+        gap_m: f64,
+        present_s: Range<f64>,
     },
-    /// Beside the car for some time, to its left.
-    Beside {
-        from_s: f64,
-        until_s: f64,
-        lateral_m: f64,
-    },
-    /// On the pavement of a side, beyond the kerb.
-    Pavement {
-        start_m: f64,
-        speed_m_s: f64,
-        side: f64,
-        kerb_m: f64,
-    },
+    /// At a constant speed (negative: oncoming) from a station at time 0.
+    Constant { start_m: f64, speed_m_s: f64 },
 }
 
-/// Hides what is left of the car up to 75 degrees from its side.
+/// Position across the path.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum AcrossPath {
+    /// Offset to the left of the path [m].
+    Lane(f64),
+    /// On the sidewalk of a side, at a distance from the kerb.
+    Sidewalk { side: f64, kerb_m: f64 },
+}
+
+/// A vehicle or pedestrian with its motion.
+#[derive(Clone, Debug)]
+struct RoadUser {
+    vehicle: Vehicle,
+    along: AlongPath,
+    across: AcrossPath,
+}
+
+/// Occludes what is left of the ego vehicle up to 75 degrees from its side.
 const LORRY: Vehicle = Vehicle::Van {
     length_m: 17.0,
     height_m: 4.0,
     reflectance: 0.6,
 };
-/// Where it drives, from the path [m].
+/// Offset of the lorry to the left of the path [m].
 const LORRY_LATERAL_M: f64 = 3.4;
 
-/// Everything that moves during a drive.
+/// The road users of a drive.
 #[derive(Clone, Debug)]
-pub struct Traffic {
-    path: Path,
-    movers: Vec<(Vehicle, Track)>,
-}
+pub struct Traffic(Vec<RoadUser>);
 
 impl Traffic {
-    /// Traffic for a drive. Lanes are `lane_width_m` apart, the oncoming one on the left.
+    /// Random traffic for a drive. Lanes are `lane_width_m` apart, the oncoming one on the left.
     pub fn new(
-        drive: &Drive,
-        path: &Path,
+        ego: &EgoMotion,
         lane_width_m: f64,
         config: &TrafficConfig,
-        (seed, number): (u64, u32),
+        rng: &mut impl Rng,
     ) -> Self {
-        let mut rng = stream(seed, Purpose::Traffic, u64::from(number));
-        let duration_s = drive.frames() as f64 * SCAN_PERIOD_S;
-        let length_m = path.length_m();
-        let mut movers = Vec::new();
+        let duration_s = ego.stations_m.len() as f64 * SCAN_PERIOD_S;
+        let length_m = ego.centreline.length_m();
+        let mut road_users = Vec::new();
+        let mut add = |vehicle, along, across| {
+            road_users.push(RoadUser {
+                vehicle,
+                along,
+                across,
+            });
+        };
         if config.has_lead_vehicle {
-            let vehicle = if rng.random_bool(0.5) {
-                Vehicle::random_van(&mut rng)
-            } else {
-                Vehicle::random_car(&mut rng)
-            };
-            let track = Track::Ahead {
-                ahead_s: rng.random_range(0.5..1.2),
+            let vehicle = Vehicle::random(0.5, rng);
+            let along = AlongPath::WithEgo {
+                headway_s: rng.random_range(0.5..1.2),
                 gap_m: rng.random_range(8.0..14.0),
+                present_s: f64::NEG_INFINITY..f64::INFINITY,
             };
-            movers.push((vehicle, track));
+            add(vehicle, along, AcrossPath::Lane(0.0));
         }
         if let Some(from_s) = config.lorry_from_s {
-            let track = Track::Beside {
-                from_s,
-                until_s: from_s + config.lorry_for_s,
-                lateral_m: LORRY_LATERAL_M,
+            let along = AlongPath::WithEgo {
+                headway_s: 0.0,
+                gap_m: 0.0,
+                present_s: from_s..from_s + config.lorry_for_s,
             };
-            movers.push((LORRY, track));
+            add(LORRY, along, AcrossPath::Lane(LORRY_LATERAL_M));
         }
         if config.oncoming_spacing_m > 0.0 {
             let mut start_m = rng.random_range(0.2..1.0) * config.oncoming_spacing_m;
             while start_m < length_m + config.oncoming_speed_m_s * duration_s {
-                let vehicle = if rng.random_bool(0.2) {
-                    Vehicle::random_van(&mut rng)
-                } else {
-                    Vehicle::random_car(&mut rng)
-                };
-                let track = Track::Lane {
-                    start_m,
-                    speed_m_s: -config.oncoming_speed_m_s,
-                    lateral_m: lane_width_m + rng.random_range(-0.15..0.2),
-                };
-                movers.push((vehicle, track));
+                let vehicle = Vehicle::random(0.2, rng);
+                let speed_m_s = -config.oncoming_speed_m_s;
+                let lateral_m = lane_width_m + rng.random_range(-0.15..0.2);
+                let along = AlongPath::Constant { start_m, speed_m_s };
+                add(vehicle, along, AcrossPath::Lane(lateral_m));
                 start_m += config.oncoming_spacing_m * rng.random_range(0.4..1.6);
             }
         }
@@ -161,10 +170,13 @@ impl Traffic {
             let expected = per_100_m * length_m / 100.0;
             (expected + rng.random_range(0.0..1.0)).floor() as usize
         };
-        let (cyclists, pedestrians) = (
-            count(config.cyclists_per_100_m),
-            count(config.pedestrians_per_100_m),
-        );
+        let cyclists = count(config.cyclists_per_100_m);
+        let pedestrians = count(config.pedestrians_per_100_m);
+        // Starts are distributed so that the density is the same at the end of the drive.
+        let constant = |speed_m_s: f64, station_m: f64| AlongPath::Constant {
+            start_m: station_m - 0.5 * speed_m_s * duration_s,
+            speed_m_s,
+        };
         for _ in 0..cyclists {
             let is_oncoming = rng.random_bool(0.5);
             let speed_m_s = rng.random_range(3.0..6.0);
@@ -174,122 +186,101 @@ impl Traffic {
             } else {
                 (speed_m_s, -edge_m)
             };
-            // Spread so that the street is as full at the end of the drive as at its start.
-            let start_m = rng.random_range(0.0..length_m) - 0.5 * speed_m_s * duration_s;
-            let track = Track::Lane {
-                start_m,
-                speed_m_s,
-                lateral_m,
-            };
-            movers.push((Vehicle::Cyclist, track));
+            let along = constant(speed_m_s, rng.random_range(0.0..length_m));
+            add(Vehicle::Cyclist, along, AcrossPath::Lane(lateral_m));
         }
         for _ in 0..pedestrians {
-            let speed_m_s =
-                rng.random_range(0.9..1.7) * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
-            let track = Track::Pavement {
-                start_m: rng.random_range(0.0..length_m) - 0.5 * speed_m_s * duration_s,
-                speed_m_s,
-                side: if rng.random_bool(0.5) { 1.0 } else { -1.0 },
+            let speed_m_s = rng.random_range(0.9..1.7) * random_side(rng);
+            let along = constant(speed_m_s, rng.random_range(0.0..length_m));
+            let across = AcrossPath::Sidewalk {
+                side: random_side(rng),
                 kerb_m: rng.random_range(0.7..1.5),
             };
-            movers.push((Vehicle::random_pedestrian(&mut rng), track));
+            add(Vehicle::random_pedestrian(rng), along, across);
         }
-        Self {
-            path: path.clone(),
-            movers,
-        }
+        Self(road_users)
     }
 
-    /// The surfaces of all that is near the car at a time, world frame.
-    pub fn surface_at(&self, time_s: f64, drive: &Drive, ground: &Ground) -> PaintedMesh {
-        let mut target = PaintedMesh::default();
-        let t = drive.world_from_lidar(ground, time_s).translation.vector;
-        let car = DVec2::new(t.x, t.y);
-        let heading = self.path.at(drive.station_m(time_s)).forward;
-        for (vehicle, track) in &self.movers {
-            let Some((position, forward)) = self.place(track, time_s, drive, ground) else {
+    /// Surfaces of all road users near the ego vehicle at a time, world frame.
+    pub fn surface_at(&self, time_s: f64, ego: &EgoMotion, ground: &GroundField) -> LabelledMesh {
+        let mut target = LabelledMesh::default();
+        let t = ego.world_from_lidar(ground, time_s).translation.vector;
+        let ego_position = DVec2::new(t.x, t.y);
+        let heading = ego.centreline.at(ego.station_m(time_s)).forward;
+        for road_user in &self.0 {
+            let Some((position, forward)) = road_user.pose_at(time_s, ego, ground) else {
                 continue;
             };
-            let offset = position - car;
-            let [half_length_m, half_width_m] = vehicle.half_size_m();
-            // Where the path meets itself, traffic of one passage makes way for the car on another.
-            let is_in_the_way = offset.dot(heading).abs() < 2.5 + half_length_m
-                && offset.dot(heading.perp()).abs() < 0.95 + half_width_m;
-            if offset.length() > VISIBLE_M || is_in_the_way {
+            let offset = position - ego_position;
+            let half_m = road_user.vehicle.half_size_m();
+            // Where the path crosses itself, traffic of one passage does not collide with the ego
+            // vehicle on the other.
+            let is_colliding = offset.dot(heading).abs() < 2.5 + half_m.x
+                && offset.dot(heading.perp()).abs() < 0.95 + half_m.y;
+            if offset.length() > VISIBLE_M || is_colliding {
                 continue;
             }
-            let primer = Paint {
-                class: classes::OTHER_OBJECT,
-                reflectance: 0.5,
-            };
-            let mut builder =
-                Builder::new(&mut target, lying_on(ground, position, forward), primer);
-            let stride = (time_s * std::f64::consts::TAU * 0.9) as f32;
-            vehicle.add_to(&mut builder, true, stride);
+            let world_from_local = ground.tangent_frame(position, forward);
+            let mut builder = MeshBuilder::new(&mut target, world_from_local);
+            let stride_rad = (time_s * TAU * 0.9) as f32;
+            road_user.vehicle.add_to(&mut builder, true, stride_rad);
         }
         target
     }
+}
 
-    /// Position and direction; `None` beyond the street and where there is no pavement.
-    fn place(
+impl RoadUser {
+    /// Position and direction; `None` beyond the street and where there is no sidewalk.
+    fn pose_at(
         &self,
-        track: &Track,
         time_s: f64,
-        drive: &Drive,
-        ground: &Ground,
+        ego: &EgoMotion,
+        ground: &GroundField,
     ) -> Option<(DVec2, DVec2)> {
-        let (station_m, sense) = match *track {
-            Track::Ahead { ahead_s, gap_m } => (drive.station_m(time_s + ahead_s) + gap_m, 1.0),
-            Track::Beside {
-                from_s, until_s, ..
+        let (station_m, direction) = match &self.along {
+            AlongPath::WithEgo {
+                headway_s,
+                gap_m,
+                present_s,
             } => {
-                if !(from_s..until_s).contains(&time_s) {
-                    return None;
-                }
-                (drive.station_m(time_s), 1.0)
+                let station_m = ego.station_m(time_s + headway_s) + gap_m;
+                (present_s.contains(&time_s).then_some(station_m)?, 1.0)
             }
-            Track::Lane {
-                start_m, speed_m_s, ..
+            AlongPath::Constant { start_m, speed_m_s } => {
+                (start_m + speed_m_s * time_s, speed_m_s.signum())
             }
-            | Track::Pavement {
-                start_m, speed_m_s, ..
-            } => (start_m + speed_m_s * time_s, speed_m_s.signum()),
         };
-        let margin_m = PROLONGATION_M - 8.0;
-        if station_m < -margin_m || station_m > self.path.length_m() + margin_m {
+        let margin_m = EXTENSION_M - 8.0;
+        if station_m < -margin_m || station_m > ego.centreline.length_m() + margin_m {
             return None;
         }
-        let point = self.path.at(station_m);
-        let position = match *track {
-            Track::Ahead { .. } => point.position,
-            Track::Lane { lateral_m, .. } | Track::Beside { lateral_m, .. } => {
-                point.beside(lateral_m)
-            }
-            Track::Pavement { side, kerb_m, .. } => {
-                self.on_pavement(ground, station_m, side, kerb_m)?
+        let point = ego.centreline.at(station_m);
+        let lateral_m = match self.across {
+            AcrossPath::Lane(lateral_m) => lateral_m,
+            AcrossPath::Sidewalk { side, kerb_m } => {
+                sidewalk_lateral_m(ego, ground, station_m, side, kerb_m)?
             }
         };
-        Some((position, sense * point.forward))
+        Some((point.beside(lateral_m), direction * point.forward))
     }
+}
 
-    /// The mean of the places beyond the kerb a few metres before and behind, because nobody
-    /// jumps where a row of bays begins.
-    fn on_pavement(
-        &self,
-        ground: &Ground,
-        station_m: f64,
-        side: f64,
-        kerb_m: f64,
-    ) -> Option<DVec2> {
-        const LIMIT_M: f64 = 14.0;
-        let lateral_m = (-3..=3)
-            .map(|step| {
-                let point = self.path.at(station_m + f64::from(step));
-                let place = ground.beside(&point, side, kerb_m, LIMIT_M)?;
-                Some((place - point.position).dot(point.left()))
-            })
-            .sum::<Option<f64>>()?
-            / 7.0;
-        Some(self.path.at(station_m).beside(lateral_m))
-    }
+/// Lateral offset of a position beyond the kerb, averaged over a few metres before and behind so
+/// that pedestrians do not jump where a row of bays begins [m].
+fn sidewalk_lateral_m(
+    ego: &EgoMotion,
+    ground: &GroundField,
+    station_m: f64,
+    side: f64,
+    kerb_m: f64,
+) -> Option<f64> {
+    const LIMIT_M: f64 = 14.0;
+    let sum_m: Option<f64> = (-3..=3)
+        .map(|step| {
+            let point = ego.centreline.at(station_m + f64::from(step));
+            let position = ground.beyond_kerb(&point, side, kerb_m, LIMIT_M)?;
+            Some((position - point.position).dot(point.left()))
+        })
+        .sum();
+    Some(sum_m? / 7.0)
 }

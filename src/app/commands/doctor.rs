@@ -60,7 +60,7 @@ fn adapter(report: &AdapterReport) -> String {
 /// Images of the simulated street by the renderer that `auto` takes.
 fn rays_per_second(time: Duration, context: &Context) -> anyhow::Result<String> {
     let simulation = Simulation::new(&SimulationConfig::default(), None)?;
-    let street = &simulation.street.mesh;
+    let street = &simulation.street.surface.mesh;
     let (poses, model) = (simulation.poses(), LidarModel::default());
     let grid = TileGrid::around(&poses, &TileConfig::default());
     let renderer = renderer(&tiles::cut(street, &grid), context.backend)?;

@@ -84,7 +84,7 @@ pub fn run(
         folder: folder.clone(),
         frames: simulation.frames(),
         kept,
-        triangles: simulation.street.mesh.triangles.len(),
+        triangles: simulation.street.surface.mesh.triangles.len(),
         driven_m: length_m(&poses),
     };
     match (state_of(config, &simulation)?, existing) {
@@ -116,7 +116,7 @@ pub fn run(
     output::write_text(&folder.join("simulation.yml"), &recipe)?;
     output::write_text(&folder.join(EXECUTABLE_FILE), &version::executable_hash()?)?;
     output::replace(&folder.join("street.ply"), |path| {
-        Ok(ply::write(path, &simulation.truth_in_map())?)
+        Ok(ply::write(path, &simulation.street_in_map())?)
     })?;
     let kept = write_scans(&simulation, &folder, progress, interrupt)?;
     write_poses(&simulation, &folder, &poses)?;

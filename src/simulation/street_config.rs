@@ -1,0 +1,95 @@
+//! Configuration of the street and of its cross-section.
+
+use serde::{Deserialize, Serialize};
+
+use crate::validation::{InvalidValue, Validate, fraction, nested, positive};
+
+/// The street and what stands along it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct StreetConfig {
+    /// Width of each of the two lanes [m].
+    pub lane_width_m: f64,
+    /// Mean distance between side streets [m].
+    pub side_street_spacing_m: f64,
+    /// Whether there is an open square beside the road.
+    pub has_square: bool,
+    /// Share of the frontage that is built on, 0 to 1.
+    pub built_share: f64,
+    /// Share of the parking bays that are occupied, 0 to 1.
+    pub parked_share: f64,
+    /// Mean distance between street lamps on one side [m].
+    pub lamp_spacing_m: f64,
+    /// Trees and bushes per 100 m of each side.
+    pub plants_per_100_m: f64,
+    /// The cross-section.
+    pub ground: CrossSectionConfig,
+}
+
+impl Default for StreetConfig {
+    /// A residential street.
+    fn default() -> Self {
+        Self {
+            lane_width_m: 3.3,
+            side_street_spacing_m: 75.0,
+            has_square: true,
+            built_share: 0.93,
+            parked_share: 0.75,
+            lamp_spacing_m: 32.0,
+            plants_per_100_m: 16.0,
+            ground: CrossSectionConfig::default(),
+        }
+    }
+}
+
+impl Validate for StreetConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        positive("lane_width_m", self.lane_width_m)?;
+        positive("side_street_spacing_m", self.side_street_spacing_m)?;
+        fraction("built_share", self.built_share)?;
+        fraction("parked_share", self.parked_share)?;
+        positive("lamp_spacing_m", self.lamp_spacing_m)?;
+        positive("plants_per_100_m", self.plants_per_100_m)?;
+        nested("ground", &self.ground)
+    }
+}
+
+/// The cross-section of the street.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct CrossSectionConfig {
+    /// Edge of the square grid cells of the ground [m].
+    pub cell_m: f64,
+    /// Distance from the carriageway up to which there is ground [m].
+    pub reach_m: f64,
+    /// Width of the sidewalk [m].
+    pub sidewalk_width_m: f64,
+    /// Height of the kerb, that is of the sidewalk above the carriageway [m].
+    pub kerb_height_m: f64,
+    /// Cross slope of the carriageway, rising from the gutter over at most three metres [m/m].
+    pub crown_slope: f64,
+    /// Amplitude of the undulation of gardens and grass [m].
+    pub undulation_m: f64,
+}
+
+impl Default for CrossSectionConfig {
+    /// A residential street.
+    fn default() -> Self {
+        Self {
+            cell_m: 1.0,
+            reach_m: 45.0,
+            sidewalk_width_m: 2.2,
+            kerb_height_m: 0.12,
+            crown_slope: 0.025,
+            undulation_m: 0.15,
+        }
+    }
+}
+
+impl Validate for CrossSectionConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        positive("cell_m", self.cell_m)?;
+        positive("reach_m", self.reach_m)?;
+        positive("sidewalk_width_m", self.sidewalk_width_m)
+    }
+}
