@@ -20,6 +20,13 @@ pub struct Material {
     pub reflectance: f32,
 }
 
+impl Material {
+    /// A material of a class with a reflectance.
+    pub const fn new(class: u16, reflectance: f32) -> Self {
+        Self { class, reflectance }
+    }
+}
+
 /// A mesh with a material per triangle.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LabelledMesh {
@@ -55,16 +62,13 @@ impl<'a> MeshBuilder<'a> {
         Self {
             target,
             world_from_local,
-            material: Material {
-                class: classes::OTHER_OBJECT,
-                reflectance: 0.5,
-            },
+            material: Material::new(classes::OTHER_OBJECT, 0.5),
         }
     }
 
     /// Sets the material of the triangles added from now on.
     pub fn set_material(&mut self, class: u16, reflectance: f32) {
-        self.material = Material { class, reflectance };
+        self.material = Material::new(class, reflectance);
     }
 
     /// Adds a triangle, counter-clockwise seen from outside.

@@ -36,13 +36,3 @@ pub const MOVING_BICYCLIST: u16 = 253;
 pub const MOVING_PERSON: u16 = 254;
 /// Moving trucks and delivery vans.
 pub const MOVING_TRUCK: u16 = 258;
-
-/// Whether a class is ground in the ground segmentation benchmark of Patchwork++.
-pub fn is_ground(class: u16) -> bool {
-    matches!(class, ROAD | PARKING | SIDEWALK | 49 | 60 | TERRAIN)
-}
-
-/// Whether objects of a class move during a scan.
-pub fn is_moving(class: u16) -> bool {
-    (252..=259).contains(&class)
-}

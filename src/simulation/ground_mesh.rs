@@ -10,22 +10,10 @@ use super::ground::{GroundField, GroundSample, GroundZone};
 /// A vertex of a polygon on the ground.
 type GroundVertex = (DVec2, GroundSample);
 
-const ROAD: Material = Material {
-    class: classes::ROAD,
-    reflectance: 0.22,
-};
-const PARKING: Material = Material {
-    class: classes::PARKING,
-    reflectance: 0.28,
-};
-const SIDEWALK: Material = Material {
-    class: classes::SIDEWALK,
-    reflectance: 0.35,
-};
-const TERRAIN: Material = Material {
-    class: classes::TERRAIN,
-    reflectance: 0.45,
-};
+const ROAD: Material = Material::new(classes::ROAD, 0.22);
+const PARKING: Material = Material::new(classes::PARKING, 0.28);
+const SIDEWALK: Material = Material::new(classes::SIDEWALK, 0.35);
+const TERRAIN: Material = Material::new(classes::TERRAIN, 0.45);
 
 /// Triangles of all ground within reach of the carriageway.
 pub fn ground_mesh(ground: &GroundField) -> LabelledMesh {

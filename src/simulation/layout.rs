@@ -124,19 +124,11 @@ pub struct Footprint {
 impl Footprint {
     /// The corners and the midpoints of the sides.
     pub fn outline(&self) -> [DVec2; 8] {
+        const ALONG: [f64; 8] = [-1.0, 0.0, 1.0, 1.0, 1.0, 0.0, -1.0, -1.0];
+        const ACROSS: [f64; 8] = [-1.0, -1.0, -1.0, 0.0, 1.0, 1.0, 1.0, 0.0];
         let along = self.half_m.x * self.forward;
         let across = self.half_m.y * self.forward.perp();
-        [
-            (-1.0, -1.0),
-            (0.0, -1.0),
-            (1.0, -1.0),
-            (1.0, 0.0),
-            (1.0, 1.0),
-            (0.0, 1.0),
-            (-1.0, 1.0),
-            (-1.0, 0.0),
-        ]
-        .map(|(u, v)| self.center + u * along + v * across)
+        std::array::from_fn(|point| self.center + ALONG[point] * along + ACROSS[point] * across)
     }
 
     /// Whether two rectangles overlap, by the separating axis theorem.

@@ -58,7 +58,7 @@ use crate::recording::Calibration;
 use crate::validation::Validate as _;
 use odometry::drifting_odometry;
 use random::{Purpose, stream};
-use scanner::{ScanTarget, Scanner};
+use scanner::{ScanTarget, simulate_scan};
 use traffic::Traffic;
 
 /// Length of the shortest path that can be driven [m].
@@ -72,7 +72,6 @@ pub struct Simulation {
     pub ego_motion: EgoMotion,
     config: SimulationConfig,
     traffic: Traffic,
-    scanner: Scanner,
     street_target: ScanTarget,
 }
 
@@ -113,7 +112,6 @@ impl Simulation {
         }
         Ok(Self {
             street_target: ScanTarget::new(street.surface.clone()),
-            scanner: Scanner::new(&config.scanner),
             config: config.clone(),
             street,
             ego_motion,
@@ -171,8 +169,8 @@ impl Simulation {
         let mut rng = stream(self.config.seed, Purpose::Scan, index);
         let traffic = ScanTarget::new(self.traffic_at(frame));
         let pose = |delay_s: f64| self.world_from_lidar(time_s(frame) + delay_s);
-        self.scanner
-            .scan(&[&self.street_target, &traffic], pose, &mut rng)
+        let targets = [&self.street_target, &traffic];
+        simulate_scan(&self.config.scanner, &targets, pose, &mut rng)
     }
 
     /// The static world in the map frame of this drive, that is of its first lidar pose.

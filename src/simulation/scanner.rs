@@ -18,7 +18,7 @@ use rand::{Rng, RngExt as _};
 use rand_distr::{Distribution as _, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::builder::LabelledMesh;
+use super::builder::{LabelledMesh, Material};
 use super::ego_motion::SCAN_PERIOD_S;
 use crate::geometry::{Pose3, Rigid3f};
 use crate::lidar::Scan;
@@ -123,135 +123,61 @@ impl ScanTarget {
 #[derive(Clone, Copy, Debug)]
 struct Echo {
     range_m: f32,
-    class: u16,
-    reflectance: f32,
+    material: Material,
     /// |cos α|.
     incidence: f32,
 }
 
-/// The sensor with its beams.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Scanner {
-    config: ScannerConfig,
-    elevations_rad: Vec<f32>,
+/// Simulates one revolution. `world_from_lidar` gives the pose at a time relative to that of the
+/// scan [s]: the sensor faces backwards half a revolution before, to the right a quarter before,
+/// and forwards at that time, as KITTI's does.
+pub fn simulate_scan(
+    config: &ScannerConfig,
+    targets: &[&ScanTarget],
+    world_from_lidar: impl Fn(f64) -> Pose3,
+    rng: &mut impl Rng,
+) -> LabelledScan {
+    let steps = config.azimuth_steps;
+    let steps_per_pose = if config.rolling_shutter {
+        STEPS_PER_POSE
+    } else {
+        steps.max(1)
+    };
+    let elevations_rad = elevations_rad(config);
+    let directions = directions(&elevations_rad, steps);
+    let mut echoes = vec![None; directions.len()];
+    for first in (0..steps).step_by(steps_per_pose) {
+        let columns = first..(first + steps_per_pose).min(steps);
+        let turn = 0.5 * (columns.start + columns.end) as f64 / steps as f64 - 0.5;
+        let world_from_lidar = Rigid3f::from(&world_from_lidar(turn * SCAN_PERIOD_S));
+        let indices: Vec<usize> = (0..elevations_rad.len())
+            .flat_map(|beam| columns.clone().map(move |column| beam * steps + column))
+            .collect();
+        let rays: Vec<Vec3> = indices
+            .iter()
+            .map(|&index| world_from_lidar.rotate(directions[index]))
+            .collect();
+        let nearest = nearest_echoes(targets, world_from_lidar.translation, &rays);
+        for (index, echo) in indices.into_iter().zip(nearest) {
+            echoes[index] = echo;
+        }
+    }
+    measure(config, &directions, &echoes, rng)
 }
 
-impl Scanner {
-    /// A sensor as configured.
-    pub fn new(config: &ScannerConfig) -> Self {
-        let elevations_deg = if config.elevations_deg.is_empty() {
-            hdl64_elevations_deg(config.beams)
-        } else {
-            config.elevations_deg.clone()
-        };
-        Self {
-            config: config.clone(),
-            elevations_rad: elevations_deg
-                .iter()
-                .map(|deg| deg.to_radians() as f32)
-                .collect(),
-        }
-    }
-
-    /// Simulates one revolution. `world_from_lidar` gives the pose at a time relative to that of
-    /// the scan [s]: the sensor faces backwards half a revolution before, to the right a quarter
-    /// before, and forwards at that time, as KITTI's does.
-    pub fn scan(
-        &self,
-        targets: &[&ScanTarget],
-        world_from_lidar: impl Fn(f64) -> Pose3,
-        rng: &mut impl Rng,
-    ) -> LabelledScan {
-        let steps = self.config.azimuth_steps;
-        let steps_per_pose = if self.config.rolling_shutter {
-            STEPS_PER_POSE
-        } else {
-            steps.max(1)
-        };
-        let directions = self.directions();
-        let mut echoes = vec![None; directions.len()];
-        for first in (0..steps).step_by(steps_per_pose) {
-            let columns = first..(first + steps_per_pose).min(steps);
-            let turn = 0.5 * (columns.start + columns.end) as f64 / steps as f64 - 0.5;
-            let world_from_lidar = Rigid3f::from(&world_from_lidar(turn * SCAN_PERIOD_S));
-            let indices: Vec<usize> = (0..self.elevations_rad.len())
-                .flat_map(|beam| columns.clone().map(move |column| beam * steps + column))
-                .collect();
-            let rays: Vec<Vec3> = indices
-                .iter()
-                .map(|&index| world_from_lidar.rotate(directions[index]))
-                .collect();
-            let nearest = nearest_echoes(targets, world_from_lidar.translation, &rays);
-            for (index, echo) in indices.into_iter().zip(nearest) {
-                echoes[index] = echo;
-            }
-        }
-        self.measure(&directions, &echoes, rng)
-    }
-
-    /// Unit directions in the lidar frame, beam by beam.
-    fn directions(&self) -> Vec<Vec3> {
-        let steps = self.config.azimuth_steps;
-        let azimuths: Vec<Vec2> = (0..steps)
-            .map(|step| {
-                let turn = (step as f32 + 0.5) / steps as f32 - 0.5;
-                Vec2::from_angle(TAU * turn)
-            })
-            .collect();
-        self.elevations_rad
-            .iter()
-            .flat_map(|elevation_rad| {
-                let (sin, cos) = elevation_rad.sin_cos();
-                azimuths
-                    .iter()
-                    .map(move |azimuth| Vec3::new(cos * azimuth.x, cos * azimuth.y, sin))
-            })
-            .collect()
-    }
-
-    /// Measurements of the echoes, with dropout and range noise.
-    fn measure(
-        &self,
-        directions: &[Vec3],
-        echoes: &[Option<Echo>],
-        rng: &mut impl Rng,
-    ) -> LabelledScan {
-        let config = &self.config;
-        let limits_m = config.min_range_m as f32..config.max_range_m as f32;
-        let mut labelled = LabelledScan::default();
-        for (&direction, echo) in directions.iter().zip(echoes) {
-            let Some(echo) = echo else { continue };
-            let dropout: f64 = rng.random();
-            let detection: f32 = rng.random();
-            let deviate: f32 = StandardNormal.sample(rng);
-            let detectable_m = self.detectable_up_to_m(echo);
-            let probability =
-                1.0 / (1.0 + ((echo.range_m - detectable_m) / (0.05 * detectable_m)).exp());
-            let range_m = echo.range_m + config.range_noise_m as f32 * deviate;
-            let is_lost = dropout < config.dropout_share || detection > probability;
-            if is_lost || !limits_m.contains(&range_m) {
-                continue;
-            }
-            let brightness = echo.reflectance * echo.incidence.sqrt();
-            let intensity = (brightness * (1.0 + 0.1 * deviate)).clamp(0.0, 1.0);
-            labelled.scan.points.push(direction * range_m);
-            labelled.scan.intensities.push(intensity);
-            labelled.classes.push(echo.class);
-        }
-        labelled
-    }
-
-    /// r_max of a surface [m].
-    fn detectable_up_to_m(&self, echo: &Echo) -> f32 {
-        const REFERENCE_REFLECTANCE: f32 = 0.8;
-        let power = echo.reflectance * echo.incidence.powf(0.25) / REFERENCE_REFLECTANCE;
-        // Even the darkest surface is detected up to two metres.
-        (self.config.reach_m as f32 * power.sqrt()).max(2.0)
-    }
+/// Elevations of the beams, from the top [rad].
+fn elevations_rad(config: &ScannerConfig) -> Vec<f32> {
+    let elevations_deg = if config.elevations_deg.is_empty() {
+        hdl64_elevations_deg(config.beams)
+    } else {
+        config.elevations_deg.clone()
+    };
+    let elevations_rad = elevations_deg.iter().map(|deg| deg.to_radians() as f32);
+    elevations_rad.collect()
 }
 
 /// `count` of the elevations of the HDL-64E, evenly chosen, from the top [deg].
-pub fn hdl64_elevations_deg(count: usize) -> Vec<f64> {
+fn hdl64_elevations_deg(count: usize) -> Vec<f64> {
     let count = count.clamp(1, 64);
     (0..count)
         .map(|beam| match (beam * 64 / count) as u8 {
@@ -259,6 +185,60 @@ pub fn hdl64_elevations_deg(count: usize) -> Vec<f64> {
             laser => -8.83 - 0.5 * f64::from(laser - 32),
         })
         .collect()
+}
+
+/// Unit directions in the lidar frame, beam by beam.
+fn directions(elevations_rad: &[f32], steps: usize) -> Vec<Vec3> {
+    let azimuths: Vec<Vec2> = (0..steps)
+        .map(|step| {
+            let turn = (step as f32 + 0.5) / steps as f32 - 0.5;
+            Vec2::from_angle(TAU * turn)
+        })
+        .collect();
+    let rows = elevations_rad.iter().flat_map(|elevation_rad| {
+        let (sin, cos) = elevation_rad.sin_cos();
+        let row = azimuths.iter();
+        row.map(move |azimuth| Vec3::new(cos * azimuth.x, cos * azimuth.y, sin))
+    });
+    rows.collect()
+}
+
+/// Measurements of the echoes, with dropout and range noise.
+fn measure(
+    config: &ScannerConfig,
+    directions: &[Vec3],
+    echoes: &[Option<Echo>],
+    rng: &mut impl Rng,
+) -> LabelledScan {
+    let limits_m = config.min_range_m as f32..config.max_range_m as f32;
+    let mut labelled = LabelledScan::default();
+    for (&direction, echo) in directions.iter().zip(echoes) {
+        let Some(echo) = echo else { continue };
+        let dropout: f64 = rng.random();
+        let detection: f32 = rng.random();
+        let deviate: f32 = StandardNormal.sample(rng);
+        let r_max = detectable_up_to_m(config, echo);
+        let probability = 1.0 / (1.0 + ((echo.range_m - r_max) / (0.05 * r_max)).exp());
+        let range_m = echo.range_m + config.range_noise_m as f32 * deviate;
+        let is_lost = dropout < config.dropout_share || detection > probability;
+        if is_lost || !limits_m.contains(&range_m) {
+            continue;
+        }
+        let brightness = echo.material.reflectance * echo.incidence.sqrt();
+        let intensity = (brightness * (1.0 + 0.1 * deviate)).clamp(0.0, 1.0);
+        labelled.scan.points.push(direction * range_m);
+        labelled.scan.intensities.push(intensity);
+        labelled.classes.push(echo.material.class);
+    }
+    labelled
+}
+
+/// r_max of a surface [m].
+fn detectable_up_to_m(config: &ScannerConfig, echo: &Echo) -> f32 {
+    const REFERENCE_REFLECTANCE: f32 = 0.8;
+    let power = echo.material.reflectance * echo.incidence.powf(0.25) / REFERENCE_REFLECTANCE;
+    // Even the darkest surface is detected up to two metres.
+    (config.reach_m as f32 * power.sqrt()).max(2.0)
 }
 
 fn nearest_echoes(targets: &[&ScanTarget], origin: Vec3, rays: &[Vec3]) -> Vec<Option<Echo>> {
@@ -274,11 +254,9 @@ fn nearest_echoes(targets: &[&ScanTarget], origin: Vec3, rays: &[Vec3]) -> Vec<O
             if hit.triangle != Hit::NO_TRIANGLE && is_nearer {
                 let triangle = hit.triangle as usize;
                 let normal = surface.mesh.scaled_normal(triangle).normalize_or_zero();
-                let material = surface.materials[triangle];
                 *best = Some(Echo {
                     range_m: hit.range_m,
-                    class: material.class,
-                    reflectance: material.reflectance,
+                    material: surface.materials[triangle],
                     incidence: normal.dot(*ray).abs(),
                 });
             }
@@ -312,7 +290,7 @@ mod tests {
 
     fn scan(config: &ScannerConfig, world_from_lidar: impl Fn(f64) -> Pose3) -> LabelledScan {
         let mut rng = StdRng::seed_from_u64(5);
-        Scanner::new(config).scan(&[&room()], world_from_lidar, &mut rng)
+        simulate_scan(config, &[&room()], world_from_lidar, &mut rng)
     }
 
     const EXACT: ScannerConfig = ScannerConfig {
@@ -453,7 +431,7 @@ mod tests {
         let car = bright_box(252, [4.0, 5.0], [-5.0, 5.0], [-5.0, 5.0]);
         for targets in [[&room(), &car], [&car, &room()]] {
             let mut rng = StdRng::seed_from_u64(5);
-            let labelled = Scanner::new(&EXACT).scan(&targets, |_| Pose3::identity(), &mut rng);
+            let labelled = simulate_scan(&EXACT, &targets, |_| Pose3::identity(), &mut rng);
             for (point, &class) in labelled.scan.points.iter().zip(&labelled.classes) {
                 let is_on_car = (point.x - 4.0).abs() < 0.01 && point.y.abs() <= 5.0;
                 assert_eq!(class == 252, is_on_car, "{point} {class}");

@@ -4,7 +4,7 @@
 use super::centreline::{Centreline, PathSegment};
 use super::ego_motion::{EgoMotion, MotionConfig};
 use super::random::{Purpose, stream};
-use super::scanner::{LabelledScan, ScanTarget, Scanner, ScannerConfig};
+use super::scanner::{LabelledScan, ScanTarget, ScannerConfig, simulate_scan};
 use super::street::Street;
 use super::street_config::StreetConfig;
 
@@ -43,7 +43,8 @@ fn straight_street_scene(
     let path = Centreline::from_segments(&segments, 0.0);
     let Street { surface, ground } = Street::new(&path, street, seed);
     let ego = EgoMotion::new(path, Some(&[STATION_M]), &MotionConfig::default(), seed, 1);
-    Scanner::new(scanner).scan(
+    simulate_scan(
+        scanner,
         &[&ScanTarget::new(surface)],
         |delay_s| ego.world_from_lidar(&ground, delay_s),
         &mut stream(seed, Purpose::Scan, 0),

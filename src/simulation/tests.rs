@@ -23,6 +23,25 @@ fn small() -> SimulationConfig {
     }
 }
 
+const NO_TRAFFIC: TrafficConfig = TrafficConfig {
+    has_lead_vehicle: false,
+    oncoming_spacing_m: 0.0,
+    oncoming_speed_m_s: 0.0,
+    cyclists_per_100_m: 0.0,
+    pedestrians_per_100_m: 0.0,
+    lorry_from_s: None,
+    lorry_for_s: 0.0,
+};
+
+fn is_ground(class: u16) -> bool {
+    use classes::{PARKING, ROAD, SIDEWALK, TERRAIN};
+    [ROAD, PARKING, SIDEWALK, TERRAIN].contains(&class)
+}
+
+fn is_moving(class: u16) -> bool {
+    (252..=259).contains(&class)
+}
+
 fn simulate(config: &SimulationConfig) -> Simulation {
     Simulation::new(config, None).unwrap()
 }
@@ -100,7 +119,7 @@ fn no_static_object_is_on_the_driven_path() {
         let poses: Vec<Pose3> = simulation.poses().into_iter().step_by(4).collect();
         let street = &simulation.street.surface;
         for (triangle, Material { class, .. }) in street.materials.iter().enumerate() {
-            if classes::is_ground(*class) {
+            if is_ground(*class) {
                 continue;
             }
             let [a, b, c] = street.mesh.corners(triangle);
@@ -161,7 +180,7 @@ fn oncoming_cars_come_nearer_at_their_speed() {
         traffic: TrafficConfig {
             oncoming_spacing_m: 30.0,
             oncoming_speed_m_s: 10.0,
-            ..TrafficConfig::NONE
+            ..NO_TRAFFIC
         },
         ..small()
     };
@@ -183,12 +202,12 @@ fn oncoming_cars_come_nearer_at_their_speed() {
 #[test]
 fn an_empty_street_has_no_moving_points() {
     let simulation = simulate(&SimulationConfig {
-        traffic: TrafficConfig::NONE,
+        traffic: NO_TRAFFIC,
         ..small()
     });
     for frame in [0, 40] {
         let labelled = simulation.scan(frame);
-        assert!(!labelled.classes.iter().any(|&c| classes::is_moving(c)));
+        assert!(!labelled.classes.iter().any(|&c| is_moving(c)));
     }
 }
 
@@ -246,7 +265,7 @@ fn a_lorry_occludes_the_left_side_for_its_duration() {
         traffic: TrafficConfig {
             lorry_from_s: Some(1.0),
             lorry_for_s: 2.0,
-            ..TrafficConfig::NONE
+            ..NO_TRAFFIC
         },
         ..small()
     });
@@ -259,7 +278,7 @@ fn a_lorry_occludes_the_left_side_for_its_duration() {
             .zip(&labelled.classes)
             .filter(|(p, _)| p.y > 0.6 * p.x.abs() && p.z > -0.5);
         let (all, hidden) = to_the_left.fold((0, 0), |(all, hidden), (_, &class)| {
-            (all + 1, hidden + usize::from(classes::is_moving(class)))
+            (all + 1, hidden + usize::from(is_moving(class)))
         });
         hidden as f64 / all.max(1) as f64
     };
@@ -397,7 +416,7 @@ fn the_street_in_the_map_frame_has_the_ranges_of_the_first_scan() {
         .zip(&hits)
         .zip(&labelled.classes)
     {
-        if !classes::is_moving(class) {
+        if !is_moving(class) {
             let difference_m = (point.length() - hit.range_m).abs();
             // Six sigma, but for beams that graze an edge after rounding.
             assert!(difference_m < 0.12 || hit.range_m > 20.0, "{difference_m}");

@@ -64,19 +64,6 @@ impl Validate for TrafficConfig {
     }
 }
 
-impl TrafficConfig {
-    /// An empty street.
-    pub const NONE: Self = Self {
-        has_lead_vehicle: false,
-        oncoming_spacing_m: 0.0,
-        oncoming_speed_m_s: 0.0,
-        cyclists_per_100_m: 0.0,
-        pedestrians_per_100_m: 0.0,
-        lorry_from_s: None,
-        lorry_for_s: 0.0,
-    };
-}
-
 /// Motion along the path.
 #[derive(Clone, Debug, PartialEq)]
 enum AlongPath {

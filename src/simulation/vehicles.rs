@@ -87,16 +87,13 @@ impl Vehicle {
 
     /// Half of length and width [m].
     pub fn half_size_m(&self) -> DVec2 {
-        let (half_length_m, half_width_m) = match self {
-            Self::Car(shape) => (
-                0.5 * f64::from(shape.length_m),
-                0.5 * f64::from(shape.width_m),
-            ),
-            Self::Van { length_m, .. } => (0.5 * f64::from(*length_m), 1.0),
-            Self::Cyclist => (0.9, 0.3),
-            Self::Pedestrian { .. } => (0.3, 0.3),
+        let (length_m, width_m) = match *self {
+            Self::Car(shape) => (shape.length_m.into(), shape.width_m.into()),
+            Self::Van { length_m, .. } => (length_m.into(), 2.0),
+            Self::Cyclist => (1.8, 0.6),
+            Self::Pedestrian { .. } => (0.6, 0.6),
         };
-        DVec2::new(half_length_m, half_width_m)
+        0.5 * DVec2::new(length_m, width_m)
     }
 
     /// SemanticKITTI class of the parked or moving vehicle.

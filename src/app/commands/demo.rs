@@ -1,4 +1,4 @@
-//! `demo`: all of it in one command, on a street that the program makes itself.
+//! `demo`: simulation, map, localization and refinement in one command.
 
 use std::path::Path;
 use std::time::Instant;
@@ -11,11 +11,11 @@ use crate::app::cli::DemoArgs;
 use crate::app::config::{BuildMapConfig, LocalizationConfig, OdometrySource, RefinementConfig};
 use crate::simulation::SimulationConfig;
 
-/// Frames per drive of a whole demonstration.
+/// Default number of frames per drive.
 const FRAMES: usize = 160;
 
-/// Simulates two drives through one street, maps it with the first, finds the car of the second in
-/// it, polishes and measures; returns the table for standard output.
+/// Simulates two drives through one street, builds a map from the first, localizes the second in
+/// it, refines and evaluates its trajectory; returns the table for standard output.
 pub fn run(args: &DemoArgs, context: &Context) -> Result<String> {
     let started = Instant::now();
     let seed = args.seed.unwrap_or(1);
@@ -29,8 +29,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<String> {
     };
     for number in [1, 2] {
         tracing::info!("simulating drive {number}");
-        simulate::run_with_progress(&drive(number), Existing::Renew, context)
-            .context("while simulating")?;
+        simulate::run(&drive(number), Existing::Renew, context).context("while simulating")?;
     }
     let (first, second) = (drive(1).drive_folder(), drive(2).drive_folder());
 
@@ -38,7 +37,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<String> {
     let map = build_map_config(&args.output, &first, seed);
     let build = build_map::run(&map, context).context("while building the map")?;
 
-    tracing::info!("finding the car of drive 2 in it");
+    tracing::info!("localizing drive 2 in the map");
     let localization = localization_config(&args.output, &map, &second, seed);
     localize::run(&localization, context).context("while localizing")?;
 

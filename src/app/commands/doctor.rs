@@ -1,10 +1,11 @@
-//! `doctor`: what this machine offers.
+//! `doctor`: instruction sets, graphics adapters and rendering speed of this machine.
 
+use std::env::consts::{ARCH, OS};
 use std::fmt::Write as _;
 use std::thread::available_parallelism;
 use std::time::{Duration, Instant};
 
-use super::{Context, output};
+use super::{Context, output, version};
 use crate::app::cli::DoctorArgs;
 use crate::lidar::LidarModel;
 use crate::map::{TileConfig, TileGrid, tiles};
@@ -12,19 +13,25 @@ use crate::rendering::backend::AdapterReport;
 use crate::rendering::{Backend, renderer, selection};
 use crate::simulation::{Simulation, SimulationConfig};
 
-/// Poses whose images are rendered at once, as many as the bench has.
+/// Number of poses whose images are rendered at once, as in the benchmark.
 const POSES: usize = 8;
 
-/// Prints what this machine offers, line by line.
+/// Prints the properties of this machine, one per line.
 pub(super) fn run(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
     let choice = selection::choose(Backend::Auto)?;
+    let processors = available_parallelism().map_or("unknown".to_owned(), |n| n.to_string());
+    let graphics = if cfg!(feature = "gpu") {
+        "built in"
+    } else {
+        "not built in; build with the feature gpu"
+    };
     let mut rows = vec![
-        ("fpmcl", env!("CARGO_PKG_VERSION").to_owned()),
-        ("system", system()),
+        ("fpmcl", version::VERSION.to_owned()),
+        ("system", format!("{OS} on {ARCH}")),
         ("instruction sets", instruction_sets()),
-        ("processors", processors()),
+        ("processors", processors),
         ("threads in use", context.threads.to_string()),
-        ("graphics support", graphics_support().to_owned()),
+        ("graphics support", graphics.to_owned()),
     ];
     rows.extend(choice.adapters.iter().map(|it| ("adapter", adapter(it))));
     rows.push((
@@ -42,7 +49,7 @@ pub(super) fn run(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
     output::print(&table)
 }
 
-/// An adapter, its driver, and why it cannot be used if so.
+/// An adapter, its driver, and the reason if it cannot be used.
 fn adapter(report: &AdapterReport) -> String {
     let obstacle = report
         .obstacle
@@ -57,7 +64,7 @@ fn adapter(report: &AdapterReport) -> String {
     )
 }
 
-/// Images of the simulated street by the renderer that `auto` takes.
+/// Rays per second for range images of the simulated street.
 fn rays_per_second(time: Duration, context: &Context) -> anyhow::Result<String> {
     let simulation = Simulation::new(&SimulationConfig::default(), None)?;
     let street = &simulation.street.surface.mesh;
@@ -81,52 +88,26 @@ fn rays_per_second(time: Duration, context: &Context) -> anyhow::Result<String> 
     ))
 }
 
-fn system() -> String {
-    format!("{} on {}", std::env::consts::OS, std::env::consts::ARCH)
-}
-
-fn processors() -> String {
-    available_parallelism().map_or_else(|_| "unknown".to_owned(), |count| count.to_string())
-}
-
 /// The vector instructions that the ray caster can use.
 fn instruction_sets() -> String {
-    let found: Vec<&str> = candidates()
-        .into_iter()
-        .filter_map(|(name, is_there)| is_there.then_some(name))
-        .collect();
-    if found.is_empty() {
-        "none that the ray caster uses".to_owned()
-    } else {
-        found.join(", ")
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-fn candidates() -> Vec<(&'static str, bool)> {
-    vec![
+    #[cfg(target_arch = "x86_64")]
+    let candidates = [
         ("sse4.2", is_x86_feature_detected!("sse4.2")),
         ("avx", is_x86_feature_detected!("avx")),
         ("avx2", is_x86_feature_detected!("avx2")),
         ("fma", is_x86_feature_detected!("fma")),
         ("avx512f", is_x86_feature_detected!("avx512f")),
-    ]
-}
-
-#[cfg(target_arch = "aarch64")]
-fn candidates() -> Vec<(&'static str, bool)> {
-    vec![("neon", std::arch::is_aarch64_feature_detected!("neon"))]
-}
-
-#[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
-fn candidates() -> Vec<(&'static str, bool)> {
-    Vec::new()
-}
-
-fn graphics_support() -> &'static str {
-    if cfg!(feature = "gpu") {
-        "built in"
-    } else {
-        "not built in; build with the feature gpu"
+    ];
+    #[cfg(target_arch = "aarch64")]
+    let candidates = [("neon", std::arch::is_aarch64_feature_detected!("neon"))];
+    #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+    let candidates = [("", false); 0];
+    let found: Vec<&str> = candidates
+        .into_iter()
+        .filter_map(|(name, is_available)| is_available.then_some(name))
+        .collect();
+    if found.is_empty() {
+        return "none that the ray caster uses".to_owned();
     }
+    found.join(", ")
 }

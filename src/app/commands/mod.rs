@@ -104,7 +104,7 @@ pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
                 true => simulate::Existing::Replace,
                 false => simulate::Existing::Keep,
             };
-            output::print(&simulate::run_with_progress(&config, existing, context)?)
+            output::print(&simulate::run(&config, existing, context)?)
         }
         Command::Compare(args) => output::print(&compare::run(args, context)?),
         Command::Demo(args) => output::print(&demo::run(args, context)?),

@@ -1,20 +1,18 @@
 //! `simulate`: a drive through a procedural street, written in the layout of KITTI.
 //!
-//! A drive becomes
-//!
 //! ```text
 //! drive_1/velodyne/000000.bin ...   points
-//! drive_1/labels/000000.label ...   a SemanticKITTI class per point
+//! drive_1/labels/000000.label ...   SemanticKITTI class of each point
 //! drive_1/calib.txt times.txt odometry.txt
-//! drive_1/street.ply                what stands still, in the map frame: the truth of a map
+//! drive_1/street.ply                the static world in the map frame: ground truth of a map
 //! drive_1/simulation.yml            the configuration, written first
-//! drive_1/executable.txt            hash of the executable that made it
+//! drive_1/executable.txt            hash of the executable that wrote the drive
 //! drive_1/poses.txt                 written last
 //! ```
 //!
-//! Every file is written under a temporary name and renamed. A drive is complete where all of them
-//! are. One that was interrupted, or that has lost files since, goes on where it was when it is
-//! simulated again with the same configuration by a program of the same source.
+//! Every file is written atomically. A drive is complete if all of them exist. One that was
+//! interrupted, or has lost files since, is completed when it is simulated again with the same
+//! configuration by the same executable.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -35,106 +33,46 @@ use crate::recording::velodyne::{write_labels, write_scan};
 use crate::recording::{Calibration, MapFrame};
 use crate::simulation::{Simulation, SimulationConfig, calibration};
 
-/// What becomes of a drive that is there already.
+/// Treatment of an existing drive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Existing {
-    /// It is kept where it is what would be made now; anything else is an error.
+    /// Keeps a drive of the same configuration and executable; anything else is an error.
     Keep,
-    /// As `Keep`, but what a program of other source made of the same configuration is made anew.
+    /// Like `Keep`, but replaces a drive of the same configuration by another executable.
     Renew,
-    /// It is made anew, whatever it is.
+    /// Replaces any drive.
     Replace,
 }
 
-/// Name of the file that says by which source a drive was made.
 const EXECUTABLE_FILE: &str = "executable.txt";
 
-/// What a run did.
+/// Remedy for a folder that cannot be used.
+const REMEDY: &str =
+    "choose another output_folder, remove that folder, or overwrite it with simulate --force";
+
+/// Summary of a simulated drive.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimulationReport {
-    /// The folder of the drive.
+    /// Folder of the drive.
     pub folder: PathBuf,
-    /// Scans of the drive.
+    /// Number of scans.
     pub frames: usize,
-    /// Scans that were there already.
+    /// Number of scans that existed before.
     pub kept: usize,
-    /// Triangles of the street.
+    /// Number of triangles of the street.
     pub triangles: usize,
     /// Length of the drive [m].
     pub driven_m: f64,
 }
 
-/// Simulates a drive. `progress` is told how many scans are done, of how many. When `interrupt` is
-/// requested, the scans that are being made are finished, and the rest is left for the next run.
-///
-/// A complete drive with the same configuration, made by a program of the same source, is kept as it
-/// is, also where it was moved to; where a part of it is missing, that part is made. What becomes of
-/// anything else, `existing` says.
-pub fn run(
-    config: &SimulationConfig,
-    existing: Existing,
-    progress: &(dyn Fn(usize, usize) + Sync),
-    interrupt: &Interrupt,
-) -> Result<SimulationReport> {
-    let simulation = prepare(config)?;
-    let folder = config.drive_folder();
-    let recipe = serde_yaml::to_string(config).context("writing the configuration as YAML")?;
-    let poses = simulation.poses();
-    let report = |kept| SimulationReport {
-        folder: folder.clone(),
-        frames: simulation.frames(),
-        kept,
-        triangles: simulation.street.surface.mesh.triangles.len(),
-        driven_m: length_m(&poses),
-    };
-    match (state_of(config, &simulation)?, existing) {
-        (State::Complete, Existing::Keep | Existing::Renew) => {
-            return Ok(report(simulation.frames()));
-        }
-        (State::Foreign, Existing::Keep | Existing::Renew) => bail!(
-            "{} holds something else, such as a drive of another configuration; choose another output_folder, remove that folder, or overwrite it with simulate --force",
-            folder.display()
-        ),
-        (State::Outdated, Existing::Keep) => bail!(
-            "{} was made by another build of the program, which may have made other scans; choose another output_folder, remove that folder, or overwrite it with simulate --force",
-            folder.display()
-        ),
-        (State::Outdated, Existing::Renew) => {
-            tracing::info!(
-                "{} was made by another build of the program and is made anew",
-                folder.display()
-            );
-            clear(&folder)?;
-        }
-        (_, Existing::Replace) => clear(&folder)?,
-        (State::Empty | State::Interrupted, _) => {}
-    }
-    for name in ["velodyne", "labels"] {
-        let path = folder.join(name);
-        fs::create_dir_all(&path).with_context(|| format!("cannot create {}", path.display()))?;
-    }
-    output::write_text(&folder.join("simulation.yml"), &recipe)?;
-    output::write_text(&folder.join(EXECUTABLE_FILE), &version::executable_hash()?)?;
-    output::replace(&folder.join("street.ply"), |path| {
-        Ok(ply::write(path, &simulation.street_in_map())?)
-    })?;
-    let kept = write_scans(&simulation, &folder, progress, interrupt)?;
-    write_poses(&simulation, &folder, &poses)?;
-    Ok(report(kept))
-}
-
-/// As [`run`], shown to the user; returns the table for standard output.
-pub fn run_with_progress(
-    config: &SimulationConfig,
-    existing: Existing,
-    context: &Context,
-) -> Result<String> {
+/// Simulates a drive and shows its progress; returns the table for standard output.
+pub fn run(config: &SimulationConfig, existing: Existing, context: &Context) -> Result<String> {
     let task: OnceLock<Arc<Task>> = OnceLock::new();
     let progress = |_done: usize, all: usize| {
         task.get_or_init(|| context.progress.task("simulate", all))
             .advance(1);
     };
-    let report = run(config, existing, &progress, &context.interrupt)?;
+    let report = write_drive(config, existing, &progress, &context.interrupt)?;
     drop(task);
     let rows = [
         ("folder", report.folder.display().to_string()),
@@ -149,8 +87,36 @@ pub fn run_with_progress(
         .collect())
 }
 
+/// Simulates a drive and writes what is missing of it. `progress` gets the number of finished
+/// scans and that of all. On an interrupt, the current scans are finished and the rest is left for
+/// the next run.
+fn write_drive(
+    config: &SimulationConfig,
+    existing: Existing,
+    progress: &(dyn Fn(usize, usize) + Sync),
+    interrupt: &Interrupt,
+) -> Result<SimulationReport> {
+    let simulation = prepare(config)?;
+    let folder = config.drive_folder();
+    let kept = if resolve_existing(config, &simulation, existing)? {
+        simulation.frames()
+    } else {
+        write_constants(config, &simulation)?;
+        let kept = write_scans(&simulation, &folder, progress, interrupt)?;
+        write_tables(&simulation, &folder)?;
+        kept
+    };
+    Ok(SimulationReport {
+        frames: simulation.frames(),
+        kept,
+        triangles: simulation.street.surface.mesh.triangles.len(),
+        driven_m: length_m(&simulation.poses()),
+        folder,
+    })
+}
+
 /// The street and the drive of a configuration, without writing anything.
-pub fn prepare(config: &SimulationConfig) -> Result<Simulation> {
+fn prepare(config: &SimulationConfig) -> Result<Simulation> {
     let recorded = match &config.path_pose_file {
         Some(pose_file) => Some(recorded_path(pose_file, config.path_calib_file.as_deref())?),
         None => None,
@@ -165,82 +131,91 @@ fn recorded_path(pose_file: &Path, calib_file: Option<&Path>) -> Result<Vec<Pose
     Ok(CameraPoses::read(pose_file)?.map_from_lidar(&calibration))
 }
 
-/// What lies in the folder of a drive.
-enum State {
+/// Applies `existing` to the folder of the drive; returns whether a complete drive is kept.
+fn resolve_existing(
+    config: &SimulationConfig,
+    simulation: &Simulation,
+    existing: Existing,
+) -> Result<bool> {
+    let folder = config.drive_folder();
+    let name = folder.display();
+    match (folder_state(config, simulation)?, existing) {
+        (_, Existing::Replace) => remove_drive(&folder)?,
+        (FolderState::Empty | FolderState::Incomplete, _) => {}
+        (FolderState::Complete, _) => return Ok(true),
+        (FolderState::Foreign, _) => {
+            bail!("{name} contains other files or a drive of another configuration; {REMEDY}")
+        }
+        (FolderState::Outdated, Existing::Keep) => {
+            bail!("{name} was written by another build of the program and may differ; {REMEDY}")
+        }
+        (FolderState::Outdated, Existing::Renew) => {
+            tracing::info!("{name} was written by another build of the program and is replaced");
+            remove_drive(&folder)?;
+        }
+    }
+    Ok(false)
+}
+
+/// Contents of the folder of a drive.
+enum FolderState {
     Empty,
-    /// A part of this very drive.
-    Interrupted,
-    /// All of this very drive.
+    /// A part of this drive.
+    Incomplete,
+    /// All of this drive.
     Complete,
-    /// This drive, or a part of it, as a program of other source made it.
+    /// All or a part of this drive, written by another executable.
     Outdated,
     /// Anything else.
     Foreign,
 }
 
-fn state_of(config: &SimulationConfig, simulation: &Simulation) -> Result<State> {
+fn folder_state(config: &SimulationConfig, simulation: &Simulation) -> Result<FolderState> {
     let folder = config.drive_folder();
-    let Ok(mut entries) = fs::read_dir(&folder) else {
-        return Ok(State::Empty);
-    };
-    let Ok(text) = fs::read_to_string(folder.join("simulation.yml")) else {
-        let is_empty = entries.next().is_none();
-        return Ok(if is_empty {
-            State::Empty
-        } else {
-            State::Foreign
-        });
-    };
-    let Ok(found) = serde_yaml::from_str::<SimulationConfig>(&text) else {
-        return Ok(State::Foreign);
-    };
-    if recipe_anywhere(&found)? != recipe_anywhere(config)? {
-        return Ok(State::Foreign);
+    if fs::read_dir(&folder).map_or(true, |mut entries| entries.next().is_none()) {
+        return Ok(FolderState::Empty);
     }
-    let paths = |config: &SimulationConfig| {
-        let SimulationConfig {
-            path_pose_file,
-            path_calib_file,
-            ..
-        } = config.clone();
-        [path_pose_file, path_calib_file]
+    let text = fs::read_to_string(folder.join("simulation.yml")).ok();
+    let found = text.and_then(|text| serde_yaml::from_str::<SimulationConfig>(&text).ok());
+    let Some(found) = found else {
+        return Ok(FolderState::Foreign);
     };
-    let is_same_path = paths(&found) == paths(config);
+    let is_same_path = found.path_pose_file == config.path_pose_file
+        && found.path_calib_file == config.path_calib_file;
+    // The drive and its recorded path may have been moved.
+    let moved = SimulationConfig {
+        output_folder: config.output_folder.clone(),
+        path_pose_file: config.path_pose_file.clone(),
+        path_calib_file: config.path_calib_file.clone(),
+        ..found
+    };
+    if moved != *config {
+        return Ok(FolderState::Foreign);
+    }
     let executable = version::executable_hash()?;
-    let is_same_source =
+    let is_same_executable =
         fs::read(folder.join(EXECUTABLE_FILE)).is_ok_and(|by| by == executable.as_bytes());
     Ok(match fs::read(folder.join("poses.txt")) {
-        // Other source may drive along another path.
-        _ if !is_same_source && is_same_path => State::Outdated,
-        // A recorded path is the same where the drive follows it, wherever it lies.
-        Ok(poses) if poses != poses_text(simulation)? => State::Foreign,
-        Ok(_) if !is_same_source => State::Outdated,
-        Ok(_) if is_whole(&folder, simulation.frames()) => State::Complete,
-        Ok(_) => State::Interrupted,
-        Err(_) if is_same_path => State::Interrupted,
-        Err(_) => State::Foreign,
+        // Another executable may follow another path.
+        _ if !is_same_executable && is_same_path => FolderState::Outdated,
+        // A recorded path is the same if its poses are, wherever its file is.
+        Ok(poses) if poses != poses_text(simulation)? => FolderState::Foreign,
+        Ok(_) if !is_same_executable => FolderState::Outdated,
+        Ok(_) if has_all_files(&folder, simulation.frames()) => FolderState::Complete,
+        Ok(_) => FolderState::Incomplete,
+        Err(_) if is_same_path => FolderState::Incomplete,
+        Err(_) => FolderState::Foreign,
     })
 }
 
-/// What a drive follows from, wherever it and its recorded path lie.
-fn recipe_anywhere(config: &SimulationConfig) -> Result<String> {
-    let nowhere = SimulationConfig {
-        output_folder: PathBuf::new(),
-        path_pose_file: None,
-        path_calib_file: None,
-        ..config.clone()
-    };
-    serde_yaml::to_string(&nowhere).context("writing the configuration as YAML")
-}
-
-/// What `poses.txt` has.
+/// Contents of `poses.txt`.
 fn poses_text(simulation: &Simulation) -> Result<Vec<u8>> {
     let mut text = Vec::new();
     write_kitti(&mut text, &simulation.poses(), &map_frame())?;
     Ok(text)
 }
 
-/// The frame of the poses of a drive; its world frame is that of the street.
+/// The frame of the written poses: the world frame of the street.
 fn map_frame() -> MapFrame {
     MapFrame {
         calibration: calibration(),
@@ -248,21 +223,24 @@ fn map_frame() -> MapFrame {
     }
 }
 
-/// Whether every file of a drive is there.
-fn is_whole(folder: &Path, frames: usize) -> bool {
-    let tables = ["street.ply", "calib.txt", "times.txt", "odometry.txt"].map(str::to_owned);
-    let scans = (0..frames).flat_map(|frame| {
-        [
-            format!("velodyne/{frame:06}.bin"),
-            format!("labels/{frame:06}.label"),
-        ]
-    });
-    (tables.into_iter().chain(scans)).all(|name| folder.join(name).exists())
+fn has_all_files(folder: &Path, frames: usize) -> bool {
+    let tables = ["street.ply", "calib.txt", "times.txt", "odometry.txt"];
+    let mut scans = (0..frames).flat_map(|frame| scan_files(folder, frame));
+    tables.iter().all(|name| folder.join(name).exists()) && scans.all(|path| path.exists())
 }
 
-/// Removes what a drive consists of, and nothing else; `poses.txt` first. What says how it was made
-/// stays and is written over, so that a folder that is half cleared is still known for what it is.
-fn clear(folder: &Path) -> Result<()> {
+/// Paths of the points and of the labels of a scan.
+fn scan_files(folder: &Path, frame: usize) -> [PathBuf; 2] {
+    [
+        folder.join(format!("velodyne/{frame:06}.bin")),
+        folder.join(format!("labels/{frame:06}.label")),
+    ]
+}
+
+/// Removes the files of a drive and nothing else, `poses.txt` first. The configuration and the
+/// executable's hash are kept and overwritten later, so that a folder that is half removed is
+/// still recognized.
+fn remove_drive(folder: &Path) -> Result<()> {
     let mut paths = ["poses.txt", "street.ply"]
         .map(|name| folder.join(name))
         .to_vec();
@@ -280,40 +258,46 @@ fn clear(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Writes the scans that are missing; returns how many were there.
+/// Writes what does not depend on the scans: configuration, executable's hash and street.
+fn write_constants(config: &SimulationConfig, simulation: &Simulation) -> Result<()> {
+    let folder = config.drive_folder();
+    let yaml = serde_yaml::to_string(config).context("cannot write the configuration as YAML")?;
+    output::write_text(&folder.join("simulation.yml"), &yaml)?;
+    output::write_text(&folder.join(EXECUTABLE_FILE), version::executable_hash()?)?;
+    output::replace(&folder.join("street.ply"), |path| {
+        Ok(ply::write(path, &simulation.street_in_map())?)
+    })
+}
+
+/// Writes the scans that are missing; returns the number of those that are not.
 fn write_scans(
     simulation: &Simulation,
     folder: &Path,
     progress: &(dyn Fn(usize, usize) + Sync),
     interrupt: &Interrupt,
 ) -> Result<usize> {
+    let frames = simulation.frames();
     let done = AtomicUsize::new(0);
     let kept = AtomicUsize::new(0);
-    (0..simulation.frames())
-        .into_par_iter()
-        .try_for_each(|frame| -> Result<()> {
-            if interrupt.requested() {
-                return Ok(());
-            }
-            let scan_path = folder.join(format!("velodyne/{frame:06}.bin"));
-            let label_path = folder.join(format!("labels/{frame:06}.label"));
-            if scan_path.exists() && label_path.exists() {
-                kept.fetch_add(1, Ordering::Relaxed);
-            } else {
-                let labelled = simulation.scan(frame);
-                write_file(&label_path, |file| write_labels(file, &labelled.classes))?;
-                write_file(&scan_path, |file| write_scan(file, &labelled.scan))?;
-            }
-            progress(
-                done.fetch_add(1, Ordering::Relaxed) + 1,
-                simulation.frames(),
-            );
-            Ok(())
-        })?;
-    let (done, frames) = (done.into_inner(), simulation.frames());
+    (0..frames).into_par_iter().try_for_each(|frame| {
+        if interrupt.requested() {
+            return Ok(());
+        }
+        let [scan_path, label_path] = scan_files(folder, frame);
+        if scan_path.exists() && label_path.exists() {
+            kept.fetch_add(1, Ordering::Relaxed);
+        } else {
+            let labelled = simulation.scan(frame);
+            write_file(&label_path, |file| write_labels(file, &labelled.classes))?;
+            write_file(&scan_path, |file| write_scan(file, &labelled.scan))?;
+        }
+        progress(done.fetch_add(1, Ordering::Relaxed) + 1, frames);
+        anyhow::Ok(())
+    })?;
+    let done = done.into_inner();
     if done < frames {
         let kept = format!(
-            "{done} of {frames} scans are kept in {}; the same command goes on from there",
+            "{done} of {frames} scans are kept in {}; the same command continues from there",
             folder.display()
         );
         return Err(Interrupted { kept }.into());
@@ -321,19 +305,22 @@ fn write_scans(
     Ok(kept.into_inner())
 }
 
-fn write_poses(simulation: &Simulation, folder: &Path, poses: &[Pose3]) -> Result<()> {
-    let frame = map_frame();
-    let write_poses = |name: &str, poses: &[Pose3]| {
-        write_file(&folder.join(name), |file| write_kitti(file, poses, &frame))
-    };
-    write_file(&folder.join("calib.txt"), |file| {
-        frame.calibration.write(file)
-    })?;
+/// Writes calibration, times, odometry and, last, the poses.
+fn write_tables(simulation: &Simulation, folder: &Path) -> Result<()> {
+    write_file(&folder.join("calib.txt"), |file| calibration().write(file))?;
+    let times_s = simulation.times_s();
     write_file(&folder.join("times.txt"), |file| {
-        write_times(file, &simulation.times_s())
+        write_times(file, &times_s)
     })?;
-    write_poses("odometry.txt", &simulation.odometry())?;
-    write_poses("poses.txt", poses)
+    for (name, poses) in [
+        ("odometry.txt", simulation.odometry()),
+        ("poses.txt", simulation.poses()),
+    ] {
+        write_file(&folder.join(name), |file| {
+            write_kitti(file, &poses, &map_frame())
+        })?;
+    }
+    Ok(())
 }
 
 fn length_m(poses: &[Pose3]) -> f64 {

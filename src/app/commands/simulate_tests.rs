@@ -1,4 +1,4 @@
-//! Laws of simulated drives on the disk: same bytes, kept or made anew, read back as promised.
+//! Laws of simulated drives on disk: reproducible bytes, kept or replaced, frames as documented.
 
 use approx::assert_relative_eq;
 
@@ -10,11 +10,7 @@ fn small(folder: &Path) -> SimulationConfig {
     SimulationConfig {
         output_folder: folder.to_owned(),
         n_scans: 6,
-        path: vec![PathSegment {
-            length_m: 30.0,
-            turn_deg: 20.0,
-            grade_percent: 2.0,
-        }],
+        path: vec![PathSegment::new(30.0, 20.0, 2.0)],
         scanner: ScannerConfig {
             beams: 16,
             azimuth_steps: 90,
@@ -24,11 +20,11 @@ fn small(folder: &Path) -> SimulationConfig {
     }
 }
 
-fn quietly(config: &SimulationConfig, existing: Existing) -> Result<SimulationReport> {
-    run(config, existing, &|_, _| {}, &Interrupt::default())
+fn simulate(config: &SimulationConfig, existing: Existing) -> Result<SimulationReport> {
+    write_drive(config, existing, &|_, _| {}, &Interrupt::default())
 }
 
-/// Every file of a drive with its bytes, except the recipe, which names the folder.
+/// Every file of a drive with its bytes, except the configuration, which names the folder.
 fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let mut files = Vec::new();
     for part in ["", "velodyne", "labels"] {
@@ -52,7 +48,7 @@ fn the_same_seed_gives_the_same_bytes_at_any_number_of_threads() {
             .num_threads(threads)
             .build()
             .unwrap();
-        pool.install(|| quietly(&small(folder.path()), Existing::Keep))
+        pool.install(|| simulate(&small(folder.path()), Existing::Keep))
             .unwrap();
         contents(&folder.path().join("drive_1"))
     });
@@ -62,24 +58,24 @@ fn the_same_seed_gives_the_same_bytes_at_any_number_of_threads() {
 }
 
 #[test]
-fn an_interrupted_drive_goes_on_and_ends_with_the_same_bytes() {
+fn an_interrupted_drive_is_completed_with_the_same_bytes() {
     let folder = tempfile::tempdir().unwrap();
     let config = small(folder.path());
     let drive = config.drive_folder();
-    assert_eq!(quietly(&config, Existing::Keep).unwrap().kept, 0);
+    assert_eq!(simulate(&config, Existing::Keep).unwrap().kept, 0);
     let whole = contents(&drive);
     // As after a crash in the middle: no poses yet, scans missing, one half written.
     fs::remove_file(drive.join("poses.txt")).unwrap();
     fs::remove_file(drive.join("velodyne/000004.bin")).unwrap();
     fs::remove_file(drive.join("velodyne/000005.bin")).unwrap();
     fs::write(drive.join("velodyne/.fpmcl-1.part"), [1, 2, 3]).unwrap();
-    assert_eq!(quietly(&config, Existing::Keep).unwrap().kept, 4);
+    assert_eq!(simulate(&config, Existing::Keep).unwrap().kept, 4);
     fs::remove_file(drive.join("velodyne/.fpmcl-1.part")).unwrap();
     assert_eq!(contents(&drive), whole);
 }
 
 #[test]
-fn an_interrupt_keeps_the_scans_that_are_done_and_says_how_many() {
+fn an_interrupt_keeps_the_finished_scans_and_reports_their_number() {
     let folder = tempfile::tempdir().unwrap();
     let config = small(folder.path());
     let interrupt = Interrupt::default();
@@ -92,43 +88,44 @@ fn an_interrupt_keeps_the_scans_that_are_done_and_says_how_many() {
         .num_threads(1)
         .build()
         .unwrap();
-    let stopped = one_thread.install(|| run(&config, Existing::Keep, &after_two, &interrupt));
+    let stopped =
+        one_thread.install(|| write_drive(&config, Existing::Keep, &after_two, &interrupt));
     let message = stopped.unwrap_err().to_string();
     assert!(message.contains("2 of 6 scans are kept"), "{message}");
     assert!(!config.drive_folder().join("poses.txt").exists());
-    assert_eq!(quietly(&config, Existing::Keep).unwrap().kept, 2);
+    assert_eq!(simulate(&config, Existing::Keep).unwrap().kept, 2);
 }
 
 #[test]
 fn what_exists_is_kept_without_force_and_replaced_with_it() {
     let folder = tempfile::tempdir().unwrap();
     let config = small(folder.path());
-    quietly(&config, Existing::Keep).unwrap();
+    simulate(&config, Existing::Keep).unwrap();
     let before = contents(&config.drive_folder());
-    assert_eq!(quietly(&config, Existing::Keep).unwrap().kept, 6);
+    assert_eq!(simulate(&config, Existing::Keep).unwrap().kept, 6);
 
     let mut other = config.clone();
     other.seed = 2;
     other.n_scans = 3;
-    let message = quietly(&other, Existing::Keep).unwrap_err().to_string();
+    let message = simulate(&other, Existing::Keep).unwrap_err().to_string();
     assert!(message.contains("--force"), "{message}");
     assert_eq!(contents(&config.drive_folder()), before);
 
-    quietly(&other, Existing::Replace).unwrap();
+    simulate(&other, Existing::Replace).unwrap();
     let after = contents(&config.drive_folder());
     assert_eq!(after.len(), 6 + 2 * 3, "scans of the old drive are gone");
 }
 
 #[test]
-fn a_drive_that_other_source_made_is_told_or_made_anew() {
+fn a_drive_of_another_executable_is_reported_or_replaced() {
     let folder = tempfile::tempdir().unwrap();
     let config = small(folder.path());
     let drive = config.drive_folder();
-    quietly(&config, Existing::Keep).unwrap();
+    simulate(&config, Existing::Keep).unwrap();
     let whole = contents(&drive);
     let age = || fs::write(drive.join("executable.txt"), "another").unwrap();
     let make_old_scan = || fs::write(drive.join("velodyne/000002.bin"), [0; 16]).unwrap();
-    assert_eq!(quietly(&config, Existing::Renew).unwrap().kept, 6);
+    assert_eq!(simulate(&config, Existing::Renew).unwrap().kept, 6);
 
     for is_complete in [true, false] {
         age();
@@ -136,40 +133,40 @@ fn a_drive_that_other_source_made_is_told_or_made_anew() {
         if !is_complete {
             fs::remove_file(drive.join("poses.txt")).unwrap();
         }
-        let message = quietly(&config, Existing::Keep).unwrap_err().to_string();
-        for told in ["another build", "remove that folder", "--force"] {
-            assert!(message.contains(told), "{message}");
+        let message = simulate(&config, Existing::Keep).unwrap_err().to_string();
+        for expected in ["another build", "remove that folder", "--force"] {
+            assert!(message.contains(expected), "{message}");
         }
-        assert_eq!(quietly(&config, Existing::Renew).unwrap().kept, 0);
+        assert_eq!(simulate(&config, Existing::Renew).unwrap().kept, 0);
         assert_eq!(contents(&drive), whole);
     }
-    // As it was before drives said what made them.
+    // A drive without the hash of its executable.
     fs::remove_file(drive.join("executable.txt")).unwrap();
-    assert_eq!(quietly(&config, Existing::Renew).unwrap().kept, 0);
+    assert_eq!(simulate(&config, Existing::Renew).unwrap().kept, 0);
 
-    // Of another configuration it is not for a comparison to replace it.
+    // A comparison does not replace a drive of another configuration.
     age();
     let other = SimulationConfig { seed: 2, ..config };
-    let message = quietly(&other, Existing::Renew).unwrap_err().to_string();
+    let message = simulate(&other, Existing::Renew).unwrap_err().to_string();
     assert!(message.contains("another configuration"), "{message}");
     assert!(message.contains("remove that folder"), "{message}");
 }
 
 #[test]
-fn a_drive_of_which_only_the_poses_are_left_is_made_again() {
+fn a_drive_of_which_only_the_poses_are_left_is_completed() {
     let folder = tempfile::tempdir().unwrap();
     let config = small(folder.path());
     let drive = config.drive_folder();
-    quietly(&config, Existing::Keep).unwrap();
+    simulate(&config, Existing::Keep).unwrap();
     let whole = contents(&drive);
     for part in ["velodyne/000002.bin", "labels/000003.label", "odometry.txt"] {
         fs::remove_file(drive.join(part)).unwrap();
     }
-    assert_eq!(quietly(&config, Existing::Keep).unwrap().kept, 4);
+    assert_eq!(simulate(&config, Existing::Keep).unwrap().kept, 4);
     assert_eq!(contents(&drive), whole);
     fs::remove_dir_all(drive.join("velodyne")).unwrap();
     fs::remove_dir_all(drive.join("labels")).unwrap();
-    assert_eq!(quietly(&config, Existing::Keep).unwrap().kept, 0);
+    assert_eq!(simulate(&config, Existing::Keep).unwrap().kept, 0);
     assert_eq!(contents(&drive), whole);
 }
 
@@ -189,7 +186,7 @@ fn a_drive_that_was_moved_is_kept_and_one_along_another_path_is_not() {
         path: Vec::new(),
         ..small(&folder.path().join("here"))
     };
-    quietly(&here, Existing::Keep).unwrap();
+    simulate(&here, Existing::Keep).unwrap();
     fs::rename(folder.path().join("here"), folder.path().join("there")).unwrap();
     let moved_poses = folder.path().join("moved.txt");
     fs::rename(&poses, &moved_poses).unwrap();
@@ -198,14 +195,14 @@ fn a_drive_that_was_moved_is_kept_and_one_along_another_path_is_not() {
         path_pose_file: Some(moved_poses.clone()),
         ..here
     };
-    assert_eq!(quietly(&there, Existing::Keep).unwrap().kept, 6);
+    assert_eq!(simulate(&there, Existing::Keep).unwrap().kept, 6);
     fs::write(&moved_poses, straight(2.7)).unwrap();
-    let message = quietly(&there, Existing::Keep).unwrap_err().to_string();
+    let message = simulate(&there, Existing::Keep).unwrap_err().to_string();
     assert!(message.contains("--force"), "{message}");
 }
 
 #[test]
-fn drives_are_read_back_in_the_frames_that_the_documentation_promises() {
+fn drives_are_read_back_in_the_documented_frames() {
     let folder = tempfile::tempdir().unwrap();
     let mapping = small(folder.path());
     let query = SimulationConfig {
@@ -213,7 +210,7 @@ fn drives_are_read_back_in_the_frames_that_the_documentation_promises() {
         ..mapping.clone()
     };
     let [map, query] = [mapping, query].map(|config| {
-        quietly(&config, Existing::Keep).unwrap();
+        simulate(&config, Existing::Keep).unwrap();
         let drive = config.drive_folder();
         let sequence = Sequence::open(
             &drive.join("velodyne"),
@@ -241,11 +238,11 @@ fn drives_are_read_back_in_the_frames_that_the_documentation_promises() {
 }
 
 #[test]
-fn a_missing_pose_file_is_told_by_name() {
+fn a_missing_calibration_is_reported_with_its_key() {
     let folder = tempfile::tempdir().unwrap();
     let mut config = small(folder.path());
     config.path_pose_file = Some(folder.path().join("07.txt"));
-    let message = format!("{:#}", quietly(&config, Existing::Keep).unwrap_err());
+    let message = format!("{:#}", simulate(&config, Existing::Keep).unwrap_err());
     assert!(message.contains("calib.txt"), "{message}");
     assert!(message.contains("path_calib_file"), "{message}");
 }

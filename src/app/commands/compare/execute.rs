@@ -172,7 +172,7 @@ fn simulate_drives(run: &PlannedRun, layout: &Layout, context: &Context) -> Resu
     let folder = layout.root.join("sequences");
     let _alone = shared::lock(&folder, &run.id.sequence)?;
     for drive in drives {
-        simulate::run_with_progress(drive, Existing::Renew, context)?;
+        simulate::run(drive, Existing::Renew, context)?;
     }
     Ok(())
 }
