@@ -8,7 +8,7 @@ use anyhow::{Context as _, Result, bail};
 use super::output;
 use crate::app::plotting::color::{MCL, REFINED, Rgb};
 use crate::app::plotting::{
-    Animation, ErrorPlot, LineChart, LocalizationPicture, MapImage, MapPlot, Panel, Path2,
+    Animation, ErrorPlot, LineChart, LocalizationPicture, MapImage, MapPlot, NamedPath, Panel,
     PathPlot, RangeImageStrip, RuntimePlot, Series, map_plot,
 };
 use crate::app::results::{
@@ -222,8 +222,8 @@ pub fn draw_run(
     let image = mesh.map(|mesh| MapImage::of_colors(mesh, MAP_CELLS));
     let truth = results.ground_truth.as_deref();
     let estimates = results.estimates.as_deref().unwrap_or_default();
-    let mut paths = vec![Path2::mcl(estimates)];
-    paths.extend(results.refined.as_deref().map(Path2::refined));
+    let mut paths = vec![NamedPath::mcl(estimates)];
+    paths.extend(results.refined.as_deref().map(NamedPath::refined));
     PathPlot {
         title: "Path against ground truth",
         ground_truth: truth,
@@ -288,7 +288,6 @@ fn draw_runtimes(files: &RunFiles, results: &LocalizationResults) -> Result<()> 
         title: "Runtime per frame",
         frames: &results.frames,
         stages: &stages,
-        converged_row: None,
     }
     .save(&files.plot("runtime.png")?)?;
     Ok(())

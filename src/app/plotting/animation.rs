@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use anyhow::{Context as _, Result, ensure};
 use rayon::prelude::*;
 
 use super::bitmap::Bitmap;
-use super::error::PlotError;
 use crate::app::output::write_atomically;
 
 /// Settings of an animated GIF.
@@ -33,26 +33,26 @@ impl Default for Animation {
 
 impl Animation {
     /// Writes a GIF that repeats forever from PNG files, all of one size.
-    pub fn save(&self, path: &Path, pictures: &[PathBuf]) -> Result<(), PlotError> {
+    pub fn save(&self, path: &Path, pictures: &[PathBuf]) -> Result<()> {
         let chosen = self.choose(pictures);
+        ensure!(
+            !chosen.is_empty(),
+            "cannot write {}: there are no pictures to animate",
+            path.display()
+        );
         let frames = chosen
             .par_iter()
             .map(|picture| self.frame(picture, chosen.len()))
-            .collect::<Result<Vec<gif::Frame>, PlotError>>()?;
-        let first = frames.first().ok_or_else(|| PlotError::Nothing {
-            path: path.to_owned(),
-            what: "there are no pictures to animate",
-        })?;
-        write_atomically(path, |file| {
-            let mut encoder = gif::Encoder::new(file, first.width, first.height, &[])?;
+            .collect::<Result<Vec<gif::Frame>>>()?;
+        write_atomically(path, |file| -> Result<()> {
+            let mut encoder = gif::Encoder::new(file, frames[0].width, frames[0].height, &[])?;
             encoder.set_repeat(gif::Repeat::Infinite)?;
-            let mut frames = frames.iter();
-            frames.try_for_each(|frame| encoder.write_lzw_pre_encoded_frame(frame))
+            for frame in &frames {
+                encoder.write_lzw_pre_encoded_frame(frame)?;
+            }
+            Ok(())
         })
-        .map_err(|source: gif::EncodingError| PlotError::Write {
-            path: path.to_owned(),
-            source: std::io::Error::other(source),
-        })
+        .with_context(|| format!("cannot write {}", path.display()))
     }
 
     fn choose<'a>(&self, pictures: &'a [PathBuf]) -> Vec<&'a PathBuf> {
@@ -63,13 +63,11 @@ impl Animation {
     }
 
     /// Reads, scales, quantizes and compresses one of `count` pictures.
-    fn frame(&self, picture: &Path, count: usize) -> Result<gif::Frame<'static>, PlotError> {
+    fn frame(&self, picture: &Path, count: usize) -> Result<gif::Frame<'static>> {
         // The fastest search for a palette; our pictures have few colors.
         const SPEED: i32 = 30;
-        let mut image = Bitmap::read_png(picture).map_err(|source| PlotError::Read {
-            path: picture.to_owned(),
-            source,
-        })?;
+        let mut image = Bitmap::read_png(picture)
+            .with_context(|| format!("cannot read {}", picture.display()))?;
         if image.width > self.width {
             let height = (image.height * self.width).div_ceil(image.width);
             image = image.resized(self.width, height);

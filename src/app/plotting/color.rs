@@ -1,21 +1,21 @@
-//! Colours: of trajectories, fixed so that every picture means the same by them, and of scalars.
+//! Colors: fixed ones of trajectories, the same in every picture, and colormaps of numbers.
 //!
-//! The palette is that of Okabe and Ito (2008), which people with colour-blindness can tell
-//! apart. Scalars are shown by viridis (van der Walt and Smith, 2015), whose lightness grows
-//! evenly, differences by ColorBrewer's red and blue (Brewer 1994), white at zero.
+//! The palette is that of Okabe and Ito (2008), which people with color blindness can distinguish.
+//! Magnitudes have the colormap viridis (van der Walt and Smith 2015), whose lightness increases
+//! uniformly, differences ColorBrewer's red and blue (Brewer 1994), white at zero.
 
-/// Red, green, blue.
+/// Red, green and blue, 0 to 255.
 pub type Rgb = [u8; 3];
 
-/// The ground truth.
+/// Color of the ground truth.
 pub const TRUTH: Rgb = [30, 30, 30];
-/// The filter's estimate.
+/// Color of the estimates of the filter.
 pub const MCL: Rgb = [213, 94, 0];
-/// The refined trajectory.
+/// Color of the refined trajectory.
 pub const REFINED: Rgb = [0, 114, 178];
-/// Odometry alone.
+/// Color of odometry.
 pub const ODOMETRY: Rgb = [204, 121, 167];
-/// Further series, in this order.
+/// Colors of further series, in this order.
 pub const SERIES: [Rgb; 6] = [
     REFINED,
     MCL,
@@ -24,7 +24,7 @@ pub const SERIES: [Rgb; 6] = [
     [86, 180, 233],
     [230, 159, 0],
 ];
-/// Where nothing is known: a pixel without a return, a vertex without a value.
+/// Color of unknown values: a pixel without a return, a vertex without a value.
 pub const MISSING: Rgb = [150, 150, 150];
 
 pub(super) const WHITE: Rgb = [255, 255, 255];
@@ -32,7 +32,7 @@ pub(super) const INK: Rgb = [40, 40, 40];
 pub(super) const GRID: Rgb = [226, 226, 226];
 pub(super) const FRAME: Rgb = [120, 120, 120];
 
-/// Which colours stand for a scalar.
+/// Mapping of numbers to colors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Colormap {
     /// Dark to light, for magnitudes.
@@ -67,7 +67,7 @@ const DIVERGING: [Rgb; 9] = [
 ];
 
 impl Colormap {
-    /// The colour of a share, 0 to 1; beyond, that of the end. [`MISSING`] where it is NaN.
+    /// Color of a share, clamped to 0 to 1; [`MISSING`] for NaN.
     pub fn at(self, share: f64) -> Rgb {
         let anchors: &[Rgb] = match self {
             Self::Viridis => &VIRIDIS,
@@ -83,7 +83,7 @@ impl Colormap {
     }
 }
 
-/// The colour at a share of the way from one to another.
+/// Linear interpolation between two colors.
 pub(super) fn blend(from: Rgb, to: Rgb, share: f64) -> Rgb {
     std::array::from_fn(|channel| {
         let (from, to) = (f64::from(from[channel]), f64::from(to[channel]));
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn viridis_grows_lighter_all_the_way() {
+    fn the_lightness_of_viridis_increases_monotonically() {
         let lights: Vec<f64> = (0..=100)
             .map(|percent| lightness(Colormap::Viridis.at(f64::from(percent) / 100.0)))
             .collect();
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn differences_are_white_at_zero_and_as_dark_on_both_sides() {
+    fn differences_are_white_at_zero_and_equally_dark_on_both_sides() {
         let middle = lightness(Colormap::Diverging.at(0.5));
         assert!(middle > 240.0);
         for share in [0.0, 0.2, 0.4] {
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_has_the_colour_of_nothing() {
+    fn nan_has_the_color_of_missing_values() {
         assert_eq!(Colormap::Viridis.at(f64::NAN), MISSING);
         assert_eq!(Colormap::Viridis.at(-3.0), VIRIDIS[0]);
         assert_eq!(Colormap::Viridis.at(f64::INFINITY), VIRIDIS[9]);

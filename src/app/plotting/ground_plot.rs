@@ -1,71 +1,85 @@
-//! A scan from above: what was called ground, and where that is wrong.
+//! Ground classification of a scan from above, with its errors.
 
 use std::path::Path;
 
+use anyhow::{Result, ensure};
 use glam::Vec3;
 
+use super::bitmap::Bitmap;
 use super::color::Rgb;
-use super::error::PlotError;
-use super::sheet;
-use super::trajectory::map_view;
-use super::view::{Key, KeyShape, Span, legend, title};
+use super::sheet::save_png;
+use super::top_view::TopView;
+use super::view::{AxisRange, LegendEntry, Mark};
 
-/// Called ground, rightly so.
+/// Color of points correctly classified as ground.
 const GROUND: Rgb = [0, 158, 115];
-/// Called something else, rightly so.
+/// Color of points correctly classified as not ground.
 const REST: Rgb = [220, 60, 40];
-/// Ground that was missed.
+/// Color of ground points that were missed.
 const MISSED: Rgb = [0, 60, 220];
-/// Something else that was called ground.
+/// Color of other points that were classified as ground.
 const FALSE: Rgb = [20, 20, 20];
-/// Points that no class tells right or wrong of are paler.
-const PALE: f64 = 0.35;
+/// Opacity of points whose true class is unknown.
+const UNKNOWN_ALPHA: f64 = 0.35;
 
-/// The points of a scan from above by what they were called: ground green and the rest red,
-/// errors larger and in colours of their own.
+/// Points of a scan from above, colored by class; errors are larger, in colors of their own.
 #[derive(Clone, Copy, Debug)]
 pub struct GroundPlot<'a> {
-    /// Above everything.
+    /// Title.
     pub title: &'a str,
-    /// Lidar frame [m].
+    /// Points in the lidar frame [m].
     pub points: &'a [Vec3],
-    /// Whether each point was called ground.
+    /// Whether each point was classified as ground.
     pub called_ground: &'a [bool],
-    /// Whether each point is ground; `None` where that is not known. Empty without labels.
+    /// Whether each point is ground; `None` where unknown. Empty without labels.
     pub truth: &'a [Option<bool>],
-    /// How far from the sensor the picture reaches, in both directions [m].
+    /// Visible distance from the sensor along x and along y [m].
     pub reach_m: (f64, f64),
 }
 
 impl GroundPlot<'_> {
     /// Writes the picture.
-    pub fn save(&self, path: &Path) -> Result<(), PlotError> {
-        self.check(path)?;
-        let (x_m, y_m) = self.reach_m;
-        let (x, y) = (Span::new(-x_m, x_m), Span::new(-y_m, y_m));
-        let (view, size) = map_view(x, y, 96.0, 30.0);
-        let key = |name: &str, color: Rgb| Key {
-            name: name.to_owned(),
-            color,
-            shape: KeyShape::Square,
-        };
-        let mut keys = vec![key("ground", GROUND), key("rest", REST)];
-        if !self.truth.is_empty() {
-            keys.push(key("missed ground", MISSED));
-            keys.push(key("falsely called ground", FALSE));
+    pub fn save(&self, path: &Path) -> Result<()> {
+        save_png(path, self.draw())
+    }
+
+    fn draw(&self) -> Result<Bitmap> {
+        let (points, answers, truths) = (self.points, self.called_ground, self.truth);
+        ensure!(
+            answers.len() == points.len(),
+            "{} answers where {} belong",
+            answers.len(),
+            points.len()
+        );
+        ensure!(
+            truths.is_empty() || truths.len() == points.len(),
+            "{} truths where {} belong",
+            truths.len(),
+            points.len()
+        );
+        let entry = |name: &str, color: Rgb| LegendEntry::new(name, color, Mark::Area);
+        let mut legend = vec![entry("ground", GROUND), entry("rest", REST)];
+        if !truths.is_empty() {
+            legend.push(entry("missed ground", MISSED));
+            legend.push(entry("false ground", FALSE));
         }
-        sheet::save(path, size, |sheet| {
-            title(sheet, self.title, view.rect.left)?;
-            legend(sheet, &keys, (view.rect.left, 70.0), view.rect.right)?;
-            view.grid(sheet)?;
+        let (x_m, y_m) = self.reach_m;
+        let view = TopView {
+            title: self.title,
+            legend,
+            x: AxisRange::new(-x_m, x_m),
+            y: AxisRange::new(-y_m, y_m),
+            color_bar: None,
+        };
+        view.draw(|sheet, view| {
             // Errors last, on top of everything.
             for errors in [false, true] {
-                for (index, point) in self.points.iter().enumerate() {
-                    let called = self.called_ground[index];
-                    let truth = self.truth.get(index).copied().flatten();
+                for (index, point) in points.iter().enumerate() {
+                    let called = answers[index];
+                    let truth = truths.get(index).copied().flatten();
                     let wrong = truth.is_some_and(|truth| truth != called);
                     let place = view.at(f64::from(point.x), f64::from(point.y));
-                    if wrong != errors || !view.rect.holds(place) {
+                    if wrong != errors || !view.rect.contains(place) {
                         continue;
                     }
                     let (color, radius) = match (wrong, called) {
@@ -74,43 +88,22 @@ impl GroundPlot<'_> {
                         (true, true) => (FALSE, 1.7),
                         (true, false) => (MISSED, 1.7),
                     };
-                    let unknown = !self.truth.is_empty() && truth.is_none();
-                    let alpha = if unknown { PALE } else { 1.0 };
+                    let unknown = !truths.is_empty() && truth.is_none();
+                    let alpha = if unknown { UNKNOWN_ALPHA } else { 1.0 };
                     sheet.dot(place, radius, color, alpha)?;
                 }
             }
-            view.frame(sheet, "x [m]", "y [m]")?;
-            view.scale_bar(sheet)
+            Ok(())
         })
-    }
-
-    fn check(&self, path: &Path) -> Result<(), PlotError> {
-        let expected = self.points.len();
-        let wrong_length = |what, found| {
-            Err(PlotError::WrongLength {
-                path: path.to_owned(),
-                what,
-                found,
-                expected,
-            })
-        };
-        if self.called_ground.len() != expected {
-            return wrong_length("answers", self.called_ground.len());
-        }
-        if !self.truth.is_empty() && self.truth.len() != expected {
-            return wrong_length("truths", self.truth.len());
-        }
-        Ok(())
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::bitmap::Bitmap;
     use super::*;
 
     #[test]
-    fn errors_are_shown_in_colours_of_their_own() {
+    fn errors_have_colors_of_their_own() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("scan.png");
         let points: Vec<Vec3> = (0..4)
@@ -144,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_that_is_missing_is_told() {
+    fn a_missing_answer_is_an_error() {
         let plot = GroundPlot {
             title: "",
             points: &[Vec3::ZERO; 2],
@@ -152,7 +145,7 @@ mod tests {
             truth: &[],
             reach_m: (10.0, 5.0),
         };
-        let message = plot.save(Path::new("scan.png")).unwrap_err().to_string();
+        let message = format!("{:#}", plot.save(Path::new("scan.png")).unwrap_err());
         assert!(message.contains("1 answers where 2 belong"), "{message}");
     }
 }

@@ -1,55 +1,50 @@
 //! The map from above as a raster: the highest triangle of each cell, shaded by its slope.
 
+use anyhow::Result;
 use glam::Vec3;
 
 use super::color::{MISSING, Rgb, WHITE, blend};
-use super::error::DrawError;
 use super::sheet::Sheet;
 use super::view::View;
 use crate::geometry::TriangleMesh;
 
-/// Where the light comes from: the upper left, steeply.
+/// Direction to the light: from the upper left, steep.
 const LIGHT: Vec3 = Vec3::new(-0.42, 0.42, 0.8);
 
-/// A raster over the x-y plane, rows from the top (largest y) down.
+/// Raster over the x-y plane, rows from the top (largest y) down.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MapImage {
-    /// Columns.
-    pub width: usize,
-    /// Rows.
-    pub height: usize,
+    /// Number of columns.
+    width: usize,
+    /// Number of rows.
+    height: usize,
     /// Left edge [m].
-    pub x_min: f64,
+    x_min: f64,
     /// Upper edge [m].
-    pub y_max: f64,
-    /// Edge of a cell [m].
-    pub cell_m: f64,
-    /// Colours, row by row; `None` where there is no surface.
-    pub cells: Vec<Option<Rgb>>,
+    y_max: f64,
+    /// Edge length of a cell [m].
+    cell_m: f64,
+    /// Colors, row by row; `None` where there is no surface.
+    cells: Vec<Option<Rgb>>,
 }
 
 impl MapImage {
-    /// The mesh in its own colours, grey where it has none, in at most `max_cells` columns and
-    /// rows.
+    /// Renders the mesh in its own colors, gray where it has none, with at most `max_cells`
+    /// columns and rows.
     pub fn of_colors(mesh: &TriangleMesh, max_cells: usize) -> Self {
         Self::render(mesh, max_cells, |triangle, weights| {
-            let Some(colors) = mesh.triangles[triangle]
-                .iter()
-                .map(|&vertex| mesh.colors.get(vertex as usize))
-                .collect::<Option<Vec<_>>>()
-            else {
+            if mesh.colors.len() != mesh.vertices.len() {
                 return MISSING;
-            };
+            }
+            let colors = mesh.triangles[triangle].map(|vertex| mesh.colors[vertex as usize]);
             std::array::from_fn(|channel| {
-                let parts = colors.iter().zip(weights);
-                parts
-                    .map(|(color, weight)| f32::from(color[channel]) * weight)
-                    .sum::<f32>() as u8
+                let channels = colors.map(|color| f32::from(color[channel]));
+                interpolated(channels, weights) as u8
             })
         })
     }
 
-    /// The mesh coloured by a number per vertex; `color` is asked with their interpolation.
+    /// Renders the mesh colored by a number per vertex; `color` maps the interpolated number.
     pub fn of_scalar(
         mesh: &TriangleMesh,
         values: &[f32],
@@ -58,17 +53,11 @@ impl MapImage {
     ) -> Self {
         Self::render(mesh, max_cells, |triangle, weights| {
             let corners = mesh.triangles[triangle].map(|vertex| values[vertex as usize]);
-            color(
-                corners
-                    .iter()
-                    .zip(weights)
-                    .map(|(value, weight)| value * weight)
-                    .sum(),
-            )
+            color(interpolated(corners, weights))
         })
     }
 
-    /// The highest surface of each cell, coloured by triangle and barycentric weights.
+    /// Renders the highest surface of each cell; `color` maps triangle and barycentric weights.
     fn render(
         mesh: &TriangleMesh,
         max_cells: usize,
@@ -110,7 +99,7 @@ impl MapImage {
     ) {
         let corners = mesh.corners(triangle);
         let shade = shade(mesh.scaled_normal(triangle));
-        // In units of cells, so that the centre of cell (column, row) is at + 0.5.
+        // In units of cells, so that the center of cell (column, row) is at + 0.5.
         let [a, b, c] = corners.map(|corner| {
             (
                 ((f64::from(corner.x) - self.x_min) / self.cell_m) as f32,
@@ -137,7 +126,7 @@ impl MapImage {
                 if weights.iter().any(|weight| *weight < -1e-4) {
                     continue;
                 }
-                let height_m: f32 = corners.iter().zip(weights).map(|(p, k)| p.z * k).sum();
+                let height_m = interpolated(corners.map(|corner| corner.z), weights);
                 let cell = row * self.width + column;
                 if height_m > tops[cell] {
                     tops[cell] = height_m;
@@ -147,8 +136,8 @@ impl MapImage {
         }
     }
 
-    /// The colour at a place; `None` where there is no surface.
-    pub fn at(&self, x: f64, y: f64) -> Option<Rgb> {
+    /// Color at a position; `None` where there is no surface.
+    fn at(&self, x: f64, y: f64) -> Option<Rgb> {
         let column = ((x - self.x_min) / self.cell_m).floor();
         let row = ((self.y_max - y) / self.cell_m).floor();
         let inside =
@@ -156,17 +145,23 @@ impl MapImage {
         inside.then(|| self.cells[row as usize * self.width + column as usize])?
     }
 
-    /// Draws the part that a view shows, mixed with white: 0 as it is, 1 invisible.
-    pub(super) fn draw(&self, sheet: &Sheet, view: &View, pale: f64) -> Result<(), DrawError> {
+    /// Draws the part inside a view, mixed with a share of white: 0 unchanged, 1 invisible.
+    pub(super) fn draw(&self, sheet: &Sheet, view: &View, whiteness: f64) -> Result<()> {
         sheet.pixels(&view.rect, |right, down| {
             let x = view.x.min + right * view.x.length();
             let y = view.y.max - down * view.y.length();
-            self.at(x, y).map(|color| blend(color, WHITE, pale))
+            self.at(x, y).map(|color| blend(color, WHITE, whiteness))
         })
     }
 }
 
-/// Brightness of a surface, whichever side of it is up.
+/// Sum of the weighted values.
+fn interpolated(values: [f32; 3], weights: [f32; 3]) -> f32 {
+    let weighted = values.iter().zip(weights);
+    weighted.map(|(value, weight)| value * weight).sum()
+}
+
+/// Brightness of a surface, independent of its orientation up or down.
 fn shade(scaled_normal: Vec3) -> f64 {
     let normal = scaled_normal.normalize_or(Vec3::Z);
     let up = if normal.z < 0.0 { -normal } else { normal };
@@ -177,7 +172,7 @@ fn shade(scaled_normal: Vec3) -> f64 {
 mod tests {
     use super::*;
 
-    /// A red floor of 10 m with a blue box of 2 m in its middle, given before the floor.
+    /// A red floor of 10 m with a blue box of 2 m in its center, stored before the floor.
     fn floor_and_box() -> TriangleMesh {
         let square = |half: f32, z: f32, color: Rgb| TriangleMesh {
             vertices: vec![
@@ -196,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_higher_hides_what_is_below_whatever_the_order() {
+    fn higher_surfaces_hide_lower_ones_in_any_order() {
         let image = MapImage::of_colors(&floor_and_box(), 100);
         let [red, _, blue] = image.at(0.0, 0.0).unwrap();
         assert!(blue > 150 && red == 0);
@@ -225,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn an_empty_mesh_is_an_image_of_nothing() {
+    fn an_empty_mesh_gives_an_empty_image() {
         let image = MapImage::of_colors(&TriangleMesh::default(), 100);
         assert!(image.cells.iter().all(Option::is_none));
     }

@@ -1,61 +1,54 @@
-//! The map from above, in its own colours or coloured by a number.
+//! The map from above, in its own colors or colored by a number.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use anyhow::{Result, ensure};
+
 use super::MapImage;
-use super::color::{Colormap, MISSING, Rgb, TRUTH};
-use super::error::PlotError;
-use super::sheet::{self, Pen, Rect, Sheet};
-use super::trajectory::{map_view, places};
-use super::view::{Key, KeyShape, Span, View, color_bar, legend, title};
+use super::bitmap::Bitmap;
+use super::color::{Colormap, MISSING, Rgb, TRUTH, WHITE};
+use super::sheet::{save_png, stroke};
+use super::top_view::{TopView, positions};
+use super::view::{AxisRange, ColorBar, LegendEntry, Mark};
 use crate::geometry::{Pose2, TriangleMesh};
 
-/// Columns or rows of the raster: as many as the picture is drawn with.
+/// Maximum number of columns and rows of the raster: the resolution of drawing.
 const RASTER: usize = 2500;
 
-/// The map from above, as its vertices are coloured.
+/// The map from above in the colors of its vertices.
 #[derive(Clone, Copy, Debug)]
 pub struct MapPlot<'a> {
-    /// Above everything.
+    /// Title.
     pub title: &'a str,
-    /// The map.
+    /// Map.
     pub mesh: &'a TriangleMesh,
-    /// A path with its name, where it is to be drawn.
+    /// Path to draw, with its name.
     pub path: Option<(&'a str, &'a [Pose2])>,
-    /// What the colours of the map are called.
+    /// Names of colors of the map.
     pub keys: &'a [(&'a str, Rgb)],
 }
 
 impl MapPlot<'_> {
     /// Writes the picture.
-    pub fn save(&self, path: &Path) -> Result<(), PlotError> {
-        let (x, y) = extent(self.mesh, path)?;
-        let image = MapImage::of_colors(self.mesh, RASTER);
-        let (view, size) = map_view(x, y, 96.0, 30.0);
-        let key = |name: &str, color: Rgb, shape: KeyShape| Key {
-            name: name.to_owned(),
-            color,
-            shape,
-        };
+    pub fn save(&self, path: &Path) -> Result<()> {
         let colors = self.keys.iter();
-        let colors = colors.map(|(name, color)| key(name, *color, KeyShape::Square));
-        let driven = self.path.map(|(name, _)| key(name, TRUTH, KeyShape::Line));
-        let keys: Vec<Key> = colors.chain(driven).collect();
-        sheet::save(path, size, |sheet| {
-            title(sheet, self.title, view.rect.left)?;
-            legend(sheet, &keys, (view.rect.left, 70.0), view.rect.right)?;
-            view.grid(sheet)?;
-            image.draw(sheet, &view, 0.0)?;
-            draw_trajectory(sheet, &view, self.path.map(|(_, poses)| poses))?;
-            view.frame(sheet, "x [m]", "y [m]")?;
-            view.scale_bar(sheet)
-        })
+        let colors = colors.map(|&(name, color)| LegendEntry::new(name, color, Mark::Area));
+        let driven = self
+            .path
+            .map(|(name, _)| LegendEntry::new(name, TRUTH, Mark::Line));
+        let legend = colors.chain(driven).collect();
+        let image = || MapImage::of_colors(self.mesh, RASTER);
+        let poses = self.path.map(|(_, poses)| poses);
+        save_png(
+            path,
+            draw(self.title, self.mesh, legend, None, image, poses),
+        )
     }
 }
 
-/// The most frequent colours of ground (more red than blue) and rest, by which a map from anywhere
-/// is told; none of a map without colours.
+/// Most frequent colors of ground (more red than blue) and of the rest, for the legend of a map
+/// from a file; none for a map without colors.
 pub fn ground_and_rest(mesh: &TriangleMesh) -> Vec<(&'static str, Rgb)> {
     let most_frequent = |is_ground: bool| {
         let mut counts = BTreeMap::<Rgb, usize>::new();
@@ -73,95 +66,91 @@ pub fn ground_and_rest(mesh: &TriangleMesh) -> Vec<(&'static str, Rgb)> {
         .collect()
 }
 
-/// The map from above, coloured by a number per vertex, such as a residual.
+/// The map from above, colored by a number per vertex, such as a residual.
 #[derive(Clone, Copy, Debug)]
 pub struct ScalarMapPlot<'a> {
-    /// Above everything.
+    /// Title.
     pub title: &'a str,
-    /// The map.
+    /// Map.
     pub mesh: &'a TriangleMesh,
-    /// One number per vertex; not finite where nothing is known.
+    /// One number per vertex; not finite where unknown.
     pub values: &'a [f32],
-    /// What the numbers are, with their unit.
+    /// Name of the numbers with their unit.
     pub value_name: &'a str,
-    /// Numbers at the ends of the colour bar; those beyond have the colour of the end.
+    /// Numbers at the ends of the color bar; numbers beyond have the color of the end.
     pub limits: (f64, f64),
-    /// Which colours.
+    /// Colors.
     pub colormap: Colormap,
-    /// The mapping trajectory, where it is to be drawn.
+    /// Mapping trajectory to draw.
     pub trajectory: Option<&'a [Pose2]>,
 }
 
 impl ScalarMapPlot<'_> {
     /// Writes the picture.
-    pub fn save(&self, path: &Path) -> Result<(), PlotError> {
-        if self.values.len() != self.mesh.vertices.len() {
-            return Err(PlotError::WrongLength {
-                path: path.to_owned(),
-                what: "values",
-                found: self.values.len(),
-                expected: self.mesh.vertices.len(),
-            });
-        }
-        let (x, y) = extent(self.mesh, path)?;
-        let limits = Span::new(self.limits.0, self.limits.1).at_least(1e-9);
-        let image = MapImage::of_scalar(self.mesh, self.values, RASTER, |value| {
-            self.colormap
-                .at((f64::from(value) - limits.min) / limits.length())
-        });
-        let (view, size) = map_view(x, y, 96.0, 150.0);
-        let unknown = Key {
-            name: "not known".to_owned(),
-            color: MISSING,
-            shape: KeyShape::Square,
+    pub fn save(&self, path: &Path) -> Result<()> {
+        save_png(path, self.draw())
+    }
+
+    fn draw(&self) -> Result<Bitmap> {
+        let (values, vertices) = (self.values.len(), self.mesh.vertices.len());
+        ensure!(
+            values == vertices,
+            "{values} values where {vertices} belong"
+        );
+        let bar = ColorBar {
+            range: AxisRange::new(self.limits.0, self.limits.1).at_least(1e-9),
+            colormap: self.colormap,
+            name: self.value_name,
         };
-        let bar = Rect {
-            left: view.rect.right + 22.0,
-            right: view.rect.right + 48.0,
-            ..view.rect
+        let unknown = LegendEntry::new("not known", MISSING, Mark::Area);
+        let image = || {
+            let color = |value| bar.color(f64::from(value));
+            MapImage::of_scalar(self.mesh, self.values, RASTER, color)
         };
-        sheet::save(path, size, |sheet| {
-            title(sheet, self.title, view.rect.left)?;
-            legend(sheet, &[unknown], (view.rect.left, 70.0), view.rect.right)?;
-            view.grid(sheet)?;
-            image.draw(sheet, &view, 0.0)?;
-            draw_trajectory(sheet, &view, self.trajectory)?;
-            view.frame(sheet, "x [m]", "y [m]")?;
-            color_bar(sheet, bar, limits, self.colormap, self.value_name)?;
-            view.scale_bar(sheet)
-        })
+        let legend = vec![unknown];
+        draw(
+            self.title,
+            self.mesh,
+            legend,
+            Some(bar),
+            image,
+            self.trajectory,
+        )
     }
 }
 
-fn draw_trajectory(
-    sheet: &Sheet,
-    view: &View,
-    trajectory: Option<&[Pose2]>,
-) -> Result<(), super::error::DrawError> {
-    let Some(poses) = trajectory else {
-        return Ok(());
-    };
-    let places = places(poses, view);
-    sheet.polyline(&places, &view.rect, Pen::new([255, 255, 255], 5.0))?;
-    sheet.polyline(&places, &view.rect, Pen::new(TRUTH, 2.5))
-}
-
-fn extent(mesh: &TriangleMesh, path: &Path) -> Result<(Span, Span), PlotError> {
+/// Draws a raster of the map and a path over it.
+fn draw(
+    title: &str,
+    mesh: &TriangleMesh,
+    legend: Vec<LegendEntry>,
+    color_bar: Option<ColorBar>,
+    image: impl FnOnce() -> MapImage,
+    path: Option<&[Pose2]>,
+) -> Result<Bitmap> {
     let bounds = mesh.bounds();
-    if bounds.is_empty() || mesh.triangles.is_empty() {
-        return Err(PlotError::Nothing {
-            path: path.to_owned(),
-            what: "the mesh has no triangles",
-        });
-    }
-    let span = |min: f32, max: f32| {
-        let span = Span::new(f64::from(min), f64::from(max)).at_least(1.0);
-        span.padded(0.02 * span.length())
+    ensure!(
+        !bounds.is_empty() && !mesh.triangles.is_empty(),
+        "there is nothing to draw: the mesh has no triangles"
+    );
+    let range = |min: f32, max: f32| {
+        let range = AxisRange::new(f64::from(min), f64::from(max)).at_least(1.0);
+        range.padded(0.02 * range.length())
     };
-    Ok((
-        span(bounds.min.x, bounds.max.x),
-        span(bounds.min.y, bounds.max.y),
-    ))
+    let view = TopView {
+        title,
+        legend,
+        x: range(bounds.min.x, bounds.max.x),
+        y: range(bounds.min.y, bounds.max.y),
+        color_bar,
+    };
+    let image = image();
+    view.draw(|sheet, view| {
+        image.draw(sheet, view, 0.0)?;
+        let path = positions(path.unwrap_or_default(), view);
+        sheet.polyline(&path, &view.rect, stroke(WHITE, 5.0))?;
+        sheet.polyline(&path, &view.rect, stroke(TRUTH, 2.5))
+    })
 }
 
 #[cfg(test)]
@@ -169,7 +158,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_legend_of_a_map_has_the_colours_that_the_map_has() {
+    fn the_legend_of_a_map_has_the_colors_of_the_map() {
         let colored = |colors: &[Rgb]| TriangleMesh {
             colors: colors.to_vec(),
             ..TriangleMesh::default()

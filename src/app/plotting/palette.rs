@@ -1,51 +1,45 @@
-//! A picture with at most 256 colours: a quarter of the bytes, and nobody sees the difference.
+//! Reduction of a picture to at most 256 colors: a quarter of the bytes without visible difference.
 //!
-//! Colours are taken from the most frequent on, each unless one that is taken is within a
-//! distance of it; every pixel becomes the nearest that was taken. The distance is the smallest
-//! of a few that leaves 256, so the flat colours of lines and text stay as they are, and no
-//! channel of a pixel moves by more than it.
+//! Colors are selected in descending order of frequency, each unless a selected color is within a
+//! distance of it; every pixel becomes the nearest selected color. The distance is the smallest
+//! that leaves at most 256, so the flat colors of lines and text stay as they are, and no
+//! channel of a pixel changes by more than it.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use anyhow::{Context as _, Result};
+
 use super::bitmap::Bitmap;
 use super::color::Rgb;
-use super::error::PlotError;
 
-/// Colours of a palette of a byte.
+/// Maximum number of colors of a palette with indices of one byte.
 const COLORS: usize = 256;
 
-/// The PNG of a picture with a palette.
-pub fn with_palette(path: &Path) -> Result<Vec<u8>, PlotError> {
-    let read = |source| PlotError::Read {
-        path: path.to_owned(),
-        source,
-    };
-    let image = Bitmap::read_png(path).map_err(read)?;
-    encoded(&image).map_err(|source| PlotError::Encode {
-        path: path.to_owned(),
-        source,
-    })
+/// Reads a PNG file and encodes it with a palette.
+pub fn with_palette(path: &Path) -> Result<Vec<u8>> {
+    let image =
+        Bitmap::read_png(path).with_context(|| format!("cannot read {}", path.display()))?;
+    encoded(&image).with_context(|| format!("cannot reduce the colors of {}", path.display()))
 }
 
-fn encoded(image: &Bitmap) -> Result<Vec<u8>, std::io::Error> {
-    let (palette, place) = palette_of(image);
+fn encoded(image: &Bitmap) -> Result<Vec<u8>, png::EncodingError> {
+    let (palette, index) = palette_of(image);
     let mut bytes = Vec::new();
     let mut encoder = png::Encoder::new(&mut bytes, image.width, image.height);
     encoder.set_color(png::ColorType::Indexed);
-    encoder.set_depth(png::BitDepth::Eight);
     encoder.set_compression(png::Compression::High);
-    // Neighbours in a palette have nothing in common that a filter could take away.
+    // Neighboring indices have nothing in common that a filter could remove.
     encoder.set_filter(png::Filter::NoFilter);
     encoder.set_palette(palette.concat());
     let mut writer = encoder.write_header()?;
-    let pixels: Vec<u8> = image.pixels.iter().map(|pixel| place[pixel]).collect();
+    let pixels: Vec<u8> = image.pixels.iter().map(|pixel| index[pixel]).collect();
     writer.write_image_data(&pixels)?;
     writer.finish()?;
     Ok(bytes)
 }
 
-/// The palette, and for every colour of the picture its place in it.
+/// The palette, and the index in it for every color of the picture.
 fn palette_of(image: &Bitmap) -> (Vec<Rgb>, BTreeMap<Rgb, u8>) {
     let mut counts = BTreeMap::<Rgb, usize>::new();
     for &pixel in &image.pixels {
@@ -54,38 +48,36 @@ fn palette_of(image: &Bitmap) -> (Vec<Rgb>, BTreeMap<Rgb, u8>) {
     let mut colors: Vec<(Rgb, usize)> = counts.into_iter().collect();
     colors.sort_by_key(|&(color, count)| (std::cmp::Reverse(count), color));
     let palette = (0..=u8::MAX)
-        .find_map(|apart| chosen(&colors, apart))
+        .find_map(|apart| selected(&colors, apart))
         .unwrap_or_default();
     let nearest = |color: Rgb| {
-        let places = 0..=u8::MAX;
-        let place = places
-            .zip(&palette)
-            .min_by_key(|(_, taken)| distance(color, **taken));
-        place.map_or(0, |(place, _)| place)
+        let indices = (0..=u8::MAX).zip(&palette);
+        let nearest = indices.min_by_key(|(_, selected)| distance(color, **selected));
+        nearest.map_or(0, |(index, _)| index)
     };
-    let places = colors.iter().map(|&(color, _)| (color, nearest(color)));
-    let places = places.collect();
-    (palette, places)
+    let indices = colors.iter().map(|&(color, _)| (color, nearest(color)));
+    let indices = indices.collect();
+    (palette, indices)
 }
 
-/// Frequent colours that are farther apart than some distance; `None` if they are too many.
-fn chosen(colors: &[(Rgb, usize)], apart: u8) -> Option<Vec<Rgb>> {
-    let mut taken: Vec<Rgb> = Vec::new();
+/// Frequent colors that are farther apart than a distance; `None` if they are too many.
+fn selected(colors: &[(Rgb, usize)], apart: u8) -> Option<Vec<Rgb>> {
+    let mut selected: Vec<Rgb> = Vec::new();
     for &(color, _) in colors {
-        if taken.iter().all(|other| distance(color, *other) > apart) {
-            if taken.len() == COLORS {
+        if selected.iter().all(|other| distance(color, *other) > apart) {
+            if selected.len() == COLORS {
                 return None;
             }
-            taken.push(color);
+            selected.push(color);
         }
     }
-    Some(taken)
+    Some(selected)
 }
 
-/// The largest difference of a channel.
+/// Largest difference of a channel.
 fn distance(a: Rgb, b: Rgb) -> u8 {
-    let [red, green, blue] = std::array::from_fn(|channel| a[channel].abs_diff(b[channel]));
-    red.max(green).max(blue)
+    let differences = a.iter().zip(b).map(|(a, b)| a.abs_diff(b));
+    differences.max().unwrap_or(0)
 }
 
 #[cfg(test)]
@@ -101,13 +93,13 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_of_few_colours_stays_as_it_is() {
+    fn a_picture_of_few_colors_is_unchanged() {
         let image = Bitmap::from_fn(40, 30, |x, y| [x as u8, (y / 6) as u8, 9]);
         assert_eq!(decoded(&image), image);
     }
 
     #[test]
-    fn lines_keep_their_colours_and_no_pixel_moves_far() {
+    fn lines_keep_their_colors_and_no_pixel_changes_much() {
         let image = Bitmap::from_fn(300, 300, |x, y| match (x, y) {
             (_, 100) => MCL,
             (_, 101) => REFINED,

@@ -1,159 +1,154 @@
-//! One frame of localization from above: particles, estimate and truth on the map.
+//! One frame of localization from above: particles, estimate and true pose on the map.
 
 use std::path::Path;
 
+use anyhow::{Context as _, Result};
+
 use super::MapImage;
-use super::color::{Colormap, MCL, REFINED, Rgb, TRUTH, WHITE};
-use super::error::{DrawError, PlotError};
-use super::sheet::{self, Pen, Point, Rect, Sheet};
-use super::trajectory::{map_view, places};
-use super::view::{Key, KeyShape, Span, View, color_bar, legend, title};
+use super::bitmap::Bitmap;
+use super::color::{Colormap, MCL, Rgb, TRUTH, WHITE};
+use super::sheet::{Point, Sheet, save_png, stroke};
+use super::top_view::{TopView, positions};
+use super::view::{AxisRange, ColorBar, LegendEntry, Mark, View};
 use crate::evaluation::ParticleRow;
 use crate::geometry::Pose2;
 
-/// What is known in one frame. Everything that is absent is left out.
+/// Particles and poses of a frame; whatever is absent is left out.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct LocalizationPicture<'a> {
-    /// Above everything, such as "frame 12".
+    /// Title, such as "frame 12".
     pub title: &'a str,
-    /// Drawn pale below everything.
+    /// Map, drawn pale below everything.
     pub map: Option<&'a MapImage>,
-    /// x, y [m], heading [rad], weight.
+    /// Particles: x, y [m], heading [rad], weight.
     pub particles: &'a [ParticleRow],
-    /// The filter's estimate.
+    /// Estimate of the filter.
     pub estimate: Option<Pose2>,
-    /// The refined pose.
-    pub refined: Option<Pose2>,
-    /// The true pose.
+    /// True pose.
     pub ground_truth: Option<Pose2>,
-    /// Where the car has been, by the truth.
+    /// True trajectory so far.
     pub driven: &'a [Pose2],
-    /// Centre and width of what is shown [m]; all of the above where it is absent.
+    /// Center and width of the visible part [m]; `None` for particles and poses with a margin.
     pub window: Option<([f64; 2], f64)>,
 }
 
 impl LocalizationPicture<'_> {
-    /// Writes the picture, 1400 pixels wide.
-    pub fn save(&self, path: &Path) -> Result<(), PlotError> {
-        let (x, y) = self.extent().ok_or_else(|| PlotError::Nothing {
-            path: path.to_owned(),
-            what: "there are no particles and no poses",
-        })?;
-        let (view, size) = map_view(x, y, 96.0, 150.0);
-        sheet::save(path, size, |sheet| self.draw(sheet, &view))
+    /// Writes the picture.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        save_png(path, self.draw())
     }
 
-    /// What is shown: the window, or everything with a margin.
-    fn extent(&self) -> Option<(Span, Span)> {
-        const NARROWEST_M: f64 = 24.0;
-        if let Some(([x, y], width_m)) = self.window {
-            let square = |center: f64| Span::new(center, center).at_least(width_m);
-            return Some((square(x), Span::new(y, y).at_least(0.6 * width_m)));
-        }
-        let poses = [self.estimate, self.refined, self.ground_truth];
-        let poses = || poses.iter().flatten().map(|pose| pose.translation.vector);
-        let particles = || self.particles.iter();
-        let x = Span::of(
-            particles()
-                .map(|p| f64::from(p[0]))
-                .chain(poses().map(|t| t.x)),
-        )?;
-        let y = Span::of(
-            particles()
-                .map(|p| f64::from(p[1]))
-                .chain(poses().map(|t| t.y)),
-        )?;
-        let margin = |span: Span| span.padded(0.06 * span.length());
-        Some((
-            margin(x).at_least(NARROWEST_M),
-            margin(y).at_least(0.6 * NARROWEST_M),
-        ))
-    }
-
-    fn draw(&self, sheet: &Sheet, view: &View) -> Result<(), DrawError> {
-        title(sheet, self.title, view.rect.left)?;
-        legend(sheet, &self.keys(), (view.rect.left, 70.0), view.rect.right)?;
-        view.grid(sheet)?;
-        if let Some(map) = self.map {
-            map.draw(sheet, view, 0.65)?;
-        }
-        let driven = places(self.driven, view);
-        sheet.dashes(&driven, &view.rect, Pen::new(TRUTH, 2.5), (8.0, 6.0))?;
-        let weights = self.draw_particles(sheet, view)?;
-        // The thinner ones on top, so that all are seen where they agree.
-        for (pose, pen, length) in [
-            (self.ground_truth, Pen::new(TRUTH, 11.0), 68.0),
-            (self.estimate, Pen::new(MCL, 6.0), 52.0),
-            (self.refined, Pen::new(REFINED, 2.5), 40.0),
-        ] {
-            if let Some(pose) = pose {
-                arrow(sheet, view, &pose, pen, length)?;
+    fn draw(&self) -> Result<Bitmap> {
+        let (x, y) = self
+            .extent()
+            .context("there is nothing to draw: there are no particles and no poses")?;
+        let view = TopView {
+            title: self.title,
+            legend: self.legend(),
+            x,
+            y,
+            color_bar: Some(ColorBar {
+                range: AxisRange::new(0.0, 1.0),
+                colormap: Colormap::Viridis,
+                name: "weight / largest",
+            }),
+        };
+        view.draw(|sheet, view| {
+            if let Some(map) = self.map {
+                map.draw(sheet, view, 0.65)?;
             }
-        }
-        view.frame(sheet, "x [m]", "y [m]")?;
-        view.scale_bar(sheet)?;
-        let bar = Rect {
-            left: view.rect.right + 22.0,
-            right: view.rect.right + 48.0,
-            ..view.rect
-        };
-        match weights {
-            Some(span) => color_bar(sheet, bar, span, Colormap::Viridis, "weight / largest"),
-            None => Ok(()),
-        }
+            let driven = positions(self.driven, view);
+            sheet.dashes(&driven, &view.rect, stroke(TRUTH, 2.5), (8.0, 6.0))?;
+            self.draw_particles(sheet, view)?;
+            // The thinner arrow is on top, so that both are visible where they agree.
+            for (pose, color, width, length) in [
+                (self.ground_truth, TRUTH, 11.0, 68.0),
+                (self.estimate, MCL, 6.0, 52.0),
+            ] {
+                if let Some(pose) = pose {
+                    draw_arrow(sheet, view, &pose, color, width, length)?;
+                }
+            }
+            Ok(())
+        })
     }
 
-    fn keys(&self) -> Vec<Key> {
-        let key = |name: &str, color: Rgb, shape: KeyShape| Key {
-            name: name.to_owned(),
-            color,
-            shape,
+    /// Visible ranges of x and y: the window, or particles and poses with a margin.
+    fn extent(&self) -> Option<(AxisRange, AxisRange)> {
+        const NARROWEST_M: f64 = 24.0;
+        let around = |center: f64| AxisRange::new(center, center);
+        if let Some(([x, y], width_m)) = self.window {
+            return Some((
+                around(x).at_least(width_m),
+                around(y).at_least(0.6 * width_m),
+            ));
+        }
+        let poses = [self.estimate, self.ground_truth].into_iter().flatten();
+        let poses = poses.map(|pose| [pose.translation.x, pose.translation.y]);
+        let particles = self.particles.iter();
+        let particles = particles.map(|&[x, y, ..]| [f64::from(x), f64::from(y)]);
+        let points: Vec<[f64; 2]> = particles.chain(poses).collect();
+        let range = |axis: usize, narrowest_m: f64| {
+            let range = AxisRange::of(points.iter().map(|point| point[axis]))?;
+            Some(range.padded(0.06 * range.length()).at_least(narrowest_m))
         };
-        let count = format!("{} particles, coloured by weight", self.particles.len());
-        [
-            Some(key(&count, Colormap::Viridis.at(0.0), KeyShape::Dot)),
-            (self.ground_truth).map(|_| key("ground truth", TRUTH, KeyShape::Line)),
-            self.estimate.map(|_| key("MCL", MCL, KeyShape::Line)),
-            self.refined
-                .map(|_| key("refined", REFINED, KeyShape::Line)),
-            (self.driven.len() > 1).then(|| key("driven", TRUTH, KeyShape::Dashes)),
-        ]
-        .into_iter()
-        .flatten()
-        .collect()
+        Some((range(0, NARROWEST_M)?, range(1, 0.6 * NARROWEST_M)?))
     }
 
-    /// Particles with a tail against their heading, light ones first; the span of the weights.
-    fn draw_particles(&self, sheet: &Sheet, view: &View) -> Result<Option<Span>, DrawError> {
+    fn legend(&self) -> Vec<LegendEntry> {
+        let count = format!("{} particles, colored by weight", self.particles.len());
+        let mut entries = vec![LegendEntry::new(
+            count,
+            Colormap::Viridis.at(0.0),
+            Mark::Dots,
+        )];
+        let truth = self
+            .ground_truth
+            .map(|_| ("ground truth", TRUTH, Mark::Line));
+        let estimate = self.estimate.map(|_| ("MCL", MCL, Mark::Line));
+        let driven = (self.driven.len() > 1).then_some(("driven", TRUTH, Mark::Dashes));
+        for (name, color, mark) in [truth, estimate, driven].into_iter().flatten() {
+            entries.push(LegendEntry::new(name, color, mark));
+        }
+        entries
+    }
+
+    /// Draws particles with a line along their heading, in ascending order of weight.
+    fn draw_particles(&self, sheet: &Sheet, view: &View) -> Result<()> {
         let largest = self.particles.iter().map(|p| p[3]).fold(0.0, f32::max);
         let mut order: Vec<&ParticleRow> = self.particles.iter().collect();
         order.sort_by(|a, b| a[3].total_cmp(&b[3]));
         let crowded = order.len() > 2000;
-        let (radius, tail) = if crowded { (1.5, 0.0) } else { (3.0, 11.0) };
+        let (radius, length) = if crowded { (1.5, 0.0) } else { (3.0, 11.0) };
         for particle in order {
             let [x, y, heading, weight] = particle.map(f64::from);
             let place = view.at(x, y);
-            if !view.rect.holds(place) {
+            if !view.rect.contains(place) {
                 continue;
             }
             let color = Colormap::Viridis.at(weight / f64::from(largest).max(1e-30));
-            if tail > 0.0 {
-                let end = (
-                    place.0 + tail * heading.cos(),
-                    place.1 - tail * heading.sin(),
-                );
-                sheet.line(place, end, Pen::new(color, 1.5))?;
+            if length > 0.0 {
+                let (sin, cos) = heading.sin_cos();
+                let end = (place.0 + length * cos, place.1 - length * sin);
+                sheet.line(place, end, stroke(color, 1.5))?;
             }
             sheet.dot(place, radius, color, 1.0)?;
         }
-        Ok((!self.particles.is_empty()).then(|| Span::new(0.0, 1.0)))
+        Ok(())
     }
 }
 
-/// An arrow of a length in pixels, whose tail is at the pose, with a white rim.
-fn arrow(sheet: &Sheet, view: &View, pose: &Pose2, pen: Pen, length: f64) -> Result<(), DrawError> {
+/// Draws an arrow with a white border, whose tail is at the pose; width and length in pixels.
+fn draw_arrow(
+    sheet: &Sheet,
+    view: &View,
+    pose: &Pose2,
+    color: Rgb,
+    width: f64,
+    length: f64,
+) -> Result<()> {
     let tail = view.at(pose.translation.x, pose.translation.y);
-    if !view.rect.holds(tail) {
+    if !view.rect.contains(tail) {
         return Ok(());
     }
     let (sin, cos) = pose.rotation.angle().sin_cos();
@@ -164,17 +159,17 @@ fn arrow(sheet: &Sheet, view: &View, pose: &Pose2, pen: Pen, length: f64) -> Res
             tail.1 - forward * sin - left * cos,
         )
     };
-    let half = 5.0 + 0.6 * pen.width;
-    for (color, rim) in [(WHITE, 1.2), (pen.color, 0.0)] {
-        let stem = Pen::new(color, pen.width + 2.0 * rim);
-        sheet.line(tail, at(length - 14.0, 0.0), stem)?;
+    let half = 5.0 + 0.6 * width;
+    for (color, border) in [(WHITE, 1.2), (color, 0.0)] {
+        let shaft = stroke(color, width + 2.0 * border);
+        sheet.line(tail, at(length - 14.0, 0.0), shaft)?;
         let head = [
-            at(length + 2.0 * rim, 0.0),
-            at(length - 20.0 - rim, half + 1.5 * rim),
-            at(length - 20.0 - rim, -half - 1.5 * rim),
+            at(length + 2.0 * border, 0.0),
+            at(length - 20.0 - border, half + 1.5 * border),
+            at(length - 20.0 - border, -half - 1.5 * border),
         ];
         sheet.polygon(&head, color)?;
-        sheet.dot(tail, 3.0 + 0.5 * pen.width + rim, color, 1.0)?;
+        sheet.dot(tail, 3.0 + 0.5 * width + border, color, 1.0)?;
     }
     Ok(())
 }

@@ -1,11 +1,13 @@
-//! What the sensor saw, what the map shows from there, and the difference.
+//! Range image of a scan, that of the map from the same pose, and their difference.
 
 use std::path::Path;
 
-use super::color::{Colormap, MISSING, Rgb};
-use super::error::{DrawError, PlotError};
-use super::sheet::{self, HPos, LABEL, Lettering, Rect, Sheet, VPos};
-use super::view::{Key, KeyShape, Span, View, color_bar, legend, title};
+use anyhow::{Result, ensure};
+
+use super::bitmap::Bitmap;
+use super::color::{Colormap, MISSING};
+use super::sheet::{self, HPos, LABEL, Rect, Sheet, VPos, save_png, text_style};
+use super::view::{AxisRange, ColorBar, LegendEntry, Mark, Ticks, View, legend};
 use crate::lidar::LidarModel;
 
 const WIDTH: f64 = 1400.0;
@@ -19,123 +21,104 @@ const BETWEEN: f64 = 34.0;
 /// Three range images one above the other: observed, rendered, observed − rendered.
 #[derive(Clone, Copy, Debug)]
 pub struct RangeImageStrip<'a> {
-    /// Above everything.
+    /// Title.
     pub title: &'a str,
-    /// The projection of both.
+    /// Projection of both images.
     pub model: &'a LidarModel,
     /// Ranges of the scan, row-major [m]; not finite or not positive where there is no return.
     pub observed: &'a [f32],
     /// Ranges of the map, likewise.
     pub rendered: &'a [f32],
-    /// Differences beyond this have the colour of the end [m].
+    /// Differences at the ends of the color bar [m].
     pub difference_limit_m: f64,
 }
 
 impl RangeImageStrip<'_> {
     /// Writes the picture.
-    pub fn save(&self, path: &Path) -> Result<(), PlotError> {
-        for (what, found) in [
-            ("observed ranges", self.observed.len()),
-            ("rendered ranges", self.rendered.len()),
-        ] {
-            if found != self.model.len() {
-                return Err(PlotError::WrongLength {
-                    path: path.to_owned(),
-                    what,
-                    found,
-                    expected: self.model.len(),
-                });
-            }
-        }
-        if self.model.is_empty() {
-            return Err(PlotError::Nothing {
-                path: path.to_owned(),
-                what: "the range images have no pixels",
-            });
-        }
-        let height = HEADER + 3.0 * (CAPTION + IMAGE + BETWEEN) + 34.0;
-        sheet::save(path, (WIDTH as u32, height as u32), |sheet| {
-            self.draw(sheet)
-        })
+    pub fn save(&self, path: &Path) -> Result<()> {
+        save_png(path, self.draw())
     }
 
-    fn draw(&self, sheet: &Sheet) -> Result<(), DrawError> {
-        title(sheet, self.title, LEFT)?;
-        let missing = Key {
-            name: "no return, or no surface in the map".to_owned(),
-            color: MISSING,
-            shape: KeyShape::Square,
-        };
+    fn draw(&self) -> Result<Bitmap> {
+        let pixels = self.model.len();
+        for (name, found) in [
+            ("observed", self.observed.len()),
+            ("rendered", self.rendered.len()),
+        ] {
+            ensure!(
+                found == pixels,
+                "{found} {name} ranges where {pixels} belong"
+            );
+        }
+        ensure!(
+            pixels > 0,
+            "there is nothing to draw: the range images have no pixels"
+        );
+        let height = HEADER + 3.0 * (CAPTION + IMAGE + BETWEEN) + 34.0;
+        sheet::draw((WIDTH as u32, height as u32), |sheet| self.draw_on(sheet))
+    }
+
+    fn draw_on(&self, sheet: &Sheet) -> Result<()> {
+        sheet.title(self.title, LEFT)?;
+        let name = "no return, or no surface in the map";
+        let missing = LegendEntry::new(name, MISSING, Mark::Area);
         legend(sheet, &[missing], (LEFT, 70.0), WIDTH - RIGHT)?;
-        let ranges = Span::new(0.0, f64::from(self.model.max_range));
+        let ranges = ColorBar {
+            range: AxisRange::new(0.0, f64::from(self.model.max_range)),
+            colormap: Colormap::Viridis,
+            name: "range [m]",
+        };
         let limit = self.difference_limit_m.abs().max(1e-3);
-        let differences = Span::new(-limit, limit);
+        let differences = ColorBar {
+            range: AxisRange::new(-limit, limit),
+            colormap: Colormap::Diverging,
+            name: "difference [m]",
+        };
         let observed = |index: usize| range(self.observed[index]);
         let rendered = |index: usize| range(self.rendered[index]);
         let difference = |index: usize| observed(index) - rendered(index);
-        let band = |number: f64| HEADER + number * (CAPTION + IMAGE + BETWEEN);
-        let viridis = Colormap::Viridis;
-        self.image(sheet, band(0.0), "observed", (ranges, viridis), observed)?;
-        self.image(
-            sheet,
-            band(1.0),
-            "rendered from the map",
-            (ranges, viridis),
-            rendered,
-        )?;
-        let scale = (differences, Colormap::Diverging);
-        self.image(sheet, band(2.0), "observed − rendered", scale, difference)
+        self.image(sheet, 0, ["observed", ""], &ranges, observed)?;
+        self.image(sheet, 1, ["rendered from the map", ""], &ranges, rendered)?;
+        let names = ["observed − rendered", "azimuth [deg]"];
+        self.image(sheet, 2, names, &differences, difference)
     }
 
-    /// One image with its caption, axes and colour bar.
+    /// Draws the image of a number with its caption, axes and color bar.
     fn image(
         &self,
         sheet: &Sheet,
-        top: f64,
-        caption: &str,
-        (span, colormap): (Span, Colormap),
+        number: u32,
+        [caption, x_name]: [&str; 2],
+        color_bar: &ColorBar,
         value_m: impl Fn(usize) -> f64,
-    ) -> Result<(), DrawError> {
+    ) -> Result<()> {
+        let top = HEADER + f64::from(number) * (CAPTION + IMAGE + BETWEEN);
         let rect = Rect {
             left: LEFT,
             top: top + CAPTION,
             right: WIDTH - RIGHT,
             bottom: top + CAPTION + IMAGE,
         };
-        let lettering = Lettering::new(LABEL, HPos::Left, VPos::Center);
-        sheet.text(caption, (LEFT, top + 0.5 * CAPTION), lettering)?;
+        let style = text_style(LABEL, HPos::Left, VPos::Center);
+        sheet.text(caption, (LEFT, top + 0.5 * CAPTION), &style)?;
+        let (width, height) = (self.model.width, self.model.height);
         sheet.pixels(&rect, |x, y| {
-            let column = ((x * self.model.width as f64) as usize).min(self.model.width - 1);
-            let row = ((y * self.model.height as f64) as usize).min(self.model.height - 1);
-            let value_m = value_m(row * self.model.width + column);
-            Some(self.color(value_m, span, colormap))
+            let column = ((x * width as f64) as usize).min(width - 1);
+            let row = ((y * height as f64) as usize).min(height - 1);
+            Some(color_bar.color(value_m(row * width + column)))
         })?;
         let view = View {
             rect,
             // Columns grow clockwise from straight back, azimuth counter-clockwise.
-            x: Span::new(180.0, -180.0),
-            y: Span::new(
+            x: AxisRange::new(180.0, -180.0),
+            y: AxisRange::new(
                 f64::from(self.model.fov_down_rad().to_degrees()),
                 f64::from(self.model.fov_up),
             ),
         };
-        let last = caption.contains('−');
-        view.panorama_frame(
-            sheet,
-            if last { "azimuth [deg]" } else { "" },
-            "elevation [deg]",
-        )?;
-        let bar = Rect {
-            left: rect.right + 20.0,
-            right: rect.right + 44.0,
-            ..rect
-        };
-        let name = if last { "difference [m]" } else { "range [m]" };
-        color_bar(sheet, bar, span, colormap, name)
-    }
-
-    fn color(&self, value_m: f64, span: Span, colormap: Colormap) -> Rgb {
-        colormap.at((value_m - span.min) / span.length())
+        let x_ticks = Ticks::every(60.0, AxisRange::new(-180.0, 180.0));
+        view.frame(sheet, &x_ticks, [x_name, "elevation [deg]"])?;
+        color_bar.draw(sheet, &rect, [rect.right + 20.0, rect.right + 44.0])
     }
 }
 

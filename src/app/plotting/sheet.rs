@@ -1,9 +1,10 @@
-//! A sheet of paper: lines, text and pixels in a bitmap that is drawn twice as large and shrunk,
-//! which smooths every edge.
+//! Drawing surface: lines, text and pixels in a bitmap of twice the size, which is scaled down so
+//! that all edges are smooth.
 
 use std::path::Path;
 use std::sync::Once;
 
+use anyhow::{Context as _, Result};
 use plotters::backend::BitMapBackend;
 use plotters::coord::Shift;
 use plotters::drawing::{DrawingArea, IntoDrawingArea as _};
@@ -18,18 +19,20 @@ pub use plotters::style::text_anchor::{HPos, VPos};
 
 use super::bitmap::Bitmap;
 use super::color::{INK, Rgb, WHITE};
-use super::error::{DrawError, PlotError};
 use crate::app::output::write_atomically;
 
-/// How much larger the bitmap is drawn than it is saved.
-pub const SCALE: u32 = 2;
+/// Ratio of the size of the bitmap while drawing to its final size.
+const SCALE: u32 = 2;
 
 /// Sizes of text [px].
-pub const TITLE: f64 = 25.0;
+const TITLE: f64 = 25.0;
 pub const LABEL: f64 = 20.0;
 pub const TICK: f64 = 17.0;
 
-/// A rectangle on the sheet [px], y down.
+/// Point on the sheet [px], y down.
+pub type Point = (f64, f64);
+
+/// Rectangle on the sheet [px], y down.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rect {
     pub left: f64,
@@ -47,243 +50,132 @@ impl Rect {
         self.bottom - self.top
     }
 
-    pub fn holds(&self, (x, y): Point) -> bool {
+    pub fn contains(&self, (x, y): Point) -> bool {
         (self.left..=self.right).contains(&x) && (self.top..=self.bottom).contains(&y)
     }
 }
 
-/// A point on the sheet [px], y down.
-pub type Point = (f64, f64);
-
-/// What is drawn on; all lengths in pixels of the saved picture.
+/// Drawing surface; all lengths are in pixels of the final picture.
 pub struct Sheet<'a> {
     root: DrawingArea<BitMapBackend<'a>, Shift>,
 }
 
-/// How a stroke looks.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Pen {
-    pub color: Rgb,
-    pub width: f64,
-    pub alpha: f64,
-}
-
-impl Pen {
-    pub fn new(color: Rgb, width: f64) -> Self {
-        Self {
-            color,
-            width,
-            alpha: 1.0,
-        }
-    }
-
-    pub fn alpha(self, alpha: f64) -> Self {
-        Self { alpha, ..self }
-    }
-
-    fn style(self, filled: bool) -> ShapeStyle {
-        ShapeStyle {
-            color: rgb(self.color).mix(self.alpha),
-            filled,
-            stroke_width: scaled(self.width).max(1) as u32,
-        }
-    }
-}
-
-/// How text looks and which point of it is given.
-#[derive(Clone, Copy)]
-pub struct Lettering {
-    pub size: f64,
-    pub color: Rgb,
-    pub bold: bool,
-    pub horizontal: HPos,
-    pub vertical: VPos,
-    pub upwards: bool,
-}
-
-impl Lettering {
-    pub fn new(size: f64, horizontal: HPos, vertical: VPos) -> Self {
-        Self {
-            size,
-            color: INK,
-            bold: false,
-            horizontal,
-            vertical,
-            upwards: false,
-        }
-    }
-
-    pub fn bold(self) -> Self {
-        Self { bold: true, ..self }
-    }
-
-    pub fn upwards(self) -> Self {
-        Self {
-            upwards: true,
-            ..self
-        }
-    }
-
-    pub fn color(self, color: Rgb) -> Self {
-        Self { color, ..self }
-    }
-
-    fn font(&self) -> FontDesc<'static> {
-        register_fonts();
-        let style = if self.bold {
-            FontStyle::Bold
-        } else {
-            FontStyle::Normal
-        };
-        let size = self.size * f64::from(SCALE);
-        FontDesc::new(FontFamily::SansSerif, size, style)
-    }
-}
-
-/// Draws a picture of a size in pixels on white.
+/// Draws on a white sheet of a size [px].
 pub fn draw(
     (width, height): (u32, u32),
-    picture: impl FnOnce(&Sheet) -> Result<(), DrawError>,
-) -> Result<Bitmap, DrawError> {
+    content: impl FnOnce(&Sheet) -> Result<()>,
+) -> Result<Bitmap> {
     let size = (width * SCALE, height * SCALE);
     let mut large = Bitmap::from_fn(size.0, size.1, |_, _| WHITE);
+    let pixels = large.pixels.as_flattened_mut();
     let sheet = Sheet {
-        root: BitMapBackend::with_buffer(large.pixels.as_flattened_mut(), size).into_drawing_area(),
+        root: BitMapBackend::with_buffer(pixels, size).into_drawing_area(),
     };
-    picture(&sheet)?;
+    content(&sheet)?;
     sheet.root.present()?;
     drop(sheet);
     Ok(large.resized(width, height))
 }
 
-/// Draws a picture and writes it as PNG.
-pub fn save(
-    path: &Path,
-    size: (u32, u32),
-    picture: impl FnOnce(&Sheet) -> Result<(), DrawError>,
-) -> Result<(), PlotError> {
-    let image = draw(size, picture).map_err(PlotError::draw(path))?;
-    write_atomically(path, |file| image.write_png(file)).map_err(|source| PlotError::Write {
-        path: path.to_owned(),
-        source,
-    })
+/// Writes a picture as PNG; errors of drawing and of writing name the file.
+pub fn save_png(path: &Path, picture: Result<Bitmap>) -> Result<()> {
+    let picture = picture.with_context(|| format!("cannot draw {}", path.display()))?;
+    write_atomically(path, |file| picture.write_png(file))
+        .with_context(|| format!("cannot write {}", path.display()))
 }
 
 impl Sheet<'_> {
-    /// A line through points, each piece of which is cut off at the border of `clip`.
-    pub fn polyline(&self, points: &[Point], clip: &Rect, pen: Pen) -> Result<(), DrawError> {
+    /// Draws a line through points, clipped to a rectangle.
+    pub fn polyline(&self, points: &[Point], clip: &Rect, stroke: ShapeStyle) -> Result<()> {
         for pair in points.windows(2) {
             if let Some((from, to)) = clipped(pair[0], pair[1], clip) {
-                self.line(from, to, pen)?;
+                self.line(from, to, stroke)?;
                 // A round joint, no wider than the line itself.
-                let style = pen.style(true);
-                let radius = (scaled(pen.width) - 1) / 2;
-                self.root
-                    .draw(&Circle::new(scaled_point(to), radius, style))?;
+                let radius = (stroke.stroke_width as i32 - 1) / 2;
+                let joint = Circle::new(scaled_point(to), radius, stroke.filled());
+                self.root.draw(&joint)?;
             }
         }
         Ok(())
     }
 
-    /// The same with gaps: drawn and left out in turn, lengths in pixels.
+    /// Draws a dashed line through points, clipped to a rectangle; `on` and `off` are the lengths
+    /// of dashes and gaps.
     pub fn dashes(
         &self,
         points: &[Point],
         clip: &Rect,
-        pen: Pen,
+        stroke: ShapeStyle,
         (on, off): (f64, f64),
-    ) -> Result<(), DrawError> {
+    ) -> Result<()> {
         let mut along = 0.0;
         for pair in points.windows(2) {
             let (from, to) = (pair[0], pair[1]);
             let length = f64::hypot(to.0 - from.0, to.1 - from.1);
-            let at = |way: f64| {
-                let share = way / length.max(1e-9);
+            let at = |distance: f64| {
+                let share = distance / length.max(1e-9);
                 (
                     from.0 + share * (to.0 - from.0),
                     from.1 + share * (to.1 - from.1),
                 )
             };
-            let mut begin = 0.0;
-            while begin < length {
-                let phase = (along + begin) % (on + off);
-                let end = if phase < on {
-                    begin + on - phase
-                } else {
-                    begin + on + off - phase
-                };
-                let end = end.min(length).max(begin + 1e-3);
-                if phase < on
-                    && let Some((from, to)) = clipped(at(begin), at(end), clip)
-                {
-                    self.line(from, to, pen)?;
+            let mut start = 0.0;
+            while start < length {
+                let phase = (along + start) % (on + off);
+                let is_dash = phase < on;
+                let rest = if is_dash { on } else { on + off } - phase;
+                let end = (start + rest).min(length).max(start + 1e-3);
+                if is_dash && let Some((from, to)) = clipped(at(start), at(end), clip) {
+                    self.line(from, to, stroke)?;
                 }
-                begin = end;
+                start = end;
             }
             along += length;
         }
         Ok(())
     }
 
-    /// A straight line.
-    pub fn line(&self, from: Point, to: Point, pen: Pen) -> Result<(), DrawError> {
+    /// Draws a straight line.
+    pub fn line(&self, from: Point, to: Point, stroke: ShapeStyle) -> Result<()> {
         let ends = vec![scaled_point(from), scaled_point(to)];
-        self.root.draw(&PathElement::new(ends, pen.style(false)))
+        Ok(self.root.draw(&PathElement::new(ends, stroke))?)
     }
 
-    /// A filled circle.
-    pub fn dot(&self, center: Point, radius: f64, color: Rgb, alpha: f64) -> Result<(), DrawError> {
-        let style = Pen::new(color, 1.0).alpha(alpha).style(true);
-        self.root
-            .draw(&Circle::new(scaled_point(center), scaled(radius), style))
+    /// Fills a circle; `alpha` is the opacity, 0 to 1.
+    pub fn dot(&self, center: Point, radius: f64, color: Rgb, alpha: f64) -> Result<()> {
+        let style = rgb(color).mix(alpha).filled();
+        let circle = Circle::new(scaled_point(center), scaled(radius), style);
+        Ok(self.root.draw(&circle)?)
     }
 
-    /// A filled polygon.
-    pub fn polygon(&self, corners: &[Point], color: Rgb) -> Result<(), DrawError> {
+    /// Fills a polygon.
+    pub fn polygon(&self, corners: &[Point], color: Rgb) -> Result<()> {
         let corners: Vec<(i32, i32)> = corners.iter().map(|&corner| scaled_point(corner)).collect();
-        self.root.draw(&Polygon::new(corners, rgb(color).filled()))
+        let polygon = Polygon::new(corners, rgb(color).filled());
+        Ok(self.root.draw(&polygon)?)
     }
 
-    /// A filled rectangle.
-    pub fn fill(&self, rect: &Rect, color: Rgb) -> Result<(), DrawError> {
-        self.rectangle(rect, Pen::new(color, 1.0).style(true))
+    /// Fills a rectangle.
+    pub fn fill(&self, rect: &Rect, color: Rgb) -> Result<()> {
+        let corners = [(rect.left, rect.top), (rect.right, rect.bottom)];
+        let rectangle = Rectangle::new(corners.map(scaled_point), rgb(color).filled());
+        Ok(self.root.draw(&rectangle)?)
     }
 
-    /// The border of a rectangle.
-    pub fn outline(&self, rect: &Rect, pen: Pen) -> Result<(), DrawError> {
-        let Rect {
-            left,
-            top,
-            right,
-            bottom,
-        } = *rect;
+    /// Draws the border of a rectangle.
+    pub fn outline(&self, rect: &Rect, stroke: ShapeStyle) -> Result<()> {
         let corners = [
-            (left, top),
-            (right, top),
-            (right, bottom),
-            (left, bottom),
-            (left, top),
+            (rect.left, rect.top),
+            (rect.right, rect.top),
+            (rect.right, rect.bottom),
+            (rect.left, rect.bottom),
         ];
-        corners
-            .windows(2)
-            .try_for_each(|side| self.line(side[0], side[1], pen))
+        (0..4).try_for_each(|side| self.line(corners[side], corners[(side + 1) % 4], stroke))
     }
 
-    fn rectangle(&self, rect: &Rect, style: ShapeStyle) -> Result<(), DrawError> {
-        let corners = [
-            scaled_point((rect.left, rect.top)),
-            scaled_point((rect.right, rect.bottom)),
-        ];
-        self.root.draw(&Rectangle::new(corners, style))
-    }
-
-    /// Pixels of a rectangle: `color` is asked with shares of its width and height, from the
-    /// left and from the top; `None` leaves what is there.
-    pub fn pixels(
-        &self,
-        rect: &Rect,
-        color: impl Fn(f64, f64) -> Option<Rgb>,
-    ) -> Result<(), DrawError> {
+    /// Sets the pixels of a rectangle: `color` maps shares of its width and height, from the left
+    /// and from the top, to a color; `None` leaves the pixel unchanged.
+    pub fn pixels(&self, rect: &Rect, color: impl Fn(f64, f64) -> Option<Rgb>) -> Result<()> {
         let (left, top) = scaled_point((rect.left, rect.top));
         let (right, bottom) = scaled_point((rect.right, rect.bottom));
         for row in top..bottom {
@@ -298,49 +190,70 @@ impl Sheet<'_> {
         Ok(())
     }
 
-    /// Text at a point.
-    pub fn text(&self, text: &str, at: Point, lettering: Lettering) -> Result<(), DrawError> {
-        let transform = if lettering.upwards {
-            FontTransform::Rotate270
-        } else {
-            FontTransform::None
-        };
-        let color = rgb(lettering.color);
-        let style = TextStyle::from(lettering.font().transform(transform))
-            .color(&color)
-            .pos(Pos::new(lettering.horizontal, lettering.vertical));
-        // The library centres the box of a line, in which letters sit high.
-        let down = match (lettering.vertical, lettering.upwards) {
-            (VPos::Center, false) => 0.14 * lettering.size,
+    /// Draws text at a point.
+    pub fn text(&self, text: &str, at: Point, style: &TextStyle) -> Result<()> {
+        // The library centers the box of a line, in whose upper part the letters are.
+        let down = match (&style.pos.v_pos, style.font.get_transform()) {
+            (VPos::Center, FontTransform::None) => 0.14 * style.font.get_size() / f64::from(SCALE),
             _ => 0.0,
         };
         let place = scaled_point((at.0, at.1 + down));
-        self.root.draw(&Text::new(text.to_owned(), place, style))
+        Ok(self.root.draw(&Text::new(text, place, style.clone()))?)
+    }
+
+    /// Draws the title of a picture.
+    pub fn title(&self, text: &str, left: f64) -> Result<()> {
+        let style = bold(text_style(TITLE, HPos::Left, VPos::Center));
+        self.text(text, (left, 30.0), &style)
     }
 }
 
+/// Stroke of a width [px].
+pub fn stroke(color: Rgb, width: f64) -> ShapeStyle {
+    let width = scaled(width).max(1) as u32;
+    rgb(color).stroke_width(width)
+}
+
+/// Text of a size [px] that is anchored at its given point.
+pub fn text_style(size: f64, horizontal: HPos, vertical: VPos) -> TextStyle<'static> {
+    register_fonts();
+    let size = size * f64::from(SCALE);
+    let font = FontDesc::new(FontFamily::SansSerif, size, FontStyle::Normal);
+    let anchor = Pos::new(horizontal, vertical);
+    font.color(&rgb(INK)).pos(anchor)
+}
+
+/// The style in bold.
+pub fn bold(style: TextStyle<'static>) -> TextStyle<'static> {
+    TextStyle {
+        font: style.font.style(FontStyle::Bold),
+        ..style
+    }
+}
+
+/// The style, rotated to read from bottom to top.
+pub fn upwards(style: &TextStyle<'static>) -> TextStyle<'static> {
+    style.transform(FontTransform::Rotate270)
+}
+
 /// Width of text [px].
-pub fn text_width(text: &str, lettering: Lettering) -> f64 {
-    let width = lettering
-        .font()
-        .box_size(text)
-        .map_or(0, |(width, _)| width);
+pub fn text_width(text: &str, style: &TextStyle) -> f64 {
+    let width = style.font.box_size(text).map_or(0, |(width, _)| width);
     f64::from(width) / f64::from(SCALE)
 }
 
-/// DejaVu Sans under the name that all text uses; there is no font of the system.
+/// Registers DejaVu Sans under the family that all text uses; fonts of the system are not used.
 fn register_fonts() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
         let name = FontFamily::SansSerif.as_str();
-        // Both fonts are compiled in and known to be fonts; without them text has no shape, and
-        // drawing it is an error.
+        // Both fonts are compiled in and known to be valid; without them, drawing text is an error.
         let _ = register_font(name, FontStyle::Normal, dejavu::sans::regular());
         let _ = register_font(name, FontStyle::Bold, dejavu::sans::bold());
     });
 }
 
-/// The part of a line inside a rectangle (Liang and Barsky 1984); `None` where it is outside.
+/// The part of a line inside a rectangle (Liang and Barsky 1984); `None` if it is outside.
 fn clipped(from: Point, to: Point, rect: &Rect) -> Option<(Point, Point)> {
     let (dx, dy) = (to.0 - from.0, to.1 - from.1);
     let (mut enter, mut leave) = (0.0_f64, 1.0_f64);
@@ -388,10 +301,10 @@ mod tests {
     };
 
     #[test]
-    fn a_line_is_drawn_inside_its_clip_only_and_in_its_colour() {
-        let pen = Pen::new([200, 0, 0], 4.0);
+    fn a_line_is_drawn_only_inside_its_clip_and_in_its_color() {
         let image = draw((100, 100), |sheet| {
-            sheet.polyline(&[(-500.0, 50.0), (500.0, 50.0)], &SQUARE, pen)
+            let ends = [(-500.0, 50.0), (500.0, 50.0)];
+            sheet.polyline(&ends, &SQUARE, stroke([200, 0, 0], 4.0))
         })
         .unwrap();
         assert_eq!(image.pixel(50, 50), [200, 0, 0]);
@@ -409,14 +322,14 @@ mod tests {
     }
 
     #[test]
-    fn text_has_shape_without_any_font_of_the_system() {
-        let lettering = Lettering::new(LABEL, HPos::Left, VPos::Top);
+    fn text_is_drawn_without_any_font_of_the_system() {
+        let style = text_style(LABEL, HPos::Left, VPos::Top);
         let image = draw((200, 40), |sheet| {
-            sheet.text("error [m]", (5.0, 5.0), lettering)
+            sheet.text("error [m]", (5.0, 5.0), &style)
         })
         .unwrap();
         let dark = image.pixels.iter().filter(|pixel| pixel[0] < 120).count();
         assert!(dark > 100, "{dark}");
-        assert!(text_width("error [m]", lettering) > text_width("[m]", lettering));
+        assert!(text_width("error [m]", &style) > text_width("[m]", &style));
     }
 }

@@ -1,6 +1,6 @@
-//! Every picture drawn of a made-up run: it has its size, is not blank, and shows its colours.
+//! Every picture of a synthetic run has its size, is not blank, and shows its colors.
 //!
-//! With `FPMCL_PICTURES=folder` the pictures stay there to be looked at.
+//! With `FPMCL_PICTURES=folder` the pictures are kept in that folder.
 
 use std::path::{Path, PathBuf};
 
@@ -15,7 +15,7 @@ use crate::evaluation::{RangeMclRules, planar_errors};
 use crate::geometry::{Pose2, TriangleMesh, Vec3};
 use crate::lidar::LidarModel;
 
-/// Where pictures go: a folder that was asked for, or one that goes away.
+/// Folder of the pictures: the one requested, or a temporary one.
 struct Gallery {
     folder: PathBuf,
     _temporary: Option<tempfile::TempDir>,
@@ -43,7 +43,7 @@ impl Gallery {
     }
 }
 
-/// A picture that is large, not blank, and has each colour in at least so many pixels.
+/// Expects a large picture that is not blank and has each color in a least number of pixels.
 fn assert_picture(path: &Path, colors: &[(Rgb, usize)]) -> Bitmap {
     let image = Bitmap::read_png(path).unwrap();
     assert!(image.width >= 1200 && image.height >= 400);
@@ -92,7 +92,7 @@ fn noisy(truth: &[Pose2], noise_m: f64, lost: usize) -> Vec<Pose2> {
         .collect()
 }
 
-/// Houses along the street on a hilly ground, coloured as build-map colours them.
+/// Houses along the street on a hilly ground, colored as build-map colors them.
 fn town(truth: &[Pose2]) -> TriangleMesh {
     let mut mesh = TriangleMesh::default();
     let mut rng = StdRng::seed_from_u64(3);
@@ -174,7 +174,7 @@ fn the_path_is_drawn_over_the_truth_and_over_the_map() {
     let gallery = Gallery::open();
     let truth = street(400);
     let (mcl, refined) = (noisy(&truth, 0.5, 8), noisy(&truth, 0.1, 0));
-    let paths = [Path2::mcl(&mcl), Path2::refined(&refined)];
+    let paths = [NamedPath::mcl(&mcl), NamedPath::refined(&refined)];
     let map = MapImage::of_colors(&town(&truth), 2000);
     let plot = PathPlot {
         title: "Path against ground truth",
@@ -190,7 +190,10 @@ fn the_path_is_drawn_over_the_truth_and_over_the_map() {
     let path = gallery.path("path_short.png");
     let short = PathPlot {
         ground_truth: Some(&truth[..36]),
-        paths: &[Path2::mcl(&mcl[..36]), Path2::refined(&refined[..36])],
+        paths: &[
+            NamedPath::mcl(&mcl[..36]),
+            NamedPath::refined(&refined[..36]),
+        ],
         map: None,
         ..plot
     };
@@ -199,7 +202,7 @@ fn the_path_is_drawn_over_the_truth_and_over_the_map() {
 }
 
 #[test]
-fn the_parents_run_on_kitti_07_is_drawn() {
+fn the_run_of_range_mcl_on_kitti_07_is_drawn() {
     let Some((truth, results)) = crate::app::results::kitti_07_tests::kitti_07() else {
         return;
     };
@@ -211,7 +214,7 @@ fn the_parents_run_on_kitti_07_is_drawn() {
     PathPlot {
         title: "KITTI 07, range-mcl against ground truth",
         ground_truth: Some(&truth),
-        paths: &[Path2::mcl(&estimates)],
+        paths: &[NamedPath::mcl(&estimates)],
         map: None,
     }
     .save(&path)
@@ -249,18 +252,20 @@ fn errors_are_drawn_for_both_trajectories() {
     plot.save(&path).unwrap();
     assert_picture(&path, &[(MCL, 1000), (REFINED, 1000)]);
 
-    let message = ErrorPlot {
+    let error = ErrorPlot {
         x: &times[1..],
         ..plot
     }
     .save(&path)
-    .unwrap_err()
-    .to_string();
-    assert!(message.contains("400 errors where 399 belong"), "{message}");
+    .unwrap_err();
+    assert!(
+        format!("{error:#}").contains("400 errors where 399 belong"),
+        "{error:#}"
+    );
 }
 
 #[test]
-fn particles_are_drawn_on_the_map_when_spread_and_when_together() {
+fn particles_are_drawn_on_the_map_spread_and_concentrated() {
     let gallery = Gallery::open();
     let truth = street(300);
     let map = MapImage::of_colors(&town(&truth), 2500);
@@ -277,7 +282,6 @@ fn particles_are_drawn_on_the_map_when_spread_and_when_together() {
             map: Some(&map),
             particles: &particles,
             estimate: Some(here * Pose2::new(Vector2::new(0.5, 0.3), 0.1)),
-            refined: None,
             ground_truth: Some(here),
             driven: &truth[..=150],
             window: None,
@@ -324,15 +328,12 @@ fn frames_become_an_animation_of_one_size() {
     assert_ne!(frames[0].buffer, frames[3].buffer);
 
     let missing = [gallery.path("no_such.png")];
-    let message = Animation::default()
-        .save(&path, &missing)
-        .unwrap_err()
-        .to_string();
-    assert!(message.contains("no_such.png"), "{message}");
+    let error = Animation::default().save(&path, &missing).unwrap_err();
+    assert!(format!("{error:#}").contains("no_such.png"), "{error:#}");
 }
 
 #[test]
-fn range_images_show_what_is_missing_and_where_the_map_differs() {
+fn range_images_show_missing_pixels_and_differences() {
     let gallery = Gallery::open();
     let model = LidarModel::default();
     let mut rng = StdRng::seed_from_u64(1);
@@ -383,20 +384,20 @@ fn range_images_show_what_is_missing_and_where_the_map_differs() {
         &path,
         &[(MISSING, 2000), (Colormap::Diverging.at(0.0), 100)],
     );
-    let message = RangeImageStrip {
+    let error = RangeImageStrip {
         observed: &observed[1..],
         ..strip
     }
     .save(&path)
     .unwrap_err();
     assert!(
-        message.to_string().contains("57599 observed ranges"),
-        "{message}"
+        format!("{error:#}").contains("57599 observed ranges"),
+        "{error:#}"
     );
 }
 
 #[test]
-fn the_map_is_drawn_in_its_colours_and_by_a_number() {
+fn the_map_is_drawn_in_its_colors_and_by_a_number() {
     let gallery = Gallery::open();
     let truth = street(300);
     let mesh = town(&truth);
@@ -450,12 +451,15 @@ fn the_map_is_drawn_in_its_colours_and_by_a_number() {
         path: None,
         keys: &[],
     };
-    let message = nothing.save(&path).unwrap_err().to_string();
-    assert!(message.contains("the mesh has no triangles"), "{message}");
+    let error = nothing.save(&path).unwrap_err();
+    assert!(
+        format!("{error:#}").contains("the mesh has no triangles"),
+        "{error:#}"
+    );
 }
 
 #[test]
-fn runtimes_and_other_lines_are_drawn() {
+fn runtimes_and_other_series_are_drawn() {
     let gallery = Gallery::open();
     let frames: Vec<usize> = (0..200).collect();
     let mut rng = StdRng::seed_from_u64(2);
@@ -470,7 +474,6 @@ fn runtimes_and_other_lines_are_drawn() {
         title: "Time per frame",
         frames: &frames,
         stages: &[("MCL", MCL, &mcl), ("refine", REFINED, &refine)],
-        converged_row: Some(20),
     }
     .save(&path)
     .unwrap();
@@ -522,14 +525,16 @@ fn a_folder_that_cannot_be_written_is_named() {
         paths: &[],
         map: None,
     };
-    let message = plot.save(&file.join("path.png")).unwrap_err().to_string();
-    assert!(message.contains("path.png"), "{message}");
-    let message = PathPlot {
+    let error = plot.save(&file.join("path.png")).unwrap_err();
+    assert!(format!("{error:#}").contains("path.png"), "{error:#}");
+    let error = PathPlot {
         ground_truth: None,
         ..plot
     }
     .save(&file)
-    .unwrap_err()
-    .to_string();
-    assert!(message.contains("nothing to draw"), "{message}");
+    .unwrap_err();
+    assert!(
+        format!("{error:#}").contains("nothing to draw"),
+        "{error:#}"
+    );
 }

@@ -1,29 +1,32 @@
-//! Where the car was and where it was thought to be; how far apart, and how long that took.
+//! Trajectories over the ground truth, their errors, and the time per frame.
 
 use std::path::Path;
 
+use anyhow::{Context as _, Result, ensure};
+
 use super::MapImage;
+use super::bitmap::Bitmap;
 use super::chart::{LineChart, Panel, Series};
-use super::color::{MCL, REFINED, Rgb, TRUTH};
-use super::error::PlotError;
-use super::sheet::{self, HPos, Lettering, Pen, Point, Rect, Sheet, TICK, VPos};
-use super::view::{Key, KeyShape, Span, View, legend, title};
+use super::color::{MCL, REFINED, Rgb, TRUTH, WHITE};
+use super::sheet::{HPos, Sheet, TICK, VPos, bold, save_png, stroke, text_style};
+use super::top_view::{TopView, positions};
+use super::view::{AxisRange, LegendEntry, Mark, View};
 use crate::evaluation::PlanarError;
 use crate::geometry::Pose2;
 
-/// A trajectory with its name and colour.
+/// Trajectory with its name and color.
 #[derive(Clone, Copy, Debug)]
-pub struct Path2<'a> {
-    /// What the legend calls it.
+pub struct NamedPath<'a> {
+    /// Name in the legend.
     pub name: &'a str,
-    /// One of [`color`](super::color).
+    /// Color, one of [`color`](super::color).
     pub color: Rgb,
-    /// In the map frame.
+    /// Poses in the map frame.
     pub poses: &'a [Pose2],
 }
 
-impl<'a> Path2<'a> {
-    /// The filter's estimates.
+impl<'a> NamedPath<'a> {
+    /// Estimates of the filter.
     pub fn mcl(poses: &'a [Pose2]) -> Self {
         Self {
             name: "MCL",
@@ -32,7 +35,7 @@ impl<'a> Path2<'a> {
         }
     }
 
-    /// The refined trajectory.
+    /// Refined trajectory.
     pub fn refined(poses: &'a [Pose2]) -> Self {
         Self {
             name: "refined",
@@ -42,158 +45,124 @@ impl<'a> Path2<'a> {
     }
 }
 
-/// Trajectories over the ground truth, seen from above.
+/// Trajectories over the ground truth, from above.
 #[derive(Clone, Copy, Debug)]
 pub struct PathPlot<'a> {
-    /// Above everything.
+    /// Title.
     pub title: &'a str,
-    /// The ground truth, where there is one.
+    /// Ground truth, if known.
     pub ground_truth: Option<&'a [Pose2]>,
-    /// Drawn over it, in this order.
-    pub paths: &'a [Path2<'a>],
-    /// Drawn pale below everything.
+    /// Trajectories, drawn in this order.
+    pub paths: &'a [NamedPath<'a>],
+    /// Map, drawn pale below everything.
     pub map: Option<&'a MapImage>,
 }
 
 impl PathPlot<'_> {
     /// Writes the picture.
-    pub fn save(&self, path: &Path) -> Result<(), PlotError> {
-        let everything = || self.all_poses().map(|pose| pose.translation.vector);
-        let spans = Span::of(everything().map(|t| t.x)).zip(Span::of(everything().map(|t| t.y)));
-        let (x, y) = spans.ok_or_else(|| PlotError::Nothing {
-            path: path.to_owned(),
-            what: "all trajectories are empty",
-        })?;
+    pub fn save(&self, path: &Path) -> Result<()> {
+        save_png(path, self.draw())
+    }
+
+    fn draw(&self) -> Result<Bitmap> {
+        let truth = self.ground_truth.map(|poses| NamedPath {
+            name: "ground truth",
+            color: TRUTH,
+            poses,
+        });
+        let all: Vec<&NamedPath> = truth.iter().chain(self.paths).collect();
+        let positions = || {
+            all.iter()
+                .flat_map(|path| path.poses)
+                .map(|p| p.translation)
+        };
+        let x = AxisRange::of(positions().map(|t| t.x));
+        let ranges = x.zip(AxisRange::of(positions().map(|t| t.y)));
+        let (x, y) = ranges.context("there is nothing to draw: all trajectories are empty")?;
         let margin = (0.05 * x.length().max(y.length())).max(2.0);
-        let (view, size) = map_view(x.padded(margin), y.padded(margin), 96.0, 30.0);
-        sheet::save(path, size, |sheet| {
-            title(sheet, self.title, view.rect.left)?;
-            legend(sheet, &self.keys(), (view.rect.left, 70.0), view.rect.right)?;
-            view.grid(sheet)?;
+        let entries = all.iter();
+        let view = TopView {
+            title: self.title,
+            legend: entries
+                .map(|path| LegendEntry::new(path.name, path.color, Mark::Line))
+                .collect(),
+            x: x.padded(margin),
+            y: y.padded(margin),
+            color_bar: None,
+        };
+        view.draw(|sheet, view| {
             if let Some(map) = self.map {
-                map.draw(sheet, &view, 0.6)?;
+                map.draw(sheet, view, 0.6)?;
             }
-            self.draw_paths(sheet, &view)?;
-            view.frame(sheet, "x [m]", "y [m]")?;
-            view.scale_bar(sheet)
+            self.draw_paths(sheet, view)
         })
     }
 
-    fn all_poses(&self) -> impl Iterator<Item = &Pose2> {
-        let paths = self.paths.iter().flat_map(|path| path.poses);
-        self.ground_truth.into_iter().flatten().chain(paths)
-    }
-
-    fn keys(&self) -> Vec<Key> {
-        let truth = self.ground_truth.map(|_| ("ground truth", TRUTH));
-        let paths = self.paths.iter().map(|path| (path.name, path.color));
-        truth
-            .into_iter()
-            .chain(paths)
-            .map(|(name, color)| Key {
-                name: name.to_owned(),
-                color,
-                shape: KeyShape::Line,
-            })
-            .collect()
-    }
-
-    fn draw_paths(&self, sheet: &Sheet, view: &View) -> Result<(), super::error::DrawError> {
+    fn draw_paths(&self, sheet: &Sheet, view: &View) -> Result<()> {
         if let Some(truth) = self.ground_truth {
-            sheet.polyline(&places(truth, view), &view.rect, Pen::new(TRUTH, 6.0))?;
+            sheet.polyline(&positions(truth, view), &view.rect, stroke(TRUTH, 6.0))?;
         }
         for (number, path) in self.paths.iter().enumerate() {
             let width = if number == 0 { 3.0 } else { 2.0 };
-            let pen = Pen::new(path.color, width);
-            sheet.polyline(&places(path.poses, view), &view.rect, pen)?;
+            let stroke = stroke(path.color, width);
+            sheet.polyline(&positions(path.poses, view), &view.rect, stroke)?;
         }
         let longest = self
             .ground_truth
             .or(self.paths.first().map(|path| path.poses));
         if let Some([first, .., last]) = longest {
-            let lettering = |h| Lettering::new(TICK, h, VPos::Bottom).bold();
-            for (pose, word, side) in [(first, "start", HPos::Right), (last, "end", HPos::Left)] {
+            for (pose, label, side, aside) in [
+                (first, "start", HPos::Right, -12.0),
+                (last, "end", HPos::Left, 12.0),
+            ] {
                 let place = view.at(pose.translation.x, pose.translation.y);
-                sheet.dot(place, 9.0, [255, 255, 255], 1.0)?;
+                sheet.dot(place, 9.0, WHITE, 1.0)?;
                 sheet.dot(place, 7.0, TRUTH, 1.0)?;
-                let aside = if matches!(side, HPos::Right) {
-                    -12.0
-                } else {
-                    12.0
-                };
-                sheet.text(word, (place.0 + aside, place.1 - 10.0), lettering(side))?;
+                let style = bold(text_style(TICK, side, VPos::Bottom));
+                sheet.text(label, (place.0 + aside, place.1 - 10.0), &style)?;
             }
         }
         Ok(())
     }
 }
 
-/// Places on the sheet of poses.
-pub(super) fn places(poses: &[Pose2], view: &View) -> Vec<Point> {
-    poses
-        .iter()
-        .map(|pose| view.at(pose.translation.x, pose.translation.y))
-        .collect()
-}
-
-/// Equal axes that suit a part of the plane, below a header of some height and with a margin to
-/// the right, and the size of the picture around them.
-pub(super) fn map_view(x: Span, y: Span, header: f64, right: f64) -> (View, (u32, u32)) {
-    const WIDTH: f64 = 1400.0;
-    const LEFT: f64 = 118.0;
-    let width = WIDTH - LEFT - right;
-    let height = (width * y.length() / x.length())
-        .clamp(380.0, 1150.0)
-        .round();
-    let rect = Rect {
-        left: LEFT,
-        top: header,
-        right: WIDTH - right,
-        bottom: header + height,
-    };
-    let size = (WIDTH as u32, (header + height + 74.0) as u32);
-    (View::equal(rect, x, y), size)
-}
-
 /// Position and heading error over time, one series per trajectory.
 #[derive(Clone, Copy, Debug)]
 pub struct ErrorPlot<'a> {
-    /// Above everything.
+    /// Title.
     pub title: &'a str,
     /// Name of the x axis with its unit.
     pub x_name: &'a str,
     /// Time, frame number or distance, one per frame.
     pub x: &'a [f64],
-    /// Name, colour and errors of each trajectory, one error per frame.
+    /// Name, color and errors of each trajectory, one error per frame.
     pub errors: &'a [(&'a str, Rgb, &'a [PlanarError])],
 }
 
 impl ErrorPlot<'_> {
     /// Writes the picture.
-    pub fn save(&self, path: &Path) -> Result<(), PlotError> {
+    pub fn save(&self, path: &Path) -> Result<()> {
+        let frames = self.x.len();
         for (_, _, errors) in self.errors {
-            if errors.len() != self.x.len() {
-                return Err(PlotError::WrongLength {
-                    path: path.to_owned(),
-                    what: "errors",
-                    found: errors.len(),
-                    expected: self.x.len(),
-                });
-            }
+            ensure!(
+                errors.len() == frames,
+                "cannot draw {}: {} errors where {frames} belong",
+                path.display(),
+                errors.len()
+            );
         }
-        let panel = |y_name: &str, number: fn(&PlanarError) -> f64| Panel {
-            y_name: y_name.to_owned(),
-            series: self
-                .errors
-                .iter()
-                .map(|(name, color, errors)| {
-                    let points = self.x.iter().copied().zip(errors.iter().map(number));
-                    Series::line(name, *color, points)
-                })
-                .collect(),
-            from_zero: true,
-            clip_outliers: true,
-            ..Panel::default()
+        let panel = |y_name: &str, number: fn(&PlanarError) -> f64| {
+            let series = self.errors.iter().map(|(name, color, errors)| {
+                let points = self.x.iter().copied().zip(errors.iter().map(number));
+                Series::line(name, *color, points)
+            });
+            Panel {
+                y_name: y_name.to_owned(),
+                series: series.collect(),
+                from_zero: true,
+                clip_outliers: true,
+                ..Panel::default()
+            }
         };
         LineChart {
             title: self.title.to_owned(),
@@ -210,45 +179,36 @@ impl ErrorPlot<'_> {
     }
 }
 
-/// Time that was spent on each frame.
+/// Runtime of each frame.
 #[derive(Clone, Copy, Debug)]
 pub struct RuntimePlot<'a> {
-    /// Above everything.
+    /// Title.
     pub title: &'a str,
-    /// Numbers of the frames.
+    /// Frame numbers.
     pub frames: &'a [usize],
-    /// Name, colour and time per frame of each stage [s].
+    /// Name, color and time per frame of each stage [s].
     pub stages: &'a [(&'a str, Rgb, &'a [f64])],
-    /// Row in which the filter converged.
-    pub converged_row: Option<usize>,
 }
 
 impl RuntimePlot<'_> {
     /// Writes the picture.
-    pub fn save(&self, path: &Path) -> Result<(), PlotError> {
-        let series = |(name, color, times_s): &(&str, Rgb, &[f64])| {
+    pub fn save(&self, path: &Path) -> Result<()> {
+        let series = self.stages.iter().map(|(name, color, times_s)| {
             let points = self.frames.iter().zip(*times_s);
-            Series::line(
-                name,
-                *color,
-                points.map(|(&frame, time_s)| (frame as f64, 1e3 * time_s)),
-            )
-        };
-        let converged = self.converged_row.and_then(|row| self.frames.get(row));
+            let points = points.map(|(&frame, time_s)| (frame as f64, 1e3 * time_s));
+            Series::line(name, *color, points)
+        });
         LineChart {
             title: self.title.to_owned(),
             x_name: "frame".to_owned(),
             panels: vec![Panel {
                 y_name: "time per frame [ms]".to_owned(),
-                series: self.stages.iter().map(series).collect(),
+                series: series.collect(),
                 from_zero: true,
                 clip_outliers: true,
                 ..Panel::default()
             }],
-            marks: converged
-                .map(|&frame| (frame as f64, "converged".to_owned()))
-                .into_iter()
-                .collect(),
+            marks: Vec::new(),
         }
         .save(path)
     }

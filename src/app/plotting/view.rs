@@ -1,44 +1,46 @@
-//! Where numbers lie on the sheet: axes with round ticks, equal scales, legends, colour bars.
+//! Mapping of numbers to the sheet: axes with round ticks, equal scales, legends, color bars.
+
+use anyhow::Result;
 
 use super::color::{Colormap, FRAME, GRID, INK, Rgb};
-use super::error::DrawError;
-use super::sheet::{HPos, LABEL, Lettering, Pen, Point, Rect, Sheet, TICK, VPos, text_width};
+use super::sheet::{
+    HPos, LABEL, Point, Rect, Sheet, TICK, VPos, stroke, text_style, text_width, upwards,
+};
 
-/// A range of numbers.
+/// Range of numbers along an axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Span {
+pub struct AxisRange {
     pub min: f64,
     pub max: f64,
 }
 
-impl Span {
+impl AxisRange {
     pub fn new(min: f64, max: f64) -> Self {
         Self { min, max }
     }
 
-    /// The range of some numbers, those that are not finite left out; `None` of none.
+    /// Range of the finite numbers; `None` without any.
     pub fn of(numbers: impl IntoIterator<Item = f64>) -> Option<Self> {
         let empty = Self::new(f64::INFINITY, f64::NEG_INFINITY);
-        let span = numbers
+        let range = numbers
             .into_iter()
             .filter(|number| number.is_finite())
-            .fold(empty, |span, number| Self {
-                min: span.min.min(number),
-                max: span.max.max(number),
+            .fold(empty, |range, number| {
+                Self::new(range.min.min(number), range.max.max(number))
             });
-        (span.min <= span.max).then_some(span)
+        (range.min <= range.max).then_some(range)
     }
 
     pub fn length(&self) -> f64 {
         self.max - self.min
     }
 
-    /// At least as long as `length`, about the same middle.
+    /// Extends the range about its center to at least a length.
     pub fn at_least(self, length: f64) -> Self {
-        let missing = 0.5 * (length - self.length()).max(0.0);
-        Self::new(self.min - missing, self.max + missing)
+        self.padded(0.5 * (length - self.length()).max(0.0))
     }
 
+    /// Extends the range by a margin on both sides.
     pub fn padded(self, margin: f64) -> Self {
         Self::new(self.min - margin, self.max + margin)
     }
@@ -48,13 +50,13 @@ impl Span {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct View {
     pub rect: Rect,
-    pub x: Span,
-    pub y: Span,
+    pub x: AxisRange,
+    pub y: AxisRange,
 }
 
 impl View {
-    /// Equal scales on both axes: the shorter range is made longer.
-    pub fn equal(rect: Rect, x: Span, y: Span) -> Self {
+    /// View with equal scales on both axes: the shorter range is extended.
+    pub fn equal(rect: Rect, x: AxisRange, y: AxisRange) -> Self {
         let scale = (x.length() / rect.width()).max(y.length() / rect.height());
         Self {
             rect,
@@ -63,7 +65,7 @@ impl View {
         }
     }
 
-    /// Where a pair of numbers lies.
+    /// Point on the sheet of a pair of numbers.
     pub fn at(&self, x: f64, y: f64) -> Point {
         (
             self.rect.left + (x - self.x.min) / self.x.length() * self.rect.width(),
@@ -76,74 +78,46 @@ impl View {
         self.rect.width() / self.x.length()
     }
 
-    /// Thin lines at the ticks.
-    pub fn grid(&self, sheet: &Sheet) -> Result<(), DrawError> {
-        let pen = Pen::new(GRID, 1.0);
+    /// Draws thin lines at the ticks.
+    pub fn grid(&self, sheet: &Sheet) -> Result<()> {
+        let Rect { left, right, .. } = self.rect;
         for x in self.x_ticks().places {
-            let (column, _) = self.at(x, self.y.min);
-            sheet.line((column, self.rect.top), (column, self.rect.bottom), pen)?;
+            let (column, bottom) = self.at(x, self.y.min);
+            sheet.line((column, self.rect.top), (column, bottom), stroke(GRID, 1.0))?;
         }
         for y in self.y_ticks().places {
             let (_, row) = self.at(self.x.min, y);
-            sheet.line((self.rect.left, row), (self.rect.right, row), pen)?;
+            sheet.line((left, row), (right, row), stroke(GRID, 1.0))?;
         }
         Ok(())
     }
 
-    /// Ticks, frame and names of the axes, without a grid.
-    pub fn frame(&self, sheet: &Sheet, x_name: &str, y_name: &str) -> Result<(), DrawError> {
-        self.frame_with(sheet, &self.x_ticks(), x_name, y_name)
-    }
-
-    /// The same around a panorama whose x runs from +180 to −180 degrees.
-    pub fn panorama_frame(
-        &self,
-        sheet: &Sheet,
-        x_name: &str,
-        y_name: &str,
-    ) -> Result<(), DrawError> {
-        let ticks = Ticks {
-            places: (-3..=3).map(|k| 60.0 * f64::from(k)).collect(),
-            step: 60.0,
-        };
-        self.frame_with(sheet, &ticks, x_name, y_name)
-    }
-
-    fn frame_with(
-        &self,
-        sheet: &Sheet,
-        x_ticks: &Ticks,
-        x_name: &str,
-        y_name: &str,
-    ) -> Result<(), DrawError> {
-        let Rect {
-            left,
-            right,
-            top,
-            bottom,
-        } = self.rect;
-        let pen = Pen::new(FRAME, 1.0);
-        sheet.outline(&self.rect, pen)?;
-        let below = Lettering::new(TICK, HPos::Center, VPos::Top);
+    /// Draws the frame, the ticks and the names of the axes.
+    pub fn frame(&self, sheet: &Sheet, x_ticks: &Ticks, names: [&str; 2]) -> Result<()> {
+        let rect @ Rect { left, bottom, .. } = self.rect;
+        let line = stroke(FRAME, 1.0);
+        sheet.outline(&rect, line)?;
+        let below = text_style(TICK, HPos::Center, VPos::Top);
         for (x, text) in x_ticks.labelled() {
             let (column, _) = self.at(x, self.y.min);
-            sheet.line((column, bottom), (column, bottom + 5.0), pen)?;
-            sheet.text(&text, (column, bottom + 9.0), below)?;
+            sheet.line((column, bottom), (column, bottom + 5.0), line)?;
+            sheet.text(&text, (column, bottom + 9.0), &below)?;
         }
-        let beside = Lettering::new(TICK, HPos::Right, VPos::Center);
+        let beside = text_style(TICK, HPos::Right, VPos::Center);
         for (y, text) in self.y_ticks().labelled() {
             let (_, row) = self.at(self.x.min, y);
-            sheet.line((left - 5.0, row), (left, row), pen)?;
-            sheet.text(&text, (left - 9.0, row), beside)?;
+            sheet.line((left - 5.0, row), (left, row), line)?;
+            sheet.text(&text, (left - 9.0, row), &beside)?;
         }
-        let name = Lettering::new(LABEL, HPos::Center, VPos::Center);
-        let middle = (0.5 * (left + right), bottom + 46.0);
-        sheet.text(x_name, middle, name)?;
-        let middle = (left - 78.0, 0.5 * (top + bottom));
-        sheet.text(y_name, middle, name.upwards())
+        let style = text_style(LABEL, HPos::Center, VPos::Center);
+        let center = (0.5 * (left + rect.right), bottom + 46.0);
+        sheet.text(names[0], center, &style)?;
+        let center = (left - 78.0, 0.5 * (rect.top + bottom));
+        sheet.text(names[1], center, &upwards(&style))
     }
 
-    fn x_ticks(&self) -> Ticks {
+    /// Ticks of the x axis.
+    pub fn x_ticks(&self) -> Ticks {
         Ticks::of(self.x, self.rect.width() / 110.0)
     }
 
@@ -156,38 +130,37 @@ impl View {
         Ticks::of(self.y, self.rect.height() / 60.0)
     }
 
-    /// A bar of a round length over the upper right corner, outside the data, for maps.
-    pub fn scale_bar(&self, sheet: &Sheet) -> Result<(), DrawError> {
+    /// Draws a bar of a round length above the upper right corner, for maps.
+    pub fn scale_bar(&self, sheet: &Sheet) -> Result<()> {
         let length = round_step(0.12 * self.x.length());
         let (right, row) = (self.rect.right, self.rect.top - 26.0);
         let left = right - length * self.scale();
-        let pen = Pen::new(INK, 3.0);
-        sheet.line((left, row), (right, row), pen)?;
+        sheet.line((left, row), (right, row), stroke(INK, 3.0))?;
         for end in [left, right] {
-            sheet.line((end, row - 6.0), (end, row + 6.0), Pen::new(INK, 2.0))?;
+            sheet.line((end, row - 6.0), (end, row + 6.0), stroke(INK, 2.0))?;
         }
-        let beside = Lettering::new(TICK, HPos::Right, VPos::Center);
-        sheet.text(&format!("{length} m"), (left - 10.0, row), beside)
+        let beside = text_style(TICK, HPos::Right, VPos::Center);
+        sheet.text(&format!("{length} m"), (left - 10.0, row), &beside)
     }
 }
 
 /// Round numbers along an axis.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ticks {
-    pub places: Vec<f64>,
+    places: Vec<f64>,
     step: f64,
 }
 
 impl Ticks {
-    /// About `count` of them, at least two.
-    pub fn of(span: Span, count: f64) -> Self {
-        Self::every(round_step(span.length() / count.max(2.0)), span)
+    /// About `count` ticks, at least two.
+    fn of(range: AxisRange, count: f64) -> Self {
+        Self::every(round_step(range.length() / count.max(2.0)), range)
     }
 
-    /// At the multiples of a step.
-    fn every(step: f64, span: Span) -> Self {
-        let first = (span.min / step - 1e-6).ceil() as i64;
-        let last = (span.max / step + 1e-6).floor() as i64;
+    /// Ticks at the multiples of a step.
+    pub fn every(step: f64, range: AxisRange) -> Self {
+        let first = (range.min / step - 1e-6).ceil() as i64;
+        let last = (range.max / step + 1e-6).floor() as i64;
         Self {
             // At most a hundred, whatever the numbers.
             places: (first..=last).take(100).map(|k| k as f64 * step).collect(),
@@ -196,7 +169,7 @@ impl Ticks {
     }
 
     /// Places with their labels.
-    pub fn labelled(&self) -> impl Iterator<Item = (f64, String)> {
+    fn labelled(&self) -> impl Iterator<Item = (f64, String)> {
         let decimals = (-self.step.log10().floor()).clamp(0.0, 9.0) as usize;
         self.places.iter().map(move |&place| {
             // Not "-0".
@@ -206,7 +179,7 @@ impl Ticks {
     }
 }
 
-/// The largest of 1, 2, 5 times a power of ten that is not above a length by more than half.
+/// Rounds a length to 1, 2 or 5 times a power of ten.
 fn round_step(length: f64) -> f64 {
     let length = if length.is_finite() && length > 0.0 {
         length
@@ -214,15 +187,11 @@ fn round_step(length: f64) -> f64 {
         1.0
     };
     let power = 10.0_f64.powi(length.log10().floor() as i32);
-    let digit = length / power;
-    let round = if digit < 1.5 {
-        1.0
-    } else if digit < 3.5 {
-        2.0
-    } else if digit < 7.5 {
-        5.0
-    } else {
-        10.0
+    let round = match length / power {
+        digit if digit < 1.5 => 1.0,
+        digit if digit < 3.5 => 2.0,
+        digit if digit < 7.5 => 5.0,
+        _ => 10.0,
     };
     // 0.3 rather than 3 × 0.1.
     if power < 1.0 {
@@ -232,95 +201,117 @@ fn round_step(length: f64) -> f64 {
     }
 }
 
-/// What stands in a legend.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Key {
-    pub name: String,
-    pub color: Rgb,
-    pub shape: KeyShape,
-}
-
-/// How an entry of a legend is marked.
+/// How data are drawn, and their key in the legend.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum KeyShape {
+pub enum Mark {
+    /// Line through the points, with a gap where one is not finite.
     Line,
+    /// Dashed line.
     Dashes,
-    Dot,
-    Square,
+    /// Dot per point.
+    Dots,
+    /// Area of a color; in legends only.
+    Area,
 }
 
-/// A legend in one line, from a point to the right; entries that do not fit wrap to the next line.
-pub fn legend(sheet: &Sheet, keys: &[Key], at: Point, right: f64) -> Result<(), DrawError> {
+/// Entry of a legend.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LegendEntry {
+    name: String,
+    color: Rgb,
+    mark: Mark,
+}
+
+impl LegendEntry {
+    pub fn new(name: impl Into<String>, color: Rgb, mark: Mark) -> Self {
+        Self {
+            name: name.into(),
+            color,
+            mark,
+        }
+    }
+
+    fn draw_key(&self, sheet: &Sheet, (x, y): Point) -> Result<()> {
+        let line = |from, to| sheet.line((x + from, y), (x + to, y), stroke(self.color, 5.0));
+        match self.mark {
+            Mark::Line => line(0.0, 34.0),
+            Mark::Dashes => line(0.0, 13.0).and_then(|()| line(21.0, 34.0)),
+            Mark::Dots => sheet.dot((x + 18.0, y), 6.0, self.color, 1.0),
+            Mark::Area => {
+                let square = Rect {
+                    left: x + 10.0,
+                    top: y - 8.0,
+                    right: x + 26.0,
+                    bottom: y + 8.0,
+                };
+                sheet.fill(&square, self.color)?;
+                sheet.outline(&square, stroke(FRAME, 1.0))
+            }
+        }
+    }
+}
+
+/// Draws a legend from a point to the right; entries beyond `right` wrap to the next line.
+pub fn legend(sheet: &Sheet, entries: &[LegendEntry], at: Point, right: f64) -> Result<()> {
     const LINE: f64 = 28.0;
-    let lettering = Lettering::new(TICK + 1.0, HPos::Left, VPos::Center);
+    let style = text_style(TICK + 1.0, HPos::Left, VPos::Center);
     let (mut x, mut y) = at;
-    for key in keys {
-        let width = 46.0 + text_width(&key.name, lettering);
+    for entry in entries {
+        let width = 46.0 + text_width(&entry.name, &style);
         if x + width > right && x > at.0 {
             (x, y) = (at.0, y + LINE);
         }
-        draw_key(sheet, key, (x, y))?;
-        sheet.text(&key.name, (x + 42.0, y), lettering)?;
+        entry.draw_key(sheet, (x, y))?;
+        sheet.text(&entry.name, (x + 42.0, y), &style)?;
         x += width + 24.0;
     }
     Ok(())
 }
 
-fn draw_key(sheet: &Sheet, key: &Key, (x, y): Point) -> Result<(), DrawError> {
-    let pen = Pen::new(key.color, 5.0);
-    let swatch = Rect {
-        left: x + 10.0,
-        top: y - 8.0,
-        right: x + 26.0,
-        bottom: y + 8.0,
-    };
-    match key.shape {
-        KeyShape::Line => sheet.line((x, y), (x + 34.0, y), pen),
-        KeyShape::Dashes => {
-            sheet.line((x, y), (x + 13.0, y), pen)?;
-            sheet.line((x + 21.0, y), (x + 34.0, y), pen)
-        }
-        KeyShape::Dot => sheet.dot((x + 18.0, y), 6.0, key.color, 1.0),
-        KeyShape::Square => {
-            sheet.fill(&swatch, key.color)?;
-            sheet.outline(&swatch, Pen::new(FRAME, 1.0))
-        }
-    }
+/// Vertical bar of the colors of a range of numbers.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ColorBar<'a> {
+    pub range: AxisRange,
+    pub colormap: Colormap,
+    /// Name of the quantity with its unit.
+    pub name: &'a str,
 }
 
-/// An upright bar of colours with its numbers to the right and its name beside them.
-pub fn color_bar(
-    sheet: &Sheet,
-    rect: Rect,
-    span: Span,
-    colormap: Colormap,
-    name: &str,
-) -> Result<(), DrawError> {
-    sheet.pixels(&rect, |_, y| Some(colormap.at(1.0 - y)))?;
-    let pen = Pen::new(FRAME, 1.0);
-    sheet.outline(&rect, pen)?;
-    let view = View {
-        rect,
-        x: Span::new(0.0, 1.0),
-        y: span,
-    };
-    let beside = Lettering::new(TICK, HPos::Left, VPos::Center);
-    let mut widest = 0.0_f64;
-    for (y, text) in Ticks::of(span, (rect.height() / 50.0).min(10.0)).labelled() {
-        let (_, row) = view.at(0.0, y);
-        sheet.line((rect.right, row), (rect.right + 5.0, row), pen)?;
-        sheet.text(&text, (rect.right + 9.0, row), beside)?;
-        widest = widest.max(text_width(&text, beside));
+impl ColorBar<'_> {
+    /// Color of a number.
+    pub fn color(&self, number: f64) -> Rgb {
+        let share = (number - self.range.min) / self.range.length();
+        self.colormap.at(share)
     }
-    let lettering = Lettering::new(TICK + 1.0, HPos::Center, VPos::Center);
-    let middle = (rect.right + widest + 28.0, 0.5 * (rect.top + rect.bottom));
-    sheet.text(name, middle, lettering.upwards())
-}
 
-/// The title of a picture.
-pub fn title(sheet: &Sheet, text: &str, left: f64) -> Result<(), DrawError> {
-    let lettering = Lettering::new(super::sheet::TITLE, HPos::Left, VPos::Center);
-    sheet.text(text, (left, 30.0), lettering.bold())
+    /// Draws the bar between two columns at the height of `beside`, with its numbers and its name
+    /// to the right.
+    pub fn draw(&self, sheet: &Sheet, beside: &Rect, [left, right]: [f64; 2]) -> Result<()> {
+        let rect = Rect {
+            left,
+            right,
+            ..*beside
+        };
+        sheet.pixels(&rect, |_, y| Some(self.colormap.at(1.0 - y)))?;
+        let line = stroke(FRAME, 1.0);
+        sheet.outline(&rect, line)?;
+        let view = View {
+            rect,
+            x: AxisRange::new(0.0, 1.0),
+            y: self.range,
+        };
+        let style = text_style(TICK, HPos::Left, VPos::Center);
+        let mut widest = 0.0_f64;
+        for (y, text) in Ticks::of(self.range, (rect.height() / 50.0).min(10.0)).labelled() {
+            let (_, row) = view.at(0.0, y);
+            sheet.line((right, row), (right + 5.0, row), line)?;
+            sheet.text(&text, (right + 9.0, row), &style)?;
+            widest = widest.max(text_width(&text, &style));
+        }
+        let style = text_style(TICK + 1.0, HPos::Center, VPos::Center);
+        let center = (right + widest + 28.0, 0.5 * (rect.top + rect.bottom));
+        sheet.text(self.name, center, &upwards(&style))
+    }
 }
 
 #[cfg(test)]
@@ -338,7 +329,7 @@ mod tests {
             bottom: 350.0,
         };
         for (x, y) in [(30.0, 2.0), (5.0, 300.0), (1.0, 1.0)] {
-            let view = View::equal(rect, Span::new(0.0, x), Span::new(-y, 0.0));
+            let view = View::equal(rect, AxisRange::new(0.0, x), AxisRange::new(-y, 0.0));
             let origin = view.at(0.0, 0.0);
             let (ahead, up) = (view.at(1.0, 0.0), view.at(0.0, 1.0));
             assert_relative_eq!(ahead.0 - origin.0, origin.1 - up.1, epsilon = 1e-9);
@@ -355,20 +346,23 @@ mod tests {
             (1e5, 1.3e5),
             (-7.0, -7.0),
         ] {
-            let span = Span::new(min, max).at_least(1e-3);
-            let ticks = Ticks::of(span, 6.0);
-            assert!((2..=14).contains(&ticks.places.len()), "{span:?} {ticks:?}");
+            let range = AxisRange::new(min, max).at_least(1e-3);
+            let ticks = Ticks::of(range, 6.0);
+            assert!(
+                (2..=14).contains(&ticks.places.len()),
+                "{range:?} {ticks:?}"
+            );
             for (place, text) in ticks.labelled() {
-                assert!(place >= span.min - 1e-9 && place <= span.max + 1e-9);
+                assert!(place >= range.min - 1e-9 && place <= range.max + 1e-9);
                 assert_relative_eq!(text.parse::<f64>().unwrap(), place, epsilon = 1e-9);
             }
         }
     }
 
     #[test]
-    fn the_span_of_numbers_leaves_out_what_is_not_finite() {
-        let span = Span::of([1.0, f64::NAN, -2.0, f64::INFINITY]);
-        assert_eq!(span, Some(Span::new(-2.0, 1.0)));
-        assert_eq!(Span::of([f64::NAN]), None);
+    fn the_range_of_numbers_ignores_what_is_not_finite() {
+        let range = AxisRange::of([1.0, f64::NAN, -2.0, f64::INFINITY]);
+        assert_eq!(range, Some(AxisRange::new(-2.0, 1.0)));
+        assert_eq!(AxisRange::of([f64::NAN]), None);
     }
 }

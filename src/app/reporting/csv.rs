@@ -74,7 +74,7 @@ fn number(number: Option<f64>) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::example;
+    use super::super::tests::example;
     use super::*;
 
     #[test]

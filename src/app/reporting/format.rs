@@ -62,7 +62,7 @@ fn signed(value: f64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::all_successful;
+    use super::super::tests::all_successful;
     use super::super::{MeanWithSpread, PairedDifference};
     use super::*;
 

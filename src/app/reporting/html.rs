@@ -61,7 +61,7 @@ fn td(cell: &Cell) -> Markup {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::example;
+    use super::super::tests::example;
 
     #[test]
     fn a_table_has_its_numbers_to_sort_by_and_none_of_its_text_is_markup() {

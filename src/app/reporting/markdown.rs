@@ -53,7 +53,7 @@ fn escape(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::example;
+    use super::super::tests::example;
     use super::*;
 
     #[test]

@@ -14,7 +14,7 @@ mod html;
 mod page;
 
 #[cfg(test)]
-mod example;
+mod tests;
 
 pub use page::{Page, PageElement, Section};
 pub use table::{Cell, Column, MeanWithSpread, PairedDifference, SuccessRate, Table};

@@ -125,7 +125,7 @@ impl PageElement {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::example;
+    use super::super::tests::example;
     use super::*;
 
     fn page() -> Page {

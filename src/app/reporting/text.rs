@@ -86,7 +86,7 @@ fn wrapped(text: &str, width: usize) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::example::example;
+    use super::super::tests::example;
     use super::*;
 
     #[test]

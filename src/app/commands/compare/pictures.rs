@@ -8,7 +8,7 @@ use super::Layout;
 use crate::app::comparison::tables::rate;
 use crate::app::comparison::{Comparison, RunRecord};
 use crate::app::plotting::color::{Rgb, SERIES};
-use crate::app::plotting::{LineChart, Mark, Panel, Path2, PathPlot, Series};
+use crate::app::plotting::{LineChart, Mark, NamedPath, Panel, PathPlot, Series};
 use crate::app::reporting::SuccessRate;
 use crate::app::results::LocalizationResults;
 use crate::evaluation::{PlanarError, planar_errors};
@@ -48,9 +48,9 @@ pub fn sequence(comparison: &Comparison, sequence: &str, layout: &Layout) -> Res
         .map(|one| format!("{} seed {}", one.name, one.seed))
         .collect();
     let seeds = seeds.join(", ");
-    let paths: Vec<Path2> = found
+    let paths: Vec<NamedPath> = found
         .iter()
-        .map(|one| Path2 {
+        .map(|one| NamedPath {
             name: &one.name,
             color: one.color,
             poses: &one.poses,
