@@ -1,11 +1,11 @@
-//! Pages in a real browser: seen whole on a desk and on a phone, printed, sorted by clicks.
+//! Pages in a real browser: displayed on a desktop and on a phone, printed, sorted by clicks.
 //!
-//! `FPMCL_PAGES` names pages, separated by colons; `FPMCL_SCREENSHOTS` is the folder in which is kept
-//! what the browser shows. `.ci/run` sets both. Without them, or without Chromium, nothing is tried,
-//! and that is said.
+//! `FPMCL_PAGES` lists pages, separated by colons; `FPMCL_SCREENSHOTS` is the folder of the
+//! screenshots. `.ci/run` sets both. Without them, or without Chromium, the tests are skipped with
+//! a message.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
-#![allow(clippy::print_stderr, reason = "what is not tried is said")]
+#![allow(clippy::print_stderr, reason = "a skipped test says so")]
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -15,61 +15,61 @@ use std::time::{Duration, Instant};
 
 use fpmcl::app::plotting::Bitmap;
 
-/// Widths of a desk's and a phone's window [pixels].
+/// Widths of the windows of a desktop and of a phone [px].
 const WIDTHS: [u32; 2] = [1280, 390];
 
-/// The browser makes no window narrower than this [pixels].
+/// Minimum width of a window of the browser [px].
 const NARROWEST: u32 = 500;
 
-/// The browser does not paint a window that is higher [pixels].
+/// Maximum height of a window that the browser paints [px].
 const HIGHEST: u32 = 8000;
 
-/// After this the browser hangs; it takes seconds.
-const PATIENCE: Duration = Duration::from_secs(120);
+/// Time limit of the browser, which takes seconds.
+const TIMEOUT: Duration = Duration::from_secs(120);
 
-/// Chromium with pages to look at.
+/// Chromium with the pages under test.
 struct Browser {
     program: &'static str,
     pages: Vec<PathBuf>,
-    kept: PathBuf,
+    screenshots: PathBuf,
 }
 
 impl Browser {
-    /// `None`, with a word, where there is nothing to look at or nothing to look with.
+    /// `None`, with a message, without pages or without a browser.
     fn open() -> Option<Self> {
-        let (Ok(pages), Ok(kept)) = (
+        let (Ok(pages), Ok(screenshots)) = (
             std::env::var("FPMCL_PAGES"),
             std::env::var("FPMCL_SCREENSHOTS"),
         ) else {
-            eprintln!("not run: FPMCL_PAGES and FPMCL_SCREENSHOTS name no pages and no folder");
+            eprintln!("not run: FPMCL_PAGES and FPMCL_SCREENSHOTS are not set");
             return None;
         };
         let programs = ["chromium", "chromium-browser", "google-chrome"];
         let is_there = |program: &&str| {
-            let mut asked = Command::new(program);
-            asked
+            let mut command = Command::new(program);
+            command
                 .arg("--version")
                 .stdout(Stdio::null())
                 .stderr(Stdio::null());
-            finished_within(PATIENCE, &mut asked).is_ok_and(|status| status.success())
+            finished_within(TIMEOUT, &mut command).is_ok_and(|status| status.success())
         };
         let Some(program) = programs.into_iter().find(is_there) else {
             eprintln!("not run: there is no Chromium");
             return None;
         };
-        fs::create_dir_all(&kept).unwrap();
+        fs::create_dir_all(&screenshots).unwrap();
         Some(Self {
             program,
             pages: pages.split(':').map(PathBuf::from).collect(),
-            kept: fs::canonicalize(kept).unwrap(),
+            screenshots: fs::canonicalize(screenshots).unwrap(),
         })
     }
 
-    /// What the browser writes to standard output about an address.
+    /// Standard output of the browser for an address.
     fn visit(&self, address: &str, arguments: &[String]) -> String {
         let profile = tempfile::tempdir().unwrap();
-        let said = profile.path().join("said.txt");
-        let complained = profile.path().join("complained.txt");
+        let output = profile.path().join("output.txt");
+        let errors = profile.path().join("errors.txt");
         let mut visiting = Command::new(self.program);
         visiting
             .args([
@@ -87,28 +87,28 @@ impl Browser {
             .arg(format!("--user-data-dir={}", profile.path().display()))
             .args(arguments)
             .arg(address)
-            .stdout(fs::File::create(&said).unwrap())
-            .stderr(fs::File::create(&complained).unwrap());
-        let finished = finished_within(PATIENCE, &mut visiting);
+            .stdout(fs::File::create(&output).unwrap())
+            .stderr(fs::File::create(&errors).unwrap());
+        let finished = finished_within(TIMEOUT, &mut visiting);
         let read = |path| String::from_utf8_lossy(&fs::read(path).unwrap()).into_owned();
-        let is_well = finished.as_ref().is_ok_and(ExitStatus::success);
-        assert!(is_well, "{address}: {finished:?}: {}", read(&complained));
-        read(&said)
+        let succeeded = finished.as_ref().is_ok_and(ExitStatus::success);
+        assert!(succeeded, "{address}: {finished:?}: {}", read(&errors));
+        read(&output)
     }
 
-    /// What a script says of a page in a window of some width.
-    fn ask(&self, html: &str, fragment: &str, script: &str, width: u32) -> String {
-        let say = "const said = (text) => parent.postMessage(text, '*');";
-        let added = format!("<script>\n{say}\n{script}\n</script>\n</body>");
+    /// Report of a script about a page in a window of a width.
+    fn run_script(&self, html: &str, fragment: &str, script: &str, width: u32) -> String {
+        let report = "const report = (text) => parent.postMessage(text, '*');";
+        let added = format!("<script>\n{report}\n{script}\n</script>\n</body>");
         let window = Window::of(&html.replace("</body>", &added), fragment, [width, 900]);
-        // Enough for a message to arrive [ms].
+        // Enough time for the message to arrive [ms].
         let arguments = ["--dump-dom", "--virtual-time-budget=10000"].map(str::to_owned);
         let found = self.visit(&window.address, &arguments);
         let (_, rest) = found.rsplit_once("<output>").unwrap();
         rest.split_once("</output>").unwrap().0.to_owned()
     }
 
-    /// The page from its top to its end, in one picture.
+    /// The whole page in one picture.
     fn screenshot(&self, html: &str, width: u32, height: u32) -> Bitmap {
         let mut pixels = Vec::new();
         for top in (0..height).step_by(HIGHEST as usize) {
@@ -132,18 +132,18 @@ impl Browser {
     }
 }
 
-/// How a program ended; one that takes longer is killed, and that is told.
+/// Exit status of a program; one that takes longer than the limit is killed, which is an error.
 fn finished_within(limit: Duration, command: &mut Command) -> Result<ExitStatus, String> {
     let child = command.spawn();
-    let told = |error: std::io::Error| format!("{command:?}: {error}");
-    let mut child = child.map_err(told)?;
+    let failed = |error: std::io::Error| format!("{command:?}: {error}");
+    let mut child = child.map_err(failed)?;
     let started = Instant::now();
     loop {
-        if let Some(status) = child.try_wait().map_err(told)? {
+        if let Some(status) = child.try_wait().map_err(failed)? {
             return Ok(status);
         }
         if started.elapsed() > limit {
-            child.kill().and_then(|()| child.wait()).map_err(told)?;
+            child.kill().and_then(|()| child.wait()).map_err(failed)?;
             return Err(format!("{command:?} hung and was killed after {limit:?}"));
         }
         std::thread::sleep(Duration::from_millis(20));
@@ -152,15 +152,15 @@ fn finished_within(limit: Duration, command: &mut Command) -> Result<ExitStatus,
 
 #[cfg(unix)]
 #[test]
-fn a_program_that_hangs_is_killed_and_told() {
+fn a_program_that_hangs_is_killed_with_an_error() {
     let mut hanging = Command::new("sleep");
-    let told = finished_within(Duration::from_millis(50), hanging.arg("3600")).unwrap_err();
-    assert!(told.contains("sleep") && told.contains("hung"), "{told}");
-    let status = finished_within(PATIENCE, &mut Command::new("true")).unwrap();
+    let error = finished_within(Duration::from_millis(50), hanging.arg("3600")).unwrap_err();
+    assert!(error.contains("sleep") && error.contains("hung"), "{error}");
+    let status = finished_within(TIMEOUT, &mut Command::new("true")).unwrap();
     assert!(status.success());
 }
 
-/// A page in a frame of its own, which may be narrower than the browser's windows.
+/// A page in a frame, which may be narrower than the windows of the browser.
 struct Window {
     folder: tempfile::TempDir,
     address: String,
@@ -172,9 +172,9 @@ impl Window {
         fs::write(folder.path().join("page.html"), html).unwrap();
         let frame = format!(
             "<!doctype html>\n<body style=\"margin: 0\">\n\
-             <script>\naddEventListener('message', (told) => {{\n  \
+             <script>\naddEventListener('message', (event) => {{\n  \
              const place = document.createElement('output');\n  \
-             place.textContent = told.data;\n  document.body.append(place);\n}});\n</script>\n\
+             place.textContent = event.data;\n  document.body.append(place);\n}});\n</script>\n\
              <iframe src=\"page.html{fragment}\" width=\"{width}\" height=\"{height}\" \
              style=\"border: 0; display: block\"></iframe>\n</body>\n"
         );
@@ -187,7 +187,7 @@ impl Window {
     }
 }
 
-/// A name for what is kept of a page: the last folders that it lies in.
+/// Name of the screenshots of a page: its last two folders.
 fn name_of(page: &Path) -> String {
     let folder = fs::canonicalize(page).unwrap();
     let parts: Vec<_> = folder.parent().unwrap().iter().rev().take(2).collect();
@@ -196,16 +196,16 @@ fn name_of(page: &Path) -> String {
 }
 
 #[test]
-fn pages_are_seen_whole_on_a_desk_and_on_a_phone() {
+fn pages_fit_a_desktop_and_a_phone() {
     let Some(browser) = Browser::open() else {
         return;
     };
     for page in &browser.pages {
         let html = fs::read_to_string(page).unwrap();
         for width in WIDTHS {
-            let said = browser.ask(&html, "", include_str!("browser/seen.js"), width);
-            let place = format!("{}, {width} pixels wide: {said}", page.display());
-            let [seen, height, fits] = said.splitn(3, ' ').collect::<Vec<_>>()[..] else {
+            let report = browser.run_script(&html, "", include_str!("browser/size.js"), width);
+            let place = format!("{}, {width} pixels wide: {report}", page.display());
+            let [seen, height, fits] = report.splitn(3, ' ').collect::<Vec<_>>()[..] else {
                 panic!("{place}")
             };
             assert_eq!(
@@ -215,10 +215,10 @@ fn pages_are_seen_whole_on_a_desk_and_on_a_phone() {
             );
             let pixels = browser.screenshot(&html, width, height.parse().unwrap());
             let name = format!("{}_{width}.png", name_of(page));
-            let kept = fs::File::create(browser.kept.join(&name)).unwrap();
-            pixels.write_png(kept).unwrap();
-            if let Some(objection) = objection_to_page(&pixels) {
-                panic!("{place}: {objection}");
+            let file = fs::File::create(browser.screenshots.join(&name)).unwrap();
+            pixels.write_png(file).unwrap();
+            if let Some(defect) = defect_of_page(&pixels) {
+                panic!("{place}: {defect}");
             }
         }
     }
@@ -230,7 +230,7 @@ fn pages_are_printed() {
         return;
     };
     for page in &browser.pages {
-        let pdf = browser.kept.join(format!("{}.pdf", name_of(page)));
+        let pdf = browser.screenshots.join(format!("{}.pdf", name_of(page)));
         let address = format!("file://{}", fs::canonicalize(page).unwrap().display());
         let print = format!("--print-to-pdf={}", pdf.display());
         browser.visit(&address, &["--no-pdf-header-footer".to_owned(), print]);
@@ -245,47 +245,50 @@ fn pages_are_printed() {
 }
 
 #[test]
-fn a_click_on_any_head_sorts_and_a_link_leads_to_the_table_as_it_was_sorted() {
+fn a_click_on_any_column_title_sorts_and_a_link_leads_to_the_sorted_table() {
     let Some(browser) = Browser::open() else {
         return;
     };
-    let script = include_str!("browser/sorted.js");
+    let script = include_str!("browser/sorting.js");
     for page in &browser.pages {
         let html = fs::read_to_string(page).unwrap();
         for width in WIDTHS {
-            let said = browser.ask(&html, "", script, width);
+            let report = browser.run_script(&html, "", script, width);
             assert!(
-                said.ends_with("heads; all sort"),
-                "{}: {said}",
+                report.ends_with("titles; all sort"),
+                "{}: {report}",
                 page.display()
             );
         }
-        // A page that has forgotten how is found out.
+        // A page whose clicks have no effect is detected.
         let dead = html.replace("addEventListener(\"click\"", "addEventListener(\"never\"");
-        let said = browser.ask(&dead, "", script, WIDTHS[0]);
-        assert!(said.contains("not told"), "{}: {said}", page.display());
+        let report = browser.run_script(&dead, "", script, WIDTHS[0]);
+        assert!(
+            report.contains("not marked"),
+            "{}: {report}",
+            page.display()
+        );
 
         let (_, rest) = html.split_once("<table id=\"").unwrap();
         let (table, _) = rest.split_once('"').unwrap();
-        let first = "said([...document.querySelectorAll('th[aria-sort]')].map((head) => \
+        let first = "report([...document.querySelectorAll('th[aria-sort]')].map((head) => \
                      `${head.closest('table').id} ${head.cellIndex} ${head.ariaSort}`).join());";
-        let said = browser.ask(&html, &format!("#sort={table}/-2"), first, WIDTHS[0]);
-        assert_eq!(said, format!("{table} 1 descending"));
+        let report = browser.run_script(&html, &format!("#sort={table}/-2"), first, WIDTHS[0]);
+        assert_eq!(report, format!("{table} 1 descending"));
     }
 }
 
-/// A page with text, lines and charts has far more than this many colours.
+/// A page with text, lines and charts has far more colors than this.
 const LEAST_COLORS: usize = 50;
 
-/// Rows at the top that have a heading, and rows at the end that have something, whatever the page
-/// [pixels].
+/// Rows at the top, which have a heading, and at the end, which are not blank [px].
 const ENDS: u32 = 300;
 
-/// What speaks against a page as a browser showed it.
-fn objection_to_page(pixels: &Bitmap) -> Option<String> {
+/// Defect of the screenshot of a page.
+fn defect_of_page(pixels: &Bitmap) -> Option<String> {
     let colors: BTreeSet<[u8; 3]> = pixels.pixels.iter().copied().collect();
     if colors.len() < LEAST_COLORS {
-        return Some(format!("only {} colours", colors.len()));
+        return Some(format!("only {} colors", colors.len()));
     }
     let band = |from: u32, to: u32| {
         let [from, to] = [from, to].map(|row| (row * pixels.width) as usize);
@@ -301,16 +304,16 @@ fn objection_to_page(pixels: &Bitmap) -> Option<String> {
 }
 
 #[test]
-fn a_blank_page_and_one_that_ends_early_are_none() {
+fn a_blank_page_and_one_that_ends_early_are_detected() {
     let mut pixels = Bitmap::from_fn(400, 900, |_, _| [255; 3]);
-    assert_eq!(objection_to_page(&pixels).unwrap(), "only 1 colours");
+    assert_eq!(defect_of_page(&pixels).unwrap(), "only 1 colors");
     let mut paint = |rows: std::ops::Range<usize>| {
         for y in rows {
             for x in 0..200 {
                 pixels.pixels[y * 400 + x] = [x as u8, 0, 0];
             }
         }
-        objection_to_page(&pixels)
+        defect_of_page(&pixels)
     };
     let heading = "10000 pixels of heading, 0 below, 0 at the end";
     assert_eq!(paint(10..60).unwrap(), heading);

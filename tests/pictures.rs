@@ -1,6 +1,6 @@
-//! The pictures of runs made outside of this test: each is readable, and shows what it should.
+//! Pictures of runs that were made outside of this test: each is readable and has its content.
 //!
-//! `FPMCL_RUNS` names the folders of runs (of `demo`, or of `localize` and `refine`), separated
+//! `FPMCL_RUNS` lists the folders of runs (of `demo`, or of `localize` and `refine`), separated
 //! by colons. `.ci/run` sets it after it has made them.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
@@ -16,7 +16,7 @@ use fpmcl::app::plotting::color::{MCL, REFINED};
 #[test]
 fn the_pictures_of_finished_runs_show_the_paths() {
     let Ok(runs) = std::env::var("FPMCL_RUNS") else {
-        eprintln!("not run: FPMCL_RUNS names no runs");
+        eprintln!("not run: FPMCL_RUNS is not set");
         return;
     };
     for run in runs.split(':') {
@@ -33,23 +33,23 @@ fn the_pictures_of_finished_runs_show_the_paths() {
 }
 
 #[test]
-fn a_blank_or_a_small_picture_or_one_without_the_line_is_none() {
+fn a_blank_or_small_picture_or_one_without_the_line_is_detected() {
     let line = [213, 94, 0];
     let mut pixels = Bitmap::from_fn(1300, 400, |_, _| [255; 3]);
-    let objection = |pixels: &Bitmap| {
+    let defect = |pixels: &Bitmap| {
         let picture = Picture::of("own".to_owned(), pixels);
-        picture.objection(40, &[line]).unwrap_or_default()
+        picture.defect(40, &[line]).unwrap_or_default()
     };
-    assert_eq!(objection(&pixels), "blank");
+    assert_eq!(defect(&pixels), "blank");
     pixels = Bitmap::from_fn(1300, 400, |x, y| match y {
         // The legend is no line.
         60 => line,
         150..170 => [x as u8, 40, (y - 150) as u8],
         _ => [255; 3],
     });
-    assert!(objection(&pixels).starts_with("nothing is drawn in"));
+    assert!(defect(&pixels).starts_with("nothing is drawn in"));
     pixels.pixels[200 * 1300..][..60].fill(line);
-    assert_eq!(objection(&pixels), "");
+    assert_eq!(defect(&pixels), "");
     let small = Bitmap::from_fn(800, 400, |x, y| pixels.pixel(x, y));
-    assert!(objection(&small).starts_with("only 800"));
+    assert!(defect(&small).starts_with("only 800"));
 }

@@ -1,24 +1,24 @@
-//! Whether a file is a picture that somebody can look at.
+//! Checks of the pictures of a run.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use fpmcl::app::plotting::Bitmap;
 
-/// Least width that is readable on a screen and on paper [pixels].
+/// Minimum width that is readable on a screen and on paper [px].
 const LEAST_WIDTH: u32 = 1200;
 
-/// The uppermost rows have title and legend, which show every colour whatever is drawn [pixels].
+/// Rows of title and legend, which have every color whatever is drawn [px].
 const HEADING: u32 = 96;
 
-/// Fewer pixels of a colour than this are no line and no marker.
+/// Minimum number of pixels of a line or a marker.
 const LEAST_OF_A_COLOR: usize = 40;
 
-/// A picture by its colours.
+/// Colors of a picture.
 pub struct Picture {
     name: String,
     width: u32,
-    /// Pixels of each colour below the heading.
+    /// Number of pixels of each color below title and legend.
     colors: BTreeMap<[u8; 3], usize>,
 }
 
@@ -34,7 +34,7 @@ impl Picture {
         Self::of(name, &pixels)
     }
 
-    /// The picture that some pixels make.
+    /// Counts the colors of a bitmap.
     pub fn of(name: String, pixels: &Bitmap) -> Self {
         let mut colors = BTreeMap::new();
         let heading = (HEADING * pixels.width) as usize;
@@ -48,23 +48,23 @@ impl Picture {
         }
     }
 
-    /// Expects a readable size, something drawn on it, and lines of these colours.
+    /// Expects a readable size, some content, and lines of these colors.
     #[track_caller]
     pub fn shows(&self, colors: &[[u8; 3]]) {
         self.shows_at_least(LEAST_OF_A_COLOR, colors);
     }
 
-    /// The same, with that many pixels of each of these colours: more than the legend of a
-    /// second chart has.
+    /// As [`shows`](Self::shows) with a minimum number of pixels of each color, such as more than
+    /// the legend of a second chart has.
     #[track_caller]
     pub fn shows_at_least(&self, pixels: usize, colors: &[[u8; 3]]) {
-        if let Some(objection) = self.objection(pixels, colors) {
-            panic!("{}: {objection}", self.name);
+        if let Some(defect) = self.defect(pixels, colors) {
+            panic!("{}: {defect}", self.name);
         }
     }
 
-    /// What speaks against the picture.
-    pub fn objection(&self, least: usize, colors: &[[u8; 3]]) -> Option<String> {
+    /// Defect of the picture.
+    pub fn defect(&self, least: usize, colors: &[[u8; 3]]) -> Option<String> {
         if self.width < LEAST_WIDTH {
             return Some(format!("only {} pixels wide", self.width));
         }

@@ -1,24 +1,24 @@
-//! Ctrl-C: the first asks a command to stop where it loses nothing, the second kills it.
+//! Ctrl-C: the first stops a command at the next point without loss, the second exits at once.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Whether the user wants to stop; loops poll it. The default is never requested.
+/// Request of the user to stop, which loops poll; not requested by default.
 #[derive(Clone, Debug, Default)]
 pub struct Interrupt {
     requested: Arc<AtomicBool>,
 }
 
-/// The user stopped the run.
+/// Error of a command that the user interrupted.
 #[derive(Debug, thiserror::Error)]
 #[error("interrupted; {kept}")]
 pub struct Interrupted {
-    /// What is finished, and where it is.
+    /// What is finished and kept, and where.
     pub kept: String,
 }
 
 impl Interrupt {
-    /// Listens for Ctrl-C; once per process.
+    /// Installs the handler of Ctrl-C; only once per process.
     pub fn install() -> Result<Self, ctrlc::Error> {
         let interrupt = Self::default();
         let requested = Arc::clone(&interrupt.requested);
@@ -38,13 +38,13 @@ impl Interrupt {
         self.requested.load(Ordering::Relaxed)
     }
 
-    /// As if Ctrl-C had been pressed.
+    /// Requests to stop, as Ctrl-C does.
     pub fn request(&self) {
         self.requested.store(true, Ordering::Relaxed);
     }
 }
 
-#[expect(clippy::exit, reason = "the user asked a second time")]
+#[expect(clippy::exit, reason = "the user requested it a second time")]
 fn kill() {
     std::process::exit(130)
 }

@@ -1,4 +1,4 @@
-//! What the program says: on standard error above the progress bars, and into the log of a run.
+//! Logging to standard error, above the progress bars, and into the log file of a run.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -14,7 +14,7 @@ use tracing_subscriber::{EnvFilter, Layer as _, fmt};
 use super::progress::Progress;
 use crate::app::cli::Verbosity;
 
-/// Starts logging; a second call in a process changes nothing.
+/// Starts logging; a second call in the same process has no effect.
 pub(super) fn start(verbosity: Verbosity, progress: &Progress, log: &RunLog) {
     let level = match verbosity {
         Verbosity::Quiet => LevelFilter::ERROR,
@@ -37,23 +37,23 @@ pub(super) fn start(verbosity: Verbosity, progress: &Progress, log: &RunLog) {
         .without_time()
         .with_ansi(false)
         .with_writer(move || log.clone())
-        // A log is complete however quiet the terminal is.
+        // The log file is complete even if the terminal is quiet.
         .with_filter(filter(level.max(LevelFilter::INFO)));
-    // It fails only where logging was started before.
+    // It fails only if logging was started before.
     let _ = tracing_subscriber::registry()
         .with(shown)
         .with(written)
         .try_init();
 }
 
-/// Graphics libraries talk a lot about what is of no interest here.
+/// Only errors of libraries: graphics libraries log much that is irrelevant here.
 fn filter(level: LevelFilter) -> EnvFilter {
     EnvFilter::builder()
         .with_default_directive(LevelFilter::ERROR.into())
         .parse_lossy(format!("error,fpmcl={level}"))
 }
 
-/// Standard error, with the progress bars out of the way while something is written.
+/// Standard error; progress bars are hidden while it is written to.
 struct AboveBars(Progress);
 
 impl Write for AboveBars {
@@ -66,35 +66,35 @@ impl Write for AboveBars {
     }
 }
 
-/// The log of the run that is going on, if it has one.
+/// Log file of the current run, if it has one.
 #[derive(Clone, Debug, Default)]
 pub struct RunLog {
     file: Arc<Mutex<Option<File>>>,
 }
 
-/// Until it is dropped, what is said is written into a file, too; then into the one before it.
+/// Guard of a log file; when it is dropped, the previous file is restored.
 #[derive(Debug)]
-pub struct Writing {
+pub struct LogGuard {
     log: RunLog,
-    before: Option<File>,
+    previous: Option<File>,
 }
 
 impl RunLog {
-    /// Writes what is said from now on into a file, from its beginning.
-    pub fn write_to(&self, path: &Path) -> anyhow::Result<Writing> {
+    /// Writes all messages into a new file until the guard is dropped.
+    pub fn write_to(&self, path: &Path) -> anyhow::Result<LogGuard> {
         let file =
             File::create(path).with_context(|| format!("cannot create {}", path.display()))?;
-        let before = self.replace(Some(file));
+        let previous = self.replace(Some(file));
         let log = self.clone();
-        Ok(Writing { log, before })
+        Ok(LogGuard { log, previous })
     }
 
-    /// Writes down what was said elsewhere, as far as that was written down.
-    pub fn repeat(&mut self, path: &Path) -> anyhow::Result<()> {
+    /// Appends another log file, if it exists.
+    pub fn append(&mut self, path: &Path) -> anyhow::Result<()> {
         if path.exists() {
-            let said =
+            let text =
                 std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-            self.write_all(&said)
+            self.write_all(&text)
                 .context("cannot write the log of the run")?;
         }
         Ok(())
@@ -106,9 +106,9 @@ impl RunLog {
     }
 }
 
-impl Drop for Writing {
+impl Drop for LogGuard {
     fn drop(&mut self) {
-        self.log.replace(self.before.take());
+        self.log.replace(self.previous.take());
     }
 }
 
@@ -131,21 +131,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_run_has_what_was_said_during_it_and_nothing_else() {
+    fn the_log_of_a_run_has_the_messages_during_it_and_no_others() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log.txt");
         let mut log = RunLog::default();
         log.write_all(b"before\n").unwrap();
-        let writing = log.write_to(&path).unwrap();
+        let guard = log.write_to(&path).unwrap();
         log.clone().write_all(b"during\n").unwrap();
         let part = folder.path().join("part.txt");
-        let writing_part = log.write_to(&part).unwrap();
+        let part_guard = log.write_to(&part).unwrap();
         log.clone().write_all(b"in a part\n").unwrap();
-        drop(writing_part);
+        drop(part_guard);
         assert_eq!(std::fs::read(&path).unwrap(), b"during\n");
-        log.repeat(&part).unwrap();
-        log.repeat(&folder.path().join("never written")).unwrap();
-        drop(writing);
+        log.append(&part).unwrap();
+        log.append(&folder.path().join("never written")).unwrap();
+        drop(guard);
         log.write_all(b"after\n").unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), b"during\nin a part\n");
     }

@@ -1,4 +1,4 @@
-//! Files that appear whole or not at all, and the table on standard output.
+//! Output of commands: files, written atomically, and standard output.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
@@ -9,9 +9,8 @@ use serde::Serialize;
 
 use crate::app::output::{temporary_beside, write_atomically};
 
-/// Makes sure, before any work is done, that `path` can be written: an existing file needs
-/// `--force`, and its folder is made and must take new files. `key` is the configuration key
-/// that names the file.
+/// Checks before any work that `path` can be written: an existing file needs `--force`, and its
+/// folder is created and must accept new files. `key` is the configuration key of the file.
 pub fn prepare(path: &Path, key: &str, force: bool) -> anyhow::Result<()> {
     if path.is_dir() {
         bail!(
@@ -47,14 +46,13 @@ pub fn write_text(path: &Path, text: &str) -> anyhow::Result<()> {
     write_file(path, |file| file.write_all(text.as_bytes()))
 }
 
-/// Lets `write` make a file under another name beside `path` and renames it, for writers that
-/// take a path: `path` is either as it was or complete.
+/// Writes a file atomically by a function that takes a path.
 pub fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<()>) -> anyhow::Result<()> {
     let mut name = path.file_name().unwrap_or_default().to_owned();
     name.push(".part");
     let part = path.with_file_name(name);
     if let Err(error) = write(&part) {
-        // What is left of it is worth nothing, and may be what fills the disk.
+        // The incomplete file is worthless, and may be what fills the disk.
         let _ = fs::remove_file(&part);
         return Err(error).with_context(|| format!("writing {}", path.display()));
     }
@@ -68,7 +66,7 @@ pub fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
     write_text(path, &(json + "\n"))
 }
 
-/// Prints to standard output; a reader that has gone away is no error.
+/// Prints to standard output; a closed pipe is not an error.
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut stdout = io::stdout().lock();
     match stdout
@@ -99,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn a_folder_that_cannot_be_is_told_before_the_work() {
+    fn an_impossible_folder_is_an_error_before_the_work() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("file");
         fs::write(&file, "").unwrap();

@@ -1,153 +1,142 @@
-//! How far the work has come: bars on a terminal, a line now and then elsewhere.
+//! Progress of long tasks: bars on a terminal, a line every few seconds elsewhere.
 
 use std::io::{IsTerminal as _, Write as _};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::app::cli::Verbosity;
 
-/// Time between two lines where there is no terminal.
+/// Time between two lines without a terminal.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
 
-/// Shows tasks to the user. The default is silent.
-#[derive(Clone, Debug, Default)]
-pub struct Progress {
-    display: Display,
-}
+/// Layout of a bar.
+const TEMPLATE: &str = "{prefix:14} {wide_bar} {pos}/{len} {per_sec} {eta} left {msg}";
 
+/// Display of the progress of tasks; by default there is none.
 #[derive(Clone, Debug, Default)]
-enum Display {
+pub enum Progress {
+    /// No display.
     #[default]
     Silent,
+    /// Lines on standard error.
     Lines,
+    /// Bars on a terminal.
     Bars(MultiProgress),
 }
 
-/// A piece of work of known size; shared by the threads that work on it.
+/// Task with a known number of steps; shared by the threads that work on it.
 #[derive(Debug)]
 pub struct Task {
     name: String,
-    total: u64,
-    done: AtomicU64,
-    started: Instant,
-    /// When the last line was written, since the start [ms].
-    last_line_ms: AtomicU64,
-    display: Display,
-    bar: Option<ProgressBar>,
+    /// Counts the steps; hidden without a terminal.
+    bar: ProgressBar,
+    /// Time of the last line since the start [ms]; `None` if no lines are written.
+    last_line_ms: Option<AtomicU64>,
 }
 
 impl Progress {
-    /// Bars if standard error is a terminal, lines if not, nothing if quiet.
+    /// Bars if standard error is a terminal, otherwise lines; silent if quiet.
     pub fn new(verbosity: Verbosity) -> Self {
-        let display = match verbosity {
-            Verbosity::Quiet => Display::Silent,
-            _ if std::io::stderr().is_terminal() => Display::Bars(MultiProgress::new()),
-            _ => Display::Lines,
-        };
-        Self { display }
+        match verbosity {
+            Verbosity::Quiet => Self::Silent,
+            _ if std::io::stderr().is_terminal() => Self::Bars(MultiProgress::new()),
+            _ => Self::Lines,
+        }
     }
 
-    /// Begins a task of `total` steps, to be counted by [`Task::advance`] and to be told as
-    /// done when it is dropped.
+    /// Starts a task of `total` steps, which are counted by [`Task::advance`]; it ends when it is
+    /// dropped.
     pub fn task(&self, name: &str, total: usize) -> Arc<Task> {
-        let total = total as u64;
-        let bar = match &self.display {
-            Display::Bars(bars) => Some(bars.add(ProgressBar::new(total))),
-            _ => None,
-        };
-        if let Some(bar) = &bar {
+        let total = Some(total as u64);
+        let mut bar = ProgressBar::with_draw_target(total, ProgressDrawTarget::hidden());
+        if let Self::Bars(bars) = self {
+            bar = bars.add(bar);
             bar.set_style(style());
             bar.set_prefix(name.to_owned());
             bar.enable_steady_tick(Duration::from_millis(200));
         }
         Arc::new(Task {
             name: name.to_owned(),
-            total,
-            done: AtomicU64::new(0),
-            started: Instant::now(),
-            last_line_ms: AtomicU64::new(0),
-            display: self.display.clone(),
             bar,
+            last_line_ms: matches!(self, Self::Lines).then(AtomicU64::default),
         })
     }
 
     /// Whether bars are drawn on a terminal.
     pub fn is_terminal(&self) -> bool {
-        matches!(self.display, Display::Bars(_))
+        matches!(self, Self::Bars(_))
     }
 
-    /// Does something with the bars out of the way.
+    /// Runs an action while the bars are hidden.
     pub fn suspend<R>(&self, action: impl FnOnce() -> R) -> R {
-        match &self.display {
-            Display::Bars(bars) => bars.suspend(action),
+        match self {
+            Self::Bars(bars) => bars.suspend(action),
             _ => action(),
         }
     }
 }
 
 impl Task {
-    /// Counts finished steps.
+    /// Counts completed steps.
     pub fn advance(&self, steps: usize) {
-        let steps = steps as u64;
-        let done = self.done.fetch_add(steps, Ordering::Relaxed) + steps;
-        if let Some(bar) = &self.bar {
-            bar.inc(steps);
-        } else if matches!(self.display, Display::Lines) && self.line_is_due() {
-            self.write_line(done);
+        self.bar.inc(steps as u64);
+        if self.line_is_due() {
+            self.write_line();
         }
     }
 
-    /// Says something short beside the bar, such as the current error.
+    /// Shows a short text beside the bar, such as the current error.
     pub fn note(&self, text: &str) {
-        if let Some(bar) = &self.bar {
-            bar.set_message(text.to_owned());
-        }
+        self.bar.set_message(text.to_owned());
     }
 
-    /// Steps that are finished.
+    /// Number of completed steps.
     pub fn done(&self) -> usize {
-        self.done.load(Ordering::Relaxed) as usize
+        self.bar.position() as usize
     }
 
-    /// Whether enough time has passed since the last line; one of many threads is told so.
+    /// Whether enough time has passed since the last line; true for only one of many threads.
     fn line_is_due(&self) -> bool {
-        let now_ms = self.started.elapsed().as_millis() as u64;
-        let last_ms = self.last_line_ms.load(Ordering::Relaxed);
+        let Some(last_line_ms) = &self.last_line_ms else {
+            return false;
+        };
+        let now_ms = self.bar.elapsed().as_millis() as u64;
+        let last_ms = last_line_ms.load(Ordering::Relaxed);
         now_ms >= last_ms + LINE_INTERVAL.as_millis() as u64
-            && self
-                .last_line_ms
+            && last_line_ms
                 .compare_exchange(last_ms, now_ms, Ordering::Relaxed, Ordering::Relaxed)
                 .is_ok()
     }
 
-    fn write_line(&self, done: u64) {
-        let line = line(&self.name, done, self.total, self.started.elapsed());
-        // Progress that cannot be shown is no reason to stop.
+    fn write_line(&self) {
+        let (done, total) = (self.bar.position(), self.bar.length().unwrap_or(0));
+        let line = line(&self.name, done, total, self.bar.elapsed());
+        // A failure to show progress must not stop the task.
         let _ = writeln!(std::io::stderr(), "{line}");
     }
 }
 
 impl Drop for Task {
     fn drop(&mut self) {
-        let done = self.done.load(Ordering::Relaxed);
-        match (&self.bar, &self.display) {
-            (Some(bar), _) if done >= self.total => bar.finish(),
-            (Some(bar), _) => bar.abandon(),
-            (None, Display::Lines) => self.write_line(done),
-            (None, _) => {}
+        if self.last_line_ms.is_some() {
+            self.write_line();
+        }
+        if Some(self.bar.position()) >= self.bar.length() {
+            self.bar.finish();
+        } else {
+            self.bar.abandon();
         }
     }
 }
 
 fn style() -> ProgressStyle {
-    let template = "{prefix:14} {wide_bar} {pos}/{len} {per_sec} {eta} left {msg}";
-    ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
+    ProgressStyle::with_template(TEMPLATE).unwrap_or_else(|_| ProgressStyle::default_bar())
 }
 
-/// `localize: 40 of 160 (25 %), 8.0 per second, 15 s left`.
+/// Formats a line such as `localize: 40 of 160 (25 %), 8.0 per second, 15 s left`.
 fn line(name: &str, done: u64, total: u64, elapsed: Duration) -> String {
     let percent = 100 * done / total.max(1);
     let per_second = done as f64 / elapsed.as_secs_f64().max(1e-3);
@@ -166,7 +155,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_tells_share_rate_and_time_left() {
+    fn a_line_has_share_rate_and_time_left() {
         assert_eq!(
             line("localize", 40, 160, Duration::from_secs(5)),
             "localize: 40 of 160 (25 %), 8.0 per second, 15 s left"
@@ -193,10 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn bars_have_their_own_style() {
-        ProgressStyle::with_template(
-            "{prefix:14} {wide_bar} {pos}/{len} {per_sec} {eta} left {msg}",
-        )
-        .unwrap();
+    fn the_layout_of_bars_is_valid() {
+        ProgressStyle::with_template(TEMPLATE).unwrap();
     }
 }

@@ -359,7 +359,6 @@ pub fn draw_likelihood(
             y_name: "likelihood / peak".to_owned(),
             own_x_name: Some(format!("offset {name} [{unit}]")),
             series: series.collect(),
-            from_zero: true,
             clip_outliers: false,
         }
     });

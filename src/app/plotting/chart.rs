@@ -42,7 +42,7 @@ impl Series {
     }
 }
 
-/// Axes with series.
+/// Axes with series; the y axis starts at zero unless there are negative values.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Panel {
     /// Name of the y axis with its unit.
@@ -51,8 +51,6 @@ pub struct Panel {
     pub own_x_name: Option<String>,
     /// Series.
     pub series: Vec<Series>,
-    /// Whether the y axis starts at zero.
-    pub from_zero: bool,
     /// Whether rare values far above all others are cut off, with a note.
     pub clip_outliers: bool,
 }
@@ -151,7 +149,7 @@ impl Panel {
         let usual = numbers[(numbers.len() - 1) * 98 / 100];
         let clipped = self.clip_outliers && usual > 0.0 && highest > 3.0 * usual;
         let top = if clipped { 1.5 * usual } else { highest };
-        let starts_at_zero = self.from_zero && lowest >= 0.0;
+        let starts_at_zero = lowest >= 0.0;
         let bottom = if starts_at_zero { 0.0 } else { lowest };
         let margin = 0.06 * (top - bottom).max(1e-6 * top.abs()).max(1e-9);
         let below = if starts_at_zero { 0.0 } else { margin };
@@ -191,7 +189,6 @@ mod tests {
         Panel {
             y_name: "error [m]".to_owned(),
             series: vec![Series::line("error", [213, 94, 0], points)],
-            from_zero: true,
             clip_outliers: true,
             ..Panel::default()
         }

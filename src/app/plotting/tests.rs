@@ -501,7 +501,6 @@ fn runtimes_and_other_series_are_drawn() {
                     ..Series::line("measured", color::SERIES[2], peak(0.3).step_by(4))
                 },
             ],
-            from_zero: true,
             clip_outliers: false,
             ..Panel::default()
         }],

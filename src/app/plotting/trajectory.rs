@@ -159,7 +159,6 @@ impl ErrorPlot<'_> {
             Panel {
                 y_name: y_name.to_owned(),
                 series: series.collect(),
-                from_zero: true,
                 clip_outliers: true,
                 ..Panel::default()
             }
@@ -204,7 +203,6 @@ impl RuntimePlot<'_> {
             panels: vec![Panel {
                 y_name: "time per frame [ms]".to_owned(),
                 series: series.collect(),
-                from_zero: true,
                 clip_outliers: true,
                 ..Panel::default()
             }],

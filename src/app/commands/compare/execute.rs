@@ -70,7 +70,7 @@ pub fn execute(
     let folder = layout.run(&run.id);
     fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
     remove_record(&folder)?;
-    let _writing = context.log.write_to(&folder.join(LOG_FILE))?;
+    let _log = context.log.write_to(&folder.join(LOG_FILE))?;
     let mut stages = Stages::default();
     let outcome = match stages.run(run, layout, &keys, context) {
         Ok(judgement) => Outcome::Finished(Box::new(judgement)),
@@ -133,13 +133,13 @@ impl Stages {
         simulate_drives(run, layout, context).context("while simulating")?;
         let map = shared_map(run, layout, keys, context).context("while building the map")?;
         self.note("1 build-map", map.seconds);
-        context.log.clone().repeat(&map.folder.join(LOG_FILE))?;
+        context.log.clone().append(&map.folder.join(LOG_FILE))?;
         copy_file(&map.folder.join("map.yml"), &folder.join("build_map.yml"))?;
 
         let found =
             shared_localization(run, layout, keys, &map, context).context("while localizing")?;
         self.note("2 localize", found.seconds);
-        context.log.clone().repeat(&found.folder.join(LOG_FILE))?;
+        context.log.clone().append(&found.folder.join(LOG_FILE))?;
         let result = folder.join(RESULT_FILE);
         // Another run of this name may have refined.
         run_output::remove_refined(&RunFiles::beside(&result))?;
@@ -179,7 +179,7 @@ fn simulate_drives(run: &PlannedRun, layout: &Layout, context: &Context) -> Resu
 
 fn shared_map(run: &PlannedRun, layout: &Layout, keys: &Keys, context: &Context) -> Result<Shared> {
     shared::get(&layout.shared("maps"), &keys.map, |folder| {
-        let _writing = context.log.write_to(&folder.join(LOG_FILE))?;
+        let _log = context.log.write_to(&folder.join(LOG_FILE))?;
         tracing::info!(
             "building the map of {}",
             run.build_map.scan_folder.display()
@@ -204,7 +204,7 @@ fn shared_localization(
         &layout.shared("localizations"),
         &keys.localization,
         |folder| {
-            let _writing = context.log.write_to(&folder.join(LOG_FILE))?;
+            let _log = context.log.write_to(&folder.join(LOG_FILE))?;
             let config = LocalizationConfig {
                 map_file: map.folder.join(MAP_FILE),
                 result_path: folder.join(RESULT_FILE),

@@ -153,7 +153,6 @@ fn errors(sequence: &str, found: &[Trajectory]) -> LineChart {
         Panel {
             y_name: y_name.to_owned(),
             series: series.collect(),
-            from_zero: true,
             clip_outliers: true,
             ..Panel::default()
         }
@@ -193,7 +192,6 @@ fn dots(comparison: &Comparison) -> LineChart {
         Panel {
             y_name: format!("{sequence}: error [m]"),
             series: series.filter(|series| !series.points.is_empty()).collect(),
-            from_zero: true,
             ..Panel::default()
         }
     };
@@ -234,7 +232,6 @@ fn success_rates(sweep: &[(usize, Vec<RunRecord>)]) -> LineChart {
         panels: vec![Panel {
             y_name: "success [%]".to_owned(),
             series: if rates.is_empty() { Vec::new() } else { series },
-            from_zero: true,
             ..Panel::default()
         }],
         marks: rates

@@ -25,7 +25,6 @@ pub fn draw_memberships(classifier: &FuzzyGround, path: &Path) -> Result<()> {
             panels.push(Panel {
                 y_name: "membership".to_owned(),
                 own_x_name: Some(x_name),
-                from_zero: true,
                 ..Panel::default()
             });
         }
