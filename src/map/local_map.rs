@@ -12,7 +12,7 @@ use super::vertex_ground;
 use super::visibility::{self, VisibilityConfig};
 use crate::geometry::{PointCloud, TriangleMesh};
 use crate::ground::GroundClassifier;
-use crate::meshing::{self, MeshingError, PoissonConfig, Surface};
+use crate::meshing::{self, MeshingError, PoissonConfig, Reconstruction};
 use crate::recording::{Frame, RecordingError, velodyne};
 use crate::validation::{
     InvalidValue, Validate, fraction, nested, not_negative, positive, require,
@@ -312,7 +312,7 @@ fn reconstruct(
     weights: Option<&[f32]>,
     settings: &LocalMapSettings,
     counts: &mut LocalMapCounts,
-) -> Result<Option<Surface>, MeshingError> {
+) -> Result<Option<Reconstruction>, MeshingError> {
     match meshing::reconstruct(cloud, weights, &settings.poisson) {
         Ok(surface) => {
             counts.unusable_points = surface.dropped_points;

@@ -1,28 +1,29 @@
-//! How densely the surface is sampled around a place: kernel density estimation on the octree.
+//! Sampling density of the surface: kernel density estimation on the octree.
 //!
 //! ```text
-//! c_d(x) = Σ_s w_s ∫ B_d(x − y) B_d(y − s) dy / 0.55        samples per cell face of depth d
-//! δ(x)   = d + log₄(c_d(x) / samples_per_node)               the depth with samples_per_node each
+//! c_d(x) = Σ_s w_s ∫ B_d(x − y) B_d(y − s) dy / 0.55        samples per cell face at depth d
+//! δ(x)   = d + log₄(c_d(x) / samples_per_node)               depth at which a face has samples_per_node
 //! ```
 //!
-//! with quadratic B-splines B at the centres of the cells. Where even that kernel is too fine
-//! to hold `samples_per_node`, d is the first coarser depth that does. Kazhdan, Bolitho and
-//! Hoppe, *Poisson Surface Reconstruction* (2006), section 4.3; on a surface c falls by 4 per
-//! depth, and 0.55 is what a plane through its own kernel sees on average.
+//! with quadratic B-splines B at the centers of the cells; d is the finest depth of the kernel at which
+//! c reaches `samples_per_node`. Kazhdan, Bolitho and Hoppe, *Poisson Surface Reconstruction* (2006),
+//! section 4.3; on a surface c decreases by a factor of 4 per depth, and 0.55 is the mean response of
+//! the kernel to a plane through it.
 
 use rayon::prelude::*;
 
 use super::octree::{CELLS, Level, Octree, offsets};
 use super::samples::Samples;
+use super::stencil::{OwnValues, PADDED, PaddedValues};
 
 /// Mean of Σ B(x − i)² over x, for the quadratic B-spline B.
 const PLANE_FACTOR: f32 = 0.55;
 
-/// Sample counts on the cells of an octree, smoothed.
+/// Smoothed sample counts on the cells of an octree.
 pub struct DensityField {
     tree: Octree,
-    /// Per level 64 counts per node, and one empty node at the end.
-    counts: Vec<Vec<f32>>,
+    /// Per level the counts of each node, and one empty node at the end.
+    counts: Vec<Vec<OwnValues>>,
     samples_per_node: f32,
 }
 
@@ -42,7 +43,7 @@ impl DensityField {
         }
     }
 
-    /// The depth whose cell faces hold `samples_per_node` samples, of every sample.
+    /// The density at every sample, see [`depth_at`](Self::depth_at).
     pub fn sample_depths(&self, samples: &Samples) -> Vec<f32> {
         samples
             .positions
@@ -52,7 +53,8 @@ impl DensityField {
             .collect()
     }
 
-    /// The same at any place of the unit cube; never below 0.
+    /// The depth at which a cell face has `samples_per_node` samples, at a position in the unit cube; at
+    /// least 0.
     pub fn depth_at(&self, position: [f32; 3]) -> f32 {
         let mut finer = 0.0;
         for level in (0..self.tree.levels.len()).rev() {
@@ -70,7 +72,7 @@ impl DensityField {
             }
             finer = count;
         }
-        // Sparser than the base level knows: on a surface the count grows by 4 per depth.
+        // Sparser than the base level: extrapolated by a factor of 4 per depth.
         let base = self.tree.levels[0].depth as f32;
         (base + (finer.max(1e-6) / self.samples_per_node).ln() / 4.0_f32.ln()).max(0.0)
     }
@@ -91,10 +93,10 @@ impl DensityField {
             for y in 0..3 {
                 let mut row = 0.0;
                 for x in 0..3 {
-                    let at = [local[0] + x - 1, local[1] + y - 1, local[2] + z - 1];
-                    let (side, inside) = split(at);
+                    let (side, inside) =
+                        split([local[0] + x - 1, local[1] + y - 1, local[2] + z - 1]);
                     row += weights[0][x as usize]
-                        * self.counts[level][neighbors[side] as usize * CELLS + inside];
+                        * self.counts[level][neighbors[side] as usize][inside];
                 }
                 sum += weights[1][y as usize] * weights[2][z as usize] * row;
             }
@@ -103,7 +105,7 @@ impl DensityField {
     }
 }
 
-/// The neighbour and the place inside it of a cell that lies up to four cells outside of a node.
+/// The neighbor that contains a cell up to four cells outside of a node, and the index in it.
 #[inline]
 fn split(cell: [i32; 3]) -> (usize, usize) {
     let side = cell.map(|x| (x + 4) >> 2);
@@ -114,7 +116,7 @@ fn split(cell: [i32; 3]) -> (usize, usize) {
     )
 }
 
-/// The quadratic B-splines of the cell below, the own cell and the one above, at a place 0 to 1 in the own.
+/// The quadratic B-splines of the lower, the own and the upper cell at a position 0 to 1 in the own one.
 #[inline]
 fn quadratic(x: f32) -> [f32; 3] {
     [
@@ -124,56 +126,49 @@ fn quadratic(x: f32) -> [f32; 3] {
     ]
 }
 
-/// Each sample's weight on the 27 cells around it: first every node over itself and a rim of one
-/// cell, then the rims are added up in the order of the neighbours.
-fn splat(samples: &Samples, level: &Level) -> Vec<f32> {
-    const WIDE: usize = 216;
-    let mut wide = vec![0.0_f32; (level.len() + 1) * WIDE];
-    wide.par_chunks_mut(WIDE)
-        .zip(&level.samples)
-        .for_each(|(wide, &[begin, end])| {
-            for sample in begin as usize..end as usize {
-                let (cell, inside) = samples.cell(sample, level.depth);
-                let local = cell.map(|x| (x & 3) as usize);
-                let weights = inside.map(quadratic);
-                for (z, wz) in weights[2].iter().enumerate() {
-                    for (y, wy) in weights[1].iter().enumerate() {
-                        let row = local[0] + 6 * (local[1] + y) + 36 * (local[2] + z);
-                        let w = samples.weights[sample] * wy * wz;
-                        for (x, wx) in weights[0].iter().enumerate() {
-                            wide[row + x] += w * wx;
-                        }
+/// Splats each sample's weight on the 27 cells around it: first each node on its own cells and one
+/// layer of padding, then the padding is added up in the order of the neighbors.
+fn splat(samples: &Samples, level: &Level) -> Vec<OwnValues> {
+    let mut padded = vec![[0.0_f32; PADDED]; level.len() + 1];
+    (padded.par_iter_mut().zip(&level.samples)).for_each(|(padded, &[begin, end])| {
+        for sample in begin as usize..end as usize {
+            let (cell, inside) = samples.cell(sample, level.depth);
+            let local = cell.map(|x| (x & 3) as usize);
+            let weights = inside.map(quadratic);
+            for (z, wz) in weights[2].iter().enumerate() {
+                for (y, wy) in weights[1].iter().enumerate() {
+                    let row = local[0] + 6 * (local[1] + y) + 36 * (local[2] + z);
+                    let w = samples.weights[sample] * wy * wz;
+                    for (x, wx) in weights[0].iter().enumerate() {
+                        padded[row + x] += w * wx;
                     }
                 }
             }
-        });
-    let mut counts = vec![0.0_f32; (level.len() + 1) * CELLS];
-    counts
-        .par_chunks_mut(CELLS)
-        .zip(&level.neighbors)
-        .for_each(|(counts, neighbors)| {
-            for (index, offset) in offsets().enumerate() {
-                let from = &wide[neighbors[index] as usize * WIDE..][..WIDE];
-                add_rim(counts, from, offset);
-            }
-        });
+        }
+    });
+    let mut counts = vec![[0.0_f32; CELLS]; level.len() + 1];
+    (counts.par_iter_mut().zip(&level.neighbors)).for_each(|(counts, neighbors)| {
+        for (&neighbor, offset) in neighbors.iter().zip(offsets()) {
+            add_neighbor(counts, &padded[neighbor as usize], offset);
+        }
+    });
     counts
 }
 
-/// Adds what a neighbour at `offset` has put onto the cells of a node.
-fn add_rim(counts: &mut [f32], from: &[f32], offset: [i32; 3]) {
-    // A cell x of the node is cell x - 4·offset of the neighbour, which knows -1 to 4.
-    let range = |axis: usize| match offset[axis] {
+/// Adds the part of a neighbor's padded counts that is on the cells of a node.
+fn add_neighbor(counts: &mut OwnValues, from: &PaddedValues, offset: [i32; 3]) {
+    // Cell x of the node is cell x - 4·offset of the neighbor, whose padded counts are -1 to 4.
+    let [range_x, range_y, range_z] = offset.map(|offset| match offset {
         -1 => 0..1,
         1 => 3..4,
         _ => 0..4,
-    };
-    let theirs = |x: i32, axis: usize| (x - 4 * offset[axis] + 1) as usize;
-    for z in range(2) {
-        for y in range(1) {
-            for x in range(0) {
+    });
+    let source = |x: i32, axis: usize| (x - 4 * offset[axis] + 1) as usize;
+    for z in range_z {
+        for y in range_y.clone() {
+            for x in range_x.clone() {
                 counts[(x + 4 * y + 16 * z) as usize] +=
-                    from[theirs(x, 0) + 6 * theirs(y, 1) + 36 * theirs(z, 2)];
+                    from[source(x, 0) + 6 * source(y, 1) + 36 * source(z, 2)];
             }
         }
     }

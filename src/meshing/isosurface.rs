@@ -1,119 +1,104 @@
-//! The surface where a function on the octree has a given value, without cracks between cells of
-//! different size.
+//! Extraction of an isosurface of a function on the octree, without cracks between cells of different
+//! size.
 //!
-//! Marching cubes on the leaf cells. Where a leaf borders on finer ones, it takes the segments of
-//! its face from them and its points from the finest edges, so that both sides draw the same line:
-//! Kazhdan, Klein, Dalal and Hoppe, *Unconstrained Isosurface Extraction on Arbitrary Octrees*
-//! (2007). The function is trilinear in every leaf and continuous, so an edge of a leaf is
-//! crossed once at most, however finely its neighbours divide it.
+//! Marching cubes on the leaf cells. A leaf with finer neighbors takes the segments of its faces from
+//! them and its vertices from the finest edges, so that both sides have the same polyline: Kazhdan,
+//! Klein, Dalal and Hoppe, *Unconstrained Isosurface Extraction on Arbitrary Octrees* (2007). The
+//! function is trilinear in every leaf and continuous, so an edge of a leaf is crossed at most once,
+//! however finely its neighbors divide it.
 
 use rayon::prelude::*;
 
-use super::block::CLOSED;
-use super::cell_table::{cell_case, close_loops, edge, face_corners, face_edges, face_segments};
+use super::case_table::{
+    cell_case, corner_signs, edge, face_corners, face_edges, face_segments, join_loops,
+};
 use super::morton;
-use super::octree::{Level, Octree};
+use super::octree::{CELLS, Level, Octree};
+use super::stencil::{CORNER_OFFSETS, CORNERS, CornerValues, corner_index};
 
 /// A mesh in the unit cube.
 pub struct UnitMesh {
-    /// Positions.
+    /// Vertex positions.
     pub vertices: Vec<[f32; 3]>,
-    /// Counter-clockwise seen from where the function is higher.
+    /// Vertex indices, counter-clockwise seen from where the function is higher.
     pub triangles: Vec<[u32; 3]>,
 }
 
-/// The function: per level the values at the closed corners of the nodes.
+/// A function on an octree by its values at the corners of all nodes.
 pub struct NodalFunction<'a> {
-    /// The cells.
+    /// The octree.
     pub tree: &'a Octree,
-    /// 125 values per node and level.
-    pub values: &'a [Vec<f32>],
+    /// Values per level and node.
+    pub values: &'a [Vec<CornerValues>],
 }
 
-/// A point of the surface: what it lies on, and where.
+/// A vertex of the isosurface before merging.
 #[derive(Clone, Copy)]
-struct Point {
-    /// Lowest corner of the edge or cell on the finest grid, and which of its points this is.
+struct Vertex {
+    /// Lowest corner of its edge or cell on the finest grid, and its number there.
     key: u64,
     position: [f32; 3],
 }
 
-/// What a few nodes add to the mesh.
+/// The triangles of a few nodes.
 #[derive(Default)]
-struct Patch {
-    points: Vec<Point>,
+struct MeshPart {
+    vertices: Vec<Vertex>,
     triangles: Vec<[u32; 3]>,
 }
 
-/// Nodes per patch.
-const PATCH: usize = 256;
-/// Place of no point in the cache of a node.
-const NOWHERE: u32 = u32::MAX;
-/// Points stay off the corners by this share of an edge: no triangle is without area.
+/// Nodes per mesh part.
+const PART_NODES: usize = 256;
+/// Cache entry of an edge without a vertex.
+const NONE: u32 = u32::MAX;
+/// Minimum distance of vertices to the ends of their edges (unitless share), against triangles
+/// without area.
 const MARGIN: f32 = 0.005;
 
-/// The surface where the function has the value `iso`.
-pub fn extract(function: &NodalFunction<'_>, iso: f32) -> UnitMesh {
-    let mut patches = Vec::new();
+/// Extracts the surface where the function has the value `iso_value`.
+pub fn extract(function: &NodalFunction<'_>, iso_value: f32) -> UnitMesh {
+    let mut parts = Vec::new();
     for (level, nodes) in function.tree.levels.iter().enumerate() {
-        let starts: Vec<usize> = (0..nodes.len()).step_by(PATCH).collect();
-        patches.par_extend(starts.into_par_iter().map(|start| {
-            let mut walk = Extraction {
+        let starts: Vec<usize> = (0..nodes.len()).step_by(PART_NODES).collect();
+        parts.par_extend(starts.into_par_iter().map(|start| {
+            let mut extraction = Extraction {
                 function,
-                iso,
+                iso_value,
                 level,
-                patch: Patch::default(),
+                part: MeshPart::default(),
             };
-            for node in start..(start + PATCH).min(nodes.len()) {
-                walk.add_node(node);
+            for node in start..(start + PART_NODES).min(nodes.len()) {
+                extraction.add_node(node);
             }
-            walk.patch
+            extraction.part
         }));
     }
-    weld(&patches)
+    merge(&parts)
 }
 
-/// One vertex for all points with one key, in the order of the keys.
-fn weld(patches: &[Patch]) -> UnitMesh {
-    let mut starts = Vec::with_capacity(patches.len());
-    let mut keys: Vec<(u64, u32)> = Vec::new();
-    for patch in patches {
-        starts.push(keys.len() as u32);
-        let start = keys.len() as u32;
-        keys.extend(
-            patch
-                .points
-                .iter()
-                .zip(start..)
-                .map(|(point, index)| (point.key, index)),
-        );
-    }
+/// Merges vertices with equal keys; they are in the order of their keys.
+fn merge(parts: &[MeshPart]) -> UnitMesh {
+    let all = || parts.iter().flat_map(|part| &part.vertices);
+    let mut keys: Vec<(u64, u32)> = (all().zip(0..))
+        .map(|(vertex, index)| (vertex.key, index))
+        .collect();
     keys.par_sort_unstable();
-    let mut vertex_of = vec![0_u32; keys.len()];
+    let positions: Vec<[f32; 3]> = all().map(|vertex| vertex.position).collect();
+    let mut merged = vec![0_u32; keys.len()];
     let mut vertices = Vec::new();
-    let positions: Vec<[f32; 3]> = patches
-        .iter()
-        .flat_map(|patch| patch.points.iter().map(|point| point.position))
-        .collect();
-    let mut previous = None;
-    for (key, index) in keys {
-        if previous != Some(key) {
-            vertices.push(positions[index as usize]);
-            previous = Some(key);
+    for same in keys.chunk_by(|a, b| a.0 == b.0) {
+        for &(_, index) in same {
+            merged[index as usize] = vertices.len() as u32;
         }
-        vertex_of[index as usize] = vertices.len() as u32 - 1;
+        vertices.push(positions[same[0].1 as usize]);
     }
-    let triangles = patches
-        .iter()
-        .zip(starts)
-        .flat_map(|(patch, start)| {
-            let vertex_of = &vertex_of;
-            patch
-                .triangles
-                .iter()
-                .map(move |triangle| triangle.map(|point| vertex_of[(start + point) as usize]))
-        })
-        .collect();
+    let mut triangles = Vec::new();
+    let mut start = 0;
+    for part in parts {
+        let of_part = part.triangles.iter();
+        triangles.extend(of_part.map(|t| t.map(|vertex| merged[start + vertex as usize])));
+        start += part.vertices.len();
+    }
     UnitMesh {
         vertices,
         triangles,
@@ -122,18 +107,12 @@ fn weld(patches: &[Patch]) -> UnitMesh {
 
 struct Extraction<'a> {
     function: &'a NodalFunction<'a>,
-    iso: f32,
+    iso_value: f32,
     level: usize,
-    patch: Patch,
+    part: MeshPart,
 }
 
-/// Place of a closed corner.
-#[inline]
-fn closed_index(corner: [usize; 3]) -> usize {
-    corner[0] + 5 * corner[1] + 25 * corner[2]
-}
-
-/// The octant of a node in which one of its cells lies.
+/// The octant of a node that contains one of its cells.
 #[inline]
 fn octant_of(cell: [usize; 3]) -> usize {
     (cell[0] >> 1) | (cell[1] >> 1) << 1 | (cell[2] >> 1) << 2
@@ -148,88 +127,80 @@ impl Extraction<'_> {
         &self.function.tree.levels[level]
     }
 
-    fn values(&self, level: usize, node: usize) -> &[f32] {
-        &self.function.values[level][node * CLOSED..][..CLOSED]
+    fn values(&self, level: usize, node: usize) -> &CornerValues {
+        &self.function.values[level][node]
+    }
+
+    fn child(&self, level: usize, node: usize, cell: [usize; 3]) -> Option<usize> {
+        self.nodes(level).child(node, octant_of(cell))
     }
 
     fn add_node(&mut self, node: usize) {
         let nodes = self.nodes(self.level);
         let values = self.values(self.level, node);
-        let first = values[0] > self.iso;
-        if nodes.child_mask[node] == 255 || values.iter().all(|&v| (v > self.iso) == first) {
+        let first = values[0] > self.iso_value;
+        if nodes.child_mask[node] == 255 || values.iter().all(|&v| (v > self.iso_value) == first) {
             return;
         }
-        let is_plain = nodes.neighbors[node]
+        let has_no_finer_neighbor = nodes.neighbors[node]
             .iter()
             .all(|&other| other as usize == nodes.len() || nodes.child_mask[other as usize] == 0);
-        let mut cache = [NOWHERE; 3 * CLOSED];
-        for index in 0..64 {
+        let mut edge_vertices = [NONE; 3 * CORNERS];
+        for index in 0..CELLS {
             let cell = [index & 3, index >> 2 & 3, index >> 4];
-            if self
-                .nodes(self.level)
-                .child(node, octant_of(cell))
-                .is_some()
-            {
+            if self.child(self.level, node, cell).is_some() {
                 continue;
             }
-            let in_front = (0..8).fold(0_u8, |bits, corner| {
-                let at = add(cell, [corner & 1, corner >> 1 & 1, corner >> 2]);
-                let value = self.values(self.level, node)[closed_index(at)];
-                bits | u8::from(value > self.iso) << corner
-            });
+            let values = self.values(self.level, node);
+            let corners = CORNER_OFFSETS.map(|offset| values[corner_index(cell) + offset]);
+            let in_front = corner_signs(corners.map(|value| value > self.iso_value));
             if in_front == 0 || in_front == 255 {
                 continue;
             }
-            if is_plain {
-                self.add_plain_cell(node, cell, in_front, &mut cache);
+            if has_no_finer_neighbor {
+                self.add_cell(node, cell, in_front, &mut edge_vertices);
             } else {
-                self.add_bordering_cell(node, cell);
+                self.add_transition_cell(node, cell);
             }
         }
     }
 
-    /// A cell whose neighbours are not finer.
-    fn add_plain_cell(
+    /// Adds a cell without finer neighbors.
+    fn add_cell(
         &mut self,
         node: usize,
         cell: [usize; 3],
         in_front: u8,
-        cache: &mut [u32; 3 * CLOSED],
+        edge_vertices: &mut [u32; 3 * CORNERS],
     ) {
         let case = cell_case(in_front);
-        let mut ids = [NOWHERE; 16];
+        let mut ids = [NONE; 16];
         for &id in case.triangles.iter().flatten().filter(|&&id| id < 12) {
             let (offset, axis) = edge(id.into());
             let corner = add(cell, offset);
-            let place = closed_index(corner) + CLOSED * axis;
-            if cache[place] == NOWHERE {
-                let values = self.values(self.level, node);
-                let mut far = corner;
-                far[axis] += 1;
-                let ends = [values[closed_index(corner)], values[closed_index(far)]];
+            let entry = &mut edge_vertices[corner_index(corner) + CORNERS * axis];
+            if *entry == NONE {
+                let ends = self.edge_values(self.level, node, corner, axis);
                 let global = self.global_corner(self.level, node, corner);
-                cache[place] = self.add_point(self.point_on(self.level, global, axis, ends));
+                *entry = self.add_vertex(self.vertex_on(self.level, global, axis, ends));
             }
-            ids[id as usize] = cache[place];
+            ids[id as usize] = *entry;
         }
-        for (number, points) in case.middles.iter().enumerate() {
-            let points: Vec<u32> = points.iter().map(|&id| ids[id as usize]).collect();
-            ids[12 + number] = self.add_middle(node, cell, number, &points);
+        for (number, polygon) in case.centers.iter().enumerate() {
+            let polygon: Vec<u32> = polygon.iter().map(|&id| ids[id as usize]).collect();
+            ids[12 + number] = self.add_center(node, cell, number, &polygon);
         }
-        self.patch.triangles.extend(
-            case.triangles
-                .iter()
-                .map(|triangle| triangle.map(|id| ids[id as usize])),
-        );
+        let triangles = case.triangles.iter();
+        (self.part.triangles).extend(triangles.map(|t| t.map(|id| ids[id as usize])));
     }
 
-    /// A cell that may have finer neighbours.
-    fn add_bordering_cell(&mut self, node: usize, cell: [usize; 3]) {
-        let mut segments: Vec<(Point, Point)> = Vec::new();
+    /// Adds a cell that may have finer neighbors.
+    fn add_transition_cell(&mut self, node: usize, cell: [usize; 3]) {
+        let mut segments: Vec<(Vertex, Vertex)> = Vec::new();
         for axis in 0..3 {
             for side in 0..2 {
                 let before = segments.len();
-                self.face_lines(node, cell, axis, side, &mut segments);
+                self.add_face_segments(node, cell, (axis, side), &mut segments);
                 if side == 1 {
                     for segment in &mut segments[before..] {
                         *segment = (segment.1, segment.0);
@@ -237,129 +208,115 @@ impl Extraction<'_> {
                 }
             }
         }
-        let loops = close_loops(segments, |a, b| a.key == b.key);
-        for (number, points) in loops
-            .iter()
-            .enumerate()
-            .filter(|(_, points)| points.len() > 2)
-        {
-            let ids: Vec<u32> = points.iter().map(|&point| self.add_point(point)).collect();
+        let loops = join_loops(segments, |a, b| a.key == b.key);
+        for (number, polygon) in loops.iter().enumerate().filter(|(_, l)| l.len() > 2) {
+            let ids: Vec<u32> = polygon.iter().map(|&v| self.add_vertex(v)).collect();
             if let [a, b, c] = ids[..] {
-                self.patch.triangles.push([a, b, c]);
+                self.part.triangles.push([a, b, c]);
                 continue;
             }
-            let middle = self.add_middle(node, cell, number, &ids);
-            for i in 0..ids.len() {
-                self.patch
-                    .triangles
-                    .push([ids[i], ids[(i + 1) % ids.len()], middle]);
-            }
+            let center = self.add_center(node, cell, number, &ids);
+            let edges = ids.iter().zip(ids.iter().cycle().skip(1));
+            (self.part.triangles).extend(edges.map(|(&a, &b)| [a, b, center]));
         }
     }
 
-    /// The segments on a face of a leaf cell: the finer neighbour's, if there is one.
-    fn face_lines(
+    /// Adds the segments on a face of a leaf cell, or those of the finer neighbor if there is one.
+    fn add_face_segments(
         &self,
         node: usize,
         cell: [usize; 3],
-        axis: usize,
-        side: usize,
-        segments: &mut Vec<(Point, Point)>,
+        (axis, side): (usize, usize),
+        segments: &mut Vec<(Vertex, Vertex)>,
     ) {
         let mut beside = self.global_corner(self.level, node, cell);
         beside[axis] += 2 * side as i32 - 1;
+        let local = beside.map(|x| (x & 3) as usize);
         match self.function.tree.node_at(self.level, beside) {
-            Some(other) => {
-                let local = beside.map(|x| (x & 3) as usize);
-                let is_finer = self
-                    .nodes(self.level)
-                    .child(other, octant_of(local))
-                    .is_some();
-                if is_finer {
-                    self.lines_of(self.level, other, local, (axis, 1 - side), segments);
-                } else {
-                    self.lines_of(self.level, node, cell, (axis, side), segments);
-                }
+            Some(other) if self.child(self.level, other, local).is_some() => {
+                self.add_leaf_segments(self.level, other, local, (axis, 1 - side), segments);
             }
-            None => self.lines_of(self.level, node, cell, (axis, side), segments),
+            _ => self.add_leaf_segments(self.level, node, cell, (axis, side), segments),
         }
     }
 
-    /// The segments on a face of a cell or, where it has them, of its children.
-    fn lines_of(
+    /// Adds the segments on a face of a cell, or of its descendants if it is no leaf.
+    fn add_leaf_segments(
         &self,
         level: usize,
         node: usize,
         cell: [usize; 3],
         (axis, side): (usize, usize),
-        segments: &mut Vec<(Point, Point)>,
+        segments: &mut Vec<(Vertex, Vertex)>,
     ) {
-        if let Some(child) = self.nodes(level).child(node, octant_of(cell)) {
+        if let Some(child) = self.child(level, node, cell) {
             let low = cell.map(|x| 2 * (x & 1));
             for corner in face_corners(axis, side) {
-                self.lines_of(level + 1, child, add(low, corner), (axis, side), segments);
+                self.add_leaf_segments(level + 1, child, add(low, corner), (axis, side), segments);
             }
             return;
         }
         let values = self.values(level, node);
         let signs = face_corners(axis, side)
-            .map(|corner| values[closed_index(add(cell, corner))] > self.iso);
+            .map(|corner| values[corner_index(add(cell, corner))] > self.iso_value);
         let edges = face_edges(axis, side);
-        for (from, to) in face_segments(signs) {
-            let [from, to] = [from, to].map(|place| {
-                let (offset, axis) = edges[place];
-                let corner = add(cell, offset);
-                let mut far = corner;
-                far[axis] += 1;
-                let ends = [values[closed_index(corner)], values[closed_index(far)]];
-                self.finest_point(level, self.global_corner(level, node, corner), axis, ends)
-            });
-            segments.push((from, to));
-        }
+        let vertex = |index: usize| {
+            let (offset, axis) = edges[index];
+            let corner = add(cell, offset);
+            let ends = self.edge_values(level, node, corner, axis);
+            self.finest_vertex(level, self.global_corner(level, node, corner), axis, ends)
+        };
+        segments.extend(face_segments(signs).map(|(from, to)| (vertex(from), vertex(to))));
     }
 
-    /// The crossing of an edge, on the finest edge that the cells around it have there.
-    fn finest_point(&self, level: usize, corner: [i32; 3], axis: usize, ends: [f32; 2]) -> Point {
+    /// The values at both ends of an edge.
+    fn edge_values(&self, level: usize, node: usize, corner: [usize; 3], axis: usize) -> [f32; 2] {
+        let values = self.values(level, node);
+        let mut far = corner;
+        far[axis] += 1;
+        [corner, far].map(|corner| values[corner_index(corner)])
+    }
+
+    /// The vertex on an edge, on the finest edge of the cells around it.
+    fn finest_vertex(&self, level: usize, corner: [i32; 3], axis: usize, ends: [f32; 2]) -> Vertex {
         let Some(child) = self.finer_node_at_edge(level, corner, axis) else {
-            return self.point_on(level, corner, axis, ends);
+            return self.vertex_on(level, corner, axis, ends);
         };
         let mut middle = corner.map(|x| 2 * x);
         middle[axis] += 1;
         let first = self.nodes(level + 1).first_cell(child);
         let local = [0, 1, 2].map(|axis| (middle[axis] - first[axis]) as usize);
-        let value = self.values(level + 1, child)[closed_index(local)];
-        if (ends[0] > self.iso) == (value > self.iso) {
-            self.finest_point(level + 1, middle, axis, [value, ends[1]])
+        let value = self.values(level + 1, child)[corner_index(local)];
+        if (ends[0] > self.iso_value) == (value > self.iso_value) {
+            self.finest_vertex(level + 1, middle, axis, [value, ends[1]])
         } else {
-            self.finest_point(level + 1, corner.map(|x| 2 * x), axis, [ends[0], value])
+            self.finest_vertex(level + 1, corner.map(|x| 2 * x), axis, [ends[0], value])
         }
     }
 
-    /// A node of the next level at one of the four cells around an edge.
+    /// A node of the next level in one of the four cells around an edge.
     fn finer_node_at_edge(&self, level: usize, corner: [i32; 3], axis: usize) -> Option<usize> {
         (0..4).find_map(|side| {
             let mut cell = corner;
             cell[(axis + 1) % 3] -= side & 1;
             cell[(axis + 2) % 3] -= side >> 1;
             let node = self.function.tree.node_at(level, cell)?;
-            let local = cell.map(|x| (x & 3) as usize);
-            self.nodes(level).child(node, octant_of(local))
+            self.child(level, node, cell.map(|x| (x & 3) as usize))
         })
     }
 
-    fn point_on(&self, level: usize, corner: [i32; 3], axis: usize, ends: [f32; 2]) -> Point {
-        let depth = self.nodes(level).depth;
-        let along = ((self.iso - ends[0]) / (ends[1] - ends[0])).clamp(MARGIN, 1.0 - MARGIN);
-        let mut place = corner.map(|x| x as f32);
-        place[axis] += along;
-        let width = (-(depth as f32)).exp2();
-        Point {
+    fn vertex_on(&self, level: usize, corner: [i32; 3], axis: usize, ends: [f32; 2]) -> Vertex {
+        let along = ((self.iso_value - ends[0]) / (ends[1] - ends[0])).clamp(MARGIN, 1.0 - MARGIN);
+        let mut position = corner.map(|x| x as f32);
+        position[axis] += along;
+        let width = (-(self.nodes(level).depth as f32)).exp2();
+        Vertex {
             key: self.key(level, corner) | axis as u64,
-            position: place.map(|x| x * width),
+            position: position.map(|x| x * width),
         }
     }
 
-    /// The lowest corner of an edge or cell on the finest grid, with room for eight bits.
+    /// The lowest corner of an edge or cell on the finest grid, with eight free bits.
     fn key(&self, level: usize, corner: [i32; 3]) -> u64 {
         let shift = self.function.tree.levels.len() - 1 - level;
         morton::encode(corner.map(|x| (x as u32) << shift)) << 8
@@ -370,22 +327,22 @@ impl Extraction<'_> {
         [0, 1, 2].map(|axis| first[axis] + corner[axis] as i32)
     }
 
-    fn add_point(&mut self, point: Point) -> u32 {
-        self.patch.points.push(point);
-        self.patch.points.len() as u32 - 1
+    fn add_vertex(&mut self, vertex: Vertex) -> u32 {
+        self.part.vertices.push(vertex);
+        self.part.vertices.len() as u32 - 1
     }
 
-    /// The mean of a loop's points.
-    fn add_middle(&mut self, node: usize, cell: [usize; 3], number: usize, loop_: &[u32]) -> u32 {
+    /// Adds the mean of the vertices of a polygon.
+    fn add_center(&mut self, node: usize, cell: [usize; 3], number: usize, polygon: &[u32]) -> u32 {
         let mut position = [0.0; 3];
-        for &index in loop_ {
-            let point = self.patch.points[index as usize].position;
+        for &index in polygon {
+            let vertex = self.part.vertices[index as usize].position;
             for axis in 0..3 {
-                position[axis] += point[axis] / loop_.len() as f32;
+                position[axis] += vertex[axis] / polygon.len() as f32;
             }
         }
         let corner = self.global_corner(self.level, node, cell);
         let key = self.key(self.level, corner) | (number as u64) << 2 | 3;
-        self.add_point(Point { key, position })
+        self.add_vertex(Vertex { key, position })
     }
 }

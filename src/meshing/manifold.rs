@@ -1,15 +1,16 @@
-//! Vertices where pieces of surface touch in nothing but that vertex, as they are left when triangles
-//! have been removed: each piece gets a vertex of its own, and every vertex one fan of triangles.
+//! Repair of non-manifold vertices, where fans of triangles touch in nothing but the vertex, as they
+//! remain after the removal of triangles.
 
+use super::adjacency::{VertexCorners, opposite_edge};
 use crate::geometry::TriangleMesh;
 
-/// Gives each fan of triangles around a vertex a vertex of its own, at the same place and with
-/// the same normal and colour; returns how many were added. The surface stays as it is.
+/// Gives each fan of triangles around a vertex its own copy of the vertex, with the same position,
+/// normal and color; returns the number of copies.
 pub fn split_fans(mesh: &mut TriangleMesh) -> usize {
     let count = mesh.vertices.len();
-    let (starts, corners) = corners_by_vertex(&mesh.triangles, count);
+    let vertex_corners = VertexCorners::new(&mesh.triangles, count);
     for vertex in 0..count {
-        let corners = &corners[starts[vertex]..starts[vertex + 1]];
+        let corners = vertex_corners.of(vertex);
         let fans = fans(&mesh.triangles, corners);
         for fan in 1..=fans.iter().copied().max().unwrap_or(0) {
             let copy = mesh.vertices.len() as u32;
@@ -28,48 +29,30 @@ pub fn split_fans(mesh: &mut TriangleMesh) -> usize {
     mesh.vertices.len() - count
 }
 
-/// The corners at each vertex: where they start, and all of them. Corner 3 t + k is corner k of
-/// triangle t.
-fn corners_by_vertex(triangles: &[[u32; 3]], vertices: usize) -> (Vec<usize>, Vec<u32>) {
-    let mut ends = vec![0_usize; vertices + 1];
-    for vertex in triangles.iter().flatten() {
-        ends[*vertex as usize + 1] += 1;
-    }
-    for index in 1..ends.len() {
-        ends[index] += ends[index - 1];
-    }
-    let starts = ends.clone();
-    let mut corners = vec![0; 3 * triangles.len()];
-    for (corner, vertex) in triangles.iter().flatten().enumerate() {
-        corners[ends[*vertex as usize]] = corner as u32;
-        ends[*vertex as usize] += 1;
-    }
-    (starts, corners)
-}
-
 /// The number of the fan of each corner at one vertex, from 0. Triangles of a fan are connected by
 /// edges at the vertex.
 fn fans(triangles: &[[u32; 3]], corners: &[u32]) -> Vec<usize> {
-    let others = |corner: u32| {
-        let triangle = triangles[corner as usize / 3];
-        [1, 2].map(|step| triangle[(corner as usize + step) % 3])
+    let edges: Vec<(u32, u32)> = (corners.iter())
+        .map(|&corner| opposite_edge(triangles, corner))
+        .collect();
+    let is_beside = |a: usize, b: usize| {
+        let ((a0, a1), (b0, b1)) = (edges[a], edges[b]);
+        a0 == b0 || a0 == b1 || a1 == b0 || a1 == b1
     };
     let mut fans = vec![usize::MAX; corners.len()];
     let mut fan = 0;
-    let mut reached = Vec::new();
+    let mut open = Vec::new();
     for start in 0..corners.len() {
         if fans[start] != usize::MAX {
             continue;
         }
         fans[start] = fan;
-        reached.push(start);
-        while let Some(here) = reached.pop() {
-            let edges = others(corners[here]);
-            for (next, of) in fans.iter_mut().enumerate() {
-                let is_beside = || others(corners[next]).iter().any(|v| edges.contains(v));
-                if *of == usize::MAX && is_beside() {
-                    *of = fan;
-                    reached.push(next);
+        open.push(start);
+        while let Some(here) = open.pop() {
+            for next in 0..corners.len() {
+                if fans[next] == usize::MAX && is_beside(here, next) {
+                    fans[next] = fan;
+                    open.push(next);
                 }
             }
         }
@@ -82,11 +65,11 @@ fn fans(triangles: &[[u32; 3]], corners: &[u32]) -> Vec<usize> {
 mod tests {
     use glam::Vec3;
 
-    use super::super::shapes::Topology;
+    use super::super::tests::shapes::Topology;
     use super::*;
 
-    /// A disc of six triangles around vertex 0, without some of them.
-    fn disc(without: &[usize]) -> TriangleMesh {
+    /// A disk of six triangles around vertex 0, without some of them.
+    fn disk(without: &[usize]) -> TriangleMesh {
         let mut mesh = TriangleMesh::default();
         mesh.vertices.push(Vec3::ZERO);
         for k in 0..6 {
@@ -101,9 +84,9 @@ mod tests {
     }
 
     #[test]
-    fn pieces_that_touch_in_a_vertex_get_one_each_and_no_triangle_moves() {
+    fn fans_that_touch_in_a_vertex_are_separated_and_no_triangle_moves() {
         for (without, copies) in [(&[0, 3][..], 1), (&[0, 2, 4], 2)] {
-            let whole = disc(without);
+            let whole = disk(without);
             assert!(!Topology::of(&whole).is_manifold());
             let mut split = whole.clone();
             assert_eq!(split_fans(&mut split), copies);
@@ -121,9 +104,9 @@ mod tests {
     }
 
     #[test]
-    fn a_ring_and_a_single_fan_stay_as_they_are() {
+    fn a_ring_and_a_single_fan_are_unchanged() {
         for without in [&[][..], &[0], &[0, 1]] {
-            let whole = disc(without);
+            let whole = disk(without);
             let mut split = whole.clone();
             assert_eq!(split_fans(&mut split), 0);
             assert_eq!(split, whole);

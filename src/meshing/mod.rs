@@ -1,32 +1,33 @@
-//! From oriented points to a triangle mesh: screened Poisson reconstruction, and what it invents
-//! cut off again.
+//! Triangle meshes from oriented points: screened Poisson reconstruction, trimming of unsupported
+//! surface, simplification of the ground.
 
-// The method.
+// The pipeline.
 pub mod poisson;
 pub mod simplify;
 pub mod trimming;
-// What it stands on, in the order in which it is needed.
+// Its parts, in the order of their use.
+mod adjacency;
 mod base_grid;
-mod block;
-mod cell_table;
+mod case_table;
 mod collapse;
 mod density;
+mod error;
 mod fan;
 mod isosurface;
 mod manifold;
 mod morton;
+mod normal_field;
 mod octree;
 mod samples;
 mod solver;
+mod stencil;
+mod weights;
 
+pub use error::MeshingError;
 pub use manifold::split_fans;
-pub use poisson::{MeshingError, PoissonConfig, Surface, reconstruct};
+pub use poisson::{PoissonConfig, Reconstruction, reconstruct};
 pub use simplify::simplify_ground;
 pub use trimming::{trim_by_density, trim_by_distance};
 
-#[cfg(test)]
-mod shapes;
-#[cfg(test)]
-mod simplify_tests;
 #[cfg(test)]
 mod tests;

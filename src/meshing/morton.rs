@@ -1,5 +1,5 @@
-//! Morton codes: the three coordinates of a cell with their bits interleaved, x lowest. Sorted by
-//! code, the cells of every octree node are neighbours in memory.
+//! Morton codes: the interleaved bits of the three coordinates of a cell, x lowest. Sorted by code,
+//! the cells of every octree node are contiguous in memory.
 
 /// The code of a cell, 21 bits per coordinate.
 pub fn encode(cell: [u32; 3]) -> u64 {
@@ -34,7 +34,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn decoding_undoes_encoding() {
+    fn decoding_inverts_encoding() {
         for cell in [[0, 0, 0], [1, 2, 3], [4095, 17, 2048], [0x1f_ffff, 0, 5]] {
             assert_eq!(decode(encode(cell)), cell);
         }

@@ -1,30 +1,31 @@
-//! The oriented points as the solver sees them: inside the unit cube and in Morton order.
+//! The input of the solver: oriented points in the unit cube, in Morton order.
 
 use glam::Vec3;
 use rayon::prelude::*;
 
-use super::{MeshingError, morton};
+use super::error::MeshingError;
+use super::morton;
 use crate::geometry::{Aabb, PointCloud};
 
-/// Where the unit cube of the solver lies in the frame of the cloud.
+/// The cube of the reconstruction in the frame of the cloud.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Domain {
     /// Lower corner [m].
     pub origin: Vec3,
-    /// Edge [m].
+    /// Edge length [m].
     pub side_m: f32,
 }
 
 impl Domain {
-    /// A point of the unit cube in the frame of the cloud [m].
-    pub fn to_metres(self, unit: [f32; 3]) -> Vec3 {
+    /// Transforms a point from the unit cube to the frame of the cloud [m].
+    pub fn to_cloud(self, unit: [f32; 3]) -> Vec3 {
         self.origin + self.side_m * Vec3::from(unit)
     }
 }
 
-/// Points in the unit cube, sorted by the Morton code of their cell.
+/// Points in the unit cube, sorted by the Morton codes of their cells.
 pub struct Samples {
-    /// Number of halvings of the cube down to the cells of the codes.
+    /// Depth of the cells of the codes.
     pub depth: u32,
     /// Morton codes, ascending.
     pub codes: Vec<u64>,
@@ -32,19 +33,20 @@ pub struct Samples {
     pub positions: Vec<[f32; 3]>,
     /// Unit normals.
     pub normals: Vec<[f32; 3]>,
-    /// How many points each stands for.
+    /// Number of points that each sample represents.
     pub weights: Vec<f32>,
-    /// Where the cube lies.
+    /// Position and size of the cube.
     pub domain: Domain,
-    /// Points that were left out: not finite, without a normal, or without weight.
+    /// Number of points ignored: not finite, without a normal, or without weight.
     pub dropped: usize,
 }
 
 impl Samples {
-    /// Below this many points there is no surface to speak of.
+    /// Minimum number of usable points.
     const MIN_POINTS: usize = 4;
 
-    /// Takes the usable points of a cloud; the cube is `scale` times their bounding box.
+    /// The usable points of a cloud; the edge of the cube is `scale` times the longest edge of their
+    /// bounding box.
     pub fn new(
         cloud: &PointCloud,
         weights: Option<&[f32]>,
@@ -89,21 +91,15 @@ impl Samples {
             })
             .collect();
         order.par_sort_unstable();
+        let indices = || order.par_iter().map(|&(_, index)| index);
         Ok(Self {
             depth,
             codes: order.iter().map(|&(code, _)| code).collect(),
-            positions: order
-                .par_iter()
-                .map(|&(_, index)| unit(index).to_array())
+            positions: indices().map(|index| unit(index).to_array()).collect(),
+            normals: indices()
+                .map(|index| cloud.normals[index as usize].normalize().to_array())
                 .collect(),
-            normals: order
-                .par_iter()
-                .map(|&(_, index)| cloud.normals[index as usize].normalize().to_array())
-                .collect(),
-            weights: order
-                .par_iter()
-                .map(|&(_, index)| weight(index as usize))
-                .collect(),
+            weights: indices().map(|index| weight(index as usize)).collect(),
             domain,
             dropped: cloud.len() - usable.len(),
         })
@@ -114,20 +110,13 @@ impl Samples {
         self.codes.len()
     }
 
-    /// The cell of a point at a depth, and where in the cell it is, 0 to 1 per axis.
+    /// The cell of a point at a depth, and the position in the cell, 0 to 1 per axis.
     #[inline]
     pub fn cell(&self, index: usize, depth: u32) -> ([i32; 3], [f32; 3]) {
         let cells = (1_u32 << depth) as f32;
         let scaled = self.positions[index].map(|x| x * cells);
         let cell = scaled.map(|x| x as i32);
-        (
-            cell,
-            [
-                scaled[0] - cell[0] as f32,
-                scaled[1] - cell[1] as f32,
-                scaled[2] - cell[2] as f32,
-            ],
-        )
+        (cell, [0, 1, 2].map(|axis| scaled[axis] - cell[axis] as f32))
     }
 }
 

@@ -1,123 +1,94 @@
-//! Cutting off what Poisson invents to close its surface: where no sample is, by density, and far
-//! from every sample, by distance. Both say how many triangles went.
+//! Removal of surface that is not supported by samples, which the Poisson reconstruction adds to close
+//! the surface: by sampling density and by distance to the samples.
 
-use std::collections::HashMap;
-
-use glam::{IVec3, Vec3};
+use glam::Vec3;
 use rayon::prelude::*;
 
-use super::Surface;
+use super::poisson::Reconstruction;
 use crate::geometry::TriangleMesh;
 
-/// Drops the vertices whose density is below the `quantile` of all densities, with their triangles,
-/// as range-mcl does (Chen et al., ICRA 2021). Returns the number of dropped triangles.
-pub fn trim_by_density(surface: &mut Surface, quantile: f64) -> usize {
+/// Removes the vertices whose density is below the `quantile` of all densities, with their triangles,
+/// as in range-mcl (Chen et al., ICRA 2021). Returns the number of removed triangles.
+pub fn trim_by_density(surface: &mut Reconstruction, quantile: f64) -> usize {
     let Some(limit) = quantile_of(&surface.densities, quantile) else {
         return 0;
     };
     let densities = std::mem::take(&mut surface.densities);
-    let is_kept = |vertex: u32| densities[vertex as usize] >= limit;
+    let is_dense: Vec<bool> = densities.iter().map(|&density| density >= limit).collect();
     let triangles = surface.mesh.triangles.clone();
+    let is_kept = |triangle: &[u32; 3]| triangle.iter().all(|&v| is_dense[v as usize]);
     let mut is_used = vec![false; densities.len()];
-    for triangle in triangles.iter().filter(|t| t.iter().all(|&v| is_kept(v))) {
-        for &vertex in triangle {
-            is_used[vertex as usize] = true;
-        }
+    for &vertex in triangles.iter().filter(|t| is_kept(t)).flatten() {
+        is_used[vertex as usize] = true;
     }
     surface.densities = (densities.iter().zip(&is_used))
         .filter_map(|(&density, &is_used)| is_used.then_some(density))
         .collect();
-    surface
-        .mesh
-        .retain_triangles(|index| triangles[index].iter().all(|&v| is_kept(v)));
+    (surface.mesh).retain_triangles(|index| is_kept(&triangles[index]));
     triangles.len() - surface.mesh.triangles.len()
 }
 
-/// Drops the triangles with a vertex farther than `max_distance_m` from every sample. Returns
-/// their number.
+/// Removes the triangles with a vertex farther than `max_distance_m` from every sample; returns their
+/// number.
 pub fn trim_by_distance(mesh: &mut TriangleMesh, samples: &[Vec3], max_distance_m: f32) -> usize {
-    let near = Neighborhood::new(samples, max_distance_m);
-    let is_near: Vec<bool> = mesh
-        .vertices
-        .par_iter()
-        .map(|&vertex| near.has_sample_at(vertex))
+    let grid = SampleGrid::new(samples, max_distance_m);
+    let is_near: Vec<bool> = (mesh.vertices.par_iter())
+        .map(|&vertex| grid.has_sample_near(vertex))
         .collect();
     let triangles = mesh.triangles.clone();
     mesh.retain_triangles(|index| triangles[index].iter().all(|&v| is_near[v as usize]));
     triangles.len() - mesh.triangles.len()
 }
 
-/// The value below which a share of all values lies, interpolated as NumPy does; `None` without values.
+/// The quantile of values, interpolated as in NumPy; `None` without values.
 fn quantile_of(values: &[f32], quantile: f64) -> Option<f32> {
     let mut sorted = values.to_vec();
     sorted.sort_unstable_by(f32::total_cmp);
-    let place = quantile.clamp(0.0, 1.0) * (sorted.len().checked_sub(1)?) as f64;
-    let low = sorted[place.floor() as usize];
-    let high = sorted[place.ceil() as usize];
-    Some(low + (high - low) * place.fract() as f32)
+    let position = quantile.clamp(0.0, 1.0) * (sorted.len().checked_sub(1)?) as f64;
+    let low = sorted[position.floor() as usize];
+    let high = sorted[position.ceil() as usize];
+    Some(low + (high - low) * position.fract() as f32)
 }
 
-/// Samples by cell, each cell as wide as the distance that is asked for.
-struct Neighborhood<'a> {
-    samples: &'a [Vec3],
-    /// Sample indices, cell by cell.
-    order: Vec<u32>,
-    ranges: HashMap<IVec3, (u32, u32)>,
-    reach_m: f32,
+/// Samples in grid cells whose edge is the search radius.
+struct SampleGrid {
+    /// Cell and position of each sample, ascending in cell.
+    samples: Vec<([i32; 3], Vec3)>,
+    radius_m: f32,
 }
 
-impl<'a> Neighborhood<'a> {
-    fn new(samples: &'a [Vec3], reach_m: f32) -> Self {
-        let mut keyed: Vec<([i32; 3], u32)> = samples
-            .par_iter()
-            .enumerate()
-            .filter(|(_, sample)| sample.is_finite())
-            .map(|(index, sample)| {
-                (
-                    (sample / reach_m).floor().as_ivec3().to_array(),
-                    index as u32,
-                )
-            })
+impl SampleGrid {
+    fn new(samples: &[Vec3], radius_m: f32) -> Self {
+        let mut samples: Vec<_> = (samples.par_iter())
+            .filter(|sample| sample.is_finite())
+            .map(|&sample| (cell_of(sample, radius_m), sample))
             .collect();
-        keyed.par_sort_unstable();
-        let mut ranges = HashMap::new();
-        let mut begin = 0;
-        for chunk in keyed.chunk_by(|a, b| a.0 == b.0) {
-            let end = begin + chunk.len() as u32;
-            ranges.insert(IVec3::from_array(chunk[0].0), (begin, end));
-            begin = end;
-        }
-        Self {
-            samples,
-            order: keyed.into_iter().map(|(_, index)| index).collect(),
-            ranges,
-            reach_m,
-        }
+        samples.par_sort_unstable_by_key(|&(cell, _)| cell);
+        Self { samples, radius_m }
     }
 
-    fn has_sample_at(&self, point: Vec3) -> bool {
-        let cell = (point / self.reach_m).floor().as_ivec3();
-        (0..27).any(|i| {
-            let offset = IVec3::new(i % 3 - 1, i / 3 % 3 - 1, i / 9 - 1);
-            self.ranges
-                .get(&(cell + offset))
-                .is_some_and(|&(begin, end)| {
-                    self.order[begin as usize..end as usize]
-                        .iter()
-                        .any(|&index| {
-                            let limit = self.reach_m * self.reach_m;
-                            self.samples[index as usize].distance_squared(point) <= limit
-                        })
-                })
+    fn has_sample_near(&self, point: Vec3) -> bool {
+        let [x, y, z] = cell_of(point, self.radius_m);
+        (0..9).any(|i| {
+            // Three cells along z are contiguous.
+            let [x, y] = [x + i % 3 - 1, y + i / 3 - 1];
+            let start = (self.samples).partition_point(|&(cell, _)| cell < [x, y, z - 1]);
+            (self.samples[start..].iter())
+                .take_while(|&&(cell, _)| cell <= [x, y, z + 1])
+                .any(|(_, s)| s.distance_squared(point) <= self.radius_m * self.radius_m)
         })
     }
+}
+
+fn cell_of(point: Vec3, edge_m: f32) -> [i32; 3] {
+    (point / edge_m).floor().as_ivec3().to_array()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// A strip of triangles along x, one vertex pair per metre.
+    /// A strip of triangles along x, one vertex pair per meter.
     fn strip(length: u32) -> TriangleMesh {
         TriangleMesh {
             vertices: (0..2 * length)
@@ -137,15 +108,15 @@ mod tests {
     }
 
     #[test]
-    fn the_sparsest_tenth_of_the_vertices_goes_and_densities_stay_beside_their_vertices() {
+    fn the_sparsest_tenth_of_the_vertices_is_removed_with_its_densities() {
         let mesh = strip(50);
-        let mut surface = Surface {
+        let mut surface = Reconstruction {
             densities: mesh.vertices.iter().map(|v| v.x).collect(),
             mesh,
             dropped_points: 0,
         };
         let dropped = trim_by_density(&mut surface, 0.1);
-        // Vertices at x < 4.9 go: of the 98 triangles those of the first five metres.
+        // Vertices at x < 4.9 are removed: of the 98 triangles those of the first five meters.
         assert_eq!(dropped, 10);
         assert_eq!(surface.mesh.vertices.len(), 90);
         assert!(
@@ -159,18 +130,18 @@ mod tests {
     }
 
     #[test]
-    fn quantile_zero_and_an_empty_surface_drop_nothing() {
-        let mut surface = Surface {
+    fn quantile_zero_and_an_empty_surface_remove_nothing() {
+        let mut surface = Reconstruction {
             mesh: strip(5),
             densities: vec![1.0; 10],
             dropped_points: 0,
         };
         assert_eq!(trim_by_density(&mut surface, 0.0), 0);
-        assert_eq!(trim_by_density(&mut Surface::default(), 0.5), 0);
+        assert_eq!(trim_by_density(&mut Reconstruction::default(), 0.5), 0);
     }
 
     #[test]
-    fn triangles_stay_where_all_their_corners_have_a_sample_in_reach() {
+    fn triangles_remain_if_all_their_vertices_are_near_a_sample() {
         let mut mesh = strip(20);
         let samples: Vec<Vec3> = (0..5).map(|x| Vec3::new(x as f32, 0.5, 0.0)).collect();
         let dropped = trim_by_distance(&mut mesh, &samples, 0.51);

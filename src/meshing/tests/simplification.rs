@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 
 use glam::Vec3;
 
+use super::super::{PoissonConfig, reconstruct, simplify_ground};
 use super::shapes::{Topology, street};
-use super::{PoissonConfig, reconstruct, simplify_ground};
 use crate::geometry::{Aabb, TriangleMesh};
 
 /// A square of 20 m over `height`, its cells as wide as 20 m over their number.
@@ -65,14 +65,14 @@ fn ground_vertices(mesh: &TriangleMesh, is_ground: &[bool]) -> Vec<Vec3> {
 }
 
 #[test]
-fn the_ground_loses_four_fifths_of_its_triangles_and_every_vertex_stays_within_a_centimetre() {
+fn the_ground_loses_four_fifths_of_its_triangles_with_an_error_below_a_centimeter() {
     for (name, (mesh, is_ground)) in [("field", field(100)), ("street", noisy_street())] {
         for smoothing in [0, 1, 4] {
             let simple = simplify_ground(&mesh, &is_ground, &[], 1.0, smoothing);
             let ground = is_ground.iter().filter(|&&is_ground| is_ground).count();
             let left = simple.triangles.len() + ground - mesh.triangles.len();
             assert!(5 * left <= ground, "{name} {smoothing}: {left} of {ground}");
-            let surface = Surface::new(&simple);
+            let surface = SurfaceIndex::new(&simple);
             for vertex in ground_vertices(&mesh, &is_ground) {
                 let distance_m = surface.distance_m(vertex);
                 assert!(distance_m < 0.01001, "{name} {vertex} {distance_m}");
@@ -82,7 +82,7 @@ fn the_ground_loses_four_fifths_of_its_triangles_and_every_vertex_stays_within_a
 }
 
 #[test]
-fn the_rest_and_the_topology_stay_as_they_were() {
+fn other_triangles_and_the_topology_are_unchanged() {
     for (mesh, is_ground) in [field(60), noisy_street()] {
         let simple = simplify_ground(&mesh, &is_ground, &[], 1.0, 1);
         let [before, after] = [&mesh, &simple].map(Topology::of);
@@ -127,7 +127,7 @@ fn island() -> TriangleMesh {
 }
 
 #[test]
-fn a_border_that_is_almost_straight_loses_vertices_and_stays_where_it_was() {
+fn an_almost_straight_boundary_is_simplified_within_its_tolerance() {
     let mesh = island();
     let all = vec![true; mesh.triangles.len()];
     let simple = simplify_ground(&mesh, &all, &[], 1.0, 0);
@@ -136,7 +136,7 @@ fn a_border_that_is_almost_straight_loses_vertices_and_stays_where_it_was() {
     // The teeth of 10 cm stay, the other three sides keep a third of their vertices at most.
     assert!((100..200).contains(&after.open_edges), "{after:?}");
     assert!(after.is_manifold());
-    let (old, new) = (Surface::new(&mesh), Surface::new(&simple));
+    let (old, new) = (SurfaceIndex::new(&mesh), SurfaceIndex::new(&simple));
     for vertex in &mesh.vertices {
         assert!(new.distance_m(*vertex) < 0.01001, "{vertex}");
     }
@@ -149,7 +149,7 @@ fn a_border_that_is_almost_straight_loses_vertices_and_stays_where_it_was() {
 }
 
 #[test]
-fn what_is_held_stays_on_the_border_and_inside() {
+fn fixed_vertices_remain_on_the_boundary_and_inside() {
     let mesh = island();
     let all = vec![true; mesh.triangles.len()];
     let held: Vec<bool> = mesh.vertices.iter().map(|vertex| vertex.y < 3.0).collect();
@@ -167,7 +167,7 @@ fn what_is_held_stays_on_the_border_and_inside() {
 }
 
 #[test]
-fn a_new_triangle_is_as_level_as_the_street_and_has_no_longer_edges_than_asked() {
+fn new_triangles_are_level_and_their_edges_within_the_limit() {
     let (mesh, is_ground) = noisy_street();
     let bits = |[a, b, c]: [Vec3; 3]| [a, b, c].map(|v| v.to_array().map(f32::to_bits));
     let old: BTreeSet<_> = (0..mesh.triangles.len())
@@ -190,7 +190,7 @@ fn a_new_triangle_is_as_level_as_the_street_and_has_no_longer_edges_than_asked()
 }
 
 #[test]
-fn smoothing_turns_no_triangle_over() {
+fn smoothing_flips_no_triangle() {
     let (mesh, is_ground) = noisy_street();
     let turned = |mesh: &TriangleMesh| {
         let is_inside = |v: &Vec3| v.x.abs() < 17.0 && v.y.abs() < 7.0 && v.z.abs() < 0.1;
@@ -210,10 +210,10 @@ fn smoothing_turns_no_triangle_over() {
 }
 
 #[test]
-fn a_plane_has_no_denser_seams_inside() {
+fn block_boundaries_leave_no_denser_seams() {
     let mesh = square(160, |_, _| 0.0);
     let simple = simplify_ground(&mesh, &vec![true; mesh.triangles.len()], &[], 1.0, 0);
-    // In squares of 1 m away from the border, which stays.
+    // Counts in squares of 1 m away from the boundary.
     let mut counts = [[0; 16]; 16];
     for triangle in 0..simple.triangles.len() {
         let [a, b, c] = simple.corners(triangle);
@@ -230,7 +230,7 @@ fn a_plane_has_no_denser_seams_inside() {
 }
 
 #[test]
-fn a_bump_higher_than_a_centimetre_stays() {
+fn a_bump_above_the_tolerance_remains() {
     let is_bump = |x: f32, y: f32| (x - 7.0).abs() < 0.01 && (y - 12.0).abs() < 0.01;
     let mesh = square(100, |x, y| if is_bump(x, y) { 0.03 } else { 0.0 });
     let simple = simplify_ground(&mesh, &vec![true; mesh.triangles.len()], &[], 1.0, 0);
@@ -239,7 +239,7 @@ fn a_bump_higher_than_a_centimetre_stays() {
 }
 
 #[test]
-fn one_thread_and_two_give_the_same_bytes() {
+fn the_result_does_not_depend_on_the_number_of_threads() {
     let (mesh, is_ground) = field(80);
     let with_threads = |count: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(count).build();
@@ -259,7 +259,7 @@ fn without_ground_nothing_changes() {
 }
 
 /// Distances to a mesh that lies mostly level.
-struct Surface<'a> {
+struct SurfaceIndex<'a> {
     mesh: &'a TriangleMesh,
     bounds: Aabb,
     /// The triangles over each square metre, row by row.
@@ -267,7 +267,7 @@ struct Surface<'a> {
     columns: usize,
 }
 
-impl<'a> Surface<'a> {
+impl<'a> SurfaceIndex<'a> {
     fn new(mesh: &'a TriangleMesh) -> Self {
         let bounds = mesh.bounds();
         let columns = bounds.size().x as usize + 1;

@@ -3,8 +3,8 @@
 use approx::assert_relative_eq;
 use glam::{Quat, Vec3};
 
+use super::super::*;
 use super::shapes::{Topology, sphere, street};
-use super::*;
 use crate::geometry::PointCloud;
 
 fn at_depth(depth: u32) -> PoissonConfig {
@@ -14,7 +14,7 @@ fn at_depth(depth: u32) -> PoissonConfig {
     }
 }
 
-fn reconstructed(cloud: &PointCloud, depth: u32) -> Surface {
+fn reconstructed(cloud: &PointCloud, depth: u32) -> Reconstruction {
     reconstruct(cloud, None, &at_depth(depth)).unwrap()
 }
 
@@ -24,7 +24,7 @@ fn median(mut values: Vec<f32>) -> f32 {
 }
 
 #[test]
-fn a_sphere_becomes_one_closed_manifold_without_holes_of_its_radius() {
+fn a_sphere_becomes_a_closed_manifold_of_genus_0_with_its_radius() {
     for depth in [4, 6, 7] {
         // At least one point per face of the finest cells.
         let surface = reconstructed(&sphere(3.0, 80_000), depth);
@@ -37,7 +37,7 @@ fn a_sphere_becomes_one_closed_manifold_without_holes_of_its_radius() {
             assert_relative_eq!(vertex.length(), 3.0, epsilon = 0.1 * cell_m);
             cosines.push(normal.dot(vertex.normalize()));
         }
-        // Single vertices between slivers lean by up to 20 degrees; half of all by less than 3.
+        // Normals between slivers are off by up to 20 degrees; the median is less than 3.
         let least = cosines.iter().copied().fold(1.0, f32::min);
         assert!(least > 0.9, "{depth} {least}");
         let typical = median(cosines);
@@ -46,7 +46,7 @@ fn a_sphere_becomes_one_closed_manifold_without_holes_of_its_radius() {
 }
 
 #[test]
-fn a_street_is_manifold_and_lies_within_a_fraction_of_its_noise() {
+fn a_street_is_manifold_and_its_error_is_a_fraction_of_the_noise() {
     let surface = reconstructed(&street(100_000, 0.02, 1), 8);
     let topology = Topology::of(&surface.mesh);
     assert!(topology.is_manifold(), "{topology:?}");
@@ -72,7 +72,7 @@ fn cells_of_different_size_meet_without_cracks() {
         let topology = Topology::of(&surface.mesh);
         assert!(topology.is_closed_manifold(), "{depth} {topology:?}");
         assert_eq!(topology.euler, 2);
-        // The sparse half has larger triangles: it was not divided as far.
+        // The sparse half has larger triangles because its cells are larger.
         let upper = surface.mesh.vertices.iter().filter(|v| v.z > 0.0).count();
         assert!(surface.mesh.vertices.len() - upper < upper / 2);
         for vertex in &surface.mesh.vertices {
@@ -82,7 +82,7 @@ fn cells_of_different_size_meet_without_cracks() {
 }
 
 #[test]
-fn densities_grow_by_one_where_there_are_four_times_the_points() {
+fn the_density_increases_by_one_with_four_times_the_points() {
     let density = |count| median(reconstructed(&sphere(3.0, count), 6).densities);
     assert_relative_eq!(density(40_000) - density(10_000), 1.0, epsilon = 0.05);
     // The area of a cell's face at that depth holds `samples_per_node` points.
@@ -141,7 +141,7 @@ fn a_rotated_street_gives_the_rotated_surface_within_a_tenth_of_a_cell() {
 }
 
 #[test]
-fn one_thread_and_two_give_the_same_bytes() {
+fn the_result_does_not_depend_on_the_number_of_threads() {
     let cloud = street(30_000, 0.02, 4);
     let with_threads = |count: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(count).build();
@@ -152,7 +152,7 @@ fn one_thread_and_two_give_the_same_bytes() {
 }
 
 #[test]
-fn a_weight_of_two_is_the_point_twice() {
+fn a_weight_of_two_equals_a_duplicated_point() {
     let once = sphere(2.0, 5_000);
     let mut twice = once.clone();
     twice.append(once.clone());
@@ -165,7 +165,7 @@ fn a_weight_of_two_is_the_point_twice() {
 }
 
 #[test]
-fn points_that_are_no_points_are_left_out_and_counted() {
+fn invalid_points_are_ignored_and_counted() {
     let clean = sphere(2.0, 5_000);
     let mut dirty = clean.clone();
     dirty.push(Vec3::new(f32::NAN, 0.0, 0.0), Vec3::X, 0.0);
@@ -178,7 +178,7 @@ fn points_that_are_no_points_are_left_out_and_counted() {
 }
 
 #[test]
-fn too_little_to_mesh_and_wrong_settings_are_errors_that_say_so() {
+fn too_few_points_and_invalid_settings_are_errors() {
     let error = |cloud: &PointCloud, depth| reconstruct(cloud, None, &at_depth(depth)).unwrap_err();
     let nothing = error(&PointCloud::default(), 8).to_string();
     assert!(nothing.contains("only 0 of 0 points"), "{nothing}");

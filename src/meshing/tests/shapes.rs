@@ -1,4 +1,4 @@
-//! Oriented points on known surfaces, and questions that tests ask of meshes.
+//! Oriented points on known surfaces, and the topology of meshes.
 
 use std::collections::BTreeMap;
 
@@ -6,6 +6,7 @@ use glam::Vec3;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 use rand_distr::{Distribution, StandardNormal};
 
+use super::super::adjacency::chain_start;
 use crate::geometry::{PointCloud, TriangleMesh};
 
 /// Points all over a sphere around the origin, normals outwards.
@@ -45,21 +46,21 @@ pub fn street(count: usize, noise_m: f32, seed: u64) -> PointCloud {
     cloud
 }
 
-/// How the triangles of a mesh hang together.
+/// Topology of a mesh.
 #[derive(Debug, PartialEq)]
 pub struct Topology {
-    /// Edges with one triangle.
+    /// Number of edges with one triangle.
     pub open_edges: usize,
-    /// Edges with more than two triangles, or with two that run through it the same way.
+    /// Number of edges with more than two triangles or inconsistent orientation.
     pub bad_edges: usize,
-    /// Vertices whose triangles do not form one fan.
+    /// Number of vertices whose triangles do not form one fan.
     pub bad_vertices: usize,
-    /// Vertices − edges + triangles.
+    /// Euler characteristic: vertices − edges + triangles.
     pub euler: i64,
 }
 
 impl Topology {
-    /// Counts the edges and fans of a mesh.
+    /// The topology of a mesh.
     pub fn of(mesh: &TriangleMesh) -> Self {
         let mut edges: BTreeMap<(u32, u32), [u32; 2]> = BTreeMap::new();
         let mut links: Vec<Vec<(u32, u32)>> = vec![Vec::new(); mesh.vertices.len()];
@@ -78,12 +79,12 @@ impl Topology {
         }
     }
 
-    /// Closed, and every point of it looks like a piece of a plane.
+    /// Whether the mesh is a manifold without boundary.
     pub fn is_closed_manifold(&self) -> bool {
         self.open_edges == 0 && self.is_manifold()
     }
 
-    /// Every point of it looks like a piece of a plane or of its border.
+    /// Whether the mesh is a manifold, with or without boundary.
     pub fn is_manifold(&self) -> bool {
         self.bad_edges == 0 && self.bad_vertices == 0
     }
@@ -91,13 +92,9 @@ impl Topology {
 
 /// Whether the edges opposite to a vertex form one chain or one ring.
 fn is_one_fan(link: &[(u32, u32)]) -> bool {
-    let Some(&first) = link.first() else {
+    let Some(start) = chain_start(link).or(link.first().copied()) else {
         return false;
     };
-    let start = link
-        .iter()
-        .find(|(from, _)| link.iter().all(|(_, to)| to != from))
-        .unwrap_or(&first);
     let (mut reached, mut end) = (1, start.1);
     while end != start.0 && reached <= link.len() {
         match link.iter().find(|(from, _)| *from == end) {

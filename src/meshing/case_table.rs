@@ -1,23 +1,31 @@
-//! How the surface passes through a cubic cell, for each of the 256 ways its corners can lie.
+//! The case table of marching cubes: the triangles of a cell for each of the 256 sign patterns of its
+//! corners.
 //!
-//! On every face the corners behind the surface are cut off one run at a time, which two cells that
-//! share the face do alike; the segments of the six faces close to loops, and the loops become
-//! triangles. A diagonal never joins two points of one face: there a neighbour could draw the
-//! same edge again, and four triangles would share it. Lorensen and Cline, *Marching Cubes*
-//! (1987), with the tables made, not copied.
+//! On every face, each run of corners behind the surface is separated by one segment, a rule that gives
+//! both cells at a face the same segments. The segments of the six faces form closed loops, which are
+//! triangulated. A diagonal never joins two vertices of one face: the neighboring cell could have the
+//! same edge, and four triangles would share it. Lorensen and Cline, *Marching Cubes* (1987), with
+//! generated tables.
 
 use std::sync::OnceLock;
 
-/// The triangles of one case, over edges 0 to 11 and, from 12 on, middles of loops.
+/// The triangles of one case; vertices are on edges 0 to 11 or, from 12 on, centers of loops.
 #[derive(Clone, Debug, Default)]
 pub struct CellCase {
-    /// Corners of the triangles, counter-clockwise seen from the front.
+    /// Vertices of the triangles, counter-clockwise seen from the front.
     pub triangles: Vec<[u8; 3]>,
-    /// The loops that need a point in their middle; the first is point 12.
-    pub middles: Vec<Vec<u8>>,
+    /// The loops that need a center; that of the first is vertex 12.
+    pub centers: Vec<Vec<u8>>,
 }
 
-/// The case of the corners in front of the surface, as bits, corner `x + 2y + 4z`.
+/// Bits of the corners in front of the surface, corner `x + 2y + 4z`.
+pub fn corner_signs(in_front: [bool; 8]) -> u8 {
+    (0..8).fold(0, |bits, corner| {
+        bits | u8::from(in_front[corner]) << corner
+    })
+}
+
+/// The case of the bits of the corners in front of the surface.
 pub fn cell_case(in_front: u8) -> &'static CellCase {
     static CASES: OnceLock<Vec<CellCase>> = OnceLock::new();
     let cases = CASES.get_or_init(|| (0..=255).map(triangulate).collect());
@@ -62,8 +70,8 @@ pub fn face_edges(axis: usize, side: usize) -> [([usize; 3], usize); 4] {
     ]
 }
 
-/// Pairs of face edges that a segment joins, with what is behind the surface on the left, seen
-/// from the end of the axis.
+/// Pairs of face edges joined by a segment; seen from the end of the axis, the left side is behind the
+/// surface.
 pub fn face_segments(in_front: [bool; 4]) -> impl Iterator<Item = (usize, usize)> {
     (0..4)
         .filter(move |&i| !in_front[i] && in_front[(i + 1) % 4])
@@ -75,8 +83,8 @@ pub fn face_segments(in_front: [bool; 4]) -> impl Iterator<Item = (usize, usize)
         })
 }
 
-/// Joins segments end to start; the loops come in the order of their first segments.
-pub fn close_loops<P: Copy>(mut segments: Vec<(P, P)>, same: impl Fn(P, P) -> bool) -> Vec<Vec<P>> {
+/// Joins segments to closed loops, in the order of their first segments.
+pub fn join_loops<P: Copy>(mut segments: Vec<(P, P)>, same: impl Fn(P, P) -> bool) -> Vec<Vec<P>> {
     let mut loops = Vec::new();
     while !segments.is_empty() {
         let (start, mut end) = segments.remove(0);
@@ -100,33 +108,32 @@ fn triangulate(in_front: u8) -> CellCase {
             let signs =
                 face_corners(axis, side).map(|[x, y, z]| in_front >> (x + 2 * y + 4 * z) & 1 == 1);
             let edges = face_edges(axis, side).map(|(corner, axis)| edge_id(corner, axis));
-            for (from, to) in face_segments(signs) {
-                let (from, to) = (edges[from], edges[to]);
-                segments.push(if side == 0 { (from, to) } else { (to, from) });
-            }
+            segments.extend(face_segments(signs).map(|(from, to)| match side {
+                0 => (edges[from], edges[to]),
+                _ => (edges[to], edges[from]),
+            }));
         }
     }
     let mut case = CellCase::default();
-    for points in close_loops(segments, |a, b| a == b) {
-        let count = points.len();
-        let fan = (0..count).find(|&apex| {
-            (2..count - 1).all(|step| !share_face(points[apex], points[(apex + step) % count]))
-        });
-        if let Some(apex) = fan {
-            let at = |step: usize| points[(apex + step) % count];
-            case.triangles
-                .extend((1..count - 1).map(|step| [at(0), at(step), at(step + 1)]));
+    for polygon in join_loops(segments, |a, b| a == b) {
+        let count = polygon.len();
+        let at = |apex: usize, step: usize| polygon[(apex + step) % count];
+        let apex = (0..count)
+            .find(|&apex| (2..count - 1).all(|step| !share_face(polygon[apex], at(apex, step))));
+        if let Some(apex) = apex {
+            let steps = 1..count - 1;
+            (case.triangles)
+                .extend(steps.map(|step| [polygon[apex], at(apex, step), at(apex, step + 1)]));
         } else {
-            let middle = (12 + case.middles.len()) as u8;
-            case.triangles
-                .extend((0..count).map(|i| [points[i], points[(i + 1) % count], middle]));
-            case.middles.push(points);
+            let center = (12 + case.centers.len()) as u8;
+            (case.triangles).extend((0..count).map(|i| [polygon[i], at(i, 1), center]));
+            case.centers.push(polygon);
         }
     }
     case
 }
 
-/// Whether two edges of a cell lie on one face.
+/// Whether two edges of a cell are on one face.
 fn share_face(a: u8, b: u8) -> bool {
     let ((corner_a, axis_a), (corner_b, axis_b)) = (edge(a.into()), edge(b.into()));
     (0..3).any(|axis| axis != axis_a && axis != axis_b && corner_a[axis] == corner_b[axis])
@@ -137,7 +144,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_corner_behind_the_surface_is_cut_off_by_one_triangle_that_faces_away_from_it() {
+    fn one_corner_behind_the_surface_gives_one_triangle_that_faces_away_from_it() {
         let case = cell_case(0b1111_1110);
         assert_eq!(case.triangles.len(), 1);
         let [a, b, c] = case.triangles[0].map(|id| {
@@ -150,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn every_edge_with_a_change_of_sign_is_used_and_no_other() {
+    fn exactly_the_edges_with_a_sign_change_are_used() {
         for in_front in 0..=255_u8 {
             let mut used = [false; 12];
             for id in cell_case(in_front)

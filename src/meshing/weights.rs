@@ -1,0 +1,85 @@
+//! Weights of the samples in the two terms of the screened Poisson energy.
+
+use super::stencil::{interpolate, trilinear};
+
+/// Surface area and screening weight of each sample.
+pub struct SampleWeights<'a> {
+    /// Depth at which a cell face holds `samples_per_node` samples, per sample.
+    pub depths: &'a [f32],
+    /// Number of points that each sample represents.
+    pub weights: &'a [f32],
+    /// Number of samples per cell face at a sample's depth.
+    pub samples_per_node: f32,
+    /// Screening weight α.
+    pub point_weight: f32,
+}
+
+impl SampleWeights<'_> {
+    /// Surface area of a sample in cell faces of a depth.
+    #[inline]
+    pub fn area(&self, sample: usize, depth: u32) -> f32 {
+        self.weights[sample] * (2.0 * (depth as f32 - self.depths[sample])).exp2()
+            / self.samples_per_node
+    }
+
+    /// Weight of a sample in the screening term; it does not increase below the sample's depth.
+    #[inline]
+    pub fn screening(&self, sample: usize, depth: u32) -> f32 {
+        let finer = (depth as f32 - self.depths[sample]).min(0.0);
+        self.point_weight * self.weights[sample] * (2.0 * finer).exp2() / self.samples_per_node
+    }
+
+    /// Fraction of a sample's normal that is splatted at this depth or finer.
+    #[inline]
+    pub fn fraction_from(&self, sample: usize, depth: u32) -> f32 {
+        (self.depths[sample] - depth as f32 + 1.0).clamp(0.0, 1.0)
+    }
+}
+
+/// Weighted sum of sample positions in a cell, and the sum of their weights.
+#[derive(Clone, Copy, Default)]
+pub struct ConstraintSum([f32; 4]);
+
+impl ConstraintSum {
+    /// Adds a sample at a position 0 to 1 in the cell.
+    #[inline]
+    pub fn add(&mut self, weight: f32, inside: [f32; 3]) {
+        for axis in 0..3 {
+            self.0[axis] += weight * inside[axis];
+        }
+        self.0[3] += weight;
+    }
+
+    /// The constraint of a cell by the index of its lowest corner; `None` without weight.
+    pub fn constraint(&self, corner: usize) -> Option<PointConstraint> {
+        let [x, y, z, weight] = self.0;
+        (weight > 0.0).then(|| PointConstraint {
+            corner: corner as u32,
+            weight,
+            inside: [x, y, z].map(|sum| (sum / weight).clamp(0.0, 1.0)),
+        })
+    }
+}
+
+/// Screening term of one cell: its samples, merged at their weighted mean, pull the solution to 0.
+pub struct PointConstraint {
+    /// Index of the lowest corner of the cell.
+    pub corner: u32,
+    /// Sum of the screening weights.
+    pub weight: f32,
+    /// Mean position in the cell, 0 to 1 per axis.
+    pub inside: [f32; 3],
+}
+
+impl PointConstraint {
+    /// Adds w φ φᵀ u to `out`; `offsets` are those of a cell's corners.
+    #[inline]
+    pub fn apply(&self, u: &[f32], offsets: &[usize; 8], out: &mut [f32]) {
+        let corner = self.corner as usize;
+        let shape = trilinear(self.inside);
+        let value = self.weight * interpolate(u, corner, offsets, &shape);
+        for i in 0..8 {
+            out[corner + offsets[i]] += value * shape[i];
+        }
+    }
+}
