@@ -3,11 +3,11 @@
 //! ```text
 //! cargo bench --bench poisson                                      times, all sizes
 //! FPMCL_POISSON=1000000,9 RAYON_NUM_THREADS=2 cargo bench --bench poisson
-//!                                                                  once: seconds, peak memory, error, coverage
-//! FPMCL_POISSON_PLY=/tmp/street cargo bench --bench poisson        writes the clouds as /tmp/street_N.ply
+//!                                                                  one run: time, peak memory, error, coverage
+//! FPMCL_POISSON_PLY=/tmp/street cargo bench --bench poisson        writes the clouds to /tmp/street_N.ply
 //! ```
 //!
-//! Open3D 0.20 on the very same points:
+//! Open3D 0.20 on the same points:
 //!
 //! ```text
 //! import sys, time, resource, open3d as o3d
@@ -17,13 +17,13 @@
 //!     cloud, depth=int(sys.argv[2]), scale=1.1, linear_fit=False, n_threads=2)
 //! print(time.time() - wall, time.process_time() - cpu,
 //!       resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, "MB", len(mesh.triangles))
-//! o3d.io.write_triangle_mesh(sys.argv[3], mesh)                    # FPMCL_POISSON_MESH=... judges it
+//! o3d.io.write_triangle_mesh(sys.argv[3], mesh)                    # evaluated by FPMCL_POISSON_MESH=...
 //! ```
 
 #![expect(
     clippy::unwrap_used,
     clippy::print_stdout,
-    reason = "a bench stops at the first error and prints what it measured"
+    reason = "a bench stops at the first error and prints its measurements"
 )]
 
 use std::io::{BufWriter, Write};
@@ -53,7 +53,7 @@ fn main() {
         let (count, depth) = job.split_once(',').expect("FPMCL_POISSON=points,depth");
         run_once(count.parse().unwrap(), depth.parse().unwrap());
     } else if let Ok(path) = std::env::var("FPMCL_POISSON_MESH") {
-        judge(&read_ply(&path));
+        evaluate(&read_ply(&path));
     } else {
         divan::main();
     }
@@ -75,7 +75,7 @@ fn depth_9(bencher: divan::Bencher<'_, '_>, count: usize) {
     bencher.bench_local(|| reconstruct(&cloud, None, &PoissonConfig::default()).unwrap());
 }
 
-/// A rectangle of the street: corner, two edges, normal.
+/// A rectangle of the street: corner and two edges.
 struct Panel(Vec3, Vec3, Vec3);
 
 impl Panel {
@@ -125,20 +125,20 @@ fn panels() -> Vec<Panel> {
             -45. + 12. * car as f32,
             if car % 2 == 0 { 3.5 } else { -5.3 },
         );
-        boxed(&mut all, v(x, y, 0.0), v(4.2, 1.8, 1.5));
+        add_box(&mut all, v(x, y, 0.0), v(4.2, 1.8, 1.5));
     }
     for pole in 0..12 {
         let (x, y) = (
             -47. + 8. * pole as f32,
             if pole % 2 == 0 { 6.8 } else { -7.2 },
         );
-        boxed(&mut all, v(x, y, 0.12), v(0.3, 0.3, 5.));
+        add_box(&mut all, v(x, y, 0.12), v(0.3, 0.3, 5.));
     }
     all
 }
 
 /// The four sides and the top of a box, normals outwards.
-fn boxed(all: &mut Vec<Panel>, low: Vec3, size: Vec3) {
+fn add_box(all: &mut Vec<Panel>, low: Vec3, size: Vec3) {
     let (x, y, z) = (Vec3::X * size.x, Vec3::Y * size.y, Vec3::Z * size.z);
     all.push(Panel(low, x, z));
     all.push(Panel(low + x, y, z));
@@ -147,8 +147,8 @@ fn boxed(all: &mut Vec<Panel>, low: Vec3, size: Vec3) {
     all.push(Panel(low + z, x, y));
 }
 
-/// Points evenly over all panels, and the panel of each.
-fn on_panels(count: usize, rng: &mut StdRng) -> Vec<(Vec3, Vec3)> {
+/// Points distributed uniformly over all panels, with normals.
+fn sample_panels(count: usize, rng: &mut StdRng) -> Vec<(Vec3, Vec3)> {
     let panels = panels();
     let areas: Vec<f32> = panels.iter().map(Panel::area).collect();
     let chooser = rand::distr::weighted::WeightedIndex::new(&areas).unwrap();
@@ -163,7 +163,7 @@ fn on_panels(count: usize, rng: &mut StdRng) -> Vec<(Vec3, Vec3)> {
 fn noisy_street(count: usize) -> PointCloud {
     let mut rng = StdRng::seed_from_u64(count as u64);
     let mut cloud = PointCloud::with_capacity(count);
-    for (point, normal) in on_panels(count, &mut rng) {
+    for (point, normal) in sample_panels(count, &mut rng) {
         let mut gauss = || -> f32 { StandardNormal.sample(&mut rng) };
         let noise = NOISE_M * Vec3::new(gauss(), gauss(), gauss());
         let tilt = 0.05 * Vec3::new(gauss(), gauss(), gauss());
@@ -193,7 +193,7 @@ fn run_once(count: usize, depth: u32) {
         peak_mb(),
         surface.mesh.triangles.len()
     );
-    judge(&surface.mesh);
+    evaluate(&surface.mesh);
     if let Ok(path) = std::env::var("FPMCL_POISSON_OUT") {
         write_ply(&path, &surface.mesh.vertices, &surface.mesh.normals).unwrap();
     }
@@ -206,8 +206,9 @@ fn setting<T: std::str::FromStr>(name: &str, default: T) -> T {
         .unwrap_or(default)
 }
 
-/// Error: distance of the vertices near the truth to it. Coverage: share of the truth within 0.1 m of a mesh.
-fn judge(mesh: &TriangleMesh) {
+/// Prints the error, the distance of the vertices to the true surface, and the coverage, the share of the
+/// true surface within 0.1 m of the mesh.
+fn evaluate(mesh: &TriangleMesh) {
     let panels = panels();
     let step = (mesh.vertices.len() / 200_000).max(1);
     let mut errors: Vec<f32> = (mesh.vertices.iter().step_by(step))
@@ -218,17 +219,17 @@ fn judge(mesh: &TriangleMesh) {
         .filter(|&error| error < 0.5)
         .collect();
     errors.sort_by(f32::total_cmp);
-    let truth = on_panels(100_000, &mut StdRng::seed_from_u64(9));
+    let truth = sample_panels(100_000, &mut StdRng::seed_from_u64(9));
     let reached = covered(mesh, &truth, 0.1);
     println!(
-        "median error {:.1} mm, 90 % within {:.1} mm; {:.2} % of the truth within 0.1 m",
+        "median error {:.1} mm, 90 % within {:.1} mm; {:.2} % of the true surface within 0.1 m",
         1e3 * errors[errors.len() / 2],
         1e3 * errors[errors.len() * 9 / 10],
         100.0 * reached as f64 / truth.len() as f64
     );
 }
 
-/// How many points have a triangle within a distance.
+/// Number of points with a triangle within a distance.
 fn covered(mesh: &TriangleMesh, points: &[(Vec3, Vec3)], reach_m: f32) -> usize {
     const CELL_M: f32 = 0.4;
     let cell = |point: Vec3| (point / CELL_M).floor().as_ivec3();
@@ -251,13 +252,14 @@ fn covered(mesh: &TriangleMesh, points: &[(Vec3, Vec3)], reach_m: f32) -> usize 
     }
     let is_near = |point: Vec3| {
         triangles.get(&cell(point)).is_some_and(|near| {
-            (near.iter()).any(|&index| to_triangle(point, mesh.corners(index as usize)) < reach_m)
+            (near.iter())
+                .any(|&index| distance_to_triangle(point, mesh.corners(index as usize)) < reach_m)
         })
     };
     points.iter().filter(|(point, _)| is_near(*point)).count()
 }
 
-fn to_triangle(p: Vec3, [a, b, c]: [Vec3; 3]) -> f32 {
+fn distance_to_triangle(p: Vec3, [a, b, c]: [Vec3; 3]) -> f32 {
     let normal = (b - a).cross(c - a).normalize_or_zero();
     let inside = [(a, b), (b, c), (c, a)]
         .iter()
@@ -292,7 +294,7 @@ fn write_ply(path: &str, points: &[Vec3], normals: &[Vec3]) -> std::io::Result<(
     out.flush()
 }
 
-/// Reads the mesh as Open3D writes it: doubles x y z nx ny nz, then lists of three.
+/// Reads a mesh in Open3D's layout: doubles x y z nx ny nz, then lists of three indices.
 fn read_ply(path: &str) -> TriangleMesh {
     let bytes = std::fs::read(path).unwrap();
     let end = bytes

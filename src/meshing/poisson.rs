@@ -195,7 +195,7 @@ fn in_cloud_frame(surface: UnitMesh, samples: &Samples, density: &DensityField) 
         .map(|&vertex| density.depth_at(vertex))
         .collect();
     let mut mesh = TriangleMesh {
-        vertices: vertices.map(|&v| samples.domain.to_cloud(v)).collect(),
+        vertices: vertices.map(|&v| samples.to_cloud(v)).collect(),
         triangles: surface.triangles,
         ..TriangleMesh::default()
     };

@@ -7,22 +7,6 @@ use super::error::MeshingError;
 use super::morton;
 use crate::geometry::{Aabb, PointCloud};
 
-/// The cube of the reconstruction in the frame of the cloud.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Domain {
-    /// Lower corner [m].
-    pub origin: Vec3,
-    /// Edge length [m].
-    pub side_m: f32,
-}
-
-impl Domain {
-    /// Transforms a point from the unit cube to the frame of the cloud [m].
-    pub fn to_cloud(self, unit: [f32; 3]) -> Vec3 {
-        self.origin + self.side_m * Vec3::from(unit)
-    }
-}
-
 /// Points in the unit cube, sorted by the Morton codes of their cells.
 pub struct Samples {
     /// Depth of the cells of the codes.
@@ -35,8 +19,10 @@ pub struct Samples {
     pub normals: Vec<[f32; 3]>,
     /// Number of points that each sample represents.
     pub weights: Vec<f32>,
-    /// Position and size of the cube.
-    pub domain: Domain,
+    /// Lower corner of the cube in the frame of the cloud [m].
+    origin: Vec3,
+    /// Edge length of the cube [m].
+    side_m: f32,
     /// Number of points ignored: not finite, without a normal, or without weight.
     pub dropped: usize,
 }
@@ -77,11 +63,8 @@ impl Samples {
             });
         }
         let side_m = scale * extent_m;
-        let domain = Domain {
-            origin: bounds.center() - Vec3::splat(0.5 * side_m),
-            side_m,
-        };
-        let unit = |index: u32| (at(index) - domain.origin) / side_m;
+        let origin = bounds.center() - Vec3::splat(0.5 * side_m);
+        let unit = |index: u32| (at(index) - origin) / side_m;
         let cells = (1_u32 << depth) as f32;
         let mut order: Vec<(u64, u32)> = usable
             .par_iter()
@@ -100,7 +83,8 @@ impl Samples {
                 .map(|index| cloud.normals[index as usize].normalize().to_array())
                 .collect(),
             weights: indices().map(|index| weight(index as usize)).collect(),
-            domain,
+            origin,
+            side_m,
             dropped: cloud.len() - usable.len(),
         })
     }
@@ -108,6 +92,11 @@ impl Samples {
     /// Number of points.
     pub fn len(&self) -> usize {
         self.codes.len()
+    }
+
+    /// Transforms a point from the unit cube to the frame of the cloud [m].
+    pub fn to_cloud(&self, unit: [f32; 3]) -> Vec3 {
+        self.origin + self.side_m * Vec3::from(unit)
     }
 
     /// The cell of a point at a depth, and the position in the cell, 0 to 1 per axis.

@@ -181,29 +181,13 @@ pub fn divergence(field: &[PaddedValues; 3]) -> OwnValues {
 ///
 /// One axis after the other, so that nodes which share a corner get identical bits.
 pub fn prolong_corners(parent: &CornerValues, octant: usize) -> CornerValues {
-    let start = octant_start(octant);
-    let mut along_x = [0.0_f32; 45];
-    for row in 0..9 {
-        let first = corner_index([start[0], start[1] + row % 3, start[2] + row / 3]);
-        for x in 0..5 {
-            along_x[x + 5 * row] = midpoint(x, |i| parent[first + i]);
-        }
-    }
-    let mut along_y = [0.0_f32; 75];
-    for z in 0..3 {
-        for y in 0..5 {
-            for x in 0..5 {
-                along_y[x + 5 * y + 25 * z] = midpoint(y, |i| along_x[x + 5 * i + 15 * z]);
-            }
-        }
-    }
-    let mut out = [0.0_f32; CORNERS];
-    for z in 0..5 {
-        for i in 0..25 {
-            out[i + 25 * z] = midpoint(z, |j| along_y[i + 25 * j]);
-        }
-    }
-    out
+    let first = corner_index(octant_start(octant));
+    std::array::from_fn(|i| {
+        let coarse = |x: usize, y: usize, z: usize| parent[first + corner_index([x, y, z])];
+        let along_x = |y: usize, z: usize| midpoint(i % 5, |x| coarse(x, y, z));
+        let along_y = |z: usize| midpoint(i / 5 % 5, |y| along_x(y, z));
+        midpoint(i / 25, along_y)
+    })
 }
 
 /// The first corner of an octant among the corners of its parent.
@@ -223,26 +207,18 @@ fn midpoint(index: usize, coarse: impl Fn(usize) -> f32) -> f32 {
 
 /// Prolongation: padded values of a child from those of its parent.
 pub fn prolong_padded(parent: &PaddedValues, octant: usize) -> PaddedValues {
-    let start = octant_start(octant);
+    let [start_x, start_y, start_z] = octant_start(octant);
     // Fine indices -1 to 4 are at coarse positions -1/2 to 2 after the start of the octant.
     let ends = |index: usize| (index.div_ceil(2), index / 2 + 1);
-    let mut out = [0.0; PADDED];
-    for z in 0..6 {
-        let (z0, z1) = ends(z);
-        for y in 0..6 {
-            let (y0, y1) = ends(y);
-            let at = |x: usize, y: usize, z: usize| {
-                parent[(start[0] + x) + 6 * (start[1] + y) + 36 * (start[2] + z)]
-            };
-            let mut row = [0.0_f32; 4];
-            for (x, value) in row.iter_mut().enumerate() {
-                *value = 0.25 * ((at(x, y0, z0) + at(x, y1, z0)) + (at(x, y0, z1) + at(x, y1, z1)));
-            }
-            for x in 0..6 {
-                let (x0, x1) = ends(x);
-                out[x + 6 * y + 36 * z] = 0.5 * (row[x0] + row[x1]);
-            }
-        }
-    }
-    out
+    std::array::from_fn(|i| {
+        let ((x0, x1), (y0, y1), (z0, z1)) = (ends(i % 6), ends(i / 6 % 6), ends(i / 36));
+        let coarse = |x: usize, y: usize, z: usize| {
+            parent[(start_x + x) + 6 * (start_y + y) + 36 * (start_z + z)]
+        };
+        let along_yz = |x: usize| {
+            let low = coarse(x, y0, z0) + coarse(x, y1, z0);
+            0.25 * (low + (coarse(x, y0, z1) + coarse(x, y1, z1)))
+        };
+        0.5 * (along_yz(x0) + along_yz(x1))
+    })
 }

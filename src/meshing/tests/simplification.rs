@@ -1,4 +1,4 @@
-//! Laws of the simplified ground.
+//! Laws of the simplification.
 
 use std::collections::BTreeSet;
 
@@ -8,7 +8,7 @@ use super::super::{PoissonConfig, reconstruct, simplify_ground};
 use super::shapes::{Topology, street};
 use crate::geometry::{Aabb, TriangleMesh};
 
-/// A square of 20 m over `height`, its cells as wide as 20 m over their number.
+/// A square of 20 m with heights `height` and a number of cells per side.
 fn square(cells: u32, height: impl Fn(f32, f32) -> f32) -> TriangleMesh {
     let side = cells + 1;
     let mut mesh = TriangleMesh::default();
@@ -25,7 +25,7 @@ fn square(cells: u32, height: impl Fn(f32, f32) -> f32) -> TriangleMesh {
     mesh
 }
 
-/// A field with a crown of 10 cm and ripples of 5 mm, and a step to a platform that is no ground.
+/// A field with a crown of 10 cm, ripples of 5 mm and a step to a platform that is not ground.
 fn field(cells: u32) -> (TriangleMesh, Vec<bool>) {
     let mesh = square(cells, |x, y| {
         let step = if y > 15.0 { 0.5 } else { 0.0 };
@@ -37,7 +37,7 @@ fn field(cells: u32) -> (TriangleMesh, Vec<bool>) {
     (mesh, is_ground)
 }
 
-/// The surface that is reconstructed from a street with a centimetre of noise, and its ground.
+/// The reconstruction of a street with 1 cm of noise, and its ground.
 fn noisy_street() -> (TriangleMesh, Vec<bool>) {
     let config = PoissonConfig {
         depth: 8,
@@ -102,7 +102,7 @@ fn other_triangles_and_the_topology_are_unchanged() {
     }
 }
 
-/// A level piece of ground with a wavy and a zigzag outline.
+/// Level ground with wavy and zigzag boundaries.
 fn island() -> TriangleMesh {
     let mut mesh = square(100, |_, _| 0.0);
     for vertex in &mut mesh.vertices {
@@ -133,7 +133,7 @@ fn an_almost_straight_boundary_is_simplified_within_its_tolerance() {
     let simple = simplify_ground(&mesh, &all, &[], 1.0, 0);
     let [before, after] = [&mesh, &simple].map(Topology::of);
     assert_eq!((before.open_edges, before.euler), (400, 1));
-    // The teeth of 10 cm stay, the other three sides keep a third of their vertices at most.
+    // The teeth of 10 cm remain; the other sides keep at most a third of their vertices.
     assert!((100..200).contains(&after.open_edges), "{after:?}");
     assert!(after.is_manifold());
     let (old, new) = (SurfaceIndex::new(&mesh), SurfaceIndex::new(&simple));
@@ -152,12 +152,17 @@ fn an_almost_straight_boundary_is_simplified_within_its_tolerance() {
 fn fixed_vertices_remain_on_the_boundary_and_inside() {
     let mesh = island();
     let all = vec![true; mesh.triangles.len()];
-    let held: Vec<bool> = mesh.vertices.iter().map(|vertex| vertex.y < 3.0).collect();
-    let simple = simplify_ground(&mesh, &all, &held, 1.0, 3);
+    let fixed: Vec<bool> = mesh.vertices.iter().map(|vertex| vertex.y < 3.0).collect();
+    let simple = simplify_ground(&mesh, &all, &fixed, 1.0, 3);
     let left: BTreeSet<_> = (simple.vertices.iter())
         .map(|vertex| vertex.to_array().map(f32::to_bits))
         .collect();
-    for (vertex, _) in mesh.vertices.iter().zip(&held).filter(|(_, held)| **held) {
+    for (vertex, _) in mesh
+        .vertices
+        .iter()
+        .zip(&fixed)
+        .filter(|(_, fixed)| **fixed)
+    {
         assert!(
             left.contains(&vertex.to_array().map(f32::to_bits)),
             "{vertex}"
@@ -258,11 +263,11 @@ fn without_ground_nothing_changes() {
     );
 }
 
-/// Distances to a mesh that lies mostly level.
+/// Distances to an approximately level mesh.
 struct SurfaceIndex<'a> {
     mesh: &'a TriangleMesh,
     bounds: Aabb,
-    /// The triangles over each square metre, row by row.
+    /// The triangles over each square meter, row-major.
     cells: Vec<Vec<usize>>,
     columns: usize,
 }
@@ -290,33 +295,33 @@ impl<'a> SurfaceIndex<'a> {
         surface
     }
 
-    fn cell(&self, place: Vec3) -> (usize, usize) {
-        let place = place - self.bounds.min;
-        (place.x as usize, place.y as usize)
+    fn cell(&self, point: Vec3) -> (usize, usize) {
+        let point = point - self.bounds.min;
+        (point.x as usize, point.y as usize)
     }
 
-    /// Distance to the nearest triangle over the same square metre: never less than the true one.
-    fn distance_m(&self, place: Vec3) -> f32 {
-        let (column, row) = self.cell(place);
+    /// Distance to the nearest triangle over the same square meter, an upper bound of the true one.
+    fn distance_m(&self, point: Vec3) -> f32 {
+        let (column, row) = self.cell(point);
         (self.cells[row * self.columns + column].iter())
-            .map(|&triangle| distance_m(place, self.mesh.corners(triangle)))
+            .map(|&triangle| distance_m(point, self.mesh.corners(triangle)))
             .fold(f32::INFINITY, f32::min)
     }
 }
 
-/// Distance to a triangle: to its plane if the foot is inside, otherwise to its edges.
-fn distance_m(place: Vec3, corners: [Vec3; 3]) -> f32 {
+/// Distance to a triangle: to its plane if the projection is inside, otherwise to its edges.
+fn distance_m(point: Vec3, corners: [Vec3; 3]) -> f32 {
     let [a, b, c] = corners;
     let normal = (b - a).cross(c - a).normalize_or_zero();
-    let is_left = |from: Vec3, to: Vec3| (to - from).cross(place - from).dot(normal) >= 0.0;
+    let is_left = |from: Vec3, to: Vec3| (to - from).cross(point - from).dot(normal) >= 0.0;
     if normal != Vec3::ZERO && is_left(a, b) && is_left(b, c) && is_left(c, a) {
-        return (place - a).dot(normal).abs();
+        return (point - a).dot(normal).abs();
     }
     [(a, b), (b, c), (c, a)]
         .map(|(from, to)| {
             let edge = to - from;
-            let share = (place - from).dot(edge) / edge.length_squared().max(1e-12);
-            place.distance(from + share.clamp(0.0, 1.0) * edge)
+            let share = (point - from).dot(edge) / edge.length_squared().max(1e-12);
+            point.distance(from + share.clamp(0.0, 1.0) * edge)
         })
         .into_iter()
         .fold(f32::INFINITY, f32::min)
