@@ -158,22 +158,12 @@ fn open_array<'a>(
     if header.order() == Order::Fortran && header.shape().len() > 1 {
         return Err(ArrayError::FortranOrder);
     }
+    let shape = header.shape().to_vec();
     let bytes = u128::from(element.size_field());
-    let needed = (header.shape().iter()).fold(bytes, |product, &extent| {
+    let needed = (shape.iter()).fold(bytes, |product, &extent| {
         product.saturating_mul(u128::from(extent))
     });
-    if needed != u128::from(entry.limit()) {
-        return Err(ArrayError::WrongSize {
-            shape: header.shape().to_vec(),
-            needed,
-            found: entry.limit(),
-        });
-    }
-    let shape = header
-        .shape()
-        .iter()
-        .map(|&extent| extent as usize)
-        .collect();
+    let found = entry.limit();
     let file = NpyFile::with_header(header, entry);
     let numbers = match (element.type_char(), element.size_field()) {
         (TypeChar::Float, 4) => numbers::<f32>(file, f64::from),
@@ -187,8 +177,16 @@ fn open_array<'a>(
                 found: file.dtype().descr(),
             });
         }
-    };
-    Ok((shape, numbers?))
+    }?;
+    if needed != u128::from(found) {
+        return Err(ArrayError::WrongSize {
+            shape,
+            needed,
+            found,
+        });
+    }
+    let shape = shape.into_iter().map(|extent| extent as usize).collect();
+    Ok((shape, numbers))
 }
 
 fn numbers<'a, T: Deserialize + 'a>(

@@ -177,6 +177,10 @@ fn read_particles(
     let mut array = npz.required("particles")?;
     array.expect_shape(&[None, None, Some(4)], "(frames, N, 4)")?;
     let (rows, capacity) = (array.shape[0], array.shape[1]);
+    if capacity == 0 {
+        // Any number of rows would need no data.
+        array.expect_shape(&[Some(0), None, None], "(frames, N, 4) with N > 0")?;
+    }
     if !(start_idx >= 0.0 && (start_idx as usize) < rows.max(1)) {
         return Err(ResultsError::StartBehindEnd {
             path: path.to_owned(),

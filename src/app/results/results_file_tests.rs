@@ -195,6 +195,10 @@ fn a_shape_without_data_is_an_error_and_is_not_allocated() {
         );
         assert!(message.contains("but there are 32"), "{message}");
     }
+    let options = SimpleFileOptions::default();
+    write_particles(&path, "<f4", &[1 << 60, 0, 4], &[], options);
+    let message = LocalizationResults::read(&path).unwrap_err().to_string();
+    assert!(message.contains("N > 0 is needed"), "{message}");
 }
 
 #[test]
