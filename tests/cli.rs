@@ -227,7 +227,7 @@ fn an_invalid_rule_is_reported_with_its_line_and_the_nearest_word() {
     let fuzzy = &ground[ground.find("\nfuzzy:").expect("it has the block")..];
     let fuzzy = &fuzzy[..fuzzy.find("\nransac:").unwrap_or(fuzzy.len())];
     for (command, text) in [("build-map", fuzzy), ("ground", ground.as_str())] {
-        for (right, wrong, key, told) in [
+        for (right, wrong, key, message) in [
             (
                 "raised AND height_variance IS high",
                 "raised AND hight_variance IS high",
@@ -261,7 +261,7 @@ fn an_invalid_rule_is_reported_with_its_line_and_the_nearest_word() {
             let path = folder.path().join("faulty.yml");
             std::fs::write(&path, faulty).expect("it is written");
             let place = format!("faulty.yml, line {line}: {key} is ");
-            fpmcl(command).with(path).fails_saying(&[&place, told]);
+            fpmcl(command).with(path).fails_saying(&[&place, message]);
         }
     }
 }

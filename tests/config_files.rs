@@ -76,7 +76,11 @@ fn explained_keys(name: &str, text: &str) -> BTreeSet<String> {
     let mut is_commented = false;
     for line in text.lines() {
         let Some(key) = key_of(line) else {
-            is_commented = line.trim_start().starts_with('#') || is_commented && !line.is_empty();
+            let is_comment = line.trim_start().starts_with('#');
+            is_commented = is_comment || is_commented && !line.is_empty();
+            if !is_comment {
+                keys.extend(keys_in_braces(line).map(str::to_owned));
+            }
             continue;
         };
         // A comment above explains the block or the keys of the same indentation below it.

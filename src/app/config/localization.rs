@@ -184,7 +184,7 @@ pub enum MotionModel {
 }
 
 impl Default for LocalizationConfig {
-    /// The values of range-mcl, whose map and recording are the same drive here.
+    /// The values of range-mcl.
     fn default() -> Self {
         let localizer = LocalizerConfig::default();
         let ransac = RansacGround::default();
