@@ -49,9 +49,9 @@ fn fans(triangles: &[[u32; 3]], corners: &[u32]) -> Vec<usize> {
         fans[start] = fan;
         open.push(start);
         while let Some(here) = open.pop() {
-            for next in 0..corners.len() {
-                if fans[next] == usize::MAX && is_beside(here, next) {
-                    fans[next] = fan;
+            for (next, of) in fans.iter_mut().enumerate() {
+                if *of == usize::MAX && is_beside(here, next) {
+                    *of = fan;
                     open.push(next);
                 }
             }
