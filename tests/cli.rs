@@ -238,7 +238,7 @@ fn an_invalid_rule_is_reported_with_its_line_and_the_nearest_word() {
                 "IF height IS above THEN",
                 "IF height above THEN",
                 "fuzzy.rules[13]",
-                "`above` where IS belongs",
+                "expected IS, found `above`",
             ),
             (
                 "{trapezoid: [-0.45, -0.15,",

@@ -140,11 +140,11 @@ fn written_labels_are_the_answer_that_was_judged() {
         .set("write_plys", "False")
         .succeeds()
         .stdout;
-    let mut score = fpmcl::ground::GroundScore::default();
+    let mut score = fpmcl::evaluation::GroundScore::default();
     for (number, scene) in scenes.iter().enumerate() {
         let answers = read_labels(&output.join(format!("labels/{number:06}.label"))).unwrap();
         for (index, answer) in answers.into_iter().enumerate() {
-            let protocol = fpmcl::ground::Protocol::PatchworkPlusPlus;
+            let protocol = fpmcl::evaluation::GroundProtocol::PatchworkPlusPlus;
             let z = scene.scan.points[index].z;
             if let Some(truth) = protocol.truth(scene.classes[index], z) {
                 score.add(answer == 40, truth);

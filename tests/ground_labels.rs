@@ -8,9 +8,9 @@
 
 use std::path::PathBuf;
 
+use fpmcl::evaluation::{GroundProtocol, GroundScore};
 use fpmcl::ground::{
-    FuzzyConfig, FuzzyGround, GroundClassifier, GroundScore, PcaGround, Protocol, RansacGround,
-    ReportRule,
+    FuzzyConfig, FuzzyGround, GroundClassifier, PcaGround, RansacGround, ReportRule,
 };
 use fpmcl::recording::velodyne::{read_labels, read_scan};
 
@@ -31,7 +31,7 @@ fn held_out_score(classifier: &dyn GroundClassifier) -> Option<GroundScore> {
         let classes = read_labels(&folder.join(format!("labels/{number:06}.label"))).unwrap();
         let confidences = classifier.ground_confidence(&scan.points);
         for ((point, class), confidence) in scan.points.iter().zip(classes).zip(confidences) {
-            if let Some(truth) = Protocol::PatchworkPlusPlus.truth(class, point.z) {
+            if let Some(truth) = GroundProtocol::PatchworkPlusPlus.truth(class, point.z) {
                 score.add(confidence > 0.5, truth);
             }
         }

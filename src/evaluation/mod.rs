@@ -4,6 +4,7 @@
 //! evaluation script. Everything here works on values; files are read and written elsewhere.
 
 pub mod convergence;
+mod ground_score;
 pub mod metrics;
 pub mod planar;
 pub mod pose_error;
@@ -12,6 +13,9 @@ pub mod smoothness;
 pub mod statistics;
 
 pub use convergence::{Convergence, StrictSuccess};
+pub use ground_score::{
+    GroundMethodReport, GroundProtocol, GroundScore, GroundScores, GroundTally, LabelledPoints,
+};
 pub use metrics::{EvaluatedTrajectory, MetricsConfig, MetricsError, TrajectoryMetrics};
 pub use planar::{PlanarError, distances_m, planar_errors};
 pub use pose_error::{Pairs, absolute_pose_error, kitti_segment_errors, relative_pose_error};

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::classifier::GroundClassifier;
 use super::fuzzy::{FuzzyConfig, FuzzyGround};
-use super::pca::PcaGround;
+use super::pca::{PcaGround, ReportRule};
 use super::ransac::RansacGround;
 use crate::validation::{InvalidValue, Validate, nested};
 
@@ -44,6 +44,51 @@ impl GroundConfig {
             GroundMethod::Pca => Box::new(self.pca),
             GroundMethod::Ransac => Box::new(self.ransac),
         })
+    }
+
+    /// Builds the classifiers of all methods with their names for tables: the configured one first.
+    pub fn all_classifiers(
+        &self,
+    ) -> Result<Vec<(&'static str, Box<dyn GroundClassifier>)>, InvalidValue> {
+        let three_features = FuzzyConfig::three_features();
+        let mut all: Vec<(&str, Box<dyn GroundClassifier>)> = vec![
+            ("fuzzy", Box::new(FuzzyGround::new(self.fuzzy.clone())?)),
+            (
+                "fuzzy, three features",
+                Box::new(FuzzyGround::new(three_features)?),
+            ),
+            ("PCA", Box::new(self.pca)),
+            ("RANSAC plane", Box::new(self.ransac)),
+            ("rule of the report", Box::new(ReportRule)),
+        ];
+        let configured = match self.method {
+            GroundMethod::Fuzzy => 0,
+            GroundMethod::Pca => 2,
+            GroundMethod::Ransac => 3,
+        };
+        all[..=configured].rotate_right(1);
+        Ok(all)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_configured_method_comes_first_of_all() {
+        for (method, first) in [
+            (GroundMethod::Fuzzy, "fuzzy"),
+            (GroundMethod::Pca, "PCA"),
+            (GroundMethod::Ransac, "RANSAC plane"),
+        ] {
+            let config = GroundConfig {
+                method,
+                ..GroundConfig::default()
+            };
+            let all = config.all_classifiers().unwrap();
+            assert_eq!((all[0].0, all.len()), (first, 5));
+        }
     }
 }
 

@@ -1,31 +1,31 @@
-//! What tells ground from the rest, per point.
+//! Features of each point for ground segmentation.
 //!
 //! ```text
-//! slope            angle between the surface normal and the vertical
+//! slope            angle between surface normal and vertical
 //! height_variance  √ mean (z − low)²   over the low points of the nine polar cells around
-//! curvature        change of slope along the beam's azimuth, from below to above: positive where
-//!                  the surface turns upwards, as at the foot of a wall
-//! height           over the local ground, see [`terrain`](super::terrain)
+//! curvature        change of slope along the azimuth of the beam, from below to above: positive
+//!                  where the surface turns upwards, as at the foot of a wall
+//! height           above the local ground, see [`terrain`](super::terrain)
 //! ```
 
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::polar::Placed;
-use super::surface::{ScanIndex, Shape};
+use super::polar_grid::PolarPosition;
+use super::surface::{BLOCK, MIN_POINTS_PER_TASK, ScanIndex, Shape};
 use super::terrain::{Terrain, TerrainConfig};
 use crate::validation::{InvalidValue, Validate, not_negative, positive};
 
-/// How features are computed.
+/// Parameters of the features.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FeatureConfig {
-    /// Distance from a point to the neighbours that tell its slope [m].
+    /// Minimum distance from a point to the neighbours that its surface is computed from [m].
     pub spacing_m: f32,
-    /// Points nearer to the sensor's axis than this are on the own car and no ground [m].
+    /// Points nearer to the sensor's axis belong to the own car and are not ground [m].
     pub min_distance_m: f32,
-    /// The local ground, over which the height of a point is measured.
+    /// Parameters of the elevation map above which the height of a point is measured.
     pub terrain: TerrainConfig,
 }
 
@@ -52,26 +52,26 @@ impl Validate for FeatureConfig {
 }
 
 /// The features of one point.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Features {
-    /// Angle between the surface and the horizontal [deg].
+    /// Angle between surface normal and vertical [deg].
     pub slope_deg: f32,
-    /// Root mean square of the point's height over the low points around it [m].
+    /// Root mean square of the height above the surrounding low points [m].
     pub height_variance_m: f32,
     /// Change of slope along the azimuth, from below to above, positive where the surface turns
     /// upwards [deg].
     pub curvature_deg: f32,
-    /// Height over the local ground [m].
+    /// Height above the local ground [m].
     pub height_m: f32,
 }
 
 impl Features {
-    /// Their names in rules, in the order of [`to_array`](Self::to_array).
+    /// Names in rules, in the order of [`to_array`](Self::to_array).
     pub const NAMES: [&str; 4] = ["slope", "height_variance", "curvature", "height"];
-    /// Their units.
+    /// Units, in the same order.
     pub const UNITS: [&str; 4] = ["deg", "m", "deg", "m"];
 
-    /// As inputs of a fuzzy system.
+    /// Returns the inputs of a fuzzy system.
     #[inline]
     pub fn to_array(&self) -> [f32; 4] {
         [
@@ -83,81 +83,78 @@ impl Features {
     }
 }
 
-/// A scan from which the features of its points are read.
-pub(super) struct Scene {
-    places: Vec<Placed>,
+/// What the features of a scan's points are computed from.
+pub(super) struct ScanFeatures {
+    positions: Vec<Option<PolarPosition>>,
     shapes: Vec<Shape>,
     terrain: Terrain,
 }
 
-/// Points that are worth a thread.
-const MIN_SHARE: usize = 1024;
-
-impl Scene {
-    /// Of all points of a scan in the lidar frame.
+impl ScanFeatures {
+    /// Analyses the points of a scan in the lidar frame.
     pub(super) fn new(points: &[Vec3], config: &FeatureConfig) -> Self {
-        let index = ScanIndex::new(points, config.min_distance_m);
-        let shapes = index.shapes(points, config.spacing_m);
-        let terrain = Terrain::estimate(&index.grid, &index.places, &shapes, &config.terrain);
+        let index = ScanIndex::new(points, config.min_distance_m, config.spacing_m);
+        let shapes = index.shapes();
+        let terrain = Terrain::estimate(index.grid, &index.positions, &shapes, &config.terrain);
         Self {
-            places: index.places,
+            positions: index.positions,
             shapes,
             terrain,
         }
     }
 
-    /// The features of every point; `None` for points that are not finite, on the own car or too
-    /// far away.
+    /// Returns the features of every point; `None` for points that are not finite, on the own car
+    /// or out of range.
     pub(super) fn features(&self) -> Vec<Option<Features>> {
-        let places = self.places.iter().zip(&self.shapes);
-        places
-            .map(|(place, shape)| place.is_somewhere().then(|| self.features_at(place, shape)))
+        let points = self.positions.iter().zip(&self.shapes);
+        points
+            .map(|(position, shape)| Some(self.features_at(position.as_ref()?, shape)))
             .collect()
     }
 
-    /// What `judge` makes of the features of every point, which it is given in blocks of `N`,
-    /// in parallel; 0 for points without features.
-    pub(super) fn judge<const N: usize>(
+    /// Maps the features of every point, `block[feature][point]`, to a number, in parallel; 0 for
+    /// points without features.
+    pub(super) fn map_blocks(
         &self,
-        judge: impl Fn(&[[f32; N]; 4]) -> [f32; N] + Sync,
+        map: impl Fn(&[[f32; BLOCK]; 4]) -> [f32; BLOCK] + Sync,
     ) -> Vec<f32> {
-        let mut answers = vec![0.0; self.places.len()];
-        answers
-            .par_chunks_mut(N)
-            .zip(self.places.par_chunks(N))
-            .zip(self.shapes.par_chunks(N))
-            .with_min_len(MIN_SHARE / N)
-            .for_each(|((answers, places), shapes)| {
-                let mut columns = [[0.0; N]; 4];
-                for (row, (place, shape)) in places.iter().zip(shapes).enumerate() {
-                    if place.is_somewhere() {
-                        let features = self.features_at(place, shape).to_array();
-                        for (column, feature) in columns.iter_mut().zip(features) {
+        let mut results = vec![0.0; self.positions.len()];
+        results
+            .par_chunks_mut(BLOCK)
+            .zip(self.positions.par_chunks(BLOCK))
+            .zip(self.shapes.par_chunks(BLOCK))
+            .with_min_len(MIN_POINTS_PER_TASK / BLOCK)
+            .for_each(|((results, positions), shapes)| {
+                let mut block = [[0.0; BLOCK]; 4];
+                for (row, (position, shape)) in positions.iter().zip(shapes).enumerate() {
+                    if let Some(position) = position {
+                        let features = self.features_at(position, shape).to_array();
+                        for (column, feature) in block.iter_mut().zip(features) {
                             column[row] = feature;
                         }
                     }
                 }
-                let judged = judge(&columns);
-                for ((answer, place), judged) in answers.iter_mut().zip(places).zip(judged) {
-                    *answer = if place.is_somewhere() { judged } else { 0.0 };
+                let mapped = map(&block);
+                for ((result, position), mapped) in results.iter_mut().zip(positions).zip(mapped) {
+                    *result = if position.is_some() { mapped } else { 0.0 };
                 }
             });
-        answers
+        results
     }
 
     #[inline]
-    fn features_at(&self, place: &Placed, shape: &Shape) -> Features {
+    fn features_at(&self, position: &PolarPosition, shape: &Shape) -> Features {
         Features {
             slope_deg: shape.slope_rad.to_degrees(),
             curvature_deg: shape.curvature_rad.to_degrees(),
-            height_variance_m: self.terrain.rise_over_lows(place),
-            height_m: place.z - self.terrain.height_at(place.ring, place.sector),
+            height_variance_m: self.terrain.height_above_lows_m(position),
+            height_m: position.z - self.terrain.height_at(position),
         }
     }
 }
 
-/// Unit surface normals of all points of a scan, of arbitrary sign; `None` without neighbours.
+/// Returns the unit surface normals of all points, of arbitrary sign; `None` without neighbours.
 pub(super) fn surface_normals(points: &[Vec3]) -> Vec<Option<Vec3>> {
     let config = FeatureConfig::default();
-    ScanIndex::new(points, config.min_distance_m).normals(points, config.spacing_m)
+    ScanIndex::new(points, config.min_distance_m, config.spacing_m).normals()
 }

@@ -1,5 +1,4 @@
-//! The fuzzy ground classifier: features of a point, rules in words, a confidence that can be
-//! explained.
+//! Ground segmentation by fuzzy rules over the features of each point.
 
 use std::fmt;
 
@@ -7,59 +6,57 @@ use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::classifier::GroundClassifier;
-use super::features::{FeatureConfig, Features, Scene};
+use super::features::{FeatureConfig, Features, ScanFeatures};
 use super::inference::{FuzzySystem, Inference};
-use super::membership::{Membership, Operators};
+use super::membership::{MembershipFunction, Operators};
 use super::rules::{RuleError, Vocabulary};
 use crate::validation::{InvalidValue, Validate, in_range, nested};
 
-/// Points that are judged together.
-const BLOCK: usize = 32;
 /// The output variable of the rules.
 const OUTPUT: &str = "ground";
 
-/// Features, sets, rules and words of the fuzzy classifier.
+/// Features, linguistic variables and rule base of the fuzzy classifier.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct FuzzyConfig {
-    /// How features are computed.
+    /// Parameters of the features.
     pub features: FeatureConfig,
-    /// How AND and OR are computed.
+    /// Fuzzy operators for AND and OR.
     pub operators: Operators,
-    /// How rules become a confidence.
+    /// Method of inference.
     pub inference: Inference,
-    /// Linguistic sets of the features `slope` [deg], `height_variance` [m], `curvature` [deg],
+    /// Fuzzy sets of the features `slope` [deg], `height_variance` [m], `curvature` [deg],
     /// `height` [m], and of the output `ground` [0, 1].
     pub variables: Vocabulary,
-    /// `IF slope IS gentle AND curvature IS flat THEN ground IS high`.
+    /// The rule base: `IF slope IS gentle AND curvature IS flat THEN ground IS high`.
     pub rules: Vec<String>,
-    /// A confidence this near to 0 or 1 is definite, unitless.
+    /// Confidence from which on a point is definitely ground, unitless.
     pub definitely: f32,
-    /// A confidence this near to 0 or 1 is probable; below, it is uncertain, unitless.
+    /// Confidence from which on a point is probably ground, unitless.
     pub probably: f32,
 }
 
 impl Default for FuzzyConfig {
-    /// Four features; fixed on the even-numbered of 21 labelled scans and on simulated streets.
+    /// Four features; tuned on the even-numbered of 21 labelled scans and on simulated streets.
     fn default() -> Self {
         Self {
             features: FeatureConfig::default(),
             operators: Operators::MinMax,
             inference: Inference::Mamdani,
             variables: vocabulary(&[
-                ("slope", "gentle", Membership::LeftShoulder([13.0, 23.0])),
-                ("slope", "moderate", Membership::Triangle([13.0, 23.0, 100.0])),
-                ("slope", "steep", Membership::RightShoulder([23.0, 100.0])),
-                ("height_variance", "low", Membership::LeftShoulder([0.01, 0.11])),
-                ("height_variance", "medium", Membership::Triangle([0.01, 0.11, 0.4])),
-                ("height_variance", "high", Membership::RightShoulder([0.11, 0.4])),
-                ("curvature", "flat", Membership::LeftShoulder([12.0, 55.0])),
-                ("curvature", "curved", Membership::Triangle([12.0, 55.0, 65.0])),
-                ("curvature", "sharp", Membership::RightShoulder([55.0, 65.0])),
-                ("height", "sunken", Membership::LeftShoulder([-0.45, -0.15])),
-                ("height", "level", Membership::Trapezoid([-0.45, -0.15, 0.03, 0.11])),
-                ("height", "raised", Membership::Triangle([0.03, 0.11, 0.22])),
-                ("height", "above", Membership::RightShoulder([0.11, 0.22])),
+                ("slope", "gentle", MembershipFunction::LeftShoulder([13.0, 23.0])),
+                ("slope", "moderate", MembershipFunction::Triangle([13.0, 23.0, 100.0])),
+                ("slope", "steep", MembershipFunction::RightShoulder([23.0, 100.0])),
+                ("height_variance", "low", MembershipFunction::LeftShoulder([0.01, 0.11])),
+                ("height_variance", "medium", MembershipFunction::Triangle([0.01, 0.11, 0.4])),
+                ("height_variance", "high", MembershipFunction::RightShoulder([0.11, 0.4])),
+                ("curvature", "flat", MembershipFunction::LeftShoulder([12.0, 55.0])),
+                ("curvature", "curved", MembershipFunction::Triangle([12.0, 55.0, 65.0])),
+                ("curvature", "sharp", MembershipFunction::RightShoulder([55.0, 65.0])),
+                ("height", "sunken", MembershipFunction::LeftShoulder([-0.45, -0.15])),
+                ("height", "level", MembershipFunction::Trapezoid([-0.45, -0.15, 0.03, 0.11])),
+                ("height", "raised", MembershipFunction::Triangle([0.03, 0.11, 0.22])),
+                ("height", "above", MembershipFunction::RightShoulder([0.11, 0.22])),
             ]),
             rules: [
                 "IF height IS level AND slope IS gentle AND curvature IS NOT sharp THEN ground IS high",
@@ -95,19 +92,19 @@ impl Validate for FuzzyConfig {
 }
 
 impl FuzzyConfig {
-    /// The three features of the report, without the height over the local ground.
+    /// A rule base of three features, without the height above the local ground.
     pub fn three_features() -> Self {
         Self {
             variables: vocabulary(&[
-                ("slope", "gentle", Membership::LeftShoulder([3.0, 16.0])),
-                ("slope", "moderate", Membership::Triangle([3.0, 16.0, 100.0])),
-                ("slope", "steep", Membership::RightShoulder([16.0, 100.0])),
-                ("height_variance", "low", Membership::LeftShoulder([0.08, 0.21])),
-                ("height_variance", "medium", Membership::Triangle([0.08, 0.21, 0.9])),
-                ("height_variance", "high", Membership::RightShoulder([0.21, 0.9])),
-                ("curvature", "flat", Membership::LeftShoulder([25.0, 50.0])),
-                ("curvature", "curved", Membership::Triangle([25.0, 50.0, 65.0])),
-                ("curvature", "sharp", Membership::RightShoulder([50.0, 65.0])),
+                ("slope", "gentle", MembershipFunction::LeftShoulder([3.0, 16.0])),
+                ("slope", "moderate", MembershipFunction::Triangle([3.0, 16.0, 100.0])),
+                ("slope", "steep", MembershipFunction::RightShoulder([16.0, 100.0])),
+                ("height_variance", "low", MembershipFunction::LeftShoulder([0.08, 0.21])),
+                ("height_variance", "medium", MembershipFunction::Triangle([0.08, 0.21, 0.9])),
+                ("height_variance", "high", MembershipFunction::RightShoulder([0.21, 0.9])),
+                ("curvature", "flat", MembershipFunction::LeftShoulder([25.0, 50.0])),
+                ("curvature", "curved", MembershipFunction::Triangle([25.0, 50.0, 65.0])),
+                ("curvature", "sharp", MembershipFunction::RightShoulder([50.0, 65.0])),
             ]),
             rules: [
                 "IF slope IS gentle AND height_variance IS low AND curvature IS NOT sharp THEN ground IS high",
@@ -125,81 +122,55 @@ impl FuzzyConfig {
             ..Self::default()
         }
     }
-}
 
-/// The sets of the features, and low, medium and high of the output.
-fn vocabulary(sets: &[(&str, &str, Membership)]) -> Vocabulary {
-    let output = [
-        (OUTPUT, "low", Membership::Triangle([0.0, 0.0, 0.4])),
-        (OUTPUT, "medium", Membership::Triangle([0.2, 0.5, 0.8])),
-        (OUTPUT, "high", Membership::Triangle([0.6, 1.0, 1.0])),
-    ];
-    let mut vocabulary = Vocabulary::new();
-    for &(variable, set, membership) in sets.iter().chain(&output) {
-        let sets = vocabulary.entry(variable.to_owned()).or_default();
-        sets.insert(set.to_owned(), membership);
+    /// The interval in which the sets of a variable differ, with a margin; for charts.
+    pub fn chart_range(&self, variable: &str) -> (f32, f32) {
+        let sets = self.variables.get(variable).into_iter().flatten();
+        let (from, to) = sets
+            .map(|(_, function)| function.span())
+            .reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
+            .unwrap_or_default();
+        let share = if variable == OUTPUT { 0.0 } else { 0.2 };
+        let margin = share * (to - from);
+        (from - margin, to + margin)
     }
-    vocabulary
 }
 
-/// Classifies points by fuzzy rules.
+/// The fuzzy ground classifier.
 #[derive(Clone, Debug)]
 pub struct FuzzyGround {
     config: FuzzyConfig,
     system: FuzzySystem,
 }
 
-/// A confidence in a word.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-#[expect(missing_docs, reason = "they are the words themselves")]
-pub enum Verdict {
-    DefinitelyGround,
-    ProbablyGround,
-    Uncertain,
-    ProbablyNotGround,
-    DefinitelyNotGround,
-}
-
-/// Why a point has its confidence.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+/// The derivation of a point's confidence.
+#[derive(Clone, Debug, PartialEq)]
 pub struct Explanation {
-    /// What was computed of the point.
+    /// The inputs of the fuzzy system.
     pub features: Features,
-    /// Per feature the degrees of its sets.
-    pub memberships: Vec<(String, Vec<(String, f32)>)>,
-    /// The rules that fired, strongest first.
+    /// Set name and degree of membership of every set, per feature.
+    pub memberships: Vec<Vec<(String, f32)>>,
+    /// The rules that fired, by descending firing strength.
     pub fired: Vec<FiredRule>,
     /// Confidence that the point is ground, 0 to 1.
     pub confidence: f32,
-    /// The same in a word.
-    pub verdict: Verdict,
+    /// The confidence in words.
+    pub verdict: &'static str,
 }
 
-/// A rule and how strongly it fired.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct FiredRule {
-    /// As it is written in the configuration.
-    pub rule: String,
-    /// 0 to 1.
-    pub strength: f32,
-    /// The set of `ground` that it speaks for.
-    pub consequence: String,
-}
-
-/// A membership function as points to draw.
+/// A rule with a firing strength greater than 0.
 #[derive(Clone, Debug, PartialEq)]
-pub struct MembershipCurve {
-    /// The variable.
-    pub variable: String,
-    /// Its linguistic set.
-    pub set: String,
-    /// Value and degree, by ascending value.
-    pub points: Vec<(f32, f32)>,
+pub struct FiredRule {
+    /// The text of the rule in the configuration.
+    pub rule: String,
+    /// Firing strength, 0 to 1.
+    pub strength: f32,
+    /// The output set of the consequent.
+    pub consequent: String,
 }
 
 impl FuzzyGround {
-    /// Reads the rules of the configuration.
+    /// Parses the rule base of the configuration.
     pub fn new(config: FuzzyConfig) -> Result<Self, RuleError> {
         let system = FuzzySystem::new(
             &config.variables,
@@ -212,34 +183,32 @@ impl FuzzyGround {
         Ok(Self { config, system })
     }
 
-    /// The features of every point; `None` for points that are not finite, under the car or too
-    /// far away.
+    /// Computes the features of every point; `None` for points that are not finite, on the own car
+    /// or out of range.
     pub fn features(&self, points: &[Vec3]) -> Vec<Option<Features>> {
-        Scene::new(points, &self.config.features).features()
+        ScanFeatures::new(points, &self.config.features).features()
     }
 
-    /// The confidence that a point with these features is ground, 0 to 1.
-    #[inline]
+    /// Infers the confidence, 0 to 1, that a point with these features is ground.
     pub fn confidence(&self, features: &Features) -> f32 {
         self.system.infer(&features.to_array())
     }
 
-    /// Why a point with these features has its confidence.
+    /// Explains the confidence of a point with these features.
     pub fn explain(&self, features: &Features) -> Explanation {
         let inputs = features.to_array();
-        let confidence = self.system.infer(&inputs);
-        let strengths = self.system.strengths(&inputs);
+        let strengths = self.system.firing_strengths(&inputs).into_iter();
         let mut fired: Vec<FiredRule> = strengths
-            .into_iter()
             .zip(&self.config.rules)
             .filter(|((strength, _), _)| *strength > 0.0)
-            .map(|((strength, consequence), rule)| FiredRule {
+            .map(|((strength, consequent), rule)| FiredRule {
                 rule: rule.clone(),
                 strength,
-                consequence: consequence.to_owned(),
+                consequent: consequent.to_owned(),
             })
             .collect();
         fired.sort_by(|a, b| b.strength.total_cmp(&a.strength));
+        let confidence = self.confidence(features);
         Explanation {
             features: *features,
             memberships: self.system.memberships(&inputs),
@@ -249,81 +218,37 @@ impl FuzzyGround {
         }
     }
 
-    /// A confidence in a word.
-    pub fn verdict(&self, confidence: f32) -> Verdict {
+    /// Expresses a confidence in words.
+    pub fn verdict(&self, confidence: f32) -> &'static str {
         let (definitely, probably) = (self.config.definitely, self.config.probably);
         if confidence >= definitely {
-            Verdict::DefinitelyGround
+            "definitely ground"
         } else if confidence >= probably {
-            Verdict::ProbablyGround
+            "probably ground"
         } else if confidence > 1.0 - probably {
-            Verdict::Uncertain
+            "uncertain"
         } else if confidence > 1.0 - definitely {
-            Verdict::ProbablyNotGround
+            "probably not ground"
         } else {
-            Verdict::DefinitelyNotGround
+            "definitely not ground"
         }
-    }
-
-    /// All membership functions over the span of their variable, `samples` points each.
-    pub fn membership_curves(&self, samples: usize) -> Vec<MembershipCurve> {
-        let mut curves = Vec::new();
-        for (variable, sets) in &self.config.variables {
-            let spans = || sets.values().map(Membership::span);
-            let from = spans().map(|(from, _)| from).fold(f32::INFINITY, f32::min);
-            let to = spans().map(|(_, to)| to).fold(f32::NEG_INFINITY, f32::max);
-            let margin = if variable == OUTPUT {
-                0.0
-            } else {
-                0.2 * (to - from)
-            };
-            let (from, to) = (from - margin, to + margin);
-            for (set, membership) in sets {
-                let points = (0..samples).map(|sample| {
-                    let share = sample as f32 / (samples.max(2) - 1) as f32;
-                    let value = from + share * (to - from);
-                    (value, membership.degree(value))
-                });
-                curves.push(MembershipCurve {
-                    variable: variable.clone(),
-                    set: set.clone(),
-                    points: points.collect(),
-                });
-            }
-        }
-        curves
     }
 }
 
 impl GroundClassifier for FuzzyGround {
     fn ground_confidence(&self, points: &[Vec3]) -> Vec<f32> {
-        let scene = Scene::new(points, &self.config.features);
-        scene.judge::<BLOCK>(|features| self.system.infer_block(features))
-    }
-}
-
-impl fmt::Display for Verdict {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.write_str(match self {
-            Self::DefinitelyGround => "definitely ground",
-            Self::ProbablyGround => "probably ground",
-            Self::Uncertain => "uncertain",
-            Self::ProbablyNotGround => "probably not ground",
-            Self::DefinitelyNotGround => "definitely not ground",
-        })
+        let features = ScanFeatures::new(points, &self.config.features);
+        features.map_blocks(|block| self.system.infer_block(block))
     }
 }
 
 impl fmt::Display for Explanation {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        let values = Features::NAMES.iter().zip(self.features.to_array());
-        for ((name, value), unit) in values.zip(Features::UNITS) {
+        let values = self.features.to_array().into_iter().zip(Features::UNITS);
+        let rows = Features::NAMES.iter().zip(values).zip(&self.memberships);
+        for ((name, (value, unit)), sets) in rows {
             write!(f, "{name:>16} {value:8.3} {unit:<4}")?;
-            let sets = self
-                .memberships
-                .iter()
-                .find(|(variable, _)| variable == name);
-            for (set, degree) in sets.iter().flat_map(|(_, sets)| sets) {
+            for (set, degree) in sets {
                 write!(f, " {set} {degree:.2}")?;
             }
             writeln!(f)?;
@@ -331,10 +256,30 @@ impl fmt::Display for Explanation {
         for rule in &self.fired {
             writeln!(f, "{:16.2} {}", rule.strength, rule.rule)?;
         }
-        write!(
-            f,
-            "{:>16} {:8.3}      {}",
-            OUTPUT, self.confidence, self.verdict
-        )
+        let (confidence, verdict) = (self.confidence, self.verdict);
+        write!(f, "{OUTPUT:>16} {confidence:8.3}      {verdict}")
     }
+}
+
+/// Collects the sets of the features, and the sets low, medium and high of the output.
+fn vocabulary(sets: &[(&str, &str, MembershipFunction)]) -> Vocabulary {
+    let output = [
+        (OUTPUT, "low", MembershipFunction::Triangle([0.0, 0.0, 0.4])),
+        (
+            OUTPUT,
+            "medium",
+            MembershipFunction::Triangle([0.2, 0.5, 0.8]),
+        ),
+        (
+            OUTPUT,
+            "high",
+            MembershipFunction::Triangle([0.6, 1.0, 1.0]),
+        ),
+    ];
+    let mut vocabulary = Vocabulary::new();
+    for &(variable, set, function) in sets.iter().chain(&output) {
+        let sets = vocabulary.entry(variable.to_owned()).or_default();
+        sets.insert(set.to_owned(), function);
+    }
+    vocabulary
 }

@@ -1,7 +1,7 @@
-//! Fuzzy inference: from numbers over memberships and rules to one number between 0 and 1.
+//! Fuzzy inference: from crisp inputs over memberships and rules to one number between 0 and 1.
 //!
 //! ```text
-//! strength of a rule  s = AND of its clauses' degrees      min or product; OR is max or a + b − ab
+//! firing strength     s = AND of the clauses' degrees      min or product; OR is max or a + b − ab
 //! Mamdani             µ(y) = maxᵢ (sᵢ ∧ µᵢ(y)),  result = ∫ y µ(y) dy / ∫ µ(y) dy
 //! Sugeno, order zero  result = Σ sᵢ yᵢ / Σ sᵢ,   yᵢ the peak of the output set
 //! ```
@@ -11,209 +11,190 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::centroid::{Centroids, UNKNOWN};
-use super::membership::{Membership, Operators};
-use super::rules::{self, Names, Rule, RuleError, Vocabulary};
+use super::defuzzification::{CentroidDefuzzifier, UNDECIDED};
+use super::membership::{MembershipFunction, Operators};
+use super::rules::{self, Clause, RuleError, Then, Variable, Vocabulary};
 
-/// How the rules' strengths become a number.
+/// Method of inference and defuzzification.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Inference {
-    /// Clipped output sets, their union's centroid.
+    /// Implied output sets, and the centroid of their union.
     #[default]
     Mamdani,
-    /// Weighted mean of the output sets' peaks.
+    /// Mean of the output sets' peaks, weighted by firing strength.
     Sugeno,
 }
 
-/// The most sets that all inputs together, or the output, may have.
+/// Maximum number of sets of all inputs together, and of the output.
 const MAX_SETS: usize = 32;
 
-/// A fuzzy system over named inputs with one output between 0 and 1.
+/// A fuzzy inference system with named inputs and one output between 0 and 1.
 #[derive(Clone, Debug)]
 pub struct FuzzySystem {
-    inputs: Vec<(String, Vec<String>)>,
-    output: (String, Vec<String>),
-    /// Input index and shape of every set, in the order in which clauses count them.
-    sets: Vec<(usize, Membership)>,
-    steps: Vec<Step>,
+    inputs: Vec<Variable>,
+    output: Variable,
+    /// Input index and membership function of every input set, in the order of [`Clause::set`].
+    sets: Vec<(usize, MembershipFunction)>,
+    /// The clauses of all rules in one list, for locality in memory.
+    clauses: Vec<Clause>,
     operators: Operators,
     inference: Inference,
-    pub(super) centroids: Centroids,
+    pub(super) defuzzifier: CentroidDefuzzifier,
+    /// Peaks of the output sets.
     peaks: Vec<f32>,
 }
 
-/// A clause of the rules, all of which stand in one list so that nothing is chased in memory.
-#[derive(Clone, Copy, Debug)]
-struct Step {
-    set: usize,
-    negated: bool,
-    then: Then,
-}
-
-#[derive(Clone, Copy, Debug)]
-enum Then {
-    And,
-    Or,
-    Output(usize),
-}
-
 impl FuzzySystem {
-    /// Looks up all names. Inputs are expected in the order of `input_names`; all variables of
-    /// the vocabulary must be among them or be the output.
+    /// Parses the rules. Every variable of the vocabulary must be one of `input_names`, which
+    /// define the order of the inputs, or `output_name`.
     pub fn new(
         vocabulary: &Vocabulary,
-        rule_texts: &[String],
+        rules: &[String],
         input_names: &[&str],
         output_name: &str,
         operators: Operators,
         inference: Inference,
     ) -> Result<Self, RuleError> {
         check(vocabulary, input_names, output_name)?;
-        let names_of = |name: &str| {
-            let sets = vocabulary.get(name);
-            sets.map_or_else(Vec::new, |sets| sets.keys().cloned().collect())
+        let variable = |name: &str| {
+            let sets = vocabulary.get(name).into_iter().flatten();
+            Variable {
+                name: name.to_owned(),
+                sets: sets
+                    .map(|(set, &function)| (set.clone(), function))
+                    .collect(),
+            }
         };
-        let inputs: Vec<(String, Vec<String>)> = input_names
-            .iter()
-            .map(|&name| (name.to_owned(), names_of(name)))
-            .collect();
-        let output = (output_name.to_owned(), names_of(output_name));
-        let sets: Vec<(usize, Membership)> = input_names
-            .iter()
-            .enumerate()
-            .filter_map(|(input, &name)| Some((input, vocabulary.get(name)?)))
-            .flat_map(|(input, sets)| sets.values().map(move |&shape| (input, shape)))
-            .collect();
-        let outputs: Vec<Membership> = vocabulary[output_name].values().copied().collect();
+        let inputs: Vec<Variable> = input_names.iter().map(|name| variable(name)).collect();
+        let output = variable(output_name);
+        let mut clauses = Vec::new();
+        for (index, rule) in rules.iter().enumerate() {
+            clauses.extend(rules::parse(rule, index + 1, &inputs, &output)?);
+        }
+        let functions = |variable: &Variable| -> Vec<MembershipFunction> {
+            variable
+                .sets
+                .iter()
+                .map(|&(_, function)| function)
+                .collect()
+        };
+        let in_input = |(index, input)| functions(input).into_iter().map(move |f| (index, f));
+        let sets: Vec<_> = inputs.iter().enumerate().flat_map(in_input).collect();
+        let outputs = functions(&output);
         if sets.len() > MAX_SETS || outputs.len() > MAX_SETS {
             return Err(RuleError::TooManySets {
-                found: sets.len(),
+                inputs: sets.len(),
                 outputs: outputs.len(),
                 limit: MAX_SETS,
             });
         }
-        let names = Names {
-            inputs: &inputs,
-            output: &output,
-        };
-        let rules = rule_texts
-            .iter()
-            .enumerate()
-            .map(|(index, text)| rules::parse(text, index + 1, &names))
-            .collect::<Result<Vec<_>, _>>()?;
         if rules.is_empty() {
             return Err(RuleError::NoRules);
         }
+        let peaks = outputs
+            .iter()
+            .map(MembershipFunction::peak_in_unit_interval);
         Ok(Self {
-            sets,
-            steps: rules.iter().flat_map(steps_of).collect(),
-            operators,
-            inference,
-            centroids: Centroids::new(&outputs, operators),
-            peaks: outputs
-                .iter()
-                .map(Membership::peak_in_unit_interval)
-                .collect(),
             inputs,
             output,
+            sets,
+            clauses,
+            operators,
+            inference,
+            defuzzifier: CentroidDefuzzifier::new(&outputs, operators),
+            peaks: peaks.collect(),
         })
     }
 
-    /// The result for inputs in the order of the names, 0 to 1; 0.5 where no rule fires.
+    /// Infers the output, 0 to 1, from one value per input; 0.5 where no rule fires.
     pub fn infer(&self, inputs: &[f32]) -> f32 {
-        let columns: Vec<[f32; 1]> = inputs.iter().map(|&input| [input]).collect();
-        self.infer_block(&columns)[0]
+        let [output] = self.infer_block(&columns(inputs));
+        output
     }
 
-    /// The same for `N` times the inputs, `inputs[i]` holding those of name `i`. Loops run over
-    /// the block inside, so that they are vectorized; nothing is allocated.
+    /// Infers `N` outputs from `inputs[input][column]`. The inner loops run over the block, so that
+    /// they are vectorized; nothing is allocated.
     #[inline]
     pub fn infer_block<const N: usize>(&self, inputs: &[[f32; N]]) -> [f32; N] {
         debug_assert_eq!(inputs.len(), self.inputs.len());
-        let degrees = self.degrees(inputs);
+        let degrees = self.fuzzify(inputs);
         match self.inference {
-            Inference::Mamdani => self.centers(&degrees),
-            Inference::Sugeno => self.weighted_peaks(&degrees),
+            Inference::Mamdani => self.infer_mamdani(&degrees),
+            Inference::Sugeno => self.infer_sugeno(&degrees),
         }
     }
 
-    #[inline]
-    fn degrees<const N: usize>(&self, inputs: &[[f32; N]]) -> [[f32; N]; MAX_SETS] {
-        let mut degrees = [[0.0; N]; MAX_SETS];
-        for (degrees, (input, shape)) in degrees.iter_mut().zip(&self.sets) {
-            shape.degrees(&inputs[*input], degrees);
-        }
-        degrees
+    /// Returns set name and degree of membership of every set, per input.
+    pub fn memberships(&self, inputs: &[f32]) -> Vec<Vec<(String, f32)>> {
+        let degrees = |(variable, &x): (&Variable, &f32)| {
+            let sets = variable.sets.iter();
+            sets.map(|(set, function)| (set.clone(), function.degree(x)))
+                .collect()
+        };
+        self.inputs.iter().zip(inputs).map(degrees).collect()
     }
 
-    /// Degrees of every input's sets: per input its name, and per set name and degree.
-    pub fn memberships(&self, inputs: &[f32]) -> Vec<(String, Vec<(String, f32)>)> {
-        let mut sets = self.sets.iter();
-        self.inputs
-            .iter()
-            .map(|(name, set_names)| {
-                let degrees = set_names
-                    .iter()
-                    .zip(sets.by_ref())
-                    .map(|(set, (input, shape))| (set.clone(), shape.degree(inputs[*input])))
-                    .collect();
-                (name.clone(), degrees)
-            })
-            .collect()
-    }
-
-    /// How strongly each rule fires, with the name of its output set.
-    pub fn strengths(&self, inputs: &[f32]) -> Vec<(f32, &str)> {
-        let columns: Vec<[f32; 1]> = inputs.iter().map(|&input| [input]).collect();
+    /// Returns the firing strength of every rule, with the name of its output set.
+    pub fn firing_strengths(&self, inputs: &[f32]) -> Vec<(f32, &str)> {
         let mut strengths = Vec::new();
-        self.fire(&self.degrees(&columns), |output, &[strength]| {
-            strengths.push((strength, self.output.1[output].as_str()));
+        self.fire(&self.fuzzify(&columns(inputs)), |output, &[strength]| {
+            strengths.push((strength, self.output.sets[output].0.as_str()));
         });
         strengths
     }
 
-    /// Calls `speak` with the output set and the strengths of every rule, in order.
+    /// Returns the degrees of membership in all input sets.
+    #[inline]
+    fn fuzzify<const N: usize>(&self, inputs: &[[f32; N]]) -> [[f32; N]; MAX_SETS] {
+        let mut degrees = [[0.0; N]; MAX_SETS];
+        for (degrees, (input, function)) in degrees.iter_mut().zip(&self.sets) {
+            function.degrees(&inputs[*input], degrees);
+        }
+        degrees
+    }
+
+    /// Calls `visit` with output set and firing strengths of every rule, in order.
     #[inline]
     fn fire<const N: usize>(
         &self,
         degrees: &[[f32; N]; MAX_SETS],
-        mut speak: impl FnMut(usize, &[f32; N]),
+        mut visit: impl FnMut(usize, &[f32; N]),
     ) {
         let (mut any, mut all) = ([0.0_f32; N], [1.0_f32; N]);
-        for step in &self.steps {
-            let (offset, sign) = if step.negated {
+        for clause in &self.clauses {
+            let (offset, sign) = if clause.negated {
                 (1.0, -1.0)
             } else {
                 (0.0, 1.0)
             };
-            let degrees = &degrees[step.set % MAX_SETS];
+            let degrees = &degrees[clause.set % MAX_SETS];
             for (all, &degree) in all.iter_mut().zip(degrees) {
                 let degree = offset + sign * degree;
                 *all = match self.operators {
-                    Operators::MinMax => smaller(*all, degree),
+                    Operators::MinMax => min(*all, degree),
                     Operators::Product => *all * degree,
                 };
             }
-            if let Then::And = step.then {
+            if let Then::And = clause.then {
                 continue;
             }
             for (any, &all) in any.iter_mut().zip(&all) {
                 *any = match self.operators {
-                    Operators::MinMax => larger(*any, all),
+                    Operators::MinMax => max(*any, all),
                     Operators::Product => *any + all - *any * all,
                 };
             }
             all = [1.0; N];
-            if let Then::Output(output) = step.then {
-                speak(output, &any);
+            if let Then::Consequent(output) = clause.then {
+                visit(output, &any);
                 any = [0.0; N];
             }
         }
     }
 
     #[inline]
-    fn weighted_peaks<const N: usize>(&self, degrees: &[[f32; N]; MAX_SETS]) -> [f32; N] {
+    fn infer_sugeno<const N: usize>(&self, degrees: &[[f32; N]; MAX_SETS]) -> [f32; N] {
         let (mut sums, mut weights) = ([0.0_f32; N], [0.0_f32; N]);
         self.fire(degrees, |output, strengths| {
             let peak = self.peaks[output];
@@ -223,74 +204,55 @@ impl FuzzySystem {
             }
         });
         let mean = |i: usize| sums[i] / weights[i];
-        std::array::from_fn(|i| if weights[i] > 0.0 { mean(i) } else { UNKNOWN })
+        std::array::from_fn(|i| if weights[i] > 0.0 { mean(i) } else { UNDECIDED })
     }
 
     #[inline]
-    fn centers<const N: usize>(&self, degrees: &[[f32; N]; MAX_SETS]) -> [f32; N] {
+    fn infer_mamdani<const N: usize>(&self, degrees: &[[f32; N]; MAX_SETS]) -> [f32; N] {
         let mut strongest = [[0.0_f32; N]; MAX_SETS];
-        // Rules of one output set are joined by max before the set is clipped: the same as
-        // after, because clipping and scaling are monotone.
+        // Rules of one output set are joined by max before implication: the same as after, because
+        // implication is monotone.
         self.fire(degrees, |output, strengths| {
             let strongest = &mut strongest[output % MAX_SETS];
             for (strongest, &strength) in strongest.iter_mut().zip(strengths) {
-                *strongest = larger(*strongest, strength);
+                *strongest = max(*strongest, strength);
             }
         });
-        self.centroids.of(&strongest[..self.peaks.len()])
+        self.defuzzifier.defuzzify(&strongest[..self.peaks.len()])
     }
 }
 
-/// The smaller of two numbers that are numbers: one instruction, unlike `f32::min`.
+/// A block of one column.
+fn columns(inputs: &[f32]) -> Vec<[f32; 1]> {
+    inputs.iter().map(|&input| [input]).collect()
+}
+
+/// The smaller of two numbers, neither NaN: one instruction, unlike `f32::min`.
 #[inline]
-fn smaller(a: f32, b: f32) -> f32 {
+fn min(a: f32, b: f32) -> f32 {
     if a < b { a } else { b }
 }
 
-/// The larger of two numbers that are numbers.
+/// The larger of two numbers, neither NaN.
 #[inline]
-fn larger(a: f32, b: f32) -> f32 {
+fn max(a: f32, b: f32) -> f32 {
     if a > b { a } else { b }
-}
-
-/// The clauses of a rule, each with what follows it.
-fn steps_of(rule: &Rule) -> impl Iterator<Item = Step> {
-    let groups = rule.condition.len();
-    rule.condition
-        .iter()
-        .enumerate()
-        .flat_map(move |(group, clauses)| {
-            let count = clauses.len();
-            clauses.iter().enumerate().map(move |(index, clause)| Step {
-                set: clause.set,
-                negated: clause.negated,
-                then: match (index + 1 < count, group + 1 < groups) {
-                    (true, _) => Then::And,
-                    (false, true) => Then::Or,
-                    (false, false) => Then::Output(rule.output),
-                },
-            })
-        })
 }
 
 fn check(vocabulary: &Vocabulary, inputs: &[&str], output: &str) -> Result<(), RuleError> {
     for (variable, sets) in vocabulary {
         if variable != output && !inputs.contains(&variable.as_str()) {
-            let known = inputs.iter().chain([&output]);
-            let known: Vec<String> = known.map(|&name| name.to_owned()).collect();
             return Err(RuleError::UnknownFeature {
                 name: variable.clone(),
-                nearest: rules::nearest(variable, &known),
+                nearest: rules::nearest(variable, inputs.iter().copied().chain([output])),
             });
         }
-        for (set, membership) in sets {
-            if !membership.is_valid() {
-                return Err(RuleError::BadSet {
-                    variable: variable.clone(),
-                    set: set.clone(),
-                    membership: *membership,
-                });
-            }
+        if let Some((set, &function)) = sets.iter().find(|(_, function)| !function.is_valid()) {
+            return Err(RuleError::InvalidSet {
+                variable: variable.clone(),
+                set: set.clone(),
+                function,
+            });
         }
     }
     if vocabulary.get(output).is_none_or(|sets| sets.is_empty()) {

@@ -1,14 +1,20 @@
-//! Laws of the inference, and its answers beside scikit-fuzzy's.
+//! Laws of the inference, and comparison with scikit-fuzzy.
 
-use super::super::centroid::MIN_TABLED;
+use super::super::defuzzification::MIN_TABULATED;
 use super::*;
 
 fn system(rules: &[&str], operators: Operators, inference: Inference) -> FuzzySystem {
     let rules: Vec<String> = rules.iter().map(|&rule| rule.to_owned()).collect();
     let sets = |names: [&str; 2]| {
         [
-            (names[0].to_owned(), Membership::LeftShoulder([0.0, 1.0])),
-            (names[1].to_owned(), Membership::RightShoulder([0.0, 1.0])),
+            (
+                names[0].to_owned(),
+                MembershipFunction::LeftShoulder([0.0, 1.0]),
+            ),
+            (
+                names[1].to_owned(),
+                MembershipFunction::RightShoulder([0.0, 1.0]),
+            ),
         ]
         .into()
     };
@@ -37,9 +43,9 @@ fn from_table(line: &str) -> (FuzzySystem, [f32; 2], f32) {
     let shape = |word: &str| {
         let (kind, corners) = word.split_once(':').unwrap();
         match (kind, &numbers(corners)[..]) {
-            ("trapezoid", &[a, b, c, d]) => Membership::Trapezoid([a, b, c, d]),
-            ("triangle", &[a, b, c]) => Membership::Triangle([a, b, c]),
-            ("gaussian", &[mean, sigma]) => Membership::Gaussian([mean, sigma]),
+            ("trapezoid", &[a, b, c, d]) => MembershipFunction::Trapezoid([a, b, c, d]),
+            ("triangle", &[a, b, c]) => MembershipFunction::Triangle([a, b, c]),
+            ("gaussian", &[mean, sigma]) => MembershipFunction::Gaussian([mean, sigma]),
             other => panic!("{other:?}"),
         }
     };
@@ -81,7 +87,7 @@ fn from_table(line: &str) -> (FuzzySystem, [f32; 2], f32) {
 }
 
 #[test]
-fn random_systems_infer_what_scikit_fuzzy_infers() {
+fn random_systems_agree_with_scikit_fuzzy() {
     let table = include_str!("scikit_fuzzy.txt");
     assert!(table.lines().count() > 50);
     for line in table.lines() {
@@ -98,17 +104,18 @@ const OPPOSITE: [&str; 2] = [
 ];
 
 #[test]
-fn the_table_of_centroids_agrees_with_the_integral() {
+fn tabulated_centroids_agree_with_the_integral() {
     let line = include_str!("scikit_fuzzy.txt").lines().next().unwrap();
     let (system, ..) = from_table(line);
-    let centroids = &system.centroids;
+    let defuzzifier = &system.defuzzifier;
     let mut worst: f32 = 0.0;
     for index in 0..1000 {
         let digit = |divisor: usize| (index / divisor % 10) as f32 / 9.0;
         let strengths = [digit(1), digit(10), digit(100)];
-        if strengths.iter().any(|&strength| strength >= MIN_TABLED) {
+        if strengths.iter().any(|&strength| strength >= MIN_TABULATED) {
             worst = worst.max(
-                (centroids.look_up(strengths) - centroids.integrate(strengths.into_iter())).abs(),
+                (defuzzifier.interpolate(strengths) - defuzzifier.integrate(strengths.into_iter()))
+                    .abs(),
             );
         }
     }
@@ -124,7 +131,7 @@ fn sugeno_inference_is_the_weighted_mean_of_the_peaks() {
 }
 
 #[test]
-fn swapping_every_set_for_its_opposite_mirrors_the_result() {
+fn mirrored_sets_mirror_the_result() {
     for operators in [Operators::MinMax, Operators::Product] {
         let system = system(&OPPOSITE, operators, Inference::Mamdani);
         for a in [0.0, 0.1, 0.4, 0.9] {
@@ -135,7 +142,7 @@ fn swapping_every_set_for_its_opposite_mirrors_the_result() {
 }
 
 #[test]
-fn where_no_rule_fires_nothing_is_known() {
+fn the_result_is_one_half_where_no_rule_fires() {
     for inference in [Inference::Mamdani, Inference::Sugeno] {
         let system = system(&OPPOSITE[1..], Operators::MinMax, inference);
         assert_eq!(system.infer(&[0.0, 0.0]), 0.5);
@@ -144,13 +151,21 @@ fn where_no_rule_fires_nothing_is_known() {
 }
 
 #[test]
-fn or_and_and_differ_as_their_operators_say() {
+fn and_and_or_follow_the_operators() {
     let strength = |joint: &str, operators| {
         let rule = format!("IF a IS large {joint} b IS NOT small THEN ground IS high");
-        system(&[&rule], operators, Inference::Sugeno).strengths(&[0.4, 0.5])[0].0
+        system(&[&rule], operators, Inference::Sugeno).firing_strengths(&[0.4, 0.5])[0].0
     };
     assert_eq!(strength("AND", Operators::MinMax), 0.4);
     assert_eq!(strength("OR", Operators::MinMax), 0.5);
     assert_eq!(strength("AND", Operators::Product), 0.2);
     assert!((strength("OR", Operators::Product) - 0.7).abs() < 1e-6);
+}
+
+#[test]
+fn and_binds_tighter_than_or() {
+    let rule = "IF a IS large AND b IS large OR b IS small THEN ground IS high";
+    let system = system(&[rule], Operators::MinMax, Inference::Sugeno);
+    assert_eq!(system.firing_strengths(&[0.3, 0.0])[0].0, 1.0);
+    assert_eq!(system.firing_strengths(&[0.3, 1.0])[0].0, 0.3);
 }

@@ -1,38 +1,40 @@
-//! Which points are road: a confidence between 0 and 1 per point.
+//! Ground segmentation: the confidence, 0 to 1, that each point of a scan is ground.
 //!
-//! Three or four features of a point are fuzzified into linguistic sets, rules in words weigh
-//! them, and the answer is soft and can be explained ([`FuzzyGround`]). Two plain methods stand
-//! beside it for comparison ([`PcaGround`], [`RansacGround`]).
+//! [`FuzzyGround`] fuzzifies three or four features of a point and infers the confidence from a
+//! rule base in words, which can be explained. [`PcaGround`] and [`RansacGround`] are baselines.
 
-mod centroid;
+// The interface, and the choice between its implementations.
 mod classifier;
 mod config;
+// Fuzzy rules over features of points.
 mod features;
 mod fuzzy;
+// Fuzzy inference.
+mod defuzzification;
 mod inference;
 mod membership;
-mod pca;
-mod polar;
-mod ransac;
-mod road;
 mod rules;
-#[cfg(test)]
-mod scenes;
-mod score;
+// Geometry of a scan.
+mod direction_image;
+mod polar_grid;
 mod surface;
 mod terrain;
+// Baselines.
+mod pca;
+mod ransac;
+// The ground plane below the sensor.
+mod road;
 #[cfg(test)]
 mod tests;
 
 pub use classifier::GroundClassifier;
 pub use config::{GroundConfig, GroundMethod};
 pub use features::{FeatureConfig, Features};
-pub use fuzzy::{Explanation, FiredRule, FuzzyConfig, FuzzyGround, MembershipCurve, Verdict};
+pub use fuzzy::{Explanation, FiredRule, FuzzyConfig, FuzzyGround};
 pub use inference::{FuzzySystem, Inference};
-pub use membership::{Membership, Operators};
+pub use membership::{MembershipFunction, Operators};
 pub use pca::{PcaGround, ReportRule};
 pub use ransac::RansacGround;
 pub use road::{RoadPlane, road_plane};
-pub use rules::{RuleError, RuleFault, Vocabulary};
-pub use score::{GroundScore, Protocol};
+pub use rules::{RuleError, Vocabulary};
 pub use terrain::TerrainConfig;

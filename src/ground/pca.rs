@@ -1,8 +1,4 @@
-//! Baseline: normals along the cloud's own vertical, and low points.
-//!
-//! k is the eigenvector of the smallest eigenvalue of the covariance of the whole cloud; a
-//! point is ground if |n · k| is large and it lies below a fixed height. After range-mcl's
-//! PCA variant (Chen et al., ICRA 2021), with the eigenvalues in order.
+//! Baselines that classify each point by its surface normal and its height alone.
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
@@ -12,18 +8,21 @@ use super::features::surface_normals;
 use crate::geometry::PlaneSums;
 use crate::validation::{InvalidValue, Validate, fraction, require};
 
-/// Ground by principal components.
+/// Ground by principal components: a point is ground if |n · k| is large, k being the eigenvector
+/// of the smallest eigenvalue of the covariance of the whole cloud, and it lies below a fixed
+/// height. After the PCA variant of range-mcl (Chen et al., ICRA 2021), with the eigenvalues in
+/// order.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PcaGround {
-    /// Least |cosine| between a point's normal and the cloud's.
+    /// Minimum |cosine| between the normal of a point and that of the cloud, unitless.
     pub min_cosine: f32,
-    /// Ground lies below this height in the lidar frame [m].
+    /// Maximum height of ground in the lidar frame [m].
     pub max_height_m: f32,
 }
 
 impl Default for PcaGround {
-    /// The values of range-mcl, for a sensor 1.73 m over the road.
+    /// The values of range-mcl, for a sensor 1.73 m above the road.
     fn default() -> Self {
         Self {
             min_cosine: 0.8,
@@ -51,42 +50,37 @@ impl GroundClassifier for PcaGround {
             sums.add(point, 1.0);
         }
         let vertical = sums.fit().map_or(Vec3::Z, |plane| plane.normal);
-        surface_normals(points)
-            .into_iter()
-            .zip(points)
-            .map(|(normal, point)| {
-                let ground = normal.is_some_and(|normal| {
-                    normal.dot(vertical).abs() >= self.min_cosine && point.z < self.max_height_m
-                });
-                f32::from(u8::from(ground))
-            })
-            .collect()
+        classify_by_normal(points, |normal, z| {
+            let is_level = normal.dot(vertical).abs() >= self.min_cosine;
+            f32::from(u8::from(is_level && z < self.max_height_m))
+        })
     }
 }
 
-/// Baseline: the rule that the report prints, `min(low(z), gentle(slope))`.
+/// Baseline of a project report: one fuzzy rule, `min(low(z), gentle(slope))`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ReportRule;
 
 impl GroundClassifier for ReportRule {
     fn ground_confidence(&self, points: &[Vec3]) -> Vec<f32> {
-        surface_normals(points)
-            .into_iter()
-            .zip(points)
-            .map(|(normal, point)| {
-                normal.map_or(0.0, |normal| {
-                    let slope_deg = normal.z.abs().min(1.0).acos().to_degrees();
-                    // Memberships over (-5, 0, 1) and (0, 10, 30) that fall from 1 at the second
-                    // corner to 0 at the third, and are 0 outside the range.
-                    let low = if point.z < -5.0 {
-                        0.0
-                    } else {
-                        (1.0 - point.z).clamp(0.0, 1.0)
-                    };
-                    let gentle = ((30.0 - slope_deg) / 20.0).clamp(0.0, 1.0);
-                    low.min(gentle)
-                })
-            })
-            .collect()
+        classify_by_normal(points, |normal, z| {
+            let slope_deg = normal.z.abs().min(1.0).acos().to_degrees();
+            // Right flanks of the sets (-5, 0, 1) and (0, 10, 30); 0 outside of the universe.
+            let low = if z < -5.0 {
+                0.0
+            } else {
+                (1.0 - z).clamp(0.0, 1.0)
+            };
+            let gentle = ((30.0 - slope_deg) / 20.0).clamp(0.0, 1.0);
+            low.min(gentle)
+        })
     }
+}
+
+/// Maps unit normal and height of every point to a confidence; 0 for points without a normal.
+fn classify_by_normal(points: &[Vec3], confidence: impl Fn(Vec3, f32) -> f32) -> Vec<f32> {
+    let normals = surface_normals(points).into_iter().zip(points);
+    normals
+        .map(|(normal, point)| normal.map_or(0.0, |normal| confidence(normal, point.z)))
+        .collect()
 }

@@ -1,7 +1,7 @@
 //! Baseline: one plane for the whole scan, as range-mcl fits it.
 //!
-//! Fischler and Bolles, *Random Sample Consensus* (1981): planes through random points; the
-//! one with the most points near it wins and is fitted to them.
+//! Fischler and Bolles, *Random Sample Consensus* (1981): of the planes through random samples,
+//! the one with the largest consensus set is fitted to that set.
 
 use glam::Vec3;
 use rand::{RngExt, SeedableRng};
@@ -10,20 +10,20 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::classifier::GroundClassifier;
-use crate::geometry::PlaneSums;
+use crate::geometry::{PlaneFit, PlaneSums};
 use crate::validation::{InvalidValue, Validate, in_range, positive, require};
 
 /// Ground by the dominant plane.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RansacGround {
-    /// How far from the plane ground may lie [m].
+    /// Maximum distance of ground from the plane [m].
     pub distance_threshold: f32,
-    /// Points that a plane is made of, at least 3.
+    /// Points per random sample, at least 3.
     pub ransac_n: usize,
-    /// Planes that are tried.
+    /// Number of random samples.
     pub num_iterations: usize,
-    /// Of the random points.
+    /// Seed of the random samples.
     pub seed: u64,
 }
 
@@ -52,75 +52,55 @@ impl Validate for RansacGround {
     }
 }
 
-#[derive(Clone, Copy)]
-struct Plane {
-    normal: Vec3,
-    offset_m: f32,
-}
-
-impl Plane {
-    fn through(points: impl Iterator<Item = Vec3>) -> Option<Self> {
-        let mut sums = PlaneSums::about(Vec3::ZERO);
-        points.for_each(|point| sums.add(point, 1.0));
-        sums.fit().map(|plane| Self {
-            normal: plane.normal,
-            offset_m: plane.normal.dot(plane.center),
-        })
-    }
-
-    fn has(&self, point: Vec3, tolerance_m: f32) -> bool {
-        (self.normal.dot(point) - self.offset_m).abs() < tolerance_m
-    }
-}
-
 impl RansacGround {
-    fn plane(&self, points: &[Vec3]) -> Option<Plane> {
-        if points.len() < self.ransac_n.max(3) {
+    fn plane(&self, points: &[Vec3]) -> Option<PlaneFit> {
+        let sample_size = self.ransac_n.max(3);
+        if points.len() < sample_size {
             return None;
         }
-        let supporters = |plane: &Plane| {
-            let near = |point: &&Vec3| plane.has(**point, self.distance_threshold);
-            points.iter().filter(near).count()
-        };
-        let scored: Vec<(usize, Plane)> = (0..self.num_iterations as u64)
+        let candidates: Vec<(usize, PlaneFit)> = (0..self.num_iterations as u64)
             .into_par_iter()
             .filter_map(|iteration| {
-                // A stream per iteration: the same planes at any number of threads.
+                // A stream per iteration: the same planes with any number of threads.
                 let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
                 rng.set_stream(iteration);
-                let draws =
-                    (0..self.ransac_n.max(3)).map(|_| points[rng.random_range(0..points.len())]);
-                let plane = Plane::through(draws)?;
-                Some((supporters(&plane), plane))
+                let plane =
+                    fit((0..sample_size).map(|_| points[rng.random_range(0..points.len())]))?;
+                let inliers = points
+                    .iter()
+                    .filter(|point| self.is_inlier(&plane, **point));
+                Some((inliers.count(), plane))
             })
             .collect();
-        let mut best: Option<(usize, Plane)> = None;
-        for (support, plane) in scored {
-            if best.is_none_or(|(most, _)| support > most) {
-                best = Some((support, plane));
-            }
-        }
-        let (_, plane) = best?;
-        let near = points
+        // The first of the largest: `max_by_key` returns the last.
+        let largest = candidates.into_iter().rev();
+        let (_, plane) = largest.max_by_key(|&(inliers, _)| inliers)?;
+        let inliers = points
             .iter()
-            .filter(|point| plane.has(**point, self.distance_threshold));
-        Plane::through(near.copied()).or(Some(plane))
+            .filter(|point| self.is_inlier(&plane, **point));
+        fit(inliers.copied()).or(Some(plane))
+    }
+
+    #[inline]
+    fn is_inlier(&self, plane: &PlaneFit, point: Vec3) -> bool {
+        let offset_m = plane.normal.dot(plane.center);
+        (plane.normal.dot(point) - offset_m).abs() < self.distance_threshold
     }
 }
 
 impl GroundClassifier for RansacGround {
     fn ground_confidence(&self, points: &[Vec3]) -> Vec<f32> {
-        let finite: Vec<Vec3> = points
-            .iter()
-            .copied()
-            .filter(|point| point.is_finite())
-            .collect();
-        let Some(plane) = self.plane(&finite) else {
+        let finite = points.iter().copied().filter(|point| point.is_finite());
+        let Some(plane) = self.plane(&finite.collect::<Vec<_>>()) else {
             return vec![0.0; points.len()];
         };
-        points
-            .iter()
-            .map(|&point| f32::from(u8::from(plane.has(point, self.distance_threshold))))
-            .collect()
+        let is_ground = |&point| f32::from(u8::from(self.is_inlier(&plane, point)));
+        points.iter().map(is_ground).collect()
     }
+}
+
+fn fit(points: impl Iterator<Item = Vec3>) -> Option<PlaneFit> {
+    let mut sums = PlaneSums::about(Vec3::ZERO);
+    points.for_each(|point| sums.add(point, 1.0));
+    sums.fit()
 }

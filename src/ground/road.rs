@@ -1,73 +1,67 @@
-//! The plane of the road right around the car: how the sensor stands over it.
+//! The plane of the road around the car, from which the sensor attitude follows: height, roll and
+//! pitch above ground.
 
 use glam::{DMat3, DVec3, Vec3};
 
-/// The plane of the ground about the sensor, in the lidar frame.
+/// The plane of the ground around the sensor, in the lidar frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RoadPlane {
     /// Unit normal, up.
     pub up: Vec3,
-    /// Distance of the sensor over the plane [m].
+    /// Distance of the sensor above the plane [m].
     pub height_m: f64,
-    /// Scatter of the ground about the plane, robust standard deviation [m].
-    pub scatter_m: f64,
-    /// Ground points that the plane rests on.
-    pub support: usize,
 }
 
-/// Within this distance of the sensor the road counts as plane [m].
+/// Radius around the sensor within which the road is taken as plane [m].
 const RADIUS_M: f32 = 12.0;
-/// How fast a cell's weight falls with its distance, so that the road counts more than what lies
+/// Standard deviation of the weight over the distance, so that the road outweighs what lies
 /// beside it [m].
 const NEARNESS_M: f64 = 5.0;
 /// Scales of Tukey's weights, from where the tilt is unknown down to where a kerb is an outlier [m].
 const SCALES_M: [f64; 12] = [
     0.3, 0.2, 0.13, 0.09, 0.06, 0.04, 0.03, 0.02, 0.02, 0.02, 0.02, 0.02,
 ];
-/// Edge of the cells that share their points' weight, so that dense rings near the car do not
+/// Edge of the cells in which points are averaged, so that dense rings near the car do not
 /// outweigh the rest [m].
 const CELL_M: f32 = 0.5;
-/// Least number of cells with ground.
+/// Minimum number of cells with ground.
 const MIN_CELLS: usize = 30;
-/// Confidence from which a point counts.
+/// Minimum confidence of a ground point.
 const MIN_CONFIDENCE: f32 = 0.5;
 
 /// Fits the plane of the ground around the sensor: least squares with Tukey's weights over
-/// cells of 0.5 m within 12 m, weighted by `ground`, the points' confidences.
+/// cells of 0.5 m within 12 m, weighted by the confidences of the points.
 ///
 /// `None` where there is too little ground, or only on one side of the sensor.
-pub fn road_plane(points: &[Vec3], ground: &[f32]) -> Option<RoadPlane> {
-    let cells = ground_cells(points, ground);
+pub fn road_plane(points: &[Vec3], confidences: &[f32]) -> Option<RoadPlane> {
+    let cells = ground_cells(points, confidences);
     if cells.len() < MIN_CELLS {
         return None;
     }
+    let mut heights: Vec<f64> = cells.iter().map(|cell| cell.point.z).collect();
+    heights.sort_by(f64::total_cmp);
     // z = a + b x + c y
-    let mut plane = DVec3::new(median(cells.iter().map(|cell| cell.point.z))?, 0.0, 0.0);
+    let mut plane = DVec3::new(heights[heights.len() / 2], 0.0, 0.0);
     for scale_m in SCALES_M {
         plane = weighted_fit(&cells, plane, scale_m)?;
     }
-    let residuals = cells.iter().map(|cell| residual(cell, plane).abs());
     let up = DVec3::new(-plane.y, -plane.z, 1.0).normalize();
     Some(RoadPlane {
         up: up.as_vec3(),
         height_m: -plane.x * up.z,
-        // Sigma of a Gaussian.
-        scatter_m: 1.4826 * median(residuals)?,
-        support: cells.iter().map(|cell| cell.count).sum(),
     })
 }
 
 struct Cell {
     point: DVec3,
     weight: f64,
-    count: usize,
 }
 
-/// Mean position and weight of the ground per cell, in the order of the cells.
-fn ground_cells(points: &[Vec3], ground: &[f32]) -> Vec<Cell> {
+/// Computes mean position and weight of the ground per cell, in the order of the cells.
+fn ground_cells(points: &[Vec3], confidences: &[f32]) -> Vec<Cell> {
     let across = (2.0 * RADIUS_M / CELL_M) as usize;
-    let mut sums = vec![(DVec3::ZERO, 0.0, 0); across * across];
-    for (&point, &confidence) in points.iter().zip(ground) {
+    let mut sums = vec![(DVec3::ZERO, 0.0, 0.0); across * across];
+    for (&point, &confidence) in points.iter().zip(confidences) {
         let near = point.x * point.x + point.y * point.y < RADIUS_M * RADIUS_M;
         if !near || confidence < MIN_CONFIDENCE || !point.z.is_finite() {
             continue;
@@ -78,15 +72,14 @@ fn ground_cells(points: &[Vec3], ground: &[f32]) -> Vec<Cell> {
         let weight = f64::from(confidence);
         sum.0 += weight * point.as_dvec3();
         sum.1 += weight;
-        sum.2 += 1;
+        sum.2 += 1.0;
     }
     sums.into_iter()
-        .filter(|sum| sum.2 > 0)
-        .map(|(sum, weight, count)| Cell {
+        .filter(|&(_, _, count)| count > 0.0)
+        .map(|(sum, weight, count): (DVec3, f64, f64)| Cell {
             point: sum / weight,
-            // A cell of many points is better known, but not as many times better.
-            weight: weight / count as f64 * (count as f64).min(8.0) * nearness(sum / weight),
-            count,
+            // A cell of many points is more certain, but not in proportion to their number.
+            weight: weight / count * count.min(8.0) * nearness(sum / weight),
         })
         .collect()
 }
@@ -95,22 +88,19 @@ fn nearness(point: DVec3) -> f64 {
     (-0.5 * point.truncate().length_squared() / (NEARNESS_M * NEARNESS_M)).exp()
 }
 
-fn residual(cell: &Cell, plane: DVec3) -> f64 {
-    cell.point.z - plane.x - plane.y * cell.point.x - plane.z * cell.point.y
-}
-
 /// One step of iteratively reweighted least squares with Tukey's biweight.
 fn weighted_fit(cells: &[Cell], plane: DVec3, scale_m: f64) -> Option<DVec3> {
     const TUKEY: f64 = 4.685;
     let mut matrix = DMat3::ZERO;
     let mut right = DVec3::ZERO;
-    for cell in cells {
-        let u = residual(cell, plane) / (TUKEY * scale_m);
+    for Cell { point, weight } in cells {
+        let residual = point.z - plane.x - plane.y * point.x - plane.z * point.y;
+        let u = residual / (TUKEY * scale_m);
         if u.abs() < 1.0 {
-            let weight = cell.weight * (1.0 - u * u).powi(2);
-            let row = DVec3::new(1.0, cell.point.x, cell.point.y);
+            let weight = weight * (1.0 - u * u).powi(2);
+            let row = DVec3::new(1.0, point.x, point.y);
             matrix += DMat3::from_cols(row, row * row.y, row * row.z) * weight;
-            right += row * cell.point.z * weight;
+            right += row * point.z * weight;
         }
     }
     let weight = matrix.x_axis.x;
@@ -122,16 +112,6 @@ fn weighted_fit(cells: &[Cell], plane: DVec3, scale_m: f64) -> Option<DVec3> {
     (narrowest > 0.5).then(|| matrix.inverse() * right)
 }
 
-fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let mut values: Vec<f64> = values.collect();
-    let middle = values.len() / 2;
-    if values.is_empty() {
-        return None;
-    }
-    values.sort_by(f64::total_cmp);
-    Some(values[middle])
-}
-
 #[cfg(test)]
 mod tests {
     use rand::{RngExt, SeedableRng};
@@ -139,7 +119,7 @@ mod tests {
 
     use super::*;
 
-    /// Points on a tilted road, with 2 cm of noise, seen from `height_m` above.
+    /// Points on a tilted road, with 2 cm of noise, seen from `height_m` above it.
     fn road(up: Vec3, height_m: f32) -> Vec<Vec3> {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         (0..20_000)
@@ -153,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn tilt_and_height_of_a_noisy_road_come_out() {
+    fn tilt_and_height_of_a_noisy_road_are_recovered() {
         for (tilt, height_m) in [
             (Vec3::Z, 1.73),
             (Vec3::new(0.05, -0.03, 1.0).normalize(), 2.1),
@@ -172,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sidewalk_and_points_wrongly_called_ground_do_not_pull() {
+    fn a_sidewalk_and_false_positives_do_not_bias_the_plane() {
         let mut points = road(Vec3::Z, 1.73);
         for point in &mut points {
             if point.y > 4.0 {
@@ -191,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn without_ground_or_with_a_strip_of_it_there_is_no_plane() {
+    fn no_plane_without_ground_or_with_a_narrow_strip_of_it() {
         let points = road(Vec3::Z, 1.73);
         assert_eq!(road_plane(&points, &vec![0.1; points.len()]), None);
         assert_eq!(road_plane(&[], &[]), None);

@@ -1,96 +1,36 @@
-//! Fuzzy rules in words: `IF slope IS gentle AND curvature IS NOT sharp THEN ground IS high`.
+//! The rule base in words: `IF slope IS gentle AND curvature IS NOT sharp THEN ground IS high`.
 //!
 //! ```text
-//! rule      = IF condition THEN output IS set
-//! condition = all { OR all }        all = clause { AND clause }
-//! clause    = variable IS [NOT] set
+//! rule       = IF antecedent THEN output IS set
+//! antecedent = conjunction { OR conjunction }     conjunction = clause { AND clause }
+//! clause     = variable IS [NOT] set
 //! ```
 //!
-//! Keywords are read in upper and lower case, names as they are written.
+//! Keywords are case-insensitive, names are not.
 
 use std::collections::BTreeMap;
+use std::iter::Peekable;
+use std::str::SplitWhitespace;
 
-use super::membership::Membership;
-
+use super::membership::MembershipFunction;
 use crate::validation::InvalidValue;
 
-/// The linguistic sets of each variable.
-pub type Vocabulary = BTreeMap<String, BTreeMap<String, Membership>>;
+/// The fuzzy sets of each linguistic variable.
+pub type Vocabulary = BTreeMap<String, BTreeMap<String, MembershipFunction>>;
 
-/// What is wrong with a rule base.
+/// An unusable rule base.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages say it")]
+#[expect(missing_docs, reason = "the messages explain the variants")]
 pub enum RuleError {
-    /// Rules are counted from 1.
-    #[error("rule {number} `{rule}`: {fault}")]
+    /// An error in one rule; rules are numbered from 1.
+    #[error("rule {number} `{rule}`: {error}")]
     Rule {
         number: usize,
         rule: String,
-        fault: RuleFault,
+        error: Box<RuleError>,
     },
-    #[error("variables: `{name}` is no feature; the nearest is `{nearest}`")]
-    UnknownFeature { name: String, nearest: String },
-    #[error("variables: the output `{name}` is missing; give it sets such as low, medium and high")]
-    NoOutput { name: String },
-    #[error("variables: set `{set}` of `{variable}` is {membership}: {}", membership.law())]
-    BadSet {
-        variable: String,
-        set: String,
-        membership: Membership,
-    },
-    #[error(
-        "variables: {found} input sets and {outputs} output sets; at most {limit} of each are possible"
-    )]
-    TooManySets {
-        found: usize,
-        outputs: usize,
-        limit: usize,
-    },
-    #[error("rules: there are none; write at least one")]
-    NoRules,
-}
-
-impl From<RuleError> for InvalidValue {
-    /// Names the rule or the set by its own key, so that its line can be found.
-    fn from(error: RuleError) -> Self {
-        match &error {
-            RuleError::Rule {
-                number,
-                rule,
-                fault,
-            } => Self::new(
-                &format!("rules[{number}]"),
-                format_args!("`{rule}`"),
-                fault.to_string(),
-            ),
-            RuleError::BadSet {
-                variable,
-                set,
-                membership,
-            } => Self::new(
-                &format!("variables.{variable}.{set}"),
-                membership,
-                membership.law(),
-            ),
-            RuleError::UnknownFeature { name, nearest } => Self::new(
-                &format!("variables.{name}"),
-                "no feature",
-                format!("the nearest is `{nearest}`"),
-            ),
-            RuleError::NoRules => Self::new("rules", "empty", error.to_string()),
-            RuleError::NoOutput { .. } | RuleError::TooManySets { .. } => {
-                Self::new("variables", "not usable", error.to_string())
-            }
-        }
-    }
-}
-
-/// What is wrong with a rule.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages say it")]
-pub enum RuleFault {
-    #[error("`{found}` where {expected} belongs")]
-    Grammar {
+    #[error("expected {expected}, found `{found}`")]
+    Syntax {
         found: String,
         expected: &'static str,
     },
@@ -102,199 +42,260 @@ pub enum RuleFault {
         name: String,
         nearest: String,
     },
+    #[error("variables: `{name}` is no feature; the nearest is `{nearest}`")]
+    UnknownFeature { name: String, nearest: String },
+    #[error(
+        "variables: the output `{name}` is missing; add it with sets such as low, medium and high"
+    )]
+    NoOutput { name: String },
+    #[error("variables: set `{set}` of `{variable}` is {function}: {}", function.requirement())]
+    InvalidSet {
+        variable: String,
+        set: String,
+        function: MembershipFunction,
+    },
+    #[error(
+        "variables: {inputs} input sets and {outputs} output sets; at most {limit} of each are possible"
+    )]
+    TooManySets {
+        inputs: usize,
+        outputs: usize,
+        limit: usize,
+    },
+    #[error("rules: the list is empty; write at least one rule")]
+    NoRules,
 }
 
-/// `variable IS set`, by position of the set among all sets.
+impl From<RuleError> for InvalidValue {
+    /// Names the rule or the set by its own key, so that its line can be found.
+    fn from(error: RuleError) -> Self {
+        match &error {
+            RuleError::Rule {
+                number,
+                rule,
+                error,
+            } => Self::new(
+                &format!("rules[{number}]"),
+                format_args!("`{rule}`"),
+                error.to_string(),
+            ),
+            RuleError::InvalidSet {
+                variable,
+                set,
+                function,
+            } => Self::new(
+                &format!("variables.{variable}.{set}"),
+                function,
+                function.requirement(),
+            ),
+            RuleError::UnknownFeature { name, nearest } => Self::new(
+                &format!("variables.{name}"),
+                "no feature",
+                format!("the nearest is `{nearest}`"),
+            ),
+            RuleError::NoRules => Self::new("rules", "empty", error.to_string()),
+            _ => Self::new("variables", "not usable", error.to_string()),
+        }
+    }
+}
+
+/// A linguistic variable with its fuzzy sets.
+#[derive(Clone, Debug)]
+pub(super) struct Variable {
+    pub(super) name: String,
+    pub(super) sets: Vec<(String, MembershipFunction)>,
+}
+
+impl Variable {
+    fn set_index(&self, set: &str) -> Result<usize, RuleError> {
+        let names = || self.sets.iter().map(|(name, _)| name.as_str());
+        names()
+            .position(|name| name == set)
+            .ok_or_else(|| RuleError::UnknownSet {
+                variable: self.name.clone(),
+                name: set.to_owned(),
+                nearest: nearest(set, names()),
+            })
+    }
+}
+
+/// A clause of an antecedent, and how it is joined to what follows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Clause {
+    /// Index of the set among the sets of all inputs.
     pub(super) set: usize,
     pub(super) negated: bool,
+    pub(super) then: Then,
 }
 
-/// A rule whose names have been looked up.
-#[derive(Clone, Debug, PartialEq)]
-pub(super) struct Rule {
-    /// Any of these, each of which wants all its clauses.
-    pub(super) condition: Vec<Vec<Clause>>,
-    /// Position of the output set.
-    pub(super) output: usize,
+/// What follows a clause.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Then {
+    /// Another clause of the same conjunction.
+    And,
+    /// The next conjunction.
+    Or,
+    /// The consequent: the index of its output set.
+    Consequent(usize),
 }
 
-/// Names of variables and their sets, in the order in which sets are counted.
-pub(super) struct Names<'a> {
-    pub(super) inputs: &'a [(String, Vec<String>)],
-    pub(super) output: &'a (String, Vec<String>),
-}
-
-/// Reads a rule; `number` counts from 1, for messages.
-pub(super) fn parse(text: &str, number: usize, names: &Names) -> Result<Rule, RuleError> {
-    let reader = Reader {
-        words: text.split_whitespace().peekable(),
-        names,
+/// Parses a rule into its clauses; `number` appears in messages.
+pub(super) fn parse(
+    rule: &str,
+    number: usize,
+    inputs: &[Variable],
+    output: &Variable,
+) -> Result<Vec<Clause>, RuleError> {
+    let parser = Parser {
+        words: rule.split_whitespace().peekable(),
+        inputs,
+        output,
     };
-    reader.rule().map_err(|fault| RuleError::Rule {
+    parser.rule().map_err(|error| RuleError::Rule {
         number,
-        rule: text.to_owned(),
-        fault,
+        rule: rule.to_owned(),
+        error: Box::new(error),
     })
 }
 
-struct Reader<'a> {
-    words: std::iter::Peekable<std::str::SplitWhitespace<'a>>,
-    names: &'a Names<'a>,
+/// Returns the known name that is most similar to `name`.
+pub(super) fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> String {
+    let distance = |other: &&str| strsim::damerau_levenshtein(name, other);
+    let nearest = known.into_iter().min_by_key(distance);
+    nearest.unwrap_or_default().to_owned()
 }
 
-impl<'a> Reader<'a> {
-    fn rule(mut self) -> Result<Rule, RuleFault> {
+/// The name of the end of a rule in messages.
+const END: &str = "the end of the rule";
+
+struct Parser<'a> {
+    words: Peekable<SplitWhitespace<'a>>,
+    inputs: &'a [Variable],
+    output: &'a Variable,
+}
+
+impl<'a> Parser<'a> {
+    fn rule(mut self) -> Result<Vec<Clause>, RuleError> {
         self.keyword("IF")?;
-        let mut condition = vec![vec![self.clause()?]];
+        let mut clauses = Vec::new();
         loop {
-            let word = self.next("AND, OR or THEN")?;
-            if is(word, "AND") {
-                let clause = self.clause()?;
-                if let Some(all) = condition.last_mut() {
-                    all.push(clause);
-                }
-            } else if is(word, "OR") {
-                condition.push(vec![self.clause()?]);
-            } else if is(word, "THEN") {
+            let (set, negated) = self.antecedent_clause()?;
+            let joint = self.word("AND, OR or THEN")?;
+            let then = match joint.to_ascii_uppercase().as_str() {
+                "AND" => Then::And,
+                "OR" => Then::Or,
+                "THEN" => Then::Consequent(self.consequent()?),
+                _ => return Err(syntax_error(joint, "AND, OR or THEN")),
+            };
+            clauses.push(Clause { set, negated, then });
+            if matches!(then, Then::Consequent(_)) {
                 break;
-            } else {
-                return Err(self.grammar(word, "AND, OR or THEN"));
             }
         }
-        let output = self.consequence()?;
         match self.words.next() {
-            None => Ok(Rule { condition, output }),
-            Some(word) => Err(self.grammar(word, "the end of the rule")),
+            None => Ok(clauses),
+            Some(word) => Err(syntax_error(word, END)),
         }
     }
 
-    fn next(&mut self, expected: &'static str) -> Result<&'a str, RuleFault> {
-        match self.words.next() {
-            Some(word) => Ok(word),
-            None => Err(self.grammar("the end of the rule", expected)),
-        }
+    fn word(&mut self, expected: &'static str) -> Result<&'a str, RuleError> {
+        let word = self.words.next();
+        word.ok_or_else(|| syntax_error(END, expected))
     }
 
-    fn keyword(&mut self, keyword: &'static str) -> Result<(), RuleFault> {
-        let word = self.next(keyword)?;
-        if is(word, keyword) {
+    fn keyword(&mut self, keyword: &'static str) -> Result<(), RuleError> {
+        let word = self.word(keyword)?;
+        if word.eq_ignore_ascii_case(keyword) {
             Ok(())
         } else {
-            Err(self.grammar(word, keyword))
+            Err(syntax_error(word, keyword))
         }
     }
 
-    fn clause(&mut self) -> Result<Clause, RuleFault> {
-        let variable = self.next("a variable")?;
+    /// The index of the set among all input sets, and whether it is negated.
+    fn antecedent_clause(&mut self) -> Result<(usize, bool), RuleError> {
+        let variable = self.word("a variable")?;
         self.keyword("IS")?;
-        let negated = self.words.peek().is_some_and(|word| is(word, "NOT"));
-        if negated {
-            self.words.next();
-        }
-        let set = self.next("a set")?;
+        let negation = self.words.next_if(|word| word.eq_ignore_ascii_case("NOT"));
+        let set = self.word("a set")?;
         let mut first_set = 0;
-        for (name, sets) in self.names.inputs {
-            if name == variable {
-                let set = first_set + self.position(variable, set, sets)?;
-                return Ok(Clause { set, negated });
+        for input in self.inputs {
+            if input.name == variable {
+                return Ok((first_set + input.set_index(set)?, negation.is_some()));
             }
-            first_set += sets.len();
+            first_set += input.sets.len();
         }
-        Err(self.unknown_variable(variable, self.names.inputs.iter().map(|(name, _)| name)))
+        Err(unknown_variable(variable, self.inputs))
     }
 
-    fn consequence(&mut self) -> Result<usize, RuleFault> {
-        let variable = self.next("the output")?;
-        let (name, sets) = self.names.output;
-        if name != variable {
-            return Err(self.unknown_variable(variable, [name]));
+    /// The index of the output set.
+    fn consequent(&mut self) -> Result<usize, RuleError> {
+        let variable = self.word("the output")?;
+        if self.output.name != variable {
+            return Err(unknown_variable(variable, [self.output]));
         }
         self.keyword("IS")?;
-        let set = self.next("a set")?;
-        self.position(variable, set, sets)
-    }
-
-    fn position(&self, variable: &str, set: &str, sets: &[String]) -> Result<usize, RuleFault> {
-        sets.iter()
-            .position(|name| name == set)
-            .ok_or_else(|| RuleFault::UnknownSet {
-                variable: variable.to_owned(),
-                name: set.to_owned(),
-                nearest: nearest(set, sets),
-            })
-    }
-
-    fn unknown_variable<'n>(
-        &self,
-        name: &str,
-        known: impl IntoIterator<Item = &'n String>,
-    ) -> RuleFault {
-        RuleFault::UnknownVariable {
-            name: name.to_owned(),
-            nearest: nearest(name, known),
-        }
-    }
-
-    fn grammar(&self, found: &str, expected: &'static str) -> RuleFault {
-        RuleFault::Grammar {
-            found: found.to_owned(),
-            expected,
-        }
+        let set = self.word("a set")?;
+        self.output.set_index(set)
     }
 }
 
-fn is(word: &str, keyword: &str) -> bool {
-    word.eq_ignore_ascii_case(keyword)
+fn unknown_variable<'a>(name: &str, known: impl IntoIterator<Item = &'a Variable>) -> RuleError {
+    let known = known.into_iter().map(|variable| variable.name.as_str());
+    RuleError::UnknownVariable {
+        name: name.to_owned(),
+        nearest: nearest(name, known),
+    }
 }
 
-/// The known name that `name` was most likely meant to be.
-pub(super) fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a String>) -> String {
-    known
-        .into_iter()
-        .min_by_key(|other| strsim::damerau_levenshtein(name, other))
-        .cloned()
-        .unwrap_or_default()
+fn syntax_error(found: &str, expected: &'static str) -> RuleError {
+    RuleError::Syntax {
+        found: found.to_owned(),
+        expected,
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn parse_one(text: &str) -> Result<Rule, RuleError> {
-        let list = |sets: &[&str]| sets.iter().map(|&set| set.to_owned()).collect();
-        parse(
-            text,
-            3,
-            &Names {
-                inputs: &[
-                    ("curvature".to_owned(), list(&["curved", "flat"])),
-                    ("slope".to_owned(), list(&["gentle", "steep"])),
-                ],
-                output: &("ground".to_owned(), list(&["high", "low"])),
-            },
-        )
+    fn variable(name: &str, sets: [&str; 2]) -> Variable {
+        let set = |name: &str| {
+            (
+                name.to_owned(),
+                MembershipFunction::LeftShoulder([0.0, 1.0]),
+            )
+        };
+        Variable {
+            name: name.to_owned(),
+            sets: sets.map(set).to_vec(),
+        }
+    }
+
+    fn parse_one(text: &str) -> Result<Vec<Clause>, RuleError> {
+        let inputs = [
+            variable("curvature", ["curved", "flat"]),
+            variable("slope", ["gentle", "steep"]),
+        ];
+        parse(text, 3, &inputs, &variable("ground", ["high", "low"]))
     }
 
     #[test]
-    fn and_binds_tighter_than_or_and_case_does_not_matter() {
-        let rule = parse_one(
+    fn clauses_are_parsed_in_order_and_the_case_of_keywords_does_not_matter() {
+        let clauses = parse_one(
             "if slope is gentle and curvature is NOT curved OR curvature IS flat then ground IS low",
         );
-        let clause = |set, negated| Clause { set, negated };
-        let expected = Rule {
-            condition: vec![
-                vec![clause(2, false), clause(0, true)],
-                vec![clause(1, false)],
-            ],
-            output: 1,
-        };
-        assert_eq!(rule, Ok(expected));
+        let clause = |set, negated, then| Clause { set, negated, then };
+        let expected = vec![
+            clause(2, false, Then::And),
+            clause(0, true, Then::Or),
+            clause(1, false, Then::Consequent(1)),
+        ];
+        assert_eq!(clauses, Ok(expected));
     }
 
     #[test]
-    fn a_mistyped_name_is_quoted_with_its_rule_and_the_nearest_known() {
+    fn an_unknown_name_is_reported_with_its_rule_and_the_nearest_known_name() {
         let message = |text| parse_one(text).unwrap_err().to_string();
         let variable = message("IF slop IS gentle THEN ground IS low");
         assert_eq!(
@@ -314,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rule_that_is_no_sentence_is_told_where_it_breaks() {
+    fn a_syntax_error_names_what_was_found_and_what_was_expected() {
         for (text, found, expected) in [
             ("slope IS gentle THEN ground IS low", "`slope`", "IF"),
             ("IF slope gentle THEN ground IS low", "`gentle`", "IS"),

@@ -1,19 +1,24 @@
-//! The shape of the surface at every point of a scan: its slope, its curvature, its normal.
+//! The local surface at every point of a scan: slope, curvature, normal.
 //!
-//! The normal is the cross product of the surface's tangents towards the neighbours above and
-//! below, left and right in an image of directions. A neighbour is the first one at least
-//! `spacing_m` away, so that noise does not tilt it, and a missing one is replaced by its
-//! opposite.
+//! The normal is the cross product of the surface's tangents, the differences of the neighbours
+//! above and below, left and right in an image of directions. A neighbour is the first one at
+//! least `spacing_m` away, so that noise does not tilt it; where it is missing, the point itself
+//! takes its place.
+
+use std::f32::consts::{FRAC_PI_2, PI};
 
 use glam::Vec3;
 use rayon::prelude::*;
 
-use super::polar::{Cell, DirectionImage, Placed, PolarGrid, Return, coarse_atan2};
+use super::direction_image::{Cell, DirectionImage, Return};
+use super::polar_grid::{PolarGrid, PolarPosition};
 
-/// Points whose angles are computed together.
-const BLOCK: usize = 32;
-/// Points that are worth a thread.
-const MIN_SHARE: usize = 1024;
+/// Points that are processed together in vectorized loops.
+pub(super) const BLOCK: usize = 32;
+/// Minimum number of points per parallel task.
+pub(super) const MIN_POINTS_PER_TASK: usize = 1024;
+/// Maximum number of columns between a point and its neighbours at the sides.
+const MAX_COLUMNS: f32 = 5.0;
 
 /// Slope and curvature of the surface at a point.
 #[derive(Clone, Copy, Debug)]
@@ -23,127 +28,199 @@ pub(super) struct Shape {
 }
 
 impl Shape {
-    /// Of a point without neighbours: nothing speaks for a road there.
+    /// The shape at a point without neighbours, which is unlike a road.
     const UNKNOWN: Self = Self {
-        slope_rad: std::f32::consts::FRAC_PI_2,
-        curvature_rad: std::f32::consts::FRAC_PI_2,
+        slope_rad: FRAC_PI_2,
+        curvature_rad: FRAC_PI_2,
     };
 }
 
-/// A scan by place and by direction.
-pub(super) struct ScanIndex {
+/// The points of a scan, indexed by position and by direction.
+pub(super) struct ScanIndex<'a> {
+    points: &'a [Vec3],
+    spacing_m: f32,
     pub(super) grid: PolarGrid,
+    pub(super) positions: Vec<Option<PolarPosition>>,
     image: DirectionImage,
-    pub(super) places: Vec<Placed>,
     /// Cells of the points in the image.
     cells: Vec<Option<Cell>>,
 }
 
-impl ScanIndex {
-    /// Points nearer to the sensor's axis than `min_distance_m` have no place.
-    pub(super) fn new(points: &[Vec3], min_distance_m: f32) -> Self {
+impl<'a> ScanIndex<'a> {
+    /// Indexes the points that are at least `min_distance_m` away from the sensor's axis.
+    pub(super) fn new(points: &'a [Vec3], min_distance_m: f32, spacing_m: f32) -> Self {
         let grid = PolarGrid::new();
-        let place = |&point: &Vec3| {
+        let locate = |&point: &Vec3| {
             let distance_m = point.truncate().length();
             if !(distance_m >= min_distance_m && point.z.is_finite()) {
-                return (Placed::NOWHERE, None);
+                return (None, None);
             }
             let azimuth_rad = coarse_atan2(point.y, point.x);
-            match grid.locate(distance_m, azimuth_rad) {
-                None => (Placed::NOWHERE, None),
-                Some((ring, sector)) => (
-                    Placed::new(ring, sector, point.z),
-                    Cell::of(point.z, distance_m, azimuth_rad),
-                ),
+            match grid.locate(point.z, distance_m, azimuth_rad) {
+                None => (None, None),
+                position => (position, Cell::of(point.z, distance_m, azimuth_rad)),
             }
         };
-        let (mut places, mut cells) = (Vec::new(), Vec::new());
+        let (mut positions, mut cells) = (Vec::new(), Vec::new());
         points
             .par_iter()
-            .with_min_len(MIN_SHARE)
-            .map(place)
-            .unzip_into_vecs(&mut places, &mut cells);
+            .with_min_len(MIN_POINTS_PER_TASK)
+            .map(locate)
+            .unzip_into_vecs(&mut positions, &mut cells);
         Self {
-            image: DirectionImage::new(points, &cells),
+            points,
+            spacing_m,
             grid,
-            places,
+            positions,
+            image: DirectionImage::new(points, &cells),
             cells,
         }
     }
 
-    /// The shapes of the surface at all points: computed for the nearest point of every
-    /// direction, and taken over by points right beside it.
-    pub(super) fn shapes(&self, points: &[Vec3], spacing_m: f32) -> Vec<Shape> {
+    /// Returns the shape of the surface at all points: computed for the nearest point of every
+    /// direction, and shared with the points close to it.
+    pub(super) fn shapes(&self) -> Vec<Shape> {
         let returns = self.image.returns();
         let mut shapes = vec![Shape::UNKNOWN; returns.len()];
         shapes
             .par_chunks_mut(BLOCK)
             .enumerate()
-            .with_min_len(MIN_SHARE / BLOCK)
+            .with_min_len(MIN_POINTS_PER_TASK / BLOCK)
             .for_each(|(block, shapes)| {
                 let mut surfaces = Surfaces::<BLOCK>::unknown();
                 for row in 0..shapes.len() {
                     let index = block * BLOCK + row;
-                    let Return {
-                        point, distance_m, ..
-                    } = returns[index];
-                    let neighbours =
-                        Neighbours::of(&self.image, index, point, distance_m, spacing_m);
-                    surfaces.set(row, &neighbours, point);
+                    let seen = &returns[index];
+                    let neighbours = self.neighbours(index, seen.point, seen.distance_m);
+                    surfaces.set(row, &neighbours, seen.point);
                 }
                 shapes.copy_from_slice(&surfaces.shapes()[..shapes.len()]);
             });
-        points
+        self.points
             .par_iter()
             .zip(&self.cells)
             .enumerate()
-            .with_min_len(MIN_SHARE)
+            .with_min_len(MIN_POINTS_PER_TASK)
             .map(|(number, (&point, cell))| {
-                let Some(holder) = cell.and_then(|cell| self.image.holder(cell)) else {
+                let Some(index) = cell.and_then(|cell| self.image.return_of(cell)) else {
                     return Shape::UNKNOWN;
                 };
-                let seen = &returns[holder];
+                let seen = &returns[index];
                 let squared_gap = seen.point.distance_squared(point);
-                if seen.number == number as u32 || squared_gap < 0.25 * spacing_m * spacing_m {
-                    return shapes[holder];
+                if seen.number == number as u32
+                    || squared_gap < 0.25 * self.spacing_m * self.spacing_m
+                {
+                    return shapes[index];
                 }
-                let distance_m = point.truncate().length();
+                let neighbours = self.neighbours(index, point, point.truncate().length());
                 let mut surface = Surfaces::<1>::unknown();
-                let neighbours = Neighbours::of(&self.image, holder, point, distance_m, spacing_m);
                 surface.set(0, &neighbours, point);
                 surface.shapes()[0]
             })
             .collect()
     }
 
-    /// Unit surface normals of all points, of arbitrary sign; `None` without neighbours.
-    pub(super) fn normals(&self, points: &[Vec3], spacing_m: f32) -> Vec<Option<Vec3>> {
-        points
+    /// Returns the unit surface normals of all points, of arbitrary sign; `None` without neighbours.
+    pub(super) fn normals(&self) -> Vec<Option<Vec3>> {
+        self.points
             .par_iter()
             .zip(&self.cells)
-            .with_min_len(MIN_SHARE)
+            .with_min_len(MIN_POINTS_PER_TASK)
             .map(|(&point, cell)| {
-                let holder = self.image.holder((*cell)?)?;
-                let distance_m = point.truncate().length();
-                Neighbours::of(&self.image, holder, point, distance_m, spacing_m).normal(point)
+                let index = self.image.return_of((*cell)?)?;
+                let neighbours = self.neighbours(index, point, point.truncate().length());
+                let (along, across) = neighbours.tangents(point)?;
+                along.cross(across).try_normalize()
             })
             .collect()
     }
+
+    /// Finds the neighbours of a point in the cell of a return, which may be the point itself.
+    #[inline]
+    fn neighbours(&self, index: usize, point: Vec3, distance_m: f32) -> Neighbours {
+        let columns = self.spacing_m / (distance_m * DirectionImage::COLUMN_RAD);
+        let columns = columns.clamp(1.0, MAX_COLUMNS) as isize;
+        let beside = |left| first_beside(self.image.beside(index, left), point, distance_m);
+        Neighbours {
+            up: first_spaced(self.image.above(index), point, self.spacing_m),
+            down: first_spaced(self.image.below(index), point, self.spacing_m),
+            left: beside(columns),
+            right: beside(-columns),
+        }
+    }
 }
 
-/// The surface at `N` points, a column per coordinate, so that angles are computed in a
+/// Vectors from a point to its neighbours on the same surface.
+struct Neighbours {
+    up: Option<Vec3>,
+    down: Option<Vec3>,
+    left: Option<Vec3>,
+    right: Option<Vec3>,
+}
+
+impl Neighbours {
+    /// Vertical and horizontal tangent; `None` without vertical neighbours.
+    fn tangents(&self, point: Vec3) -> Option<(Vec3, Vec3)> {
+        let along = difference(self.up, self.down)?;
+        // Without neighbours at the sides the surface is assumed to be level across the beam.
+        let level = Vec3::new(-point.y, point.x, 0.0);
+        Some((along, difference(self.left, self.right).unwrap_or(level)))
+    }
+}
+
+fn difference(ahead: Option<Vec3>, behind: Option<Vec3>) -> Option<Vec3> {
+    match (ahead, behind) {
+        (Some(ahead), Some(behind)) => Some(ahead - behind),
+        (ahead, behind) => ahead.or(behind.map(|behind| -behind)),
+    }
+}
+
+/// Returns the vector to the first return that is `spacing_m` away, or else to the last one.
+#[inline]
+fn first_spaced<'a>(
+    returns: impl Iterator<Item = &'a Return>,
+    point: Vec3,
+    spacing_m: f32,
+) -> Option<Vec3> {
+    let mut found = None;
+    for other in returns {
+        let delta = other.point - point;
+        found = Some(delta);
+        if delta.length_squared() > spacing_m * spacing_m {
+            break;
+        }
+    }
+    found
+}
+
+/// Returns the vector to the first return about as far away as the point.
+#[inline]
+fn first_beside<'a>(
+    mut returns: impl Iterator<Item = &'a Return>,
+    point: Vec3,
+    distance_m: f32,
+) -> Option<Vec3> {
+    let gate_m = 0.3 + 0.02 * distance_m;
+    returns
+        .find(|other| (other.distance_m - distance_m).abs() < gate_m)
+        .map(|other| other.point - point)
+}
+
+/// The surface at `N` points, one column per coordinate, so that angles are computed in a
 /// vectorized loop.
 struct Surfaces<const N: usize> {
-    /// Two tangents.
+    /// Vertical tangents.
     along: [[f32; N]; 3],
+    /// Horizontal tangents.
     across: [[f32; N]; 3],
-    /// Squared level length and rise of the way up to a point and of the way on from it.
+    /// Squared horizontal length and rise from the neighbour below to the point.
     before: [[f32; N]; 2],
+    /// Squared horizontal length and rise from the point to the neighbour above.
     after: [[f32; N]; 2],
 }
 
 impl<const N: usize> Surfaces<N> {
-    /// An upright wall with a sharp edge: nothing speaks for a road there.
+    /// A vertical wall with a sharp edge, as [`Shape::UNKNOWN`].
     fn unknown() -> Self {
         let (no, yes) = ([0.0; N], [1.0; N]);
         Self {
@@ -167,9 +244,9 @@ impl<const N: usize> Surfaces<N> {
             (Some(down), Some(up)) => (-down, up),
             _ => (Vec3::X, Vec3::X),
         };
-        for (columns, way) in [(&mut self.before, before), (&mut self.after, after)] {
-            columns[0][row] = way.truncate().length_squared();
-            columns[1][row] = way.z;
+        for (columns, step) in [(&mut self.before, before), (&mut self.after, after)] {
+            columns[0][row] = step.truncate().length_squared();
+            columns[1][row] = step.z;
         }
     }
 
@@ -200,87 +277,21 @@ impl<const N: usize> Surfaces<N> {
     }
 }
 
-/// Vectors from a point to its neighbours on the same surface, as far as there are any.
-struct Neighbours {
-    up: Option<Vec3>,
-    down: Option<Vec3>,
-    left: Option<Vec3>,
-    right: Option<Vec3>,
-}
-
-/// How many columns to the sides a neighbour is looked for.
-const MAX_COLUMNS: f32 = 5.0;
-
-impl Neighbours {
-    /// Of a point in the cell of a return, which may be the point itself.
-    #[inline]
-    fn of(
-        image: &DirectionImage,
-        holder: usize,
-        point: Vec3,
-        distance_m: f32,
-        spacing_m: f32,
-    ) -> Self {
-        let columns = spacing_m / (distance_m * DirectionImage::COLUMN_RAD);
-        let columns = columns.clamp(1.0, MAX_COLUMNS) as isize;
-        let beside = |left| beside(image.beside(holder, left), point, distance_m);
-        Self {
-            up: first_spaced(image.above(holder), point, spacing_m),
-            down: first_spaced(image.below(holder), point, spacing_m),
-            left: beside(columns),
-            right: beside(-columns),
-        }
-    }
-
-    fn tangents(&self, point: Vec3) -> Option<(Vec3, Vec3)> {
-        let along = difference(self.up, self.down)?;
-        // Without neighbours at the sides the surface is taken as level across.
-        let level = Vec3::new(-point.y, point.x, 0.0);
-        Some((along, difference(self.left, self.right).unwrap_or(level)))
-    }
-
-    fn normal(&self, point: Vec3) -> Option<Vec3> {
-        let (along, across) = self.tangents(point)?;
-        along.cross(across).try_normalize()
-    }
-}
-
-fn difference(ahead: Option<Vec3>, behind: Option<Vec3>) -> Option<Vec3> {
-    match (ahead, behind) {
-        (Some(ahead), Some(behind)) => Some(ahead - behind),
-        (Some(ahead), None) => Some(ahead),
-        (None, Some(behind)) => Some(-behind),
-        (None, None) => None,
-    }
-}
-
-/// Towards the first return that is `spacing_m` away, or the last nearer one.
+/// `atan2` to 2e-4 rad, which suffices to choose a cell; several times faster than the exact one.
 #[inline]
-fn first_spaced<'a>(
-    returns: impl Iterator<Item = &'a Return>,
-    point: Vec3,
-    spacing_m: f32,
-) -> Option<Vec3> {
-    let mut found = None;
-    for other in returns {
-        let delta = other.point - point;
-        found = Some(delta);
-        if delta.length_squared() > spacing_m * spacing_m {
-            break;
-        }
-    }
-    found
-}
-
-/// Towards the first of the returns that is about as far away as the point.
-#[inline]
-fn beside<'a>(
-    mut returns: impl Iterator<Item = &'a Return>,
-    point: Vec3,
-    distance_m: f32,
-) -> Option<Vec3> {
-    let gate_m = 0.3 + 0.02 * distance_m;
-    returns
-        .find(|other| (other.distance_m - distance_m).abs() < gate_m)
-        .map(|other| other.point - point)
+fn coarse_atan2(y: f32, x: f32) -> f32 {
+    let (ax, ay) = (x.abs(), y.abs());
+    // Selections instead of branches, so that loops over it are vectorized.
+    let (small, large) = if ay < ax { (ay, ax) } else { (ax, ay) };
+    let large = if large > f32::MIN_POSITIVE {
+        large
+    } else {
+        f32::MIN_POSITIVE
+    };
+    let t = small / large;
+    let s = t * t;
+    let octant = t * (0.999_787_8 + s * (-0.325_808_4 + s * (0.155_557_6 - s * 0.044_326_12)));
+    let quadrant = if ay < ax { octant } else { FRAC_PI_2 - octant };
+    let half = if x < 0.0 { PI - quadrant } else { quadrant };
+    half.copysign(y)
 }

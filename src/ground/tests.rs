@@ -1,8 +1,10 @@
-//! Laws of the classifiers on drawn worlds.
+//! Laws of the classifiers in synthetic worlds.
+
+mod scenes;
 
 use glam::Vec3;
 
-use super::scenes::{Sensor, Surface, cuboid};
+use self::scenes::{Sensor, Surface, cuboid};
 use super::*;
 
 const SENSORS: [Sensor; 2] = [Sensor::SIXTY_FOUR, Sensor::THIRTY_TWO];
@@ -12,24 +14,24 @@ fn fuzzy() -> [FuzzyGround; 2] {
         .map(|config| FuzzyGround::new(config).unwrap())
 }
 
-/// Share of the returns of one surface that are called ground, among those that `wanted` names.
+/// Share of the returns that are classified as ground, among those that `selected` accepts.
 fn share_of_ground(
     classifier: &dyn GroundClassifier,
     sensor: &Sensor,
     surfaces: &[Surface],
-    wanted: impl Fn(usize, Vec3) -> bool,
+    selected: impl Fn(usize, Vec3) -> bool,
 ) -> f64 {
     let (points, hits) = sensor.scan(surfaces);
     let confidences = classifier.ground_confidence(&points);
-    let (mut called, mut all) = (0, 0);
+    let (mut positives, mut all) = (0, 0);
     for ((&point, &hit), &confidence) in points.iter().zip(&hits).zip(&confidences) {
-        if wanted(hit, point) && point.truncate().length() > 2.5 {
+        if selected(hit, point) && point.truncate().length() > 2.5 {
             all += 1;
-            called += usize::from(confidence > 0.5);
+            positives += u32::from(confidence > 0.5);
         }
     }
-    assert!(all > 50, "{all} points are too few to tell");
-    f64::from(called as u32) / f64::from(all as u32)
+    assert!(all > 50, "{all} points are too few");
+    f64::from(positives) / f64::from(all)
 }
 
 #[test]
@@ -69,7 +71,7 @@ fn a_crest_is_ground() {
 }
 
 #[test]
-fn a_wall_is_not_ground_and_the_road_before_it_is() {
+fn a_wall_is_not_ground_but_the_road_in_front_of_it_is() {
     for sensor in SENSORS {
         for classifier in fuzzy() {
             let scene = [
@@ -97,7 +99,7 @@ fn the_top_of_a_kerb_is_ground() {
 }
 
 #[test]
-fn a_car_is_not_ground_neither_its_side_nor_its_roof() {
+fn neither_the_side_nor_the_roof_of_a_car_is_ground() {
     for sensor in SENSORS {
         let road_m = -sensor.height_m;
         let scene = [
@@ -115,13 +117,13 @@ fn a_car_is_not_ground_neither_its_side_nor_its_roof() {
         let is_car = |hit, point: Vec3| hit > 0 && point.z > road_m + 0.2;
         let [four, three] = fuzzy().map(|fuzzy| share_of_ground(&fuzzy, &sensor, &scene, is_car));
         assert!(four < 0.05, "{four}");
-        // A roof is as flat as a road, and its height alone gives it away.
+        // A roof is as flat as a road; only its height distinguishes it.
         assert!(three < 0.15, "{three}");
     }
 }
 
 #[test]
-fn on_a_slope_the_fuzzy_rules_see_ground_where_one_plane_does_not() {
+fn fuzzy_rules_find_the_ground_of_a_slope_where_one_plane_does_not() {
     let sensor = Sensor::SIXTY_FOUR;
     let slope = [sensor.ground(|x, _| 0.15 * (x - 8.0).max(0.0))];
     let on_slope = |_, point: Vec3| point.x > 12.0;
@@ -132,7 +134,7 @@ fn on_a_slope_the_fuzzy_rules_see_ground_where_one_plane_does_not() {
 }
 
 #[test]
-fn nothing_and_points_that_are_no_numbers_are_no_ground() {
+fn empty_scans_and_points_that_are_not_finite_are_not_ground() {
     let classifiers: [&dyn GroundClassifier; 5] = [
         &fuzzy()[0],
         &fuzzy()[1],
@@ -161,7 +163,7 @@ fn nothing_and_points_that_are_no_numbers_are_no_ground() {
 }
 
 #[test]
-fn bad_points_among_good_ones_change_nothing() {
+fn invalid_points_do_not_affect_the_others() {
     let sensor = Sensor::SIXTY_FOUR;
     let (points, _) = sensor.scan(&[sensor.ground(|_, _| 0.0)]);
     let mut spoiled = points.clone();
@@ -179,7 +181,7 @@ fn bad_points_among_good_ones_change_nothing() {
 }
 
 #[test]
-fn an_explanation_ends_at_the_confidence_and_names_the_rules_that_fired() {
+fn an_explanation_contains_the_confidence_and_the_rules_that_fired() {
     let [classifier, _] = fuzzy();
     let road = Features {
         slope_deg: 2.0,
@@ -189,8 +191,8 @@ fn an_explanation_ends_at_the_confidence_and_names_the_rules_that_fired() {
     };
     let explanation = classifier.explain(&road);
     assert_eq!(explanation.confidence, classifier.confidence(&road));
-    assert_eq!(explanation.verdict, Verdict::DefinitelyGround);
-    assert_eq!(explanation.fired[0].consequence, "high");
+    assert_eq!(explanation.verdict, "definitely ground");
+    assert_eq!(explanation.fired[0].consequent, "high");
     assert_eq!(explanation.fired[0].strength, 1.0);
     let text = explanation.to_string();
     assert!(
@@ -203,25 +205,25 @@ fn an_explanation_ends_at_the_confidence_and_names_the_rules_that_fired() {
         ..road
     };
     let explanation = classifier.explain(&roof);
-    assert_eq!(explanation.verdict, Verdict::DefinitelyNotGround);
+    assert_eq!(explanation.verdict, "definitely not ground");
 }
 
 #[test]
-fn the_words_of_a_confidence_and_of_its_complement_mirror_each_other() {
+fn verdicts_are_symmetric_about_one_half() {
     let [classifier, _] = fuzzy();
     let words = [0.95, 0.7, 0.5, 0.3, 0.05].map(|confidence| classifier.verdict(confidence));
     let expected = [
-        Verdict::DefinitelyGround,
-        Verdict::ProbablyGround,
-        Verdict::Uncertain,
-        Verdict::ProbablyNotGround,
-        Verdict::DefinitelyNotGround,
+        "definitely ground",
+        "probably ground",
+        "uncertain",
+        "probably not ground",
+        "definitely not ground",
     ];
     assert_eq!(words, expected);
 }
 
 #[test]
-fn a_configuration_survives_yaml_and_a_mistyped_rule_is_told() {
+fn a_configuration_round_trips_through_yaml_and_typing_errors_are_reported() {
     let config = FuzzyConfig::three_features();
     let text = serde_yaml::to_string(&config).unwrap();
     let back: FuzzyConfig = serde_yaml::from_str(&text).unwrap();
@@ -238,14 +240,14 @@ fn a_configuration_survives_yaml_and_a_mistyped_rule_is_told() {
 }
 
 #[test]
-fn membership_curves_stay_within_0_and_1_and_cover_every_set() {
-    let [classifier, _] = fuzzy();
-    let curves = classifier.membership_curves(101);
-    assert_eq!(curves.len(), 3 * 3 + 4 + 3);
-    for curve in curves {
-        assert_eq!(curve.points.len(), 101);
-        let degrees = || curve.points.iter().map(|&(_, degree)| degree);
-        assert!(degrees().all(|degree| (0.0..=1.0).contains(&degree)));
-        assert!(degrees().any(|degree| degree > 0.9), "{}", curve.set);
+fn the_chart_range_of_a_variable_contains_the_core_of_every_set() {
+    for config in [FuzzyConfig::default(), FuzzyConfig::three_features()] {
+        for (variable, sets) in &config.variables {
+            let (from, to) = config.chart_range(variable);
+            for (set, function) in sets {
+                let degree = |step| function.degree(from + 0.01 * step as f32 * (to - from));
+                assert!((0..=100).any(|step| degree(step) > 0.9), "{set}");
+            }
+        }
     }
 }

@@ -81,6 +81,12 @@ impl Colormap {
         let below = (place as usize).min(last - 1);
         blend(anchors[below], anchors[below + 1], place - below as f64)
     }
+
+    /// Color of each confidence, 0 to 1.
+    pub fn colors(self, confidences: &[f32]) -> Vec<Rgb> {
+        let color = |&confidence: &f32| self.at(f64::from(confidence));
+        confidences.iter().map(color).collect()
+    }
 }
 
 /// Linear interpolation between two colors.

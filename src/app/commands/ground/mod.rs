@@ -1,19 +1,19 @@
-//! `ground`: which points are road, and why.
+//! `ground`: ground segmentation of a recording, with scores if there are labels.
 //!
 //! Into `output_folder` go
 //!
 //! ```text
 //! labels/000000.label    SemanticKITTI classes: 40 (road) for ground, 99 (other object) else
 //! points/000000.ply      the points coloured by confidence: red is ground, blue is not
-//! scan_000000.png        a scan from above, its errors highlighted
-//! memberships.png        the sets of the fuzzy rules
+//! scan_000000.png        a scan from above, errors highlighted
+//! memberships.png        the membership functions of the fuzzy rules
 //! ground.yml             the effective configuration
 //! ground.json            the table on standard output; written last
 //! ```
 
 mod input;
-mod methods;
 mod pictures;
+mod report;
 mod simulated;
 
 use std::fmt::Write as _;
@@ -21,119 +21,89 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
-use serde::Serialize;
 
-use self::input::{LabelledPoints, Source};
-use self::methods::{Method, MethodReport, Tally, tally_table};
+use self::report::GroundReport;
 use super::interrupt::Interrupted;
 use super::{Context, output};
 use crate::app::cli::GroundArgs;
 use crate::app::config::{self, GroundCommandConfig};
 use crate::app::plotting::color::Colormap;
+use crate::evaluation::{GroundTally, LabelledPoints};
 use crate::geometry::Vec3;
 use crate::ground::{FuzzyGround, GroundMethod};
 use crate::map::ply;
 use crate::recording::velodyne;
 
-/// Class of ground in written labels.
+/// SemanticKITTI class of ground in written labels.
 const GROUND_CLASS: u16 = 40;
-/// Class of everything else.
-const REST_CLASS: u16 = 99;
+/// SemanticKITTI class of all other points.
+const OTHER_CLASS: u16 = 99;
 
-/// `ground.json`.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct GroundReport {
-    /// Folder of the scans, or the scan.
-    pub scans_from: PathBuf,
-    /// Scans that were judged.
-    pub scans: usize,
-    /// Of them with labels.
-    pub labelled_scans: usize,
-    /// Points of all scans.
-    pub points: usize,
-    /// Threads that shared the work.
-    pub threads: usize,
-    /// What the chosen method did, then the others.
-    pub methods: Vec<MethodReport>,
-}
-
-/// Judges scans, or explains a point, or compares on simulated scenes; the text for standard output.
+/// Segments scans, explains a point, or compares the methods on simulated scenes; returns the text
+/// for standard output.
 pub fn run(args: &GroundArgs, context: &Context) -> Result<String> {
-    let (config, source) = input::load(args)?;
+    let (config, path) = input::load(args)?;
     if args.simulated {
         return simulated::run(&config, context);
     }
     match args.explain.as_deref() {
-        Some(&[x, y, z]) => explain(&config, &source, Vec3::new(x, y, z)),
-        _ => Ok(judge(&config, &source, context)?.to_text()),
+        Some(&[x, y, z]) => explain(&config, &path, Vec3::new(x, y, z)),
+        _ => Ok(segment(&config, &path, context)?.to_text()),
     }
 }
 
-/// Why the point nearest to a position has its confidence.
-fn explain(config: &GroundCommandConfig, source: &Source, position: Vec3) -> Result<String> {
-    let scan_file = match source {
-        Source::Scan(path) => path,
-        Source::Folder(folder) => anyhow::bail!(
-            "--explain needs one scan, but {} is a folder; give the path of one of its .bin files",
-            folder.display()
-        ),
-    };
+/// Explains the confidence of the point nearest to a position.
+fn explain(config: &GroundCommandConfig, path: &Path, position: Vec3) -> Result<String> {
+    ensure!(
+        input::is_scan(path),
+        "--explain needs one scan, but {} is a folder; give the path of one of its .bin files",
+        path.display()
+    );
     ensure!(
         config.ground_method == GroundMethod::Fuzzy,
-        "--explain shows fuzzy rules, but ground_method is another; leave it at fuzzy"
+        "--explain needs fuzzy rules; set ground_method to fuzzy"
     );
-    let points = velodyne::read_scan(scan_file)?.points;
-    let squared_gap = |point: &Vec3| point.distance_squared(position);
-    let nearest = (0..points.len())
-        .filter(|&index| points[index].is_finite())
-        .min_by(|&a, &b| squared_gap(&points[a]).total_cmp(&squared_gap(&points[b])));
-    let Some(index) = nearest else {
-        anyhow::bail!("{} has no finite point to explain", scan_file.display());
-    };
-    let classifier = fuzzy(config)?;
-    let point = points[index];
-    let mut text = format!(
-        "point {index} at {:.3} {:.3} {:.3} m, {:.3} m from there\n",
-        point.x,
-        point.y,
-        point.z,
-        point.distance(position)
-    );
-    let classes = input::labels_of(scan_file, config.label_folder.as_deref(), None)?;
-    if let Some(class) = classes.iter().flatten().nth(index) {
-        writeln!(text, "its label is class {class}")?;
+    let scan = input::scans(path, config)?.remove(0).read()?;
+    let distance_m = |&index: &usize| scan.points[index].distance(position);
+    let index = (0..scan.points.len())
+        .filter(|&index| scan.points[index].is_finite())
+        .min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)))
+        .with_context(|| format!("{} has no finite point to explain", path.display()))?;
+    let Vec3 { x, y, z } = scan.points[index];
+    let distance_m = distance_m(&index);
+    let mut text =
+        format!("point {index} at {x:.3} {y:.3} {z:.3} m, at a distance of {distance_m:.3} m\n");
+    if let Some(classes) = &scan.classes {
+        writeln!(text, "its label is class {}", classes[index])?;
     }
-    match classifier.features(&points)[index] {
+    let classifier = FuzzyGround::new(config.fuzzy.clone())?;
+    match classifier.features(&scan.points)[index] {
         Some(features) => writeln!(text, "\n{}", classifier.explain(&features))?,
         None => writeln!(
             text,
-            "not judged: it is on the own car, nearer than fuzzy.features.min_distance_m = {} m, or too far away; its confidence is 0",
+            "its confidence is 0 because it is out of range, or on the own car: nearer than fuzzy.features.min_distance_m = {} m",
             config.fuzzy.features.min_distance_m
         )?,
     }
     Ok(text)
 }
 
-/// Judges all scans of a source.
-fn judge(config: &GroundCommandConfig, source: &Source, context: &Context) -> Result<GroundReport> {
-    let scans = source.scans(config)?;
+/// Segments the scan at a path or all selected scans of a folder, and writes the results.
+fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Result<GroundReport> {
+    let scans = input::scans(path, config)?;
     let report_file = config.output_folder.join("ground.json");
     output::prepare(&report_file, "output_folder", config.force)?;
-    input::keep_truth_safe(config, source)?;
-    let mut methods = methods::all(config)?;
-    let any_labels = scans.iter().any(|scan| scan.label_path.is_some());
-    if !(config.compare && any_labels) {
+    input::check_overwrite(config, &scans)?;
+    pictures::draw_memberships(&config.fuzzy, &config.output_folder.join("memberships.png"))?;
+
+    let mut methods = config.ground().all_classifiers()?;
+    if !(config.compare && scans.iter().any(|scan| scan.label_path.is_some())) {
         methods.truncate(1);
     }
-    pictures::draw_memberships(
-        &fuzzy(config)?,
-        &config.output_folder.join("memberships.png"),
-    )?;
-
-    let mut tallies = vec![Tally::default(); methods.len()];
+    let mut tallies = vec![GroundTally::default(); methods.len()];
     let (mut labelled_scans, mut points) = (0, 0);
     let task = context.progress.task("ground", scans.len());
-    for (position, scan) in scans.iter().enumerate() {
+    for (position, files) in scans.iter().enumerate() {
         if context.interrupt.requested() {
             let kept = format!(
                 "{position} of {} scans are in {}; run again with --force for all of them",
@@ -142,26 +112,28 @@ fn judge(config: &GroundCommandConfig, source: &Source, context: &Context) -> Re
             );
             return Err(Interrupted { kept }.into());
         }
-        let labelled = scan.read()?;
-        points += labelled.points.len();
-        labelled_scans += usize::from(labelled.classes.is_some());
-        let chosen = judge_scan(&methods, &mut tallies, &labelled, config.ground_threshold);
-        write_scan(config, &scan.name, &labelled, &chosen)?;
+        let scan = files.read()?;
+        points += scan.points.len();
+        labelled_scans += usize::from(scan.classes.is_some());
+        let confidences: Vec<Vec<f32>> = std::iter::zip(&methods, &mut tallies)
+            .map(|((_, classifier), tally)| {
+                tally.classify(classifier.as_ref(), &scan, config.ground_threshold)
+            })
+            .collect();
+        write_scan(config, &files.name, &scan, &confidences[0])?;
         if config.plot_step > 0 && position % config.plot_step == 0 {
-            pictures::draw_scan(config, &scan.name, &labelled, &chosen)?;
+            pictures::draw_scan(config, &files.name, &scan, &confidences[0])?;
         }
         task.advance(1);
     }
     let report = GroundReport {
-        scans_from: source.path().to_owned(),
+        scans_from: path.to_owned(),
         scans: scans.len(),
         labelled_scans,
         points,
         threads: context.threads,
-        methods: methods
-            .iter()
-            .zip(&tallies)
-            .map(|(method, tally)| tally.report(method.name, labelled_scans > 0))
+        methods: std::iter::zip(&methods, &tallies)
+            .map(|((name, _), tally)| tally.report(name))
             .collect(),
     };
     config::write(&config.output_folder.join("ground.yml"), config)?;
@@ -169,95 +141,34 @@ fn judge(config: &GroundCommandConfig, source: &Source, context: &Context) -> Re
     Ok(report)
 }
 
-/// The confidences of the first method; all methods are tallied.
-fn judge_scan(
-    methods: &[Method],
-    tallies: &mut [Tally],
-    scan: &LabelledPoints,
-    threshold: f32,
-) -> Vec<f32> {
-    let mut chosen = Vec::new();
-    for (index, (method, tally)) in methods.iter().zip(tallies).enumerate() {
-        let confidences = tally.judge(method.classifier.as_ref(), scan, threshold);
-        if index == 0 {
-            chosen = confidences;
-        }
-    }
-    chosen
-}
-
-/// Writes what is to be written of a scan.
+/// Writes labels and coloured points of a scan, as configured.
 fn write_scan(
     config: &GroundCommandConfig,
     name: &Path,
     scan: &LabelledPoints,
     confidences: &[f32],
 ) -> Result<()> {
+    let output_path = |folder: &str, extension: &str| -> Result<PathBuf> {
+        let path = config.output_folder.join(folder).join(name);
+        let folder = path.parent().unwrap_or(&path);
+        fs::create_dir_all(folder)
+            .with_context(|| format!("cannot create {}", folder.display()))?;
+        Ok(path.with_extension(extension))
+    };
     if config.write_labels {
-        let classes: Vec<u16> = confidences
-            .iter()
-            .map(|&confidence| {
-                if confidence > config.ground_threshold {
-                    GROUND_CLASS
-                } else {
-                    REST_CLASS
-                }
-            })
-            .collect();
-        let path = output_path(config, "labels", name, "label")?;
+        let class = |&confidence: &f32| {
+            let is_ground = confidence > config.ground_threshold;
+            if is_ground { GROUND_CLASS } else { OTHER_CLASS }
+        };
+        let classes: Vec<u16> = confidences.iter().map(class).collect();
+        let path = output_path("labels", "label")?;
         output::write_file(&path, |file| velodyne::write_labels(file, &classes))?;
     }
     if config.write_plys {
-        let colors: Vec<[u8; 3]> = confidences
-            .iter()
-            .map(|&confidence| Colormap::Diverging.at(f64::from(confidence)))
-            .collect();
-        let path = output_path(config, "points", name, "ply")?;
-        output::replace(&path, |part| {
+        let colors = Colormap::Diverging.colors(confidences);
+        output::replace(&output_path("points", "ply")?, |part| {
             Ok(ply::write_points(part, &scan.points, &colors, confidences)?)
         })?;
     }
     Ok(())
-}
-
-/// A file of a scan in the output folder; its folder is made.
-fn output_path(
-    config: &GroundCommandConfig,
-    kind: &str,
-    name: &Path,
-    extension: &str,
-) -> Result<PathBuf> {
-    let path = config
-        .output_folder
-        .join(kind)
-        .join(name)
-        .with_extension(extension);
-    let folder = path.parent().unwrap_or(&path);
-    fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
-    Ok(path)
-}
-
-fn fuzzy(config: &GroundCommandConfig) -> Result<FuzzyGround> {
-    FuzzyGround::new(config.fuzzy.clone()).context("fuzzy: the rules of the ground")
-}
-
-impl GroundReport {
-    /// The table for people.
-    pub fn to_text(&self) -> String {
-        let mut text = format!(
-            "{} scans of {}, {} with labels, {} points, {} {}\n",
-            self.scans,
-            self.scans_from.display(),
-            self.labelled_scans,
-            self.points,
-            self.threads,
-            if self.threads == 1 {
-                "thread"
-            } else {
-                "threads"
-            }
-        );
-        text.push_str(&tally_table(&self.methods));
-        text
-    }
 }

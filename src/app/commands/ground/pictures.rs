@@ -1,46 +1,46 @@
-//! The sets of the rules, and scans from above.
+//! Membership functions, and scans from above.
 
 use std::path::Path;
 
 use anyhow::Result;
 
-use super::input::LabelledPoints;
-use super::methods::score;
 use crate::app::config::GroundCommandConfig;
 use crate::app::plotting::color::SERIES;
 use crate::app::plotting::{GroundPlot, LineChart, Panel, Series};
-use crate::ground::{Features, FuzzyGround, Protocol};
+use crate::evaluation::{GroundProtocol, LabelledPoints};
+use crate::ground::{Features, FuzzyConfig};
 
 /// Samples of a membership function.
-const SAMPLES: usize = 401;
-/// How far a picture reaches ahead and to the sides [m].
+const SAMPLES: u16 = 401;
+/// Distances ahead and to the sides up to which a scan is drawn [m].
 const REACH_M: (f64, f64) = (50.0, 35.0);
 
-/// Draws all membership functions, a panel per variable.
-pub fn draw_memberships(classifier: &FuzzyGround, path: &Path) -> Result<()> {
-    let mut panels: Vec<Panel> = Vec::new();
-    for curve in classifier.membership_curves(SAMPLES) {
-        let x_name = name_with_unit(&curve.variable);
-        if panels.last().and_then(|panel| panel.own_x_name.as_ref()) != Some(&x_name) {
-            panels.push(Panel {
-                y_name: "membership".to_owned(),
-                own_x_name: Some(x_name),
-                ..Panel::default()
-            });
-        }
-        if let Some(panel) = panels.last_mut() {
-            let color = SERIES[panel.series.len() % SERIES.len()];
-            let points = curve.points.iter().map(|&(x, y)| (x.into(), y.into()));
-            panel.series.push(Series::line(&curve.set, color, points));
-        }
+/// Draws the membership functions of all fuzzy sets, one panel per linguistic variable.
+pub fn draw_memberships(config: &FuzzyConfig, path: &Path) -> Result<()> {
+    let mut panels = Vec::new();
+    for (variable, sets) in &config.variables {
+        let (from, to) = config.chart_range(variable);
+        let series = sets.iter().zip(SERIES.iter().cycle());
+        let series = series.map(|((set, function), &color)| {
+            let sample = |sample| {
+                let x = from + f32::from(sample) / f32::from(SAMPLES - 1) * (to - from);
+                (x.into(), function.degree(x).into())
+            };
+            Series::line(set, color, (0..SAMPLES).map(sample))
+        });
+        panels.push(Panel {
+            y_name: "membership".to_owned(),
+            own_x_name: Some(name_with_unit(variable)),
+            series: series.collect(),
+            ..Panel::default()
+        });
     }
-    LineChart {
-        title: "Linguistic sets".to_owned(),
+    let chart = LineChart {
+        title: "Membership functions".to_owned(),
         panels,
         ..LineChart::default()
-    }
-    .save(path)?;
-    Ok(())
+    };
+    Ok(chart.save(path)?)
 }
 
 /// `height_variance` becomes `height variance [m]`; the output has no unit.
@@ -61,29 +61,23 @@ pub fn draw_scan(
     confidences: &[f32],
 ) -> Result<()> {
     let threshold = config.ground_threshold;
-    let called_ground: Vec<bool> = confidences.iter().map(|&c| c > threshold).collect();
-    let protocol = Protocol::PatchworkPlusPlus;
-    let classes = scan.classes.iter().flatten();
-    let truth: Vec<Option<bool>> = scan
-        .points
-        .iter()
-        .zip(classes)
-        .map(|(point, &class)| protocol.truth(class, point.z))
-        .collect();
-    let f1 = score(scan, confidences, threshold, protocol).f1();
-    let title = if truth.is_empty() {
-        format!("Ground of scan {}", name.display())
-    } else {
-        format!("Ground of scan {}, F1 {:.2} %", name.display(), 100.0 * f1)
-    };
+    let protocol = GroundProtocol::PatchworkPlusPlus;
+    let truth = scan.truth(protocol);
+    let mut title = format!("Ground of scan {}", name.display());
+    if !truth.is_empty() {
+        let f1 = scan.score(protocol, confidences, threshold, |_| true).f1();
+        title += &format!(", F1 {:.2} %", 100.0 * f1);
+    }
     let file = format!("scan_{}.png", name.display()).replace(['/', '\\'], "_");
-    GroundPlot {
+    let plot = GroundPlot {
         title: &title,
         points: &scan.points,
-        called_ground: &called_ground,
+        called_ground: &confidences
+            .iter()
+            .map(|&c| c > threshold)
+            .collect::<Vec<_>>(),
         truth: &truth,
         reach_m: REACH_M,
-    }
-    .save(&config.output_folder.join(file))?;
-    Ok(())
+    };
+    Ok(plot.save(&config.output_folder.join(file))?)
 }

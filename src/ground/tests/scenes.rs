@@ -1,4 +1,4 @@
-//! Scans of drawn worlds for tests: what a spinning sensor sees of ground, boxes and walls.
+//! Scans of synthetic worlds for tests: what a spinning sensor measures of ground, boxes and walls.
 
 use glam::Vec3;
 
@@ -27,7 +27,7 @@ impl Sensor {
         height_m: 1.9,
     };
 
-    /// The returns of one revolution and the number of the surface that each came from.
+    /// The returns of one revolution, and the index of the surface of each.
     pub(super) fn scan(&self, surfaces: &[Surface]) -> (Vec<Vec3>, Vec<usize>) {
         const COLUMNS: usize = 1000;
         let (mut points, mut hits) = (Vec::new(), Vec::new());
@@ -54,7 +54,7 @@ impl Sensor {
         (points, hits)
     }
 
-    /// Ground whose height over the ground under the sensor is a function of x and y.
+    /// Ground whose height above the ground below the sensor is a function of x and y.
     pub(super) fn ground(&self, height: impl Fn(f32, f32) -> f32 + 'static) -> Surface {
         let sensor_m = self.height_m;
         Box::new(move |direction| {
@@ -84,7 +84,7 @@ impl Sensor {
     }
 }
 
-/// An upright box between two corners in the lidar frame.
+/// An axis-aligned box between two corners in the lidar frame.
 pub(super) fn cuboid(min: Vec3, max: Vec3) -> Surface {
     Box::new(move |direction| {
         let (a, b) = (min / direction, max / direction);
