@@ -17,10 +17,10 @@ mod logging;
 mod odometry;
 pub mod output;
 pub mod progress;
-mod run_output;
-mod run_page;
+pub mod run_output;
+pub mod run_page;
 mod stages;
-mod version;
+pub mod version;
 
 use std::io::Write as _;
 use std::process::ExitCode;

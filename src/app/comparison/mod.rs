@@ -1,12 +1,32 @@
-//! Many runs beside each other: which configuration is better, by how much, and whether that is
-//! more than chance.
+//! Comparison of configurations: which one is better, by how much, and whether the difference
+//! exceeds chance. Sequences × configurations × seeds are executed and summarized in tables.
 //!
-//! A [`RunRecord`] is what one run leaves for the comparison. [`measures`] takes numbers out of it,
-//! [`spread`] tells their mean and scatter over seeds and sequences, [`paired`] whether two
-//! configurations differ, and [`tables`] puts all that into rows and columns.
+//! ```text
+//! comparison.yml
+//!   | plan        all runs with their effective configurations; overrides in the order
+//!   |             defaults <- base <- sequence <- configuration <- seed
+//!   v
+//! sequences/NAME/drive_1, drive_2          simulated drives
+//!   | keys        hash of all that a stage depends on: configuration without paths, contents of
+//!   |             the inputs, executable (BLAKE3)
+//!   v
+//! shared/maps/KEY/map.ply                  one per map key
+//! shared/localizations/KEY/...             one per map, filter configuration and seed
+//!   | execute     one run after another; each uses all threads
+//!   v
+//! runs/SEQUENCE/CONFIGURATION/SEED/        build_map.yml localization.yml refinement.yml log.txt
+//!   |                                      localization.npz report.html plots/, finally run.json
+//!   | collect     tables and page of the finished runs
+//!   v
+//! report.html tables.txt tables.md comparison.json TABLE.csv plots/
+//! ```
 //!
-//! What a run is measured by, with e = t_estimate − t_truth in the plane, θ the heading, s the distance
-//! driven, and the mean over the frames that count:
+//! A run is skipped if its `run.json` has the current key, so that an interrupted comparison
+//! resumes. Shared results are created under a file lock: the runs of one comparison may be
+//! separate processes, on one or several machines.
+//!
+//! Measures of a run, with e = t_estimate − t_truth in the plane, heading θ, driven distance s, and
+//! means over the evaluated frames:
 //!
 //! ```text
 //! average positional error   mean |e|                          absolute pose error without alignment,
@@ -17,23 +37,34 @@
 //! smoothness                 −ln(T³ / v_peak² · ∫ |d³p/dt³|² dt)   Hogan and Sternad 2009
 //! drift                      slope of |e| against s, and against time (least squares)
 //! mean pose change           mean |p_k − p_k−1|,  mean |wrap(θ_k − θ_k−1)|
-//! success                    from the first of ten frames in a row with |e| ≤ 0.5 m and a heading
-//!                            error ≤ 2 degrees on, all frames are like that
+//! success                    |e| ≤ 0.5 m and heading error ≤ 2 degrees in ten consecutive frames
+//!                            and in all frames after them
 //! range-mcl's success        |e| < 5 m at every 100th frame from the 100th on; Chen et al. 2021
 //! ```
 //!
-//! Relative pose errors and KITTI's segment errors are in [`pose_error`](super::pose_error).
+//! Relative pose errors and KITTI's segment errors: [`pose_error`](crate::evaluation::pose_error).
 
-pub mod measures;
-pub mod paired;
+// Runs and their execution.
+mod cache;
+mod execute;
+mod keys;
+pub mod layout;
+pub mod plan;
 pub mod record;
-pub mod spread;
-pub mod success;
-pub mod tables;
+// Evaluation of the records.
+mod collect;
+pub mod measures;
+mod page;
+mod pictures;
+mod results;
+pub mod statistics;
+pub mod table;
+mod tables;
 
-pub use measures::Measure;
-pub use paired::paired_difference;
+pub use collect::collect;
+pub use execute::Executor;
+pub use layout::Layout;
+pub use plan::{PlannedRun, planned_runs};
 pub use record::{Outcome, RunId, RunRecord};
-pub use spread::mean_with_spread;
-pub use success::success_rate;
-pub use tables::{Comparison, Contrast, Variant};
+pub use statistics::{Estimate, PairedDifference, SuccessRate};
+pub use table::{Cell, Column, Table};

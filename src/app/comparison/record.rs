@@ -1,26 +1,33 @@
-//! What one run leaves for the comparison.
+//! Record of one run, `run.json`.
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::fs;
+use std::path::Path;
 use std::str::FromStr;
 
+use anyhow::{Context as _, Result};
 use serde::{Deserialize, Serialize};
 
 use crate::app::results::TrajectoryReport;
+use crate::evaluation::TrajectoryMetrics;
 
-/// Which run: the drive, how it was localized, and the seed.
+/// Name of the record in the folder of its run; written last.
+pub const RECORD_FILE: &str = "run.json";
+
+/// Identity of a run: sequence, configuration and seed.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct RunId {
     /// Name of the sequence.
     pub sequence: String,
     /// Name of the configuration.
     pub configuration: String,
-    /// What random choices follow from.
+    /// Seed of the random numbers.
     pub seed: u64,
 }
 
 impl fmt::Display for RunId {
-    /// `sequence/configuration/seed`, which is also the run's folder.
+    /// `sequence/configuration/seed`, also the folder of the run.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}/{}/{}", self.sequence, self.configuration, self.seed)
     }
@@ -43,58 +50,66 @@ impl FromStr for RunId {
     }
 }
 
-/// How a run ended.
+/// Outcome of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// With a trajectory: the refined one where the configuration refines, else the filter's. Its
-    /// runtime is all that was spent on a frame.
+    /// Errors of the final trajectory: the refined one if the configuration refines, else the
+    /// filter's. The runtime per frame includes all stages.
     Finished(Box<TrajectoryReport>),
-    /// With this message.
+    /// Error message.
     Failed(String),
 }
 
-/// One run: `run.json`.
+/// Record of one run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RunRecord {
-    /// Which run.
+    /// Identity of the run.
     pub id: RunId,
-    /// Hash of all that it follows from: configuration, inputs, source of the program.
+    /// Hash of configuration, contents of the inputs and executable.
     pub key: String,
-    /// Hash of its effective configuration and the version alone.
+    /// Hash of configuration, names of the inputs and version of the program.
     pub settings: String,
-    /// Program, version and source.
+    /// Program, version and executable.
     pub program: String,
     /// Processor, threads and renderer.
     pub machine: BTreeMap<String, String>,
-    /// Wall time per stage, of those that were shared with other runs too [s].
+    /// Wall time per stage, shared stages included [s].
     pub stage_seconds: BTreeMap<String, f64>,
-    /// How it ended.
+    /// Outcome of the run.
     pub outcome: Outcome,
 }
 
 impl RunRecord {
-    /// The judgement; `None` where the run failed.
-    pub fn judgement(&self) -> Option<&TrajectoryReport> {
+    /// Reads the record in the folder of a run; `None` if there is none or if it is not readable
+    /// by this version of the program.
+    pub fn read(folder: &Path) -> Result<Option<Self>> {
+        let path = folder.join(RECORD_FILE);
+        if !path.exists() {
+            return Ok(None);
+        }
+        let text =
+            fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))?;
+        let record = serde_json::from_str(&text);
+        if let Err(error) = &record {
+            tracing::warn!("{} is ignored: {error}", path.display());
+        }
+        Ok(record.ok())
+    }
+
+    /// Metrics of the final trajectory; `None` if the run failed.
+    pub fn metrics(&self) -> Option<&TrajectoryMetrics> {
         match &self.outcome {
-            Outcome::Finished(judgement) => Some(judgement),
+            Outcome::Finished(report) => Some(&report.metrics),
             Outcome::Failed(_) => None,
         }
     }
 
-    /// Why the run failed; `None` where it did not.
-    pub fn failure(&self) -> Option<&str> {
-        match &self.outcome {
-            Outcome::Finished(_) => None,
-            Outcome::Failed(why) => Some(why),
-        }
-    }
-
-    /// Whether the car was found and kept to the end, by the strict rule.
+    /// Whether the filter converged and never diverged again (strict rule).
     pub fn is_success(&self) -> bool {
-        self.judgement().is_some_and(|judgement| {
-            (judgement.metrics.convergence).is_some_and(|convergence| convergence.kept)
-        })
+        self.metrics()
+            .and_then(|metrics| metrics.convergence.as_ref())
+            .is_some_and(|convergence| convergence.kept)
     }
 }
 
@@ -103,7 +118,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_name_of_a_run_reads_back() {
+    fn a_run_id_is_parsed_from_its_text() {
         let id = RunId {
             sequence: "town".to_owned(),
             configuration: "Fuzzy-PSO-MCL".to_owned(),

@@ -1,4 +1,4 @@
-//! `compare`: sequences x configurations x seeds.
+//! Configuration of `compare`: sequences × configurations × seeds.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -6,34 +6,33 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::check::path;
-use crate::app::comparison::{Contrast, Variant};
 use crate::validation::{InvalidValue, Validate, at_least_one, require};
 
-/// Keys of a stage's configuration with their values, as `--set` has them: `range_image.width: 450`.
-/// A block of keys stands for each of its keys.
+/// Keys of the configuration of a stage with their values, dotted as in `--set`
+/// (`range_image.width: 450`) or nested.
 pub type Overrides = BTreeMap<String, serde_json::Value>;
 
-/// What is compared.
+/// Configuration of a comparison.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ComparisonConfig {
-    /// Everything that it makes.
+    /// Folder of all results.
     pub output_folder: PathBuf,
-    /// What random choices of the runs follow from; a run per seed.
+    /// Seeds of the runs, one run per seed.
     pub seeds: Vec<u64>,
-    /// What all runs have in common.
+    /// Overrides for all runs.
     pub base: StageOverrides,
-    /// The drives.
+    /// Sequences.
     pub sequences: Vec<SequenceConfig>,
-    /// What is done with each of them.
+    /// Configurations that every sequence is run with.
     pub configurations: Vec<VariantConfig>,
-    /// Which configurations are compared with which; none: all with the first.
+    /// Pairs of configurations to compare; if empty, each configuration with the first.
     pub contrasts: Vec<Contrast>,
-    /// Success against the number of particles.
+    /// Success rate against the number of particles.
     pub particles: Option<ParticleSweep>,
 }
 
-/// What differs from the stages' defaults.
+/// Overrides of the defaults of the stages.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct StageOverrides {
@@ -45,33 +44,34 @@ pub struct StageOverrides {
     pub refinement: Overrides,
 }
 
-/// A drive to map and a drive to find the car in.
+/// A drive to map and a drive to localize.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SequenceConfig {
-    /// In tables and folders.
+    /// Name in tables and folders.
     pub name: String,
-    /// Whether it is left out, with a word, where its files are not there.
+    /// Whether to skip the sequence, with a log message, if its files are missing.
     pub optional: bool,
-    /// Keys of `simulation.yml`: drive 1 is mapped, the car of drive 2 is found. None of a recording.
+    /// Keys of `simulation.yml` for a simulated sequence, of which drive 1 is mapped and drive 2
+    /// localized; `None` for a recording.
     pub simulation: Option<Overrides>,
     /// Keys of `build_map.yml`, such as the files of a recording.
     pub build_map: Overrides,
     /// Keys of `localization.yml`.
     pub localization: Overrides,
-    /// Keys of `refinement.yml`; files, frames and odometry are those of the localization.
+    /// Keys of `refinement.yml`; files, frames and odometry default to those of the localization.
     pub refinement: Overrides,
 }
 
-/// A configuration that takes part.
+/// A configuration to compare.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct VariantConfig {
-    /// In tables and folders.
+    /// Name in tables and folders.
     pub name: String,
-    /// Whether the trajectory is refined.
+    /// Whether to refine the trajectory.
     pub refine: bool,
-    /// The average positional error that the report claims for it [m].
+    /// Average positional error that the report claims for the configuration [m].
     pub claimed_m: Option<f64>,
     /// Keys of `build_map.yml`.
     pub build_map: Overrides,
@@ -81,24 +81,34 @@ pub struct VariantConfig {
     pub refinement: Overrides,
 }
 
-/// Runs of one configuration with more and more particles.
+/// Two configurations to compare.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Contrast {
+    /// Name of the configuration.
+    pub of: String,
+    /// Name of the configuration to compare it with.
+    pub against: String,
+}
+
+/// Runs of one configuration with several numbers of particles.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ParticleSweep {
-    /// Numbers of particles at the start.
+    /// Initial numbers of particles.
     pub counts: Vec<usize>,
-    /// The configuration that they are put into.
+    /// Name of the configuration.
     pub configuration: String,
-    /// The sequences.
+    /// Names of the sequences.
     pub sequences: Vec<String>,
-    /// A run per seed.
+    /// Seeds of the runs, one run per seed.
     pub seeds: Vec<u64>,
-    /// Keys of `localization.yml`, such as a start anywhere on the road.
+    /// Keys of `localization.yml`, such as global initialization.
     pub localization: Overrides,
 }
 
 impl Default for ComparisonConfig {
-    /// Nothing to compare yet, with five seeds.
+    /// No sequences and configurations; five seeds.
     fn default() -> Self {
         Self {
             output_folder: "results/comparison".into(),
@@ -113,52 +123,32 @@ impl Default for ComparisonConfig {
 }
 
 impl ComparisonConfig {
-    /// The configurations as they stand in tables.
-    pub fn variants(&self) -> Vec<Variant> {
-        let variant = |variant: &VariantConfig| Variant {
-            name: variant.name.clone(),
-            claimed_m: variant.claimed_m,
-        };
-        self.configurations.iter().map(variant).collect()
-    }
-
-    /// The contrasts as told, or else of each configuration against the first.
+    /// The configured contrasts; without any, each configuration against the first.
     pub fn contrasts(&self) -> Vec<Contrast> {
-        let names = || self.configurations.iter().map(|variant| &variant.name);
-        if !self.contrasts.is_empty() {
-            return self.contrasts.clone();
+        match &self.configurations[..] {
+            [first, others @ ..] if self.contrasts.is_empty() => {
+                let contrast = |other: &VariantConfig| Contrast {
+                    of: other.name.clone(),
+                    against: first.name.clone(),
+                };
+                others.iter().map(contrast).collect()
+            }
+            _ => self.contrasts.clone(),
         }
-        let against = names().next();
-        against
-            .into_iter()
-            .flat_map(|first| {
-                names().skip(1).map(|of| Contrast {
-                    of: of.clone(),
-                    against: first.clone(),
-                })
-            })
-            .collect()
     }
 }
 
-/// Overrides as dotted keys with YAML values, blocks before what is in them.
+/// Overrides as pairs of dotted key and YAML value.
 pub fn settings(overrides: &Overrides) -> Vec<(String, String)> {
-    fn add(prefix: &str, value: &serde_json::Value, found: &mut Vec<(String, String)>) {
-        match value {
-            serde_json::Value::Object(block) if !block.is_empty() => {
-                for (key, value) in block {
-                    add(&format!("{prefix}.{key}"), value, found);
-                }
-            }
-            // JSON is YAML.
-            value => found.push((prefix.to_owned(), value.to_string())),
+    let pairs = overrides.iter().flat_map(|(key, value)| match value {
+        serde_json::Value::Object(block) if !block.is_empty() => {
+            let block = block.iter().map(|(inner, value)| (format!("{key}.{inner}"), value.clone()));
+            settings(&block.collect())
         }
-    }
-    let mut found = Vec::new();
-    for (key, value) in overrides {
-        add(key, value, &mut found);
-    }
-    found
+        // JSON is YAML.
+        value => vec![(key.clone(), value.to_string())],
+    });
+    pairs.collect()
 }
 
 impl Validate for ComparisonConfig {
@@ -166,35 +156,28 @@ impl Validate for ComparisonConfig {
         path("output_folder", &self.output_folder)?;
         at_least_one("seeds", self.seeds.len())?;
         let sequences: Vec<&str> = self.sequences.iter().map(|s| s.name.as_str()).collect();
-        let variants: Vec<&str> = self
-            .configurations
-            .iter()
-            .map(|c| c.name.as_str())
-            .collect();
-        names("sequences", &sequences)?;
-        names("configurations", &variants)?;
-        let once: BTreeSet<&u64> = self.seeds.iter().collect();
+        let configurations = self.configurations.iter();
+        let configurations: Vec<&str> = configurations.map(|c| c.name.as_str()).collect();
+        check_names("sequences", &sequences)?;
+        check_names("configurations", &configurations)?;
+        let unique: BTreeSet<&u64> = self.seeds.iter().collect();
         require(
-            once.len() == self.seeds.len(),
+            unique.len() == self.seeds.len(),
             "seeds",
             format_args!("{:?}", self.seeds),
             "give each seed once",
         )?;
         for name in self.contrasts.iter().flat_map(|c| [&c.of, &c.against]) {
-            known("contrasts", name, &variants)?;
+            check_known("contrasts", name, &configurations)?;
         }
         let Some(particles) = &self.particles else {
             return Ok(());
         };
         at_least_one("particles.counts", particles.counts.len())?;
         at_least_one("particles.seeds", particles.seeds.len())?;
-        known(
-            "particles.configuration",
-            &particles.configuration,
-            &variants,
-        )?;
+        check_known("particles.configuration", &particles.configuration, &configurations)?;
         for name in &particles.sequences {
-            known("particles.sequences", name, &sequences)?;
+            check_known("particles.sequences", name, &sequences)?;
         }
         require(
             !particles.counts.contains(&0),
@@ -205,28 +188,28 @@ impl Validate for ComparisonConfig {
     }
 }
 
-/// At least one name, each once, and each fit for a folder.
-fn names(key: &str, names: &[&str]) -> Result<(), InvalidValue> {
+/// At least one name, without duplicates, each valid as the name of a folder.
+fn check_names(key: &str, names: &[&str]) -> Result<(), InvalidValue> {
     at_least_one(key, names.len())?;
     for (index, name) in names.iter().enumerate() {
-        let is_plain = |c: char| c.is_ascii_alphanumeric() || "-_+.".contains(c);
+        let is_valid = |c: char| c.is_ascii_alphanumeric() || "-_+.".contains(c);
         require(
-            name.chars().all(is_plain) && name.starts_with(|c: char| c.is_ascii_alphanumeric()),
+            name.chars().all(is_valid) && name.starts_with(|c: char| c.is_ascii_alphanumeric()),
             key,
             format_args!("named `{name}`"),
-            "a name has letters, digits, -, _, + and . only, and begins with a letter or a digit; it is the name of a folder, too",
+            "a name consists of letters, digits, -, _, + and ., and begins with a letter or a digit; it is also the name of a folder",
         )?;
         require(
             !names[..index].contains(name),
             key,
             format_args!("named `{name}` twice"),
-            "give each a name of its own",
+            "choose unique names",
         )?;
     }
     Ok(())
 }
 
-fn known(key: &str, name: &str, names: &[&str]) -> Result<(), InvalidValue> {
+fn check_known(key: &str, name: &str, names: &[&str]) -> Result<(), InvalidValue> {
     let remedy = format!("it must be one of {}", names.join(", "));
     require(names.contains(&name), key, name, remedy)
 }
@@ -273,13 +256,13 @@ configurations:
     }
 
     #[test]
-    fn the_effective_configuration_comes_back() {
+    fn the_effective_configuration_loads_again() {
         let loaded = load(TEXT).unwrap();
         assert_eq!(load(&config::to_yaml(&loaded).unwrap()), Ok(loaded));
     }
 
     #[test]
-    fn without_contrasts_all_are_compared_with_the_first() {
+    fn by_default_all_configurations_are_compared_with_the_first() {
         let of: Vec<String> = load(TEXT)
             .unwrap()
             .contrasts()
@@ -290,8 +273,8 @@ configurations:
     }
 
     #[test]
-    fn names_that_are_no_folders_or_not_there_are_told() {
-        for (from, to, told) in [
+    fn invalid_and_unknown_names_are_reported() {
+        for (from, to, expected) in [
             ("name: town", "name: ../town", "letters, digits"),
             ("name: Fuzzy-MCL", "name: PCA-MCL", "twice"),
             ("seeds: [3, 4]", "seeds: [3, 3]", "each seed once"),
@@ -303,7 +286,7 @@ configurations:
             ("refine: True", "refined: True", "did you mean `refine`"),
         ] {
             let message = load(&TEXT.replace(from, to)).unwrap_err();
-            assert!(message.contains(told), "{message}");
+            assert!(message.contains(expected), "{message}");
         }
     }
 }

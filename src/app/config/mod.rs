@@ -26,7 +26,7 @@ mod yaml;
 
 pub use build_map::BuildMapConfig;
 pub use comparison::{
-    ComparisonConfig, Overrides, ParticleSweep, SequenceConfig, StageOverrides, VariantConfig,
+    ComparisonConfig, Contrast, Overrides, ParticleSweep, SequenceConfig, StageOverrides, VariantConfig,
     settings,
 };
 pub use error::ConfigError;

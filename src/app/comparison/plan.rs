@@ -1,58 +1,59 @@
-//! Every run of a comparison with its effective configurations.
+//! Plan of a comparison: all runs with their effective configurations.
 
 use anyhow::{Context as _, Result};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 
-use crate::app::comparison::RunId;
+use super::record::RunId;
 use crate::app::config::{
     self, BuildMapConfig, ComparisonConfig, LocalizationConfig, OdometrySource, Overrides,
     RefinementConfig, SequenceConfig, VariantConfig, settings,
 };
 use crate::simulation::SimulationConfig;
 use crate::validation::Validate;
-use serde::Serialize;
-use serde::de::DeserializeOwned;
 
-/// A run that is to be done; where its files go is decided when it is done.
+/// A run to execute. Paths of its results are set on execution.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PlannedRun {
-    /// Which run.
+    /// Identity of the run.
     pub id: RunId,
-    /// The drives to be simulated; none of a recording.
-    pub drives: Option<[SimulationConfig; 2]>,
-    /// How the map is built.
+    /// The two drives of a simulated sequence; empty for a recording.
+    pub drives: Vec<SimulationConfig>,
+    /// Configuration of the map builder.
     pub build_map: BuildMapConfig,
-    /// How the car is found.
+    /// Configuration of the localization.
     pub localization: LocalizationConfig,
-    /// How the trajectory is refined, if it is.
+    /// Configuration of the refinement, if the run refines.
     pub refinement: Option<RefinementConfig>,
-    /// Particles at the start, in runs that ask for success against their number.
+    /// Number of particles, for runs of the particle sweep.
     pub particles: Option<usize>,
 }
 
-/// All runs, sequence by sequence. Optional sequences whose files are absent are left out, with a
-/// word.
-pub fn runs(config: &ComparisonConfig) -> Result<Vec<PlannedRun>> {
+/// All runs, sequence by sequence. Skips optional sequences whose files are missing, with a log
+/// message.
+pub fn planned_runs(config: &ComparisonConfig) -> Result<Vec<PlannedRun>> {
     let mut runs = Vec::new();
     for sequence in &config.sequences {
         let drives = drives(config, sequence)
             .with_context(|| format!("in the sequence {}", sequence.name))?;
         for variant in &config.configurations {
-            let first = planned(config, sequence, variant, drives.as_ref()).with_context(|| {
+            let run = planned_run(config, sequence, variant, &drives).with_context(|| {
                 format!(
                     "in the sequence {} with the configuration {}",
                     sequence.name, variant.name
                 )
             })?;
-            if sequence.optional && !first.build_map.scan_folder.is_dir() && drives.is_none() {
+            let scan_folder = &run.build_map.scan_folder;
+            if sequence.optional && drives.is_empty() && !scan_folder.is_dir() {
                 tracing::info!(
-                    "sequence {} is left out: there is no folder {}",
+                    "sequence {} is skipped: there is no folder {}",
                     sequence.name,
-                    first.build_map.scan_folder.display()
+                    scan_folder.display()
                 );
                 break;
             }
-            runs.extend(config.seeds.iter().map(|&seed| first.with_seed(seed)));
-            runs.extend(particle_runs(config, &first)?);
+            runs.extend(config.seeds.iter().map(|&seed| run.with_seed(seed)));
+            runs.extend(particle_runs(config, &run)?);
         }
     }
     Ok(runs)
@@ -70,37 +71,32 @@ impl PlannedRun {
     }
 }
 
-/// The two drives of a simulated sequence.
-fn drives(
-    config: &ComparisonConfig,
-    sequence: &SequenceConfig,
-) -> Result<Option<[SimulationConfig; 2]>> {
+/// The mapping drive and the localization drive of a simulated sequence.
+fn drives(config: &ComparisonConfig, sequence: &SequenceConfig) -> Result<Vec<SimulationConfig>> {
     let Some(overrides) = &sequence.simulation else {
-        return Ok(None);
+        return Ok(Vec::new());
     };
-    let street = applied(SimulationConfig::default(), "simulation", &[overrides])?;
-    let folder = config.output_folder.join("sequences").join(&sequence.name);
-    Ok(Some([1, 2].map(|drive| SimulationConfig {
-        output_folder: folder.clone(),
+    let street = with_overrides(SimulationConfig::default(), "simulation", &[overrides])?;
+    let output_folder = config.output_folder.join("sequences").join(&sequence.name);
+    let drive = |drive| SimulationConfig {
+        output_folder: output_folder.clone(),
         drive,
         ..street.clone()
-    })))
+    };
+    Ok(vec![drive(1), drive(2)])
 }
 
-/// The run of the first seed.
-fn planned(
+/// The run of a configuration in a sequence, with seed 0.
+fn planned_run(
     config: &ComparisonConfig,
     sequence: &SequenceConfig,
     variant: &VariantConfig,
-    drives: Option<&[SimulationConfig; 2]>,
+    drives: &[SimulationConfig],
 ) -> Result<PlannedRun> {
-    let mut build_map = BuildMapConfig {
-        visualize: false,
-        ..BuildMapConfig::default()
-    };
+    let mut build_map = BuildMapConfig::default();
     let mut localization = LocalizationConfig::default();
-    if let Some([first, second]) = drives.map(|drives| drives.each_ref().map(|d| d.drive_folder()))
-    {
+    if let [first, second] = drives {
+        let [first, second] = [first, second].map(SimulationConfig::drive_folder);
         build_map.scan_folder = first.join("velodyne");
         build_map.pose_file = first.join("poses.txt");
         build_map.calib_file = first.join("calib.txt");
@@ -110,30 +106,32 @@ fn planned(
         localization.odometry = OdometrySource::File;
         localization.odometry_file = Some(second.join("odometry.txt"));
     }
-    let (base, own, asked) = (&config.base, sequence, variant);
-    let build_map = applied(
+    let base = &config.base;
+    let build_map = with_overrides(
         build_map,
         "build_map",
-        &[&base.build_map, &own.build_map, &asked.build_map],
+        &[&base.build_map, &sequence.build_map, &variant.build_map],
     )?;
-    let localization = applied(
+    let localization = with_overrides(
         localization,
         "localization",
-        &[&base.localization, &own.localization, &asked.localization],
+        &[
+            &base.localization,
+            &sequence.localization,
+            &variant.localization,
+        ],
     )?;
     let localization = LocalizationConfig {
-        map_pose_file: Some(build_map.pose_file.clone()),
-        map_calib_file: Some(build_map.calib_file.clone()),
+        map_pose_file: build_map.pose_file.clone(),
+        map_calib_file: build_map.calib_file.clone(),
         ..localization
     };
-    let refinement = if variant.refine {
-        Some(applied(
-            RefinementConfig::of(localization.clone()),
+    let refinement = || {
+        with_overrides(
+            refinement_of(&localization),
             "refinement",
-            &[&base.refinement, &own.refinement, &asked.refinement],
-        )?)
-    } else {
-        None
+            &[&base.refinement, &sequence.refinement, &variant.refinement],
+        )
     };
     Ok(PlannedRun {
         id: RunId {
@@ -141,53 +139,76 @@ fn planned(
             configuration: variant.name.clone(),
             seed: 0,
         },
-        drives: drives.cloned(),
+        drives: drives.to_vec(),
+        refinement: variant.refine.then(refinement).transpose()?,
         build_map,
         localization,
-        refinement,
         particles: None,
     })
 }
 
-/// Runs of the same with other numbers of particles, without refinement.
-fn particle_runs(config: &ComparisonConfig, like: &PlannedRun) -> Result<Vec<PlannedRun>> {
+/// The particle sweep of a run, without refinement.
+fn particle_runs(config: &ComparisonConfig, run: &PlannedRun) -> Result<Vec<PlannedRun>> {
     let mut runs = Vec::new();
-    let asked = config.particles.iter().filter(|particles| {
-        particles.configuration == like.id.configuration
-            && particles.sequences.contains(&like.id.sequence)
-    });
-    for particles in asked {
-        let localization = applied(
-            like.localization.clone(),
-            "particles.localization",
-            &[&particles.localization],
-        )?;
-        for &count in &particles.counts {
-            for &seed in &particles.seeds {
-                let mut run = like.with_seed(seed);
-                run.id.configuration = format!("{}-{count}-particles", like.id.configuration);
-                run.localization = LocalizationConfig {
+    let Some(sweep) = config.particles.as_ref().filter(|sweep| {
+        sweep.configuration == run.id.configuration && sweep.sequences.contains(&run.id.sequence)
+    }) else {
+        return Ok(runs);
+    };
+    let localization = with_overrides(
+        run.localization.clone(),
+        "particles.localization",
+        &[&sweep.localization],
+    )?;
+    for &count in &sweep.counts {
+        for &seed in &sweep.seeds {
+            let mut run = PlannedRun {
+                localization: LocalizationConfig {
                     num_particles: count,
                     num_reduced: localization.num_reduced.min(count),
-                    seed,
                     ..localization.clone()
-                };
-                run.refinement = None;
-                run.particles = Some(count);
-                runs.push(run);
-            }
+                },
+                refinement: None,
+                particles: Some(count),
+                ..run.with_seed(seed)
+            };
+            run.localization.seed = seed;
+            run.id.configuration = format!("{}-{count}-particles", run.id.configuration);
+            runs.push(run);
         }
     }
     Ok(runs)
 }
 
-/// A configuration with overrides, the later ones on top.
-fn applied<T>(config: T, block: &str, overrides: &[&Overrides]) -> Result<T>
+/// Refinement of the result of a localization: same files, frames, odometry and compensation.
+fn refinement_of(localization: &LocalizationConfig) -> RefinementConfig {
+    RefinementConfig {
+        scan_folder: localization.scan_folder.clone(),
+        map_file: localization.map_file.clone(),
+        map_pose_file: localization.map_pose_file.clone(),
+        map_calib_file: localization.map_calib_file.clone(),
+        pose_file: localization.pose_file.clone(),
+        calib_file: localization.calib_file.clone(),
+        start_idx: localization.start_idx,
+        n_scans: localization.n_scans,
+        frame_step: localization.frame_step,
+        odometry: localization.odometry,
+        odometry_file: localization.odometry_file.clone(),
+        range_image: localization.range_image.model(),
+        own_car_m: localization.own_car_m,
+        observation: localization.observation.clone(),
+        motion_compensation: localization.motion_compensation,
+        ..RefinementConfig::default()
+    }
+}
+
+/// Applies overrides in order, the last with the highest precedence.
+fn with_overrides<T>(config: T, block: &str, overrides: &[&Overrides]) -> Result<T>
 where
     T: Validate + Serialize + DeserializeOwned,
 {
     let all: Vec<(String, String)> = overrides.iter().flat_map(|keys| settings(keys)).collect();
-    config::with_settings(config, &all).with_context(|| format!("among the keys of {block}"))
+    config::with_overrides(config, &all).with_context(|| format!("in the block {block}"))
 }
 
 #[cfg(test)]
@@ -221,7 +242,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
         let folder = tempfile::tempdir()?;
         let path = folder.path().join("comparison.yml");
         std::fs::write(&path, text)?;
-        runs(&config::load(Some(&path), &[])?)
+        planned_runs(&config::load(Some(&path), &path, &[])?)
     }
 
     fn find<'a>(runs: &'a [PlannedRun], id: &str) -> &'a PlannedRun {
@@ -229,7 +250,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
     }
 
     #[test]
-    fn every_sequence_meets_every_configuration_with_every_seed() {
+    fn every_sequence_is_combined_with_every_configuration_and_seed() {
         let runs = planned(TEXT).unwrap();
         assert_eq!(runs.len(), 2 * 2 * 2 + 2);
         let run = find(&runs, "town/Fuzzy-PSO-MCL/4");
@@ -239,7 +260,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
     }
 
     #[test]
-    fn the_configuration_overrides_the_sequence_and_that_the_base() {
+    fn the_configuration_overrides_the_sequence_and_the_sequence_overrides_the_base() {
         let runs = planned(TEXT).unwrap();
         let particles = |id| find(&runs, id).localization.num_particles;
         assert_eq!(particles("town/PCA-MCL/3"), 500);
@@ -258,7 +279,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
     }
 
     #[test]
-    fn the_refinement_looks_at_what_was_localized() {
+    fn the_refinement_uses_the_recording_of_the_localization() {
         let runs = planned(TEXT).unwrap();
         let refinement = find(&runs, "drive/Fuzzy-PSO-MCL/3")
             .refinement
@@ -266,11 +287,14 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
             .unwrap();
         assert_eq!(refinement.scan_folder, std::path::Path::new("b/velodyne"));
         assert_eq!(refinement.start_idx, 1);
-        assert_eq!(refinement.map_pose_file, Some("a/poses.txt".into()));
+        assert_eq!(
+            refinement.map_pose_file,
+            std::path::Path::new("a/poses.txt")
+        );
     }
 
     #[test]
-    fn the_first_drive_is_mapped_and_the_car_of_the_second_is_found() {
+    fn the_first_drive_is_mapped_and_the_second_is_localized() {
         let runs = planned(TEXT).unwrap();
         let run = find(&runs, "town/PCA-MCL/3");
         let ends = |path: &std::path::Path, end| assert!(path.ends_with(end), "{path:?}");
@@ -282,12 +306,14 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
             &run.localization.scan_folder,
             "sequences/town/drive_2/velodyne",
         );
-        let [first, second] = run.drives.as_ref().unwrap();
+        let [first, second] = &run.drives[..] else {
+            panic!("{run:?}")
+        };
         assert_eq!((first.seed, first.drive, second.drive), (7, 1, 2));
     }
 
     #[test]
-    fn runs_with_other_numbers_of_particles_are_of_the_configuration_that_is_named() {
+    fn the_particle_sweep_varies_the_named_configuration() {
         let runs = planned(TEXT).unwrap();
         let few = find(&runs, "town/PCA-MCL-50-particles/1");
         assert_eq!(few.localization.num_particles, 50);
@@ -301,7 +327,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
     }
 
     #[test]
-    fn a_key_that_a_stage_does_not_have_is_told_with_its_place() {
+    fn an_unknown_key_of_a_stage_is_reported_with_its_place() {
         let wrong = TEXT.replace("ground_method: pca", "ground_metod: pca");
         let message = format!("{:#}", planned(&wrong).unwrap_err());
         for part in [

@@ -1,0 +1,99 @@
+//! `compare`: sequences × configurations × seeds, summarized in tables and a page; see
+//! [`comparison`](crate::app::comparison).
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result, bail};
+
+use super::{Context, output};
+use crate::app::cli::CompareArgs;
+use crate::app::comparison::{
+    Executor, Layout, Outcome, PlannedRun, RunId, collect, planned_runs,
+};
+use crate::app::config::{self, ComparisonConfig};
+
+/// Executes the missing runs, or the requested part of the work; returns the text for standard
+/// output.
+pub fn run(args: &CompareArgs, context: &Context) -> Result<String> {
+    let path = args.source.config.as_deref();
+    let default_path = Path::new("config/comparison.yml");
+    let config: ComparisonConfig = config::load(path, default_path, &args.source.settings)?;
+    let runs = planned_runs(&config)?;
+    let layout = Layout {
+        root: config.output_folder.clone(),
+    };
+    let mut executor = Executor::new(&layout, context);
+    if args.list_jobs {
+        Ok(job_commands(&runs))
+    } else if args.prepare {
+        prepare(&runs, &mut executor)
+    } else if let Some(id) = &args.job {
+        run_one(&runs, id, &mut executor)
+    } else if args.collect {
+        collect(&config, &runs, &layout)
+    } else {
+        let failed = run_all(&runs, &mut executor)?;
+        let tables = collect(&config, &runs, &layout)?;
+        if failed.is_empty() {
+            return Ok(tables);
+        }
+        output::print(&tables)?;
+        bail!(
+            "{} of {} runs failed: {}; see log.txt in the folder of each; run the same command to try them again",
+            failed.len(),
+            runs.len(),
+            failed.join(", ")
+        )
+    }
+}
+
+/// One shell command per run, for the current folder: the command line of this process with
+/// `--job` instead of `--list-jobs`.
+fn job_commands(runs: &[PlannedRun]) -> String {
+    let words = std::env::args_os().map(|word| word.to_string_lossy().into_owned());
+    let command = shell_words::join(words.filter(|word| word != "--list-jobs"));
+    runs.iter()
+        .map(|run| format!("{command} --job {}\n", run.id))
+        .collect()
+}
+
+/// Simulates the drives and builds the maps; returns the folders of the maps.
+fn prepare(runs: &[PlannedRun], executor: &mut Executor) -> Result<String> {
+    let mut folders = String::new();
+    for run in runs {
+        let map = executor
+            .prepare_map(run)
+            .with_context(|| format!("while preparing {}", run.id))?;
+        let line = format!("{}\n", map.display());
+        if !folders.contains(&line) {
+            folders.push_str(&line);
+        }
+    }
+    Ok(folders)
+}
+
+fn run_one(runs: &[PlannedRun], id: &RunId, executor: &mut Executor) -> Result<String> {
+    let run = runs.iter().find(|run| run.id == *id).with_context(|| {
+        format!("there is no run {id} in this comparison; --list-jobs lists all of them")
+    })?;
+    match executor.finish(run)?.outcome {
+        Outcome::Finished(report) => Ok(format!(
+            "{id}: average positional error {:.4} m\n",
+            report.metrics.position_m.mean
+        )),
+        Outcome::Failed(message) => bail!("{id} failed: {message}"),
+    }
+}
+
+/// Executes all unfinished runs, also after a failure; returns the names of failed runs.
+fn run_all(runs: &[PlannedRun], executor: &mut Executor) -> Result<Vec<String>> {
+    let mut failed = Vec::new();
+    for (index, run) in runs.iter().enumerate() {
+        tracing::info!("run {} of {}: {}", index + 1, runs.len(), run.id);
+        if let Outcome::Failed(message) = executor.finish(run)?.outcome {
+            tracing::warn!("{} failed: {message}", run.id);
+            failed.push(run.id.to_string());
+        }
+    }
+    Ok(failed)
+}

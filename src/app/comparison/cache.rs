@@ -1,0 +1,114 @@
+//! Results that several runs share, created by the first run that needs them.
+//!
+//! ```text
+//! FOLDER/KEY/...             the result
+//! FOLDER/KEY/finished.json   written last: its existence marks a complete result
+//! FOLDER/KEY.lock            held during creation; the file system releases it after a crash
+//! ```
+
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Context as _, Result};
+use serde::{Deserialize, Serialize};
+
+use crate::app::commands::output;
+
+/// A complete shared result.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SharedResult {
+    /// Folder of the result.
+    pub folder: PathBuf,
+    /// Wall time of its creation [s].
+    pub seconds: f64,
+}
+
+/// Name of the file that marks a complete result.
+pub const FINISHED_FILE: &str = "finished.json";
+
+#[derive(Serialize, Deserialize)]
+struct Finished {
+    seconds: f64,
+}
+
+/// Returns the result with a key below `folder`. Creates it if it is missing, while other processes
+/// that need it wait.
+pub fn get_or_create(
+    folder: &Path,
+    key: &str,
+    create: impl FnOnce(&Path) -> Result<()>,
+) -> Result<SharedResult> {
+    let _lock = lock(folder, key)?;
+    let folder = folder.join(key);
+    let mark = folder.join(FINISHED_FILE);
+    let seconds = if let Ok(text) = fs::read_to_string(&mark) {
+        let finished: Finished = serde_json::from_str(&text)
+            .with_context(|| format!("{} is damaged; remove it", mark.display()))?;
+        finished.seconds
+    } else {
+        fs::create_dir_all(&folder)
+            .with_context(|| format!("cannot create {}", folder.display()))?;
+        let start = Instant::now();
+        create(&folder)?;
+        let seconds = start.elapsed().as_secs_f64();
+        output::write_json(&mark, &Finished { seconds })?;
+        seconds
+    };
+    Ok(SharedResult { folder, seconds })
+}
+
+/// Waits for the exclusive lock `folder/name.lock`, which is held until the file is dropped.
+pub fn lock(folder: &Path, name: &str) -> Result<File> {
+    fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
+    let path = folder.join(format!("{name}.lock"));
+    let context = || format!("cannot lock {}", path.display());
+    let lock = File::create(&path).with_context(context)?;
+    lock.lock().with_context(context)?;
+    Ok(lock)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use super::*;
+
+    #[test]
+    fn simultaneous_requests_create_the_result_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let created = AtomicUsize::new(0);
+        let request = || {
+            get_or_create(folder.path(), "key", |folder| {
+                created.fetch_add(1, Ordering::Relaxed);
+                std::thread::sleep(std::time::Duration::from_millis(30));
+                Ok(fs::write(folder.join("map"), "complete")?)
+            })
+        };
+        std::thread::scope(|scope| {
+            let all: Vec<_> = (0..4).map(|_| scope.spawn(request)).collect();
+            for one in all {
+                let shared = one.join().unwrap().unwrap();
+                assert_eq!(fs::read(shared.folder.join("map")).unwrap(), b"complete");
+            }
+        });
+        assert_eq!(created.into_inner(), 1);
+    }
+
+    #[test]
+    fn an_incomplete_result_is_created_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let broken = get_or_create(folder.path(), "key", |folder| {
+            fs::write(folder.join("map"), "half")?;
+            anyhow::bail!("interrupted")
+        });
+        assert!(broken.is_err());
+        let whole = get_or_create(folder.path(), "key", |folder| {
+            Ok(fs::write(folder.join("map"), "whole")?)
+        });
+        assert_eq!(
+            fs::read(whole.unwrap().folder.join("map")).unwrap(),
+            b"whole"
+        );
+    }
+}

@@ -1,0 +1,105 @@
+//! Tables and page of the finished runs.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use anyhow::{Result, ensure};
+use serde::Serialize;
+
+use super::layout::Layout;
+use super::plan::PlannedRun;
+use super::record::RunRecord;
+use super::results::ComparisonResults;
+use super::table::Table;
+use super::{keys, page, tables};
+use crate::app::commands::{output, version};
+use crate::app::config::{self, ComparisonConfig};
+use crate::app::reporting::{csv, markdown, text};
+
+/// `comparison.json`.
+#[derive(Serialize)]
+struct ComparisonFile<'a> {
+    program: String,
+    tables: &'a [Table],
+    runs: Vec<&'a RunRecord>,
+}
+
+/// Writes tables and page of the finished runs; returns the tables for standard output.
+pub fn collect(config: &ComparisonConfig, runs: &[PlannedRun], layout: &Layout) -> Result<String> {
+    let results = read_results(config, runs, layout)?;
+    let found = results.all_records().count();
+    ensure!(
+        found > 0,
+        "no run is finished below {}; run the comparison without --collect, or the commands of --list-jobs",
+        layout.root.display()
+    );
+    tracing::info!("{found} of {} runs are finished", runs.len());
+    let programs: BTreeSet<&str> = results.all_records().map(|r| r.program.as_str()).collect();
+    if programs.len() > 1 {
+        let programs: Vec<&str> = programs.into_iter().collect();
+        tracing::warn!(
+            "the runs were made by different programs: {}",
+            programs.join(", ")
+        );
+    }
+    let tables = tables::tables(&results);
+    write_tables(&tables, &layout.root)?;
+    let page = page::page(&results, &tables, runs, layout)?;
+    output::write_text(&layout.root.join("report.html"), &page.to_html())?;
+    config::write(&layout.root.join("comparison.yml"), config)?;
+    let file = ComparisonFile {
+        program: version::program()?,
+        tables: &tables,
+        runs: results.all_records().collect(),
+    };
+    output::write_json(&layout.root.join("comparison.json"), &file)?;
+    // The table of single runs is too wide for a terminal.
+    let summaries = tables.iter().filter(|table| table.name != "runs");
+    Ok(summaries.map(text::table).collect::<Vec<_>>().join("\n"))
+}
+
+/// Reads the records of the planned runs; skips those of other settings.
+fn read_results<'a>(
+    config: &'a ComparisonConfig,
+    runs: &[PlannedRun],
+    layout: &Layout,
+) -> Result<ComparisonResults<'a>> {
+    let mut sequences: Vec<String> = runs.iter().map(|run| run.id.sequence.clone()).collect();
+    sequences.dedup();
+    let mut records = Vec::new();
+    let mut sweep = BTreeMap::<usize, Vec<RunRecord>>::new();
+    for run in runs {
+        let Some(record) = RunRecord::read(&layout.run(&run.id))? else {
+            continue;
+        };
+        if record.settings != keys::settings_hash(run)? {
+            tracing::warn!(
+                "{} is skipped: its record has another configuration or version; run it again",
+                run.id
+            );
+            continue;
+        }
+        match run.particles {
+            Some(count) => sweep.entry(count).or_default().push(record),
+            None => records.push(record),
+        }
+    }
+    Ok(ComparisonResults {
+        config,
+        sequences,
+        records,
+        sweep,
+    })
+}
+
+fn write_tables(tables: &[Table], folder: &Path) -> Result<()> {
+    let all: Vec<String> = tables.iter().map(text::table).collect();
+    output::write_text(&folder.join("tables.txt"), &all.join("\n"))?;
+    let all: Vec<String> = tables.iter().map(markdown::table).collect();
+    output::write_text(&folder.join("tables.md"), &all.join("\n"))?;
+    for table in tables {
+        let path = folder.join(format!("{}.csv", table.name));
+        output::write_text(&path, &csv::table(table))?;
+    }
+    Ok(())
+}

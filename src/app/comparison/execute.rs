@@ -1,0 +1,297 @@
+//! Execution of runs.
+
+use std::collections::BTreeMap;
+use std::ffi::OsStr;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Context as _, Result};
+
+use super::cache::{self, SharedResult};
+use super::keys::{self, KeyCache, Keys};
+use super::layout::Layout;
+use super::plan::PlannedRun;
+use super::record::{Outcome, RECORD_FILE, RunRecord};
+use crate::app::commands::interrupt::Interrupted;
+use crate::app::commands::run_output::{self, RunFiles};
+use crate::app::commands::run_page::RunPage;
+use crate::app::commands::simulate::{self, Existing};
+use crate::app::commands::{Context, build_map, localize, output, refine, version};
+use crate::app::config::{BuildMapConfig, LocalizationConfig, RefinementConfig};
+use crate::app::results::{LocalizationResults, Report, TrajectoryReport};
+use crate::evaluation::{EvaluatedTrajectory, RangeMclRules};
+
+const MAP_FILE: &str = "map.ply";
+const RESULT_FILE: &str = "localization.npz";
+const LOG_FILE: &str = "log.txt";
+
+/// Executes runs, sharing maps and localizations between them.
+pub struct Executor<'a> {
+    layout: &'a Layout,
+    context: &'a Context,
+    keys: KeyCache,
+}
+
+impl<'a> Executor<'a> {
+    /// An executor for the runs below an output folder.
+    pub fn new(layout: &'a Layout, context: &'a Context) -> Self {
+        let keys = KeyCache::default();
+        Self {
+            layout,
+            context,
+            keys,
+        }
+    }
+
+    /// Returns the record of a run; executes the run unless it finished with the same key.
+    pub fn finish(&mut self, run: &PlannedRun) -> Result<RunRecord> {
+        let keys = self.keys(run)?;
+        let folder = self.layout.run(&run.id);
+        if let Some(record) = RunRecord::read(&folder)?
+            && record.key == keys.run
+            && record.metrics().is_some()
+        {
+            tracing::info!("{} is already finished", run.id);
+            return Ok(record);
+        }
+        let record = self.execute(run, keys)?;
+        output::write_json(&folder.join(RECORD_FILE), &record)?;
+        Ok(record)
+    }
+
+    /// Simulates the drives of a run and builds its map; returns the folder of the map.
+    pub fn prepare_map(&mut self, run: &PlannedRun) -> Result<PathBuf> {
+        let keys = self.keys(run)?;
+        self.simulate_drives(run)?;
+        Ok(self.map(run, &keys)?.folder)
+    }
+
+    /// Keys of a run; an error after an interrupt.
+    fn keys(&mut self, run: &PlannedRun) -> Result<Keys> {
+        if self.context.interrupt.requested() {
+            let kept = format!(
+                "finished runs are kept in {}; run the same command again to resume",
+                self.layout.root.display()
+            );
+            return Err(Interrupted { kept }.into());
+        }
+        let keys = self.keys.keys(run);
+        keys.with_context(|| format!("while reading the inputs of {}", run.id))
+    }
+
+    /// Executes a run. Its previous record is removed first, since it does not describe the new
+    /// files. A failure becomes the outcome; only an interrupt is an error.
+    fn execute(&self, run: &PlannedRun, keys: Keys) -> Result<RunRecord> {
+        let folder = self.layout.run(&run.id);
+        fs::create_dir_all(&folder)
+            .with_context(|| format!("cannot create {}", folder.display()))?;
+        let record_file = folder.join(RECORD_FILE);
+        if record_file.exists() {
+            fs::remove_file(&record_file)
+                .with_context(|| format!("cannot remove {}", record_file.display()))?;
+        }
+        let _log = self.context.log.write_to(&folder.join(LOG_FILE))?;
+        let mut stages = Stages::default();
+        let outcome = match self.run_stages(run, &keys, &mut stages) {
+            Ok(report) => Outcome::Finished(Box::new(report)),
+            Err(error) if error.is::<Interrupted>() => return Err(error),
+            Err(error) => {
+                tracing::error!("{error:#}");
+                Outcome::Failed(format!("{error:#}"))
+            }
+        };
+        let record = RunRecord {
+            id: run.id.clone(),
+            key: keys.run,
+            settings: keys::settings_hash(run)?,
+            program: version::program()?,
+            machine: self.machine(stages.report.as_ref()),
+            stage_seconds: stages.seconds,
+            outcome,
+        };
+        if let Some(report) = &stages.report {
+            RunPage {
+                files: &RunFiles::beside(&folder.join(RESULT_FILE)),
+                title: &format!("Run {}", run.id),
+                report,
+                stage_seconds: &record.stage_seconds,
+                machine: &record.machine,
+            }
+            .write()?;
+        }
+        Ok(record)
+    }
+
+    fn run_stages(
+        &self,
+        run: &PlannedRun,
+        keys: &Keys,
+        stages: &mut Stages,
+    ) -> Result<TrajectoryReport> {
+        let folder = self.layout.run(&run.id);
+        let result = folder.join(RESULT_FILE);
+        self.simulate_drives(run).context("while simulating")?;
+
+        let map = self.map(run, keys).context("while building the map")?;
+        stages.add("1 build-map", map.seconds);
+        self.repeat_log(&map)?;
+        copy_file(&map.folder.join("map.yml"), &folder.join("build_map.yml"))?;
+
+        let localization = self
+            .localization(run, keys, &map)
+            .context("while localizing")?;
+        stages.add("2 localize", localization.seconds);
+        self.repeat_log(&localization)?;
+        // An earlier run in this folder may have refined.
+        run_output::remove_refined(&RunFiles::beside(&result))?;
+        copy_folder(&localization.folder, &folder)?;
+        stages.report = Some(Report::read_json(&folder.join("report.json"))?);
+
+        if let Some(refinement) = &run.refinement {
+            let start = Instant::now();
+            let config = RefinementConfig {
+                map_file: map.folder.join(MAP_FILE),
+                result_file: result.clone(),
+                force: true,
+                ..refinement.clone()
+            };
+            let report = refine::run(&config, self.context).context("while refining")?;
+            stages.report = Some(report);
+            stages.add("3 refine", start.elapsed().as_secs_f64());
+        }
+        evaluate(&result, run.refinement.is_some())
+    }
+
+    fn simulate_drives(&self, run: &PlannedRun) -> Result<()> {
+        if run.drives.is_empty() {
+            return Ok(());
+        }
+        let _lock = cache::lock(&self.layout.root.join("sequences"), &run.id.sequence)?;
+        for drive in &run.drives {
+            simulate::run_with_progress(drive, Existing::Renew, self.context)?;
+        }
+        Ok(())
+    }
+
+    fn map(&self, run: &PlannedRun, keys: &Keys) -> Result<SharedResult> {
+        cache::get_or_create(&self.layout.shared("maps"), &keys.map, |folder| {
+            let _log = self.context.log.write_to(&folder.join(LOG_FILE))?;
+            let config = BuildMapConfig {
+                mesh_file: folder.join(MAP_FILE),
+                force: true,
+                ..run.build_map.clone()
+            };
+            tracing::info!("building the map of {}", config.scan_folder.display());
+            build_map::run(&config, self.context).map(drop)
+        })
+    }
+
+    fn localization(
+        &self,
+        run: &PlannedRun,
+        keys: &Keys,
+        map: &SharedResult,
+    ) -> Result<SharedResult> {
+        let shared = self.layout.shared("localizations");
+        cache::get_or_create(&shared, &keys.localization, |folder| {
+            let _log = self.context.log.write_to(&folder.join(LOG_FILE))?;
+            let config = LocalizationConfig {
+                map_file: map.folder.join(MAP_FILE),
+                result_path: folder.join(RESULT_FILE),
+                save_result: true,
+                force: true,
+                ..run.localization.clone()
+            };
+            localize::run(&config, self.context).map(drop)
+        })
+    }
+
+    /// Appends the log of a shared stage to the log of the run.
+    fn repeat_log(&self, stage: &SharedResult) -> Result<()> {
+        self.context.log.clone().repeat(&stage.folder.join(LOG_FILE))
+    }
+
+    /// Description of the machine for the record of a run.
+    fn machine(&self, report: Option<&Report>) -> BTreeMap<String, String> {
+        let unknown = || "unknown".to_owned();
+        let renderer = report.and_then(|report| report.about.get("renderer").cloned());
+        let (system, architecture) = (std::env::consts::OS, std::env::consts::ARCH);
+        [
+            ("processor", processor().unwrap_or_else(unknown)),
+            ("threads", self.context.threads.to_string()),
+            ("system", format!("{system} {architecture}")),
+            ("renderer", renderer.unwrap_or_else(unknown)),
+        ]
+        .map(|(key, value)| (key.to_owned(), value))
+        .into()
+    }
+}
+
+/// Progress of a run: times of the finished stages, and the latest report.
+#[derive(Default)]
+struct Stages {
+    seconds: BTreeMap<String, f64>,
+    report: Option<Report>,
+}
+
+impl Stages {
+    fn add(&mut self, stage: &str, seconds: f64) {
+        self.seconds.insert(stage.to_owned(), seconds);
+    }
+}
+
+/// Evaluates the final trajectory of a run, with the runtime of all stages per frame.
+fn evaluate(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
+    let results = LocalizationResults::read(result)?;
+    let (poses, refinement_s) = if is_refined {
+        (results.refined, results.refine_runtimes_s)
+    } else {
+        (results.estimates, None)
+    };
+    let (poses, truth) = poses
+        .zip(results.ground_truth)
+        .with_context(|| format!("{} has no trajectory to evaluate", result.display()))?;
+    let mut runtimes_s = results.runtimes_s;
+    for (filter_s, refinement_s) in runtimes_s.iter_mut().flatten().zip(refinement_s.iter().flatten()) {
+        *filter_s += refinement_s;
+    }
+    let trajectory = EvaluatedTrajectory {
+        estimates: &poses,
+        ground_truth: &truth,
+        times_s: results.times_s.as_deref(),
+        runtimes_s: runtimes_s.as_deref(),
+    };
+    run_output::judge_one(&trajectory, &RangeMclRules::default())
+}
+
+/// Name of the processor, on systems with `/proc/cpuinfo`.
+fn processor() -> Option<String> {
+    let text = fs::read_to_string("/proc/cpuinfo").ok()?;
+    let name = text.lines().find(|line| line.starts_with("model name"))?;
+    Some(name.split_once(':')?.1.trim().to_owned())
+}
+
+/// Copies the content of a folder, except for [`cache::FINISHED_FILE`] and the log.
+fn copy_folder(from: &Path, to: &Path) -> Result<()> {
+    fs::create_dir_all(to).with_context(|| format!("cannot create {}", to.display()))?;
+    for entry in fs::read_dir(from).with_context(|| format!("cannot read {}", from.display()))? {
+        let entry = entry?;
+        let name = entry.file_name();
+        if [cache::FINISHED_FILE, LOG_FILE].map(OsStr::new).contains(&name.as_os_str()) {
+            continue;
+        }
+        if entry.path().is_dir() {
+            copy_folder(&entry.path(), &to.join(name))?;
+        } else {
+            copy_file(&entry.path(), &to.join(name))?;
+        }
+    }
+    Ok(())
+}
+
+fn copy_file(from: &Path, to: &Path) -> Result<()> {
+    fs::copy(from, to)
+        .map(drop)
+        .with_context(|| format!("cannot copy {} to {}", from.display(), to.display()))
+}

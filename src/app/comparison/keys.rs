@@ -1,0 +1,363 @@
+//! Keys of results: hashes of all that a stage depends on.
+//!
+//! ```text
+//! map          = H(executable, build_map settings, scans, poses, calibration)
+//! localization = H(map, localization settings, scans, poses, calibration, odometry)
+//! run          = H(localization, refinement settings, odometry)
+//! ```
+//!
+//! H is BLAKE3. Settings are the effective configuration without paths, so that a copied or renamed
+//! folder keeps its results. A simulated drive is represented by its configuration instead of its
+//! files, which need not exist yet; drives of another executable are simulated again before use
+//! ([`Existing::Renew`](crate::app::commands::simulate::Existing::Renew)).
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+use anyhow::{Context as _, Result};
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::plan::PlannedRun;
+use crate::app::commands::version;
+use crate::recording::Selection;
+use crate::recording::sequence::selected_scans;
+use crate::simulation::SimulationConfig;
+
+/// Configuration keys without effect on the numbers: paths, plots, permission to replace files.
+const IGNORED_KEYS: [&str; 16] = [
+    "scan_folder",
+    "pose_file",
+    "calib_file",
+    "mesh_file",
+    "map_file",
+    "map_pose_file",
+    "map_calib_file",
+    "result_path",
+    "result_file",
+    "odometry_file",
+    "output_folder",
+    "path_pose_file",
+    "path_calib_file",
+    "plot_loc_results",
+    "visualize",
+    "force",
+];
+
+/// Keys of the stages of a run.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Keys {
+    /// Key of the map.
+    pub map: String,
+    /// Key of the localization.
+    pub localization: String,
+    /// Key of the run.
+    pub run: String,
+}
+
+/// Computes keys; hashes each input once.
+#[derive(Debug, Default)]
+pub struct KeyCache {
+    inputs: BTreeMap<String, String>,
+}
+
+impl KeyCache {
+    /// Keys of a run.
+    pub fn keys(&mut self, run: &PlannedRun) -> Result<Keys> {
+        let [map, localization, refinement] = stages(run)?;
+        let map = self.key(version::executable_hash()?, map)?;
+        let localization = self.key(&map, localization)?;
+        Ok(Keys {
+            run: self.key(&localization, refinement)?,
+            map,
+            localization,
+        })
+    }
+
+    fn key(&mut self, previous: &str, stage: Stage) -> Result<String> {
+        let mut parts = vec![previous.to_owned(), stage.settings];
+        for input in &stage.inputs {
+            parts.push(self.input(input)?);
+        }
+        Ok(hash(&parts))
+    }
+
+    fn input(&mut self, input: &Input) -> Result<String> {
+        match *input {
+            Input::Simulated(drive, _) => {
+                let mut parts = vec![input.name()?];
+                if let Some(poses) = &drive.path_pose_file {
+                    let beside = poses.with_file_name("calib.txt");
+                    parts.push(self.file(poses)?);
+                    parts.push(self.file(drive.path_calib_file.as_ref().unwrap_or(&beside))?);
+                }
+                Ok(hash(&parts))
+            }
+            Input::Scans(folder, selection) => {
+                self.once(format!("{folder:?} {selection:?}"), || {
+                    let hashes = selected_scans(folder, &selection)?
+                        .par_iter()
+                        .map(|(number, path)| Ok(format!("{number} {}", content(path)?)))
+                        .collect::<Result<Vec<String>>>()?;
+                    Ok(hash(&hashes))
+                })
+            }
+            Input::File(path) => self.file(path),
+        }
+    }
+
+    /// Hash of a file and of the `times.txt` beside it, which is part of a file of poses.
+    fn file(&mut self, path: &Path) -> Result<String> {
+        self.once(format!("{path:?}"), || {
+            let times = path.with_file_name("times.txt");
+            let times = times.exists().then(|| content(&times)).transpose()?;
+            Ok(hash(&[content(path)?, times.unwrap_or_default()]))
+        })
+    }
+
+    fn once(&mut self, name: String, hash: impl FnOnce() -> Result<String>) -> Result<String> {
+        if let Some(known) = self.inputs.get(&name) {
+            return Ok(known.clone());
+        }
+        let found = hash()?;
+        self.inputs.insert(name, found.clone());
+        Ok(found)
+    }
+}
+
+/// Hash of the settings of a run, the names of its inputs and the version of the program. Needs no
+/// access to the inputs, so that records can be collected without them and by a later build.
+pub fn settings_hash(run: &PlannedRun) -> Result<String> {
+    let mut parts = vec![version::VERSION.to_owned()];
+    for stage in stages(run)? {
+        parts.push(stage.settings);
+        for input in &stage.inputs {
+            parts.push(input.name()?);
+        }
+    }
+    Ok(hash(&parts))
+}
+
+/// What a stage depends on besides the previous stage.
+struct Stage<'a> {
+    settings: String,
+    inputs: Vec<Input<'a>>,
+}
+
+/// The stages of a run: map, localization, refinement.
+fn stages(run: &PlannedRun) -> Result<[Stage<'_>; 3]> {
+    let (map, query, refinement) = (&run.build_map, &run.localization, &run.refinement);
+    let file = |path| Input::new(run, path, None);
+    let map = Stage {
+        settings: settings(map)?,
+        inputs: vec![
+            Input::new(run, &map.scan_folder, Some(map.selection())),
+            file(&map.pose_file),
+            file(&map.calib_file),
+        ],
+    };
+    let mut localization = Stage {
+        settings: settings(query)?,
+        inputs: vec![
+            Input::new(run, &query.scan_folder, Some(query.selection())),
+            file(&query.pose_file),
+            file(&query.calib_file),
+        ],
+    };
+    let odometry = query.odometry_file.iter();
+    localization.inputs.extend(odometry.map(|path| file(path)));
+    let odometry = refinement.iter().flat_map(|r| &r.odometry_file);
+    let refinement = Stage {
+        settings: settings(refinement)?,
+        inputs: odometry.map(|path| file(path)).collect(),
+    };
+    Ok([map, localization, refinement])
+}
+
+/// A file or folder that a stage reads.
+enum Input<'a> {
+    /// A part of a simulated drive: the drive, and the path below its folder.
+    Simulated(&'a SimulationConfig, &'a Path),
+    /// Selected scans of a folder.
+    Scans(&'a Path, Selection),
+    /// Any other file.
+    File(&'a Path),
+}
+
+impl<'a> Input<'a> {
+    fn new(run: &'a PlannedRun, path: &'a Path, selection: Option<Selection>) -> Self {
+        let below = |drive: &SimulationConfig| path.strip_prefix(drive.drive_folder()).ok();
+        let simulated = run.drives.iter().find_map(|drive| Some((drive, below(drive)?)));
+        match (simulated, selection) {
+            (Some((drive, path)), _) => Self::Simulated(drive, path),
+            (None, Some(selection)) => Self::Scans(path, selection),
+            (None, None) => Self::File(path),
+        }
+    }
+
+    /// The path; for a simulated drive, its configuration and the path below its folder.
+    fn name(&self) -> Result<String> {
+        Ok(match self {
+            Self::Simulated(drive, path) => format!("{} {path:?}", settings(drive)?),
+            Self::Scans(path, _) | Self::File(path) => format!("{path:?}"),
+        })
+    }
+}
+
+/// A configuration as text, without [`IGNORED_KEYS`].
+fn settings(config: &impl Serialize) -> Result<String> {
+    let mut settings = serde_json::to_value(config).context("cannot serialize a configuration")?;
+    if let Some(settings) = settings.as_object_mut() {
+        settings.retain(|key, _| !IGNORED_KEYS.contains(&key.as_str()));
+    }
+    Ok(settings.to_string())
+}
+
+fn content(path: &Path) -> Result<String> {
+    let bytes = fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+    Ok(blake3::hash(&bytes).to_hex().to_string())
+}
+
+/// Hash of a list of texts, 32 hexadecimal digits.
+fn hash(parts: &[impl AsRef<str>]) -> String {
+    let mut hasher = blake3::Hasher::new();
+    for part in parts {
+        let part = part.as_ref();
+        hasher.update(&(part.len() as u64).to_le_bytes());
+        hasher.update(part.as_bytes());
+    }
+    hasher.finalize().to_hex()[..32].to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::app::comparison::record::RunId;
+    use crate::app::config::{BuildMapConfig, LocalizationConfig, RefinementConfig};
+
+    fn planned_run() -> PlannedRun {
+        planned_run_in("here")
+    }
+
+    fn planned_run_in(folder: &str) -> PlannedRun {
+        let drives = [1, 2].map(|drive| SimulationConfig {
+            drive,
+            output_folder: folder.into(),
+            ..SimulationConfig::default()
+        });
+        let [first, second] = drives.each_ref().map(SimulationConfig::drive_folder);
+        PlannedRun {
+            id: RunId {
+                sequence: "town".to_owned(),
+                configuration: "A".to_owned(),
+                seed: 1,
+            },
+            drives: drives.into(),
+            build_map: BuildMapConfig {
+                scan_folder: first.join("velodyne"),
+                pose_file: first.join("poses.txt"),
+                calib_file: first.join("calib.txt"),
+                ..BuildMapConfig::default()
+            },
+            localization: LocalizationConfig {
+                scan_folder: second.join("velodyne"),
+                pose_file: second.join("poses.txt"),
+                calib_file: second.join("calib.txt"),
+                odometry_file: Some(second.join("odometry.txt")),
+                ..LocalizationConfig::default()
+            },
+            refinement: Some(RefinementConfig::default()),
+            particles: None,
+        }
+    }
+
+    fn keys(change: impl FnOnce(&mut PlannedRun)) -> Keys {
+        let mut run = planned_run();
+        change(&mut run);
+        KeyCache::default().keys(&run).unwrap()
+    }
+
+    #[test]
+    fn paths_and_names_change_no_key() {
+        let moved = keys(|run| {
+            run.id.configuration = "B".to_owned();
+            run.build_map.mesh_file = "elsewhere.ply".into();
+            run.localization.result_path = "elsewhere.npz".into();
+            run.localization.force = true;
+        });
+        assert_eq!(moved, keys(|_| ()));
+        let elsewhere = KeyCache::default().keys(&planned_run_in("elsewhere"));
+        assert_eq!(elsewhere.unwrap(), moved);
+    }
+
+    #[test]
+    fn a_change_affects_the_keys_of_its_stage_and_of_later_stages() {
+        let same = keys(|_| ());
+        let other = keys(|run| run.refinement = None);
+        assert!(other.run != same.run && other.localization == same.localization);
+        let other = keys(|run| run.localization.seed = 9);
+        assert!(other.run != same.run && other.localization != same.localization);
+        assert_eq!(other.map, same.map);
+        let other = keys(|run| run.build_map.depth = 7);
+        assert!(other.run != same.run && other.localization != same.localization);
+        assert_ne!(other.map, same.map);
+        let other = keys(|run| {
+            run.drives[1].traffic.pedestrians_per_100_m = 0.0;
+        });
+        assert!(other.map == same.map && other.localization != same.localization);
+    }
+
+    #[test]
+    fn a_byte_of_a_recording_changes_the_key() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        fs::create_dir(path("velodyne")).unwrap();
+        fs::write(path("velodyne/000000.bin"), [0; 16]).unwrap();
+        fs::write(path("poses.txt"), "1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
+        fs::write(path("calib.txt"), "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n").unwrap();
+        let mut run = planned_run();
+        run.drives.clear();
+        run.build_map.scan_folder = path("velodyne");
+        run.build_map.pose_file = path("poses.txt");
+        run.build_map.calib_file = path("calib.txt");
+        run.localization.scan_folder = path("velodyne");
+        run.localization.pose_file = path("poses.txt");
+        run.localization.calib_file = path("calib.txt");
+        run.localization.odometry_file = None;
+        let before = KeyCache::default().keys(&run).unwrap();
+        assert_eq!(KeyCache::default().keys(&run).unwrap(), before);
+        fs::write(path("velodyne/000000.bin"), [1; 16]).unwrap();
+        let after = KeyCache::default().keys(&run).unwrap();
+        assert!(after.map != before.map && after.run != before.run);
+    }
+
+    #[test]
+    fn another_odometry_changes_the_key_and_a_missing_one_is_an_error() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("other.txt");
+        fs::write(&path, "1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
+        let (before, own) = (planned_run(), keys(|_| ()));
+        let other = keys(|run| run.localization.odometry_file = Some(path.clone()));
+        assert!(other.map == own.map && other.localization != own.localization);
+        let refined = keys(|run| {
+            if let Some(refinement) = &mut run.refinement {
+                refinement.odometry_file = Some(path.clone());
+            }
+        });
+        assert!(refined.localization == own.localization && refined.run != own.run);
+        let mut missing = planned_run();
+        missing.localization.odometry_file = Some("nowhere.txt".into());
+        assert!(KeyCache::default().keys(&missing).is_err());
+        // The settings differ without access to the files, too.
+        assert_ne!(
+            settings_hash(&missing).unwrap(),
+            settings_hash(&before).unwrap()
+        );
+    }
+
+    #[test]
+    fn boundaries_between_parts_change_the_hash() {
+        assert_ne!(hash(&["ab", "c"]), hash(&["a", "bc"]));
+    }
+}

@@ -1,0 +1,243 @@
+//! Page of a comparison: tables, plots and configuration in one HTML file, from the available files.
+
+use anyhow::Result;
+
+use super::layout::Layout;
+use super::pictures;
+use super::plan::PlannedRun;
+use super::record::{Outcome, RunRecord};
+use super::results::ComparisonResults;
+use super::table::{Cell, Column, Table};
+use crate::app::commands::run_page::{PICTURES, TEXTS, folded, picture};
+use crate::app::commands::version;
+use crate::app::config::{self, ComparisonConfig, Overrides, settings};
+use crate::app::reporting::{Block, Page, Section};
+
+/// Pictures of a run that the comparison has for all configurations together.
+const COMBINED_PICTURES: [&str; 2] = ["path.png", "errors.png"];
+
+/// Maximum number of missing runs to list.
+const MAX_LISTED: usize = 20;
+
+/// Draws the plots of a comparison and assembles its page.
+pub fn page(
+    results: &ComparisonResults,
+    tables: &[Table],
+    planned: &[PlannedRun],
+    layout: &Layout,
+) -> Result<Page> {
+    let blocks = |names: &[&str]| -> Vec<Block> {
+        let tables = tables.iter().filter(|t| names.contains(&t.name.as_str()));
+        tables.cloned().map(Block::Table).collect()
+    };
+    let mut sequences = blocks(&["by_sequence"]);
+    sequences.extend(pictures::errors_of_runs(results, layout)?);
+    let mut sections = vec![
+        section("Missing runs", missing_runs(results, planned)),
+        section("Tables", blocks(&["table_1", "table_2"])),
+        section("Differences", blocks(&["differences"])),
+        section("Sequences", sequences),
+    ];
+    for sequence in &results.sequences {
+        let blocks = sequence_blocks(results, sequence, layout)?;
+        sections.push(section(&format!("Sequence {sequence}"), blocks));
+    }
+    let mut particles = blocks(&["particles"]);
+    particles.extend(pictures::success_rates(results, layout)?);
+    sections.extend([
+        section("Time", blocks(&["timing"])),
+        section("Numbers of particles", particles),
+        section("Runs", blocks(&["runs"])),
+        section("Configuration and versions", configuration(results, layout)?),
+    ]);
+    sections.retain(|section| !section.blocks.is_empty());
+    Ok(Page {
+        title: "Comparison".to_owned(),
+        subtitle: format!(
+            "{} configurations, sequences {}; {} of {} runs.",
+            results.config.configurations.len(),
+            results.sequences.join(", "),
+            results.all_records().count(),
+            planned.len()
+        ),
+        sections,
+    })
+}
+
+fn section(title: &str, blocks: Vec<Block>) -> Section {
+    Section {
+        title: title.to_owned(),
+        blocks,
+    }
+}
+
+/// Planned runs without a record, and failed runs; empty if there are none.
+fn missing_runs(results: &ComparisonResults, planned: &[PlannedRun]) -> Vec<Block> {
+    let has_record = |run: &&PlannedRun| results.all_records().any(|record| record.id == run.id);
+    let missing = planned.iter().filter(|run| !has_record(run));
+    let missing: Vec<String> = missing.map(|run| run.id.to_string()).collect();
+    let failed = results.all_records().filter_map(|record| match &record.outcome {
+        Outcome::Finished(_) => None,
+        Outcome::Failed(message) => Some((record.id.to_string(), format!("failed: {message}"))),
+    });
+    let failed: Vec<(String, String)> = failed.collect();
+    let mut blocks = Vec::new();
+    if !missing.is_empty() {
+        let listed = missing[..missing.len().min(MAX_LISTED)].join(", ");
+        let more = match missing.len().saturating_sub(MAX_LISTED) {
+            0 => String::new(),
+            more => format!(" and {more} more"),
+        };
+        blocks.push(Block::Paragraph(format!(
+            "{} of {} runs are missing or have another configuration: {listed}{more}.",
+            missing.len(),
+            planned.len()
+        )));
+    }
+    if !failed.is_empty() {
+        blocks.push(Block::Facts(failed));
+    }
+    blocks
+}
+
+/// All configurations in a sequence, and the pictures of one of its runs.
+fn sequence_blocks(
+    results: &ComparisonResults,
+    sequence: &str,
+    layout: &Layout,
+) -> Result<Vec<Block>> {
+    let mut blocks = pictures::trajectories(results, sequence, layout)?;
+    if blocks.is_empty() {
+        blocks.push(Block::Paragraph(
+            "No paths and no errors over time: the result files of the runs are missing."
+                .to_owned(),
+        ));
+    }
+    let Some(run) = example_run(results, sequence, layout) else {
+        blocks.push(Block::Paragraph(
+            "No particles, range images, map, likelihood and time per frame: the pictures of the runs are missing."
+                .to_owned(),
+        ));
+        return Ok(blocks);
+    };
+    blocks.push(Block::Paragraph(format!(
+        "Example run: {}, the first seed of the last configuration with pictures. Every run has a page of its own, linked from the table of runs.",
+        run.id
+    )));
+    let mut omitted = Vec::new();
+    for (_, name, caption) in PICTURES {
+        if COMBINED_PICTURES.contains(&name) {
+            continue;
+        }
+        let path = layout.run(&run.id).join("plots").join(name);
+        match picture(&path, &format!("{}: {caption}", run.id)) {
+            Ok(Some(picture)) => blocks.push(picture),
+            Ok(None) => omitted.push(name.to_owned()),
+            Err(error) => omitted.push(format!("{error:#}")),
+        }
+    }
+    if !omitted.is_empty() {
+        let omitted = omitted.join(", ");
+        blocks.push(Block::Paragraph(format!("Missing or not readable: {omitted}.")));
+    }
+    Ok(blocks)
+}
+
+/// First seed of the last configuration that has a finished run with pictures.
+fn example_run<'a>(
+    results: &'a ComparisonResults,
+    sequence: &str,
+    layout: &Layout,
+) -> Option<&'a RunRecord> {
+    let has_pictures = |record: &&RunRecord| {
+        let plots = layout.run(&record.id).join("plots");
+        let mut names = PICTURES.iter().map(|(_, name, _)| name);
+        record.metrics().is_some() && names.any(|name| plots.join(name).exists())
+    };
+    results.config.configurations.iter().rev().find_map(|it| {
+        let runs = results.runs(sequence, &it.name).into_iter();
+        runs.filter(has_pictures).min_by_key(|run| run.id.seed)
+    })
+}
+
+/// Programs, overrides and effective configurations.
+fn configuration(results: &ComparisonResults, layout: &Layout) -> Result<Vec<Block>> {
+    let mut blocks = vec![
+        Block::Facts(versions(results)?),
+        Block::Table(overrides_table(results.config)),
+        Block::Folded {
+            name: "comparison.yml".to_owned(),
+            text: config::to_yaml(results.config)?,
+        },
+    ];
+    let mut examples = results.sequences.iter();
+    let example = examples.find_map(|sequence| example_run(results, sequence, layout));
+    let Some(run) = example else {
+        return Ok(blocks);
+    };
+    for name in TEXTS.iter().filter(|name| name.ends_with(".yml")) {
+        let path = layout.run(&run.id).join(name);
+        blocks.extend(folded(&path, &format!("{name} of {}", run.id))?);
+    }
+    Ok(blocks)
+}
+
+/// Overrides of all runs, of each sequence and of each configuration.
+fn overrides_table(config: &ComparisonConfig) -> Table {
+    let row = |name: String, blocks: &[(&str, &Overrides)]| -> Vec<Cell> {
+        let keys = blocks.iter().flat_map(|(block, overrides)| {
+            let keys = settings(overrides).into_iter();
+            keys.map(move |(key, value)| format!("{block}.{key}: {value}"))
+        });
+        let keys: Vec<String> = keys.collect();
+        vec![Cell::Text(name), Cell::Text(keys.join("; "))]
+    };
+    let stages = |build_map, localization, refinement| {
+        vec![
+            ("build_map", build_map),
+            ("localization", localization),
+            ("refinement", refinement),
+        ]
+    };
+    let base = &config.base;
+    let blocks = stages(&base.build_map, &base.localization, &base.refinement);
+    let mut rows = vec![row("all".to_owned(), &blocks)];
+    for it in &config.sequences {
+        let mut blocks = stages(&it.build_map, &it.localization, &it.refinement);
+        blocks.extend(it.simulation.iter().map(|keys| ("simulation", keys)));
+        rows.push(row(format!("sequence {}", it.name), &blocks));
+    }
+    for it in &config.configurations {
+        let refined = if it.refine { ", refined" } else { "" };
+        let blocks = stages(&it.build_map, &it.localization, &it.refinement);
+        rows.push(row(format!("{}{refined}", it.name), &blocks));
+    }
+    if let Some(sweep) = &config.particles {
+        let name = format!("numbers of particles, {}", sweep.configuration);
+        rows.push(row(name, &[("localization", &sweep.localization)]));
+    }
+    Table {
+        name: "keys".to_owned(),
+        title: "Differences from the defaults".to_owned(),
+        note: "Keys of a sequence override those of all runs, keys of a configuration override both."
+            .to_owned(),
+        columns: ["scope", "keys"].map(Column::named).into(),
+        rows,
+    }
+}
+
+/// Programs and machines of the runs, each once.
+fn versions(results: &ComparisonResults) -> Result<Vec<(String, String)>> {
+    let mut facts = vec![("collected by".to_owned(), version::program()?)];
+    for record in results.all_records() {
+        let machine = record.machine.iter();
+        let machine: String = machine
+            .map(|(key, value)| format!(", {key} {value}"))
+            .collect();
+        let fact = ("run by".to_owned(), record.program.clone() + &machine);
+        if !facts.contains(&fact) {
+            facts.push(fact);
+        }
+    }
+    Ok(facts)
+}

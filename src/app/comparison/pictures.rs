@@ -1,0 +1,227 @@
+//! Plots of a comparison, each as a block of its page.
+
+use std::fs;
+
+use anyhow::{Context as _, Result};
+
+use super::layout::Layout;
+use super::record::RunRecord;
+use super::results::{ComparisonResults, success_rate};
+use super::statistics::SuccessRate;
+use crate::app::commands::run_page::picture;
+use crate::app::plotting::color::{Rgb, SERIES};
+use crate::app::plotting::{LineChart, Mark, Panel, Path2, PathPlot, Series};
+use crate::app::reporting::Block;
+use crate::app::results::LocalizationResults;
+use crate::evaluation::{PlanarError, planar_errors};
+use crate::geometry::Pose2;
+
+/// Error of every run over its seed; `None` without runs.
+pub fn errors_of_runs(results: &ComparisonResults, layout: &Layout) -> Result<Option<Block>> {
+    let panels = results.sequences.iter().map(|sequence| {
+        let names = results.config.configurations.iter().map(|it| &it.name);
+        let series = names.enumerate().map(|(index, name)| {
+            // Equal errors of different configurations lie side by side.
+            let count = results.config.configurations.len();
+            let offset = 0.05 * (index as f64 - 0.5 * (count - 1) as f64);
+            let runs = results.runs(sequence, name).into_iter();
+            let points = runs.filter_map(|run| {
+                Some((run.id.seed as f64 + offset, run.metrics()?.position_m.mean))
+            });
+            Series {
+                name: name.clone(),
+                color: color(index),
+                mark: Mark::Dots,
+                points: points.collect(),
+            }
+        });
+        Panel {
+            y_name: format!("{sequence}: error [m]"),
+            series: series.filter(|series| !series.points.is_empty()).collect(),
+            from_zero: true,
+            ..Panel::default()
+        }
+    });
+    let chart = LineChart {
+        title: "Average positional error of every run".to_owned(),
+        x_name: "seed".to_owned(),
+        panels: panels.filter(|panel| !panel.series.is_empty()).collect(),
+        marks: Vec::new(),
+    };
+    let caption = "Average positional error of every run over its seed";
+    save_chart("runs.png", caption, &chart, layout)
+}
+
+/// Success rate against the number of particles; `None` without a particle sweep.
+pub fn success_rates(results: &ComparisonResults, layout: &Layout) -> Result<Option<Block>> {
+    let rates = results.sweep.iter().filter_map(|(count, records)| {
+        let runs: Vec<&RunRecord> = records.iter().collect();
+        Some((*count, success_rate(&runs)?))
+    });
+    let rates: Vec<(usize, SuccessRate)> = rates.collect();
+    let x = |count: usize| (count as f64).log10();
+    let line = |name: &str, mark, value: fn(&SuccessRate) -> f64| {
+        let points = rates.iter().map(|(n, rate)| (x(*n), 100.0 * value(rate)));
+        Series {
+            mark,
+            ..Series::line(name, color(0), points)
+        }
+    };
+    let panel = Panel {
+        y_name: "success [%]".to_owned(),
+        series: vec![
+            line("success", Mark::Line, |rate| rate.rate),
+            line("95 % interval", Mark::Dashes, |rate| rate.low),
+            line("", Mark::Dashes, |rate| rate.high),
+        ],
+        from_zero: true,
+        ..Panel::default()
+    };
+    let chart = LineChart {
+        title: "Success against the number of particles".to_owned(),
+        x_name: "log10 of the number of particles".to_owned(),
+        panels: if rates.is_empty() { vec![] } else { vec![panel] },
+        marks: rates.iter().map(|(n, _)| (x(*n), n.to_string())).collect(),
+    };
+    let caption =
+        "Success rate against the number of particles, dashed: 95 % interval (Wilson)";
+    save_chart("success.png", caption, &chart, layout)
+}
+
+/// Trajectories and errors of all configurations in a sequence, from the first seed whose result
+/// file is present; empty without result files.
+pub fn trajectories(
+    results: &ComparisonResults,
+    sequence: &str,
+    layout: &Layout,
+) -> Result<Vec<Block>> {
+    let trajectories = read_trajectories(results, sequence, layout);
+    let Some(first) = trajectories.first() else {
+        return Ok(Vec::new());
+    };
+    let seeds = trajectories.iter().map(|it| format!("{} seed {}", it.name, it.seed));
+    let seeds = seeds.collect::<Vec<String>>().join(", ");
+    let paths = trajectories.iter().map(|it| Path2 {
+        name: &it.name,
+        color: it.color,
+        poses: &it.poses,
+    });
+    let plot = plot_path(&format!("paths_{sequence}.png"), layout)?;
+    PathPlot {
+        title: &format!("{sequence}: paths against ground truth"),
+        ground_truth: Some(&first.truth),
+        paths: &paths.collect::<Vec<Path2>>(),
+        map: None,
+    }
+    .save(&plot)?;
+    let paths = picture(&plot, &format!("Paths of all configurations ({seeds})"))?;
+    let errors = save_chart(
+        &format!("errors_{sequence}.png"),
+        &format!("Position and heading error over time ({seeds})"),
+        &error_chart(sequence, &trajectories),
+        layout,
+    )?;
+    Ok([paths, errors].into_iter().flatten().collect())
+}
+
+/// Final trajectory of one run of a configuration.
+struct Trajectory {
+    name: String,
+    color: Rgb,
+    seed: u64,
+    frames: Vec<usize>,
+    poses: Vec<Pose2>,
+    truth: Vec<Pose2>,
+}
+
+fn read_trajectories(
+    results: &ComparisonResults,
+    sequence: &str,
+    layout: &Layout,
+) -> Vec<Trajectory> {
+    let configurations = results.config.configurations.iter().enumerate();
+    let of_configuration = configurations.filter_map(|(index, configuration)| {
+        let mut runs = results.runs(sequence, &configuration.name);
+        runs.retain(|run| run.metrics().is_some());
+        runs.sort_by_key(|run| run.id.seed);
+        let mut found = runs.into_iter();
+        found.find_map(|run| read_trajectory(run, color(index), layout))
+    });
+    of_configuration.collect()
+}
+
+/// `None` if the result file of a run is missing or not readable.
+fn read_trajectory(record: &RunRecord, color: Rgb, layout: &Layout) -> Option<Trajectory> {
+    let path = layout.run(&record.id).join("localization.npz");
+    if !path.exists() {
+        return None;
+    }
+    let results = LocalizationResults::read(&path)
+        .inspect_err(|error| tracing::warn!("{} is not plotted: {error}", record.id))
+        .ok()?;
+    Some(Trajectory {
+        name: record.id.configuration.clone(),
+        color,
+        seed: record.id.seed,
+        frames: results.frames,
+        poses: results.refined.or(results.estimates)?,
+        truth: results.ground_truth?,
+    })
+}
+
+/// A panel for position and one for heading, with one line per configuration.
+fn error_chart(sequence: &str, trajectories: &[Trajectory]) -> LineChart {
+    let panel = |y_name: &str, value: fn(&PlanarError) -> f64| {
+        let series = trajectories.iter().map(|it| {
+            let errors = planar_errors(&it.poses, &it.truth);
+            let points = it.frames.iter().zip(&errors);
+            let points = points.map(|(&frame, error)| (frame as f64, value(error)));
+            Series::line(&it.name, it.color, points)
+        });
+        Panel {
+            y_name: y_name.to_owned(),
+            series: series.collect(),
+            from_zero: true,
+            clip_outliers: true,
+            ..Panel::default()
+        }
+    };
+    LineChart {
+        title: format!("{sequence}: errors over time"),
+        x_name: "frame".to_owned(),
+        panels: vec![
+            panel("position error [m]", PlanarError::distance_m),
+            panel("heading error [deg]", |error| {
+                error.turn_rad.abs().to_degrees()
+            }),
+        ],
+        marks: Vec::new(),
+    }
+}
+
+/// Saves a chart unless it has no panels.
+fn save_chart(
+    name: &str,
+    caption: &str,
+    chart: &LineChart,
+    layout: &Layout,
+) -> Result<Option<Block>> {
+    if chart.panels.is_empty() {
+        return Ok(None);
+    }
+    let path = plot_path(name, layout)?;
+    chart.save(&path)?;
+    picture(&path, caption)
+}
+
+/// Path of a plot, whose folder is created.
+fn plot_path(name: &str, layout: &Layout) -> Result<std::path::PathBuf> {
+    let folder = layout.root.join("plots");
+    fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
+    Ok(folder.join(name))
+}
+
+/// Color of a configuration.
+fn color(index: usize) -> Rgb {
+    SERIES[index % SERIES.len()]
+}
