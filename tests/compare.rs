@@ -1,5 +1,5 @@
-//! A comparison from outside, on a street of a few scans: what is finished is kept, what is shared
-//! is made once, and the tables say what the runs say.
+//! The command `compare` on a street of a few scans: finished runs are kept, shared results are
+//! created once, and the tables agree with the runs.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
@@ -58,7 +58,7 @@ fn json(path: &Path) -> Value {
     serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
 }
 
-/// The folders with a key as their name, that is, without the locks.
+/// The folders of shared results, without the lock files.
 fn shared(recording: &Recording, what: &str) -> Vec<PathBuf> {
     let entries = fs::read_dir(recording.path(&format!("out/shared/{what}"))).unwrap();
     let paths = entries.map(|entry| entry.unwrap().path());
@@ -82,43 +82,43 @@ fn records(recording: &Recording) -> Vec<(PathBuf, Vec<u8>)> {
 }
 
 #[test]
-fn a_comparison_is_done_once_and_goes_on_where_it_was() {
+fn every_run_is_executed_once_and_an_interrupted_comparison_resumes() {
     let recording = recording();
     let job = compare(&recording).with("--job=street/Fuzzy-PSO-MCL/2");
-    let said = job.succeeds().stdout;
-    assert!(said.contains("average positional error"), "{said}");
+    let output = job.succeeds().stdout;
+    assert!(output.contains("average positional error"), "{output}");
     let first = records(&recording);
     assert_eq!(first.len(), 1);
     let collected = compare(&recording).with("--collect").succeeds().stdout;
     assert!(collected.contains("1 of 2"), "{collected}");
 
-    let said = compare(&recording).succeeds();
+    let output = compare(&recording).succeeds();
     let all = records(&recording);
     assert_eq!(all.len(), 3 * 2 + 2);
-    assert!(all.contains(&first[0]), "a finished run was done again");
+    assert!(all.contains(&first[0]), "a finished run was executed again");
     assert!(
-        said.stderr.contains("elsewhere is left out"),
+        output.stderr.contains("elsewhere is skipped"),
         "{}",
-        said.stderr
+        output.stderr
     );
-    // Two ways to find the ground; two seeds in each map, and two numbers of particles.
+    // Two ground methods; two seeds in each map, and two numbers of particles.
     assert_eq!(shared(&recording, "maps").len(), 2);
     assert_eq!(shared(&recording, "localizations").len(), 2 * 2 + 2);
 
-    // As after a crash: a run without its record, and a map that was not finished.
+    // As after a crash: a run without its record, and an incomplete map.
     fs::remove_file(&all[0].0).unwrap();
     fs::remove_file(shared(&recording, "maps")[0].join("finished.json")).unwrap();
     compare(&recording).succeeds();
     let again = records(&recording);
     assert_eq!(again.len(), all.len());
-    assert_eq!(again[1..], all[1..], "finished runs were done again");
+    assert_eq!(again[1..], all[1..], "finished runs were executed again");
 
-    the_tables_say_what_the_runs_say(&recording);
-    every_run_can_be_repeated(&recording);
-    the_pages_need_nothing_else(&recording);
-    the_page_is_made_of_whatever_is_there(&recording);
+    the_tables_agree_with_the_runs(&recording);
+    a_run_is_reproduced_by_its_configuration(&recording);
+    the_pages_are_self_contained(&recording);
+    the_page_is_made_of_the_available_files(&recording);
 
-    // Another configuration is another run, and tables do not mix the two.
+    // Records of another configuration are not collected.
     let other = compare(&recording)
         .set("seeds", "[1]")
         .set("base.build_map.voxel_size", "0.25");
@@ -127,7 +127,7 @@ fn a_comparison_is_done_once_and_goes_on_where_it_was() {
         .fails_saying(&["no run is finished"]);
 }
 
-fn the_tables_say_what_the_runs_say(recording: &Recording) {
+fn the_tables_agree_with_the_runs(recording: &Recording) {
     let comparison = json(&recording.path("out/comparison.json"));
     let table = &comparison["tables"][0];
     let column = |name: &str| {
@@ -154,16 +154,16 @@ fn the_tables_say_what_the_runs_say(recording: &Recording) {
                 let folder = format!("out/runs/street/{configuration}/{seed}");
                 let record = json(&recording.path(&format!("{folder}/run.json")));
                 let pointer = "/outcome/finished/metrics/position_m/mean";
-                let told = record.pointer(pointer).unwrap().as_f64().unwrap();
+                let error_m = record.pointer(pointer).unwrap().as_f64().unwrap();
                 let report = json(&recording.path(&format!("{folder}/report.json")));
-                let who = if configuration.contains("PSO") {
+                let trajectory = if configuration.contains("PSO") {
                     "refined"
                 } else {
                     "mcl"
                 };
-                let pointer = format!("/{who}/metrics/position_m/mean");
-                assert_eq!(report.pointer(&pointer).unwrap().as_f64(), Some(told));
-                told
+                let pointer = format!("/{trajectory}/metrics/position_m/mean");
+                assert_eq!(report.pointer(&pointer).unwrap().as_f64(), Some(error_m));
+                error_m
             })
             .into();
         let mean = row[error]["estimate"]["mean"].as_f64().unwrap();
@@ -185,8 +185,8 @@ fn the_tables_say_what_the_runs_say(recording: &Recording) {
     assert!(markdown.contains("claimed by the report [m]"), "{markdown}");
 }
 
-/// The effective configuration of a run gives the run's trajectory again.
-fn every_run_can_be_repeated(recording: &Recording) {
+/// The effective configuration of a run reproduces its trajectory.
+fn a_run_is_reproduced_by_its_configuration(recording: &Recording) {
     let folder = "out/runs/street/Fuzzy-MCL/2";
     let again = fpmcl("localize")
         .in_folder(recording.folder())
@@ -201,9 +201,9 @@ fn every_run_can_be_repeated(recording: &Recording) {
     assert!(log.contains("triangles"), "{log}");
 }
 
-fn the_pages_need_nothing_else(recording: &Recording) {
+fn the_pages_are_self_contained(recording: &Recording) {
     let of_run = "out/runs/street/Fuzzy-PSO-MCL/1/report.html";
-    // Of the comparison: runs, success, paths and errors, and five of one run.
+    // The comparison has runs, success, paths and errors, and five pictures of the example run.
     for (page, pictures) in [("out/report.html", 4 + 5), (of_run, 7)] {
         let html = String::from_utf8(recording.bytes(page)).unwrap();
         for word in ["src=\"http", "href=\"http", "<link", "@import"] {
@@ -224,20 +224,20 @@ fn the_pages_need_nothing_else(recording: &Recording) {
     }
 }
 
-/// Records that came without their runs, and one that did not come.
-fn the_page_is_made_of_whatever_is_there(recording: &Recording) {
+/// Records without the other files of their runs, and missing records.
+fn the_page_is_made_of_the_available_files(recording: &Recording) {
     let page = || String::from_utf8(recording.bytes("out/report.html")).unwrap();
     let whole = page();
-    assert!(!whole.contains("What is missing") && !whole.contains("left out"));
-    for told in [
-        "One run with all its pictures: street/Fuzzy-PSO-MCL/1",
+    assert!(!whole.contains("Missing"));
+    for text in [
+        "Example run: street/Fuzzy-PSO-MCL/1",
         "street/Fuzzy-PSO-MCL/1: Likelihood around the true pose",
         "numbers of particles, Fuzzy-MCL",
         "build_map.ground_method: &quot;pca&quot;",
         "localization.yml of street/Fuzzy-PSO-MCL/1",
-        "(source ",
+        "(executable ",
     ] {
-        assert!(whole.contains(told), "{told}");
+        assert!(whole.contains(text), "{text}");
     }
     let runs = recording.path("out/runs/street");
     let aside = recording.path("out/runs/aside");
@@ -251,13 +251,13 @@ fn the_page_is_made_of_whatever_is_there(recording: &Recording) {
     keep("PCA-MCL/1", &["run.json"]);
     compare(recording).with("--collect").succeeds();
     let html = page();
-    for told in [
-        "7 of 8 runs are not there",
+    for text in [
+        "7 of 8 runs are missing",
         "street/PCA-MCL/2, street/Fuzzy-MCL/1",
-        "No result of its runs is here",
-        "No folder of its runs is here",
+        "the result files of the runs are missing",
+        "the pictures of the runs are missing",
     ] {
-        assert!(html.contains(told), "{told}");
+        assert!(html.contains(text), "{text}");
     }
     keep(
         "Fuzzy-MCL/2",
@@ -266,19 +266,19 @@ fn the_page_is_made_of_whatever_is_there(recording: &Recording) {
     fs::write(runs.join("Fuzzy-MCL/2/plots/likelihood.png"), "half a").unwrap();
     compare(recording).with("--collect").succeeds();
     let html = page();
-    for told in [
-        "One run with all its pictures: street/Fuzzy-MCL/2",
-        "Not there, or not readable: particles.png, range_images.png, cannot read",
+    for text in [
+        "Example run: street/Fuzzy-MCL/2",
+        "Missing or not readable: particles.png, range_images.png, cannot read",
         "(Fuzzy-MCL seed 2)",
     ] {
-        assert!(html.contains(told), "{told}");
+        assert!(html.contains(text), "{text}");
     }
     fs::remove_dir_all(&runs).unwrap();
     fs::rename(&aside, &runs).unwrap();
 }
 
 #[test]
-fn numbers_of_before_do_not_stand_beside_what_a_later_run_made() {
+fn an_outdated_record_is_removed_before_its_run_is_executed_again() {
     let recording = recording();
     let job = || compare(&recording).with("--job=street/Fuzzy-MCL/1");
     job().succeeds();
@@ -286,8 +286,8 @@ fn numbers_of_before_do_not_stand_beside_what_a_later_run_made() {
     let trajectory = "out/runs/street/Fuzzy-MCL/1/mcl_kitti.txt";
     let before = recording.bytes(trajectory);
 
-    // Asked the same of another recording, it ends when everything but the record is written: a
-    // folder lies where a text of its page is looked for.
+    // With another scan, the run fails after everything but the record is written: there is a
+    // folder in the place of a file that its page includes.
     let mut points = recording.scan(0);
     points.truncate(points.len() / 2);
     recording.write_scan(0, &points);
@@ -302,7 +302,7 @@ fn numbers_of_before_do_not_stand_beside_what_a_later_run_made() {
 }
 
 #[test]
-fn every_run_is_a_job_of_its_own() {
+fn every_run_has_a_command_of_its_own() {
     let recording = recording();
     let listed = compare(&recording)
         .set("seeds", "[1, 5]")
@@ -314,25 +314,26 @@ fn every_run_is_a_job_of_its_own() {
     assert_eq!(jobs.iter().collect::<BTreeSet<_>>().len(), jobs.len());
     for job in &jobs {
         assert!(
-            job.contains(" compare comparison.yml --set 'seeds=[1, 5]'"),
+            job.contains(
+                " compare comparison.yml '--backend=cpu' --set 'seeds=[1, 5]' --job street/"
+            ),
             "{job}"
         );
-        assert!(job.contains(" --backend=cpu --job street/"), "{job}");
     }
-    assert!(!recording.path("out").exists(), "listing does nothing");
+    assert!(!recording.path("out").exists(), "listing executes nothing");
 }
 
 #[test]
-fn what_cannot_be_is_told_before_any_work() {
+fn errors_are_reported_before_any_run_is_executed() {
     let recording = recording();
-    let told = |call: Fpmcl, parts: &[&str]| {
+    let fails = |call: Fpmcl, parts: &[&str]| {
         call.fails_saying(parts);
     };
-    told(
+    fails(
         compare(&recording).with("--job=street/Fuzzy/1"),
         &["there is no run street/Fuzzy/1", "--list-jobs"],
     );
-    told(
+    fails(
         compare(&recording).with("--collect"),
         &["no run is finished below out"],
     );
@@ -340,7 +341,7 @@ fn what_cannot_be_is_told_before_any_work() {
         "comparison.yml",
         &COMPARISON.replace("ground_method: pca", "ground_method: pcb"),
     );
-    told(compare(&recording), &["PCA-MCL", "ground_method", "pcb"]);
+    fails(compare(&recording), &["PCA-MCL", "ground_method", "pcb"]);
     compare(&recording)
         .with("--job=street")
         .misuse_saying(&["SEQUENCE/CONFIGURATION/SEED"]);

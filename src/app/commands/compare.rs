@@ -7,9 +7,7 @@ use anyhow::{Context as _, Result, bail};
 
 use super::{Context, output};
 use crate::app::cli::CompareArgs;
-use crate::app::comparison::{
-    Executor, Layout, Outcome, PlannedRun, RunId, collect, planned_runs,
-};
+use crate::app::comparison::{Executor, Layout, Outcome, PlannedRun, RunId, collect, planned_runs};
 use crate::app::config::{self, ComparisonConfig};
 
 /// Executes the missing runs, or the requested part of the work; returns the text for standard

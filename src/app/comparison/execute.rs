@@ -209,7 +209,10 @@ impl<'a> Executor<'a> {
 
     /// Appends the log of a shared stage to the log of the run.
     fn repeat_log(&self, stage: &SharedResult) -> Result<()> {
-        self.context.log.clone().repeat(&stage.folder.join(LOG_FILE))
+        self.context
+            .log
+            .clone()
+            .repeat(&stage.folder.join(LOG_FILE))
     }
 
     /// Description of the machine for the record of a run.
@@ -253,7 +256,11 @@ fn evaluate(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
         .zip(results.ground_truth)
         .with_context(|| format!("{} has no trajectory to evaluate", result.display()))?;
     let mut runtimes_s = results.runtimes_s;
-    for (filter_s, refinement_s) in runtimes_s.iter_mut().flatten().zip(refinement_s.iter().flatten()) {
+    for (filter_s, refinement_s) in runtimes_s
+        .iter_mut()
+        .flatten()
+        .zip(refinement_s.iter().flatten())
+    {
         *filter_s += refinement_s;
     }
     let trajectory = EvaluatedTrajectory {
@@ -262,7 +269,7 @@ fn evaluate(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
         times_s: results.times_s.as_deref(),
         runtimes_s: runtimes_s.as_deref(),
     };
-    run_output::judge_one(&trajectory, &RangeMclRules::default())
+    run_output::evaluate_trajectory(&trajectory, &RangeMclRules::default())
 }
 
 /// Name of the processor, on systems with `/proc/cpuinfo`.
@@ -278,7 +285,10 @@ fn copy_folder(from: &Path, to: &Path) -> Result<()> {
     for entry in fs::read_dir(from).with_context(|| format!("cannot read {}", from.display()))? {
         let entry = entry?;
         let name = entry.file_name();
-        if [cache::FINISHED_FILE, LOG_FILE].map(OsStr::new).contains(&name.as_os_str()) {
+        if [cache::FINISHED_FILE, LOG_FILE]
+            .map(OsStr::new)
+            .contains(&name.as_os_str())
+        {
             continue;
         }
         if entry.path().is_dir() {

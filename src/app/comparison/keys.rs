@@ -188,7 +188,10 @@ enum Input<'a> {
 impl<'a> Input<'a> {
     fn new(run: &'a PlannedRun, path: &'a Path, selection: Option<Selection>) -> Self {
         let below = |drive: &SimulationConfig| path.strip_prefix(drive.drive_folder()).ok();
-        let simulated = run.drives.iter().find_map(|drive| Some((drive, below(drive)?)));
+        let simulated = run
+            .drives
+            .iter()
+            .find_map(|drive| Some((drive, below(drive)?)));
         match (simulated, selection) {
             (Some((drive, path)), _) => Self::Simulated(drive, path),
             (None, Some(selection)) => Self::Scans(path, selection),

@@ -48,7 +48,10 @@ pub fn page(
         section("Time", blocks(&["timing"])),
         section("Numbers of particles", particles),
         section("Runs", blocks(&["runs"])),
-        section("Configuration and versions", configuration(results, layout)?),
+        section(
+            "Configuration and versions",
+            configuration(results, layout)?,
+        ),
     ]);
     sections.retain(|section| !section.blocks.is_empty());
     Ok(Page {
@@ -76,10 +79,12 @@ fn missing_runs(results: &ComparisonResults, planned: &[PlannedRun]) -> Vec<Bloc
     let has_record = |run: &&PlannedRun| results.all_records().any(|record| record.id == run.id);
     let missing = planned.iter().filter(|run| !has_record(run));
     let missing: Vec<String> = missing.map(|run| run.id.to_string()).collect();
-    let failed = results.all_records().filter_map(|record| match &record.outcome {
-        Outcome::Finished(_) => None,
-        Outcome::Failed(message) => Some((record.id.to_string(), format!("failed: {message}"))),
-    });
+    let failed = results
+        .all_records()
+        .filter_map(|record| match &record.outcome {
+            Outcome::Finished(_) => None,
+            Outcome::Failed(message) => Some((record.id.to_string(), format!("failed: {message}"))),
+        });
     let failed: Vec<(String, String)> = failed.collect();
     let mut blocks = Vec::new();
     if !missing.is_empty() {
@@ -138,7 +143,9 @@ fn sequence_blocks(
     }
     if !omitted.is_empty() {
         let omitted = omitted.join(", ");
-        blocks.push(Block::Paragraph(format!("Missing or not readable: {omitted}.")));
+        blocks.push(Block::Paragraph(format!(
+            "Missing or not readable: {omitted}."
+        )));
     }
     Ok(blocks)
 }
@@ -219,8 +226,9 @@ fn overrides_table(config: &ComparisonConfig) -> Table {
     Table {
         name: "keys".to_owned(),
         title: "Differences from the defaults".to_owned(),
-        note: "Keys of a sequence override those of all runs, keys of a configuration override both."
-            .to_owned(),
+        note:
+            "Keys of a sequence override those of all runs, keys of a configuration override both."
+                .to_owned(),
         columns: ["scope", "keys"].map(Column::named).into(),
         rows,
     }

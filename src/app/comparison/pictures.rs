@@ -80,11 +80,14 @@ pub fn success_rates(results: &ComparisonResults, layout: &Layout) -> Result<Opt
     let chart = LineChart {
         title: "Success against the number of particles".to_owned(),
         x_name: "log10 of the number of particles".to_owned(),
-        panels: if rates.is_empty() { vec![] } else { vec![panel] },
+        panels: if rates.is_empty() {
+            vec![]
+        } else {
+            vec![panel]
+        },
         marks: rates.iter().map(|(n, _)| (x(*n), n.to_string())).collect(),
     };
-    let caption =
-        "Success rate against the number of particles, dashed: 95 % interval (Wilson)";
+    let caption = "Success rate against the number of particles, dashed: 95 % interval (Wilson)";
     save_chart("success.png", caption, &chart, layout)
 }
 
@@ -99,7 +102,9 @@ pub fn trajectories(
     let Some(first) = trajectories.first() else {
         return Ok(Vec::new());
     };
-    let seeds = trajectories.iter().map(|it| format!("{} seed {}", it.name, it.seed));
+    let seeds = trajectories
+        .iter()
+        .map(|it| format!("{} seed {}", it.name, it.seed));
     let seeds = seeds.collect::<Vec<String>>().join(", ");
     let paths = trajectories.iter().map(|it| Path2 {
         name: &it.name,

@@ -37,7 +37,9 @@ impl ComparisonResults<'_> {
     /// Records of a configuration, one group per sequence.
     pub fn runs_by_sequence(&self, configuration: &str) -> Vec<Vec<&RunRecord>> {
         let sequences = self.sequences.iter();
-        sequences.map(|name| self.runs(name, configuration)).collect()
+        sequences
+            .map(|name| self.runs(name, configuration))
+            .collect()
     }
 
     /// Differences of a contrast per sequence, over the seeds that both configurations have.

@@ -75,17 +75,24 @@ fn summary(results: &ComparisonResults, measures: &[Measure]) -> (Vec<Column>, V
         [start, estimates(&groups, measures)].concat()
     };
     let rows = results.config.configurations.iter().map(row).collect();
-    let start = [Column::named("configuration"), runs_column(), success_column()];
+    let start = [
+        Column::named("configuration"),
+        runs_column(),
+        success_column(),
+    ];
     (columns(start, measures), rows)
 }
 
 /// One row per contrast, one column per measure.
 fn differences(results: &ComparisonResults) -> Table {
     let row = |contrast: &Contrast| {
-        let start = [contrast.of.as_str().into(), contrast.against.as_str().into()];
-        let differences = SELECTED.iter().map(|measure| {
-            PairedDifference::of(&results.differences(contrast, measure)).into()
-        });
+        let start = [
+            contrast.of.as_str().into(),
+            contrast.against.as_str().into(),
+        ];
+        let differences = SELECTED
+            .iter()
+            .map(|measure| PairedDifference::of(&results.differences(contrast, measure)).into());
         start.into_iter().chain(differences).collect()
     };
     Table {

@@ -1,14 +1,17 @@
-//! Runs whose numbers are known, and what the tables make of them.
+//! Tables of runs with known errors.
+
+use std::collections::BTreeMap;
 
 use approx::assert_relative_eq;
 
 use super::*;
 use crate::app::comparison::record::{Outcome, RunId};
+use crate::app::config::ComparisonConfig;
 use crate::app::results::TrajectoryReport;
 use crate::evaluation::{EvaluatedTrajectory, MetricsConfig, RangeMclRules, TrajectoryMetrics};
 use crate::geometry::Pose2;
 
-/// A run that is `error_m` to the left of the truth all the way.
+/// A run with a constant error of `error_m` to the left.
 fn run(sequence: &str, configuration: &str, seed: u64, error_m: f64) -> RunRecord {
     let truth: Vec<Pose2> = (0..40)
         .map(|k| Pose2::translation(f64::from(k), 0.0))
@@ -23,7 +26,7 @@ fn run(sequence: &str, configuration: &str, seed: u64, error_m: f64) -> RunRecor
         times_s: None,
         runtimes_s: Some(&[0.1; 40]),
     };
-    let judgement = TrajectoryReport {
+    let report = TrajectoryReport {
         range_mcl: RangeMclRules::default().evaluate(&estimates, &truth),
         metrics: TrajectoryMetrics::of(&trajectory, &MetricsConfig::default()).unwrap(),
     };
@@ -38,29 +41,33 @@ fn run(sequence: &str, configuration: &str, seed: u64, error_m: f64) -> RunRecor
         program: String::new(),
         machine: [].into(),
         stage_seconds: [].into(),
-        outcome: Outcome::Finished(Box::new(judgement)),
+        outcome: Outcome::Finished(Box::new(report)),
     }
 }
 
-fn comparison(records: Vec<RunRecord>) -> Comparison {
-    let variant = |name: &str, claimed_m| Variant {
+fn config() -> ComparisonConfig {
+    let configuration = |name: &str, claimed_m| VariantConfig {
         name: name.to_owned(),
         claimed_m,
+        ..VariantConfig::default()
     };
-    Comparison {
-        sequences: vec!["town".to_owned(), "hill".to_owned()],
-        variants: vec![variant("A", Some(1.45)), variant("B", None)],
-        contrasts: vec![Contrast {
-            of: "B".to_owned(),
-            against: "A".to_owned(),
-        }],
-        seeds: 2,
-        records,
-        sweep: Vec::new(),
+    ComparisonConfig {
+        seeds: vec![1, 2],
+        configurations: vec![configuration("A", Some(1.45)), configuration("B", None)],
+        ..ComparisonConfig::default()
     }
 }
 
-/// B is a centimetre better than A wherever both have a run.
+fn comparison(config: &ComparisonConfig, records: Vec<RunRecord>) -> ComparisonResults<'_> {
+    ComparisonResults {
+        config,
+        sequences: vec!["town".to_owned(), "hill".to_owned()],
+        records,
+        sweep: BTreeMap::new(),
+    }
+}
+
+/// Runs of A and B, where B is one centimetre better than A.
 fn eight_runs() -> Vec<RunRecord> {
     let mut runs = Vec::new();
     for (sequence, error_m) in [("town", 0.10), ("hill", 0.30)] {
@@ -79,8 +86,8 @@ fn cell<'a>(table: &'a Table, row: usize, name: &str) -> &'a Cell {
 }
 
 #[test]
-fn the_mean_of_a_configuration_is_over_sequences_and_its_claim_stands_beside() {
-    let table = comparison(eight_runs()).table_1();
+fn the_mean_of_a_configuration_is_over_sequences_and_the_claim_has_its_own_column() {
+    let table = table_1(&comparison(&config(), eight_runs()));
     let Cell::Mean(error) = cell(&table, 0, "average positional error") else {
         panic!("{table:?}")
     };
@@ -102,8 +109,8 @@ fn the_mean_of_a_configuration_is_over_sequences_and_its_claim_stands_beside() {
 }
 
 #[test]
-fn a_small_difference_in_every_pair_is_one_however_wide_the_runs_scatter() {
-    let table = comparison(eight_runs()).differences();
+fn a_small_difference_in_every_pair_is_significant_despite_a_large_scatter_of_the_runs() {
+    let table = differences(&comparison(&config(), eight_runs()));
     let Cell::Difference(error) = cell(&table, 0, "average positional error") else {
         panic!("{table:?}")
     };
@@ -112,22 +119,23 @@ fn a_small_difference_in_every_pair_is_one_however_wide_the_runs_scatter() {
 }
 
 #[test]
-fn runs_without_a_partner_do_not_enter_a_difference() {
+fn unpaired_runs_are_not_part_of_a_difference() {
     let mut runs = eight_runs();
     runs.retain(|run| !(run.id.configuration == "A" && run.id.seed == 2));
     runs.retain(|run| !(run.id.configuration == "B" && run.id.sequence == "hill"));
-    let comparison = comparison(runs);
-    let pairs = comparison.pairs(&comparison.contrasts[0], &TABLE_1[0]);
+    let config = config();
+    let comparison = comparison(&config, runs);
+    let pairs = comparison.differences(&config.contrasts()[0], &TABLE_1[0]);
     assert_eq!(pairs.iter().map(Vec::len).collect::<Vec<_>>(), [1, 0]);
-    assert_eq!(comparison.table_1().rows.len(), 2);
+    assert_eq!(table_1(&comparison).rows.len(), 2);
 }
 
 #[test]
-fn a_failed_run_counts_against_success_and_has_no_error() {
+fn a_failed_run_lowers_the_success_rate_and_has_no_error() {
     let mut runs = eight_runs();
     runs[0].outcome = Outcome::Failed("no ground".to_owned());
     runs.push(run("town", "A", 3, 2.0));
-    let table = comparison(runs).table_1();
+    let table = table_1(&comparison(&config(), runs));
     let Cell::Rate(rate) = cell(&table, 0, "success") else {
         panic!("{table:?}")
     };
@@ -140,9 +148,7 @@ fn a_failed_run_counts_against_success_and_has_no_error() {
 
 #[test]
 fn every_row_has_a_cell_per_column_and_every_run_a_row() {
-    let mut runs = eight_runs();
-    runs.reverse();
-    let tables = comparison(runs).tables();
+    let tables = tables(&comparison(&config(), eight_runs()));
     for table in &tables {
         for row in &table.rows {
             assert_eq!(row.len(), table.columns.len(), "{}", table.name);
@@ -156,22 +162,26 @@ fn every_row_has_a_cell_per_column_and_every_run_a_row() {
 }
 
 #[test]
-fn more_particles_are_more_rows() {
+fn every_number_of_particles_has_a_row() {
     let runs = eight_runs();
     let some: Vec<RunRecord> = runs.iter().take(3).cloned().collect();
-    let table = particle_table(&[(100, vec![]), (1000, some)]);
+    let config = config();
+    let mut comparison = comparison(&config, runs);
+    comparison.sweep = [(100, vec![]), (1000, some)].into();
+    let table = particles(&comparison);
     assert_eq!(cell(&table, 0, "success"), &Cell::Absent);
     assert_eq!(cell(&table, 1, "success").number(), Some(1.0));
 }
 
 #[test]
-fn runs_of_the_sweep_are_in_the_list_of_runs_and_in_no_mean() {
+fn runs_of_the_particle_sweep_are_listed_and_in_no_mean() {
     let mut swept = run("town", "A-100-particles", 1, 9.0);
     swept.id.seed = 7;
-    let mut comparison = comparison(eight_runs());
-    let without = comparison.tables();
-    comparison.sweep = vec![(100, vec![swept])];
-    let tables = comparison.tables();
+    let config = config();
+    let mut comparison = comparison(&config, eight_runs());
+    let without = tables(&comparison);
+    comparison.sweep = [(100, vec![swept])].into();
+    let tables = tables(&comparison);
     for (before, after) in without.iter().zip(&tables).take(5) {
         assert_eq!(before, after);
     }
@@ -186,7 +196,7 @@ fn runs_of_the_sweep_are_in_the_list_of_runs_and_in_no_mean() {
 }
 
 #[test]
-fn every_stage_has_a_column_and_what_was_not_done_no_time() {
+fn every_stage_has_a_column_and_a_skipped_stage_no_time() {
     let mut runs = eight_runs();
     for run in &mut runs {
         let seconds = run.id.seed as f64;
@@ -195,7 +205,7 @@ fn every_stage_has_a_column_and_what_was_not_done_no_time() {
             run.stage_seconds.insert("2 refine".to_owned(), 5.0);
         }
     }
-    let table = comparison(runs).timing();
+    let table = timing(&comparison(&config(), runs));
     assert_eq!(table.rows.len(), 4);
     assert_eq!(cell(&table, 0, "1 map").number(), Some(1.5));
     assert_eq!(cell(&table, 0, "2 refine"), &Cell::Absent);

@@ -142,7 +142,9 @@ impl ComparisonConfig {
 pub fn settings(overrides: &Overrides) -> Vec<(String, String)> {
     let pairs = overrides.iter().flat_map(|(key, value)| match value {
         serde_json::Value::Object(block) if !block.is_empty() => {
-            let block = block.iter().map(|(inner, value)| (format!("{key}.{inner}"), value.clone()));
+            let block = block
+                .iter()
+                .map(|(inner, value)| (format!("{key}.{inner}"), value.clone()));
             settings(&block.collect())
         }
         // JSON is YAML.
@@ -175,7 +177,11 @@ impl Validate for ComparisonConfig {
         };
         at_least_one("particles.counts", particles.counts.len())?;
         at_least_one("particles.seeds", particles.seeds.len())?;
-        check_known("particles.configuration", &particles.configuration, &configurations)?;
+        check_known(
+            "particles.configuration",
+            &particles.configuration,
+            &configurations,
+        )?;
         for name in &particles.sequences {
             check_known("particles.sequences", name, &sequences)?;
         }

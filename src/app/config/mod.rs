@@ -26,8 +26,8 @@ mod yaml;
 
 pub use build_map::BuildMapConfig;
 pub use comparison::{
-    ComparisonConfig, Contrast, Overrides, ParticleSweep, SequenceConfig, StageOverrides, VariantConfig,
-    settings,
+    ComparisonConfig, Contrast, Overrides, ParticleSweep, SequenceConfig, StageOverrides,
+    VariantConfig, settings,
 };
 pub use error::ConfigError;
 pub use evaluation::EvaluationConfig;
