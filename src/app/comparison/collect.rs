@@ -10,11 +10,10 @@ use super::layout::Layout;
 use super::plan::PlannedRun;
 use super::record::RunRecord;
 use super::results::ComparisonResults;
-use super::table::Table;
 use super::{keys, page, tables};
 use crate::app::commands::{output, version};
 use crate::app::config::{self, ComparisonConfig};
-use crate::app::reporting::{csv, markdown, text};
+use crate::app::reporting::{Table, csv, markdown, text};
 
 /// `comparison.json`.
 #[derive(Serialize)]
@@ -99,7 +98,7 @@ fn write_tables(tables: &[Table], folder: &Path) -> Result<()> {
     output::write_text(&folder.join("tables.md"), &all.join("\n"))?;
     for table in tables {
         let path = folder.join(format!("{}.csv", table.name));
-        output::write_text(&path, &csv::table(table))?;
+        output::write_file(&path, |file| csv::write(table, file))?;
     }
     Ok(())
 }

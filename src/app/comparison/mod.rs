@@ -48,17 +48,16 @@
 mod cache;
 mod execute;
 mod keys;
-pub mod layout;
-pub mod plan;
-pub mod record;
+mod layout;
+mod plan;
+mod record;
 // Evaluation of the records.
 mod collect;
-pub mod measures;
+mod measures;
 mod page;
 mod pictures;
 mod results;
-pub mod statistics;
-pub mod table;
+mod statistics;
 mod tables;
 
 pub use collect::collect;
@@ -66,5 +65,3 @@ pub use execute::Executor;
 pub use layout::Layout;
 pub use plan::{PlannedRun, planned_runs};
 pub use record::{Outcome, RunId, RunRecord};
-pub use statistics::{Estimate, PairedDifference, SuccessRate};
-pub use table::{Cell, Column, Table};

@@ -7,11 +7,10 @@ use super::pictures;
 use super::plan::PlannedRun;
 use super::record::{Outcome, RunRecord};
 use super::results::ComparisonResults;
-use super::table::{Cell, Column, Table};
-use crate::app::commands::run_page::{PICTURES, TEXTS, folded, picture};
+use crate::app::commands::run_page::{PICTURES, TEXTS, collapsed, picture};
 use crate::app::commands::version;
 use crate::app::config::{self, ComparisonConfig, Overrides, settings};
-use crate::app::reporting::{Block, Page, Section};
+use crate::app::reporting::{Cell, Column, Page, PageElement, Section, Table};
 
 /// Pictures of a run that the comparison has for all configurations together.
 const COMBINED_PICTURES: [&str; 2] = ["path.png", "errors.png"];
@@ -26,34 +25,34 @@ pub fn page(
     planned: &[PlannedRun],
     layout: &Layout,
 ) -> Result<Page> {
-    let blocks = |names: &[&str]| -> Vec<Block> {
+    let elements = |names: &[&str]| -> Vec<PageElement> {
         let tables = tables.iter().filter(|t| names.contains(&t.name.as_str()));
-        tables.cloned().map(Block::Table).collect()
+        tables.cloned().map(PageElement::Table).collect()
     };
-    let mut sequences = blocks(&["by_sequence"]);
+    let mut sequences = elements(&["by_sequence"]);
     sequences.extend(pictures::errors_of_runs(results, layout)?);
     let mut sections = vec![
         section("Missing runs", missing_runs(results, planned)),
-        section("Tables", blocks(&["table_1", "table_2"])),
-        section("Differences", blocks(&["differences"])),
+        section("Tables", elements(&["table_1", "table_2"])),
+        section("Differences", elements(&["differences"])),
         section("Sequences", sequences),
     ];
     for sequence in &results.sequences {
-        let blocks = sequence_blocks(results, sequence, layout)?;
-        sections.push(section(&format!("Sequence {sequence}"), blocks));
+        let elements = sequence_elements(results, sequence, layout)?;
+        sections.push(section(&format!("Sequence {sequence}"), elements));
     }
-    let mut particles = blocks(&["particles"]);
+    let mut particles = elements(&["particles"]);
     particles.extend(pictures::success_rates(results, layout)?);
     sections.extend([
-        section("Time", blocks(&["timing"])),
+        section("Time", elements(&["timing"])),
         section("Numbers of particles", particles),
-        section("Runs", blocks(&["runs"])),
+        section("Runs", elements(&["runs"])),
         section(
             "Configuration and versions",
             configuration(results, layout)?,
         ),
     ]);
-    sections.retain(|section| !section.blocks.is_empty());
+    sections.retain(|section| !section.elements.is_empty());
     Ok(Page {
         title: "Comparison".to_owned(),
         subtitle: format!(
@@ -67,15 +66,15 @@ pub fn page(
     })
 }
 
-fn section(title: &str, blocks: Vec<Block>) -> Section {
+fn section(title: &str, elements: Vec<PageElement>) -> Section {
     Section {
         title: title.to_owned(),
-        blocks,
+        elements,
     }
 }
 
 /// Planned runs without a record, and failed runs; empty if there are none.
-fn missing_runs(results: &ComparisonResults, planned: &[PlannedRun]) -> Vec<Block> {
+fn missing_runs(results: &ComparisonResults, planned: &[PlannedRun]) -> Vec<PageElement> {
     let has_record = |run: &&PlannedRun| results.all_records().any(|record| record.id == run.id);
     let missing = planned.iter().filter(|run| !has_record(run));
     let missing: Vec<String> = missing.map(|run| run.id.to_string()).collect();
@@ -86,46 +85,46 @@ fn missing_runs(results: &ComparisonResults, planned: &[PlannedRun]) -> Vec<Bloc
             Outcome::Failed(message) => Some((record.id.to_string(), format!("failed: {message}"))),
         });
     let failed: Vec<(String, String)> = failed.collect();
-    let mut blocks = Vec::new();
+    let mut elements = Vec::new();
     if !missing.is_empty() {
         let listed = missing[..missing.len().min(MAX_LISTED)].join(", ");
         let more = match missing.len().saturating_sub(MAX_LISTED) {
             0 => String::new(),
             more => format!(" and {more} more"),
         };
-        blocks.push(Block::Paragraph(format!(
+        elements.push(PageElement::Paragraph(format!(
             "{} of {} runs are missing or have another configuration: {listed}{more}.",
             missing.len(),
             planned.len()
         )));
     }
     if !failed.is_empty() {
-        blocks.push(Block::Facts(failed));
+        elements.push(PageElement::Facts(failed));
     }
-    blocks
+    elements
 }
 
 /// All configurations in a sequence, and the pictures of one of its runs.
-fn sequence_blocks(
+fn sequence_elements(
     results: &ComparisonResults,
     sequence: &str,
     layout: &Layout,
-) -> Result<Vec<Block>> {
-    let mut blocks = pictures::trajectories(results, sequence, layout)?;
-    if blocks.is_empty() {
-        blocks.push(Block::Paragraph(
+) -> Result<Vec<PageElement>> {
+    let mut elements = pictures::trajectories(results, sequence, layout)?;
+    if elements.is_empty() {
+        elements.push(PageElement::Paragraph(
             "No paths and no errors over time: the result files of the runs are missing."
                 .to_owned(),
         ));
     }
     let Some(run) = example_run(results, sequence, layout) else {
-        blocks.push(Block::Paragraph(
+        elements.push(PageElement::Paragraph(
             "No particles, range images, map, likelihood and time per frame: the pictures of the runs are missing."
                 .to_owned(),
         ));
-        return Ok(blocks);
+        return Ok(elements);
     };
-    blocks.push(Block::Paragraph(format!(
+    elements.push(PageElement::Paragraph(format!(
         "Example run: {}, the first seed of the last configuration with pictures. Every run has a page of its own, linked from the table of runs.",
         run.id
     )));
@@ -136,18 +135,18 @@ fn sequence_blocks(
         }
         let path = layout.run(&run.id).join("plots").join(name);
         match picture(&path, &format!("{}: {caption}", run.id)) {
-            Ok(Some(picture)) => blocks.push(picture),
+            Ok(Some(picture)) => elements.push(picture),
             Ok(None) => omitted.push(name.to_owned()),
             Err(error) => omitted.push(format!("{error:#}")),
         }
     }
     if !omitted.is_empty() {
         let omitted = omitted.join(", ");
-        blocks.push(Block::Paragraph(format!(
+        elements.push(PageElement::Paragraph(format!(
             "Missing or not readable: {omitted}."
         )));
     }
-    Ok(blocks)
+    Ok(elements)
 }
 
 /// First seed of the last configuration that has a finished run with pictures.
@@ -168,11 +167,11 @@ fn example_run<'a>(
 }
 
 /// Programs, overrides and effective configurations.
-fn configuration(results: &ComparisonResults, layout: &Layout) -> Result<Vec<Block>> {
-    let mut blocks = vec![
-        Block::Facts(versions(results)?),
-        Block::Table(overrides_table(results.config)),
-        Block::Folded {
+fn configuration(results: &ComparisonResults, layout: &Layout) -> Result<Vec<PageElement>> {
+    let mut elements = vec![
+        PageElement::Facts(versions(results)?),
+        PageElement::Table(overrides_table(results.config)),
+        PageElement::Collapsed {
             name: "comparison.yml".to_owned(),
             text: config::to_yaml(results.config)?,
         },
@@ -180,19 +179,19 @@ fn configuration(results: &ComparisonResults, layout: &Layout) -> Result<Vec<Blo
     let mut examples = results.sequences.iter();
     let example = examples.find_map(|sequence| example_run(results, sequence, layout));
     let Some(run) = example else {
-        return Ok(blocks);
+        return Ok(elements);
     };
     for name in TEXTS.iter().filter(|name| name.ends_with(".yml")) {
         let path = layout.run(&run.id).join(name);
-        blocks.extend(folded(&path, &format!("{name} of {}", run.id))?);
+        elements.extend(collapsed(&path, &format!("{name} of {}", run.id))?);
     }
-    Ok(blocks)
+    Ok(elements)
 }
 
 /// Overrides of all runs, of each sequence and of each configuration.
 fn overrides_table(config: &ComparisonConfig) -> Table {
-    let row = |name: String, blocks: &[(&str, &Overrides)]| -> Vec<Cell> {
-        let keys = blocks.iter().flat_map(|(block, overrides)| {
+    let row = |name: String, elements: &[(&str, &Overrides)]| -> Vec<Cell> {
+        let keys = elements.iter().flat_map(|(block, overrides)| {
             let keys = settings(overrides).into_iter();
             keys.map(move |(key, value)| format!("{block}.{key}: {value}"))
         });
@@ -207,17 +206,17 @@ fn overrides_table(config: &ComparisonConfig) -> Table {
         ]
     };
     let base = &config.base;
-    let blocks = stages(&base.build_map, &base.localization, &base.refinement);
-    let mut rows = vec![row("all".to_owned(), &blocks)];
+    let elements = stages(&base.build_map, &base.localization, &base.refinement);
+    let mut rows = vec![row("all".to_owned(), &elements)];
     for it in &config.sequences {
-        let mut blocks = stages(&it.build_map, &it.localization, &it.refinement);
-        blocks.extend(it.simulation.iter().map(|keys| ("simulation", keys)));
-        rows.push(row(format!("sequence {}", it.name), &blocks));
+        let mut elements = stages(&it.build_map, &it.localization, &it.refinement);
+        elements.extend(it.simulation.iter().map(|keys| ("simulation", keys)));
+        rows.push(row(format!("sequence {}", it.name), &elements));
     }
     for it in &config.configurations {
         let refined = if it.refine { ", refined" } else { "" };
-        let blocks = stages(&it.build_map, &it.localization, &it.refinement);
-        rows.push(row(format!("{}{refined}", it.name), &blocks));
+        let elements = stages(&it.build_map, &it.localization, &it.refinement);
+        rows.push(row(format!("{}{refined}", it.name), &elements));
     }
     if let Some(sweep) = &config.particles {
         let name = format!("numbers of particles, {}", sweep.configuration);

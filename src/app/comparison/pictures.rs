@@ -1,4 +1,4 @@
-//! Plots of a comparison, each as a block of its page.
+//! Plots of a comparison, each as an element of its page.
 
 use std::fs;
 
@@ -7,17 +7,16 @@ use anyhow::{Context as _, Result};
 use super::layout::Layout;
 use super::record::RunRecord;
 use super::results::{ComparisonResults, success_rate};
-use super::statistics::SuccessRate;
 use crate::app::commands::run_page::picture;
 use crate::app::plotting::color::{Rgb, SERIES};
 use crate::app::plotting::{LineChart, Mark, Panel, Path2, PathPlot, Series};
-use crate::app::reporting::Block;
+use crate::app::reporting::{PageElement, SuccessRate};
 use crate::app::results::LocalizationResults;
 use crate::evaluation::{PlanarError, planar_errors};
 use crate::geometry::Pose2;
 
 /// Error of every run over its seed; `None` without runs.
-pub fn errors_of_runs(results: &ComparisonResults, layout: &Layout) -> Result<Option<Block>> {
+pub fn errors_of_runs(results: &ComparisonResults, layout: &Layout) -> Result<Option<PageElement>> {
     let panels = results.sequences.iter().map(|sequence| {
         let names = results.config.configurations.iter().map(|it| &it.name);
         let series = names.enumerate().map(|(index, name)| {
@@ -53,7 +52,7 @@ pub fn errors_of_runs(results: &ComparisonResults, layout: &Layout) -> Result<Op
 }
 
 /// Success rate against the number of particles; `None` without a particle sweep.
-pub fn success_rates(results: &ComparisonResults, layout: &Layout) -> Result<Option<Block>> {
+pub fn success_rates(results: &ComparisonResults, layout: &Layout) -> Result<Option<PageElement>> {
     let rates = results.sweep.iter().filter_map(|(count, records)| {
         let runs: Vec<&RunRecord> = records.iter().collect();
         Some((*count, success_rate(&runs)?))
@@ -97,7 +96,7 @@ pub fn trajectories(
     results: &ComparisonResults,
     sequence: &str,
     layout: &Layout,
-) -> Result<Vec<Block>> {
+) -> Result<Vec<PageElement>> {
     let trajectories = read_trajectories(results, sequence, layout);
     let Some(first) = trajectories.first() else {
         return Ok(Vec::new());
@@ -210,7 +209,7 @@ fn save_chart(
     caption: &str,
     chart: &LineChart,
     layout: &Layout,
-) -> Result<Option<Block>> {
+) -> Result<Option<PageElement>> {
     if chart.panels.is_empty() {
         return Ok(None);
     }

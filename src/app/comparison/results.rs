@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 
 use super::measures::Measure;
 use super::record::RunRecord;
-use super::statistics::SuccessRate;
+use super::statistics;
 use crate::app::config::{ComparisonConfig, Contrast};
+use crate::app::reporting::SuccessRate;
 
 /// All available records of a comparison.
 #[derive(Clone, Debug)]
@@ -65,5 +66,5 @@ pub fn value(record: &RunRecord, measure: &Measure) -> Option<f64> {
 /// Share of successful runs; `None` without runs.
 pub fn success_rate(records: &[&RunRecord]) -> Option<SuccessRate> {
     let successes = records.iter().filter(|record| record.is_success()).count();
-    SuccessRate::of(successes, records.len())
+    statistics::success_rate(successes, records.len())
 }

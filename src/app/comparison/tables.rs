@@ -5,9 +5,9 @@ use std::collections::BTreeSet;
 use super::measures::{Measure, SELECTED, TABLE_1, TABLE_2};
 use super::record::RunRecord;
 use super::results::{ComparisonResults, success_rate, value};
-use super::statistics::{Estimate, PairedDifference};
-use super::table::{Cell, Column, Table};
+use super::statistics::{mean_with_spread, paired_difference};
 use crate::app::config::{Contrast, VariantConfig};
+use crate::app::reporting::{Cell, Column, Table};
 
 const SPREAD: &str = "Mean over sequences ± standard deviation over seeds ± standard deviation over sequences; the first ten frames (half of the frames in runs shorter than twenty) are not evaluated.";
 
@@ -72,7 +72,7 @@ fn summary(results: &ComparisonResults, measures: &[Measure]) -> (Vec<Column>, V
             Cell::Text(count),
             success_rate(&runs).into(),
         ];
-        [start, estimates(&groups, measures)].concat()
+        [start, means(&groups, measures)].concat()
     };
     let rows = results.config.configurations.iter().map(row).collect();
     let start = [
@@ -92,7 +92,7 @@ fn differences(results: &ComparisonResults) -> Table {
         ];
         let differences = SELECTED
             .iter()
-            .map(|measure| PairedDifference::of(&results.differences(contrast, measure)).into());
+            .map(|measure| paired_difference(&results.differences(contrast, measure)).into());
         start.into_iter().chain(differences).collect()
     };
     Table {
@@ -108,7 +108,7 @@ fn differences(results: &ComparisonResults) -> Table {
 fn by_sequence(results: &ComparisonResults) -> Table {
     let row = |runs: &[&RunRecord]| {
         let mut row = vec![success_rate(runs).into()];
-        row.extend(estimates(&[runs.to_vec()], &SELECTED));
+        row.extend(means(&[runs.to_vec()], &SELECTED));
         row
     };
     let [sequence, configuration] = ["sequence", "configuration"].map(Column::named);
@@ -134,10 +134,10 @@ fn timing(results: &ComparisonResults) -> Table {
     let row = |runs: &[&RunRecord]| {
         let seconds = |stage: &&String| {
             let seconds = runs.iter().filter_map(|run| run.stage_seconds.get(*stage));
-            Estimate::of(&[seconds.copied().collect()]).into()
+            mean_with_spread(&[seconds.copied().collect()]).into()
         };
         let mut row: Vec<Cell> = stages.iter().map(seconds).collect();
-        row.extend(estimates(&[runs.to_vec()], &per_frame));
+        row.extend(means(&[runs.to_vec()], &per_frame));
         row
     };
     let start = ["sequence", "configuration"].map(Column::named);
@@ -162,7 +162,7 @@ fn particles(results: &ComparisonResults) -> Table {
             Cell::Text(runs.len().to_string()),
             success_rate(&runs).into(),
         ];
-        [start, estimates(&[successful.collect()], &measures)].concat()
+        [start, means(&[successful.collect()], &measures)].concat()
     };
     let start = [Column::named("particles"), runs_column(), success_column()];
     Table {
@@ -210,17 +210,17 @@ fn rows_by_sequence(
     rows
 }
 
-/// Estimate of each measure over groups of runs, one group per sequence.
-fn estimates(groups: &[Vec<&RunRecord>], measures: &[Measure]) -> Vec<Cell> {
-    let estimate = |measure: &Measure| {
+/// Mean of each measure over groups of runs, one group per sequence.
+fn means(groups: &[Vec<&RunRecord>], measures: &[Measure]) -> Vec<Cell> {
+    let mean = |measure: &Measure| {
         let values = |runs: &Vec<&RunRecord>| {
             let values = runs.iter().filter_map(|run| value(run, measure));
             values.collect()
         };
         let values: Vec<Vec<f64>> = groups.iter().map(values).collect();
-        Estimate::of(&values).into()
+        mean_with_spread(&values).into()
     };
-    measures.iter().map(estimate).collect()
+    measures.iter().map(mean).collect()
 }
 
 /// Columns of a table, those of measures last.
