@@ -1,8 +1,6 @@
 //! `compare`: sequences × configurations × seeds, summarized in tables and a page; see
 //! [`comparison`](crate::app::comparison).
 
-use std::path::Path;
-
 use anyhow::{Context as _, Result, bail};
 
 use super::{Context, output};
@@ -14,8 +12,7 @@ use crate::app::config::{self, ComparisonConfig};
 /// output.
 pub fn run(args: &CompareArgs, context: &Context) -> Result<String> {
     let path = args.source.config.as_deref();
-    let default_path = Path::new("config/comparison.yml");
-    let config: ComparisonConfig = config::load(path, default_path, &args.source.settings)?;
+    let config: ComparisonConfig = config::load(path, &args.source.settings)?;
     let runs = planned_runs(&config)?;
     let layout = Layout {
         root: config.output_folder.clone(),

@@ -135,14 +135,14 @@ impl<'a> Executor<'a> {
 
         let map = self.map(run, keys).context("while building the map")?;
         stages.add("1 build-map", map.seconds);
-        self.repeat_log(&map)?;
+        self.append_log(&map)?;
         copy_file(&map.folder.join("map.yml"), &folder.join("build_map.yml"))?;
 
         let localization = self
             .localization(run, keys, &map)
             .context("while localizing")?;
         stages.add("2 localize", localization.seconds);
-        self.repeat_log(&localization)?;
+        self.append_log(&localization)?;
         // An earlier run in this folder may have refined.
         run_output::remove_refined(&RunFiles::beside(&result))?;
         copy_folder(&localization.folder, &folder)?;
@@ -169,7 +169,7 @@ impl<'a> Executor<'a> {
         }
         let _lock = cache::lock(&self.layout.root.join("sequences"), &run.id.sequence)?;
         for drive in &run.drives {
-            simulate::run_with_progress(drive, Existing::Renew, self.context)?;
+            simulate::run(drive, Existing::Renew, self.context)?;
         }
         Ok(())
     }
@@ -208,11 +208,11 @@ impl<'a> Executor<'a> {
     }
 
     /// Appends the log of a shared stage to the log of the run.
-    fn repeat_log(&self, stage: &SharedResult) -> Result<()> {
+    fn append_log(&self, stage: &SharedResult) -> Result<()> {
         self.context
             .log
             .clone()
-            .repeat(&stage.folder.join(LOG_FILE))
+            .append(&stage.folder.join(LOG_FILE))
     }
 
     /// Description of the machine for the record of a run.

@@ -9,7 +9,7 @@ use super::record::RunRecord;
 use super::results::{ComparisonResults, success_rate};
 use crate::app::commands::run_page::picture;
 use crate::app::plotting::color::{Rgb, SERIES};
-use crate::app::plotting::{LineChart, Mark, Panel, Path2, PathPlot, Series};
+use crate::app::plotting::{LineChart, Mark, NamedPath, Panel, PathPlot, Series};
 use crate::app::reporting::{PageElement, SuccessRate};
 use crate::app::results::LocalizationResults;
 use crate::evaluation::{PlanarError, planar_errors};
@@ -37,7 +37,6 @@ pub fn errors_of_runs(results: &ComparisonResults, layout: &Layout) -> Result<Op
         Panel {
             y_name: format!("{sequence}: error [m]"),
             series: series.filter(|series| !series.points.is_empty()).collect(),
-            from_zero: true,
             ..Panel::default()
         }
     });
@@ -73,7 +72,6 @@ pub fn success_rates(results: &ComparisonResults, layout: &Layout) -> Result<Opt
             line("95 % interval", Mark::Dashes, |rate| rate.low),
             line("", Mark::Dashes, |rate| rate.high),
         ],
-        from_zero: true,
         ..Panel::default()
     };
     let chart = LineChart {
@@ -105,7 +103,7 @@ pub fn trajectories(
         .iter()
         .map(|it| format!("{} seed {}", it.name, it.seed));
     let seeds = seeds.collect::<Vec<String>>().join(", ");
-    let paths = trajectories.iter().map(|it| Path2 {
+    let paths = trajectories.iter().map(|it| NamedPath {
         name: &it.name,
         color: it.color,
         poses: &it.poses,
@@ -114,7 +112,7 @@ pub fn trajectories(
     PathPlot {
         title: &format!("{sequence}: paths against ground truth"),
         ground_truth: Some(&first.truth),
-        paths: &paths.collect::<Vec<Path2>>(),
+        paths: &paths.collect::<Vec<NamedPath>>(),
         map: None,
     }
     .save(&plot)?;
@@ -185,7 +183,6 @@ fn error_chart(sequence: &str, trajectories: &[Trajectory]) -> LineChart {
         Panel {
             y_name: y_name.to_owned(),
             series: series.collect(),
-            from_zero: true,
             clip_outliers: true,
             ..Panel::default()
         }

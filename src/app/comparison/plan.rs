@@ -93,7 +93,10 @@ fn planned_run(
     variant: &VariantConfig,
     drives: &[SimulationConfig],
 ) -> Result<PlannedRun> {
-    let mut build_map = BuildMapConfig::default();
+    let mut build_map = BuildMapConfig {
+        visualize: false,
+        ..BuildMapConfig::default()
+    };
     let mut localization = LocalizationConfig::default();
     if let [first, second] = drives {
         let [first, second] = [first, second].map(SimulationConfig::drive_folder);
@@ -122,13 +125,13 @@ fn planned_run(
         ],
     )?;
     let localization = LocalizationConfig {
-        map_pose_file: build_map.pose_file.clone(),
-        map_calib_file: build_map.calib_file.clone(),
+        map_pose_file: Some(build_map.pose_file.clone()),
+        map_calib_file: Some(build_map.calib_file.clone()),
         ..localization
     };
     let refinement = || {
         with_overrides(
-            refinement_of(&localization),
+            RefinementConfig::of(localization.clone()),
             "refinement",
             &[&base.refinement, &sequence.refinement, &variant.refinement],
         )
@@ -180,35 +183,13 @@ fn particle_runs(config: &ComparisonConfig, run: &PlannedRun) -> Result<Vec<Plan
     Ok(runs)
 }
 
-/// Refinement of the result of a localization: same files, frames, odometry and compensation.
-fn refinement_of(localization: &LocalizationConfig) -> RefinementConfig {
-    RefinementConfig {
-        scan_folder: localization.scan_folder.clone(),
-        map_file: localization.map_file.clone(),
-        map_pose_file: localization.map_pose_file.clone(),
-        map_calib_file: localization.map_calib_file.clone(),
-        pose_file: localization.pose_file.clone(),
-        calib_file: localization.calib_file.clone(),
-        start_idx: localization.start_idx,
-        n_scans: localization.n_scans,
-        frame_step: localization.frame_step,
-        odometry: localization.odometry,
-        odometry_file: localization.odometry_file.clone(),
-        range_image: localization.range_image.model(),
-        own_car_m: localization.own_car_m,
-        observation: localization.observation.clone(),
-        motion_compensation: localization.motion_compensation,
-        ..RefinementConfig::default()
-    }
-}
-
 /// Applies overrides in order, the last with the highest precedence.
 fn with_overrides<T>(config: T, block: &str, overrides: &[&Overrides]) -> Result<T>
 where
     T: Validate + Serialize + DeserializeOwned,
 {
     let all: Vec<(String, String)> = overrides.iter().flat_map(|keys| settings(keys)).collect();
-    config::with_overrides(config, &all).with_context(|| format!("in the block {block}"))
+    config::with_settings(config, &all).with_context(|| format!("in the block {block}"))
 }
 
 #[cfg(test)]
@@ -242,7 +223,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
         let folder = tempfile::tempdir()?;
         let path = folder.path().join("comparison.yml");
         std::fs::write(&path, text)?;
-        planned_runs(&config::load(Some(&path), &path, &[])?)
+        planned_runs(&config::load(Some(&path), &[])?)
     }
 
     fn find<'a>(runs: &'a [PlannedRun], id: &str) -> &'a PlannedRun {
@@ -287,10 +268,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
             .unwrap();
         assert_eq!(refinement.scan_folder, std::path::Path::new("b/velodyne"));
         assert_eq!(refinement.start_idx, 1);
-        assert_eq!(
-            refinement.map_pose_file,
-            std::path::Path::new("a/poses.txt")
-        );
+        assert_eq!(refinement.map_pose_file, Some("a/poses.txt".into()));
     }
 
     #[test]
