@@ -35,6 +35,9 @@ pub struct GroundConfig {
     pub ransac: RansacGround,
 }
 
+/// A classifier with its name for tables.
+pub type NamedClassifier = (&'static str, Box<dyn GroundClassifier>);
+
 impl GroundConfig {
     /// Builds the configured classifier.
     pub fn classifier(&self) -> Result<Box<dyn GroundClassifier>, InvalidValue> {
@@ -47,11 +50,9 @@ impl GroundConfig {
     }
 
     /// Builds the classifiers of all methods with their names for tables: the configured one first.
-    pub fn all_classifiers(
-        &self,
-    ) -> Result<Vec<(&'static str, Box<dyn GroundClassifier>)>, InvalidValue> {
+    pub fn all_classifiers(&self) -> Result<Vec<NamedClassifier>, InvalidValue> {
         let three_features = FuzzyConfig::three_features();
-        let mut all: Vec<(&str, Box<dyn GroundClassifier>)> = vec![
+        let mut all: Vec<NamedClassifier> = vec![
             ("fuzzy", Box::new(FuzzyGround::new(self.fuzzy.clone())?)),
             (
                 "fuzzy, three features",
@@ -68,6 +69,14 @@ impl GroundConfig {
         };
         all[..=configured].rotate_right(1);
         Ok(all)
+    }
+}
+
+impl Validate for GroundConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        nested("fuzzy", &self.fuzzy)?;
+        nested("pca", &self.pca)?;
+        nested("ransac", &self.ransac)
     }
 }
 
@@ -89,13 +98,5 @@ mod tests {
             let all = config.all_classifiers().unwrap();
             assert_eq!((all[0].0, all.len()), (first, 5));
         }
-    }
-}
-
-impl Validate for GroundConfig {
-    fn validate(&self) -> Result<(), InvalidValue> {
-        nested("fuzzy", &self.fuzzy)?;
-        nested("pca", &self.pca)?;
-        nested("ransac", &self.ransac)
     }
 }

@@ -28,7 +28,7 @@ mod road;
 mod tests;
 
 pub use classifier::GroundClassifier;
-pub use config::{GroundConfig, GroundMethod};
+pub use config::{GroundConfig, GroundMethod, NamedClassifier};
 pub use features::{FeatureConfig, Features};
 pub use fuzzy::{Explanation, FiredRule, FuzzyConfig, FuzzyGround};
 pub use inference::{FuzzySystem, Inference};

@@ -40,7 +40,7 @@ pub fn draw_memberships(config: &FuzzyConfig, path: &Path) -> Result<()> {
         panels,
         ..LineChart::default()
     };
-    Ok(chart.save(path)?)
+    chart.save(path)
 }
 
 /// `height_variance` becomes `height variance [m]`; the output has no unit.
@@ -79,5 +79,5 @@ pub fn draw_scan(
         truth: &truth,
         reach_m: REACH_M,
     };
-    Ok(plot.save(&config.output_folder.join(file))?)
+    plot.save(&config.output_folder.join(file))
 }
