@@ -17,9 +17,12 @@
 //! Imports point only upwards in this list, which `tests/architecture.rs` checks.
 
 // What everything is made of.
+pub mod files;
 pub mod geometry;
 pub mod lidar;
+pub mod random;
 pub mod raycasting;
+pub mod rendering;
 pub mod validation;
 // From a recording to surfaces.
 pub mod ground;
@@ -28,7 +31,6 @@ pub mod recording;
 // From surfaces to a map, and back to what the sensor would see in it.
 pub mod map;
 pub mod registration;
-pub mod rendering;
 pub mod simulation;
 // Where the car is, and how well that is known.
 pub mod evaluation;

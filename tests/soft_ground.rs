@@ -1,16 +1,14 @@
-//! The confidence of points reaches the map: its colours, and what of it is simplified.
+//! The ground confidence of points determines the colours of the map and its simplification.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
 use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
 use fpmcl::ground::GroundClassifier;
-use fpmcl::map::local_map::{self, LocalMapCounts, LocalMapSettings, Watcher};
-use fpmcl::map::plan::{self, Ownership};
-use fpmcl::recording::Frame;
-use fpmcl::recording::velodyne::write_scan;
+use fpmcl::lidar::Scan;
+use fpmcl::map::{LocalMapCounts, MapBuilder, MapConfig};
 use fpmcl::simulation::{ScannerConfig, kerb_scene};
 
-/// As sure of every point of a scan as of the others: of small scans otherwise than of large.
+/// The same confidence for all points of a scan: one for small scans, another for large ones.
 struct ByScan {
     small: f32,
     large: f32,
@@ -26,7 +24,6 @@ impl GroundClassifier for ByScan {
 
 /// The map of two scans from one place, the second without every fourth point.
 fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMapCounts) {
-    let folder = tempfile::tempdir().unwrap();
     let scanner = ScannerConfig {
         azimuth_steps: 600,
         ..ScannerConfig::default()
@@ -40,49 +37,21 @@ fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMap
     });
     thinned.intensities.truncate(thinned.points.len());
     let border = whole.len() * 7 / 8;
-    let frames: Vec<Frame> = [whole, thinned]
-        .iter()
-        .enumerate()
-        .map(|(number, scan)| {
-            let scan_path = folder.path().join(format!("{number}.bin"));
-            write_scan(std::fs::File::create(&scan_path).unwrap(), scan).unwrap();
-            Frame {
-                number,
-                scan_path,
-                time_s: 0.1 * number as f64,
-                map_from_lidar: Pose3::identity(),
-                sweep: None,
-            }
-        })
-        .collect();
-    let mut settings = LocalMapSettings {
-        ground_threshold,
-        ..LocalMapSettings::default()
-    };
-    settings.poisson.depth = 6;
-    settings.scan.crop_m = Vec3::new(10.0, 10.0, 5.0);
-    settings.visibility.enabled = false;
-    let plans = plan::local_maps(&frames, 10, 0.0);
-    let ownership = Ownership::new(&frames, &plans, 50.0);
-    let watcher = Watcher {
-        scan_done: &|| (),
-        stage: &|_| (),
-        cancelled: &|| false,
-    };
-    let classifier = ByScan {
+    let scans: [Scan; 2] = [whole, thinned];
+    let mut config = MapConfig::default();
+    config.local_map.ground_threshold = ground_threshold;
+    config.local_map.poisson.depth = 6;
+    config.local_map.scan.crop_m = Vec3::new(10.0, 10.0, 5.0);
+    config.local_map.visibility.enabled = false;
+    let builder = MapBuilder::new(config);
+    let mut plan = builder.plan(vec![Pose3::identity(); 2]).unwrap();
+    plan.classifier = Box::new(ByScan {
         small,
         large,
         border,
-    };
-    let built = local_map::build(
-        &frames,
-        &plans[0],
-        &ownership,
-        &settings,
-        &classifier,
-        &watcher,
-    )
-    .unwrap();
+    });
+    let read = |key: usize| Ok(scans[key].clone());
+    let built = plan.build_local_map(&plan.local_maps[0], &read).unwrap();
     (built.mesh, built.counts)
 }
 
@@ -92,7 +61,7 @@ fn mean_red(mesh: &TriangleMesh) -> f32 {
 }
 
 #[test]
-fn surer_points_make_redder_vertices() {
+fn more_confident_points_make_redder_vertices() {
     let means = [0.0, 0.4, 1.0].map(|confidence| {
         // A threshold that nothing reaches leaves every vertex where it is.
         let (mesh, counts) = map(confidence, confidence, 1.1);
@@ -108,7 +77,7 @@ fn surer_points_make_redder_vertices() {
 }
 
 #[test]
-fn what_two_scans_disagree_on_lies_between_them() {
+fn the_colour_of_a_disagreement_lies_between() {
     let [low, high] = [0.5, 0.9].map(|confidence| mean_red(&map(confidence, confidence, 1.1).0));
     let between = mean_red(&map(0.9, 0.5, 1.1).0);
     let share = (between - low) / (high - low);

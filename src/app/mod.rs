@@ -4,7 +4,6 @@ pub mod cli;
 pub mod commands;
 pub mod comparison;
 pub mod config;
-pub mod output;
 pub mod plotting;
 pub mod reporting;
 pub mod results;

@@ -43,12 +43,18 @@ impl Scan {
     /// Removes points that are not finite or outside the range limits of the model; returns their
     /// number.
     pub fn drop_invalid(&mut self, model: &LidarModel) -> usize {
+        self.retain(|point| point.is_finite() && model.accepts_range(point.length()))
+    }
+
+    /// Drops the points inside a rectangle of the lidar frame, x_min, x_max, y_min, y_max [m], such as
+    /// the own car. Returns how many.
+    pub fn drop_inside(&mut self, [x_min, x_max, y_min, y_max]: [f32; 4]) -> usize {
+        self.retain(|p| !(p.x > x_min && p.x < x_max && p.y > y_min && p.y < y_max))
+    }
+
+    fn retain(&mut self, is_kept: impl Fn(&Vec3) -> bool) -> usize {
         let before = self.len();
-        let keep: Vec<bool> = self
-            .points
-            .iter()
-            .map(|point| point.is_finite() && model.accepts_range(point.length()))
-            .collect();
+        let keep: Vec<bool> = self.points.iter().map(is_kept).collect();
         let mut flags = keep.iter();
         self.points.retain(|_| flags.next() == Some(&true));
         let mut flags = keep.iter();

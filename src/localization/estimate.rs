@@ -1,36 +1,45 @@
-//! What the filter says about a frame.
+//! Result of the filter for a frame.
 
 use nalgebra::Matrix3;
 
 use super::particles::ParticleSet;
-use super::vigilance::State;
+use super::tracking_loss::State;
 use crate::geometry::{Pose2, Pose3};
+use crate::map::SensorAttitude;
 
-/// The estimate of a frame, and how far it can be believed.
+/// Estimated pose of a frame, with its uncertainty and the state of the filter.
 #[derive(Clone, Debug)]
-pub struct FrameEstimate {
+pub struct Estimate {
     /// Weighted mean of the particles, `p_map = pose * p_lidar` seen from above.
     pub pose: Pose2,
-    /// The same pose standing on the map's ground, `p_map = lifted * p_lidar`.
-    pub lifted: Pose3,
-    /// Height of the ground below it; `None` where there never was any [m].
+    /// The same pose in space, aligned to the ground of the map: `p_map = map_from_lidar * p_lidar`.
+    pub map_from_lidar: Pose3,
+    /// Attitude of the sensor above that ground.
+    pub attitude: SensorAttitude,
+    /// Height of the ground below it [m]; `None` before any ground was known.
     pub level_m: Option<f64>,
     /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
-    /// Effective number of particles after weighing, before resampling.
+    /// Effective sample size after the update, before resampling (unitless).
     pub effective_sample_size: f64,
-    /// Weighted mean of the particles' cost; `None` where the frame was not weighed or no
-    /// particle was on the map [m].
+    /// Weighted mean cost of the particles [m]; `None` where the scan was not used or no particle was on
+    /// the map.
     pub mean_cost_m: Option<f64>,
-    /// Share of beams above the road that meet the map at the estimate; `None` where unknown.
+    /// Share of beams above the road that agree with the map at the estimate; `None` where unknown.
     pub agreement: Option<f64>,
     /// Searching, tracking or lost.
     pub state: State,
-    /// Whether the scan was weighed; not so before the car moved far enough.
+    /// Whether the scan was used; it is not while the car moved too little.
     pub updated: bool,
-    /// Whether there is mapped ground under the estimate; if not, it stands on the last ground
-    /// that there was.
+    /// Whether there is mapped ground under the estimate; otherwise the last known ground is used.
     pub on_mapped_ground: bool,
     /// The particles with their weights, before resampling.
     pub particles: ParticleSet,
+}
+
+impl Estimate {
+    /// Standard deviations of x [m], y [m] and heading [rad].
+    pub fn standard_deviations(&self) -> [f64; 3] {
+        std::array::from_fn(|axis| self.covariance[(axis, axis)].max(0.0).sqrt())
+    }
 }

@@ -1,20 +1,17 @@
 //! The filter where a road crosses another one on a bridge.
 
-use std::cell::OnceCell;
-
 use glam::Vec3;
 use nalgebra::Vector2;
 use rand::{SeedableRng, rngs::StdRng};
 
-use super::super::initialization::{Cells, ROAD_HALF_WIDTH_M, StartSpread, around};
+use super::super::initialization::{StartSpread, around, from_panoramas};
 use super::super::observation::ObservationConfig;
 use super::super::odometry::Odometry;
-use super::super::panorama::{PanoramaConfig, Panoramas};
 use super::super::particles::Hypothesis;
 use super::*;
 use crate::geometry::{TriangleMesh, pose2_from_pose3};
 use crate::lidar::LidarModel;
-use crate::map::TileConfig;
+use crate::map::{GroundMap, MappingPath, PanoramaConfig, SearchRegion, TileConfig, TileGrid};
 use crate::rendering::CpuRenderer;
 
 /// Height of the deck over the road below [m].
@@ -26,9 +23,7 @@ const HEAD_M: f64 = 10.0;
 
 /// One road along y on the ground, another one along x that a ramp leads over it and down again.
 struct Crossing {
-    renderer: CpuRenderer,
-    ground: GroundMap,
-    tiles: TileGrid,
+    map: Map,
 }
 
 /// Height of the upper road [m].
@@ -121,21 +116,15 @@ impl Crossing {
                 }
             }
         }
-        let drives = upper_drive().into_iter().chain(lower_drive());
-        let tiles = TileGrid::around(&drives.collect::<Vec<_>>(), &TileConfig::default());
+        let path = MappingPath {
+            world_from_map: Pose3::identity(),
+            map_from_lidar: upper_drive().into_iter().chain(lower_drive()).collect(),
+        };
+        let tiles = TileGrid::around(&path.map_from_lidar, &TileConfig::default());
+        let renderer = CpuRenderer::new(std::slice::from_ref(&mesh));
+        let ground = GroundMap::from_mesh(&mesh, |triangle| triangle < of_ground, 0.5);
         Self {
-            renderer: CpuRenderer::new(std::slice::from_ref(&mesh)),
-            ground: GroundMap::from_mesh(&mesh, |triangle| triangle < of_ground, 0.5),
-            tiles,
-        }
-    }
-
-    fn surroundings(&self) -> Surroundings<'_> {
-        Surroundings {
-            renderer: &self.renderer,
-            ground: &self.ground,
-            tiles: &self.tiles,
-            panoramas: None,
+            map: Map::from_parts(mesh, path, tiles, ground, std::sync::Arc::new(renderer)),
         }
     }
 
@@ -145,7 +134,11 @@ impl Crossing {
             width: 360,
             ..LidarModel::default()
         };
-        let images = self.renderer.render(&[*map_from_lidar], &model).unwrap();
+        let images = self
+            .map
+            .renderer
+            .render(&[*map_from_lidar], &model)
+            .unwrap();
         RangeImage::from_ranges(images.into_iter().next().unwrap(), &model)
     }
 }
@@ -160,7 +153,10 @@ fn upper_drive() -> Vec<Pose3> {
             height_m: upper_m(x),
             normal,
         };
-        patch.lift(&Pose2::new(Vector2::new(x, 0.5), 0.02), &Stance::default())
+        patch.lift(
+            &Pose2::new(Vector2::new(x, 0.5), 0.02),
+            &SensorAttitude::default(),
+        )
     };
     (0..90).map(pose).collect()
 }
@@ -173,7 +169,7 @@ fn lower_drive() -> Vec<Pose3> {
     };
     let pose = |frame: i32| {
         let place = Vector2::new(-0.6, -50.0 + 1.5 * f64::from(frame));
-        patch.lift(&Pose2::new(place, 1.55), &Stance::default())
+        patch.lift(&Pose2::new(place, 1.55), &SensorAttitude::default())
     };
     (0..65).map(pose).collect()
 }
@@ -192,17 +188,17 @@ fn config() -> LocalizerConfig {
 }
 
 /// Runs the filter and asks that it is near the truth, in space, from the tenth frame on.
-fn follow(crossing: &Crossing, mut localizer: Localizer<'_>, truth: &[Pose3], rng: &mut StdRng) {
+fn follow(crossing: &Crossing, mut filter: ParticleFilter, truth: &[Pose3], rng: &mut StdRng) {
     let mut before = pose2_from_pose3(&truth[0]);
     for (frame, truth) in truth.iter().enumerate() {
         let increment = before.inverse() * pose2_from_pose3(truth);
         before = pose2_from_pose3(truth);
         let odometry = Odometry::Increment(increment);
         let scan = crossing.scan(truth);
-        let found = localizer
-            .step(odometry, &scan, &Stance::default(), rng)
+        let found = filter
+            .step(odometry, &scan, &SensorAttitude::default(), rng)
             .unwrap();
-        let off = found.lifted.translation.vector - truth.translation.vector;
+        let off = found.map_from_lidar.translation.vector - truth.translation.vector;
         assert!(
             frame < 10 || (off.xy().norm() < 0.1 && off.z.abs() < 0.2),
             "frame {frame} at {}: off by {off}",
@@ -216,7 +212,7 @@ fn follow(crossing: &Crossing, mut localizer: Localizer<'_>, truth: &[Pose3], rn
 }
 
 #[test]
-fn the_car_above_and_the_car_below_keep_their_level_also_on_the_ramp() {
+fn cars_above_and_below_keep_their_level_also_on_the_ramp() {
     let crossing = Crossing::new();
     for (seed, truth) in [(1, upper_drive()), (2, lower_drive())] {
         let mut rng = StdRng::seed_from_u64(seed);
@@ -226,46 +222,37 @@ fn the_car_above_and_the_car_below_keep_their_level_also_on_the_ramp() {
             &StartSpread::default(),
             &mut rng,
         );
-        let level_m = Some(truth[0].translation.z - Stance::default().height_m);
+        let level_m = Some(truth[0].translation.z - SensorAttitude::default().height_m);
         let start = ParticleSet::uniform(start.into_iter().map(|map_from_lidar| Hypothesis {
             map_from_lidar,
             level_m,
         }));
-        let localizer = Localizer::new(config(), crossing.surroundings(), start);
-        follow(&crossing, localizer, &truth, &mut rng);
+        let filter = ParticleFilter::new(config(), crossing.map.clone(), None, start);
+        follow(&crossing, filter, &truth, &mut rng);
     }
 }
 
 #[test]
-fn who_does_not_know_where_it_is_finds_its_level_too() {
+fn a_start_anywhere_finds_its_level() {
     let crossing = Crossing::new();
-    let panoramas = Panoramas {
-        cells: Cells::along_road(
-            &upper_drive()
-                .iter()
-                .chain(&lower_drive())
-                .map(pose2_from_pose3)
-                .collect::<Vec<_>>(),
-            ROAD_HALF_WIDTH_M,
-            1.0,
-        ),
-        surroundings: crossing.surroundings(),
+    let request = PanoramaRequest {
+        region: SearchRegion::Road,
         lidar: LidarModel::default(),
-        height_m: Stance::default().height_m,
+        sensor_height_m: SensorAttitude::default().height_m,
         config: PanoramaConfig::default(),
-        index: OnceCell::new(),
     };
-    let index = panoramas.index().unwrap();
+    let index = crossing.map.panoramas(&request).unwrap();
     // On the deck and right below it.
     for (seed, truth) in [(3, &upper_drive()[44..]), (4, &lower_drive()[31..])] {
         let mut rng = StdRng::seed_from_u64(seed);
         let scan = crossing.scan(&truth[0]);
-        let start = index.sample(&scan, &Stance::default(), 500, &mut rng);
-        let localizer = Localizer::new(
+        let start = from_panoramas(&index, &scan, &SensorAttitude::default(), 500, &mut rng);
+        let filter = ParticleFilter::new(
             config(),
-            crossing.surroundings(),
+            crossing.map.clone(),
+            None,
             ParticleSet::uniform(start),
         );
-        follow(&crossing, localizer, truth, &mut rng);
+        follow(&crossing, filter, truth, &mut rng);
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::geometry::{Pose2, Pose3};
 use crate::lidar::Beam;
-use crate::map::{GroundMap, Stance};
+use crate::map::{GroundMap, SensorAttitude};
 use crate::rendering::{RangeRenderer, RenderError};
 
 use super::observation::{ObservationConfig, costs};
@@ -58,7 +58,7 @@ pub struct View<'a> {
     /// About the height of the ground; needed where there are several levels [m].
     pub level_m: Option<f64>,
     /// How the sensor stands over the road.
-    pub stance: Stance,
+    pub attitude: SensorAttitude,
     /// The beams of the scan, lidar frame.
     pub beams: &'a [Beam],
 }
@@ -82,7 +82,7 @@ pub fn profile(
         .map(|&offset| {
             let moved = direction.moved(pose, offset);
             let patch = view.ground.patch_under(&moved, view.level_m)?;
-            Some(patch.lift(&moved, &view.stance))
+            Some(patch.lift(&moved, &view.attitude))
         })
         .collect();
     let costs_m = costs(view.renderer, &lifted, view.beams, &config.difference())?;
@@ -119,7 +119,7 @@ mod tests {
     use approx::assert_relative_eq;
 
     use super::*;
-    use crate::rendering::test_world::TestWorld;
+    use crate::map::test_world::TestWorld;
 
     #[test]
     fn the_width_is_that_of_a_triangle_and_nothing_for_a_plateau() {
@@ -164,12 +164,11 @@ mod tests {
         let truth = world.pose_at(12.0, 0.1, 0.05);
         let image = world.scan(&truth);
         let beams: Vec<Beam> = image.beams().collect();
-        let surroundings = world.surroundings();
         let view = View {
-            renderer: surroundings.renderer,
-            ground: surroundings.ground,
+            renderer: &world,
+            ground: &world.ground,
             level_m: None,
-            stance: Stance::default(),
+            attitude: SensorAttitude::default(),
             beams: &beams,
         };
         for direction in Direction::ALL {

@@ -1,51 +1,42 @@
-//! Where the car is: Monte Carlo localization in the mesh map.
+//! Monte Carlo localization of a car in a mesh map.
 //!
-//! > [`initialization`] spreads [`particles`], [`odometry`] says how the car moved, [`motion`]
-//! > moves every particle so, [`observation`] weighs them by what the map would look like from
-//! > there, [`resampling`] keeps the good ones, [`convergence`] says when a few are enough and
-//! > [`vigilance`] when none is right; [`panorama`] finds the places to begin (again) at;
-//! > [`localizer`] is the loop. [`likelihood`] shows how sharp the peak is.
+//! > [`Localizer`] turns scans into range images with the attitude of the sensor ([`sensor`]) and feeds the
+//! > particle [`filter`]: [`initialization`] draws the first particles, [`motion`] moves them by the
+//! > [`odometry`], [`observation`] weights them, [`resampling`] keeps the likely ones, [`convergence`]
+//! > decides when few are enough and [`tracking_loss`] when none is right. [`likelihood`] shows how
+//! > peaked the likelihood is.
 //!
-//! Poses are `map_from_lidar` in the plane; the map's ground lifts them into space.
+//! Particles are planar poses `map_from_lidar`; the ground of the map gives height, roll and pitch.
 //!
 //! Dellaert et al., *Monte Carlo Localization for Mobile Robots*, ICRA 1999; Chen et al.,
 //! *Range Image-based LiDAR Localization for Autonomous Vehicles*, ICRA 2021.
 
-// What is estimated, and from what.
-pub mod initialization;
+// State, input and output.
+pub mod config;
+pub mod estimate;
 pub mod odometry;
 pub mod particles;
+pub mod sensor;
 // One step of the filter.
+pub mod initialization;
 pub mod motion;
 pub mod observation;
 pub mod proposal;
 pub mod resampling;
 pub mod tempering;
-// Knowing how sure it is.
+// Confidence.
 pub mod convergence;
 pub mod likelihood;
-pub mod panorama;
-pub mod vigilance;
+pub mod tracking_loss;
 // The loop.
-pub mod estimate;
+pub mod filter;
 pub mod localizer;
-pub mod settings;
 
-pub use estimate::FrameEstimate;
-pub use localizer::{Localizer, Surroundings};
+pub use config::LocalizerConfig;
+pub use estimate::Estimate;
+pub use filter::ParticleFilter;
+pub use localizer::{Localizer, LocalizerError, Start};
+pub use odometry::Odometry;
 pub use particles::{Particle, ParticleSet};
-pub use settings::LocalizerConfig;
-pub use vigilance::State;
-
-#[cfg(test)]
-impl crate::rendering::test_world::TestWorld {
-    /// The street as the localizer sees it.
-    fn surroundings(&self) -> Surroundings<'_> {
-        Surroundings {
-            renderer: self,
-            ground: &self.ground,
-            tiles: &self.tiles,
-            panoramas: None,
-        }
-    }
-}
+pub use sensor::{Sensor, SensorConfig};
+pub use tracking_loss::State;

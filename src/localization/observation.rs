@@ -1,4 +1,4 @@
-//! How well the map explains a scan from a pose.
+//! Observation model: the likelihood of a scan at a pose in the map.
 //!
 //! ```text
 //! d = mean over the beams of cost(measured, rendered)      [m]
@@ -6,7 +6,7 @@
 //! L = exp(−d / s)          robust: |difference| up to a limit
 //! ```
 //!
-//! The beams are a stratified part of the scan, the same for every particle of a frame, and are
+//! The beams are a stratified sample of the scan, the same for all particles of a frame, and are
 //! cast along the directions in which they were measured. Chen et al., *Range Image-based LiDAR
 //! Localization for Autonomous Vehicles*, ICRA 2021, eq. 6, for the reference.
 
@@ -16,45 +16,45 @@ use serde::{Deserialize, Serialize};
 use super::particles::Hypothesis;
 use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::{Beam, RangeImage};
-use crate::map::{GroundMap, GroundPatch, Stance, TileGrid};
+use crate::map::{GroundPatch, Map, SensorAttitude};
 use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
 use crate::validation::{
     InvalidValue, Validate, at_least_one, fraction, positive, positive_or_infinite,
 };
 
-/// From the mean cost of the beams to a likelihood.
+/// Form of the likelihood.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Likelihood {
-    /// range-mcl's: a Gaussian of the mean |difference| without limits.
+    /// Gaussian of the mean |difference| without limits, as in range-mcl.
     Reference,
-    /// Exponential in the mean |difference| with limits.
+    /// Exponential of the mean |difference| with limits.
     Robust,
 }
 
-/// Which beams are compared, and what a difference means.
+/// Selection of beams and cost of differences.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ObservationConfig {
-    /// The form of the likelihood.
+    /// Form of the likelihood.
     pub likelihood: Likelihood,
     /// Standard deviation σ of the reference likelihood [m].
     pub reference_sigma_m: f64,
     /// Scale s of the robust likelihood: a mean cost that is larger by s is e times less likely [m].
     pub scale_m: f64,
-    /// Limit of the cost of a return nearer than the map: something that the map does not have [m].
+    /// Limit of the cost of a return in front of the map [m].
     pub short_m: f32,
     /// Limit of the cost of a return behind a surface of the map [m].
     pub long_m: f32,
-    /// Limit of the cost of a return where the map has nothing [m].
+    /// Limit of the cost of a return where the map has no surface [m].
     pub no_surface_m: f32,
     /// Beams per particle, at most.
     pub beams: usize,
-    /// Beams per particle, at least, however many particles there are.
+    /// Beams per particle, at least.
     pub min_beams: usize,
-    /// Rays per update over all particles: many particles get fewer beams each.
+    /// Rays per update over all particles, which limits the beams per particle.
     pub ray_budget: usize,
-    /// At most this share of the beams looks at the road, which looks the same from everywhere.
+    /// Largest share of beams that end on the road, which looks alike everywhere (unitless).
     pub road_share: f64,
 }
 
@@ -100,7 +100,7 @@ impl ObservationConfig {
         }
     }
 
-    /// What a difference of ranges costs.
+    /// Cost of a difference of ranges.
     pub fn difference(&self) -> RangeDifference {
         match self.likelihood {
             Likelihood::Reference => RangeDifference::UNLIMITED,
@@ -130,7 +130,7 @@ impl ObservationConfig {
         }
     }
 
-    /// How many beams each of `poses` poses gets.
+    /// Number of beams per pose for `poses` poses.
     pub fn beams_for(&self, poses: usize) -> usize {
         (self.ray_budget / poses.max(1))
             .max(self.min_beams)
@@ -138,18 +138,18 @@ impl ObservationConfig {
     }
 }
 
-/// Draws beams of a scan, evenly over the image, at most `road_share` of them from the road.
-/// In the order of the image: neighbours stay neighbours.
+/// Samples beams evenly over the image, at most `road_share` of them on the road, in the order of the
+/// image.
 pub fn choose_beams(
     image: &RangeImage,
     count: usize,
     road_share: f64,
-    stance: &Stance,
+    attitude: &SensorAttitude,
     rng: &mut impl Rng,
 ) -> Vec<Beam> {
-    /// What is lower than this over the plane of the road is the road [m].
+    /// Points below this height above the plane of the road are on the road [m].
     const ROAD_TOP_M: f32 = 0.3;
-    let road_from_lidar = Rigid3f::from(&stance.road_from_lidar());
+    let road_from_lidar = Rigid3f::from(&attitude.road_from_lidar());
     let is_road = |index: usize| road_from_lidar.apply(image.points[index]).z < ROAD_TOP_M;
     let returns = (0..image.ranges.len()).filter(|&index| image.has_return(index));
     let (road, rest): (Vec<usize>, Vec<usize>) = returns.partition(|&index| is_road(index));
@@ -166,7 +166,7 @@ pub fn choose_beams(
         .collect()
 }
 
-/// One member from each of `count` equal stretches of a list; the whole list where it is shorter.
+/// Samples one member from each of `count` equal parts of a list; the whole list if it is shorter.
 fn stratified(list: &[usize], count: usize, rng: &mut impl Rng) -> Vec<usize> {
     if list.len() <= count {
         return list.to_vec();
@@ -180,12 +180,12 @@ fn stratified(list: &[usize], count: usize, rng: &mut impl Rng) -> Vec<usize> {
         .collect()
 }
 
-/// A few thousand of the returns near the car, most of them from the road: for
-/// [`GroundMap::stance_at`].
+/// Returns a few thousand points near the car, most of them on the road, for
+/// [`GroundMap::attitude_at`](crate::map::GroundMap::attitude_at).
 pub fn near_points(image: &RangeImage) -> Vec<Vec3> {
-    /// As far as the rings on the road are dense [m].
+    /// Range up to which the rings on the road are dense [m].
     const NEAR_M: f32 = 20.0;
-    /// Coprime to the widths of images, so that no column is left out.
+    /// Step, coprime to common image widths, so that every column is used.
     const EVERY: usize = 7;
     (0..image.ranges.len())
         .step_by(EVERY)
@@ -194,7 +194,7 @@ pub fn near_points(image: &RangeImage) -> Vec<Vec3> {
         .collect()
 }
 
-/// Mean cost of the beams from each pose [m]; `None` for poses that are not on the map.
+/// Returns the mean cost of the beams at each pose [m]; `None` for poses off the map.
 pub fn costs(
     renderer: &dyn RangeRenderer,
     map_from_lidar: &[Option<Pose3>],
@@ -212,67 +212,65 @@ pub fn costs(
         .collect())
 }
 
-/// The ground that a hypothesis on the map stands on; `None` outside the tiles that were mapped and
-/// where there is no ground. `remembered` is a patch to stand on where the map has a gap.
-pub fn footing(
+/// Returns the ground patch under a hypothesis; `None` outside the mapped tiles and where there is no
+/// ground. `remembered` replaces it in gaps of the map.
+pub fn ground_patch_of(
     hypothesis: &Hypothesis,
-    ground: &GroundMap,
-    tiles: &TileGrid,
+    map: &Map,
     remembered: Option<&GroundPatch>,
 ) -> Option<GroundPatch> {
     let pose = &hypothesis.map_from_lidar;
-    tiles.valid_tile_of(pose)?;
-    let patch = ground.patch_under(pose, hypothesis.level_m);
+    map.tiles.valid_tile_of(pose)?;
+    let patch = map.ground.patch_under(pose, hypothesis.level_m);
     patch.or(remembered.copied())
 }
 
-/// How the beams of a scan meet the map from one pose, as counts. Beams that look at the road
-/// and beams without a surface behind them say nothing and are not counted.
+/// Numbers of beams of a scan by their agreement with the map, seen from one pose.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Fit {
-    /// The return is where the map has a surface.
+pub struct BeamAgreement {
+    /// Beams that return from a surface of the map.
     pub hit: usize,
-    /// The return is nearer: something stands in front of the map.
+    /// Beams that return in front of the map, from something that is not in it.
     pub short: usize,
-    /// The return is farther: the beam went through a surface of the map.
+    /// Beams that return behind a surface of the map.
     pub long: usize,
-    /// The map has nothing along the beam.
+    /// Beams along which the map has no surface.
     pub missing: usize,
 }
 
-impl Fit {
-    /// Compares measured with rendered ranges, one of each per beam.
+impl BeamAgreement {
+    /// Compares measured and rendered ranges, one of each per beam.
     pub fn of(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Self {
-        let mut fit = Self::default();
+        let mut counts = Self::default();
         for (beam, &rendered_m) in beams.iter().zip(rendered_m) {
             let excess_m = beam.range_m - rendered_m;
             let count = if rendered_m == f32::INFINITY {
-                &mut fit.missing
+                &mut counts.missing
             } else if excess_m.abs() <= tolerance_m {
-                &mut fit.hit
+                &mut counts.hit
             } else if excess_m < 0.0 {
-                &mut fit.short
+                &mut counts.short
             } else {
-                &mut fit.long
+                &mut counts.long
             };
             *count += 1;
         }
-        fit
+        counts
     }
 
-    /// Of the beams that reached the map, how many met it where it is; `None` where too few did
-    /// to tell. What stands in the way (traffic) does not count against a pose.
-    pub fn agreement(&self) -> Option<f64> {
-        /// Fewer beams than this tell nothing.
+    /// Share of hits among the beams that were not stopped in front of the map; `None` for fewer than
+    /// 30. Traffic in front of the map does not count against a pose.
+    pub fn share(&self) -> Option<f64> {
+        /// Smallest number of beams.
         const ENOUGH: usize = 30;
         let reached = self.hit + self.long;
         (reached >= ENOUGH).then(|| self.hit as f64 / reached as f64)
     }
 }
 
-/// The beams that end above the road: what tells one place from another.
-pub fn above_road(beams: &[Beam], stance: &Stance, clearance_m: f32) -> Vec<Beam> {
-    let road_from_lidar = Rigid3f::from(&stance.road_from_lidar());
+/// Returns the beams that end above the road, which distinguish one place from another.
+pub fn above_road(beams: &[Beam], attitude: &SensorAttitude, clearance_m: f32) -> Vec<Beam> {
+    let road_from_lidar = Rigid3f::from(&attitude.road_from_lidar());
     let height_of = |point: Vec3| road_from_lidar.apply(point).z;
     beams
         .iter()
@@ -289,7 +287,7 @@ mod tests {
     use super::*;
     use crate::geometry::Pose2;
     use crate::lidar::LidarModel;
-    use crate::rendering::test_world::TestWorld;
+    use crate::map::test_world::TestWorld;
 
     #[test]
     fn the_reference_likelihood_is_the_published_one() {
@@ -318,9 +316,9 @@ mod tests {
         let world = TestWorld::street();
         let image = world.scan(&world.pose_at(0.0, 0.0, 0.0));
         let mut rng = StdRng::seed_from_u64(1);
-        let beams = choose_beams(&image, 1000, 0.2, &Stance::default(), &mut rng);
+        let beams = choose_beams(&image, 1000, 0.2, &SensorAttitude::default(), &mut rng);
         assert_eq!(beams.len(), 1000);
-        let high = above_road(&beams, &Stance::default(), 0.3);
+        let high = above_road(&beams, &SensorAttitude::default(), 0.3);
         assert!((795..=805).contains(&high.len()), "{}", high.len());
         // All round: no quarter of the circle is left out.
         for quarter in 0..4 {
@@ -337,10 +335,10 @@ mod tests {
         let model = LidarModel::default();
         let image = RangeImage::project(&[Vec3::new(8.0, 1.0, 0.0)], &model);
         let mut rng = StdRng::seed_from_u64(1);
-        let beams = choose_beams(&image, 100, 0.2, &Stance::default(), &mut rng);
+        let beams = choose_beams(&image, 100, 0.2, &SensorAttitude::default(), &mut rng);
         assert_eq!(beams.len(), 1);
         let empty = RangeImage::project(&[], &model);
-        assert!(choose_beams(&empty, 100, 0.2, &Stance::default(), &mut rng).is_empty());
+        assert!(choose_beams(&empty, 100, 0.2, &SensorAttitude::default(), &mut rng).is_empty());
     }
 
     #[test]
@@ -349,11 +347,11 @@ mod tests {
         let truth = world.pose_at(3.0, 0.2, 0.1);
         let mut rng = StdRng::seed_from_u64(1);
         let image = world.scan(&truth);
-        let beams = choose_beams(&image, 2000, 0.2, &Stance::default(), &mut rng);
+        let beams = choose_beams(&image, 2000, 0.2, &SensorAttitude::default(), &mut rng);
         let place = |x: f64, y: f64, heading: f64| {
             let pose = Pose2::new(nalgebra::Vector2::new(x, y), heading);
-            let patch = footing(&pose.into(), &world.ground, &world.tiles, None);
-            patch.map(|patch| patch.lift(&pose, &Stance::default()))
+            let patch = ground_patch_of(&pose.into(), &world.map(), None);
+            patch.map(|patch| patch.lift(&pose, &SensorAttitude::default()))
         };
         let poses = [
             place(3.0, 0.2, 0.1),
@@ -373,7 +371,7 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_in_the_way_does_not_count_against_a_pose() {
+    fn traffic_in_front_of_the_map_does_not_count_against_a_pose() {
         let beam = |range_m| Beam {
             direction: Vec3::X,
             range_m,
@@ -381,10 +379,16 @@ mod tests {
         let beams: Vec<Beam> = (0..90)
             .map(|i| beam(if i < 40 { 5.0 } else { 10.0 }))
             .collect();
-        let fit = Fit::of(&beams, &[10.0; 90], 0.3);
-        assert_eq!((fit.hit, fit.short, fit.long), (50, 40, 0));
-        assert_eq!(fit.agreement(), Some(1.0));
-        assert_eq!(Fit::of(&beams, &[7.0; 90], 0.3).agreement(), Some(0.0));
-        assert_eq!(Fit::of(&beams, &[f32::INFINITY; 90], 0.3).agreement(), None);
+        let counts = BeamAgreement::of(&beams, &[10.0; 90], 0.3);
+        assert_eq!((counts.hit, counts.short, counts.long), (50, 40, 0));
+        assert_eq!(counts.share(), Some(1.0));
+        assert_eq!(
+            BeamAgreement::of(&beams, &[7.0; 90], 0.3).share(),
+            Some(0.0)
+        );
+        assert_eq!(
+            BeamAgreement::of(&beams, &[f32::INFINITY; 90], 0.3).share(),
+            None
+        );
     }
 }

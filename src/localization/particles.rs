@@ -113,7 +113,7 @@ impl ParticleSet {
     }
 
     /// Says on which ground the particles stand, in order; those that stand on none remember the last.
-    pub fn stand(&mut self, levels_m: impl IntoIterator<Item = Option<f64>>) {
+    pub fn set_levels(&mut self, levels_m: impl IntoIterator<Item = Option<f64>>) {
         for (particle, level_m) in self.particles.iter_mut().zip(levels_m) {
             particle.level_m = level_m.or(particle.level_m);
         }

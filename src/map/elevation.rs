@@ -8,7 +8,7 @@
 //! The road frame lies on the mapped ground under the sensor, z along the ground's normal, x
 //! forward. How the sensor stands over it (height, roll, pitch) is the car's own affair and
 //! comes from the scan: from the plane of its road, or, where the place is known, better from the
-//! distances of its returns to the mapped ground ([`GroundMap::stance_at`]).
+//! distances of its returns to the mapped ground ([`GroundMap::attitude_at`]).
 //!
 //! Where roads cross above one another, a place in the plane has several levels of ground. Who stood
 //! on one of them a moment ago says how high that was, and stays on it.
@@ -24,7 +24,7 @@ const RADIUS_M: f64 = 2.0;
 
 /// How the sensor stands over the road: height, roll and pitch.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Stance {
+pub struct SensorAttitude {
     /// Height of the sensor over the road, along the road's normal [m].
     pub height_m: f64,
     /// About the forward axis [rad].
@@ -33,7 +33,7 @@ pub struct Stance {
     pub pitch_rad: f64,
 }
 
-impl Default for Stance {
+impl Default for SensorAttitude {
     /// KITTI's car on a level road.
     fn default() -> Self {
         Self {
@@ -44,7 +44,7 @@ impl Default for Stance {
     }
 }
 
-impl Stance {
+impl SensorAttitude {
     /// `p_road = road_from_lidar * p_lidar`.
     pub fn road_from_lidar(&self) -> Pose3 {
         Pose3::from_parts(
@@ -207,11 +207,11 @@ impl GroundMap {
         })
     }
 
-    /// Where in space a planar pose is, standing on the (lowest) ground as `stance` says; `None` where
+    /// Where in space a planar pose is, standing on the (lowest) ground as `attitude` says; `None` where
     /// there is no ground. `map_from_lidar = map_from_road · road_from_lidar`, with the sensor at the
     /// pose's x and y.
-    pub fn lift(&self, planar: &Pose2, stance: &Stance) -> Option<Pose3> {
-        Some(self.patch_under(planar, None)?.lift(planar, stance))
+    pub fn lift(&self, planar: &Pose2, attitude: &SensorAttitude) -> Option<Pose3> {
+        Some(self.patch_under(planar, None)?.lift(planar, attitude))
     }
 
     /// Height of the ground at a place, of the level nearest to `level_m`, between the middles of the
@@ -233,28 +233,28 @@ impl GroundMap {
         Some((1.0 - up) * between(row)? + up * between(row + 1)?)
     }
 
-    /// How the sensor stands over the road at a planar pose: the stance with which the returns
+    /// How the sensor stands over the road at a planar pose: the attitude with which the returns
     /// from the road (`points`, lidar frame; others among them do no harm) lie on the mapped
     /// ground. Robust least squares from `start`; `None` where too few returns meet known ground.
     ///
     /// The plane of the road that a scan sees and the patch of the map under the car are fitted to
     /// different stretches of a road that is not flat; this asks one surface only.
-    pub fn stance_at(
+    pub fn attitude_at(
         &self,
         planar: &Pose2,
         level_m: Option<f64>,
-        start: &Stance,
+        start: &SensorAttitude,
         points: &[Vec3],
-    ) -> Option<Stance> {
+    ) -> Option<SensorAttitude> {
         /// What lies farther off the ground than this is none of it, from blunt to sharp [m].
         const GATES_M: [f64; 4] = [0.4, 0.2, 0.1, 0.1];
         /// Fewer returns on the ground than this do not tell.
         const ENOUGH: usize = 50;
         let patch = self.patch_under(planar, level_m)?;
         let mut heights = self.heights.reader();
-        let mut stance = *start;
+        let mut attitude = *start;
         for gate_m in GATES_M {
-            let map_from_lidar = patch.lift(planar, &stance);
+            let map_from_lidar = patch.lift(planar, &attitude);
             let mut normal_matrix = Matrix3::zeros();
             let mut right_side = Vector3::zeros();
             let mut used = 0;
@@ -280,11 +280,11 @@ impl GroundMap {
                 return None;
             }
             let step = normal_matrix.cholesky()?.solve(&right_side);
-            stance.height_m += step.x;
-            stance.roll_rad += step.y;
-            stance.pitch_rad += step.z;
+            attitude.height_m += step.x;
+            attitude.roll_rad += step.y;
+            attitude.pitch_rad += step.z;
         }
-        Some(stance)
+        Some(attitude)
     }
 
     /// The ground that a car at a planar pose stands on; `None` where there is none. Of several
@@ -309,9 +309,9 @@ fn is_enough(known: usize, all: usize) -> bool {
 }
 
 impl GroundPatch {
-    /// Where in space a planar pose is, standing on the plane of this patch as `stance` says.
+    /// Where in space a planar pose is, standing on the plane of this patch as `attitude` says.
     /// [`planar`](crate::geometry::pose2_from_pose3) gives the planar pose back, on every slope.
-    pub fn lift(&self, planar: &Pose2, stance: &Stance) -> Pose3 {
+    pub fn lift(&self, planar: &Pose2, attitude: &SensorAttitude) -> Pose3 {
         let t = planar.translation.vector;
         let heading = planar.rotation.angle();
         let up = self.normal;
@@ -321,12 +321,12 @@ impl GroundPatch {
             Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[left.cross(&up), left, up]));
         let map_from_road = UnitQuaternion::from_rotation_matrix(&rotation);
         let tilted = map_from_road
-            * UnitQuaternion::from_euler_angles(stance.roll_rad, stance.pitch_rad, 0.0);
+            * UnitQuaternion::from_euler_angles(attitude.roll_rad, attitude.pitch_rad, 0.0);
         // Leaning on a slope turns the nose a little; the heading is the one that was asked for.
         let nose = tilted * Vector3::x();
         let turn_rad = heading - nose.y.atan2(nose.x);
         // The road plane passes through the patch; the sensor hangs `height_m` along its normal over it.
-        let height_m = self.height_m + stance.height_m / up.z;
+        let height_m = self.height_m + attitude.height_m / up.z;
         Pose3::from_parts(
             Translation3::new(t.x, t.y, height_m),
             UnitQuaternion::from_euler_angles(0.0, 0.0, turn_rad) * tilted,
@@ -335,10 +335,10 @@ impl GroundPatch {
 
     /// How a sensor at a pose in space stands over the plane of this patch; [`lift`](Self::lift) of
     /// the same pose seen from above undoes it, but for the turn of the nose on a slope.
-    pub fn stance_of(&self, map_from_lidar: &Pose3) -> Stance {
+    pub fn attitude_of(&self, map_from_lidar: &Pose3) -> SensorAttitude {
         let up = map_from_lidar.rotation.inverse() * self.normal;
         let above_m = map_from_lidar.translation.z - self.height_m;
-        Stance::from_plane(
+        SensorAttitude::from_plane(
             Vec3::new(up.x as f32, up.y as f32, up.z as f32),
             above_m * self.normal.z,
         )

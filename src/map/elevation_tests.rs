@@ -185,7 +185,7 @@ fn at_the_edge_of_a_bridge_a_place_has_the_levels_of_its_own_cell() {
 fn on_level_ground_the_lifted_pose_is_the_stance_at_the_planar_pose() {
     let ground = GroundMap::flat(Point2::new(-10.0, -10.0), Point2::new(10.0, 10.0), -1.73);
     let pose = Pose2::new(Vector2::new(1.0, 2.0), 2.5);
-    let lifted = ground.lift(&pose, &Stance::default()).unwrap();
+    let lifted = ground.lift(&pose, &SensorAttitude::default()).unwrap();
     assert_relative_eq!(pose2_from_pose3(&lifted), pose, epsilon = 1e-9);
     assert_relative_eq!(lifted.translation.z, 0.0, epsilon = 1e-6);
 }
@@ -196,14 +196,14 @@ fn a_lifted_pose_casts_its_planar_pose_as_shadow_on_every_slope() {
         height_m: 4.0,
         normal: Vector3::new(-0.1, 0.08, 1.0).normalize(),
     };
-    let stance = Stance {
+    let attitude = SensorAttitude {
         height_m: 1.7,
         roll_rad: 0.04,
         pitch_rad: -0.05,
     };
     for heading in [-3.0, -1.0, 0.0, 0.7, 2.5] {
         let pose = Pose2::new(Vector2::new(1.0, 2.0), heading);
-        let shadow = pose2_from_pose3(&patch.lift(&pose, &stance));
+        let shadow = pose2_from_pose3(&patch.lift(&pose, &attitude));
         assert_relative_eq!(shadow, pose, epsilon = 1e-12);
     }
 }
@@ -212,7 +212,7 @@ fn a_lifted_pose_casts_its_planar_pose_as_shadow_on_every_slope() {
 fn the_stance_is_found_from_returns_off_a_slope_among_others_that_are_not_off_it() {
     let ground = GroundMap::from_mesh(&slope(0.06), |_| true, 0.5);
     let pose = Pose2::new(Vector2::new(1.0, 2.0), 0.6);
-    let truth = Stance {
+    let truth = SensorAttitude {
         height_m: 1.65,
         roll_rad: 0.015,
         pitch_rad: -0.02,
@@ -226,12 +226,12 @@ fn the_stance_is_found_from_returns_off_a_slope_among_others_that_are_not_off_it
             Vec3::new(point.x as f32, point.y as f32, point.z as f32)
         })
         .collect();
-    let start = Stance::default();
-    let found = ground.stance_at(&pose, None, &start, &points).unwrap();
+    let start = SensorAttitude::default();
+    let found = ground.attitude_at(&pose, None, &start, &points).unwrap();
     assert_relative_eq!(found.height_m, truth.height_m, epsilon = 5e-3);
     assert_relative_eq!(found.roll_rad, truth.roll_rad, epsilon = 5e-4);
     assert_relative_eq!(found.pitch_rad, truth.pitch_rad, epsilon = 5e-4);
-    assert_eq!(ground.stance_at(&pose, None, &start, &points[..40]), None);
+    assert_eq!(ground.attitude_at(&pose, None, &start, &points[..40]), None);
 }
 
 #[test]
@@ -239,7 +239,7 @@ fn uphill_the_nose_points_up_and_downhill_down() {
     let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
     for (heading, sign) in [(0.0, 1.0), (std::f64::consts::PI, -1.0)] {
         let pose = Pose2::new(Vector2::new(0.0, 0.0), heading);
-        let lifted = ground.lift(&pose, &Stance::default()).unwrap();
+        let lifted = ground.lift(&pose, &SensorAttitude::default()).unwrap();
         let nose = lifted.rotation * Vector3::x();
         assert_relative_eq!(nose.z, sign * 0.1_f64.atan().sin(), epsilon = 1e-3);
     }
@@ -247,14 +247,14 @@ fn uphill_the_nose_points_up_and_downhill_down() {
 
 #[test]
 fn a_stance_from_the_plane_that_it_makes_is_itself() {
-    let stance = Stance {
+    let attitude = SensorAttitude {
         height_m: 1.7,
         roll_rad: 0.03,
         pitch_rad: -0.02,
     };
-    let up = stance.road_from_lidar().rotation.inverse() * Vector3::z();
+    let up = attitude.road_from_lidar().rotation.inverse() * Vector3::z();
     let up = Vec3::new(up.x as f32, up.y as f32, up.z as f32);
-    let back = Stance::from_plane(up, 1.7);
-    assert_relative_eq!(back.roll_rad, stance.roll_rad, epsilon = 1e-6);
-    assert_relative_eq!(back.pitch_rad, stance.pitch_rad, epsilon = 1e-6);
+    let back = SensorAttitude::from_plane(up, 1.7);
+    assert_relative_eq!(back.roll_rad, attitude.roll_rad, epsilon = 1e-6);
+    assert_relative_eq!(back.pitch_rad, attitude.pitch_rad, epsilon = 1e-6);
 }

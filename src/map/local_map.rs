@@ -1,19 +1,15 @@
-//! A local map: the scans of a stretch of road turned into a mesh.
+//! A local map: the mesh of the scans of a stretch of road.
 
-use blake3::Hash;
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::confidence::{self, ConfidenceConfig};
-use super::plan::{LocalMapPlan, Ownership};
-use super::scan_cloud::{PointCounts, ScanCloud, ScanSettings};
+use super::plan::Ownership;
+use super::scan_cloud::{PointCounts, ScanCloud, ScanConfig};
 use super::seam;
 use super::vertex_ground;
 use super::visibility::{self, VisibilityConfig};
 use crate::geometry::{PointCloud, TriangleMesh};
-use crate::ground::GroundClassifier;
 use crate::meshing::{self, MeshingError, PoissonConfig, Reconstruction};
-use crate::recording::{Frame, RecordingError, velodyne};
 use crate::validation::{
     InvalidValue, Validate, fraction, nested, not_negative, positive, require,
 };
@@ -21,39 +17,39 @@ use crate::validation::{
 /// Vertices that are gathered in neighbouring cells are less than two cells apart along an axis.
 const CELLS_PER_EDGE: f32 = 2.0;
 
-/// How scans become a mesh.
+/// Processing of scans into a mesh.
 #[derive(Clone, Debug, PartialEq)]
-pub struct LocalMapSettings {
-    /// What of a scan is used.
-    pub scan: ScanSettings,
-    /// How much each point counts.
+pub struct LocalMapConfig {
+    /// Selection and preparation of points.
+    pub scan: ScanConfig,
+    /// Confidence weights of points.
     pub confidence: ConfidenceConfig,
     /// Surface reconstruction.
     pub poisson: PoissonConfig,
-    /// Vertices below this quantile of density are dropped (unitless).
+    /// Vertices below this quantile of density are removed (unitless).
     pub min_density: f64,
-    /// Surface farther than this from every point is invented and dropped [m].
+    /// Surface farther than this from every point is extrapolated and removed [m].
     pub max_distance_m: f32,
     /// Free-space votes.
     pub visibility: VisibilityConfig,
-    /// A vertex is ground from this confidence on (unitless).
+    /// A vertex with at least this ground confidence is ground (unitless).
     pub ground_threshold: f32,
-    /// The ground is simplified as if its vertices were gathered in cells of this edge [m]: no new
-    /// edge is longer than two of them; 0 leaves the ground as it is.
+    /// Cell size of the simplification of the ground [m]: no new edge is longer than two cells; 0
+    /// disables it.
     pub simplify_resolution_m: f32,
-    /// Rounds of smoothing of the simplified ground.
+    /// Smoothing iterations of the simplified ground.
     pub smoothing_iterations: usize,
-    /// Colour of what is surely ground; the less sure, the nearer to `rest_color`.
+    /// Colour of confidence 1; lower confidences are interpolated towards `rest_color`.
     pub ground_color: [u8; 3],
-    /// Colour of what surely is none.
+    /// Colour of confidence 0.
     pub rest_color: [u8; 3],
 }
 
-impl Default for LocalMapSettings {
+impl Default for LocalMapConfig {
     /// range-mcl's values where it has them.
     fn default() -> Self {
         Self {
-            scan: ScanSettings::default(),
+            scan: ScanConfig::default(),
             confidence: ConfidenceConfig::default(),
             poisson: PoissonConfig::default(),
             min_density: 0.1,
@@ -68,7 +64,7 @@ impl Default for LocalMapSettings {
     }
 }
 
-impl Validate for LocalMapSettings {
+impl Validate for LocalMapConfig {
     /// With the keys of `build_map.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
         self.scan.validate()?;
@@ -87,32 +83,32 @@ impl Validate for LocalMapSettings {
     }
 }
 
-/// What happened to the points and triangles of a local map.
+/// Numbers of points and triangles at each step of a local map.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct LocalMapCounts {
     /// Scans meshed.
     pub scans: usize,
     /// Points, summed over the scans.
     pub points: PointCounts,
-    /// Points that moved.
+    /// Points removed as dynamic.
     pub dynamic_points: usize,
-    /// Points that the reconstruction could not use: merged from opposite normals, they have none.
+    /// Points without a normal, merged from opposite ones, which the reconstruction cannot use.
     pub unusable_points: usize,
     /// Triangles as reconstructed.
     pub reconstructed_triangles: usize,
-    /// Triangles dropped for few points around them.
+    /// Triangles removed for low point density.
     pub sparse_triangles: usize,
-    /// Triangles dropped for distance to all points.
+    /// Triangles removed for their distance to all points.
     pub distant_triangles: usize,
-    /// Triangles that beams pass through.
+    /// Triangles removed because beams pass through them.
     pub crossed_triangles: usize,
     /// Triangles saved by simplifying the ground.
     pub simplified_triangles: usize,
-    /// Triangles left to neighbouring local maps.
+    /// Triangles that belong to neighbouring local maps.
     pub foreign_triangles: usize,
     /// Triangles of the finished local map.
     pub triangles: usize,
-    /// Whether it was left out because it had too few points to mesh.
+    /// Whether it had too few points to mesh.
     #[serde(default)]
     pub is_empty: bool,
 }
@@ -120,171 +116,75 @@ pub struct LocalMapCounts {
 /// A finished local map.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LocalMap {
-    /// What it owns of the surface; empty where there were too few points.
+    /// The part of the surface that it owns; empty where there were too few points.
     pub mesh: TriangleMesh,
-    /// What happened to its points and triangles.
+    /// Numbers of points and triangles at each step.
     pub counts: LocalMapCounts,
-    /// Hash of the scans that it was made of, see [`scans_hash`].
-    pub scans_hash: String,
 }
 
-/// Who watches a build and may stop it.
-#[derive(Clone, Copy)]
-pub struct Watcher<'a> {
-    /// Called after each scan that was read.
-    pub scan_done: &'a (dyn Fn() + Sync),
-    /// Called with the name of each stage that begins.
-    pub stage: &'a (dyn Fn(&'static str) + Sync),
-    /// Asked between steps; the build ends with [`LocalMapError::Interrupted`] once it says so.
-    pub cancelled: &'a (dyn Fn() -> bool + Sync),
-}
-
-impl Watcher<'_> {
-    fn check(&self) -> Result<(), LocalMapError> {
-        if (self.cancelled)() {
-            Err(LocalMapError::Interrupted)
-        } else {
-            Ok(())
-        }
-    }
-
-    fn begin(&self, stage: &'static str) -> Result<(), LocalMapError> {
-        (self.stage)(stage);
-        self.check()
-    }
-}
-
-/// Why a local map could not be made.
-#[derive(Debug, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages say it")]
-pub enum LocalMapError {
-    #[error("interrupted")]
-    Interrupted,
-    #[error(transparent)]
-    Scan(#[from] RecordingError),
-    #[error("local map {number} (frames {first} to {last}): {source}")]
-    Meshing {
-        number: usize,
-        first: usize,
-        last: usize,
-        source: MeshingError,
-    },
-}
-
-/// Reads, cleans, meshes and colours the scans of one local map.
-pub fn build(
-    frames: &[Frame],
-    plan: &LocalMapPlan,
+/// Meshes the prepared scans of a local map and colours the mesh by ground confidence. `begin_stage`
+/// is called at the start of each stage and may end the work with an error.
+pub(super) fn build<E: From<MeshingError>>(
+    scans: Vec<ScanCloud>,
+    number: usize,
     ownership: &Ownership,
-    settings: &LocalMapSettings,
-    classifier: &dyn GroundClassifier,
-    watcher: &Watcher,
-) -> Result<LocalMap, LocalMapError> {
-    let mut counts = LocalMapCounts::default();
-    watcher.begin("scans")?;
-    let scans = prepare_scans(&frames[plan.used.clone()], settings, classifier, watcher)?;
-    counts.scans = scans.len();
-    scans
-        .iter()
-        .for_each(|scan| counts.points.add(&scan.counts));
-    let scans_hash = joint_hash(scans.iter().map(|scan| scan.hash));
+    config: &LocalMapConfig,
+    begin_stage: impl Fn(&'static str) -> Result<(), E>,
+) -> Result<LocalMap, E> {
+    let mut counts = LocalMapCounts {
+        scans: scans.len(),
+        ..LocalMapCounts::default()
+    };
+    for scan in &scans {
+        counts.points.add(&scan.counts);
+    }
+    begin_stage("moving points")?;
+    let (cloud, weights) = static_cloud(&scans, config, &mut counts);
 
-    watcher.begin("moving points")?;
-    let (cloud, weights) = static_cloud(&scans, settings, &mut counts);
-
-    watcher.begin("surface")?;
-    let surface = reconstruct(&cloud, weights.as_deref(), settings, &mut counts);
-    let surface = surface.map_err(|source| LocalMapError::Meshing {
-        number: plan.number,
-        first: frames[plan.own.start].number,
-        last: frames[plan.own.end - 1].number,
-        source,
-    })?;
-    let Some(mut surface) = surface else {
+    begin_stage("surface")?;
+    let Some(mut surface) = reconstruct(&cloud, weights.as_deref(), config, &mut counts)? else {
         let mesh = TriangleMesh::default();
-        return Ok(LocalMap {
-            mesh,
-            counts,
-            scans_hash,
-        });
+        return Ok(LocalMap { mesh, counts });
     };
     counts.reconstructed_triangles = surface.mesh.triangles.len();
-    counts.sparse_triangles = meshing::trim_by_density(&mut surface, settings.min_density);
+    counts.sparse_triangles = meshing::trim_by_density(&mut surface, config.min_density);
     let mut mesh = surface.mesh;
     counts.distant_triangles =
-        meshing::trim_by_distance(&mut mesh, &cloud.positions, settings.max_distance_m);
+        meshing::trim_by_distance(&mut mesh, &cloud.positions, config.max_distance_m);
 
-    watcher.begin("false surfaces")?;
-    if settings.visibility.enabled {
+    begin_stage("false surfaces")?;
+    if config.visibility.enabled {
         counts.crossed_triangles =
-            visibility::remove_crossed_triangles(&mut mesh, &scans, &settings.visibility);
+            visibility::remove_crossed_triangles(&mut mesh, &scans, &config.visibility);
     }
     drop(scans);
 
-    watcher.begin("ground")?;
-    counts.foreign_triangles = seam::keep_own(&mut mesh, ownership, plan.number);
+    begin_stage("ground")?;
+    counts.foreign_triangles = seam::keep_own(&mut mesh, ownership, number);
     meshing::split_fans(&mut mesh);
-    let is_held = seam::on_border(&mesh.vertices, ownership, plan.number);
-    finish_ground(&mut mesh, &cloud, &is_held, settings, &mut counts);
+    let is_held = seam::on_border(&mesh.vertices, ownership, number);
+    finish_ground(&mut mesh, &cloud, &is_held, config, &mut counts);
     counts.triangles = mesh.triangles.len();
-    Ok(LocalMap {
-        mesh,
-        counts,
-        scans_hash,
-    })
+    Ok(LocalMap { mesh, counts })
 }
 
-/// The hash that a local map has if it is made of these frames as they lie on disk now.
-pub fn scans_hash(frames: &[Frame], plan: &LocalMapPlan) -> Result<String, RecordingError> {
-    let hashes: Vec<Hash> = frames[plan.used.clone()]
-        .par_iter()
-        .map(|frame| velodyne::hash_of_scan(&frame.scan_path))
-        .collect::<Result<_, _>>()?;
-    Ok(joint_hash(hashes))
-}
-
-fn joint_hash(hashes: impl IntoIterator<Item = Hash>) -> String {
-    let mut hasher = blake3::Hasher::new();
-    for hash in hashes {
-        hasher.update(hash.as_bytes());
-    }
-    hasher.finalize().to_hex().to_string()
-}
-
-fn prepare_scans(
-    frames: &[Frame],
-    settings: &LocalMapSettings,
-    classifier: &dyn GroundClassifier,
-    watcher: &Watcher,
-) -> Result<Vec<ScanCloud>, LocalMapError> {
-    frames
-        .par_iter()
-        .map(|frame| {
-            watcher.check()?;
-            let scan = ScanCloud::prepare(frame, &settings.scan, classifier)?;
-            (watcher.scan_done)();
-            Ok(scan)
-        })
-        .collect()
-}
-
-/// All points that did not move, of all scans, and how much they count.
+/// Returns the static points of all scans with their weights.
 fn static_cloud(
     scans: &[ScanCloud],
-    settings: &LocalMapSettings,
+    config: &LocalMapConfig,
     counts: &mut LocalMapCounts,
 ) -> (PointCloud, Option<Vec<f32>>) {
-    let model = &settings.scan.range_image;
-    let is_static = settings
+    let model = &config.scan.range_image;
+    let is_static = config
         .visibility
         .enabled
-        .then(|| visibility::static_points(scans, model, &settings.visibility));
+        .then(|| visibility::static_points(scans, model, &config.visibility));
     let mut all = PointCloud::default();
     let mut weights: Option<Vec<f32>> = None;
     for (number, scan) in scans.iter().enumerate() {
         let mut cloud = scan.cloud.clone();
         let is_kept = |index: usize| is_static.as_ref().is_none_or(|all| all[number][index]);
-        if let Some(confidences) = settings.confidence.of(scan) {
+        if let Some(confidences) = config.confidence.of(scan) {
             let kept = confidences
                 .into_iter()
                 .enumerate()
@@ -305,15 +205,14 @@ fn static_cloud(
     (all, weights)
 }
 
-/// The surface through the points; `None` where there are too few, which is a hole in the map, and
-/// no reason to have no map.
+/// Reconstructs the surface; `None` where there are too few points, which leaves a hole in the map.
 fn reconstruct(
     cloud: &PointCloud,
     weights: Option<&[f32]>,
-    settings: &LocalMapSettings,
+    config: &LocalMapConfig,
     counts: &mut LocalMapCounts,
 ) -> Result<Option<Reconstruction>, MeshingError> {
-    match meshing::reconstruct(cloud, weights, &settings.poisson) {
+    match meshing::reconstruct(cloud, weights, &config.poisson) {
         Ok(surface) => {
             counts.unusable_points = surface.dropped_points;
             Ok(Some(surface))
@@ -327,26 +226,23 @@ fn reconstruct(
     }
 }
 
-/// Colours the mesh by confidence and simplifies what is ground, apart from the vertices that are
-/// held.
+/// Colours the mesh by ground confidence and simplifies its ground, apart from the held vertices.
 fn finish_ground(
     mesh: &mut TriangleMesh,
     cloud: &PointCloud,
     is_held: &[bool],
-    settings: &LocalMapSettings,
+    config: &LocalMapConfig,
     counts: &mut LocalMapCounts,
 ) {
-    let cell_m = settings
-        .max_distance_m
-        .max(2.0 * settings.scan.voxel_size_m);
+    let cell_m = config.max_distance_m.max(2.0 * config.scan.voxel_size_m);
     let confidences = vertex_ground::mean_confidences(&mesh.vertices, cloud, cell_m);
-    let threshold = settings.ground_threshold;
-    let (rest, ground) = (settings.rest_color, settings.ground_color);
+    let threshold = config.ground_threshold;
+    let (rest, ground) = (config.rest_color, config.ground_color);
     mesh.colors = confidences
         .iter()
         .map(|&confidence| vertex_ground::color(confidence, threshold, rest, ground))
         .collect();
-    if settings.simplify_resolution_m <= 0.0 {
+    if config.simplify_resolution_m <= 0.0 {
         return;
     }
     let before = mesh.triangles.len();
@@ -354,8 +250,8 @@ fn finish_ground(
         mesh,
         &vertex_ground::ground_triangles(mesh, &confidences, threshold),
         is_held,
-        CELLS_PER_EDGE * settings.simplify_resolution_m,
-        settings.smoothing_iterations,
+        CELLS_PER_EDGE * config.simplify_resolution_m,
+        config.smoothing_iterations,
     );
     counts.simplified_triangles = before.saturating_sub(mesh.triangles.len());
 }
@@ -384,12 +280,12 @@ mod tests {
 
     fn unusable(cloud: &PointCloud) -> (bool, usize) {
         let mut counts = LocalMapCounts::default();
-        let settings = LocalMapSettings {
+        let settings = LocalMapConfig {
             poisson: PoissonConfig {
                 depth: 5,
                 ..PoissonConfig::default()
             },
-            ..LocalMapSettings::default()
+            ..LocalMapConfig::default()
         };
         let surface = reconstruct(cloud, None, &settings, &mut counts).unwrap();
         assert_eq!(surface.is_none(), counts.is_empty);
@@ -406,8 +302,7 @@ mod tests {
             map_from_lidar: Rigid3f::from(&Pose3::identity()),
             cloud,
             returns: Vec::new(),
-            free_range_m: vec![7.0; ScanSettings::default().range_image.len()],
-            hash: blake3::hash(&[]),
+            free_range_m: vec![7.0; ScanConfig::default().range_image.len()],
             counts: PointCounts::default(),
         }
     }
@@ -415,7 +310,7 @@ mod tests {
     #[test]
     fn weights_go_with_the_points_that_did_not_move() {
         let scans = [scan(), scan(), scan()];
-        let mut settings = LocalMapSettings::default();
+        let mut settings = LocalMapConfig::default();
         let mut counts = LocalMapCounts::default();
         let (_, weights) = static_cloud(&scans, &settings, &mut counts);
         assert_eq!(weights, None);

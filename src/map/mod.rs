@@ -1,26 +1,42 @@
-//! The map: built from scans, kept as a mesh, cut into tiles.
+//! The map: built from scans, a mesh with its ground and tiles, saved and loaded.
+//!
+//! > [`MapBuilder`] makes a [`Map`] of scans with poses: [`plan`] divides the drive into local maps,
+//! > [`scan_cloud`] prepares each scan, [`visibility`] finds moving points and surfaces that beams pass
+//! > through, [`local_map`] meshes and cuts what belongs to it. A [`Map`] knows its [`elevation`],
+//! > its [`tiles`], the [`panorama`] of every place, and what renders it.
 
+// From scans to a mesh.
+pub mod builder;
 pub mod confidence;
-pub mod elevation;
-mod heights;
+pub mod config;
 pub mod local_map;
 pub mod plan;
-pub mod ply;
-pub mod quality;
 pub mod scan_cloud;
 mod seam;
-mod surface_distance;
-pub mod tiles;
-pub mod truth;
 mod vertex_ground;
 pub mod visibility;
+// What a pose in the map needs.
+pub mod cells;
+pub mod elevation;
+mod heights;
+pub mod panorama;
+pub mod tiles;
+// The map as a whole, and its file.
+pub mod mapping_path;
+pub mod model;
+pub mod ply;
 
 #[cfg(test)]
 mod seam_tests;
+#[cfg(test)]
+pub(crate) mod test_world;
 
-pub use elevation::{GroundMap, GroundPatch, Stance};
-pub use local_map::{LocalMapCounts, LocalMapError, LocalMapSettings};
+pub use builder::{BuildError, BuildEvent, MapBuilder, MapPlan, ScanError};
+pub use config::{MapConfig, MapOptions};
+pub use elevation::{GroundMap, GroundPatch, SensorAttitude};
+pub use local_map::{LocalMap, LocalMapConfig, LocalMapCounts};
+pub use mapping_path::MappingPath;
+pub use model::{Map, MapError};
+pub use panorama::{PanoramaConfig, PanoramaIndex, PanoramaRequest, PanoramaSeed, SearchRegion};
 pub use ply::PlyError;
-pub use quality::MapQuality;
 pub use tiles::{TileConfig, TileGrid, TileIndex};
-pub use truth::TruthAgreement;

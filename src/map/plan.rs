@@ -1,62 +1,63 @@
-//! Which scans make which local map, and which local map owns which place.
+//! Division of a drive into local maps, and ownership of places by local maps.
 //!
-//! A scan counts if the car has moved since the last one that counted. Every
-//! `local_map_size` counted scans, and at the end of the recording, a local map is closed. It is
-//! meshed from its own scans and those a few metres before and after; of its mesh it keeps
-//! what lies nearer to its own scans than to those of any other local map, cut off at the very
-//! border, see [`super::seam`]: neighbours meet and no wall stands twice, also where the car comes
-//! by again.
+//! A scan is a key scan if the car has moved since the previous key scan. Every `local_map_size` key
+//! scans, and at the end of the recording, a local map is closed. It is meshed from its own scans and
+//! those a few metres before and after; of its mesh it keeps what is closer to its own scans than to
+//! those of any other local map, cut exactly at the border (see [`super::seam`]): neighbours meet
+//! without overlap, also where the car returns to a place.
 
 use std::ops::Range;
 
 use nalgebra::Point2;
 
-use crate::geometry::Grid2;
-use crate::recording::Frame;
+use crate::geometry::{Grid2, Pose3};
 
 /// Edge of the cells in which ownership is decided [m].
 const OWNER_CELL_M: f64 = 0.5;
 
-/// One local map.
-#[derive(Clone, Debug, PartialEq)]
+/// The scans of one local map.
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LocalMapPlan {
-    /// From 0, in the order of the recording.
+    /// Number of the local map, from 0 in the order of the drive.
     pub number: usize,
-    /// The scans it is made of, as indices into the counted frames; no two local maps share one.
+    /// Its own key scans; no two local maps share one.
     pub own: Range<usize>,
-    /// Those and its neighbours', from which it is meshed.
+    /// Its own key scans and those of its neighbours from which it is meshed.
     pub used: Range<usize>,
 }
 
-/// The frames that count: the first, and each that is `displacement_m` or more away from the
-/// last one that counts.
-pub fn counted_frames(frames: &[Frame], displacement_m: f64) -> Vec<Frame> {
-    let mut counted: Vec<Frame> = Vec::with_capacity(frames.len());
-    for frame in frames {
-        let moved = counted
-            .last()
-            .is_none_or(|last| distance_m(last, frame) >= displacement_m);
-        if moved {
-            counted.push(frame.clone());
+/// Returns the indices of the key scans: the first, and each that is `displacement_m` or more away
+/// from the previous key scan.
+pub fn key_scans(map_from_lidar: &[Pose3], displacement_m: f64) -> Vec<usize> {
+    let mut keys: Vec<usize> = Vec::with_capacity(map_from_lidar.len());
+    for (index, pose) in map_from_lidar.iter().enumerate() {
+        let previous = keys.last().map(|&key| &map_from_lidar[key]);
+        if is_key_scan(previous, pose, displacement_m) {
+            keys.push(index);
         }
     }
-    counted
+    keys
 }
 
-/// Cuts counted frames into local maps of `local_map_size` scans, the last with what is left,
-/// each meshed with the frames within `overlap_m` of path before and after.
-pub fn local_maps(frames: &[Frame], local_map_size: usize, overlap_m: f64) -> Vec<LocalMapPlan> {
-    (0..frames.len())
+/// Whether a scan is a key scan, given the previous one.
+pub fn is_key_scan(previous: Option<&Pose3>, pose: &Pose3, displacement_m: f64) -> bool {
+    previous.is_none_or(|previous| distance_m(previous, pose) >= displacement_m)
+}
+
+/// Cuts key scans into local maps of `local_map_size` scans, the last with the remainder, each
+/// meshed with the scans within `overlap_m` before and after.
+pub fn local_maps(poses: &[Pose3], local_map_size: usize, overlap_m: f64) -> Vec<LocalMapPlan> {
+    (0..poses.len())
         .step_by(local_map_size)
         .enumerate()
         .map(|(number, start)| {
-            let own = start..(start + local_map_size).min(frames.len());
-            let near = |a: usize, b: usize| distance_m(&frames[a], &frames[b]) <= overlap_m;
+            let own = start..(start + local_map_size).min(poses.len());
+            let near = |a: usize, b: usize| distance_m(&poses[a], &poses[b]) <= overlap_m;
             let mut used = own.clone();
             while used.start > 0 && near(used.start - 1, own.start) {
                 used.start -= 1;
             }
-            while used.end < frames.len() && near(used.end, own.end - 1) {
+            while used.end < poses.len() && near(used.end, own.end - 1) {
                 used.end += 1;
             }
             LocalMapPlan { number, own, used }
@@ -64,11 +65,11 @@ pub fn local_maps(frames: &[Frame], local_map_size: usize, overlap_m: f64) -> Ve
         .collect()
 }
 
-fn distance_m(a: &Frame, b: &Frame) -> f64 {
-    (a.map_from_lidar.translation.vector - b.map_from_lidar.translation.vector).norm()
+fn distance_m(a: &Pose3, b: &Pose3) -> f64 {
+    (a.translation.vector - b.translation.vector).norm()
 }
 
-/// Which local map owns a place: that of the nearest counted scan.
+/// Owner of each place: the local map of the nearest key scan.
 #[derive(Clone, Debug)]
 pub struct Ownership {
     grid: Grid2,
@@ -76,11 +77,11 @@ pub struct Ownership {
 }
 
 impl Ownership {
-    /// Over all places within `reach_m` of a counted scan.
-    pub fn new(frames: &[Frame], plans: &[LocalMapPlan], reach_m: f64) -> Self {
-        let positions: Vec<Point2<f64>> = frames
+    /// Covers all places within `reach_m` of a key scan; `poses` are `map_from_lidar` of the key scans.
+    pub fn new(poses: &[Pose3], plans: &[LocalMapPlan], reach_m: f64) -> Self {
+        let positions: Vec<Point2<f64>> = poses
             .iter()
-            .map(|frame| frame.map_from_lidar.translation.vector.xy().into())
+            .map(|pose| pose.translation.vector.xy().into())
             .collect();
         let corner = |pick: fn(f64, f64) -> f64, start: f64, margin_m: f64| {
             let along =
@@ -92,18 +93,18 @@ impl Ownership {
             corner(f64::max, f64::NEG_INFINITY, reach_m),
             OWNER_CELL_M,
         );
-        let mut owner_of_frame = vec![0; frames.len()];
+        let mut owner_of_scan = vec![0; poses.len()];
         for plan in plans {
-            owner_of_frame[plan.own.clone()].fill(plan.number as u32);
+            owner_of_scan[plan.own.clone()].fill(plan.number as u32);
         }
         let owners = nearest_positions(&grid, &positions)
             .into_iter()
-            .map(|frame| owner_of_frame[frame])
+            .map(|scan| owner_of_scan[scan])
             .collect();
         Self { grid, owners }
     }
 
-    /// The cells in which ownership is decided.
+    /// The grid in whose cells ownership is decided.
     pub fn grid(&self) -> &Grid2 {
         &self.grid
     }
@@ -157,34 +158,25 @@ fn nearest_positions(grid: &Grid2, positions: &[Point2<f64>]) -> Vec<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::Pose3;
 
-    fn drive(positions_m: impl IntoIterator<Item = f64>) -> Vec<Frame> {
-        positions_m
-            .into_iter()
-            .enumerate()
-            .map(|(number, x)| Frame {
-                number,
-                scan_path: String::new().into(),
-                time_s: 0.0,
-                map_from_lidar: Pose3::translation(x, 0.0, 0.0),
-                sweep: None,
-            })
+    fn drive(positions_m: impl IntoIterator<Item = f64>) -> Vec<Pose3> {
+        (positions_m.into_iter())
+            .map(|x| Pose3::translation(x, 0.0, 0.0))
             .collect()
     }
 
     #[test]
-    fn a_standing_car_adds_one_scan_and_a_creeping_one_some() {
+    fn a_standing_car_has_one_key_scan_and_a_slow_one_a_key_scan_per_displacement() {
         let standing = drive([0.0; 50]);
-        assert_eq!(counted_frames(&standing, 0.2).len(), 1);
+        assert_eq!(key_scans(&standing, 0.2).len(), 1);
         let creeping = drive((0..50).map(|i| 0.05 * f64::from(i)));
-        assert_eq!(counted_frames(&creeping, 0.199).len(), 13);
+        assert_eq!(key_scans(&creeping, 0.199).len(), 13);
     }
 
     #[test]
-    fn every_counted_scan_is_in_exactly_one_local_map() {
-        let frames = drive((0..23).map(f64::from));
-        let plans = local_maps(&frames, 10, 2.0);
+    fn every_key_scan_is_in_exactly_one_local_map() {
+        let poses = drive((0..23).map(f64::from));
+        let plans = local_maps(&poses, 10, 2.0);
         let owned: Vec<usize> = plans.iter().flat_map(|plan| plan.own.clone()).collect();
         assert_eq!(owned, (0..23).collect::<Vec<_>>());
         assert_eq!(plans[1].used, 8..22);
@@ -193,9 +185,9 @@ mod tests {
 
     #[test]
     fn a_place_belongs_to_the_local_map_of_the_nearest_scan() {
-        let frames = drive((0..20).map(f64::from));
-        let plans = local_maps(&frames, 10, 2.0);
-        let ownership = Ownership::new(&frames, &plans, 30.0);
+        let poses = drive((0..20).map(f64::from));
+        let plans = local_maps(&poses, 10, 2.0);
+        let ownership = Ownership::new(&poses, &plans, 30.0);
         let owner_at = |x: f64, y: f64| {
             let (column, row) = ownership.grid().cell_at(x, y)?;
             ownership.owner_of(column as isize, row as isize)

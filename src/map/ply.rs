@@ -1,11 +1,12 @@
-//! Meshes as PLY files: binary, vertex x y z, nx ny nz, red green blue, triangles.
+//! PLY files of meshes and points.
 //!
-//! Reads what range-mcl, Open3D, MeshLab and CloudCompare write (float or double, ascii or
-//! binary, `vertex_indices` or `vertex_index`, polygons are cut into fans); a file is
-//! checked against its own header before anything is allocated for it.
+//! Meshes are written as binary little-endian with vertex x y z, nx ny nz, red green blue and
+//! triangles. Files of range-mcl, Open3D, MeshLab and CloudCompare are read (float or double, ASCII or
+//! binary, `vertex_indices` or `vertex_index`, polygons are triangulated); the counts of the header
+//! are checked against the size of the file before anything is allocated.
 
 use std::fs::File;
-use std::io::{BufReader, BufWriter, Write};
+use std::io::{BufReader, Write};
 use std::path::{Path, PathBuf};
 
 use glam::Vec3;
@@ -16,11 +17,13 @@ use ply_rs::ply::{
 };
 use ply_rs::writer::Writer;
 
+use super::mapping_path::{BadPathComment, MappingPath};
+use crate::files::write_atomically;
 use crate::geometry::TriangleMesh;
 
-/// What can be wrong with a PLY file.
+/// Why a PLY file cannot be read or written.
 #[derive(Debug, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages say it")]
+#[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum PlyError {
     #[error("cannot read {}: {source}", path.display())]
     Read {
@@ -31,6 +34,11 @@ pub enum PlyError {
     Malformed {
         path: PathBuf,
         source: ply_rs::parser::ParseError,
+    },
+    #[error("{}: {source}", path.display())]
+    Path {
+        path: PathBuf,
+        source: BadPathComment,
     },
     #[error("cannot write {}: {source}", path.display())]
     Write {
@@ -72,19 +80,33 @@ pub enum PlyError {
 /// The circumference of the Earth [m]: no coordinate of a map is larger.
 const FARTHEST_M: f32 = 4.0e7;
 
-/// Writes a mesh as binary little-endian PLY. Missing normals are computed, missing colours grey.
+/// Writes a mesh. Missing normals are computed, missing colours are grey.
+///
+/// The file is written under a temporary name in the same folder and renamed.
 pub fn write(path: &Path, mesh: &TriangleMesh) -> Result<(), PlyError> {
-    let write_error = |source| PlyError::Write {
+    write_with_comments(path, mesh, Vec::new())
+}
+
+/// Writes the mesh of a map with its frame and the path of the mapping drive as comments; see
+/// [`MappingPath`].
+pub fn write_map(path: &Path, mesh: &TriangleMesh, along: &MappingPath) -> Result<(), PlyError> {
+    write_with_comments(path, mesh, along.to_comments())
+}
+
+fn write_with_comments(
+    path: &Path,
+    mesh: &TriangleMesh,
+    comments: Vec<String>,
+) -> Result<(), PlyError> {
+    write_atomically(path, |out| {
+        write_to(out, mesh, comments)?;
+        out.flush()?;
+        out.get_ref().sync_all()
+    })
+    .map_err(|source| PlyError::Write {
         path: path.to_owned(),
         source,
-    };
-    let file = File::create(path).map_err(write_error)?;
-    let mut out = BufWriter::with_capacity(1 << 20, file);
-    write_to(&mut out, mesh).map_err(write_error)?;
-    let file = out
-        .into_inner()
-        .map_err(|error| write_error(error.into_error()))?;
-    file.sync_all().map_err(write_error)
+    })
 }
 
 /// Writes points as binary little-endian PLY: x y z, red green blue, and the number `confidence`,
@@ -118,8 +140,7 @@ pub fn write_points(
         bytes.extend(color);
         bytes.extend(confidence.to_le_bytes());
     }
-    let written = File::create(path).and_then(|mut file| file.write_all(&bytes));
-    written.map_err(|source| PlyError::Write {
+    write_atomically(path, |out| out.write_all(&bytes)).map_err(|source| PlyError::Write {
         path: path.to_owned(),
         source,
     })
@@ -127,6 +148,21 @@ pub fn write_points(
 
 /// Reads a mesh. Normals and colours are empty where the file has none.
 pub fn read(path: &Path) -> Result<TriangleMesh, PlyError> {
+    Ok(read_with_comments(path)?.0)
+}
+
+/// Reads the mesh of a map, and the path of its mapping drive if it is in the file.
+pub fn read_map(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), PlyError> {
+    let (mesh, comments) = read_with_comments(path)?;
+    let comments = comments.iter().map(String::as_str);
+    let along = MappingPath::from_comments(comments).map_err(|source| PlyError::Path {
+        path: path.to_owned(),
+        source,
+    })?;
+    Ok((mesh, along))
+}
+
+fn read_with_comments(path: &Path) -> Result<(TriangleMesh, Vec<String>), PlyError> {
     let read_error = |source| PlyError::Read {
         path: path.to_owned(),
         source,
@@ -205,7 +241,7 @@ pub fn read(path: &Path) -> Result<TriangleMesh, PlyError> {
             });
         }
     }
-    Ok(mesh)
+    Ok((mesh, header.comments))
 }
 
 #[derive(Debug, Default)]
@@ -330,7 +366,7 @@ impl PropertyAccess for Face {
     }
 }
 
-/// An element that means nothing to us.
+/// An element that is skipped.
 struct Skipped;
 
 impl PropertyAccess for Skipped {
@@ -339,10 +375,15 @@ impl PropertyAccess for Skipped {
     }
 }
 
-fn write_to(out: &mut impl Write, mesh: &TriangleMesh) -> std::io::Result<()> {
+fn write_to(
+    out: &mut impl Write,
+    mesh: &TriangleMesh,
+    comments: Vec<String>,
+) -> std::io::Result<()> {
     let (vertex_def, face_def) = definitions(mesh);
     let mut header = Header::new();
     header.encoding = Encoding::BinaryLittleEndian;
+    header.comments = comments;
     header.elements.add(vertex_def.clone());
     header.elements.add(face_def.clone());
     Writer::<Vertex>::new().write_header(out, &header)?;

@@ -1,31 +1,30 @@
-//! One scan made ready for mapping: oriented points with ground confidence in the map frame, and
-//! the beams that later vote on what is free space.
+//! A scan prepared for mapping: oriented points with ground confidence in the map frame, and the
+//! beams that later vote on free space.
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::{PointCloud, Rigid3f};
+use crate::geometry::{PointCloud, Pose3, Rigid3f};
 use crate::ground::GroundClassifier;
-use crate::lidar::{LidarModel, NormalConfig, RangeImage, estimate_normals};
-use crate::recording::{Frame, RecordingError};
+use crate::lidar::{LidarModel, NormalConfig, RangeImage, Scan, estimate_normals};
 use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 
-/// What of a scan goes into the map.
+/// Selection and preparation of the points of a scan.
 #[derive(Clone, Debug, PartialEq)]
-pub struct ScanSettings {
+pub struct ScanConfig {
     /// Projection and range limits.
     pub range_image: LidarModel,
-    /// How normals are found.
+    /// Normal estimation.
     pub normals: NormalConfig,
-    /// Edge of the voxels that keep one point each, in the frame of the scan [m].
+    /// Edge of the voxels for downsampling, in the lidar frame [m].
     pub voxel_size_m: f32,
-    /// Points farther than this from the sensor along x, y and z are not meshed [m].
+    /// Half extent of the crop box around the sensor along x, y and z [m].
     pub crop_m: Vec3,
-    /// The own car: points in this box of the lidar frame are dropped, [x_min, x_max, y_min, y_max] [m].
+    /// Rectangle of the own car in the lidar frame, whose points are dropped: x_min, x_max, y_min, y_max [m].
     pub own_car_m: [f32; 4],
 }
 
-impl Default for ScanSettings {
+impl Default for ScanConfig {
     /// range-mcl's, with the outline of KITTI's car.
     fn default() -> Self {
         Self {
@@ -38,7 +37,7 @@ impl Default for ScanSettings {
     }
 }
 
-impl Validate for ScanSettings {
+impl Validate for ScanConfig {
     /// With the keys of `build_map.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
         nested("range_image", &self.range_image)?;
@@ -51,22 +50,22 @@ impl Validate for ScanSettings {
     }
 }
 
-/// How many points a scan lost, and where.
+/// Number of points dropped in each step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PointCounts {
-    /// In the file.
+    /// Points of the scan.
     pub read: usize,
-    /// Not finite, out of the range limits, or on the own car.
+    /// Not finite, outside the range limits, or on the own car.
     pub invalid: usize,
     /// Outside the field of view, or behind another point of the same pixel.
     pub not_in_image: usize,
-    /// In the image, but without a good normal.
+    /// In the image, without a reliable normal.
     pub without_normal: usize,
-    /// Merged into a voxel with others.
+    /// Merged with others of the same voxel.
     pub merged: usize,
     /// Outside the crop box.
     pub cropped: usize,
-    /// Left for meshing.
+    /// Kept for meshing.
     pub kept: usize,
 }
 
@@ -83,43 +82,37 @@ impl PointCounts {
     }
 }
 
-/// A scan ready for mapping.
+/// A scan prepared for mapping.
 #[derive(Clone, Debug)]
 pub struct ScanCloud {
     /// `p_map = map_from_lidar * p_lidar`.
     pub map_from_lidar: Rigid3f,
     /// Oriented points in the map frame.
     pub cloud: PointCloud,
-    /// All valid returns, lidar frame [m]: the ends of the beams that vote on free space. The image
-    /// would not do, for of two returns in a pixel it keeps the nearer one, and so forgets the
-    /// beams that pass close by an edge.
+    /// All valid returns, lidar frame [m]: the ends of the beams that vote on free space. The range
+    /// image is not enough: of two returns in a pixel it keeps the nearer one, and loses the
+    /// beams that pass close to an edge.
     pub returns: Vec<Vec3>,
-    /// Per pixel of the range image the range up to which space is surely free [m]; 0 where unknown.
+    /// Per pixel of the range image, the range up to which space is free [m]; 0 where unknown.
     pub free_range_m: Vec<f32>,
-    /// Of the bytes that the scan was read from.
-    pub hash: blake3::Hash,
-    /// What was dropped on the way.
+    /// Number of points dropped in each step.
     pub counts: PointCounts,
 }
 
 impl ScanCloud {
-    /// Reads the scan of a frame and makes it ready.
+    /// Prepares a scan taken at `map_from_lidar`.
     pub fn prepare(
-        frame: &Frame,
-        settings: &ScanSettings,
+        mut scan: Scan,
+        map_from_lidar: &Pose3,
+        settings: &ScanConfig,
         classifier: &dyn GroundClassifier,
-    ) -> Result<Self, RecordingError> {
-        let (mut scan, hash) = frame.read_and_hash()?;
+    ) -> Self {
         let mut counts = PointCounts {
             read: scan.len(),
             ..PointCounts::default()
         };
         counts.invalid = scan.drop_invalid(&settings.range_image);
-        let [x_min, x_max, y_min, y_max] = settings.own_car_m;
-        let on_own_car = |p: Vec3| p.x > x_min && p.x < x_max && p.y > y_min && p.y < y_max;
-        let before = scan.points.len();
-        scan.points.retain(|&point| !on_own_car(point));
-        counts.invalid += before - scan.points.len();
+        counts.invalid += scan.drop_inside(settings.own_car_m);
 
         let image = RangeImage::project(&scan.points, &settings.range_image);
         let ground = classifier.ground_confidence(&scan.points);
@@ -149,21 +142,20 @@ impl ScanCloud {
         counts.cropped = merged - cloud.len();
         counts.kept = cloud.len();
 
-        let map_from_lidar = Rigid3f::from(&frame.map_from_lidar);
+        let map_from_lidar = Rigid3f::from(map_from_lidar);
         cloud.transform(&map_from_lidar);
-        Ok(Self {
+        Self {
             map_from_lidar,
             cloud,
             returns: scan.points,
             free_range_m: free_ranges(&image),
-            hash,
             counts,
-        })
+        }
     }
 }
 
-/// Per pixel the smallest range among it and its eight neighbours: nearer than that is surely
-/// free. 0 where the pixel itself saw nothing, for "nothing came back" is no proof of free space.
+/// Returns per pixel the smallest range among it and its eight neighbours: space nearer than that is
+/// free. 0 where the pixel has no return, because a missing return does not prove free space.
 pub(super) fn free_ranges(image: &RangeImage) -> Vec<f32> {
     let (width, height) = (image.model.width, image.model.height);
     let row_minimum = |row: usize, column: usize| {
@@ -198,7 +190,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn free_space_ends_at_the_nearest_of_nine_pixels_and_is_unknown_where_nothing_came_back() {
+    fn free_space_ends_at_the_nearest_of_nine_pixels_and_is_unknown_without_a_return() {
         let model = LidarModel {
             height: 4,
             width: 8,

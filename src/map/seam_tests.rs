@@ -5,30 +5,22 @@ use std::collections::HashSet;
 use glam::Vec3;
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
-use super::plan::{Ownership, counted_frames, local_maps};
+use super::plan::{Ownership, local_maps};
 use super::seam::{keep_own, on_border};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::raycasting::Scene;
-use crate::recording::Frame;
 
 const LOCAL_MAPS: usize = 4;
 
 /// Scans along an arc of 12 m, three to a local map.
 fn ownership() -> Ownership {
-    let frames: Vec<Frame> = (0..3 * LOCAL_MAPS)
+    let poses: Vec<Pose3> = (0..3 * LOCAL_MAPS)
         .map(|number| {
             let turn = number as f64 * 0.25;
-            Frame {
-                number,
-                scan_path: String::new().into(),
-                time_s: 0.0,
-                map_from_lidar: Pose3::translation(4.0 * turn.sin(), 4.0 * turn.cos(), 0.0),
-                sweep: None,
-            }
+            Pose3::translation(4.0 * turn.sin(), 4.0 * turn.cos(), 0.0)
         })
         .collect();
-    let frames = counted_frames(&frames, 0.2);
-    Ownership::new(&frames, &local_maps(&frames, 3, 1.0), 20.0)
+    Ownership::new(&poses, &local_maps(&poses, 3, 1.0), 20.0)
 }
 
 /// Bumpy ground of 16 m x 16 m with corners where chance puts them.
@@ -169,14 +161,8 @@ fn the_vertices_on_the_border_are_those_that_the_cut_made() {
 
 #[test]
 fn what_is_not_near_the_border_stays_as_it_is() {
-    let frames: Vec<Frame> = Vec::from_iter((0..1).map(|number| Frame {
-        number,
-        scan_path: String::new().into(),
-        time_s: 0.0,
-        map_from_lidar: Pose3::identity(),
-        sweep: None,
-    }));
-    let ownership = Ownership::new(&frames, &local_maps(&frames, 3, 1.0), 20.0);
+    let poses = [Pose3::identity()];
+    let ownership = Ownership::new(&poses, &local_maps(&poses, 3, 1.0), 20.0);
     let whole = bumpy(1);
     let mut own = whole.clone();
     assert_eq!(keep_own(&mut own, &ownership, 0), 0);

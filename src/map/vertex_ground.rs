@@ -61,6 +61,11 @@ pub(super) fn color(confidence: f32, threshold: f32, rest: [u8; 3], ground: [u8;
     })
 }
 
+/// Whether a colour is that of ground in a map: more red than blue.
+pub(super) fn is_ground_color([red, _, blue]: &[u8; 3]) -> bool {
+    red > blue
+}
+
 /// Which triangles are ground: those of whose corners each reaches the threshold.
 pub(super) fn ground_triangles(
     mesh: &TriangleMesh,

@@ -290,7 +290,6 @@ mod tests {
             cloud,
             returns,
             free_range_m: crate::map::scan_cloud::free_ranges(&image),
-            hash: blake3::hash(&[]),
             counts: PointCounts::default(),
         }
     }

@@ -32,12 +32,17 @@ impl CameraPoses {
         Ok(Self { world_from_cam0 })
     }
 
-    /// The lidar poses in the frame of the first one; see [`MapFrame::map_from_lidar`].
-    pub fn map_from_lidar(&self, calibration: &Calibration) -> Vec<Pose3> {
-        let frame = MapFrame {
+    /// The frame of the first lidar pose.
+    pub fn frame(&self, calibration: &Calibration) -> MapFrame {
+        MapFrame {
             calibration: *calibration,
             world_from_first_cam0: self.world_from_cam0[0],
-        };
+        }
+    }
+
+    /// The lidar poses in the frame of the first one; see [`MapFrame::map_from_lidar`].
+    pub fn map_from_lidar(&self, calibration: &Calibration) -> Vec<Pose3> {
+        let frame = self.frame(calibration);
         self.world_from_cam0
             .iter()
             .map(|pose| frame.map_from_lidar(pose))
@@ -45,24 +50,16 @@ impl CameraPoses {
     }
 }
 
-/// The frame of a map: that of the first lidar pose of the recording that it was built from.
+/// The frame of a recording: that of its first lidar pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapFrame {
-    /// The calibration of that recording.
+    /// Calibration of the recording.
     pub calibration: Calibration,
-    /// Its first camera pose.
+    /// First camera pose of the recording.
     pub world_from_first_cam0: Pose3,
 }
 
 impl MapFrame {
-    /// Reads the frame of a map from the poses and the calibration that it was built with.
-    pub fn read(pose_file: &Path, calib_file: &Path) -> Result<Self, RecordingError> {
-        Ok(Self {
-            calibration: Calibration::read(calib_file)?,
-            world_from_first_cam0: CameraPoses::read(pose_file)?.world_from_cam0[0],
-        })
-    }
-
     /// The lidar pose of a camera pose: `map_from_lidar = inv(Tr) * inv(P₀) * P * Tr`.
     pub fn map_from_lidar(&self, world_from_cam0: &Pose3) -> Pose3 {
         let cam0_from_lidar = self.calibration.cam0_from_lidar;
@@ -72,31 +69,26 @@ impl MapFrame {
             * cam0_from_lidar
     }
 
-    /// The camera pose of a lidar pose; the inverse of [`map_from_lidar`](Self::map_from_lidar).
-    pub fn world_from_cam0(&self, map_from_lidar: &Pose3) -> Pose3 {
-        let cam0_from_lidar = self.calibration.cam0_from_lidar;
-        self.world_from_first_cam0 * cam0_from_lidar * map_from_lidar * cam0_from_lidar.inverse()
-    }
-
-    /// `p_map = map_from_recording * p`, where p is a point in the frame of another recording with
-    /// camera poses in the same world.
-    pub fn map_from_recording(&self, recording: &Self) -> Pose3 {
-        let world_from_lidar =
-            recording.world_from_first_cam0 * recording.calibration.cam0_from_lidar;
-        let world_from_map = self.world_from_first_cam0 * self.calibration.cam0_from_lidar;
-        world_from_map.inverse() * world_from_lidar
+    /// Frame of these lidar poses in the world of the camera poses: `p_world = world_from_map * p_map`.
+    pub fn world_from_map(&self) -> Pose3 {
+        self.world_from_first_cam0 * self.calibration.cam0_from_lidar
     }
 }
 
-/// Writes lidar poses in the frame of a map as camera poses, in the format of `poses.txt`.
+/// Writes lidar poses as camera poses, as in `poses.txt`, in the world of `world_from_map`.
 pub fn write_kitti(
     mut writer: impl Write,
     map_from_lidar: &[Pose3],
-    frame: &MapFrame,
+    world_from_map: &Pose3,
+    calibration: &Calibration,
 ) -> io::Result<()> {
-    map_from_lidar
-        .iter()
-        .try_for_each(|pose| writeln!(writer, "{}", row_from_pose(&frame.world_from_cam0(pose))))
+    map_from_lidar.iter().try_for_each(|pose| {
+        writeln!(
+            writer,
+            "{}",
+            row_from_pose(&calibration.world_from_cam0(world_from_map, pose))
+        )
+    })
 }
 
 /// Writes `time x y z qx qy qz qw` rows of lidar poses in the map frame.
@@ -188,7 +180,7 @@ mod tests {
             world_from_first_cam0: first,
         };
         let map_from_lidar = frame.map_from_lidar(&pose);
-        let back = frame.world_from_cam0(&map_from_lidar);
+        let back = calibration.world_from_cam0(&frame.world_from_map(), &map_from_lidar);
         assert_relative_eq!(back, pose, epsilon = 1e-12);
         let origin = frame.map_from_lidar(&first);
         assert_relative_eq!(origin, Pose3::identity(), epsilon = 1e-12);
@@ -205,11 +197,11 @@ mod tests {
         };
         let first = Pose3::new(Vector3::new(5.0, 6.0, 7.0), Vector3::new(0.3, 0.2, 0.1));
         let later = Pose3::new(Vector3::new(9.0, 6.5, 7.0), Vector3::new(0.4, 0.2, 0.1));
-        let map_from_recording = frame(first).map_from_recording(&frame(later));
+        let [world_from_map, world_from_recording] =
+            [first, later].map(|pose| frame(pose).world_from_map());
+        let map_from_recording = world_from_map.inverse() * world_from_recording;
         let expected = frame(first).map_from_lidar(&later);
         assert_relative_eq!(map_from_recording, expected, epsilon = 1e-12);
-        let same = frame(first).map_from_recording(&frame(first));
-        assert_relative_eq!(same, Pose3::identity(), epsilon = 1e-12);
     }
 
     #[test]
@@ -227,7 +219,13 @@ mod tests {
             calibration,
             world_from_first_cam0: first,
         };
-        write_kitti(fs::File::create(&path).unwrap(), &poses(), &frame).unwrap();
+        write_kitti(
+            fs::File::create(&path).unwrap(),
+            &poses(),
+            &frame.world_from_map(),
+            &calibration,
+        )
+        .unwrap();
         let back = CameraPoses::read(&path)
             .unwrap()
             .map_from_lidar(&calibration);

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::calibration::Calibration;
 use super::error::RecordingError;
-use super::poses::{CameraPoses, MapFrame, read_times};
+use super::poses::{CameraPoses, read_times};
 use super::velodyne;
 use crate::geometry::{Pose3, StampedPose};
 use crate::lidar::{RotationDirection, Scan, SweepMotion, interpolate_motion};
@@ -107,8 +107,10 @@ pub struct Sequence {
     pub frames: Vec<Frame>,
     /// All lidar poses of the recording in the frame of the first.
     pub map_from_lidar: Vec<Pose3>,
-    /// The frame of all poses of this sequence, which converts them to camera poses.
-    pub frame: MapFrame,
+    /// Calibration of the recording.
+    pub calibration: Calibration,
+    /// Frame of all poses of this sequence in the world of its camera poses.
+    pub world_from_map: Pose3,
 }
 
 impl Sequence {
@@ -148,11 +150,22 @@ impl Sequence {
         Ok(Self {
             frames,
             map_from_lidar,
-            frame: MapFrame {
-                calibration,
-                world_from_first_cam0: camera_poses.world_from_cam0[0],
-            },
+            calibration,
+            world_from_map: camera_poses.frame(&calibration).world_from_map(),
         })
+    }
+
+    /// Opens a folder in the layout of KITTI: `velodyne/`, `poses.txt` and `calib.txt`.
+    pub fn open_folder(folder: &Path) -> Result<Self, RecordingError> {
+        let [scans, poses, calibration] =
+            ["velodyne", "poses.txt", "calib.txt"].map(|name| folder.join(name));
+        Self::open(&scans, &poses, &calibration, &Selection::default())
+    }
+
+    /// Reads the scans, one after the other, with their poses `map_from_lidar`.
+    pub fn scans(&self) -> impl Iterator<Item = Result<(Scan, Pose3), RecordingError>> {
+        let read = |frame: &Frame| Ok((frame.read()?, frame.map_from_lidar));
+        self.frames.iter().map(read)
     }
 
     /// The same sequence with scans deskewed by the poses of the recording: the motion of a frame
@@ -189,18 +202,17 @@ impl Sequence {
         self
     }
 
-    /// The same sequence with its poses in the frame of a map that was built from another (or the
-    /// same) recording in the same world frame.
+    /// Transforms all poses into the frame of a map in the same world.
     #[must_use]
-    pub fn in_map(mut self, map: &MapFrame) -> Self {
-        let map_from_recording = map.map_from_recording(&self.frame);
+    pub fn in_map(mut self, world_from_map: &Pose3) -> Self {
+        let map_from_recording = world_from_map.inverse() * self.world_from_map;
         for pose in &mut self.map_from_lidar {
             *pose = map_from_recording * *pose;
         }
         for frame in &mut self.frames {
             frame.map_from_lidar = map_from_recording * frame.map_from_lidar;
         }
-        self.frame = *map;
+        self.world_from_map = *world_from_map;
         self
     }
 }

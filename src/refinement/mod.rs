@@ -1,22 +1,26 @@
-//! A trajectory polished: a particle swarm over every pose, a finishing step, then smoothing.
+//! Refinement of a trajectory: a particle swarm and Gauss-Newton per frame, then smoothing.
 //!
-//! > [`refiner`] takes the estimate of a frame, lets a [`swarm`] look for a better one by the
-//! > [`objective`], and Gauss-Newton ([`registration`](crate::registration)) finishes; [`smoothing`] fits the whole trajectory to what
-//! > the frames and the odometry say.
+//! > [`TrajectoryRefiner`] takes the frames of a [`trajectory`]; [`refiner`] searches a better pose of
+//! > each with a [`swarm`] that minimizes the [`objective`], and finishes with Gauss-Newton
+//! > ([`registration`](crate::registration)); [`smoothing`] combines all frames with the odometry.
 //!
-//! No step makes an estimate worse by its own measure: what does not improve is not taken.
+//! No step makes an estimate worse by its own measure: what does not lower the cost is rejected.
 
 pub mod objective;
 pub mod refiner;
 pub mod smoothing;
 pub mod swarm;
+pub mod trajectory;
 
 pub use objective::FrameObjective;
 pub use refiner::{Method, RefinedFrame, RefinementConfig, refine_frame};
 pub use smoothing::{FramePrior, SmoothingConfig, smooth};
+pub use trajectory::{
+    FrameResult, InitialEstimate, RefinedTrajectory, RefinerConfig, RefinerError, TrajectoryRefiner,
+};
 
 #[cfg(test)]
-impl crate::rendering::test_world::TestWorld {
+impl crate::map::test_world::TestWorld {
     /// The objective of a scan from the street.
     fn objective<'a>(&'a self, beams: &'a [crate::lidar::Beam]) -> FrameObjective<'a> {
         FrameObjective {
@@ -24,7 +28,7 @@ impl crate::rendering::test_world::TestWorld {
             ground: &self.ground,
             beams,
             level_m: None,
-            stance: crate::map::Stance::default(),
+            attitude: crate::map::SensorAttitude::default(),
             difference: crate::rendering::RangeDifference::truncated(0.5),
         }
     }

@@ -1,60 +1,60 @@
-//! What refinement minimizes: the range difference between a scan and the map from a pose.
+//! Objective of the refinement: the range difference between a scan and the map at a pose.
 //!
 //! ```text
 //! f(x, y, θ) = mean over the beams of cost(measured, rendered from lift(x, y, θ))      [m]
 //! Σ ≈ s · H⁻¹        H: second differences of f;  s: the scale of exp(−f / s)
 //! ```
 //!
-//! The pose stands on the map's ground, as in localization, so that only x, y and heading are free.
+//! The pose is aligned to the ground of the map, as in localization: x, y and heading are free.
 
 use nalgebra::{Matrix3, SymmetricEigen, Vector2, Vector3};
 
 use crate::geometry::{Pose2, Pose3, Vec3};
 use crate::lidar::Beam;
-use crate::map::{GroundMap, GroundPatch, Stance};
+use crate::map::{GroundMap, GroundPatch, SensorAttitude};
 use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
 
 /// The objective of one frame.
 #[derive(Clone, Copy)]
 pub struct FrameObjective<'a> {
-    /// Shows the map.
+    /// Renders the map.
     pub renderer: &'a dyn RangeRenderer,
-    /// Carries the poses.
+    /// Ground of the map.
     pub ground: &'a GroundMap,
     /// The beams of the frame, lidar frame.
     pub beams: &'a [Beam],
-    /// About the height of the ground, which says on which of several levels the car is; `None`: on
-    /// the lowest [m].
+    /// Approximate height of the ground [m], which selects among several levels; `None` selects the
+    /// lowest.
     pub level_m: Option<f64>,
-    /// How the sensor stands over the road.
-    pub stance: Stance,
-    /// What a difference costs.
+    /// Attitude of the sensor above the ground.
+    pub attitude: SensorAttitude,
+    /// Cost of a difference.
     pub difference: RangeDifference,
 }
 
 impl FrameObjective<'_> {
-    /// Where in space a pose is; where the map has no ground there, it stands on `remembered`.
+    /// Aligns a pose to the ground; `remembered` replaces it where the map has none.
     pub fn lift(&self, pose: &Pose2, remembered: Option<&GroundPatch>) -> Option<Pose3> {
         let patch = self.ground.patch_under(pose, self.level_m);
-        Some(patch.as_ref().or(remembered)?.lift(pose, &self.stance))
+        Some(patch.as_ref().or(remembered)?.lift(pose, &self.attitude))
     }
 
-    /// The same objective with the stance with which the beams that hit the road end on the mapped
-    /// ground, seen from a pose; unchanged where too few of them do.
+    /// Returns the objective with the attitude fitted at a pose, so that the beams on the road end on the
+    /// mapped ground; unchanged where too few of them do.
     #[must_use]
-    pub fn settled(&self, pose: &Pose2) -> Self {
+    pub fn with_fitted_attitude(&self, pose: &Pose2) -> Self {
         let points: Vec<Vec3> = self.beams.iter().map(Beam::point).collect();
-        let stance = self
+        let attitude = self
             .ground
-            .stance_at(pose, self.level_m, &self.stance, &points);
+            .attitude_at(pose, self.level_m, &self.attitude, &points);
         Self {
-            stance: stance.unwrap_or(self.stance),
+            attitude: attitude.unwrap_or(self.attitude),
             ..*self
         }
     }
 
-    /// The same objective on the level of the ground on which it is least, seen from a pose: for who
-    /// does not know on which one the car is.
+    /// Returns the objective on the level of the ground where it is smallest at a pose, for an unknown
+    /// level.
     pub fn on_best_level(&self, pose: &Pose2) -> Result<Self, RenderError> {
         let place = pose.translation.vector;
         let levels = self.ground.levels_at(place.x, place.y);
@@ -65,7 +65,7 @@ impl FrameObjective<'_> {
             if levels.len() == 1 {
                 return Ok(on_level);
             }
-            let lifted = patch.lift(pose, &on_level.settled(pose).stance);
+            let lifted = patch.lift(pose, &on_level.with_fitted_attitude(pose).attitude);
             let cost_m = self.costs_in_space(&[lifted])?[0];
             if cost_m < best.0 {
                 best = (cost_m, on_level);
@@ -74,7 +74,7 @@ impl FrameObjective<'_> {
         Ok(best.1)
     }
 
-    /// The mean cost from each pose [m]; infinite where a pose has no ground to stand on.
+    /// Returns the mean cost at each pose [m]; infinite where there is no ground.
     pub fn costs(
         &self,
         poses: &[Pose2],
@@ -84,15 +84,15 @@ impl FrameObjective<'_> {
             .iter()
             .map(|pose| self.lift(pose, remembered))
             .collect();
-        let standing: Vec<Pose3> = lifted.iter().flatten().copied().collect();
-        let mut costs = self.costs_in_space(&standing)?.into_iter();
+        let on_ground: Vec<Pose3> = lifted.iter().flatten().copied().collect();
+        let mut costs = self.costs_in_space(&on_ground)?.into_iter();
         Ok(lifted
             .iter()
             .map(|pose| pose.and_then(|_| costs.next()).unwrap_or(f64::INFINITY))
             .collect())
     }
 
-    /// The mean cost from poses in space [m].
+    /// Returns the mean cost at poses in space [m].
     pub fn costs_in_space(&self, map_from_lidar: &[Pose3]) -> Result<Vec<f64>, RenderError> {
         let costs = self
             .renderer
@@ -100,19 +100,19 @@ impl FrameObjective<'_> {
         Ok(costs.into_iter().map(f64::from).collect())
     }
 
-    /// How well the frame alone knows its pose: covariance of (x, y, heading) in the axes of the
-    /// map [m², m·rad, rad²], from the curvature of the objective around a minimum. `scale_m` is
-    /// the cost that makes a pose e times less likely.
+    /// Returns the covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²] from the
+    /// curvature of the objective around a minimum. `scale_m` is the increase of the cost that makes a
+    /// pose e times less likely.
     ///
-    /// A direction in which the objective is flat has a standard deviation of `MAX_SIGMA`, and so has
-    /// every direction where some pose around has no ground to stand on.
+    /// Directions in which the objective is flat get a standard deviation of `MAX_SIGMA` steps, and all
+    /// directions do where a pose of the stencil has no ground.
     pub fn covariance(
         &self,
         pose: &Pose2,
         remembered: Option<&GroundPatch>,
         scale_m: f64,
     ) -> Result<Matrix3<f64>, RenderError> {
-        /// Of a direction of which the frame knows nothing, in steps.
+        /// Standard deviation of an undetermined direction, in steps.
         const MAX_SIGMA: f64 = 10.0;
         let offsets = stencil();
         let poses: Vec<Pose2> = offsets.iter().map(|offset| shifted(pose, offset)).collect();
@@ -180,7 +180,7 @@ mod tests {
     use approx::assert_relative_eq;
 
     use super::*;
-    use crate::rendering::test_world::TestWorld;
+    use crate::map::test_world::TestWorld;
 
     #[test]
     fn second_differences_of_a_quadratic_are_its_matrix() {

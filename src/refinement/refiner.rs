@@ -1,7 +1,6 @@
-//! One frame refined: the swarm searches around the estimate, Gauss-Newton finishes.
+//! Refinement of one frame: the swarm searches around the estimate, Gauss-Newton finishes.
 //!
-//! Each is optional, each is taken only where it lowers the objective. Frames before convergence
-//! are not for this: their estimate is no estimate yet.
+//! Each is optional, and the result of each is accepted only if it lowers the objective.
 
 use nalgebra::Matrix3;
 use rand::Rng;
@@ -12,20 +11,20 @@ use super::smoothing::SmoothingConfig;
 use super::swarm::{Dimension, SwarmConfig, minimize};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::Beam;
-use crate::map::Stance;
+use crate::map::SensorAttitude;
 use crate::registration::{RegistrationConfig, RegistrationResult, register};
 use crate::rendering::RenderError;
 use crate::validation::{
     InvalidValue, Validate, at_least_one, nested, not_negative, positive, require,
 };
 
-/// Which steps polish a frame.
+/// Steps of the refinement of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Method {
-    /// The estimate stays as it is.
+    /// No step; the estimate is kept.
     None,
-    /// The swarm.
+    /// The particle swarm.
     Swarm,
     /// Gauss-Newton.
     GaussNewton,
@@ -33,37 +32,37 @@ pub enum Method {
     Both,
 }
 
-/// Everything that can be set about refinement.
+/// Configuration of the refinement of a frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RefinementConfig {
-    /// Which steps polish a frame.
+    /// Steps of the refinement of a frame.
     pub method: Method,
     /// The swarm.
     pub swarm: SwarmConfig,
-    /// Beams that the swarm compares, of those of the frame: it looks for the right place, the
-    /// finishing step for the last centimetres.
+    /// Number of the frame's beams that the swarm compares: it searches the basin, Gauss-Newton the
+    /// last centimetres.
     pub swarm_beams: usize,
-    /// The finishing step.
+    /// Gauss-Newton.
     pub gauss_newton: RegistrationConfig,
     /// The smoothing of the whole trajectory.
     pub smoothing: SmoothingConfig,
-    /// The swarm searches this many standard deviations around the estimate (unitless).
+    /// Reach of the swarm in standard deviations of the estimate (unitless).
     pub reach_sigmas: f64,
-    /// And at least this far in x and y [m].
+    /// Smallest reach in x and y [m].
     pub min_reach_m: f64,
-    /// And at least this far in heading [rad].
+    /// Smallest reach in heading [rad].
     pub min_reach_rad: f64,
-    /// And at most this far in x and y [m].
+    /// Largest reach in x and y [m].
     pub max_reach_m: f64,
-    /// And at most this far in heading [rad].
+    /// Largest reach in heading [rad].
     pub max_reach_rad: f64,
-    /// A mean cost that is larger by this makes a pose e times less likely: for covariances [m].
+    /// Increase of the mean cost that makes a pose e times less likely, for covariances [m].
     pub scale_m: f64,
 }
 
 impl Default for RefinementConfig {
-    /// Both steps; the bounds are ours.
+    /// Both steps; the bounds are of this project.
     fn default() -> Self {
         Self {
             method: Method::Both,
@@ -118,24 +117,24 @@ pub struct RefinedFrame {
     /// `map_from_lidar` seen from above.
     pub pose: Pose2,
     /// `map_from_lidar` in space.
-    pub lifted: Pose3,
+    pub map_from_lidar: Pose3,
     /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
-    /// How the sensor stands over the mapped ground.
-    pub stance: Stance,
+    /// Attitude of the sensor above the mapped ground.
+    pub attitude: SensorAttitude,
     /// Height of that ground [m].
     pub level_m: Option<f64>,
     /// Objective at the estimate [m].
     pub cost_before_m: f64,
-    /// Objective at the result, never larger [m].
+    /// Objective at the result, never larger than before [m].
     pub cost_after_m: f64,
-    /// Rays that were cast.
+    /// Number of rays cast.
     pub rays: usize,
 }
 
-/// Refines an estimate with its covariance of (x, y, heading). The stance of the objective is only
-/// where it starts: the sensor is settled onto the mapped ground first. `None` where there is no ground
-/// under the estimate or the scan has no beams: then nothing is known that could be better.
+/// Refines an estimate with its covariance of (x, y, heading). The attitude of the objective is an
+/// initial value, which is first fitted to the mapped ground. `None` where there is no ground under the
+/// estimate or the scan has no beams.
 pub fn refine_frame(
     objective: &FrameObjective<'_>,
     estimate: &Pose2,
@@ -143,7 +142,7 @@ pub fn refine_frame(
     config: &RefinementConfig,
     rng: &mut impl Rng,
 ) -> Result<Option<RefinedFrame>, RenderError> {
-    let objective = &objective.settled(estimate);
+    let objective = &objective.with_fitted_attitude(estimate);
     let Some(lifted) = objective
         .lift(estimate, None)
         .filter(|_| !objective.beams.is_empty())
@@ -153,9 +152,9 @@ pub fn refine_frame(
     let cost_before_m = objective.costs_in_space(&[lifted])?[0];
     let mut frame = RefinedFrame {
         pose: *estimate,
-        lifted,
+        map_from_lidar: lifted,
         covariance: *covariance,
-        stance: objective.stance,
+        attitude: objective.attitude,
         level_m: objective.level_m,
         cost_before_m,
         cost_after_m: cost_before_m,
@@ -165,12 +164,12 @@ pub fn refine_frame(
         search(objective, &mut frame, config, rng)?;
     }
     let finished = match config.method {
-        Method::GaussNewton | Method::Both => polish(objective, &mut frame, config)?,
+        Method::GaussNewton | Method::Both => finish(objective, &mut frame, config)?,
         Method::None | Method::Swarm => None,
     };
     let patch = objective.ground.patch_under(&frame.pose, objective.level_m);
     if let Some(patch) = &patch {
-        frame.stance = patch.stance_of(&frame.lifted);
+        frame.attitude = patch.attitude_of(&frame.map_from_lidar);
         frame.level_m = Some(patch.height_m);
     }
     if config.method != Method::None {
@@ -182,7 +181,7 @@ pub fn refine_frame(
     Ok(Some(frame))
 }
 
-/// Lets the swarm look for a better pose.
+/// Searches a better pose with the swarm.
 fn search(
     objective: &FrameObjective<'_>,
     frame: &mut RefinedFrame,
@@ -210,13 +209,13 @@ fn search(
     let cost_m = objective.costs_in_space(&[lifted])?[0];
     if cost_m < frame.cost_after_m {
         frame.pose = pose;
-        frame.lifted = lifted;
+        frame.map_from_lidar = lifted;
         frame.cost_after_m = cost_m;
     }
     Ok(())
 }
 
-/// x, y and heading around the estimate, as wide as it is uncertain.
+/// Search space of x, y and heading around the estimate, as large as its uncertainty.
 fn search_space(
     pose: &Pose2,
     covariance: &Matrix3<f64>,
@@ -248,8 +247,8 @@ fn pose_of(position: &[f64]) -> Pose2 {
     )
 }
 
-/// Lets Gauss-Newton finish; what it did where that lowered the objective.
-fn polish(
+/// Runs Gauss-Newton; `None` where it did not lower the objective.
+fn finish(
     objective: &FrameObjective<'_>,
     frame: &mut RefinedFrame,
     config: &RefinementConfig,
@@ -257,19 +256,19 @@ fn polish(
     let found = register(
         objective.renderer,
         objective.beams,
-        &frame.lifted,
+        &frame.map_from_lidar,
         &config.gauss_newton,
     )?;
     let Some(registered) = found else {
         return Ok(None);
     };
-    // One more to see whether it is better.
+    // One more to evaluate the result.
     frame.rays += (registered.iterations + 1) * objective.beams.len();
     let cost_m = objective.costs_in_space(&[registered.map_from_lidar])?[0];
     if cost_m > frame.cost_after_m {
         return Ok(None);
     }
-    frame.lifted = registered.map_from_lidar;
+    frame.map_from_lidar = registered.map_from_lidar;
     frame.pose = pose2_from_pose3(&registered.map_from_lidar);
     frame.cost_after_m = cost_m;
     Ok(Some(registered))
@@ -281,7 +280,7 @@ mod tests {
     use rand::{SeedableRng, rngs::StdRng};
 
     use super::*;
-    use crate::rendering::test_world::TestWorld;
+    use crate::map::test_world::TestWorld;
 
     fn refine(method: Method, off: &Pose2, seed: u64) -> (RefinedFrame, Pose2) {
         let world = TestWorld::street();
@@ -303,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn every_method_comes_nearer_and_none_stays() {
+    fn every_method_approaches_the_truth_and_none_keeps_the_estimate() {
         let off = Pose2::new(Vector2::new(0.08, -0.06), 0.006);
         for (method, tolerance_m) in [
             (Method::Swarm, 0.02),
@@ -327,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn an_estimate_that_is_right_gets_no_worse() {
+    fn a_correct_estimate_stays_correct() {
         for seed in 0..3 {
             let (frame, truth) = refine(Method::Both, &Pose2::identity(), seed);
             assert!(frame.cost_after_m <= frame.cost_before_m);

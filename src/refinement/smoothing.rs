@@ -1,14 +1,13 @@
-//! The whole trajectory as one least-squares problem: every frame near where its scan says it is,
-//! neighbours as far apart as the odometry says.
+//! Smoothing of a trajectory: least squares over the measured poses of all frames and the odometry
+//! between neighbours.
 //!
 //! ```text
 //! min  Σ ρ(‖xᵢ ⊖ pᵢ‖²_Rᵢ) + Σ ‖zᵢ⁻¹ (xᵢ⁻¹ xᵢ₊₁)‖²_Qᵢ        ρ(s) = c² ln(1 + s/c²)
 //! ```
 //!
-//! pᵢ, Rᵢ: pose and covariance of a frame; zᵢ, Qᵢ: odometry between neighbours. The odometry
-//! turns where the car turned, so that corners stay corners. The normal equations are block
-//! tridiagonal: a step costs one pass forth and one back, and so do the diagonal blocks of their
-//! inverse, the covariances of the smoothed poses (Rauch, Tung and Striebel, 1965). Grisetti et al., *A Tutorial on
+//! pᵢ, Rᵢ: measured pose and covariance of a frame; zᵢ, Qᵢ: odometry between neighbours. The normal
+//! equations are block tridiagonal: a step costs one forward and one backward pass, and so do the
+//! diagonal blocks of their inverse, the covariances of the smoothed poses (Rauch, Tung and Striebel, 1965). Grisetti et al., *A Tutorial on
 //! Graph-Based SLAM* (2010), with the robust kernel of Cauchy.
 
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
@@ -17,19 +16,19 @@ use serde::{Deserialize, Serialize};
 use crate::geometry::{Pose2, wrap_angle};
 use crate::validation::{InvalidValue, Validate, at_least_one, positive};
 
-/// How much the odometry and the frames are trusted.
+/// Noise of the odometry and robustness against wrong frames.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SmoothingConfig {
     /// Standard deviation of the odometry along the car, per frame [m].
     pub odometry_ahead_m: f64,
-    /// Across the car, per frame [m].
+    /// Standard deviation across the car, per frame [m].
     pub odometry_aside_m: f64,
-    /// In heading, per frame [rad].
+    /// Standard deviation of the heading, per frame [rad].
     pub odometry_turn_rad: f64,
-    /// Scale c of the robust kernel in standard deviations: frames farther off count less and less.
+    /// Scale c of the robust kernel (standard deviations).
     pub robust_sigmas: f64,
-    /// Iterations, at most.
+    /// Largest number of iterations.
     pub iterations: usize,
 }
 
@@ -56,7 +55,7 @@ impl Validate for SmoothingConfig {
     }
 }
 
-/// What a frame says about its own pose.
+/// Measured pose of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FramePrior {
     /// `map_from_lidar`.
@@ -65,11 +64,11 @@ pub struct FramePrior {
     pub covariance: Matrix3<f64>,
 }
 
-/// The trajectory that agrees best with frames and odometry.
+/// Returns the trajectory that agrees best with the measured poses and the odometry.
 ///
-/// `start[i]` is where the search begins, `priors[i]` what frame i says (`None`: nothing, such as
-/// before convergence), `increments[i]` the odometry `previous_from_current` into frame i (that of
-/// frame 0 is not read). All are of one length. The result never fits worse than the start.
+/// `start` are initial poses, `priors[i]` the measured pose of frame i (`None` where it has none),
+/// `increments[i]` the odometry `previous_from_current` into frame i (that of frame 0 is not read).
+/// All have the same length. The result never fits worse than the start.
 pub fn smooth(
     start: &[Pose2],
     priors: &[Option<FramePrior>],
@@ -105,12 +104,12 @@ pub fn smooth(
     poses
 }
 
-/// Covariances of (x, y, heading) in the axes of the map [m², m·rad, rad²] of the poses of a smoothed
-/// trajectory, each with all others unknown (marginal); `None` where they are not determined, because
-/// no frame says anything. The arguments are those of [`smooth`], of which `smoothed` is the result.
+/// Returns the marginal covariances of (x, y, heading) in the axes of the map [m², m·rad, rad²] of a
+/// smoothed trajectory; `None` where no frame has a measured pose. The arguments are those of
+/// [`smooth`], of which `smoothed` is the result.
 ///
-/// They take the frames' errors for independent: what all frames have in common, as an error of the
-/// map, is not in them.
+/// The errors of frames are assumed independent: what all frames have in common, such as an error of
+/// the map, is not included.
 pub fn covariances(
     smoothed: &[Pose2],
     priors: &[Option<FramePrior>],

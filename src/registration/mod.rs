@@ -264,15 +264,15 @@ mod tests {
 
     use super::*;
     use crate::geometry::Pose2;
-    use crate::map::Stance;
-    use crate::rendering::test_world::TestWorld;
+    use crate::map::SensorAttitude;
+    use crate::map::test_world::TestWorld;
 
     fn beams(world: &TestWorld, truth: &Pose2) -> Vec<Beam> {
         world.scan(truth).beams().step_by(3).collect()
     }
 
     fn lift(world: &TestWorld, pose: &Pose2) -> Pose3 {
-        world.ground.lift(pose, &Stance::default()).unwrap()
+        world.ground.lift(pose, &SensorAttitude::default()).unwrap()
     }
 
     fn perfect_map_config() -> RegistrationConfig {

@@ -14,8 +14,6 @@ pub use backend::Backend;
 pub use batched::Batched;
 pub use cpu::CpuRenderer;
 pub use selection::renderer;
-#[cfg(test)]
-pub(crate) mod test_world;
 
 use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::{Beam, LidarModel};

@@ -47,7 +47,7 @@ pub fn read_increments(
 fn recorded(file: &Path, sequence: &Sequence) -> Result<Vec<Pose3>> {
     let context = || format!("odometry_file is {}", file.display());
     match CameraPoses::read(file) {
-        Ok(poses) => Ok(poses.map_from_lidar(&sequence.frame.calibration)),
+        Ok(poses) => Ok(poses.map_from_lidar(&sequence.calibration)),
         Err(RecordingError::WrongCount { found: 8, .. }) => {
             let trajectory = read_tum(file).with_context(context)?;
             Ok(trajectory

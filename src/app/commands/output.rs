@@ -7,7 +7,7 @@ use std::path::Path;
 use anyhow::{Context as _, bail};
 use serde::Serialize;
 
-use crate::app::output::{temporary_beside, write_atomically};
+use crate::files::{temporary_beside, write_atomically};
 
 /// Checks before any work that `path` can be written: an existing file needs `--force`, and its
 /// folder is created and must accept new files. `key` is the configuration key of the file.

@@ -21,7 +21,7 @@ use crate::evaluation::{
 use crate::geometry::{Pose2, Pose3, StampedPose, Trajectory, TriangleMesh};
 use crate::lidar::RangeImage;
 use crate::localization::likelihood::{Direction, width_at_half};
-use crate::localization::{FrameEstimate, ParticleSet};
+use crate::localization::{Estimate, ParticleSet};
 use crate::recording::Sequence;
 use crate::recording::poses::{write_kitti, write_tum};
 
@@ -136,7 +136,12 @@ pub fn write_trajectory(
         write_tum(file, &trajectory)
     })?;
     output::write_file(&files.file(&format!("{name}_kitti.txt")), |file| {
-        write_kitti(file, map_from_lidar, &sequence.frame)
+        write_kitti(
+            file,
+            map_from_lidar,
+            &sequence.world_from_map,
+            &sequence.calibration,
+        )
     })
 }
 
@@ -390,8 +395,8 @@ impl Movie {
     }
 
     /// Draws the last frame of the results.
-    pub fn add(&mut self, results: &LocalizationResults, estimate: &FrameEstimate) -> Result<()> {
-        /// Width of the window around the estimate [m].
+    pub fn add(&mut self, results: &LocalizationResults, estimate: &Estimate) -> Result<()> {
+        /// Width of what is shown around the estimate [m].
         const WINDOW_M: f64 = 80.0;
         let Some(&number) = results.frames.last() else {
             return Ok(());

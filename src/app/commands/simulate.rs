@@ -211,7 +211,13 @@ fn folder_state(config: &SimulationConfig, simulation: &Simulation) -> Result<Fo
 /// Contents of `poses.txt`.
 fn poses_text(simulation: &Simulation) -> Result<Vec<u8>> {
     let mut text = Vec::new();
-    write_kitti(&mut text, &simulation.poses(), &map_frame())?;
+    let frame = map_frame();
+    write_kitti(
+        &mut text,
+        &simulation.poses(),
+        &frame.world_from_map(),
+        &frame.calibration,
+    )?;
     Ok(text)
 }
 
@@ -312,12 +318,13 @@ fn write_tables(simulation: &Simulation, folder: &Path) -> Result<()> {
     write_file(&folder.join("times.txt"), |file| {
         write_times(file, &times_s)
     })?;
+    let frame = map_frame();
     for (name, poses) in [
         ("odometry.txt", simulation.odometry()),
         ("poses.txt", simulation.poses()),
     ] {
         write_file(&folder.join(name), |file| {
-            write_kitti(file, &poses, &map_frame())
+            write_kitti(file, &poses, &frame.world_from_map(), &frame.calibration)
         })?;
     }
     Ok(())

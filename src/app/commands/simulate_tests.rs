@@ -227,8 +227,9 @@ fn drives_are_read_back_in_the_documented_frames() {
         let expected = truth[0].inverse() * pose;
         assert_relative_eq!(frame.map_from_lidar, expected, epsilon = 1e-6);
     }
+    let frame = map.2.frame(&sequence.calibration);
     for (pose, world_from_cam0) in query.0.iter().zip(&query.2.world_from_cam0) {
-        let in_map = sequence.frame.map_from_lidar(world_from_cam0);
+        let in_map = frame.map_from_lidar(world_from_cam0);
         assert_relative_eq!(in_map, truth[0].inverse() * pose, epsilon = 1e-6);
     }
     let labels = velodyne::read_labels(&query.3.join("labels/000003.label")).unwrap();

@@ -8,13 +8,13 @@ use serde::{Deserialize, Serialize};
 use super::check::{ground, path};
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::lidar::{LidarModel, NormalConfig, RotationDirection};
-use crate::map::LocalMapSettings;
 use crate::map::confidence::ConfidenceConfig;
-use crate::map::scan_cloud::ScanSettings;
+use crate::map::scan_cloud::ScanConfig;
 use crate::map::visibility::VisibilityConfig;
+use crate::map::{LocalMapConfig, MapConfig};
 use crate::meshing::PoissonConfig;
 use crate::recording::Selection;
-use crate::validation::{InvalidValue, Validate, at_least_one, in_range, not_negative, require};
+use crate::validation::{InvalidValue, Validate, in_range, require};
 
 /// Configuration of `build-map`: the keys of range-mcl's `build_map.yml`, then new ones.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -108,7 +108,7 @@ pub struct BuildMapConfig {
 impl Default for BuildMapConfig {
     /// The values of range-mcl.
     fn default() -> Self {
-        let settings = LocalMapSettings::default();
+        let settings = LocalMapConfig::default();
         Self {
             scan_folder: "data/kitti/velodyne".into(),
             pose_file: "data/kitti/poses.txt".into(),
@@ -164,10 +164,21 @@ impl BuildMapConfig {
         }
     }
 
-    /// Settings of the local maps.
-    pub fn local_map_settings(&self) -> LocalMapSettings {
-        LocalMapSettings {
-            scan: ScanSettings {
+    /// The build of the map.
+    pub fn map(&self) -> MapConfig {
+        MapConfig {
+            displacement_threshold_m: self.displacement_threshold_m,
+            local_map_size: self.local_map_size,
+            overlap_m: self.overlap_m,
+            ground: self.ground(),
+            local_map: self.local_map(),
+        }
+    }
+
+    /// How scans become local maps.
+    fn local_map(&self) -> LocalMapConfig {
+        LocalMapConfig {
+            scan: ScanConfig {
                 range_image: self.range_image,
                 normals: self.normals,
                 voxel_size_m: self.voxel_size as f32,
@@ -217,12 +228,9 @@ impl Validate for BuildMapConfig {
         path("calib_file", &self.calib_file)?;
         path("mesh_file", &self.mesh_file)?;
         self.selection().validate()?;
-        at_least_one("local_map_size", self.local_map_size)?;
         in_range("depth", self.depth, PoissonConfig::DEPTHS)?;
         color("ground_color", self.ground_color)?;
         color("rest_color", self.rest_color)?;
-        not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
-        not_negative("overlap_m", self.overlap_m)?;
         require(
             self.holdout_step != 1,
             "holdout_step",
@@ -230,7 +238,7 @@ impl Validate for BuildMapConfig {
             "1 would exclude every scan; 0 excludes none, 10 every tenth",
         )?;
         ground(&self.ground())?;
-        self.local_map_settings().validate()
+        self.map().validate()
     }
 }
 

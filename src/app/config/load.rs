@@ -10,7 +10,7 @@ use serde::de::DeserializeOwned;
 use super::error::{self, ConfigError};
 use super::template::CommandConfig;
 use super::yaml::{self, keys, to_yaml};
-use crate::app::output::write_atomically;
+use crate::files::write_atomically;
 use crate::validation::Validate;
 
 /// Loads and validates the configuration of a command from `path`, else from its default path

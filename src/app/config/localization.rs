@@ -8,19 +8,19 @@ use super::check::{ground, optional_path, path};
 use super::odometry::OdometrySource;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::lidar::{LidarModel, RotationDirection};
-use crate::localization::LocalizerConfig;
+use crate::localization::config::TemperingConfig;
 use crate::localization::convergence::ConvergenceConfig;
 use crate::localization::initialization::StartSpread;
 use crate::localization::motion::{OdometryNoise, VelocityNoise};
 use crate::localization::observation::ObservationConfig;
-use crate::localization::panorama::PanoramaConfig;
 use crate::localization::proposal::ProposalConfig;
 use crate::localization::resampling::{KldConfig, ResamplingConfig};
-use crate::localization::settings::TemperingConfig;
-use crate::localization::vigilance::VigilanceConfig;
-use crate::map::scan_cloud::ScanSettings;
+use crate::localization::tracking_loss::TrackingLossConfig;
+use crate::localization::{LocalizerConfig, SensorConfig};
+use crate::map::PanoramaConfig;
+use crate::map::scan_cloud::ScanConfig;
 use crate::recording::Selection;
-use crate::refinement::RefinementConfig;
+use crate::refinement::{RefinementConfig, RefinerConfig};
 use crate::validation::{
     InvalidValue, Validate, at_least_one, nested, not_negative, positive, rectangle,
 };
@@ -122,7 +122,7 @@ pub struct LocalizationConfig {
     /// Adaptive number of particles.
     pub kld: KldConfig,
     /// Detection of tracking loss.
-    pub vigilance: VigilanceConfig,
+    pub vigilance: TrackingLossConfig,
     /// Search for the start with panoramas.
     pub panorama: PanoramaConfig,
     /// Direction of rotation of the sensor for motion compensation; `None` for scans that are
@@ -214,7 +214,7 @@ impl Default for LocalizationConfig {
             odometry: OdometrySource::default(),
             odometry_file: None,
             motion_model: MotionModel::default(),
-            own_car_m: ScanSettings::default().own_car_m,
+            own_car_m: ScanConfig::default().own_car_m,
             sensor_height_m: None,
             ground_method: GroundMethod::default(),
             distance_threshold: ransac.distance_threshold,
@@ -234,7 +234,7 @@ impl Default for LocalizationConfig {
             proposal: localizer.proposal,
             resampling: localizer.resampling,
             kld: localizer.kld,
-            vigilance: localizer.vigilance,
+            vigilance: localizer.tracking_loss,
             panorama: PanoramaConfig::default(),
             motion_compensation: None,
             refine: false,
@@ -299,12 +299,33 @@ impl LocalizationConfig {
                 converge_thres: self.converge_thres,
                 ..self.convergence.clone()
             },
-            vigilance: self.vigilance.clone(),
+            tracking_loss: self.vigilance.clone(),
+            sensor: self.sensor(),
+            panorama: self.panorama_config(),
+        }
+    }
+
+    /// The sensor and the preparation of its scans.
+    pub fn sensor(&self) -> SensorConfig {
+        SensorConfig {
+            lidar: self.range_image.model(),
+            own_car_m: self.own_car_m,
+            ground: self.ground(),
+            height_m: self.sensor_height_m,
+        }
+    }
+
+    /// The refinement of every frame, where `refine` is set.
+    pub fn refiner(&self) -> RefinerConfig {
+        RefinerConfig {
+            sensor: self.sensor(),
+            observation: self.observation.clone(),
+            refinement: self.refinement.clone(),
         }
     }
 
     /// Configuration of the search for the start, with `grid_res` and `yaw_sigma`.
-    pub fn panorama_config(&self) -> PanoramaConfig {
+    fn panorama_config(&self) -> PanoramaConfig {
         PanoramaConfig {
             cell_m: self.grid_res,
             yaw_sigma_rad: self.yaw_sigma.to_radians(),

@@ -9,9 +9,10 @@ use super::localization::LocalizationConfig;
 use super::odometry::OdometrySource;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::lidar::{LidarModel, RotationDirection};
+use crate::localization::SensorConfig;
 use crate::localization::observation::ObservationConfig;
 use crate::recording::Selection;
-use crate::refinement;
+use crate::refinement::{self, RefinerConfig};
 use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 
 /// Configuration of `refine`.
@@ -131,6 +132,20 @@ impl RefinementConfig {
                 num_iterations: self.num_iterations,
                 seed: self.seed,
             },
+        }
+    }
+
+    /// The refiner.
+    pub fn refiner(&self) -> RefinerConfig {
+        RefinerConfig {
+            sensor: SensorConfig {
+                lidar: self.range_image,
+                own_car_m: self.own_car_m,
+                ground: self.ground(),
+                height_m: self.sensor_height_m,
+            },
+            observation: self.observation.clone(),
+            refinement: self.refinement.clone(),
         }
     }
 }

@@ -7,7 +7,7 @@ use anyhow::{Context as _, Result, ensure};
 use rayon::prelude::*;
 
 use super::bitmap::Bitmap;
-use crate::app::output::write_atomically;
+use crate::files::write_atomically;
 
 /// Settings of an animated GIF.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -19,7 +19,7 @@ pub use plotters::style::text_anchor::{HPos, VPos};
 
 use super::bitmap::Bitmap;
 use super::color::{INK, Rgb, WHITE};
-use crate::app::output::write_atomically;
+use crate::files::write_atomically;
 
 /// Ratio of the size of the bitmap while drawing to its final size.
 const SCALE: u32 = 2;

@@ -5,8 +5,8 @@ use std::path::Path;
 
 use super::error::ResultsError;
 use super::localization_results::LocalizationResults;
-use crate::app::output::write_atomically;
 use crate::evaluation::{PlanarError, distances_m, planar_errors};
+use crate::files::write_atomically;
 use crate::geometry::Pose2;
 
 /// Writes the table; `estimates` are those of the filter, one per frame.

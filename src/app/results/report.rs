@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 
 use super::error::ResultsError;
 use super::rows::{MetricRow, Value, metric_rows};
-use crate::app::output::write_atomically;
 use crate::evaluation::{RangeMclErrors, TrajectoryMetrics};
+use crate::files::write_atomically;
 
 /// Errors of one trajectory.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

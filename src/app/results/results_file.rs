@@ -9,8 +9,8 @@ use nalgebra::{Matrix3, Vector2};
 use super::error::ResultsError;
 use super::localization_results::{LocalizationResults, ParticleLog};
 use super::npz::{Array, NpzReader, NpzWriter, write_npy};
-use crate::app::output::write_atomically;
 use crate::evaluation::ParticleRow;
+use crate::files::write_atomically;
 use crate::geometry::Pose2;
 
 impl LocalizationResults {

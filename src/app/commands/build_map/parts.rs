@@ -1,29 +1,28 @@
-//! Finished local maps on disk, so that an interrupted build goes on where it was.
+//! Finished local maps on disk, from which an interrupted build resumes.
 //!
-//! Beside the map lies, while it is being built, the folder `<map>.parts`: per local map a mesh,
-//! its counts and the hash of its scans, and `inputs.txt`, which says what else they were made from.
-//! Parts of other inputs are thrown away. A part counts as finished once its counts are there, which
-//! are written last.
+//! While a map is being built, the folder `<map>.parts` beside it holds per local map a mesh, and its
+//! counts with the hash of its scans, and `inputs.txt` with all other inputs. Parts of other inputs are
+//! deleted. A part is finished once its counts exist, which are written last.
 
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::app::commands::output;
 use crate::geometry::TriangleMesh;
-use crate::map::local_map::LocalMap;
-use crate::map::{LocalMapCounts, ply};
+use crate::map::{LocalMap, LocalMapCounts, ply};
+use crate::recording::Frame;
 
-/// What is known of a finished local map beside its mesh.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Part {
+/// A finished local map beside its mesh.
+#[derive(Serialize, Deserialize)]
+struct Part {
     /// Hash of the scans that it was made of.
-    pub scans_hash: String,
-    /// What happened to its points and triangles.
-    pub counts: LocalMapCounts,
+    scans_hash: String,
+    counts: LocalMapCounts,
 }
 
 /// The folder of finished local maps of one build.
@@ -32,7 +31,7 @@ pub struct Parts {
 }
 
 impl Parts {
-    /// Opens the folder beside `mesh_file`; keeps what is in it if it was made from the same inputs.
+    /// Opens the folder beside `mesh_file`; deletes its content if it was made from other inputs.
     pub fn open(mesh_file: &Path, inputs: &str) -> Result<Self> {
         let mut name = mesh_file.file_name().unwrap_or_default().to_owned();
         name.push(".parts");
@@ -51,36 +50,33 @@ impl Parts {
         Ok(Self { folder })
     }
 
-    /// Where the parts lie.
+    /// The folder of the parts.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// What is known of a local map if it is finished, and its mesh is there.
-    pub fn finished(&self, number: usize) -> Option<Part> {
+    /// The counts of a local map if it is finished, with its mesh, and made of these scans.
+    pub fn finished(&self, number: usize, scans_hash: &str) -> Option<LocalMapCounts> {
         let text = fs::read_to_string(self.counts_file(number)).ok()?;
         let part: Part = serde_json::from_str(&text).ok()?;
         let is_whole = part.counts.triangles == 0 || self.mesh_file(number).exists();
-        is_whole.then_some(part)
+        (is_whole && part.scans_hash == scans_hash).then_some(part.counts)
     }
 
     /// Keeps a finished local map.
-    pub fn save(&self, number: usize, local_map: &LocalMap) -> Result<()> {
+    pub fn save(&self, number: usize, local_map: &LocalMap, scans_hash: &str) -> Result<()> {
         self.discard(number)?;
         if !local_map.mesh.triangles.is_empty() {
-            let temporary = self.folder.join("unfinished.ply");
-            ply::write(&temporary, &local_map.mesh)?;
-            fs::rename(&temporary, self.mesh_file(number))
-                .with_context(|| format!("cannot rename {}", temporary.display()))?;
+            ply::write(&self.mesh_file(number), &local_map.mesh)?;
         }
         let part = Part {
-            scans_hash: local_map.scans_hash.clone(),
+            scans_hash: scans_hash.to_owned(),
             counts: local_map.counts.clone(),
         };
         output::write_json(&self.counts_file(number), &part)
     }
 
-    /// Removes what there is of a part that was made of other scans, its counts first.
+    /// Deletes a part that was made of other scans, its counts first.
     fn discard(&self, number: usize) -> Result<()> {
         for file in [self.counts_file(number), self.mesh_file(number)] {
             match fs::remove_file(&file) {
@@ -93,7 +89,7 @@ impl Parts {
         Ok(())
     }
 
-    /// All local maps 0..count as one mesh.
+    /// Joins the meshes of the local maps 0..count.
     pub fn join(&self, count: usize) -> Result<TriangleMesh> {
         let mut whole = TriangleMesh::default();
         for number in 0..count {
@@ -120,6 +116,21 @@ impl Parts {
     }
 }
 
+/// BLAKE3 hash of the files of scans, in order.
+pub fn hash_of_scans(frames: &[Frame]) -> Result<String> {
+    let hash = |frame: &Frame| {
+        let path = &frame.scan_path;
+        let bytes = fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
+        Ok(blake3::hash(&bytes))
+    };
+    let hashes: Vec<blake3::Hash> = frames.par_iter().map(hash).collect::<Result<_>>()?;
+    let mut joint = blake3::Hasher::new();
+    for hash in hashes {
+        joint.update(hash.as_bytes());
+    }
+    Ok(joint.finalize().to_hex().to_string())
+}
+
 #[cfg(test)]
 mod tests {
     use glam::Vec3;
@@ -139,7 +150,6 @@ mod tests {
                 triangles: 1,
                 ..LocalMapCounts::default()
             },
-            scans_hash: "0123abcd".to_owned(),
         }
     }
 
@@ -148,26 +158,28 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
         let parts = Parts::open(&map, "inputs").unwrap();
-        parts.save(1, &local_map(1.5)).unwrap();
-        parts.save(0, &local_map(0.5)).unwrap();
+        parts.save(1, &local_map(1.5), "0123").unwrap();
+        parts.save(0, &local_map(0.5), "0123").unwrap();
 
         let again = Parts::open(&map, "inputs").unwrap();
-        let part = again.finished(1).unwrap();
-        assert_eq!(part.scans_hash, "0123abcd");
-        assert_eq!(part.counts.scans, 7);
-        assert_eq!(again.finished(2), None);
+        assert_eq!(again.finished(1, "0123").unwrap().scans, 7);
+        assert_eq!(again.finished(1, "4567"), None);
+        assert_eq!(again.finished(2, "0123"), None);
         let whole = again.join(2).unwrap();
         assert_eq!(whole.vertices[0].x, 0.5);
         assert_eq!(whole.vertices[3].x, 1.5);
     }
 
     #[test]
-    fn parts_of_other_inputs_are_thrown_away() {
+    fn parts_of_other_inputs_are_deleted() {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
         let parts = Parts::open(&map, "inputs").unwrap();
-        parts.save(0, &local_map(0.5)).unwrap();
-        assert_eq!(Parts::open(&map, "others").unwrap().finished(0), None);
+        parts.save(0, &local_map(0.5), "0123").unwrap();
+        assert_eq!(
+            Parts::open(&map, "others").unwrap().finished(0, "0123"),
+            None
+        );
     }
 
     #[test]
@@ -175,27 +187,27 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
         let parts = Parts::open(&map, "inputs").unwrap();
-        parts.save(0, &local_map(0.5)).unwrap();
+        parts.save(0, &local_map(0.5), "0123").unwrap();
         fs::remove_file(parts.counts_file(0)).unwrap();
-        assert_eq!(parts.finished(0), None);
+        assert_eq!(parts.finished(0, "0123"), None);
     }
 
     #[test]
     fn counts_without_their_mesh_are_not_finished() {
         let folder = tempfile::tempdir().unwrap();
         let parts = Parts::open(&folder.path().join("map.ply"), "inputs").unwrap();
-        parts.save(0, &local_map(0.5)).unwrap();
+        parts.save(0, &local_map(0.5), "0123").unwrap();
         fs::remove_file(parts.mesh_file(0)).unwrap();
-        assert_eq!(parts.finished(0), None);
+        assert_eq!(parts.finished(0, "0123"), None);
     }
 
     #[test]
-    fn a_part_that_has_become_empty_leaves_nothing_of_what_it_was() {
+    fn an_empty_part_replaces_the_mesh_of_an_earlier_one() {
         let folder = tempfile::tempdir().unwrap();
         let parts = Parts::open(&folder.path().join("map.ply"), "inputs").unwrap();
-        parts.save(0, &local_map(0.5)).unwrap();
-        parts.save(0, &LocalMap::default()).unwrap();
-        assert_eq!(parts.finished(0).unwrap().scans_hash, "");
+        parts.save(0, &local_map(0.5), "0123").unwrap();
+        parts.save(0, &LocalMap::default(), "").unwrap();
+        assert!(parts.finished(0, "").is_some());
         assert!(parts.join(1).unwrap().triangles.is_empty());
     }
 }

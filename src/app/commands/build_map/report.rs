@@ -1,23 +1,25 @@
-//! What a build tells of itself.
+//! Report of a map build.
 
 use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::Instant;
 
 use serde::Serialize;
 
-use crate::map::local_map::LocalMapCounts;
-use crate::map::quality::MapQuality;
-use crate::map::truth::TruthAgreement;
+use crate::evaluation::{MapQuality, TruthAgreement};
+use crate::geometry::TriangleMesh;
+use crate::map::{LocalMapCounts, MappingPath};
 
-/// What a build did, as it stands in the report.
-#[derive(Debug, Serialize)]
+/// Report of a map build.
+#[derive(Debug, Default, Serialize)]
 pub struct BuildReport {
-    /// Frames that were looked at.
+    /// Selected frames.
     pub frames: usize,
-    /// Frames in which the car had moved, and which are not held back.
+    /// Key scans that the map was built from.
     pub mapped_frames: usize,
-    /// Frames held back for judging the map.
+    /// Key scans held out to evaluate the map.
     pub held_out_frames: usize,
-    /// Path of the mapped frames [m].
+    /// Length of the path of the mapped scans [m].
     pub path_m: f64,
     /// Triangles of the map.
     pub triangles: usize,
@@ -31,15 +33,41 @@ pub struct BuildReport {
     pub seconds: f64,
     /// Wall time per stage, summed over the local maps made in this run [s].
     pub stage_seconds: BTreeMap<String, f64>,
-    /// The map along the beams of the frames held back.
+    /// Quality along the beams of the held-out scans.
     pub quality: Option<MapQuality>,
-    /// The map against the true surface, where that is known.
+    /// Agreement with the true surface, where it is known.
     pub truth: Option<TruthAgreement>,
-    /// What happened to points and triangles, per local map.
+    /// Numbers of points and triangles per local map.
     pub local_maps: Vec<LocalMapCounts>,
 }
 
 impl BuildReport {
+    /// The size of a written map, per length of its path, and the time since the build started.
+    pub fn of_map(
+        mesh: &TriangleMesh,
+        path: &MappingPath,
+        mesh_file: &Path,
+        started: Instant,
+    ) -> Self {
+        let positions = path
+            .map_from_lidar
+            .iter()
+            .map(|pose| pose.translation.vector);
+        let steps = positions.clone().zip(positions.skip(1));
+        let path_m = steps.map(|(from, to)| (to - from).norm()).sum();
+        let map_mb = std::fs::metadata(mesh_file).map_or(0.0, |file| file.len() as f64 / 1e6);
+        let per_100m = |amount: f64| 100.0 * amount / f64::max(path_m, 1.0);
+        Self {
+            path_m,
+            triangles: mesh.triangles.len(),
+            map_mb,
+            triangles_per_100m: per_100m(mesh.triangles.len() as f64),
+            mb_per_100m: per_100m(map_mb),
+            seconds: started.elapsed().as_secs_f64(),
+            ..Self::default()
+        }
+    }
+
     /// The table on standard output.
     pub fn table(&self) -> String {
         let mut rows = vec![
@@ -68,7 +96,7 @@ impl BuildReport {
         let centimetres = |metres: f64| format!("{:.1} cm", 100.0 * metres);
         if let Some(quality) = &self.quality {
             rows.extend([
-                ("beams judged", quality.beams.to_string()),
+                ("beams evaluated", quality.beams.to_string()),
                 ("early", percent(quality.early)),
                 ("late", percent(quality.late)),
                 ("miss", percent(quality.miss)),

@@ -1,53 +1,43 @@
-//! `localize`: where the car is in a map, scan by scan.
+//! `localize`: localizes a recording in a map, scan by scan.
 
-mod drive;
 mod pictures;
 mod recorder;
 
-use std::path::Path;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use rand::SeedableRng as _;
-use rand_chacha::ChaCha8Rng;
 
-use self::drive::{Drive, global_start, motion, panoramas};
 use self::pictures::draw_example;
-use self::recorder::Recorder;
+use self::recorder::{Recorder, Run};
 use super::interrupt::Interrupted;
-use super::run_output::{self, Movie, RunFiles};
-use super::stages::{Inputs, LoadedMap, Observer, mapping_file};
+use super::run_output::{self, RunFiles};
+use super::stages::Inputs;
 use super::{Context, odometry, run_page};
-use crate::app::config::{self, LocalizationConfig};
+use crate::app::config::{self, Initialization, LocalizationConfig, MotionModel};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
-use crate::geometry::{Pose2, Pose3};
-use crate::ground::{FuzzyConfig, FuzzyGround};
-use crate::localization::State;
-use crate::map::Stance;
+use crate::geometry::Pose2;
+use crate::localization::motion::VelocityCommand;
+use crate::localization::{Localizer, Odometry, Start, State};
+use crate::map::Map;
+use crate::random::stream;
 use crate::recording::Sequence;
+use crate::refinement::{InitialEstimate, TrajectoryRefiner};
 
-/// Which random stream belongs to what; the streams of frames follow.
-const INITIALIZATION_STREAM: u64 = 0;
+/// Random stream of the noise on the odometry; the localizer has its own streams.
 const ODOMETRY_STREAM: u64 = 1;
-const FIRST_FRAME_STREAM: u64 = 2;
 
-/// Localizes the frames that a configuration selects.
+/// Localizes the selected frames of a recording.
 pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
-    let inputs = Inputs {
-        map_file: &config.map_file,
-        map_pose_file: mapping_file("map_pose_file", config.map_pose_file.as_deref())?,
-        map_calib_file: mapping_file("map_calib_file", config.map_calib_file.as_deref())?,
-        scan_folder: &config.scan_folder,
-        pose_file: &config.pose_file,
-        calib_file: &config.calib_file,
-    };
+    let inputs = inputs(config);
     inputs.require()?;
     let files = RunFiles::beside(&config.result_path);
     if config.save_result || config.plot_loc_results || config.visualize {
         run_output::prepare(&files, "result_path", config.force)?;
     }
-    let map = LoadedMap::load(&inputs, Some(config.range_image.batch_size()), context)?;
-    let sequence = map.sequence(&inputs, &config.selection())?;
+    let map = inputs.load_map(Some(config.range_image.batch_size()), context)?;
+    let sequence = inputs.open_recording(&config.selection(), &map)?;
     let increments = odometry::read_increments(
         config.odometry,
         config.odometry_file.as_deref(),
@@ -56,91 +46,145 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     )?;
     let sequence = odometry::compensated(sequence, config.motion_compensation, &increments);
     let run = localize(config, context, &map, &sequence, &increments, &files)?;
-    let Run {
-        results,
-        lifted,
-        refined,
-        movie,
-        mut failure,
-    } = run;
-    let about = about(config, context, &map);
+    let report = write_run(config, context, &files, &map, &sequence, &run)?;
+    run.finish(config, sequence.frames.len())?;
+    Ok(report)
+}
+
+fn inputs(config: &LocalizationConfig) -> Inputs<'_> {
+    Inputs {
+        map_file: &config.map_file,
+        map_pose_file: config.map_pose_file.as_deref(),
+        map_calib_file: config.map_calib_file.as_deref(),
+        scan_folder: &config.scan_folder,
+        pose_file: &config.pose_file,
+        calib_file: &config.calib_file,
+    }
+}
+
+/// Localizes frames until the end, an interruption or an error; an error only where no frame was
+/// finished.
+fn localize(
+    config: &LocalizationConfig,
+    context: &Context,
+    map: &Map,
+    sequence: &Sequence,
+    increments: &[Option<Pose2>],
+    files: &RunFiles,
+) -> Result<Run> {
+    let start = start(config, sequence);
+    let mut localizer = Localizer::new(map, config.localizer(), start, config.seed)?;
+    let refiner = || TrajectoryRefiner::new(map, config.refiner(), config.seed);
+    let mut refiner = config.refine.then(refiner).transpose()?;
+    let mut recorder = Recorder::new(config, map, files);
+    let task = context.progress.task("localize", sequence.frames.len());
+    for (row, frame) in sequence.frames.iter().enumerate() {
+        if context.interrupt.requested() {
+            break;
+        }
+        let odometry = odometry_into(config.motion_model, increments[row], sequence, row);
+        let mut process = || {
+            let scan = frame.read()?;
+            let started = Instant::now();
+            let estimate = localizer.step(&scan, odometry)?;
+            let runtime = started.elapsed();
+            let refined = match &mut refiner {
+                Some(refiner) => Some(refiner.add(&scan, &InitialEstimate::from(&estimate))?),
+                None => None,
+            };
+            let runtimes = [runtime, started.elapsed() - runtime];
+            recorder.record(frame, increments[row], &estimate, refined, runtimes)
+        };
+        if let Err(error) = process() {
+            recorder.failure = Some(error);
+            break;
+        }
+        task.advance(1);
+    }
+    drop(task);
+    recorder.into_run()
+}
+
+/// Where the particles start.
+fn start(config: &LocalizationConfig, sequence: &Sequence) -> Start {
+    match config.initialization() {
+        Initialization::Tracking => {
+            Start::near(&sequence.frames[0].map_from_lidar, config.start.clone())
+        }
+        Initialization::Corridor => Start::Road,
+        Initialization::Extent => Start::Anywhere,
+    }
+}
+
+/// The odometry into a frame, in the form that the motion model needs.
+fn odometry_into(
+    model: MotionModel,
+    increment: Option<Pose2>,
+    sequence: &Sequence,
+    row: usize,
+) -> Odometry {
+    match (increment, model) {
+        (None, _) => Odometry::Unknown,
+        (Some(increment), MotionModel::TurnDriveTurn) => Odometry::Increment(increment),
+        (Some(increment), MotionModel::Velocity) => {
+            let times_s = [row.saturating_sub(1), row].map(|row| sequence.frames[row].time_s);
+            let duration = Duration::from_secs_f64((times_s[1] - times_s[0]).max(0.0));
+            Odometry::Velocity(VelocityCommand::driving(&increment, duration))
+        }
+    }
+}
+
+/// Writes results, report, plots and page, and returns the report.
+fn write_run(
+    config: &LocalizationConfig,
+    context: &Context,
+    files: &RunFiles,
+    map: &Map,
+    sequence: &Sequence,
+    run: &Run,
+) -> Result<Report> {
+    let results = &run.results;
     if config.save_result {
-        run_output::write_results(&files, &results)?;
-        run_output::write_trajectory(&files, "mcl", &sequence, &lifted)?;
+        run_output::write_results(files, results)?;
+        run_output::write_trajectory(files, "mcl", sequence, &run.map_from_lidar)?;
         if config.refine {
-            run_output::write_trajectory(&files, "refined", &sequence, &refined)?;
+            run_output::write_trajectory(files, "refined", sequence, &run.refined)?;
         } else {
-            run_output::remove_refined(&files)?;
+            run_output::remove_refined(files)?;
         }
         config::write(&files.file("localization.yml"), config)?;
     }
-    tell_of_doubt(&results);
-    let report = run_output::evaluate(&results, &RangeMclRules::default(), about)?;
+    warn_of_doubt(results);
+    let about = about(config, context, map);
+    let report = run_output::evaluate(results, &RangeMclRules::default(), about)?;
     if config.save_result {
-        run_output::write_report(&files, &results, &report)?;
+        run_output::write_report(files, results, &report)?;
     }
     if config.plot_loc_results {
-        run_output::draw_run(&files, Some(&map.mesh), &results)?;
-        draw_example(config, &files, &map, &sequence, &lifted)?;
+        run_output::draw_run(files, Some(&map.mesh), results)?;
+        draw_example(config, files, map, sequence, &run.map_from_lidar)?;
     }
     if config.save_result {
-        run_page::write(&files, &report)?;
+        run_page::write(files, &report)?;
     }
-    if let Some(movie) = movie
-        && let Err(error) = movie.finish()
-    {
-        failure.get_or_insert(error);
-    }
-    let is_whole = results.len() == sequence.frames.len();
-    if is_whole && failure.is_none() {
-        if !config.save_result {
-            tracing::warn!("the result is not kept: save_result is False");
-        }
-        return Ok(report);
-    }
-    let (found, all) = (results.len(), sequence.frames.len());
-    let kept = if config.save_result {
-        let path = config.result_path.display();
-        format!("{found} of {all} frames are localized and kept in {path}")
-    } else {
-        format!("{found} of {all} frames were localized, and nothing is kept: save_result is False")
-    };
-    Err(match failure {
-        Some(failure) => failure.context(kept),
-        None => Interrupted { kept }.into(),
-    })
+    Ok(report)
 }
 
-/// What the filter made of the frames up to where it came.
-struct Run {
-    results: LocalizationResults,
-    /// The estimates in space.
-    lifted: Vec<Pose3>,
-    /// The refined poses in space; none unless frames are refined.
-    refined: Vec<Pose3>,
-    /// Why it did not come to the end, unless that was wished.
-    failure: Option<anyhow::Error>,
-    /// The pictures of the frames, if they are wanted.
-    movie: Option<Movie>,
-}
-
-/// Says where the filter was not sure.
-fn tell_of_doubt(results: &LocalizationResults) {
+/// Warns of frames in which the filter was not tracking.
+fn warn_of_doubt(results: &LocalizationResults) {
     let states = results.states.as_deref().unwrap_or_default();
-    let is_sure = |state: &u8| *state == State::Tracking as u8;
-    match states.iter().position(is_sure) {
+    let is_tracking = |state: &u8| *state == State::Tracking as u8;
+    match states.iter().position(is_tracking) {
         None => tracing::warn!(
-            "the filter was not sure of any of {} frames: the car is perhaps not in the map, or did not drive far enough to tell",
+            "the filter converged in none of {} frames: the car may not be in the map, or did not drive far enough",
             states.len()
         ),
         Some(first) => {
-            let doubtful = states[first..]
-                .iter()
-                .filter(|&state| !is_sure(state))
-                .count();
+            let tracked = states[first..].iter().filter(|&state| is_tracking(state));
+            let doubtful = states.len() - first - tracked.count();
             if doubtful > 0 {
                 tracing::warn!(
-                    "the filter lost its way in {doubtful} of {} frames; frames.csv has the state of each",
+                    "tracking was lost in {doubtful} of {} frames; frames.csv lists the state of each",
                     states.len()
                 );
             }
@@ -148,90 +192,46 @@ fn tell_of_doubt(results: &LocalizationResults) {
     }
 }
 
-/// Runs the filter over the frames, as far as it comes; an error only where no frame was finished.
-fn localize(
-    config: &LocalizationConfig,
-    context: &Context,
-    map: &LoadedMap,
-    sequence: &Sequence,
-    increments: &[Option<Pose2>],
-    files: &RunFiles,
-) -> Result<Run> {
-    let classifier = FuzzyGround::new(FuzzyConfig::default())?;
-    let observer = Observer {
-        model: config.range_image.model(),
-        own_car_m: config.own_car_m,
-        classifier: &classifier,
-    };
-    let panoramas = panoramas(config, map);
-    let global_start = global_start(config, &panoramas)?;
-    let mut recorder = Recorder::new(config, map, files);
-    let mut drive = Drive {
-        config,
-        map,
-        observer: &observer,
-        panoramas: &panoramas,
-        global_start,
-        localizer: None,
-        stance: Stance::default(),
-    };
-    let mut failure = None;
-    let task = context.progress.task("localize", sequence.frames.len());
-    for (row, frame) in sequence.frames.iter().enumerate() {
-        if context.interrupt.requested() {
-            break;
-        }
-        let moved = motion(config.motion_model, increments[row], sequence, row);
-        let said = drive
-            .take_in(row, frame, moved)
-            .and_then(|said| recorder.record(frame, increments[row], said));
-        if let Err(error) = said {
-            failure = Some(error);
-            break;
-        }
-        task.advance(1);
-    }
-    drop(task);
-    let run = recorder.finish(failure);
-    match (run.results.is_empty(), run.failure) {
-        (false, failure) => Ok(Run { failure, ..run }),
-        (true, Some(failure)) => Err(failure),
-        (true, None) => {
-            let kept = "no frame was finished".to_owned();
-            Err(Interrupted { kept }.into())
-        }
-    }
-}
-
-/// What was run, for the report.
-fn about(
-    config: &LocalizationConfig,
-    context: &Context,
-    map: &LoadedMap,
-) -> std::collections::BTreeMap<String, String> {
-    let path = |path: &Path| path.display().to_string();
+/// Description of the run for the report.
+fn about(config: &LocalizationConfig, context: &Context, map: &Map) -> BTreeMap<String, String> {
+    let odometry = odometry::description(config.odometry, config.odometry_file.as_deref());
+    let particles = format!("{} reduced to {}", config.num_particles, config.num_reduced);
     [
-        ("recording", path(&config.scan_folder)),
-        ("map", path(&config.map_file)),
-        (
-            "odometry",
-            odometry::description(config.odometry, config.odometry_file.as_deref()),
-        ),
+        ("recording", config.scan_folder.display().to_string()),
+        ("map", config.map_file.display().to_string()),
+        ("odometry", odometry),
         ("renderer", map.renderer.name()),
         ("seed", config.seed.to_string()),
         ("threads", context.threads.to_string()),
-        (
-            "particles",
-            format!("{} reduced to {}", config.num_particles, config.num_reduced),
-        ),
+        ("particles", particles),
     ]
     .map(|(key, value)| (key.to_owned(), value))
     .into()
 }
 
-/// The generator of a stream: the same whatever happens in the others.
-fn stream(seed: u64, stream: u64) -> ChaCha8Rng {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    rng.set_stream(stream);
-    rng
+impl Run {
+    /// Finishes the animation; an error where not all frames were localized, which names what is kept.
+    fn finish(self, config: &LocalizationConfig, frames: usize) -> Result<()> {
+        let animation = self.movie.map_or(Ok(()), |movie| movie.finish());
+        let failure = self.failure.or(animation.err());
+        let found = self.results.len();
+        if found == frames && failure.is_none() {
+            if !config.save_result {
+                tracing::warn!("the result is not kept: save_result is False");
+            }
+            return Ok(());
+        }
+        let kept = if config.save_result {
+            let path = config.result_path.display();
+            format!("{found} of {frames} frames are localized and kept in {path}")
+        } else {
+            format!(
+                "{found} of {frames} frames were localized; nothing is kept: save_result is False"
+            )
+        };
+        Err(match failure {
+            Some(failure) => failure.context(kept),
+            None => Interrupted { kept }.into(),
+        })
+    }
 }

@@ -1,69 +1,71 @@
-//! One frame looked at closely.
+//! Pictures of one frame: its range images and its likelihood.
 
 use anyhow::{Context as _, Result};
 
-use super::{FIRST_FRAME_STREAM, stream};
 use crate::app::commands::run_output::{self, RunFiles};
-use crate::app::commands::stages::LoadedMap;
 use crate::app::config::LocalizationConfig;
 use crate::app::plotting::color::{MCL, REFINED};
 use crate::geometry::{Pose3, pose2_from_pose3};
 use crate::lidar::RangeImage;
 use crate::localization::likelihood::{Direction, View, profile};
 use crate::localization::observation::{Likelihood, ObservationConfig, choose_beams};
-use crate::map::Stance;
+use crate::map::{Map, SensorAttitude};
+use crate::random::stream;
 use crate::recording::{Frame, Sequence};
 
-/// Draws one frame's range image beside the map's from the estimate.
+/// Random stream of the beams that are compared.
+const LIKELIHOOD_STREAM: u64 = 2;
+
+/// Draws the range image of a frame beside that of the map at the estimate.
 pub fn draw_example(
     config: &LocalizationConfig,
     files: &RunFiles,
-    map: &LoadedMap,
+    map: &Map,
     sequence: &Sequence,
-    lifted: &[Pose3],
+    map_from_lidar: &[Pose3],
 ) -> Result<()> {
-    let row = lifted.len() / 2;
+    let row = map_from_lidar.len() / 2;
     let model = config.range_image.model();
     let scan = sequence.frames[row].read()?;
     let observed = RangeImage::project(&scan.points, &model);
-    let rendered = map.renderer.render(&lifted[row..=row], &model)?;
+    let rendered = map.renderer.render(&map_from_lidar[row..=row], &model)?;
     let rendered = rendered.first().context("one pose gives one image")?;
     run_output::draw_range_images(files, &observed, rendered, sequence.frames[row].number)?;
     draw_likelihood(config, files, map, &sequence.frames[row], &observed)
 }
 
-/// Draws the likelihood around the true pose of a frame: ours and range-mcl's.
+/// Draws the likelihood of this run and of range-mcl around the true pose of a frame.
 fn draw_likelihood(
     config: &LocalizationConfig,
     files: &RunFiles,
-    map: &LoadedMap,
+    map: &Map,
     frame: &Frame,
     scan: &RangeImage,
 ) -> Result<()> {
     let truth = pose2_from_pose3(&frame.map_from_lidar);
-    let below_m = frame.map_from_lidar.translation.z - Stance::default().height_m;
+    let below_m = frame.map_from_lidar.translation.z - SensorAttitude::default().height_m;
     let Some(patch) = map.ground.patch_under(&truth, Some(below_m)) else {
         tracing::info!(
-            "frame {}: no ground below the true pose, no likelihood drawn",
+            "frame {}: the likelihood is not drawn because there is no ground below the true pose",
             frame.number
         );
         return Ok(());
     };
     let observation = &config.observation;
-    let stance = patch.stance_of(&frame.map_from_lidar);
-    let mut rng = stream(config.seed, FIRST_FRAME_STREAM);
+    let attitude = patch.attitude_of(&frame.map_from_lidar);
+    let mut rng = stream(config.seed, LIKELIHOOD_STREAM);
     let beams = choose_beams(
         scan,
         observation.beams,
         observation.road_share,
-        &stance,
+        &attitude,
         &mut rng,
     );
     let view = View {
         renderer: &*map.renderer,
         ground: &map.ground,
         level_m: Some(patch.height_m),
-        stance,
+        attitude,
         beams: &beams,
     };
     let reference = ObservationConfig {

@@ -1,28 +1,46 @@
-//! What the filter said, frame by frame.
+//! Results of localize, collected frame by frame.
+
+use std::time::Duration;
 
 use anyhow::Result;
 
-use super::Run;
-use super::drive::Said;
+use crate::app::commands::interrupt::Interrupted;
 use crate::app::commands::run_output::{self, Movie, RunFiles};
-use crate::app::commands::stages::LoadedMap;
 use crate::app::config::LocalizationConfig;
 use crate::app::results::{LocalizationResults, ParticleLog};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
+use crate::localization::Estimate;
+use crate::map::Map;
 use crate::recording::Frame;
+use crate::refinement::FrameResult;
 
-/// Collects what the filter says.
+/// The localized frames.
+pub struct Run {
+    pub results: LocalizationResults,
+    /// The estimates in space.
+    pub map_from_lidar: Vec<Pose3>,
+    /// The refined poses in space; the estimates where a frame was not refined.
+    pub refined: Vec<Pose3>,
+    /// The error that ended the run before its last frame.
+    pub failure: Option<anyhow::Error>,
+    /// Pictures of the frames, if they were requested.
+    pub movie: Option<Movie>,
+}
+
+/// Collects the results of frames.
 pub struct Recorder {
     results: LocalizationResults,
-    lifted: Vec<Pose3>,
+    map_from_lidar: Vec<Pose3>,
     refined: Vec<Pose3>,
     movie: Option<Movie>,
-    /// Frames with no ground of the map below the estimate.
+    /// Frames without mapped ground below the estimate.
     off_ground: usize,
+    /// The error that ended the run.
+    pub failure: Option<anyhow::Error>,
 }
 
 impl Recorder {
-    pub fn new(config: &LocalizationConfig, map: &LoadedMap, files: &RunFiles) -> Self {
+    pub fn new(config: &LocalizationConfig, map: &Map, files: &RunFiles) -> Self {
         let empty = || Some(Vec::new());
         Self {
             results: LocalizationResults {
@@ -39,24 +57,28 @@ impl Recorder {
                 refine_runtimes_s: config.refine.then(Vec::new),
                 ..LocalizationResults::default()
             },
-            lifted: Vec::new(),
+            map_from_lidar: Vec::new(),
             refined: Vec::new(),
             movie: config.visualize.then(|| Movie::begin(files, &map.mesh)),
             off_ground: 0,
+            failure: None,
         }
     }
 
-    pub fn record(&mut self, frame: &Frame, increment: Option<Pose2>, said: Said) -> Result<()> {
+    /// Adds a frame; `runtimes` are those of the filter and of the refinement.
+    pub fn record(
+        &mut self,
+        frame: &Frame,
+        increment: Option<Pose2>,
+        estimate: &Estimate,
+        refined: Option<&FrameResult>,
+        [runtime, refine_runtime]: [Duration; 2],
+    ) -> Result<()> {
         fn push<T>(column: &mut Option<Vec<T>>, value: T) {
             if let Some(column) = column {
                 column.push(value);
             }
         }
-        let Said {
-            estimate,
-            runtime,
-            refined,
-        } = &said;
         let results = &mut self.results;
         results.frames.push(frame.number);
         results
@@ -76,38 +98,40 @@ impl Recorder {
         push(&mut results.times_s, frame.time_s);
         push(&mut results.runtimes_s, runtime.as_secs_f64());
         push(&mut results.states, estimate.state as u8);
-        let (pose, lifted, covariance, seconds) = match refined {
-            Some((refined, runtime)) => {
-                let seconds = runtime.as_secs_f64();
-                (refined.pose, refined.lifted, refined.covariance, seconds)
-            }
-            None => (estimate.pose, estimate.lifted, estimate.covariance, 0.0),
-        };
-        push(&mut results.refined, pose);
+        let refined_pose = refined.map_or(estimate.pose, |refined| refined.pose);
+        let covariance = refined.map_or(estimate.covariance, |refined| refined.covariance);
+        let in_space = refined.and_then(|refined| refined.map_from_lidar);
+        push(&mut results.refined, refined_pose);
         push(&mut results.refined_covariances, covariance);
-        push(&mut results.refine_runtimes_s, seconds);
-        self.refined.push(lifted);
-        self.lifted.push(estimate.lifted);
+        push(&mut results.refine_runtimes_s, refine_runtime.as_secs_f64());
+        self.refined
+            .push(in_space.unwrap_or(estimate.map_from_lidar));
+        self.map_from_lidar.push(estimate.map_from_lidar);
         if let Some(movie) = &mut self.movie {
             movie.add(results, estimate)?;
         }
         Ok(())
     }
 
-    pub fn finish(self, failure: Option<anyhow::Error>) -> Run {
+    /// Returns the run; an error where no frame was finished.
+    pub fn into_run(self) -> Result<Run> {
+        let frames = self.results.len();
+        if frames == 0 {
+            let kept = "no frame was finished".to_owned();
+            return Err(self.failure.unwrap_or_else(|| Interrupted { kept }.into()));
+        }
         if self.off_ground > 0 {
             tracing::warn!(
-                "{} of {} frames have no ground of the map below them and stand on the last that there was",
-                self.off_ground,
-                self.results.len()
+                "{} of {frames} frames have no mapped ground below them; the last known ground is used",
+                self.off_ground
             );
         }
-        Run {
+        Ok(Run {
             results: self.results,
-            lifted: self.lifted,
+            map_from_lidar: self.map_from_lidar,
             refined: self.refined,
-            failure,
+            failure: self.failure,
             movie: self.movie,
-        }
+        })
     }
 }

@@ -1,4 +1,4 @@
-//! Everything that can be set about the filter, in one place.
+//! Configuration of the localizer.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,24 +7,26 @@ use super::motion::{OdometryNoise, VelocityNoise};
 use super::observation::ObservationConfig;
 use super::proposal::ProposalConfig;
 use super::resampling::{KldConfig, ResamplingConfig};
-use super::vigilance::VigilanceConfig;
+use super::sensor::SensorConfig;
+use super::tracking_loss::TrackingLossConfig;
+use crate::map::PanoramaConfig;
 use crate::validation::{InvalidValue, Validate, at_least_one, fraction, nested, not_negative};
 
-/// How the likelihood is sharpened within a frame.
+/// Annealing of the likelihood within a frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TemperingConfig {
-    /// A frame never leaves a smaller share of effective particles than this; 0 takes the
-    /// likelihood at its word, as range-mcl does.
+    /// Smallest share of effective particles that a frame may leave (unitless); 0 uses the likelihood
+    /// unchanged, as range-mcl does.
     pub min_effective_fraction: f64,
     /// Rounds of reweighting and resampling per frame while searching.
     pub searching_rounds: usize,
-    /// The same while tracking.
+    /// Rounds of reweighting and resampling per frame while tracking.
     pub tracking_rounds: usize,
 }
 
 impl Default for TemperingConfig {
-    /// Our own values.
+    /// Values of this project.
     fn default() -> Self {
         Self {
             min_effective_fraction: 0.2,
@@ -42,46 +44,50 @@ impl Validate for TemperingConfig {
     }
 }
 
-/// Everything that can be set about the filter.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+/// Configuration of the localizer.
+#[derive(Clone, Debug, PartialEq)]
 pub struct LocalizerConfig {
-    /// Particles while searching, at most.
+    /// The sensor and the preparation of its scans.
+    pub sensor: SensorConfig,
+    /// Largest number of particles while searching.
     pub num_particles: usize,
-    /// Particles once converged.
+    /// Number of particles while tracking.
     pub num_reduced: usize,
-    /// The weights are updated after this much motion [m].
+    /// Motion after which the weights are updated [m].
     pub move_thres_m: f64,
-    /// Or after this much turning [rad].
+    /// Turn after which the weights are updated [rad].
     pub turn_thres_rad: f64,
-    /// Noise of the odometry, per update.
+    /// Noise of odometry increments, per update.
     pub motion: OdometryNoise,
     /// Noise of velocity commands.
     pub velocity: VelocityNoise,
-    /// Noise of the guess that the car goes on as it went, where there is no odometry.
+    /// Noise of the constant-velocity prediction without odometry.
     pub constant_velocity: OdometryNoise,
-    /// Noise of the guess that it stands, where there is none and it is not known how it went.
+    /// Noise of the prediction without odometry while the velocity is unknown.
     pub unknown_velocity: OdometryNoise,
-    /// The likelihood.
+    /// Observation model.
     pub observation: ObservationConfig,
-    /// Its sharpness.
+    /// Annealing of the likelihood.
     pub tempering: TemperingConfig,
-    /// Where particles are drawn while tracking.
+    /// Proposal distribution while tracking.
     pub proposal: ProposalConfig,
     /// Resampling.
     pub resampling: ResamplingConfig,
     /// Number of particles while searching.
     pub kld: KldConfig,
-    /// When a few particles are enough.
+    /// Detection of convergence.
     pub convergence: ConvergenceConfig,
-    /// When the map disagrees.
-    pub vigilance: VigilanceConfig,
+    /// Detection of tracking loss.
+    pub tracking_loss: TrackingLossConfig,
+    /// Search for a start without a pose, and after a loss.
+    pub panorama: PanoramaConfig,
 }
 
 impl Default for LocalizerConfig {
-    /// range-mcl's numbers of particles and threshold of motion.
+    /// Numbers of particles and motion threshold of range-mcl.
     fn default() -> Self {
         Self {
+            sensor: SensorConfig::default(),
             num_particles: 10_000,
             num_reduced: 100,
             move_thres_m: 0.2,
@@ -105,7 +111,8 @@ impl Default for LocalizerConfig {
             resampling: ResamplingConfig::default(),
             kld: KldConfig::default(),
             convergence: ConvergenceConfig::default(),
-            vigilance: VigilanceConfig::default(),
+            tracking_loss: TrackingLossConfig::default(),
+            panorama: PanoramaConfig::default(),
         }
     }
 }
@@ -128,6 +135,6 @@ impl Validate for LocalizerConfig {
         nested("kld", &self.kld)?;
         at_least_one("converge_thres", self.convergence.converge_thres)?;
         nested("convergence", &self.convergence)?;
-        nested("vigilance", &self.vigilance)
+        nested("vigilance", &self.tracking_loss)
     }
 }

@@ -1,23 +1,24 @@
-//! Frames in which the car hardly moved: not weighed, but carried along.
+//! Prediction of frames in which the car hardly moved and whose scan is not used.
 
 use nalgebra::Matrix3;
 
-use super::super::estimate::FrameEstimate;
+use super::super::estimate::Estimate;
 use super::super::motion::{TurnDriveTurn, VelocityCommand};
 use super::super::odometry::Odometry;
-use super::Localizer;
-use crate::map::Stance;
+use super::ParticleFilter;
+use crate::map::SensorAttitude;
 
-impl Localizer<'_> {
-    /// A frame in which the car hardly moved: the last estimate, carried along.
-    pub(super) fn coast(&mut self, odometry: Odometry, stance: &Stance) -> FrameEstimate {
+impl ParticleFilter {
+    /// Moves the last estimate by the motion since the last update.
+    pub(super) fn coast(&mut self, odometry: Odometry, attitude: &SensorAttitude) -> Estimate {
         let mut particles = self.particles.clone();
         particles.propagate(|pose| pose * self.pending);
         let pose = particles.mean();
         let covariance = self.covariance_after_pending(odometry);
-        FrameEstimate {
+        Estimate {
             pose,
-            lifted: self.lift_estimate(&pose, stance).0,
+            map_from_lidar: self.lift_estimate(&pose, attitude).0,
+            attitude: *attitude,
             level_m: self.patch.map(|patch| patch.height_m),
             covariance,
             effective_sample_size: particles.effective_sample_size(),
@@ -30,14 +31,14 @@ impl Localizer<'_> {
         }
     }
 
-    /// Covariance of the last estimate carried along by the motion since then [m², m·rad, rad²]:
+    /// Covariance of the last estimate, propagated by the motion since then [m², m·rad, rad²]:
     ///
     /// ```text
-    /// Σ = J Σ_last Jᵀ + s R N Rᵀ        J: how turns of the last pose move this one
+    /// Σ = J Σ_last Jᵀ + s R N Rᵀ        J: Jacobian of the motion by the last pose
     /// ```
     ///
-    /// N is the noise of one update by its source, in the axes of the car, of which a motion that is due for none
-    /// yet has made the share s: a car that stands becomes no less sure of where it is.
+    /// N is the noise of one update, in the axes of the car, and s the share of the motion that triggers an
+    /// update: a standing car does not lose certainty.
     fn covariance_after_pending(&self, odometry: Odometry) -> Matrix3<f64> {
         let config = &self.config;
         let moved_m = self.pending.translation.vector.norm();
@@ -57,7 +58,7 @@ impl Localizer<'_> {
         rotation
             .fixed_view_mut::<2, 2>(0, 0)
             .copy_from(turn.to_rotation_matrix().matrix());
-        // Thresholds of zero mean that every motion is weighed: nothing is ever pending.
+        // With thresholds of zero every motion triggers an update, and none is ever pending.
         let share = if share.is_finite() {
             share.min(1.0)
         } else {

@@ -1,34 +1,34 @@
-//! Searching, tracking or lost: whether the estimate deserves belief.
+//! Detection of tracking loss.
 //!
-//! Of the beams that reach the map from the estimated pose, how many meet it where it is? That
-//! share is followed by a fast and a slow average,
+//! The share a of beams that agree with the map at the estimate, among those that reach it, is followed
+//! by a fast and a slow average,
 //!
 //! ```text
 //! fast ← fast + α_fast (a − fast)      slow ← slow + α_slow (a − slow)
 //! lost  ⇔  fast < min_agreement  ∨  fast < lost_fraction · slow
 //! ```
 //!
-//! Augmented MCL (Thrun, Burgard and Fox, *Probabilistic Robotics*, 2005, table 8.3) does so with
-//! the likelihood; here traffic in front of the map must not raise an alarm, so that beams that
-//! end before the map are left out.
+//! Augmented MCL (Thrun, Burgard and Fox, *Probabilistic Robotics*, 2005, table 8.3) averages the
+//! likelihood instead; here traffic in front of the map must not raise an alarm, so that beams that
+//! end in front of the map are not counted.
 
 use crate::validation::{InvalidValue, Validate, at_least_one, fraction, positive, require};
 use serde::{Deserialize, Serialize};
 
-/// What the filter believes about itself.
+/// State of the filter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
-    /// The belief is still wide.
+    /// The distribution is still wide.
     Searching,
-    /// The belief is narrow and the map agrees.
+    /// The distribution is narrow and the scan agrees with the map.
     Tracking,
-    /// The belief is narrow and the map disagrees: the estimate is not to be used.
+    /// The scan disagrees with the map: the estimate must not be used.
     Lost,
 }
 
 impl State {
-    /// For people.
+    /// Name of the state in reports.
     pub fn word(self) -> &'static str {
         match self {
             Self::Searching => "searching",
@@ -38,29 +38,28 @@ impl State {
     }
 }
 
-/// When the map disagrees.
+/// Thresholds of the detection.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct VigilanceConfig {
-    /// A beam meets the map where it is within this [m].
+pub struct TrackingLossConfig {
+    /// Largest difference of an agreeing beam [m].
     pub tolerance_m: f32,
     /// Weight of a new frame in the fast average, α_fast.
     pub fast_rate: f64,
     /// Weight of a new frame in the slow average, α_slow.
     pub slow_rate: f64,
-    /// Lost below this share of agreeing beams, whatever is usual here.
+    /// Tracking is lost below this share of agreeing beams (unitless).
     pub min_agreement: f64,
-    /// Lost below this fraction of what is usual here.
+    /// Tracking is lost below this fraction of the slow average (unitless).
     pub lost_fraction: f64,
-    /// Updates without convergence after which the search begins anew.
+    /// Updates without convergence after which the search restarts.
     pub patience: usize,
-    /// Lost, too, where the belief has grown wider than this, as beyond the map, where nothing
-    /// agrees and nothing disagrees: √(σ_x² + σ_y²) [m].
+    /// Tracking is lost where the distribution is wider than this, as outside the map: √(σ_x² + σ_y²) [m].
     pub max_spread_m: f64,
 }
 
-impl Default for VigilanceConfig {
-    /// Our own values.
+impl Default for TrackingLossConfig {
+    /// Values of this project.
     fn default() -> Self {
         Self {
             tolerance_m: 0.3,
@@ -74,7 +73,7 @@ impl Default for VigilanceConfig {
     }
 }
 
-impl Validate for VigilanceConfig {
+impl Validate for TrackingLossConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         positive("tolerance_m", self.tolerance_m)?;
         fraction("fast_rate", self.fast_rate)?;
@@ -95,16 +94,16 @@ impl Validate for VigilanceConfig {
     }
 }
 
-/// The two averages.
+/// Averages of the share of agreeing beams.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Vigilance {
+pub struct AgreementMonitor {
     fast: Option<f64>,
     slow: Option<f64>,
 }
 
-impl Vigilance {
-    /// Follows the agreement of a frame; a frame that cannot tell changes nothing.
-    pub fn observe(&mut self, agreement: Option<f64>, config: &VigilanceConfig) {
+impl AgreementMonitor {
+    /// Updates the averages by the share of a frame; `None` changes nothing.
+    pub fn observe(&mut self, agreement: Option<f64>, config: &TrackingLossConfig) {
         let Some(agreement) = agreement else {
             return;
         };
@@ -116,15 +115,15 @@ impl Vigilance {
         follow(&mut self.slow, config.slow_rate);
     }
 
-    /// Whether the map disagrees with the estimate.
-    pub fn is_lost(&self, config: &VigilanceConfig) -> bool {
+    /// Whether tracking is lost.
+    pub fn is_lost(&self, config: &TrackingLossConfig) -> bool {
         let (Some(fast), Some(slow)) = (self.fast, self.slow) else {
             return false;
         };
         fast < config.min_agreement || fast < config.lost_fraction * slow
     }
 
-    /// The share of agreeing beams that is usual here; `None` before the first frame.
+    /// The slow average; `None` before the first frame.
     pub fn expected(&self) -> Option<f64> {
         self.slow
     }
@@ -135,12 +134,12 @@ mod tests {
     use super::*;
 
     fn after(agreements: &[f64]) -> bool {
-        let config = VigilanceConfig::default();
-        let mut vigilance = Vigilance::default();
+        let config = TrackingLossConfig::default();
+        let mut monitor = AgreementMonitor::default();
         for &agreement in agreements {
-            vigilance.observe(Some(agreement), &config);
+            monitor.observe(Some(agreement), &config);
         }
-        vigilance.is_lost(&config)
+        monitor.is_lost(&config)
     }
 
     #[test]
@@ -161,10 +160,10 @@ mod tests {
 
     #[test]
     fn frames_that_cannot_tell_change_nothing() {
-        let config = VigilanceConfig::default();
-        let mut vigilance = Vigilance::default();
-        vigilance.observe(None, &config);
-        assert_eq!(vigilance, Vigilance::default());
-        assert!(!vigilance.is_lost(&config));
+        let config = TrackingLossConfig::default();
+        let mut monitor = AgreementMonitor::default();
+        monitor.observe(None, &config);
+        assert_eq!(monitor, AgreementMonitor::default());
+        assert!(!monitor.is_lost(&config));
     }
 }

@@ -1,20 +1,18 @@
 //! The filter as a whole, in a street of boxes.
 
-use std::cell::OnceCell;
-
 use approx::assert_relative_eq;
 use nalgebra::Vector2;
 use rand::{SeedableRng, rngs::StdRng};
 
-use super::super::initialization::{Cells, ROAD_HALF_WIDTH_M, StartSpread, around};
+use super::super::initialization::{StartSpread, around, from_panoramas};
 use super::super::motion::OdometryNoise;
 use super::super::observation::ObservationConfig;
 use super::super::odometry::{Odometry, increments, with_noise};
-use super::super::panorama::{PanoramaConfig, Panoramas};
 use super::*;
 use crate::geometry::wrap_angle;
 use crate::lidar::LidarModel;
-use crate::rendering::test_world::TestWorld;
+use crate::map::test_world::TestWorld;
+use crate::map::{PanoramaConfig, SearchRegion};
 
 /// Small enough for a test, else the defaults.
 fn config(num_particles: usize) -> LocalizerConfig {
@@ -58,7 +56,7 @@ fn odometry(truth: &[Pose2], seed: u64) -> Vec<Pose2> {
     )
 }
 
-/// What the filter is told about the motion.
+/// The motion that the filter is given.
 #[derive(Clone, Copy)]
 enum Sense {
     Odometry,
@@ -67,12 +65,12 @@ enum Sense {
 }
 
 fn run(
-    localizer: &mut Localizer<'_>,
+    filter: &mut ParticleFilter,
     world: &TestWorld,
     truth: &[Pose2],
     sense: Sense,
     rng: &mut StdRng,
-) -> Vec<FrameEstimate> {
+) -> Vec<Estimate> {
     let increments = odometry(truth, 99);
     truth
         .iter()
@@ -86,26 +84,23 @@ fn run(
                 }
                 Sense::Nothing => Odometry::Unknown,
             };
-            localizer
-                .step(odometry, &world.scan(pose), &Stance::default(), rng)
+            filter
+                .step(odometry, &world.scan(pose), &SensorAttitude::default(), rng)
                 .unwrap()
         })
         .collect()
 }
 
-fn track(world: &TestWorld, truth: &[Pose2], seed: u64) -> Vec<FrameEstimate> {
+fn track(world: &TestWorld, truth: &[Pose2], seed: u64) -> Vec<Estimate> {
     let mut rng = StdRng::seed_from_u64(seed);
     let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
-    let mut localizer = Localizer::new(
-        config(500),
-        world.surroundings(),
-        ParticleSet::uniform(start),
-    );
-    run(&mut localizer, world, truth, Sense::Odometry, &mut rng)
+    let mut filter =
+        ParticleFilter::new(config(500), world.map(), None, ParticleSet::uniform(start));
+    run(&mut filter, world, truth, Sense::Odometry, &mut rng)
 }
 
 /// Root mean square of position [m] and heading [rad].
-fn rmse(frames: &[FrameEstimate], truth: &[Pose2]) -> (f64, f64) {
+fn rmse(frames: &[Estimate], truth: &[Pose2]) -> (f64, f64) {
     let errors = frames.iter().zip(truth).map(|(frame, truth)| {
         let position = (frame.pose.translation.vector - truth.translation.vector).norm_squared();
         let turn = wrap_angle(frame.pose.rotation.angle() - truth.rotation.angle());
@@ -117,7 +112,7 @@ fn rmse(frames: &[FrameEstimate], truth: &[Pose2]) -> (f64, f64) {
 }
 
 #[test]
-fn from_five_metres_and_thirty_degrees_it_converges_to_centimetres() {
+fn a_start_within_five_metres_and_thirty_degrees_converges_to_centimetres() {
     let world = TestWorld::street();
     let truth = drive(&world, 0.0, 30);
     for seed in 0..3 {
@@ -195,7 +190,7 @@ fn the_same_seed_gives_the_same_bytes_on_one_thread_and_on_two() {
 }
 
 #[test]
-fn without_odometry_it_finds_out_how_fast_the_car_is_and_raises_no_alarm() {
+fn without_odometry_the_speed_is_estimated_and_no_alarm_is_raised() {
     let world = TestWorld::street();
     // Walking pace, a town, a road outside of it: metres per frame.
     for (step_m, seed) in [(0.1, 1), (0.8, 2), (1.9, 3)] {
@@ -208,8 +203,8 @@ fn without_odometry_it_finds_out_how_fast_the_car_is_and_raises_no_alarm() {
         let mut rng = StdRng::seed_from_u64(seed);
         let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
         let start = ParticleSet::uniform(start);
-        let mut localizer = Localizer::new(config(500), world.surroundings(), start);
-        let frames = run(&mut localizer, &world, &truth, Sense::Nothing, &mut rng);
+        let mut filter = ParticleFilter::new(config(500), world.map(), None, start);
+        let frames = run(&mut filter, &world, &truth, Sense::Nothing, &mut rng);
         let (position_m, heading_rad) = rmse(&frames[10..], &truth[10..]);
         assert!(
             position_m < 0.05 && heading_rad.to_degrees() < 0.2,
@@ -222,7 +217,7 @@ fn without_odometry_it_finds_out_how_fast_the_car_is_and_raises_no_alarm() {
 }
 
 #[test]
-fn velocities_of_a_car_that_moves_a_little_sideways_lead_no_farther_aside() {
+fn velocity_commands_of_a_car_that_drifts_sideways_add_no_bias() {
     let world = TestWorld::street();
     // A sensor that is mounted a degree askew: every frame drifts to the same side.
     let truth: Vec<Pose2> = (0..30)
@@ -235,8 +230,8 @@ fn velocities_of_a_car_that_moves_a_little_sideways_lead_no_farther_aside() {
         let mut rng = StdRng::seed_from_u64(4);
         let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
         let start = ParticleSet::uniform(start);
-        let mut localizer = Localizer::new(config(500), world.surroundings(), start);
-        run(&mut localizer, &world, &truth, Sense::Velocity, &mut rng)
+        let mut filter = ParticleFilter::new(config(500), world.map(), None, start);
+        run(&mut filter, &world, &truth, Sense::Velocity, &mut rng)
     };
     let aside: f64 = frames[10..]
         .iter()
@@ -247,24 +242,21 @@ fn velocities_of_a_car_that_moves_a_little_sideways_lead_no_farther_aside() {
 }
 
 #[test]
-fn a_car_that_stands_is_not_weighed_and_its_belief_does_not_spread() {
+fn a_standing_car_is_not_updated_and_its_distribution_does_not_spread() {
     let world = TestWorld::street();
     let truth = drive(&world, 0.0, 10);
     let mut rng = StdRng::seed_from_u64(5);
     let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
-    let mut localizer = Localizer::new(
-        config(500),
-        world.surroundings(),
-        ParticleSet::uniform(start),
-    );
-    let last = run(&mut localizer, &world, &truth, Sense::Odometry, &mut rng)
+    let mut filter =
+        ParticleFilter::new(config(500), world.map(), None, ParticleSet::uniform(start));
+    let last = run(&mut filter, &world, &truth, Sense::Odometry, &mut rng)
         .pop()
         .unwrap();
     let scan = world.scan(&truth[9]);
     for _ in 0..20 {
         let creep = Odometry::Increment(Pose2::translation(0.001, 0.0));
-        let frame = localizer
-            .step(creep, &scan, &Stance::default(), &mut rng)
+        let frame = filter
+            .step(creep, &scan, &SensorAttitude::default(), &mut rng)
             .unwrap();
         assert!(!frame.updated);
         // Two centimetres are a tenth of an update, with a tenth of its variance.
@@ -298,18 +290,18 @@ fn a_car_that_creeps_is_as_unsure_as_what_tells_its_motion() {
     ] {
         // All alike: what they are unsure of is the motion.
         let start = ParticleSet::uniform([truth; 3]);
-        let mut localizer = Localizer::new(config.clone(), world.surroundings(), start);
-        let (scan, stance) = (world.scan(&truth), Stance::default());
+        let mut filter = ParticleFilter::new(config.clone(), world.map(), None, start);
+        let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
         let mut rng = StdRng::seed_from_u64(1);
-        localizer.step(odometry, &scan, &stance, &mut rng).unwrap();
-        let frame = localizer.step(odometry, &scan, &stance, &mut rng).unwrap();
+        filter.step(odometry, &scan, &attitude, &mut rng).unwrap();
+        let frame = filter.step(odometry, &scan, &attitude, &mut rng).unwrap();
         assert!(!frame.updated);
         assert_relative_eq!(frame.covariance, 0.01 * noise, epsilon = 1e-9);
     }
 }
 
 #[test]
-fn across_a_border_of_tiles_it_knows_how_fast_the_car_is() {
+fn the_speed_is_known_across_a_border_of_tiles() {
     let world = TestWorld::street();
     let config = config(500);
     let border = Vector2::new(50.0, 0.2);
@@ -326,54 +318,49 @@ fn across_a_border_of_tiles_it_knows_how_fast_the_car_is() {
     let mut rng = StdRng::seed_from_u64(3);
     let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
     let start = ParticleSet::uniform(start);
-    let mut localizer = Localizer::new(config, world.surroundings(), start);
-    run(
-        &mut localizer,
-        &world,
-        &truth[..10],
-        Sense::Nothing,
-        &mut rng,
-    );
+    let mut filter = ParticleFilter::new(config, world.map(), None, start);
+    run(&mut filter, &world, &truth[..10], Sense::Nothing, &mut rng);
     for frame in 10..truth.len() {
         let scan = world.scan(&truth[frame]);
-        localizer
-            .step(Odometry::Unknown, &scan, &Stance::default(), &mut rng)
+        filter
+            .step(
+                Odometry::Unknown,
+                &scan,
+                &SensorAttitude::default(),
+                &mut rng,
+            )
             .unwrap();
-        let found_m = localizer.last_increment.unwrap().translation.x;
+        let found_m = filter.last_increment.unwrap().translation.x;
         let step_m = (truth[frame - 1].inverse() * truth[frame]).translation.x;
         assert_relative_eq!(found_m, step_m, epsilon = 0.08);
     }
 }
 
-fn panoramas(world: &TestWorld) -> Panoramas<'_> {
-    let config = PanoramaConfig::default();
-    Panoramas {
-        cells: Cells::along_road(&world.road(), ROAD_HALF_WIDTH_M, config.cell_m),
-        surroundings: world.surroundings(),
+fn panoramas() -> PanoramaRequest {
+    PanoramaRequest {
+        region: SearchRegion::Road,
         lidar: LidarModel::default(),
-        height_m: 1.73,
-        config,
-        index: OnceCell::new(),
+        sensor_height_m: 1.73,
+        config: PanoramaConfig::default(),
     }
 }
 
 #[test]
-fn carried_elsewhere_it_notices_within_five_frames_and_finds_itself_again() {
+fn a_kidnapped_car_is_noticed_within_five_frames_and_localized_again() {
     let world = TestWorld::street();
-    let index = panoramas(&world);
-    let surroundings = Surroundings {
-        panoramas: Some(&index),
-        ..world.surroundings()
-    };
     let before = drive(&world, -30.0, 12);
     let after = drive(&world, 47.0, 25);
     let mut rng = StdRng::seed_from_u64(6);
     let start = around(&before[0], 500, &StartSpread::default(), &mut rng);
-    let mut localizer = Localizer::new(config(500), surroundings, ParticleSet::uniform(start));
-    let frames = run(&mut localizer, &world, &before, Sense::Odometry, &mut rng);
+    let mut filter = ParticleFilter::new(
+        config(500),
+        world.map(),
+        Some(panoramas()),
+        ParticleSet::uniform(start),
+    );
+    let frames = run(&mut filter, &world, &before, Sense::Odometry, &mut rng);
     assert_eq!(frames.last().unwrap().state, State::Tracking);
-    assert!(index.index.get().is_none(), "rendered without need");
-    let frames = run(&mut localizer, &world, &after, Sense::Odometry, &mut rng);
+    let frames = run(&mut filter, &world, &after, Sense::Odometry, &mut rng);
     let noticed = frames.iter().position(|frame| frame.state == State::Lost);
     assert!(noticed.is_some_and(|frame| frame < 5), "{noticed:?}");
     let (position_m, heading_rad) = rmse(&frames[20..], &after[20..]);
@@ -385,32 +372,37 @@ fn carried_elsewhere_it_notices_within_five_frames_and_finds_itself_again() {
 }
 
 #[test]
-fn who_has_just_begun_anew_says_how_little_it_knows_also_where_it_stands_still() {
+fn after_a_restart_the_covariance_is_that_of_the_particles_also_for_a_standing_car() {
     let world = TestWorld::street();
-    let index = panoramas(&world);
-    let surroundings = Surroundings {
-        panoramas: Some(&index),
-        ..world.surroundings()
-    };
     let before = drive(&world, -30.0, 12);
     let mut rng = StdRng::seed_from_u64(6);
     let start = around(&before[0], 500, &StartSpread::default(), &mut rng);
-    let mut localizer = Localizer::new(config(500), surroundings, ParticleSet::uniform(start));
-    run(&mut localizer, &world, &before, Sense::Odometry, &mut rng);
+    let mut filter = ParticleFilter::new(
+        config(500),
+        world.map(),
+        Some(panoramas()),
+        ParticleSet::uniform(start),
+    );
+    run(&mut filter, &world, &before, Sense::Odometry, &mut rng);
     let after = drive(&world, 47.0, 8);
     let lost = after.iter().find(|pose| {
         let odometry = Odometry::Increment(Pose2::translation(0.8, 0.0));
-        let frame = localizer
-            .step(odometry, &world.scan(pose), &Stance::default(), &mut rng)
+        let frame = filter
+            .step(
+                odometry,
+                &world.scan(pose),
+                &SensorAttitude::default(),
+                &mut rng,
+            )
             .unwrap();
         frame.state == State::Lost
     });
     let stays = Odometry::Increment(Pose2::identity());
-    let frame = localizer
+    let frame = filter
         .step(
             stays,
             &world.scan(lost.unwrap()),
-            &Stance::default(),
+            &SensorAttitude::default(),
             &mut rng,
         )
         .unwrap();
@@ -421,24 +413,21 @@ fn who_has_just_begun_anew_says_how_little_it_knows_also_where_it_stands_still()
 }
 
 #[test]
-fn it_finds_itself_from_nowhere() {
+fn a_start_anywhere_converges() {
     let world = TestWorld::street();
-    let index = panoramas(&world);
+    let index = world.map().panoramas(&panoramas()).unwrap();
     for (seed, from_x) in [(1, -40.0), (2, 3.3), (3, 71.7)] {
         let truth = drive(&world, from_x, 20);
         let mut rng = StdRng::seed_from_u64(seed);
-        let start = index.index().unwrap().sample(
-            &world.scan(&truth[0]),
-            &Stance::default(),
-            1000,
-            &mut rng,
+        let scan = world.scan(&truth[0]);
+        let start = from_panoramas(&index, &scan, &SensorAttitude::default(), 1000, &mut rng);
+        let mut filter = ParticleFilter::new(
+            config(1000),
+            world.map(),
+            Some(panoramas()),
+            ParticleSet::uniform(start),
         );
-        let surroundings = Surroundings {
-            panoramas: Some(&index),
-            ..world.surroundings()
-        };
-        let mut localizer = Localizer::new(config(1000), surroundings, ParticleSet::uniform(start));
-        let frames = run(&mut localizer, &world, &truth, Sense::Odometry, &mut rng);
+        let frames = run(&mut filter, &world, &truth, Sense::Odometry, &mut rng);
         let (position_m, heading_rad) = rmse(&frames[15..], &truth[15..]);
         assert!(
             position_m < 0.05 && heading_rad.to_degrees() < 0.2,
@@ -461,52 +450,49 @@ fn a_lorry_beside_the_car_raises_no_alarm() {
         ..StartSpread::default()
     };
     let start = ParticleSet::uniform(around(&truth[0], 500, &start, &mut rng));
-    let mut localizer = Localizer::new(config(500), map.surroundings(), start);
-    let frames = run(&mut localizer, &seen, &truth, Sense::Odometry, &mut rng);
+    let mut filter = ParticleFilter::new(config(500), map.map(), None, start);
+    let frames = run(&mut filter, &seen, &truth, Sense::Odometry, &mut rng);
     let (position_m, _) = rmse(&frames[10..], &truth[10..]);
     assert!(position_m < 0.05, "{position_m}");
     assert!(frames.iter().all(|frame| frame.state != State::Lost));
 }
 
 #[test]
-fn particles_that_are_nowhere_on_the_map_do_no_harm() {
+fn particles_off_the_map_do_no_harm() {
     let world = TestWorld::street();
     let truth = world.pose_at(0.0, 0.0, 0.0);
     let nowhere = Pose2::translation(1e6, f64::MAX.sqrt());
     let start = ParticleSet::uniform([nowhere, truth, nowhere]);
-    let mut localizer = Localizer::new(config(3), world.surroundings(), start);
+    let mut filter = ParticleFilter::new(config(3), world.map(), None, start);
     let mut rng = StdRng::seed_from_u64(1);
     let scan = world.scan(&truth);
     let odometry = Odometry::Increment(Pose2::identity());
-    let frame = localizer
-        .step(odometry, &scan, &Stance::default(), &mut rng)
+    let frame = filter
+        .step(odometry, &scan, &SensorAttitude::default(), &mut rng)
         .unwrap();
     assert!(frame.mean_cost_m.is_some());
     let start = ParticleSet::uniform([nowhere; 3]);
-    let mut localizer = Localizer::new(config(3), world.surroundings(), start);
-    let frame = localizer
-        .step(odometry, &scan, &Stance::default(), &mut rng)
+    let mut filter = ParticleFilter::new(config(3), world.map(), None, start);
+    let frame = filter
+        .step(odometry, &scan, &SensorAttitude::default(), &mut rng)
         .unwrap();
     assert_eq!(frame.mean_cost_m, None);
     assert_ne!(frame.state, State::Tracking);
 }
 
 #[test]
-fn a_scan_without_returns_changes_nothing_and_breaks_nothing() {
+fn a_scan_without_returns_changes_nothing() {
     let world = TestWorld::street();
     let truth = drive(&world, 0.0, 10);
     let mut rng = StdRng::seed_from_u64(9);
     let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
-    let mut localizer = Localizer::new(
-        config(500),
-        world.surroundings(),
-        ParticleSet::uniform(start),
-    );
-    run(&mut localizer, &world, &truth, Sense::Odometry, &mut rng);
+    let mut filter =
+        ParticleFilter::new(config(500), world.map(), None, ParticleSet::uniform(start));
+    run(&mut filter, &world, &truth, Sense::Odometry, &mut rng);
     let empty = RangeImage::project(&[], &LidarModel::default());
     let step = Odometry::Increment(Pose2::translation(0.8, 0.0));
-    let frame = localizer
-        .step(step, &empty, &Stance::default(), &mut rng)
+    let frame = filter
+        .step(step, &empty, &SensorAttitude::default(), &mut rng)
         .unwrap();
     assert_relative_eq!(frame.pose.translation.x, 8.0, epsilon = 0.1);
     assert_eq!(frame.agreement, None);
@@ -519,19 +505,16 @@ fn where_nothing_can_be_seen_it_does_not_go_on_saying_that_it_knows() {
     let truth = drive(&world, 0.0, 8);
     let mut rng = StdRng::seed_from_u64(9);
     let start = around(&truth[0], 300, &StartSpread::default(), &mut rng);
-    let mut localizer = Localizer::new(
-        config(300),
-        world.surroundings(),
-        ParticleSet::uniform(start),
-    );
-    let frames = run(&mut localizer, &world, &truth, Sense::Odometry, &mut rng);
+    let mut filter =
+        ParticleFilter::new(config(300), world.map(), None, ParticleSet::uniform(start));
+    let frames = run(&mut filter, &world, &truth, Sense::Odometry, &mut rng);
     assert_eq!(frames.last().unwrap().state, State::Tracking);
     let nothing = RangeImage::project(&[], &LidarModel::default());
     let step = Odometry::Increment(Pose2::translation(2.0, 0.0));
     let mut after_m = 0.0;
-    while localizer.state() == State::Tracking {
-        localizer
-            .step(step, &nothing, &Stance::default(), &mut rng)
+    while filter.state() == State::Tracking {
+        filter
+            .step(step, &nothing, &SensorAttitude::default(), &mut rng)
             .unwrap();
         after_m += 2.0;
         assert!(after_m < 600.0, "still sure after {after_m} m in the dark");

@@ -1,30 +1,28 @@
-//! A map against the true surface, where that is known, as in a simulation.
+//! Accuracy and completeness of a map against the true surface, where it is known, as in simulations.
 //!
 //! ```text
 //! accuracy     = share of the map's area within 10 cm of the truth
-//! completeness = share of the truth that scans have seen within 10 cm of the map
+//! completeness = share of the visible truth within 10 cm of the map
 //! F            = 2 · accuracy · completeness / (accuracy + completeness)
 //! ```
 //!
-//! Knapitsch et al., *Tanks and Temples*, ACM TOG 36(4), 2017. Nobody can map what was never in
-//! view, so the truth is what the beams of the mapping scans would meet without noise and without
-//! traffic.
+//! Knapitsch et al., *Tanks and Temples*, ACM TOG 36(4), 2017. The visible truth is what the beams of the
+//! mapping scans would meet without noise and without traffic.
 
 use std::collections::HashSet;
 
 use glam::{IVec3, Vec3};
 use serde::Serialize;
 
-use super::quality::NEAR_M;
-use super::scan_cloud::ScanSettings;
+use super::map_quality::NEAR_M;
 use super::surface_distance::distances_m;
-use crate::geometry::{Rigid3f, TriangleMesh};
+use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
+use crate::map::scan_cloud::ScanConfig;
 use crate::raycasting::{Hit, Scene};
-use crate::recording::Frame;
 
-/// The truth is judged at one point per voxel of this edge [m].
+/// Voxel size of the sampling of the truth [m].
 const VOXEL_M: f32 = 0.1;
-/// One point of the map is judged per so much of its area [m²].
+/// Area of the map per sample [m²].
 const AREA_M2: f32 = 0.01;
 
 /// Agreement of a map with the true surface.
@@ -41,15 +39,15 @@ pub struct TruthAgreement {
 }
 
 impl TruthAgreement {
-    /// Compares a map with the truth, both in the map frame, that `frames` have seen inside the crop
-    /// box of the settings; `None` where either is empty.
+    /// Compares a map with the truth that is visible from `map_from_lidar` inside the crop box, both in
+    /// the map frame; `None` where either is empty.
     pub fn of(
         mesh: &TriangleMesh,
         truth: &TriangleMesh,
-        frames: &[Frame],
-        settings: &ScanSettings,
+        map_from_lidar: &[Pose3],
+        settings: &ScanConfig,
     ) -> Option<Self> {
-        let seen = seen_points(truth, frames, settings);
+        let seen = visible_points(truth, map_from_lidar, settings);
         let samples = samples(mesh);
         if seen.is_empty() || samples.is_empty() {
             return None;
@@ -67,22 +65,22 @@ impl TruthAgreement {
     }
 }
 
-/// The distances of the points that are near a mesh.
+/// Distances of the points that are near a mesh.
 fn near_distances(points: &[Vec3], mesh: &TriangleMesh) -> Vec<f32> {
     let mut distances = distances_m(points, mesh, NEAR_M);
     distances.retain(|distance_m| distance_m.is_finite());
     distances
 }
 
-/// What the beams at the pixels of the frames' range images meet, thinned.
-fn seen_points(truth: &TriangleMesh, frames: &[Frame], settings: &ScanSettings) -> Vec<Vec3> {
+/// Points where the beams of the pixels meet the truth, one per voxel.
+fn visible_points(truth: &TriangleMesh, poses: &[Pose3], settings: &ScanConfig) -> Vec<Vec3> {
     let scene = Scene::new(truth);
     let model = &settings.range_image;
     let in_lidar = model.directions();
     let mut taken = HashSet::new();
     let mut seen = Vec::new();
-    for frame in frames {
-        let map_from_lidar = Rigid3f::from(&frame.map_from_lidar);
+    for pose in poses {
+        let map_from_lidar = Rigid3f::from(pose);
         let directions: Vec<Vec3> = in_lidar
             .iter()
             .map(|&direction| map_from_lidar.rotate(direction))
@@ -147,7 +145,6 @@ fn samples(mesh: &TriangleMesh) -> Vec<Vec3> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::Pose3;
 
     /// A floor of 20 m x `width_m` at a height, in two triangles.
     fn floor(width_m: f32, z: f32) -> TriangleMesh {
@@ -164,15 +161,8 @@ mod tests {
     }
 
     fn agreement(mesh: &TriangleMesh) -> TruthAgreement {
-        let frame = Frame {
-            number: 0,
-            scan_path: String::new().into(),
-            time_s: 0.0,
-            map_from_lidar: Pose3::identity(),
-            sweep: None,
-        };
         let truth = floor(10.0, -1.7);
-        TruthAgreement::of(mesh, &truth, &[frame], &ScanSettings::default()).unwrap()
+        TruthAgreement::of(mesh, &truth, &[Pose3::identity()], &ScanConfig::default()).unwrap()
     }
 
     #[test]

@@ -1,16 +1,16 @@
-//! How good a map is, along the beams of scans that did not build it.
+//! Quality of a map along the beams of scans that it was not built from.
 //!
-//! A map whose points all lie on surfaces can still be useless: what counts is what a beam
-//! from the sensor meets first. For every beam
+//! A map whose surfaces pass through all points can still be useless: what counts is the first surface
+//! that a beam from the sensor meets. For every beam
 //!
 //! ```text
 //! residual   = mapped range − measured range
-//! beam-plane = |residual| · |cos(incidence)|      the distance to the plane that was hit
+//! beam-plane = |residual| · |cos(incidence)|      the distance to the plane of the triangle hit
 //! ```
 //!
-//! early: residual < −0.5 m (ghosts, trails, invented surfaces); late: > 0.5 m (a moving object in
-//! the scan, or a hole); miss: nothing there. Beside it stands the distance of the returns to the
-//! nearest surface, which says whether the world is in the map at all.
+//! early: residual < −0.5 m (ghosts, trails, extrapolated surfaces); late: > 0.5 m (a moving object in
+//! the scan, or a hole); miss: no surface. The distance of the returns to the nearest surface shows
+//! how much of the world is in the map.
 
 use std::collections::HashMap;
 
@@ -18,33 +18,33 @@ use glam::{IVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::scan_cloud::ScanSettings;
 use super::surface_distance::distances_m;
-use crate::geometry::{Rigid3f, TriangleMesh};
+use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
+use crate::lidar::Scan;
+use crate::map::scan_cloud::ScanConfig;
 use crate::raycasting::{Hit, Scene};
-use crate::recording::{Frame, RecordingError};
 
 /// A residual beyond this is early or late [m].
 const GROSS_M: f32 = 0.5;
 /// A distance below this counts as "within", here and against the truth [m].
 pub(super) const NEAR_M: f32 = 0.1;
-/// Beams shorter than this are the own car's surroundings and not judged [m].
+/// Shorter beams are not evaluated [m].
 const NEAREST_M: f32 = 3.0;
 /// Edge of the cells in which residuals are averaged for a picture [m].
 const PICTURE_CELL_M: f32 = 0.5;
-/// Every how manieth beam is judged.
+/// One of so many beams is evaluated.
 const BEAM_STEP: usize = 7;
 
-/// Shares of all judged beams (unitless), and medians over those that hit [m].
+/// Shares of all evaluated beams (unitless), and medians over those that hit [m].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct MapQuality {
-    /// Judged beams.
+    /// Number of evaluated beams.
     pub beams: usize,
-    /// Share stopped half a metre or more too early.
+    /// Share stopped more than 0.5 m too early.
     pub early: f64,
-    /// Share stopped half a metre or more too late.
+    /// Share stopped more than 0.5 m too late.
     pub late: f64,
-    /// Share that meets nothing.
+    /// Share that meets no surface.
     pub miss: f64,
     /// Median distance to the plane that was hit [m].
     pub beam_plane_median_m: f64,
@@ -60,32 +60,34 @@ pub struct MapQuality {
     pub bias_m: f64,
 }
 
-/// A judged beam.
+/// An evaluated beam.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BeamResidual {
     /// Where the beam was returned, map frame.
     pub point_in_map: Vec3,
-    /// Mapped minus measured range [m]; infinite where the map has nothing.
+    /// Mapped minus measured range [m]; infinite where the map has no surface.
     pub residual_m: f32,
     /// |residual| times cosine of incidence [m].
     pub beam_plane_m: f32,
     /// Distance of the return to the nearest surface [m]; infinite if over 10 cm.
     pub point_m: f32,
-    /// Where the map stops the beam, map frame; `None` where it has nothing.
+    /// Where the map stops the beam, map frame; `None` where it has no surface.
     pub stopped_at: Option<Vec3>,
 }
 
-/// Judges a map along the beams of frames, inside the crop box of the settings.
-pub fn residuals(
+/// Compares a map with `count` scans and their poses, inside the crop box. `read` gives them by index,
+/// from any thread.
+pub fn residuals<E: Send>(
     mesh: &TriangleMesh,
-    frames: &[Frame],
-    settings: &ScanSettings,
-) -> Result<Vec<BeamResidual>, RecordingError> {
+    count: usize,
+    read: impl Fn(usize) -> Result<(Scan, Pose3), E> + Sync,
+    settings: &ScanConfig,
+) -> Result<Vec<BeamResidual>, E> {
     let scene = Scene::new(mesh);
-    let per_frame = frames
-        .par_iter()
-        .map(|frame| {
-            let mut scan = frame.read()?;
+    let per_scan = (0..count)
+        .into_par_iter()
+        .map(|index| {
+            let (mut scan, map_from_lidar) = read(index)?;
             scan.drop_invalid(&settings.range_image);
             let points: Vec<Vec3> = scan
                 .points
@@ -94,11 +96,15 @@ pub fn residuals(
                 .step_by(BEAM_STEP)
                 .filter(|point| point.abs().cmplt(settings.crop_m).all())
                 .collect();
-            let map_from_lidar = Rigid3f::from(&frame.map_from_lidar);
-            Ok(judge(mesh, &scene, &map_from_lidar, &points))
+            Ok(compare(
+                mesh,
+                &scene,
+                &Rigid3f::from(&map_from_lidar),
+                &points,
+            ))
         })
-        .collect::<Result<Vec<_>, RecordingError>>()?;
-    let mut beams: Vec<BeamResidual> = per_frame.into_iter().flatten().collect();
+        .collect::<Result<Vec<_>, E>>()?;
+    let mut beams: Vec<BeamResidual> = per_scan.into_iter().flatten().collect();
     let points: Vec<Vec3> = beams.iter().map(|beam| beam.point_in_map).collect();
     for (beam, point_m) in beams.iter_mut().zip(distances_m(&points, mesh, NEAR_M)) {
         beam.point_m = point_m;
@@ -106,9 +112,8 @@ pub fn residuals(
     Ok(beams)
 }
 
-/// Per vertex the mean distance of beams to the plane that they hit around it, for a picture [m];
-/// not a number where no beam was judged. A beam that is far too early or too late counts as
-/// half a metre.
+/// Returns per vertex the mean beam-plane distance around it, for a picture [m]; NaN where no beam was
+/// evaluated. Gross residuals count as 0.5 m.
 pub fn vertex_residuals(mesh: &TriangleMesh, beams: &[BeamResidual]) -> Vec<f32> {
     let cell_of = |point: Vec3| (point / PICTURE_CELL_M).floor().as_ivec3();
     let mut cells: HashMap<IVec3, (f32, f32)> = HashMap::new();
@@ -129,7 +134,7 @@ pub fn vertex_residuals(mesh: &TriangleMesh, beams: &[BeamResidual]) -> Vec<f32>
         .collect()
 }
 
-fn judge(
+fn compare(
     mesh: &TriangleMesh,
     scene: &Scene,
     map_from_lidar: &Rigid3f,
@@ -168,7 +173,7 @@ fn judge(
 }
 
 impl MapQuality {
-    /// Sums residuals up; `None` without any.
+    /// Summarizes residuals; `None` without any.
     pub fn of(residuals: &[BeamResidual]) -> Option<Self> {
         let hits: Vec<&BeamResidual> = residuals
             .iter()
@@ -227,7 +232,7 @@ mod tests {
     fn judged(wall_x: f32, points: &[Vec3]) -> MapQuality {
         let mesh = wall(wall_x);
         let identity = Rigid3f::from(&crate::geometry::Pose3::identity());
-        MapQuality::of(&judge(&mesh, &Scene::new(&mesh), &identity, points)).unwrap()
+        MapQuality::of(&compare(&mesh, &Scene::new(&mesh), &identity, points)).unwrap()
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Where in the map the car may be, without a guess: one panorama per place scores all headings.
+//! Place recognition without an initial guess: one panorama per place scores all headings.
 //!
 //! A panorama is rendered once per cell of the road, level over the ground, heading along x. A car
 //! there with heading θ sees the same panorama shifted,
@@ -8,29 +8,24 @@
 //! θ = 2π s / width
 //! ```
 //!
-//! so that every heading costs one comparison and no rendering. First all cells at a part of the
-//! columns and headings, then the best of them at all. The memory is 4 · rows · columns bytes per
+//! so that every heading costs one comparison and no rendering. The first pass compares all cells at a
+//! part of the columns and headings, the second the best of them at all. The memory is 4 · rows · columns bytes per
 //! cell: with the defaults 4.3 kB, 12 MB for 700 m of road in cells of one metre. Where roads cross
 //! above one another, a cell has a panorama on each level.
 
-use std::cell::OnceCell;
-use std::f32::consts::{PI, TAU};
+use std::f32::consts::TAU;
 
 use glam::Vec3;
 use nalgebra::Point2;
-use rand::{Rng, RngExt as _};
-use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::initialization::{Cells, uniform_in_cell};
-use super::localizer::Surroundings;
-use super::particles::Hypothesis;
-use super::resampling::systematic;
-use crate::geometry::{Pose2, Pose3, Rigid3f, wrap_angle};
+use super::cells::{Cells, ROAD_HALF_WIDTH_M};
+use super::elevation::{GroundMap, SensorAttitude};
+use super::tiles::TileGrid;
+use crate::geometry::{Pose2, Pose3, Rigid3f, pose2_from_pose3, wrap_angle};
 use crate::lidar::{LidarModel, RangeImage};
-use crate::map::Stance;
-use crate::rendering::RenderError;
+use crate::rendering::{RangeRenderer, RenderError};
 use crate::validation::{InvalidValue, Validate, fraction, in_range, positive, require};
 
 /// Size of the panoramas and of the search.
@@ -94,55 +89,60 @@ impl Validate for PanoramaConfig {
     }
 }
 
-/// What the map looks like from every cell.
+/// Part of the map in which a search begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SearchRegion {
+    /// The road that was mapped: within 2 m of the mapping poses.
+    Road,
+    /// All ground of the map.
+    Anywhere,
+}
+
+/// The panoramas that a search needs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PanoramaRequest {
+    /// Where they are.
+    pub region: SearchRegion,
+    /// Sensor whose scans will be searched for.
+    pub lidar: LidarModel,
+    /// Height of that sensor above the ground [m].
+    pub sensor_height_m: f64,
+    /// Size of the panoramas and of the search.
+    pub config: PanoramaConfig,
+}
+
+impl PanoramaRequest {
+    /// Returns the cells of the region in a map.
+    pub fn cells(&self, path: &[Pose3], tiles: &TileGrid, ground: &GroundMap) -> Cells {
+        let cell_m = self.config.cell_m;
+        match self.region {
+            SearchRegion::Road => {
+                let poses: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
+                Cells::along_road(&poses, ROAD_HALF_WIDTH_M, cell_m)
+            }
+            SearchRegion::Anywhere => Cells::over_map(tiles, ground, cell_m),
+        }
+    }
+}
+
+/// Panoramas of the map from every cell.
 #[derive(Clone, Debug)]
 pub struct PanoramaIndex {
-    config: PanoramaConfig,
-    model: LidarModel,
-    /// Cells that are on the map: middle and height of the ground [m].
+    /// Size of the panoramas and of the search.
+    pub config: PanoramaConfig,
+    /// Projection of the panoramas.
+    pub model: LidarModel,
+    /// Side of a cell [m].
+    pub cell_m: f64,
+    /// Cells that are on the map: centre and height of the ground [m].
     places: Vec<(Point2<f64>, f64)>,
-    cell_m: f64,
     /// One panorama per cell, row-major; [`FAR_M`] where there is no surface.
     images: Vec<Vec<f32>>,
 }
 
-/// Panoramas that are rendered when they are first asked for: a filter that knows where it begins
-/// and is never lost needs none.
-pub struct Panoramas<'a> {
-    /// The places, and what is rendered there.
-    pub cells: Cells,
-    /// The map; its own panoramas are not asked for.
-    pub surroundings: Surroundings<'a>,
-    /// The sensor whose scans will be looked up.
-    pub lidar: LidarModel,
-    /// Its height over the road [m].
-    pub height_m: f64,
-    /// Size of the panoramas and of the search.
-    pub config: PanoramaConfig,
-    /// Empty until asked for.
-    pub index: OnceCell<PanoramaIndex>,
-}
-
-impl Panoramas<'_> {
-    /// The panoramas, rendered now if they were not yet.
-    pub fn index(&self) -> Result<&PanoramaIndex, RenderError> {
-        if let Some(index) = self.index.get() {
-            return Ok(index);
-        }
-        let index = PanoramaIndex::build(
-            &self.cells,
-            &self.surroundings,
-            &self.lidar,
-            self.height_m,
-            &self.config,
-        )?;
-        Ok(self.index.get_or_init(|| index))
-    }
-}
-
 /// A place where the car may be.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Seed {
+pub struct PanoramaSeed {
     /// Middle of the cell [m].
     pub center: Point2<f64>,
     /// Height of the ground there [m].
@@ -157,23 +157,21 @@ pub struct Seed {
 const FAR_M: f32 = 1e9;
 
 impl PanoramaIndex {
-    /// Renders the panoramas of all cells that are on the map. `lidar` is the sensor whose scans
-    /// will be looked up, `height_m` its height over the road.
+    /// Renders the panoramas of all cells that are on the map.
     pub fn build(
         cells: &Cells,
-        surroundings: &Surroundings<'_>,
-        lidar: &LidarModel,
-        height_m: f64,
-        config: &PanoramaConfig,
+        renderer: &dyn RangeRenderer,
+        ground: &GroundMap,
+        tiles: &TileGrid,
+        request: &PanoramaRequest,
     ) -> Result<Self, RenderError> {
-        /// Panoramas per call: what a renderer makes at once is kept only as thumbnails.
+        /// Panoramas rendered per call.
         const BATCH: usize = 512;
-        let upright = Stance {
-            height_m,
+        let upright = SensorAttitude {
+            height_m: request.sensor_height_m,
             roll_rad: 0.0,
             pitch_rad: 0.0,
         };
-        let Surroundings { ground, tiles, .. } = surroundings;
         let on_map = |center: &&Point2<f64>| {
             let pose = Pose2::from(center.coords);
             tiles.valid_tile_of(&pose).is_some()
@@ -187,16 +185,16 @@ impl PanoramaIndex {
         };
         let (places, poses): (Vec<(Point2<f64>, f64)>, Vec<Pose3>) =
             cells.centers.iter().filter(on_map).flat_map(levels).unzip();
-        let model = panorama_model(lidar, config);
+        let model = panorama_model(&request.lidar, &request.config);
         let mut images = Vec::with_capacity(poses.len());
         for batch in poses.chunks(BATCH) {
-            for mut image in surroundings.renderer.render(batch, &model)? {
+            for mut image in renderer.render(batch, &model)? {
                 image.iter_mut().for_each(|range| *range = range.min(FAR_M));
                 images.push(image);
             }
         }
         Ok(Self {
-            config: config.clone(),
+            config: request.config.clone(),
             model,
             places,
             cell_m: cells.cell_m,
@@ -220,8 +218,8 @@ impl PanoramaIndex {
     }
 
     /// The best heading of the cells that may be where the scan was taken, best cell first.
-    pub fn search(&self, scan: &RangeImage, stance: &Stance) -> Vec<Seed> {
-        let scan = DoubledScan::new(scan, stance, &self.model);
+    pub fn search(&self, scan: &RangeImage, attitude: &SensorAttitude) -> Vec<PanoramaSeed> {
+        let scan = DoubledScan::new(scan, attitude, &self.model);
         let step = self.config.coarse_step.max(1);
         let coarse_scan = scan.thinned(step);
         let limit_m = self.config.limit_m;
@@ -237,11 +235,11 @@ impl PanoramaIndex {
         coarse.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         let kept = (self.config.refined_share * coarse.len() as f64).ceil() as usize;
         coarse.truncate(kept.max(1));
-        let mut seeds: Vec<Seed> = coarse
+        let mut seeds: Vec<PanoramaSeed> = coarse
             .par_iter()
             .map(|&(_, cell)| {
                 let (cost_m, shift) = best_shift(&self.images[cell], &scan, limit_m);
-                Seed {
+                PanoramaSeed {
                     center: self.places[cell].0,
                     level_m: self.places[cell].1,
                     heading_rad: wrap_angle(
@@ -254,47 +252,6 @@ impl PanoramaIndex {
         // Stable: cells that cost the same stay in their order.
         seeds.sort_by(|a, b| a.cost_m.total_cmp(&b.cost_m));
         seeds
-    }
-
-    /// Hypotheses in the cells of the search, the more the better a cell fits. None without cells.
-    pub fn sample(
-        &self,
-        scan: &RangeImage,
-        stance: &Stance,
-        count: usize,
-        rng: &mut impl Rng,
-    ) -> Vec<Hypothesis> {
-        let seeds = self.search(scan, stance);
-        let Some(best) = seeds.first() else {
-            return Vec::new();
-        };
-        let best_m = best.cost_m;
-        let mut weights: Vec<f64> = seeds
-            .iter()
-            .map(|seed| ((best_m - seed.cost_m) / self.config.scale_m).exp())
-            .collect();
-        let sum: f64 = weights.iter().sum();
-        weights.iter_mut().for_each(|weight| *weight /= sum);
-        let half_column_rad = f64::from(PI) / self.model.width as f64;
-        systematic(&weights, count, rng)
-            .into_iter()
-            .map(|seed| {
-                let Seed {
-                    center,
-                    level_m,
-                    heading_rad,
-                    ..
-                } = seeds[seed];
-                let place = uniform_in_cell(center, self.cell_m, rng);
-                let deviate: f64 = StandardNormal.sample(rng);
-                let turn_rad = self.config.yaw_sigma_rad * deviate
-                    + rng.random_range(-half_column_rad..=half_column_rad);
-                Hypothesis {
-                    map_from_lidar: Pose2::new(place, heading_rad + turn_rad),
-                    level_m: Some(level_m),
-                }
-            })
-            .collect()
     }
 }
 
@@ -365,8 +322,8 @@ struct DoubledScan {
 impl DoubledScan {
     /// Of the returns in a pixel, the one nearest to its centre counts. Pixels without a return
     /// differ from everything by the limit, at every heading alike.
-    fn new(scan: &RangeImage, stance: &Stance, model: &LidarModel) -> Self {
-        let road_from_lidar = Rigid3f::from(&stance.road_from_lidar());
+    fn new(scan: &RangeImage, attitude: &SensorAttitude, model: &LidarModel) -> Self {
+        let road_from_lidar = Rigid3f::from(&attitude.road_from_lidar());
         let directions = model.directions();
         let mut nearest = vec![(-1.0_f32, -FAR_M); model.len()];
         for beam in scan.beams() {
@@ -403,17 +360,20 @@ impl DoubledScan {
 
 #[cfg(test)]
 mod tests {
-    use rand::{SeedableRng, rngs::StdRng};
-
-    use super::super::initialization::ROAD_HALF_WIDTH_M;
+    use super::super::test_world::TestWorld;
     use super::*;
-    use crate::rendering::test_world::TestWorld;
 
-    fn index(world: &TestWorld) -> PanoramaIndex {
-        let config = PanoramaConfig::default();
-        let cells = Cells::along_road(&world.road(), ROAD_HALF_WIDTH_M, config.cell_m);
-        let lidar = LidarModel::default();
-        PanoramaIndex::build(&cells, &world.surroundings(), &lidar, 1.73, &config).unwrap()
+    fn request() -> PanoramaRequest {
+        PanoramaRequest {
+            region: SearchRegion::Road,
+            lidar: LidarModel::default(),
+            sensor_height_m: 1.73,
+            config: PanoramaConfig::default(),
+        }
+    }
+
+    fn index(world: &TestWorld) -> std::sync::Arc<PanoramaIndex> {
+        world.map().panoramas(&request()).unwrap()
     }
 
     #[test]
@@ -427,7 +387,7 @@ mod tests {
             (90.0, 0.0, 3.1),
         ] {
             let truth = world.pose_at(x, y, heading);
-            let best = index.search(&world.scan(&truth), &Stance::default())[0];
+            let best = index.search(&world.scan(&truth), &SensorAttitude::default())[0];
             let distance = (best.center.coords - truth.translation.vector).norm();
             let turn = wrap_angle(best.heading_rad - heading).abs();
             assert!(distance < 1.5, "{distance} m from {x} {y}");
@@ -443,7 +403,7 @@ mod tests {
         let search = |heading: f64| {
             index.search(
                 &world.scan(&world.pose_at(25.2, 0.1, heading)),
-                &Stance::default(),
+                &SensorAttitude::default(),
             )[0]
         };
         let (straight, turned) = (search(0.0), search(turn));
@@ -452,41 +412,34 @@ mod tests {
     }
 
     #[test]
-    fn samples_lie_around_the_truth() {
-        let world = TestWorld::street();
-        let truth = world.pose_at(33.0, 0.4, 0.2);
-        let mut rng = StdRng::seed_from_u64(1);
-        let poses = index(&world).sample(&world.scan(&truth), &Stance::default(), 1000, &mut rng);
-        let near = poses
-            .iter()
-            .map(|hypothesis| hypothesis.map_from_lidar.translation.vector)
-            .filter(|place| (place - truth.translation.vector).norm() < 1.5)
-            .count();
-        assert!(near > 300, "{near} of {}", poses.len());
+    fn the_same_request_renders_nothing_again() {
+        let map = TestWorld::street().map();
+        let first = map.panoramas(&request()).unwrap();
+        assert!(std::sync::Arc::ptr_eq(
+            &first,
+            &map.panoramas(&request()).unwrap()
+        ));
+        let higher = PanoramaRequest {
+            sensor_height_m: 2.0,
+            ..request()
+        };
+        assert!(!std::sync::Arc::ptr_eq(
+            &first,
+            &map.panoramas(&higher).unwrap()
+        ));
     }
 
     #[test]
-    fn without_cells_there_is_nothing_to_find() {
+    fn without_cells_on_the_map_there_is_nothing_to_find() {
         let world = TestWorld::street();
         let cells = Cells {
             centers: vec![Point2::new(9e3, 0.0)],
             cell_m: 1.0,
         };
-        let config = PanoramaConfig::default();
-        let index = PanoramaIndex::build(
-            &cells,
-            &world.surroundings(),
-            &LidarModel::default(),
-            1.73,
-            &config,
-        )
-        .unwrap();
+        let index =
+            PanoramaIndex::build(&cells, &world, &world.ground, &world.tiles, &request()).unwrap();
         let scan = world.scan(&world.pose_at(0.0, 0.0, 0.0));
         assert!(index.is_empty());
-        assert!(
-            index
-                .sample(&scan, &Stance::default(), 10, &mut StdRng::seed_from_u64(1))
-                .is_empty()
-        );
+        assert!(index.search(&scan, &SensorAttitude::default()).is_empty());
     }
 }

@@ -3,12 +3,13 @@
 use glam::Vec3;
 use nalgebra::{Point2, Vector2};
 
-use super::{RangeDifference, RangeRenderer, RenderError};
-use crate::geometry::{Pose2, Pose3, Rigid3f};
+use super::{GroundMap, Map, MappingPath, SensorAttitude, TileConfig, TileGrid};
+use crate::geometry::{Pose2, Pose3, Rigid3f, TriangleMesh};
 use crate::lidar::{Beam, LidarModel, RangeImage};
-use crate::map::{GroundMap, Stance, TileConfig, TileGrid};
+use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
 
 /// Axis-aligned boxes on flat ground, seen in a frame that may be turned and shifted.
+#[derive(Clone)]
 pub struct TestWorld {
     /// Lower and upper corners, street frame.
     boxes: Vec<(Vec3, Vec3)>,
@@ -90,6 +91,21 @@ impl TestWorld {
             .collect()
     }
 
+    /// The street as a map.
+    pub fn map(&self) -> Map {
+        let road = self.road();
+        let path = MappingPath {
+            world_from_map: Pose3::identity(),
+            map_from_lidar: road
+                .iter()
+                .map(|pose| crate::geometry::pose3_from_pose2(pose, 0.0))
+                .collect(),
+        };
+        let (tiles, ground) = (self.tiles.clone(), self.ground.clone());
+        let renderer = std::sync::Arc::new(self.clone());
+        Map::from_parts(TriangleMesh::default(), path, tiles, ground, renderer)
+    }
+
     /// A pose of the street in the map.
     pub fn pose_at(&self, x: f64, y: f64, heading: f64) -> Pose2 {
         self.map_from_street * Pose2::new(Vector2::new(x, y), heading)
@@ -97,7 +113,7 @@ impl TestWorld {
 
     /// What the sensor sees from a pose.
     pub fn scan(&self, pose: &Pose2) -> RangeImage {
-        let map_from_lidar = self.ground.lift(pose, &Stance::default()).unwrap();
+        let map_from_lidar = self.ground.lift(pose, &SensorAttitude::default()).unwrap();
         let ranges = self.ranges(&map_from_lidar, &self.model.directions());
         let limited = ranges
             .into_iter()

@@ -1,24 +1,25 @@
-//! The particles of the next frame: resampled, or spread anew where the filter is lost.
+//! Particles of the next frame: resampled, or drawn from the panoramas when tracking is lost.
 
 use rand::Rng;
 
+use super::super::initialization::from_panoramas;
 use super::super::particles::ParticleSet;
 use super::super::resampling::{jitter, kld_sample_size, occupied_bins, systematic};
-use super::super::vigilance::{State, Vigilance};
-use super::Localizer;
+use super::super::tracking_loss::{AgreementMonitor, State};
+use super::ParticleFilter;
 use crate::lidar::RangeImage;
-use crate::map::Stance;
+use crate::map::SensorAttitude;
 use crate::rendering::RenderError;
 
-impl Localizer<'_> {
-    /// Gets the particles ready for the next frame: begins anew when lost, else resamples.
+impl ParticleFilter {
+    /// Prepares the particles of the next frame: restarts the search when lost, else resamples.
     pub(super) fn prepare_next(
         &mut self,
         scan: &RangeImage,
-        stance: &Stance,
+        attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<(), RenderError> {
-        if self.state == State::Lost && self.begin_anew(scan, stance, rng)? {
+        if self.state == State::Lost && self.restart_search(scan, attitude, rng)? {
             return Ok(());
         }
         let size = self.particles.len();
@@ -30,19 +31,20 @@ impl Localizer<'_> {
         Ok(())
     }
 
-    /// Spreads particles over the places where the scan may have been taken; those that there were
-    /// stay among them, for an alarm may be false. `false` without panoramas.
-    fn begin_anew(
+    /// Draws particles in the places whose panoramas resemble the scan and keeps some of the previous
+    /// ones, because the alarm may be false. Returns `false` without panoramas.
+    fn restart_search(
         &mut self,
         scan: &RangeImage,
-        stance: &Stance,
+        attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<bool, RenderError> {
-        let Some(panoramas) = self.surroundings.panoramas else {
+        let Some(request) = &self.restart else {
             return Ok(false);
         };
-        let index = panoramas.index()?;
-        let mut hypotheses = index.sample(scan, stance, self.config.num_particles, rng);
+        let index = self.map.panoramas(request)?;
+        let count = self.config.num_particles;
+        let mut hypotheses = from_panoramas(&index, scan, attitude, count, rng);
         if hypotheses.is_empty() {
             return Ok(false);
         }
@@ -50,12 +52,12 @@ impl Localizer<'_> {
         let before = self.particles.particles();
         hypotheses.extend(kept.into_iter().map(|index| before[index].hypothesis()));
         self.particles = ParticleSet::uniform(hypotheses);
-        // Until the next frame is weighed, this is all that is known.
+        // Valid until the next update.
         self.estimate = self.particles.mean();
         self.covariance = self.particles.covariance_about(&self.estimate);
         self.is_narrow = false;
         self.last_increment = None;
-        self.vigilance = Vigilance::default();
+        self.agreement = AgreementMonitor::default();
         self.updates_in_state = 0;
         self.state = State::Searching;
         Ok(true)
@@ -77,10 +79,10 @@ impl Localizer<'_> {
         );
     }
 
-    /// How many particles the belief needs while it is wide.
+    /// Number of particles that the distribution needs while it is wide.
     fn searching_size(&self) -> usize {
         let average = 1.0 / self.particles.len() as f64;
-        // A particle that weighs nothing occupies nothing.
+        // Particles of negligible weight do not occupy bins.
         let alive = self
             .particles
             .particles()

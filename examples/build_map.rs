@@ -1,0 +1,25 @@
+//! Builds a map from a recording in the layout of KITTI:
+//! `cargo run --release --example build_map -- RECORDING MAP.ply`.
+
+#![allow(clippy::print_stdout, reason = "examples print their result")]
+
+use std::path::PathBuf;
+
+use fpmcl::map::{MapBuilder, MapConfig};
+use fpmcl::recording::Sequence;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let arguments: Vec<PathBuf> = std::env::args_os().skip(1).map(PathBuf::from).collect();
+    let [recording, map_file] = arguments.as_slice() else {
+        return Err("usage: build_map RECORDING MAP.ply".into());
+    };
+    let drive = Sequence::open_folder(recording)?;
+    let map = MapBuilder::new(MapConfig::default()).build(drive.scans())?;
+    map.save(map_file)?;
+    println!(
+        "{} triangles, {} key scans",
+        map.mesh.triangles.len(),
+        map.path.map_from_lidar.len()
+    );
+    Ok(())
+}

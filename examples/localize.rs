@@ -1,0 +1,39 @@
+//! Localizes a recording anywhere in a map, from its scans alone:
+//! `cargo run --release --example localize -- RECORDING MAP.ply TRAJECTORY.txt`.
+
+#![allow(clippy::print_stdout, reason = "examples print their result")]
+
+use std::path::PathBuf;
+
+use fpmcl::geometry::StampedPose;
+use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
+use fpmcl::map::{Map, MapOptions};
+use fpmcl::recording::{Sequence, poses::write_tum};
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let arguments: Vec<PathBuf> = std::env::args_os().skip(1).map(PathBuf::from).collect();
+    let [recording, map_file, trajectory_file] = arguments.as_slice() else {
+        return Err("usage: localize RECORDING MAP.ply TRAJECTORY.txt".into());
+    };
+    let map = Map::load(map_file, &MapOptions::default())?;
+    let mut localizer = Localizer::new(&map, LocalizerConfig::default(), Start::Anywhere, 0)?;
+    let mut trajectory = Vec::new();
+    for frame in &Sequence::open_folder(recording)?.frames {
+        let estimate = localizer.step(&frame.read()?, Odometry::Unknown)?;
+        let (t, deviations) = (estimate.pose.translation, estimate.standard_deviations());
+        let state = estimate.state.word();
+        println!(
+            "{}: {:.2} {:.2} +- {:.3?} {state}",
+            frame.number, t.x, t.y, deviations
+        );
+        trajectory.push(StampedPose {
+            map_from_lidar: estimate.map_from_lidar,
+            ..frame.stamped()
+        });
+    }
+    write_tum(
+        std::fs::File::create(trajectory_file)?,
+        &trajectory.into_iter().collect(),
+    )?;
+    Ok(())
+}

@@ -1,0 +1,49 @@
+//! Pictures of a map from above.
+
+use anyhow::Result;
+
+use super::beside;
+use crate::app::config::BuildMapConfig;
+use crate::app::plotting::color::Colormap;
+use crate::app::plotting::{MapPlot, ScalarMapPlot};
+use crate::evaluation::map_quality::{BeamResidual, vertex_residuals};
+use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
+
+/// Residual at the end of the colour bar [m].
+const PICTURE_LIMIT_M: f64 = 0.2;
+
+/// Draws the map with the path of the mapping drive, and its residuals where scans were held out.
+pub fn draw(
+    config: &BuildMapConfig,
+    mesh: &TriangleMesh,
+    path: &[Pose3],
+    residuals: &[BeamResidual],
+) -> Result<()> {
+    let colors = config.map().local_map;
+    let driven: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
+    let picture = beside(&config.mesh_file, "png");
+    MapPlot {
+        title: "Map from above",
+        mesh,
+        path: Some(("mapping trajectory", &driven)),
+        keys: &[("ground", colors.ground_color), ("rest", colors.rest_color)],
+    }
+    .save(&picture)?;
+    tracing::info!("drew {}", picture.display());
+    if residuals.is_empty() {
+        return Ok(());
+    }
+    let picture = beside(&config.mesh_file, "residuals.png");
+    ScalarMapPlot {
+        title: "Distance of held-out beams to the surface that they hit",
+        mesh,
+        values: &vertex_residuals(mesh, residuals),
+        value_name: "mean beam-plane distance [m]",
+        limits: (0.0, PICTURE_LIMIT_M),
+        colormap: Colormap::Viridis,
+        trajectory: Some(&driven),
+    }
+    .save(&picture)?;
+    tracing::info!("drew {}", picture.display());
+    Ok(())
+}

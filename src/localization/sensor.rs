@@ -1,0 +1,80 @@
+//! The sensor: from a scan to a range image, and its attitude above the ground.
+
+use crate::ground::{GroundClassifier, GroundConfig, road_plane};
+use crate::lidar::{LidarModel, RangeImage, Scan};
+use crate::map::SensorAttitude;
+use crate::validation::InvalidValue;
+
+/// The sensor and the preparation of its scans.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SensorConfig {
+    /// Projection and range limits.
+    pub lidar: LidarModel,
+    /// Rectangle of the own car in the lidar frame, whose points are dropped: x_min, x_max, y_min, y_max [m].
+    pub own_car_m: [f32; 4],
+    /// Ground segmentation of the scans.
+    pub ground: GroundConfig,
+    /// Height of the sensor above the ground [m]; `None` measures it in the scans.
+    pub height_m: Option<f64>,
+}
+
+impl Default for SensorConfig {
+    /// KITTI's.
+    fn default() -> Self {
+        Self {
+            lidar: LidarModel::default(),
+            own_car_m: crate::map::scan_cloud::ScanConfig::default().own_car_m,
+            ground: GroundConfig::default(),
+            height_m: None,
+        }
+    }
+}
+
+impl SensorConfig {
+    /// Attitude to assume while no scan shows enough ground: level, at the configured height, or at
+    /// that of KITTI's car.
+    pub fn assumed_attitude(&self) -> SensorAttitude {
+        let assumed = SensorAttitude::default();
+        SensorAttitude {
+            height_m: self.height_m.unwrap_or(assumed.height_m),
+            ..assumed
+        }
+    }
+}
+
+/// Prepares scans.
+pub struct Sensor {
+    lidar: LidarModel,
+    own_car_m: [f32; 4],
+    classifier: Box<dyn GroundClassifier>,
+}
+
+impl Sensor {
+    /// Prepares the ground classifier.
+    pub fn new(config: &SensorConfig) -> Result<Self, InvalidValue> {
+        Ok(Self {
+            lidar: config.lidar,
+            own_car_m: config.own_car_m,
+            classifier: config.ground.classifier()?,
+        })
+    }
+
+    /// Projects a scan without the points on the own car and out of range.
+    pub fn range_image(&self, scan: &Scan) -> RangeImage {
+        let [x_min, x_max, y_min, y_max] = self.own_car_m;
+        let mut points = scan.points.clone();
+        points.retain(|p| !(p.x > x_min && p.x < x_max && p.y > y_min && p.y < y_max));
+        RangeImage::project(&points, &self.lidar)
+    }
+
+    /// Attitude of the sensor above the ground in the scan; `None` where too little ground is visible.
+    pub fn attitude(&self, image: &RangeImage) -> Option<SensorAttitude> {
+        let points: Vec<_> = (0..image.ranges.len())
+            .filter(|&index| image.has_return(index))
+            .map(|index| image.points[index])
+            .collect();
+        let ground = self.classifier.ground_confidence(&points);
+        let plane = road_plane(&points, &ground)?;
+        Some(SensorAttitude::from_plane(plane.up, plane.height_m))
+    }
+}

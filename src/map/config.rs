@@ -1,0 +1,58 @@
+//! Configuration of a map build.
+
+use serde::{Deserialize, Serialize};
+
+use super::local_map::LocalMapConfig;
+use super::tiles::TileConfig;
+use crate::ground::GroundConfig;
+use crate::rendering::Backend;
+use crate::validation::{InvalidValue, Validate, at_least_one, not_negative};
+
+/// Everything that can be configured about building a map.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MapConfig {
+    /// Distance from the previous key scan after which a scan is a key scan [m].
+    pub displacement_threshold_m: f64,
+    /// Key scans per local map.
+    pub local_map_size: usize,
+    /// Length of path of the neighbours with which a local map is meshed [m].
+    pub overlap_m: f64,
+    /// Ground segmentation of the scans.
+    pub ground: GroundConfig,
+    /// From the scans of a local map to its mesh.
+    pub local_map: LocalMapConfig,
+}
+
+impl Default for MapConfig {
+    /// The values of range-mcl where it has them.
+    fn default() -> Self {
+        Self {
+            displacement_threshold_m: 0.2,
+            local_map_size: 100,
+            overlap_m: 5.0,
+            ground: GroundConfig::default(),
+            local_map: LocalMapConfig::default(),
+        }
+    }
+}
+
+impl Validate for MapConfig {
+    /// With the keys of `build_map.yml`.
+    fn validate(&self) -> Result<(), InvalidValue> {
+        not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
+        at_least_one("local_map_size", self.local_map_size)?;
+        not_negative("overlap_m", self.overlap_m)?;
+        self.local_map.validate()
+    }
+}
+
+/// How a map is prepared for localization.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct MapOptions {
+    /// Processor that renders the map.
+    pub backend: Backend,
+    /// Largest number of poses rendered at once; `None` for no limit.
+    pub max_poses: Option<usize>,
+    /// Division into tiles.
+    pub tiles: TileConfig,
+}

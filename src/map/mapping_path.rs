@@ -1,0 +1,135 @@
+//! The path of the mapping drive and the frame of the map, stored with the map.
+//!
+//! In the PLY file they are comments, which every reader of meshes skips: one for the frame, one per
+//! pose, each a translation [m] and a unit quaternion, written so that reading gives the same bits.
+//!
+//! ```text
+//! comment fpmcl world_from_map   tx ty tz qx qy qz qw
+//! comment fpmcl map_from_lidar   tx ty tz qx qy qz qw
+//! ```
+
+use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+
+use crate::geometry::Pose3;
+
+const WORLD: &str = "fpmcl world_from_map";
+const POSE: &str = "fpmcl map_from_lidar";
+
+/// Poses of the scans that a map was built from, and the place of the map in the world.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MappingPath {
+    /// `p_world = world_from_map * p_map`, where the world is the frame in which the poses of the
+    /// mapping drive were given; the identity where they were given in the map frame.
+    pub world_from_map: Pose3,
+    /// Poses of the key scans, `p_map = map_from_lidar * p_lidar`.
+    pub map_from_lidar: Vec<Pose3>,
+}
+
+/// A comment of a map that cannot be read.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the comment `{0}` is not a pose of 7 finite numbers; build the map again")]
+pub struct BadPathComment(String);
+
+impl MappingPath {
+    /// Returns the comments of the PLY file.
+    pub fn to_comments(&self) -> Vec<String> {
+        let line = |key: &str, pose: &Pose3| {
+            let (t, q) = (pose.translation, pose.rotation);
+            format!(
+                "{key} {} {} {} {} {} {} {}",
+                t.x, t.y, t.z, q.i, q.j, q.k, q.w
+            )
+        };
+        let poses = self.map_from_lidar.iter().map(|pose| line(POSE, pose));
+        std::iter::once(line(WORLD, &self.world_from_map))
+            .chain(poses)
+            .collect()
+    }
+
+    /// Reads the comments of a PLY file; `None` where they hold no path.
+    pub fn from_comments<'a>(
+        comments: impl IntoIterator<Item = &'a str>,
+    ) -> Result<Option<Self>, BadPathComment> {
+        let (mut world_from_map, mut map_from_lidar) = (Pose3::identity(), Vec::new());
+        for comment in comments {
+            if let Some(numbers) = comment.strip_prefix(WORLD) {
+                world_from_map = pose(numbers, comment)?;
+            } else if let Some(numbers) = comment.strip_prefix(POSE) {
+                map_from_lidar.push(pose(numbers, comment)?);
+            }
+        }
+        Ok((!map_from_lidar.is_empty()).then_some(Self {
+            world_from_map,
+            map_from_lidar,
+        }))
+    }
+}
+
+fn pose(numbers: &str, comment: &str) -> Result<Pose3, BadPathComment> {
+    let bad = || BadPathComment(comment.to_owned());
+    let numbers: Vec<f64> = numbers
+        .split_whitespace()
+        .map(|number| {
+            number
+                .parse()
+                .ok()
+                .filter(|number: &f64| number.is_finite())
+        })
+        .collect::<Option<_>>()
+        .ok_or_else(bad)?;
+    let &[x, y, z, i, j, k, w] = numbers.as_slice() else {
+        return Err(bad());
+    };
+    let quaternion = Quaternion::new(w, i, j, k);
+    if (quaternion.norm() - 1.0).abs() > 1e-6 {
+        return Err(bad());
+    }
+    // Not normalized again, so that the same bits come back.
+    Ok(Pose3::from_parts(
+        Translation3::new(x, y, z),
+        UnitQuaternion::new_unchecked(quaternion),
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+
+    fn path() -> MappingPath {
+        let pose = |i: i32| {
+            let s = f64::from(i);
+            Pose3::new(
+                Vector3::new(s / 3.0, 1e6 * s, -s),
+                Vector3::new(0.1 * s, 0.2, -s),
+            )
+        };
+        MappingPath {
+            world_from_map: pose(7),
+            map_from_lidar: (0..5).map(pose).collect(),
+        }
+    }
+
+    #[test]
+    fn reading_what_was_written_gives_the_same_bits() {
+        let comments = path().to_comments();
+        let others = ["made by somebody", "fpmcl"];
+        let lines = comments.iter().map(String::as_str).chain(others);
+        assert_eq!(MappingPath::from_comments(lines).unwrap(), Some(path()));
+    }
+
+    #[test]
+    fn a_file_without_poses_has_no_path() {
+        assert_eq!(MappingPath::from_comments(["a comment"]), Ok(None));
+    }
+
+    #[test]
+    fn a_damaged_comment_is_an_error_that_quotes_it() {
+        for numbers in ["1 2 3", "1 2 3 0 0 0 x", "1 2 3 0 0 0 nan", "1 2 3 0 0 0 2"] {
+            let line = format!("{POSE} {numbers}");
+            let error = MappingPath::from_comments([line.as_str()]).unwrap_err();
+            assert!(error.to_string().contains(&line), "{error}");
+        }
+    }
+}

@@ -1,0 +1,360 @@
+//! Refinement of a whole trajectory: every frame by itself, then all of them with the odometry.
+//!
+//! ```text
+//! frame by frame    swarm, Gauss-Newton                                  refiner
+//! all frames        min  frames (robust) + odometry between neighbours   smoothing
+//! ```
+//!
+//! The trajectory is split where tracking was lost, because the odometry may not describe how the car
+//! came from before the loss to after it; frames without an estimate are bridged by the odometry.
+
+use std::ops::Range;
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::objective::FrameObjective;
+use super::refiner::{RefinementConfig, refine_frame};
+use super::smoothing::{self, FramePrior, smooth};
+use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
+use crate::lidar::Scan;
+use crate::localization::observation::{ObservationConfig, choose_beams};
+use crate::localization::{Estimate, Sensor, SensorConfig, State};
+use crate::map::{Map, SensorAttitude};
+use crate::random::stream;
+use crate::rendering::RenderError;
+use crate::validation::{InvalidValue, Validate as _};
+
+/// Configuration of the refinement of a trajectory.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RefinerConfig {
+    /// The sensor and the preparation of its scans.
+    pub sensor: SensorConfig,
+    /// Selection of beams and cost of differences.
+    pub observation: ObservationConfig,
+    /// Swarm, Gauss-Newton and smoothing.
+    pub refinement: RefinementConfig,
+}
+
+/// An estimate to refine.
+#[derive(Clone, Debug, PartialEq)]
+pub struct InitialEstimate {
+    /// `map_from_lidar`.
+    pub pose: Pose2,
+    /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²]; `None` for standard
+    /// deviations of 0.2 m and 0.6 degrees.
+    pub covariance: Option<Matrix3<f64>>,
+    /// State of the filter. Only tracked frames are refined.
+    pub state: State,
+}
+
+impl From<&Estimate> for InitialEstimate {
+    fn from(estimate: &Estimate) -> Self {
+        Self {
+            pose: estimate.pose,
+            covariance: Some(estimate.covariance),
+            state: estimate.state,
+        }
+    }
+}
+
+impl InitialEstimate {
+    fn covariance(&self) -> Matrix3<f64> {
+        let default = || Matrix3::from_diagonal(&Vector3::new(0.04, 0.04, 1e-4));
+        self.covariance.unwrap_or_else(default)
+    }
+}
+
+/// A refined frame, before smoothing.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FrameResult {
+    /// `map_from_lidar` seen from above.
+    pub pose: Pose2,
+    /// `map_from_lidar` in space; `None` where the frame was not refined.
+    pub map_from_lidar: Option<Pose3>,
+    /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
+    pub covariance: Matrix3<f64>,
+    /// Measurement of the pose for smoothing; `None` where the filter was not tracking.
+    prior: Option<FramePrior>,
+    /// State of the filter.
+    state: State,
+    attitude: SensorAttitude,
+    /// Height of the ground below the sensor [m], if known.
+    level_m: Option<f64>,
+}
+
+/// A refined trajectory.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RefinedTrajectory {
+    /// `map_from_lidar` seen from above.
+    pub poses: Vec<Pose2>,
+    /// `map_from_lidar` in space, aligned to the ground of the map.
+    pub map_from_lidar: Vec<Pose3>,
+    /// Covariances of (x, y, heading) in the axes of the map [m², m·rad, rad²].
+    pub covariances: Vec<Matrix3<f64>>,
+    /// Frames that were not refined because the filter was not tracking.
+    pub untracked: usize,
+    /// Tracked frames that were not refined because there is no mapped ground under the car, or no
+    /// beam in the scan.
+    pub unmapped: usize,
+    /// Whether the trajectory was smoothed.
+    pub is_smoothed: bool,
+}
+
+/// Why a trajectory cannot be refined.
+#[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages are the documentation")]
+pub enum RefinerError {
+    #[error(transparent)]
+    Invalid(#[from] InvalidValue),
+    #[error(transparent)]
+    Render(#[from] RenderError),
+    #[error(
+        "there are {increments} odometry increments for {frames} frames; give one per frame, the first of which is ignored"
+    )]
+    IncrementCount { frames: usize, increments: usize },
+}
+
+/// Refines a trajectory: [`add`](Self::add) every frame in order, then [`finish`](Self::finish).
+pub struct TrajectoryRefiner {
+    map: Map,
+    config: RefinerConfig,
+    seed: u64,
+    sensor: Sensor,
+    frames: Vec<FrameResult>,
+}
+
+impl TrajectoryRefiner {
+    /// Prepares the refinement in a map. The same seed gives the same trajectory.
+    pub fn new(map: &Map, config: RefinerConfig, seed: u64) -> Result<Self, RefinerError> {
+        config.observation.validate()?;
+        config.refinement.validate()?;
+        Ok(Self {
+            map: map.clone(),
+            sensor: Sensor::new(&config.sensor)?,
+            config,
+            seed,
+            frames: Vec::new(),
+        })
+    }
+
+    /// Refines the next frame. A frame whose state is not `Tracking` keeps its estimate.
+    pub fn add(
+        &mut self,
+        scan: &Scan,
+        estimate: &InitialEstimate,
+    ) -> Result<&FrameResult, RefinerError> {
+        let mut rng = stream(self.seed, self.frames.len() as u64);
+        let image = self.sensor.range_image(scan);
+        let previous = self.frames.last();
+        // The attitude of a registered frame is more accurate than the ground plane of a scan.
+        let attitude = match previous {
+            Some(previous) if previous.is_refined() => previous.attitude,
+            _ => self.sensor.attitude(&image).unwrap_or_else(|| {
+                previous.map_or_else(
+                    || self.config.sensor.assumed_attitude(),
+                    |previous| previous.attitude,
+                )
+            }),
+        };
+        let level_m = previous
+            .filter(|_| estimate.state != State::Lost)
+            .and_then(|previous| previous.level_m);
+        let mut result = FrameResult {
+            pose: estimate.pose,
+            map_from_lidar: None,
+            covariance: estimate.covariance(),
+            prior: None,
+            state: estimate.state,
+            attitude,
+            level_m,
+        };
+        if estimate.state == State::Tracking {
+            let observation = &self.config.observation;
+            let (count, road_share) = (observation.beams, observation.road_share);
+            let beams = choose_beams(&image, count, road_share, &attitude, &mut rng);
+            let mut objective = FrameObjective {
+                renderer: &*self.map.renderer,
+                ground: &self.map.ground,
+                beams: &beams,
+                level_m,
+                attitude,
+                difference: observation.difference(),
+            };
+            if level_m.is_none() {
+                objective = objective.on_best_level(&estimate.pose)?;
+            }
+            let (pose, config) = (&estimate.pose, &self.config.refinement);
+            let refined = refine_frame(&objective, pose, &result.covariance, config, &mut rng)?;
+            if let Some(refined) = refined {
+                result.pose = refined.pose;
+                result.map_from_lidar = Some(refined.map_from_lidar);
+                result.covariance = refined.covariance;
+                result.attitude = refined.attitude;
+                result.level_m = refined.level_m.or(level_m);
+            }
+            result.prior = Some(FramePrior {
+                pose: result.pose,
+                covariance: result.covariance,
+            });
+        }
+        self.frames.push(result);
+        Ok(&self.frames[self.frames.len() - 1])
+    }
+
+    /// Smooths the trajectory with the odometry `previous_from_current` into each frame (the first is
+    /// ignored), or leaves every frame as its scan determines it where there is none.
+    pub fn finish(self, increments: Option<&[Pose2]>) -> Result<RefinedTrajectory, RefinerError> {
+        let frames = &self.frames;
+        let mut poses: Vec<Pose2> = frames.iter().map(|frame| frame.pose).collect();
+        let mut covariances: Vec<_> = frames.iter().map(|frame| frame.covariance).collect();
+        let is_measured = frames.iter().any(|frame| frame.prior.is_some());
+        if let Some(increments) = increments.filter(|_| is_measured) {
+            if increments.len() != frames.len() {
+                return Err(RefinerError::IncrementCount {
+                    frames: frames.len(),
+                    increments: increments.len(),
+                });
+            }
+            for rows in self.tracked_stretches() {
+                self.smooth_stretch(rows, increments, &mut poses, &mut covariances);
+            }
+        }
+        let untracked = frames.iter().filter(|f| f.state != State::Tracking).count();
+        let refined = frames.iter().filter(|frame| frame.is_refined()).count();
+        Ok(RefinedTrajectory {
+            map_from_lidar: self.lift(&poses),
+            poses,
+            covariances,
+            untracked,
+            unmapped: frames.len() - untracked - refined,
+            is_smoothed: increments.is_some() && is_measured,
+        })
+    }
+
+    /// The stretches between frames in which tracking was lost, of which a frame is measured.
+    fn tracked_stretches(&self) -> Vec<Range<usize>> {
+        let is_lost = |frame: &FrameResult| frame.state == State::Lost;
+        let mut stretches = Vec::new();
+        let mut start = 0;
+        for stretch in self.frames.chunk_by(|a, b| is_lost(a) == is_lost(b)) {
+            let rows = start..start + stretch.len();
+            start = rows.end;
+            if !is_lost(&stretch[0]) && stretch.iter().any(|frame| frame.prior.is_some()) {
+                stretches.push(rows);
+            }
+        }
+        stretches
+    }
+
+    fn smooth_stretch(
+        &self,
+        rows: Range<usize>,
+        increments: &[Pose2],
+        poses: &mut [Pose2],
+        covariances: &mut [Matrix3<f64>],
+    ) {
+        let config = &self.config.refinement;
+        let frames = &self.frames[rows.clone()];
+        let priors: Vec<Option<FramePrior>> = frames.iter().map(|frame| frame.prior).collect();
+        let increments = &increments[rows.clone()];
+        let smoothed = smooth(&poses[rows.clone()], &priors, increments, &config.smoothing);
+        let marginals = smoothing::covariances(&smoothed, &priors, increments, &config.smoothing);
+        if let Some(mut marginals) = marginals {
+            // Smoothing cannot reduce the error that the map has in all frames.
+            let variance = config.gauss_newton.map_error_m.powi(2);
+            let of_map = Matrix3::from_diagonal(&Vector3::new(variance, variance, 0.0));
+            marginals
+                .iter_mut()
+                .for_each(|covariance| *covariance += of_map);
+            covariances[rows.clone()].copy_from_slice(&marginals);
+        }
+        poses[rows].copy_from_slice(&smoothed);
+    }
+
+    /// The poses in space, aligned to the ground of the map, or to the last known ground.
+    fn lift(&self, poses: &[Pose2]) -> Vec<Pose3> {
+        let mut patch = None;
+        let lift = |(pose, frame): (&Pose2, &FrameResult)| {
+            patch = self.map.ground.patch_under(pose, frame.level_m).or(patch);
+            match &patch {
+                Some(patch) => patch.lift(pose, &frame.attitude),
+                None => pose3_from_pose2(pose, 0.0),
+            }
+        };
+        poses.iter().zip(&self.frames).map(lift).collect()
+    }
+}
+
+impl FrameResult {
+    fn is_refined(&self) -> bool {
+        self.map_from_lidar.is_some()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::map::test_world::TestWorld;
+
+    #[test]
+    fn a_jump_where_tracking_was_lost_bends_no_frame_beside_it() {
+        let map = TestWorld::street().map();
+        let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), 0).unwrap();
+        for row in 0..20 {
+            let is_lost = row == 10;
+            let jump_m = if row > 10 { 50.0 } else { 0.0 };
+            let pose = Pose2::translation(f64::from(row) + jump_m, 0.0);
+            let covariance = Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-6));
+            refiner.frames.push(FrameResult {
+                pose,
+                map_from_lidar: (!is_lost).then(|| pose3_from_pose2(&pose, 0.0)),
+                covariance,
+                prior: (!is_lost).then_some(FramePrior { pose, covariance }),
+                state: if is_lost {
+                    State::Lost
+                } else {
+                    State::Tracking
+                },
+                attitude: SensorAttitude::default(),
+                level_m: None,
+            });
+        }
+        let before: Vec<Pose2> = refiner.frames.iter().map(|frame| frame.pose).collect();
+        let increments = vec![Pose2::translation(1.0, 0.0); 20];
+        let refined = refiner.finish(Some(&increments)).unwrap();
+        assert!(refined.is_smoothed);
+        assert_eq!((refined.untracked, refined.unmapped), (1, 0));
+        for (before, after) in before.iter().zip(&refined.poses) {
+            let off_m = (after.translation.vector - before.translation.vector).norm();
+            assert!(off_m < 1e-6, "{off_m}");
+        }
+    }
+
+    #[test]
+    fn an_odometry_of_another_length_is_an_error() {
+        let world = TestWorld::street();
+        let mut refiner =
+            TrajectoryRefiner::new(&world.map(), RefinerConfig::default(), 0).unwrap();
+        let truth = world.pose_at(10.0, 0.0, 0.0);
+        let points = world.scan(&truth).points;
+        let scan = Scan {
+            points,
+            intensities: Vec::new(),
+        };
+        let estimate = InitialEstimate {
+            pose: truth * Pose2::translation(0.05, 0.05),
+            covariance: None,
+            state: State::Tracking,
+        };
+        let refined = refiner.add(&scan, &estimate).unwrap();
+        let off_m = (refined.pose.translation.vector - truth.translation.vector).norm();
+        assert!(off_m < 0.01, "{off_m}");
+        let error = refiner.finish(Some(&[])).unwrap_err();
+        assert!(
+            error
+                .to_string()
+                .contains("0 odometry increments for 1 frames"),
+            "{error}"
+        );
+    }
+}
