@@ -225,8 +225,10 @@ pub fn text_style(size: f64, horizontal: HPos, vertical: VPos) -> TextStyle<'sta
 
 /// The style in bold.
 pub fn bold(style: TextStyle<'static>) -> TextStyle<'static> {
+    // `FontDesc::style` would keep the regular font.
+    let size = style.font.get_size();
     TextStyle {
-        font: style.font.style(FontStyle::Bold),
+        font: FontDesc::new(FontFamily::SansSerif, size, FontStyle::Bold),
         ..style
     }
 }
@@ -331,5 +333,7 @@ mod tests {
         let dark = image.pixels.iter().filter(|pixel| pixel[0] < 120).count();
         assert!(dark > 100, "{dark}");
         assert!(text_width("error [m]", &style) > text_width("[m]", &style));
+        let bold = bold(style.clone());
+        assert!(text_width("error [m]", &bold) > text_width("error [m]", &style));
     }
 }
