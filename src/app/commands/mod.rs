@@ -1,4 +1,4 @@
-//! One file per subcommand; each `run` reads as a paragraph.
+//! The subcommands: files, progress and pictures around the library.
 
 // The subcommands, in the order of their use.
 pub mod build_map;
@@ -10,7 +10,7 @@ pub mod ground;
 pub mod localize;
 pub mod refine;
 pub mod simulate;
-// What they share.
+// Shared by them.
 mod input;
 pub mod interrupt;
 mod logging;
@@ -40,25 +40,25 @@ use interrupt::{Interrupt, Interrupted};
 use logging::RunLog;
 use progress::Progress;
 
-/// What every command is given beside its configuration.
+/// What every command gets beside its configuration.
 #[derive(Clone, Debug)]
 pub struct Context {
-    /// Threads that share the work.
+    /// Number of threads.
     pub threads: usize,
-    /// What renders the map.
+    /// Processor that renders the map.
     pub backend: Backend,
-    /// How much is said on standard error.
+    /// Amount of output on standard error.
     pub verbosity: Verbosity,
-    /// Whether the user wants to stop.
+    /// Interruption by the user.
     pub interrupt: Interrupt,
-    /// How far the work has come, for the user to see.
+    /// Progress display.
     pub progress: Progress,
-    /// Where what is said is written down, too.
+    /// Copy of the log for the results of a run.
     pub log: RunLog,
 }
 
 impl Context {
-    /// Starts logging, the threads and the handling of Ctrl-C; once per process.
+    /// Starts logging, the thread pool and the handling of Ctrl-C, once per process.
     pub fn new(verbosity: Verbosity, machine: MachineArgs) -> anyhow::Result<Self> {
         let progress = Progress::new(verbosity);
         let log = RunLog::default();
@@ -130,13 +130,13 @@ fn configuration(args: &ConfigurationArgs) -> &'static str {
     }
 }
 
-/// Tells an error once, on standard error: what failed, then each cause that says more.
+/// Prints an error with its causes on standard error.
 pub fn report(error: &anyhow::Error) {
-    // Standard error may be closed; there is nowhere else to say so.
-    let _ = std::io::stderr().write_all(told(error).as_bytes());
+    // There is nowhere to report that standard error is closed.
+    let _ = std::io::stderr().write_all(format_error_chain(error).as_bytes());
 }
 
-/// 130 for an interrupted run, as shells have it, else 1; 2 is wrong usage.
+/// Exit code of a failed run: 130 if it was interrupted, as in shells, else 1; 2 is wrong usage.
 pub fn exit_code(error: &anyhow::Error) -> ExitCode {
     ExitCode::from(if error.is::<Interrupted>() { 130 } else { 1 })
 }
@@ -153,8 +153,8 @@ fn load<T: CommandConfig>(args: &RunArgs) -> Result<T, ConfigError> {
     config::load(args.source.config.as_deref(), &settings)
 }
 
-/// The chain of an error without what was said already.
-fn told(error: &anyhow::Error) -> String {
+/// Formats an error and its causes, without repetitions.
+fn format_error_chain(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
         let cause = cause.to_string();
@@ -186,13 +186,13 @@ mod tests {
         std::fs::write(&path, "").unwrap();
         let start = ["fpmcl", "localize", path.to_str().unwrap()];
         let Command::Localize(args) = Cli::parse_from(start.iter().chain(arguments)).command else {
-            unreachable!("it says localize")
+            unreachable!("the command is localize")
         };
         load(&args).unwrap()
     }
 
     #[test]
-    fn flags_come_after_settings_and_pass_by_a_configuration_without_their_keys() {
+    fn flags_override_settings_and_are_ignored_by_a_configuration_without_their_keys() {
         let arguments = ["--seed", "7", "--set", "n_scans=5", "--force"];
         let config: LocalizationConfig = loaded(&arguments);
         assert_eq!((config.seed, config.n_scans, config.force), (7, 5, true));
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cause_is_told_once() {
+    fn a_cause_is_printed_once() {
         let source = std::io::Error::new(std::io::ErrorKind::NotFound, "no such file");
         let error = anyhow::Error::new(RecordingError::Read {
             path: "poses.txt".into(),
@@ -211,7 +211,7 @@ mod tests {
         })
         .context("while building the map");
         assert_eq!(
-            told(&error),
+            format_error_chain(&error),
             "error: while building the map\n  because: cannot read poses.txt: no such file\n"
         );
     }
