@@ -1,41 +1,102 @@
 //! Finds a car's pose to the centimetre from one spinning LiDAR and a mesh map that it builds itself.
 //!
-//! > A [`recording`] sequence gives [`lidar`] scans; [`ground`] tells road from rest; [`meshing`]
-//! > turns points into surfaces, [`map`] tiles them; [`rendering`] shows the map from any pose,
-//! > [`registration`] lays a scan onto it; [`localization`] finds the pose; [`refinement`]
-//! > polishes it; [`evaluation`] measures it; the program around it is `app`.
+//! # Entry points
+//!
+//! | type | from | to |
+//! |---|---|---|
+//! | [`map::MapBuilder`] | scans with their poses | a [`map::Map`] |
+//! | [`map::Map`] | a PLY file | mesh, ground, tiles and renderer; [`save`](map::Map::save) writes it |
+//! | [`localization::Localizer`] | a map, then scan by scan | an [`Estimate`](localization::Estimate): pose, covariance, state |
+//! | [`refinement::TrajectoryRefiner`] | a map, scans, estimates | a refined, smoothed trajectory |
+//!
+//! ```no_run
+//! use std::path::Path;
+//!
+//! use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
+//! use fpmcl::map::{Map, MapBuilder, MapConfig, MapOptions};
+//! use fpmcl::recording::Sequence;
+//! use fpmcl::refinement::{InitialEstimate, RefinerConfig, TrajectoryRefiner};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let first_drive = Sequence::open_folder(Path::new("data/street/drive_1"))?;
+//! let map = MapBuilder::new(MapConfig::default()).build(first_drive.scans())?;
+//! map.save(Path::new("results/map.ply"))?;
+//!
+//! let map = Map::load(Path::new("results/map.ply"), &MapOptions::default())?;
+//! let seed = 0;
+//! let mut localizer = Localizer::new(&map, LocalizerConfig::default(), Start::Anywhere, seed)?;
+//! let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), seed)?;
+//! for frame in &Sequence::open_folder(Path::new("data/street/drive_2"))?.frames {
+//!     let scan = frame.read()?;
+//!     let estimate = localizer.step(&scan, Odometry::Unknown)?;
+//!     println!("{} ± {:?}", estimate.pose, estimate.standard_deviations());
+//!     refiner.add(&scan, &InitialEstimate::from(&estimate))?;
+//! }
+//! let trajectory = refiner.finish(None)?;
+//! println!("{} refined poses", trajectory.poses.len());
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! Everything random follows from the seed, at any number of threads. Configurations are plain structs
+//! whose [`Default`] holds the published values.
+//!
+//! # Frames
 //!
 //! | frame | origin and axes | appears in |
 //! |---|---|---|
 //! | `lidar` | the sensor; x forward, y left, z up | scans, range images |
-//! | `cam0` | left grey camera; x right, y down, z forward | KITTI's `poses.txt`, nowhere else |
-//! | `map` | the `lidar` frame of the first mapping scan | map, particles, trajectories |
+//! | `map` | that of the poses given to [`map::MapBuilder`]; for a recording, the `lidar` frame of its first pose | map, particles, trajectories |
+//! | `cam0` | left grey camera; x right, y down, z forward | KITTI's pose files, nowhere else |
+//! | `world` | that of the camera poses of a recording | [`recording`], to compare drives of one place |
 //!
-//! Metres and radians inside; degrees only in configuration files and reports. A transform
-//! says both its frames: `p_map = map_from_lidar * p_lidar`.
+//! The name of a transform contains both of its frames: `p_map = map_from_lidar * p_lidar`.
 //!
-//! Imports point only upwards in this list, which `tests/architecture.rs` checks.
+//! # Units
+//!
+//! Metres, radians and seconds; names of bare numbers end in their unit (`max_range_m`). Degrees occur
+//! in configuration files and reports, and in the field of view of [`lidar::LidarModel`], which has the
+//! keys of range-mcl.
+//!
+//! # Layers
+//!
+//! The modules below are in layers. A module imports modules of the layers above its own, and none of
+//! its own layer or of those below it; `tests/architecture.rs` checks this.
+//!
+//! | layer | modules |
+//! |---|---|
+//! | foundations | [`files`], [`geometry`], [`random`], [`validation`] |
+//! | sensor and rays | [`lidar`], [`raycasting`] |
+//! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
+//! | map | [`map`], [`registration`], [`simulation`] |
+//! | poses | [`evaluation`], [`localization`] |
+//! | trajectories | [`refinement`] |
+//! | program, feature `cli` | `app` |
+//!
+//! `docs/architecture.md` describes how a scan and a configuration key pass through them.
 
-// What everything is made of.
+// Foundations.
 pub mod files;
 pub mod geometry;
-pub mod lidar;
 pub mod random;
-pub mod raycasting;
-pub mod rendering;
 pub mod validation;
-// From a recording to surfaces.
+// Sensor and rays.
+pub mod lidar;
+pub mod raycasting;
+// Scans, points and meshes.
 pub mod ground;
 pub mod meshing;
 pub mod recording;
-// From surfaces to a map, and back to what the sensor would see in it.
+pub mod rendering;
+// Map.
 pub mod map;
 pub mod registration;
 pub mod simulation;
-// Where the car is, and how well that is known.
+// Poses.
 pub mod evaluation;
 pub mod localization;
+// Trajectories.
 pub mod refinement;
-// The program.
+// Program.
 #[cfg(feature = "cli")]
 pub mod app;
