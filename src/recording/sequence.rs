@@ -74,20 +74,11 @@ pub struct Frame {
 impl Frame {
     /// Reads the scan and deskews it by the motion, if that is known.
     pub fn read(&self) -> Result<Scan, RecordingError> {
-        Ok(self.deskewed(velodyne::read_scan(&self.scan_path)?))
-    }
-
-    /// As [`read`](Self::read), with the hash of the file.
-    pub fn read_and_hash(&self) -> Result<(Scan, blake3::Hash), RecordingError> {
-        let (scan, hash) = velodyne::read_scan_and_hash(&self.scan_path)?;
-        Ok((self.deskewed(scan), hash))
-    }
-
-    fn deskewed(&self, mut scan: Scan) -> Scan {
+        let mut scan = velodyne::read_scan(&self.scan_path)?;
         if let Some(sweep) = &self.sweep {
             sweep.deskew(&mut scan.points);
         }
-        scan
+        Ok(scan)
     }
 
     /// The pose with its frame number and time.

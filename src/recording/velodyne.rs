@@ -4,7 +4,6 @@ use std::fs;
 use std::io::{self, Write};
 use std::path::Path;
 
-use blake3::Hash;
 use glam::Vec3;
 
 use super::error::RecordingError;
@@ -13,17 +12,6 @@ use crate::lidar::Scan;
 /// Reads a scan with all its points, including invalid ones.
 pub fn read_scan(path: &Path) -> Result<Scan, RecordingError> {
     parse_scan(path, &read_bytes(path)?)
-}
-
-/// Reads a scan and the BLAKE3 hash of its file.
-pub fn read_scan_and_hash(path: &Path) -> Result<(Scan, Hash), RecordingError> {
-    let bytes = read_bytes(path)?;
-    Ok((parse_scan(path, &bytes)?, blake3::hash(&bytes)))
-}
-
-/// The BLAKE3 hash of a scan's file.
-pub fn hash_of_scan(path: &Path) -> Result<Hash, RecordingError> {
-    Ok(blake3::hash(&read_bytes(path)?))
 }
 
 fn parse_scan(path: &Path, bytes: &[u8]) -> Result<Scan, RecordingError> {
@@ -105,23 +93,6 @@ mod tests {
         };
         write_scan(fs::File::create(&path).unwrap(), &scan).unwrap();
         assert_eq!(read_scan(&path).unwrap(), scan);
-    }
-
-    #[test]
-    fn the_hash_of_a_scan_is_that_of_its_file_and_changes_with_one_bit() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("000000.bin");
-        let mut scan = Scan {
-            points: vec![Vec3::X, Vec3::Y],
-            intensities: vec![0.3, 0.9],
-        };
-        write_scan(fs::File::create(&path).unwrap(), &scan).unwrap();
-        let (read, hash) = read_scan_and_hash(&path).unwrap();
-        assert_eq!(read, scan);
-        assert_eq!(hash_of_scan(&path).unwrap(), hash);
-        scan.points[1].y = f32::from_bits(scan.points[1].y.to_bits() ^ 1);
-        write_scan(fs::File::create(&path).unwrap(), &scan).unwrap();
-        assert_ne!(hash_of_scan(&path).unwrap(), hash);
     }
 
     #[test]

@@ -11,6 +11,7 @@ pub mod localize;
 pub mod refine;
 pub mod simulate;
 // Shared by them.
+mod context;
 mod input;
 pub mod interrupt;
 mod logging;
@@ -25,59 +26,14 @@ pub mod version;
 use std::io::Write as _;
 use std::process::ExitCode;
 
-use anyhow::Context as _;
-
-use crate::app::cli::{
-    Command, ConfigurationArgs, ConfiguredCommand, MachineArgs, RunArgs, Verbosity,
-};
+use crate::app::cli::{Command, ConfigurationArgs, ConfiguredCommand, RunArgs};
 use crate::app::config::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, ConfigError, EvaluationConfig,
     GroundCommandConfig, LocalizationConfig, RefinementConfig,
 };
-use crate::rendering::Backend;
 use crate::simulation::SimulationConfig;
-use interrupt::{Interrupt, Interrupted};
-use logging::RunLog;
-use progress::Progress;
-
-/// What every command gets beside its configuration.
-#[derive(Clone, Debug)]
-pub struct Context {
-    /// Number of threads.
-    pub threads: usize,
-    /// Processor that renders the map.
-    pub backend: Backend,
-    /// Amount of output on standard error.
-    pub verbosity: Verbosity,
-    /// Interruption by the user.
-    pub interrupt: Interrupt,
-    /// Progress display.
-    pub progress: Progress,
-    /// Copy of the log for the results of a run.
-    pub log: RunLog,
-}
-
-impl Context {
-    /// Starts logging, the thread pool and the handling of Ctrl-C, once per process.
-    pub fn new(verbosity: Verbosity, machine: MachineArgs) -> anyhow::Result<Self> {
-        let progress = Progress::new(verbosity);
-        let log = RunLog::default();
-        logging::start(verbosity, &progress, &log);
-        let threads = machine.threads.map_or(0, usize::from);
-        rayon::ThreadPoolBuilder::new()
-            .num_threads(threads)
-            .build_global()
-            .context("starting the threads; choose fewer with --threads")?;
-        Ok(Self {
-            threads: rayon::current_num_threads(),
-            backend: machine.backend.into(),
-            verbosity,
-            interrupt: Interrupt::install().context("listening for Ctrl-C")?,
-            progress,
-            log,
-        })
-    }
-}
+pub use context::Context;
+use interrupt::Interrupted;
 
 /// Runs a command.
 pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {

@@ -4,40 +4,6 @@ use std::collections::VecDeque;
 
 use super::device::{Gpu, InFlight};
 use crate::rendering::RenderError;
-use crate::rendering::backend::AdapterKind;
-
-/// How much is given to the device at once.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct BatchSizes {
-    /// Rays whose ranges are read back.
-    pub ranges: usize,
-    /// Beams that are compared.
-    pub beams: usize,
-    /// Directions, which are counted in work groups of one dimension (65,535 of 64).
-    pub directions: usize,
-    /// Poses, which are the work groups of the other dimension.
-    pub poses: usize,
-    /// Images in an atlas.
-    pub images: usize,
-    /// Vertices of an atlas.
-    pub vertices: usize,
-}
-
-impl BatchSizes {
-    /// As much as takes a fraction of a second, and 16 MB of results; on a software adapter some
-    /// seconds.
-    pub fn of(kind: AdapterKind) -> Self {
-        let shorter = if kind == AdapterKind::Software { 64 } else { 1 };
-        Self {
-            ranges: (1 << 22) / shorter,
-            beams: (1 << 24) / shorter,
-            directions: 1 << 20,
-            poses: 65_535,
-            images: 64,
-            vertices: (1 << 29) / shorter,
-        }
-    }
-}
 
 /// While one is read back, one runs and one waits.
 const IN_FLIGHT: usize = 3;

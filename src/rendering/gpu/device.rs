@@ -11,7 +11,7 @@ use std::time::Duration;
 use bytemuck::{NoUninit, Pod};
 use wgpu::{Buffer, BufferUsages};
 
-use super::batches::BatchSizes;
+use super::batch_sizes::BatchSizes;
 use crate::rendering::RenderError;
 use crate::rendering::backend::{AdapterKind, AdapterReport, Backend, best_adapter};
 

@@ -17,6 +17,7 @@
 //! Ranges are those of the plane of the triangle that the ray meets, by one text (`ray.wgsl`),
 //! whichever the way.
 
+mod batch_sizes;
 mod batches;
 mod caster;
 mod device;

@@ -5,7 +5,7 @@
 
 use nalgebra::Vector3;
 
-use super::batches::BatchSizes;
+use super::batch_sizes::BatchSizes;
 use super::*;
 
 /// A floor of 30 m by 30 m with steps up.

@@ -7,7 +7,7 @@ mod report;
 
 use std::fmt::Write as _;
 use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -55,8 +55,8 @@ pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
         local_maps,
         ..BuildReport::of_map(&mesh, &path, &config.mesh_file, started)
     };
-    output::write_json(&beside(&config.mesh_file, "report.json"), &report)?;
-    config::write(&beside(&config.mesh_file, "yml"), config)?;
+    output::write_json(&config.mesh_file.with_extension("report.json"), &report)?;
+    config::write(&config.mesh_file.with_extension("yml"), config)?;
     parts.remove()?;
     Ok(report)
 }
@@ -252,9 +252,4 @@ fn write_map(config: &BuildMapConfig, mesh: &TriangleMesh, path: &MappingPath) -
         config.scan_folder.display()
     );
     Ok(ply::write_map(&config.mesh_file, mesh, path)?)
-}
-
-/// `results/map.ply` -> `results/map.<extension>`.
-fn beside(mesh_file: &Path, extension: &str) -> PathBuf {
-    mesh_file.with_extension(extension)
 }

@@ -2,7 +2,6 @@
 
 use anyhow::Result;
 
-use super::beside;
 use crate::app::config::BuildMapConfig;
 use crate::app::plotting::color::Colormap;
 use crate::app::plotting::{MapPlot, ScalarMapPlot};
@@ -21,7 +20,7 @@ pub fn draw(
 ) -> Result<()> {
     let colors = config.map().local_map;
     let driven: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
-    let picture = beside(&config.mesh_file, "png");
+    let picture = config.mesh_file.with_extension("png");
     MapPlot {
         title: "Map from above",
         mesh,
@@ -33,7 +32,7 @@ pub fn draw(
     if residuals.is_empty() {
         return Ok(());
     }
-    let picture = beside(&config.mesh_file, "residuals.png");
+    let picture = config.mesh_file.with_extension("residuals.png");
     ScalarMapPlot {
         title: "Distance of held-out beams to the surface that they hit",
         mesh,
