@@ -414,7 +414,6 @@ impl Movie {
             ground_truth: truth.last().copied(),
             driven: truth,
             window: Some(([t.x, t.y], WINDOW_M)),
-            ..LocalizationPicture::default()
         }
         .save(&path)?;
         self.pictures.push(path);

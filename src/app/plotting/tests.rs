@@ -310,7 +310,6 @@ fn frames_become_an_animation_of_one_size() {
                 ground_truth: Some(truth[k]),
                 driven: &truth[..=k],
                 window: Some(([t.x, t.y], 60.0)),
-                ..LocalizationPicture::default()
             }
             .save(&path)
             .unwrap();
