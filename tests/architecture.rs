@@ -158,7 +158,7 @@ fn tokens(lines: &[(usize, String)]) -> Vec<(usize, String)> {
                 escaped[1..].find('"').map_or(rest.len(), |end| end + 2)
             } else if first == '\'' {
                 let character = if rest[1..].starts_with('\\') { 2 } else { 1 };
-                let close = rest.char_indices().skip(character + 1).next();
+                let close = rest.char_indices().nth(character + 1);
                 match close {
                     Some((end, '\'')) => end + 1,
                     // A lifetime.
