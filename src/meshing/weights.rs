@@ -44,8 +44,8 @@ impl ConstraintSum {
     /// Adds a sample at a position 0 to 1 in the cell.
     #[inline]
     pub fn add(&mut self, weight: f32, inside: [f32; 3]) {
-        for axis in 0..3 {
-            self.0[axis] += weight * inside[axis];
+        for (sum, position) in self.0.iter_mut().zip(inside) {
+            *sum += weight * position;
         }
         self.0[3] += weight;
     }
