@@ -26,11 +26,11 @@ fn shaders() -> Vec<(String, String)> {
     shaders
 }
 
-/// A shader behind those that it says stand before it.
+/// A shader behind those that are prepended to it.
 fn composed(text: &str, shaders: &[(String, String)]) -> String {
     let needed = shaders
         .iter()
-        .filter(|(name, _)| text.contains(&format!("`{name}` stands before this text")));
+        .filter(|(name, _)| text.contains(&format!("`{name}` is prepended to this text")));
     needed
         .map(|(_, text)| text.as_str())
         .chain([text])

@@ -1,14 +1,14 @@
-//! At most so many poses in one call: the memory of a renderer bounded, whatever is asked of it.
+//! Rendering in batches of poses, which bounds the memory of a renderer.
 
 use super::{RangeDifference, RangeRenderer, RenderError, SurfaceHit};
 use crate::geometry::{Pose3, Vec3};
 use crate::lidar::{Beam, LidarModel};
 
-/// Hands another renderer its poses in batches; the results are the same.
+/// Passes poses to another renderer in batches; the results are the same.
 pub struct Batched {
-    /// Shows the map.
+    /// Renders the batches.
     pub renderer: Box<dyn RangeRenderer>,
-    /// Most poses in a call, at least 1: range-mcl's `max_instance`.
+    /// Maximum number of poses per call, at least 1: range-mcl's `max_instance`.
     pub max_poses: usize,
 }
 
@@ -75,7 +75,7 @@ mod tests {
 
     use super::*;
 
-    /// Remembers how many poses each call had, and shows each pose its own x.
+    /// Records the number of poses of each call, and renders x of each pose.
     struct Counting(std::sync::Arc<Mutex<Vec<usize>>>);
 
     impl RangeRenderer for Counting {

@@ -1,41 +1,41 @@
-//! Rendering by casting rays at the tiles of the map, on all threads of the current pool.
+//! Rendering on the CPU, by casting rays at the tiles of the map on all threads of the current pool.
 //!
-//! Rays are put in an order once in which neighbours in the list are neighbours in space, and cut
-//! into pieces that do not depend on the number of threads; sums are made piece by piece in that
-//! order. So the result is the same, byte for byte, on every machine.
+//! Rays are sorted once such that neighbours in the list are neighbours in space, and cut into
+//! pieces that do not depend on the number of threads; sums are made piece by piece in that order.
+//! So the result is the same, byte for byte, on every machine.
 //!
-//! Beams that are close to each other, as those of an image, go through the scene in packets; where
-//! poses are closer to each other than beams, as those of particles that agree, each beam goes
-//! through it in bundles, from eight poses at once; others go one by one. All meet the same bits,
-//! unless a ray passes an edge within rounding: then it may meet either of the triangles there,
-//! whose ranges differ by about a millimetre where they are seen at a flat angle. Otherwise what a
-//! pose sees never depends on the other poses.
+//! Beams that are close to each other, as those of an image, traverse the scene in packets; if
+//! poses are closer to each other than beams, as those of converged particles, each beam traverses
+//! it in bundles, from eight poses at once; otherwise rays are single. All hit the same bits,
+//! unless a ray passes an edge within rounding: then it may hit either of the triangles there,
+//! whose ranges differ by about a millimetre at grazing angles. Otherwise what a pose sees never
+//! depends on the other poses.
 
 mod order;
 
 use glam::{DVec3, Mat3};
 use rayon::prelude::*;
 
-use order::{coherent_order, order_of_poses, pixel_order, width_of_bundles_m, width_of_packets_m};
+use order::{bundle_width_m, coherent_order, packet_width_m, pixel_order, pose_order};
 
-use super::{RangeDifference, RangeRenderer, RenderError, SurfaceHit};
+use super::{RangeDifference, RangeRenderer, RenderError, SurfaceHit, facing};
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh, Vec3};
 use crate::lidar::{Beam, LidarModel};
 use crate::raycasting::{Hit, RAYS, Reach, Scene};
 
-/// Beams that are cast without asking for another thread.
+/// Beams that one thread casts at a time.
 const RAYS_PER_PIECE: usize = 64;
-/// What ends lower than this below the sensor has the ground about its end from almost any pose:
-/// it does not pay to look there first [m].
+/// A beam that ends lower than this below the sensor has the ground near its end from almost any
+/// pose, so that it does not pay to look there first [m].
 const HIGHEST_GROUND_M: f32 = -1.0;
-/// Packets that are wider than this where they end go slower than their rays one by one: measured
-/// with `benches/rendering.rs` [m].
-const WIDEST_PACKET_M: f64 = 0.8;
-/// Bundles that are wider than this where they end go slower than their rays one by one: measured
-/// likewise [m].
-const WIDEST_BUNDLE_M: f64 = 0.6;
-/// A bundle is slower than a packet that is wider by this, because its rays do not share their
-/// origin: measured likewise, unitless.
+/// Packets that are wider than this at their ends are slower than single rays: measured with
+/// `benches/rendering.rs` [m].
+const MAX_PACKET_WIDTH_M: f64 = 0.8;
+/// Bundles that are wider than this at their ends are slower than single rays: measured likewise
+/// [m].
+const MAX_BUNDLE_WIDTH_M: f64 = 0.6;
+/// Width of a bundle relative to that of a packet of the same speed, because the rays of a bundle
+/// do not share their origin: measured likewise, unitless.
 const BUNDLE_PER_PACKET: f64 = 0.5;
 /// Rounding of sums and differences of ranges.
 const ROUNDING: f32 = 1e-6;
@@ -54,32 +54,32 @@ impl CpuRenderer {
         }
     }
 
-    /// Casts the beams of every pose piece by piece, and keeps, per pose, what `summarize` makes
-    /// of the numbers of the beams of each piece and the ranges that they met.
-    fn each_piece<T: Send>(
+    /// Casts the beams of every pose piece by piece, and returns, per pose, what `summarize` makes
+    /// of the indices of the beams of each piece and their ranges.
+    fn map_pieces<T: Send>(
         &self,
         map_from_lidar: &[Pose3],
-        beams: &Beams,
+        beams: &CastBeams,
         summarize: impl Fn(&[u32], &[f32]) -> T + Sync,
     ) -> Vec<Vec<T>> {
-        let order = order_of_poses(map_from_lidar);
+        let order = pose_order(map_from_lidar);
         let poses: Vec<Pose3> = order
             .iter()
             .map(|&pose| map_from_lidar[pose as usize])
             .collect();
-        let way = Way::of(&poses, beams);
-        let groups: Vec<&[Pose3]> = poses.chunks(way.poses_at_once()).collect();
+        let grouping = Grouping::of(&poses, beams);
+        let groups: Vec<&[Pose3]> = poses.chunks(grouping.poses_at_once()).collect();
         let pieces: Vec<&[u32]> = beams.order.chunks(RAYS_PER_PIECE).collect();
-        // Pose by pose for a few beams: what these pass through stays in the cache.
+        // Pose by pose for a few beams: the nodes that these enter stay in the cache.
         let summaries: Vec<Vec<T>> = (0..groups.len() * pieces.len())
             .into_par_iter()
             .map(|number| {
                 let rays = pieces[number / groups.len()];
                 let group = groups[number % groups.len()];
-                let ranges = match way {
-                    Way::Packets => vec![self.cast_packets(&group[0], rays, beams)],
-                    Way::Bundles => self.cast_bundles(group, rays, beams),
-                    Way::Alone => vec![self.cast_lone(&group[0], rays, beams)],
+                let ranges = match grouping {
+                    Grouping::Packets => vec![self.cast_packets(&group[0], rays, beams)],
+                    Grouping::Bundles => self.cast_bundles(group, rays, beams),
+                    Grouping::Single => vec![self.cast_single(&group[0], rays, beams)],
                 };
                 ranges
                     .iter()
@@ -89,7 +89,7 @@ impl CpuRenderer {
             .collect();
         let mut per_pose: Vec<Vec<T>> = map_from_lidar.iter().map(|_| Vec::new()).collect();
         for (number, summaries) in summaries.into_iter().enumerate() {
-            let first = number % groups.len() * way.poses_at_once();
+            let first = number % groups.len() * grouping.poses_at_once();
             for (&pose, summary) in order[first..].iter().zip(summaries) {
                 per_pose[pose as usize].push(summary);
             }
@@ -97,33 +97,25 @@ impl CpuRenderer {
         per_pose
     }
 
-    /// Ranges of some beams of one pose.
-    fn cast_packets(&self, map_from_lidar: &Pose3, rays: &[u32], beams: &Beams) -> Vec<f32> {
-        let mut directions = [Vec3::ZERO; RAYS_PER_PIECE];
-        let mut reaches = [Reach::UNLIMITED; RAYS_PER_PIECE];
-        let mut hits = [Hit::MISS; RAYS_PER_PIECE];
-        let rotation = rotation_of(map_from_lidar);
-        for (place, &ray) in rays.iter().enumerate() {
-            directions[place] = rotation * beams.directions[ray as usize];
-            reaches[place] = beams.reaches[ray as usize];
-        }
-        self.scene.cast_packets(
-            origin_of(map_from_lidar),
-            &directions[..rays.len()],
-            &reaches[..rays.len()],
-            &mut hits[..rays.len()],
-        );
-        hits[..rays.len()].iter().map(|hit| hit.range_m).collect()
+    /// Nearest hits of some beams of one pose.
+    fn hits(&self, map_from_lidar: &Pose3, rays: &[u32], beams: &CastBeams) -> Vec<Hit> {
+        let (directions, reaches) = beams.in_map(map_from_lidar, rays);
+        let mut hits = vec![Hit::MISS; rays.len()];
+        let origin = origin_of(map_from_lidar);
+        self.scene
+            .cast_packets(origin, &directions, &reaches, &mut hits);
+        hits
     }
 
     /// Ranges of some beams of one pose.
-    fn cast_lone(&self, map_from_lidar: &Pose3, rays: &[u32], beams: &Beams) -> Vec<f32> {
-        let rotation = rotation_of(map_from_lidar);
-        let (directions, reaches): (Vec<Vec3>, Vec<Reach>) = rays
-            .iter()
-            .map(|&ray| ray as usize)
-            .map(|ray| (rotation * beams.directions[ray], beams.reaches[ray]))
-            .unzip();
+    fn cast_packets(&self, map_from_lidar: &Pose3, rays: &[u32], beams: &CastBeams) -> Vec<f32> {
+        let hits = self.hits(map_from_lidar, rays, beams);
+        hits.iter().map(|hit| hit.range_m).collect()
+    }
+
+    /// Ranges of some beams of one pose.
+    fn cast_single(&self, map_from_lidar: &Pose3, rays: &[u32], beams: &CastBeams) -> Vec<f32> {
+        let (directions, reaches) = beams.in_map(map_from_lidar, rays);
         let mut ranges = vec![f32::INFINITY; rays.len()];
         let origin = origin_of(map_from_lidar);
         self.scene
@@ -132,19 +124,18 @@ impl CpuRenderer {
     }
 
     /// Ranges of some beams of up to [`RAYS`] poses, pose by pose.
-    fn cast_bundles(&self, map_from_lidar: &[Pose3], rays: &[u32], beams: &Beams) -> Vec<Vec<f32>> {
+    fn cast_bundles(
+        &self,
+        map_from_lidar: &[Pose3],
+        rays: &[u32],
+        beams: &CastBeams,
+    ) -> Vec<Vec<f32>> {
         // The last pose fills the empty places.
         let last = map_from_lidar.len() - 1;
         let poses: [&Pose3; RAYS] = std::array::from_fn(|place| &map_from_lidar[place.min(last)]);
         let rotations = poses.map(rotation_of);
-        let (directions, reaches): (Vec<[Vec3; RAYS]>, Vec<Reach>) = rays
-            .iter()
-            .map(|&ray| ray as usize)
-            .map(|ray| {
-                let direction = beams.directions[ray];
-                (rotations.map(|r| r * direction), beams.reaches[ray])
-            })
-            .unzip();
+        let (directions, reaches): (Vec<[Vec3; RAYS]>, Vec<Reach>) =
+            beams.rotated(rays, |direction| rotations.map(|r| r * direction));
         let mut ranges = vec![[f32::INFINITY; RAYS]; rays.len()];
         let origins = poses.map(origin_of);
         self.scene
@@ -154,9 +145,9 @@ impl CpuRenderer {
             .collect()
     }
 
-    /// Ranges of every pose, ray by ray in the order of their numbers.
-    fn ranges(&self, map_from_lidar: &[Pose3], beams: &Beams) -> Vec<Vec<f32>> {
-        self.each_piece(map_from_lidar, beams, |_, ranges| ranges.to_vec())
+    /// Ranges of every pose, in the order of the beams.
+    fn ranges(&self, map_from_lidar: &[Pose3], beams: &CastBeams) -> Vec<Vec<f32>> {
+        self.map_pieces(map_from_lidar, beams, |_, ranges| ranges.to_vec())
             .into_par_iter()
             .map(|pieces| {
                 let mut ranges = vec![f32::INFINITY; beams.order.len()];
@@ -169,46 +160,69 @@ impl CpuRenderer {
     }
 }
 
-/// Which rays go through the scene together.
+/// Which rays traverse the scene together.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Way {
+enum Grouping {
     /// Neighbouring beams of one pose.
     Packets,
     /// One beam of neighbouring poses.
     Bundles,
     /// None.
-    Alone,
+    Single,
 }
 
-impl Way {
-    /// The way for poses and beams, in their order.
-    fn of(poses: &[Pose3], beams: &Beams) -> Self {
-        let packet_m = width_of_packets_m(&beams.directions, &beams.order);
-        let bundle_m = width_of_bundles_m(poses);
-        if bundle_m < WIDEST_BUNDLE_M.min(BUNDLE_PER_PACKET * packet_m) {
+impl Grouping {
+    /// The fastest grouping for poses and beams, both in their order.
+    fn of(poses: &[Pose3], beams: &CastBeams) -> Self {
+        let packet_m = packet_width_m(&beams.directions, &beams.order);
+        if bundle_width_m(poses) < MAX_BUNDLE_WIDTH_M.min(BUNDLE_PER_PACKET * packet_m) {
             Self::Bundles
-        } else if packet_m < WIDEST_PACKET_M {
+        } else if packet_m < MAX_PACKET_WIDTH_M {
             Self::Packets
         } else {
-            Self::Alone
+            Self::Single
         }
     }
 
     fn poses_at_once(self) -> usize {
         match self {
             Self::Bundles => RAYS,
-            Self::Packets | Self::Alone => 1,
+            Self::Packets | Self::Single => 1,
         }
     }
 }
 
-/// What is cast from every pose.
-struct Beams {
+/// Beams to be cast from every pose.
+struct CastBeams {
     /// Unit, lidar frame.
     directions: Vec<Vec3>,
     reaches: Vec<Reach>,
-    /// Numbers of the beams such that neighbours in the list are neighbours in space.
+    /// Indices of the beams such that neighbours in the list are neighbours in space.
     order: Vec<u32>,
+}
+
+impl CastBeams {
+    /// Beams that look for the nearest surface at any range.
+    fn unlimited(directions: &[Vec3]) -> Self {
+        Self {
+            directions: directions.to_vec(),
+            reaches: vec![Reach::UNLIMITED; directions.len()],
+            order: coherent_order(directions),
+        }
+    }
+
+    /// Directions of some beams in the map frame, and their reaches.
+    fn in_map(&self, map_from_lidar: &Pose3, rays: &[u32]) -> (Vec<Vec3>, Vec<Reach>) {
+        let rotation = rotation_of(map_from_lidar);
+        self.rotated(rays, |direction| rotation * direction)
+    }
+
+    fn rotated<T>(&self, rays: &[u32], rotate: impl Fn(Vec3) -> T) -> (Vec<T>, Vec<Reach>) {
+        rays.iter()
+            .map(|&ray| ray as usize)
+            .map(|ray| (rotate(self.directions[ray]), self.reaches[ray]))
+            .unzip()
+    }
 }
 
 fn rotation_of(map_from_lidar: &Pose3) -> Mat3 {
@@ -230,7 +244,7 @@ impl RangeRenderer for CpuRenderer {
         map_from_lidar: &[Pose3],
         model: &LidarModel,
     ) -> Result<Vec<Vec<f32>>, RenderError> {
-        let beams = Beams {
+        let beams = CastBeams {
             directions: model.directions(),
             reaches: vec![Reach::until(model.max_range); model.len()],
             order: pixel_order(model),
@@ -249,11 +263,7 @@ impl RangeRenderer for CpuRenderer {
         map_from_lidar: &[Pose3],
         directions: &[Vec3],
     ) -> Result<Vec<Vec<f32>>, RenderError> {
-        let beams = Beams {
-            directions: directions.to_vec(),
-            reaches: vec![Reach::UNLIMITED; directions.len()],
-            order: coherent_order(directions),
-        };
+        let beams = CastBeams::unlimited(directions);
         Ok(self.ranges(map_from_lidar, &beams))
     }
 
@@ -263,34 +273,18 @@ impl RangeRenderer for CpuRenderer {
         map_from_lidar: &Pose3,
         directions: &[Vec3],
     ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
-        let order = coherent_order(directions);
-        let (rotation, origin) = (rotation_of(map_from_lidar), origin_of(map_from_lidar));
-        let pieces: Vec<Vec<Hit>> = order
+        let beams = CastBeams::unlimited(directions);
+        let pieces: Vec<Vec<Hit>> = beams
+            .order
             .par_chunks(RAYS_PER_PIECE)
-            .map(|rays| {
-                let turned: Vec<Vec3> = rays
-                    .iter()
-                    .map(|&ray| rotation * directions[ray as usize])
-                    .collect();
-                let mut hits = vec![Hit::MISS; rays.len()];
-                let reaches = vec![Reach::UNLIMITED; rays.len()];
-                self.scene
-                    .cast_packets(origin, &turned, &reaches, &mut hits);
-                hits
-            })
+            .map(|rays| self.hits(map_from_lidar, rays, &beams))
             .collect();
+        let rotation = rotation_of(map_from_lidar);
         let mut surfaces = vec![None; directions.len()];
-        for (&ray, hit) in order.iter().zip(pieces.into_iter().flatten()) {
-            surfaces[ray as usize] = self.scene.normal(hit.triangle).map(|normal| {
-                let against = rotation * directions[ray as usize];
-                SurfaceHit {
-                    range_m: hit.range_m,
-                    normal_in_map: if normal.dot(against) > 0.0 {
-                        -normal
-                    } else {
-                        normal
-                    },
-                }
+        for (&ray, hit) in beams.order.iter().zip(pieces.into_iter().flatten()) {
+            surfaces[ray as usize] = self.scene.normal(hit.triangle).map(|normal| SurfaceHit {
+                range_m: hit.range_m,
+                normal_in_map: facing(normal, rotation * directions[ray as usize]),
             });
         }
         Ok(surfaces)
@@ -310,12 +304,12 @@ impl RangeRenderer for CpuRenderer {
             .iter()
             .map(|beam| deciding_reach(beam, difference))
             .collect();
-        let to_cast = Beams {
+        let to_cast = CastBeams {
             order: coherent_order(&directions),
             directions,
             reaches,
         };
-        let sums = self.each_piece(map_from_lidar, &to_cast, |rays, ranges| {
+        let sums = self.map_pieces(map_from_lidar, &to_cast, |rays, ranges| {
             let costs = rays.iter().zip(ranges).map(|(&ray, &range_m)| {
                 f64::from(difference.cost(beams[ray as usize].range_m, range_m))
             });
@@ -326,23 +320,23 @@ impl RangeRenderer for CpuRenderer {
     }
 }
 
-/// Where a ray must look for its exact cost: no surface matters at whose range the cost has reached
-/// its limit. Where all limits are one, a ray that meets nothing about its measured range costs
-/// that limit, whatever stands before.
+/// Range interval that decides the exact cost of a beam: surfaces at whose range the cost has
+/// reached its limit do not matter. If all limits are equal, a ray without a surface near its
+/// measured range costs that limit, whatever is nearer.
 fn deciding_reach(beam: &Beam, difference: &RangeDifference) -> Reach {
     let measured_m = beam.range_m;
-    let nothing_costs_as_far = measured_m.min(difference.no_surface_m) == difference.short_m;
-    let is_of_the_ground = beam.direction.z * measured_m < HIGHEST_GROUND_M;
+    let no_surface_costs_as_far = measured_m.min(difference.no_surface_m) == difference.short_m;
+    let is_on_ground = beam.direction.z * measured_m < HIGHEST_GROUND_M;
     Reach {
-        until_m: if nothing_costs_as_far {
+        until_m: if no_surface_costs_as_far {
             (measured_m + difference.short_m) * (1.0 + ROUNDING)
         } else {
             f32::INFINITY
         },
         enough_m: (measured_m - difference.long_m) * (1.0 - ROUNDING),
-        is_window: nothing_costs_as_far
+        is_window: no_surface_costs_as_far
             && difference.long_m == difference.short_m
-            && !is_of_the_ground,
+            && !is_on_ground,
     }
 }
 

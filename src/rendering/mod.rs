@@ -1,13 +1,14 @@
-//! The map as the sensor would see it from any pose.
+//! Expected ranges: the map as the sensor would see it from any pose.
 //!
-//! Two ways to ask: range images at pixel centres (for pictures), and arbitrary beams (for
-//! weights): an observation is compared along the very directions that were measured.
+//! Range images at pixel centres are for pictures, arbitrary beams for weights: an observation is
+//! compared along the very directions that were measured.
 
 pub mod backend;
 pub mod batched;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;
+mod morton;
 pub mod selection;
 
 pub use backend::Backend;
@@ -18,9 +19,9 @@ pub use selection::renderer;
 use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::{Beam, LidarModel};
 
-/// Shows the map from many poses at once. Ranges are infinite where there is no surface.
+/// Renders the map from many poses at once. Ranges are infinite where there is no surface.
 pub trait RangeRenderer: Send + Sync {
-    /// What renders, for reports: backend and device.
+    /// Backend and device, for reports.
     fn name(&self) -> String;
 
     /// Ranges along the centre rays of all pixels, row-major, one image per pose [m].
@@ -38,16 +39,16 @@ pub trait RangeRenderer: Send + Sync {
         directions: &[Vec3],
     ) -> Result<Vec<Vec<f32>>, RenderError>;
 
-    /// What rays along unit directions of the lidar frame meet first, and how it is turned.
+    /// Nearest surfaces along unit directions of the lidar frame, with their normals.
     ///
-    /// Unless a renderer knows its triangles, the plane through the ends of three rays that lie
-    /// close together; rays whose neighbours meet nothing meet nothing here.
+    /// By default those of the plane through the ends of three rays that are close together; rays
+    /// whose neighbours hit nothing hit nothing here.
     fn surfaces(
         &self,
         map_from_lidar: &Pose3,
         directions: &[Vec3],
     ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
-        /// Between the three rays [rad]: two millimetres at two metres.
+        /// Angle between the three rays [rad]: two millimetres at two metres.
         const APART_RAD: f32 = 1e-3;
         let mut bundles = Vec::with_capacity(3 * directions.len());
         for direction in directions {
@@ -62,14 +63,9 @@ pub trait RangeRenderer: Send + Sync {
             let end = |ray: usize| rays[ray] * ranges_m[ray];
             let across = (end(1) - end(0)).cross(end(2) - end(0));
             let normal = across.try_normalize()?;
-            let against = if normal.dot(rays[0]) > 0.0 {
-                -normal
-            } else {
-                normal
-            };
             Some(SurfaceHit {
                 range_m: ranges_m[0],
-                normal_in_map: map_from_lidar.rotate(against),
+                normal_in_map: map_from_lidar.rotate(facing(normal, rays[0])),
             })
         };
         let ranges = ranges.first().map_or(&[][..], Vec::as_slice);
@@ -90,7 +86,7 @@ pub trait RangeRenderer: Send + Sync {
     ) -> Result<Vec<f32>, RenderError>;
 }
 
-/// A surface of the map that a ray met.
+/// Surface of the map that a ray hits.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SurfaceHit {
     /// Distance along the unit direction [m].
@@ -99,12 +95,12 @@ pub struct SurfaceHit {
     pub normal_in_map: Vec3,
 }
 
-/// How much a rendered range that is not the measured one costs: |difference| up to a limit.
+/// Cost of the difference between measured and rendered range: its magnitude, up to a limit.
 ///
 /// ```text
-/// cost = min(rendered − measured, short_m)       something stands in front of the map
-///        min(measured − rendered, long_m)        the beam went through the map
-///        min(measured, no_surface_m)             the map has nothing there
+/// cost = min(rendered − measured, short_m)       an object in front of the map
+///        min(measured − rendered, long_m)        the beam passed through the map
+///        min(measured, no_surface_m)             no surface in the map
 /// ```
 ///
 /// With infinite limits this is |measured − rendered| with 0 for "nothing there", as in
@@ -127,7 +123,7 @@ impl RangeDifference {
         no_surface_m: f32::INFINITY,
     };
 
-    /// |difference| truncated at `limit_m`, whatever its reason.
+    /// Magnitude truncated at `limit_m` in all cases.
     pub const fn truncated(limit_m: f32) -> Self {
         Self {
             short_m: limit_m,
@@ -149,7 +145,16 @@ impl RangeDifference {
     }
 }
 
-/// Why nothing was rendered.
+/// Returns the normal on the side that a ray comes from.
+fn facing(normal: Vec3, direction: Vec3) -> Vec3 {
+    if normal.dot(direction) > 0.0 {
+        -normal
+    } else {
+        normal
+    }
+}
+
+/// Error while rendering.
 #[derive(Debug, thiserror::Error)]
 #[expect(missing_docs, reason = "the messages say it")]
 pub enum RenderError {

@@ -5,7 +5,7 @@ use fpmcl::lidar::Beam;
 use fpmcl::rendering::RangeDifference;
 use nalgebra::Vector3;
 
-/// The plain ray caster.
+/// Ray caster without a hierarchy.
 #[derive(Clone)]
 pub struct BruteForce {
     triangles: Vec<[Vector3<f64>; 3]>,
@@ -41,7 +41,7 @@ impl BruteForce {
         let ranges = self
             .triangles
             .iter()
-            .filter_map(|t| meet(t, origin, direction));
+            .filter_map(|t| intersect(t, origin, direction));
         let nearest = ranges.fold(f64::INFINITY, f64::min);
         let (min_m, max_m) = self.limits_m;
         if min_m < nearest && nearest < max_m {
@@ -62,7 +62,7 @@ impl BruteForce {
 }
 
 /// Möller and Trumbore, *Fast, Minimum Storage Ray/Triangle Intersection*, 1997.
-fn meet(corners: &[Vector3<f64>; 3], origin: Vector3<f64>, d: Vector3<f64>) -> Option<f64> {
+fn intersect(corners: &[Vector3<f64>; 3], origin: Vector3<f64>, d: Vector3<f64>) -> Option<f64> {
     let [a, b, c] = corners;
     let (ab, ac) = (b - a, c - a);
     let p = d.cross(&ac);

@@ -1,19 +1,19 @@
-//! In which order rays and poses are worked on, so that neighbours in the list are neighbours in
-//! space.
+//! Processing order of rays and poses: neighbours in the list are neighbours in space.
 
 use nalgebra::Vector3;
 
 use crate::geometry::{Pose3, Vec3};
 use crate::lidar::{LidarModel, Pixel};
 use crate::raycasting::RAYS;
+use crate::rendering::morton::{spread, spread_by_three};
 
-/// Surfaces are about this far away: how far an angle moves the end of a ray [m].
+/// Typical range of a surface, by which an angle moves the end of a ray [m].
 const LEVER_M: f64 = 10.0;
 /// Cells of the curve over poses, per axis.
 const CELLS: u32 = 1 << 10;
 
-/// Pixels in blocks of four columns and two rows, the blocks column by column: what lies in one
-/// direction stays in the cache.
+/// Pixels in blocks of four columns and two rows, the blocks column by column: the nodes in one
+/// direction stay in the cache.
 pub(super) fn pixel_order(model: &LidarModel) -> Vec<u32> {
     let mut order: Vec<u32> = Vec::with_capacity(model.len());
     for left in (0..model.width).step_by(4) {
@@ -28,7 +28,7 @@ pub(super) fn pixel_order(model: &LidarModel) -> Vec<u32> {
     order
 }
 
-/// Directions along a Z-shaped curve over azimuth and elevation (Morton 1966).
+/// Directions along a Z-order curve over azimuth and elevation (Morton 1966).
 pub(super) fn coherent_order(directions: &[Vec3]) -> Vec<u32> {
     let mut keyed: Vec<(u32, u32)> = directions
         .iter()
@@ -51,10 +51,10 @@ pub(super) fn coherent_order(directions: &[Vec3]) -> Vec<u32> {
     keyed.into_iter().map(|(_, ray)| ray).collect()
 }
 
-/// The numbers of poses along a Z-shaped curve over their places and headings: neighbours see about
-/// the same, and what one has seen is still in the cache for the next.
-pub(super) fn order_of_poses(poses: &[Pose3]) -> Vec<u32> {
-    let places = || poses.iter().map(place_and_turn_m);
+/// Indices of poses along a Z-order curve over positions and headings: neighbours see about the
+/// same surfaces, which are still in the cache.
+pub(super) fn pose_order(poses: &[Pose3]) -> Vec<u32> {
+    let places = || poses.iter().map(place_and_heading_m);
     let start = Vector3::repeat(f64::INFINITY);
     let least = places().fold(start, |least, place| least.inf(&place));
     let most = places().fold(-start, |most, place| most.sup(&place));
@@ -70,15 +70,15 @@ pub(super) fn order_of_poses(poses: &[Pose3]) -> Vec<u32> {
     keyed.into_iter().map(|(_, pose)| pose).collect()
 }
 
-/// Where a pose is, and how far its heading moves the end of a ray [m].
-pub(super) fn place_and_turn_m(pose: &Pose3) -> Vector3<f64> {
+/// Position of a pose, and how far its heading moves the end of a ray [m].
+pub(super) fn place_and_heading_m(pose: &Pose3) -> Vector3<f64> {
     let ahead = pose.rotation * Vector3::x();
     let place = pose.translation.vector;
     Vector3::new(place.x, place.y, LEVER_M * ahead.y.atan2(ahead.x))
 }
 
-/// How far the rays of a beam are from each other where they end, from neighbouring poses [m].
-pub(super) fn width_of_bundles_m(poses: &[Pose3]) -> f64 {
+/// Mean distance between the ends of the rays of a bundle, one beam from neighbouring poses [m].
+pub(super) fn bundle_width_m(poses: &[Pose3]) -> f64 {
     let widths = poses.chunks(RAYS).map(|bundle| {
         let first = &bundle[0];
         let apart_m = |pose: &Pose3| {
@@ -94,8 +94,8 @@ pub(super) fn width_of_bundles_m(poses: &[Pose3]) -> f64 {
     widths.sum::<f64>() / poses.len().div_ceil(RAYS) as f64
 }
 
-/// How far the rays of a packet of neighbouring beams are from each other where they end [m].
-pub(super) fn width_of_packets_m(directions: &[Vec3], order: &[u32]) -> f64 {
+/// Mean distance between the ends of the rays of a packet of neighbouring beams [m].
+pub(super) fn packet_width_m(directions: &[Vec3], order: &[u32]) -> f64 {
     let direction_of = |ray: u32| directions[ray as usize];
     let widths = order.chunks(RAYS).map(|rays| {
         let first = direction_of(rays[0]);
@@ -104,22 +104,4 @@ pub(super) fn width_of_packets_m(directions: &[Vec3], order: &[u32]) -> f64 {
             .fold(0.0, f64::max)
     });
     LEVER_M * widths.sum::<f64>() / order.len().div_ceil(RAYS).max(1) as f64
-}
-
-/// Puts two zeros before each of the lower 10 bits.
-fn spread_by_three(bits: u32) -> u32 {
-    let bits = bits & (CELLS - 1);
-    let bits = (bits | bits << 16) & 0x0300_00ff;
-    let bits = (bits | bits << 8) & 0x0300_f00f;
-    let bits = (bits | bits << 4) & 0x030c_30c3;
-    (bits | bits << 2) & 0x0924_9249
-}
-
-/// Puts a zero before each of the lower 16 bits.
-fn spread(bits: u32) -> u32 {
-    let bits = bits & 0xffff;
-    let bits = (bits | bits << 8) & 0x00ff_00ff;
-    let bits = (bits | bits << 4) & 0x0f0f_0f0f;
-    let bits = (bits | bits << 2) & 0x3333_3333;
-    (bits | bits << 1) & 0x5555_5555
 }

@@ -2,7 +2,7 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::order::place_and_turn_m;
+use super::order::place_and_heading_m;
 use super::*;
 
 /// A wavy ground of 40 m in two tiles, the border in the middle.
@@ -174,9 +174,9 @@ fn a_wall_is_seen_with_its_range_and_its_normal_towards_the_sensor() {
     let pose = Isometry3::from_parts(Translation3::new(1.0, 0.5, 0.0), quarter);
     // Ahead of the turned sensor is +y of the map, so +x is on its right.
     let surfaces = renderer.surfaces(&pose, &[Vec3::NEG_Y, Vec3::Y]).unwrap();
-    let met = surfaces[0].unwrap();
-    assert!((met.range_m - 4.0).abs() < 1e-6);
-    assert!((met.normal_in_map - Vec3::NEG_X).length() < 1e-6);
+    let hit = surfaces[0].unwrap();
+    assert!((hit.range_m - 4.0).abs() < 1e-6);
+    assert!((hit.normal_in_map - Vec3::NEG_X).length() < 1e-6);
     assert_eq!(surfaces[1], None);
 }
 
@@ -259,7 +259,7 @@ fn out_of_the_map_there_is_nothing() {
 }
 
 #[test]
-fn a_pose_sees_the_same_bits_alone_as_among_others() {
+fn the_costs_of_a_pose_have_the_same_bits_alone_and_among_others() {
     let renderer = CpuRenderer::new(&hills(Vec3::ZERO));
     let difference = RangeDifference::truncated(0.5);
     for (count, beams) in [(100, beams(600)), (3, beams(20_000))] {
@@ -273,10 +273,10 @@ fn a_pose_sees_the_same_bits_alone_as_among_others() {
 }
 
 #[test]
-fn neighbours_in_the_order_of_poses_are_near_and_every_pose_is_in_it_once() {
+fn the_pose_order_is_a_permutation_with_near_neighbours() {
     let poses = poses(1000);
-    let order = order_of_poses(&poses);
-    let place = |pose: u32| place_and_turn_m(&poses[pose as usize]);
+    let order = pose_order(&poses);
+    let place = |pose: u32| place_and_heading_m(&poses[pose as usize]);
     let mean_step_m = |order: &[u32]| {
         let steps = order.windows(2).map(|p| (place(p[0]) - place(p[1])).norm());
         steps.sum::<f64>() / order.len() as f64
@@ -285,7 +285,7 @@ fn neighbours_in_the_order_of_poses_are_near_and_every_pose_is_in_it_once() {
     sorted.sort_unstable();
     assert!(sorted.iter().copied().eq(0..1000));
     assert!(mean_step_m(&order) < 0.3 * mean_step_m(&sorted));
-    assert_eq!(order_of_poses(&[]), Vec::<u32>::new());
+    assert_eq!(pose_order(&[]), Vec::<u32>::new());
 }
 
 /// Poses within centimetres of one.
@@ -303,24 +303,24 @@ fn close_poses(count: usize) -> Vec<Pose3> {
 }
 
 #[test]
-fn what_is_close_to_each_other_is_cast_together() {
-    let way = |poses: &[Pose3], count: usize| {
+fn rays_that_are_close_to_each_other_are_grouped() {
+    let grouping = |poses: &[Pose3], count: usize| {
         let directions: Vec<Vec3> = beams(count).iter().map(|beam| beam.direction).collect();
-        let beams = Beams {
+        let beams = CastBeams {
             order: coherent_order(&directions),
             reaches: vec![Reach::UNLIMITED; count],
             directions,
         };
-        Way::of(poses, &beams)
+        Grouping::of(poses, &beams)
     };
-    assert_eq!(way(&poses(100), 500), Way::Alone);
-    assert_eq!(way(&poses(100), 100_000), Way::Packets);
-    assert_eq!(way(&close_poses(100), 500), Way::Bundles);
-    assert_eq!(way(&close_poses(1), 500), Way::Alone);
+    assert_eq!(grouping(&poses(100), 500), Grouping::Single);
+    assert_eq!(grouping(&poses(100), 100_000), Grouping::Packets);
+    assert_eq!(grouping(&close_poses(100), 500), Grouping::Bundles);
+    assert_eq!(grouping(&close_poses(1), 500), Grouping::Single);
 }
 
 #[test]
-fn the_poses_about_it_do_not_change_what_a_pose_sees() {
+fn neighbouring_poses_do_not_change_the_cost_of_a_pose() {
     let renderer = CpuRenderer::new(&hills(Vec3::ZERO));
     let difference = RangeDifference::truncated(0.5);
     let beams = beams(600);

@@ -20,17 +20,17 @@ pub(super) struct BatchSizes {
 }
 
 impl BatchSizes {
-    /// As much as takes a fraction of a second, and 16 MB of results; on a software adapter some
+    /// Work for a fraction of a second, and 16 MB of results; on a software adapter for some
     /// seconds.
     pub fn of(kind: AdapterKind) -> Self {
-        let shorter = if kind == AdapterKind::Software { 64 } else { 1 };
+        let divisor = if kind == AdapterKind::Software { 64 } else { 1 };
         Self {
-            ranges: (1 << 22) / shorter,
-            beams: (1 << 24) / shorter,
+            ranges: (1 << 22) / divisor,
+            beams: (1 << 24) / divisor,
             directions: 1 << 20,
             poses: 65_535,
             images: 64,
-            vertices: (1 << 29) / shorter,
+            vertices: (1 << 29) / divisor,
         }
     }
 }

@@ -1,14 +1,14 @@
-//! Several batches of work in flight, their results taken in the order in which they were given.
+//! Several batches of work in flight; their results are read in the order of submission.
 
 use std::collections::VecDeque;
 
 use super::device::{Gpu, InFlight};
 use crate::rendering::RenderError;
 
-/// While one is read back, one runs and one waits.
+/// One is read back, one runs, one is queued.
 const IN_FLIGHT: usize = 3;
 
-/// Starts every batch and finishes it once so many others have been started after it.
+/// Starts every batch, and finishes it before more than [`IN_FLIGHT`] have been started.
 pub(super) fn run<B>(
     gpu: &Gpu,
     batches: impl IntoIterator<Item = B>,

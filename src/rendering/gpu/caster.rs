@@ -7,47 +7,48 @@ use wgpu::{BindGroup, Buffer, BufferUsages, CommandEncoder, ComputePipeline};
 
 use super::batches;
 use super::device::{Gpu, InFlight};
+use super::device_map::DeviceMap;
 use super::layout::{BEAMS_PER_GROUP, FAR, LANES, Pose, Query, Reduction};
-use super::scene::Scene;
 use super::shaders;
 use crate::geometry::Vec3;
 use crate::lidar::Beam;
+use crate::rendering::morton::spread;
 use crate::rendering::{RangeDifference, RenderError};
 
-/// Pipelines over a map.
+/// Compute pipelines with the map bound to them.
 pub(super) struct Caster {
     cast: Kernel,
     compare: Kernel,
-    add_up: ComputePipeline,
+    reduce: ComputePipeline,
 }
 
 /// A pipeline and the map bound to it.
 struct Kernel {
     pipeline: ComputePipeline,
-    scene: BindGroup,
+    map: BindGroup,
 }
 
-/// Part of the poses against part of the directions.
+/// Some of the poses with some of the directions.
 struct Batch {
     poses: Range<usize>,
     rays: usize,
-    /// Index of that part of the directions.
+    /// Index of the part of the directions.
     part: usize,
 }
 
 impl Caster {
-    pub fn new(gpu: &Gpu, scene: &Scene) -> Self {
-        let source = shaders::caster(scene.depth);
+    pub fn new(gpu: &Gpu, map: &DeviceMap) -> Self {
+        let source = shaders::caster(map.depth);
         let kernel = |entry_point| {
             let pipeline = pipeline(gpu, &source, entry_point);
-            let buffers = [&scene.nodes, &scene.triangles];
-            let scene = bind(gpu, &pipeline, 0, &buffers);
-            Kernel { pipeline, scene }
+            let buffers = [&map.nodes, &map.triangles];
+            let map = bind(gpu, &pipeline, 0, &buffers);
+            Kernel { pipeline, map }
         };
         Self {
             cast: kernel("cast_rays"),
             compare: kernel("compare_beams"),
-            add_up: pipeline(gpu, shaders::REDUCE, "add_up"),
+            reduce: pipeline(gpu, shaders::REDUCE, "reduce"),
         }
     }
 
@@ -56,14 +57,14 @@ impl Caster {
     pub fn cast(
         &self,
         gpu: &Gpu,
-        scene: &Scene,
+        map: &DeviceMap,
         poses: &[Pose],
         (directions, far_m): (&[Vec3], f32),
     ) -> Result<Vec<Vec<f32>>, RenderError> {
         let parts = parts(gpu, directions, |_, place| f32::from_bits(place));
         let query = Query {
             far_m: far_m.min(FAR),
-            ..Query::new(scene, &RangeDifference::UNLIMITED)
+            ..Query::new(map, &RangeDifference::UNLIMITED)
         };
         let mut rows = vec![Vec::with_capacity(directions.len()); poses.len()];
         batches::run(
@@ -86,13 +87,13 @@ impl Caster {
     pub fn compare(
         &self,
         gpu: &Gpu,
-        scene: &Scene,
+        map: &DeviceMap,
         poses: &[Pose],
         (beams, difference): (&[Beam], &RangeDifference),
     ) -> Result<Vec<f32>, RenderError> {
         let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
         let parts = parts(gpu, &directions, |index, _| beams[index].range_m);
-        let query = Query::new(scene, difference);
+        let query = Query::new(map, difference);
         let mut totals = vec![0.0_f64; poses.len()];
         batches::run(
             gpu,
@@ -157,9 +158,9 @@ impl Caster {
             unused: [0; 3],
         };
         let reduction = gpu.upload("reduction", &[reduction], BufferUsages::UNIFORM);
-        let bound = bind(gpu, &self.add_up, 0, &[&reduction, &sums, &totals]);
+        let bound = bind(gpu, &self.reduce, 0, &[&reduction, &sums, &totals]);
         let mut pass = encoder.begin_compute_pass(&Default::default());
-        pass.set_pipeline(&self.add_up);
+        pass.set_pipeline(&self.reduce);
         pass.set_bind_group(0, &bound, &[]);
         pass.dispatch_workgroups(poses.len() as u32, 1, 1);
         drop(pass);
@@ -183,18 +184,18 @@ impl Kernel {
         let bound = bind(gpu, &self.pipeline, 1, &[&query, &buffer, rays, results]);
         let mut pass = encoder.begin_compute_pass(&Default::default());
         pass.set_pipeline(&self.pipeline);
-        pass.set_bind_group(0, &self.scene, &[]);
+        pass.set_bind_group(0, &self.map, &[]);
         pass.set_bind_group(1, &bound, &[]);
         pass.dispatch_workgroups(groups, poses.len() as u32, 1);
     }
 }
 
 impl Query {
-    fn new(scene: &Scene, difference: &RangeDifference) -> Self {
+    fn new(map: &DeviceMap, difference: &RangeDifference) -> Self {
         Self {
             rays: 0,
             groups: 0,
-            root: scene.root,
+            root: map.root,
             unused: 0,
             far_m: FAR,
             short_m: difference.short_m.min(FAR),
@@ -205,14 +206,14 @@ impl Query {
 }
 
 /// Some of the directions, on the device.
-struct Part {
+struct RayPart {
     buffer: Buffer,
     rays: usize,
 }
 
-/// Sends directions in parts, each in an order in which neighbours look the same way. `fourth`
-/// makes the fourth number of a direction from its index and its place in its part.
-fn parts(gpu: &Gpu, directions: &[Vec3], fourth: impl Fn(usize, u32) -> f32) -> Vec<Part> {
+/// Uploads directions in parts, each in a coherent order. `fourth` makes the fourth number of a
+/// direction from its index and its place in its part.
+fn parts(gpu: &Gpu, directions: &[Vec3], fourth: impl Fn(usize, u32) -> f32) -> Vec<RayPart> {
     let size = gpu
         .batch_sizes
         .directions
@@ -225,7 +226,7 @@ fn parts(gpu: &Gpu, directions: &[Vec3], fourth: impl Fn(usize, u32) -> f32) -> 
                 part[place as usize].extend(fourth).to_array()
             })
             .collect();
-        Part {
+        RayPart {
             buffer: gpu.upload("rays", &rays, BufferUsages::STORAGE),
             rays: rays.len(),
         }
@@ -233,8 +234,8 @@ fn parts(gpu: &Gpu, directions: &[Vec3], fourth: impl Fn(usize, u32) -> f32) -> 
     directions.chunks(size).enumerate().map(part).collect()
 }
 
-/// All poses against all parts, `rays_per_batch` at most unless a single pose has more.
-fn batches_of(gpu: &Gpu, poses: usize, parts: &[Part], rays_per_batch: usize) -> Vec<Batch> {
+/// All poses with all parts, at most `rays_per_batch` unless a single pose has more.
+fn batches_of(gpu: &Gpu, poses: usize, parts: &[RayPart], rays_per_batch: usize) -> Vec<Batch> {
     let mut batches = Vec::new();
     for (number, part) in parts.iter().enumerate() {
         let step = (rays_per_batch / part.rays).clamp(1, gpu.batch_sizes.poses);
@@ -249,8 +250,8 @@ fn batches_of(gpu: &Gpu, poses: usize, parts: &[Part], rays_per_batch: usize) ->
     batches
 }
 
-/// Places of directions along a Z-curve over azimuth and elevation: threads that run side by side
-/// then go the same way through the hierarchy.
+/// Places of directions along a Z-order curve over azimuth and elevation: neighbouring threads
+/// then traverse the hierarchy alike.
 fn coherent_order(directions: &[Vec3]) -> Vec<u32> {
     let key = |direction: Vec3| {
         let azimuth = (direction.y.atan2(direction.x) / PI + 1.0) * 511.0;
@@ -260,14 +261,6 @@ fn coherent_order(directions: &[Vec3]) -> Vec<u32> {
     let mut order: Vec<u32> = (0..directions.len() as u32).collect();
     order.sort_by_cached_key(|&place| key(directions[place as usize]));
     order
-}
-
-/// Puts a zero before each of the lowest 16 bits.
-fn spread(mut bits: u32) -> u32 {
-    bits = (bits | bits << 8) & 0x00ff_00ff;
-    bits = (bits | bits << 4) & 0x0f0f_0f0f;
-    bits = (bits | bits << 2) & 0x3333_3333;
-    (bits | bits << 1) & 0x5555_5555
 }
 
 fn pipeline(gpu: &Gpu, source: &str, entry_point: &str) -> ComputePipeline {
@@ -283,7 +276,7 @@ fn pipeline(gpu: &Gpu, source: &str, entry_point: &str) -> ComputePipeline {
         })
 }
 
-/// Binds buffers to 0, 1, 2 … of a group.
+/// Binds buffers to the bindings 0, 1, 2 … of a group.
 fn bind(gpu: &Gpu, pipeline: &ComputePipeline, group: u32, buffers: &[&Buffer]) -> BindGroup {
     let layout = pipeline.get_bind_group_layout(group);
     shaders::bind(gpu, &layout, buffers)
@@ -306,7 +299,7 @@ mod tests {
     use crate::lidar::LidarModel;
 
     #[test]
-    fn the_coherent_order_is_a_permutation_in_which_neighbours_look_the_same_way() {
+    fn the_coherent_order_is_a_permutation_with_similar_neighbours() {
         let directions = LidarModel::default().directions();
         let order = coherent_order(&directions);
         let mut sorted = order.clone();
@@ -331,11 +324,5 @@ mod tests {
         };
         let row_by_row: Vec<u32> = (0..order.len() as u32).collect();
         assert!(widest(&order) < 0.7 * widest(&row_by_row));
-    }
-
-    #[test]
-    fn spreading_leaves_room_for_another_number() {
-        assert_eq!(spread(0b1011), 0b100_0101);
-        assert_eq!(spread(0xffff) & spread(0xffff) << 1, 0);
     }
 }

@@ -1,15 +1,15 @@
-// Rays through a bounding volume hierarchy, nearer child first; what they met is written down
-// (`cast_rays`) or compared with what was measured (`compare_beams`).
+// Ray casting through a bounding volume hierarchy, nearer child first; ranges are written
+// (`cast_rays`) or compared with measured ones (`compare_beams`).
 //
-// `ray.wgsl` stands before this text. Keep in sync with `layout.rs`: `Node`, `Query`, `LEAF`,
-// `LANES`, `BEAMS_PER_GROUP`, and the bits of a child; `STACK_SIZE` is replaced by `caster.rs`
-// with the depth of the hierarchy.
+// `ray.wgsl` is prepended to this text. Keep in sync with `layout.rs`: `Node`, `Query`, `LEAF`,
+// `LANES`, `BEAMS_PER_GROUP`, and the bits of a node reference; `STACK_SIZE` is replaced by
+// `shaders.rs` with the depth of the hierarchy.
 
 const STACK_SIZE: u32 = 64u;
 const LANES: u32 = 64u;
 const BEAMS_PER_GROUP: u32 = 256u;
 
-// A child is the index of a node, or LEAF | number of triangles << 28 | first triangle.
+// A node reference is the index of a node, or LEAF | number of triangles << 28 | first triangle.
 const LEAF: u32 = 0x80000000u;
 
 struct Node {
@@ -28,10 +28,10 @@ struct Query {
     rays: u32,
     // Work groups per pose.
     groups: u32,
-    // The child that leads to everything.
+    // Reference to the root.
     root: u32,
     unused: u32,
-    // Surfaces at this range or farther are not met [m].
+    // Surfaces at this range or farther are not hit [m].
     far_m: f32,
     // As in `RangeDifference` [m].
     short_m: f32,
@@ -43,12 +43,12 @@ struct Query {
 @group(0) @binding(1) var<storage, read> triangles: array<Triangle>;
 @group(1) @binding(0) var<uniform> query: Query;
 @group(1) @binding(1) var<storage, read> poses: array<Pose>;
-// Direction in the lidar frame; then where its result goes, or the measured range [m].
+// Direction in the lidar frame; then the index of its result, or the measured range [m].
 @group(1) @binding(2) var<storage, read> rays: array<vec4f>;
 @group(1) @binding(3) var<storage, read_write> results: array<f32>;
 
-// Where a ray enters a box, FAR where it does not before `far_m`. The way out is put back by more
-// than divisions are rounded (2.5 units in the last place): a ray along a face enters the box.
+// Range at which a ray enters a box, FAR if it does not before `far_m`. The exit is enlarged by more
+// than the rounding of divisions (2.5 units in the last place): a ray along a face enters the box.
 fn entry(low: vec3f, high: vec3f, origin: vec3f, inverse: vec3f, far_m: f32) -> f32 {
     let one = (low - origin) * inverse;
     let other = (high - origin) * inverse;
@@ -69,8 +69,8 @@ fn inverse_of(direction: vec3f) -> vec3f {
 fn nearest(origin: vec3f, direction: vec3f, far_m: f32, enough_m: f32) -> f32 {
     let inverse = inverse_of(direction);
     var best = far_m;
-    var waiting: array<u32, STACK_SIZE>;
-    var waiting_from: array<f32, STACK_SIZE>;
+    var stack: array<u32, STACK_SIZE>;
+    var stack_near: array<f32, STACK_SIZE>;
     var depth = 0u;
     var child = query.root;
     loop {
@@ -90,24 +90,24 @@ fn nearest(origin: vec3f, direction: vec3f, far_m: f32, enough_m: f32) -> f32 {
             let left_first = left <= right;
             if min(left, right) < FAR {
                 if max(left, right) < FAR {
-                    waiting[depth] = select(node.left, node.right, left_first);
-                    waiting_from[depth] = max(left, right);
+                    stack[depth] = select(node.left, node.right, left_first);
+                    stack_near[depth] = max(left, right);
                     depth++;
                 }
                 child = select(node.right, node.left, left_first);
                 continue;
             }
         }
-        // The next one that can still hold something nearer.
+        // The next node that is entered before the nearest surface.
         var found = false;
         while depth > 0u && !found {
             depth--;
-            found = waiting_from[depth] < best;
+            found = stack_near[depth] < best;
         }
         if !found {
             break;
         }
-        child = waiting[depth];
+        child = stack[depth];
     }
     return select(best, FAR, best >= far_m);
 }
@@ -135,9 +135,9 @@ fn cost(measured_m: f32, rendered_m: f32) -> f32 {
     return min(measured_m - rendered_m, query.long_m);
 }
 
-// A ray is followed only as far as it can change the cost: what is nearer than
-// measured - long_m costs long_m wherever it is; what is farther than measured + short_m costs
-// short_m, and where nothing at all costs as much, it does not matter whether it is there.
+// A ray is traced only as far as it can change the cost: a surface nearer than measured - long_m
+// costs long_m at any range; one farther than measured + short_m costs short_m, and if no surface
+// at all costs as much, it does not matter whether there is one.
 fn cost_of(pose: Pose, beam: vec4f) -> f32 {
     let measured_m = beam.w;
     let nothing_is_short = min(measured_m, query.no_surface_m) == query.short_m;

@@ -1,8 +1,8 @@
-//! A graphics device: found, opened, its faults remembered, results read back.
+//! A graphics device: enumeration, opening, errors, buffers and read-back.
 //!
-//! wgpu reports faults to callbacks, by default by a panic. Here the callbacks write the first
-//! fault down, and whoever reads a result asks for it first, so that no result of a device that
-//! has failed is ever taken for a range. A fault stays: the device is not used again.
+//! wgpu reports errors to callbacks, by default by a panic. Here the callbacks record the first
+//! error, which is checked before any result is read, so that no result of a failed device is ever
+//! taken for a range. An error stays: the device is not used again.
 
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -15,30 +15,30 @@ use super::batch_sizes::BatchSizes;
 use crate::rendering::RenderError;
 use crate::rendering::backend::{AdapterKind, AdapterReport, Backend, best_adapter};
 
-/// After this long a batch is taken for lost; each is meant to take a fraction of a second.
-const PATIENCE: Duration = Duration::from_secs(120);
+/// Time after which a batch is considered lost; each should take a fraction of a second.
+const TIMEOUT: Duration = Duration::from_secs(120);
 
-/// As large as the largest element of any array in the shaders [bytes].
-const SMALLEST_BUFFER: u64 = 64;
+/// Size of the largest element of any array in the shaders [bytes].
+const MIN_BUFFER_BYTES: u64 = 64;
 
 /// All graphics adapters of this machine, best first.
 pub fn adapters() -> Vec<AdapterReport> {
-    found_adapters().iter().map(report).collect()
+    enumerate_adapters().iter().map(report).collect()
 }
 
-/// Best first. OpenGL is only asked where Vulkan knows no adapter: it would name the same ones
-/// again. Where there is no display, Mesa's libraries complain on standard error; for Vulkan that
-/// is its layer that chooses among devices, which `NODEVICE_SELECT=1` leaves out.
-fn found_adapters() -> Vec<wgpu::Adapter> {
-    let mut found = found_through(wgpu::Backends::PRIMARY);
+/// Best first. OpenGL is only enumerated if Vulkan has no adapter: it would list the same ones
+/// again. Without a display, Mesa's libraries print warnings on standard error; for Vulkan its
+/// device selection layer does, which `NODEVICE_SELECT=1` disables.
+fn enumerate_adapters() -> Vec<wgpu::Adapter> {
+    let mut found = enumerate(wgpu::Backends::PRIMARY);
     if found.is_empty() {
-        found = found_through(wgpu::Backends::SECONDARY);
+        found = enumerate(wgpu::Backends::SECONDARY);
     }
     found.sort_by_key(|adapter| kind(adapter.get_info().device_type));
     found
 }
 
-fn found_through(backends: wgpu::Backends) -> Vec<wgpu::Adapter> {
+fn enumerate(backends: wgpu::Backends) -> Vec<wgpu::Adapter> {
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
         backends,
         ..wgpu::InstanceDescriptor::new_without_display_handle()
@@ -83,20 +83,20 @@ fn obstacle(adapter: &wgpu::Adapter) -> Option<&'static str> {
     }
 }
 
-/// What went wrong first.
+/// First errors that the device reported.
 #[derive(Default)]
-struct Faults {
+struct DeviceErrors {
     lost: Mutex<Option<String>>,
     refused: Mutex<Option<String>>,
 }
 
-fn note(slot: &Mutex<Option<String>>, reason: String) {
+fn record(slot: &Mutex<Option<String>>, reason: String) {
     slot.lock()
         .unwrap_or_else(PoisonError::into_inner)
         .get_or_insert(reason);
 }
 
-fn noted(slot: &Mutex<Option<String>>) -> Option<String> {
+fn recorded(slot: &Mutex<Option<String>>) -> Option<String> {
     slot.lock().unwrap_or_else(PoisonError::into_inner).clone()
 }
 
@@ -107,15 +107,15 @@ pub(super) struct Gpu {
     pub report: AdapterReport,
     pub limits: wgpu::Limits,
     pub batch_sizes: BatchSizes,
-    /// Whether the stages of the rasterizer can read the map.
+    /// Whether vertex and fragment shaders can read the map.
     pub can_rasterize: bool,
-    faults: Arc<Faults>,
+    errors: Arc<DeviceErrors>,
 }
 
 impl Gpu {
-    /// Opens the best adapter that the backend allows, with all that it can bind.
+    /// Opens the best adapter that the backend allows, with its own limits.
     pub fn open(backend: Backend) -> Result<Self, RenderError> {
-        let adapters = found_adapters();
+        let adapters = enumerate_adapters();
         let reports: Vec<AdapterReport> = adapters.iter().map(report).collect();
         let index = best_adapter(&reports, backend).ok_or(RenderError::NoAdapter)?;
         let (adapter, report) = (&adapters[index], reports[index].clone());
@@ -128,14 +128,14 @@ impl Gpu {
         .map_err(|error| RenderError::DeviceRefused {
             reason: error.to_string(),
         })?;
-        let faults = Arc::new(Faults::default());
-        let heard = Arc::clone(&faults);
+        let errors = Arc::new(DeviceErrors::default());
+        let recorder = Arc::clone(&errors);
         device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
-            note(&heard.refused, error.to_string());
+            record(&recorder.refused, error.to_string());
         }));
-        let heard = Arc::clone(&faults);
+        let recorder = Arc::clone(&errors);
         device.set_device_lost_callback(move |reason, message| {
-            note(&heard.lost, format!("{reason:?}: {message}"));
+            record(&recorder.lost, format!("{reason:?}: {message}"));
         });
         let stages = wgpu::DownlevelFlags::VERTEX_STORAGE | wgpu::DownlevelFlags::FRAGMENT_STORAGE;
         Ok(Self {
@@ -145,18 +145,18 @@ impl Gpu {
             report,
             limits,
             can_rasterize: adapter.get_downlevel_capabilities().flags.contains(stages),
-            faults,
+            errors,
         })
     }
 
-    /// An error if anything went wrong so far.
+    /// Returns the first error that the device has reported.
     pub fn check(&self) -> Result<(), RenderError> {
-        let refused = noted(&self.faults.refused);
+        let refused = recorded(&self.errors.refused);
         if refused.is_some() {
-            // A lost device refuses everything, and says only when polled that it is lost.
+            // A lost device refuses all work, and reports the loss only when polled.
             let _ = self.device.poll(wgpu::PollType::Poll);
         }
-        match (noted(&self.faults.lost), refused) {
+        match (recorded(&self.errors.lost), refused) {
             (Some(reason), _) => Err(RenderError::DeviceLost { reason }),
             (None, Some(reason)) => Err(RenderError::DeviceRefused { reason }),
             (None, None) => Ok(()),
@@ -178,17 +178,17 @@ impl Gpu {
         buffer
     }
 
-    /// A buffer of zeros, with room for one element of what it is for: none can be empty.
+    /// A buffer of zeros with room for at least one element, because none can be empty.
     pub fn buffer(&self, label: &str, bytes: u64, usage: BufferUsages) -> Buffer {
         self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(label),
-            size: bytes.max(SMALLEST_BUFFER).next_multiple_of(16),
+            size: bytes.max(MIN_BUFFER_BYTES).next_multiple_of(16),
             usage,
             mapped_at_creation: false,
         })
     }
 
-    /// A buffer that results are copied to, to be read here.
+    /// A buffer that results are copied to for reading on the host.
     pub fn staging(&self, bytes: u64) -> Buffer {
         let usage = BufferUsages::COPY_DST | BufferUsages::MAP_READ;
         self.buffer("results", bytes, usage)
@@ -199,7 +199,7 @@ impl Gpu {
         let submission = self.queue.submit([encoder.finish()]);
         let (sender, done) = sync_channel(1);
         staging.map_async(wgpu::MapMode::Read, 0..bytes, move |result| {
-            // Nobody waits any more where an earlier batch has failed.
+            // The receiver is gone if an earlier batch has failed.
             let _ = sender.try_send(result);
         });
         InFlight {
@@ -214,12 +214,12 @@ impl Gpu {
     pub fn fetch<T: Pod>(&self, work: &InFlight) -> Result<Vec<T>, RenderError> {
         let waited = self.device.poll(wgpu::PollType::Wait {
             submission_index: Some(work.submission.clone()),
-            timeout: Some(PATIENCE),
+            timeout: Some(TIMEOUT),
         });
         self.check()?;
         let lost = |reason: String| RenderError::DeviceLost { reason };
         waited.map_err(|error| lost(error.to_string()))?;
-        let mapped = work.done.recv_timeout(PATIENCE);
+        let mapped = work.done.recv_timeout(TIMEOUT);
         let mapped = mapped.map_err(|_timeout| lost("no answer".to_owned()))?;
         self.check()?;
         mapped.map_err(|error| lost(error.to_string()))?;
@@ -229,7 +229,7 @@ impl Gpu {
     }
 }
 
-/// Work that was given to the device.
+/// Work that was submitted to the device.
 pub(super) struct InFlight {
     staging: Buffer,
     bytes: u64,

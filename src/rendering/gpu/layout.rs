@@ -1,4 +1,4 @@
-//! What the shaders read, byte for byte.
+//! Memory layout of the data that the shaders read.
 //!
 //! Keep in sync with `ray.wgsl`, `caster.wgsl`, `reduce.wgsl` and `raster.wgsl`; a test compares
 //! the sizes, and the parity tests the rest.
@@ -7,20 +7,20 @@ use bytemuck::{Pod, Zeroable};
 
 use crate::geometry::{Pose3, Vec3};
 
-/// Farther than everything: "there is no surface". Shaders know no infinity.
+/// Range without a surface: WGSL has no infinity.
 pub(super) const FAR: f32 = 3.0e38;
 /// Threads per work group.
 pub(super) const LANES: u32 = 64;
-/// Beams that one work group compares.
+/// Beams per work group.
 pub(super) const BEAMS_PER_GROUP: u32 = 256;
 /// Two rectangles of two triangles: one in the image, one for what lies beyond its seam.
 pub(super) const VERTICES_PER_TRIANGLE: u32 = 12;
-/// Marks a child that is a leaf.
+/// Flag of a reference to a leaf.
 pub(super) const LEAF: u32 = 1 << 31;
-/// Most triangles in a leaf.
+/// Maximum number of triangles in a leaf.
 pub(super) const MAX_LEAF: usize = 7;
 
-/// The number by which a node refers to a leaf.
+/// Reference to a leaf.
 pub(super) fn leaf(first: usize, count: usize) -> u32 {
     debug_assert!(count <= MAX_LEAF && first < 1 << 28);
     LEAF | (count as u32) << 28 | first as u32
@@ -75,7 +75,7 @@ impl Pose {
     }
 }
 
-/// What the caster is asked.
+/// Parameters of the caster.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub(super) struct Query {
@@ -83,17 +83,17 @@ pub(super) struct Query {
     pub rays: u32,
     /// Work groups per pose.
     pub groups: u32,
-    /// The child that leads to everything.
+    /// Reference to the root.
     pub root: u32,
     pub unused: u32,
-    /// Surfaces at this range or farther are not met [m].
+    /// Surfaces at this range or farther are not hit [m].
     pub far_m: f32,
     pub short_m: f32,
     pub long_m: f32,
     pub no_surface_m: f32,
 }
 
-/// How many numbers are added up per pose.
+/// Number of terms of the sum of a pose.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub(super) struct Reduction {
@@ -101,7 +101,7 @@ pub(super) struct Reduction {
     pub unused: [u32; 3],
 }
 
-/// How images lie in the texture that they are drawn to.
+/// Positions of images in the texture that they are drawn to.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub(super) struct Atlas {

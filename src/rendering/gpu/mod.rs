@@ -1,31 +1,31 @@
-//! The map as the sensor would see it, on a graphics card through wgpu (Vulkan, OpenGL).
+//! Rendering on a graphics card through wgpu (Vulkan, OpenGL).
 //!
-//! Two ways to a range image, which find the same ranges:
+//! Two methods for range images, which find the same ranges:
 //!
 //! - *cast*: a compute shader sends the rays through a bounding volume hierarchy. A ray costs
 //!   some dozens of boxes and a few triangles, however large the map is.
 //! - *draw*: the tiles that a pose can see are drawn, an instance per pose, on an atlas of
-//!   images; every triangle is a rectangle of pixels whose centre rays are then asked one by one.
+//!   images; every triangle is a rectangle of pixels whose centre rays are then cast one by one.
 //!   Every triangle costs twelve vertices in every image.
 //!
 //! A range image has some 10⁴ to 10⁵ rays, the tiles around a car 10⁶ triangles: casting is the
-//! rule, drawing is there to be compared with (images of 57,600 rays on a software adapter: as
+//! default, drawing the comparison (images of 57,600 rays on a software adapter: as
 //! fast with 20,000 triangles, casting 40 times faster with 1.6 million). Arbitrary beams can
 //! only be cast. Comparisons are
 //! added up on the device; one number per pose is read back.
 //!
-//! Ranges are those of the plane of the triangle that the ray meets, by one text (`ray.wgsl`),
-//! whichever the way.
+//! Ranges are those of the plane of the triangle that the ray hits, by one text (`ray.wgsl`) for
+//! both methods.
 
 mod batch_sizes;
 mod batches;
 mod caster;
 mod device;
-mod forest;
+mod device_map;
 mod layout;
 mod raster;
-mod scene;
 mod shaders;
+mod two_level;
 
 use super::backend::{AdapterReport, Backend};
 use super::{RangeDifference, RangeRenderer, RenderError};
@@ -34,13 +34,13 @@ use crate::lidar::{Beam, LidarModel};
 
 use caster::Caster;
 use device::Gpu;
+use device_map::DeviceMap;
 use layout::FAR;
 use raster::Rasterizer;
-use scene::Scene;
 
 pub use device::adapters;
 
-/// How range images are made.
+/// Method to render range images.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ImageMethod {
     /// Rays through a hierarchy, by a compute shader.
@@ -52,7 +52,7 @@ pub enum ImageMethod {
 /// Renders on a graphics device that holds the whole map.
 pub struct GpuRenderer {
     gpu: Gpu,
-    scene: Scene,
+    map: DeviceMap,
     caster: Caster,
     rasterizer: Option<Rasterizer>,
 }
@@ -62,16 +62,16 @@ impl GpuRenderer {
     ///
     /// # Errors
     /// [`RenderError::NoAdapter`] where there is none, [`RenderError::MapTooLarge`] where the
-    /// map does not fit what the device binds, and the device's own faults.
+    /// map does not fit what the device binds, and the errors of the device.
     pub fn new(tiles: &[TriangleMesh], backend: Backend) -> Result<Self, RenderError> {
         let gpu = Gpu::open(backend)?;
-        let scene = Scene::upload(&gpu, tiles)?;
-        let caster = Caster::new(&gpu, &scene);
+        let map = DeviceMap::upload(&gpu, tiles)?;
+        let caster = Caster::new(&gpu, &map);
         let rasterizer = gpu.can_rasterize.then(|| Rasterizer::new(&gpu));
         gpu.check()?;
         Ok(Self {
             gpu,
-            scene,
+            map,
             caster,
             rasterizer,
         })
@@ -82,31 +82,31 @@ impl GpuRenderer {
         &self.gpu.report
     }
 
-    /// What the map takes on the device [bytes].
+    /// Size of the map on the device [bytes].
     pub fn map_bytes(&self) -> u64 {
-        self.scene.bytes
+        self.map.bytes
     }
 
-    /// [`RangeRenderer::render`] in a given way.
+    /// [`RangeRenderer::render`] by a given method.
     ///
     /// # Errors
-    /// The device's faults; [`RenderError::DeviceRefused`] where images are to be drawn that fit
-    /// no texture, or on a device that cannot draw.
+    /// The errors of the device; [`RenderError::DeviceRefused`] if images to be drawn fit no texture,
+    /// or if the device cannot draw.
     pub fn render_by(
         &self,
         method: ImageMethod,
         map_from_lidar: &[Pose3],
         model: &LidarModel,
     ) -> Result<Vec<Vec<f32>>, RenderError> {
-        let (gpu, scene) = (&self.gpu, &self.scene);
-        let poses = scene.poses(map_from_lidar);
+        let (gpu, map) = (&self.gpu, &self.map);
+        let poses = map.poses(map_from_lidar);
         let mut images = match (method, &self.rasterizer) {
             (ImageMethod::Cast, _) => {
                 let rays = model.directions();
                 self.caster
-                    .cast(gpu, scene, &poses, (&rays, model.max_range))?
+                    .cast(gpu, map, &poses, (&rays, model.max_range))?
             }
-            (ImageMethod::Draw, Some(rasterizer)) => rasterizer.draw(gpu, scene, &poses, model)?,
+            (ImageMethod::Draw, Some(rasterizer)) => rasterizer.draw(gpu, map, &poses, model)?,
             (ImageMethod::Draw, None) => {
                 return Err(RenderError::DeviceRefused {
                     reason: "its drawing stages read no storage buffers".to_owned(),
@@ -140,9 +140,9 @@ impl RangeRenderer for GpuRenderer {
         map_from_lidar: &[Pose3],
         directions: &[Vec3],
     ) -> Result<Vec<Vec<f32>>, RenderError> {
-        let poses = self.scene.poses(map_from_lidar);
+        let poses = self.map.poses(map_from_lidar);
         let rays = (directions, f32::INFINITY);
-        let mut rows = self.caster.cast(&self.gpu, &self.scene, &poses, rays)?;
+        let mut rows = self.caster.cast(&self.gpu, &self.map, &poses, rays)?;
         for range_m in rows.iter_mut().flatten() {
             if *range_m >= FAR {
                 *range_m = f32::INFINITY;
@@ -157,9 +157,9 @@ impl RangeRenderer for GpuRenderer {
         beams: &[Beam],
         difference: &RangeDifference,
     ) -> Result<Vec<f32>, RenderError> {
-        let poses = self.scene.poses(map_from_lidar);
+        let poses = self.map.poses(map_from_lidar);
         self.caster
-            .compare(&self.gpu, &self.scene, &poses, (beams, difference))
+            .compare(&self.gpu, &self.map, &poses, (beams, difference))
     }
 }
 

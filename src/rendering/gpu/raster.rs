@@ -6,30 +6,30 @@ use wgpu::{BufferUsages, RenderPipeline, TextureFormat, TextureUsages};
 
 use super::batches;
 use super::device::{Gpu, InFlight};
+use super::device_map::DeviceMap;
 use super::layout::{self, FAR, Pose, VERTICES_PER_TRIANGLE};
-use super::scene::Scene;
 use super::shaders;
 use crate::geometry::Vec3;
 use crate::lidar::LidarModel;
 use crate::rendering::RenderError;
 
-/// Most pixels in an atlas, unless a single image has more: 64 MB of ranges.
+/// Maximum number of pixels in an atlas, unless a single image has more: 64 MB of ranges.
 const PIXELS_PER_ATLAS: usize = 1 << 24;
 /// Rows of a texture are copied in multiples of 256 bytes.
 const ROW_PIXELS: u32 = wgpu::COPY_BYTES_PER_ROW_ALIGNMENT / 4;
 const RANGES: TextureFormat = TextureFormat::R32Uint;
 const DEPTH: TextureFormat = TextureFormat::Depth32Float;
-/// Depth is range / limit; as large a limit as any keeps it a normal number.
-const LARGEST_LIMIT_M: f32 = 1e30;
+/// Depth is range / limit; this limit keeps it a normal number.
+const MAX_LIMIT_M: f32 = 1e30;
 
-/// The pipeline.
+/// Render pipeline of range images.
 pub(super) struct Rasterizer {
     pipeline: RenderPipeline,
 }
 
-/// How images lie in a texture.
+/// Positions of images in a texture.
 #[derive(Clone, Copy, Debug)]
-struct Sheet {
+struct AtlasLayout {
     columns: usize,
     rows: usize,
     /// Of the texture [pixels].
@@ -37,8 +37,8 @@ struct Sheet {
     height: u32,
 }
 
-impl Sheet {
-    /// A texture for as many of the images as fit; `None` where not even one does.
+impl AtlasLayout {
+    /// A texture for as many of the images as fit; `None` if not even one does.
     fn fitting(images: usize, model: &LidarModel, largest: u32) -> Option<Self> {
         let largest_row = (largest - largest % ROW_PIXELS) as usize;
         let most = images.min(PIXELS_PER_ATLAS / model.len().max(1)).max(1);
@@ -74,7 +74,7 @@ impl Sheet {
     }
 }
 
-/// Tiles and the poses of a batch that see them.
+/// Draws of the tiles for the poses of a batch that see them.
 struct Instances {
     /// Slots in the atlas, tile by tile.
     slots: Vec<u32>,
@@ -83,10 +83,10 @@ struct Instances {
 }
 
 impl Instances {
-    fn of(scene: &Scene, poses: &[Pose], far_m: f32) -> Self {
+    fn of(map: &DeviceMap, poses: &[Pose], far_m: f32) -> Self {
         let mut slots = Vec::new();
         let mut draws = Vec::new();
-        for tile in &scene.tiles {
+        for tile in &map.tiles {
             let first = slots.len() as u32;
             let sees = |pose: &Pose| {
                 let [x, y, z, _] = pose.origin;
@@ -136,7 +136,7 @@ impl Rasterizer {
                 multisample: wgpu::MultisampleState::default(),
                 fragment: Some(wgpu::FragmentState {
                     module: &module,
-                    entry_point: Some("ask_ray"),
+                    entry_point: Some("cast_pixel"),
                     compilation_options: wgpu::PipelineCompilationOptions::default(),
                     targets: &[Some(RANGES.into())],
                 }),
@@ -151,19 +151,20 @@ impl Rasterizer {
     pub fn draw(
         &self,
         gpu: &Gpu,
-        scene: &Scene,
+        map: &DeviceMap,
         poses: &[Pose],
         model: &LidarModel,
     ) -> Result<Vec<Vec<f32>>, RenderError> {
         let largest = gpu.limits.max_texture_dimension_2d;
-        let vertices = scene.triangle_count() * VERTICES_PER_TRIANGLE as usize;
+        let vertices = map.triangle_count() * VERTICES_PER_TRIANGLE as usize;
         let images = (gpu.batch_sizes.vertices / vertices.max(1)).min(gpu.batch_sizes.images);
-        let sheet = Sheet::fitting(images.min(poses.len()), model, largest).ok_or_else(|| {
-            let (width, height) = (model.width, model.height);
-            RenderError::DeviceRefused {
-                reason: format!("images of {width}x{height} pixels, textures have {largest}"),
-            }
-        })?;
+        let atlas_layout = AtlasLayout::fitting(images.min(poses.len()), model, largest)
+            .ok_or_else(|| {
+                let (width, height) = (model.width, model.height);
+                RenderError::DeviceRefused {
+                    reason: format!("images of {width}x{height} pixels, textures have {largest}"),
+                }
+            })?;
         let directions: Vec<[f32; 4]> = model
             .directions()
             .iter()
@@ -173,10 +174,11 @@ impl Rasterizer {
         let mut images = Vec::with_capacity(poses.len());
         batches::run(
             gpu,
-            poses.chunks(sheet.images()),
-            |batch| self.start(gpu, scene, batch, (model, &sheet, &directions)),
+            poses.chunks(atlas_layout.images()),
+            |batch| self.start(gpu, map, batch, (model, &atlas_layout, &directions)),
             |batch, texels| {
-                images.extend((0..batch.len()).map(|slot| sheet.image(&texels, slot, model)));
+                images
+                    .extend((0..batch.len()).map(|slot| atlas_layout.image(&texels, slot, model)));
             },
         )?;
         Ok(images)
@@ -185,21 +187,26 @@ impl Rasterizer {
     fn start(
         &self,
         gpu: &Gpu,
-        scene: &Scene,
+        map: &DeviceMap,
         poses: &[Pose],
-        (model, sheet, directions): (&LidarModel, &Sheet, &wgpu::Buffer),
+        (model, atlas_layout, directions): (&LidarModel, &AtlasLayout, &wgpu::Buffer),
     ) -> InFlight {
-        let far_m = model.max_range.min(LARGEST_LIMIT_M);
-        let instances = Instances::of(scene, poses, far_m);
+        let far_m = model.max_range.min(MAX_LIMIT_M);
+        let instances = Instances::of(map, poses, far_m);
         let slots = gpu.upload("slots", &instances.slots, BufferUsages::VERTEX);
-        let atlas = layout::Atlas::new(model, sheet.columns, [sheet.width, sheet.height], far_m);
+        let atlas = layout::Atlas::new(
+            model,
+            atlas_layout.columns,
+            [atlas_layout.width, atlas_layout.height],
+            far_m,
+        );
         let atlas = gpu.upload("atlas", &[atlas], BufferUsages::UNIFORM);
         let poses = gpu.upload("poses", poses, BufferUsages::STORAGE);
-        let buffers = [&scene.triangles, &atlas, &poses, directions];
+        let buffers = [&map.triangles, &atlas, &poses, directions];
         let bound = shaders::bind(gpu, &self.pipeline.get_bind_group_layout(0), &buffers);
 
-        let ranges = texture(gpu, sheet, RANGES);
-        let depths = texture(gpu, sheet, DEPTH);
+        let ranges = texture(gpu, atlas_layout, RANGES);
+        let depths = texture(gpu, atlas_layout, DEPTH);
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         {
             let mut pass = begin(&mut encoder, &ranges, &depths);
@@ -212,7 +219,7 @@ impl Rasterizer {
                 }
             }
         }
-        let bytes = (sheet.pixels() * size_of::<f32>()) as u64;
+        let bytes = (atlas_layout.pixels() * size_of::<f32>()) as u64;
         let staging = gpu.staging(bytes);
         encoder.copy_texture_to_buffer(
             ranges.as_image_copy(),
@@ -220,7 +227,7 @@ impl Rasterizer {
                 buffer: &staging,
                 layout: wgpu::TexelCopyBufferLayout {
                     offset: 0,
-                    bytes_per_row: Some(sheet.width * 4),
+                    bytes_per_row: Some(atlas_layout.width * 4),
                     rows_per_image: None,
                 },
             },
@@ -246,12 +253,12 @@ impl layout::Atlas {
     }
 }
 
-fn texture(gpu: &Gpu, sheet: &Sheet, format: TextureFormat) -> wgpu::Texture {
+fn texture(gpu: &Gpu, atlas_layout: &AtlasLayout, format: TextureFormat) -> wgpu::Texture {
     gpu.device.create_texture(&wgpu::TextureDescriptor {
         label: Some("atlas"),
         size: wgpu::Extent3d {
-            width: sheet.width,
-            height: sheet.height,
+            width: atlas_layout.width,
+            height: atlas_layout.height,
             depth_or_array_layers: 1,
         },
         mip_level_count: 1,
@@ -263,7 +270,7 @@ fn texture(gpu: &Gpu, sheet: &Sheet, format: TextureFormat) -> wgpu::Texture {
     })
 }
 
-/// Starts to draw on an atlas in which nothing is anywhere.
+/// Begins a render pass on an atlas without surfaces.
 fn begin<'a>(
     encoder: &'a mut wgpu::CommandEncoder,
     ranges: &wgpu::Texture,
@@ -307,19 +314,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_sheet_fits_its_texture_and_holds_all_images_where_that_is_possible() {
+    fn an_atlas_fits_its_texture_and_holds_all_images_where_that_is_possible() {
         let model = LidarModel::default();
         for images in [1, 2, 9, 10, 64] {
-            let sheet = Sheet::fitting(images, &model, 8192).unwrap();
-            assert!(sheet.images() >= images && sheet.images() < images + 9);
-            assert!(sheet.width <= 8192 && sheet.height <= 8192);
-            assert_eq!(sheet.width % 64, 0);
+            let atlas_layout = AtlasLayout::fitting(images, &model, 8192).unwrap();
+            assert!(atlas_layout.images() >= images && atlas_layout.images() < images + 9);
+            assert!(atlas_layout.width <= 8192 && atlas_layout.height <= 8192);
+            assert_eq!(atlas_layout.width % 64, 0);
         }
         let wide = LidarModel {
             width: 8193,
             ..model
         };
-        assert!(Sheet::fitting(1, &wide, 8192).is_none());
+        assert!(AtlasLayout::fitting(1, &wide, 8192).is_none());
     }
 
     #[test]
@@ -329,10 +336,12 @@ mod tests {
             width: 3,
             ..LidarModel::default()
         };
-        let sheet = Sheet::fitting(4, &model, 64).unwrap();
-        let texels: Vec<f32> = (0..sheet.pixels()).map(|texel| texel as f32).collect();
+        let atlas_layout = AtlasLayout::fitting(4, &model, 64).unwrap();
+        let texels: Vec<f32> = (0..atlas_layout.pixels())
+            .map(|texel| texel as f32)
+            .collect();
         assert_eq!(
-            sheet.image(&texels, 1, &model),
+            atlas_layout.image(&texels, 1, &model),
             [3.0, 4.0, 5.0, 67.0, 68.0, 69.0]
         );
     }

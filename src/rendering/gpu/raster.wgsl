@@ -1,19 +1,19 @@
 // Range images by drawing: every triangle is a rectangle of pixels that surely covers it, and
-// every pixel of the rectangle asks its own centre ray.
+// every pixel of the rectangle casts its own centre ray.
 //
 // In spherical projection straight edges bend, triangles cross the seam behind the sensor, and
 // those above or below it reach all around: the rectangle only has to be large enough, the ray
 // decides. A triangle that crosses the seam is drawn on both sides, as two rectangles.
 //
-// `ray.wgsl` stands before this text. Keep in sync with `layout.rs`: `Atlas`,
+// `ray.wgsl` is prepended to this text. Keep in sync with `layout.rs`: `Atlas`,
 // `VERTICES_PER_TRIANGLE`; and with `LidarModel::pixel_of` in `model.rs` of `lidar`.
 
 const PI: f32 = 3.14159274;
 const VERTICES_PER_RECTANGLE: u32 = 6u;
 const VERTICES_PER_TRIANGLE: u32 = 12u;
-// What `atan2` may be wrong by (WGSL allows 4096 units in the last place) [rad].
+// Error bound of `atan2` (WGSL allows 4096 units in the last place) [rad].
 const SLACK_RAD: f32 = 0.002;
-// Nearer than this to the vertical through the sensor a corner has no azimuth [m].
+// A corner nearer than this to the vertical through the sensor has no azimuth [m].
 const AXIS_M: f32 = 1.0e-4;
 
 // Images side by side and one above the other in one texture.
@@ -156,7 +156,7 @@ fn cover(@builtin(vertex_index) vertex: u32, @location(0) slot: u32) -> Corner {
     var corner: Corner;
     corner.triangle = vertex / VERTICES_PER_TRIANGLE;
     corner.slot = slot;
-    // Outside of what is drawn, wherever nothing is to be drawn.
+    // Outside the clip volume unless the rectangle has pixels.
     corner.position = vec4f(2.0, 2.0, 0.0, 1.0);
 
     let pose = poses[slot];
@@ -184,14 +184,14 @@ fn cover(@builtin(vertex_index) vertex: u32, @location(0) slot: u32) -> Corner {
 }
 
 struct Fragment {
-    // The bits of the range: a target of floats is not to be had everywhere.
+    // The bits of the range: float targets are not available on all devices.
     @location(0) range_bits: u32,
-    // Nearest wins.
+    // The nearest surface wins.
     @builtin(frag_depth) depth: f32,
 }
 
 @fragment
-fn ask_ray(corner: Corner) -> Fragment {
+fn cast_pixel(corner: Corner) -> Fragment {
     let pixel = vec2u(corner.position.xy - origin_of_slot(corner.slot));
     let pose = poses[corner.slot];
     let direction = directions[pixel.y * atlas.width + pixel.x].xyz;

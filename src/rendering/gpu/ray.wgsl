@@ -1,11 +1,10 @@
-// Where a ray meets a triangle. Put before `caster.wgsl` and before `raster.wgsl`, so that both
-// find the same range to the last bit.
+// Ray-triangle intersection. Prepended to `caster.wgsl` and `raster.wgsl`, so that both find the same range to the last bit.
 //
 // Keep in sync with `layout.rs`: `FAR`, `Triangle`, `Pose`; and with `raycasting`: `NEAREST_M`.
 
-// Farther than everything: "there is no surface". WGSL has no infinity.
+// Range without a surface: WGSL has no infinity.
 const FAR: f32 = 3.0e38;
-// Surfaces nearer to the origin of a ray are not met [m].
+// Surfaces nearer to the origin of a ray are not hit [m].
 const NEAREST_M: f32 = 1.0e-4;
 
 struct Triangle {
@@ -27,8 +26,8 @@ fn direction_in_map(pose: Pose, direction: vec3f) -> vec3f {
         + pose.z_axis.xyz * direction.z;
 }
 
-// On which side of the edge from p to q (as seen from the origin) the direction passes. The edge
-// taken the other way round gives exactly the negative, so that no ray slips between triangles.
+// Edge function: the side of the edge from p to q (as seen from the origin) on which the direction
+// passes. The reversed edge gives exactly the negative, so that no ray slips between triangles.
 fn side_of_edge(p: vec3f, q: vec3f, direction: vec3f) -> f32 {
     return dot(cross(p + q, q - p), direction);
 }

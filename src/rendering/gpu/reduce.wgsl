@@ -1,4 +1,5 @@
-// Adds up what the work groups of a pose found, one pose per work group, always in the same order.
+// Sums the costs of the work groups of a pose, one pose per work group, always in the same order.
+// Dispatched by `caster.rs`.
 //
 // Keep in sync with `layout.rs`: `Reduction`, `LANES`.
 
@@ -19,7 +20,7 @@ struct Reduction {
 var<workgroup> sums: array<f32, LANES>;
 
 @compute @workgroup_size(64)
-fn add_up(
+fn reduce(
     @builtin(workgroup_id) group: vec3u,
     @builtin(local_invocation_index) lane: u32,
 ) {

@@ -1,4 +1,4 @@
-//! The texts of the shaders, put together.
+//! Sources of the shaders.
 
 use wgpu::{BindGroup, BindGroupDescriptor, BindGroupEntry, BindGroupLayout, Buffer};
 
@@ -6,15 +6,15 @@ use super::device::Gpu;
 
 /// Casts rays and compares beams.
 const CASTER: &str = concat!(include_str!("ray.wgsl"), include_str!("caster.wgsl"));
-/// Adds up.
+/// Sums costs.
 pub(super) const REDUCE: &str = include_str!("reduce.wgsl");
 /// Draws range images.
 pub(super) const RASTER: &str = concat!(include_str!("ray.wgsl"), include_str!("raster.wgsl"));
 
-/// What `caster.rs` replaces.
+/// Replaced by the depth of the hierarchy.
 const STACK_SIZE: &str = "const STACK_SIZE: u32 = 64u;";
 
-/// Casts rays through a hierarchy of that depth.
+/// The source that casts rays through a hierarchy of the given depth.
 pub(super) fn caster(depth: usize) -> String {
     let stack_size = format!("const STACK_SIZE: u32 = {}u;", depth.max(1));
     CASTER.replace(STACK_SIZE, &stack_size)
@@ -28,7 +28,7 @@ pub(super) fn module(gpu: &Gpu, source: &str) -> wgpu::ShaderModule {
         })
 }
 
-/// Binds buffers to 0, 1, 2 …
+/// Binds buffers to the bindings 0, 1, 2 …
 pub(super) fn bind(gpu: &Gpu, layout: &BindGroupLayout, buffers: &[&Buffer]) -> BindGroup {
     let entries: Vec<BindGroupEntry> = (0..)
         .zip(buffers)
@@ -50,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_depth_of_the_hierarchy_is_put_into_the_shader() {
+    fn the_shader_has_the_depth_of_the_hierarchy() {
         assert!(CASTER.contains(STACK_SIZE));
         assert!(caster(23).contains("const STACK_SIZE: u32 = 23u;"));
     }
@@ -78,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn rays_start_as_far_from_surfaces_as_on_the_processor() {
+    fn the_nearest_range_is_that_of_the_cpu() {
         let line = "const NEAREST_M: f32 = 1.0e-4;";
         assert!(CASTER.contains(line) && crate::raycasting::NEAREST_M == 1.0e-4);
     }

@@ -128,7 +128,7 @@ fn a_map_that_the_device_cannot_bind_is_an_error_that_says_how_large_it_is() {
         return;
     };
     renderer.gpu.limits.max_storage_buffer_binding_size = 1 << 16;
-    let error = Scene::upload(&renderer.gpu, &[stairs()]).err();
+    let error = DeviceMap::upload(&renderer.gpu, &[stairs()]).err();
     assert!(
         matches!(
             error,

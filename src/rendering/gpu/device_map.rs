@@ -4,50 +4,50 @@ use nalgebra::Vector3;
 use wgpu::{Buffer, BufferUsages};
 
 use super::device::Gpu;
-use super::forest::{Forest, Tile};
 use super::layout::Pose;
+use super::two_level::{DeviceTile, TwoLevelBvh};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::rendering::RenderError;
 
-/// Buffers of the map and what is known about them here.
-pub(super) struct Scene {
+/// Buffers of the map and their layout.
+pub(super) struct DeviceMap {
     pub nodes: Buffer,
     pub triangles: Buffer,
-    pub tiles: Vec<Tile>,
+    pub tiles: Vec<DeviceTile>,
     pub root: u32,
     pub depth: usize,
     pub bytes: u64,
     center: Vector3<f64>,
 }
 
-impl Scene {
-    /// Grows the hierarchy and sends it to the device.
+impl DeviceMap {
+    /// Builds the hierarchy and uploads it.
     pub fn upload(gpu: &Gpu, tiles: &[TriangleMesh]) -> Result<Self, RenderError> {
-        let forest = Forest::grow(tiles);
+        let bvh = TwoLevelBvh::build(tiles);
         let sizes = [
-            size_of_val(forest.triangles.as_slice()) as u64,
-            size_of_val(forest.nodes.as_slice()) as u64,
+            size_of_val(bvh.triangles.as_slice()) as u64,
+            size_of_val(bvh.nodes.as_slice()) as u64,
         ];
         check_sizes(&sizes, gpu.max_binding_bytes())?;
-        let scene = Self {
-            nodes: gpu.upload("nodes", &forest.nodes, BufferUsages::STORAGE),
-            triangles: gpu.upload("triangles", &forest.triangles, BufferUsages::STORAGE),
-            tiles: forest.tiles,
-            root: forest.root,
-            depth: forest.depth,
+        let map = Self {
+            nodes: gpu.upload("nodes", &bvh.nodes, BufferUsages::STORAGE),
+            triangles: gpu.upload("triangles", &bvh.triangles, BufferUsages::STORAGE),
+            tiles: bvh.tiles,
+            root: bvh.root,
+            depth: bvh.depth,
             bytes: sizes.iter().sum(),
-            center: Vector3::new(forest.center.x, forest.center.y, forest.center.z),
+            center: Vector3::new(bvh.center.x, bvh.center.y, bvh.center.z),
         };
         gpu.check()?;
-        Ok(scene)
+        Ok(map)
     }
 
-    /// Number of triangles of all tiles.
+    /// Number of triangles in all tiles.
     pub fn triangle_count(&self) -> usize {
         self.tiles.iter().map(|tile| tile.triangles.len()).sum()
     }
 
-    /// Poses as the shaders read them, relative to the centre of the map.
+    /// Poses for the shaders, relative to the centre of the map.
     pub fn poses(&self, map_from_lidar: &[Pose3]) -> Vec<Pose> {
         map_from_lidar
             .iter()
@@ -56,7 +56,7 @@ impl Scene {
     }
 }
 
-/// An error where a shader could not read one of the buffers as a whole [bytes].
+/// Checks that shaders can bind each buffer as a whole [bytes].
 fn check_sizes(sizes: &[u64], limit: u64) -> Result<(), RenderError> {
     match sizes.iter().copied().max() {
         Some(needed) if needed > limit => Err(RenderError::MapTooLarge { needed, limit }),
@@ -80,9 +80,9 @@ mod tests {
                 limit: 128
             }
         ));
-        let told = error.to_string();
+        let message = error.to_string();
         for part in ["300 bytes", "at most 128", "--backend cpu"] {
-            assert!(told.contains(part), "{told}");
+            assert!(message.contains(part), "{message}");
         }
     }
 }

@@ -1,7 +1,7 @@
-//! The map as the device reads it: one hierarchy per tile under one over all tiles.
+//! Two-level bounding volume hierarchy for the device: one per tile under one over all tiles.
 //!
-//! Triangles lie tile by tile, so that the rasterizer draws a tile as one run of them, and leaf
-//! by leaf within a tile, so that a leaf is one run too. Coordinates are relative to the centre
+//! Triangles are stored tile by tile, so that the rasterizer draws a tile as one range of them, and
+//! leaf by leaf within a tile, so that a leaf is one range too. Coordinates are relative to the centre
 //! of the map, subtracted in `f64`.
 
 use std::ops::Range;
@@ -14,48 +14,48 @@ use crate::geometry::{Aabb, TriangleMesh};
 use crate::raycasting::bvh::{Bvh, Leaves, NodeRef, PrimRef};
 use crate::raycasting::is_proper;
 
-/// Most triangles in a leaf: a test costs the device about as much as a node.
+/// Maximum number of triangles in a leaf: an intersection costs the device about as much as a node.
 const LEAF_SIZE: usize = 4;
 
 /// A tile of the map.
 #[derive(Clone, Debug)]
-pub(super) struct Tile {
+pub(super) struct DeviceTile {
     /// Relative to the centre of the map [m].
     pub bounds: Aabb,
-    /// Its triangles among all.
+    /// Range of its triangles among all.
     pub triangles: Range<u32>,
 }
 
-impl Tile {
-    /// Distance of a place to the box of the tile [m].
-    pub fn distance_to(&self, place: Vec3) -> f32 {
-        (place.clamp(self.bounds.min, self.bounds.max) - place).length()
+impl DeviceTile {
+    /// Distance of a point to the box of the tile [m].
+    pub fn distance_to(&self, point: Vec3) -> f32 {
+        (point.clamp(self.bounds.min, self.bounds.max) - point).length()
     }
 }
 
-/// All tiles.
+/// Hierarchy over all tiles.
 #[derive(Debug)]
-pub(super) struct Forest {
-    /// Of the map; the origin of all coordinates here [m].
+pub(super) struct TwoLevelBvh {
+    /// Centre of the map, the origin of all coordinates here [m].
     pub center: DVec3,
     pub nodes: Vec<Node>,
     pub triangles: Vec<Triangle>,
-    pub tiles: Vec<Tile>,
-    /// The child that leads to everything.
+    pub tiles: Vec<DeviceTile>,
+    /// Reference to the root.
     pub root: u32,
-    /// Nodes on the longest way from the root to a leaf: so many children can wait at once.
+    /// Longest path from the root to a leaf [nodes], which bounds the traversal stack.
     pub depth: usize,
 }
 
-impl Forest {
-    /// Grows the hierarchies; triangles that are degenerate or not finite are left out.
-    pub fn grow(tiles: &[TriangleMesh]) -> Self {
+impl TwoLevelBvh {
+    /// Builds the hierarchies; triangles that are degenerate or not finite are left out.
+    pub fn build(tiles: &[TriangleMesh]) -> Self {
         let center = center_of(tiles);
-        let trees: Vec<Tree> = tiles
+        let bottom_levels: Vec<BottomLevel> = tiles
             .par_iter()
-            .map(|mesh| Tree::grow(mesh, center))
+            .map(|mesh| BottomLevel::build(mesh, center))
             .collect();
-        let mut forest = Self {
+        let mut hierarchy = Self {
             center,
             nodes: Vec::new(),
             triangles: Vec::new(),
@@ -64,87 +64,87 @@ impl Forest {
             depth: 0,
         };
         let mut roots = Vec::new();
-        for tree in trees {
-            roots.extend(forest.plant(tree));
+        for bottom in bottom_levels {
+            roots.extend(hierarchy.append(bottom));
         }
-        forest.join(&roots);
-        forest.depth = forest.longest_way();
-        forest
+        hierarchy.build_top_level(&roots);
+        hierarchy.depth = hierarchy.depth_from_root();
+        hierarchy
     }
 
-    /// Appends a tile; returns the child that leads to it, `None` where it has no triangles.
-    fn plant(&mut self, tree: Tree) -> Option<u32> {
-        let root = tree.bvh.root?;
+    /// Appends a tile; returns the reference to its root, `None` if it has no triangles.
+    fn append(&mut self, bottom: BottomLevel) -> Option<u32> {
+        let root = bottom.bvh.root?;
         let (first_node, first) = (self.nodes.len(), self.triangles.len());
-        let refer = |child: NodeRef| {
-            if child.is_leaf() {
-                let range = &tree.leaves.ranges[child.index()];
+        let refer = |node: NodeRef| {
+            if node.is_leaf() {
+                let range = &bottom.leaves.ranges[node.index()];
                 layout::leaf(first + range.start as usize, range.len())
             } else {
-                (first_node + child.index()) as u32
+                (first_node + node.index()) as u32
             }
         };
-        let nodes = tree.bvh.nodes.iter();
+        let nodes = bottom.bvh.nodes.iter();
         self.nodes
             .extend(nodes.map(|n| node(n.bounds, n.children.map(refer))));
-        let order = tree.leaves.order.iter();
+        let order = bottom.leaves.order.iter();
         self.triangles
-            .extend(order.map(|&index| Triangle::new(tree.corners[index as usize])));
-        self.tiles.push(Tile {
-            bounds: Aabb::of(tree.corners.iter().flatten().copied()),
+            .extend(order.map(|&index| Triangle::new(bottom.corners[index as usize])));
+        self.tiles.push(DeviceTile {
+            bounds: Aabb::of(bottom.corners.iter().flatten().copied()),
             triangles: first as u32..self.triangles.len() as u32,
         });
         Some(refer(root))
     }
 
-    /// Puts one hierarchy over those of all tiles.
-    fn join(&mut self, roots: &[u32]) {
+    /// Builds the hierarchy over the roots of all tiles.
+    fn build_top_level(&mut self, roots: &[u32]) {
         let tiles = self.tiles.iter().zip(0..);
         let prims = tiles.map(|(tile, index)| PrimRef::new(tile.bounds, index));
-        let (over, leaves) = Bvh::build(prims.collect(), 1);
-        let Some(root) = over.root else {
+        let (top, leaves) = Bvh::build(prims.collect(), 1);
+        let Some(root) = top.root else {
             return;
         };
         let first_node = self.nodes.len();
-        let refer = |child: NodeRef| {
-            if child.is_leaf() {
-                let place = leaves.ranges[child.index()].start as usize;
+        let refer = |node: NodeRef| {
+            if node.is_leaf() {
+                let place = leaves.ranges[node.index()].start as usize;
                 roots[leaves.order[place] as usize]
             } else {
-                (first_node + child.index()) as u32
+                (first_node + node.index()) as u32
             }
         };
         self.nodes.extend(
-            over.nodes
+            top.nodes
                 .iter()
                 .map(|n| node(n.bounds, n.children.map(refer))),
         );
         self.root = refer(root);
     }
 
-    fn longest_way(&self) -> usize {
+    fn depth_from_root(&self) -> usize {
         let mut longest = 0;
-        let mut waiting = vec![(self.root, 0)];
-        while let Some((child, depth)) = waiting.pop() {
+        let mut pending = vec![(self.root, 0)];
+        while let Some((child, depth)) = pending.pop() {
             longest = longest.max(depth);
             if child & layout::LEAF == 0 {
                 let node = &self.nodes[child as usize];
-                waiting.extend([(node.left, depth + 1), (node.right, depth + 1)]);
+                pending.extend([(node.left, depth + 1), (node.right, depth + 1)]);
             }
         }
         longest
     }
 }
 
-/// The hierarchy of a tile that counts its own triangles from zero.
-struct Tree {
+/// Hierarchy of a tile that numbers its own triangles from zero.
+struct BottomLevel {
     bvh: Bvh,
     leaves: Leaves,
     corners: Vec<[Vec3; 3]>,
 }
 
-impl Tree {
-    fn grow(mesh: &TriangleMesh, center: DVec3) -> Self {
+impl BottomLevel {
+    fn build(mesh: &TriangleMesh, center: DVec3) -> Self {
         let corners: Vec<[Vec3; 3]> = (0..mesh.triangles.len())
             .map(|triangle| mesh.corners(triangle))
             .filter(|&corners| is_proper(corners))
@@ -204,19 +204,22 @@ mod tests {
         let tiles: Vec<TriangleMesh> = (0..50_u8)
             .map(|i| square(Vec3::new(f32::from(i % 7) * 3.0, f32::from(i) * 5.0, 0.0)))
             .collect();
-        let forest = Forest::grow(&tiles);
-        let mut seen = vec![0; forest.triangles.len()];
-        let mut waiting = vec![(forest.root, Vec3::NEG_INFINITY, Vec3::INFINITY)];
-        while let Some((child, low, high)) = waiting.pop() {
+        let hierarchy = TwoLevelBvh::build(&tiles);
+        let mut seen = vec![0; hierarchy.triangles.len()];
+        let mut pending = vec![(hierarchy.root, Vec3::NEG_INFINITY, Vec3::INFINITY)];
+        while let Some((child, low, high)) = pending.pop() {
             if child & layout::LEAF == 0 {
-                let node = forest.nodes[child as usize];
-                waiting.push((node.left, node.left_min.into(), node.left_max.into()));
-                waiting.push((node.right, node.right_min.into(), node.right_max.into()));
+                let node = hierarchy.nodes[child as usize];
+                pending.push((node.left, node.left_min.into(), node.left_max.into()));
+                pending.push((node.right, node.right_min.into(), node.right_max.into()));
                 continue;
             }
             let first = (child & 0x0fff_ffff) as usize;
-            let run = first..first + (child >> 28 & 7) as usize;
-            for (times, triangle) in seen[run.clone()].iter_mut().zip(&forest.triangles[run]) {
+            let range = first..first + (child >> 28 & 7) as usize;
+            for (times, triangle) in seen[range.clone()]
+                .iter_mut()
+                .zip(&hierarchy.triangles[range])
+            {
                 *times += 1;
                 for [x, y, z, _] in triangle.corners {
                     let corner = Vec3::new(x, y, z);
@@ -228,28 +231,32 @@ mod tests {
     }
 
     #[test]
-    fn the_triangles_of_a_tile_are_one_run() {
+    fn the_triangles_of_a_tile_are_one_range() {
         let tiles = [
             square(Vec3::ZERO),
             TriangleMesh::default(),
             square(9.0 * Vec3::X),
         ];
-        let forest = Forest::grow(&tiles);
-        let runs: Vec<_> = forest.tiles.iter().map(|t| t.triangles.clone()).collect();
-        assert_eq!(runs, [0..2, 2..4]);
-        assert_eq!(forest.center, DVec3::new(5.0, 0.5, 0.0));
+        let hierarchy = TwoLevelBvh::build(&tiles);
+        let ranges: Vec<_> = hierarchy
+            .tiles
+            .iter()
+            .map(|t| t.triangles.clone())
+            .collect();
+        assert_eq!(ranges, [0..2, 2..4]);
+        assert_eq!(hierarchy.center, DVec3::new(5.0, 0.5, 0.0));
         assert_eq!(
-            forest.tiles[1].distance_to(Vec3::new(3.0, 0.0, 2.0)),
+            hierarchy.tiles[1].distance_to(Vec3::new(3.0, 0.0, 2.0)),
             2.0_f32.hypot(1.0)
         );
     }
 
     #[test]
-    fn what_is_not_finite_or_has_no_area_is_left_out() {
+    fn degenerate_triangles_are_left_out() {
         let mut mesh = square(Vec3::ZERO);
         mesh.vertices.extend([Vec3::NAN, Vec3::new(0.5, 0.5, 0.0)]);
         mesh.triangles.extend([[0, 1, 4], [0, 2, 5], [3, 3, 1]]);
-        assert_eq!(Forest::grow(&[mesh]).triangles.len(), 2);
-        assert!(Forest::grow(&[]).triangles.is_empty());
+        assert_eq!(TwoLevelBvh::build(&[mesh]).triangles.len(), 2);
+        assert!(TwoLevelBvh::build(&[]).triangles.is_empty());
     }
 }
