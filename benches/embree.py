@@ -1,4 +1,4 @@
-"""Rays per second of Embree (through Open3D) on the mesh and the rays of `rendering.rs`.
+"""Rays per second of Embree (in Open3D) on the mesh and the rays of `rendering.rs`.
 
     python benches/embree.py FOLDER [NAME ...]
 """

@@ -1,5 +1,5 @@
-//! Time per scan of every ground classifier: `cargo bench --bench ground`, one thread with
-//! `RAYON_NUM_THREADS=1`.
+//! Time per scan of each ground classifier: `cargo bench --bench ground`, with
+//! `RAYON_NUM_THREADS=1` on one thread.
 
 use divan::{Bencher, black_box};
 use fpmcl::geometry::Vec3;
@@ -11,10 +11,10 @@ fn main() {
     divan::main();
 }
 
-/// Azimuths of a revolution of the scans: thinned to an image's width, and whole.
+/// Number of azimuths per revolution: the width of a range image, and a full scan.
 const COLUMNS: [usize; 2] = [1024, 2000];
 
-/// A street between two walls with a box every eight metres, seen by 64 beams.
+/// Scan with 64 beams of a street between two walls with a box every 8 m.
 fn street(columns: usize) -> Vec<Vec3> {
     const BEAMS: usize = 64;
     let mut points = Vec::with_capacity(BEAMS * columns);

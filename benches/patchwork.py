@@ -1,9 +1,9 @@
-"""Time per scan of Patchwork++ on one thread, to be run in turns with `fpmcl ground SCANS --threads 1`.
+"""Time per scan of Patchwork++ on one thread; run alternately with `fpmcl ground SCANS --threads 1`.
 
     pip install pypatchworkpp
     python benches/patchwork.py SCANS
 
-SCANS is a folder of KITTI scans. Reading the files is in neither time.
+SCANS is a folder of KITTI scans. Neither time includes reading the files.
 """
 
 import pathlib

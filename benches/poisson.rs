@@ -26,10 +26,11 @@
     reason = "a bench stops at the first error and prints its measurements"
 )]
 
-use std::io::{BufWriter, Write};
+use std::path::Path;
 use std::time::Instant;
 
 use fpmcl::geometry::{PointCloud, TriangleMesh};
+use fpmcl::map::ply;
 use fpmcl::meshing::{PoissonConfig, reconstruct};
 use glam::Vec3;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
@@ -42,18 +43,18 @@ fn main() {
     if let Ok(stem) = std::env::var("FPMCL_POISSON_PLY") {
         for count in SIZES {
             let cloud = noisy_street(count);
-            write_ply(
-                &format!("{stem}_{count}.ply"),
-                &cloud.positions,
-                &cloud.normals,
-            )
-            .unwrap();
+            let points = TriangleMesh {
+                vertices: cloud.positions,
+                normals: cloud.normals,
+                ..TriangleMesh::default()
+            };
+            ply::write(Path::new(&format!("{stem}_{count}.ply")), &points).unwrap();
         }
     } else if let Ok(job) = std::env::var("FPMCL_POISSON") {
         let (count, depth) = job.split_once(',').expect("FPMCL_POISSON=points,depth");
         run_once(count.parse().unwrap(), depth.parse().unwrap());
     } else if let Ok(path) = std::env::var("FPMCL_POISSON_MESH") {
-        evaluate(&read_ply(&path));
+        evaluate(&ply::read(Path::new(&path)).unwrap());
     } else {
         divan::main();
     }
@@ -75,7 +76,7 @@ fn depth_9(bencher: divan::Bencher<'_, '_>, count: usize) {
     bencher.bench_local(|| reconstruct(&cloud, None, &PoissonConfig::default()).unwrap());
 }
 
-/// A rectangle of the street: corner and two edges.
+/// A rectangle of the street: a corner and two edges.
 struct Panel(Vec3, Vec3, Vec3);
 
 impl Panel {
@@ -85,14 +86,14 @@ impl Panel {
     fn area(&self) -> f32 {
         self.1.cross(self.2).length()
     }
-    fn at(&self, u: f32, v: f32) -> Vec3 {
+    fn point(&self, u: f32, v: f32) -> Vec3 {
         self.0 + u * self.1 + v * self.2
     }
     fn distance(&self, point: Vec3) -> f32 {
         let d = point - self.0;
         let u = (d.dot(self.1) / self.1.length_squared()).clamp(0.0, 1.0);
         let v = (d.dot(self.2) / self.2.length_squared()).clamp(0.0, 1.0);
-        point.distance(self.at(u, v))
+        point.distance(self.point(u, v))
     }
 }
 
@@ -155,7 +156,7 @@ fn sample_panels(count: usize, rng: &mut StdRng) -> Vec<(Vec3, Vec3)> {
     (0..count)
         .map(|_| {
             let panel = &panels[chooser.sample(rng)];
-            (panel.at(rng.random(), rng.random()), panel.normal())
+            (panel.point(rng.random(), rng.random()), panel.normal())
         })
         .collect()
 }
@@ -176,9 +177,9 @@ fn run_once(count: usize, depth: u32) {
     let cloud = noisy_street(count);
     let config: PoissonConfig = PoissonConfig {
         depth,
-        iterations: setting("ITERATIONS", PoissonConfig::default().iterations),
-        point_weight: setting("POINT_WEIGHT", PoissonConfig::default().point_weight),
-        samples_per_node: setting(
+        iterations: parse_env("ITERATIONS", PoissonConfig::default().iterations),
+        point_weight: parse_env("POINT_WEIGHT", PoissonConfig::default().point_weight),
+        samples_per_node: parse_env(
             "SAMPLES_PER_NODE",
             PoissonConfig::default().samples_per_node,
         ),
@@ -195,11 +196,11 @@ fn run_once(count: usize, depth: u32) {
     );
     evaluate(&surface.mesh);
     if let Ok(path) = std::env::var("FPMCL_POISSON_OUT") {
-        write_ply(&path, &surface.mesh.vertices, &surface.mesh.normals).unwrap();
+        ply::write(Path::new(&path), &surface.mesh).unwrap();
     }
 }
 
-fn setting<T: std::str::FromStr>(name: &str, default: T) -> T {
+fn parse_env<T: std::str::FromStr>(name: &str, default: T) -> T {
     let value = std::env::var(name).ok();
     value
         .and_then(|value| value.parse().ok())
@@ -220,24 +221,24 @@ fn evaluate(mesh: &TriangleMesh) {
         .collect();
     errors.sort_by(f32::total_cmp);
     let truth = sample_panels(100_000, &mut StdRng::seed_from_u64(9));
-    let reached = covered(mesh, &truth, 0.1);
+    let covered = count_covered(mesh, &truth, 0.1);
     println!(
         "median error {:.1} mm, 90 % within {:.1} mm; {:.2} % of the true surface within 0.1 m",
         1e3 * errors[errors.len() / 2],
         1e3 * errors[errors.len() * 9 / 10],
-        100.0 * reached as f64 / truth.len() as f64
+        100.0 * covered as f64 / truth.len() as f64
     );
 }
 
 /// Number of points with a triangle within a distance.
-fn covered(mesh: &TriangleMesh, points: &[(Vec3, Vec3)], reach_m: f32) -> usize {
+fn count_covered(mesh: &TriangleMesh, points: &[(Vec3, Vec3)], max_distance_m: f32) -> usize {
     const CELL_M: f32 = 0.4;
     let cell = |point: Vec3| (point / CELL_M).floor().as_ivec3();
     let mut triangles: std::collections::HashMap<glam::IVec3, Vec<u32>> = Default::default();
     for index in 0..mesh.triangles.len() {
         let [a, b, c] = mesh.corners(index);
-        let low = cell(a.min(b).min(c) - reach_m);
-        let high = cell(a.max(b).max(c) + reach_m);
+        let low = cell(a.min(b).min(c) - max_distance_m);
+        let high = cell(a.max(b).max(c) + max_distance_m);
         if (high - low).max_element() > 40 {
             continue;
         }
@@ -252,8 +253,9 @@ fn covered(mesh: &TriangleMesh, points: &[(Vec3, Vec3)], reach_m: f32) -> usize 
     }
     let is_near = |point: Vec3| {
         triangles.get(&cell(point)).is_some_and(|near| {
-            (near.iter())
-                .any(|&index| distance_to_triangle(point, mesh.corners(index as usize)) < reach_m)
+            (near.iter()).any(|&index| {
+                distance_to_triangle(point, mesh.corners(index as usize)) < max_distance_m
+            })
         })
     };
     points.iter().filter(|(point, _)| is_near(*point)).count()
@@ -269,68 +271,10 @@ fn distance_to_triangle(p: Vec3, [a, b, c]: [Vec3; 3]) -> f32 {
     }
     [(a, b), (b, c), (c, a)]
         .iter()
-        .fold(f32::INFINITY, |least, (s, e)| {
+        .fold(f32::INFINITY, |nearest, (s, e)| {
             let t = ((p - s).dot(e - s) / (e - s).length_squared().max(1e-20)).clamp(0.0, 1.0);
-            least.min(p.distance(s + t * (e - s)))
+            nearest.min(p.distance(s + t * (e - s)))
         })
-}
-
-fn write_ply(path: &str, points: &[Vec3], normals: &[Vec3]) -> std::io::Result<()> {
-    let mut out = BufWriter::new(std::fs::File::create(path)?);
-    writeln!(
-        out,
-        "ply\nformat binary_little_endian 1.0\nelement vertex {}",
-        points.len()
-    )?;
-    for name in ["x", "y", "z", "nx", "ny", "nz"] {
-        writeln!(out, "property float {name}")?;
-    }
-    writeln!(out, "end_header")?;
-    for (point, normal) in points.iter().zip(normals) {
-        for value in [point.x, point.y, point.z, normal.x, normal.y, normal.z] {
-            out.write_all(&value.to_le_bytes())?;
-        }
-    }
-    out.flush()
-}
-
-/// Reads a mesh in Open3D's layout: doubles x y z nx ny nz, then lists of three indices.
-fn read_ply(path: &str) -> TriangleMesh {
-    let bytes = std::fs::read(path).unwrap();
-    let end = bytes
-        .windows(11)
-        .position(|w| w == b"end_header\n")
-        .unwrap()
-        + 11;
-    let header = String::from_utf8_lossy(&bytes[..end]).into_owned();
-    let count = |name: &str| -> usize {
-        let line = header.lines().find(|line| line.starts_with(name)).unwrap();
-        line.rsplit(' ').next().unwrap().parse().unwrap()
-    };
-    let (vertices, faces) = (count("element vertex"), count("element face"));
-    let doubles = header
-        .lines()
-        .filter(|line| line.starts_with("property double"))
-        .count();
-    let colors = header
-        .lines()
-        .filter(|line| line.starts_with("property uchar"))
-        .count();
-    let stride = 8 * doubles + colors;
-    let double = |at: usize| f64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as f32;
-    let int = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
-    let face_start = end + stride * vertices;
-    TriangleMesh {
-        vertices: (0..vertices)
-            .map(|i| end + stride * i)
-            .map(|at| Vec3::new(double(at), double(at + 8), double(at + 16)))
-            .collect(),
-        triangles: (0..faces)
-            .map(|i| face_start + 13 * i + 1)
-            .map(|at| [int(at), int(at + 4), int(at + 8)])
-            .collect(),
-        ..TriangleMesh::default()
-    }
 }
 
 /// CPU seconds of this process, all threads (Linux; 0 elsewhere).

@@ -1,30 +1,30 @@
-//! Rays per second of the CPU renderer in a street of 1.3 million triangles, what comparing costs,
-//! and how long its hierarchy takes to build.
+//! CPU renderer on a street of 1.3 million triangles: rays per second of images and comparisons, and
+//! build time of the bounding volume hierarchy.
 //!
 //! ```text
 //! cargo bench --bench rendering
 //! ```
 //!
-//! Beside Embree, on the same mesh and the same rays: with `FPMCL_BENCH_DIR` set the bench writes
-//! them there first, and Open3D casts them,
+//! Comparison with Embree on the same mesh and rays: with `FPMCL_BENCH_DIR`, the bench writes them to
+//! that folder first, and Open3D casts them,
 //!
 //! ```text
 //! FPMCL_BENCH_DIR=/tmp/rays cargo bench --bench rendering -- images
 //! python benches/embree.py /tmp/rays
 //! ```
 //!
-//! run in turns, A B A B, on an otherwise idle machine. Embree is given the rays in the order of
-//! the beams, and finds the nearest surface of each; comparing needs less, and takes it.
+//! alternately (A B A B) on an otherwise idle machine. Embree casts the rays in the order of the
+//! beams and computes the nearest hit of each; a comparison may stop earlier.
 
 mod street;
 
-use std::io::Write as _;
 use std::path::Path;
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
-use fpmcl::geometry::{Pose3, Rigid3f, TriangleMesh, Vec3};
+use fpmcl::geometry::{Pose3, Rigid3f, Vec3};
 use fpmcl::lidar::{Beam, LidarModel};
+use fpmcl::map::ply;
 use fpmcl::raycasting::Scene;
 use fpmcl::rendering::{CpuRenderer, RangeDifference, RangeRenderer as _};
 use npyz::WriterBuilder as _;
@@ -41,11 +41,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     Ok(())
 }
 
-/// The street and the rays of the benches, an origin and a direction each, for another ray caster.
+/// Writes the street and the rays of the benches for another ray caster.
 fn write_rays(folder: &Path) -> Result<(), Box<dyn std::error::Error>> {
     let renderer = renderer();
     std::fs::create_dir_all(folder)?;
-    std::fs::write(folder.join("street.ply"), ply(&street::street(SEED))?)?;
+    ply::write(&folder.join("street.ply"), &street::street(SEED))?;
     let pixels = LidarModel::default().directions();
     let few = directions_of(&beams(&renderer, truth(), 500));
     let many = directions_of(&beams(&renderer, truth(), 3600));
@@ -71,7 +71,7 @@ fn directions_of(beams: &[Beam]) -> Vec<Vec3> {
     beams.iter().map(|beam| beam.direction).collect()
 }
 
-/// A row per ray, pose by pose: origin, then unit direction.
+/// Origin and unit direction of each ray, ordered by pose.
 fn rays(poses: &[Pose3], directions: &[Vec3]) -> Vec<[f32; 6]> {
     let mut rays = Vec::with_capacity(poses.len() * directions.len());
     for pose in poses {
@@ -85,7 +85,7 @@ fn rays(poses: &[Pose3], directions: &[Vec3]) -> Vec<[f32; 6]> {
     rays
 }
 
-/// Whole images from eight poses.
+/// Full images at eight poses.
 #[divan::bench(args = THREADS, sample_count = 10)]
 fn images(bencher: Bencher, threads: usize) {
     let (renderer, poses, model) = (renderer(), poses(), LidarModel::default());
@@ -110,7 +110,7 @@ fn strided_images(bencher: Bencher, threads: usize) {
         .bench(|| pool.install(|| renderer.render(black_box(&poses), &model)));
 }
 
-/// A frame of tracking: poses within centimetres of the truth.
+/// Tracking: poses within centimetres of the truth.
 #[divan::bench(args = THREADS, sample_count = 10)]
 fn compare_100_close_poses_3600_beams(bencher: Bencher, threads: usize) {
     compare(bencher, threads, &close_poses(), 3600);
@@ -122,13 +122,13 @@ fn compare_100_poses_3600_beams(bencher: Bencher, threads: usize) {
     compare(bencher, threads, &tracked_poses(), 3600);
 }
 
-/// A start whose place is known to a few metres.
+/// Initialization within a few metres of the truth.
 #[divan::bench(args = THREADS, sample_count = 3)]
 fn compare_10000_near_poses_500_beams(bencher: Bencher, threads: usize) {
     compare(bencher, threads, &near_poses(), 500);
 }
 
-/// The first frame of a global start: poses over the whole street.
+/// Global initialization: poses over the whole street.
 #[divan::bench(args = THREADS, sample_count = 3)]
 fn compare_10000_poses_500_beams(bencher: Bencher, threads: usize) {
     compare(bencher, threads, &all_poses(), 500);
@@ -162,8 +162,8 @@ fn renderer() -> CpuRenderer {
     CpuRenderer::new(&street::tiles(&street::street(SEED), 100.0))
 }
 
-fn at(place: Vec3) -> Pose3 {
-    Pose3::translation(place.x.into(), place.y.into(), place.z.into())
+fn at(position: Vec3) -> Pose3 {
+    Pose3::translation(position.x.into(), position.y.into(), position.z.into())
 }
 
 fn poses() -> Vec<Pose3> {
@@ -189,20 +189,20 @@ fn all_poses() -> Vec<Pose3> {
     around(10_000, 100.0, 2.0, 1.0)
 }
 
-/// Where the beams are measured.
+/// Position at which the beams are measured.
 fn truth() -> Vec3 {
     street::on_the_road(0.5, 0.0)
 }
 
-/// Poses within `along_m` of the middle of the street, in a strip of `width_m`, with headings
-/// over `turn_rad`, in a sequence without gaps (Weyl).
+/// Poses within `along_m` of the middle of the street, in a strip of `width_m`, with a range of
+/// headings of `turn_rad`, from a low-discrepancy (Weyl) sequence.
 fn around(count: usize, along_m: f64, width_m: f64, turn_rad: f64) -> Vec<Pose3> {
     let spread = |number: usize, step: f64| (number as f64 * step).fract() - 0.5;
     (0..count)
         .map(|number| {
             let along = 0.5 + 2.0 * along_m / 300.0 * spread(number, 0.754_877_666);
-            let aside_m = width_m * spread(number, 0.569_840_291);
-            at(street::on_the_road(along as f32, aside_m as f32))
+            let lateral_m = width_m * spread(number, 0.569_840_291);
+            at(street::on_the_road(along as f32, lateral_m as f32))
                 * Pose3::rotation(
                     nalgebra::Vector3::z() * (turn_rad * spread(number, 0.618_033_989)),
                 )
@@ -210,35 +210,18 @@ fn around(count: usize, along_m: f64, width_m: f64, turn_rad: f64) -> Vec<Pose3>
         .collect()
 }
 
-/// About as many beams as asked for, evenly over the image that is seen from a place.
-fn beams(renderer: &CpuRenderer, place: Vec3, count: usize) -> Vec<Beam> {
+/// About `count` beams, evenly distributed over the image at a position.
+fn beams(renderer: &CpuRenderer, position: Vec3, count: usize) -> Vec<Beam> {
     let columns = (count as f32 * 900.0 / 64.0).sqrt();
     let model = LidarModel {
         width: columns as usize,
         height: (count as f32 / columns) as usize,
         ..LidarModel::default()
     };
-    let image = renderer.render(&[at(place)], &model);
+    let image = renderer.render(&[at(position)], &model);
     let ranges = image.expect("the CPU always renders").concat();
     std::iter::zip(model.directions(), ranges)
         .filter(|(_, range_m)| range_m.is_finite())
         .map(|(direction, range_m)| Beam { direction, range_m })
         .collect()
-}
-
-fn ply(mesh: &TriangleMesh) -> std::io::Result<Vec<u8>> {
-    let mut file = Vec::new();
-    writeln!(file, "ply\nformat binary_little_endian 1.0")?;
-    writeln!(file, "element vertex {}", mesh.vertices.len())?;
-    writeln!(file, "property float x\nproperty float y\nproperty float z")?;
-    writeln!(file, "element face {}", mesh.triangles.len())?;
-    writeln!(file, "property list uchar int vertex_indices\nend_header")?;
-    for coordinate in mesh.vertices.iter().flat_map(|v| v.to_array()) {
-        file.extend(coordinate.to_le_bytes());
-    }
-    for triangle in &mesh.triangles {
-        file.push(3);
-        file.extend(triangle.iter().flat_map(|vertex| vertex.to_le_bytes()));
-    }
-    Ok(file)
 }

@@ -1,4 +1,4 @@
-//! Builds a map from a recording in the layout of KITTI:
+//! Builds a map from a recording in KITTI layout:
 //! `cargo run --release --example build_map -- RECORDING MAP.ply`.
 
 #![allow(clippy::print_stdout, reason = "examples print their result")]

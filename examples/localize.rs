@@ -1,4 +1,4 @@
-//! Localizes a recording anywhere in a map, from its scans alone:
+//! Localizes a recording in a map without an initial pose and without odometry:
 //! `cargo run --release --example localize -- RECORDING MAP.ply TRAJECTORY.txt`.
 
 #![allow(clippy::print_stdout, reason = "examples print their result")]

@@ -1,4 +1,4 @@
-//! Refines a trajectory in the frame of a map, one TUM row per scan of the recording:
+//! Refines a trajectory in the map frame, with one TUM row per scan of the recording:
 //! `cargo run --release --example refine -- RECORDING MAP.ply TRAJECTORY.txt`.
 
 #![allow(clippy::print_stdout, reason = "examples print their result")]

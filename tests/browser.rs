@@ -5,7 +5,7 @@
 //! a message.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
-#![allow(clippy::print_stderr, reason = "a skipped test says so")]
+#![allow(clippy::print_stderr, reason = "a skipped test reports it")]
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -19,10 +19,10 @@ use fpmcl::app::plotting::Bitmap;
 const WIDTHS: [u32; 2] = [1280, 390];
 
 /// Minimum width of a window of the browser [px].
-const NARROWEST: u32 = 500;
+const MIN_WIDTH: u32 = 500;
 
 /// Maximum height of a window that the browser paints [px].
-const HIGHEST: u32 = 8000;
+const MAX_HEIGHT: u32 = 8000;
 
 /// Time limit of the browser, which takes seconds.
 const TIMEOUT: Duration = Duration::from_secs(120);
@@ -45,7 +45,7 @@ impl Browser {
             return None;
         };
         let programs = ["chromium", "chromium-browser", "google-chrome"];
-        let is_there = |program: &&str| {
+        let is_installed = |program: &&str| {
             let mut command = Command::new(program);
             command
                 .arg("--version")
@@ -53,7 +53,7 @@ impl Browser {
                 .stderr(Stdio::null());
             finished_within(TIMEOUT, &mut command).is_ok_and(|status| status.success())
         };
-        let Some(program) = programs.into_iter().find(is_there) else {
+        let Some(program) = programs.into_iter().find(is_installed) else {
             eprintln!("not run: there is no Chromium");
             return None;
         };
@@ -111,12 +111,12 @@ impl Browser {
     /// The whole page in one picture.
     fn screenshot(&self, html: &str, width: u32, height: u32) -> Bitmap {
         let mut pixels = Vec::new();
-        for top in (0..height).step_by(HIGHEST as usize) {
+        for top in (0..height).step_by(MAX_HEIGHT as usize) {
             let style = format!("<style>body {{ margin-top: -{top}px }}</style></head>");
-            let rows = HIGHEST.min(height - top);
+            let rows = MAX_HEIGHT.min(height - top);
             let window = Window::of(&html.replace("</head>", &style), "", [width, rows]);
             let picture = window.folder.path().join("part.png");
-            let size = format!("--window-size={},{rows}", width.max(NARROWEST));
+            let size = format!("--window-size={},{rows}", width.max(MIN_WIDTH));
             let shot = format!("--screenshot={}", picture.display());
             self.visit(&window.address, &[shot, size]);
             let part = Bitmap::read_png(&picture).unwrap();
@@ -278,16 +278,16 @@ fn a_click_on_any_column_title_sorts_and_a_link_leads_to_the_sorted_table() {
     }
 }
 
-/// A page with text, lines and charts has far more colors than this.
-const LEAST_COLORS: usize = 50;
+/// Minimum number of colors of a page with text, lines and charts.
+const MIN_COLORS: usize = 50;
 
-/// Rows at the top, which have a heading, and at the end, which are not blank [px].
+/// Number of rows at the top, with a heading, and at the end, which are not blank [px].
 const ENDS: u32 = 300;
 
 /// Defect of the screenshot of a page.
 fn defect_of_page(pixels: &Bitmap) -> Option<String> {
     let colors: BTreeSet<[u8; 3]> = pixels.pixels.iter().copied().collect();
-    if colors.len() < LEAST_COLORS {
+    if colors.len() < MIN_COLORS {
         return Some(format!("only {} colors", colors.len()));
     }
     let band = |from: u32, to: u32| {

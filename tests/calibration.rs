@@ -1,13 +1,14 @@
-//! What the filter says about its own errors is true: on a drive through a street with traffic, in
-//! which the car also creeps and stands, the errors are as large as the covariances say.
+//! Consistency of the filter: on a drive through a street with traffic, with slow driving and
+//! standstill, the errors agree with the covariances.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
+mod common;
+
 use std::fmt::Write as _;
 use std::fs;
-use std::path::Path;
 
-use assert_cmd::Command;
+use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, run, simulate_two_drives};
 use fpmcl::app::results::LocalizationResults;
 use nalgebra::Vector3;
 
@@ -17,46 +18,30 @@ path_pose_file: path.txt
 scanner: {azimuth_steps: 900}
 ";
 
-const BUILD_MAP: &str = "\
-scan_folder: street/drive_1/velodyne
-pose_file: street/drive_1/poses.txt
-calib_file: street/drive_1/calib.txt
-mesh_file: results/map.ply
-depth: 9
-";
-
 const LOCALIZATION: &str = "\
-map_file: results/map.ply
-map_pose_file: street/drive_1/poses.txt
-map_calib_file: street/drive_1/calib.txt
-scan_folder: street/drive_2/velodyne
-pose_file: street/drive_2/poses.txt
-calib_file: street/drive_2/calib.txt
 result_path: results/localization.npz
-odometry: file
-odometry_file: street/drive_2/odometry.txt
 numParticles: 500
 plot_loc_results: False
 force: True
 ";
 
-/// Frames before the filter has settled.
-const SETTLING: usize = 10;
+/// Number of frames that are excluded while the filter converges.
+const WARM_UP: usize = 10;
 
-/// How far the car drives into each frame: a town, a queue, a red light, and on [m].
+/// Distance driven before each frame: constant speed, braking, crawling, standstill, starting [m].
 fn steps_m() -> Vec<f64> {
-    let slows = (0..10).map(|frame| 0.9 - 0.08 * f64::from(frame));
-    let goes_on = (0..10).map(|frame| 0.1 * f64::from(frame));
+    let braking = (0..10).map(|frame| 0.9 - 0.08 * f64::from(frame));
+    let starting = (0..10).map(|frame| 0.1 * f64::from(frame));
     [0.9; 25]
         .into_iter()
-        .chain(slows)
+        .chain(braking)
         .chain([0.06; 10])
         .chain([0.0; 10])
-        .chain(goes_on)
+        .chain(starting)
         .collect()
 }
 
-/// A bend to the left with these steps, as KITTI writes poses.
+/// A left bend with these steps in the KITTI format.
 fn path() -> String {
     let (mut x, mut z, mut heading) = (0.0, 0.0, 0.0_f64);
     let mut text = String::new();
@@ -70,67 +55,48 @@ fn path() -> String {
     text
 }
 
-#[track_caller]
-fn run(folder: &Path, arguments: &[&str]) {
-    let output = Command::cargo_bin("fpmcl")
-        .unwrap()
-        .args(arguments)
-        .current_dir(folder)
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{arguments:?}: {said}");
-}
-
-/// Normalized squared errors of the estimates, by frame from the first that has settled.
+/// Normalized squared error of the estimate of each frame after the warm-up.
 fn squared_errors(results: &LocalizationResults) -> Vec<f64> {
     let estimates = results.estimates.as_ref().unwrap();
     let truths = results.ground_truth.as_ref().unwrap();
     let covariances = results.covariances.as_ref().unwrap();
     let frames = estimates.iter().zip(truths).zip(covariances);
     frames
-        .skip(SETTLING)
+        .skip(WARM_UP)
         .map(|((estimate, truth), covariance)| {
-            let off = estimate.translation.vector - truth.translation.vector;
-            let turn = (truth.rotation.inverse() * estimate.rotation).angle();
-            let error = Vector3::new(off.x, off.y, turn);
+            let shift_m = estimate.translation.vector - truth.translation.vector;
+            let turn_rad = (truth.rotation.inverse() * estimate.rotation).angle();
+            let error = Vector3::new(shift_m.x, shift_m.y, turn_rad);
             error.dot(&(covariance.try_inverse().unwrap() * error))
         })
         .collect()
 }
 
 #[test]
-fn errors_are_as_large_as_the_covariances_say_also_where_the_car_creeps_and_stands() {
-    /// Below this are 95 % of the squares of three normal deviates.
+fn errors_agree_with_the_covariances_also_at_low_speed_and_at_standstill() {
+    /// 95 % quantile of the chi-squared distribution with three degrees of freedom.
     const BOUND: f64 = 7.815;
-    let home = tempfile::tempdir().unwrap();
-    let folder = home.path();
+    let temporary = tempfile::tempdir().unwrap();
+    let folder = temporary.path();
     let write = |name: &str, text: &str| fs::write(folder.join(name), text).unwrap();
     write("path.txt", &path());
     write("calib.txt", "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n");
-    write("simulation.yml", SIMULATION);
-    write("build_map.yml", BUILD_MAP);
-    write("localization.yml", LOCALIZATION);
-    run(folder, &["simulate", "simulation.yml"]);
-    run(folder, &["simulate", "simulation.yml", "--set", "drive=2"]);
+    write("build_map.yml", &format!("{MAP_OF_DRIVE_1}depth: 9\n"));
+    write(
+        "localization.yml",
+        &format!("{DRIVE_2_IN_MAP}{LOCALIZATION}"),
+    );
+    simulate_two_drives(folder, SIMULATION);
     run(folder, &["build-map", "build_map.yml"]);
 
     let is_slow: Vec<bool> = steps_m().iter().map(|&step_m| step_m < 0.2).collect();
     let (mut all, mut slow, mut sigmas_m) = (Vec::new(), Vec::new(), Vec::new());
     for seed in ["1", "2", "3", "4"] {
-        run(
-            folder,
-            &[
-                "localize",
-                "localization.yml",
-                "--backend=cpu",
-                "--seed",
-                seed,
-            ],
-        );
+        let call = ["localize", "localization.yml", "--backend=cpu", "--seed"];
+        run(folder, &[call.as_slice(), &[seed]].concat());
         let results = LocalizationResults::read(&folder.join("results/localization.npz")).unwrap();
         let squares = squared_errors(&results);
-        let of_slow = squares.iter().zip(&is_slow[SETTLING..]);
+        let of_slow = squares.iter().zip(&is_slow[WARM_UP..]);
         slow.extend(
             of_slow
                 .filter(|(_, is_slow)| **is_slow)
@@ -138,7 +104,7 @@ fn errors_are_as_large_as_the_covariances_say_also_where_the_car_creeps_and_stan
         );
         let covariances = results.covariances.unwrap();
         sigmas_m.extend(
-            covariances[SETTLING..25]
+            covariances[WARM_UP..25]
                 .iter()
                 .map(|c| (c[(0, 0)] + c[(1, 1)]).sqrt()),
         );
@@ -149,17 +115,17 @@ fn errors_are_as_large_as_the_covariances_say_also_where_the_car_creeps_and_stan
         count as f64 / squares.len() as f64
     };
     let mean = |squares: &[f64]| squares.iter().sum::<f64>() / squares.len() as f64;
-    let told = format!(
+    let summary = format!(
         "all: {:.3} outside, mean {:.2}; slow: {:.3} outside, mean {:.2}",
         outside(&all),
         mean(&all),
         outside(&slow),
         mean(&slow)
     );
-    assert!(outside(&all) < 0.1 && outside(&slow) < 0.1, "{told}");
-    assert!((1.0..4.5).contains(&mean(&all)), "{told}");
-    // Not by being unsure: centimetres where the car drives.
+    assert!(outside(&all) < 0.1 && outside(&slow) < 0.1, "{summary}");
+    assert!((1.0..4.5).contains(&mean(&all)), "{summary}");
+    // The covariances are also small: centimetres while the car drives.
     sigmas_m.sort_by(f64::total_cmp);
     assert!(sigmas_m[sigmas_m.len() / 2] < 0.03, "{sigmas_m:?}");
-    eprintln!("{told}");
+    eprintln!("{summary}");
 }

@@ -1,12 +1,10 @@
-//! The program from outside: help, exit codes and errors of configurations.
+//! The binary from outside: help, exit codes and errors in configurations.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
 mod common;
 
-use std::path::Path;
-
-use common::{Recording, fpmcl};
+use common::{Recording, config_file, fpmcl};
 
 const COMMANDS: [&str; 10] = [
     "build-map",
@@ -21,21 +19,15 @@ const COMMANDS: [&str; 10] = [
     "doctor",
 ];
 
-fn delivered(name: &str) -> std::path::PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("config")
-        .join(name)
-}
-
-// Manners.
+// Command line.
 
 #[test]
-fn the_help_is_what_it_was() {
+fn the_help_matches_its_snapshot() {
     insta::assert_snapshot!("help", fpmcl("--help").succeeds().stdout);
 }
 
 #[test]
-fn the_help_of_every_command_is_what_it_was() {
+fn the_help_of_every_command_matches_its_snapshot() {
     for command in COMMANDS {
         let help = fpmcl(command).with("--help").succeeds().stdout;
         insta::assert_snapshot!(format!("help-{command}"), help);
@@ -51,64 +43,64 @@ fn the_help_lists_every_command() {
 }
 
 #[test]
-fn the_version_is_that_of_the_package() {
+fn the_version_is_the_version_of_the_package() {
     let expected = format!("fpmcl {}\n", env!("CARGO_PKG_VERSION"));
     assert_eq!(fpmcl("--version").succeeds().stdout, expected);
 }
 
 #[test]
-fn wrong_usage_has_its_own_exit_code() {
-    fpmcl("build-mop").misuse_saying(&["build-mop", "build-map"]);
+fn wrong_usage_has_exit_code_2() {
+    fpmcl("build-mop").rejects_usage_with(&["build-mop", "build-map"]);
     fpmcl("localize")
         .with("--treads=2")
-        .misuse_saying(&["--treads", "--threads"]);
+        .rejects_usage_with(&["--treads", "--threads"]);
     fpmcl("localize")
         .with("--threads=0")
-        .misuse_saying(&["--threads", "0"]);
+        .rejects_usage_with(&["--threads", "0"]);
     fpmcl("localize")
         .with("--backend=cuda")
-        .misuse_saying(&["cuda", "auto, cpu, gpu"]);
+        .rejects_usage_with(&["cuda", "auto, cpu, gpu"]);
     fpmcl("localize")
         .with("--set")
         .with("seed")
-        .misuse_saying(&["key=value"]);
+        .rejects_usage_with(&["key=value"]);
     fpmcl("localize")
         .with("-q")
         .with("-v")
-        .misuse_saying(&["cannot be used with"]);
+        .rejects_usage_with(&["cannot be used with"]);
 }
 
 #[test]
 fn the_doctor_prints_threads_and_backend() {
-    let said = fpmcl("doctor").with("--measure=0").succeeds();
+    let stdout = fpmcl("doctor").with("--measure=0").succeeds().stdout;
     for row in ["instruction sets", "threads in use", "backend auto"] {
-        assert!(said.stdout.contains(row), "{}", said.stdout);
+        assert!(stdout.contains(row), "{stdout}");
     }
-    assert!(!said.stdout.contains("per second"), "{}", said.stdout);
+    assert!(!stdout.contains("per second"), "{stdout}");
 }
 
 #[test]
 fn the_doctor_measures_rays_per_second() {
-    let said = fpmcl("doctor").with("--measure=1").succeeds();
-    let row = said.stdout.lines().find(|line| line.starts_with("rays "));
+    let stdout = fpmcl("doctor").with("--measure=1").succeeds().stdout;
+    let row = stdout.lines().find(|line| line.starts_with("rays "));
     let number = row.and_then(|row| row.split_whitespace().nth(1)).unwrap();
-    assert!(number.parse::<f64>().unwrap() > 0.0, "{}", said.stdout);
+    assert!(number.parse::<f64>().unwrap() > 0.0, "{stdout}");
 }
 
 // Configurations.
 
 #[test]
-fn a_missing_configuration_is_named() {
+fn a_missing_configuration_is_reported_with_its_path() {
     fpmcl("evaluate")
         .with("own.yml")
-        .fails_saying(&["cannot read", "own.yml", "give the path"]);
+        .fails_with(&["cannot read", "own.yml", "give the path"]);
 }
 
 #[test]
 fn without_a_file_the_built_in_configuration_is_used() {
-    fpmcl("build-map").fails_saying(&["scan_folder is data/kitti/velodyne"]);
-    fpmcl("ground").fails_saying(&["data/kitti/velodyne"]);
-    fpmcl("evaluate").fails_saying(&["result_file is results/localization.npz"]);
+    fpmcl("build-map").fails_with(&["scan_folder is data/kitti/velodyne"]);
+    fpmcl("ground").fails_with(&["data/kitti/velodyne"]);
+    fpmcl("evaluate").fails_with(&["result_file is results/localization.npz"]);
     let runs = fpmcl("compare").with("--list-jobs").succeeds().stdout;
     assert!(runs.contains("town/Fuzzy-PSO-MCL/5"), "{runs}");
 }
@@ -125,7 +117,7 @@ fn config_prints_the_short_file_and_the_full_one() {
         ("compare", "comparison.yml"),
     ] {
         let short = fpmcl("config").with(command).succeeds().stdout;
-        assert_eq!(short, std::fs::read_to_string(delivered(file)).unwrap());
+        assert_eq!(short, std::fs::read_to_string(config_file(file)).unwrap());
         let full = fpmcl("config")
             .with(command)
             .with("--full")
@@ -135,14 +127,14 @@ fn config_prints_the_short_file_and_the_full_one() {
     }
     fpmcl("config")
         .with("demo")
-        .misuse_saying(&["demo", "localize"]);
+        .rejects_usage_with(&["demo", "localize"]);
 }
 
 #[test]
 fn an_unknown_key_is_reported_with_line_and_nearest_key() {
     let recording = Recording::street(0);
     recording.write("build_map.yml", "depth: 8\nvoxel_sise: 0.1\n");
-    recording.fpmcl("build-map").fails_saying(&[
+    recording.fpmcl("build-map").fails_with(&[
         "build_map.yml, line 2",
         "unknown key `voxel_sise`",
         "did you mean `voxel_size`?",
@@ -153,11 +145,9 @@ fn an_unknown_key_is_reported_with_line_and_nearest_key() {
 fn a_value_of_the_wrong_type_is_reported_with_its_line() {
     let recording = Recording::street(0);
     recording.write("localization.yml", "# start\n\nnumParticles: many\n");
-    recording.fpmcl("localize").fails_saying(&[
-        "localization.yml, line 3",
-        "`many`",
-        "numParticles",
-    ]);
+    recording
+        .fpmcl("localize")
+        .fails_with(&["localization.yml, line 3", "`many`", "numParticles"]);
 }
 
 #[test]
@@ -166,31 +156,31 @@ fn contradictory_values_are_reported_with_a_remedy() {
         Recording::street(0)
             .fpmcl(command)
             .set("range_image.min_range", "60")
-            .fails_saying(&[
+            .fails_with(&[
                 "--set range_image.min_range=60",
                 "less than max_range, which is 50",
             ]);
     }
     fpmcl("refine")
-        .with(delivered("refinement.yml"))
+        .with(config_file("refinement.yml"))
         .set("range_image.width", "0")
-        .fails_saying(&["range_image.width is 0"]);
+        .fails_with(&["range_image.width is 0"]);
     fpmcl("evaluate")
-        .with(delivered("evaluation.yml"))
+        .with(config_file("evaluation.yml"))
         .set("frame_step", "0")
-        .fails_saying(&["frame_step is 0", "1 takes every frame"]);
+        .fails_with(&["frame_step is 0", "1 takes every frame"]);
     fpmcl("refine")
-        .with(delivered("refinement.yml"))
+        .with(config_file("refinement.yml"))
         .set("refinement.max_reach_m", "0.05")
-        .fails_saying(&["max_reach_m is 0.05", "min_reach_m, which is 0.1"]);
+        .fails_with(&["max_reach_m is 0.05", "min_reach_m, which is 0.1"]);
 }
 
 #[test]
 fn a_setting_of_an_unknown_key_is_reported_with_the_nearest() {
     fpmcl("localize")
-        .with(delivered("localization.yml"))
+        .with(config_file("localization.yml"))
         .set("range_image.widht", "512")
-        .fails_saying(&["--set range_image.widht=512", "`range_image.width`"]);
+        .fails_with(&["--set range_image.widht=512", "`range_image.width`"]);
 }
 
 #[test]
@@ -213,18 +203,18 @@ fn invalid_values_are_reported_before_any_work() {
     ] {
         let setting = format!("--set {key}={value}: {key} is ");
         fpmcl(command)
-            .with(delivered(file))
+            .with(config_file(file))
             .set(key, value)
-            .fails_saying(&[&setting]);
+            .fails_with(&[&setting]);
     }
 }
 
 #[test]
 fn an_invalid_rule_is_reported_with_its_line_and_the_nearest_word() {
-    // Both commands have this block.
+    // Both commands use this block.
     let ground = fpmcl("config").with("ground").with("--full");
     let ground = ground.succeeds().stdout;
-    let fuzzy = &ground[ground.find("\nfuzzy:").expect("it has the block")..];
+    let fuzzy = &ground[ground.find("\nfuzzy:").expect("it contains the block")..];
     let fuzzy = &fuzzy[..fuzzy.find("\nransac:").unwrap_or(fuzzy.len())];
     for (command, text) in [("build-map", fuzzy), ("ground", ground.as_str())] {
         for (right, wrong, key, message) in [
@@ -253,15 +243,15 @@ fn an_invalid_rule_is_reported_with_its_line_and_the_nearest_word() {
                 "no feature: the nearest is `ground`",
             ),
         ] {
-            let faulty = text.replace(right, wrong);
-            let line = 1 + std::iter::zip(text.lines(), faulty.lines())
+            let invalid = text.replace(right, wrong);
+            let line = 1 + std::iter::zip(text.lines(), invalid.lines())
                 .position(|(before, after)| before != after)
-                .expect("the file has the words");
+                .expect("the text differs");
             let folder = tempfile::tempdir().expect("a folder");
-            let path = folder.path().join("faulty.yml");
-            std::fs::write(&path, faulty).expect("it is written");
-            let place = format!("faulty.yml, line {line}: {key} is ");
-            fpmcl(command).with(path).fails_saying(&[&place, message]);
+            let path = folder.path().join("invalid.yml");
+            std::fs::write(&path, invalid).expect("it can be written");
+            let place = format!("invalid.yml, line {line}: {key} is ");
+            fpmcl(command).with(path).fails_with(&[&place, message]);
         }
     }
 }
@@ -269,9 +259,9 @@ fn an_invalid_rule_is_reported_with_its_line_and_the_nearest_word() {
 #[test]
 fn an_invalid_rule_on_the_command_line_is_reported_there() {
     fpmcl("build-map")
-        .with(delivered("build_map.yml"))
+        .with(config_file("build_map.yml"))
         .set("fuzzy.rules", "[IF height IS hight THEN ground IS low]")
-        .fails_saying(&[
+        .fails_with(&[
             "--set fuzzy.rules=[IF height IS hight",
             "fuzzy.rules[1] is",
             "`height` has no set `hight`",
@@ -282,15 +272,15 @@ fn an_invalid_rule_on_the_command_line_is_reported_there() {
 #[test]
 fn a_key_that_another_key_sets_is_unknown_in_its_block() {
     fpmcl("build-map")
-        .with(delivered("build_map.yml"))
+        .with(config_file("build_map.yml"))
         .set("poisson.depth", "8")
-        .fails_saying(&["unknown key `poisson.depth`"]);
+        .fails_with(&["unknown key `poisson.depth`"]);
 }
 
 #[test]
-fn a_setting_of_the_wrong_kind_is_quoted() {
+fn a_setting_of_the_wrong_type_is_quoted() {
     fpmcl("localize")
-        .with(delivered("localization.yml"))
+        .with(config_file("localization.yml"))
         .set("seed", "yesterday")
-        .fails_saying(&["--set seed=yesterday", "whole number"]);
+        .fails_with(&["--set seed=yesterday", "whole number"]);
 }

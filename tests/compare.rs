@@ -7,10 +7,9 @@ mod common;
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use common::{Fpmcl, Recording, fpmcl};
-use serde_json::Value;
+use common::{Fpmcl, Recording, fpmcl, json};
 
 const FRAMES: usize = 12;
 
@@ -52,10 +51,6 @@ fn compare(recording: &Recording) -> Fpmcl {
         .in_folder(recording.folder())
         .with("comparison.yml")
         .with("--backend=cpu")
-}
-
-fn json(path: &Path) -> Value {
-    serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
 }
 
 /// The folders of shared results, without the lock files.
@@ -122,9 +117,7 @@ fn every_run_is_executed_once_and_an_interrupted_comparison_resumes() {
     let other = compare(&recording)
         .set("seeds", "[1]")
         .set("base.build_map.voxel_size", "0.25");
-    other
-        .with("--collect")
-        .fails_saying(&["no run is finished"]);
+    other.with("--collect").fails_with(&["no run is finished"]);
 }
 
 fn the_tables_agree_with_the_runs(recording: &Recording) {
@@ -149,23 +142,21 @@ fn the_tables_agree_with_the_runs(recording: &Recording) {
         .zip([1.45, 1.02, 0.71])
     {
         let configuration = row[name]["text"].as_str().unwrap();
-        let of_runs: Vec<f64> = [1, 2]
-            .map(|seed| {
-                let folder = format!("out/runs/street/{configuration}/{seed}");
-                let record = json(&recording.path(&format!("{folder}/run.json")));
-                let pointer = "/outcome/finished/metrics/position_m/mean";
-                let error_m = record.pointer(pointer).unwrap().as_f64().unwrap();
-                let report = json(&recording.path(&format!("{folder}/report.json")));
-                let trajectory = if configuration.contains("PSO") {
-                    "refined"
-                } else {
-                    "mcl"
-                };
-                let pointer = format!("/{trajectory}/metrics/position_m/mean");
-                assert_eq!(report.pointer(&pointer).unwrap().as_f64(), Some(error_m));
-                error_m
-            })
-            .into();
+        let of_runs = [1, 2].map(|seed| {
+            let folder = format!("out/runs/street/{configuration}/{seed}");
+            let record = json(&recording.path(&format!("{folder}/run.json")));
+            let pointer = "/outcome/finished/metrics/position_m/mean";
+            let error_m = record.pointer(pointer).unwrap().as_f64().unwrap();
+            let report = json(&recording.path(&format!("{folder}/report.json")));
+            let trajectory = if configuration.contains("PSO") {
+                "refined"
+            } else {
+                "mcl"
+            };
+            let pointer = format!("/{trajectory}/metrics/position_m/mean");
+            assert_eq!(report.pointer(&pointer).unwrap().as_f64(), Some(error_m));
+            error_m
+        });
         let mean = row[error]["estimate"]["mean"].as_f64().unwrap();
         assert!((mean - 0.5 * (of_runs[0] + of_runs[1])).abs() < 1e-12);
         assert_eq!(row[claim]["number"].as_f64(), Some(claimed_m));
@@ -293,12 +284,12 @@ fn an_outdated_record_is_removed_before_its_run_is_executed_again() {
     recording.write_scan(0, &points);
     let text = recording.path("out/runs/street/Fuzzy-MCL/1/evaluation.yml");
     fs::create_dir(&text).unwrap();
-    job().fails_saying(&["evaluation.yml"]);
+    job().fails_with(&["evaluation.yml"]);
     assert_ne!(recording.bytes(trajectory), before);
     assert!(records(&recording).is_empty());
     compare(&recording)
         .with("--collect")
-        .fails_saying(&["no run is finished"]);
+        .fails_with(&["no run is finished"]);
 }
 
 #[test]
@@ -327,7 +318,7 @@ fn every_run_has_a_command_of_its_own() {
 fn errors_are_reported_before_any_run_is_executed() {
     let recording = recording();
     let fails = |call: Fpmcl, parts: &[&str]| {
-        call.fails_saying(parts);
+        call.fails_with(parts);
     };
     fails(
         compare(&recording).with("--job=street/Fuzzy/1"),
@@ -344,5 +335,5 @@ fn errors_are_reported_before_any_run_is_executed() {
     fails(compare(&recording), &["PCA-MCL", "ground_method", "pcb"]);
     compare(&recording)
         .with("--job=street")
-        .misuse_saying(&["SEQUENCE/CONFIGURATION/SEED"]);
+        .rejects_usage_with(&["SEQUENCE/CONFIGURATION/SEED"]);
 }

@@ -1,4 +1,4 @@
-//! The examples as their readers run them, on a simulated drive.
+//! The examples, run on a simulated drive.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
@@ -7,7 +7,7 @@ mod common;
 use std::path::Path;
 use std::process::Command;
 
-use common::fpmcl;
+use common::simulate_two_drives;
 use fpmcl::geometry::Pose3;
 use fpmcl::recording::{Sequence, poses::read_tum};
 
@@ -39,17 +39,10 @@ fn distance_m(a: &Pose3, b: &Pose3) -> f64 {
 }
 
 #[test]
-fn a_map_is_built_a_second_drive_is_localized_in_it_and_refined() {
+fn a_second_drive_is_localized_and_refined_in_the_map_of_the_first() {
     let folder = tempfile::tempdir().unwrap();
-    std::fs::write(folder.path().join("simulation.yml"), SIMULATION).unwrap();
-    for drive in ["1", "2"] {
-        fpmcl("simulate")
-            .with("simulation.yml")
-            .set("drive", drive)
-            .in_folder(folder.path())
-            .succeeds();
-    }
     let folder = folder.path();
+    simulate_two_drives(folder, SIMULATION);
     let built = example("build_map", folder, &["street/drive_1", "map.ply"]);
     assert!(built.contains("key scans"), "{built}");
     let query = ["street/drive_2", "map.ply", "trajectory.txt"];
@@ -60,7 +53,7 @@ fn a_map_is_built_a_second_drive_is_localized_in_it_and_refined() {
         "{localized}"
     );
 
-    // Poses of drive 2 in the frame of the map, which is the first pose of drive 1.
+    // The map frame is the lidar frame of the first pose of drive 1.
     let map = Sequence::open_folder(&folder.join("street/drive_1")).unwrap();
     let truth = Sequence::open_folder(&folder.join("street/drive_2")).unwrap();
     let truth = truth.in_map(&map.world_from_map);
@@ -73,8 +66,8 @@ fn a_map_is_built_a_second_drive_is_localized_in_it_and_refined() {
             .split(' ')
             .filter_map(|word| word.parse().ok())
             .collect();
-        let place = frame.map_from_lidar.translation;
-        let off_m = (numbers[0] - place.x).hypot(numbers[1] - place.y);
-        assert!(off_m < 0.05, "row {row}: {off_m} m");
+        let position = frame.map_from_lidar.translation;
+        let error_m = (numbers[0] - position.x).hypot(numbers[1] - position.y);
+        assert!(error_m < 0.05, "refined row {row}: {error_m} m");
     }
 }

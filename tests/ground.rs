@@ -1,4 +1,4 @@
-//! `fpmcl ground` from outside, on scans of simulated streets.
+//! The command `ground` from outside, on scans of simulated streets.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
@@ -12,7 +12,7 @@ use fpmcl::recording::velodyne::{read_labels, write_labels, write_scan};
 use fpmcl::simulation::{LabelledScan, ScannerConfig, slope_scene};
 use tempfile::TempDir;
 
-/// A recording of two scans before a slope, with labels.
+/// A recording of two labelled scans in front of a slope.
 fn recording() -> (TempDir, Vec<LabelledScan>) {
     let folder = tempfile::tempdir().unwrap();
     let scanner = ScannerConfig {
@@ -40,7 +40,7 @@ fn coordinates(x: f32, y: f32, z: f32) -> [String; 3] {
     [x, y, z].map(|number| number.to_string())
 }
 
-/// The numbers behind the name of a method in the table.
+/// Numbers in the row of a method in the table.
 fn row(table: &str, method: &str) -> Vec<f64> {
     let line = table.lines().find(|line| line.starts_with(method)).unwrap();
     line[method.len()..]
@@ -50,28 +50,28 @@ fn row(table: &str, method: &str) -> Vec<f64> {
 }
 
 #[test]
-fn a_point_is_explained_by_the_rules_that_fired() {
+fn a_decision_is_explained_by_the_rules_that_fired() {
     let (folder, scenes) = recording();
     let scan = folder.path().join("velodyne/000000.bin");
     let points = &scenes[0].scan.points;
-    let explained = |class: u16, rise_m: f32| {
+    let explanation = |class: u16, min_z_m: f32| {
         let index = (0..points.len())
             .find(|&index| {
                 let point = points[index];
-                scenes[0].classes[index] == class && point.z > rise_m && point.length() < 15.0
+                scenes[0].classes[index] == class && point.z > min_z_m && point.length() < 15.0
             })
             .unwrap();
         let [x, y, z] = coordinates(points[index].x, points[index].y, points[index].z);
         let call = fpmcl("ground").with(&scan).with("--explain");
-        let said = call.with(x).with(y).with(z).succeeds().stdout;
-        assert!(said.contains(&format!("point {index} at ")), "{said}");
-        assert!(said.contains(&format!("class {class}")), "{said}");
+        let text = call.with(x).with(y).with(z).succeeds().stdout;
+        assert!(text.contains(&format!("point {index} at ")), "{text}");
+        assert!(text.contains(&format!("class {class}")), "{text}");
         for feature in ["slope", "height_variance", "curvature", "height"] {
-            assert!(said.contains(feature), "{said}");
+            assert!(text.contains(feature), "{text}");
         }
-        said
+        text
     };
-    let road = explained(fpmcl::simulation::classes::ROAD, -3.0);
+    let road = explanation(fpmcl::simulation::classes::ROAD, -3.0);
     assert!(road.contains(
         "IF height IS level AND slope IS gentle AND curvature IS NOT sharp THEN ground IS high"
     ));
@@ -79,7 +79,7 @@ fn a_point_is_explained_by_the_rules_that_fired() {
         road.contains("ly ground") && !road.contains("not ground"),
         "{road}"
     );
-    let wall = explained(fpmcl::simulation::classes::BUILDING, 0.0);
+    let wall = explanation(fpmcl::simulation::classes::BUILDING, 0.0);
     assert!(
         wall.contains("IF height IS above THEN ground IS low"),
         "{wall}"
@@ -88,13 +88,14 @@ fn a_point_is_explained_by_the_rules_that_fired() {
 }
 
 #[test]
-fn a_recording_is_labelled_coloured_drawn_and_judged() {
+fn labels_points_pictures_and_scores_of_a_recording_are_written() {
     let (folder, scenes) = recording();
     let output = folder.path().join("out");
-    let said = fpmcl("ground")
+    let stdout = fpmcl("ground")
         .with(folder.path())
         .set("output_folder", output.to_str().unwrap())
-        .succeeds();
+        .succeeds()
+        .stdout;
     for (number, scene) in scenes.iter().enumerate() {
         let classes = read_labels(&output.join(format!("labels/{number:06}.label"))).unwrap();
         assert_eq!(classes.len(), scene.scan.len());
@@ -102,7 +103,7 @@ fn a_recording_is_labelled_coloured_drawn_and_judged() {
         let ply = fs::read(output.join(format!("points/{number:06}.ply"))).unwrap();
         let header = format!("element vertex {}\n", scene.scan.len());
         assert!(String::from_utf8_lossy(&ply[..200]).contains(&header));
-        // Three coordinates, three colours, a confidence.
+        // Three coordinates, three color channels and a confidence.
         let end = ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
         assert_eq!(ply.len() - end, scene.scan.len() * (12 + 3 + 4));
     }
@@ -121,16 +122,16 @@ fn a_recording_is_labelled_coloured_drawn_and_judged() {
         "RANSAC plane",
         "rule of the report",
     ] {
-        let numbers = row(&said.stdout, &format!("{method:<22}"));
-        assert_eq!(numbers.len(), 2 * 4 + 2, "{}", said.stdout);
+        let numbers = row(&stdout, &format!("{method:<22}"));
+        assert_eq!(numbers.len(), 2 * 4 + 2, "{stdout}");
     }
-    let f1 = |method: &str| row(&said.stdout, &format!("{method:<22}"))[2];
-    assert!(f1("fuzzy") > 97.0, "{}", said.stdout);
-    assert!(f1("fuzzy") > f1("RANSAC plane"), "{}", said.stdout);
+    let f1 = |method: &str| row(&stdout, &format!("{method:<22}"))[2];
+    assert!(f1("fuzzy") > 97.0, "{stdout}");
+    assert!(f1("fuzzy") > f1("RANSAC plane"), "{stdout}");
 }
 
 #[test]
-fn written_labels_are_the_answer_that_was_judged() {
+fn the_scores_belong_to_the_written_labels() {
     let (folder, scenes) = recording();
     let output = folder.path().join("out");
     let stdout = fpmcl("ground")
@@ -142,19 +143,19 @@ fn written_labels_are_the_answer_that_was_judged() {
         .stdout;
     let mut score = fpmcl::evaluation::GroundScore::default();
     for (number, scene) in scenes.iter().enumerate() {
-        let answers = read_labels(&output.join(format!("labels/{number:06}.label"))).unwrap();
-        for (index, answer) in answers.into_iter().enumerate() {
+        let labels = read_labels(&output.join(format!("labels/{number:06}.label"))).unwrap();
+        for (index, label) in labels.into_iter().enumerate() {
             let protocol = fpmcl::evaluation::GroundProtocol::PatchworkPlusPlus;
             let z = scene.scan.points[index].z;
             if let Some(truth) = protocol.truth(scene.classes[index], z) {
-                score.add(answer == 40, truth);
+                score.add(label == 40, truth);
             }
         }
     }
-    let told = row(&stdout, &format!("{:<22}", "fuzzy"))[2];
+    let printed = row(&stdout, &format!("{:<22}", "fuzzy"))[2];
     assert!(
-        (told - 100.0 * score.f1()).abs() < 0.006,
-        "{told} {score:?}"
+        (printed - 100.0 * score.f1()).abs() < 0.006,
+        "{printed} {score:?}"
     );
     assert!(!output.join("points").exists());
 }
@@ -165,13 +166,14 @@ fn a_single_scan_and_a_folder_without_labels_are_classified_too() {
     fs::remove_dir_all(folder.path().join("labels")).unwrap();
     for (input, name) in [("velodyne/000001.bin", "one"), ("velodyne", "all")] {
         let output = folder.path().join(name);
-        let said = fpmcl("ground")
+        let stdout = fpmcl("ground")
             .with(folder.path().join(input))
             .set("output_folder", output.to_str().unwrap())
             .set("plot_step", "0")
-            .succeeds();
+            .succeeds()
+            .stdout;
         assert!(output.join("labels/000001.label").is_file());
-        assert!(!said.stdout.contains("precision"), "{}", said.stdout);
+        assert!(!stdout.contains("precision"), "{stdout}");
     }
 }
 
@@ -187,40 +189,40 @@ fn existing_output_and_true_labels_are_not_overwritten() {
     };
     let output = folder.path().join("out");
     call(&output).succeeds();
-    call(&output).fails_saying(&["ground.json exists", "--force", "output_folder"]);
+    call(&output).fails_with(&["ground.json exists", "--force", "output_folder"]);
     call(&output).with("--force").succeeds();
 
-    call(folder.path()).fails_saying(&["true labels", "choose another output_folder"]);
+    call(folder.path()).fails_with(&["true labels", "choose another output_folder"]);
     let classes = read_labels(&folder.path().join("labels/000000.label")).unwrap();
     assert_eq!(classes, scenes[0].classes);
 }
 
 #[test]
-fn bad_input_is_told_with_a_remedy() {
+fn invalid_input_is_reported_with_a_remedy() {
     let (folder, _) = recording();
-    fpmcl("ground").fails_saying(&["data/kitti/velodyne"]);
+    fpmcl("ground").fails_with(&["data/kitti/velodyne"]);
     fpmcl("ground")
         .with("absent.bin")
-        .fails_saying(&["cannot read", "absent.bin"]);
+        .fails_with(&["cannot read", "absent.bin"]);
     fpmcl("ground")
         .with(folder.path())
         .with("--explain")
         .with("1")
         .with("-2")
         .with("-1.7")
-        .fails_saying(&["--explain needs one scan", ".bin"]);
+        .fails_with(&["--explain needs one scan", ".bin"]);
     fpmcl("ground")
         .with(folder.path())
         .set("fuzzy.rules", "[IF slop IS gentle THEN ground IS high]")
-        .fails_saying(&["slop", "nearest is `slope`"]);
+        .fails_with(&["slop", "nearest is `slope`"]);
     fpmcl("ground")
         .with(folder.path())
         .set("ransac.ransac_n", "2")
-        .fails_saying(&["ransac.ransac_n", "3 points"]);
+        .fails_with(&["ransac.ransac_n", "3 points"]);
 
     let labels = folder.path().join("labels/000001.label");
     write_labels(fs::File::create(&labels).unwrap(), &[40; 7]).unwrap();
     fpmcl("ground")
         .with(folder.path())
-        .fails_saying(&["000001.label has 7 labels", "label_folder"]);
+        .fails_with(&["000001.label has 7 labels", "label_folder"]);
 }

@@ -1,30 +1,19 @@
-//! Ground against the labels of SemanticKITTI, where the data is there.
+//! Ground segmentation against the labels of SemanticKITTI, where they are available.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::print_stderr,
-    reason = "a test helper that says why it skips"
-)]
+#![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
-use std::path::PathBuf;
+mod common;
 
+use common::real_recording;
 use fpmcl::evaluation::{GroundProtocol, GroundScore};
 use fpmcl::ground::{
     FuzzyConfig, FuzzyGround, GroundClassifier, PcaGround, RansacGround, ReportRule,
 };
 use fpmcl::recording::velodyne::{read_labels, read_scan};
 
-/// The classifier's score on scans with odd numbers, which no parameter was fixed on.
+/// Score of a classifier on the odd scans, which were not used to choose parameters.
 fn held_out_score(classifier: &dyn GroundClassifier) -> Option<GroundScore> {
-    let root = std::env::var_os("FPMCL_DATA").map_or_else(
-        || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
-        PathBuf::from,
-    );
-    let folder = root.join("semantickitti-00-labels");
-    if !folder.is_dir() {
-        eprintln!("skipped: {} is absent", folder.display());
-        return None;
-    }
+    let folder = real_recording("semantickitti-00-labels")?;
     let mut score = GroundScore::default();
     for number in (1..21).step_by(2) {
         let scan = read_scan(&folder.join(format!("velodyne/{number:06}.bin"))).unwrap();
@@ -40,7 +29,7 @@ fn held_out_score(classifier: &dyn GroundClassifier) -> Option<GroundScore> {
 }
 
 #[test]
-fn four_features_surpass_the_specialists_and_three_come_close() {
+fn fuzzy_ground_reaches_its_published_scores_and_exceeds_the_baselines() {
     let fuzzy = |config| held_out_score(&FuzzyGround::new(config).unwrap());
     let (Some(four), Some(three)) = (
         fuzzy(FuzzyConfig::default()),

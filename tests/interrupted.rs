@@ -1,7 +1,7 @@
-//! Runs that are stopped in the middle, by Ctrl-C or by death, and what is left of them.
+//! Commands that are interrupted or killed, and what they keep.
 //!
-//! The middle is a certain one: a scan of the recording is a named pipe, at which the program
-//! waits until the test has done with it what it wants to.
+//! The time of the interruption is reproducible: a scan of the recording is a named pipe, at which
+//! the program waits for the test.
 
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
@@ -19,8 +19,8 @@ use std::time::Duration;
 use common::Recording;
 use fpmcl::app::results::LocalizationResults;
 
-/// Longer than this nothing here takes; a limit only so that a hanging program ends.
-const PATIENCE: Duration = Duration::from_secs(120);
+/// Time limit for a program that hangs.
+const TIMEOUT: Duration = Duration::from_secs(120);
 
 /// Four local maps of three scans.
 const BUILD_MAP: &[&str] = &[
@@ -34,14 +34,14 @@ const LOCALIZE: &[&str] = &["localize", "localization.yml", "--backend=cpu"];
 
 const REFINE: &[&str] = &["refine", "refinement.yml", "--backend=cpu"];
 
-/// A scan that the program has to wait for.
-struct HeldScan {
+/// A scan as a named pipe.
+struct PipedScan {
     path: PathBuf,
     bytes: Vec<u8>,
 }
 
-impl HeldScan {
-    fn of(recording: &Recording, frame: usize) -> Self {
+impl PipedScan {
+    fn new(recording: &Recording, frame: usize) -> Self {
         let path = recording.path(&format!("velodyne/{frame:06}.bin"));
         let bytes = fs::read(&path).unwrap();
         fs::remove_file(&path).unwrap();
@@ -50,21 +50,21 @@ impl HeldScan {
         Self { path, bytes }
     }
 
-    /// Tells when the program waits for the scan, and hands over the end to write it to.
-    fn asked_for(&self) -> Receiver<File> {
+    /// Receives the write end of the pipe when the program opens the scan.
+    fn opened(&self) -> Receiver<File> {
         let (sender, receiver) = channel();
         let path = self.path.clone();
         thread::spawn(move || {
-            // Opening waits for the reader.
+            // Opening blocks until there is a reader.
             let pipe = File::options().write(true).open(path).unwrap();
-            // The test may have given up.
+            // After a timeout, nobody receives it.
             let _ = sender.send(pipe);
         });
         receiver
     }
 
-    /// Makes it an ordinary file again.
-    fn release(self) {
+    /// Replaces the pipe by an ordinary file.
+    fn restore(self) {
         fs::remove_file(&self.path).unwrap();
         fs::write(&self.path, &self.bytes).unwrap();
     }
@@ -80,105 +80,102 @@ fn start(recording: &Recording, arguments: &[&str]) -> Child {
         .unwrap()
 }
 
-/// Waits until the program asks for the scan.
+/// Waits until the program opens the scan.
 #[track_caller]
-fn wait(asked: &Receiver<File>, child: &mut Child) -> File {
-    match asked.recv_timeout(PATIENCE) {
+fn wait(opened: &Receiver<File>, child: &mut Child) -> File {
+    match opened.recv_timeout(TIMEOUT) {
         Ok(pipe) => pipe,
         Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {
             child.kill().unwrap();
-            panic!("the program never asks for the scan");
+            panic!("the program does not open the scan");
         }
     }
 }
 
-/// Reads what the program says until a line has `part`, or to the end.
+/// Reads standard error up to the line that contains `part`, or to the end.
 fn read_until(stderr: &mut BufReader<ChildStderr>, part: Option<&str>) -> String {
-    let mut said = String::new();
-    while stderr.read_line(&mut said).unwrap() > 0 {
-        let is_there = part.is_some_and(|part| said.contains(part));
-        if is_there {
+    let mut text = String::new();
+    while stderr.read_line(&mut text).unwrap() > 0 {
+        if part.is_some_and(|part| text.contains(part)) {
             break;
         }
     }
-    said
+    text
 }
 
-/// Runs a command, presses Ctrl-C while it waits for the scan, then gives it the scan; the exit
-/// code and all that was said.
+/// Runs a command and interrupts it while it waits for the scan, which it then receives; returns
+/// the exit code and standard error.
 fn interrupted(
     recording: &Recording,
     arguments: &[&str],
-    scan: &HeldScan,
+    scan: &PipedScan,
 ) -> (Option<i32>, String) {
     signalled("-INT", recording, arguments, scan)
 }
 
-/// As [`interrupted`], by another signal.
+/// As [`interrupted`], with another signal.
 fn signalled(
     signal: &str,
     recording: &Recording,
     arguments: &[&str],
-    scan: &HeldScan,
+    scan: &PipedScan,
 ) -> (Option<i32>, String) {
-    let asked = scan.asked_for();
+    let opened = scan.opened();
     let mut child = start(recording, arguments);
-    let mut pipe = wait(&asked, &mut child);
-    let mut stderr = BufReader::new(child.stderr.take().unwrap());
-    let pressed = Command::new("kill")
+    let mut pipe = wait(&opened, &mut child);
+    let mut reader = BufReader::new(child.stderr.take().unwrap());
+    let sent = Command::new("kill")
         .args([signal, &child.id().to_string()])
         .status()
         .unwrap();
-    assert!(pressed.success());
-    let mut said = read_until(&mut stderr, Some("press Ctrl-C again"));
+    assert!(sent.success());
+    let mut stderr = read_until(&mut reader, Some("press Ctrl-C again"));
     pipe.write_all(&scan.bytes).unwrap();
     drop(pipe);
-    said += &read_until(&mut stderr, None);
-    (child.wait().unwrap().code(), said)
+    stderr += &read_until(&mut reader, None);
+    (child.wait().unwrap().code(), stderr)
 }
 
 /// Kills a command while it waits for the scan.
-fn killed(recording: &Recording, arguments: &[&str], scan: &HeldScan) {
-    let asked = scan.asked_for();
+fn killed(recording: &Recording, arguments: &[&str], scan: &PipedScan) {
+    let opened = scan.opened();
     let mut child = start(recording, arguments);
-    let pipe = wait(&asked, &mut child);
+    let pipe = wait(&opened, &mut child);
     child.kill().unwrap();
     child.wait().unwrap();
     drop(pipe);
 }
 
-/// Runs a command to its end, giving it the scan when it asks; all that was said.
-fn resumed(recording: &Recording, arguments: &[&str], scan: &HeldScan) -> String {
-    let asked = scan.asked_for();
+/// Runs a command to its end, with the scan; returns standard error.
+fn resumed(recording: &Recording, arguments: &[&str], scan: &PipedScan) -> String {
+    let opened = scan.opened();
     let mut child = start(recording, arguments);
-    let mut pipe = wait(&asked, &mut child);
+    let mut pipe = wait(&opened, &mut child);
     pipe.write_all(&scan.bytes).unwrap();
     drop(pipe);
-    let mut stderr = BufReader::new(child.stderr.take().unwrap());
-    let said = read_until(&mut stderr, None);
-    assert_eq!(child.wait().unwrap().code(), Some(0), "{said}");
-    said
+    let mut reader = BufReader::new(child.stderr.take().unwrap());
+    let stderr = read_until(&mut reader, None);
+    assert_eq!(child.wait().unwrap().code(), Some(0), "{stderr}");
+    stderr
 }
 
-/// The map that a build gives that nobody stops.
-fn whole_map() -> Vec<u8> {
-    let recording = Recording::street(12);
-    let mut child = start(&recording, BUILD_MAP);
-    let said = read_until(&mut BufReader::new(child.stderr.take().unwrap()), None);
-    assert_eq!(child.wait().unwrap().code(), Some(0), "{said}");
+/// Map of a recording, built without interruption.
+fn uninterrupted_map(recording: &Recording) -> Vec<u8> {
+    let call = recording.fpmcl("build-map");
+    call.with(BUILD_MAP[2]).with(BUILD_MAP[3]).succeeds();
     recording.bytes("map.ply")
 }
 
 #[test]
-fn an_interrupted_build_keeps_its_local_maps_and_goes_on_from_there() {
+fn an_interrupted_build_keeps_its_local_maps_and_resumes() {
     let recording = Recording::street(12);
-    // The scan in the middle of the third local map, in which no other takes part.
-    let scan = HeldScan::of(&recording, 7);
-    let (code, said) = interrupted(&recording, BUILD_MAP, &scan);
-    assert_eq!(code, Some(130), "{said}");
+    // The middle scan of the third local map, which belongs to no other local map.
+    let scan = PipedScan::new(&recording, 7);
+    let (code, stderr) = interrupted(&recording, BUILD_MAP, &scan);
+    assert_eq!(code, Some(130), "{stderr}");
     let kept = "interrupted; 2 of 4 local maps are finished and kept in map.ply.parts";
-    assert!(said.contains(kept), "{said}");
-    assert!(said.contains("run the same command again"), "{said}");
+    assert!(stderr.contains(kept), "{stderr}");
+    assert!(stderr.contains("run the same command again"), "{stderr}");
     assert!(!recording.path("map.ply").exists());
     assert!(
         recording
@@ -186,89 +183,97 @@ fn an_interrupted_build_keeps_its_local_maps_and_goes_on_from_there() {
             .starts_with(b"ply")
     );
 
-    let said = resumed(&recording, BUILD_MAP, &scan);
-    for there in ["local map 1 of 4 is there", "local map 2 of 4 is there"] {
-        assert!(said.contains(there), "{said}");
+    let stderr = resumed(&recording, BUILD_MAP, &scan);
+    for number in [1, 2] {
+        let reused = format!("local map {number} of 4 is finished already");
+        assert!(stderr.contains(&reused), "{stderr}");
     }
-    assert!(!said.contains("local map 3 of 4 is there"), "{said}");
-    assert!(recording.bytes("map.ply") == whole_map());
+    assert!(
+        !stderr.contains("local map 3 of 4 is finished already"),
+        "{stderr}"
+    );
+    assert!(recording.bytes("map.ply") == uninterrupted_map(&Recording::street(12)));
     assert!(!recording.path("map.ply.parts").exists());
 }
 
 #[test]
-fn a_killed_build_goes_on_and_ends_with_the_same_bytes() {
+fn a_killed_build_resumes_and_gives_the_same_bytes() {
     let recording = Recording::street(12);
-    let scan = HeldScan::of(&recording, 7);
+    let scan = PipedScan::new(&recording, 7);
     killed(&recording, BUILD_MAP, &scan);
     assert!(!recording.path("map.ply").exists());
-    // As if death had come while a part was being written.
+    // As after a crash while a part was written.
     recording.write("map.ply.parts/unfinished.ply", "ply\nformat bin");
     recording.write("map.ply.parts/0002.ply", "ply\nformat bin");
-    let said = resumed(&recording, BUILD_MAP, &scan);
-    assert!(said.contains("local map 2 of 4 is there"), "{said}");
-    assert!(recording.bytes("map.ply") == whole_map());
+    let stderr = resumed(&recording, BUILD_MAP, &scan);
+    assert!(
+        stderr.contains("local map 2 of 4 is finished already"),
+        "{stderr}"
+    );
+    assert!(recording.bytes("map.ply") == uninterrupted_map(&Recording::street(12)));
 }
 
 #[test]
-fn a_scan_that_is_replaced_by_one_of_the_same_size_is_meshed_again() {
+fn a_replaced_scan_of_the_same_size_is_meshed_again() {
     let recording = Recording::street(12);
-    let scan = HeldScan::of(&recording, 7);
+    let scan = PipedScan::new(&recording, 7);
     killed(&recording, BUILD_MAP, &scan);
-    // Of the two local maps that are finished only the first has seen it.
+    // Of the two finished local maps, only the first contains it.
     let shifted: Vec<[f32; 3]> = (recording.scan(0).into_iter())
         .map(|[x, y, z]| [x, y, z + 0.05])
         .collect();
     recording.write_scan(0, &shifted);
-    let said = resumed(&recording, BUILD_MAP, &scan);
-    assert!(!said.contains("local map 1 of 4 is there"), "{said}");
-    assert!(said.contains("local map 2 of 4 is there"), "{said}");
+    let stderr = resumed(&recording, BUILD_MAP, &scan);
+    assert!(
+        !stderr.contains("local map 1 of 4 is finished already"),
+        "{stderr}"
+    );
+    assert!(
+        stderr.contains("local map 2 of 4 is finished already"),
+        "{stderr}"
+    );
 
-    let undisturbed = Recording::street(12);
-    undisturbed.write_scan(0, &shifted);
-    undisturbed
-        .fpmcl("build-map")
-        .with(BUILD_MAP[2])
-        .with(BUILD_MAP[3])
-        .succeeds();
+    let reference = Recording::street(12);
+    reference.write_scan(0, &shifted);
     let bytes = recording.bytes("map.ply");
-    assert!(bytes == undisturbed.bytes("map.ply"));
-    assert!(bytes != whole_map());
+    assert!(bytes == uninterrupted_map(&reference));
+    assert!(bytes != uninterrupted_map(&Recording::street(12)));
 }
 
 #[test]
-fn parts_of_another_configuration_are_not_taken() {
+fn parts_of_another_configuration_are_not_reused() {
     let recording = Recording::street(12);
-    let scan = HeldScan::of(&recording, 7);
+    let scan = PipedScan::new(&recording, 7);
     killed(&recording, BUILD_MAP, &scan);
     let coarser = [BUILD_MAP, &["--set=voxel_size=0.3"]].concat();
-    let said = resumed(&recording, &coarser, &scan);
-    assert!(!said.contains("is there"), "{said}");
+    let stderr = resumed(&recording, &coarser, &scan);
+    assert!(!stderr.contains("is finished already"), "{stderr}");
 }
 
 #[test]
-fn a_build_that_is_stopped_leaves_an_old_map_as_it_was() {
+fn an_interrupted_build_leaves_an_existing_map_unchanged() {
     let recording = Recording::street(12);
-    recording.write("map.ply", "mine");
-    let scan = HeldScan::of(&recording, 7);
+    recording.write("map.ply", "existing");
+    let scan = PipedScan::new(&recording, 7);
     let forced = [BUILD_MAP, &["--force"]].concat();
-    let (code, said) = interrupted(&recording, &forced, &scan);
-    assert_eq!(code, Some(130), "{said}");
-    assert_eq!(recording.bytes("map.ply"), b"mine");
+    let (code, stderr) = interrupted(&recording, &forced, &scan);
+    assert_eq!(code, Some(130), "{stderr}");
+    assert_eq!(recording.bytes("map.ply"), b"existing");
 }
 
 #[test]
-fn an_interrupted_localization_keeps_the_frames_it_has() {
+fn an_interrupted_localization_keeps_its_finished_frames() {
     let recording = Recording::street(12);
     recording.fpmcl("build-map").succeeds();
-    let scan = HeldScan::of(&recording, 7);
-    let (code, said) = interrupted(&recording, LOCALIZE, &scan);
-    assert_eq!(code, Some(130), "{said}");
+    let scan = PipedScan::new(&recording, 7);
+    let (code, stderr) = interrupted(&recording, LOCALIZE, &scan);
+    assert_eq!(code, Some(130), "{stderr}");
     let results = LocalizationResults::read(&recording.path("results/localization.npz")).unwrap();
     let frames = results.frames.len();
-    // The scan may have been asked for ahead of its turn.
+    // Scans may be read ahead.
     assert!((6..=8).contains(&frames), "{frames}");
     let kept = format!("interrupted; {frames} of 12 frames are localized and kept in results/");
-    assert!(said.contains(&kept), "{said}");
+    assert!(stderr.contains(&kept), "{stderr}");
     for name in ["mcl_tum.txt", "mcl_kitti.txt"] {
         let rows = recording.bytes(&format!("results/{name}"));
         assert_eq!(String::from_utf8(rows).unwrap().lines().count(), frames);
@@ -276,28 +281,28 @@ fn an_interrupted_localization_keeps_the_frames_it_has() {
 }
 
 #[test]
-fn a_localization_that_is_ended_in_its_first_frame_finishes_that_frame() {
+fn a_localization_that_is_terminated_in_its_first_frame_finishes_that_frame() {
     let recording = Recording::street(6);
     recording.fpmcl("build-map").succeeds();
-    let scan = HeldScan::of(&recording, 0);
-    // What a batch system or a service manager sends.
-    let (code, said) = signalled("-TERM", &recording, LOCALIZE, &scan);
-    assert_eq!(code, Some(130), "{said}");
+    let scan = PipedScan::new(&recording, 0);
+    // The signal of batch systems and service managers.
+    let (code, stderr) = signalled("-TERM", &recording, LOCALIZE, &scan);
+    assert_eq!(code, Some(130), "{stderr}");
     let kept = "interrupted; 1 of 6 frames are localized and kept in results/localization.npz";
-    assert!(said.contains(kept), "{said}");
+    assert!(stderr.contains(kept), "{stderr}");
 }
 
 #[test]
-fn an_interrupted_refinement_leaves_the_result_as_it_was() {
+fn an_interrupted_refinement_leaves_the_result_unchanged() {
     let recording = Recording::street(8);
     recording.fpmcl("build-map").succeeds();
     recording.fpmcl("localize").succeeds();
     let before = recording.bytes("results/localization.npz");
-    let scan = HeldScan::of(&recording, 5);
-    let (code, said) = interrupted(&recording, REFINE, &scan);
-    assert_eq!(code, Some(130), "{said}");
-    assert!(said.contains("is as it was"), "{said}");
+    let scan = PipedScan::new(&recording, 5);
+    let (code, stderr) = interrupted(&recording, REFINE, &scan);
+    assert_eq!(code, Some(130), "{stderr}");
+    assert!(stderr.contains("is unchanged"), "{stderr}");
     assert!(recording.bytes("results/localization.npz") == before);
-    scan.release();
+    scan.restore();
     recording.fpmcl("refine").succeeds();
 }

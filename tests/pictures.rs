@@ -1,7 +1,7 @@
-//! Pictures of runs that were made outside of this test: each is readable and has its content.
+//! Pictures of earlier runs: each is readable and has the expected content.
 //!
 //! `FPMCL_RUNS` lists the folders of runs (of `demo`, or of `localize` and `refine`), separated
-//! by colons. `.ci/run` sets it after it has made them.
+//! by colons; `.ci/run` sets it.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
@@ -20,10 +20,10 @@ fn the_pictures_of_finished_runs_show_the_paths() {
         return;
     };
     for run in runs.split(':') {
-        // Tests run in the folder of the package, as .ci/run does.
+        // Relative to the folder of the package.
         let plots = Path::new(run).join("plots");
         let picture = |name: &str| Picture::read(&plots.join(name));
-        // The last path that is drawn may lie on all the others.
+        // The path that is drawn last may cover all others.
         picture("path.png").shows(&[REFINED]);
         picture("errors.png").shows_at_least(400, &[MCL, REFINED]);
         picture("runtime.png").shows(&[MCL, REFINED]);
@@ -42,7 +42,7 @@ fn a_blank_or_small_picture_or_one_without_the_line_is_detected() {
     };
     assert_eq!(defect(&pixels), "blank");
     pixels = Bitmap::from_fn(1300, 400, |x, y| match y {
-        // The legend is no line.
+        // The legend has the color of the line.
         60 => line,
         150..170 => [x as u8, 40, (y - 150) as u8],
         _ => [255; 3],

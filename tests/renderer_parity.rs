@@ -1,14 +1,14 @@
-//! What the graphics device renders is what a plain ray caster in `f64` finds.
+//! Parity of the GPU renderer with the CPU renderer and with a brute-force ray caster in `f64`.
 //!
-//! Runs on any adapter, be it a software one. Without any the tests say that they did not run,
-//! unless `FPMCL_REQUIRE_GPU=1`.
+//! The tests run on any adapter, also a software one. Without an adapter they are skipped with a
+//! message; with `FPMCL_REQUIRE_GPU=1` they fail.
 #![cfg(feature = "gpu")]
 
 mod brute_force;
 #[expect(clippy::unwrap_used, reason = "a failing test may panic")]
 mod common;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
 use fpmcl::lidar::{Beam, LidarModel, RangeImage};
@@ -20,11 +20,8 @@ use brute_force::{BruteForce, room, street};
 
 const METHODS: [ImageMethod; 2] = [ImageMethod::Cast, ImageMethod::Draw];
 
-/// A renderer on any adapter; `None`, and said so, where there is none.
-#[expect(
-    clippy::print_stderr,
-    reason = "a test that did not run must not look like one that did"
-)]
+/// A renderer on any adapter; `None`, with a message, without one.
+#[expect(clippy::print_stderr, reason = "a skipped test reports it")]
 fn renderer(tiles: &[TriangleMesh]) -> Option<GpuRenderer> {
     match GpuRenderer::new(tiles, Backend::Gpu) {
         Ok(renderer) => Some(renderer),
@@ -32,7 +29,7 @@ fn renderer(tiles: &[TriangleMesh]) -> Option<GpuRenderer> {
             let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|value| value == "1");
             assert!(
                 !required,
-                "FPMCL_REQUIRE_GPU=1, and there is no graphics adapter"
+                "FPMCL_REQUIRE_GPU=1, but there is no graphics adapter"
             );
             eprintln!("not run: there is no graphics adapter");
             None
@@ -64,21 +61,27 @@ fn street_poses() -> Vec<Pose3> {
     ]
 }
 
-/// Checks ranges against the plain ones: within 1 mm on 99.9 % of the rays, and wherever not,
-/// a ray turned by 0.02 mrad does find what the device found: it passes along an edge.
-fn assert_same(truth: &BruteForce, pose: &Pose3, directions: &[Vec3], ranges: &[f32], what: &str) {
+/// Checks ranges against brute force: 99.9 % agree within 1 mm; each other ray passes an edge, so
+/// that a ray rotated by 0.02 mrad agrees.
+fn assert_ranges_agree(
+    truth: &BruteForce,
+    pose: &Pose3,
+    directions: &[Vec3],
+    ranges: &[f32],
+    what: &str,
+) {
     assert_eq!(directions.len(), ranges.len());
     let mut differ = 0;
     for (&direction, &range_m) in directions.iter().zip(ranges) {
         let expected = truth.range(pose, direction);
-        if same(expected, range_m) {
+        if agree(expected, range_m) {
             continue;
         }
         differ += 1;
-        let turned = sideways(truth, pose, direction);
+        let nearby = ranges_nearby(truth, pose, direction);
         assert!(
-            turned.iter().any(|&near| same(near, range_m)),
-            "{what}: {range_m} m instead of {expected} m along {direction}, no edge"
+            nearby.iter().any(|&near| agree(near, range_m)),
+            "{what}: {range_m} m instead of {expected} m along {direction}, without an edge"
         );
     }
     assert!(
@@ -88,18 +91,18 @@ fn assert_same(truth: &BruteForce, pose: &Pose3, directions: &[Vec3], ranges: &[
     );
 }
 
-/// Ranges along six directions a hair (0.02 mrad) beside one.
-fn sideways(truth: &BruteForce, pose: &Pose3, direction: Vec3) -> [f64; 6] {
+/// Ranges along six directions 0.02 mrad from a direction [m].
+fn ranges_nearby(truth: &BruteForce, pose: &Pose3, direction: Vec3) -> [f64; 6] {
     [Vec3::X, Vec3::Y, Vec3::Z, -Vec3::X, -Vec3::Y, -Vec3::Z]
-        .map(|aside| truth.range(pose, (direction + 2e-5 * aside).normalize()))
+        .map(|axis| truth.range(pose, (direction + 2e-5 * axis).normalize()))
 }
 
-fn same(expected: f64, range_m: f32) -> bool {
+fn agree(expected: f64, range_m: f32) -> bool {
     expected == f64::from(range_m) || (expected - f64::from(range_m)).abs() < 1e-3
 }
 
 #[test]
-fn both_ways_show_the_street_as_a_plain_ray_caster_does() {
+fn both_methods_render_the_street_as_brute_force_does() {
     let tiles = street();
     let Some(renderer) = renderer(&tiles) else {
         return;
@@ -110,7 +113,7 @@ fn both_ways_show_the_street_as_a_plain_ray_caster_does() {
     for method in METHODS {
         let images = renderer.render_by(method, &poses, &model).unwrap();
         for (pose, image) in poses.iter().zip(&images) {
-            assert_same(
+            assert_ranges_agree(
                 &truth,
                 pose,
                 &model.directions(),
@@ -123,7 +126,7 @@ fn both_ways_show_the_street_as_a_plain_ray_caster_does() {
 }
 
 #[test]
-fn rendering_is_casting_along_the_centre_rays() {
+fn rendering_equals_casting_along_the_centre_rays() {
     let Some(renderer) = renderer(&street()) else {
         return;
     };
@@ -140,7 +143,7 @@ fn rendering_is_casting_along_the_centre_rays() {
 }
 
 #[test]
-fn rays_in_any_direction_find_what_a_plain_ray_caster_finds() {
+fn rays_in_any_direction_agree_with_brute_force() {
     let tiles = street();
     let Some(renderer) = renderer(&tiles) else {
         return;
@@ -160,13 +163,13 @@ fn rays_in_any_direction_find_what_a_plain_ray_caster_finds() {
     let rows = renderer.cast(&poses, &directions).unwrap();
     let truth = BruteForce::new(&tiles);
     for (pose, row) in poses.iter().zip(&rows) {
-        assert_same(&truth, pose, &directions, row, "cast");
+        assert_ranges_agree(&truth, pose, &directions, row, "cast");
     }
     assert!(rows[0].contains(&f32::INFINITY));
 }
 
 #[test]
-fn a_closed_room_has_no_holes_anywhere_not_at_the_seam_and_not_at_the_poles() {
+fn a_closed_room_has_no_holes_at_the_seam_and_at_the_poles() {
     let model = LidarModel {
         height: 45,
         width: 90,
@@ -175,13 +178,13 @@ fn a_closed_room_has_no_holes_anywhere_not_at_the_seam_and_not_at_the_poles() {
         max_range: 100.0,
         min_range: 0.05,
     };
-    // Walls of two triangles each, which bend most; and finely cut ones.
+    // Walls of two triangles each, whose projections are curved most, and finer ones.
     for cuts in [1, 7] {
         let tiles = [room(5.0, cuts)];
         let Some(renderer) = renderer(&tiles) else {
             return;
         };
-        // From the middle corners, edges and the seam lie in symmetric places.
+        // From the centre, corners, edges and the seam are in symmetric positions.
         let poses = [
             Pose3::identity(),
             pose(0.3, -1.1, 0.7, [0.1, 0.2, 2.0]),
@@ -194,20 +197,20 @@ fn a_closed_room_has_no_holes_anywhere_not_at_the_seam_and_not_at_the_poles() {
                 let holes = image.iter().filter(|range_m| !range_m.is_finite()).count();
                 assert_eq!(holes, 0, "{method:?}, walls cut {cuts} times");
                 let what = format!("{method:?} in a room");
-                assert_same(&truth, pose, &model.directions(), image, &what);
+                assert_ranges_agree(&truth, pose, &model.directions(), image, &what);
             }
         }
     }
 }
 
 #[test]
-fn straight_ahead_and_straight_behind_nothing_is_missing() {
+fn the_columns_at_the_centre_and_at_the_seam_are_complete() {
     let tiles = street();
     let Some(renderer) = renderer(&tiles) else {
         return;
     };
     let model = LidarModel::default();
-    // Off the edges of the triangles, so that some cross the seam.
+    // Not on the edges of the triangles, so that some triangles cross the seam.
     let poses = [pose(0.2, 0.37, 1.73, [0.0; 3])];
     let truth = BruteForce::new(&tiles).between(model.min_range, model.max_range);
     let directions = model.directions();
@@ -218,7 +221,7 @@ fn straight_ahead_and_straight_behind_nothing_is_missing() {
             let (rays, ranges): (Vec<Vec3>, Vec<f32>) = pixels
                 .map(|pixel| (directions[pixel], image[pixel]))
                 .unzip();
-            assert_same(
+            assert_ranges_agree(
                 &truth,
                 &poses[0],
                 &rays,
@@ -230,21 +233,21 @@ fn straight_ahead_and_straight_behind_nothing_is_missing() {
 }
 
 #[test]
-fn costs_and_the_weights_that_follow_agree() {
+fn costs_and_weights_agree_with_brute_force() {
     let tiles = street();
     let Some(renderer) = renderer(&tiles) else {
         return;
     };
     let truth = BruteForce::new(&tiles);
-    let (at, elsewhere) = (street_poses(), pose(-19.5, 0.9, 1.73, [0.0, 0.0, 0.05]));
+    let (near, far) = (street_poses(), pose(-19.5, 0.9, 1.73, [0.0, 0.0, 0.05]));
     let directions: Vec<Vec3> = small_model().directions().into_iter().step_by(5).collect();
     let beams: Vec<Beam> = directions
         .iter()
-        .map(|&direction| (direction, truth.range(&at[0], direction) as f32))
+        .map(|&direction| (direction, truth.range(&near[0], direction) as f32))
         .filter(|&(_, range_m)| range_m < 50.0)
         .map(|(direction, range_m)| Beam { direction, range_m })
         .collect();
-    let poses: Vec<Pose3> = at.into_iter().chain([elsewhere]).collect();
+    let poses: Vec<Pose3> = near.into_iter().chain([far]).collect();
     let differences = [
         RangeDifference::UNLIMITED,
         RangeDifference::truncated(0.5),
@@ -266,9 +269,9 @@ fn costs_and_the_weights_that_follow_agree() {
             .map(|pose| truth.mean_cost(pose, &beams, &difference));
         for (cost, expected) in costs.iter().zip(expected) {
             let weight = |cost: f64| (-0.5 * (cost / 2.0).powi(2)).exp();
-            let (ours, theirs) = (weight(f64::from(*cost)), weight(expected));
+            let difference_of_weights = weight(f64::from(*cost)) - weight(expected);
             assert!(
-                (ours - theirs).abs() < 1e-4,
+                difference_of_weights.abs() < 1e-4,
                 "{difference:?}: {cost} {expected}"
             );
             assert!(
@@ -281,7 +284,7 @@ fn costs_and_the_weights_that_follow_agree() {
 }
 
 #[test]
-fn the_processor_and_the_device_show_the_same_street() {
+fn cpu_and_gpu_render_the_same_street() {
     let tiles = street();
     let Some(renderer) = renderer(&tiles) else {
         return;
@@ -296,7 +299,7 @@ fn the_processor_and_the_device_show_the_same_street() {
         let images = renderer.render_by(method, &poses, &model).unwrap();
         for ((pose, image), expected) in poses.iter().zip(&images).zip(&expected) {
             let differ: Vec<usize> = (0..image.len())
-                .filter(|&pixel| !same(f64::from(expected[pixel]), image[pixel]))
+                .filter(|&pixel| !agree(f64::from(expected[pixel]), image[pixel]))
                 .collect();
             assert!(
                 differ.len() * 1000 <= image.len(),
@@ -304,34 +307,23 @@ fn the_processor_and_the_device_show_the_same_street() {
                 differ.len()
             );
             for pixel in differ {
-                let near = sideways(&truth, pose, directions[pixel]);
-                assert!(near.iter().any(|&range_m| same(range_m, image[pixel])));
-                assert!(near.iter().any(|&range_m| same(range_m, expected[pixel])));
+                let near = ranges_nearby(&truth, pose, directions[pixel]);
+                assert!(near.iter().any(|&range_m| agree(range_m, image[pixel])));
+                assert!(near.iter().any(|&range_m| agree(range_m, expected[pixel])));
             }
         }
     }
 }
 
-/// A map of a few scans of drive 0005 in one tile; `None`, and said so, where the data is not.
-#[expect(
-    clippy::print_stderr,
-    clippy::unwrap_used,
-    reason = "a test that did not run must not look like one that did, a failing one may panic"
-)]
+/// A map of a few scans of drive 0005 in one tile; `None`, with a message, where they are missing.
+#[expect(clippy::unwrap_used, reason = "a failing test may panic")]
 fn drive_0005() -> Option<TriangleMesh> {
-    let project = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let data = std::env::var_os("FPMCL_DATA")
-        .map_or_else(|| project.join("../shared/data"), PathBuf::from)
-        .join("kitti-0926-drive-0005");
-    if !data.is_dir() {
-        eprintln!("not run: {} is absent", data.display());
-        return None;
-    }
+    let data = common::real_recording("kitti-0926-drive-0005")?;
     let folder = tempfile::tempdir().unwrap();
     let map = folder.path().join("map.ply");
     let path = |path: &Path| path.display().to_string();
     common::fpmcl("build-map")
-        .with(project.join("config/build_map.yml"))
+        .with(common::config_file("build_map.yml"))
         .set("scan_folder", &path(&data.join("velodyne")))
         .set("pose_file", &path(&data.join("poses.txt")))
         .set("calib_file", &path(&data.join("calib.txt")))
@@ -343,7 +335,7 @@ fn drive_0005() -> Option<TriangleMesh> {
 }
 
 #[test]
-fn the_processor_and_the_device_show_the_same_map_of_drive_0005() {
+fn cpu_and_gpu_render_the_same_map_of_drive_0005() {
     let Some(mesh) = drive_0005() else {
         return;
     };
@@ -364,7 +356,7 @@ fn the_processor_and_the_device_show_the_same_map_of_drive_0005() {
             .filter(|range_m| range_m.is_finite())
             .count();
         let differ = std::iter::zip(image, expected)
-            .filter(|&(&range_m, &expected)| !same(f64::from(expected), range_m))
+            .filter(|&(&range_m, &expected)| !agree(f64::from(expected), range_m))
             .count();
         assert!(differ * 1000 <= image.len(), "{differ}");
         assert!(seen * 4 > image.len(), "{seen}");
@@ -372,7 +364,7 @@ fn the_processor_and_the_device_show_the_same_map_of_drive_0005() {
 }
 
 #[test]
-fn the_processor_and_the_device_give_particles_the_same_weights() {
+fn cpu_and_gpu_give_particles_the_same_weights() {
     let tiles = street();
     let Some(renderer) = renderer(&tiles) else {
         return;
@@ -388,13 +380,13 @@ fn the_processor_and_the_device_give_particles_the_same_weights() {
     let particles: Vec<Pose3> = (0..60)
         .map(|i| {
             let i = f64::from(i);
-            let aside = pose(
+            let offset = pose(
                 i.sin(),
                 (1.7 * i).cos(),
                 0.0,
                 [0.0, 0.0, 0.02 * (0.9 * i).sin()],
             );
-            at * aside
+            at * offset
         })
         .collect();
     for (difference, sigma) in [
@@ -410,22 +402,19 @@ fn the_processor_and_the_device_give_particles_the_same_weights() {
                 .map(|likelihood| likelihood / sum)
                 .collect()
         };
-        let ours = weights(renderer.compare(&particles, &beams, &difference).unwrap());
-        let theirs = weights(cpu.compare(&particles, &beams, &difference).unwrap());
-        for (ours, theirs) in ours.iter().zip(&theirs) {
-            assert!(
-                (ours - theirs).abs() < 1e-4,
-                "{difference:?}: {ours} {theirs}"
-            );
+        let by_gpu = weights(renderer.compare(&particles, &beams, &difference).unwrap());
+        let by_cpu = weights(cpu.compare(&particles, &beams, &difference).unwrap());
+        for (gpu, cpu) in by_gpu.iter().zip(&by_cpu) {
+            assert!((gpu - cpu).abs() < 1e-4, "{difference:?}: {gpu} {cpu}");
         }
-        let least = theirs.iter().copied().fold(f64::INFINITY, f64::min);
-        let most = theirs.iter().copied().fold(0.0, f64::max);
-        assert!(most > 1.2 * least, "all particles weigh the same");
+        let min = by_cpu.iter().copied().fold(f64::INFINITY, f64::min);
+        let max = by_cpu.iter().copied().fold(0.0, f64::max);
+        assert!(max > 1.2 * min, "all weights are equal");
     }
 }
 
 #[test]
-fn surfaces_out_of_the_limits_are_infinite_and_hide_what_is_behind() {
+fn surfaces_outside_the_range_limits_are_infinite_and_occlude_others() {
     let near = room(1.0, 1);
     let far = room(30.0, 1);
     let Some(renderer) = renderer(&[near, far]) else {
@@ -452,24 +441,27 @@ fn surfaces_out_of_the_limits_are_infinite_and_hide_what_is_behind() {
 }
 
 #[test]
-fn far_from_the_origin_of_the_map_nothing_changes() {
+fn ranges_far_from_the_map_origin_agree_with_brute_force() {
     let tiles = street();
     let shift = Vec3::new(81920.0, -163840.0, 256.0);
     let mut shifted = tiles.clone();
     for vertex in shifted.iter_mut().flat_map(|tile| &mut tile.vertices) {
-        // Rounded to centimetres, for both: only the poses can lose digits.
+        // Both renderers use the rounded vertices; only the poses can lose precision.
         *vertex += shift;
     }
     let Some(renderer) = renderer(&shifted) else {
         return;
     };
     let truth = BruteForce::new(&shifted);
-    let to = nalgebra::Translation3::new(81920.0, -163840.0, 256.0);
-    let poses: Vec<Pose3> = street_poses().iter().map(|pose| to * pose).collect();
+    let translation = nalgebra::Translation3::new(81920.0, -163840.0, 256.0);
+    let poses: Vec<Pose3> = street_poses()
+        .iter()
+        .map(|pose| translation * pose)
+        .collect();
     let directions: Vec<Vec3> = small_model().directions().into_iter().step_by(7).collect();
     let rows = renderer.cast(&poses, &directions).unwrap();
     for (pose, row) in poses.iter().zip(&rows) {
-        assert_same(&truth, pose, &directions, row, "far away");
+        assert_ranges_agree(&truth, pose, &directions, row, "far away");
     }
 }
 
@@ -500,7 +492,7 @@ fn an_empty_map_has_no_surface() {
 }
 
 #[test]
-fn no_poses_and_no_rays_are_no_work() {
+fn without_poses_or_rays_the_result_is_empty() {
     let Some(renderer) = renderer(&street()) else {
         return;
     };

@@ -1,4 +1,4 @@
-//! The shaders are valid, which needs no graphics adapter, and know their Rust twins.
+//! The shaders are valid and in sync with the Rust code; no graphics adapter is needed.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("src/rendering/gpu")
 }
 
-/// Name and text of every shader, in the order of the names.
+/// Name and source of every shader, sorted by name.
 fn shaders() -> Vec<(String, String)> {
     let mut shaders: Vec<(String, String)> = fs::read_dir(folder())
         .into_iter()
@@ -26,7 +26,7 @@ fn shaders() -> Vec<(String, String)> {
     shaders
 }
 
-/// A shader behind those that are prepended to it.
+/// Source of a shader after the shaders that its comments prepend to it.
 fn composed(text: &str, shaders: &[(String, String)]) -> String {
     let needed = shaders
         .iter()
@@ -55,7 +55,7 @@ fn every_shader_is_valid() {
 fn every_shader_and_its_rust_twin_name_each_other() {
     for (name, text) in shaders() {
         let twin = "Keep in sync with `layout.rs`";
-        assert!(text.contains(twin), "{name} does not say: {twin}");
+        assert!(text.contains(twin), "{name} does not contain: {twin}");
     }
     let layout = fs::read_to_string(folder().join("layout.rs")).unwrap();
     for (name, _) in shaders() {

@@ -1,4 +1,4 @@
-//! The ground confidence of points determines the colours of the map and its simplification.
+//! The ground confidence of points determines the colors of the map and its simplification.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
@@ -8,21 +8,21 @@ use fpmcl::lidar::Scan;
 use fpmcl::map::{LocalMapCounts, MapBuilder, MapConfig};
 use fpmcl::simulation::{ScannerConfig, kerb_scene};
 
-/// The same confidence for all points of a scan: one for small scans, another for large ones.
+/// Classifier with one confidence per scan, which depends on its number of points.
 struct ByScan {
     small: f32,
     large: f32,
-    border: usize,
+    large_from: usize,
 }
 
 impl GroundClassifier for ByScan {
     fn ground_confidence(&self, points: &[Vec3]) -> Vec<f32> {
-        let is_small = points.len() < self.border;
+        let is_small = points.len() < self.large_from;
         vec![if is_small { self.small } else { self.large }; points.len()]
     }
 }
 
-/// The map of two scans from one place, the second without every fourth point.
+/// Map of a scan and of the same scan without every fourth point.
 fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMapCounts) {
     let scanner = ScannerConfig {
         azimuth_steps: 600,
@@ -36,7 +36,7 @@ fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMap
         number % 4 != 0
     });
     thinned.intensities.truncate(thinned.points.len());
-    let border = whole.len() * 7 / 8;
+    let large_from = whole.len() * 7 / 8;
     let scans: [Scan; 2] = [whole, thinned];
     let mut config = MapConfig::default();
     config.local_map.ground_threshold = ground_threshold;
@@ -48,7 +48,7 @@ fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMap
     plan.classifier = Box::new(ByScan {
         small,
         large,
-        border,
+        large_from,
     });
     let read = |key: usize| Ok(scans[key].clone());
     let built = plan.build_local_map(&plan.local_maps[0], &read).unwrap();
@@ -63,7 +63,7 @@ fn mean_red(mesh: &TriangleMesh) -> f32 {
 #[test]
 fn more_confident_points_make_redder_vertices() {
     let means = [0.0, 0.4, 1.0].map(|confidence| {
-        // A threshold that nothing reaches leaves every vertex where it is.
+        // No confidence reaches this threshold, so nothing is simplified.
         let (mesh, counts) = map(confidence, confidence, 1.1);
         assert!(mesh.colors.len() > 300);
         assert_eq!(counts.simplified_triangles, 0);
@@ -77,7 +77,7 @@ fn more_confident_points_make_redder_vertices() {
 }
 
 #[test]
-fn the_colour_of_a_disagreement_lies_between() {
+fn different_confidences_are_averaged_in_the_color() {
     let [low, high] = [0.5, 0.9].map(|confidence| mean_red(&map(confidence, confidence, 1.1).0));
     let between = mean_red(&map(0.9, 0.5, 1.1).0);
     let share = (between - low) / (high - low);
@@ -85,14 +85,14 @@ fn the_colour_of_a_disagreement_lies_between() {
 }
 
 #[test]
-fn the_mean_over_scans_decides_what_is_simplified() {
+fn the_mean_confidence_of_the_scans_determines_what_is_simplified() {
     let simplified = |small, large| map(small, large, 0.6).1.simplified_triangles;
     let (agreed, none) = (simplified(0.9, 0.9), simplified(0.5, 0.5));
     assert!(agreed > 100, "{agreed}");
     assert_eq!(none, 0);
-    // One scan is sure and one is not: their mean, 0.7, is enough nearly everywhere.
-    let outvoted = simplified(0.9, 0.5);
-    assert!(2 * outvoted > agreed, "{outvoted} of {agreed}");
-    let still_none = simplified(0.6, 0.5);
-    assert!(10 * still_none < agreed, "{still_none} of {agreed}");
+    // The mean of a confident and an uncertain scan, 0.7, exceeds the threshold nearly everywhere.
+    let mixed = simplified(0.9, 0.5);
+    assert!(2 * mixed > agreed, "{mixed} of {agreed}");
+    let few = simplified(0.6, 0.5);
+    assert!(10 * few < agreed, "{few} of {agreed}");
 }

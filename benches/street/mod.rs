@@ -1,5 +1,5 @@
 //! A street of 300 m as a mesh of about 1.3 million triangles: bumpy ground, house fronts with
-//! windows, trees and parked cars. The same for the same seed.
+//! windows, trees and parked cars. Deterministic for a seed.
 
 use std::f32::consts::TAU;
 
@@ -12,7 +12,7 @@ const LENGTH_M: f32 = 300.0;
 const HALF_WIDTH_M: f32 = 20.0;
 /// Edge length of the triangles [m].
 const STEP_M: f32 = 0.2;
-/// The street does not run along an axis [rad].
+/// Heading of the street, not parallel to an axis [rad].
 const HEADING_RAD: f32 = 0.3;
 
 /// The street in one mesh.
@@ -37,12 +37,12 @@ pub fn street(seed: u64) -> TriangleMesh {
     mesh
 }
 
-/// A place on the road, 1.73 m over it, at a part of the length of the street.
-pub fn on_the_road(part: f32, aside_m: f32) -> Vec3 {
-    Mat3::from_rotation_z(HEADING_RAD) * Vec3::new(part * LENGTH_M, aside_m, 1.73)
+/// Position 1.73 m above the road at a fraction of the length of the street.
+pub fn on_the_road(fraction: f32, lateral_m: f32) -> Vec3 {
+    Mat3::from_rotation_z(HEADING_RAD) * Vec3::new(fraction * LENGTH_M, lateral_m, 1.73)
 }
 
-/// Cuts a mesh into square tiles by the centroids of its triangles, row by row.
+/// Splits a mesh into square tiles by the centroids of its triangles, in row-major order.
 pub fn tiles(mesh: &TriangleMesh, size_m: f32) -> Vec<TriangleMesh> {
     let bounds = mesh.bounds();
     let cells = (bounds.size() / size_m).ceil();
@@ -60,13 +60,13 @@ pub fn tiles(mesh: &TriangleMesh, size_m: f32) -> Vec<TriangleMesh> {
         .collect()
 }
 
-/// A grid of `columns` x `rows` quads through `place`, which gets parameters from 0 to 1.
-fn sheet(columns: usize, rows: usize, place: impl Fn(Vec2) -> Vec3) -> TriangleMesh {
+/// Parametric surface of `columns` x `rows` quads; the parameters range from 0 to 1.
+fn surface(columns: usize, rows: usize, position: impl Fn(Vec2) -> Vec3) -> TriangleMesh {
     let mut mesh = TriangleMesh::default();
     for row in 0..=rows {
         for column in 0..=columns {
             let at = Vec2::new(column as f32 / columns as f32, row as f32 / rows as f32);
-            mesh.vertices.push(place(at));
+            mesh.vertices.push(position(at));
         }
     }
     for row in 0..rows {
@@ -87,7 +87,7 @@ fn bump(x: f32, y: f32) -> f32 {
 fn ground() -> TriangleMesh {
     let columns = (LENGTH_M / STEP_M) as usize;
     let rows = (2.0 * HALF_WIDTH_M / STEP_M) as usize;
-    sheet(columns, rows, |at| {
+    surface(columns, rows, |at| {
         let (x, y) = (at.x * LENGTH_M, (2.0 * at.y - 1.0) * HALF_WIDTH_M);
         let kerb = if y.abs() > 6.0 { 0.12 } else { 0.0 };
         Vec3::new(x, y, kerb + bump(x, y))
@@ -98,7 +98,7 @@ fn fronts(side: f32) -> TriangleMesh {
     const HEIGHT_M: f32 = 10.0;
     let columns = (LENGTH_M / STEP_M) as usize;
     let rows = (HEIGHT_M / STEP_M) as usize;
-    sheet(columns, rows, |at| {
+    surface(columns, rows, |at| {
         let (x, z) = (at.x * LENGTH_M, at.y * HEIGHT_M);
         let window = (x % 3.0) > 1.8 && (z % 2.8) > 1.2;
         let house = 0.8 * ((x / 14.0).floor() * 12.9898).sin();
@@ -107,13 +107,13 @@ fn fronts(side: f32) -> TriangleMesh {
     })
 }
 
-/// A trunk and a ragged ball.
+/// A trunk and a rough crown.
 fn tree(foot: Vec3, crown_m: f32) -> TriangleMesh {
-    let mut mesh = sheet(12, 20, |at| {
+    let mut mesh = surface(12, 20, |at| {
         let turn = Vec2::from_angle(at.x * TAU);
         foot + Vec3::new(0.18 * turn.x, 0.18 * turn.y, 3.0 * at.y)
     });
-    mesh.append(&ball(
+    mesh.append(&ellipsoid(
         foot + Vec3::Z * (2.6 + crown_m),
         Vec3::splat(crown_m),
         0.25,
@@ -121,16 +121,16 @@ fn tree(foot: Vec3, crown_m: f32) -> TriangleMesh {
     mesh
 }
 
-fn car(middle: Vec3) -> TriangleMesh {
-    ball(middle, Vec3::new(2.1, 0.9, 0.7), 0.02)
+fn car(center: Vec3) -> TriangleMesh {
+    ellipsoid(center, Vec3::new(2.1, 0.9, 0.7), 0.02)
 }
 
-/// An ellipsoid whose surface goes in and out by a part of its radius.
-fn ball(middle: Vec3, radii: Vec3, ragged: f32) -> TriangleMesh {
-    sheet(56, 28, |at| {
+/// An ellipsoid with a rough surface; `roughness` is relative to the radii.
+fn ellipsoid(center: Vec3, radii: Vec3, roughness: f32) -> TriangleMesh {
+    surface(56, 28, |at| {
         let around = Vec2::from_angle(at.x * TAU);
         let up = Vec2::from_angle((at.y - 0.5) * 0.5 * TAU);
-        let scale = 1.0 + ragged * (7.0 * at.x * TAU).sin() * (23.0 * at.y).sin();
-        middle + scale * radii * Vec3::new(up.x * around.x, up.x * around.y, up.y)
+        let scale = 1.0 + roughness * (7.0 * at.x * TAU).sin() * (23.0 * at.y).sin();
+        center + scale * radii * Vec3::new(up.x * around.x, up.x * around.y, up.y)
     })
 }

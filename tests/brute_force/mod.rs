@@ -1,11 +1,11 @@
-//! Every ray against every triangle in `f64`, and worlds to try it on.
+//! Brute-force ray casting in `f64`, and scenes for it.
 
 use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
 use fpmcl::lidar::Beam;
 use fpmcl::rendering::RangeDifference;
 use nalgebra::Vector3;
 
-/// Ray caster without a hierarchy.
+/// Ray caster that intersects every ray with every triangle.
 #[derive(Clone)]
 pub struct BruteForce {
     triangles: Vec<[Vector3<f64>; 3]>,
@@ -28,7 +28,7 @@ impl BruteForce {
         }
     }
 
-    /// Ranges out of these limits become infinite [m].
+    /// Sets limits outside which ranges are infinite [m].
     pub fn between(mut self, min_m: f32, max_m: f32) -> Self {
         self.limits_m = (f64::from(min_m), f64::from(max_m));
         self
@@ -73,12 +73,12 @@ fn intersect(corners: &[Vector3<f64>; 3], origin: Vector3<f64>, d: Vector3<f64>)
     let s = (origin - a) / determinant;
     let q = s.cross(&ab);
     let (u, v, range_m) = (s.dot(&p), d.dot(&q), ac.dot(&q));
-    // As much over the edge as rounding in `f64` can hide.
+    // Tolerance for rounding in `f64`.
     let inside = u >= -1e-12 && v >= -1e-12 && u + v <= 1.0 + 1e-12;
     (inside && range_m > 1e-4).then_some(range_m)
 }
 
-/// A rectangle from `corner` along two edges, cut into `cuts` by `cuts` squares of two triangles.
+/// Adds a rectangle at `corner` with two edges, as `cuts` by `cuts` quads of two triangles.
 fn rectangle(mesh: &mut TriangleMesh, corner: Vec3, edges: [Vec3; 2], cuts: u32) {
     let first = mesh.vertices.len() as u32;
     for i in 0..=cuts {
@@ -117,12 +117,12 @@ pub fn room(half_m: f32, cuts: u32) -> TriangleMesh {
     mesh
 }
 
-/// A street of 80 m in two tiles: a rolling road, houses, cars, poles, a bridge overhead.
+/// A street of 80 m in two tiles: an undulating road, houses, cars, poles and a bridge.
 pub fn street() -> Vec<TriangleMesh> {
-    [-40.0_f32, 0.0].map(half_a_street).to_vec()
+    [-40.0_f32, 0.0].map(half_street).to_vec()
 }
 
-fn half_a_street(from_m: f32) -> TriangleMesh {
+fn half_street(from_m: f32) -> TriangleMesh {
     let mut mesh = TriangleMesh::default();
     rectangle(
         &mut mesh,

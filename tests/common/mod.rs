@@ -1,5 +1,5 @@
-//! What tests of the binary share: a recording of a street that is nowhere but in the test,
-//! and the program as a sentence: `fpmcl("build-map").with(&file).fails_saying(&["..."])`.
+//! Shared helpers of the tests of the binary: a procedural recording of a street, and calls such as
+//! `fpmcl("build-map").with(&file).fails_with(&["..."])`.
 
 #![allow(dead_code, reason = "each test file uses its own part")]
 
@@ -11,10 +11,10 @@ use std::path::{Path, PathBuf};
 use assert_cmd::Command;
 use tempfile::TempDir;
 
-/// The binary with a subcommand, run in an empty folder unless told otherwise.
+/// A call of the binary with a subcommand, by default in an empty folder.
 pub fn fpmcl(subcommand: &str) -> Fpmcl {
     let mut command = Command::cargo_bin("fpmcl").unwrap();
-    // Help texts must not depend on who asks for them.
+    // Help texts must not depend on the environment.
     command.env_remove("COLUMNS").env("NO_COLOR", "1");
     if !subcommand.is_empty() {
         command.arg(subcommand);
@@ -26,95 +26,159 @@ pub fn fpmcl(subcommand: &str) -> Fpmcl {
     }
 }
 
-/// A call of the program.
+/// A call of the binary.
 pub struct Fpmcl {
     command: Command,
     folder: TempDir,
     in_folder: Option<PathBuf>,
 }
 
-/// What a call said.
-pub struct Said {
+/// The output of a call.
+pub struct Output {
     pub stdout: String,
     pub stderr: String,
 }
 
 impl Fpmcl {
-    /// With an argument.
+    /// Adds an argument.
     pub fn with(mut self, argument: impl AsRef<std::ffi::OsStr>) -> Self {
         self.command.arg(argument);
         self
     }
 
-    /// With one key of the configuration changed.
+    /// Overrides a key of the configuration.
     pub fn set(self, key: &str, value: &str) -> Self {
         self.with("--set").with(format!("{key}={value}"))
     }
 
-    /// Run in a folder.
+    /// Sets the working directory.
     pub fn in_folder(mut self, folder: &Path) -> Self {
         self.in_folder = Some(folder.to_owned());
         self
     }
 
-    /// Runs and expects success.
+    /// Runs the binary and expects success.
     #[track_caller]
-    pub fn succeeds(self) -> Said {
+    pub fn succeeds(self) -> Output {
         self.exits_with(0)
     }
 
-    /// Runs and expects exit code 1 and one message that has all the parts.
+    /// Runs the binary and expects exit code 1 and one error message that contains all parts.
     #[track_caller]
-    pub fn fails_saying(self, parts: &[&str]) -> Said {
-        self.exits_saying(1, parts)
+    pub fn fails_with(self, parts: &[&str]) -> Output {
+        self.exits_with_message(1, parts)
     }
 
-    /// Runs and expects the exit code of wrong usage and a message that has all the parts.
+    /// Runs the binary and expects the exit code of wrong usage and one error message that contains
+    /// all parts.
     #[track_caller]
-    pub fn misuse_saying(self, parts: &[&str]) -> Said {
-        self.exits_saying(2, parts)
+    pub fn rejects_usage_with(self, parts: &[&str]) -> Output {
+        self.exits_with_message(2, parts)
     }
 
     #[track_caller]
-    fn exits_saying(self, code: i32, parts: &[&str]) -> Said {
-        let said = self.exits_with(code);
+    fn exits_with_message(self, code: i32, parts: &[&str]) -> Output {
+        let output = self.exits_with(code);
+        let stderr = &output.stderr;
         for part in parts {
-            assert!(
-                said.stderr.contains(part),
-                "no `{part}` in: {}",
-                said.stderr
-            );
+            assert!(stderr.contains(part), "no `{part}` in: {stderr}");
         }
-        assert_eq!(said.stderr.matches("error: ").count(), 1, "{}", said.stderr);
-        assert!(!said.stderr.contains("panicked"), "{}", said.stderr);
-        assert_eq!(said.stdout, "");
-        said
+        assert_eq!(stderr.matches("error: ").count(), 1, "{stderr}");
+        assert!(!stderr.contains("panicked"), "{stderr}");
+        assert_eq!(output.stdout, "");
+        output
     }
 
-    /// Runs and expects an exit code.
+    /// Runs the binary and expects an exit code.
     #[track_caller]
-    pub fn exits_with(mut self, code: i32) -> Said {
+    pub fn exits_with(mut self, code: i32) -> Output {
         let folder = self.in_folder.as_deref().unwrap_or(self.folder.path());
         let output = self.command.current_dir(folder).output().unwrap();
-        let said = Said {
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(code), "{stderr}");
+        Output {
             stdout: String::from_utf8(output.stdout).unwrap(),
-            stderr: String::from_utf8(output.stderr).unwrap(),
-        };
-        assert_eq!(output.status.code(), Some(code), "{}", said.stderr);
-        said
+            stderr,
+        }
     }
 }
 
-/// A recording in KITTI layout in a folder of its own, with configurations for it.
+/// Runs the binary in a folder, expects success and returns its standard output.
+#[track_caller]
+pub fn run(folder: &Path, arguments: &[&str]) -> String {
+    let call = fpmcl("").in_folder(folder);
+    let call = arguments.iter().fold(call, Fpmcl::with);
+    call.succeeds().stdout
+}
+
+/// Simulates the drives 1 and 2 of a configuration in a folder.
+#[track_caller]
+pub fn simulate_two_drives(folder: &Path, config: &str) {
+    fs::write(folder.join("simulation.yml"), config).unwrap();
+    for drive in ["drive=1", "drive=2"] {
+        run(folder, &["simulate", "simulation.yml", "--set", drive]);
+    }
+}
+
+/// Keys of build-map for drive 1 in the folder `street`.
+pub const MAP_OF_DRIVE_1: &str = "\
+scan_folder: street/drive_1/velodyne
+pose_file: street/drive_1/poses.txt
+calib_file: street/drive_1/calib.txt
+mesh_file: results/map.ply
+";
+
+/// Common keys of localize and refine for drive 2 in the map of drive 1.
+pub const DRIVE_2_IN_MAP: &str = "\
+map_file: results/map.ply
+map_pose_file: street/drive_1/poses.txt
+map_calib_file: street/drive_1/calib.txt
+scan_folder: street/drive_2/velodyne
+pose_file: street/drive_2/poses.txt
+calib_file: street/drive_2/calib.txt
+odometry: file
+odometry_file: street/drive_2/odometry.txt
+";
+
+/// Path of a file under `config/`.
+pub fn config_file(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("config")
+        .join(name)
+}
+
+/// Folder of a real recording; `None`, with a message, where it is missing.
+#[allow(clippy::print_stderr, reason = "a skipped test reports it")]
+pub fn real_recording(name: &str) -> Option<PathBuf> {
+    let folder = std::env::var_os("FPMCL_DATA")
+        .map_or_else(
+            || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
+            PathBuf::from,
+        )
+        .join(name);
+    if !folder.is_dir() {
+        eprintln!("not run: {} is missing", folder.display());
+        return None;
+    }
+    Some(folder)
+}
+
+/// Reads a JSON file.
+#[track_caller]
+pub fn json(path: &Path) -> serde_json::Value {
+    serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
+}
+
+/// A recording in KITTI layout in a temporary folder, with configurations.
 ///
-/// A street 16 m wide and 60 m long between walls, with boxes as houses and cars, scanned by
-/// 32 x 360 beams every half metre.
+/// A street 16 m wide and 60 m long between walls, with boxes as houses and cars, scanned with
+/// 32 x 360 beams every 0.5 m.
 pub struct Recording {
     folder: TempDir,
 }
 
 impl Recording {
-    /// Scans `frames` frames.
+    /// Simulates `frames` scans.
     pub fn street(frames: usize) -> Self {
         let folder = tempfile::tempdir().unwrap();
         fs::create_dir(folder.path().join("velodyne")).unwrap();
@@ -133,17 +197,17 @@ impl Recording {
         recording
     }
 
-    /// The folder; configurations have paths relative to it.
+    /// Folder of the recording, to which the paths in the configurations are relative.
     pub fn folder(&self) -> &Path {
         self.folder.path()
     }
 
-    /// A path in the recording.
+    /// Path of a file in the recording.
     pub fn path(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
     }
 
-    /// Writes a text file into the recording.
+    /// Writes a text file of the recording.
     pub fn write(&self, name: &str, text: &str) {
         fs::write(self.path(name), text).unwrap();
     }
@@ -168,7 +232,7 @@ impl Recording {
             .collect()
     }
 
-    /// A subcommand with its configuration, run in the folder of the recording.
+    /// A call of a subcommand with its configuration in the folder of the recording.
     pub fn fpmcl(&self, subcommand: &str) -> Fpmcl {
         let call = fpmcl(subcommand).in_folder(self.folder());
         match subcommand {
@@ -179,7 +243,7 @@ impl Recording {
         }
     }
 
-    /// The bytes of a file in the recording.
+    /// Content of a file in the recording.
     pub fn bytes(&self, name: &str) -> Vec<u8> {
         let path = self.path(name);
         fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
@@ -225,7 +289,7 @@ refinement: {swarm: {iterations: 5}}
 range_image: {height: 32, width: 360, fov_up: 3, fov_down: -25, max_range: 50, min_range: 1}
 ";
 
-/// Axis-aligned boxes in the street: smallest and largest corner [m], z over the road.
+/// Axis-aligned boxes in the street: minimum and maximum corner, z above the road [m].
 const BOXES: [[[f64; 3]; 2]; 5] = [
     [[8.0, 4.0, 0.0], [12.0, 6.0, 1.5]],
     [[18.0, -6.0, 0.0], [22.5, -4.0, 1.6]],
@@ -234,10 +298,10 @@ const BOXES: [[[f64; 3]; 2]; 5] = [
     [[28.0, -8.0, 0.0], [31.0, -6.0, 3.0]],
 ];
 
-/// Height of the sensor over the road [m].
+/// Height of the sensor above the road [m].
 const SENSOR_HEIGHT_M: f64 = 1.73;
 
-/// The points that a sensor `ahead_m` along the street sees, in its own frame.
+/// Scan `ahead_m` along the street, in the lidar frame [m].
 fn scan(ahead_m: f64) -> Vec<[f32; 3]> {
     let origin = [ahead_m, 0.0, SENSOR_HEIGHT_M];
     let mut points = Vec::new();
@@ -262,7 +326,7 @@ fn scan(ahead_m: f64) -> Vec<[f32; 3]> {
     points
 }
 
-/// Where a ray meets the road, the walls at the sides or those at the ends.
+/// Range to the road, the side walls and the end walls [m].
 fn street_range(origin: [f64; 3], direction: [f64; 3]) -> f64 {
     let to_plane = |axis: usize, at: f64| {
         let range = (at - origin[axis]) / direction[axis];
@@ -279,7 +343,7 @@ fn street_range(origin: [f64; 3], direction: [f64; 3]) -> f64 {
     .fold(f64::INFINITY, f64::min)
 }
 
-/// Where a ray enters a box, if it does.
+/// Range at which a ray enters a box [m].
 fn entry(origin: [f64; 3], direction: [f64; 3], low: [f64; 3], high: [f64; 3]) -> Option<f64> {
     let (mut near, mut far) = (0.0_f64, f64::INFINITY);
     for axis in 0..3 {

@@ -6,13 +6,13 @@ use std::path::Path;
 use fpmcl::app::plotting::Bitmap;
 
 /// Minimum width that is readable on a screen and on paper [px].
-const LEAST_WIDTH: u32 = 1200;
+const MIN_WIDTH: u32 = 1200;
 
-/// Rows of title and legend, which have every color whatever is drawn [px].
+/// Rows of title and legend, which have every color regardless of the content [px].
 const HEADING: u32 = 96;
 
 /// Minimum number of pixels of a line or a marker.
-const LEAST_OF_A_COLOR: usize = 40;
+const MIN_PIXELS: usize = 40;
 
 /// Colors of a picture.
 pub struct Picture {
@@ -51,7 +51,7 @@ impl Picture {
     /// Expects a readable size, some content, and lines of these colors.
     #[track_caller]
     pub fn shows(&self, colors: &[[u8; 3]]) {
-        self.shows_at_least(LEAST_OF_A_COLOR, colors);
+        self.shows_at_least(MIN_PIXELS, colors);
     }
 
     /// As [`shows`](Self::shows) with a minimum number of pixels of each color, such as more than
@@ -65,7 +65,7 @@ impl Picture {
 
     /// Defect of the picture.
     pub fn defect(&self, least: usize, colors: &[[u8; 3]]) -> Option<String> {
-        if self.width < LEAST_WIDTH {
+        if self.width < MIN_WIDTH {
             return Some(format!("only {} pixels wide", self.width));
         }
         let pixels = self.colors.values().sum::<usize>();
