@@ -75,6 +75,11 @@
 //!
 //! `docs/architecture.md` describes how a scan and a configuration key pass through them.
 
+#![allow(
+    rustdoc::broken_intra_doc_links,
+    reason = "units in brackets, such as [m], are no links"
+)]
+
 // Foundations.
 pub mod files;
 pub mod geometry;

@@ -3,7 +3,7 @@
 //! A scan is a key scan if the car has moved since the previous key scan. Every `local_map_size` key
 //! scans, and at the end of the recording, a local map is closed. It is meshed from its own scans and
 //! those a few metres before and after; of its mesh it keeps what is closer to its own scans than to
-//! those of any other local map, cut exactly at the border (see [`super::seam`]): neighbours meet
+//! those of any other local map, cut exactly at the border (see `seam`): neighbours meet
 //! without overlap, also where the car returns to a place.
 
 use std::ops::Range;

@@ -1,7 +1,7 @@
 //! Simplification of the ground, block by block.
 //!
 //! The plane is divided into square blocks that are simplified independently and in parallel, see
-//! [`super::collapse`]; then twice again with blocks shifted by a third and two thirds, so that every
+//! `collapse`; then twice again with blocks shifted by a third and two thirds, so that every
 //! position is inside a block at least once. Vertices shared with other triangles are fixed, so no
 //! cracks open; boundary vertices are removed where the boundary is almost straight.
 
