@@ -1,48 +1,15 @@
 //! Configuration of the localizer.
 
-use serde::{Deserialize, Serialize};
-
 use super::convergence::ConvergenceConfig;
 use super::motion::{OdometryNoise, VelocityNoise};
 use super::observation::ObservationConfig;
 use super::proposal::ProposalConfig;
 use super::resampling::{KldConfig, ResamplingConfig};
 use super::sensor::SensorConfig;
+use super::tempering::TemperingConfig;
 use super::tracking_loss::TrackingLossConfig;
 use crate::map::PanoramaConfig;
-use crate::validation::{InvalidValue, Validate, at_least_one, fraction, nested, not_negative};
-
-/// Annealing of the likelihood within a frame.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct TemperingConfig {
-    /// Smallest share of effective particles that a frame may leave (unitless); 0 uses the likelihood
-    /// unchanged, as range-mcl does.
-    pub min_effective_fraction: f64,
-    /// Rounds of reweighting and resampling per frame while searching.
-    pub searching_rounds: usize,
-    /// Rounds of reweighting and resampling per frame while tracking.
-    pub tracking_rounds: usize,
-}
-
-impl Default for TemperingConfig {
-    /// Values of this project.
-    fn default() -> Self {
-        Self {
-            min_effective_fraction: 0.2,
-            searching_rounds: 4,
-            tracking_rounds: 1,
-        }
-    }
-}
-
-impl Validate for TemperingConfig {
-    fn validate(&self) -> Result<(), InvalidValue> {
-        fraction("min_effective_fraction", self.min_effective_fraction)?;
-        at_least_one("searching_rounds", self.searching_rounds)?;
-        at_least_one("tracking_rounds", self.tracking_rounds)
-    }
-}
+use crate::validation::{InvalidValue, Validate, at_least_one, nested, not_negative};
 
 /// Configuration of the localizer.
 #[derive(Clone, Debug, PartialEq)]
@@ -67,13 +34,13 @@ pub struct LocalizerConfig {
     pub unknown_velocity: OdometryNoise,
     /// Observation model.
     pub observation: ObservationConfig,
-    /// Annealing of the likelihood.
+    /// Tempering of the likelihood.
     pub tempering: TemperingConfig,
     /// Proposal distribution while tracking.
     pub proposal: ProposalConfig,
     /// Resampling.
     pub resampling: ResamplingConfig,
-    /// Number of particles while searching.
+    /// KLD sampling, for the number of particles while searching.
     pub kld: KldConfig,
     /// Detection of convergence.
     pub convergence: ConvergenceConfig,
@@ -118,7 +85,7 @@ impl Default for LocalizerConfig {
 }
 
 impl Validate for LocalizerConfig {
-    /// With the keys of `localization.yml`.
+    /// Errors have the keys of `localization.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
         at_least_one("numParticles", self.num_particles)?;
         at_least_one("num_reduced", self.num_reduced)?;

@@ -1,11 +1,11 @@
-//! When a few particles are enough: they stand in few tiles and close together.
+//! Convergence of the particles: they occupy few tiles and their spread is small.
 //!
 //! ```text
 //! converged  ⇔  0 < occupied valid tiles < converge_thres  ∧  √(σ_x² + σ_y²) < s  ∧  σ_θ < s_θ
 //! ```
 //!
-//! The first is range-mcl's criterion (Chen et al., ICRA 2021, section III-D), which holds from
-//! the first frame on a map of one tile; hence the spread.
+//! The first condition is range-mcl's (Chen et al., ICRA 2021, section III-D). On a map of one tile it
+//! holds from the first frame on, hence the limits on the spread.
 
 use std::collections::BTreeSet;
 
@@ -15,21 +15,23 @@ use super::particles::{ParticleSet, spread};
 use crate::map::TileGrid;
 use crate::validation::{InvalidValue, Validate, positive_or_infinite};
 
-/// What counts as converged.
+/// Thresholds of convergence.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ConvergenceConfig {
-    /// The particles stand in fewer valid tiles than this; `converge_thres` of `localization.yml`.
+    /// Number of occupied valid tiles below which the particles have converged; `converge_thres` of
+    /// `localization.yml`.
     #[serde(skip)]
     pub converge_thres: usize,
-    /// Their standard deviation in position is below this; infinite for range-mcl's criterion alone [m].
+    /// Standard deviation of the position below which they have converged [m]; infinite for range-mcl's
+    /// condition alone.
     pub max_spread_m: f64,
-    /// Their standard deviation in heading is below this [rad].
+    /// Standard deviation of the heading below which they have converged [rad].
     pub max_spread_rad: f64,
 }
 
 impl Default for ConvergenceConfig {
-    /// range-mcl's two tiles; half a metre and five degrees.
+    /// Two tiles, as range-mcl; half a metre and five degrees.
     fn default() -> Self {
         Self {
             converge_thres: 2,
@@ -46,7 +48,7 @@ impl Validate for ConvergenceConfig {
     }
 }
 
-/// How many valid tiles the particles stand in.
+/// Number of valid tiles that contain particles.
 pub fn occupied_tiles(particles: &ParticleSet, tiles: &TileGrid) -> usize {
     let occupied: BTreeSet<_> = particles
         .poses()
@@ -55,13 +57,13 @@ pub fn occupied_tiles(particles: &ParticleSet, tiles: &TileGrid) -> usize {
     occupied.len()
 }
 
-/// Whether the particles stand close together, wherever that is: also astride a border of tiles.
+/// Whether the spread is small, whatever tiles the particles occupy.
 pub fn is_narrow(particles: &ParticleSet, config: &ConvergenceConfig) -> bool {
     let (position_m, heading_rad) = spread(&particles.covariance_about(&particles.mean()));
     position_m < config.max_spread_m && heading_rad < config.max_spread_rad
 }
 
-/// Whether the belief is narrow enough for few particles.
+/// Whether the particles have converged: a small number is sufficient.
 pub fn is_converged(particles: &ParticleSet, tiles: &TileGrid, config: &ConvergenceConfig) -> bool {
     let occupied = occupied_tiles(particles, tiles);
     occupied > 0 && occupied < config.converge_thres && is_narrow(particles, config)
@@ -91,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn particles_in_one_tile_and_close_together_are_converged() {
+    fn particles_in_one_tile_with_a_small_spread_have_converged() {
         let config = ConvergenceConfig::default();
         assert!(is_converged(
             &at(&[(0.0, 0.0), (0.1, 0.01)]),
@@ -111,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn without_limits_on_the_spread_only_tiles_count() {
+    fn without_limits_on_the_spread_only_the_number_of_tiles_matters() {
         let config = ConvergenceConfig {
             max_spread_m: f64::INFINITY,
             max_spread_rad: f64::INFINITY,
@@ -134,11 +136,11 @@ mod tests {
     }
 
     #[test]
-    fn particles_that_stand_nowhere_have_not_converged() {
-        let lost = at(&[(-900.0, 0.0), (-900.0, 0.0)]);
-        assert_eq!(occupied_tiles(&lost, &tiles()), 0);
+    fn particles_outside_all_tiles_have_not_converged() {
+        let outside = at(&[(-900.0, 0.0), (-900.0, 0.0)]);
+        assert_eq!(occupied_tiles(&outside, &tiles()), 0);
         assert!(!is_converged(
-            &lost,
+            &outside,
             &tiles(),
             &ConvergenceConfig::default()
         ));

@@ -11,14 +11,14 @@
 
 use nalgebra::{Point2, Vector2};
 use rand::{Rng, RngExt as _};
-use rand_distr::{Distribution, StandardNormal};
+use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
 
-use super::particles::Hypothesis;
+use super::particles::Particle;
 use super::resampling::systematic;
 use crate::geometry::Pose2;
 use crate::lidar::RangeImage;
-use crate::map::{PanoramaIndex, PanoramaSeed, SensorAttitude};
+use crate::map::{PanoramaIndex, SensorAttitude};
 use crate::validation::{InvalidValue, Validate, not_negative};
 
 /// Shape of the initial distribution.
@@ -61,36 +61,42 @@ impl Validate for StartSpread {
     }
 }
 
-/// Draws poses around a given one, spread along the axes of the map.
-pub fn around(pose: &Pose2, count: usize, start: &StartSpread, rng: &mut impl Rng) -> Vec<Pose2> {
-    let mut draw = |bound: f64| -> f64 {
-        let unit: f64 = match start.distribution {
-            StartDistribution::Uniform => rng.random_range(-1.0..=1.0),
-            StartDistribution::Gaussian => StandardNormal.sample(rng),
-        };
-        bound * unit
+/// Samples particles around a pose, along the axes of the map; `level_m` is the height of the ground [m],
+/// if known.
+pub fn around(
+    pose: &Pose2,
+    level_m: Option<f64>,
+    count: usize,
+    spread: &StartSpread,
+    rng: &mut impl Rng,
+) -> Vec<Particle> {
+    let mut sample = |bound: f64| -> f64 {
+        bound
+            * match spread.distribution {
+                StartDistribution::Uniform => rng.random_range(-1.0..=1.0),
+                StartDistribution::Gaussian => rng.sample(StandardNormal),
+            }
     };
-    (0..count)
-        .map(|_| {
-            let offset = Vector2::new(draw(start.position_m), draw(start.position_m));
-            let turn_rad = draw(start.heading_rad);
-            Pose2::new(
-                pose.translation.vector + offset,
-                pose.rotation.angle() + turn_rad,
-            )
-        })
-        .collect()
+    let mut particle = |_| {
+        let offset = Vector2::new(sample(spread.position_m), sample(spread.position_m));
+        let heading_rad = pose.rotation.angle() + sample(spread.heading_rad);
+        Particle::new(
+            Pose2::new(pose.translation.vector + offset, heading_rad),
+            level_m,
+        )
+    };
+    (0..count).map(&mut particle).collect()
 }
 
-/// Draws hypotheses in the cells whose panoramas resemble the scan, more of them the better a cell
-/// fits. Empty without cells.
+/// Samples particles in the cells whose panoramas resemble the scan, in proportion to the likelihoods of
+/// the cells. Empty without cells.
 pub fn from_panoramas(
     index: &PanoramaIndex,
     scan: &RangeImage,
     attitude: &SensorAttitude,
     count: usize,
     rng: &mut impl Rng,
-) -> Vec<Hypothesis> {
+) -> Vec<Particle> {
     let seeds = index.search(scan, attitude);
     let Some(best) = seeds.first() else {
         return Vec::new();
@@ -103,26 +109,18 @@ pub fn from_panoramas(
     weights.iter_mut().for_each(|weight| *weight /= sum);
     let half_column_rad = std::f64::consts::PI / index.model.width as f64;
     let chosen = systematic(&weights, count, rng);
-    let draw = |seed: usize| {
-        let PanoramaSeed {
-            center,
-            level_m,
-            heading_rad,
-            ..
-        } = seeds[seed];
-        let place = uniform_in_cell(center, index.cell_m, rng);
-        let deviate: f64 = StandardNormal.sample(rng);
-        let turn_rad = index.config.yaw_sigma_rad * deviate
+    let sample = |number: usize| {
+        let seed = &seeds[number];
+        let position = uniform_in_cell(seed.center, index.cell_m, rng);
+        let turn_rad = index.config.yaw_sigma_rad * rng.sample::<f64, _>(StandardNormal)
             + rng.random_range(-half_column_rad..=half_column_rad);
-        Hypothesis {
-            map_from_lidar: Pose2::new(place, heading_rad + turn_rad),
-            level_m: Some(level_m),
-        }
+        let map_from_lidar = Pose2::new(position, seed.heading_rad + turn_rad);
+        Particle::new(map_from_lidar, Some(seed.level_m))
     };
-    chosen.into_iter().map(draw).collect()
+    chosen.into_iter().map(sample).collect()
 }
 
-/// Draws a position in a square cell [m].
+/// Samples a position in a square cell [m].
 fn uniform_in_cell(center: Point2<f64>, cell_m: f64, rng: &mut impl Rng) -> Vector2<f64> {
     let half_m = 0.5 * cell_m;
     let mut offset = || rng.random_range(-half_m..=half_m);
@@ -141,16 +139,16 @@ mod tests {
     use crate::map::{PanoramaConfig, PanoramaRequest, SearchRegion};
 
     #[test]
-    fn a_uniform_start_fills_its_bounds_and_keeps_within_them() {
+    fn a_uniform_start_has_the_variance_of_its_bounds_and_stays_within_them() {
         let pose = Pose2::new(Vector2::new(10.0, -3.0), 3.0);
         let mut rng = StdRng::seed_from_u64(1);
-        let poses = around(&pose, 20_000, &StartSpread::default(), &mut rng);
+        let particles = around(&pose, None, 20_000, &StartSpread::default(), &mut rng);
         let bound = 30.0_f64.to_radians();
-        let turns: Vec<f64> = poses
-            .iter()
-            .map(|p| wrap_angle(p.rotation.angle() - 3.0))
+        let poses = || particles.iter().map(|particle| particle.map_from_lidar);
+        let turns: Vec<f64> = poses()
+            .map(|pose| wrap_angle(pose.rotation.angle() - 3.0))
             .collect();
-        let x: Vec<f64> = poses.iter().map(|p| p.translation.x - 10.0).collect();
+        let x: Vec<f64> = poses().map(|pose| pose.translation.x - 10.0).collect();
         for (values, bound) in [(turns, bound), (x, 5.0)] {
             assert!(values.iter().all(|v| v.abs() <= bound + 1e-12));
             let n = values.len() as f64;
@@ -163,15 +161,18 @@ mod tests {
 
     #[test]
     fn a_gaussian_start_has_its_standard_deviation() {
-        let start = StartSpread {
+        let spread = StartSpread {
             distribution: StartDistribution::Gaussian,
             position_m: 0.5,
             heading_rad: 0.1,
         };
         let mut rng = StdRng::seed_from_u64(2);
-        let poses = around(&Pose2::identity(), 20_000, &start, &mut rng);
-        let n = poses.len() as f64;
-        let sigma = (poses.iter().map(|p| p.translation.y.powi(2)).sum::<f64>() / n).sqrt();
+        let particles = around(&Pose2::identity(), None, 20_000, &spread, &mut rng);
+        let n = particles.len() as f64;
+        let squares = particles
+            .iter()
+            .map(|particle| particle.map_from_lidar.translation.y.powi(2));
+        let sigma = (squares.sum::<f64>() / n).sqrt();
         assert_relative_eq!(sigma, 0.5, epsilon = 4.0 * 0.5 / (2.0 * n).sqrt());
     }
 
@@ -188,12 +189,12 @@ mod tests {
         };
         let index = world.map().panoramas(&request).unwrap();
         let scan = world.scan(&truth);
-        let poses = from_panoramas(&index, &scan, &SensorAttitude::default(), 1000, &mut rng);
-        let near = poses
+        let particles = from_panoramas(&index, &scan, &SensorAttitude::default(), 1000, &mut rng);
+        let near = particles
             .iter()
-            .map(|hypothesis| hypothesis.map_from_lidar.translation.vector)
+            .map(|particle| particle.map_from_lidar.translation.vector)
             .filter(|place| (place - truth.translation.vector).norm() < 1.5)
             .count();
-        assert!(near > 300, "{near} of {}", poses.len());
+        assert!(near > 300, "{near} of {}", particles.len());
     }
 }

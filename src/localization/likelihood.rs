@@ -1,43 +1,38 @@
-//! The likelihood around a pose, along, across and in heading: how sharp its peak is.
+//! Profiles of the likelihood around a pose, along, across and in heading.
 
+use super::observation::{ObservationConfig, costs};
 use crate::geometry::{Pose2, Pose3};
 use crate::lidar::Beam;
 use crate::map::{GroundMap, SensorAttitude};
 use crate::rendering::{RangeRenderer, RenderError};
 
-use super::observation::{ObservationConfig, costs};
-
-/// Offsets of a profile reach this far along and across [m].
-pub const REACH_M: f64 = 2.0;
-/// And this far in heading [deg].
-pub const REACH_DEG: f64 = 10.0;
-/// Offsets on each side of the pose; they are denser near it, where a peak is.
+/// Number of offsets on each side of the pose; they are denser near it, where the peak is.
 const STEPS: i32 = 60;
 
-/// In which direction a pose is moved.
+/// Direction of an offset from a pose.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Direction {
-    /// Ahead of the car [m].
+    /// Forward [m].
     Along,
-    /// To its left [m].
+    /// To the left [m].
     Across,
-    /// Turned to the left [deg].
+    /// Turn to the left [deg].
     Heading,
 }
 
 impl Direction {
-    /// All of them.
+    /// All directions.
     pub const ALL: [Self; 3] = [Self::Along, Self::Across, Self::Heading];
 
-    /// The farthest offset [m or deg].
+    /// Largest offset [m or deg].
     pub fn reach(self) -> f64 {
         match self {
-            Self::Along | Self::Across => REACH_M,
-            Self::Heading => REACH_DEG,
+            Self::Along | Self::Across => 2.0,
+            Self::Heading => 10.0,
         }
     }
 
-    /// A pose moved by an offset [m or deg].
+    /// Moves a pose by an offset [m or deg].
     pub fn moved(self, pose: &Pose2, offset: f64) -> Pose2 {
         let step = match self {
             Self::Along => Pose2::translation(offset, 0.0),
@@ -48,23 +43,23 @@ impl Direction {
     }
 }
 
-/// Where likelihoods come from.
+/// Scan and map of a profile.
 #[derive(Clone, Copy)]
 pub struct View<'a> {
-    /// Shows the map.
+    /// Renders the map.
     pub renderer: &'a dyn RangeRenderer,
-    /// Carries the poses.
+    /// Ground of the map.
     pub ground: &'a GroundMap,
-    /// About the height of the ground; needed where there are several levels [m].
+    /// Approximate height of the ground [m], which selects among several levels.
     pub level_m: Option<f64>,
-    /// How the sensor stands over the road.
+    /// Attitude of the sensor above the ground.
     pub attitude: SensorAttitude,
-    /// The beams of the scan, lidar frame.
+    /// Beams of the scan, lidar frame.
     pub beams: &'a [Beam],
 }
 
-/// (offset [m or deg], likelihood over that of the best offset), offsets ascending; offsets without
-/// ground below are left out.
+/// Returns (offset [m or deg], likelihood relative to the best offset), offsets ascending, without those
+/// that have no ground below.
 pub fn profile(
     view: &View,
     pose: &Pose2,
@@ -100,8 +95,8 @@ pub fn profile(
         .collect())
 }
 
-/// Distance between the places on both sides of the peak where a profile falls to half of it; `None`
-/// where it does not fall that far inside its reach.
+/// Width of the peak of a profile at half its height [m or deg]; `None` where the profile does not fall
+/// that far on both sides.
 pub fn width_at_half(profile: &[(f64, f64)]) -> Option<f64> {
     let peak = (0..profile.len()).max_by(|&a, &b| profile[a].1.total_cmp(&profile[b].1))?;
     let half = 0.5 * profile[peak].1;
@@ -122,7 +117,7 @@ mod tests {
     use crate::map::test_world::TestWorld;
 
     #[test]
-    fn the_width_is_that_of_a_triangle_and_nothing_for_a_plateau() {
+    fn the_width_of_a_triangle_is_half_its_base_and_a_plateau_has_none() {
         let triangle: Vec<(f64, f64)> = (-10..=10)
             .map(|k| (f64::from(k), 1.0 - 0.1 * f64::from(k).abs()))
             .collect();
@@ -133,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_is_moved_in_the_axes_of_the_car() {
+    fn an_offset_is_in_the_axes_of_the_car() {
         let pose = Pose2::new(
             nalgebra::Vector2::new(1.0, 2.0),
             std::f64::consts::FRAC_PI_2,
@@ -159,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn the_robust_likelihood_has_its_peak_at_the_truth_and_the_reference_has_a_wide_one() {
+    fn the_robust_likelihood_is_more_peaked_than_the_reference_and_its_peak_is_at_the_truth() {
         let world = TestWorld::street();
         let truth = world.pose_at(12.0, 0.1, 0.05);
         let image = world.scan(&truth);

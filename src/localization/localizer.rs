@@ -5,12 +5,12 @@ use super::estimate::Estimate;
 use super::filter::ParticleFilter;
 use super::initialization::{StartSpread, around, from_panoramas};
 use super::odometry::Odometry;
-use super::particles::{Hypothesis, ParticleSet};
+use super::particles::{Particle, ParticleSet};
 use super::sensor::Sensor;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{RangeImage, Scan};
 use crate::map::{Map, PanoramaRequest, SearchRegion, SensorAttitude};
-use crate::random::{Generator, stream};
+use crate::random::stream;
 use crate::rendering::RenderError;
 use crate::validation::{InvalidValue, Validate as _};
 
@@ -120,51 +120,33 @@ impl Localizer {
     fn initialize(&self, image: &RangeImage) -> Result<ParticleFilter, LocalizerError> {
         let mut rng = stream(self.seed, INITIALIZATION_STREAM);
         let request = self.panorama_request();
-        let hypotheses = match &self.start {
+        let count = self.config.num_particles;
+        let particles = match &self.start {
             Start::Pose {
                 map_from_lidar,
                 height_m,
                 spread,
-            } => self.near_pose(map_from_lidar, *height_m, spread, &mut rng),
+            } => {
+                let level_m = height_m.map(|height_m| height_m - self.attitude.height_m);
+                around(map_from_lidar, level_m, count, spread, &mut rng)
+            }
             Start::Road | Start::Anywhere => {
                 let index = self.map.panoramas(&request)?;
-                let count = self.config.num_particles;
                 from_panoramas(&index, image, &self.attitude, count, &mut rng)
             }
         };
-        let Some(first) = hypotheses.first().copied() else {
+        let Some(first) = particles.first() else {
             return Err(LocalizerError::NoGround);
         };
-        let is_on_map = |start: &Hypothesis| {
-            self.map
-                .tiles
-                .valid_tile_of(&start.map_from_lidar)
-                .is_some()
-        };
-        if !hypotheses.iter().any(is_on_map) {
+        let tiles = &self.map.tiles;
+        let is_on_map = |p: &Particle| tiles.valid_tile_of(&p.map_from_lidar).is_some();
+        if !particles.iter().any(is_on_map) {
             let t = first.map_from_lidar.translation;
             return Err(LocalizerError::StartOutside { x: t.x, y: t.y });
         }
-        let particles = ParticleSet::uniform(hypotheses);
+        let particles = ParticleSet::uniform(particles);
         let (config, map) = (self.config.clone(), self.map.clone());
         Ok(ParticleFilter::new(config, map, Some(request), particles))
-    }
-
-    fn near_pose(
-        &self,
-        pose: &Pose2,
-        height_m: Option<f64>,
-        spread: &StartSpread,
-        rng: &mut Generator,
-    ) -> Vec<Hypothesis> {
-        let level_m = height_m.map(|height_m| height_m - self.attitude.height_m);
-        around(pose, self.config.num_particles, spread, rng)
-            .into_iter()
-            .map(|map_from_lidar| Hypothesis {
-                map_from_lidar,
-                level_m,
-            })
-            .collect()
     }
 
     /// The panoramas for a start without a pose and for a restart after a loss.
@@ -188,3 +170,7 @@ impl Localizer {
         }
     }
 }
+
+#[cfg(test)]
+#[path = "localizer_tests.rs"]
+mod tests;

@@ -1,7 +1,7 @@
 //! Monte Carlo localization of a car in a mesh map.
 //!
 //! > [`Localizer`] turns scans into range images with the attitude of the sensor ([`sensor`]) and feeds the
-//! > particle [`filter`]: [`initialization`] draws the first particles, [`motion`] moves them by the
+//! > particle [`filter`]: [`initialization`] samples the first particles, [`motion`] moves them by the
 //! > [`odometry`], [`observation`] weights them, [`resampling`] keeps the likely ones, [`convergence`]
 //! > decides when few are enough and [`tracking_loss`] when none is right. [`likelihood`] shows how
 //! > peaked the likelihood is.

@@ -1,30 +1,30 @@
-//! Odometry motion model: where a pose hypothesis goes when the vehicle moves.
+//! Odometry motion model: prediction of a pose hypothesis by a noisy motion.
 //!
-//! An odometry increment is read as *turn, drive, turn*, u = (δ₁, d, δ₂), and every
-//! hypothesis follows its own noisy copy of it:
+//! An odometry increment is decomposed into *turn, drive, turn*, u = (δ₁, d, δ₂), of which every
+//! particle samples a noisy copy:
 //!
 //! ```text
 //! δ̂₁ ~ N(δ₁, σ_turn²)    d̂ ~ N(d, σ_drive²)    ŝ ~ N(0, σ_side²)    δ̂₂ ~ N(δ₂, σ_turn²)
 //! T_map_current = T_map_previous · Rot(δ̂₁) · Trans(d̂, ŝ) · Rot(δ̂₂)
 //! ```
 //!
-//! Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), table 5.6, with a noise that
-//! does not grow with the motion, as in range-mcl (Chen et al., ICRA 2021), and one that the tables
-//! do not have: to the side, where turning says the less the shorter the step. A vehicle that
-//! reports its speeds (v, ω) over a duration Δt instead drives an arc (table 5.3):
+//! Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), table 5.6, with noise that does not grow
+//! with the motion, as in range-mcl (Chen et al., ICRA 2021), and with lateral noise, because for
+//! short steps the noise of the turns hardly moves a particle sideways. A vehicle that reports its
+//! speeds (v, ω) over a duration Δt instead drives an arc (table 5.3):
 //!
 //! ```text
 //! v̂ ~ N(v, σ_v²)    ω̂ ~ N(ω, σ_ω²)    T_map_current = T_map_previous · exp(v̂ Δt, 0, ω̂ Δt)
 //! ```
 //!
-//! A sensor does not follow such an arc exactly: it is mounted at a small angle to the axle, and
-//! tyres slip. What it moves sideways has a noise of its own.
+//! A sensor does not follow such an arc exactly, because it is mounted at a small angle to the axle
+//! and tyres slip: its lateral motion has noise of its own.
 
 use std::time::Duration;
 
-use nalgebra::{Matrix3, Matrix4, Matrix4x3, Vector2, Vector4};
-use rand::Rng;
-use rand_distr::{Distribution, StandardNormal};
+use nalgebra::{Matrix3, Matrix3x4, Matrix4, Vector2, Vector3, Vector4};
+use rand::{Rng, RngExt as _};
+use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::Pose2;
@@ -34,16 +34,16 @@ use crate::validation::{InvalidValue, Validate, not_negative};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct OdometryNoise {
-    /// Of each of the two turns [rad].
+    /// Standard deviation of each of the two turns [rad].
     pub turn_rad: f64,
-    /// Of the distance driven [m].
+    /// Standard deviation of the distance driven [m].
     pub drive_m: f64,
-    /// Of a shift to the side: slip, and what an odometry from images errs there [m].
+    /// Standard deviation of the lateral motion, from slip and visual odometry [m].
     pub side_m: f64,
 }
 
 impl Default for OdometryNoise {
-    /// The values of range-mcl, and twice the centimetre that a good odometry errs to the side.
+    /// The values of range-mcl, and twice the lateral error of a good odometry, 1 cm.
     fn default() -> Self {
         Self {
             turn_rad: 0.01,
@@ -66,39 +66,30 @@ impl OdometryNoise {
     /// to first order in the turns.
     pub fn covariance(&self, motion: &TurnDriveTurn) -> Matrix3<f64> {
         let (sin, cos) = motion.first_turn_rad.sin_cos();
-        let slopes = Matrix4x3::new(
-            -motion.drive_m * sin,
-            motion.drive_m * cos,
-            1.0,
-            cos,
-            sin,
-            0.0,
-            -sin,
-            cos,
-            0.0,
-            0.0,
-            0.0,
-            1.0,
-        );
+        let jacobian = Matrix3x4::from_columns(&[
+            Vector3::new(-motion.drive_m * sin, motion.drive_m * cos, 1.0),
+            Vector3::new(cos, sin, 0.0),
+            Vector3::new(-sin, cos, 0.0),
+            Vector3::z(),
+        ]);
         let sigmas = Vector4::new(self.turn_rad, self.drive_m, self.side_m, self.turn_rad);
-        let variances = Matrix4::from_diagonal(&sigmas.map(|sigma| sigma.powi(2)));
-        slopes.transpose() * variances * slopes
+        propagated_covariance(&jacobian, &sigmas)
     }
 }
 
-/// An odometry increment as three moves.
+/// An odometry increment as turn, drive, turn.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TurnDriveTurn {
-    /// From the old heading towards the goal [rad].
+    /// Turn from the previous heading towards the current position, δ₁ [rad].
     pub first_turn_rad: f64,
-    /// Straight ahead [m].
+    /// Distance driven, d [m].
     pub drive_m: f64,
-    /// From there into the new heading [rad].
+    /// Turn into the current heading, δ₂ [rad].
     pub second_turn_rad: f64,
 }
 
 impl TurnDriveTurn {
-    /// Splits an increment into its three moves; [`compose`](Self::compose) is the inverse.
+    /// Decomposes an increment.
     pub fn decompose(previous_from_current: &Pose2) -> Self {
         let step = previous_from_current.translation.vector;
         let first_turn_rad = step.y.atan2(step.x);
@@ -110,47 +101,38 @@ impl TurnDriveTurn {
         }
     }
 
-    /// The increment `previous_from_current` that the three moves add up to.
-    pub fn compose(&self) -> Pose2 {
-        Pose2::rotation(self.first_turn_rad)
-            * Pose2::translation(self.drive_m, 0.0)
-            * Pose2::rotation(self.second_turn_rad)
-    }
-
-    /// Draws the increment of a noisy copy of the moves.
+    /// Samples `previous_from_current` with noise; without noise it is the decomposed increment.
     pub fn sample(&self, noise: &OdometryNoise, rng: &mut impl Rng) -> Pose2 {
-        let mut gaussian = |mean: f64, sigma: f64| {
-            let deviate: f64 = StandardNormal.sample(rng);
-            mean + sigma * deviate
-        };
-        let first_turn_rad = gaussian(self.first_turn_rad, noise.turn_rad);
-        let drive_m = gaussian(self.drive_m, noise.drive_m);
-        let second_turn_rad = gaussian(self.second_turn_rad, noise.turn_rad);
-        let side_m = gaussian(0.0, noise.side_m);
+        let mut normal =
+            |mean: f64, sigma: f64| mean + sigma * rng.sample::<f64, _>(StandardNormal);
+        let first_turn_rad = normal(self.first_turn_rad, noise.turn_rad);
+        let drive_m = normal(self.drive_m, noise.drive_m);
+        let second_turn_rad = normal(self.second_turn_rad, noise.turn_rad);
+        let side_m = normal(0.0, noise.side_m);
         Pose2::rotation(first_turn_rad)
             * Pose2::translation(drive_m, side_m)
             * Pose2::rotation(second_turn_rad)
     }
 }
 
-/// Standard deviations of commanded velocities, constant over a command.
+/// Standard deviations of the velocities, constant over a command.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct VelocityNoise {
-    /// Of the speed ahead [m/s].
+    /// Standard deviation of the forward speed [m/s].
     pub speed_m_per_s: f64,
-    /// Of the speed to the side, which a command does not have: slip, and a sensor that is mounted
-    /// askew (a degree at 60 km/h makes 0.3 m/s) [m/s].
+    /// Standard deviation of the lateral speed [m/s]: slip, and the mounting angle of the sensor, which
+    /// causes 0.3 m/s per degree at 60 km/h.
     pub side_speed_m_per_s: f64,
-    /// Of the turn rate [rad/s].
+    /// Standard deviation of the turn rate [rad/s].
     pub turn_rate_rad_per_s: f64,
-    /// Of the rate of a last turn on the spot, without which the poses would lie on a surface
-    /// (γ̂ of table 5.3) [rad/s].
+    /// Standard deviation of the rate of a final turn in place, without which the poses would lie on a
+    /// surface (γ̂ of table 5.3) [rad/s].
     pub final_turn_rate_rad_per_s: f64,
 }
 
 impl Default for VelocityNoise {
-    /// At ten commands a second ahead and in heading as much as [`OdometryNoise`].
+    /// At ten commands per second, the forward and heading noise of [`OdometryNoise`].
     fn default() -> Self {
         Self {
             speed_m_per_s: 0.5,
@@ -171,56 +153,52 @@ impl Validate for VelocityNoise {
 }
 
 impl VelocityNoise {
-    /// Covariance of (x, y, heading) of a command's motion in the axes of the car before it
-    /// [m², m·rad, rad²], to first order in the noise. Taken for an arc that is hardly longer than its
-    /// chord, which points along the middle of the turn.
+    /// Covariance of (x, y, heading) of the motion of a command in the axes of the car before it
+    /// [m², m·rad, rad²], to first order in the noise, for arcs hardly longer than their chord.
     pub fn covariance(&self, command: &VelocityCommand) -> Matrix3<f64> {
         let seconds = command.duration.as_secs_f64();
         let turn_rad = command.turn_rate_rad_per_s * seconds;
         let (middle_sin, middle_cos) = (0.5 * turn_rad).sin_cos();
         let (sin, cos) = turn_rad.sin_cos();
-        // A turn moves the end of the arc half as far aside as the whole arc lies ahead.
+        // The chord points along the middle of the turn; a turn by dα moves its end sideways by half
+        // its length times dα.
         let half_drive_m = 0.5 * command.speed_m_per_s * seconds;
-        let slopes = Matrix4x3::new(
-            middle_cos,
-            middle_sin,
-            0.0,
-            -half_drive_m * middle_sin,
-            half_drive_m * middle_cos,
-            1.0,
-            -sin,
-            cos,
-            0.0,
-            0.0,
-            0.0,
-            1.0,
+        let jacobian = Matrix3x4::from_columns(&[
+            Vector3::new(middle_cos, middle_sin, 0.0),
+            Vector3::new(-half_drive_m * middle_sin, half_drive_m * middle_cos, 1.0),
+            Vector3::new(-sin, cos, 0.0),
+            Vector3::z(),
+        ]);
+        let rates = Vector4::new(
+            self.speed_m_per_s,
+            self.turn_rate_rad_per_s,
+            self.side_speed_m_per_s,
+            self.final_turn_rate_rad_per_s,
         );
-        let sigmas = seconds
-            * Vector4::new(
-                self.speed_m_per_s,
-                self.turn_rate_rad_per_s,
-                self.side_speed_m_per_s,
-                self.final_turn_rate_rad_per_s,
-            );
-        let variances = Matrix4::from_diagonal(&sigmas.map(|sigma| sigma.powi(2)));
-        slopes.transpose() * variances * slopes
+        propagated_covariance(&jacobian, &(seconds * rates))
     }
 }
 
-/// A velocity command [v, ω] that is held for some time.
+/// J diag(σ²) Jᵀ.
+fn propagated_covariance(jacobian: &Matrix3x4<f64>, sigmas: &Vector4<f64>) -> Matrix3<f64> {
+    let variances = Matrix4::from_diagonal(&sigmas.map(|sigma| sigma.powi(2)));
+    jacobian * variances * jacobian.transpose()
+}
+
+/// Velocities that are held for a duration.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VelocityCommand {
-    /// Ahead, v [m/s].
+    /// Forward speed, v [m/s].
     pub speed_m_per_s: f64,
-    /// To the left, ω [rad/s].
+    /// Turn rate to the left, ω [rad/s].
     pub turn_rate_rad_per_s: f64,
-    /// How long it is held, Δt.
+    /// Duration, Δt.
     pub duration: Duration,
 }
 
 impl VelocityCommand {
-    /// The command whose arc ends where an increment does, as far as an arc can: its length is the
-    /// distance driven (backwards where that is behind), its turn that of the increment.
+    /// The command whose arc has the turn of an increment and a chord of its length; backwards where
+    /// the increment is.
     pub fn driving(previous_from_current: &Pose2, duration: Duration) -> Self {
         let seconds = duration.as_secs_f64().max(f64::MIN_POSITIVE);
         let turn_rad = previous_from_current.rotation.angle();
@@ -240,35 +218,32 @@ impl VelocityCommand {
         }
     }
 
-    /// The increment `previous_from_current` along the arc; a straight line where ω is 0.
+    /// `previous_from_current` along the arc; a straight line for ω = 0.
     pub fn compose(&self) -> Pose2 {
         let seconds = self.duration.as_secs_f64();
         let turn_rad = self.turn_rate_rad_per_s * seconds;
         let drive_m = self.speed_m_per_s * seconds;
         // sin α / α and (1 − cos α) / α, by their series where α is small.
-        let (ahead, aside) = if turn_rad.abs() < 1e-6 {
+        let (forward, lateral) = if turn_rad.abs() < 1e-6 {
             (1.0, 0.5 * turn_rad)
         } else {
             (turn_rad.sin() / turn_rad, (1.0 - turn_rad.cos()) / turn_rad)
         };
-        Pose2::new(Vector2::new(ahead, aside) * drive_m, turn_rad)
+        Pose2::new(Vector2::new(forward, lateral) * drive_m, turn_rad)
     }
 
-    /// Draws the increment of a noisy copy of the command.
+    /// Samples `previous_from_current` with noise.
     pub fn sample(&self, noise: &VelocityNoise, rng: &mut impl Rng) -> Pose2 {
-        let mut gaussian = |sigma: f64| {
-            let deviate: f64 = StandardNormal.sample(rng);
-            sigma * deviate
-        };
+        let mut normal = |sigma: f64| sigma * rng.sample::<f64, _>(StandardNormal);
         let noisy = Self {
-            speed_m_per_s: self.speed_m_per_s + gaussian(noise.speed_m_per_s),
-            turn_rate_rad_per_s: self.turn_rate_rad_per_s + gaussian(noise.turn_rate_rad_per_s),
+            speed_m_per_s: self.speed_m_per_s + normal(noise.speed_m_per_s),
+            turn_rate_rad_per_s: self.turn_rate_rad_per_s + normal(noise.turn_rate_rad_per_s),
             duration: self.duration,
         };
         let seconds = self.duration.as_secs_f64();
-        let aside_m = gaussian(noise.side_speed_m_per_s) * seconds;
-        let last_turn_rad = gaussian(noise.final_turn_rate_rad_per_s) * seconds;
-        noisy.compose() * Pose2::new(Vector2::new(0.0, aside_m), last_turn_rad)
+        let lateral_m = normal(noise.side_speed_m_per_s) * seconds;
+        let final_turn_rad = normal(noise.final_turn_rate_rad_per_s) * seconds;
+        noisy.compose() * Pose2::new(Vector2::new(0.0, lateral_m), final_turn_rad)
     }
 }
 

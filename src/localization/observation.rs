@@ -13,7 +13,7 @@
 use rand::{Rng, RngExt as _};
 use serde::{Deserialize, Serialize};
 
-use super::particles::Hypothesis;
+use super::particles::Particle;
 use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::{Beam, RangeImage};
 use crate::map::{GroundPatch, Map, SensorAttitude};
@@ -154,9 +154,9 @@ pub fn choose_beams(
     let returns = (0..image.ranges.len()).filter(|&index| image.has_return(index));
     let (road, rest): (Vec<usize>, Vec<usize>) = returns.partition(|&index| is_road(index));
 
-    let most_of_road = (road_share * count as f64).round() as usize;
-    let fair = count * road.len() / (road.len() + rest.len()).max(1);
-    let of_road = fair.min(most_of_road);
+    let largest = (road_share * count as f64).round() as usize;
+    let proportional = count * road.len() / (road.len() + rest.len()).max(1);
+    let of_road = proportional.min(largest);
     let mut chosen = stratified(&road, of_road, rng);
     chosen.extend(stratified(&rest, count - of_road, rng));
     chosen.sort_unstable();
@@ -171,11 +171,11 @@ fn stratified(list: &[usize], count: usize, rng: &mut impl Rng) -> Vec<usize> {
     if list.len() <= count {
         return list.to_vec();
     }
-    let stretch = list.len() as f64 / count as f64;
+    let part = list.len() as f64 / count as f64;
     (0..count)
         .map(|k| {
-            let place = (k as f64 + rng.random::<f64>()) * stretch;
-            list[(place as usize).min(list.len() - 1)]
+            let position = (k as f64 + rng.random::<f64>()) * part;
+            list[(position as usize).min(list.len() - 1)]
         })
         .collect()
 }
@@ -212,60 +212,34 @@ pub fn costs(
         .collect())
 }
 
-/// Returns the ground patch under a hypothesis; `None` outside the mapped tiles and where there is no
+/// Returns the ground patch under a particle; `None` outside the mapped tiles and where there is no
 /// ground. `remembered` replaces it in gaps of the map.
 pub fn ground_patch_of(
-    hypothesis: &Hypothesis,
+    particle: &Particle,
     map: &Map,
     remembered: Option<&GroundPatch>,
 ) -> Option<GroundPatch> {
-    let pose = &hypothesis.map_from_lidar;
+    let pose = &particle.map_from_lidar;
     map.tiles.valid_tile_of(pose)?;
-    let patch = map.ground.patch_under(pose, hypothesis.level_m);
+    let patch = map.ground.patch_under(pose, particle.level_m);
     patch.or(remembered.copied())
 }
 
-/// Numbers of beams of a scan by their agreement with the map, seen from one pose.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct BeamAgreement {
-    /// Beams that return from a surface of the map.
-    pub hit: usize,
-    /// Beams that return in front of the map, from something that is not in it.
-    pub short: usize,
-    /// Beams that return behind a surface of the map.
-    pub long: usize,
-    /// Beams along which the map has no surface.
-    pub missing: usize,
-}
-
-impl BeamAgreement {
-    /// Compares measured and rendered ranges, one of each per beam.
-    pub fn of(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Self {
-        let mut counts = Self::default();
-        for (beam, &rendered_m) in beams.iter().zip(rendered_m) {
-            let excess_m = beam.range_m - rendered_m;
-            let count = if rendered_m == f32::INFINITY {
-                &mut counts.missing
-            } else if excess_m.abs() <= tolerance_m {
-                &mut counts.hit
-            } else if excess_m < 0.0 {
-                &mut counts.short
-            } else {
-                &mut counts.long
-            };
-            *count += 1;
-        }
-        counts
-    }
-
-    /// Share of hits among the beams that were not stopped in front of the map; `None` for fewer than
-    /// 30. Traffic in front of the map does not count against a pose.
-    pub fn share(&self) -> Option<f64> {
-        /// Smallest number of beams.
-        const ENOUGH: usize = 30;
-        let reached = self.hit + self.long;
-        (reached >= ENOUGH).then(|| self.hit as f64 / reached as f64)
-    }
+/// Returns the share of beams that end on a surface of the map, among those that reach one; `None` for
+/// fewer than 30 of them. Measured and rendered ranges agree within the tolerance. Beams that end in
+/// front of the map, on traffic, and beams along which it has no surface do not count.
+pub fn agreement(beams: &[Beam], rendered_m: &[f32], tolerance_m: f32) -> Option<f64> {
+    /// Smallest number of beams.
+    const MIN_BEAMS: usize = 30;
+    let excesses_m: Vec<f32> = beams
+        .iter()
+        .zip(rendered_m)
+        .filter(|&(_, &rendered_m)| rendered_m != f32::INFINITY)
+        .map(|(beam, rendered_m)| beam.range_m - rendered_m)
+        .filter(|&excess_m| excess_m >= -tolerance_m)
+        .collect();
+    let hits = excesses_m.iter().filter(|&&m| m <= tolerance_m).count();
+    (excesses_m.len() >= MIN_BEAMS).then(|| hits as f64 / excesses_m.len() as f64)
 }
 
 /// Returns the beams that end above the road, which distinguish one place from another.
@@ -305,14 +279,14 @@ mod tests {
     }
 
     #[test]
-    fn nothing_on_the_map_is_worse_than_off_the_map_for_the_robust_likelihood() {
+    fn every_pose_on_the_map_is_more_likely_than_one_off_the_map() {
         let config = ObservationConfig::default();
         assert!(config.log_likelihood(0.5) > config.floor_log_likelihood());
         assert!(config.log_likelihood(0.1) > config.log_likelihood(0.11));
     }
 
     #[test]
-    fn beams_are_spread_over_the_image_and_few_of_them_look_at_the_road() {
+    fn beams_cover_the_image_and_few_of_them_end_on_the_road() {
         let world = TestWorld::street();
         let image = world.scan(&world.pose_at(0.0, 0.0, 0.0));
         let mut rng = StdRng::seed_from_u64(1);
@@ -320,7 +294,7 @@ mod tests {
         assert_eq!(beams.len(), 1000);
         let high = above_road(&beams, &SensorAttitude::default(), 0.3);
         assert!((795..=805).contains(&high.len()), "{}", high.len());
-        // All round: no quarter of the circle is left out.
+        // Every quarter of the circle has beams.
         for quarter in 0..4 {
             let in_quarter = |b: &&Beam| {
                 let turn = f64::from(b.direction.y.atan2(b.direction.x)) / std::f64::consts::TAU;
@@ -331,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scan_with_few_returns_gives_what_it_has() {
+    fn a_scan_with_few_returns_yields_all_of_them() {
         let model = LidarModel::default();
         let image = RangeImage::project(&[Vec3::new(8.0, 1.0, 0.0)], &model);
         let mut rng = StdRng::seed_from_u64(1);
@@ -348,17 +322,17 @@ mod tests {
         let mut rng = StdRng::seed_from_u64(1);
         let image = world.scan(&truth);
         let beams = choose_beams(&image, 2000, 0.2, &SensorAttitude::default(), &mut rng);
-        let place = |x: f64, y: f64, heading: f64| {
+        let lifted = |x: f64, y: f64, heading: f64| {
             let pose = Pose2::new(nalgebra::Vector2::new(x, y), heading);
             let patch = ground_patch_of(&pose.into(), &world.map(), None);
             patch.map(|patch| patch.lift(&pose, &SensorAttitude::default()))
         };
         let poses = [
-            place(3.0, 0.2, 0.1),
-            place(3.1, 0.2, 0.1),
-            place(3.0, 0.3, 0.1),
-            place(3.0, 0.2, 0.11),
-            place(900.0, 0.0, 0.0),
+            lifted(3.0, 0.2, 0.1),
+            lifted(3.1, 0.2, 0.1),
+            lifted(3.0, 0.3, 0.1),
+            lifted(3.0, 0.2, 0.11),
+            lifted(900.0, 0.0, 0.0),
         ];
         let difference = ObservationConfig::default().difference();
         let costs = costs(&world, &poses, &beams, &difference).unwrap();
@@ -379,16 +353,12 @@ mod tests {
         let beams: Vec<Beam> = (0..90)
             .map(|i| beam(if i < 40 { 5.0 } else { 10.0 }))
             .collect();
-        let counts = BeamAgreement::of(&beams, &[10.0; 90], 0.3);
-        assert_eq!((counts.hit, counts.short, counts.long), (50, 40, 0));
-        assert_eq!(counts.share(), Some(1.0));
-        assert_eq!(
-            BeamAgreement::of(&beams, &[7.0; 90], 0.3).share(),
-            Some(0.0)
-        );
-        assert_eq!(
-            BeamAgreement::of(&beams, &[f32::INFINITY; 90], 0.3).share(),
-            None
-        );
+        assert_eq!(agreement(&beams, &[10.0; 90], 0.3), Some(1.0));
+        assert_eq!(agreement(&beams, &[7.0; 90], 0.3), Some(0.0));
+        assert_eq!(agreement(&beams, &[f32::INFINITY; 90], 0.3), None);
+        // 40 beams end behind the surface, 50 on it.
+        let mut rendered_m = [4.0; 90];
+        rendered_m[40..].fill(10.2);
+        assert_eq!(agreement(&beams, &rendered_m, 0.3), Some(50.0 / 90.0));
     }
 }

@@ -1,19 +1,29 @@
-//! How the car moved between two frames, as a transform `previous_from_current` in the plane.
+//! Motion of the car between two frames, as a planar transform `previous_from_current`.
 //!
 //! ```text
 //! u_k = T_world_lidar(k−1)⁻¹ · T_world_lidar(k)
 //! ```
 //!
-//! The world frame cancels out: a recorded odometry may start anywhere and drift. From the
-//! ground truth with noise, as range-mcl does for demonstration, from a file, or not at all: then
-//! the car goes on as it went.
+//! The world frame cancels out: recorded odometry may start anywhere and drift.
 
 use rand::Rng;
 
 use super::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 
-/// One increment per pose, the first of them the identity; in the plane of the car.
+/// Known motion into a frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Odometry {
+    /// Measured: `previous_from_current`.
+    Increment(Pose2),
+    /// Commanded: velocities held since the previous frame.
+    Velocity(VelocityCommand),
+    /// Unknown: the motion into the previous frame is assumed to continue (constant velocity).
+    Unknown,
+}
+
+/// Increments between consecutive poses in the plane of the car, one per pose; the first is the
+/// identity.
 pub fn increments(world_from_lidar: &[Pose3]) -> Vec<Pose2> {
     let first = world_from_lidar.first().map(|_| Pose2::identity());
     let steps = world_from_lidar
@@ -22,9 +32,8 @@ pub fn increments(world_from_lidar: &[Pose3]) -> Vec<Pose2> {
     first.into_iter().chain(steps).collect()
 }
 
-/// Increments with noise on each of their three moves, except where the first says that nothing
-/// came before. With the ground truth's increments this is range-mcl's demonstration, and a
-/// report has to name it so.
+/// Increments with noise on turn, drive and turn; the first, which is no motion, is unchanged. With
+/// increments of the ground truth this is the demonstration of range-mcl, which reports must state.
 pub fn with_noise(increments: &[Pose2], noise: &OdometryNoise, rng: &mut impl Rng) -> Vec<Pose2> {
     increments
         .iter()
@@ -36,24 +45,13 @@ pub fn with_noise(increments: &[Pose2], noise: &OdometryNoise, rng: &mut impl Rn
         .collect()
 }
 
-/// The noise that range-mcl puts on the true increments: 0.01 rad, 0.01 m, none to the side.
+/// Noise that range-mcl adds to the true increments: 0.01 rad, 0.01 m, none laterally.
 pub fn demonstration_noise() -> OdometryNoise {
     OdometryNoise {
         turn_rad: 0.01,
         drive_m: 0.01,
         side_m: 0.0,
     }
-}
-
-/// What is known about the motion into a frame.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Odometry {
-    /// Measured: `previous_from_current`.
-    Increment(Pose2),
-    /// Commanded: speed and turn rate, held from the frame before to this one.
-    Velocity(VelocityCommand),
-    /// Nothing: the car went on as in the frame before (constant velocity).
-    Unknown,
 }
 
 #[cfg(test)]
@@ -76,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn increments_chained_from_the_first_pose_give_the_trajectory() {
+    fn the_product_of_the_increments_is_the_trajectory() {
         let poses = drive();
         let mut pose = pose2_from_pose3(&poses[0]);
         for (increment, expected) in increments(&poses).iter().zip(&poses) {
@@ -96,20 +94,20 @@ mod tests {
     }
 
     #[test]
-    fn no_poses_have_no_increments() {
+    fn a_trajectory_without_poses_has_no_increments() {
         assert_eq!(increments(&[]), []);
     }
 
     #[test]
-    fn noise_of_zero_changes_nothing_and_the_first_frame_never_has_any() {
+    fn zero_noise_changes_nothing_and_the_first_increment_has_no_noise() {
         let increments = increments(&drive());
         let mut rng = StdRng::seed_from_u64(1);
-        let silent = OdometryNoise {
+        let zero = OdometryNoise {
             turn_rad: 0.0,
             drive_m: 0.0,
             side_m: 0.0,
         };
-        for (a, b) in with_noise(&increments, &silent, &mut rng)
+        for (a, b) in with_noise(&increments, &zero, &mut rng)
             .iter()
             .zip(&increments)
         {

@@ -1,54 +1,43 @@
-//! The belief: weighted pose hypotheses.
+//! Weighted particles: the distribution over the pose of the car.
 //!
 //! ```text
 //! Σ wᵢ = 1        N_eff = 1 / Σ wᵢ²        mean = (Σ wᵢ xᵢ, Σ wᵢ yᵢ, arg Σ wᵢ e^{iθᵢ})
 //! ```
 //!
-//! Every operation keeps the weights summing to one. Thrun, Burgard and Fox, *Probabilistic
+//! Every operation keeps the sum of the weights at one. Thrun, Burgard and Fox, *Probabilistic
 //! Robotics* (2005), chapter 4.3; Kong, Liu and Wong (1994) for the effective sample size.
 
 use nalgebra::{Matrix3, Vector2, Vector3};
 
 use crate::geometry::{Pose2, circular_mean, wrap_angle};
 
-/// Where the car may be.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Hypothesis {
-    /// `p_map = map_from_lidar * p_lidar`, seen from above.
-    pub map_from_lidar: Pose2,
-    /// Height of the ground that it stands on, which tells levels above one another apart; `None`
-    /// where it never stood on any [m].
-    pub level_m: Option<f64>,
-}
-
-impl From<Pose2> for Hypothesis {
-    /// Without a level.
-    fn from(map_from_lidar: Pose2) -> Self {
-        Self {
-            map_from_lidar,
-            level_m: None,
-        }
-    }
-}
-
 /// A pose hypothesis of the filter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Particle {
-    /// `p_map = map_from_lidar * p_lidar`, seen from above.
+    /// `p_map = map_from_lidar * p_lidar`, in the plane.
     pub map_from_lidar: Pose2,
-    /// Height of the ground that it stands on, as in [`Hypothesis`] [m].
+    /// Height of the ground below it [m], which selects among several levels; `None` before any ground
+    /// was found.
     pub level_m: Option<f64>,
-    /// Share of the belief, 0 to 1.
+    /// Importance weight, 0 to 1 in a set (unitless).
     pub weight: f64,
 }
 
 impl Particle {
-    /// The particle without its weight.
-    pub fn hypothesis(&self) -> Hypothesis {
-        Hypothesis {
-            map_from_lidar: self.map_from_lidar,
-            level_m: self.level_m,
+    /// A particle of weight 1.
+    pub fn new(map_from_lidar: Pose2, level_m: Option<f64>) -> Self {
+        Self {
+            map_from_lidar,
+            level_m,
+            weight: 1.0,
         }
+    }
+}
+
+impl From<Pose2> for Particle {
+    /// A particle of weight 1 without a known level.
+    fn from(map_from_lidar: Pose2) -> Self {
+        Self::new(map_from_lidar, None)
     }
 }
 
@@ -59,22 +48,14 @@ pub struct ParticleSet {
 }
 
 impl ParticleSet {
-    /// Equally weighted hypotheses; at least one.
-    pub fn uniform(hypotheses: impl IntoIterator<Item = impl Into<Hypothesis>>) -> Self {
-        let mut particles: Vec<Particle> = hypotheses
-            .into_iter()
-            .map(Into::into)
-            .map(|hypothesis: Hypothesis| Particle {
-                map_from_lidar: hypothesis.map_from_lidar,
-                level_m: hypothesis.level_m,
-                weight: 1.0,
-            })
-            .collect();
-        debug_assert!(!particles.is_empty(), "a belief needs a hypothesis");
+    /// At least one particle, with equal weights whatever they were.
+    pub fn uniform(particles: impl IntoIterator<Item = impl Into<Particle>>) -> Self {
+        let mut particles: Vec<Particle> = particles.into_iter().map(Into::into).collect();
+        debug_assert!(!particles.is_empty(), "a distribution needs a particle");
         let weight = 1.0 / particles.len() as f64;
-        for particle in &mut particles {
-            particle.weight = weight;
-        }
+        particles
+            .iter_mut()
+            .for_each(|particle| particle.weight = weight);
         Self { particles }
     }
 
@@ -93,34 +74,35 @@ impl ParticleSet {
         &self.particles
     }
 
-    /// The hypotheses without their weights.
+    /// The poses, in the order of the particles.
     pub fn poses(&self) -> impl ExactSizeIterator<Item = &Pose2> {
         self.particles
             .iter()
             .map(|particle| &particle.map_from_lidar)
     }
 
-    /// The weights in the order of the particles.
+    /// The weights, in the order of the particles.
     pub fn weights(&self) -> Vec<f64> {
         self.particles.iter().map(|p| p.weight).collect()
     }
 
-    /// Replaces every pose by what `moved` makes of it, in order.
+    /// Moves every particle, in order.
     pub fn propagate(&mut self, mut moved: impl FnMut(&Pose2) -> Pose2) {
         for particle in &mut self.particles {
             particle.map_from_lidar = moved(&particle.map_from_lidar);
         }
     }
 
-    /// Says on which ground the particles stand, in order; those that stand on none remember the last.
+    /// Sets the heights of the ground below the particles [m], in order; particles without ground keep
+    /// the last one.
     pub fn set_levels(&mut self, levels_m: impl IntoIterator<Item = Option<f64>>) {
         for (particle, level_m) in self.particles.iter_mut().zip(levels_m) {
             particle.level_m = level_m.or(particle.level_m);
         }
     }
 
-    /// Multiplies every weight by its likelihood and normalizes (Bayes' rule). Logarithms, so
-    /// that nothing underflows; only differences between them matter.
+    /// Multiplies every weight by its likelihood and normalizes (Bayes' rule). The logarithms may have
+    /// any common offset, and their exponentials do not underflow.
     pub fn reweight(&mut self, log_likelihoods: &[f64]) {
         debug_assert_eq!(log_likelihoods.len(), self.len());
         let highest = self
@@ -142,38 +124,28 @@ impl ParticleSet {
         }
     }
 
-    /// How many equally weighted particles would be worth as much: 1 to N (unitless).
+    /// Number of equally weighted particles with the same variance, 1 to N (unitless).
     pub fn effective_sample_size(&self) -> f64 {
         1.0 / self.particles.iter().map(|p| p.weight.powi(2)).sum::<f64>()
     }
 
-    /// The equally weighted set of the given members, some of them more than once.
+    /// Copies of the particles with these indices, equally weighted; an index may occur several times.
     #[must_use]
-    pub fn selected(&self, members: &[usize]) -> Self {
-        Self::uniform(members.iter().map(|&i| self.particles[i].hypothesis()))
+    pub fn selected(&self, indices: &[usize]) -> Self {
+        Self::uniform(indices.iter().map(|&index| self.particles[index]))
     }
 
-    /// The particle with the largest weight, of equals the first.
+    /// The particle with the largest weight, the first among equals.
     pub fn best(&self) -> Particle {
-        self.particles
-            .iter()
-            .copied()
-            .reduce(|best, next| {
-                if next.weight > best.weight {
-                    next
-                } else {
-                    best
-                }
-            })
-            .unwrap_or(Particle {
-                map_from_lidar: Pose2::identity(),
-                level_m: None,
-                weight: 0.0,
-            })
+        let heavier = |best: Particle, next: &Particle| match next.weight > best.weight {
+            true => *next,
+            false => best,
+        };
+        self.particles.iter().fold(self.particles[0], heavier)
     }
 
-    /// The weighted mean, with the circular mean of the headings; where the headings cancel out,
-    /// the heading of the best particle.
+    /// Weighted mean, with the circular mean of the headings; the heading of the best particle where
+    /// the circular mean is undefined.
     pub fn mean(&self) -> Pose2 {
         let position: Vector2<f64> = self
             .particles
@@ -189,7 +161,7 @@ impl ParticleSet {
         Pose2::new(position, heading_rad)
     }
 
-    /// Weighted covariance of (x, y, heading) about a pose, in the map frame [m², m·rad, rad²].
+    /// Weighted covariance of (x, y, heading) about a pose, in the axes of the map [m², m·rad, rad²].
     pub fn covariance_about(&self, center: &Pose2) -> Matrix3<f64> {
         self.particles
             .iter()
@@ -200,21 +172,20 @@ impl ParticleSet {
             .sum()
     }
 
-    /// Covariance of (x, y, heading) of the mean as an estimate of the pose, in the map frame
-    /// [m², m·rad, rad²]: that of the belief, and that of a mean of so few draws,
+    /// Covariance of (x, y, heading) of the mean as an estimate of the pose, in the axes of the map
+    /// [m², m·rad, rad²]: that of the distribution, and that of the mean of so few samples,
     ///
     /// ```text
-    /// Σ = Σ_weighted + Σ_drawn / ESS        Σ_drawn: of the particles without their weights
+    /// Σ = Σ_weighted + Σ_samples / N_eff        Σ_samples: of the particles without their weights
     /// ```
     pub fn covariance_of_estimate(&self) -> Matrix3<f64> {
-        let mean = self.mean();
-        let drawn = Self::uniform(self.poses().copied());
-        let of_drawing = drawn.covariance_about(&drawn.mean()) / self.effective_sample_size();
-        self.covariance_about(&mean) + of_drawing
+        let samples = Self::uniform(self.poses().copied());
+        let of_mean = samples.covariance_about(&samples.mean()) / self.effective_sample_size();
+        self.covariance_about(&self.mean()) + of_mean
     }
 }
 
-/// How far a pose is from another: Δx, Δy [m] in the map frame and the turn in [-π, π) [rad].
+/// Difference of two poses: Δx, Δy [m] in the axes of the map and the turn in [-π, π) [rad].
 pub fn deviation(pose: &Pose2, center: &Pose2) -> Vector3<f64> {
     let offset = pose.translation.vector - center.translation.vector;
     let turn_rad = wrap_angle(pose.rotation.angle() - center.rotation.angle());
@@ -248,14 +219,14 @@ mod tests {
     }
 
     #[test]
-    fn the_covariance_of_an_estimate_of_few_draws_covers_its_errors() {
+    fn the_covariance_of_an_estimate_from_few_samples_matches_its_errors() {
         let mut rng = StdRng::seed_from_u64(3);
         let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
         let trials = 3000;
         let mut squared = 0.0;
         for _ in 0..trials {
             let truth_m = normal();
-            // Drawn twice as wide as what the weights then say.
+            // Sampled twice as wide as the weighted distribution.
             let mut set = ParticleSet::uniform((0..8).map(|_| pose(2.0 * normal(), 0.0, 0.0)));
             let logs: Vec<f64> = set
                 .poses()
@@ -265,7 +236,7 @@ mod tests {
             let error_m = set.mean().translation.x - truth_m;
             squared += error_m.powi(2) / set.covariance_of_estimate()[(0, 0)];
         }
-        // On the safe side; the covariance of the weighted particles alone gives 1.1.
+        // Slightly conservative; the covariance of the weighted particles alone gives 1.1.
         let normalized = squared / f64::from(trials);
         assert!((0.7..1.1).contains(&normalized), "{normalized}");
     }
@@ -301,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn the_effective_sample_size_is_all_of_equals_and_one_of_a_single_survivor() {
+    fn the_effective_sample_size_is_n_for_equal_weights_and_one_for_a_single_weight() {
         let mut set = ParticleSet::uniform((0..5).map(|i| pose(f64::from(i), 0.0, 0.0)));
         assert_relative_eq!(set.effective_sample_size(), 5.0, epsilon = 1e-9);
         set.reweight(&[0.0, -1e6, -1e6, -1e6, -1e6]);

@@ -1,24 +1,24 @@
-//! Where particles are drawn while the belief is narrow: where odometry and scan agree.
+//! Approximation of the optimal proposal distribution by registration, for a narrow distribution.
 //!
-//! Particles that follow the odometry alone are spread by its noise, and most of them lie where
-//! the scan says that the car is not. So the scan is laid onto the map once for all particles, and
-//! they are drawn from what odometry and scan say together:
+//! Particles that are predicted by the odometry alone have the spread of its noise, and most of them are
+//! unlikely given the scan. The scan is therefore registered with the map once for all particles, which
+//! are sampled from the product of prediction and registration:
 //!
 //! ```text
-//! prior      N(m, P)       the particles after the motion
-//! scan       N(s, S)       the scan laid onto the map, from m on (registration)
+//! prior      N(m, P)       the predicted particles
+//! scan       N(s, S)       registration of the scan with the map, starting at m
 //! proposal   N(q, k² Q)    Q = (P⁻¹ + S⁻¹)⁻¹,   q = m + Q S⁻¹ (s − m)
 //! weight     w ∝ p(scan | x, map)ᵝ N(x; m, P) / N(x; q, k² Q)
 //! ```
 //!
-//! The registration also solves for the car's tilt and height, which all particles share.
+//! The registration also estimates height, roll and pitch, which all particles share.
 //! Grisetti, Stachniss and Burgard, *Improved Techniques for Grid Mapping with Rao-Blackwellized
 //! Particle Filters* (2007), section III; Kotecha and Djurić, *Gaussian Particle Filtering* (2003),
-//! for a belief that is its mean and covariance.
+//! for a distribution that is represented by its mean and covariance.
 
 use nalgebra::{Cholesky, Const, Matrix3, Vector3};
-use rand::Rng;
-use rand_distr::{Distribution, StandardNormal};
+use rand::{Rng, RngExt as _};
+use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
 
 use super::particles::deviation;
@@ -28,36 +28,37 @@ use crate::validation::{
     InvalidValue, Validate, at_least_one, fraction, nested, positive, require,
 };
 
-/// Whether and how the scan takes part in the proposal.
+/// Proposal distribution while tracking.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ProposalConfig {
-    /// Whether it does; if not, particles follow the odometry alone, as in range-mcl.
+    /// Whether the scan is part of the proposal; otherwise the prediction alone is, as in range-mcl.
     pub scan: bool,
-    /// Beams that are laid onto the map.
+    /// Number of beams that are registered.
     pub beams: usize,
-    /// At most this share of them looks at the road, which gives height, roll and pitch.
+    /// Largest share of them that end on the road, which determines height, roll and pitch (unitless).
     pub road_share: f64,
-    /// Beams by which the particles are weighed.
+    /// Number of beams that weight the particles.
     pub weighed_beams: usize,
-    /// How the scan is laid onto the map.
+    /// Registration of the scan with the map.
     pub registration: RegistrationConfig,
-    /// Widening k of the proposal, at least 1: particles shall reach beyond what is expected.
+    /// Factor k of the standard deviations of the proposal, at least 1, so that its tails are heavier than
+    /// those of the target (unitless).
     pub widening: f64,
-    /// A scan that came to lie this many standard deviations of the prior away is not believed.
+    /// Distance from the prior beyond which a registration is rejected (standard deviations).
     pub max_sigmas: f64,
 }
 
 impl Default for ProposalConfig {
-    /// Our own values.
+    /// Values of this project.
     fn default() -> Self {
         Self {
             scan: true,
             beams: 2400,
             road_share: 0.4,
             weighed_beams: 300,
-            // Drawing and weighing add a width of their own, into which the rest of the map's error
-            // fits: with more, the covariances of simulated drives are too large.
+            // Sampling and weighting add variance, which covers the rest of the map error: with a larger
+            // value the covariances of simulated drives are too large.
             registration: RegistrationConfig {
                 map_error_m: 0.001,
                 ..RegistrationConfig::default()
@@ -84,18 +85,18 @@ impl Validate for ProposalConfig {
     }
 }
 
-/// A Gaussian of poses in the plane, in the axes of the map.
+/// Normal distribution of planar poses, in the axes of the map.
 #[derive(Clone, Debug)]
 pub struct Gaussian {
-    /// Its middle.
+    /// Mean.
     pub mean: Pose2,
-    /// Of (x, y, heading) [m², m·rad, rad²].
+    /// Covariance of (x, y, heading) [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
     cholesky: Cholesky<f64, Const<3>>,
 }
 
 impl Gaussian {
-    /// Around a pose; `None` where the covariance is not positive definite.
+    /// `None` where the covariance is not positive definite.
     pub fn new(mean: Pose2, covariance: Matrix3<f64>) -> Option<Self> {
         Some(Self {
             mean,
@@ -104,36 +105,36 @@ impl Gaussian {
         })
     }
 
-    /// Squared distance of a pose from the middle, in standard deviations (Mahalanobis).
+    /// Squared Mahalanobis distance of a pose from the mean (unitless).
     pub fn squared_distance(&self, pose: &Pose2) -> f64 {
         let offset = deviation(pose, &self.mean);
         offset.dot(&self.cholesky.solve(&offset))
     }
 
-    /// Logarithm of the density, but for a constant that is the same for all poses.
+    /// Logarithm of the density, up to a constant.
     pub fn log_density(&self, pose: &Pose2) -> f64 {
         -0.5 * self.squared_distance(pose)
     }
 
-    /// Draws poses.
+    /// Samples poses.
     pub fn sample(&self, count: usize, rng: &mut impl Rng) -> Vec<Pose2> {
         let root = self.cholesky.l();
         let draw = |_| {
-            let deviates: [f64; 3] = std::array::from_fn(|_| StandardNormal.sample(rng));
-            shifted(&self.mean, &(root * Vector3::from(deviates)))
+            let deviates = Vector3::from_fn(|_, _| rng.sample(StandardNormal));
+            shifted(&self.mean, &(root * deviates))
         };
         (0..count).map(draw).collect()
     }
 
-    /// What two Gaussians say together: their product.
+    /// Normalized product with another one.
     pub fn fused(&self, other: &Self) -> Option<Self> {
         let information = self.cholesky.inverse() + other.cholesky.inverse();
         let covariance = information.cholesky()?.inverse();
-        let pull = other.cholesky.solve(&deviation(&other.mean, &self.mean));
-        Self::new(shifted(&self.mean, &(covariance * pull)), covariance)
+        let weighted = other.cholesky.solve(&deviation(&other.mean, &self.mean));
+        Self::new(shifted(&self.mean, &(covariance * weighted)), covariance)
     }
 
-    /// The same `factor` times as wide.
+    /// Scales the standard deviations.
     pub fn widened(&self, factor: f64) -> Option<Self> {
         Self::new(self.mean, self.covariance * factor.powi(2))
     }
@@ -146,11 +147,11 @@ fn shifted(pose: &Pose2, offset: &Vector3<f64>) -> Pose2 {
     )
 }
 
-/// A covariance that has an inverse, also where all particles are alike: no belief is narrower
-/// than a tenth of a millimetre and a thousandth of a degree.
+/// Returns a covariance that is positive definite also for identical particles: variances of a tenth of a
+/// millimetre and a thousandth of a degree are added.
 pub fn regular(covariance: &Matrix3<f64>) -> Matrix3<f64> {
-    const LEAST: Vector3<f64> = Vector3::new(1e-8, 1e-8, 3e-10);
-    covariance + Matrix3::from_diagonal(&LEAST)
+    const SMALLEST: Vector3<f64> = Vector3::new(1e-8, 1e-8, 3e-10);
+    covariance + Matrix3::from_diagonal(&SMALLEST)
 }
 
 #[cfg(test)]
@@ -169,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn two_that_are_equally_sure_meet_in_the_middle_and_are_surer_together() {
+    fn the_product_of_equal_gaussians_has_the_average_mean_and_half_the_covariance() {
         let (a, b) = (gaussian(0.0, 3.1, 0.2), gaussian(1.0, -3.1, 0.2));
         let fused = a.fused(&b).unwrap();
         assert_relative_eq!(fused.mean.translation.x, 0.5, epsilon = 1e-9);
@@ -179,32 +180,31 @@ mod tests {
     }
 
     #[test]
-    fn who_knows_nothing_changes_nothing() {
-        let sure = gaussian(0.4, 0.2, 0.1);
-        let unsure = gaussian(9.0, 2.0, 1e6);
-        let fused = sure.fused(&unsure).unwrap();
-        assert_relative_eq!(fused.mean, sure.mean, epsilon = 1e-9);
-        assert_relative_eq!(fused.covariance, sure.covariance, epsilon = 1e-9);
+    fn a_gaussian_without_information_does_not_change_the_product() {
+        let narrow = gaussian(0.4, 0.2, 0.1);
+        let wide = gaussian(9.0, 2.0, 1e6);
+        let fused = narrow.fused(&wide).unwrap();
+        assert_relative_eq!(fused.mean, narrow.mean, epsilon = 1e-9);
+        assert_relative_eq!(fused.covariance, narrow.covariance, epsilon = 1e-9);
     }
 
     #[test]
-    fn samples_have_the_mean_and_the_covariance_that_they_are_drawn_from() {
-        let wanted = gaussian(2.0, 1.0, 0.3);
+    fn samples_have_the_covariance_of_their_gaussian() {
+        let gaussian = gaussian(2.0, 1.0, 0.3);
         let count = 20_000;
-        let poses = wanted.sample(count, &mut StdRng::seed_from_u64(1));
-        let drawn = ParticleSet::uniform(poses);
-        let found = drawn.covariance_about(&wanted.mean);
+        let poses = gaussian.sample(count, &mut StdRng::seed_from_u64(1));
+        let particles = ParticleSet::uniform(poses);
+        let found = particles.covariance_about(&gaussian.mean);
         let error = 4.0 * (2.0 / count as f64).sqrt();
-        assert_relative_eq!(found, wanted.covariance, epsilon = error * 0.36);
+        assert_relative_eq!(found, gaussian.covariance, epsilon = error * 0.36);
         for axis in 0..3 {
-            let (found, wanted) = (found[(axis, axis)], wanted.covariance[(axis, axis)]);
-            assert_relative_eq!(found, wanted, max_relative = error);
+            let expected = gaussian.covariance[(axis, axis)];
+            assert_relative_eq!(found[(axis, axis)], expected, max_relative = error);
         }
     }
 
     #[test]
-    fn weights_undo_the_choice_of_the_proposal() {
-        // Drawn from a wide proposal and weighed by prior over proposal, the particles are the prior.
+    fn importance_weights_recover_the_prior_from_the_proposal() {
         let prior = gaussian(1.0, 0.0, 0.2);
         let proposal = gaussian(1.1, 0.0, 0.4);
         let poses = proposal.sample(50_000, &mut StdRng::seed_from_u64(2));
@@ -220,8 +220,8 @@ mod tests {
     }
 
     #[test]
-    fn particles_that_are_all_alike_have_a_covariance_with_an_inverse() {
-        let alike = regular(&Matrix3::zeros());
-        assert!(Gaussian::new(Pose2::identity(), alike).is_some());
+    fn the_regular_covariance_of_identical_particles_is_positive_definite() {
+        let covariance = regular(&Matrix3::zeros());
+        assert!(Gaussian::new(Pose2::identity(), covariance).is_some());
     }
 }

@@ -1,5 +1,5 @@
-//! Particles where the belief is: systematic resampling, the number of particles that a belief
-//! needs, and a jitter that keeps copies apart.
+//! Resampling: systematic resampling, KLD sampling for the number of particles, and regularization,
+//! which separates the copies of a particle by jitter.
 //!
 //! ```text
 //! pointers  r + k/N,  r ~ U(0, 1/N)                      E[copies of i] = N wᵢ
@@ -15,30 +15,30 @@ use std::collections::BTreeSet;
 
 use nalgebra::{Matrix3, Vector3};
 use rand::{Rng, RngExt as _};
-use rand_distr::{Distribution, StandardNormal};
+use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
 
 use super::particles::{ParticleSet, spread};
 use crate::geometry::{Pose2, wrap_angle};
 use crate::validation::{InvalidValue, Validate, fraction, not_negative, positive};
 
-/// When to resample, and how far copies of a particle are set apart.
+/// Threshold of resampling, and jitter of the copies of a particle.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ResamplingConfig {
-    /// Resample when the effective sample size is below this share of the particles.
+    /// Share of the particles below which the effective sample size triggers resampling (unitless).
     pub min_effective_fraction: f64,
-    /// The jitter as a multiple of the kernel width h; 0 for none, as in range-mcl.
+    /// Jitter as a multiple of the kernel width h (unitless); 0 for none, as in range-mcl.
     pub jitter: f64,
-    /// The jitter never exceeds this in x and y, however wide the belief [m].
+    /// Largest standard deviation of the jitter in position, however wide the distribution [m].
     pub max_jitter_m: f64,
-    /// And this in heading [rad].
+    /// Largest standard deviation of the jitter in heading [rad].
     pub max_jitter_rad: f64,
 }
 
 impl Default for ResamplingConfig {
-    /// range-mcl's 0.75; half the optimal kernel, since a belief is narrower than the Gaussian of
-    /// its covariance.
+    /// range-mcl's 0.75; half the optimal kernel, since the distribution is narrower than the Gaussian
+    /// with its covariance.
     fn default() -> Self {
         Self {
             min_effective_fraction: 0.75,
@@ -58,13 +58,13 @@ impl Validate for ResamplingConfig {
     }
 }
 
-/// How many particles a belief needs while it is wide.
+/// KLD sampling: the number of particles of a wide distribution.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct KldConfig {
-    /// Bound on the Kullback-Leibler distance between the particles and the belief, ε (unitless).
+    /// Bound on the Kullback-Leibler distance between particles and distribution, ε (unitless).
     pub max_distance: f64,
-    /// Quantile of the standard normal distribution, z: how surely the bound holds.
+    /// Quantile of the standard normal distribution for the probability of the bound, z (unitless).
     pub quantile: f64,
     /// Side of a bin in x and y [m].
     pub bin_m: f64,
@@ -93,12 +93,13 @@ impl Validate for KldConfig {
     }
 }
 
-/// Draws `count` members with one random number: each is drawn as often as its weight says,
-/// rounded up or down, and on average exactly that often. `weights` sum to one.
+/// Systematic resampling: draws `count` indices with one random number. The number of copies of an
+/// index is `count` times its weight, rounded up or down, and equal to that on average. `weights`
+/// sum to one.
 pub fn systematic(weights: &[f64], count: usize, rng: &mut impl Rng) -> Vec<usize> {
     let step = 1.0 / count as f64;
     let offset = rng.random::<f64>() * step;
-    let mut members = Vec::with_capacity(count);
+    let mut indices = Vec::with_capacity(count);
     let mut index = 0;
     let mut cumulative = weights[0];
     for k in 0..count {
@@ -107,12 +108,12 @@ pub fn systematic(weights: &[f64], count: usize, rng: &mut impl Rng) -> Vec<usiz
             index += 1;
             cumulative += weights[index];
         }
-        members.push(index);
+        indices.push(index);
     }
-    members
+    indices
 }
 
-/// The number of particles after which the belief is known well enough (unitless).
+/// Number of particles for which the bound of KLD sampling holds.
 pub fn kld_sample_size(occupied_bins: usize, config: &KldConfig) -> usize {
     if occupied_bins < 2 {
         return 1;
@@ -123,7 +124,7 @@ pub fn kld_sample_size(occupied_bins: usize, config: &KldConfig) -> usize {
     (degrees / (2.0 * config.max_distance) * cube).ceil() as usize
 }
 
-/// How many bins of (x, y, heading) the particles occupy.
+/// Number of bins of (x, y, heading) that contain poses.
 pub fn occupied_bins<'a>(poses: impl IntoIterator<Item = &'a Pose2>, config: &KldConfig) -> usize {
     let bin = |pose: &Pose2| {
         let place = pose.translation.vector / config.bin_m;
@@ -134,8 +135,8 @@ pub fn occupied_bins<'a>(poses: impl IntoIterator<Item = &'a Pose2>, config: &Kl
     bins.len()
 }
 
-/// Sets particles apart by a small share of the belief's own covariance, so that copies of one
-/// particle explore its surroundings. `covariance` is that of the belief before resampling.
+/// Separates the copies of particles by samples of a kernel: the scaled covariance of the distribution
+/// before resampling, of (x, y, heading) [m², m·rad, rad²].
 pub fn jitter(
     particles: &mut ParticleSet,
     covariance: &Matrix3<f64>,
@@ -143,12 +144,11 @@ pub fn jitter(
     rng: &mut impl Rng,
 ) {
     let kernel = config.jitter * kernel_width(particles.len());
-    let Some(root) = capped_root(covariance, kernel, config) else {
+    let Some(root) = limited_root(covariance, kernel, config) else {
         return;
     };
     particles.propagate(|pose| {
-        let deviates: [f64; 3] = std::array::from_fn(|_| StandardNormal.sample(rng));
-        let offset = root * Vector3::from(deviates);
+        let offset = root * Vector3::from_fn(|_, _| rng.sample(StandardNormal));
         Pose2::new(
             pose.translation.vector + offset.xy(),
             pose.rotation.angle() + offset.z,
@@ -156,29 +156,26 @@ pub fn jitter(
     });
 }
 
-/// Width of the optimal Gaussian kernel for `count` samples of a Gaussian in three dimensions, in
-/// standard deviations.
+/// Width of the optimal Gaussian kernel for `count` samples of a Gaussian in three dimensions
+/// (standard deviations).
 fn kernel_width(count: usize) -> f64 {
     (4.0 / (5.0 * count as f64)).powf(1.0 / 7.0)
 }
 
-/// A square root of kernel² · covariance, with its spread cut to the caps; `None` where the
-/// covariance is not positive definite (all particles alike).
-fn capped_root(
+/// Square root of kernel² · covariance, limited to the largest standard deviations; `None` where the
+/// covariance is not positive definite, as for identical particles.
+fn limited_root(
     covariance: &Matrix3<f64>,
     kernel: f64,
     config: &ResamplingConfig,
 ) -> Option<Matrix3<f64>> {
     let (position_m, heading_rad) = spread(covariance);
-    let cap = |sigma: f64, most: f64| {
-        if sigma * kernel > most {
-            most / sigma
-        } else {
-            kernel
-        }
+    let scale = |sigma: f64, largest: f64| match sigma * kernel > largest {
+        true => largest / sigma,
+        false => kernel,
     };
-    let scale_m = cap(position_m, config.max_jitter_m);
-    let scale_rad = cap(heading_rad, config.max_jitter_rad);
+    let scale_m = scale(position_m, config.max_jitter_m);
+    let scale_rad = scale(heading_rad, config.max_jitter_rad);
     let scale = Matrix3::from_diagonal(&Vector3::new(scale_m, scale_m, scale_rad));
     Some(scale * covariance.cholesky()?.l())
 }
@@ -191,13 +188,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_member_is_drawn_as_often_as_its_weight_says_up_to_rounding() {
+    fn the_number_of_copies_is_proportional_to_the_weight_up_to_rounding() {
         let weights = [0.05, 0.4, 0.0, 0.33, 0.22];
         let mut rng = StdRng::seed_from_u64(1);
         for _ in 0..200 {
-            let members = systematic(&weights, 10, &mut rng);
+            let indices = systematic(&weights, 10, &mut rng);
             for (index, weight) in weights.iter().enumerate() {
-                let copies = members.iter().filter(|&&m| m == index).count() as f64;
+                let copies = indices.iter().filter(|&&drawn| drawn == index).count() as f64;
                 assert!(
                     (copies - 10.0 * weight).abs() < 1.0 + 1e-9,
                     "{copies} {weight}"
@@ -213,8 +210,8 @@ mod tests {
         let rounds = 20_000;
         let mut copies = [0.0; 4];
         for _ in 0..rounds {
-            for member in systematic(&weights, 3, &mut rng) {
-                copies[member] += 1.0 / f64::from(3 * rounds);
+            for index in systematic(&weights, 3, &mut rng) {
+                copies[index] += 1.0 / f64::from(3 * rounds);
             }
         }
         for (share, weight) in copies.iter().zip(weights) {
@@ -228,14 +225,14 @@ mod tests {
     }
 
     #[test]
-    fn equal_weights_are_a_copy() {
+    fn equal_weights_keep_every_particle_once() {
         let mut rng = StdRng::seed_from_u64(3);
-        let members = systematic(&[0.125; 8], 8, &mut rng);
-        assert_eq!(members, (0..8).collect::<Vec<_>>());
+        let indices = systematic(&[0.125; 8], 8, &mut rng);
+        assert_eq!(indices, (0..8).collect::<Vec<_>>());
     }
 
     #[test]
-    fn a_wider_belief_needs_more_particles() {
+    fn a_wider_distribution_needs_more_particles() {
         let config = KldConfig::default();
         assert_eq!(kld_sample_size(0, &config), 1);
         let sizes: Vec<usize> = [2, 10, 100, 1000]
@@ -248,7 +245,7 @@ mod tests {
     }
 
     #[test]
-    fn jitter_has_the_spread_of_the_kernel_and_no_more_than_the_cap() {
+    fn jitter_has_the_spread_of_the_kernel_up_to_its_limit() {
         let covariance = Matrix3::from_diagonal(&Vector3::new(0.04, 0.01, 1.0));
         let config = ResamplingConfig {
             jitter: 1.0,

@@ -1,7 +1,7 @@
-//! Trusting a frame no more than the particles can bear.
+//! Tempering of the likelihood, so that enough effective particles remain.
 //!
-//! The beams of a frame are not independent, and far more precise than a cloud of particles is
-//! dense: taken at its word, the likelihood leaves one survivor. So it is raised to a power,
+//! The beams of a frame are not independent, and the likelihood is far more peaked than the particles
+//! are dense: unchanged, it would leave a single effective particle. It is therefore raised to a power,
 //!
 //! ```text
 //! wᵢ ∝ wᵢ · L_iᵝ        β = max { β ≤ 1 : N_eff(β) ≥ N_min }
@@ -9,28 +9,64 @@
 //!
 //! the largest that leaves enough effective particles. Del Moral, Doucet and Jasra, *An Adaptive
 //! Sequential Monte Carlo Method for Approximate Bayesian Computation* (2012), section 3; Deutscher,
-//! Blake and Reid, *Articulated Body Motion Capture by Annealed Particle Filtering*, CVPR 2000.
+//! Blake and Reid, *Articulated Body Motion Capture by Annealed Particle Filtering*, CVPR 2000, for
+//! several rounds of it in a frame.
 
-/// The exponent β, at most `most`, for the effective sample size `min_effective`, to 1e-4 relative.
-///
-/// `most` itself where even that leaves enough; 0 where the weights alone leave too few already.
-pub fn exponent(weights: &[f64], log_likelihoods: &[f64], min_effective: f64, most: f64) -> f64 {
-    let enough = |beta: f64| effective(weights, log_likelihoods, beta) >= min_effective;
-    if enough(most) {
-        return most;
+use serde::{Deserialize, Serialize};
+
+use crate::validation::{InvalidValue, Validate, at_least_one, fraction};
+
+/// Tempering of the likelihood within a frame.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TemperingConfig {
+    /// Smallest share of effective particles that a frame may leave (unitless); 0 uses the likelihood
+    /// unchanged, as range-mcl does.
+    pub min_effective_fraction: f64,
+    /// Rounds of reweighting and resampling per frame while searching.
+    pub searching_rounds: usize,
+    /// Rounds of reweighting and resampling per frame while tracking.
+    pub tracking_rounds: usize,
+}
+
+impl Default for TemperingConfig {
+    /// Values of this project.
+    fn default() -> Self {
+        Self {
+            min_effective_fraction: 0.2,
+            searching_rounds: 4,
+            tracking_rounds: 1,
+        }
     }
-    if !enough(0.0) {
+}
+
+impl Validate for TemperingConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        fraction("min_effective_fraction", self.min_effective_fraction)?;
+        at_least_one("searching_rounds", self.searching_rounds)?;
+        at_least_one("tracking_rounds", self.tracking_rounds)
+    }
+}
+
+/// Largest exponent β up to `largest` that leaves an effective sample size of `min_effective`, to 1e-4
+/// relative; 0 where the weights alone leave fewer.
+pub fn exponent(weights: &[f64], log_likelihoods: &[f64], min_effective: f64, largest: f64) -> f64 {
+    let is_enough = |beta: f64| effective(weights, log_likelihoods, beta) >= min_effective;
+    if is_enough(largest) {
+        return largest;
+    }
+    if !is_enough(0.0) {
         return 0.0;
     }
-    // The scale is unknown: halve down to a β that leaves enough, then bisect above it.
-    let mut low = 0.5 * most;
-    while !enough(low) && low > most * 1e-12 {
+    // The scale of β is unknown: halve it until it leaves enough, then bisect above that.
+    let mut low = 0.5 * largest;
+    while !is_enough(low) && low > largest * 1e-12 {
         low *= 0.5;
     }
     let mut high = 2.0 * low;
     while high - low > 1e-4 * high {
         let middle = 0.5 * (low + high);
-        if enough(middle) {
+        if is_enough(middle) {
             low = middle;
         } else {
             high = middle;
@@ -39,7 +75,7 @@ pub fn exponent(weights: &[f64], log_likelihoods: &[f64], min_effective: f64, mo
     low
 }
 
-/// The effective sample size that an exponent leaves.
+/// Effective sample size after tempering with an exponent.
 fn effective(weights: &[f64], log_likelihoods: &[f64], beta: f64) -> f64 {
     let highest = weights
         .iter()
@@ -62,12 +98,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_flat_likelihood_is_taken_at_its_word() {
+    fn a_flat_likelihood_is_used_unchanged() {
         assert_eq!(exponent(&[0.25; 4], &[-3.0; 4], 2.0, 1.0), 1.0);
     }
 
     #[test]
-    fn a_sharp_likelihood_leaves_just_enough_particles() {
+    fn a_peaked_likelihood_leaves_just_enough_effective_particles() {
         let logs: Vec<f64> = (0..100).map(|i| -50.0 * f64::from(i)).collect();
         let weights = [0.01; 100];
         let beta = exponent(&weights, &logs, 30.0, 1.0);
@@ -76,17 +112,17 @@ mod tests {
     }
 
     #[test]
-    fn scaling_the_likelihood_scales_the_exponent_back() {
+    fn the_exponent_is_inversely_proportional_to_the_scale_of_the_log_likelihood() {
         let logs: Vec<f64> = (0..50).map(|i| -f64::from(i * i)).collect();
-        let sharper: Vec<f64> = logs.iter().map(|log| 8.0 * log).collect();
+        let scaled: Vec<f64> = logs.iter().map(|log| 8.0 * log).collect();
         let weights = [0.02; 50];
         let beta = exponent(&weights, &logs, 10.0, 1.0);
-        let sharper_beta = exponent(&weights, &sharper, 10.0, 1.0);
-        assert_relative_eq!(beta, 8.0 * sharper_beta, max_relative = 1e-3);
+        let scaled_beta = exponent(&weights, &scaled, 10.0, 1.0);
+        assert_relative_eq!(beta, 8.0 * scaled_beta, max_relative = 1e-3);
     }
 
     #[test]
-    fn weights_that_are_too_few_already_are_left_alone() {
+    fn weights_with_too_few_effective_particles_are_unchanged() {
         assert_eq!(
             exponent(&[0.97, 0.01, 0.01, 0.01], &[0.0, -9.0, 0.0, 0.0], 3.0, 1.0),
             0.0

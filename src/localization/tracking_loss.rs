@@ -12,8 +12,9 @@
 //! likelihood instead; here traffic in front of the map must not raise an alarm, so that beams that
 //! end in front of the map are not counted.
 
-use crate::validation::{InvalidValue, Validate, at_least_one, fraction, positive, require};
 use serde::{Deserialize, Serialize};
+
+use crate::validation::{InvalidValue, Validate, at_least_one, fraction, positive, require};
 
 /// State of the filter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -122,11 +123,6 @@ impl AgreementMonitor {
         };
         fast < config.min_agreement || fast < config.lost_fraction * slow
     }
-
-    /// The slow average; `None` before the first frame.
-    pub fn expected(&self) -> Option<f64> {
-        self.slow
-    }
 }
 
 #[cfg(test)]
@@ -143,14 +139,14 @@ mod tests {
     }
 
     #[test]
-    fn an_agreeing_map_raises_no_alarm_and_a_map_that_never_agrees_does() {
+    fn tracking_is_lost_only_where_the_scan_disagrees_with_the_map() {
         assert!(!after(&[0.9; 50]));
         assert!(!after(&[0.7; 50]));
         assert!(after(&[0.3; 1]));
     }
 
     #[test]
-    fn one_bad_frame_is_no_alarm_and_five_are() {
+    fn tracking_is_lost_after_five_disagreeing_frames_and_not_after_one() {
         let mut frames = vec![0.95; 30];
         frames.push(0.5);
         assert!(!after(&frames));
@@ -159,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_that_cannot_tell_change_nothing() {
+    fn frames_without_agreement_change_nothing() {
         let config = TrackingLossConfig::default();
         let mut monitor = AgreementMonitor::default();
         monitor.observe(None, &config);

@@ -11,6 +11,7 @@ use nalgebra::{Matrix3, SymmetricEigen, Vector2, Vector3};
 
 use crate::geometry::{Pose2, Pose3, Vec3};
 use crate::lidar::Beam;
+use crate::localization::observation::costs;
 use crate::map::{GroundMap, GroundPatch, SensorAttitude};
 use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
 
@@ -84,11 +85,10 @@ impl FrameObjective<'_> {
             .iter()
             .map(|pose| self.lift(pose, remembered))
             .collect();
-        let on_ground: Vec<Pose3> = lifted.iter().flatten().copied().collect();
-        let mut costs = self.costs_in_space(&on_ground)?.into_iter();
-        Ok(lifted
-            .iter()
-            .map(|pose| pose.and_then(|_| costs.next()).unwrap_or(f64::INFINITY))
+        let costs = costs(self.renderer, &lifted, self.beams, &self.difference)?;
+        Ok(costs
+            .into_iter()
+            .map(|cost_m| cost_m.unwrap_or(f64::INFINITY))
             .collect())
     }
 
@@ -136,8 +136,8 @@ impl FrameObjective<'_> {
 /// Steps of the second differences: x, y [m], heading [rad]. About the width of the minimum.
 const STEP: Vector3<f64> = Vector3::new(0.05, 0.05, 0.005);
 
-/// The places of the second differences in steps: the middle, both ways along every axis, and both ways
-/// along the diagonals of every pair of axes.
+/// The offsets of the second differences in steps: the center, both directions of every axis, and both
+/// directions of the diagonals of every pair of axes.
 fn stencil() -> Vec<Vector3<f64>> {
     let mut offsets = vec![Vector3::zeros()];
     for axis in 0..3 {
@@ -220,7 +220,7 @@ mod tests {
         let costs = objective.costs(&off, None).unwrap();
         assert_eq!(costs[0], f64::INFINITY);
         assert!(costs[1] < 1e-3);
-        // Nothing is known of the pose where the poses around it cannot be told apart.
+        // The covariance is large where the costs of the poses around it are unknown.
         let unknown = objective.covariance(&off[0], None, 0.002).unwrap();
         assert!(unknown.iter().all(|entry| entry.is_finite()) && unknown[(0, 0)] > 0.1);
         let patch = world.ground.patch_under(&off[1], None);

@@ -89,24 +89,13 @@ impl Validate for RefinementConfig {
         not_negative("reach_sigmas", self.reach_sigmas)?;
         positive("min_reach_m", self.min_reach_m)?;
         positive("min_reach_rad", self.min_reach_rad)?;
-        require(
-            self.max_reach_m.is_finite() && self.max_reach_m >= self.min_reach_m,
-            "max_reach_m",
-            self.max_reach_m,
-            format!(
-                "it must not be less than min_reach_m, which is {}",
-                self.min_reach_m
-            ),
-        )?;
-        require(
-            self.max_reach_rad.is_finite() && self.max_reach_rad >= self.min_reach_rad,
-            "max_reach_rad",
-            self.max_reach_rad,
-            format!(
-                "it must not be less than min_reach_rad, which is {}",
-                self.min_reach_rad
-            ),
-        )?;
+        let ordered = |max_key: &str, max: f64, min_key: &str, min: f64| {
+            let remedy = format!("it must not be less than {min_key}, which is {min}");
+            require(max.is_finite() && max >= min, max_key, max, remedy)
+        };
+        let (m, rad) = (self.min_reach_m, self.min_reach_rad);
+        ordered("max_reach_m", self.max_reach_m, "min_reach_m", m)?;
+        ordered("max_reach_rad", self.max_reach_rad, "min_reach_rad", rad)?;
         positive("scale_m", self.scale_m)
     }
 }
@@ -128,8 +117,6 @@ pub struct RefinedFrame {
     pub cost_before_m: f64,
     /// Objective at the result, never larger than before [m].
     pub cost_after_m: f64,
-    /// Number of rays cast.
-    pub rays: usize,
 }
 
 /// Refines an estimate with its covariance of (x, y, heading). The attitude of the objective is an
@@ -158,7 +145,6 @@ pub fn refine_frame(
         level_m: objective.level_m,
         cost_before_m,
         cost_after_m: cost_before_m,
-        rays: objective.beams.len(),
     };
     if matches!(config.method, Method::Swarm | Method::Both) {
         search(objective, &mut frame, config, rng)?;
@@ -181,7 +167,7 @@ pub fn refine_frame(
     Ok(Some(frame))
 }
 
-/// Searches a better pose with the swarm.
+/// Searches for a better pose with the swarm.
 fn search(
     objective: &FrameObjective<'_>,
     frame: &mut RefinedFrame,
@@ -202,7 +188,6 @@ fn search(
     };
     let minimum = minimize(&dimensions, &config.swarm, batch, rng)?;
     let pose = pose_of(&minimum.position);
-    frame.rays += minimum.evaluations * beams.len() + objective.beams.len();
     let Some(lifted) = objective.lift(&pose, patch.as_ref()) else {
         return Ok(());
     };
@@ -253,17 +238,11 @@ fn finish(
     frame: &mut RefinedFrame,
     config: &RefinementConfig,
 ) -> Result<Option<RegistrationResult>, RenderError> {
-    let found = register(
-        objective.renderer,
-        objective.beams,
-        &frame.map_from_lidar,
-        &config.gauss_newton,
-    )?;
-    let Some(registered) = found else {
+    let (renderer, beams) = (objective.renderer, objective.beams);
+    let start = &frame.map_from_lidar;
+    let Some(registered) = register(renderer, beams, start, &config.gauss_newton)? else {
         return Ok(None);
     };
-    // One more to evaluate the result.
-    frame.rays += (registered.iterations + 1) * objective.beams.len();
     let cost_m = objective.costs_in_space(&[registered.map_from_lidar])?[0];
     if cost_m > frame.cost_after_m {
         return Ok(None);
@@ -302,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn every_method_approaches_the_truth_and_none_keeps_the_estimate() {
+    fn every_method_approaches_the_truth_and_method_none_keeps_the_estimate() {
         let off = Pose2::new(Vector2::new(0.08, -0.06), 0.006);
         for (method, tolerance_m) in [
             (Method::Swarm, 0.02),
@@ -335,7 +314,7 @@ mod tests {
     }
 
     #[test]
-    fn without_beams_or_ground_there_is_nothing_to_refine() {
+    fn a_frame_without_beams_or_ground_is_not_refined() {
         let world = TestWorld::street();
         let truth = world.pose_at(0.0, 0.0, 0.0);
         let beams: Vec<Beam> = world.scan(&truth).beams().collect();

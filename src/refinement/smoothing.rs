@@ -1,19 +1,20 @@
 //! Smoothing of a trajectory: least squares over the measured poses of all frames and the odometry
-//! between neighbours.
+//! between neighbors.
 //!
 //! ```text
 //! min  Σ ρ(‖xᵢ ⊖ pᵢ‖²_Rᵢ) + Σ ‖zᵢ⁻¹ (xᵢ⁻¹ xᵢ₊₁)‖²_Qᵢ        ρ(s) = c² ln(1 + s/c²)
 //! ```
 //!
-//! pᵢ, Rᵢ: measured pose and covariance of a frame; zᵢ, Qᵢ: odometry between neighbours. The normal
+//! pᵢ, Rᵢ: measured pose and covariance of a frame; zᵢ, Qᵢ: odometry between neighbors. The normal
 //! equations are block tridiagonal: a step costs one forward and one backward pass, and so do the
-//! diagonal blocks of their inverse, the covariances of the smoothed poses (Rauch, Tung and Striebel, 1965). Grisetti et al., *A Tutorial on
-//! Graph-Based SLAM* (2010), with the robust kernel of Cauchy.
+//! diagonal blocks of their inverse, the marginal covariances (Rauch, Tung and Striebel, 1965).
+//! Grisetti et al., *A Tutorial on Graph-Based SLAM* (2010), with the robust kernel of Cauchy.
 
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
-use crate::geometry::{Pose2, wrap_angle};
+use crate::geometry::Pose2;
+use crate::localization::particles::deviation;
 use crate::validation::{InvalidValue, Validate, at_least_one, positive};
 
 /// Noise of the odometry and robustness against wrong frames.
@@ -87,7 +88,7 @@ pub fn smooth(
         let moved: Vec<Pose2> = poses
             .iter()
             .zip(&steps)
-            .map(|(pose, step)| pose * motion(step))
+            .map(|(pose, step)| pose * Pose2::new(step.xy(), step.z))
             .collect();
         let moved_cost = problem.cost(&moved);
         if moved_cost <= cost {
@@ -119,7 +120,7 @@ pub fn covariances(
     let problem = Problem::new(priors, increments, config);
     let in_cars = problem.linearize(smoothed, 0.0).diagonal_of_inverse()?;
     let in_map = smoothed.iter().zip(&in_cars).map(|(pose, in_car)| {
-        let map_from_car = rotating(pose.rotation.angle());
+        let map_from_car = rotation(pose.rotation.angle());
         map_from_car * in_car * map_from_car.transpose()
     });
     Some(in_map.collect())
@@ -156,7 +157,7 @@ impl<'a> Problem<'a> {
                 .iter()
                 .map(|prior| {
                     let prior = (*prior)?;
-                    // A frame whose covariance has no inverse says nothing.
+                    // A singular covariance gives no information.
                     Some((prior.pose, prior.covariance.try_inverse()?))
                 })
                 .collect(),
@@ -169,7 +170,7 @@ impl<'a> Problem<'a> {
     fn cost(&self, poses: &[Pose2]) -> f64 {
         let frames = poses.iter().zip(&self.priors).filter_map(|(pose, prior)| {
             let (expected, information) = prior.as_ref()?;
-            let residual = offset(pose, expected);
+            let residual = deviation(pose, expected);
             Some(self.kernel * (residual.dot(&(information * residual)) / self.kernel).ln_1p())
         });
         let odometry = poses
@@ -194,9 +195,9 @@ impl<'a> Problem<'a> {
             let Some((expected, information)) = prior else {
                 continue;
             };
-            let residual = offset(pose, expected);
+            let residual = deviation(pose, expected);
             let weight = 1.0 / (1.0 + residual.dot(&(information * residual)) / self.kernel);
-            let jacobian = rotating(pose.rotation.angle());
+            let jacobian = rotation(pose.rotation.angle());
             let weighted = weight * jacobian.transpose() * information;
             equations.diagonal[frame] += weighted * jacobian;
             equations.right_side[frame] -= weighted * residual;
@@ -214,7 +215,7 @@ impl<'a> Problem<'a> {
             equations.right_side[frame] -= after.transpose() * information * residual;
         }
         for block in &mut equations.diagonal {
-            // Marquardt's: relative to the block, and a little for a frame of which nothing is known.
+            // Marquardt damping, and a small constant for frames without any measurement.
             *block += Matrix3::from_diagonal(&(block.diagonal() * damping).add_scalar(1e-12));
         }
         equations
@@ -222,7 +223,7 @@ impl<'a> Problem<'a> {
 }
 
 impl NormalEquations {
-    /// Block Cholesky: forth and back. `None` where a pivot is not positive definite.
+    /// Block Cholesky, forward and backward pass. `None` where a pivot is not positive definite.
     fn solve(mut self) -> Option<Vec<Vector3<f64>>> {
         let count = self.diagonal.len();
         let mut gains = Vec::with_capacity(count);
@@ -269,19 +270,7 @@ impl NormalEquations {
     }
 }
 
-/// A small step in the frame of a pose.
-fn motion(step: &Vector3<f64>) -> Pose2 {
-    Pose2::new(step.xy(), step.z)
-}
-
-/// x ⊖ p: offset in the axes of the map and turn.
-fn offset(pose: &Pose2, expected: &Pose2) -> Vector3<f64> {
-    let shift = pose.translation.vector - expected.translation.vector;
-    let turn = wrap_angle(pose.rotation.angle() - expected.rotation.angle());
-    Vector3::new(shift.x, shift.y, turn)
-}
-
-/// What is left of the motion between two poses after the odometry is undone.
+/// Residual of the odometry between two poses: zᵢ⁻¹ (xᵢ⁻¹ xᵢ₊₁).
 fn relative(pair: &[Pose2], increment: &Pose2) -> Vector3<f64> {
     let left = increment.inverse() * (pair[0].inverse() * pair[1]);
     Vector3::new(
@@ -291,23 +280,23 @@ fn relative(pair: &[Pose2], increment: &Pose2) -> Vector3<f64> {
     )
 }
 
-/// Slopes of [`relative`] for steps in the frames of the first and of the second pose.
+/// Jacobians of [`relative`] by steps in the frames of the first and of the second pose.
 fn relative_jacobians(pair: &[Pose2], increment: &Pose2) -> (Matrix3<f64>, Matrix3<f64>) {
     let between = pair[0].inverse() * pair[1];
     let back = Matrix2::from(increment.rotation.inverse().to_rotation_matrix());
     let t = between.translation.vector;
-    // A turn of the first frame moves the second about it the other way.
+    // A turn of the first frame moves the second one in the opposite direction.
     let lever = back * Vector2::new(t.y, -t.x);
     let mut before = Matrix3::zeros();
     before.fixed_view_mut::<2, 2>(0, 0).copy_from(&-back);
     before.fixed_view_mut::<2, 1>(0, 2).copy_from(&lever);
     before[(2, 2)] = -1.0;
-    let after = rotating((increment.rotation.inverse() * between.rotation).angle());
+    let after = rotation((increment.rotation.inverse() * between.rotation).angle());
     (before, after)
 }
 
-/// Rotation of the position part.
-fn rotating(angle_rad: f64) -> Matrix3<f64> {
+/// Rotation of (x, y, heading), which leaves the heading.
+fn rotation(angle_rad: f64) -> Matrix3<f64> {
     let (sin, cos) = angle_rad.sin_cos();
     Matrix3::new(cos, -sin, 0.0, sin, cos, 0.0, 0.0, 0.0, 1.0)
 }
@@ -320,7 +309,7 @@ mod tests {
 
     use super::*;
 
-    /// Straight, a corner of 90 degrees within five frames, straight.
+    /// A straight road with a corner of 90 degrees within five frames.
     fn corner() -> Vec<Pose2> {
         let mut pose = Pose2::new(Vector2::new(4.0, -2.0), 2.9);
         (0..60)
@@ -382,7 +371,7 @@ mod tests {
     }
 
     #[test]
-    fn when_everything_agrees_the_truth_comes_out_wherever_it_starts() {
+    fn consistent_measurements_give_the_truth_from_any_start() {
         let truth = corner();
         let start = disturbed(&truth, 0.3, 0.05, 1);
         let smooth = smooth(
@@ -397,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_shrinks_and_the_corner_stays() {
+    fn smoothing_reduces_noise_and_keeps_the_corner() {
         let truth = corner();
         for seed in 0..5 {
             let noisy = disturbed(&truth, 0.05, 0.005, seed);
@@ -415,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_that_is_far_off_pulls_little() {
+    fn an_outlier_has_little_influence() {
         let truth = corner();
         let mut wrong = truth.clone();
         wrong[20] = Pose2::translation(3.0, 3.0) * wrong[20];
@@ -429,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_that_say_nothing_follow_from_the_odometry() {
+    fn frames_without_a_measured_pose_follow_from_the_odometry() {
         let truth = corner();
         let mut some = priors(&truth, 0.02, 0.002);
         some[..10].fill(None);
@@ -445,7 +434,7 @@ mod tests {
     }
 
     #[test]
-    fn a_trajectory_elsewhere_is_smoothed_alike() {
+    fn smoothing_does_not_depend_on_the_map_frame() {
         let truth = corner();
         let noisy = disturbed(&truth, 0.05, 0.005, 9);
         let elsewhere = Pose2::new(Vector2::new(-300.0, 70.0), 1.2);
@@ -460,19 +449,19 @@ mod tests {
     }
 
     #[test]
-    fn short_trajectories_and_useless_covariances_are_no_problem() {
+    fn an_empty_trajectory_and_a_singular_covariance_are_allowed() {
         let config = SmoothingConfig::default();
         assert_eq!(smooth(&[], &[], &[], &config), []);
         let pose = Pose2::translation(1.0, 2.0);
-        let useless = Some(FramePrior {
+        let singular = Some(FramePrior {
             pose,
             covariance: Matrix3::zeros(),
         });
-        assert_eq!(smooth(&[pose], &[useless], &[pose], &config), [pose]);
+        assert_eq!(smooth(&[pose], &[singular], &[pose], &config), [pose]);
     }
 
     #[test]
-    fn the_covariances_are_the_blocks_of_the_inverse() {
+    fn the_covariances_are_the_diagonal_blocks_of_the_inverse() {
         let truth: Vec<Pose2> = corner()[26..34].to_vec();
         let mut some = priors(&truth, 0.05, 0.004);
         some[2] = None;
@@ -496,7 +485,7 @@ mod tests {
         }
         let inverse = dense.try_inverse().unwrap();
         for (frame, (found, pose)) in found.iter().zip(&truth).enumerate() {
-            let turn = rotating(pose.rotation.angle());
+            let turn = rotation(pose.rotation.angle());
             let block = inverse.fixed_view::<3, 3>(3 * frame, 3 * frame);
             let expected = turn * block * turn.transpose();
             assert_relative_eq!(*found, expected, max_relative = 1e-9, epsilon = 1e-12);
@@ -504,7 +493,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_of_smoothed_poses_are_as_large_as_their_covariances_say() {
+    fn errors_of_smoothed_poses_match_their_covariances() {
         let truth = corner();
         let config = SmoothingConfig {
             odometry_ahead_m: 0.01,
@@ -521,26 +510,26 @@ mod tests {
             let smoothed = smooth(&noisy, &priors, &odometry, &config);
             let found = covariances(&smoothed, &priors, &odometry, &config).unwrap();
             for ((pose, truth), covariance) in smoothed.iter().zip(&truth).zip(found) {
-                let error = offset(pose, truth);
+                let error = deviation(pose, truth);
                 squares.push(error.dot(&(covariance.try_inverse().unwrap() * error)));
             }
         }
-        // Three degrees of freedom; neighbours err together, so that 1200 poses count as about 100.
+        // Three degrees of freedom; errors of neighbors are correlated: 1200 poses count as about 100.
         let mean = squares.iter().sum::<f64>() / squares.len() as f64;
         assert_relative_eq!(mean, 3.0, epsilon = 4.0 * (6.0_f64 / 100.0).sqrt());
     }
 
     #[test]
-    fn without_a_word_from_any_frame_there_is_no_covariance() {
+    fn without_measured_poses_the_covariance_is_undefined_or_large() {
         let truth = corner();
         let config = SmoothingConfig::default();
-        let silent = vec![None; truth.len()];
-        let found = covariances(&truth, &silent, &increments(&truth), &config);
+        let unmeasured = vec![None; truth.len()];
+        let found = covariances(&truth, &unmeasured, &increments(&truth), &config);
         assert!(found.is_none_or(|all| all[0][(0, 0)] > 1e6));
     }
 
     #[test]
-    fn the_slopes_are_those_of_the_residuals() {
+    fn the_jacobians_are_the_derivatives_of_the_residuals() {
         let pair = [
             Pose2::new(Vector2::new(1.0, 2.0), 0.7),
             Pose2::new(Vector2::new(1.9, 2.4), 0.9),
@@ -548,17 +537,18 @@ mod tests {
         let increment = Pose2::new(Vector2::new(0.9, -0.1), 0.25);
         let (before, after) = relative_jacobians(&pair, &increment);
         for axis in 0..3 {
-            let step = motion(&Vector3::ith(axis, 1e-6));
-            let slope = |moved: [Pose2; 2]| {
+            let step = Vector3::ith(axis, 1e-6);
+            let step = Pose2::new(step.xy(), step.z);
+            let derivative = |moved: [Pose2; 2]| {
                 (relative(&moved, &increment) - relative(&pair, &increment)) / 1e-6
             };
             assert_relative_eq!(
-                slope([pair[0] * step, pair[1]]),
+                derivative([pair[0] * step, pair[1]]),
                 before.column(axis).into_owned(),
                 epsilon = 1e-5
             );
             assert_relative_eq!(
-                slope([pair[0], pair[1] * step]),
+                derivative([pair[0], pair[1] * step]),
                 after.column(axis).into_owned(),
                 epsilon = 1e-5
             );

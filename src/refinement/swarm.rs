@@ -1,49 +1,48 @@
-//! Particle swarm optimization: candidates that remember their best place and look towards the
-//! best place of all.
+//! Particle swarm optimization: candidates accelerate towards their own best position and towards the
+//! best position of the swarm.
 //!
 //! ```text
 //! v ← ω v + φ_p r_p (p_best − x) + φ_g r_g (g_best − x)        r_p, r_g ~ U(0, 1) per dimension
 //! x ← x + v
 //! ```
 //!
-//! Velocities begin at random and are clamped per dimension; positions stay within bounds; on a
-//! circle positions and differences are wrapped. Kennedy and Eberhart, *Particle Swarm
-//! Optimization* (1995); Shi and Eberhart (1998) for the inertia ω and its decrease. The swarm
-//! knows nothing of poses: it minimizes any function of n numbers.
+//! Initial velocities are random; velocities and positions are clamped per dimension; angles and their
+//! differences are wrapped. Kennedy and Eberhart, *Particle Swarm Optimization* (1995); Shi and Eberhart
+//! (1998) for the inertia ω and its decrease. The objective is any function of n numbers.
 
 use rand::{Rng, RngExt as _};
-use rand_distr::{Distribution, StandardNormal};
+use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::wrap_angle;
 use crate::validation::{InvalidValue, Validate, at_least_one, not_negative, positive};
 
-/// How the swarm moves.
+/// Parameters of the swarm.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SwarmConfig {
     /// Number of candidates.
     pub candidates: usize,
-    /// Iterations, at most.
+    /// Largest number of iterations.
     pub iterations: usize,
-    /// Share of its velocity that a candidate keeps, ω (unitless).
+    /// Inertia ω of the first iteration: share of its velocity that a candidate keeps (unitless).
     pub inertia: f64,
-    /// ω of the last iteration, reached linearly; the same as `inertia` for a constant one.
+    /// Inertia of the last iteration, linear in between (unitless).
     pub final_inertia: f64,
-    /// Pull towards a candidate's own best place, φ_p (unitless).
+    /// Cognitive acceleration φ_p, towards the best position of the candidate (unitless).
     pub cognitive: f64,
-    /// Pull towards the best place of all, φ_g (unitless).
+    /// Social acceleration φ_g, towards the best position of the swarm (unitless).
     pub social: f64,
-    /// Velocities never exceed this share of the bounds' half width per iteration (unitless).
+    /// Largest velocity per iteration, as a share of the reach (unitless).
     pub max_velocity: f64,
-    /// Stop after so many iterations in a row without progress; 0 never stops early.
+    /// Number of consecutive iterations without progress after which the search stops; 0 for no limit.
     pub patience: usize,
-    /// Progress is a decrease of the best value by more than this.
+    /// Decrease of the best value that counts as progress.
     pub tolerance: f64,
 }
 
 impl Default for SwarmConfig {
-    /// ω, φ_p, φ_g and the iterations of Fuzzy-PSO-MCL; it gives no size and no bounds.
+    /// ω, φ_p, φ_g and the number of iterations of Fuzzy-PSO-MCL, which gives no size and no bounds.
     fn default() -> Self {
         Self {
             candidates: 20,
@@ -72,21 +71,21 @@ impl Validate for SwarmConfig {
     }
 }
 
-/// One coordinate of the search.
+/// A dimension of the search space.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Dimension {
-    /// Where the search starts.
+    /// Initial value.
     pub start: f64,
-    /// Standard deviation of the candidates around the start.
+    /// Standard deviation of the initial candidates around it.
     pub spread: f64,
-    /// How far from the start a candidate may go.
+    /// Largest distance of a candidate from it.
     pub reach: f64,
-    /// Whether the coordinate is an angle [rad], on the circle.
+    /// Whether the coordinate is an angle [rad].
     pub is_circular: bool,
 }
 
 impl Dimension {
-    /// From `b` to `a`, the short way round.
+    /// `a - b`, wrapped for angles.
     fn difference(&self, a: f64, b: f64) -> f64 {
         if self.is_circular {
             wrap_angle(a - b)
@@ -95,7 +94,7 @@ impl Dimension {
         }
     }
 
-    /// The nearest value within the bounds.
+    /// Nearest value within the reach.
     fn bounded(&self, value: f64) -> f64 {
         let offset = self
             .difference(value, self.start)
@@ -109,17 +108,13 @@ impl Dimension {
     }
 }
 
-/// The best place that was found.
+/// The best position found.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Minimum {
     /// One value per dimension.
     pub position: Vec<f64>,
-    /// The objective there.
+    /// Value of the objective there.
     pub value: f64,
-    /// The best value after the start and after every iteration, never ascending.
-    pub history: Vec<f64>,
-    /// How often the objective was evaluated.
-    pub evaluations: usize,
 }
 
 struct Candidate {
@@ -129,31 +124,34 @@ struct Candidate {
     best_value: f64,
 }
 
-/// Minimizes `objective`, which is given all positions of an iteration at once and returns one
-/// value for each; a value that is not a number counts as infinite.
+/// Minimizes `objective`, which evaluates all positions of an iteration in one call; a value of NaN
+/// counts as infinite.
 ///
-/// The first candidate begins at the start itself, so that the result is never worse than that.
+/// The first candidate is at the start, so that the result is never worse than the start.
 pub fn minimize<E>(
     dimensions: &[Dimension],
     config: &SwarmConfig,
     mut objective: impl FnMut(&[Vec<f64>]) -> Result<Vec<f64>, E>,
     rng: &mut impl Rng,
 ) -> Result<Minimum, E> {
-    let mut swarm = spread_out(dimensions, config, rng);
-    let mut best = evaluate(&mut swarm, None, &mut objective)?;
+    let mut swarm = initial_swarm(dimensions, config, rng);
+    let mut best = Minimum {
+        position: swarm[0].position.clone(),
+        value: f64::INFINITY,
+    };
+    evaluate(&mut swarm, &mut best, &mut objective)?;
     let mut idle = 0;
     for iteration in 0..config.iterations {
         let progress = iteration as f64 / (config.iterations.max(2) - 1) as f64;
         let inertia = config.inertia + progress * (config.final_inertia - config.inertia);
         for candidate in &mut swarm {
-            fly(candidate, &best.position, dimensions, inertia, config, rng);
+            advance(candidate, &best.position, dimensions, inertia, config, rng);
         }
         let before = best.value;
-        best = evaluate(&mut swarm, Some(best), &mut objective)?;
-        idle = if before - best.value > config.tolerance {
-            0
-        } else {
-            idle + 1
+        evaluate(&mut swarm, &mut best, &mut objective)?;
+        idle = match before - best.value > config.tolerance {
+            true => 0,
+            false => idle + 1,
         };
         if config.patience > 0 && idle >= config.patience {
             break;
@@ -162,31 +160,27 @@ pub fn minimize<E>(
     Ok(best)
 }
 
-/// Candidates around the start, with random velocities; the first stands at the start.
-fn spread_out(
+/// Candidates around the start with random velocities; the first is at the start.
+fn initial_swarm(
     dimensions: &[Dimension],
     config: &SwarmConfig,
     rng: &mut impl Rng,
 ) -> Vec<Candidate> {
     (0..config.candidates.max(1))
         .map(|number| {
-            let mut place = |dimension: &Dimension| {
-                let deviate: f64 = StandardNormal.sample(rng);
-                let offset = if number == 0 {
-                    0.0
-                } else {
-                    dimension.spread * deviate
+            let sample = |dimension: &Dimension| {
+                let deviate: f64 = rng.sample(StandardNormal);
+                let offset = match number {
+                    0 => 0.0,
+                    _ => dimension.spread * deviate,
                 };
                 dimension.bounded(dimension.start + offset)
             };
-            let position: Vec<f64> = dimensions.iter().map(&mut place).collect();
-            let velocity = dimensions
-                .iter()
-                .map(|dimension| {
-                    let most = config.max_velocity * dimension.reach;
-                    most * rng.random_range(-1.0..=1.0)
-                })
-                .collect();
+            let position: Vec<f64> = dimensions.iter().map(sample).collect();
+            let velocity = |dimension: &Dimension| {
+                config.max_velocity * dimension.reach * rng.random_range(-1.0..=1.0)
+            };
+            let velocity = dimensions.iter().map(velocity).collect();
             Candidate {
                 best_position: position.clone(),
                 best_value: f64::INFINITY,
@@ -197,23 +191,16 @@ fn spread_out(
         .collect()
 }
 
-/// Evaluates all candidates in one call and brings every memory up to date.
+/// Evaluates all candidates in one call and updates their best positions and that of the swarm.
 fn evaluate<E>(
     swarm: &mut [Candidate],
-    best: Option<Minimum>,
+    best: &mut Minimum,
     objective: &mut impl FnMut(&[Vec<f64>]) -> Result<Vec<f64>, E>,
-) -> Result<Minimum, E> {
+) -> Result<(), E> {
     let positions: Vec<Vec<f64>> = swarm.iter().map(|c| c.position.clone()).collect();
     let values = objective(&positions)?;
-    let mut best = best.unwrap_or_else(|| Minimum {
-        position: positions[0].clone(),
-        value: f64::INFINITY,
-        history: Vec::new(),
-        evaluations: 0,
-    });
-    best.evaluations += positions.len();
     for (candidate, value) in swarm.iter_mut().zip(values) {
-        // A comparison with what is not a number is false.
+        // Comparisons with NaN are false.
         if value < candidate.best_value {
             candidate.best_value = value;
             candidate.best_position.clone_from(&candidate.position);
@@ -223,12 +210,11 @@ fn evaluate<E>(
             best.position.clone_from(&candidate.position);
         }
     }
-    best.history.push(best.value);
-    Ok(best)
+    Ok(())
 }
 
-/// One step of one candidate.
-fn fly(
+/// Moves a candidate.
+fn advance(
     candidate: &mut Candidate,
     best: &[f64],
     dimensions: &[Dimension],
@@ -238,13 +224,13 @@ fn fly(
 ) {
     for (axis, dimension) in dimensions.iter().enumerate() {
         let here = candidate.position[axis];
-        let own_pull = dimension.difference(candidate.best_position[axis], here);
-        let common_pull = dimension.difference(best[axis], here);
-        let most = config.max_velocity * dimension.reach;
+        let to_own_best = dimension.difference(candidate.best_position[axis], here);
+        let to_best = dimension.difference(best[axis], here);
+        let largest = config.max_velocity * dimension.reach;
         let velocity = inertia * candidate.velocity[axis]
-            + config.cognitive * rng.random::<f64>() * own_pull
-            + config.social * rng.random::<f64>() * common_pull;
-        candidate.velocity[axis] = velocity.clamp(-most, most);
+            + config.cognitive * rng.random::<f64>() * to_own_best
+            + config.social * rng.random::<f64>() * to_best;
+        candidate.velocity[axis] = velocity.clamp(-largest, largest);
         candidate.position[axis] = dimension.bounded(here + candidate.velocity[axis]);
     }
 }
@@ -327,22 +313,26 @@ mod tests {
     }
 
     #[test]
-    fn the_result_is_never_worse_than_the_start_and_the_history_never_ascends() {
+    fn the_result_is_never_worse_than_the_start_or_that_of_fewer_iterations() {
         for seed in 0..20 {
             let start = [dimension(1.0), dimension(1.0 + 1e-6)];
-            let config = SwarmConfig {
-                candidates: 3,
-                ..SwarmConfig::default()
-            };
-            let minimum = run(&start, &config, seed, sphere);
-            assert!(minimum.value <= sphere(&[1.0, 1.0 + 1e-6]));
-            assert!(minimum.history.is_sorted_by(|a, b| a >= b));
-            assert_eq!(minimum.value, sphere(&minimum.position));
+            let mut previous = sphere(&[1.0, 1.0 + 1e-6]);
+            for iterations in 1..=15 {
+                let config = SwarmConfig {
+                    candidates: 3,
+                    iterations,
+                    ..SwarmConfig::default()
+                };
+                let minimum = run(&start, &config, seed, sphere);
+                assert!(minimum.value <= previous);
+                assert_eq!(minimum.value, sphere(&minimum.position));
+                previous = minimum.value;
+            }
         }
     }
 
     #[test]
-    fn on_a_circle_the_swarm_goes_the_short_way_round() {
+    fn angles_are_wrapped_and_stay_within_their_reach() {
         let heading = Dimension {
             start: PI - 0.05,
             spread: 0.1,
@@ -370,7 +360,7 @@ mod tests {
     }
 
     #[test]
-    fn candidates_stay_within_their_bounds() {
+    fn candidates_stay_within_their_reach() {
         let narrow = Dimension {
             reach: 0.5,
             ..dimension(-1.0)
@@ -384,28 +374,24 @@ mod tests {
     }
 
     #[test]
-    fn every_iteration_is_one_call_and_patience_ends_it_early() {
+    fn every_iteration_is_one_call_and_patience_stops_early() {
         let mut calls = 0;
         let flat = |positions: &[Vec<f64>]| -> Result<Vec<f64>, Infallible> {
             calls += 1;
+            assert_eq!(positions.len(), SwarmConfig::default().candidates);
             Ok(vec![1.0; positions.len()])
         };
         let config = SwarmConfig {
             patience: 3,
             ..SwarmConfig::default()
         };
-        let Ok(minimum) = minimize(
-            &[dimension(0.0)],
-            &config,
-            flat,
-            &mut StdRng::seed_from_u64(1),
-        );
+        let mut rng = StdRng::seed_from_u64(1);
+        let Ok(_) = minimize(&[dimension(0.0)], &config, flat, &mut rng);
         assert_eq!(calls, 4);
-        assert_eq!(minimum.evaluations, 4 * config.candidates);
     }
 
     #[test]
-    fn values_that_are_no_numbers_are_never_best() {
+    fn nan_is_never_the_minimum() {
         let half = |x: &[f64]| if x[0] > 0.0 { f64::NAN } else { -x[0] };
         let minimum = run(&[dimension(-2.0)], &many(), 1, half);
         assert!(minimum.value >= 0.0 && minimum.value < 1e-2, "{minimum:?}");

@@ -16,11 +16,11 @@ use super::objective::FrameObjective;
 use super::refiner::{RefinementConfig, refine_frame};
 use super::smoothing::{self, FramePrior, smooth};
 use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
-use crate::lidar::Scan;
+use crate::lidar::{RangeImage, Scan};
 use crate::localization::observation::{ObservationConfig, choose_beams};
 use crate::localization::{Estimate, Sensor, SensorConfig, State};
 use crate::map::{Map, SensorAttitude};
-use crate::random::stream;
+use crate::random::{Generator, stream};
 use crate::rendering::RenderError;
 use crate::validation::{InvalidValue, Validate as _};
 
@@ -73,8 +73,6 @@ pub struct FrameResult {
     pub map_from_lidar: Option<Pose3>,
     /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
-    /// Measurement of the pose for smoothing; `None` where the filter was not tracking.
-    prior: Option<FramePrior>,
     /// State of the filter.
     state: State,
     attitude: SensorAttitude,
@@ -146,59 +144,65 @@ impl TrajectoryRefiner {
         let mut rng = stream(self.seed, self.frames.len() as u64);
         let image = self.sensor.range_image(scan);
         let previous = self.frames.last();
-        // The attitude of a registered frame is more accurate than the ground plane of a scan.
-        let attitude = match previous {
-            Some(previous) if previous.is_refined() => previous.attitude,
-            _ => self.sensor.attitude(&image).unwrap_or_else(|| {
-                previous.map_or_else(
-                    || self.config.sensor.assumed_attitude(),
-                    |previous| previous.attitude,
-                )
-            }),
-        };
-        let level_m = previous
-            .filter(|_| estimate.state != State::Lost)
-            .and_then(|previous| previous.level_m);
-        let mut result = FrameResult {
+        let mut frame = FrameResult {
             pose: estimate.pose,
             map_from_lidar: None,
             covariance: estimate.covariance(),
-            prior: None,
             state: estimate.state,
-            attitude,
-            level_m,
+            attitude: self.initial_attitude(&image),
+            level_m: previous
+                .filter(|_| estimate.state != State::Lost)
+                .and_then(|previous| previous.level_m),
         };
-        if estimate.state == State::Tracking {
-            let observation = &self.config.observation;
-            let (count, road_share) = (observation.beams, observation.road_share);
-            let beams = choose_beams(&image, count, road_share, &attitude, &mut rng);
-            let mut objective = FrameObjective {
-                renderer: &*self.map.renderer,
-                ground: &self.map.ground,
-                beams: &beams,
-                level_m,
-                attitude,
-                difference: observation.difference(),
-            };
-            if level_m.is_none() {
-                objective = objective.on_best_level(&estimate.pose)?;
-            }
-            let (pose, config) = (&estimate.pose, &self.config.refinement);
-            let refined = refine_frame(&objective, pose, &result.covariance, config, &mut rng)?;
-            if let Some(refined) = refined {
-                result.pose = refined.pose;
-                result.map_from_lidar = Some(refined.map_from_lidar);
-                result.covariance = refined.covariance;
-                result.attitude = refined.attitude;
-                result.level_m = refined.level_m.or(level_m);
-            }
-            result.prior = Some(FramePrior {
-                pose: result.pose,
-                covariance: result.covariance,
-            });
+        if frame.state == State::Tracking {
+            self.refine(&image, &mut frame, &mut rng)?;
         }
-        self.frames.push(result);
+        self.frames.push(frame);
         Ok(&self.frames[self.frames.len() - 1])
+    }
+
+    /// Attitude of the sensor in the next frame. That of a registered frame is more accurate than the
+    /// ground plane of a scan.
+    fn initial_attitude(&self, image: &RangeImage) -> SensorAttitude {
+        let previous = self.frames.last();
+        previous
+            .filter(|previous| previous.is_refined())
+            .map(|previous| previous.attitude)
+            .or_else(|| self.sensor.attitude(image))
+            .or(previous.map(|previous| previous.attitude))
+            .unwrap_or_else(|| self.config.sensor.assumed_attitude())
+    }
+
+    fn refine(
+        &self,
+        image: &RangeImage,
+        frame: &mut FrameResult,
+        rng: &mut Generator,
+    ) -> Result<(), RefinerError> {
+        let observation = &self.config.observation;
+        let (count, road_share) = (observation.beams, observation.road_share);
+        let beams = choose_beams(image, count, road_share, &frame.attitude, rng);
+        let mut objective = FrameObjective {
+            renderer: &*self.map.renderer,
+            ground: &self.map.ground,
+            beams: &beams,
+            level_m: frame.level_m,
+            attitude: frame.attitude,
+            difference: observation.difference(),
+        };
+        if frame.level_m.is_none() {
+            objective = objective.on_best_level(&frame.pose)?;
+        }
+        let config = &self.config.refinement;
+        let refined = refine_frame(&objective, &frame.pose, &frame.covariance, config, rng)?;
+        if let Some(refined) = refined {
+            frame.pose = refined.pose;
+            frame.map_from_lidar = Some(refined.map_from_lidar);
+            frame.covariance = refined.covariance;
+            frame.attitude = refined.attitude;
+            frame.level_m = refined.level_m.or(frame.level_m);
+        }
+        Ok(())
     }
 
     /// Smooths the trajectory with the odometry `previous_from_current` into each frame (the first is
@@ -207,7 +211,7 @@ impl TrajectoryRefiner {
         let frames = &self.frames;
         let mut poses: Vec<Pose2> = frames.iter().map(|frame| frame.pose).collect();
         let mut covariances: Vec<_> = frames.iter().map(|frame| frame.covariance).collect();
-        let is_measured = frames.iter().any(|frame| frame.prior.is_some());
+        let is_measured = frames.iter().any(FrameResult::is_tracked);
         if let Some(increments) = increments.filter(|_| is_measured) {
             if increments.len() != frames.len() {
                 return Err(RefinerError::IncrementCount {
@@ -219,7 +223,7 @@ impl TrajectoryRefiner {
                 self.smooth_stretch(rows, increments, &mut poses, &mut covariances);
             }
         }
-        let untracked = frames.iter().filter(|f| f.state != State::Tracking).count();
+        let untracked = frames.iter().filter(|frame| !frame.is_tracked()).count();
         let refined = frames.iter().filter(|frame| frame.is_refined()).count();
         Ok(RefinedTrajectory {
             map_from_lidar: self.lift(&poses),
@@ -239,7 +243,7 @@ impl TrajectoryRefiner {
         for stretch in self.frames.chunk_by(|a, b| is_lost(a) == is_lost(b)) {
             let rows = start..start + stretch.len();
             start = rows.end;
-            if !is_lost(&stretch[0]) && stretch.iter().any(|frame| frame.prior.is_some()) {
+            if !is_lost(&stretch[0]) && stretch.iter().any(FrameResult::is_tracked) {
                 stretches.push(rows);
             }
         }
@@ -255,7 +259,7 @@ impl TrajectoryRefiner {
     ) {
         let config = &self.config.refinement;
         let frames = &self.frames[rows.clone()];
-        let priors: Vec<Option<FramePrior>> = frames.iter().map(|frame| frame.prior).collect();
+        let priors: Vec<Option<FramePrior>> = frames.iter().map(FrameResult::prior).collect();
         let increments = &increments[rows.clone()];
         let smoothed = smooth(&poses[rows.clone()], &priors, increments, &config.smoothing);
         let marginals = smoothing::covariances(&smoothed, &priors, increments, &config.smoothing);
@@ -286,6 +290,18 @@ impl TrajectoryRefiner {
 }
 
 impl FrameResult {
+    fn is_tracked(&self) -> bool {
+        self.state == State::Tracking
+    }
+
+    /// Measured pose for smoothing.
+    fn prior(&self) -> Option<FramePrior> {
+        self.is_tracked().then_some(FramePrior {
+            pose: self.pose,
+            covariance: self.covariance,
+        })
+    }
+
     fn is_refined(&self) -> bool {
         self.map_from_lidar.is_some()
     }
@@ -297,7 +313,7 @@ mod tests {
     use crate::map::test_world::TestWorld;
 
     #[test]
-    fn a_jump_where_tracking_was_lost_bends_no_frame_beside_it() {
+    fn a_jump_where_tracking_was_lost_does_not_affect_its_neighbors() {
         let map = TestWorld::street().map();
         let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), 0).unwrap();
         for row in 0..20 {
@@ -309,7 +325,6 @@ mod tests {
                 pose,
                 map_from_lidar: (!is_lost).then(|| pose3_from_pose2(&pose, 0.0)),
                 covariance,
-                prior: (!is_lost).then_some(FramePrior { pose, covariance }),
                 state: if is_lost {
                     State::Lost
                 } else {
@@ -331,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn an_odometry_of_another_length_is_an_error() {
+    fn a_wrong_number_of_increments_is_an_error() {
         let world = TestWorld::street();
         let mut refiner =
             TrajectoryRefiner::new(&world.map(), RefinerConfig::default(), 0).unwrap();

@@ -1,4 +1,4 @@
-//! Where the motion between frames comes from, and how a report names it.
+//! Source of the motion between frames, and its description in reports.
 
 use std::path::Path;
 
@@ -13,14 +13,14 @@ use crate::localization::odometry::{demonstration_noise, increments, with_noise}
 use crate::recording::poses::{CameraPoses, read_tum};
 use crate::recording::{RecordingError, Sequence};
 
-/// `previous_from_current` into each frame of the sequence; `None` where nothing is known.
+/// Reads `previous_from_current` into each frame of the sequence; `None` without odometry.
 pub fn read_increments(
     source: OdometrySource,
     file: Option<&Path>,
     sequence: &Sequence,
     rng: &mut impl Rng,
 ) -> Result<Vec<Option<Pose2>>> {
-    let known = match (source, file) {
+    let increments = match (source, file) {
         (OdometrySource::None, _) => return Ok(vec![None; sequence.frames.len()]),
         (OdometrySource::File, Some(file)) => {
             input::require_file("odometry_file", file)?;
@@ -40,10 +40,10 @@ pub fn read_increments(
             with_noise(&increments(&poses), &demonstration_noise(), rng)
         }
     };
-    Ok(known.into_iter().map(Some).collect())
+    Ok(increments.into_iter().map(Some).collect())
 }
 
-/// Lidar poses from an odometry file: KITTI rows (12 numbers, camera) or TUM rows (8, lidar).
+/// Reads the lidar poses of an odometry file: KITTI rows (12 numbers, camera) or TUM rows (8, lidar).
 fn recorded(file: &Path, sequence: &Sequence) -> Result<Vec<Pose3>> {
     let context = || format!("odometry_file is {}", file.display());
     match CameraPoses::read(file) {
@@ -60,7 +60,7 @@ fn recorded(file: &Path, sequence: &Sequence) -> Result<Vec<Pose3>> {
     }
 }
 
-/// The sequence with its scans compensated by an odometry, where that is wanted.
+/// Compensates the motion within the scans of a sequence, where a direction of rotation is configured.
 pub fn compensated(
     sequence: Sequence,
     direction: Option<RotationDirection>,
@@ -69,18 +69,15 @@ pub fn compensated(
     let Some(direction) = direction else {
         return sequence;
     };
-    let in_space =
-        |increment: &Option<Pose2>| increment.map(|motion| pose3_from_pose2(&motion, 0.0));
-    sequence.compensated_by(
-        direction,
-        &increments.iter().map(in_space).collect::<Vec<_>>(),
-    )
+    let spatial = |increment: &Option<Pose2>| Some(pose3_from_pose2(increment.as_ref()?, 0.0));
+    let increments: Vec<_> = increments.iter().map(spatial).collect();
+    sequence.compensated_by(direction, &increments)
 }
 
-/// For reports.
+/// Description of the odometry for reports.
 pub fn description(source: OdometrySource, file: Option<&Path>) -> String {
     match (source, file) {
-        (OdometrySource::None, _) => "none: the car goes on as it went".to_owned(),
+        (OdometrySource::None, _) => "none (constant velocity)".to_owned(),
         (OdometrySource::File, Some(file)) => file.display().to_string(),
         _ => "ground truth with noise (a demonstration, as in range-mcl)".to_owned(),
     }

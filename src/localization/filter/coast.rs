@@ -2,10 +2,10 @@
 
 use nalgebra::Matrix3;
 
-use super::super::estimate::Estimate;
-use super::super::motion::{TurnDriveTurn, VelocityCommand};
-use super::super::odometry::Odometry;
-use super::ParticleFilter;
+use super::state::ParticleFilter;
+use crate::localization::estimate::Estimate;
+use crate::localization::motion::{TurnDriveTurn, VelocityCommand};
+use crate::localization::odometry::Odometry;
 use crate::map::SensorAttitude;
 
 impl ParticleFilter {
@@ -13,22 +13,8 @@ impl ParticleFilter {
     pub(super) fn coast(&mut self, odometry: Odometry, attitude: &SensorAttitude) -> Estimate {
         let mut particles = self.particles.clone();
         particles.propagate(|pose| pose * self.pending);
-        let pose = particles.mean();
         let covariance = self.covariance_after_pending(odometry);
-        Estimate {
-            pose,
-            map_from_lidar: self.lift_estimate(&pose, attitude).0,
-            attitude: *attitude,
-            level_m: self.patch.map(|patch| patch.height_m),
-            covariance,
-            effective_sample_size: particles.effective_sample_size(),
-            mean_cost_m: None,
-            agreement: None,
-            state: self.state,
-            updated: false,
-            on_mapped_ground: self.patch_at(&pose).is_some(),
-            particles,
-        }
+        self.estimate_of(particles, covariance, attitude)
     }
 
     /// Covariance of the last estimate, propagated by the motion since then [m², m·rad, rad²]:
@@ -45,26 +31,22 @@ impl ParticleFilter {
         let turned_rad = self.pending.rotation.angle().abs();
         let share = (moved_m / config.move_thres_m).max(turned_rad / config.turn_thres_rad);
         let noise = if let Odometry::Velocity(_) = odometry {
-            let held = VelocityCommand::driving(&self.pending, self.pending_duration);
-            config.velocity.covariance(&held)
+            let command = VelocityCommand::driving(&self.pending, self.pending_duration);
+            config.velocity.covariance(&command)
         } else {
-            let motion = TurnDriveTurn::decompose(&self.pending);
-            config.motion.covariance(&motion)
+            config
+                .motion
+                .covariance(&TurnDriveTurn::decompose(&self.pending))
         };
-        let turn = self.estimate.rotation;
-        let step = turn * self.pending.translation.vector;
-        let carried = Matrix3::new(1.0, 0.0, -step.y, 0.0, 1.0, step.x, 0.0, 0.0, 1.0);
-        let mut rotation = Matrix3::identity();
-        rotation
-            .fixed_view_mut::<2, 2>(0, 0)
-            .copy_from(turn.to_rotation_matrix().matrix());
+        let step = self.estimate.rotation * self.pending.translation.vector;
+        let jacobian = Matrix3::new(1.0, 0.0, -step.y, 0.0, 1.0, step.x, 0.0, 0.0, 1.0);
+        let rotation = self.estimate.rotation.to_rotation_matrix().to_homogeneous();
         // With thresholds of zero every motion triggers an update, and none is ever pending.
-        let share = if share.is_finite() {
-            share.min(1.0)
-        } else {
-            0.0
+        let share = match share.is_finite() {
+            true => share.min(1.0),
+            false => 0.0,
         };
-        carried * self.covariance * carried.transpose()
+        jacobian * self.covariance * jacobian.transpose()
             + share * rotation * noise * rotation.transpose()
     }
 }

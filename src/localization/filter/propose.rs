@@ -3,13 +3,14 @@
 
 use rand::Rng;
 
-use super::super::observation::choose_beams;
-use super::super::particles::{Hypothesis, ParticleSet};
-use super::super::proposal::{Gaussian, regular};
-use super::super::tracking_loss::State;
-use super::{ParticleFilter, Update, weighted_mean};
+use super::reweight::Update;
+use super::state::ParticleFilter;
 use crate::geometry::pose2_from_pose3;
 use crate::lidar::{Beam, RangeImage};
+use crate::localization::observation::choose_beams;
+use crate::localization::particles::{Particle, ParticleSet};
+use crate::localization::proposal::{Gaussian, regular};
+use crate::localization::tracking_loss::State;
 use crate::map::SensorAttitude;
 use crate::registration::register;
 use crate::rendering::RenderError;
@@ -84,20 +85,17 @@ impl ParticleFilter {
             attitude,
         } = proposal;
         let poses = proposal.sample(self.config.num_reduced, rng);
-        self.particles = ParticleSet::uniform(poses.into_iter().map(|pose| Hypothesis {
-            map_from_lidar: pose,
-            level_m: Some(level_m),
-        }));
+        let particle = |pose| Particle::new(pose, Some(level_m));
+        self.particles = ParticleSet::uniform(poses.into_iter().map(particle));
         let step = beams.len().div_ceil(self.config.proposal.weighed_beams);
         let compared: Vec<Beam> = beams.iter().step_by(step.max(1)).copied().collect();
-        let (mut logs, costs) = self.log_likelihoods(&compared, &attitude)?;
+        let (mut logs, costs_m) = self.log_likelihoods(&compared, &attitude)?;
         for (log, pose) in logs.iter_mut().zip(self.particles.poses()) {
             *log += prior.log_density(pose) - proposal.log_density(pose);
         }
         self.reweight(&logs, 1.0);
         Ok(Update {
-            effective_sample_size: self.particles.effective_sample_size(),
-            mean_cost_m: weighted_mean(&self.particles, &costs),
+            costs_m,
             beams,
             attitude,
         })

@@ -1,13 +1,13 @@
-//! Particles of the next frame: resampled, or drawn from the panoramas when tracking is lost.
+//! Particles of the next frame: resampled, or sampled with the panoramas when tracking is lost.
 
 use rand::Rng;
 
-use super::super::initialization::from_panoramas;
-use super::super::particles::ParticleSet;
-use super::super::resampling::{jitter, kld_sample_size, occupied_bins, systematic};
-use super::super::tracking_loss::{AgreementMonitor, State};
-use super::ParticleFilter;
+use super::state::ParticleFilter;
 use crate::lidar::RangeImage;
+use crate::localization::initialization::from_panoramas;
+use crate::localization::particles::ParticleSet;
+use crate::localization::resampling::{jitter, kld_sample_size, occupied_bins, systematic};
+use crate::localization::tracking_loss::{AgreementMonitor, State};
 use crate::map::SensorAttitude;
 use crate::rendering::RenderError;
 
@@ -31,7 +31,7 @@ impl ParticleFilter {
         Ok(())
     }
 
-    /// Draws particles in the places whose panoramas resemble the scan and keeps some of the previous
+    /// Samples particles in the places whose panoramas resemble the scan and keeps some of the previous
     /// ones, because the alarm may be false. Returns `false` without panoramas.
     fn restart_search(
         &mut self,
@@ -44,14 +44,14 @@ impl ParticleFilter {
         };
         let index = self.map.panoramas(request)?;
         let count = self.config.num_particles;
-        let mut hypotheses = from_panoramas(&index, scan, attitude, count, rng);
-        if hypotheses.is_empty() {
+        let mut particles = from_panoramas(&index, scan, attitude, count, rng);
+        if particles.is_empty() {
             return Ok(false);
         }
         let kept = systematic(&self.particles.weights(), self.config.num_reduced, rng);
         let before = self.particles.particles();
-        hypotheses.extend(kept.into_iter().map(|index| before[index].hypothesis()));
-        self.particles = ParticleSet::uniform(hypotheses);
+        particles.extend(kept.into_iter().map(|index| before[index]));
+        self.particles = ParticleSet::uniform(particles);
         // Valid until the next update.
         self.estimate = self.particles.mean();
         self.covariance = self.particles.covariance_about(&self.estimate);
@@ -63,34 +63,30 @@ impl ParticleFilter {
         Ok(true)
     }
 
+    /// Resamples as many particles as the distribution needs, with jitter.
     pub(super) fn resample(&mut self, rng: &mut impl Rng) {
         let count = match self.state {
             State::Tracking => self.config.num_reduced,
             State::Searching | State::Lost => self.searching_size(),
         };
         let covariance = self.particles.covariance_about(&self.particles.mean());
-        let members = systematic(&self.particles.weights(), count, rng);
-        self.particles = self.particles.selected(&members);
-        jitter(
-            &mut self.particles,
-            &covariance,
-            &self.config.resampling,
-            rng,
-        );
+        let indices = systematic(&self.particles.weights(), count, rng);
+        self.particles = self.particles.selected(&indices);
+        let config = &self.config.resampling;
+        jitter(&mut self.particles, &covariance, config, rng);
     }
 
     /// Number of particles that the distribution needs while it is wide.
     fn searching_size(&self) -> usize {
         let average = 1.0 / self.particles.len() as f64;
         // Particles of negligible weight do not occupy bins.
-        let alive = self
-            .particles
-            .particles()
-            .iter()
+        let relevant = self.particles.particles().iter();
+        let relevant = relevant
             .filter(|particle| particle.weight > 0.1 * average)
             .map(|particle| &particle.map_from_lidar);
-        let bins = occupied_bins(alive, &self.config.kld);
-        let most = self.particles.len().max(self.config.num_reduced);
-        kld_sample_size(bins, &self.config.kld).clamp(self.config.num_reduced.min(most), most)
+        let bins = occupied_bins(relevant, &self.config.kld);
+        let least = self.config.num_reduced;
+        let most = self.particles.len().max(least);
+        kld_sample_size(bins, &self.config.kld).clamp(least, most)
     }
 }

@@ -154,7 +154,7 @@ fn write_run(
         }
         config::write(&files.file("localization.yml"), config)?;
     }
-    warn_of_doubt(results);
+    warn_of_untracked_frames(results);
     let about = about(config, context, map);
     let report = run_output::evaluate(results, &RangeMclRules::default(), about)?;
     if config.save_result {
@@ -171,7 +171,7 @@ fn write_run(
 }
 
 /// Warns of frames in which the filter was not tracking.
-fn warn_of_doubt(results: &LocalizationResults) {
+fn warn_of_untracked_frames(results: &LocalizationResults) {
     let states = results.states.as_deref().unwrap_or_default();
     let is_tracking = |state: &u8| *state == State::Tracking as u8;
     match states.iter().position(is_tracking) {
@@ -181,10 +181,10 @@ fn warn_of_doubt(results: &LocalizationResults) {
         ),
         Some(first) => {
             let tracked = states[first..].iter().filter(|&state| is_tracking(state));
-            let doubtful = states.len() - first - tracked.count();
-            if doubtful > 0 {
+            let untracked = states.len() - first - tracked.count();
+            if untracked > 0 {
                 tracing::warn!(
-                    "tracking was lost in {doubtful} of {} frames; frames.csv lists the state of each",
+                    "tracking was lost in {untracked} of {} frames; frames.csv lists the state of each",
                     states.len()
                 );
             }

@@ -1,18 +1,21 @@
-//! The filter as a whole, in a street of boxes.
+//! The filter in a street of boxes.
+
+use std::time::Duration;
 
 use approx::assert_relative_eq;
 use nalgebra::Vector2;
 use rand::{SeedableRng, rngs::StdRng};
 
-use super::super::initialization::{StartSpread, around, from_panoramas};
-use super::super::motion::OdometryNoise;
-use super::super::observation::ObservationConfig;
-use super::super::odometry::{Odometry, increments, with_noise};
-use super::*;
-use crate::geometry::wrap_angle;
-use crate::lidar::LidarModel;
+use super::ParticleFilter;
+use crate::geometry::{Pose2, Pose3, wrap_angle};
+use crate::lidar::{LidarModel, RangeImage};
+use crate::localization::initialization::{StartSpread, around, from_panoramas};
+use crate::localization::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand};
+use crate::localization::observation::ObservationConfig;
+use crate::localization::odometry::{increments, with_noise};
+use crate::localization::{Estimate, LocalizerConfig, Odometry, ParticleSet, State};
 use crate::map::test_world::TestWorld;
-use crate::map::{PanoramaConfig, SearchRegion};
+use crate::map::{PanoramaConfig, PanoramaRequest, SearchRegion, SensorAttitude};
 
 /// Small enough for a test, else the defaults.
 fn config(num_particles: usize) -> LocalizerConfig {
@@ -28,7 +31,7 @@ fn config(num_particles: usize) -> LocalizerConfig {
     }
 }
 
-/// A drive along the street, swaying a little, 0.8 m per frame, in the map.
+/// A slightly winding drive along the street, 0.8 m per frame, map frame.
 fn drive(world: &TestWorld, from_x: f64, frames: usize) -> Vec<Pose2> {
     (0..frames)
         .map(|frame| {
@@ -38,7 +41,7 @@ fn drive(world: &TestWorld, from_x: f64, frames: usize) -> Vec<Pose2> {
         .collect()
 }
 
-/// Odometry with a centimetre and a tenth of a degree of noise per frame.
+/// Odometry with noise of a centimetre and a tenth of a degree per frame.
 fn odometry(truth: &[Pose2], seed: u64) -> Vec<Pose2> {
     let poses: Vec<Pose3> = truth
         .iter()
@@ -56,19 +59,19 @@ fn odometry(truth: &[Pose2], seed: u64) -> Vec<Pose2> {
     )
 }
 
-/// The motion that the filter is given.
+/// Source of the odometry.
 #[derive(Clone, Copy)]
-enum Sense {
+enum Source {
     Odometry,
     Velocity,
-    Nothing,
+    None,
 }
 
 fn run(
     filter: &mut ParticleFilter,
     world: &TestWorld,
     truth: &[Pose2],
-    sense: Sense,
+    source: Source,
     rng: &mut StdRng,
 ) -> Vec<Estimate> {
     let increments = odometry(truth, 99);
@@ -76,13 +79,13 @@ fn run(
         .iter()
         .zip(increments)
         .map(|(pose, increment)| {
-            let odometry = match sense {
-                Sense::Odometry => Odometry::Increment(increment),
-                Sense::Velocity => {
+            let odometry = match source {
+                Source::Odometry => Odometry::Increment(increment),
+                Source::Velocity => {
                     let duration = Duration::from_millis(100);
                     Odometry::Velocity(VelocityCommand::driving(&increment, duration))
                 }
-                Sense::Nothing => Odometry::Unknown,
+                Source::None => Odometry::Unknown,
             };
             filter
                 .step(odometry, &world.scan(pose), &SensorAttitude::default(), rng)
@@ -93,10 +96,10 @@ fn run(
 
 fn track(world: &TestWorld, truth: &[Pose2], seed: u64) -> Vec<Estimate> {
     let mut rng = StdRng::seed_from_u64(seed);
-    let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+    let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
     let mut filter =
         ParticleFilter::new(config(500), world.map(), None, ParticleSet::uniform(start));
-    run(&mut filter, world, truth, Sense::Odometry, &mut rng)
+    run(&mut filter, world, truth, Source::Odometry, &mut rng)
 }
 
 /// Root mean square of position [m] and heading [rad].
@@ -158,7 +161,7 @@ fn a_street_shifted_by_a_tile_shifts_the_estimates() {
     let (a, b) = (drive(&here, 0.0, 12), drive(&there, 0.0, 12));
     let (a, b) = (track(&here, &a, 4), track(&there, &b, 4));
     let (a, b) = (a.last().unwrap(), b.last().unwrap());
-    // Rounding decides some resampling pointers: the runs agree to the width of the belief.
+    // Rounding decides some resampling pointers: the runs agree to the width of the distribution.
     assert_relative_eq!(
         a.pose.translation.x + 100.0,
         b.pose.translation.x,
@@ -168,7 +171,7 @@ fn a_street_shifted_by_a_tile_shifts_the_estimates() {
 }
 
 #[test]
-fn the_same_seed_gives_the_same_bytes_on_one_thread_and_on_two() {
+fn the_same_seed_gives_identical_estimates_on_one_thread_and_on_two() {
     let world = TestWorld::street();
     let truth = drive(&world, 20.0, 6);
     let on = |threads: usize| {
@@ -190,7 +193,7 @@ fn the_same_seed_gives_the_same_bytes_on_one_thread_and_on_two() {
 }
 
 #[test]
-fn without_odometry_the_speed_is_estimated_and_no_alarm_is_raised() {
+fn without_odometry_the_velocity_is_estimated_and_tracking_is_not_lost() {
     let world = TestWorld::street();
     // Walking pace, a town, a road outside of it: metres per frame.
     for (step_m, seed) in [(0.1, 1), (0.8, 2), (1.9, 3)] {
@@ -201,10 +204,10 @@ fn without_odometry_the_speed_is_estimated_and_no_alarm_is_raised() {
             })
             .collect();
         let mut rng = StdRng::seed_from_u64(seed);
-        let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+        let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
         let start = ParticleSet::uniform(start);
         let mut filter = ParticleFilter::new(config(500), world.map(), None, start);
-        let frames = run(&mut filter, &world, &truth, Sense::Nothing, &mut rng);
+        let frames = run(&mut filter, &world, &truth, Source::None, &mut rng);
         let (position_m, heading_rad) = rmse(&frames[10..], &truth[10..]);
         assert!(
             position_m < 0.05 && heading_rad.to_degrees() < 0.2,
@@ -219,7 +222,7 @@ fn without_odometry_the_speed_is_estimated_and_no_alarm_is_raised() {
 #[test]
 fn velocity_commands_of_a_car_that_drifts_sideways_add_no_bias() {
     let world = TestWorld::street();
-    // A sensor that is mounted a degree askew: every frame drifts to the same side.
+    // A sensor with a mounting angle of one degree: every frame drifts to the same side.
     let truth: Vec<Pose2> = (0..30)
         .map(|frame| {
             let x = 0.8 * f64::from(frame);
@@ -228,10 +231,10 @@ fn velocity_commands_of_a_car_that_drifts_sideways_add_no_bias() {
         .collect();
     let frames = {
         let mut rng = StdRng::seed_from_u64(4);
-        let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+        let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
         let start = ParticleSet::uniform(start);
         let mut filter = ParticleFilter::new(config(500), world.map(), None, start);
-        run(&mut filter, &world, &truth, Sense::Velocity, &mut rng)
+        run(&mut filter, &world, &truth, Source::Velocity, &mut rng)
     };
     let aside: f64 = frames[10..]
         .iter()
@@ -242,14 +245,14 @@ fn velocity_commands_of_a_car_that_drifts_sideways_add_no_bias() {
 }
 
 #[test]
-fn a_standing_car_is_not_updated_and_its_distribution_does_not_spread() {
+fn a_standing_car_is_not_updated_and_its_covariance_does_not_grow() {
     let world = TestWorld::street();
     let truth = drive(&world, 0.0, 10);
     let mut rng = StdRng::seed_from_u64(5);
-    let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+    let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
     let mut filter =
         ParticleFilter::new(config(500), world.map(), None, ParticleSet::uniform(start));
-    let last = run(&mut filter, &world, &truth, Sense::Odometry, &mut rng)
+    let last = run(&mut filter, &world, &truth, Source::Odometry, &mut rng)
         .pop()
         .unwrap();
     let scan = world.scan(&truth[9]);
@@ -270,7 +273,7 @@ fn a_standing_car_is_not_updated_and_its_distribution_does_not_spread() {
 }
 
 #[test]
-fn a_car_that_creeps_is_as_unsure_as_what_tells_its_motion() {
+fn the_covariance_of_a_creeping_car_grows_by_the_noise_of_its_motion() {
     let world = TestWorld::street();
     let truth = world.pose_at(0.0, 0.0, 0.0);
     let mut config = config(3);
@@ -288,7 +291,7 @@ fn a_car_that_creeps_is_as_unsure_as_what_tells_its_motion() {
         (Odometry::Velocity(command), of_velocity),
         (Odometry::Increment(command.compose()), of_motion),
     ] {
-        // All alike: what they are unsure of is the motion.
+        // Identical particles: all of the covariance comes from the motion.
         let start = ParticleSet::uniform([truth; 3]);
         let mut filter = ParticleFilter::new(config.clone(), world.map(), None, start);
         let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
@@ -301,7 +304,7 @@ fn a_car_that_creeps_is_as_unsure_as_what_tells_its_motion() {
 }
 
 #[test]
-fn the_speed_is_known_across_a_border_of_tiles() {
+fn the_velocity_is_known_across_a_border_of_tiles() {
     let world = TestWorld::street();
     let config = config(500);
     let border = Vector2::new(50.0, 0.2);
@@ -316,10 +319,10 @@ fn the_speed_is_known_across_a_border_of_tiles() {
         .map(|&x| world.pose_at(x, border.y, 0.0))
         .collect();
     let mut rng = StdRng::seed_from_u64(3);
-    let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+    let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
     let start = ParticleSet::uniform(start);
     let mut filter = ParticleFilter::new(config, world.map(), None, start);
-    run(&mut filter, &world, &truth[..10], Sense::Nothing, &mut rng);
+    run(&mut filter, &world, &truth[..10], Source::None, &mut rng);
     for frame in 10..truth.len() {
         let scan = world.scan(&truth[frame]);
         filter
@@ -346,21 +349,21 @@ fn panoramas() -> PanoramaRequest {
 }
 
 #[test]
-fn a_kidnapped_car_is_noticed_within_five_frames_and_localized_again() {
+fn a_kidnapped_car_is_detected_within_five_frames_and_localized_again() {
     let world = TestWorld::street();
     let before = drive(&world, -30.0, 12);
     let after = drive(&world, 47.0, 25);
     let mut rng = StdRng::seed_from_u64(6);
-    let start = around(&before[0], 500, &StartSpread::default(), &mut rng);
+    let start = around(&before[0], None, 500, &StartSpread::default(), &mut rng);
     let mut filter = ParticleFilter::new(
         config(500),
         world.map(),
         Some(panoramas()),
         ParticleSet::uniform(start),
     );
-    let frames = run(&mut filter, &world, &before, Sense::Odometry, &mut rng);
+    let frames = run(&mut filter, &world, &before, Source::Odometry, &mut rng);
     assert_eq!(frames.last().unwrap().state, State::Tracking);
-    let frames = run(&mut filter, &world, &after, Sense::Odometry, &mut rng);
+    let frames = run(&mut filter, &world, &after, Source::Odometry, &mut rng);
     let noticed = frames.iter().position(|frame| frame.state == State::Lost);
     assert!(noticed.is_some_and(|frame| frame < 5), "{noticed:?}");
     let (position_m, heading_rad) = rmse(&frames[20..], &after[20..]);
@@ -372,18 +375,18 @@ fn a_kidnapped_car_is_noticed_within_five_frames_and_localized_again() {
 }
 
 #[test]
-fn after_a_restart_the_covariance_is_that_of_the_particles_also_for_a_standing_car() {
+fn after_a_restart_the_covariance_of_a_standing_car_is_that_of_the_particles() {
     let world = TestWorld::street();
     let before = drive(&world, -30.0, 12);
     let mut rng = StdRng::seed_from_u64(6);
-    let start = around(&before[0], 500, &StartSpread::default(), &mut rng);
+    let start = around(&before[0], None, 500, &StartSpread::default(), &mut rng);
     let mut filter = ParticleFilter::new(
         config(500),
         world.map(),
         Some(panoramas()),
         ParticleSet::uniform(start),
     );
-    run(&mut filter, &world, &before, Sense::Odometry, &mut rng);
+    run(&mut filter, &world, &before, Source::Odometry, &mut rng);
     let after = drive(&world, 47.0, 8);
     let lost = after.iter().find(|pose| {
         let odometry = Odometry::Increment(Pose2::translation(0.8, 0.0));
@@ -427,7 +430,7 @@ fn a_start_anywhere_converges() {
             Some(panoramas()),
             ParticleSet::uniform(start),
         );
-        let frames = run(&mut filter, &world, &truth, Sense::Odometry, &mut rng);
+        let frames = run(&mut filter, &world, &truth, Source::Odometry, &mut rng);
         let (position_m, heading_rad) = rmse(&frames[15..], &truth[15..]);
         assert!(
             position_m < 0.05 && heading_rad.to_degrees() < 0.2,
@@ -437,7 +440,7 @@ fn a_start_anywhere_converges() {
 }
 
 #[test]
-fn a_lorry_beside_the_car_raises_no_alarm() {
+fn tracking_is_not_lost_beside_a_lorry() {
     let map = TestWorld::street();
     let mut seen = TestWorld::street();
     // As long as the drive: it hides the left side of the street in every frame.
@@ -449,16 +452,16 @@ fn a_lorry_beside_the_car_raises_no_alarm() {
         heading_rad: 0.05,
         ..StartSpread::default()
     };
-    let start = ParticleSet::uniform(around(&truth[0], 500, &start, &mut rng));
+    let start = ParticleSet::uniform(around(&truth[0], None, 500, &start, &mut rng));
     let mut filter = ParticleFilter::new(config(500), map.map(), None, start);
-    let frames = run(&mut filter, &seen, &truth, Sense::Odometry, &mut rng);
+    let frames = run(&mut filter, &seen, &truth, Source::Odometry, &mut rng);
     let (position_m, _) = rmse(&frames[10..], &truth[10..]);
     assert!(position_m < 0.05, "{position_m}");
     assert!(frames.iter().all(|frame| frame.state != State::Lost));
 }
 
 #[test]
-fn particles_off_the_map_do_no_harm() {
+fn particles_off_the_map_have_no_cost() {
     let world = TestWorld::street();
     let truth = world.pose_at(0.0, 0.0, 0.0);
     let nowhere = Pose2::translation(1e6, f64::MAX.sqrt());
@@ -481,14 +484,14 @@ fn particles_off_the_map_do_no_harm() {
 }
 
 #[test]
-fn a_scan_without_returns_changes_nothing() {
+fn a_scan_without_returns_leaves_the_prediction() {
     let world = TestWorld::street();
     let truth = drive(&world, 0.0, 10);
     let mut rng = StdRng::seed_from_u64(9);
-    let start = around(&truth[0], 500, &StartSpread::default(), &mut rng);
+    let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
     let mut filter =
         ParticleFilter::new(config(500), world.map(), None, ParticleSet::uniform(start));
-    run(&mut filter, &world, &truth, Sense::Odometry, &mut rng);
+    run(&mut filter, &world, &truth, Source::Odometry, &mut rng);
     let empty = RangeImage::project(&[], &LidarModel::default());
     let step = Odometry::Increment(Pose2::translation(0.8, 0.0));
     let frame = filter
@@ -500,14 +503,14 @@ fn a_scan_without_returns_changes_nothing() {
 }
 
 #[test]
-fn where_nothing_can_be_seen_it_does_not_go_on_saying_that_it_knows() {
+fn without_returns_tracking_is_lost_after_some_distance() {
     let world = TestWorld::street();
     let truth = drive(&world, 0.0, 8);
     let mut rng = StdRng::seed_from_u64(9);
-    let start = around(&truth[0], 300, &StartSpread::default(), &mut rng);
+    let start = around(&truth[0], None, 300, &StartSpread::default(), &mut rng);
     let mut filter =
         ParticleFilter::new(config(300), world.map(), None, ParticleSet::uniform(start));
-    let frames = run(&mut filter, &world, &truth, Sense::Odometry, &mut rng);
+    let frames = run(&mut filter, &world, &truth, Source::Odometry, &mut rng);
     assert_eq!(frames.last().unwrap().state, State::Tracking);
     let nothing = RangeImage::project(&[], &LidarModel::default());
     let step = Odometry::Increment(Pose2::translation(2.0, 0.0));
@@ -517,7 +520,13 @@ fn where_nothing_can_be_seen_it_does_not_go_on_saying_that_it_knows() {
             .step(step, &nothing, &SensorAttitude::default(), &mut rng)
             .unwrap();
         after_m += 2.0;
-        assert!(after_m < 600.0, "still sure after {after_m} m in the dark");
+        assert!(
+            after_m < 600.0,
+            "still tracking after {after_m} m without returns"
+        );
     }
-    assert!(after_m > 4.0, "a metre or two in the dark is no reason");
+    assert!(
+        after_m > 4.0,
+        "tracking was lost after {after_m} m without returns"
+    );
 }

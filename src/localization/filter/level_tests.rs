@@ -1,27 +1,29 @@
-//! The filter where a road crosses another one on a bridge.
+//! The filter at a crossing of two roads on two levels.
 
 use glam::Vec3;
 use nalgebra::Vector2;
 use rand::{SeedableRng, rngs::StdRng};
 
-use super::super::initialization::{StartSpread, around, from_panoramas};
-use super::super::observation::ObservationConfig;
-use super::super::odometry::Odometry;
-use super::super::particles::Hypothesis;
-use super::*;
-use crate::geometry::{TriangleMesh, pose2_from_pose3};
-use crate::lidar::LidarModel;
-use crate::map::{GroundMap, MappingPath, PanoramaConfig, SearchRegion, TileConfig, TileGrid};
+use super::ParticleFilter;
+use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
+use crate::lidar::{LidarModel, RangeImage};
+use crate::localization::initialization::{StartSpread, around, from_panoramas};
+use crate::localization::observation::ObservationConfig;
+use crate::localization::{LocalizerConfig, Odometry, ParticleSet, State};
+use crate::map::{
+    GroundMap, GroundPatch, Map, MappingPath, PanoramaConfig, PanoramaRequest, SearchRegion,
+    SensorAttitude, TileConfig, TileGrid,
+};
 use crate::rendering::CpuRenderer;
 
 /// Height of the deck over the road below [m].
 const DECK_M: f64 = 6.0;
-/// The ramps begin this far from the middle of the bridge [m].
+/// Distance of the lower ends of the ramps from the middle of the bridge [m].
 const FOOT_M: f64 = 60.0;
-/// And end this far from it [m].
+/// Distance of their upper ends from it [m].
 const HEAD_M: f64 = 10.0;
 
-/// One road along y on the ground, another one along x that a ramp leads over it and down again.
+/// A road along y on the ground, and one along x that crosses it on a bridge.
 struct Crossing {
     map: Map,
 }
@@ -143,7 +145,7 @@ impl Crossing {
     }
 }
 
-/// Where the sensor is on the upper road, tilted with it.
+/// Poses of the sensor on the upper road, tilted with it.
 fn upper_drive() -> Vec<Pose3> {
     let pose = |frame: i32| {
         let x = -70.0 + 1.5 * f64::from(frame);
@@ -161,7 +163,7 @@ fn upper_drive() -> Vec<Pose3> {
     (0..90).map(pose).collect()
 }
 
-/// Where it is on the lower one.
+/// Poses of the sensor on the lower road.
 fn lower_drive() -> Vec<Pose3> {
     let patch = GroundPatch {
         height_m: 0.0,
@@ -187,7 +189,7 @@ fn config() -> LocalizerConfig {
     }
 }
 
-/// Runs the filter and asks that it is near the truth, in space, from the tenth frame on.
+/// Runs the filter, which must track the truth in space from the tenth frame on.
 fn follow(crossing: &Crossing, mut filter: ParticleFilter, truth: &[Pose3], rng: &mut StdRng) {
     let mut before = pose2_from_pose3(&truth[0]);
     for (frame, truth) in truth.iter().enumerate() {
@@ -212,21 +214,14 @@ fn follow(crossing: &Crossing, mut filter: ParticleFilter, truth: &[Pose3], rng:
 }
 
 #[test]
-fn cars_above_and_below_keep_their_level_also_on_the_ramp() {
+fn cars_on_both_levels_and_on_the_ramp_keep_their_level() {
     let crossing = Crossing::new();
     for (seed, truth) in [(1, upper_drive()), (2, lower_drive())] {
         let mut rng = StdRng::seed_from_u64(seed);
-        let start = around(
-            &pose2_from_pose3(&truth[0]),
-            500,
-            &StartSpread::default(),
-            &mut rng,
-        );
         let level_m = Some(truth[0].translation.z - SensorAttitude::default().height_m);
-        let start = ParticleSet::uniform(start.into_iter().map(|map_from_lidar| Hypothesis {
-            map_from_lidar,
-            level_m,
-        }));
+        let pose = pose2_from_pose3(&truth[0]);
+        let start = around(&pose, level_m, 500, &StartSpread::default(), &mut rng);
+        let start = ParticleSet::uniform(start);
         let filter = ParticleFilter::new(config(), crossing.map.clone(), None, start);
         follow(&crossing, filter, &truth, &mut rng);
     }
@@ -242,7 +237,7 @@ fn a_start_anywhere_finds_its_level() {
         config: PanoramaConfig::default(),
     };
     let index = crossing.map.panoramas(&request).unwrap();
-    // On the deck and right below it.
+    // On the deck and below it.
     for (seed, truth) in [(3, &upper_drive()[44..]), (4, &lower_drive()[31..])] {
         let mut rng = StdRng::seed_from_u64(seed);
         let scan = crossing.scan(&truth[0]);

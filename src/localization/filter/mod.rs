@@ -1,0 +1,28 @@
+//! The particle filter: Monte Carlo localization with range images.
+//!
+//! ```text
+//! propagate      x ~ p(x | x_before, odometry)           motion
+//! reweight       w ∝ w · p(scan | x, map)ᵝ               observation, tempering
+//! estimate       weighted mean, covariance, state        particles, tracking_loss
+//! resample       when few particles carry the weight     resampling
+//! ```
+//!
+//! While the filter searches, reweighting and resampling alternate several times within one frame,
+//! with an increasingly peaked likelihood (annealing). Once the distribution is narrow, `num_reduced`
+//! particles are enough; they are sampled where odometry and scan agree
+//! ([`proposal`](super::proposal)).
+
+mod state;
+
+mod coast;
+mod propose;
+mod resample;
+mod reweight;
+mod step;
+
+pub use state::ParticleFilter;
+
+#[cfg(test)]
+mod filter_tests;
+#[cfg(test)]
+mod level_tests;

@@ -1,0 +1,148 @@
+//! Measurement update: the weights of the particles, and the estimate that follows from them.
+
+use rand::Rng;
+
+use super::state::ParticleFilter;
+use crate::geometry::Pose3;
+use crate::lidar::{Beam, RangeImage};
+use crate::localization::estimate::Estimate;
+use crate::localization::observation::{choose_beams, costs, ground_patch_of, near_points};
+use crate::localization::particles::{Particle, ParticleSet};
+use crate::localization::tempering::exponent;
+use crate::localization::tracking_loss::State;
+use crate::map::{GroundPatch, SensorAttitude};
+use crate::rendering::RenderError;
+
+/// Result of a measurement update.
+pub(super) struct Update {
+    /// Mean costs of the particles [m]; `None` off the map.
+    pub(super) costs_m: Vec<Option<f64>>,
+    /// The beams of the last round.
+    pub(super) beams: Vec<Beam>,
+    /// Attitude of the sensor as estimated in this frame.
+    pub(super) attitude: SensorAttitude,
+}
+
+impl ParticleFilter {
+    /// Reweights the particles by the scan, in one round or several.
+    pub(super) fn reweight_in_rounds(
+        &mut self,
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+        rng: &mut impl Rng,
+    ) -> Result<Update, RenderError> {
+        let rounds = match self.state {
+            State::Tracking => self.config.tempering.tracking_rounds,
+            State::Searching | State::Lost => self.config.tempering.searching_rounds,
+        };
+        let (mut remaining, mut round) = (1.0, 1);
+        loop {
+            let observation = &self.config.observation;
+            let count = observation.beams_for(self.particles.len());
+            let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
+            let refined = self.refined_attitude(scan, attitude);
+            let (logs, costs_m) = self.log_likelihoods(&beams, &refined)?;
+            let used = self.reweight(&logs, remaining);
+            remaining -= used;
+            if round >= rounds || remaining <= 0.0 || used <= 0.0 {
+                return Ok(Update {
+                    costs_m,
+                    beams,
+                    attitude: self.refined_attitude(scan, attitude),
+                });
+            }
+            self.resample(rng);
+            round += 1;
+        }
+    }
+
+    /// Log-likelihoods of the particles, up to a constant, and their mean costs [m].
+    pub(super) fn log_likelihoods(
+        &mut self,
+        beams: &[Beam],
+        attitude: &SensorAttitude,
+    ) -> Result<(Vec<f64>, Vec<Option<f64>>), RenderError> {
+        let poses = self.align_to_ground(attitude);
+        let observation = &self.config.observation;
+        let difference = observation.difference();
+        let costs = costs(&*self.map.renderer, &poses, beams, &difference)?;
+        let log = |cost: &Option<f64>| {
+            cost.map_or(observation.floor_log_likelihood(), |cost_m| {
+                observation.log_likelihood(cost_m)
+            })
+        };
+        Ok((costs.iter().map(log).collect(), costs))
+    }
+
+    /// Multiplies the weights by a power of the likelihoods, at most `largest`. Returns the power.
+    pub(super) fn reweight(&mut self, logs: &[f64], largest: f64) -> f64 {
+        let min_effective =
+            self.config.tempering.min_effective_fraction * self.particles.len() as f64;
+        let power = exponent(&self.particles.weights(), logs, min_effective, largest);
+        let tempered: Vec<f64> = logs.iter().map(|log| power * log).collect();
+        self.particles.reweight(&tempered);
+        power
+    }
+
+    /// Estimate of an updated frame, which is kept for the next frames.
+    pub(super) fn updated_estimate(&mut self, update: &Update) -> Estimate {
+        self.covariance = self.particles.covariance_of_estimate();
+        let particles = self.particles.clone();
+        let mut estimate = self.estimate_of(particles, self.covariance, &update.attitude);
+        estimate.updated = true;
+        estimate.mean_cost_m = weighted_mean(&self.particles, &update.costs_m);
+        let is_narrow = self.is_narrow();
+        // A jump of a wide distribution is not a motion of the car.
+        if self.is_narrow && is_narrow {
+            self.last_increment = Some(self.estimate.inverse() * estimate.pose);
+        }
+        self.is_narrow = is_narrow;
+        self.estimate = estimate.pose;
+        estimate
+    }
+
+    /// Attitude of the sensor: where the distribution is narrow, from the distances of ground returns
+    /// to the mapped ground; otherwise from the scan alone.
+    fn refined_attitude(&self, scan: &RangeImage, attitude: &SensorAttitude) -> SensorAttitude {
+        if !self.is_narrow() {
+            return *attitude;
+        }
+        let (mean, points) = (self.particles.mean(), near_points(scan));
+        self.map
+            .ground
+            .attitude_at(&mean, self.level_m(), attitude, &points)
+            .unwrap_or(*attitude)
+    }
+
+    /// Aligns the particles to the ground of the map and returns their poses in space.
+    fn align_to_ground(&mut self, attitude: &SensorAttitude) -> Vec<Option<Pose3>> {
+        let remembered = self.patch.filter(|_| self.state == State::Tracking);
+        let particles = self.particles.particles();
+        let patches: Vec<Option<GroundPatch>> = particles
+            .iter()
+            .map(|particle| ground_patch_of(particle, &self.map, remembered.as_ref()))
+            .collect();
+        let lift = |(particle, patch): (&Particle, &Option<GroundPatch>)| {
+            Some(patch.as_ref()?.lift(&particle.map_from_lidar, attitude))
+        };
+        let poses = particles.iter().zip(&patches).map(lift).collect();
+        let levels_m = patches
+            .iter()
+            .map(|patch| patch.map(|patch| patch.height_m));
+        self.particles.set_levels(levels_m);
+        poses
+    }
+}
+
+/// Weighted mean of the costs of the particles that have one [m].
+fn weighted_mean(particles: &ParticleSet, costs_m: &[Option<f64>]) -> Option<f64> {
+    let (sum, weight) = particles
+        .particles()
+        .iter()
+        .zip(costs_m)
+        .filter_map(|(particle, cost_m)| cost_m.map(|cost_m| (particle.weight, cost_m)))
+        .fold((0.0, 0.0), |(sum, weight), (w, cost_m)| {
+            (sum + w * cost_m, weight + w)
+        });
+    (weight > 0.0).then(|| sum / weight)
+}

@@ -1,0 +1,149 @@
+//! The localizer on scans as values.
+
+use nalgebra::Vector2;
+
+use super::*;
+use crate::lidar::LidarModel;
+use crate::localization::State;
+use crate::localization::observation::ObservationConfig;
+use crate::localization::sensor::SensorConfig;
+use crate::map::test_world::TestWorld;
+
+/// A localizer runs on one thread at a time, a map is shared by several.
+const _: () = {
+    const fn is_send<T: Send>() {}
+    const fn is_shared<T: Send + Sync>() {}
+    is_send::<Localizer>();
+    is_shared::<Map>();
+};
+
+/// Small enough for a test, else the defaults.
+fn config() -> LocalizerConfig {
+    LocalizerConfig {
+        sensor: SensorConfig {
+            lidar: LidarModel {
+                height: 32,
+                width: 360,
+                ..LidarModel::default()
+            },
+            ..SensorConfig::default()
+        },
+        num_particles: 500,
+        observation: ObservationConfig {
+            beams: 600,
+            min_beams: 150,
+            ray_budget: 60_000,
+            ..ObservationConfig::default()
+        },
+        ..LocalizerConfig::default()
+    }
+}
+
+/// A drive along the street, 0.8 m per frame.
+fn drive(world: &TestWorld, from_x: f64, frames: usize) -> Vec<Pose2> {
+    (0..frames)
+        .map(|frame| world.pose_at(from_x + 0.8 * frame as f64, 0.3, 0.02))
+        .collect()
+}
+
+fn scan(world: &TestWorld, pose: &Pose2) -> Scan {
+    Scan {
+        points: world.scan(pose).points,
+        intensities: Vec::new(),
+    }
+}
+
+fn near(pose: &Pose2) -> Start {
+    Start::Pose {
+        map_from_lidar: *pose,
+        height_m: None,
+        spread: StartSpread::default(),
+    }
+}
+
+/// Localizes a drive with exact odometry.
+fn localize(world: &TestWorld, start: Start, truth: &[Pose2], seed: u64) -> Vec<Estimate> {
+    let mut localizer = Localizer::new(&world.map(), config(), start, seed).unwrap();
+    let mut previous = truth[0];
+    truth
+        .iter()
+        .map(|pose| {
+            let increment = previous.inverse() * pose;
+            previous = *pose;
+            let odometry = Odometry::Increment(increment);
+            localizer.step(&scan(world, pose), odometry).unwrap()
+        })
+        .collect()
+}
+
+/// Distance between an estimate and the truth [m].
+fn error_m(estimate: &Estimate, truth: &Pose2) -> f64 {
+    (estimate.pose.translation.vector - truth.translation.vector).norm()
+}
+
+#[test]
+fn the_same_seed_gives_identical_estimates() {
+    let world = TestWorld::street();
+    let truth = drive(&world, 10.0, 4);
+    let run = |seed| localize(&world, near(&truth[0]), &truth, seed);
+    let (a, b, other) = (run(3), run(3), run(4));
+    for (a, b) in a.iter().zip(&b) {
+        assert_eq!((a.pose, a.covariance), (b.pose, b.covariance));
+        assert_eq!(a.particles, b.particles);
+    }
+    assert_ne!(a[3].pose, other[3].pose);
+}
+
+#[test]
+fn every_start_finds_the_car_in_the_street() {
+    let world = TestWorld::street();
+    let truth = drive(&world, 31.0, 12);
+    for start in [near(&truth[0]), Start::Road, Start::Anywhere] {
+        let estimates = localize(&world, start.clone(), &truth, 1);
+        let last = estimates.last().unwrap();
+        let error_m = error_m(last, &truth[11]);
+        assert!(error_m < 0.05, "{start:?}: {error_m} m");
+        assert_eq!(last.state, State::Tracking, "{start:?}");
+    }
+}
+
+#[test]
+fn a_start_outside_the_map_is_an_error_that_gives_the_place() {
+    let world = TestWorld::street();
+    let start = near(&Pose2::new(Vector2::new(9000.0, -50.0), 0.0));
+    let mut localizer = Localizer::new(&world.map(), config(), start, 0).unwrap();
+    let scan = scan(&world, &world.pose_at(0.0, 0.0, 0.0));
+    let error = localizer.step(&scan, Odometry::Unknown).unwrap_err();
+    let LocalizerError::StartOutside { x, y } = error else {
+        panic!("{error}");
+    };
+    assert!((x - 9000.0).abs() <= 5.0 && (y + 50.0).abs() <= 5.0);
+}
+
+#[test]
+fn a_configured_height_of_the_sensor_is_used_where_no_ground_is_visible() {
+    let world = TestWorld::street();
+    let mut config = config();
+    config.sensor.height_m = Some(2.1);
+    let start = near(&world.pose_at(0.0, 0.0, 0.0));
+    let mut localizer = Localizer::new(&world.map(), config, start, 0).unwrap();
+    let estimate = localizer.step(&Scan::default(), Odometry::Unknown).unwrap();
+    assert_eq!(estimate.attitude.height_m, 2.1);
+    let request = localizer.panorama_request();
+    assert!((request.sensor_height_m - 2.1).abs() < 1e-9);
+}
+
+#[test]
+fn an_invalid_configuration_is_an_error_that_names_its_key() {
+    let map = TestWorld::street().map();
+    let message = |change: fn(&mut LocalizerConfig)| {
+        let mut config = config();
+        change(&mut config);
+        let result = Localizer::new(&map, config, Start::Road, 0);
+        result.err().unwrap().to_string()
+    };
+    let no_particles = message(|config| config.num_particles = 0);
+    assert!(no_particles.contains("numParticles is 0"), "{no_particles}");
+    let no_scale = message(|config| config.observation.scale_m = -1.0);
+    assert!(no_scale.contains("observation.scale_m is -1"), "{no_scale}");
+}
