@@ -189,7 +189,7 @@ impl ParticleSet {
 pub fn deviation(pose: &Pose2, center: &Pose2) -> Vector3<f64> {
     let offset = pose.translation.vector - center.translation.vector;
     let turn_rad = wrap_angle(pose.rotation.angle() - center.rotation.angle());
-    Vector3::new(offset.x, offset.y, turn_rad)
+    offset.push(turn_rad)
 }
 
 /// Standard deviations of a covariance of (x, y, heading): position as √(σ_x² + σ_y²) [m], heading [rad].

@@ -272,12 +272,8 @@ impl NormalEquations {
 
 /// Residual of the odometry between two poses: zᵢ⁻¹ (xᵢ⁻¹ xᵢ₊₁).
 fn relative(pair: &[Pose2], increment: &Pose2) -> Vector3<f64> {
-    let left = increment.inverse() * (pair[0].inverse() * pair[1]);
-    Vector3::new(
-        left.translation.x,
-        left.translation.y,
-        left.rotation.angle(),
-    )
+    let residual = increment.inverse() * (pair[0].inverse() * pair[1]);
+    residual.translation.vector.push(residual.rotation.angle())
 }
 
 /// Jacobians of [`relative`] by steps in the frames of the first and of the second pose.

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 
 use self::pictures::draw_example;
-use self::recorder::{Recorder, Run};
+use self::recorder::Run;
 use super::interrupt::Interrupted;
 use super::run_output::{self, RunFiles};
 use super::stages::Inputs;
@@ -76,7 +76,7 @@ fn localize(
     let mut localizer = Localizer::new(map, config.localizer(), start, config.seed)?;
     let refiner = || TrajectoryRefiner::new(map, config.refiner(), config.seed);
     let mut refiner = config.refine.then(refiner).transpose()?;
-    let mut recorder = Recorder::new(config, map, files);
+    let mut run = Run::new(config, map, files);
     let task = context.progress.task("localize", sequence.frames.len());
     for (row, frame) in sequence.frames.iter().enumerate() {
         if context.interrupt.requested() {
@@ -93,16 +93,16 @@ fn localize(
                 None => None,
             };
             let runtimes = [runtime, started.elapsed() - runtime];
-            recorder.record(frame, increments[row], &estimate, refined, runtimes)
+            run.record(frame, increments[row], &estimate, refined, runtimes)
         };
         if let Err(error) = process() {
-            recorder.failure = Some(error);
+            run.failure = Some(error);
             break;
         }
         task.advance(1);
     }
     drop(task);
-    recorder.into_run()
+    run.completed()
 }
 
 /// Where the particles start.

@@ -21,25 +21,15 @@ pub struct Run {
     pub map_from_lidar: Vec<Pose3>,
     /// The refined poses in space; the estimates where a frame was not refined.
     pub refined: Vec<Pose3>,
-    /// The error that ended the run before its last frame.
-    pub failure: Option<anyhow::Error>,
     /// Pictures of the frames, if they were requested.
     pub movie: Option<Movie>,
-}
-
-/// Collects the results of frames.
-pub struct Recorder {
-    results: LocalizationResults,
-    map_from_lidar: Vec<Pose3>,
-    refined: Vec<Pose3>,
-    movie: Option<Movie>,
-    /// Frames without mapped ground below the estimate.
+    /// Number of frames without mapped ground below the estimate.
     off_ground: usize,
-    /// The error that ended the run.
+    /// The error that ended the run before its last frame.
     pub failure: Option<anyhow::Error>,
 }
 
-impl Recorder {
+impl Run {
     pub fn new(config: &LocalizationConfig, map: &Map, files: &RunFiles) -> Self {
         let empty = || Some(Vec::new());
         Self {
@@ -113,8 +103,8 @@ impl Recorder {
         Ok(())
     }
 
-    /// Returns the run; an error where no frame was finished.
-    pub fn into_run(self) -> Result<Run> {
+    /// Returns the run after its last frame; an error where no frame was finished.
+    pub fn completed(self) -> Result<Self> {
         let frames = self.results.len();
         if frames == 0 {
             let kept = "no frame was finished".to_owned();
@@ -126,12 +116,6 @@ impl Recorder {
                 self.off_ground
             );
         }
-        Ok(Run {
-            results: self.results,
-            map_from_lidar: self.map_from_lidar,
-            refined: self.refined,
-            failure: self.failure,
-            movie: self.movie,
-        })
+        Ok(self)
     }
 }
