@@ -1,6 +1,6 @@
 //! Output of commands: files, written atomically, and standard output.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
@@ -46,19 +46,6 @@ pub fn write_text(path: &Path, text: &str) -> anyhow::Result<()> {
     write_file(path, |file| file.write_all(text.as_bytes()))
 }
 
-/// Writes a file atomically by a function that takes a path.
-pub fn replace(path: &Path, write: impl FnOnce(&Path) -> anyhow::Result<()>) -> anyhow::Result<()> {
-    let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(".part");
-    let part = path.with_file_name(name);
-    if let Err(error) = write(&part) {
-        // The incomplete file is worthless, and may be what fills the disk.
-        let _ = fs::remove_file(&part);
-        return Err(error).with_context(|| format!("writing {}", path.display()));
-    }
-    fs::rename(&part, path).with_context(|| format!("cannot write {}", path.display()))
-}
-
 /// Writes a report as JSON atomically.
 pub fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
     let json = serde_json::to_string_pretty(report)
@@ -82,6 +69,8 @@ pub fn print(text: &str) -> anyhow::Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     #[test]

@@ -166,9 +166,8 @@ fn write_scan(
     }
     if config.write_plys {
         let colors = Colormap::Diverging.colors(confidences);
-        output::replace(&output_path("points", "ply")?, |part| {
-            Ok(ply::write_points(part, &scan.points, &colors, confidences)?)
-        })?;
+        let path = output_path("points", "ply")?;
+        ply::write_points(&path, &scan.points, &colors, confidences)?;
     }
     Ok(())
 }
