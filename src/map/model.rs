@@ -36,8 +36,11 @@ pub struct Map {
     /// Renders the map from any pose.
     pub renderer: Arc<dyn RangeRenderer>,
     /// The panoramas that were asked for last.
-    panoramas: Arc<Mutex<Option<(PanoramaRequest, Arc<PanoramaIndex>)>>>,
+    panoramas: Arc<Mutex<Option<CachedPanoramas>>>,
 }
+
+/// Rendered panoramas and the request that they answer.
+type CachedPanoramas = (PanoramaRequest, Arc<PanoramaIndex>);
 
 /// Why a map cannot be loaded or prepared.
 #[derive(Debug, thiserror::Error)]
