@@ -167,9 +167,9 @@ impl GroundMap {
     ) -> Option<impl Iterator<Item = ((i64, i64), Vector2<f64>)>> {
         let (column, row) = self.heights.cell_at(x, y)?;
         let reach = (radius_m / self.heights.cell_m).ceil() as i64;
-        let rows = row - reach..=row + reach;
+        let rows = row.saturating_sub(reach)..=row.saturating_add(reach);
         let cells = rows.flat_map(move |row| {
-            let columns = column - reach..=column + reach;
+            let columns = column.saturating_sub(reach)..=column.saturating_add(reach);
             columns.map(move |column| (column, row))
         });
         Some(cells.filter_map(move |cell| {
