@@ -2,12 +2,12 @@
 //!
 //! ```text
 //! key scans  ->  local maps  ->  per local map: ground, static points, Poisson surface, trimming,
-//!                                free space, border, simplified ground  ->  one mesh
+//!                                free space, clipping, simplified ground  ->  one mesh
 //! ```
 //!
-//! [`MapBuilder::build`] does all of it on scans in memory. A drive that is too long for that, or a
-//! build that resumes, goes through [`MapPlan`]: the poses of all scans first, then one local map after
-//! the other, with scans that are read when they are needed.
+//! [`MapBuilder::build`] does all of it on scans in memory. For drives too long for
+//! that, and to resume builds, use [`MapPlan`]: give the poses of all key scans, then build the local
+//! maps one by one, with scans that are read on demand.
 
 use std::error::Error;
 use std::ops::ControlFlow;
@@ -26,7 +26,7 @@ use crate::lidar::Scan;
 use crate::meshing::MeshingError;
 use crate::validation::{InvalidValue, Validate as _};
 
-/// The error of whoever gives the scans.
+/// An error of the source of the scans.
 pub type ScanError = Box<dyn Error + Send + Sync>;
 
 /// Progress of a build.
@@ -46,6 +46,10 @@ pub enum BuildError {
     Interrupted,
     #[error(transparent)]
     Scan(ScanError),
+    #[error(
+        "there are no scans to build a map from; check the recording and its selection of frames"
+    )]
+    NoScans,
     #[error("local map {number} (key scans {first} to {last}): {source}")]
     LocalMap {
         number: usize,
@@ -69,7 +73,7 @@ pub enum BuildError {
 pub struct MapBuilder {
     /// Configuration of the build.
     pub config: MapConfig,
-    /// How the finished map is prepared.
+    /// Preparation of the finished map for localization.
     pub options: MapOptions,
     /// Called for every event, from any thread; the build stops with [`BuildError::Interrupted`] soon
     /// after it returns `Break`.
@@ -77,7 +81,7 @@ pub struct MapBuilder {
 }
 
 impl MapBuilder {
-    /// A builder that reports nothing and cannot be interrupted.
+    /// Creates a builder without events and interruption.
     pub fn new(config: MapConfig) -> Self {
         Self {
             config,
@@ -93,6 +97,7 @@ impl MapBuilder {
         &self,
         scans: impl IntoIterator<Item = Result<(Scan, Pose3), E>>,
     ) -> Result<Map, BuildError> {
+        self.config.validate()?;
         let (mut keys, mut poses): (Vec<Scan>, Vec<Pose3>) = Default::default();
         for item in scans {
             let (scan, pose) = item.map_err(|error| BuildError::Scan(error.into()))?;
@@ -114,6 +119,9 @@ impl MapBuilder {
     pub fn plan(&self, map_from_lidar: Vec<Pose3>) -> Result<MapPlan<'_>, BuildError> {
         let config = &self.config;
         config.validate()?;
+        if map_from_lidar.is_empty() {
+            return Err(BuildError::NoScans);
+        }
         let local_maps = plan::local_maps(&map_from_lidar, config.local_map_size, config.overlap_m);
         let reach_m = f64::from(config.local_map.scan.crop_m.length());
         Ok(MapPlan {
@@ -128,18 +136,18 @@ impl MapBuilder {
 
 /// The local maps of a drive.
 pub struct MapPlan<'a> {
-    /// Which scans make which local map.
+    /// Key scans of each local map.
     pub local_maps: Vec<LocalMapPlan>,
     /// Poses of the key scans.
     pub map_from_lidar: Vec<Pose3>,
-    /// Ground classifier, that of the configuration unless it is replaced.
+    /// Ground classifier; by default that of the configuration.
     pub classifier: Box<dyn GroundClassifier>,
     builder: &'a MapBuilder,
     ownership: Ownership,
 }
 
 impl MapPlan<'_> {
-    /// Builds a local map. `read_scan` gives a key scan by its index, from any thread.
+    /// Builds a local map. `read_scan` returns a key scan by its index and is called from any thread.
     pub fn build_local_map(
         &self,
         plan: &LocalMapPlan,
@@ -175,7 +183,7 @@ impl MapPlan<'_> {
         )
     }
 
-    /// Prepares the joined mesh of all local maps as a map; its world is its own frame.
+    /// Prepares the joined mesh of all local maps as a map; `world_from_map` is the identity.
     pub fn finish(self, mesh: TriangleMesh) -> Result<Map, BuildError> {
         if mesh.triangles.is_empty() {
             let scans = self.map_from_lidar.len();
@@ -186,5 +194,155 @@ impl MapPlan<'_> {
             map_from_lidar: self.map_from_lidar,
         };
         Ok(Map::new(mesh, path, &self.builder.options)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+
+    use super::*;
+    use crate::lidar::LidarModel;
+    use crate::rendering::Backend;
+
+    fn model() -> LidarModel {
+        LidarModel {
+            height: 32,
+            width: 240,
+            ..LidarModel::default()
+        }
+    }
+
+    /// A builder of coarse local maps of three scans.
+    fn builder() -> MapBuilder {
+        let mut config = MapConfig {
+            local_map_size: 3,
+            overlap_m: 1.5,
+            ..MapConfig::default()
+        };
+        config.local_map.poisson.depth = 5;
+        config.local_map.max_distance_m = 1.0;
+        config.local_map.scan.range_image = model();
+        config.local_map.scan.crop_m = Vec3::new(10.0, 10.0, 5.0);
+        MapBuilder {
+            options: MapOptions {
+                backend: Backend::Cpu,
+                ..MapOptions::default()
+            },
+            ..MapBuilder::new(config)
+        }
+    }
+
+    /// A scan of a road between two walls along x, the same from everywhere on its centre line.
+    fn scan() -> Scan {
+        let returned = |direction: &Vec3| {
+            let road_m = if direction.z < 0.0 {
+                -1.73 / direction.z
+            } else {
+                f32::INFINITY
+            };
+            let range_m = road_m.min(6.0 / direction.y.abs());
+            (range_m < 20.0).then(|| range_m * *direction)
+        };
+        let points: Vec<Vec3> = model().directions().iter().filter_map(returned).collect();
+        Scan {
+            intensities: vec![0.5; points.len()],
+            points,
+        }
+    }
+
+    /// Scans along x.
+    fn drive(positions_m: &[f64]) -> Vec<Result<(Scan, Pose3), ScanError>> {
+        let at = |&x: &f64| Ok((scan(), Pose3::translation(x, 0.0, 0.0)));
+        positions_m.iter().map(at).collect()
+    }
+
+    fn error_of(builder: &MapBuilder, positions_m: &[f64]) -> BuildError {
+        builder.build(drive(positions_m)).err().unwrap()
+    }
+
+    #[test]
+    fn a_map_built_at_once_is_that_of_its_local_maps_built_one_by_one() {
+        let builder = builder();
+        let positions_m = [0.0, 1.0, 2.0, 3.0, 4.0];
+        let map = builder.build(drive(&positions_m)).unwrap();
+
+        let poses = positions_m.map(|x| Pose3::translation(x, 0.0, 0.0));
+        let plan = builder.plan(poses.to_vec()).unwrap();
+        assert_eq!(plan.local_maps.len(), 2);
+        let mut mesh = TriangleMesh::default();
+        for local_map in &plan.local_maps {
+            let built = plan.build_local_map(local_map, &|_| Ok(scan())).unwrap();
+            assert!(built.counts.triangles > 100, "{:?}", built.counts);
+            mesh.append(&built.mesh);
+        }
+        assert!(*map.mesh == mesh);
+        assert_eq!(map.path.map_from_lidar, poses);
+        let joined = plan.finish(mesh).unwrap();
+        assert!(joined.mesh == map.mesh && joined.path == map.path);
+    }
+
+    #[test]
+    fn a_saved_map_loads_with_the_same_mesh_and_path() {
+        let builder = builder();
+        let mut map = builder.build(drive(&[0.0])).unwrap();
+        let world_from_map = Pose3::new([1e6 / 3.0, -0.1, 7.0].into(), [0.1, 0.2, -0.3].into());
+        map.path = MappingPath {
+            world_from_map,
+            map_from_lidar: vec![world_from_map.inverse(); 3],
+        }
+        .into();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.ply");
+        map.save(&path).unwrap();
+        let loaded = Map::load(&path, &builder.options).unwrap();
+        assert!(loaded.mesh == map.mesh);
+        assert_eq!(loaded.path, map.path);
+    }
+
+    #[test]
+    fn a_drive_without_motion_has_one_key_scan() {
+        let map = builder().build(drive(&[1.0; 4])).unwrap();
+        assert_eq!(map.path.map_from_lidar.len(), 1);
+    }
+
+    #[test]
+    fn a_build_stops_when_an_event_is_answered_with_break() {
+        let builder = MapBuilder {
+            on_event: Box::new(|event| match event {
+                BuildEvent::ScanPrepared => ControlFlow::Break(()),
+                BuildEvent::Stage(_) => ControlFlow::Continue(()),
+            }),
+            ..builder()
+        };
+        let error = error_of(&builder, &[0.0, 1.0]);
+        assert!(matches!(error, BuildError::Interrupted), "{error}");
+    }
+
+    #[test]
+    fn without_scans_or_without_points_the_build_is_an_error() {
+        let error = error_of(&builder(), &[]);
+        assert!(matches!(error, BuildError::NoScans), "{error}");
+        let empty = [Ok::<_, ScanError>((Scan::default(), Pose3::identity()))];
+        let error = builder().build(empty).err().unwrap();
+        assert!(matches!(error, BuildError::Empty { scans: 1 }), "{error}");
+    }
+
+    #[test]
+    fn an_error_of_the_source_of_the_scans_is_passed_on() {
+        let damaged = [Err::<(Scan, Pose3), _>("the disk is on fire")];
+        let error = builder().build(damaged).err().unwrap();
+        assert_eq!(error.to_string(), "the disk is on fire");
+    }
+
+    #[test]
+    fn an_invalid_configuration_is_an_error_with_its_key_before_a_scan_is_read() {
+        let mut builder = builder();
+        builder.config.displacement_threshold_m = f64::NAN;
+        let unread = std::iter::from_fn(|| -> Option<Result<(Scan, Pose3), ScanError>> {
+            unreachable!("a scan was read")
+        });
+        let message = builder.build(unread).err().unwrap().to_string();
+        assert!(message.contains("displacement_threshold_m"), "{message}");
     }
 }

@@ -1,35 +1,37 @@
-//! The ground of the map: how high the road is and how it leans, and with it where in space a
-//! pose in the plane is.
+//! Elevation map of the ground, and the pose in space that belongs to a planar pose.
 //!
 //! ```text
 //! map_from_lidar = map_from_road(x, y, heading) · road_from_lidar
 //! ```
 //!
-//! The road frame lies on the mapped ground under the sensor, z along the ground's normal, x
-//! forward. How the sensor stands over it (height, roll, pitch) is the car's own affair and
-//! comes from the scan: from the plane of its road, or, where the place is known, better from the
-//! distances of its returns to the mapped ground ([`GroundMap::attitude_at`]).
+//! The origin of the road frame is the point of the mapped ground below the sensor; z is the normal
+//! of the ground, x points forward. The sensor attitude (height, roll, pitch above the ground) changes
+//! with the load and motion of the car and is estimated from the scan: from the plane of the road in
+//! the scan or, once the planar pose is known, more accurately from the distances of the returns to
+//! the mapped ground ([`GroundMap::attitude_at`]).
 //!
-//! Where roads cross above one another, a place in the plane has several levels of ground. Who stood
-//! on one of them a moment ago says how high that was, and stays on it.
+//! Where roads cross above one another the map has several levels. The height of the last known
+//! ground selects the level.
 
 use glam::Vec3;
-use nalgebra::{Matrix3, Point2, Rotation3, Translation3, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{
+    Matrix3, Point2, Point3, Rotation3, Translation3, UnitQuaternion, Vector2, Vector3,
+};
 
-use super::heights::{Heights, LEVEL_GAP_M, Reader};
+use super::heights::{HeightReader, Heights, LEVEL_GAP_M};
 use crate::geometry::{Pose2, Pose3, TriangleMesh};
 
-/// About the wheelbase and track of a car: so far the ground carries it [m].
+/// Radius of the ground that carries a car, about its wheelbase [m].
 const RADIUS_M: f64 = 2.0;
 
-/// How the sensor stands over the road: height, roll and pitch.
+/// Sensor attitude: height, roll and pitch above the ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SensorAttitude {
-    /// Height of the sensor over the road, along the road's normal [m].
+    /// Height of the sensor above the road, along the normal of the road [m].
     pub height_m: f64,
-    /// About the forward axis [rad].
+    /// Rotation about the forward axis [rad].
     pub roll_rad: f64,
-    /// About the left axis; positive looks down [rad].
+    /// Rotation about the left axis; positive looks down [rad].
     pub pitch_rad: f64,
 }
 
@@ -45,7 +47,7 @@ impl Default for SensorAttitude {
 }
 
 impl SensorAttitude {
-    /// `p_road = road_from_lidar * p_lidar`.
+    /// Returns the pose of the sensor above the road, `p_road = road_from_lidar * p_lidar`.
     pub fn road_from_lidar(&self) -> Pose3 {
         Pose3::from_parts(
             Translation3::new(0.0, 0.0, self.height_m),
@@ -53,8 +55,8 @@ impl SensorAttitude {
         )
     }
 
-    /// From the road's plane as the sensor sees it: unit normal (up) and distance of the sensor
-    /// over the plane [m].
+    /// Computes the attitude from the plane of the road in the lidar frame: its unit normal (up) and
+    /// the distance of the sensor from it [m].
     pub fn from_plane(up_in_lidar: Vec3, height_m: f64) -> Self {
         let up: Vector3<f64> = Vector3::new(up_in_lidar.x, up_in_lidar.y, up_in_lidar.z).cast();
         // up = Rx(roll)ᵀ Ry(pitch)ᵀ z  (no yaw)  =  (-sin p, cos p sin r, cos p cos r)
@@ -66,23 +68,60 @@ impl SensorAttitude {
     }
 }
 
-/// The ground at one place.
+/// Plane of the ground around a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GroundPatch {
-    /// Height in the map frame [m].
+    /// Height at the point, map frame [m].
     pub height_m: f64,
     /// Unit normal, up.
     pub normal: Vector3<f64>,
 }
 
-/// Height of the ground on a grid over the map.
+impl GroundPatch {
+    /// Lifts a planar pose into space: a sensor of that `attitude` above the plane of this patch.
+    /// [`pose2_from_pose3`](crate::geometry::pose2_from_pose3) is the inverse, on every slope.
+    pub fn lift(&self, planar: &Pose2, attitude: &SensorAttitude) -> Pose3 {
+        let t = planar.translation.vector;
+        let heading = planar.rotation.angle();
+        let up = self.normal;
+        let forward = Vector3::new(heading.cos(), heading.sin(), 0.0);
+        let left = up.cross(&forward).normalize();
+        let rotation =
+            Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[left.cross(&up), left, up]));
+        let map_from_road = UnitQuaternion::from_rotation_matrix(&rotation);
+        let tilted = map_from_road
+            * UnitQuaternion::from_euler_angles(attitude.roll_rad, attitude.pitch_rad, 0.0);
+        // Roll on a slope changes the heading; this turn restores it.
+        let forward = tilted * Vector3::x();
+        let turn_rad = heading - forward.y.atan2(forward.x);
+        // The sensor is `height_m` above the plane along its normal, at the x and y of the pose.
+        let height_m = self.height_m + attitude.height_m / up.z;
+        Pose3::from_parts(
+            Translation3::new(t.x, t.y, height_m),
+            UnitQuaternion::from_euler_angles(0.0, 0.0, turn_rad) * tilted,
+        )
+    }
+
+    /// Computes the attitude of a sensor above the plane of this patch; [`lift`](Self::lift) of the
+    /// planar pose with it gives the pose back, up to the turn of the heading on a slope.
+    pub fn attitude_of(&self, map_from_lidar: &Pose3) -> SensorAttitude {
+        let up = map_from_lidar.rotation.inverse() * self.normal;
+        let above_m = map_from_lidar.translation.z - self.height_m;
+        SensorAttitude::from_plane(
+            Vec3::new(up.x as f32, up.y as f32, up.z as f32),
+            above_m * self.normal.z,
+        )
+    }
+}
+
+/// Elevation map: heights of the ground on a grid, with several levels under bridges.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GroundMap {
     heights: Heights,
 }
 
 impl GroundMap {
-    /// From the triangles for which `is_ground` holds, in cells of `cell_m`.
+    /// Builds the elevation map of the triangles for which `is_ground` holds, in cells of `cell_m`.
     pub fn from_mesh(mesh: &TriangleMesh, is_ground: impl Fn(usize) -> bool, cell_m: f64) -> Self {
         let ground = (0..mesh.triangles.len()).filter(|&triangle| is_ground(triangle));
         Self {
@@ -90,18 +129,19 @@ impl GroundMap {
         }
     }
 
-    /// Flat ground everywhere in a rectangle, for tests and for maps whose ground is not marked.
+    /// Flat ground in a rectangle, for tests and for maps whose ground is not marked.
     pub fn flat(min: Point2<f64>, max: Point2<f64>, height_m: f64) -> Self {
         Self {
             heights: Heights::flat(min, max, height_m, 1.0),
         }
     }
 
-    /// The ground at a place: a plane fitted to the known cells within `radius_m`. Of several levels
-    /// it is the one at about `level_m`, or where there is none the nearest to it that enough cells
-    /// have; the lowest such where that is not known. `None` where no level has a third of the
-    /// cells, and where the one at `level_m` has fewer: nobody falls from a bridge through a gap in
-    /// its map.
+    /// Fits a plane to the ground within `radius_m` of a position.
+    ///
+    /// Of several levels, takes the one at about `level_m`, else the nearest to it that at least a
+    /// third of the cells have; the lowest such without `level_m`. `None` where no level has that
+    /// many, and where the one at `level_m` has fewer: a gap in a bridge does not drop the car
+    /// onto the road below.
     pub fn patch_at(
         &self,
         x: f64,
@@ -110,12 +150,12 @@ impl GroundMap {
         level_m: Option<f64>,
     ) -> Option<GroundPatch> {
         let on_level = level_m.and_then(|level_m| self.patch_on_level(x, y, radius_m, level_m));
-        on_level.or_else(|| self.patch_on_fitting_level(x, y, radius_m, level_m))
+        on_level.or_else(|| self.patch_on_nearest_level(x, y, radius_m, level_m))
     }
 
-    /// The patch of the level nearest to a height, or the lowest one, among those that enough cells
-    /// have; where some cells are at about that height, the level is one of theirs.
-    fn patch_on_fitting_level(
+    /// Fits a plane to the level nearest to a height, or to the lowest, among those of enough cells.
+    /// If cells have a height at about `level_m`, only their levels are considered.
+    fn patch_on_nearest_level(
         &self,
         x: f64,
         y: f64,
@@ -130,20 +170,21 @@ impl GroundMap {
             known_m.extend(heights.levels_m(cell));
         }
         let near = |height_m: f64| known_m.iter().filter(move |&&m| is_near(m, height_m));
-        let off = |height_m: f64| level_m.map_or(height_m, |level_m| (height_m - level_m).abs());
+        let distance_m =
+            |height_m: f64| level_m.map_or(height_m, |level_m| (height_m - level_m).abs());
         let mut levels_m = match level_m {
             Some(level_m) if near(level_m).next().is_some() => near(level_m).copied().collect(),
             _ => known_m.clone(),
         };
-        levels_m.sort_unstable_by(|&a, &b| off(a).total_cmp(&off(b)));
+        levels_m.sort_unstable_by(|&a, &b| distance_m(a).total_cmp(&distance_m(b)));
         levels_m.dedup();
         (levels_m.into_iter())
             .filter(|&level_m| is_enough(near(level_m).count(), all))
             .find_map(|level_m| self.patch_on_level(x, y, radius_m, level_m))
     }
 
-    /// The patches of all levels at a place, from the lowest up; where its own cell has none that
-    /// enough others share, the one around it.
+    /// Returns the patches of all levels at a position, the lowest first. If no level of its own cell
+    /// has enough cells around it, returns the lowest patch of the surroundings.
     pub fn levels_at(&self, x: f64, y: f64) -> Vec<GroundPatch> {
         let Some(cell) = self.heights.cell_at(x, y) else {
             return Vec::new();
@@ -158,7 +199,7 @@ impl GroundMap {
         own
     }
 
-    /// The cells within a radius of a place, each with the offset of its middle.
+    /// Returns the cells within a radius of a position, with the offsets of their centres.
     fn cells_around(
         &self,
         x: f64,
@@ -173,13 +214,12 @@ impl GroundMap {
             columns.map(move |column| (column, row))
         });
         Some(cells.filter_map(move |cell| {
-            let center = self.heights.center(cell);
-            let offset = Vector2::new(center.x - x, center.y - y);
+            let offset = self.heights.center(cell) - Point2::new(x, y);
             (offset.norm() <= radius_m).then_some((cell, offset))
         }))
     }
 
-    /// The plane through the cells whose ground is at about a height.
+    /// Fits a plane to the cells whose ground is at about a height.
     fn patch_on_level(&self, x: f64, y: f64, radius_m: f64, level_m: f64) -> Option<GroundPatch> {
         let mut heights = self.heights.reader();
         let mut normal_matrix = Matrix3::zeros();
@@ -187,10 +227,8 @@ impl GroundMap {
         let (mut known, mut all) = (0, 0);
         for (cell, offset) in self.cells_around(x, y, radius_m)? {
             all += 1;
-            let Some(height_m) = heights.nearest_m(cell, level_m) else {
-                continue;
-            };
-            if is_near(height_m, level_m) {
+            let height_m = heights.nearest_m(cell, level_m);
+            if let Some(height_m) = height_m.filter(|&height_m| is_near(height_m, level_m)) {
                 known += 1;
                 let offset = offset.push(1.0);
                 normal_matrix += offset * offset.transpose();
@@ -207,20 +245,15 @@ impl GroundMap {
         })
     }
 
-    /// Where in space a planar pose is, standing on the (lowest) ground as `attitude` says; `None` where
-    /// there is no ground. `map_from_lidar = map_from_road · road_from_lidar`, with the sensor at the
-    /// pose's x and y.
+    /// Lifts a planar pose onto the (lowest) ground, `map_from_lidar = map_from_road ·
+    /// road_from_lidar`, at the x and y of the planar pose; `None` where there is no ground.
     pub fn lift(&self, planar: &Pose2, attitude: &SensorAttitude) -> Option<Pose3> {
         Some(self.patch_under(planar, None)?.lift(planar, attitude))
     }
 
-    /// Height of the ground at a place, of the level nearest to `level_m`, between the middles of the
-    /// four cells around it [m]; `None` where one of them is not known.
-    pub fn height_at(&self, x: f64, y: f64, level_m: f64) -> Option<f64> {
-        self.height_with(&mut self.heights.reader(), x, y, level_m)
-    }
-
-    fn height_with(&self, heights: &mut Reader, x: f64, y: f64, level_m: f64) -> Option<f64> {
+    /// Interpolates the height of the ground bilinearly on the level nearest to `level_m` [m]; `None`
+    /// if it is unknown in one of the four cells.
+    fn height_at(&self, heights: &mut HeightReader, x: f64, y: f64, level_m: f64) -> Option<f64> {
         let cell_m = self.heights.cell_m;
         let (column, row) = self.heights.cell_at(x - 0.5 * cell_m, y - 0.5 * cell_m)?;
         let center = self.heights.center((column, row));
@@ -233,12 +266,12 @@ impl GroundMap {
         Some((1.0 - up) * between(row)? + up * between(row + 1)?)
     }
 
-    /// How the sensor stands over the road at a planar pose: the attitude with which the returns
-    /// from the road (`points`, lidar frame; others among them do no harm) lie on the mapped
-    /// ground. Robust least squares from `start`; `None` where too few returns meet known ground.
+    /// Estimates the sensor attitude at a planar pose: minimizes the distances of the returns from
+    /// the road (`points`, lidar frame) to the mapped ground by robust least squares from `start`;
+    /// other returns among them are rejected as outliers. `None` if too few returns are near known ground.
     ///
-    /// The plane of the road that a scan sees and the patch of the map under the car are fitted to
-    /// different stretches of a road that is not flat; this asks one surface only.
+    /// The plane of the road in the scan and the patch of the map under the car are fitted to different
+    /// stretches of a road that is not flat; this estimate uses one surface only.
     pub fn attitude_at(
         &self,
         planar: &Pose2,
@@ -246,10 +279,10 @@ impl GroundMap {
         start: &SensorAttitude,
         points: &[Vec3],
     ) -> Option<SensorAttitude> {
-        /// What lies farther off the ground than this is none of it, from blunt to sharp [m].
+        /// Returns farther from the ground are outliers, per iteration [m].
         const GATES_M: [f64; 4] = [0.4, 0.2, 0.1, 0.1];
-        /// Fewer returns on the ground than this do not tell.
-        const ENOUGH: usize = 50;
+        /// Least number of returns on the ground.
+        const MIN_RETURNS: usize = 50;
         let patch = self.patch_under(planar, level_m)?;
         let mut heights = self.heights.reader();
         let mut attitude = *start;
@@ -259,24 +292,22 @@ impl GroundMap {
             let mut right_side = Vector3::zeros();
             let mut used = 0;
             for point in points {
-                let in_lidar = nalgebra::Point3::new(point.x, point.y, point.z).cast::<f64>();
+                let in_lidar = Point3::new(point.x, point.y, point.z).cast::<f64>();
                 let in_map = map_from_lidar * in_lidar;
-                let ground_m = self.height_with(&mut heights, in_map.x, in_map.y, in_map.z);
-                let Some(ground_m) = ground_m else {
+                let ground_m = self.height_at(&mut heights, in_map.x, in_map.y, in_map.z);
+                let Some(above_m) = (ground_m.map(|ground_m| in_map.z - ground_m))
+                    .filter(|above_m| above_m.abs() <= gate_m)
+                else {
                     continue;
                 };
-                let above_m = in_map.z - ground_m;
-                if above_m.abs() > gate_m {
-                    continue;
-                }
-                // Slopes of the height of the point: by the height of the sensor, roll and pitch.
+                // Derivatives of the height of the point by sensor height, roll and pitch.
                 let slopes = Vector3::new(1.0, in_lidar.y, -in_lidar.x);
                 let weight = (1.0 - (above_m / gate_m).powi(2)).powi(2);
                 normal_matrix += weight * slopes * slopes.transpose();
                 right_side -= weight * above_m * slopes;
                 used += 1;
             }
-            if used < ENOUGH {
+            if used < MIN_RETURNS {
                 return None;
             }
             let step = normal_matrix.cholesky()?.solve(&right_side);
@@ -287,62 +318,25 @@ impl GroundMap {
         Some(attitude)
     }
 
-    /// The ground that a car at a planar pose stands on; `None` where there is none. Of several
-    /// levels as in [`patch_at`](Self::patch_at).
+    /// Returns the ground under a car at a planar pose; `None` where there is none. The level is
+    /// chosen as in [`patch_at`](Self::patch_at).
     pub fn patch_under(&self, planar: &Pose2, level_m: Option<f64>) -> Option<GroundPatch> {
         let t = planar.translation.vector;
         self.patch_at(t.x, t.y, RADIUS_M, level_m)
     }
 }
 
-/// Whether a height within the radius is of the ground at a level.
+/// Whether a height within the radius is on the level at `level_m`.
 fn is_near(height_m: f64, level_m: f64) -> bool {
-    /// Up or down to here the ground may lead within the radius and since the level was known:
-    /// the level above begins no nearer than twice this.
+    /// Largest change of the height of a level within the radius and since the level was known [m]: no
+    /// other level is nearer than twice this.
     const REACH_M: f64 = 0.5 * LEVEL_GAP_M;
     (height_m - level_m).abs() <= REACH_M
 }
 
-/// Whether so many known cells of all tell where the plane of the ground is.
+/// Whether `known` cells of `all` determine a plane.
 fn is_enough(known: usize, all: usize) -> bool {
     known >= 3 && 3 * known >= all
-}
-
-impl GroundPatch {
-    /// Where in space a planar pose is, standing on the plane of this patch as `attitude` says.
-    /// [`planar`](crate::geometry::pose2_from_pose3) gives the planar pose back, on every slope.
-    pub fn lift(&self, planar: &Pose2, attitude: &SensorAttitude) -> Pose3 {
-        let t = planar.translation.vector;
-        let heading = planar.rotation.angle();
-        let up = self.normal;
-        let forward = Vector3::new(heading.cos(), heading.sin(), 0.0);
-        let left = up.cross(&forward).normalize();
-        let rotation =
-            Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[left.cross(&up), left, up]));
-        let map_from_road = UnitQuaternion::from_rotation_matrix(&rotation);
-        let tilted = map_from_road
-            * UnitQuaternion::from_euler_angles(attitude.roll_rad, attitude.pitch_rad, 0.0);
-        // Leaning on a slope turns the nose a little; the heading is the one that was asked for.
-        let nose = tilted * Vector3::x();
-        let turn_rad = heading - nose.y.atan2(nose.x);
-        // The road plane passes through the patch; the sensor hangs `height_m` along its normal over it.
-        let height_m = self.height_m + attitude.height_m / up.z;
-        Pose3::from_parts(
-            Translation3::new(t.x, t.y, height_m),
-            UnitQuaternion::from_euler_angles(0.0, 0.0, turn_rad) * tilted,
-        )
-    }
-
-    /// How a sensor at a pose in space stands over the plane of this patch; [`lift`](Self::lift) of
-    /// the same pose seen from above undoes it, but for the turn of the nose on a slope.
-    pub fn attitude_of(&self, map_from_lidar: &Pose3) -> SensorAttitude {
-        let up = map_from_lidar.rotation.inverse() * self.normal;
-        let above_m = map_from_lidar.translation.z - self.height_m;
-        SensorAttitude::from_plane(
-            Vec3::new(up.x as f32, up.y as f32, up.z as f32),
-            above_m * self.normal.z,
-        )
-    }
 }
 
 #[cfg(test)]

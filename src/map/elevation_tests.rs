@@ -1,11 +1,11 @@
-//! The ground of the map on slopes, under bridges and in gaps.
+//! Elevation maps of slopes, bridges and maps with gaps.
 
 use approx::assert_relative_eq;
 
 use super::*;
 use crate::geometry::pose2_from_pose3;
 
-/// A square of 40 m that climbs along x.
+/// A square of 40 m with a slope along x.
 fn slope(grade: f32) -> TriangleMesh {
     let at = |x: f32, y: f32| Vec3::new(x, y, grade * x);
     TriangleMesh {
@@ -21,7 +21,7 @@ fn slope(grade: f32) -> TriangleMesh {
 }
 
 #[test]
-fn a_patch_of_a_slope_has_its_height_and_its_normal() {
+fn a_patch_of_a_slope_has_the_height_and_normal_of_the_slope() {
     let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
     let patch = ground.patch_at(3.0, -2.0, 2.0, None).unwrap();
     assert_relative_eq!(patch.height_m, 0.3, epsilon = 1e-3);
@@ -29,19 +29,23 @@ fn a_patch_of_a_slope_has_its_height_and_its_normal() {
     assert_relative_eq!(patch.normal, expected, epsilon = 1e-3);
 }
 
-#[test]
-fn between_cells_the_height_follows_the_slope() {
-    let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
-    for (x, y) in [(0.0, 0.0), (3.13, -2.2), (-7.5, 4.99)] {
-        let height_m = ground.height_at(x, y, 0.0).unwrap();
-        assert_relative_eq!(height_m, 0.1 * x, epsilon = 1e-3);
-    }
-    assert_eq!(ground.height_at(20.5, 0.0, 0.0), None);
-    assert_eq!(ground.height_at(f64::NAN, 0.0, 0.0), None);
+fn height_at(ground: &GroundMap, x: f64, y: f64) -> Option<f64> {
+    ground.height_at(&mut ground.heights.reader(), x, y, 0.0)
 }
 
 #[test]
-fn beside_the_map_there_is_no_ground() {
+fn heights_are_interpolated_between_cells() {
+    let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
+    for (x, y) in [(0.0, 0.0), (3.13, -2.2), (-7.5, 4.99)] {
+        let height_m = height_at(&ground, x, y).unwrap();
+        assert_relative_eq!(height_m, 0.1 * x, epsilon = 1e-3);
+    }
+    assert_eq!(height_at(&ground, 20.5, 0.0), None);
+    assert_eq!(height_at(&ground, f64::NAN, 0.0), None);
+}
+
+#[test]
+fn outside_the_map_there_is_no_ground() {
     let ground = GroundMap::from_mesh(&slope(0.0), |_| true, 0.5);
     assert_eq!(ground.patch_at(25.0, 0.0, 2.0, None), None);
     let nothing = GroundMap::from_mesh(&TriangleMesh::default(), |_| true, 0.5);
@@ -49,7 +53,7 @@ fn beside_the_map_there_is_no_ground() {
     assert_eq!(nothing.levels_at(0.0, 0.0), []);
 }
 
-/// Two squares above one another, the upper one climbing from the lower by a ramp.
+/// A square with a deck above it, connected by a ramp.
 fn bridge() -> TriangleMesh {
     let mut mesh = slope(0.0);
     let deck = |x0: f32, z0: f32, x1: f32, z1: f32| TriangleMesh {
@@ -68,7 +72,7 @@ fn bridge() -> TriangleMesh {
 }
 
 #[test]
-fn who_drives_up_a_ramp_stays_above_and_who_drives_below_stays_below() {
+fn a_car_stays_on_its_level_up_a_ramp_and_under_a_bridge() {
     let ground = GroundMap::from_mesh(&bridge(), |_| true, 0.5);
     let mut above_m = 0.0;
     for step in 0..170 {
@@ -92,7 +96,7 @@ fn who_drives_up_a_ramp_stays_above_and_who_drives_below_stays_below() {
 }
 
 #[test]
-fn a_height_that_was_told_wrong_leads_to_the_nearest_ground_that_there_is() {
+fn a_wrong_level_height_selects_the_nearest_level() {
     let ground = GroundMap::from_mesh(&bridge(), |_| true, 0.5);
     let height_m = |level_m: Option<f64>| {
         let patch = ground.patch_under(&Pose2::identity(), level_m);
@@ -104,7 +108,7 @@ fn a_height_that_was_told_wrong_leads_to_the_nearest_ground_that_there_is() {
     assert_relative_eq!(height_m(None), 0.0, epsilon = 1e-6);
 }
 
-/// One small triangle in each half-metre cell within 8 m, as high as is told of its middle.
+/// One small triangle in each half-metre cell within 8 m, with the height at its centre.
 fn mosaic(height_m: impl Fn(f32, f32) -> Option<f32>) -> TriangleMesh {
     let mut mesh = TriangleMesh::default();
     for (column, row) in (-16..16).flat_map(|column| (-16..16).map(move |row| (column, row))) {
@@ -126,13 +130,13 @@ fn mosaic(height_m: impl Fn(f32, f32) -> Option<f32>) -> TriangleMesh {
 }
 
 #[test]
-fn a_single_cell_above_or_below_the_ground_takes_no_place_away() {
-    let is_stray = |x: f32, y: f32| (x, y) == (0.25, 0.25);
-    for stray_m in [-3.0, 3.0] {
-        let mesh = mosaic(|x, y| Some(if is_stray(x, y) { stray_m } else { 0.0 }));
+fn an_outlier_cell_above_or_below_the_ground_does_not_change_the_patch() {
+    let is_outlier = |x: f32, y: f32| (x, y) == (0.25, 0.25);
+    for outlier_m in [-3.0, 3.0] {
+        let mesh = mosaic(|x, y| Some(if is_outlier(x, y) { outlier_m } else { 0.0 }));
         let ground = GroundMap::from_mesh(&mesh, |_| true, 0.5);
         for (x, y) in [(0.25, 0.25), (0.8, 0.25), (-1.0, 0.5)] {
-            for level_m in [None, Some(0.0), Some(3.0 * f64::from(stray_m))] {
+            for level_m in [None, Some(0.0), Some(3.0 * f64::from(outlier_m))] {
                 let patch = ground.patch_at(x, y, RADIUS_M, level_m).unwrap();
                 assert_relative_eq!(patch.height_m, 0.0, epsilon = 1e-6);
             }
@@ -143,31 +147,31 @@ fn a_single_cell_above_or_below_the_ground_takes_no_place_away() {
     }
 }
 
-/// A deck up to y = 4 m, and a road below that is known from some y on.
-fn deck_over_road(known_from_m: f32) -> GroundMap {
+/// A deck up to y = 4 m, and a road below it that is mapped from some y on.
+fn deck_over_road(mapped_from_m: f32) -> GroundMap {
     let mut mesh = mosaic(|_, y| (y < 4.0).then_some(6.0));
-    mesh.append(&mosaic(|_, y| (y > known_from_m).then_some(0.0)));
+    mesh.append(&mosaic(|_, y| (y > mapped_from_m).then_some(0.0)));
     GroundMap::from_mesh(&mesh, |_| true, 0.5)
 }
 
 #[test]
-fn at_the_edge_of_a_bridge_a_strip_of_the_road_below_hides_the_deck_from_nobody() {
+fn at_the_edge_of_a_bridge_a_strip_of_the_road_below_does_not_hide_the_deck() {
     let ground = deck_over_road(2.0);
     let height_m = |y: f64, level_m: Option<f64>| {
         let patch = ground.patch_at(0.0, y, RADIUS_M, level_m);
         patch.map(|patch| patch.height_m)
     };
-    // A fifth of the cells around know the road; the deck is all around.
+    // A fifth of the cells around contain the road, all of them the deck.
     assert_relative_eq!(height_m(1.0, None).unwrap(), 6.0, epsilon = 1e-6);
     assert_relative_eq!(height_m(1.0, Some(-9.0)).unwrap(), 6.0, epsilon = 1e-6);
     assert_relative_eq!(height_m(3.0, None).unwrap(), 0.0, epsilon = 1e-6);
-    // Who is on the deck does not fall where only its rim is near.
+    // A car on the deck does not drop to the road where only the edge of the deck is near.
     assert_eq!(height_m(5.0, Some(6.0)), None);
     assert_relative_eq!(height_m(5.0, Some(9.0)).unwrap(), 0.0, epsilon = 1e-6);
 }
 
 #[test]
-fn at_the_edge_of_a_bridge_a_place_has_the_levels_of_its_own_cell() {
+fn at_the_edge_of_a_bridge_a_position_has_the_levels_of_its_own_cell() {
     let ground = deck_over_road(4.0);
     let levels_m = |y: f64| {
         let levels = ground.levels_at(0.0, y);
@@ -176,13 +180,13 @@ fn at_the_edge_of_a_bridge_a_place_has_the_levels_of_its_own_cell() {
             .map(|patch| patch.height_m)
             .collect::<Vec<_>>()
     };
-    // Either side of the edge, well over a third of the cells around are of the other level.
+    // On both sides of the edge, more than a third of the cells around are of the other level.
     assert_relative_eq!(levels_m(3.8)[..], [6.0][..], epsilon = 1e-6);
     assert_relative_eq!(levels_m(4.2)[..], [0.0][..], epsilon = 1e-6);
 }
 
 #[test]
-fn on_level_ground_the_lifted_pose_is_the_stance_at_the_planar_pose() {
+fn on_level_ground_a_lifted_pose_has_the_sensor_height_at_the_planar_pose() {
     let ground = GroundMap::flat(Point2::new(-10.0, -10.0), Point2::new(10.0, 10.0), -1.73);
     let pose = Pose2::new(Vector2::new(1.0, 2.0), 2.5);
     let lifted = ground.lift(&pose, &SensorAttitude::default()).unwrap();
@@ -191,7 +195,7 @@ fn on_level_ground_the_lifted_pose_is_the_stance_at_the_planar_pose() {
 }
 
 #[test]
-fn a_lifted_pose_casts_its_planar_pose_as_shadow_on_every_slope() {
+fn a_lifted_pose_projects_to_its_planar_pose_on_every_slope() {
     let patch = GroundPatch {
         height_m: 4.0,
         normal: Vector3::new(-0.1, 0.08, 1.0).normalize(),
@@ -203,13 +207,13 @@ fn a_lifted_pose_casts_its_planar_pose_as_shadow_on_every_slope() {
     };
     for heading in [-3.0, -1.0, 0.0, 0.7, 2.5] {
         let pose = Pose2::new(Vector2::new(1.0, 2.0), heading);
-        let shadow = pose2_from_pose3(&patch.lift(&pose, &attitude));
-        assert_relative_eq!(shadow, pose, epsilon = 1e-12);
+        let projected = pose2_from_pose3(&patch.lift(&pose, &attitude));
+        assert_relative_eq!(projected, pose, epsilon = 1e-12);
     }
 }
 
 #[test]
-fn the_stance_is_found_from_returns_off_a_slope_among_others_that_are_not_off_it() {
+fn the_attitude_is_estimated_from_returns_of_a_slope_with_outliers() {
     let ground = GroundMap::from_mesh(&slope(0.06), |_| true, 0.5);
     let pose = Pose2::new(Vector2::new(1.0, 2.0), 0.6);
     let truth = SensorAttitude {
@@ -235,18 +239,18 @@ fn the_stance_is_found_from_returns_off_a_slope_among_others_that_are_not_off_it
 }
 
 #[test]
-fn uphill_the_nose_points_up_and_downhill_down() {
+fn the_pitch_follows_the_slope_uphill_and_downhill() {
     let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
     for (heading, sign) in [(0.0, 1.0), (std::f64::consts::PI, -1.0)] {
         let pose = Pose2::new(Vector2::new(0.0, 0.0), heading);
         let lifted = ground.lift(&pose, &SensorAttitude::default()).unwrap();
-        let nose = lifted.rotation * Vector3::x();
-        assert_relative_eq!(nose.z, sign * 0.1_f64.atan().sin(), epsilon = 1e-3);
+        let forward = lifted.rotation * Vector3::x();
+        assert_relative_eq!(forward.z, sign * 0.1_f64.atan().sin(), epsilon = 1e-3);
     }
 }
 
 #[test]
-fn a_stance_from_the_plane_that_it_makes_is_itself() {
+fn the_attitude_from_its_own_plane_is_the_same() {
     let attitude = SensorAttitude {
         height_m: 1.7,
         roll_rad: 0.03,

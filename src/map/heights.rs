@@ -1,15 +1,16 @@
-//! Heights on a regular grid over the whole x-y plane, kept only where there are any.
+//! Multi-level surface map: heights on a regular grid over the whole x-y plane, sparse.
 //!
 //! ```text
 //! cell (i, j) covers [i c, (i + 1) c) × [j c, (j + 1) c)      c = edge of a cell
 //! ```
 //!
-//! Cells lie in square blocks that are made when the first height falls into them: the memory
-//! goes with the mapped area, not with the rectangle around it, which one stray vertex could make
-//! as large as the Earth.
+//! Cells are stored in square chunks, which are allocated with their first height: the memory is
+//! proportional to the mapped area, not to its bounding box, which one outlier could make as large
+//! as the Earth.
 //!
-//! A cell may have several levels, as where a bridge crosses a road: heights that lie farther apart
-//! than a car is high are of different levels (single linkage), each of which is their mean.
+//! A cell may have several levels, as where a bridge crosses a road (Triebel, Pfaff and Burgard,
+//! *Multi-Level Surface Maps for Outdoor Terrain Mapping and Loop Closing*, IROS 2006): the heights of
+//! a cell are clustered by single linkage, and each level is the mean of a cluster.
 
 use std::collections::HashMap;
 
@@ -17,203 +18,190 @@ use nalgebra::{Point2, Vector3};
 
 use crate::geometry::Vec3;
 
-/// Cells along the edge of a block.
-const BLOCK_CELLS: i64 = 64;
+/// Cells along the edge of a chunk.
+const CHUNK_CELLS: i64 = 64;
 
-/// A longer edge than this is no edge of a road's surface, but a damaged map's [m].
-const LONGEST_EDGE_M: f64 = 500.0;
+/// Triangles with longer edges are artefacts, not the surface of a road [m].
+const MAX_EDGE_M: f64 = 500.0;
 
-/// Nothing drives where there is less room than this above the road: heights that are nearer to each
-/// other belong to one level [m].
+/// Smallest distance of two levels, less than the clearance that any vehicle needs [m].
 pub(super) const LEVEL_GAP_M: f64 = 2.0;
 
 /// Column and row of a cell.
 type Cell = (i64, i64);
 
-/// Values of cells, in blocks.
-#[derive(Clone, Debug, PartialEq)]
-struct Blocks<T> {
-    of: HashMap<Cell, Box<[T]>>,
-}
+/// Levels of the cells of a chunk, the lowest of each cell first; NaN where a cell has no such
+/// level [m].
+type ChunkLevels = Vec<Box<[f32]>>;
 
-impl<T: Clone> Blocks<T> {
-    fn address((column, row): Cell) -> (Cell, usize) {
-        let block = (column.div_euclid(BLOCK_CELLS), row.div_euclid(BLOCK_CELLS));
-        let within = row.rem_euclid(BLOCK_CELLS) * BLOCK_CELLS + column.rem_euclid(BLOCK_CELLS);
-        (block, within as usize)
-    }
-
-    fn entry(&mut self, cell: Cell, empty: T) -> &mut T {
-        let (block, within) = Self::address(cell);
-        let fresh = || vec![empty; (BLOCK_CELLS * BLOCK_CELLS) as usize].into_boxed_slice();
-        &mut self.of.entry(block).or_insert_with(fresh)[within]
-    }
-}
-
-/// The heights of a block of cells: the lowest of each cell, those above it, and so on; not a number
-/// where a cell has no such level [m].
-type Levels = Vec<Box<[f32]>>;
-
-/// Heights of cells; many cells have none, a few have several.
+/// Heights of the levels of all cells.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Heights {
     /// Edge of a cell [m].
     pub cell_m: f64,
-    blocks: HashMap<Cell, Levels>,
-}
-
-/// Heights of a cell that belong together.
-#[derive(Clone, Debug)]
-struct Level {
-    low_m: f64,
-    high_m: f64,
-    sum_m: f64,
-    count: f64,
-}
-
-impl Level {
-    /// Adds a height to the levels of a cell: to the one that it is near to, or as a new one. Levels
-    /// that a height brings together become one.
-    fn add(levels: &mut Vec<Self>, height_m: f64) {
-        let mut added = Self {
-            low_m: height_m,
-            high_m: height_m,
-            sum_m: height_m,
-            count: 1.0,
-        };
-        levels.retain(|level| {
-            let is_near =
-                level.low_m - LEVEL_GAP_M < height_m && height_m < level.high_m + LEVEL_GAP_M;
-            if is_near {
-                added.low_m = added.low_m.min(level.low_m);
-                added.high_m = added.high_m.max(level.high_m);
-                added.sum_m += level.sum_m;
-                added.count += level.count;
-            }
-            !is_near
-        });
-        let place = levels.partition_point(|level| level.high_m < added.low_m);
-        levels.insert(place, added);
-    }
+    chunks: HashMap<Cell, ChunkLevels>,
 }
 
 impl Heights {
-    /// The mean height of the surface of triangles in each cell whose centre they cover, and of
-    /// their corners in the cells of those; of every level of its own.
+    /// Averages the heights of triangles per cell and level: one sample in each cell whose centre a
+    /// triangle covers, and one at each of its corners.
     pub fn of_triangles(corners: impl Iterator<Item = [Vec3; 3]>, cell_m: f64) -> Self {
-        let mut levels = Blocks { of: HashMap::new() };
+        let mut samples = HeightSamples::default();
         for corners in corners {
-            rasterize(corners, cell_m, |cell, height_m| {
-                Level::add(levels.entry(cell, Vec::new()), height_m);
-            });
+            rasterize(corners, cell_m, &mut samples);
         }
-        let means = |(block, cells): (Cell, Box<[Vec<Level>]>)| {
-            let most = cells.iter().map(Vec::len).max().unwrap_or(0);
-            let mean = |level: &Level| (level.sum_m / level.count) as f32;
-            let of_level = |number: usize| {
-                let heights = cells
-                    .iter()
-                    .map(|levels| levels.get(number).map_or(f32::NAN, mean));
-                heights.collect()
-            };
-            (block, (0..most).map(of_level).collect())
-        };
-        Self {
-            cell_m,
-            blocks: levels.of.into_iter().map(means).collect(),
-        }
+        samples.into_heights(cell_m)
     }
 
     /// One height for every cell of a rectangle.
     pub fn flat(min: Point2<f64>, max: Point2<f64>, height_m: f64, cell_m: f64) -> Self {
-        let mut blocks = Blocks { of: HashMap::new() };
+        let mut samples = HeightSamples::default();
         let (first, last) = (cell_of(min, cell_m), cell_of(max, cell_m));
         for row in first.1..=last.1 {
             for column in first.0..=last.0 {
-                *blocks.entry((column, row), f32::NAN) = height_m as f32;
+                samples.add((column, row), height_m);
             }
         }
-        Self {
-            cell_m,
-            blocks: (blocks.of.into_iter())
-                .map(|(block, heights)| (block, vec![heights]))
-                .collect(),
-        }
+        samples.into_heights(cell_m)
     }
 
-    /// The cell that a place falls into; `None` where there is no such place.
+    /// Returns the cell of a position; `None` if a coordinate is not finite.
     pub fn cell_at(&self, x: f64, y: f64) -> Option<Cell> {
         (x.is_finite() && y.is_finite()).then(|| cell_of(Point2::new(x, y), self.cell_m))
     }
 
-    /// The middle of a cell.
-    pub fn center(&self, (column, row): Cell) -> Point2<f64> {
-        center_of((column, row), self.cell_m)
+    /// Returns the centre of a cell.
+    pub fn center(&self, cell: Cell) -> Point2<f64> {
+        center_of(cell, self.cell_m)
     }
 
-    /// Reads heights of cells near each other.
-    pub fn reader(&self) -> Reader<'_> {
-        Reader {
+    /// Returns a reader that is fast for neighbouring cells.
+    pub fn reader(&self) -> HeightReader<'_> {
+        HeightReader {
             heights: self,
-            block: None,
+            last: None,
         }
     }
 }
 
-/// Remembers the block that it read last: neighbours mostly lie in the same one.
-pub(super) struct Reader<'a> {
+/// Reads heights and caches the last chunk: neighbouring cells mostly share one.
+pub(super) struct HeightReader<'a> {
     heights: &'a Heights,
-    block: Option<(Cell, &'a [Box<[f32]>])>,
+    last: Option<(Cell, &'a [Box<[f32]>])>,
 }
 
-impl Reader<'_> {
-    /// The heights of a cell, from the lowest level up [m].
+impl HeightReader<'_> {
+    /// Returns the levels of a cell, the lowest first [m].
     pub fn levels_m(&mut self, cell: Cell) -> impl Iterator<Item = f64> {
-        let (block, within) = Blocks::<f32>::address(cell);
-        let levels = match self.block {
-            Some((last, levels)) if last == block => levels,
-            _ => {
-                let levels = self
-                    .heights
-                    .blocks
-                    .get(&block)
-                    .map_or(&[][..], Vec::as_slice);
-                self.block = Some((block, levels));
-                levels
-            }
+        let (chunk, offset) = chunk_of(cell);
+        let levels = match self.last {
+            Some((last, levels)) if last == chunk => levels,
+            _ => self
+                .heights
+                .chunks
+                .get(&chunk)
+                .map_or(&[][..], Vec::as_slice),
         };
+        self.last = Some((chunk, levels));
         levels
             .iter()
-            .map(move |cells| f64::from(cells[within]))
+            .map(move |cells| f64::from(cells[offset]))
             .take_while(|height_m| !height_m.is_nan())
     }
 
-    /// The level of a cell that is nearest to a height [m]; `None` where no height is known.
+    /// Returns the level of a cell nearest to a height [m]; `None` in a cell without ground.
     pub fn nearest_m(&mut self, cell: Cell, height_m: f64) -> Option<f64> {
         self.levels_m(cell)
             .min_by(|a, b| (a - height_m).abs().total_cmp(&(b - height_m).abs()))
     }
 }
 
-fn cell_of(place: Point2<f64>, cell_m: f64) -> Cell {
+/// Clusters of heights per cell, in chunks.
+#[derive(Default)]
+struct HeightSamples {
+    chunks: HashMap<Cell, Box<[Vec<HeightCluster>]>>,
+}
+
+/// A cluster of the heights of a cell.
+#[derive(Clone)]
+struct HeightCluster {
+    low_m: f64,
+    high_m: f64,
+    sum_m: f64,
+    count: f64,
+}
+
+impl HeightSamples {
+    /// Adds a height to the cell's cluster within [`LEVEL_GAP_M`], or as a new cluster. Clusters that
+    /// it connects are merged.
+    fn add(&mut self, cell: Cell, height_m: f64) {
+        let (chunk, offset) = chunk_of(cell);
+        let empty = || vec![Vec::new(); (CHUNK_CELLS * CHUNK_CELLS) as usize].into();
+        let clusters = &mut self.chunks.entry(chunk).or_insert_with(empty)[offset];
+        let mut added = HeightCluster {
+            low_m: height_m,
+            high_m: height_m,
+            sum_m: height_m,
+            count: 1.0,
+        };
+        clusters.retain(|cluster| {
+            let is_near =
+                cluster.low_m - LEVEL_GAP_M < height_m && height_m < cluster.high_m + LEVEL_GAP_M;
+            if is_near {
+                added.low_m = added.low_m.min(cluster.low_m);
+                added.high_m = added.high_m.max(cluster.high_m);
+                added.sum_m += cluster.sum_m;
+                added.count += cluster.count;
+            }
+            !is_near
+        });
+        let index = clusters.partition_point(|cluster| cluster.high_m < added.low_m);
+        clusters.insert(index, added);
+    }
+
+    fn into_heights(self, cell_m: f64) -> Heights {
+        let mean_m = |cluster: &HeightCluster| (cluster.sum_m / cluster.count) as f32;
+        let levels = |cells: &[Vec<HeightCluster>]| -> ChunkLevels {
+            let most = cells.iter().map(Vec::len).max().unwrap_or(0);
+            let level_m = |clusters: &Vec<_>, level| clusters.get(level).map_or(f32::NAN, mean_m);
+            (0..most)
+                .map(|level| cells.iter().map(|cell| level_m(cell, level)).collect())
+                .collect()
+        };
+        Heights {
+            cell_m,
+            chunks: (self.chunks.into_iter())
+                .map(|(chunk, cells)| (chunk, levels(&cells)))
+                .collect(),
+        }
+    }
+}
+
+/// Returns the chunk of a cell and the cell's index in it.
+fn chunk_of((column, row): Cell) -> (Cell, usize) {
+    let chunk = (column.div_euclid(CHUNK_CELLS), row.div_euclid(CHUNK_CELLS));
+    let offset = row.rem_euclid(CHUNK_CELLS) * CHUNK_CELLS + column.rem_euclid(CHUNK_CELLS);
+    (chunk, offset as usize)
+}
+
+fn cell_of(position: Point2<f64>, cell_m: f64) -> Cell {
     let cell = |along: f64| (along / cell_m).floor() as i64;
-    (cell(place.x), cell(place.y))
+    (cell(position.x), cell(position.y))
 }
 
 fn center_of((column, row): Cell, cell_m: f64) -> Point2<f64> {
     Point2::new((column as f64 + 0.5) * cell_m, (row as f64 + 0.5) * cell_m)
 }
 
-/// Tells the height of a triangle in the cells whose centre it covers, and of its corners in
-/// theirs.
-fn rasterize(corners: [Vec3; 3], cell_m: f64, mut add: impl FnMut(Cell, f64)) {
+/// Adds the heights of a triangle at the centres of cells that it covers, and those of its corners.
+fn rasterize(corners: [Vec3; 3], cell_m: f64, samples: &mut HeightSamples) {
     let [a, b, c] = corners.map(|corner| Vector3::new(corner.x, corner.y, corner.z).cast::<f64>());
     let (ab, ac) = (b - a, c - a);
-    if ab.xy().norm().max(ac.xy().norm()) > LONGEST_EDGE_M {
+    if ab.xy().norm().max(ac.xy().norm()) > MAX_EDGE_M {
         return;
     }
     for corner in [a, b, c] {
-        add(cell_of(corner.xy().into(), cell_m), corner.z);
+        samples.add(cell_of(corner.xy().into(), cell_m), corner.z);
     }
     let area = ab.x * ac.y - ab.y * ac.x;
     if area.abs() <= 1e-12 {
@@ -228,7 +216,7 @@ fn rasterize(corners: [Vec3; 3], cell_m: f64, mut add: impl FnMut(Cell, f64)) {
             let u = (x * ac.y - y * ac.x) / area;
             let v = (ab.x * y - ab.y * x) / area;
             if u >= 0.0 && v >= 0.0 && u + v <= 1.0 {
-                add((column, row), a.z + u * ab.z + v * ac.z);
+                samples.add((column, row), a.z + u * ab.z + v * ac.z);
             }
         }
     }
@@ -239,7 +227,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_centre_falls_into_its_own_cell_on_either_side_of_the_origin() {
+    fn the_center_of_a_cell_is_in_the_cell_on_both_sides_of_the_origin() {
         let heights = Heights::flat(Point2::origin(), Point2::origin(), 0.0, 0.5);
         for cell in [(0, 0), (-1, 63), (64, -64), (-65, 1_000_000)] {
             let center = heights.center(cell);
@@ -248,18 +236,18 @@ mod tests {
     }
 
     #[test]
-    fn a_stray_triangle_costs_no_more_than_its_own_blocks() {
+    fn an_outlier_triangle_allocates_only_its_own_chunks() {
         let near = [Vec3::ZERO, Vec3::X, Vec3::Y];
         let far = near.map(|corner| corner + Vec3::new(1.0e9, -1.0e9, 0.0));
-        let endless = [Vec3::ZERO, Vec3::X, Vec3::new(0.0, 1.0e30, 0.0)];
-        let heights = Heights::of_triangles([near, far, endless].into_iter(), 0.25);
-        assert_eq!(heights.blocks.len(), 2);
+        let degenerate = [Vec3::ZERO, Vec3::X, Vec3::new(0.0, 1.0e30, 0.0)];
+        let heights = Heights::of_triangles([near, far, degenerate].into_iter(), 0.25);
+        assert_eq!(heights.chunks.len(), 2);
         assert_eq!(heights.reader().nearest_m((1, 1), 5.0), Some(0.0));
         assert_eq!(heights.reader().nearest_m((1000, 1), 0.0), None);
     }
 
     #[test]
-    fn heights_a_car_apart_are_levels_and_what_lies_between_brings_them_together() {
+    fn heights_farther_apart_than_the_gap_are_levels_and_a_height_between_merges_them() {
         let slab =
             |height: f32| [Vec3::ZERO, Vec3::X, Vec3::Y].map(|corner| corner + Vec3::Z * height);
         let levels = |heights_m: &[f32]| {
@@ -273,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_gives_the_same_heights_in_any_order() {
+    fn a_reader_returns_the_same_heights_in_any_order() {
         let climbing = [
             Vec3::new(-40.0, -40.0, -4.0),
             Vec3::new(40.0, -40.0, 4.0),

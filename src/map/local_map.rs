@@ -14,7 +14,8 @@ use crate::validation::{
     InvalidValue, Validate, fraction, nested, not_negative, positive, require,
 };
 
-/// Vertices that are gathered in neighbouring cells are less than two cells apart along an axis.
+/// Longest edge of the simplified ground in cells: vertices of neighbouring cells are less than two
+/// cells apart along an axis.
 const CELLS_PER_EDGE: f32 = 2.0;
 
 /// Processing of scans into a mesh.
@@ -104,7 +105,7 @@ pub struct LocalMapCounts {
     pub crossed_triangles: usize,
     /// Triangles saved by simplifying the ground.
     pub simplified_triangles: usize,
-    /// Triangles that belong to neighbouring local maps.
+    /// Triangles in regions of neighbouring local maps.
     pub foreign_triangles: usize,
     /// Triangles of the finished local map.
     pub triangles: usize,
@@ -200,7 +201,7 @@ fn static_cloud(
         all.append(cloud);
     }
     if let Some(weights) = &mut weights {
-        confidence::balance(weights);
+        confidence::normalize(weights);
     }
     (all, weights)
 }
@@ -272,8 +273,8 @@ mod tests {
             } else {
                 Vec3::Z
             };
-            let place = Vec3::new((i % 40) as f32, (i / 40) as f32, 0.0);
-            cloud.push(0.1 * place, normal, 1.0);
+            let corner = Vec3::new((i % 40) as f32, (i / 40) as f32, 0.0);
+            cloud.push(0.1 * corner, normal, 1.0);
         }
         cloud
     }
@@ -292,7 +293,7 @@ mod tests {
         (counts.is_empty, counts.unusable_points)
     }
 
-    /// Sees a point at 5 m, through which its own beams pass, and two behind it.
+    /// A scan with a point at 5 m in its own free space, and two points behind that.
     fn scan() -> ScanCloud {
         let mut cloud = PointCloud::default();
         for range_m in [5.0, 10.0, 20.0] {
@@ -308,7 +309,7 @@ mod tests {
     }
 
     #[test]
-    fn weights_go_with_the_points_that_did_not_move() {
+    fn weights_are_those_of_the_static_points() {
         let scans = [scan(), scan(), scan()];
         let mut settings = LocalMapConfig::default();
         let mut counts = LocalMapCounts::default();
@@ -330,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn points_that_the_reconstruction_cannot_use_are_counted_also_where_nothing_is_left() {
+    fn points_without_normals_are_counted_also_where_too_few_points_remain() {
         assert_eq!(unusable(&floor(0)), (false, 0));
         assert_eq!(unusable(&floor(7)), (false, 7));
         assert_eq!(unusable(&floor(1597)), (true, 1597));

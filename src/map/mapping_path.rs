@@ -1,7 +1,7 @@
 //! The path of the mapping drive and the frame of the map, stored with the map.
 //!
-//! In the PLY file they are comments, which every reader of meshes skips: one for the frame, one per
-//! pose, each a translation [m] and a unit quaternion, written so that reading gives the same bits.
+//! In the PLY file they are comments, which all mesh readers skip: one for the frame, one per pose,
+//! each a translation [m] and a unit quaternion with all digits, so that reading gives the same bits.
 //!
 //! ```text
 //! comment fpmcl world_from_map   tx ty tz qx qy qz qw
@@ -15,7 +15,7 @@ use crate::geometry::Pose3;
 const WORLD: &str = "fpmcl world_from_map";
 const POSE: &str = "fpmcl map_from_lidar";
 
-/// Poses of the scans that a map was built from, and the place of the map in the world.
+/// Poses of the scans that a map was built from, and the pose of the map in the world.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MappingPath {
     /// `p_world = world_from_map * p_map`, where the world is the frame in which the poses of the
@@ -114,7 +114,7 @@ mod tests {
     #[test]
     fn reading_what_was_written_gives_the_same_bits() {
         let comments = path().to_comments();
-        let others = ["made by somebody", "fpmcl"];
+        let others = ["made by hand", "fpmcl"];
         let lines = comments.iter().map(String::as_str).chain(others);
         assert_eq!(MappingPath::from_comments(lines).unwrap(), Some(path()));
     }

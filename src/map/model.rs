@@ -19,10 +19,10 @@ const GROUND_CELL_M: f64 = 0.5;
 /// Cosine of the steepest slope that counts as ground in a map without ground colours.
 const LEVEL_COSINE: f32 = 0.97;
 
-/// A mesh of a place, prepared for localization: its tiles, its ground, what renders it, and the path
-/// that it was built along. All poses in it are `map_from_lidar`.
+/// A mesh prepared for localization, with its tile grid, elevation map, renderer and the path of the
+/// mapping drive. All poses in it are `map_from_lidar`.
 ///
-/// A clone shares everything with its original, at no cost.
+/// Clones share their data.
 #[derive(Clone)]
 pub struct Map {
     /// The surface, map frame.
@@ -35,7 +35,7 @@ pub struct Map {
     pub ground: Arc<GroundMap>,
     /// Renders the map from any pose.
     pub renderer: Arc<dyn RangeRenderer>,
-    /// The panoramas that were asked for last.
+    /// The panoramas of the last request.
     panoramas: Arc<Mutex<Option<CachedPanoramas>>>,
 }
 
@@ -49,7 +49,7 @@ pub enum MapError {
     #[error(transparent)]
     Ply(#[from] PlyError),
     #[error(
-        "none of the {triangles} triangles of the map has an area: no beam can meet it; build the map again"
+        "none of the {triangles} triangles of the map has an area: no beam can hit it; build the map again"
     )]
     NoArea { triangles: usize },
     #[error("{} does not contain the path of its mapping drive; give the poses that it was built with (map_pose_file and map_calib_file)", path.display())]
@@ -61,8 +61,8 @@ pub enum MapError {
 impl Map {
     /// Prepares a mesh in the map frame.
     ///
-    /// Ground is what is coloured red rather than blue, as `build-map` and range-mcl do; in a mesh
-    /// without such a triangle, every nearly horizontal surface.
+    /// The ground consists of the triangles with more red than blue, as `build-map` and range-mcl
+    /// colour them; in a mesh without such triangles, of all nearly horizontal ones.
     pub fn new(
         mesh: TriangleMesh,
         path: MappingPath,
@@ -84,7 +84,7 @@ impl Map {
         Ok(Self::from_parts(mesh, path, tiles, ground, renderer.into()))
     }
 
-    /// Puts together a map of which everything is given.
+    /// Assembles a map from its parts.
     pub fn from_parts(
         mesh: TriangleMesh,
         path: MappingPath,
@@ -117,7 +117,7 @@ impl Map {
         Ok(ply::write_map(path, &self.mesh, &self.path)?)
     }
 
-    /// Returns the panoramas of the places where a search for the car begins, rendered now if the
+    /// Returns the panoramas of the cells in which place recognition searches. They are rendered if the
     /// last request was a different one.
     pub fn panoramas(&self, request: &PanoramaRequest) -> Result<Arc<PanoramaIndex>, RenderError> {
         let mut last = self.panoramas.lock().unwrap_or_else(|e| e.into_inner());
@@ -140,7 +140,7 @@ impl Map {
     }
 }
 
-/// Elevation of the red triangles; in a mesh without any, of the nearly horizontal ones.
+/// Builds the elevation map of the red triangles; in a mesh without any, of the nearly horizontal ones.
 fn ground_of(mesh: &TriangleMesh) -> GroundMap {
     let is_red = |triangle: usize| {
         let mut vertices = mesh.triangles[triangle].iter();

@@ -1,10 +1,10 @@
-//! Division of a drive into local maps, and ownership of places by local maps.
+//! Division of a drive into local maps, and of the plane into the regions that they own.
 //!
 //! A scan is a key scan if the car has moved since the previous key scan. Every `local_map_size` key
-//! scans, and at the end of the recording, a local map is closed. It is meshed from its own scans and
-//! those a few metres before and after; of its mesh it keeps what is closer to its own scans than to
-//! those of any other local map, cut exactly at the border (see `seam`): neighbours meet
-//! without overlap, also where the car returns to a place.
+//! scans, and at the end of the recording, a local map is complete. It is meshed from its own scans
+//! and those a few metres before and after. Of its mesh it keeps what is closer to its own scans than
+//! to those of any other local map, clipped exactly at the border (see `seam`): neighbours
+//! meet without overlap, also where the drive crosses itself.
 
 use std::ops::Range;
 
@@ -22,7 +22,7 @@ pub struct LocalMapPlan {
     pub number: usize,
     /// Its own key scans; no two local maps share one.
     pub own: Range<usize>,
-    /// Its own key scans and those of its neighbours from which it is meshed.
+    /// The key scans from which it is meshed: its own and some of its neighbours.
     pub used: Range<usize>,
 }
 
@@ -69,7 +69,7 @@ fn distance_m(a: &Pose3, b: &Pose3) -> f64 {
     (a.translation.vector - b.translation.vector).norm()
 }
 
-/// Owner of each place: the local map of the nearest key scan.
+/// Owner of each cell of the plane: the local map of the nearest key scan.
 #[derive(Clone, Debug)]
 pub struct Ownership {
     grid: Grid2,
@@ -77,7 +77,7 @@ pub struct Ownership {
 }
 
 impl Ownership {
-    /// Covers all places within `reach_m` of a key scan; `poses` are `map_from_lidar` of the key scans.
+    /// Assigns the plane within `reach_m` of a key scan; `poses` are `map_from_lidar` of the key scans.
     pub fn new(poses: &[Pose3], plans: &[LocalMapPlan], reach_m: f64) -> Self {
         let positions: Vec<Point2<f64>> = poses
             .iter()
@@ -104,43 +104,39 @@ impl Ownership {
         Self { grid, owners }
     }
 
-    /// The grid in whose cells ownership is decided.
+    /// Returns the grid in whose cells ownership is decided.
     pub fn grid(&self) -> &Grid2 {
         &self.grid
     }
 
-    /// The number of the local map that owns a cell; `None` out of reach of all.
-    pub fn owner_of(&self, column: isize, row: isize) -> Option<usize> {
-        let column = usize::try_from(column).ok()?;
-        let row = usize::try_from(row).ok()?;
+    /// Returns the number of the local map that owns a cell; `None` outside the grid.
+    pub fn owner_of(&self, column: usize, row: usize) -> Option<usize> {
         let is_inside = column < self.grid.columns && row < self.grid.rows;
         is_inside.then(|| self.owners[row * self.grid.columns + column] as usize)
     }
 }
 
-/// For each cell of a grid the index of the position nearest to its center, the first among
+/// Returns for each cell of a grid the index of the position nearest to its center, the first among
 /// equals; there must be at least one position.
 ///
-/// Only positions that are nearest to some point of a block of cells are compared: by the
-/// triangle inequality they lie within the least distance from the center of the block plus the
-/// block's diameter.
+/// Only positions that are nearest to some point of a square of cells are compared: by the triangle
+/// inequality they lie within the least distance from the center of the square plus its diameter.
 fn nearest_positions(grid: &Grid2, positions: &[Point2<f64>]) -> Vec<usize> {
-    const BLOCK_CELLS: usize = 16;
-    // Of the circle around a block, rounded up.
-    let block_diameter_m = 1.5 * BLOCK_CELLS as f64 * grid.cell_m;
+    const SQUARE_CELLS: usize = 16;
+    // Diameter of the circle around a square, rounded up.
+    let diameter_m = 1.5 * SQUARE_CELLS as f64 * grid.cell_m;
     let mut nearest = vec![0; grid.len()];
-    for first_row in (0..grid.rows).step_by(BLOCK_CELLS) {
-        for first_column in (0..grid.columns).step_by(BLOCK_CELLS) {
+    for first_row in (0..grid.rows).step_by(SQUARE_CELLS) {
+        for first_column in (0..grid.columns).step_by(SQUARE_CELLS) {
             let corner = grid.center(first_column, first_row);
-            let center = corner.map(|m| m + 0.5 * (BLOCK_CELLS - 1) as f64 * grid.cell_m);
+            let center = corner.map(|m| m + 0.5 * (SQUARE_CELLS - 1) as f64 * grid.cell_m);
             let distances_m: Vec<f64> = positions.iter().map(|p| (p - center).norm()).collect();
-            let reach_m =
-                distances_m.iter().copied().fold(f64::INFINITY, f64::min) + block_diameter_m;
+            let reach_m = distances_m.iter().copied().fold(f64::INFINITY, f64::min) + diameter_m;
             let candidates: Vec<usize> = (0..positions.len())
                 .filter(|&i| distances_m[i] <= reach_m)
                 .collect();
-            for row in first_row..grid.rows.min(first_row + BLOCK_CELLS) {
-                for column in first_column..grid.columns.min(first_column + BLOCK_CELLS) {
+            for row in first_row..grid.rows.min(first_row + SQUARE_CELLS) {
+                for column in first_column..grid.columns.min(first_column + SQUARE_CELLS) {
                     let cell = grid.center(column, row);
                     let squared = |i: usize| (positions[i] - cell).norm_squared();
                     nearest[row * grid.columns + column] = candidates
@@ -166,9 +162,9 @@ mod tests {
     }
 
     #[test]
-    fn a_standing_car_has_one_key_scan_and_a_slow_one_a_key_scan_per_displacement() {
-        let standing = drive([0.0; 50]);
-        assert_eq!(key_scans(&standing, 0.2).len(), 1);
+    fn a_car_without_motion_has_one_key_scan_and_a_slow_one_a_key_scan_per_displacement() {
+        let parked = drive([0.0; 50]);
+        assert_eq!(key_scans(&parked, 0.2).len(), 1);
         let creeping = drive((0..50).map(|i| 0.05 * f64::from(i)));
         assert_eq!(key_scans(&creeping, 0.199).len(), 13);
     }
@@ -184,13 +180,13 @@ mod tests {
     }
 
     #[test]
-    fn a_place_belongs_to_the_local_map_of_the_nearest_scan() {
+    fn a_cell_is_owned_by_the_local_map_of_the_nearest_scan() {
         let poses = drive((0..20).map(f64::from));
         let plans = local_maps(&poses, 10, 2.0);
         let ownership = Ownership::new(&poses, &plans, 30.0);
         let owner_at = |x: f64, y: f64| {
             let (column, row) = ownership.grid().cell_at(x, y)?;
-            ownership.owner_of(column as isize, row as isize)
+            ownership.owner_of(column, row)
         };
         assert_eq!(owner_at(3.0, 20.0), Some(0));
         assert_eq!(owner_at(9.1, -20.0), Some(0));

@@ -1,4 +1,4 @@
-//! Laws of the cut between local maps.
+//! Laws of the clipping between local maps.
 
 use std::collections::HashSet;
 
@@ -23,7 +23,7 @@ fn ownership() -> Ownership {
     Ownership::new(&poses, &local_maps(&poses, 3, 1.0), 20.0)
 }
 
-/// Bumpy ground of 16 m x 16 m with corners where chance puts them.
+/// Bumpy ground of 16 m x 16 m with random vertices.
 fn bumpy(seed: u64) -> TriangleMesh {
     const CELLS: u32 = 53;
     let mut rng = StdRng::seed_from_u64(seed);
@@ -64,7 +64,7 @@ fn area(mesh: &TriangleMesh) -> f32 {
 }
 
 #[test]
-fn neighbours_of_other_meshes_of_one_ground_leave_no_gap_and_cover_nothing_twice() {
+fn clipped_neighbours_of_different_meshes_have_no_gap_and_no_overlap() {
     let ownership = ownership();
     let mut joined = TriangleMesh::default();
     for (number, seed) in (0..LOCAL_MAPS).zip(1..) {
@@ -75,11 +75,11 @@ fn neighbours_of_other_meshes_of_one_ground_leave_no_gap_and_cover_nothing_twice
     let scene = Scene::new(&joined);
     let mut rng = StdRng::seed_from_u64(0);
     for _ in 0..50_000 {
-        let mut place = || 15.0 * (rng.random::<f32>() - 0.5);
-        let above = Vec3::new(place(), place(), 1.0);
+        let mut coordinate = || 15.0 * (rng.random::<f32>() - 0.5);
+        let above = Vec3::new(coordinate(), coordinate(), 1.0);
         let mut heights_m = Vec::new();
         scene.for_each_hit(above, Vec3::NEG_Z, 2.0, |hit| heights_m.push(hit.range_m));
-        // An edge belongs to both of its triangles.
+        // A ray through an edge hits both of its triangles.
         heights_m.sort_unstable_by(f32::total_cmp);
         heights_m.dedup_by(|a, b| (*a - *b).abs() < 1e-5);
         assert_eq!(heights_m.len(), 1, "under {above}: {heights_m:?}");
@@ -87,7 +87,7 @@ fn neighbours_of_other_meshes_of_one_ground_leave_no_gap_and_cover_nothing_twice
 }
 
 #[test]
-fn the_pieces_of_a_mesh_have_its_area_and_lie_on_it() {
+fn the_pieces_of_a_mesh_have_its_total_area_and_lie_on_it() {
     let whole = bumpy(1);
     let pieces = pieces(&whole, &ownership());
     let sum: f32 = pieces.iter().map(area).sum();
@@ -109,7 +109,7 @@ fn the_pieces_of_a_mesh_have_its_area_and_lie_on_it() {
 }
 
 #[test]
-fn a_piece_is_open_only_where_it_was_and_along_the_border() {
+fn a_piece_is_open_only_at_the_rim_of_the_mesh_and_along_the_border() {
     let ownership = ownership();
     let whole = bumpy(1);
     for piece in pieces(&whole, &ownership) {
@@ -132,9 +132,9 @@ fn a_piece_is_open_only_where_it_was_and_along_the_border() {
             }
             let middle = 0.5 * (a + b).truncate();
             let across = (b - a).truncate().perp().normalize() * 0.01;
-            let [left, right] = [middle + across, middle - across].map(|place| {
-                let (column, row) = grid.cell_at(place.x.into(), place.y.into()).unwrap();
-                ownership.owner_of(column as isize, row as isize)
+            let [left, right] = [middle + across, middle - across].map(|point| {
+                let (column, row) = grid.cell_at(point.x.into(), point.y.into()).unwrap();
+                ownership.owner_of(column, row)
             });
             assert_ne!(left, right, "a crack from {a} to {b}");
         }
@@ -142,7 +142,7 @@ fn a_piece_is_open_only_where_it_was_and_along_the_border() {
 }
 
 #[test]
-fn the_vertices_on_the_border_are_those_that_the_cut_made() {
+fn the_vertices_on_the_border_are_new_ones() {
     let ownership = ownership();
     let whole = bumpy(1);
     let old: HashSet<_> = (whole.vertices.iter())
@@ -152,7 +152,7 @@ fn the_vertices_on_the_border_are_those_that_the_cut_made() {
         let on_border = on_border(&piece.vertices, &ownership, number);
         assert!(on_border.contains(&true));
         for (vertex, on_border) in piece.vertices.iter().zip(on_border) {
-            // Lines between own cells are cut along where a triangle reaches over the border.
+            // Triangles across the border are divided at lines between own cells too.
             let is_new = !old.contains(&vertex.to_array().map(f32::to_bits));
             assert!(is_new || !on_border, "{vertex}");
         }
@@ -160,7 +160,7 @@ fn the_vertices_on_the_border_are_those_that_the_cut_made() {
 }
 
 #[test]
-fn what_is_not_near_the_border_stays_as_it_is() {
+fn a_mesh_without_a_border_stays_unchanged() {
     let poses = [Pose3::identity()];
     let ownership = Ownership::new(&poses, &local_maps(&poses, 3, 1.0), 20.0);
     let whole = bumpy(1);

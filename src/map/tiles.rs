@@ -1,5 +1,4 @@
-//! The map in square tiles: which tile a place belongs to, which tiles the recording visited,
-//! and the mesh cut along them.
+//! Tile grid: division of the map into square tiles, and which of them the mapping drive visited.
 //!
 //! ```text
 //! tile (i, j) covers [(i − ½) S, (i + ½) S) × [(j − ½) S, (j + ½) S)      S = side of a tile
@@ -14,13 +13,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::geometry::{Pose2, Pose3, TriangleMesh, Vec3};
 
-/// How the map is divided.
+/// Division of the map into tiles.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TileConfig {
     /// Side of a tile [m].
     pub side_m: f64,
-    /// How far the map reaches beyond the mapping poses [m].
+    /// Extent of the map beyond the mapping poses [m].
     pub margin_m: f64,
 }
 
@@ -38,7 +37,7 @@ impl Default for TileConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TileIndex(pub usize);
 
-/// Square tiles over the places that a recording visited.
+/// Square tiles around the path of the mapping drive.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TileGrid {
     /// Side of a tile [m].
@@ -53,17 +52,17 @@ pub struct TileGrid {
 }
 
 impl TileGrid {
-    /// The tiles within a margin of mapping poses (`map_from_lidar`). Without poses, one tile
-    /// around the origin that is not valid.
+    /// Covers mapping poses (`map_from_lidar`) and a margin around them. Without poses, one invalid tile
+    /// around the origin.
     pub fn around<'a>(poses: impl IntoIterator<Item = &'a Pose3>, config: &TileConfig) -> Self {
-        let places: Vec<Point2<f64>> = poses
+        let positions: Vec<Point2<f64>> = poses
             .into_iter()
             .map(|pose| Point2::from(pose.translation.vector.xy()))
             .collect();
         let range = |axis: usize| {
-            let at = |place: &Point2<f64>| place.coords[axis];
-            let min = places.iter().map(at).fold(0.0, f64::min) - config.margin_m;
-            let max = places.iter().map(at).fold(0.0, f64::max) + config.margin_m;
+            let at = |position: &Point2<f64>| position.coords[axis];
+            let min = positions.iter().map(at).fold(0.0, f64::min) - config.margin_m;
+            let max = positions.iter().map(at).fold(0.0, f64::max) + config.margin_m;
             let first = (min / config.side_m + 0.5).floor() as i64;
             let last = (max / config.side_m - 0.5).ceil() as i64;
             (first, (last - first + 1).max(1) as usize)
@@ -76,14 +75,14 @@ impl TileGrid {
             first: (first_x, first_y),
             valid: Vec::new(),
         };
-        // A mapping pose makes the tiles valid whose centre is nearer than this.
+        // Radius around the centre of a tile in which mapping poses are counted.
         let reach_m = config.margin_m + 0.25 * config.side_m;
         grid.valid = grid
             .indices()
             .map(|tile| {
                 let center = grid.center(tile);
-                let near = |place: &&Point2<f64>| (**place - center).norm() < reach_m;
-                places.iter().filter(near).count() > 1
+                let near = |position: &&Point2<f64>| (**position - center).norm() < reach_m;
+                positions.iter().filter(near).count() > 1
             })
             .collect();
         grid
@@ -99,12 +98,12 @@ impl TileGrid {
         self.len() == 0
     }
 
-    /// All tiles in order.
+    /// Returns all tiles in order.
     pub fn indices(&self) -> impl Iterator<Item = TileIndex> + use<> {
         (0..self.len()).map(TileIndex)
     }
 
-    /// The tile that a position falls into; `None` outside the grid.
+    /// Returns the tile of a position; `None` outside the grid.
     pub fn tile_at(&self, x: f64, y: f64) -> Option<TileIndex> {
         let column = (x / self.side_m + 0.5).floor() - self.first.0 as f64;
         let row = (y / self.side_m + 0.5).floor() - self.first.1 as f64;
@@ -113,20 +112,20 @@ impl TileGrid {
         inside.then_some(TileIndex(row as usize * self.columns + column as usize))
     }
 
-    /// The valid tile that a pose stands in; `None` outside the grid and in tiles that the
-    /// recording did not visit.
+    /// Returns the valid tile of a pose; `None` outside the grid and in tiles that the mapping drive did
+    /// not visit.
     pub fn valid_tile_of(&self, pose: &Pose2) -> Option<TileIndex> {
-        let place = pose.translation.vector;
-        self.tile_at(place.x, place.y)
+        let position = pose.translation.vector;
+        self.tile_at(position.x, position.y)
             .filter(|tile| self.is_valid(*tile))
     }
 
-    /// Whether the recording visited a tile.
+    /// Whether the mapping drive visited a tile.
     pub fn is_valid(&self, tile: TileIndex) -> bool {
         self.valid[tile.0]
     }
 
-    /// The middle of a tile [m].
+    /// Returns the centre of a tile [m].
     pub fn center(&self, tile: TileIndex) -> Point2<f64> {
         let (column, row) = (tile.0 % self.columns, tile.0 / self.columns);
         Point2::new(
@@ -135,7 +134,7 @@ impl TileGrid {
         )
     }
 
-    /// Lower and upper corner of the rectangle that all tiles cover [m].
+    /// Returns the lower and upper corner of the rectangle that all tiles cover [m].
     pub fn extent(&self) -> (Point2<f64>, Point2<f64>) {
         let half = nalgebra::Vector2::repeat(0.5 * self.side_m);
         (
@@ -144,7 +143,7 @@ impl TileGrid {
         )
     }
 
-    /// The tile of a position, or the nearest one where it lies outside the grid.
+    /// Returns the tile of a position, outside the grid the nearest one.
     fn nearest_tile(&self, point: Vec3) -> TileIndex {
         let cell = |coordinate: f32, first: i64, cells: usize| {
             let cell = (f64::from(coordinate) / self.side_m + 0.5).floor() - first as f64;
@@ -156,10 +155,10 @@ impl TileGrid {
     }
 }
 
-/// Cuts a mesh along the tiles: one mesh per tile in the order of the tiles, some of them empty.
+/// Divides a mesh into one mesh per tile, in the order of the tiles; some may be empty.
 ///
-/// Every triangle is in exactly one of them, by its centroid; what lies outside the grid goes to
-/// the nearest tile, so that nothing of the map is lost. The order of triangles and vertices stays.
+/// Each triangle is assigned to the tile of its centroid, outside the grid to the nearest tile. The
+/// order of triangles and vertices is preserved.
 pub fn cut(mesh: &TriangleMesh, grid: &TileGrid) -> Vec<TriangleMesh> {
     let mut triangles_of: Vec<Vec<usize>> = vec![Vec::new(); grid.len()];
     for triangle in 0..mesh.triangles.len() {
@@ -174,7 +173,7 @@ pub fn cut(mesh: &TriangleMesh, grid: &TileGrid) -> Vec<TriangleMesh> {
         .collect()
 }
 
-/// The mesh of some triangles. `local_index` is scratch: one entry per vertex of `mesh`, all
+/// Extracts the mesh of some triangles. `local_index` is scratch space: one entry per vertex of `mesh`, all
 /// `u32::MAX` before and after.
 fn extract(mesh: &TriangleMesh, triangles: &[usize], local_index: &mut [u32]) -> TriangleMesh {
     let mut used: Vec<u32> = triangles
@@ -201,7 +200,7 @@ fn extract(mesh: &TriangleMesh, triangles: &[usize], local_index: &mut [u32]) ->
     part
 }
 
-/// The entries of a column at some rows; an empty column stays empty.
+/// Returns the entries of a column at some rows; an empty column stays empty.
 fn pick<T: Copy>(column: &[T], rows: &[u32]) -> Vec<T> {
     if column.is_empty() {
         return Vec::new();
@@ -213,18 +212,18 @@ fn pick<T: Copy>(column: &[T], rows: &[u32]) -> Vec<T> {
 mod tests {
     use super::*;
 
-    fn drive(places: &[(f64, f64)]) -> Vec<Pose3> {
-        places
+    fn drive(positions: &[(f64, f64)]) -> Vec<Pose3> {
+        positions
             .iter()
             .map(|&(x, y)| Pose3::translation(x, y, 0.0))
             .collect()
     }
 
-    fn grid(places: &[(f64, f64)]) -> TileGrid {
-        TileGrid::around(&drive(places), &TileConfig::default())
+    fn grid(positions: &[(f64, f64)]) -> TileGrid {
+        TileGrid::around(&drive(positions), &TileConfig::default())
     }
 
-    /// A sheet of triangles of 7 m over [-180, 180] in x and [-60, 60] in y.
+    /// Triangles of 7 m over [-180, 180] in x and [-60, 60] in y.
     fn sheet() -> TriangleMesh {
         let mut mesh = TriangleMesh::default();
         for row in 0..18 {
@@ -242,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn one_tile_is_centred_at_the_origin_and_every_centre_lies_in_its_own_tile() {
+    fn one_tile_is_centred_at_the_origin_and_every_tile_contains_its_centre() {
         let grid = grid(&[(0.0, 0.0), (230.0, -130.0)]);
         assert!(grid.indices().any(|t| grid.center(t) == Point2::origin()));
         for tile in grid.indices() {
@@ -283,7 +282,7 @@ mod tests {
     }
 
     #[test]
-    fn every_triangle_is_in_exactly_one_tile_with_its_corners_and_colours() {
+    fn every_triangle_is_in_exactly_one_tile_with_its_corners_and_colors() {
         let mesh = sheet();
         let grid = grid(&[(0.0, 0.0), (60.0, 0.0)]);
         let parts = cut(&mesh, &grid);
@@ -314,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn a_triangle_inside_the_grid_goes_to_the_tile_of_its_centroid() {
+    fn a_triangle_inside_the_grid_is_in_the_tile_of_its_centroid() {
         let mesh = sheet();
         let grid = grid(&[(-150.0, -20.0), (150.0, 60.0)]);
         for (part, tile) in cut(&mesh, &grid).iter().zip(grid.indices()) {

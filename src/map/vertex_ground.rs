@@ -1,9 +1,8 @@
-//! From the ground confidence of points to that of vertices, to their colours and to the
-//! decision which triangles are simplified.
+//! Ground confidences and colours of vertices, and the ground triangles of a mesh.
 //!
-//! The confidence of a vertex is the mean over the points around it, of all scans that saw them.
-//! Its colour lies between the colours of rest and ground, and reaches the middle at the
-//! threshold, so that who reads the map finds the decision in the stronger colour.
+//! The confidence of a vertex is the mean over the points around it, of all scans. Its colour is
+//! interpolated between the colours of rest and ground and changes sides at the threshold: the stronger
+//! of the two shows the classification.
 
 use std::collections::HashMap;
 
@@ -12,12 +11,12 @@ use rayon::prelude::*;
 
 use crate::geometry::{PointCloud, TriangleMesh};
 
-/// Distance of colours from the middle where the decision is closest, unitless: more than
-/// rounding to bytes takes away.
-const LEAST_LEAD: f32 = 0.01;
+/// Smallest distance of a colour from the middle (unitless), more than the error of rounding to
+/// bytes.
+const MIN_CONTRAST: f32 = 0.01;
 
-/// The mean ground confidence, 0 to 1, of the points in the cell of each vertex, or in the cells
-/// around it; 0 where there are none.
+/// Returns per vertex the mean ground confidence, 0 to 1, of the points in its cell, or else in the
+/// cells around it; 0 where there are none.
 pub(super) fn mean_confidences(vertices: &[Vec3], cloud: &PointCloud, cell_m: f32) -> Vec<f32> {
     let cell_of = |point: Vec3| (point / cell_m).floor().as_ivec3();
     let mut cells: HashMap<IVec3, (f32, f32)> = HashMap::with_capacity(cloud.len() / 4);
@@ -45,10 +44,10 @@ pub(super) fn mean_confidences(vertices: &[Vec3], cloud: &PointCloud, cell_m: f3
         .collect()
 }
 
-/// The colour of a confidence: `rest` at 0, `ground` at 1, nearer to `ground` exactly from the
+/// Returns the colour of a confidence: `rest` at 0, `ground` at 1, closer to `ground` exactly from the
 /// threshold on.
 pub(super) fn color(confidence: f32, threshold: f32, rest: [u8; 3], ground: [u8; 3]) -> [u8; 3] {
-    let half = 0.5 - LEAST_LEAD;
+    let half = 0.5 - MIN_CONTRAST;
     let share = if confidence >= threshold {
         let over = (confidence - threshold) / (1.0 - threshold).max(f32::EPSILON);
         1.0 - half + half * over.min(1.0)
@@ -66,7 +65,7 @@ pub(super) fn is_ground_color([red, _, blue]: &[u8; 3]) -> bool {
     red > blue
 }
 
-/// Which triangles are ground: those of whose corners each reaches the threshold.
+/// Returns which triangles are ground: those whose corners all reach the threshold.
 pub(super) fn ground_triangles(
     mesh: &TriangleMesh,
     confidences: &[f32],
@@ -87,12 +86,12 @@ mod tests {
     const BLUE: [u8; 3] = [0, 0, 255];
 
     #[test]
-    fn a_vertex_has_the_mean_confidence_of_all_scans_that_saw_it() {
+    fn a_vertex_has_the_mean_confidence_of_the_points_around_it() {
         let mut cloud = PointCloud::default();
         for (x, confidence) in [(0.1, 0.9), (0.1, 0.9), (0.15, 0.3), (5.1, 0.2)] {
             cloud.push(Vec3::new(x, 0.1, 0.1), Vec3::Z, confidence);
         }
-        // In the cell of three points, in that of one, beside it, and far from all.
+        // In the cell of three points, in the cell of one, beside it, and far from all.
         let vertices = [0.05, 5.2, 5.45, 9.0].map(|x| Vec3::new(x, 0.1, 0.1));
         let means = mean_confidences(&vertices, &cloud, 0.25);
         for (mean, expected) in means.into_iter().zip([0.7, 0.2, 0.2, 0.0]) {
@@ -101,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_run_from_rest_to_ground_and_tell_the_decision() {
+    fn colors_are_interpolated_from_rest_to_ground_and_show_the_classification() {
         for threshold in [0.2, 0.5, 0.8, 1.0] {
             assert_eq!(color(0.0, threshold, BLUE, RED), BLUE);
             assert_eq!(color(1.0, 0.9 * threshold, BLUE, RED), RED);

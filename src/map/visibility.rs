@@ -1,10 +1,9 @@
-//! What beams pass through is not there: free-space votes on points, then on triangles.
+//! Free-space (visibility) voting: removes moving points and false surfaces.
 //!
-//! A point that the beams of other scans pass through was a moving object when it was measured,
-//! and is not meshed. A triangle that more beams pass through than end on was invented by the
-//! reconstruction, and goes. Every beam votes on all triangles that it meets before its end, not
-//! only on the first, so that a false surface is no shelter for the one behind it, and one count
-//! says what repeated counting would.
+//! A point that the beams of other scans pass through was on a moving object and is not meshed. A
+//! triangle that more beams pass through than end on is an artefact of the reconstruction and is
+//! removed. Every beam votes on all triangles that it intersects before its end, not only on the
+//! first: a false surface does not shield those behind it, and one pass is enough.
 //!
 //! ```text
 //! d = measured range − range of the triangle      p = |d| · |cos(incidence)|
@@ -12,8 +11,8 @@
 //! supported:  |d| < support_range_m                                       and  p < support_m
 //! ```
 //!
-//! Along a beam that grazes the road a few millimetres of height are decimetres of range: such a beam
-//! is no witness against the road, hence the distances to the plane.
+//! At grazing incidence on the road, millimetres of height are decimetres of range, hence the
+//! distances p to the plane of the triangle.
 //!
 //! In the spirit of Pomerleau et al., *Long-term 3D map maintenance in dynamic environments*,
 //! ICRA 2014, and Kim and Kim, *Remove, then Revert*, IROS 2020.
@@ -30,34 +29,34 @@ use crate::lidar::LidarModel;
 use crate::raycasting::Scene;
 use crate::validation::{InvalidValue, Validate, at_least_one, not_negative};
 
-/// How free space votes.
+/// Parameters of free-space voting.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct VisibilityConfig {
-    /// Off: every point is meshed, and every triangle stays.
+    /// If false, all points are meshed and no triangle is removed.
     pub enabled: bool,
-    /// At most this many scans, spread over the local map, vote on points.
+    /// Largest number of scans that vote on points, spread over the local map.
     pub point_voters: usize,
     /// A beam passes through a point if it ends this far behind it [m].
     pub point_margin_m: f32,
-    /// The same, growing with range (unitless).
+    /// Increase of this margin with range (unitless).
     pub point_margin_per_range: f32,
-    /// So many beams at least must pass through a point, and more than half as many as end on it.
+    /// A point is dynamic if at least this many beams pass through it, and more than half as many as
+    /// end on it.
     pub point_votes: u32,
     /// A beam passes through a triangle if it ends this far behind it [m].
     pub triangle_margin_m: f32,
-    /// The same, growing with range (unitless).
+    /// Increase of this margin with range (unitless).
     pub triangle_margin_per_range: f32,
-    /// And if it ends this far from the plane of the triangle [m].
+    /// and at least this far from the plane of the triangle [m].
     pub crossing_m: f32,
-    /// A beam that ends this near to the plane of a triangle supports it [m].
+    /// A beam supports a triangle if it ends this near to its plane [m]
     pub support_m: f32,
-    /// If it also ends this near along the beam [m].
+    /// and at least this near along the beam [m].
     pub support_range_m: f32,
-    /// So many beams at least must pass through a triangle, and more than support it.
+    /// A triangle is removed if at least this many beams pass through it, and more than support it.
     pub triangle_votes: u32,
-    /// Beams of a local map that vote on its triangles, at most; where there are more, every second
-    /// or third of them votes.
+    /// Largest number of beams of a local map that vote on its triangles; of more, every n-th votes.
     pub max_beams: usize,
 }
 
@@ -97,7 +96,7 @@ impl Validate for VisibilityConfig {
     }
 }
 
-/// Per scan, whether each point of its cloud is static: not passed through by other scans' beams.
+/// Returns per scan and point whether it is static: beams of other scans do not pass through it.
 pub fn static_points(
     scans: &[ScanCloud],
     model: &LidarModel,
@@ -127,7 +126,7 @@ pub fn static_points(
         .collect()
 }
 
-/// At most `most` of `count` indices, evenly spread.
+/// Returns at most `most` of `count` indices, evenly spread.
 fn spread(count: usize, most: usize) -> Vec<usize> {
     let taken = count.min(most);
     (0..taken)
@@ -135,13 +134,14 @@ fn spread(count: usize, most: usize) -> Vec<usize> {
         .collect()
 }
 
-/// What a beam says of a place.
+/// Vote of a beam on a point or triangle.
 enum Vote {
     Through,
     Seen,
     Unknown,
 }
 
+/// Vote of a scan on a point of the map.
 fn vote(scan: &ScanCloud, point: Vec3, model: &LidarModel, config: &VisibilityConfig) -> Vote {
     const SEEN_WITHIN_M: f32 = 0.3;
     let point_in_lidar =
@@ -163,7 +163,7 @@ fn vote(scan: &ScanCloud, point: Vec3, model: &LidarModel, config: &VisibilityCo
     }
 }
 
-/// Removes the triangles that beams pass through; returns how many went.
+/// Removes the triangles that beams pass through; returns their number.
 pub fn remove_crossed_triangles(
     mesh: &mut TriangleMesh,
     scans: &[ScanCloud],
@@ -174,7 +174,7 @@ pub fn remove_crossed_triangles(
     crossed.iter().filter(|&&crossed| crossed).count()
 }
 
-/// Whether each triangle is passed through more often than it is hit.
+/// Returns which triangles more beams pass through than end on.
 fn crossed_triangles(
     mesh: &TriangleMesh,
     scans: &[ScanCloud],
@@ -185,7 +185,7 @@ fn crossed_triangles(
         .into_par_iter()
         .map(|triangle| mesh.scaled_normal(triangle).normalize_or_zero())
         .collect();
-    // Counts do not depend on the order of the beams, so threads may share them.
+    // Sums of integers do not depend on the order of the threads.
     let counters = || -> Vec<AtomicU32> {
         std::iter::repeat_with(AtomicU32::default)
             .take(mesh.triangles.len())
@@ -218,7 +218,7 @@ fn crossed_triangles(
         .collect()
 }
 
-/// What a beam of a range says of a triangle that it meets at another one.
+/// Vote of a beam with a measured range on a triangle that it intersects at another range.
 fn triangle_vote(measured_m: f32, triangle_m: f32, cosine: f32, config: &VisibilityConfig) -> Vote {
     let in_front_m = measured_m - triangle_m;
     let plane_m = in_front_m.abs() * cosine;
@@ -270,21 +270,21 @@ mod tests {
         mesh
     }
 
-    /// A scan of a mesh from a place, level and looking along x.
-    fn scan(world: &TriangleMesh, place: Vec3) -> ScanCloud {
+    /// A scan of a mesh from a position, level and heading along x.
+    fn scan(world: &TriangleMesh, position: Vec3) -> ScanCloud {
         let model = model();
         let directions = model.directions();
         let mut hits = vec![Hit::MISS; directions.len()];
-        Scene::new(world).cast(place, &directions, &mut hits);
+        Scene::new(world).cast(position, &directions, &mut hits);
         let ranges = hits.iter().map(|hit| hit.range_m).collect();
         let image = RangeImage::from_ranges(ranges, &model);
         let mut cloud = PointCloud::default();
         let returns: Vec<_> = image.beams().map(|beam| beam.point()).collect();
         for &point in &returns {
-            cloud.push(place + point, Vec3::NEG_X, 0.0);
+            cloud.push(position + point, Vec3::NEG_X, 0.0);
         }
         let mut map_from_lidar = Rigid3f::from(&Pose3::identity());
-        map_from_lidar.translation = place;
+        map_from_lidar.translation = position;
         ScanCloud {
             map_from_lidar,
             cloud,
@@ -305,12 +305,12 @@ mod tests {
     }
 
     #[test]
-    fn an_invented_surface_goes_and_what_beams_end_on_stays() {
+    fn false_surfaces_are_removed_and_those_that_beams_end_on_are_kept() {
         let scans = three_scans(&wall());
         let mut mesh = wall();
         let true_triangles = mesh.triangles.len();
         mesh.append(&panel(10.0, [-2.0, 2.0], [-1.0, 1.0]));
-        // Another ghost in the shadow of the first.
+        // Another false surface behind the first.
         mesh.append(&panel(12.0, [-1.0, 1.0], [-0.5, 0.5]));
         let removed = remove_crossed_triangles(&mut mesh, &scans, &VisibilityConfig::default());
         assert_eq!(removed, 2 * (8 * 4 + 4 * 2));
@@ -319,9 +319,9 @@ mod tests {
     }
 
     #[test]
-    fn a_true_mesh_loses_nothing() {
+    fn a_correct_mesh_is_unchanged() {
         let mut mesh = wall();
-        // A pole of a third of a metre before the wall.
+        // A pole in front of the wall.
         mesh.append(&panel(10.0, [0.0, 0.5], [-3.0, 3.0]));
         let scans = three_scans(&mesh);
         let before = mesh.clone();
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn beams_that_graze_a_road_are_no_witnesses_against_it() {
+    fn beams_at_grazing_incidence_do_not_pass_through_the_road() {
         let config = VisibilityConfig::default();
         // 30 m away, 1.7 m below: the range is half a metre and more longer, the height 4 cm less.
         let cosine = 1.7 / 30.0;
@@ -343,7 +343,7 @@ mod tests {
             triangle_vote(30.0, 27.0, cosine, &config),
             Vote::Through
         ));
-        // Seen from the front it is another surface.
+        // At normal incidence it is another surface.
         assert!(matches!(
             triangle_vote(30.0, 29.3, 1.0, &config),
             Vote::Through
@@ -351,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn points_of_what_has_moved_on_are_dynamic_and_walls_are_not() {
+    fn points_on_a_moving_object_are_dynamic_and_walls_are_static() {
         let mut with_van = wall();
         with_van.append(&panel(10.0, [-2.0, 2.0], [-1.0, 1.0]));
         let mut scans = three_scans(&wall());
@@ -359,19 +359,19 @@ mod tests {
         let is_static = static_points(&scans, &model(), &VisibilityConfig::default());
         for (scan, is_static) in scans.iter().zip(&is_static) {
             for (position, &is_static) in scan.cloud.positions.iter().zip(is_static) {
-                // The rim of the van is seen past by pixels that see the wall beside it.
-                let on_rim = position.y.abs() > 1.7 || position.z.abs() > 0.7;
+                // Pixels at the edges of the van see the wall beside it.
+                let on_edge = position.y.abs() > 1.7 || position.z.abs() > 0.7;
                 if position.x > 19.0 {
-                    assert!(is_static, "a wall stands: {position}");
-                } else if !on_rim {
-                    assert!(!is_static, "the van has gone: {position}");
+                    assert!(is_static, "wall: {position}");
+                } else if !on_edge {
+                    assert!(!is_static, "van: {position}");
                 }
             }
         }
     }
 
     #[test]
-    fn voters_are_spread_over_all_scans() {
+    fn voting_scans_are_spread_over_all_scans() {
         assert_eq!(spread(100, 4), [12, 37, 62, 87]);
         assert_eq!(spread(3, 24), [0, 1, 2]);
         assert!(spread(0, 4).is_empty());
