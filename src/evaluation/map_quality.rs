@@ -1,7 +1,7 @@
 //! Quality of a map along the beams of scans that it was not built from.
 //!
-//! A map whose surfaces pass through all points can still be useless: what counts is the first surface
-//! that a beam from the sensor meets. For every beam
+//! A map whose surfaces pass through all points can still be useless: localization depends on the
+//! first surface that a beam from the sensor hits. For every beam
 //!
 //! ```text
 //! residual   = mapped range − measured range
@@ -32,7 +32,7 @@ pub(super) const NEAR_M: f32 = 0.1;
 const NEAREST_M: f32 = 3.0;
 /// Edge of the cells in which residuals are averaged for a picture [m].
 const PICTURE_CELL_M: f32 = 0.5;
-/// One of so many beams is evaluated.
+/// Every n-th beam is evaluated.
 const BEAM_STEP: usize = 7;
 
 /// Shares of all evaluated beams (unitless), and medians over those that hit [m].
@@ -44,7 +44,7 @@ pub struct MapQuality {
     pub early: f64,
     /// Share stopped more than 0.5 m too late.
     pub late: f64,
-    /// Share that meets no surface.
+    /// Share that hits no surface.
     pub miss: f64,
     /// Median distance to the plane that was hit [m].
     pub beam_plane_median_m: f64,
@@ -63,7 +63,7 @@ pub struct MapQuality {
 /// An evaluated beam.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BeamResidual {
-    /// Where the beam was returned, map frame.
+    /// Return of the beam, map frame [m].
     pub point_in_map: Vec3,
     /// Mapped minus measured range [m]; infinite where the map has no surface.
     pub residual_m: f32,
@@ -71,12 +71,12 @@ pub struct BeamResidual {
     pub beam_plane_m: f32,
     /// Distance of the return to the nearest surface [m]; infinite if over 10 cm.
     pub point_m: f32,
-    /// Where the map stops the beam, map frame; `None` where it has no surface.
+    /// First intersection of the beam with the map, map frame [m]; `None` where it has no surface.
     pub stopped_at: Option<Vec3>,
 }
 
-/// Compares a map with `count` scans and their poses, inside the crop box. `read` gives them by index,
-/// from any thread.
+/// Compares a map with `count` scans and their poses, inside the crop box. `read` returns them by index
+/// and is called from any thread.
 pub fn residuals<E: Send>(
     mesh: &TriangleMesh,
     count: usize,
@@ -118,8 +118,8 @@ pub fn vertex_residuals(mesh: &TriangleMesh, beams: &[BeamResidual]) -> Vec<f32>
     let cell_of = |point: Vec3| (point / PICTURE_CELL_M).floor().as_ivec3();
     let mut cells: HashMap<IVec3, (f32, f32)> = HashMap::new();
     for beam in beams {
-        if let Some(place) = beam.stopped_at {
-            let (sum, count) = cells.entry(cell_of(place)).or_default();
+        if let Some(point) = beam.stopped_at {
+            let (sum, count) = cells.entry(cell_of(point)).or_default();
             *sum += beam.beam_plane_m.min(GROSS_M);
             *count += 1.0;
         }
@@ -229,21 +229,21 @@ mod tests {
         }
     }
 
-    fn judged(wall_x: f32, points: &[Vec3]) -> MapQuality {
+    fn quality_of(wall_x: f32, points: &[Vec3]) -> MapQuality {
         let mesh = wall(wall_x);
         let identity = Rigid3f::from(&crate::geometry::Pose3::identity());
         MapQuality::of(&compare(&mesh, &Scene::new(&mesh), &identity, points)).unwrap()
     }
 
     #[test]
-    fn early_late_and_missing_are_told_apart() {
+    fn early_late_and_missing_beams_are_distinguished() {
         let points = [
             Vec3::new(10.0, 0.0, 0.0),
             Vec3::new(12.0, 0.0, 0.0),
             Vec3::new(8.0, 0.0, 0.0),
             Vec3::new(-10.0, 0.0, 0.0),
         ];
-        let quality = judged(10.0, &points);
+        let quality = quality_of(10.0, &points);
         assert_eq!(
             (quality.early, quality.late, quality.miss),
             (0.25, 0.25, 0.25)
@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_shows_residuals_where_beams_were_stopped_and_nothing_elsewhere() {
+    fn a_picture_shows_residuals_where_beams_end_and_nothing_elsewhere() {
         let mesh = TriangleMesh {
             vertices: vec![Vec3::new(10.2, 0.1, 0.1), Vec3::new(10.2, 30.0, 0.0)],
             ..TriangleMesh::default()
@@ -272,7 +272,7 @@ mod tests {
     #[test]
     fn a_grazing_beam_counts_by_its_distance_to_the_plane() {
         // 45 degrees of incidence, the wall 5 cm behind the point.
-        let quality = judged(10.05, &[Vec3::new(10.0, 10.0, 0.0)]);
+        let quality = quality_of(10.05, &[Vec3::new(10.0, 10.0, 0.0)]);
         assert!((quality.beam_plane_median_m - 0.05).abs() < 1e-4);
         assert!((quality.ray_median_m - 0.05 * 2.0_f64.sqrt()).abs() < 1e-4);
         assert!((quality.bias_m - quality.ray_median_m).abs() < 1e-9);

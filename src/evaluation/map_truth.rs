@@ -6,8 +6,8 @@
 //! F            = 2 · accuracy · completeness / (accuracy + completeness)
 //! ```
 //!
-//! Knapitsch et al., *Tanks and Temples*, ACM TOG 36(4), 2017. The visible truth is what the beams of the
-//! mapping scans would meet without noise and without traffic.
+//! Knapitsch et al., *Tanks and Temples*, ACM TOG 36(4), 2017. The visible truth is the surface that the
+//! beams of the mapping scans would hit without noise and traffic.
 
 use std::collections::HashSet;
 
@@ -30,7 +30,7 @@ const AREA_M2: f32 = 0.01;
 pub struct TruthAgreement {
     /// Share of the map's area within 10 cm of the truth (unitless).
     pub accuracy: f64,
-    /// Share of the seen truth within 10 cm of the map (unitless).
+    /// Share of the visible truth within 10 cm of the map (unitless).
     pub completeness: f64,
     /// Their harmonic mean (unitless).
     pub f_score: f64,
@@ -72,7 +72,7 @@ fn near_distances(points: &[Vec3], mesh: &TriangleMesh) -> Vec<f32> {
     distances
 }
 
-/// Points where the beams of the pixels meet the truth, one per voxel.
+/// Returns the points where the beams of the pixels hit the truth, one per voxel.
 fn visible_points(truth: &TriangleMesh, poses: &[Pose3], settings: &ScanConfig) -> Vec<Vec3> {
     let scene = Scene::new(truth);
     let model = &settings.range_image;
@@ -111,19 +111,19 @@ fn voxel_of(point: Vec3) -> IVec3 {
     (point / VOXEL_M).floor().as_ivec3()
 }
 
-/// Points spread evenly over the area of a mesh: in the middles of like triangles that each of its
-/// triangles is cut into.
+/// Samples the area of a mesh uniformly, at the centroids of similar triangles that each of its
+/// triangles is subdivided into.
 fn samples(mesh: &TriangleMesh) -> Vec<Vec3> {
     let mut samples = Vec::new();
-    let mut owed = 0.0;
+    let mut due = 0.0;
     for triangle in 0..mesh.triangles.len() {
         let [a, b, c] = mesh.corners(triangle);
         let area_m2 = 0.5 * mesh.scaled_normal(triangle).length();
-        owed += area_m2 / AREA_M2;
-        if owed < 1.0 {
+        due += area_m2 / AREA_M2;
+        if due < 1.0 {
             continue;
         }
-        let cuts = (owed.floor().sqrt() as u32).max(1);
+        let cuts = (due.floor().sqrt() as u32).max(1);
         let share = 1.0 / cuts as f32;
         for i in 0..cuts {
             for j in 0..cuts - i {
@@ -137,7 +137,7 @@ fn samples(mesh: &TriangleMesh) -> Vec<Vec3> {
                 }
             }
         }
-        owed -= (cuts * cuts) as f32;
+        due -= (cuts * cuts) as f32;
     }
     samples
 }

@@ -1,7 +1,8 @@
-//! How far points are from a mesh, up to a limit.
+//! Distances from points to a mesh, up to a limit.
 //!
-//! The points are sorted into cubic cells; every triangle asks the points of the cells that its
-//! box, grown by the limit, touches. So memory follows the points, however large the mesh is.
+//! The points are sorted into cubic cells; every triangle is compared with the points of the cells that
+//! its bounding box, grown by the limit, overlaps. The memory is proportional to the points, whatever
+//! the size of the mesh.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -11,7 +12,7 @@ use rayon::prelude::*;
 
 use crate::geometry::TriangleMesh;
 
-/// The distance from each point to the nearest triangle of a mesh [m]; infinite beyond `limit_m`,
+/// Returns the distance from each point to the nearest triangle of a mesh [m]; infinite beyond `limit_m`,
 /// which must be greater than 0.
 pub fn distances_m(points: &[Vec3], mesh: &TriangleMesh, limit_m: f32) -> Vec<f32> {
     let cell_of = |point: Vec3| (point / limit_m).floor().as_ivec3();
@@ -25,7 +26,7 @@ pub fn distances_m(points: &[Vec3], mesh: &TriangleMesh, limit_m: f32) -> Vec<f3
     for members in order.chunk_by(|a, b| a.0 == b.0) {
         cells.insert(IVec3::from_array(members[0].0), members);
     }
-    // Numbers that are not negative are ordered as their bits are.
+    // Non-negative floats have the order of their bits.
     let least: Vec<AtomicU32> = std::iter::repeat_with(|| AtomicU32::new(f32::INFINITY.to_bits()))
         .take(points.len())
         .collect();
@@ -53,7 +54,7 @@ fn for_each_cell_near([a, b, c]: [Vec3; 3], limit_m: f32, mut visit: impl FnMut(
     let low = ((a.min(b).min(c) - limit_m) / limit_m).floor().as_ivec3();
     let high = ((a.max(b).max(c) + limit_m) / limit_m).floor().as_ivec3();
     let normal = (b - a).cross(c - a).normalize_or_zero();
-    // Of the box of a large triangle most cells are far from its plane.
+    // Most cells in the bounding box of a large triangle are far from its plane.
     let reach_m = limit_m * (1.0 + 0.5 * 3.0_f32.sqrt());
     for z in low.z..=high.z {
         for y in low.y..=high.y {
@@ -68,7 +69,7 @@ fn for_each_cell_near([a, b, c]: [Vec3; 3], limit_m: f32, mut visit: impl FnMut(
     }
 }
 
-/// The distance from a point to a triangle [m].
+/// Returns the distance from a point to a triangle [m].
 fn to_triangle_m(p: Vec3, [a, b, c]: [Vec3; 3]) -> f32 {
     let normal = (b - a).cross(c - a).normalize_or_zero();
     let sides = [(a, b), (b, c), (c, a)];
@@ -117,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn beyond_the_limit_and_without_a_mesh_there_is_nothing() {
+    fn beyond_the_limit_and_without_a_mesh_the_distance_is_infinite() {
         let point = [Vec3::new(1.0, 1.0, 1.6)];
         assert_eq!(distances_m(&point, &triangle(), 0.5), [f32::INFINITY]);
         let empty = TriangleMesh::default();

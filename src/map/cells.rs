@@ -1,4 +1,4 @@
-//! Square cells of the plane in which a search for the car begins.
+//! Square cells of the plane in which place recognition searches.
 
 use std::collections::BTreeSet;
 
@@ -11,7 +11,7 @@ use crate::geometry::Pose2;
 /// Half the width of the road around the mapping poses [m], as in range-mcl.
 pub const ROAD_HALF_WIDTH_M: f64 = 2.0;
 
-/// Square cells in which a search begins.
+/// Square cells in which place recognition searches.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cells {
     /// Centres of the cells [m], ordered by y, then x.

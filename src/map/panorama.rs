@@ -1,17 +1,17 @@
-//! Place recognition without an initial guess: one panorama per place scores all headings.
+//! Place recognition without an initial pose: one panorama per cell gives the costs of all headings.
 //!
-//! A panorama is rendered once per cell of the road, level over the ground, heading along x. A car
-//! there with heading θ sees the same panorama shifted,
+//! A panorama is rendered once per cell of the road, level above the ground, heading along x. At
+//! heading θ a sensor there sees the same panorama shifted,
 //!
 //! ```text
 //! cost(cell, s) = mean over the pixels of min(|panorama(row, c) − scan(row, c + s)|, limit)
 //! θ = 2π s / width
 //! ```
 //!
-//! so that every heading costs one comparison and no rendering. The first pass compares all cells at a
-//! part of the columns and headings, the second the best of them at all. The memory is 4 · rows · columns bytes per
-//! cell: with the defaults 4.3 kB, 12 MB for 700 m of road in cells of one metre. Where roads cross
-//! above one another, a cell has a panorama on each level.
+//! so a heading costs one comparison and no rendering. The first pass compares all cells with a subset
+//! of columns and headings, the second the best cells with all of them. The memory is
+//! 4 · rows · columns bytes per cell: with the defaults 4.3 kB, 12 MB for 700 m of road in cells of one
+//! metre. Where roads cross above one another, a cell has one panorama per level.
 
 use std::f32::consts::TAU;
 
@@ -32,22 +32,22 @@ use crate::validation::{InvalidValue, Validate, fraction, in_range, positive, re
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PanoramaConfig {
-    /// Side of a cell: one panorama each [m]; `grid_res` of `localization.yml`.
+    /// Side of a cell, which has one panorama per level [m]; `grid_res` of `localization.yml`.
     #[serde(skip)]
     pub cell_m: f64,
     /// Rows of a panorama.
     pub rows: usize,
     /// Columns of a panorama over 360 degrees.
     pub columns: usize,
-    /// Lower edge of the panorama below the horizon: lower beams see the road alone [rad].
+    /// Lower edge of the panorama below the horizon: lower beams see only the road [rad].
     pub lowest_rad: f32,
-    /// Limit of the difference of a pixel [m].
+    /// Limit of the range difference of a pixel [m].
     pub limit_m: f32,
     /// The first pass takes every n-th column and heading.
     pub coarse_step: usize,
-    /// Share of the cells that the second pass takes.
+    /// Share of the cells in the second pass (unitless).
     pub refined_share: f64,
-    /// A cell whose mean cost is larger by this gets e times fewer particles [m].
+    /// Increase of the mean cost for which a cell gets e times fewer particles [m].
     pub scale_m: f64,
     /// Standard deviation of the headings around the best heading of a cell [rad]; `yaw_sigma` of
     /// `localization.yml`.
@@ -89,21 +89,21 @@ impl Validate for PanoramaConfig {
     }
 }
 
-/// Part of the map in which a search begins.
+/// Part of the map in which place recognition searches.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SearchRegion {
-    /// The road that was mapped: within 2 m of the mapping poses.
+    /// The mapped road: within 2 m of the mapping poses.
     Road,
     /// All ground of the map.
     Anywhere,
 }
 
-/// The panoramas that a search needs.
+/// Panoramas for a search.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PanoramaRequest {
-    /// Where they are.
+    /// Cells that have panoramas.
     pub region: SearchRegion,
-    /// Sensor whose scans will be searched for.
+    /// Sensor of the scans.
     pub lidar: LidarModel,
     /// Height of that sensor above the ground [m].
     pub sensor_height_m: f64,
@@ -140,20 +140,20 @@ pub struct PanoramaIndex {
     images: Vec<Vec<f32>>,
 }
 
-/// A place where the car may be.
+/// A candidate pose of the car.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PanoramaSeed {
-    /// Middle of the cell [m].
+    /// Centre of the cell [m].
     pub center: Point2<f64>,
     /// Height of the ground there [m].
     pub level_m: f64,
-    /// The heading that fits best there [rad].
+    /// Heading with the lowest cost [rad].
     pub heading_rad: f64,
-    /// Mean truncated difference [m].
+    /// Mean limited difference [m].
     pub cost_m: f64,
 }
 
-/// Farther than everything, and finite: differences of it are beyond every limit.
+/// Range of pixels without a surface: finite, and every difference from it exceeds the limit.
 const FAR_M: f32 = 1e9;
 
 impl PanoramaIndex {
@@ -207,17 +207,17 @@ impl PanoramaIndex {
         self.images.len()
     }
 
-    /// Whether no cell was on the map.
+    /// Whether no cell has ground.
     pub fn is_empty(&self) -> bool {
         self.images.is_empty()
     }
 
-    /// Memory that the panoramas take [bytes].
+    /// Memory of the panoramas [bytes].
     pub fn size_bytes(&self) -> usize {
         self.len() * self.model.len() * size_of::<f32>()
     }
 
-    /// The best heading of the cells that may be where the scan was taken, best cell first.
+    /// Returns the best heading of each cell of the second pass, the lowest cost first.
     pub fn search(&self, scan: &RangeImage, attitude: &SensorAttitude) -> Vec<PanoramaSeed> {
         let scan = DoubledScan::new(scan, attitude, &self.model);
         let step = self.config.coarse_step.max(1);
@@ -249,20 +249,20 @@ impl PanoramaIndex {
                 }
             })
             .collect();
-        // Stable: cells that cost the same stay in their order.
+        // Stable: cells of equal cost keep their order.
         seeds.sort_by(|a, b| a.cost_m.total_cmp(&b.cost_m));
         seeds
     }
 }
 
-/// Every `step`-th column of rows of a width, from the first.
+/// Returns every `step`-th column of rows of a width.
 fn thinned(rows: &[f32], width: usize, step: usize) -> Vec<f32> {
     rows.chunks(width)
         .flat_map(|row| row.iter().copied().step_by(step))
         .collect()
 }
 
-/// Least cost [m] and its shift.
+/// Returns the lowest cost [m] and its shift.
 fn best_shift(panorama: &[f32], scan: &DoubledScan, limit_m: f32) -> (f32, usize) {
     (0..scan.width)
         .map(|shift| (cost(panorama, scan, shift, limit_m), shift))
@@ -271,9 +271,9 @@ fn best_shift(panorama: &[f32], scan: &DoubledScan, limit_m: f32) -> (f32, usize
         })
 }
 
-/// Mean truncated difference of a panorama and the shifted scan [m].
+/// Mean limited difference of a panorama and the shifted scan [m].
 fn cost(panorama: &[f32], scan: &DoubledScan, shift: usize, limit_m: f32) -> f32 {
-    /// Sums that grow beside each other, in one register.
+    /// Partial sums per SIMD register.
     const LANES: usize = 8;
     let width = scan.width;
     let difference = |rendered: f32, measured: f32| {
@@ -302,7 +302,7 @@ fn cost(panorama: &[f32], scan: &DoubledScan, shift: usize, limit_m: f32) -> f32
     (sums.iter().sum::<f32>() + rest) / panorama.len() as f32
 }
 
-/// The projection of the panoramas: the upper part of what the sensor sees.
+/// Projection of the panoramas: the upper part of the field of view of the sensor.
 fn panorama_model(lidar: &LidarModel, config: &PanoramaConfig) -> LidarModel {
     LidarModel {
         height: config.rows,
@@ -312,16 +312,16 @@ fn panorama_model(lidar: &LidarModel, config: &PanoramaConfig) -> LidarModel {
     }
 }
 
-/// A scan as a panorama, level, every row twice over, so that a shift is a slice.
+/// A scan as a level panorama with each row repeated, so that a shift is a slice.
 struct DoubledScan {
-    /// Columns of a row before it was doubled.
+    /// Columns of a panorama.
     width: usize,
     ranges: Vec<f32>,
 }
 
 impl DoubledScan {
-    /// Of the returns in a pixel, the one nearest to its centre counts. Pixels without a return
-    /// differ from everything by the limit, at every heading alike.
+    /// Takes the return nearest to the centre of each pixel. Pixels without a return differ from every
+    /// range by the limit, at all headings.
     fn new(scan: &RangeImage, attitude: &SensorAttitude, model: &LidarModel) -> Self {
         let road_from_lidar = Rigid3f::from(&attitude.road_from_lidar());
         let directions = model.directions();
@@ -348,7 +348,7 @@ impl DoubledScan {
         }
     }
 
-    /// Every `step`-th column.
+    /// Returns every `step`-th column.
     fn thinned(&self, step: usize) -> Self {
         let halves = thinned(&self.ranges, self.width, step);
         Self {
@@ -377,7 +377,7 @@ mod tests {
     }
 
     #[test]
-    fn the_best_cell_is_where_the_scan_was_taken_at_any_heading() {
+    fn the_best_cell_contains_the_true_position_at_any_heading() {
         let world = TestWorld::street();
         let index = index(&world);
         for (x, y, heading) in [
@@ -396,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn turning_the_car_by_whole_columns_shifts_the_best_heading_and_nothing_else() {
+    fn a_turn_by_whole_columns_changes_only_the_best_heading() {
         let world = TestWorld::street();
         let index = index(&world);
         let turn = 10.0 * std::f64::consts::TAU / index.model.width as f64;
@@ -412,7 +412,7 @@ mod tests {
     }
 
     #[test]
-    fn the_same_request_renders_nothing_again() {
+    fn the_same_request_returns_the_same_panoramas() {
         let map = TestWorld::street().map();
         let first = map.panoramas(&request()).unwrap();
         assert!(std::sync::Arc::ptr_eq(
@@ -430,7 +430,7 @@ mod tests {
     }
 
     #[test]
-    fn without_cells_on_the_map_there_is_nothing_to_find() {
+    fn without_cells_on_the_map_the_search_is_empty() {
         let world = TestWorld::street();
         let cells = Cells {
             centers: vec![Point2::new(9e3, 0.0)],

@@ -1,4 +1,4 @@
-//! A street of boxes with a renderer that needs no mesh: for tests only.
+//! A street of boxes with a renderer without a mesh, for tests.
 
 use glam::Vec3;
 use nalgebra::{Point2, Vector2};
@@ -8,7 +8,7 @@ use crate::geometry::{Pose2, Pose3, Rigid3f, TriangleMesh};
 use crate::lidar::{Beam, LidarModel, RangeImage};
 use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
 
-/// Axis-aligned boxes on flat ground, seen in a frame that may be turned and shifted.
+/// Axis-aligned boxes on flat ground, in a street frame at any pose in the map.
 #[derive(Clone)]
 pub struct TestWorld {
     /// Lower and upper corners, street frame.
@@ -24,12 +24,12 @@ pub struct TestWorld {
 const GROUND_M: f64 = -1.73;
 
 impl TestWorld {
-    /// 200 m of street along x with houses, gaps, parked cars and poles at irregular places.
+    /// 200 m of street along x with houses, gaps, parked cars and poles at irregular positions.
     pub fn street() -> Self {
         Self::moved_street(Pose2::identity())
     }
 
-    /// The same street elsewhere in the map.
+    /// The same street at another pose in the map.
     pub fn moved_street(map_from_street: Pose2) -> Self {
         let mut boxes = Vec::new();
         let mut state = 12345_u32;
@@ -111,7 +111,7 @@ impl TestWorld {
         self.map_from_street * Pose2::new(Vector2::new(x, y), heading)
     }
 
-    /// What the sensor sees from a pose.
+    /// The range image at a pose.
     pub fn scan(&self, pose: &Pose2) -> RangeImage {
         let map_from_lidar = self.ground.lift(pose, &SensorAttitude::default()).unwrap();
         let ranges = self.ranges(&map_from_lidar, &self.model.directions());
@@ -128,7 +128,7 @@ impl TestWorld {
         RangeImage::from_ranges(limited, &self.model)
     }
 
-    /// Adds a box of the street that the ground and tiles know nothing of.
+    /// Adds a box to the street; ground and tiles are unchanged.
     pub fn put_box(&mut self, x: (f32, f32), y: (f32, f32), height: f32) {
         self.boxes.push(footprint(x.0, x.1, y.0, y.1, height));
     }
@@ -165,7 +165,7 @@ fn footprint(x0: f32, x1: f32, y0: f32, y1: f32, height: f32) -> (Vec3, Vec3) {
     (a.min(b), a.max(b))
 }
 
-/// Where a ray enters a box from outside; infinite where it does not.
+/// Range at which a ray enters a box from outside; infinite if it does not.
 fn enter(corners: &(Vec3, Vec3), origin: Vec3, ray: Vec3) -> f32 {
     let (a, b) = ((corners.0 - origin) / ray, (corners.1 - origin) / ray);
     let (enter, exit) = (a.min(b).max_element(), a.max(b).min_element());

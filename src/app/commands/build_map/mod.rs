@@ -173,7 +173,7 @@ fn build_part(
     Ok(built.counts)
 }
 
-/// Adds to an interruption what is kept.
+/// Replaces an interruption by one that names the finished local maps.
 fn interrupted(
     error: anyhow::Error,
     finished: usize,
