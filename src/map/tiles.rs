@@ -109,7 +109,7 @@ impl TileGrid {
         let row = (y / self.side_m + 0.5).floor() - self.first.1 as f64;
         let inside =
             column >= 0.0 && row >= 0.0 && column < self.columns as f64 && row < self.rows as f64;
-        inside.then_some(TileIndex(row as usize * self.columns + column as usize))
+        inside.then(|| TileIndex(row as usize * self.columns + column as usize))
     }
 
     /// Returns the valid tile of a pose; `None` outside the grid and in tiles that the mapping drive did
