@@ -270,7 +270,10 @@ fn write_constants(config: &SimulationConfig, simulation: &Simulation) -> Result
     let yaml = serde_yaml::to_string(config).context("cannot write the configuration as YAML")?;
     output::write_text(&folder.join("simulation.yml"), &yaml)?;
     output::write_text(&folder.join(EXECUTABLE_FILE), version::executable_hash()?)?;
-    Ok(ply::write(&folder.join("street.ply"), &simulation.street_in_map())?)
+    Ok(ply::write(
+        &folder.join("street.ply"),
+        &simulation.street_in_map(),
+    )?)
 }
 
 /// Writes the scans that are missing; returns the number of those that are not.
