@@ -74,7 +74,12 @@ pub struct Frame {
 impl Frame {
     /// Reads the scan and deskews it by the motion, if that is known.
     pub fn read(&self) -> Result<Scan, RecordingError> {
-        let mut scan = velodyne::read_scan(&self.scan_path)?;
+        self.parse(&velodyne::read_bytes(&self.scan_path)?)
+    }
+
+    /// Reads the scan from the content of its file, as [`read`](Self::read) does.
+    pub fn parse(&self, bytes: &[u8]) -> Result<Scan, RecordingError> {
+        let mut scan = velodyne::parse_scan(&self.scan_path, bytes)?;
         if let Some(sweep) = &self.sweep {
             sweep.deskew(&mut scan.points);
         }

@@ -14,7 +14,8 @@ pub fn read_scan(path: &Path) -> Result<Scan, RecordingError> {
     parse_scan(path, &read_bytes(path)?)
 }
 
-fn parse_scan(path: &Path, bytes: &[u8]) -> Result<Scan, RecordingError> {
+/// Reads the content of a scan's file; `path` is for errors.
+pub fn parse_scan(path: &Path, bytes: &[u8]) -> Result<Scan, RecordingError> {
     let (points, intensities) = records::<16>(path, bytes)?
         .iter()
         .map(|record| {
@@ -59,7 +60,7 @@ pub fn write_labels(mut writer: impl Write, classes: &[u16]) -> io::Result<()> {
     writer.write_all(&bytes)
 }
 
-fn read_bytes(path: &Path) -> Result<Vec<u8>, RecordingError> {
+pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, RecordingError> {
     fs::read(path).map_err(RecordingError::read(path))
 }
 

@@ -5,16 +5,17 @@ mod parts;
 mod pictures;
 mod report;
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 use anyhow::Result;
 
 use self::clock::StageClock;
-use self::parts::Parts;
+use self::parts::{Parts, hash_of_scans, joint_hash, read_scan_file};
 pub use self::report::BuildReport;
 use super::interrupt::Interrupted;
 use super::{Context, input, output, version};
@@ -134,8 +135,8 @@ fn build_parts(
     let plan = builder.plan(poses)?;
     let mut all = Vec::with_capacity(plan.local_maps.len());
     for local_map in &plan.local_maps {
-        let scans_hash = parts::hash_of_scans(&frames[local_map.used.clone()])?;
-        let counts = match parts.finished(local_map.number, &scans_hash) {
+        let used = &frames[local_map.used.clone()];
+        let counts = match parts.finished(local_map.number, || hash_of_scans(used)) {
             Some(counts) => {
                 let (number, count) = (local_map.number + 1, plan.local_maps.len());
                 tracing::info!("local map {number} of {count} is finished already");
@@ -143,7 +144,7 @@ fn build_parts(
                 counts
             }
             None => {
-                let built = build_part(&plan, local_map, frames, parts, &scans_hash);
+                let built = build_part(&plan, local_map, frames, parts);
                 clock.end();
                 built.map_err(|error| interrupted(error, all.len(), &plan, parts))?
             }
@@ -159,9 +160,21 @@ fn build_part(
     local_map: &LocalMapPlan,
     frames: &[Frame],
     parts: &Parts,
-    scans_hash: &str,
 ) -> Result<LocalMapCounts> {
-    let built = plan.build_local_map(local_map, &|key| Ok(frames[key].read()?))?;
+    // The hashes of the very bytes that are meshed.
+    let hashes = Mutex::new(BTreeMap::new());
+    let read = |key: usize| {
+        let frame: &Frame = &frames[key];
+        let bytes = read_scan_file(frame)?;
+        let hash = blake3::hash(&bytes);
+        hashes
+            .lock()
+            .unwrap_or_else(|e| e.into_inner())
+            .insert(key, hash);
+        Ok(frame.parse(&bytes)?)
+    };
+    let built = plan.build_local_map(local_map, &read)?;
+    let hashes = hashes.into_inner().unwrap_or_else(|e| e.into_inner());
     if built.counts.is_empty {
         tracing::warn!(
             "frames {} to {} have too few points to mesh: the map has a hole there",
@@ -169,7 +182,7 @@ fn build_part(
             frames[local_map.own.end - 1].number
         );
     }
-    parts.save(local_map.number, &built, scans_hash)?;
+    parts.save(local_map.number, &built, &joint_hash(hashes.into_values()))?;
     Ok(built.counts)
 }
 

@@ -5,10 +5,11 @@
 //! deleted. A part is finished once its counts exist, which are written last.
 
 use std::fs;
-use std::io::ErrorKind;
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
+use blake3::Hash;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -56,11 +57,17 @@ impl Parts {
     }
 
     /// The counts of a local map if it is finished, with its mesh, and made of these scans.
-    pub fn finished(&self, number: usize, scans_hash: &str) -> Option<LocalMapCounts> {
+    pub fn finished(
+        &self,
+        number: usize,
+        scans_hash: impl FnOnce() -> io::Result<String>,
+    ) -> Option<LocalMapCounts> {
         let text = fs::read_to_string(self.counts_file(number)).ok()?;
         let part: Part = serde_json::from_str(&text).ok()?;
         let is_whole = part.counts.triangles == 0 || self.mesh_file(number).exists();
-        (is_whole && part.scans_hash == scans_hash).then_some(part.counts)
+        // A scan that cannot be read is reported by the build.
+        let is_same = || scans_hash().is_ok_and(|hash| hash == part.scans_hash);
+        (is_whole && is_same()).then_some(part.counts)
     }
 
     /// Keeps a finished local map.
@@ -117,18 +124,29 @@ impl Parts {
 }
 
 /// BLAKE3 hash of the files of scans, in order.
-pub fn hash_of_scans(frames: &[Frame]) -> Result<String> {
-    let hash = |frame: &Frame| {
-        let path = &frame.scan_path;
-        let bytes = fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-        Ok(blake3::hash(&bytes))
-    };
-    let hashes: Vec<blake3::Hash> = frames.par_iter().map(hash).collect::<Result<_>>()?;
+pub fn hash_of_scans(frames: &[Frame]) -> io::Result<String> {
+    let hash = |frame: &Frame| Ok(blake3::hash(&read_scan_file(frame)?));
+    let hashes: Vec<Hash> = frames.par_iter().map(hash).collect::<io::Result<_>>()?;
+    Ok(joint_hash(hashes))
+}
+
+/// Hash of the hashes of scans, in order.
+pub fn joint_hash(hashes: impl IntoIterator<Item = Hash>) -> String {
     let mut joint = blake3::Hasher::new();
     for hash in hashes {
         joint.update(hash.as_bytes());
     }
-    Ok(joint.finalize().to_hex().to_string())
+    joint.finalize().to_hex().to_string()
+}
+
+/// Reads the file of a scan; an error names it.
+pub fn read_scan_file(frame: &Frame) -> io::Result<Vec<u8>> {
+    let path = &frame.scan_path;
+    let named = |error: io::Error| {
+        let message = format!("cannot read {}: {error}", path.display());
+        io::Error::new(error.kind(), message)
+    };
+    fs::read(path).map_err(named)
 }
 
 #[cfg(test)]
@@ -162,9 +180,9 @@ mod tests {
         parts.save(0, &local_map(0.5), "0123").unwrap();
 
         let again = Parts::open(&map, "inputs").unwrap();
-        assert_eq!(again.finished(1, "0123").unwrap().scans, 7);
-        assert_eq!(again.finished(1, "4567"), None);
-        assert_eq!(again.finished(2, "0123"), None);
+        assert_eq!(again.finished(1, || Ok("0123".into())).unwrap().scans, 7);
+        assert_eq!(again.finished(1, || Ok("4567".into())), None);
+        assert_eq!(again.finished(2, || Ok("0123".into())), None);
         let whole = again.join(2).unwrap();
         assert_eq!(whole.vertices[0].x, 0.5);
         assert_eq!(whole.vertices[3].x, 1.5);
@@ -177,7 +195,9 @@ mod tests {
         let parts = Parts::open(&map, "inputs").unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
         assert_eq!(
-            Parts::open(&map, "others").unwrap().finished(0, "0123"),
+            Parts::open(&map, "others")
+                .unwrap()
+                .finished(0, || Ok("0123".into())),
             None
         );
     }
@@ -189,7 +209,7 @@ mod tests {
         let parts = Parts::open(&map, "inputs").unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
         fs::remove_file(parts.counts_file(0)).unwrap();
-        assert_eq!(parts.finished(0, "0123"), None);
+        assert_eq!(parts.finished(0, || Ok("0123".into())), None);
     }
 
     #[test]
@@ -198,7 +218,7 @@ mod tests {
         let parts = Parts::open(&folder.path().join("map.ply"), "inputs").unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
         fs::remove_file(parts.mesh_file(0)).unwrap();
-        assert_eq!(parts.finished(0, "0123"), None);
+        assert_eq!(parts.finished(0, || Ok("0123".into())), None);
     }
 
     #[test]
@@ -207,7 +227,7 @@ mod tests {
         let parts = Parts::open(&folder.path().join("map.ply"), "inputs").unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
         parts.save(0, &LocalMap::default(), "").unwrap();
-        assert!(parts.finished(0, "").is_some());
+        assert!(parts.finished(0, || Ok("".into())).is_some());
         assert!(parts.join(1).unwrap().triangles.is_empty());
     }
 }
