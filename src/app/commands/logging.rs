@@ -9,7 +9,8 @@ use anyhow::Context as _;
 use tracing::level_filters::LevelFilter;
 use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
-use tracing_subscriber::{EnvFilter, Layer as _, fmt};
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::{Layer as _, fmt};
 
 use super::progress::Progress;
 use crate::app::cli::Verbosity;
@@ -47,10 +48,10 @@ pub(super) fn start(verbosity: Verbosity, progress: &Progress, log: &RunLog) {
 }
 
 /// Only errors of libraries: graphics libraries log much that is irrelevant here.
-fn filter(level: LevelFilter) -> EnvFilter {
-    EnvFilter::builder()
-        .with_default_directive(LevelFilter::ERROR.into())
-        .parse_lossy(format!("error,fpmcl={level}"))
+fn filter(level: LevelFilter) -> Targets {
+    Targets::new()
+        .with_default(LevelFilter::ERROR)
+        .with_target("fpmcl", level)
 }
 
 /// Standard error; progress bars are hidden while it is written to.
