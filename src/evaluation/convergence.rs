@@ -4,30 +4,25 @@
 //! errors are within the limits. It is a strict success if all later frames are, too.
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::planar::PlanarError;
 
 /// Limits of the errors after convergence.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: half a metre and two degrees, held for ten frames: a second of a 10 Hz sensor.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct StrictSuccess {
     /// Largest position error [m].
+    #[default(0.5)]
     pub position_m: f64,
     /// Largest heading error [rad].
+    #[default(2.0_f64.to_radians())]
     pub heading_rad: f64,
     /// Number of consecutive frames within the limits that count as convergence.
+    #[default(10)]
     pub hold_frames: usize,
-}
-
-impl Default for StrictSuccess {
-    /// Half a metre and two degrees, held for ten frames: a second of a 10 Hz sensor.
-    fn default() -> Self {
-        Self {
-            position_m: 0.5,
-            heading_rad: 2.0_f64.to_radians(),
-            hold_frames: 10,
-        }
-    }
 }
 
 /// Convergence of a run.

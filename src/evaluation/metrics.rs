@@ -4,6 +4,7 @@
 //! convergence. Trajectories are not aligned.
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::convergence::{Convergence, StrictSuccess};
 use super::planar::{PlanarError, distances_m, planar_errors};
@@ -13,26 +14,19 @@ use super::statistics::{Summary, mean, rms, slope};
 use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
 
 /// Parameters of the metrics.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: ten frames to converge; relative errors from frame to frame.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct MetricsConfig {
     /// Number of frames at the beginning that are excluded.
+    #[default(10)]
     pub skip_frames: usize,
     /// Limits of the errors after convergence.
     pub success: StrictSuccess,
     /// Pairs of poses that the relative pose error compares.
+    #[default(Pairs::Frames(1))]
     pub rpe_pairs: Pairs,
-}
-
-impl Default for MetricsConfig {
-    /// Ten frames to converge; relative errors from frame to frame.
-    fn default() -> Self {
-        Self {
-            skip_frames: 10,
-            success: StrictSuccess::default(),
-            rpe_pairs: Pairs::Frames(1),
-        }
-    }
 }
 
 /// A trajectory with its ground truth, one entry of each per frame.

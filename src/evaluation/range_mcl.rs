@@ -11,6 +11,7 @@
 
 use nalgebra::Vector2;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::planar::{PlanarError, planar_errors};
 use crate::geometry::{Pose2, wrap_angle};
@@ -19,27 +20,21 @@ use crate::geometry::{Pose2, wrap_angle};
 pub type ParticleRow = [f32; 4];
 
 /// Parameters of range-mcl's evaluation.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: the values of range-mcl's `evaluation.yml`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct RangeMclRules {
     /// Interval of the rows whose error decides on success, and number of rows before the first
     /// (frames).
+    #[default(100)]
     pub convergence_interval: usize,
     /// Position error below which a row is a success [m].
+    #[default(5.0)]
     pub converge_thres: f64,
     /// Share of the stored rows, by descending weight, that the estimate averages (unitless).
+    #[default(0.8)]
     pub particle_select_ratio: f64,
-}
-
-impl Default for RangeMclRules {
-    /// The values of range-mcl's `evaluation.yml`.
-    fn default() -> Self {
-        Self {
-            convergence_interval: 100,
-            converge_thres: 5.0,
-            particle_select_ratio: 0.8,
-        }
-    }
 }
 
 /// Errors of a trajectory by range-mcl's rules.

@@ -11,6 +11,7 @@
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::polar_grid::PolarPosition;
 use super::surface::{BLOCK, MIN_POINTS_PER_TASK, ScanIndex, Shape};
@@ -18,25 +19,17 @@ use super::terrain::{Terrain, TerrainConfig};
 use crate::validation::{InvalidValue, Validate, not_negative, positive};
 
 /// Parameters of the features.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct FeatureConfig {
     /// Minimum distance from a point to the neighbours that its surface is computed from [m].
+    #[default(0.15)]
     pub spacing_m: f32,
     /// Points nearer to the sensor's axis belong to the own car and are not ground [m].
+    #[default(2.0)]
     pub min_distance_m: f32,
     /// Parameters of the elevation map above which the height of a point is measured.
     pub terrain: TerrainConfig,
-}
-
-impl Default for FeatureConfig {
-    fn default() -> Self {
-        Self {
-            spacing_m: 0.15,
-            min_distance_m: 2.0,
-            terrain: TerrainConfig::default(),
-        }
-    }
 }
 
 impl Validate for FeatureConfig {

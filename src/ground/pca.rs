@@ -2,6 +2,7 @@
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::classifier::GroundClassifier;
 use super::features::surface_normals;
@@ -12,23 +13,17 @@ use crate::validation::{InvalidValue, Validate, fraction, require};
 /// of the smallest eigenvalue of the covariance of the whole cloud, and it lies below a fixed
 /// height. After the PCA variant of range-mcl (Chen et al., ICRA 2021), with the eigenvalues in
 /// order.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: the values of range-mcl, for a sensor 1.73 m above the road.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct PcaGround {
     /// Minimum |cosine| between the normal of a point and that of the cloud, unitless.
+    #[default(0.8)]
     pub min_cosine: f32,
     /// Maximum height of ground in the lidar frame [m].
+    #[default(-1.1)]
     pub max_height_m: f32,
-}
-
-impl Default for PcaGround {
-    /// The values of range-mcl, for a sensor 1.73 m above the road.
-    fn default() -> Self {
-        Self {
-            min_cosine: 0.8,
-            max_height_m: -1.1,
-        }
-    }
 }
 
 impl Validate for PcaGround {

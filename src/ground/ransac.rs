@@ -8,35 +8,29 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::classifier::GroundClassifier;
 use crate::geometry::{PlaneFit, PlaneSums};
 use crate::validation::{InvalidValue, Validate, in_range, positive, require};
 
 /// Ground by the dominant plane.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: the values of range-mcl.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct RansacGround {
     /// Maximum distance of ground from the plane [m].
+    #[default(0.3)]
     pub distance_threshold: f32,
     /// Points per random sample, at least 3.
+    #[default(3)]
     pub ransac_n: usize,
     /// Number of random samples.
+    #[default(100)]
     pub num_iterations: usize,
     /// Seed of the random samples.
     pub seed: u64,
-}
-
-impl Default for RansacGround {
-    /// The values of range-mcl.
-    fn default() -> Self {
-        Self {
-            distance_threshold: 0.3,
-            ransac_n: 3,
-            num_iterations: 100,
-            seed: 0,
-        }
-    }
 }
 
 impl Validate for RansacGround {

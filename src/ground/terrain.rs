@@ -12,37 +12,32 @@
 
 use glam::{Mat3, Vec3};
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::polar_grid::{PolarGrid, PolarPosition, SECTORS};
 use super::surface::Shape;
 
 /// Limits of the change of ground height between cells.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: tuned on the even-numbered of 21 labelled scans.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct TerrainConfig {
     /// Change of height that is always accepted, such as a kerb [m].
+    #[default(0.15)]
     pub step_m: f32,
     /// Slope relative to the prediction that is accepted in addition, unitless.
+    #[default(0.08)]
     pub max_slope: f32,
     /// Maximum change that is accepted across a gap [m].
+    #[default(0.6)]
     pub max_jump_m: f32,
     /// Radius within which the ground is initialized as a plane [m].
+    #[default(10.0)]
     pub start_radius_m: f32,
     /// Points on steeper surfaces are no candidates for low points of the ground [rad].
+    #[default(0.8)]
     pub max_low_slope_rad: f32,
-}
-
-impl Default for TerrainConfig {
-    /// Tuned on the even-numbered of 21 labelled scans.
-    fn default() -> Self {
-        Self {
-            step_m: 0.15,
-            max_slope: 0.08,
-            max_jump_m: 0.6,
-            start_radius_m: 10.0,
-            max_low_slope_rad: 0.8,
-        }
-    }
 }
 
 /// Distance over which the slope of known ground is averaged [m].

@@ -14,37 +14,32 @@ use std::f32::consts::PI;
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive, require};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 /// Size, field of view and range limits of a range image.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: a Velodyne HDL-64E with the values of range-mcl.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct LidarModel {
     /// Number of rows.
+    #[default(64)]
     pub height: usize,
     /// Number of columns over 360 degrees.
+    #[default(900)]
     pub width: usize,
     /// Upper limit of the vertical field of view, above the horizon [deg].
+    #[default(3.0)]
     pub fov_up: f32,
     /// Lower limit of the vertical field of view, below the horizon whatever its sign [deg].
+    #[default(-25.0)]
     pub fov_down: f32,
     /// Maximum range, exclusive [m].
+    #[default(50.0)]
     pub max_range: f32,
     /// Minimum range, exclusive [m].
+    #[default(2.0)]
     pub min_range: f32,
-}
-
-impl Default for LidarModel {
-    /// A Velodyne HDL-64E with the values of range-mcl.
-    fn default() -> Self {
-        Self {
-            height: 64,
-            width: 900,
-            fov_up: 3.0,
-            fov_down: -25.0,
-            max_range: 50.0,
-            min_range: 2.0,
-        }
-    }
 }
 
 impl Validate for LidarModel {

@@ -16,45 +16,40 @@
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::range_image::RangeImage;
 use crate::geometry::PlaneSums;
 use crate::validation::{InvalidValue, Validate, fraction, not_negative, positive, require};
 
 /// Settings of the normal estimation.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: values for sensors with about 2 cm of noise.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct NormalConfig {
     /// Desired distance between the pixels of a neighborhood near the sensor [m].
+    #[default(0.12)]
     pub spacing_m: f32,
     /// Inlier distance to the plane at range 0 [m].
+    #[default(0.05)]
     pub tolerance_m: f32,
     /// Increase of the inlier distance per meter of range (unitless).
+    #[default(0.001)]
     pub relative_tolerance: f32,
     /// Inlier distance along the beam [m]; the stricter limit at grazing incidence.
+    #[default(1.0)]
     pub beam_tolerance_m: f32,
     /// Minimum number of inliers, without the pixel itself.
+    #[default(5)]
     pub min_support: usize,
     /// Minimum share of inliers among the neighbors, 0 to 1 (unitless).
+    #[default(0.35)]
     pub min_share: f32,
     /// Minimum cosine between normal and beam (unitless): a plane at a more grazing incidence is the
     /// gap between two surfaces.
+    #[default(0.02)]
     pub min_incidence: f32,
-}
-
-impl Default for NormalConfig {
-    /// Values for sensors with about 2 cm of noise.
-    fn default() -> Self {
-        Self {
-            spacing_m: 0.12,
-            tolerance_m: 0.05,
-            relative_tolerance: 0.001,
-            beam_tolerance_m: 1.0,
-            min_support: 5,
-            min_share: 0.35,
-            min_incidence: 0.02,
-        }
-    }
 }
 
 impl Validate for NormalConfig {

@@ -10,27 +10,37 @@ use super::tempering::TemperingConfig;
 use super::tracking_loss::TrackingLossConfig;
 use crate::map::PanoramaConfig;
 use crate::validation::{InvalidValue, Validate, at_least_one, nested, not_negative};
+use smart_default::SmartDefault;
 
 /// Configuration of the localizer.
-#[derive(Clone, Debug, PartialEq)]
+///
+/// Defaults: numbers of particles and motion threshold of range-mcl.
+#[derive(Clone, Debug, PartialEq, SmartDefault)]
 pub struct LocalizerConfig {
     /// The sensor and the preparation of its scans.
     pub sensor: SensorConfig,
     /// Largest number of particles while searching.
+    #[default(10_000)]
     pub num_particles: usize,
     /// Number of particles while tracking.
+    #[default(100)]
     pub num_reduced: usize,
     /// Motion after which the weights are updated [m].
+    #[default(0.2)]
     pub move_thres_m: f64,
     /// Turn after which the weights are updated [rad].
+    #[default(0.05)]
     pub turn_thres_rad: f64,
     /// Noise of odometry increments, per update.
     pub motion: OdometryNoise,
     /// Noise of velocity commands.
     pub velocity: VelocityNoise,
     /// Noise of the constant-velocity prediction without odometry.
+    #[default(OdometryNoise { turn_rad: 0.02, drive_m: 0.2, side_m: 0.03, })]
     pub constant_velocity: OdometryNoise,
-    /// Noise of the prediction without odometry while the velocity is unknown.
+    /// Noise of the prediction without odometry while the velocity is unknown: up to 100 km/h at ten
+    /// frames a second within two standard deviations.
+    #[default(OdometryNoise { turn_rad: 0.03, drive_m: 1.4, side_m: 0.05, })]
     pub unknown_velocity: OdometryNoise,
     /// Observation model.
     pub observation: ObservationConfig,
@@ -48,40 +58,6 @@ pub struct LocalizerConfig {
     pub tracking_loss: TrackingLossConfig,
     /// Search for a start without a pose, and after a loss.
     pub panorama: PanoramaConfig,
-}
-
-impl Default for LocalizerConfig {
-    /// Numbers of particles and motion threshold of range-mcl.
-    fn default() -> Self {
-        Self {
-            sensor: SensorConfig::default(),
-            num_particles: 10_000,
-            num_reduced: 100,
-            move_thres_m: 0.2,
-            turn_thres_rad: 0.05,
-            motion: OdometryNoise::default(),
-            velocity: VelocityNoise::default(),
-            constant_velocity: OdometryNoise {
-                turn_rad: 0.02,
-                drive_m: 0.2,
-                side_m: 0.03,
-            },
-            // Up to 100 km/h at ten frames a second within two standard deviations.
-            unknown_velocity: OdometryNoise {
-                turn_rad: 0.03,
-                drive_m: 1.4,
-                side_m: 0.05,
-            },
-            observation: ObservationConfig::default(),
-            tempering: TemperingConfig::default(),
-            proposal: ProposalConfig::default(),
-            resampling: ResamplingConfig::default(),
-            kld: KldConfig::default(),
-            convergence: ConvergenceConfig::default(),
-            tracking_loss: TrackingLossConfig::default(),
-            panorama: PanoramaConfig::default(),
-        }
-    }
 }
 
 impl Validate for LocalizerConfig {

@@ -10,35 +10,30 @@
 use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::particles::{ParticleSet, spread};
 use crate::map::TileGrid;
 use crate::validation::{InvalidValue, Validate, positive_or_infinite};
 
 /// Thresholds of convergence.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: two tiles, as range-mcl; half a metre and five degrees.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct ConvergenceConfig {
     /// Number of occupied valid tiles below which the particles have converged; `converge_thres` of
     /// `localization.yml`.
     #[serde(skip)]
+    #[default(2)]
     pub converge_thres: usize,
     /// Standard deviation of the position below which they have converged [m]; infinite for range-mcl's
     /// condition alone.
+    #[default(0.5)]
     pub max_spread_m: f64,
     /// Standard deviation of the heading below which they have converged [rad].
+    #[default(5.0_f64.to_radians())]
     pub max_spread_rad: f64,
-}
-
-impl Default for ConvergenceConfig {
-    /// Two tiles, as range-mcl; half a metre and five degrees.
-    fn default() -> Self {
-        Self {
-            converge_thres: 2,
-            max_spread_m: 0.5,
-            max_spread_rad: 5.0_f64.to_radians(),
-        }
-    }
 }
 
 impl Validate for ConvergenceConfig {

@@ -13,6 +13,7 @@ use nalgebra::{Point2, Vector2};
 use rand::{Rng, RngExt as _};
 use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::particles::Particle;
 use super::resampling::systematic;
@@ -32,26 +33,20 @@ pub enum StartDistribution {
 }
 
 /// Spread of the particles around a given pose.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: the values of range-mcl: uniform, ±5 m, ±30 degrees.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct StartSpread {
     /// Distribution of each coordinate.
+    #[default(StartDistribution::Uniform)]
     pub distribution: StartDistribution,
     /// Bound of x and y [m].
+    #[default(5.0)]
     pub position_m: f64,
     /// Bound of the heading [rad].
+    #[default(30.0_f64.to_radians())]
     pub heading_rad: f64,
-}
-
-impl Default for StartSpread {
-    /// The values of range-mcl: uniform, ±5 m, ±30 degrees.
-    fn default() -> Self {
-        Self {
-            distribution: StartDistribution::Uniform,
-            position_m: 5.0,
-            heading_rad: 30.0_f64.to_radians(),
-        }
-    }
 }
 
 impl Validate for StartSpread {

@@ -26,31 +26,26 @@ use nalgebra::{Matrix3, Matrix3x4, Matrix4, Vector2, Vector3, Vector4};
 use rand::{Rng, RngExt as _};
 use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use crate::geometry::Pose2;
 use crate::validation::{InvalidValue, Validate, not_negative};
 
 /// Standard deviations of the odometry noise, per increment.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: the values of range-mcl, and twice the lateral error of a good odometry, 1 cm.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct OdometryNoise {
     /// Standard deviation of each of the two turns [rad].
+    #[default(0.01)]
     pub turn_rad: f64,
     /// Standard deviation of the distance driven [m].
+    #[default(0.05)]
     pub drive_m: f64,
     /// Standard deviation of the lateral motion, from slip and visual odometry [m].
+    #[default(0.02)]
     pub side_m: f64,
-}
-
-impl Default for OdometryNoise {
-    /// The values of range-mcl, and twice the lateral error of a good odometry, 1 cm.
-    fn default() -> Self {
-        Self {
-            turn_rad: 0.01,
-            drive_m: 0.05,
-            side_m: 0.02,
-        }
-    }
 }
 
 impl Validate for OdometryNoise {
@@ -116,31 +111,25 @@ impl TurnDriveTurn {
 }
 
 /// Standard deviations of the velocities, constant over a command.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: at ten commands per second, the forward and heading noise of [`OdometryNoise`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct VelocityNoise {
     /// Standard deviation of the forward speed [m/s].
+    #[default(0.5)]
     pub speed_m_per_s: f64,
     /// Standard deviation of the lateral speed [m/s]: slip, and the mounting angle of the sensor, which
     /// causes 0.3 m/s per degree at 60 km/h.
+    #[default(0.3)]
     pub side_speed_m_per_s: f64,
     /// Standard deviation of the turn rate [rad/s].
+    #[default(0.1)]
     pub turn_rate_rad_per_s: f64,
     /// Standard deviation of the rate of a final turn in place, without which the poses would lie on a
     /// surface (γ̂ of table 5.3) [rad/s].
+    #[default(0.1)]
     pub final_turn_rate_rad_per_s: f64,
-}
-
-impl Default for VelocityNoise {
-    /// At ten commands per second, the forward and heading noise of [`OdometryNoise`].
-    fn default() -> Self {
-        Self {
-            speed_m_per_s: 0.5,
-            side_speed_m_per_s: 0.3,
-            turn_rate_rad_per_s: 0.1,
-            final_turn_rate_rad_per_s: 0.1,
-        }
-    }
 }
 
 impl Validate for VelocityNoise {

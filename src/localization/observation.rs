@@ -12,6 +12,7 @@
 
 use rand::{Rng, RngExt as _};
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::particles::Particle;
 use crate::geometry::{Pose3, Rigid3f, Vec3};
@@ -33,47 +34,41 @@ pub enum Likelihood {
 }
 
 /// Selection of beams and cost of differences.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: robust; see [`reference`](Self::reference) for the published values.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct ObservationConfig {
     /// Form of the likelihood.
+    #[default(Likelihood::Robust)]
     pub likelihood: Likelihood,
     /// Standard deviation σ of the reference likelihood [m].
+    #[default(2.0)]
     pub reference_sigma_m: f64,
     /// Scale s of the robust likelihood: a mean cost that is larger by s is e times less likely [m].
+    #[default(0.002)]
     pub scale_m: f64,
     /// Limit of the cost of a return in front of the map [m].
+    #[default(0.5)]
     pub short_m: f32,
     /// Limit of the cost of a return behind a surface of the map [m].
+    #[default(0.5)]
     pub long_m: f32,
     /// Limit of the cost of a return where the map has no surface [m].
+    #[default(0.5)]
     pub no_surface_m: f32,
     /// Beams per particle, at most.
+    #[default(3600)]
     pub beams: usize,
     /// Beams per particle, at least.
+    #[default(300)]
     pub min_beams: usize,
     /// Rays per update over all particles, which limits the beams per particle.
+    #[default(1_000_000)]
     pub ray_budget: usize,
     /// Largest share of beams that end on the road, which looks alike everywhere (unitless).
+    #[default(0.2)]
     pub road_share: f64,
-}
-
-impl Default for ObservationConfig {
-    /// Robust; see [`reference`](Self::reference) for the published values.
-    fn default() -> Self {
-        Self {
-            likelihood: Likelihood::Robust,
-            reference_sigma_m: 2.0,
-            scale_m: 0.002,
-            short_m: 0.5,
-            long_m: 0.5,
-            no_surface_m: 0.5,
-            beams: 3600,
-            min_beams: 300,
-            ray_budget: 1_000_000,
-            road_share: 0.2,
-        }
-    }
 }
 
 impl Validate for ObservationConfig {

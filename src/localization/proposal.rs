@@ -20,6 +20,7 @@ use nalgebra::{Cholesky, Const, Matrix3, Vector3};
 use rand::{Rng, RngExt as _};
 use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::particles::deviation;
 use crate::geometry::{Pose2, wrap_angle};
@@ -29,44 +30,34 @@ use crate::validation::{
 };
 
 /// Proposal distribution while tracking.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: values of this project.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct ProposalConfig {
     /// Whether the scan is part of the proposal; otherwise the prediction alone is, as in range-mcl.
+    #[default(true)]
     pub scan: bool,
     /// Number of beams that are registered.
+    #[default(2400)]
     pub beams: usize,
     /// Largest share of them that end on the road, which determines height, roll and pitch (unitless).
+    #[default(0.4)]
     pub road_share: f64,
     /// Number of beams that weight the particles.
+    #[default(300)]
     pub weighed_beams: usize,
-    /// Registration of the scan with the map.
+    /// Registration of the scan with the map. Sampling and weighting add variance, which covers the
+    /// rest of the map error: with a larger `map_error_m` the covariances of simulated drives are too large.
+    #[default(RegistrationConfig { map_error_m: 0.001, ..RegistrationConfig::default() })]
     pub registration: RegistrationConfig,
     /// Factor k of the standard deviations of the proposal, at least 1, so that its tails are heavier than
     /// those of the target (unitless).
+    #[default(1.5)]
     pub widening: f64,
     /// Distance from the prior beyond which a registration is rejected (standard deviations).
+    #[default(6.0)]
     pub max_sigmas: f64,
-}
-
-impl Default for ProposalConfig {
-    /// Values of this project.
-    fn default() -> Self {
-        Self {
-            scan: true,
-            beams: 2400,
-            road_share: 0.4,
-            weighed_beams: 300,
-            // Sampling and weighting add variance, which covers the rest of the map error: with a larger
-            // value the covariances of simulated drives are too large.
-            registration: RegistrationConfig {
-                map_error_m: 0.001,
-                ..RegistrationConfig::default()
-            },
-            widening: 1.5,
-            max_sigmas: 6.0,
-        }
-    }
 }
 
 impl Validate for ProposalConfig {

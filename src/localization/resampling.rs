@@ -17,36 +17,31 @@ use nalgebra::{Matrix3, Vector3};
 use rand::{Rng, RngExt as _};
 use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::particles::{ParticleSet, spread};
 use crate::geometry::{Pose2, wrap_angle};
 use crate::validation::{InvalidValue, Validate, fraction, not_negative, positive};
 
 /// Threshold of resampling, and jitter of the copies of a particle.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: range-mcl's 0.75; half the optimal kernel, since the distribution is narrower than the Gaussian
+/// with its covariance.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct ResamplingConfig {
     /// Share of the particles below which the effective sample size triggers resampling (unitless).
+    #[default(0.75)]
     pub min_effective_fraction: f64,
     /// Jitter as a multiple of the kernel width h (unitless); 0 for none, as in range-mcl.
+    #[default(0.5)]
     pub jitter: f64,
     /// Largest standard deviation of the jitter in position, however wide the distribution [m].
+    #[default(0.3)]
     pub max_jitter_m: f64,
     /// Largest standard deviation of the jitter in heading [rad].
+    #[default(0.05)]
     pub max_jitter_rad: f64,
-}
-
-impl Default for ResamplingConfig {
-    /// range-mcl's 0.75; half the optimal kernel, since the distribution is narrower than the Gaussian
-    /// with its covariance.
-    fn default() -> Self {
-        Self {
-            min_effective_fraction: 0.75,
-            jitter: 0.5,
-            max_jitter_m: 0.3,
-            max_jitter_rad: 0.05,
-        }
-    }
 }
 
 impl Validate for ResamplingConfig {
@@ -59,29 +54,23 @@ impl Validate for ResamplingConfig {
 }
 
 /// KLD sampling: the number of particles of a wide distribution.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: ε and z of Fox (2003), section 4: 0.05 with probability 0.99; bins of 0.5 m and 10 degrees.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct KldConfig {
     /// Bound on the Kullback-Leibler distance between particles and distribution, ε (unitless).
+    #[default(0.05)]
     pub max_distance: f64,
     /// Quantile of the standard normal distribution for the probability of the bound, z (unitless).
+    #[default(2.33)]
     pub quantile: f64,
     /// Side of a bin in x and y [m].
+    #[default(0.5)]
     pub bin_m: f64,
     /// Width of a bin in heading [rad].
+    #[default(10.0_f64.to_radians())]
     pub bin_rad: f64,
-}
-
-impl Default for KldConfig {
-    /// ε and z of Fox (2003), section 4: 0.05 with probability 0.99; bins of 0.5 m and 10 degrees.
-    fn default() -> Self {
-        Self {
-            max_distance: 0.05,
-            quantile: 2.33,
-            bin_m: 0.5,
-            bin_rad: 10.0_f64.to_radians(),
-        }
-    }
 }
 
 impl Validate for KldConfig {

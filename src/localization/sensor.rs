@@ -4,30 +4,22 @@ use crate::ground::{GroundClassifier, GroundConfig, road_plane};
 use crate::lidar::{LidarModel, RangeImage, Scan};
 use crate::map::SensorAttitude;
 use crate::validation::InvalidValue;
+use smart_default::SmartDefault;
 
 /// The sensor and the preparation of its scans.
-#[derive(Clone, Debug, PartialEq)]
+///
+/// Defaults: KITTI's.
+#[derive(Clone, Debug, PartialEq, SmartDefault)]
 pub struct SensorConfig {
     /// Projection and range limits.
     pub lidar: LidarModel,
     /// Rectangle of the own car in the lidar frame, whose points are dropped: x_min, x_max, y_min, y_max [m].
+    #[default(crate::map::scan_cloud::ScanConfig::default().own_car_m)]
     pub own_car_m: [f32; 4],
     /// Ground segmentation of the scans.
     pub ground: GroundConfig,
     /// Height of the sensor above the ground [m]; `None` measures it in the scans.
     pub height_m: Option<f64>,
-}
-
-impl Default for SensorConfig {
-    /// KITTI's.
-    fn default() -> Self {
-        Self {
-            lidar: LidarModel::default(),
-            own_car_m: crate::map::scan_cloud::ScanConfig::default().own_car_m,
-            ground: GroundConfig::default(),
-            height_m: None,
-        }
-    }
 }
 
 impl SensorConfig {

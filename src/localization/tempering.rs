@@ -13,31 +13,26 @@
 //! several rounds of it in a frame.
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use crate::validation::{InvalidValue, Validate, at_least_one, fraction};
 
 /// Tempering of the likelihood within a frame.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: values of this project.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct TemperingConfig {
     /// Smallest share of effective particles that a frame may leave (unitless); 0 uses the likelihood
     /// unchanged, as range-mcl does.
+    #[default(0.2)]
     pub min_effective_fraction: f64,
     /// Rounds of reweighting and resampling per frame while searching.
+    #[default(4)]
     pub searching_rounds: usize,
     /// Rounds of reweighting and resampling per frame while tracking.
+    #[default(1)]
     pub tracking_rounds: usize,
-}
-
-impl Default for TemperingConfig {
-    /// Values of this project.
-    fn default() -> Self {
-        Self {
-            min_effective_fraction: 0.2,
-            searching_rounds: 4,
-            tracking_rounds: 1,
-        }
-    }
 }
 
 impl Validate for TemperingConfig {

@@ -13,6 +13,7 @@
 //! end in front of the map are not counted.
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use crate::validation::{InvalidValue, Validate, at_least_one, fraction, positive, require};
 
@@ -40,38 +41,32 @@ impl State {
 }
 
 /// Thresholds of the detection.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: values of this project.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrackingLossConfig {
     /// Largest difference of an agreeing beam [m].
+    #[default(0.3)]
     pub tolerance_m: f32,
     /// Weight of a new frame in the fast average, α_fast.
+    #[default(0.4)]
     pub fast_rate: f64,
     /// Weight of a new frame in the slow average, α_slow.
+    #[default(0.02)]
     pub slow_rate: f64,
     /// Tracking is lost below this share of agreeing beams (unitless).
+    #[default(0.5)]
     pub min_agreement: f64,
     /// Tracking is lost below this fraction of the slow average (unitless).
+    #[default(0.75)]
     pub lost_fraction: f64,
     /// Updates without convergence after which the search restarts.
+    #[default(25)]
     pub patience: usize,
     /// Tracking is lost where the distribution is wider than this, as outside the map: √(σ_x² + σ_y²) [m].
+    #[default(2.0)]
     pub max_spread_m: f64,
-}
-
-impl Default for TrackingLossConfig {
-    /// Values of this project.
-    fn default() -> Self {
-        Self {
-            tolerance_m: 0.3,
-            fast_rate: 0.4,
-            slow_rate: 0.02,
-            min_agreement: 0.5,
-            lost_fraction: 0.75,
-            patience: 25,
-            max_spread_m: 2.0,
-        }
-    }
 }
 
 impl Validate for TrackingLossConfig {

@@ -1,6 +1,7 @@
 //! Configuration of a map build.
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::local_map::LocalMapConfig;
 use super::tiles::TileConfig;
@@ -9,31 +10,23 @@ use crate::rendering::Backend;
 use crate::validation::{InvalidValue, Validate, at_least_one, not_negative};
 
 /// Everything that can be configured about building a map.
-#[derive(Clone, Debug, PartialEq)]
+///
+/// Defaults: the values of range-mcl where it has them.
+#[derive(Clone, Debug, PartialEq, SmartDefault)]
 pub struct MapConfig {
     /// Distance from the previous key scan after which a scan is a key scan [m].
+    #[default(0.2)]
     pub displacement_threshold_m: f64,
     /// Key scans per local map.
+    #[default(100)]
     pub local_map_size: usize,
     /// Length of path of the neighbours with which a local map is meshed [m].
+    #[default(5.0)]
     pub overlap_m: f64,
     /// Ground segmentation of the scans.
     pub ground: GroundConfig,
     /// From the scans of a local map to its mesh.
     pub local_map: LocalMapConfig,
-}
-
-impl Default for MapConfig {
-    /// The values of range-mcl where it has them.
-    fn default() -> Self {
-        Self {
-            displacement_threshold_m: 0.2,
-            local_map_size: 100,
-            overlap_m: 5.0,
-            ground: GroundConfig::default(),
-            local_map: LocalMapConfig::default(),
-        }
-    }
 }
 
 impl Validate for MapConfig {

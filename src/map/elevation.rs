@@ -17,6 +17,7 @@ use glam::Vec3;
 use nalgebra::{
     Matrix3, Point2, Point3, Rotation3, Translation3, UnitQuaternion, Vector2, Vector3,
 };
+use smart_default::SmartDefault;
 
 use super::heights::{HeightReader, Heights, LEVEL_GAP_M};
 use crate::geometry::{Pose2, Pose3, TriangleMesh};
@@ -25,25 +26,17 @@ use crate::geometry::{Pose2, Pose3, TriangleMesh};
 const RADIUS_M: f64 = 2.0;
 
 /// Sensor attitude: height, roll and pitch above the ground.
-#[derive(Clone, Copy, Debug, PartialEq)]
+///
+/// Defaults: KITTI's car on a level road.
+#[derive(Clone, Copy, Debug, PartialEq, SmartDefault)]
 pub struct SensorAttitude {
     /// Height of the sensor above the road, along the normal of the road [m].
+    #[default(1.73)]
     pub height_m: f64,
     /// Rotation about the forward axis [rad].
     pub roll_rad: f64,
     /// Rotation about the left axis; positive looks down [rad].
     pub pitch_rad: f64,
-}
-
-impl Default for SensorAttitude {
-    /// KITTI's car on a level road.
-    fn default() -> Self {
-        Self {
-            height_m: 1.73,
-            roll_rad: 0.0,
-            pitch_rad: 0.0,
-        }
-    }
 }
 
 impl SensorAttitude {

@@ -1,6 +1,7 @@
 //! A local map: the mesh of the scans of a stretch of road.
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::confidence::{self, ConfidenceConfig};
 use super::plan::Ownership;
@@ -19,7 +20,9 @@ use crate::validation::{
 const CELLS_PER_EDGE: f32 = 2.0;
 
 /// Processing of scans into a mesh.
-#[derive(Clone, Debug, PartialEq)]
+///
+/// Defaults: range-mcl's values where it has them.
+#[derive(Clone, Debug, PartialEq, SmartDefault)]
 pub struct LocalMapConfig {
     /// Selection and preparation of points.
     pub scan: ScanConfig,
@@ -28,41 +31,29 @@ pub struct LocalMapConfig {
     /// Surface reconstruction.
     pub poisson: PoissonConfig,
     /// Vertices below this quantile of density are removed (unitless).
+    #[default(0.1)]
     pub min_density: f64,
     /// Surface farther than this from every point is extrapolated and removed [m].
+    #[default(0.25)]
     pub max_distance_m: f32,
     /// Free-space votes.
     pub visibility: VisibilityConfig,
     /// A vertex with at least this ground confidence is ground (unitless).
+    #[default(0.5)]
     pub ground_threshold: f32,
     /// Cell size of the simplification of the ground [m]: no new edge is longer than two cells; 0
     /// disables it.
+    #[default(1.0)]
     pub simplify_resolution_m: f32,
     /// Smoothing iterations of the simplified ground.
+    #[default(1)]
     pub smoothing_iterations: usize,
     /// Colour of confidence 1; lower confidences are interpolated towards `rest_color`.
+    #[default([255, 0, 0])]
     pub ground_color: [u8; 3],
     /// Colour of confidence 0.
+    #[default([0, 0, 255])]
     pub rest_color: [u8; 3],
-}
-
-impl Default for LocalMapConfig {
-    /// range-mcl's values where it has them.
-    fn default() -> Self {
-        Self {
-            scan: ScanConfig::default(),
-            confidence: ConfidenceConfig::default(),
-            poisson: PoissonConfig::default(),
-            min_density: 0.1,
-            max_distance_m: 0.25,
-            visibility: VisibilityConfig::default(),
-            ground_threshold: 0.5,
-            simplify_resolution_m: 1.0,
-            smoothing_iterations: 1,
-            ground_color: [255, 0, 0],
-            rest_color: [0, 0, 255],
-        }
-    }
 }
 
 impl Validate for LocalMapConfig {

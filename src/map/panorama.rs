@@ -19,6 +19,7 @@ use glam::Vec3;
 use nalgebra::Point2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::cells::{Cells, ROAD_HALF_WIDTH_M};
 use super::elevation::{GroundMap, SensorAttitude};
@@ -29,47 +30,41 @@ use crate::rendering::{RangeRenderer, RenderError};
 use crate::validation::{InvalidValue, Validate, fraction, in_range, positive, require};
 
 /// Size of the panoramas and of the search.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: `yaw_sigma` of range-mcl, 2 degrees; the rest is ours.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct PanoramaConfig {
     /// Side of a cell, which has one panorama per level [m]; `grid_res` of `localization.yml`.
     #[serde(skip)]
+    #[default(1.0)]
     pub cell_m: f64,
     /// Rows of a panorama.
+    #[default(6)]
     pub rows: usize,
     /// Columns of a panorama over 360 degrees.
+    #[default(180)]
     pub columns: usize,
     /// Lower edge of the panorama below the horizon: lower beams see only the road [rad].
+    #[default(0.12)]
     pub lowest_rad: f32,
     /// Limit of the range difference of a pixel [m].
+    #[default(2.0)]
     pub limit_m: f32,
     /// The first pass takes every n-th column and heading.
+    #[default(2)]
     pub coarse_step: usize,
     /// Share of the cells in the second pass (unitless).
+    #[default(0.1)]
     pub refined_share: f64,
     /// Increase of the mean cost for which a cell gets e times fewer particles [m].
+    #[default(0.03)]
     pub scale_m: f64,
     /// Standard deviation of the headings around the best heading of a cell [rad]; `yaw_sigma` of
     /// `localization.yml`.
     #[serde(skip)]
+    #[default(2.0_f64.to_radians())]
     pub yaw_sigma_rad: f64,
-}
-
-impl Default for PanoramaConfig {
-    /// `yaw_sigma` of range-mcl, 2 degrees; the rest is ours.
-    fn default() -> Self {
-        Self {
-            cell_m: 1.0,
-            rows: 6,
-            columns: 180,
-            lowest_rad: 0.12,
-            limit_m: 2.0,
-            coarse_step: 2,
-            refined_share: 0.1,
-            scale_m: 0.03,
-            yaw_sigma_rad: 2.0_f64.to_radians(),
-        }
-    }
 }
 
 impl Validate for PanoramaConfig {

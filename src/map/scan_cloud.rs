@@ -3,6 +3,7 @@
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use crate::geometry::{PointCloud, Pose3, Rigid3f};
 use crate::ground::GroundClassifier;
@@ -10,31 +11,23 @@ use crate::lidar::{LidarModel, NormalConfig, RangeImage, Scan, estimate_normals}
 use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 
 /// Selection and preparation of the points of a scan.
-#[derive(Clone, Debug, PartialEq)]
+///
+/// Defaults: range-mcl's, with the outline of KITTI's car.
+#[derive(Clone, Debug, PartialEq, SmartDefault)]
 pub struct ScanConfig {
     /// Projection and range limits.
     pub range_image: LidarModel,
     /// Normal estimation.
     pub normals: NormalConfig,
     /// Edge of the voxels for downsampling, in the lidar frame [m].
+    #[default(0.1)]
     pub voxel_size_m: f32,
     /// Half extent of the crop box around the sensor along x, y and z [m].
+    #[default(Vec3::new(30.0, 30.0, 5.0))]
     pub crop_m: Vec3,
     /// Rectangle of the own car in the lidar frame, whose points are dropped: x_min, x_max, y_min, y_max [m].
+    #[default([-2.5, 2.7, -1.2, 1.2])]
     pub own_car_m: [f32; 4],
-}
-
-impl Default for ScanConfig {
-    /// range-mcl's, with the outline of KITTI's car.
-    fn default() -> Self {
-        Self {
-            range_image: LidarModel::default(),
-            normals: NormalConfig::default(),
-            voxel_size_m: 0.1,
-            crop_m: Vec3::new(30.0, 30.0, 5.0),
-            own_car_m: [-2.5, 2.7, -1.2, 1.2],
-        }
-    }
 }
 
 impl Validate for ScanConfig {

@@ -10,27 +10,22 @@
 
 use nalgebra::Point2;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use crate::geometry::{Pose2, Pose3, TriangleMesh, Vec3};
 
 /// Division of the map into tiles.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: the values of range-mcl.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct TileConfig {
     /// Side of a tile [m].
+    #[default(100.0)]
     pub side_m: f64,
     /// Extent of the map beyond the mapping poses [m].
+    #[default(50.0)]
     pub margin_m: f64,
-}
-
-impl Default for TileConfig {
-    /// The values of range-mcl.
-    fn default() -> Self {
-        Self {
-            side_m: 100.0,
-            margin_m: 50.0,
-        }
-    }
 }
 
 /// Number of a tile in its grid, row-major with x fastest.

@@ -22,6 +22,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::scan_cloud::ScanCloud;
 use crate::geometry::TriangleMesh;
@@ -30,54 +31,48 @@ use crate::raycasting::Scene;
 use crate::validation::{InvalidValue, Validate, at_least_one, not_negative};
 
 /// Parameters of free-space voting.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: measured on a real drive and a simulated one.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct VisibilityConfig {
     /// If false, all points are meshed and no triangle is removed.
+    #[default(true)]
     pub enabled: bool,
     /// Largest number of scans that vote on points, spread over the local map.
+    #[default(24)]
     pub point_voters: usize,
     /// A beam passes through a point if it ends this far behind it [m].
+    #[default(0.5)]
     pub point_margin_m: f32,
     /// Increase of this margin with range (unitless).
+    #[default(0.02)]
     pub point_margin_per_range: f32,
     /// A point is dynamic if at least this many beams pass through it, and more than half as many as
     /// end on it.
+    #[default(2)]
     pub point_votes: u32,
     /// A beam passes through a triangle if it ends this far behind it [m].
+    #[default(0.3)]
     pub triangle_margin_m: f32,
     /// Increase of this margin with range (unitless).
+    #[default(0.01)]
     pub triangle_margin_per_range: f32,
     /// and at least this far from the plane of the triangle [m].
+    #[default(0.05)]
     pub crossing_m: f32,
     /// A beam supports a triangle if it ends this near to its plane [m]
+    #[default(0.1)]
     pub support_m: f32,
     /// and at least this near along the beam [m].
+    #[default(1.0)]
     pub support_range_m: f32,
     /// A triangle is removed if at least this many beams pass through it, and more than support it.
+    #[default(2)]
     pub triangle_votes: u32,
     /// Largest number of beams of a local map that vote on its triangles; of more, every n-th votes.
+    #[default(5_000_000)]
     pub max_beams: usize,
-}
-
-impl Default for VisibilityConfig {
-    /// Measured on a real drive and a simulated one.
-    fn default() -> Self {
-        Self {
-            enabled: true,
-            point_voters: 24,
-            point_margin_m: 0.5,
-            point_margin_per_range: 0.02,
-            point_votes: 2,
-            triangle_margin_m: 0.3,
-            triangle_margin_per_range: 0.01,
-            crossing_m: 0.05,
-            support_m: 0.1,
-            support_range_m: 1.0,
-            triangle_votes: 2,
-            max_beams: 5_000_000,
-        }
-    }
 }
 
 impl Validate for VisibilityConfig {

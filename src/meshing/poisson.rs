@@ -14,6 +14,7 @@ use std::ops::RangeInclusive;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::base_grid;
 use super::density::DensityField;
@@ -29,35 +30,29 @@ use crate::geometry::{PointCloud, TriangleMesh};
 use crate::validation::{InvalidValue, Validate, at_least_one, in_range, not_negative, positive};
 
 /// Settings of the reconstruction.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: `scale` and `samples_per_node` are Open3D's values, `depth` is range-mcl's. α is per area of a
+/// cell face here; in `benches/poisson.rs` 10 is the best compromise of error and coverage.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct PoissonConfig {
     /// Depth of the finest cells, the number of bisections of the cube, 3 to 12; `depth` of
     /// `build_map.yml`.
     #[serde(skip)]
+    #[default(9)]
     pub depth: u32,
     /// Edge of the cube over the longest edge of the points' bounding box, 1.05 to 10 (unitless).
+    #[default(1.1)]
     pub scale: f32,
     /// Screening weight α, 0 or more (unitless).
+    #[default(10.0)]
     pub point_weight: f32,
     /// Desired number of samples per cell face; higher values smooth noise.
+    #[default(1.5)]
     pub samples_per_node: f32,
     /// Conjugate gradient iterations per depth.
+    #[default(8)]
     pub iterations: usize,
-}
-
-impl Default for PoissonConfig {
-    /// `scale` and `samples_per_node` are Open3D's values, `depth` is range-mcl's. α is per area of a
-    /// cell face here; in `benches/poisson.rs` 10 is the best compromise of error and coverage.
-    fn default() -> Self {
-        Self {
-            depth: 9,
-            scale: 1.1,
-            point_weight: 10.0,
-            samples_per_node: 1.5,
-            iterations: 8,
-        }
-    }
 }
 
 impl PoissonConfig {

@@ -4,6 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::calibration::Calibration;
 use super::error::RecordingError;
@@ -17,26 +18,19 @@ use crate::validation::{InvalidValue, Validate, require};
 const SCANS_PER_SECOND: f64 = 10.0;
 
 /// Selected frames of a recording: `start_idx`, `start_idx + frame_step`, ...
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: every frame.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct Selection {
     /// First frame.
     pub start_idx: usize,
     /// Number of consecutive scans to select from; -1 for all.
+    #[default(-1)]
     pub n_scans: i64,
     /// Every n-th of them is selected.
+    #[default(1)]
     pub frame_step: usize,
-}
-
-impl Default for Selection {
-    /// Every frame.
-    fn default() -> Self {
-        Self {
-            start_idx: 0,
-            n_scans: -1,
-            frame_step: 1,
-        }
-    }
 }
 
 impl Validate for Selection {

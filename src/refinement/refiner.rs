@@ -5,6 +5,7 @@
 use nalgebra::Matrix3;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::objective::FrameObjective;
 use super::smoothing::SmoothingConfig;
@@ -33,51 +34,42 @@ pub enum Method {
 }
 
 /// Configuration of the refinement of a frame.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: both steps; the bounds are of this project.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct RefinementConfig {
     /// Steps of the refinement of a frame.
+    #[default(Method::Both)]
     pub method: Method,
     /// The swarm.
     pub swarm: SwarmConfig,
     /// Number of the frame's beams that the swarm compares: it searches the basin, Gauss-Newton the
     /// last centimetres.
+    #[default(300)]
     pub swarm_beams: usize,
     /// Gauss-Newton.
     pub gauss_newton: RegistrationConfig,
     /// The smoothing of the whole trajectory.
     pub smoothing: SmoothingConfig,
     /// Reach of the swarm in standard deviations of the estimate (unitless).
+    #[default(3.0)]
     pub reach_sigmas: f64,
     /// Smallest reach in x and y [m].
+    #[default(0.1)]
     pub min_reach_m: f64,
     /// Smallest reach in heading [rad].
+    #[default(0.01)]
     pub min_reach_rad: f64,
     /// Largest reach in x and y [m].
+    #[default(1.0)]
     pub max_reach_m: f64,
     /// Largest reach in heading [rad].
+    #[default(0.1)]
     pub max_reach_rad: f64,
     /// Increase of the mean cost that makes a pose e times less likely, for covariances [m].
+    #[default(0.001)]
     pub scale_m: f64,
-}
-
-impl Default for RefinementConfig {
-    /// Both steps; the bounds are of this project.
-    fn default() -> Self {
-        Self {
-            method: Method::Both,
-            swarm: SwarmConfig::default(),
-            swarm_beams: 300,
-            gauss_newton: RegistrationConfig::default(),
-            smoothing: SmoothingConfig::default(),
-            reach_sigmas: 3.0,
-            min_reach_m: 0.1,
-            min_reach_rad: 0.01,
-            max_reach_m: 1.0,
-            max_reach_rad: 0.1,
-            scale_m: 0.001,
-        }
-    }
 }
 
 impl Validate for RefinementConfig {

@@ -12,38 +12,33 @@
 
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use crate::geometry::Pose2;
 use crate::localization::particles::deviation;
 use crate::validation::{InvalidValue, Validate, at_least_one, positive};
 
 /// Noise of the odometry and robustness against wrong frames.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: an odometry of KITTI's quality: 2 cm and 0.06 degrees per frame.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct SmoothingConfig {
     /// Standard deviation of the odometry along the car, per frame [m].
+    #[default(0.02)]
     pub odometry_ahead_m: f64,
     /// Standard deviation across the car, per frame [m].
+    #[default(0.01)]
     pub odometry_aside_m: f64,
     /// Standard deviation of the heading, per frame [rad].
+    #[default(0.001)]
     pub odometry_turn_rad: f64,
     /// Scale c of the robust kernel (standard deviations).
+    #[default(3.0)]
     pub robust_sigmas: f64,
     /// Largest number of iterations.
+    #[default(20)]
     pub iterations: usize,
-}
-
-impl Default for SmoothingConfig {
-    /// An odometry of KITTI's quality: 2 cm and 0.06 degrees per frame.
-    fn default() -> Self {
-        Self {
-            odometry_ahead_m: 0.02,
-            odometry_aside_m: 0.01,
-            odometry_turn_rad: 0.001,
-            robust_sigmas: 3.0,
-            iterations: 20,
-        }
-    }
 }
 
 impl Validate for SmoothingConfig {

@@ -13,49 +13,43 @@
 use rand::{Rng, RngExt as _};
 use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use crate::geometry::wrap_angle;
 use crate::validation::{InvalidValue, Validate, at_least_one, not_negative, positive};
 
 /// Parameters of the swarm.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: ω, φ_p, φ_g and the number of iterations of Fuzzy-PSO-MCL, which gives no size and no bounds.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct SwarmConfig {
     /// Number of candidates.
+    #[default(20)]
     pub candidates: usize,
     /// Largest number of iterations.
+    #[default(15)]
     pub iterations: usize,
     /// Inertia ω of the first iteration: share of its velocity that a candidate keeps (unitless).
+    #[default(0.5)]
     pub inertia: f64,
     /// Inertia of the last iteration, linear in between (unitless).
+    #[default(0.5)]
     pub final_inertia: f64,
     /// Cognitive acceleration φ_p, towards the best position of the candidate (unitless).
+    #[default(1.5)]
     pub cognitive: f64,
     /// Social acceleration φ_g, towards the best position of the swarm (unitless).
+    #[default(1.5)]
     pub social: f64,
     /// Largest velocity per iteration, as a share of the reach (unitless).
+    #[default(0.3)]
     pub max_velocity: f64,
     /// Number of consecutive iterations without progress after which the search stops; 0 for no limit.
     pub patience: usize,
     /// Decrease of the best value that counts as progress.
+    #[default(1e-5)]
     pub tolerance: f64,
-}
-
-impl Default for SwarmConfig {
-    /// ω, φ_p, φ_g and the number of iterations of Fuzzy-PSO-MCL, which gives no size and no bounds.
-    fn default() -> Self {
-        Self {
-            candidates: 20,
-            iterations: 15,
-            inertia: 0.5,
-            final_inertia: 0.5,
-            cognitive: 1.5,
-            social: 1.5,
-            max_velocity: 0.3,
-            patience: 0,
-            tolerance: 1e-5,
-        }
-    }
 }
 
 impl Validate for SwarmConfig {

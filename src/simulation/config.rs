@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::centreline::PathSegment;
 use super::ego_motion::MotionConfig;
@@ -13,22 +14,29 @@ use super::traffic::TrafficConfig;
 use crate::validation::{InvalidValue, Validate, nested, positive};
 
 /// A drive along a street: the configuration of `simulate`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: 260 m through a small town, up a slope and over a crest, past a square.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct SimulationConfig {
     /// Folder of the drives: drive n is written to `drive_n` below it.
+    #[default(PathBuf::from("data/street"))]
     pub output_folder: PathBuf,
     /// Seed of the street and of all noise.
+    #[default(1)]
     pub seed: u64,
     /// Number of the drive, from 1. Drives of one seed and path share the street and nothing else.
+    #[default(1)]
     pub drive: u32,
     /// Number of scans from the start of the drive; -1 for all.
+    #[default(-1)]
     pub n_scans: i64,
     /// KITTI poses to drive along, instead of `path`.
     pub path_pose_file: Option<PathBuf>,
     /// Calibration of those poses; null: `calib.txt` beside them.
     pub path_calib_file: Option<PathBuf>,
     /// Segments of the path.
+    #[default(vec![ PathSegment::new(45.0, 0.0, 0.0), PathSegment::new(25.0, 55.0, 0.0), PathSegment::new(35.0, -8.0, 7.0), PathSegment::new(20.0, 0.0, -6.0), PathSegment::new(25.0, -75.0, 0.0), PathSegment::new(60.0, 12.0, 0.0), PathSegment::new(20.0, -60.0, 1.0), PathSegment::new(30.0, 0.0, 1.0), ])]
     pub path: Vec<PathSegment>,
     /// The street and what stands along it.
     pub street: StreetConfig,
@@ -40,35 +48,6 @@ pub struct SimulationConfig {
     pub scanner: ScannerConfig,
     /// The odometry written beside the true poses.
     pub odometry: OdometryConfig,
-}
-
-impl Default for SimulationConfig {
-    /// 260 m through a small town, up a slope and over a crest, past a square.
-    fn default() -> Self {
-        Self {
-            output_folder: PathBuf::from("data/street"),
-            seed: 1,
-            drive: 1,
-            n_scans: -1,
-            path_pose_file: None,
-            path_calib_file: None,
-            path: vec![
-                PathSegment::new(45.0, 0.0, 0.0),
-                PathSegment::new(25.0, 55.0, 0.0),
-                PathSegment::new(35.0, -8.0, 7.0),
-                PathSegment::new(20.0, 0.0, -6.0),
-                PathSegment::new(25.0, -75.0, 0.0),
-                PathSegment::new(60.0, 12.0, 0.0),
-                PathSegment::new(20.0, -60.0, 1.0),
-                PathSegment::new(30.0, 0.0, 1.0),
-            ],
-            street: StreetConfig::default(),
-            motion: MotionConfig::default(),
-            traffic: TrafficConfig::default(),
-            scanner: ScannerConfig::default(),
-            odometry: OdometryConfig::default(),
-        }
-    }
 }
 
 impl SimulationConfig {

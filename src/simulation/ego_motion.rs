@@ -10,6 +10,7 @@ use glam::DVec2;
 use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt as _;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::centreline::Centreline;
 use super::ground::{GroundField, GroundZone};
@@ -27,48 +28,40 @@ const HALF_TRACK_M: f64 = 0.75;
 const LANE_OFFSETS_M: [f64; 5] = [0.0, 0.4, -0.4, 0.25, -0.25];
 
 /// Motion of the vehicle.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: the vehicle of KITTI at a residential speed.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct MotionConfig {
     /// Mean speed on a path of segments; a recorded path has its own [m/s].
+    #[default(8.0)]
     pub speed_m_s: f64,
     /// Offset to the left of the path [m]; null: 0 for drive 1, then +0.4, -0.4, +0.25, -0.25.
     pub lane_offset_m: Option<f64>,
     /// Amplitude of the slow weaving about that offset [m].
+    #[default(0.08)]
     pub weaving_m: f64,
     /// Height of the lidar above the road [m].
+    #[default(1.73)]
     pub sensor_height_m: f64,
     /// Amplitude of the pitch of the suspension [deg].
     #[serde(rename = "nodding_deg")]
+    #[default(0.3)]
     pub pitch_amplitude_deg: f64,
     /// Amplitude of the roll of the suspension [deg].
     #[serde(rename = "rolling_deg")]
+    #[default(0.2)]
     pub roll_amplitude_deg: f64,
     /// Amplitude of the heave of the suspension [m].
     #[serde(rename = "heaving_m")]
+    #[default(0.01)]
     pub heave_amplitude_m: f64,
     /// First frame at which the vehicle is somewhere else without its odometry noticing (the
     /// kidnapped robot problem); null: never.
     pub kidnapped_at_frame: Option<usize>,
     /// Distance along the path by which it is then displaced [m].
+    #[default(150.0)]
     pub kidnapped_by_m: f64,
-}
-
-impl Default for MotionConfig {
-    /// The vehicle of KITTI at a residential speed.
-    fn default() -> Self {
-        Self {
-            speed_m_s: 8.0,
-            lane_offset_m: None,
-            weaving_m: 0.08,
-            sensor_height_m: 1.73,
-            pitch_amplitude_deg: 0.3,
-            roll_amplitude_deg: 0.2,
-            heave_amplitude_m: 0.01,
-            kidnapped_at_frame: None,
-            kidnapped_by_m: 150.0,
-        }
-    }
 }
 
 impl Validate for MotionConfig {

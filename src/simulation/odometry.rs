@@ -11,33 +11,28 @@ use nalgebra::{UnitQuaternion, Vector3};
 use rand::Rng;
 use rand_distr::{Distribution as _, StandardNormal};
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use crate::geometry::Pose3;
 
 /// Errors of the odometry.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: a good wheel odometry: 1 % too long, one degree in 100 m.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct OdometryConfig {
     /// Relative error of distances (s), positive if they are too long.
+    #[default(0.01)]
     pub scale_error: f64,
     /// Heading drift to the left per metre (ω_drift) [deg/m].
+    #[default(0.01)]
     pub heading_drift_deg_per_m: f64,
     /// Standard deviation of each component of a translation (ε_t) [m].
+    #[default(0.01)]
     pub step_noise_m: f64,
     /// Standard deviation of each component of a rotation, per scan (ε_ω) [deg].
+    #[default(0.02)]
     pub turn_noise_deg: f64,
-}
-
-impl Default for OdometryConfig {
-    /// A good wheel odometry: 1 % too long, one degree in 100 m.
-    fn default() -> Self {
-        Self {
-            scale_error: 0.01,
-            heading_drift_deg_per_m: 0.01,
-            step_noise_m: 0.01,
-            turn_noise_deg: 0.02,
-        }
-    }
 }
 
 /// The poses that odometry reports for true poses, starting at the first of them.

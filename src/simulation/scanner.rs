@@ -17,6 +17,7 @@ use glam::{Vec2, Vec3};
 use rand::{Rng, RngExt as _};
 use rand_distr::{Distribution as _, StandardNormal};
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::builder::{LabelledMesh, Material};
 use super::ego_motion::SCAN_PERIOD_S;
@@ -31,46 +32,38 @@ use crate::validation::{
 const STEPS_PER_POSE: usize = 8;
 
 /// The sensor.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: a Velodyne HDL-64E at 10 revolutions per second.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct ScannerConfig {
     /// Number of beams of the HDL-64E that are used, evenly chosen: 64, 32, 16, ...
+    #[default(64)]
     pub beams: usize,
     /// Elevations of the beams from the top, instead of those of the HDL-64E; empty for
     /// those [deg].
     pub elevations_deg: Vec<f64>,
     /// Measurements of each beam per revolution.
+    #[default(1900)]
     pub azimuth_steps: usize,
     /// Least measured range [m].
+    #[default(2.0)]
     pub min_range_m: f64,
     /// Greatest measured range [m].
+    #[default(90.0)]
     pub max_range_m: f64,
     /// Range at which half the beams return from a surface of reflectance 0.8 at normal
     /// incidence [m].
+    #[default(140.0)]
     pub reach_m: f64,
     /// Standard deviation of a range [m].
+    #[default(0.02)]
     pub range_noise_m: f64,
     /// Share of all returns that is lost at random, 0 to 1.
+    #[default(0.02)]
     pub dropout_share: f64,
     /// Whether the sensor moves during a revolution; `false` gives motion-compensated scans.
     pub rolling_shutter: bool,
-}
-
-impl Default for ScannerConfig {
-    /// A Velodyne HDL-64E at 10 revolutions per second.
-    fn default() -> Self {
-        Self {
-            beams: 64,
-            elevations_deg: Vec::new(),
-            azimuth_steps: 1900,
-            min_range_m: 2.0,
-            max_range_m: 90.0,
-            reach_m: 140.0,
-            range_noise_m: 0.02,
-            dropout_share: 0.02,
-            rolling_shutter: false,
-        }
-    }
 }
 
 impl Validate for ScannerConfig {

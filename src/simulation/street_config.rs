@@ -1,45 +1,39 @@
 //! Configuration of the street and of its cross-section.
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use crate::validation::{InvalidValue, Validate, fraction, nested, positive};
 
 /// The street and what stands along it.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: a residential street.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct StreetConfig {
     /// Width of each of the two lanes [m].
+    #[default(3.3)]
     pub lane_width_m: f64,
     /// Mean distance between side streets [m].
+    #[default(75.0)]
     pub side_street_spacing_m: f64,
     /// Whether there is an open square beside the road.
+    #[default(true)]
     pub has_square: bool,
     /// Share of the frontage that is built on, 0 to 1.
+    #[default(0.93)]
     pub built_share: f64,
     /// Share of the parking bays that are occupied, 0 to 1.
+    #[default(0.75)]
     pub parked_share: f64,
     /// Mean distance between street lamps on one side [m].
+    #[default(32.0)]
     pub lamp_spacing_m: f64,
     /// Trees and bushes per 100 m of each side.
+    #[default(16.0)]
     pub plants_per_100_m: f64,
     /// The cross-section.
     pub ground: CrossSectionConfig,
-}
-
-impl Default for StreetConfig {
-    /// A residential street.
-    fn default() -> Self {
-        Self {
-            lane_width_m: 3.3,
-            side_street_spacing_m: 75.0,
-            has_square: true,
-            built_share: 0.93,
-            parked_share: 0.75,
-            lamp_spacing_m: 32.0,
-            plants_per_100_m: 16.0,
-            ground: CrossSectionConfig::default(),
-        }
-    }
 }
 
 impl Validate for StreetConfig {
@@ -55,35 +49,29 @@ impl Validate for StreetConfig {
 }
 
 /// The cross-section of the street.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: a residential street.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct CrossSectionConfig {
     /// Edge of the square grid cells of the ground [m].
+    #[default(1.0)]
     pub cell_m: f64,
     /// Distance from the carriageway up to which there is ground [m].
+    #[default(45.0)]
     pub reach_m: f64,
     /// Width of the sidewalk [m].
+    #[default(2.2)]
     pub sidewalk_width_m: f64,
     /// Height of the kerb, that is of the sidewalk above the carriageway [m].
+    #[default(0.12)]
     pub kerb_height_m: f64,
     /// Cross slope of the carriageway, rising from the gutter over at most three metres [m/m].
+    #[default(0.025)]
     pub crown_slope: f64,
     /// Amplitude of the undulation of gardens and grass [m].
+    #[default(0.15)]
     pub undulation_m: f64,
-}
-
-impl Default for CrossSectionConfig {
-    /// A residential street.
-    fn default() -> Self {
-        Self {
-            cell_m: 1.0,
-            reach_m: 45.0,
-            sidewalk_width_m: 2.2,
-            kerb_height_m: 0.12,
-            crown_slope: 0.025,
-            undulation_m: 0.15,
-        }
-    }
 }
 
 impl Validate for CrossSectionConfig {

@@ -6,6 +6,7 @@ use std::ops::Range;
 use glam::DVec2;
 use rand::{Rng, RngExt as _};
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::builder::{LabelledMesh, MeshBuilder};
 use super::ego_motion::{EgoMotion, SCAN_PERIOD_S};
@@ -18,39 +19,32 @@ use crate::validation::{InvalidValue, Validate, not_negative};
 const VISIBLE_M: f64 = 90.0;
 
 /// Density of the traffic.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: a town in the afternoon.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrafficConfig {
     /// Whether a vehicle drives ahead during the whole drive.
+    #[default(true)]
     pub has_lead_vehicle: bool,
     /// Mean distance between oncoming vehicles [m]; 0 for none.
+    #[default(70.0)]
     pub oncoming_spacing_m: f64,
     /// Speed of oncoming vehicles [m/s].
+    #[default(9.0)]
     pub oncoming_speed_m_s: f64,
     /// Cyclists per 100 m of path.
+    #[default(1.0)]
     pub cyclists_per_100_m: f64,
     /// Pedestrians per 100 m of path.
+    #[default(3.0)]
     pub pedestrians_per_100_m: f64,
     /// Time from which a lorry drives close on the left and occludes half of the view, a test of
     /// localization [s]; null: never.
     pub lorry_from_s: Option<f64>,
     /// Duration for which it does [s].
+    #[default(3.0)]
     pub lorry_for_s: f64,
-}
-
-impl Default for TrafficConfig {
-    /// A town in the afternoon.
-    fn default() -> Self {
-        Self {
-            has_lead_vehicle: true,
-            oncoming_spacing_m: 70.0,
-            oncoming_speed_m_s: 9.0,
-            cyclists_per_100_m: 1.0,
-            pedestrians_per_100_m: 3.0,
-            lorry_from_s: None,
-            lorry_for_s: 3.0,
-        }
-    }
 }
 
 impl Validate for TrafficConfig {

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::check::{ground, path};
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
@@ -17,48 +18,70 @@ use crate::recording::Selection;
 use crate::validation::{InvalidValue, Validate, in_range, require};
 
 /// Configuration of `build-map`: the keys of range-mcl's `build_map.yml`, then new ones.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: the values of range-mcl.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct BuildMapConfig {
     /// Folder of the scans, `NNNNNN.bin`.
+    #[default("data/kitti/velodyne".into())]
     pub scan_folder: PathBuf,
     /// Camera poses of the recording.
+    #[default("data/kitti/poses.txt".into())]
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`.
+    #[default("data/kitti/calib.txt".into())]
     pub calib_file: PathBuf,
     /// Output path of the map.
+    #[default("results/map.ply".into())]
     pub mesh_file: PathBuf,
     /// Number of scans from `start_idx` on; -1 for all.
+    #[default(-1)]
     pub n_scans: i64,
     /// Number of counted scans in a local map.
+    #[default(100)]
     pub local_map_size: usize,
     /// Whether to draw the map from above.
+    #[default(true)]
     pub visualize: bool,
     /// Octree depth of the Poisson reconstruction.
+    #[default(9)]
     pub depth: u32,
     /// Quantile of the vertex density below which vertices are removed, unitless.
+    #[default(0.1)]
     pub min_density: f64,
     /// Voxel edge of the downsampling [m].
+    #[default(0.1)]
     pub voxel_size: f64,
     /// Half length of the crop box [m].
+    #[default(30.0)]
     pub crop_x: f64,
     /// Half width of the crop box [m].
+    #[default(30.0)]
     pub crop_y: f64,
     /// Half height of the crop box [m].
+    #[default(5.0)]
     pub crop_z: f64,
     /// Inlier distance of the RANSAC plane [m].
+    #[default(0.3)]
     pub distance_threshold: f64,
     /// Sample size of a RANSAC plane.
+    #[default(3)]
     pub ransac_n: usize,
     /// Number of RANSAC planes.
+    #[default(100)]
     pub num_iterations: usize,
     /// Cell edge of the ground simplification [m].
+    #[default(1.0)]
     pub simplify_resolution: f64,
     /// Smoothing iterations of the ground.
+    #[default(1)]
     pub number_of_iterations: usize,
     /// Red, green and blue of the ground, 0 to 1.
+    #[default([1.0, 0.0, 0.0])]
     pub ground_color: [f64; 3],
     /// Red, green and blue of everything else, 0 to 1.
+    #[default([0.0, 0.0, 1.0])]
     pub rest_color: [f64; 3],
     /// Size and limits of the range images for the normals.
     pub range_image: LidarModel,
@@ -66,12 +89,15 @@ pub struct BuildMapConfig {
     /// First frame of the recording.
     pub start_idx: usize,
     /// Step between frames: n uses every n-th frame.
+    #[default(1)]
     pub frame_step: usize,
     /// Motion since the last counted scan above which a scan counts [m].
+    #[default(0.2)]
     pub displacement_threshold_m: f64,
     /// Method of ground segmentation.
     pub ground_method: GroundMethod,
     /// Length of path that neighbouring local maps share [m].
+    #[default(5.0)]
     pub overlap_m: f64,
     /// Step between counted scans that are excluded from the map and used to evaluate it; 0 for none.
     pub holdout_step: usize,
@@ -79,10 +105,13 @@ pub struct BuildMapConfig {
     /// simulated drive is one.
     pub truth_mesh: Option<PathBuf>,
     /// Distance to the nearest point above which reconstructed surface is removed [m].
+    #[default(f64::from(LocalMapConfig::default().max_distance_m))]
     pub max_distance_m: f64,
     /// Confidence above which a vertex is ground, unitless.
+    #[default(LocalMapConfig::default().ground_threshold)]
     pub ground_threshold: f32,
     /// Box of the own car in the lidar frame: x_min, x_max, y_min, y_max [m].
+    #[default(ScanConfig::default().own_car_m)]
     pub own_car_m: [f32; 4],
     /// Weight of each point. Off by default: it improved no map.
     pub confidence: ConfidenceConfig,
@@ -103,55 +132,6 @@ pub struct BuildMapConfig {
     pub seed: u64,
     /// Whether to replace an existing map.
     pub force: bool,
-}
-
-impl Default for BuildMapConfig {
-    /// The values of range-mcl.
-    fn default() -> Self {
-        let settings = LocalMapConfig::default();
-        Self {
-            scan_folder: "data/kitti/velodyne".into(),
-            pose_file: "data/kitti/poses.txt".into(),
-            calib_file: "data/kitti/calib.txt".into(),
-            mesh_file: "results/map.ply".into(),
-            n_scans: -1,
-            local_map_size: 100,
-            visualize: true,
-            depth: 9,
-            min_density: 0.1,
-            voxel_size: 0.1,
-            crop_x: 30.0,
-            crop_y: 30.0,
-            crop_z: 5.0,
-            distance_threshold: 0.3,
-            ransac_n: 3,
-            num_iterations: 100,
-            simplify_resolution: 1.0,
-            number_of_iterations: 1,
-            ground_color: [1.0, 0.0, 0.0],
-            rest_color: [0.0, 0.0, 1.0],
-            range_image: LidarModel::default(),
-            start_idx: 0,
-            frame_step: 1,
-            displacement_threshold_m: 0.2,
-            ground_method: GroundMethod::default(),
-            overlap_m: 5.0,
-            holdout_step: 0,
-            truth_mesh: None,
-            max_distance_m: f64::from(settings.max_distance_m),
-            ground_threshold: settings.ground_threshold,
-            own_car_m: settings.scan.own_car_m,
-            confidence: settings.confidence,
-            poisson: settings.poisson,
-            normals: settings.scan.normals,
-            visibility: settings.visibility,
-            fuzzy: FuzzyConfig::default(),
-            pca: PcaGround::default(),
-            motion_compensation: None,
-            seed: 0,
-            force: false,
-        }
-    }
 }
 
 impl BuildMapConfig {

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::check::path;
 use crate::validation::{InvalidValue, Validate, at_least_one, require};
@@ -13,12 +14,16 @@ use crate::validation::{InvalidValue, Validate, at_least_one, require};
 pub type Overrides = BTreeMap<String, serde_json::Value>;
 
 /// Configuration of a comparison.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: no sequences and configurations; five seeds.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct ComparisonConfig {
     /// Folder of all results.
+    #[default("results/comparison".into())]
     pub output_folder: PathBuf,
     /// Seeds of the runs, one run per seed.
+    #[default((1..=5).collect())]
     pub seeds: Vec<u64>,
     /// Overrides for all runs.
     pub base: StageOverrides,
@@ -105,21 +110,6 @@ pub struct ParticleSweep {
     pub seeds: Vec<u64>,
     /// Keys of `localization.yml`, such as global initialization.
     pub localization: Overrides,
-}
-
-impl Default for ComparisonConfig {
-    /// No sequences and configurations; five seeds.
-    fn default() -> Self {
-        Self {
-            output_folder: "results/comparison".into(),
-            seeds: (1..=5).collect(),
-            base: StageOverrides::default(),
-            sequences: Vec::new(),
-            configurations: Vec::new(),
-            contrasts: Vec::new(),
-            particles: None,
-        }
-    }
 }
 
 impl ComparisonConfig {

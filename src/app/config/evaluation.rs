@@ -3,60 +3,54 @@
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::check::path;
 use crate::recording::Selection;
 use crate::validation::{InvalidValue, Validate, at_least_one, positive, require};
 
 /// Configuration of `evaluate`: the keys of range-mcl's `evaluation.yml`, then new ones.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: the values of range-mcl.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct EvaluationConfig {
     /// Result of `localize`, `refine` or range-mcl.
+    #[default("results/localization.npz".into())]
     pub result_file: PathBuf,
     /// Camera poses of the recording, for results without ground truth, such as those of range-mcl.
+    #[default("data/kitti/poses.txt".into())]
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`, for the same results.
+    #[default("data/kitti/calib.txt".into())]
     pub calib_file: PathBuf,
     /// Whether to draw the trajectory.
+    #[default(true)]
     pub plot_loc_traj: bool,
     /// Whether to write the metrics beside the result.
+    #[default(true)]
     pub save_evaluation_results: bool,
     /// Metres per unit of the result's positions.
+    #[default(1.0)]
     pub grid_resolution: f64,
     /// Position error above which a checked frame is a failure [m].
+    #[default(5.0)]
     pub converge_thres: f64,
     /// Fraction of the particles, by descending weight, that an estimate is computed from, unitless.
+    #[default(0.8)]
     pub particle_select_ratio: f64,
     /// Number of frames before the first check of convergence, and between checks.
+    #[default(100)]
     pub convergence_interval: usize,
 
     /// First frame of the result.
     pub start_idx: usize,
     /// Number of frames from `start_idx` on; -1 for all.
+    #[default(-1)]
     pub n_scans: i64,
     /// Step between frames: n uses every n-th frame.
+    #[default(1)]
     pub frame_step: usize,
-}
-
-impl Default for EvaluationConfig {
-    /// The values of range-mcl.
-    fn default() -> Self {
-        Self {
-            result_file: "results/localization.npz".into(),
-            pose_file: "data/kitti/poses.txt".into(),
-            calib_file: "data/kitti/calib.txt".into(),
-            plot_loc_traj: true,
-            save_evaluation_results: true,
-            grid_resolution: 1.0,
-            converge_thres: 5.0,
-            particle_select_ratio: 0.8,
-            convergence_interval: 100,
-            start_idx: 0,
-            n_scans: -1,
-            frame_step: 1,
-        }
-    }
 }
 
 impl EvaluationConfig {

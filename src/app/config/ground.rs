@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::check::path;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
@@ -10,33 +11,42 @@ use crate::recording::Selection;
 use crate::validation::{InvalidValue, Validate, in_range};
 
 /// Configuration of `ground`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct GroundCommandConfig {
     /// Folder of the scans, `NNNNNN.bin`.
+    #[default("data/kitti/velodyne".into())]
     pub scan_folder: PathBuf,
     /// Folder of the true classes, `NNNNNN.label`; `None`: `labels` beside the scans, where it
     /// exists.
     pub label_folder: Option<PathBuf>,
     /// Folder of the labels, points, pictures and the report.
+    #[default("results/ground".into())]
     pub output_folder: PathBuf,
     /// First frame of the recording.
     pub start_idx: usize,
     /// Number of scans from `start_idx` on; -1 for all.
+    #[default(-1)]
     pub n_scans: i64,
     /// Step between frames: n uses every n-th frame.
+    #[default(1)]
     pub frame_step: usize,
     /// Method of ground segmentation.
     pub ground_method: GroundMethod,
     /// Confidence above which a point is ground, unitless.
+    #[default(0.5)]
     pub ground_threshold: f32,
     /// Whether to evaluate all methods, where labels exist.
+    #[default(true)]
     pub compare: bool,
     /// Whether to write the result as SemanticKITTI labels.
+    #[default(true)]
     pub write_labels: bool,
     /// Whether to write the points, coloured by confidence.
+    #[default(true)]
     pub write_plys: bool,
     /// Step between the scans that are drawn from above; 0 for none.
+    #[default(10)]
     pub plot_step: usize,
     /// Linguistic sets and rules of `ground_method: fuzzy`.
     pub fuzzy: FuzzyConfig,
@@ -46,29 +56,6 @@ pub struct GroundCommandConfig {
     pub ransac: RansacGround,
     /// Whether to replace existing output.
     pub force: bool,
-}
-
-impl Default for GroundCommandConfig {
-    fn default() -> Self {
-        Self {
-            scan_folder: "data/kitti/velodyne".into(),
-            label_folder: None,
-            output_folder: "results/ground".into(),
-            start_idx: 0,
-            n_scans: -1,
-            frame_step: 1,
-            ground_method: GroundMethod::default(),
-            ground_threshold: 0.5,
-            compare: true,
-            write_labels: true,
-            write_plys: true,
-            plot_step: 10,
-            fuzzy: FuzzyConfig::default(),
-            pca: PcaGround::default(),
-            ransac: RansacGround::default(),
-            force: false,
-        }
-    }
 }
 
 impl GroundCommandConfig {

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
 use super::check::{ground, optional_path, path};
 use super::odometry::OdometrySource;
@@ -26,52 +27,70 @@ use crate::validation::{
 };
 
 /// Configuration of `localize`: the keys of range-mcl's `localization.yml`, then new ones.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Defaults: the values of range-mcl.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct LocalizationConfig {
     /// Folder of the scans, `NNNNNN.bin`.
+    #[default("data/kitti/velodyne".into())]
     pub scan_folder: PathBuf,
     /// Map of `build-map` or range-mcl.
+    #[default("results/map.ply".into())]
     pub map_file: PathBuf,
     /// Camera poses of the mapping drive; `None`: the map carries its own frame.
     pub map_pose_file: Option<PathBuf>,
     /// Calibration of the mapping drive; `None`: the map carries its own frame.
     pub map_calib_file: Option<PathBuf>,
     /// Camera poses of the recording.
+    #[default("data/kitti/poses.txt".into())]
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`.
+    #[default("data/kitti/calib.txt".into())]
     pub calib_file: PathBuf,
     /// Output path of the result; all other output is written beside it.
+    #[default("results/localization.npz".into())]
     pub result_path: PathBuf,
     /// Whether to draw the final plots.
+    #[default(true)]
     pub plot_loc_results: bool,
     /// Whether the start is known; `initialization` takes precedence.
+    #[default(true)]
     pub pose_tracking: bool,
     /// First frame of the recording.
     pub start_idx: usize,
     /// Cell edge of the grid for initialization [m].
+    #[default(1.0)]
     pub grid_res: f64,
     /// Number of particles at the start.
     #[serde(rename = "numParticles")]
+    #[default(LocalizerConfig::default().num_particles)]
     pub num_particles: usize,
     /// Number of occupied tiles below which the filter has converged.
+    #[default(LocalizerConfig::default().convergence.converge_thres)]
     pub converge_thres: usize,
     /// Number of particles after convergence.
+    #[default(LocalizerConfig::default().num_reduced)]
     pub num_reduced: usize,
     /// Motion after which the weights are updated [m].
+    #[default(LocalizerConfig::default().move_thres_m)]
     pub move_thres: f64,
     /// Standard deviation of the initial headings around the best heading of a cell [deg].
+    #[default(2.0)]
     pub yaw_sigma: f64,
     /// Whether to draw a picture per frame and an animation.
     pub visualize: bool,
     /// Whether to write the result.
+    #[default(true)]
     pub save_result: bool,
     /// Size and limits of the range images, and their rendering.
     pub range_image: RenderedRangeImage,
 
     /// Number of scans from `start_idx` on; -1 for all.
+    #[default(-1)]
     pub n_scans: i64,
     /// Step between frames: n uses every n-th frame.
+    #[default(1)]
     pub frame_step: usize,
     /// Initial distribution of the particles; `None`: it follows from `pose_tracking`.
     pub initialization: Option<Initialization>,
@@ -82,22 +101,27 @@ pub struct LocalizationConfig {
     /// Motion model.
     pub motion_model: MotionModel,
     /// Box of the own car in the lidar frame: x_min, x_max, y_min, y_max [m].
+    #[default(ScanConfig::default().own_car_m)]
     pub own_car_m: [f32; 4],
     /// Height of the sensor above the road [m]; `None`: estimated from the scans.
     pub sensor_height_m: Option<f64>,
     /// Method of ground segmentation of the scans.
     pub ground_method: GroundMethod,
     /// Inlier distance of the RANSAC plane [m].
+    #[default(RansacGround::default().distance_threshold)]
     pub distance_threshold: f32,
     /// Sample size of a RANSAC plane.
+    #[default(RansacGround::default().ransac_n)]
     pub ransac_n: usize,
     /// Number of RANSAC planes.
+    #[default(RansacGround::default().num_iterations)]
     pub num_iterations: usize,
     /// Parameters of `ground_method: pca`.
     pub pca: PcaGround,
     /// Linguistic sets and rules of `ground_method: fuzzy`.
     pub fuzzy: FuzzyConfig,
     /// Turn after which the weights are updated [rad].
+    #[default(LocalizerConfig::default().turn_thres_rad)]
     pub turn_thres_rad: f64,
     /// Spread below which the filter has converged.
     pub convergence: ConvergenceConfig,
@@ -108,8 +132,10 @@ pub struct LocalizationConfig {
     /// Noise of the velocity model.
     pub velocity_noise: VelocityNoise,
     /// Noise of constant velocity, without odometry, per frame.
+    #[default(LocalizerConfig::default().constant_velocity)]
     pub constant_velocity_noise: OdometryNoise,
     /// The same before the velocity is known, per frame.
+    #[default(LocalizerConfig::default().unknown_velocity)]
     pub unknown_velocity_noise: OdometryNoise,
     /// Observation model.
     pub observation: ObservationConfig,
@@ -181,68 +207,6 @@ pub enum MotionModel {
     TurnDriveTurn,
     /// Speed and turn rate over a duration.
     Velocity,
-}
-
-impl Default for LocalizationConfig {
-    /// The values of range-mcl.
-    fn default() -> Self {
-        let localizer = LocalizerConfig::default();
-        let ransac = RansacGround::default();
-        Self {
-            scan_folder: "data/kitti/velodyne".into(),
-            map_file: "results/map.ply".into(),
-            map_pose_file: None,
-            map_calib_file: None,
-            pose_file: "data/kitti/poses.txt".into(),
-            calib_file: "data/kitti/calib.txt".into(),
-            result_path: "results/localization.npz".into(),
-            plot_loc_results: true,
-            pose_tracking: true,
-            start_idx: 0,
-            grid_res: 1.0,
-            num_particles: localizer.num_particles,
-            converge_thres: localizer.convergence.converge_thres,
-            num_reduced: localizer.num_reduced,
-            move_thres: localizer.move_thres_m,
-            yaw_sigma: 2.0,
-            visualize: false,
-            save_result: true,
-            range_image: RenderedRangeImage::default(),
-            n_scans: -1,
-            frame_step: 1,
-            initialization: None,
-            odometry: OdometrySource::default(),
-            odometry_file: None,
-            motion_model: MotionModel::default(),
-            own_car_m: ScanConfig::default().own_car_m,
-            sensor_height_m: None,
-            ground_method: GroundMethod::default(),
-            distance_threshold: ransac.distance_threshold,
-            ransac_n: ransac.ransac_n,
-            num_iterations: ransac.num_iterations,
-            pca: PcaGround::default(),
-            fuzzy: FuzzyConfig::default(),
-            turn_thres_rad: localizer.turn_thres_rad,
-            convergence: localizer.convergence,
-            start: StartSpread::default(),
-            odometry_noise: localizer.motion,
-            velocity_noise: localizer.velocity,
-            constant_velocity_noise: localizer.constant_velocity,
-            unknown_velocity_noise: localizer.unknown_velocity,
-            observation: localizer.observation,
-            tempering: localizer.tempering,
-            proposal: localizer.proposal,
-            resampling: localizer.resampling,
-            kld: localizer.kld,
-            vigilance: localizer.tracking_loss,
-            panorama: PanoramaConfig::default(),
-            motion_compensation: None,
-            refine: false,
-            refinement: RefinementConfig::default(),
-            seed: 0,
-            force: false,
-        }
-    }
 }
 
 impl Default for RenderedRangeImage {
