@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result, bail};
 
 use super::output;
-use crate::app::plotting::color::{MCL, REFINED, Rgb};
+use crate::app::plotting::color::{MCL, REFINED};
 use crate::app::plotting::{
-    Animation, ErrorPlot, LineChart, LocalizationPicture, MapImage, MapPlot, NamedPath, Panel,
-    PathPlot, RangeImageStrip, RuntimePlot, Series, map_plot,
+    Animation, LineChart, LocalizationPicture, MapImage, MapPlot, Panel, PathPlot, Series,
+    error_chart, map_plot,
 };
 use crate::app::results::{
     LocalizationResults, Report, TrajectoryReport, write_frames_csv, write_poses_npy,
@@ -19,8 +19,6 @@ use crate::evaluation::{
     planar_errors,
 };
 use crate::geometry::{Pose2, Pose3, StampedPose, Trajectory, TriangleMesh};
-use crate::lidar::RangeImage;
-use crate::localization::likelihood::{Direction, width_at_half};
 use crate::localization::{Estimate, ParticleSet};
 use crate::recording::Sequence;
 use crate::recording::poses::{write_kitti, write_tum};
@@ -227,8 +225,13 @@ pub fn draw_run(
     let image = mesh.map(|mesh| MapImage::of_colors(mesh, MAP_CELLS));
     let truth = results.ground_truth.as_deref();
     let estimates = results.estimates.as_deref().unwrap_or_default();
-    let mut paths = vec![NamedPath::mcl(estimates)];
-    paths.extend(results.refined.as_deref().map(NamedPath::refined));
+    let mut paths = vec![("MCL", MCL, estimates)];
+    paths.extend(
+        results
+            .refined
+            .as_deref()
+            .map(|it| ("refined", REFINED, it)),
+    );
     PathPlot {
         title: "Path against ground truth",
         ground_truth: truth,
@@ -259,43 +262,48 @@ fn draw_errors(
     estimates: &[Pose2],
     truth: &[Pose2],
 ) -> Result<()> {
-    let mcl = planar_errors(estimates, truth);
-    let refined = (results.refined.as_deref()).map(|refined| planar_errors(refined, truth));
-    let mut errors = vec![("MCL", MCL, mcl.as_slice())];
-    errors.extend((refined.as_deref()).map(|refined| ("refined", REFINED, refined)));
     let by_frame: Vec<f64> = results.frames.iter().map(|&frame| frame as f64).collect();
     let (x_name, x) = match &results.times_s {
         Some(times_s) => ("time [s]", times_s),
         None => ("frame", &by_frame),
     };
-    ErrorPlot {
-        title: "Errors over time",
-        x_name,
-        x,
-        errors: &errors,
-    }
-    .save(&files.plot("errors.png")?)?;
-    Ok(())
+    let errors = |poses: &[Pose2]| x.iter().copied().zip(planar_errors(poses, truth)).collect();
+    let mut trajectories = vec![("MCL", MCL, errors(estimates))];
+    trajectories.extend(
+        results
+            .refined
+            .as_deref()
+            .map(|it| ("refined", REFINED, errors(it))),
+    );
+    error_chart("Errors over time", x_name, &trajectories).save(&files.plot("errors.png")?)
 }
 
 fn draw_runtimes(files: &RunFiles, results: &LocalizationResults) -> Result<()> {
-    let stages: Vec<_> = [
+    let stages = [
         ("localize", MCL, &results.runtimes_s),
         ("refine", REFINED, &results.refine_runtimes_s),
-    ]
-    .into_iter()
-    .filter_map(|(stage, color, times_s)| Some((stage, color, times_s.as_deref()?)))
-    .collect();
-    if stages.is_empty() {
+    ];
+    let series = stages.into_iter().filter_map(|(stage, color, times_s)| {
+        let points = results.frames.iter().zip(times_s.as_ref()?);
+        let points = points.map(|(&frame, time_s)| (frame as f64, 1e3 * time_s));
+        Some(Series::line(stage, color, points))
+    });
+    let series: Vec<Series> = series.collect();
+    if series.is_empty() {
         return Ok(());
     }
-    RuntimePlot {
-        title: "Runtime per frame",
-        frames: &results.frames,
-        stages: &stages,
+    LineChart {
+        title: "Runtime per frame".to_owned(),
+        x_name: "frame".to_owned(),
+        panels: vec![Panel {
+            y_name: "time per frame [ms]".to_owned(),
+            series,
+            clip_outliers: true,
+            ..Panel::default()
+        }],
+        marks: Vec::new(),
     }
-    .save(&files.plot("runtime.png")?)?;
-    Ok(())
+    .save(&files.plot("runtime.png")?)
 }
 
 /// Draws the particles of the first frame, which are spread most.
@@ -316,65 +324,7 @@ fn draw_particles(
         ground_truth: first(&results.ground_truth),
         ..LocalizationPicture::default()
     }
-    .save(&files.plot("particles.png")?)?;
-    Ok(())
-}
-
-/// Draws a measured range image, the one rendered at the estimate, and their difference.
-pub fn draw_range_images(
-    files: &RunFiles,
-    observed: &RangeImage,
-    rendered: &[f32],
-    frame: usize,
-) -> Result<()> {
-    RangeImageStrip {
-        title: &format!("Frame {frame}: observed, rendered, difference"),
-        model: &observed.model,
-        observed: &observed.ranges,
-        rendered,
-        difference_limit_m: 1.0,
-    }
-    .save(&files.plot("range_images.png")?)?;
-    Ok(())
-}
-
-/// Name and colour of a line through (offset, likelihood).
-pub type NamedProfile = (&'static str, Rgb, Vec<(f64, f64)>);
-
-/// Draws the likelihood around the true pose of a frame, one panel per direction.
-pub fn draw_likelihood(
-    files: &RunFiles,
-    frame: usize,
-    profiles: Vec<(Direction, Vec<NamedProfile>)>,
-) -> Result<()> {
-    let panels = profiles.into_iter().map(|(direction, profiles)| {
-        let (name, unit) = match direction {
-            Direction::Along => ("along", "m"),
-            Direction::Across => ("across", "m"),
-            Direction::Heading => ("heading", "deg"),
-        };
-        let series = profiles.into_iter().map(|(model, color, points)| {
-            let width = match width_at_half(&points) {
-                Some(width) => format!("{width:.3} {unit} wide at half height"),
-                None => "wider than shown at half height".to_owned(),
-            };
-            Series::line(&format!("{model}: {width}"), color, points)
-        });
-        Panel {
-            y_name: "likelihood / peak".to_owned(),
-            own_x_name: Some(format!("offset {name} [{unit}]")),
-            series: series.collect(),
-            clip_outliers: false,
-        }
-    });
-    LineChart {
-        title: format!("Frame {frame}: likelihood around the true pose"),
-        x_name: String::new(),
-        panels: panels.collect(),
-        marks: vec![(0.0, "truth".to_owned())],
-    }
-    .save(&files.plot("likelihood.png")?)?;
-    Ok(())
+    .save(&files.plot("particles.png")?)
 }
 
 /// A picture per frame, and an animation of them.
@@ -422,7 +372,6 @@ impl Movie {
 
     /// Writes the animation.
     pub fn finish(self) -> Result<()> {
-        Animation::default().save(&self.files.file("localization.gif"), &self.pictures)?;
-        Ok(())
+        Animation::default().save(&self.files.file("localization.gif"), &self.pictures)
     }
 }

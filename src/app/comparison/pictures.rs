@@ -9,10 +9,10 @@ use super::record::RunRecord;
 use super::results::{ComparisonResults, success_rate};
 use crate::app::commands::run_page::picture;
 use crate::app::plotting::color::{Rgb, SERIES};
-use crate::app::plotting::{LineChart, Mark, NamedPath, Panel, PathPlot, Series};
+use crate::app::plotting::{LineChart, Mark, Panel, PathPlot, Series, error_chart};
 use crate::app::reporting::{PageElement, SuccessRate};
 use crate::app::results::LocalizationResults;
-use crate::evaluation::{PlanarError, planar_errors};
+use crate::evaluation::planar_errors;
 use crate::geometry::Pose2;
 
 /// Error of every run over its seed; `None` without runs.
@@ -103,24 +103,28 @@ pub fn trajectories(
         .iter()
         .map(|it| format!("{} seed {}", it.name, it.seed));
     let seeds = seeds.collect::<Vec<String>>().join(", ");
-    let paths = trajectories.iter().map(|it| NamedPath {
-        name: &it.name,
-        color: it.color,
-        poses: &it.poses,
-    });
+    let paths = trajectories
+        .iter()
+        .map(|it| (it.name.as_str(), it.color, it.poses.as_slice()));
     let plot = plot_path(&format!("paths_{sequence}.png"), layout)?;
     PathPlot {
         title: &format!("{sequence}: paths against ground truth"),
         ground_truth: Some(&first.truth),
-        paths: &paths.collect::<Vec<NamedPath>>(),
+        paths: &paths.collect::<Vec<_>>(),
         map: None,
     }
     .save(&plot)?;
     let paths = picture(&plot, &format!("Paths of all configurations ({seeds})"))?;
+    let errors = trajectories.iter().map(|it| {
+        let frames = it.frames.iter().map(|&frame| frame as f64);
+        let errors = frames.zip(planar_errors(&it.poses, &it.truth));
+        (it.name.as_str(), it.color, errors.collect())
+    });
+    let title = format!("{sequence}: errors over time");
     let errors = save_chart(
         &format!("errors_{sequence}.png"),
         &format!("Position and heading error over time ({seeds})"),
-        &error_chart(sequence, &trajectories),
+        &error_chart(&title, "frame", &errors.collect::<Vec<_>>()),
         layout,
     )?;
     Ok([paths, errors].into_iter().flatten().collect())
@@ -169,35 +173,6 @@ fn read_trajectory(record: &RunRecord, color: Rgb, layout: &Layout) -> Option<Tr
         poses: results.refined.or(results.estimates)?,
         truth: results.ground_truth?,
     })
-}
-
-/// A panel for position and one for heading, with one line per configuration.
-fn error_chart(sequence: &str, trajectories: &[Trajectory]) -> LineChart {
-    let panel = |y_name: &str, value: fn(&PlanarError) -> f64| {
-        let series = trajectories.iter().map(|it| {
-            let errors = planar_errors(&it.poses, &it.truth);
-            let points = it.frames.iter().zip(&errors);
-            let points = points.map(|(&frame, error)| (frame as f64, value(error)));
-            Series::line(&it.name, it.color, points)
-        });
-        Panel {
-            y_name: y_name.to_owned(),
-            series: series.collect(),
-            clip_outliers: true,
-            ..Panel::default()
-        }
-    };
-    LineChart {
-        title: format!("{sequence}: errors over time"),
-        x_name: "frame".to_owned(),
-        panels: vec![
-            panel("position error [m]", PlanarError::distance_m),
-            panel("heading error [deg]", |error| {
-                error.turn_rad.abs().to_degrees()
-            }),
-        ],
-        marks: Vec::new(),
-    }
 }
 
 /// Saves a chart unless it has no panels.

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::{Result, ensure};
+use anyhow::Result;
 use glam::Vec3;
 
 use super::bitmap::Bitmap;
@@ -45,18 +45,7 @@ impl GroundPlot<'_> {
 
     fn draw(&self) -> Result<Bitmap> {
         let (points, answers, truths) = (self.points, self.called_ground, self.truth);
-        ensure!(
-            answers.len() == points.len(),
-            "{} answers where {} belong",
-            answers.len(),
-            points.len()
-        );
-        ensure!(
-            truths.is_empty() || truths.len() == points.len(),
-            "{} truths where {} belong",
-            truths.len(),
-            points.len()
-        );
+        debug_assert_eq!(answers.len(), points.len());
         let entry = |name: &str, color: Rgb| LegendEntry::new(name, color, Mark::Area);
         let mut legend = vec![entry("ground", GROUND), entry("rest", REST)];
         if !truths.is_empty() {
@@ -134,18 +123,5 @@ mod tests {
         let count = |color: Rgb| image.pixels.iter().filter(|pixel| **pixel == color).count();
         let without = [GROUND, REST, MISSED, FALSE].map(count);
         assert!(without[0] > with_errors[0] && without[2] < with_errors[2]);
-    }
-
-    #[test]
-    fn a_missing_answer_is_an_error() {
-        let plot = GroundPlot {
-            title: "",
-            points: &[Vec3::ZERO; 2],
-            called_ground: &[true],
-            truth: &[],
-            reach_m: (10.0, 5.0),
-        };
-        let message = format!("{:#}", plot.save(Path::new("scan.png")).unwrap_err());
-        assert!(message.contains("1 answers where 2 belong"), "{message}");
     }
 }

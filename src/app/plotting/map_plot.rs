@@ -92,11 +92,7 @@ impl ScalarMapPlot<'_> {
     }
 
     fn draw(&self) -> Result<Bitmap> {
-        let (values, vertices) = (self.values.len(), self.mesh.vertices.len());
-        ensure!(
-            values == vertices,
-            "{values} values where {vertices} belong"
-        );
+        debug_assert_eq!(self.values.len(), self.mesh.vertices.len());
         let bar = ColorBar {
             range: AxisRange::new(self.limits.0, self.limits.1).at_least(1e-9),
             colormap: self.colormap,

@@ -31,5 +31,5 @@ pub use map_image::MapImage;
 pub use map_plot::{MapPlot, ScalarMapPlot};
 pub use particles::LocalizationPicture;
 pub use range_images::RangeImageStrip;
-pub use trajectory::{ErrorPlot, NamedPath, PathPlot, RuntimePlot};
+pub use trajectory::{PathPlot, error_chart};
 pub use view::Mark;

@@ -8,7 +8,7 @@ use super::bitmap::Bitmap;
 use super::color::{Colormap, MISSING};
 use super::sheet::{self, HPos, LABEL, Rect, Sheet, VPos, save_png, text_style};
 use super::view::{AxisRange, ColorBar, LegendEntry, Mark, Ticks, View, legend};
-use crate::lidar::LidarModel;
+use crate::lidar::RangeImage;
 
 const WIDTH: f64 = 1400.0;
 const LEFT: f64 = 118.0;
@@ -17,20 +17,19 @@ const HEADER: f64 = 96.0;
 const CAPTION: f64 = 32.0;
 const IMAGE: f64 = 170.0;
 const BETWEEN: f64 = 34.0;
+/// Differences at the ends of the color bar [m].
+const DIFFERENCE_LIMIT_M: f64 = 1.0;
 
 /// Three range images one above the other: observed, rendered, observed − rendered.
 #[derive(Clone, Copy, Debug)]
 pub struct RangeImageStrip<'a> {
     /// Title.
     pub title: &'a str,
-    /// Projection of both images.
-    pub model: &'a LidarModel,
-    /// Ranges of the scan, row-major [m]; not finite or not positive where there is no return.
-    pub observed: &'a [f32],
-    /// Ranges of the map, likewise.
+    /// Range image of the scan.
+    pub observed: &'a RangeImage,
+    /// Ranges of the map in the same projection, row-major [m]; not finite or not positive where
+    /// there is no return.
     pub rendered: &'a [f32],
-    /// Differences at the ends of the color bar [m].
-    pub difference_limit_m: f64,
 }
 
 impl RangeImageStrip<'_> {
@@ -40,18 +39,8 @@ impl RangeImageStrip<'_> {
     }
 
     fn draw(&self) -> Result<Bitmap> {
-        let pixels = self.model.len();
-        for (name, found) in [
-            ("observed", self.observed.len()),
-            ("rendered", self.rendered.len()),
-        ] {
-            ensure!(
-                found == pixels,
-                "{found} {name} ranges where {pixels} belong"
-            );
-        }
         ensure!(
-            pixels > 0,
+            !self.rendered.is_empty(),
             "there is nothing to draw: the range images have no pixels"
         );
         let height = HEADER + 3.0 * (CAPTION + IMAGE + BETWEEN) + 34.0;
@@ -64,17 +53,16 @@ impl RangeImageStrip<'_> {
         let missing = LegendEntry::new(name, MISSING, Mark::Area);
         legend(sheet, &[missing], (LEFT, 70.0), WIDTH - RIGHT)?;
         let ranges = ColorBar {
-            range: AxisRange::new(0.0, f64::from(self.model.max_range)),
+            range: AxisRange::new(0.0, f64::from(self.observed.model.max_range)),
             colormap: Colormap::Viridis,
             name: "range [m]",
         };
-        let limit = self.difference_limit_m.abs().max(1e-3);
         let differences = ColorBar {
-            range: AxisRange::new(-limit, limit),
+            range: AxisRange::new(-DIFFERENCE_LIMIT_M, DIFFERENCE_LIMIT_M),
             colormap: Colormap::Diverging,
             name: "difference [m]",
         };
-        let observed = |index: usize| range(self.observed[index]);
+        let observed = |index: usize| range(self.observed.ranges[index]);
         let rendered = |index: usize| range(self.rendered[index]);
         let difference = |index: usize| observed(index) - rendered(index);
         self.image(sheet, 0, ["observed", ""], &ranges, observed)?;
@@ -101,7 +89,8 @@ impl RangeImageStrip<'_> {
         };
         let style = text_style(LABEL, HPos::Left, VPos::Center);
         sheet.text(caption, (LEFT, top + 0.5 * CAPTION), &style)?;
-        let (width, height) = (self.model.width, self.model.height);
+        let model = &self.observed.model;
+        let (width, height) = (model.width, model.height);
         sheet.pixels(&rect, |x, y| {
             let column = ((x * width as f64) as usize).min(width - 1);
             let row = ((y * height as f64) as usize).min(height - 1);
@@ -112,8 +101,8 @@ impl RangeImageStrip<'_> {
             // Columns grow clockwise from straight back, azimuth counter-clockwise.
             x: AxisRange::new(180.0, -180.0),
             y: AxisRange::new(
-                f64::from(self.model.fov_down_rad().to_degrees()),
-                f64::from(self.model.fov_up),
+                f64::from(model.fov_down_rad().to_degrees()),
+                f64::from(model.fov_up),
             ),
         };
         let x_ticks = Ticks::every(60.0, AxisRange::new(-180.0, 180.0));

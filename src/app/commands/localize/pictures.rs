@@ -2,12 +2,13 @@
 
 use anyhow::{Context as _, Result};
 
-use crate::app::commands::run_output::{self, RunFiles};
+use crate::app::commands::run_output::RunFiles;
 use crate::app::config::LocalizationConfig;
 use crate::app::plotting::color::{MCL, REFINED};
+use crate::app::plotting::{LineChart, Panel, RangeImageStrip, Series};
 use crate::geometry::{Pose3, pose2_from_pose3};
 use crate::lidar::RangeImage;
-use crate::localization::likelihood::{Direction, View, profile};
+use crate::localization::likelihood::{Direction, View, profile, width_at_half};
 use crate::localization::observation::{Likelihood, ObservationConfig, choose_beams};
 use crate::map::{Map, SensorAttitude};
 use crate::random::stream;
@@ -30,11 +31,18 @@ pub fn draw_example(
     let observed = RangeImage::project(&scan.points, &model);
     let rendered = map.renderer.render(&map_from_lidar[row..=row], &model)?;
     let rendered = rendered.first().context("one pose gives one image")?;
-    run_output::draw_range_images(files, &observed, rendered, sequence.frames[row].number)?;
-    draw_likelihood(config, files, map, &sequence.frames[row], &observed)
+    let frame = &sequence.frames[row];
+    RangeImageStrip {
+        title: &format!("Frame {}: observed, rendered, difference", frame.number),
+        observed: &observed,
+        rendered,
+    }
+    .save(&files.plot("range_images.png")?)?;
+    draw_likelihood(config, files, map, frame, &observed)
 }
 
-/// Draws the likelihood of this run and of range-mcl around the true pose of a frame.
+/// Draws the likelihood of this run and of range-mcl around the true pose of a frame, one panel
+/// per direction.
 fn draw_likelihood(
     config: &LocalizationConfig,
     files: &RunFiles,
@@ -78,13 +86,32 @@ fn draw_likelihood(
     ];
     let mut panels = Vec::new();
     for direction in Direction::ALL {
-        let profiles = models
-            .into_iter()
-            .map(|(name, color, model)| {
-                Ok((name, color, profile(&view, &truth, direction, model)?))
-            })
-            .collect::<Result<Vec<_>>>()?;
-        panels.push((direction, profiles));
+        let (name, unit) = match direction {
+            Direction::Along => ("along", "m"),
+            Direction::Across => ("across", "m"),
+            Direction::Heading => ("heading", "deg"),
+        };
+        let mut series = Vec::new();
+        for (model, color, observation) in models {
+            let points = profile(&view, &truth, direction, observation)?;
+            let width = match width_at_half(&points) {
+                Some(width) => format!("{width:.3} {unit} wide at half height"),
+                None => "wider than shown at half height".to_owned(),
+            };
+            series.push(Series::line(&format!("{model}: {width}"), color, points));
+        }
+        panels.push(Panel {
+            y_name: "likelihood / peak".to_owned(),
+            own_x_name: Some(format!("offset {name} [{unit}]")),
+            series,
+            clip_outliers: false,
+        });
     }
-    run_output::draw_likelihood(files, frame.number, panels)
+    LineChart {
+        title: format!("Frame {}: likelihood around the true pose", frame.number),
+        x_name: String::new(),
+        panels,
+        marks: vec![(0.0, "truth".to_owned())],
+    }
+    .save(&files.plot("likelihood.png")?)
 }
