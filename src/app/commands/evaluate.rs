@@ -6,7 +6,7 @@ use anyhow::{Result, ensure};
 
 use super::input;
 use super::run_output::{self, RunFiles};
-use super::run_page;
+use super::{output, run_page};
 use crate::app::config::{self, EvaluationConfig, LocalizationConfig};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
@@ -41,7 +41,7 @@ pub fn run(config: &EvaluationConfig) -> Result<Report> {
     let report = run_output::evaluate(&results, &rules, about(config, &files)?)?;
     if config.save_evaluation_results {
         run_output::write_report(&files, &results, &report)?;
-        config::write(&files.file("evaluation.yml"), config)?;
+        output::write_yaml(&files.file("evaluation.yml"), config)?;
     }
     if config.plot_loc_traj {
         run_output::draw_run(&files, map_of(&files)?.as_ref(), &results)?;

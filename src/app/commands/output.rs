@@ -7,6 +7,7 @@ use std::path::Path;
 use anyhow::{Context as _, bail};
 use serde::Serialize;
 
+use crate::app::config::to_yaml;
 use crate::files::{temporary_beside, write_atomically};
 
 /// Checks before any work that `path` can be written: an existing file needs `--force`, and its
@@ -51,6 +52,11 @@ pub fn write_json(path: &Path, report: &impl Serialize) -> anyhow::Result<()> {
     let json = serde_json::to_string_pretty(report)
         .with_context(|| format!("cannot serialize {}", path.display()))?;
     write_text(path, &(json + "\n"))
+}
+
+/// Writes the effective configuration atomically; loading it gives an equal one.
+pub fn write_yaml(path: &Path, config: &impl Serialize) -> anyhow::Result<()> {
+    write_text(path, &to_yaml(config)?)
 }
 
 /// Prints to standard output; a closed pipe is not an error.

@@ -7,8 +7,8 @@ use anyhow::{Result, ensure};
 use super::interrupt::Interrupted;
 use super::run_output::{self, RunFiles};
 use super::stages::Inputs;
-use super::{Context, input, odometry, run_page};
-use crate::app::config::{self, OdometrySource, RefinementConfig};
+use super::{Context, input, odometry, output, run_page};
+use crate::app::config::{OdometrySource, RefinementConfig};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
 use crate::geometry::Pose2;
@@ -195,7 +195,7 @@ fn write_run(
     let files = RunFiles::beside(&config.result_file);
     run_output::write_results(&files, results)?;
     run_output::write_trajectory(&files, "refined", sequence, &refined.map_from_lidar)?;
-    config::write(&files.file("refinement.yml"), config)?;
+    output::write_yaml(&files.file("refinement.yml"), config)?;
     let odometry = odometry::description(config.odometry, config.odometry_file.as_deref());
     let about = [
         ("recording", config.scan_folder.display().to_string()),

@@ -161,12 +161,9 @@ pub fn write_report(
     results: &LocalizationResults,
     report: &Report,
 ) -> Result<()> {
-    report.write_json(&files.file("report.json"))?;
-    report.write_markdown(&files.file("report.md"))?;
-    if let Some(estimates) = &results.estimates {
-        write_frames_csv(&files.file("frames.csv"), results, estimates)?;
-    }
-    Ok(())
+    output::write_json(&files.file("report.json"), report)?;
+    output::write_text(&files.file("report.md"), &report.to_markdown())?;
+    write_frames_csv(&files.file("frames.csv"), results)
 }
 
 /// Compares the estimates and, if there is one, the refined trajectory with the ground truth.

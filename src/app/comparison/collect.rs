@@ -12,7 +12,7 @@ use super::record::RunRecord;
 use super::results::ComparisonResults;
 use super::{keys, page, tables};
 use crate::app::commands::{output, version};
-use crate::app::config::{self, ComparisonConfig};
+use crate::app::config::ComparisonConfig;
 use crate::app::reporting::{Table, csv, markdown, text};
 
 /// `comparison.json`.
@@ -45,7 +45,7 @@ pub fn collect(config: &ComparisonConfig, runs: &[PlannedRun], layout: &Layout) 
     write_tables(&tables, &layout.root)?;
     let page = page::page(&results, &tables, runs, layout)?;
     output::write_text(&layout.root.join("report.html"), &page.to_html())?;
-    config::write(&layout.root.join("comparison.yml"), config)?;
+    output::write_yaml(&layout.root.join("comparison.yml"), config)?;
     let file = ComparisonFile {
         program: version::program()?,
         tables: &tables,

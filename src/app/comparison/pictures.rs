@@ -163,7 +163,7 @@ fn read_trajectory(record: &RunRecord, color: Rgb, layout: &Layout) -> Option<Tr
         return None;
     }
     let results = LocalizationResults::read(&path)
-        .inspect_err(|error| tracing::warn!("{} is not plotted: {error}", record.id))
+        .inspect_err(|error| tracing::warn!("{} is not plotted: {error:#}", record.id))
         .ok()?;
     Some(Trajectory {
         name: record.id.configuration.clone(),

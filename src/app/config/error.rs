@@ -17,11 +17,6 @@ pub enum ConfigError {
         path: PathBuf,
         source: std::io::Error,
     },
-    #[error("cannot write the configuration {}: {source}", path.display())]
-    Write {
-        path: PathBuf,
-        source: std::io::Error,
-    },
     #[error("{place}: unknown key `{key}`{}", suggestion(nearest.as_deref()))]
     UnknownKey {
         place: String,

@@ -1,7 +1,6 @@
 //! Loading, overriding and writing of configurations.
 
 use std::fs;
-use std::io::Write as _;
 use std::path::Path;
 
 use serde::Serialize;
@@ -10,7 +9,6 @@ use serde::de::DeserializeOwned;
 use super::error::{self, ConfigError};
 use super::template::CommandConfig;
 use super::yaml::{self, keys, to_yaml};
-use crate::files::write_atomically;
 use crate::validation::Validate;
 
 /// Loads and validates the configuration of a command from `path`, else from its default path
@@ -43,17 +41,6 @@ where
 pub fn has_key<T: Default + Serialize>(key: &str) -> Result<bool, ConfigError> {
     let text = to_yaml(&T::default())?;
     Ok(keys(&text).iter().any(|it| it.name == key))
-}
-
-/// Writes the effective configuration atomically; loading it gives an equal one.
-pub fn write<T: Serialize>(path: &Path, config: &T) -> Result<(), ConfigError> {
-    let text = to_yaml(config)?;
-    write_atomically(path, |file| file.write_all(text.as_bytes())).map_err(|source| {
-        ConfigError::Write {
-            path: path.to_owned(),
-            source,
-        }
-    })
 }
 
 fn load_text<T>(name: &str, text: &str, settings: &[(String, String)]) -> Result<T, ConfigError>

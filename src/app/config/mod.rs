@@ -32,7 +32,7 @@ pub use comparison::{
 pub use error::ConfigError;
 pub use evaluation::EvaluationConfig;
 pub use ground::GroundCommandConfig;
-pub use load::{has_key, load, with_settings, write};
+pub use load::{has_key, load, with_settings};
 pub use localization::{Initialization, LocalizationConfig, MotionModel, RenderedRangeImage};
 pub use odometry::OdometrySource;
 pub use refinement::RefinementConfig;

@@ -3,28 +3,21 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use super::error::ResultsError;
+use anyhow::{Context as _, Result};
+
 use super::localization_results::LocalizationResults;
 use crate::evaluation::{PlanarError, distances_m, planar_errors};
 use crate::files::write_atomically;
 use crate::geometry::Pose2;
 
-/// Writes the table; `estimates` are those of the filter, one per frame.
-pub fn write_frames_csv(
-    path: &Path,
-    results: &LocalizationResults,
-    estimates: &[Pose2],
-) -> Result<(), ResultsError> {
-    if estimates.len() != results.len() {
-        return Err(ResultsError::WrongLength {
-            path: path.to_owned(),
-            array: "estimates",
-            found: estimates.len(),
-            expected: results.len(),
-        });
-    }
+/// Writes the table; nothing without estimates.
+pub fn write_frames_csv(path: &Path, results: &LocalizationResults) -> Result<()> {
+    let Some(estimates) = &results.estimates else {
+        return Ok(());
+    };
     let table = FrameTable::new(results, estimates);
-    write_atomically(path, |file| table.write(file)).map_err(ResultsError::write(path))
+    write_atomically(path, |file| table.write(file))
+        .with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// Columns with a title and one cell per frame.
@@ -116,19 +109,12 @@ impl FrameTable {
     }
 
     fn write(&self, file: &mut impl Write) -> io::Result<()> {
-        let titles: Vec<&str> = self
-            .columns
-            .iter()
-            .map(|column| column.0.as_str())
-            .collect();
-        writeln!(file, "{}", titles.join(","))?;
+        let mut writer = csv::Writer::from_writer(file);
+        writer.write_record(self.columns.iter().map(|(title, _)| title))?;
         for row in 0..self.rows {
-            let cells: Vec<&str> = (self.columns.iter())
-                .map(|column| column.1[row].as_str())
-                .collect();
-            writeln!(file, "{}", cells.join(","))?;
+            writer.write_record(self.columns.iter().map(|(_, cells)| &cells[row]))?;
         }
-        Ok(())
+        writer.flush()
     }
 }
 
@@ -153,11 +139,12 @@ mod tests {
         let results = LocalizationResults {
             frames: vec![1, 3, 5],
             particles,
+            estimates: Some(estimates),
             ground_truth: Some(truth),
             runtimes_s: Some(vec![0.01, 0.02, 0.03]),
             ..LocalizationResults::default()
         };
-        write_frames_csv(&path, &results, &estimates).unwrap();
+        write_frames_csv(&path, &results).unwrap();
         let text = std::fs::read_to_string(&path).unwrap();
         let lines: Vec<Vec<&str>> = text.lines().map(|line| line.split(',').collect()).collect();
         assert_eq!(lines.len(), 4);

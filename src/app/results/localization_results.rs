@@ -16,9 +16,9 @@
 //!
 //! All but the first three are optional. In rows before `start_idx` they are NaN.
 
+use anyhow::{Context as _, Result};
 use nalgebra::Matrix3;
 
-use super::error::ResultsError;
 use crate::evaluation::{ParticleRow, RangeMclRules};
 use crate::geometry::Pose2;
 
@@ -149,10 +149,7 @@ impl LocalizationResults {
     }
 
     /// The stored estimates, or if there are none, weighted means of the particles.
-    pub fn estimates_or_particle_means(
-        &self,
-        rules: &RangeMclRules,
-    ) -> Result<Vec<Pose2>, ResultsError> {
+    pub fn estimates_or_particle_means(&self, rules: &RangeMclRules) -> Result<Vec<Pose2>> {
         if let Some(estimates) = &self.estimates {
             return Ok(estimates.clone());
         }
@@ -161,31 +158,12 @@ impl LocalizationResults {
             .map(|row| {
                 let mean = rules.estimate(self.particles.frame(row), capacity);
                 let frame = self.frames[row];
-                mean.ok_or(ResultsError::ZeroWeights { frame })
+                mean.with_context(|| {
+                    format!(
+                        "the particles of frame {frame} have no weight, and the file holds no estimates; run localize again"
+                    )
+                })
             })
             .collect()
-    }
-
-    /// The first array that does not have one row per frame, and its number of rows.
-    pub(super) fn incomplete_array(&self) -> Option<(&'static str, usize)> {
-        fn length<T>(column: &Option<Vec<T>>) -> Option<usize> {
-            column.as_ref().map(Vec::len)
-        }
-        [
-            ("particles", Some(self.particles.len())),
-            ("estimates", length(&self.estimates)),
-            ("refined", length(&self.refined)),
-            ("ground_truth", length(&self.ground_truth)),
-            ("odometry", length(&self.odometry)),
-            ("covariances", length(&self.covariances)),
-            ("refined_covariances", length(&self.refined_covariances)),
-            ("times_s", length(&self.times_s)),
-            ("runtimes_s", length(&self.runtimes_s)),
-            ("refine_runtimes_s", length(&self.refine_runtimes_s)),
-            ("states", length(&self.states)),
-        ]
-        .into_iter()
-        .filter_map(|(name, length)| Some((name, length?)))
-        .find(|(_, length)| *length != self.len())
     }
 }

@@ -1,7 +1,6 @@
 //! Result files of a run: `localization.npz`, `frames.csv`, `report.json` and `report.md`.
 
 // The results of a run and their `.npz` file.
-mod error;
 mod localization_results;
 mod npz;
 mod results_file;
@@ -15,7 +14,6 @@ mod rows;
 #[cfg(test)]
 pub(crate) mod kitti_07_tests;
 
-pub use error::{ArrayError, ResultsError};
 pub use frames::write_frames_csv;
 pub use localization_results::{LocalizationResults, ParticleLog};
 pub use report::{Report, TrajectoryReport};

@@ -2,16 +2,16 @@
 //!
 //! Memory grows with the data that a file holds, not with what its headers claim.
 
+use std::fmt::Display;
 use std::fs::File;
 use std::io::{self, BufReader, BufWriter, Read, Seek, Write};
 use std::path::Path;
 
+use anyhow::{Context as _, Result, anyhow, bail, ensure};
 use npyz::{AutoSerialize, DType, Deserialize, NpyFile, NpyHeader, Order, TypeChar, WriterBuilder};
 use zip::result::ZipError;
 use zip::write::SimpleFileOptions;
 use zip::{ZipArchive, ZipWriter};
-
-use super::error::{ArrayError, ResultsError};
 
 /// Size of the buffer between decompression and numbers [bytes].
 const BUFFER_BYTES: usize = 1 << 16;
@@ -27,37 +27,25 @@ pub struct NpzReader<'a> {
 
 impl<'a> NpzReader<'a> {
     /// Opens a file.
-    pub fn open(path: &'a Path) -> Result<Self, ResultsError> {
-        let file = File::open(path).map_err(ResultsError::read(path))?;
+    pub fn open(path: &'a Path) -> Result<Self> {
+        let file = File::open(path).with_context(|| format!("cannot read {}", path.display()))?;
         let archive = ZipArchive::new(BufReader::new(file)).map_err(|error| match error {
-            ZipError::Io(source) => ResultsError::read(path)(source),
-            source => ResultsError::NotNpz {
-                path: path.to_owned(),
-                source,
-            },
+            ZipError::Io(error) => anyhow!("cannot read {}: {error}", path.display()),
+            error => not_npz(path, &error),
         })?;
         Ok(Self { path, archive })
     }
 
     /// Opens an array; `None` if the file has none of this name.
-    pub fn array(&mut self, name: &'static str) -> Result<Option<Array<'_>>, ResultsError> {
+    pub fn array(&mut self, name: &'static str) -> Result<Option<Array<'_>>> {
         let entry = match self.archive.by_name(&format!("{name}.npy")) {
             Ok(entry) => entry,
             Err(ZipError::FileNotFound) => return Ok(None),
-            Err(source) => {
-                return Err(ResultsError::NotNpz {
-                    path: self.path.to_owned(),
-                    source,
-                });
-            }
+            Err(error) => return Err(not_npz(self.path, &error)),
         };
         let bytes = entry.size();
         let entry = BufReader::with_capacity(BUFFER_BYTES, entry).take(bytes);
-        let (shape, numbers) = open_array(entry).map_err(|source| ResultsError::BadArray {
-            path: self.path.to_owned(),
-            array: name,
-            source,
-        })?;
+        let (shape, numbers) = open_array(entry).map_err(|e| bad_array(self.path, name, &e))?;
         Ok(Some(Array {
             path: self.path,
             name,
@@ -67,13 +55,26 @@ impl<'a> NpzReader<'a> {
     }
 
     /// Opens an array that must be there.
-    pub fn required(&mut self, name: &'static str) -> Result<Array<'_>, ResultsError> {
+    pub fn required(&mut self, name: &'static str) -> Result<Array<'_>> {
         let path = self.path;
-        self.array(name)?.ok_or_else(|| ResultsError::MissingArray {
-            path: path.to_owned(),
-            array: name,
+        self.array(name)?.with_context(|| {
+            format!(
+                "{} has no array `{name}`; it needs `particles` and `start_idx`, as localize and range-mcl write them",
+                path.display()
+            )
         })
     }
+}
+
+fn not_npz(path: &Path, error: &ZipError) -> anyhow::Error {
+    anyhow!(
+        "{} is not a result file (.npz) or is cut off: {error}; run localize again",
+        path.display()
+    )
+}
+
+fn bad_array(path: &Path, name: &str, error: &impl Display) -> anyhow::Error {
+    anyhow!("{}, array `{name}`: {error}", path.display())
 }
 
 /// Numbers of any type in row-major order, converted to `f64`.
@@ -90,74 +91,62 @@ pub struct Array<'a> {
 
 impl Array<'_> {
     /// Checks the shape against a pattern, in which `None` is any extent.
-    pub fn expect_shape(
-        &self,
-        pattern: &[Option<usize>],
-        expected: &'static str,
-    ) -> Result<(), ResultsError> {
+    pub fn expect_shape(&self, pattern: &[Option<usize>], expected: &'static str) -> Result<()> {
         let is_expected = self.shape.len() == pattern.len()
             && (self.shape.iter().zip(pattern))
                 .all(|(&found, expected)| expected.is_none_or(|expected| expected == found));
-        if is_expected {
-            return Ok(());
-        }
-        Err(self.error(ArrayError::WrongShape {
-            found: self.shape.clone(),
-            expected,
-        }))
+        let error = format!("its shape is {:?}, but {expected} is needed", self.shape);
+        ensure!(is_expected, bad_array(self.path, self.name, &error));
+        Ok(())
     }
 
     /// Reads the next `N` numbers; integers beyond 2⁵³ are rounded.
-    pub fn next_row<const N: usize>(&mut self) -> Result<[f64; N], ResultsError> {
+    pub fn next_row<const N: usize>(&mut self) -> Result<[f64; N]> {
         let mut row = [0.0; N];
         for number in &mut row {
             let next = self.numbers.next();
             *number = next
                 .unwrap_or_else(|| Err(io::ErrorKind::UnexpectedEof.into()))
-                .map_err(|source| self.error(source.into()))?;
+                .map_err(|error| bad_array(self.path, self.name, &unreadable(&error)))?;
         }
         Ok(row)
     }
 
     /// As [`next_row`](Self::next_row), of finite numbers; `row` is its index for the message.
-    pub fn next_finite_row<const N: usize>(
-        &mut self,
-        row: usize,
-    ) -> Result<[f64; N], ResultsError> {
+    pub fn next_finite_row<const N: usize>(&mut self, row: usize) -> Result<[f64; N]> {
         let numbers = self.next_row()?;
         match numbers.iter().find(|number| !number.is_finite()) {
-            Some(&value) => Err(ResultsError::BadNumber {
-                path: self.path.to_owned(),
-                array: self.name,
-                row,
-                value,
-            }),
+            Some(value) => bail!(
+                "{}, array `{}`, row {row}: {value} is not a valid value",
+                self.path.display(),
+                self.name
+            ),
             None => Ok(numbers),
-        }
-    }
-
-    fn error(&self, source: ArrayError) -> ResultsError {
-        ResultsError::BadArray {
-            path: self.path.to_owned(),
-            array: self.name,
-            source,
         }
     }
 }
 
+fn unreadable(error: &io::Error) -> String {
+    format!("it cannot be read: {error}")
+}
+
+fn not_numbers(found: &DType) -> anyhow::Error {
+    anyhow!(
+        "its elements are of type {}, but numbers are needed (float32, float64, int32, int64, uint8 or bool); convert it with numpy.asarray(array, float)",
+        found.descr()
+    )
+}
+
 /// Reads the header of an array and checks that the bytes after it are those that it claims.
-fn open_array<'a>(
-    mut entry: io::Take<impl Read + 'a>,
-) -> Result<(Vec<usize>, Numbers<'a>), ArrayError> {
-    let header = NpyHeader::from_reader(&mut entry)?;
+fn open_array<'a>(mut entry: io::Take<impl Read + 'a>) -> Result<(Vec<usize>, Numbers<'a>)> {
+    let header = NpyHeader::from_reader(&mut entry).map_err(|error| anyhow!(unreadable(&error)))?;
     let DType::Plain(element) = header.dtype() else {
-        return Err(ArrayError::NotNumbers {
-            found: header.dtype().descr(),
-        });
+        return Err(not_numbers(&header.dtype()));
     };
-    if header.order() == Order::Fortran && header.shape().len() > 1 {
-        return Err(ArrayError::FortranOrder);
-    }
+    ensure!(
+        header.order() != Order::Fortran || header.shape().len() <= 1,
+        "it is in Fortran order; save it with numpy.ascontiguousarray"
+    );
     let shape = header.shape().to_vec();
     let bytes = u128::from(element.size_field());
     let needed = (shape.iter()).fold(bytes, |product, &extent| {
@@ -172,19 +161,12 @@ fn open_array<'a>(
         (TypeChar::Int, 8) => numbers::<i64>(file, |number| number as f64),
         (TypeChar::Uint, 1) => numbers::<u8>(file, f64::from),
         (TypeChar::Bool, 1) => numbers::<bool>(file, f64::from),
-        _ => {
-            return Err(ArrayError::NotNumbers {
-                found: file.dtype().descr(),
-            });
-        }
+        _ => return Err(not_numbers(&file.dtype())),
     }?;
-    if needed != u128::from(found) {
-        return Err(ArrayError::WrongSize {
-            shape,
-            needed,
-            found,
-        });
-    }
+    ensure!(
+        needed == u128::from(found),
+        "its shape {shape:?} needs {needed} bytes of numbers, but there are {found}"
+    );
     let shape = shape.into_iter().map(|extent| extent as usize).collect();
     Ok((shape, numbers))
 }
@@ -192,8 +174,9 @@ fn open_array<'a>(
 fn numbers<'a, T: Deserialize + 'a>(
     file: NpyFile<impl Read + 'a>,
     convert: impl Fn(T) -> f64 + 'a,
-) -> Result<Numbers<'a>, ArrayError> {
-    let elements = file.data::<T>().map_err(io::Error::other)?;
+) -> Result<Numbers<'a>> {
+    let elements =
+        (file.data::<T>()).map_err(|error| anyhow!(unreadable(&io::Error::other(error))))?;
     Ok(Box::new(elements.map(move |element| element.map(&convert))))
 }
 

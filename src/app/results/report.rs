@@ -2,15 +2,13 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::io::{self, Write as _};
 use std::path::Path;
 
+use anyhow::{Context as _, Result, anyhow};
 use serde::{Deserialize, Serialize};
 
-use super::error::ResultsError;
 use super::rows::{MetricRow, Value, metric_rows};
 use crate::evaluation::{RangeMclErrors, TrajectoryMetrics};
-use crate::files::write_atomically;
 
 /// Errors of one trajectory.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -55,19 +53,15 @@ pub struct Report {
 }
 
 impl Report {
-    /// Writes `report.json`.
-    pub fn write_json(&self, path: &Path) -> Result<(), ResultsError> {
-        let json = serde_json::to_string_pretty(self)
-            .map_err(|error| ResultsError::write(path)(io::Error::other(error)))?;
-        write_text(path, &(json + "\n"))
-    }
-
     /// Reads `report.json`.
-    pub fn read_json(path: &Path) -> Result<Self, ResultsError> {
-        let text = std::fs::read_to_string(path).map_err(ResultsError::read(path))?;
-        serde_json::from_str(&text).map_err(|source| ResultsError::BadReport {
-            path: path.to_owned(),
-            source,
+    pub fn read_json(path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read {}", path.display()))?;
+        serde_json::from_str(&text).map_err(|error| {
+            anyhow!(
+                "{} is not a report of fpmcl: {error}; run evaluate again",
+                path.display()
+            )
         })
     }
 
@@ -116,11 +110,6 @@ impl Report {
         text
     }
 
-    /// Writes the Markdown table.
-    pub fn write_markdown(&self, path: &Path) -> Result<(), ResultsError> {
-        write_text(path, &self.to_markdown())
-    }
-
     /// Each row of the filter with the value of the same row of the refined trajectory.
     fn joined_rows(&self) -> Vec<(MetricRow, Option<Value>)> {
         let mut refined = self.refined.iter().flat_map(TrajectoryReport::rows);
@@ -134,11 +123,6 @@ impl Report {
             .map(|(name, value)| format!("{prefix}{name}: {value}\n"))
             .collect()
     }
-}
-
-fn write_text(path: &Path, text: &str) -> Result<(), ResultsError> {
-    write_atomically(path, |file| file.write_all(text.as_bytes()))
-        .map_err(ResultsError::write(path))
 }
 
 #[cfg(test)]
@@ -177,7 +161,7 @@ mod tests {
     fn a_report_reads_back() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("report.json");
-        report().write_json(&path).unwrap();
+        std::fs::write(&path, serde_json::to_string_pretty(&report()).unwrap()).unwrap();
         // To the last digit of every number.
         assert_eq!(Report::read_json(&path).unwrap(), report());
         std::fs::write(&path, "{\"mcl\": 3}").unwrap();

@@ -4,9 +4,9 @@ use std::io::{self, Seek, Write};
 use std::iter::repeat_n;
 use std::path::Path;
 
+use anyhow::{Context as _, Result, bail, ensure};
 use nalgebra::{Matrix3, Vector2};
 
-use super::error::ResultsError;
 use super::localization_results::{LocalizationResults, ParticleLog};
 use super::npz::{Array, NpzReader, NpzWriter, write_npy};
 use crate::evaluation::ParticleRow;
@@ -15,7 +15,7 @@ use crate::geometry::Pose2;
 
 impl LocalizationResults {
     /// Reads a file of fpmcl or of range-mcl.
-    pub fn read(path: &Path) -> Result<Self, ResultsError> {
+    pub fn read(path: &Path) -> Result<Self> {
         let mut npz = NpzReader::open(path)?;
         let (rows, first, particles) = read_particles(path, &mut npz)?;
         let mut file = RowReader {
@@ -51,19 +51,13 @@ impl LocalizationResults {
     ///
     /// Row k is frame k, as in range-mcl, if the frames are consecutive; otherwise there is one
     /// row per localized frame.
-    pub fn write(&self, path: &Path) -> Result<(), ResultsError> {
-        if let Some((array, found)) = self.incomplete_array() {
-            return Err(ResultsError::WrongLength {
-                path: path.to_owned(),
-                array,
-                found,
-                expected: self.len(),
-            });
-        }
-        write_atomically(path, |file| self.write_to(file)).map_err(ResultsError::write(path))
+    pub fn write(&self, path: &Path) -> Result<()> {
+        write_atomically(path, |file| self.write_to(file))
+            .with_context(|| format!("cannot write {}", path.display()))
     }
 
     fn write_to(&self, file: impl Write + Seek) -> io::Result<()> {
+        debug_assert_eq!(self.particles.len(), self.len());
         let leading = self.leading_rows();
         let rows = leading + self.len();
         let capacity = self.particles.capacity();
@@ -114,10 +108,10 @@ impl LocalizationResults {
 }
 
 /// Writes poses as a NumPy array (rows, 3) of x, y [m] and heading [rad].
-pub fn write_poses_npy(path: &Path, poses: &[Pose2]) -> Result<(), ResultsError> {
+pub fn write_poses_npy(path: &Path, poses: &[Pose2]) -> Result<()> {
     let numbers = poses.iter().flat_map(row_from_pose);
     write_atomically(path, |file| write_npy(file, &[poses.len(), 3], numbers))
-        .map_err(ResultsError::write(path))
+        .with_context(|| format!("cannot write {}", path.display()))
 }
 
 fn pose_from_row([x, y, heading]: [f64; 3]) -> Pose2 {
@@ -165,10 +159,7 @@ impl<W: Write + Seek> RowWriter<W> {
 }
 
 /// Reads the number of rows, the first row that was localized, and the particles from there on.
-fn read_particles(
-    path: &Path,
-    npz: &mut NpzReader,
-) -> Result<(usize, usize, ParticleLog), ResultsError> {
+fn read_particles(path: &Path, npz: &mut NpzReader) -> Result<(usize, usize, ParticleLog)> {
     let [start_idx] = {
         let mut array = npz.required("start_idx")?;
         array.expect_shape(&[], "one number ()")?;
@@ -181,13 +172,11 @@ fn read_particles(
         // Any number of rows would need no data.
         array.expect_shape(&[Some(0), None, None], "(frames, N, 4) with N > 0")?;
     }
-    if !(start_idx >= 0.0 && (start_idx as usize) < rows.max(1)) {
-        return Err(ResultsError::StartBehindEnd {
-            path: path.to_owned(),
-            start_idx,
-            rows,
-        });
-    }
+    ensure!(
+        start_idx >= 0.0 && (start_idx as usize) < rows.max(1),
+        "{}: start_idx is {start_idx}, but there are {rows} rows",
+        path.display()
+    );
     let first = start_idx as usize;
     let mut log = ParticleLog::new(capacity);
     for row in 0..rows {
@@ -200,11 +189,7 @@ fn read_particles(
 }
 
 /// Reads the particles of a frame without the padding after the last.
-fn next_particles(
-    array: &mut Array,
-    row: usize,
-    capacity: usize,
-) -> Result<Vec<ParticleRow>, ResultsError> {
+fn next_particles(array: &mut Array, row: usize, capacity: usize) -> Result<Vec<ParticleRow>> {
     let mut particles = Vec::new();
     let mut zeros = 0;
     for _ in 0..capacity {
@@ -235,7 +220,7 @@ impl RowReader<'_> {
         &mut self,
         name: &'static str,
         item: impl Fn([f64; N]) -> T,
-    ) -> Result<Option<Vec<T>>, ResultsError> {
+    ) -> Result<Option<Vec<T>>> {
         let Some(mut array) = self.npz.array(name)? else {
             return Ok(None);
         };
@@ -257,19 +242,17 @@ impl RowReader<'_> {
     }
 
     /// Reads the frame of each row: the row itself if the file does not contain `frames`.
-    fn frames(&mut self) -> Result<Vec<usize>, ResultsError> {
+    fn frames(&mut self) -> Result<Vec<usize>> {
         let Some(frames) = self.rows("frames", |[frame]| frame)? else {
             return Ok((self.first..self.rows).collect());
         };
         let mut previous = -1.0;
         for (row, &frame) in (self.first..).zip(&frames) {
             if frame <= previous || frame.fract() != 0.0 {
-                return Err(ResultsError::BadNumber {
-                    path: self.path.to_owned(),
-                    array: "frames",
-                    row,
-                    value: frame,
-                });
+                bail!(
+                    "{}, array `frames`, row {row}: {frame} is not a valid value",
+                    self.path.display()
+                );
             }
             previous = frame;
         }

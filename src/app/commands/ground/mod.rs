@@ -26,7 +26,7 @@ use self::report::GroundReport;
 use super::interrupt::Interrupted;
 use super::{Context, output};
 use crate::app::cli::GroundArgs;
-use crate::app::config::{self, GroundCommandConfig};
+use crate::app::config::GroundCommandConfig;
 use crate::app::plotting::color::Colormap;
 use crate::evaluation::{GroundTally, LabelledPoints};
 use crate::geometry::Vec3;
@@ -136,7 +136,7 @@ fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Resu
             .map(|((name, _), tally)| tally.report(name))
             .collect(),
     };
-    config::write(&config.output_folder.join("ground.yml"), config)?;
+    output::write_yaml(&config.output_folder.join("ground.yml"), config)?;
     output::write_json(&report_file, &report)?;
     Ok(report)
 }

@@ -13,8 +13,8 @@ use self::recorder::Run;
 use super::interrupt::Interrupted;
 use super::run_output::{self, RunFiles};
 use super::stages::Inputs;
-use super::{Context, odometry, run_page};
-use crate::app::config::{self, Initialization, LocalizationConfig, MotionModel};
+use super::{Context, odometry, output, run_page};
+use crate::app::config::{Initialization, LocalizationConfig, MotionModel};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
 use crate::geometry::Pose2;
@@ -152,7 +152,7 @@ fn write_run(
         } else {
             run_output::remove_refined(files)?;
         }
-        config::write(&files.file("localization.yml"), config)?;
+        output::write_yaml(&files.file("localization.yml"), config)?;
     }
     warn_of_untracked_frames(results);
     let about = about(config, context, map);

@@ -79,7 +79,7 @@ fn a_written_configuration_loads_to_an_equal_one() {
             },
             ..LocalizationConfig::default()
         };
-        write(&path, &config).unwrap();
+        fs::write(&path, to_yaml(&config).unwrap()).unwrap();
         let loaded: LocalizationConfig = load(Some(&path), &[]).unwrap();
         assert_eq!(loaded, config);
     }
@@ -89,7 +89,8 @@ fn a_written_configuration_loads_to_an_equal_one() {
 fn writing_makes_the_folder_and_leaves_nothing_else_in_it() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a/b/effective.yml");
-    write(&path, &EvaluationConfig::default()).unwrap();
+    let text = to_yaml(&EvaluationConfig::default()).unwrap();
+    fs::write(&path, text).unwrap();
     assert_eq!(fs::read_dir(path.parent().unwrap()).unwrap().count(), 1);
 }
 
