@@ -16,8 +16,8 @@ const KNOT_SPACING_M: f64 = 2.0;
 /// recorded poses [m].
 const SMOOTHING_M: f64 = 4.0;
 
-/// Length of the shortest recorded drive that makes a centreline [m].
-const SHORTEST_M: f64 = 10.0;
+/// Length of the shortest path that can be driven [m].
+pub(super) const SHORTEST_M: f64 = 10.0;
 
 /// A piece of the driven path: an arc (straight where `turn_deg` is 0) of constant grade.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]

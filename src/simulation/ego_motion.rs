@@ -45,17 +45,14 @@ pub struct MotionConfig {
     #[default(1.73)]
     pub sensor_height_m: f64,
     /// Amplitude of the pitch of the suspension [deg].
-    #[serde(rename = "nodding_deg")]
     #[default(0.3)]
-    pub pitch_amplitude_deg: f64,
+    pub nodding_deg: f64,
     /// Amplitude of the roll of the suspension [deg].
-    #[serde(rename = "rolling_deg")]
     #[default(0.2)]
-    pub roll_amplitude_deg: f64,
+    pub rolling_deg: f64,
     /// Amplitude of the heave of the suspension [m].
-    #[serde(rename = "heaving_m")]
     #[default(0.01)]
-    pub heave_amplitude_m: f64,
+    pub heaving_m: f64,
     /// First frame at which the vehicle is somewhere else without its odometry noticing (the
     /// kidnapped robot problem); null: never.
     pub kidnapped_at_frame: Option<usize>,
@@ -154,9 +151,9 @@ impl EgoMotion {
             0.65 * slow + 0.35 * fast
         };
         let config = &self.config;
-        let pitch_rad = config.pitch_amplitude_deg.to_radians() * oscillation(1.9, 2);
-        let roll_rad = config.roll_amplitude_deg.to_radians() * oscillation(2.7, 4);
-        let height_m = config.sensor_height_m + config.heave_amplitude_m * oscillation(1.3, 6);
+        let pitch_rad = config.nodding_deg.to_radians() * oscillation(1.9, 2);
+        let roll_rad = config.rolling_deg.to_radians() * oscillation(2.7, 4);
+        let height_m = config.sensor_height_m + config.heaving_m * oscillation(1.3, 6);
         Pose3::from_parts(
             Translation3::new(0.0, 0.0, height_m),
             UnitQuaternion::from_euler_angles(roll_rad, pitch_rad, 0.0),

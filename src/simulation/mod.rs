@@ -56,13 +56,11 @@ pub use traffic::TrafficConfig;
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
 use crate::recording::Calibration;
 use crate::validation::Validate as _;
+use centreline::SHORTEST_M;
 use odometry::drifting_odometry;
 use random::{Purpose, stream};
 use scanner::{ScanTarget, simulate_scan};
 use traffic::Traffic;
-
-/// Length of the shortest path that can be driven [m].
-const SHORTEST_PATH_M: f64 = 10.0;
 
 /// A street and one drive through it.
 pub struct Simulation {
@@ -207,7 +205,7 @@ fn driven_path(
 ) -> Result<(Centreline, Option<Vec<f64>>), SimulationError> {
     let too_short = |length_m: f64| SimulationError::PathTooShort {
         length_m,
-        least_m: SHORTEST_PATH_M,
+        least_m: SHORTEST_M,
     };
     let sensor_height_m = config.motion.sensor_height_m;
     if let Some(poses) = recorded {
@@ -216,7 +214,7 @@ fn driven_path(
         return Ok((path, Some(stations_m)));
     }
     let length_m = config.path.iter().map(|segment| segment.length_m).sum();
-    if length_m < SHORTEST_PATH_M {
+    if length_m < SHORTEST_M {
         return Err(too_short(length_m));
     }
     let path = Centreline::from_segments(&config.path, -sensor_height_m);

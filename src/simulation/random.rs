@@ -1,8 +1,7 @@
 //! Counter-based random streams: the numbers of a stream depend on the seed, its purpose and its
 //! index alone, never on the thread that draws or on what was drawn elsewhere.
 
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
+use crate::random::Generator;
 
 /// Purpose of random numbers; each has its own streams.
 #[derive(Clone, Copy, Debug)]
@@ -22,8 +21,6 @@ pub(super) enum Purpose {
 }
 
 /// Stream number `index` of a purpose: the only source of generators in this module.
-pub(super) fn stream(seed: u64, purpose: Purpose, index: u64) -> ChaCha8Rng {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    rng.set_stream(((purpose as u64) << 56) | index);
-    rng
+pub(super) fn stream(seed: u64, purpose: Purpose, index: u64) -> Generator {
+    crate::random::stream(seed, ((purpose as u64) << 56) | index)
 }

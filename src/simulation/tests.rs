@@ -303,9 +303,9 @@ fn a_lorry_before_the_start_or_at_no_finite_time_is_an_error() {
 fn the_lidar_has_its_height_above_the_road_and_the_slope_of_it() {
     let config = SimulationConfig {
         motion: MotionConfig {
-            pitch_amplitude_deg: 0.0,
-            roll_amplitude_deg: 0.0,
-            heave_amplitude_m: 0.0,
+            nodding_deg: 0.0,
+            rolling_deg: 0.0,
+            heaving_m: 0.0,
             ..MotionConfig::default()
         },
         ..small()
@@ -349,9 +349,9 @@ fn kitti_07_closes_its_loop() {
     let Some(recorded) = kitti_07() else { return };
     let config = SimulationConfig {
         motion: MotionConfig {
-            pitch_amplitude_deg: 0.0,
-            roll_amplitude_deg: 0.0,
-            heave_amplitude_m: 0.0,
+            nodding_deg: 0.0,
+            rolling_deg: 0.0,
+            heaving_m: 0.0,
             ..MotionConfig::default()
         },
         ..SimulationConfig::default()

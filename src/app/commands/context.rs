@@ -8,15 +8,13 @@ use super::progress::Progress;
 use crate::app::cli::{MachineArgs, Verbosity};
 use crate::rendering::Backend;
 
-/// Machine, verbosity and user interface of a command.
+/// Machine and user interface of a command.
 #[derive(Clone, Debug)]
 pub struct Context {
     /// Number of threads.
     pub threads: usize,
     /// Processor that renders the map.
     pub backend: Backend,
-    /// Amount of output on standard error.
-    pub verbosity: Verbosity,
     /// Interruption by the user.
     pub interrupt: Interrupt,
     /// Progress display.
@@ -39,7 +37,6 @@ impl Context {
         Ok(Self {
             threads: rayon::current_num_threads(),
             backend: machine.backend.into(),
-            verbosity,
             interrupt: Interrupt::install().context("listening for Ctrl-C")?,
             progress,
             log,

@@ -1,6 +1,6 @@
 //! Output of commands: files, written atomically, and standard output.
 
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
@@ -59,6 +59,28 @@ pub fn write_yaml(path: &Path, config: &impl Serialize) -> anyhow::Result<()> {
     write_text(path, &to_yaml(config)?)
 }
 
+/// Formats rows of a name and a value for standard output.
+pub fn rows(rows: &[(&str, String)]) -> String {
+    rows.iter()
+        .map(|(name, value)| format!("{name:<24} {value:>14}\n"))
+        .collect()
+}
+
+/// Creates a folder and those above it.
+pub fn create_folder(folder: &Path) -> anyhow::Result<()> {
+    fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))
+}
+
+/// Removes a file, if it exists.
+pub fn remove_if_exists(path: &Path) -> anyhow::Result<()> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => {
+            Err(error).with_context(|| format!("cannot remove {}", path.display()))
+        }
+        _ => Ok(()),
+    }
+}
+
 /// Prints to standard output; a closed pipe is not an error.
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut stdout = io::stdout().lock();
@@ -75,8 +97,6 @@ pub fn print(text: &str) -> anyhow::Result<()> {
 
 #[cfg(test)]
 mod tests {
-    use std::fs;
-
     use super::*;
 
     #[test]

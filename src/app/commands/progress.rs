@@ -93,11 +93,6 @@ impl Task {
         self.bar.set_message(text.to_owned());
     }
 
-    /// Number of completed steps.
-    pub fn done(&self) -> usize {
-        self.bar.position() as usize
-    }
-
     /// Whether enough time has passed since the last line; true for only one of many threads.
     fn line_is_due(&self) -> bool {
         let Some(last_line_ms) = &self.last_line_ms else {
@@ -178,7 +173,7 @@ mod tests {
                 scope.spawn(|| (0..100).for_each(|_| task.advance(1)));
             }
         });
-        assert_eq!(task.done(), 400);
+        assert_eq!(task.bar.position(), 400);
     }
 
     #[test]

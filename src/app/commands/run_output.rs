@@ -59,8 +59,7 @@ impl RunFiles {
 
     fn in_folder(&self, folder: &str, name: &str) -> Result<PathBuf> {
         let folder = self.folder.join(folder);
-        std::fs::create_dir_all(&folder)
-            .with_context(|| format!("cannot create {}", folder.display()))?;
+        output::create_folder(&folder)?;
         Ok(folder.join(name))
     }
 }
@@ -95,13 +94,9 @@ pub fn prepare(files: &RunFiles, key: &str, force: bool) -> Result<()> {
 
 /// Removes the files that refinement added to an earlier result.
 pub fn remove_refined(files: &RunFiles) -> Result<()> {
-    for path in REFINEMENT_FILES.map(|name| files.file(name)) {
-        if path.exists() {
-            std::fs::remove_file(&path)
-                .with_context(|| format!("cannot remove {}", path.display()))?;
-        }
-    }
-    Ok(())
+    REFINEMENT_FILES
+        .iter()
+        .try_for_each(|name| output::remove_if_exists(&files.file(name)))
 }
 
 /// Particles in the layout of the results.

@@ -81,10 +81,7 @@ pub fn run(config: &SimulationConfig, existing: Existing, context: &Context) -> 
         ("path", format!("{:.1} m", report.driven_m)),
         ("triangles of the street", report.triangles.to_string()),
     ];
-    Ok(rows
-        .iter()
-        .map(|(name, value)| format!("{name:<24} {value:>14}\n"))
-        .collect())
+    Ok(output::rows(&rows))
 }
 
 /// Simulates a drive and writes what is missing of it. `progress` gets the number of finished
@@ -258,10 +255,9 @@ fn remove_drive(folder: &Path) -> Result<()> {
             }
         }
     }
-    for path in paths.iter().filter(|path| path.exists()) {
-        fs::remove_file(path).with_context(|| format!("cannot remove {}", path.display()))?;
-    }
-    Ok(())
+    paths
+        .iter()
+        .try_for_each(|path| output::remove_if_exists(path))
 }
 
 /// Writes what does not depend on the scans: configuration, executable's hash and street.

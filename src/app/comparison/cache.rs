@@ -47,8 +47,7 @@ pub fn get_or_create(
             .with_context(|| format!("{} is damaged; remove it", mark.display()))?;
         finished.seconds
     } else {
-        fs::create_dir_all(&folder)
-            .with_context(|| format!("cannot create {}", folder.display()))?;
+        output::create_folder(&folder)?;
         let start = Instant::now();
         create(&folder)?;
         let seconds = start.elapsed().as_secs_f64();
@@ -60,7 +59,7 @@ pub fn get_or_create(
 
 /// Waits for the exclusive lock `folder/name.lock`, which is held until the file is dropped.
 pub fn lock(folder: &Path, name: &str) -> Result<File> {
-    fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
+    output::create_folder(folder)?;
     let path = folder.join(format!("{name}.lock"));
     let context = || format!("cannot lock {}", path.display());
     let lock = File::create(&path).with_context(context)?;

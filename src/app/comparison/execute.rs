@@ -84,13 +84,8 @@ impl<'a> Executor<'a> {
     /// files. A failure becomes the outcome; only an interrupt is an error.
     fn execute(&self, run: &PlannedRun, keys: Keys) -> Result<RunRecord> {
         let folder = self.layout.run(&run.id);
-        fs::create_dir_all(&folder)
-            .with_context(|| format!("cannot create {}", folder.display()))?;
-        let record_file = folder.join(RECORD_FILE);
-        if record_file.exists() {
-            fs::remove_file(&record_file)
-                .with_context(|| format!("cannot remove {}", record_file.display()))?;
-        }
+        output::create_folder(&folder)?;
+        output::remove_if_exists(&folder.join(RECORD_FILE))?;
         let _log = self.context.log.write_to(&folder.join(LOG_FILE))?;
         let mut stages = Stages::default();
         let outcome = match self.run_stages(run, &keys, &mut stages) {
@@ -281,7 +276,7 @@ fn processor() -> Option<String> {
 
 /// Copies the content of a folder, except for [`cache::FINISHED_FILE`] and the log.
 fn copy_folder(from: &Path, to: &Path) -> Result<()> {
-    fs::create_dir_all(to).with_context(|| format!("cannot create {}", to.display()))?;
+    output::create_folder(to)?;
     for entry in fs::read_dir(from).with_context(|| format!("cannot read {}", from.display()))? {
         let entry = entry?;
         let name = entry.file_name();

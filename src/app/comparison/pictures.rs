@@ -1,13 +1,11 @@
 //! Plots of a comparison, each as an element of its page.
 
-use std::fs;
-
-use anyhow::{Context as _, Result};
+use anyhow::Result;
 
 use super::layout::Layout;
 use super::record::RunRecord;
 use super::results::{ComparisonResults, success_rate};
-use crate::app::commands::run_page::picture;
+use crate::app::commands::{output, run_page::picture};
 use crate::app::plotting::color::{Rgb, SERIES};
 use crate::app::plotting::{LineChart, Mark, Panel, PathPlot, Series, error_chart};
 use crate::app::reporting::{PageElement, SuccessRate};
@@ -193,7 +191,7 @@ fn save_chart(
 /// Path of a plot, whose folder is created.
 fn plot_path(name: &str, layout: &Layout) -> Result<std::path::PathBuf> {
     let folder = layout.root.join("plots");
-    fs::create_dir_all(&folder).with_context(|| format!("cannot create {}", folder.display()))?;
+    output::create_folder(&folder)?;
     Ok(folder.join(name))
 }
 

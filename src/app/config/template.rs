@@ -22,44 +22,27 @@ pub trait CommandConfig: Validate + Default + Serialize + DeserializeOwned {
     const FULL: &'static str;
 }
 
-impl CommandConfig for BuildMapConfig {
-    const PATH: &'static str = "config/build_map.yml";
-    const SHORT: &'static str = include_str!("../../../config/build_map.yml");
-    const FULL: &'static str = include_str!("full/build_map.yml");
+/// Implements [`CommandConfig`] from the name of the file; `short` has one text for both.
+macro_rules! command_config {
+    ($config:ty, $name:literal, short) => {
+        command_config!(@ $config, $name, Self::SHORT);
+    };
+    ($config:ty, $name:literal) => {
+        command_config!(@ $config, $name, include_str!(concat!("full/", $name, ".yml")));
+    };
+    (@ $config:ty, $name:literal, $full:expr) => {
+        impl CommandConfig for $config {
+            const PATH: &'static str = concat!("config/", $name, ".yml");
+            const SHORT: &'static str = include_str!(concat!("../../../config/", $name, ".yml"));
+            const FULL: &'static str = $full;
+        }
+    };
 }
 
-impl CommandConfig for LocalizationConfig {
-    const PATH: &'static str = "config/localization.yml";
-    const SHORT: &'static str = include_str!("../../../config/localization.yml");
-    const FULL: &'static str = include_str!("full/localization.yml");
-}
-
-impl CommandConfig for RefinementConfig {
-    const PATH: &'static str = "config/refinement.yml";
-    const SHORT: &'static str = include_str!("../../../config/refinement.yml");
-    const FULL: &'static str = include_str!("full/refinement.yml");
-}
-
-impl CommandConfig for EvaluationConfig {
-    const PATH: &'static str = "config/evaluation.yml";
-    const SHORT: &'static str = include_str!("../../../config/evaluation.yml");
-    const FULL: &'static str = Self::SHORT;
-}
-
-impl CommandConfig for GroundCommandConfig {
-    const PATH: &'static str = "config/ground.yml";
-    const SHORT: &'static str = include_str!("../../../config/ground.yml");
-    const FULL: &'static str = include_str!("full/ground.yml");
-}
-
-impl CommandConfig for SimulationConfig {
-    const PATH: &'static str = "config/simulation.yml";
-    const SHORT: &'static str = include_str!("../../../config/simulation.yml");
-    const FULL: &'static str = include_str!("full/simulation.yml");
-}
-
-impl CommandConfig for ComparisonConfig {
-    const PATH: &'static str = "config/comparison.yml";
-    const SHORT: &'static str = include_str!("../../../config/comparison.yml");
-    const FULL: &'static str = Self::SHORT;
-}
+command_config!(BuildMapConfig, "build_map");
+command_config!(LocalizationConfig, "localization");
+command_config!(RefinementConfig, "refinement");
+command_config!(EvaluationConfig, "evaluation", short);
+command_config!(GroundCommandConfig, "ground");
+command_config!(SimulationConfig, "simulation");
+command_config!(ComparisonConfig, "comparison", short);

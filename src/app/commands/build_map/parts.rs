@@ -44,8 +44,6 @@ impl Parts {
                 fs::remove_dir_all(&folder)
                     .with_context(|| format!("cannot remove {}", folder.display()))?;
             }
-            fs::create_dir_all(&folder)
-                .with_context(|| format!("cannot create {}", folder.display()))?;
             output::write_text(&inputs_file, inputs)?;
         }
         Ok(Self { folder })

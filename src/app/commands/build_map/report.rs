@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use crate::app::commands::output;
 use crate::evaluation::{MapQuality, TruthAgreement};
 use crate::geometry::TriangleMesh;
 use crate::map::{LocalMapCounts, MappingPath};
@@ -120,8 +121,6 @@ impl BuildReport {
                 ("median to the truth", centimetres(truth.median_m)),
             ]);
         }
-        rows.iter()
-            .map(|(name, value)| format!("{name:<24} {value:>14}\n"))
-            .collect()
+        output::rows(&rows)
     }
 }

@@ -17,8 +17,7 @@ mod report;
 mod simulated;
 
 use std::fmt::Write as _;
-use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 
@@ -148,12 +147,9 @@ fn write_scan(
     scan: &LabelledPoints,
     confidences: &[f32],
 ) -> Result<()> {
-    let output_path = |folder: &str, extension: &str| -> Result<PathBuf> {
+    let output_path = |folder: &str, extension: &str| {
         let path = config.output_folder.join(folder).join(name);
-        let folder = path.parent().unwrap_or(&path);
-        fs::create_dir_all(folder)
-            .with_context(|| format!("cannot create {}", folder.display()))?;
-        Ok(path.with_extension(extension))
+        path.with_extension(extension)
     };
     if config.write_labels {
         let class = |&confidence: &f32| {
@@ -161,12 +157,12 @@ fn write_scan(
             if is_ground { GROUND_CLASS } else { OTHER_CLASS }
         };
         let classes: Vec<u16> = confidences.iter().map(class).collect();
-        let path = output_path("labels", "label")?;
+        let path = output_path("labels", "label");
         output::write_file(&path, |file| velodyne::write_labels(file, &classes))?;
     }
     if config.write_plys {
         let colors = Colormap::Diverging.colors(confidences);
-        let path = output_path("points", "ply")?;
+        let path = output_path("points", "ply");
         ply::write_points(&path, &scan.points, &colors, confidences)?;
     }
     Ok(())

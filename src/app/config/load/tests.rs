@@ -86,15 +86,6 @@ fn a_written_configuration_loads_to_an_equal_one() {
 }
 
 #[test]
-fn writing_makes_the_folder_and_leaves_nothing_else_in_it() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("a/b/effective.yml");
-    let text = to_yaml(&EvaluationConfig::default()).unwrap();
-    fs::write(&path, text).unwrap();
-    assert_eq!(fs::read_dir(path.parent().unwrap()).unwrap().count(), 1);
-}
-
-#[test]
 fn an_unknown_key_is_reported_with_its_line_and_the_nearest_key() {
     let message = message_of("seed: 1\nnumparticles: 100\n", &[]);
     assert_contains(
