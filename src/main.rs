@@ -18,6 +18,6 @@ fn main() -> ExitCode {
 }
 
 fn run(cli: &Cli) -> anyhow::Result<()> {
-    let context = Context::new(cli.verbosity(), cli.command.machine())?;
+    let context = Context::new(cli.level(), cli.command.machine())?;
     commands::run(&cli.command, &context)
 }

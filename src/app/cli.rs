@@ -4,6 +4,7 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
+use tracing::level_filters::LevelFilter;
 
 use crate::app::comparison::RunId;
 use crate::rendering::Backend;
@@ -285,27 +286,14 @@ impl From<BackendArg> for Backend {
     }
 }
 
-/// Amount of output on standard error.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verbosity {
-    /// Errors only.
-    Quiet,
-    /// Progress and warnings.
-    Normal,
-    /// Details.
-    Verbose,
-    /// Everything.
-    Everything,
-}
-
 impl Cli {
-    /// Amount of output on standard error.
-    pub fn verbosity(&self) -> Verbosity {
+    /// Least important messages on standard error.
+    pub fn level(&self) -> LevelFilter {
         match (self.quiet, self.verbose) {
-            (true, _) => Verbosity::Quiet,
-            (false, 0) => Verbosity::Normal,
-            (false, 1) => Verbosity::Verbose,
-            (false, _) => Verbosity::Everything,
+            (true, _) => LevelFilter::ERROR,
+            (false, 0) => LevelFilter::INFO,
+            (false, 1) => LevelFilter::DEBUG,
+            (false, _) => LevelFilter::TRACE,
         }
     }
 }

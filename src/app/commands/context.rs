@@ -1,11 +1,12 @@
 //! What every command gets beside its configuration.
 
 use anyhow::Context as _;
+use tracing::level_filters::LevelFilter;
 
 use super::interrupt::Interrupt;
 use super::logging::{self, RunLog};
 use super::progress::Progress;
-use crate::app::cli::{MachineArgs, Verbosity};
+use crate::app::cli::MachineArgs;
 use crate::rendering::Backend;
 
 /// Machine and user interface of a command.
@@ -25,10 +26,10 @@ pub struct Context {
 
 impl Context {
     /// Starts logging, the thread pool and the handling of Ctrl-C, once per process.
-    pub fn new(verbosity: Verbosity, machine: MachineArgs) -> anyhow::Result<Self> {
-        let progress = Progress::new(verbosity);
+    pub fn new(level: LevelFilter, machine: MachineArgs) -> anyhow::Result<Self> {
+        let progress = Progress::new(level);
         let log = RunLog::default();
-        logging::start(verbosity, &progress, &log);
+        logging::start(level, &progress, &log);
         let threads = machine.threads.map_or(0, usize::from);
         rayon::ThreadPoolBuilder::new()
             .num_threads(threads)

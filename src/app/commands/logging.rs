@@ -13,16 +13,9 @@ use tracing_subscriber::util::SubscriberInitExt as _;
 use tracing_subscriber::{Layer as _, fmt};
 
 use super::progress::Progress;
-use crate::app::cli::Verbosity;
 
 /// Starts logging; a second call in the same process has no effect.
-pub(super) fn start(verbosity: Verbosity, progress: &Progress, log: &RunLog) {
-    let level = match verbosity {
-        Verbosity::Quiet => LevelFilter::ERROR,
-        Verbosity::Normal => LevelFilter::INFO,
-        Verbosity::Verbose => LevelFilter::DEBUG,
-        Verbosity::Everything => LevelFilter::TRACE,
-    };
+pub(super) fn start(level: LevelFilter, progress: &Progress, log: &RunLog) {
     let detailed = level > LevelFilter::INFO;
     let progress = progress.clone();
     let colored = progress.is_terminal();

@@ -6,8 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
-
-use crate::app::cli::Verbosity;
+use tracing::level_filters::LevelFilter;
 
 /// Time between two lines without a terminal.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
@@ -39,9 +38,9 @@ pub struct Task {
 
 impl Progress {
     /// Bars if standard error is a terminal, otherwise lines; silent if quiet.
-    pub fn new(verbosity: Verbosity) -> Self {
-        match verbosity {
-            Verbosity::Quiet => Self::Silent,
+    pub fn new(level: LevelFilter) -> Self {
+        match level {
+            LevelFilter::ERROR => Self::Silent,
             _ if std::io::stderr().is_terminal() => Self::Bars(MultiProgress::new()),
             _ => Self::Lines,
         }

@@ -14,7 +14,6 @@ use crate::map::scan_cloud::ScanConfig;
 use crate::map::visibility::VisibilityConfig;
 use crate::map::{LocalMapConfig, MapConfig};
 use crate::meshing::PoissonConfig;
-use crate::recording::Selection;
 use crate::validation::{InvalidValue, Validate, in_range, require};
 
 /// Configuration of `build-map`: the keys of range-mcl's `build_map.yml`, then new ones.
@@ -135,15 +134,6 @@ pub struct BuildMapConfig {
 }
 
 impl BuildMapConfig {
-    /// Selection of the mapping frames.
-    pub fn selection(&self) -> Selection {
-        Selection {
-            start_idx: self.start_idx,
-            n_scans: self.n_scans,
-            frame_step: self.frame_step,
-        }
-    }
-
     /// The build of the map.
     pub fn map(&self) -> MapConfig {
         MapConfig {

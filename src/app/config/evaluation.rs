@@ -6,7 +6,6 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::check::path;
-use crate::recording::Selection;
 use crate::validation::{InvalidValue, Validate, at_least_one, positive, require};
 
 /// Configuration of `evaluate`: the keys of range-mcl's `evaluation.yml`, then new ones.
@@ -51,17 +50,6 @@ pub struct EvaluationConfig {
     /// Step between frames: n uses every n-th frame.
     #[default(1)]
     pub frame_step: usize,
-}
-
-impl EvaluationConfig {
-    /// Selection of the frames.
-    pub fn selection(&self) -> Selection {
-        Selection {
-            start_idx: self.start_idx,
-            n_scans: self.n_scans,
-            frame_step: self.frame_step,
-        }
-    }
 }
 
 impl Validate for EvaluationConfig {

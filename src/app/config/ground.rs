@@ -7,7 +7,6 @@ use smart_default::SmartDefault;
 
 use super::check::path;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
-use crate::recording::Selection;
 use crate::validation::{InvalidValue, Validate, in_range};
 
 /// Configuration of `ground`.
@@ -59,15 +58,6 @@ pub struct GroundCommandConfig {
 }
 
 impl GroundCommandConfig {
-    /// Selection of the frames.
-    pub fn selection(&self) -> Selection {
-        Selection {
-            start_idx: self.start_idx,
-            n_scans: self.n_scans,
-            frame_step: self.frame_step,
-        }
-    }
-
     /// The ground classifier and its parameters.
     pub fn ground(&self) -> GroundConfig {
         GroundConfig {

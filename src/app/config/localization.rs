@@ -20,7 +20,6 @@ use crate::localization::tracking_loss::TrackingLossConfig;
 use crate::localization::{LocalizerConfig, SensorConfig};
 use crate::map::PanoramaConfig;
 use crate::map::scan_cloud::ScanConfig;
-use crate::recording::Selection;
 use crate::refinement::{RefinementConfig, RefinerConfig};
 use crate::validation::{
     InvalidValue, Validate, at_least_one, nested, not_negative, positive, rectangle,
@@ -234,15 +233,6 @@ impl Default for RenderedRangeImage {
 }
 
 impl LocalizationConfig {
-    /// Selection of the frames.
-    pub fn selection(&self) -> Selection {
-        Selection {
-            start_idx: self.start_idx,
-            n_scans: self.n_scans,
-            frame_step: self.frame_step,
-        }
-    }
-
     /// Configuration of the filter.
     pub fn localizer(&self) -> LocalizerConfig {
         LocalizerConfig {

@@ -11,7 +11,6 @@ use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGr
 use crate::lidar::{LidarModel, RotationDirection};
 use crate::localization::SensorConfig;
 use crate::localization::observation::ObservationConfig;
-use crate::recording::Selection;
 use crate::refinement::{self, RefinerConfig};
 use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 
@@ -110,16 +109,6 @@ impl RefinementConfig {
             force: localization.force,
         }
     }
-
-    /// Selection of the frames.
-    pub fn selection(&self) -> Selection {
-        Selection {
-            start_idx: self.start_idx,
-            n_scans: self.n_scans,
-            frame_step: self.frame_step,
-        }
-    }
-
     /// The ground classifier of the scans and its parameters.
     pub fn ground(&self) -> GroundConfig {
         GroundConfig {

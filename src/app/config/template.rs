@@ -1,4 +1,5 @@
-//! Built-in texts of the configurations.
+//! What the configurations of several commands have in common: built-in texts, and the keys that
+//! select frames.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -9,6 +10,7 @@ use super::evaluation::EvaluationConfig;
 use super::ground::GroundCommandConfig;
 use super::localization::LocalizationConfig;
 use super::refinement::RefinementConfig;
+use crate::recording::Selection;
 use crate::simulation::SimulationConfig;
 use crate::validation::Validate;
 
@@ -46,3 +48,27 @@ command_config!(EvaluationConfig, "evaluation", short);
 command_config!(GroundCommandConfig, "ground");
 command_config!(SimulationConfig, "simulation");
 command_config!(ComparisonConfig, "comparison", short);
+
+/// Adds the frames that the keys `start_idx`, `n_scans` and `frame_step` select.
+macro_rules! selection {
+    ($($config:ty),*) => {
+        $(impl $config {
+            /// Selection of the frames.
+            pub fn selection(&self) -> Selection {
+                Selection {
+                    start_idx: self.start_idx,
+                    n_scans: self.n_scans,
+                    frame_step: self.frame_step,
+                }
+            }
+        })*
+    };
+}
+
+selection!(
+    BuildMapConfig,
+    LocalizationConfig,
+    RefinementConfig,
+    EvaluationConfig,
+    GroundCommandConfig
+);

@@ -92,13 +92,11 @@ impl PathPlot<'_> {
     }
 }
 
-/// Position and heading error of trajectories: the name and color of each, and its errors over
-/// time, frame number or distance.
-pub fn error_chart(
-    title: &str,
-    x_name: &str,
-    trajectories: &[(&str, Rgb, Vec<(f64, PlanarError)>)],
-) -> LineChart {
+/// Name and color of a trajectory, and its errors over time, frame number or distance.
+pub type NamedErrors<'a> = (&'a str, Rgb, Vec<(f64, PlanarError)>);
+
+/// Position and heading error of trajectories.
+pub fn error_chart(title: &str, x_name: &str, trajectories: &[NamedErrors]) -> LineChart {
     let panel = |y_name: &str, value: fn(&PlanarError) -> f64| {
         let series = trajectories.iter().map(|(name, color, errors)| {
             let points = errors.iter().map(|(x, error)| (*x, value(error)));
