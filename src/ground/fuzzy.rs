@@ -9,7 +9,7 @@ use super::classifier::GroundClassifier;
 use super::features::{FeatureConfig, Features, ScanFeatures};
 use super::inference::{FuzzySystem, Inference};
 use super::membership::{MembershipFunction, Operators};
-use super::rules::{RuleError, Vocabulary};
+use super::rules::Vocabulary;
 use crate::validation::{InvalidValue, Validate, in_range, nested};
 
 /// The output variable of the rules.
@@ -86,8 +86,7 @@ impl Validate for FuzzyConfig {
         nested("features", &self.features)?;
         in_range("definitely", self.definitely, 0.5..=1.0)?;
         in_range("probably", self.probably, 0.5..=self.definitely)?;
-        FuzzyGround::new(self.clone())?;
-        Ok(())
+        FuzzyGround::new(self.clone()).map(|_| ())
     }
 }
 
@@ -150,28 +149,17 @@ pub struct Explanation {
     pub features: Features,
     /// Set name and degree of membership of every set, per feature.
     pub memberships: Vec<Vec<(String, f32)>>,
-    /// The rules that fired, by descending firing strength.
-    pub fired: Vec<FiredRule>,
+    /// Firing strength, 0 to 1, and text of the rules that fired; by descending strength.
+    pub fired: Vec<(f32, String)>,
     /// Confidence that the point is ground, 0 to 1.
     pub confidence: f32,
     /// The confidence in words.
     pub verdict: &'static str,
 }
 
-/// A rule with a firing strength greater than 0.
-#[derive(Clone, Debug, PartialEq)]
-pub struct FiredRule {
-    /// The text of the rule in the configuration.
-    pub rule: String,
-    /// Firing strength, 0 to 1.
-    pub strength: f32,
-    /// The output set of the consequent.
-    pub consequent: String,
-}
-
 impl FuzzyGround {
     /// Parses the rule base of the configuration.
-    pub fn new(config: FuzzyConfig) -> Result<Self, RuleError> {
+    pub fn new(config: FuzzyConfig) -> Result<Self, InvalidValue> {
         let system = FuzzySystem::new(
             &config.variables,
             &config.rules,
@@ -198,16 +186,9 @@ impl FuzzyGround {
     pub fn explain(&self, features: &Features) -> Explanation {
         let inputs = features.to_array();
         let strengths = self.system.firing_strengths(&inputs).into_iter();
-        let mut fired: Vec<FiredRule> = strengths
-            .zip(&self.config.rules)
-            .filter(|((strength, _), _)| *strength > 0.0)
-            .map(|((strength, consequent), rule)| FiredRule {
-                rule: rule.clone(),
-                strength,
-                consequent: consequent.to_owned(),
-            })
-            .collect();
-        fired.sort_by(|a, b| b.strength.total_cmp(&a.strength));
+        let mut fired: Vec<(f32, String)> = strengths.zip(self.config.rules.clone()).collect();
+        fired.retain(|(strength, _)| *strength > 0.0);
+        fired.sort_by(|a, b| b.0.total_cmp(&a.0));
         let confidence = self.confidence(features);
         Explanation {
             features: *features,
@@ -253,8 +234,8 @@ impl fmt::Display for Explanation {
             }
             writeln!(f)?;
         }
-        for rule in &self.fired {
-            writeln!(f, "{:16.2} {}", rule.strength, rule.rule)?;
+        for (strength, rule) in &self.fired {
+            writeln!(f, "{strength:16.2} {rule}")?;
         }
         let (confidence, verdict) = (self.confidence, self.verdict);
         write!(f, "{OUTPUT:>16} {confidence:8.3}      {verdict}")

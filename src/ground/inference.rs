@@ -13,7 +13,8 @@ use serde::{Deserialize, Serialize};
 
 use super::defuzzification::{CentroidDefuzzifier, UNDECIDED};
 use super::membership::{MembershipFunction, Operators};
-use super::rules::{self, Clause, RuleError, Then, Variable, Vocabulary};
+use super::rules::{self, Clause, Then, Variable, Vocabulary};
+use crate::validation::InvalidValue;
 
 /// Method of inference and defuzzification.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -33,7 +34,6 @@ const MAX_SETS: usize = 32;
 #[derive(Clone, Debug)]
 pub struct FuzzySystem {
     inputs: Vec<Variable>,
-    output: Variable,
     /// Input index and membership function of every input set, in the order of [`Clause::set`].
     sets: Vec<(usize, MembershipFunction)>,
     /// The clauses of all rules in one list, for locality in memory.
@@ -55,7 +55,7 @@ impl FuzzySystem {
         output_name: &str,
         operators: Operators,
         inference: Inference,
-    ) -> Result<Self, RuleError> {
+    ) -> Result<Self, InvalidValue> {
         check(vocabulary, input_names, output_name)?;
         let variable = |name: &str| {
             let sets = vocabulary.get(name).into_iter().flatten();
@@ -70,7 +70,11 @@ impl FuzzySystem {
         let output = variable(output_name);
         let mut clauses = Vec::new();
         for (index, rule) in rules.iter().enumerate() {
-            clauses.extend(rules::parse(rule, index + 1, &inputs, &output)?);
+            let parsed = rules::parse(rule, &inputs, &output).map_err(|error| {
+                let key = format!("rules[{}]", index + 1);
+                InvalidValue::new(&key, format_args!("`{rule}`"), error)
+            })?;
+            clauses.extend(parsed);
         }
         let functions = |variable: &Variable| -> Vec<MembershipFunction> {
             variable
@@ -83,21 +87,20 @@ impl FuzzySystem {
         let sets: Vec<_> = inputs.iter().enumerate().flat_map(in_input).collect();
         let outputs = functions(&output);
         if sets.len() > MAX_SETS || outputs.len() > MAX_SETS {
-            return Err(RuleError::TooManySets {
-                inputs: sets.len(),
-                outputs: outputs.len(),
-                limit: MAX_SETS,
-            });
+            let (inputs, outputs) = (sets.len(), outputs.len());
+            return Err(unusable_variables(format!(
+                "{inputs} input sets and {outputs} output sets; at most {MAX_SETS} of each are possible"
+            )));
         }
         if rules.is_empty() {
-            return Err(RuleError::NoRules);
+            let remedy = "rules: the list is empty; write at least one rule";
+            return Err(InvalidValue::new("rules", "empty", remedy));
         }
         let peaks = outputs
             .iter()
             .map(MembershipFunction::peak_in_unit_interval);
         Ok(Self {
             inputs,
-            output,
             sets,
             clauses,
             operators,
@@ -135,11 +138,11 @@ impl FuzzySystem {
         self.inputs.iter().zip(inputs).map(degrees).collect()
     }
 
-    /// Returns the firing strength of every rule, with the name of its output set.
-    pub fn firing_strengths(&self, inputs: &[f32]) -> Vec<(f32, &str)> {
+    /// Returns the firing strength of every rule.
+    pub fn firing_strengths(&self, inputs: &[f32]) -> Vec<f32> {
         let mut strengths = Vec::new();
-        self.fire(&self.fuzzify(&columns(inputs)), |output, &[strength]| {
-            strengths.push((strength, self.output.sets[output].0.as_str()));
+        self.fire(&self.fuzzify(&columns(inputs)), |_, &[strength]| {
+            strengths.push(strength);
         });
         strengths
     }
@@ -239,28 +242,31 @@ fn max(a: f32, b: f32) -> f32 {
     if a > b { a } else { b }
 }
 
-fn check(vocabulary: &Vocabulary, inputs: &[&str], output: &str) -> Result<(), RuleError> {
+fn check(vocabulary: &Vocabulary, inputs: &[&str], output: &str) -> Result<(), InvalidValue> {
     for (variable, sets) in vocabulary {
         if variable != output && !inputs.contains(&variable.as_str()) {
-            return Err(RuleError::UnknownFeature {
-                name: variable.clone(),
-                nearest: rules::nearest(variable, inputs.iter().copied().chain([output])),
-            });
+            let nearest = rules::nearest(variable, inputs.iter().copied().chain([output]));
+            return Err(InvalidValue::new(
+                &format!("variables.{variable}"),
+                "no feature",
+                format!("the nearest is `{nearest}`"),
+            ));
         }
-        if let Some((set, &function)) = sets.iter().find(|(_, function)| !function.is_valid()) {
-            return Err(RuleError::InvalidSet {
-                variable: variable.clone(),
-                set: set.clone(),
-                function,
-            });
+        if let Some((set, function)) = sets.iter().find(|(_, function)| !function.is_valid()) {
+            let key = format!("variables.{variable}.{set}");
+            return Err(InvalidValue::new(&key, function, function.requirement()));
         }
     }
     if vocabulary.get(output).is_none_or(|sets| sets.is_empty()) {
-        return Err(RuleError::NoOutput {
-            name: output.to_owned(),
-        });
+        return Err(unusable_variables(format!(
+            "the output `{output}` is missing; add it with sets such as low, medium and high"
+        )));
     }
     Ok(())
+}
+
+fn unusable_variables(reason: String) -> InvalidValue {
+    InvalidValue::new("variables", "not usable", format!("variables: {reason}"))
 }
 
 #[cfg(test)]

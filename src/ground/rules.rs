@@ -13,91 +13,9 @@ use std::iter::Peekable;
 use std::str::SplitWhitespace;
 
 use super::membership::MembershipFunction;
-use crate::validation::InvalidValue;
 
 /// The fuzzy sets of each linguistic variable.
 pub type Vocabulary = BTreeMap<String, BTreeMap<String, MembershipFunction>>;
-
-/// An unusable rule base.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages explain the variants")]
-pub enum RuleError {
-    /// An error in one rule; rules are numbered from 1.
-    #[error("rule {number} `{rule}`: {error}")]
-    Rule {
-        number: usize,
-        rule: String,
-        error: Box<RuleError>,
-    },
-    #[error("expected {expected}, found `{found}`")]
-    Syntax {
-        found: String,
-        expected: &'static str,
-    },
-    #[error("unknown variable `{name}`; the nearest is `{nearest}`")]
-    UnknownVariable { name: String, nearest: String },
-    #[error("`{variable}` has no set `{name}`; the nearest is `{nearest}`")]
-    UnknownSet {
-        variable: String,
-        name: String,
-        nearest: String,
-    },
-    #[error("variables: `{name}` is no feature; the nearest is `{nearest}`")]
-    UnknownFeature { name: String, nearest: String },
-    #[error(
-        "variables: the output `{name}` is missing; add it with sets such as low, medium and high"
-    )]
-    NoOutput { name: String },
-    #[error("variables: set `{set}` of `{variable}` is {function}: {}", function.requirement())]
-    InvalidSet {
-        variable: String,
-        set: String,
-        function: MembershipFunction,
-    },
-    #[error(
-        "variables: {inputs} input sets and {outputs} output sets; at most {limit} of each are possible"
-    )]
-    TooManySets {
-        inputs: usize,
-        outputs: usize,
-        limit: usize,
-    },
-    #[error("rules: the list is empty; write at least one rule")]
-    NoRules,
-}
-
-impl From<RuleError> for InvalidValue {
-    /// Names the rule or the set by its own key, so that its line can be found.
-    fn from(error: RuleError) -> Self {
-        match &error {
-            RuleError::Rule {
-                number,
-                rule,
-                error,
-            } => Self::new(
-                &format!("rules[{number}]"),
-                format_args!("`{rule}`"),
-                error.to_string(),
-            ),
-            RuleError::InvalidSet {
-                variable,
-                set,
-                function,
-            } => Self::new(
-                &format!("variables.{variable}.{set}"),
-                function,
-                function.requirement(),
-            ),
-            RuleError::UnknownFeature { name, nearest } => Self::new(
-                &format!("variables.{name}"),
-                "no feature",
-                format!("the nearest is `{nearest}`"),
-            ),
-            RuleError::NoRules => Self::new("rules", "empty", error.to_string()),
-            _ => Self::new("variables", "not usable", error.to_string()),
-        }
-    }
-}
 
 /// A linguistic variable with its fuzzy sets.
 #[derive(Clone, Debug)]
@@ -107,15 +25,12 @@ pub(super) struct Variable {
 }
 
 impl Variable {
-    fn set_index(&self, set: &str) -> Result<usize, RuleError> {
+    fn set_index(&self, set: &str) -> Result<usize, String> {
         let names = || self.sets.iter().map(|(name, _)| name.as_str());
-        names()
-            .position(|name| name == set)
-            .ok_or_else(|| RuleError::UnknownSet {
-                variable: self.name.clone(),
-                name: set.to_owned(),
-                nearest: nearest(set, names()),
-            })
+        names().position(|name| name == set).ok_or_else(|| {
+            let (variable, nearest) = (&self.name, nearest(set, names()));
+            format!("`{variable}` has no set `{set}`; the nearest is `{nearest}`")
+        })
     }
 }
 
@@ -139,23 +54,19 @@ pub(super) enum Then {
     Consequent(usize),
 }
 
-/// Parses a rule into its clauses; `number` appears in messages.
+/// Parses a rule into its clauses; the error is a sentence.
 pub(super) fn parse(
     rule: &str,
-    number: usize,
     inputs: &[Variable],
     output: &Variable,
-) -> Result<Vec<Clause>, RuleError> {
-    let parser = Parser {
-        words: rule.split_whitespace().peekable(),
+) -> Result<Vec<Clause>, String> {
+    let words = rule.split_whitespace().peekable();
+    Parser {
+        words,
         inputs,
         output,
-    };
-    parser.rule().map_err(|error| RuleError::Rule {
-        number,
-        rule: rule.to_owned(),
-        error: Box::new(error),
-    })
+    }
+    .rule()
 }
 
 /// Returns the known name that is most similar to `name`.
@@ -175,7 +86,7 @@ struct Parser<'a> {
 }
 
 impl<'a> Parser<'a> {
-    fn rule(mut self) -> Result<Vec<Clause>, RuleError> {
+    fn rule(mut self) -> Result<Vec<Clause>, String> {
         self.keyword("IF")?;
         let mut clauses = Vec::new();
         loop {
@@ -198,12 +109,12 @@ impl<'a> Parser<'a> {
         }
     }
 
-    fn word(&mut self, expected: &'static str) -> Result<&'a str, RuleError> {
+    fn word(&mut self, expected: &'static str) -> Result<&'a str, String> {
         let word = self.words.next();
         word.ok_or_else(|| syntax_error(END, expected))
     }
 
-    fn keyword(&mut self, keyword: &'static str) -> Result<(), RuleError> {
+    fn keyword(&mut self, keyword: &'static str) -> Result<(), String> {
         let word = self.word(keyword)?;
         if word.eq_ignore_ascii_case(keyword) {
             Ok(())
@@ -213,7 +124,7 @@ impl<'a> Parser<'a> {
     }
 
     /// The index of the set among all input sets, and whether it is negated.
-    fn antecedent_clause(&mut self) -> Result<(usize, bool), RuleError> {
+    fn antecedent_clause(&mut self) -> Result<(usize, bool), String> {
         let variable = self.word("a variable")?;
         self.keyword("IS")?;
         let negation = self.words.next_if(|word| word.eq_ignore_ascii_case("NOT"));
@@ -229,7 +140,7 @@ impl<'a> Parser<'a> {
     }
 
     /// The index of the output set.
-    fn consequent(&mut self) -> Result<usize, RuleError> {
+    fn consequent(&mut self) -> Result<usize, String> {
         let variable = self.word("the output")?;
         if self.output.name != variable {
             return Err(unknown_variable(variable, [self.output]));
@@ -240,19 +151,16 @@ impl<'a> Parser<'a> {
     }
 }
 
-fn unknown_variable<'a>(name: &str, known: impl IntoIterator<Item = &'a Variable>) -> RuleError {
-    let known = known.into_iter().map(|variable| variable.name.as_str());
-    RuleError::UnknownVariable {
-        name: name.to_owned(),
-        nearest: nearest(name, known),
-    }
+fn unknown_variable<'a>(name: &str, known: impl IntoIterator<Item = &'a Variable>) -> String {
+    let nearest = nearest(
+        name,
+        known.into_iter().map(|variable| variable.name.as_str()),
+    );
+    format!("unknown variable `{name}`; the nearest is `{nearest}`")
 }
 
-fn syntax_error(found: &str, expected: &'static str) -> RuleError {
-    RuleError::Syntax {
-        found: found.to_owned(),
-        expected,
-    }
+fn syntax_error(found: &str, expected: &str) -> String {
+    format!("expected {expected}, found `{found}`")
 }
 
 #[cfg(test)]
@@ -272,12 +180,12 @@ mod tests {
         }
     }
 
-    fn parse_one(text: &str) -> Result<Vec<Clause>, RuleError> {
+    fn parse_one(text: &str) -> Result<Vec<Clause>, String> {
         let inputs = [
             variable("curvature", ["curved", "flat"]),
             variable("slope", ["gentle", "steep"]),
         ];
-        parse(text, 3, &inputs, &variable("ground", ["high", "low"]))
+        parse(text, &inputs, &variable("ground", ["high", "low"]))
     }
 
     #[test]
@@ -295,13 +203,10 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_name_is_reported_with_its_rule_and_the_nearest_known_name() {
-        let message = |text| parse_one(text).unwrap_err().to_string();
+    fn an_unknown_name_is_reported_with_the_nearest_known_name() {
+        let message = |text| parse_one(text).unwrap_err();
         let variable = message("IF slop IS gentle THEN ground IS low");
-        assert_eq!(
-            variable,
-            "rule 3 `IF slop IS gentle THEN ground IS low`: unknown variable `slop`; the nearest is `slope`"
-        );
+        assert_eq!(variable, "unknown variable `slop`; the nearest is `slope`");
         let set = message("IF slope IS gentel THEN ground IS low");
         assert!(
             set.contains("`slope` has no set `gentel`; the nearest is `gentle`"),
@@ -332,7 +237,7 @@ mod tests {
             ),
             ("", "`the end of the rule`", "IF"),
         ] {
-            let message = parse_one(text).unwrap_err().to_string();
+            let message = parse_one(text).unwrap_err();
             assert!(
                 message.contains(found) && message.contains(expected),
                 "{message}"
