@@ -54,7 +54,7 @@ pub fn tiles(mesh: &TriangleMesh, size_m: f32) -> Vec<TriangleMesh> {
     (0..(cells.x * cells.y) as usize)
         .map(|tile| {
             let mut part = mesh.clone();
-            part.retain_triangles(|triangle| tile_of(triangle) == tile);
+            part.retain_triangles(|index, _| tile_of(index) == tile);
             part
         })
         .collect()

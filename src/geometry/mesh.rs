@@ -47,14 +47,17 @@ impl TriangleMesh {
         }
     }
 
-    /// Keeps the triangles whose index satisfies `keep` and removes unreferenced vertices.
-    pub fn retain_triangles(&mut self, keep: impl Fn(usize) -> bool) {
+    /// Keeps the triangles whose index and vertices satisfy `keep` and removes unreferenced
+    /// vertices. Returns the number of removed triangles.
+    pub fn retain_triangles(&mut self, keep: impl Fn(usize, [u32; 3]) -> bool) -> usize {
+        let count = self.triangles.len();
         let mut index = 0;
-        self.triangles.retain(|_| {
+        self.triangles.retain(|&triangle| {
             index += 1;
-            keep(index - 1)
+            keep(index - 1, triangle)
         });
         self.drop_unreferenced_vertices();
+        count - self.triangles.len()
     }
 
     /// Removes the vertices without a triangle and keeps the order of the others.
@@ -126,16 +129,11 @@ impl Aabb {
 
     /// Bounding box of points.
     pub fn of(points: impl IntoIterator<Item = Vec3>) -> Self {
-        points.into_iter().fold(Self::EMPTY, Self::grown_to)
-    }
-
-    /// Bounding box of this box and a point.
-    #[must_use]
-    pub fn grown_to(self, point: Vec3) -> Self {
-        Self {
-            min: self.min.min(point),
-            max: self.max.max(point),
-        }
+        let grown = |bounds: Self, point| Self {
+            min: bounds.min.min(point),
+            max: bounds.max.max(point),
+        };
+        points.into_iter().fold(Self::EMPTY, grown)
     }
 
     /// Bounding box of two boxes.
@@ -150,11 +148,6 @@ impl Aabb {
     /// Whether the box contains no point.
     pub fn is_empty(&self) -> bool {
         self.min.cmpgt(self.max).any()
-    }
-
-    /// Whether a point is inside or on the boundary.
-    pub fn contains(&self, point: Vec3) -> bool {
-        point.cmpge(self.min).all() && point.cmple(self.max).all()
     }
 
     /// Edge lengths [m].
@@ -190,7 +183,8 @@ mod tests {
     #[test]
     fn removing_a_triangle_removes_only_its_unshared_vertex() {
         let mut mesh = square();
-        mesh.retain_triangles(|triangle| triangle == 1);
+        let removed = mesh.retain_triangles(|index, _| index == 1);
+        assert_eq!(removed, 1);
         assert_eq!(mesh.vertices, [Vec3::ZERO, Vec3::X + Vec3::Y, Vec3::Y]);
         assert_eq!(mesh.triangles, [[0, 1, 2]]);
     }
@@ -204,9 +198,9 @@ mod tests {
     }
 
     #[test]
-    fn the_empty_box_contains_nothing() {
+    fn the_box_of_no_points_is_empty() {
         assert!(Aabb::EMPTY.is_empty());
-        assert!(!Aabb::EMPTY.contains(Vec3::ZERO));
-        assert_eq!(Aabb::EMPTY.grown_to(Vec3::X).center(), Vec3::X);
+        assert!(Aabb::of([]).is_empty());
+        assert_eq!(Aabb::of([Vec3::X]).center(), Vec3::X);
     }
 }

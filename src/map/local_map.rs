@@ -134,13 +134,15 @@ pub(super) fn build<E: From<MeshingError>>(
     let (cloud, weights) = static_cloud(&scans, config, &mut counts);
 
     begin_stage("surface")?;
-    let Some(mut surface) = reconstruct(&cloud, weights.as_deref(), config, &mut counts)? else {
+    let Some(surface) = reconstruct(&cloud, weights.as_deref(), config, &mut counts)? else {
         let mesh = TriangleMesh::default();
         return Ok(LocalMap { mesh, counts });
     };
     counts.reconstructed_triangles = surface.mesh.triangles.len();
-    counts.sparse_triangles = meshing::trim_by_density(&mut surface, config.min_density);
     let mut mesh = surface.mesh;
+    counts.sparse_triangles =
+        meshing::trim_by_density(&mut mesh, &surface.densities, config.min_density);
+    drop(surface.densities);
     counts.distant_triangles =
         meshing::trim_by_distance(&mut mesh, &cloud.positions, config.max_distance_m);
 

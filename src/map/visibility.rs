@@ -165,8 +165,7 @@ pub fn remove_crossed_triangles(
     config: &VisibilityConfig,
 ) -> usize {
     let crossed = crossed_triangles(mesh, scans, config);
-    mesh.retain_triangles(|triangle| !crossed[triangle]);
-    crossed.iter().filter(|&&crossed| crossed).count()
+    mesh.retain_triangles(|index, _| !crossed[index])
 }
 
 /// Returns which triangles more beams pass through than end on.

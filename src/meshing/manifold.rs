@@ -79,7 +79,7 @@ mod tests {
         mesh.compute_normals();
         mesh.colors = (0..7).map(|k| [k, 0, 0]).collect();
         mesh.triangles = (0..6).map(|k| [0, 1 + k, 1 + (k + 1) % 6]).collect();
-        mesh.retain_triangles(|triangle| !without.contains(&triangle));
+        mesh.retain_triangles(|index, _| !without.contains(&index));
         mesh
     }
 

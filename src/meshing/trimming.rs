@@ -4,28 +4,15 @@
 use glam::Vec3;
 use rayon::prelude::*;
 
-use super::poisson::Reconstruction;
 use crate::geometry::TriangleMesh;
 
 /// Removes the vertices whose density is below the `quantile` of all densities, with their triangles,
 /// as in range-mcl (Chen et al., ICRA 2021). Returns the number of removed triangles.
-pub fn trim_by_density(surface: &mut Reconstruction, quantile: f64) -> usize {
-    let Some(limit) = quantile_of(&surface.densities, quantile) else {
+pub fn trim_by_density(mesh: &mut TriangleMesh, densities: &[f32], quantile: f64) -> usize {
+    let Some(limit) = quantile_of(densities, quantile) else {
         return 0;
     };
-    let densities = std::mem::take(&mut surface.densities);
-    let is_dense: Vec<bool> = densities.iter().map(|&density| density >= limit).collect();
-    let triangles = surface.mesh.triangles.clone();
-    let is_kept = |triangle: &[u32; 3]| triangle.iter().all(|&v| is_dense[v as usize]);
-    let mut is_used = vec![false; densities.len()];
-    for &vertex in triangles.iter().filter(|t| is_kept(t)).flatten() {
-        is_used[vertex as usize] = true;
-    }
-    surface.densities = (densities.iter().zip(&is_used))
-        .filter_map(|(&density, &is_used)| is_used.then_some(density))
-        .collect();
-    (surface.mesh).retain_triangles(|index| is_kept(&triangles[index]));
-    triangles.len() - surface.mesh.triangles.len()
+    mesh.retain_triangles(|_, triangle| triangle.iter().all(|&v| densities[v as usize] >= limit))
 }
 
 /// Removes the triangles with a vertex farther than `max_distance_m` from every sample; returns their
@@ -35,9 +22,7 @@ pub fn trim_by_distance(mesh: &mut TriangleMesh, samples: &[Vec3], max_distance_
     let is_near: Vec<bool> = (mesh.vertices.par_iter())
         .map(|&vertex| grid.has_sample_near(vertex))
         .collect();
-    let triangles = mesh.triangles.clone();
-    mesh.retain_triangles(|index| triangles[index].iter().all(|&v| is_near[v as usize]));
-    triangles.len() - mesh.triangles.len()
+    mesh.retain_triangles(|_, triangle| triangle.iter().all(|&v| is_near[v as usize]))
 }
 
 /// The quantile of values, interpolated as in NumPy; `None` without values.
@@ -108,36 +93,20 @@ mod tests {
     }
 
     #[test]
-    fn the_sparsest_tenth_of_the_vertices_is_removed_with_its_densities() {
-        let mesh = strip(50);
-        let mut surface = Reconstruction {
-            densities: mesh.vertices.iter().map(|v| v.x).collect(),
-            mesh,
-            dropped_points: 0,
-        };
-        let dropped = trim_by_density(&mut surface, 0.1);
+    fn the_sparsest_tenth_of_the_vertices_is_removed() {
+        let mut mesh = strip(50);
+        let densities: Vec<f32> = mesh.vertices.iter().map(|v| v.x).collect();
+        let dropped = trim_by_density(&mut mesh, &densities, 0.1);
         // Vertices at x < 4.9 are removed: of the 98 triangles those of the first five meters.
         assert_eq!(dropped, 10);
-        assert_eq!(surface.mesh.vertices.len(), 90);
-        assert!(
-            surface
-                .mesh
-                .vertices
-                .iter()
-                .zip(&surface.densities)
-                .all(|(v, d)| v.x == *d)
-        );
+        assert_eq!(mesh.vertices.len(), 90);
+        assert!(mesh.vertices.iter().all(|vertex| vertex.x >= 4.9));
     }
 
     #[test]
     fn quantile_zero_and_an_empty_surface_remove_nothing() {
-        let mut surface = Reconstruction {
-            mesh: strip(5),
-            densities: vec![1.0; 10],
-            dropped_points: 0,
-        };
-        assert_eq!(trim_by_density(&mut surface, 0.0), 0);
-        assert_eq!(trim_by_density(&mut Reconstruction::default(), 0.5), 0);
+        assert_eq!(trim_by_density(&mut strip(5), &[1.0; 10], 0.0), 0);
+        assert_eq!(trim_by_density(&mut TriangleMesh::default(), &[], 0.5), 0);
     }
 
     #[test]

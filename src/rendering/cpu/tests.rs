@@ -25,8 +25,8 @@ fn hills(middle: Vec3) -> Vec<TriangleMesh> {
     }
     let is_left = |triangle: usize| mesh.corners(triangle)[0].x < middle.x;
     let [mut left, mut right] = [mesh.clone(), mesh.clone()];
-    left.retain_triangles(is_left);
-    right.retain_triangles(|triangle| !is_left(triangle));
+    left.retain_triangles(|index, _| is_left(index));
+    right.retain_triangles(|index, _| !is_left(index));
     vec![left, TriangleMesh::default(), right]
 }
 
