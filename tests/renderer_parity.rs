@@ -23,7 +23,7 @@ const METHODS: [ImageMethod; 2] = [ImageMethod::Cast, ImageMethod::Draw];
 /// A renderer on any adapter; `None`, with a message, without one.
 #[expect(clippy::print_stderr, reason = "a skipped test reports it")]
 fn renderer(tiles: &[TriangleMesh]) -> Option<GpuRenderer> {
-    match GpuRenderer::new(tiles, Backend::Gpu) {
+    match GpuRenderer::new(tiles, Backend::Gpu, None) {
         Ok(renderer) => Some(renderer),
         Err(RenderError::NoAdapter) => {
             let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|value| value == "1");

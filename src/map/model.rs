@@ -11,7 +11,7 @@ use super::ply::{self, PlyError};
 use super::tiles::{self, TileGrid};
 use super::vertex_ground::is_ground_color;
 use crate::geometry::TriangleMesh;
-use crate::rendering::{Batched, RangeRenderer, RenderError, renderer};
+use crate::rendering::{RangeRenderer, RenderError, renderer};
 
 /// Cell size of the elevation of the ground [m].
 const GROUND_CELL_M: f64 = 0.5;
@@ -73,13 +73,9 @@ impl Map {
             return Err(MapError::NoArea { triangles });
         }
         let tiles = TileGrid::around(&path.map_from_lidar, &options.tiles);
-        let mut renderer = renderer(&tiles::cut(&mesh, &tiles), options.backend)?;
-        if let Some(max_poses) = options.max_poses {
-            renderer = Box::new(Batched {
-                renderer,
-                max_poses,
-            });
-        }
+        let parts = tiles::cut(&mesh, &tiles);
+        let renderer = renderer(&parts, options.backend, options.max_poses)?;
+        drop(parts);
         let ground = ground_of(&mesh);
         Ok(Self::from_parts(mesh, path, tiles, ground, renderer.into()))
     }

@@ -44,6 +44,8 @@ const ROUNDING: f32 = 1e-6;
 #[derive(Clone, Debug)]
 pub struct CpuRenderer {
     scene: Scene,
+    /// Maximum number of poses rendered at once, which bounds the memory.
+    pub max_poses: usize,
 }
 
 impl CpuRenderer {
@@ -51,12 +53,25 @@ impl CpuRenderer {
     pub fn new(tiles: &[TriangleMesh]) -> Self {
         Self {
             scene: Scene::of_tiles(tiles),
+            max_poses: usize::MAX,
         }
     }
 
     /// Casts the beams of every pose piece by piece, and returns, per pose, what `summarize` makes
     /// of the indices of the beams of each piece and their ranges.
     fn map_pieces<T: Send>(
+        &self,
+        map_from_lidar: &[Pose3],
+        beams: &CastBeams,
+        summarize: impl Fn(&[u32], &[f32]) -> T + Sync,
+    ) -> Vec<Vec<T>> {
+        let batches = map_from_lidar.chunks(self.max_poses.max(1));
+        batches
+            .flat_map(|poses| self.map_batch(poses, beams, &summarize))
+            .collect()
+    }
+
+    fn map_batch<T: Send>(
         &self,
         map_from_lidar: &[Pose3],
         beams: &CastBeams,

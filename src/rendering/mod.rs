@@ -4,7 +4,6 @@
 //! compared along the very directions that were measured.
 
 pub mod backend;
-pub mod batched;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;
@@ -12,7 +11,6 @@ mod morton;
 pub mod selection;
 
 pub use backend::Backend;
-pub use batched::Batched;
 pub use cpu::CpuRenderer;
 pub use selection::renderer;
 

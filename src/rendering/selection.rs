@@ -29,7 +29,8 @@ impl BackendChoice {
     }
 }
 
-/// Prepares the tiles of a map, in the map frame, for rendering on the requested backend.
+/// Prepares the tiles of a map, in the map frame, for rendering on the requested backend, at most
+/// `max_poses` poses at once (range-mcl's `max_instance`), which bounds the memory.
 ///
 /// # Errors
 /// [`RenderError::NoAdapter`] if a graphics adapter is requested and there is none, and the errors
@@ -37,14 +38,18 @@ impl BackendChoice {
 pub fn renderer(
     tiles: &[TriangleMesh],
     backend: Backend,
+    max_poses: Option<usize>,
 ) -> Result<Box<dyn RangeRenderer>, RenderError> {
     let choice = choose(backend)?;
     tracing::info!("rendering on {} because {}", choice.name(), choice.reason);
     #[cfg(feature = "gpu")]
     if choice.adapter.is_some() {
-        return Ok(Box::new(super::gpu::GpuRenderer::new(tiles, backend)?));
+        let renderer = super::gpu::GpuRenderer::new(tiles, backend, max_poses)?;
+        return Ok(Box::new(renderer));
     }
-    Ok(Box::new(CpuRenderer::new(tiles)))
+    let mut renderer = CpuRenderer::new(tiles);
+    renderer.max_poses = max_poses.unwrap_or(usize::MAX);
+    Ok(Box::new(renderer))
 }
 
 /// Selects one of the graphics adapters of this machine, or the CPU.

@@ -70,7 +70,7 @@ fn rays_per_second(time: Duration, context: &Context) -> anyhow::Result<String> 
     let street = &simulation.street.surface.mesh;
     let (poses, model) = (simulation.poses(), LidarModel::default());
     let grid = TileGrid::around(&poses, &TileConfig::default());
-    let renderer = renderer(&tiles::cut(street, &grid), context.backend)?;
+    let renderer = renderer(&tiles::cut(street, &grid), context.backend, None)?;
     let step = poses.len().div_ceil(POSES);
     let poses: Vec<_> = poses.into_iter().step_by(step).collect();
     let (start, mut rays) = (Instant::now(), 0);

@@ -116,6 +116,15 @@ fn the_number_of_threads_does_not_change_a_bit() {
 }
 
 #[test]
+fn batches_of_poses_do_not_change_the_ranges() {
+    let mut renderer = CpuRenderer::new(&hills(Vec3::ZERO));
+    let (poses, model) = (poses(8), LidarModel::default());
+    let whole = renderer.render(&poses, &model).unwrap();
+    renderer.max_poses = 3;
+    assert_eq!(renderer.render(&poses, &model).unwrap(), whole);
+}
+
+#[test]
 fn comparing_is_casting_and_counting_the_cost() {
     let renderer = CpuRenderer::new(&hills(Vec3::ZERO));
     let (poses, beams) = (poses(20), beams(1000));

@@ -16,7 +16,6 @@ pub(super) struct DeviceMap {
     pub tiles: Vec<DeviceTile>,
     pub root: u32,
     pub depth: usize,
-    pub bytes: u64,
     center: Vector3<f64>,
 }
 
@@ -35,7 +34,6 @@ impl DeviceMap {
             tiles: bvh.tiles,
             root: bvh.root,
             depth: bvh.depth,
-            bytes: sizes.iter().sum(),
             center: Vector3::new(bvh.center.x, bvh.center.y, bvh.center.z),
         };
         gpu.check()?;

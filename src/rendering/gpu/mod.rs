@@ -27,7 +27,7 @@ mod raster;
 mod shaders;
 mod two_level;
 
-use super::backend::{AdapterReport, Backend};
+use super::backend::Backend;
 use super::{RangeDifference, RangeRenderer, RenderError};
 use crate::geometry::{Pose3, TriangleMesh, Vec3};
 use crate::lidar::{Beam, LidarModel};
@@ -58,13 +58,21 @@ pub struct GpuRenderer {
 }
 
 impl GpuRenderer {
-    /// Opens the best adapter that the backend allows and uploads the map.
+    /// Opens the best adapter that the backend allows and uploads the map; renders at most
+    /// `max_poses` poses at once.
     ///
     /// # Errors
     /// [`RenderError::NoAdapter`] where there is none, [`RenderError::MapTooLarge`] where the
     /// map does not fit what the device binds, and the errors of the device.
-    pub fn new(tiles: &[TriangleMesh], backend: Backend) -> Result<Self, RenderError> {
-        let gpu = Gpu::open(backend)?;
+    pub fn new(
+        tiles: &[TriangleMesh],
+        backend: Backend,
+        max_poses: Option<usize>,
+    ) -> Result<Self, RenderError> {
+        let mut gpu = Gpu::open(backend)?;
+        if let Some(max_poses) = max_poses {
+            gpu.batch_sizes.poses = gpu.batch_sizes.poses.min(max_poses).max(1);
+        }
         let map = DeviceMap::upload(&gpu, tiles)?;
         let caster = Caster::new(&gpu, &map);
         let rasterizer = gpu.can_rasterize.then(|| Rasterizer::new(&gpu));
@@ -75,16 +83,6 @@ impl GpuRenderer {
             caster,
             rasterizer,
         })
-    }
-
-    /// The adapter that renders.
-    pub fn adapter(&self) -> &AdapterReport {
-        &self.gpu.report
-    }
-
-    /// Size of the map on the device [bytes].
-    pub fn map_bytes(&self) -> u64 {
-        self.map.bytes
     }
 
     /// [`RangeRenderer::render`] by a given method.

@@ -29,7 +29,7 @@ fn stairs() -> TriangleMesh {
 }
 
 fn renderer() -> Option<GpuRenderer> {
-    match GpuRenderer::new(&[stairs()], Backend::Gpu) {
+    match GpuRenderer::new(&[stairs()], Backend::Gpu, None) {
         Ok(renderer) => Some(renderer),
         Err(RenderError::NoAdapter) => {
             let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|value| value == "1");
