@@ -48,7 +48,7 @@ fn main() {
                 normals: cloud.normals,
                 ..TriangleMesh::default()
             };
-            ply::write(Path::new(&format!("{stem}_{count}.ply")), &points).unwrap();
+            ply::write(Path::new(&format!("{stem}_{count}.ply")), &points, None).unwrap();
         }
     } else if let Ok(job) = std::env::var("FPMCL_POISSON") {
         let (count, depth) = job.split_once(',').expect("FPMCL_POISSON=points,depth");
@@ -196,7 +196,7 @@ fn run_once(count: usize, depth: u32) {
     );
     evaluate(&surface.mesh);
     if let Ok(path) = std::env::var("FPMCL_POISSON_OUT") {
-        ply::write(Path::new(&path), &surface.mesh).unwrap();
+        ply::write(Path::new(&path), &surface.mesh, None).unwrap();
     }
 }
 

@@ -45,7 +45,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 fn write_rays(folder: &Path) -> Result<(), Box<dyn std::error::Error>> {
     let renderer = renderer();
     std::fs::create_dir_all(folder)?;
-    ply::write(&folder.join("street.ply"), &street::street(SEED))?;
+    ply::write(&folder.join("street.ply"), &street::street(SEED), None)?;
     let pixels = LidarModel::default().directions();
     let few = directions_of(&beams(&renderer, truth(), 500));
     let many = directions_of(&beams(&renderer, truth(), 3600));

@@ -343,7 +343,7 @@ fn frames_without_ground_keep_the_estimates_of_the_filter() {
     for vertex in &mut map.vertices {
         vertex.y += 500.0;
     }
-    ::fpmcl::map::ply::write(&recording.path("elsewhere.ply"), &map).unwrap();
+    ::fpmcl::map::ply::write(&recording.path("elsewhere.ply"), &map, None).unwrap();
     // Without odometry, the trajectory is not smoothed either.
     let stderr = recording
         .fpmcl("refine")

@@ -108,9 +108,9 @@ impl Map {
         Self::new(mesh, mapping_path, options)
     }
 
-    /// Writes the map as a PLY file that is complete by itself; see [`ply::write_map`].
+    /// Writes the map as a PLY file that is complete by itself; see [`ply::write`].
     pub fn save(&self, path: &Path) -> Result<(), MapError> {
-        Ok(ply::write_map(path, &self.mesh, &self.path)?)
+        Ok(ply::write(path, &self.mesh, Some(&self.path))?)
     }
 
     /// Returns the panoramas of the cells in which place recognition searches. They are rendered if the
@@ -120,7 +120,7 @@ impl Map {
         match &*last {
             Some((made_for, index)) if made_for == request => Ok(index.clone()),
             _ => {
-                let cells = request.cells(&self.path.map_from_lidar, &self.tiles, &self.ground);
+                let cells = request.cells(&self.path.map_from_lidar, &self.tiles);
                 let index = PanoramaIndex::build(
                     &cells,
                     &*self.renderer,

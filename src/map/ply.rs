@@ -77,24 +77,15 @@ const POSITION: &str = "property float x\nproperty float y\nproperty float z\n";
 const NORMAL: &str = "property float nx\nproperty float ny\nproperty float nz\n";
 const COLOR: &str = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
 
-/// Writes a mesh. Missing normals are computed, missing colours are grey.
+/// Writes a mesh. Missing normals are computed, missing colours are grey. That of a map has its frame
+/// and the path of the mapping drive as comments; see [`MappingPath`].
 ///
 /// The file is written under a temporary name in the same folder and renamed.
-pub fn write(path: &Path, mesh: &TriangleMesh) -> Result<(), PlyError> {
-    write_mesh(path, mesh, &[])
-}
-
-/// Writes the mesh of a map with its frame and the path of the mapping drive as comments; see
-/// [`MappingPath`].
-pub fn write_map(
+pub fn write(
     path: &Path,
     mesh: &TriangleMesh,
-    mapping_path: &MappingPath,
+    mapping_path: Option<&MappingPath>,
 ) -> Result<(), PlyError> {
-    write_mesh(path, mesh, &mapping_path.to_comments())
-}
-
-fn write_mesh(path: &Path, mesh: &TriangleMesh, comments: &[String]) -> Result<(), PlyError> {
     let computed;
     let normals = if mesh.normals.len() == mesh.vertices.len() {
         &mesh.normals
@@ -104,6 +95,7 @@ fn write_mesh(path: &Path, mesh: &TriangleMesh, comments: &[String]) -> Result<(
         computed = copy.normals;
         &computed
     };
+    let comments = mapping_path.map_or_else(Vec::new, MappingPath::to_comments);
     let comments: String = (comments.iter())
         .map(|comment| format!("comment {comment}\n"))
         .collect();
@@ -176,22 +168,15 @@ fn write_floats(out: &mut impl Write, values: &[f32]) -> io::Result<()> {
 
 /// Reads a mesh. Normals and colours are empty where the file has none.
 pub fn read(path: &Path) -> Result<TriangleMesh, PlyError> {
-    let (mesh, _) = read_mesh(path).map_err(|problem| problem.of(path))?;
-    Ok(mesh)
+    Ok(read_map(path)?.0)
 }
 
 /// Reads the mesh of a map, and the path of its mapping drive if it is in the file.
 pub fn read_map(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), PlyError> {
-    let read = || {
-        let (mesh, comments) = read_mesh(path)?;
-        let mapping_path = MappingPath::from_comments(comments.iter().map(String::as_str))?;
-        Ok((mesh, mapping_path))
-    };
-    read().map_err(|problem: PlyProblem| problem.of(path))
+    read_mesh(path).map_err(|problem| problem.of(path))
 }
 
-/// Reads a mesh and the comments of its header.
-fn read_mesh(path: &Path) -> Result<(TriangleMesh, Vec<String>), PlyProblem> {
+fn read_mesh(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), PlyProblem> {
     let file = File::open(path)?;
     let bytes = file.metadata()?.len();
     let mut reader = Reader::new(BufReader::with_capacity(1 << 20, file));
@@ -227,7 +212,8 @@ fn read_mesh(path: &Path) -> Result<(TriangleMesh, Vec<String>), PlyProblem> {
         mesh.colors = vertices.iter().map(|vertex| vertex.color).collect();
     }
     check_mesh(&mesh)?;
-    Ok((mesh, header.comments))
+    let mapping_path = MappingPath::from_comments(header.comments.iter().map(String::as_str))?;
+    Ok((mesh, mapping_path))
 }
 
 impl PlyProblem {
@@ -419,7 +405,7 @@ mod tests {
     fn a_written_mesh_reads_back_bit_by_bit() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("map.ply");
-        write(&path, &mesh()).unwrap();
+        write(&path, &mesh(), None).unwrap();
         assert_eq!(read(&path).unwrap(), mesh());
     }
 
@@ -432,8 +418,8 @@ mod tests {
             triangles: vec![[0, 1, 2]],
             ..TriangleMesh::default()
         };
-        write_mesh(&path, &triangle, &["made by a test".to_owned()]).unwrap();
-        let mut expected = b"ply\nformat binary_little_endian 1.0\ncomment made by a test\n\
+        write(&path, &triangle, None).unwrap();
+        let mut expected = b"ply\nformat binary_little_endian 1.0\n\
             element vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
             property float nx\nproperty float ny\nproperty float nz\n\
             property uchar red\nproperty uchar green\nproperty uchar blue\n\

@@ -269,6 +269,7 @@ fn write_constants(config: &SimulationConfig, simulation: &Simulation) -> Result
     Ok(ply::write(
         &folder.join("street.ply"),
         &simulation.street_in_map(),
+        None,
     )?)
 }
 

@@ -264,5 +264,5 @@ fn write_map(config: &BuildMapConfig, mesh: &TriangleMesh, path: &MappingPath) -
         "the map has no triangles: the scans in {} have no points left to mesh; check range_image, crop_x, crop_y and crop_z",
         config.scan_folder.display()
     );
-    Ok(ply::write_map(&config.mesh_file, mesh, path)?)
+    Ok(ply::write(&config.mesh_file, mesh, Some(path))?)
 }

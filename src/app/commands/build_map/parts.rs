@@ -72,7 +72,7 @@ impl Parts {
     pub fn save(&self, number: usize, local_map: &LocalMap, scans_hash: &str) -> Result<()> {
         self.discard(number)?;
         if !local_map.mesh.triangles.is_empty() {
-            ply::write(&self.mesh_file(number), &local_map.mesh)?;
+            ply::write(&self.mesh_file(number), &local_map.mesh, None)?;
         }
         let part = Part {
             scans_hash: scans_hash.to_owned(),
