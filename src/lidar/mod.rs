@@ -7,7 +7,7 @@ pub mod range_image;
 pub mod scan;
 
 pub use deskewing::{RotationDirection, SweepMotion, interpolate_motion};
-pub use model::{LidarModel, Pixel};
+pub use model::LidarModel;
 pub use normals::{NormalConfig, estimate_normals};
 pub use range_image::{NO_RETURN, RangeImage};
 pub use scan::{Beam, Scan};

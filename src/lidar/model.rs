@@ -68,15 +68,6 @@ impl Validate for LidarModel {
     }
 }
 
-/// Row and column in a range image.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub struct Pixel {
-    /// Row, from the top.
-    pub row: usize,
-    /// Column, clockwise from backward.
-    pub column: usize,
-}
-
 impl LidarModel {
     /// Number of pixels.
     pub fn len(&self) -> usize {
@@ -93,8 +84,9 @@ impl LidarModel {
         self.min_range < range_m && range_m < self.max_range
     }
 
-    /// The pixel of a direction of any length; `None` above or below the field of view.
-    pub fn pixel_of(&self, direction: Vec3) -> Option<Pixel> {
+    /// Row-major index of the pixel of a direction of any length; `None` above or below the field of
+    /// view.
+    pub fn pixel_of(&self, direction: Vec3) -> Option<usize> {
         let elevation_rad = (direction.z / direction.length()).asin();
         let row = (self.fov_up_rad() - elevation_rad) / self.fov_rad() * self.height as f32;
         if !(row >= 0.0 && row < self.height as f32) {
@@ -102,18 +94,16 @@ impl LidarModel {
         }
         let azimuth_rad = direction.y.atan2(direction.x);
         let column = 0.5 * (1.0 - azimuth_rad / PI) * self.width as f32;
-        Some(Pixel {
-            row: row as usize,
-            // An azimuth of exactly -π wraps to column 0.
-            column: column as usize % self.width,
-        })
+        // An azimuth of exactly -π wraps to column 0.
+        Some(row as usize * self.width + column as usize % self.width)
     }
 
-    /// The unit direction through the center of a pixel.
-    pub fn direction_of(&self, pixel: Pixel) -> Vec3 {
+    /// The unit direction through the center of the pixel at a row-major index.
+    pub fn direction_of(&self, index: usize) -> Vec3 {
+        let (row, column) = (index / self.width, index % self.width);
         let elevation_rad =
-            self.fov_up_rad() - (pixel.row as f32 + 0.5) / self.height as f32 * self.fov_rad();
-        let azimuth_rad = PI * (1.0 - 2.0 * (pixel.column as f32 + 0.5) / self.width as f32);
+            self.fov_up_rad() - (row as f32 + 0.5) / self.height as f32 * self.fov_rad();
+        let azimuth_rad = PI * (1.0 - 2.0 * (column as f32 + 0.5) / self.width as f32);
         Vec3::new(
             elevation_rad.cos() * azimuth_rad.cos(),
             elevation_rad.cos() * azimuth_rad.sin(),
@@ -124,23 +114,8 @@ impl LidarModel {
     /// The directions of all pixels, row-major.
     pub fn directions(&self) -> Vec<Vec3> {
         (0..self.len())
-            .map(|index| self.direction_of(self.pixel_at(index)))
+            .map(|index| self.direction_of(index))
             .collect()
-    }
-
-    /// Row-major index of a pixel.
-    #[inline]
-    pub fn index_of(&self, pixel: Pixel) -> usize {
-        pixel.row * self.width + pixel.column
-    }
-
-    /// The pixel at a row-major index.
-    #[inline]
-    pub fn pixel_at(&self, index: usize) -> Pixel {
-        Pixel {
-            row: index / self.width,
-            column: index % self.width,
-        }
     }
 
     /// Upper limit of the field of view [rad].
@@ -167,15 +142,14 @@ mod tests {
     fn every_pixel_center_projects_into_its_pixel() {
         let model = LidarModel::default();
         for index in 0..model.len() {
-            let pixel = model.pixel_at(index);
-            assert_eq!(model.pixel_of(model.direction_of(pixel)), Some(pixel));
+            assert_eq!(model.pixel_of(model.direction_of(index)), Some(index));
         }
     }
 
     #[test]
     fn columns_increase_clockwise_from_backward() {
         let model = LidarModel::default();
-        let column = |direction| model.pixel_of(direction).unwrap().column;
+        let column = |direction| model.pixel_of(direction).unwrap() % model.width;
         assert_eq!(column(Vec3::new(1.0, 0.0, 0.0)), 450);
         assert_eq!(column(Vec3::new(0.0, -1.0, 0.0)), 675);
         assert_eq!(column(Vec3::new(0.0, 1.0, 0.0)), 225);
@@ -191,8 +165,8 @@ mod tests {
             model.pixel_of(Vec3::new(elevation.cos(), 0.0, elevation.sin()))
         };
         assert_eq!(at(3.1), None);
-        assert_eq!(at(2.99).unwrap().row, 0);
-        assert_eq!(at(-24.99).unwrap().row, 63);
+        assert_eq!(at(2.99).unwrap() / model.width, 0);
+        assert_eq!(at(-24.99).unwrap() / model.width, 63);
         assert_eq!(at(-25.1), None);
     }
 

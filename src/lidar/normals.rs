@@ -252,7 +252,7 @@ mod tests {
             let Some(normal) = *normal else { continue };
             found += 1;
             let best = normal.dot(Vec3::Z).max(normal.dot(-Vec3::X));
-            assert!(best > 0.99, "{normal} at {:?}", image.model.pixel_at(index));
+            assert!(best > 0.99, "{normal} at {index}");
             assert!(normal.dot(image.points[index]) < 0.0);
         }
         assert!(found as f32 > 0.97 * returns as f32, "{found} of {returns}");

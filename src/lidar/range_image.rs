@@ -38,10 +38,9 @@ impl RangeImage {
             if !model.accepts_range(range_m) {
                 continue;
             }
-            let Some(pixel) = model.pixel_of(point) else {
+            let Some(index) = model.pixel_of(point) else {
                 continue;
             };
-            let index = model.index_of(pixel);
             if range_m < image.ranges[index] {
                 image.ranges[index] = range_m;
                 image.points[index] = point;
@@ -123,7 +122,7 @@ mod tests {
         let points = [Vec3::new(8.0, 3.0, -1.0), Vec3::new(-7.0, 1.0, 0.1)];
         let image = RangeImage::project(&points, &model);
         for (number, &point) in points.iter().enumerate() {
-            let index = model.index_of(model.pixel_of(point).unwrap());
+            let index = model.pixel_of(point).unwrap();
             assert_eq!(image.point_index(index), Some(number));
             let beam = image.beam(index).unwrap();
             assert!((beam.point() - point).length() < 1e-5);

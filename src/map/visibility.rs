@@ -148,7 +148,7 @@ fn vote(scan: &ScanCloud, point: Vec3, model: &LidarModel, config: &VisibilityCo
     let Some(pixel) = model.pixel_of(point_in_lidar) else {
         return Vote::Unknown;
     };
-    let free_m = scan.free_range_m[model.index_of(pixel)];
+    let free_m = scan.free_range_m[pixel];
     if free_m > range_m + config.point_margin_m + config.point_margin_per_range * range_m {
         Vote::Through
     } else if (free_m - range_m).abs() < SEEN_WITHIN_M {

@@ -321,7 +321,7 @@ fn range_images_show_missing_pixels_and_differences() {
     let model = LidarModel::default();
     let mut rng = StdRng::seed_from_u64(1);
     let range_at = |index: usize, car: bool| {
-        let direction = model.direction_of(model.pixel_at(index));
+        let direction = model.direction_of(index);
         let azimuth = direction.y.atan2(direction.x);
         let ground = if direction.z < 0.0 {
             -1.73 / direction.z

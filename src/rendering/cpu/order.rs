@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use crate::geometry::{Pose3, Vec3};
-use crate::lidar::{LidarModel, Pixel};
+use crate::lidar::LidarModel;
 use crate::raycasting::RAYS;
 use crate::rendering::morton::{spread, spread_by_three};
 
@@ -20,7 +20,7 @@ pub(super) fn pixel_order(model: &LidarModel) -> Vec<u32> {
         for top in (0..model.height).step_by(2) {
             for row in top..model.height.min(top + 2) {
                 for column in left..model.width.min(left + 4) {
-                    order.push(model.index_of(Pixel { row, column }) as u32);
+                    order.push((row * model.width + column) as u32);
                 }
             }
         }
