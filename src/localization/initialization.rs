@@ -106,7 +106,7 @@ pub fn from_panoramas(
     let chosen = systematic(&weights, count, rng);
     let sample = |number: usize| {
         let seed = &seeds[number];
-        let position = uniform_in_cell(seed.center, index.cell_m, rng);
+        let position = uniform_in_cell(seed.center, index.config.cell_m, rng);
         let turn_rad = index.config.yaw_sigma_rad * rng.sample::<f64, _>(StandardNormal)
             + rng.random_range(-half_column_rad..=half_column_rad);
         let map_from_lidar = Pose2::new(position, seed.heading_rad + turn_rad);

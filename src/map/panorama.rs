@@ -21,7 +21,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::cells::{Cells, ROAD_HALF_WIDTH_M};
+use super::cells::{self, ROAD_HALF_WIDTH_M};
 use super::elevation::{GroundMap, SensorAttitude};
 use super::tiles::TileGrid;
 use crate::geometry::{Pose2, Pose3, Rigid3f, pose2_from_pose3, wrap_angle};
@@ -107,15 +107,15 @@ pub struct PanoramaRequest {
 }
 
 impl PanoramaRequest {
-    /// Returns the cells of the region in a map.
-    pub fn cells(&self, path: &[Pose3], tiles: &TileGrid, ground: &GroundMap) -> Cells {
+    /// Returns the centres of the cells of the region in a map [m].
+    pub fn cells(&self, path: &[Pose3], tiles: &TileGrid) -> Vec<Point2<f64>> {
         let cell_m = self.config.cell_m;
         match self.region {
             SearchRegion::Road => {
                 let poses: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
-                Cells::along_road(&poses, ROAD_HALF_WIDTH_M, cell_m)
+                cells::along_road(&poses, ROAD_HALF_WIDTH_M, cell_m)
             }
-            SearchRegion::Anywhere => Cells::over_map(tiles, ground, cell_m),
+            SearchRegion::Anywhere => cells::over_map(tiles, cell_m),
         }
     }
 }
@@ -127,8 +127,6 @@ pub struct PanoramaIndex {
     pub config: PanoramaConfig,
     /// Projection of the panoramas.
     pub model: LidarModel,
-    /// Side of a cell [m].
-    pub cell_m: f64,
     /// Cells that are on the map: centre and height of the ground [m].
     places: Vec<(Point2<f64>, f64)>,
     /// One panorama per cell, row-major; [`FAR_M`] where there is no surface.
@@ -152,9 +150,9 @@ pub struct PanoramaSeed {
 const FAR_M: f32 = 1e9;
 
 impl PanoramaIndex {
-    /// Renders the panoramas of all cells that are on the map.
+    /// Renders the panoramas of all cells, given by their centres [m], with ground in valid tiles.
     pub fn build(
-        cells: &Cells,
+        cells: &[Point2<f64>],
         renderer: &dyn RangeRenderer,
         ground: &GroundMap,
         tiles: &TileGrid,
@@ -179,7 +177,7 @@ impl PanoramaIndex {
                 .map(move |patch| ((center, patch.height_m), patch.lift(&pose, &upright)))
         };
         let (places, poses): (Vec<(Point2<f64>, f64)>, Vec<Pose3>) =
-            cells.centers.iter().filter(on_map).flat_map(levels).unzip();
+            cells.iter().filter(on_map).flat_map(levels).unzip();
         let model = panorama_model(&request.lidar, &request.config);
         let mut images = Vec::with_capacity(poses.len());
         for batch in poses.chunks(BATCH) {
@@ -192,24 +190,13 @@ impl PanoramaIndex {
             config: request.config.clone(),
             model,
             places,
-            cell_m: cells.cell_m,
             images,
         })
-    }
-
-    /// Number of panoramas.
-    pub fn len(&self) -> usize {
-        self.images.len()
     }
 
     /// Whether no cell has ground.
     pub fn is_empty(&self) -> bool {
         self.images.is_empty()
-    }
-
-    /// Memory of the panoramas [bytes].
-    pub fn size_bytes(&self) -> usize {
-        self.len() * self.model.len() * size_of::<f32>()
     }
 
     /// Returns the best heading of each cell of the second pass, the lowest cost first.
@@ -323,10 +310,9 @@ impl DoubledScan {
         let mut nearest = vec![(-1.0_f32, -FAR_M); model.len()];
         for beam in scan.beams() {
             let direction: Vec3 = road_from_lidar.rotate(beam.direction);
-            let Some(pixel) = model.pixel_of(direction) else {
+            let Some(index) = model.pixel_of(direction) else {
                 continue;
             };
-            let index = model.index_of(pixel);
             let closeness = direction.dot(directions[index]);
             if closeness > nearest[index].0 {
                 nearest[index] = (closeness, beam.range_m);
@@ -425,12 +411,29 @@ mod tests {
     }
 
     #[test]
+    fn panoramas_of_the_whole_map_have_ground_and_a_valid_tile() {
+        let world = TestWorld::street();
+        let anywhere = PanoramaRequest {
+            region: SearchRegion::Anywhere,
+            config: PanoramaConfig {
+                cell_m: 10.0,
+                ..PanoramaConfig::default()
+            },
+            ..request()
+        };
+        let index = world.map().panoramas(&anywhere).unwrap();
+        assert!(!index.is_empty());
+        for (center, _) in &index.places {
+            let pose = Pose2::from(center.coords);
+            assert!(world.ground.patch_under(&pose, None).is_some());
+            assert!(world.tiles.valid_tile_of(&pose).is_some());
+        }
+    }
+
+    #[test]
     fn without_cells_on_the_map_the_search_is_empty() {
         let world = TestWorld::street();
-        let cells = Cells {
-            centers: vec![Point2::new(9e3, 0.0)],
-            cell_m: 1.0,
-        };
+        let cells = [Point2::new(9e3, 0.0)];
         let index =
             PanoramaIndex::build(&cells, &world, &world.ground, &world.tiles, &request()).unwrap();
         let scan = world.scan(&world.pose_at(0.0, 0.0, 0.0));
