@@ -60,7 +60,7 @@ fn a_second_drive_is_localized_and_refined_in_the_map_of_the_first() {
     let found = read_tum(&folder.join("trajectory.txt")).unwrap();
     let refined = example("refine", folder, &query);
     for (row, (frame, line)) in truth.frames.iter().zip(refined.lines()).enumerate().skip(5) {
-        let error_m = distance_m(&found.poses[row].map_from_lidar, &frame.map_from_lidar);
+        let error_m = distance_m(&found[row].map_from_lidar, &frame.map_from_lidar);
         assert!(error_m < 0.1, "row {row}: {error_m} m");
         let numbers: Vec<f64> = line
             .split(' ')

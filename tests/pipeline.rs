@@ -158,8 +158,8 @@ fn the_trajectories_agree_with_the_truth(folder: &Path) {
         let kitti = folder.join(format!("results/{name}_kitti.txt"));
         let kitti = CameraPoses::read(&kitti).unwrap().world_from_cam0;
         let tum = read_tum(&folder.join(format!("results/{name}_tum.txt"))).unwrap();
-        assert_eq!((kitti.len(), tum.poses.len()), (FRAMES, FRAMES));
-        for (frame, (camera, stamped)) in kitti.iter().zip(&tum.poses).enumerate() {
+        assert_eq!((kitti.len(), tum.len()), (FRAMES, FRAMES));
+        for (frame, (camera, stamped)) in kitti.iter().zip(&tum).enumerate() {
             let error = truth.world_from_cam0[frame].inverse() * camera;
             let error_m = error.translation.vector.norm();
             assert!(error_m < limit_m, "{name}, frame {frame}: {error_m} m");

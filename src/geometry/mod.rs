@@ -18,6 +18,6 @@ pub use grid::Grid2;
 pub use mesh::{Aabb, TriangleMesh};
 pub use plane::{PlaneFit, PlaneSums};
 pub use pose::{Pose2, Pose3, Rigid3f, pose2_from_pose3, pose3_from_pose2, yaw};
-pub use trajectory::{StampedPose, Trajectory};
+pub use trajectory::StampedPose;
 
 pub use glam::Vec3;

@@ -1,7 +1,7 @@
 //! Least-squares planes by principal component analysis.
 //!
 //! ```text
-//! C = Σ wᵢ (pᵢ − p̄)(pᵢ − p̄)ᵀ / Σ wᵢ        λ₀ ≤ λ₁ ≤ λ₂
+//! C = Σ (pᵢ − p̄)(pᵢ − p̄)ᵀ / n        λ₀ ≤ λ₁ ≤ λ₂
 //! ```
 //!
 //! The normal is the eigenvector of the smallest eigenvalue, found in closed form (Smith,
@@ -9,15 +9,14 @@
 
 use glam::{DMat3, DVec3, Vec3};
 
-/// Weighted first and second moments of points, relative to an anchor near the points for numerical
+/// First and second moments of points, relative to an anchor near the points for numerical
 /// accuracy far from the origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PlaneSums {
     anchor: DVec3,
-    weight: f64,
+    count: f64,
     first: DVec3,
-    /// Second moments xx, xy, xz, yy, yz, zz.
-    second: [f64; 6],
+    second: DMat3,
 }
 
 /// A fitted plane.
@@ -36,50 +35,29 @@ impl PlaneSums {
     pub fn about(anchor: Vec3) -> Self {
         Self {
             anchor: anchor.as_dvec3(),
-            weight: 0.0,
+            count: 0.0,
             first: DVec3::ZERO,
-            second: [0.0; 6],
+            second: DMat3::ZERO,
         }
     }
 
     /// Adds a point.
     #[inline]
-    pub fn add(&mut self, point: Vec3, weight: f64) {
+    pub fn add(&mut self, point: Vec3) {
         let p = point.as_dvec3() - self.anchor;
-        let q = p * weight;
-        self.weight += weight;
-        self.first += q;
-        let products = [
-            q.x * p.x,
-            q.x * p.y,
-            q.x * p.z,
-            q.y * p.y,
-            q.y * p.z,
-            q.z * p.z,
-        ];
-        for (sum, product) in self.second.iter_mut().zip(products) {
-            *sum += product;
-        }
+        self.count += 1.0;
+        self.first += p;
+        self.second += DMat3::from_cols(p * p.x, p * p.y, p * p.z);
     }
 
-    /// The least-squares plane; `None` without weight or if the points are collinear.
+    /// The least-squares plane; `None` without points or if they are collinear.
     pub fn fit(&self) -> Option<PlaneFit> {
-        if self.weight <= 0.0 || self.weight.is_nan() {
+        if self.count == 0.0 {
             return None;
         }
-        let mean = self.first / self.weight;
-        let [xx, xy, xz, yy, yz, zz] = self.second.map(|sum| sum / self.weight);
-        let covariance = DMat3::from_cols_array(&[
-            xx - mean.x * mean.x,
-            xy - mean.x * mean.y,
-            xz - mean.x * mean.z,
-            xy - mean.x * mean.y,
-            yy - mean.y * mean.y,
-            yz - mean.y * mean.z,
-            xz - mean.x * mean.z,
-            yz - mean.y * mean.z,
-            zz - mean.z * mean.z,
-        ]);
+        let mean = self.first / self.count;
+        let column = |axis| self.second.col(axis) / self.count - mean * mean[axis];
+        let covariance = DMat3::from_cols(column(0), column(1), column(2));
         let variances = eigenvalues(&covariance);
         let normal = eigenvector(&covariance, variances)?;
         Some(PlaneFit {
@@ -135,7 +113,7 @@ mod tests {
     fn fit(points: &[Vec3]) -> Option<PlaneFit> {
         let mut sums = PlaneSums::about(points[0]);
         for &point in points {
-            sums.add(point, 1.0);
+            sums.add(point);
         }
         sums.fit()
     }

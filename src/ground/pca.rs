@@ -42,7 +42,7 @@ impl GroundClassifier for PcaGround {
     fn ground_confidence(&self, points: &[Vec3]) -> Vec<f32> {
         let mut sums = PlaneSums::about(Vec3::ZERO);
         for &point in points.iter().filter(|point| point.is_finite()) {
-            sums.add(point, 1.0);
+            sums.add(point);
         }
         let vertical = sums.fit().map_or(Vec3::Z, |plane| plane.normal);
         classify_by_normal(points, |normal, z| {

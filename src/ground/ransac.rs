@@ -4,14 +4,14 @@
 //! the one with the largest consensus set is fitted to that set.
 
 use glam::Vec3;
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+use rand::RngExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::classifier::GroundClassifier;
 use crate::geometry::{PlaneFit, PlaneSums};
+use crate::random;
 use crate::validation::{InvalidValue, Validate, in_range, positive, require};
 
 /// Ground by the dominant plane.
@@ -56,8 +56,7 @@ impl RansacGround {
             .into_par_iter()
             .filter_map(|iteration| {
                 // A stream per iteration: the same planes with any number of threads.
-                let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
-                rng.set_stream(iteration);
+                let mut rng = random::stream(self.seed, iteration);
                 let plane =
                     fit((0..sample_size).map(|_| points[rng.random_range(0..points.len())]))?;
                 let inliers = points
@@ -95,6 +94,6 @@ impl GroundClassifier for RansacGround {
 
 fn fit(points: impl Iterator<Item = Vec3>) -> Option<PlaneFit> {
     let mut sums = PlaneSums::about(Vec3::ZERO);
-    points.for_each(|point| sums.add(point, 1.0));
+    points.for_each(|point| sums.add(point));
     sums.fit()
 }

@@ -123,11 +123,11 @@ fn normal_at(image: &RangeImage, config: &NormalConfig, row: usize, column: usiz
         .max((config.min_share * points.len() as f32) as usize);
 
     let mut sums = PlaneSums::about(point);
-    sums.add(point, 1.0);
+    sums.add(point);
     let mut inliers = 0;
     for &neighbor in points {
         if hypothesis.dot(neighbor - point).abs() < tolerance_m {
-            sums.add(neighbor, 1.0);
+            sums.add(neighbor);
             inliers += 1;
         }
     }

@@ -8,7 +8,7 @@ use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use super::calibration::Calibration;
 use super::error::RecordingError;
 use super::table::{pose_from_row, read_rows, row_array, row_from_pose};
-use crate::geometry::{Pose3, StampedPose, Trajectory};
+use crate::geometry::{Pose3, StampedPose};
 
 /// Camera poses of a recording, one per frame: `p_world = world_from_cam0 * p_cam0`.
 #[derive(Clone, Debug, PartialEq)]
@@ -92,8 +92,8 @@ pub fn write_kitti(
 }
 
 /// Writes `time x y z qx qy qz qw` rows of lidar poses in the map frame.
-pub fn write_tum(mut writer: impl Write, trajectory: &Trajectory) -> io::Result<()> {
-    trajectory.poses.iter().try_for_each(|pose| {
+pub fn write_tum(mut writer: impl Write, trajectory: &[StampedPose]) -> io::Result<()> {
+    trajectory.iter().try_for_each(|pose| {
         let t = pose.map_from_lidar.translation.vector;
         let q = pose.map_from_lidar.rotation.coords;
         writeln!(
@@ -105,7 +105,7 @@ pub fn write_tum(mut writer: impl Write, trajectory: &Trajectory) -> io::Result<
 }
 
 /// Reads a TUM trajectory; frames are numbered by row.
-pub fn read_tum(path: &Path) -> Result<Trajectory, RecordingError> {
+pub fn read_tum(path: &Path) -> Result<Vec<StampedPose>, RecordingError> {
     read_rows(path)?
         .iter()
         .enumerate()
@@ -238,7 +238,7 @@ mod tests {
     fn a_tum_trajectory_reads_back() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("tum.txt");
-        let trajectory: Trajectory = poses()
+        let trajectory: Vec<StampedPose> = poses()
             .into_iter()
             .enumerate()
             .map(|(frame, map_from_lidar)| StampedPose {
@@ -249,7 +249,7 @@ mod tests {
             .collect();
         write_tum(fs::File::create(&path).unwrap(), &trajectory).unwrap();
         let back = read_tum(&path).unwrap();
-        for (a, b) in trajectory.poses.iter().zip(&back.poses) {
+        for (a, b) in trajectory.iter().zip(&back) {
             assert_relative_eq!(a.map_from_lidar, b.map_from_lidar, epsilon = 1e-5);
             assert_relative_eq!(a.time_s, b.time_s, epsilon = 1e-6);
         }

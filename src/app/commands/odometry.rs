@@ -50,11 +50,7 @@ fn recorded(file: &Path, sequence: &Sequence) -> Result<Vec<Pose3>> {
         Ok(poses) => Ok(poses.map_from_lidar(&sequence.calibration)),
         Err(RecordingError::WrongCount { found: 8, .. }) => {
             let trajectory = read_tum(file).with_context(context)?;
-            Ok(trajectory
-                .poses
-                .iter()
-                .map(|pose| pose.map_from_lidar)
-                .collect())
+            Ok(trajectory.iter().map(|pose| pose.map_from_lidar).collect())
         }
         Err(error) => Err(error).with_context(context),
     }

@@ -18,7 +18,7 @@ use crate::evaluation::{
     EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, TrajectoryMetrics,
     planar_errors,
 };
-use crate::geometry::{Pose2, Pose3, StampedPose, Trajectory, TriangleMesh};
+use crate::geometry::{Pose2, Pose3, StampedPose, TriangleMesh};
 use crate::localization::{Estimate, ParticleSet};
 use crate::recording::Sequence;
 use crate::recording::poses::{write_kitti, write_tum};
@@ -118,7 +118,7 @@ pub fn write_trajectory(
     sequence: &Sequence,
     map_from_lidar: &[Pose3],
 ) -> Result<()> {
-    let trajectory: Trajectory = (sequence.frames.iter())
+    let trajectory: Vec<StampedPose> = (sequence.frames.iter())
         .zip(map_from_lidar)
         .map(|(frame, &map_from_lidar)| StampedPose {
             map_from_lidar,
