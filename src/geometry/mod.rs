@@ -8,6 +8,7 @@ pub mod angle;
 pub mod cloud;
 pub mod grid;
 pub mod mesh;
+pub mod morton;
 pub mod plane;
 pub mod pose;
 pub mod trajectory;

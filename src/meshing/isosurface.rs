@@ -12,9 +12,9 @@ use rayon::prelude::*;
 use super::case_table::{
     cell_case, corner_signs, edge, face_corners, face_edges, face_segments, join_loops,
 };
-use super::morton;
 use super::octree::{CELLS, Level, Octree};
 use super::stencil::{CORNER_OFFSETS, CORNERS, CornerValues, corner_index};
+use crate::geometry::morton;
 
 /// A mesh in the unit cube.
 pub struct UnitMesh {

@@ -15,7 +15,6 @@ mod error;
 mod fan;
 mod isosurface;
 mod manifold;
-mod morton;
 mod normal_field;
 mod octree;
 mod samples;

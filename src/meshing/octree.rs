@@ -7,8 +7,8 @@
 
 use rayon::prelude::*;
 
-use super::morton;
 use super::samples::Samples;
+use crate::geometry::morton;
 
 /// Depth down to which the whole cube is divided; below it the tree adapts to the samples.
 pub const BASE_DEPTH: u32 = 5;

@@ -4,7 +4,7 @@ use glam::Vec3;
 use rayon::prelude::*;
 
 use super::error::MeshingError;
-use super::morton;
+use crate::geometry::morton;
 use crate::geometry::{Aabb, PointCloud};
 
 /// Points in the unit cube, sorted by the Morton codes of their cells.

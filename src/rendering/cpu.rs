@@ -11,12 +11,10 @@
 //! whose ranges differ by about a millimetre at grazing angles. Otherwise what a pose sees never
 //! depends on the other poses.
 
-mod order;
-
 use glam::{DVec3, Mat3};
 use rayon::prelude::*;
 
-use order::{bundle_width_m, coherent_order, packet_width_m, pixel_order, pose_order};
+use super::order::{bundle_width_m, coherent_order, packet_width_m, pixel_order, pose_order};
 
 use super::{RangeDifference, RangeRenderer, RenderError, SurfaceHit, facing};
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh, Vec3};

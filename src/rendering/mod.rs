@@ -7,7 +7,7 @@ pub mod backend;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;
-mod morton;
+mod order;
 pub mod selection;
 
 pub use backend::Backend;

@@ -2,8 +2,8 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::order::place_and_heading_m;
 use super::*;
+use crate::rendering::order::place_and_heading_m;
 
 /// A wavy ground of 40 m in two tiles, the border in the middle.
 fn hills(middle: Vec3) -> Vec<TriangleMesh> {

@@ -1,6 +1,5 @@
 //! Rays and beams cast by compute shaders; twin of `caster.wgsl` and `reduce.wgsl`.
 
-use std::f32::consts::PI;
 use std::ops::Range;
 
 use wgpu::{BindGroup, Buffer, BufferUsages, CommandEncoder, ComputePipeline};
@@ -12,7 +11,7 @@ use super::layout::{BEAMS_PER_GROUP, FAR, LANES, Pose, Query, Reduction};
 use super::shaders;
 use crate::geometry::Vec3;
 use crate::lidar::Beam;
-use crate::rendering::morton::spread;
+use crate::rendering::order::coherent_order;
 use crate::rendering::{RangeDifference, RenderError};
 
 /// Compute pipelines with the map bound to them.
@@ -250,19 +249,6 @@ fn batches_of(gpu: &Gpu, poses: usize, parts: &[RayPart], rays_per_batch: usize)
     batches
 }
 
-/// Places of directions along a Z-order curve over azimuth and elevation: neighbouring threads
-/// then traverse the hierarchy alike.
-fn coherent_order(directions: &[Vec3]) -> Vec<u32> {
-    let key = |direction: Vec3| {
-        let azimuth = (direction.y.atan2(direction.x) / PI + 1.0) * 511.0;
-        let height = (direction.z + 1.0) * 511.0;
-        spread(azimuth as u32) | spread(height as u32) << 1
-    };
-    let mut order: Vec<u32> = (0..directions.len() as u32).collect();
-    order.sort_by_cached_key(|&place| key(directions[place as usize]));
-    order
-}
-
 fn pipeline(gpu: &Gpu, source: &str, entry_point: &str) -> ComputePipeline {
     let module = shaders::module(gpu, source);
     gpu.device
@@ -291,38 +277,4 @@ fn read_back(gpu: &Gpu, mut encoder: CommandEncoder, results: &Buffer, bytes: u6
     let staging = gpu.staging(bytes);
     encoder.copy_buffer_to_buffer(results, 0, &staging, 0, bytes);
     gpu.submit(encoder, staging, bytes)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::lidar::LidarModel;
-
-    #[test]
-    fn the_coherent_order_is_a_permutation_with_similar_neighbours() {
-        let directions = LidarModel::default().directions();
-        let order = coherent_order(&directions);
-        let mut sorted = order.clone();
-        sorted.sort_unstable();
-        assert!(
-            sorted
-                .iter()
-                .enumerate()
-                .all(|(i, &place)| i == place as usize)
-        );
-
-        let widest = |order: &[u32]| -> f32 {
-            let groups = order.chunks(32);
-            let widths = groups.map(|group| {
-                let first = directions[group[0] as usize];
-                group
-                    .iter()
-                    .map(|&place| first.angle_between(directions[place as usize]))
-                    .fold(0.0, f32::max)
-            });
-            widths.sum()
-        };
-        let row_by_row: Vec<u32> = (0..order.len() as u32).collect();
-        assert!(widest(&order) < 0.7 * widest(&row_by_row));
-    }
 }

@@ -2,10 +2,9 @@
 
 use nalgebra::Vector3;
 
-use crate::geometry::{Pose3, Vec3};
+use crate::geometry::{Pose3, Vec3, morton};
 use crate::lidar::LidarModel;
 use crate::raycasting::RAYS;
-use crate::rendering::morton::{spread, spread_by_three};
 
 /// Typical range of a surface, by which an angle moves the end of a ray [m].
 const LEVER_M: f64 = 10.0;
@@ -30,7 +29,7 @@ pub(super) fn pixel_order(model: &LidarModel) -> Vec<u32> {
 
 /// Directions along a Z-order curve over azimuth and elevation (Morton 1966).
 pub(super) fn coherent_order(directions: &[Vec3]) -> Vec<u32> {
-    let mut keyed: Vec<(u32, u32)> = directions
+    let mut keyed: Vec<(u64, u32)> = directions
         .iter()
         .enumerate()
         .map(|(ray, direction)| {
@@ -42,9 +41,8 @@ pub(super) fn coherent_order(directions: &[Vec3]) -> Vec<u32> {
                 1.0 - along
             };
             // As fine in elevation as in azimuth: half a turn is a half of both.
-            let key = spread(((turn + 2.0) * 4096.0) as u32)
-                | spread(((direction.z + 1.0) * 4096.0) as u32) << 1;
-            (key, ray as u32)
+            let cell = [turn + 2.0, direction.z + 1.0, 0.0].map(|x| (x * 4096.0) as u32);
+            (morton::encode(cell), ray as u32)
         })
         .collect();
     keyed.sort_unstable();
@@ -59,11 +57,11 @@ pub(super) fn pose_order(poses: &[Pose3]) -> Vec<u32> {
     let least = places().fold(start, |least, place| least.inf(&place));
     let most = places().fold(-start, |most, place| most.sup(&place));
     let cells_per_m = f64::from(CELLS - 1) / (most - least).max().max(1e-3);
-    let mut keyed: Vec<(u32, u32)> = places()
+    let mut keyed: Vec<(u64, u32)> = places()
         .zip(0..)
         .map(|(place, pose)| {
-            let cell = ((place - least) * cells_per_m).map(|cell| spread_by_three(cell as u32));
-            (cell.x | cell.y << 1 | cell.z << 2, pose)
+            let cell = ((place - least) * cells_per_m).map(|cell| cell as u32);
+            (morton::encode(cell.into()), pose)
         })
         .collect();
     keyed.sort_unstable();
@@ -104,4 +102,38 @@ pub(super) fn packet_width_m(directions: &[Vec3], order: &[u32]) -> f64 {
             .fold(0.0, f64::max)
     });
     LEVER_M * widths.sum::<f64>() / order.len().div_ceil(RAYS).max(1) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lidar::LidarModel;
+
+    #[test]
+    fn the_coherent_order_is_a_permutation_with_similar_neighbours() {
+        let directions = LidarModel::default().directions();
+        let order = coherent_order(&directions);
+        let mut sorted = order.clone();
+        sorted.sort_unstable();
+        assert!(
+            sorted
+                .iter()
+                .enumerate()
+                .all(|(i, &place)| i == place as usize)
+        );
+
+        let widest = |order: &[u32]| -> f32 {
+            let groups = order.chunks(32);
+            let widths = groups.map(|group| {
+                let first = directions[group[0] as usize];
+                group
+                    .iter()
+                    .map(|&place| first.angle_between(directions[place as usize]))
+                    .fold(0.0, f32::max)
+            });
+            widths.sum()
+        };
+        let row_by_row: Vec<u32> = (0..order.len() as u32).collect();
+        assert!(widest(&order) < 0.7 * widest(&row_by_row));
+    }
 }

@@ -1,5 +1,5 @@
-//! Morton codes: the interleaved bits of the three coordinates of a cell, x lowest. Sorted by code,
-//! the cells of every octree node are contiguous in memory.
+//! Morton codes: the interleaved bits of the three coordinates of a cell, x lowest (Morton 1966). Cells
+//! sorted by code lie along a Z-order curve, and those of every octree node are contiguous.
 
 /// The code of a cell, 21 bits per coordinate.
 pub fn encode(cell: [u32; 3]) -> u64 {
