@@ -174,12 +174,12 @@ fn search(
         beams: &beams,
         ..*objective
     };
-    let batch = |positions: &[Vec<f64>]| {
-        let poses: Vec<Pose2> = positions.iter().map(|p| pose_of(p)).collect();
+    let batch = |positions: &[[f64; 3]]| {
+        let poses: Vec<Pose2> = positions.iter().map(pose_of).collect();
         coarse.costs(&poses, patch.as_ref())
     };
-    let minimum = minimize(&dimensions, &config.swarm, batch, rng)?;
-    let pose = pose_of(&minimum.position);
+    let (position, _) = minimize(&dimensions, &config.swarm, batch, rng)?;
+    let pose = pose_of(&position);
     let Some(lifted) = objective.lift(&pose, patch.as_ref()) else {
         return Ok(());
     };
@@ -217,11 +217,8 @@ fn search_space(
     ]
 }
 
-fn pose_of(position: &[f64]) -> Pose2 {
-    Pose2::new(
-        nalgebra::Vector2::new(position[0], position[1]),
-        position[2],
-    )
+fn pose_of(&[x, y, heading_rad]: &[f64; 3]) -> Pose2 {
+    Pose2::new(nalgebra::Vector2::new(x, y), heading_rad)
 }
 
 /// Runs Gauss-Newton; `None` where it did not lower the objective.

@@ -102,48 +102,36 @@ impl Dimension {
     }
 }
 
-/// The best position found.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Minimum {
-    /// One value per dimension.
-    pub position: Vec<f64>,
-    /// Value of the objective there.
-    pub value: f64,
-}
-
-struct Candidate {
-    position: Vec<f64>,
-    velocity: Vec<f64>,
-    best_position: Vec<f64>,
+struct Candidate<const N: usize> {
+    position: [f64; N],
+    velocity: [f64; N],
+    best_position: [f64; N],
     best_value: f64,
 }
 
 /// Minimizes `objective`, which evaluates all positions of an iteration in one call; a value of NaN
-/// counts as infinite.
+/// counts as infinite. Returns the best position and its value.
 ///
 /// The first candidate is at the start, so that the result is never worse than the start.
-pub fn minimize<E>(
-    dimensions: &[Dimension],
+pub fn minimize<const N: usize, E>(
+    dimensions: &[Dimension; N],
     config: &SwarmConfig,
-    mut objective: impl FnMut(&[Vec<f64>]) -> Result<Vec<f64>, E>,
+    mut objective: impl FnMut(&[[f64; N]]) -> Result<Vec<f64>, E>,
     rng: &mut impl Rng,
-) -> Result<Minimum, E> {
+) -> Result<([f64; N], f64), E> {
     let mut swarm = initial_swarm(dimensions, config, rng);
-    let mut best = Minimum {
-        position: swarm[0].position.clone(),
-        value: f64::INFINITY,
-    };
+    let mut best = (swarm[0].position, f64::INFINITY);
     evaluate(&mut swarm, &mut best, &mut objective)?;
     let mut idle = 0;
     for iteration in 0..config.iterations {
         let progress = iteration as f64 / (config.iterations.max(2) - 1) as f64;
         let inertia = config.inertia + progress * (config.final_inertia - config.inertia);
         for candidate in &mut swarm {
-            advance(candidate, &best.position, dimensions, inertia, config, rng);
+            advance(candidate, &best.0, dimensions, inertia, config, rng);
         }
-        let before = best.value;
+        let before = best.1;
         evaluate(&mut swarm, &mut best, &mut objective)?;
-        idle = match before - best.value > config.tolerance {
+        idle = match before - best.1 > config.tolerance {
             true => 0,
             false => idle + 1,
         };
@@ -155,11 +143,11 @@ pub fn minimize<E>(
 }
 
 /// Candidates around the start with random velocities; the first is at the start.
-fn initial_swarm(
-    dimensions: &[Dimension],
+fn initial_swarm<const N: usize>(
+    dimensions: &[Dimension; N],
     config: &SwarmConfig,
     rng: &mut impl Rng,
-) -> Vec<Candidate> {
+) -> Vec<Candidate<N>> {
     (0..config.candidates.max(1))
         .map(|number| {
             let sample = |dimension: &Dimension| {
@@ -170,48 +158,46 @@ fn initial_swarm(
                 };
                 dimension.bounded(dimension.start + offset)
             };
-            let position: Vec<f64> = dimensions.iter().map(sample).collect();
+            let position = dimensions.each_ref().map(sample);
             let velocity = |dimension: &Dimension| {
                 config.max_velocity * dimension.reach * rng.random_range(-1.0..=1.0)
             };
-            let velocity = dimensions.iter().map(velocity).collect();
             Candidate {
-                best_position: position.clone(),
-                best_value: f64::INFINITY,
                 position,
-                velocity,
+                velocity: dimensions.each_ref().map(velocity),
+                best_position: position,
+                best_value: f64::INFINITY,
             }
         })
         .collect()
 }
 
 /// Evaluates all candidates in one call and updates their best positions and that of the swarm.
-fn evaluate<E>(
-    swarm: &mut [Candidate],
-    best: &mut Minimum,
-    objective: &mut impl FnMut(&[Vec<f64>]) -> Result<Vec<f64>, E>,
+fn evaluate<const N: usize, E>(
+    swarm: &mut [Candidate<N>],
+    best: &mut ([f64; N], f64),
+    objective: &mut impl FnMut(&[[f64; N]]) -> Result<Vec<f64>, E>,
 ) -> Result<(), E> {
-    let positions: Vec<Vec<f64>> = swarm.iter().map(|c| c.position.clone()).collect();
+    let positions: Vec<[f64; N]> = swarm.iter().map(|c| c.position).collect();
     let values = objective(&positions)?;
     for (candidate, value) in swarm.iter_mut().zip(values) {
         // Comparisons with NaN are false.
         if value < candidate.best_value {
             candidate.best_value = value;
-            candidate.best_position.clone_from(&candidate.position);
+            candidate.best_position = candidate.position;
         }
-        if value < best.value {
-            best.value = value;
-            best.position.clone_from(&candidate.position);
+        if value < best.1 {
+            *best = (candidate.position, value);
         }
     }
     Ok(())
 }
 
 /// Moves a candidate.
-fn advance(
-    candidate: &mut Candidate,
-    best: &[f64],
-    dimensions: &[Dimension],
+fn advance<const N: usize>(
+    candidate: &mut Candidate<N>,
+    best: &[f64; N],
+    dimensions: &[Dimension; N],
     inertia: f64,
     config: &SwarmConfig,
     rng: &mut impl Rng,
@@ -257,13 +243,13 @@ mod tests {
         }
     }
 
-    fn run(
-        dimensions: &[Dimension],
+    fn run<const N: usize>(
+        dimensions: &[Dimension; N],
         config: &SwarmConfig,
         seed: u64,
         function: impl Fn(&[f64]) -> f64,
-    ) -> Minimum {
-        let batch = |positions: &[Vec<f64>]| -> Result<Vec<f64>, Infallible> {
+    ) -> ([f64; N], f64) {
+        let batch = |positions: &[[f64; N]]| -> Result<Vec<f64>, Infallible> {
             Ok(positions
                 .iter()
                 .map(|position| function(position))
@@ -287,21 +273,13 @@ mod tests {
         };
         for seed in 0..5 {
             let start = [dimension(-1.0), dimension(2.5)];
-            for (name, minimum, tolerance) in [
+            for (name, (position, _), tolerance) in [
                 ("sphere", run(&start, &many(), seed, sphere), 1e-4),
                 ("rosenbrock", run(&start, &many(), seed, rosenbrock), 0.05),
                 ("rastrigin", run(&start, &many(), seed, rastrigin), 1e-3),
             ] {
-                let error = minimum
-                    .position
-                    .iter()
-                    .map(|x| (x - 1.0).abs())
-                    .fold(0.0, f64::max);
-                assert!(
-                    error < tolerance,
-                    "{name}, seed {seed}: {:?}",
-                    minimum.position
-                );
+                let error = position.iter().map(|x| (x - 1.0).abs()).fold(0.0, f64::max);
+                assert!(error < tolerance, "{name}, seed {seed}: {position:?}");
             }
         }
     }
@@ -317,10 +295,10 @@ mod tests {
                     iterations,
                     ..SwarmConfig::default()
                 };
-                let minimum = run(&start, &config, seed, sphere);
-                assert!(minimum.value <= previous);
-                assert_eq!(minimum.value, sphere(&minimum.position));
-                previous = minimum.value;
+                let (position, value) = run(&start, &config, seed, sphere);
+                assert!(value <= previous);
+                assert_eq!(value, sphere(&position));
+                previous = value;
             }
         }
     }
@@ -336,7 +314,7 @@ mod tests {
         let goal = -PI + 0.1;
         let distance = |x: &[f64]| wrap_angle(x[0] - goal).abs();
         let mut seen = Vec::new();
-        let batch = |positions: &[Vec<f64>]| -> Result<Vec<f64>, Infallible> {
+        let batch = |positions: &[[f64; 1]]| -> Result<Vec<f64>, Infallible> {
             seen.extend(positions.iter().map(|p| p[0]));
             Ok(positions.iter().map(|p| distance(p)).collect())
         };
@@ -345,7 +323,7 @@ mod tests {
             ..SwarmConfig::default()
         };
         let Ok(minimum) = minimize(&[heading], &config, batch, &mut StdRng::seed_from_u64(1));
-        assert!(minimum.value < 1e-4, "{minimum:?}");
+        assert!(minimum.1 < 1e-4, "{minimum:?}");
         assert!(seen.iter().all(|x| (-PI..PI).contains(x)));
         assert!(
             seen.iter()
@@ -359,18 +337,14 @@ mod tests {
             reach: 0.5,
             ..dimension(-1.0)
         };
-        let minimum = run(&[narrow, dimension(0.0)], &many(), 1, sphere);
-        assert!(
-            (minimum.position[0] + 0.5).abs() < 1e-9,
-            "{:?}",
-            minimum.position
-        );
+        let (position, _) = run(&[narrow, dimension(0.0)], &many(), 1, sphere);
+        assert!((position[0] + 0.5).abs() < 1e-9, "{position:?}");
     }
 
     #[test]
     fn every_iteration_is_one_call_and_patience_stops_early() {
         let mut calls = 0;
-        let flat = |positions: &[Vec<f64>]| -> Result<Vec<f64>, Infallible> {
+        let flat = |positions: &[[f64; 1]]| -> Result<Vec<f64>, Infallible> {
             calls += 1;
             assert_eq!(positions.len(), SwarmConfig::default().candidates);
             Ok(vec![1.0; positions.len()])
@@ -388,7 +362,7 @@ mod tests {
     fn nan_is_never_the_minimum() {
         let half = |x: &[f64]| if x[0] > 0.0 { f64::NAN } else { -x[0] };
         let minimum = run(&[dimension(-2.0)], &many(), 1, half);
-        assert!(minimum.value >= 0.0 && minimum.value < 1e-2, "{minimum:?}");
+        assert!((0.0..1e-2).contains(&minimum.1), "{minimum:?}");
     }
 
     #[test]
