@@ -31,9 +31,6 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             ..frame.stamped()
         });
     }
-    write_tum(
-        std::fs::File::create(trajectory_file)?,
-        &trajectory.into_iter().collect(),
-    )?;
+    write_tum(std::fs::File::create(trajectory_file)?, &trajectory)?;
     Ok(())
 }

@@ -22,7 +22,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for (frame, row) in Sequence::open_folder(recording)?
         .frames
         .iter()
-        .zip(&trajectory.poses)
+        .zip(&trajectory)
     {
         let estimate = InitialEstimate {
             pose: pose2_from_pose3(&row.map_from_lidar),

@@ -19,7 +19,7 @@ const DRIVE_STEP: usize = 20;
 const AHEAD_M: f32 = 8.0;
 
 /// A row of the table: a name, and the scans of a seed.
-type Scene = (String, Box<dyn Fn(u64) -> Result<Vec<LabelledScan>> + Sync>);
+type TableRow = (String, Box<dyn Fn(u64) -> Result<Vec<LabelledScan>> + Sync>);
 
 /// Returns the table for standard output.
 pub fn run(config: &GroundCommandConfig, context: &Context) -> Result<String> {
@@ -78,9 +78,9 @@ pub fn run(config: &GroundCommandConfig, context: &Context) -> Result<String> {
     ))
 }
 
-fn scenes() -> Vec<Scene> {
+fn scenes() -> Vec<TableRow> {
     let percent = |grade: f64| (100.0 * grade).round();
-    let mut scenes: Vec<Scene> = Vec::new();
+    let mut scenes: Vec<TableRow> = Vec::new();
     for grade in [0.0, 0.05, 0.10, 0.15, -0.10] {
         let name = format!("slope {} %", percent(grade));
         scenes.push(one_scan(name, move |scanner, seed| {
@@ -109,7 +109,7 @@ fn scenes() -> Vec<Scene> {
 fn one_scan(
     name: String,
     scan: impl Fn(&ScannerConfig, u64) -> LabelledScan + Sync + 'static,
-) -> Scene {
+) -> TableRow {
     let scans = move |seed| Ok(vec![scan(&ScannerConfig::default(), seed)]);
     (name, Box::new(scans))
 }
