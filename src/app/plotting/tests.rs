@@ -347,7 +347,7 @@ fn range_images_show_missing_pixels_and_differences() {
     let points: Vec<Vec3> = (0..model.len())
         .filter_map(|index| {
             let range = range_at(index, true) + rng.random_range(-0.1..0.1);
-            let point = model.direction_of(model.pixel_at(index)) * range;
+            let point = model.direction_of(index) * range;
             (!rng.random_bool(0.05)).then_some(point)
         })
         .collect();
