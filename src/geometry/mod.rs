@@ -18,7 +18,7 @@ pub use cloud::PointCloud;
 pub use grid::Grid2;
 pub use mesh::{Aabb, TriangleMesh};
 pub use plane::{PlaneFit, PlaneSums};
-pub use pose::{Pose2, Pose3, Rigid3f, pose2_from_pose3, pose3_from_pose2, yaw};
+pub use pose::{FARTHEST_M, Pose2, Pose3, Rigid3f, pose2_from_pose3, pose3_from_pose2, yaw};
 pub use trajectory::StampedPose;
 
 pub use glam::Vec3;

@@ -8,6 +8,9 @@ pub type Pose2 = Isometry2<f64>;
 /// A pose or transform in space [m].
 pub type Pose3 = Isometry3<f64>;
 
+/// The circumference of the Earth [m]: no coordinate of a recording or a map is larger.
+pub const FARTHEST_M: f64 = 4.0e7;
+
 /// Heading of a pose, `atan2(R₁₀, R₀₀)` [rad].
 pub fn yaw(pose: &Pose3) -> f64 {
     let forward = pose.rotation * nalgebra::Vector3::x();

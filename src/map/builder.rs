@@ -18,7 +18,9 @@ use super::config::{MapConfig, MapOptions};
 use super::local_map::{self, LocalMap};
 use super::mapping_path::MappingPath;
 use super::model::{Map, MapError};
+use super::path_check::{self, ImplausiblePath};
 use super::plan::{self, LocalMapPlan, Ownership};
+use super::scan_agreement;
 use super::scan_cloud::ScanCloud;
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::ground::GroundClassifier;
@@ -50,6 +52,16 @@ pub enum BuildError {
         "there are no scans to build a map from; check the recording and its selection of frames"
     )]
     NoScans,
+    #[error(transparent)]
+    Path(#[from] ImplausiblePath),
+    #[error(
+        "the poses of scans {first} to {last} do not fit: only {percent:.0} % of a scan's points are on the surfaces of the next one; check that the poses are of this recording and that calib_file has the line Tr that belongs to them"
+    )]
+    PosesDoNotFit {
+        first: usize,
+        last: usize,
+        percent: f32,
+    },
     #[error("local map {number} (key scans {first} to {last}): {source}")]
     LocalMap {
         number: usize,
@@ -122,6 +134,7 @@ impl MapBuilder {
         if map_from_lidar.is_empty() {
             return Err(BuildError::NoScans);
         }
+        path_check::check(map_from_lidar.iter().enumerate(), config.max_step_m)?;
         let local_maps = plan::local_maps(&map_from_lidar, config.local_map_size, config.overlap_m);
         let reach_m = f64::from(config.local_map.scan.crop_m.length());
         Ok(MapPlan {
@@ -169,18 +182,31 @@ impl MapPlan<'_> {
         let scans: Vec<ScanCloud> = (plan.used.clone().into_par_iter())
             .map(prepare)
             .collect::<Result<_, BuildError>>()?;
+        let agreements = scan_agreement::of_neighbours(&scans);
+        let agreement = scan_agreement::median(&agreements);
+        if !agreements.is_empty() && agreement < scan_agreement::WRONG {
+            return Err(BuildError::PosesDoNotFit {
+                first: plan.used.start,
+                last: plan.used.end - 1,
+                percent: 100.0 * agreement,
+            });
+        }
         let begin_stage = |name| notify(BuildEvent::Stage(name));
-        local_map::build(scans, plan.number, &self.ownership, config, begin_stage).map_err(
-            |error| match error {
-                BuildError::Meshing(source) => BuildError::LocalMap {
-                    number: plan.number,
-                    first: plan.own.start,
-                    last: plan.own.end - 1,
-                    source,
-                },
-                other => other,
+        let built = local_map::build(scans, plan.number, &self.ownership, config, begin_stage);
+        let mut local_map = built.map_err(|error| match error {
+            BuildError::Meshing(source) => BuildError::LocalMap {
+                number: plan.number,
+                first: plan.own.start,
+                last: plan.own.end - 1,
+                source,
             },
-        )
+            other => other,
+        })?;
+        local_map.agreement = agreement;
+        local_map.doubtful_scans = (scan_agreement::doubtful_scans(&agreements).iter())
+            .map(|scan| plan.used.start + scan)
+            .collect();
+        Ok(local_map)
     }
 
     /// Prepares the joined mesh of all local maps as a map; `world_from_map` is the identity.

@@ -7,7 +7,7 @@ use super::local_map::LocalMapConfig;
 use super::tiles::TileConfig;
 use crate::ground::GroundConfig;
 use crate::rendering::Backend;
-use crate::validation::{InvalidValue, Validate, at_least_one, not_negative};
+use crate::validation::{InvalidValue, Validate, at_least_one, not_negative, positive};
 
 /// Everything that can be configured about building a map.
 ///
@@ -23,6 +23,9 @@ pub struct MapConfig {
     /// Length of path of the neighbours with which a local map is meshed [m].
     #[default(5.0)]
     pub overlap_m: f64,
+    /// Largest distance between successive scans [m]; a larger one is an error of the poses.
+    #[default(50.0)]
+    pub max_step_m: f64,
     /// Ground segmentation of the scans.
     pub ground: GroundConfig,
     /// From the scans of a local map to its mesh.
@@ -35,6 +38,7 @@ impl Validate for MapConfig {
         not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
         at_least_one("local_map_size", self.local_map_size)?;
         not_negative("overlap_m", self.overlap_m)?;
+        positive("max_step_m", self.max_step_m)?;
         self.local_map.validate()
     }
 }

@@ -112,6 +112,11 @@ pub struct LocalMap {
     pub mesh: TriangleMesh,
     /// Numbers of points and triangles at each step.
     pub counts: LocalMapCounts,
+    /// Median share of the points of a scan that are on surfaces of the next one, from 0 to 1; below
+    /// 0.8 the poses are doubtful.
+    pub agreement: f32,
+    /// Key scans that agree with neither neighbour as well as the others do: their poses are doubtful.
+    pub doubtful_scans: Vec<usize>,
 }
 
 /// Meshes the prepared scans of a local map and colours the mesh by ground confidence. `begin_stage`
@@ -136,7 +141,11 @@ pub(super) fn build<E: From<MeshingError>>(
     begin_stage("surface")?;
     let Some(surface) = reconstruct(&cloud, weights.as_deref(), config, &mut counts)? else {
         let mesh = TriangleMesh::default();
-        return Ok(LocalMap { mesh, counts });
+        return Ok(LocalMap {
+            mesh,
+            counts,
+            ..LocalMap::default()
+        });
     };
     counts.reconstructed_triangles = surface.mesh.triangles.len();
     let mut mesh = surface.mesh;
@@ -159,7 +168,11 @@ pub(super) fn build<E: From<MeshingError>>(
     let is_held = seam::on_border(&mesh.vertices, ownership, number);
     finish_ground(&mut mesh, &cloud, &is_held, config, &mut counts);
     counts.triangles = mesh.triangles.len();
-    Ok(LocalMap { mesh, counts })
+    Ok(LocalMap {
+        mesh,
+        counts,
+        ..LocalMap::default()
+    })
 }
 
 /// Returns the static points of all scans with their weights.

@@ -12,12 +12,13 @@ use std::path::{Path, PathBuf};
 use glam::Vec3;
 use ply_rs::parser::{ParseError, Parser, Reader};
 use ply_rs::ply::{
-    BeginList, Encoding, Header, PropertyAccess, PropertyAccessResult, PropertyType, ScalarType,
+    BeginList, Encoding, Header, Property, PropertyAccess, PropertyAccessResult, PropertyType,
+    ScalarType,
 };
 
 use super::mapping_path::{BadPathComment, MappingPath};
 use crate::files::write_atomically;
-use crate::geometry::TriangleMesh;
+use crate::geometry::{FARTHEST_M, TriangleMesh};
 
 /// A PLY file that cannot be read or written.
 #[derive(Debug, thiserror::Error)]
@@ -52,6 +53,13 @@ pub enum PlyProblem {
     },
     #[error("has no element `{0}`; a map is a triangle mesh with vertices and faces")]
     NoElement(&'static str),
+    #[error(
+        "has no property `{property}` of `{element}` that can be used; a map needs the numbers x, y and z of each vertex and the list of integers vertex_indices of each face"
+    )]
+    NoProperty {
+        element: &'static str,
+        property: &'static str,
+    },
     #[error("has no triangles; build the map again, or choose another map_file")]
     NoTriangles,
     #[error(
@@ -69,9 +77,6 @@ pub enum PlyProblem {
     )]
     TooFar { vertex: usize, position: Vec3 },
 }
-
-/// The circumference of the Earth [m]: no coordinate of a map is larger.
-const FARTHEST_M: f32 = 4.0e7;
 
 const POSITION: &str = "property float x\nproperty float y\nproperty float z\n";
 const NORMAL: &str = "property float nx\nproperty float ny\nproperty float nz\n";
@@ -181,7 +186,7 @@ fn read_mesh(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), PlyProb
     let bytes = file.metadata()?.len();
     let mut reader = Reader::new(BufReader::with_capacity(1 << 20, file));
     let header = Parser::<Vertex>::new().read_header(&mut reader)?;
-    check_counts(&header, bytes)?;
+    check_header(&header, bytes)?;
 
     let (mut vertices, mut faces): (Option<Vec<Vertex>>, Option<Vec<Face>>) = (None, None);
     for (name, element) in &header.elements {
@@ -196,8 +201,7 @@ fn read_mesh(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), PlyProb
             }
         }
     }
-    let vertices = vertices.ok_or(PlyProblem::NoElement("vertex"))?;
-    let faces = faces.ok_or(PlyProblem::NoElement("face"))?;
+    let (vertices, faces) = (vertices.unwrap_or_default(), faces.unwrap_or_default());
     let mut mesh = TriangleMesh {
         vertices: vertices.iter().map(|vertex| vertex.position).collect(),
         triangles: triangles_of(&faces, vertices.len())?,
@@ -233,39 +237,70 @@ struct Vertex {
     color: [u8; 3],
 }
 
+impl Vertex {
+    /// The coordinate of a name, in any case.
+    fn coordinate(&mut self, name: &str) -> Option<&mut f32> {
+        Some(match name {
+            "x" | "X" => &mut self.position.x,
+            "y" | "Y" => &mut self.position.y,
+            "z" | "Z" => &mut self.position.z,
+            "nx" => &mut self.normal.x,
+            "ny" => &mut self.normal.y,
+            "nz" => &mut self.normal.z,
+            _ => return None,
+        })
+    }
+
+    /// Sets a coordinate, or a color channel from 0 to 255.
+    fn set(&mut self, name: &str, value: f32) -> PropertyAccessResult {
+        let channel = match name {
+            "red" => 0,
+            "green" => 1,
+            "blue" => 2,
+            _ => match self.coordinate(name) {
+                Some(coordinate) => {
+                    *coordinate = value;
+                    return PropertyAccessResult::Set;
+                }
+                None => return PropertyAccessResult::Ignored,
+            },
+        };
+        self.color[channel] = value.round() as u8;
+        PropertyAccessResult::Set
+    }
+}
+
 impl PropertyAccess for Vertex {
     fn new() -> Self {
         Self::default()
     }
 
-    fn set_float(&mut self, name: &str, value: f32) -> PropertyAccessResult {
-        let target = match name {
-            "x" => &mut self.position.x,
-            "y" => &mut self.position.y,
-            "z" => &mut self.position.z,
-            "nx" => &mut self.normal.x,
-            "ny" => &mut self.normal.y,
-            "nz" => &mut self.normal.z,
-            // Colours as numbers from 0 to 1, as some tools write them.
-            _ => return self.set_uchar(name, (value.clamp(0.0, 1.0) * 255.0).round() as u8),
-        };
-        *target = value;
-        PropertyAccessResult::Set
-    }
-
-    fn set_double(&mut self, name: &str, value: f64) -> PropertyAccessResult {
-        self.set_float(name, value as f32)
-    }
-
-    fn set_uchar(&mut self, name: &str, value: u8) -> PropertyAccessResult {
-        let channel = match name {
-            "red" => 0,
-            "green" => 1,
-            "blue" => 2,
+    fn set_property(&mut self, name: &str, property: Property) -> PropertyAccessResult {
+        let value = match property {
+            Property::Char(value) => f32::from(value),
+            Property::UChar(value) => f32::from(value),
+            Property::Short(value) => f32::from(value),
+            Property::UShort(value) => f32::from(value),
+            Property::Int(value) => value as f32,
+            Property::UInt(value) => value as f32,
+            Property::Float(value) => return self.set_float(name, value),
+            Property::Double(value) => return self.set_float(name, value as f32),
             _ => return PropertyAccessResult::Ignored,
         };
-        self.color[channel] = value;
-        PropertyAccessResult::Set
+        self.set(name, value)
+    }
+
+    fn set_float(&mut self, name: &str, value: f32) -> PropertyAccessResult {
+        let is_color = matches!(name, "red" | "green" | "blue");
+        // Colors as numbers from 0 to 1, as some tools write them.
+        self.set(
+            name,
+            if is_color {
+                value.clamp(0.0, 1.0) * 255.0
+            } else {
+                value
+            },
+        )
     }
 }
 
@@ -273,16 +308,6 @@ impl PropertyAccess for Vertex {
 #[derive(Debug, Default)]
 struct Face {
     vertices: Vec<u32>,
-}
-
-impl Face {
-    fn set(&mut self, name: &str, vertices: impl Iterator<Item = u32>) -> PropertyAccessResult {
-        if !matches!(name, "vertex_indices" | "vertex_index") {
-            return PropertyAccessResult::Ignored;
-        }
-        self.vertices = vertices.collect();
-        PropertyAccessResult::Set
-    }
 }
 
 impl PropertyAccess for Face {
@@ -297,23 +322,56 @@ impl PropertyAccess for Face {
         }
     }
 
-    fn set_list_int(&mut self, name: &str, value: Vec<i32>) -> PropertyAccessResult {
-        // Negative indices become one that no mesh has, which is an error.
-        let index = |index: i32| u32::try_from(index).unwrap_or(u32::MAX);
-        self.set(name, value.into_iter().map(index))
-    }
-
-    fn set_list_ushort(&mut self, name: &str, value: Vec<u16>) -> PropertyAccessResult {
-        self.set(name, value.into_iter().map(u32::from))
-    }
-
-    fn set_list_uchar(&mut self, name: &str, value: Vec<u8>) -> PropertyAccessResult {
-        self.set(name, value.into_iter().map(u32::from))
+    fn set_property(&mut self, name: &str, property: Property) -> PropertyAccessResult {
+        /// Negative indices become one that no mesh has, which is an error.
+        fn indices<T: TryInto<u32>>(values: Vec<T>) -> Vec<u32> {
+            (values.into_iter())
+                .map(|index| index.try_into().unwrap_or(u32::MAX))
+                .collect()
+        }
+        if !matches!(name, "vertex_indices" | "vertex_index") {
+            return PropertyAccessResult::Ignored;
+        }
+        self.vertices = match property {
+            Property::ListChar(values) => indices(values),
+            Property::ListUChar(values) => indices(values),
+            Property::ListShort(values) => indices(values),
+            Property::ListUShort(values) => indices(values),
+            Property::ListInt(values) => indices(values),
+            Property::ListUInt(values) => values,
+            _ => return PropertyAccessResult::UnsupportedType,
+        };
+        PropertyAccessResult::Set
     }
 }
 
-/// Checks that the header does not claim more than the file can hold.
-fn check_counts(header: &Header, bytes: u64) -> Result<(), PlyProblem> {
+/// Checks that the header has the elements and properties of a mesh and does not claim more than the
+/// file can hold.
+fn check_header(header: &Header, bytes: u64) -> Result<(), PlyProblem> {
+    let is_scalar = |kind: &PropertyType| matches!(kind, PropertyType::Scalar(_));
+    let is_list = |kind: &PropertyType| matches!(kind, PropertyType::List(..));
+    type Needed<'a> = (
+        &'static str,
+        [&'static str; 2],
+        &'a dyn Fn(&PropertyType) -> bool,
+    );
+    let needed: [Needed; 4] = [
+        ("vertex", ["x", "X"], &is_scalar),
+        ("vertex", ["y", "Y"], &is_scalar),
+        ("vertex", ["z", "Z"], &is_scalar),
+        ("face", ["vertex_indices", "vertex_index"], &is_list),
+    ];
+    for (element, names, has_kind) in needed {
+        let properties = match header.elements.get(element) {
+            Some(found) => &found.properties,
+            None => return Err(PlyProblem::NoElement(element)),
+        };
+        let found = names.iter().find_map(|name| properties.get(*name));
+        if !found.is_some_and(|property| has_kind(&property.data_type)) {
+            let property = names[0];
+            return Err(PlyProblem::NoProperty { element, property });
+        }
+    }
     for (name, element) in &header.elements {
         let least: usize = match header.encoding {
             // One character and a space or line break per property.
@@ -324,7 +382,7 @@ fn check_counts(header: &Header, bytes: u64) -> Result<(), PlyProblem> {
                 })
                 .sum(),
         };
-        let needed = element.count as u128 * least as u128;
+        let needed = element.count as u128 * least.max(1) as u128;
         if needed > u128::from(bytes) {
             return Err(PlyProblem::ImpossibleCount {
                 element: name.clone(),
@@ -372,7 +430,7 @@ fn check_mesh(mesh: &TriangleMesh) -> Result<(), PlyProblem> {
         if !position.is_finite() {
             return Err(PlyProblem::NotFinite(vertex));
         }
-        if position.abs().max_element() > FARTHEST_M {
+        if f64::from(position.abs().max_element()) > FARTHEST_M {
             return Err(PlyProblem::TooFar { vertex, position });
         }
     }
@@ -445,6 +503,48 @@ mod tests {
         .unwrap();
         assert_eq!(mesh.triangles, [[0, 1, 2], [0, 2, 3]]);
         assert!(mesh.normals.is_empty());
+    }
+
+    /// The ASCII file of a triangle whose vertices have properties of a type and names.
+    fn triangle(kind: &str, names: [&str; 3], index: &str) -> String {
+        let [x, y, z] = names.map(|name| format!("property {kind} {name}\n"));
+        format!(
+            "ply\nformat ascii 1.0\nelement vertex 3\n{x}{y}{z}element face 1\n\
+             property list uchar {index} vertex_index\nend_header\n0 0 1\n2 0 1\n0 3 1\n3 0 1 2\n"
+        )
+    }
+
+    #[test]
+    fn coordinates_and_indices_of_every_type_and_coordinates_in_capitals_are_read() {
+        let expected = read_text(&triangle("float", ["x", "y", "z"], "uint")).unwrap();
+        assert_eq!(expected.vertices[1], Vec3::new(2.0, 0.0, 1.0));
+        for kind in ["char", "uchar", "short", "ushort", "int", "uint", "double"] {
+            let mesh = read_text(&triangle(kind, ["X", "Y", "Z"], "uint")).unwrap();
+            assert_eq!(mesh, expected, "{kind}");
+        }
+        for index in ["char", "uchar", "short", "ushort", "int"] {
+            let mesh = read_text(&triangle("float", ["x", "y", "z"], index)).unwrap();
+            assert_eq!(mesh, expected, "{index}");
+        }
+    }
+
+    #[test]
+    fn a_missing_or_unusable_property_is_named() {
+        for (text, property) in [
+            (triangle("float", ["x", "y", "height"], "uint"), "`z`"),
+            (triangle("list uchar int", ["x", "y", "z"], "uint"), "`x`"),
+        ] {
+            let message = read_text(&text).unwrap_err().to_string();
+            assert!(message.contains(property), "{message}");
+        }
+        assert!(read_text(&triangle("float", ["x", "y", "z"], "float")).is_err());
+        let endless = "ply\nformat ascii 1.0\nelement nothing 1000000000000\n";
+        let text = triangle("float", ["x", "y", "z"], "uint");
+        let text = text.replace("ply\nformat ascii 1.0\n", endless);
+        assert!(matches!(
+            read_text(&text).unwrap_err().problem,
+            PlyProblem::ImpossibleCount { .. }
+        ));
     }
 
     #[test]

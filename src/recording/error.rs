@@ -49,6 +49,25 @@ pub enum RecordingError {
         times: usize,
         poses: usize,
     },
+    #[error("{}: frame {frame} at {time_s} s is not later than the frame before it at {previous_s} s; give times that ascend, in seconds with decimals, or remove the file to assume 10 scans per second", path.display())]
+    TimesDoNotAscend {
+        path: PathBuf,
+        frame: usize,
+        time_s: f64,
+        previous_s: f64,
+    },
+    #[error("{}, line {line}: {value} is beyond any {quantity} of a recording, {limit}", path.display())]
+    OutOfRange {
+        path: PathBuf,
+        line: usize,
+        value: f64,
+        quantity: &'static str,
+        limit: &'static str,
+    },
+    #[error("the name of {} is a number and that of {} is not; the numbers of scans are rows of the pose file, remove the file that is no scan of the recording", number.display(), word.display())]
+    MixedNames { number: PathBuf, word: PathBuf },
+    #[error("{} and {} have the same number; give the folder of one recording", first.display(), second.display())]
+    SameNumber { first: PathBuf, second: PathBuf },
     #[error("no frame is selected: start_idx {start_idx}, n_scans {n_scans}, frame_step {frame_step} of {scans} scans in {}", path.display())]
     NothingSelected {
         path: PathBuf,

@@ -3,11 +3,11 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+use nalgebra::{Quaternion, UnitQuaternion};
 
 use super::calibration::Calibration;
 use super::error::RecordingError;
-use super::table::{pose_from_row, read_rows, row_array, row_from_pose};
+use super::table::{pose_from_row, position, read_rows, row_array, row_from_pose};
 use crate::geometry::{Pose3, StampedPose};
 
 /// Camera poses of a recording, one per frame: `p_world = world_from_cam0 * p_cam0`.
@@ -112,6 +112,7 @@ pub fn read_tum(path: &Path) -> Result<Vec<StampedPose>, RecordingError> {
         .map(|(frame, (line, row))| {
             let [time_s, x, y, z, qx, qy, qz, qw] =
                 row_array(row, path, *line, "time x y z qx qy qz qw")?;
+            check_time(time_s, path, *line)?;
             let quaternion = Quaternion::new(qw, qx, qy, qz);
             if (quaternion.norm() - 1.0).abs() > 0.01 {
                 return Err(RecordingError::NotARotation {
@@ -123,7 +124,7 @@ pub fn read_tum(path: &Path) -> Result<Vec<StampedPose>, RecordingError> {
                 frame,
                 time_s,
                 map_from_lidar: Pose3::from_parts(
-                    Translation3::new(x, y, z),
+                    position(x, y, z, path, *line)?,
                     UnitQuaternion::from_quaternion(quaternion),
                 ),
             })
@@ -137,9 +138,23 @@ pub fn read_times(path: &Path) -> Result<Vec<f64>, RecordingError> {
         .iter()
         .map(|(line, row)| {
             let [time_s] = row_array(row, path, *line, "seconds")?;
-            Ok(time_s)
+            check_time(time_s, path, *line)
         })
         .collect()
+}
+
+/// Returns a time that a clock can show, from 1653 to 2286 if it counts from 1970 [s].
+fn check_time(time_s: f64, path: &Path, line: usize) -> Result<f64, RecordingError> {
+    if time_s.abs() <= 1e10 {
+        return Ok(time_s);
+    }
+    Err(RecordingError::OutOfRange {
+        path: path.to_owned(),
+        line,
+        value: time_s,
+        quantity: "time",
+        limit: "1e10 s; times are in seconds",
+    })
 }
 
 /// Writes `times.txt` [s].

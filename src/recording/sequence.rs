@@ -1,5 +1,6 @@
 //! A recording: its selected scans with their poses and times.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -106,10 +107,11 @@ pub struct Sequence {
 impl Sequence {
     /// Opens a recording without reading its scans.
     ///
-    /// Scans are the `.bin` files below `scan_folder` in the order of their paths. If their names
-    /// are numbers, the number is the row of the pose file, so that a part of a recording keeps
-    /// its poses; otherwise the position in the order is. Times are read from `times.txt` beside
-    /// the pose file if it exists.
+    /// Scans are the `.bin` files below `scan_folder`, without hidden ones. If their names are
+    /// numbers, the number is the row of the pose file, from 0, so that a part of a recording keeps
+    /// its poses; if none is a number, the position in the order of their paths is. A mixture, and
+    /// a number that two scans have, are errors. Times are read from `times.txt` beside the pose
+    /// file if it exists; they must ascend.
     pub fn open(
         scan_folder: &Path,
         pose_file: &Path,
@@ -220,13 +222,11 @@ pub fn selected_scans(
     folder: &Path,
     selection: &Selection,
 ) -> Result<Vec<(usize, PathBuf)>, RecordingError> {
-    let scans = scan_paths(folder)?;
+    let scans = numbered(scan_paths(folder)?)?;
     let count = scans.len();
     let window = usize::try_from(selection.n_scans).unwrap_or(usize::MAX);
     let window_end = selection.start_idx.saturating_add(window);
-    let selected: Vec<(usize, PathBuf)> = frame_numbers(&scans)
-        .into_iter()
-        .zip(scans)
+    let selected: Vec<(usize, PathBuf)> = (scans.into_iter())
         .filter(|(number, _)| {
             let in_window = (selection.start_idx..window_end).contains(number);
             in_window && (number - selection.start_idx).is_multiple_of(selection.frame_step)
@@ -244,13 +244,23 @@ pub fn selected_scans(
     Ok(selected)
 }
 
-/// All `.bin` files below a folder, sorted by path.
+/// All `.bin` files below a folder, sorted by path, without hidden files and folders. A folder that
+/// is linked more than once is read once.
 pub fn scan_paths(folder: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     let mut paths = Vec::new();
     let mut folders = vec![folder.to_owned()];
+    let mut visited = BTreeSet::new();
     while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(&folder).map_err(RecordingError::read(&folder))? {
-            let path = entry.map_err(RecordingError::read(&folder))?.path();
+        let read_error = || RecordingError::read(&folder);
+        if !visited.insert(folder.canonicalize().map_err(read_error())?) {
+            continue;
+        }
+        for entry in fs::read_dir(&folder).map_err(read_error())? {
+            let path = entry.map_err(read_error())?.path();
+            let is_hidden = (path.file_name()).is_some_and(|n| n.as_encoded_bytes()[0] == b'.');
+            if is_hidden {
+                continue;
+            }
             if path.is_dir() {
                 folders.push(path);
             } else if path.extension().is_some_and(|extension| extension == "bin") {
@@ -267,16 +277,33 @@ pub fn scan_paths(folder: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     Ok(paths)
 }
 
-/// The numbers in the names if all names are distinct numbers, else the positions.
-fn frame_numbers(scans: &[PathBuf]) -> Vec<usize> {
-    let named: Option<Vec<usize>> = scans
-        .iter()
-        .map(|path| path.file_stem()?.to_str()?.parse().ok())
-        .collect();
-    match named {
-        Some(numbers) if numbers.is_sorted_by(|a, b| a < b) => numbers,
-        _ => (0..scans.len()).collect(),
+/// Scans with their numbers, ascending: those in their names, or, if no name is a number, their
+/// positions.
+fn numbered(scans: Vec<PathBuf>) -> Result<Vec<(usize, PathBuf)>, RecordingError> {
+    let number_of = |path: &PathBuf| path.file_stem()?.to_str()?.parse::<usize>().ok();
+    let Some(first) = scans.iter().find(|path| number_of(path).is_some()).cloned() else {
+        return Ok(scans.into_iter().enumerate().collect());
+    };
+    let mut numbered = Vec::with_capacity(scans.len());
+    for path in scans {
+        let Some(number) = number_of(&path) else {
+            return Err(RecordingError::MixedNames {
+                number: first,
+                word: path,
+            });
+        };
+        numbered.push((number, path));
     }
+    numbered.sort();
+    for pair in numbered.windows(2) {
+        if pair[0].0 == pair[1].0 {
+            return Err(RecordingError::SameNumber {
+                first: pair[0].1.clone(),
+                second: pair[1].1.clone(),
+            });
+        }
+    }
+    Ok(numbered)
 }
 
 fn frame_times(pose_file: &Path, poses: usize) -> Result<Vec<f64>, RecordingError> {
@@ -285,14 +312,21 @@ fn frame_times(pose_file: &Path, poses: usize) -> Result<Vec<f64>, RecordingErro
         return Ok((0..poses).map(|i| i as f64 / SCANS_PER_SECOND).collect());
     }
     let times_s = read_times(&path)?;
-    if times_s.len() == poses {
-        Ok(times_s)
-    } else {
-        Err(RecordingError::WrongTimes {
+    if times_s.len() != poses {
+        return Err(RecordingError::WrongTimes {
             path,
             times: times_s.len(),
             poses,
-        })
+        });
+    }
+    match times_s.windows(2).position(|pair| pair[1] <= pair[0]) {
+        Some(frame) => Err(RecordingError::TimesDoNotAscend {
+            path,
+            frame: frame + 1,
+            time_s: times_s[frame + 1],
+            previous_s: times_s[frame],
+        }),
+        None => Ok(times_s),
     }
 }
 
@@ -357,6 +391,49 @@ mod tests {
             numbers(&open(folder.path(), &Selection::default()).unwrap()),
             [0, 1]
         );
+    }
+
+    #[test]
+    fn numbers_are_sorted_as_numbers() {
+        let folder = recording(&["10.bin", "2.bin", "1.bin"], 11);
+        let sequence = open(folder.path(), &Selection::default()).unwrap();
+        assert_eq!(numbers(&sequence), [1, 2, 10]);
+    }
+
+    #[test]
+    fn hidden_files_are_ignored_and_names_that_are_partly_numbers_are_an_error() {
+        let names = ["000000.bin", "000001.bin", "._000000.bin"];
+        let folder = recording(&names, 2);
+        let sequence = open(folder.path(), &Selection::default()).unwrap();
+        assert_eq!(numbers(&sequence), [0, 1]);
+        let copy = folder.path().join("velodyne/000000 (copy).bin");
+        fs::write(&copy, []).unwrap();
+        let result = open(folder.path(), &Selection::default());
+        let message = result.unwrap_err().to_string();
+        assert!(message.contains("000000 (copy).bin"), "{message}");
+        fs::rename(copy, folder.path().join("velodyne/0.bin")).unwrap();
+        let result = open(folder.path(), &Selection::default());
+        assert!(matches!(result, Err(RecordingError::SameNumber { .. })));
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_loop_of_links_does_not_multiply_the_recording() {
+        let folder = recording(&["a.bin", "b.bin"], 2);
+        let velodyne = folder.path().join("velodyne");
+        std::os::unix::fs::symlink(&velodyne, velodyne.join("loop")).unwrap();
+        assert_eq!(scan_paths(&velodyne).unwrap().len(), 2);
+    }
+
+    #[test]
+    fn times_that_do_not_ascend_are_an_error() {
+        let folder = recording(&["000000.bin"], 3);
+        for times in ["0\n0.1\n0.1\n", "0\n0.2\n0.1\n"] {
+            fs::write(folder.path().join("times.txt"), times).unwrap();
+            let result = open(folder.path(), &Selection::default());
+            let message = result.unwrap_err().to_string();
+            assert!(message.contains("frame 2"), "{message}");
+        }
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::path::Path;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
 
 use super::error::RecordingError;
-use crate::geometry::Pose3;
+use crate::geometry::{FARTHEST_M, Pose3};
 
 /// Reads the rows of a file with their line numbers, without blank lines and comments (`#`).
 pub fn read_rows(path: &Path) -> Result<Vec<(usize, Vec<f64>)>, RecordingError> {
@@ -17,9 +17,13 @@ pub fn read_rows(path: &Path) -> Result<Vec<(usize, Vec<f64>)>, RecordingError> 
         .collect()
 }
 
-/// Reads a whole file as text.
+/// Reads a whole file as text, without the byte order mark that some editors write.
 pub fn read_text(path: &Path) -> Result<String, RecordingError> {
-    fs::read_to_string(path).map_err(RecordingError::read(path))
+    let mut text = fs::read_to_string(path).map_err(RecordingError::read(path))?;
+    if text.starts_with('\u{feff}') {
+        text.remove(0);
+    }
+    Ok(text)
 }
 
 /// Parses finite numbers separated by white space.
@@ -71,9 +75,29 @@ pub fn pose_from_row(row: &[f64], path: &Path, line: usize) -> Result<Pose3, Rec
     }
     let rotation = nearest_rotation(matrix);
     Ok(Isometry3::from_parts(
-        Translation3::new(row[3], row[7], row[11]),
+        position(row[3], row[7], row[11], path, line)?,
         UnitQuaternion::from_rotation_matrix(&rotation),
     ))
+}
+
+/// A position; one that is farther from the origin than any place on Earth is an error.
+pub fn position(
+    x: f64,
+    y: f64,
+    z: f64,
+    path: &Path,
+    line: usize,
+) -> Result<Translation3<f64>, RecordingError> {
+    match [x, y, z].into_iter().find(|m| m.abs() > FARTHEST_M) {
+        Some(value) => Err(RecordingError::OutOfRange {
+            path: path.to_owned(),
+            line,
+            value,
+            quantity: "position",
+            limit: "40,000 km",
+        }),
+        None => Ok(Translation3::new(x, y, z)),
+    }
 }
 
 /// The rotation nearest to a matrix, `U Vᵀ` of its singular value decomposition.

@@ -93,6 +93,9 @@ pub struct BuildMapConfig {
     /// Motion since the last counted scan above which a scan counts [m].
     #[default(0.2)]
     pub displacement_threshold_m: f64,
+    /// Largest distance between successive frames [m]; a larger one is an error of the poses.
+    #[default(50.0)]
+    pub max_step_m: f64,
     /// Method of ground segmentation.
     pub ground_method: GroundMethod,
     /// Length of path that neighbouring local maps share [m].
@@ -140,6 +143,7 @@ impl BuildMapConfig {
             displacement_threshold_m: self.displacement_threshold_m,
             local_map_size: self.local_map_size,
             overlap_m: self.overlap_m,
+            max_step_m: self.max_step_m,
             ground: self.ground(),
             local_map: self.local_map(),
         }

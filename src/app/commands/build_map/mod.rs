@@ -12,7 +12,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-use anyhow::Result;
+use anyhow::{Context as _, Result};
 
 use self::clock::StageClock;
 use self::parts::{Parts, hash_of_scans, joint_hash, read_scan_file};
@@ -24,7 +24,10 @@ use crate::evaluation::map_quality::{self, BeamResidual};
 use crate::evaluation::{MapQuality, TruthAgreement};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::map::plan::{LocalMapPlan, key_scans, local_maps};
-use crate::map::{BuildError, BuildEvent, LocalMapCounts, MapBuilder, MapPlan, MappingPath, ply};
+use crate::map::{
+    BuildError, BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan, MappingPath, path_check,
+    ply, scan_agreement,
+};
 use crate::recording::{Frame, Sequence};
 
 /// Builds the map that a configuration describes.
@@ -77,6 +80,9 @@ fn open(config: &BuildMapConfig) -> Result<Sequence> {
         &config.calib_file,
         &config.selection(),
     )?;
+    let poses = (sequence.frames.iter()).map(|frame| (frame.number, &frame.map_from_lidar));
+    path_check::check(poses, config.max_step_m)
+        .with_context(|| format!("pose_file is {}", config.pose_file.display()))?;
     Ok(match config.motion_compensation {
         Some(spin) => sequence.compensated_by_poses(spin),
         None => sequence,
@@ -173,17 +179,50 @@ fn build_part(
             .insert(key, hash);
         Ok(frame.parse(&bytes)?)
     };
-    let built = plan.build_local_map(local_map, &read)?;
+    let number_of = |key: usize| frames[key].number;
+    let built = plan.build_local_map(local_map, &read);
+    let built = built.map_err(|error| match error {
+        BuildError::PosesDoNotFit {
+            first,
+            last,
+            percent,
+        } => BuildError::PosesDoNotFit {
+            first: number_of(first),
+            last: number_of(last),
+            percent,
+        },
+        other => other,
+    })?;
+    warn_of_doubtful_poses(&built, frames);
     let hashes = hashes.into_inner().unwrap_or_else(|e| e.into_inner());
     if built.counts.is_empty {
         tracing::warn!(
             "frames {} to {} have too few points to mesh: the map has a hole there",
-            frames[local_map.own.start].number,
-            frames[local_map.own.end - 1].number
+            number_of(local_map.own.start),
+            number_of(local_map.own.end - 1)
         );
     }
     parts.save(local_map.number, &built, &joint_hash(hashes.into_values()))?;
     Ok(built.counts)
+}
+
+/// Warns of scans that do not agree with their neighbours.
+fn warn_of_doubtful_poses(built: &LocalMap, frames: &[Frame]) {
+    let numbers: Vec<String> = (built.doubtful_scans.iter())
+        .map(|&scan| frames[scan].number.to_string())
+        .collect();
+    if !numbers.is_empty() {
+        tracing::warn!(
+            "the poses of these frames fit neither the scan before nor after, the map is worse there: {}",
+            numbers.join(", ")
+        );
+    }
+    if built.agreement > 0.0 && built.agreement < scan_agreement::DOUBTFUL {
+        tracing::warn!(
+            "only {:.0} % of a scan's points are on the surfaces of the next one: the poses may be inaccurate, of another recording, or in another frame",
+            100.0 * built.agreement
+        );
+    }
 }
 
 /// Replaces an interruption by one that names the finished local maps.

@@ -166,6 +166,7 @@ mod tests {
                 triangles: 1,
                 ..LocalMapCounts::default()
             },
+            ..LocalMap::default()
         }
     }
 
