@@ -30,7 +30,7 @@ const RESULT: &str = "results/localization.npz";
 fn a_map_is_built_and_the_car_is_localized_in_it() {
     let recording = localized(6);
     recording.fpmcl("refine").succeeds();
-    for name in ["map.ply", "map.yml", "map.report.json", RESULT] {
+    for name in ["map.ply", "map.effective.yml", "map.report.json", RESULT] {
         assert!(recording.path(name).exists(), "{name}");
     }
     assert!(!recording.path("map.ply.parts").exists());
@@ -331,7 +331,11 @@ fn a_result_beside_another_is_refused_and_force_removes_all_files_of_the_old_one
     recording.fpmcl("refine").succeeds();
     assert!(recording.path("results/refined_tum.txt").exists());
     recording.fpmcl("localize").with("--force").succeeds();
-    for name in ["refined_tum.txt", "refined_kitti.txt", "refinement.yml"] {
+    for name in [
+        "refined_tum.txt",
+        "refined_kitti.txt",
+        "effective_refinement.yml",
+    ] {
         assert!(!recording.path("results").join(name).exists(), "{name}");
     }
 }

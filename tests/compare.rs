@@ -181,7 +181,7 @@ fn a_run_is_reproduced_by_its_configuration(recording: &Recording) {
     let folder = "out/runs/street/Fuzzy-MCL/2";
     let again = fpmcl("localize")
         .in_folder(recording.folder())
-        .with(format!("{folder}/localization.yml"))
+        .with(format!("{folder}/effective_localization.yml"))
         .with("--backend=cpu")
         .set("result_path", "again/localization.npz");
     again.succeeds();
@@ -225,7 +225,7 @@ fn the_page_is_made_of_the_available_files(recording: &Recording) {
         "street/Fuzzy-PSO-MCL/1: Likelihood around the true pose",
         "numbers of particles, Fuzzy-MCL",
         "build_map.ground_method: &quot;pca&quot;",
-        "localization.yml of street/Fuzzy-PSO-MCL/1",
+        "effective_localization.yml of street/Fuzzy-PSO-MCL/1",
         "(executable ",
     ] {
         assert!(whole.contains(text), "{text}");
@@ -282,7 +282,7 @@ fn an_outdated_record_is_removed_before_its_run_is_executed_again() {
     let mut points = recording.scan(0);
     points.truncate(points.len() / 2);
     recording.write_scan(0, &points);
-    let text = recording.path("out/runs/street/Fuzzy-MCL/1/evaluation.yml");
+    let text = recording.path("out/runs/street/Fuzzy-MCL/1/effective_evaluation.yml");
     fs::create_dir(&text).unwrap();
     job().fails_with(&["evaluation.yml"]);
     assert_ne!(recording.bytes(trajectory), before);

@@ -110,7 +110,7 @@ fn labels_points_pictures_and_scores_of_a_recording_are_written() {
     for name in [
         "scan_000000.png",
         "memberships.png",
-        "ground.yml",
+        "effective_ground.yml",
         "ground.json",
     ] {
         assert!(output.join(name).is_file(), "{name}");

@@ -41,7 +41,7 @@ pub fn run(config: &EvaluationConfig) -> Result<Report> {
     let report = run_output::evaluate(&results, &rules, about(config, &files)?)?;
     if config.save_evaluation_results {
         run_output::write_report(&files, &results, &report)?;
-        output::write_yaml(&files.file("evaluation.yml"), config)?;
+        output::write_yaml(&files.file("effective_evaluation.yml"), config)?;
     }
     if config.plot_loc_traj {
         run_output::draw_run(&files, map_of(&files)?.as_ref(), &results)?;
@@ -67,7 +67,7 @@ fn about(config: &EvaluationConfig, files: &RunFiles) -> Result<BTreeMap<String,
 
 /// The map of the run; `None` if its configuration or its map file does not exist.
 fn map_of(files: &RunFiles) -> Result<Option<TriangleMesh>> {
-    let effective = files.file("localization.yml");
+    let effective = files.file("effective_localization.yml");
     if !effective.exists() {
         return Ok(None);
     }

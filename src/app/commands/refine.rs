@@ -195,7 +195,7 @@ fn write_run(
     let files = RunFiles::beside(&config.result_file);
     run_output::write_results(&files, results)?;
     run_output::write_trajectory(&files, "refined", sequence, &refined.map_from_lidar)?;
-    output::write_yaml(&files.file("refinement.yml"), config)?;
+    output::write_yaml(&files.file("effective_refinement.yml"), config)?;
     let odometry = odometry::description(config.odometry, config.odometry_file.as_deref());
     let about = [
         ("recording", config.scan_folder.display().to_string()),

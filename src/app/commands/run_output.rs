@@ -72,7 +72,7 @@ const REFINEMENT_FILES: [&str; 4] = [
     "refined_tum.txt",
     "refined_kitti.txt",
     "refined_poses.npy",
-    "refinement.yml",
+    "effective_refinement.yml",
 ];
 
 /// Checks before the computation that writing a result will not overwrite another one: neither

@@ -51,10 +51,10 @@ pub const PICTURES: [(&str, &str, &str); 7] = [
 
 /// Configuration and log files of a run, where they exist.
 pub const TEXTS: [&str; 5] = [
-    "build_map.yml",
-    "localization.yml",
-    "refinement.yml",
-    "evaluation.yml",
+    "effective_build_map.yml",
+    "effective_localization.yml",
+    "effective_refinement.yml",
+    "effective_evaluation.yml",
     "log.txt",
 ];
 

@@ -45,7 +45,7 @@ pub fn collect(config: &ComparisonConfig, runs: &[PlannedRun], layout: &Layout) 
     write_tables(&tables, &layout.root)?;
     let page = page::page(&results, &tables, runs, layout)?;
     output::write_text(&layout.root.join("report.html"), &page.to_html())?;
-    output::write_yaml(&layout.root.join("comparison.yml"), config)?;
+    output::write_yaml(&layout.root.join("effective_comparison.yml"), config)?;
     let file = ComparisonFile {
         program: version::program()?,
         tables: &tables,

@@ -131,7 +131,10 @@ impl<'a> Executor<'a> {
         let map = self.map(run, keys).context("while building the map")?;
         stages.add("1 build-map", map.seconds);
         self.append_log(&map)?;
-        copy_file(&map.folder.join("map.yml"), &folder.join("build_map.yml"))?;
+        copy_file(
+            &map.folder.join("map.effective.yml"),
+            &folder.join("effective_build_map.yml"),
+        )?;
 
         let localization = self
             .localization(run, keys, &map)

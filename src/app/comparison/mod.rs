@@ -14,11 +14,12 @@
 //! shared/localizations/KEY/...             one per map, filter configuration and seed
 //!   | execute     one run after another; each uses all threads
 //!   v
-//! runs/SEQUENCE/CONFIGURATION/SEED/        build_map.yml localization.yml refinement.yml log.txt
-//!   |                                      localization.npz report.html plots/, finally run.json
+//! runs/SEQUENCE/CONFIGURATION/SEED/        effective_build_map.yml effective_localization.yml
+//!   |                                      effective_refinement.yml log.txt localization.npz
+//!   |                                      report.html plots/, finally run.json
 //!   | collect     tables and page of the finished runs
 //!   v
-//! report.html tables.txt tables.md comparison.json TABLE.csv plots/
+//! report.html tables.txt tables.md comparison.json TABLE.csv plots/ effective_comparison.yml
 //! ```
 //!
 //! A run is skipped if its `run.json` has the current key, so that an interrupted comparison

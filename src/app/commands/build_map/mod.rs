@@ -60,7 +60,7 @@ pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
         ..BuildReport::of_map(&mesh, &path, &config.mesh_file, started)
     };
     output::write_json(&config.mesh_file.with_extension("report.json"), &report)?;
-    output::write_yaml(&config.mesh_file.with_extension("yml"), config)?;
+    output::write_yaml(&config.mesh_file.with_extension("effective.yml"), config)?;
     parts.remove()?;
     Ok(report)
 }

@@ -7,7 +7,7 @@
 //! points/000000.ply      the points coloured by confidence: red is ground, blue is not
 //! scan_000000.png        a scan from above, errors highlighted
 //! memberships.png        the membership functions of the fuzzy rules
-//! ground.yml             the effective configuration
+//! effective_ground.yml   the effective configuration
 //! ground.json            the table on standard output; written last
 //! ```
 
@@ -135,7 +135,7 @@ fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Resu
             .map(|((name, _), tally)| tally.report(name))
             .collect(),
     };
-    output::write_yaml(&config.output_folder.join("ground.yml"), config)?;
+    output::write_yaml(&config.output_folder.join("effective_ground.yml"), config)?;
     output::write_json(&report_file, &report)?;
     Ok(report)
 }

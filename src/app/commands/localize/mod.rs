@@ -152,7 +152,7 @@ fn write_run(
         } else {
             run_output::remove_refined(files)?;
         }
-        output::write_yaml(&files.file("localization.yml"), config)?;
+        output::write_yaml(&files.file("effective_localization.yml"), config)?;
     }
     warn_of_untracked_frames(results);
     let about = about(config, context, map);
