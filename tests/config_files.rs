@@ -185,7 +185,7 @@ fn the_evaluation_file_of_range_mcl_loads_unchanged() {
     let config: EvaluationConfig = load(&root().join("tests/range_mcl/evaluation.yml"));
     let expected = EvaluationConfig {
         result_file: "../results/demo_loc_results.npz".into(),
-        pose_file: "../data/07/poses.txt".into(),
+        pose_file: Some("../data/07/poses.txt".into()),
         calib_file: "../data/07/calib.txt".into(),
         ..EvaluationConfig::default()
     };

@@ -13,7 +13,7 @@ use crate::rendering::Backend;
 #[derive(Clone, Debug, Parser)]
 #[command(name = "fpmcl", version, arg_required_else_help = true, after_help = EXAMPLES)]
 pub struct Cli {
-    /// Print errors and results only.
+    /// Print errors, warnings and results only.
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     pub quiet: bool,
 
@@ -290,7 +290,7 @@ impl Cli {
     /// Least important messages on standard error.
     pub fn level(&self) -> LevelFilter {
         match (self.quiet, self.verbose) {
-            (true, _) => LevelFilter::ERROR,
+            (true, _) => LevelFilter::WARN,
             (false, 0) => LevelFilter::INFO,
             (false, 1) => LevelFilter::DEBUG,
             (false, _) => LevelFilter::TRACE,

@@ -40,8 +40,9 @@ pub struct RangeMclRules {
 /// Errors of a trajectory by range-mcl's rules.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RangeMclErrors {
-    /// Whether the position error was below the threshold at every checked row.
-    pub success: bool,
+    /// Whether the position error was below the threshold at every checked row; absent if the run is too
+    /// short for one.
+    pub success: Option<bool>,
     /// RMSE of the planar position [m]; absent without success, or without counted rows.
     pub rmse_location_m: Option<f64>,
     /// RMSE of the heading [deg]; absent without success, or without counted rows.
@@ -53,13 +54,12 @@ impl RangeMclRules {
     pub fn evaluate(&self, estimates: &[Pose2], ground_truth: &[Pose2]) -> RangeMclErrors {
         let errors = planar_errors(estimates, ground_truth);
         let counted = errors.get(self.convergence_interval..).unwrap_or_default();
-        let success = counted
-            .iter()
-            .step_by(self.convergence_interval.max(1))
-            .all(|error| error.distance_m() < self.converge_thres);
+        let mut checked = counted.iter().step_by(self.convergence_interval.max(1));
+        let success = (!counted.is_empty())
+            .then(|| checked.all(|error| error.distance_m() < self.converge_thres));
         let rmse = |number: fn(&PlanarError) -> f64| {
             let sum: f64 = counted.iter().map(|error| number(error).powi(2)).sum();
-            (success && !counted.is_empty()).then(|| (sum / counted.len() as f64).sqrt())
+            (success == Some(true)).then(|| (sum / counted.len() as f64).sqrt())
         };
         RangeMclErrors {
             success,
@@ -120,7 +120,7 @@ mod tests {
     fn a_constant_offset_is_the_rmse() {
         let truth = straight(301);
         let errors = RangeMclRules::default().evaluate(&beside(&truth, 0.3, 0.02), &truth);
-        assert!(errors.success);
+        assert_eq!(errors.success, Some(true));
         assert_relative_eq!(errors.rmse_location_m.unwrap(), 0.3, epsilon = 1e-12);
         let expected_deg = 0.02_f64.to_degrees();
         assert_relative_eq!(errors.rmse_yaw_deg.unwrap(), expected_deg, epsilon = 1e-12);
@@ -137,17 +137,20 @@ mod tests {
             Some(0.0)
         );
         estimates[150].translation.y = 5.1;
-        assert!(rules.evaluate(&estimates, &truth).success);
+        assert_eq!(rules.evaluate(&estimates, &truth).success, Some(true));
         estimates[200].translation.y = 5.1;
         let errors = rules.evaluate(&estimates, &truth);
-        assert_eq!((errors.success, errors.rmse_location_m), (false, None));
+        assert_eq!(
+            (errors.success, errors.rmse_location_m),
+            (Some(false), None)
+        );
     }
 
     #[test]
-    fn a_run_shorter_than_the_interval_has_no_rmse() {
+    fn a_run_shorter_than_the_interval_has_no_rmse_and_is_not_checked() {
         let truth = straight(100);
         let errors = RangeMclRules::default().evaluate(&truth, &truth);
-        assert_eq!((errors.success, errors.rmse_location_m), (true, None));
+        assert_eq!((errors.success, errors.rmse_location_m), (None, None));
     }
 
     #[test]

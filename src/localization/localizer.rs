@@ -56,6 +56,10 @@ pub enum LocalizerError {
     Invalid(#[from] InvalidValue),
     #[error(transparent)]
     Render(#[from] RenderError),
+    #[error(
+        "the odometry {0:?} is not finite or farther than any place on Earth; correct the odometry of this frame"
+    )]
+    ImpossibleOdometry(Odometry),
     #[error("the map has no ground where the search could start; build the map again")]
     NoGround,
     #[error(
@@ -101,6 +105,9 @@ impl Localizer {
 
     /// Estimates the pose of the next scan, given the motion since the previous one.
     pub fn step(&mut self, scan: &Scan, odometry: Odometry) -> Result<Estimate, LocalizerError> {
+        if !odometry.is_possible() {
+            return Err(LocalizerError::ImpossibleOdometry(odometry));
+        }
         let image = self.sensor.range_image(scan);
         let known = self.filter.as_ref().and_then(ParticleFilter::attitude);
         if let Some(attitude) = known.or_else(|| self.sensor.attitude(&image)) {

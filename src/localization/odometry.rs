@@ -9,7 +9,7 @@
 use rand::Rng;
 
 use super::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand};
-use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
+use crate::geometry::{FARTHEST_M, Pose2, Pose3, pose2_from_pose3};
 
 /// Known motion into a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -20,6 +20,19 @@ pub enum Odometry {
     Velocity(VelocityCommand),
     /// Unknown: the motion into the previous frame is assumed to continue (constant velocity).
     Unknown,
+}
+
+impl Odometry {
+    /// Whether the motion is finite and stays on Earth.
+    pub(super) fn is_possible(&self) -> bool {
+        let increment = match self {
+            Self::Increment(increment) => *increment,
+            Self::Velocity(command) => command.compose(),
+            Self::Unknown => return true,
+        };
+        let length_m = increment.translation.vector.norm();
+        length_m <= FARTHEST_M && increment.rotation.angle().is_finite()
+    }
 }
 
 /// Increments between consecutive poses in the plane of the car, one per pose; the first is the

@@ -184,7 +184,9 @@ impl MapPlan<'_> {
             .collect::<Result<_, BuildError>>()?;
         let agreements = scan_agreement::of_neighbours(&scans);
         let agreement = scan_agreement::median(&agreements);
-        if !agreements.is_empty() && agreement < scan_agreement::WRONG {
+        if let Some(agreement) = agreement
+            && agreement < scan_agreement::WRONG
+        {
             return Err(BuildError::PosesDoNotFit {
                 first: plan.used.start,
                 last: plan.used.end - 1,

@@ -113,8 +113,8 @@ pub struct LocalMap {
     /// Numbers of points and triangles at each step.
     pub counts: LocalMapCounts,
     /// Median share of the points of a scan that are on surfaces of the next one, from 0 to 1; below
-    /// 0.8 the poses are doubtful.
-    pub agreement: f32,
+    /// 0.8 the poses are doubtful. `None` if no scans could be compared.
+    pub agreement: Option<f32>,
     /// Key scans that agree with neither neighbour as well as the others do: their poses are doubtful.
     pub doubtful_scans: Vec<usize>,
 }

@@ -1,6 +1,7 @@
 //! `evaluate`: the errors of a result.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use anyhow::{Result, ensure};
 
@@ -11,7 +12,7 @@ use crate::app::config::{self, EvaluationConfig, LocalizationConfig};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
 use crate::geometry::{Pose2, TriangleMesh, pose2_from_pose3};
-use crate::map::ply;
+use crate::map::{MappingPath, ply};
 use crate::recording::Calibration;
 use crate::recording::poses::CameraPoses;
 
@@ -20,11 +21,15 @@ pub fn run(config: &EvaluationConfig) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
     let mut results = LocalizationResults::read(&config.result_file)?;
     scale(&mut results, config.grid_resolution);
-    if results.ground_truth.is_none() {
-        results.ground_truth = Some(truth(config, &results)?);
-    } else {
-        tracing::info!("using the ground truth in {}", config.result_file.display());
+    let files = RunFiles::beside(&config.result_file);
+    if let Some(pose_file) = &config.pose_file {
+        results.ground_truth = Some(truth(pose_file, config, &results, &files)?);
     }
+    ensure!(
+        results.ground_truth.is_some(),
+        "{} has no ground truth; set pose_file and calib_file to the poses of its recording",
+        config.result_file.display()
+    );
     let mut results = selected(results, config);
     ensure!(
         !results.is_empty(),
@@ -37,14 +42,14 @@ pub fn run(config: &EvaluationConfig) -> Result<Report> {
         particle_select_ratio: config.particle_select_ratio,
     };
     results.estimates = Some(results.estimates_or_particle_means(&rules)?);
-    let files = RunFiles::beside(&config.result_file);
     let report = run_output::evaluate(&results, &rules, about(config, &files)?)?;
     if config.save_evaluation_results {
         run_output::write_report(&files, &results, &report)?;
         output::write_yaml(&files.file("effective_evaluation.yml"), config)?;
     }
     if config.plot_loc_traj {
-        run_output::draw_run(&files, map_of(&files)?.as_ref(), &results)?;
+        let map = map_of(&files)?.map(|(mesh, _)| mesh);
+        run_output::draw_run(&files, map.as_ref(), &results)?;
     }
     if config.save_evaluation_results {
         run_page::write(&files, &report)?;
@@ -65,21 +70,18 @@ fn about(config: &EvaluationConfig, files: &RunFiles) -> Result<BTreeMap<String,
     Ok(about)
 }
 
-/// The map of the run; `None` if its configuration or its map file does not exist.
-fn map_of(files: &RunFiles) -> Result<Option<TriangleMesh>> {
+/// The map of the run and its path; `None` if its configuration or its map file does not exist.
+fn map_of(files: &RunFiles) -> Result<Option<(TriangleMesh, Option<MappingPath>)>> {
     let effective = files.file("effective_localization.yml");
     if !effective.exists() {
         return Ok(None);
     }
     let localized: LocalizationConfig = config::load(Some(&effective), &[])?;
     if !localized.map_file.exists() {
-        tracing::info!(
-            "drawing without the map: {} does not exist",
-            localized.map_file.display()
-        );
+        tracing::info!("{} does not exist any more", localized.map_file.display());
         return Ok(None);
     }
-    Ok(Some(ply::read(&localized.map_file)?))
+    Ok(Some(ply::read_map(&localized.map_file)?))
 }
 
 /// Converts positions in grid cells to metres.
@@ -94,22 +96,34 @@ fn scale(results: &mut LocalizationResults, grid_resolution_m: f64) {
     results.particles.scale_positions(grid_resolution_m as f32);
 }
 
-/// The true poses of the frames of a result, in the frame of the first pose of the recording.
-fn truth(config: &EvaluationConfig, results: &LocalizationResults) -> Result<Vec<Pose2>> {
-    input::require_file("pose_file", &config.pose_file)?;
+/// The true poses of the frames of a result: in the frame of its map, or, if that is not known, of the
+/// first pose of the recording.
+fn truth(
+    pose_file: &Path,
+    config: &EvaluationConfig,
+    results: &LocalizationResults,
+    files: &RunFiles,
+) -> Result<Vec<Pose2>> {
+    input::require_file("pose_file", pose_file)?;
     input::require_file("calib_file", &config.calib_file)?;
     let calibration = Calibration::read(&config.calib_file)?;
-    let poses = CameraPoses::read(&config.pose_file)?.map_from_lidar(&calibration);
+    let camera_poses = CameraPoses::read(pose_file)?;
+    let mut poses = camera_poses.map_from_lidar(&calibration);
+    if let Some((_, Some(path))) = map_of(files)? {
+        let world_from_first = camera_poses.frame(&calibration).world_from_map();
+        let map_from_first = path.world_from_map.inverse() * world_from_first;
+        poses
+            .iter_mut()
+            .for_each(|pose| *pose = map_from_first * *pose);
+    }
     let last = results.frames.last().copied().unwrap_or_default();
     ensure!(
         last < poses.len(),
         "{} has {} poses, but the result reaches frame {last}; pose_file and result_file belong to different recordings",
-        config.pose_file.display(),
+        pose_file.display(),
         poses.len()
     );
-    Ok(results
-        .frames
-        .iter()
+    Ok((results.frames.iter())
         .map(|&frame| pose2_from_pose3(&poses[frame]))
         .collect())
 }

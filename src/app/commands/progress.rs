@@ -40,7 +40,7 @@ impl Progress {
     /// Bars if standard error is a terminal, otherwise lines; silent if quiet.
     pub fn new(level: LevelFilter) -> Self {
         match level {
-            LevelFilter::ERROR => Self::Silent,
+            LevelFilter::ERROR | LevelFilter::WARN => Self::Silent,
             _ if std::io::stderr().is_terminal() => Self::Bars(MultiProgress::new()),
             _ => Self::Lines,
         }

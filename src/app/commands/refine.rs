@@ -11,7 +11,7 @@ use super::{Context, input, odometry, output, run_page};
 use crate::app::config::{OdometrySource, RefinementConfig};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
-use crate::geometry::Pose2;
+use crate::geometry::{Pose2, pose2_from_pose3};
 use crate::localization::State;
 use crate::localization::odometry::demonstration_noise;
 use crate::map::Map;
@@ -43,6 +43,10 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let sequence = odometry::compensated(sequence, config.motion_compensation, &increments);
     let starts = initial_estimates(&results, &estimates);
     let (refined, runtimes_s) = refine(config, context, &map, &sequence, &starts, &increments)?;
+    if results.ground_truth.is_none() {
+        let poses = sequence.frames.iter().map(|frame| &frame.map_from_lidar);
+        results.ground_truth = Some(poses.map(pose2_from_pose3).collect());
+    }
     results.estimates = Some(estimates);
     results.refined = Some(refined.poses.clone());
     results.refined_covariances = Some(refined.covariances.clone());

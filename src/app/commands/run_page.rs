@@ -122,7 +122,7 @@ fn metrics(report: &Report) -> Table {
     let cell = |value: Value| match value {
         Value::Number(number) => Cell::Number(number),
         Value::Count(count) => Cell::Number(count as f64),
-        Value::Flag(_) | Value::Absent => Cell::Text(value.to_string()),
+        Value::Flag(_) | Value::NotChecked | Value::Absent => Cell::Text(value.to_string()),
     };
     let row = |index: usize| {
         let row = &mcl[index];

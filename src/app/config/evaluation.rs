@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::check::path;
+use super::check::{optional_path, path};
 use crate::validation::{InvalidValue, Validate, at_least_one, positive, require};
 
 /// Configuration of `evaluate`: the keys of range-mcl's `evaluation.yml`, then new ones.
@@ -17,10 +17,9 @@ pub struct EvaluationConfig {
     /// Result of `localize`, `refine` or range-mcl.
     #[default("results/localization.npz".into())]
     pub result_file: PathBuf,
-    /// Camera poses of the recording, for results without ground truth, such as those of range-mcl.
-    #[default("data/kitti/poses.txt".into())]
-    pub pose_file: PathBuf,
-    /// Calibration of the recording, with its line `Tr`, for the same results.
+    /// Camera poses of the recording, the ground truth; `None`: that in the result.
+    pub pose_file: Option<PathBuf>,
+    /// Calibration of the recording, with its line `Tr`, for `pose_file`.
     #[default("data/kitti/calib.txt".into())]
     pub calib_file: PathBuf,
     /// Whether to draw the trajectory.
@@ -55,7 +54,7 @@ pub struct EvaluationConfig {
 impl Validate for EvaluationConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         path("result_file", &self.result_file)?;
-        path("pose_file", &self.pose_file)?;
+        optional_path("pose_file", self.pose_file.as_deref())?;
         path("calib_file", &self.calib_file)?;
         self.selection().validate()?;
         positive("grid_resolution", self.grid_resolution)?;

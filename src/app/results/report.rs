@@ -25,7 +25,9 @@ impl TrajectoryReport {
         let range_mcl = vec![
             MetricRow::new(
                 "range-mcl success: position error under converge_thres at every convergence_interval-th row",
-                self.range_mcl.success,
+                self.range_mcl
+                    .success
+                    .map_or(Value::NotChecked, Value::Flag),
             ),
             MetricRow::new(
                 "range-mcl RMSE location [m]: position RMSE from row convergence_interval on, as range-mcl computes it",

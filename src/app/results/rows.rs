@@ -13,6 +13,8 @@ pub enum Value {
     Count(usize),
     /// Yes or no.
     Flag(bool),
+    /// A condition that no frame could be checked for.
+    NotChecked,
     /// Not measured, or not defined for this run.
     Absent,
 }
@@ -29,6 +31,7 @@ impl fmt::Display for Value {
             Self::Count(count) => formatter.pad(&count.to_string()),
             Self::Flag(true) => formatter.pad("yes"),
             Self::Flag(false) => formatter.pad("no"),
+            Self::NotChecked => formatter.pad("not checked"),
             Self::Absent => formatter.pad("-"),
         }
     }

@@ -217,10 +217,12 @@ fn warn_of_doubtful_poses(built: &LocalMap, frames: &[Frame]) {
             numbers.join(", ")
         );
     }
-    if built.agreement > 0.0 && built.agreement < scan_agreement::DOUBTFUL {
+    if let Some(agreement) = built.agreement
+        && agreement < scan_agreement::DOUBTFUL
+    {
         tracing::warn!(
             "only {:.0} % of a scan's points are on the surfaces of the next one: the poses may be inaccurate, of another recording, or in another frame",
-            100.0 * built.agreement
+            100.0 * agreement
         );
     }
 }

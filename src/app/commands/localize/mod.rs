@@ -155,7 +155,8 @@ fn write_run(
         output::write_yaml(&files.file("effective_localization.yml"), config)?;
     }
     warn_of_untracked_frames(results);
-    let about = about(config, context, map);
+    let mut about = about(config, context, map);
+    about.insert("states".to_owned(), states_in_words(results));
     let report = run_output::evaluate(results, &RangeMclRules::default(), about)?;
     if config.save_result {
         run_output::write_report(files, results, &report)?;
@@ -170,21 +171,35 @@ fn write_run(
     Ok(report)
 }
 
+/// Numbers of frames in each state, in words.
+fn states_in_words(results: &LocalizationResults) -> String {
+    let states = results.states.as_deref().unwrap_or_default();
+    let words = [State::Tracking, State::Searching, State::Lost].map(|state| {
+        let count = states.iter().filter(|&&found| found == state as u8).count();
+        format!("{} in {count}", state.word())
+    });
+    format!("{} of {} frames", words.join(", "), states.len())
+}
+
 /// Warns of frames in which the filter was not tracking.
 fn warn_of_untracked_frames(results: &LocalizationResults) {
     let states = results.states.as_deref().unwrap_or_default();
     let is_tracking = |state: &u8| *state == State::Tracking as u8;
     match states.iter().position(is_tracking) {
         None => tracing::warn!(
-            "the filter converged in none of {} frames: the car may not be in the map, or did not drive far enough",
+            "the filter converged in none of {} frames: the car may not be in the map, or did not drive far enough; the poses must not be used",
             states.len()
         ),
         Some(first) => {
-            let tracked = states[first..].iter().filter(|&state| is_tracking(state));
-            let untracked = states.len() - first - tracked.count();
-            if untracked > 0 {
+            if !states[first..].iter().all(is_tracking) {
                 tracing::warn!(
-                    "tracking was lost in {untracked} of {} frames; frames.csv lists the state of each",
+                    "tracking was lost on the way ({}); frames.csv lists the state of each",
+                    states_in_words(results)
+                );
+            }
+            if 2 * first > states.len() {
+                tracing::warn!(
+                    "the first {first} of {} frames were not localized: frames.csv lists the state of each",
                     states.len()
                 );
             }

@@ -1,0 +1,206 @@
+//! Inputs that would give a wrong result without an error: each is refused or warned about.
+
+#![allow(clippy::unwrap_used, reason = "a failing test may panic")]
+
+mod common;
+
+use std::fs;
+
+use common::{Recording, config_file, fpmcl, json};
+
+/// The poses of `Recording::street`, `(right, ahead)` of each frame [m].
+fn poses(positions_m: &[(f64, f64)]) -> String {
+    (positions_m.iter())
+        .map(|(right_m, ahead_m)| format!("1 0 0 {right_m} 0 1 0 0 0 0 1 {ahead_m}\n"))
+        .collect()
+}
+
+/// A straight drive in which one frame is somewhere else.
+fn with_frame_at(frames: usize, wrong: usize, at: (f64, f64)) -> String {
+    let mut positions_m: Vec<_> = (0..frames).map(|i| (0.0, 0.5 * i as f64)).collect();
+    positions_m[wrong] = at;
+    poses(&positions_m)
+}
+
+fn mapped(frames: usize) -> Recording {
+    let recording = Recording::street(frames);
+    recording.fpmcl("build-map").succeeds();
+    recording
+}
+
+#[test]
+fn one_pose_a_kilometre_off_stops_the_build_and_is_named() {
+    let recording = Recording::street(8);
+    recording.write("poses.txt", &with_frame_at(8, 4, (0.0, 1002.0)));
+    let parts = ["pose_file is poses.txt", "the pose of frame 4 is wrong"];
+    recording.fpmcl("build-map").fails_with(&parts);
+    assert!(!recording.path("map.ply").exists());
+}
+
+#[test]
+fn a_jump_of_the_poses_is_an_error_that_can_be_allowed() {
+    let recording = Recording::street(4);
+    let positions_m = [(0.0, 0.0), (0.0, 0.5), (0.0, 70.0), (0.0, 70.5)];
+    recording.write("poses.txt", &poses(&positions_m));
+    let parts = ["jump by 70 m from frame 1 to frame 2", "max_step_m"];
+    recording.fpmcl("build-map").fails_with(&parts);
+    recording
+        .fpmcl("build-map")
+        .set("max_step_m", "100")
+        .succeeds();
+}
+
+#[test]
+fn one_displaced_pose_is_warned_about_with_its_frame() {
+    let recording = Recording::street(9);
+    recording.write("poses.txt", &with_frame_at(9, 5, (3.0, 2.5)));
+    let stderr = recording.fpmcl("build-map").succeeds().stderr;
+    let warning = "fit neither the scan before nor after";
+    let line = stderr.lines().find(|line| line.contains(warning)).unwrap();
+    assert!(line.ends_with(": 5"), "{line}");
+    let stderr = mapped(9)
+        .fpmcl("build-map")
+        .with("--force")
+        .succeeds()
+        .stderr;
+    assert!(!stderr.contains(warning), "{stderr}");
+}
+
+#[test]
+fn poses_of_the_camera_taken_for_those_of_the_lidar_are_an_error() {
+    let recording = Recording::street(9);
+    recording.write("calib.txt", "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n");
+    recording
+        .fpmcl("build-map")
+        .fails_with(&["the poses of scans 0 to 8 do not fit", "the line Tr"]);
+}
+
+#[test]
+fn times_that_do_not_ascend_or_are_no_times_are_an_error() {
+    let recording = mapped(3);
+    for (times, part) in [
+        ("0\n0.1\n0.1\n", "frame 2 at 0.1 s is not later"),
+        ("1\n1\n1\n", "frame 1 at 1 s is not later"),
+        ("0.2\n0.1\n0\n", "frame 1 at 0.1 s is not later"),
+        ("0\n0.1\n1e300\n", "is beyond any time"),
+    ] {
+        recording.write("times.txt", times);
+        let call = recording.fpmcl("localize");
+        call.set("motion_model", "velocity")
+            .fails_with(&["times.txt", part]);
+    }
+}
+
+#[test]
+fn poses_and_odometry_beyond_earth_are_an_error() {
+    let recording = mapped(3);
+    recording.write("far.txt", &poses(&[(0.0, 0.0), (0.0, 1e200), (0.0, 1e9)]));
+    let parts = ["far.txt, line 2", "is beyond any position"];
+    recording
+        .fpmcl("localize")
+        .set("odometry", "file")
+        .set("odometry_file", "far.txt")
+        .fails_with(&parts);
+    recording
+        .fpmcl("build-map")
+        .with("--force")
+        .set("pose_file", "far.txt")
+        .fails_with(&parts);
+}
+
+#[test]
+fn files_that_are_no_scans_do_not_renumber_the_recording() {
+    let recording = mapped(4);
+    recording.fpmcl("localize").succeeds();
+    let expected = recording.bytes("results/mcl_tum.txt");
+    fs::write(recording.path("velodyne/._000000.bin"), "hidden").unwrap();
+    recording.fpmcl("localize").with("--force").succeeds();
+    assert!(recording.bytes("results/mcl_tum.txt") == expected);
+    for name in ["notes.bin", "000001 (copy).bin"] {
+        let path = recording.path("velodyne").join(name);
+        fs::write(&path, []).unwrap();
+        let call = recording.fpmcl("localize").with("--force");
+        call.fails_with(&[name, "is a number and that of"]);
+        fs::remove_file(path).unwrap();
+    }
+    fs::write(recording.path("velodyne/1.bin"), []).unwrap();
+    let call = recording.fpmcl("localize").with("--force");
+    call.fails_with(&["1.bin", "have the same number"]);
+}
+
+#[test]
+fn text_files_with_a_byte_order_mark_and_line_ends_of_windows_are_read() {
+    let recording = mapped(3);
+    recording.fpmcl("localize").succeeds();
+    let expected = recording.bytes("results/mcl_tum.txt");
+    for name in ["poses.txt", "calib.txt"] {
+        let text = fs::read_to_string(recording.path(name)).unwrap();
+        recording.write(name, &format!("\u{feff}{}", text.replace('\n', "\r\n")));
+    }
+    recording.fpmcl("localize").with("--force").succeeds();
+    assert!(recording.bytes("results/mcl_tum.txt") == expected);
+}
+
+#[test]
+fn a_run_too_short_for_the_check_of_range_mcl_is_not_a_success() {
+    let recording = mapped(4);
+    let table = recording.fpmcl("localize").succeeds().stdout;
+    let row = (table.lines()).find(|line| line.starts_with("range-mcl success"));
+    assert!(row.unwrap().contains("not checked"), "{table}");
+    let report = json(&recording.path("results/report.json"));
+    assert!(report["mcl"]["range_mcl"]["success"].is_null());
+}
+
+#[test]
+fn evaluate_uses_the_poses_that_it_is_given() {
+    let recording = mapped(4);
+    recording.fpmcl("localize").succeeds();
+    let moved: Vec<_> = (0..4).map(|i| (50.0, 0.5 * f64::from(i))).collect();
+    // The first pose is the origin of the map.
+    recording.write("moved.txt", &poses(&[&[(0.0, 0.0)], &moved[1..]].concat()));
+    let evaluate = |pose_file: &str| {
+        fpmcl("evaluate")
+            .in_folder(recording.folder())
+            .with(config_file("evaluation.yml"))
+            .set("pose_file", pose_file)
+            .set("calib_file", "calib.txt")
+            .set("plot_loc_traj", "False")
+            .succeeds();
+        let report = json(&recording.path("results/report.json"));
+        report["mcl"]["metrics"]["position_m"]["max"]
+            .as_f64()
+            .unwrap()
+    };
+    let error_m = evaluate("null");
+    assert!(error_m < 8.0, "{error_m} m");
+    let error_m = evaluate("moved.txt");
+    assert!((42.0..58.0).contains(&error_m), "{error_m} m");
+}
+
+#[test]
+fn a_run_that_is_lost_says_so_even_when_quiet() {
+    let recording = mapped(20);
+    // The car is somewhere else: a scan of nothing that the map has.
+    for frame in 3..20 {
+        let points: Vec<[f32; 3]> = (0..4000)
+            .map(|i| {
+                let azimuth = 0.0157 * f64::from(i % 400);
+                let z = -1.5 + 0.3 * f64::from(i / 400);
+                [30.0 * azimuth.cos(), 30.0 * azimuth.sin(), z].map(|m| m as f32)
+            })
+            .collect();
+        recording.write_scan(frame, &points);
+    }
+    let output = recording.fpmcl("localize").with("-q").succeeds();
+    assert!(
+        output.stderr.contains("WARN tracking was lost"),
+        "{}\n{}",
+        output.stderr,
+        output.stdout
+    );
+    assert!(
+        output.stdout.contains("states: tracking in"),
+        "{}",
+        output.stdout
+    );
+}
