@@ -2,7 +2,11 @@
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// Temporary files of writes that are under way.
+static UNFINISHED: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
 
 /// Writes a temporary file in the folder of `path`, which is created if necessary, and renames it
 /// to `path` once it is complete. On an error or an interruption, `path` is unchanged.
@@ -10,13 +14,44 @@ pub fn write_atomically<T, E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<&mut File>) -> Result<T, E>,
 ) -> Result<T, E> {
-    let mut temporary = temporary_beside(path)?;
+    let (mut temporary, _unfinished) = {
+        let mut unfinished = unfinished();
+        let temporary = temporary_beside(path)?;
+        unfinished.push(temporary.path().to_owned());
+        let entry = Unfinished(temporary.path().to_owned());
+        (temporary, entry)
+    };
     let mut writer = BufWriter::new(temporary.as_file_mut());
     let outcome = write(&mut writer)?;
     writer.flush()?;
     drop(writer);
     temporary.persist(path).map_err(|failed| failed.error)?;
     Ok(outcome)
+}
+
+/// Removes the temporary files of all writes that are under way, and lets none finish; for the moment
+/// before the process ends.
+pub fn abandon_writes() {
+    let unfinished = unfinished();
+    for path in unfinished.iter() {
+        // There is nobody left to whom a failure matters.
+        let _ = std::fs::remove_file(path);
+    }
+    // A write that goes on must not begin another file.
+    std::mem::forget(unfinished);
+}
+
+fn unfinished() -> MutexGuard<'static, Vec<PathBuf>> {
+    UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Entry of a temporary file among the unfinished ones.
+struct Unfinished(PathBuf);
+
+impl Drop for Unfinished {
+    fn drop(&mut self) {
+        unfinished().retain(|path| *path != self.0);
+    }
 }
 
 /// Creates a temporary file in the folder of `path`, and that folder if necessary. Its permissions

@@ -56,11 +56,20 @@ pub fn require(
     }
 }
 
-/// Requires a finite value greater than 0.
+/// Smallest and largest positive value: squares, inverses, and their products with the size of a map
+/// are finite and precise enough.
+const SMALLEST: f64 = 1e-9;
+const LARGEST: f64 = 1e6;
+
+/// Requires a value greater than 0, from 1e-9 to a million.
 pub fn positive<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), InvalidValue> {
     let number: f64 = value.into();
-    let holds = number.is_finite() && number > 0.0;
-    require(holds, key, value, "it must be greater than 0")
+    require(number > 0.0, key, value, "it must be greater than 0")?;
+    // Values of single precision are rounded.
+    in_range(key, number, 0.999 * SMALLEST..=LARGEST).map_err(|_| {
+        let remedy = format!("it must lie between {SMALLEST} and {LARGEST}");
+        InvalidValue::new(key, value, remedy)
+    })
 }
 
 /// Requires a value greater than 0, which may be infinite: no limit.
@@ -71,14 +80,20 @@ pub fn positive_or_infinite<N: Into<f64> + Copy + Display>(
     require(value.into() > 0.0, key, value, "it must be greater than 0")
 }
 
-/// Requires a finite value of 0 or greater.
+/// Requires a value of 0 or greater, at most a million.
 pub fn not_negative<N: Into<f64> + Copy + Display>(
     key: &str,
     value: N,
 ) -> Result<(), InvalidValue> {
     let number: f64 = value.into();
-    let holds = number.is_finite() && number >= 0.0;
-    require(holds, key, value, "it must be 0 or greater")
+    require(number >= 0.0, key, value, "it must be 0 or greater")?;
+    bounded(key, value)
+}
+
+/// Requires a value between minus and plus a million.
+pub fn bounded<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), InvalidValue> {
+    let remedy = format!("it must lie between -{LARGEST} and {LARGEST}");
+    require(value.into().abs() <= LARGEST, key, value, remedy)
 }
 
 /// Requires a value within both limits.
@@ -106,7 +121,11 @@ pub fn at_least_one(key: &str, count: usize) -> Result<(), InvalidValue> {
 pub fn rectangle(key: &str, limits_m: [f32; 4]) -> Result<(), InvalidValue> {
     let [x_min, x_max, y_min, y_max] = limits_m;
     require(
-        limits_m.iter().all(|limit| limit.is_finite()) && x_min <= x_max && y_min <= y_max,
+        limits_m
+            .iter()
+            .all(|limit| f64::from(limit.abs()) <= LARGEST)
+            && x_min <= x_max
+            && y_min <= y_max,
         key,
         format_args!("{limits_m:?}"),
         "it must be x_min, x_max, y_min, y_max with x_min <= x_max and y_min <= y_max; \

@@ -16,7 +16,7 @@ use smart_default::SmartDefault;
 use super::polar_grid::PolarPosition;
 use super::surface::{BLOCK, MIN_POINTS_PER_TASK, ScanIndex, Shape};
 use super::terrain::{Terrain, TerrainConfig};
-use crate::validation::{InvalidValue, Validate, not_negative, positive};
+use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Parameters of the features.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
@@ -34,7 +34,7 @@ pub struct FeatureConfig {
 
 impl Validate for FeatureConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        positive("spacing_m", self.spacing_m)?;
+        in_range("spacing_m", self.spacing_m, 0.001..=10.0)?;
         not_negative("min_distance_m", self.min_distance_m)?;
         positive("terrain.step_m", self.terrain.step_m)?;
         not_negative("terrain.max_slope", self.terrain.max_slope)?;

@@ -12,7 +12,7 @@ use smart_default::SmartDefault;
 use super::classifier::GroundClassifier;
 use crate::geometry::{PlaneFit, PlaneSums};
 use crate::random;
-use crate::validation::{InvalidValue, Validate, in_range, positive, require};
+use crate::validation::{InvalidValue, Validate, in_range, positive};
 
 /// Ground by the dominant plane.
 ///
@@ -36,13 +36,8 @@ pub struct RansacGround {
 impl Validate for RansacGround {
     fn validate(&self) -> Result<(), InvalidValue> {
         positive("distance_threshold", self.distance_threshold)?;
-        require(
-            self.ransac_n >= 3,
-            "ransac_n",
-            self.ransac_n,
-            "a plane needs 3 points or more",
-        )?;
-        in_range("num_iterations", self.num_iterations, 1..=1_000_000)
+        in_range("ransac_n", self.ransac_n, 3..=1000)?;
+        in_range("num_iterations", self.num_iterations, 1..=100_000)
     }
 }
 

@@ -42,10 +42,26 @@ pub struct LidarModel {
     pub min_range: f32,
 }
 
+impl LidarModel {
+    /// Largest number of pixels: ten times those of the largest sensors.
+    pub const MAX_PIXELS: usize = 1 << 22;
+}
+
 impl Validate for LidarModel {
     fn validate(&self) -> Result<(), InvalidValue> {
         in_range("height", self.height, 1..=4096)?;
         in_range("width", self.width, 1..=65_536)?;
+        require(
+            self.height * self.width <= Self::MAX_PIXELS,
+            "width",
+            self.width,
+            format!(
+                "with height {} it must be at most {}: an image has up to {} pixels",
+                self.height,
+                Self::MAX_PIXELS / self.height,
+                Self::MAX_PIXELS
+            ),
+        )?;
         in_range("fov_up", self.fov_up, -90.0..=90.0)?;
         in_range("fov_down", self.fov_down, -90.0..=90.0)?;
         require(

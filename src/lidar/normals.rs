@@ -20,7 +20,9 @@ use smart_default::SmartDefault;
 
 use super::range_image::RangeImage;
 use crate::geometry::PlaneSums;
-use crate::validation::{InvalidValue, Validate, fraction, not_negative, positive, require};
+use crate::validation::{
+    InvalidValue, Validate, fraction, in_range, not_negative, positive, require,
+};
 
 /// Settings of the normal estimation.
 ///
@@ -54,7 +56,7 @@ pub struct NormalConfig {
 
 impl Validate for NormalConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        positive("spacing_m", self.spacing_m)?;
+        in_range("spacing_m", self.spacing_m, 0.001..=10.0)?;
         positive("tolerance_m", self.tolerance_m)?;
         not_negative("relative_tolerance", self.relative_tolerance)?;
         positive("beam_tolerance_m", self.beam_tolerance_m)?;

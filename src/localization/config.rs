@@ -9,7 +9,7 @@ use super::sensor::SensorConfig;
 use super::tempering::TemperingConfig;
 use super::tracking_loss::TrackingLossConfig;
 use crate::map::PanoramaConfig;
-use crate::validation::{InvalidValue, Validate, at_least_one, nested, not_negative};
+use crate::validation::{InvalidValue, Validate, at_least_one, in_range, nested, not_negative};
 use smart_default::SmartDefault;
 
 /// Configuration of the localizer.
@@ -60,11 +60,14 @@ pub struct LocalizerConfig {
     pub panorama: PanoramaConfig,
 }
 
+/// Largest number of particles.
+const MAX_PARTICLES: usize = 1_000_000;
+
 impl Validate for LocalizerConfig {
     /// Errors have the keys of `localization.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
-        at_least_one("numParticles", self.num_particles)?;
-        at_least_one("num_reduced", self.num_reduced)?;
+        in_range("numParticles", self.num_particles, 1..=MAX_PARTICLES)?;
+        in_range("num_reduced", self.num_reduced, 1..=MAX_PARTICLES)?;
         not_negative("move_thres", self.move_thres_m)?;
         not_negative("turn_thres_rad", self.turn_thres_rad)?;
         nested("odometry_noise", &self.motion)?;
@@ -78,6 +81,7 @@ impl Validate for LocalizerConfig {
         nested("kld", &self.kld)?;
         at_least_one("converge_thres", self.convergence.converge_thres)?;
         nested("convergence", &self.convergence)?;
-        nested("vigilance", &self.tracking_loss)
+        nested("vigilance", &self.tracking_loss)?;
+        nested("panorama", &self.panorama)
     }
 }

@@ -20,7 +20,7 @@ use crate::lidar::{Beam, RangeImage};
 use crate::map::{GroundPatch, Map, SensorAttitude};
 use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
 use crate::validation::{
-    InvalidValue, Validate, at_least_one, fraction, positive, positive_or_infinite,
+    InvalidValue, Validate, fraction, in_range, positive, positive_or_infinite,
 };
 
 /// Form of the likelihood.
@@ -78,9 +78,9 @@ impl Validate for ObservationConfig {
         positive_or_infinite("short_m", self.short_m)?;
         positive_or_infinite("long_m", self.long_m)?;
         positive_or_infinite("no_surface_m", self.no_surface_m)?;
-        at_least_one("beams", self.beams)?;
-        at_least_one("min_beams", self.min_beams)?;
-        at_least_one("ray_budget", self.ray_budget)?;
+        in_range("beams", self.beams, 1..=1_000_000)?;
+        in_range("min_beams", self.min_beams, 1..=1_000_000)?;
+        in_range("ray_budget", self.ray_budget, 1..=1_000_000_000)?;
         fraction("road_share", self.road_share)
     }
 }

@@ -25,9 +25,7 @@ use smart_default::SmartDefault;
 use super::particles::deviation;
 use crate::geometry::{Pose2, wrap_angle};
 use crate::registration::RegistrationConfig;
-use crate::validation::{
-    InvalidValue, Validate, at_least_one, fraction, nested, positive, require,
-};
+use crate::validation::{InvalidValue, Validate, fraction, in_range, nested, positive};
 
 /// Proposal distribution while tracking.
 ///
@@ -62,16 +60,11 @@ pub struct ProposalConfig {
 
 impl Validate for ProposalConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        at_least_one("beams", self.beams)?;
+        in_range("beams", self.beams, 1..=1_000_000)?;
         fraction("road_share", self.road_share)?;
-        at_least_one("weighed_beams", self.weighed_beams)?;
+        in_range("weighed_beams", self.weighed_beams, 1..=1_000_000)?;
         nested("registration", &self.registration)?;
-        require(
-            self.widening >= 1.0 && self.widening.is_finite(),
-            "widening",
-            self.widening,
-            "it must be 1 or greater",
-        )?;
+        in_range("widening", self.widening, 1.0..=1000.0)?;
         positive("max_sigmas", self.max_sigmas)
     }
 }

@@ -15,7 +15,7 @@
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use crate::validation::{InvalidValue, Validate, at_least_one, fraction};
+use crate::validation::{InvalidValue, Validate, fraction, in_range};
 
 /// Tempering of the likelihood within a frame.
 ///
@@ -38,8 +38,8 @@ pub struct TemperingConfig {
 impl Validate for TemperingConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         fraction("min_effective_fraction", self.min_effective_fraction)?;
-        at_least_one("searching_rounds", self.searching_rounds)?;
-        at_least_one("tracking_rounds", self.tracking_rounds)
+        in_range("searching_rounds", self.searching_rounds, 1..=100)?;
+        in_range("tracking_rounds", self.tracking_rounds, 1..=100)
     }
 }
 

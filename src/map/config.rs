@@ -7,7 +7,7 @@ use super::local_map::LocalMapConfig;
 use super::tiles::TileConfig;
 use crate::ground::GroundConfig;
 use crate::rendering::Backend;
-use crate::validation::{InvalidValue, Validate, at_least_one, not_negative, positive};
+use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Everything that can be configured about building a map.
 ///
@@ -36,7 +36,7 @@ impl Validate for MapConfig {
     /// With the keys of `build_map.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
         not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
-        at_least_one("local_map_size", self.local_map_size)?;
+        in_range("local_map_size", self.local_map_size, 1..=10_000)?;
         not_negative("overlap_m", self.overlap_m)?;
         positive("max_step_m", self.max_step_m)?;
         self.local_map.validate()

@@ -11,9 +11,7 @@ use super::vertex_ground;
 use super::visibility::{self, VisibilityConfig};
 use crate::geometry::{PointCloud, TriangleMesh};
 use crate::meshing::{self, MeshingError, PoissonConfig, Reconstruction};
-use crate::validation::{
-    InvalidValue, Validate, fraction, nested, not_negative, positive, require,
-};
+use crate::validation::{InvalidValue, Validate, fraction, in_range, nested, positive, require};
 
 /// Longest edge of the simplified ground in cells: vertices of neighbouring cells are less than two
 /// cells apart along an axis.
@@ -71,7 +69,14 @@ impl Validate for LocalMapConfig {
         positive("max_distance_m", self.max_distance_m)?;
         nested("visibility", &self.visibility)?;
         fraction("ground_threshold", self.ground_threshold)?;
-        not_negative("simplify_resolution", self.simplify_resolution_m)
+        let resolution_m = self.simplify_resolution_m;
+        require(
+            resolution_m == 0.0 || (0.01..=100.0).contains(&resolution_m),
+            "simplify_resolution",
+            resolution_m,
+            "it must lie between 0.01 and 100; 0 disables the simplification",
+        )?;
+        in_range("number_of_iterations", self.smoothing_iterations, 0..=1000)
     }
 }
 

@@ -14,6 +14,7 @@
 //! metre. Where roads cross above one another, a cell has one panorama per level.
 
 use std::f32::consts::TAU;
+use std::ops::RangeInclusive;
 
 use glam::Vec3;
 use nalgebra::Point2;
@@ -27,7 +28,7 @@ use super::tiles::TileGrid;
 use crate::geometry::{Pose2, Pose3, Rigid3f, pose2_from_pose3, wrap_angle};
 use crate::lidar::{LidarModel, RangeImage};
 use crate::rendering::{RangeRenderer, RenderError};
-use crate::validation::{InvalidValue, Validate, fraction, in_range, positive, require};
+use crate::validation::{InvalidValue, Validate, fraction, in_range, positive};
 
 /// Size of the panoramas and of the search.
 ///
@@ -67,16 +68,17 @@ pub struct PanoramaConfig {
     pub yaw_sigma_rad: f64,
 }
 
+impl PanoramaConfig {
+    /// Allowed sides of a cell [m].
+    pub const CELLS_M: RangeInclusive<f64> = 0.05..=1000.0;
+}
+
 impl Validate for PanoramaConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        in_range("rows", self.rows, 1..=4096)?;
-        in_range("columns", self.columns, 1..=65_536)?;
-        require(
-            self.lowest_rad.is_finite(),
-            "lowest_rad",
-            self.lowest_rad,
-            "it must be an angle below the horizon, such as 0.12",
-        )?;
+        in_range("cell_m", self.cell_m, Self::CELLS_M)?;
+        in_range("rows", self.rows, 1..=256)?;
+        in_range("columns", self.columns, 1..=3600)?;
+        in_range("lowest_rad", self.lowest_rad, -1.5..=1.5)?;
         positive("limit_m", self.limit_m)?;
         in_range("coarse_step", self.coarse_step, 1..=self.columns)?;
         fraction("refined_share", self.refined_share)?;

@@ -8,7 +8,7 @@ use smart_default::SmartDefault;
 use crate::geometry::{PointCloud, Pose3, Rigid3f};
 use crate::ground::GroundClassifier;
 use crate::lidar::{LidarModel, NormalConfig, RangeImage, Scan, estimate_normals};
-use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
+use crate::validation::{InvalidValue, Validate, in_range, nested, rectangle};
 
 /// Selection and preparation of the points of a scan.
 ///
@@ -30,15 +30,18 @@ pub struct ScanConfig {
     pub own_car_m: [f32; 4],
 }
 
+/// Largest half extent of the crop box [m]: beyond the range of any sensor.
+const MAX_CROP_M: f32 = 500.0;
+
 impl Validate for ScanConfig {
     /// With the keys of `build_map.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
         nested("range_image", &self.range_image)?;
         nested("normals", &self.normals)?;
-        positive("voxel_size", self.voxel_size_m)?;
-        positive("crop_x", self.crop_m.x)?;
-        positive("crop_y", self.crop_m.y)?;
-        positive("crop_z", self.crop_m.z)?;
+        in_range("voxel_size", self.voxel_size_m, 0.001..=100.0)?;
+        in_range("crop_x", self.crop_m.x, 0.001..=MAX_CROP_M)?;
+        in_range("crop_y", self.crop_m.y, 0.001..=MAX_CROP_M)?;
+        in_range("crop_z", self.crop_m.z, 0.001..=MAX_CROP_M)?;
         rectangle("own_car_m", self.own_car_m)
     }
 }

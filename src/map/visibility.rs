@@ -28,7 +28,7 @@ use super::scan_cloud::ScanCloud;
 use crate::geometry::TriangleMesh;
 use crate::lidar::LidarModel;
 use crate::raycasting::Scene;
-use crate::validation::{InvalidValue, Validate, at_least_one, not_negative};
+use crate::validation::{InvalidValue, Validate, at_least_one, in_range, not_negative};
 
 /// Parameters of free-space voting.
 ///
@@ -77,7 +77,7 @@ pub struct VisibilityConfig {
 
 impl Validate for VisibilityConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        at_least_one("point_voters", self.point_voters)?;
+        in_range("point_voters", self.point_voters, 1..=1000)?;
         not_negative("point_margin_m", self.point_margin_m)?;
         not_negative("point_margin_per_range", self.point_margin_per_range)?;
         at_least_one("point_votes", self.point_votes as usize)?;
@@ -87,7 +87,7 @@ impl Validate for VisibilityConfig {
         not_negative("support_m", self.support_m)?;
         not_negative("support_range_m", self.support_range_m)?;
         at_least_one("triangle_votes", self.triangle_votes as usize)?;
-        at_least_one("max_beams", self.max_beams)
+        in_range("max_beams", self.max_beams, 1..=1_000_000_000)
     }
 }
 

@@ -27,7 +27,7 @@ use super::solver;
 use super::stencil::{CORNER_OFFSETS, CornerValues, corner_index, interpolate, trilinear};
 use super::weights::SampleWeights;
 use crate::geometry::{PointCloud, TriangleMesh};
-use crate::validation::{InvalidValue, Validate, at_least_one, in_range, not_negative, positive};
+use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Settings of the reconstruction.
 ///
@@ -66,7 +66,7 @@ impl Validate for PoissonConfig {
         in_range("scale", self.scale, 1.05..=10.0)?;
         not_negative("point_weight", self.point_weight)?;
         positive("samples_per_node", self.samples_per_node)?;
-        at_least_one("iterations", self.iterations)
+        in_range("iterations", self.iterations, 1..=1000)
     }
 }
 

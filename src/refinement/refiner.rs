@@ -16,7 +16,7 @@ use crate::map::SensorAttitude;
 use crate::registration::{RegistrationConfig, RegistrationResult, register};
 use crate::rendering::RenderError;
 use crate::validation::{
-    InvalidValue, Validate, at_least_one, nested, not_negative, positive, require,
+    InvalidValue, Validate, in_range, nested, not_negative, positive, require,
 };
 
 /// Steps of the refinement of a frame.
@@ -75,7 +75,7 @@ pub struct RefinementConfig {
 impl Validate for RefinementConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         nested("swarm", &self.swarm)?;
-        at_least_one("swarm_beams", self.swarm_beams)?;
+        in_range("swarm_beams", self.swarm_beams, 1..=1_000_000)?;
         nested("gauss_newton", &self.gauss_newton)?;
         nested("smoothing", &self.smoothing)?;
         not_negative("reach_sigmas", self.reach_sigmas)?;
@@ -83,7 +83,8 @@ impl Validate for RefinementConfig {
         positive("min_reach_rad", self.min_reach_rad)?;
         let ordered = |max_key: &str, max: f64, min_key: &str, min: f64| {
             let remedy = format!("it must not be less than {min_key}, which is {min}");
-            require(max.is_finite() && max >= min, max_key, max, remedy)
+            positive(max_key, max)?;
+            require(max >= min, max_key, max, remedy)
         };
         let (m, rad) = (self.min_reach_m, self.min_reach_rad);
         ordered("max_reach_m", self.max_reach_m, "min_reach_m", m)?;

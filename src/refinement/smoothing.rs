@@ -16,7 +16,7 @@ use smart_default::SmartDefault;
 
 use crate::geometry::Pose2;
 use crate::localization::particles::deviation;
-use crate::validation::{InvalidValue, Validate, at_least_one, positive};
+use crate::validation::{InvalidValue, Validate, in_range, positive};
 
 /// Noise of the odometry and robustness against wrong frames.
 ///
@@ -47,7 +47,7 @@ impl Validate for SmoothingConfig {
         positive("odometry_aside_m", self.odometry_aside_m)?;
         positive("odometry_turn_rad", self.odometry_turn_rad)?;
         positive("robust_sigmas", self.robust_sigmas)?;
-        at_least_one("iterations", self.iterations)
+        in_range("iterations", self.iterations, 1..=1000)
     }
 }
 

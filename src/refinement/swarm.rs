@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use crate::geometry::wrap_angle;
-use crate::validation::{InvalidValue, Validate, at_least_one, not_negative, positive};
+use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Parameters of the swarm.
 ///
@@ -54,8 +54,8 @@ pub struct SwarmConfig {
 
 impl Validate for SwarmConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        at_least_one("candidates", self.candidates)?;
-        at_least_one("iterations", self.iterations)?;
+        in_range("candidates", self.candidates, 1..=10_000)?;
+        in_range("iterations", self.iterations, 1..=1000)?;
         not_negative("inertia", self.inertia)?;
         not_negative("final_inertia", self.final_inertia)?;
         not_negative("cognitive", self.cognitive)?;

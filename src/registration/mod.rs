@@ -33,7 +33,7 @@ use smart_default::SmartDefault;
 use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::Beam;
 use crate::rendering::{RangeRenderer, RenderError, SurfaceHit};
-use crate::validation::{InvalidValue, Validate, at_least_one, not_negative, positive};
+use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Components of the pose that registration estimates.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -77,10 +77,10 @@ pub struct RegistrationConfig {
 
 impl Validate for RegistrationConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        at_least_one("iterations", self.iterations)?;
+        in_range("iterations", self.iterations, 1..=1000)?;
         positive("kernel_m", self.kernel_m)?;
         not_negative("tolerance_m", self.tolerance_m)?;
-        at_least_one("sectors", self.sectors)?;
+        in_range("sectors", self.sectors, 1..=10_000)?;
         not_negative("map_error_m", self.map_error_m)
     }
 }

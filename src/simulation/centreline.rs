@@ -7,7 +7,7 @@ use glam::DVec2;
 use serde::{Deserialize, Serialize};
 
 use crate::geometry::Pose3;
-use crate::validation::{InvalidValue, Validate, positive};
+use crate::validation::{InvalidValue, Validate, bounded, in_range};
 
 /// Distance between knots [m].
 const KNOT_SPACING_M: f64 = 2.0;
@@ -51,7 +51,9 @@ impl Default for PathSegment {
 
 impl Validate for PathSegment {
     fn validate(&self) -> Result<(), InvalidValue> {
-        positive("length_m", self.length_m)
+        in_range("length_m", self.length_m, 0.1..=100_000.0)?;
+        bounded("turn_deg", self.turn_deg)?;
+        in_range("grade_percent", self.grade_percent, -100.0..=100.0)
     }
 }
 

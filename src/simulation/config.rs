@@ -11,7 +11,7 @@ use super::odometry::OdometryConfig;
 use super::scanner::ScannerConfig;
 use super::street_config::StreetConfig;
 use super::traffic::TrafficConfig;
-use crate::validation::{InvalidValue, Validate, nested, positive};
+use crate::validation::{InvalidValue, Validate, nested, positive, require};
 
 /// A drive along a street: the configuration of `simulate`.
 ///
@@ -57,16 +57,23 @@ impl SimulationConfig {
     }
 }
 
+/// Longest path [m].
+const LONGEST_M: f64 = 100_000.0;
+
 impl Validate for SimulationConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         positive("drive", self.drive)?;
+        let length_m: f64 = self.path.iter().map(|segment| segment.length_m).sum();
+        let remedy = format!("its segments must be at most {LONGEST_M} m long together");
+        require(length_m <= LONGEST_M, "path", length_m, remedy)?;
         for (index, segment) in self.path.iter().enumerate() {
             nested(&format!("path.{}", index + 1), segment)?;
         }
         nested("street", &self.street)?;
         nested("motion", &self.motion)?;
         nested("traffic", &self.traffic)?;
-        nested("scanner", &self.scanner)
+        nested("scanner", &self.scanner)?;
+        nested("odometry", &self.odometry)
     }
 }
 

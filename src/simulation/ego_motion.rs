@@ -16,7 +16,7 @@ use super::centreline::Centreline;
 use super::ground::{GroundField, GroundZone};
 use super::random::{Purpose, stream};
 use crate::geometry::Pose3;
-use crate::validation::{InvalidValue, Validate, positive};
+use crate::validation::{InvalidValue, Validate, in_range, positive};
 
 /// Time between two scans [s].
 pub const SCAN_PERIOD_S: f64 = 0.1;
@@ -63,8 +63,14 @@ pub struct MotionConfig {
 
 impl Validate for MotionConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        positive("speed_m_s", self.speed_m_s)?;
-        positive("sensor_height_m", self.sensor_height_m)?;
+        in_range("speed_m_s", self.speed_m_s, 0.1..=100.0)?;
+        let offset_m = self.lane_offset_m.unwrap_or_default();
+        in_range("lane_offset_m", offset_m, -100.0..=100.0)?;
+        in_range("weaving_m", self.weaving_m, 0.0..=10.0)?;
+        in_range("sensor_height_m", self.sensor_height_m, 0.1..=100.0)?;
+        in_range("nodding_deg", self.nodding_deg, 0.0..=45.0)?;
+        in_range("rolling_deg", self.rolling_deg, 0.0..=45.0)?;
+        in_range("heaving_m", self.heaving_m, 0.0..=1.0)?;
         positive("kidnapped_by_m", self.kidnapped_by_m)
     }
 }

@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use crate::geometry::Pose3;
+use crate::validation::{InvalidValue, Validate, in_range};
 
 /// Errors of the odometry.
 ///
@@ -33,6 +34,16 @@ pub struct OdometryConfig {
     /// Standard deviation of each component of a rotation, per scan (ε_ω) [deg].
     #[default(0.02)]
     pub turn_noise_deg: f64,
+}
+
+impl Validate for OdometryConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        in_range("scale_error", self.scale_error, -0.9..=10.0)?;
+        let drift = self.heading_drift_deg_per_m;
+        in_range("heading_drift_deg_per_m", drift, -90.0..=90.0)?;
+        in_range("step_noise_m", self.step_noise_m, 0.0..=100.0)?;
+        in_range("turn_noise_deg", self.turn_noise_deg, 0.0..=180.0)
+    }
 }
 
 /// The poses that odometry reports for true poses, starting at the first of them.

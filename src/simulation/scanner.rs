@@ -22,10 +22,10 @@ use smart_default::SmartDefault;
 use super::builder::{LabelledMesh, Material};
 use super::ego_motion::SCAN_PERIOD_S;
 use crate::geometry::{Pose3, Rigid3f};
-use crate::lidar::Scan;
+use crate::lidar::{LidarModel, Scan};
 use crate::raycasting::{Hit, Scene};
 use crate::validation::{
-    InvalidValue, Validate, at_least_one, fraction, not_negative, positive, require,
+    InvalidValue, Validate, fraction, in_range, not_negative, positive, require,
 };
 
 /// Azimuth steps that share one sensor pose under a rolling shutter.
@@ -68,8 +68,18 @@ pub struct ScannerConfig {
 
 impl Validate for ScannerConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        at_least_one("beams", self.beams)?;
-        at_least_one("azimuth_steps", self.azimuth_steps)?;
+        in_range("beams", self.beams, 1..=4096)?;
+        in_range("azimuth_steps", self.azimuth_steps, 1..=65_536)?;
+        require(
+            self.beams.max(self.elevations_deg.len()) * self.azimuth_steps
+                <= LidarModel::MAX_PIXELS,
+            "azimuth_steps",
+            self.azimuth_steps,
+            format!(
+                "a scan has up to {} beams, beams times azimuth_steps",
+                LidarModel::MAX_PIXELS
+            ),
+        )?;
         not_negative("min_range_m", self.min_range_m)?;
         positive("max_range_m", self.max_range_m)?;
         require(
@@ -81,7 +91,7 @@ impl Validate for ScannerConfig {
                 self.max_range_m
             ),
         )?;
-        positive("reach_m", self.reach_m)?;
+        in_range("reach_m", self.reach_m, 1.0..=10_000.0)?;
         not_negative("range_noise_m", self.range_noise_m)?;
         fraction("dropout_share", self.dropout_share)
     }

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use crate::validation::{InvalidValue, Validate, fraction, nested, positive};
+use crate::validation::{InvalidValue, Validate, fraction, in_range, nested};
 
 /// The street and what stands along it.
 ///
@@ -38,12 +38,16 @@ pub struct StreetConfig {
 
 impl Validate for StreetConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        positive("lane_width_m", self.lane_width_m)?;
-        positive("side_street_spacing_m", self.side_street_spacing_m)?;
+        in_range("lane_width_m", self.lane_width_m, 1.0..=50.0)?;
+        in_range(
+            "side_street_spacing_m",
+            self.side_street_spacing_m,
+            5.0..=1e6,
+        )?;
         fraction("built_share", self.built_share)?;
         fraction("parked_share", self.parked_share)?;
-        positive("lamp_spacing_m", self.lamp_spacing_m)?;
-        positive("plants_per_100_m", self.plants_per_100_m)?;
+        in_range("lamp_spacing_m", self.lamp_spacing_m, 1.0..=1e6)?;
+        in_range("plants_per_100_m", self.plants_per_100_m, 0.001..=1000.0)?;
         nested("ground", &self.ground)
     }
 }
@@ -76,8 +80,11 @@ pub struct CrossSectionConfig {
 
 impl Validate for CrossSectionConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        positive("cell_m", self.cell_m)?;
-        positive("reach_m", self.reach_m)?;
-        positive("sidewalk_width_m", self.sidewalk_width_m)
+        in_range("cell_m", self.cell_m, 0.1..=50.0)?;
+        in_range("reach_m", self.reach_m, 1.0..=500.0)?;
+        in_range("sidewalk_width_m", self.sidewalk_width_m, 0.1..=50.0)?;
+        in_range("kerb_height_m", self.kerb_height_m, 0.0..=1.0)?;
+        in_range("crown_slope", self.crown_slope, -1.0..=1.0)?;
+        in_range("undulation_m", self.undulation_m, 0.0..=10.0)
     }
 }

@@ -13,7 +13,7 @@ use super::ego_motion::{EgoMotion, SCAN_PERIOD_S};
 use super::ground::GroundField;
 use super::layout::{EXTENSION_M, random_side};
 use super::vehicles::Vehicle;
-use crate::validation::{InvalidValue, Validate, not_negative};
+use crate::validation::{InvalidValue, Validate, in_range, not_negative, require};
 
 /// Distance from the lidar beyond which road users are not simulated [m].
 const VISIBLE_M: f64 = 90.0;
@@ -51,10 +51,19 @@ impl Validate for TrafficConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         not_negative("lorry_from_s", self.lorry_from_s.unwrap_or_default())?;
         not_negative("lorry_for_s", self.lorry_for_s)?;
-        not_negative("oncoming_spacing_m", self.oncoming_spacing_m)?;
-        not_negative("oncoming_speed_m_s", self.oncoming_speed_m_s)?;
-        not_negative("cyclists_per_100_m", self.cyclists_per_100_m)?;
-        not_negative("pedestrians_per_100_m", self.pedestrians_per_100_m)
+        require(
+            self.oncoming_spacing_m == 0.0 || (1.0..=1e6).contains(&self.oncoming_spacing_m),
+            "oncoming_spacing_m",
+            self.oncoming_spacing_m,
+            "it must lie between 1 and 1000000; 0 is for none",
+        )?;
+        in_range("oncoming_speed_m_s", self.oncoming_speed_m_s, 0.0..=100.0)?;
+        in_range("cyclists_per_100_m", self.cyclists_per_100_m, 0.0..=1000.0)?;
+        in_range(
+            "pedestrians_per_100_m",
+            self.pedestrians_per_100_m,
+            0.0..=1000.0,
+        )
     }
 }
 

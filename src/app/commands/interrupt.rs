@@ -1,12 +1,41 @@
-//! Ctrl-C: the first stops a command at the next point without loss, the second exits at once.
+//! Ctrl-C: the first stops a command at the next point without loss, at the latest after a second and
+//! a half; the second exits at once.
+//!
+//! Loops poll [`Interrupt::requested`]. For what lasts longer, the process ends while it runs: files
+//! are written atomically, so what is finished stays. A command whose finished work is still in memory
+//! saves it by [`Interrupt::supervise`].
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use crate::files;
+
+/// Time from the request to stop until the process ends.
+const GRACE: Duration = Duration::from_millis(1500);
+
+/// Time between two looks at the request.
+const POLL: Duration = Duration::from_millis(20);
 
 /// Request of the user to stop, which loops poll; not requested by default.
 #[derive(Clone, Debug, Default)]
 pub struct Interrupt {
-    requested: Arc<AtomicBool>,
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    requested: AtomicBool,
+    /// Whether the time after the request has passed.
+    is_overdue: AtomicBool,
+    /// Whether [`Interrupt::supervise`] ends the process.
+    is_supervised: AtomicBool,
+    /// Held while files are written that belong together.
+    saving: Mutex<()>,
+    /// What is finished and kept, and where; empty if a command does not say.
+    kept: Mutex<String>,
 }
 
 /// Error of a command that the user interrupted.
@@ -21,44 +50,112 @@ impl Interrupt {
     /// Installs the handler of Ctrl-C; only once per process.
     pub fn install() -> Result<Self, ctrlc::Error> {
         let interrupt = Self::default();
-        let requested = Arc::clone(&interrupt.requested);
+        let handled = interrupt.clone();
         ctrlc::set_handler(move || {
-            if requested.swap(true, Ordering::Relaxed) {
-                kill();
+            if handled.shared.requested.swap(true, Ordering::Relaxed) {
+                files::abandon_writes();
+                exit();
             }
             tracing::warn!(
                 "interrupted: keeping what is finished; press Ctrl-C again to stop at once"
             );
+            let watched = handled.clone();
+            thread::spawn(move || watched.exit_when_overdue());
         })?;
         Ok(interrupt)
     }
 
     /// Whether Ctrl-C was pressed.
     pub fn requested(&self) -> bool {
-        self.requested.load(Ordering::Relaxed)
+        self.shared.requested.load(Ordering::Relaxed)
     }
 
     /// Requests to stop, as Ctrl-C does.
     pub fn request(&self) {
-        self.requested.store(true, Ordering::Relaxed);
+        self.shared.requested.store(true, Ordering::Relaxed);
+    }
+
+    /// Sets what is finished and kept from now on, for the message of an interruption.
+    pub fn keeps(&self, kept: impl Into<String>) {
+        *lock(&self.shared.kept) = kept.into();
+    }
+
+    /// Guard of files that belong together: the process does not end between them.
+    pub fn saving(&self) -> MutexGuard<'_, ()> {
+        lock(&self.shared.saving)
+    }
+
+    /// Does work of which finished parts are in memory. Where it does not end in time after a request to
+    /// stop, `save` saves them and returns what is kept, and the process ends.
+    pub fn supervise<T>(
+        &self,
+        work: impl FnOnce() -> T,
+        save: impl FnOnce() -> anyhow::Result<String> + Send,
+    ) -> T {
+        self.shared.is_supervised.store(true, Ordering::SeqCst);
+        let (working, worker) = channel::<()>();
+        let supervise = move || {
+            while let Err(RecvTimeoutError::Timeout) = worker.recv_timeout(POLL) {
+                if self.shared.is_overdue.load(Ordering::SeqCst) {
+                    match save() {
+                        Ok(kept) => self.keeps(kept),
+                        Err(error) => tracing::error!("{error:#}"),
+                    }
+                    self.exit_after_saving();
+                }
+            }
+            self.shared.is_supervised.store(false, Ordering::SeqCst);
+        };
+        thread::scope(|scope| {
+            scope.spawn(supervise);
+            // Dropped at the end of the work, also by a panic.
+            let _working = working;
+            work()
+        })
+    }
+
+    fn exit_when_overdue(&self) {
+        thread::sleep(GRACE);
+        self.shared.is_overdue.store(true, Ordering::SeqCst);
+        while self.shared.is_supervised.load(Ordering::SeqCst) {
+            thread::sleep(POLL);
+        }
+        self.exit_after_saving();
+    }
+
+    fn exit_after_saving(&self) -> ! {
+        let _saving = self.saving();
+        files::abandon_writes();
+        let mut kept = lock(&self.shared.kept).clone();
+        if kept.is_empty() {
+            "every output file that exists is complete".clone_into(&mut kept);
+        }
+        tracing::error!("{}", Interrupted { kept });
+        exit()
     }
 }
 
-#[expect(clippy::exit, reason = "the user requested it a second time")]
-fn kill() {
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[expect(clippy::exit, reason = "the user requested it, and files are complete")]
+fn exit() -> ! {
     std::process::exit(130)
 }
 
 #[cfg(all(test, unix))]
 mod tests {
     use std::process::Command;
-    use std::time::{Duration, Instant};
+    use std::time::Instant;
 
     use super::*;
 
     #[test]
     fn ctrl_c_is_seen_by_every_copy() {
         let interrupt = Interrupt::install().unwrap();
+        // The process of the tests must not end.
+        std::mem::forget(interrupt.saving());
         let copy = interrupt.clone();
         assert!(!copy.requested());
         let pid = std::process::id().to_string();
@@ -66,8 +163,16 @@ mod tests {
         assert!(sent.success());
         let start = Instant::now();
         while !copy.requested() && start.elapsed() < Duration::from_secs(20) {
-            std::thread::sleep(Duration::from_millis(5));
+            thread::sleep(Duration::from_millis(5));
         }
         assert!(copy.requested() && interrupt.requested());
+    }
+
+    #[test]
+    fn supervised_work_returns_its_value_and_nothing_is_saved() {
+        let interrupt = Interrupt::default();
+        interrupt.request();
+        let value = interrupt.supervise(|| 7, || unreachable!("the work is in time"));
+        assert_eq!(value, 7);
     }
 }

@@ -51,7 +51,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     results.refined = Some(refined.poses.clone());
     results.refined_covariances = Some(refined.covariances.clone());
     results.refine_runtimes_s = Some(runtimes_s);
-    write_run(config, &map, &sequence, &results, &refined)
+    write_run(config, context, &map, &sequence, &results, &refined)
 }
 
 fn inputs(config: &RefinementConfig) -> Inputs<'_> {
@@ -108,13 +108,14 @@ fn refine(
     starts: &[InitialEstimate],
     increments: &[Option<Pose2>],
 ) -> Result<(RefinedTrajectory, Vec<f64>)> {
+    let path = config.result_file.display();
+    let kept = format!("{path} is unchanged: a trajectory is refined as a whole");
+    context.interrupt.keeps(kept.clone());
     let mut refiner = TrajectoryRefiner::new(map, refiner_config(config), config.seed)?;
     let mut runtimes_s = Vec::with_capacity(starts.len());
     let task = context.progress.task("refine", starts.len());
     for (frame, start) in sequence.frames.iter().zip(starts) {
         if context.interrupt.requested() {
-            let path = config.result_file.display();
-            let kept = format!("{path} is unchanged: a trajectory is refined as a whole");
             return Err(Interrupted { kept }.into());
         }
         let scan = frame.read()?;
@@ -191,12 +192,14 @@ fn refiner_config(config: &RefinementConfig) -> RefinerConfig {
 /// Writes results, report, plots and page, and returns the report.
 fn write_run(
     config: &RefinementConfig,
+    context: &Context,
     map: &Map,
     sequence: &Sequence,
     results: &LocalizationResults,
     refined: &RefinedTrajectory,
 ) -> Result<Report> {
     let files = RunFiles::beside(&config.result_file);
+    let saving = context.interrupt.saving();
     run_output::write_results(&files, results)?;
     run_output::write_trajectory(&files, "refined", sequence, &refined.map_from_lidar)?;
     output::write_yaml(&files.file("effective_refinement.yml"), config)?;
@@ -211,6 +214,11 @@ fn write_run(
     .map(|(key, value)| (key.to_owned(), value));
     let report = run_output::evaluate(results, &RangeMclRules::default(), about.into())?;
     run_output::write_report(&files, results, &report)?;
+    let path = config.result_file.display();
+    context.interrupt.keeps(format!(
+        "the refined trajectory is kept in {path}; plots are missing"
+    ));
+    drop(saving);
     if config.plot_loc_results {
         run_output::draw_run(&files, Some(&map.mesh), results)?;
     }

@@ -95,6 +95,10 @@ fn write_drive(
 ) -> Result<SimulationReport> {
     let simulation = prepare(config)?;
     let folder = config.drive_folder();
+    interrupt.keeps(format!(
+        "finished scans are kept in {}; the same command continues from there",
+        folder.display()
+    ));
     let kept = if resolve_existing(config, &simulation, existing)? {
         simulation.frames()
     } else {

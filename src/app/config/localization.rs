@@ -22,7 +22,7 @@ use crate::map::PanoramaConfig;
 use crate::map::scan_cloud::ScanConfig;
 use crate::refinement::{RefinementConfig, RefinerConfig};
 use crate::validation::{
-    InvalidValue, Validate, at_least_one, nested, not_negative, positive, rectangle,
+    InvalidValue, Validate, in_range, nested, not_negative, positive, rectangle,
 };
 
 /// Configuration of `localize`: the keys of range-mcl's `localization.yml`, then new ones.
@@ -351,11 +351,10 @@ impl Validate for LocalizationConfig {
         self.sensor_height_m
             .map_or(Ok(()), |height| positive("sensor_height_m", height))?;
         ground(&self.ground())?;
-        positive("grid_res", self.grid_res)?;
+        in_range("grid_res", self.grid_res, PanoramaConfig::CELLS_M)?;
         not_negative("yaw_sigma", self.yaw_sigma)?;
         nested("start", &self.start)?;
         self.localizer().validate()?;
-        nested("panorama", &self.panorama)?;
         nested("refinement", &self.refinement)?;
         nested("range_image", &self.range_image)
     }
@@ -363,7 +362,7 @@ impl Validate for LocalizationConfig {
 
 impl Validate for RenderedRangeImage {
     fn validate(&self) -> Result<(), InvalidValue> {
-        at_least_one("max_instance", self.max_instance)?;
+        in_range("max_instance", self.max_instance, 1..=1_000_000)?;
         self.model().validate()
     }
 }

@@ -140,6 +140,7 @@ fn build_parts(
     };
     let plan = builder.plan(poses)?;
     let mut all = Vec::with_capacity(plan.local_maps.len());
+    context.interrupt.keeps(kept(0, &plan, parts));
     for local_map in &plan.local_maps {
         let used = &frames[local_map.used.clone()];
         let counts = match parts.finished(local_map.number, || hash_of_scans(used)) {
@@ -156,6 +157,7 @@ fn build_parts(
             }
         };
         all.push(counts);
+        context.interrupt.keeps(kept(all.len(), &plan, parts));
     }
     Ok(all)
 }
@@ -236,15 +238,20 @@ fn interrupted(
 ) -> anyhow::Error {
     match error.downcast_ref() {
         Some(BuildError::Interrupted) => Interrupted {
-            kept: format!(
-                "{finished} of {} local maps are finished and kept in {}; run the same command again to continue",
-                plan.local_maps.len(),
-                parts.folder().display()
-            ),
+            kept: kept(finished, plan, parts),
         }
         .into(),
         _ => error,
     }
+}
+
+/// What is kept of an interrupted build.
+fn kept(finished: usize, plan: &MapPlan, parts: &Parts) -> String {
+    format!(
+        "{finished} of {} local maps are finished and kept in {}; run the same command again to continue",
+        plan.local_maps.len(),
+        parts.folder().display()
+    )
 }
 
 /// Inputs on which all local maps depend: the program, the configuration without the paths of outputs,

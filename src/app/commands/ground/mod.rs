@@ -103,12 +103,13 @@ fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Resu
     let (mut labelled_scans, mut points) = (0, 0);
     let task = context.progress.task("ground", scans.len());
     for (position, files) in scans.iter().enumerate() {
+        let kept = format!(
+            "{position} of {} scans are in {}; run again with --force for all of them",
+            scans.len(),
+            config.output_folder.display()
+        );
+        context.interrupt.keeps(kept.clone());
         if context.interrupt.requested() {
-            let kept = format!(
-                "{position} of {} scans are in {}; run again with --force for all of them",
-                scans.len(),
-                config.output_folder.display()
-            );
             return Err(Interrupted { kept }.into());
         }
         let scan = files.read()?;

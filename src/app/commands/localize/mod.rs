@@ -4,6 +4,7 @@ mod pictures;
 mod recorder;
 
 use std::collections::BTreeMap;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
@@ -45,7 +46,25 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         &mut stream(config.seed, ODOMETRY_STREAM),
     )?;
     let sequence = odometry::compensated(sequence, config.motion_compensation, &increments);
-    let run = localize(config, context, &map, &sequence, &increments, &files)?;
+    let run = Mutex::new(Run::new(config, &map, &files));
+    let recorded = || run.lock().unwrap_or_else(PoisonError::into_inner);
+    let kept = |run: &Run| run.kept(config, sequence.frames.len());
+    context.interrupt.supervise(
+        || {
+            localize(config, context, &map, &sequence, &increments, &recorded)?;
+            let mut run = recorded();
+            run.complete()?;
+            write_results(config, &files, &sequence, &run)?;
+            context.interrupt.keeps(kept(&run));
+            anyhow::Ok(())
+        },
+        || {
+            let run = recorded();
+            write_results(config, &files, &sequence, &run)?;
+            Ok(kept(&run))
+        },
+    )?;
+    let run = run.into_inner().unwrap_or_else(PoisonError::into_inner);
     let report = write_run(config, context, &files, &map, &sequence, &run)?;
     run.finish(config, sequence.frames.len())?;
     Ok(report)
@@ -62,21 +81,19 @@ fn inputs(config: &LocalizationConfig) -> Inputs<'_> {
     }
 }
 
-/// Localizes frames until the end, an interruption or an error; an error only where no frame was
-/// finished.
-fn localize(
+/// Localizes frames until the end, an interruption or an error, which is recorded.
+fn localize<'a>(
     config: &LocalizationConfig,
     context: &Context,
     map: &Map,
     sequence: &Sequence,
     increments: &[Option<Pose2>],
-    files: &RunFiles,
-) -> Result<Run> {
+    recorded: &dyn Fn() -> MutexGuard<'a, Run>,
+) -> Result<()> {
     let start = start(config, sequence);
     let mut localizer = Localizer::new(map, config.localizer(), start, config.seed)?;
     let refiner = || TrajectoryRefiner::new(map, config.refiner(), config.seed);
     let mut refiner = config.refine.then(refiner).transpose()?;
-    let mut run = Run::new(config, map, files);
     let task = context.progress.task("localize", sequence.frames.len());
     for (row, frame) in sequence.frames.iter().enumerate() {
         if context.interrupt.requested() {
@@ -93,16 +110,15 @@ fn localize(
                 None => None,
             };
             let runtimes = [runtime, started.elapsed() - runtime];
-            run.record(frame, increments[row], &estimate, refined, runtimes)
+            recorded().record(frame, increments[row], &estimate, refined, runtimes)
         };
         if let Err(error) = process() {
-            run.failure = Some(error);
+            recorded().failure = Some(error);
             break;
         }
         task.advance(1);
     }
-    drop(task);
-    run.completed()
+    Ok(())
 }
 
 /// Where the particles start.
@@ -134,7 +150,27 @@ fn odometry_into(
     }
 }
 
-/// Writes results, report, plots and page, and returns the report.
+/// Writes results and trajectories.
+fn write_results(
+    config: &LocalizationConfig,
+    files: &RunFiles,
+    sequence: &Sequence,
+    run: &Run,
+) -> Result<()> {
+    if !config.save_result || run.results.is_empty() {
+        return Ok(());
+    }
+    run_output::write_results(files, &run.results)?;
+    run_output::write_trajectory(files, "mcl", sequence, &run.map_from_lidar)?;
+    if config.refine {
+        run_output::write_trajectory(files, "refined", sequence, &run.refined)?;
+    } else {
+        run_output::remove_refined(files)?;
+    }
+    output::write_yaml(&files.file("effective_localization.yml"), config)
+}
+
+/// Writes report, plots and page, and returns the report.
 fn write_run(
     config: &LocalizationConfig,
     context: &Context,
@@ -144,16 +180,6 @@ fn write_run(
     run: &Run,
 ) -> Result<Report> {
     let results = &run.results;
-    if config.save_result {
-        run_output::write_results(files, results)?;
-        run_output::write_trajectory(files, "mcl", sequence, &run.map_from_lidar)?;
-        if config.refine {
-            run_output::write_trajectory(files, "refined", sequence, &run.refined)?;
-        } else {
-            run_output::remove_refined(files)?;
-        }
-        output::write_yaml(&files.file("effective_localization.yml"), config)?;
-    }
     warn_of_untracked_frames(results);
     let mut about = about(config, context, map);
     about.insert("states".to_owned(), states_in_words(results));
@@ -225,8 +251,24 @@ fn about(config: &LocalizationConfig, context: &Context, map: &Map) -> BTreeMap<
 }
 
 impl Run {
+    /// What is kept of the run after an interruption.
+    fn kept(&self, config: &LocalizationConfig, frames: usize) -> String {
+        let found = self.results.len();
+        if found == 0 {
+            "no frame was finished".to_owned()
+        } else if config.save_result {
+            let path = config.result_path.display();
+            format!("{found} of {frames} frames are localized and kept in {path}")
+        } else {
+            format!(
+                "{found} of {frames} frames were localized; nothing is kept: save_result is False"
+            )
+        }
+    }
+
     /// Finishes the animation; an error where not all frames were localized, which names what is kept.
     fn finish(self, config: &LocalizationConfig, frames: usize) -> Result<()> {
+        let kept = self.kept(config, frames);
         let animation = self.movie.map_or(Ok(()), |movie| movie.finish());
         let failure = self.failure.or(animation.err());
         let found = self.results.len();
@@ -236,14 +278,6 @@ impl Run {
             }
             return Ok(());
         }
-        let kept = if config.save_result {
-            let path = config.result_path.display();
-            format!("{found} of {frames} frames are localized and kept in {path}")
-        } else {
-            format!(
-                "{found} of {frames} frames were localized; nothing is kept: save_result is False"
-            )
-        };
         Err(match failure {
             Some(failure) => failure.context(kept),
             None => Interrupted { kept }.into(),

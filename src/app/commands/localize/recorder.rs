@@ -103,12 +103,13 @@ impl Run {
         Ok(())
     }
 
-    /// Returns the run after its last frame; an error where no frame was finished.
-    pub fn completed(self) -> Result<Self> {
+    /// Completes the run after its last frame; an error where no frame was finished.
+    pub fn complete(&mut self) -> Result<()> {
         let frames = self.results.len();
         if frames == 0 {
             let kept = "no frame was finished".to_owned();
-            return Err(self.failure.unwrap_or_else(|| Interrupted { kept }.into()));
+            let failure = self.failure.take();
+            return Err(failure.unwrap_or_else(|| Interrupted { kept }.into()));
         }
         if self.off_ground > 0 {
             tracing::warn!(
@@ -116,6 +117,6 @@ impl Run {
                 self.off_ground
             );
         }
-        Ok(self)
+        Ok(())
     }
 }
