@@ -14,7 +14,7 @@ use std::path::PathBuf;
 use std::process::{Child, ChildStderr, Command, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use common::Recording;
 use fpmcl::app::results::LocalizationResults;
@@ -134,6 +134,43 @@ fn signalled(
     drop(pipe);
     stderr += &read_until(&mut reader, None);
     (child.wait().unwrap().code(), stderr)
+}
+
+/// Interrupts a command that is busy and does not look up: it waits for the scan and never gets it;
+/// returns standard error.
+#[track_caller]
+fn overdue(signal: &str, recording: &Recording, arguments: &[&str], scan: &PipedScan) -> String {
+    let opened = scan.opened();
+    let mut child = start(recording, arguments);
+    let _pipe = wait(&opened, &mut child);
+    stopped_in_time(signal, child)
+}
+
+/// Sends a signal and requires the end within two seconds, and one for a machine under load.
+#[track_caller]
+fn stopped_in_time(signal: &str, mut child: Child) -> String {
+    let sent = Instant::now();
+    let id = child.id().to_string();
+    let kill = Command::new("kill").args([signal, &id]).status().unwrap();
+    assert!(kill.success());
+    while child.try_wait().unwrap().is_none() {
+        if sent.elapsed() > Duration::from_secs(3) {
+            child.kill().unwrap();
+            panic!("the program goes on after the signal");
+        }
+        thread::sleep(Duration::from_millis(10));
+    }
+    let mut reader = BufReader::new(child.stderr.take().unwrap());
+    let stderr = read_until(&mut reader, None);
+    assert_eq!(child.wait().unwrap().code(), Some(130), "{stderr}");
+    stderr
+}
+
+/// Names of the temporary files in a folder of the recording.
+fn temporary_files(recording: &Recording, folder: &str) -> Vec<String> {
+    let entries = fs::read_dir(recording.path(folder)).unwrap();
+    let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    names.filter(|name| name.ends_with(".part")).collect()
 }
 
 /// Kills a command while it waits for the scan.
@@ -305,4 +342,79 @@ fn an_interrupted_refinement_leaves_the_result_unchanged() {
     assert!(recording.bytes("results/localization.npz") == before);
     scan.restore();
     recording.fpmcl("refine").succeeds();
+}
+
+#[test]
+fn a_busy_build_ends_in_time_and_keeps_its_local_maps() {
+    let recording = Recording::street(12);
+    let scan = PipedScan::new(&recording, 7);
+    let stderr = overdue("-INT", &recording, BUILD_MAP, &scan);
+    let kept = "interrupted; 2 of 4 local maps are finished and kept in map.ply.parts";
+    assert!(stderr.contains(kept), "{stderr}");
+    assert_eq!(temporary_files(&recording, "."), [""; 0]);
+    assert_eq!(temporary_files(&recording, "map.ply.parts"), [""; 0]);
+    let stderr = resumed(&recording, BUILD_MAP, &scan);
+    assert!(
+        stderr.contains("local map 2 of 4 is finished already"),
+        "{stderr}"
+    );
+    assert!(recording.bytes("map.ply") == uninterrupted_map(&Recording::street(12)));
+}
+
+#[test]
+fn a_long_ransac_ends_in_time() {
+    let recording = Recording::street(12);
+    let slow = ["--set=ground_method=ransac", "--set=num_iterations=100000"];
+    let mut child = start(&recording, &[BUILD_MAP, &slow].concat());
+    // In the first scans.
+    thread::sleep(Duration::from_secs(1));
+    assert!(child.try_wait().unwrap().is_none());
+    stopped_in_time("-TERM", child);
+}
+
+#[test]
+fn a_busy_localization_ends_in_time_and_keeps_its_finished_frames() {
+    let recording = Recording::street(12);
+    recording.fpmcl("build-map").succeeds();
+    let scan = PipedScan::new(&recording, 7);
+    for signal in ["-INT", "-TERM"] {
+        let forced = [LOCALIZE, &["--force"]].concat();
+        let stderr = overdue(signal, &recording, &forced, &scan);
+        let kept = "interrupted; 7 of 12 frames are localized and kept in results/";
+        assert!(stderr.contains(kept), "{stderr}");
+        let results = LocalizationResults::read(&recording.path("results/localization.npz"));
+        assert_eq!(results.unwrap().frames.len(), 7);
+        assert_eq!(temporary_files(&recording, "results"), [""; 0]);
+    }
+}
+
+#[test]
+fn a_localization_that_is_busy_in_its_first_frame_ends_in_time() {
+    let recording = Recording::street(6);
+    recording.fpmcl("build-map").succeeds();
+    let scan = PipedScan::new(&recording, 0);
+    let stderr = overdue("-INT", &recording, LOCALIZE, &scan);
+    assert!(stderr.contains("no frame was finished"), "{stderr}");
+    assert!(!recording.path("results/localization.npz").exists());
+}
+
+#[test]
+fn a_busy_refinement_ends_in_time_and_leaves_the_result_unchanged() {
+    let recording = Recording::street(8);
+    recording.fpmcl("build-map").succeeds();
+    recording.fpmcl("localize").succeeds();
+    let before = recording.bytes("results/localization.npz");
+    let scan = PipedScan::new(&recording, 5);
+    let stderr = overdue("-INT", &recording, REFINE, &scan);
+    assert!(stderr.contains("is unchanged"), "{stderr}");
+    assert!(recording.bytes("results/localization.npz") == before);
+}
+
+#[test]
+fn a_busy_ground_segmentation_ends_in_time() {
+    let recording = Recording::street(3);
+    let scan = PipedScan::new(&recording, 1);
+    let arguments = ["ground", "velodyne", "--set=compare=False"];
+    let stderr = overdue("-INT", &recording, &arguments, &scan);
+    assert!(stderr.contains("1 of 3 scans are in"), "{stderr}");
 }
