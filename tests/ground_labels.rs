@@ -9,14 +9,15 @@ use fpmcl::evaluation::{GroundProtocol, GroundScore};
 use fpmcl::ground::{
     FuzzyConfig, FuzzyGround, GroundClassifier, PcaGround, RansacGround, ReportRule,
 };
-use fpmcl::recording::velodyne::{read_labels, read_scan};
+use fpmcl::recording::scan_files;
+use fpmcl::recording::velodyne::read_labels;
 
 /// Score of a classifier on the odd scans, which were not used to choose parameters.
 fn held_out_score(classifier: &dyn GroundClassifier) -> Option<GroundScore> {
     let folder = real_recording("semantickitti-00-labels")?;
     let mut score = GroundScore::default();
     for number in (1..21).step_by(2) {
-        let scan = read_scan(&folder.join(format!("velodyne/{number:06}.bin"))).unwrap();
+        let scan = scan_files::read(&folder.join(format!("velodyne/{number:06}.bin"))).unwrap();
         let classes = read_labels(&folder.join(format!("labels/{number:06}.label"))).unwrap();
         let confidences = classifier.ground_confidence(&scan.points);
         for ((point, class), confidence) in scan.points.iter().zip(classes).zip(confidences) {

@@ -15,6 +15,8 @@ pub enum RecordingError {
         bytes: u64,
         record_bytes: usize,
     },
+    #[error("{} {problem}", path.display())]
+    BadScan { path: PathBuf, problem: String },
     #[error("{}, line {line}: `{word}` is not a finite number", path.display())]
     NotANumber {
         path: PathBuf,
@@ -35,7 +37,7 @@ pub enum RecordingError {
     NoTr { path: PathBuf },
     #[error("{} contains no poses", path.display())]
     NoPoses { path: PathBuf },
-    #[error("{} contains no scans (*.bin); set scan_folder to the velodyne folder of the recording", path.display())]
+    #[error("{} contains no scans (.bin, .pcd, .ply or .npy); set scan_folder to the folder of the scans", path.display())]
     NoScans { path: PathBuf },
     #[error("{} has no pose: {} has {poses} rows; check that both belong to one recording, or select fewer frames with n_scans", scan.display(), pose_file.display())]
     ScanWithoutPose {

@@ -10,6 +10,7 @@
 pub mod calibration;
 mod error;
 pub mod poses;
+pub mod scan_files;
 pub mod sequence;
 mod table;
 pub mod velodyne;

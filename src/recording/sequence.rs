@@ -10,7 +10,8 @@ use smart_default::SmartDefault;
 use super::calibration::Calibration;
 use super::error::RecordingError;
 use super::poses::{CameraPoses, read_times};
-use super::velodyne;
+use super::scan_files;
+use super::velodyne::read_bytes;
 use crate::geometry::{Pose3, StampedPose};
 use crate::lidar::{RotationDirection, Scan, SweepMotion, interpolate_motion};
 use crate::validation::{InvalidValue, Validate, require};
@@ -69,12 +70,12 @@ pub struct Frame {
 impl Frame {
     /// Reads the scan and deskews it by the motion, if that is known.
     pub fn read(&self) -> Result<Scan, RecordingError> {
-        self.parse(&velodyne::read_bytes(&self.scan_path)?)
+        self.parse(&read_bytes(&self.scan_path)?)
     }
 
     /// Reads the scan from the content of its file, as [`read`](Self::read) does.
     pub fn parse(&self, bytes: &[u8]) -> Result<Scan, RecordingError> {
-        let mut scan = velodyne::parse_scan(&self.scan_path, bytes)?;
+        let mut scan = scan_files::parse(&self.scan_path, bytes)?;
         if let Some(sweep) = &self.sweep {
             sweep.deskew(&mut scan.points);
         }
@@ -107,7 +108,7 @@ pub struct Sequence {
 impl Sequence {
     /// Opens a recording without reading its scans.
     ///
-    /// Scans are the `.bin` files below `scan_folder`, without hidden ones. If their names are
+    /// Scans are the files below `scan_folder` that [`scan_files`] reads, without hidden ones. If their names are
     /// numbers, the number is the row of the pose file, from 0, so that a part of a recording keeps
     /// its poses; if none is a number, the position in the order of their paths is. A mixture, and
     /// a number that two scans have, are errors. Times are read from `times.txt` beside the pose
@@ -244,7 +245,7 @@ pub fn selected_scans(
     Ok(selected)
 }
 
-/// All `.bin` files below a folder, sorted by path, without hidden files and folders. A folder that
+/// All scans below a folder, sorted by path, without hidden files and folders. A folder that
 /// is linked more than once is read once.
 pub fn scan_paths(folder: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     let mut paths = Vec::new();
@@ -263,7 +264,7 @@ pub fn scan_paths(folder: &Path) -> Result<Vec<PathBuf>, RecordingError> {
             }
             if path.is_dir() {
                 folders.push(path);
-            } else if path.extension().is_some_and(|extension| extension == "bin") {
+            } else if scan_files::is_scan(&path) {
                 paths.push(path);
             }
         }
@@ -280,7 +281,11 @@ pub fn scan_paths(folder: &Path) -> Result<Vec<PathBuf>, RecordingError> {
 /// Scans with their numbers, ascending: those in their names, or, if no name is a number, their
 /// positions.
 fn numbered(scans: Vec<PathBuf>) -> Result<Vec<(usize, PathBuf)>, RecordingError> {
-    let number_of = |path: &PathBuf| path.file_stem()?.to_str()?.parse::<usize>().ok();
+    // The name of nuScenes' scans is `000000.pcd.bin`.
+    let number_of = |path: &PathBuf| {
+        let name = path.file_name()?.to_str()?;
+        name.split('.').next()?.parse::<usize>().ok()
+    };
     let Some(first) = scans.iter().find(|path| number_of(path).is_some()).cloned() else {
         return Ok(scans.into_iter().enumerate().collect());
     };

@@ -1,34 +1,11 @@
-//! Velodyne scans (`.bin`: float32 x, y, z, intensity) and SemanticKITTI labels (`.label`: u32).
+//! Writing of scans (`.bin`: float32 x, y, z, intensity), and SemanticKITTI labels (`.label`: u32).
 
 use std::fs;
 use std::io::{self, Write};
 use std::path::Path;
 
-use glam::Vec3;
-
 use super::error::RecordingError;
 use crate::lidar::Scan;
-
-/// Reads a scan with all its points, including invalid ones.
-pub fn read_scan(path: &Path) -> Result<Scan, RecordingError> {
-    parse_scan(path, &read_bytes(path)?)
-}
-
-/// Reads the content of a scan's file; `path` is for errors.
-pub fn parse_scan(path: &Path, bytes: &[u8]) -> Result<Scan, RecordingError> {
-    let (points, intensities) = records::<16>(path, bytes)?
-        .iter()
-        .map(|record| {
-            let (words, _) = record.as_chunks::<4>();
-            let [x, y, z, intensity] = [0, 1, 2, 3].map(|word| f32::from_le_bytes(words[word]));
-            (Vec3::new(x, y, z), intensity)
-        })
-        .unzip();
-    Ok(Scan {
-        points,
-        intensities,
-    })
-}
 
 /// Writes a scan.
 pub fn write_scan(mut writer: impl Write, scan: &Scan) -> io::Result<()> {
@@ -82,7 +59,10 @@ fn records<'a, const SIZE: usize>(
 
 #[cfg(test)]
 mod tests {
+    use glam::Vec3;
+
     use super::*;
+    use crate::recording::scan_files;
 
     #[test]
     fn a_written_scan_reads_back_exactly() {
@@ -93,17 +73,7 @@ mod tests {
             intensities: vec![0.3, 0.9],
         };
         write_scan(fs::File::create(&path).unwrap(), &scan).unwrap();
-        assert_eq!(read_scan(&path).unwrap(), scan);
-    }
-
-    #[test]
-    fn a_truncated_scan_is_an_error_with_its_size() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("000000.bin");
-        fs::write(&path, [0; 33]).unwrap();
-        let message = read_scan(&path).unwrap_err().to_string();
-        assert!(message.contains("33 bytes"), "{message}");
-        assert!(message.contains("truncated"), "{message}");
+        assert_eq!(scan_files::read(&path).unwrap(), scan);
     }
 
     #[test]

@@ -8,7 +8,7 @@ use crate::app::cli::GroundArgs;
 use crate::app::config::{self, GroundCommandConfig};
 use crate::evaluation::LabelledPoints;
 use crate::recording::sequence::selected_scans;
-use crate::recording::velodyne;
+use crate::recording::{scan_files, velodyne};
 
 /// A scan on disk.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -53,8 +53,8 @@ pub fn load(args: &GroundArgs) -> Result<(GroundCommandConfig, PathBuf)> {
         return Ok((config, folder));
     }
     ensure!(
-        has_extension(path, "bin") || !path.exists(),
-        "{} is neither a folder nor a scan (.bin) nor a configuration (.yml)",
+        scan_files::is_scan(path) || !path.exists(),
+        "{} is neither a folder nor a scan (.bin, .pcd, .ply, .npy) nor a configuration (.yml)",
         path.display()
     );
     Ok((config, path.to_owned()))
@@ -81,7 +81,7 @@ pub fn scans(path: &Path, config: &GroundCommandConfig) -> Result<Vec<ScanFiles>
 
 /// Whether a path names one scan, not a folder of scans.
 pub fn is_scan(path: &Path) -> bool {
-    has_extension(path, "bin") && !path.is_dir()
+    scan_files::is_scan(path) && !path.is_dir()
 }
 
 fn has_extension(path: &Path, extension: &str) -> bool {
@@ -101,7 +101,7 @@ fn label_path(scan_path: &Path, name: &Path, label_folder: Option<&Path>) -> Opt
 impl ScanFiles {
     /// Reads points and classes.
     pub fn read(&self) -> Result<LabelledPoints> {
-        let points = velodyne::read_scan(&self.scan_path)?.points;
+        let points = scan_files::read(&self.scan_path)?.points;
         let label_path = self.label_path.as_deref();
         let classes = label_path.map(velodyne::read_labels).transpose()?;
         if let (Some(path), Some(classes)) = (label_path, &classes) {
