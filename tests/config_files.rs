@@ -151,7 +151,7 @@ fn the_build_map_file_of_range_mcl_loads_unchanged() {
     let expected = BuildMapConfig {
         scan_folder: "../data/07/velodyne".into(),
         pose_file: "../data/07/poses.txt".into(),
-        calib_file: "../data/07/calib.txt".into(),
+        calib_file: Some("../data/07/calib.txt".into()),
         mesh_file: "../data/mesh_kitti_07.ply".into(),
         ..BuildMapConfig::default()
     };
@@ -167,7 +167,7 @@ fn the_localization_file_of_range_mcl_loads_unchanged() {
         map_pose_file: Some("../data/07/poses.txt".into()),
         map_calib_file: Some("../data/07/calib.txt".into()),
         pose_file: "../data/07/poses.txt".into(),
-        calib_file: "../data/07/calib.txt".into(),
+        calib_file: Some("../data/07/calib.txt".into()),
         result_path: "../results/demo_loc_results.npz".into(),
         pose_tracking: false,
         range_image: RenderedRangeImage {
@@ -186,7 +186,7 @@ fn the_evaluation_file_of_range_mcl_loads_unchanged() {
     let expected = EvaluationConfig {
         result_file: "../results/demo_loc_results.npz".into(),
         pose_file: Some("../data/07/poses.txt".into()),
-        calib_file: "../data/07/calib.txt".into(),
+        calib_file: Some("../data/07/calib.txt".into()),
         ..EvaluationConfig::default()
     };
     assert_eq!(config, expected);

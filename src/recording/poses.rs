@@ -50,6 +50,57 @@ impl CameraPoses {
     }
 }
 
+/// The poses of a drive with what is needed to use them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DrivePoses {
+    /// Poses of the camera; of the lidar if the calibration is the identity.
+    pub camera: CameraPoses,
+    /// Calibration of the recording.
+    pub calibration: Calibration,
+    /// Times of the poses [s], if the file has them.
+    pub times_s: Option<Vec<f64>>,
+}
+
+impl DrivePoses {
+    /// Reads rows of KITTI (12 numbers) or TUM (8 numbers).
+    ///
+    /// Rows of KITTI are poses of the camera if there is a calibration, else of the lidar; rows of TUM
+    /// are poses of the lidar.
+    pub fn read(pose_file: &Path, calib_file: Option<&Path>) -> Result<Self, RecordingError> {
+        let lidar = Calibration {
+            cam0_from_lidar: Pose3::identity(),
+        };
+        match CameraPoses::read(pose_file) {
+            Ok(camera) => Ok(Self {
+                camera,
+                calibration: calib_file.map_or(Ok(lidar), Calibration::read)?,
+                times_s: None,
+            }),
+            Err(RecordingError::WrongCount { found: 8, .. }) => {
+                let rows = read_tum(pose_file)?;
+                Ok(Self {
+                    camera: CameraPoses {
+                        world_from_cam0: rows.iter().map(|row| row.map_from_lidar).collect(),
+                    },
+                    calibration: lidar,
+                    times_s: Some(rows.iter().map(|row| row.time_s).collect()),
+                })
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    /// The lidar poses in the frame of the first one.
+    pub fn map_from_lidar(&self) -> Vec<Pose3> {
+        self.camera.map_from_lidar(&self.calibration)
+    }
+
+    /// Frame of [`map_from_lidar`](Self::map_from_lidar) in the world of the poses in the file.
+    pub fn world_from_map(&self) -> Pose3 {
+        self.camera.frame(&self.calibration).world_from_map()
+    }
+}
+
 /// The frame of a recording: that of its first lidar pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapFrame {

@@ -9,7 +9,7 @@ use smart_default::SmartDefault;
 
 use super::calibration::Calibration;
 use super::error::RecordingError;
-use super::poses::{CameraPoses, read_times};
+use super::poses::{DrivePoses, read_times};
 use super::scan_files;
 use super::velodyne::read_bytes;
 use crate::geometry::{Pose3, StampedPose};
@@ -116,13 +116,12 @@ impl Sequence {
     pub fn open(
         scan_folder: &Path,
         pose_file: &Path,
-        calib_file: &Path,
+        calib_file: Option<&Path>,
         selection: &Selection,
     ) -> Result<Self, RecordingError> {
-        let calibration = Calibration::read(calib_file)?;
-        let camera_poses = CameraPoses::read(pose_file)?;
-        let map_from_lidar = camera_poses.map_from_lidar(&calibration);
-        let times_s = frame_times(pose_file, map_from_lidar.len())?;
+        let poses = DrivePoses::read(pose_file, calib_file)?;
+        let map_from_lidar = poses.map_from_lidar();
+        let times_s = frame_times(pose_file, poses.times_s.as_deref(), map_from_lidar.len())?;
         let mut frames = Vec::new();
         for (number, scan_path) in selected_scans(scan_folder, selection)? {
             let Some(&pose) = map_from_lidar.get(number) else {
@@ -143,8 +142,8 @@ impl Sequence {
         Ok(Self {
             frames,
             map_from_lidar,
-            calibration,
-            world_from_map: camera_poses.frame(&calibration).world_from_map(),
+            calibration: poses.calibration,
+            world_from_map: poses.world_from_map(),
         })
     }
 
@@ -152,7 +151,7 @@ impl Sequence {
     pub fn open_folder(folder: &Path) -> Result<Self, RecordingError> {
         let [scans, poses, calibration] =
             ["velodyne", "poses.txt", "calib.txt"].map(|name| folder.join(name));
-        Self::open(&scans, &poses, &calibration, &Selection::default())
+        Self::open(&scans, &poses, Some(&calibration), &Selection::default())
     }
 
     /// Reads the scans, one after the other, with their poses `map_from_lidar`.
@@ -311,12 +310,18 @@ fn numbered(scans: Vec<PathBuf>) -> Result<Vec<(usize, PathBuf)>, RecordingError
     Ok(numbered)
 }
 
-fn frame_times(pose_file: &Path, poses: usize) -> Result<Vec<f64>, RecordingError> {
-    let path = pose_file.with_file_name("times.txt");
-    if !path.exists() {
-        return Ok((0..poses).map(|i| i as f64 / SCANS_PER_SECOND).collect());
-    }
-    let times_s = read_times(&path)?;
+/// Times of the poses: those of `times.txt` beside the pose file, else those in the pose file.
+fn frame_times(
+    pose_file: &Path,
+    own_s: Option<&[f64]>,
+    poses: usize,
+) -> Result<Vec<f64>, RecordingError> {
+    let beside = pose_file.with_file_name("times.txt");
+    let (path, times_s) = match own_s {
+        _ if beside.exists() => (beside.clone(), read_times(&beside)?),
+        Some(own_s) => (pose_file.to_owned(), own_s.to_vec()),
+        None => return Ok((0..poses).map(|i| i as f64 / SCANS_PER_SECOND).collect()),
+    };
     if times_s.len() != poses {
         return Err(RecordingError::WrongTimes {
             path,
@@ -356,7 +361,7 @@ mod tests {
         Sequence::open(
             &folder.join("velodyne"),
             &folder.join("poses.txt"),
-            &folder.join("calib.txt"),
+            Some(&folder.join("calib.txt")),
             selection,
         )
     }

@@ -60,7 +60,7 @@ fn build_map_config(output: &Path, drive: &Path, seed: u64) -> BuildMapConfig {
     BuildMapConfig {
         scan_folder: drive.join("velodyne"),
         pose_file: drive.join("poses.txt"),
-        calib_file: drive.join("calib.txt"),
+        calib_file: Some(drive.join("calib.txt")),
         mesh_file: output.join("map.ply"),
         visualize: false,
         holdout_step: 10,
@@ -79,10 +79,10 @@ fn localization_config(
     LocalizationConfig {
         scan_folder: drive.join("velodyne"),
         pose_file: drive.join("poses.txt"),
-        calib_file: drive.join("calib.txt"),
+        calib_file: Some(drive.join("calib.txt")),
         map_file: map.mesh_file.clone(),
         map_pose_file: Some(map.pose_file.clone()),
-        map_calib_file: Some(map.calib_file.clone()),
+        map_calib_file: map.calib_file.clone(),
         result_path: output.join("localization.npz"),
         num_particles: 1000,
         odometry: OdometrySource::File,

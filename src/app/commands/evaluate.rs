@@ -13,8 +13,7 @@ use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
 use crate::geometry::{Pose2, TriangleMesh, pose2_from_pose3};
 use crate::map::{MappingPath, ply};
-use crate::recording::Calibration;
-use crate::recording::poses::CameraPoses;
+use crate::recording::poses::DrivePoses;
 
 /// Compares a result of `localize`, `refine` or range-mcl with the ground truth.
 pub fn run(config: &EvaluationConfig) -> Result<Report> {
@@ -105,13 +104,11 @@ fn truth(
     files: &RunFiles,
 ) -> Result<Vec<Pose2>> {
     input::require_file("pose_file", pose_file)?;
-    input::require_file("calib_file", &config.calib_file)?;
-    let calibration = Calibration::read(&config.calib_file)?;
-    let camera_poses = CameraPoses::read(pose_file)?;
-    let mut poses = camera_poses.map_from_lidar(&calibration);
+    input::require_optional_file("calib_file", config.calib_file.as_deref())?;
+    let drive = DrivePoses::read(pose_file, config.calib_file.as_deref())?;
+    let mut poses = drive.map_from_lidar();
     if let Some((_, Some(path))) = map_of(files)? {
-        let world_from_first = camera_poses.frame(&calibration).world_from_map();
-        let map_from_first = path.world_from_map.inverse() * world_from_first;
+        let map_from_first = path.world_from_map.inverse() * drive.world_from_map();
         poses
             .iter_mut()
             .for_each(|pose| *pose = map_from_first * *pose);

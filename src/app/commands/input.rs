@@ -19,6 +19,11 @@ pub fn require_file(key: &str, path: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Requires a file at `path`, if there is one; `key` is the configuration key.
+pub fn require_optional_file(key: &str, path: Option<&Path>) -> Result<()> {
+    path.map_or(Ok(()), |path| require_file(key, path))
+}
+
 /// Requires a folder at `path`, the value of the configuration key `key`.
 pub fn require_folder(key: &str, path: &Path) -> Result<()> {
     ensure!(

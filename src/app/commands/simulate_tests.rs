@@ -215,7 +215,7 @@ fn drives_are_read_back_in_the_documented_frames() {
         let sequence = Sequence::open(
             &drive.join("velodyne"),
             &drive.join("poses.txt"),
-            &drive.join("calib.txt"),
+            Some(&drive.join("calib.txt")),
             &Selection::default(),
         )
         .unwrap();

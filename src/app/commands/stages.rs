@@ -6,8 +6,8 @@ use anyhow::{Context as _, Result};
 
 use super::{Context, input};
 use crate::map::{Map, MapError, MapOptions, MappingPath, ply};
-use crate::recording::poses::CameraPoses;
-use crate::recording::{Calibration, Selection, Sequence};
+use crate::recording::poses::DrivePoses;
+use crate::recording::{Selection, Sequence};
 
 /// Paths of the inputs.
 pub struct Inputs<'a> {
@@ -18,7 +18,7 @@ pub struct Inputs<'a> {
     pub map_calib_file: Option<&'a Path>,
     pub scan_folder: &'a Path,
     pub pose_file: &'a Path,
-    pub calib_file: &'a Path,
+    pub calib_file: Option<&'a Path>,
 }
 
 impl Inputs<'_> {
@@ -27,7 +27,7 @@ impl Inputs<'_> {
         input::require_file("map_file", self.map_file)?;
         input::require_folder("scan_folder", self.scan_folder)?;
         input::require_file("pose_file", self.pose_file)?;
-        input::require_file("calib_file", self.calib_file)
+        input::require_optional_file("calib_file", self.calib_file)
     }
 
     /// Reads the map and prepares it for rendering at most `max_poses` poses at once.
@@ -56,16 +56,16 @@ impl Inputs<'_> {
 
     /// The path of the mapping drive from the files of the configuration.
     fn given_path(&self) -> Result<MappingPath> {
-        let (Some(poses), Some(calib)) = (self.map_pose_file, self.map_calib_file) else {
+        let Some(poses) = self.map_pose_file else {
             let path = self.map_file.to_owned();
             return Err(MapError::NoPath { path }.into());
         };
         input::require_file("map_pose_file", poses)?;
-        input::require_file("map_calib_file", calib)?;
-        let (calibration, poses) = (Calibration::read(calib)?, CameraPoses::read(poses)?);
+        input::require_optional_file("map_calib_file", self.map_calib_file)?;
+        let drive = DrivePoses::read(poses, self.map_calib_file)?;
         Ok(MappingPath {
-            world_from_map: poses.frame(&calibration).world_from_map(),
-            map_from_lidar: poses.map_from_lidar(&calibration),
+            world_from_map: drive.world_from_map(),
+            map_from_lidar: drive.map_from_lidar(),
         })
     }
 

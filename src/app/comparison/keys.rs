@@ -149,22 +149,27 @@ struct Stage<'a> {
 fn stages(run: &PlannedRun) -> Result<[Stage<'_>; 3]> {
     let (map, query, refinement) = (&run.build_map, &run.localization, &run.refinement);
     let file = |path| Input::new(run, path, None);
-    let map = Stage {
+    let mut mapping = Stage {
         settings: settings(map)?,
         inputs: vec![
             Input::new(run, &map.scan_folder, Some(map.selection())),
             file(&map.pose_file),
-            file(&map.calib_file),
         ],
     };
+    mapping
+        .inputs
+        .extend(map.calib_file.iter().map(|path| file(path)));
     let mut localization = Stage {
         settings: settings(query)?,
         inputs: vec![
             Input::new(run, &query.scan_folder, Some(query.selection())),
             file(&query.pose_file),
-            file(&query.calib_file),
         ],
     };
+    let calibration = query.calib_file.iter();
+    localization
+        .inputs
+        .extend(calibration.map(|path| file(path)));
     let odometry = query.odometry_file.iter();
     localization.inputs.extend(odometry.map(|path| file(path)));
     let odometry = refinement.iter().flat_map(|r| &r.odometry_file);
@@ -172,7 +177,7 @@ fn stages(run: &PlannedRun) -> Result<[Stage<'_>; 3]> {
         settings: settings(refinement)?,
         inputs: odometry.map(|path| file(path)).collect(),
     };
-    Ok([map, localization, refinement])
+    Ok([mapping, localization, refinement])
 }
 
 /// A file or folder that a stage reads.
@@ -260,13 +265,13 @@ mod tests {
             build_map: BuildMapConfig {
                 scan_folder: first.join("velodyne"),
                 pose_file: first.join("poses.txt"),
-                calib_file: first.join("calib.txt"),
+                calib_file: Some(first.join("calib.txt")),
                 ..BuildMapConfig::default()
             },
             localization: LocalizationConfig {
                 scan_folder: second.join("velodyne"),
                 pose_file: second.join("poses.txt"),
-                calib_file: second.join("calib.txt"),
+                calib_file: Some(second.join("calib.txt")),
                 odometry_file: Some(second.join("odometry.txt")),
                 ..LocalizationConfig::default()
             },
@@ -323,10 +328,10 @@ mod tests {
         run.drives.clear();
         run.build_map.scan_folder = path("velodyne");
         run.build_map.pose_file = path("poses.txt");
-        run.build_map.calib_file = path("calib.txt");
+        run.build_map.calib_file = Some(path("calib.txt"));
         run.localization.scan_folder = path("velodyne");
         run.localization.pose_file = path("poses.txt");
-        run.localization.calib_file = path("calib.txt");
+        run.localization.calib_file = Some(path("calib.txt"));
         run.localization.odometry_file = None;
         let before = KeyCache::default().keys(&run).unwrap();
         assert_eq!(KeyCache::default().keys(&run).unwrap(), before);

@@ -102,10 +102,10 @@ fn planned_run(
         let [first, second] = [first, second].map(SimulationConfig::drive_folder);
         build_map.scan_folder = first.join("velodyne");
         build_map.pose_file = first.join("poses.txt");
-        build_map.calib_file = first.join("calib.txt");
+        build_map.calib_file = Some(first.join("calib.txt"));
         localization.scan_folder = second.join("velodyne");
         localization.pose_file = second.join("poses.txt");
-        localization.calib_file = second.join("calib.txt");
+        localization.calib_file = Some(second.join("calib.txt"));
         localization.odometry = OdometrySource::File;
         localization.odometry_file = Some(second.join("odometry.txt"));
     }
@@ -126,7 +126,7 @@ fn planned_run(
     )?;
     let localization = LocalizationConfig {
         map_pose_file: Some(build_map.pose_file.clone()),
-        map_calib_file: Some(build_map.calib_file.clone()),
+        map_calib_file: build_map.calib_file.clone(),
         ..localization
     };
     let refinement = || {

@@ -6,7 +6,7 @@ use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::check::{ground, path};
+use super::check::{ground, optional_path, path};
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::lidar::{LidarModel, NormalConfig, RotationDirection};
 use crate::map::confidence::ConfidenceConfig;
@@ -29,8 +29,9 @@ pub struct BuildMapConfig {
     #[default("data/kitti/poses.txt".into())]
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`.
-    #[default("data/kitti/calib.txt".into())]
-    pub calib_file: PathBuf,
+    /// `None`: the poses are those of the lidar.
+    #[default(Some("data/kitti/calib.txt".into()))]
+    pub calib_file: Option<PathBuf>,
     /// Output path of the map.
     #[default("results/map.ply".into())]
     pub mesh_file: PathBuf,
@@ -199,7 +200,7 @@ impl Validate for BuildMapConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         path("scan_folder", &self.scan_folder)?;
         path("pose_file", &self.pose_file)?;
-        path("calib_file", &self.calib_file)?;
+        optional_path("calib_file", self.calib_file.as_deref())?;
         path("mesh_file", &self.mesh_file)?;
         self.selection().validate()?;
         in_range("depth", self.depth, PoissonConfig::DEPTHS)?;

@@ -20,8 +20,9 @@ pub struct EvaluationConfig {
     /// Camera poses of the recording, the ground truth; `None`: that in the result.
     pub pose_file: Option<PathBuf>,
     /// Calibration of the recording, with its line `Tr`, for `pose_file`.
-    #[default("data/kitti/calib.txt".into())]
-    pub calib_file: PathBuf,
+    /// `None`: the poses are those of the lidar.
+    #[default(Some("data/kitti/calib.txt".into()))]
+    pub calib_file: Option<PathBuf>,
     /// Whether to draw the trajectory.
     #[default(true)]
     pub plot_loc_traj: bool,
@@ -55,7 +56,7 @@ impl Validate for EvaluationConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         path("result_file", &self.result_file)?;
         optional_path("pose_file", self.pose_file.as_deref())?;
-        path("calib_file", &self.calib_file)?;
+        optional_path("calib_file", self.calib_file.as_deref())?;
         self.selection().validate()?;
         positive("grid_resolution", self.grid_resolution)?;
         positive("converge_thres", self.converge_thres)?;

@@ -45,8 +45,9 @@ pub struct LocalizationConfig {
     #[default("data/kitti/poses.txt".into())]
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`.
-    #[default("data/kitti/calib.txt".into())]
-    pub calib_file: PathBuf,
+    /// `None`: the poses are those of the lidar.
+    #[default(Some("data/kitti/calib.txt".into()))]
+    pub calib_file: Option<PathBuf>,
     /// Output path of the result; all other output is written beside it.
     #[default("results/localization.npz".into())]
     pub result_path: PathBuf,
@@ -343,7 +344,7 @@ impl Validate for LocalizationConfig {
         optional_path("map_pose_file", self.map_pose_file.as_deref())?;
         optional_path("map_calib_file", self.map_calib_file.as_deref())?;
         path("pose_file", &self.pose_file)?;
-        path("calib_file", &self.calib_file)?;
+        optional_path("calib_file", self.calib_file.as_deref())?;
         path("result_path", &self.result_path)?;
         self.selection().validate()?;
         self.odometry.validate(self.odometry_file.as_deref())?;

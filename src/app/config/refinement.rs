@@ -29,7 +29,8 @@ pub struct RefinementConfig {
     /// Camera poses of the recording.
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`.
-    pub calib_file: PathBuf,
+    /// `None`: the poses are those of the lidar.
+    pub calib_file: Option<PathBuf>,
     /// Result of `localize`, to which the refined poses are added.
     pub result_file: PathBuf,
     /// Whether to draw the final plots.
@@ -153,7 +154,7 @@ impl Validate for RefinementConfig {
         optional_path("map_pose_file", self.map_pose_file.as_deref())?;
         optional_path("map_calib_file", self.map_calib_file.as_deref())?;
         path("pose_file", &self.pose_file)?;
-        path("calib_file", &self.calib_file)?;
+        optional_path("calib_file", self.calib_file.as_deref())?;
         path("result_file", &self.result_file)?;
         self.selection().validate()?;
         self.odometry.validate(self.odometry_file.as_deref())?;

@@ -69,7 +69,7 @@ pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
 fn open(config: &BuildMapConfig) -> Result<Sequence> {
     input::require_folder("scan_folder", &config.scan_folder)?;
     input::require_file("pose_file", &config.pose_file)?;
-    input::require_file("calib_file", &config.calib_file)?;
+    input::require_optional_file("calib_file", config.calib_file.as_deref())?;
     if let Some(path) = &config.truth_mesh {
         input::require_file("truth_mesh", path)?;
     }
@@ -77,7 +77,7 @@ fn open(config: &BuildMapConfig) -> Result<Sequence> {
     let sequence = Sequence::open(
         &config.scan_folder,
         &config.pose_file,
-        &config.calib_file,
+        config.calib_file.as_deref(),
         &config.selection(),
     )?;
     let poses = (sequence.frames.iter()).map(|frame| (frame.number, &frame.map_from_lidar));

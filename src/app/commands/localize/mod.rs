@@ -77,7 +77,7 @@ fn inputs(config: &LocalizationConfig) -> Inputs<'_> {
         map_calib_file: config.map_calib_file.as_deref(),
         scan_folder: &config.scan_folder,
         pose_file: &config.pose_file,
-        calib_file: &config.calib_file,
+        calib_file: config.calib_file.as_deref(),
     }
 }
 

@@ -1,0 +1,135 @@
+//! The same recording in other files gives the same trajectory.
+
+#![allow(clippy::unwrap_used, reason = "a failing test may panic")]
+
+mod common;
+
+use std::fs;
+
+use common::Recording;
+
+const FRAMES: usize = 6;
+
+/// Positions of a TUM trajectory.
+fn positions(recording: &Recording) -> Vec<[f64; 3]> {
+    let text = String::from_utf8(recording.bytes("results/mcl_tum.txt")).unwrap();
+    text.lines()
+        .map(|line| {
+            let numbers: Vec<f64> = line.split(' ').map(|word| word.parse().unwrap()).collect();
+            [numbers[1], numbers[2], numbers[3]]
+        })
+        .collect()
+}
+
+/// Builds the map, localizes in it, and compares with the expected positions [m].
+#[track_caller]
+fn gives(recording: &Recording, expected: &[[f64; 3]]) {
+    recording.fpmcl("build-map").with("--force").succeeds();
+    recording.fpmcl("localize").with("--force").succeeds();
+    let found = positions(recording);
+    assert_eq!(found.len(), expected.len());
+    for (found, expected) in found.iter().zip(expected) {
+        for axis in 0..3 {
+            assert!(
+                (found[axis] - expected[axis]).abs() < 1e-3,
+                "{found:?} {expected:?}"
+            );
+        }
+    }
+}
+
+/// Replaces the `.bin` files by files of another format.
+fn convert(recording: &Recording, extension: &str, bytes_of: impl Fn(&[[f32; 3]]) -> Vec<u8>) {
+    for frame in 0..FRAMES {
+        let points = recording.scan(frame);
+        let path = recording.path(&format!("velodyne/{frame:06}.bin"));
+        fs::remove_file(&path).unwrap();
+        fs::write(path.with_extension(extension), bytes_of(&points)).unwrap();
+    }
+}
+
+fn little_endian(numbers: impl IntoIterator<Item = f32>) -> Vec<u8> {
+    numbers.into_iter().flat_map(f32::to_le_bytes).collect()
+}
+
+#[test]
+fn scans_as_pcd_ply_npy_and_five_floats_give_the_same_trajectory() {
+    let recording = Recording::street(FRAMES);
+    recording.fpmcl("build-map").succeeds();
+    recording.fpmcl("localize").succeeds();
+    let expected = positions(&recording);
+
+    let pcd = Recording::street(FRAMES);
+    convert(&pcd, "pcd", |points| {
+        let header = format!(
+            "VERSION .7\nFIELDS z y x\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA binary\n",
+            points.len()
+        );
+        let data = little_endian(points.iter().flat_map(|&[x, y, z]| [z, y, x]));
+        [header.as_bytes(), &data].concat()
+    });
+    gives(&pcd, &expected);
+
+    let ply = Recording::street(FRAMES);
+    convert(&ply, "ply", |points| {
+        let header = format!(
+            "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\n\
+             property float y\nproperty float z\nproperty uchar intensity\nend_header\n",
+            points.len()
+        );
+        let row = |point: &[f32; 3]| [little_endian(*point), vec![7]].concat();
+        let data: Vec<u8> = points.iter().flat_map(row).collect();
+        [header.as_bytes(), &data].concat()
+    });
+    gives(&ply, &expected);
+
+    let npy = Recording::street(FRAMES);
+    convert(&npy, "npy", |points| {
+        let shape = format!("({}, 3)", points.len());
+        let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
+        let padding = 64 - (10 + header.len() + 1) % 64;
+        let header = format!("{header}{}\n", " ".repeat(padding));
+        let length = (header.len() as u16).to_le_bytes();
+        let data = little_endian(points.iter().flatten().copied());
+        [b"\x93NUMPY\x01\x00", &length[..], header.as_bytes(), &data].concat()
+    });
+    gives(&npy, &expected);
+
+    let five = Recording::street(FRAMES);
+    convert(&five, "bin", |points| {
+        little_endian(points.iter().flat_map(|&[x, y, z]| [x, y, z, 0.5, 12.0]))
+    });
+    gives(&five, &expected);
+}
+
+#[test]
+fn poses_of_the_lidar_need_no_calibration() {
+    let recording = Recording::street(FRAMES);
+    recording.fpmcl("build-map").succeeds();
+    recording.fpmcl("localize").succeeds();
+    let expected = positions(&recording);
+    fs::remove_file(recording.path("calib.txt")).unwrap();
+    let ahead_m = |frame: usize| 0.5 * frame as f64;
+    let tum: String = (0..FRAMES)
+        .map(|frame| format!("{} {} 0 0 0 0 0 1\n", 0.1 * frame as f64, ahead_m(frame)))
+        .collect();
+    let kitti: String = (0..FRAMES)
+        .map(|frame| format!("1 0 0 {} 0 1 0 0 0 0 1 0\n", ahead_m(frame)))
+        .collect();
+    for (name, poses) in [("TUM", tum), ("KITTI", kitti)] {
+        recording.write("poses.txt", &poses);
+        let call = |command: &str| {
+            let call = recording.fpmcl(command).with("--force");
+            call.set("calib_file", "null")
+        };
+        call("build-map").succeeds();
+        call("localize").set("map_calib_file", "null").succeeds();
+        let found = positions(&recording);
+        for (found, expected) in found.iter().zip(&expected) {
+            assert!(
+                (found[0] - expected[0]).abs() < 1e-3,
+                "{name}: {found:?} {expected:?}"
+            );
+        }
+    }
+}
