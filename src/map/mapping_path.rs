@@ -10,7 +10,7 @@
 
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
-use crate::geometry::Pose3;
+use crate::geometry::{FARTHEST_M, Pose3};
 
 const WORLD: &str = "fpmcl world_from_map";
 const POSE: &str = "fpmcl map_from_lidar";
@@ -27,7 +27,7 @@ pub struct MappingPath {
 
 /// A comment of a map that cannot be read.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("the comment `{0}` is not a pose of 7 finite numbers; build the map again")]
+#[error("the comment `{0}` is not a pose of 7 finite numbers on Earth; build the map again")]
 pub struct BadPathComment(String);
 
 impl MappingPath {
@@ -81,7 +81,8 @@ fn pose(numbers: &str, comment: &str) -> Result<Pose3, BadPathComment> {
         return Err(bad());
     };
     let quaternion = Quaternion::new(w, i, j, k);
-    if (quaternion.norm() - 1.0).abs() > 1e-6 {
+    let is_on_earth = [x, y, z].iter().all(|m| m.abs() <= FARTHEST_M);
+    if !is_on_earth || (quaternion.norm() - 1.0).abs() > 1e-6 {
         return Err(bad());
     }
     // Not normalized again, so that the same bits come back.
@@ -126,7 +127,13 @@ mod tests {
 
     #[test]
     fn a_damaged_comment_is_an_error_that_quotes_it() {
-        for numbers in ["1 2 3", "1 2 3 0 0 0 x", "1 2 3 0 0 0 nan", "1 2 3 0 0 0 2"] {
+        for numbers in [
+            "1 2 3",
+            "1 2 3 0 0 0 x",
+            "1 2 3 0 0 0 nan",
+            "1 2 3 0 0 0 2",
+            "1e9 2 3 0 0 0 1",
+        ] {
             let line = format!("{POSE} {numbers}");
             let error = MappingPath::from_comments([line.as_str()]).unwrap_err();
             assert!(error.to_string().contains(&line), "{error}");

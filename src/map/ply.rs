@@ -171,7 +171,8 @@ fn write_floats(out: &mut impl Write, values: &[f32]) -> io::Result<()> {
     (values.iter()).try_for_each(|value| out.write_all(&value.to_le_bytes()))
 }
 
-/// Reads a mesh. Normals and colours are empty where the file has none.
+/// Reads a mesh. Normals and colours are empty where the file has none, normals also where one of
+/// them is not finite.
 pub fn read(path: &Path) -> Result<TriangleMesh, PlyError> {
     Ok(read_map(path)?.0)
 }
@@ -210,7 +211,10 @@ fn read_mesh(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), PlyProb
     let properties = &header.elements["vertex"].properties;
     let has = |names: [&str; 3]| names.iter().all(|name| properties.contains_key(*name));
     if has(["nx", "ny", "nz"]) {
-        mesh.normals = vertices.iter().map(|vertex| vertex.normal).collect();
+        let normals = || vertices.iter().map(|vertex| vertex.normal);
+        if normals().all(Vec3::is_finite) {
+            mesh.normals = normals().collect();
+        }
     }
     if has(["red", "green", "blue"]) {
         mesh.colors = vertices.iter().map(|vertex| vertex.color).collect();

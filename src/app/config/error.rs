@@ -5,6 +5,9 @@ use std::path::PathBuf;
 use super::yaml::{is_within, keys};
 use crate::validation::InvalidValue;
 
+/// Longest key that is compared with the known ones [bytes].
+const LONGEST_KEY: usize = 200;
+
 /// Why a configuration cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[expect(missing_docs, reason = "the messages say it")]
@@ -43,7 +46,7 @@ pub enum ConfigError {
 pub(super) fn in_file(name: &str, text: &str, source: serde_yaml::Error) -> ConfigError {
     let Some(line) = source
         .location()
-        .map(|location| location.line() as usize - 1)
+        .map(|location| (location.line() as usize).saturating_sub(1))
     else {
         return describe(name.to_owned(), None, source);
     };
@@ -84,7 +87,7 @@ pub(super) fn invalid(
 ) -> ConfigError {
     let set = settings
         .iter()
-        .rfind(|(key, _)| is_within(&invalid.key, key));
+        .rfind(|(key, _)| is_within(&invalid.key, key) || is_within(key, &invalid.key));
     let place = match set {
         Some((key, value)) => setting(key, value),
         None => {
@@ -116,13 +119,14 @@ fn suggestion(nearest: Option<&str>) -> String {
 }
 
 /// The known key that is most similar, by itself or as the last part of a dotted key; `None` where
-/// none is similar.
+/// none is similar. Keys too long for any configuration are compared with none.
 fn nearest<'a>(key: &str, known: impl Iterator<Item = &'a str>) -> Option<String> {
     let distance = |candidate: &str| {
         let last = candidate.rsplit('.').next().unwrap_or(candidate);
         strsim::damerau_levenshtein(key, candidate).min(strsim::damerau_levenshtein(key, last))
     };
     let limit = (key.chars().count() / 3).max(2);
+    let known = known.filter(|_| key.len() <= LONGEST_KEY);
     known
         .map(|candidate| (distance(candidate), candidate))
         .min_by_key(|(distance, _)| *distance)

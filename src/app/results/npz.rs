@@ -19,6 +19,10 @@ const BUFFER_BYTES: usize = 1 << 16;
 /// Largest array that is written without the 64-bit extensions of the zip format [bytes].
 const ZIP32_LIMIT: usize = u32::MAX as usize - BUFFER_BYTES;
 
+/// Largest magnitude of a number of a result: beyond any position, covariance, time and frame, and
+/// exact as an integer.
+const LARGEST: f64 = 1e15;
+
 /// A `.npz` file that is open for reading.
 pub struct NpzReader<'a> {
     path: &'a Path,
@@ -112,10 +116,11 @@ impl Array<'_> {
         Ok(row)
     }
 
-    /// As [`next_row`](Self::next_row), of finite numbers; `row` is its index for the message.
+    /// As [`next_row`](Self::next_row), of finite numbers that a result can have; `row` is its index
+    /// for the message.
     pub fn next_finite_row<const N: usize>(&mut self, row: usize) -> Result<[f64; N]> {
         let numbers = self.next_row()?;
-        match numbers.iter().find(|number| !number.is_finite()) {
+        match numbers.iter().find(|number| !(number.abs() <= LARGEST)) {
             Some(value) => bail!(
                 "{}, array `{}`, row {row}: {value} is not a valid value",
                 self.path.display(),

@@ -4,7 +4,7 @@ use std::io::{self, Seek, Write};
 use std::iter::repeat_n;
 use std::path::Path;
 
-use anyhow::{Context as _, Result, bail, ensure};
+use anyhow::{Context as _, Result, anyhow, ensure};
 use nalgebra::{Matrix3, Vector2};
 
 use super::localization_results::{LocalizationResults, ParticleLog};
@@ -12,6 +12,9 @@ use super::npz::{Array, NpzReader, NpzWriter, write_npy};
 use crate::evaluation::ParticleRow;
 use crate::files::write_atomically;
 use crate::geometry::Pose2;
+
+/// Largest number of particles in empty rows, 4 GiB of zeros.
+const MOST_EMPTY_PARTICLES: usize = 1 << 28;
 
 impl LocalizationResults {
     /// Reads a file of fpmcl or of range-mcl.
@@ -43,14 +46,14 @@ impl LocalizationResults {
             times_s: file.rows("times_s", |[time_s]| time_s)?,
             runtimes_s: file.rows("runtimes_s", |[time_s]| time_s)?,
             refine_runtimes_s: file.rows("refine_runtimes_s", |[time_s]| time_s)?,
-            states: file.rows("states", |[state]| state as u8)?,
+            states: file.states()?,
         })
     }
 
     /// Writes the file, replacing an existing one only when the new one is complete.
     ///
-    /// Row k is frame k, as in range-mcl, if the frames are consecutive; otherwise there is one
-    /// row per localized frame.
+    /// Row k is frame k, as in range-mcl, if the frames are consecutive and the rows before the first
+    /// are not too many; otherwise there is one row per localized frame.
     pub fn write(&self, path: &Path) -> Result<()> {
         write_atomically(path, |file| self.write_to(file))
             .with_context(|| format!("cannot write {}", path.display()))
@@ -91,12 +94,20 @@ impl LocalizationResults {
         file.npz.finish()
     }
 
-    /// The number of empty rows before the first frame that make row k frame k.
+    /// The number of empty rows before the first frame that make row k frame k; none where these
+    /// would be a file of gigabytes.
     fn leading_rows(&self) -> usize {
         let first = self.frames.first().copied().unwrap_or(0);
-        let is_consecutive =
-            (self.frames.iter().enumerate()).all(|(row, &frame)| frame == first + row);
-        if is_consecutive { first } else { 0 }
+        let is_consecutive = (first..)
+            .zip(&self.frames)
+            .all(|(row, &frame)| frame == row);
+        let particles = first.saturating_mul(self.particles.capacity().max(1));
+        let is_possible = particles <= MOST_EMPTY_PARTICLES;
+        if is_consecutive && is_possible {
+            first
+        } else {
+            0
+        }
     }
 
     /// The particles of a frame, padded with zeros to the capacity.
@@ -173,7 +184,7 @@ fn read_particles(path: &Path, npz: &mut NpzReader) -> Result<(usize, usize, Par
         array.expect_shape(&[Some(0), None, None], "(frames, N, 4) with N > 0")?;
     }
     ensure!(
-        start_idx >= 0.0 && (start_idx as usize) < rows.max(1),
+        start_idx >= 0.0 && start_idx.fract() == 0.0 && (start_idx as usize) < rows.max(1),
         "{}: start_idx is {start_idx}, but there are {rows} rows",
         path.display()
     );
@@ -249,13 +260,28 @@ impl RowReader<'_> {
         let mut previous = -1.0;
         for (row, &frame) in (self.first..).zip(&frames) {
             if frame <= previous || frame.fract() != 0.0 {
-                bail!(
-                    "{}, array `frames`, row {row}: {frame} is not a valid value",
-                    self.path.display()
-                );
+                return Err(self.invalid("frames", row, frame));
             }
             previous = frame;
         }
         Ok(frames.iter().map(|&frame| frame as usize).collect())
+    }
+
+    /// Reads the states of the filter.
+    fn states(&mut self) -> Result<Option<Vec<u8>>> {
+        let Some(states) = self.rows("states", |[state]| state)? else {
+            return Ok(None);
+        };
+        let state_in = |(row, &state): (usize, &f64)| match state as u8 {
+            number if f64::from(number) == state => Ok(number),
+            _ => Err(self.invalid("states", row, state)),
+        };
+        let states = (self.first..).zip(&states).map(state_in);
+        states.collect::<Result<_>>().map(Some)
+    }
+
+    fn invalid(&self, name: &str, row: usize, value: f64) -> anyhow::Error {
+        let path = self.path.display();
+        anyhow!("{path}, array `{name}`, row {row}: {value} is not a valid value")
     }
 }

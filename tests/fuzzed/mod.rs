@@ -1,0 +1,9 @@
+//! The parts of the fuzzing of readers.
+
+pub mod allocation;
+pub mod configurations;
+pub mod files;
+pub mod harness;
+pub mod mutation;
+pub mod npz;
+pub mod ply;
