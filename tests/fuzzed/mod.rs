@@ -7,3 +7,4 @@ pub mod harness;
 pub mod mutation;
 pub mod npz;
 pub mod ply;
+pub mod point_clouds;

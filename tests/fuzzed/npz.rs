@@ -119,7 +119,7 @@ fn add(
 }
 
 /// The header of an array.
-fn npy(kind: &str, shape: &[u64]) -> Vec<u8> {
+pub fn npy(kind: &str, shape: &[u64]) -> Vec<u8> {
     let extents: String = shape.iter().map(|extent| format!("{extent}, ")).collect();
     let text = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({extents}), }}\n");
     let mut bytes = b"\x93NUMPY\x01\x00".to_vec();

@@ -60,6 +60,11 @@ pub fn binary(u: &mut Unstructured) -> Result<Vec<u8>> {
     file(u, order)
 }
 
+/// Any file.
+pub fn any(u: &mut Unstructured) -> Result<Vec<u8>> {
+    if u.arbitrary()? { ascii(u) } else { binary(u) }
+}
+
 fn file(u: &mut Unstructured, encoding: Encoding) -> Result<Vec<u8>> {
     let vertices = u.int_in_range(1..=12)?;
     let mut elements = vec![vertex(u, vertices)?, face(u)?];

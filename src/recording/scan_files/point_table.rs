@@ -90,7 +90,7 @@ pub fn scan_of(columns: &[Column], bytes: &[u8], count: usize) -> Result<Scan, S
     let intensity = named(&INTENSITY);
     for column in columns {
         let last = count.saturating_sub(1).saturating_mul(column.stride);
-        let end = last.saturating_add(column.offset + column.number_type.size());
+        let end = (last.saturating_add(column.offset)).saturating_add(column.number_type.size());
         if count > 0 && end > bytes.len() {
             return Err(format!(
                 "is truncated: {count} points need {end} bytes, but there are {}; copy it again",

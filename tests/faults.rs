@@ -1,0 +1,579 @@
+//! Faults while commands run: kill -9, Ctrl-C and SIGTERM at random moments, full disks, folders that
+//! cannot be written, and two processes on one output. After a fault the same command runs again, and
+//! its results must be those of an uninterrupted run, without files left over and without foreign
+//! files lost.
+//!
+//! `cargo test --release --test faults -- --ignored --nocapture` is the campaign. It stops each command
+//! 100 times, or as often as `FPMCL_FAULT_TRIES` says, and prints a table. The moments follow from a seed.
+
+#![cfg(unix)]
+#![allow(clippy::unwrap_used, reason = "a failing test may panic")]
+#![allow(clippy::print_stdout, reason = "the table of the campaign")]
+
+mod common;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::Write as _;
+use std::os::unix::process::ExitStatusExt as _;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+use common::Recording;
+use fpmcl::app::results::LocalizationResults;
+use rand::RngExt as _;
+
+/// A command, and the call that prepares its inputs.
+struct Stage {
+    name: &'static str,
+    arguments: &'static [&'static str],
+    /// Commands that run before it, without faults.
+    before: &'static [&'static str],
+}
+
+const STAGES: &[Stage] = &[
+    Stage {
+        name: "build-map",
+        arguments: &["build-map", "build_map.yml"],
+        before: &[],
+    },
+    Stage {
+        name: "localize",
+        arguments: &["localize", "localization.yml", "--backend=cpu"],
+        before: &["build-map"],
+    },
+    Stage {
+        name: "refine",
+        arguments: &["refine", "refinement.yml", "--backend=cpu"],
+        before: &["build-map", "localize"],
+    },
+    Stage {
+        name: "compare",
+        arguments: &["compare", "comparison.yml", "--backend=cpu"],
+        before: &[],
+    },
+    Stage {
+        name: "simulate",
+        arguments: &["simulate", "simulation.yml"],
+        before: &[],
+    },
+];
+
+const FRAMES: usize = 12;
+
+const COMPARISON: &str = "\
+output_folder: results
+seeds: [1]
+base:
+  build_map: {depth: 6, voxel_size: 0.2, displacement_threshold_m: 0, simplify_resolution: 0.5}
+  localization: {numParticles: 50, num_reduced: 20}
+  refinement: {refinement: {method: swarm, swarm: {iterations: 3}}}
+sequences:
+- name: street
+  build_map:
+    scan_folder: velodyne
+    pose_file: poses.txt
+    calib_file: calib.txt
+    range_image: {height: 32, width: 360, min_range: 1}
+  localization:
+    scan_folder: velodyne
+    pose_file: poses.txt
+    calib_file: calib.txt
+    range_image: {height: 32, width: 360, min_range: 1}
+configurations:
+- {name: Fuzzy-MCL}
+- {name: Fuzzy-PSO-MCL, refine: True}
+";
+
+const SIMULATION: &str = "\
+output_folder: results
+n_scans: 8
+path:
+- {length_m: 40, turn_deg: 30, grade_percent: 3}
+scanner: {azimuth_steps: 300}
+";
+
+/// Faults by signals.
+const SIGNALS: &[(&str, i32)] = &[("SIGKILL", 9), ("SIGINT", 2), ("SIGTERM", 15)];
+
+/// A command that runs longer than this hangs.
+const TIMEOUT: Duration = Duration::from_secs(120);
+
+/// The inputs of a stage, and what its uninterrupted run makes of them.
+struct Reference {
+    stage: &'static Stage,
+    inputs: Recording,
+    expected: Contents,
+    duration: Duration,
+}
+
+/// Files by their paths; the bytes of those that are the same in every run.
+type Contents = BTreeMap<PathBuf, Option<Vec<u8>>>;
+
+impl Reference {
+    fn new(stage: &'static Stage) -> Self {
+        let inputs = Recording::street(FRAMES);
+        inputs.write("comparison.yml", COMPARISON);
+        inputs.write("simulation.yml", SIMULATION);
+        for name in ["build_map.yml", "localization.yml", "refinement.yml"] {
+            // All outputs are in one folder.
+            let text = fs::read_to_string(inputs.path(name)).unwrap();
+            inputs.write(name, &text.replace(": map.ply", ": results/map.ply"));
+        }
+        let map = fs::read_to_string(inputs.path("build_map.yml")).unwrap();
+        inputs.write(
+            "build_map.yml",
+            &format!("{map}local_map_size: 3\noverlap_m: 0.6\n"),
+        );
+        for before in stage.before {
+            inputs.fpmcl(before).succeeds();
+        }
+        // Files of the user where the outputs are.
+        fs::create_dir_all(inputs.path("results")).unwrap();
+        inputs.write("mine.txt", "mine");
+        inputs.write("results/mine.yml", "mine: True");
+        let copy = Copy::of(inputs.folder());
+        let start = Instant::now();
+        let ended = run(stage, &copy.path(), &[]);
+        let duration = start.elapsed();
+        assert!(ended.status.success(), "{}", ended.stderr);
+        Self {
+            stage,
+            inputs,
+            expected: contents(&copy.path()),
+            duration,
+        }
+    }
+
+    /// Runs the command again after a fault and notes what is not as expected.
+    fn check_rerun(&self, folder: &Path, threads: &str, row: &mut Row) {
+        let mut ended = run(self.stage, folder, &[threads]);
+        if ended.stderr.contains("--force") && !ended.status.success() {
+            row.forced += 1;
+            ended = run(self.stage, folder, &[threads, "--force"]);
+        }
+        if !ended.status.success() {
+            row.note(format!("rerun: {}", ended.stderr.trim()));
+            return;
+        }
+        self.check(folder, row);
+    }
+
+    /// Compares a folder with that of the uninterrupted run.
+    fn check(&self, folder: &Path, row: &mut Row) {
+        let found = contents(folder);
+        let mut differences = Vec::new();
+        for (path, bytes) in &self.expected {
+            match found.get(path) {
+                None => differences.push(format!("{} is missing", path.display())),
+                Some(found) if found != bytes => {
+                    differences.push(format!("{} differs", path.display()));
+                }
+                Some(_) => {}
+            }
+        }
+        let known = |path: &&PathBuf| !self.expected.contains_key(*path);
+        for path in found.keys().filter(known) {
+            differences.push(format!("{} is left over", path.display()));
+        }
+        if differences.is_empty() {
+            row.identical += 1;
+        } else {
+            row.note(differences.join(", "));
+        }
+    }
+}
+
+/// A row of the table.
+#[derive(Default)]
+struct Row {
+    fault: &'static str,
+    command: &'static str,
+    tries: usize,
+    identical: usize,
+    /// Reruns that asked for `--force`.
+    forced: usize,
+    /// Commands that ended before the fault.
+    finished: usize,
+    /// Errors of one line that said what was wrong.
+    errors: usize,
+    /// Longest time from a signal to the end.
+    longest_stop: Duration,
+    wrong: Vec<String>,
+}
+
+impl Row {
+    fn new(fault: &'static str, stage: &Stage) -> Self {
+        Self {
+            fault,
+            command: stage.name,
+            ..Self::default()
+        }
+    }
+
+    fn note(&mut self, wrong: String) {
+        self.wrong.push(wrong);
+    }
+
+    /// Notes an error that is not one line.
+    fn check_error(&mut self, ended: &Ended) {
+        let errors = ended.stderr.matches("error: ").count();
+        if ended.stderr.contains("panicked") || errors != 1 {
+            self.note(format!("{:?}: {}", ended.status, ended.stderr.trim()));
+        } else {
+            self.errors += 1;
+        }
+    }
+
+    fn print(&self) {
+        println!(
+            "| {} | {} | {} | {} | {} | {} | {} | {:.2} | {} |",
+            self.fault,
+            self.command,
+            self.tries,
+            self.identical,
+            self.finished,
+            self.forced,
+            self.errors,
+            self.longest_stop.as_secs_f64(),
+            self.wrong.len(),
+        );
+        for wrong in &self.wrong {
+            println!("wrong: {} {}: {wrong}", self.fault, self.command);
+        }
+    }
+}
+
+fn print_head() {
+    println!(
+        "| fault | command | tries | identical | finished before it | reruns with --force | errors of one line | longest stop [s] | wrong |\n\
+         |---|---|---:|---:|---:|---:|---:|---:|---:|"
+    );
+}
+
+/// A command that ended.
+struct Ended {
+    status: ExitStatus,
+    stderr: String,
+}
+
+fn start(stage: &Stage, folder: &Path, more: &[&str]) -> Child {
+    Command::new(assert_cmd::cargo::cargo_bin!("fpmcl"))
+        .args(stage.arguments)
+        .args(more)
+        .current_dir(folder)
+        .stdout(Stdio::null())
+        .stderr(fs::File::create(stderr_file(folder, 0)).unwrap())
+        .spawn()
+        .unwrap()
+}
+
+/// The file for the messages of a command, beside its folder so that it is no output.
+fn stderr_file(folder: &Path, process: u32) -> PathBuf {
+    folder.with_extension(format!("stderr{process}"))
+}
+
+fn end(mut child: Child, folder: &Path) -> Ended {
+    let start = Instant::now();
+    let status = loop {
+        match child.try_wait().unwrap() {
+            Some(status) => break status,
+            None if start.elapsed() > TIMEOUT => {
+                child.kill().unwrap();
+                panic!("the command hangs in {}", folder.display());
+            }
+            None => std::thread::sleep(Duration::from_millis(2)),
+        }
+    };
+    let stderr = fs::read_to_string(stderr_file(folder, 0)).unwrap();
+    Ended { status, stderr }
+}
+
+fn run(stage: &Stage, folder: &Path, more: &[&str]) -> Ended {
+    end(start(stage, folder, more), folder)
+}
+
+/// A copy of a folder in a temporary folder, with space beside it.
+struct Copy(tempfile::TempDir);
+
+impl Copy {
+    fn of(folder: &Path) -> Self {
+        let copy = Self(tempfile::tempdir().unwrap());
+        copy_into(folder, &copy.path());
+        copy
+    }
+
+    fn path(&self) -> PathBuf {
+        self.0.path().join("drive")
+    }
+}
+
+fn copy_into(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    for entry in fs::read_dir(from).unwrap() {
+        let path = entry.unwrap().path();
+        let target = to.join(path.file_name().unwrap());
+        if path.is_dir() {
+            copy_into(&path, &target);
+        } else {
+            fs::copy(&path, &target).unwrap();
+        }
+    }
+}
+
+/// All files below a folder.
+fn contents(folder: &Path) -> Contents {
+    fn add(folder: &Path, root: &Path, found: &mut Contents) {
+        for entry in fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                add(&path, root, found);
+            } else {
+                found.insert(
+                    path.strip_prefix(root).unwrap().to_owned(),
+                    stable_bytes(&path),
+                );
+            }
+        }
+    }
+    let mut found = Contents::new();
+    add(folder, folder, &mut found);
+    found
+}
+
+/// The bytes of a file that every run writes alike: none of those with times of computation.
+fn stable_bytes(path: &Path) -> Option<Vec<u8>> {
+    let name = path.file_name()?.to_str()?;
+    if name.ends_with(".npz") {
+        let results = LocalizationResults::read(path).unwrap();
+        let results = LocalizationResults {
+            runtimes_s: None,
+            refine_runtimes_s: None,
+            ..results
+        };
+        return Some(format!("{results:?}").into_bytes());
+    }
+    let is_stable = [".ply", ".txt", ".bin", ".label", ".yml", ".npy"]
+        .iter()
+        .any(|end| name.ends_with(end));
+    is_stable.then(|| fs::read(path).unwrap())
+}
+
+/// Stops a command by signals at random moments and runs it again.
+fn stop_at_random_moments(reference: &Reference, tries: usize) -> Vec<Row> {
+    let mut rng = fpmcl::random::stream(14, 0);
+    let mut rows: Vec<Row> = (SIGNALS.iter())
+        .map(|(name, _)| Row::new(name, reference.stage))
+        .collect();
+    for number in 0..tries {
+        let (name, signal) = SIGNALS[number % SIGNALS.len()];
+        let row = &mut rows[number % SIGNALS.len()];
+        row.tries += 1;
+        let threads = ["--threads=1", "--threads=2"][number / SIGNALS.len() % 2];
+        let copy = Copy::of(reference.inputs.folder());
+        let moment = reference.duration.mul_f64(1.05 * rng.random::<f64>());
+        let child = start(reference.stage, &copy.path(), &[threads]);
+        std::thread::sleep(moment);
+        let sent = Instant::now();
+        let id = child.id().to_string();
+        // It may have ended already.
+        let _ = Command::new("kill")
+            .args(["-s", &name[3..], &id])
+            .stderr(Stdio::null())
+            .status();
+        let ended = end(child, &copy.path());
+        row.longest_stop = row.longest_stop.max(sent.elapsed());
+        if ended.status.success() {
+            row.finished += 1;
+            reference.check(&copy.path(), row);
+            continue;
+        }
+        let was_stopped = ended.status.signal() == Some(signal) || ended.status.code() == Some(130);
+        if !was_stopped {
+            row.note(format!("{:?}: {}", ended.status, ended.stderr.trim()));
+        } else if ended.status.code() == Some(130) {
+            row.check_error(&ended);
+        }
+        reference.check_rerun(&copy.path(), threads, row);
+    }
+    rows
+}
+
+/// Two processes of one command at the same time: at least one succeeds, the other may be refused.
+fn start_twice(reference: &Reference, tries: usize) -> Row {
+    let mut row = Row::new("two processes", reference.stage);
+    for number in 0..tries {
+        row.tries += 1;
+        let threads = ["--threads=1", "--threads=2"][number % 2];
+        let copy = Copy::of(reference.inputs.folder());
+        let first = start(reference.stage, &copy.path(), &[threads]);
+        std::thread::sleep(reference.duration.mul_f64(0.1 * (number % 8) as f64));
+        let messages = fs::File::create(stderr_file(&copy.path(), 1)).unwrap();
+        let second = Command::new(assert_cmd::cargo::cargo_bin!("fpmcl"))
+            .args(reference.stage.arguments)
+            .arg(threads)
+            .current_dir(&copy.path())
+            .stdout(Stdio::null())
+            .stderr(messages)
+            .output()
+            .unwrap();
+        let first = end(first, &copy.path());
+        let second = Ended {
+            status: second.status,
+            stderr: fs::read_to_string(stderr_file(&copy.path(), 1)).unwrap(),
+        };
+        for ended in [&first, &second] {
+            if !ended.status.success() {
+                row.check_error(ended);
+            }
+        }
+        if first.status.success() || second.status.success() {
+            reference.check(&copy.path(), &mut row);
+        } else {
+            reference.check_rerun(&copy.path(), threads, &mut row);
+        }
+    }
+    row
+}
+
+/// A small disk for the folder `results`, and for the map; needs root.
+struct SmallDisk(PathBuf);
+
+impl SmallDisk {
+    fn mount(folder: &Path) -> Option<Self> {
+        let mounted = Command::new("mount")
+            .args(["-t", "tmpfs", "-o", "size=2m", "tmpfs"])
+            .arg(folder)
+            .stderr(Stdio::null())
+            .status();
+        (mounted.is_ok_and(|status| status.success())).then(|| Self(folder.to_owned()))
+    }
+
+    fn remount(&self, options: &str) {
+        let status = Command::new("mount")
+            .args(["-o", options])
+            .arg(&self.0)
+            .status();
+        assert!(status.unwrap().success());
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg("-l").arg(&self.0).status();
+    }
+}
+
+/// A command whose folder `results` is on a disk that is full, and then not; `None` without root.
+fn fill_the_disk(reference: &Reference) -> Option<Row> {
+    let mut row = Row::new("full disk of 2 MB", reference.stage);
+    for free_bytes in [0, 5_000, 30_000, 100_000, 250_000] {
+        let copy = Copy::of(reference.inputs.folder());
+        let results = copy.path().join("results");
+        let disk = SmallDisk::mount(&results)?;
+        copy_into(&reference.inputs.path("results"), &results);
+        let ballast = results.join("ballast");
+        fill(&ballast, free_bytes);
+        row.tries += 1;
+        let ended = run(reference.stage, &copy.path(), &[]);
+        match ended.status.success() {
+            true => row.finished += 1,
+            false => row.check_error(&ended),
+        }
+        let leftover = contents(&results)
+            .keys()
+            .find(|path| is_temporary(path))
+            .cloned();
+        if let Some(path) = leftover {
+            row.note(format!("{} is left over", path.display()));
+        }
+        fs::remove_file(&ballast).unwrap();
+        disk.remount("remount,size=64m");
+        if ended.status.success() {
+            reference.check(&copy.path(), &mut row);
+        } else {
+            reference.check_rerun(&copy.path(), "--threads=2", &mut row);
+        }
+    }
+    Some(row)
+}
+
+/// Writes a file that fills its disk, then takes bytes off its end.
+fn fill(path: &Path, free_bytes: u64) {
+    let mut file = fs::File::create(path).unwrap();
+    while file.write_all(&[1; 4096]).is_ok() {}
+    let bytes = file.metadata().unwrap().len();
+    file.set_len(bytes.saturating_sub(free_bytes)).unwrap();
+}
+
+fn is_temporary(path: &Path) -> bool {
+    let name = path.file_name().and_then(|name| name.to_str());
+    name.is_some_and(|name| name.starts_with(".fpmcl-"))
+}
+
+/// A command whose folder `results` cannot be written; `None` without root.
+fn protect_the_folder(reference: &Reference) -> Option<Row> {
+    let mut row = Row::new("read-only folder", reference.stage);
+    let copy = Copy::of(reference.inputs.folder());
+    let results = copy.path().join("results");
+    let disk = SmallDisk::mount(&results)?;
+    copy_into(&reference.inputs.path("results"), &results);
+    let before = contents(&results);
+    disk.remount("remount,ro");
+    row.tries += 1;
+    let ended = run(reference.stage, &copy.path(), &[]);
+    if ended.status.success() {
+        row.note("it succeeds".to_owned());
+    } else {
+        row.check_error(&ended);
+    }
+    if contents(&results) != before {
+        row.note("files have changed".to_owned());
+    }
+    disk.remount("remount,rw,size=64m");
+    reference.check_rerun(&copy.path(), "--threads=2", &mut row);
+    Some(row)
+}
+
+fn assert_nothing_is_wrong(rows: &[Row]) {
+    let wrong: usize = rows.iter().map(|row| row.wrong.len()).sum();
+    assert_eq!(wrong, 0, "see the table");
+}
+
+#[test]
+fn a_command_that_is_stopped_gives_the_same_results_when_it_runs_again() {
+    print_head();
+    let mut all = Vec::new();
+    for stage in STAGES.iter().filter(|stage| stage.name != "compare") {
+        let reference = Reference::new(stage);
+        let mut rows = stop_at_random_moments(&reference, 3);
+        rows.push(start_twice(&reference, 1));
+        rows.iter().for_each(Row::print);
+        all.extend(rows);
+    }
+    assert_nothing_is_wrong(&all);
+}
+
+#[test]
+#[ignore = "the campaign: half an hour"]
+fn campaign() {
+    let tries = std::env::var("FPMCL_FAULT_TRIES").map_or(100, |text| text.parse().unwrap());
+    print_head();
+    let mut all = Vec::new();
+    for stage in STAGES {
+        let reference = Reference::new(stage);
+        let mut rows = stop_at_random_moments(&reference, tries);
+        rows.push(start_twice(&reference, tries.div_ceil(10)));
+        let disks = [fill_the_disk(&reference), protect_the_folder(&reference)];
+        for row in disks {
+            match row {
+                Some(row) => rows.push(row),
+                None => println!("not run: a disk of its own for {} needs root", stage.name),
+            }
+        }
+        rows.iter().for_each(Row::print);
+        all.extend(rows);
+    }
+    assert_nothing_is_wrong(&all);
+}
