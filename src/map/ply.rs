@@ -472,6 +472,16 @@ mod tests {
     }
 
     #[test]
+    fn normals_that_are_not_finite_are_as_if_missing() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.ply");
+        let mut damaged = mesh();
+        damaged.normals[2].y = f32::NAN;
+        write(&path, &damaged, None).unwrap();
+        assert!(read(&path).unwrap().normals.is_empty());
+    }
+
+    #[test]
     fn the_bytes_of_a_mesh_are_a_header_and_little_endian_rows() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("map.ply");

@@ -109,9 +109,13 @@ fn add(
     if rarely(u, 3)? {
         Mutations::new(u)?.apply(&mut array);
     }
-    let method = [CompressionMethod::Stored, CompressionMethod::Deflated];
+    // Compression takes long.
+    let method = match rarely(u, 16)? {
+        true => CompressionMethod::Deflated,
+        false => CompressionMethod::Stored,
+    };
     let options = SimpleFileOptions::default()
-        .compression_method(*u.choose(&method)?)
+        .compression_method(method)
         .large_file(rarely(u, 8)?);
     file.start_file(format!("{name}.npy"), options).unwrap();
     file.write_all(&array).unwrap();

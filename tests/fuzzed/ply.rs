@@ -158,14 +158,14 @@ fn vertex(u: &mut Unstructured, count: usize) -> Result<Element> {
 
 fn face(u: &mut Unstructured) -> Result<Element> {
     let mut properties = vec![Property {
-        name: *u.choose(&["vertex_indices", "vertex_index"])?,
+        name: u.choose(&["vertex_indices", "vertex_index"])?,
         list: Some(if rarely(u, 16)? {
             *u.choose(INTEGERS)?
         } else {
             "uchar"
         }),
         kind: if rarely(u, 64)? {
-            *u.choose(INTEGERS)?
+            u.choose(INTEGERS)?
         } else {
             "int"
         },
@@ -192,7 +192,7 @@ fn other_element(u: &mut Unstructured) -> Result<Element> {
         });
     }
     Ok(Element {
-        name: *u.choose(&["edge", "camera", "vertex", "face"])?,
+        name: u.choose(&["edge", "camera", "vertex", "face"])?,
         count: u.int_in_range(0..=4)?,
         properties,
     })

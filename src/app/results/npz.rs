@@ -13,6 +13,8 @@ use zip::result::ZipError;
 use zip::write::SimpleFileOptions;
 use zip::{ZipArchive, ZipWriter};
 
+use crate::recording::scan_files::npy::has_endless_header;
+
 /// Size of the buffer between decompression and numbers [bytes].
 const BUFFER_BYTES: usize = 1 << 16;
 
@@ -120,7 +122,10 @@ impl Array<'_> {
     /// for the message.
     pub fn next_finite_row<const N: usize>(&mut self, row: usize) -> Result<[f64; N]> {
         let numbers = self.next_row()?;
-        match numbers.iter().find(|number| !(number.abs() <= LARGEST)) {
+        match numbers
+            .iter()
+            .find(|number| !number.is_finite() || number.abs() > LARGEST)
+        {
             Some(value) => bail!(
                 "{}, array `{}`, row {row}: {value} is not a valid value",
                 self.path.display(),
@@ -144,7 +149,14 @@ fn not_numbers(found: &DType) -> anyhow::Error {
 
 /// Reads the header of an array and checks that the bytes after it are those that it claims.
 fn open_array<'a>(mut entry: io::Take<impl Read + 'a>) -> Result<(Vec<usize>, Numbers<'a>)> {
-    let header = NpyHeader::from_reader(&mut entry).map_err(|error| anyhow!(unreadable(&error)))?;
+    let mut start = [0; 12];
+    (entry.read_exact(&mut start)).map_err(|error| anyhow!(unreadable(&error)))?;
+    ensure!(
+        !has_endless_header(&start),
+        "it cannot be read: its header has no end"
+    );
+    let header = NpyHeader::from_reader(start.chain(&mut entry))
+        .map_err(|error| anyhow!(unreadable(&error)))?;
     let DType::Plain(element) = header.dtype() else {
         return Err(not_numbers(&header.dtype()));
     };

@@ -108,6 +108,18 @@ fn the_same_results_give_the_same_bytes() {
 }
 
 #[test]
+fn a_late_first_frame_needs_no_empty_rows_of_gigabytes() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("results.npz");
+    let late = results(1_000_000_000_000..1_000_000_000_003);
+    late.write(&path).unwrap();
+    assert_eq!(
+        LocalizationResults::read(&path).unwrap().frames,
+        late.frames
+    );
+}
+
+#[test]
 fn a_file_of_range_mcl_alone_is_read() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("results.npz");
@@ -288,6 +300,23 @@ fn inconsistent_arrays_are_errors_that_name_the_array() {
     assert!(message.contains("start_idx is -1"), "{message}");
     let message = write([2, 2, 4], f32::NAN, 0);
     assert!(message.contains("`particles`, row 0: NaN"), "{message}");
+
+    // Beyond float32, in which particles are kept.
+    write_particles(
+        &path,
+        "<f8",
+        &[1, 1, 4],
+        &[1e300_f64; 4].map(f64::to_le_bytes).concat(),
+        SimpleFileOptions::default(),
+    );
+    let message = LocalizationResults::read(&path).unwrap_err().to_string();
+    assert!(message.contains("is not a valid value"), "{message}");
+
+    let mut far = results(0..2);
+    far.frames = vec![10, usize::MAX];
+    far.write(&path).unwrap();
+    let message = LocalizationResults::read(&path).unwrap_err().to_string();
+    assert!(message.contains("`frames`, row 1"), "{message}");
 
     let mut disordered = results(0..3);
     disordered.frames = vec![4, 6, 5];

@@ -1,7 +1,7 @@
 //! Files of one scan: `.bin` of KITTI, SemanticKITTI and nuScenes, `.pcd`, `.ply` and `.npy`.
 
 mod bin;
-mod npy;
+pub mod npy;
 mod pcd;
 mod ply;
 mod point_table;

@@ -5,8 +5,23 @@ use npyz::{DType, NpyFile, Order, TypeChar};
 use super::point_table::{Column, NumberType, scan_of};
 use crate::lidar::Scan;
 
+/// Longest header of an array; those of numbers have about a hundred [bytes].
+const LONGEST_HEADER: u32 = 1 << 16;
+
+/// Whether the first bytes of an array claim a header that no array of numbers has, and for which memory
+/// is not to be allocated.
+pub fn has_endless_header(start: &[u8]) -> bool {
+    // Magic number, major and minor version, length; with 16 bits in the first version.
+    let length = start.get(8..).and_then(<[u8]>::first_chunk);
+    let has_long_length = start.get(6).is_some_and(|&major| major > 1);
+    has_long_length && length.is_some_and(|&l| u32::from_le_bytes(l) > LONGEST_HEADER)
+}
+
 /// Reads an array of floats with two dimensions.
 pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
+    if has_endless_header(bytes) {
+        return Err("is no npy array: its header has no end".to_owned());
+    }
     let mut rest = bytes;
     let array = NpyFile::new(&mut rest).map_err(|error| format!("is no npy array: {error}"))?;
     let number_type = match array.dtype() {
@@ -49,4 +64,15 @@ pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
         .collect();
     drop(array);
     scan_of(&columns, rest, rows)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn memory_for_a_header_of_gigabytes_is_not_allocated() {
+        let message = parse(b"\x93NUMPY\x02\x00\xff\xff\xff\xff{'descr'").unwrap_err();
+        assert!(message.contains("its header has no end"), "{message}");
+    }
 }

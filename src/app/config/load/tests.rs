@@ -204,6 +204,12 @@ fn an_invalid_setting_is_quoted() {
     assert_contains(&message, &["--set range_image=[1"]);
     let message = message_of("", &[("seed", "-1")]);
     assert_contains(&message, &["--set seed=-1", "not negative"]);
+    // The error is of the block of the key.
+    let (key, value) = ("fuzzy.variables.height.level", "{triangle: [3, 2, 1]}");
+    let message = message_of("", &[(key, value)]);
+    assert_contains(&message, &["--set fuzzy.variables.height.level"]);
+    let message = message_of("", &[(&"k".repeat(100_000), "1")]);
+    assert_contains(&message, &["prints every key"]);
 }
 
 #[test]
