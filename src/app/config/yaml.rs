@@ -25,7 +25,7 @@ pub(super) struct Key {
     items: usize,
 }
 
-/// Lists the keys and the items of a text in order; what stands in braces is part of a value.
+/// Lists the keys and the items of a text in order; what is in braces is part of a value.
 pub(super) fn keys(text: &str) -> Vec<Key> {
     let mut keys: Vec<Key> = Vec::new();
     let mut open: Vec<usize> = Vec::new();
