@@ -65,7 +65,7 @@
 //!
 //! | layer | modules |
 //! |---|---|
-//! | foundations | [`files`], [`geometry`], [`random`], [`validation`] |
+//! | foundations | [`files`], [`geometry`], [`memory`], [`random`], [`validation`] |
 //! | sensor and rays | [`lidar`], [`raycasting`] |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
 //! | map | [`map`], [`registration`], [`simulation`] |
@@ -83,6 +83,7 @@
 // Foundations.
 pub mod files;
 pub mod geometry;
+pub mod memory;
 pub mod random;
 pub mod validation;
 // Sensor and rays.

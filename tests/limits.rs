@@ -5,7 +5,10 @@
 
 mod common;
 
-use common::fpmcl;
+use common::{Recording, fpmcl, json};
+
+/// A budget that no stage fits in [GiB].
+const TINY: &str = "--memory=0.01";
 
 /// Sets one key of a command and expects the error that names it.
 #[track_caller]
@@ -105,4 +108,72 @@ fn simulations_are_bounded() {
     ] {
         refuses("simulate", key, value, limit);
     }
+}
+
+#[test]
+fn a_budget_of_memory_that_does_not_suffice_is_an_error_that_names_what_needs_it_and_the_key() {
+    let recording = Recording::street(6);
+    let parts = ["would need", "more than the budget of 0.0 GiB", "--memory"];
+    let build = || recording.fpmcl("build-map").with(TINY);
+    let expected = |what, key| [&parts[..], &[what, key]].concat();
+    build().fails_with(&expected("the octree of the surface", "depth"));
+    (build().set("range_image.height", "1024")).fails_with(&expected("range images", "width"));
+    (build().set("crop_x", "500")).fails_with(&expected("the plane around the drive", "crop_x"));
+    assert!(!recording.path("map.ply").exists());
+
+    recording.fpmcl("build-map").succeeds();
+    let localize = || recording.fpmcl("localize").with(TINY);
+    let search = localize().set("initialization", "extent");
+    (search.set("grid_res", "0.05")).fails_with(&expected("the search grid", "grid_res"));
+    let search = localize().set("initialization", "corridor");
+    (search.set("grid_res", "0.1")).fails_with(&expected("the panoramas", "panorama.rows"));
+    assert!(!recording.path("results/localization.npz").exists());
+
+    let street = fpmcl("simulate").with(TINY);
+    (street.set("n_scans", "1")).fails_with(&expected("the ground of the street", "path"));
+}
+
+#[test]
+fn particles_that_exceed_the_budget_end_a_run_that_keeps_its_frames() {
+    let recording = Recording::street(12);
+    recording.fpmcl("build-map").succeeds();
+    // 16 bytes per particle and frame: 6.4 MB per frame of 10.7 MB.
+    let call = recording.fpmcl("localize").with(TINY);
+    call.set("numParticles", "400000")
+        .set("num_reduced", "400000")
+        .set("observation.min_beams", "1")
+        .set("observation.ray_budget", "1")
+        .set("proposal.weighed_beams", "1")
+        .fails_with(&[
+            "the particles of all frames",
+            "numParticles",
+            "of 12 frames are localized",
+        ]);
+}
+
+#[test]
+fn a_budget_is_a_positive_number() {
+    for value in ["0", "-1", "nan", "much"] {
+        let call = fpmcl("build-map").with(format!("--memory={value}"));
+        call.rejects_usage_with(&["give a number from 0.01"]);
+    }
+}
+
+#[test]
+fn the_size_of_an_octree_cell_is_reported_and_bounded() {
+    let recording = Recording::street(4);
+    recording.fpmcl("build-map").succeeds();
+    let report = json(&recording.path("map.report.json"));
+    let cell_m = report["octree_cell_m"].as_f64().unwrap();
+    assert!((0.5..1.2).contains(&cell_m), "{cell_m}");
+    let coarse = recording
+        .fpmcl("build-map")
+        .with("--force")
+        .set("depth", "4");
+    coarse.fails_with(&[
+        "octree cells",
+        "more than 1.5 m",
+        "raise depth, which is 4",
+        "extend over",
+    ]);
 }

@@ -262,6 +262,10 @@ pub struct MachineArgs {
     /// Number of threads; by default one per processor.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     pub threads: Option<u16>,
+
+    /// Largest memory that a stage may plan for; by default half of the machine's.
+    #[arg(long, value_name = "GIB", value_parser = gibibytes)]
+    pub memory: Option<f64>,
 }
 
 /// Renderer of the map.
@@ -321,6 +325,14 @@ impl RunArgs {
         let seed = self.seed.map(|seed| ("seed".to_owned(), seed.to_string()));
         let force = self.force.then(|| ("force".to_owned(), "true".to_owned()));
         seed.into_iter().chain(force).collect()
+    }
+}
+
+/// Parses a positive number of gibibytes.
+fn gibibytes(text: &str) -> Result<f64, &'static str> {
+    match text.parse::<f64>() {
+        Ok(number) if (0.01..=1e6).contains(&number) => Ok(number),
+        _ => Err("give a number from 0.01 to 1000000, such as 8"),
     }
 }
 

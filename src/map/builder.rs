@@ -11,6 +11,7 @@
 
 use std::error::Error;
 use std::ops::ControlFlow;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 
@@ -24,7 +25,8 @@ use super::scan_agreement;
 use super::scan_cloud::ScanCloud;
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::ground::GroundClassifier;
-use crate::lidar::Scan;
+use crate::lidar::{LidarModel, Scan};
+use crate::memory::{self, MemoryError};
 use crate::meshing::MeshingError;
 use crate::validation::{InvalidValue, Validate as _};
 
@@ -77,6 +79,8 @@ pub enum BuildError {
         "the map has no triangles: none of the {scans} key scans has points left to mesh; check range_image, crop_x, crop_y and crop_z"
     )]
     Empty { scans: usize },
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
     #[error(transparent)]
     Map(#[from] MapError),
 }
@@ -137,6 +141,8 @@ impl MapBuilder {
         path_check::check(map_from_lidar.iter().enumerate(), config.max_step_m)?;
         let local_maps = plan::local_maps(&map_from_lidar, config.local_map_size, config.overlap_m);
         let reach_m = f64::from(config.local_map.scan.crop_m.length());
+        Ownership::require_memory(&map_from_lidar, reach_m)?;
+        require_memory_of_images(&config.local_map.scan.range_image)?;
         Ok(MapPlan {
             builder: self,
             classifier: config.ground.classifier()?,
@@ -145,6 +151,16 @@ impl MapBuilder {
             map_from_lidar,
         })
     }
+}
+
+/// Requires the memory of one range image per thread, with normals, free space and ground features.
+fn require_memory_of_images(model: &LidarModel) -> Result<(), MemoryError> {
+    const PIXEL_BYTES: usize = 128;
+    memory::require(
+        "the range images of the scans",
+        (model.len() * rayon::current_num_threads() * PIXEL_BYTES) as f64,
+        "lower range_image.height or range_image.width, or give fewer --threads",
+    )
 }
 
 /// The local maps of a drive.
@@ -172,10 +188,17 @@ impl MapPlan<'_> {
             ControlFlow::Break(()) => Err(BuildError::Interrupted),
         };
         notify(BuildEvent::Stage("scans"))?;
+        let held_bytes = AtomicUsize::new(0);
         let prepare = |index: usize| {
             let scan = read_scan(index).map_err(BuildError::Scan)?;
             let pose = &self.map_from_lidar[index];
             let prepared = ScanCloud::prepare(scan, pose, &config.scan, &*self.classifier);
+            let bytes = held_bytes.fetch_add(prepared.bytes(), Ordering::Relaxed);
+            memory::require(
+                "the scans of a local map",
+                bytes as f64,
+                "lower local_map_size or overlap_m, or raise voxel_size",
+            )?;
             notify(BuildEvent::ScanPrepared)?;
             Ok(prepared)
         };

@@ -91,6 +91,9 @@ pub struct LocalMapCounts {
     pub dynamic_points: usize,
     /// Points without a normal, merged from opposite ones, which the reconstruction cannot use.
     pub unusable_points: usize,
+    /// Edge of the finest octree cells [m].
+    #[serde(default)]
+    pub cell_m: f32,
     /// Triangles as reconstructed.
     pub reconstructed_triangles: usize,
     /// Triangles removed for low point density.
@@ -227,6 +230,7 @@ fn reconstruct(
     match meshing::reconstruct(cloud, weights, &config.poisson) {
         Ok(surface) => {
             counts.unusable_points = surface.dropped_points;
+            counts.cell_m = surface.cell_m;
             Ok(Some(surface))
         }
         Err(MeshingError::TooFewPoints { usable, given, .. }) => {

@@ -11,6 +11,7 @@ use super::ply::{self, PlyError};
 use super::tiles::{self, TileGrid};
 use super::vertex_ground::is_ground_color;
 use crate::geometry::TriangleMesh;
+use crate::memory::{self, MemoryError};
 use crate::rendering::{RangeRenderer, RenderError, renderer};
 
 /// Cell size of the elevation of the ground [m].
@@ -18,6 +19,12 @@ const GROUND_CELL_M: f64 = 0.5;
 
 /// Cosine of the steepest slope that counts as ground in a map without ground colours.
 const LEVEL_COSINE: f32 = 0.97;
+
+/// Memory per triangle, in the mesh, the tiles and the renderer's hierarchy [bytes].
+const TRIANGLE_BYTES: f64 = 300.0;
+
+/// Memory per tile [bytes].
+const TILE_BYTES: f64 = 1000.0;
 
 /// A mesh prepared for localization, with its tile grid, elevation map, renderer and the path of the
 /// mapping drive. All poses in it are `map_from_lidar`.
@@ -55,6 +62,8 @@ pub enum MapError {
     #[error("{} does not contain the path of its mapping drive; give the poses that it was built with (map_pose_file and map_calib_file)", path.display())]
     NoPath { path: PathBuf },
     #[error(transparent)]
+    Memory(#[from] MemoryError),
+    #[error(transparent)]
     Render(#[from] RenderError),
 }
 
@@ -72,6 +81,12 @@ impl Map {
         if (0..triangles).all(|triangle| mesh.scaled_normal(triangle) == glam::Vec3::ZERO) {
             return Err(MapError::NoArea { triangles });
         }
+        memory::require(
+            "the map",
+            triangles as f64 * TRIANGLE_BYTES
+                + TileGrid::count(&path.map_from_lidar, &options.tiles) * TILE_BYTES,
+            "choose a smaller map, or check the poses of its mapping drive",
+        )?;
         let tiles = TileGrid::around(&path.map_from_lidar, &options.tiles);
         let parts = tiles::cut(&mesh, &tiles);
         let renderer = renderer(&parts, options.backend, options.max_poses)?;
@@ -120,6 +135,7 @@ impl Map {
         match &*last {
             Some((made_for, index)) if made_for == request => Ok(index.clone()),
             _ => {
+                request.require_memory(&self.tiles)?;
                 let cells = request.cells(&self.path.map_from_lidar, &self.tiles);
                 let index = PanoramaIndex::build(
                     &cells,

@@ -27,6 +27,7 @@ use super::elevation::{GroundMap, SensorAttitude};
 use super::tiles::TileGrid;
 use crate::geometry::{Pose2, Pose3, Rigid3f, pose2_from_pose3, wrap_angle};
 use crate::lidar::{LidarModel, RangeImage};
+use crate::memory::{self, MemoryError};
 use crate::rendering::{RangeRenderer, RenderError};
 use crate::validation::{InvalidValue, Validate, fraction, in_range, positive};
 
@@ -109,6 +110,19 @@ pub struct PanoramaRequest {
 }
 
 impl PanoramaRequest {
+    /// Requires the memory of the centres of all cells in the extent of the map, for a search anywhere.
+    pub fn require_memory(&self, tiles: &TileGrid) -> Result<(), MemoryError> {
+        const CELL_BYTES: f64 = 16.0;
+        let (min, max) = tiles.extent();
+        let cells = (max.x - min.x) * (max.y - min.y) / self.config.cell_m.powi(2);
+        match self.region {
+            SearchRegion::Road => Ok(()),
+            SearchRegion::Anywhere => {
+                memory::require("the search grid", cells * CELL_BYTES, "raise grid_res")
+            }
+        }
+    }
+
     /// Returns the centres of the cells of the region in a map [m].
     pub fn cells(&self, path: &[Pose3], tiles: &TileGrid) -> Vec<Point2<f64>> {
         let cell_m = self.config.cell_m;
@@ -181,6 +195,11 @@ impl PanoramaIndex {
         let (places, poses): (Vec<(Point2<f64>, f64)>, Vec<Pose3>) =
             cells.iter().filter(on_map).flat_map(levels).unzip();
         let model = panorama_model(&request.lidar, &request.config);
+        memory::require(
+            "the panoramas of the map",
+            4.0 * model.len() as f64 * (poses.len() + poses.len().min(BATCH)) as f64,
+            "raise grid_res, or lower panorama.rows or panorama.columns",
+        )?;
         let mut images = Vec::with_capacity(poses.len());
         for batch in poses.chunks(BATCH) {
             for mut image in renderer.render(batch, &model)? {

@@ -11,6 +11,7 @@ use std::ops::Range;
 use nalgebra::Point2;
 
 use crate::geometry::{Grid2, Pose3};
+use crate::memory::{self, MemoryError};
 
 /// Edge of the cells in which ownership is decided [m].
 const OWNER_CELL_M: f64 = 0.5;
@@ -77,6 +78,22 @@ pub struct Ownership {
 }
 
 impl Ownership {
+    /// Requires the memory of the plane within `reach_m` of the poses, of about 48 MB per square
+    /// kilometre.
+    pub fn require_memory(poses: &[Pose3], reach_m: f64) -> Result<(), MemoryError> {
+        const CELL_BYTES: f64 = 12.0;
+        let extent_m = |axis: usize| {
+            let along = poses.iter().map(|pose| pose.translation.vector[axis]);
+            let max = along.clone().fold(f64::NEG_INFINITY, f64::max);
+            max - along.fold(f64::INFINITY, f64::min) + 2.0 * reach_m
+        };
+        memory::require(
+            "the plane around the drive",
+            extent_m(0) * extent_m(1) / OWNER_CELL_M.powi(2) * CELL_BYTES,
+            "map a shorter drive (start_idx, n_scans), lower crop_x and crop_y, or check the poses",
+        )
+    }
+
     /// Assigns the plane within `reach_m` of a key scan; `poses` are `map_from_lidar` of the key scans.
     pub fn new(poses: &[Pose3], plans: &[LocalMapPlan], reach_m: f64) -> Self {
         let positions: Vec<Point2<f64>> = poses

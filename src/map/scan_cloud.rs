@@ -150,6 +150,14 @@ impl ScanCloud {
     }
 }
 
+impl ScanCloud {
+    /// Size in memory, and of the copy of its points among those of the local map [bytes].
+    pub fn bytes(&self) -> usize {
+        const POINT_BYTES: usize = 4 * (3 + 3 + 1);
+        2 * self.cloud.len() * POINT_BYTES + 12 * self.returns.len() + 4 * self.free_range_m.len()
+    }
+}
+
 /// Returns per pixel the smallest range among it and its eight neighbours: space nearer than that is
 /// free. 0 where the pixel has no return, because a missing return does not prove free space.
 pub(super) fn free_ranges(image: &RangeImage) -> Vec<f32> {

@@ -54,15 +54,8 @@ impl TileGrid {
             .into_iter()
             .map(|pose| Point2::from(pose.translation.vector.xy()))
             .collect();
-        let range = |axis: usize| {
-            let at = |position: &Point2<f64>| position.coords[axis];
-            let min = positions.iter().map(at).fold(0.0, f64::min) - config.margin_m;
-            let max = positions.iter().map(at).fold(0.0, f64::max) + config.margin_m;
-            let first = (min / config.side_m + 0.5).floor() as i64;
-            let last = (max / config.side_m - 0.5).ceil() as i64;
-            (first, (last - first + 1).max(1) as usize)
-        };
-        let ((first_x, columns), (first_y, rows)) = (range(0), range(1));
+        let [(first_x, columns), (first_y, rows)] =
+            [0, 1].map(|axis| range(positions.iter().map(|p| p.coords[axis]), config));
         let mut grid = Self {
             side_m: config.side_m,
             columns,
@@ -81,6 +74,13 @@ impl TileGrid {
             })
             .collect();
         grid
+    }
+
+    /// Number of tiles of [`around`](Self::around).
+    pub fn count(poses: &[Pose3], config: &TileConfig) -> f64 {
+        let positions = || poses.iter().map(|pose| pose.translation.vector);
+        let along = |axis: usize| range(positions().map(|p| p[axis]), config).1 as f64;
+        along(0) * along(1)
     }
 
     /// Number of tiles.
@@ -148,6 +148,16 @@ impl TileGrid {
         let row = cell(point.y, self.first.1, self.rows);
         TileIndex(row * self.columns + column)
     }
+}
+
+/// The first tile along an axis and the number of tiles that cover positions and a margin around them.
+fn range(positions_m: impl Iterator<Item = f64>, config: &TileConfig) -> (i64, usize) {
+    let (min, max) = positions_m.fold((0.0, 0.0), |(min, max), at| {
+        (f64::min(min, at), f64::max(max, at))
+    });
+    let first = ((min - config.margin_m) / config.side_m + 0.5).floor() as i64;
+    let last = ((max + config.margin_m) / config.side_m - 0.5).ceil() as i64;
+    (first, (last - first + 1).max(1) as usize)
 }
 
 /// Divides a mesh into one mesh per tile, in the order of the tiles; some may be empty.

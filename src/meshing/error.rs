@@ -1,5 +1,6 @@
 //! Errors of the surface reconstruction.
 
+use crate::memory::MemoryError;
 use crate::validation::InvalidValue;
 
 /// Why a surface cannot be reconstructed.
@@ -17,6 +18,17 @@ pub enum MeshingError {
     },
     #[error("{weights} weights were given for {points} points; give one per point")]
     WeightsDoNotMatch { points: usize, weights: usize },
+    #[error(
+        "the points extend over {extent_m:.0} m, so that the finest octree cells would be {cell_m:.2} m wide, more than {limit_m} m; raise depth, which is {depth}, or lower local_map_size, or check the poses"
+    )]
+    CellsTooLarge {
+        extent_m: f32,
+        cell_m: f32,
+        limit_m: f32,
+        depth: u32,
+    },
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
     #[error(transparent)]
     InvalidValue(#[from] InvalidValue),
 }

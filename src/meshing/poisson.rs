@@ -21,12 +21,13 @@ use super::density::DensityField;
 use super::error::MeshingError;
 use super::isosurface::{self, NodalFunction, UnitMesh};
 use super::normal_field::CoarseField;
-use super::octree::Octree;
+use super::octree::{Level, Octree};
 use super::samples::Samples;
 use super::solver;
 use super::stencil::{CORNER_OFFSETS, CornerValues, corner_index, interpolate, trilinear};
 use super::weights::SampleWeights;
 use crate::geometry::{PointCloud, TriangleMesh};
+use crate::memory::{self, MemoryError};
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Settings of the reconstruction.
@@ -80,7 +81,12 @@ pub struct Reconstruction {
     pub densities: Vec<f32>,
     /// Number of points ignored: not finite, without a normal, or without weight.
     pub dropped_points: usize,
+    /// Edge of the finest cells [m].
+    pub cell_m: f32,
 }
+
+/// Largest edge of the finest cells [m]: coarser ones show no road.
+const MAX_CELL_M: f32 = 1.5;
 
 /// Levels between the finest cells and the kernel of the density estimation, as in Kazhdan's program.
 const KERNEL_LEVELS: u32 = 2;
@@ -91,7 +97,8 @@ const KERNEL_LEVELS: u32 = 2;
 /// finite position and normal, are ignored. The result does not depend on the number of threads.
 ///
 /// # Errors
-/// If fewer than four points are usable, or a setting is out of its range.
+/// If fewer than four points are usable, the finest cells are too large, the memory does not suffice, or
+/// a setting is out of its range.
 pub fn reconstruct(
     cloud: &PointCloud,
     weights: Option<&[f32]>,
@@ -99,12 +106,22 @@ pub fn reconstruct(
 ) -> Result<Reconstruction, MeshingError> {
     config.validate()?;
     let samples = Samples::new(cloud, weights, config.depth, config.scale)?;
+    let cell_m = samples.cell_m();
+    if cell_m > MAX_CELL_M {
+        return Err(MeshingError::CellsTooLarge {
+            extent_m: samples.side_m / config.scale,
+            cell_m,
+            limit_m: MAX_CELL_M,
+            depth: config.depth,
+        });
+    }
     let kernel_depth = config.depth.saturating_sub(KERNEL_LEVELS).max(2);
     let density = DensityField::new(&samples, kernel_depth, config.samples_per_node);
     let depths = density.sample_depths(&samples);
     let tree = Octree::build(&samples, config.depth, |sample, depth| {
         depths[sample] > (depth - 1) as f32
     });
+    require_memory(&tree, &samples)?;
     let values = solve(&samples, &depths, &tree, config);
     let function = NodalFunction {
         tree: &tree,
@@ -113,6 +130,19 @@ pub fn reconstruct(
     let iso_value = mean_at_samples(&samples, &function);
     let surface = isosurface::extract(&function, iso_value);
     Ok(in_cloud_frame(surface, &samples, &density))
+}
+
+/// Requires the memory of the solver: per node its tables, the solution at 125 corners, the normal field
+/// and five vectors of the conjugate gradients at 64; per sample its constraint.
+fn require_memory(tree: &Octree, samples: &Samples) -> Result<(), MemoryError> {
+    const NODE_BYTES: f64 = 4096.0;
+    const SAMPLE_BYTES: f64 = 256.0;
+    let nodes: usize = tree.levels.iter().map(Level::len).sum();
+    memory::require(
+        "the octree of the surface",
+        nodes as f64 * NODE_BYTES + samples.len() as f64 * SAMPLE_BYTES,
+        "lower depth or local_map_size",
+    )
 }
 
 /// The values of χ at the corners of all nodes, per level.
@@ -199,5 +229,6 @@ fn in_cloud_frame(surface: UnitMesh, samples: &Samples, density: &DensityField) 
         mesh,
         densities,
         dropped_points: samples.dropped,
+        cell_m: samples.cell_m(),
     }
 }

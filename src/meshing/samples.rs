@@ -22,7 +22,7 @@ pub struct Samples {
     /// Lower corner of the cube in the frame of the cloud [m].
     origin: Vec3,
     /// Edge length of the cube [m].
-    side_m: f32,
+    pub side_m: f32,
     /// Number of points ignored: not finite, without a normal, or without weight.
     pub dropped: usize,
 }
@@ -92,6 +92,11 @@ impl Samples {
     /// Number of points.
     pub fn len(&self) -> usize {
         self.codes.len()
+    }
+
+    /// Edge of the finest cells [m].
+    pub fn cell_m(&self) -> f32 {
+        self.side_m / (1_u32 << self.depth) as f32
     }
 
     /// Transforms a point from the unit cube to the frame of the cloud [m].

@@ -16,6 +16,7 @@ pub use selection::renderer;
 
 use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::{Beam, LidarModel};
+use crate::memory::MemoryError;
 
 /// Renders the map from many poses at once. Ranges are infinite where there is no surface.
 pub trait RangeRenderer: Send + Sync {
@@ -166,6 +167,8 @@ pub enum RenderError {
         "the map needs {needed} bytes on the graphics device, which binds at most {limit}; use --backend cpu"
     )]
     MapTooLarge { needed: u64, limit: u64 },
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
 }
 
 #[cfg(test)]

@@ -11,6 +11,7 @@ use super::odometry::OdometryConfig;
 use super::scanner::ScannerConfig;
 use super::street_config::StreetConfig;
 use super::traffic::TrafficConfig;
+use crate::memory::MemoryError;
 use crate::validation::{InvalidValue, Validate, nested, positive, require};
 
 /// A drive along a street: the configuration of `simulate`.
@@ -83,6 +84,8 @@ impl Validate for SimulationConfig {
 pub enum SimulationError {
     #[error(transparent)]
     InvalidValue(#[from] InvalidValue),
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
     #[error(
         "the path is {length_m:.1} m long, at least {least_m} m are needed; add segments to `path`, or choose another `path_pose_file`"
     )]

@@ -54,6 +54,7 @@ pub use street_config::{CrossSectionConfig, StreetConfig};
 pub use traffic::TrafficConfig;
 
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
+use crate::memory::{self, MemoryError};
 use crate::recording::Calibration;
 use crate::validation::Validate as _;
 use centreline::SHORTEST_M;
@@ -83,6 +84,7 @@ impl Simulation {
         config.validate()?;
         let (path, stations_m) = driven_path(config, recorded)?;
         let length_m = path.length_m();
+        require_memory(&path, &config.street.ground)?;
         let street = Street::new(&path, &config.street, config.seed);
         let mut ego_motion = EgoMotion::new(
             path,
@@ -219,6 +221,27 @@ fn driven_path(
     }
     let path = Centreline::from_segments(&config.path, -sensor_height_m);
     Ok((path, None))
+}
+
+/// Requires the memory of the ground: its samples in the rectangle around the path and side streets, and
+/// its triangles with their hierarchy within reach of the path.
+fn require_memory(path: &Centreline, ground: &CrossSectionConfig) -> Result<(), MemoryError> {
+    const SAMPLE_BYTES: f64 = 16.0;
+    const CELL_BYTES: f64 = 1000.0;
+    let (mut min, mut max) = (path.at(0.0).position, path.at(0.0).position);
+    let length_m = path.length_m();
+    for step in 0..=(length_m / 10.0) as usize {
+        let position = path.at(10.0 * step as f64).position;
+        (min, max) = (min.min(position), max.max(position));
+    }
+    let margin_m = 2.0 * (ground.reach_m + layout::EXTENSION_M);
+    let samples = (max.x - min.x + margin_m) * (max.y - min.y + margin_m);
+    let cells = 2.0 * ground.reach_m * (length_m + margin_m);
+    memory::require(
+        "the ground of the street",
+        (samples * SAMPLE_BYTES + cells * CELL_BYTES) / ground.cell_m.powi(2),
+        "raise street.ground.cell_m, or shorten path or street.ground.reach_m",
+    )
 }
 
 /// Time of a scan [s].

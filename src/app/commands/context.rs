@@ -7,7 +7,10 @@ use super::interrupt::Interrupt;
 use super::logging::{self, RunLog};
 use super::progress::Progress;
 use crate::app::cli::MachineArgs;
+use crate::memory;
 use crate::rendering::Backend;
+
+const GIB: f64 = (1_u64 << 30) as f64;
 
 /// Machine and user interface of a command.
 #[derive(Clone, Debug)]
@@ -30,6 +33,8 @@ impl Context {
         let progress = Progress::new(level);
         let log = RunLog::default();
         logging::start(level, &progress, &log);
+        let half_gib = 0.5 * machine_bytes() / GIB;
+        memory::set_budget((machine.memory.unwrap_or(half_gib) * GIB) as u64);
         let threads = machine.threads.map_or(0, usize::from);
         rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
@@ -43,4 +48,24 @@ impl Context {
             log,
         })
     }
+}
+
+/// The memory that this process can have: that of the machine or, if less, of its container or the limit
+/// of its address space; 8 GiB where the system does not say [bytes].
+fn machine_bytes() -> f64 {
+    let number_in = |path: &str, name: &str, unit: f64| -> Option<f64> {
+        let text = std::fs::read_to_string(path).ok()?;
+        let line = text.lines().find(|line| line.starts_with(name))?;
+        let number = line[name.len()..].split_whitespace().next()?;
+        Some(unit * number.parse::<f64>().ok()?)
+    };
+    [
+        number_in("/proc/meminfo", "MemTotal:", 1024.0),
+        number_in("/sys/fs/cgroup/memory.max", "", 1.0),
+        number_in("/proc/self/limits", "Max address space", 1.0),
+    ]
+    .into_iter()
+    .flatten()
+    .reduce(f64::min)
+    .unwrap_or(8.0 * GIB)
 }

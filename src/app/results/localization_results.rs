@@ -63,6 +63,11 @@ impl ParticleLog {
         }
     }
 
+    /// Size in memory [bytes].
+    pub fn bytes(&self) -> usize {
+        size_of_val(&*self.rows)
+    }
+
     /// Number of frames.
     pub fn len(&self) -> usize {
         self.ends.len()

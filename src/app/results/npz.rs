@@ -13,6 +13,7 @@ use zip::result::ZipError;
 use zip::write::SimpleFileOptions;
 use zip::{ZipArchive, ZipWriter};
 
+use crate::memory;
 use crate::recording::scan_files::npy::has_endless_header;
 
 /// Size of the buffer between decompression and numbers [bytes].
@@ -184,6 +185,8 @@ fn open_array<'a>(mut entry: io::Take<impl Read + 'a>) -> Result<(Vec<usize>, Nu
         needed == u128::from(found),
         "its shape {shape:?} needs {needed} bytes of numbers, but there are {found}"
     );
+    // Numbers of single precision and rows of poses take about as much as in the file.
+    memory::require("the array", needed as f64, "give a smaller file")?;
     let shape = shape.into_iter().map(|extent| extent as usize).collect();
     Ok((shape, numbers))
 }

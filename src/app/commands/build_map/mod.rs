@@ -56,6 +56,7 @@ pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
         stage_seconds: clock.seconds(),
         quality: MapQuality::of(&residuals),
         truth,
+        octree_cell_m: (local_maps.iter()).fold(0.0, |largest, counts| counts.cell_m.max(largest)),
         local_maps,
         ..BuildReport::of_map(&mesh, &path, &config.mesh_file, started)
     };

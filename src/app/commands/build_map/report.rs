@@ -30,6 +30,8 @@ pub struct BuildReport {
     pub triangles_per_100m: f64,
     /// Megabytes per 100 m of path.
     pub mb_per_100m: f64,
+    /// Edge of the finest octree cells, the largest of the local maps [m].
+    pub octree_cell_m: f32,
     /// Wall time of the whole build [s].
     pub seconds: f64,
     /// Wall time per stage, summed over the local maps made in this run [s].
@@ -82,6 +84,7 @@ impl BuildReport {
                 "rate",
                 format!("{:.1} scans/s", self.mapped_frames as f64 / self.seconds),
             ),
+            ("octree cell", format!("{:.2} m", self.octree_cell_m)),
             ("triangles", self.triangles.to_string()),
             ("size", format!("{:.1} MB", self.map_mb)),
             (

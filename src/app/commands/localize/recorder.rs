@@ -11,6 +11,7 @@ use crate::app::results::{LocalizationResults, ParticleLog};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::localization::Estimate;
 use crate::map::Map;
+use crate::memory;
 use crate::recording::Frame;
 use crate::refinement::FrameResult;
 
@@ -74,6 +75,11 @@ impl Run {
         results
             .particles
             .push_frame(run_output::particle_rows(&estimate.particles));
+        memory::require(
+            "the particles of all frames",
+            results.particles.bytes() as f64,
+            "lower numParticles or n_scans",
+        )?;
         self.off_ground += usize::from(!estimate.on_mapped_ground);
         push(&mut results.estimates, estimate.pose);
         push(
