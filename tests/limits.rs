@@ -126,7 +126,7 @@ fn a_budget_of_memory_that_does_not_suffice_is_an_error_that_names_what_needs_it
     let search = localize().set("initialization", "extent");
     (search.set("grid_res", "0.05")).fails_with(&expected("the search grid", "grid_res"));
     let search = localize().set("initialization", "corridor");
-    (search.set("grid_res", "0.1")).fails_with(&expected("the panoramas", "panorama.rows"));
+    (search.set("grid_res", "0.05")).fails_with(&expected("the panoramas", "panorama.rows"));
     assert!(!recording.path("results/localization.npz").exists());
 
     let street = fpmcl("simulate").with(TINY);

@@ -71,15 +71,14 @@ impl Run {
             }
         }
         let results = &mut self.results;
-        results.frames.push(frame.number);
-        results
-            .particles
-            .push_frame(run_output::particle_rows(&estimate.particles));
+        let particles = run_output::particle_rows(&estimate.particles);
         memory::require(
             "the particles of all frames",
-            results.particles.bytes() as f64,
+            (results.particles.bytes() + size_of_val(&*particles)) as f64,
             "lower numParticles or n_scans",
         )?;
+        results.frames.push(frame.number);
+        results.particles.push_frame(particles);
         self.off_ground += usize::from(!estimate.on_mapped_ground);
         push(&mut results.estimates, estimate.pose);
         push(
