@@ -27,6 +27,7 @@ fn maps_are_bounded() {
         ("crop_z", ".inf", "500"),
         ("voxel_size", "1e-9", "0.001"),
         ("simplify_resolution", "1e-6", "0.01"),
+        ("max_distance_m", "1e-9", "0.001"),
         ("number_of_iterations", "1000000000", "1000"),
         ("depth", "40", "12"),
         ("local_map_size", "1000000000", "10000"),

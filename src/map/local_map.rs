@@ -11,7 +11,7 @@ use super::vertex_ground;
 use super::visibility::{self, VisibilityConfig};
 use crate::geometry::{PointCloud, TriangleMesh};
 use crate::meshing::{self, MeshingError, PoissonConfig, Reconstruction};
-use crate::validation::{InvalidValue, Validate, fraction, in_range, nested, positive, require};
+use crate::validation::{InvalidValue, Validate, fraction, in_range, nested, require};
 
 /// Longest edge of the simplified ground in cells: vertices of neighbouring cells are less than two
 /// cells apart along an axis.
@@ -66,7 +66,7 @@ impl Validate for LocalMapConfig {
             self.min_density,
             "it is the fraction of the vertices to remove, 0 or greater and less than 1",
         )?;
-        positive("max_distance_m", self.max_distance_m)?;
+        in_range("max_distance_m", self.max_distance_m, 0.001..=1000.0)?;
         nested("visibility", &self.visibility)?;
         fraction("ground_threshold", self.ground_threshold)?;
         let resolution_m = self.simplify_resolution_m;
