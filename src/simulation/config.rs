@@ -12,7 +12,7 @@ use super::scanner::ScannerConfig;
 use super::street_config::StreetConfig;
 use super::traffic::TrafficConfig;
 use crate::memory::MemoryError;
-use crate::validation::{InvalidValue, Validate, nested, positive, require};
+use crate::validation::{InvalidValue, Validate, in_range, nested, require};
 
 /// A drive along a street: the configuration of `simulate`.
 ///
@@ -63,7 +63,7 @@ const LONGEST_M: f64 = 100_000.0;
 
 impl Validate for SimulationConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        positive("drive", self.drive)?;
+        in_range("drive", self.drive, 1..=1_000_000)?;
         let length_m: f64 = self.path.iter().map(|segment| segment.length_m).sum();
         let remedy = format!("its segments must be at most {LONGEST_M} m long together");
         require(length_m <= LONGEST_M, "path", length_m, remedy)?;

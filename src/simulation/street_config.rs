@@ -46,7 +46,7 @@ impl Validate for StreetConfig {
         )?;
         fraction("built_share", self.built_share)?;
         fraction("parked_share", self.parked_share)?;
-        in_range("lamp_spacing_m", self.lamp_spacing_m, 1.0..=1e6)?;
+        in_range("lamp_spacing_m", self.lamp_spacing_m, 6.0..=1e6)?;
         in_range("plants_per_100_m", self.plants_per_100_m, 0.001..=1000.0)?;
         nested("ground", &self.ground)
     }
