@@ -1,15 +1,25 @@
 //! Atomic writing of files: a file is complete or does not exist.
+//!
+//! The temporary file of `map.ply` is `.fpmcl-map.ply-XXXXXX.part` in the same folder. It is locked
+//! while it is written, so that one that a killed process left is known by being unlocked.
 
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use tempfile::{Builder, NamedTempFile};
+
 /// Temporary files of writes that are under way.
 static UNFINISHED: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
 
-/// Writes a temporary file in the folder of `path`, which is created if necessary, and renames it
-/// to `path` once it is complete. On an error or an interruption, `path` is unchanged.
+const PREFIX: &str = ".fpmcl-";
+/// Random characters in the name of a temporary file.
+const RANDOM: usize = 6;
+const SUFFIX: &str = ".part";
+
+/// Writes a temporary file in the folder of `path`, which must exist, and renames it to `path` once
+/// it is complete. On an error or an interruption, `path` is unchanged.
 pub fn write_atomically<T, E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<&mut File>) -> Result<T, E>,
@@ -35,7 +45,7 @@ pub fn abandon_writes() {
     let unfinished = unfinished();
     for path in unfinished.iter() {
         // There is nobody left to whom a failure matters.
-        let _ = std::fs::remove_file(path);
+        let _ = fs::remove_file(path);
     }
     // A write that goes on must not begin another file.
     std::mem::forget(unfinished);
@@ -54,30 +64,79 @@ impl Drop for Unfinished {
     }
 }
 
-/// Creates a temporary file in the folder of `path`, and that folder if necessary. Its permissions
-/// are those that the umask allows, as of other files.
-pub fn temporary_beside(path: &Path) -> io::Result<tempfile::NamedTempFile> {
-    let folder = match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    };
-    std::fs::create_dir_all(folder)?;
-    let mut builder = tempfile::Builder::new();
+/// Creates the temporary file of `path` in its folder. Its permissions are those that the umask
+/// allows, as of other files.
+pub fn temporary_beside(path: &Path) -> io::Result<NamedTempFile> {
+    let mut builder = Builder::new();
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt as _;
-        builder.permissions(std::fs::Permissions::from_mode(0o666));
+        builder.permissions(fs::Permissions::from_mode(0o666));
     }
-    builder
-        .prefix(".fpmcl-")
-        .suffix(".part")
-        .tempfile_in(folder)
+    let temporary = builder
+        .prefix(&temporary_prefix(path))
+        .rand_bytes(RANDOM)
+        .suffix(SUFFIX)
+        .tempfile_in(folder_of(path))?;
+    // Some file systems have no locks; what is left there stays.
+    let _ = temporary.as_file().try_lock();
+    Ok(temporary)
+}
+
+/// Removes the temporary files of `path` that killed processes left, and if it is a folder, those
+/// of all files below it.
+pub fn remove_abandoned(path: &Path) -> io::Result<()> {
+    let prefix = temporary_prefix(path);
+    let length = prefix.len() + RANDOM + SUFFIX.len();
+    remove_unlocked(folder_of(path), &|name| {
+        name.starts_with(&prefix) && name.len() == length
+    })?;
+    remove_abandoned_below(path)
+}
+
+fn remove_abandoned_below(folder: &Path) -> io::Result<()> {
+    if !fs::symlink_metadata(folder).is_ok_and(|found| found.is_dir()) {
+        return Ok(());
+    }
+    for entry in fs::read_dir(folder)? {
+        remove_abandoned_below(&entry?.path())?;
+    }
+    remove_unlocked(folder, &|name| name.starts_with(PREFIX))
+}
+
+/// Removes the unlocked temporary files of a folder whose names match.
+fn remove_unlocked(folder: &Path, matches: &dyn Fn(&str) -> bool) -> io::Result<()> {
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        let name = entry.file_name().to_string_lossy().into_owned();
+        if name.ends_with(SUFFIX)
+            && matches(&name)
+            && entry.file_type()?.is_file()
+            && File::open(entry.path()).is_ok_and(|file| file.try_lock().is_ok())
+        {
+            fs::remove_file(entry.path())?;
+        }
+    }
+    Ok(())
+}
+
+/// The folder of a file.
+pub fn folder_of(path: &Path) -> &Path {
+    match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    }
+}
+
+/// The start of the names of the temporary files of `path`, short enough for file systems.
+fn temporary_prefix(path: &Path) -> String {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let name: String = name.chars().take(50).collect();
+    format!("{PREFIX}{name}-")
 }
 
 #[cfg(test)]
 mod tests {
-    use std::fs;
-
     use super::*;
 
     #[test]
@@ -97,12 +156,44 @@ mod tests {
     #[test]
     fn a_whole_write_replaces_what_was_there() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("new/report.json");
+        let path = folder.path().join("report.json");
         for text in ["old", "new"] {
-            let outcome: io::Result<()> =
-                write_atomically(&path, |writer| writer.write_all(text.as_bytes()));
-            outcome.unwrap();
+            write(&path, text).unwrap();
         }
         assert_eq!(fs::read_to_string(&path).unwrap(), "new");
+    }
+
+    #[test]
+    fn a_folder_that_vanished_is_an_error() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("gone/report.json");
+        assert_eq!(
+            write(&path, "text").unwrap_err().kind(),
+            io::ErrorKind::NotFound
+        );
+        assert!(!folder.path().join("gone").exists());
+    }
+
+    #[test]
+    fn only_unlocked_temporary_files_of_the_same_target_are_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        fs::create_dir_all(path("plots/inner")).unwrap();
+        let others = [".fpmcl-a-b-123456.part", ".fpmcl-ab-123456.part", "a"];
+        let abandoned = [".fpmcl-a-123456.part", "plots/inner/.fpmcl-c-123456.part"];
+        for name in others.iter().chain(&abandoned) {
+            fs::write(path(name), "").unwrap();
+        }
+        let in_use = temporary_beside(&path("a")).unwrap();
+        for name in ["a", "plots", "missing"] {
+            remove_abandoned(&path(name)).unwrap();
+        }
+        assert!(others.iter().all(|name| path(name).exists()));
+        assert!(!abandoned.iter().any(|name| path(name).exists()));
+        assert!(in_use.path().exists());
+    }
+
+    fn write(path: &Path, text: &str) -> io::Result<()> {
+        write_atomically(path, |writer| writer.write_all(text.as_bytes()))
     }
 }

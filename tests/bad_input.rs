@@ -214,11 +214,11 @@ fn a_map_that_is_not_ply_or_is_truncated_is_refused() {
 #[test]
 fn an_existing_map_is_kept_unless_forced() {
     let recording = Recording::street(4);
-    recording.write("map.ply", "existing");
+    recording.write("map.ply", "ply of before");
     recording
         .fpmcl("build-map")
         .fails_with(&["map.ply exists", "--force"]);
-    assert_eq!(recording.bytes("map.ply"), b"existing");
+    assert_eq!(recording.bytes("map.ply"), b"ply of before");
     recording.fpmcl("build-map").with("--force").succeeds();
     assert!(recording.bytes("map.ply").starts_with(b"ply"));
 }
@@ -305,8 +305,9 @@ fn a_damaged_scan_loses_no_frame_before_it() {
 #[test]
 fn a_picture_that_cannot_be_written_loses_no_frame() {
     let recording = mapped(4);
-    fs::create_dir(recording.path("results")).unwrap();
-    recording.write("results/loc_plots", "a file in the place of a folder");
+    // A folder in the place of a picture, after an earlier run.
+    fs::create_dir_all(recording.path("results/loc_plots/000000.png")).unwrap();
+    recording.write("results/.fpmcl", "claimed loc_plots\n");
     let stderr = recording
         .fpmcl("localize")
         .set("visualize", "True")

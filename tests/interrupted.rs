@@ -290,12 +290,12 @@ fn parts_of_another_configuration_are_not_reused() {
 #[test]
 fn an_interrupted_build_leaves_an_existing_map_unchanged() {
     let recording = Recording::street(12);
-    recording.write("map.ply", "existing");
+    recording.write("map.ply", "ply of before");
     let scan = PipedScan::new(&recording, 7);
     let forced = [BUILD_MAP, &["--force"]].concat();
     let (code, stderr) = interrupted(&recording, &forced, &scan);
     assert_eq!(code, Some(130), "{stderr}");
-    assert_eq!(recording.bytes("map.ply"), b"existing");
+    assert_eq!(recording.bytes("map.ply"), b"ply of before");
 }
 
 #[test]

@@ -6,13 +6,14 @@ use anyhow::{Context as _, Result, bail};
 use super::{Context, output};
 use crate::app::cli::CompareArgs;
 use crate::app::comparison::{Executor, Layout, Outcome, PlannedRun, RunId, collect, planned_runs};
-use crate::app::config::{self, ComparisonConfig};
+use crate::app::config::{self, CommandConfig as _, ComparisonConfig};
 
 /// Executes the missing runs, or the requested part of the work; returns the text for standard
 /// output.
 pub fn run(args: &CompareArgs, context: &Context) -> Result<String> {
     let path = args.source.config.as_deref();
     let config: ComparisonConfig = config::load(path, &args.source.settings)?;
+    let context = &context.with_config_file(path, ComparisonConfig::PATH);
     let runs = planned_runs(&config)?;
     let layout = Layout {
         root: config.output_folder.clone(),
@@ -25,10 +26,10 @@ pub fn run(args: &CompareArgs, context: &Context) -> Result<String> {
     } else if let Some(id) = &args.job {
         run_one(&runs, id, &mut executor)
     } else if args.collect {
-        collect(&config, &runs, &layout)
+        collect(&config, &runs, &layout, context)
     } else {
         let failed = run_all(&runs, &mut executor)?;
-        let tables = collect(&config, &runs, &layout)?;
+        let tables = collect(&config, &runs, &layout, context)?;
         if failed.is_empty() {
             return Ok(tables);
         }

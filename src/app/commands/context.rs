@@ -1,5 +1,7 @@
 //! What every command gets beside its configuration.
 
+use std::path::{Path, PathBuf};
+
 use anyhow::Context as _;
 use tracing::level_filters::LevelFilter;
 
@@ -25,6 +27,8 @@ pub struct Context {
     pub progress: Progress,
     /// Copy of the log for the results of a run.
     pub log: RunLog,
+    /// The configuration file, which no output may replace.
+    pub config_file: Option<PathBuf>,
 }
 
 impl Context {
@@ -46,7 +50,21 @@ impl Context {
             interrupt: Interrupt::install().context("listening for Ctrl-C")?,
             progress,
             log,
+            config_file: None,
         })
+    }
+
+    /// The context of a command with a configuration file: the given one, else the default.
+    pub fn with_config_file(&self, given: Option<&Path>, default: &str) -> Self {
+        Self {
+            config_file: Some(given.unwrap_or(Path::new(default)).to_owned()),
+            ..self.clone()
+        }
+    }
+
+    /// The configuration file as an input.
+    pub fn input(&self) -> Option<(&'static str, &Path)> {
+        Some(("the configuration file", self.config_file.as_deref()?))
     }
 }
 

@@ -5,22 +5,28 @@ use std::path::Path;
 
 use anyhow::{Result, ensure};
 
-use super::input;
-use super::run_output::{self, RunFiles};
-use super::{output, run_page};
+use super::claims::{Claims, Outputs};
+use super::run_output::{self, REPORT_FILES, RunFiles};
+use super::{Context, input, output, run_page};
 use crate::app::config::{self, EvaluationConfig, LocalizationConfig};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
+use crate::files::folder_of;
 use crate::geometry::{Pose2, TriangleMesh, pose2_from_pose3};
 use crate::map::{MappingPath, ply};
 use crate::recording::poses::DrivePoses;
 
 /// Compares a result of `localize`, `refine` or range-mcl with the ground truth.
-pub fn run(config: &EvaluationConfig) -> Result<Report> {
+pub fn run(config: &EvaluationConfig, context: &Context) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
-    let mut results = LocalizationResults::read(&config.result_file)?;
-    scale(&mut results, config.grid_resolution);
     let files = RunFiles::beside(&config.result_file);
+    let main = files.file("effective_evaluation.yml");
+    let mut claims = prepare(config, context, &main)?;
+    let mut results = LocalizationResults::read(&config.result_file)?;
+    run_output::warn_of_shortfall(&results, &config.result_file);
+    let mut about = about(config, &files)?;
+    about.extend(run_output::shortfall(&results));
+    scale(&mut results, config.grid_resolution);
     if let Some(pose_file) = &config.pose_file {
         results.ground_truth = Some(truth(pose_file, config, &results, &files)?);
     }
@@ -41,10 +47,11 @@ pub fn run(config: &EvaluationConfig) -> Result<Report> {
         particle_select_ratio: config.particle_select_ratio,
     };
     results.estimates = Some(results.estimates_or_particle_means(&rules)?);
-    let report = run_output::evaluate(&results, &rules, about(config, &files)?)?;
+    let report = run_output::evaluate(&results, &rules, about)?;
     if config.save_evaluation_results {
+        claims.begin(&main)?;
         run_output::write_report(&files, &results, &report)?;
-        output::write_yaml(&files.file("effective_evaluation.yml"), config)?;
+        output::write_yaml(&main, config)?;
     }
     if config.plot_loc_traj {
         let map = map_of(&files)?.map(|(mesh, _)| mesh);
@@ -52,8 +59,39 @@ pub fn run(config: &EvaluationConfig) -> Result<Report> {
     }
     if config.save_evaluation_results {
         run_page::write(&files, &report)?;
+        claims.finish(&main)?;
     }
     Ok(report)
+}
+
+/// Prepares the configured outputs; the effective configuration is the main one.
+fn prepare(config: &EvaluationConfig, context: &Context, main: &Path) -> Result<Claims> {
+    let reports = REPORT_FILES.iter();
+    let mut names: Vec<&str> = reports
+        .copied()
+        .filter(|_| config.save_evaluation_results)
+        .collect();
+    names.extend(config.plot_loc_traj.then_some("plots"));
+    if names.is_empty() {
+        return Claims::read(folder_of(main));
+    }
+    let optional = [
+        ("pose_file", &config.pose_file),
+        ("calib_file", &config.calib_file),
+    ];
+    let inputs = (optional.iter()).filter_map(|(key, path)| Some((*key, path.as_deref()?)));
+    let outputs = Outputs {
+        key: "result_file",
+        main,
+        magic: None,
+        names: names.into_iter().map(str::to_owned).collect(),
+        inputs: inputs
+            .chain([("result_file", config.result_file.as_path())])
+            .chain(context.input())
+            .collect(),
+        force: true,
+    };
+    outputs.prepare()
 }
 
 /// The inputs and settings of the run from its report, and the evaluated file.

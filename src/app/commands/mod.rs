@@ -11,6 +11,7 @@ pub mod localize;
 pub mod refine;
 pub mod simulate;
 // Shared by them.
+pub mod claims;
 mod context;
 mod input;
 pub mod interrupt;
@@ -39,28 +40,28 @@ use interrupt::Interrupted;
 pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
     match command {
         Command::BuildMap(args) => {
-            let config: BuildMapConfig = load(args)?;
-            output::print(&build_map::run(&config, context)?.table())
+            let (config, context) = configured::<BuildMapConfig>(args, context)?;
+            output::print(&build_map::run(&config, &context)?.table())
         }
         Command::Localize(args) => {
-            let config: LocalizationConfig = load(args)?;
-            output::print(&localize::run(&config, context)?.to_text())
+            let (config, context) = configured::<LocalizationConfig>(args, context)?;
+            output::print(&localize::run(&config, &context)?.to_text())
         }
         Command::Refine(args) => {
-            let config: RefinementConfig = load(args)?;
-            output::print(&refine::run(&config, context)?.to_text())
+            let (config, context) = configured::<RefinementConfig>(args, context)?;
+            output::print(&refine::run(&config, &context)?.to_text())
         }
         Command::Evaluate(args) => {
-            let config: EvaluationConfig = load(args)?;
-            output::print(&evaluate::run(&config)?.to_text())
+            let (config, context) = configured::<EvaluationConfig>(args, context)?;
+            output::print(&evaluate::run(&config, &context)?.to_text())
         }
         Command::Simulate(args) => {
-            let config: SimulationConfig = load(args)?;
+            let (config, context) = configured::<SimulationConfig>(args, context)?;
             let existing = match args.force {
                 true => simulate::Existing::Replace,
                 false => simulate::Existing::Keep,
             };
-            output::print(&simulate::run(&config, existing, context)?)
+            output::print(&simulate::run(&config, existing, &context)?)
         }
         Command::Compare(args) => output::print(&compare::run(args, context)?),
         Command::Demo(args) => output::print(&demo::run(args, context)?),
@@ -95,6 +96,15 @@ pub fn report(error: &anyhow::Error) {
 /// Exit code of a failed run: 130 if it was interrupted, as in shells, else 1; 2 is wrong usage.
 pub fn exit_code(error: &anyhow::Error) -> ExitCode {
     ExitCode::from(if error.is::<Interrupted>() { 130 } else { 1 })
+}
+
+/// Loads the configuration of a command, and notes its file.
+fn configured<T: CommandConfig>(
+    args: &RunArgs,
+    context: &Context,
+) -> Result<(T, Context), ConfigError> {
+    let path = args.source.config.as_deref();
+    Ok((load(args)?, context.with_config_file(path, T::PATH)))
 }
 
 /// Loads the configuration of a command; `--seed` and `--force` are the last settings of a

@@ -4,34 +4,11 @@ use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
 
-use anyhow::{Context as _, bail};
+use anyhow::Context as _;
 use serde::Serialize;
 
 use crate::app::config::to_yaml;
-use crate::files::{temporary_beside, write_atomically};
-
-/// Checks before any work that `path` can be written: an existing file needs `--force`, and its
-/// folder is created and must accept new files. `key` is the configuration key of the file.
-pub fn prepare(path: &Path, key: &str, force: bool) -> anyhow::Result<()> {
-    if path.is_dir() {
-        bail!(
-            "{} is a folder; give {key} the name of a file",
-            path.display()
-        );
-    }
-    if path.exists() && !force {
-        bail!(
-            "{} exists; add --force to replace it, or choose another {key}",
-            path.display()
-        );
-    }
-    temporary_beside(path).map(drop).with_context(|| {
-        format!(
-            "{key} is {}, and nothing can be written there; choose another {key}",
-            path.display()
-        )
-    })
-}
+use crate::files::write_atomically;
 
 /// Writes a file atomically.
 pub fn write_file<E: Into<anyhow::Error>>(
@@ -71,6 +48,16 @@ pub fn create_folder(folder: &Path) -> anyhow::Result<()> {
     fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))
 }
 
+/// Creates a folder in one that must exist.
+pub fn create_subfolder(folder: &Path) -> anyhow::Result<()> {
+    match fs::create_dir(folder) {
+        Err(error) if !folder.is_dir() => {
+            Err(error).with_context(|| format!("cannot create {}", folder.display()))
+        }
+        _ => Ok(()),
+    }
+}
+
 /// Removes a file, if it exists.
 pub fn remove_if_exists(path: &Path) -> anyhow::Result<()> {
     match fs::remove_file(path) {
@@ -92,33 +79,5 @@ pub fn print(text: &str) -> anyhow::Result<()> {
             Err(error).context("writing to standard output")
         }
         _ => Ok(()),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn an_existing_file_needs_force() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("map.ply");
-        prepare(&path, "mesh_file", false).unwrap();
-        fs::write(&path, "kept").unwrap();
-        let message = prepare(&path, "mesh_file", false).unwrap_err().to_string();
-        assert!(message.contains("map.ply exists; add --force"), "{message}");
-        prepare(&path, "mesh_file", true).unwrap();
-        assert_eq!(fs::read(&path).unwrap(), b"kept");
-    }
-
-    #[test]
-    fn an_impossible_folder_is_an_error_before_the_work() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("file");
-        fs::write(&file, "").unwrap();
-        let message = prepare(&file.join("map.ply"), "mesh_file", false)
-            .unwrap_err()
-            .to_string();
-        assert!(message.contains("choose another mesh_file"), "{message}");
     }
 }

@@ -1,16 +1,20 @@
 //! `refine`: refines the trajectory of `localize` frame by frame and smooths it.
 
+use std::fs;
+use std::path::Path;
 use std::time::Instant;
 
 use anyhow::{Result, ensure};
 
+use super::claims::{Claims, Outputs};
 use super::interrupt::Interrupted;
-use super::run_output::{self, RunFiles};
+use super::run_output::{self, REFINEMENT_FILES, REPORT_FILES, RunFiles};
 use super::stages::Inputs;
 use super::{Context, input, odometry, output, run_page};
 use crate::app::config::{OdometrySource, RefinementConfig};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
+use crate::files::remove_abandoned;
 use crate::geometry::{Pose2, pose2_from_pose3};
 use crate::localization::State;
 use crate::localization::odometry::demonstration_noise;
@@ -29,12 +33,17 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
     let inputs = inputs(config);
     inputs.require()?;
+    let files = RunFiles::beside(&config.result_file);
+    let main = files.file("effective_refinement.yml");
+    let mut claims = prepare(config, context, &inputs, &main)?;
     let mut results = LocalizationResults::read(&config.result_file)?;
+    let is_unfinished = claims.state(&main) == Some("unfinished");
     ensure!(
-        results.refined.is_none() || config.force,
+        results.refined.is_none() || config.force || is_unfinished,
         "{} already has refined poses; add --force to replace them",
         config.result_file.display()
     );
+    run_output::warn_of_shortfall(&results, &config.result_file);
     let map = inputs.load_map(None, context)?;
     let sequence = inputs.open_recording(&config.selection(), &map)?;
     let sequence = frames_of(sequence, &results, config)?;
@@ -51,7 +60,38 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     results.refined = Some(refined.poses.clone());
     results.refined_covariances = Some(refined.covariances.clone());
     results.refine_runtimes_s = Some(runtimes_s);
-    write_run(config, context, &map, &sequence, &results, &refined)
+    claims.begin(&main)?;
+    let report = write_run(config, context, &files, &map, &sequence, &results, &refined)?;
+    claims.finish(&main)?;
+    Ok(report)
+}
+
+/// Prepares the outputs; the effective configuration is the main one, as the result exists already.
+fn prepare(
+    config: &RefinementConfig,
+    context: &Context,
+    inputs: &Inputs,
+    main: &Path,
+) -> Result<Claims> {
+    ensure!(
+        fs::symlink_metadata(&config.result_file)?.is_file(),
+        "result_file is {}, which is not a regular file; refine replaces it: give the path of the file itself",
+        config.result_file.display()
+    );
+    let mut names: Vec<&str> = [REPORT_FILES, REFINEMENT_FILES].concat();
+    names.push("ground_truth_poses.npy");
+    names.extend(config.plot_loc_results.then_some("plots"));
+    let outputs = Outputs {
+        key: "result_file",
+        main,
+        magic: None,
+        names: names.into_iter().map(str::to_owned).collect(),
+        inputs: inputs.files().into_iter().chain(context.input()).collect(),
+        force: true,
+    };
+    let claims = outputs.prepare()?;
+    remove_abandoned(&config.result_file)?;
+    Ok(claims)
 }
 
 fn inputs(config: &RefinementConfig) -> Inputs<'_> {
@@ -62,6 +102,7 @@ fn inputs(config: &RefinementConfig) -> Inputs<'_> {
         scan_folder: &config.scan_folder,
         pose_file: &config.pose_file,
         calib_file: config.calib_file.as_deref(),
+        odometry_file: config.odometry_file.as_deref(),
     }
 }
 
@@ -193,15 +234,15 @@ fn refiner_config(config: &RefinementConfig) -> RefinerConfig {
 fn write_run(
     config: &RefinementConfig,
     context: &Context,
+    files: &RunFiles,
     map: &Map,
     sequence: &Sequence,
     results: &LocalizationResults,
     refined: &RefinedTrajectory,
 ) -> Result<Report> {
-    let files = RunFiles::beside(&config.result_file);
     let saving = context.interrupt.saving();
-    run_output::write_results(&files, results)?;
-    run_output::write_trajectory(&files, "refined", sequence, &refined.map_from_lidar)?;
+    run_output::write_results(files, results)?;
+    run_output::write_trajectory(files, "refined", sequence, &refined.map_from_lidar)?;
     output::write_yaml(&files.file("effective_refinement.yml"), config)?;
     let odometry = odometry::description(config.odometry, config.odometry_file.as_deref());
     let about = [
@@ -212,16 +253,17 @@ fn write_run(
         ("seed", config.seed.to_string()),
     ]
     .map(|(key, value)| (key.to_owned(), value));
-    let report = run_output::evaluate(results, &RangeMclRules::default(), about.into())?;
-    run_output::write_report(&files, results, &report)?;
+    let about = about.into_iter().chain(run_output::shortfall(results));
+    let report = run_output::evaluate(results, &RangeMclRules::default(), about.collect())?;
+    run_output::write_report(files, results, &report)?;
     let path = config.result_file.display();
     context.interrupt.keeps(format!(
         "the refined trajectory is kept in {path}; plots are missing"
     ));
     drop(saving);
     if config.plot_loc_results {
-        run_output::draw_run(&files, Some(&map.mesh), results)?;
+        run_output::draw_run(files, Some(&map.mesh), results)?;
     }
-    run_page::write(&files, &report)?;
+    run_page::write(files, &report)?;
     Ok(report)
 }

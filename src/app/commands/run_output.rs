@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail};
 
+use super::claims::{Claims, Outputs};
 use super::output;
 use crate::app::plotting::color::{MCL, REFINED};
 use crate::app::plotting::{
@@ -18,6 +19,7 @@ use crate::evaluation::{
     EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, TrajectoryMetrics,
     planar_errors,
 };
+use crate::files::folder_of;
 use crate::geometry::{Pose2, Pose3, StampedPose, TriangleMesh};
 use crate::localization::{Estimate, ParticleSet};
 use crate::recording::Sequence;
@@ -37,14 +39,15 @@ pub struct RunFiles {
 impl RunFiles {
     /// The files beside a result.
     pub fn beside(result: &Path) -> Self {
-        let folder = match result.parent() {
-            Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
-            _ => PathBuf::from("."),
-        };
         Self {
             result: result.to_owned(),
-            folder,
+            folder: folder_of(result).to_owned(),
         }
+    }
+
+    /// The folder of the result.
+    pub fn folder(&self) -> &Path {
+        &self.folder
     }
 
     /// The path of a file beside the result.
@@ -52,51 +55,51 @@ impl RunFiles {
         self.folder.join(name)
     }
 
-    /// The path of a plot in `plots/`, which is created if necessary.
+    /// The path of a plot in `plots/`, which is created if necessary, but not the folder above it.
     pub fn plot(&self, name: &str) -> Result<PathBuf> {
         self.in_folder("plots", name)
     }
 
     fn in_folder(&self, folder: &str, name: &str) -> Result<PathBuf> {
         let folder = self.folder.join(folder);
-        output::create_folder(&folder)?;
+        output::create_subfolder(&folder)?;
         Ok(folder.join(name))
     }
 }
 
-/// Files beside a result whose names do not depend on that of the result.
-const FIXED_NAMES: [&str; 3] = ["report.json", "mcl_tum.txt", "frames.csv"];
+/// Report files of a result.
+pub const REPORT_FILES: [&str; 4] = ["report.json", "report.md", "report.html", "frames.csv"];
+
+/// Further files that localization writes beside its result.
+pub const LOCALIZATION_FILES: [&str; 4] = [
+    "mcl_tum.txt",
+    "mcl_kitti.txt",
+    "ground_truth_poses.npy",
+    "effective_localization.yml",
+];
 
 /// Files that refinement adds to a result.
-const REFINEMENT_FILES: [&str; 4] = [
+pub const REFINEMENT_FILES: [&str; 4] = [
     "refined_tum.txt",
     "refined_kitti.txt",
     "refined_poses.npy",
     "effective_refinement.yml",
 ];
 
-/// Checks before the computation that writing a result will not overwrite another one: neither
-/// its own file nor those of a result with a different name in the same folder.
-pub fn prepare(files: &RunFiles, key: &str, force: bool) -> Result<()> {
-    output::prepare(&files.result, key, force)?;
-    let foreign = FIXED_NAMES
-        .iter()
-        .map(|name| files.file(name))
-        .find(|path| path.exists());
-    match foreign {
-        Some(path) if !force && !files.result.exists() => bail!(
-            "{} exists and belongs to another result; set {key} to a path in a folder of its own, or add --force to overwrite it",
-            path.display()
+/// Prepares the outputs of a new result; an error if there is another one, also one with a
+/// different name in the same folder.
+pub fn prepare(files: &RunFiles, outputs: &Outputs) -> Result<Claims> {
+    let claims = outputs.prepare()?;
+    let names = ["report.json", "mcl_tum.txt", "frames.csv"];
+    let other = names.map(|name| files.file(name));
+    match other.iter().find(|path| path.exists()) {
+        Some(path) if !outputs.force && !files.result.exists() => bail!(
+            "{} exists and belongs to another result; set {} to a path in a folder of its own, or add --force to overwrite it",
+            path.display(),
+            outputs.key
         ),
-        _ => Ok(()),
+        _ => Ok(claims),
     }
-}
-
-/// Removes the files that refinement added to an earlier result.
-pub fn remove_refined(files: &RunFiles) -> Result<()> {
-    REFINEMENT_FILES
-        .iter()
-        .try_for_each(|name| output::remove_if_exists(&files.file(name)))
 }
 
 /// Particles in the layout of the results.
@@ -159,6 +162,21 @@ pub fn write_report(
     output::write_json(&files.file("report.json"), report)?;
     output::write_text(&files.file("report.md"), &report.to_markdown())?;
     write_frames_csv(&files.file("frames.csv"), results)
+}
+
+/// The entry of a report about a result that is not complete.
+pub fn shortfall(results: &LocalizationResults) -> Option<(String, String)> {
+    Some(("frames".to_owned(), results.shortfall()?))
+}
+
+/// Warns of a result that is not complete.
+pub fn warn_of_shortfall(results: &LocalizationResults, path: &Path) {
+    if let Some(shortfall) = results.shortfall() {
+        tracing::warn!(
+            "{} is incomplete: {shortfall}; run localize again for all of them",
+            path.display()
+        );
+    }
 }
 
 /// Compares the estimates and, if there is one, the refined trajectory with the ground truth.

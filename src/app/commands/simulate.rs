@@ -5,8 +5,8 @@
 //! drive_1/labels/000000.label ...   SemanticKITTI class of each point
 //! drive_1/calib.txt times.txt odometry.txt
 //! drive_1/street.ply                the static world in the map frame: ground truth of a map
-//! drive_1/simulation.yml            the configuration, written first
-//! drive_1/executable.txt            hash of the executable that wrote the drive
+//! drive_1/executable.txt            hash of the executable that wrote the drive, written first
+//! drive_1/simulation.yml            the configuration
 //! drive_1/poses.txt                 written last
 //! ```
 //!
@@ -19,13 +19,14 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
 
-use anyhow::{Context as _, Result, bail};
+use anyhow::{Context as _, Result, bail, ensure};
 use rayon::prelude::*;
 
 use super::interrupt::{Interrupt, Interrupted};
 use super::output::{self, write_file};
 use super::progress::Task;
 use super::{Context, version};
+use crate::files::remove_abandoned;
 use crate::geometry::Pose3;
 use crate::map::ply;
 use crate::recording::poses::{CameraPoses, write_kitti, write_times};
@@ -141,7 +142,13 @@ fn resolve_existing(
     let folder = config.drive_folder();
     let name = folder.display();
     match (folder_state(config, simulation)?, existing) {
-        (_, Existing::Replace) => remove_drive(&folder)?,
+        (state, Existing::Replace) => {
+            ensure!(
+                matches!(state, FolderState::Empty) || is_drive(&folder),
+                "{name} contains files that were not written by fpmcl simulate; choose another output_folder, or move that folder"
+            );
+            remove_drive(&folder)?;
+        }
         (FolderState::Empty | FolderState::Incomplete, _) => {}
         (FolderState::Complete, _) => return Ok(true),
         (FolderState::Foreign, _) => {
@@ -156,6 +163,12 @@ fn resolve_existing(
         }
     }
     Ok(false)
+}
+
+/// Whether this program wrote the drive in a folder.
+fn is_drive(folder: &Path) -> bool {
+    let text = fs::read_to_string(folder.join("simulation.yml")).unwrap_or_default();
+    serde_yaml::from_str::<SimulationConfig>(&text).is_ok() && folder.join(EXECUTABLE_FILE).exists()
 }
 
 /// Contents of the folder of a drive.
@@ -173,7 +186,13 @@ enum FolderState {
 
 fn folder_state(config: &SimulationConfig, simulation: &Simulation) -> Result<FolderState> {
     let folder = config.drive_folder();
-    if fs::read_dir(&folder).map_or(true, |mut entries| entries.next().is_none()) {
+    // What a run leaves that was killed before it wrote the configuration is empty, too.
+    let is_early = |name: &str| name == EXECUTABLE_FILE || name.starts_with(".fpmcl-");
+    let names = fs::read_dir(&folder).into_iter().flatten().flatten();
+    if names
+        .map(|entry| entry.file_name())
+        .all(|name| is_early(&name.to_string_lossy()))
+    {
         return Ok(FolderState::Empty);
     }
     let text = fs::read_to_string(folder.join("simulation.yml")).ok();
@@ -267,9 +286,14 @@ fn remove_drive(folder: &Path) -> Result<()> {
 /// Writes what does not depend on the scans: configuration, executable's hash and street.
 fn write_constants(config: &SimulationConfig, simulation: &Simulation) -> Result<()> {
     let folder = config.drive_folder();
+    output::create_folder(&folder)?;
+    remove_abandoned(&folder)?;
+    output::write_text(&folder.join(EXECUTABLE_FILE), version::executable_hash()?)?;
     let yaml = serde_yaml::to_string(config).context("cannot write the configuration as YAML")?;
     output::write_text(&folder.join("simulation.yml"), &yaml)?;
-    output::write_text(&folder.join(EXECUTABLE_FILE), version::executable_hash()?)?;
+    for name in ["velodyne", "labels"] {
+        output::create_subfolder(&folder.join(name))?;
+    }
     Ok(ply::write(
         &folder.join("street.ply"),
         &simulation.street_in_map(),

@@ -70,7 +70,6 @@ fn an_interrupted_drive_is_completed_with_the_same_bytes() {
     fs::remove_file(drive.join("velodyne/000005.bin")).unwrap();
     fs::write(drive.join("velodyne/.fpmcl-1.part"), [1, 2, 3]).unwrap();
     assert_eq!(simulate(&config, Existing::Keep).unwrap().kept, 4);
-    fs::remove_file(drive.join("velodyne/.fpmcl-1.part")).unwrap();
     assert_eq!(contents(&drive), whole);
 }
 

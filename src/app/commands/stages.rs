@@ -19,6 +19,7 @@ pub struct Inputs<'a> {
     pub scan_folder: &'a Path,
     pub pose_file: &'a Path,
     pub calib_file: Option<&'a Path>,
+    pub odometry_file: Option<&'a Path>,
 }
 
 impl Inputs<'_> {
@@ -28,6 +29,16 @@ impl Inputs<'_> {
         input::require_folder("scan_folder", self.scan_folder)?;
         input::require_file("pose_file", self.pose_file)?;
         input::require_optional_file("calib_file", self.calib_file)
+    }
+
+    /// The files and their keys.
+    pub fn files(&self) -> Vec<(&'static str, &Path)> {
+        let mut files = vec![("map_file", self.map_file), ("pose_file", self.pose_file)];
+        files.extend(self.calib_file.map(|path| ("calib_file", path)));
+        files.extend(self.map_pose_file.map(|path| ("map_pose_file", path)));
+        files.extend(self.map_calib_file.map(|path| ("map_calib_file", path)));
+        files.extend(self.odometry_file.map(|path| ("odometry_file", path)));
+        files
     }
 
     /// Reads the map and prepares it for rendering at most `max_poses` poses at once.

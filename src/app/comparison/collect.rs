@@ -11,7 +11,8 @@ use super::plan::PlannedRun;
 use super::record::RunRecord;
 use super::results::ComparisonResults;
 use super::{keys, page, tables};
-use crate::app::commands::{output, version};
+use crate::app::commands::claims::Outputs;
+use crate::app::commands::{Context, output, version};
 use crate::app::config::ComparisonConfig;
 use crate::app::reporting::{Table, csv, markdown, text};
 
@@ -24,7 +25,12 @@ struct ComparisonFile<'a> {
 }
 
 /// Writes tables and page of the finished runs; returns the tables for standard output.
-pub fn collect(config: &ComparisonConfig, runs: &[PlannedRun], layout: &Layout) -> Result<String> {
+pub fn collect(
+    config: &ComparisonConfig,
+    runs: &[PlannedRun],
+    layout: &Layout,
+    context: &Context,
+) -> Result<String> {
     let results = read_results(config, runs, layout)?;
     let found = results.all_records().count();
     ensure!(
@@ -42,6 +48,7 @@ pub fn collect(config: &ComparisonConfig, runs: &[PlannedRun], layout: &Layout) 
         );
     }
     let tables = tables::tables(&results);
+    prepare(&tables, &layout.root, context)?;
     write_tables(&tables, &layout.root)?;
     let page = page::page(&results, &tables, runs, layout)?;
     output::write_text(&layout.root.join("report.html"), &page.to_html())?;
@@ -91,13 +98,37 @@ fn read_results<'a>(
     })
 }
 
+fn prepare(tables: &[Table], folder: &Path, context: &Context) -> Result<()> {
+    let fixed = [
+        "tables.txt",
+        "tables.md",
+        "report.html",
+        "effective_comparison.yml",
+        "plots",
+    ];
+    let fixed = fixed.map(str::to_owned);
+    let outputs = Outputs {
+        key: "output_folder",
+        main: &folder.join("comparison.json"),
+        magic: None,
+        names: (tables.iter().map(table_file)).chain(fixed).collect(),
+        inputs: context.input().into_iter().collect(),
+        force: true,
+    };
+    outputs.prepare().map(drop)
+}
+
+fn table_file(table: &Table) -> String {
+    format!("{}.csv", table.name)
+}
+
 fn write_tables(tables: &[Table], folder: &Path) -> Result<()> {
     let all: Vec<String> = tables.iter().map(text::table).collect();
     output::write_text(&folder.join("tables.txt"), &all.join("\n"))?;
     let all: Vec<String> = tables.iter().map(markdown::table).collect();
     output::write_text(&folder.join("tables.md"), &all.join("\n"))?;
     for table in tables {
-        let path = folder.join(format!("{}.csv", table.name));
+        let path = folder.join(table_file(table));
         output::write_file(&path, |file| csv::write(table, file))?;
     }
     Ok(())

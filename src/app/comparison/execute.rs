@@ -1,7 +1,6 @@
 //! Execution of runs.
 
 use std::collections::BTreeMap;
-use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -13,8 +12,9 @@ use super::keys::{self, KeyCache, Keys};
 use super::layout::Layout;
 use super::plan::PlannedRun;
 use super::record::{Outcome, RECORD_FILE, RunRecord};
+use crate::app::commands::claims::{CLAIMS_FILE, Claims, Outputs};
 use crate::app::commands::interrupt::Interrupted;
-use crate::app::commands::run_output::{self, RunFiles};
+use crate::app::commands::run_output::{self, REFINEMENT_FILES, RunFiles};
 use crate::app::commands::run_page::RunPage;
 use crate::app::commands::simulate::{self, Existing};
 use crate::app::commands::{Context, build_map, localize, output, refine, version};
@@ -24,6 +24,7 @@ use crate::evaluation::{EvaluatedTrajectory, RangeMclRules};
 
 const MAP_FILE: &str = "map.ply";
 const RESULT_FILE: &str = "localization.npz";
+const MAP_CONFIG_FILE: &str = "effective_build_map.yml";
 const LOG_FILE: &str = "log.txt";
 
 /// Executes runs, sharing maps and localizations between them.
@@ -84,7 +85,10 @@ impl<'a> Executor<'a> {
     /// files. A failure becomes the outcome; only an interrupt is an error.
     fn execute(&self, run: &PlannedRun, keys: Keys) -> Result<RunRecord> {
         let folder = self.layout.run(&run.id);
-        output::create_folder(&folder)?;
+        prepare(
+            &folder,
+            [LOG_FILE, MAP_CONFIG_FILE].map(str::to_owned).to_vec(),
+        )?;
         output::remove_if_exists(&folder.join(RECORD_FILE))?;
         let _log = self.context.log.write_to(&folder.join(LOG_FILE))?;
         let mut stages = Stages::default();
@@ -133,7 +137,7 @@ impl<'a> Executor<'a> {
         self.append_log(&map)?;
         copy_file(
             &map.folder.join("map.effective.yml"),
-            &folder.join("effective_build_map.yml"),
+            &folder.join(MAP_CONFIG_FILE),
         )?;
 
         let localization = self
@@ -142,7 +146,7 @@ impl<'a> Executor<'a> {
         stages.add("2 localize", localization.seconds);
         self.append_log(&localization)?;
         // An earlier run in this folder may have refined.
-        run_output::remove_refined(&RunFiles::beside(&result))?;
+        prepare(&folder, names_to_copy(&localization.folder)?)?.remove(&REFINEMENT_FILES)?;
         copy_folder(&localization.folder, &folder)?;
         stages.report = Some(Report::read_json(&folder.join("report.json"))?);
 
@@ -277,25 +281,45 @@ fn processor() -> Option<String> {
     Some(name.split_once(':')?.1.trim().to_owned())
 }
 
-/// Copies the content of a folder, except for [`cache::FINISHED_FILE`] and the log.
+/// Prepares the record of a run in its folder, and further files there.
+fn prepare(folder: &Path, names: Vec<String>) -> Result<Claims> {
+    let record = folder.join(RECORD_FILE);
+    let outputs = Outputs {
+        key: "output_folder",
+        main: &record,
+        magic: None,
+        names,
+        inputs: Vec::new(),
+        force: true,
+    };
+    outputs.prepare()
+}
+
+/// Copies the content of a folder, except for [`cache::FINISHED_FILE`], the log and the claims.
 fn copy_folder(from: &Path, to: &Path) -> Result<()> {
     output::create_folder(to)?;
-    for entry in fs::read_dir(from).with_context(|| format!("cannot read {}", from.display()))? {
-        let entry = entry?;
-        let name = entry.file_name();
-        if [cache::FINISHED_FILE, LOG_FILE]
-            .map(OsStr::new)
-            .contains(&name.as_os_str())
-        {
-            continue;
-        }
-        if entry.path().is_dir() {
-            copy_folder(&entry.path(), &to.join(name))?;
+    for name in names_to_copy(from)? {
+        let (from, to) = (from.join(&name), to.join(&name));
+        if from.is_dir() {
+            copy_folder(&from, &to)?;
         } else {
-            copy_file(&entry.path(), &to.join(name))?;
+            copy_file(&from, &to)?;
         }
     }
     Ok(())
+}
+
+fn names_to_copy(folder: &Path) -> Result<Vec<String>> {
+    let mut names = Vec::new();
+    for entry in
+        fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?
+    {
+        let name = entry?.file_name().to_string_lossy().into_owned();
+        if ![cache::FINISHED_FILE, LOG_FILE, CLAIMS_FILE].contains(&&*name) {
+            names.push(name);
+        }
+    }
+    Ok(names)
 }
 
 fn copy_file(from: &Path, to: &Path) -> Result<()> {

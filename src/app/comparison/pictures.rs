@@ -191,7 +191,7 @@ fn save_chart(
 /// Path of a plot, whose folder is created.
 fn plot_path(name: &str, layout: &Layout) -> Result<std::path::PathBuf> {
     let folder = layout.root.join("plots");
-    output::create_folder(&folder)?;
+    output::create_subfolder(&folder)?;
     Ok(folder.join(name))
 }
 

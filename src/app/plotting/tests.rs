@@ -284,7 +284,7 @@ fn frames_become_an_animation_of_one_size() {
     let pictures: Vec<PathBuf> = (0..120)
         .step_by(30)
         .map(|k| {
-            let path = gallery.path(&format!("loc_plots/{k:06}.png"));
+            let path = gallery.path(&format!("frame_{k:06}.png"));
             let t = truth[k].translation;
             LocalizationPicture {
                 title: &format!("frame {k}"),

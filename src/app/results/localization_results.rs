@@ -13,6 +13,7 @@
 //! | `covariances`, `refined_covariances` | (rows, 9) | float64 | of x, y, heading, row-major [m², m rad, rad²] |
 //! | `times_s`, `runtimes_s`, `refine_runtimes_s` | (rows) | float64 | time of the frame; computing time [s] |
 //! | `states` | (rows) | uint8 | state of the filter |
+//! | `selected_frames` | () | int64 | number of frames to localize; only where not all were |
 //!
 //! All but the first three are optional. In rows before `start_idx` they are NaN.
 
@@ -111,6 +112,8 @@ pub struct LocalizationResults {
     pub refine_runtimes_s: Option<Vec<f64>>,
     /// State of the filter as a number.
     pub states: Option<Vec<u8>>,
+    /// Number of frames to localize; a file has it only if the run ended before the last of them.
+    pub selected: Option<usize>,
 }
 
 impl LocalizationResults {
@@ -122,6 +125,13 @@ impl LocalizationResults {
     /// Whether there are no frames.
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()
+    }
+
+    /// How many of the frames were localized, if not all.
+    pub fn shortfall(&self) -> Option<String> {
+        let found = self.len();
+        let selected = self.selected.filter(|&selected| found < selected)?;
+        Some(format!("only {found} of {selected} frames were localized"))
     }
 
     /// The results of a subset of the rows.
@@ -150,6 +160,7 @@ impl LocalizationResults {
             runtimes_s: pick(&self.runtimes_s, rows),
             refine_runtimes_s: pick(&self.refine_runtimes_s, rows),
             states: pick(&self.states, rows),
+            selected: None,
         }
     }
 

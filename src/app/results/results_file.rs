@@ -21,6 +21,7 @@ impl LocalizationResults {
     pub fn read(path: &Path) -> Result<Self> {
         let mut npz = NpzReader::open(path)?;
         let (rows, first, particles) = read_particles(path, &mut npz)?;
+        let selected = read_selected(&mut npz)?;
         let mut file = RowReader {
             path,
             npz,
@@ -47,6 +48,7 @@ impl LocalizationResults {
             runtimes_s: file.rows("runtimes_s", |[time_s]| time_s)?,
             refine_runtimes_s: file.rows("refine_runtimes_s", |[time_s]| time_s)?,
             states: file.states()?,
+            selected,
         })
     }
 
@@ -76,6 +78,9 @@ impl LocalizationResults {
         npz.add("numParticles", &[], [capacity as i64])?;
         let frames = (0..leading).chain(self.frames.iter().copied());
         npz.add("frames", &[rows], frames.map(|frame| frame as i64))?;
+        if let Some(selected) = self.selected.filter(|&selected| self.len() < selected) {
+            npz.add("selected_frames", &[], [selected as i64])?;
+        }
         let mut file = RowWriter { npz, leading };
         file.rows("estimates", &self.estimates, row_from_pose)?;
         file.rows("refined", &self.refined, row_from_pose)?;
@@ -197,6 +202,16 @@ fn read_particles(path: &Path, npz: &mut NpzReader) -> Result<(usize, usize, Par
         }
     }
     Ok((rows, first, log))
+}
+
+/// Reads the number of frames to localize, which only a run that ended early wrote.
+fn read_selected(npz: &mut NpzReader) -> Result<Option<usize>> {
+    let Some(mut array) = npz.array("selected_frames")? else {
+        return Ok(None);
+    };
+    array.expect_shape(&[], "one number ()")?;
+    let [selected] = array.next_finite_row(0)?;
+    Ok(Some(selected as usize))
 }
 
 /// Reads the particles of a frame without the padding after the last.

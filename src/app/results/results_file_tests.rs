@@ -36,6 +36,7 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
         runtimes_s: numbers(0.01),
         refine_runtimes_s: numbers(0.02),
         states: Some(frames.iter().map(|&frame| frame as u8 % 3).collect()),
+        selected: Some(40),
         frames,
     }
 }

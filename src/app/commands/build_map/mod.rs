@@ -8,7 +8,7 @@ mod report;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::ops::ControlFlow;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
@@ -17,6 +17,7 @@ use anyhow::{Context as _, Result};
 use self::clock::StageClock;
 use self::parts::{Parts, hash_of_scans, joint_hash, read_scan_file};
 pub use self::report::BuildReport;
+use super::claims::{Claims, Outputs, PLY};
 use super::interrupt::Interrupted;
 use super::{Context, input, output, version};
 use crate::app::config::{self, BuildMapConfig};
@@ -33,7 +34,7 @@ use crate::recording::{Frame, Sequence};
 /// Builds the map that a configuration describes.
 pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
     let started = Instant::now();
-    let sequence = open(config)?;
+    let (sequence, mut claims) = (open(config)?, prepare(config, context)?);
     let (mapped, held_out) = hold_out(&sequence.frames, config);
     let clock = Arc::new(StageClock::default());
     let parts = Parts::open(&config.mesh_file, &inputs(config, &mapped)?)?;
@@ -44,7 +45,7 @@ pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
         map_from_lidar: poses_of(&mapped),
     };
     let residuals = clock.time("quality", || residuals(config, &mesh, &held_out))?;
-    write_map(config, &mesh, &path)?;
+    write_map(config, &mesh, &path, &mut claims)?;
     let truth = clock.time("truth", || agreement(config, &mesh, &path))?;
     if config.visualize {
         pictures::draw(config, &mesh, &path.map_from_lidar, &residuals)?;
@@ -63,10 +64,11 @@ pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
     output::write_json(&config.mesh_file.with_extension("report.json"), &report)?;
     output::write_yaml(&config.mesh_file.with_extension("effective.yml"), config)?;
     parts.remove()?;
+    claims.finish(&config.mesh_file)?;
     Ok(report)
 }
 
-/// Checks that inputs exist and outputs are free, and opens the recording.
+/// Checks that inputs exist, and opens the recording.
 fn open(config: &BuildMapConfig) -> Result<Sequence> {
     input::require_folder("scan_folder", &config.scan_folder)?;
     input::require_file("pose_file", &config.pose_file)?;
@@ -74,7 +76,6 @@ fn open(config: &BuildMapConfig) -> Result<Sequence> {
     if let Some(path) = &config.truth_mesh {
         input::require_file("truth_mesh", path)?;
     }
-    output::prepare(&config.mesh_file, "mesh_file", config.force)?;
     let sequence = Sequence::open(
         &config.scan_folder,
         &config.pose_file,
@@ -88,6 +89,42 @@ fn open(config: &BuildMapConfig) -> Result<Sequence> {
         Some(spin) => sequence.compensated_by_poses(spin),
         None => sequence,
     })
+}
+
+/// Prepares the outputs.
+fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
+    let mut extensions = vec!["report.json", "effective.yml"];
+    if config.visualize {
+        extensions.extend(["png", "residuals.png"]);
+    }
+    let name = |extension| {
+        let path = config.mesh_file.with_extension(extension);
+        path.file_name()
+            .map(|name| name.to_string_lossy().into_owned())
+    };
+    let mut inputs: Vec<(&str, &Path)> = vec![("pose_file", &config.pose_file)];
+    inputs.extend(
+        config
+            .calib_file
+            .as_deref()
+            .map(|path| ("calib_file", path)),
+    );
+    inputs.extend(
+        config
+            .truth_mesh
+            .as_deref()
+            .map(|path| ("truth_mesh", path)),
+    );
+    inputs.extend(context.input());
+    let outputs = Outputs {
+        key: "mesh_file",
+        main: &config.mesh_file,
+        magic: Some(PLY),
+        names: extensions.into_iter().filter_map(name).collect(),
+        inputs,
+        force: config.force,
+    };
+    outputs.prepare()
 }
 
 /// The key scans that build the map, and those that are held out to evaluate it.
@@ -307,11 +344,17 @@ fn agreement(
     ))
 }
 
-fn write_map(config: &BuildMapConfig, mesh: &TriangleMesh, path: &MappingPath) -> Result<()> {
+fn write_map(
+    config: &BuildMapConfig,
+    mesh: &TriangleMesh,
+    path: &MappingPath,
+    claims: &mut Claims,
+) -> Result<()> {
     anyhow::ensure!(
         !mesh.triangles.is_empty(),
         "the map has no triangles: the scans in {} have no points left to mesh; check range_image, crop_x, crop_y and crop_z",
         config.scan_folder.display()
     );
+    claims.begin(&config.mesh_file)?;
     Ok(ply::write(&config.mesh_file, mesh, Some(path))?)
 }

@@ -1,52 +1,76 @@
 //! Finished local maps on disk, from which an interrupted build resumes.
 //!
 //! While a map is being built, the folder `<map>.parts` beside it holds per local map a mesh, and its
-//! counts with the hash of its scans, and `inputs.txt` with all other inputs. Parts of other inputs are
-//! deleted. A part is finished once its counts exist, which are written last.
+//! counts with the hashes of its scans and of the mesh; `inputs.txt` with all other inputs; and a file
+//! that the build locks. Parts of other inputs are deleted, files of others never. A part is finished
+//! once its counts exist, which are written last.
 
-use std::fs;
-use std::io::{self, ErrorKind};
+use std::fs::{self, File, TryLockError};
+use std::io;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, bail, ensure};
 use blake3::Hash;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::app::commands::output;
+use crate::files::remove_abandoned;
 use crate::geometry::TriangleMesh;
 use crate::map::{LocalMap, LocalMapCounts, ply};
 use crate::recording::Frame;
+
+const INPUTS_FILE: &str = "inputs.txt";
+const LOCK_FILE: &str = "lock";
+/// Start of the inputs, by which a folder is recognized as ours.
+const INPUTS_START: &str = "# fpmcl ";
 
 /// A finished local map beside its mesh.
 #[derive(Serialize, Deserialize)]
 struct Part {
     /// Hash of the scans that it was made of.
     scans_hash: String,
+    /// Hash of the file of its mesh; `None` if it has no triangles.
+    mesh_hash: Option<String>,
     counts: LocalMapCounts,
 }
 
-/// The folder of finished local maps of one build.
+/// The folder of finished local maps of one build, locked.
 pub struct Parts {
     folder: PathBuf,
+    /// Released by the operating system, also after a crash.
+    _lock: File,
 }
 
 impl Parts {
-    /// Opens the folder beside `mesh_file`; deletes its content if it was made from other inputs.
+    /// Opens and locks the folder beside `mesh_file`; deletes its parts if they were made from other
+    /// inputs.
     pub fn open(mesh_file: &Path, inputs: &str) -> Result<Self> {
         let mut name = mesh_file.file_name().unwrap_or_default().to_owned();
         name.push(".parts");
         let folder = mesh_file.with_file_name(name);
-        let inputs_file = folder.join("inputs.txt");
-        let same = fs::read_to_string(&inputs_file).is_ok_and(|found| found == inputs);
-        if !same {
-            if folder.exists() {
-                fs::remove_dir_all(&folder)
-                    .with_context(|| format!("cannot remove {}", folder.display()))?;
-            }
-            output::write_text(&inputs_file, inputs)?;
+        let context = || format!("cannot use {} for unfinished maps", folder.display());
+        output::create_subfolder(&folder)?;
+        remove_abandoned(&folder).with_context(context)?;
+        let found = fs::read_to_string(folder.join(INPUTS_FILE)).unwrap_or_default();
+        let is_early = |entry: &fs::DirEntry| {
+            let name = entry.file_name();
+            name == LOCK_FILE || name.to_string_lossy().starts_with(".fpmcl-")
+        };
+        ensure!(
+            found.starts_with(INPUTS_START) || entries(&folder)?.iter().all(is_early),
+            "{} is needed for unfinished maps, but has files that fpmcl did not write; move it, or choose another mesh_file",
+            folder.display()
+        );
+        let parts = Self {
+            _lock: lock(&folder, mesh_file)?,
+            folder,
+        };
+        if found != inputs {
+            parts.remove_files(|name| name != LOCK_FILE)?;
+            output::write_text(&parts.folder.join(INPUTS_FILE), inputs)?;
         }
-        Ok(Self { folder })
+        Ok(parts)
     }
 
     /// The folder of the parts.
@@ -60,56 +84,82 @@ impl Parts {
         number: usize,
         scans_hash: impl FnOnce() -> io::Result<String>,
     ) -> Option<LocalMapCounts> {
-        let text = fs::read_to_string(self.counts_file(number)).ok()?;
-        let part: Part = serde_json::from_str(&text).ok()?;
-        let is_whole = part.counts.triangles == 0 || self.mesh_file(number).exists();
+        let part = self.read(number).ok()?;
         // A scan that cannot be read is reported by the build.
         let is_same = || scans_hash().is_ok_and(|hash| hash == part.scans_hash);
-        (is_whole && is_same()).then_some(part.counts)
+        is_same().then_some(part.counts)
     }
 
-    /// Keeps a finished local map.
+    /// Keeps a finished local map, after deleting one that was made of other scans, its counts first.
     pub fn save(&self, number: usize, local_map: &LocalMap, scans_hash: &str) -> Result<()> {
-        self.discard(number)?;
+        let (counts, mesh) = (self.counts_file(number), self.mesh_file(number));
+        output::remove_if_exists(&counts)?;
+        output::remove_if_exists(&mesh)?;
+        let mut mesh_hash = None;
         if !local_map.mesh.triangles.is_empty() {
-            ply::write(&self.mesh_file(number), &local_map.mesh, None)?;
+            ply::write(&mesh, &local_map.mesh, None)?;
+            mesh_hash = Some(hash_of_file(&mesh)?);
         }
         let part = Part {
             scans_hash: scans_hash.to_owned(),
+            mesh_hash,
             counts: local_map.counts.clone(),
         };
-        output::write_json(&self.counts_file(number), &part)
+        output::write_json(&counts, &part)
     }
 
-    /// Deletes a part that was made of other scans, its counts first.
-    fn discard(&self, number: usize) -> Result<()> {
-        for file in [self.counts_file(number), self.mesh_file(number)] {
-            match fs::remove_file(&file) {
-                Err(error) if error.kind() != ErrorKind::NotFound => {
-                    return Err(error).with_context(|| format!("cannot remove {}", file.display()));
-                }
-                _ => {}
-            }
-        }
-        Ok(())
-    }
-
-    /// Joins the meshes of the local maps 0..count.
+    /// Joins the meshes of the local maps 0..count; an error if one is missing or damaged.
     pub fn join(&self, count: usize) -> Result<TriangleMesh> {
         let mut whole = TriangleMesh::default();
         for number in 0..count {
-            let file = self.mesh_file(number);
-            if file.exists() {
-                whole.append(&ply::read(&file)?);
+            let part = self.read(number).with_context(|| {
+                let folder = self.folder.display();
+                format!("{folder} has lost local map {number}; run the same command again")
+            })?;
+            if part.mesh_hash.is_some() {
+                whole.append(&ply::read(&self.mesh_file(number))?);
             }
         }
         Ok(whole)
     }
 
-    /// Removes the folder.
+    /// Removes the parts, and the folder unless others have files in it.
     pub fn remove(self) -> Result<()> {
-        fs::remove_dir_all(&self.folder)
-            .with_context(|| format!("cannot remove {}", self.folder.display()))
+        self.remove_files(|_| true)?;
+        if fs::remove_dir(&self.folder).is_err() {
+            tracing::warn!("{} is kept: it has other files", self.folder.display());
+        }
+        Ok(())
+    }
+
+    /// Reads a part; an error if it is missing, or its mesh is not the one that was written.
+    fn read(&self, number: usize) -> Result<Part> {
+        let counts = self.counts_file(number);
+        let text =
+            fs::read(&counts).with_context(|| format!("cannot read {}", counts.display()))?;
+        let part: Part = serde_json::from_slice(&text)
+            .with_context(|| format!("{} is damaged", counts.display()))?;
+        if let Some(hash) = &part.mesh_hash {
+            let mesh = self.mesh_file(number);
+            ensure!(
+                hash_of_file(&mesh)? == *hash,
+                "{} is damaged",
+                mesh.display()
+            );
+        }
+        Ok(part)
+    }
+
+    /// Removes those files of this program whose names match; the inputs, which make the folder ours,
+    /// after the parts.
+    fn remove_files(&self, matches: impl Fn(&str) -> bool) -> Result<()> {
+        let names = entries(&self.folder)?.into_iter();
+        let mut names: Vec<String> = names
+            .map(|entry| entry.file_name().to_string_lossy().into_owned())
+            .filter(|name| is_ours(name) && matches(name))
+            .collect();
+        names.sort();
+        (names.iter()).try_for_each(|name| output::remove_if_exists(&self.folder.join(name)))
     }
 
     fn mesh_file(&self, number: usize) -> PathBuf {
@@ -119,6 +169,42 @@ impl Parts {
     fn counts_file(&self, number: usize) -> PathBuf {
         self.folder.join(format!("{number:04}.json"))
     }
+}
+
+/// Whether a name is one of those in a folder of parts.
+fn is_ours(name: &str) -> bool {
+    let is_number = |stem: &str| stem.len() >= 4 && stem.bytes().all(|b| b.is_ascii_digit());
+    let is_part = |(stem, extension)| is_number(stem) && ["ply", "json"].contains(&extension);
+    [INPUTS_FILE, LOCK_FILE].contains(&name) || name.split_once('.').is_some_and(is_part)
+}
+
+fn entries(folder: &Path) -> Result<Vec<fs::DirEntry>> {
+    let entries = fs::read_dir(folder).and_then(Iterator::collect);
+    entries.with_context(|| format!("cannot read {}", folder.display()))
+}
+
+/// Locks a folder of parts; an error if another build has locked it.
+fn lock(folder: &Path, mesh_file: &Path) -> Result<File> {
+    let path = folder.join(LOCK_FILE);
+    let context = || format!("cannot lock {}", path.display());
+    let file = File::create(&path).with_context(context)?;
+    match file.try_lock() {
+        // A build that has just ended removes its lock.
+        Ok(()) if path.exists() => Ok(file),
+        Ok(()) | Err(TryLockError::WouldBlock) => bail!(
+            "{} is being built by another build-map, which has locked {}; wait for it, or choose another mesh_file",
+            mesh_file.display(),
+            path.display()
+        ),
+        Err(TryLockError::Error(error)) => Err(error).with_context(context),
+    }
+}
+
+fn hash_of_file(path: &Path) -> Result<String> {
+    let mut hasher = blake3::Hasher::new();
+    (File::open(path).and_then(|file| hasher.update_reader(file).map(drop)))
+        .with_context(|| format!("cannot read {}", path.display()))?;
+    Ok(hasher.finalize().to_hex().to_string())
 }
 
 /// BLAKE3 hash of the files of scans, in order.
@@ -153,6 +239,8 @@ mod tests {
 
     use super::*;
 
+    const INPUTS: &str = "# fpmcl inputs";
+
     fn local_map(x: f32) -> LocalMap {
         LocalMap {
             mesh: TriangleMesh {
@@ -174,11 +262,12 @@ mod tests {
     fn finished_parts_are_found_again_and_joined_in_order() {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
-        let parts = Parts::open(&map, "inputs").unwrap();
+        let parts = Parts::open(&map, INPUTS).unwrap();
         parts.save(1, &local_map(1.5), "0123").unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
 
-        let again = Parts::open(&map, "inputs").unwrap();
+        drop(parts);
+        let again = Parts::open(&map, INPUTS).unwrap();
         assert_eq!(again.finished(1, || Ok("0123".into())).unwrap().scans, 7);
         assert_eq!(again.finished(1, || Ok("4567".into())), None);
         assert_eq!(again.finished(2, || Ok("0123".into())), None);
@@ -191,10 +280,11 @@ mod tests {
     fn parts_of_other_inputs_are_deleted() {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
-        let parts = Parts::open(&map, "inputs").unwrap();
+        let parts = Parts::open(&map, INPUTS).unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
+        drop(parts);
         assert_eq!(
-            Parts::open(&map, "others")
+            Parts::open(&map, "# fpmcl others")
                 .unwrap()
                 .finished(0, || Ok("0123".into())),
             None
@@ -205,7 +295,7 @@ mod tests {
     fn a_mesh_without_its_counts_is_not_finished() {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
-        let parts = Parts::open(&map, "inputs").unwrap();
+        let parts = Parts::open(&map, INPUTS).unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
         fs::remove_file(parts.counts_file(0)).unwrap();
         assert_eq!(parts.finished(0, || Ok("0123".into())), None);
@@ -214,16 +304,29 @@ mod tests {
     #[test]
     fn counts_without_their_mesh_are_not_finished() {
         let folder = tempfile::tempdir().unwrap();
-        let parts = Parts::open(&folder.path().join("map.ply"), "inputs").unwrap();
+        let parts = Parts::open(&folder.path().join("map.ply"), INPUTS).unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
         fs::remove_file(parts.mesh_file(0)).unwrap();
         assert_eq!(parts.finished(0, || Ok("0123".into())), None);
     }
 
     #[test]
+    fn a_truncated_mesh_is_not_finished_and_not_joined() {
+        let folder = tempfile::tempdir().unwrap();
+        let parts = Parts::open(&folder.path().join("map.ply"), INPUTS).unwrap();
+        parts.save(0, &local_map(0.5), "0123").unwrap();
+        let bytes = fs::read(parts.mesh_file(0)).unwrap();
+        fs::write(parts.mesh_file(0), &bytes[..bytes.len() - 1]).unwrap();
+        assert_eq!(parts.finished(0, || Ok("0123".into())), None);
+        let message = format!("{:#}", parts.join(1).unwrap_err());
+        assert!(message.contains("has lost local map 0"), "{message}");
+        assert!(message.contains("0000.ply is damaged"), "{message}");
+    }
+
+    #[test]
     fn an_empty_part_replaces_the_mesh_of_an_earlier_one() {
         let folder = tempfile::tempdir().unwrap();
-        let parts = Parts::open(&folder.path().join("map.ply"), "inputs").unwrap();
+        let parts = Parts::open(&folder.path().join("map.ply"), INPUTS).unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
         parts.save(0, &LocalMap::default(), "").unwrap();
         assert!(parts.finished(0, || Ok("".into())).is_some());

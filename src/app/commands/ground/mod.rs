@@ -21,13 +21,16 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 
+use self::input::ScanFiles;
 use self::report::GroundReport;
+use super::claims::{Claims, Outputs};
 use super::interrupt::Interrupted;
 use super::{Context, output};
 use crate::app::cli::GroundArgs;
-use crate::app::config::GroundCommandConfig;
+use crate::app::config::{CommandConfig as _, GroundCommandConfig};
 use crate::app::plotting::color::Colormap;
 use crate::evaluation::{GroundTally, LabelledPoints};
+use crate::files::folder_of;
 use crate::geometry::Vec3;
 use crate::ground::{FuzzyGround, GroundMethod};
 use crate::map::ply;
@@ -45,6 +48,8 @@ pub fn run(args: &GroundArgs, context: &Context) -> Result<String> {
     if args.simulated {
         return simulated::run(&config, context);
     }
+    let path_of_config = args.config.as_deref().or(args.input.as_deref());
+    let context = &context.with_config_file(path_of_config, GroundCommandConfig::PATH);
     match args.explain.as_deref() {
         Some(&[x, y, z]) => explain(&config, &path, Vec3::new(x, y, z)),
         _ => Ok(segment(&config, &path, context)?.to_text()),
@@ -91,8 +96,8 @@ fn explain(config: &GroundCommandConfig, path: &Path, position: Vec3) -> Result<
 fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Result<GroundReport> {
     let scans = input::scans(path, config)?;
     let report_file = config.output_folder.join("ground.json");
-    output::prepare(&report_file, "output_folder", config.force)?;
     input::check_overwrite(config, &scans)?;
+    let mut claims = prepare(config, context, &scans, &report_file)?;
     pictures::draw_memberships(&config.fuzzy, &config.output_folder.join("memberships.png"))?;
 
     let mut methods = config.ground().all_classifiers()?;
@@ -136,9 +141,49 @@ fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Resu
             .map(|((name, _), tally)| tally.report(name))
             .collect(),
     };
+    claims.begin(&report_file)?;
     output::write_yaml(&config.output_folder.join("effective_ground.yml"), config)?;
     output::write_json(&report_file, &report)?;
+    claims.finish(&report_file)?;
     Ok(report)
+}
+
+/// Prepares the outputs and the folders of those of single scans.
+fn prepare(
+    config: &GroundCommandConfig,
+    context: &Context,
+    scans: &[ScanFiles],
+    report_file: &Path,
+) -> Result<Claims> {
+    let mut names = vec![
+        "effective_ground.yml".to_owned(),
+        "memberships.png".to_owned(),
+    ];
+    names.extend(config.write_labels.then(|| "labels".to_owned()));
+    names.extend(config.write_plys.then(|| "points".to_owned()));
+    if config.plot_step > 0 {
+        let drawn = scans.iter().step_by(config.plot_step);
+        names.extend(drawn.map(|scan| pictures::file_name(&scan.name)));
+    }
+    let outputs = Outputs {
+        key: "output_folder",
+        main: report_file,
+        magic: None,
+        names,
+        inputs: context.input().into_iter().collect(),
+        force: config.force,
+    };
+    let claims = outputs.prepare()?;
+    for (folder, is_written) in [
+        ("labels", config.write_labels),
+        ("points", config.write_plys),
+    ] {
+        for scan in scans.iter().filter(|_| is_written) {
+            let path = config.output_folder.join(folder).join(&scan.name);
+            output::create_folder(folder_of(&path))?;
+        }
+    }
+    Ok(claims)
 }
 
 /// Writes labels and coloured points of a scan, as configured.

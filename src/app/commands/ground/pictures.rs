@@ -53,6 +53,11 @@ fn name_with_unit(variable: &str) -> String {
     }
 }
 
+/// Name of the picture of a scan.
+pub fn file_name(name: &Path) -> String {
+    format!("scan_{}.png", name.display()).replace(['/', '\\'], "_")
+}
+
 /// Draws a scan from above.
 pub fn draw_scan(
     config: &GroundCommandConfig,
@@ -68,7 +73,6 @@ pub fn draw_scan(
         let f1 = scan.score(protocol, confidences, threshold, |_| true).f1();
         title += &format!(", F1 {:.2} %", 100.0 * f1);
     }
-    let file = format!("scan_{}.png", name.display()).replace(['/', '\\'], "_");
     let plot = GroundPlot {
         title: &title,
         points: &scan.points,
@@ -79,5 +83,5 @@ pub fn draw_scan(
         truth: &truth,
         reach_m: REACH_M,
     };
-    plot.save(&config.output_folder.join(file))
+    plot.save(&config.output_folder.join(file_name(name)))
 }

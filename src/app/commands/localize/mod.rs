@@ -11,8 +11,9 @@ use anyhow::Result;
 
 use self::pictures::draw_example;
 use self::recorder::Run;
+use super::claims::{Claims, NPZ, Outputs};
 use super::interrupt::Interrupted;
-use super::run_output::{self, RunFiles};
+use super::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES, RunFiles};
 use super::stages::Inputs;
 use super::{Context, odometry, output, run_page};
 use crate::app::config::{Initialization, LocalizationConfig, MotionModel};
@@ -34,9 +35,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     let inputs = inputs(config);
     inputs.require()?;
     let files = RunFiles::beside(&config.result_path);
-    if config.save_result || config.plot_loc_results || config.visualize {
-        run_output::prepare(&files, "result_path", config.force)?;
-    }
+    let claims = prepare(config, context, &inputs, &files)?;
     let map = inputs.load_map(Some(config.range_image.batch_size()), context)?;
     let sequence = inputs.open_recording(&config.selection(), &map)?;
     let increments = odometry::read_increments(
@@ -46,7 +45,13 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         &mut stream(config.seed, ODOMETRY_STREAM),
     )?;
     let sequence = odometry::compensated(sequence, config.motion_compensation, &increments);
-    let run = Mutex::new(Run::new(config, &map, &files));
+    let run = Mutex::new(Run::new(
+        config,
+        &map,
+        &files,
+        sequence.frames.len(),
+        claims,
+    ));
     let recorded = || run.lock().unwrap_or_else(PoisonError::into_inner);
     let kept = |run: &Run| run.kept(config, sequence.frames.len());
     context.interrupt.supervise(
@@ -54,18 +59,19 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
             localize(config, context, &map, &sequence, &increments, &recorded)?;
             let mut run = recorded();
             run.complete()?;
-            write_results(config, &files, &sequence, &run)?;
+            write_results(config, &files, &sequence, &mut run)?;
             context.interrupt.keeps(kept(&run));
             anyhow::Ok(())
         },
         || {
-            let run = recorded();
-            write_results(config, &files, &sequence, &run)?;
+            let mut run = recorded();
+            write_results(config, &files, &sequence, &mut run)?;
+            run.claims.finish(&files.result)?;
             Ok(kept(&run))
         },
     )?;
-    let run = run.into_inner().unwrap_or_else(PoisonError::into_inner);
-    let report = write_run(config, context, &files, &map, &sequence, &run)?;
+    let mut run = run.into_inner().unwrap_or_else(PoisonError::into_inner);
+    let report = write_run(config, context, &files, &map, &sequence, &mut run)?;
     run.finish(config, sequence.frames.len())?;
     Ok(report)
 }
@@ -78,7 +84,39 @@ fn inputs(config: &LocalizationConfig) -> Inputs<'_> {
         scan_folder: &config.scan_folder,
         pose_file: &config.pose_file,
         calib_file: config.calib_file.as_deref(),
+        odometry_file: config.odometry_file.as_deref(),
     }
+}
+
+/// Prepares the configured outputs.
+fn prepare(
+    config: &LocalizationConfig,
+    context: &Context,
+    inputs: &Inputs,
+    files: &RunFiles,
+) -> Result<Claims> {
+    let mut names = Vec::new();
+    if config.save_result {
+        names.extend(REPORT_FILES.iter().chain(&LOCALIZATION_FILES));
+        let is_refined = config.refine;
+        names.extend(REFINEMENT_FILES.iter().filter(|_| is_refined));
+    }
+    names.extend(config.plot_loc_results.then_some("plots"));
+    if config.visualize {
+        names.extend(["loc_plots", "localization.gif"]);
+    }
+    if names.is_empty() {
+        return Claims::read(files.folder());
+    }
+    let outputs = Outputs {
+        key: "result_path",
+        main: &config.result_path,
+        magic: Some(NPZ),
+        names: names.into_iter().map(str::to_owned).collect(),
+        inputs: inputs.files().into_iter().chain(context.input()).collect(),
+        force: config.force,
+    };
+    run_output::prepare(files, &outputs)
 }
 
 /// Localizes frames until the end, an interruption or an error, which is recorded.
@@ -155,17 +193,18 @@ fn write_results(
     config: &LocalizationConfig,
     files: &RunFiles,
     sequence: &Sequence,
-    run: &Run,
+    run: &mut Run,
 ) -> Result<()> {
     if !config.save_result || run.results.is_empty() {
         return Ok(());
     }
+    run.claims.begin(&files.result)?;
     run_output::write_results(files, &run.results)?;
     run_output::write_trajectory(files, "mcl", sequence, &run.map_from_lidar)?;
     if config.refine {
         run_output::write_trajectory(files, "refined", sequence, &run.refined)?;
     } else {
-        run_output::remove_refined(files)?;
+        run.claims.remove(&REFINEMENT_FILES)?;
     }
     output::write_yaml(&files.file("effective_localization.yml"), config)
 }
@@ -177,12 +216,13 @@ fn write_run(
     files: &RunFiles,
     map: &Map,
     sequence: &Sequence,
-    run: &Run,
+    run: &mut Run,
 ) -> Result<Report> {
     let results = &run.results;
     warn_of_untracked_frames(results);
     let mut about = about(config, context, map);
     about.insert("states".to_owned(), states_in_words(results));
+    about.extend(run_output::shortfall(results));
     let report = run_output::evaluate(results, &RangeMclRules::default(), about)?;
     if config.save_result {
         run_output::write_report(files, results, &report)?;
@@ -193,6 +233,7 @@ fn write_run(
     }
     if config.save_result {
         run_page::write(files, &report)?;
+        run.claims.finish(&files.result)?;
     }
     Ok(report)
 }

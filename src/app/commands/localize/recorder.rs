@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use anyhow::Result;
 
+use crate::app::commands::claims::Claims;
 use crate::app::commands::interrupt::Interrupted;
 use crate::app::commands::run_output::{self, Movie, RunFiles};
 use crate::app::config::LocalizationConfig;
@@ -18,6 +19,8 @@ use crate::refinement::FrameResult;
 /// The localized frames.
 pub struct Run {
     pub results: LocalizationResults,
+    /// The claimed outputs.
+    pub claims: Claims,
     /// The estimates in space.
     pub map_from_lidar: Vec<Pose3>,
     /// The refined poses in space; the estimates where a frame was not refined.
@@ -31,7 +34,13 @@ pub struct Run {
 }
 
 impl Run {
-    pub fn new(config: &LocalizationConfig, map: &Map, files: &RunFiles) -> Self {
+    pub fn new(
+        config: &LocalizationConfig,
+        map: &Map,
+        files: &RunFiles,
+        selected: usize,
+        claims: Claims,
+    ) -> Self {
         let empty = || Some(Vec::new());
         Self {
             results: LocalizationResults {
@@ -46,8 +55,10 @@ impl Run {
                 refined: config.refine.then(Vec::new),
                 refined_covariances: config.refine.then(Vec::new),
                 refine_runtimes_s: config.refine.then(Vec::new),
+                selected: Some(selected),
                 ..LocalizationResults::default()
             },
+            claims,
             map_from_lidar: Vec::new(),
             refined: Vec::new(),
             movie: config.visualize.then(|| Movie::begin(files, &map.mesh)),
