@@ -311,6 +311,7 @@ fn an_interrupted_localization_keeps_its_finished_frames() {
     assert!((6..=8).contains(&frames), "{frames}");
     let kept = format!("interrupted; {frames} of 12 frames are localized and kept in results/");
     assert!(stderr.contains(&kept), "{stderr}");
+    assert_eq!(results.selected, Some(12));
     for name in ["mcl_tum.txt", "mcl_kitti.txt"] {
         let rows = recording.bytes(&format!("results/{name}"));
         assert_eq!(String::from_utf8(rows).unwrap().lines().count(), frames);
@@ -417,4 +418,160 @@ fn a_busy_ground_segmentation_ends_in_time() {
     let arguments = ["ground", "velodyne", "--set=compare=False"];
     let stderr = overdue("-INT", &recording, &arguments, &scan);
     assert!(stderr.contains("1 of 3 scans are in"), "{stderr}");
+}
+
+#[test]
+fn an_incomplete_result_is_reported_by_refine_and_evaluate() {
+    let recording = Recording::street(12);
+    recording.fpmcl("build-map").succeeds();
+    let scan = PipedScan::new(&recording, 7);
+    assert_eq!(interrupted(&recording, LOCALIZE, &scan).0, Some(130));
+    scan.restore();
+    let refined = recording.fpmcl("refine").succeeds().stderr;
+    let evaluated = common::fpmcl("evaluate")
+        .in_folder(recording.folder())
+        .with(common::config_file("evaluation.yml"))
+        .succeeds()
+        .stderr;
+    let results = LocalizationResults::read(&recording.path("results/localization.npz")).unwrap();
+    let shortfall = format!("only {} of 12 frames were localized", results.len());
+    for text in [refined, evaluated] {
+        assert!(text.contains(&shortfall), "{text}");
+    }
+    let report = common::json(&recording.path("results/report.json"));
+    assert_eq!(report["about"]["frames"], shortfall.as_str());
+}
+
+#[test]
+fn a_localization_that_is_killed_before_its_pictures_is_completed_without_force() {
+    let recording = Recording::street(6);
+    recording.fpmcl("build-map").succeeds();
+    let localize = [LOCALIZE, &["--set=plot_loc_results=True"]].concat();
+    // The middle scan, which is read again for the pictures.
+    let scan = PipedScan::new(&recording, 3);
+    let opened = scan.opened();
+    let mut child = start(&recording, &localize);
+    wait(&opened, &mut child).write_all(&scan.bytes).unwrap();
+    let written = recording.path("results/frames.csv");
+    for _ in 0..2400 {
+        if written.exists() {
+            break;
+        }
+        thread::sleep(Duration::from_millis(50));
+    }
+    let opened = scan.opened();
+    let pipe = wait(&opened, &mut child);
+    child.kill().unwrap();
+    child.wait().unwrap();
+    drop(pipe);
+    let picture = recording.path("results/plots/range_images.png");
+    assert!(recording.path("results/localization.npz").exists());
+    assert!(!picture.exists());
+
+    scan.restore();
+    let again = || {
+        let call = recording.fpmcl("localize");
+        call.set("plot_loc_results", "True")
+    };
+    again().succeeds();
+    assert!(picture.exists());
+    again().fails_with(&["results/localization.npz exists", "--force"]);
+}
+
+#[test]
+fn a_build_that_is_killed_after_its_map_is_completed_without_force() {
+    let recording = Recording::street(12);
+    let build = [BUILD_MAP, &["--set=truth_mesh=velodyne/truth.ply"]].concat();
+    // The true surface is read after the map is written.
+    let path = recording.path("velodyne/truth.ply");
+    let bytes = uninterrupted_map(&Recording::street(12));
+    let made = Command::new("mkfifo").arg(&path).status().unwrap();
+    assert!(made.success());
+    let truth = PipedScan { path, bytes };
+    killed(&recording, &build, &truth);
+    assert!(recording.path("map.ply").exists());
+    assert!(recording.path("map.ply.parts").exists());
+    assert!(!recording.path("map.report.json").exists());
+
+    truth.restore();
+    let call = || {
+        build
+            .iter()
+            .skip(2)
+            .fold(recording.fpmcl("build-map"), |call, argument| {
+                call.with(argument)
+            })
+    };
+    let stderr = call().succeeds().stderr;
+    assert!(
+        stderr.contains("local map 4 of 4 is finished already"),
+        "{stderr}"
+    );
+    assert!(recording.path("map.report.json").exists());
+    assert!(!recording.path("map.ply.parts").exists());
+    call().fails_with(&["map.ply exists", "--force"]);
+}
+
+#[test]
+fn a_second_build_of_the_same_map_is_refused() {
+    let recording = Recording::street(12);
+    let scan = PipedScan::new(&recording, 7);
+    let opened = scan.opened();
+    let mut first = start(&recording, BUILD_MAP);
+    let pipe = wait(&opened, &mut first);
+    for force in ["force=False", "force=True"] {
+        let second = recording.fpmcl("build-map").with("--set").with(force);
+        second.fails_with(&["map.ply is being built by another build-map", "mesh_file"]);
+    }
+    first.kill().unwrap();
+    first.wait().unwrap();
+    drop(pipe);
+    // The lock of a killed build is released, and its parts are there still.
+    let stderr = resumed(&recording, BUILD_MAP, &scan);
+    assert!(
+        stderr.contains("local map 2 of 4 is finished already"),
+        "{stderr}"
+    );
+    assert!(recording.bytes("map.ply") == uninterrupted_map(&Recording::street(12)));
+}
+
+#[test]
+fn a_truncated_part_is_made_again() {
+    let recording = Recording::street(12);
+    let scan = PipedScan::new(&recording, 7);
+    killed(&recording, BUILD_MAP, &scan);
+    let part = recording.bytes("map.ply.parts/0000.ply");
+    fs::write(
+        recording.path("map.ply.parts/0000.ply"),
+        &part[..part.len() - 1],
+    )
+    .unwrap();
+    let stderr = resumed(&recording, BUILD_MAP, &scan);
+    assert!(
+        !stderr.contains("local map 1 of 4 is finished already"),
+        "{stderr}"
+    );
+    assert!(
+        stderr.contains("local map 2 of 4 is finished already"),
+        "{stderr}"
+    );
+    assert!(recording.bytes("map.ply") == uninterrupted_map(&Recording::street(12)));
+}
+
+#[test]
+fn an_output_folder_that_vanishes_is_an_error() {
+    let recording = Recording::street(6);
+    recording.fpmcl("build-map").succeeds();
+    let scan = PipedScan::new(&recording, 3);
+    let opened = scan.opened();
+    let mut child = start(&recording, LOCALIZE);
+    let mut pipe = wait(&opened, &mut child);
+    fs::rename(recording.path("results"), recording.path("moved")).unwrap();
+    pipe.write_all(&scan.bytes).unwrap();
+    drop(pipe);
+    let mut reader = BufReader::new(child.stderr.take().unwrap());
+    let stderr = read_until(&mut reader, None);
+    assert_eq!(child.wait().unwrap().code(), Some(1), "{stderr}");
+    assert!(stderr.contains("error: cannot write results/"), "{stderr}");
+    assert!(!recording.path("results").exists());
 }

@@ -123,19 +123,19 @@ fn load<T: CommandConfig>(args: &RunArgs) -> Result<T, ConfigError> {
 fn format_error_chain(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
-        let cause = cause.to_string();
-        if text.contains(&cause) {
+        let words = cause.to_string();
+        if text.contains(&words) {
             continue;
         }
-        text.push_str(if text.is_empty() {
-            "error: "
-        } else {
-            "  because: "
-        });
-        text.push_str(&cause);
-        text.push('\n');
+        text += match (text.is_empty(), cause.is::<std::io::Error>()) {
+            (true, _) => "error: ",
+            // What the operating system reports, such as a full disk.
+            (false, true) => ": ",
+            (false, false) => "\n  because: ",
+        };
+        text += &words;
     }
-    text
+    text + "\n"
 }
 
 #[cfg(test)]

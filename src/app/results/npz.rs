@@ -5,6 +5,7 @@
 use std::fmt::Display;
 use std::fs::File;
 use std::io::{self, BufReader, BufWriter, Read, Seek, Write};
+use std::mem::ManuallyDrop;
 use std::path::Path;
 
 use anyhow::{Context as _, Result, anyhow, bail, ensure};
@@ -202,14 +203,15 @@ fn numbers<'a, T: Deserialize + 'a>(
 
 /// A compressed `.npz` file that is being written.
 pub struct NpzWriter<W: Write + Seek> {
-    archive: ZipWriter<W>,
+    /// Dropped, it would try to complete the file after an error, and print the next one.
+    archive: ManuallyDrop<ZipWriter<W>>,
 }
 
 impl<W: Write + Seek> NpzWriter<W> {
     /// Starts a file.
     pub fn new(writer: W) -> Self {
         Self {
-            archive: ZipWriter::new(writer),
+            archive: ManuallyDrop::new(ZipWriter::new(writer)),
         }
     }
 
@@ -224,12 +226,12 @@ impl<W: Write + Seek> NpzWriter<W> {
             .compression_method(zip::CompressionMethod::Deflated)
             .large_file(shape.iter().product::<usize>() * size_of::<T>() > ZIP32_LIMIT);
         self.archive.start_file(format!("{name}.npy"), options)?;
-        write_npy(&mut self.archive, shape, numbers)
+        write_npy(&mut *self.archive, shape, numbers)
     }
 
     /// Writes the directory of the file.
     pub fn finish(self) -> io::Result<()> {
-        self.archive.finish()?;
+        ManuallyDrop::into_inner(self.archive).finish()?;
         Ok(())
     }
 }
