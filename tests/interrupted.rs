@@ -481,9 +481,9 @@ fn a_localization_that_is_killed_before_its_pictures_is_completed_without_force(
 #[test]
 fn a_build_that_is_killed_after_its_map_is_completed_without_force() {
     let recording = Recording::street(12);
-    let build = [BUILD_MAP, &["--set=truth_mesh=velodyne/truth.ply"]].concat();
+    let build = [BUILD_MAP, &["--set=truth_mesh=truth.ply"]].concat();
     // The true surface is read after the map is written.
-    let path = recording.path("velodyne/truth.ply");
+    let path = recording.path("truth.ply");
     let bytes = uninterrupted_map(&Recording::street(12));
     let made = Command::new("mkfifo").arg(&path).status().unwrap();
     assert!(made.success());
