@@ -352,7 +352,8 @@ fn stable_bytes(path: &Path) -> Option<Vec<u8>> {
             refine_runtimes_s: None,
             ..results
         };
-        return Some(format!("{results:?}").into_bytes());
+        // Each command that adds to a file rounds the headings again, to the last bit of an angle.
+        return Some(format!("{results:.9?}").into_bytes());
     }
     if name.ends_with(".yml") {
         let text = fs::read_to_string(path).unwrap();
