@@ -1,0 +1,205 @@
+//! What may go wrong on the road, through the binary: every trial of the table in
+//! `docs/benchmarks.md`, on a short simulated drive.
+
+#![allow(clippy::unwrap_used, reason = "a failing test may panic")]
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+use std::sync::LazyLock;
+
+use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, fpmcl, json, run, simulate_two_drives};
+use fpmcl::map::ply;
+use tempfile::TempDir;
+
+/// Frames of a drive; 0.8 m apart.
+const FRAMES: usize = 40;
+
+const SIMULATION: &str = "\
+output_folder: street
+n_scans: 40
+path:
+- {length_m: 60, turn_deg: 30}
+- {length_m: 60, turn_deg: -20}
+scanner: {azimuth_steps: 600}
+";
+
+const SENSOR: &str = "range_image: {height: 64, width: 600, fov_up: 3, fov_down: -25, max_range: 50, min_range: 2}\n";
+
+/// A folder with a map of drive 1 and the scans of drive 2.
+static WORLD: LazyLock<TempDir> = LazyLock::new(|| {
+    let temporary = tempfile::tempdir().unwrap();
+    let folder = temporary.path();
+    simulate_two_drives(folder, SIMULATION);
+    let map = format!("{MAP_OF_DRIVE_1}{SENSOR}depth: 8\nvisualize: False\n");
+    fs::write(folder.join("build_map.yml"), map).unwrap();
+    let query = format!("{DRIVE_2_IN_MAP}{SENSOR}numParticles: 2000\nplot_loc_results: False\n");
+    fs::write(folder.join("localization.yml"), query).unwrap();
+    run(folder, &["build-map", "build_map.yml"]);
+    temporary
+});
+
+/// Largest position errors of a trial [m], from frame 20 on.
+struct Outcome {
+    worst_m: f64,
+    report: serde_json::Value,
+}
+
+/// Localizes with overrides, into a folder with the name of the trial.
+fn localize(trial: &str, settings: &[&str]) -> Outcome {
+    let folder = WORLD.path();
+    let result = format!("{trial}/localization.npz");
+    let call = fpmcl("localize")
+        .in_folder(folder)
+        .with("localization.yml")
+        .set("result_path", &result);
+    let call = if settings.contains(&"--backend=gpu") {
+        call
+    } else {
+        call.with("--backend=cpu")
+    };
+    let call = settings
+        .iter()
+        .fold(call, |call, setting| match setting.split_once('=') {
+            Some((key, value)) if !key.starts_with('-') => call.set(key, value),
+            _ => call.with(setting),
+        });
+    call.succeeds();
+    let table = fs::read_to_string(folder.join(trial).join("frames.csv")).unwrap();
+    let column = table.lines().next().unwrap();
+    let column = column
+        .split(',')
+        .position(|name| name == "mcl_position_error_m")
+        .unwrap();
+    let errors_m: Vec<f64> = (table.lines().skip(1))
+        .map(|row| row.split(',').nth(column).unwrap().parse().unwrap())
+        .collect();
+    assert_eq!(errors_m.len(), FRAMES);
+    Outcome {
+        worst_m: errors_m[20..].iter().copied().fold(0.0, f64::max),
+        report: json(&folder.join(trial).join("report.json")),
+    }
+}
+
+/// Simulates drive 2 again with overrides, in a folder of its own, and returns the settings that
+/// localize it.
+fn simulated(trial: &str, settings: &[&str]) -> Vec<String> {
+    let folder = WORLD.path();
+    let mut arguments = vec!["simulate".to_owned(), "simulation.yml".to_owned()];
+    let output = format!("output_folder={trial}_street");
+    for setting in ["drive=2", &output].iter().chain(settings) {
+        arguments.extend(["--set".to_owned(), (*setting).to_owned()]);
+    }
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    run(folder, &arguments);
+    let drive = format!("{trial}_street/drive_2");
+    vec![
+        format!("scan_folder={drive}/velodyne"),
+        format!("pose_file={drive}/poses.txt"),
+        format!("calib_file={drive}/calib.txt"),
+        format!("odometry_file={drive}/odometry.txt"),
+    ]
+}
+
+fn localize_simulated(trial: &str, settings: &[&str]) -> Outcome {
+    let drive = simulated(trial, settings);
+    let drive: Vec<&str> = drive.iter().map(String::as_str).collect();
+    localize(trial, &drive)
+}
+
+#[test]
+fn a_start_anywhere_is_found_on_the_road_and_in_the_map() {
+    for region in ["corridor", "extent"] {
+        let outcome = localize(region, &[&format!("initialization={region}")]);
+        assert!(outcome.worst_m < 0.2, "{region}: {} m", outcome.worst_m);
+    }
+}
+
+#[test]
+fn both_motion_models_and_none_follow_the_car() {
+    for model in ["turn_drive_turn", "velocity"] {
+        let outcome = localize(model, &[&format!("motion_model={model}")]);
+        assert!(outcome.worst_m < 0.2, "{model}: {} m", outcome.worst_m);
+    }
+    let outcome = localize("no_odometry", &["odometry=none"]);
+    assert!(outcome.worst_m < 0.2, "{} m", outcome.worst_m);
+}
+
+#[test]
+fn a_car_that_is_moved_is_lost_and_found_again() {
+    let moved = ["motion.kidnapped_at_frame=12", "motion.kidnapped_by_m=12"];
+    let outcome = localize_simulated("kidnapped", &moved);
+    assert!(outcome.worst_m < 0.3, "{} m", outcome.worst_m);
+    let states = outcome.report["about"]["states"].as_str().unwrap();
+    assert!(!states.contains("tracking in 40"), "{states}");
+}
+
+#[test]
+fn a_lorry_beside_the_car_and_missing_beams_do_not_disturb() {
+    let lorry = ["traffic.lorry_from_s=1", "traffic.lorry_for_s=2"];
+    let outcome = localize_simulated("lorry", &lorry);
+    assert!(outcome.worst_m < 0.3, "{} m", outcome.worst_m);
+    let outcome = localize_simulated("dropout", &["scanner.dropout_share=0.3"]);
+    assert!(outcome.worst_m < 0.2, "{} m", outcome.worst_m);
+}
+
+#[test]
+fn a_map_with_a_tenth_of_its_triangles_missing_is_enough() {
+    let path = WORLD.path().join("results/map.ply");
+    let (mut mesh, drive) = ply::read_map(&path).unwrap();
+    let mut number = 0_usize;
+    mesh.triangles.retain(|_| {
+        number += 1;
+        number % 10 != 0
+    });
+    let holes = WORLD.path().join("holes.ply");
+    ply::write(&holes, &mesh, drive.as_ref()).unwrap();
+    let outcome = localize("holes", &["map_file=holes.ply"]);
+    assert!(outcome.worst_m < 0.2, "{} m", outcome.worst_m);
+}
+
+#[test]
+fn scans_bent_by_the_motion_are_compensated() {
+    let drive = simulated(
+        "rolling",
+        &["scanner.rolling_shutter=true", "odometry.scale_error=0"],
+    );
+    let mut settings: Vec<&str> = drive.iter().map(String::as_str).collect();
+    let bent = localize("bent", &settings);
+    settings.push("motion_compensation=counter_clockwise");
+    let compensated = localize("compensated", &settings);
+    let rmse = |outcome: &Outcome| {
+        let metrics = &outcome.report["mcl"]["metrics"];
+        metrics["position_m"]["rmse"].as_f64().unwrap()
+    };
+    assert!(
+        rmse(&compensated) < 0.5 * rmse(&bent),
+        "{} {}",
+        rmse(&compensated),
+        rmse(&bent)
+    );
+}
+
+#[test]
+fn localize_refines_where_it_is_asked_to() {
+    let outcome = localize("refined", &["refine=True"]);
+    let rmse = |name: &str| outcome.report[name]["metrics"]["position_m"]["rmse"].as_f64();
+    assert!(rmse("refined").unwrap() < rmse("mcl").unwrap().max(0.02));
+}
+
+/// Where the variable `FPMCL_REQUIRE_GPU` is set, a missing adapter is an error.
+#[test]
+#[allow(clippy::print_stderr, reason = "a skipped test reports it")]
+fn the_graphics_card_finds_the_same_path() {
+    let text = run(Path::new("."), &["doctor"]);
+    let has_adapter =
+        (text.lines()).any(|line| line.starts_with("adapter ") && !line.contains("none"));
+    let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|value| value == "1");
+    if !has_adapter && !required {
+        eprintln!("not run: no graphics adapter");
+        return;
+    }
+    let outcome = localize("gpu", &["--backend=gpu"]);
+    assert!(outcome.worst_m < 0.2, "{} m", outcome.worst_m);
+}
