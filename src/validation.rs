@@ -66,10 +66,13 @@ pub fn positive<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<()
     let number: f64 = value.into();
     require(number > 0.0, key, value, "it must be greater than 0")?;
     // Values of single precision are rounded.
-    in_range(key, number, 0.999 * SMALLEST..=LARGEST).map_err(|_| {
-        let remedy = format!("it must lie between {SMALLEST} and {LARGEST}");
-        InvalidValue::new(key, value, remedy)
-    })
+    match (0.999 * SMALLEST..=LARGEST).contains(&number) {
+        true => Ok(()),
+        false => {
+            let remedy = format!("it must be between {SMALLEST} and {LARGEST}");
+            Err(InvalidValue::new(key, value, remedy))
+        }
+    }
 }
 
 /// Requires a value greater than 0, which may be infinite: no limit.

@@ -388,3 +388,18 @@ fn the_demonstration_runs_twice_in_one_folder() {
     }
     assert!(folder.path().join("out/map.ply").exists());
 }
+
+#[test]
+fn an_effective_configuration_runs_again_in_its_own_folder() {
+    let recording = Recording::street(4);
+    recording.fpmcl("build-map").succeeds();
+    recording.fpmcl("localize").succeeds();
+    let expected = recording.bytes("results/mcl_tum.txt");
+    fpmcl("localize")
+        .in_folder(recording.folder())
+        .with("results/effective_localization.yml")
+        .with("--backend=cpu")
+        .with("--force")
+        .succeeds();
+    assert!(recording.bytes("results/mcl_tum.txt") == expected);
+}

@@ -151,7 +151,7 @@ fn a_map_with_a_tenth_of_its_triangles_missing_is_enough() {
     let mut number = 0_usize;
     mesh.triangles.retain(|_| {
         number += 1;
-        number % 10 != 0
+        !number.is_multiple_of(10)
     });
     let holes = WORLD.path().join("holes.ply");
     ply::write(&holes, &mesh, drive.as_ref()).unwrap();

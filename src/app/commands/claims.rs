@@ -25,6 +25,9 @@ use crate::files::{folder_of, remove_abandoned, temporary_beside};
 /// File of the claims in each folder.
 pub const CLAIMS_FILE: &str = ".fpmcl";
 
+/// Name of the configuration file among the inputs.
+pub const CONFIGURATION_FILE: &str = "the configuration file";
+
 /// First bytes of a map.
 pub const PLY: &[u8] = b"ply";
 /// First bytes of a result.
@@ -75,7 +78,7 @@ impl Outputs<'_> {
 
     fn check_main(&self, claims: &Claims) -> Result<()> {
         let (key, path) = (self.key, self.main.display());
-        self.check_inputs(self.main)?;
+        self.check_inputs(self.main, |_key| true)?;
         let Ok(found) = fs::symlink_metadata(self.main) else {
             return Ok(());
         };
@@ -115,7 +118,10 @@ impl Outputs<'_> {
 
     /// Checks a file or folder that is replaced with and without `force`.
     fn check(&self, path: &Path, claims: &Claims) -> Result<()> {
-        self.check_inputs(path)?;
+        let is_claimed = claims.state(path).is_some();
+        // An effective configuration may be run again: it is read before it is replaced.
+        let is_replaced = |key: &str| !(is_claimed && key == CONFIGURATION_FILE);
+        self.check_inputs(path, is_replaced)?;
         let Ok(found) = fs::symlink_metadata(path) else {
             return Ok(());
         };
@@ -131,13 +137,13 @@ impl Outputs<'_> {
         )
     }
 
-    /// Checks that an output is none of the inputs, also through links.
-    fn check_inputs(&self, output: &Path) -> Result<()> {
+    /// Checks that an output is none of the inputs whose keys count, also through links.
+    fn check_inputs(&self, output: &Path, counts: impl Fn(&str) -> bool) -> Result<()> {
         let Ok(output) = output.canonicalize() else {
             return Ok(());
         };
         let is_same = |input: &Path| input.canonicalize().is_ok_and(|input| input == output);
-        match self.inputs.iter().find(|(_, input)| is_same(input)) {
+        match (self.inputs.iter()).find(|(key, input)| counts(key) && is_same(input)) {
             Some((input_key, input)) => bail!(
                 "{} would be replaced, but it is an input ({input_key}); set {} to a path in another folder",
                 input.display(),

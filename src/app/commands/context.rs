@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use tracing::level_filters::LevelFilter;
 
+use super::claims::CONFIGURATION_FILE;
 use super::interrupt::Interrupt;
 use super::logging::{self, RunLog};
 use super::progress::Progress;
@@ -64,7 +65,7 @@ impl Context {
 
     /// The configuration file as an input.
     pub fn input(&self) -> Option<(&'static str, &Path)> {
-        Some(("the configuration file", self.config_file.as_deref()?))
+        Some((CONFIGURATION_FILE, self.config_file.as_deref()?))
     }
 }
 

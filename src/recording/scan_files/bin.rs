@@ -44,7 +44,7 @@ fn with_columns(bytes: &[u8], columns: usize) -> Scan {
 
 fn is_plausible(scan: &Scan) -> bool {
     let is_point = |point: &Vec3| !point.is_finite() || point.length() < FARTHEST_M;
-    scan.points.iter().all(is_point) && scan.intensities.iter().all(|&i| !(i < 0.0))
+    scan.points.iter().all(is_point) && !scan.intensities.iter().any(|&intensity| intensity < 0.0)
 }
 
 #[cfg(test)]
