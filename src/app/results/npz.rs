@@ -9,13 +9,13 @@ use std::mem::ManuallyDrop;
 use std::path::Path;
 
 use anyhow::{Context as _, Result, anyhow, bail, ensure};
-use npyz::{AutoSerialize, DType, Deserialize, NpyFile, NpyHeader, Order, TypeChar, WriterBuilder};
+use npyz::{AutoSerialize, DType, Deserialize, NpyFile, Order, TypeChar, WriterBuilder};
 use zip::result::ZipError;
 use zip::write::SimpleFileOptions;
 use zip::{ZipArchive, ZipWriter};
 
 use crate::memory;
-use crate::recording::scan_files::npy::has_endless_header;
+use crate::recording::scan_files::npy::read_header;
 
 /// Size of the buffer between decompression and numbers [bytes].
 const BUFFER_BYTES: usize = 1 << 16;
@@ -151,14 +151,8 @@ fn not_numbers(found: &DType) -> anyhow::Error {
 
 /// Reads the header of an array and checks that the bytes after it are those that it claims.
 fn open_array<'a>(mut entry: io::Take<impl Read + 'a>) -> Result<(Vec<usize>, Numbers<'a>)> {
-    let mut start = [0; 12];
-    (entry.read_exact(&mut start)).map_err(|error| anyhow!(unreadable(&error)))?;
-    ensure!(
-        !has_endless_header(&start),
-        "it cannot be read: its header has no end"
-    );
-    let header = NpyHeader::from_reader(start.chain(&mut entry))
-        .map_err(|error| anyhow!(unreadable(&error)))?;
+    let header =
+        read_header(&mut entry).map_err(|problem| anyhow!("it cannot be read: it {problem}"))?;
     let DType::Plain(element) = header.dtype() else {
         return Err(not_numbers(&header.dtype()));
     };

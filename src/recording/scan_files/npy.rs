@@ -1,29 +1,61 @@
 //! `.npy`: an array of one row per point, x, y, z and, if there is a fourth column, intensity.
 
-use npyz::{DType, NpyFile, Order, TypeChar};
+use std::io::{self, Read};
+
+use npyz::{DType, NpyHeader, Order, TypeChar};
 
 use super::point_table::{Column, NumberType, scan_of};
 use crate::lidar::Scan;
 
 /// Longest header of an array; those of numbers have about a hundred [bytes].
-const LONGEST_HEADER: u32 = 1 << 16;
+const LONGEST_HEADER: usize = 1 << 16;
 
-/// Whether the first bytes of an array claim a header that no array of numbers has, and for which memory
-/// is not to be allocated.
-pub fn has_endless_header(start: &[u8]) -> bool {
+/// Deepest nesting of a header; the time to parse it doubles with each level.
+const DEEPEST_HEADER: usize = 8;
+
+/// Reads the header of an array, and checks that reading it needs neither much memory nor much time.
+pub fn read_header(reader: &mut impl Read) -> Result<NpyHeader, String> {
+    let unreadable = |error: io::Error| format!("is no npy array: {error}");
     // Magic number, major and minor version, length; with 16 bits in the first version.
-    let length = start.get(8..).and_then(<[u8]>::first_chunk);
-    let has_long_length = start.get(6).is_some_and(|&major| major > 1);
-    has_long_length && length.is_some_and(|&l| u32::from_le_bytes(l) > LONGEST_HEADER)
+    let mut header = vec![0; 10];
+    reader.read_exact(&mut header).map_err(unreadable)?;
+    if header[6] > 1 {
+        header.resize(12, 0);
+        reader.read_exact(&mut header[10..]).map_err(unreadable)?;
+    }
+    let length = header[8..].iter().rev();
+    let length = length.fold(0, |length, &byte| length << 8 | usize::from(byte));
+    if length > LONGEST_HEADER {
+        return Err(format!(
+            "is no npy array: its header of {length} bytes is too long"
+        ));
+    }
+    let start = header.len();
+    header.resize(start + length, 0);
+    reader
+        .read_exact(&mut header[start..])
+        .map_err(unreadable)?;
+    let (mut depth, mut deepest) = (0_usize, 0);
+    for byte in &header[start..] {
+        match byte {
+            b'{' | b'[' | b'(' => depth += 1,
+            b'}' | b']' | b')' => depth = depth.saturating_sub(1),
+            _ => {}
+        }
+        deepest = deepest.max(depth);
+    }
+    if deepest > DEEPEST_HEADER {
+        return Err(format!(
+            "is no npy array: its header is nested {deepest} times"
+        ));
+    }
+    NpyHeader::from_reader(header.as_slice()).map_err(unreadable)
 }
 
 /// Reads an array of floats with two dimensions.
 pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
-    if has_endless_header(bytes) {
-        return Err("is no npy array: its header has no end".to_owned());
-    }
     let mut rest = bytes;
-    let array = NpyFile::new(&mut rest).map_err(|error| format!("is no npy array: {error}"))?;
+    let array = read_header(&mut rest)?;
     let number_type = match array.dtype() {
         DType::Plain(plain) => match (plain.type_char(), plain.size_field()) {
             (TypeChar::Float, 4) => NumberType::F32,
@@ -62,7 +94,6 @@ pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
         .enumerate()
         .map(column)
         .collect();
-    drop(array);
     scan_of(&columns, rest, rows)
 }
 
@@ -71,8 +102,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn memory_for_a_header_of_gigabytes_is_not_allocated() {
+    fn a_header_that_would_need_gigabytes_or_years_is_an_error() {
         let message = parse(b"\x93NUMPY\x02\x00\xff\xff\xff\xff{'descr'").unwrap_err();
-        assert!(message.contains("its header has no end"), "{message}");
+        assert!(message.contains("is too long"), "{message}");
+        let nested = [b"\x93NUMPY\x01\x00\x3e\x00".as_slice(), &[b'{'; 62]].concat();
+        let message = parse(&nested).unwrap_err();
+        assert!(message.contains("is nested 62 times"), "{message}");
     }
 }
