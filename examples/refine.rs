@@ -6,7 +6,6 @@
 use std::path::PathBuf;
 
 use fpmcl::geometry::pose2_from_pose3;
-use fpmcl::localization::State;
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::recording::{Sequence, poses::read_tum};
 use fpmcl::refinement::{InitialEstimate, RefinerConfig, TrajectoryRefiner};
@@ -19,16 +18,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let map = Map::load(map_file, &MapOptions::default())?;
     let trajectory = read_tum(trajectory_file)?;
     let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), 0)?;
-    for (frame, row) in Sequence::open_folder(recording)?
-        .frames
-        .iter()
-        .zip(&trajectory)
-    {
-        let estimate = InitialEstimate {
-            pose: pose2_from_pose3(&row.map_from_lidar),
-            covariance: None,
-            state: State::Tracking,
-        };
+    let recording = Sequence::open_folder(recording)?;
+    for (frame, row) in recording.frames.iter().zip(&trajectory) {
+        let estimate = InitialEstimate::tracked(pose2_from_pose3(&row.map_from_lidar));
         refiner.add(&frame.read()?, &estimate)?;
     }
     for (row, pose) in refiner.finish(None)?.poses.iter().enumerate() {

@@ -217,7 +217,7 @@ pub struct CompareArgs {
 /// Arguments of `ground`.
 #[derive(Clone, Debug, Args)]
 pub struct GroundArgs {
-    /// Scan (.bin), folder of scans, recording with velodyne/ and labels/, or configuration (.yml);
+    /// Scan (.bin, .pcd, .ply, .npy), folder of scans, recording with velodyne/ and labels/, or configuration (.yml);
     /// by default the configuration's scan_folder.
     pub input: Option<PathBuf>,
 

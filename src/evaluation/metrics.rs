@@ -109,7 +109,7 @@ pub struct TrajectoryMetrics {
 
 /// An error of the input.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages say it")]
+#[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum MetricsError {
     #[error(
         "{frames} frames are too few: the first {skip_frames} (skip_frames) are excluded and one is needed after them"

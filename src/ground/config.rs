@@ -80,6 +80,15 @@ impl Validate for GroundConfig {
     }
 }
 
+impl GroundConfig {
+    /// Validates a configuration whose RANSAC keys are at the top level, as in range-mcl's files.
+    pub fn validate_with_flat_ransac(&self) -> Result<(), InvalidValue> {
+        nested("fuzzy", &self.fuzzy)?;
+        nested("pca", &self.pca)?;
+        self.ransac.validate()
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

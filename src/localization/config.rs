@@ -66,6 +66,7 @@ const MAX_PARTICLES: usize = 1_000_000;
 impl Validate for LocalizerConfig {
     /// Errors have the keys of `localization.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
+        self.sensor.validate()?;
         in_range("numParticles", self.num_particles, 1..=MAX_PARTICLES)?;
         in_range("num_reduced", self.num_reduced, 1..=MAX_PARTICLES)?;
         not_negative("move_thres", self.move_thres_m)?;

@@ -12,7 +12,7 @@ use crate::lidar::{RangeImage, Scan};
 use crate::map::{Map, PanoramaRequest, SearchRegion, SensorAttitude};
 use crate::random::stream;
 use crate::rendering::RenderError;
-use crate::validation::{InvalidValue, Validate as _};
+use crate::validation::{InvalidValue, Validate as _, nested};
 
 /// Random streams: of the initial particles, and of the first frame; those of the other frames follow.
 const INITIALIZATION_STREAM: u64 = 0;
@@ -91,6 +91,9 @@ impl Localizer {
         seed: u64,
     ) -> Result<Self, LocalizerError> {
         config.validate()?;
+        if let Start::Pose { spread, .. } = &start {
+            nested("start", spread)?;
+        }
         Ok(Self {
             map: map.clone(),
             sensor: Sensor::new(&config.sensor)?,

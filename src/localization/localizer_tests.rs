@@ -147,3 +147,17 @@ fn an_invalid_configuration_is_an_error_that_names_its_key() {
     let no_scale = message(|config| config.observation.scale_m = -1.0);
     assert!(no_scale.contains("observation.scale_m is -1"), "{no_scale}");
 }
+
+#[test]
+fn library_and_program_refuse_the_same_values() {
+    let refused = |change: fn(&mut LocalizerConfig)| {
+        let mut config = LocalizerConfig::default();
+        change(&mut config);
+        config.validate().unwrap_err().to_string()
+    };
+    assert!(refused(|config| config.sensor.lidar.width = 0).contains("range_image"));
+    assert!(refused(|config| config.sensor.height_m = Some(-1.0)).contains("sensor_height_m"));
+    assert!(refused(|config| config.sensor.height_m = Some(f64::NAN)).contains("sensor_height_m"));
+    assert!(refused(|config| config.sensor.own_car_m = [1.0, -1.0, 0.0, 1.0]).contains("own_car"));
+    assert!(refused(|config| config.panorama.yaw_sigma_rad = -1.0).contains("yaw_sigma"));
+}

@@ -35,6 +35,7 @@ pub mod localizer;
 pub use config::LocalizerConfig;
 pub use estimate::Estimate;
 pub use filter::ParticleFilter;
+pub use initialization::StartSpread;
 pub use localizer::{Localizer, LocalizerError, Start};
 pub use odometry::Odometry;
 pub use particles::{Particle, ParticleSet};

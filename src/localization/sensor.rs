@@ -3,7 +3,7 @@
 use crate::ground::{GroundClassifier, GroundConfig, road_plane};
 use crate::lidar::{LidarModel, RangeImage, Scan};
 use crate::map::SensorAttitude;
-use crate::validation::InvalidValue;
+use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 use smart_default::SmartDefault;
 
 /// The sensor and the preparation of its scans.
@@ -20,6 +20,18 @@ pub struct SensorConfig {
     pub ground: GroundConfig,
     /// Height of the sensor above the ground [m]; `None` measures it in the scans.
     pub height_m: Option<f64>,
+}
+
+impl Validate for SensorConfig {
+    /// Errors have the keys of `localization.yml`.
+    fn validate(&self) -> Result<(), InvalidValue> {
+        nested("range_image", &self.lidar)?;
+        rectangle("own_car_m", self.own_car_m)?;
+        if let Some(height_m) = self.height_m {
+            positive("sensor_height_m", height_m)?;
+        }
+        self.ground.validate_with_flat_ransac()
+    }
 }
 
 impl SensorConfig {
@@ -39,6 +51,8 @@ pub struct Sensor {
     lidar: LidarModel,
     own_car_m: [f32; 4],
     classifier: Box<dyn GroundClassifier>,
+    /// `None`: measured.
+    height_m: Option<f64>,
 }
 
 impl Sensor {
@@ -48,6 +62,7 @@ impl Sensor {
             lidar: config.lidar,
             own_car_m: config.own_car_m,
             classifier: config.ground.classifier()?,
+            height_m: config.height_m,
         })
     }
 
@@ -59,7 +74,8 @@ impl Sensor {
         RangeImage::project(&points, &self.lidar)
     }
 
-    /// Attitude of the sensor above the ground in the scan; `None` where too little ground is visible.
+    /// Attitude of the sensor above the ground in the scan, with the height of the configuration if it
+    /// has one; `None` where too little ground is visible.
     pub fn attitude(&self, image: &RangeImage) -> Option<SensorAttitude> {
         let points: Vec<_> = (0..image.ranges.len())
             .filter(|&index| image.has_return(index))
@@ -67,6 +83,10 @@ impl Sensor {
             .collect();
         let ground = self.classifier.ground_confidence(&points);
         let plane = road_plane(&points, &ground)?;
-        Some(SensorAttitude::from_plane(plane.up, plane.height_m))
+        let measured = SensorAttitude::from_plane(plane.up, plane.height_m);
+        Some(SensorAttitude {
+            height_m: self.height_m.unwrap_or(measured.height_m),
+            ..measured
+        })
     }
 }

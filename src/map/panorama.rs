@@ -29,7 +29,7 @@ use crate::geometry::{Pose2, Pose3, Rigid3f, pose2_from_pose3, wrap_angle};
 use crate::lidar::{LidarModel, RangeImage};
 use crate::memory::{self, MemoryError};
 use crate::rendering::{RangeRenderer, RenderError};
-use crate::validation::{InvalidValue, Validate, fraction, in_range, positive};
+use crate::validation::{InvalidValue, Validate, fraction, in_range, not_negative, positive};
 
 /// Size of the panoramas and of the search.
 ///
@@ -83,7 +83,8 @@ impl Validate for PanoramaConfig {
         positive("limit_m", self.limit_m)?;
         in_range("coarse_step", self.coarse_step, 1..=self.columns)?;
         fraction("refined_share", self.refined_share)?;
-        positive("scale_m", self.scale_m)
+        positive("scale_m", self.scale_m)?;
+        not_negative("yaw_sigma_rad", self.yaw_sigma_rad)
     }
 }
 

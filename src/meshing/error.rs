@@ -5,7 +5,7 @@ use crate::validation::InvalidValue;
 
 /// Why a surface cannot be reconstructed.
 #[derive(Debug, thiserror::Error, PartialEq)]
-#[expect(missing_docs, reason = "the messages say it")]
+#[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum MeshingError {
     #[error(
         "only {usable} of {given} points can be meshed, at least {needed} at different positions are needed; \

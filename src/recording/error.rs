@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 /// A file of a recording that cannot be read or used.
 #[derive(Debug, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages say it")]
+#[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum RecordingError {
     #[error("cannot read {}: {source}", path.display())]
     Read { path: PathBuf, source: io::Error },

@@ -22,7 +22,7 @@ use crate::localization::{Estimate, Sensor, SensorConfig, State};
 use crate::map::{Map, SensorAttitude};
 use crate::random::{Generator, stream};
 use crate::rendering::RenderError;
-use crate::validation::{InvalidValue, Validate as _};
+use crate::validation::{InvalidValue, Validate, nested};
 
 /// Configuration of the refinement of a trajectory.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -35,6 +35,15 @@ pub struct RefinerConfig {
     pub refinement: RefinementConfig,
 }
 
+impl Validate for RefinerConfig {
+    /// Errors have the keys of `refinement.yml`.
+    fn validate(&self) -> Result<(), InvalidValue> {
+        self.sensor.validate()?;
+        nested("observation", &self.observation)?;
+        nested("refinement", &self.refinement)
+    }
+}
+
 /// An estimate to refine.
 #[derive(Clone, Debug, PartialEq)]
 pub struct InitialEstimate {
@@ -45,6 +54,17 @@ pub struct InitialEstimate {
     pub covariance: Option<Matrix3<f64>>,
     /// State of the filter. Only tracked frames are refined.
     pub state: State,
+}
+
+impl InitialEstimate {
+    /// A pose whose frame was tracked, without a covariance.
+    pub fn tracked(pose: Pose2) -> Self {
+        Self {
+            pose,
+            covariance: None,
+            state: State::Tracking,
+        }
+    }
 }
 
 impl From<&Estimate> for InitialEstimate {
@@ -124,8 +144,7 @@ pub struct TrajectoryRefiner {
 impl TrajectoryRefiner {
     /// Prepares the refinement in a map. The same seed gives the same trajectory.
     pub fn new(map: &Map, config: RefinerConfig, seed: u64) -> Result<Self, RefinerError> {
-        config.observation.validate()?;
-        config.refinement.validate()?;
+        config.validate()?;
         Ok(Self {
             map: map.clone(),
             sensor: Sensor::new(&config.sensor)?,

@@ -19,7 +19,7 @@ pub enum Backend {
 
 /// Type of a graphics adapter, best first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-#[expect(missing_docs, reason = "the names say it")]
+#[expect(missing_docs, reason = "the names are the documentation")]
 pub enum AdapterKind {
     Discrete,
     Integrated,

@@ -155,7 +155,7 @@ fn facing(normal: Vec3, direction: Vec3) -> Vec3 {
 
 /// Error while rendering.
 #[derive(Debug, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages say it")]
+#[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum RenderError {
     #[error("there is no graphics adapter; use --backend cpu")]
     NoAdapter,

@@ -81,8 +81,6 @@ fn localization_config(
         pose_file: drive.join("poses.txt"),
         calib_file: Some(drive.join("calib.txt")),
         map_file: map.mesh_file.clone(),
-        map_pose_file: Some(map.pose_file.clone()),
-        map_calib_file: map.calib_file.clone(),
         result_path: output.join("localization.npz"),
         num_particles: 1000,
         odometry: OdometrySource::File,

@@ -124,11 +124,6 @@ fn planned_run(
             &variant.localization,
         ],
     )?;
-    let localization = LocalizationConfig {
-        map_pose_file: Some(build_map.pose_file.clone()),
-        map_calib_file: build_map.calib_file.clone(),
-        ..localization
-    };
     let refinement = || {
         with_overrides(
             RefinementConfig::of(localization.clone()),

@@ -6,7 +6,7 @@ use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::check::{ground, optional_path, path};
+use super::check::{optional_path, path};
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::lidar::{LidarModel, NormalConfig, RotationDirection};
 use crate::map::confidence::ConfidenceConfig;
@@ -22,10 +22,10 @@ use crate::validation::{InvalidValue, Validate, in_range, require};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct BuildMapConfig {
-    /// Folder of the scans, `NNNNNN.bin`.
+    /// Folder of the scans, `.bin`, `.pcd`, `.ply` or `.npy`.
     #[default("data/kitti/velodyne".into())]
     pub scan_folder: PathBuf,
-    /// Camera poses of the recording.
+    /// Poses of the recording, rows of KITTI or TUM.
     #[default("data/kitti/poses.txt".into())]
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`.
@@ -212,7 +212,7 @@ impl Validate for BuildMapConfig {
             self.holdout_step,
             "1 would exclude every scan; 0 excludes none, 10 every tenth",
         )?;
-        ground(&self.ground())?;
+        self.ground().validate_with_flat_ransac()?;
         self.map().validate()
     }
 }

@@ -10,7 +10,7 @@ const LONGEST_KEY: usize = 200;
 
 /// Why a configuration cannot be used.
 #[derive(Debug, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages say it")]
+#[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum ConfigError {
     #[error(
         "cannot read the configuration {}: {source}; give the path of a YAML file, such as one that `fpmcl config` prints",

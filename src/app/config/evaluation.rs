@@ -17,7 +17,7 @@ pub struct EvaluationConfig {
     /// Result of `localize`, `refine` or range-mcl.
     #[default("results/localization.npz".into())]
     pub result_file: PathBuf,
-    /// Camera poses of the recording, the ground truth; `None`: that in the result.
+    /// Poses of the recording, rows of KITTI or TUM, the ground truth; `None`: that in the result.
     pub pose_file: Option<PathBuf>,
     /// Calibration of the recording, with its line `Tr`, for `pose_file`.
     /// `None`: the poses are those of the lidar.

@@ -13,7 +13,7 @@ use crate::validation::{InvalidValue, Validate, in_range};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct GroundCommandConfig {
-    /// Folder of the scans, `NNNNNN.bin`.
+    /// Folder of the scans, `.bin`, `.pcd`, `.ply` or `.npy`.
     #[default("data/kitti/velodyne".into())]
     pub scan_folder: PathBuf,
     /// Folder of the true classes, `NNNNNN.label`; `None`: `labels` beside the scans, where it

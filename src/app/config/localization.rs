@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::check::{ground, optional_path, path};
+use super::check::{optional_path, path};
 use super::odometry::OdometrySource;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::lidar::{LidarModel, RotationDirection};
@@ -21,9 +21,7 @@ use crate::localization::{LocalizerConfig, SensorConfig};
 use crate::map::PanoramaConfig;
 use crate::map::scan_cloud::ScanConfig;
 use crate::refinement::{RefinementConfig, RefinerConfig};
-use crate::validation::{
-    InvalidValue, Validate, in_range, nested, not_negative, positive, rectangle,
-};
+use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative};
 
 /// Configuration of `localize`: the keys of range-mcl's `localization.yml`, then new ones.
 ///
@@ -31,7 +29,7 @@ use crate::validation::{
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct LocalizationConfig {
-    /// Folder of the scans, `NNNNNN.bin`.
+    /// Folder of the scans, `.bin`, `.pcd`, `.ply` or `.npy`.
     #[default("data/kitti/velodyne".into())]
     pub scan_folder: PathBuf,
     /// Map of `build-map` or range-mcl.
@@ -41,7 +39,7 @@ pub struct LocalizationConfig {
     pub map_pose_file: Option<PathBuf>,
     /// Calibration of the mapping drive; `None`: the map carries its own frame.
     pub map_calib_file: Option<PathBuf>,
-    /// Camera poses of the recording.
+    /// Poses of the recording, rows of KITTI or TUM.
     #[default("data/kitti/poses.txt".into())]
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`.
@@ -348,10 +346,6 @@ impl Validate for LocalizationConfig {
         path("result_path", &self.result_path)?;
         self.selection().validate()?;
         self.odometry.validate(self.odometry_file.as_deref())?;
-        rectangle("own_car_m", self.own_car_m)?;
-        self.sensor_height_m
-            .map_or(Ok(()), |height| positive("sensor_height_m", height))?;
-        ground(&self.ground())?;
         in_range("grid_res", self.grid_res, PanoramaConfig::CELLS_M)?;
         not_negative("yaw_sigma", self.yaw_sigma)?;
         nested("start", &self.start)?;

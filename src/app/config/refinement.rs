@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::check::{ground, optional_path, path};
+use super::check::{optional_path, path};
 use super::localization::LocalizationConfig;
 use super::odometry::OdometrySource;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
@@ -12,13 +12,13 @@ use crate::lidar::{LidarModel, RotationDirection};
 use crate::localization::SensorConfig;
 use crate::localization::observation::ObservationConfig;
 use crate::refinement::{self, RefinerConfig};
-use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
+use crate::validation::{InvalidValue, Validate, nested};
 
 /// Configuration of `refine`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RefinementConfig {
-    /// Folder of the scans, `NNNNNN.bin`.
+    /// Folder of the scans, `.bin`, `.pcd`, `.ply` or `.npy`.
     pub scan_folder: PathBuf,
     /// Map of `build-map` or range-mcl.
     pub map_file: PathBuf,
@@ -26,7 +26,7 @@ pub struct RefinementConfig {
     pub map_pose_file: Option<PathBuf>,
     /// Calibration of the mapping drive; `None`: the map carries its own frame.
     pub map_calib_file: Option<PathBuf>,
-    /// Camera poses of the recording.
+    /// Poses of the recording, rows of KITTI or TUM.
     pub pose_file: PathBuf,
     /// Calibration of the recording, with its line `Tr`.
     /// `None`: the poses are those of the lidar.
@@ -158,12 +158,7 @@ impl Validate for RefinementConfig {
         path("result_file", &self.result_file)?;
         self.selection().validate()?;
         self.odometry.validate(self.odometry_file.as_deref())?;
-        rectangle("own_car_m", self.own_car_m)?;
-        self.sensor_height_m
-            .map_or(Ok(()), |height| positive("sensor_height_m", height))?;
-        ground(&self.ground())?;
-        nested("observation", &self.observation)?;
-        nested("refinement", &self.refinement)?;
-        nested("range_image", &self.range_image)
+        nested("range_image", &self.range_image)?;
+        self.refiner().validate()
     }
 }

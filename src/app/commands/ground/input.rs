@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail, ensure};
 
 use crate::app::cli::GroundArgs;
+use crate::app::commands::input::require_folder;
 use crate::app::config::{self, GroundCommandConfig};
 use crate::evaluation::LabelledPoints;
 use crate::recording::sequence::selected_scans;
@@ -62,6 +63,9 @@ pub fn load(args: &GroundArgs) -> Result<(GroundCommandConfig, PathBuf)> {
 
 /// Lists the scan at a path, or the selected scans of a folder, in order.
 pub fn scans(path: &Path, config: &GroundCommandConfig) -> Result<Vec<ScanFiles>> {
+    if !is_scan(path) {
+        require_folder("scan_folder", path)?;
+    }
     let (folder, scan_paths) = if is_scan(path) {
         (path.parent().unwrap_or(path), vec![path.to_owned()])
     } else {
