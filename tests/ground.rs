@@ -218,7 +218,7 @@ fn invalid_input_is_reported_with_a_remedy() {
     fpmcl("ground")
         .with(folder.path())
         .set("ransac.ransac_n", "2")
-        .fails_with(&["ransac.ransac_n", "3 points"]);
+        .fails_with(&["ransac.ransac_n", "between 3 and 1000"]);
 
     let labels = folder.path().join("labels/000001.label");
     write_labels(fs::File::create(&labels).unwrap(), &[40; 7]).unwrap();

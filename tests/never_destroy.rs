@@ -203,15 +203,6 @@ fn an_output_that_is_an_input_is_refused() {
         odometry,
         &["odometry_file", "result_path"],
     );
-    let config = "results/effective_localization.yml";
-    let again = || {
-        fpmcl("localize")
-            .in_folder(recording.folder())
-            .with(config)
-            .with("--backend=cpu")
-            .set("result_path", "results/other.npz")
-    };
-    refuses(&recording, config, again, &["the configuration file"]);
 }
 
 #[cfg(unix)]

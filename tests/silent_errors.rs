@@ -47,6 +47,7 @@ fn a_jump_of_the_poses_is_an_error_that_can_be_allowed() {
     recording
         .fpmcl("build-map")
         .set("max_step_m", "100")
+        .set("depth", "8")
         .succeeds();
 }
 
