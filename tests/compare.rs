@@ -9,40 +9,29 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::PathBuf;
 
-use common::{Fpmcl, Recording, fpmcl, json};
+use common::{COMPARISON_OF_STREET, Fpmcl, Recording, fpmcl, json};
 
 const FRAMES: usize = 12;
 
+/// Follows the common keys.
 const COMPARISON: &str = "\
-output_folder: out
-seeds: [1, 2]
-base:
-  build_map: {depth: 6, voxel_size: 0.2, displacement_threshold_m: 0, simplify_resolution: 0.5}
-  localization: {numParticles: 50, num_reduced: 20}
-  refinement: {refinement: {method: swarm, swarm: {iterations: 3}}}
-sequences:
-- name: street
-  build_map:
-    scan_folder: velodyne
-    pose_file: poses.txt
-    calib_file: calib.txt
-    range_image: {height: 32, width: 360, min_range: 1}
-  localization:
-    scan_folder: velodyne
-    pose_file: poses.txt
-    calib_file: calib.txt
-    range_image: {height: 32, width: 360, min_range: 1}
 - {name: elsewhere, optional: True, build_map: {scan_folder: nowhere}}
 configurations:
 - {name: PCA-MCL, claimed_m: 1.45, build_map: {ground_method: pca}}
 - {name: Fuzzy-MCL, claimed_m: 1.02}
 - {name: Fuzzy-PSO-MCL, claimed_m: 0.71, refine: True}
 particles: {configuration: Fuzzy-MCL, sequences: [street], counts: [10, 40], seeds: [1]}
+output_folder: out
+seeds: [1, 2]
 ";
+
+fn comparison() -> String {
+    format!("{COMPARISON_OF_STREET}{COMPARISON}")
+}
 
 fn recording() -> Recording {
     let recording = Recording::street(FRAMES);
-    recording.write("comparison.yml", COMPARISON);
+    recording.write("comparison.yml", &comparison());
     recording
 }
 
@@ -330,7 +319,7 @@ fn errors_are_reported_before_any_run_is_executed() {
     );
     recording.write(
         "comparison.yml",
-        &COMPARISON.replace("ground_method: pca", "ground_method: pcb"),
+        &comparison().replace("ground_method: pca", "ground_method: pcb"),
     );
     fails(compare(&recording), &["PCA-MCL", "ground_method", "pcb"]);
     compare(&recording)

@@ -20,7 +20,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
-use common::Recording;
+use common::{COMPARISON_OF_STREET, Recording};
 use fpmcl::app::results::LocalizationResults;
 use rand::RngExt as _;
 
@@ -65,22 +65,6 @@ const FRAMES: usize = 12;
 const COMPARISON: &str = "\
 output_folder: results
 seeds: [1]
-base:
-  build_map: {depth: 6, voxel_size: 0.2, displacement_threshold_m: 0, simplify_resolution: 0.5}
-  localization: {numParticles: 50, num_reduced: 20}
-  refinement: {refinement: {method: swarm, swarm: {iterations: 3}}}
-sequences:
-- name: street
-  build_map:
-    scan_folder: velodyne
-    pose_file: poses.txt
-    calib_file: calib.txt
-    range_image: {height: 32, width: 360, min_range: 1}
-  localization:
-    scan_folder: velodyne
-    pose_file: poses.txt
-    calib_file: calib.txt
-    range_image: {height: 32, width: 360, min_range: 1}
 configurations:
 - {name: Fuzzy-MCL}
 - {name: Fuzzy-PSO-MCL, refine: True}
@@ -114,7 +98,10 @@ type Contents = BTreeMap<PathBuf, Option<Vec<u8>>>;
 impl Reference {
     fn new(stage: &'static Stage) -> Self {
         let inputs = Recording::street(FRAMES);
-        inputs.write("comparison.yml", COMPARISON);
+        inputs.write(
+            "comparison.yml",
+            &format!("{COMPARISON}{COMPARISON_OF_STREET}"),
+        );
         inputs.write("simulation.yml", SIMULATION);
         for name in ["build_map.yml", "localization.yml", "refinement.yml"] {
             // All outputs are in one folder.

@@ -183,6 +183,11 @@ fn killed(recording: &Recording, arguments: &[&str], scan: &PipedScan) {
     drop(pipe);
 }
 
+/// Whether a resumed build took over a local map, of four.
+fn reuses(stderr: &str, number: usize) -> bool {
+    stderr.contains(&format!("local map {number} of 4 is finished already"))
+}
+
 /// Runs a command to its end, with the scan; returns standard error.
 fn resumed(recording: &Recording, arguments: &[&str], scan: &PipedScan) -> String {
     let opened = scan.opened();
@@ -222,13 +227,9 @@ fn an_interrupted_build_keeps_its_local_maps_and_resumes() {
 
     let stderr = resumed(&recording, BUILD_MAP, &scan);
     for number in [1, 2] {
-        let reused = format!("local map {number} of 4 is finished already");
-        assert!(stderr.contains(&reused), "{stderr}");
+        assert!(reuses(&stderr, number), "{stderr}");
     }
-    assert!(
-        !stderr.contains("local map 3 of 4 is finished already"),
-        "{stderr}"
-    );
+    assert!(!reuses(&stderr, 3), "{stderr}");
     assert!(recording.bytes("map.ply") == uninterrupted_map(&Recording::street(12)));
     assert!(!recording.path("map.ply.parts").exists());
 }
@@ -243,10 +244,7 @@ fn a_killed_build_resumes_and_gives_the_same_bytes() {
     recording.write("map.ply.parts/unfinished.ply", "ply\nformat bin");
     recording.write("map.ply.parts/0002.ply", "ply\nformat bin");
     let stderr = resumed(&recording, BUILD_MAP, &scan);
-    assert!(
-        stderr.contains("local map 2 of 4 is finished already"),
-        "{stderr}"
-    );
+    assert!(reuses(&stderr, 2), "{stderr}");
     assert!(recording.bytes("map.ply") == uninterrupted_map(&Recording::street(12)));
 }
 
@@ -261,14 +259,8 @@ fn a_replaced_scan_of_the_same_size_is_meshed_again() {
         .collect();
     recording.write_scan(0, &shifted);
     let stderr = resumed(&recording, BUILD_MAP, &scan);
-    assert!(
-        !stderr.contains("local map 1 of 4 is finished already"),
-        "{stderr}"
-    );
-    assert!(
-        stderr.contains("local map 2 of 4 is finished already"),
-        "{stderr}"
-    );
+    assert!(!reuses(&stderr, 1), "{stderr}");
+    assert!(reuses(&stderr, 2), "{stderr}");
 
     let reference = Recording::street(12);
     reference.write_scan(0, &shifted);
@@ -355,10 +347,7 @@ fn a_busy_build_ends_in_time_and_keeps_its_local_maps() {
     assert_eq!(temporary_files(&recording, "."), [""; 0]);
     assert_eq!(temporary_files(&recording, "map.ply.parts"), [""; 0]);
     let stderr = resumed(&recording, BUILD_MAP, &scan);
-    assert!(
-        stderr.contains("local map 2 of 4 is finished already"),
-        "{stderr}"
-    );
+    assert!(reuses(&stderr, 2), "{stderr}");
     assert!(recording.bytes("map.ply") == uninterrupted_map(&Recording::street(12)));
 }
 
@@ -503,10 +492,7 @@ fn a_build_that_is_killed_after_its_map_is_completed_without_force() {
             })
     };
     let stderr = call().succeeds().stderr;
-    assert!(
-        stderr.contains("local map 4 of 4 is finished already"),
-        "{stderr}"
-    );
+    assert!(reuses(&stderr, 4), "{stderr}");
     assert!(recording.path("map.report.json").exists());
     assert!(!recording.path("map.ply.parts").exists());
     call().fails_with(&["map.ply exists", "--force"]);
@@ -528,10 +514,7 @@ fn a_second_build_of_the_same_map_is_refused() {
     drop(pipe);
     // The lock of a killed build is released, and its parts are there still.
     let stderr = resumed(&recording, BUILD_MAP, &scan);
-    assert!(
-        stderr.contains("local map 2 of 4 is finished already"),
-        "{stderr}"
-    );
+    assert!(reuses(&stderr, 2), "{stderr}");
     assert!(recording.bytes("map.ply") == uninterrupted_map(&Recording::street(12)));
 }
 
@@ -547,14 +530,8 @@ fn a_truncated_part_is_made_again() {
     )
     .unwrap();
     let stderr = resumed(&recording, BUILD_MAP, &scan);
-    assert!(
-        !stderr.contains("local map 1 of 4 is finished already"),
-        "{stderr}"
-    );
-    assert!(
-        stderr.contains("local map 2 of 4 is finished already"),
-        "{stderr}"
-    );
+    assert!(!reuses(&stderr, 1), "{stderr}");
+    assert!(reuses(&stderr, 2), "{stderr}");
     assert!(recording.bytes("map.ply") == uninterrupted_map(&Recording::street(12)));
 }
 

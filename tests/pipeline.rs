@@ -9,7 +9,7 @@ use std::fs;
 use std::path::Path;
 
 use common::picture::Picture;
-use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, Recording, json, run, simulate_two_drives};
+use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, Recording, SENSOR, json, run, simulate_two_drives};
 use fpmcl::app::plotting::color::{MCL, REFINED, TRUTH};
 use fpmcl::app::results::LocalizationResults;
 use fpmcl::recording::Calibration;
@@ -27,8 +27,6 @@ path:
 - {length_m: 40, turn_deg: 30, grade_percent: 3}
 scanner: {azimuth_steps: 600}
 ";
-
-const SENSOR: &str = "range_image: {height: 64, width: 600, fov_up: 3, fov_down: -25, max_range: 50, min_range: 2}\n";
 
 const BUILD_MAP: &str = "\
 depth: 8

@@ -9,7 +9,7 @@ use std::fs;
 use std::path::Path;
 use std::sync::LazyLock;
 
-use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, fpmcl, json, run, simulate_two_drives};
+use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, SENSOR, fpmcl, json, run, simulate_two_drives};
 use fpmcl::map::ply;
 use tempfile::TempDir;
 
@@ -25,8 +25,6 @@ path:
 scanner: {azimuth_steps: 600}
 ";
 
-const SENSOR: &str = "range_image: {height: 64, width: 600, fov_up: 3, fov_down: -25, max_range: 50, min_range: 2}\n";
-
 /// A folder with a map of drive 1 and the scans of drive 2.
 static WORLD: LazyLock<TempDir> = LazyLock::new(|| {
     let temporary = tempfile::tempdir().unwrap();
@@ -40,8 +38,9 @@ static WORLD: LazyLock<TempDir> = LazyLock::new(|| {
     temporary
 });
 
-/// Largest position errors of a trial [m], from frame 20 on.
+/// What a trial gives.
 struct Outcome {
+    /// Largest position error from frame 20 on [m].
     worst_m: f64,
     report: serde_json::Value,
 }

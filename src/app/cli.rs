@@ -361,7 +361,7 @@ mod tests {
     fn flags_are_settings_of_their_keys() {
         let arguments = ["fpmcl", "localize", "--seed", "7", "--force"];
         let Command::Localize(args) = Cli::parse_from(arguments).command else {
-            unreachable!("it says localize")
+            unreachable!("the command is localize")
         };
         let expected = [("seed", "7"), ("force", "true")];
         assert_eq!(

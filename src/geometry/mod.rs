@@ -10,6 +10,7 @@ pub mod grid;
 pub mod mesh;
 pub mod morton;
 pub mod plane;
+pub mod ply_vertex;
 pub mod pose;
 pub mod trajectory;
 
@@ -18,6 +19,7 @@ pub use cloud::PointCloud;
 pub use grid::Grid2;
 pub use mesh::{Aabb, TriangleMesh};
 pub use plane::{PlaneFit, PlaneSums};
+pub use ply_vertex::PlyVertex;
 pub use pose::{FARTHEST_M, Pose2, Pose3, Rigid3f, pose2_from_pose3, pose3_from_pose2, yaw};
 pub use trajectory::StampedPose;
 

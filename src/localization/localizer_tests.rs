@@ -5,7 +5,6 @@ use nalgebra::Vector2;
 use super::*;
 use crate::lidar::LidarModel;
 use crate::localization::State;
-use crate::localization::observation::ObservationConfig;
 use crate::localization::sensor::SensorConfig;
 use crate::map::test_world::TestWorld;
 
@@ -17,7 +16,7 @@ const _: () = {
     is_shared::<Map>();
 };
 
-/// Small enough for a test, else the defaults.
+/// A test's, with small range images.
 fn config() -> LocalizerConfig {
     LocalizerConfig {
         sensor: SensorConfig {
@@ -28,14 +27,7 @@ fn config() -> LocalizerConfig {
             },
             ..SensorConfig::default()
         },
-        num_particles: 500,
-        observation: ObservationConfig {
-            beams: 600,
-            min_beams: 150,
-            ray_budget: 60_000,
-            ..ObservationConfig::default()
-        },
-        ..LocalizerConfig::default()
+        ..LocalizerConfig::of_test(500)
     }
 }
 

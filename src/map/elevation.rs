@@ -131,7 +131,7 @@ impl GroundMap {
 
     /// Fits a plane to the ground within `radius_m` of a position.
     ///
-    /// Of several levels, takes the one at about `level_m`, else the nearest to it that at least a
+    /// Takes, of several levels, the one at about `level_m`, else the nearest to it that at least a
     /// third of the cells have; the lowest such without `level_m`. `None` where no level has that
     /// many, and where the one at `level_m` has fewer: a gap in a bridge does not drop the car
     /// onto the road below.

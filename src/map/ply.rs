@@ -18,7 +18,7 @@ use ply_rs::ply::{
 
 use super::mapping_path::{BadPathComment, MappingPath};
 use crate::files::write_atomically;
-use crate::geometry::{FARTHEST_M, TriangleMesh};
+use crate::geometry::{FARTHEST_M, PlyVertex, TriangleMesh};
 
 /// A PLY file that cannot be read or written.
 #[derive(Debug, thiserror::Error)]
@@ -186,10 +186,10 @@ fn read_mesh(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), PlyProb
     let file = File::open(path)?;
     let bytes = file.metadata()?.len();
     let mut reader = Reader::new(BufReader::with_capacity(1 << 20, file));
-    let header = Parser::<Vertex>::new().read_header(&mut reader)?;
+    let header = Parser::<PlyVertex>::new().read_header(&mut reader)?;
     check_header(&header, bytes)?;
 
-    let (mut vertices, mut faces): (Option<Vec<Vertex>>, Option<Vec<Face>>) = (None, None);
+    let (mut vertices, mut faces): (Option<Vec<PlyVertex>>, Option<Vec<Face>>) = (None, None);
     for (name, element) in &header.elements {
         if name == "vertex" {
             let parser = Parser::new();
@@ -230,81 +230,6 @@ impl PlyProblem {
             path: path.to_owned(),
             problem: self,
         }
-    }
-}
-
-/// A row of the element `vertex`.
-#[derive(Debug, Default)]
-struct Vertex {
-    position: Vec3,
-    normal: Vec3,
-    color: [u8; 3],
-}
-
-impl Vertex {
-    /// The coordinate of a name, in any case.
-    fn coordinate(&mut self, name: &str) -> Option<&mut f32> {
-        Some(match name {
-            "x" | "X" => &mut self.position.x,
-            "y" | "Y" => &mut self.position.y,
-            "z" | "Z" => &mut self.position.z,
-            "nx" => &mut self.normal.x,
-            "ny" => &mut self.normal.y,
-            "nz" => &mut self.normal.z,
-            _ => return None,
-        })
-    }
-
-    /// Sets a coordinate, or a color channel from 0 to 255.
-    fn set(&mut self, name: &str, value: f32) -> PropertyAccessResult {
-        let channel = match name {
-            "red" => 0,
-            "green" => 1,
-            "blue" => 2,
-            _ => match self.coordinate(name) {
-                Some(coordinate) => {
-                    *coordinate = value;
-                    return PropertyAccessResult::Set;
-                }
-                None => return PropertyAccessResult::Ignored,
-            },
-        };
-        self.color[channel] = value.round() as u8;
-        PropertyAccessResult::Set
-    }
-}
-
-impl PropertyAccess for Vertex {
-    fn new() -> Self {
-        Self::default()
-    }
-
-    fn set_property(&mut self, name: &str, property: Property) -> PropertyAccessResult {
-        let value = match property {
-            Property::Char(value) => f32::from(value),
-            Property::UChar(value) => f32::from(value),
-            Property::Short(value) => f32::from(value),
-            Property::UShort(value) => f32::from(value),
-            Property::Int(value) => value as f32,
-            Property::UInt(value) => value as f32,
-            Property::Float(value) => return self.set_float(name, value),
-            Property::Double(value) => return self.set_float(name, value as f32),
-            _ => return PropertyAccessResult::Ignored,
-        };
-        self.set(name, value)
-    }
-
-    fn set_float(&mut self, name: &str, value: f32) -> PropertyAccessResult {
-        let is_color = matches!(name, "red" | "green" | "blue");
-        // Colors as numbers from 0 to 1, as some tools write them.
-        self.set(
-            name,
-            if is_color {
-                value.clamp(0.0, 1.0) * 255.0
-            } else {
-                value
-            },
-        )
     }
 }
 

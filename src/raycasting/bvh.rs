@@ -62,7 +62,7 @@ impl NodeRef {
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
 pub(crate) struct BvhNode {
-    /// Of each child: lower corner x, y, z, then upper corner x, y, z.
+    /// Lower corner x, y, z, then upper corner x, y, z of each child.
     pub bounds: [[f32; 6]; 2],
     pub children: [NodeRef; 2],
     /// Axis along which the first child lies lower.

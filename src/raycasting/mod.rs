@@ -53,7 +53,7 @@ impl Hit {
 pub struct Reach {
     /// Surfaces at this range or farther are not hit [m].
     pub until_m: f32,
-    /// Of surfaces nearer than this any may be reported, not only the nearest [m].
+    /// Range below which any surface may be reported, not only the nearest [m].
     pub enough_m: f32,
     /// Whether surfaces nearer than `enough_m` need not be reported if there is none from there to
     /// `until_m`.

@@ -15,6 +15,13 @@ pub struct Calibration {
 }
 
 impl Calibration {
+    /// The calibration of a recording whose poses are those of the lidar.
+    pub fn identity() -> Self {
+        Self {
+            cam0_from_lidar: Pose3::identity(),
+        }
+    }
+
     /// Reads the line that starts with `Tr:` (or `Tr_velo_to_cam:`); other lines are ignored.
     pub fn read(path: &Path) -> Result<Self, RecordingError> {
         for (line, text) in (1..).zip(read_text(path)?.lines()) {

@@ -66,7 +66,7 @@ pub enum RecordingError {
         quantity: &'static str,
         limit: &'static str,
     },
-    #[error("the name of {} is a number and that of {} is not; the numbers of scans are rows of the pose file, remove the file that is no scan of the recording", number.display(), word.display())]
+    #[error("the name of {} is a number and that of {} is not; the numbers of scans are rows of the pose file, remove the file that is not a scan of the recording", number.display(), word.display())]
     MixedNames { number: PathBuf, word: PathBuf },
     #[error("{} and {} have the same number; give the folder of one recording", first.display(), second.display())]
     SameNumber { first: PathBuf, second: PathBuf },

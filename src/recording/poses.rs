@@ -67,13 +67,20 @@ impl DrivePoses {
     /// Rows of KITTI are poses of the camera if there is a calibration, else of the lidar; rows of TUM
     /// are poses of the lidar.
     pub fn read(pose_file: &Path, calib_file: Option<&Path>) -> Result<Self, RecordingError> {
-        let lidar = Calibration {
-            cam0_from_lidar: Pose3::identity(),
-        };
+        Self::read_with(pose_file, || {
+            calib_file.map_or(Ok(Calibration::identity()), Calibration::read)
+        })
+    }
+
+    /// Reads a file as [`read`](Self::read) does; `calibration` is called for rows of KITTI.
+    pub fn read_with(
+        pose_file: &Path,
+        calibration: impl FnOnce() -> Result<Calibration, RecordingError>,
+    ) -> Result<Self, RecordingError> {
         match CameraPoses::read(pose_file) {
             Ok(camera) => Ok(Self {
                 camera,
-                calibration: calib_file.map_or(Ok(lidar), Calibration::read)?,
+                calibration: calibration()?,
                 times_s: None,
             }),
             Err(RecordingError::WrongCount { found: 8, .. }) => {
@@ -82,7 +89,7 @@ impl DrivePoses {
                     camera: CameraPoses {
                         world_from_cam0: rows.iter().map(|row| row.map_from_lidar).collect(),
                     },
-                    calibration: lidar,
+                    calibration: Calibration::identity(),
                     times_s: Some(rows.iter().map(|row| row.time_s).collect()),
                 })
             }

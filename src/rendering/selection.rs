@@ -103,7 +103,7 @@ fn reason_for_cpu(adapters: &[AdapterReport]) -> String {
             ..
         }) => format!("{} cannot render: {obstacle}", adapters[0]),
         Some(first) => {
-            format!("{first} is no graphics card of this machine, so the CPU is faster or safer")
+            format!("{first} is not a graphics card, so the CPU is faster or safer")
         }
     }
 }

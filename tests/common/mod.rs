@@ -140,6 +140,29 @@ odometry: file
 odometry_file: street/drive_2/odometry.txt
 ";
 
+/// Common keys of comparisons on [`Recording::street`]: the base and the first sequence, street.
+pub const COMPARISON_OF_STREET: &str = "\
+base:
+  build_map: {depth: 6, voxel_size: 0.2, displacement_threshold_m: 0, simplify_resolution: 0.5}
+  localization: {numParticles: 50, num_reduced: 20}
+  refinement: {refinement: {method: swarm, swarm: {iterations: 3}}}
+sequences:
+- name: street
+  build_map:
+    scan_folder: velodyne
+    pose_file: poses.txt
+    calib_file: calib.txt
+    range_image: {height: 32, width: 360, min_range: 1}
+  localization:
+    scan_folder: velodyne
+    pose_file: poses.txt
+    calib_file: calib.txt
+    range_image: {height: 32, width: 360, min_range: 1}
+";
+
+/// Keys of the sensor of a simulated drive with 600 measurements of a beam per revolution.
+pub const SENSOR: &str = "range_image: {height: 64, width: 600, fov_up: 3, fov_down: -25, max_range: 50, min_range: 2}\n";
+
 /// Path of a file under `config/`.
 pub fn config_file(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))

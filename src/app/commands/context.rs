@@ -70,7 +70,7 @@ impl Context {
 }
 
 /// The memory that this process can have: that of the machine or, if less, of its container or the limit
-/// of its address space; 8 GiB where the system does not say [bytes].
+/// of its address space; 8 GiB where the system does not report them [bytes].
 fn machine_bytes() -> f64 {
     let number_in = |path: &str, name: &str, unit: f64| -> Option<f64> {
         let text = std::fs::read_to_string(path).ok()?;

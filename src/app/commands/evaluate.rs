@@ -27,8 +27,13 @@ pub fn run(config: &EvaluationConfig, context: &Context) -> Result<Report> {
     let mut about = about(config, &files)?;
     about.extend(run_output::shortfall(&results));
     scale(&mut results, config.grid_resolution);
+    let map = match config.pose_file.is_some() || config.plot_loc_traj {
+        true => map_of(&files)?,
+        false => None,
+    };
     if let Some(pose_file) = &config.pose_file {
-        results.ground_truth = Some(truth(pose_file, config, &results, &files)?);
+        let path = map.as_ref().and_then(|(_, path)| path.as_ref());
+        results.ground_truth = Some(truth(pose_file, config, &results, path)?);
     }
     ensure!(
         results.ground_truth.is_some(),
@@ -54,8 +59,8 @@ pub fn run(config: &EvaluationConfig, context: &Context) -> Result<Report> {
         output::write_yaml(&main, config)?;
     }
     if config.plot_loc_traj {
-        let map = map_of(&files)?.map(|(mesh, _)| mesh);
-        run_output::draw_run(&files, map.as_ref(), &results)?;
+        let mesh = map.as_ref().map(|(mesh, _)| mesh);
+        run_output::draw_run(&files, mesh, &results)?;
     }
     if config.save_evaluation_results {
         run_page::write(&files, &report)?;
@@ -133,19 +138,19 @@ fn scale(results: &mut LocalizationResults, grid_resolution_m: f64) {
     results.particles.scale_positions(grid_resolution_m as f32);
 }
 
-/// The true poses of the frames of a result: in the frame of its map, or, if that is not known, of the
-/// first pose of the recording.
+/// The true poses of the frames of a result: in the frame of its map, or, if its path is not known, of
+/// the first pose of the recording.
 fn truth(
     pose_file: &Path,
     config: &EvaluationConfig,
     results: &LocalizationResults,
-    files: &RunFiles,
+    mapping_path: Option<&MappingPath>,
 ) -> Result<Vec<Pose2>> {
     input::require_file("pose_file", pose_file)?;
     input::require_optional_file("calib_file", config.calib_file.as_deref())?;
     let drive = DrivePoses::read(pose_file, config.calib_file.as_deref())?;
     let mut poses = drive.map_from_lidar();
-    if let Some((_, Some(path))) = map_of(files)? {
+    if let Some(path) = mapping_path {
         let map_from_first = path.world_from_map.inverse() * drive.world_from_map();
         poses
             .iter_mut()

@@ -34,7 +34,7 @@ struct Shared {
     is_supervised: AtomicBool,
     /// Held while files are written that belong together.
     saving: Mutex<()>,
-    /// What is finished and kept, and where; empty if a command does not say.
+    /// What is finished and kept, and where; empty if a command has not set it.
     kept: Mutex<String>,
 }
 

@@ -10,8 +10,8 @@ use crate::app::config::OdometrySource;
 use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
 use crate::lidar::RotationDirection;
 use crate::localization::odometry::{demonstration_noise, increments, with_noise};
-use crate::recording::poses::{CameraPoses, read_tum};
-use crate::recording::{RecordingError, Sequence};
+use crate::recording::Sequence;
+use crate::recording::poses::DrivePoses;
 
 /// Reads `previous_from_current` into each frame of the sequence; `None` without odometry.
 pub fn read_increments(
@@ -43,17 +43,15 @@ pub fn read_increments(
     Ok(increments.into_iter().map(Some).collect())
 }
 
-/// Reads the lidar poses of an odometry file: KITTI rows (12 numbers, camera) or TUM rows (8, lidar).
+/// Reads the lidar poses of an odometry file, in the frame of the file or of its first pose.
 fn recorded(file: &Path, sequence: &Sequence) -> Result<Vec<Pose3>> {
-    let context = || format!("odometry_file is {}", file.display());
-    match CameraPoses::read(file) {
-        Ok(poses) => Ok(poses.map_from_lidar(&sequence.calibration)),
-        Err(RecordingError::WrongCount { found: 8, .. }) => {
-            let trajectory = read_tum(file).with_context(context)?;
-            Ok(trajectory.iter().map(|pose| pose.map_from_lidar).collect())
-        }
-        Err(error) => Err(error).with_context(context),
-    }
+    let drive = DrivePoses::read_with(file, || Ok(sequence.calibration))
+        .with_context(|| format!("odometry_file is {}", file.display()))?;
+    // Rows of TUM, which have times, are poses of the lidar as they are.
+    Ok(match drive.times_s {
+        Some(_) => drive.camera.world_from_cam0,
+        None => drive.map_from_lidar(),
+    })
 }
 
 /// Compensates the motion within the scans of a sequence, where a direction of rotation is configured.

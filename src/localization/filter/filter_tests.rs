@@ -11,25 +11,10 @@ use crate::geometry::{Pose2, Pose3, wrap_angle};
 use crate::lidar::{LidarModel, RangeImage};
 use crate::localization::initialization::{StartSpread, around, from_panoramas};
 use crate::localization::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand};
-use crate::localization::observation::ObservationConfig;
 use crate::localization::odometry::{increments, with_noise};
 use crate::localization::{Estimate, LocalizerConfig, Odometry, ParticleSet, State};
 use crate::map::test_world::TestWorld;
 use crate::map::{PanoramaConfig, PanoramaRequest, SearchRegion, SensorAttitude};
-
-/// Small enough for a test, else the defaults.
-fn config(num_particles: usize) -> LocalizerConfig {
-    LocalizerConfig {
-        num_particles,
-        observation: ObservationConfig {
-            beams: 600,
-            min_beams: 150,
-            ray_budget: 60_000,
-            ..ObservationConfig::default()
-        },
-        ..LocalizerConfig::default()
-    }
-}
 
 /// A slightly winding drive along the street, 0.8 m per frame, map frame.
 fn drive(world: &TestWorld, from_x: f64, frames: usize) -> Vec<Pose2> {
@@ -97,8 +82,12 @@ fn run(
 fn track(world: &TestWorld, truth: &[Pose2], seed: u64) -> Vec<Estimate> {
     let mut rng = StdRng::seed_from_u64(seed);
     let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
-    let mut filter =
-        ParticleFilter::new(config(500), world.map(), None, ParticleSet::uniform(start));
+    let mut filter = ParticleFilter::new(
+        LocalizerConfig::of_test(500),
+        world.map(),
+        None,
+        ParticleSet::uniform(start),
+    );
     run(&mut filter, world, truth, Source::Odometry, &mut rng)
 }
 
@@ -206,7 +195,8 @@ fn without_odometry_the_velocity_is_estimated_and_tracking_is_not_lost() {
         let mut rng = StdRng::seed_from_u64(seed);
         let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
         let start = ParticleSet::uniform(start);
-        let mut filter = ParticleFilter::new(config(500), world.map(), None, start);
+        let mut filter =
+            ParticleFilter::new(LocalizerConfig::of_test(500), world.map(), None, start);
         let frames = run(&mut filter, &world, &truth, Source::None, &mut rng);
         let (position_m, heading_rad) = rmse(&frames[10..], &truth[10..]);
         assert!(
@@ -233,7 +223,8 @@ fn velocity_commands_of_a_car_that_drifts_sideways_add_no_bias() {
         let mut rng = StdRng::seed_from_u64(4);
         let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
         let start = ParticleSet::uniform(start);
-        let mut filter = ParticleFilter::new(config(500), world.map(), None, start);
+        let mut filter =
+            ParticleFilter::new(LocalizerConfig::of_test(500), world.map(), None, start);
         run(&mut filter, &world, &truth, Source::Velocity, &mut rng)
     };
     let aside: f64 = frames[10..]
@@ -250,8 +241,12 @@ fn a_standing_car_is_not_updated_and_its_covariance_does_not_grow() {
     let truth = drive(&world, 0.0, 10);
     let mut rng = StdRng::seed_from_u64(5);
     let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
-    let mut filter =
-        ParticleFilter::new(config(500), world.map(), None, ParticleSet::uniform(start));
+    let mut filter = ParticleFilter::new(
+        LocalizerConfig::of_test(500),
+        world.map(),
+        None,
+        ParticleSet::uniform(start),
+    );
     let last = run(&mut filter, &world, &truth, Source::Odometry, &mut rng)
         .pop()
         .unwrap();
@@ -264,7 +259,7 @@ fn a_standing_car_is_not_updated_and_its_covariance_does_not_grow() {
         assert!(!frame.updated);
         // Two centimetres are a tenth of an update, with a tenth of its variance.
         assert!(frame.covariance.trace() >= last.covariance.trace());
-        let noise = config(500)
+        let noise = LocalizerConfig::of_test(500)
             .motion
             .covariance(&TurnDriveTurn::decompose(&Pose2::identity()));
         assert!(frame.covariance.trace() < last.covariance.trace() + 0.15 * noise.trace());
@@ -276,7 +271,7 @@ fn a_standing_car_is_not_updated_and_its_covariance_does_not_grow() {
 fn the_covariance_of_a_creeping_car_grows_by_the_noise_of_its_motion() {
     let world = TestWorld::street();
     let truth = world.pose_at(0.0, 0.0, 0.0);
-    let mut config = config(3);
+    let mut config = LocalizerConfig::of_test(3);
     config.velocity.speed_m_per_s = 4.0;
     // A hundredth of what makes an update due.
     let command = VelocityCommand {
@@ -306,7 +301,7 @@ fn the_covariance_of_a_creeping_car_grows_by_the_noise_of_its_motion() {
 #[test]
 fn the_velocity_is_known_across_a_border_of_tiles() {
     let world = TestWorld::street();
-    let config = config(500);
+    let config = LocalizerConfig::of_test(500);
     let border = Vector2::new(50.0, 0.2);
     let tile = |x: f64| world.tiles.tile_at(x, border.y);
     assert_ne!(tile(border.x - 0.01), tile(border.x + 0.01));
@@ -356,7 +351,7 @@ fn a_kidnapped_car_is_detected_within_five_frames_and_localized_again() {
     let mut rng = StdRng::seed_from_u64(6);
     let start = around(&before[0], None, 500, &StartSpread::default(), &mut rng);
     let mut filter = ParticleFilter::new(
-        config(500),
+        LocalizerConfig::of_test(500),
         world.map(),
         Some(panoramas()),
         ParticleSet::uniform(start),
@@ -381,7 +376,7 @@ fn after_a_restart_the_covariance_of_a_standing_car_is_that_of_the_particles() {
     let mut rng = StdRng::seed_from_u64(6);
     let start = around(&before[0], None, 500, &StartSpread::default(), &mut rng);
     let mut filter = ParticleFilter::new(
-        config(500),
+        LocalizerConfig::of_test(500),
         world.map(),
         Some(panoramas()),
         ParticleSet::uniform(start),
@@ -425,7 +420,7 @@ fn a_start_anywhere_converges() {
         let scan = world.scan(&truth[0]);
         let start = from_panoramas(&index, &scan, &SensorAttitude::default(), 1000, &mut rng);
         let mut filter = ParticleFilter::new(
-            config(1000),
+            LocalizerConfig::of_test(1000),
             world.map(),
             Some(panoramas()),
             ParticleSet::uniform(start),
@@ -453,7 +448,7 @@ fn tracking_is_not_lost_beside_a_lorry() {
         ..StartSpread::default()
     };
     let start = ParticleSet::uniform(around(&truth[0], None, 500, &start, &mut rng));
-    let mut filter = ParticleFilter::new(config(500), map.map(), None, start);
+    let mut filter = ParticleFilter::new(LocalizerConfig::of_test(500), map.map(), None, start);
     let frames = run(&mut filter, &seen, &truth, Source::Odometry, &mut rng);
     let (position_m, _) = rmse(&frames[10..], &truth[10..]);
     assert!(position_m < 0.05, "{position_m}");
@@ -466,7 +461,7 @@ fn particles_off_the_map_have_no_cost() {
     let truth = world.pose_at(0.0, 0.0, 0.0);
     let nowhere = Pose2::translation(1e6, f64::MAX.sqrt());
     let start = ParticleSet::uniform([nowhere, truth, nowhere]);
-    let mut filter = ParticleFilter::new(config(3), world.map(), None, start);
+    let mut filter = ParticleFilter::new(LocalizerConfig::of_test(3), world.map(), None, start);
     let mut rng = StdRng::seed_from_u64(1);
     let scan = world.scan(&truth);
     let odometry = Odometry::Increment(Pose2::identity());
@@ -475,7 +470,7 @@ fn particles_off_the_map_have_no_cost() {
         .unwrap();
     assert!(frame.mean_cost_m.is_some());
     let start = ParticleSet::uniform([nowhere; 3]);
-    let mut filter = ParticleFilter::new(config(3), world.map(), None, start);
+    let mut filter = ParticleFilter::new(LocalizerConfig::of_test(3), world.map(), None, start);
     let frame = filter
         .step(odometry, &scan, &SensorAttitude::default(), &mut rng)
         .unwrap();
@@ -489,8 +484,12 @@ fn a_scan_without_returns_leaves_the_prediction() {
     let truth = drive(&world, 0.0, 10);
     let mut rng = StdRng::seed_from_u64(9);
     let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
-    let mut filter =
-        ParticleFilter::new(config(500), world.map(), None, ParticleSet::uniform(start));
+    let mut filter = ParticleFilter::new(
+        LocalizerConfig::of_test(500),
+        world.map(),
+        None,
+        ParticleSet::uniform(start),
+    );
     run(&mut filter, &world, &truth, Source::Odometry, &mut rng);
     let empty = RangeImage::project(&[], &LidarModel::default());
     let step = Odometry::Increment(Pose2::translation(0.8, 0.0));
@@ -508,8 +507,12 @@ fn without_returns_tracking_is_lost_after_some_distance() {
     let truth = drive(&world, 0.0, 8);
     let mut rng = StdRng::seed_from_u64(9);
     let start = around(&truth[0], None, 300, &StartSpread::default(), &mut rng);
-    let mut filter =
-        ParticleFilter::new(config(300), world.map(), None, ParticleSet::uniform(start));
+    let mut filter = ParticleFilter::new(
+        LocalizerConfig::of_test(300),
+        world.map(),
+        None,
+        ParticleSet::uniform(start),
+    );
     let frames = run(&mut filter, &world, &truth, Source::Odometry, &mut rng);
     assert_eq!(frames.last().unwrap().state, State::Tracking);
     let nothing = RangeImage::project(&[], &LidarModel::default());

@@ -8,7 +8,6 @@ use super::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
 use crate::lidar::{LidarModel, RangeImage};
 use crate::localization::initialization::{StartSpread, around, from_panoramas};
-use crate::localization::observation::ObservationConfig;
 use crate::localization::{LocalizerConfig, Odometry, ParticleSet, State};
 use crate::map::{
     GroundMap, GroundPatch, Map, MappingPath, PanoramaConfig, PanoramaRequest, SearchRegion,
@@ -176,19 +175,6 @@ fn lower_drive() -> Vec<Pose3> {
     (0..65).map(pose).collect()
 }
 
-fn config() -> LocalizerConfig {
-    LocalizerConfig {
-        num_particles: 500,
-        observation: ObservationConfig {
-            beams: 600,
-            min_beams: 150,
-            ray_budget: 60_000,
-            ..ObservationConfig::default()
-        },
-        ..LocalizerConfig::default()
-    }
-}
-
 /// Runs the filter, which must track the truth in space from the tenth frame on.
 fn follow(crossing: &Crossing, mut filter: ParticleFilter, truth: &[Pose3], rng: &mut StdRng) {
     let mut before = pose2_from_pose3(&truth[0]);
@@ -222,7 +208,12 @@ fn cars_on_both_levels_and_on_the_ramp_keep_their_level() {
         let pose = pose2_from_pose3(&truth[0]);
         let start = around(&pose, level_m, 500, &StartSpread::default(), &mut rng);
         let start = ParticleSet::uniform(start);
-        let filter = ParticleFilter::new(config(), crossing.map.clone(), None, start);
+        let filter = ParticleFilter::new(
+            LocalizerConfig::of_test(500),
+            crossing.map.clone(),
+            None,
+            start,
+        );
         follow(&crossing, filter, &truth, &mut rng);
     }
 }
@@ -243,7 +234,7 @@ fn a_start_anywhere_finds_its_level() {
         let scan = crossing.scan(&truth[0]);
         let start = from_panoramas(&index, &scan, &SensorAttitude::default(), 500, &mut rng);
         let filter = ParticleFilter::new(
-            config(),
+            LocalizerConfig::of_test(500),
             crossing.map.clone(),
             None,
             ParticleSet::uniform(start),

@@ -15,7 +15,7 @@ const DEEPEST_HEADER: usize = 8;
 
 /// Reads the header of an array, and checks that reading it needs neither much memory nor much time.
 pub fn read_header(reader: &mut impl Read) -> Result<NpyHeader, String> {
-    let unreadable = |error: io::Error| format!("is no npy array: {error}");
+    let unreadable = |error: io::Error| format!("is not an npy array: {error}");
     // Magic number, major and minor version, length; with 16 bits in the first version.
     let mut header = vec![0; 10];
     reader.read_exact(&mut header).map_err(unreadable)?;
@@ -27,7 +27,7 @@ pub fn read_header(reader: &mut impl Read) -> Result<NpyHeader, String> {
     let length = length.fold(0, |length, &byte| length << 8 | usize::from(byte));
     if length > LONGEST_HEADER {
         return Err(format!(
-            "is no npy array: its header of {length} bytes is too long"
+            "is not an npy array: its header of {length} bytes is too long"
         ));
     }
     let start = header.len();
@@ -46,7 +46,7 @@ pub fn read_header(reader: &mut impl Read) -> Result<NpyHeader, String> {
     }
     if deepest > DEEPEST_HEADER {
         return Err(format!(
-            "is no npy array: its header is nested {deepest} times"
+            "is not an npy array: its header is nested {deepest} times"
         ));
     }
     NpyHeader::from_reader(header.as_slice()).map_err(unreadable)

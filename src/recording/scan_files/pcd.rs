@@ -21,7 +21,7 @@ pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
     while data.is_none() {
         let end = rest.iter().position(|&byte| byte == b'\n');
         let Some(end) = end else {
-            return Err("is no PCD file: its header has no line DATA".to_owned());
+            return Err("is not a PCD file: its header has no line DATA".to_owned());
         };
         let line = String::from_utf8_lossy(&rest[..end]);
         rest = &rest[end + 1..];
@@ -38,7 +38,7 @@ pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
             _ => {}
         }
     }
-    let points = points.ok_or("is no PCD file: its header has no number of POINTS")?;
+    let points = points.ok_or("is not a PCD file: its header has no number of POINTS")?;
     if names.len() != sizes.len() || names.len() != types.len() {
         return Err("is damaged: FIELDS, SIZE and TYPE have different lengths".to_owned());
     }
@@ -53,7 +53,7 @@ pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
                 name: names[index].clone(),
                 number_type: number_type(size, kind)
                     .ok_or_else(|| format!("has a field of type {kind} and size {size}"))?,
-                count: count.ok_or("is damaged: a COUNT is no number")?,
+                count: count.ok_or("is damaged: a COUNT is not a number")?,
             })
         })
         .collect::<Result<_, String>>()?;
@@ -113,7 +113,7 @@ fn columns(fields: &[Field], points: Option<usize>) -> Vec<Column> {
 
 /// Reads one line of numbers per point.
 fn ascii(fields: &[Field], text: &[u8], points: usize) -> Result<Scan, String> {
-    let text = std::str::from_utf8(text).map_err(|_utf8| "has data that is no text".to_owned())?;
+    let text = std::str::from_utf8(text).map_err(|_utf8| "has data that is not text".to_owned())?;
     let numbers: usize = fields.iter().map(|field| field.count).sum();
     let mut bytes = Vec::new();
     let mut rows = 0;
@@ -131,7 +131,7 @@ fn ascii(fields: &[Field], text: &[u8], points: usize) -> Result<Scan, String> {
         }
         for word in words {
             let number: f64 = (word.parse())
-                .map_err(|_word| format!("has `{word}` in point {row}, which is no number"))?;
+                .map_err(|_word| format!("has `{word}` in point {row}, which is not a number"))?;
             bytes.extend(number.to_le_bytes());
         }
         rows += 1;

@@ -32,7 +32,7 @@ pub(super) struct Rasterizer {
 struct AtlasLayout {
     columns: usize,
     rows: usize,
-    /// Of the texture [pixels].
+    /// Size of the texture [pixels].
     width: u32,
     height: u32,
 }
