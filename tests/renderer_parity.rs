@@ -177,6 +177,7 @@ fn a_closed_room_has_no_holes_at_the_seam_and_at_the_poles() {
         fov_down: 90.0,
         max_range: 100.0,
         min_range: 0.05,
+        elevations: None,
     };
     // Walls of two triangles each, whose projections are curved most, and finer ones.
     for cuts in [1, 7] {

@@ -1,22 +1,27 @@
-//! Motion compensation (deskewing) of the scans of a spinning sensor.
+//! Motion compensation (deskewing) of scans.
 //!
-//! A sweep takes about a tenth of a second, in which a car moves up to a few meters. The pose of a
-//! scan is that of the moment when the sensor faces forward; a point at azimuth α was measured a
-//! fraction f of a sweep earlier or later,
+//! A sweep takes about a tenth of a second, in which a car moves up to a few meters. With constant velocity,
+//! a point that was measured at a time t after the moment of the scan's pose is moved to that moment by
 //!
 //! ```text
-//! f = −α / 2π  clockwise,   +α / 2π  counter-clockwise           f in [−½, ½)
-//! p = exp(f · log(previous_from_current)) · p_measured
+//! p = exp(t / T · log(previous_from_current)) · p_measured       T: duration of the motion
 //! ```
 //!
-//! at constant velocity. Geiger et al., *Vision meets Robotics: The KITTI Dataset* (2013), section
-//! III, for the time stamp.
+//! Where the data have no times, they follow from the azimuth α of a sensor that turns once in a period P
+//! and whose pose is that of facing forward:
+//!
+//! ```text
+//! t = −α P / 2π  clockwise,   +α P / 2π  counter-clockwise
+//! ```
+//!
+//! Geiger et al., *Vision meets Robotics: The KITTI Dataset* (2013), section III, for the time stamp.
 
 use std::f32::consts::TAU;
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
+use super::scan::Scan;
 use crate::geometry::{Pose3, Rigid3f};
 
 /// Direction of rotation of a spinning sensor, seen from above.
@@ -29,35 +34,66 @@ pub enum RotationDirection {
     CounterClockwise,
 }
 
-/// Motion of the sensor during a sweep.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SweepMotion {
-    /// Direction of rotation of the sensor.
+/// Rotation of a spinning sensor.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Rotation {
+    /// Direction.
     pub direction: RotationDirection,
-    /// Motion over one sweep.
-    pub previous_from_current: Pose3,
+    /// Duration of a revolution [s].
+    pub period_s: f64,
 }
 
-impl SweepMotion {
-    /// Transforms points, each measured at its own time, to the pose of the scan.
-    pub fn deskew(&self, points: &mut [Vec3]) {
-        /// Equal azimuth intervals; the points of each share one transform.
+impl Rotation {
+    /// Time of each point from its azimuth, zero in front [s].
+    pub fn point_times(&self, points: &[Vec3]) -> Vec<f32> {
+        let period_s = match self.direction {
+            RotationDirection::Clockwise => -self.period_s,
+            RotationDirection::CounterClockwise => self.period_s,
+        } as f32;
+        let time = |point: &Vec3| point.y.atan2(point.x) / TAU * period_s;
+        points.iter().map(time).collect()
+    }
+}
+
+/// Motion at constant velocity.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Motion {
+    /// `p_previous = previous_from_current * p_current`.
+    pub previous_from_current: Pose3,
+    /// Duration, greater than zero [s].
+    pub duration_s: f64,
+}
+
+impl Motion {
+    /// The motion in a time; backward if it is negative.
+    pub fn after(&self, time_s: f64) -> Pose3 {
+        interpolate_motion(&self.previous_from_current, time_s / self.duration_s)
+    }
+
+    /// Moves the points of a scan to the moment of its pose. Afterwards the scan has no times; a scan
+    /// without times is unchanged.
+    pub fn deskew(&self, scan: &mut Scan) {
+        /// Equal intervals of time; the points of each share one transform.
         const INTERVALS: usize = 720;
-        let transforms: Vec<Rigid3f> = (0..INTERVALS)
-            .map(|interval| {
-                let azimuth = (interval as f64 + 0.5) / INTERVALS as f64 - 0.5;
-                let fraction = match self.direction {
-                    RotationDirection::Clockwise => -azimuth,
-                    RotationDirection::CounterClockwise => azimuth,
-                };
-                Rigid3f::from(&interpolate_motion(&self.previous_from_current, fraction))
-            })
-            .collect();
-        for point in points {
-            let turns = point.y.atan2(point.x) / TAU + 0.5;
-            let interval = (turns * INTERVALS as f32) as usize;
-            *point = transforms[interval.min(INTERVALS - 1)].apply(*point);
+        let finite = || scan.times_s.iter().copied().filter(|time| time.is_finite());
+        let (first, last) = (
+            finite().fold(f32::INFINITY, f32::min),
+            finite().fold(f32::NEG_INFINITY, f32::max),
+        );
+        if first <= last {
+            let interval_s = ((last - first) / INTERVALS as f32).max(f32::MIN_POSITIVE);
+            let transforms: Vec<Rigid3f> = (0..INTERVALS)
+                .map(|interval| {
+                    let time_s = first + (interval as f32 + 0.5) * interval_s;
+                    Rigid3f::from(&self.after(time_s.into()))
+                })
+                .collect();
+            for (point, time_s) in scan.points.iter_mut().zip(&scan.times_s) {
+                let interval = ((time_s - first) / interval_s) as usize;
+                *point = transforms[interval.min(INTERVALS - 1)].apply(*point);
+            }
         }
+        scan.times_s.clear();
     }
 }
 
@@ -95,16 +131,53 @@ mod tests {
         assert_eq!(interpolate_motion(&motion(), 0.0), Pose3::identity());
     }
 
-    #[test]
-    fn the_scan_of_a_stationary_sensor_is_unchanged() {
-        let measured = [Vec3::new(3.0, -2.0, 0.5), Vec3::new(-7.0, 1.0, 0.0)];
-        let mut points = measured;
-        SweepMotion {
-            direction: RotationDirection::Clockwise,
-            previous_from_current: Pose3::identity(),
+    fn rotation(direction: RotationDirection) -> Rotation {
+        Rotation {
+            direction,
+            period_s: 0.1,
         }
-        .deskew(&mut points);
-        assert_eq!(points, measured);
+    }
+
+    fn deskewed(points: &[Vec3], direction: RotationDirection, motion: Pose3) -> Vec<Vec3> {
+        let mut scan = Scan {
+            points: points.to_vec(),
+            times_s: rotation(direction).point_times(points),
+            ..Scan::default()
+        };
+        // Two revolutions.
+        let motion = Motion {
+            previous_from_current: motion * motion,
+            duration_s: 0.2,
+        };
+        motion.deskew(&mut scan);
+        assert!(scan.times_s.is_empty(), "it is compensated");
+        scan.points
+    }
+
+    #[test]
+    fn a_scan_without_motion_or_without_times_is_unchanged() {
+        let points = [Vec3::new(3.0, -2.0, 0.5), Vec3::new(-7.0, 1.0, 0.0)];
+        let moved = deskewed(&points, RotationDirection::Clockwise, Pose3::identity());
+        assert_eq!(moved, points);
+        let mut scan = Scan {
+            points: points.to_vec(),
+            ..Scan::default()
+        };
+        let motion = Motion {
+            previous_from_current: motion(),
+            duration_s: 0.1,
+        };
+        motion.deskew(&mut scan);
+        assert_eq!(scan.points, points);
+    }
+
+    #[test]
+    fn times_are_zero_in_front_and_grow_with_the_rotation() {
+        let points = [Vec3::X, Vec3::Y, -Vec3::Y];
+        let times = rotation(RotationDirection::Clockwise).point_times(&points);
+        assert_eq!(times, [0.0, -0.025, 0.025]);
+        let times = rotation(RotationDirection::CounterClockwise).point_times(&points);
+        assert_eq!(times, [0.0, 0.025, -0.025]);
     }
 
     #[test]
@@ -120,18 +193,14 @@ mod tests {
                     Vec3::new(20.0 * azimuth.cos(), 20.0 * azimuth.sin(), 1.0)
                 })
                 .collect();
-            let mut points: Vec<Vec3> = truth
+            let points: Vec<Vec3> = truth
                 .iter()
                 .map(|&point| {
                     // Fixed-point iteration: the azimuth depends on the pose of the sensor.
                     let mut seen = point;
                     for _ in 0..5 {
-                        let azimuth = f64::from(seen.y.atan2(seen.x) / TAU);
-                        let fraction = match direction {
-                            RotationDirection::Clockwise => -azimuth,
-                            RotationDirection::CounterClockwise => azimuth,
-                        };
-                        let sensor = interpolate_motion(&motion(), fraction);
+                        let time_s = rotation(direction).point_times(&[seen])[0];
+                        let sensor = interpolate_motion(&motion(), f64::from(time_s) / 0.1);
                         seen = Rigid3f::from(&sensor.inverse()).apply(point);
                     }
                     seen
@@ -142,12 +211,8 @@ mod tests {
                 distances.fold(0.0, f32::max)
             };
             assert!(off(&points) > 0.5, "behind it is off by half the motion");
-            SweepMotion {
-                direction,
-                previous_from_current: motion(),
-            }
-            .deskew(&mut points);
-            assert!(off(&points) < 5e-3, "{direction:?}: {}", off(&points));
+            let found = off(&deskewed(&points, direction, motion()));
+            assert!(found < 5e-3, "{direction:?}: {found}");
         }
     }
 }

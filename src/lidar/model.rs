@@ -7,9 +7,11 @@
 //!
 //! Column 0 faces backward, the middle column forward, columns increase clockwise; row 0 is the top.
 //! Chen et al., *Range Image-based LiDAR Localization for Autonomous Vehicles*, ICRA 2021, eq. 1.
-//! Unlike there, a direction outside the vertical field of view has no pixel.
+//! Unlike there, a direction outside the vertical field of view has no pixel, and rows may be the beams
+//! of a sensor whose elevations are not evenly spaced: a direction then belongs to the nearest beam.
 
 use std::f32::consts::PI;
+use std::sync::Arc;
 
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive, require};
 use glam::Vec3;
@@ -19,7 +21,7 @@ use smart_default::SmartDefault;
 /// Size, field of view and range limits of a range image.
 ///
 /// Defaults: a Velodyne HDL-64E with the values of range-mcl.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct LidarModel {
     /// Number of rows.
@@ -40,6 +42,8 @@ pub struct LidarModel {
     /// Minimum range, exclusive [m].
     #[default(2.0)]
     pub min_range: f32,
+    /// Elevations of the rows, from the top [deg]; `None` if they are evenly spaced over the field of view.
+    pub elevations: Option<Arc<[f32]>>,
 }
 
 impl LidarModel {
@@ -70,6 +74,22 @@ impl Validate for LidarModel {
             self.fov_up,
             format!("it must lie above fov_down, which is {}", self.fov_down),
         )?;
+        if let Some(elevations) = &self.elevations {
+            require(
+                elevations.len() == self.height,
+                "elevations",
+                elevations.len(),
+                format!("there must be one for each of the {} rows", self.height),
+            )?;
+            let is_valid = elevations.iter().all(|deg| deg.abs() <= 90.0)
+                && elevations.is_sorted_by(|upper, lower| upper > lower);
+            require(
+                is_valid,
+                "elevations",
+                format!("{elevations:?}"),
+                "they must descend, from at most 90 to at least -90 degrees",
+            )?;
+        }
         not_negative("min_range", self.min_range)?;
         positive("max_range", self.max_range)?;
         require(
@@ -104,21 +124,53 @@ impl LidarModel {
     /// view.
     pub fn pixel_of(&self, direction: Vec3) -> Option<usize> {
         let elevation_rad = (direction.z / direction.length()).asin();
-        let row = (self.fov_up_rad() - elevation_rad) / self.fov_rad() * self.height as f32;
-        if !(row >= 0.0 && row < self.height as f32) {
-            return None;
-        }
+        let row = self.row_of(elevation_rad)?;
         let azimuth_rad = direction.y.atan2(direction.x);
         let column = 0.5 * (1.0 - azimuth_rad / PI) * self.width as f32;
         // An azimuth of exactly -π wraps to column 0.
-        Some(row as usize * self.width + column as usize % self.width)
+        Some(row * self.width + column as usize % self.width)
+    }
+
+    /// Row of an elevation; `None` outside the field of view or if it is not a number.
+    fn row_of(&self, elevation_rad: f32) -> Option<usize> {
+        let Some(elevations) = &self.elevations else {
+            let row = (self.fov_up_rad() - elevation_rad) / self.fov_rad() * self.height as f32;
+            return (row >= 0.0 && row < self.height as f32).then_some(row as usize);
+        };
+        let deg = elevation_rad.to_degrees();
+        let below = elevations.partition_point(|&row| row > deg);
+        let nearer = |row: usize| (elevations[row] - deg).abs();
+        let row = match below {
+            0 => 0,
+            row if row == elevations.len() => row - 1,
+            row if nearer(row - 1) <= nearer(row) => row - 1,
+            row => row,
+        };
+        (nearer(row) <= 0.5 * self.row_spacing_rad(row).to_degrees()).then_some(row)
+    }
+
+    /// Elevation of the centre of a row [rad].
+    pub fn elevation_rad(&self, row: usize) -> f32 {
+        match &self.elevations {
+            Some(elevations) => elevations[row].to_radians(),
+            None => self.fov_up_rad() - (row as f32 + 0.5) / self.height as f32 * self.fov_rad(),
+        }
+    }
+
+    /// Greatest angle between a row and its neighbours [rad].
+    pub fn row_spacing_rad(&self, row: usize) -> f32 {
+        let Some(elevations) = &self.elevations else {
+            return self.fov_rad() / self.height as f32;
+        };
+        let neighbors = &elevations[row.saturating_sub(1)..(row + 2).min(elevations.len())];
+        let spacing_deg = neighbors.windows(2).map(|pair| pair[0] - pair[1]);
+        (spacing_deg.fold(0.0_f32, f32::max).max(0.2)).to_radians()
     }
 
     /// The unit direction through the center of the pixel at a row-major index.
     pub fn direction_of(&self, index: usize) -> Vec3 {
         let (row, column) = (index / self.width, index % self.width);
-        let elevation_rad =
-            self.fov_up_rad() - (row as f32 + 0.5) / self.height as f32 * self.fov_rad();
+        let elevation_rad = self.elevation_rad(row);
         let azimuth_rad = PI * (1.0 - 2.0 * (column as f32 + 0.5) / self.width as f32);
         Vec3::new(
             elevation_rad.cos() * azimuth_rad.cos(),
@@ -163,6 +215,26 @@ mod tests {
     }
 
     #[test]
+    fn rows_of_uneven_beams_take_the_nearest_directions() {
+        let elevations = [15.0, 5.0, 1.0, 0.0, -1.0, -9.0];
+        let model = LidarModel {
+            height: 6,
+            fov_up: 20.0,
+            elevations: Some(elevations.into()),
+            ..LidarModel::default()
+        };
+        for index in 0..model.len() {
+            assert_eq!(model.pixel_of(model.direction_of(index)), Some(index));
+        }
+        let row_at = |deg: f32| model.row_of(deg.to_radians());
+        assert_eq!(
+            [14.0, 9.0, 0.4, 0.6, -1.2].map(row_at),
+            [0, 1, 3, 2, 4].map(Some)
+        );
+        assert_eq!([20.5, -14.0, f32::NAN].map(row_at), [None; 3]);
+    }
+
+    #[test]
     fn columns_increase_clockwise_from_backward() {
         let model = LidarModel::default();
         let column = |direction| model.pixel_of(direction).unwrap() % model.width;
@@ -198,7 +270,7 @@ mod tests {
         let below = LidarModel::default();
         let unsigned = LidarModel {
             fov_down: 25.0,
-            ..below
+            ..below.clone()
         };
         assert_eq!(below.fov_rad(), unsigned.fov_rad());
     }

@@ -151,7 +151,7 @@ impl Neighborhood {
             ((config.spacing_m / (range_m * angle_rad)).round() as isize).clamp(1, MAX_STRIDE)
         };
         let column_stride = stride(std::f32::consts::TAU / model.width as f32);
-        let row_stride = stride(model.fov_rad() / model.height as f32);
+        let row_stride = stride(model.row_spacing_rad(row as usize));
 
         let mut found = Self {
             points: [Vec3::ZERO; 24],

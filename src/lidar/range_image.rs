@@ -28,7 +28,7 @@ impl RangeImage {
     /// that are not finite or are outside the field of view or the range limits are ignored.
     pub fn project(points: &[Vec3], model: &LidarModel) -> Self {
         let mut image = Self {
-            model: *model,
+            model: model.clone(),
             ranges: vec![NO_RETURN; model.len()],
             points: vec![Vec3::ZERO; model.len()],
             point_indices: vec![NO_POINT; model.len()],
@@ -65,7 +65,7 @@ impl RangeImage {
             })
             .collect();
         Self {
-            model: *model,
+            model: model.clone(),
             point_indices: vec![NO_POINT; ranges.len()],
             ranges,
             points,

@@ -25,8 +25,15 @@ impl Beam {
 pub struct Scan {
     /// Positions [m], in the order of the file.
     pub points: Vec<Vec3>,
-    /// Reflectance of each point, 0 to 1 (unitless).
+    /// Reflectance of each point, 0 to 1 (unitless); empty if unknown.
     pub intensities: Vec<f32>,
+    /// When each point was measured, after the moment of the pose [s]; empty if unknown, or if the scan
+    /// is motion-compensated.
+    pub times_s: Vec<f32>,
+    /// Number of the beam that measured each point; empty if unknown.
+    pub rings: Vec<u16>,
+    /// The moment of the pose [s], from any origin; `None` if unknown.
+    pub time_s: Option<f64>,
 }
 
 impl Scan {
@@ -55,12 +62,18 @@ impl Scan {
     fn retain(&mut self, is_kept: impl Fn(&Vec3) -> bool) -> usize {
         let before = self.len();
         let keep: Vec<bool> = self.points.iter().map(is_kept).collect();
-        let mut flags = keep.iter();
-        self.points.retain(|_| flags.next() == Some(&true));
-        let mut flags = keep.iter();
-        self.intensities.retain(|_| flags.next() == Some(&true));
+        retain_flagged(&mut self.points, &keep);
+        retain_flagged(&mut self.intensities, &keep);
+        retain_flagged(&mut self.times_s, &keep);
+        retain_flagged(&mut self.rings, &keep);
         before - self.len()
     }
+}
+
+/// Keeps the values whose flag is set.
+fn retain_flagged<T>(values: &mut Vec<T>, keep: &[bool]) {
+    let mut flags = keep.iter();
+    values.retain(|_| flags.next() == Some(&true));
 }
 
 #[cfg(test)]
@@ -79,9 +92,12 @@ mod tests {
                 Vec3::new(0.0, 6.0, 0.0),
             ],
             intensities: vec![0.0, 0.1, 0.2, 0.3, 0.4, 0.5],
+            rings: vec![0, 1, 2, 3, 4, 5],
+            ..Scan::default()
         };
         assert_eq!(scan.drop_invalid(&LidarModel::default()), 4);
         assert_eq!(scan.intensities, [0.0, 0.5]);
+        assert_eq!(scan.rings, [0, 5]);
         assert_eq!(scan.points[1], Vec3::new(0.0, 6.0, 0.0));
     }
 }

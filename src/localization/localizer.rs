@@ -174,7 +174,7 @@ impl Localizer {
             .unwrap_or(self.attitude.height_m);
         PanoramaRequest {
             region,
-            lidar: self.config.sensor.lidar,
+            lidar: self.config.sensor.lidar.clone(),
             sensor_height_m: (height_m / HEIGHT_STEP_M).round() * HEIGHT_STEP_M,
             config: self.config.panorama.clone(),
         }

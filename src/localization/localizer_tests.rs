@@ -41,7 +41,7 @@ fn drive(world: &TestWorld, from_x: f64, frames: usize) -> Vec<Pose2> {
 fn scan(world: &TestWorld, pose: &Pose2) -> Scan {
     Scan {
         points: world.scan(pose).points,
-        intensities: Vec::new(),
+        ..Scan::default()
     }
 }
 

@@ -59,7 +59,7 @@ impl Sensor {
     /// Prepares the ground classifier.
     pub fn new(config: &SensorConfig) -> Result<Self, InvalidValue> {
         Ok(Self {
-            lidar: config.lidar,
+            lidar: config.lidar.clone(),
             own_car_m: config.own_car_m,
             classifier: config.ground.classifier()?,
             height_m: config.height_m,

@@ -299,6 +299,7 @@ mod tests {
         Scan {
             intensities: vec![0.5; points.len()],
             points,
+            ..Scan::default()
         }
     }
 

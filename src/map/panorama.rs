@@ -312,7 +312,8 @@ fn panorama_model(lidar: &LidarModel, config: &PanoramaConfig) -> LidarModel {
         height: config.rows,
         width: config.columns,
         fov_down: lidar.fov_down.abs().min(config.lowest_rad.to_degrees()),
-        ..*lidar
+        elevations: None,
+        ..lidar.clone()
     }
 }
 

@@ -13,7 +13,7 @@ use super::poses::{DrivePoses, read_times};
 use super::scan_files;
 use super::velodyne::read_bytes;
 use crate::geometry::{Pose3, StampedPose};
-use crate::lidar::{RotationDirection, Scan, SweepMotion, interpolate_motion};
+use crate::lidar::{Motion, Rotation, RotationDirection, Scan};
 use crate::validation::{InvalidValue, Validate, require};
 
 /// Revolutions per second of the sensor, for recordings without `times.txt`.
@@ -63,8 +63,10 @@ pub struct Frame {
     pub time_s: f64,
     /// `p_map = map_from_lidar * p_lidar`.
     pub map_from_lidar: Pose3,
-    /// Motion of the sensor during the scan; `None` if the scan is not deskewed.
-    pub sweep: Option<SweepMotion>,
+    /// Rotation of the sensor, from which the times of the points follow where the file has none.
+    pub rotation: Option<Rotation>,
+    /// Motion by which the scan is deskewed when it is read; `None` if it is not.
+    pub motion: Option<Motion>,
 }
 
 impl Frame {
@@ -76,8 +78,12 @@ impl Frame {
     /// Reads the scan from the content of its file, as [`read`](Self::read) does.
     pub fn parse(&self, bytes: &[u8]) -> Result<Scan, RecordingError> {
         let mut scan = scan_files::parse(&self.scan_path, bytes)?;
-        if let Some(sweep) = &self.sweep {
-            sweep.deskew(&mut scan.points);
+        scan.time_s = Some(self.time_s);
+        if let (true, Some(rotation)) = (scan.times_s.is_empty(), &self.rotation) {
+            scan.times_s = rotation.point_times(&scan.points);
+        }
+        if let Some(motion) = &self.motion {
+            motion.deskew(&mut scan);
         }
         Ok(scan)
     }
@@ -136,7 +142,8 @@ impl Sequence {
                 scan_path,
                 time_s: times_s[number],
                 map_from_lidar: pose,
-                sweep: None,
+                rotation: None,
+                motion: None,
             });
         }
         Ok(Self {
@@ -168,7 +175,8 @@ impl Sequence {
             let before = frame.number.saturating_sub(1);
             let after = (frame.number + 1).min(self.map_from_lidar.len() - 1);
             let motion = self.map_from_lidar[before].inverse() * self.map_from_lidar[after];
-            frame.sweep = Some(sweep_motion(direction, &motion, (after - before).max(1)));
+            frame.rotation = Some(rotation(direction));
+            frame.motion = Some(motion_over((after - before).max(1), motion));
         }
         self
     }
@@ -189,7 +197,8 @@ impl Sequence {
                 continue;
             };
             let revolutions = numbers[row] - numbers[row - 1];
-            frame.sweep = Some(sweep_motion(direction, &motion, revolutions));
+            frame.rotation = Some(rotation(direction));
+            frame.motion = Some(motion_over(revolutions, motion));
         }
         self
     }
@@ -209,11 +218,18 @@ impl Sequence {
     }
 }
 
-/// The motion over one of several revolutions.
-fn sweep_motion(direction: RotationDirection, motion: &Pose3, revolutions: usize) -> SweepMotion {
-    SweepMotion {
+fn rotation(direction: RotationDirection) -> Rotation {
+    Rotation {
         direction,
-        previous_from_current: interpolate_motion(motion, 1.0 / revolutions as f64),
+        period_s: 1.0 / SCANS_PER_SECOND,
+    }
+}
+
+/// A motion over several revolutions.
+fn motion_over(revolutions: usize, previous_from_current: Pose3) -> Motion {
+    Motion {
+        previous_from_current,
+        duration_s: revolutions as f64 / SCANS_PER_SECOND,
     }
 }
 

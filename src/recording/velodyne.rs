@@ -71,6 +71,7 @@ mod tests {
         let scan = Scan {
             points: vec![Vec3::new(1.5, -2.25, 0.1), Vec3::INFINITY],
             intensities: vec![0.3, 0.9],
+            ..Scan::default()
         };
         write_scan(fs::File::create(&path).unwrap(), &scan).unwrap();
         assert_eq!(scan_files::read(&path).unwrap(), scan);

@@ -373,7 +373,7 @@ mod tests {
         let points = world.scan(&truth).points;
         let scan = Scan {
             points,
-            intensities: Vec::new(),
+            ..Scan::default()
         };
         let estimate = InitialEstimate {
             pose: truth * Pose2::translation(0.05, 0.05),

@@ -154,7 +154,7 @@ impl BuildMapConfig {
     fn local_map(&self) -> LocalMapConfig {
         LocalMapConfig {
             scan: ScanConfig {
-                range_image: self.range_image,
+                range_image: self.range_image.clone(),
                 normals: self.normals,
                 voxel_size_m: self.voxel_size as f32,
                 crop_m: Vec3::new(self.crop_x as f32, self.crop_y as f32, self.crop_z as f32),

@@ -1,6 +1,7 @@
 //! Configuration of `localize`: the pose of the car in a map.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
@@ -163,7 +164,7 @@ pub struct LocalizationConfig {
 }
 
 /// Range images of `localize`: the sensor model and the number of images per batch.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RenderedRangeImage {
     /// Rows.
@@ -178,6 +179,8 @@ pub struct RenderedRangeImage {
     pub max_range: f32,
     /// Range up to which returns are dropped [m].
     pub min_range: f32,
+    /// Elevations of the rows, from the top [deg]; `None` if they are evenly spaced over the field of view.
+    pub elevations: Option<Arc<[f32]>>,
     /// Whether to render the particles in batches instead of one by one.
     pub render_instanced: bool,
     /// Number of particles per batch.
@@ -217,6 +220,7 @@ impl Default for RenderedRangeImage {
             fov_down,
             max_range,
             min_range,
+            elevations,
         } = LidarModel::default();
         Self {
             height,
@@ -225,6 +229,7 @@ impl Default for RenderedRangeImage {
             fov_down,
             max_range,
             min_range,
+            elevations,
             render_instanced: true,
             max_instance: 1024,
         }
@@ -322,6 +327,7 @@ impl RenderedRangeImage {
             fov_down: self.fov_down,
             max_range: self.max_range,
             min_range: self.min_range,
+            elevations: self.elevations.clone(),
         }
     }
 

@@ -129,7 +129,7 @@ impl RefinementConfig {
     pub fn refiner(&self) -> RefinerConfig {
         RefinerConfig {
             sensor: SensorConfig {
-                lidar: self.range_image,
+                lidar: self.range_image.clone(),
                 own_car_m: self.own_car_m,
                 ground: self.ground(),
                 height_m: self.sensor_height_m,

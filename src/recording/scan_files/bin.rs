@@ -39,6 +39,7 @@ fn with_columns(bytes: &[u8], columns: usize) -> Scan {
     Scan {
         points,
         intensities,
+        ..Scan::default()
     }
 }
 

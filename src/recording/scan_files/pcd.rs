@@ -232,6 +232,7 @@ mod tests {
         let expected = Scan {
             points: vec![Vec3::new(1.5, -2.0, 0.25), Vec3::new(4.0, 5.0, 6.0)],
             intensities: vec![7.0, 9.0],
+            ..Scan::default()
         };
         let ascii = b"7 3 1.5 -2 0.25\n9 4 4 5 6\n";
         assert_eq!(parse(&file("ascii", ascii)).unwrap(), expected);

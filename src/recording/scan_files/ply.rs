@@ -43,5 +43,6 @@ pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
     Ok(Scan {
         points,
         intensities,
+        ..Scan::default()
     })
 }

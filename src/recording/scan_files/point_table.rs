@@ -111,5 +111,6 @@ pub fn scan_of(columns: &[Column], bytes: &[u8], count: usize) -> Result<Scan, S
     Ok(Scan {
         points,
         intensities,
+        ..Scan::default()
     })
 }

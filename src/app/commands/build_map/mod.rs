@@ -307,7 +307,7 @@ fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
     for frame in frames {
         let (path, pose) = (frame.scan_path.display(), frame.map_from_lidar);
         let (t, q) = (pose.translation.vector, pose.rotation.coords);
-        writeln!(text, "{path} {t:?} {q:?} {:?}", frame.sweep)?;
+        writeln!(text, "{path} {t:?} {q:?} {:?}", frame.motion)?;
     }
     Ok(text)
 }
