@@ -220,7 +220,8 @@ fn recordings() {
                 assert!(position.iter().all(|m| m.is_finite()));
             }
             for frame in &sequence
-                .compensated_by_poses(RotationDirection::Clockwise)
+                .rotating(Some(RotationDirection::Clockwise))
+                .compensated_by_poses()
                 .frames
             {
                 let _ = frame.read();

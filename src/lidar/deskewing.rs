@@ -65,6 +65,18 @@ pub struct Motion {
 }
 
 impl Motion {
+    /// The motion around a row of a trajectory, from the row before to the row after; `None` if there is
+    /// only one row, or if the times do not ascend.
+    pub fn along(map_from_lidar: &[Pose3], times_s: &[f64], row: usize) -> Option<Self> {
+        let before = row.saturating_sub(1);
+        let after = (row + 1).min(map_from_lidar.len() - 1);
+        let motion = Self {
+            previous_from_current: map_from_lidar[before].inverse() * map_from_lidar[after],
+            duration_s: times_s[after] - times_s[before],
+        };
+        (motion.duration_s > 0.0).then_some(motion)
+    }
+
     /// The motion in a time; backward if it is negative.
     pub fn after(&self, time_s: f64) -> Pose3 {
         interpolate_motion(&self.previous_from_current, time_s / self.duration_s)

@@ -5,6 +5,7 @@ use nalgebra::Matrix3;
 use super::particles::ParticleSet;
 use super::tracking_loss::State;
 use crate::geometry::{Pose2, Pose3};
+use crate::lidar::Motion;
 use crate::map::SensorAttitude;
 
 /// Estimated pose of a frame, with its uncertainty and the state of the filter.
@@ -33,6 +34,8 @@ pub struct Estimate {
     pub updated: bool,
     /// Whether there is mapped ground under the estimate; otherwise the last known ground is used.
     pub on_mapped_ground: bool,
+    /// Motion of the sensor around the frame; `None` while unknown.
+    pub motion: Option<Motion>,
     /// The particles with their weights, before resampling.
     pub particles: ParticleSet,
 }

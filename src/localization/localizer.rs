@@ -7,6 +7,8 @@ use super::initialization::{StartSpread, around, from_panoramas};
 use super::odometry::Odometry;
 use super::particles::{Particle, ParticleSet};
 use super::sensor::Sensor;
+use super::sweep::SweepMotion;
+use super::tracking_loss::State;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{RangeImage, Scan};
 use crate::map::{Map, PanoramaRequest, SearchRegion, SensorAttitude};
@@ -77,6 +79,7 @@ pub struct Localizer {
     sensor: Sensor,
     /// Attitude of the sensor in the last frame.
     attitude: SensorAttitude,
+    sweep: SweepMotion,
     frames: u64,
     /// `None` before the first frame.
     filter: Option<ParticleFilter>,
@@ -98,6 +101,7 @@ impl Localizer {
             map: map.clone(),
             sensor: Sensor::new(&config.sensor)?,
             attitude: config.sensor.assumed_attitude(),
+            sweep: SweepMotion::default(),
             config,
             start,
             seed,
@@ -111,7 +115,9 @@ impl Localizer {
         if !odometry.is_possible() {
             return Err(LocalizerError::ImpossibleOdometry(odometry));
         }
-        let image = self.sensor.range_image(scan);
+        let duration_s = self.sweep.duration_s(scan);
+        let mut motion = self.sweep.predict(odometry, duration_s);
+        let mut image = self.sensor.range_image(scan, motion.as_ref());
         let known = self.filter.as_ref().and_then(ParticleFilter::attitude);
         if let Some(attitude) = known.or_else(|| self.sensor.attitude(&image)) {
             self.attitude = attitude;
@@ -123,7 +129,19 @@ impl Localizer {
         let mut rng = stream(self.seed, FIRST_FRAME_STREAM + self.frames);
         self.frames += 1;
         let filter = self.filter.insert(filter);
-        Ok(filter.step(odometry, &image, &self.attitude, &mut rng)?)
+        if !scan.times_s.is_empty()
+            && let Some(pose) = filter.registered(odometry, &image, &self.attitude, &mut rng)?
+            && let Some(found) = self.sweep.around(&pose, duration_s)
+        {
+            image = self.sensor.range_image(scan, Some(&found));
+            motion = Some(found);
+        }
+        let mut estimate = filter.step(odometry, &image, &self.attitude, &mut rng)?;
+        let pose = Some(estimate.map_from_lidar).filter(|_| estimate.state == State::Tracking);
+        let found = pose.and_then(|pose| self.sweep.around(&pose, duration_s));
+        self.sweep.update(pose, scan, duration_s);
+        estimate.motion = found.or(motion);
+        Ok(estimate)
     }
 
     /// The filter with its initial particles.

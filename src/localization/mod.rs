@@ -17,6 +17,7 @@ pub mod estimate;
 pub mod odometry;
 pub mod particles;
 pub mod sensor;
+mod sweep;
 // One step of the filter.
 pub mod initialization;
 pub mod motion;

@@ -1,7 +1,7 @@
 //! The sensor: from a scan to a range image, and its attitude above the ground.
 
 use crate::ground::{GroundClassifier, GroundConfig, road_plane};
-use crate::lidar::{LidarModel, RangeImage, Scan};
+use crate::lidar::{LidarModel, Motion, RangeImage, Scan};
 use crate::map::SensorAttitude;
 use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 use smart_default::SmartDefault;
@@ -66,12 +66,14 @@ impl Sensor {
         })
     }
 
-    /// Projects a scan without the points on the own car and out of range.
-    pub fn range_image(&self, scan: &Scan) -> RangeImage {
-        let [x_min, x_max, y_min, y_max] = self.own_car_m;
-        let mut points = scan.points.clone();
-        points.retain(|p| !(p.x > x_min && p.x < x_max && p.y > y_min && p.y < y_max));
-        RangeImage::project(&points, &self.lidar)
+    /// Projects a scan, deskewed by a motion, without the points on the own car and out of range.
+    pub fn range_image(&self, scan: &Scan, motion: Option<&Motion>) -> RangeImage {
+        let mut scan = scan.clone();
+        scan.drop_inside(self.own_car_m);
+        if let Some(motion) = motion {
+            motion.deskew(&mut scan);
+        }
+        RangeImage::project(&scan.points, &self.lidar)
     }
 
     /// Attitude of the sensor above the ground in the scan, with the height of the configuration if it

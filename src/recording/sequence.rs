@@ -105,6 +105,8 @@ pub struct Sequence {
     pub frames: Vec<Frame>,
     /// All lidar poses of the recording in the frame of the first.
     pub map_from_lidar: Vec<Pose3>,
+    /// Their times [s].
+    pub times_s: Vec<f64>,
     /// Calibration of the recording.
     pub calibration: Calibration,
     /// Frame of all poses of this sequence in the world of its camera poses.
@@ -149,6 +151,7 @@ impl Sequence {
         Ok(Self {
             frames,
             map_from_lidar,
+            times_s,
             calibration: poses.calibration,
             world_from_map: poses.world_from_map(),
         })
@@ -167,38 +170,24 @@ impl Sequence {
         self.frames.iter().map(read)
     }
 
-    /// The same sequence with scans deskewed by the poses of the recording: the motion of a frame
-    /// is half of that from the previous to the next frame.
+    /// The same sequence, whose points have times from the rotation of the sensor.
     #[must_use]
-    pub fn compensated_by_poses(mut self, direction: RotationDirection) -> Self {
+    pub fn rotating(mut self, direction: Option<RotationDirection>) -> Self {
+        let rotation = direction.map(|direction| Rotation {
+            direction,
+            period_s: 1.0 / SCANS_PER_SECOND,
+        });
         for frame in &mut self.frames {
-            let before = frame.number.saturating_sub(1);
-            let after = (frame.number + 1).min(self.map_from_lidar.len() - 1);
-            let motion = self.map_from_lidar[before].inverse() * self.map_from_lidar[after];
-            frame.rotation = Some(rotation(direction));
-            frame.motion = Some(motion_over((after - before).max(1), motion));
+            frame.rotation = rotation;
         }
         self
     }
 
-    /// The same sequence with scans deskewed by odometry increments `previous_from_current` into
-    /// each frame. The first frame uses the motion of the second; frames without an increment are
-    /// not deskewed.
+    /// The same sequence, whose scans are deskewed by the poses of the recording.
     #[must_use]
-    pub fn compensated_by(
-        mut self,
-        direction: RotationDirection,
-        increments: &[Option<Pose3>],
-    ) -> Self {
-        let numbers: Vec<usize> = self.frames.iter().map(|frame| frame.number).collect();
-        for (row, frame) in self.frames.iter_mut().enumerate() {
-            let row = row.max(1);
-            let Some(&Some(motion)) = increments.get(row) else {
-                continue;
-            };
-            let revolutions = numbers[row] - numbers[row - 1];
-            frame.rotation = Some(rotation(direction));
-            frame.motion = Some(motion_over(revolutions, motion));
+    pub fn compensated_by_poses(mut self) -> Self {
+        for frame in &mut self.frames {
+            frame.motion = Motion::along(&self.map_from_lidar, &self.times_s, frame.number);
         }
         self
     }
@@ -215,21 +204,6 @@ impl Sequence {
         }
         self.world_from_map = *world_from_map;
         self
-    }
-}
-
-fn rotation(direction: RotationDirection) -> Rotation {
-    Rotation {
-        direction,
-        period_s: 1.0 / SCANS_PER_SECOND,
-    }
-}
-
-/// A motion over several revolutions.
-fn motion_over(revolutions: usize, previous_from_current: Pose3) -> Motion {
-    Motion {
-        previous_from_current,
-        duration_s: revolutions as f64 / SCANS_PER_SECOND,
     }
 }
 

@@ -16,7 +16,7 @@ use super::objective::FrameObjective;
 use super::refiner::{RefinementConfig, refine_frame};
 use super::smoothing::{self, FramePrior, smooth};
 use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
-use crate::lidar::{RangeImage, Scan};
+use crate::lidar::{Motion, RangeImage, Scan};
 use crate::localization::observation::{ObservationConfig, choose_beams};
 use crate::localization::{Estimate, Sensor, SensorConfig, State};
 use crate::map::{Map, SensorAttitude};
@@ -54,6 +54,8 @@ pub struct InitialEstimate {
     pub covariance: Option<Matrix3<f64>>,
     /// State of the filter. Only tracked frames are refined.
     pub state: State,
+    /// Motion of the sensor, by which the scan is deskewed.
+    pub motion: Option<Motion>,
 }
 
 impl InitialEstimate {
@@ -63,6 +65,7 @@ impl InitialEstimate {
             pose,
             covariance: None,
             state: State::Tracking,
+            motion: None,
         }
     }
 }
@@ -73,6 +76,7 @@ impl From<&Estimate> for InitialEstimate {
             pose: estimate.pose,
             covariance: Some(estimate.covariance),
             state: estimate.state,
+            motion: estimate.motion,
         }
     }
 }
@@ -161,7 +165,7 @@ impl TrajectoryRefiner {
         estimate: &InitialEstimate,
     ) -> Result<&FrameResult, RefinerError> {
         let mut rng = stream(self.seed, self.frames.len() as u64);
-        let image = self.sensor.range_image(scan);
+        let image = self.sensor.range_image(scan, estimate.motion.as_ref());
         let previous = self.frames.last();
         let mut frame = FrameResult {
             pose: estimate.pose,
@@ -379,6 +383,7 @@ mod tests {
             pose: truth * Pose2::translation(0.05, 0.05),
             covariance: None,
             state: State::Tracking,
+            motion: None,
         };
         let refined = refiner.add(&scan, &estimate).unwrap();
         let off_m = (refined.pose.translation.vector - truth.translation.vector).norm();

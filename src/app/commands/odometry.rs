@@ -7,8 +7,7 @@ use rand::Rng;
 
 use super::input;
 use crate::app::config::OdometrySource;
-use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
-use crate::lidar::RotationDirection;
+use crate::geometry::{Pose2, Pose3};
 use crate::localization::odometry::{demonstration_noise, increments, with_noise};
 use crate::recording::Sequence;
 use crate::recording::poses::DrivePoses;
@@ -52,20 +51,6 @@ fn recorded(file: &Path, sequence: &Sequence) -> Result<Vec<Pose3>> {
         Some(_) => drive.camera.world_from_cam0,
         None => drive.map_from_lidar(),
     })
-}
-
-/// Compensates the motion within the scans of a sequence, where a direction of rotation is configured.
-pub fn compensated(
-    sequence: Sequence,
-    direction: Option<RotationDirection>,
-    increments: &[Option<Pose2>],
-) -> Sequence {
-    let Some(direction) = direction else {
-        return sequence;
-    };
-    let spatial = |increment: &Option<Pose2>| Some(pose3_from_pose2(increment.as_ref()?, 0.0));
-    let increments: Vec<_> = increments.iter().map(spatial).collect();
-    sequence.compensated_by(direction, &increments)
 }
 
 /// Description of the odometry for reports.

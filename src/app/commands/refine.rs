@@ -15,7 +15,8 @@ use crate::app::config::{OdometrySource, RefinementConfig};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
 use crate::files::remove_abandoned;
-use crate::geometry::{Pose2, pose2_from_pose3};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
+use crate::lidar::Motion;
 use crate::localization::State;
 use crate::localization::odometry::demonstration_noise;
 use crate::map::Map;
@@ -49,7 +50,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let sequence = frames_of(sequence, &results, config)?;
     let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
     let increments = increments(config, &sequence, &results)?;
-    let sequence = odometry::compensated(sequence, config.motion_compensation, &increments);
+    let sequence = sequence.rotating(config.motion_compensation);
     let starts = initial_estimates(&results, &estimates);
     let (refined, runtimes_s) = refine(config, context, &map, &sequence, &starts, &increments)?;
     if results.ground_truth.is_none() {
@@ -132,10 +133,20 @@ fn initial_estimates(results: &LocalizationResults, estimates: &[Pose2]) -> Vec<
         Some(states) if states[row] == State::Searching as u8 => State::Searching,
         _ => State::Tracking,
     };
+    let in_space: Vec<Pose3> = (estimates.iter())
+        .map(|pose| pose3_from_pose2(pose, 0.0))
+        .collect();
+    let motion = |row: usize| {
+        let around = row.saturating_sub(1)..=(row + 1).min(estimates.len() - 1);
+        let is_known = around.into_iter().all(|row| state(row) == State::Tracking);
+        let times_s = results.times_s.as_ref().filter(|_| is_known)?;
+        Motion::along(&in_space, times_s, row)
+    };
     let initial = |(row, pose): (usize, &Pose2)| InitialEstimate {
         pose: *pose,
         covariance: results.covariances.as_ref().map(|all| all[row]),
         state: state(row),
+        motion: motion(row),
     };
     estimates.iter().enumerate().map(initial).collect()
 }

@@ -5,9 +5,10 @@ use rand::Rng;
 
 use super::reweight::Update;
 use super::state::ParticleFilter;
-use crate::geometry::pose2_from_pose3;
+use crate::geometry::{Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
 use crate::localization::observation::choose_beams;
+use crate::localization::odometry::Odometry;
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::proposal::{Gaussian, regular};
 use crate::localization::tracking_loss::State;
@@ -27,6 +28,27 @@ pub(super) struct Proposal {
 }
 
 impl ParticleFilter {
+    /// Pose of a scan, registered with the map at the predicted pose; `None` while the filter is not
+    /// tracking and where registration fails. The filter is not changed.
+    pub fn registered(
+        &self,
+        odometry: Odometry,
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+        rng: &mut impl Rng,
+    ) -> Result<Option<Pose3>, RenderError> {
+        let config = &self.config.proposal;
+        let predicted = self.particles.mean() * self.pending * self.increment(odometry);
+        let patch = self.patch_at(&predicted).or(self.patch);
+        let Some(patch) = patch.filter(|_| self.state == State::Tracking) else {
+            return Ok(None);
+        };
+        let beams = choose_beams(scan, config.beams, config.road_share, attitude, rng);
+        let start = patch.lift(&predicted, attitude);
+        let found = register(&*self.map.renderer, &beams, &start, &config.registration)?;
+        Ok(found.map(|found| found.map_from_lidar))
+    }
+
     /// Registers the scan with the map and fuses the result with the prediction; `None` while the
     /// distribution is wide, where registration fails, and where its result is implausible.
     pub(super) fn propose(

@@ -114,6 +114,7 @@ impl ParticleFilter {
             state: self.state,
             updated: false,
             on_mapped_ground: found.is_some(),
+            motion: None,
             particles,
         }
     }

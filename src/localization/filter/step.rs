@@ -51,14 +51,19 @@ impl ParticleFilter {
 
     /// Adds the motion into a frame to the motion since the last update.
     fn accumulate(&mut self, odometry: Odometry) {
-        self.pending *= match odometry {
+        self.pending *= self.increment(odometry);
+        if let Odometry::Velocity(command) = odometry {
+            self.pending_duration += command.duration;
+        }
+    }
+
+    /// Motion into a frame.
+    pub(super) fn increment(&self, odometry: Odometry) -> Pose2 {
+        match odometry {
             Odometry::Increment(previous_from_current) => previous_from_current,
-            Odometry::Velocity(command) => {
-                self.pending_duration += command.duration;
-                command.compose()
-            }
+            Odometry::Velocity(command) => command.compose(),
             Odometry::Unknown => self.last_increment.unwrap_or_else(Pose2::identity),
-        };
+        }
     }
 
     /// Without odometry every scan is used: nothing else shows whether the car moves.

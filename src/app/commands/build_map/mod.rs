@@ -85,10 +85,9 @@ fn open(config: &BuildMapConfig) -> Result<Sequence> {
     let poses = (sequence.frames.iter()).map(|frame| (frame.number, &frame.map_from_lidar));
     path_check::check(poses, config.max_step_m)
         .with_context(|| format!("pose_file is {}", config.pose_file.display()))?;
-    Ok(match config.motion_compensation {
-        Some(spin) => sequence.compensated_by_poses(spin),
-        None => sequence,
-    })
+    Ok(sequence
+        .rotating(config.motion_compensation)
+        .compensated_by_poses())
 }
 
 /// Prepares the outputs.

@@ -44,7 +44,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         &sequence,
         &mut stream(config.seed, ODOMETRY_STREAM),
     )?;
-    let sequence = odometry::compensated(sequence, config.motion_compensation, &increments);
+    let sequence = sequence.rotating(config.motion_compensation);
     let run = Mutex::new(Run::new(
         config,
         &map,
