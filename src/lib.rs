@@ -14,11 +14,11 @@
 //!
 //! use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
 //! use fpmcl::map::{Map, MapBuilder, MapConfig, MapOptions};
-//! use fpmcl::recording::Sequence;
+//! use fpmcl::recording::{Recording, Selection};
 //! use fpmcl::refinement::{InitialEstimate, RefinerConfig, TrajectoryRefiner};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! let first_drive = Sequence::open_folder(Path::new("data/street/drive_1"))?;
+//! let first_drive = Recording::open_with_poses(Path::new("data/street/drive_1"))?;
 //! let map = MapBuilder::new(MapConfig::default()).build(first_drive.scans())?;
 //! map.save(Path::new("results/map.ply"))?;
 //!
@@ -26,7 +26,8 @@
 //! let seed = 0;
 //! let mut localizer = Localizer::new(&map, LocalizerConfig::default(), Start::Anywhere, seed)?;
 //! let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), seed)?;
-//! for frame in &Sequence::open_folder(Path::new("data/street/drive_2"))?.frames {
+//! let second_drive = Recording::open(Path::new("data/street/drive_2"), &Selection::default())?;
+//! for frame in &second_drive.frames {
 //!     let scan = frame.read()?;
 //!     let estimate = localizer.step(&scan, Odometry::Unknown)?;
 //!     println!("{} ± {:?}", estimate.pose, estimate.standard_deviations());

@@ -45,6 +45,23 @@ pub enum RecordingError {
         pose_file: PathBuf,
         poses: usize,
     },
+    #[error("{} has no poses (poses.txt, poses_tum.txt or oxts); name their file in pose_file, or with --poses", path.display())]
+    NoPoseFile { path: PathBuf },
+    #[error("{} has no calib_imu_to_velo.txt in its folder or above it; copy it there from the archive of the calibration", path.display())]
+    NoImuCalibration { path: PathBuf },
+    #[error("{} has no time: times.txt has {times} rows; give one row per scan, or remove the file to assume 10 scans per second", scan.display())]
+    ScanWithoutTime { scan: PathBuf, times: usize },
+    #[error("{missing} of {scans} scans have no pose: the scans are from {first_scan_s:.3} to {last_scan_s:.3} s and the {poses} poses of {} from {first_pose_s:.3} to {last_pose_s:.3} s; give poses of this recording with times of the same clock", pose_file.display())]
+    TimesDoNotMatch {
+        pose_file: PathBuf,
+        poses: usize,
+        first_pose_s: f64,
+        last_pose_s: f64,
+        scans: usize,
+        first_scan_s: f64,
+        last_scan_s: f64,
+        missing: usize,
+    },
     #[error("{} has {times} times for {poses} poses; both need one row per frame", path.display())]
     WrongTimes {
         path: PathBuf,

@@ -1,21 +1,33 @@
-//! Recordings in the layout of the KITTI odometry benchmark.
+//! Recordings: scans with their times, and the poses that belong to them.
 //!
-//! Poses on disk are camera poses; [`MapFrame`] converts between them and the lidar poses that
-//! everything else uses:
+//! [`Recording::open`] recognizes the [`layout`]; [`PoseTrack`] reads poses and matches them to the scans. Poses on disk
+//! are poses of a camera or of another body on which the lidar is mounted; [`MapFrame`] converts between
+//! them and the lidar poses that everything else uses:
 //!
 //! ```text
 //! map_from_lidar(i) = inv(Tr) · inv(P₀) · Pᵢ · Tr        Tr = cam0_from_lidar
 //! ```
 
-pub mod calibration;
-mod error;
-pub mod poses;
+// Scans.
+pub mod frame;
+pub mod layout;
+pub mod open;
 pub mod scan_files;
-pub mod sequence;
-mod table;
+pub mod scan_list;
 pub mod velodyne;
+// Poses.
+pub mod calibration;
+mod oxts;
+pub mod poses;
+pub mod track;
+// Text files and errors.
+mod error;
+mod table;
 
 pub use calibration::Calibration;
 pub use error::RecordingError;
+pub use frame::Frame;
+pub use open::Recording;
 pub use poses::MapFrame;
-pub use sequence::{Frame, Selection, Sequence};
+pub use scan_list::Selection;
+pub use track::PoseTrack;

@@ -50,61 +50,20 @@ impl CameraPoses {
     }
 }
 
-/// The poses of a drive with what is needed to use them.
-#[derive(Clone, Debug, PartialEq)]
-pub struct DrivePoses {
-    /// Poses of the camera; of the lidar if the calibration is the identity.
-    pub camera: CameraPoses,
-    /// Calibration of the recording.
-    pub calibration: Calibration,
-    /// Times of the poses [s], if the file has them.
-    pub times_s: Option<Vec<f64>>,
-}
-
-impl DrivePoses {
-    /// Reads rows of KITTI (12 numbers) or TUM (8 numbers).
-    ///
-    /// Rows of KITTI are poses of the camera if there is a calibration, else of the lidar; rows of TUM
-    /// are poses of the lidar.
-    pub fn read(pose_file: &Path, calib_file: Option<&Path>) -> Result<Self, RecordingError> {
-        Self::read_with(pose_file, || {
-            calib_file.map_or(Ok(Calibration::identity()), Calibration::read)
-        })
-    }
-
-    /// Reads a file as [`read`](Self::read) does; `calibration` is called for rows of KITTI.
-    pub fn read_with(
-        pose_file: &Path,
-        calibration: impl FnOnce() -> Result<Calibration, RecordingError>,
-    ) -> Result<Self, RecordingError> {
-        match CameraPoses::read(pose_file) {
-            Ok(camera) => Ok(Self {
-                camera,
-                calibration: calibration()?,
-                times_s: None,
-            }),
-            Err(RecordingError::WrongCount { found: 8, .. }) => {
-                let rows = read_tum(pose_file)?;
-                Ok(Self {
-                    camera: CameraPoses {
-                        world_from_cam0: rows.iter().map(|row| row.map_from_lidar).collect(),
-                    },
-                    calibration: Calibration::identity(),
-                    times_s: Some(rows.iter().map(|row| row.time_s).collect()),
-                })
-            }
-            Err(error) => Err(error),
+/// Reads the rows of a pose file, of KITTI (12 numbers) or TUM (8 numbers, with times [s]).
+pub fn read_rows_of_poses(
+    path: &Path,
+) -> Result<(CameraPoses, Option<Vec<f64>>), RecordingError> {
+    match CameraPoses::read(path) {
+        Ok(poses) => Ok((poses, None)),
+        Err(RecordingError::WrongCount { found: 8, .. }) => {
+            let rows = read_tum(path)?;
+            let poses = CameraPoses {
+                world_from_cam0: rows.iter().map(|row| row.map_from_lidar).collect(),
+            };
+            Ok((poses, Some(rows.iter().map(|row| row.time_s).collect())))
         }
-    }
-
-    /// The lidar poses in the frame of the first one.
-    pub fn map_from_lidar(&self) -> Vec<Pose3> {
-        self.camera.map_from_lidar(&self.calibration)
-    }
-
-    /// Frame of [`map_from_lidar`](Self::map_from_lidar) in the world of the poses in the file.
-    pub fn world_from_map(&self) -> Pose3 {
-        self.camera.frame(&self.calibration).world_from_map()
+        Err(error) => Err(error),
     }
 }
 
@@ -213,6 +172,19 @@ fn check_time(time_s: f64, path: &Path, line: usize) -> Result<f64, RecordingErr
         quantity: "time",
         limit: "1e10 s; times are in seconds",
     })
+}
+
+/// Returns times that ascend [s].
+pub(super) fn ascending(path: &Path, times_s: Vec<f64>) -> Result<Vec<f64>, RecordingError> {
+    match times_s.windows(2).position(|pair| pair[1] <= pair[0]) {
+        Some(frame) => Err(RecordingError::TimesDoNotAscend {
+            path: path.to_owned(),
+            frame: frame + 1,
+            time_s: times_s[frame + 1],
+            previous_s: times_s[frame],
+        }),
+        None => Ok(times_s),
+    }
 }
 
 /// Writes `times.txt` [s].

@@ -7,8 +7,9 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::check::{optional_path, path};
+use super::recording::{MotionCompensation, RangeImageConfig, mounting};
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
-use crate::lidar::{LidarModel, NormalConfig, RotationDirection};
+use crate::lidar::NormalConfig;
 use crate::map::confidence::ConfidenceConfig;
 use crate::map::scan_cloud::ScanConfig;
 use crate::map::visibility::VisibilityConfig;
@@ -22,16 +23,19 @@ use crate::validation::{InvalidValue, Validate, in_range, require};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct BuildMapConfig {
-    /// Folder of the scans, `.bin`, `.pcd`, `.ply` or `.npy`.
+    /// The recording: its folder, the folder of its scans, or a bag.
     #[default("data/kitti/velodyne".into())]
     pub scan_folder: PathBuf,
-    /// Poses of the recording, rows of KITTI or TUM.
-    #[default("data/kitti/poses.txt".into())]
-    pub pose_file: PathBuf,
-    /// Calibration of the recording, with its line `Tr`.
-    /// `None`: the poses are those of the lidar.
-    #[default(Some("data/kitti/calib.txt".into()))]
+    /// Topic of the point clouds in a bag with several.
+    pub topic: Option<String>,
+    /// Poses of the recording, rows of KITTI or TUM, a folder `oxts`, or a topic of a bag; `None`: those that the
+    /// recording contains.
+    pub pose_file: Option<PathBuf>,
+    /// Calibration of the recording, with its line `Tr`; `None`: the poses in `pose_file` are those of the lidar.
     pub calib_file: Option<PathBuf>,
+    /// Pose x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose poses are given; `None`: they are
+    /// those of the lidar.
+    pub body_from_lidar: Option<[f64; 6]>,
     /// Output path of the map.
     #[default("results/map.ply".into())]
     pub mesh_file: PathBuf,
@@ -84,7 +88,7 @@ pub struct BuildMapConfig {
     #[default([0.0, 0.0, 1.0])]
     pub rest_color: [f64; 3],
     /// Size and limits of the range images for the normals.
-    pub range_image: LidarModel,
+    pub range_image: RangeImageConfig,
 
     /// First frame of the recording.
     pub start_idx: usize,
@@ -114,8 +118,7 @@ pub struct BuildMapConfig {
     #[default(LocalMapConfig::default().ground_threshold)]
     pub ground_threshold: f32,
     /// Box of the own car in the lidar frame: x_min, x_max, y_min, y_max [m].
-    #[default(ScanConfig::default().own_car_m)]
-    pub own_car_m: [f32; 4],
+    pub own_car_m: Option<[f32; 4]>,
     /// Weight of each point. Off by default: it improved no map.
     pub confidence: ConfidenceConfig,
     /// Surface reconstruction, beside `depth`.
@@ -128,9 +131,10 @@ pub struct BuildMapConfig {
     pub fuzzy: FuzzyConfig,
     /// Parameters of `ground_method: pca`.
     pub pca: PcaGround,
-    /// Direction of rotation of the sensor for motion compensation; `None` for scans that are
-    /// compensated already, such as those of KITTI odometry.
-    pub motion_compensation: Option<RotationDirection>,
+    /// Times of the points for motion compensation; `None` for scans that are compensated already, such as
+    /// those of KITTI odometry.
+    #[default(Some(MotionCompensation::Auto))]
+    pub motion_compensation: Option<MotionCompensation>,
     /// Seed of all random choices.
     pub seed: u64,
     /// Whether to replace an existing map.
@@ -154,11 +158,11 @@ impl BuildMapConfig {
     fn local_map(&self) -> LocalMapConfig {
         LocalMapConfig {
             scan: ScanConfig {
-                range_image: self.range_image.clone(),
+                range_image: self.range_image.model(),
                 normals: self.normals,
                 voxel_size_m: self.voxel_size as f32,
                 crop_m: Vec3::new(self.crop_x as f32, self.crop_y as f32, self.crop_z as f32),
-                own_car_m: self.own_car_m,
+                own_car_m: self.own_car_m.unwrap_or(ScanConfig::default().own_car_m),
             },
             confidence: self.confidence.clone(),
             poisson: PoissonConfig {
@@ -199,8 +203,9 @@ fn bytes(rgb: [f64; 3]) -> [u8; 3] {
 impl Validate for BuildMapConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         path("scan_folder", &self.scan_folder)?;
-        path("pose_file", &self.pose_file)?;
+        optional_path("pose_file", self.pose_file.as_deref())?;
         optional_path("calib_file", self.calib_file.as_deref())?;
+        mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
         path("mesh_file", &self.mesh_file)?;
         self.selection().validate()?;
         in_range("depth", self.depth, PoissonConfig::DEPTHS)?;

@@ -1,15 +1,15 @@
 //! Configuration of `localize`: the pose of the car in a map.
 
 use std::path::PathBuf;
-use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::check::{optional_path, path};
 use super::odometry::OdometrySource;
+use super::recording::{MotionCompensation, RangeImageConfig, mounting};
+use crate::geometry::FARTHEST_M;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
-use crate::lidar::{LidarModel, RotationDirection};
 use crate::localization::convergence::ConvergenceConfig;
 use crate::localization::initialization::StartSpread;
 use crate::localization::motion::{OdometryNoise, VelocityNoise};
@@ -22,7 +22,7 @@ use crate::localization::{LocalizerConfig, SensorConfig};
 use crate::map::PanoramaConfig;
 use crate::map::scan_cloud::ScanConfig;
 use crate::refinement::{RefinementConfig, RefinerConfig};
-use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative};
+use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative, require};
 
 /// Configuration of `localize`: the keys of range-mcl's `localization.yml`, then new ones.
 ///
@@ -30,9 +30,11 @@ use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct LocalizationConfig {
-    /// Folder of the scans, `.bin`, `.pcd`, `.ply` or `.npy`.
+    /// The recording: its folder, the folder of its scans, or a bag.
     #[default("data/kitti/velodyne".into())]
     pub scan_folder: PathBuf,
+    /// Topic of the point clouds in a bag with several.
+    pub topic: Option<String>,
     /// Map of `build-map` or range-mcl.
     #[default("results/map.ply".into())]
     pub map_file: PathBuf,
@@ -40,22 +42,22 @@ pub struct LocalizationConfig {
     pub map_pose_file: Option<PathBuf>,
     /// Calibration of the mapping drive; `None`: the map carries its own frame.
     pub map_calib_file: Option<PathBuf>,
-    /// Poses of the recording, rows of KITTI or TUM.
-    #[default("data/kitti/poses.txt".into())]
-    pub pose_file: PathBuf,
-    /// Calibration of the recording, with its line `Tr`.
-    /// `None`: the poses are those of the lidar.
-    #[default(Some("data/kitti/calib.txt".into()))]
+    /// True poses of the recording for the report, rows of KITTI or TUM, a folder `oxts`, or a topic of a bag.
+    pub pose_file: Option<PathBuf>,
+    /// Calibration of the recording, with its line `Tr`; `None`: its poses are those of the lidar.
     pub calib_file: Option<PathBuf>,
+    /// Pose x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose poses are given; `None`: they are
+    /// those of the lidar.
+    pub body_from_lidar: Option<[f64; 6]>,
     /// Output path of the result; all other output is written beside it.
     #[default("results/localization.npz".into())]
     pub result_path: PathBuf,
     /// Whether to draw the final plots.
     #[default(true)]
     pub plot_loc_results: bool,
-    /// Whether the start is known; `initialization` takes precedence.
-    #[default(true)]
-    pub pose_tracking: bool,
+    /// Whether the start is known: `initial_pose`, else the first true pose. `None`: it is if there is an
+    /// `initial_pose`. `initialization` takes precedence.
+    pub pose_tracking: Option<bool>,
     /// First frame of the recording.
     pub start_idx: usize,
     /// Cell edge of the grid for initialization [m].
@@ -83,7 +85,7 @@ pub struct LocalizationConfig {
     #[default(true)]
     pub save_result: bool,
     /// Size and limits of the range images, and their rendering.
-    pub range_image: RenderedRangeImage,
+    pub range_image: RangeImageConfig,
 
     /// Number of scans from `start_idx` on; -1 for all.
     #[default(-1)]
@@ -91,7 +93,9 @@ pub struct LocalizationConfig {
     /// Step between frames: n uses every n-th frame.
     #[default(1)]
     pub frame_step: usize,
-    /// Initial distribution of the particles; `None`: it follows from `pose_tracking`.
+    /// Start: x, y in the map [m], heading [deg].
+    pub initial_pose: Option<[f64; 3]>,
+    /// Initial distribution of the particles; `None`: it follows from `pose_tracking` and `initial_pose`.
     pub initialization: Option<Initialization>,
     /// Source of the motion between frames.
     pub odometry: OdometrySource,
@@ -99,9 +103,8 @@ pub struct LocalizationConfig {
     pub odometry_file: Option<PathBuf>,
     /// Motion model.
     pub motion_model: MotionModel,
-    /// Box of the own car in the lidar frame: x_min, x_max, y_min, y_max [m].
-    #[default(ScanConfig::default().own_car_m)]
-    pub own_car_m: [f32; 4],
+    /// Box of the own car in the lidar frame: x_min, x_max, y_min, y_max [m]; `None`: inferred.
+    pub own_car_m: Option<[f32; 4]>,
     /// Height of the sensor above the road [m]; `None`: estimated from the scans.
     pub sensor_height_m: Option<f64>,
     /// Method of ground segmentation of the scans.
@@ -150,9 +153,12 @@ pub struct LocalizationConfig {
     pub vigilance: TrackingLossConfig,
     /// Search for the start with panoramas.
     pub panorama: PanoramaConfig,
-    /// Direction of rotation of the sensor for motion compensation; `None` for scans that are
-    /// compensated already, such as those of KITTI odometry.
-    pub motion_compensation: Option<RotationDirection>,
+    /// Times of the points for motion compensation; `None` for scans that are compensated already, such as
+    /// those of KITTI odometry.
+    #[default(Some(MotionCompensation::Auto))]
+    pub motion_compensation: Option<MotionCompensation>,
+    /// Axis of driving in the lidar frame, 0 for x, 90 for y [deg]; `None`: inferred from the motion.
+    pub forward_deg: Option<f64>,
     /// Whether to refine every frame while tracking.
     pub refine: bool,
     /// Parameters of the refinement.
@@ -161,30 +167,6 @@ pub struct LocalizationConfig {
     pub seed: u64,
     /// Whether to replace an existing result.
     pub force: bool,
-}
-
-/// Range images of `localize`: the sensor model and the number of images per batch.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct RenderedRangeImage {
-    /// Rows.
-    pub height: usize,
-    /// Columns over 360 degrees.
-    pub width: usize,
-    /// Upper edge of the vertical field of view over the horizon [deg].
-    pub fov_up: f32,
-    /// Lower edge of the vertical field of view; below the horizon whatever its sign [deg].
-    pub fov_down: f32,
-    /// Range from which on returns are dropped [m].
-    pub max_range: f32,
-    /// Range up to which returns are dropped [m].
-    pub min_range: f32,
-    /// Elevations of the rows, from the top [deg]; `None` if they are evenly spaced over the field of view.
-    pub elevations: Option<Arc<[f32]>>,
-    /// Whether to render the particles in batches instead of one by one.
-    pub render_instanced: bool,
-    /// Number of particles per batch.
-    pub max_instance: usize,
 }
 
 /// Initial distribution of the particles.
@@ -208,32 +190,6 @@ pub enum MotionModel {
     TurnDriveTurn,
     /// Speed and turn rate over a duration.
     Velocity,
-}
-
-impl Default for RenderedRangeImage {
-    /// The sensor of [`LidarModel`]; batches large enough for every renderer.
-    fn default() -> Self {
-        let LidarModel {
-            height,
-            width,
-            fov_up,
-            fov_down,
-            max_range,
-            min_range,
-            elevations,
-        } = LidarModel::default();
-        Self {
-            height,
-            width,
-            fov_up,
-            fov_down,
-            max_range,
-            min_range,
-            elevations,
-            render_instanced: true,
-            max_instance: 1024,
-        }
-    }
 }
 
 impl LocalizationConfig {
@@ -267,7 +223,7 @@ impl LocalizationConfig {
     pub fn sensor(&self) -> SensorConfig {
         SensorConfig {
             lidar: self.range_image.model(),
-            own_car_m: self.own_car_m,
+            own_car_m: self.own_car_m.unwrap_or(ScanConfig::default().own_car_m),
             ground: self.ground(),
             height_m: self.sensor_height_m,
         }
@@ -306,38 +262,15 @@ impl LocalizationConfig {
         }
     }
 
-    /// Initial distribution of the particles: `initialization`, else around the known start for
-    /// `pose_tracking`, else along the road.
+    /// Initial distribution of the particles: `initialization`, else around a known start, else along the
+    /// road where `pose_tracking` is false, else anywhere.
     pub fn initialization(&self) -> Initialization {
-        self.initialization.unwrap_or(if self.pose_tracking {
-            Initialization::Tracking
-        } else {
-            Initialization::Corridor
-        })
-    }
-}
-
-impl RenderedRangeImage {
-    /// The sensor model.
-    pub fn model(&self) -> LidarModel {
-        LidarModel {
-            height: self.height,
-            width: self.width,
-            fov_up: self.fov_up,
-            fov_down: self.fov_down,
-            max_range: self.max_range,
-            min_range: self.min_range,
-            elevations: self.elevations.clone(),
-        }
-    }
-
-    /// Number of particles that are rendered at once.
-    pub fn batch_size(&self) -> usize {
-        if self.render_instanced {
-            self.max_instance
-        } else {
-            1
-        }
+        let by_start = match (self.pose_tracking, self.initial_pose) {
+            (Some(true), _) | (None, Some(_)) => Initialization::Tracking,
+            (Some(false), _) => Initialization::Corridor,
+            (None, None) => Initialization::Extent,
+        };
+        self.initialization.unwrap_or(by_start)
     }
 }
 
@@ -347,11 +280,13 @@ impl Validate for LocalizationConfig {
         path("map_file", &self.map_file)?;
         optional_path("map_pose_file", self.map_pose_file.as_deref())?;
         optional_path("map_calib_file", self.map_calib_file.as_deref())?;
-        path("pose_file", &self.pose_file)?;
+        optional_path("pose_file", self.pose_file.as_deref())?;
         optional_path("calib_file", self.calib_file.as_deref())?;
+        mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
         path("result_path", &self.result_path)?;
         self.selection().validate()?;
-        self.odometry.validate(self.odometry_file.as_deref())?;
+        (self.odometry).validate(self.odometry_file.as_deref(), self.pose_file.as_deref())?;
+        self.validate_start()?;
         in_range("grid_res", self.grid_res, PanoramaConfig::CELLS_M)?;
         not_negative("yaw_sigma", self.yaw_sigma)?;
         nested("start", &self.start)?;
@@ -361,9 +296,29 @@ impl Validate for LocalizationConfig {
     }
 }
 
-impl Validate for RenderedRangeImage {
-    fn validate(&self) -> Result<(), InvalidValue> {
-        in_range("max_instance", self.max_instance, 1..=1_000_000)?;
-        self.model().validate()
+impl LocalizationConfig {
+    fn validate_start(&self) -> Result<(), InvalidValue> {
+        let has_start = self.initial_pose.is_some() || self.pose_file.is_some();
+        let (key, value) = match self.initialization {
+            Some(_) => ("initialization", "tracking"),
+            None => ("pose_tracking", "True"),
+        };
+        require(
+            has_start || self.initialization() != Initialization::Tracking,
+            key,
+            value,
+            "a known start needs initial_pose (--start X,Y,HEADING_DEG), or pose_file with the true poses",
+        )?;
+        let Some([x, y, heading_deg]) = self.initial_pose else {
+            return Ok(());
+        };
+        let is_possible =
+            x.abs().max(y.abs()) <= FARTHEST_M && heading_deg.abs() <= 360.0;
+        require(
+            is_possible,
+            "initial_pose",
+            format!("[{x}, {y}, {heading_deg}]"),
+            "give x and y in the map in metres, and the heading from -360 to 360 degrees",
+        )
     }
 }

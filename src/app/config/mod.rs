@@ -18,6 +18,7 @@ mod refinement;
 // What they share.
 mod check;
 mod odometry;
+mod recording;
 // From text to configuration and back.
 mod error;
 mod load;
@@ -33,8 +34,9 @@ pub use error::ConfigError;
 pub use evaluation::EvaluationConfig;
 pub use ground::GroundCommandConfig;
 pub use load::{has_key, load, with_settings};
-pub use localization::{Initialization, LocalizationConfig, MotionModel, RenderedRangeImage};
+pub use localization::{Initialization, LocalizationConfig, MotionModel};
 pub use odometry::OdometrySource;
+pub use recording::{MotionCompensation, RangeImageConfig, body_from_lidar};
 pub use refinement::RefinementConfig;
 pub use template::CommandConfig;
 pub use yaml::to_yaml;

@@ -7,10 +7,11 @@ use serde::{Deserialize, Serialize};
 use super::check::{optional_path, path};
 use super::localization::LocalizationConfig;
 use super::odometry::OdometrySource;
+use super::recording::{MotionCompensation, RangeImageConfig, mounting};
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
-use crate::lidar::{LidarModel, RotationDirection};
 use crate::localization::SensorConfig;
 use crate::localization::observation::ObservationConfig;
+use crate::map::scan_cloud::ScanConfig;
 use crate::refinement::{self, RefinerConfig};
 use crate::validation::{InvalidValue, Validate, nested};
 
@@ -18,19 +19,23 @@ use crate::validation::{InvalidValue, Validate, nested};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct RefinementConfig {
-    /// Folder of the scans, `.bin`, `.pcd`, `.ply` or `.npy`.
+    /// The recording: its folder, the folder of its scans, or a bag.
     pub scan_folder: PathBuf,
+    /// Topic of the point clouds in a bag with several.
+    pub topic: Option<String>,
     /// Map of `build-map` or range-mcl.
     pub map_file: PathBuf,
     /// Camera poses of the mapping drive; `None`: the map carries its own frame.
     pub map_pose_file: Option<PathBuf>,
     /// Calibration of the mapping drive; `None`: the map carries its own frame.
     pub map_calib_file: Option<PathBuf>,
-    /// Poses of the recording, rows of KITTI or TUM.
-    pub pose_file: PathBuf,
-    /// Calibration of the recording, with its line `Tr`.
-    /// `None`: the poses are those of the lidar.
+    /// True poses of the recording for the report, rows of KITTI or TUM, a folder `oxts`, or a topic of a bag.
+    pub pose_file: Option<PathBuf>,
+    /// Calibration of the recording, with its line `Tr`; `None`: its poses are those of the lidar.
     pub calib_file: Option<PathBuf>,
+    /// Pose x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose poses are given; `None`: they are
+    /// those of the lidar.
+    pub body_from_lidar: Option<[f64; 6]>,
     /// Result of `localize`, to which the refined poses are added.
     pub result_file: PathBuf,
     /// Whether to draw the final plots.
@@ -46,9 +51,9 @@ pub struct RefinementConfig {
     /// Odometry poses in KITTI or TUM format, for `odometry: file`.
     pub odometry_file: Option<PathBuf>,
     /// Size and limits of the range images.
-    pub range_image: LidarModel,
-    /// Box of the own car in the lidar frame: x_min, x_max, y_min, y_max [m].
-    pub own_car_m: [f32; 4],
+    pub range_image: RangeImageConfig,
+    /// Box of the own car in the lidar frame: x_min, x_max, y_min, y_max [m]; `None`: inferred.
+    pub own_car_m: Option<[f32; 4]>,
     /// Height of the sensor above the road [m]; `None`: estimated from the scans.
     pub sensor_height_m: Option<f64>,
     /// Method of ground segmentation of the scans.
@@ -67,9 +72,9 @@ pub struct RefinementConfig {
     pub observation: ObservationConfig,
     /// Swarm, Gauss-Newton and smoothing.
     pub refinement: refinement::RefinementConfig,
-    /// Direction of rotation of the sensor for motion compensation; `None` for scans that are
-    /// compensated already, such as those of KITTI odometry.
-    pub motion_compensation: Option<RotationDirection>,
+    /// Times of the points for motion compensation; `None` for scans that are compensated already, such as
+    /// those of KITTI odometry.
+    pub motion_compensation: Option<MotionCompensation>,
     /// Seed of all random choices.
     pub seed: u64,
     /// Whether to replace existing refined poses.
@@ -81,8 +86,10 @@ impl RefinementConfig {
     /// classifier and observation model.
     pub fn of(localization: LocalizationConfig) -> Self {
         Self {
-            range_image: localization.range_image.model(),
+            range_image: localization.range_image,
             scan_folder: localization.scan_folder,
+            topic: localization.topic,
+            body_from_lidar: localization.body_from_lidar,
             map_file: localization.map_file,
             map_pose_file: localization.map_pose_file,
             map_calib_file: localization.map_calib_file,
@@ -129,8 +136,8 @@ impl RefinementConfig {
     pub fn refiner(&self) -> RefinerConfig {
         RefinerConfig {
             sensor: SensorConfig {
-                lidar: self.range_image.clone(),
-                own_car_m: self.own_car_m,
+                lidar: self.range_image.model(),
+                own_car_m: self.own_car_m.unwrap_or(ScanConfig::default().own_car_m),
                 ground: self.ground(),
                 height_m: self.sensor_height_m,
             },
@@ -153,11 +160,12 @@ impl Validate for RefinementConfig {
         path("map_file", &self.map_file)?;
         optional_path("map_pose_file", self.map_pose_file.as_deref())?;
         optional_path("map_calib_file", self.map_calib_file.as_deref())?;
-        path("pose_file", &self.pose_file)?;
+        optional_path("pose_file", self.pose_file.as_deref())?;
         optional_path("calib_file", self.calib_file.as_deref())?;
+        mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
         path("result_file", &self.result_file)?;
         self.selection().validate()?;
-        self.odometry.validate(self.odometry_file.as_deref())?;
+        (self.odometry).validate(self.odometry_file.as_deref(), self.pose_file.as_deref())?;
         nested("range_image", &self.range_image)?;
         self.refiner().validate()
     }

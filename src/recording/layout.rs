@@ -1,0 +1,87 @@
+//! Layouts of recordings, recognized by their files.
+
+use std::path::{Path, PathBuf};
+
+/// How a recording is stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Layout {
+    /// `velodyne/`, `times.txt`, `poses.txt` and `calib.txt` of the KITTI odometry benchmark.
+    KittiOdometry,
+    /// `velodyne_points/data`, `velodyne_points/timestamps.txt` and `oxts/` of KITTI's raw data.
+    KittiRaw,
+    /// Scan files in a folder.
+    Folder,
+}
+
+impl Layout {
+    /// Name for reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::KittiOdometry => "KITTI odometry",
+            Self::KittiRaw => "KITTI raw",
+            Self::Folder => "folder of scans",
+        }
+    }
+}
+
+/// The files of a recording in a folder.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RecordingFiles {
+    /// How they are stored.
+    pub layout: Layout,
+    /// Folder of the scans.
+    pub scans: PathBuf,
+    /// Times of the scans, one row per scan.
+    pub times: Option<PathBuf>,
+    /// Poses of the recording: a file, or KITTI's folder `oxts`.
+    pub poses: Option<PathBuf>,
+    /// Calibration of the recording.
+    pub calibration: Option<PathBuf>,
+}
+
+impl RecordingFiles {
+    /// Finds the files of a recording: of its folder, or of the folder of its scans.
+    pub fn find(folder: &Path) -> Self {
+        let existing = |base: &Path, names: &[&str]| {
+            let paths = names.iter().map(|name| base.join(name));
+            paths.into_iter().find(|path| path.exists())
+        };
+        // `velodyne` and `velodyne_points/data` themselves are recordings, too.
+        let is_inner = |name: &str| folder.ends_with(name);
+        let base = if is_inner("velodyne_points/data") {
+            folder.ancestors().nth(2).unwrap_or(folder)
+        } else if is_inner("velodyne") || is_inner("lidar") {
+            folder.parent().unwrap_or(folder)
+        } else {
+            folder
+        };
+        let poses = || existing(base, &["poses.txt", "poses_tum.txt", "poses.tum"]);
+        let calibration = existing(base, &["calib.txt"]);
+        let times = existing(base, &["times.txt"]);
+        if base.join("velodyne_points/data").is_dir() {
+            return Self {
+                layout: Layout::KittiRaw,
+                scans: base.join("velodyne_points/data"),
+                times: existing(base, &["velodyne_points/timestamps.txt"]),
+                poses: existing(base, &["oxts"]).or_else(poses),
+                calibration,
+            };
+        }
+        if base.join("velodyne").is_dir() {
+            return Self {
+                layout: Layout::KittiOdometry,
+                scans: base.join("velodyne"),
+                times,
+                poses: poses(),
+                calibration,
+            };
+        }
+        Self {
+            layout: Layout::Folder,
+            scans: folder.to_owned(),
+            times,
+            poses: poses(),
+            calibration,
+        }
+    }
+}

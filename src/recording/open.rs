@@ -1,0 +1,295 @@
+//! A recording: its selected scans with their times.
+
+use std::path::{Path, PathBuf};
+
+use super::calibration::Calibration;
+use super::error::RecordingError;
+use super::frame::Frame;
+use super::layout::{Layout, RecordingFiles};
+use super::oxts::read_timestamps;
+use super::poses::{ascending, read_times};
+use super::scan_list::{self, Selection};
+use super::track::PoseTrack;
+use crate::geometry::Pose3;
+use crate::lidar::{Rotation, Scan};
+
+/// Revolutions per second of the sensor, for recordings without times.
+const SCANS_PER_SECOND: f64 = 10.0;
+
+/// A recording with its selected frames.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Recording {
+    /// The folder that was opened.
+    pub path: PathBuf,
+    /// Its files.
+    pub files: RecordingFiles,
+    /// Number of all scans.
+    pub scans: usize,
+    /// Whether the times were recorded; otherwise ten scans per second are assumed.
+    pub has_times: bool,
+    /// The selected frames, ascending.
+    pub frames: Vec<Frame>,
+    /// The given poses, of which the frames have theirs.
+    pub track: Option<PoseTrack>,
+}
+
+impl Recording {
+    /// Opens a recording without reading its scans.
+    ///
+    /// `path` is the folder of a recording in one of the layouts of [`Layout`], or the folder of its scans.
+    /// Times are those in the names of the scans, else those of `times.txt` (`timestamps.txt` of KITTI raw); they
+    /// must ascend.
+    pub fn open(path: &Path, selection: &Selection) -> Result<Self, RecordingError> {
+        let files = RecordingFiles::find(path);
+        let scans = scan_list::scan_files(&files.scans)?;
+        let recorded_s = recorded_times(&files)?;
+        let has_times = recorded_s.is_some() || scans[0].time_s.is_some();
+        let count = scans.len();
+        let scans = selection.of(scans, |scan| scan.number, path)?;
+        let mut frames = Vec::with_capacity(scans.len());
+        for scan in scans {
+            let row = || match &recorded_s {
+                Some(times_s) => times_s.get(scan.number).copied(),
+                None => Some(scan.number as f64 / SCANS_PER_SECOND),
+            };
+            let Some(time_s) = scan.time_s.or_else(row) else {
+                return Err(RecordingError::ScanWithoutTime {
+                    scan: scan.path,
+                    times: recorded_s.map_or(0, |times_s| times_s.len()),
+                });
+            };
+            frames.push(Frame {
+                number: scan.number,
+                scan_path: scan.path,
+                time_s,
+                map_from_lidar: None,
+                rotation: None,
+                motion: None,
+            });
+        }
+        Ok(Self {
+            path: path.to_owned(),
+            files,
+            scans: count,
+            has_times,
+            frames,
+            track: None,
+        })
+    }
+
+    /// Opens a recording in the layout of KITTI odometry with its poses and calibration.
+    pub fn open_with_poses(folder: &Path) -> Result<Self, RecordingError> {
+        let recording = Self::open(folder, &Selection::default())?;
+        let track = recording.own_track()?;
+        recording.with_poses(track)
+    }
+
+    /// The poses that belong to the recording by their names and places.
+    pub fn own_track(&self) -> Result<PoseTrack, RecordingError> {
+        let Some(path) = &self.files.poses else {
+            return Err(RecordingError::NoPoseFile {
+                path: self.path.clone(),
+            });
+        };
+        PoseTrack::read(path, self.files.calibration.as_deref())
+    }
+
+    /// The same recording, whose frames have poses; see [`PoseTrack::matched`].
+    pub fn with_poses(mut self, track: PoseTrack) -> Result<Self, RecordingError> {
+        if !self.has_times
+            && let Some(times_s) = &track.times_s
+        {
+            for frame in &mut self.frames {
+                frame.time_s = times_s.get(frame.number).copied().unwrap_or(frame.time_s);
+            }
+        }
+        let poses = track.matched(&self.frames, self.has_times)?;
+        for (frame, pose) in self.frames.iter_mut().zip(poses) {
+            frame.map_from_lidar = pose;
+        }
+        self.frames.retain(|frame| frame.map_from_lidar.is_some());
+        self.track = Some(track);
+        Ok(self)
+    }
+
+    /// Reads the scans, one after the other, with their poses `map_from_lidar`.
+    pub fn scans(&self) -> impl Iterator<Item = Result<(Scan, Pose3), RecordingError>> {
+        let read = |frame: &Frame| Ok((frame.read()?, frame.map_from_lidar.unwrap_or_default()));
+        self.frames.iter().map(read)
+    }
+
+    /// The same recording, whose points have times from the rotation of the sensor where the data have none.
+    #[must_use]
+    pub fn rotating(mut self, rotation: Option<Rotation>) -> Self {
+        for frame in &mut self.frames {
+            frame.rotation = rotation;
+        }
+        self
+    }
+
+    /// The same recording, whose scans are deskewed by its poses.
+    #[must_use]
+    pub fn compensated_by_poses(mut self) -> Self {
+        if let Some(track) = &self.track {
+            for frame in &mut self.frames {
+                frame.motion = track.motion_at(frame, self.has_times);
+            }
+        }
+        self
+    }
+
+    /// The frame of the poses in the world of their file, and the calibration; identities without poses.
+    pub fn world(&self) -> (Pose3, Calibration) {
+        let track = self.track.as_ref();
+        (
+            track.map_or_else(Pose3::identity, |track| track.world_from_map),
+            track.map_or_else(Calibration::identity, |track| track.calibration),
+        )
+    }
+}
+
+/// The times in the files of a recording, which ascend [s].
+fn recorded_times(files: &RecordingFiles) -> Result<Option<Vec<f64>>, RecordingError> {
+    let Some(path) = &files.times else {
+        return Ok(None);
+    };
+    let times_s = match files.layout {
+        Layout::KittiRaw => read_timestamps(path)?,
+        _ => read_times(path)?,
+    };
+    ascending(path, times_s).map(Some)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+    use crate::recording::scan_list::scan_paths;
+
+    fn recording(scans: &[&str], poses: usize) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        let velodyne = folder.path().join("velodyne");
+        fs::create_dir(&velodyne).unwrap();
+        for name in scans {
+            fs::write(velodyne.join(name), []).unwrap();
+        }
+        let row = "1 0 0 0 0 1 0 0 0 0 1 0\n";
+        fs::write(folder.path().join("poses.txt"), row.repeat(poses)).unwrap();
+        fs::write(folder.path().join("calib.txt"), format!("Tr: {row}")).unwrap();
+        folder
+    }
+
+    fn open(folder: &Path, selection: &Selection) -> Result<Recording, RecordingError> {
+        let recording = Recording::open(folder, selection)?;
+        let track = recording.own_track()?;
+        recording.with_poses(track)
+    }
+
+    fn numbers(recording: &Recording) -> Vec<usize> {
+        recording.frames.iter().map(|frame| frame.number).collect()
+    }
+
+    #[test]
+    fn even_and_odd_frames_partition_the_recording() {
+        let names: Vec<String> = (0..9).map(|i| format!("{i:06}.bin")).collect();
+        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+        let folder = recording(&names, 9);
+        let step = |start_idx| Selection {
+            start_idx,
+            frame_step: 2,
+            ..Selection::default()
+        };
+        let even = open(folder.path(), &step(0)).unwrap();
+        let odd = open(folder.path(), &step(1)).unwrap();
+        assert_eq!(numbers(&even), [0, 2, 4, 6, 8]);
+        assert_eq!(numbers(&odd), [1, 3, 5, 7]);
+    }
+
+    #[test]
+    fn scans_with_numbers_as_names_keep_their_poses() {
+        let folder = recording(&["000005.bin", "000007.bin"], 10);
+        let recording = open(folder.path(), &Selection::default()).unwrap();
+        assert_eq!(numbers(&recording), [5, 7]);
+        assert_eq!(recording.frames[0].time_s, 0.5);
+    }
+
+    #[test]
+    fn scans_without_numbers_as_names_are_numbered_by_position() {
+        let folder = recording(&["a.bin", "b.bin"], 2);
+        assert_eq!(
+            numbers(&open(folder.path(), &Selection::default()).unwrap()),
+            [0, 1]
+        );
+    }
+
+    #[test]
+    fn numbers_are_sorted_as_numbers() {
+        let folder = recording(&["10.bin", "2.bin", "1.bin"], 11);
+        let recording = open(folder.path(), &Selection::default()).unwrap();
+        assert_eq!(numbers(&recording), [1, 2, 10]);
+    }
+
+    #[test]
+    fn hidden_files_are_ignored_and_names_that_are_partly_numbers_are_an_error() {
+        let names = ["000000.bin", "000001.bin", "._000000.bin"];
+        let folder = recording(&names, 2);
+        let recording = open(folder.path(), &Selection::default()).unwrap();
+        assert_eq!(numbers(&recording), [0, 1]);
+        let copy = folder.path().join("velodyne/000000 (copy).bin");
+        fs::write(&copy, []).unwrap();
+        let result = open(folder.path(), &Selection::default());
+        let message = result.unwrap_err().to_string();
+        assert!(message.contains("000000 (copy).bin"), "{message}");
+        fs::rename(copy, folder.path().join("velodyne/0.bin")).unwrap();
+        let result = open(folder.path(), &Selection::default());
+        assert!(matches!(result, Err(RecordingError::SameNumber { .. })));
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_loop_of_links_does_not_multiply_the_recording() {
+        let folder = recording(&["a.bin", "b.bin"], 2);
+        let velodyne = folder.path().join("velodyne");
+        std::os::unix::fs::symlink(&velodyne, velodyne.join("loop")).unwrap();
+        assert_eq!(scan_paths(&velodyne).unwrap().len(), 2);
+    }
+
+    #[test]
+    fn times_that_do_not_ascend_are_an_error() {
+        let folder = recording(&["000000.bin"], 3);
+        for times in ["0\n0.1\n0.1\n", "0\n0.2\n0.1\n"] {
+            fs::write(folder.path().join("times.txt"), times).unwrap();
+            let result = open(folder.path(), &Selection::default());
+            let message = result.unwrap_err().to_string();
+            assert!(message.contains("frame 2"), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_selected_scan_without_a_pose_is_an_error() {
+        let folder = recording(&["000000.bin", "000001.bin"], 1);
+        let message = open(folder.path(), &Selection::default())
+            .unwrap_err()
+            .to_string();
+        assert!(message.contains("000001.bin has no pose"), "{message}");
+        let first = Selection {
+            n_scans: 1,
+            ..Selection::default()
+        };
+        assert_eq!(numbers(&open(folder.path(), &first).unwrap()), [0]);
+    }
+
+    #[test]
+    fn times_are_read_and_their_number_is_checked() {
+        let folder = recording(&["000000.bin", "000001.bin"], 2);
+        fs::write(folder.path().join("times.txt"), "0.0\n0.104\n").unwrap();
+        let recording = open(folder.path(), &Selection::default()).unwrap();
+        assert_eq!(recording.frames[1].time_s, 0.104);
+        fs::write(folder.path().join("times.txt"), "0.0\n").unwrap();
+        let message = open(folder.path(), &Selection::default())
+            .unwrap_err()
+            .to_string();
+        assert!(message.contains("1 times for 2 poses"), "{message}");
+    }
+}

@@ -1,0 +1,201 @@
+//! Poses of a recording, and how they meet its scans.
+//!
+//! Poses and scans are matched by time where both have one: a pose is interpolated between the rows before
+//! and after it. Otherwise the number of a scan is the row of its pose, from 0.
+
+use std::path::{Path, PathBuf};
+
+use super::calibration::Calibration;
+use super::error::RecordingError;
+use super::frame::Frame;
+use super::oxts;
+use super::poses::{CameraPoses, ascending, read_rows_of_poses, read_times};
+use crate::geometry::Pose3;
+use crate::lidar::{Motion, interpolate_motion};
+
+/// Longest time between two rows across which poses are interpolated [s].
+const MAX_GAP_S: f64 = 2.0;
+
+/// Poses of the sensor along a drive, at least one.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PoseTrack {
+    /// The file.
+    pub path: PathBuf,
+    /// Poses of the lidar, in the frame of the first row unless moved by [`in_map`](Self::in_map).
+    pub map_from_lidar: Vec<Pose3>,
+    /// Their times, which ascend [s]; `None` if the file has none.
+    pub times_s: Option<Vec<f64>>,
+    /// Calibration: of the camera or another body whose poses the file has.
+    pub calibration: Calibration,
+    /// Frame of the poses in the world of the file.
+    pub world_from_map: Pose3,
+}
+
+impl PoseTrack {
+    /// Reads rows of KITTI (12 numbers: poses of the camera if there is a calibration, else of the lidar), rows of
+    /// TUM (8 numbers: poses of the lidar), or a folder `oxts` of KITTI raw. Times are those of the rows, or
+    /// of `times.txt` beside the file.
+    pub fn read(path: &Path, calib_file: Option<&Path>) -> Result<Self, RecordingError> {
+        if path.is_dir() {
+            let (world_from_imu, calibration) = oxts::read(path)?;
+            let camera = CameraPoses {
+                world_from_cam0: world_from_imu,
+            };
+            return Self::of(path, camera, calibration, None);
+        }
+        let (camera, times_s) = read_rows_of_poses(path)?;
+        let calibration = match (calib_file, &times_s) {
+            (Some(calib_file), None) => Calibration::read(calib_file)?,
+            _ => Calibration::identity(),
+        };
+        Self::of(path, camera, calibration, times_s)
+    }
+
+    /// Reads poses of a body on which the lidar is mounted, rows of KITTI or TUM.
+    pub fn read_of_body(path: &Path, body_from_lidar: Pose3) -> Result<Self, RecordingError> {
+        let (body, times_s) = read_rows_of_poses(path)?;
+        let calibration = Calibration {
+            cam0_from_lidar: body_from_lidar,
+        };
+        Self::of(path, body, calibration, times_s)
+    }
+
+    fn of(
+        path: &Path,
+        camera: CameraPoses,
+        calibration: Calibration,
+        times_s: Option<Vec<f64>>,
+    ) -> Result<Self, RecordingError> {
+        let map_from_lidar = camera.map_from_lidar(&calibration);
+        let beside = path.with_file_name("times.txt");
+        let (times_path, times_s) = match times_s {
+            Some(times_s) => (path.to_owned(), Some(times_s)),
+            None if beside.exists() => (beside.clone(), Some(read_times(&beside)?)),
+            None => (path.to_owned(), None),
+        };
+        if let Some(times_s) = &times_s
+            && times_s.len() != map_from_lidar.len()
+        {
+            return Err(RecordingError::WrongTimes {
+                path: times_path,
+                times: times_s.len(),
+                poses: map_from_lidar.len(),
+            });
+        }
+        Ok(Self {
+            times_s: times_s.map(|t| ascending(&times_path, t)).transpose()?,
+            world_from_map: camera.frame(&calibration).world_from_map(),
+            calibration,
+            path: path.to_owned(),
+            map_from_lidar,
+        })
+    }
+
+    /// Transforms all poses into the frame of a map in the same world.
+    #[must_use]
+    pub fn in_map(mut self, world_from_map: &Pose3) -> Self {
+        let map_from_track = world_from_map.inverse() * self.world_from_map;
+        for pose in &mut self.map_from_lidar {
+            *pose = map_from_track * *pose;
+        }
+        self.world_from_map = *world_from_map;
+        self
+    }
+
+    /// The poses of frames. Frames after the last row or before the first are without one, with a
+    /// warning; an error if these are more than one and a hundredth of the frames.
+    pub fn matched(
+        &self,
+        frames: &[Frame],
+        have_times: bool,
+    ) -> Result<Vec<Option<Pose3>>, RecordingError> {
+        let poses: Vec<_> = (frames.iter())
+            .map(|frame| Some(self.at(frame, have_times)?.0))
+            .collect();
+        let missing = || frames.iter().zip(&poses).filter(|(_, pose)| pose.is_none());
+        let count = missing().count();
+        if let Some((first, _)) = missing().next() {
+            if count > 1 + frames.len() / 100 || count == frames.len() {
+                return Err(self.mismatch(frames, have_times, first, count));
+            }
+            let numbers: Vec<String> = missing().map(|(frame, _)| frame.number.to_string()).collect();
+            tracing::warn!(
+                "{} has no pose for these frames, which are left out: {}",
+                self.path.display(),
+                numbers.join(", ")
+            );
+        }
+        Ok(poses)
+    }
+
+    fn mismatch(
+        &self,
+        frames: &[Frame],
+        have_times: bool,
+        first: &Frame,
+        missing: usize,
+    ) -> RecordingError {
+        match &self.times_s {
+            Some(times_s) if have_times => RecordingError::TimesDoNotMatch {
+                pose_file: self.path.clone(),
+                poses: times_s.len(),
+                first_pose_s: times_s[0],
+                last_pose_s: times_s[times_s.len() - 1],
+                scans: frames.len(),
+                first_scan_s: frames[0].time_s,
+                last_scan_s: frames[frames.len() - 1].time_s,
+                missing,
+            },
+            _ => RecordingError::ScanWithoutPose {
+                scan: first.scan_path.clone(),
+                pose_file: self.path.clone(),
+                poses: self.map_from_lidar.len(),
+            },
+        }
+    }
+
+    /// Motion of the sensor around a frame; `None` if the frame has no pose, or the track only one.
+    pub fn motion_at(&self, frame: &Frame, have_times: bool) -> Option<Motion> {
+        self.at(frame, have_times)?.1
+    }
+
+    /// Pose of a frame and the motion around it.
+    fn at(&self, frame: &Frame, have_times: bool) -> Option<(Pose3, Option<Motion>)> {
+        let poses = &self.map_from_lidar;
+        let Some(times_s) = self.times_s.as_ref().filter(|_| have_times) else {
+            let pose = *poses.get(frame.number)?;
+            let seconds: Vec<f64>;
+            let times_s = match &self.times_s {
+                Some(times_s) => times_s,
+                None => {
+                    seconds = (0..poses.len()).map(|row| 0.1 * row as f64).collect();
+                    &seconds
+                }
+            };
+            return Some((pose, Motion::along(poses, times_s, frame.number)));
+        };
+        /// Differences of clocks and rounded times [s].
+        const SAME_S: f64 = 1e-4;
+        let after = times_s.partition_point(|&time_s| time_s <= frame.time_s);
+        let nearest = |row: usize| (times_s[row] - frame.time_s).abs() <= SAME_S;
+        for row in [after.saturating_sub(1), after.min(poses.len() - 1)] {
+            if nearest(row) {
+                return Some((poses[row], Motion::along(poses, times_s, row)));
+            }
+        }
+        // The interval around the time, or the first or last, which is continued by its own length.
+        let after = after.clamp(1, poses.len().checked_sub(1).filter(|&last| last > 0)?);
+        let interval = Motion {
+            previous_from_current: poses[after - 1].inverse() * poses[after],
+            duration_s: times_s[after] - times_s[after - 1],
+        };
+        let since_s = frame.time_s - times_s[after - 1];
+        let is_near = (-interval.duration_s..=2.0 * interval.duration_s).contains(&since_s);
+        if !is_near || interval.duration_s > MAX_GAP_S {
+            return None;
+        }
+        let share = since_s / interval.duration_s;
+        let moved = interpolate_motion(&interval.previous_from_current, share);
+        Some((poses[after - 1] * moved, Some(interval)))
+    }
+}
