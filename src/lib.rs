@@ -68,7 +68,7 @@
 //! | foundations | [`files`], [`geometry`], [`memory`], [`random`], [`validation`] |
 //! | sensor and rays | [`lidar`], [`raycasting`] |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
-//! | map | [`map`], [`registration`], [`simulation`] |
+//! | map | [`map`], [`odometry`], [`registration`], [`simulation`] |
 //! | poses | [`evaluation`], [`localization`] |
 //! | trajectories | [`refinement`] |
 //! | program, feature `cli` | `app` |
@@ -96,6 +96,7 @@ pub mod recording;
 pub mod rendering;
 // Map.
 pub mod map;
+pub mod odometry;
 pub mod registration;
 pub mod simulation;
 // Poses.
