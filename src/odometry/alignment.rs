@@ -121,28 +121,47 @@ impl Problem<'_> {
         const KERNEL_SIGMAS: f64 = 3.0;
         /// Lever of rotations, in kernels.
         const TOLERANCE: f64 = 0.01;
+        const MAX_KERNEL: f64 = 10.0;
+        const SCORE_KERNEL: f64 = 2.0;
         let lever_m = self.lever();
         let mut pose = *initial;
         let mut kernel_m = kernel_m.max(self.min_kernel_m);
         let mut matches = vec![Match::default(); self.points.len()];
-        let mut result = None;
+        let mut result: Option<Alignment> = None;
         for _ in 0..self.iterations {
             let mut equations = self.linearize(&pose, kernel_m, &mut matches);
             let (step, alignment) = self.solve(&equations, &pose)?;
             pose *= exponential(&step);
-            result = Some(Alignment {
-                odom_from_lidar: pose,
-                ..alignment
-            });
+            result = Some(alignment);
             let scale_m = 1.48 * median(&mut equations.distances)?;
-            let target_m = (KERNEL_SIGMAS * scale_m).max(self.min_kernel_m);
+            let target_m =
+                (KERNEL_SIGMAS * scale_m).clamp(self.min_kernel_m, MAX_KERNEL * self.min_kernel_m);
             let shift_m = step.fixed_rows::<3>(0).norm() + lever_m * step.fixed_rows::<3>(3).norm();
             if kernel_m <= 1.1 * target_m && shift_m < TOLERANCE * self.min_kernel_m {
                 break;
             }
             kernel_m = (SHRINK * kernel_m).max(target_m).min(kernel_m);
         }
-        result
+        let cost = self.cost(&pose, SCORE_KERNEL * self.min_kernel_m, &mut matches);
+        Some(Alignment {
+            odom_from_lidar: pose,
+            cost,
+            ..result?
+        })
+    }
+
+    /// Mean robust cost of all points, 0 to 1.
+    fn cost(&self, pose: &Pose3, kernel_m: f64, matches: &mut [Match]) -> f64 {
+        self.linearize(pose, kernel_m, matches).cost / self.points.len().max(1) as f64
+    }
+
+    /// The mean robust cost at a pose.
+    pub fn cost_at(&self, pose: &Pose3, kernel_m: f64) -> f64 {
+        self.cost(
+            pose,
+            kernel_m,
+            &mut vec![Match::default(); self.points.len()],
+        )
     }
 
     /// Root mean square of the ranges: what a rotation moves a point by [m].
@@ -303,7 +322,7 @@ impl Problem<'_> {
             information: information / (share * planar.weight + other_share * other.weight),
             residual_m: variance.sqrt(),
             matched_share: count as f64 / self.points.len() as f64,
-            cost: equations.cost / self.points.len() as f64,
+            cost: 1.0,
         };
         (step.iter().all(|value| value.is_finite())).then_some((step, alignment))
     }

@@ -61,6 +61,7 @@ pub struct OdometryEstimate {
     pub residual_m: Option<f64>,
     /// Share of the points that match the local map.
     pub matched_share: f64,
+    pub cost: f64,
     /// Time of computation.
     pub elapsed: Duration,
 }
@@ -86,6 +87,8 @@ struct Last {
     first_points: Option<Vec<TimedPoint>>,
     /// Mean squared deviation from the predictions (m², rad²).
     deviation: [f64; 2],
+    /// Mean cost of the registered scans.
+    cost: f64,
 }
 
 impl Odometer {
@@ -138,6 +141,7 @@ impl Odometer {
                 time_s: scan.time_s,
                 first_points: None,
                 deviation: [0.0; 2],
+                cost: 1.0,
             };
             last.map.insert(&mapped(&points, &odom_from_lidar, None));
             last.first_points = Some(points);
@@ -152,6 +156,7 @@ impl Odometer {
             degenerate_directions: Vec::new(),
             residual_m: None,
             matched_share: 0.0,
+            cost: 1.0,
             elapsed: Duration::ZERO,
         }
     }
@@ -179,10 +184,7 @@ impl Odometer {
         };
         let lever_m = problem.lever();
         let found = match last.motion {
-            Some(_) => {
-                let kernel_m = self.kernel(last);
-                problem.align(&predicted, kernel_m)
-            }
+            Some(_) => self.track(last, &problem),
             None => self.first_motion(last, &problem),
         };
         let found = found.filter(|found| self.is_possible(last, found, &predicted, duration_s));
@@ -197,6 +199,7 @@ impl Odometer {
                 degenerate_directions: (0..6).map(|axis| unit(axis)).collect(),
                 residual_m: None,
                 matched_share: 0.0,
+                cost: 1.0,
                 elapsed: Duration::ZERO,
             };
         };
@@ -208,6 +211,10 @@ impl Odometer {
         if last.motion.is_some() {
             last.remember_deviation(&(predicted.inverse() * found.odom_from_lidar));
         }
+        last.cost = match last.motion {
+            Some(_) => 0.8 * last.cost + 0.2 * found.cost,
+            None => found.cost,
+        };
         if let Some(first) = last.first_points.take() {
             last.map = self.empty_map(last.range_m);
             last.map.insert(&mapped(&first, &previous, Some(&motion)));
@@ -229,8 +236,25 @@ impl Odometer {
             degenerate_directions: degenerate(&found, lever_m),
             residual_m: Some(found.residual_m),
             matched_share: found.matched_share,
+            cost: found.cost,
             elapsed: Duration::ZERO,
         }
+    }
+
+    /// Registers a scan from the prediction; if the result is worse than usual, from several starts.
+    fn track(&self, last: &Last, problem: &Problem) -> Option<Alignment> {
+        /// Increase of the cost that starts a search.
+        const WORSE: f64 = 0.1;
+        let found = problem.align(&problem.predicted, self.kernel(last));
+        if found
+            .as_ref()
+            .is_some_and(|found| found.cost < last.cost + WORSE)
+        {
+            return found;
+        }
+        let voxel_m = self.voxel_m(last.range_m);
+        let searched = search(problem, 4.0 * voxel_m, 8.0 * voxel_m);
+        (found.into_iter().chain(searched)).min_by(|a, b| a.cost.total_cmp(&b.cost))
     }
 
     /// The motion from the first scan to the second, without a prediction. The first scan is compensated by it, and the
@@ -307,7 +331,8 @@ impl Odometer {
         duration_s: f64,
     ) -> bool {
         let config = &self.config;
-        if found.matched_share < config.min_matched_share {
+        const LOST: f64 = 0.85;
+        if found.cost > LOST || found.matched_share < config.min_matched_share {
             return false;
         }
         let periods = (duration_s / 0.1).max(1.0);
