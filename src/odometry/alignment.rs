@@ -20,6 +20,9 @@ use crate::lidar::Motion;
 /// Azimuth sectors, the clusters of correlated residuals in the covariance.
 const SECTORS: usize = 24;
 
+/// Neighbouring residuals are correlated: so many count as one against the prediction.
+const CORRELATED: f64 = 10.0;
+
 /// A scan to be registered.
 #[derive(Clone, Copy)]
 pub struct Problem<'a> {
@@ -150,9 +153,11 @@ impl Problem<'_> {
         })
     }
 
-    /// Mean robust cost of all points, 0 to 1.
+    /// Mean robust cost of all points, 0 to 1, and the share of the prediction in it.
     fn cost(&self, pose: &Pose3, kernel_m: f64, matches: &mut [Match]) -> f64 {
-        self.linearize(pose, kernel_m, matches).cost / self.points.len().max(1) as f64
+        let deviation = logarithm(&(self.predicted.inverse() * pose));
+        let prior = 0.5 * deviation.dot(&(self.prior_information * deviation)) * CORRELATED;
+        (self.linearize(pose, kernel_m, matches).cost + prior) / self.points.len().max(1) as f64
     }
 
     /// The mean robust cost at a pose.
@@ -293,8 +298,6 @@ impl Problem<'_> {
 
     /// The Gauss-Newton step and the accuracy of the pose.
     fn solve(&self, equations: &Equations, pose: &Pose3) -> Option<(Vector6<f64>, Alignment)> {
-        /// Neighbouring residuals are correlated: so many count as one against the prediction.
-        const CORRELATED: f64 = 10.0;
         const MIN_MATCHES: usize = 30;
         let (planar, other) = (&equations.planar, &equations.other);
         let count = planar.count + other.count;
