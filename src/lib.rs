@@ -68,7 +68,7 @@
 //! | foundations | [`files`], [`geometry`], [`memory`], [`random`], [`validation`] |
 //! | sensor and rays | [`lidar`], [`raycasting`] |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
-//! | map | [`map`], [`odometry`], [`registration`], [`simulation`] |
+//! | map | [`map`], [`odometry`], [`registration`], [`sensor`], [`simulation`] |
 //! | poses | [`evaluation`], [`localization`] |
 //! | trajectories | [`refinement`] |
 //! | program, feature `cli` | `app` |
@@ -98,6 +98,7 @@ pub mod rendering;
 pub mod map;
 pub mod odometry;
 pub mod registration;
+pub mod sensor;
 pub mod simulation;
 // Poses.
 pub mod evaluation;
