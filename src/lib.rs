@@ -69,7 +69,7 @@
 //! | foundations | [`files`], [`geometry`], [`memory`], [`random`], [`validation`] |
 //! | sensor and rays | [`lidar`], [`raycasting`] |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
-//! | map | [`map`], [`registration`], [`simulation`] |
+//! | map | [`map`], [`odometry`], [`registration`], [`sensor`], [`simulation`] |
 //! | poses | [`evaluation`], [`localization`] |
 //! | trajectories | [`refinement`] |
 //! | program, feature `cli` | `app` |
@@ -97,7 +97,9 @@ pub mod recording;
 pub mod rendering;
 // Map.
 pub mod map;
+pub mod odometry;
 pub mod registration;
+pub mod sensor;
 pub mod simulation;
 // Poses.
 pub mod evaluation;

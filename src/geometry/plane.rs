@@ -41,6 +41,16 @@ impl PlaneSums {
         }
     }
 
+    /// Sums of `count` points p: `first` Σ (p − anchor) and `second` Σ (p − anchor)(p − anchor)ᵀ.
+    pub fn from_moments(anchor: Vec3, count: f64, first: DVec3, second: DMat3) -> Self {
+        Self {
+            anchor: anchor.as_dvec3(),
+            count,
+            first,
+            second,
+        }
+    }
+
     /// Adds a point.
     #[inline]
     pub fn add(&mut self, point: Vec3) {

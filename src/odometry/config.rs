@@ -1,0 +1,67 @@
+//! Settings of the odometry.
+
+use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
+
+use crate::validation::{InvalidValue, Validate, in_range, positive};
+
+/// Settings of the odometry. Lengths are shares of the sensor's range, which 98 % of the points do not exceed.
+///
+/// Defaults: our own values.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[serde(default, deny_unknown_fields)]
+pub struct OdometryConfig {
+    /// Edge of a voxel of the local map, as a share of the range (unitless).
+    #[default(0.01)]
+    pub voxel_share: f64,
+    /// Distance between mapped points of a scan, in voxels.
+    #[default(0.5)]
+    pub map_spacing: f64,
+    /// Distance between registered points of a scan, in voxels.
+    #[default(2.0)]
+    pub registration_spacing: f64,
+    /// Radius of the local map, as a share of the range (unitless).
+    #[default(2.0)]
+    pub map_radius_share: f64,
+    /// Nearer points are dropped, such as those on the own car, as a share of the range (unitless).
+    #[default(0.05)]
+    pub min_range_share: f64,
+    /// Number of points of a voxel after which older ones are forgotten.
+    #[default(50.0)]
+    pub voxel_points: f32,
+    /// Maximum number of Gauss-Newton iterations.
+    #[default(20)]
+    pub iterations: usize,
+    /// Largest deviation of a step from the prediction, as a share of the range per 0.1 s (unitless).
+    #[default(0.04)]
+    pub max_deviation_share: f64,
+    /// Largest deviation of a turn from the prediction per 0.1 s [deg].
+    #[default(20.0)]
+    pub max_deviation_deg: f64,
+    /// Smallest share of matched points of a step that is accepted (unitless).
+    #[default(0.3)]
+    pub min_matched_share: f64,
+    /// Duration between scans that have no times [s].
+    #[default(0.1)]
+    pub period_s: f64,
+}
+
+impl Validate for OdometryConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        in_range("voxel_share", self.voxel_share, 0.001..=0.2)?;
+        in_range("map_spacing", self.map_spacing, 0.1..=10.0)?;
+        in_range(
+            "registration_spacing",
+            self.registration_spacing,
+            0.1..=20.0,
+        )?;
+        in_range("map_radius_share", self.map_radius_share, 0.1..=10.0)?;
+        in_range("min_range_share", self.min_range_share, 0.0..=0.5)?;
+        in_range("voxel_points", self.voxel_points, 1.0..=1e6)?;
+        in_range("iterations", self.iterations, 1..=1000)?;
+        positive("max_deviation_share", self.max_deviation_share)?;
+        positive("max_deviation_deg", self.max_deviation_deg)?;
+        in_range("min_matched_share", self.min_matched_share, 0.0..=1.0)?;
+        positive("period_s", self.period_s)
+    }
+}

@@ -1,0 +1,28 @@
+//! LiDAR odometry: poses of scans from the scans themselves, in six degrees of freedom.
+//!
+//! Each scan is registered to a local map of the scans before it. The pose of the scan determines the motion since
+//! the previous one, and this motion compensates the scan: a point measured at a time t after the moment of
+//! the pose is
+//!
+//! ```text
+//! q(t)   = odom_from_lidar · exp(t / T · log(previous_from_current)) · p        T: time between the scans
+//! Σ wᵢ (nᵢ · (qᵢ − sᵢ))² + ‖log(predicted⁻¹ · odom_from_lidar)‖²_P  → min       surface s with normal n
+//! ```
+//!
+//! by Gauss-Newton on SE(3). Surfaces are principal components of the mapped points around q, at the finest scale
+//! at which they are a plane. The prediction is constant velocity. Lengths are shares of the sensor's range.
+//!
+//! Vizzo et al., *KISS-ICP* (RA-L 2023), for the adaptive kernel; Lee et al., *GenZ-ICP* (RA-L 2025), for planar
+//! and other points blended by their share; Dellenbach et al., *CT-ICP* (ICRA 2022), for compensation by the
+//! motion that is estimated; Magnusson, *The Three-Dimensional Normal-Distributions Transform* (2009), for
+//! distributions of points in voxels; Blanco-Claraco, *MOLA* (2025), for scales relative to the range.
+
+mod alignment;
+mod config;
+mod odometer;
+mod sampling;
+mod search;
+mod voxel_map;
+
+pub use config::OdometryConfig;
+pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};

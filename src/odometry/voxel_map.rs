@@ -1,0 +1,219 @@
+//! Local map: moments of the mapped points in voxels of three scales, and the planes that they form.
+//!
+//! ```text
+//! n, Σ p, Σ p pᵀ  per voxel         sums of the 2 x 2 x 2 voxels nearest to a point: distribution of its neighbours
+//! ```
+//!
+//! A block of eight voxels moves with the point in steps of one voxel, so a point is never farther than half a
+//! voxel from the middle of its block. The finest block whose points form a plane is the surface near the
+//! point: variances λ₀ ≪ λ₁, and λ₁ not ≪ λ₂, as it would be on a single ring.
+
+use std::collections::HashMap;
+use std::hash::{BuildHasherDefault, Hasher};
+
+use glam::{DMat3, DVec3, IVec3, Vec3};
+
+use crate::geometry::PlaneSums;
+
+/// Hasher of packed voxel coordinates.
+#[derive(Clone, Default)]
+pub struct PackedHasher(u64);
+
+/// Builds a [`PackedHasher`].
+pub type CellHasher = BuildHasherDefault<PackedHasher>;
+
+impl Hasher for PackedHasher {
+    fn finish(&self) -> u64 {
+        self.0
+    }
+
+    fn write(&mut self, bytes: &[u8]) {
+        for &byte in bytes {
+            self.write_u64(self.0 ^ u64::from(byte));
+        }
+    }
+
+    fn write_u64(&mut self, key: u64) {
+        let product = key.wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        self.0 = product ^ (product >> 32);
+    }
+}
+
+/// Voxel coordinates as one number; they wrap after two million voxels.
+pub fn pack(cell: IVec3) -> u64 {
+    const BITS: u64 = 21;
+    const MASK: u64 = (1 << BITS) - 1;
+    let field = |coordinate: i32| i64::from(coordinate) as u64 & MASK;
+    field(cell.x) | field(cell.y) << BITS | field(cell.z) << (2 * BITS)
+}
+
+/// Moments of the points in a voxel, relative to its lower corner.
+#[derive(Clone, Copy, Debug, Default)]
+struct Cell {
+    count: f32,
+    first: Vec3,
+    /// xx, yy, zz
+    squares: Vec3,
+    /// yz, zx, xy
+    products: Vec3,
+}
+
+impl Cell {
+    /// Adds a point; beyond `limit` points older ones are forgotten.
+    fn add(&mut self, p: Vec3, limit: f32) {
+        if self.count >= limit {
+            let kept = (limit - 1.0) / self.count;
+            self.count *= kept;
+            self.first *= kept;
+            self.squares *= kept;
+            self.products *= kept;
+        }
+        self.count += 1.0;
+        self.first += p;
+        self.squares += p * p;
+        self.products += Vec3::new(p.y * p.z, p.z * p.x, p.x * p.y);
+    }
+
+    /// Adds the moments of another cell whose corner is at `offset` from the own one.
+    fn merge(&mut self, other: &Self, offset: Vec3) {
+        let (n, f) = (other.count, other.first);
+        self.count += n;
+        self.first += f + offset * n;
+        self.squares += other.squares + offset * (2.0 * f + offset * n);
+        let cross = |a: Vec3, b: Vec3| Vec3::new(a.y * b.z, a.z * b.x, a.x * b.y);
+        self.products +=
+            other.products + cross(f, offset) + cross(offset, f) + n * cross(offset, offset);
+    }
+}
+
+/// Voxels of one scale.
+#[derive(Clone, Debug)]
+struct Level {
+    edge_m: f64,
+    cells: HashMap<u64, Cell, CellHasher>,
+}
+
+/// The surface near a point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Surface {
+    /// Mean of the mapped points [m].
+    pub center: DVec3,
+    /// Unit normal of arbitrary sign.
+    pub normal: DVec3,
+    /// Whether the points form a plane.
+    pub is_planar: bool,
+}
+
+/// The local map.
+#[derive(Clone, Debug)]
+pub struct VoxelMap {
+    levels: [Level; 3],
+    point_limit: f32,
+}
+
+impl VoxelMap {
+    /// An empty map whose finest voxels have an edge `edge_m`.
+    pub fn new(edge_m: f64, point_limit: f32) -> Self {
+        let level = |scale: f64| Level {
+            edge_m: edge_m * scale,
+            cells: HashMap::default(),
+        };
+        Self {
+            levels: [level(1.0), level(2.0), level(4.0)],
+            point_limit,
+        }
+    }
+
+    /// Adds points.
+    pub fn insert(&mut self, points: &[DVec3]) {
+        for level in &mut self.levels {
+            for &point in points {
+                let cell = (point / level.edge_m).floor();
+                let offset = (point - cell * level.edge_m).as_vec3();
+                let moments = level.cells.entry(pack(cell.as_ivec3())).or_default();
+                moments.add(offset, self.point_limit);
+            }
+        }
+    }
+
+    /// Removes voxels whose mean is farther than `radius_m` from a point.
+    pub fn remove_beyond(&mut self, center: DVec3, radius_m: f64) {
+        for level in &mut self.levels {
+            let edge_m = level.edge_m;
+            level.cells.retain(|&key, _| {
+                let corner = unpack(key).as_dvec3() * edge_m;
+                corner.distance_squared(center) <= radius_m * radius_m
+            });
+        }
+    }
+
+    /// The block of finest voxels around a point: two points in one block have the same surface.
+    pub fn block(&self, point: DVec3) -> IVec3 {
+        self.levels[0].block(point)
+    }
+
+    /// The surface near a point; `None` where nothing is mapped.
+    pub fn surface(&self, point: DVec3) -> Option<Surface> {
+        let mut other = None;
+        for level in &self.levels {
+            let Some(surface) = level.surface(point) else {
+                continue;
+            };
+            if surface.is_planar {
+                return Some(surface);
+            }
+            other = other.or(Some(surface));
+        }
+        other
+    }
+}
+
+/// The inverse of [`pack`].
+fn unpack(key: u64) -> IVec3 {
+    let field = |shift: u32| ((key << (43 - shift)) as i64 >> 43) as i32;
+    IVec3::new(field(0), field(21), field(42))
+}
+
+impl Level {
+    fn block(&self, point: DVec3) -> IVec3 {
+        (point / self.edge_m - 0.5).floor().as_ivec3()
+    }
+
+    fn surface(&self, point: DVec3) -> Option<Surface> {
+        /// Fewer points have no plane.
+        const MIN_POINTS: f32 = 5.0;
+        /// Largest share of the smallest variance in the second one of a plane.
+        const FLAT: f64 = 0.1;
+        /// Smallest share of the second variance in the largest one of a plane.
+        const WIDE: f64 = 0.05;
+        let block = self.block(point);
+        let edge_m = self.edge_m as f32;
+        let mut sums = Cell::default();
+        for corner in 0..8 {
+            let step = IVec3::new(corner & 1, (corner >> 1) & 1, corner >> 2);
+            if let Some(cell) = self.cells.get(&pack(block + step)) {
+                // Relative to the middle of the block.
+                sums.merge(cell, (step - IVec3::ONE).as_vec3() * edge_m);
+            }
+        }
+        if sums.count < MIN_POINTS {
+            return None;
+        }
+        let middle = (block + IVec3::ONE).as_dvec3() * self.edge_m;
+        let (s, p) = (sums.squares.as_dvec3(), sums.products.as_dvec3());
+        let second = DMat3::from_cols(
+            DVec3::new(s.x, p.z, p.y),
+            DVec3::new(p.z, s.y, p.x),
+            DVec3::new(p.y, p.x, s.z),
+        );
+        let plane =
+            PlaneSums::from_moments(Vec3::ZERO, sums.count.into(), sums.first.as_dvec3(), second);
+        let plane = plane.fit()?;
+        let [smallest, second, largest] = plane.variances;
+        Some(Surface {
+            center: middle + plane.center.as_dvec3(),
+            normal: plane.normal.as_dvec3(),
+            is_planar: smallest < FLAT * second && second > WIDE * largest,
+        })
+    }
+}

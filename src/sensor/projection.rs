@@ -1,0 +1,119 @@
+//! The range image of a sensor, and its limits of range.
+//!
+//! With rows, each beam is a row, and there are as many columns as azimuth steps, up to the 2048 for which the
+//! neighbourhoods of normals are made; sensors with finer steps lose every second return, which is beside another.
+//! Without rows, pixels are squares of half the mean angular distance of the points,
+//! of which few share a pixel,
+//!
+//! ```text
+//! ½ √(Ω / n)       Ω: solid angle that has points
+//! ```
+
+use std::collections::BTreeSet;
+
+use super::beams::{Beams, angles};
+use super::quantile;
+use crate::lidar::{LidarModel, Scan};
+
+/// Columns of a range image, at most and at least.
+const MAX_COLUMNS: usize = 2048;
+const MIN_COLUMNS: usize = 90;
+
+/// The projection; that of KITTI's sensor for no points.
+pub fn model(scans: &[Scan], beams: &Beams, columns: usize, own_car_m: [f32; 4]) -> LidarModel {
+    if scans.iter().all(Scan::is_empty) {
+        return LidarModel::default();
+    }
+    let (min_range, max_range) = range_limits(scans, own_car_m);
+    let rows = match beams.rows.as_slice() {
+        [] => rowless(scans),
+        _ => of_beams(beams, columns),
+    };
+    LidarModel {
+        min_range,
+        max_range,
+        ..rows
+    }
+}
+
+fn of_beams(beams: &Beams, columns: usize) -> LidarModel {
+    /// Deviation from even rows, relative to their distance (unitless).
+    const EVEN: f32 = 0.1;
+    let elevations: Vec<f32> = beams.rows.iter().map(|row| row.elevation_deg).collect();
+    let (top, bottom) = (elevations[0], elevations[elevations.len() - 1]);
+    let step = (top - bottom) / (elevations.len() - 1).max(1) as f32;
+    let even = |row: usize| top - row as f32 * step;
+    let is_even = (elevations.iter().enumerate())
+        .all(|(row, elevation)| (elevation - even(row)).abs() < EVEN * step);
+    LidarModel {
+        height: elevations.len(),
+        width: columns.clamp(MIN_COLUMNS, MAX_COLUMNS),
+        fov_up: (top + 0.5 * step).min(90.0),
+        fov_down: (bottom - 0.5 * step).max(-90.0),
+        elevations: (!is_even).then(|| elevations.into()),
+        ..LidarModel::default()
+    }
+}
+
+fn rowless(scans: &[Scan]) -> LidarModel {
+    /// Edge of the cells that measure the solid angle [deg].
+    const CELL_DEG: f32 = 4.0;
+    const MAX_ROWS: f32 = 512.0;
+    let largest = scans.iter().max_by_key(|scan| scan.len());
+    let directions = || {
+        largest
+            .into_iter()
+            .flat_map(|scan| &scan.points)
+            .map(|&p| angles(p))
+    };
+    let cell = |[elevation_deg, azimuth_rad]: [f32; 2]| {
+        let azimuth_deg = azimuth_rad.to_degrees();
+        [elevation_deg, azimuth_deg].map(|deg| (deg / CELL_DEG).floor() as i32)
+    };
+    let cells: BTreeSet<[i32; 2]> = directions().map(cell).collect();
+    let area = |[row, _]: &[i32; 2]| {
+        let elevation_deg = (*row as f32 + 0.5) * CELL_DEG;
+        CELL_DEG * CELL_DEG * elevation_deg.to_radians().cos().max(0.0)
+    };
+    let solid_angle: f32 = cells.iter().map(area).sum();
+    let spacing_deg = 0.5 * (solid_angle / directions().count().max(1) as f32).sqrt();
+
+    let all = || {
+        scans
+            .iter()
+            .flat_map(|scan| &scan.points)
+            .map(|&p| angles(p)[0])
+    };
+    let mut elevations: Vec<f32> = all().collect();
+    let fov_up = (quantile(&mut elevations, 1.0) + spacing_deg).min(90.0);
+    let fov_down = (quantile(&mut elevations, 0.0) - spacing_deg).max(-90.0);
+    let columns = (360.0 / spacing_deg).round() as usize;
+    LidarModel {
+        height: ((fov_up - fov_down) / spacing_deg)
+            .ceil()
+            .clamp(1.0, MAX_ROWS) as usize,
+        width: columns.clamp(MIN_COLUMNS, MAX_COLUMNS),
+        fov_up,
+        fov_down,
+        ..LidarModel::default()
+    }
+}
+
+/// Least and greatest range of a return [m].
+///
+/// The greatest is 50 m, as far as a map is rendered, or twice the range of nearly all returns in a building. The
+/// least is that of nearly all returns beside the own car, but between 0.3 m, where housings and hands are, and 2 m.
+fn range_limits(scans: &[Scan], [x_min, x_max, y_min, y_max]: [f32; 4]) -> (f32, f32) {
+    const NEARLY_ALL: f64 = 0.99;
+    let is_own = |x: f32, y: f32| x > x_min && x < x_max && y > y_min && y < y_max;
+    let mut ranges: Vec<f32> = (scans.iter().flat_map(|scan| &scan.points))
+        .filter(|point| !is_own(point.x, point.y))
+        .map(|point| point.length())
+        .collect();
+    let nearest = quantile(&mut ranges, 0.1 * (1.0 - NEARLY_ALL));
+    let farthest = quantile(&mut ranges, NEARLY_ALL);
+    (
+        (0.9 * nearest).clamp(0.3, 2.0),
+        (2.0 * farthest).clamp(10.0, 50.0),
+    )
+}

@@ -1,0 +1,63 @@
+//! Sense and period of rotation.
+//!
+//! For a sensor that turns once in a period T, azimuth and time of a point satisfy α = α₀ ± 2π t / T. The
+//! sense is the one for which the directions α ∓ 2π t / T agree: their mean vector is long.
+
+use std::f64::consts::TAU;
+
+use super::beams::angles;
+use crate::lidar::{RotationDirection, Scan};
+
+/// Frames per second of sensors, at least and at most [s].
+const PERIODS_S: std::ops::RangeInclusive<f64> = 0.019..=0.22;
+
+/// Duration of a revolution or frame: the time in which the points of a scan were measured if they surround the
+/// sensor, else the interval of the scans.
+pub fn period_s(scans: &[Scan], horizontal_fov_deg: f32) -> Option<f64> {
+    let sweeps = scans.iter().filter_map(|scan| {
+        let (first, last) = bounds(scan)?;
+        (horizontal_fov_deg == 360.0).then_some(last - first)
+    });
+    let times: Vec<f64> = scans.iter().filter_map(|scan| scan.time_s).collect();
+    let intervals = times.windows(2).map(|pair| pair[1] - pair[0]);
+    [median(sweeps), median(intervals)]
+        .into_iter()
+        .flatten()
+        .find(|period_s| PERIODS_S.contains(period_s))
+}
+
+/// Sense of rotation by the times of the points.
+pub fn direction(scans: &[Scan], horizontal_fov_deg: f32) -> Option<RotationDirection> {
+    const LONG: f64 = 0.9;
+    let scan = scans.iter().find(|scan| bounds(scan).is_some())?;
+    let (first, last) = bounds(scan)?;
+    // Not the period of the scans: they may be a subset.
+    let period_s = (last - first) * 360.0 / f64::from(horizontal_fov_deg);
+    let agreement = |sense: f64| {
+        let (mut sin, mut cos) = (0.0, 0.0);
+        for (&point, &time_s) in scan.points.iter().zip(&scan.times_s) {
+            let phase = f64::from(angles(point)[1]) - sense * TAU * f64::from(time_s) / period_s;
+            (sin, cos) = (sin + phase.sin(), cos + phase.cos());
+        }
+        f64::hypot(sin, cos) / scan.len() as f64
+    };
+    let (clockwise, counter) = (agreement(-1.0), agreement(1.0));
+    match (clockwise > LONG, counter > LONG) {
+        (true, false) => Some(RotationDirection::Clockwise),
+        (false, true) => Some(RotationDirection::CounterClockwise),
+        _ => None,
+    }
+}
+
+/// First and last time of the points; `None` if they have no different times.
+fn bounds(scan: &Scan) -> Option<(f64, f64)> {
+    let times = || scan.times_s.iter().map(|&time_s| f64::from(time_s));
+    let (first, last) = (times().reduce(f64::min)?, times().reduce(f64::max)?);
+    (first < last && last - first < 1e3).then_some((first, last))
+}
+
+fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied()
+}
