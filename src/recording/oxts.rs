@@ -112,11 +112,16 @@ fn time_s(row: &str) -> Option<f64> {
     let (date, time) = row.split_once([' ', 'T'])?;
     let mut date = date.split('-').map(|part| part.parse::<i64>().ok());
     let (year, month, day) = (date.next()??, date.next()??, date.next()??);
-    let is_date = (1970..3000).contains(&year) && (1..=12).contains(&month) && (1..=31).contains(&day);
+    let is_date =
+        (1970..3000).contains(&year) && (1..=12).contains(&month) && (1..=31).contains(&day);
     let mut time = time.split(':').map(|part| part.parse::<f64>().ok());
     let (hour, minute, second) = (time.next()??, time.next()??, time.next()??);
     // Days since 1970 of the Gregorian calendar; the year begins in March.
-    let (y, m) = if month > 2 { (year, month - 3) } else { (year - 1, month + 9) };
+    let (y, m) = if month > 2 {
+        (year, month - 3)
+    } else {
+        (year - 1, month + 9)
+    };
     let days = 365 * y + y / 4 - y / 100 + y / 400 + (153 * m + 2) / 5 + day - 719_469;
     let seconds = days as f64 * 86_400.0 + hour * 3600.0 + minute * 60.0 + second;
     (is_date && seconds.is_finite()).then_some(seconds)
@@ -145,14 +150,25 @@ mod tests {
         fs::create_dir_all(&data).unwrap();
         let identity = "R: 1 0 0 0 1 0 0 0 1\nT: -0.81 0.32 -0.8\n";
         fs::write(folder.path().join("calib_imu_to_velo.txt"), identity).unwrap();
-        for (number, (lat, lon)) in [(49.0, 8.4), (49.0001, 8.4), (49.0, 8.4001)].into_iter().enumerate() {
-            fs::write(data.join(format!("{number:010}.txt")), format!("{lat} {lon} 110 0 0 1.5 0 0\n")).unwrap();
+        for (number, (lat, lon)) in [(49.0, 8.4), (49.0001, 8.4), (49.0, 8.4001)]
+            .into_iter()
+            .enumerate()
+        {
+            fs::write(
+                data.join(format!("{number:010}.txt")),
+                format!("{lat} {lon} 110 0 0 1.5 0 0\n"),
+            )
+            .unwrap();
         }
         let (poses, imu_from_lidar) = read(&folder.path().join("oxts")).unwrap();
         // A ten-thousandth of a degree of a great circle, and of the parallel.
         let degree_m = EARTH_RADIUS_M * 1e-4_f64.to_radians();
         assert_relative_eq!(poses[1].translation.y, degree_m, epsilon = 1e-3);
-        assert_relative_eq!(poses[2].translation.x, degree_m * 49_f64.to_radians().cos(), epsilon = 1e-3);
+        assert_relative_eq!(
+            poses[2].translation.x,
+            degree_m * 49_f64.to_radians().cos(),
+            epsilon = 1e-3
+        );
         assert_relative_eq!(poses[0].translation.vector.norm(), 0.0);
         assert_relative_eq!(imu_from_lidar.cam0_from_lidar.translation.x, 0.81);
     }

@@ -51,9 +51,7 @@ impl CameraPoses {
 }
 
 /// Reads the rows of a pose file, of KITTI (12 numbers) or TUM (8 numbers, with times [s]).
-pub fn read_rows_of_poses(
-    path: &Path,
-) -> Result<(CameraPoses, Option<Vec<f64>>), RecordingError> {
+pub fn read_rows_of_poses(path: &Path) -> Result<(CameraPoses, Option<Vec<f64>>), RecordingError> {
     match CameraPoses::read(path) {
         Ok(poses) => Ok((poses, None)),
         Err(RecordingError::WrongCount { found: 8, .. }) => {

@@ -118,7 +118,9 @@ impl PoseTrack {
             if count > 1 + frames.len() / 100 || count == frames.len() {
                 return Err(self.mismatch(frames, have_times, first, count));
             }
-            let numbers: Vec<String> = missing().map(|(frame, _)| frame.number.to_string()).collect();
+            let numbers: Vec<String> = missing()
+                .map(|(frame, _)| frame.number.to_string())
+                .collect();
             tracing::warn!(
                 "{} has no pose for these frames, which are left out: {}",
                 self.path.display(),

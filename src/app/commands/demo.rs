@@ -59,7 +59,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<String> {
 fn build_map_config(output: &Path, drive: &Path, seed: u64) -> BuildMapConfig {
     BuildMapConfig {
         scan_folder: drive.join("velodyne"),
-        pose_file: drive.join("poses.txt"),
+        pose_file: Some(drive.join("poses.txt")),
         calib_file: Some(drive.join("calib.txt")),
         mesh_file: output.join("map.ply"),
         visualize: false,
@@ -78,10 +78,11 @@ fn localization_config(
 ) -> LocalizationConfig {
     LocalizationConfig {
         scan_folder: drive.join("velodyne"),
-        pose_file: drive.join("poses.txt"),
+        pose_file: Some(drive.join("poses.txt")),
         calib_file: Some(drive.join("calib.txt")),
         map_file: map.mesh_file.clone(),
         result_path: output.join("localization.npz"),
+        pose_tracking: Some(true),
         num_particles: 1000,
         odometry: OdometrySource::File,
         odometry_file: Some(drive.join("odometry.txt")),

@@ -14,7 +14,7 @@ use crate::evaluation::RangeMclRules;
 use crate::files::folder_of;
 use crate::geometry::{Pose2, TriangleMesh, pose2_from_pose3};
 use crate::map::{MappingPath, ply};
-use crate::recording::poses::DrivePoses;
+use crate::recording::PoseTrack;
 
 /// Compares a result of `localize`, `refine` or range-mcl with the ground truth.
 pub fn run(config: &EvaluationConfig, context: &Context) -> Result<Report> {
@@ -148,14 +148,11 @@ fn truth(
 ) -> Result<Vec<Pose2>> {
     input::require_file("pose_file", pose_file)?;
     input::require_optional_file("calib_file", config.calib_file.as_deref())?;
-    let drive = DrivePoses::read(pose_file, config.calib_file.as_deref())?;
-    let mut poses = drive.map_from_lidar();
+    let mut track = PoseTrack::read(pose_file, config.calib_file.as_deref())?;
     if let Some(path) = mapping_path {
-        let map_from_first = path.world_from_map.inverse() * drive.world_from_map();
-        poses
-            .iter_mut()
-            .for_each(|pose| *pose = map_from_first * *pose);
+        track = track.in_map(&path.world_from_map);
     }
+    let poses = &track.map_from_lidar;
     let last = results.frames.last().copied().unwrap_or_default();
     ensure!(
         last < poses.len(),

@@ -2,62 +2,82 @@
 
 use std::path::Path;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::Result;
 use rand::Rng;
 
 use super::input;
+use super::stages::RecordingInputs;
 use crate::app::config::OdometrySource;
-use crate::geometry::{Pose2, Pose3};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
+use crate::lidar::Scan;
 use crate::localization::odometry::{demonstration_noise, increments, with_noise};
-use crate::recording::Sequence;
-use crate::recording::poses::DrivePoses;
+use crate::odometry::{Odometer, OdometryConfig};
+use crate::recording::Recording;
 
-/// Reads `previous_from_current` into each frame of the sequence; `None` without odometry.
-pub fn read_increments(
-    source: OdometrySource,
-    file: Option<&Path>,
-    sequence: &Sequence,
-    rng: &mut impl Rng,
-) -> Result<Vec<Option<Pose2>>> {
-    let increments = match (source, file) {
-        (OdometrySource::None, _) => return Ok(vec![None; sequence.frames.len()]),
-        (OdometrySource::File, Some(file)) => {
-            input::require_file("odometry_file", file)?;
-            let poses = recorded(file, sequence)?;
-            let numbers = sequence.frames.iter().map(|frame| frame.number);
-            let last = sequence.frames.last().map_or(0, |frame| frame.number);
-            ensure!(
-                last < poses.len(),
-                "{} has {} rows, but frame {last} is to be localized; the odometry needs one row per frame of the recording",
-                file.display(),
-                poses.len()
-            );
-            increments(&numbers.map(|number| poses[number]).collect::<Vec<_>>())
-        }
-        _ => {
-            let poses: Vec<Pose3> = sequence.frames.iter().map(|f| f.map_from_lidar).collect();
-            with_noise(&increments(&poses), &demonstration_noise(), rng)
-        }
-    };
-    Ok(increments.into_iter().map(Some).collect())
+/// The motion `previous_from_current` into each frame.
+pub enum MotionSource {
+    /// Known for all frames.
+    Given(Vec<Pose2>),
+    /// From the scans themselves.
+    Scans(Box<Odometer>),
+    /// Not known.
+    Unknown,
 }
 
-/// Reads the lidar poses of an odometry file, in the frame of the file or of its first pose.
-fn recorded(file: &Path, sequence: &Sequence) -> Result<Vec<Pose3>> {
-    let drive = DrivePoses::read_with(file, || Ok(sequence.calibration))
-        .with_context(|| format!("odometry_file is {}", file.display()))?;
-    // Rows of TUM, which have times, are poses of the lidar as they are.
-    Ok(match drive.times_s {
-        Some(_) => drive.camera.world_from_cam0,
-        None => drive.map_from_lidar(),
-    })
+impl MotionSource {
+    /// Opens the configured source for the frames of a recording.
+    pub fn open(
+        source: OdometrySource,
+        file: Option<&Path>,
+        inputs: &RecordingInputs,
+        recording: &Recording,
+        rng: &mut impl Rng,
+    ) -> Result<Self> {
+        Ok(match (source, file) {
+            (OdometrySource::None, _) => Self::Unknown,
+            (OdometrySource::File | OdometrySource::Auto, Some(file)) => {
+                input::require_file("odometry_file", file)?;
+                let track = inputs.track(file)?;
+                let poses = track.matched(&recording.frames, recording.has_times)?;
+                let mut last = Pose3::identity();
+                let known = poses.into_iter().map(|pose| {
+                    last = pose.unwrap_or(last);
+                    last
+                });
+                Self::Given(increments(&known.collect::<Vec<_>>()))
+            }
+            (OdometrySource::GroundTruth, _) => {
+                let poses = recording
+                    .frames
+                    .iter()
+                    .filter_map(|frame| frame.map_from_lidar);
+                let increments = increments(&poses.collect::<Vec<_>>());
+                Self::Given(with_noise(&increments, &demonstration_noise(), rng))
+            }
+            _ => Self::Scans(Box::new(Odometer::new(OdometryConfig::default())?)),
+        })
+    }
+
+    /// The motion into a frame by its row and scan; every scan has to be given, in order.
+    pub fn into_frame(&mut self, row: usize, scan: &Scan) -> Result<Option<Pose2>> {
+        Ok(match self {
+            Self::Given(increments) => increments.get(row).copied(),
+            Self::Scans(odometer) => Some(pose2_from_pose3(
+                &odometer.step(scan)?.previous_from_current,
+            )),
+            Self::Unknown => None,
+        })
+    }
 }
 
 /// Description of the odometry for reports.
 pub fn description(source: OdometrySource, file: Option<&Path>) -> String {
     match (source, file) {
         (OdometrySource::None, _) => "none (constant velocity)".to_owned(),
-        (OdometrySource::File, Some(file)) => file.display().to_string(),
-        _ => "ground truth with noise (a demonstration, as in range-mcl)".to_owned(),
+        (OdometrySource::File | OdometrySource::Auto, Some(file)) => file.display().to_string(),
+        (OdometrySource::GroundTruth, _) => {
+            "ground truth with noise (a demonstration, as in range-mcl)".to_owned()
+        }
+        _ => "from the scans".to_owned(),
     }
 }

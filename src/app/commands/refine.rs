@@ -8,20 +8,21 @@ use anyhow::{Result, ensure};
 
 use super::claims::{Claims, Outputs};
 use super::interrupt::Interrupted;
+use super::odometry::MotionSource;
 use super::run_output::{self, REFINEMENT_FILES, REPORT_FILES, RunFiles};
-use super::stages::Inputs;
+use super::stages::{MapInputs, RecordingInputs, SensorKeys};
 use super::{Context, input, odometry, output, run_page};
 use crate::app::config::{OdometrySource, RefinementConfig};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
 use crate::files::remove_abandoned;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
-use crate::lidar::Motion;
+use crate::lidar::{Motion, Scan};
 use crate::localization::State;
 use crate::localization::odometry::demonstration_noise;
 use crate::map::Map;
 use crate::random::stream;
-use crate::recording::Sequence;
+use crate::recording::{Frame, Recording};
 use crate::refinement::{
     InitialEstimate, RefinedTrajectory, RefinerConfig, SmoothingConfig, TrajectoryRefiner,
 };
@@ -32,11 +33,11 @@ const ODOMETRY_STREAM: u64 = u64::MAX;
 /// Refines the result that a configuration names, and adds the refined trajectory to it.
 pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
-    let inputs = inputs(config);
-    inputs.require()?;
+    input::require_file("map_file", &config.map_file)?;
+    recording_inputs(config).require()?;
     let files = RunFiles::beside(&config.result_file);
     let main = files.file("effective_refinement.yml");
-    let mut claims = prepare(config, context, &inputs, &main)?;
+    let mut claims = prepare(config, context, &main)?;
     let mut results = LocalizationResults::read(&config.result_file)?;
     let is_unfinished = claims.state(&main) == Some("unfinished");
     ensure!(
@@ -45,17 +46,21 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
         config.result_file.display()
     );
     run_output::warn_of_shortfall(&results, &config.result_file);
-    let map = inputs.load_map(None, context)?;
-    let sequence = inputs.open_recording(&config.selection(), &map)?;
+    let map = map_inputs(config).load(None, context)?;
+    let mut resolved = config.clone();
+    let sequence = open(&mut resolved, &map)?;
+    let config = &resolved;
     let sequence = frames_of(sequence, &results, config)?;
     let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
     let increments = increments(config, &sequence, &results)?;
-    let sequence = sequence.rotating(config.motion_compensation);
     let starts = initial_estimates(&results, &estimates);
     let (refined, runtimes_s) = refine(config, context, &map, &sequence, &starts, &increments)?;
     if results.ground_truth.is_none() {
-        let poses = sequence.frames.iter().map(|frame| &frame.map_from_lidar);
-        results.ground_truth = Some(poses.map(pose2_from_pose3).collect());
+        let poses = sequence
+            .frames
+            .iter()
+            .map(|frame| frame.map_from_lidar.as_ref());
+        results.ground_truth = poses.map(|pose| pose.map(pose2_from_pose3)).collect();
     }
     results.estimates = Some(estimates);
     results.refined = Some(refined.poses.clone());
@@ -68,12 +73,12 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
 }
 
 /// Prepares the outputs; the effective configuration is the main one, as the result exists already.
-fn prepare(
-    config: &RefinementConfig,
-    context: &Context,
-    inputs: &Inputs,
-    main: &Path,
-) -> Result<Claims> {
+fn prepare(config: &RefinementConfig, context: &Context, main: &Path) -> Result<Claims> {
+    let mut inputs = map_inputs(config).files();
+    inputs.extend(recording_inputs(config).files());
+    let odometry = config.odometry_file.as_deref();
+    inputs.extend(odometry.map(|path| ("odometry_file", path)));
+    inputs.extend(context.input());
     ensure!(
         fs::symlink_metadata(&config.result_file)?.is_file(),
         "result_file is {}, which is not a regular file; refine replaces it: give the path of the file itself",
@@ -87,7 +92,7 @@ fn prepare(
         main,
         magic: None,
         names: names.into_iter().map(str::to_owned).collect(),
-        inputs: inputs.files().into_iter().chain(context.input()).collect(),
+        inputs,
         force: true,
     };
     let claims = outputs.prepare()?;
@@ -95,24 +100,45 @@ fn prepare(
     Ok(claims)
 }
 
-fn inputs(config: &RefinementConfig) -> Inputs<'_> {
-    Inputs {
+/// Opens the selected frames, with the true poses in the frame of the map, and completes the configuration by
+/// what the scans show about the sensor.
+fn open(config: &mut RefinementConfig, map: &Map) -> Result<Recording> {
+    let mut recording = Recording::open(&config.scan_folder, &config.selection())?;
+    if let Some(pose_file) = &config.pose_file {
+        let track = recording_inputs(config).track(pose_file)?;
+        recording = recording.with_poses(track.in_map(&map.path.world_from_map))?;
+    }
+    let keys = SensorKeys {
+        range_image: &mut config.range_image,
+        own_car_m: &mut config.own_car_m,
+        motion_compensation: &mut config.motion_compensation,
+    };
+    Ok(keys.resolve(recording)?.0)
+}
+
+fn map_inputs(config: &RefinementConfig) -> MapInputs<'_> {
+    MapInputs {
         map_file: &config.map_file,
         map_pose_file: config.map_pose_file.as_deref(),
         map_calib_file: config.map_calib_file.as_deref(),
+    }
+}
+
+fn recording_inputs(config: &RefinementConfig) -> RecordingInputs<'_> {
+    RecordingInputs {
         scan_folder: &config.scan_folder,
-        pose_file: &config.pose_file,
+        pose_file: config.pose_file.as_deref(),
         calib_file: config.calib_file.as_deref(),
-        odometry_file: config.odometry_file.as_deref(),
+        body_from_lidar: config.body_from_lidar,
     }
 }
 
 /// The frames of the sequence that the result contains, in its order.
 fn frames_of(
-    mut sequence: Sequence,
+    mut sequence: Recording,
     results: &LocalizationResults,
     config: &RefinementConfig,
-) -> Result<Sequence> {
+) -> Result<Recording> {
     sequence
         .frames
         .retain(|frame| results.frames.binary_search(&frame.number).is_ok());
@@ -156,7 +182,7 @@ fn refine(
     config: &RefinementConfig,
     context: &Context,
     map: &Map,
-    sequence: &Sequence,
+    sequence: &Recording,
     starts: &[InitialEstimate],
     increments: &[Option<Pose2>],
 ) -> Result<(RefinedTrajectory, Vec<f64>)> {
@@ -207,20 +233,26 @@ fn report_unrefined(refined: &RefinedTrajectory) {
 /// The odometry into each frame: that of the localization, where the result contains it.
 fn increments(
     config: &RefinementConfig,
-    sequence: &Sequence,
+    sequence: &Recording,
     results: &LocalizationResults,
 ) -> Result<Vec<Option<Pose2>>> {
-    match (&results.odometry, config.odometry) {
-        (Some(recorded), OdometrySource::GroundTruth) => {
-            Ok(recorded.iter().copied().map(Some).collect())
-        }
-        _ => odometry::read_increments(
-            config.odometry,
-            config.odometry_file.as_deref(),
-            sequence,
-            &mut stream(config.seed, ODOMETRY_STREAM),
-        ),
+    let is_new = config.odometry == OdometrySource::None || config.odometry_file.is_some();
+    if let (Some(recorded), false) = (&results.odometry, is_new) {
+        return Ok(recorded.iter().copied().map(Some).collect());
     }
+    let mut motion = MotionSource::open(
+        config.odometry,
+        config.odometry_file.as_deref(),
+        &recording_inputs(config),
+        sequence,
+        &mut stream(config.seed, ODOMETRY_STREAM),
+    )?;
+    let frames = sequence.frames.iter().enumerate();
+    let into_frame = |(row, frame): (usize, &Frame)| match &mut motion {
+        MotionSource::Scans(_) => motion.into_frame(row, &frame.read()?),
+        _ => motion.into_frame(row, &Scan::default()),
+    };
+    frames.map(into_frame).collect()
 }
 
 /// The configuration of the refiner; the noise that the demonstration adds to the true odometry is
@@ -247,7 +279,7 @@ fn write_run(
     context: &Context,
     files: &RunFiles,
     map: &Map,
-    sequence: &Sequence,
+    sequence: &Recording,
     results: &LocalizationResults,
     refined: &RefinedTrajectory,
 ) -> Result<Report> {

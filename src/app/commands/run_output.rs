@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Result, bail};
+use anyhow::{Result, bail};
 
 use super::claims::{Claims, Outputs};
 use super::output;
@@ -13,7 +13,7 @@ use crate::app::plotting::{
     error_chart, map_plot,
 };
 use crate::app::results::{
-    LocalizationResults, Report, TrajectoryReport, write_frames_csv, write_poses_npy,
+    LocalizationResults, Report, RunSummary, TrajectoryReport, write_frames_csv, write_poses_npy,
 };
 use crate::evaluation::{
     EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, TrajectoryMetrics,
@@ -22,7 +22,7 @@ use crate::evaluation::{
 use crate::files::folder_of;
 use crate::geometry::{Pose2, Pose3, StampedPose, TriangleMesh};
 use crate::localization::{Estimate, ParticleSet};
-use crate::recording::Sequence;
+use crate::recording::Recording;
 use crate::recording::poses::{write_kitti, write_tum};
 
 /// Cells along the longer side of the map image in plots.
@@ -114,30 +114,23 @@ pub fn particle_rows(particles: &ParticleSet) -> Vec<ParticleRow> {
 }
 
 /// Writes `<name>_tum.txt` (map frame, seconds) and `<name>_kitti.txt` (the convention of the
-/// recording's `poses.txt`); the poses are those of the first frames of the sequence.
+/// recording's poses; without any, lidar poses in the map frame); the poses are those of the first frames.
 pub fn write_trajectory(
     files: &RunFiles,
     name: &str,
-    sequence: &Sequence,
+    recording: &Recording,
     map_from_lidar: &[Pose3],
 ) -> Result<()> {
-    let trajectory: Vec<StampedPose> = (sequence.frames.iter())
+    let trajectory: Vec<StampedPose> = (recording.frames.iter())
         .zip(map_from_lidar)
-        .map(|(frame, &map_from_lidar)| StampedPose {
-            map_from_lidar,
-            ..frame.stamped()
-        })
+        .map(|(frame, &map_from_lidar)| frame.stamped(map_from_lidar))
         .collect();
+    let (world_from_map, calibration) = recording.world();
     output::write_file(&files.file(&format!("{name}_tum.txt")), |file| {
         write_tum(file, &trajectory)
     })?;
     output::write_file(&files.file(&format!("{name}_kitti.txt")), |file| {
-        write_kitti(
-            file,
-            map_from_lidar,
-            &sequence.world_from_map,
-            &sequence.calibration,
-        )
+        write_kitti(file, map_from_lidar, &world_from_map, &calibration)
     })
 }
 
@@ -179,31 +172,31 @@ pub fn warn_of_shortfall(results: &LocalizationResults, path: &Path) {
     }
 }
 
-/// Compares the estimates and, if there is one, the refined trajectory with the ground truth.
+/// Summarizes a run, and compares the estimates and the refined trajectory with the ground truth, if there is one.
 pub fn evaluate(
     results: &LocalizationResults,
     rules: &RangeMclRules,
     about: BTreeMap<String, String>,
 ) -> Result<Report> {
-    let ground_truth = results
-        .ground_truth
-        .as_deref()
-        .context("there is no ground truth to compare with; set pose_file")?;
     let report = |estimates: &[Pose2], runtimes_s: &Option<Vec<f64>>| {
+        let Some(ground_truth) = results.ground_truth.as_deref() else {
+            return Ok(None);
+        };
         let trajectory = EvaluatedTrajectory {
             estimates,
             ground_truth,
             times_s: results.times_s.as_deref(),
             runtimes_s: runtimes_s.as_deref(),
         };
-        evaluate_trajectory(&trajectory, rules)
+        evaluate_trajectory(&trajectory, rules).map(Some)
     };
     let estimates = results.estimates_or_particle_means(rules)?;
     Ok(Report {
         about,
+        summary: RunSummary::of(results, &estimates),
         mcl: report(&estimates, &results.runtimes_s)?,
         refined: match &results.refined {
-            Some(refined) => Some(report(refined, &results.refine_runtimes_s)?),
+            Some(refined) => report(refined, &results.refine_runtimes_s)?,
             None => None,
         },
     })
@@ -243,7 +236,10 @@ pub fn draw_run(
             .map(|it| ("refined", REFINED, it)),
     );
     PathPlot {
-        title: "Path against ground truth",
+        title: match truth {
+            Some(_) => "Path against ground truth",
+            None => "Path",
+        },
         ground_truth: truth,
         paths: &paths,
         map: image.as_ref(),
@@ -258,7 +254,10 @@ pub fn draw_run(
         MapPlot {
             title: "Map from above",
             mesh,
-            path: truth.map(|truth| ("path of the car to be found", truth)),
+            path: match truth {
+                Some(truth) => Some(("true path", truth)),
+                None => Some(("found path", estimates)),
+            },
             keys: &map_plot::ground_and_rest(mesh),
         }
         .save(&files.plot("map.png")?)?;
@@ -362,6 +361,10 @@ impl Movie {
             return Ok(());
         };
         let truth = results.ground_truth.as_deref().unwrap_or_default();
+        let driven = match truth {
+            [] => results.estimates.as_deref().unwrap_or_default(),
+            truth => truth,
+        };
         let t = estimate.pose.translation;
         let path = self
             .files
@@ -372,7 +375,7 @@ impl Movie {
             particles: results.particles.frame(results.len() - 1),
             estimate: Some(estimate.pose),
             ground_truth: truth.last().copied(),
-            driven: truth,
+            driven,
             window: Some(([t.x, t.y], WINDOW_M)),
         }
         .save(&path)?;

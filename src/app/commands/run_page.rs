@@ -10,7 +10,7 @@ use super::run_output::RunFiles;
 use super::{output, version};
 use crate::app::plotting::palette;
 use crate::app::reporting::{Cell, Column, Page, PageElement, Section, Table};
-use crate::app::results::{Report, TrajectoryReport, Value};
+use crate::app::results::{MetricRow, Report, Value};
 
 /// Content of the page, apart from the files of the run.
 pub struct RunPage<'a> {
@@ -44,7 +44,7 @@ pub const PICTURES: [(&str, &str, &str); 7] = [
     (
         "Likelihood",
         "likelihood.png",
-        "Likelihood around the true pose",
+        "Likelihood around the true pose, or the estimate",
     ),
     ("Timing", "runtime.png", "Time per frame"),
 ];
@@ -116,31 +116,35 @@ impl RunPage<'_> {
 
 /// Metrics of both trajectories with their definitions.
 fn metrics(report: &Report) -> Table {
-    let mcl = report.mcl.rows();
-    let refined = report.refined.as_ref().map(TrajectoryReport::rows);
+    let has_refined = report.refined.is_some();
     let titles = ["metric", "MCL", "refined", "unit", "definition"];
     let cell = |value: Value| match value {
         Value::Number(number) => Cell::Number(number),
         Value::Count(count) => Cell::Number(count as f64),
         Value::Flag(_) | Value::NotChecked | Value::Absent => Cell::Text(value.to_string()),
     };
-    let row = |index: usize| {
-        let row = &mcl[index];
+    let row = |(row, refined): (MetricRow, Option<Value>)| {
         let mut cells = vec![row.name.into(), cell(row.value)];
-        cells.extend(refined.as_ref().map(|rows| cell(rows[index].value)));
+        if has_refined {
+            cells.push(refined.map_or(Cell::Text(String::new()), cell));
+        }
         cells.extend([row.unit.into(), row.definition.into()]);
         cells
     };
+    let title = match report.mcl {
+        Some(_) => "Errors from the tenth frame on, without alignment",
+        None => "No true poses were given: what the run shows itself",
+    };
     Table {
         name: "numbers".to_owned(),
-        title: "Errors from the tenth frame on, without alignment".to_owned(),
+        title: title.to_owned(),
         note: String::new(),
         columns: titles
             .into_iter()
-            .filter(|title| refined.is_some() || *title != "refined")
+            .filter(|title| has_refined || *title != "refined")
             .map(Column::named)
             .collect(),
-        rows: (0..mcl.len()).map(row).collect(),
+        rows: report.joined_rows().into_iter().map(row).collect(),
     }
 }
 

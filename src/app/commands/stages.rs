@@ -1,48 +1,79 @@
-//! Inputs of localize and refine: a map, and a recording with its poses in the frame of the map.
+//! Inputs of build-map, localize and refine: a recording with what is known about its sensor, and a map.
 
 use std::path::Path;
 
 use anyhow::{Context as _, Result};
 
 use super::{Context, input};
+use crate::app::config::{MotionCompensation, RangeImageConfig, body_from_lidar};
+use crate::lidar::{LidarModel, Rotation, Scan};
+use crate::map::scan_cloud::ScanConfig;
 use crate::map::{Map, MapError, MapOptions, MappingPath, ply};
-use crate::recording::poses::DrivePoses;
-use crate::recording::{Selection, Sequence};
+use crate::recording::{PoseTrack, Recording};
+use crate::sensor::{self, DroppedPoints, SensorDescription};
 
-/// Paths of the inputs.
-pub struct Inputs<'a> {
+/// Number of scans from which a sensor is inferred.
+const SENSOR_SCANS: usize = 10;
+
+/// Keys of a recording.
+#[derive(Clone, Copy)]
+pub struct RecordingInputs<'a> {
+    pub scan_folder: &'a Path,
+    pub pose_file: Option<&'a Path>,
+    pub calib_file: Option<&'a Path>,
+    pub body_from_lidar: Option<[f64; 6]>,
+}
+
+impl<'a> RecordingInputs<'a> {
+    /// Checks that the files exist, before any work is done.
+    pub fn require(&self) -> Result<()> {
+        input::require_folder("scan_folder", self.scan_folder)?;
+        if let Some(path) = self.pose_file.filter(|path| !path.is_dir()) {
+            input::require_file("pose_file", path)?;
+        }
+        input::require_optional_file("calib_file", self.calib_file)
+    }
+
+    /// The files and their keys.
+    pub fn files(&self) -> Vec<(&'static str, &'a Path)> {
+        let optional = [
+            ("pose_file", self.pose_file),
+            ("calib_file", self.calib_file),
+        ];
+        (optional.into_iter())
+            .filter_map(|(key, path)| Some((key, path?)))
+            .collect()
+    }
+
+    /// Reads poses of the recording from a file.
+    pub fn track(&self, path: &Path) -> Result<PoseTrack> {
+        Ok(match self.body_from_lidar {
+            Some(numbers) => PoseTrack::read_of_body(path, body_from_lidar(numbers))?,
+            None => PoseTrack::read(path, self.calib_file)?,
+        })
+    }
+}
+
+/// Keys of a map.
+pub struct MapInputs<'a> {
     pub map_file: &'a Path,
     /// Poses that the map was built with; for maps of range-mcl.
     pub map_pose_file: Option<&'a Path>,
     /// Calibration that the map was built with; for maps of range-mcl.
     pub map_calib_file: Option<&'a Path>,
-    pub scan_folder: &'a Path,
-    pub pose_file: &'a Path,
-    pub calib_file: Option<&'a Path>,
-    pub odometry_file: Option<&'a Path>,
 }
 
-impl Inputs<'_> {
-    /// Checks that the files exist, before any work is done.
-    pub fn require(&self) -> Result<()> {
-        input::require_file("map_file", self.map_file)?;
-        input::require_folder("scan_folder", self.scan_folder)?;
-        input::require_file("pose_file", self.pose_file)?;
-        input::require_optional_file("calib_file", self.calib_file)
-    }
-
+impl<'a> MapInputs<'a> {
     /// The files and their keys.
-    pub fn files(&self) -> Vec<(&'static str, &Path)> {
-        let mut files = vec![("map_file", self.map_file), ("pose_file", self.pose_file)];
-        files.extend(self.calib_file.map(|path| ("calib_file", path)));
+    pub fn files(&self) -> Vec<(&'static str, &'a Path)> {
+        let mut files = vec![("map_file", self.map_file)];
         files.extend(self.map_pose_file.map(|path| ("map_pose_file", path)));
         files.extend(self.map_calib_file.map(|path| ("map_calib_file", path)));
-        files.extend(self.odometry_file.map(|path| ("odometry_file", path)));
         files
     }
 
     /// Reads the map and prepares it for rendering at most `max_poses` poses at once.
-    pub fn load_map(&self, max_poses: Option<usize>, context: &Context) -> Result<Map> {
+    pub fn load(&self, max_poses: Option<usize>, context: &Context) -> Result<Map> {
         let (mesh, path) = ply::read_map(self.map_file)?;
         let path = match path {
             Some(path) => path,
@@ -73,17 +104,105 @@ impl Inputs<'_> {
         };
         input::require_file("map_pose_file", poses)?;
         input::require_optional_file("map_calib_file", self.map_calib_file)?;
-        let drive = DrivePoses::read(poses, self.map_calib_file)?;
+        let track = PoseTrack::read(poses, self.map_calib_file)?;
         Ok(MappingPath {
-            world_from_map: drive.world_from_map(),
-            map_from_lidar: drive.map_from_lidar(),
+            world_from_map: track.world_from_map,
+            map_from_lidar: track.map_from_lidar,
         })
     }
+}
 
-    /// Opens the selected frames of the recording, with their poses in the frame of the map.
-    pub fn open_recording(&self, selection: &Selection, map: &Map) -> Result<Sequence> {
-        let (scans, poses, calib) = (self.scan_folder, self.pose_file, self.calib_file);
-        let sequence = Sequence::open(scans, poses, calib, selection)?;
-        Ok(sequence.in_map(&map.path.world_from_map))
+/// Keys of the sensor that are inferred where they are not given.
+pub struct SensorKeys<'a> {
+    pub range_image: &'a mut RangeImageConfig,
+    pub own_car_m: &'a mut Option<[f32; 4]>,
+    pub motion_compensation: &'a mut Option<MotionCompensation>,
+}
+
+impl SensorKeys<'_> {
+    /// Sets what is not given from the scans; returns the recording, whose points have times if they are known.
+    pub fn resolve(self, recording: Recording) -> Result<(Recording, Option<SensorDescription>)> {
+        let is_given = RangeImageConfig::of(&self.range_image.model());
+        let is_complete = RangeImageConfig {
+            max_instance: None,
+            render_instanced: None,
+            ..self.range_image.clone()
+        } == is_given
+            && self.own_car_m.is_some();
+        let is_auto = *self.motion_compensation == Some(MotionCompensation::Auto);
+        if is_complete && !is_auto {
+            let rotation = self
+                .motion_compensation
+                .and_then(|it| it.rotation(PERIOD_S));
+            return Ok((recording.rotating(rotation), None));
+        }
+        let scans = sample(&recording)?;
+        let sensor = sensor::infer(&scans);
+        tracing::info!("{}", description(&sensor));
+        self.range_image.resolve(&sensor.lidar);
+        let default_m = ScanConfig::default().own_car_m;
+        let own_car_m = match sensor.is_moving {
+            true => sensor.own_car_m,
+            false => default_m,
+        };
+        *self.own_car_m = Some(self.own_car_m.unwrap_or(own_car_m));
+        warn_of_dropped_points(&scans, &self.range_image.model(), own_car_m);
+        let period_s = sensor.period_s.unwrap_or(PERIOD_S);
+        let rotation: Option<Rotation> = self
+            .motion_compensation
+            .and_then(|it| it.rotation(period_s));
+        Ok((recording.rotating(rotation), Some(sensor)))
+    }
+}
+
+/// Duration of a revolution where nothing shows it [s].
+const PERIOD_S: f64 = 0.1;
+
+/// Some scans, spread over the recording.
+fn sample(recording: &Recording) -> Result<Vec<Scan>> {
+    let count = recording.frames.len();
+    let step = count.div_ceil(SENSOR_SCANS).max(1);
+    let frames = recording.frames.iter().step_by(step);
+    Ok(frames.map(|frame| frame.read()).collect::<Result<_, _>>()?)
+}
+
+/// The sensor in words.
+pub fn description(sensor: &SensorDescription) -> String {
+    let model = &sensor.lidar;
+    let rows = match sensor.beams {
+        Some(beams) => format!("{beams} beams"),
+        None => "no rows".to_owned(),
+    };
+    let elevations = model.elevations.as_deref();
+    let highest = elevations
+        .and_then(|rows| rows.first())
+        .unwrap_or(&model.fov_up);
+    let lowest = -model.fov_down.abs();
+    let lowest = elevations.and_then(|rows| rows.last()).unwrap_or(&lowest);
+    let mut text = format!(
+        "sensor: {rows} from {highest:+.1} to {lowest:+.1} degrees, image {} x {}, ranges {:.1} to {:.0} m",
+        model.height, model.width, model.min_range, model.max_range
+    );
+    if let Some(mounting) = &sensor.mounting {
+        text += &format!(", {:.2} m above the ground", mounting.height_m);
+    }
+    text
+}
+
+/// Warns if more than a fifth of the points are dropped, with the reason that drops most.
+fn warn_of_dropped_points(scans: &[Scan], model: &LidarModel, own_car_m: [f32; 4]) {
+    /// Share of the points.
+    const WARNED: f64 = 0.2;
+    let mut dropped = DroppedPoints::default();
+    for scan in scans {
+        dropped.add(&DroppedPoints::count(scan, model, own_car_m));
+    }
+    for (reason, share) in dropped.above(WARNED) {
+        tracing::warn!(
+            "{:.0} % of the points are not used: they {}; see {}",
+            100.0 * share,
+            reason.description(),
+            reason.keys()
+        );
     }
 }

@@ -21,8 +21,8 @@ use serde::Serialize;
 
 use super::plan::PlannedRun;
 use crate::app::commands::version;
+use crate::recording::Recording;
 use crate::recording::Selection;
-use crate::recording::sequence::selected_scans;
 use crate::simulation::SimulationConfig;
 
 /// Configuration keys without effect on the numbers: paths, plots, permission to replace files.
@@ -96,9 +96,12 @@ impl KeyCache {
             }
             Input::Scans(folder, selection) => {
                 self.once(format!("{folder:?} {selection:?}"), || {
-                    let hashes = selected_scans(folder, &selection)?
+                    let hashes = (Recording::open(folder, &selection)?.frames)
                         .par_iter()
-                        .map(|(number, path)| Ok(format!("{number} {}", content(path)?)))
+                        .map(|frame| {
+                            let content = content(&frame.scan_path)?;
+                            Ok(format!("{} {} {content}", frame.number, frame.time_s))
+                        })
                         .collect::<Result<Vec<String>>>()?;
                     Ok(hash(&hashes))
                 })
@@ -151,25 +154,16 @@ fn stages(run: &PlannedRun) -> Result<[Stage<'_>; 3]> {
     let file = |path| Input::new(run, path, None);
     let mut mapping = Stage {
         settings: settings(map)?,
-        inputs: vec![
-            Input::new(run, &map.scan_folder, Some(map.selection())),
-            file(&map.pose_file),
-        ],
+        inputs: vec![Input::new(run, &map.scan_folder, Some(map.selection()))],
     };
-    mapping
-        .inputs
-        .extend(map.calib_file.iter().map(|path| file(path)));
+    let of_map = map.pose_file.iter().chain(&map.calib_file);
+    mapping.inputs.extend(of_map.map(|path| file(path)));
     let mut localization = Stage {
         settings: settings(query)?,
-        inputs: vec![
-            Input::new(run, &query.scan_folder, Some(query.selection())),
-            file(&query.pose_file),
-        ],
+        inputs: vec![Input::new(run, &query.scan_folder, Some(query.selection()))],
     };
-    let calibration = query.calib_file.iter();
-    localization
-        .inputs
-        .extend(calibration.map(|path| file(path)));
+    let of_query = query.pose_file.iter().chain(&query.calib_file);
+    localization.inputs.extend(of_query.map(|path| file(path)));
     let odometry = query.odometry_file.iter();
     localization.inputs.extend(odometry.map(|path| file(path)));
     let odometry = refinement.iter().flat_map(|r| &r.odometry_file);
@@ -264,13 +258,13 @@ mod tests {
             drives: drives.into(),
             build_map: BuildMapConfig {
                 scan_folder: first.join("velodyne"),
-                pose_file: first.join("poses.txt"),
+                pose_file: Some(first.join("poses.txt")),
                 calib_file: Some(first.join("calib.txt")),
                 ..BuildMapConfig::default()
             },
             localization: LocalizationConfig {
                 scan_folder: second.join("velodyne"),
-                pose_file: second.join("poses.txt"),
+                pose_file: Some(second.join("poses.txt")),
                 calib_file: Some(second.join("calib.txt")),
                 odometry_file: Some(second.join("odometry.txt")),
                 ..LocalizationConfig::default()
@@ -327,10 +321,10 @@ mod tests {
         let mut run = planned_run();
         run.drives.clear();
         run.build_map.scan_folder = path("velodyne");
-        run.build_map.pose_file = path("poses.txt");
+        run.build_map.pose_file = Some(path("poses.txt"));
         run.build_map.calib_file = Some(path("calib.txt"));
         run.localization.scan_folder = path("velodyne");
-        run.localization.pose_file = path("poses.txt");
+        run.localization.pose_file = Some(path("poses.txt"));
         run.localization.calib_file = Some(path("calib.txt"));
         run.localization.odometry_file = None;
         let before = KeyCache::default().keys(&run).unwrap();

@@ -101,10 +101,10 @@ fn planned_run(
     if let [first, second] = drives {
         let [first, second] = [first, second].map(SimulationConfig::drive_folder);
         build_map.scan_folder = first.join("velodyne");
-        build_map.pose_file = first.join("poses.txt");
+        build_map.pose_file = Some(first.join("poses.txt"));
         build_map.calib_file = Some(first.join("calib.txt"));
         localization.scan_folder = second.join("velodyne");
-        localization.pose_file = second.join("poses.txt");
+        localization.pose_file = Some(second.join("poses.txt"));
         localization.calib_file = Some(second.join("calib.txt"));
         localization.odometry = OdometrySource::File;
         localization.odometry_file = Some(second.join("odometry.txt"));
@@ -295,7 +295,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
             (few.localization.num_reduced, few.particles),
             (50, Some(50))
         );
-        assert!(!few.localization.pose_tracking);
+        assert_eq!(few.localization.pose_tracking, Some(false));
         let many = find(&runs, "town/PCA-MCL-2000-particles/1");
         assert_eq!(many.build_map, find(&runs, "town/PCA-MCL/3").build_map);
     }

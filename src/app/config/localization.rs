@@ -157,8 +157,6 @@ pub struct LocalizationConfig {
     /// those of KITTI odometry.
     #[default(Some(MotionCompensation::Auto))]
     pub motion_compensation: Option<MotionCompensation>,
-    /// Axis of driving in the lidar frame, 0 for x, 90 for y [deg]; `None`: inferred from the motion.
-    pub forward_deg: Option<f64>,
     /// Whether to refine every frame while tracking.
     pub refine: bool,
     /// Parameters of the refinement.
@@ -312,8 +310,7 @@ impl LocalizationConfig {
         let Some([x, y, heading_deg]) = self.initial_pose else {
             return Ok(());
         };
-        let is_possible =
-            x.abs().max(y.abs()) <= FARTHEST_M && heading_deg.abs() <= 360.0;
+        let is_possible = x.abs().max(y.abs()) <= FARTHEST_M && heading_deg.abs() <= 360.0;
         require(
             is_possible,
             "initial_pose",

@@ -79,8 +79,7 @@ impl RangeImageConfig {
 
     /// The sensor model, with the values of another where none is given.
     pub fn model_over(&self, inferred: &LidarModel) -> LidarModel {
-        let has_rows =
-            self.height.is_some() || self.fov_up.is_some() || self.fov_down.is_some();
+        let has_rows = self.height.is_some() || self.fov_up.is_some() || self.fov_down.is_some();
         LidarModel {
             height: (self.height)
                 .or(self.elevations.as_ref().map(|elevations| elevations.len()))

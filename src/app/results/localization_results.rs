@@ -12,6 +12,7 @@
 //! | `estimates`, `refined`, `ground_truth`, `odometry` | (rows, 3) | float64 | x, y [m], heading [rad] |
 //! | `covariances`, `refined_covariances` | (rows, 9) | float64 | of x, y, heading, row-major [m², m rad, rad²] |
 //! | `times_s`, `runtimes_s`, `refine_runtimes_s` | (rows) | float64 | time of the frame; computing time [s] |
+//! | `agreements` | (rows) | float64 | share of beams above the road that agree with the map, −1 where unknown |
 //! | `states` | (rows) | uint8 | state of the filter |
 //! | `selected_frames` | () | int64 | number of frames to localize; only where not all were |
 //!
@@ -110,6 +111,8 @@ pub struct LocalizationResults {
     pub runtimes_s: Option<Vec<f64>>,
     /// Computing time of refinement per frame [s].
     pub refine_runtimes_s: Option<Vec<f64>>,
+    /// Share of the beams above the road that agree with the map, −1 where unknown (unitless).
+    pub agreements: Option<Vec<f64>>,
     /// State of the filter as a number.
     pub states: Option<Vec<u8>>,
     /// Number of frames to localize; a file has it only if the run ended before the last of them.
@@ -159,6 +162,7 @@ impl LocalizationResults {
             times_s: pick(&self.times_s, rows),
             runtimes_s: pick(&self.runtimes_s, rows),
             refine_runtimes_s: pick(&self.refine_runtimes_s, rows),
+            agreements: pick(&self.agreements, rows),
             states: pick(&self.states, rows),
             selected: None,
         }

@@ -10,6 +10,7 @@ mod results_file_tests;
 mod frames;
 mod report;
 mod rows;
+mod run_summary;
 
 #[cfg(test)]
 pub(crate) mod kitti_07_tests;
@@ -19,3 +20,4 @@ pub use localization_results::{LocalizationResults, ParticleLog};
 pub use report::{Report, TrajectoryReport};
 pub use results_file::write_poses_npy;
 pub use rows::{MetricRow, Value};
+pub use run_summary::RunSummary;

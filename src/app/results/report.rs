@@ -8,6 +8,7 @@ use anyhow::{Context as _, Result, anyhow};
 use serde::{Deserialize, Serialize};
 
 use super::rows::{MetricRow, Value, metric_rows};
+use super::run_summary::RunSummary;
 use crate::evaluation::{RangeMclErrors, TrajectoryMetrics};
 
 /// Errors of one trajectory.
@@ -48,9 +49,12 @@ pub struct Report {
     /// Inputs and settings by name: the recording, the map, the odometry and its source, the
     /// seed, the renderer.
     pub about: BTreeMap<String, String>,
-    /// The filter's estimates.
-    pub mcl: TrajectoryReport,
-    /// The refined trajectory, if there is one.
+    /// What the run shows without the true poses.
+    #[serde(default)]
+    pub summary: RunSummary,
+    /// Errors of the filter's estimates; `None` without true poses.
+    pub mcl: Option<TrajectoryReport>,
+    /// Errors of the refined trajectory, if there is one.
     pub refined: Option<TrajectoryReport>,
 }
 
@@ -100,7 +104,11 @@ impl Report {
             "\n| | MCL |{refined_title} unit | definition |\n|---|---:|{refined_rule}---|---|"
         );
         for (row, refined) in self.joined_rows() {
-            let refined = refined.map_or(String::new(), |value| format!(" {value} |"));
+            let refined = match (&self.refined, refined) {
+                (None, _) => String::new(),
+                (Some(_), None) => " |".to_owned(),
+                (Some(_), Some(value)) => format!(" {value} |"),
+            };
             // A bar inside a cell would end the cell.
             let definition = row.definition.replace('|', "\\|");
             let _ = writeln!(
@@ -112,12 +120,13 @@ impl Report {
         text
     }
 
-    /// Each row of the filter with the value of the same row of the refined trajectory.
-    fn joined_rows(&self) -> Vec<(MetricRow, Option<Value>)> {
+    /// Rows of the summary, then each error of the filter with that of the refined trajectory.
+    pub fn joined_rows(&self) -> Vec<(MetricRow, Option<Value>)> {
         let mut refined = self.refined.iter().flat_map(TrajectoryReport::rows);
-        (self.mcl.rows().into_iter())
-            .map(|row| (row, refined.next().map(|row| row.value)))
-            .collect()
+        let errors = self.mcl.iter().flat_map(TrajectoryReport::rows);
+        let errors = errors.map(|row| (row, refined.next().map(|row| row.value)));
+        let summary = self.summary.rows().into_iter().map(|row| (row, None));
+        summary.chain(errors).collect()
     }
 
     fn about_lines(&self, prefix: &str) -> String {
@@ -154,7 +163,8 @@ mod tests {
     fn report() -> Report {
         Report {
             about: [("odometry".to_owned(), "from file".to_owned())].into(),
-            mcl: trajectory(0.25),
+            summary: RunSummary::default(),
+            mcl: Some(trajectory(0.25)),
             refined: Some(trajectory(0.02)),
         }
     }

@@ -47,6 +47,7 @@ impl LocalizationResults {
             times_s: file.rows("times_s", |[time_s]| time_s)?,
             runtimes_s: file.rows("runtimes_s", |[time_s]| time_s)?,
             refine_runtimes_s: file.rows("refine_runtimes_s", |[time_s]| time_s)?,
+            agreements: file.rows("agreements", |[share]| share)?,
             states: file.states()?,
             selected,
         })
@@ -95,6 +96,7 @@ impl LocalizationResults {
         file.numbers("times_s", &self.times_s, f64::NAN)?;
         file.numbers("runtimes_s", &self.runtimes_s, f64::NAN)?;
         file.numbers("refine_runtimes_s", &self.refine_runtimes_s, f64::NAN)?;
+        file.numbers("agreements", &self.agreements, f64::NAN)?;
         file.numbers("states", &self.states, 0)?;
         file.npz.finish()
     }

@@ -8,17 +8,18 @@ mod report;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 
 use self::clock::StageClock;
-use self::parts::{Parts, hash_of_scans, joint_hash, read_scan_file};
+use self::parts::{Parts, hash_of_scan, hash_of_scans, joint_hash};
 pub use self::report::BuildReport;
 use super::claims::{Claims, Outputs, PLY};
 use super::interrupt::Interrupted;
+use super::stages::{RecordingInputs, SensorKeys};
 use super::{Context, input, output, version};
 use crate::app::config::{self, BuildMapConfig};
 use crate::evaluation::map_quality::{self, BeamResidual};
@@ -29,19 +30,23 @@ use crate::map::{
     BuildError, BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan, MappingPath, path_check,
     ply, scan_agreement,
 };
-use crate::recording::{Frame, Sequence};
+use crate::recording::{Frame, Recording};
+use crate::sensor::SensorDescription;
 
 /// Builds the map that a configuration describes.
 pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
     let started = Instant::now();
-    let (sequence, mut claims) = (open(config)?, prepare(config, context)?);
+    let mut claims = prepare(config, context)?;
+    let mut resolved = config.clone();
+    let (sequence, sensor) = open(&mut resolved)?;
+    let config = &resolved;
     let (mapped, held_out) = hold_out(&sequence.frames, config);
     let clock = Arc::new(StageClock::default());
     let parts = Parts::open(&config.mesh_file, &inputs(config, &mapped)?)?;
     let local_maps = build_parts(config, context, &mapped, &parts, &clock)?;
     let mesh = clock.time("join", || parts.join(local_maps.len()))?;
     let path = MappingPath {
-        world_from_map: sequence.world_from_map,
+        world_from_map: sequence.world().0,
         map_from_lidar: poses_of(&mapped),
     };
     let residuals = clock.time("quality", || residuals(config, &mesh, &held_out))?;
@@ -54,6 +59,7 @@ pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
         frames: sequence.frames.len(),
         mapped_frames: mapped.len(),
         held_out_frames: held_out.len(),
+        sensor,
         stage_seconds: clock.seconds(),
         quality: MapQuality::of(&residuals),
         truth,
@@ -68,26 +74,41 @@ pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
     Ok(report)
 }
 
-/// Checks that inputs exist, and opens the recording.
-fn open(config: &BuildMapConfig) -> Result<Sequence> {
-    input::require_folder("scan_folder", &config.scan_folder)?;
-    input::require_file("pose_file", &config.pose_file)?;
-    input::require_optional_file("calib_file", config.calib_file.as_deref())?;
+/// Opens the recording with its poses, and completes the configuration by what the scans show about the
+/// sensor.
+fn open(config: &mut BuildMapConfig) -> Result<(Recording, Option<SensorDescription>)> {
+    let inputs = recording_inputs(config);
+    inputs.require()?;
     if let Some(path) = &config.truth_mesh {
         input::require_file("truth_mesh", path)?;
     }
-    let sequence = Sequence::open(
-        &config.scan_folder,
-        &config.pose_file,
-        config.calib_file.as_deref(),
-        &config.selection(),
-    )?;
-    let poses = (sequence.frames.iter()).map(|frame| (frame.number, &frame.map_from_lidar));
+    let recording = Recording::open(&config.scan_folder, &config.selection())?;
+    let track = match &config.pose_file {
+        Some(path) => inputs.track(path)?,
+        None => recording.own_track()?,
+    };
+    let pose_file = track.path.clone();
+    let recording = recording.with_poses(track)?;
+    let poses = recording.frames.iter();
+    let poses = poses.filter_map(|frame| Some((frame.number, frame.map_from_lidar.as_ref()?)));
     path_check::check(poses, config.max_step_m)
-        .with_context(|| format!("pose_file is {}", config.pose_file.display()))?;
-    Ok(sequence
-        .rotating(config.motion_compensation)
-        .compensated_by_poses())
+        .with_context(|| format!("pose_file is {}", pose_file.display()))?;
+    let keys = SensorKeys {
+        range_image: &mut config.range_image,
+        own_car_m: &mut config.own_car_m,
+        motion_compensation: &mut config.motion_compensation,
+    };
+    let (recording, sensor) = keys.resolve(recording)?;
+    Ok((recording.compensated_by_poses(), sensor))
+}
+
+fn recording_inputs(config: &BuildMapConfig) -> RecordingInputs<'_> {
+    RecordingInputs {
+        scan_folder: &config.scan_folder,
+        pose_file: config.pose_file.as_deref(),
+        calib_file: config.calib_file.as_deref(),
+        body_from_lidar: config.body_from_lidar,
+    }
 }
 
 /// Prepares the outputs.
@@ -101,13 +122,7 @@ fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
         path.file_name()
             .map(|name| name.to_string_lossy().into_owned())
     };
-    let mut inputs: Vec<(&str, &Path)> = vec![("pose_file", &config.pose_file)];
-    inputs.extend(
-        config
-            .calib_file
-            .as_deref()
-            .map(|path| ("calib_file", path)),
-    );
+    let mut inputs = recording_inputs(config).files();
     inputs.extend(
         config
             .truth_mesh
@@ -140,7 +155,8 @@ fn hold_out(frames: &[Frame], config: &BuildMapConfig) -> (Vec<Frame>, Vec<Frame
 }
 
 fn poses_of(frames: &[Frame]) -> Vec<Pose3> {
-    frames.iter().map(|frame| frame.map_from_lidar).collect()
+    let poses = frames.iter().map(|frame| frame.map_from_lidar);
+    poses.map(Option::unwrap_or_default).collect()
 }
 
 /// Builds the local maps that are not finished yet; returns the counts of all.
@@ -206,17 +222,17 @@ fn build_part(
     frames: &[Frame],
     parts: &Parts,
 ) -> Result<LocalMapCounts> {
-    // The hashes of the very bytes that are meshed.
+    // The hashes of the very points that are meshed.
     let hashes = Mutex::new(BTreeMap::new());
     let read = |key: usize| {
         let frame: &Frame = &frames[key];
-        let bytes = read_scan_file(frame)?;
-        let hash = blake3::hash(&bytes);
+        let scan = frame.read()?;
+        let hash = hash_of_scan(&scan);
         hashes
             .lock()
             .unwrap_or_else(|e| e.into_inner())
             .insert(key, hash);
-        Ok(frame.parse(&bytes)?)
+        Ok(scan)
     };
     let number_of = |key: usize| frames[key].number;
     let built = plan.build_local_map(local_map, &read);
@@ -304,7 +320,8 @@ fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
     let mut text = format!("# {}\n", version::program()?);
     text += &config::to_yaml(&relevant)?;
     for frame in frames {
-        let (path, pose) = (frame.scan_path.display(), frame.map_from_lidar);
+        let path = frame.scan_path.display();
+        let pose = frame.map_from_lidar.unwrap_or_default();
         let (t, q) = (pose.translation.vector, pose.rotation.coords);
         writeln!(text, "{path} {t:?} {q:?} {:?}", frame.motion)?;
     }
@@ -319,7 +336,7 @@ fn residuals(
 ) -> Result<Vec<BeamResidual>> {
     let read = |index: usize| -> Result<_> {
         let frame: &Frame = &held_out[index];
-        Ok((frame.read()?, frame.map_from_lidar))
+        Ok((frame.read()?, frame.map_from_lidar.unwrap_or_default()))
     };
     map_quality::residuals(mesh, held_out.len(), read, &config.map().local_map.scan)
 }

@@ -17,8 +17,9 @@ use serde::{Deserialize, Serialize};
 use crate::app::commands::output;
 use crate::files::remove_abandoned;
 use crate::geometry::TriangleMesh;
+use crate::lidar::Scan;
 use crate::map::{LocalMap, LocalMapCounts, ply};
-use crate::recording::Frame;
+use crate::recording::{Frame, RecordingError};
 
 const INPUTS_FILE: &str = "inputs.txt";
 const LOCK_FILE: &str = "lock";
@@ -82,7 +83,7 @@ impl Parts {
     pub fn finished(
         &self,
         number: usize,
-        scans_hash: impl FnOnce() -> io::Result<String>,
+        scans_hash: impl FnOnce() -> Result<String, RecordingError>,
     ) -> Option<LocalMapCounts> {
         let part = self.read(number).ok()?;
         // A scan that cannot be read is reported by the build.
@@ -208,9 +209,12 @@ fn hash_of_file(path: &Path) -> Result<String> {
 }
 
 /// BLAKE3 hash of the files of scans, in order.
-pub fn hash_of_scans(frames: &[Frame]) -> io::Result<String> {
-    let hash = |frame: &Frame| Ok(blake3::hash(&read_scan_file(frame)?));
-    let hashes: Vec<Hash> = frames.par_iter().map(hash).collect::<io::Result<_>>()?;
+pub fn hash_of_scans(frames: &[Frame]) -> Result<String, RecordingError> {
+    let hash = |frame: &Frame| Ok(hash_of_scan(&frame.read()?));
+    let hashes: Vec<Hash> = frames
+        .par_iter()
+        .map(hash)
+        .collect::<Result<_, RecordingError>>()?;
     Ok(joint_hash(hashes))
 }
 
@@ -223,14 +227,11 @@ pub fn joint_hash(hashes: impl IntoIterator<Item = Hash>) -> String {
     joint.finalize().to_hex().to_string()
 }
 
-/// Reads the file of a scan; an error names it.
-pub fn read_scan_file(frame: &Frame) -> io::Result<Vec<u8>> {
-    let path = &frame.scan_path;
-    let named = |error: io::Error| {
-        let message = format!("cannot read {}: {error}", path.display());
-        io::Error::new(error.kind(), message)
-    };
-    fs::read(path).map_err(named)
+/// Hash of the points of a scan.
+pub fn hash_of_scan(scan: &Scan) -> Hash {
+    let numbers = scan.points.iter().flat_map(|point| point.to_array());
+    let bytes: Vec<u8> = numbers.flat_map(f32::to_le_bytes).collect();
+    blake3::hash(&bytes)
 }
 
 #[cfg(test)]

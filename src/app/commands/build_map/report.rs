@@ -10,6 +10,7 @@ use crate::app::commands::output;
 use crate::evaluation::{MapQuality, TruthAgreement};
 use crate::geometry::TriangleMesh;
 use crate::map::{LocalMapCounts, MappingPath};
+use crate::sensor::SensorDescription;
 
 /// Report of a map build.
 #[derive(Debug, Default, Serialize)]
@@ -20,6 +21,8 @@ pub struct BuildReport {
     pub mapped_frames: usize,
     /// Key scans held out to evaluate the map.
     pub held_out_frames: usize,
+    /// What was inferred about the sensor; `None` if all of it was configured.
+    pub sensor: Option<SensorDescription>,
     /// Length of the path of the mapped scans [m].
     pub path_m: f64,
     /// Triangles of the map.

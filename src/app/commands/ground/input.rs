@@ -8,7 +8,7 @@ use crate::app::cli::GroundArgs;
 use crate::app::commands::input::require_folder;
 use crate::app::config::{self, GroundCommandConfig};
 use crate::evaluation::LabelledPoints;
-use crate::recording::sequence::selected_scans;
+use crate::recording::scan_list::selected_scans;
 use crate::recording::{scan_files, velodyne};
 
 /// A scan on disk.
@@ -70,7 +70,7 @@ pub fn scans(path: &Path, config: &GroundCommandConfig) -> Result<Vec<ScanFiles>
         (path.parent().unwrap_or(path), vec![path.to_owned()])
     } else {
         let selected = selected_scans(path, &config.selection())?;
-        (path, selected.into_iter().map(|(_, path)| path).collect())
+        (path, selected.into_iter().map(|scan| scan.path).collect())
     };
     let files = |scan_path: PathBuf| {
         let name = scan_path.strip_prefix(folder).unwrap_or(&scan_path);

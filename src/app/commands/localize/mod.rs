@@ -8,14 +8,16 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
+use nalgebra::Vector2;
 
 use self::pictures::draw_example;
 use self::recorder::Run;
 use super::claims::{Claims, NPZ, Outputs};
 use super::interrupt::Interrupted;
+use super::odometry::MotionSource;
 use super::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES, RunFiles};
-use super::stages::Inputs;
-use super::{Context, odometry, output, run_page};
+use super::stages::{MapInputs, RecordingInputs, SensorKeys};
+use super::{Context, input, odometry, output, run_page};
 use crate::app::config::{Initialization, LocalizationConfig, MotionModel};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
@@ -24,7 +26,7 @@ use crate::localization::motion::VelocityCommand;
 use crate::localization::{Localizer, Odometry, Start, State};
 use crate::map::Map;
 use crate::random::stream;
-use crate::recording::Sequence;
+use crate::recording::Recording;
 use crate::refinement::{InitialEstimate, TrajectoryRefiner};
 
 /// Random stream of the noise on the odometry; the localizer has its own streams.
@@ -32,19 +34,22 @@ const ODOMETRY_STREAM: u64 = 1;
 
 /// Localizes the selected frames of a recording.
 pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
-    let inputs = inputs(config);
-    inputs.require()?;
+    input::require_file("map_file", &config.map_file)?;
+    recording_inputs(config).require()?;
     let files = RunFiles::beside(&config.result_path);
-    let claims = prepare(config, context, &inputs, &files)?;
-    let map = inputs.load_map(Some(config.range_image.batch_size()), context)?;
-    let sequence = inputs.open_recording(&config.selection(), &map)?;
-    let increments = odometry::read_increments(
+    let claims = prepare(config, context, &files)?;
+    let map = map_inputs(config).load(Some(config.range_image.batch_size()), context)?;
+    let mut resolved = config.clone();
+    let sequence = open(&mut resolved, &map)?;
+    let config = &resolved;
+    let motion = MotionSource::open(
         config.odometry,
         config.odometry_file.as_deref(),
+        &recording_inputs(config),
         &sequence,
         &mut stream(config.seed, ODOMETRY_STREAM),
     )?;
-    let sequence = sequence.rotating(config.motion_compensation);
+    let motion = Mutex::new(motion);
     let run = Mutex::new(Run::new(
         config,
         &map,
@@ -56,7 +61,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     let kept = |run: &Run| run.kept(config, sequence.frames.len());
     context.interrupt.supervise(
         || {
-            localize(config, context, &map, &sequence, &increments, &recorded)?;
+            localize(config, context, &map, &sequence, &motion, &recorded)?;
             let mut run = recorded();
             run.complete()?;
             write_results(config, &files, &sequence, &mut run)?;
@@ -76,25 +81,46 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     Ok(report)
 }
 
-fn inputs(config: &LocalizationConfig) -> Inputs<'_> {
-    Inputs {
+/// Opens the selected frames, with the true poses in the frame of the map, and completes the configuration by
+/// what the scans show about the sensor.
+fn open(config: &mut LocalizationConfig, map: &Map) -> Result<Recording> {
+    let mut recording = Recording::open(&config.scan_folder, &config.selection())?;
+    if let Some(pose_file) = &config.pose_file {
+        let track = recording_inputs(config).track(pose_file)?;
+        recording = recording.with_poses(track.in_map(&map.path.world_from_map))?;
+    }
+    let keys = SensorKeys {
+        range_image: &mut config.range_image,
+        own_car_m: &mut config.own_car_m,
+        motion_compensation: &mut config.motion_compensation,
+    };
+    Ok(keys.resolve(recording)?.0)
+}
+
+fn map_inputs(config: &LocalizationConfig) -> MapInputs<'_> {
+    MapInputs {
         map_file: &config.map_file,
         map_pose_file: config.map_pose_file.as_deref(),
         map_calib_file: config.map_calib_file.as_deref(),
+    }
+}
+
+fn recording_inputs(config: &LocalizationConfig) -> RecordingInputs<'_> {
+    RecordingInputs {
         scan_folder: &config.scan_folder,
-        pose_file: &config.pose_file,
+        pose_file: config.pose_file.as_deref(),
         calib_file: config.calib_file.as_deref(),
-        odometry_file: config.odometry_file.as_deref(),
+        body_from_lidar: config.body_from_lidar,
     }
 }
 
 /// Prepares the configured outputs.
-fn prepare(
-    config: &LocalizationConfig,
-    context: &Context,
-    inputs: &Inputs,
-    files: &RunFiles,
-) -> Result<Claims> {
+fn prepare(config: &LocalizationConfig, context: &Context, files: &RunFiles) -> Result<Claims> {
+    let mut inputs = map_inputs(config).files();
+    inputs.extend(recording_inputs(config).files());
+    let odometry = config.odometry_file.as_deref();
+    inputs.extend(odometry.map(|path| ("odometry_file", path)));
+    inputs.extend(context.input());
     let mut names = Vec::new();
     if config.save_result {
         names.extend(REPORT_FILES.iter().chain(&LOCALIZATION_FILES));
@@ -113,7 +139,7 @@ fn prepare(
         main: &config.result_path,
         magic: Some(NPZ),
         names: names.into_iter().map(str::to_owned).collect(),
-        inputs: inputs.files().into_iter().chain(context.input()).collect(),
+        inputs,
         force: config.force,
     };
     run_output::prepare(files, &outputs)
@@ -124,11 +150,12 @@ fn localize<'a>(
     config: &LocalizationConfig,
     context: &Context,
     map: &Map,
-    sequence: &Sequence,
-    increments: &[Option<Pose2>],
+    sequence: &Recording,
+    motion: &Mutex<MotionSource>,
     recorded: &dyn Fn() -> MutexGuard<'a, Run>,
 ) -> Result<()> {
     let start = start(config, sequence);
+    let mut motion = motion.lock().unwrap_or_else(PoisonError::into_inner);
     let mut localizer = Localizer::new(map, config.localizer(), start, config.seed)?;
     let refiner = || TrajectoryRefiner::new(map, config.refiner(), config.seed);
     let mut refiner = config.refine.then(refiner).transpose()?;
@@ -137,10 +164,11 @@ fn localize<'a>(
         if context.interrupt.requested() {
             break;
         }
-        let odometry = odometry_into(config.motion_model, increments[row], sequence, row);
         let mut process = || {
             let scan = frame.read()?;
             let started = Instant::now();
+            let increment = motion.into_frame(row, &scan)?;
+            let odometry = odometry_into(config.motion_model, increment, sequence, row);
             let estimate = localizer.step(&scan, odometry)?;
             let runtime = started.elapsed();
             let refined = match &mut refiner {
@@ -148,7 +176,7 @@ fn localize<'a>(
                 None => None,
             };
             let runtimes = [runtime, started.elapsed() - runtime];
-            recorded().record(frame, increments[row], &estimate, refined, runtimes)
+            recorded().record(frame, increment, &estimate, refined, runtimes)
         };
         if let Err(error) = process() {
             recorded().failure = Some(error);
@@ -160,13 +188,20 @@ fn localize<'a>(
 }
 
 /// Where the particles start.
-fn start(config: &LocalizationConfig, sequence: &Sequence) -> Start {
-    match config.initialization() {
-        Initialization::Tracking => {
-            Start::near(&sequence.frames[0].map_from_lidar, config.start.clone())
+fn start(config: &LocalizationConfig, recording: &Recording) -> Start {
+    let spread = config.start.clone();
+    match (config.initialization(), config.initial_pose) {
+        (Initialization::Tracking, Some([x, y, heading_deg])) => Start::Pose {
+            map_from_lidar: Pose2::new(Vector2::new(x, y), heading_deg.to_radians()),
+            height_m: None,
+            spread,
+        },
+        (Initialization::Tracking, None) => {
+            let truth = recording.frames[0].map_from_lidar.unwrap_or_default();
+            Start::near(&truth, spread)
         }
-        Initialization::Corridor => Start::Road,
-        Initialization::Extent => Start::Anywhere,
+        (Initialization::Corridor, _) => Start::Road,
+        (Initialization::Extent, _) => Start::Anywhere,
     }
 }
 
@@ -174,7 +209,7 @@ fn start(config: &LocalizationConfig, sequence: &Sequence) -> Start {
 fn odometry_into(
     model: MotionModel,
     increment: Option<Pose2>,
-    sequence: &Sequence,
+    sequence: &Recording,
     row: usize,
 ) -> Odometry {
     match (increment, model) {
@@ -192,7 +227,7 @@ fn odometry_into(
 fn write_results(
     config: &LocalizationConfig,
     files: &RunFiles,
-    sequence: &Sequence,
+    sequence: &Recording,
     run: &mut Run,
 ) -> Result<()> {
     if !config.save_result || run.results.is_empty() {
@@ -215,7 +250,7 @@ fn write_run(
     context: &Context,
     files: &RunFiles,
     map: &Map,
-    sequence: &Sequence,
+    sequence: &Recording,
     run: &mut Run,
 ) -> Result<Report> {
     let results = &run.results;

@@ -12,7 +12,7 @@ use crate::localization::likelihood::{Direction, View, profile, width_at_half};
 use crate::localization::observation::{Likelihood, ObservationConfig, choose_beams};
 use crate::map::{Map, SensorAttitude};
 use crate::random::stream;
-use crate::recording::{Frame, Sequence};
+use crate::recording::{Frame, Recording};
 
 /// Random stream of the beams that are compared.
 const LIKELIHOOD_STREAM: u64 = 2;
@@ -22,45 +22,49 @@ pub fn draw_example(
     config: &LocalizationConfig,
     files: &RunFiles,
     map: &Map,
-    sequence: &Sequence,
+    recording: &Recording,
     map_from_lidar: &[Pose3],
 ) -> Result<()> {
     let row = map_from_lidar.len() / 2;
     let model = config.range_image.model();
-    let scan = sequence.frames[row].read()?;
+    let scan = recording.frames[row].read()?;
     let observed = RangeImage::project(&scan.points, &model);
     let rendered = map.renderer.render(&map_from_lidar[row..=row], &model)?;
     let rendered = rendered.first().context("one pose gives one image")?;
-    let frame = &sequence.frames[row];
+    let frame = &recording.frames[row];
     RangeImageStrip {
         title: &format!("Frame {}: observed, rendered, difference", frame.number),
         observed: &observed,
         rendered,
     }
     .save(&files.plot("range_images.png")?)?;
-    draw_likelihood(config, files, map, frame, &observed)
+    let (name, pose) = match frame.map_from_lidar {
+        Some(truth) => ("true pose", truth),
+        None => ("estimate", map_from_lidar[row]),
+    };
+    draw_likelihood(config, files, map, (frame, name, &pose), &observed)
 }
 
-/// Draws the likelihood of this run and of range-mcl around the true pose of a frame, one panel
-/// per direction.
+/// Draws the likelihood of this run and of range-mcl around a named pose of a frame, one panel per
+/// direction.
 fn draw_likelihood(
     config: &LocalizationConfig,
     files: &RunFiles,
     map: &Map,
-    frame: &Frame,
+    (frame, name, map_from_lidar): (&Frame, &str, &Pose3),
     scan: &RangeImage,
 ) -> Result<()> {
-    let truth = pose2_from_pose3(&frame.map_from_lidar);
-    let below_m = frame.map_from_lidar.translation.z - SensorAttitude::default().height_m;
-    let Some(patch) = map.ground.patch_under(&truth, Some(below_m)) else {
+    let center = pose2_from_pose3(map_from_lidar);
+    let below_m = map_from_lidar.translation.z - SensorAttitude::default().height_m;
+    let Some(patch) = map.ground.patch_under(&center, Some(below_m)) else {
         tracing::info!(
-            "frame {}: the likelihood is not drawn because there is no ground below the true pose",
+            "frame {}: the likelihood is not drawn because there is no ground below the {name}",
             frame.number
         );
         return Ok(());
     };
     let observation = &config.observation;
-    let attitude = patch.attitude_of(&frame.map_from_lidar);
+    let attitude = patch.attitude_of(map_from_lidar);
     let mut rng = stream(config.seed, LIKELIHOOD_STREAM);
     let beams = choose_beams(
         scan,
@@ -86,14 +90,14 @@ fn draw_likelihood(
     ];
     let mut panels = Vec::new();
     for direction in Direction::ALL {
-        let (name, unit) = match direction {
+        let (axis, unit) = match direction {
             Direction::Along => ("along", "m"),
             Direction::Across => ("across", "m"),
             Direction::Heading => ("heading", "deg"),
         };
         let mut series = Vec::new();
         for (model, color, observation) in models {
-            let points = profile(&view, &truth, direction, observation)?;
+            let points = profile(&view, &center, direction, observation)?;
             let width = match width_at_half(&points) {
                 Some(width) => format!("{width:.3} {unit} wide at half height"),
                 None => "wider than shown at half height".to_owned(),
@@ -102,16 +106,16 @@ fn draw_likelihood(
         }
         panels.push(Panel {
             y_name: "likelihood / peak".to_owned(),
-            own_x_name: Some(format!("offset {name} [{unit}]")),
+            own_x_name: Some(format!("offset {axis} [{unit}]")),
             series,
             clip_outliers: false,
         });
     }
     LineChart {
-        title: format!("Frame {}: likelihood around the true pose", frame.number),
+        title: format!("Frame {}: likelihood around the {name}", frame.number),
         x_name: String::new(),
         panels,
-        marks: vec![(0.0, "truth".to_owned())],
+        marks: vec![(0.0, name.to_owned())],
     }
     .save(&files.plot("likelihood.png")?)
 }

@@ -46,11 +46,12 @@ impl Run {
             results: LocalizationResults {
                 particles: ParticleLog::new(config.num_particles),
                 estimates: empty(),
-                ground_truth: empty(),
+                ground_truth: config.pose_file.as_ref().map(|_| Vec::new()),
                 odometry: empty(),
                 covariances: Some(Vec::new()),
                 times_s: Some(Vec::new()),
                 runtimes_s: Some(Vec::new()),
+                agreements: Some(Vec::new()),
                 states: Some(Vec::new()),
                 refined: config.refine.then(Vec::new),
                 refined_covariances: config.refine.then(Vec::new),
@@ -92,10 +93,9 @@ impl Run {
         results.particles.push_frame(particles);
         self.off_ground += usize::from(!estimate.on_mapped_ground);
         push(&mut results.estimates, estimate.pose);
-        push(
-            &mut results.ground_truth,
-            pose2_from_pose3(&frame.map_from_lidar),
-        );
+        if let Some(truth) = &frame.map_from_lidar {
+            push(&mut results.ground_truth, pose2_from_pose3(truth));
+        }
         push(
             &mut results.odometry,
             increment.unwrap_or_else(Pose2::identity),
@@ -103,6 +103,7 @@ impl Run {
         push(&mut results.covariances, estimate.covariance);
         push(&mut results.times_s, frame.time_s);
         push(&mut results.runtimes_s, runtime.as_secs_f64());
+        push(&mut results.agreements, estimate.agreement.unwrap_or(-1.0));
         push(&mut results.states, estimate.state as u8);
         let refined_pose = refined.map_or(estimate.pose, |refined| refined.pose);
         let covariance = refined.map_or(estimate.covariance, |refined| refined.covariance);

@@ -1,0 +1,108 @@
+//! What a run shows about itself, without the true poses.
+
+use serde::{Deserialize, Serialize};
+
+use super::localization_results::LocalizationResults;
+use super::rows::MetricRow;
+use crate::evaluation::Summary;
+use crate::geometry::Pose2;
+use crate::localization::State;
+
+/// States, uncertainty and agreement with the map over the frames of a run.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct RunSummary {
+    /// Number of frames.
+    pub frames: usize,
+    /// Number of frames in which the filter was tracking.
+    pub tracking: Option<usize>,
+    /// Number of the first frame in which it was tracking.
+    pub first_tracked: Option<usize>,
+    /// Length of the found path [m].
+    pub path_m: f64,
+    /// Mean speed [m/s]; `None` without times.
+    pub speed_m_per_s: Option<f64>,
+    /// Standard deviation of the position, larger axis [m].
+    pub position_sigma_m: Option<Summary>,
+    /// Standard deviation of the heading [rad].
+    pub heading_sigma_rad: Option<Summary>,
+    /// Share of the beams above the road that agree with the map (unitless).
+    pub agreement: Option<Summary>,
+}
+
+impl RunSummary {
+    /// The summary of results with their estimates. Uncertainty and agreement are those of the frames in
+    /// which the filter was tracking.
+    pub fn of(results: &LocalizationResults, estimates: &[Pose2]) -> Self {
+        let states = results.states.as_deref();
+        let is_tracked = |row: usize| states.is_none_or(|s| s[row] == State::Tracking as u8);
+        let tracked: Vec<usize> = (0..results.len()).filter(|&row| is_tracked(row)).collect();
+        let over_tracked = |value: &dyn Fn(usize) -> Option<f64>| {
+            let values: Vec<f64> = tracked.iter().filter_map(|&row| value(row)).collect();
+            Summary::of(&values)
+        };
+        let covariance = |row: usize| Some(results.covariances.as_ref()?[row]);
+        let steps = estimates.iter().zip(estimates.iter().skip(1));
+        let path_m = steps
+            .map(|(a, b)| (b.translation.vector - a.translation.vector).norm())
+            .sum();
+        let times_s = results.times_s.as_deref().unwrap_or_default();
+        let duration_s = times_s.first().zip(times_s.last()).map(|(a, b)| b - a);
+        Self {
+            frames: results.len(),
+            tracking: states.map(|_| tracked.len()),
+            first_tracked: states.and_then(|_| Some(results.frames[*tracked.first()?])),
+            path_m,
+            speed_m_per_s: duration_s.filter(|&s| s > 0.0).map(|s| path_m / s),
+            position_sigma_m: over_tracked(&|row| {
+                let position = covariance(row)?.fixed_view::<2, 2>(0, 0).into_owned();
+                Some(position.symmetric_eigenvalues().max().max(0.0).sqrt())
+            }),
+            heading_sigma_rad: over_tracked(&|row| Some(covariance(row)?[(2, 2)].max(0.0).sqrt())),
+            agreement: over_tracked(&|row| {
+                let share = results.agreements.as_ref()?[row];
+                (share >= 0.0).then_some(share)
+            }),
+        }
+    }
+
+    /// Rows of the report.
+    pub fn rows(&self) -> Vec<MetricRow> {
+        let mut rows = vec![MetricRow::new(
+            "frames: number of localized frames",
+            self.frames,
+        )];
+        if let Some(tracking) = self.tracking {
+            rows.extend([
+                MetricRow::new("tracking: number of frames in which the filter was tracking", tracking),
+                MetricRow::new("first tracked frame: number of the first frame in which the filter was tracking", self.first_tracked),
+            ]);
+        }
+        rows.push(MetricRow::new(
+            "path [m]: length of the found path",
+            self.path_m,
+        ));
+        if let Some(speed) = self.speed_m_per_s {
+            rows.push(MetricRow::new(
+                "speed [m/s]: length of the path over its duration",
+                speed,
+            ));
+        }
+        if let Some(sigma) = &self.position_sigma_m {
+            rows.extend([
+                MetricRow::new("position sigma median [m]: estimated standard deviation along its larger axis, tracked frames", sigma.median),
+                MetricRow::new("position sigma p95 [m]: its 95th percentile", sigma.p95),
+            ]);
+        }
+        if let Some(sigma) = &self.heading_sigma_rad {
+            rows.push(MetricRow::new(
+                "heading sigma median [deg]: estimated standard deviation, tracked frames",
+                sigma.median.to_degrees(),
+            ));
+        }
+        if let Some(agreement) = &self.agreement {
+            rows.push(MetricRow::new("agreement median: share of the beams above the road that end on a surface of the map, tracked frames", agreement.median));
+        }
+        rows
+    }
+}
