@@ -85,27 +85,55 @@ impl Motion {
     /// Moves the points of a scan to the moment of its pose. Afterwards the scan has no times; a scan
     /// without times is unchanged.
     pub fn deskew(&self, scan: &mut Scan) {
-        /// Equal intervals of time; the points of each share one transform.
-        const INTERVALS: usize = 720;
-        let finite = || scan.times_s.iter().copied().filter(|time| time.is_finite());
-        let (first, last) = (
-            finite().fold(f32::INFINITY, f32::min),
-            finite().fold(f32::NEG_INFINITY, f32::max),
-        );
-        if first <= last {
-            let interval_s = ((last - first) / INTERVALS as f32).max(f32::MIN_POSITIVE);
-            let transforms: Vec<Rigid3f> = (0..INTERVALS)
-                .map(|interval| {
-                    let time_s = first + (interval as f32 + 0.5) * interval_s;
-                    Rigid3f::from(&self.after(time_s.into()))
-                })
-                .collect();
-            for (point, time_s) in scan.points.iter_mut().zip(&scan.times_s) {
-                let interval = ((time_s - first) / interval_s) as usize;
-                *point = transforms[interval.min(INTERVALS - 1)].apply(*point);
-            }
+        let sweep = Sweep::spanning(scan.times_s.iter().copied());
+        let transforms = sweep.transforms(self);
+        for (point, &time_s) in scan.points.iter_mut().zip(&scan.times_s) {
+            *point = transforms[sweep.interval(time_s)].apply(*point);
         }
         scan.times_s.clear();
+    }
+}
+
+/// Equal intervals of the time of a sweep; the points of each share one transform.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sweep {
+    first_s: f32,
+    interval_s: f32,
+}
+
+impl Sweep {
+    const INTERVALS: usize = 720;
+
+    /// The intervals between the first and the last of finite times.
+    pub fn spanning(times_s: impl Iterator<Item = f32>) -> Self {
+        let (first_s, last_s) = (times_s.filter(|time_s| time_s.is_finite())).fold(
+            (f32::INFINITY, f32::NEG_INFINITY),
+            |(first, last), time_s| (first.min(time_s), last.max(time_s)),
+        );
+        let (first_s, last_s) = if first_s <= last_s {
+            (first_s, last_s)
+        } else {
+            (0.0, 0.0)
+        };
+        Self {
+            first_s,
+            interval_s: ((last_s - first_s) / Self::INTERVALS as f32).max(f32::MIN_POSITIVE),
+        }
+    }
+
+    /// Number of the interval of a time.
+    #[inline]
+    pub fn interval(&self, time_s: f32) -> usize {
+        (((time_s - self.first_s) / self.interval_s) as usize).min(Self::INTERVALS - 1)
+    }
+
+    /// For each interval, the transform of points to the moment of the scan's pose.
+    pub fn transforms(&self, motion: &Motion) -> Vec<Rigid3f> {
+        let transform = |interval: usize| {
+            let time_s = self.first_s + (interval as f32 + 0.5) * self.interval_s;
+            Rigid3f::from(&motion.after(time_s.into()))
+        };
+        (0..Self::INTERVALS).map(transform).collect()
     }
 }
 

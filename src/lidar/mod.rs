@@ -6,7 +6,7 @@ pub mod normals;
 pub mod range_image;
 pub mod scan;
 
-pub use deskewing::{Motion, Rotation, RotationDirection, interpolate_motion};
+pub use deskewing::{Motion, Rotation, RotationDirection, Sweep, interpolate_motion};
 pub use model::LidarModel;
 pub use normals::{NormalConfig, estimate_normals};
 pub use range_image::{NO_RETURN, RangeImage};

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use crate::validation::{InvalidValue, Validate, in_range, positive};
+use crate::validation::{InvalidValue, Validate, at_least_one, in_range, positive};
 
 /// Settings of the odometry. Lengths are shares of the sensor's range, which 98 % of the points do not exceed.
 ///
@@ -32,6 +32,12 @@ pub struct OdometryConfig {
     /// Maximum number of Gauss-Newton iterations.
     #[default(20)]
     pub iterations: usize,
+    /// Smallest scale of the robust kernel, in voxels.
+    #[default(0.1)]
+    pub min_kernel: f64,
+    /// Largest first motion, as a share of the range (unitless).
+    #[default(0.2)]
+    pub first_motion_share: f64,
     /// Largest deviation of a step from the prediction, as a share of the range per 0.1 s (unitless).
     #[default(0.04)]
     pub max_deviation_share: f64,
@@ -41,6 +47,12 @@ pub struct OdometryConfig {
     /// Smallest share of matched points of a step that is accepted (unitless).
     #[default(0.3)]
     pub min_matched_share: f64,
+    /// Largest mean robust cost of a step that is accepted, 0 to 1 (unitless).
+    #[default(0.85)]
+    pub max_cost: f64,
+    /// Number of scans in turn that do not fit, after which the local map begins anew.
+    #[default(10)]
+    pub restart_after: usize,
     /// Duration between scans that have no times [s].
     #[default(0.1)]
     pub period_s: f64,
@@ -59,9 +71,13 @@ impl Validate for OdometryConfig {
         in_range("min_range_share", self.min_range_share, 0.0..=0.5)?;
         in_range("voxel_points", self.voxel_points, 1.0..=1e6)?;
         in_range("iterations", self.iterations, 1..=1000)?;
+        in_range("min_kernel", self.min_kernel, 0.001..=10.0)?;
+        positive("first_motion_share", self.first_motion_share)?;
         positive("max_deviation_share", self.max_deviation_share)?;
         positive("max_deviation_deg", self.max_deviation_deg)?;
         in_range("min_matched_share", self.min_matched_share, 0.0..=1.0)?;
+        in_range("max_cost", self.max_cost, 0.0..=1.0)?;
+        at_least_one("restart_after", self.restart_after)?;
         positive("period_s", self.period_s)
     }
 }

@@ -19,10 +19,15 @@
 
 mod alignment;
 mod config;
+mod degeneracy;
 mod odometer;
+mod residuals;
 mod sampling;
 mod search;
+mod state;
+mod timing;
 mod voxel_map;
 
 pub use config::OdometryConfig;
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
+pub use timing::{TimingComparison, TimingError, compare_timings};

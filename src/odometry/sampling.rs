@@ -4,8 +4,9 @@ use std::collections::HashSet;
 
 use glam::Vec3;
 
+use super::config::OdometryConfig;
 use super::voxel_map::{CellHasher, pack};
-use crate::lidar::Scan;
+use crate::lidar::{Scan, Sweep};
 
 /// A measured point.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -14,6 +15,55 @@ pub struct TimedPoint {
     pub position: Vec3,
     /// Time of measurement after the moment of the scan's pose [s].
     pub time_s: f32,
+}
+
+/// Valid points of a scan, at most one per voxel.
+#[derive(Clone, Debug)]
+pub struct Sample {
+    /// The points, in the order of the scan.
+    pub points: Vec<TimedPoint>,
+    /// Their times.
+    pub sweep: Sweep,
+}
+
+impl Sample {
+    /// Samples a scan for a sensor of range `range_m`.
+    pub fn of(scan: &Scan, range_m: f64, config: &OdometryConfig) -> Self {
+        /// Larger times before or after the moment of the pose are errors [s].
+        const MAX_TIME_S: f32 = 1.0;
+        /// Largest range of a point, in ranges of the sensor.
+        const MAX_RANGE: f64 = 2.0;
+        let min_range_m = (config.min_range_share * range_m) as f32;
+        let max_range_m = (MAX_RANGE * range_m) as f32;
+        let valid = (scan.points.iter().enumerate())
+            .map(|(index, &position)| TimedPoint {
+                position,
+                time_s: scan.times_s.get(index).copied().unwrap_or(0.0),
+            })
+            .filter(|point| {
+                let square = point.position.length_squared();
+                square >= min_range_m * min_range_m
+                    && square <= max_range_m * max_range_m
+                    && point.time_s.abs() <= MAX_TIME_S
+            });
+        let points = first_per_voxel(valid, config.map_spacing * config.voxel_share * range_m);
+        let sweep = Sweep::spanning(points.iter().map(|point| point.time_s));
+        Self { points, sweep }
+    }
+
+    /// Points at a larger distance from each other.
+    pub fn thinned(&self, voxel_m: f64) -> Vec<TimedPoint> {
+        first_per_voxel(self.points.iter().copied(), voxel_m)
+    }
+}
+
+/// The first point in each voxel.
+fn first_per_voxel(points: impl Iterator<Item = TimedPoint>, voxel_m: f64) -> Vec<TimedPoint> {
+    let per_m = (1.0 / voxel_m) as f32;
+    let mut occupied = HashSet::<u64, CellHasher>::default();
+    points
+        .filter(|point| occupied.insert(pack((point.position * per_m).floor().as_ivec3())))
+        .collect()
 }
 
 /// Range that 98 % of the valid points do not exceed [m]; `None` with few points.
@@ -33,31 +83,4 @@ pub fn sensor_range(scan: &Scan) -> Option<f64> {
     }
     let rank = (QUANTILE * (ranges.len() - 1) as f64) as usize;
     Some((*ranges.select_nth_unstable_by(rank, f32::total_cmp).1).into())
-}
-
-/// Points with valid ranges and times: the first in each voxel of edge `voxel_m`.
-pub fn sample(scan: &Scan, min_range_m: f32, max_range_m: f32, voxel_m: f32) -> Vec<TimedPoint> {
-    /// Longer after or before the moment of the pose, a time is an error [s].
-    const MAX_TIME_S: f32 = 1.0;
-    let time_of = |index: usize| scan.times_s.get(index).copied().unwrap_or(0.0);
-    let points = (scan.points.iter().enumerate())
-        .map(|(index, &position)| TimedPoint {
-            position,
-            time_s: time_of(index),
-        })
-        .filter(|point| {
-            let range_sq = point.position.length_squared();
-            range_sq >= min_range_m * min_range_m
-                && range_sq <= max_range_m * max_range_m
-                && point.time_s.abs() <= MAX_TIME_S
-        });
-    first_per_voxel(points, voxel_m)
-}
-
-/// The first point in each voxel of edge `voxel_m`, in order.
-pub fn first_per_voxel(points: impl Iterator<Item = TimedPoint>, voxel_m: f32) -> Vec<TimedPoint> {
-    let mut occupied = HashSet::<u64, CellHasher>::default();
-    points
-        .filter(|point| occupied.insert(pack((point.position / voxel_m).floor().as_ivec3())))
-        .collect()
 }

@@ -3,6 +3,7 @@
 use nalgebra::Vector3;
 
 use super::alignment::{Alignment, Problem};
+use super::residuals::Observation;
 use crate::geometry::Pose3;
 
 /// The alignment with the least cost from starts around the prediction and around the previous pose: shifts along
@@ -12,14 +13,21 @@ pub fn search(problem: &Problem, step_m: f64, reach_m: f64) -> Option<Alignment>
     const POINTS: usize = 400;
     /// Starts that are aligned.
     const ALIGNED: usize = 8;
-    let stride = problem.points.len().div_ceil(POINTS).max(1);
-    let points: Vec<_> = problem.points.iter().copied().step_by(stride).collect();
-    let coarse = Problem {
+    let stride = problem.observation.points.len().div_ceil(POINTS).max(1);
+    let points: Vec<_> = (problem.observation.points.iter().copied().step_by(stride)).collect();
+    let observation = Observation {
         points: &points,
+        ..problem.observation
+    };
+    let coarse = Problem {
+        observation,
         ..*problem
     };
     let mut starts: Vec<(f64, Pose3)> = (starts(problem, step_m, reach_m).into_iter())
-        .map(|start| (coarse.cost_at(&start, step_m), start))
+        .map(|start| {
+            let cost = coarse.cost(&start, step_m, &mut observation.unmatched());
+            (cost, start)
+        })
         .collect();
     starts.sort_by(|a, b| a.0.total_cmp(&b.0));
     let aligned =
@@ -48,7 +56,7 @@ fn starts(problem: &Problem, step_m: f64, reach_m: f64) -> Vec<Pose3> {
     let moves: Vec<Pose3> = (turning.chain(driving))
         .map(|(shift, turn)| Pose3::new(shift, turn))
         .collect();
-    [problem.predicted, problem.odom_from_previous]
+    [problem.predicted, problem.observation.odom_from_previous]
         .iter()
         .flat_map(|middle| moves.iter().map(move |start| middle * start))
         .collect()

@@ -136,6 +136,18 @@ impl VoxelMap {
         }
     }
 
+    /// The means of the finest voxels, in a fixed order.
+    pub fn means(&self) -> Vec<DVec3> {
+        let level = &self.levels[0];
+        let mut keys: Vec<u64> = level.cells.keys().copied().collect();
+        keys.sort_unstable();
+        let mean = |key: u64| {
+            let cell = &level.cells[&key];
+            unpack(key).as_dvec3() * level.edge_m + (cell.first / cell.count).as_dvec3()
+        };
+        keys.into_iter().map(mean).collect()
+    }
+
     /// Removes voxels whose mean is farther than `radius_m` from a point.
     pub fn remove_beyond(&mut self, center: DVec3, radius_m: f64) {
         for level in &mut self.levels {

@@ -1,0 +1,318 @@
+//! State between scans: the local map, the pose, the motion, and how well it predicts.
+
+use glam::{DMat3, DQuat, DVec3};
+use nalgebra::Vector6;
+
+use super::alignment::{Alignment, Problem};
+use super::config::OdometryConfig;
+use super::residuals::Observation;
+use super::sampling::{Sample, sensor_range};
+use super::search::search;
+use super::voxel_map::VoxelMap;
+use crate::geometry::Pose3;
+use crate::lidar::{Motion, Scan};
+
+/// State after a scan.
+#[derive(Clone, Debug)]
+pub struct State {
+    map: VoxelMap,
+    /// Range of the sensor, for all lengths [m].
+    range_m: f64,
+    /// Mean range of the last scans [m].
+    mean_range_m: f64,
+    /// `p_odom = odom_from_lidar * p_lidar`.
+    pub odom_from_lidar: Pose3,
+    /// The last motion; `None` before the second scan.
+    pub motion: Option<Motion>,
+    /// The first scan, which is compensated once its motion is known.
+    first: Option<Sample>,
+    /// Mean square of the deviations from the predictions [m², rad²].
+    deviation: [f64; 2],
+    /// Mean cost of the registered scans.
+    cost: f64,
+    /// Scans since the last that was registered.
+    missed: usize,
+}
+
+impl State {
+    /// The state after the first scan; `None` if it has too few points.
+    pub fn begin(scan: &Scan, config: &OdometryConfig) -> Option<Self> {
+        let range_m = sensor_range(scan)?;
+        let mut state = Self {
+            map: VoxelMap::new(config.voxel_share * range_m, config.voxel_points),
+            range_m,
+            mean_range_m: range_m,
+            odom_from_lidar: Pose3::identity(),
+            motion: None,
+            first: None,
+            deviation: [0.0; 2],
+            cost: 1.0,
+            missed: 0,
+        };
+        let sample = state.sample(scan, config);
+        state.map.insert(&mapped(&sample, &Pose3::identity(), None));
+        state.first = Some(sample);
+        Some(state)
+    }
+
+    /// Pose after a time at constant velocity.
+    pub fn predicted(&self, duration_s: f64) -> Pose3 {
+        let motion = self
+            .motion
+            .map_or(Pose3::identity(), |motion| motion.after(duration_s));
+        self.odom_from_lidar * motion
+    }
+
+    /// Variances of the prediction, (x, y, z, roll, pitch, yaw) in the lidar frame [m², rad²].
+    pub fn prior(&self, duration_s: f64, config: &OdometryConfig) -> Vector6<f64> {
+        /// Standard deviations of the mean deviation.
+        const SIGMAS: f64 = 3.0;
+        /// Least standard deviation per period, in voxels.
+        const FLOOR: f64 = 0.3;
+        /// Least standard deviation per period [rad].
+        const FLOOR_RAD: f64 = 0.02;
+        /// Standard deviation of the first motion [rad].
+        const FIRST_RAD: f64 = 0.3;
+        let periods = (duration_s / config.period_s).max(1.0);
+        let floor_m = FLOOR * self.voxel_m(config) * periods;
+        let [shift, turn] = match self.motion {
+            Some(_) => {
+                let [shift, turn] = self.deviation.map(|square| SIGMAS * SIGMAS * square);
+                [
+                    shift + floor_m.powi(2),
+                    turn + (FLOOR_RAD * periods).powi(2),
+                ]
+            }
+            None => [
+                (config.first_motion_share * self.range_m).powi(2),
+                FIRST_RAD.powi(2),
+            ],
+        };
+        Vector6::new(shift, shift, shift, turn, turn, turn)
+    }
+
+    /// Registers a scan to the local map and adds it; `None` if it does not fit, then the pose is unchanged.
+    pub fn register(
+        &mut self,
+        scan: &Scan,
+        duration_s: f64,
+        config: &OdometryConfig,
+    ) -> Option<Alignment> {
+        self.follow_range(sensor_range(scan)?, config);
+        let sample = self.sample(scan, config);
+        let sparse = sample.thinned(config.registration_spacing * self.voxel_m(config));
+        let problem = Problem {
+            observation: Observation {
+                map: &self.map,
+                points: &sparse,
+                sweep: sample.sweep,
+                odom_from_previous: self.odom_from_lidar,
+                duration_s,
+            },
+            predicted: self.predicted(duration_s),
+            prior: self.prior(duration_s, config),
+            min_kernel_m: config.min_kernel * self.voxel_m(config),
+            iterations: config.iterations,
+        };
+        let found = match &self.first {
+            None => self.track(&problem, config),
+            Some(first) => self.first_motion(first, &problem, config),
+        }?;
+        if !self.is_possible(&found, &problem.predicted, duration_s, config) {
+            return None;
+        }
+        let predicted = problem.predicted;
+        self.update(&found, &predicted, &sample, duration_s, config);
+        Some(found)
+    }
+
+    /// Registers a scan from the prediction; if the result is worse than usual, from several starts.
+    fn track(&self, problem: &Problem, config: &OdometryConfig) -> Option<Alignment> {
+        /// Increase of the cost that starts a search.
+        const WORSE: f64 = 0.1;
+        /// Limits of the initial kernel, in voxels.
+        const KERNEL: [f64; 2] = [1.0, 4.0];
+        /// Step and reach of the search, in voxels.
+        const STEP: f64 = 4.0;
+        const REACH: f64 = 8.0;
+        let voxel_m = self.voxel_m(config);
+        let [shift, turn] = self.deviation.map(f64::sqrt);
+        let kernel_m = 3.0 * (shift + 0.5 * self.range_m * turn);
+        let kernel_m = kernel_m.clamp(KERNEL[0] * voxel_m, KERNEL[1] * voxel_m);
+        let found = problem.align(&problem.predicted, kernel_m);
+        if found
+            .as_ref()
+            .is_some_and(|found| found.cost < self.cost + WORSE)
+        {
+            return found;
+        }
+        let searched = search(problem, STEP * voxel_m, REACH * voxel_m);
+        (found.into_iter().chain(searched)).min_by(|a, b| a.cost.total_cmp(&b.cost))
+    }
+
+    /// The motion from the first scan to the second, without a prediction. The first scan is compensated by it, and the
+    /// second is registered again.
+    fn first_motion(
+        &self,
+        first: &Sample,
+        problem: &Problem,
+        config: &OdometryConfig,
+    ) -> Option<Alignment> {
+        const PASSES: usize = 3;
+        const STEP: f64 = 4.0;
+        let voxel_m = self.voxel_m(config);
+        let mut found = search(
+            problem,
+            STEP * voxel_m,
+            config.first_motion_share * self.range_m,
+        )?;
+        for _ in 0..PASSES {
+            let motion = Motion {
+                previous_from_current: self.odom_from_lidar.inverse() * found.odom_from_lidar,
+                duration_s: problem.observation.duration_s,
+            };
+            let mut map = self.empty_map(config);
+            map.insert(&mapped(first, &self.odom_from_lidar, Some(&motion)));
+            let observation = Observation {
+                map: &map,
+                ..problem.observation
+            };
+            let problem = Problem {
+                observation,
+                ..*problem
+            };
+            found = problem.align(&found.odom_from_lidar, voxel_m)?;
+        }
+        Some(found)
+    }
+
+    /// Whether a motion fits the local map, and deviates from the prediction by no more than a vehicle can accelerate.
+    fn is_possible(
+        &self,
+        found: &Alignment,
+        predicted: &Pose3,
+        duration_s: f64,
+        config: &OdometryConfig,
+    ) -> bool {
+        /// Period of the largest deviations [s].
+        const PERIOD_S: f64 = 0.1;
+        let periods = (duration_s / PERIOD_S).max(1.0);
+        let deviation = predicted.inverse() * found.odom_from_lidar;
+        let is_smooth = self.motion.is_none()
+            || deviation.translation.vector.norm()
+                <= config.max_deviation_share * self.range_m * periods
+                && deviation.rotation.angle() <= config.max_deviation_deg.to_radians() * periods;
+        is_smooth
+            && found.cost <= config.max_cost
+            && found.matched_share >= config.min_matched_share
+    }
+
+    /// Takes over a registered scan.
+    fn update(
+        &mut self,
+        found: &Alignment,
+        predicted: &Pose3,
+        sample: &Sample,
+        duration_s: f64,
+        config: &OdometryConfig,
+    ) {
+        /// Weight of a scan in the mean deviation.
+        const NEW_DEVIATION: f64 = 0.1;
+        /// Weight of a scan in the mean cost.
+        const NEW_COST: f64 = 0.2;
+        let motion = Motion {
+            previous_from_current: self.odom_from_lidar.inverse() * found.odom_from_lidar,
+            duration_s,
+        };
+        if let Some(first) = self.first.take() {
+            self.map = self.empty_map(config);
+            self.map
+                .insert(&mapped(&first, &self.odom_from_lidar, Some(&motion)));
+            self.cost = found.cost;
+        } else {
+            let deviation = predicted.inverse() * found.odom_from_lidar;
+            let squares = [
+                deviation.translation.vector.norm_squared(),
+                deviation.rotation.angle().powi(2),
+            ];
+            for (mean, square) in self.deviation.iter_mut().zip(squares) {
+                *mean += NEW_DEVIATION * (square - *mean);
+            }
+            self.cost += NEW_COST * (found.cost - self.cost);
+        }
+        self.odom_from_lidar = found.odom_from_lidar;
+        self.motion = Some(motion);
+        self.missed = 0;
+        self.map
+            .insert(&mapped(sample, &self.odom_from_lidar, Some(&motion)));
+        let center = self.odom_from_lidar.translation.vector.into();
+        self.map
+            .remove_beyond(center, config.map_radius_share * self.range_m);
+    }
+
+    /// Moves by the prediction. After several scans in turn that do not fit, the local map begins anew with this one.
+    pub fn coast(&mut self, scan: &Scan, duration_s: f64, config: &OdometryConfig) {
+        self.odom_from_lidar = self.predicted(duration_s);
+        self.missed += 1;
+        if self.motion.is_some() && self.missed < config.restart_after
+            || sensor_range(scan).is_none()
+        {
+            return;
+        }
+        let sample = self.sample(scan, config);
+        self.map = self.empty_map(config);
+        self.map.insert(&mapped(
+            &sample,
+            &self.odom_from_lidar,
+            self.motion.as_ref(),
+        ));
+        self.first = self.motion.is_none().then_some(sample);
+        self.missed = 0;
+    }
+
+    /// Changes all lengths where the range of the sensor has changed much, such as from a room to a street.
+    fn follow_range(&mut self, range_m: f64, config: &OdometryConfig) {
+        /// Weight of a scan in the mean range.
+        const NEW: f64 = 0.05;
+        /// Ratio of the mean range to that of the lengths.
+        const CHANGE: f64 = 2.5;
+        self.mean_range_m += NEW * (range_m - self.mean_range_m);
+        let ratio = self.mean_range_m / self.range_m;
+        if (1.0 / CHANGE..=CHANGE).contains(&ratio) || self.motion.is_none() {
+            return;
+        }
+        self.range_m = self.mean_range_m;
+        let means = self.map.means();
+        self.map = self.empty_map(config);
+        self.map.insert(&means);
+    }
+
+    fn voxel_m(&self, config: &OdometryConfig) -> f64 {
+        config.voxel_share * self.range_m
+    }
+
+    fn empty_map(&self, config: &OdometryConfig) -> VoxelMap {
+        VoxelMap::new(self.voxel_m(config), config.voxel_points)
+    }
+
+    fn sample(&self, scan: &Scan, config: &OdometryConfig) -> Sample {
+        Sample::of(scan, self.range_m, config)
+    }
+}
+
+/// Points in the odom frame, compensated by the motion.
+fn mapped(sample: &Sample, odom_from_lidar: &Pose3, motion: Option<&Motion>) -> Vec<DVec3> {
+    let rotation = DMat3::from_quat(DQuat::from(odom_from_lidar.rotation));
+    let translation = DVec3::from(odom_from_lidar.translation.vector);
+    let still = Motion {
+        previous_from_current: Pose3::identity(),
+        duration_s: 1.0,
+    };
+    let compensation = sample.sweep.transforms(motion.unwrap_or(&still));
+    (sample.points.iter())
+        .map(|point| {
+            let in_lidar = compensation[sample.sweep.interval(point.time_s)].apply(point.position);
+            rotation * in_lidar.as_dvec3() + translation
+        })
+        .collect()
+}
