@@ -6,14 +6,14 @@
 use std::path::PathBuf;
 
 use fpmcl::map::{MapBuilder, MapConfig};
-use fpmcl::recording::Sequence;
+use fpmcl::recording::Recording;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<PathBuf> = std::env::args_os().skip(1).map(PathBuf::from).collect();
     let [recording, map_file] = arguments.as_slice() else {
         return Err("usage: build_map RECORDING MAP.ply".into());
     };
-    let drive = Sequence::open_folder(recording)?;
+    let drive = Recording::open_with_poses(recording)?;
     let map = MapBuilder::new(MapConfig::default()).build(drive.scans())?;
     map.save(map_file)?;
     println!(

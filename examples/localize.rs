@@ -5,10 +5,9 @@
 
 use std::path::PathBuf;
 
-use fpmcl::geometry::StampedPose;
 use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
 use fpmcl::map::{Map, MapOptions};
-use fpmcl::recording::{Sequence, poses::write_tum};
+use fpmcl::recording::{Recording, Selection, poses::write_tum};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<PathBuf> = std::env::args_os().skip(1).map(PathBuf::from).collect();
@@ -18,7 +17,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let map = Map::load(map_file, &MapOptions::default())?;
     let mut localizer = Localizer::new(&map, LocalizerConfig::default(), Start::Anywhere, 0)?;
     let mut trajectory = Vec::new();
-    for frame in &Sequence::open_folder(recording)?.frames {
+    for frame in &Recording::open(recording, &Selection::default())?.frames {
         let estimate = localizer.step(&frame.read()?, Odometry::Unknown)?;
         let (t, deviations) = (estimate.pose.translation, estimate.standard_deviations());
         let state = estimate.state.word();
@@ -26,10 +25,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             "{}: {:.2} {:.2} +- {:.3?} {state}",
             frame.number, t.x, t.y, deviations
         );
-        trajectory.push(StampedPose {
-            map_from_lidar: estimate.map_from_lidar,
-            ..frame.stamped()
-        });
+        trajectory.push(frame.stamped(estimate.map_from_lidar));
     }
     write_tum(std::fs::File::create(trajectory_file)?, &trajectory)?;
     Ok(())

@@ -10,8 +10,9 @@ use std::path::{Path, PathBuf};
 
 use fpmcl::app::config::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
-    Initialization, LocalizationConfig, RefinementConfig, RenderedRangeImage,
+    Initialization, LocalizationConfig, RangeImageConfig, RefinementConfig,
 };
+use fpmcl::lidar::LidarModel;
 use fpmcl::simulation::SimulationConfig;
 
 fn root() -> &'static Path {
@@ -150,9 +151,10 @@ fn the_build_map_file_of_range_mcl_loads_unchanged() {
     let config: BuildMapConfig = load(&root().join("tests/range_mcl/build_map.yml"));
     let expected = BuildMapConfig {
         scan_folder: "../data/07/velodyne".into(),
-        pose_file: "../data/07/poses.txt".into(),
+        pose_file: Some("../data/07/poses.txt".into()),
         calib_file: Some("../data/07/calib.txt".into()),
         mesh_file: "../data/mesh_kitti_07.ply".into(),
+        range_image: RangeImageConfig::of(&LidarModel::default()),
         ..BuildMapConfig::default()
     };
     assert_eq!(config, expected);
@@ -166,13 +168,14 @@ fn the_localization_file_of_range_mcl_loads_unchanged() {
         map_file: "../data/mesh_kitti_07.ply".into(),
         map_pose_file: Some("../data/07/poses.txt".into()),
         map_calib_file: Some("../data/07/calib.txt".into()),
-        pose_file: "../data/07/poses.txt".into(),
+        pose_file: Some("../data/07/poses.txt".into()),
         calib_file: Some("../data/07/calib.txt".into()),
         result_path: "../results/demo_loc_results.npz".into(),
-        pose_tracking: false,
-        range_image: RenderedRangeImage {
-            max_instance: 50,
-            ..RenderedRangeImage::default()
+        pose_tracking: Some(false),
+        range_image: RangeImageConfig {
+            max_instance: Some(50),
+            render_instanced: Some(true),
+            ..RangeImageConfig::of(&LidarModel::default())
         },
         ..LocalizationConfig::default()
     };

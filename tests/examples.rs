@@ -9,7 +9,7 @@ use std::process::Command;
 
 use common::simulate_two_drives;
 use fpmcl::geometry::Pose3;
-use fpmcl::recording::{Sequence, poses::read_tum};
+use fpmcl::recording::{Recording, poses::read_tum};
 
 const SIMULATION: &str = "\
 output_folder: street
@@ -45,8 +45,8 @@ fn a_second_drive_is_localized_and_refined_in_the_map_of_the_first() {
     simulate_two_drives(folder, SIMULATION);
     let built = example("build_map", folder, &["street/drive_1", "map.ply"]);
     assert!(built.contains("key scans"), "{built}");
-    let query = ["street/drive_2", "map.ply", "trajectory.txt"];
-    let localized = example("localize", folder, &query);
+    let arguments = ["street/drive_2", "map.ply", "trajectory.txt"];
+    let localized = example("localize", folder, &arguments);
     assert_eq!(localized.lines().count(), 16);
     assert!(
         localized.lines().last().unwrap().ends_with("tracking"),
@@ -54,19 +54,20 @@ fn a_second_drive_is_localized_and_refined_in_the_map_of_the_first() {
     );
 
     // The map frame is the lidar frame of the first pose of drive 1.
-    let map = Sequence::open_folder(&folder.join("street/drive_1")).unwrap();
-    let truth = Sequence::open_folder(&folder.join("street/drive_2")).unwrap();
-    let truth = truth.in_map(&map.world_from_map);
+    let map = Recording::open_with_poses(&folder.join("street/drive_1")).unwrap();
+    let query = Recording::open_with_poses(&folder.join("street/drive_2")).unwrap();
+    let truth = query.own_track().unwrap().in_map(&map.world().0);
     let found = read_tum(&folder.join("trajectory.txt")).unwrap();
-    let refined = example("refine", folder, &query);
-    for (row, (frame, line)) in truth.frames.iter().zip(refined.lines()).enumerate().skip(5) {
-        let error_m = distance_m(&found[row].map_from_lidar, &frame.map_from_lidar);
+    let refined = example("refine", folder, &arguments);
+    let rows = truth.map_from_lidar.iter().zip(refined.lines());
+    for (row, (truth, line)) in rows.enumerate().skip(5) {
+        let error_m = distance_m(&found[row].map_from_lidar, truth);
         assert!(error_m < 0.1, "row {row}: {error_m} m");
         let numbers: Vec<f64> = line
             .split(' ')
             .filter_map(|word| word.parse().ok())
             .collect();
-        let position = frame.map_from_lidar.translation;
+        let position = truth.translation;
         let error_m = (numbers[0] - position.x).hypot(numbers[1] - position.y);
         assert!(error_m < 0.05, "refined row {row}: {error_m} m");
     }

@@ -24,13 +24,13 @@ use fpmcl::app::config::{
 };
 use fpmcl::app::results::LocalizationResults;
 use fpmcl::geometry::{FARTHEST_M, Pose2, Pose3, TriangleMesh};
-use fpmcl::lidar::{RotationDirection, Scan};
+use fpmcl::lidar::{Rotation, RotationDirection, Scan};
 use fpmcl::map::ply;
 use fpmcl::recording::poses::{
     CameraPoses, read_times, read_tum, write_kitti, write_times, write_tum,
 };
 use fpmcl::recording::velodyne::{read_labels, write_labels, write_scan};
-use fpmcl::recording::{Calibration, Sequence, scan_files};
+use fpmcl::recording::{Calibration, Recording, scan_files};
 use fpmcl::simulation::SimulationConfig;
 
 use fuzzed::files;
@@ -204,7 +204,7 @@ fn recordings() {
         |file| {
             let folder = file.path.with_file_name("recording");
             write_recording(&folder, file.bytes);
-            let opened = Sequence::open_folder(&folder);
+            let opened = Recording::open_with_poses(&folder);
             let sequence = opened.map_err(|error| format!("recording.txt: {error}"))?;
             let frames = &sequence.frames;
             assert!(!frames.is_empty());
@@ -215,12 +215,14 @@ fn recordings() {
             );
             for frame in frames {
                 assert!(frame.time_s.is_finite());
-                assert_eq!(frame.map_from_lidar, sequence.map_from_lidar[frame.number]);
-                let position = frame.map_from_lidar.translation.vector;
+                let position = frame.map_from_lidar.unwrap().translation.vector;
                 assert!(position.iter().all(|m| m.is_finite()));
             }
             for frame in &sequence
-                .rotating(Some(RotationDirection::Clockwise))
+                .rotating(Some(Rotation {
+                    direction: RotationDirection::Clockwise,
+                    period_s: 0.1,
+                }))
                 .compensated_by_poses()
                 .frames
             {
@@ -469,10 +471,10 @@ fn set<'a, T: CommandConfig + PartialEq>(
     let arguments = ["fpmcl", command].map(str::to_owned);
     let cli = Cli::try_parse_from(arguments.into_iter().chain(settings)).map_err(text)?;
     let settings = match cli.command {
-        Command::BuildMap(args)
-        | Command::Localize(args)
-        | Command::Refine(args)
-        | Command::Evaluate(args)
+        Command::BuildMap(args) => args.run.source.settings,
+        Command::Localize(args) => args.run.source.settings,
+        Command::Refine(args) => args.run.source.settings,
+        Command::Evaluate(args)
         | Command::Simulate(args) => args.source.settings,
         Command::Compare(args) => args.source.settings,
         Command::Ground(args) => args.settings,

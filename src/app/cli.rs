@@ -1,7 +1,7 @@
 //! The command line as types; nothing else.
 
 use std::num::NonZeroUsize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
 use tracing::level_filters::LevelFilter;
@@ -37,26 +37,37 @@ Examples:
 /// The subcommands, in the order of their use.
 #[derive(Clone, Debug, Subcommand)]
 pub enum Command {
+    /// Describe a recording, a map or a result, and what is missing for which command.
+    #[command(after_help = "\
+Examples:
+  fpmcl info drive_1/
+  fpmcl info map.ply")]
+    Info(InfoArgs),
+
     /// Build a triangle-mesh map from scans with poses.
     #[command(after_help = "\
 Examples:
+  fpmcl build-map drive_1/ --output map.ply
   fpmcl build-map config/build_map.yml
   fpmcl build-map --set mesh_file=results/even.ply --set frame_step=2 --force")]
-    BuildMap(RunArgs),
+    BuildMap(BuildMapArgs),
 
     /// Localize a recording in a map, scan by scan.
     #[command(after_help = "\
 Examples:
+  fpmcl localize drive_2/ --map map.ply       the start may be anywhere
+  fpmcl localize drive_2/ --map map.ply --start 12.5,-3,90
   fpmcl localize config/localization.yml
   fpmcl localize --set pose_tracking=False --set range_image.width=1024 --seed 7")]
-    Localize(RunArgs),
+    Localize(LocalizeArgs),
 
     /// Refine the trajectory that `localize` found.
     #[command(after_help = "\
 Examples:
+  fpmcl refine results/localization.npz
   fpmcl refine config/refinement.yml
   fpmcl refine --set result_file=results/localization.npz --backend cpu")]
-    Refine(RunArgs),
+    Refine(RefineArgs),
 
     /// Compute the errors of a result against the ground truth.
     #[command(after_help = "\
@@ -142,7 +153,8 @@ pub struct DoctorArgs {
 /// Configuration and machine.
 #[derive(Clone, Debug, Args)]
 pub struct ConfigArgs {
-    /// YAML file; by default the command's file under config/ or, without one, built-in values.
+    /// Configuration (.yml), or what the command works on; by default the command's file under config/ or, without one, built-in values.
+    #[arg(value_name = "CONFIG | INPUT")]
     pub config: Option<PathBuf>,
 
     /// Override a key, such as range_image.width=1024; repeatable.
@@ -168,6 +180,81 @@ pub struct RunArgs {
     /// Replace existing output; sets the key `force` where it exists.
     #[arg(long)]
     pub force: bool,
+}
+
+/// Arguments of `info`.
+#[derive(Clone, Debug, Args)]
+pub struct InfoArgs {
+    /// Folder of a recording or of its scans, map (.ply), or result (.npz).
+    pub path: PathBuf,
+}
+
+/// Arguments of `build-map`.
+#[derive(Clone, Debug, Args)]
+pub struct BuildMapArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    pub run: RunArgs,
+
+    /// Map to write; sets the key `mesh_file`.
+    #[arg(long, value_name = "MAP")]
+    pub output: Option<PathBuf>,
+
+    /// Poses of the recording; by default those that it contains. Sets the key `pose_file`.
+    #[arg(long, value_name = "FILE")]
+    pub poses: Option<PathBuf>,
+
+    /// Calibration of the camera whose poses these are; sets the key `calib_file`.
+    #[arg(long, value_name = "FILE")]
+    pub calib: Option<PathBuf>,
+}
+
+/// Arguments of `localize`.
+#[derive(Clone, Debug, Args)]
+pub struct LocalizeArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    pub run: RunArgs,
+
+    /// Map of `build-map` or range-mcl; sets the key `map_file`.
+    #[arg(long, value_name = "MAP")]
+    pub map: Option<PathBuf>,
+
+    /// Start in the map [m, deg], if it is known; sets the key `initial_pose`.
+    #[arg(long, value_name = "X,Y,HEADING", value_parser = start, allow_hyphen_values = true)]
+    pub start: Option<[f64; 3]>,
+
+    /// Odometry, rows of KITTI or TUM; by default the scans. Sets the key `odometry_file`.
+    #[arg(long, value_name = "FILE")]
+    pub odometry: Option<PathBuf>,
+
+    /// True poses of the recording for the report; sets the key `pose_file`.
+    #[arg(long, value_name = "FILE")]
+    pub truth: Option<PathBuf>,
+
+    /// Calibration of the camera whose poses these are; sets the key `calib_file`.
+    #[arg(long, value_name = "FILE")]
+    pub calib: Option<PathBuf>,
+
+    /// Result to write (.npz); sets the key `result_path`.
+    #[arg(long, value_name = "RESULT")]
+    pub output: Option<PathBuf>,
+}
+
+/// Arguments of `refine`.
+#[derive(Clone, Debug, Args)]
+pub struct RefineArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    pub run: RunArgs,
+
+    /// Recording; by default that of the localization. Sets the key `scan_folder`.
+    #[arg(long, value_name = "RECORDING")]
+    pub recording: Option<PathBuf>,
+
+    /// Map; by default that of the localization. Sets the key `map_file`.
+    #[arg(long, value_name = "MAP")]
+    pub map: Option<PathBuf>,
 }
 
 /// Arguments of `demo`.
@@ -306,26 +393,114 @@ impl Command {
     /// Renderer and threads of this command.
     pub fn machine(&self) -> MachineArgs {
         match self {
-            Self::BuildMap(args)
-            | Self::Localize(args)
-            | Self::Refine(args)
-            | Self::Evaluate(args)
-            | Self::Simulate(args) => args.source.machine,
+            Self::BuildMap(args) => args.run.source.machine,
+            Self::Localize(args) => args.run.source.machine,
+            Self::Refine(args) => args.run.source.machine,
+            Self::Evaluate(args) | Self::Simulate(args) => args.source.machine,
             Self::Compare(args) => args.source.machine,
             Self::Demo(args) => args.machine,
             Self::Ground(args) => args.machine,
-            Self::Config(_) | Self::Doctor(_) => MachineArgs::default(),
+            Self::Config(_) | Self::Doctor(_) | Self::Info(_) => MachineArgs::default(),
         }
     }
 }
 
+impl ConfigArgs {
+    /// The configuration file.
+    pub fn config_file(&self) -> Option<&Path> {
+        self.config.as_deref().filter(|path| is_config(path))
+    }
+
+    /// What the command works on, where the argument is no configuration.
+    pub fn input(&self) -> Option<&Path> {
+        self.config.as_deref().filter(|path| !is_config(path))
+    }
+}
+
+/// Whether a path is that of a configuration.
+fn is_config(path: &Path) -> bool {
+    let extension = path.extension();
+    extension.is_some_and(|it| it.eq_ignore_ascii_case("yml") || it.eq_ignore_ascii_case("yaml"))
+}
+
 impl RunArgs {
+    /// Settings of the flags that stand for a key, and of the argument, whose key this is.
+    pub fn flags_with_input(&self, key: &str) -> Vec<(String, String)> {
+        [path_settings(&[(key, self.source.input())]), self.flags()].concat()
+    }
+
     /// Settings of the flags that stand for a key.
     pub fn flags(&self) -> Vec<(String, String)> {
         let seed = self.seed.map(|seed| ("seed".to_owned(), seed.to_string()));
         let force = self.force.then(|| ("force".to_owned(), "true".to_owned()));
         seed.into_iter().chain(force).collect()
     }
+}
+
+impl BuildMapArgs {
+    /// Settings of the flags that stand for a key.
+    pub fn flags(&self) -> Vec<(String, String)> {
+        let paths = [
+            ("scan_folder", self.run.source.input()),
+            ("mesh_file", self.output.as_deref()),
+            ("pose_file", self.poses.as_deref()),
+            ("calib_file", self.calib.as_deref()),
+        ];
+        [path_settings(&paths), self.run.flags()].concat()
+    }
+}
+
+impl LocalizeArgs {
+    /// Settings of the flags that stand for a key.
+    pub fn flags(&self) -> Vec<(String, String)> {
+        let paths = [
+            ("scan_folder", self.run.source.input()),
+            ("map_file", self.map.as_deref()),
+            ("odometry_file", self.odometry.as_deref()),
+            ("pose_file", self.truth.as_deref()),
+            ("calib_file", self.calib.as_deref()),
+            ("result_path", self.output.as_deref()),
+        ];
+        let start = (self.start).map(|start| ("initial_pose".to_owned(), format!("{start:?}")));
+        let mut settings = path_settings(&paths);
+        settings.extend(start);
+        [settings, self.run.flags()].concat()
+    }
+}
+
+impl RefineArgs {
+    /// Settings of the flags that stand for a key.
+    pub fn flags(&self) -> Vec<(String, String)> {
+        let paths = [
+            ("result_file", self.run.source.input()),
+            ("scan_folder", self.recording.as_deref()),
+            ("map_file", self.map.as_deref()),
+        ];
+        [path_settings(&paths), self.run.flags()].concat()
+    }
+}
+
+/// Settings of keys whose values are paths, as YAML strings in single quotes.
+fn path_settings(paths: &[(&str, Option<&Path>)]) -> Vec<(String, String)> {
+    let quoted = |path: &Path| format!("'{}'", path.display().to_string().replace('\'', "''"));
+    let given = paths
+        .iter()
+        .filter_map(|(key, path)| Some((*key, (*path)?)));
+    given
+        .map(|(key, path)| (key.to_owned(), quoted(path)))
+        .collect()
+}
+
+/// Parses a start: x, y [m], heading [deg].
+fn start(text: &str) -> Result<[f64; 3], &'static str> {
+    let numbers = text.split(',').map(|number| number.trim().parse::<f64>());
+    let numbers: Result<Vec<f64>, _> = numbers.collect();
+    let finite = numbers
+        .ok()
+        .filter(|n| n.iter().all(|number| number.is_finite()));
+    finite
+        .and_then(|numbers| numbers.try_into().ok())
+        .ok_or("give x and y in the map in metres and the heading in degrees, such as 12.5,-3,90")
 }
 
 /// Parses a positive number of gibibytes.
@@ -368,6 +543,27 @@ mod tests {
             args.flags(),
             expected.map(|(key, value)| (key.to_owned(), value.to_owned()))
         );
+    }
+
+    #[test]
+    fn a_recording_and_a_start_are_settings_of_their_keys() {
+        let arguments = [
+            "fpmcl", "localize", "it's/", "--map", "m.ply", "--start", "-1,2,90",
+        ];
+        let Command::Localize(args) = Cli::parse_from(arguments).command else {
+            unreachable!("the command is localize")
+        };
+        let expected = [
+            ("scan_folder", "'it''s/'"),
+            ("map_file", "'m.ply'"),
+            ("initial_pose", "[-1.0, 2.0, 90.0]"),
+        ];
+        assert_eq!(
+            args.flags(),
+            expected.map(|(key, value)| (key.to_owned(), value.to_owned()))
+        );
+        assert_eq!(args.run.source.config_file(), None);
+        assert!(start("1,2").is_err() && start("1,2,inf").is_err());
     }
 
     #[test]

@@ -144,7 +144,7 @@ odometry_file: street/drive_2/odometry.txt
 pub const COMPARISON_OF_STREET: &str = "\
 base:
   build_map: {depth: 6, voxel_size: 0.2, displacement_threshold_m: 0, simplify_resolution: 0.5}
-  localization: {numParticles: 50, num_reduced: 20}
+  localization: {numParticles: 50, num_reduced: 20, pose_tracking: True, odometry: ground_truth}
   refinement: {refinement: {method: swarm, swarm: {iterations: 3}}}
 sequences:
 - name: street
@@ -161,7 +161,11 @@ sequences:
 ";
 
 /// Keys of the sensor of a simulated drive with 600 measurements of a beam per revolution.
-pub const SENSOR: &str = "range_image: {height: 64, width: 600, fov_up: 3, fov_down: -25, max_range: 50, min_range: 2}\n";
+pub const SENSOR: &str = "\
+range_image: {height: 64, width: 600, fov_up: 3, fov_down: -25, max_range: 50, min_range: 2}
+own_car_m: [-2.5, 2.7, -1.2, 1.2]
+motion_compensation: null
+";
 
 /// Path of a file under `config/`.
 pub fn config_file(name: &str) -> PathBuf {
@@ -282,6 +286,8 @@ depth: 6
 voxel_size: 0.2
 simplify_resolution: 0.5
 displacement_threshold_m: 0
+own_car_m: [-2.5, 2.7, -1.2, 1.2]
+motion_compensation: null
 range_image: {height: 32, width: 360, fov_up: 3, fov_down: -25, max_range: 50, min_range: 1}
 ";
 
@@ -296,6 +302,10 @@ result_path: results/localization.npz
 numParticles: 50
 num_reduced: 20
 plot_loc_results: False
+pose_tracking: True
+odometry: ground_truth
+own_car_m: [-2.5, 2.7, -1.2, 1.2]
+motion_compensation: null
 range_image: {height: 32, width: 360, fov_up: 3, fov_down: -25, max_range: 50, min_range: 1}
 ";
 
@@ -309,6 +319,9 @@ calib_file: calib.txt
 result_file: results/localization.npz
 plot_loc_results: False
 refinement: {swarm: {iterations: 5}}
+odometry: ground_truth
+own_car_m: [-2.5, 2.7, -1.2, 1.2]
+motion_compensation: null
 range_image: {height: 32, width: 360, fov_up: 3, fov_down: -25, max_range: 50, min_range: 1}
 ";
 

@@ -7,6 +7,7 @@ mod demo;
 mod doctor;
 pub mod evaluate;
 pub mod ground;
+mod info;
 pub mod localize;
 pub mod refine;
 pub mod simulate;
@@ -39,24 +40,33 @@ use interrupt::Interrupted;
 /// Runs a command.
 pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
     match command {
+        Command::Info(args) => output::print(&info::run(&args.path)?),
         Command::BuildMap(args) => {
-            let (config, context) = configured::<BuildMapConfig>(args, context)?;
+            let base = BuildMapConfig::default;
+            let (config, context) = configured(&args.run, args.flags(), base, context)?;
             output::print(&build_map::run(&config, &context)?.table())
         }
         Command::Localize(args) => {
-            let (config, context) = configured::<LocalizationConfig>(args, context)?;
+            let base = LocalizationConfig::default;
+            let (config, context) = configured(&args.run, args.flags(), base, context)?;
             output::print(&localize::run(&config, &context)?.to_text())
         }
         Command::Refine(args) => {
-            let (config, context) = configured::<RefinementConfig>(args, context)?;
+            let base = || refine::base_config(args.run.source.input());
+            let (config, context) = configured(&args.run, args.flags(), base, context)?;
             output::print(&refine::run(&config, &context)?.to_text())
         }
         Command::Evaluate(args) => {
-            let (config, context) = configured::<EvaluationConfig>(args, context)?;
+            let base = EvaluationConfig::default;
+            let flags = args.flags_with_input("result_file");
+            let (config, context) = configured(args, flags, base, context)?;
             output::print(&evaluate::run(&config, &context)?.to_text())
         }
         Command::Simulate(args) => {
-            let (config, context) = configured::<SimulationConfig>(args, context)?;
+            let settings = with_flags::<SimulationConfig>(args, args.flags())?;
+            let path = args.source.config.as_deref();
+            let config: SimulationConfig = config::load(path, &settings)?;
+            let context = context.with_config_file(path, SimulationConfig::PATH);
             let existing = match args.force {
                 true => simulate::Existing::Replace,
                 false => simulate::Existing::Keep,
@@ -98,25 +108,35 @@ pub fn exit_code(error: &anyhow::Error) -> ExitCode {
     ExitCode::from(if error.is::<Interrupted>() { 130 } else { 1 })
 }
 
-/// Loads the configuration of a command, and notes its file.
+/// Loads the configuration of a command, and notes its file. Where the argument of the command is no
+/// configuration, flags and settings change `base`.
 fn configured<T: CommandConfig>(
     args: &RunArgs,
+    flags: Vec<(String, String)>,
+    base: impl FnOnce() -> T,
     context: &Context,
 ) -> Result<(T, Context), ConfigError> {
-    let path = args.source.config.as_deref();
-    Ok((load(args)?, context.with_config_file(path, T::PATH)))
+    let path = args.source.config_file();
+    let settings = with_flags::<T>(args, flags)?;
+    if args.source.input().is_some() {
+        return Ok((config::with_settings(base(), &settings)?, context.clone()));
+    }
+    let config = config::load(path, &settings)?;
+    Ok((config, context.with_config_file(path, T::PATH)))
 }
 
-/// Loads the configuration of a command; `--seed` and `--force` are the last settings of a
-/// configuration that has these keys.
-fn load<T: CommandConfig>(args: &RunArgs) -> Result<T, ConfigError> {
+/// The settings of a command; those of flags are the last, where the configuration has their keys.
+fn with_flags<T: CommandConfig>(
+    args: &RunArgs,
+    flags: Vec<(String, String)>,
+) -> Result<Vec<(String, String)>, ConfigError> {
     let mut settings = args.source.settings.clone();
-    for (key, value) in args.flags() {
+    for (key, value) in flags {
         if config::has_key::<T>(&key)? {
             settings.push((key, value));
         }
     }
-    config::load(args.source.config.as_deref(), &settings)
+    Ok(settings)
 }
 
 /// Formats an error and its causes, without repetitions.
@@ -154,7 +174,8 @@ mod tests {
         let Command::Localize(args) = Cli::parse_from(start.iter().chain(arguments)).command else {
             unreachable!("the command is localize")
         };
-        load(&args).unwrap()
+        let settings = with_flags::<T>(&args.run, args.flags()).unwrap();
+        config::load(args.run.source.config_file(), &settings).unwrap()
     }
 
     #[test]

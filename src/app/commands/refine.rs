@@ -12,7 +12,7 @@ use super::odometry::MotionSource;
 use super::run_output::{self, REFINEMENT_FILES, REPORT_FILES, RunFiles};
 use super::stages::{MapInputs, RecordingInputs, SensorKeys};
 use super::{Context, input, odometry, output, run_page};
-use crate::app::config::{OdometrySource, RefinementConfig};
+use crate::app::config::{self, LocalizationConfig, OdometrySource, RefinementConfig};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
 use crate::files::remove_abandoned;
@@ -70,6 +70,22 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let report = write_run(config, context, &files, &map, &sequence, &results, &refined)?;
     claims.finish(&main)?;
     Ok(report)
+}
+
+/// The configuration for a result: that of its localization, which is beside it.
+pub fn base_config(result: Option<&Path>) -> RefinementConfig {
+    let Some(result) = result else {
+        return RefinementConfig::default();
+    };
+    let path = RunFiles::beside(result).file("effective_localization.yml");
+    let found = config::load::<LocalizationConfig>(Some(&path), &[]);
+    found.map_or_else(
+        |_missing| RefinementConfig::default(),
+        |found| RefinementConfig {
+            force: false,
+            ..RefinementConfig::of(found)
+        },
+    )
 }
 
 /// Prepares the outputs; the effective configuration is the main one, as the result exists already.

@@ -3,7 +3,7 @@
 use approx::assert_relative_eq;
 
 use super::*;
-use crate::recording::{Selection, Sequence, velodyne};
+use crate::recording::{Recording, velodyne};
 use crate::simulation::{PathSegment, ScannerConfig};
 
 fn small(folder: &Path) -> SimulationConfig {
@@ -211,22 +211,16 @@ fn drives_are_read_back_in_the_documented_frames() {
     let [map, query] = [mapping, query].map(|config| {
         simulate(&config, Existing::Keep).unwrap();
         let drive = config.drive_folder();
-        let sequence = Sequence::open(
-            &drive.join("velodyne"),
-            &drive.join("poses.txt"),
-            Some(&drive.join("calib.txt")),
-            &Selection::default(),
-        )
-        .unwrap();
+        let sequence = Recording::open_with_poses(&drive).unwrap();
         let poses = CameraPoses::read(&drive.join("poses.txt")).unwrap();
         (prepare(&config).unwrap().poses(), sequence, poses, drive)
     });
     let (truth, sequence, ..) = &map;
     for (frame, pose) in sequence.frames.iter().zip(truth) {
         let expected = truth[0].inverse() * pose;
-        assert_relative_eq!(frame.map_from_lidar, expected, epsilon = 1e-6);
+        assert_relative_eq!(frame.map_from_lidar.unwrap(), expected, epsilon = 1e-6);
     }
-    let frame = map.2.frame(&sequence.calibration);
+    let frame = map.2.frame(&sequence.world().1);
     for (pose, world_from_cam0) in query.0.iter().zip(&query.2.world_from_cam0) {
         let in_map = frame.map_from_lidar(world_from_cam0);
         assert_relative_eq!(in_map, truth[0].inverse() * pose, epsilon = 1e-6);

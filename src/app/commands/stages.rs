@@ -6,9 +6,10 @@ use anyhow::{Context as _, Result};
 
 use super::{Context, input};
 use crate::app::config::{MotionCompensation, RangeImageConfig, body_from_lidar};
-use crate::lidar::{LidarModel, Rotation, Scan};
+use crate::lidar::{LidarModel, Scan};
 use crate::map::scan_cloud::ScanConfig;
 use crate::map::{Map, MapError, MapOptions, MappingPath, ply};
+use crate::odometry::{OdometryConfig, compare_timings};
 use crate::recording::{PoseTrack, Recording};
 use crate::sensor::{self, DroppedPoints, SensorDescription};
 
@@ -147,19 +148,82 @@ impl SensorKeys<'_> {
         };
         *self.own_car_m = Some(self.own_car_m.unwrap_or(own_car_m));
         warn_of_dropped_points(&scans, &self.range_image.model(), own_car_m);
-        let period_s = sensor.period_s.unwrap_or(PERIOD_S);
-        let rotation: Option<Rotation> = self
+        if is_auto && scans.iter().all(|scan| scan.times_s.is_empty()) {
+            let is_spinning = sensor.has_rows && sensor.horizontal_fov_deg > SPINNING_DEG;
+            *self.motion_compensation = match is_spinning {
+                true => fitting_rotation(&recording)?,
+                false => None,
+            };
+        }
+        let period_s = period_s(&recording);
+        let rotation = self
             .motion_compensation
             .and_then(|it| it.rotation(period_s));
         Ok((recording.rotating(rotation), Some(sensor)))
     }
 }
 
+/// Horizontal field of view from which on a sensor is taken for one that spins [deg].
+const SPINNING_DEG: f32 = 300.0;
+
+/// Duration of a revolution: the time between scans with consecutive numbers, if that is plausible [s].
+fn period_s(recording: &Recording) -> f64 {
+    let [first, .., last] = recording.frames.as_slice() else {
+        return PERIOD_S;
+    };
+    let period_s = (last.time_s - first.time_s) / (last.number - first.number) as f64;
+    match recording.has_times && (0.03..0.3).contains(&period_s) {
+        true => period_s,
+        false => PERIOD_S,
+    }
+}
+
+/// The rotation that makes consecutive scans fit best; `None` if they fit best as they are, or if nothing shows it.
+fn fitting_rotation(recording: &Recording) -> Result<Option<MotionCompensation>> {
+    /// Number of scans, from the middle of the recording.
+    const SCANS: usize = 16;
+    /// Longest time between scans in which a sensor moves evenly [s].
+    const MAX_STEP_S: f64 = 0.35;
+    let frames = &recording.frames;
+    let first = frames.len().saturating_sub(SCANS) / 2;
+    let run = &frames[first..(first + SCANS).min(frames.len())];
+    let is_dense = (run.windows(2)).all(|pair| pair[1].time_s - pair[0].time_s < MAX_STEP_S);
+    if run.len() < SCANS / 2 || !is_dense {
+        return Ok(None);
+    }
+    let scans: Vec<Scan> = run
+        .iter()
+        .map(|frame| frame.read())
+        .collect::<Result<_, _>>()?;
+    let period_s = period_s(recording);
+    let choices = [
+        (None, "compensated already"),
+        (Some(MotionCompensation::Clockwise), "clockwise"),
+        (
+            Some(MotionCompensation::CounterClockwise),
+            "counter-clockwise",
+        ),
+    ];
+    let candidates = choices.map(|(choice, _)| choice.and_then(|it| it.rotation(period_s)));
+    let compared = compare_timings(&scans, &candidates, &OdometryConfig::default())?;
+    let residuals = compared.residuals_m.iter().zip(choices);
+    let residuals = residuals.map(|((_, m), (_, name))| format!("{name} {:.1} mm", 1e3 * m));
+    let residuals: Vec<String> = residuals.collect();
+    tracing::info!(
+        "motion compensation: {}; distances between scans: {}",
+        compared
+            .best
+            .map_or("undecided, none", |best| choices[best].1),
+        residuals.join(", ")
+    );
+    Ok(choices[compared.best.unwrap_or(0)].0)
+}
+
 /// Duration of a revolution where nothing shows it [s].
 const PERIOD_S: f64 = 0.1;
 
 /// Some scans, spread over the recording.
-fn sample(recording: &Recording) -> Result<Vec<Scan>> {
+pub fn sample(recording: &Recording) -> Result<Vec<Scan>> {
     let count = recording.frames.len();
     let step = count.div_ceil(SENSOR_SCANS).max(1);
     let frames = recording.frames.iter().step_by(step);

@@ -21,7 +21,6 @@ pub struct EvaluationConfig {
     pub pose_file: Option<PathBuf>,
     /// Calibration of the recording, with its line `Tr`, for `pose_file`.
     /// `None`: the poses are those of the lidar.
-    #[default(Some("data/kitti/calib.txt".into()))]
     pub calib_file: Option<PathBuf>,
     /// Whether to draw the trajectory.
     #[default(true)]

@@ -35,6 +35,7 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
         times_s: numbers(0.1),
         runtimes_s: numbers(0.01),
         refine_runtimes_s: numbers(0.02),
+        agreements: numbers(0.001),
         states: Some(frames.iter().map(|&frame| frame as u8 % 3).collect()),
         selected: Some(40),
         frames,

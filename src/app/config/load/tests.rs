@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use super::*;
 use crate::app::config::{
     BuildMapConfig, EvaluationConfig, GroundCommandConfig, Initialization, LocalizationConfig,
-    OdometrySource, RefinementConfig, RenderedRangeImage,
+    OdometrySource, RangeImageConfig, RefinementConfig,
 };
 
 /// Loads a configuration from a text.
@@ -72,10 +72,10 @@ fn a_written_configuration_loads_to_an_equal_one() {
             initialization: Some(Initialization::Extent),
             move_thres: 0.1 + 0.2,
             seed: u64::MAX,
-            range_image: RenderedRangeImage {
-                fov_up: 0.1,
-                max_range: 1.0e6,
-                ..RenderedRangeImage::default()
+            range_image: RangeImageConfig {
+                fov_up: Some(0.1),
+                max_range: Some(1.0e6),
+                ..RangeImageConfig::default()
             },
             ..LocalizationConfig::default()
         };
@@ -167,10 +167,10 @@ fn a_setting_replaces_one_key_and_the_last_one_wins() {
         scan_folder: "07".into(),
         odometry_file: Some("odometry.txt".into()),
         odometry: OdometrySource::File,
-        range_image: RenderedRangeImage {
-            height: 32,
-            width: 1024,
-            ..RenderedRangeImage::default()
+        range_image: RangeImageConfig {
+            height: Some(32),
+            width: Some(1024),
+            ..RangeImageConfig::default()
         },
         ..LocalizationConfig::default()
     };

@@ -1,0 +1,176 @@
+//! `info`: what a recording, a map or a result contains, and what is missing for which command.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use anyhow::{Result, bail, ensure};
+
+use super::output;
+use super::stages::{self, sample};
+use crate::app::results::{LocalizationResults, RunSummary};
+use crate::evaluation::RangeMclRules;
+use crate::lidar::Scan;
+use crate::map::ply;
+use crate::recording::{PoseTrack, Recording, Selection};
+use crate::sensor::{self, BeamSource, SensorDescription};
+
+/// Describes what is at a path.
+pub fn run(path: &Path) -> Result<String> {
+    ensure!(
+        path.exists(),
+        "{} does not exist; give the folder of a recording, a map (.ply) or a result (.npz)",
+        path.display()
+    );
+    let extension = path.extension().and_then(|extension| extension.to_str());
+    match extension {
+        _ if path.is_dir() => recording(path),
+        Some("ply") => map(path),
+        Some("npz") => result(path),
+        _ => bail!(
+            "{} is no folder of a recording, no map (.ply) and no result (.npz)",
+            path.display()
+        ),
+    }
+}
+
+fn recording(path: &Path) -> Result<String> {
+    let recording = Recording::open(path, &Selection::default())?;
+    let frames = &recording.frames;
+    let (first, last) = (&frames[0], &frames[frames.len() - 1]);
+    let scans = sample(&recording)?;
+    let points = scans.iter().map(Scan::len).sum::<usize>() / scans.len();
+    let sensor = sensor::infer(&scans);
+    let duration = match recording.has_times {
+        true => format!("{:.1} s", last.time_s - first.time_s),
+        false => "unknown: there are no times, 10 scans per second are assumed".to_owned(),
+    };
+    let mut rows = vec![
+        ("layout", recording.files.layout.name().to_owned()),
+        (
+            "scans",
+            format!("{}, {} to {}", frames.len(), first.number, last.number),
+        ),
+        ("duration", duration),
+        (
+            "points per scan",
+            format!("{points} ({})", fields(&scans[0])),
+        ),
+    ];
+    rows.extend(sensor_rows(&sensor));
+    let track = recording.own_track();
+    let poses = match &track {
+        Ok(track) => track_in_words(track, &recording),
+        Err(error) => error.to_string(),
+    };
+    let has_poses = track.is_ok_and(|track| track.matched(frames, recording.has_times).is_ok());
+    let build_map = match has_poses {
+        true => "ready".to_owned(),
+        false => "needs poses: --poses FILE".to_owned(),
+    };
+    rows.extend([
+        ("poses", poses),
+        ("build-map", build_map),
+        ("localize", "ready; needs a map: --map MAP".to_owned()),
+    ]);
+    Ok(output::rows(&rows))
+}
+
+/// The fields of the points.
+fn fields(scan: &Scan) -> String {
+    let mut fields = vec!["x y z"];
+    let has_intensity = scan.intensities.iter().any(|&value| value != 0.0);
+    fields.extend(has_intensity.then_some("intensity"));
+    fields.extend((!scan.rings.is_empty()).then_some("ring"));
+    fields.extend((!scan.times_s.is_empty()).then_some("time"));
+    fields.join(", ")
+}
+
+fn sensor_rows(sensor: &SensorDescription) -> Vec<(&'static str, String)> {
+    let source = match sensor.beam_source {
+        BeamSource::Rings => "from the rings of the points",
+        BeamSource::Order => "from the order of the points",
+        BeamSource::Elevations => "from peaks of the elevations",
+        BeamSource::None => "no rows were found",
+    };
+    let [x_min, x_max, y_min, y_max] = sensor.own_car_m;
+    let own_car = match (sensor.is_moving, x_max > x_min) {
+        (false, _) => "unknown: the sensor does not move".to_owned(),
+        (true, false) => "no returns".to_owned(),
+        (true, true) => format!("x {x_min:.1} to {x_max:.1} m, y {y_min:.1} to {y_max:.1} m"),
+    };
+    let height = sensor.mounting.map_or_else(
+        || "unknown: too little ground is visible".to_owned(),
+        |mounting| {
+            format!(
+                "{:.2} m (±{:.2}), roll {:.1}, pitch {:.1} deg",
+                mounting.height_m,
+                mounting.height_spread_m,
+                mounting.roll_rad.to_degrees(),
+                mounting.pitch_rad.to_degrees()
+            )
+        },
+    );
+    vec![
+        ("sensor", stages::description(sensor)),
+        ("beams", source.to_owned()),
+        (
+            "field of view",
+            format!("{:.0} deg", sensor.horizontal_fov_deg),
+        ),
+        ("height", height),
+        ("own car", own_car),
+    ]
+}
+
+fn track_in_words(track: &PoseTrack, recording: &Recording) -> String {
+    let (path, count) = (track.path.display(), track.map_from_lidar.len());
+    let mut text = format!("{path}: {count} rows");
+    if let (Some(times_s), true) = (&track.times_s, recording.has_times) {
+        let (first_s, last_s) = (times_s[0], times_s[times_s.len() - 1]);
+        let _ = write!(text, ", {first_s:.1} to {last_s:.1} s");
+    }
+    if let Err(error) = track.matched(&recording.frames, recording.has_times) {
+        let _ = write!(text, "; {error}");
+    }
+    text
+}
+
+fn map(path: &Path) -> Result<String> {
+    let (mesh, mapping_path) = ply::read_map(path)?;
+    let extent = [0, 1, 2].map(|axis| {
+        let along = mesh.vertices.iter().map(|vertex| vertex[axis]);
+        along.fold([f32::INFINITY, f32::NEG_INFINITY], |range, value| {
+            [range[0].min(value), range[1].max(value)]
+        })
+    });
+    let [[x_min, x_max], [y_min, y_max], [low, high]] = extent;
+    let path = match mapping_path {
+        Some(path) => format!("{} poses of the mapping drive", path.map_from_lidar.len()),
+        None => "none: a map of another program".to_owned(),
+    };
+    Ok(output::rows(&[
+        ("triangles", mesh.triangles.len().to_string()),
+        (
+            "extent",
+            format!(
+                "{:.0} x {:.0} m, heights {low:.1} to {high:.1} m",
+                x_max - x_min,
+                y_max - y_min
+            ),
+        ),
+        ("path", path),
+    ]))
+}
+
+fn result(path: &Path) -> Result<String> {
+    let results = LocalizationResults::read(path)?;
+    let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
+    let summary = RunSummary::of(&results, &estimates);
+    let yes = |is: bool| if is { "yes" } else { "no" }.to_owned();
+    let mut rows: Vec<(&str, String)> = (summary.rows().into_iter())
+        .map(|row| (row.name, format!("{} {}", row.value, row.unit)))
+        .collect();
+    rows.push(("refined", yes(results.refined.is_some())));
+    rows.push(("true poses", yes(results.ground_truth.is_some())));
+    Ok(output::rows(&rows))
+}
