@@ -17,6 +17,34 @@ pub enum RecordingError {
     },
     #[error("{} {problem}", path.display())]
     BadScan { path: PathBuf, problem: String },
+    #[error("{} {problem}", path.display())]
+    BadBag { path: PathBuf, problem: String },
+    #[error("{}: message {number} of {topic} {problem}", path.display())]
+    BadMessage {
+        path: PathBuf,
+        topic: String,
+        number: usize,
+        problem: String,
+    },
+    #[error("{} has no topic of {types}; it has {found}", path.display())]
+    NoTopic {
+        path: PathBuf,
+        types: &'static str,
+        found: String,
+    },
+    #[error("{} has no topic {topic} of {types}; choose one of: {known}", path.display())]
+    UnknownTopic {
+        path: PathBuf,
+        topic: String,
+        types: &'static str,
+        known: String,
+    },
+    #[error("{} has several topics of {types}; choose one of: {known}", path.display())]
+    SeveralTopics {
+        path: PathBuf,
+        types: &'static str,
+        known: String,
+    },
     #[error("{}, line {line}: `{word}` is not a finite number", path.display())]
     NotANumber {
         path: PathBuf,

@@ -7,6 +7,8 @@
 //! map_from_lidar(i) = inv(Tr) · inv(P₀) · Pᵢ · Tr        Tr = cam0_from_lidar
 //! ```
 
+#[cfg(feature = "bags")]
+pub mod bags;
 pub mod calibration;
 mod error;
 pub mod poses;
@@ -15,6 +17,8 @@ pub mod sequence;
 mod table;
 pub mod velodyne;
 
+#[cfg(feature = "bags")]
+pub use bags::Bag;
 pub use calibration::Calibration;
 pub use error::RecordingError;
 pub use poses::MapFrame;
