@@ -38,13 +38,9 @@ enum Reader {
 
 impl Reader {
     fn open(path: &Path, format: &str) -> Result<Self, String> {
-        let open = || {
-            let file = File::open(path).map_err(super::chunk_file::unreadable)?;
-            ChunkFile::new(file)
-        };
         match format {
-            "mcap" => open().map(Self::Mcap),
-            "bag" => open().map(Self::Ros1),
+            "mcap" => ChunkFile::open(path).map(Self::Mcap),
+            "bag" => ChunkFile::open(path).map(Self::Ros1),
             "db3" => database::open(path).map(Self::Database),
             other => Err(format!(
                 "is not a bag: `{other}` is none of {}",

@@ -2,6 +2,7 @@
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
 
 use bzip2::read::BzDecoder;
 use lz4_flex::frame::FrameDecoder;
@@ -22,15 +23,18 @@ pub struct ChunkFormat {
 
 /// An open file with the chunk that was read last.
 pub struct ChunkFile {
+    pub path: PathBuf,
     pub file: BufReader<File>,
     pub length: u64,
     last_chunk: Option<(u64, Vec<u8>)>,
 }
 
 impl ChunkFile {
-    pub fn new(mut file: File) -> Result<Self, String> {
+    pub fn open(path: &Path) -> Result<Self, String> {
+        let mut file = File::open(path).map_err(unreadable)?;
         let length = file.seek(SeekFrom::End(0)).map_err(unreadable)?;
         Ok(Self {
+            path: path.to_owned(),
             file: BufReader::new(file),
             length,
             last_chunk: None,

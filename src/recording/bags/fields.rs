@@ -86,6 +86,10 @@ impl<'a> Fields<'a> {
         self.number().map(u8::from_le_bytes)
     }
 
+    pub fn u16(&mut self) -> Result<u16, String> {
+        self.number().map(u16::from_le_bytes)
+    }
+
     pub fn u32(&mut self) -> Result<u32, String> {
         self.number().map(u32::from_le_bytes)
     }

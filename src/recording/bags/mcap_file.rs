@@ -1,22 +1,38 @@
 //! `.mcap`, from the index in its summary, or, where it has none, from one pass over its records.
 //!
-//! Format: <https://mcap.dev/spec>
+//! Format: <https://mcap.dev/spec>. The crate `mcap` reserves as much memory as a damaged length claims, and
+//! panics on damaged attachments.
 
 use std::collections::BTreeMap;
 use std::io::Read;
 
-use mcap::records::{ChunkIndex, Record, op};
-use mcap::{MAGIC, parse_record};
-
 use super::chunk_file::{ChunkFile, ChunkFormat, decompress, read_bytes, truncated, unreadable};
+use super::fields::Fields;
 use super::index::{Connection, Index, Place, Serialization};
 
 pub const FORMAT: ChunkFormat = ChunkFormat { chunk, message };
+
+const MAGIC: &[u8] = b"\x89MCAP0\r\n";
+
+/// Types of records.
+mod op {
+    pub const FOOTER: u8 = 0x02;
+    pub const SCHEMA: u8 = 0x03;
+    pub const CHANNEL: u8 = 0x04;
+    pub const MESSAGE: u8 = 0x05;
+    pub const CHUNK: u8 = 0x06;
+    pub const MESSAGE_INDEX: u8 = 0x07;
+    pub const CHUNK_INDEX: u8 = 0x08;
+    pub const STATISTICS: u8 = 0x0b;
+    pub const DATA_END: u8 = 0x0f;
+}
 
 /// Bytes before the body of a record: its type and its length.
 const HEAD: u64 = 9;
 /// Bytes of a message before its data.
 const MESSAGE_HEADER: usize = 22;
+/// Bytes of the head of a chunk's body without the name of its compression.
+const CHUNK_HEADER: u64 = 40;
 /// Bytes of the footer, with its head and the magic bytes after it.
 const FOOTER: u64 = HEAD + 20 + MAGIC.len() as u64;
 
@@ -28,7 +44,8 @@ pub fn index(file: &mut ChunkFile, number: usize) -> Result<Index, String> {
     }
     from_summary(file, Index::of_file(number)).or_else(|problem| {
         tracing::warn!(
-            "a bag {problem}; all of it is read for an index, `mcap recover` writes one"
+            "{} {problem}; all of it is read for an index, `mcap recover` writes one",
+            file.path.display()
         );
         from_records(file, Index::of_file(number))
     })
@@ -40,10 +57,7 @@ fn from_summary(file: &mut ChunkFile, index: Index) -> Result<Index, String> {
     let footer_at = length.checked_sub(FOOTER).ok_or_else(truncated)?;
     let footer = read_bytes(file.at(footer_at)?, FOOTER)?;
     let summary_at = match footer.strip_suffix(MAGIC) {
-        Some([op::FOOTER, rest @ ..]) => match parse(op::FOOTER, &rest[HEAD as usize - 1..])? {
-            Record::Footer(footer) => footer.summary_start,
-            _ => 0,
-        },
+        Some([op::FOOTER, rest @ ..]) => fields(&rest[HEAD as usize - 1..])?.u64()?,
         _ => return Err("was not closed by its recorder".to_owned()),
     };
     let summary_length = footer_at.checked_sub(summary_at);
@@ -58,15 +72,12 @@ fn from_summary(file: &mut ChunkFile, index: Index) -> Result<Index, String> {
     for record in records(&summary) {
         let (kind, _offset, body) = record?;
         match kind {
-            op::CHUNK_INDEX | op::STATISTICS => match parse(kind, body)? {
-                Record::ChunkIndex(chunk) => chunks.push(chunk),
-                Record::Statistics(statistics) => count = statistics.message_count,
-                _ => {}
-            },
+            op::CHUNK_INDEX => chunks.push(ChunkIndex::parse(body)?),
+            op::STATISTICS => count = fields(body)?.u64()?,
             _ => tables.add(kind, body, Place::Row(0))?,
         }
     }
-    let index_lengths = chunks.iter().map(|chunk| chunk.message_index_length);
+    let index_lengths = chunks.iter().map(|chunk| chunk.index_length);
     if index_lengths.fold(0, u64::saturating_add) > length {
         return Err("has chunks that overlap".to_owned());
     }
@@ -93,7 +104,10 @@ fn from_records(file: &mut ChunkFile, index: Index) -> Result<Index, String> {
             .checked_add(length)
             .filter(|&end| end <= file.length)
         else {
-            tracing::warn!("a bag ends within a record; its last messages are missing");
+            tracing::warn!(
+                "{} ends within a record; its last messages are missing",
+                file.path.display()
+            );
             break;
         };
         match kind {
@@ -124,29 +138,28 @@ struct Tables {
 impl Tables {
     /// Adds a schema, a channel or a message.
     fn add(&mut self, kind: u8, body: &[u8], place: Place) -> Result<(), String> {
-        if !matches!(kind, op::SCHEMA | op::CHANNEL | op::MESSAGE) {
-            return Ok(());
-        }
-        match parse(kind, body)? {
-            Record::Schema { header, .. } => {
-                self.schemas.insert(header.id, header.name);
+        let mut fields = fields(body)?;
+        match kind {
+            op::SCHEMA => {
+                self.schemas.insert(fields.u16()?, fields.text()?);
             }
-            Record::Channel(channel) => {
-                let message_type = self.schemas.get(&channel.schema_id);
+            op::CHANNEL => {
+                let (number, schema) = (fields.u16()?, fields.u16()?);
                 let connection = Connection {
-                    topic: channel.topic,
-                    message_type: message_type.cloned().unwrap_or_default(),
-                    serialization: match channel.message_encoding.as_str() {
+                    topic: fields.text()?,
+                    message_type: self.schemas.get(&schema).cloned().unwrap_or_default(),
+                    serialization: match fields.text()?.as_str() {
                         "cdr" => Some(Serialization::Cdr),
                         "ros1" => Some(Serialization::Ros1),
                         _ => None,
                     },
                     is_latched: false,
                 };
-                self.index.connect(channel.id.into(), connection);
+                self.index.connect(number.into(), connection);
             }
-            Record::Message { header, .. } => {
-                (self.index).add(header.channel_id.into(), header.log_time, place)?;
+            op::MESSAGE => {
+                let (channel, _sequence, time_ns) = (fields.u16()?, fields.u32()?, fields.u64()?);
+                self.index.add(channel.into(), time_ns, place)?;
             }
             _ => {}
         }
@@ -155,25 +168,25 @@ impl Tables {
 
     /// Adds the messages of a chunk from the message indexes after it.
     fn add_chunk(&mut self, file: &mut ChunkFile, chunk: &ChunkIndex) -> Result<(), String> {
-        let start = chunk.chunk_start_offset;
-        let end = start.checked_add(chunk.chunk_length);
+        let end = chunk.position.checked_add(chunk.length);
         let indexes_at = file.at(end.ok_or_else(truncated)?)?;
-        let indexes = read_bytes(indexes_at, chunk.message_index_length)?;
-        let data_at = chunk.compressed_data_offset().map_err(damaged)?;
+        let indexes = read_bytes(indexes_at, chunk.index_length)?;
+        let data_at = chunk.position + HEAD + CHUNK_HEADER;
         for record in records(&indexes) {
             let (kind, _offset, body) = record?;
             if kind != op::MESSAGE_INDEX {
                 continue;
             }
-            let Record::MessageIndex(index) = parse(kind, body)? else {
-                continue;
-            };
-            for entry in index.records {
-                let place = match chunk.compression.as_str() {
-                    "" => Place::File(data_at.saturating_add(entry.offset)),
-                    _ => Place::Chunk(start, entry.offset),
+            let mut fields = fields(body)?;
+            let (channel, length) = (fields.u16()?, fields.u32()?);
+            for _ in 0..length / 16 {
+                let (time_ns, offset) = (fields.u64()?, fields.u64()?);
+                let place = if chunk.is_compressed {
+                    Place::Chunk(chunk.position, offset)
+                } else {
+                    Place::File(data_at.saturating_add(offset))
                 };
-                (self.index).add(index.channel_id.into(), entry.log_time, place)?;
+                self.index.add(channel.into(), time_ns, place)?;
             }
         }
         Ok(())
@@ -187,6 +200,31 @@ impl Tables {
             self.add(kind, body, Place::Chunk(position, offset))?;
         }
         Ok(())
+    }
+}
+
+/// Where a chunk is.
+struct ChunkIndex {
+    position: u64,
+    length: u64,
+    /// Size of the message indexes after it [bytes].
+    index_length: u64,
+    is_compressed: bool,
+}
+
+impl ChunkIndex {
+    fn parse(body: &[u8]) -> Result<Self, String> {
+        let mut fields = fields(body)?;
+        let _times = (fields.u64()?, fields.u64()?);
+        let (position, length) = (fields.u64()?, fields.u64()?);
+        let offsets = fields.u32()?;
+        fields.bytes(offsets as usize)?;
+        Ok(Self {
+            position,
+            length,
+            index_length: fields.u64()?,
+            is_compressed: !fields.text()?.is_empty(),
+        })
     }
 }
 
@@ -221,12 +259,9 @@ fn read_head(source: &mut dyn Read) -> Result<(u8, u64), String> {
     Ok((kind, u64::from_le_bytes(length)))
 }
 
-fn parse(kind: u8, body: &[u8]) -> Result<Record<'_>, String> {
-    parse_record(kind, body).map_err(damaged)
-}
-
-fn damaged(error: mcap::McapError) -> String {
-    format!("has a damaged record: {error}")
+/// The fields of a record: little-endian, without padding.
+fn fields(body: &[u8]) -> Result<Fields<'_>, String> {
+    Fields::new(body, Serialization::Ros1)
 }
 
 /// Reads the body of a record of a type.
@@ -239,12 +274,13 @@ fn body(source: &mut dyn Read, expected: u8) -> Result<Vec<u8>, String> {
 }
 
 fn chunk(source: &mut dyn Read) -> Result<Vec<u8>, String> {
-    match parse(op::CHUNK, &body(source, op::CHUNK)?)? {
-        Record::Chunk { header, data } => {
-            decompress(&header.compression, &data, header.uncompressed_size)
-        }
-        _ => Err(truncated()),
-    }
+    let body = body(source, op::CHUNK)?;
+    let mut fields = fields(&body)?;
+    let (_start, _end, size, _checksum) =
+        (fields.u64()?, fields.u64()?, fields.u64()?, fields.u32()?);
+    let (compression, length) = (fields.text()?, fields.u64()?);
+    let length = usize::try_from(length).map_err(|_large| truncated())?;
+    decompress(&compression, fields.bytes(length)?, size)
 }
 
 fn message(source: &mut dyn Read) -> Result<Vec<u8>, String> {

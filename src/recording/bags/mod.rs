@@ -1,7 +1,7 @@
 //! Bags, the recordings of ROS: `.mcap` and `.db3` of ROS 2, `.bag` of ROS 1, and folders with `metadata.yaml`
 //! of several such files.
 //!
-//! A bag that is opened has its index in memory, about 50 bytes per message of the types that are read.
+//! A bag that is opened has its index in memory, 40 bytes per message of the types that are read.
 //! Every message can then be read from every thread; a thread holds one decompressed chunk. The times of
 //! lists of messages are those at which they were logged, since the stamps are in the messages; scans and
 //! poses that are read have the times of their stamps.

@@ -18,7 +18,7 @@ const UNITS: [f64; 4] = [1.0, 1e-3, 1e-6, 1e-9];
 pub struct SweepTimes {
     /// The middle of the sweep [s], in the clock of the stamp.
     pub middle_s: f64,
-    /// Time of each point after the middle [s].
+    /// Time of each point after the middle [s], 0 for one without a number.
     pub times_s: Vec<f32>,
 }
 
@@ -42,7 +42,10 @@ pub fn sweep_times(numbers: &[f64], is_measured: &[bool], stamp_s: f64) -> Optio
     } else {
         return None;
     };
-    let after_middle = |number: &f64| (unit * (number.clamp(first, last) - middle)) as f32;
+    let after_middle = |&number: &f64| {
+        let number = if number.is_nan() { middle } else { number };
+        (unit * (number.clamp(first, last) - middle)) as f32
+    };
     Some(SweepTimes {
         middle_s,
         times_s: numbers.iter().map(after_middle).collect(),
@@ -101,5 +104,7 @@ mod tests {
         let sweep = sweep_times(&numbers, &[true, false, true], STAMP_S).unwrap();
         assert!((sweep.middle_s - STAMP_S - 0.05).abs() < 1e-6);
         assert!(sweep.times_s[1].abs() <= 0.0500001);
+        let sweep = sweep_times(&[0.0, f64::NAN, 0.1], &[true; 3], STAMP_S).unwrap();
+        assert_eq!(sweep.times_s, [-0.05, 0.0, 0.05]);
     }
 }
