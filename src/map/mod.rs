@@ -20,13 +20,20 @@ pub mod visibility;
 // What a pose in the map needs.
 pub mod cells;
 pub mod elevation;
+mod ground_surface;
 mod heights;
 pub mod panorama;
 pub mod tiles;
 // The map as a whole, and its file.
 pub mod mapping_path;
+mod mesh_error;
+pub mod mesh_file;
+mod mesh_origin;
+mod mesh_polygons;
 pub mod model;
+mod obj;
 pub mod ply;
+mod stl;
 
 #[cfg(test)]
 mod seam_tests;
@@ -38,7 +45,7 @@ pub use config::{MapConfig, MapOptions};
 pub use elevation::{GroundMap, GroundPatch, SensorAttitude};
 pub use local_map::{LocalMap, LocalMapConfig, LocalMapCounts};
 pub use mapping_path::MappingPath;
+pub use mesh_error::{MeshFileError, MeshFileProblem};
 pub use model::{Map, MapError};
 pub use panorama::{PanoramaConfig, PanoramaIndex, PanoramaRequest, PanoramaSeed, SearchRegion};
-pub use ply::PlyError;
 pub use tiles::{TileConfig, TileGrid, TileIndex};

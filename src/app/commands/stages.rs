@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result};
 
 use super::{Context, input};
-use crate::map::{Map, MapError, MapOptions, MappingPath, ply};
+use crate::map::{Map, MapOptions, MappingPath, mesh_file};
 use crate::recording::poses::DrivePoses;
 use crate::recording::{Selection, Sequence};
 
@@ -43,11 +43,12 @@ impl Inputs<'_> {
 
     /// Reads the map and prepares it for rendering at most `max_poses` poses at once.
     pub fn load_map(&self, max_poses: Option<usize>, context: &Context) -> Result<Map> {
-        let (mesh, path) = ply::read_map(self.map_file)?;
-        let path = match path {
-            Some(path) => path,
-            None => self.given_path()?,
+        let (mesh, path) = mesh_file::read(self.map_file)?;
+        let path = match self.given_path()? {
+            Some(given) if path.is_none() => given,
+            _ => path.unwrap_or_default(),
         };
+        self.report_frame(&path);
         let options = MapOptions {
             backend: context.backend,
             max_poses,
@@ -66,18 +67,37 @@ impl Inputs<'_> {
     }
 
     /// The path of the mapping drive from the files of the configuration.
-    fn given_path(&self) -> Result<MappingPath> {
+    fn given_path(&self) -> Result<Option<MappingPath>> {
         let Some(poses) = self.map_pose_file else {
-            let path = self.map_file.to_owned();
-            return Err(MapError::NoPath { path }.into());
+            return Ok(None);
         };
         input::require_file("map_pose_file", poses)?;
         input::require_optional_file("map_calib_file", self.map_calib_file)?;
         let drive = DrivePoses::read(poses, self.map_calib_file)?;
-        Ok(MappingPath {
+        Ok(Some(MappingPath {
             world_from_map: drive.world_from_map(),
             map_from_lidar: drive.map_from_lidar(),
-        })
+        }))
+    }
+
+    /// Reports the frame of a map without a mapping drive.
+    fn report_frame(&self, path: &MappingPath) {
+        if !path.map_from_lidar.is_empty() {
+            return;
+        }
+        let map = self.map_file.display();
+        tracing::info!(
+            "{map} has no mapping path: poses are in its own frame, and a start on the road is one anywhere; for a map of range-mcl, give map_pose_file and map_calib_file"
+        );
+        let origin = path.world_from_map.translation.vector;
+        if origin.norm() > 0.0 {
+            tracing::warn!(
+                "the origin of {map} is moved by ({:.0}, {:.0}, {:.0}) m, because its coordinates are large: results are relative to it",
+                origin.x,
+                origin.y,
+                origin.z
+            );
+        }
     }
 
     /// Opens the selected frames of the recording, with their poses in the frame of the map.
