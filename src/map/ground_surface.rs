@@ -82,7 +82,6 @@ impl GroundSurface {
     }
 
     /// Detects the ground of points with normals.
-    #[cfg_attr(not(test), expect(dead_code, reason = "for clouds"))]
     pub fn of_points(points: &[Vec3], normals: &[Vec3]) -> Self {
         let level = points
             .iter()
@@ -101,7 +100,6 @@ impl GroundSurface {
     }
 
     /// Whether a point with its normal is ground.
-    #[cfg_attr(not(test), expect(dead_code, reason = "for clouds"))]
     pub fn has_point(&self, point: Vec3, normal: Vec3) -> bool {
         is_level(normal) && self.contains(point)
     }

@@ -7,6 +7,8 @@
 
 // From scans to a mesh.
 pub mod builder;
+pub mod cloud;
+mod cloud_normals;
 pub mod confidence;
 pub mod config;
 pub mod local_map;
@@ -41,6 +43,7 @@ mod seam_tests;
 pub(crate) mod test_world;
 
 pub use builder::{BuildError, BuildEvent, MapBuilder, MapPlan, ScanError};
+pub use cloud::CloudPlan;
 pub use config::{MapConfig, MapOptions};
 pub use elevation::{GroundMap, GroundPatch, SensorAttitude};
 pub use local_map::{LocalMap, LocalMapConfig, LocalMapCounts};

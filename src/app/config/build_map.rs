@@ -86,6 +86,8 @@ pub struct BuildMapConfig {
     /// Size and limits of the range images for the normals.
     pub range_image: LidarModel,
 
+    /// Point cloud in the map frame that is meshed instead of scans with poses, `.pcd`, `.ply` or `.npy`.
+    pub cloud_file: Option<PathBuf>,
     /// First frame of the recording.
     pub start_idx: usize,
     /// Step between frames: n uses every n-th frame.
@@ -201,6 +203,7 @@ impl Validate for BuildMapConfig {
         path("scan_folder", &self.scan_folder)?;
         path("pose_file", &self.pose_file)?;
         optional_path("calib_file", self.calib_file.as_deref())?;
+        optional_path("cloud_file", self.cloud_file.as_deref())?;
         path("mesh_file", &self.mesh_file)?;
         self.selection().validate()?;
         in_range("depth", self.depth, PoissonConfig::DEPTHS)?;

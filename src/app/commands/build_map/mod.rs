@@ -1,6 +1,7 @@
 //! `build-map`: builds a triangle-mesh map from scans with poses.
 
 mod clock;
+mod cloud;
 mod parts;
 mod pictures;
 mod report;
@@ -33,6 +34,14 @@ use crate::recording::{Frame, Sequence};
 
 /// Builds the map that a configuration describes.
 pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
+    match &config.cloud_file {
+        Some(cloud_file) => cloud::run(config, cloud_file, context),
+        None => run_with_scans(config, context),
+    }
+}
+
+/// Builds the map of scans with poses.
+fn run_with_scans(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
     let started = Instant::now();
     let (sequence, mut claims) = (open(config)?, prepare(config, context)?);
     let (mapped, held_out) = hold_out(&sequence.frames, config);
@@ -102,19 +111,13 @@ fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
         path.file_name()
             .map(|name| name.to_string_lossy().into_owned())
     };
+    let optional = [
+        ("cloud_file", &config.cloud_file),
+        ("calib_file", &config.calib_file),
+        ("truth_mesh", &config.truth_mesh),
+    ];
     let mut inputs: Vec<(&str, &Path)> = vec![("pose_file", &config.pose_file)];
-    inputs.extend(
-        config
-            .calib_file
-            .as_deref()
-            .map(|path| ("calib_file", path)),
-    );
-    inputs.extend(
-        config
-            .truth_mesh
-            .as_deref()
-            .map(|path| ("truth_mesh", path)),
-    );
+    inputs.extend((optional.iter()).filter_map(|(key, path)| Some((*key, path.as_deref()?))));
     inputs.extend(context.input());
     let outputs = Outputs {
         key: "mesh_file",
@@ -352,8 +355,12 @@ fn write_map(
 ) -> Result<()> {
     anyhow::ensure!(
         !mesh.triangles.is_empty(),
-        "the map has no triangles: the scans in {} have no points left to mesh; check range_image, crop_x, crop_y and crop_z",
-        config.scan_folder.display()
+        "the map has no triangles: {} has no points left to mesh; check range_image, crop_x, crop_y and crop_z",
+        config
+            .cloud_file
+            .as_ref()
+            .unwrap_or(&config.scan_folder)
+            .display()
     );
     claims.begin(&config.mesh_file)?;
     Ok(ply::write(&config.mesh_file, mesh, Some(path))?)
