@@ -242,7 +242,7 @@ mod tests {
     #[test]
     fn a_street_is_meshed_in_blocks_without_gaps_and_its_ground_is_red() {
         let path: Vec<Vec3> = (0..12)
-            .map(|i| Vec3::new(10.0 * i as f32, 0.0, 2.0))
+            .map(|i| Vec3::new(10.0 * i as f32, 0.0, 0.2 * i as f32 + 2.0))
             .collect();
         for sensor_positions in [&[][..], &path] {
             let (plan, mesh) = build(&street(), sensor_positions);
