@@ -11,11 +11,10 @@
 
 use std::f32::consts::{PI, TAU};
 
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
+use super::beam::{Beam, MAX_BEAMS, angles, elevation_deg, quantile};
 use super::elevations;
-use super::quantile;
 use crate::lidar::Scan;
 
 /// What the beams of a sensor follow from.
@@ -33,15 +32,6 @@ pub enum BeamSource {
     Elevations,
 }
 
-/// The returns of a beam.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Beam {
-    /// Median elevation [deg].
-    pub elevation_deg: f32,
-    /// Azimuths of the returns in one scan [rad].
-    pub azimuths_rad: Vec<f32>,
-}
-
 /// The beams of a sensor.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Beams {
@@ -53,8 +43,6 @@ pub struct Beams {
     pub nominal: Option<usize>,
 }
 
-/// Largest number of beams.
-pub(super) const MAX_BEAMS: usize = 512;
 /// Largest width of a ring that is one beam, relative to the distance between rings (unitless).
 const NARROW: f32 = 0.6;
 /// The same where nothing else shows beams: they may be smeared by motion compensation.
@@ -85,12 +73,6 @@ pub fn find(scans: &[Scan]) -> Beams {
     }
 }
 
-/// Elevation [deg] and azimuth [rad] of a point.
-pub(super) fn angles(point: Vec3) -> [f32; 2] {
-    let elevation = point.z.atan2(point.truncate().length());
-    [elevation.to_degrees(), point.y.atan2(point.x)]
-}
-
 /// Beams by the rings of the points.
 struct Rings {
     rows: Vec<Beam>,
@@ -110,8 +92,9 @@ fn by_rings(scans: &[Scan]) -> Option<Rings> {
     let mut rows = vec![Beam::default(); elevations.len()];
     for (number, scan) in scans.iter().enumerate() {
         for (&point, &ring) in scan.points.iter().zip(&scan.rings) {
-            let [elevation_deg, azimuth_rad] = angles(point);
-            elevations[usize::from(ring)].push(elevation_deg);
+            let [degrees, azimuth_rad] = angles(point);
+            let distance_m = point.truncate().length();
+            elevations[usize::from(ring)].push([distance_m, degrees]);
             if number == largest {
                 rows[usize::from(ring)].azimuths_rad.push(azimuth_rad);
             }
@@ -124,9 +107,10 @@ fn by_rings(scans: &[Scan]) -> Option<Rings> {
     };
     let mut found: Vec<(Beam, f32)> = (rows.into_iter().zip(&mut elevations))
         .filter(|(_, elevations)| !elevations.is_empty())
-        .map(|(mut row, elevations)| {
-            row.elevation_deg = quantile(elevations, 0.5);
-            let width = quantile(elevations, 0.95) - quantile(elevations, 0.05);
+        .map(|(mut row, returns)| {
+            row.elevation_deg = elevation_deg(returns);
+            let mut elevations: Vec<f32> = returns.iter().map(|far| far[1]).collect();
+            let width = quantile(&mut elevations, 0.95) - quantile(&mut elevations, 0.05);
             (row, width)
         })
         .collect();
@@ -178,15 +162,18 @@ fn by_order(scan: &Scan) -> Option<Vec<Beam>> {
 
     let start_rad = start_of_revolutions(&angles, sense, change_deg);
     let along = |azimuth_rad: f32| (sense * (azimuth_rad - start_rad)).rem_euclid(TAU);
+    let mut first = 0;
     let revolutions: Vec<Beam> = angles
         .chunk_by(|a, b| along(b[1]) > along(a[1]) - JITTER_RAD)
-        .filter(|returns| returns.len() >= MIN_RETURNS[1])
-        .map(|returns| {
-            let mut elevations: Vec<f32> = returns.iter().map(|angles| angles[0]).collect();
-            Beam {
-                elevation_deg: quantile(&mut elevations, 0.5),
+        .filter_map(|returns| {
+            let points = &scan.points[first..first + returns.len()];
+            first += returns.len();
+            let distances = points.iter().map(|point| point.truncate().length());
+            let elevations = distances.zip(returns).map(|(m, angles)| [m, angles[0]]);
+            (returns.len() >= MIN_RETURNS[1]).then(|| Beam {
+                elevation_deg: elevation_deg(&mut elevations.collect::<Vec<_>>()),
                 azimuths_rad: returns.iter().map(|angles| angles[1]).collect(),
-            }
+            })
         })
         .collect();
     if !(2..=MAX_BEAMS).contains(&revolutions.len())
@@ -251,7 +238,7 @@ fn merged(mut beams: Vec<Beam>, min_gap_deg: f32) -> Vec<Beam> {
 }
 
 /// Numbers of beams of the sensors that are built.
-const BUILT: [usize; 11] = [1, 2, 4, 8, 16, 32, 40, 64, 80, 128, 256];
+const BUILT: [usize; 10] = [1, 2, 4, 8, 16, 32, 40, 64, 128, 256];
 
 /// Number of beams of the device: as many as returned, or the next number that is built if it is almost
 /// reached or the beams at an edge have few returns, so that others have none.

@@ -14,8 +14,7 @@
 
 use rayon::prelude::*;
 
-use super::beams::{Beam, MAX_BEAMS, angles};
-use super::quantile;
+use super::beam::{Beam, MAX_BEAMS, angles, elevation_deg, quantile};
 use crate::lidar::Scan;
 
 /// Points that are examined, about.
@@ -26,8 +25,10 @@ const BIN_DEG: f32 = 0.01;
 const WINDOWS: [usize; 5] = [3, 6, 12, 25, 50];
 /// Share of the points near a peak, at least (unitless).
 const MIN_SHARE: f64 = 0.75;
+/// The widest window is taken whose share is as good; narrower ones divide peaks (unitless).
+const SAME_SHARE: f64 = 0.04;
 /// Height of a peak, at least: points, and relative to the median peak.
-const MIN_PEAK: (u32, f32) = (3, 0.005);
+const MIN_PEAK: (u32, f32) = (3, 0.01);
 
 /// A point as a beam saw it.
 #[derive(Clone, Copy)]
@@ -51,11 +52,9 @@ pub fn rows(scans: &[Scan]) -> Option<Vec<Beam>> {
     let others: Vec<Ray> = rays.iter().filter(|ray| !is_tested(ray)).copied().collect();
     let share = |window: &usize| share_near(&peaks(&others, *window), &tested);
     let shares: Vec<f64> = WINDOWS.par_iter().map(share).collect();
-    let best = (0..WINDOWS.len()).max_by(|&a, &b| shares[a].total_cmp(&shares[b]))?;
-    if shares[best] < MIN_SHARE {
-        return None;
-    }
-    let peaks = peaks(&rays, WINDOWS[best]);
+    let best = shares.iter().copied().fold(MIN_SHARE + SAME_SHARE, f64::max);
+    let widest = shares.iter().rposition(|&share| share >= best - SAME_SHARE)?;
+    let peaks = peaks(&rays, WINDOWS[widest]);
     (2..=MAX_BEAMS)
         .contains(&peaks.len())
         .then(|| beams_at(&peaks, &rays))
@@ -190,15 +189,15 @@ fn beams_at(peaks: &[f32], rays: &[Ray]) -> Vec<Beam> {
         let Some(peak) = near(peaks, ray.cone_deg) else {
             continue;
         };
-        beams[peak].0.push(ray.elevation_deg);
+        beams[peak].0.push([ray.distance_m, ray.elevation_deg]);
         if Some(ray.scan) == first_scan {
             beams[peak].1.push(ray.azimuth_rad);
         }
     }
     let mut beams: Vec<Beam> = (beams.into_iter())
-        .filter(|(elevations, _)| !elevations.is_empty())
-        .map(|(mut elevations, azimuths_rad)| Beam {
-            elevation_deg: quantile(&mut elevations, 0.5),
+        .filter(|(returns, _)| !returns.is_empty())
+        .map(|(mut returns, azimuths_rad)| Beam {
+            elevation_deg: elevation_deg(&mut returns),
             azimuths_rad,
         })
         .collect();
