@@ -26,7 +26,9 @@ const WINDOWS: [usize; 5] = [3, 6, 12, 25, 50];
 /// Share of the points near a peak, at least (unitless).
 const MIN_SHARE: f64 = 0.75;
 /// The widest window is taken whose share is as good; narrower ones divide peaks (unitless).
-const SAME_SHARE: f64 = 0.04;
+const SAME_SHARE: f64 = 0.003;
+/// Peaks that are as many times lower than both neighbours are of stray points.
+const STRAY: u32 = 10;
 /// Height of a peak, at least: points, and relative to the median peak.
 const MIN_PEAK: (u32, f32) = (3, 0.01);
 
@@ -52,8 +54,13 @@ pub fn rows(scans: &[Scan]) -> Option<Vec<Beam>> {
     let others: Vec<Ray> = rays.iter().filter(|ray| !is_tested(ray)).copied().collect();
     let share = |window: &usize| share_near(&peaks(&others, *window), &tested);
     let shares: Vec<f64> = WINDOWS.par_iter().map(share).collect();
-    let best = shares.iter().copied().fold(MIN_SHARE + SAME_SHARE, f64::max);
-    let widest = shares.iter().rposition(|&share| share >= best - SAME_SHARE)?;
+    let best = shares
+        .iter()
+        .copied()
+        .fold(MIN_SHARE + SAME_SHARE, f64::max);
+    let widest = shares
+        .iter()
+        .rposition(|&share| share >= best - SAME_SHARE)?;
     let peaks = peaks(&rays, WINDOWS[widest]);
     (2..=MAX_BEAMS)
         .contains(&peaks.len())
@@ -156,6 +163,13 @@ fn peaks(rays: &[Ray], window: usize) -> Vec<f32> {
         .0
         .max((MIN_PEAK.1 * quantile(&mut heights, 0.5)) as u32);
     peaks.retain(|peak| peak.1 >= least);
+    let heights: Vec<u32> = peaks.iter().map(|peak| peak.1).collect();
+    let mut number = 0_usize;
+    peaks.retain(|peak| {
+        let beside = [number.wrapping_sub(1), number + 1].map(|other| heights.get(other));
+        number += 1;
+        !matches!(beside, [Some(a), Some(b)] if peak.1 < a.min(b) / STRAY)
+    });
     // The window ends with its last bin.
     let angle = |(end, _)| (end as f32 + 1.0 - 0.5 * window as f32) * BIN_DEG - 90.0;
     peaks.into_iter().map(angle).collect()

@@ -103,3 +103,6 @@ fn valid_points(scan: &Scan) -> Scan {
     scan.drop_invalid(&any_range);
     scan
 }
+
+#[cfg(test)]
+mod tests;

@@ -161,6 +161,7 @@ impl BuildMapConfig {
                 voxel_size_m: self.voxel_size as f32,
                 crop_m: Vec3::new(self.crop_x as f32, self.crop_y as f32, self.crop_z as f32),
                 own_car_m: self.own_car_m,
+                ..ScanConfig::default()
             },
             confidence: self.confidence.clone(),
             poisson: PoissonConfig {
