@@ -7,7 +7,7 @@ pub const MAX_BEAMS: usize = 512;
 
 /// The returns of a beam.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Beam {
+pub struct BeamReturns {
     /// Elevation [deg].
     pub elevation_deg: f32,
     /// Azimuths of the returns in one scan [rad].

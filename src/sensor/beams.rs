@@ -13,7 +13,7 @@ use std::f32::consts::{PI, TAU};
 
 use serde::{Deserialize, Serialize};
 
-use super::beam::{Beam, MAX_BEAMS, angles, elevation_deg, quantile};
+use super::beam::{BeamReturns, MAX_BEAMS, angles, elevation_deg, quantile};
 use super::elevations;
 use crate::lidar::Scan;
 
@@ -38,7 +38,7 @@ pub struct Beams {
     /// What they follow from.
     pub source: BeamSource,
     /// Those that returned, from the top.
-    pub rows: Vec<Beam>,
+    pub rows: Vec<BeamReturns>,
     /// Number of beams of the device; `None` without rows.
     pub nominal: Option<usize>,
 }
@@ -75,7 +75,7 @@ pub fn find(scans: &[Scan]) -> Beams {
 
 /// Beams by the rings of the points.
 struct Rings {
-    rows: Vec<Beam>,
+    rows: Vec<BeamReturns>,
     /// Median width of a ring relative to its distance from the next (unitless).
     width: f32,
     /// Numbers of rings, from 0 or 1 to the last.
@@ -89,7 +89,7 @@ fn by_rings(scans: &[Scan]) -> Option<Rings> {
         return None;
     }
     let mut elevations = vec![vec![]; usize::from(*last) + 1];
-    let mut rows = vec![Beam::default(); elevations.len()];
+    let mut rows = vec![BeamReturns::default(); elevations.len()];
     for (number, scan) in scans.iter().enumerate() {
         for (&point, &ring) in scan.points.iter().zip(&scan.rings) {
             let [degrees, azimuth_rad] = angles(point);
@@ -105,7 +105,7 @@ fn by_rings(scans: &[Scan]) -> Option<Rings> {
     } else {
         elevations.len()
     };
-    let mut found: Vec<(Beam, f32)> = (rows.into_iter().zip(&mut elevations))
+    let mut found: Vec<(BeamReturns, f32)> = (rows.into_iter().zip(&mut elevations))
         .filter(|(_, elevations)| !elevations.is_empty())
         .map(|(mut row, returns)| {
             row.elevation_deg = elevation_deg(returns);
@@ -127,10 +127,10 @@ fn by_rings(scans: &[Scan]) -> Option<Rings> {
 }
 
 /// The rows of the scan with most beams; elevations are medians over all scans with as many.
-fn by_order_of_scans(scans: &[Scan]) -> Option<Vec<Beam>> {
-    let found: Vec<Vec<Beam>> = scans.iter().filter_map(by_order).collect();
+fn by_order_of_scans(scans: &[Scan]) -> Option<Vec<BeamReturns>> {
+    let found: Vec<Vec<BeamReturns>> = scans.iter().filter_map(by_order).collect();
     let most = found.iter().map(Vec::len).max()?;
-    let full: Vec<&Vec<Beam>> = found.iter().filter(|rows| rows.len() == most).collect();
+    let full: Vec<&Vec<BeamReturns>> = found.iter().filter(|rows| rows.len() == most).collect();
     let mut rows = full[0].clone();
     for (number, row) in rows.iter_mut().enumerate() {
         let mut all: Vec<f32> = full.iter().map(|rows| rows[number].elevation_deg).collect();
@@ -140,7 +140,7 @@ fn by_order_of_scans(scans: &[Scan]) -> Option<Vec<Beam>> {
 }
 
 /// Beams of points that are in the order of revolutions; `None` of others.
-fn by_order(scan: &Scan) -> Option<Vec<Beam>> {
+fn by_order(scan: &Scan) -> Option<Vec<BeamReturns>> {
     /// Share of the steps in the direction of the revolutions, at least (unitless).
     const MIN_FORWARD: f32 = 0.8;
     /// Median change of elevation from point to point, at most; neighbouring beams are farther apart [deg].
@@ -163,14 +163,14 @@ fn by_order(scan: &Scan) -> Option<Vec<Beam>> {
     let start_rad = start_of_revolutions(&angles, sense, change_deg);
     let along = |azimuth_rad: f32| (sense * (azimuth_rad - start_rad)).rem_euclid(TAU);
     let mut first = 0;
-    let revolutions: Vec<Beam> = angles
+    let revolutions: Vec<BeamReturns> = angles
         .chunk_by(|a, b| along(b[1]) > along(a[1]) - JITTER_RAD)
         .filter_map(|returns| {
             let points = &scan.points[first..first + returns.len()];
             first += returns.len();
             let distances = points.iter().map(|point| point.truncate().length());
             let elevations = distances.zip(returns).map(|(m, angles)| [m, angles[0]]);
-            (returns.len() >= MIN_RETURNS[1]).then(|| Beam {
+            (returns.len() >= MIN_RETURNS[1]).then(|| BeamReturns {
                 elevation_deg: elevation_deg(&mut elevations.collect::<Vec<_>>()),
                 azimuths_rad: returns.iter().map(|angles| angles[1]).collect(),
             })
@@ -214,7 +214,7 @@ fn wrap(angle_rad: f32) -> f32 {
 }
 
 /// Median difference of elevation between neighbouring beams [deg].
-fn median_spacing(beams: &[Beam]) -> f32 {
+fn median_spacing(beams: &[BeamReturns]) -> f32 {
     let mut elevations: Vec<f32> = beams.iter().map(|beam| beam.elevation_deg).collect();
     elevations.sort_by(f32::total_cmp);
     let mut gaps: Vec<f32> = elevations
@@ -225,7 +225,7 @@ fn median_spacing(beams: &[Beam]) -> f32 {
 }
 
 /// Beams from the top; those closer than `min_gap_deg` are one.
-fn merged(mut beams: Vec<Beam>, min_gap_deg: f32) -> Vec<Beam> {
+fn merged(mut beams: Vec<BeamReturns>, min_gap_deg: f32) -> Vec<BeamReturns> {
     beams.sort_by(|a, b| b.elevation_deg.total_cmp(&a.elevation_deg));
     beams.dedup_by(|lower, upper| {
         let same = upper.elevation_deg - lower.elevation_deg < min_gap_deg;
@@ -242,7 +242,7 @@ const BUILT: [usize; 10] = [1, 2, 4, 8, 16, 32, 40, 64, 128, 256];
 
 /// Number of beams of the device: as many as returned, or the next number that is built if it is almost
 /// reached or the beams at an edge have few returns, so that others have none.
-fn nominal(rows: &[Beam]) -> usize {
+fn nominal(rows: &[BeamReturns]) -> usize {
     let mut counts: Vec<f32> = rows
         .iter()
         .map(|row| row.azimuths_rad.len() as f32)

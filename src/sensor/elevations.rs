@@ -14,7 +14,7 @@
 
 use rayon::prelude::*;
 
-use super::beam::{Beam, MAX_BEAMS, angles, elevation_deg, quantile};
+use super::beam::{BeamReturns, MAX_BEAMS, angles, elevation_deg, quantile};
 use crate::lidar::Scan;
 
 /// Points that are examined, about.
@@ -45,7 +45,7 @@ struct Ray {
 }
 
 /// The beams, from the top; `None` if the elevations have no peaks.
-pub fn rows(scans: &[Scan]) -> Option<Vec<Beam>> {
+pub fn rows(scans: &[Scan]) -> Option<Vec<BeamReturns>> {
     let mut rays = rays(scans);
     set_cones(&mut rays);
     // Neighbouring points are not independent of each other: sectors of azimuth are.
@@ -196,7 +196,7 @@ fn share_near(peaks: &[f32], rays: &[Ray]) -> f64 {
     near.count() as f64 / rays.len() as f64
 }
 
-fn beams_at(peaks: &[f32], rays: &[Ray]) -> Vec<Beam> {
+fn beams_at(peaks: &[f32], rays: &[Ray]) -> Vec<BeamReturns> {
     let first_scan = rays.iter().map(|ray| ray.scan).min();
     let mut beams = vec![(vec![], vec![]); peaks.len()];
     for ray in rays {
@@ -208,9 +208,9 @@ fn beams_at(peaks: &[f32], rays: &[Ray]) -> Vec<Beam> {
             beams[peak].1.push(ray.azimuth_rad);
         }
     }
-    let mut beams: Vec<Beam> = (beams.into_iter())
+    let mut beams: Vec<BeamReturns> = (beams.into_iter())
         .filter(|(returns, _)| !returns.is_empty())
-        .map(|(mut returns, azimuths_rad)| Beam {
+        .map(|(mut returns, azimuths_rad)| BeamReturns {
             elevation_deg: elevation_deg(&mut returns),
             azimuths_rad,
         })

@@ -24,7 +24,7 @@ pub mod rotation;
 
 use serde::{Deserialize, Serialize};
 
-pub use beam::Beam;
+pub use beam::BeamReturns;
 pub use beams::BeamSource;
 pub use dropped::{DropReason, DroppedPoints};
 pub use mounting::Mounting;
