@@ -41,15 +41,18 @@ struct Grid {
     cells: HashMap<IVec3, Range<usize>>,
 }
 
+/// Whether a point is near enough, and not that of an empty pixel at the origin.
+fn is_return(point: Vec3) -> bool {
+    point.abs().max_element() < FARTHEST_M && point != Vec3::ZERO
+}
+
 fn cell_of(point: Vec3) -> IVec3 {
     (point / CELL_M).floor().as_ivec3()
 }
 
 impl Grid {
     fn new(points: &[Vec3]) -> Self {
-        let near = points
-            .iter()
-            .filter(|point| point.abs().max_element() < FARTHEST_M);
+        let near = points.iter().filter(|point| is_return(**point));
         let mut points: Vec<Vec3> = near.copied().collect();
         points.sort_by_key(|&point| cell_of(point).to_array());
         let mut start = 0;
@@ -80,7 +83,7 @@ impl Grid {
 }
 
 fn normal_at(grid: &Grid, point: Vec3, config: &NormalConfig) -> Option<Vec3> {
-    if !(point.abs().max_element() < FARTHEST_M) {
+    if !is_return(point) {
         return None;
     }
     let mut neighbors = grid.around(point, 1);
