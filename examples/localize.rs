@@ -17,7 +17,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let map = Map::load(map_file, &MapOptions::default())?;
     let mut localizer = Localizer::new(&map, LocalizerConfig::default(), Start::Anywhere, 0)?;
     let mut trajectory = Vec::new();
-    for frame in &Recording::open(recording, &Selection::default())?.frames {
+    for frame in &Recording::open(recording, None, &Selection::default())?.frames {
         let estimate = localizer.step(&frame.read()?, Odometry::Unknown)?;
         let (t, deviations) = (estimate.pose.translation, estimate.standard_deviations());
         let state = estimate.state.word();

@@ -18,7 +18,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let map = Map::load(map_file, &MapOptions::default())?;
     let trajectory = read_tum(trajectory_file)?;
     let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), 0)?;
-    let recording = Recording::open(recording, &Selection::default())?;
+    let recording = Recording::open(recording, None, &Selection::default())?;
     for (frame, row) in recording.frames.iter().zip(&trajectory) {
         let estimate = InitialEstimate::tracked(pose2_from_pose3(&row.map_from_lidar));
         refiner.add(&frame.read()?, &estimate)?;

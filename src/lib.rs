@@ -26,7 +26,7 @@
 //! let seed = 0;
 //! let mut localizer = Localizer::new(&map, LocalizerConfig::default(), Start::Anywhere, seed)?;
 //! let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), seed)?;
-//! let second_drive = Recording::open(Path::new("data/street/drive_2"), &Selection::default())?;
+//! let second_drive = Recording::open(Path::new("data/street/drive_2"), None, &Selection::default())?;
 //! for frame in &second_drive.frames {
 //!     let scan = frame.read()?;
 //!     let estimate = localizer.step(&scan, Odometry::Unknown)?;

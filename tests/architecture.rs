@@ -17,7 +17,7 @@ struct Restriction {
     reason: &'static str,
 }
 
-const RESTRICTIONS: [Restriction; 9] = [
+const RESTRICTIONS: [Restriction; 10] = [
     Restriction {
         words: &["wgpu::", "use wgpu", "pollster::"],
         allowed: &["rendering/gpu"],
@@ -37,6 +37,11 @@ const RESTRICTIONS: [Restriction; 9] = [
         words: &["zip::", "use zip"],
         allowed: &["app/results"],
         reason: "archives are confined to results",
+    },
+    Restriction {
+        words: &["rusqlite::", "ruzstd::", "lz4_flex::", "bzip2::"],
+        allowed: &["recording/bags"],
+        reason: "databases and compressions are confined to bags",
     },
     Restriction {
         words: &["clap::", "use clap"],
@@ -89,8 +94,14 @@ const RESTRICTIONS: [Restriction; 9] = [
             "NamedTempFile",
             "tempfile_in",
         ],
-        allowed: &["recording", "map/ply.rs", "files.rs", "app"],
-        reason: "files are opened only in recording, map/ply.rs, files.rs and app",
+        allowed: &[
+            "recording",
+            "map/ply.rs",
+            "map/mesh_file.rs",
+            "files.rs",
+            "app",
+        ],
+        reason: "files are opened only in recording, the readers of meshes, files.rs and app",
     },
 ];
 

@@ -11,6 +11,8 @@
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 #![allow(clippy::print_stdout, reason = "the table of the campaign")]
 
+#[cfg(feature = "bags")]
+mod bag_writers;
 mod fuzzed;
 
 use std::fs;
@@ -109,6 +111,49 @@ fn read_scan(file: &Input) -> Result<Scan, String> {
     assert_eq!(scan.points.len(), scan.intensities.len());
     assert!(scan.len() <= file.bytes.len());
     Ok(scan)
+}
+
+#[cfg(feature = "bags")]
+#[test]
+fn bags_mcap() {
+    fuzz("bags (.mcap)", "a.mcap", fuzzed::bags::mcap_file, read_bag);
+}
+
+#[cfg(feature = "bags")]
+#[test]
+fn bags_ros1() {
+    fuzz("bags (.bag)", "a.bag", fuzzed::bags::ros1_file, read_bag);
+}
+
+#[cfg(feature = "bags")]
+#[test]
+fn bags_database() {
+    fuzz("bags (.db3)", "a.db3", fuzzed::bags::database, read_bag);
+}
+
+/// Reads all scans, poses and transforms of a bag.
+#[cfg(feature = "bags")]
+fn read_bag(file: &Input) -> Result<(), String> {
+    use fpmcl::recording::bags::{Bag, Wanted};
+
+    let bag = Bag::open(file.path).map_err(text)?;
+    for topic in bag.topics_of(Wanted::Scans) {
+        for scan in 0..bag.scan_times(&topic.name).unwrap().len() {
+            let scan = bag.read_scan(&topic.name, scan).map_err(text)?;
+            assert_eq!(scan.points.len(), scan.intensities.len());
+            assert!([0, scan.len()].contains(&scan.times_s.len()));
+            assert!([0, scan.len()].contains(&scan.rings.len()));
+            assert!(scan.points.iter().all(|point| point.is_finite()));
+            assert!(scan.times_s.iter().all(|time_s| time_s.abs() <= 0.51));
+        }
+    }
+    for topic in bag.topics_of(Wanted::Poses) {
+        for pose in bag.poses(&topic.name).map_err(text)? {
+            check_pose(&pose.parent_from_child);
+        }
+    }
+    bag.static_transforms().map_err(text)?;
+    Ok(())
 }
 
 #[test]
@@ -474,8 +519,7 @@ fn set<'a, T: CommandConfig + PartialEq>(
         Command::BuildMap(args) => args.run.source.settings,
         Command::Localize(args) => args.run.source.settings,
         Command::Refine(args) => args.run.source.settings,
-        Command::Evaluate(args)
-        | Command::Simulate(args) => args.source.settings,
+        Command::Evaluate(args) | Command::Simulate(args) => args.source.settings,
         Command::Compare(args) => args.source.settings,
         Command::Ground(args) => args.settings,
         other => panic!("{other:?} has no settings"),

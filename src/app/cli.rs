@@ -7,6 +7,7 @@ use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
 use tracing::level_filters::LevelFilter;
 
 use crate::app::comparison::RunId;
+use crate::recording::scan_files;
 use crate::rendering::Backend;
 
 /// Finds a car's pose to the centimetre from one spinning LiDAR and a mesh map that it builds itself.
@@ -440,8 +441,15 @@ impl RunArgs {
 impl BuildMapArgs {
     /// Settings of the flags that stand for a key.
     pub fn flags(&self) -> Vec<(String, String)> {
+        let input = self.run.source.input();
+        let is_cloud = input.is_some_and(|path| path.is_file() && scan_files::is_scan(path));
+        let input_key = if is_cloud {
+            "cloud_file"
+        } else {
+            "scan_folder"
+        };
         let paths = [
-            ("scan_folder", self.run.source.input()),
+            (input_key, input),
             ("mesh_file", self.output.as_deref()),
             ("pose_file", self.poses.as_deref()),
             ("calib_file", self.calib.as_deref()),

@@ -7,6 +7,7 @@
 pub mod angle;
 pub mod cloud;
 pub mod grid;
+pub mod kd_tree;
 pub mod mesh;
 pub mod morton;
 pub mod plane;
@@ -17,6 +18,7 @@ pub mod trajectory;
 pub use angle::{circular_mean, wrap_angle};
 pub use cloud::PointCloud;
 pub use grid::Grid2;
+pub use kd_tree::KdTree;
 pub use mesh::{Aabb, TriangleMesh};
 pub use plane::{PlaneFit, PlaneSums};
 pub use ply_vertex::PlyVertex;

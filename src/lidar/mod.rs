@@ -5,9 +5,11 @@ pub mod model;
 pub mod normals;
 pub mod range_image;
 pub mod scan;
+pub mod spatial_normals;
 
 pub use deskewing::{Motion, Rotation, RotationDirection, Sweep, interpolate_motion};
 pub use model::LidarModel;
 pub use normals::{NormalConfig, estimate_normals};
 pub use range_image::{NO_RETURN, RangeImage};
 pub use scan::{Beam, Scan};
+pub use spatial_normals::estimate_spatial_normals;

@@ -13,6 +13,7 @@ use std::error::Error;
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use glam::Vec3;
 use rayon::prelude::*;
 
 use super::config::{MapConfig, MapOptions};
@@ -79,6 +80,18 @@ pub enum BuildError {
         "the map has no triangles: none of the {scans} key scans has points left to mesh; check range_image, crop_x, crop_y and crop_z"
     )]
     Empty { scans: usize },
+    #[error(
+        "the cloud has no ground: none of its {points} points with normals are on a near-horizontal surface of 4 m² or more below others; its z axis must point up, and its unit must be the metre"
+    )]
+    CloudWithoutGround { points: usize },
+    #[error(
+        "the cloud has a point at {position}: single precision does not resolve centimetres there; subtract an offset before exporting it"
+    )]
+    CloudTooFar { position: Vec3 },
+    #[error(
+        "the cloud has {points} points, more than the 4 billion that can be numbered; divide it"
+    )]
+    CloudTooLarge { points: usize },
     #[error(transparent)]
     Memory(#[from] MemoryError),
     #[error(transparent)]
@@ -250,8 +263,6 @@ impl MapPlan<'_> {
 
 #[cfg(test)]
 mod tests {
-    use glam::Vec3;
-
     use super::*;
     use crate::lidar::LidarModel;
     use crate::rendering::Backend;

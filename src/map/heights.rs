@@ -48,7 +48,9 @@ impl Heights {
     pub fn of_triangles(corners: impl Iterator<Item = [Vec3; 3]>, cell_m: f64) -> Self {
         let mut samples = HeightSamples::default();
         for corners in corners {
-            rasterize(corners, cell_m, &mut samples);
+            rasterize(corners, cell_m, &mut |cell, height_m| {
+                samples.add(cell, height_m)
+            });
         }
         samples.into_heights(cell_m)
     }
@@ -184,7 +186,8 @@ fn chunk_of((column, row): Cell) -> (Cell, usize) {
     (chunk, offset as usize)
 }
 
-fn cell_of(position: Point2<f64>, cell_m: f64) -> Cell {
+/// Cell of a position.
+pub(super) fn cell_of(position: Point2<f64>, cell_m: f64) -> Cell {
     let cell = |along: f64| (along / cell_m).floor() as i64;
     (cell(position.x), cell(position.y))
 }
@@ -194,14 +197,14 @@ fn center_of((column, row): Cell, cell_m: f64) -> Point2<f64> {
 }
 
 /// Adds the heights of a triangle at the centres of cells that it covers, and those of its corners.
-fn rasterize(corners: [Vec3; 3], cell_m: f64, samples: &mut HeightSamples) {
+pub(super) fn rasterize(corners: [Vec3; 3], cell_m: f64, add: &mut impl FnMut(Cell, f64)) {
     let [a, b, c] = corners.map(|corner| Vector3::new(corner.x, corner.y, corner.z).cast::<f64>());
     let (ab, ac) = (b - a, c - a);
     if ab.xy().norm().max(ac.xy().norm()) > MAX_EDGE_M {
         return;
     }
     for corner in [a, b, c] {
-        samples.add(cell_of(corner.xy().into(), cell_m), corner.z);
+        add(cell_of(corner.xy().into(), cell_m), corner.z);
     }
     let area = ab.x * ac.y - ab.y * ac.x;
     if area.abs() <= 1e-12 {
@@ -216,7 +219,7 @@ fn rasterize(corners: [Vec3; 3], cell_m: f64, samples: &mut HeightSamples) {
             let u = (x * ac.y - y * ac.x) / area;
             let v = (ab.x * y - ab.y * x) / area;
             if u >= 0.0 && v >= 0.0 && u + v <= 1.0 {
-                samples.add((column, row), a.z + u * ab.z + v * ac.z);
+                add((column, row), a.z + u * ab.z + v * ac.z);
             }
         }
     }

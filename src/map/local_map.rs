@@ -147,21 +147,12 @@ pub(super) fn build<E: From<MeshingError>>(
     let (cloud, weights) = static_cloud(&scans, config, &mut counts);
 
     begin_stage("surface")?;
-    let Some(surface) = reconstruct(&cloud, weights.as_deref(), config, &mut counts)? else {
-        let mesh = TriangleMesh::default();
+    let Some(mut mesh) = surface(&cloud, weights.as_deref(), config, &mut counts)? else {
         return Ok(LocalMap {
-            mesh,
             counts,
             ..LocalMap::default()
         });
     };
-    counts.reconstructed_triangles = surface.mesh.triangles.len();
-    let mut mesh = surface.mesh;
-    counts.sparse_triangles =
-        meshing::trim_by_density(&mut mesh, &surface.densities, config.min_density);
-    drop(surface.densities);
-    counts.distant_triangles =
-        meshing::trim_by_distance(&mut mesh, &cloud.positions, config.max_distance_m);
 
     begin_stage("false surfaces")?;
     if config.visibility.enabled {
@@ -171,16 +162,69 @@ pub(super) fn build<E: From<MeshingError>>(
     drop(scans);
 
     begin_stage("ground")?;
+    Ok(finish(mesh, &cloud, (number, ownership), config, counts))
+}
+
+/// Meshes oriented points with ground confidences, as [`build`] does after the preparation of the scans.
+pub(super) fn build_of_cloud<E: From<MeshingError>>(
+    cloud: &PointCloud,
+    number: usize,
+    ownership: &Ownership,
+    config: &LocalMapConfig,
+    begin_stage: impl Fn(&'static str) -> Result<(), E>,
+) -> Result<LocalMap, E> {
+    let mut counts = LocalMapCounts::default();
+    begin_stage("surface")?;
+    let Some(mesh) = surface(cloud, None, config, &mut counts)? else {
+        return Ok(LocalMap {
+            counts,
+            ..LocalMap::default()
+        });
+    };
+    begin_stage("ground")?;
+    Ok(finish(mesh, cloud, (number, ownership), config, counts))
+}
+
+/// Reconstructs and trims the surface; `None` where there are too few points.
+fn surface(
+    cloud: &PointCloud,
+    weights: Option<&[f32]>,
+    config: &LocalMapConfig,
+    counts: &mut LocalMapCounts,
+) -> Result<Option<TriangleMesh>, MeshingError> {
+    let Some(Reconstruction {
+        mut mesh,
+        densities,
+        ..
+    }) = reconstruct(cloud, weights, config, counts)?
+    else {
+        return Ok(None);
+    };
+    counts.reconstructed_triangles = mesh.triangles.len();
+    counts.sparse_triangles = meshing::trim_by_density(&mut mesh, &densities, config.min_density);
+    counts.distant_triangles =
+        meshing::trim_by_distance(&mut mesh, &cloud.positions, config.max_distance_m);
+    Ok(Some(mesh))
+}
+
+/// Clips a mesh to what a local map owns, and colours and simplifies its ground.
+fn finish(
+    mut mesh: TriangleMesh,
+    cloud: &PointCloud,
+    (number, ownership): (usize, &Ownership),
+    config: &LocalMapConfig,
+    mut counts: LocalMapCounts,
+) -> LocalMap {
     counts.foreign_triangles = seam::keep_own(&mut mesh, ownership, number);
     meshing::split_fans(&mut mesh);
     let is_held = seam::on_border(&mesh.vertices, ownership, number);
-    finish_ground(&mut mesh, &cloud, &is_held, config, &mut counts);
+    finish_ground(&mut mesh, cloud, &is_held, config, &mut counts);
     counts.triangles = mesh.triangles.len();
-    Ok(LocalMap {
+    LocalMap {
         mesh,
         counts,
         ..LocalMap::default()
-    })
+    }
 }
 
 /// Returns the static points of all scans with their weights.

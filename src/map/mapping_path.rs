@@ -8,6 +8,7 @@
 //! comment fpmcl map_from_lidar   tx ty tz qx qy qz qw
 //! ```
 
+use glam::DVec3;
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
 use crate::geometry::{FARTHEST_M, Pose3};
@@ -16,12 +17,12 @@ const WORLD: &str = "fpmcl world_from_map";
 const POSE: &str = "fpmcl map_from_lidar";
 
 /// Poses of the scans that a map was built from, and the pose of the map in the world.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct MappingPath {
     /// `p_world = world_from_map * p_map`, where the world is the frame in which the poses of the
     /// mapping drive were given; the identity where they were given in the map frame.
     pub world_from_map: Pose3,
-    /// Poses of the key scans, `p_map = map_from_lidar * p_lidar`.
+    /// Poses of the key scans, `p_map = map_from_lidar * p_lidar`; empty for a mesh from elsewhere.
     pub map_from_lidar: Vec<Pose3>,
 }
 
@@ -46,22 +47,28 @@ impl MappingPath {
             .collect()
     }
 
-    /// Reads the comments of a PLY file; `None` where they hold no path.
+    /// Frame of a mesh without a mapping drive that was moved by an origin [m]; `None` if it was not moved.
+    pub(super) fn at_origin(origin: DVec3) -> Option<Self> {
+        (origin != DVec3::ZERO).then(|| Self {
+            world_from_map: Pose3::translation(origin.x, origin.y, origin.z),
+            ..Self::default()
+        })
+    }
+
+    /// Reads the comments of a PLY file; `None` where they hold neither path nor frame.
     pub fn from_comments<'a>(
         comments: impl IntoIterator<Item = &'a str>,
     ) -> Result<Option<Self>, BadPathComment> {
-        let (mut world_from_map, mut map_from_lidar) = (Pose3::identity(), Vec::new());
+        let mut path: Option<Self> = None;
         for comment in comments {
             if let Some(numbers) = comment.strip_prefix(WORLD) {
-                world_from_map = pose(numbers, comment)?;
+                path.get_or_insert_default().world_from_map = pose(numbers, comment)?;
             } else if let Some(numbers) = comment.strip_prefix(POSE) {
-                map_from_lidar.push(pose(numbers, comment)?);
+                let path = path.get_or_insert_default();
+                path.map_from_lidar.push(pose(numbers, comment)?);
             }
         }
-        Ok((!map_from_lidar.is_empty()).then_some(Self {
-            world_from_map,
-            map_from_lidar,
-        }))
+        Ok(path)
     }
 }
 

@@ -7,6 +7,8 @@
 
 // From scans to a mesh.
 pub mod builder;
+pub mod cloud;
+mod cloud_normals;
 pub mod confidence;
 pub mod config;
 pub mod local_map;
@@ -20,13 +22,20 @@ pub mod visibility;
 // What a pose in the map needs.
 pub mod cells;
 pub mod elevation;
+mod ground_surface;
 mod heights;
 pub mod panorama;
 pub mod tiles;
 // The map as a whole, and its file.
 pub mod mapping_path;
+mod mesh_error;
+pub mod mesh_file;
+mod mesh_origin;
+mod mesh_polygons;
 pub mod model;
+mod obj;
 pub mod ply;
+mod stl;
 
 #[cfg(test)]
 mod seam_tests;
@@ -34,11 +43,12 @@ mod seam_tests;
 pub(crate) mod test_world;
 
 pub use builder::{BuildError, BuildEvent, MapBuilder, MapPlan, ScanError};
+pub use cloud::CloudPlan;
 pub use config::{MapConfig, MapOptions};
 pub use elevation::{GroundMap, GroundPatch, SensorAttitude};
 pub use local_map::{LocalMap, LocalMapConfig, LocalMapCounts};
 pub use mapping_path::MappingPath;
+pub use mesh_error::{MeshFileError, MeshFileProblem};
 pub use model::{Map, MapError};
 pub use panorama::{PanoramaConfig, PanoramaIndex, PanoramaRequest, PanoramaSeed, SearchRegion};
-pub use ply::PlyError;
 pub use tiles::{TileConfig, TileGrid, TileIndex};

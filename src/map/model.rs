@@ -1,13 +1,19 @@
 //! The map that a car is localized in.
 
-use std::path::{Path, PathBuf};
+use std::ops::RangeInclusive;
+use std::path::Path;
 use std::sync::{Arc, Mutex};
+
+use glam::Vec3;
 
 use super::config::MapOptions;
 use super::elevation::GroundMap;
+use super::ground_surface::GroundSurface;
 use super::mapping_path::MappingPath;
+use super::mesh_error::MeshFileError;
+use super::mesh_file;
 use super::panorama::{PanoramaIndex, PanoramaRequest};
-use super::ply::{self, PlyError};
+use super::ply;
 use super::tiles::{self, TileGrid};
 use super::vertex_ground::is_ground_color;
 use crate::geometry::TriangleMesh;
@@ -17,8 +23,8 @@ use crate::rendering::{RangeRenderer, RenderError, renderer};
 /// Cell size of the elevation of the ground [m].
 const GROUND_CELL_M: f64 = 0.5;
 
-/// Cosine of the steepest slope that counts as ground in a map without ground colours.
-const LEVEL_COSINE: f32 = 0.97;
+/// Extents between which a map in metres lies [m].
+const PLAUSIBLE_M: RangeInclusive<f32> = 2.0..=20_000.0;
 
 /// Memory per triangle, in the mesh, the tiles and the renderer's hierarchy [bytes].
 const TRIANGLE_BYTES: f64 = 300.0;
@@ -54,13 +60,15 @@ type CachedPanoramas = (PanoramaRequest, Arc<PanoramaIndex>);
 #[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum MapError {
     #[error(transparent)]
-    Ply(#[from] PlyError),
+    File(#[from] MeshFileError),
     #[error(
         "none of the {triangles} triangles of the map has an area: no beam can hit it; build the map again"
     )]
     NoArea { triangles: usize },
-    #[error("{} does not contain the path of its mapping drive; give the poses that it was built with (map_pose_file and map_calib_file)", path.display())]
-    NoPath { path: PathBuf },
+    #[error(
+        "the map has no ground: no near-horizontal surface of 4 m² or more lies below the others{}", hint(*.is_y_up)
+    )]
+    NoGround { is_y_up: bool },
     #[error(transparent)]
     Memory(#[from] MemoryError),
     #[error(transparent)]
@@ -71,7 +79,7 @@ impl Map {
     /// Prepares a mesh in the map frame.
     ///
     /// The ground consists of the triangles with more red than blue, as `build-map` and range-mcl
-    /// colour them; in a mesh without such triangles, of all nearly horizontal ones.
+    /// colour them; in a mesh without such colours, it is found by its shape (see `ground_surface`).
     pub fn new(
         mesh: TriangleMesh,
         path: MappingPath,
@@ -81,17 +89,25 @@ impl Map {
         if (0..triangles).all(|triangle| mesh.scaled_normal(triangle) == glam::Vec3::ZERO) {
             return Err(MapError::NoArea { triangles });
         }
+        let has_path = !path.map_from_lidar.is_empty();
+        let bounds = mesh.bounds();
+        let tiles = match has_path {
+            true => TileGrid::count(&path.map_from_lidar, &options.tiles),
+            false => TileGrid::count_of_mesh(&bounds, &options.tiles),
+        };
         memory::require(
             "the map",
-            triangles as f64 * TRIANGLE_BYTES
-                + TileGrid::count(&path.map_from_lidar, &options.tiles) * TILE_BYTES,
+            triangles as f64 * TRIANGLE_BYTES + tiles * TILE_BYTES,
             "choose a smaller map, or check the poses of its mapping drive",
         )?;
-        let tiles = TileGrid::around(&path.map_from_lidar, &options.tiles);
+        let ground = ground_of(&mesh, has_path)?;
+        let tiles = match has_path {
+            true => TileGrid::around(&path.map_from_lidar, &options.tiles),
+            false => TileGrid::of_mesh(&mesh, &options.tiles),
+        };
         let parts = tiles::cut(&mesh, &tiles);
         let renderer = renderer(&parts, options.backend, options.max_poses)?;
         drop(parts);
-        let ground = ground_of(&mesh);
         Ok(Self::from_parts(mesh, path, tiles, ground, renderer.into()))
     }
 
@@ -113,14 +129,12 @@ impl Map {
         }
     }
 
-    /// Reads a map that [`save`](Self::save) or `build-map` wrote. A map of range-mcl does not contain
-    /// the path of its mapping drive: give [`ply::read`] and that path to [`new`](Self::new).
+    /// Reads a map that [`save`](Self::save) or `build-map` wrote, or a mesh from elsewhere (PLY, OBJ or
+    /// STL). A map of range-mcl does not contain the path of its mapping drive: give
+    /// [`mesh_file::read`] and that path to [`new`](Self::new).
     pub fn load(path: &Path, options: &MapOptions) -> Result<Self, MapError> {
-        let (mesh, mapping_path) = ply::read_map(path)?;
-        let mapping_path = mapping_path.ok_or_else(|| MapError::NoPath {
-            path: path.to_owned(),
-        })?;
-        Self::new(mesh, mapping_path, options)
+        let (mesh, mapping_path) = mesh_file::read(path)?;
+        Self::new(mesh, mapping_path.unwrap_or_default(), options)
     }
 
     /// Writes the map as a PLY file that is complete by itself; see [`ply::write`].
@@ -135,7 +149,7 @@ impl Map {
         match &*last {
             Some((made_for, index)) if made_for == request => Ok(index.clone()),
             _ => {
-                request.require_memory(&self.tiles)?;
+                request.require_memory(&self.path.map_from_lidar, &self.tiles)?;
                 let cells = request.cells(&self.path.map_from_lidar, &self.tiles);
                 let index = PanoramaIndex::build(
                     &cells,
@@ -152,8 +166,12 @@ impl Map {
     }
 }
 
-/// Builds the elevation map of the red triangles; in a mesh without any, of the nearly horizontal ones.
-fn ground_of(mesh: &TriangleMesh) -> GroundMap {
+/// Builds the elevation map of the red triangles; in a mesh without any, of the ground found by its shape.
+///
+/// Colours of a mesh without a mapping drive mark the ground only if they are between red and blue: others
+/// are those of a photograph.
+fn ground_of(mesh: &TriangleMesh, has_path: bool) -> Result<GroundMap, MapError> {
+    let is_marked = has_path || mesh.colors.iter().all(|[_, green, _]| *green == 0);
     let is_red = |triangle: usize| {
         let mut vertices = mesh.triangles[triangle].iter();
         vertices.all(|&vertex| {
@@ -162,13 +180,52 @@ fn ground_of(mesh: &TriangleMesh) -> GroundMap {
                 .is_some_and(is_ground_color)
         })
     };
-    if (0..mesh.triangles.len()).any(is_red) {
-        return GroundMap::from_mesh(mesh, is_red, GROUND_CELL_M);
+    if is_marked && (0..mesh.triangles.len()).any(is_red) {
+        return Ok(GroundMap::from_mesh(mesh, is_red, GROUND_CELL_M));
     }
-    tracing::warn!("the map has no ground marked red; every nearly horizontal surface is used");
-    let is_level = |triangle: usize| {
-        let normal = mesh.scaled_normal(triangle).normalize_or_zero();
-        normal.z.abs() > LEVEL_COSINE
-    };
-    GroundMap::from_mesh(mesh, is_level, GROUND_CELL_M)
+    warn_of_extent(mesh);
+    let ground = GroundSurface::of_mesh(mesh);
+    let area_m2 = ground.area_m2();
+    let y_up_area_m2 = GroundSurface::of_mesh(&turned_from_y_up(mesh)).area_m2();
+    let is_y_up = y_up_area_m2 > 2.0 * area_m2;
+    if area_m2 == 0.0 {
+        return Err(MapError::NoGround { is_y_up });
+    }
+    if is_y_up {
+        tracing::warn!(
+            "the map has {area_m2:.0} m² of ground, and would have {y_up_area_m2:.0} m²{}",
+            hint(true)
+        );
+    }
+    tracing::info!("the map has no ground marked red: {area_m2:.0} m² were found by their shape");
+    let is_ground = |triangle| ground.has_triangle(mesh, triangle);
+    Ok(GroundMap::from_mesh(mesh, is_ground, GROUND_CELL_M))
+}
+
+/// Warns of an extent that is not that of a map in metres.
+fn warn_of_extent(mesh: &TriangleMesh) {
+    let extent_m = mesh.bounds().size().max_element();
+    if !PLAUSIBLE_M.contains(&extent_m) {
+        tracing::warn!(
+            "the map is {extent_m:.2} m across: if its unit is not the metre, scale it before exporting (from millimetres by 0.001)"
+        );
+    }
+}
+
+/// A mesh whose y points up with z up.
+fn turned_from_y_up(mesh: &TriangleMesh) -> TriangleMesh {
+    let turned = |&Vec3 { x, y, z }: &Vec3| Vec3::new(x, -z, y);
+    TriangleMesh {
+        vertices: mesh.vertices.iter().map(turned).collect(),
+        triangles: mesh.triangles.clone(),
+        ..TriangleMesh::default()
+    }
+}
+
+/// What to do about a mesh that seems to have y up.
+fn hint(is_y_up: bool) -> &'static str {
+    match is_y_up {
+        true => " if its y axis pointed up: export it with z up, or turn it by 90 degrees about x",
+        false => "; the z axis of a map points up and its unit is the metre",
+    }
 }

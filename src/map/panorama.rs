@@ -91,7 +91,7 @@ impl Validate for PanoramaConfig {
 /// Part of the map in which place recognition searches.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SearchRegion {
-    /// The mapped road: within 2 m of the mapping poses.
+    /// The mapped road: within 2 m of the mapping poses; in a map without them, anywhere.
     Road,
     /// All ground of the map.
     Anywhere,
@@ -112,28 +112,29 @@ pub struct PanoramaRequest {
 
 impl PanoramaRequest {
     /// Requires the memory of the centres of all cells in the extent of the map, for a search anywhere.
-    pub fn require_memory(&self, tiles: &TileGrid) -> Result<(), MemoryError> {
+    pub fn require_memory(&self, path: &[Pose3], tiles: &TileGrid) -> Result<(), MemoryError> {
         const CELL_BYTES: f64 = 16.0;
         let (min, max) = tiles.extent();
         let cells = (max.x - min.x) * (max.y - min.y) / self.config.cell_m.powi(2);
-        match self.region {
-            SearchRegion::Road => Ok(()),
-            SearchRegion::Anywhere => {
-                memory::require("the search grid", cells * CELL_BYTES, "raise grid_res")
-            }
+        match self.is_along(path) {
+            true => Ok(()),
+            false => memory::require("the search grid", cells * CELL_BYTES, "raise grid_res"),
         }
     }
 
     /// Returns the centres of the cells of the region in a map [m].
     pub fn cells(&self, path: &[Pose3], tiles: &TileGrid) -> Vec<Point2<f64>> {
         let cell_m = self.config.cell_m;
-        match self.region {
-            SearchRegion::Road => {
-                let poses: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
-                cells::along_road(&poses, ROAD_HALF_WIDTH_M, cell_m)
-            }
-            SearchRegion::Anywhere => cells::over_map(tiles, cell_m),
+        if !self.is_along(path) {
+            return cells::over_map(tiles, cell_m);
         }
+        let poses: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
+        cells::along_road(&poses, ROAD_HALF_WIDTH_M, cell_m)
+    }
+
+    /// Whether the region is the road along the path of the mapping drive.
+    fn is_along(&self, path: &[Pose3]) -> bool {
+        self.region == SearchRegion::Road && !path.is_empty()
     }
 }
 

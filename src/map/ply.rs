@@ -6,77 +6,22 @@
 //! are checked against the size of the file before anything is allocated.
 
 use std::fs::File;
-use std::io::{self, BufReader, BufWriter, Write};
-use std::path::{Path, PathBuf};
+use std::io::{self, BufReader, BufWriter, Read as _, Write};
+use std::path::Path;
 
-use glam::Vec3;
-use ply_rs::parser::{ParseError, Parser, Reader};
+use glam::{DVec3, Vec3};
+use ply_rs::parser::{Parser, Reader};
 use ply_rs::ply::{
-    BeginList, Encoding, Header, Property, PropertyAccess, PropertyAccessResult, PropertyType,
-    ScalarType,
+    BeginList, Encoding, Header, KeyMap, Property, PropertyAccess, PropertyAccessResult,
+    PropertyDef, PropertyType, ScalarType,
 };
 
-use super::mapping_path::{BadPathComment, MappingPath};
+use super::mapping_path::MappingPath;
+use super::mesh_error::{MeshFileError, MeshFileProblem};
+use super::mesh_origin::{self, Precision};
+use super::mesh_polygons::{fan, require_vertices};
 use crate::files::write_atomically;
-use crate::geometry::{FARTHEST_M, PlyVertex, TriangleMesh};
-
-/// A PLY file that cannot be read or written.
-#[derive(Debug, thiserror::Error)]
-#[error("{} {problem}", path.display())]
-pub struct PlyError {
-    /// The file.
-    pub path: PathBuf,
-    /// Why it cannot be read or written.
-    pub problem: PlyProblem,
-}
-
-/// Why a PLY file cannot be read or written.
-#[derive(Debug, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages are the documentation")]
-pub enum PlyProblem {
-    #[error("cannot be written: {0}")]
-    Write(io::Error),
-    #[error("cannot be read: {0}")]
-    Read(#[from] io::Error),
-    #[error("is not a readable PLY file: {0}")]
-    Malformed(#[from] ParseError),
-    #[error("contains a damaged mapping path: {0}")]
-    Path(#[from] BadPathComment),
-    #[error(
-        "claims {count} of `{element}`, which need at least {needed} bytes, but has only {bytes}; the file is truncated or its header is wrong"
-    )]
-    ImpossibleCount {
-        element: String,
-        count: usize,
-        needed: u128,
-        bytes: u64,
-    },
-    #[error("has no element `{0}`; a map is a triangle mesh with vertices and faces")]
-    NoElement(&'static str),
-    #[error(
-        "has no property `{property}` of `{element}` that can be used; a map needs the numbers x, y and z of each vertex and the list of integers vertex_indices of each face"
-    )]
-    NoProperty {
-        element: &'static str,
-        property: &'static str,
-    },
-    #[error("has no triangles; build the map again, or choose another map_file")]
-    NoTriangles,
-    #[error(
-        "is damaged: face {face} uses vertex {vertex}, but there are {vertices}; build the map again"
-    )]
-    VertexOutOfRange {
-        face: usize,
-        vertex: i64,
-        vertices: usize,
-    },
-    #[error("is damaged: vertex {0} is not finite; build the map again")]
-    NotFinite(usize),
-    #[error(
-        "has vertex {vertex} at {position}, which is farther from the origin than any place on Earth; the file is damaged, or its unit is not the metre"
-    )]
-    TooFar { vertex: usize, position: Vec3 },
-}
+use crate::geometry::{PlyVertex, TriangleMesh};
 
 const POSITION: &str = "property float x\nproperty float y\nproperty float z\n";
 const NORMAL: &str = "property float nx\nproperty float ny\nproperty float nz\n";
@@ -90,7 +35,7 @@ pub fn write(
     path: &Path,
     mesh: &TriangleMesh,
     mapping_path: Option<&MappingPath>,
-) -> Result<(), PlyError> {
+) -> Result<(), MeshFileError> {
     let computed;
     let normals = if mesh.normals.len() == mesh.vertices.len() {
         &mesh.normals
@@ -136,7 +81,7 @@ pub fn write_points(
     points: &[Vec3],
     colors: &[[u8; 3]],
     confidences: &[f32],
-) -> Result<(), PlyError> {
+) -> Result<(), MeshFileError> {
     debug_assert!(points.len() == colors.len() && points.len() == confidences.len());
     let finite = || (0..points.len()).filter(|&index| points[index].is_finite());
     let count = finite().count();
@@ -156,7 +101,7 @@ fn write_file(
     path: &Path,
     header: &str,
     write_rows: impl FnOnce(&mut BufWriter<&mut File>) -> io::Result<()>,
-) -> Result<(), PlyError> {
+) -> Result<(), MeshFileError> {
     write_atomically(path, |out| {
         write!(
             out,
@@ -164,7 +109,7 @@ fn write_file(
         )?;
         write_rows(out)
     })
-    .map_err(|error| PlyProblem::Write(error).of(path))
+    .map_err(|error| MeshFileProblem::Write(error).of(path))
 }
 
 fn write_floats(out: &mut impl Write, values: &[f32]) -> io::Result<()> {
@@ -173,16 +118,16 @@ fn write_floats(out: &mut impl Write, values: &[f32]) -> io::Result<()> {
 
 /// Reads a mesh. Normals and colours are empty where the file has none, normals also where one of
 /// them is not finite.
-pub fn read(path: &Path) -> Result<TriangleMesh, PlyError> {
+pub fn read(path: &Path) -> Result<TriangleMesh, MeshFileError> {
     Ok(read_map(path)?.0)
 }
 
 /// Reads the mesh of a map, and the path of its mapping drive if it is in the file.
-pub fn read_map(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), PlyError> {
+pub fn read_map(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), MeshFileError> {
     read_mesh(path).map_err(|problem| problem.of(path))
 }
 
-fn read_mesh(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), PlyProblem> {
+fn read_mesh(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), MeshFileProblem> {
     let file = File::open(path)?;
     let bytes = file.metadata()?.len();
     let mut reader = Reader::new(BufReader::with_capacity(1 << 20, file));
@@ -203,12 +148,28 @@ fn read_mesh(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), PlyProb
         }
     }
     let (vertices, faces) = (vertices.unwrap_or_default(), faces.unwrap_or_default());
+    let properties = &header.elements["vertex"].properties;
+    let positions: Vec<DVec3> = vertices.iter().map(|vertex| vertex.position).collect();
+    let mut path = MappingPath::from_comments(header.comments.iter().map(String::as_str))?;
+    let positions = if path.is_some() {
+        mesh_origin::check(&positions)?;
+        positions
+            .iter()
+            .map(|position| position.as_vec3())
+            .collect()
+    } else {
+        let (origin, positions) = mesh_origin::relative(&positions, precision_of(properties))?;
+        path = MappingPath::at_origin(origin);
+        positions
+    };
     let mut mesh = TriangleMesh {
-        vertices: vertices.iter().map(|vertex| vertex.position).collect(),
-        triangles: triangles_of(&faces, vertices.len())?,
+        triangles: triangles_of(&faces, positions.len())?,
+        vertices: positions,
         ..TriangleMesh::default()
     };
-    let properties = &header.elements["vertex"].properties;
+    if mesh.triangles.is_empty() {
+        return Err(MeshFileProblem::NoTriangles);
+    }
     let has = |names: [&str; 3]| names.iter().all(|name| properties.contains_key(*name));
     if has(["nx", "ny", "nz"]) {
         let normals = || vertices.iter().map(|vertex| vertex.normal);
@@ -219,17 +180,25 @@ fn read_mesh(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), PlyProb
     if has(["red", "green", "blue"]) {
         mesh.colors = vertices.iter().map(|vertex| vertex.color).collect();
     }
-    check_mesh(&mesh)?;
-    let mapping_path = MappingPath::from_comments(header.comments.iter().map(String::as_str))?;
-    Ok((mesh, mapping_path))
+    Ok((mesh, path))
 }
 
-impl PlyProblem {
-    fn of(self, path: &Path) -> PlyError {
-        PlyError {
-            path: path.to_owned(),
-            problem: self,
-        }
+/// Whether a file begins as a PLY file does.
+pub(super) fn is_ply(path: &Path) -> bool {
+    let mut start = [0; 3];
+    let read = File::open(path).and_then(|mut file| file.read_exact(&mut start));
+    read.is_ok() && start == *b"ply"
+}
+
+/// Precision of the coordinates: double where one is of that type.
+fn precision_of(properties: &KeyMap<PropertyDef>) -> Precision {
+    let is_double = |name: &&str| {
+        let found = properties.get(*name);
+        found.is_some_and(|p| p.data_type == PropertyType::Scalar(ScalarType::Double))
+    };
+    match ["x", "y", "X", "Y"].iter().any(is_double) {
+        true => Precision::Double,
+        false => Precision::Single,
     }
 }
 
@@ -276,7 +245,7 @@ impl PropertyAccess for Face {
 
 /// Checks that the header has the elements and properties of a mesh and does not claim more than the
 /// file can hold.
-fn check_header(header: &Header, bytes: u64) -> Result<(), PlyProblem> {
+fn check_header(header: &Header, bytes: u64) -> Result<(), MeshFileProblem> {
     let is_scalar = |kind: &PropertyType| matches!(kind, PropertyType::Scalar(_));
     let is_list = |kind: &PropertyType| matches!(kind, PropertyType::List(..));
     type Needed<'a> = (
@@ -293,12 +262,12 @@ fn check_header(header: &Header, bytes: u64) -> Result<(), PlyProblem> {
     for (element, names, has_kind) in needed {
         let properties = match header.elements.get(element) {
             Some(found) => &found.properties,
-            None => return Err(PlyProblem::NoElement(element)),
+            None => return Err(MeshFileProblem::NoElement(element)),
         };
         let found = names.iter().find_map(|name| properties.get(*name));
         if !found.is_some_and(|property| has_kind(&property.data_type)) {
             let property = names[0];
-            return Err(PlyProblem::NoProperty { element, property });
+            return Err(MeshFileProblem::NoProperty { element, property });
         }
     }
     for (name, element) in &header.elements {
@@ -313,7 +282,7 @@ fn check_header(header: &Header, bytes: u64) -> Result<(), PlyProblem> {
         };
         let needed = element.count as u128 * least.max(1) as u128;
         if needed > u128::from(bytes) {
-            return Err(PlyProblem::ImpossibleCount {
+            return Err(MeshFileProblem::ImpossibleCount {
                 element: name.clone(),
                 count: element.count,
                 needed,
@@ -333,37 +302,14 @@ fn size_of(kind: &ScalarType) -> usize {
     }
 }
 
-/// Divides polygons into fans of triangles.
-fn triangles_of(faces: &[Face], vertices: usize) -> Result<Vec<[u32; 3]>, PlyProblem> {
+/// Divides polygons into triangles.
+fn triangles_of(faces: &[Face], vertices: usize) -> Result<Vec<[u32; 3]>, MeshFileProblem> {
     let mut triangles = Vec::with_capacity(faces.len());
-    for (face, Face { vertices: corners }) in faces.iter().enumerate() {
-        if let Some(&vertex) = corners.iter().find(|&&v| v as usize >= vertices) {
-            return Err(PlyProblem::VertexOutOfRange {
-                face,
-                vertex: i64::from(vertex as i32),
-                vertices,
-            });
-        }
-        let fan = |pair: &[u32]| [corners[0], pair[0], pair[1]];
-        triangles.extend(corners.windows(2).skip(1).map(fan));
+    for face in faces {
+        triangles.extend(fan(&face.vertices));
     }
+    require_vertices(&triangles, vertices)?;
     Ok(triangles)
-}
-
-/// Checks that a mesh has triangles and that its vertices lie on Earth.
-fn check_mesh(mesh: &TriangleMesh) -> Result<(), PlyProblem> {
-    if mesh.triangles.is_empty() {
-        return Err(PlyProblem::NoTriangles);
-    }
-    for (vertex, &position) in mesh.vertices.iter().enumerate() {
-        if !position.is_finite() {
-            return Err(PlyProblem::NotFinite(vertex));
-        }
-        if f64::from(position.abs().max_element()) > FARTHEST_M {
-            return Err(PlyProblem::TooFar { vertex, position });
-        }
-    }
-    Ok(())
 }
 
 #[cfg(test)]
@@ -381,7 +327,7 @@ mod tests {
         }
     }
 
-    fn read_text(text: &str) -> Result<TriangleMesh, PlyError> {
+    fn read_text(text: &str) -> Result<TriangleMesh, MeshFileError> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("map.ply");
         fs::write(&path, text).unwrap();
@@ -482,7 +428,7 @@ mod tests {
         let text = text.replace("ply\nformat ascii 1.0\n", endless);
         assert!(matches!(
             read_text(&text).unwrap_err().problem,
-            PlyProblem::ImpossibleCount { .. }
+            MeshFileProblem::ImpossibleCount { .. }
         ));
     }
 
@@ -495,7 +441,7 @@ mod tests {
         )
         .unwrap_err();
         assert!(
-            matches!(error.problem, PlyProblem::ImpossibleCount { .. }),
+            matches!(error.problem, MeshFileProblem::ImpossibleCount { .. }),
             "{error}"
         );
         assert!(error.to_string().contains("1000000000"), "{error}");
@@ -509,7 +455,10 @@ mod tests {
              0 0 0\n",
         )
         .unwrap_err();
-        assert!(matches!(error.problem, PlyProblem::NoTriangles), "{error}");
+        assert!(
+            matches!(error.problem, MeshFileProblem::NoTriangles),
+            "{error}"
+        );
     }
 
     #[test]
@@ -521,7 +470,7 @@ mod tests {
         )
         .unwrap_err();
         assert!(
-            matches!(error.problem, PlyProblem::TooFar { vertex: 1, .. }),
+            matches!(error.problem, MeshFileProblem::TooFar { vertex: 1, .. }),
             "{error}"
         );
     }
@@ -536,7 +485,7 @@ mod tests {
             ))
             .unwrap_err();
             assert!(
-                matches!(error.problem, PlyProblem::VertexOutOfRange { .. }),
+                matches!(error.problem, MeshFileProblem::VertexOutOfRange { .. }),
                 "{error}"
             );
             assert!(error.to_string().contains(index), "{error}");

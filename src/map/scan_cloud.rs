@@ -7,7 +7,9 @@ use smart_default::SmartDefault;
 
 use crate::geometry::{PointCloud, Pose3, Rigid3f};
 use crate::ground::GroundClassifier;
-use crate::lidar::{LidarModel, NormalConfig, RangeImage, Scan, estimate_normals};
+use crate::lidar::{
+    LidarModel, NormalConfig, RangeImage, Scan, estimate_normals, estimate_spatial_normals,
+};
 use crate::validation::{InvalidValue, Validate, in_range, nested, rectangle};
 
 /// Selection and preparation of the points of a scan.
@@ -19,6 +21,10 @@ pub struct ScanConfig {
     pub range_image: LidarModel,
     /// Normal estimation.
     pub normals: NormalConfig,
+    /// Whether neighbouring pixels of the range image are neighbours on a surface; otherwise normals are
+    /// those of neighbours in space.
+    #[default(true)]
+    pub has_rows: bool,
     /// Edge of the voxels for downsampling, in the lidar frame [m].
     #[default(0.1)]
     pub voxel_size_m: f32,
@@ -112,7 +118,11 @@ impl ScanCloud {
 
         let image = RangeImage::project(&scan.points, &settings.range_image);
         let ground = classifier.ground_confidence(&scan.points);
-        let normals = estimate_normals(&image, &settings.normals);
+        let normals = if settings.has_rows {
+            estimate_normals(&image, &settings.normals)
+        } else {
+            estimate_spatial_normals(&image.points, &settings.normals)
+        };
         let mut cloud = PointCloud::with_capacity(image.ranges.len());
         for (index, normal) in normals.iter().enumerate() {
             let Some(number) = image.point_index(index) else {

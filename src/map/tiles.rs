@@ -12,7 +12,7 @@ use nalgebra::Point2;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use crate::geometry::{Pose2, Pose3, TriangleMesh, Vec3};
+use crate::geometry::{Aabb, Pose2, Pose3, TriangleMesh, Vec3};
 
 /// Division of the map into tiles.
 ///
@@ -74,6 +74,34 @@ impl TileGrid {
             })
             .collect();
         grid
+    }
+
+    /// Covers a mesh without a mapping drive; the tiles with triangles are valid.
+    pub fn of_mesh(mesh: &TriangleMesh, config: &TileConfig) -> Self {
+        let bounds = mesh.bounds();
+        let [(first_x, columns), (first_y, rows)] = ranges(&bounds, config);
+        let mut grid = Self {
+            side_m: config.side_m,
+            columns,
+            rows,
+            first: (first_x, first_y),
+            valid: vec![false; columns * rows],
+        };
+        for triangle in 0..mesh.triangles.len() {
+            for corner in mesh.corners(triangle) {
+                let tile = grid.nearest_tile(corner);
+                grid.valid[tile.0] = true;
+            }
+        }
+        grid
+    }
+
+    /// Number of tiles of [`of_mesh`](Self::of_mesh) for a mesh of a bounding box.
+    pub fn count_of_mesh(bounds: &Aabb, config: &TileConfig) -> f64 {
+        ranges(bounds, config)
+            .iter()
+            .map(|(_, count)| *count as f64)
+            .product()
     }
 
     /// Number of tiles of [`around`](Self::around).
@@ -150,13 +178,29 @@ impl TileGrid {
     }
 }
 
+/// The first tile and the number of tiles along x and y that cover a box.
+fn ranges(bounds: &Aabb, config: &TileConfig) -> [(i64, usize); 2] {
+    [0, 1].map(|axis| {
+        span(
+            f64::from(bounds.min[axis]),
+            f64::from(bounds.max[axis]),
+            config.side_m,
+        )
+    })
+}
+
 /// The first tile along an axis and the number of tiles that cover positions and a margin around them.
 fn range(positions_m: impl Iterator<Item = f64>, config: &TileConfig) -> (i64, usize) {
     let (min, max) = positions_m.fold((0.0, 0.0), |(min, max), at| {
         (f64::min(min, at), f64::max(max, at))
     });
-    let first = ((min - config.margin_m) / config.side_m + 0.5).floor() as i64;
-    let last = ((max + config.margin_m) / config.side_m - 0.5).ceil() as i64;
+    span(min - config.margin_m, max + config.margin_m, config.side_m)
+}
+
+/// The first tile along an axis and the number of tiles that cover an interval.
+fn span(min_m: f64, max_m: f64, side_m: f64) -> (i64, usize) {
+    let first = (min_m / side_m + 0.5).floor() as i64;
+    let last = (max_m / side_m - 0.5).ceil() as i64;
     (first, (last - first + 1).max(1) as usize)
 }
 

@@ -17,6 +17,34 @@ pub enum RecordingError {
     },
     #[error("{} {problem}", path.display())]
     BadScan { path: PathBuf, problem: String },
+    #[error("{} {problem}", path.display())]
+    BadBag { path: PathBuf, problem: String },
+    #[error("{}: message {number} of {topic} {problem}", path.display())]
+    BadMessage {
+        path: PathBuf,
+        topic: String,
+        number: usize,
+        problem: String,
+    },
+    #[error("{} has no topic of {types}; it has {found}", path.display())]
+    NoTopic {
+        path: PathBuf,
+        types: &'static str,
+        found: String,
+    },
+    #[error("{} has no topic {topic} of {types}; choose one of: {known}", path.display())]
+    UnknownTopic {
+        path: PathBuf,
+        topic: String,
+        types: &'static str,
+        known: String,
+    },
+    #[error("{} has several topics of {types}; choose one of: {known}", path.display())]
+    SeveralTopics {
+        path: PathBuf,
+        types: &'static str,
+        known: String,
+    },
     #[error("{}, line {line}: `{word}` is not a finite number", path.display())]
     NotANumber {
         path: PathBuf,
@@ -39,14 +67,22 @@ pub enum RecordingError {
     NoPoses { path: PathBuf },
     #[error("{} contains no scans (.bin, .pcd, .ply or .npy); set scan_folder to the folder of the scans", path.display())]
     NoScans { path: PathBuf },
-    #[error("{} has no pose: {} has {poses} rows; check that both belong to one recording, or select fewer frames with n_scans", scan.display(), pose_file.display())]
+    #[error("{scan} has no pose: {} has {poses} rows; check that both belong to one recording, or select fewer frames with n_scans", pose_file.display())]
     ScanWithoutPose {
-        scan: PathBuf,
+        scan: String,
         pose_file: PathBuf,
         poses: usize,
     },
     #[error("{} has no poses (poses.txt, poses_tum.txt or oxts); name their file in pose_file, or with --poses", path.display())]
     NoPoseFile { path: PathBuf },
+    #[error(
+        "the poses of {topic} are those of {body}, and no static transform leads from it to {lidar}, the frame of the scans; give the mounting with body_from_lidar, or record tf_static"
+    )]
+    NoMounting {
+        topic: String,
+        body: String,
+        lidar: String,
+    },
     #[error("{} has no calib_imu_to_velo.txt in its folder or above it; copy it there from the archive of the calibration", path.display())]
     NoImuCalibration { path: PathBuf },
     #[error("{} has no time: times.txt has {times} rows; give one row per scan, or remove the file to assume 10 scans per second", scan.display())]

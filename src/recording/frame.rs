@@ -1,19 +1,61 @@
 //! One frame of a recording.
 
+use std::fmt;
 use std::path::PathBuf;
+#[cfg(feature = "bags")]
+use std::sync::Arc;
 
+#[cfg(feature = "bags")]
+use super::bags::Bag;
 use super::error::RecordingError;
 use super::scan_files;
 use crate::geometry::{Pose3, StampedPose};
 use crate::lidar::{Motion, Rotation, Scan};
 
+/// Where a scan is stored.
+#[derive(Clone, Debug)]
+pub enum ScanSource {
+    /// A file.
+    File(PathBuf),
+    /// A message of a bag.
+    #[cfg(feature = "bags")]
+    Message {
+        /// The bag.
+        bag: Arc<Bag>,
+        /// Topic of the scans.
+        topic: Arc<str>,
+        /// Number of the message among those of the topic.
+        index: usize,
+    },
+}
+
+impl ScanSource {
+    fn read(&self) -> Result<Scan, RecordingError> {
+        match self {
+            Self::File(path) => scan_files::read(path),
+            #[cfg(feature = "bags")]
+            Self::Message { bag, topic, index } => bag.read_scan(topic, *index),
+        }
+    }
+}
+
+impl fmt::Display for ScanSource {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::File(path) => write!(formatter, "{}", path.display()),
+            #[cfg(feature = "bags")]
+            Self::Message { topic, index, .. } => write!(formatter, "message {index} of {topic}"),
+        }
+    }
+}
+
 /// One frame of a recording; the scan is read by [`read`](Self::read).
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct Frame {
     /// Number in the recording.
     pub number: usize,
-    /// The scan's file.
-    pub scan_path: PathBuf,
+    /// Where the scan is stored.
+    pub source: ScanSource,
     /// Time of the scan's pose, since the start of the recording or since 1970 [s].
     pub time_s: f64,
     /// Given pose, `p_map = map_from_lidar * p_lidar`.
@@ -27,7 +69,7 @@ pub struct Frame {
 impl Frame {
     /// Reads the scan and deskews it by the motion, if that is known.
     pub fn read(&self) -> Result<Scan, RecordingError> {
-        let mut scan = scan_files::read(&self.scan_path)?;
+        let mut scan = self.source.read()?;
         scan.time_s = scan.time_s.or(Some(self.time_s));
         if let (true, Some(rotation)) = (scan.times_s.is_empty(), &self.rotation) {
             scan.times_s = rotation.point_times(&scan.points);

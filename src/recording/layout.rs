@@ -11,6 +11,8 @@ pub enum Layout {
     KittiRaw,
     /// Scan files in a folder.
     Folder,
+    /// MCAP, rosbag2 or a bag of ROS 1.
+    Bag,
 }
 
 impl Layout {
@@ -20,6 +22,7 @@ impl Layout {
             Self::KittiOdometry => "KITTI odometry",
             Self::KittiRaw => "KITTI raw",
             Self::Folder => "folder of scans",
+            Self::Bag => "bag",
         }
     }
 }
@@ -40,6 +43,17 @@ pub struct RecordingFiles {
 }
 
 impl RecordingFiles {
+    /// A bag, which has its times and poses in itself.
+    pub fn bag(path: &Path) -> Self {
+        Self {
+            layout: Layout::Bag,
+            scans: path.to_owned(),
+            times: None,
+            poses: None,
+            calibration: None,
+        }
+    }
+
     /// Finds the files of a recording: of its folder, or of the folder of its scans.
     pub fn find(folder: &Path) -> Self {
         let existing = |base: &Path, names: &[&str]| {

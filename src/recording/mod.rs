@@ -9,6 +9,8 @@
 //! ```
 
 // Scans.
+#[cfg(feature = "bags")]
+pub mod bags;
 pub mod frame;
 pub mod layout;
 pub mod open;
@@ -24,9 +26,11 @@ pub mod track;
 mod error;
 mod table;
 
+#[cfg(feature = "bags")]
+pub use bags::Bag;
 pub use calibration::Calibration;
 pub use error::RecordingError;
-pub use frame::Frame;
+pub use frame::{Frame, ScanSource};
 pub use open::Recording;
 pub use poses::MapFrame;
 pub use scan_list::Selection;

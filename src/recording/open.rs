@@ -1,10 +1,14 @@
 //! A recording: its selected scans with their times.
 
 use std::path::{Path, PathBuf};
+#[cfg(feature = "bags")]
+use std::sync::Arc;
 
+#[cfg(feature = "bags")]
+use super::bags::{Bag, Wanted, is_bag};
 use super::calibration::Calibration;
 use super::error::RecordingError;
-use super::frame::Frame;
+use super::frame::{Frame, ScanSource};
 use super::layout::{Layout, RecordingFiles};
 use super::oxts::read_timestamps;
 use super::poses::{ascending, read_times};
@@ -17,7 +21,7 @@ use crate::lidar::{Rotation, Scan};
 const SCANS_PER_SECOND: f64 = 10.0;
 
 /// A recording with its selected frames.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct Recording {
     /// The folder that was opened.
     pub path: PathBuf,
@@ -31,15 +35,28 @@ pub struct Recording {
     pub frames: Vec<Frame>,
     /// The given poses, of which the frames have theirs.
     pub track: Option<PoseTrack>,
+    /// The bag and the topic of its scans.
+    #[cfg(feature = "bags")]
+    pub bag: Option<(Arc<Bag>, Arc<str>)>,
 }
 
 impl Recording {
     /// Opens a recording without reading its scans.
     ///
-    /// `path` is the folder of a recording in one of the layouts of [`Layout`], or the folder of its scans.
-    /// Times are those in the names of the scans, else those of `times.txt` (`timestamps.txt` of KITTI raw); they
+    /// `path` is the folder of a recording in one of the layouts of [`Layout`], the folder of its scans, or a bag, of
+    /// which `topic` is taken, or the only one with scans. Times are those of a bag, those in the names of the scans, else those of `times.txt` (`timestamps.txt` of KITTI raw); they
     /// must ascend.
-    pub fn open(path: &Path, selection: &Selection) -> Result<Self, RecordingError> {
+    pub fn open(
+        path: &Path,
+        topic: Option<&str>,
+        selection: &Selection,
+    ) -> Result<Self, RecordingError> {
+        #[cfg(feature = "bags")]
+        if is_bag(path) {
+            return Self::open_bag(path, topic, selection);
+        }
+        #[cfg(not(feature = "bags"))]
+        let _ = topic;
         let files = RecordingFiles::find(path);
         let scans = scan_list::scan_files(&files.scans)?;
         let recorded_s = recorded_times(&files)?;
@@ -60,7 +77,7 @@ impl Recording {
             };
             frames.push(Frame {
                 number: scan.number,
-                scan_path: scan.path,
+                source: ScanSource::File(scan.path),
                 time_s,
                 map_from_lidar: None,
                 rotation: None,
@@ -74,18 +91,61 @@ impl Recording {
             has_times,
             frames,
             track: None,
+            #[cfg(feature = "bags")]
+            bag: None,
+        })
+    }
+
+    /// Opens a bag. Its index has the times of writing; the moment of the first scan gives the difference to
+    /// those of the poses.
+    #[cfg(feature = "bags")]
+    fn open_bag(
+        path: &Path,
+        topic: Option<&str>,
+        selection: &Selection,
+    ) -> Result<Self, RecordingError> {
+        let bag = Arc::new(Bag::open(path)?);
+        let topic: Arc<str> = bag.topic(Wanted::Scans, topic)?.name.as_str().into();
+        let times_s = bag.scan_times(&topic)?;
+        let moment_s = bag.read_scan(&topic, 0)?.time_s;
+        let later_s = moment_s.map_or(0.0, |moment_s| moment_s - times_s[0]);
+        let frames = times_s.iter().enumerate();
+        let frames = frames.map(|(index, time_s)| Frame {
+            number: index,
+            source: ScanSource::Message {
+                bag: bag.clone(),
+                topic: topic.clone(),
+                index,
+            },
+            time_s: time_s + later_s,
+            map_from_lidar: None,
+            rotation: None,
+            motion: None,
+        });
+        Ok(Self {
+            path: path.to_owned(),
+            files: RecordingFiles::bag(path),
+            scans: times_s.len(),
+            has_times: true,
+            frames: selection.of(frames.collect(), |frame| frame.number, path)?,
+            track: None,
+            bag: Some((bag, topic)),
         })
     }
 
     /// Opens a recording in the layout of KITTI odometry with its poses and calibration.
     pub fn open_with_poses(folder: &Path) -> Result<Self, RecordingError> {
-        let recording = Self::open(folder, &Selection::default())?;
+        let recording = Self::open(folder, None, &Selection::default())?;
         let track = recording.own_track()?;
         recording.with_poses(track)
     }
 
     /// The poses that belong to the recording by their names and places.
     pub fn own_track(&self) -> Result<PoseTrack, RecordingError> {
+        #[cfg(feature = "bags")]
+        if let Some((bag, topic)) = &self.bag {
+            return PoseTrack::read_topic(bag, None, topic);
+        }
         let Some(path) = &self.files.poses else {
             return Err(RecordingError::NoPoseFile {
                 path: self.path.clone(),
@@ -181,7 +241,7 @@ mod tests {
     }
 
     fn open(folder: &Path, selection: &Selection) -> Result<Recording, RecordingError> {
-        let recording = Recording::open(folder, selection)?;
+        let recording = Recording::open(folder, None, selection)?;
         let track = recording.own_track()?;
         recording.with_poses(track)
     }

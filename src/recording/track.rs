@@ -5,6 +5,8 @@
 
 use std::path::{Path, PathBuf};
 
+#[cfg(feature = "bags")]
+use super::bags::{Bag, Wanted};
 use super::calibration::Calibration;
 use super::error::RecordingError;
 use super::frame::Frame;
@@ -58,6 +60,37 @@ impl PoseTrack {
             cam0_from_lidar: body_from_lidar,
         };
         Self::of(path, body, calibration, times_s)
+    }
+
+    /// Reads the poses of a topic of a bag, of the lidar or of a body on which it is mounted by the static
+    /// transforms.
+    #[cfg(feature = "bags")]
+    pub fn read_topic(
+        bag: &Bag,
+        topic: Option<&str>,
+        scan_topic: &str,
+    ) -> Result<Self, RecordingError> {
+        let topic = &bag.topic(Wanted::Poses, topic)?.name;
+        let rows = bag.poses(topic)?;
+        let Some(first) = rows.first() else {
+            let path = PathBuf::from(topic);
+            return Err(RecordingError::NoPoses { path });
+        };
+        let Some(body_from_lidar) = bag.body_from_lidar(&first.child, scan_topic)? else {
+            return Err(RecordingError::NoMounting {
+                topic: topic.clone(),
+                body: first.child.clone(),
+                lidar: bag.scan_frame(scan_topic)?,
+            });
+        };
+        let body = CameraPoses {
+            world_from_cam0: rows.iter().map(|row| row.parent_from_child).collect(),
+        };
+        let calibration = Calibration {
+            cam0_from_lidar: body_from_lidar,
+        };
+        let times_s = rows.iter().map(|row| row.time_s).collect();
+        Self::of(Path::new(topic), body, calibration, Some(times_s))
     }
 
     fn of(
@@ -149,7 +182,7 @@ impl PoseTrack {
                 missing,
             },
             _ => RecordingError::ScanWithoutPose {
-                scan: first.scan_path.clone(),
+                scan: first.source.to_string(),
                 pose_file: self.path.clone(),
                 poses: self.map_from_lidar.len(),
             },

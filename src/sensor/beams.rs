@@ -11,11 +11,10 @@
 
 use std::f32::consts::{PI, TAU};
 
-use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
+use super::beam::{BeamReturns, MAX_BEAMS, angles, elevation_deg, quantile};
 use super::elevations;
-use super::quantile;
 use crate::lidar::Scan;
 
 /// What the beams of a sensor follow from.
@@ -33,28 +32,17 @@ pub enum BeamSource {
     Elevations,
 }
 
-/// The returns of a beam.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Beam {
-    /// Median elevation [deg].
-    pub elevation_deg: f32,
-    /// Azimuths of the returns in one scan [rad].
-    pub azimuths_rad: Vec<f32>,
-}
-
 /// The beams of a sensor.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Beams {
     /// What they follow from.
     pub source: BeamSource,
     /// Those that returned, from the top.
-    pub rows: Vec<Beam>,
+    pub rows: Vec<BeamReturns>,
     /// Number of beams of the device; `None` without rows.
     pub nominal: Option<usize>,
 }
 
-/// Largest number of beams.
-pub(super) const MAX_BEAMS: usize = 512;
 /// Largest width of a ring that is one beam, relative to the distance between rings (unitless).
 const NARROW: f32 = 0.6;
 /// The same where nothing else shows beams: they may be smeared by motion compensation.
@@ -85,15 +73,9 @@ pub fn find(scans: &[Scan]) -> Beams {
     }
 }
 
-/// Elevation [deg] and azimuth [rad] of a point.
-pub(super) fn angles(point: Vec3) -> [f32; 2] {
-    let elevation = point.z.atan2(point.truncate().length());
-    [elevation.to_degrees(), point.y.atan2(point.x)]
-}
-
 /// Beams by the rings of the points.
 struct Rings {
-    rows: Vec<Beam>,
+    rows: Vec<BeamReturns>,
     /// Median width of a ring relative to its distance from the next (unitless).
     width: f32,
     /// Numbers of rings, from 0 or 1 to the last.
@@ -107,11 +89,12 @@ fn by_rings(scans: &[Scan]) -> Option<Rings> {
         return None;
     }
     let mut elevations = vec![vec![]; usize::from(*last) + 1];
-    let mut rows = vec![Beam::default(); elevations.len()];
+    let mut rows = vec![BeamReturns::default(); elevations.len()];
     for (number, scan) in scans.iter().enumerate() {
         for (&point, &ring) in scan.points.iter().zip(&scan.rings) {
-            let [elevation_deg, azimuth_rad] = angles(point);
-            elevations[usize::from(ring)].push(elevation_deg);
+            let [degrees, azimuth_rad] = angles(point);
+            let distance_m = point.truncate().length();
+            elevations[usize::from(ring)].push([distance_m, degrees]);
             if number == largest {
                 rows[usize::from(ring)].azimuths_rad.push(azimuth_rad);
             }
@@ -122,11 +105,12 @@ fn by_rings(scans: &[Scan]) -> Option<Rings> {
     } else {
         elevations.len()
     };
-    let mut found: Vec<(Beam, f32)> = (rows.into_iter().zip(&mut elevations))
+    let mut found: Vec<(BeamReturns, f32)> = (rows.into_iter().zip(&mut elevations))
         .filter(|(_, elevations)| !elevations.is_empty())
-        .map(|(mut row, elevations)| {
-            row.elevation_deg = quantile(elevations, 0.5);
-            let width = quantile(elevations, 0.95) - quantile(elevations, 0.05);
+        .map(|(mut row, returns)| {
+            row.elevation_deg = elevation_deg(returns);
+            let mut elevations: Vec<f32> = returns.iter().map(|far| far[1]).collect();
+            let width = quantile(&mut elevations, 0.95) - quantile(&mut elevations, 0.05);
             (row, width)
         })
         .collect();
@@ -143,10 +127,10 @@ fn by_rings(scans: &[Scan]) -> Option<Rings> {
 }
 
 /// The rows of the scan with most beams; elevations are medians over all scans with as many.
-fn by_order_of_scans(scans: &[Scan]) -> Option<Vec<Beam>> {
-    let found: Vec<Vec<Beam>> = scans.iter().filter_map(by_order).collect();
+fn by_order_of_scans(scans: &[Scan]) -> Option<Vec<BeamReturns>> {
+    let found: Vec<Vec<BeamReturns>> = scans.iter().filter_map(by_order).collect();
     let most = found.iter().map(Vec::len).max()?;
-    let full: Vec<&Vec<Beam>> = found.iter().filter(|rows| rows.len() == most).collect();
+    let full: Vec<&Vec<BeamReturns>> = found.iter().filter(|rows| rows.len() == most).collect();
     let mut rows = full[0].clone();
     for (number, row) in rows.iter_mut().enumerate() {
         let mut all: Vec<f32> = full.iter().map(|rows| rows[number].elevation_deg).collect();
@@ -156,7 +140,7 @@ fn by_order_of_scans(scans: &[Scan]) -> Option<Vec<Beam>> {
 }
 
 /// Beams of points that are in the order of revolutions; `None` of others.
-fn by_order(scan: &Scan) -> Option<Vec<Beam>> {
+fn by_order(scan: &Scan) -> Option<Vec<BeamReturns>> {
     /// Share of the steps in the direction of the revolutions, at least (unitless).
     const MIN_FORWARD: f32 = 0.8;
     /// Median change of elevation from point to point, at most; neighbouring beams are farther apart [deg].
@@ -178,15 +162,18 @@ fn by_order(scan: &Scan) -> Option<Vec<Beam>> {
 
     let start_rad = start_of_revolutions(&angles, sense, change_deg);
     let along = |azimuth_rad: f32| (sense * (azimuth_rad - start_rad)).rem_euclid(TAU);
-    let revolutions: Vec<Beam> = angles
+    let mut first = 0;
+    let revolutions: Vec<BeamReturns> = angles
         .chunk_by(|a, b| along(b[1]) > along(a[1]) - JITTER_RAD)
-        .filter(|returns| returns.len() >= MIN_RETURNS[1])
-        .map(|returns| {
-            let mut elevations: Vec<f32> = returns.iter().map(|angles| angles[0]).collect();
-            Beam {
-                elevation_deg: quantile(&mut elevations, 0.5),
+        .filter_map(|returns| {
+            let points = &scan.points[first..first + returns.len()];
+            first += returns.len();
+            let distances = points.iter().map(|point| point.truncate().length());
+            let elevations = distances.zip(returns).map(|(m, angles)| [m, angles[0]]);
+            (returns.len() >= MIN_RETURNS[1]).then(|| BeamReturns {
+                elevation_deg: elevation_deg(&mut elevations.collect::<Vec<_>>()),
                 azimuths_rad: returns.iter().map(|angles| angles[1]).collect(),
-            }
+            })
         })
         .collect();
     if !(2..=MAX_BEAMS).contains(&revolutions.len())
@@ -227,7 +214,7 @@ fn wrap(angle_rad: f32) -> f32 {
 }
 
 /// Median difference of elevation between neighbouring beams [deg].
-fn median_spacing(beams: &[Beam]) -> f32 {
+fn median_spacing(beams: &[BeamReturns]) -> f32 {
     let mut elevations: Vec<f32> = beams.iter().map(|beam| beam.elevation_deg).collect();
     elevations.sort_by(f32::total_cmp);
     let mut gaps: Vec<f32> = elevations
@@ -238,7 +225,7 @@ fn median_spacing(beams: &[Beam]) -> f32 {
 }
 
 /// Beams from the top; those closer than `min_gap_deg` are one.
-fn merged(mut beams: Vec<Beam>, min_gap_deg: f32) -> Vec<Beam> {
+fn merged(mut beams: Vec<BeamReturns>, min_gap_deg: f32) -> Vec<BeamReturns> {
     beams.sort_by(|a, b| b.elevation_deg.total_cmp(&a.elevation_deg));
     beams.dedup_by(|lower, upper| {
         let same = upper.elevation_deg - lower.elevation_deg < min_gap_deg;
@@ -251,11 +238,11 @@ fn merged(mut beams: Vec<Beam>, min_gap_deg: f32) -> Vec<Beam> {
 }
 
 /// Numbers of beams of the sensors that are built.
-const BUILT: [usize; 11] = [1, 2, 4, 8, 16, 32, 40, 64, 80, 128, 256];
+const BUILT: [usize; 10] = [1, 2, 4, 8, 16, 32, 40, 64, 128, 256];
 
 /// Number of beams of the device: as many as returned, or the next number that is built if it is almost
 /// reached or the beams at an edge have few returns, so that others have none.
-fn nominal(rows: &[Beam]) -> usize {
+fn nominal(rows: &[BeamReturns]) -> usize {
     let mut counts: Vec<f32> = rows
         .iter()
         .map(|row| row.azimuths_rad.len() as f32)

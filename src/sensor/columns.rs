@@ -2,8 +2,8 @@
 
 use std::f32::consts::TAU;
 
-use super::beams::{Beams, angles};
-use super::quantile;
+use super::beam::{angles, quantile};
+use super::beams::Beams;
 use crate::lidar::Scan;
 
 /// Azimuth steps of a beam per revolution, from the median difference of azimuth between neighbouring returns;

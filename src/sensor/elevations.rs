@@ -14,8 +14,7 @@
 
 use rayon::prelude::*;
 
-use super::beams::{Beam, MAX_BEAMS, angles};
-use super::quantile;
+use super::beam::{BeamReturns, MAX_BEAMS, angles, elevation_deg, quantile};
 use crate::lidar::Scan;
 
 /// Points that are examined, about.
@@ -26,8 +25,12 @@ const BIN_DEG: f32 = 0.01;
 const WINDOWS: [usize; 5] = [3, 6, 12, 25, 50];
 /// Share of the points near a peak, at least (unitless).
 const MIN_SHARE: f64 = 0.75;
+/// The widest window is taken whose share is as good; narrower ones divide peaks (unitless).
+const SAME_SHARE: f64 = 0.003;
+/// Peaks that are as many times lower than both neighbours are of stray points.
+const STRAY: u32 = 10;
 /// Height of a peak, at least: points, and relative to the median peak.
-const MIN_PEAK: (u32, f32) = (3, 0.005);
+const MIN_PEAK: (u32, f32) = (3, 0.01);
 
 /// A point as a beam saw it.
 #[derive(Clone, Copy)]
@@ -42,7 +45,7 @@ struct Ray {
 }
 
 /// The beams, from the top; `None` if the elevations have no peaks.
-pub fn rows(scans: &[Scan]) -> Option<Vec<Beam>> {
+pub fn rows(scans: &[Scan]) -> Option<Vec<BeamReturns>> {
     let mut rays = rays(scans);
     set_cones(&mut rays);
     // Neighbouring points are not independent of each other: sectors of azimuth are.
@@ -51,11 +54,14 @@ pub fn rows(scans: &[Scan]) -> Option<Vec<Beam>> {
     let others: Vec<Ray> = rays.iter().filter(|ray| !is_tested(ray)).copied().collect();
     let share = |window: &usize| share_near(&peaks(&others, *window), &tested);
     let shares: Vec<f64> = WINDOWS.par_iter().map(share).collect();
-    let best = (0..WINDOWS.len()).max_by(|&a, &b| shares[a].total_cmp(&shares[b]))?;
-    if shares[best] < MIN_SHARE {
-        return None;
-    }
-    let peaks = peaks(&rays, WINDOWS[best]);
+    let best = shares
+        .iter()
+        .copied()
+        .fold(MIN_SHARE + SAME_SHARE, f64::max);
+    let widest = shares
+        .iter()
+        .rposition(|&share| share >= best - SAME_SHARE)?;
+    let peaks = peaks(&rays, WINDOWS[widest]);
     (2..=MAX_BEAMS)
         .contains(&peaks.len())
         .then(|| beams_at(&peaks, &rays))
@@ -157,6 +163,13 @@ fn peaks(rays: &[Ray], window: usize) -> Vec<f32> {
         .0
         .max((MIN_PEAK.1 * quantile(&mut heights, 0.5)) as u32);
     peaks.retain(|peak| peak.1 >= least);
+    let heights: Vec<u32> = peaks.iter().map(|peak| peak.1).collect();
+    let mut number = 0_usize;
+    peaks.retain(|peak| {
+        let beside = [number.wrapping_sub(1), number + 1].map(|other| heights.get(other));
+        number += 1;
+        !matches!(beside, [Some(a), Some(b)] if peak.1 < a.min(b) / STRAY)
+    });
     // The window ends with its last bin.
     let angle = |(end, _)| (end as f32 + 1.0 - 0.5 * window as f32) * BIN_DEG - 90.0;
     peaks.into_iter().map(angle).collect()
@@ -183,22 +196,22 @@ fn share_near(peaks: &[f32], rays: &[Ray]) -> f64 {
     near.count() as f64 / rays.len() as f64
 }
 
-fn beams_at(peaks: &[f32], rays: &[Ray]) -> Vec<Beam> {
+fn beams_at(peaks: &[f32], rays: &[Ray]) -> Vec<BeamReturns> {
     let first_scan = rays.iter().map(|ray| ray.scan).min();
     let mut beams = vec![(vec![], vec![]); peaks.len()];
     for ray in rays {
         let Some(peak) = near(peaks, ray.cone_deg) else {
             continue;
         };
-        beams[peak].0.push(ray.elevation_deg);
+        beams[peak].0.push([ray.distance_m, ray.elevation_deg]);
         if Some(ray.scan) == first_scan {
             beams[peak].1.push(ray.azimuth_rad);
         }
     }
-    let mut beams: Vec<Beam> = (beams.into_iter())
-        .filter(|(elevations, _)| !elevations.is_empty())
-        .map(|(mut elevations, azimuths_rad)| Beam {
-            elevation_deg: quantile(&mut elevations, 0.5),
+    let mut beams: Vec<BeamReturns> = (beams.into_iter())
+        .filter(|(returns, _)| !returns.is_empty())
+        .map(|(mut returns, azimuths_rad)| BeamReturns {
+            elevation_deg: elevation_deg(&mut returns),
             azimuths_rad,
         })
         .collect();

@@ -12,6 +12,7 @@
 //! [`dropped`] counts which points a projection loses, and why. Two returns of one pulse are two points of
 //! one direction: they count once for beams and columns, and a range image keeps the nearer one.
 
+mod beam;
 pub mod beams;
 pub mod columns;
 pub mod dropped;
@@ -23,6 +24,7 @@ pub mod rotation;
 
 use serde::{Deserialize, Serialize};
 
+pub use beam::BeamReturns;
 pub use beams::BeamSource;
 pub use dropped::{DropReason, DroppedPoints};
 pub use mounting::Mounting;
@@ -102,11 +104,5 @@ fn valid_points(scan: &Scan) -> Scan {
     scan
 }
 
-/// The value that a share of the values lie below; 0 of none.
-fn quantile(values: &mut [f32], share: f64) -> f32 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let index = ((values.len() - 1) as f64 * share).round() as usize;
-    *values.select_nth_unstable_by(index, f32::total_cmp).1
-}
+#[cfg(test)]
+mod tests;

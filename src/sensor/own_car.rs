@@ -115,8 +115,9 @@ fn rectangle(cells: Vec<[i32; 3]>, reach_m: f32) -> [f32; 4] {
         };
         if group.iter().all(ends) {
             for cell in group {
-                least = least.min(cell.truncate());
-                greatest = greatest.max(cell.truncate() + 1);
+                // One cell more, for the returns that come and go at the edges.
+                least = least.min(cell.truncate() - 1);
+                greatest = greatest.max(cell.truncate() + 2);
             }
         }
     }

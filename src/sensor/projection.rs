@@ -11,13 +11,17 @@
 
 use std::collections::BTreeSet;
 
-use super::beams::{Beams, angles};
-use super::quantile;
+use super::beam::{MAX_BEAMS, angles, quantile};
+use super::beams::Beams;
+use super::dropped::DroppedPoints;
 use crate::lidar::{LidarModel, Scan};
 
 /// Columns of a range image, at most and at least.
 const MAX_COLUMNS: usize = 2048;
 const MIN_COLUMNS: usize = 90;
+
+/// Share of the points between and beside the rows above which beams keep no elevation (unitless).
+const MAX_OUTSIDE: f64 = 0.05;
 
 /// The projection; that of KITTI's sensor for no points.
 pub fn model(scans: &[Scan], beams: &Beams, columns: usize, own_car_m: [f32; 4]) -> LidarModel {
@@ -29,10 +33,34 @@ pub fn model(scans: &[Scan], beams: &Beams, columns: usize, own_car_m: [f32; 4])
         [] => rowless(scans),
         _ => of_beams(beams, columns),
     };
-    LidarModel {
+    let model = LidarModel {
         min_range,
         max_range,
         ..rows
+    };
+    let largest = scans.iter().max_by_key(|scan| scan.len());
+    let lost = largest.map(|scan| DroppedPoints::count(scan, &model, own_car_m));
+    match lost {
+        Some(lost) if lost.outside_image as f64 > MAX_OUTSIDE * lost.points as f64 => {
+            evenly(scans, model)
+        }
+        _ => model,
+    }
+}
+
+/// As many rows per angle, over all elevations: for beams whose elevations change along a revolution, because the
+/// points are in a frame that is inclined to the sensor's, or compensated for fast motion.
+fn evenly(scans: &[Scan], beams: LidarModel) -> LidarModel {
+    let all = scans.iter().flat_map(|scan| &scan.points);
+    let mut elevations: Vec<f32> = all.map(|&point| angles(point)[0]).collect();
+    let [fov_up, fov_down] = [0.999, 0.001].map(|share| quantile(&mut elevations, share));
+    let rows = beams.height as f32 * (fov_up - fov_down).to_radians() / beams.fov_rad();
+    LidarModel {
+        height: (rows.ceil() as usize).clamp(1, MAX_BEAMS),
+        fov_up,
+        fov_down,
+        elevations: None,
+        ..beams
     }
 }
 

@@ -5,7 +5,7 @@
 
 use std::f64::consts::TAU;
 
-use super::beams::angles;
+use super::beam::angles;
 use crate::lidar::{RotationDirection, Scan};
 
 /// Frames per second of sensors, at least and at most [s].

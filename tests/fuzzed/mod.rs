@@ -1,6 +1,8 @@
 //! The parts of the fuzzing of readers.
 
 pub mod allocation;
+#[cfg(feature = "bags")]
+pub mod bags;
 pub mod configurations;
 pub mod files;
 pub mod harness;

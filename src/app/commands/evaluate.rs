@@ -13,7 +13,7 @@ use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
 use crate::files::folder_of;
 use crate::geometry::{Pose2, TriangleMesh, pose2_from_pose3};
-use crate::map::{MappingPath, ply};
+use crate::map::{MappingPath, mesh_file};
 use crate::recording::PoseTrack;
 
 /// Compares a result of `localize`, `refine` or range-mcl with the ground truth.
@@ -123,7 +123,7 @@ fn map_of(files: &RunFiles) -> Result<Option<(TriangleMesh, Option<MappingPath>)
         tracing::info!("{} does not exist any more", localized.map_file.display());
         return Ok(None);
     }
-    Ok(Some(ply::read_map(&localized.map_file)?))
+    Ok(Some(mesh_file::read(&localized.map_file)?))
 }
 
 /// Converts positions in grid cells to metres.

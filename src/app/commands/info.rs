@@ -6,7 +6,7 @@ use std::path::Path;
 use anyhow::{Result, bail, ensure};
 
 use super::output;
-use super::stages::{self, sample};
+use super::stages::{self, is_bag, sample};
 use crate::app::results::{LocalizationResults, RunSummary};
 use crate::evaluation::RangeMclRules;
 use crate::lidar::Scan;
@@ -23,7 +23,7 @@ pub fn run(path: &Path) -> Result<String> {
     );
     let extension = path.extension().and_then(|extension| extension.to_str());
     match extension {
-        _ if path.is_dir() => recording(path),
+        _ if path.is_dir() || is_bag(path) => recording(path),
         Some("ply") => map(path),
         Some("npz") => result(path),
         _ => bail!(
@@ -34,7 +34,7 @@ pub fn run(path: &Path) -> Result<String> {
 }
 
 fn recording(path: &Path) -> Result<String> {
-    let recording = Recording::open(path, &Selection::default())?;
+    let recording = Recording::open(path, None, &Selection::default())?;
     let frames = &recording.frames;
     let (first, last) = (&frames[0], &frames[frames.len() - 1]);
     let scans = sample(&recording)?;

@@ -5,14 +5,14 @@ use std::path::Path;
 use anyhow::Result;
 use rand::Rng;
 
-use super::input;
 use super::stages::RecordingInputs;
 use crate::app::config::OdometrySource;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::Scan;
 use crate::localization::odometry::{demonstration_noise, increments, with_noise};
 use crate::odometry::{Odometer, OdometryConfig};
-use crate::recording::Recording;
+use crate::recording::layout::Layout;
+use crate::recording::{PoseTrack, Recording};
 
 /// The motion `previous_from_current` into each frame.
 pub enum MotionSource {
@@ -36,15 +36,17 @@ impl MotionSource {
         Ok(match (source, file) {
             (OdometrySource::None, _) => Self::Unknown,
             (OdometrySource::File | OdometrySource::Auto, Some(file)) => {
-                input::require_file("odometry_file", file)?;
-                let track = inputs.track(file)?;
-                let poses = track.matched(&recording.frames, recording.has_times)?;
-                let mut last = Pose3::identity();
-                let known = poses.into_iter().map(|pose| {
-                    last = pose.unwrap_or(last);
-                    last
-                });
-                Self::Given(increments(&known.collect::<Vec<_>>()))
+                Self::of_track(&inputs.track(file, recording)?, recording)?
+            }
+            // A bag may have a topic of odometry.
+            (OdometrySource::Auto, None) if recording.files.layout == Layout::Bag => {
+                match recording.own_track() {
+                    Ok(track) => Self::of_track(&track, recording)?,
+                    Err(error) => {
+                        tracing::info!("odometry from the scans: {error}");
+                        Self::of_scans()?
+                    }
+                }
             }
             (OdometrySource::GroundTruth, _) => {
                 let poses = recording
@@ -54,8 +56,24 @@ impl MotionSource {
                 let increments = increments(&poses.collect::<Vec<_>>());
                 Self::Given(with_noise(&increments, &demonstration_noise(), rng))
             }
-            _ => Self::Scans(Box::new(Odometer::new(OdometryConfig::default())?)),
+            _ => Self::of_scans()?,
         })
+    }
+
+    fn of_scans() -> Result<Self> {
+        Ok(Self::Scans(Box::new(Odometer::new(
+            OdometryConfig::default(),
+        )?)))
+    }
+
+    fn of_track(track: &PoseTrack, recording: &Recording) -> Result<Self> {
+        let mut last = Pose3::identity();
+        let poses = track.matched(&recording.frames, recording.has_times)?;
+        let known = poses.into_iter().map(|pose| {
+            last = pose.unwrap_or(last);
+            last
+        });
+        Ok(Self::Given(increments(&known.collect::<Vec<_>>())))
     }
 
     /// The motion into a frame by its row and scan; every scan has to be given, in order.

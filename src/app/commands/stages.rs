@@ -8,9 +8,9 @@ use super::{Context, input};
 use crate::app::config::{MotionCompensation, RangeImageConfig, body_from_lidar};
 use crate::lidar::{LidarModel, Scan};
 use crate::map::scan_cloud::ScanConfig;
-use crate::map::{Map, MapError, MapOptions, MappingPath, ply};
+use crate::map::{Map, MapOptions, MappingPath, mesh_file};
 use crate::odometry::{OdometryConfig, compare_timings};
-use crate::recording::{PoseTrack, Recording};
+use crate::recording::{PoseTrack, Recording, Selection};
 use crate::sensor::{self, DroppedPoints, SensorDescription};
 
 /// Number of scans from which a sensor is inferred.
@@ -20,6 +20,7 @@ const SENSOR_SCANS: usize = 10;
 #[derive(Clone, Copy)]
 pub struct RecordingInputs<'a> {
     pub scan_folder: &'a Path,
+    pub topic: Option<&'a str>,
     pub pose_file: Option<&'a Path>,
     pub calib_file: Option<&'a Path>,
     pub body_from_lidar: Option<[f64; 6]>,
@@ -28,8 +29,12 @@ pub struct RecordingInputs<'a> {
 impl<'a> RecordingInputs<'a> {
     /// Checks that the files exist, before any work is done.
     pub fn require(&self) -> Result<()> {
-        input::require_folder("scan_folder", self.scan_folder)?;
-        if let Some(path) = self.pose_file.filter(|path| !path.is_dir()) {
+        let is_bag = is_bag(self.scan_folder);
+        if !is_bag {
+            input::require_folder("scan_folder", self.scan_folder)?;
+        }
+        let is_file = |path: &&Path| !path.is_dir() && !(is_bag && is_topic(path));
+        if let Some(path) = self.pose_file.filter(is_file) {
             input::require_file("pose_file", path)?;
         }
         input::require_optional_file("calib_file", self.calib_file)
@@ -46,13 +51,40 @@ impl<'a> RecordingInputs<'a> {
             .collect()
     }
 
-    /// Reads poses of the recording from a file.
-    pub fn track(&self, path: &Path) -> Result<PoseTrack> {
+    /// Opens the selected frames of the recording.
+    pub fn open(&self, selection: &Selection) -> Result<Recording> {
+        Ok(Recording::open(self.scan_folder, self.topic, selection)?)
+    }
+
+    /// Reads poses of the recording from a file, or from a topic of its bag.
+    pub fn track(&self, path: &Path, recording: &Recording) -> Result<PoseTrack> {
+        #[cfg(feature = "bags")]
+        if let (Some((bag, scan_topic)), true) = (&recording.bag, is_topic(path)) {
+            return Ok(PoseTrack::read_topic(bag, path.to_str(), scan_topic)?);
+        }
+        #[cfg(not(feature = "bags"))]
+        let _ = recording;
         Ok(match self.body_from_lidar {
             Some(numbers) => PoseTrack::read_of_body(path, body_from_lidar(numbers))?,
             None => PoseTrack::read(path, self.calib_file)?,
         })
     }
+}
+
+/// Whether a path is that of a bag.
+pub fn is_bag(path: &Path) -> bool {
+    #[cfg(feature = "bags")]
+    return crate::recording::bags::is_bag(path);
+    #[cfg(not(feature = "bags"))]
+    return {
+        let _ = path;
+        false
+    };
+}
+
+/// Whether a path can be the name of a topic.
+fn is_topic(path: &Path) -> bool {
+    path.starts_with("/") && !path.exists()
 }
 
 /// Keys of a map.
@@ -75,11 +107,12 @@ impl<'a> MapInputs<'a> {
 
     /// Reads the map and prepares it for rendering at most `max_poses` poses at once.
     pub fn load(&self, max_poses: Option<usize>, context: &Context) -> Result<Map> {
-        let (mesh, path) = ply::read_map(self.map_file)?;
-        let path = match path {
-            Some(path) => path,
-            None => self.given_path()?,
+        let (mesh, path) = mesh_file::read(self.map_file)?;
+        let path = match self.given_path()? {
+            Some(given) if path.is_none() => given,
+            _ => path.unwrap_or_default(),
         };
+        self.report_frame(&path);
         let options = MapOptions {
             backend: context.backend,
             max_poses,
@@ -98,18 +131,37 @@ impl<'a> MapInputs<'a> {
     }
 
     /// The path of the mapping drive from the files of the configuration.
-    fn given_path(&self) -> Result<MappingPath> {
+    fn given_path(&self) -> Result<Option<MappingPath>> {
         let Some(poses) = self.map_pose_file else {
-            let path = self.map_file.to_owned();
-            return Err(MapError::NoPath { path }.into());
+            return Ok(None);
         };
         input::require_file("map_pose_file", poses)?;
         input::require_optional_file("map_calib_file", self.map_calib_file)?;
         let track = PoseTrack::read(poses, self.map_calib_file)?;
-        Ok(MappingPath {
+        Ok(Some(MappingPath {
             world_from_map: track.world_from_map,
             map_from_lidar: track.map_from_lidar,
-        })
+        }))
+    }
+
+    /// Reports the frame of a map without a mapping drive.
+    fn report_frame(&self, path: &MappingPath) {
+        if !path.map_from_lidar.is_empty() {
+            return;
+        }
+        let map = self.map_file.display();
+        tracing::info!(
+            "{map} has no mapping path: poses are in its own frame, and a start on the road is one anywhere; for a map of range-mcl, give map_pose_file and map_calib_file"
+        );
+        let origin = path.world_from_map.translation.vector;
+        if origin.norm() > 0.0 {
+            tracing::warn!(
+                "the origin of {map} is moved by ({:.0}, {:.0}, {:.0}) m, because its coordinates are large: results are relative to it",
+                origin.x,
+                origin.y,
+                origin.z
+            );
+        }
     }
 }
 
@@ -125,6 +177,7 @@ impl SensorKeys<'_> {
     pub fn resolve(self, recording: Recording) -> Result<(Recording, Option<SensorDescription>)> {
         let is_given = RangeImageConfig::of(&self.range_image.model());
         let is_complete = RangeImageConfig {
+            has_rows: None,
             max_instance: None,
             render_instanced: None,
             ..self.range_image.clone()
@@ -139,8 +192,8 @@ impl SensorKeys<'_> {
         }
         let scans = sample(&recording)?;
         let sensor = sensor::infer(&scans);
-        tracing::info!("{}", description(&sensor));
-        self.range_image.resolve(&sensor.lidar);
+        tracing::info!("sensor: {}", description(&sensor));
+        self.range_image.resolve(&sensor.lidar, sensor.has_rows);
         let default_m = ScanConfig::default().own_car_m;
         let own_car_m = match sensor.is_moving {
             true => sensor.own_car_m,
@@ -244,7 +297,7 @@ pub fn description(sensor: &SensorDescription) -> String {
     let lowest = -model.fov_down.abs();
     let lowest = elevations.and_then(|rows| rows.last()).unwrap_or(&lowest);
     let mut text = format!(
-        "sensor: {rows} from {highest:+.1} to {lowest:+.1} degrees, image {} x {}, ranges {:.1} to {:.0} m",
+        "{rows} from {highest:+.1} to {lowest:+.1} degrees, image {} x {}, ranges {:.1} to {:.0} m",
         model.height, model.width, model.min_range, model.max_range
     );
     if let Some(mounting) = &sensor.mounting {

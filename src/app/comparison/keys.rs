@@ -20,9 +20,9 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::plan::PlannedRun;
+use crate::app::commands::build_map::hash_of_scan;
 use crate::app::commands::version;
-use crate::recording::Recording;
-use crate::recording::Selection;
+use crate::recording::{Recording, Selection};
 use crate::simulation::SimulationConfig;
 
 /// Configuration keys without effect on the numbers: paths, plots, permission to replace files.
@@ -96,10 +96,10 @@ impl KeyCache {
             }
             Input::Scans(folder, selection) => {
                 self.once(format!("{folder:?} {selection:?}"), || {
-                    let hashes = (Recording::open(folder, &selection)?.frames)
+                    let hashes = (Recording::open(folder, None, &selection)?.frames)
                         .par_iter()
                         .map(|frame| {
-                            let content = content(&frame.scan_path)?;
+                            let content = hash_of_scan(&frame.read()?);
                             Ok(format!("{} {} {content}", frame.number, frame.time_s))
                         })
                         .collect::<Result<Vec<String>>>()?;

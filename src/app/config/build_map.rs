@@ -90,6 +90,8 @@ pub struct BuildMapConfig {
     /// Size and limits of the range images for the normals.
     pub range_image: RangeImageConfig,
 
+    /// Point cloud in the map frame that is meshed instead of scans with poses, `.pcd`, `.ply` or `.npy`.
+    pub cloud_file: Option<PathBuf>,
     /// First frame of the recording.
     pub start_idx: usize,
     /// Step between frames: n uses every n-th frame.
@@ -163,6 +165,7 @@ impl BuildMapConfig {
                 voxel_size_m: self.voxel_size as f32,
                 crop_m: Vec3::new(self.crop_x as f32, self.crop_y as f32, self.crop_z as f32),
                 own_car_m: self.own_car_m.unwrap_or(ScanConfig::default().own_car_m),
+                has_rows: self.range_image.has_rows.unwrap_or(true),
             },
             confidence: self.confidence.clone(),
             poisson: PoissonConfig {
@@ -206,6 +209,7 @@ impl Validate for BuildMapConfig {
         optional_path("pose_file", self.pose_file.as_deref())?;
         optional_path("calib_file", self.calib_file.as_deref())?;
         mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
+        optional_path("cloud_file", self.cloud_file.as_deref())?;
         path("mesh_file", &self.mesh_file)?;
         self.selection().validate()?;
         in_range("depth", self.depth, PoissonConfig::DEPTHS)?;

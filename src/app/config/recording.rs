@@ -56,6 +56,9 @@ pub struct RangeImageConfig {
     /// Elevations of the rows, from the top [deg]; without them, rows of a given `height`, `fov_up` or
     /// `fov_down` are evenly spaced.
     pub elevations: Option<Arc<[f32]>>,
+    /// Whether each beam keeps its elevation, as those of spinning sensors do; otherwise `build-map` takes normals
+    /// from neighbours in space.
+    pub has_rows: Option<bool>,
     /// Number of particles that `localize` renders at once.
     pub max_instance: Option<usize>,
     /// Whether `localize` renders the particles in batches instead of one by one.
@@ -102,9 +105,10 @@ impl RangeImageConfig {
     }
 
     /// Sets what is not given.
-    pub fn resolve(&mut self, inferred: &LidarModel) {
+    pub fn resolve(&mut self, inferred: &LidarModel, has_rows: bool) {
         let (max_instance, render_instanced) = (self.max_instance, self.render_instanced);
         *self = Self {
+            has_rows: self.has_rows.or(Some(has_rows)),
             max_instance,
             render_instanced,
             ..Self::of(&self.model_over(inferred))

@@ -4,7 +4,7 @@ mod bin;
 pub mod npy;
 mod pcd;
 mod ply;
-mod point_table;
+pub(super) mod point_table;
 
 use std::path::Path;
 

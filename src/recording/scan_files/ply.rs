@@ -39,7 +39,10 @@ pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
     }
     let rows = (parser.read_payload_for_element(&mut reader, element, &header))
         .map_err(|e| unreadable(&e))?;
-    let (points, intensities) = rows.iter().map(|row| (row.position, row.intensity)).unzip();
+    let (points, intensities) = rows
+        .iter()
+        .map(|row| (row.position.as_vec3(), row.intensity))
+        .unzip();
     Ok(Scan {
         points,
         intensities,

@@ -31,7 +31,7 @@ impl NumberType {
     }
 
     /// The number at an offset; `None` beyond the end.
-    fn read(self, bytes: &[u8], offset: usize) -> Option<f64> {
+    pub fn read(self, bytes: &[u8], offset: usize) -> Option<f64> {
         fn at<const N: usize>(bytes: &[u8], offset: usize) -> Option<[u8; N]> {
             bytes.get(offset..)?.first_chunk().copied()
         }
@@ -64,7 +64,7 @@ pub struct Column {
 }
 
 /// Names of the reflectance in the files of drivers.
-const INTENSITY: [&str; 6] = [
+pub const INTENSITY: [&str; 6] = [
     "intensity",
     "i",
     "reflectivity",

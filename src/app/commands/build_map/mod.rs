@@ -1,6 +1,7 @@
 //! `build-map`: builds a triangle-mesh map from scans with poses.
 
 mod clock;
+mod cloud;
 mod parts;
 mod pictures;
 mod report;
@@ -15,7 +16,8 @@ use std::time::Instant;
 use anyhow::{Context as _, Result};
 
 use self::clock::StageClock;
-use self::parts::{Parts, hash_of_scan, hash_of_scans, joint_hash};
+pub use self::parts::hash_of_scan;
+use self::parts::{Parts, hash_of_scans, joint_hash};
 pub use self::report::BuildReport;
 use super::claims::{Claims, Outputs, PLY};
 use super::interrupt::Interrupted;
@@ -35,6 +37,14 @@ use crate::sensor::SensorDescription;
 
 /// Builds the map that a configuration describes.
 pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
+    match &config.cloud_file {
+        Some(cloud_file) => cloud::run(config, cloud_file, context),
+        None => run_with_scans(config, context),
+    }
+}
+
+/// Builds the map of scans with poses.
+fn run_with_scans(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
     let started = Instant::now();
     let mut claims = prepare(config, context)?;
     let mut resolved = config.clone();
@@ -82,9 +92,9 @@ fn open(config: &mut BuildMapConfig) -> Result<(Recording, Option<SensorDescript
     if let Some(path) = &config.truth_mesh {
         input::require_file("truth_mesh", path)?;
     }
-    let recording = Recording::open(&config.scan_folder, &config.selection())?;
+    let recording = inputs.open(&config.selection())?;
     let track = match &config.pose_file {
-        Some(path) => inputs.track(path)?,
+        Some(path) => inputs.track(path, &recording)?,
         None => recording.own_track()?,
     };
     let pose_file = track.path.clone();
@@ -105,6 +115,7 @@ fn open(config: &mut BuildMapConfig) -> Result<(Recording, Option<SensorDescript
 fn recording_inputs(config: &BuildMapConfig) -> RecordingInputs<'_> {
     RecordingInputs {
         scan_folder: &config.scan_folder,
+        topic: config.topic.as_deref(),
         pose_file: config.pose_file.as_deref(),
         calib_file: config.calib_file.as_deref(),
         body_from_lidar: config.body_from_lidar,
@@ -123,12 +134,11 @@ fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
             .map(|name| name.to_string_lossy().into_owned())
     };
     let mut inputs = recording_inputs(config).files();
-    inputs.extend(
-        config
-            .truth_mesh
-            .as_deref()
-            .map(|path| ("truth_mesh", path)),
-    );
+    let optional = [
+        ("cloud_file", &config.cloud_file),
+        ("truth_mesh", &config.truth_mesh),
+    ];
+    inputs.extend((optional.iter()).filter_map(|(key, path)| Some((*key, path.as_deref()?))));
     inputs.extend(context.input());
     let outputs = Outputs {
         key: "mesh_file",
@@ -320,7 +330,7 @@ fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
     let mut text = format!("# {}\n", version::program()?);
     text += &config::to_yaml(&relevant)?;
     for frame in frames {
-        let path = frame.scan_path.display();
+        let path = &frame.source;
         let pose = frame.map_from_lidar.unwrap_or_default();
         let (t, q) = (pose.translation.vector, pose.rotation.coords);
         writeln!(text, "{path} {t:?} {q:?} {:?}", frame.motion)?;
@@ -368,8 +378,12 @@ fn write_map(
 ) -> Result<()> {
     anyhow::ensure!(
         !mesh.triangles.is_empty(),
-        "the map has no triangles: the scans in {} have no points left to mesh; check range_image, crop_x, crop_y and crop_z",
-        config.scan_folder.display()
+        "the map has no triangles: {} has no points left to mesh; check range_image, crop_x, crop_y and crop_z",
+        config
+            .cloud_file
+            .as_ref()
+            .unwrap_or(&config.scan_folder)
+            .display()
     );
     claims.begin(&config.mesh_file)?;
     Ok(ply::write(&config.mesh_file, mesh, Some(path))?)

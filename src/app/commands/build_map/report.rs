@@ -77,28 +77,28 @@ impl BuildReport {
     /// The table on standard output.
     pub fn table(&self) -> String {
         let mut rows = vec![
-            (
-                "scans",
-                format!("{} of {}", self.mapped_frames, self.frames),
-            ),
-            ("path", format!("{:.1} m", self.path_m)),
             ("time", format!("{:.1} s", self.seconds)),
-            (
-                "rate",
-                format!("{:.1} scans/s", self.mapped_frames as f64 / self.seconds),
-            ),
             ("octree cell", format!("{:.2} m", self.octree_cell_m)),
             ("triangles", self.triangles.to_string()),
             ("size", format!("{:.1} MB", self.map_mb)),
-            (
+        ];
+        if self.mapped_frames > 0 {
+            let scans = format!("{} of {}", self.mapped_frames, self.frames);
+            let rate = self.mapped_frames as f64 / self.seconds;
+            rows.splice(
+                0..0,
+                [("scans", scans), ("path", format!("{:.1} m", self.path_m))],
+            );
+            rows.insert(3, ("rate", format!("{rate:.1} scans/s")));
+            rows.push((
                 "per 100 m",
                 format!(
                     "{:.0} k, {:.1} MB",
                     self.triangles_per_100m / 1e3,
                     self.mb_per_100m
                 ),
-            ),
-        ];
+            ));
+        }
         let percent = |share: f64| format!("{:.1} %", 100.0 * share);
         let centimetres = |metres: f64| format!("{:.1} cm", 100.0 * metres);
         if let Some(quality) = &self.quality {

@@ -84,9 +84,10 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
 /// Opens the selected frames, with the true poses in the frame of the map, and completes the configuration by
 /// what the scans show about the sensor.
 fn open(config: &mut LocalizationConfig, map: &Map) -> Result<Recording> {
-    let mut recording = Recording::open(&config.scan_folder, &config.selection())?;
+    let inputs = recording_inputs(config);
+    let mut recording = inputs.open(&config.selection())?;
     if let Some(pose_file) = &config.pose_file {
-        let track = recording_inputs(config).track(pose_file)?;
+        let track = inputs.track(pose_file, &recording)?;
         recording = recording.with_poses(track.in_map(&map.path.world_from_map))?;
     }
     let keys = SensorKeys {
@@ -108,6 +109,7 @@ fn map_inputs(config: &LocalizationConfig) -> MapInputs<'_> {
 fn recording_inputs(config: &LocalizationConfig) -> RecordingInputs<'_> {
     RecordingInputs {
         scan_folder: &config.scan_folder,
+        topic: config.topic.as_deref(),
         pose_file: config.pose_file.as_deref(),
         calib_file: config.calib_file.as_deref(),
         body_from_lidar: config.body_from_lidar,

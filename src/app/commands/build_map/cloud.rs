@@ -1,0 +1,101 @@
+//! `build-map` of a point cloud without scans and poses.
+
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::time::Instant;
+
+use anyhow::{Result, ensure};
+
+use super::{BuildReport, StageClock, pictures, prepare, write_map};
+use crate::app::commands::interrupt::Interrupted;
+use crate::app::commands::{Context, input, output};
+use crate::app::config::BuildMapConfig;
+use crate::geometry::TriangleMesh;
+use crate::map::{BuildError, BuildEvent, CloudPlan, LocalMap, MappingPath};
+use crate::recording::scan_files;
+
+/// Meshes the cloud of a configuration.
+pub fn run(config: &BuildMapConfig, cloud_file: &Path, context: &Context) -> Result<BuildReport> {
+    let started = Instant::now();
+    input::require_file("cloud_file", cloud_file)?;
+    ensure!(
+        scan_files::is_scan(cloud_file),
+        "cloud_file is {}, which is not a point cloud; its name must end in .pcd, .ply, .npy or .bin",
+        cloud_file.display()
+    );
+    let mut claims = prepare(config, context)?;
+    let clock = StageClock::default();
+    let blocks = build_blocks(config, cloud_file, context, &clock)?;
+    let mut mesh = TriangleMesh::default();
+    blocks.iter().for_each(|block| mesh.append(&block.mesh));
+    let path = MappingPath::default();
+    write_map(config, &mesh, &path, &mut claims)?;
+    if config.visualize {
+        pictures::draw(config, &mesh, &[], &[])?;
+    }
+    let cells_m = blocks.iter().map(|block| block.counts.cell_m);
+    let report = BuildReport {
+        stage_seconds: clock.seconds(),
+        octree_cell_m: cells_m.fold(0.0, f32::max),
+        local_maps: blocks.into_iter().map(|block| block.counts).collect(),
+        ..BuildReport::of_map(&mesh, &path, &config.mesh_file, started)
+    };
+    output::write_json(&config.mesh_file.with_extension("report.json"), &report)?;
+    output::write_yaml(&config.mesh_file.with_extension("effective.yml"), config)?;
+    claims.finish(&config.mesh_file)?;
+    Ok(report)
+}
+
+/// Builds the blocks of the cloud.
+fn build_blocks(
+    config: &BuildMapConfig,
+    cloud_file: &Path,
+    context: &Context,
+    clock: &StageClock,
+) -> Result<Vec<LocalMap>> {
+    let kept = "nothing is kept of an unfinished map of a cloud";
+    context.interrupt.keeps(kept.to_owned());
+    let points = clock.time("read", || scan_files::read(cloud_file))?.points;
+    let local_map = config.map().local_map;
+    let prepare = || {
+        CloudPlan::new(&points, &[], &local_map, &|event| {
+            on_stage(event, context, clock)
+        })
+    };
+    let plan = prepare().map_err(|error| interrupted(error, kept))?;
+    tracing::info!(
+        "{} of {} points are kept, in {} blocks",
+        plan.cloud.len(),
+        points.len(),
+        plan.blocks()
+    );
+    let task = context.progress.task("build-map", plan.blocks());
+    let mut blocks = Vec::with_capacity(plan.blocks());
+    for number in 0..plan.blocks() {
+        let built = plan.build_block(number, &|event| on_stage(event, context, clock));
+        blocks.push(built.map_err(|error| interrupted(error, kept))?);
+        task.advance(1);
+    }
+    clock.end();
+    Ok(blocks)
+}
+
+fn on_stage(event: BuildEvent, context: &Context, clock: &StageClock) -> ControlFlow<()> {
+    if let BuildEvent::Stage(name) = event {
+        clock.begin(name);
+    }
+    match context.interrupt.requested() {
+        true => ControlFlow::Break(()),
+        false => ControlFlow::Continue(()),
+    }
+}
+
+fn interrupted(error: BuildError, kept: &str) -> anyhow::Error {
+    match error {
+        BuildError::Interrupted => Interrupted {
+            kept: kept.to_owned(),
+        }
+        .into(),
+        other => other.into(),
+    }
+}

@@ -1,0 +1,101 @@
+//! Headers, poses and transforms of messages.
+
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+
+use super::fields::Fields;
+use super::index::{Content, Serialization};
+use crate::geometry::{FARTHEST_M, Pose3};
+
+/// `std_msgs/Header`.
+pub struct Header {
+    /// When it was measured [s]; 0 if unknown.
+    pub stamp_s: f64,
+    /// Name of the frame, without a slash before it.
+    pub frame: String,
+}
+
+impl Header {
+    /// Reads the header at the begin of a message.
+    pub fn read(fields: &mut Fields) -> Result<Self, String> {
+        if fields.has_sequence_numbers() {
+            fields.u32()?;
+        }
+        let (seconds, nanoseconds) = (fields.u32()?, fields.u32()?);
+        Ok(Self {
+            stamp_s: f64::from(seconds) + 1e-9 * f64::from(nanoseconds),
+            frame: frame(fields)?,
+        })
+    }
+}
+
+fn frame(fields: &mut Fields) -> Result<String, String> {
+    Ok(fields.text()?.trim_start_matches('/').to_owned())
+}
+
+/// The pose of a frame in another one at a time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FramePose {
+    /// When it was measured, or logged if that is unknown [s].
+    pub time_s: f64,
+    /// Name of the frame that the pose is in.
+    pub parent: String,
+    /// Name of the frame whose pose it is; empty if the message has none.
+    pub child: String,
+    /// `p_parent = parent_from_child * p_child`.
+    pub parent_from_child: Pose3,
+}
+
+/// Reads the poses of a message; `log_s` is the moment of those without a stamp.
+pub fn read_poses(
+    message: &[u8],
+    serialization: Serialization,
+    content: Content,
+    log_s: f64,
+) -> Result<Vec<FramePose>, String> {
+    let mut fields = Fields::new(message, serialization)?;
+    let fields = &mut fields;
+    let count = match content {
+        Content::TransformTree => fields.u32()?,
+        _ => 1,
+    };
+    let mut poses = Vec::new();
+    for _ in 0..count {
+        fields.align(4);
+        let header = Header::read(fields)?;
+        let child = match content {
+            Content::Pose => String::new(),
+            _ => frame(fields)?,
+        };
+        poses.push(FramePose {
+            time_s: if header.stamp_s == 0.0 {
+                log_s
+            } else {
+                header.stamp_s
+            },
+            parent: header.frame,
+            child,
+            parent_from_child: pose(fields)?,
+        });
+    }
+    Ok(poses)
+}
+
+/// A position or translation, and a quaternion x, y, z, w.
+fn pose(fields: &mut Fields) -> Result<Pose3, String> {
+    let mut numbers = [0.0; 7];
+    for number in &mut numbers {
+        *number = fields.f64()?;
+    }
+    let [x, y, z, i, j, k, w] = numbers;
+    let quaternion = Quaternion::new(w, i, j, k);
+    let is_on_earth = [x, y, z].iter().all(|m| m.abs() <= FARTHEST_M);
+    if !is_on_earth || !(0.9..1.1).contains(&quaternion.norm()) {
+        return Err(format!(
+            "has no pose: position {x} {y} {z}, quaternion {i} {j} {k} {w}"
+        ));
+    }
+    Ok(Isometry3::from_parts(
+        Translation3::new(x, y, z),
+        UnitQuaternion::from_quaternion(quaternion),
+    ))
+}

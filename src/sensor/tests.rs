@@ -1,0 +1,273 @@
+//! Laws of the inference, on drawn sensors and scenes.
+
+use std::f32::consts::TAU;
+
+use arbtest::arbtest;
+use glam::Vec3;
+use rand::seq::SliceRandom;
+use rand::{Rng, RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::*;
+
+/// A drawn spinning sensor at the origin in a yard: ground 1.8 m below, walls around at 8 to 30 m.
+struct Spinner {
+    elevations_deg: Vec<f32>,
+    columns: usize,
+    /// Heights of the lasers above the origin [m].
+    offset_m: f32,
+}
+
+impl Spinner {
+    fn draw(rng: &mut impl Rng, beams: usize) -> Self {
+        let gaps: Vec<f32> = (0..beams).map(|_| rng.random_range(0.3..2.0)).collect();
+        let scale = 45.0_f32.min(1.0 * beams as f32) / gaps.iter().sum::<f32>();
+        let mut elevation_deg = 0.4 * scale * gaps.iter().sum::<f32>();
+        let elevations_deg = (gaps.iter())
+            .map(|gap| {
+                elevation_deg -= scale * gap;
+                elevation_deg
+            })
+            .collect();
+        Self {
+            elevations_deg,
+            columns: rng.random_range(500..1800),
+            offset_m: 0.0,
+        }
+    }
+
+    /// A scan at a place along the yard, column after column; walls move by with the place.
+    fn scan(&self, place_m: f32, rng: &mut impl Rng) -> Scan {
+        let mut scan = Scan::default();
+        for column in 0..self.columns {
+            let azimuth = TAU * (column as f32 + 0.5) / self.columns as f32;
+            let (sin, cos) = azimuth.sin_cos();
+            let wall_m = 14.0 + 6.0 * (3.0 * azimuth + 0.4 * place_m).sin();
+            for elevation_deg in &self.elevations_deg {
+                let slope = elevation_deg.to_radians().tan();
+                let ground_m = if slope < 0.0 {
+                    (1.8 + self.offset_m) / -slope
+                } else {
+                    1e3
+                };
+                let distance_m = wall_m.min(ground_m) + rng.random_range(-0.02..0.02);
+                let z = self.offset_m + slope * distance_m;
+                scan.points
+                    .push(Vec3::new(distance_m * cos, distance_m * sin, z));
+                scan.times_s.push(0.1 * column as f32 / self.columns as f32);
+            }
+        }
+        scan
+    }
+}
+
+fn assert_finds(sensor: &Spinner, scan: &Scan) {
+    let found = infer(std::slice::from_ref(scan));
+    assert!(found.has_rows);
+    assert_eq!(found.lidar.height, sensor.elevations_deg.len());
+    for (row, expected) in sensor.elevations_deg.iter().enumerate() {
+        let error = found.lidar.elevation_rad(row).to_degrees() - expected;
+        assert!(error.abs() < 0.15, "row {row}: {error}");
+    }
+}
+
+#[test]
+fn beams_of_any_elevations_are_found_in_any_order_and_with_a_third_of_the_points_dropped() {
+    arbtest(|u| {
+        let mut rng = ChaCha8Rng::seed_from_u64(u.arbitrary()?);
+        let sensor = Spinner::draw(&mut rng, u.int_in_range(4..=90)?);
+        let mut scan = sensor.scan(0.0, &mut rng);
+        scan.times_s.clear();
+        assert_finds(&sensor, &scan);
+        scan.points.retain(|_| rng.random_bool(0.7));
+        assert_finds(&sensor, &scan);
+        scan.points.shuffle(&mut rng);
+        assert_finds(&sensor, &scan);
+        Ok(())
+    })
+    .budget_ms(3000);
+}
+
+#[test]
+fn beams_that_follow_one_another_are_found_by_their_order_though_motion_smears_them() {
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    let sensor = Spinner::draw(&mut rng, 40);
+    let mut points = vec![];
+    let scan = sensor.scan(0.0, &mut rng);
+    for beam in 0..40 {
+        points.extend(scan.points.iter().skip(beam).step_by(40));
+    }
+    // Compensated for 2 m of motion in the revolution.
+    let azimuth = |point: Vec3| point.y.atan2(point.x) / TAU;
+    let moved = points
+        .iter()
+        .map(|&p: &Vec3| p + 2.0 * azimuth(p) * Vec3::X);
+    let scan = Scan {
+        points: moved.filter(|_| rng.random_bool(0.7)).collect(),
+        ..Scan::default()
+    };
+    let found = infer(&[scan]);
+    assert_eq!(found.beam_source, BeamSource::Order);
+    assert_eq!(found.beams, Some(40));
+}
+
+#[test]
+fn lasers_above_the_origin_are_found_in_any_order() {
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let mut sensor = Spinner::draw(&mut rng, 50);
+    sensor.offset_m = 0.2;
+    let mut scan = sensor.scan(0.0, &mut rng);
+    scan.points.shuffle(&mut rng);
+    let found = infer(&[scan]);
+    // The offset is found to a centimetre, so two beams close together may be one.
+    assert!((49..=51).contains(&found.lidar.height));
+}
+
+#[test]
+fn rings_are_trusted_only_if_they_are_beams() {
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    let sensor = Spinner::draw(&mut rng, 14);
+    let mut scan = sensor.scan(0.0, &mut rng);
+    // Two beams without a return.
+    scan.rings = (0..scan.len())
+        .map(|point| 1 + (point % 14) as u16)
+        .collect();
+    let found = infer(std::slice::from_ref(&scan));
+    assert_eq!(
+        (found.beam_source, found.beams),
+        (BeamSource::Rings, Some(15))
+    );
+    assert_eq!(found.lidar.height, 14);
+    scan.rings = (0..scan.len()).map(|_| rng.random_range(0..6)).collect();
+    let found = infer(&[scan]);
+    assert_eq!(
+        (found.beam_source, found.lidar.height),
+        (BeamSource::Elevations, 14)
+    );
+}
+
+#[test]
+fn random_directions_have_no_rows() {
+    arbtest(|u| {
+        let mut rng = ChaCha8Rng::seed_from_u64(u.arbitrary()?);
+        let count = u.int_in_range(500..=60_000)?;
+        let points = (0..count).map(|_| {
+            let direction = Vec3::new(
+                1.0,
+                rng.random_range(-0.7..0.7),
+                rng.random_range(-0.7..0.7),
+            );
+            direction * rng.random_range(3.0..20.0_f32)
+        });
+        let scan = Scan {
+            points: points.collect(),
+            ..Scan::default()
+        };
+        let found = infer(&[scan]);
+        assert!(!found.has_rows, "{count} points: {found:?}");
+        assert_eq!(found.beams, None);
+        assert!((60.0..90.0).contains(&found.horizontal_fov_deg));
+        Ok(())
+    })
+    .budget_ms(2000);
+}
+
+#[test]
+fn times_tell_the_sense_and_the_period() {
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    let sensor = Spinner::draw(&mut rng, 16);
+    let mut scan = sensor.scan(0.0, &mut rng);
+    let found = infer(std::slice::from_ref(&scan));
+    assert_eq!(found.rotation, Some(RotationDirection::CounterClockwise));
+    assert!((found.period_s.unwrap() - 0.1).abs() < 1e-3);
+    scan.points.iter_mut().for_each(|point| point.y = -point.y);
+    assert_eq!(infer(&[scan]).rotation, Some(RotationDirection::Clockwise));
+}
+
+#[test]
+fn a_moving_sensor_sees_its_own_car_and_the_ground_below() {
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    let sensor = Spinner::draw(&mut rng, 48);
+    let scans: Vec<Scan> = (0..10)
+        .map(|number| {
+            let mut scan = sensor.scan(2.0 * number as f32, &mut rng);
+            scan.times_s.clear();
+            // A hood in front, 0.7 m below the sensor.
+            let hood = (0..400).map(|_| {
+                let (x, y) = (rng.random_range(1.0..2.0), rng.random_range(-0.6..0.6));
+                Vec3::new(x, y, -0.7)
+            });
+            scan.points.extend(hood);
+            scan
+        })
+        .collect();
+    let found = infer(&scans);
+    assert!(found.is_moving);
+    for (limit, expected) in found.own_car_m.into_iter().zip([1.0, 2.0, -0.6, 0.6]) {
+        assert!((limit - expected).abs() <= 0.41, "{:?}", found.own_car_m);
+    }
+    let mounting = found.mounting.unwrap();
+    assert!((mounting.height_m - 1.8).abs() < 0.03, "{mounting:?}");
+    assert!(mounting.pitch_rad.abs() < 0.02);
+
+    let standing: Vec<Scan> = (0..10).map(|_| sensor.scan(0.0, &mut rng)).collect();
+    assert!(!infer(&standing).is_moving);
+}
+
+#[test]
+fn nothing_follows_from_no_points_and_damaged_ones() {
+    for points in [
+        vec![],
+        vec![Vec3::NAN; 50],
+        vec![Vec3::ZERO; 50],
+        vec![Vec3::X; 50],
+    ] {
+        let scan = Scan {
+            rings: vec![u16::MAX; points.len()],
+            times_s: vec![f32::NAN; points.len()],
+            points,
+            ..Scan::default()
+        };
+        let found = infer(&[scan.clone(), scan]);
+        assert!(!found.has_rows);
+        assert_eq!(found.mounting, None);
+    }
+    assert_eq!(infer(&[]).lidar, LidarModel::default());
+}
+
+#[test]
+fn every_point_is_in_the_image_or_counted_with_its_reason() {
+    let lidar = LidarModel::default();
+    let scan = Scan {
+        points: vec![
+            Vec3::new(10.0, 0.0, 0.0),
+            Vec3::new(20.0, 0.0, 0.0),
+            Vec3::new(20.0, -0.02, 0.0),
+            Vec3::new(10.0, 0.0, 5.0),
+            Vec3::new(1.0, 0.0, 0.0),
+            Vec3::new(0.0, 5.0, 0.0),
+            Vec3::new(-70.0, 0.0, 0.0),
+            Vec3::ZERO,
+            Vec3::NAN,
+        ],
+        ..Scan::default()
+    };
+    let own_car_m = [-1.0, 1.0, 4.0, 6.0];
+    let mut counts = DroppedPoints::count(&scan, &lidar, own_car_m);
+    let expected = DroppedPoints {
+        points: 9,
+        without_return: 2,
+        own_car: 1,
+        too_near: 1,
+        too_far: 1,
+        outside_image: 1,
+        second_return: 1,
+        same_pixel: 1,
+    };
+    assert_eq!(counts, expected);
+    assert_eq!(counts.above(0.2), []);
+    assert_eq!(counts.above(0.1).len(), 5);
+    counts.outside_image += 3;
+    counts.points += 3;
+    assert_eq!(counts.above(0.2)[0].0, DropReason::OutsideImage);
+}

@@ -1,0 +1,615 @@
+//! Bags from the outside: one recording in every format is the same recording, and damaged ones are errors.
+
+#![cfg(feature = "bags")]
+#![allow(clippy::unwrap_used, reason = "a failing test may panic")]
+#![allow(clippy::print_stderr, reason = "tests that do not run say so")]
+
+mod bag_writers;
+
+use std::fs;
+use std::path::Path;
+
+use fpmcl::geometry::Vec3;
+use fpmcl::lidar::Scan;
+use fpmcl::recording::bags::{FramePose, Wanted};
+use fpmcl::recording::{Bag, RecordingError, scan_files};
+use rayon::prelude::*;
+
+use bag_writers::{
+    Cloud, Kind, Recorded, compress, db3, livox, mcap, mcap_compressed, odometry, point_cloud2,
+    pose_stamped, ros1, transforms,
+};
+
+const START_NS: u64 = 1_700_000_000_250_000_000;
+
+const LEVEL: [f64; 4] = [0.0, 0.0, 0.0, 1.0];
+
+/// Five scans with odometry, and the mounting of the sensor.
+fn recording(kind: Kind) -> Vec<Recorded> {
+    let mounting = [
+        ("base_link", "mast", [1.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]),
+        ("mast", "/lidar", [0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0]),
+        ("base_link", "imu", [0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0]),
+    ];
+    let mut messages = vec![Recorded {
+        topic: "/tf_static",
+        message_type: "tf2_msgs/msg/TFMessage",
+        time_ns: START_NS,
+        data: transforms(kind, &mounting),
+    }];
+    for scan in 0..5 {
+        let time_ns = START_NS + 100_000_000 * scan;
+        let points: Vec<_> = (0..=40_u16)
+            .map(|i| {
+                let x = if i == 7 {
+                    f32::NAN
+                } else {
+                    f32::from(i) + scan as f32
+                };
+                ([x, 2.0, -1.5, 0.25], i % 4, 0.0025 * f32::from(i))
+            })
+            .collect();
+        messages.push(Recorded {
+            topic: "/points",
+            message_type: "sensor_msgs/msg/PointCloud2",
+            time_ns: time_ns + 1_000_000,
+            data: point_cloud2(kind, time_ns, "lidar", &Cloud::of(&points)),
+        });
+        let pose = [[scan as f64, 0.5, 0.0].as_slice(), &LEVEL].concat();
+        messages.push(Recorded {
+            topic: "/odom",
+            message_type: "nav_msgs/msg/Odometry",
+            time_ns: time_ns + 2_000_000,
+            data: odometry(
+                kind,
+                time_ns,
+                "odom",
+                "imu",
+                pose.as_slice().try_into().unwrap(),
+            ),
+        });
+        messages.push(Recorded {
+            topic: "/chatter",
+            message_type: "std_msgs/msg/String",
+            time_ns,
+            data: vec![0, 1, 0, 0],
+        });
+    }
+    messages
+}
+
+/// All that fpmcl reads of a bag.
+type Content = (Vec<Scan>, Vec<FramePose>, Vec<FramePose>);
+
+fn content(bag: &Bag) -> Result<Content, RecordingError> {
+    let topic = &bag.topic(Wanted::Scans, None)?.name;
+    let scans = 0..bag.scan_times(topic)?.len();
+    let scans = scans
+        .map(|scan| bag.read_scan(topic, scan))
+        .collect::<Result<_, _>>()?;
+    let poses = bag.poses(&bag.topic(Wanted::Poses, None)?.name)?;
+    Ok((scans, poses, bag.static_transforms()?))
+}
+
+fn metadata(folder: &Path, files: &[&str]) {
+    let mut text = "rosbag2_bagfile_information:\n  version: 5\n  compression_format: zstd\n  relative_file_paths:\n".to_owned();
+    for file in files {
+        text += &format!("    - {file}\n");
+    }
+    fs::write(
+        folder.join("metadata.yaml"),
+        text + "  duration:\n    nanoseconds: 1\n",
+    )
+    .unwrap();
+}
+
+/// Writes one recording in every format; returns the names, the first that of a plain MCAP.
+fn write_all_formats(folder: &Path) -> Vec<&'static str> {
+    let path = |name: &str| folder.join(name);
+    let (little, big) = (recording(Kind::CdrLittle), recording(Kind::CdrBig));
+    let options = || {
+        mcap::WriteOptions::new()
+            .compression(None)
+            .chunk_size(Some(1500))
+    };
+    let whole = mcap(options(), "cdr", &little);
+    fs::write(path("whole.mcap"), &whole).unwrap();
+    fs::write(path("big.mcap"), mcap(options(), "cdr", &big)).unwrap();
+    let unchunked = mcap(options().use_chunks(false), "cdr", &little);
+    fs::write(path("unchunked.mcap"), unchunked).unwrap();
+    let unindexed = options().emit_message_indexes(false);
+    fs::write(path("unindexed.mcap"), mcap(unindexed, "cdr", &little)).unwrap();
+    let ros1_messages = recording(Kind::Ros1);
+    fs::write(path("ros1.mcap"), mcap(options(), "ros1", &ros1_messages)).unwrap();
+    let mut names = vec!["big.mcap", "unchunked.mcap", "unindexed.mcap", "ros1.mcap"];
+    for compression in ["lz4", "zstd"] {
+        let name = if compression == "lz4" {
+            "lz4.mcap"
+        } else {
+            "zstd.mcap"
+        };
+        fs::write(path(name), mcap_compressed(&whole, compression)).unwrap();
+        names.push(name);
+    }
+    for (name, compression) in [("none.bag", "none"), ("lz4.bag", "lz4"), ("bz2.bag", "bz2")] {
+        fs::write(path(name), ros1(compression, &ros1_messages)).unwrap();
+        names.push(name);
+    }
+    db3(&path("all.db3"), &big);
+    let bytes = fs::read(path("all.db3")).unwrap();
+    fs::write(path("all 100%.db3.zstd"), compress("zstd", &bytes)).unwrap();
+    let messages = little.iter().map(|message| Recorded {
+        data: compress("zstd", &message.data),
+        ..message.clone()
+    });
+    db3(&path("messages.db3"), &messages.collect::<Vec<_>>());
+    for name in ["split", "split_mcap"] {
+        fs::create_dir(path(name)).unwrap();
+    }
+    db3(&path("split/1.db3"), &little[..7]);
+    db3(&path("split/0.db3"), &little[7..]);
+    metadata(&path("split"), &["\"split/1.db3\"", "0.db3"]);
+    fs::write(
+        path("split_mcap/a.mcap"),
+        mcap(options(), "cdr", &little[..4]),
+    )
+    .unwrap();
+    let rest = compress("zstd", &mcap(options(), "cdr", &little[4..]));
+    fs::write(path("split_mcap/b.mcap.zstd"), rest).unwrap();
+    metadata(&path("split_mcap"), &["a.mcap", "'b.mcap.zstd'"]);
+    names.extend([
+        "all.db3",
+        "all 100%.db3.zstd",
+        "messages.db3",
+        "split",
+        "split_mcap",
+    ]);
+    names.insert(0, "whole.mcap");
+    names
+}
+
+#[test]
+fn one_recording_in_every_format_is_the_same() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let names = write_all_formats(folder.path());
+    let expected = content(&Bag::open(&path("whole.mcap")).unwrap()).unwrap();
+    let (scans, poses, mounting) = &expected;
+    assert_eq!((scans.len(), poses.len(), mounting.len()), (5, 5, 3));
+    for (number, scan) in scans.iter().enumerate() {
+        let start_s = 1e-9 * START_NS as f64 + 0.1 * number as f64;
+        assert!((scan.time_s.unwrap() - start_s - 0.05).abs() < 1e-6);
+        assert_eq!(scan.points[3], Vec3::new(3.0 + number as f32, 2.0, -1.5));
+        assert_eq!(
+            (scan.points.len(), scan.times_s.len(), scan.rings.len()),
+            (40, 40, 40)
+        );
+        assert!(
+            (scan.times_s[7] + 0.05 - 8.0 * 0.0025).abs() < 1e-6,
+            "after the dropped point"
+        );
+        assert_eq!((scan.rings[7], scan.intensities[7]), (0, 0.25));
+        let pose = &poses[number];
+        assert_eq!((pose.parent.as_str(), pose.child.as_str()), ("odom", "imu"));
+        assert!((pose.time_s - start_s).abs() < 1e-6);
+        assert_eq!(pose.parent_from_child.translation.x, number as f64);
+    }
+    for name in names {
+        let bag = Bag::open(&path(name)).unwrap();
+        assert_eq!(content(&bag).unwrap(), expected, "{name}");
+        let chatter = &bag.topics()[0];
+        assert_eq!(
+            (chatter.name.as_str(), chatter.count),
+            ("/chatter", 5),
+            "{name}"
+        );
+        let (first_s, last_s) = chatter.span_s.unwrap();
+        assert!((last_s - first_s - 0.4).abs() < 1e-6, "{name}");
+        let files = fs::read_dir(folder.path()).unwrap();
+        let names = files.map(|file| file.unwrap().file_name().into_string().unwrap());
+        assert!(
+            !names
+                .into_iter()
+                .any(|n| n.contains("-shm") || n.contains("-wal")),
+            "{name}"
+        );
+    }
+}
+
+#[test]
+fn threads_read_the_same_scans() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bag.bag");
+    fs::write(&path, ros1("lz4", &recording(Kind::Ros1))).unwrap();
+    let bag = Bag::open(&path).unwrap();
+    let (scans, ..) = content(&bag).unwrap();
+    (0..200_usize).into_par_iter().for_each(|i| {
+        assert_eq!(
+            bag.read_scan("/points", 7 * i % 5).unwrap(),
+            scans[7 * i % 5]
+        );
+    });
+}
+
+/// A bag of one topic.
+fn bag_of(message_type: &'static str, data: Vec<u8>) -> (tempfile::TempDir, Bag) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("one.mcap");
+    let message = Recorded {
+        topic: "/one",
+        message_type,
+        time_ns: START_NS,
+        data,
+    };
+    let options = mcap::WriteOptions::new().compression(None);
+    fs::write(&path, mcap(options, "cdr", &[message])).unwrap();
+    let bag = Bag::open(&path).unwrap();
+    (folder, bag)
+}
+
+fn read_cloud(cloud: &Cloud) -> Result<Scan, RecordingError> {
+    let data = point_cloud2(Kind::CdrLittle, START_NS, "lidar", cloud);
+    bag_of("sensor_msgs/msg/PointCloud2", data)
+        .1
+        .read_scan("/one", 0)
+}
+
+/// An organized cloud of 3 x 2 points with padding, whose fields have a type.
+fn organized(datatype: u8, size: usize, is_big_endian: bool) -> Cloud {
+    let number = |number: i8| {
+        let mut bytes = match datatype {
+            7 => f32::from(number).to_le_bytes().to_vec(),
+            8 => f64::from(number).to_le_bytes().to_vec(),
+            _ => i64::from(number).to_le_bytes()[..size].to_vec(),
+        };
+        if is_big_endian {
+            bytes.reverse();
+        }
+        bytes
+    };
+    let mut data = Vec::new();
+    for row in 0..2 {
+        for column in 0..3 {
+            data.push(0xff);
+            for value in [row, column, 5, 100] {
+                data.extend(number(value));
+            }
+            data.extend([0xff; 2]);
+        }
+        data.extend([0xff; 11]);
+    }
+    let step = |field: u32| 1 + field * size as u32;
+    Cloud {
+        // In another order than in memory.
+        fields: vec![
+            ("z", step(2), datatype),
+            ("Reflectivity", step(3), datatype),
+            ("y", step(1), datatype),
+            ("x", step(0), datatype),
+        ],
+        width: 3,
+        height: 2,
+        point_step: step(4) + 2,
+        row_step: 3 * (step(4) + 2) + 11,
+        is_big_endian,
+        data,
+    }
+}
+
+#[test]
+fn points_of_any_type_order_and_padding_are_read() {
+    let types = [
+        (1, 1),
+        (2, 1),
+        (3, 2),
+        (4, 2),
+        (5, 4),
+        (6, 4),
+        (7, 4),
+        (8, 8),
+    ];
+    for (datatype, size) in types {
+        for is_big_endian in [false, true] {
+            let scan = read_cloud(&organized(datatype, size, is_big_endian)).unwrap();
+            assert_eq!(scan.len(), 6, "{datatype}");
+            assert_eq!(scan.points[5], Vec3::new(1.0, 2.0, 5.0), "{datatype}");
+            assert_eq!(scan.intensities, [100.0; 6]);
+            assert!(scan.times_s.is_empty() && scan.rings.is_empty());
+            assert!((scan.time_s.unwrap() - 1e-9 * START_NS as f64).abs() < 1e-6);
+        }
+    }
+}
+
+#[test]
+fn sizes_that_contradict_the_data_are_errors() {
+    type Change = fn(&mut Cloud);
+    let changes: [(&str, Change); 8] = [
+        ("width", |cloud| cloud.width = u32::MAX),
+        ("height", |cloud| cloud.height = u32::MAX),
+        ("both", |cloud| {
+            (cloud.width, cloud.height) = (u32::MAX, u32::MAX)
+        }),
+        ("point step", |cloud| cloud.point_step = 3),
+        ("no point step", |cloud| cloud.point_step = 0),
+        ("row step", |cloud| cloud.row_step = 1),
+        ("offset", |cloud| cloud.fields[0].1 = u32::MAX),
+        ("data", |cloud| cloud.data.truncate(122)),
+    ];
+    for (name, change) in changes {
+        let mut cloud = organized(7, 4, false);
+        change(&mut cloud);
+        let message = read_cloud(&cloud).unwrap_err().to_string();
+        assert!(
+            message.contains("one.mcap: message 0 of /one is damaged"),
+            "{name}: {message}"
+        );
+    }
+    let mut cloud = organized(7, 4, false);
+    cloud.fields[0].0 = "depth";
+    let message = read_cloud(&cloud).unwrap_err().to_string();
+    assert!(
+        message.contains("no fields x, y and z, but: depth"),
+        "{message}"
+    );
+    cloud.fields[0].0 = "z";
+    (cloud.width, cloud.height) = (0, 0);
+    assert!(read_cloud(&cloud).unwrap().is_empty());
+}
+
+#[test]
+fn points_of_livox_have_times_lines_and_reflectivities() {
+    for (kind, encoding) in [
+        (Kind::CdrLittle, "cdr"),
+        (Kind::CdrBig, "cdr"),
+        (Kind::Ros1, "ros1"),
+    ] {
+        let points: Vec<_> = (0..=100)
+            .map(|i| {
+                (
+                    1_000_000 * i,
+                    [i as f32, 1.0, 2.0],
+                    7 * (i % 30) as u8,
+                    (i % 6) as u8,
+                )
+            })
+            .collect();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("livox.mcap");
+        let message = Recorded {
+            topic: "/livox/lidar",
+            message_type: "livox_ros_driver2/msg/CustomMsg",
+            time_ns: START_NS,
+            data: livox(kind, START_NS, &points),
+        };
+        let options = mcap::WriteOptions::new().compression(None);
+        fs::write(&path, mcap(options, encoding, &[message])).unwrap();
+        let scan = Bag::open(&path)
+            .unwrap()
+            .read_scan("/livox/lidar", 0)
+            .unwrap();
+        assert_eq!(scan.len(), 101);
+        assert_eq!(scan.points[99], Vec3::new(99.0, 1.0, 2.0));
+        assert_eq!((scan.rings[99], scan.intensities[99]), (3, 63.0));
+        assert!((scan.times_s[99] - 0.049).abs() < 1e-6);
+        assert!((scan.time_s.unwrap() - 1e-9 * START_NS as f64 - 0.05).abs() < 1e-6);
+    }
+}
+
+#[test]
+fn the_mounting_follows_from_the_static_transforms() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("all.db3");
+    db3(&path, &recording(Kind::CdrLittle));
+    let bag = Bag::open(&path).unwrap();
+    let mounting = |body| bag.body_from_lidar(body, "/points").unwrap();
+    // Turned by half a turn on the mast.
+    let base_from_lidar = mounting("/base_link").unwrap();
+    let point = base_from_lidar * nalgebra::Point3::new(1.0, 2.0, 3.0);
+    assert!((point.coords - nalgebra::Vector3::new(0.0, -2.0, 4.5)).norm() < 1e-12);
+    let imu_from_lidar = mounting("imu").unwrap();
+    let point = imu_from_lidar * nalgebra::Point3::new(1.0, 2.0, 3.0);
+    assert!((point.coords - nalgebra::Vector3::new(0.0, -4.0, 4.5)).norm() < 1e-12);
+    assert_eq!(mounting("lidar").unwrap(), nalgebra::Isometry3::identity());
+    assert_eq!(mounting("map"), None);
+}
+
+#[test]
+fn topics_that_cannot_be_taken_are_errors_that_list_the_others() {
+    let pose = pose_stamped(
+        Kind::CdrLittle,
+        START_NS,
+        "map",
+        &[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0],
+    );
+    let (_folder, bag) = bag_of("geometry_msgs/msg/PoseStamped", pose);
+    let poses = bag.poses("/one").unwrap();
+    assert_eq!(
+        (poses[0].parent.as_str(), poses[0].child.as_str()),
+        ("map", "")
+    );
+    let message = bag.topic(Wanted::Scans, None).unwrap_err().to_string();
+    assert!(message.contains("has no topic of scans"), "{message}");
+    assert!(
+        message.contains("it has /one (geometry_msgs/msg/PoseStamped)"),
+        "{message}"
+    );
+    let message = bag.poses("/two").unwrap_err().to_string();
+    assert!(message.contains("no topic /two"), "{message}");
+    assert!(message.contains("choose one of: /one"), "{message}");
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("two.db3");
+    let mut messages = recording(Kind::CdrLittle);
+    messages[4].topic = "/points_2";
+    db3(&path, &messages);
+    let bag = Bag::open(&path).unwrap();
+    let message = bag.topic(Wanted::Scans, None).unwrap_err().to_string();
+    assert!(message.contains("several topics of scans"), "{message}");
+    assert!(
+        message.contains("/points (sensor_msgs/msg/PointCloud2), /points_2"),
+        "{message}"
+    );
+    assert_eq!(
+        bag.topic(Wanted::Scans, Some("/points_2")).unwrap().count,
+        1
+    );
+    let message = bag.read_scan("/points", 4).unwrap_err().to_string();
+    assert!(
+        message.contains("message 4 of /points does not exist, there are 4"),
+        "{message}"
+    );
+}
+
+#[test]
+fn quaternions_and_positions_that_are_none_are_errors() {
+    let unknown = [0.0; 7];
+    let far = [1e9, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+    let infinite = [f64::INFINITY, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+    let not_a_number = [0.0, 0.0, 0.0, f64::NAN, 0.0, 0.0, 1.0];
+    for pose in [unknown, far, infinite, not_a_number] {
+        let data = pose_stamped(Kind::CdrLittle, START_NS, "map", &pose);
+        let (_folder, bag) = bag_of("geometry_msgs/msg/PoseStamped", data);
+        let message = bag.poses("/one").unwrap_err().to_string();
+        assert!(
+            message.contains("message 0 of /one has no pose"),
+            "{message}"
+        );
+    }
+}
+
+/// Reads whatever a file still has.
+fn read_all(path: &Path, bytes: &[u8]) -> Result<Content, String> {
+    fs::write(path, bytes).unwrap();
+    let name = path.file_name().unwrap().to_str().unwrap();
+    let outcome = Bag::open(path).and_then(|bag| content(&bag));
+    outcome.map_err(|error| {
+        let message = error.to_string();
+        assert!(message.contains(name), "{message}");
+        message
+    })
+}
+
+#[test]
+fn truncated_and_flipped_bags_are_errors_or_what_is_left() {
+    let folder = tempfile::tempdir().unwrap();
+    let messages = recording(Kind::CdrLittle);
+    db3(&folder.path().join("whole.db3"), &messages);
+    let options = mcap::WriteOptions::new()
+        .compression(None)
+        .chunk_size(Some(1500));
+    let whole = mcap(options, "cdr", &messages);
+    let database = fs::read(folder.path().join("whole.db3")).unwrap();
+    for (name, bytes) in [
+        ("a.mcap", &whole),
+        ("zstd.mcap", &mcap_compressed(&whole, "zstd")),
+        ("lz4.bag", &ros1("lz4", &recording(Kind::Ros1))),
+        ("bz2.bag", &ros1("bz2", &recording(Kind::Ros1))),
+        ("none.bag", &ros1("none", &recording(Kind::Ros1))),
+        ("a.db3", &database),
+    ] {
+        let path = folder.path().join(name);
+        assert!(read_all(&path, bytes).is_ok(), "{name}");
+        for part in 0..97 {
+            let _ = read_all(&path, &bytes[..part * bytes.len() / 97]);
+        }
+        for flipped in (0..bytes.len()).step_by(bytes.len() / 397) {
+            let mut bytes = bytes.clone();
+            bytes[flipped] ^= 1 << (flipped % 8);
+            let _ = read_all(&path, &bytes);
+        }
+    }
+}
+
+#[test]
+fn the_messages_of_an_interrupted_recording_are_read_or_repaired() {
+    let folder = tempfile::tempdir().unwrap();
+    let messages = recording(Kind::CdrLittle);
+    let options = mcap::WriteOptions::new()
+        .compression(None)
+        .chunk_size(Some(1500));
+    let whole = mcap(options, "cdr", &messages);
+    let path = folder.path().join("a.mcap");
+    fs::write(&path, &whole[..whole.len() / 2]).unwrap();
+    let bag = Bag::open(&path).unwrap();
+    let scans = bag.scan_times("/points").unwrap().len();
+    assert!((1..5).contains(&scans), "{scans}");
+    let mut bag = ros1("none", &recording(Kind::Ros1));
+    let position = bag
+        .windows(10)
+        .position(|bytes| bytes == b"index_pos=")
+        .unwrap();
+    bag[position + 10..position + 18].fill(0);
+    let message = read_all(&folder.path().join("a.bag"), &bag).unwrap_err();
+    assert!(message.contains("rosbag reindex"), "{message}");
+    let message = read_all(&folder.path().join("b.bag"), b"#ROSBAG V1.2\n").unwrap_err();
+    assert!(message.contains("rosbag fix"), "{message}");
+    fs::create_dir(folder.path().join("folder")).unwrap();
+    let Err(error) = Bag::open(&folder.path().join("folder")) else {
+        panic!("a folder without metadata.yaml");
+    };
+    assert!(error.to_string().contains("ros2 bag reindex"), "{error}");
+}
+
+/// Bags by other writers of a drive of KITTI: `FPMCL_PYTHON` names an interpreter with rosbags and mcap.
+#[test]
+fn bags_of_other_writers_have_the_points_of_the_drive() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let shared = std::env::var("FPMCL_DATA").map_or(root.join("../shared/data"), Into::into);
+    let drive = shared.join("kitti-0926-drive-0005");
+    let script = shared.join("../judge/make_bags.py");
+    let Some(python) = std::env::var_os("FPMCL_PYTHON").filter(|_python| drive.exists()) else {
+        eprintln!(
+            "bags of other writers: skipped, FPMCL_PYTHON or {} is missing",
+            drive.display()
+        );
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = std::process::Command::new(python);
+    command
+        .arg(script)
+        .arg(&drive)
+        .arg(folder.path())
+        .args(["0", "20"]);
+    assert!(command.status().unwrap().success());
+    let mut first: Option<Content> = None;
+    for name in ["ros1.bag", "ros2_db3", "ros2.mcap"] {
+        let bag = Bag::open(&folder.path().join(name)).unwrap();
+        let (scans, poses, mounting) = content(&bag).unwrap();
+        assert_eq!((scans.len(), poses.len()), (20, 20));
+        for (number, scan) in scans.iter().enumerate() {
+            let file = drive.join(format!("velodyne/{number:06}.bin"));
+            let expected = scan_files::read(&file).unwrap();
+            assert_eq!(scan.points, expected.points, "{name} {number}");
+            assert_eq!(scan.intensities, expected.intensities, "{name} {number}");
+            let start_s = 1_317_000_000.0 + 0.1 * number as f64;
+            assert!((scan.time_s.unwrap() - start_s - 0.05).abs() < 1e-4);
+            assert!((poses[number].time_s - start_s).abs() < 1e-6);
+            for (point, time_s) in scan.points.iter().zip(&scan.times_s) {
+                // Clockwise, from straight behind.
+                let expected_s = -point.y.atan2(point.x) / std::f32::consts::TAU * 0.1;
+                assert!(
+                    (time_s - expected_s).abs() < 1e-4,
+                    "{name} {time_s} {expected_s}"
+                );
+            }
+            assert_eq!(scan.times_s.len(), scan.len());
+            assert!(scan.rings.iter().all(|&ring| ring < 64) && scan.rings.len() == scan.len());
+        }
+        assert_eq!(poses[0].parent_from_child.translation.vector.norm(), 0.0);
+        assert!(poses[19].parent_from_child.translation.vector.norm() > 1.0);
+        let base_from_lidar = bag
+            .body_from_lidar("base_link", "/points")
+            .unwrap()
+            .unwrap();
+        assert!((base_from_lidar.translation.z - 1.73).abs() < 1e-12);
+        assert_eq!(
+            bag.body_from_lidar(&poses[0].child, "/points").unwrap(),
+            Some(nalgebra::Isometry3::identity())
+        );
+        let content = (scans, poses, mounting);
+        assert!(
+            *first.get_or_insert_with(|| content.clone()) == content,
+            "{name}"
+        );
+    }
+}
