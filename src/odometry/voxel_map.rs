@@ -98,10 +98,17 @@ struct Level {
 pub struct Surface {
     /// Mean of the mapped points [m].
     pub center: DVec3,
-    /// Unit normal of arbitrary sign.
-    pub normal: DVec3,
-    /// Whether the points form a plane.
-    pub is_planar: bool,
+    /// How they are spread.
+    pub shape: Shape,
+}
+
+/// How mapped points are spread.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Shape {
+    /// A plane with a unit normal of arbitrary sign.
+    Plane(DVec3),
+    /// Another distribution, with its covariance [m²].
+    Other(DMat3),
 }
 
 /// The local map.
@@ -171,7 +178,7 @@ impl VoxelMap {
             let Some(surface) = level.surface(point) else {
                 continue;
             };
-            if surface.is_planar {
+            if matches!(surface.shape, Shape::Plane(_)) {
                 return Some(surface);
             }
             other = other.or(Some(surface));
@@ -218,14 +225,21 @@ impl Level {
             DVec3::new(p.z, s.y, p.x),
             DVec3::new(p.y, p.x, s.z),
         );
-        let plane =
-            PlaneSums::from_moments(Vec3::ZERO, sums.count.into(), sums.first.as_dvec3(), second);
-        let plane = plane.fit()?;
-        let [smallest, second, largest] = plane.variances;
+        let count = f64::from(sums.count);
+        let first = sums.first.as_dvec3();
+        let plane = PlaneSums::from_moments(Vec3::ZERO, count, first, second).fit()?;
+        let [smallest, middle_one, largest] = plane.variances;
+        if middle_one <= WIDE * largest {
+            return None;
+        }
+        let mean = first / count;
+        let outer = DMat3::from_cols(mean * mean.x, mean * mean.y, mean * mean.z);
         Some(Surface {
-            center: middle + plane.center.as_dvec3(),
-            normal: plane.normal.as_dvec3(),
-            is_planar: smallest < FLAT * second && second > WIDE * largest,
+            center: middle + mean,
+            shape: match smallest < FLAT * middle_one {
+                true => Shape::Plane(plane.normal.as_dvec3()),
+                false => Shape::Other(second * (1.0 / count) - outer),
+            },
         })
     }
 }
@@ -263,12 +277,10 @@ mod tests {
         map.insert(&points);
         for &point in points.iter().skip(800).step_by(37).take(5) {
             let surface = map.surface(point + normal * 0.1).unwrap();
-            assert!(surface.is_planar);
-            assert!(
-                surface.normal.dot(normal).abs() > 0.9999,
-                "{}",
-                surface.normal
-            );
+            let Shape::Plane(found) = surface.shape else {
+                panic!("{surface:?}");
+            };
+            assert!(found.dot(normal).abs() > 0.9999, "{found}");
             assert!((surface.center - point).dot(normal).abs() < 1e-3);
         }
         assert_eq!(map.surface(points[0] + normal * 50.0), None);
