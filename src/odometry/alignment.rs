@@ -131,7 +131,7 @@ impl Problem<'_> {
         let degeneracy = Degeneracy::of(&(information / weight), lever_m);
         let kept = degeneracy.projection;
         let information = kept * information * kept.transpose();
-        right_side = kept * right_side;
+        right_side = kept * kept * right_side;
         let variance =
             (planar.squares / planar.weight).max((MIN_SIGMA * self.min_kernel_m).powi(2));
         let prior = Matrix6::from_diagonal(&self.prior.map(|prior| variance * CORRELATED / prior));

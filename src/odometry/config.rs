@@ -50,6 +50,9 @@ pub struct OdometryConfig {
     /// Largest mean robust cost of a step that is accepted, 0 to 1 (unitless).
     #[default(0.85)]
     pub max_cost: f64,
+    /// Largest increase of this cost above the mean of the last steps, 0 to 1 (unitless).
+    #[default(0.2)]
+    pub max_cost_increase: f64,
     /// Number of scans in turn that do not fit, after which the local map begins anew.
     #[default(10)]
     pub restart_after: usize,
@@ -77,6 +80,7 @@ impl Validate for OdometryConfig {
         positive("max_deviation_deg", self.max_deviation_deg)?;
         in_range("min_matched_share", self.min_matched_share, 0.0..=1.0)?;
         in_range("max_cost", self.max_cost, 0.0..=1.0)?;
+        in_range("max_cost_increase", self.max_cost_increase, 0.0..=1.0)?;
         at_least_one("restart_after", self.restart_after)?;
         positive("period_s", self.period_s)
     }

@@ -21,8 +21,8 @@ pub struct Degeneracy {
 impl Degeneracy {
     /// The degenerate directions of an information matrix per unit of weight.
     pub fn of(information: &Matrix6<f64>, lever_m: f64) -> Self {
-        /// Largest eigenvalue of a degenerate direction (unitless).
-        const NEGLIGIBLE: f64 = 0.001;
+        /// Largest eigenvalue that noise of the surfaces explains (unitless).
+        const NOISE: f64 = 0.004;
         let turn = 1.0 / lever_m.max(f64::MIN_POSITIVE);
         let scale = Vector6::new(1.0, 1.0, 1.0, turn, turn, turn);
         let scaled = information.component_mul(&(scale * scale.transpose()));
@@ -34,8 +34,10 @@ impl Degeneracy {
             .iter()
             .zip(eigen.eigenvectors.column_iter())
         {
-            if value < NEGLIGIBLE {
-                kept -= direction * direction.transpose();
+            // The square root, since the projection is applied from both sides of the information.
+            let weight = (1.0 - NOISE / value.max(NOISE)).sqrt();
+            kept -= (1.0 - weight) * direction * direction.transpose();
+            if weight == 0.0 {
                 directions.push(direction.component_mul(&scale));
             }
         }

@@ -31,3 +31,6 @@ mod voxel_map;
 pub use config::OdometryConfig;
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 pub use timing::{TimingComparison, TimingError, compare_timings};
+
+#[cfg(test)]
+mod tests;

@@ -6,15 +6,16 @@
 //! wᵢ = (1 + rᵢ²/c²)⁻²                                                     Geman-McClure kernel
 //! ```
 //!
-//! A change of the pose also changes the motion, hence the factor 1 + f. Points whose neighbours form no plane
-//! have residuals to their mean, along three axes.
+//! A change of the pose also changes the motion, hence the factor 1 + f. Where the neighbours of a point form no plane,
+//! it has a residual to their mean, with the information σ² (Σ + σ²)⁻¹ of their covariance Σ and the noise σ: all of it
+//! across a thin pole, little along it, little in a bush.
 
 use glam::{DMat3, DQuat, DVec3, IVec3};
 use nalgebra::{Matrix6, Vector6};
 use rayon::prelude::*;
 
 use super::sampling::TimedPoint;
-use super::voxel_map::{Surface, VoxelMap};
+use super::voxel_map::{Shape, Surface, VoxelMap};
 use crate::geometry::{Pose3, Rigid3f};
 use crate::lidar::{Motion, Sweep};
 
@@ -34,6 +35,8 @@ pub struct Observation<'a> {
     pub odom_from_previous: Pose3,
     /// Time since then [s].
     pub duration_s: f64,
+    /// Standard deviation of a measured point [m].
+    pub noise_m: f64,
 }
 
 /// The match of a point; it holds while the point stays in its block of voxels.
@@ -145,9 +148,15 @@ impl Observation<'_> {
             return;
         };
         let offset = in_odom - surface.center;
-        let distance_m = match surface.is_planar {
-            true => surface.normal.dot(offset),
-            false => offset.length(),
+        let information = match surface.shape {
+            Shape::Plane(_) => DMat3::IDENTITY,
+            Shape::Other(covariance) => {
+                (covariance * self.noise_m.powi(-2) + DMat3::IDENTITY).inverse()
+            }
+        };
+        let distance_m = match surface.shape {
+            Shape::Plane(normal) => normal.dot(offset),
+            Shape::Other(_) => offset.dot(information * offset).sqrt(),
         };
         if distance_m.abs() > GATE * at.kernel_m {
             equations.cost += 1.0;
@@ -157,19 +166,25 @@ impl Observation<'_> {
         let weight = (1.0 + ratio).powi(-2);
         equations.cost += ratio / (1.0 + ratio);
         let factor = 1.0 + f64::from(point.time_s) / self.duration_s;
-        if surface.is_planar {
+        if let Shape::Plane(normal) = surface.shape {
             equations.distances_m.push(distance_m.abs() as f32);
-            let jacobian = factor * jacobian(at.lidar_from_odom * surface.normal, in_lidar);
+            let jacobian = factor * jacobian(at.lidar_from_odom * normal, in_lidar);
             equations.planar.add(&jacobian, distance_m, weight);
             equations.planar.count(distance_m, weight);
             equations.gradients[sector(point)] += weight * distance_m * jacobian;
         } else {
-            let offset = at.lidar_from_odom * offset;
-            for (axis, residual_m) in DVec3::AXES.into_iter().zip(offset.to_array()) {
-                let jacobian = factor * jacobian(axis, in_lidar);
-                equations.other.add(&jacobian, residual_m, weight);
+            let information = at.lidar_from_odom * information * at.rotation;
+            let pull = information * (at.lidar_from_odom * offset);
+            let jacobian = DVec3::AXES.map(|axis| factor * jacobian(axis, in_lidar));
+            let sums = &mut equations.other;
+            for row in 0..3 {
+                sums.right_side -= weight * pull[row] * jacobian[row];
+                for column in 0..3 {
+                    let value = weight * information.col(column)[row];
+                    (sums.information).ger(value, &jacobian[row], &jacobian[column], 1.0);
+                }
             }
-            equations.other.count(distance_m, weight);
+            sums.count(distance_m, weight);
         }
     }
 }

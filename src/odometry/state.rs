@@ -101,6 +101,7 @@ impl State {
         self.follow_range(sensor_range(scan)?, config);
         let sample = self.sample(scan, config);
         let sparse = sample.thinned(config.registration_spacing * self.voxel_m(config));
+        let min_kernel_m = config.min_kernel * self.voxel_m(config);
         let problem = Problem {
             observation: Observation {
                 map: &self.map,
@@ -108,10 +109,11 @@ impl State {
                 sweep: sample.sweep,
                 odom_from_previous: self.odom_from_lidar,
                 duration_s,
+                noise_m: min_kernel_m,
             },
             predicted: self.predicted(duration_s),
             prior: self.prior(duration_s, config),
-            min_kernel_m: config.min_kernel * self.voxel_m(config),
+            min_kernel_m,
             iterations: config.iterations,
         };
         let found = match &self.first {
@@ -202,8 +204,12 @@ impl State {
             || deviation.translation.vector.norm()
                 <= config.max_deviation_share * self.range_m * periods
                 && deviation.rotation.angle() <= config.max_deviation_deg.to_radians() * periods;
+        let usual_cost = match self.motion {
+            Some(_) => self.cost + config.max_cost_increase,
+            None => config.max_cost,
+        };
         is_smooth
-            && found.cost <= config.max_cost
+            && found.cost <= usual_cost.min(config.max_cost)
             && found.matched_share >= config.min_matched_share
     }
 
@@ -268,6 +274,7 @@ impl State {
         ));
         self.first = self.motion.is_none().then_some(sample);
         self.missed = 0;
+        self.cost = config.max_cost;
     }
 
     /// Changes all lengths where the range of the sensor has changed much, such as from a room to a street.

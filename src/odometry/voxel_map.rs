@@ -98,10 +98,17 @@ struct Level {
 pub struct Surface {
     /// Mean of the mapped points [m].
     pub center: DVec3,
-    /// Unit normal of arbitrary sign.
-    pub normal: DVec3,
-    /// Whether the points form a plane.
-    pub is_planar: bool,
+    /// How they are spread.
+    pub shape: Shape,
+}
+
+/// How mapped points are spread.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Shape {
+    /// A plane with a unit normal of arbitrary sign.
+    Plane(DVec3),
+    /// Another distribution, with its covariance [m²].
+    Other(DMat3),
 }
 
 /// The local map.
@@ -171,7 +178,7 @@ impl VoxelMap {
             let Some(surface) = level.surface(point) else {
                 continue;
             };
-            if surface.is_planar {
+            if matches!(surface.shape, Shape::Plane(_)) {
                 return Some(surface);
             }
             other = other.or(Some(surface));
@@ -218,14 +225,88 @@ impl Level {
             DVec3::new(p.z, s.y, p.x),
             DVec3::new(p.y, p.x, s.z),
         );
-        let plane =
-            PlaneSums::from_moments(Vec3::ZERO, sums.count.into(), sums.first.as_dvec3(), second);
-        let plane = plane.fit()?;
-        let [smallest, second, largest] = plane.variances;
+        let count = f64::from(sums.count);
+        let first = sums.first.as_dvec3();
+        let plane = PlaneSums::from_moments(Vec3::ZERO, count, first, second).fit()?;
+        let [smallest, middle_one, largest] = plane.variances;
+        if middle_one <= WIDE * largest {
+            return None;
+        }
+        let mean = first / count;
+        let outer = DMat3::from_cols(mean * mean.x, mean * mean.y, mean * mean.z);
         Some(Surface {
-            center: middle + plane.center.as_dvec3(),
-            normal: plane.normal.as_dvec3(),
-            is_planar: smallest < FLAT * second && second > WIDE * largest,
+            center: middle + mean,
+            shape: match smallest < FLAT * middle_one {
+                true => Shape::Plane(plane.normal.as_dvec3()),
+                false => Shape::Other(second * (1.0 / count) - outer),
+            },
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unpacking_inverts_packing() {
+        for cell in [
+            IVec3::ZERO,
+            IVec3::new(-1, 5, -1_000_000),
+            IVec3::new(1_048_575, -3, 7),
+        ] {
+            assert_eq!(unpack(pack(cell)), cell);
+        }
+    }
+
+    fn tilted_plane() -> (Vec<DVec3>, DVec3) {
+        let normal = DVec3::new(0.2, -0.3, 1.0).normalize();
+        let u = normal.any_orthonormal_vector();
+        let v = normal.cross(u);
+        let origin = DVec3::new(4000.3, -2000.1, 3.3);
+        let points = (-20..20).flat_map(|a| {
+            (-20..20).map(move |b| origin + u * f64::from(a) * 0.2 + v * f64::from(b) * 0.2)
+        });
+        (points.collect(), normal)
+    }
+
+    #[test]
+    fn points_of_a_plane_have_its_normal_also_across_voxels_and_far_from_the_origin() {
+        let (points, normal) = tilted_plane();
+        let mut map = VoxelMap::new(0.5, 50.0);
+        map.insert(&points);
+        for &point in points.iter().skip(800).step_by(37).take(5) {
+            let surface = map.surface(point + normal * 0.1).unwrap();
+            let Shape::Plane(found) = surface.shape else {
+                panic!("{surface:?}");
+            };
+            assert!(found.dot(normal).abs() > 0.9999, "{found}");
+            assert!((surface.center - point).dot(normal).abs() < 1e-3);
+        }
+        assert_eq!(map.surface(points[0] + normal * 50.0), None);
+    }
+
+    #[test]
+    fn a_full_voxel_forgets_and_keeps_its_mean() {
+        let mut cell = Cell::default();
+        for _ in 0..100 {
+            cell.add(Vec3::splat(0.1), 10.0);
+        }
+        for _ in 0..30 {
+            cell.add(Vec3::splat(0.3), 10.0);
+        }
+        assert!((cell.count - 10.0).abs() < 1e-3);
+        assert!((cell.first.x / cell.count - 0.3).abs() < 0.01);
+    }
+
+    #[test]
+    fn distant_voxels_are_removed() {
+        let (points, _) = tilted_plane();
+        let mut map = VoxelMap::new(0.5, 50.0);
+        map.insert(&points);
+        map.remove_beyond(points[0], 1.0);
+        assert!(map.surface(points[0]).is_some() && map.surface(points[1599]).is_none());
+        map.remove_beyond(DVec3::ZERO, 1.0);
+        assert!(map.means().is_empty());
     }
 }
