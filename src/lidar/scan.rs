@@ -59,6 +59,22 @@ impl Scan {
         self.retain(|p| !(p.x > x_min && p.x < x_max && p.y > y_min && p.y < y_max))
     }
 
+    /// Moves the moment of the scan to the middle of its sweep, and rounds times to microseconds, so that the same
+    /// scan of different files has the same times.
+    pub fn center_times(&mut self) {
+        let finite = || self.times_s.iter().copied().filter(|time| time.is_finite());
+        let first_s = finite().fold(f32::INFINITY, f32::min);
+        let last_s = finite().fold(f32::NEG_INFINITY, f32::max);
+        if first_s > last_s {
+            return;
+        }
+        let middle_s = 0.5 * (f64::from(first_s) + f64::from(last_s));
+        for time_s in &mut self.times_s {
+            *time_s = (1e6 * (f64::from(*time_s) - middle_s)).round() as f32 * 1e-6;
+        }
+        self.time_s = self.time_s.map(|time_s| time_s + middle_s);
+    }
+
     fn retain(&mut self, is_kept: impl Fn(&Vec3) -> bool) -> usize {
         let before = self.len();
         let keep: Vec<bool> = self.points.iter().map(is_kept).collect();
@@ -79,6 +95,23 @@ fn retain_flagged<T>(values: &mut Vec<T>, keep: &[bool]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_moment_of_a_scan_is_the_middle_of_its_sweep() {
+        let mut scan = Scan {
+            times_s: vec![0.0, 0.025, 0.1],
+            time_s: Some(5.0),
+            ..Scan::default()
+        };
+        scan.center_times();
+        for (found, expected) in scan.times_s.iter().zip([-0.05, -0.025, 0.05]) {
+            assert!((found - expected).abs() < 1e-6);
+        }
+        assert!((scan.time_s.unwrap() - 5.05).abs() < 1e-6);
+        let centered = scan.clone();
+        scan.center_times();
+        assert_eq!(scan, centered);
+    }
 
     #[test]
     fn invalid_points_are_removed_with_their_intensities() {

@@ -32,7 +32,7 @@ impl SweepMotion {
     /// Time since the last frame [s].
     pub fn duration_s(&self, scan: &Scan) -> f64 {
         let times_s = scan.time_s.zip(self.last_time_s);
-        let since = times_s.map(|(now_s, last_s)| now_s - last_s);
+        let since = times_s.map(|(now_s, last_s)| 1e-6 * (1e6 * (now_s - last_s)).round());
         since.filter(|&s| s > 0.0).unwrap_or(PERIOD_S)
     }
 

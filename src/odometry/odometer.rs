@@ -103,7 +103,7 @@ impl Odometer {
         let (Some(previous_s), Some(time_s)) = (self.time_s, scan.time_s) else {
             return Ok(self.config.period_s);
         };
-        let duration_s = time_s - previous_s;
+        let duration_s = 1e-6 * (1e6 * (time_s - previous_s)).round();
         match duration_s > 0.0 && duration_s.is_finite() {
             true => Ok(duration_s),
             false => Err(OdometryError::TimeNotAscending { previous_s, time_s }),

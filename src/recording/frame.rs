@@ -67,6 +67,18 @@ pub struct Frame {
 }
 
 impl Frame {
+    /// A frame without a pose.
+    pub fn new(number: usize, source: ScanSource, time_s: f64) -> Self {
+        Self {
+            number,
+            source,
+            time_s,
+            map_from_lidar: None,
+            rotation: None,
+            motion: None,
+        }
+    }
+
     /// Reads the scan and deskews it by the motion, if that is known.
     pub fn read(&self) -> Result<Scan, RecordingError> {
         let mut scan = self.source.read()?;
@@ -74,6 +86,7 @@ impl Frame {
         if let (true, Some(rotation)) = (scan.times_s.is_empty(), &self.rotation) {
             scan.times_s = rotation.point_times(&scan.points);
         }
+        scan.center_times();
         if let Some(motion) = &self.motion {
             motion.deskew(&mut scan);
         }

@@ -12,7 +12,7 @@ use super::frame::{Frame, ScanSource};
 use super::layout::{Layout, RecordingFiles};
 use super::oxts::read_timestamps;
 use super::poses::{ascending, read_times};
-use super::scan_list::{self, Selection};
+use super::scan_list::{self, ScanFile, Selection};
 use super::track::PoseTrack;
 use crate::geometry::Pose3;
 use crate::lidar::{Rotation, Scan};
@@ -33,6 +33,8 @@ pub struct Recording {
     pub has_times: bool,
     /// The selected frames, ascending.
     pub frames: Vec<Frame>,
+    /// The frames that are not selected between the first and the last of these, ascending.
+    pub skipped: Vec<Frame>,
     /// The given poses, of which the frames have theirs.
     pub track: Option<PoseTrack>,
     /// The bag and the topic of its scans.
@@ -62,9 +64,7 @@ impl Recording {
         let recorded_s = recorded_times(&files)?;
         let has_times = recorded_s.is_some() || scans[0].time_s.is_some();
         let count = scans.len();
-        let scans = selection.of(scans, |scan| scan.number, path)?;
-        let mut frames = Vec::with_capacity(scans.len());
-        for scan in scans {
+        let frame = |scan: ScanFile| {
             let row = || match &recorded_s {
                 Some(times_s) => times_s.get(scan.number).copied(),
                 None => Some(scan.number as f64 / SCANS_PER_SECOND),
@@ -72,24 +72,20 @@ impl Recording {
             let Some(time_s) = scan.time_s.or_else(row) else {
                 return Err(RecordingError::ScanWithoutTime {
                     scan: scan.path,
-                    times: recorded_s.map_or(0, |times_s| times_s.len()),
+                    times: recorded_s.as_ref().map_or(0, Vec::len),
                 });
             };
-            frames.push(Frame {
-                number: scan.number,
-                source: ScanSource::File(scan.path),
-                time_s,
-                map_from_lidar: None,
-                rotation: None,
-                motion: None,
-            });
-        }
+            Ok(Frame::new(scan.number, ScanSource::File(scan.path), time_s))
+        };
+        let frames: Vec<Frame> = scans.into_iter().map(frame).collect::<Result<_, _>>()?;
+        let (frames, skipped) = selection.of(frames, |frame| frame.number, path)?;
         Ok(Self {
             path: path.to_owned(),
             files,
             scans: count,
             has_times,
             frames,
+            skipped,
             track: None,
             #[cfg(feature = "bags")]
             bag: None,
@@ -109,25 +105,23 @@ impl Recording {
         let times_s = bag.scan_times(&topic)?;
         let moment_s = bag.read_scan(&topic, 0)?.time_s;
         let later_s = moment_s.map_or(0.0, |moment_s| moment_s - times_s[0]);
-        let frames = times_s.iter().enumerate();
-        let frames = frames.map(|(index, time_s)| Frame {
-            number: index,
-            source: ScanSource::Message {
+        let frame = |(index, time_s): (usize, &f64)| {
+            let source = ScanSource::Message {
                 bag: bag.clone(),
                 topic: topic.clone(),
                 index,
-            },
-            time_s: time_s + later_s,
-            map_from_lidar: None,
-            rotation: None,
-            motion: None,
-        });
+            };
+            Frame::new(index, source, time_s + later_s)
+        };
+        let frames = times_s.iter().enumerate().map(frame).collect();
+        let (frames, skipped) = selection.of(frames, |frame: &Frame| frame.number, path)?;
         Ok(Self {
             path: path.to_owned(),
             files: RecordingFiles::bag(path),
             scans: times_s.len(),
             has_times: true,
-            frames: selection.of(frames.collect(), |frame| frame.number, path)?,
+            frames,
+            skipped,
             track: None,
             bag: Some((bag, topic)),
         })
@@ -159,7 +153,7 @@ impl Recording {
         if !self.has_times
             && let Some(times_s) = &track.times_s
         {
-            for frame in &mut self.frames {
+            for frame in self.frames.iter_mut().chain(&mut self.skipped) {
                 frame.time_s = times_s.get(frame.number).copied().unwrap_or(frame.time_s);
             }
         }
@@ -181,7 +175,7 @@ impl Recording {
     /// The same recording, whose points have times from the rotation of the sensor where the data have none.
     #[must_use]
     pub fn rotating(mut self, rotation: Option<Rotation>) -> Self {
-        for frame in &mut self.frames {
+        for frame in self.frames.iter_mut().chain(&mut self.skipped) {
             frame.rotation = rotation;
         }
         self

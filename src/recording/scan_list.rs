@@ -56,13 +56,13 @@ pub struct ScanFile {
 }
 
 impl Selection {
-    /// The selected ones of all frames of a recording.
+    /// The selected ones of all frames of a recording, and the others between them.
     pub fn of<T>(
         &self,
         frames: Vec<T>,
         number: impl Fn(&T) -> usize,
         path: &Path,
-    ) -> Result<Vec<T>, RecordingError> {
+    ) -> Result<(Vec<T>, Vec<T>), RecordingError> {
         let scans = frames.len();
         let window = usize::try_from(self.n_scans).unwrap_or(usize::MAX);
         let window_end = self.start_idx.saturating_add(window);
@@ -70,8 +70,11 @@ impl Selection {
             let in_window = (self.start_idx..window_end).contains(&number(frame));
             in_window && (number(frame) - self.start_idx).is_multiple_of(self.frame_step)
         };
-        let selected: Vec<T> = frames.into_iter().filter(is_selected).collect();
-        if selected.is_empty() {
+        let (selected, mut skipped): (Vec<T>, Vec<T>) = frames.into_iter().partition(is_selected);
+        let [first, .., last] = selected.as_slice() else {
+            if selected.len() == 1 {
+                return Ok((selected, Vec::new()));
+            }
             return Err(RecordingError::NothingSelected {
                 path: path.to_owned(),
                 start_idx: self.start_idx,
@@ -79,8 +82,10 @@ impl Selection {
                 frame_step: self.frame_step,
                 scans,
             });
-        }
-        Ok(selected)
+        };
+        let between = number(first)..number(last);
+        skipped.retain(|frame| between.contains(&number(frame)));
+        Ok((selected, skipped))
     }
 }
 
@@ -114,7 +119,7 @@ pub fn selected_scans(
     folder: &Path,
     selection: &Selection,
 ) -> Result<Vec<ScanFile>, RecordingError> {
-    selection.of(scan_files(folder)?, |scan| scan.number, folder)
+    Ok((selection.of(scan_files(folder)?, |scan| scan.number, folder)?).0)
 }
 
 /// The time in a name such as `1317384506.4.pcd`, or `1317384506400000000.bin` in nanoseconds [s]: since

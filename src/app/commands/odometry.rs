@@ -1,5 +1,6 @@
 //! Source of the motion between frames, and its description in reports.
 
+use std::collections::VecDeque;
 use std::path::Path;
 
 use anyhow::Result;
@@ -12,14 +13,14 @@ use crate::lidar::Scan;
 use crate::localization::odometry::{demonstration_noise, increments, with_noise};
 use crate::odometry::{Odometer, OdometryConfig};
 use crate::recording::layout::Layout;
-use crate::recording::{PoseTrack, Recording};
+use crate::recording::{Frame, PoseTrack, Recording};
 
 /// The motion `previous_from_current` into each frame.
 pub enum MotionSource {
     /// Known for all frames.
     Given(Vec<Pose2>),
-    /// From the scans themselves.
-    Scans(Box<Odometer>),
+    /// From the scans themselves, also from those between the selected ones.
+    Scans(Box<ScanOdometry>),
     /// Not known.
     Unknown,
 }
@@ -44,7 +45,7 @@ impl MotionSource {
                     Ok(track) => Self::of_track(&track, recording)?,
                     Err(error) => {
                         tracing::info!("odometry from the scans: {error}");
-                        Self::of_scans()?
+                        Self::of_scans(recording)?
                     }
                 }
             }
@@ -56,14 +57,23 @@ impl MotionSource {
                 let increments = increments(&poses.collect::<Vec<_>>());
                 Self::Given(with_noise(&increments, &demonstration_noise(), rng))
             }
-            _ => Self::of_scans()?,
+            _ => Self::of_scans(recording)?,
         })
     }
 
-    fn of_scans() -> Result<Self> {
-        Ok(Self::Scans(Box::new(Odometer::new(
-            OdometryConfig::default(),
-        )?)))
+    fn of_scans(recording: &Recording) -> Result<Self> {
+        /// Larger steps are not bridged by the scans between.
+        const MAX_STEP: usize = 10;
+        let steps = recording.frames.windows(2);
+        let largest = steps.map(|pair| pair[1].number - pair[0].number).max();
+        let skipped = match largest.is_some_and(|step| step <= MAX_STEP) {
+            true => recording.skipped.clone(),
+            false => Vec::new(),
+        };
+        Ok(Self::Scans(Box::new(ScanOdometry {
+            odometer: Odometer::new(OdometryConfig::default())?,
+            skipped: skipped.into(),
+        })))
     }
 
     fn of_track(track: &PoseTrack, recording: &Recording) -> Result<Self> {
@@ -77,14 +87,32 @@ impl MotionSource {
     }
 
     /// The motion into a frame by its row and scan; every scan has to be given, in order.
-    pub fn into_frame(&mut self, row: usize, scan: &Scan) -> Result<Option<Pose2>> {
+    pub fn into_frame(&mut self, row: usize, frame: &Frame, scan: &Scan) -> Result<Option<Pose2>> {
         Ok(match self {
             Self::Given(increments) => increments.get(row).copied(),
-            Self::Scans(odometer) => Some(pose2_from_pose3(
-                &odometer.step(scan)?.previous_from_current,
-            )),
+            Self::Scans(odometry) => Some(odometry.into_frame(frame, scan)?),
             Self::Unknown => None,
         })
+    }
+}
+
+/// Odometry of the scans.
+pub struct ScanOdometry {
+    odometer: Odometer,
+    /// The scans between the selected ones that were not registered yet.
+    skipped: VecDeque<Frame>,
+}
+
+impl ScanOdometry {
+    fn into_frame(&mut self, frame: &Frame, scan: &Scan) -> Result<Pose2> {
+        let mut motion = Pose3::identity();
+        while (self.skipped.front()).is_some_and(|between| between.number < frame.number) {
+            if let Some(between) = self.skipped.pop_front() {
+                motion *= self.odometer.step(&between.read()?)?.previous_from_current;
+            }
+        }
+        motion *= self.odometer.step(scan)?.previous_from_current;
+        Ok(pose2_from_pose3(&motion))
     }
 }
 

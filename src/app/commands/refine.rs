@@ -267,8 +267,8 @@ fn increments(
     )?;
     let frames = sequence.frames.iter().enumerate();
     let into_frame = |(row, frame): (usize, &Frame)| match &mut motion {
-        MotionSource::Scans(_) => motion.into_frame(row, &frame.read()?),
-        _ => motion.into_frame(row, &Scan::default()),
+        MotionSource::Scans(_) => motion.into_frame(row, frame, &frame.read()?),
+        _ => motion.into_frame(row, frame, &Scan::default()),
     };
     frames.map(into_frame).collect()
 }

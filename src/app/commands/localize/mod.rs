@@ -169,7 +169,7 @@ fn localize<'a>(
         let mut process = || {
             let scan = frame.read()?;
             let started = Instant::now();
-            let increment = motion.into_frame(row, &scan)?;
+            let increment = motion.into_frame(row, frame, &scan)?;
             let odometry = odometry_into(config.motion_model, increment, sequence, row);
             let estimate = localizer.step(&scan, odometry)?;
             let runtime = started.elapsed();
