@@ -115,9 +115,12 @@ impl Sweep {
         } else {
             (0.0, 0.0)
         };
+        // Powers of two and their multiples, so that the intervals do not depend on rounding of the first and last time.
+        let least_s = ((last_s - first_s) / (Self::INTERVALS - 1) as f32).max(1e-9);
+        let interval_s = least_s.log2().ceil().exp2();
         Self {
-            first_s,
-            interval_s: ((last_s - first_s) / Self::INTERVALS as f32).max(f32::MIN_POSITIVE),
+            first_s: (first_s / interval_s).floor() * interval_s,
+            interval_s,
         }
     }
 
