@@ -111,7 +111,8 @@ fn a_drive_is_localized_in_a_mesh_of_any_format_without_colors_and_path() {
     let maps = names.map(|name| Map::load(&folder.join(name), &options).unwrap());
     for map in &maps {
         assert_eq!(map.tiles, maps[0].tiles);
-        assert_eq!(map.ground, maps[0].ground);
+        // Cells without ground are not numbers, which are not equal.
+        assert_eq!(format!("{:?}", map.ground), format!("{:?}", maps[0].ground));
         for pose in &truth {
             let planar = pose2_from_pose3(&pose.map_from_lidar);
             let patch = map.ground.patch_under(&planar, None).unwrap();

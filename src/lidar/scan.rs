@@ -47,6 +47,21 @@ impl Scan {
         self.points.is_empty()
     }
 
+    /// Every n-th of its points.
+    #[must_use]
+    pub fn every(&self, n: usize) -> Self {
+        fn pick<T: Copy>(values: &[T], n: usize) -> Vec<T> {
+            values.iter().step_by(n).copied().collect()
+        }
+        Self {
+            points: pick(&self.points, n),
+            intensities: pick(&self.intensities, n),
+            times_s: pick(&self.times_s, n),
+            rings: pick(&self.rings, n),
+            time_s: self.time_s,
+        }
+    }
+
     /// Removes points that are not finite or outside the range limits of the model; returns their
     /// number.
     pub fn drop_invalid(&mut self, model: &LidarModel) -> usize {

@@ -35,12 +35,11 @@ pub struct LocalizerConfig {
     pub motion: OdometryNoise,
     /// Noise of velocity commands.
     pub velocity: VelocityNoise,
-    /// Noise of the constant-velocity prediction without odometry.
-    #[default(OdometryNoise { turn_rad: 0.02, drive_m: 0.2, side_m: 0.03, })]
+    /// Noise of the constant-velocity prediction without odometry over a tenth of a second, in proportion to the time.
+    #[default(OdometryNoise::constant(0.02, 0.2, 0.03))]
     pub constant_velocity: OdometryNoise,
-    /// Noise of the prediction without odometry while the velocity is unknown: up to 100 km/h at ten
-    /// frames a second within two standard deviations.
-    #[default(OdometryNoise { turn_rad: 0.03, drive_m: 1.4, side_m: 0.05, })]
+    /// The same while the velocity is unknown: up to 100 km/h within two standard deviations.
+    #[default(OdometryNoise::constant(0.03, 1.4, 0.05))]
     pub unknown_velocity: OdometryNoise,
     /// Observation model.
     pub observation: ObservationConfig,

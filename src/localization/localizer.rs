@@ -10,9 +10,9 @@ use super::sensor::Sensor;
 use super::sweep::SweepMotion;
 use super::tracking_loss::State;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
-use crate::lidar::{RangeImage, Scan};
+use crate::lidar::{Motion, RangeImage, Scan};
 use crate::map::{Map, PanoramaRequest, SearchRegion, SensorAttitude};
-use crate::random::stream;
+use crate::random::{Generator, stream};
 use crate::rendering::RenderError;
 use crate::validation::{InvalidValue, Validate as _, nested};
 
@@ -116,8 +116,10 @@ impl Localizer {
             return Err(LocalizerError::ImpossibleOdometry(odometry));
         }
         let duration_s = self.sweep.duration_s(scan);
-        let mut motion = self.sweep.predict(odometry, duration_s);
-        let mut image = self.sensor.range_image(scan, motion.as_ref());
+        let mut rng = stream(self.seed, FIRST_FRAME_STREAM + self.frames);
+        self.frames += 1;
+        let motion = self.motion_during(scan, odometry, duration_s, &mut rng)?;
+        let image = self.sensor.range_image(scan, motion.as_ref());
         let known = self.filter.as_ref().and_then(ParticleFilter::attitude);
         if let Some(attitude) = known.or_else(|| self.sensor.attitude(&image)) {
             self.attitude = attitude;
@@ -126,22 +128,39 @@ impl Localizer {
             Some(filter) => filter,
             None => self.initialize(&image)?,
         };
-        let mut rng = stream(self.seed, FIRST_FRAME_STREAM + self.frames);
-        self.frames += 1;
         let filter = self.filter.insert(filter);
-        if !scan.times_s.is_empty()
-            && let Some(pose) = filter.registered(odometry, &image, &self.attitude, &mut rng)?
-            && let Some(found) = self.sweep.around(&pose, duration_s)
-        {
-            image = self.sensor.range_image(scan, Some(&found));
-            motion = Some(found);
-        }
+        filter.set_duration_s(duration_s);
         let mut estimate = filter.step(odometry, &image, &self.attitude, &mut rng)?;
         let pose = Some(estimate.map_from_lidar).filter(|_| estimate.state == State::Tracking);
         let found = pose.and_then(|pose| self.sweep.around(&pose, duration_s));
         self.sweep.update(pose, scan, duration_s);
         estimate.motion = found.or(motion);
         Ok(estimate)
+    }
+
+    /// Motion of the sensor during a sweep: while tracking, from a registration of some of its points; otherwise the
+    /// predicted one. `None` if it is unknown.
+    fn motion_during(
+        &self,
+        scan: &Scan,
+        odometry: Odometry,
+        duration_s: f64,
+        rng: &mut Generator,
+    ) -> Result<Option<Motion>, LocalizerError> {
+        /// Every n-th point is registered; beams are not numbered in multiples of it.
+        const STEP: usize = 3;
+        let predicted = self.sweep.predict(odometry, duration_s);
+        let Some(filter) = self.filter.as_ref().filter(|_| !scan.times_s.is_empty()) else {
+            return Ok(predicted);
+        };
+        let Some(attitude) = filter.attitude() else {
+            return Ok(predicted);
+        };
+        let some = scan.every(STEP);
+        let image = self.sensor.range_image(&some, predicted.as_ref());
+        let pose = filter.registered(odometry, &image, &attitude, rng)?;
+        let found = pose.and_then(|pose| self.sweep.around(&pose, duration_s));
+        Ok(found.or(predicted))
     }
 
     /// The filter with its initial particles.

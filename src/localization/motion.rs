@@ -8,9 +8,10 @@
 //! T_map_current = T_map_previous · Rot(δ̂₁) · Trans(d̂, ŝ) · Rot(δ̂₂)
 //! ```
 //!
-//! Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), table 5.6, with noise that does not grow
+//! Thrun, Burgard and Fox, *Probabilistic Robotics* (2005), table 5.6, with noise that hardly grows
 //! with the motion, as in range-mcl (Chen et al., ICRA 2021), and with lateral noise, because for
-//! short steps the noise of the turns hardly moves a particle sideways. A vehicle that reports its
+//! short steps the noise of the turns hardly moves a particle sideways. Long steps, as of two scans a
+//! second, add noise in proportion to the distance, σ² = σ_step² + (σ_metre d)². A vehicle that reports its
 //! speeds (v, ω) over a duration Δt instead drives an arc (table 5.3):
 //!
 //! ```text
@@ -31,9 +32,10 @@ use smart_default::SmartDefault;
 use crate::geometry::Pose2;
 use crate::validation::{InvalidValue, Validate, not_negative};
 
-/// Standard deviations of the odometry noise, per increment.
+/// Standard deviations of the odometry noise, per increment and per metre of it.
 ///
-/// Defaults: the values of range-mcl, and twice the lateral error of a good odometry, 1 cm.
+/// Defaults: the values of range-mcl, twice the lateral error of a good odometry, 1 cm, and per metre those
+/// of a poor one.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct OdometryNoise {
@@ -46,17 +48,64 @@ pub struct OdometryNoise {
     /// Standard deviation of the lateral motion, from slip and visual odometry [m].
     #[default(0.02)]
     pub side_m: f64,
+    /// Further standard deviation of each turn per metre [rad/m].
+    #[default(0.002)]
+    pub turn_rad_per_m: f64,
+    /// Further standard deviation of the distance per metre (unitless).
+    #[default(0.02)]
+    pub drive_per_m: f64,
+    /// Further standard deviation of the lateral motion per metre (unitless).
+    #[default(0.01)]
+    pub side_per_m: f64,
 }
 
 impl Validate for OdometryNoise {
     fn validate(&self) -> Result<(), InvalidValue> {
         not_negative("turn_rad", self.turn_rad)?;
         not_negative("drive_m", self.drive_m)?;
-        not_negative("side_m", self.side_m)
+        not_negative("side_m", self.side_m)?;
+        not_negative("turn_rad_per_m", self.turn_rad_per_m)?;
+        not_negative("drive_per_m", self.drive_per_m)?;
+        not_negative("side_per_m", self.side_per_m)
     }
 }
 
 impl OdometryNoise {
+    /// The same noise for every length of the motion.
+    pub fn constant(turn_rad: f64, drive_m: f64, side_m: f64) -> Self {
+        Self {
+            turn_rad,
+            drive_m,
+            side_m,
+            turn_rad_per_m: 0.0,
+            drive_per_m: 0.0,
+            side_per_m: 0.0,
+        }
+    }
+
+    /// The noise with all standard deviations multiplied.
+    #[must_use]
+    pub fn scaled(&self, factor: f64) -> Self {
+        Self {
+            turn_rad: factor * self.turn_rad,
+            drive_m: factor * self.drive_m,
+            side_m: factor * self.side_m,
+            turn_rad_per_m: factor * self.turn_rad_per_m,
+            drive_per_m: factor * self.drive_per_m,
+            side_per_m: factor * self.side_per_m,
+        }
+    }
+
+    /// Standard deviations of turn, drive and lateral motion of a motion.
+    fn of(&self, motion: &TurnDriveTurn) -> [f64; 3] {
+        let distance_m = motion.drive_m.abs();
+        [
+            self.turn_rad.hypot(self.turn_rad_per_m * distance_m),
+            self.drive_m.hypot(self.drive_per_m * distance_m),
+            self.side_m.hypot(self.side_per_m * distance_m),
+        ]
+    }
+
     /// Covariance of (x, y, heading) of a motion in the axes of the car before it [m², m·rad, rad²],
     /// to first order in the turns.
     pub fn covariance(&self, motion: &TurnDriveTurn) -> Matrix3<f64> {
@@ -67,7 +116,8 @@ impl OdometryNoise {
             Vector3::new(-sin, cos, 0.0),
             Vector3::z(),
         ]);
-        let sigmas = Vector4::new(self.turn_rad, self.drive_m, self.side_m, self.turn_rad);
+        let [turn_rad, drive_m, side_m] = self.of(motion);
+        let sigmas = Vector4::new(turn_rad, drive_m, side_m, turn_rad);
         propagated_covariance(&jacobian, &sigmas)
     }
 }
@@ -100,10 +150,11 @@ impl TurnDriveTurn {
     pub fn sample(&self, noise: &OdometryNoise, rng: &mut impl Rng) -> Pose2 {
         let mut normal =
             |mean: f64, sigma: f64| mean + sigma * rng.sample::<f64, _>(StandardNormal);
-        let first_turn_rad = normal(self.first_turn_rad, noise.turn_rad);
-        let drive_m = normal(self.drive_m, noise.drive_m);
-        let second_turn_rad = normal(self.second_turn_rad, noise.turn_rad);
-        let side_m = normal(0.0, noise.side_m);
+        let [turn_sigma_rad, drive_sigma_m, side_sigma_m] = noise.of(self);
+        let first_turn_rad = normal(self.first_turn_rad, turn_sigma_rad);
+        let drive_m = normal(self.drive_m, drive_sigma_m);
+        let second_turn_rad = normal(self.second_turn_rad, turn_sigma_rad);
+        let side_m = normal(0.0, side_sigma_m);
         Pose2::rotation(first_turn_rad)
             * Pose2::translation(drive_m, side_m)
             * Pose2::rotation(second_turn_rad)

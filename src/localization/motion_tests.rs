@@ -10,11 +10,7 @@ use super::*;
 
 /// The increment of turn, drive, turn without noise.
 fn compose(motion: &TurnDriveTurn) -> Pose2 {
-    let zero = OdometryNoise {
-        turn_rad: 0.0,
-        drive_m: 0.0,
-        side_m: 0.0,
-    };
+    let zero = OdometryNoise::constant(0.0, 0.0, 0.0);
     motion.sample(&zero, &mut StdRng::seed_from_u64(0))
 }
 
@@ -43,11 +39,7 @@ fn samples_have_the_configured_spread() {
         drive_m: 1.0,
         second_turn_rad: -0.1,
     };
-    let noise = OdometryNoise {
-        turn_rad: 0.02,
-        drive_m: 0.2,
-        side_m: 0.1,
-    };
+    let noise = OdometryNoise::constant(0.02, 0.2, 0.1);
     let mut rng = StdRng::seed_from_u64(7);
     let n = 20_000.0_f64;
     let noiseless = compose(&odometry);
@@ -187,4 +179,24 @@ fn a_mistyped_key_is_an_error() {
     let result: Result<OdometryNoise, _> = serde_yaml::from_str("turn_red: 0.02\n");
     let message = result.unwrap_err().to_string();
     assert!(message.contains("turn_red"), "{message}");
+}
+
+#[test]
+fn noise_per_metre_adds_to_the_variance_in_proportion_to_the_squared_distance() {
+    let noise = OdometryNoise {
+        drive_per_m: 0.1,
+        ..OdometryNoise::constant(0.0, 0.3, 0.0)
+    };
+    let variance = |drive_m: f64| {
+        let straight = TurnDriveTurn {
+            first_turn_rad: 0.0,
+            drive_m,
+            second_turn_rad: 0.0,
+        };
+        noise.covariance(&straight)[(0, 0)]
+    };
+    assert_relative_eq!(variance(0.0), 0.09, epsilon = 1e-12);
+    assert_relative_eq!(variance(4.0), 0.09 + 0.16, epsilon = 1e-12);
+    assert_relative_eq!(variance(-4.0), variance(4.0), epsilon = 1e-12);
+    assert_eq!(noise.scaled(2.0).drive_m, 0.6);
 }

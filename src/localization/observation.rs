@@ -152,8 +152,9 @@ pub fn choose_beams(
     let largest = (road_share * count as f64).round() as usize;
     let proportional = count * road.len() / (road.len() + rest.len()).max(1);
     let of_road = proportional.min(largest);
-    let mut chosen = evenly_spread(&road, of_road, rng);
-    chosen.extend(evenly_spread(&rest, count - of_road, rng));
+    let width = image.model.width;
+    let mut chosen = evenly_spread(&road, of_road, width, rng);
+    chosen.extend(evenly_spread(&rest, count - of_road, width, rng));
     chosen.sort_unstable();
     chosen
         .into_iter()
@@ -161,16 +162,20 @@ pub fn choose_beams(
         .collect()
 }
 
-/// Samples about `count` members of an ascending list of pixels, evenly spread; the whole list if it is shorter.
+/// Samples about `count` members of a list of pixels, evenly spread over the rows; the whole list if it is shorter.
 ///
-/// A pixel i is chosen if frac(i φ + u) is less than the share of the list that is wanted, with the golden ratio φ, whose
-/// multiples are spread most evenly. Whether a pixel is chosen hardly depends on the others, so that almost equal
-/// scans give almost equal samples.
-fn evenly_spread(list: &[usize], count: usize, rng: &mut impl Rng) -> Vec<usize> {
+/// The pixel of a column c is chosen if frac(c φ + u) is less than the share of the list that is wanted, with the golden
+/// ratio φ, whose multiples are spread most evenly, and a random u for each row. Whether a pixel is chosen
+/// hardly depends on the others, so that almost equal scans give almost equal samples.
+fn evenly_spread(list: &[usize], count: usize, width: usize, rng: &mut impl Rng) -> Vec<usize> {
     const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
-    let offset: f64 = rng.random();
     let share = count as f64 / list.len().max(1) as f64;
-    let is_chosen = |&pixel: &usize| (pixel as f64 * GOLDEN_RATIO + offset).fract() < share;
+    let rows = list.last().map_or(0, |last| last / width + 1);
+    let offsets: Vec<f64> = (0..rows).map(|_| rng.random()).collect();
+    let is_chosen = |&pixel: &usize| {
+        let (row, column) = (pixel / width, pixel % width);
+        (column as f64 * GOLDEN_RATIO + offsets[row]).fract() < share
+    };
     list.iter().copied().filter(is_chosen).collect()
 }
 

@@ -60,11 +60,7 @@ pub fn with_noise(increments: &[Pose2], noise: &OdometryNoise, rng: &mut impl Rn
 
 /// Noise that range-mcl adds to the true increments: 0.01 rad, 0.01 m, none laterally.
 pub fn demonstration_noise() -> OdometryNoise {
-    OdometryNoise {
-        turn_rad: 0.01,
-        drive_m: 0.01,
-        side_m: 0.0,
-    }
+    OdometryNoise::constant(0.01, 0.01, 0.0)
 }
 
 #[cfg(test)]
@@ -115,11 +111,7 @@ mod tests {
     fn zero_noise_changes_nothing_and_the_first_increment_has_no_noise() {
         let increments = increments(&drive());
         let mut rng = StdRng::seed_from_u64(1);
-        let zero = OdometryNoise {
-            turn_rad: 0.0,
-            drive_m: 0.0,
-            side_m: 0.0,
-        };
+        let zero = OdometryNoise::constant(0.0, 0.0, 0.0);
         for (a, b) in with_noise(&increments, &zero, &mut rng)
             .iter()
             .zip(&increments)

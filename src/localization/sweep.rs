@@ -10,12 +10,10 @@
 //! The pose of this frame is found first with the scan deskewed by m', then again with v. Odometry is used
 //! until there are two frames in a row in which the filter was tracking.
 
+use super::filter::PERIOD_S;
 use super::odometry::Odometry;
 use crate::geometry::{Pose3, pose3_from_pose2};
 use crate::lidar::{Motion, Scan, interpolate_motion};
-
-/// Time between scans whose times are unknown [s].
-const PERIOD_S: f64 = 0.1;
 
 /// The motion of the sensor, updated frame by frame.
 #[derive(Clone, Debug, Default)]

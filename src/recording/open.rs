@@ -322,11 +322,15 @@ mod tests {
 
     #[test]
     fn a_selected_scan_without_a_pose_is_an_error() {
-        let folder = recording(&["000000.bin", "000001.bin"], 1);
+        let folder = recording(&["000000.bin", "000001.bin", "000002.bin"], 1);
         let message = open(folder.path(), &Selection::default())
             .unwrap_err()
             .to_string();
         assert!(message.contains("000001.bin has no pose"), "{message}");
+        // One at the end is left out.
+        let row = "1 0 0 0 0 1 0 0 0 0 1 0\n";
+        fs::write(folder.path().join("poses.txt"), row.repeat(2)).unwrap();
+        assert_eq!(numbers(&open(folder.path(), &Selection::default()).unwrap()), [0, 1]);
         let first = Selection {
             n_scans: 1,
             ..Selection::default()
@@ -344,6 +348,6 @@ mod tests {
         let message = open(folder.path(), &Selection::default())
             .unwrap_err()
             .to_string();
-        assert!(message.contains("1 times for 2 poses"), "{message}");
+        assert!(message.contains("000001.bin has no time"), "{message}");
     }
 }

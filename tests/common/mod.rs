@@ -144,7 +144,7 @@ odometry_file: street/drive_2/odometry.txt
 pub const COMPARISON_OF_STREET: &str = "\
 base:
   build_map: {depth: 6, voxel_size: 0.2, displacement_threshold_m: 0, simplify_resolution: 0.5}
-  localization: {numParticles: 50, num_reduced: 20, pose_tracking: True, odometry: ground_truth}
+  localization: {numParticles: 50, num_reduced: 20}
   refinement: {refinement: {method: swarm, swarm: {iterations: 3}}}
 sequences:
 - name: street
@@ -157,6 +157,8 @@ sequences:
     scan_folder: velodyne
     pose_file: poses.txt
     calib_file: calib.txt
+    pose_tracking: True
+    odometry: ground_truth
     range_image: {height: 32, width: 360, min_range: 1}
 ";
 

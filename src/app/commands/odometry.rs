@@ -37,6 +37,7 @@ impl MotionSource {
         Ok(match (source, file) {
             (OdometrySource::None, _) => Self::Unknown,
             (OdometrySource::File | OdometrySource::Auto, Some(file)) => {
+                inputs.require_poses("odometry_file", file)?;
                 Self::of_track(&inputs.track(file, recording)?, recording)?
             }
             // A bag may have a topic of odometry.

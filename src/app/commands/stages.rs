@@ -9,7 +9,7 @@ use crate::app::config::{MotionCompensation, RangeImageConfig, body_from_lidar};
 use crate::lidar::{LidarModel, Scan};
 use crate::map::scan_cloud::ScanConfig;
 use crate::map::{Map, MapOptions, MappingPath, mesh_file};
-use crate::odometry::{OdometryConfig, compare_timings};
+use crate::odometry::{OdometryConfig, TimingComparison, compare_timings};
 use crate::recording::{PoseTrack, Recording, Selection};
 use crate::sensor::{self, DroppedPoints, SensorDescription};
 
@@ -29,15 +29,21 @@ pub struct RecordingInputs<'a> {
 impl<'a> RecordingInputs<'a> {
     /// Checks that the files exist, before any work is done.
     pub fn require(&self) -> Result<()> {
-        let is_bag = is_bag(self.scan_folder);
-        if !is_bag {
+        if !is_bag(self.scan_folder) {
             input::require_folder("scan_folder", self.scan_folder)?;
         }
-        let is_file = |path: &&Path| !path.is_dir() && !(is_bag && is_topic(path));
-        if let Some(path) = self.pose_file.filter(is_file) {
-            input::require_file("pose_file", path)?;
+        if let Some(path) = self.pose_file {
+            self.require_poses("pose_file", path)?;
         }
         input::require_optional_file("calib_file", self.calib_file)
+    }
+
+    /// Requires a file of poses, a folder `oxts`, or a topic if the recording is a bag.
+    pub fn require_poses(&self, key: &str, path: &Path) -> Result<()> {
+        if path.is_dir() || (is_bag(self.scan_folder) && is_topic(path)) {
+            return Ok(());
+        }
+        input::require_file(key, path)
     }
 
     /// The files and their keys.
@@ -184,10 +190,14 @@ impl SensorKeys<'_> {
         } == is_given
             && self.own_car_m.is_some();
         let is_auto = *self.motion_compensation == Some(MotionCompensation::Auto);
+        if let (Some(configured), false) = (*self.motion_compensation, is_auto) {
+            warn_of_contradiction(&recording, configured)?;
+        }
         if is_complete && !is_auto {
+            let period_s = period_s(&recording);
             let rotation = self
                 .motion_compensation
-                .and_then(|it| it.rotation(PERIOD_S));
+                .and_then(|it| it.rotation(period_s));
             return Ok((recording.rotating(rotation), None));
         }
         let scans = sample(&recording)?;
@@ -231,8 +241,56 @@ fn period_s(recording: &Recording) -> f64 {
     }
 }
 
+/// Choices of the times of points, with their names.
+const TIMINGS: [(Option<MotionCompensation>, &str); 3] = [
+    (None, "compensated already"),
+    (Some(MotionCompensation::Clockwise), "clockwise"),
+    (
+        Some(MotionCompensation::CounterClockwise),
+        "counter-clockwise",
+    ),
+];
+
 /// The rotation that makes consecutive scans fit best; `None` if they fit best as they are, or if nothing shows it.
 fn fitting_rotation(recording: &Recording) -> Result<Option<MotionCompensation>> {
+    let Some(compared) = compared_timings(recording)? else {
+        return Ok(None);
+    };
+    let name = (compared.best).map_or("undecided, none", |best| TIMINGS[best].1);
+    tracing::info!(
+        "motion compensation: {name}; distances between scans: {}",
+        residuals_in_words(&compared)
+    );
+    Ok(TIMINGS[compared.best.unwrap_or(0)].0)
+}
+
+/// Warns if another rotation than the configured one makes consecutive scans fit best.
+fn warn_of_contradiction(recording: &Recording, configured: MotionCompensation) -> Result<()> {
+    let Some(compared) = compared_timings(recording)? else {
+        return Ok(());
+    };
+    if let Some((choice, name)) = compared.best.map(|best| TIMINGS[best])
+        && choice != Some(configured)
+    {
+        tracing::warn!(
+            "the scans fit best as {name}, not as motion_compensation says; distances between scans: {}",
+            residuals_in_words(&compared)
+        );
+    }
+    Ok(())
+}
+
+fn residuals_in_words(compared: &TimingComparison) -> String {
+    let residuals = compared.residuals_m.iter().zip(TIMINGS);
+    let words: Vec<String> = residuals
+        .map(|((_, m), (_, name))| format!("{name} {:.1} mm", 1e3 * m))
+        .collect();
+    words.join(", ")
+}
+
+/// Compares the times of points by the distances between consecutive scans; `None` if the data have times, or if
+/// the scans are too few or too far apart.
+fn compared_timings(recording: &Recording) -> Result<Option<TimingComparison>> {
     /// Number of scans, from the middle of the recording.
     const SCANS: usize = 16;
     /// Longest time between scans in which a sensor moves evenly [s].
@@ -248,28 +306,16 @@ fn fitting_rotation(recording: &Recording) -> Result<Option<MotionCompensation>>
         .iter()
         .map(|frame| frame.read())
         .collect::<Result<_, _>>()?;
+    if scans.iter().any(|scan| !scan.times_s.is_empty()) {
+        return Ok(None);
+    }
     let period_s = period_s(recording);
-    let choices = [
-        (None, "compensated already"),
-        (Some(MotionCompensation::Clockwise), "clockwise"),
-        (
-            Some(MotionCompensation::CounterClockwise),
-            "counter-clockwise",
-        ),
-    ];
-    let candidates = choices.map(|(choice, _)| choice.and_then(|it| it.rotation(period_s)));
-    let compared = compare_timings(&scans, &candidates, &OdometryConfig::default())?;
-    let residuals = compared.residuals_m.iter().zip(choices);
-    let residuals = residuals.map(|((_, m), (_, name))| format!("{name} {:.1} mm", 1e3 * m));
-    let residuals: Vec<String> = residuals.collect();
-    tracing::info!(
-        "motion compensation: {}; distances between scans: {}",
-        compared
-            .best
-            .map_or("undecided, none", |best| choices[best].1),
-        residuals.join(", ")
-    );
-    Ok(choices[compared.best.unwrap_or(0)].0)
+    let candidates = TIMINGS.map(|(choice, _)| choice.and_then(|it| it.rotation(period_s)));
+    Ok(Some(compare_timings(
+        &scans,
+        &candidates,
+        &OdometryConfig::default(),
+    )?))
 }
 
 /// Duration of a revolution where nothing shows it [s].

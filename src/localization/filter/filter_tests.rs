@@ -32,11 +32,7 @@ fn odometry(truth: &[Pose2], seed: u64) -> Vec<Pose2> {
         .iter()
         .map(|pose| crate::geometry::pose3_from_pose2(pose, 0.0))
         .collect();
-    let noise = OdometryNoise {
-        turn_rad: 0.002,
-        drive_m: 0.01,
-        side_m: 0.0,
-    };
+    let noise = OdometryNoise::constant(0.002, 0.01, 0.0);
     with_noise(
         &increments(&poses),
         &noise,

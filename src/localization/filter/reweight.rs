@@ -95,6 +95,7 @@ impl ParticleFilter {
         // A jump of a wide distribution is not a motion of the car.
         if self.is_narrow && is_narrow {
             self.last_increment = Some(self.estimate.inverse() * estimate.pose);
+            self.last_duration_s = self.duration_s;
         }
         self.is_narrow = is_narrow;
         self.estimate = estimate.pose;

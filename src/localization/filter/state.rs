@@ -12,6 +12,10 @@ use crate::localization::particles::ParticleSet;
 use crate::localization::tracking_loss::{AgreementMonitor, State};
 use crate::map::{GroundPatch, Map, PanoramaRequest, SensorAttitude};
 
+/// Time between frames for which the noise without odometry is given, and which is assumed where times are
+/// unknown [s].
+pub const PERIOD_S: f64 = 0.1;
+
 /// A distribution over planar poses, `map_from_lidar`, updated frame by frame.
 pub struct ParticleFilter {
     pub(super) config: LocalizerConfig,
@@ -32,6 +36,10 @@ pub struct ParticleFilter {
     pub(super) is_narrow: bool,
     /// Motion into it, for frames without odometry; `None` while unknown.
     pub(super) last_increment: Option<Pose2>,
+    /// Duration of that motion [s].
+    pub(super) last_duration_s: f64,
+    /// Time since the previous frame [s].
+    pub(super) duration_s: f64,
     /// Last known ground below the estimate.
     pub(super) patch: Option<GroundPatch>,
     pub(super) attitude: Option<SensorAttitude>,
@@ -62,12 +70,19 @@ impl ParticleFilter {
             estimate,
             is_narrow: false,
             last_increment: None,
+            last_duration_s: PERIOD_S,
+            duration_s: PERIOD_S,
             attitude: None,
             state: State::Searching,
             agreement: AgreementMonitor::default(),
             updates_in_state: 0,
             is_first: true,
         }
+    }
+
+    /// Sets the time between the previous frame and the next [s].
+    pub fn set_duration_s(&mut self, duration_s: f64) {
+        self.duration_s = duration_s;
     }
 
     /// Searching, tracking or lost.

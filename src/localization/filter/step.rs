@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use rand::Rng;
 
-use super::state::ParticleFilter;
+use super::state::{PERIOD_S, ParticleFilter};
 use crate::geometry::{Pose2, Pose3};
 use crate::lidar::{Beam, RangeImage};
 use crate::localization::convergence::is_converged;
@@ -62,7 +62,12 @@ impl ParticleFilter {
         match odometry {
             Odometry::Increment(previous_from_current) => previous_from_current,
             Odometry::Velocity(command) => command.compose(),
-            Odometry::Unknown => self.last_increment.unwrap_or_else(Pose2::identity),
+            Odometry::Unknown => {
+                let last = self.last_increment.unwrap_or_else(Pose2::identity);
+                let share = self.duration_s / self.last_duration_s;
+                let translation = last.translation.vector * share;
+                Pose2::new(translation, last.rotation.angle() * share)
+            }
         }
     }
 
@@ -90,13 +95,14 @@ impl ParticleFilter {
                     .propagate(|pose| pose * command.sample(&config.velocity, rng));
             } else {
                 let motion = TurnDriveTurn::decompose(&self.pending);
+                let periods = self.duration_s / PERIOD_S;
                 let noise = match (odometry, self.last_increment) {
-                    (Odometry::Unknown, None) => &config.unknown_velocity,
-                    (Odometry::Unknown, Some(_)) => &config.constant_velocity,
-                    _ => &config.motion,
+                    (Odometry::Unknown, None) => config.unknown_velocity.scaled(periods),
+                    (Odometry::Unknown, Some(_)) => config.constant_velocity.scaled(periods),
+                    _ => config.motion.clone(),
                 };
                 self.particles
-                    .propagate(|pose| pose * motion.sample(noise, rng));
+                    .propagate(|pose| pose * motion.sample(&noise, rng));
             }
         }
         self.is_first = false;

@@ -6,7 +6,10 @@ use std::time::Instant;
 
 use anyhow::{Result, ensure};
 
-use super::{BuildReport, StageClock, pictures, prepare, write_map};
+use super::clock::StageClock;
+use super::files::{prepare, write_map};
+use super::pictures;
+use super::report::BuildReport;
 use crate::app::commands::interrupt::Interrupted;
 use crate::app::commands::{Context, input, output};
 use crate::app::config::BuildMapConfig;

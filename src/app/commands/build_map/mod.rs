@@ -2,6 +2,7 @@
 
 mod clock;
 mod cloud;
+mod files;
 mod parts;
 mod pictures;
 mod report;
@@ -16,12 +17,12 @@ use std::time::Instant;
 use anyhow::{Context as _, Result};
 
 use self::clock::StageClock;
+use self::files::{prepare, recording_inputs, write_map};
 pub use self::parts::hash_of_scan;
 use self::parts::{Parts, hash_of_scans, joint_hash};
 pub use self::report::BuildReport;
-use super::claims::{Claims, Outputs, PLY};
 use super::interrupt::Interrupted;
-use super::stages::{RecordingInputs, SensorKeys};
+use super::stages::SensorKeys;
 use super::{Context, input, output, version};
 use crate::app::config::{self, BuildMapConfig};
 use crate::evaluation::map_quality::{self, BeamResidual};
@@ -112,44 +113,6 @@ fn open(config: &mut BuildMapConfig) -> Result<(Recording, Option<SensorDescript
     Ok((recording.compensated_by_poses(), sensor))
 }
 
-fn recording_inputs(config: &BuildMapConfig) -> RecordingInputs<'_> {
-    RecordingInputs {
-        scan_folder: &config.scan_folder,
-        topic: config.topic.as_deref(),
-        pose_file: config.pose_file.as_deref(),
-        calib_file: config.calib_file.as_deref(),
-        body_from_lidar: config.body_from_lidar,
-    }
-}
-
-/// Prepares the outputs.
-fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
-    let mut extensions = vec!["report.json", "effective.yml"];
-    if config.visualize {
-        extensions.extend(["png", "residuals.png"]);
-    }
-    let name = |extension| {
-        let path = config.mesh_file.with_extension(extension);
-        path.file_name()
-            .map(|name| name.to_string_lossy().into_owned())
-    };
-    let mut inputs = recording_inputs(config).files();
-    let optional = [
-        ("cloud_file", &config.cloud_file),
-        ("truth_mesh", &config.truth_mesh),
-    ];
-    inputs.extend((optional.iter()).filter_map(|(key, path)| Some((*key, path.as_deref()?))));
-    inputs.extend(context.input());
-    let outputs = Outputs {
-        key: "mesh_file",
-        main: &config.mesh_file,
-        magic: Some(PLY),
-        names: extensions.into_iter().filter_map(name).collect(),
-        inputs,
-        force: config.force,
-    };
-    outputs.prepare()
-}
 
 /// The key scans that build the map, and those that are held out to evaluate it.
 fn hold_out(frames: &[Frame], config: &BuildMapConfig) -> (Vec<Frame>, Vec<Frame>) {
@@ -368,23 +331,4 @@ fn agreement(
         &path.map_from_lidar,
         &scan,
     ))
-}
-
-fn write_map(
-    config: &BuildMapConfig,
-    mesh: &TriangleMesh,
-    path: &MappingPath,
-    claims: &mut Claims,
-) -> Result<()> {
-    anyhow::ensure!(
-        !mesh.triangles.is_empty(),
-        "the map has no triangles: {} has no points left to mesh; check range_image, crop_x, crop_y and crop_z",
-        config
-            .cloud_file
-            .as_ref()
-            .unwrap_or(&config.scan_folder)
-            .display()
-    );
-    claims.begin(&config.mesh_file)?;
-    Ok(ply::write(&config.mesh_file, mesh, Some(path))?)
 }

@@ -111,7 +111,7 @@ fn a_value_of_the_wrong_type_is_reported_with_line_key_and_value() {
     let message = message_of("pose_tracking: perhaps\n", &[]);
     assert_contains(&message, &["line 1", "pose_tracking", "True or False"]);
     let message = message_of("odometry: guess\n", &[]);
-    assert_contains(&message, &["line 1", "`guess`", "ground_truth, file, none"]);
+    assert_contains(&message, &["line 1", "`guess`", "auto, scans, file, ground_truth, none"]);
 }
 
 #[test]
@@ -186,7 +186,7 @@ fn a_setting_may_be_a_list_or_reset_a_key() {
     assert_eq!(config.seed, 3);
     let config: LocalizationConfig =
         load_text("initialization: extent\n", &[("initialization", "null")]).unwrap();
-    assert_eq!(config.initialization(), Initialization::Tracking);
+    assert_eq!(config.initialization, None);
 }
 
 #[test]
@@ -277,15 +277,33 @@ fn the_numbers_of_items_are_not_part_of_the_keys_of_settings() {
 
 #[test]
 fn the_initialization_follows_from_pose_tracking_unless_it_is_given() {
-    let start = |text| {
-        load_text::<LocalizationConfig>(text, &[])
+    let start = |text: &str| {
+        let text = format!("pose_file: poses.txt\n{text}");
+        load_text::<LocalizationConfig>(&text, &[])
             .unwrap()
             .initialization()
     };
+    assert_eq!(start(""), Initialization::Extent);
+    assert_eq!(start("initial_pose: [1, 2, 90]\n"), Initialization::Tracking);
     assert_eq!(start("pose_tracking: True\n"), Initialization::Tracking);
     assert_eq!(start("pose_tracking: False\n"), Initialization::Corridor);
     assert_eq!(
         start("pose_tracking: True\ninitialization: extent\n"),
         Initialization::Extent
     );
+}
+
+#[test]
+fn a_known_start_and_the_true_odometry_need_their_poses() {
+    for text in [
+        "pose_tracking: True\n",
+        "initialization: tracking\n",
+        "odometry: ground_truth\n",
+    ] {
+        assert_contains(&message_of(text, &[]), &["pose_file"]);
+    }
+    let text = "initial_pose: [1e9, 0, 0]\n";
+    assert_contains(&message_of(text, &[]), &["initial_pose", "metres"]);
+    let text = "calib_file: calib.txt\nbody_from_lidar: [0, 0, 1.7, 0, 0, 0]\n";
+    assert_contains(&message_of(text, &[]), &["calib_file or body_from_lidar"]);
 }

@@ -1,0 +1,70 @@
+//! Input and output files of `build-map`.
+
+use anyhow::Result;
+
+use crate::app::commands::Context;
+use crate::app::commands::claims::{Claims, Outputs, PLY};
+use crate::app::commands::stages::RecordingInputs;
+use crate::app::config::BuildMapConfig;
+use crate::geometry::TriangleMesh;
+use crate::map::{MappingPath, ply};
+
+/// The recording with its poses.
+pub fn recording_inputs(config: &BuildMapConfig) -> RecordingInputs<'_> {
+    RecordingInputs {
+        scan_folder: &config.scan_folder,
+        topic: config.topic.as_deref(),
+        pose_file: config.pose_file.as_deref(),
+        calib_file: config.calib_file.as_deref(),
+        body_from_lidar: config.body_from_lidar,
+    }
+}
+
+/// Prepares the outputs.
+pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
+    let mut extensions = vec!["report.json", "effective.yml"];
+    if config.visualize {
+        extensions.extend(["png", "residuals.png"]);
+    }
+    let name = |extension| {
+        let path = config.mesh_file.with_extension(extension);
+        path.file_name()
+            .map(|name| name.to_string_lossy().into_owned())
+    };
+    let mut inputs = recording_inputs(config).files();
+    let optional = [
+        ("cloud_file", &config.cloud_file),
+        ("truth_mesh", &config.truth_mesh),
+    ];
+    inputs.extend((optional.iter()).filter_map(|(key, path)| Some((*key, path.as_deref()?))));
+    inputs.extend(context.input());
+    let outputs = Outputs {
+        key: "mesh_file",
+        main: &config.mesh_file,
+        magic: Some(PLY),
+        names: extensions.into_iter().filter_map(name).collect(),
+        inputs,
+        force: config.force,
+    };
+    outputs.prepare()
+}
+
+/// Writes the map.
+pub fn write_map(
+    config: &BuildMapConfig,
+    mesh: &TriangleMesh,
+    path: &MappingPath,
+    claims: &mut Claims,
+) -> Result<()> {
+    anyhow::ensure!(
+        !mesh.triangles.is_empty(),
+        "the map has no triangles: {} has no points left to mesh; check range_image, crop_x, crop_y and crop_z",
+        config
+            .cloud_file
+            .as_ref()
+            .unwrap_or(&config.scan_folder)
+            .display()
+    );
+    claims.begin(&config.mesh_file)?;
+    Ok(ply::write(&config.mesh_file, mesh, Some(path))?)
+}

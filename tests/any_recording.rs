@@ -1,0 +1,235 @@
+//! Recordings as users have them: folders as arguments, without true poses, odometry or a known sensor.
+
+#![allow(clippy::unwrap_used, reason = "a failing test may panic")]
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+
+use common::{Fpmcl, fpmcl, json, real_recording, run, simulate_two_drives};
+use fpmcl::geometry::Pose3;
+use fpmcl::recording::PoseTrack;
+use fpmcl::recording::poses::read_tum;
+use serde_json::Value;
+
+/// A street with a bend, scanned by 32 beams that are not evenly spaced, without times.
+const SIMULATION: &str = "\
+output_folder: street
+n_scans: 14
+path:
+- {length_m: 40, turn_deg: 30, grade_percent: 3}
+scanner:
+  elevations_deg: [15, 10, 7, 5, 3.5, 2, 1, 0.3, -0.3, -1, -1.6, -2.2, -2.8, -3.4, -4, -4.7, -5.4, -6.2, -7, -8, -9, -10, -11.2, -12.5, -14, -15.5, -17, -19, -21, -23, -25, -27]
+  azimuth_steps: 900
+";
+
+/// True poses of drive 2 in the map of drive 1.
+fn truth(folder: &Path) -> Vec<Pose3> {
+    let track = |drive: &str| {
+        let drive = folder.join("street").join(drive);
+        PoseTrack::read(&drive.join("poses.txt"), Some(&drive.join("calib.txt"))).unwrap()
+    };
+    let map = track("drive_1").world_from_map;
+    track("drive_2").in_map(&map).map_from_lidar
+}
+
+/// Largest distance of the found positions from the true ones, from a row on [m].
+fn largest_error_m(result: &Path, truth: &[Pose3], first: usize) -> f64 {
+    let found = read_tum(&result.with_file_name("mcl_tum.txt")).unwrap();
+    let rows = found.iter().zip(truth).skip(first);
+    rows.map(|(row, truth)| {
+        let found = row.map_from_lidar.translation.vector;
+        (found - truth.translation.vector).xy().norm()
+    })
+    .fold(0.0, f64::max)
+}
+
+fn localize(folder: &Path, drive: &str, result: &str) -> Fpmcl {
+    fpmcl("localize")
+        .in_folder(folder)
+        .with(drive)
+        .with("--map=map.ply")
+        .with(format!("--output={result}"))
+        .with("--backend=cpu")
+        .set("plot_loc_results", "False")
+}
+
+#[test]
+fn two_folders_are_enough_for_a_map_and_a_trajectory_in_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, SIMULATION);
+    let described = run(folder, &["info", "street/drive_1"]);
+    for part in ["KITTI odometry", "32 beams", "build-map", "ready"] {
+        assert!(described.contains(part), "{described}");
+    }
+    let build = ["build-map", "street/drive_1", "--output", "map.ply"];
+    run(
+        folder,
+        &[&build[..], &["--set", "visualize=False"]].concat(),
+    );
+    let sensor = json(&folder.join("map.report.json"))["sensor"].clone();
+    assert_eq!(sensor["beams"], 32);
+    let height_m = sensor["mounting"]["height_m"].as_f64().unwrap();
+    assert!((height_m - 1.73).abs() < 0.05, "{height_m}");
+
+    // No true poses, no odometry, no start.
+    let output = localize(folder, "street/drive_2", "anywhere/r.npz").succeeds();
+    assert!(!output.stdout.contains("RMSE"), "{}", output.stdout);
+    let report = json(&folder.join("anywhere/report.json"));
+    assert_eq!(report["mcl"], Value::Null);
+    assert_eq!(report["summary"]["frames"], 14);
+    let truth = truth(folder);
+    let error_m = largest_error_m(&folder.join("anywhere/r.npz"), &truth, 2);
+    assert!(error_m < 0.1, "{error_m} m");
+
+    // The refinement takes what it needs from the localization, and evaluation the true poses.
+    run(folder, &["refine", "anywhere/r.npz"]);
+    assert_eq!(
+        json(&folder.join("anywhere/report.json"))["refined"],
+        Value::Null
+    );
+    run(
+        folder,
+        &[
+            "evaluate",
+            "anywhere/r.npz",
+            "--set",
+            "pose_file=street/drive_2/poses.txt",
+            "--set",
+            "calib_file=street/drive_2/calib.txt",
+        ],
+    );
+    let rmse_m =
+        json(&folder.join("anywhere/report.json"))["refined"]["metrics"]["position_m"]["rmse"]
+            .as_f64()
+            .unwrap();
+    assert!(rmse_m < 0.05, "{rmse_m} m");
+
+    // A start that is known.
+    let start = truth[0].translation;
+    let heading_deg = truth[0].rotation.euler_angles().2.to_degrees();
+    localize(folder, "street/drive_2", "start/r.npz")
+        .with(format!(
+            "--start={:.1},{:.1},{heading_deg:.0}",
+            start.x, start.y
+        ))
+        .succeeds();
+    let error_m = largest_error_m(&folder.join("start/r.npz"), &truth, 2);
+    assert!(error_m < 0.1, "{error_m} m");
+    localize(folder, "street/drive_2", "far/r.npz")
+        .with("--start=5000,0,0")
+        .fails_with(&["outside the mapped area"]);
+    localize(folder, "street/drive_2", "word/r.npz")
+        .with("--start=here")
+        .rejects_usage_with(&["12.5,-3,90"]);
+}
+
+#[test]
+fn poses_are_matched_by_time_and_their_absence_is_explained() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, SIMULATION);
+    let drive = folder.join("street/drive_1");
+    let track = PoseTrack::read(&drive.join("poses.txt"), Some(&drive.join("calib.txt"))).unwrap();
+    fs::create_dir(folder.join("scans")).unwrap();
+    for scan in 0..14 {
+        // Seconds since 1970, half a tenth after a row of the poses.
+        let name = format!("scans/{:.2}.bin", 1_700_000_000.05 + 0.1 * f64::from(scan));
+        let from = drive.join(format!("velodyne/{scan:06}.bin"));
+        fs::copy(from, folder.join(name)).unwrap();
+    }
+    let tum = |later_s: f64| {
+        let row = |(row, pose): (usize, &Pose3)| {
+            let time_s = 1_700_000_000.0 + later_s + 0.1 * row as f64;
+            let (t, q) = (pose.translation, pose.rotation.coords);
+            format!(
+                "{time_s:.3} {} {} {} {} {} {} {}\n",
+                t.x, t.y, t.z, q.x, q.y, q.z, q.w
+            )
+        };
+        let rows: String = track.map_from_lidar.iter().enumerate().map(row).collect();
+        fs::write(folder.join("poses.tum"), rows).unwrap();
+    };
+    let build = || {
+        fpmcl("build-map")
+            .in_folder(folder)
+            .with("scans")
+            .with("--poses=poses.tum")
+            .with("--output=map.ply")
+            .with("--force")
+            .set("visualize", "False")
+    };
+    // The scans of row n are at the time of row n, whatever their order or number.
+    tum(0.05);
+    build().succeeds();
+    let report = json(&folder.join("map.report.json"));
+    assert_eq!(report["frames"], 14);
+    // The last scan is half an interval after the last row, which is near enough.
+    tum(0.0);
+    build().succeeds();
+    // Another clock.
+    tum(5000.0);
+    build().fails_with(&["14 of 14 scans have no pose", "1700005000.000"]);
+    // No poses at all.
+    fpmcl("build-map")
+        .in_folder(folder)
+        .with("scans")
+        .with("--output=other.ply")
+        .fails_with(&["has no poses", "--poses"]);
+}
+
+#[test]
+fn a_real_drive_is_localized_without_any_key() {
+    let Some(data) = real_recording("kitti-0926-drive-0005") else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let data = data.display().to_string();
+    let build = ["build-map", &data, "--output", "map.ply"];
+    let keys = ["--set", "frame_step=2", "--set", "visualize=False"];
+    let output = fpmcl("").in_folder(folder);
+    let output = build
+        .iter()
+        .chain(&keys)
+        .fold(output, Fpmcl::with)
+        .succeeds();
+    for part in ["64 beams", "motion compensation: clockwise"] {
+        assert!(output.stderr.contains(part), "{}", output.stderr);
+    }
+    localize(folder, &data, "r/r.npz")
+        .set("start_idx", "1")
+        .set("frame_step", "2")
+        .with(format!("--truth={data}/poses.txt"))
+        .with(format!("--calib={data}/calib.txt"))
+        .succeeds();
+    let report = json(&folder.join("r/report.json"));
+    let rmse = |quantity: &str| report["mcl"]["metrics"][quantity]["rmse"].as_f64().unwrap();
+    assert!(rmse("position_m") < 0.012, "{} m", rmse("position_m"));
+    assert!(rmse("heading_rad") < 3e-4, "{} rad", rmse("heading_rad"));
+}
+
+#[test]
+fn a_sensor_of_another_kind_is_found_anywhere_at_two_scans_a_second() {
+    let Some(data) = real_recording("nuscenes-hdl32") else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let data = data.display().to_string();
+    let build = ["build-map", &data, "--output", "map.ply"];
+    let keys = ["--set", "frame_step=2", "--set", "visualize=False"];
+    run(folder, &[&build[..], &keys].concat());
+    localize(folder, &data, "r/r.npz")
+        .set("start_idx", "1")
+        .set("frame_step", "2")
+        .with(format!("--truth={data}/poses_tum.txt"))
+        .succeeds();
+    let report = json(&folder.join("r/report.json"));
+    assert_eq!(report["summary"]["tracking"], 16);
+    let position = &report["mcl"]["metrics"]["position_m"];
+    assert!(position["rmse"].as_f64().unwrap() < 0.05, "{position}");
+    assert!(position["max"].as_f64().unwrap() < 0.5, "{position}");
+}
