@@ -1,4 +1,4 @@
-//! Finds a car's pose to the centimetre from one spinning LiDAR and a mesh map that it builds itself.
+//! Finds a car's pose to the centimetre from one LiDAR and a mesh map that it builds itself.
 //!
 //! # Entry points
 //!
@@ -46,10 +46,11 @@
 //!
 //! | frame | origin and axes | appears in |
 //! |---|---|---|
-//! | `lidar` | the sensor; x forward, y left, z up | scans, range images |
+//! | `lidar` | the sensor; z up, and x forward, y left in KITTI's scans | scans, range images |
 //! | `map` | that of the poses given to [`map::MapBuilder`]; for a recording, the `lidar` frame of its first pose | map, particles, trajectories |
 //! | `cam0` | left grey camera; x right, y down, z forward | KITTI's pose files, nowhere else |
-//! | `world` | that of the camera poses of a recording | [`recording`], to compare drives of one place |
+//! | `body` | what the poses of a recording are poses of, if not the lidar or a camera | [`recording`] |
+//! | `world` | that of the poses of a recording | [`recording`], to compare drives of one place |
 //!
 //! The name of a transform contains both of its frames: `p_map = map_from_lidar * p_lidar`.
 //!
