@@ -10,7 +10,7 @@ use crate::app::comparison::RunId;
 use crate::recording::scan_files;
 use crate::rendering::Backend;
 
-/// Finds a car's pose to the centimetre from one spinning LiDAR and a mesh map that it builds itself.
+/// Finds a car's pose to the centimetre from one LiDAR and a mesh map that it builds itself.
 #[derive(Clone, Debug, Parser)]
 #[command(name = "fpmcl", version, arg_required_else_help = true, after_help = EXAMPLES)]
 pub struct Cli {
@@ -30,10 +30,11 @@ pub struct Cli {
 const EXAMPLES: &str = "\
 Examples:
   fpmcl demo                                  the whole pipeline on a simulated street
-  fpmcl config build-map > my.yml             write a configuration file to edit
-  fpmcl build-map my.yml                      build a mesh map from a recording
-  fpmcl localize --set numParticles=1000      localize in it, with one key changed
-  fpmcl refine && fpmcl evaluate              refine the trajectory and evaluate it";
+  fpmcl info drive_1/                         describe a recording
+  fpmcl build-map drive_1/ --output map.ply   build a mesh map from it
+  fpmcl localize drive_2/ --map map.ply       localize another drive in the map
+  fpmcl refine results/localization.npz       refine the trajectory
+  fpmcl config localize > my.yml              write a configuration file to edit";
 
 /// The subcommands, in the order of their use.
 #[derive(Clone, Debug, Subcommand)]
@@ -42,13 +43,15 @@ pub enum Command {
     #[command(after_help = "\
 Examples:
   fpmcl info drive_1/
+  fpmcl info drive_2.mcap
   fpmcl info map.ply")]
     Info(InfoArgs),
 
-    /// Build a triangle-mesh map from scans with poses.
+    /// Build a triangle-mesh map from scans with poses, or from a point cloud.
     #[command(after_help = "\
 Examples:
-  fpmcl build-map drive_1/ --output map.ply
+  fpmcl build-map drive_1/ --output map.ply   poses that the recording contains, or --poses
+  fpmcl build-map cloud.pcd --output map.ply  a point cloud from elsewhere
   fpmcl build-map config/build_map.yml
   fpmcl build-map --set mesh_file=results/even.ply --set frame_step=2 --force")]
     BuildMap(BuildMapArgs),
@@ -59,13 +62,13 @@ Examples:
   fpmcl localize drive_2/ --map map.ply       the start may be anywhere
   fpmcl localize drive_2/ --map map.ply --start 12.5,-3,90
   fpmcl localize config/localization.yml
-  fpmcl localize --set pose_tracking=False --set range_image.width=1024 --seed 7")]
+  fpmcl localize drive_2/ --map map.ply --set numParticles=1000 --seed 7")]
     Localize(LocalizeArgs),
 
     /// Refine the trajectory that `localize` found.
     #[command(after_help = "\
 Examples:
-  fpmcl refine results/localization.npz
+  fpmcl refine results/localization.npz       recording and map are those of the localization
   fpmcl refine config/refinement.yml
   fpmcl refine --set result_file=results/localization.npz --backend cpu")]
     Refine(RefineArgs),
@@ -73,8 +76,8 @@ Examples:
     /// Compute the errors of a result against the ground truth.
     #[command(after_help = "\
 Examples:
-  fpmcl evaluate config/evaluation.yml
-  fpmcl evaluate --set result_file=results/localization.npz")]
+  fpmcl evaluate results/localization.npz --set pose_file=poses.txt
+  fpmcl evaluate config/evaluation.yml")]
     Evaluate(RunArgs),
 
     /// Compare configurations: sequences x configurations x seeds.
@@ -154,7 +157,7 @@ pub struct DoctorArgs {
 /// Configuration and machine.
 #[derive(Clone, Debug, Args)]
 pub struct ConfigArgs {
-    /// Configuration (.yml), or what the command works on; by default the command's file under config/ or, without one, built-in values.
+    /// Configuration (.yml), or the input: a recording (build-map, localize), a point cloud (build-map) or a result (refine, evaluate). Without it, the command's file under config/ or, if there is none, built-in values.
     #[arg(value_name = "CONFIG | INPUT")]
     pub config: Option<PathBuf>,
 
@@ -186,7 +189,7 @@ pub struct RunArgs {
 /// Arguments of `info`.
 #[derive(Clone, Debug, Args)]
 pub struct InfoArgs {
-    /// Folder of a recording or of its scans, map (.ply), or result (.npz).
+    /// Recording (its folder, the folder of its scans, or a bag), map (.ply), or result (.npz).
     pub path: PathBuf,
 }
 
@@ -201,7 +204,7 @@ pub struct BuildMapArgs {
     #[arg(long, value_name = "MAP")]
     pub output: Option<PathBuf>,
 
-    /// Poses of the recording; by default those that it contains. Sets the key `pose_file`.
+    /// Poses of the recording, rows of KITTI or TUM, or a topic of the bag; by default those that it contains. Sets the key `pose_file`.
     #[arg(long, value_name = "FILE")]
     pub poses: Option<PathBuf>,
 
@@ -217,7 +220,7 @@ pub struct LocalizeArgs {
     #[command(flatten)]
     pub run: RunArgs,
 
-    /// Map of `build-map` or range-mcl; sets the key `map_file`.
+    /// Map of `build-map` or range-mcl, or a mesh (.ply, .obj, .stl); sets the key `map_file`.
     #[arg(long, value_name = "MAP")]
     pub map: Option<PathBuf>,
 
@@ -225,7 +228,7 @@ pub struct LocalizeArgs {
     #[arg(long, value_name = "X,Y,HEADING", value_parser = start, allow_hyphen_values = true)]
     pub start: Option<[f64; 3]>,
 
-    /// Odometry, rows of KITTI or TUM; by default the scans. Sets the key `odometry_file`.
+    /// Odometry, rows of KITTI or TUM, or a topic of the bag; by default the topic of odometry that a bag has, else the scans. Sets the key `odometry_file`.
     #[arg(long, value_name = "FILE")]
     pub odometry: Option<PathBuf>,
 

@@ -39,7 +39,7 @@ pub enum RecordingError {
         types: &'static str,
         known: String,
     },
-    #[error("{} has several topics of {types}; choose one of: {known}", path.display())]
+    #[error("{} has several topics of {types}; choose one by the key topic (of scans) or pose_file (of poses): {known}", path.display())]
     SeveralTopics {
         path: PathBuf,
         types: &'static str,
@@ -61,11 +61,11 @@ pub enum RecordingError {
     },
     #[error("{}, line {line}: the first three columns are not a rotation", path.display())]
     NotARotation { path: PathBuf, line: usize },
-    #[error("{} has no line `Tr:` (cam0_from_lidar, 12 numbers); use the calib.txt of the odometry benchmark", path.display())]
+    #[error("{} has no line `Tr:` (cam0_from_lidar, 12 numbers); use the calib.txt that belongs to the poses, or give the mounting with body_from_lidar", path.display())]
     NoTr { path: PathBuf },
     #[error("{} contains no poses", path.display())]
     NoPoses { path: PathBuf },
-    #[error("{} contains no scans (.bin, .pcd, .ply or .npy); set scan_folder to the folder of the scans", path.display())]
+    #[error("{} contains no scans (.bin, .pcd, .ply or .npy); give the folder of a recording or of its scans, or a bag", path.display())]
     NoScans { path: PathBuf },
     #[error("{scan} has no pose: {} has {poses} rows; check that both belong to one recording, or select fewer frames with n_scans", pose_file.display())]
     ScanWithoutPose {
@@ -73,10 +73,10 @@ pub enum RecordingError {
         pose_file: PathBuf,
         poses: usize,
     },
-    #[error("{} has no poses (poses.txt, poses_tum.txt or oxts); name their file in pose_file, or with --poses", path.display())]
+    #[error("{} has no poses (poses.txt, poses_tum.txt, poses.tum or oxts); name their file with --poses, or in pose_file", path.display())]
     NoPoseFile { path: PathBuf },
     #[error(
-        "the poses of {topic} are those of {body}, and no static transform leads from it to {lidar}, the frame of the scans; give the mounting with body_from_lidar, or record tf_static"
+        "the poses of {topic} are those of {body}, and no static transform leads from it to {lidar}, the frame of the scans; record tf_static, or give the poses as a file with --poses and the mounting with body_from_lidar"
     )]
     NoMounting {
         topic: String,

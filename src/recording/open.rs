@@ -23,7 +23,7 @@ const SCANS_PER_SECOND: f64 = 10.0;
 /// A recording with its selected frames.
 #[derive(Clone, Debug)]
 pub struct Recording {
-    /// The folder that was opened.
+    /// The folder or bag that was opened.
     pub path: PathBuf,
     /// Its files.
     pub files: RecordingFiles,
@@ -46,8 +46,8 @@ impl Recording {
     /// Opens a recording without reading its scans.
     ///
     /// `path` is the folder of a recording in one of the layouts of [`Layout`], the folder of its scans, or a bag, of
-    /// which `topic` is taken, or the only one with scans. Times are those of a bag, those in the names of the scans, else those of `times.txt` (`timestamps.txt` of KITTI raw); they
-    /// must ascend.
+    /// which `topic` is taken, or the only one with scans. Times are those of a bag, those in the names of the scans,
+    /// else those of `times.txt` (`timestamps.txt` of KITTI raw), which must ascend.
     pub fn open(
         path: &Path,
         topic: Option<&str>,
@@ -127,7 +127,7 @@ impl Recording {
         })
     }
 
-    /// Opens a recording in the layout of KITTI odometry with its poses and calibration.
+    /// Opens a recording with the poses that it contains.
     pub fn open_with_poses(folder: &Path) -> Result<Self, RecordingError> {
         let recording = Self::open(folder, None, &Selection::default())?;
         let track = recording.own_track()?;

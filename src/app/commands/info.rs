@@ -18,7 +18,7 @@ use crate::sensor::{self, BeamSource, SensorDescription};
 pub fn run(path: &Path) -> Result<String> {
     ensure!(
         path.exists(),
-        "{} does not exist; give the folder of a recording, a map (.ply) or a result (.npz)",
+        "{} does not exist; give a recording (a folder or a bag), a map (.ply) or a result (.npz)",
         path.display()
     );
     let extension = path.extension().and_then(|extension| extension.to_str());
@@ -27,7 +27,7 @@ pub fn run(path: &Path) -> Result<String> {
         Some("ply") => map(path),
         Some("npz") => result(path),
         _ => bail!(
-            "{} is no folder of a recording, no map (.ply) and no result (.npz)",
+            "{} is neither a recording (a folder, .mcap, .db3 or .bag) nor a map (.ply) nor a result (.npz)",
             path.display()
         ),
     }

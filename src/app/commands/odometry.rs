@@ -45,7 +45,9 @@ impl MotionSource {
                 match recording.own_track() {
                     Ok(track) => Self::of_track(&track, recording)?,
                     Err(error) => {
-                        tracing::info!("odometry from the scans: {error}");
+                        tracing::info!(
+                            "odometry from the scans, because the bag has none to use: {error}"
+                        );
                         Self::of_scans(recording)?
                     }
                 }

@@ -334,7 +334,7 @@ pub fn description(sensor: &SensorDescription) -> String {
     let model = &sensor.lidar;
     let rows = match sensor.beams {
         Some(beams) => format!("{beams} beams"),
-        None => "no rows".to_owned(),
+        None => "points without rows".to_owned(),
     };
     let elevations = model.elevations.as_deref();
     let highest = elevations
