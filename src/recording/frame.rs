@@ -62,6 +62,8 @@ pub struct Frame {
     pub map_from_lidar: Option<Pose3>,
     /// Rotation of the sensor, from which the times of the points follow where the file has none.
     pub rotation: Option<Rotation>,
+    /// Whether the points have times; otherwise the scan is taken as compensated.
+    pub is_timed: bool,
     /// Motion by which the scan is deskewed when it is read; `None` if it is not.
     pub motion: Option<Motion>,
 }
@@ -75,6 +77,7 @@ impl Frame {
             time_s,
             map_from_lidar: None,
             rotation: None,
+            is_timed: true,
             motion: None,
         }
     }
@@ -87,6 +90,9 @@ impl Frame {
             scan.times_s = rotation.point_times(&scan.points);
         }
         scan.center_times();
+        if !self.is_timed {
+            scan.times_s.clear();
+        }
         if let Some(motion) = &self.motion {
             motion.deskew(&mut scan);
         }

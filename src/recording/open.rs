@@ -172,6 +172,15 @@ impl Recording {
         self.frames.iter().map(read)
     }
 
+    /// The same recording, whose scans are compensated already: times of points are ignored.
+    #[must_use]
+    pub fn compensated(mut self) -> Self {
+        for frame in self.frames.iter_mut().chain(&mut self.skipped) {
+            frame.is_timed = false;
+        }
+        self
+    }
+
     /// The same recording, whose points have times from the rotation of the sensor where the data have none.
     #[must_use]
     pub fn rotating(mut self, rotation: Option<Rotation>) -> Self {

@@ -180,7 +180,10 @@ pub struct SensorKeys<'a> {
 
 impl SensorKeys<'_> {
     /// Sets what is not given from the scans; returns the recording, whose points have times if they are known.
-    pub fn resolve(self, recording: Recording) -> Result<(Recording, Option<SensorDescription>)> {
+    pub fn resolve(self, mut recording: Recording) -> Result<(Recording, Option<SensorDescription>)> {
+        if self.motion_compensation.is_none() {
+            recording = recording.compensated();
+        }
         let is_given = RangeImageConfig::of(&self.range_image.model());
         let is_complete = RangeImageConfig {
             has_rows: None,
