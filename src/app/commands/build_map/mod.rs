@@ -5,6 +5,7 @@ mod cloud;
 mod files;
 mod parts;
 mod pictures;
+mod pose_check;
 mod report;
 
 use std::collections::BTreeMap;
@@ -110,6 +111,8 @@ fn open(config: &mut BuildMapConfig) -> Result<(Recording, Option<SensorDescript
         motion_compensation: &mut config.motion_compensation,
     };
     let (recording, sensor) = keys.resolve(recording)?;
+    pose_check::check(&recording)
+        .with_context(|| format!("pose_file is {}", pose_file.display()))?;
     Ok((recording.compensated_by_poses(), sensor))
 }
 
