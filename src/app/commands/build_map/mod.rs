@@ -116,7 +116,6 @@ fn open(config: &mut BuildMapConfig) -> Result<(Recording, Option<SensorDescript
     Ok((recording.compensated_by_poses(), sensor))
 }
 
-
 /// The key scans that build the map, and those that are held out to evaluate it.
 fn hold_out(frames: &[Frame], config: &BuildMapConfig) -> (Vec<Frame>, Vec<Frame>) {
     let keys = key_scans(&poses_of(frames), config.displacement_threshold_m);

@@ -97,6 +97,7 @@ fn description(check: &PoseCheck) -> String {
             let (name, advice) = meaning_and_advice(*meaning);
             format!("; as {name} they differ by {}: {advice}", difference(better))
         }
+        None if check.fit == PoseFit::Fits => String::new(),
         None => "; check that pose_file belongs to this recording, and that calib_file or body_from_lidar describe the body whose poses it has".to_owned(),
     };
     text
