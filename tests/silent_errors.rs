@@ -68,12 +68,43 @@ fn one_displaced_pose_is_warned_about_with_its_frame() {
 }
 
 #[test]
-fn poses_of_the_camera_taken_for_those_of_the_lidar_are_an_error() {
+fn poses_of_the_camera_taken_for_those_of_the_lidar_are_an_error_that_names_what_fits() {
     let recording = Recording::street(9);
     recording.write("calib.txt", "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n");
-    recording
-        .fpmcl("build-map")
-        .fails_with(&["the poses of scans 0 to 8 do not fit", "the line Tr"]);
+    recording.fpmcl("build-map").fails_with(&[
+        "pose_file is poses.txt",
+        "the poses do not fit the scans: between frames 0 and 8",
+        "as poses of a camera they differ by 0.0",
+        "give calib_file",
+    ]);
+    assert!(!recording.path("map.ply").exists());
+}
+
+#[test]
+fn poses_of_the_lidar_taken_for_those_of_a_camera_are_an_error_that_names_what_fits() {
+    let recording = Recording::street(9);
+    let rows = (0..9).map(|i| format!("1 0 0 {} 0 1 0 0 0 0 1 0\n", 0.5 * f64::from(i)));
+    recording.write("poses.txt", &rows.collect::<String>());
+    recording.fpmcl("build-map").fails_with(&[
+        "as poses of the lidar itself they differ by 0.0",
+        "remove calib_file",
+    ]);
+}
+
+#[test]
+fn a_map_whose_ground_is_tilted_is_warned_about() {
+    let warning = "the ground is tilted by 20 degrees";
+    let tilted = Recording::street(3);
+    let (sin, cos) = 20.0_f32.to_radians().sin_cos();
+    for frame in 0..3 {
+        let points = tilted.scan(frame).into_iter();
+        let points = points.map(|[x, y, z]| [x, cos * y - sin * z, sin * y + cos * z]);
+        tilted.write_scan(frame, &points.collect::<Vec<_>>());
+    }
+    let stderr = tilted.fpmcl("build-map").succeeds().stderr;
+    assert!(stderr.contains(warning), "{stderr}");
+    let stderr = Recording::street(3).fpmcl("build-map").succeeds().stderr;
+    assert!(!stderr.contains("tilted"), "{stderr}");
 }
 
 #[test]

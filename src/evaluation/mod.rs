@@ -12,6 +12,7 @@ pub mod planar;
 pub mod pose_error;
 pub mod range_mcl;
 pub mod smoothness;
+pub mod spatial;
 pub mod statistics;
 mod surface_distance;
 
@@ -25,4 +26,5 @@ pub use metrics::{EvaluatedTrajectory, MetricsConfig, MetricsError, TrajectoryMe
 pub use planar::{PlanarError, distances_m, planar_errors};
 pub use pose_error::{Pairs, absolute_pose_error, kitti_segment_errors, relative_pose_error};
 pub use range_mcl::{ParticleRow, RangeMclErrors, RangeMclRules};
+pub use spatial::SpatialMetrics;
 pub use statistics::Summary;

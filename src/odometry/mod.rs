@@ -21,6 +21,7 @@ mod alignment;
 mod config;
 mod degeneracy;
 mod odometer;
+mod pose_check;
 mod residuals;
 mod sampling;
 mod search;
@@ -30,6 +31,7 @@ mod voxel_map;
 
 pub use config::OdometryConfig;
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
+pub use pose_check::{GivenPoses, MotionDifference, PoseCheck, PoseFit, PoseMeaning, check_poses};
 pub use timing::{TimingComparison, TimingError, compare_timings};
 
 #[cfg(test)]

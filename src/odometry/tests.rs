@@ -119,7 +119,7 @@ impl World {
 }
 
 /// A curve with pitching and rolling: the pose of the sensor at a time, 6 m/s.
-fn drive(time_s: f64) -> Pose3 {
+pub(super) fn drive(time_s: f64) -> Pose3 {
     let (speed, turn_rate) = (6.0, 0.25);
     let heading = turn_rate * time_s;
     let radius = speed / turn_rate;
@@ -142,7 +142,7 @@ const CLOCKWISE: Rotation = Rotation {
 };
 
 /// Scans of the drive, ten per second; with a rotation they are not compensated.
-fn drive_scans(count: usize, rotation: Option<Rotation>) -> Vec<Scan> {
+pub(super) fn drive_scans(count: usize, rotation: Option<Rotation>) -> Vec<Scan> {
     let world = World::crossing();
     (0..count)
         .map(|number| {

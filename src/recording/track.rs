@@ -143,7 +143,7 @@ impl PoseTrack {
         have_times: bool,
     ) -> Result<Vec<Option<Pose3>>, RecordingError> {
         let poses: Vec<_> = (frames.iter())
-            .map(|frame| Some(self.at(frame, have_times)?.0))
+            .map(|frame| self.pose_at(frame, have_times))
             .collect();
         let missing = || frames.iter().zip(&poses).filter(|(_, pose)| pose.is_none());
         let count = missing().count();
@@ -192,6 +192,11 @@ impl PoseTrack {
     /// Motion of the sensor around a frame; `None` if the frame has no pose, or the track only one.
     pub fn motion_at(&self, frame: &Frame, have_times: bool) -> Option<Motion> {
         self.at(frame, have_times)?.1
+    }
+
+    /// Pose of a frame; `None` if the track has none.
+    pub fn pose_at(&self, frame: &Frame, have_times: bool) -> Option<Pose3> {
+        Some(self.at(frame, have_times)?.0)
     }
 
     /// Pose of a frame and the motion around it.

@@ -4,6 +4,7 @@
 //! some degrees sees a slope; the points are therefore turned level by the first plane and segmented once more.
 
 use glam::{Quat, Vec3};
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use crate::ground::{GroundClassifier, GroundConfig, RoadPlane, road_plane};
@@ -89,6 +90,13 @@ pub fn find(surroundings: &Surroundings) -> Option<Mounting> {
         height_spread_m: height.1,
         tilt_spread_rad: roll.1.max(pitch.1),
     })
+}
+
+/// Angle between z and the mean of directions up, and the median of the angles to this mean [rad]; `None` of none.
+pub fn tilt(ups: &[Vector3<f64>]) -> Option<(f64, f64)> {
+    let mean: Vector3<f64> = ups.iter().sum();
+    let angles = ups.iter().map(|up| up.angle(&mean));
+    (!ups.is_empty()).then(|| (mean.angle(&Vector3::z()), spread(angles).0))
 }
 
 /// Median, and median of the absolute deviations from it.

@@ -12,7 +12,7 @@ use crate::app::config::{self, EvaluationConfig, LocalizationConfig};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
 use crate::files::folder_of;
-use crate::geometry::{Pose2, TriangleMesh, pose2_from_pose3};
+use crate::geometry::{Pose3, TriangleMesh, pose2_from_pose3};
 use crate::map::{MappingPath, mesh_file};
 use crate::recording::PoseTrack;
 
@@ -33,7 +33,9 @@ pub fn run(config: &EvaluationConfig, context: &Context) -> Result<Report> {
     };
     if let Some(pose_file) = &config.pose_file {
         let path = map.as_ref().and_then(|(_, path)| path.as_ref());
-        results.ground_truth = Some(truth(pose_file, config, &results, path)?);
+        let truth = truth(pose_file, config, &results, path)?;
+        results.ground_truth = Some(truth.iter().map(pose2_from_pose3).collect());
+        results.ground_truth_in_space = Some(truth);
     }
     ensure!(
         results.ground_truth.is_some(),
@@ -136,6 +138,8 @@ fn scale(results: &mut LocalizationResults, grid_resolution_m: f64) {
         pose.translation.vector *= grid_resolution_m;
     }
     results.particles.scale_positions(grid_resolution_m as f32);
+    // Results of range-mcl, which are planar.
+    (results.estimates_in_space, results.refined_in_space) = (None, None);
 }
 
 /// The true poses of the frames of a result: in the frame of its map, or, if its path is not known, of
@@ -145,7 +149,7 @@ fn truth(
     config: &EvaluationConfig,
     results: &LocalizationResults,
     mapping_path: Option<&MappingPath>,
-) -> Result<Vec<Pose2>> {
+) -> Result<Vec<Pose3>> {
     input::require_file("pose_file", pose_file)?;
     input::require_optional_file("calib_file", config.calib_file.as_deref())?;
     let mut track = PoseTrack::read(pose_file, config.calib_file.as_deref())?;
@@ -160,9 +164,7 @@ fn truth(
         pose_file.display(),
         poses.len()
     );
-    Ok((results.frames.iter())
-        .map(|&frame| pose2_from_pose3(&poses[frame]))
-        .collect())
+    Ok((results.frames.iter()).map(|&frame| poses[frame]).collect())
 }
 
 /// The results of the frames that the configuration selects.

@@ -55,15 +55,14 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let increments = increments(config, &sequence, &results)?;
     let starts = initial_estimates(&results, &estimates);
     let (refined, runtimes_s) = refine(config, context, &map, &sequence, &starts, &increments)?;
-    if results.ground_truth.is_none() {
-        let poses = sequence
-            .frames
-            .iter()
-            .map(|frame| frame.map_from_lidar.as_ref());
-        results.ground_truth = poses.map(|pose| pose.map(pose2_from_pose3)).collect();
-    }
+    let truth = sequence.frames.iter().map(|frame| frame.map_from_lidar);
+    let truth: Option<Vec<Pose3>> = truth.collect();
+    let planar = |truth: &[Pose3]| truth.iter().map(pose2_from_pose3).collect();
+    results.ground_truth = (results.ground_truth.take()).or(truth.as_deref().map(planar));
+    results.ground_truth_in_space = results.ground_truth_in_space.take().or(truth);
     results.estimates = Some(estimates);
     results.refined = Some(refined.poses.clone());
+    results.refined_in_space = Some(refined.map_from_lidar.clone());
     results.refined_covariances = Some(refined.covariances.clone());
     results.refine_runtimes_s = Some(runtimes_s);
     claims.begin(&main)?;

@@ -16,8 +16,8 @@ use crate::app::results::{
     LocalizationResults, Report, RunSummary, TrajectoryReport, write_frames_csv, write_poses_npy,
 };
 use crate::evaluation::{
-    EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, TrajectoryMetrics,
-    planar_errors,
+    EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, SpatialMetrics,
+    TrajectoryMetrics, planar_errors,
 };
 use crate::files::folder_of;
 use crate::geometry::{Pose2, Pose3, StampedPose, TriangleMesh};
@@ -178,25 +178,33 @@ pub fn evaluate(
     rules: &RangeMclRules,
     about: BTreeMap<String, String>,
 ) -> Result<Report> {
-    let report = |estimates: &[Pose2], runtimes_s: &Option<Vec<f64>>| {
-        let Some(ground_truth) = results.ground_truth.as_deref() else {
-            return Ok(None);
+    let report =
+        |estimates: &[Pose2], in_space: &Option<Vec<Pose3>>, runtimes_s: &Option<Vec<f64>>| {
+            let Some(ground_truth) = results.ground_truth.as_deref() else {
+                return Ok(None);
+            };
+            let trajectory = EvaluatedTrajectory {
+                estimates,
+                ground_truth,
+                times_s: results.times_s.as_deref(),
+                runtimes_s: runtimes_s.as_deref(),
+            };
+            let in_space = in_space
+                .as_deref()
+                .zip(results.ground_truth_in_space.as_deref());
+            evaluate_trajectory(&trajectory, in_space, rules).map(Some)
         };
-        let trajectory = EvaluatedTrajectory {
-            estimates,
-            ground_truth,
-            times_s: results.times_s.as_deref(),
-            runtimes_s: runtimes_s.as_deref(),
-        };
-        evaluate_trajectory(&trajectory, rules).map(Some)
-    };
     let estimates = results.estimates_or_particle_means(rules)?;
     Ok(Report {
         about,
         summary: RunSummary::of(results, &estimates),
-        mcl: report(&estimates, &results.runtimes_s)?,
+        mcl: report(&estimates, &results.estimates_in_space, &results.runtimes_s)?,
         refined: match &results.refined {
-            Some(refined) => report(refined, &results.refine_runtimes_s)?,
+            Some(refined) => report(
+                refined,
+                &results.refined_in_space,
+                &results.refine_runtimes_s,
+            )?,
             None => None,
         },
     })
@@ -205,6 +213,7 @@ pub fn evaluate(
 /// Computes the errors of one trajectory.
 pub fn evaluate_trajectory(
     trajectory: &EvaluatedTrajectory,
+    in_space: Option<(&[Pose3], &[Pose3])>,
     rules: &RangeMclRules,
 ) -> Result<TrajectoryReport> {
     let defaults = MetricsConfig::default();
@@ -216,6 +225,9 @@ pub fn evaluate_trajectory(
     Ok(TrajectoryReport {
         range_mcl: rules.evaluate(trajectory.estimates, trajectory.ground_truth),
         metrics: TrajectoryMetrics::of(trajectory, &config)?,
+        in_space: in_space.and_then(|(estimates, truth)| {
+            SpatialMetrics::of(estimates, truth, config.skip_frames)
+        }),
     })
 }
 

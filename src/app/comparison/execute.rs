@@ -249,10 +249,14 @@ impl Stages {
 /// Evaluates the final trajectory of a run, with the runtime of all stages per frame.
 fn evaluate(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
     let results = LocalizationResults::read(result)?;
-    let (poses, refinement_s) = if is_refined {
-        (results.refined, results.refine_runtimes_s)
+    let (poses, in_space, refinement_s) = if is_refined {
+        (
+            results.refined,
+            results.refined_in_space,
+            results.refine_runtimes_s,
+        )
     } else {
-        (results.estimates, None)
+        (results.estimates, results.estimates_in_space, None)
     };
     let (poses, truth) = poses
         .zip(results.ground_truth)
@@ -271,7 +275,10 @@ fn evaluate(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
         times_s: results.times_s.as_deref(),
         runtimes_s: runtimes_s.as_deref(),
     };
-    run_output::evaluate_trajectory(&trajectory, &RangeMclRules::default())
+    let in_space = in_space
+        .as_deref()
+        .zip(results.ground_truth_in_space.as_deref());
+    run_output::evaluate_trajectory(&trajectory, in_space, &RangeMclRules::default())
 }
 
 /// Name of the processor, on systems with `/proc/cpuinfo`.

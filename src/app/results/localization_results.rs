@@ -10,6 +10,7 @@
 //! | `numParticles` | () | int64 | N |
 //! | `frames` | (rows) | int64 | number of the frame in its recording |
 //! | `estimates`, `refined`, `ground_truth`, `odometry` | (rows, 3) | float64 | x, y [m], heading [rad] |
+//! | `estimates_in_space`, `refined_in_space`, `ground_truth_in_space` | (rows, 7) | float64 | x, y, z [m], quaternion x, y, z, w |
 //! | `covariances`, `refined_covariances` | (rows, 9) | float64 | of x, y, heading, row-major [m², m rad, rad²] |
 //! | `times_s`, `runtimes_s`, `refine_runtimes_s` | (rows) | float64 | time of the frame; computing time [s] |
 //! | `agreements` | (rows) | float64 | share of beams above the road that agree with the map, −1 where unknown |
@@ -22,7 +23,7 @@ use anyhow::{Context as _, Result};
 use nalgebra::Matrix3;
 
 use crate::evaluation::{ParticleRow, RangeMclRules};
-use crate::geometry::Pose2;
+use crate::geometry::{Pose2, Pose3};
 
 /// Particles of many frames, without the padding of the stored array.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -99,6 +100,12 @@ pub struct LocalizationResults {
     pub refined: Option<Vec<Pose2>>,
     /// The ground truth.
     pub ground_truth: Option<Vec<Pose2>>,
+    /// The filter's estimates in space, `map_from_lidar`.
+    pub estimates_in_space: Option<Vec<Pose3>>,
+    /// The refined trajectory in space.
+    pub refined_in_space: Option<Vec<Pose3>>,
+    /// The ground truth in space.
+    pub ground_truth_in_space: Option<Vec<Pose3>>,
     /// The odometry increment into each frame, `previous_from_current`.
     pub odometry: Option<Vec<Pose2>>,
     /// Covariances of the estimates in x, y [m], heading [rad].
@@ -156,6 +163,9 @@ impl LocalizationResults {
             estimates: pick(&self.estimates, rows),
             refined: pick(&self.refined, rows),
             ground_truth: pick(&self.ground_truth, rows),
+            estimates_in_space: pick(&self.estimates_in_space, rows),
+            refined_in_space: pick(&self.refined_in_space, rows),
+            ground_truth_in_space: pick(&self.ground_truth_in_space, rows),
             odometry: pick(&self.odometry, rows),
             covariances: pick(&self.covariances, rows),
             refined_covariances: pick(&self.refined_covariances, rows),

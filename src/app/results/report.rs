@@ -7,9 +7,9 @@ use std::path::Path;
 use anyhow::{Context as _, Result, anyhow};
 use serde::{Deserialize, Serialize};
 
-use super::rows::{MetricRow, Value, metric_rows};
+use super::rows::{MetricRow, Value, metric_rows, spatial_rows};
 use super::run_summary::RunSummary;
-use crate::evaluation::{RangeMclErrors, TrajectoryMetrics};
+use crate::evaluation::{RangeMclErrors, SpatialMetrics, TrajectoryMetrics};
 
 /// Errors of one trajectory.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -18,6 +18,9 @@ pub struct TrajectoryReport {
     pub range_mcl: RangeMclErrors,
     /// Errors as defined in the literature.
     pub metrics: TrajectoryMetrics,
+    /// Errors in six degrees of freedom, where the poses in space are known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub in_space: Option<SpatialMetrics>,
 }
 
 impl TrajectoryReport {
@@ -39,7 +42,8 @@ impl TrajectoryReport {
                 self.range_mcl.rmse_yaw_deg,
             ),
         ];
-        [range_mcl, metric_rows(&self.metrics)].concat()
+        let in_space = self.in_space.as_ref().map_or_else(Vec::new, spatial_rows);
+        [range_mcl, metric_rows(&self.metrics), in_space].concat()
     }
 }
 
@@ -157,6 +161,7 @@ mod tests {
         TrajectoryReport {
             range_mcl: RangeMclRules::default().evaluate(&estimates, &truth),
             metrics: TrajectoryMetrics::of(&trajectory, &MetricsConfig::default()).unwrap(),
+            in_space: None,
         }
     }
 

@@ -5,13 +5,13 @@ use std::iter::repeat_n;
 use std::path::Path;
 
 use anyhow::{Context as _, Result, anyhow, ensure};
-use nalgebra::{Matrix3, Vector2};
+use nalgebra::{Matrix3, Quaternion, Translation3, UnitQuaternion, Vector2};
 
 use super::localization_results::{LocalizationResults, ParticleLog};
 use super::npz::{Array, NpzReader, NpzWriter, write_npy};
 use crate::evaluation::ParticleRow;
 use crate::files::write_atomically;
-use crate::geometry::Pose2;
+use crate::geometry::{Pose2, Pose3};
 
 /// Largest number of particles in empty rows, 4 GiB of zeros.
 const MOST_EMPTY_PARTICLES: usize = 1 << 28;
@@ -32,6 +32,10 @@ impl LocalizationResults {
         let mut poses = |name| file.rows(name, pose_from_row);
         let (estimates, refined) = (poses("estimates")?, poses("refined")?);
         let (ground_truth, odometry) = (poses("ground_truth")?, poses("odometry")?);
+        let mut spatial = |name| file.rows(name, pose_in_space_from_row);
+        let (estimates_in_space, refined_in_space) =
+            (spatial("estimates_in_space")?, spatial("refined_in_space")?);
+        let ground_truth_in_space = spatial("ground_truth_in_space")?;
         let mut matrices = |name| file.rows(name, |row: [f64; 9]| Matrix3::from_row_slice(&row));
         let (covariances, refined_covariances) =
             (matrices("covariances")?, matrices("refined_covariances")?);
@@ -41,6 +45,9 @@ impl LocalizationResults {
             estimates,
             refined,
             ground_truth,
+            estimates_in_space,
+            refined_in_space,
+            ground_truth_in_space,
             odometry,
             covariances,
             refined_covariances,
@@ -86,6 +93,13 @@ impl LocalizationResults {
         file.rows("estimates", &self.estimates, row_from_pose)?;
         file.rows("refined", &self.refined, row_from_pose)?;
         file.rows("ground_truth", &self.ground_truth, row_from_pose)?;
+        for (name, poses) in [
+            ("estimates_in_space", &self.estimates_in_space),
+            ("refined_in_space", &self.refined_in_space),
+            ("ground_truth_in_space", &self.ground_truth_in_space),
+        ] {
+            file.rows(name, poses, row_from_pose_in_space)?;
+        }
         file.rows("odometry", &self.odometry, row_from_pose)?;
         file.rows("covariances", &self.covariances, row_from_matrix)?;
         file.rows(
@@ -139,6 +153,17 @@ fn pose_from_row([x, y, heading]: [f64; 3]) -> Pose2 {
 fn row_from_pose(pose: &Pose2) -> [f64; 3] {
     let t = pose.translation;
     [t.x, t.y, pose.rotation.angle()]
+}
+
+/// The rotation of a row of zeros is the identity.
+fn pose_in_space_from_row([x, y, z, i, j, k, w]: [f64; 7]) -> Pose3 {
+    let rotation = UnitQuaternion::try_new(Quaternion::new(w, i, j, k), f64::MIN_POSITIVE);
+    Pose3::from_parts(Translation3::new(x, y, z), rotation.unwrap_or_default())
+}
+
+fn row_from_pose_in_space(pose: &Pose3) -> [f64; 7] {
+    let (t, q) = (pose.translation, pose.rotation);
+    [t.x, t.y, t.z, q.i, q.j, q.k, q.w]
 }
 
 fn row_from_matrix(matrix: &Matrix3<f64>) -> [f64; 9] {

@@ -9,7 +9,7 @@ use zip::write::SimpleFileOptions;
 
 use super::npz::NpzWriter;
 use super::{LocalizationResults, ParticleLog};
-use crate::geometry::Pose2;
+use crate::geometry::{Pose2, Pose3};
 
 fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
     let frames: Vec<usize> = frames.collect();
@@ -22,6 +22,11 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
         let pose = |&frame: &usize| Pose2::new([frame as f64, offset].into(), 3.0 - offset);
         Some(frames.iter().map(pose).collect::<Vec<_>>())
     };
+    // Quaternions of exactly unit length are read back bit by bit.
+    let in_space = |height: f64| {
+        let pose = |&frame: &usize| Pose3::translation(frame as f64, 0.5, height);
+        Some(frames.iter().map(pose).collect::<Vec<_>>())
+    };
     let numbers = |scale: f64| Some(frames.iter().map(|&f| scale * f as f64).collect());
     let matrix = |&frame: &usize| Matrix3::from_diagonal_element(1.0 + frame as f64);
     LocalizationResults {
@@ -29,6 +34,9 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
         estimates: poses(0.1),
         refined: poses(0.2),
         ground_truth: poses(0.3),
+        estimates_in_space: in_space(0.1),
+        refined_in_space: in_space(0.2),
+        ground_truth_in_space: in_space(0.3),
         odometry: poses(0.4),
         covariances: Some(frames.iter().map(matrix).collect()),
         refined_covariances: Some(frames.iter().map(|frame| 0.5 * matrix(frame)).collect()),

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::evaluation::{Summary, TrajectoryMetrics};
+use crate::evaluation::{SpatialMetrics, Summary, TrajectoryMetrics};
 
 /// The value of a metric.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -99,6 +99,32 @@ pub fn metric_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
         runtime_rows(metrics),
     ]
     .concat()
+}
+
+/// The rows of the errors in six degrees of freedom.
+pub fn spatial_rows(metrics: &SpatialMetrics) -> Vec<MetricRow> {
+    vec![
+        MetricRow::new(
+            "position in space RMSE [m]: root mean square of the distance to the true position",
+            metrics.position_m.rmse,
+        ),
+        MetricRow::new(
+            "height RMSE [m]: root mean square of the height difference",
+            metrics.height_m.rmse,
+        ),
+        MetricRow::new(
+            "height bias [m]: mean of the height difference; positive is above the truth",
+            metrics.height_bias_m,
+        ),
+        MetricRow::new(
+            "rotation RMSE [deg]: root mean square of the angle between the orientations",
+            metrics.rotation_rad.rmse.to_degrees(),
+        ),
+        MetricRow::new(
+            "rotation max [deg]: the worst frame",
+            metrics.rotation_rad.max.to_degrees(),
+        ),
+    ]
 }
 
 fn position_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {

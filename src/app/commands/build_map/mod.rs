@@ -5,6 +5,7 @@ mod cloud;
 mod files;
 mod parts;
 mod pictures;
+mod pose_check;
 mod report;
 
 use std::collections::BTreeMap;
@@ -110,9 +111,10 @@ fn open(config: &mut BuildMapConfig) -> Result<(Recording, Option<SensorDescript
         motion_compensation: &mut config.motion_compensation,
     };
     let (recording, sensor) = keys.resolve(recording)?;
+    pose_check::check(&recording)
+        .with_context(|| format!("pose_file is {}", pose_file.display()))?;
     Ok((recording.compensated_by_poses(), sensor))
 }
-
 
 /// The key scans that build the map, and those that are held out to evaluate it.
 fn hold_out(frames: &[Frame], config: &BuildMapConfig) -> (Vec<Frame>, Vec<Frame>) {

@@ -47,6 +47,9 @@ impl Run {
                 particles: ParticleLog::new(config.num_particles),
                 estimates: empty(),
                 ground_truth: config.pose_file.as_ref().map(|_| Vec::new()),
+                estimates_in_space: Some(Vec::new()),
+                refined_in_space: config.refine.then(Vec::new),
+                ground_truth_in_space: config.pose_file.as_ref().map(|_| Vec::new()),
                 odometry: empty(),
                 covariances: Some(Vec::new()),
                 times_s: Some(Vec::new()),
@@ -95,6 +98,7 @@ impl Run {
         push(&mut results.estimates, estimate.pose);
         if let Some(truth) = &frame.map_from_lidar {
             push(&mut results.ground_truth, pose2_from_pose3(truth));
+            push(&mut results.ground_truth_in_space, *truth);
         }
         push(
             &mut results.odometry,
@@ -108,11 +112,13 @@ impl Run {
         let refined_pose = refined.map_or(estimate.pose, |refined| refined.pose);
         let covariance = refined.map_or(estimate.covariance, |refined| refined.covariance);
         let in_space = refined.and_then(|refined| refined.map_from_lidar);
+        let refined_in_space = in_space.unwrap_or(estimate.map_from_lidar);
+        push(&mut results.estimates_in_space, estimate.map_from_lidar);
+        push(&mut results.refined_in_space, refined_in_space);
         push(&mut results.refined, refined_pose);
         push(&mut results.refined_covariances, covariance);
         push(&mut results.refine_runtimes_s, refine_runtime.as_secs_f64());
-        self.refined
-            .push(in_space.unwrap_or(estimate.map_from_lidar));
+        self.refined.push(refined_in_space);
         self.map_from_lidar.push(estimate.map_from_lidar);
         if let Some(movie) = &mut self.movie {
             movie.add(results, estimate)?;
