@@ -130,15 +130,18 @@ impl Recording {
     /// Opens a recording with the poses that it contains.
     pub fn open_with_poses(folder: &Path) -> Result<Self, RecordingError> {
         let recording = Self::open(folder, None, &Selection::default())?;
-        let track = recording.own_track()?;
+        let track = recording.own_track(None)?;
         recording.with_poses(track)
     }
 
-    /// The poses that belong to the recording by their names and places.
-    pub fn own_track(&self) -> Result<PoseTrack, RecordingError> {
+    /// The poses that belong to the recording by their names and places; in a bag, of a body on which the lidar is
+    /// mounted as given, else by the static transforms.
+    pub fn own_track(&self, body_from_lidar: Option<Pose3>) -> Result<PoseTrack, RecordingError> {
+        #[cfg(not(feature = "bags"))]
+        let _ = body_from_lidar;
         #[cfg(feature = "bags")]
         if let Some((bag, topic)) = &self.bag {
-            return PoseTrack::read_topic(bag, None, topic);
+            return PoseTrack::read_topic(bag, None, topic, body_from_lidar);
         }
         let Some(path) = &self.files.poses else {
             return Err(RecordingError::NoPoseFile {
@@ -245,7 +248,7 @@ mod tests {
 
     fn open(folder: &Path, selection: &Selection) -> Result<Recording, RecordingError> {
         let recording = Recording::open(folder, None, selection)?;
-        let track = recording.own_track()?;
+        let track = recording.own_track(None)?;
         recording.with_poses(track)
     }
 
@@ -339,7 +342,10 @@ mod tests {
         // One at the end is left out.
         let row = "1 0 0 0 0 1 0 0 0 0 1 0\n";
         fs::write(folder.path().join("poses.txt"), row.repeat(2)).unwrap();
-        assert_eq!(numbers(&open(folder.path(), &Selection::default()).unwrap()), [0, 1]);
+        assert_eq!(
+            numbers(&open(folder.path(), &Selection::default()).unwrap()),
+            [0, 1]
+        );
         let first = Selection {
             n_scans: 1,
             ..Selection::default()

@@ -62,13 +62,14 @@ impl PoseTrack {
         Self::of(path, body, calibration, times_s)
     }
 
-    /// Reads the poses of a topic of a bag, of the lidar or of a body on which it is mounted by the static
-    /// transforms.
+    /// Reads the poses of a topic of a bag, of the lidar or of a body on which it is mounted as given, else by the
+    /// static transforms.
     #[cfg(feature = "bags")]
     pub fn read_topic(
         bag: &Bag,
         topic: Option<&str>,
         scan_topic: &str,
+        body_from_lidar: Option<Pose3>,
     ) -> Result<Self, RecordingError> {
         let topic = &bag.topic(Wanted::Poses, topic)?.name;
         let rows = bag.poses(topic)?;
@@ -76,7 +77,11 @@ impl PoseTrack {
             let path = PathBuf::from(topic);
             return Err(RecordingError::NoPoses { path });
         };
-        let Some(body_from_lidar) = bag.body_from_lidar(&first.child, scan_topic)? else {
+        let found = match body_from_lidar {
+            Some(given) => Some(given),
+            None => bag.body_from_lidar(&first.child, scan_topic)?,
+        };
+        let Some(body_from_lidar) = found else {
             return Err(RecordingError::NoMounting {
                 topic: topic.clone(),
                 body: first.child.clone(),

@@ -57,7 +57,7 @@ fn recording(path: &Path) -> Result<String> {
         ),
     ];
     rows.extend(sensor_rows(&sensor));
-    let track = recording.own_track();
+    let track = recording.own_track(None);
     let poses = match &track {
         Ok(track) => track_in_words(track, &recording),
         Err(error) => error.to_string(),

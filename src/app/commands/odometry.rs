@@ -15,6 +15,9 @@ use crate::odometry::{Odometer, OdometryConfig};
 use crate::recording::layout::Layout;
 use crate::recording::{Frame, PoseTrack, Recording};
 
+/// Description of the odometry from the scans.
+const FROM_SCANS: &str = "from the scans";
+
 /// The motion `previous_from_current` into each frame.
 pub enum MotionSource {
     /// Known for all frames.
@@ -42,7 +45,7 @@ impl MotionSource {
             }
             // A bag may have a topic of odometry.
             (OdometrySource::Auto, None) if recording.files.layout == Layout::Bag => {
-                match recording.own_track() {
+                match inputs.own_track(recording) {
                     Ok(track) => Self::of_track(&track, recording)?,
                     Err(error) => {
                         tracing::info!(
@@ -90,10 +93,10 @@ impl MotionSource {
     }
 
     /// The motion into a frame by its row and scan; every scan has to be given, in order.
-    pub fn into_frame(&mut self, row: usize, frame: &Frame, scan: &Scan) -> Result<Option<Pose2>> {
+    pub fn motion_to(&mut self, row: usize, frame: &Frame, scan: &Scan) -> Result<Option<Pose2>> {
         Ok(match self {
             Self::Given(increments) => increments.get(row).copied(),
-            Self::Scans(odometry) => Some(odometry.into_frame(frame, scan)?),
+            Self::Scans(odometry) => Some(odometry.motion_to(frame, scan)?),
             Self::Unknown => None,
         })
     }
@@ -107,7 +110,7 @@ pub struct ScanOdometry {
 }
 
 impl ScanOdometry {
-    fn into_frame(&mut self, frame: &Frame, scan: &Scan) -> Result<Pose2> {
+    fn motion_to(&mut self, frame: &Frame, scan: &Scan) -> Result<Pose2> {
         let mut motion = Pose3::identity();
         while (self.skipped.front()).is_some_and(|between| between.number < frame.number) {
             if let Some(between) = self.skipped.pop_front() {
@@ -120,13 +123,25 @@ impl ScanOdometry {
 }
 
 /// Description of the odometry for reports.
-pub fn description(source: OdometrySource, file: Option<&Path>) -> String {
+pub fn description(
+    source: OdometrySource,
+    file: Option<&Path>,
+    inputs: &RecordingInputs,
+    recording: &Recording,
+) -> String {
     match (source, file) {
+        (OdometrySource::Auto, None) if recording.files.layout == Layout::Bag => {
+            let track = inputs.own_track(recording);
+            track.map_or_else(
+                |_unusable| FROM_SCANS.to_owned(),
+                |track| track.path.display().to_string(),
+            )
+        }
         (OdometrySource::None, _) => "none (constant velocity)".to_owned(),
         (OdometrySource::File | OdometrySource::Auto, Some(file)) => file.display().to_string(),
         (OdometrySource::GroundTruth, _) => {
             "ground truth with noise (a demonstration, as in range-mcl)".to_owned()
         }
-        _ => "from the scans".to_owned(),
+        _ => FROM_SCANS.to_owned(),
     }
 }

@@ -266,8 +266,8 @@ fn increments(
     )?;
     let frames = sequence.frames.iter().enumerate();
     let into_frame = |(row, frame): (usize, &Frame)| match &mut motion {
-        MotionSource::Scans(_) => motion.into_frame(row, frame, &frame.read()?),
-        _ => motion.into_frame(row, frame, &Scan::default()),
+        MotionSource::Scans(_) => motion.motion_to(row, frame, &frame.read()?),
+        _ => motion.motion_to(row, frame, &Scan::default()),
     };
     frames.map(into_frame).collect()
 }
@@ -304,7 +304,12 @@ fn write_run(
     run_output::write_results(files, results)?;
     run_output::write_trajectory(files, "refined", sequence, &refined.map_from_lidar)?;
     output::write_yaml(&files.file("effective_refinement.yml"), config)?;
-    let odometry = odometry::description(config.odometry, config.odometry_file.as_deref());
+    let odometry = odometry::description(
+        config.odometry,
+        config.odometry_file.as_deref(),
+        &recording_inputs(config),
+        sequence,
+    );
     let about = [
         ("recording", config.scan_folder.display().to_string()),
         ("map", config.map_file.display().to_string()),

@@ -62,11 +62,21 @@ impl<'a> RecordingInputs<'a> {
         Ok(Recording::open(self.scan_folder, self.topic, selection)?)
     }
 
+    /// The poses that the recording contains.
+    pub fn own_track(&self, recording: &Recording) -> Result<PoseTrack> {
+        Ok(recording.own_track(self.body_from_lidar.map(body_from_lidar))?)
+    }
+
     /// Reads poses of the recording from a file, or from a topic of its bag.
     pub fn track(&self, path: &Path, recording: &Recording) -> Result<PoseTrack> {
         #[cfg(feature = "bags")]
         if let (Some((bag, scan_topic)), true) = (&recording.bag, is_topic(path)) {
-            return Ok(PoseTrack::read_topic(bag, path.to_str(), scan_topic)?);
+            return Ok(PoseTrack::read_topic(
+                bag,
+                path.to_str(),
+                scan_topic,
+                self.body_from_lidar.map(body_from_lidar),
+            )?);
         }
         #[cfg(not(feature = "bags"))]
         let _ = recording;
@@ -180,7 +190,10 @@ pub struct SensorKeys<'a> {
 
 impl SensorKeys<'_> {
     /// Sets what is not given from the scans; returns the recording, whose points have times if they are known.
-    pub fn resolve(self, mut recording: Recording) -> Result<(Recording, Option<SensorDescription>)> {
+    pub fn resolve(
+        self,
+        mut recording: Recording,
+    ) -> Result<(Recording, Option<SensorDescription>)> {
         if self.motion_compensation.is_none() {
             recording = recording.compensated();
         }

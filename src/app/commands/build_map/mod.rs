@@ -97,7 +97,7 @@ fn open(config: &mut BuildMapConfig) -> Result<(Recording, Option<SensorDescript
     let recording = inputs.open(&config.selection())?;
     let track = match &config.pose_file {
         Some(path) => inputs.track(path, &recording)?,
-        None => recording.own_track()?,
+        None => inputs.own_track(&recording)?,
     };
     let pose_file = track.path.clone();
     let recording = recording.with_poses(track)?;

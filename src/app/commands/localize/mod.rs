@@ -169,7 +169,7 @@ fn localize<'a>(
         let mut process = || {
             let scan = frame.read()?;
             let started = Instant::now();
-            let increment = motion.into_frame(row, frame, &scan)?;
+            let increment = motion.motion_to(row, frame, &scan)?;
             let odometry = odometry_into(config.motion_model, increment, sequence, row);
             let estimate = localizer.step(&scan, odometry)?;
             let runtime = started.elapsed();
@@ -257,7 +257,7 @@ fn write_run(
 ) -> Result<Report> {
     let results = &run.results;
     warn_of_untracked_frames(results);
-    let mut about = about(config, context, map);
+    let mut about = about(config, context, map, sequence);
     about.insert("states".to_owned(), states_in_words(results));
     about.extend(run_output::shortfall(results));
     let report = run_output::evaluate(results, &RangeMclRules::default(), about)?;
@@ -312,8 +312,18 @@ fn warn_of_untracked_frames(results: &LocalizationResults) {
 }
 
 /// Description of the run for the report.
-fn about(config: &LocalizationConfig, context: &Context, map: &Map) -> BTreeMap<String, String> {
-    let odometry = odometry::description(config.odometry, config.odometry_file.as_deref());
+fn about(
+    config: &LocalizationConfig,
+    context: &Context,
+    map: &Map,
+    recording: &Recording,
+) -> BTreeMap<String, String> {
+    let odometry = odometry::description(
+        config.odometry,
+        config.odometry_file.as_deref(),
+        &recording_inputs(config),
+        recording,
+    );
     let particles = format!("{} reduced to {}", config.num_particles, config.num_reduced);
     [
         ("recording", config.scan_folder.display().to_string()),

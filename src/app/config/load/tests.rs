@@ -111,7 +111,10 @@ fn a_value_of_the_wrong_type_is_reported_with_line_key_and_value() {
     let message = message_of("pose_tracking: perhaps\n", &[]);
     assert_contains(&message, &["line 1", "pose_tracking", "True or False"]);
     let message = message_of("odometry: guess\n", &[]);
-    assert_contains(&message, &["line 1", "`guess`", "auto, scans, file, ground_truth, none"]);
+    assert_contains(
+        &message,
+        &["line 1", "`guess`", "auto, scans, file, ground_truth, none"],
+    );
 }
 
 #[test]
@@ -284,7 +287,10 @@ fn the_initialization_follows_from_pose_tracking_unless_it_is_given() {
             .initialization()
     };
     assert_eq!(start(""), Initialization::Extent);
-    assert_eq!(start("initial_pose: [1, 2, 90]\n"), Initialization::Tracking);
+    assert_eq!(
+        start("initial_pose: [1, 2, 90]\n"),
+        Initialization::Tracking
+    );
     assert_eq!(start("pose_tracking: True\n"), Initialization::Tracking);
     assert_eq!(start("pose_tracking: False\n"), Initialization::Corridor);
     assert_eq!(
