@@ -211,7 +211,7 @@ mod tests {
         let kept: Vec<usize> = (0..points.len()).filter(has_normal).collect();
         assert!(kept.len() > points.len() * 9 / 10);
         let points: Vec<Vec3> = kept.iter().map(|&i| points[i]).collect();
-        let sign = |i: usize| if i % 3 == 0 { -1.0 } else { 1.0 };
+        let sign = |i: usize| if i.is_multiple_of(3) { -1.0 } else { 1.0 };
         Unoriented {
             outward: kept.iter().map(|&i| outward[i]).collect(),
             normals: kept.iter().map(|&i| sign(i) * found[i].unwrap()).collect(),
