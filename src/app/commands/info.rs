@@ -145,8 +145,10 @@ fn map(path: &Path) -> Result<String> {
     });
     let [[x_min, x_max], [y_min, y_max], [low, high]] = extent;
     let path = match mapping_path {
-        Some(path) => format!("{} poses of the mapping drive", path.map_from_lidar.len()),
-        None => "none: a map of another program".to_owned(),
+        Some(path) if !path.map_from_lidar.is_empty() => {
+            format!("{} poses of the mapping drive", path.map_from_lidar.len())
+        }
+        _ => "none".to_owned(),
     };
     Ok(output::rows(&[
         ("triangles", mesh.triangles.len().to_string()),

@@ -20,7 +20,7 @@ pub struct RunSummary {
     pub first_tracked: Option<usize>,
     /// Length of the found path [m].
     pub path_m: f64,
-    /// Mean speed [m/s]; `None` without times.
+    /// Mean speed [m/s]; `None` without times, and if ten frames per second were assumed.
     pub speed_m_per_s: Option<f64>,
     /// Standard deviation of the position, larger axis [m].
     pub position_sigma_m: Option<Summary>,
@@ -47,13 +47,18 @@ impl RunSummary {
             .map(|(a, b)| (b.translation.vector - a.translation.vector).norm())
             .sum();
         let times_s = results.times_s.as_deref().unwrap_or_default();
+        let assumed =
+            |(frame, time_s): (&usize, &f64)| (*frame as f64 / 10.0 - time_s).abs() < 1e-9;
+        let are_assumed = results.frames.iter().zip(times_s).all(assumed);
         let duration_s = times_s.first().zip(times_s.last()).map(|(a, b)| b - a);
         Self {
             frames: results.len(),
             tracking: states.map(|_| tracked.len()),
             first_tracked: states.and_then(|_| Some(results.frames[*tracked.first()?])),
             path_m,
-            speed_m_per_s: duration_s.filter(|&s| s > 0.0).map(|s| path_m / s),
+            speed_m_per_s: duration_s
+                .filter(|&s| s > 0.0 && !are_assumed)
+                .map(|s| path_m / s),
             position_sigma_m: over_tracked(&|row| {
                 let position = covariance(row)?.fixed_view::<2, 2>(0, 0).into_owned();
                 Some(position.symmetric_eigenvalues().max().max(0.0).sqrt())
@@ -104,5 +109,50 @@ impl RunSummary {
             rows.push(MetricRow::new("agreement median: share of the beams above the road that end on a surface of the map, tracked frames", agreement.median));
         }
         rows
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_speed_needs_times_that_were_recorded() {
+        let estimates: Vec<Pose2> = (0..3)
+            .map(|row| Pose2::translation(2.0 * f64::from(row), 0.0))
+            .collect();
+        let speed = |times_s: [f64; 3]| {
+            let results = LocalizationResults {
+                frames: vec![1, 2, 3],
+                times_s: Some(times_s.to_vec()),
+                ..LocalizationResults::default()
+            };
+            RunSummary::of(&results, &estimates).speed_m_per_s
+        };
+        assert_eq!(speed([0.1, 0.2, 0.3]), None);
+        assert_eq!(speed([7.0, 7.5, 8.0]), Some(4.0));
+    }
+
+    #[test]
+    fn uncertainty_is_that_of_the_tracked_frames() {
+        let estimates = vec![Pose2::identity(); 2];
+        let results = LocalizationResults {
+            frames: vec![4, 5],
+            states: Some(vec![State::Lost as u8, State::Tracking as u8]),
+            covariances: Some(
+                [100.0, 4.0]
+                    .map(nalgebra::Matrix3::from_diagonal_element)
+                    .to_vec(),
+            ),
+            agreements: Some(vec![0.1, -1.0]),
+            ..LocalizationResults::default()
+        };
+        let summary = RunSummary::of(&results, &estimates);
+        assert_eq!(
+            (summary.tracking, summary.first_tracked),
+            (Some(1), Some(5))
+        );
+        assert!((summary.position_sigma_m.unwrap().max - 2.0).abs() < 1e-12);
+        assert_eq!(summary.agreement, None);
     }
 }
