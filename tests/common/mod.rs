@@ -288,6 +288,7 @@ depth: 6
 voxel_size: 0.2
 simplify_resolution: 0.5
 displacement_threshold_m: 0
+check_poses: False
 own_car_m: [-2.5, 2.7, -1.2, 1.2]
 motion_compensation: null
 range_image: {height: 32, width: 360, fov_up: 3, fov_down: -25, max_range: 50, min_range: 1}

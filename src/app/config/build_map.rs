@@ -103,6 +103,9 @@ pub struct BuildMapConfig {
     /// Largest distance between successive frames [m]; a larger one is an error of the poses.
     #[default(50.0)]
     pub max_step_m: f64,
+    /// Whether to compare the poses with the motion of some scans before anything is built.
+    #[default(true)]
+    pub check_poses: bool,
     /// Method of ground segmentation.
     pub ground_method: GroundMethod,
     /// Length of path that neighbouring local maps share [m].
