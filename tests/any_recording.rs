@@ -7,7 +7,7 @@ mod common;
 use std::fs;
 use std::path::Path;
 
-use common::{Fpmcl, fpmcl, json, real_recording, run, simulate_two_drives};
+use common::{Fpmcl, Output, fpmcl, json, real_recording, run, simulate_two_drives};
 use fpmcl::geometry::Pose3;
 use fpmcl::recording::PoseTrack;
 use fpmcl::recording::poses::read_tum;
@@ -180,32 +180,42 @@ fn poses_are_matched_by_time_and_their_absence_is_explained() {
         .fails_with(&["has no poses", "--poses"]);
 }
 
+/// Maps the even frames of a recording.
+fn map_even_frames(folder: &Path, recording: &str) -> Output {
+    fpmcl("build-map")
+        .in_folder(folder)
+        .with(recording)
+        .with("--output=map.ply")
+        .set("frame_step", "2")
+        .set("visualize", "False")
+        .succeeds()
+}
+
+/// Localizes the odd frames of a recording, whose true poses the arguments name, and returns the report.
+fn localize_odd_frames(folder: &Path, recording: &str, truth: &[String]) -> Value {
+    let call = localize(folder, recording, "r/r.npz")
+        .set("start_idx", "1")
+        .set("frame_step", "2");
+    truth.iter().fold(call, Fpmcl::with).succeeds();
+    json(&folder.join("r/report.json"))
+}
+
 #[test]
 fn a_real_drive_is_localized_without_any_key() {
     let Some(data) = real_recording("kitti-0926-drive-0005") else {
         return;
     };
     let folder = tempfile::tempdir().unwrap();
-    let folder = folder.path();
-    let data = data.display().to_string();
-    let build = ["build-map", &data, "--output", "map.ply"];
-    let keys = ["--set", "frame_step=2", "--set", "visualize=False"];
-    let output = fpmcl("").in_folder(folder);
-    let output = build
-        .iter()
-        .chain(&keys)
-        .fold(output, Fpmcl::with)
-        .succeeds();
+    let (folder, data) = (folder.path(), data.display().to_string());
+    let output = map_even_frames(folder, &data);
     for part in ["64 beams", "motion compensation: clockwise"] {
         assert!(output.stderr.contains(part), "{}", output.stderr);
     }
-    localize(folder, &data, "r/r.npz")
-        .set("start_idx", "1")
-        .set("frame_step", "2")
-        .with(format!("--truth={data}/poses.txt"))
-        .with(format!("--calib={data}/calib.txt"))
-        .succeeds();
-    let report = json(&folder.join("r/report.json"));
+    let truth = [
+        format!("--truth={data}/poses.txt"),
+        format!("--calib={data}/calib.txt"),
+    ];
+    let report = localize_odd_frames(folder, &data, &truth);
     let rmse = |quantity: &str| report["mcl"]["metrics"][quantity]["rmse"].as_f64().unwrap();
     assert!(rmse("position_m") < 0.012, "{} m", rmse("position_m"));
     assert!(rmse("heading_rad") < 3e-4, "{} rad", rmse("heading_rad"));
@@ -217,17 +227,10 @@ fn a_sensor_of_another_kind_is_found_anywhere_at_two_scans_a_second() {
         return;
     };
     let folder = tempfile::tempdir().unwrap();
-    let folder = folder.path();
-    let data = data.display().to_string();
-    let build = ["build-map", &data, "--output", "map.ply"];
-    let keys = ["--set", "frame_step=2", "--set", "visualize=False"];
-    run(folder, &[&build[..], &keys].concat());
-    localize(folder, &data, "r/r.npz")
-        .set("start_idx", "1")
-        .set("frame_step", "2")
-        .with(format!("--truth={data}/poses_tum.txt"))
-        .succeeds();
-    let report = json(&folder.join("r/report.json"));
+    let (folder, data) = (folder.path(), data.display().to_string());
+    map_even_frames(folder, &data);
+    let truth = [format!("--truth={data}/poses_tum.txt")];
+    let report = localize_odd_frames(folder, &data, &truth);
     assert_eq!(report["summary"]["tracking"], 16);
     let position = &report["mcl"]["metrics"]["position_m"];
     assert!(position["rmse"].as_f64().unwrap() < 0.05, "{position}");

@@ -11,7 +11,7 @@ use std::path::Path;
 
 use fpmcl::geometry::Vec3;
 use fpmcl::lidar::Scan;
-use fpmcl::recording::bags::{FramePose, Wanted};
+use fpmcl::recording::bags::{FramePose, TopicKind};
 use fpmcl::recording::{Bag, RecordingError, scan_files};
 use rayon::prelude::*;
 
@@ -82,12 +82,12 @@ fn recording(kind: Kind) -> Vec<Recorded> {
 type Content = (Vec<Scan>, Vec<FramePose>, Vec<FramePose>);
 
 fn content(bag: &Bag) -> Result<Content, RecordingError> {
-    let topic = &bag.topic(Wanted::Scans, None)?.name;
+    let topic = &bag.topic(TopicKind::Scans, None)?.name;
     let scans = 0..bag.scan_times(topic)?.len();
     let scans = scans
         .map(|scan| bag.read_scan(topic, scan))
         .collect::<Result<_, _>>()?;
-    let poses = bag.poses(&bag.topic(Wanted::Poses, None)?.name)?;
+    let poses = bag.poses(&bag.topic(TopicKind::Poses, None)?.name)?;
     Ok((scans, poses, bag.static_transforms()?))
 }
 
@@ -427,7 +427,7 @@ fn topics_that_cannot_be_taken_are_errors_that_list_the_others() {
         (poses[0].parent.as_str(), poses[0].child.as_str()),
         ("map", "")
     );
-    let message = bag.topic(Wanted::Scans, None).unwrap_err().to_string();
+    let message = bag.topic(TopicKind::Scans, None).unwrap_err().to_string();
     assert!(message.contains("has no topic of scans"), "{message}");
     assert!(
         message.contains("it has /one (geometry_msgs/msg/PoseStamped)"),
@@ -442,14 +442,16 @@ fn topics_that_cannot_be_taken_are_errors_that_list_the_others() {
     messages[4].topic = "/points_2";
     db3(&path, &messages);
     let bag = Bag::open(&path).unwrap();
-    let message = bag.topic(Wanted::Scans, None).unwrap_err().to_string();
+    let message = bag.topic(TopicKind::Scans, None).unwrap_err().to_string();
     assert!(message.contains("several topics of scans"), "{message}");
     assert!(
         message.contains("/points (sensor_msgs/msg/PointCloud2), /points_2"),
         "{message}"
     );
     assert_eq!(
-        bag.topic(Wanted::Scans, Some("/points_2")).unwrap().count,
+        bag.topic(TopicKind::Scans, Some("/points_2"))
+            .unwrap()
+            .count,
         1
     );
     let message = bag.read_scan("/points", 4).unwrap_err().to_string();

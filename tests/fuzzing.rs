@@ -134,10 +134,10 @@ fn bags_database() {
 /// Reads all scans, poses and transforms of a bag.
 #[cfg(feature = "bags")]
 fn read_bag(file: &Input) -> Result<(), String> {
-    use fpmcl::recording::bags::{Bag, Wanted};
+    use fpmcl::recording::bags::{Bag, TopicKind};
 
     let bag = Bag::open(file.path).map_err(text)?;
-    for topic in bag.topics_of(Wanted::Scans) {
+    for topic in bag.topics_of(TopicKind::Scans) {
         for scan in 0..bag.scan_times(&topic.name).unwrap().len() {
             let scan = bag.read_scan(&topic.name, scan).map_err(text)?;
             assert_eq!(scan.points.len(), scan.intensities.len());
@@ -147,7 +147,7 @@ fn read_bag(file: &Input) -> Result<(), String> {
             assert!(scan.times_s.iter().all(|time_s| time_s.abs() <= 0.51));
         }
     }
-    for topic in bag.topics_of(Wanted::Poses) {
+    for topic in bag.topics_of(TopicKind::Poses) {
         for pose in bag.poses(&topic.name).map_err(text)? {
             check_pose(&pose.parent_from_child);
         }

@@ -24,6 +24,9 @@ use serde::{Deserialize, Serialize};
 use super::scan::Scan;
 use crate::geometry::{Pose3, Rigid3f};
 
+/// Duration of a revolution, and time between scans, where nothing shows it [s].
+pub const PERIOD_S: f64 = 0.1;
+
 /// Direction of rotation of a spinning sensor, seen from above.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

@@ -7,9 +7,9 @@ pub mod range_image;
 pub mod scan;
 pub mod spatial_normals;
 
-pub use deskewing::{Motion, Rotation, RotationDirection, Sweep, interpolate_motion};
+pub use deskewing::{Motion, PERIOD_S, Rotation, RotationDirection, Sweep, interpolate_motion};
 pub use model::LidarModel;
 pub use normals::{NormalConfig, estimate_normals};
 pub use range_image::{NO_RETURN, RangeImage};
-pub use scan::{Beam, Scan};
+pub use scan::{Beam, Scan, interval_s};
 pub use spatial_normals::estimate_spatial_normals;

@@ -101,6 +101,12 @@ impl Scan {
     }
 }
 
+/// Time between two moments of scans, in whole microseconds, so that the same scans of different files have the
+/// same intervals [s].
+pub fn interval_s(earlier_s: f64, later_s: f64) -> f64 {
+    1e-6 * (1e6 * (later_s - earlier_s)).round()
+}
+
 /// Keeps the values whose flag is set.
 fn retain_flagged<T>(values: &mut Vec<T>, keep: &[bool]) {
     let mut flags = keep.iter();

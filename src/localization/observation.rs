@@ -164,7 +164,7 @@ pub fn choose_beams(
 
 /// Samples about `count` members of a list of pixels, evenly spread over the rows; the whole list if it is shorter.
 ///
-/// The pixel of a column c is chosen if frac(c φ + u) is less than the share of the list that is wanted, with the golden
+/// The pixel of a column c is chosen if frac(c φ + u) is less than the requested share of the list, with the golden
 /// ratio φ, whose multiples are spread most evenly, and a random u for each row. Whether a pixel is chosen
 /// hardly depends on the others, so that almost equal scans give almost equal samples.
 fn evenly_spread(list: &[usize], count: usize, width: usize, rng: &mut impl Rng) -> Vec<usize> {

@@ -10,10 +10,9 @@
 //! The pose of this frame is found first with the scan deskewed by m', then again with v. Odometry is used
 //! until there are two frames in a row in which the filter was tracking.
 
-use super::filter::PERIOD_S;
 use super::odometry::Odometry;
 use crate::geometry::{Pose3, pose3_from_pose2};
-use crate::lidar::{Motion, Scan, interpolate_motion};
+use crate::lidar::{Motion, PERIOD_S, Scan, interpolate_motion, interval_s};
 
 /// The motion of the sensor, updated frame by frame.
 #[derive(Clone, Debug, Default)]
@@ -29,8 +28,8 @@ pub struct SweepMotion {
 impl SweepMotion {
     /// Time since the last frame [s].
     pub fn duration_s(&self, scan: &Scan) -> f64 {
-        let times_s = scan.time_s.zip(self.last_time_s);
-        let since = times_s.map(|(now_s, last_s)| 1e-6 * (1e6 * (now_s - last_s)).round());
+        let times_s = self.last_time_s.zip(scan.time_s);
+        let since = times_s.map(|(last_s, now_s)| interval_s(last_s, now_s));
         since.filter(|&s| s > 0.0).unwrap_or(PERIOD_S)
     }
 

@@ -53,7 +53,7 @@ pub struct OdometryConfig {
     /// Largest increase of this cost above the mean of the last steps, 0 to 1 (unitless).
     #[default(0.2)]
     pub max_cost_increase: f64,
-    /// Number of scans in turn that do not fit, after which the local map begins anew.
+    /// Number of scans in turn that do not fit, after which the local map restarts.
     #[default(10)]
     pub restart_after: usize,
     /// Duration between scans that have no times [s].

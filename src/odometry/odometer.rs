@@ -7,7 +7,7 @@ use nalgebra::{Matrix6, Vector6};
 use super::config::OdometryConfig;
 use super::state::State;
 use crate::geometry::Pose3;
-use crate::lidar::Scan;
+use crate::lidar::{Scan, interval_s};
 use crate::validation::{InvalidValue, Validate as _};
 
 /// A scan that cannot be the next one.
@@ -33,7 +33,7 @@ pub enum StepState {
     /// Registered to the local map.
     Registered,
     /// Predicted by constant velocity; the scan is not mapped. It has too few points, it does not fit the local
-    /// map, or the motion to where it fits is impossible. After several in turn the local map begins anew.
+    /// map, or the motion to where it fits is impossible. After several in turn the local map is started again.
     Predicted,
 }
 
@@ -103,7 +103,7 @@ impl Odometer {
         let (Some(previous_s), Some(time_s)) = (self.time_s, scan.time_s) else {
             return Ok(self.config.period_s);
         };
-        let duration_s = 1e-6 * (1e6 * (time_s - previous_s)).round();
+        let duration_s = interval_s(previous_s, time_s);
         match duration_s > 0.0 && duration_s.is_finite() {
             true => Ok(duration_s),
             false => Err(OdometryError::TimeNotAscending { previous_s, time_s }),

@@ -256,7 +256,7 @@ impl State {
             .remove_beyond(center, config.map_radius_share * self.range_m);
     }
 
-    /// Moves by the prediction. After several scans in turn that do not fit, the local map begins anew with this one.
+    /// Moves by the prediction. After several scans in turn that do not fit, the local map restarts with this one.
     pub fn coast(&mut self, scan: &Scan, duration_s: f64, config: &OdometryConfig) {
         self.odom_from_lidar = self.predicted(duration_s);
         self.missed += 1;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 #[cfg(feature = "bags")]
-use super::bags::{Bag, Wanted, is_bag};
+use super::bags::{Bag, TopicKind, is_bag};
 use super::calibration::Calibration;
 use super::error::RecordingError;
 use super::frame::{Frame, ScanSource};
@@ -101,7 +101,7 @@ impl Recording {
         selection: &Selection,
     ) -> Result<Self, RecordingError> {
         let bag = Arc::new(Bag::open(path)?);
-        let topic: Arc<str> = bag.topic(Wanted::Scans, topic)?.name.as_str().into();
+        let topic: Arc<str> = bag.topic(TopicKind::Scans, topic)?.name.as_str().into();
         let times_s = bag.scan_times(&topic)?;
         let moment_s = bag.read_scan(&topic, 0)?.time_s;
         let later_s = moment_s.map_or(0.0, |moment_s| moment_s - times_s[0]);

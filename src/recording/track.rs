@@ -6,14 +6,14 @@
 use std::path::{Path, PathBuf};
 
 #[cfg(feature = "bags")]
-use super::bags::{Bag, Wanted};
+use super::bags::{Bag, TopicKind};
 use super::calibration::Calibration;
 use super::error::RecordingError;
 use super::frame::Frame;
 use super::oxts;
 use super::poses::{CameraPoses, ascending, read_rows_of_poses, read_times};
 use crate::geometry::Pose3;
-use crate::lidar::{Motion, interpolate_motion};
+use crate::lidar::{Motion, PERIOD_S, interpolate_motion};
 
 /// Longest time between two rows across which poses are interpolated [s].
 const MAX_GAP_S: f64 = 2.0;
@@ -71,7 +71,7 @@ impl PoseTrack {
         scan_topic: &str,
         body_from_lidar: Option<Pose3>,
     ) -> Result<Self, RecordingError> {
-        let topic = &bag.topic(Wanted::Poses, topic)?.name;
+        let topic = &bag.topic(TopicKind::Poses, topic)?.name;
         let rows = bag.poses(topic)?;
         let Some(first) = rows.first() else {
             let path = PathBuf::from(topic);
@@ -209,15 +209,15 @@ impl PoseTrack {
         let poses = &self.map_from_lidar;
         let Some(times_s) = self.times_s.as_ref().filter(|_| have_times) else {
             let pose = *poses.get(frame.number)?;
-            let seconds: Vec<f64>;
-            let times_s = match &self.times_s {
-                Some(times_s) => times_s,
-                None => {
-                    seconds = (0..poses.len()).map(|row| 0.1 * row as f64).collect();
-                    &seconds
-                }
+            let first = frame.number.saturating_sub(1);
+            let around = first..(frame.number + 2).min(poses.len());
+            let assumed_s = |row| PERIOD_S * row as f64;
+            let times_s: Vec<f64> = match &self.times_s {
+                Some(times_s) => times_s[around.clone()].to_vec(),
+                None => around.clone().map(assumed_s).collect(),
             };
-            return Some((pose, Motion::along(poses, times_s, frame.number)));
+            let motion = Motion::along(&poses[around], &times_s, frame.number - first);
+            return Some((pose, motion));
         };
         /// Differences of clocks and rounded times [s].
         const SAME_S: f64 = 1e-4;

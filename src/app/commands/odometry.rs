@@ -1,7 +1,7 @@
 //! Source of the motion between frames, and its description in reports.
 
 use std::collections::VecDeque;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
 use rand::Rng;
@@ -15,9 +15,6 @@ use crate::odometry::{Odometer, OdometryConfig};
 use crate::recording::layout::Layout;
 use crate::recording::{Frame, PoseTrack, Recording};
 
-/// Description of the odometry from the scans.
-const FROM_SCANS: &str = "from the scans";
-
 /// The motion `previous_from_current` into each frame.
 pub enum MotionSource {
     /// Known for all frames.
@@ -29,15 +26,16 @@ pub enum MotionSource {
 }
 
 impl MotionSource {
-    /// Opens the configured source for the frames of a recording.
+    /// Opens the configured source for the frames of a recording; returns also the file or, in a bag, the topic that
+    /// is used.
     pub fn open(
         source: OdometrySource,
-        file: Option<&Path>,
+        file: Option<PathBuf>,
         inputs: &RecordingInputs,
         recording: &Recording,
         rng: &mut impl Rng,
-    ) -> Result<Self> {
-        Ok(match (source, file) {
+    ) -> Result<(Self, Option<PathBuf>)> {
+        let motion = match (source, &file) {
             (OdometrySource::None, _) => Self::Unknown,
             (OdometrySource::File | OdometrySource::Auto, Some(file)) => {
                 inputs.require_poses("odometry_file", file)?;
@@ -46,7 +44,9 @@ impl MotionSource {
             // A bag may have a topic of odometry.
             (OdometrySource::Auto, None) if recording.files.layout == Layout::Bag => {
                 match inputs.own_track(recording) {
-                    Ok(track) => Self::of_track(&track, recording)?,
+                    Ok(track) => {
+                        return Ok((Self::of_track(&track, recording)?, Some(track.path)));
+                    }
                     Err(error) => {
                         tracing::info!(
                             "odometry from the scans, because the bag has none to use: {error}"
@@ -64,7 +64,8 @@ impl MotionSource {
                 Self::Given(with_noise(&increments, &demonstration_noise(), rng))
             }
             _ => Self::of_scans(recording)?,
-        })
+        };
+        Ok((motion, file))
     }
 
     fn of_scans(recording: &Recording) -> Result<Self> {
@@ -123,25 +124,13 @@ impl ScanOdometry {
 }
 
 /// Description of the odometry for reports.
-pub fn description(
-    source: OdometrySource,
-    file: Option<&Path>,
-    inputs: &RecordingInputs,
-    recording: &Recording,
-) -> String {
+pub fn description(source: OdometrySource, file: Option<&Path>) -> String {
     match (source, file) {
-        (OdometrySource::Auto, None) if recording.files.layout == Layout::Bag => {
-            let track = inputs.own_track(recording);
-            track.map_or_else(
-                |_unusable| FROM_SCANS.to_owned(),
-                |track| track.path.display().to_string(),
-            )
-        }
         (OdometrySource::None, _) => "none (constant velocity)".to_owned(),
         (OdometrySource::File | OdometrySource::Auto, Some(file)) => file.display().to_string(),
         (OdometrySource::GroundTruth, _) => {
             "ground truth with noise (a demonstration, as in range-mcl)".to_owned()
         }
-        _ => FROM_SCANS.to_owned(),
+        _ => "from the scans".to_owned(),
     }
 }

@@ -10,7 +10,6 @@ use super::claims::{Claims, Outputs};
 use super::interrupt::Interrupted;
 use super::odometry::MotionSource;
 use super::run_output::{self, REFINEMENT_FILES, REPORT_FILES, RunFiles};
-use super::stages::{MapInputs, RecordingInputs, SensorKeys};
 use super::{Context, input, odometry, output, run_page};
 use crate::app::config::{self, LocalizationConfig, OdometrySource, RefinementConfig};
 use crate::app::results::{LocalizationResults, Report};
@@ -22,6 +21,7 @@ use crate::localization::State;
 use crate::localization::odometry::demonstration_noise;
 use crate::map::Map;
 use crate::random::stream;
+use crate::recording::layout::Layout;
 use crate::recording::{Frame, Recording};
 use crate::refinement::{
     InitialEstimate, RefinedTrajectory, RefinerConfig, SmoothingConfig, TrajectoryRefiner,
@@ -34,7 +34,7 @@ const ODOMETRY_STREAM: u64 = u64::MAX;
 pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
     input::require_file("map_file", &config.map_file)?;
-    recording_inputs(config).require()?;
+    config.recording_inputs().require()?;
     let files = RunFiles::beside(&config.result_file);
     let main = files.file("effective_refinement.yml");
     let mut claims = prepare(config, context, &main)?;
@@ -46,9 +46,9 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
         config.result_file.display()
     );
     run_output::warn_of_shortfall(&results, &config.result_file);
-    let map = map_inputs(config).load(None, context)?;
+    let map = config.map_inputs().load(None, context)?;
     let mut resolved = config.clone();
-    let sequence = open(&mut resolved, &map)?;
+    let sequence = resolved.open_in_map(&map)?;
     let config = &resolved;
     let sequence = frames_of(sequence, &results, config)?;
     let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
@@ -89,11 +89,6 @@ pub fn base_config(result: Option<&Path>) -> RefinementConfig {
 
 /// Prepares the outputs; the effective configuration is the main one, as the result exists already.
 fn prepare(config: &RefinementConfig, context: &Context, main: &Path) -> Result<Claims> {
-    let mut inputs = map_inputs(config).files();
-    inputs.extend(recording_inputs(config).files());
-    let odometry = config.odometry_file.as_deref();
-    inputs.extend(odometry.map(|path| ("odometry_file", path)));
-    inputs.extend(context.input());
     ensure!(
         fs::symlink_metadata(&config.result_file)?.is_file(),
         "result_file is {}, which is not a regular file; refine replaces it: give the path of the file itself",
@@ -107,47 +102,12 @@ fn prepare(config: &RefinementConfig, context: &Context, main: &Path) -> Result<
         main,
         magic: None,
         names: names.into_iter().map(str::to_owned).collect(),
-        inputs,
+        inputs: config.input_files(context),
         force: true,
     };
     let claims = outputs.prepare()?;
     remove_abandoned(&config.result_file)?;
     Ok(claims)
-}
-
-/// Opens the selected frames, with the true poses in the frame of the map, and completes the configuration by
-/// what the scans show about the sensor.
-fn open(config: &mut RefinementConfig, map: &Map) -> Result<Recording> {
-    let inputs = recording_inputs(config);
-    let mut recording = inputs.open(&config.selection())?;
-    if let Some(pose_file) = &config.pose_file {
-        let track = inputs.track(pose_file, &recording)?;
-        recording = recording.with_poses(track.in_map(&map.path.world_from_map))?;
-    }
-    let keys = SensorKeys {
-        range_image: &mut config.range_image,
-        own_car_m: &mut config.own_car_m,
-        motion_compensation: &mut config.motion_compensation,
-    };
-    Ok(keys.resolve(recording)?.0)
-}
-
-fn map_inputs(config: &RefinementConfig) -> MapInputs<'_> {
-    MapInputs {
-        map_file: &config.map_file,
-        map_pose_file: config.map_pose_file.as_deref(),
-        map_calib_file: config.map_calib_file.as_deref(),
-    }
-}
-
-fn recording_inputs(config: &RefinementConfig) -> RecordingInputs<'_> {
-    RecordingInputs {
-        scan_folder: &config.scan_folder,
-        topic: config.topic.as_deref(),
-        pose_file: config.pose_file.as_deref(),
-        calib_file: config.calib_file.as_deref(),
-        body_from_lidar: config.body_from_lidar,
-    }
 }
 
 /// The frames of the sequence that the result contains, in its order.
@@ -257,10 +217,10 @@ fn increments(
     if let (Some(recorded), false) = (&results.odometry, is_new) {
         return Ok(recorded.iter().copied().map(Some).collect());
     }
-    let mut motion = MotionSource::open(
+    let (mut motion, _file) = MotionSource::open(
         config.odometry,
-        config.odometry_file.as_deref(),
-        &recording_inputs(config),
+        config.odometry_file.clone(),
+        &config.recording_inputs(),
         sequence,
         &mut stream(config.seed, ODOMETRY_STREAM),
     )?;
@@ -304,12 +264,13 @@ fn write_run(
     run_output::write_results(files, results)?;
     run_output::write_trajectory(files, "refined", sequence, &refined.map_from_lidar)?;
     output::write_yaml(&files.file("effective_refinement.yml"), config)?;
-    let odometry = odometry::description(
-        config.odometry,
-        config.odometry_file.as_deref(),
-        &recording_inputs(config),
-        sequence,
-    );
+    let odometry = match (config.odometry, &config.odometry_file) {
+        // It may be that of a topic.
+        (OdometrySource::Auto, None) if sequence.files.layout == Layout::Bag => {
+            "that of the localization".to_owned()
+        }
+        (source, file) => odometry::description(source, file.as_deref()),
+    };
     let about = [
         ("recording", config.scan_folder.display().to_string()),
         ("map", config.map_file.display().to_string()),

@@ -5,8 +5,11 @@ use std::path::Path;
 use anyhow::{Context as _, Result};
 
 use super::{Context, input};
-use crate::app::config::{MotionCompensation, RangeImageConfig, body_from_lidar};
-use crate::lidar::{LidarModel, Scan};
+use crate::app::config::{
+    BuildMapConfig, LocalizationConfig, MotionCompensation, RangeImageConfig, RefinementConfig,
+    body_from_lidar,
+};
+use crate::lidar::{LidarModel, PERIOD_S, Scan};
 use crate::map::scan_cloud::ScanConfig;
 use crate::map::{Map, MapOptions, MappingPath, mesh_file};
 use crate::odometry::{OdometryConfig, TimingComparison, compare_timings};
@@ -210,11 +213,7 @@ impl SensorKeys<'_> {
             warn_of_contradiction(&recording, configured)?;
         }
         if is_complete && !is_auto {
-            let period_s = period_s(&recording);
-            let rotation = self
-                .motion_compensation
-                .and_then(|it| it.rotation(period_s));
-            return Ok((recording.rotating(rotation), None));
+            return Ok((rotating(recording, *self.motion_compensation), None));
         }
         let scans = sample(&recording)?;
         let sensor = sensor::infer(&scans);
@@ -225,7 +224,7 @@ impl SensorKeys<'_> {
             true => sensor.own_car_m,
             false => default_m,
         };
-        *self.own_car_m = Some(self.own_car_m.unwrap_or(own_car_m));
+        let own_car_m = *self.own_car_m.get_or_insert(own_car_m);
         warn_of_dropped_points(&scans, &self.range_image.model(), own_car_m);
         if is_auto && scans.iter().all(|scan| scan.times_s.is_empty()) {
             let is_spinning = sensor.has_rows && sensor.horizontal_fov_deg > SPINNING_DEG;
@@ -234,13 +233,85 @@ impl SensorKeys<'_> {
                 false => None,
             };
         }
-        let period_s = period_s(&recording);
-        let rotation = self
-            .motion_compensation
-            .and_then(|it| it.rotation(period_s));
-        Ok((recording.rotating(rotation), Some(sensor)))
+        Ok((rotating(recording, *self.motion_compensation), Some(sensor)))
     }
 }
+
+/// The recording, whose points have times from the rotation of the sensor where the data have none.
+fn rotating(recording: Recording, compensation: Option<MotionCompensation>) -> Recording {
+    let period_s = period_s(&recording);
+    let rotation = compensation.and_then(|it| it.rotation(period_s));
+    recording.rotating(rotation)
+}
+
+/// Adds the inputs of a configuration that names a recording and its sensor.
+macro_rules! recording_inputs {
+    ($($config:ty),*) => {
+        $(impl $config {
+            /// The recording with its poses.
+            pub fn recording_inputs(&self) -> RecordingInputs<'_> {
+                RecordingInputs {
+                    scan_folder: &self.scan_folder,
+                    topic: self.topic.as_deref(),
+                    pose_file: self.pose_file.as_deref(),
+                    calib_file: self.calib_file.as_deref(),
+                    body_from_lidar: self.body_from_lidar,
+                }
+            }
+
+            /// The keys of the sensor.
+            pub fn sensor_keys(&mut self) -> SensorKeys<'_> {
+                SensorKeys {
+                    range_image: &mut self.range_image,
+                    own_car_m: &mut self.own_car_m,
+                    motion_compensation: &mut self.motion_compensation,
+                }
+            }
+        })*
+    };
+}
+
+recording_inputs!(BuildMapConfig, LocalizationConfig, RefinementConfig);
+
+/// Adds the inputs of a configuration that names also a map.
+macro_rules! inputs_in_map {
+    ($($config:ty),*) => {
+        $(impl $config {
+            /// The map.
+            pub fn map_inputs(&self) -> MapInputs<'_> {
+                MapInputs {
+                    map_file: &self.map_file,
+                    map_pose_file: self.map_pose_file.as_deref(),
+                    map_calib_file: self.map_calib_file.as_deref(),
+                }
+            }
+
+            /// All input files and their keys.
+            pub fn input_files<'a>(&'a self, context: &'a Context) -> Vec<(&'static str, &'a Path)> {
+                let mut files = self.map_inputs().files();
+                files.extend(self.recording_inputs().files());
+                let odometry = self.odometry_file.as_deref();
+                files.extend(odometry.map(|path| ("odometry_file", path)));
+                files.extend(context.input());
+                files
+            }
+
+            /// Opens the selected frames, with the true poses in the frame of the map, and completes the
+            /// configuration by what the scans show about the sensor.
+            pub fn open_in_map(&mut self, map: &Map) -> Result<Recording> {
+                let inputs = self.recording_inputs();
+                let mut recording = inputs.open(&self.selection())?;
+                if let Some(pose_file) = &self.pose_file {
+                    let track = inputs.track(pose_file, &recording)?;
+                    recording = recording.with_poses(track.in_map(&map.path.world_from_map))?;
+                }
+                Ok(self.sensor_keys().resolve(recording)?.0)
+            }
+        })*
+    };
+}
+
+inputs_in_map!(LocalizationConfig, RefinementConfig);
 
 /// Horizontal field of view from which on a sensor is taken for one that spins [deg].
 const SPINNING_DEG: f32 = 300.0;
@@ -333,9 +404,6 @@ fn compared_timings(recording: &Recording) -> Result<Option<TimingComparison>> {
         &OdometryConfig::default(),
     )?))
 }
-
-/// Duration of a revolution where nothing shows it [s].
-const PERIOD_S: f64 = 0.1;
 
 /// Some scans, spread over the recording.
 pub fn sample(recording: &Recording) -> Result<Vec<Scan>> {

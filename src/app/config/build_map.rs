@@ -215,6 +215,7 @@ impl Validate for BuildMapConfig {
         optional_path("cloud_file", self.cloud_file.as_deref())?;
         path("mesh_file", &self.mesh_file)?;
         self.selection().validate()?;
+        self.range_image.without_batches()?;
         in_range("depth", self.depth, PoissonConfig::DEPTHS)?;
         color("ground_color", self.ground_color)?;
         color("rest_color", self.rest_color)?;

@@ -115,6 +115,19 @@ impl RangeImageConfig {
         };
     }
 
+    /// Requires that the keys of the batches, which only `localize` renders, are not given.
+    pub(super) fn without_batches(&self) -> Result<(), InvalidValue> {
+        const REMEDY: &str = "only localize renders in batches; remove the key";
+        if let Some(value) = self.max_instance {
+            return Err(InvalidValue::new("range_image.max_instance", value, REMEDY));
+        }
+        let Some(value) = self.render_instanced else {
+            return Ok(());
+        };
+        let key = "range_image.render_instanced";
+        Err(InvalidValue::new(key, value, REMEDY))
+    }
+
     /// Number of particles that are rendered at once.
     pub fn batch_size(&self) -> usize {
         match self.render_instanced {

@@ -86,7 +86,11 @@ impl RefinementConfig {
     /// classifier and observation model.
     pub fn of(localization: LocalizationConfig) -> Self {
         Self {
-            range_image: localization.range_image,
+            range_image: RangeImageConfig {
+                max_instance: None,
+                render_instanced: None,
+                ..localization.range_image
+            },
             scan_folder: localization.scan_folder,
             topic: localization.topic,
             body_from_lidar: localization.body_from_lidar,
@@ -167,6 +171,7 @@ impl Validate for RefinementConfig {
         self.selection().validate()?;
         (self.odometry).validate(self.odometry_file.as_deref(), self.pose_file.as_deref())?;
         nested("range_image", &self.range_image)?;
+        self.range_image.without_batches()?;
         self.refiner().validate()
     }
 }

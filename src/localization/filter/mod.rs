@@ -20,7 +20,7 @@ mod resample;
 mod reweight;
 mod step;
 
-pub use state::{PERIOD_S, ParticleFilter};
+pub use state::ParticleFilter;
 
 #[cfg(test)]
 mod filter_tests;

@@ -5,16 +5,13 @@ use std::time::Duration;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::geometry::Pose2;
+use crate::lidar::PERIOD_S;
 use crate::localization::config::LocalizerConfig;
 use crate::localization::convergence::is_narrow;
 use crate::localization::estimate::Estimate;
 use crate::localization::particles::ParticleSet;
 use crate::localization::tracking_loss::{AgreementMonitor, State};
 use crate::map::{GroundPatch, Map, PanoramaRequest, SensorAttitude};
-
-/// Time between frames for which the noise without odometry is given, and which is assumed where times are
-/// unknown [s].
-pub const PERIOD_S: f64 = 0.1;
 
 /// A distribution over planar poses, `map_from_lidar`, updated frame by frame.
 pub struct ParticleFilter {

@@ -4,9 +4,9 @@ use std::time::Duration;
 
 use rand::Rng;
 
-use super::state::{PERIOD_S, ParticleFilter};
+use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3};
-use crate::lidar::{Beam, RangeImage};
+use crate::lidar::{Beam, PERIOD_S, RangeImage};
 use crate::localization::convergence::is_converged;
 use crate::localization::estimate::Estimate;
 use crate::localization::motion::{TurnDriveTurn, VelocityCommand};

@@ -41,16 +41,16 @@ pub fn is_bag(path: &Path) -> bool {
     EXTENSIONS.contains(&format.as_str()) || path.join("metadata.yaml").exists()
 }
 
-/// Topics that a bag is searched for.
+/// What the messages of a topic contain.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Wanted {
+pub enum TopicKind {
     /// Scans: `sensor_msgs/PointCloud2` and `CustomMsg` of Livox.
     Scans,
     /// Poses: `nav_msgs/Odometry`, `geometry_msgs/PoseStamped`, `PoseWithCovarianceStamped` and `TransformStamped`.
     Poses,
 }
 
-impl Wanted {
+impl TopicKind {
     fn includes(self, topic: &Topic) -> bool {
         let contents: &[Content] = match self {
             Self::Scans => &[Content::PointCloud, Content::LivoxCloud],
@@ -117,19 +117,19 @@ impl Bag {
     }
 
     /// The topics of a kind.
-    pub fn topics_of(&self, wanted: Wanted) -> impl Iterator<Item = &Topic> {
-        (self.topics.iter()).filter(move |topic| wanted.includes(topic))
+    pub fn topics_of(&self, kind: TopicKind) -> impl Iterator<Item = &Topic> {
+        (self.topics.iter()).filter(move |topic| kind.includes(topic))
     }
 
     /// The topic of a kind that is named, or the only one.
-    pub fn topic(&self, wanted: Wanted, name: Option<&str>) -> Result<&Topic, RecordingError> {
-        let mut found = self.topics_of(wanted);
-        let (path, types) = (self.path.clone(), wanted.types());
+    pub fn topic(&self, kind: TopicKind, name: Option<&str>) -> Result<&Topic, RecordingError> {
+        let mut found = self.topics_of(kind);
+        let (path, types) = (self.path.clone(), kind.types());
         let list = |topics: &mut dyn Iterator<Item = &Topic>| {
             let names = topics.map(|topic| format!("{} ({})", topic.name, topic.message_type));
             names.collect::<Vec<_>>().join(", ")
         };
-        let known = list(&mut self.topics_of(wanted));
+        let known = list(&mut self.topics_of(kind));
         if known.is_empty() {
             let found = list(&mut self.topics.iter());
             return Err(RecordingError::NoTopic { path, types, found });
@@ -154,7 +154,7 @@ impl Bag {
     /// When the scans of a topic were logged [s], ascending. What [`read_scan`](Self::read_scan) returns
     /// has the time of its stamp and its points.
     pub fn scan_times(&self, topic: &str) -> Result<Vec<f64>, RecordingError> {
-        let messages = &self.topic(Wanted::Scans, Some(topic))?.messages;
+        let messages = &self.topic(TopicKind::Scans, Some(topic))?.messages;
         Ok(messages.iter().map(Message::time_s).collect())
     }
 
@@ -163,7 +163,7 @@ impl Bag {
     /// If the points have times, the moment of the scan is the middle of its sweep, else its stamp.
     /// Intensities are as in the message, 0 where it has none.
     pub fn read_scan(&self, topic: &str, scan: usize) -> Result<Scan, RecordingError> {
-        let topic = self.topic(Wanted::Scans, Some(topic))?;
+        let topic = self.topic(TopicKind::Scans, Some(topic))?;
         let read = self.parse(topic, scan, |message, log_s| {
             let mut fields = Fields::new(message, topic.serialization)?;
             let content = topic.content.unwrap_or(Content::PointCloud);
@@ -181,7 +181,7 @@ impl Bag {
 
     /// Name of the frame of the scans of a topic, from the first of them.
     pub fn scan_frame(&self, topic: &str) -> Result<String, RecordingError> {
-        let topic = self.topic(Wanted::Scans, Some(topic))?;
+        let topic = self.topic(TopicKind::Scans, Some(topic))?;
         self.parse(topic, 0, |message, _log_s| {
             let header = Header::read(&mut Fields::new(message, topic.serialization)?)?;
             Ok(header.frame)
@@ -190,7 +190,7 @@ impl Bag {
 
     /// Reads the poses of a topic, by time.
     pub fn poses(&self, topic: &str) -> Result<Vec<FramePose>, RecordingError> {
-        let mut poses = self.poses_of(self.topic(Wanted::Poses, Some(topic))?)?;
+        let mut poses = self.poses_of(self.topic(TopicKind::Poses, Some(topic))?)?;
         poses.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
         Ok(poses)
     }

@@ -4,21 +4,9 @@ use anyhow::Result;
 
 use crate::app::commands::Context;
 use crate::app::commands::claims::{Claims, Outputs, PLY};
-use crate::app::commands::stages::RecordingInputs;
 use crate::app::config::BuildMapConfig;
 use crate::geometry::TriangleMesh;
 use crate::map::{MappingPath, ply};
-
-/// The recording with its poses.
-pub fn recording_inputs(config: &BuildMapConfig) -> RecordingInputs<'_> {
-    RecordingInputs {
-        scan_folder: &config.scan_folder,
-        topic: config.topic.as_deref(),
-        pose_file: config.pose_file.as_deref(),
-        calib_file: config.calib_file.as_deref(),
-        body_from_lidar: config.body_from_lidar,
-    }
-}
 
 /// Prepares the outputs.
 pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
@@ -31,7 +19,7 @@ pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
         path.file_name()
             .map(|name| name.to_string_lossy().into_owned())
     };
-    let mut inputs = recording_inputs(config).files();
+    let mut inputs = config.recording_inputs().files();
     let optional = [
         ("cloud_file", &config.cloud_file),
         ("truth_mesh", &config.truth_mesh),

@@ -18,12 +18,11 @@ use std::time::Instant;
 use anyhow::{Context as _, Result};
 
 use self::clock::StageClock;
-use self::files::{prepare, recording_inputs, write_map};
+use self::files::{prepare, write_map};
 pub use self::parts::hash_of_scan;
 use self::parts::{Parts, hash_of_scans, joint_hash};
 pub use self::report::BuildReport;
 use super::interrupt::Interrupted;
-use super::stages::SensorKeys;
 use super::{Context, input, output, version};
 use crate::app::config::{self, BuildMapConfig};
 use crate::evaluation::map_quality::{self, BeamResidual};
@@ -89,7 +88,7 @@ fn run_with_scans(config: &BuildMapConfig, context: &Context) -> Result<BuildRep
 /// Opens the recording with its poses, and completes the configuration by what the scans show about the
 /// sensor.
 fn open(config: &mut BuildMapConfig) -> Result<(Recording, Option<SensorDescription>)> {
-    let inputs = recording_inputs(config);
+    let inputs = config.recording_inputs();
     inputs.require()?;
     if let Some(path) = &config.truth_mesh {
         input::require_file("truth_mesh", path)?;
@@ -105,12 +104,7 @@ fn open(config: &mut BuildMapConfig) -> Result<(Recording, Option<SensorDescript
     let poses = poses.filter_map(|frame| Some((frame.number, frame.map_from_lidar.as_ref()?)));
     path_check::check(poses, config.max_step_m)
         .with_context(|| format!("pose_file is {}", pose_file.display()))?;
-    let keys = SensorKeys {
-        range_image: &mut config.range_image,
-        own_car_m: &mut config.own_car_m,
-        motion_compensation: &mut config.motion_compensation,
-    };
-    let (recording, sensor) = keys.resolve(recording)?;
+    let (recording, sensor) = config.sensor_keys().resolve(recording)?;
     if config.check_poses {
         pose_check::check(&recording)
             .with_context(|| format!("pose_file is {}", pose_file.display()))?;

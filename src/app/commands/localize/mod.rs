@@ -16,7 +16,6 @@ use super::claims::{Claims, NPZ, Outputs};
 use super::interrupt::Interrupted;
 use super::odometry::MotionSource;
 use super::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES, RunFiles};
-use super::stages::{MapInputs, RecordingInputs, SensorKeys};
 use super::{Context, input, odometry, output, run_page};
 use crate::app::config::{Initialization, LocalizationConfig, MotionModel};
 use crate::app::results::{LocalizationResults, Report};
@@ -35,20 +34,23 @@ const ODOMETRY_STREAM: u64 = 1;
 /// Localizes the selected frames of a recording.
 pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     input::require_file("map_file", &config.map_file)?;
-    recording_inputs(config).require()?;
+    config.recording_inputs().require()?;
     let files = RunFiles::beside(&config.result_path);
     let claims = prepare(config, context, &files)?;
-    let map = map_inputs(config).load(Some(config.range_image.batch_size()), context)?;
+    let map = config
+        .map_inputs()
+        .load(Some(config.range_image.batch_size()), context)?;
     let mut resolved = config.clone();
-    let sequence = open(&mut resolved, &map)?;
-    let config = &resolved;
-    let motion = MotionSource::open(
+    let sequence = resolved.open_in_map(&map)?;
+    let (motion, odometry_file) = MotionSource::open(
         config.odometry,
-        config.odometry_file.as_deref(),
-        &recording_inputs(config),
+        config.odometry_file.clone(),
+        &config.recording_inputs(),
         &sequence,
         &mut stream(config.seed, ODOMETRY_STREAM),
     )?;
+    resolved.odometry_file = odometry_file;
+    let config = &resolved;
     let motion = Mutex::new(motion);
     let run = Mutex::new(Run::new(
         config,
@@ -81,48 +83,8 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     Ok(report)
 }
 
-/// Opens the selected frames, with the true poses in the frame of the map, and completes the configuration by
-/// what the scans show about the sensor.
-fn open(config: &mut LocalizationConfig, map: &Map) -> Result<Recording> {
-    let inputs = recording_inputs(config);
-    let mut recording = inputs.open(&config.selection())?;
-    if let Some(pose_file) = &config.pose_file {
-        let track = inputs.track(pose_file, &recording)?;
-        recording = recording.with_poses(track.in_map(&map.path.world_from_map))?;
-    }
-    let keys = SensorKeys {
-        range_image: &mut config.range_image,
-        own_car_m: &mut config.own_car_m,
-        motion_compensation: &mut config.motion_compensation,
-    };
-    Ok(keys.resolve(recording)?.0)
-}
-
-fn map_inputs(config: &LocalizationConfig) -> MapInputs<'_> {
-    MapInputs {
-        map_file: &config.map_file,
-        map_pose_file: config.map_pose_file.as_deref(),
-        map_calib_file: config.map_calib_file.as_deref(),
-    }
-}
-
-fn recording_inputs(config: &LocalizationConfig) -> RecordingInputs<'_> {
-    RecordingInputs {
-        scan_folder: &config.scan_folder,
-        topic: config.topic.as_deref(),
-        pose_file: config.pose_file.as_deref(),
-        calib_file: config.calib_file.as_deref(),
-        body_from_lidar: config.body_from_lidar,
-    }
-}
-
 /// Prepares the configured outputs.
 fn prepare(config: &LocalizationConfig, context: &Context, files: &RunFiles) -> Result<Claims> {
-    let mut inputs = map_inputs(config).files();
-    inputs.extend(recording_inputs(config).files());
-    let odometry = config.odometry_file.as_deref();
-    inputs.extend(odometry.map(|path| ("odometry_file", path)));
-    inputs.extend(context.input());
     let mut names = Vec::new();
     if config.save_result {
         names.extend(REPORT_FILES.iter().chain(&LOCALIZATION_FILES));
@@ -141,7 +103,7 @@ fn prepare(config: &LocalizationConfig, context: &Context, files: &RunFiles) -> 
         main: &config.result_path,
         magic: Some(NPZ),
         names: names.into_iter().map(str::to_owned).collect(),
-        inputs,
+        inputs: config.input_files(context),
         force: config.force,
     };
     run_output::prepare(files, &outputs)
@@ -257,7 +219,7 @@ fn write_run(
 ) -> Result<Report> {
     let results = &run.results;
     warn_of_untracked_frames(results);
-    let mut about = about(config, context, map, sequence);
+    let mut about = about(config, context, map);
     about.insert("states".to_owned(), states_in_words(results));
     about.extend(run_output::shortfall(results));
     let report = run_output::evaluate(results, &RangeMclRules::default(), about)?;
@@ -312,18 +274,8 @@ fn warn_of_untracked_frames(results: &LocalizationResults) {
 }
 
 /// Description of the run for the report.
-fn about(
-    config: &LocalizationConfig,
-    context: &Context,
-    map: &Map,
-    recording: &Recording,
-) -> BTreeMap<String, String> {
-    let odometry = odometry::description(
-        config.odometry,
-        config.odometry_file.as_deref(),
-        &recording_inputs(config),
-        recording,
-    );
+fn about(config: &LocalizationConfig, context: &Context, map: &Map) -> BTreeMap<String, String> {
+    let odometry = odometry::description(config.odometry, config.odometry_file.as_deref());
     let particles = format!("{} reduced to {}", config.num_particles, config.num_reduced);
     [
         ("recording", config.scan_folder.display().to_string()),

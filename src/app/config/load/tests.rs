@@ -313,3 +313,20 @@ fn a_known_start_and_the_true_odometry_need_their_poses() {
     let text = "calib_file: calib.txt\nbody_from_lidar: [0, 0, 1.7, 0, 0, 0]\n";
     assert_contains(&message_of(text, &[]), &["calib_file or body_from_lidar"]);
 }
+
+#[test]
+fn keys_of_batches_are_those_of_localize_alone() {
+    for (key, value) in [("max_instance", "50"), ("render_instanced", "True")] {
+        let text = format!("range_image: {{{key}: {value}}}\n");
+        load_text::<LocalizationConfig>(&text, &[]).unwrap();
+        let errors = [
+            load_text::<BuildMapConfig>(&text, &[]).unwrap_err(),
+            load_text::<RefinementConfig>(&text, &[]).unwrap_err(),
+        ];
+        for error in errors {
+            assert_contains(&error.to_string(), &["range_image", key, "only localize"]);
+        }
+    }
+    let localization = load_text("range_image: {max_instance: 50}\n", &[]).unwrap();
+    RefinementConfig::of(localization).validate().unwrap();
+}
