@@ -9,7 +9,8 @@
 //! so that θ is the same at all ranges and z / √(x² + y²) is not. The offset z₀ is the one with the sharpest
 //! histogram of θ, for each band of elevation, because lasers in different blocks have different ones. Peaks are
 //! maxima with valleys of less than half their height on both sides, for several widths of the window in which
-//! points are counted. Beams are there if peaks that are found in half of the azimuths hold most points
+//! points are counted: the widest that serves, since narrower ones divide a blurred beam, unless a narrower one
+//! finds more peaks with empty valleys between all of them. Beams are there if peaks that are found in half of the azimuths hold most points
 //! of the other half, in the quarter of the gap next to them; of directions without rows it is half.
 
 use rayon::prelude::*;
@@ -27,6 +28,8 @@ const WINDOWS: [usize; 5] = [3, 6, 12, 25, 50];
 const MIN_SHARE: f64 = 0.75;
 /// The widest window is taken whose share is as good; narrower ones divide peaks (unitless).
 const SAME_SHARE: f64 = 0.003;
+/// Share of the points between any two peaks of a narrower window that is taken nevertheless, at least (unitless).
+const CLEAN_SHARE: f64 = 0.99;
 /// Peaks that are as many times lower than both neighbours are of stray points.
 const STRAY: u32 = 10;
 /// Height of a peak, at least: points, and relative to the median peak.
@@ -52,16 +55,10 @@ pub fn rows(scans: &[Scan]) -> Option<Vec<BeamReturns>> {
     let is_tested = |ray: &&Ray| (ray.azimuth_rad.to_degrees() / 4.0).floor() as i32 % 2 == 0;
     let tested: Vec<Ray> = rays.iter().filter(is_tested).copied().collect();
     let others: Vec<Ray> = rays.iter().filter(|ray| !is_tested(ray)).copied().collect();
-    let share = |window: &usize| share_near(&peaks(&others, *window), &tested);
-    let shares: Vec<f64> = WINDOWS.par_iter().map(share).collect();
-    let best = shares
-        .iter()
-        .copied()
-        .fold(MIN_SHARE + SAME_SHARE, f64::max);
-    let widest = shares
-        .iter()
-        .rposition(|&share| share >= best - SAME_SHARE)?;
-    let peaks = peaks(&rays, WINDOWS[widest]);
+    let fit = |&window: &usize| Fit::of(window, &peaks(&others, window), &tested);
+    let fits: Vec<Fit> = WINDOWS.par_iter().map(fit).collect();
+    let window = best_window(&fits)?;
+    let peaks = peaks(&rays, window);
     (2..=MAX_BEAMS)
         .contains(&peaks.len())
         .then(|| beams_at(&peaks, &rays))
@@ -175,25 +172,74 @@ fn peaks(rays: &[Ray], window: usize) -> Vec<f32> {
     peaks.into_iter().map(angle).collect()
 }
 
+/// Number of the peak above an angle, of the gap around it; the gaps at the ends are also those beyond.
+fn gap(peaks: &[f32], angle_deg: f32) -> usize {
+    let above = peaks.partition_point(|&peak| peak < angle_deg);
+    above.clamp(1, peaks.len() - 1)
+}
+
 /// Index of the nearest peak if it is nearer than a quarter of the gap between the peaks around.
 fn near(peaks: &[f32], angle_deg: f32) -> Option<usize> {
-    let above = peaks.partition_point(|&peak| peak < angle_deg);
-    let upper = above.clamp(1, peaks.len() - 1);
+    let upper = gap(peaks, angle_deg);
     let gap_deg = peaks[upper] - peaks[upper - 1];
     [upper - 1, upper]
         .into_iter()
         .find(|&peak| (peaks[peak] - angle_deg).abs() < 0.25 * gap_deg)
 }
 
-/// Share of the points that are near a peak.
-fn share_near(peaks: &[f32], rays: &[Ray]) -> f64 {
-    if !(2..=MAX_BEAMS).contains(&peaks.len()) || rays.is_empty() {
-        return 0.0;
+/// How well the peaks of a window hold the points.
+struct Fit {
+    window: usize,
+    peaks: usize,
+    /// Share of the points that are near a peak.
+    share: f64,
+    /// The same between two neighbouring peaks, where it is smallest.
+    least_share: f64,
+}
+
+impl Fit {
+    fn of(window: usize, peaks: &[f32], rays: &[Ray]) -> Self {
+        let mut fit = Self {
+            window,
+            peaks: peaks.len(),
+            share: 0.0,
+            least_share: 0.0,
+        };
+        if !(2..=MAX_BEAMS).contains(&peaks.len()) || rays.is_empty() {
+            return fit;
+        }
+        // Points near a peak and all points, by the gap that they are in.
+        let mut counts = vec![[0_u32; 2]; peaks.len() - 1];
+        for ray in rays {
+            let is_near = near(peaks, ray.cone_deg).is_some();
+            let [near, all] = &mut counts[gap(peaks, ray.cone_deg) - 1];
+            *near += u32::from(is_near);
+            *all += 1;
+        }
+        let near: u32 = counts.iter().map(|count| count[0]).sum();
+        fit.share = f64::from(near) / rays.len() as f64;
+        let shares = (counts.iter()).map(|&[near, all]| f64::from(near) / f64::from(all.max(1)));
+        fit.least_share = shares.fold(1.0, f64::min);
+        fit
     }
-    let near = rays
+}
+
+/// The widest window whose share is as good as the best, or a narrower one that finds more peaks with
+/// next to no point in any valley.
+fn best_window(fits: &[Fit]) -> Option<usize> {
+    let best = (fits.iter().map(|fit| fit.share)).fold(MIN_SHARE + SAME_SHARE, f64::max);
+    let mut chosen: Option<&Fit> = None;
+    for fit in fits
         .iter()
-        .filter(|ray| near(peaks, ray.cone_deg).is_some());
-    near.count() as f64 / rays.len() as f64
+        .rev()
+        .filter(|fit| fit.share >= best - SAME_SHARE)
+    {
+        let is_better = |wider: &Fit| fit.peaks > wider.peaks && fit.least_share >= CLEAN_SHARE;
+        if chosen.is_none_or(is_better) {
+            chosen = Some(fit);
+        }
+    }
+    chosen.map(|fit| fit.window)
 }
 
 fn beams_at(peaks: &[f32], rays: &[Ray]) -> Vec<BeamReturns> {
