@@ -10,7 +10,7 @@ use std::path::Path;
 
 use fpmcl::lidar::{NormalConfig, RangeImage, Scan, estimate_spatial_normals};
 use fpmcl::recording::scan_files;
-use fpmcl::sensor::{DroppedPoints, SensorDescription, infer};
+use fpmcl::sensor::{BeamSource, DroppedPoints, SensorDescription, infer};
 
 #[test]
 fn every_sample_has_the_points_of_its_header_and_they_surround_the_sensor() {
@@ -86,6 +86,19 @@ fn the_beams_of_twelve_sensors_are_counted_from_one_scan() {
         assert!(sensor.has_rows, "{name}");
         assert_eq!(sensor.beams, Some(beams), "{name}");
     }
+}
+
+#[test]
+fn channels_are_rings_and_times_within_packets_are_none_of_the_sweep() {
+    let Some(folder) = common::real_recording("sensor-samples") else {
+        return;
+    };
+    let read = scan_files::read_stamped(&folder.join("vlp16.pcd"), None).unwrap();
+    assert_eq!(read.scan.rings.len(), read.scan.len());
+    assert_eq!(read.scan.rings.iter().max(), Some(&15));
+    // They span 1.3 ms in nanoseconds.
+    assert!(read.has_unknown_times && read.scan.times_s.is_empty());
+    assert_eq!(infer(&[read.scan]).beam_source, BeamSource::Rings);
 }
 
 #[test]

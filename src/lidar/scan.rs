@@ -68,6 +68,11 @@ impl Scan {
         self.retain(|point| point.is_finite() && model.accepts_range(point.length()))
     }
 
+    /// Removes points that are not finite; returns their number.
+    pub fn drop_not_finite(&mut self) -> usize {
+        self.retain(|point| point.is_finite())
+    }
+
     /// Drops the points inside a rectangle of the lidar frame, x_min, x_max, y_min, y_max [m], such as
     /// the own car. Returns how many.
     pub fn drop_inside(&mut self, [x_min, x_max, y_min, y_max]: [f32; 4]) -> usize {

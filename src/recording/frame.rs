@@ -16,7 +16,12 @@ use crate::lidar::{Motion, Rotation, Scan};
 #[derive(Clone, Debug)]
 pub enum ScanSource {
     /// A file.
-    File(PathBuf),
+    File {
+        /// Its path.
+        path: PathBuf,
+        /// The stamp of its scan, to which times of points are relative [s]; `None` if unknown.
+        stamp_s: Option<f64>,
+    },
     /// A message of a bag.
     #[cfg(feature = "bags")]
     Message {
@@ -32,7 +37,7 @@ pub enum ScanSource {
 impl ScanSource {
     fn read(&self) -> Result<Scan, RecordingError> {
         match self {
-            Self::File(path) => scan_files::read(path),
+            Self::File { path, stamp_s } => Ok(scan_files::read_stamped(path, *stamp_s)?.scan),
             #[cfg(feature = "bags")]
             Self::Message { bag, topic, index } => bag.read_scan(topic, *index),
         }
@@ -42,7 +47,7 @@ impl ScanSource {
 impl fmt::Display for ScanSource {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::File(path) => write!(formatter, "{}", path.display()),
+            Self::File { path, .. } => write!(formatter, "{}", path.display()),
             #[cfg(feature = "bags")]
             Self::Message { topic, index, .. } => write!(formatter, "message {index} of {topic}"),
         }

@@ -12,6 +12,7 @@ use super::frame::{Frame, ScanSource};
 use super::layout::{Layout, RecordingFiles};
 use super::oxts::read_timestamps;
 use super::poses::{ascending, read_times};
+use super::scan_files;
 use super::scan_list::{self, ScanFile, Selection};
 use super::track::PoseTrack;
 use crate::geometry::Pose3;
@@ -65,20 +66,25 @@ impl Recording {
         let has_times = recorded_s.is_some() || scans[0].time_s.is_some();
         let count = scans.len();
         let frame = |scan: ScanFile| {
-            let row = || match &recorded_s {
-                Some(times_s) => times_s.get(scan.number).copied(),
-                None => Some(scan.number as f64 / SCANS_PER_SECOND),
-            };
-            let Some(time_s) = scan.time_s.or_else(row) else {
+            let row = || recorded_s.as_ref()?.get(scan.number).copied();
+            let stamp_s = scan.time_s.or_else(row);
+            let assumed_s = (!has_times).then_some(scan.number as f64 / SCANS_PER_SECOND);
+            let Some(time_s) = stamp_s.or(assumed_s) else {
                 return Err(RecordingError::ScanWithoutTime {
                     scan: scan.path,
                     times: recorded_s.as_ref().map_or(0, Vec::len),
                 });
             };
-            Ok(Frame::new(scan.number, ScanSource::File(scan.path), time_s))
+            let path = scan.path;
+            let source = ScanSource::File { path, stamp_s };
+            Ok(Frame::new(scan.number, source, time_s))
         };
         let frames: Vec<Frame> = scans.into_iter().map(frame).collect::<Result<_, _>>()?;
-        let (frames, skipped) = selection.of(frames, |frame| frame.number, path)?;
+        let (mut frames, mut skipped) = selection.of(frames, |frame| frame.number, path)?;
+        let later_s = moment_after_stamp_s(&frames[0].source)?;
+        for frame in frames.iter_mut().chain(&mut skipped) {
+            frame.time_s += later_s;
+        }
         Ok(Self {
             path: path.to_owned(),
             files,
@@ -212,6 +218,25 @@ impl Recording {
             track.map_or_else(Calibration::identity, |track| track.calibration),
         )
     }
+}
+
+/// Time from the stamp of a scan of a file to its moment, the middle of its sweep [s]; 0 without times of points.
+fn moment_after_stamp_s(source: &ScanSource) -> Result<f64, RecordingError> {
+    let ScanSource::File { path, stamp_s } = source else {
+        return Ok(0.0);
+    };
+    if !scan_files::has_named_columns(path) {
+        return Ok(0.0);
+    }
+    let read = scan_files::read_stamped(path, *stamp_s)?;
+    if read.has_unknown_times {
+        tracing::warn!(
+            "{}: the times of the points are ignored: in no unit do they last 10 ms to 1 s",
+            path.display()
+        );
+    }
+    let later_s = read.scan.time_s.zip(*stamp_s);
+    Ok(later_s.map_or(0.0, |(moment_s, stamp_s)| moment_s - stamp_s))
 }
 
 /// The times in the files of a recording, which ascend [s].

@@ -14,7 +14,6 @@ mod index;
 mod mcap_file;
 mod message;
 mod point_cloud;
-mod point_times;
 mod ros1_file;
 mod transforms;
 

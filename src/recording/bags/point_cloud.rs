@@ -1,35 +1,11 @@
 //! Scans of `sensor_msgs/PointCloud2` and of Livox' `CustomMsg`.
 
-use glam::Vec3;
-
 use super::fields::Fields;
 use super::index::Content;
 use super::message::Header;
-use super::point_times::sweep_times;
-use crate::lidar::Scan;
-use crate::recording::scan_files::point_table::{INTENSITY, NumberType};
-
-/// Names of the number of the beam.
-const RING: [&str; 4] = ["ring", "channel", "line", "ring_id"];
-
-/// Names of the time of a point.
-const TIME: [&str; 8] = [
-    "time",
-    "t",
-    "timestamp",
-    "time_stamp",
-    "offset_time",
-    "time_offset",
-    "timeoffset",
-    "offsettime",
-];
-
-/// A scan as it is read.
-pub struct ReadScan {
-    pub scan: Scan,
-    /// Whether the points have numbers by the name of a time which make no sense as one.
-    pub has_unknown_times: bool,
-}
+use crate::recording::scan_files::ReadScan;
+use crate::recording::scan_files::point_table::{Column, NumberType, Table};
+use crate::recording::scan_files::point_times::set_times;
 
 /// Reads a message; `log_s` is its moment if it has no stamp.
 pub fn read_scan(fields: &mut Fields, content: Content, log_s: f64) -> Result<ReadScan, String> {
@@ -43,26 +19,13 @@ pub fn read_scan(fields: &mut Fields, content: Content, log_s: f64) -> Result<Re
     } else {
         header.stamp_s
     };
-    table.scan(stamp_s)
-}
-
-/// A field of all points.
-struct Column {
-    name: String,
-    number_type: NumberType,
-    offset: usize,
-}
-
-/// Points in rows.
-struct Table<'a> {
-    columns: Vec<Column>,
-    width: usize,
-    height: usize,
-    /// Distance between points, and between rows of them [bytes].
-    point_step: usize,
-    row_step: usize,
-    is_big_endian: bool,
-    data: &'a [u8],
+    let (mut scan, times) = table.points()?;
+    let has_unknown_times = !set_times(&mut scan, &times, Some(stamp_s));
+    scan.drop_not_finite();
+    Ok(ReadScan {
+        scan,
+        has_unknown_times,
+    })
 }
 
 fn point_cloud2<'a>(fields: &mut Fields<'a>) -> Result<Table<'a>, String> {
@@ -86,33 +49,40 @@ fn point_cloud2<'a>(fields: &mut Fields<'a>) -> Result<Table<'a>, String> {
             name,
             number_type,
             offset: offset as usize,
+            stride: 0,
+            is_big_endian: false,
         });
     }
     let is_big_endian = fields.u8()? != 0;
     let (point_step, row_step) = (fields.u32()? as usize, fields.u32()? as usize);
+    for column in &mut columns {
+        (column.stride, column.is_big_endian) = (point_step, is_big_endian);
+    }
     let length = fields.u32()? as usize;
-    Ok(Table {
+    let table = Table {
         columns,
         width,
         height,
-        point_step,
         row_step,
-        is_big_endian,
-        data: fields.bytes(length)?,
-    })
+        data: fields.bytes(length)?.into(),
+    };
+    check(&table, point_step)?;
+    Ok(table)
 }
 
 fn livox<'a>(fields: &mut Fields<'a>) -> Result<Table<'a>, String> {
     // Time base, number of points, number of the sensor and three reserved bytes.
     let _before = (fields.u64()?, fields.u32()?, fields.u8()?, fields.bytes(3)?);
     let points = fields.u32()? as usize;
+    let (stride, is_big_endian) = (fields.stride(19), fields.is_big_endian());
     let column = |name: &str, number_type, offset| Column {
         name: name.to_owned(),
         number_type,
         offset,
+        stride,
+        is_big_endian,
     };
-    let point_step = fields.stride(19);
-    Ok(Table {
+    let table = Table {
         columns: vec![
             column("offset_time", NumberType::U32, 0),
             column("x", NumberType::F32, 4),
@@ -123,117 +93,37 @@ fn livox<'a>(fields: &mut Fields<'a>) -> Result<Table<'a>, String> {
         ],
         width: points,
         height: 1,
-        point_step,
         row_step: 0,
-        is_big_endian: fields.is_big_endian(),
-        data: fields.rest(),
-    })
+        data: fields.rest().into(),
+    };
+    check(&table, stride)?;
+    Ok(table)
 }
 
-impl Table<'_> {
-    /// The first column with one of some names, in their order.
-    fn named(&self, names: &[&str]) -> Option<&Column> {
-        let named = |name: &&str| {
-            (self.columns.iter()).find(|column| column.name.eq_ignore_ascii_case(name))
-        };
-        names.iter().find_map(named)
+/// Requires that the columns of a table that are used are within its points, and these within the data.
+fn check(table: &Table, point_step: usize) -> Result<(), String> {
+    let (width, height, length) = (table.width, table.height, table.data.len());
+    if width == 0 || height == 0 {
+        return Ok(());
     }
-
-    /// Requires that all points and a column of them are within the data.
-    fn check(&self, column: &Column) -> Result<(), String> {
-        let size = column.number_type.size();
-        let rows = self.height.saturating_sub(1).saturating_mul(self.row_step);
-        let points = self.width.saturating_sub(1).saturating_mul(self.point_step);
-        let end = (rows.saturating_add(points)).saturating_add(column.offset + size);
-        let row_bytes = self.width.saturating_mul(self.point_step);
-        let problem = if end > self.data.len() {
+    let row_bytes = width.saturating_mul(point_step);
+    for column in table.used()? {
+        let end = table.end_of(column);
+        let problem = if end > length {
             format!("its points need {end} bytes")
-        } else if column.offset + size > self.point_step {
+        } else if column.offset + column.number_type.size() > point_step {
             format!(
-                "its points of {} bytes end before `{}`",
-                self.point_step, column.name
+                "its points of {point_step} bytes end before `{}`",
+                column.name
             )
-        } else if self.height > 1 && self.row_step < row_bytes {
-            format!("its rows of {row_bytes} bytes are {} apart", self.row_step)
+        } else if height > 1 && table.row_step < row_bytes {
+            format!("its rows of {row_bytes} bytes are {} apart", table.row_step)
         } else {
-            return Ok(());
+            continue;
         };
-        let (width, height, length) = (self.width, self.height, self.data.len());
-        Err(format!(
+        return Err(format!(
             "is damaged: {width} x {height} points in {length} bytes, but {problem}"
-        ))
+        ));
     }
-
-    fn number(&self, column: &Column, at: usize) -> f64 {
-        let size = column.number_type.size();
-        let mut bytes = [0; 8];
-        let number = self
-            .data
-            .get(at + column.offset..)
-            .and_then(|rest| rest.get(..size));
-        bytes[..size].copy_from_slice(number.unwrap_or(&[0; 8][..size]));
-        if self.is_big_endian {
-            bytes[..size].reverse();
-        }
-        column.number_type.read(&bytes, 0).unwrap_or(f64::NAN)
-    }
-
-    /// The points with finite coordinates.
-    fn scan(&self, stamp_s: f64) -> Result<ReadScan, String> {
-        let [Some(x), Some(y), Some(z)] = [["x"], ["y"], ["z"]].map(|name| self.named(&name))
-        else {
-            let found: Vec<&str> = self.columns.iter().map(|c| c.name.as_str()).collect();
-            return Err(format!(
-                "has no fields x, y and z, but: {}",
-                found.join(", ")
-            ));
-        };
-        let [intensity, ring, time] = [&INTENSITY[..], &RING, &TIME].map(|names| self.named(names));
-        let mut scan = Scan {
-            time_s: Some(stamp_s),
-            ..Scan::default()
-        };
-        let mut has_unknown_times = false;
-        if self.width == 0 || self.height == 0 {
-            return Ok(ReadScan {
-                scan,
-                has_unknown_times,
-            });
-        }
-        for column in [Some(x), Some(y), Some(z), intensity, ring, time]
-            .into_iter()
-            .flatten()
-        {
-            self.check(column)?;
-        }
-        let (mut times, mut is_measured) = (Vec::new(), Vec::new());
-        for row in 0..self.height {
-            for column in 0..self.width {
-                let at = row * self.row_step + column * self.point_step;
-                let point = [x, y, z].map(|axis| self.number(axis, at) as f32);
-                let point = Vec3::from_array(point);
-                if !point.is_finite() {
-                    continue;
-                }
-                scan.points.push(point);
-                let intensity = intensity.map_or(0.0, |column| self.number(column, at) as f32);
-                scan.intensities.push(intensity);
-                scan.rings
-                    .extend(ring.map(|column| self.number(column, at) as u16));
-                times.extend(time.map(|column| self.number(column, at)));
-                is_measured.push(point != Vec3::ZERO);
-            }
-        }
-        match sweep_times(&times, &is_measured, stamp_s) {
-            Some(sweep) => {
-                scan.times_s = sweep.times_s;
-                scan.time_s = Some(sweep.middle_s);
-            }
-            None => has_unknown_times = !times.is_empty(),
-        }
-        Ok(ReadScan {
-            scan,
-            has_unknown_times,
-        })
-    }
+    Ok(())
 }

@@ -5,14 +5,17 @@ pub mod npy;
 mod pcd;
 mod ply;
 pub(super) mod point_table;
+pub(super) mod point_times;
 
 use std::path::Path;
 
+use self::point_table::Table;
+use self::point_times::set_times;
 use super::error::RecordingError;
 use super::velodyne::read_bytes;
 use crate::lidar::Scan;
 
-/// Extensions of the files that [`parse`] reads.
+/// Extensions of the files that [`read`] reads.
 pub const EXTENSIONS: [&str; 4] = ["bin", "pcd", "ply", "npy"];
 
 /// Whether a file is a scan, by its extension.
@@ -20,28 +23,68 @@ pub fn is_scan(path: &Path) -> bool {
     EXTENSIONS.iter().any(|known| has_extension(path, known))
 }
 
-/// Reads a scan with all its points, including invalid ones.
-pub fn read(path: &Path) -> Result<Scan, RecordingError> {
-    parse(path, &read_bytes(path)?)
+/// Whether the columns of a file have names, so that points can have times.
+pub fn has_named_columns(path: &Path) -> bool {
+    is_scan(path) && !has_extension(path, "bin")
 }
 
-/// Reads the content of a scan's file, whose format is that of its extension; `path` is also for errors.
+/// A scan as it is read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ReadScan {
+    /// The scan.
+    pub scan: Scan,
+    /// Whether the points have numbers by the name of a time which make no sense as one.
+    pub has_unknown_times: bool,
+}
+
+/// Reads a scan with all its points, including invalid ones.
 ///
-/// Intensities are as in the file, 0 where it has none.
-pub fn parse(path: &Path, bytes: &[u8]) -> Result<Scan, RecordingError> {
-    let scan = if has_extension(path, "pcd") {
-        pcd::parse(bytes)
-    } else if has_extension(path, "ply") {
-        ply::parse(bytes)
-    } else if has_extension(path, "npy") {
-        npy::parse(bytes)
-    } else {
-        bin::parse(bytes)
+/// Intensities are as in the file, 0 where it has none. Times of the points are those after the middle of the sweep.
+pub fn read(path: &Path) -> Result<Scan, RecordingError> {
+    Ok(read_stamped(path, None)?.scan)
+}
+
+/// Reads a scan with a stamp [s], to which the times of its points are relative. The moment of the scan is the middle of
+/// its sweep if the points have times, else the stamp; points with times of another clock have the stamp in the
+/// middle.
+pub fn read_stamped(path: &Path, stamp_s: Option<f64>) -> Result<ReadScan, RecordingError> {
+    let bytes = read_bytes(path)?;
+    let read = match table(path, &bytes) {
+        Some(table) => table.and_then(|table| {
+            let (mut scan, numbers) = table.points()?;
+            let has_times =
+                set_times(&mut scan, &numbers, stamp_s) || set_times(&mut scan, &numbers, None);
+            scan.time_s = scan.time_s.or(stamp_s);
+            Ok(ReadScan {
+                scan,
+                has_unknown_times: !has_times,
+            })
+        }),
+        None => bin::parse(&bytes).map(|scan| ReadScan {
+            scan: Scan {
+                time_s: stamp_s,
+                ..scan
+            },
+            has_unknown_times: false,
+        }),
     };
-    scan.map_err(|problem| RecordingError::BadScan {
+    read.map_err(|problem| RecordingError::BadScan {
         path: path.to_owned(),
         problem,
     })
+}
+
+/// The table of a file whose format is that of its extension; `None` for `.bin`.
+fn table<'a>(path: &Path, bytes: &'a [u8]) -> Option<Result<Table<'a>, String>> {
+    if has_extension(path, "pcd") {
+        Some(pcd::parse(bytes))
+    } else if has_extension(path, "ply") {
+        Some(ply::parse(bytes))
+    } else if has_extension(path, "npy") {
+        Some(npy::parse(bytes))
+    } else {
+        None
+    }
 }
 
 fn has_extension(path: &Path, extension: &str) -> bool {

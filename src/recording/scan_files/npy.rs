@@ -1,11 +1,11 @@
-//! `.npy`: an array of one row per point, x, y, z and, if there is a fourth column, intensity.
+//! `.npy`: an array of one row per point, x, y, z and, if there is a fourth column, intensity; or a structured array
+//! with fields of any order and number types.
 
 use std::io::{self, Read};
 
-use npyz::{DType, NpyHeader, Order, TypeChar};
+use npyz::{DType, Endianness, Field, NpyHeader, Order, TypeChar, TypeStr};
 
-use super::point_table::{Column, NumberType, scan_of};
-use crate::lidar::Scan;
+use super::point_table::{Column, NumberType, Table};
 
 /// Longest header of an array; those of numbers have about a hundred [bytes].
 const LONGEST_HEADER: usize = 1 << 16;
@@ -52,19 +52,25 @@ pub fn read_header(reader: &mut impl Read) -> Result<NpyHeader, String> {
     NpyHeader::from_reader(header.as_slice()).map_err(unreadable)
 }
 
-/// Reads an array of floats with two dimensions.
-pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
+/// Reads an array of floats with two dimensions, or a structured array.
+pub fn parse(bytes: &[u8]) -> Result<Table<'_>, String> {
     let mut rest = bytes;
     let array = read_header(&mut rest)?;
-    let number_type = match array.dtype() {
-        DType::Plain(plain) => match (plain.type_char(), plain.size_field()) {
-            (TypeChar::Float, 4) => NumberType::F32,
-            (TypeChar::Float, 8) => NumberType::F64,
-            _ => return Err("has numbers that are not float32 or float64".to_owned()),
-        },
-        DType::Array(..) | DType::Record(_) => {
-            return Err("is a structured array; store columns x, y, z, intensity".to_owned());
+    match array.dtype() {
+        DType::Plain(plain) => of_rows(&array, &plain, rest),
+        DType::Record(fields) => {
+            let lengths = array.shape().iter();
+            let points = lengths.fold(1_usize, |all, &length| all.saturating_mul(length as usize));
+            Table::of_file(columns_of(&fields)?, points, rest)
         }
+        DType::Array(..) => Err("has arrays as elements; store a row per point".to_owned()),
+    }
+}
+
+fn of_rows<'a>(array: &NpyHeader, plain: &TypeStr, rest: &'a [u8]) -> Result<Table<'a>, String> {
+    let number_type = match number_type(plain) {
+        Some(found @ (NumberType::F32 | NumberType::F64)) => found,
+        _ => return Err("has numbers that are not float32 or float64".to_owned()),
     };
     let (rows, columns) = match array.shape() {
         &[rows, columns] if columns >= 3 => (rows as usize, columns as usize),
@@ -87,14 +93,53 @@ pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
             number_type,
             offset,
             stride,
+            is_big_endian: plain.endianness() == Endianness::Big,
         }
     };
-    let columns: Vec<Column> = names[..columns.min(4)]
-        .iter()
-        .enumerate()
-        .map(column)
-        .collect();
-    scan_of(&columns, rest, rows)
+    let columns = names[..columns.min(4)].iter().enumerate().map(column);
+    Table::of_file(columns.collect(), rows, rest)
+}
+
+/// The fields of a structured array that are numbers.
+fn columns_of(fields: &[Field]) -> Result<Vec<Column>, String> {
+    let mut columns = Vec::new();
+    let mut offset = 0_usize;
+    for field in fields {
+        if let DType::Plain(plain) = &field.dtype
+            && let Some(number_type) = number_type(plain)
+        {
+            columns.push(Column {
+                name: field.name.clone(),
+                number_type,
+                offset,
+                stride: 0,
+                is_big_endian: plain.endianness() == Endianness::Big,
+            });
+        }
+        let size = field.dtype.num_bytes();
+        let size = size.ok_or_else(|| format!("has a field {} of unknown size", field.name))?;
+        offset = offset.saturating_add(size);
+    }
+    for column in &mut columns {
+        column.stride = offset;
+    }
+    Ok(columns)
+}
+
+fn number_type(plain: &TypeStr) -> Option<NumberType> {
+    Some(match (plain.type_char(), plain.size_field()) {
+        (TypeChar::Int, 1) => NumberType::I8,
+        (TypeChar::Int, 2) => NumberType::I16,
+        (TypeChar::Int, 4) => NumberType::I32,
+        (TypeChar::Int, 8) => NumberType::I64,
+        (TypeChar::Uint, 1) => NumberType::U8,
+        (TypeChar::Uint, 2) => NumberType::U16,
+        (TypeChar::Uint, 4) => NumberType::U32,
+        (TypeChar::Uint, 8) => NumberType::U64,
+        (TypeChar::Float, 4) => NumberType::F32,
+        (TypeChar::Float, 8) => NumberType::F64,
+        _ => return None,
+    })
 }
 
 #[cfg(test)]

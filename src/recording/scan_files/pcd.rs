@@ -3,8 +3,7 @@
 //!
 //! Format: <https://pointclouds.org/documentation/tutorials/pcd_file_format.html>
 
-use super::point_table::{Column, NumberType, scan_of};
-use crate::lidar::Scan;
+use super::point_table::{Column, NumberType, Table, lines_of, numbers_of_text};
 
 /// A field of the header.
 struct Field {
@@ -14,7 +13,7 @@ struct Field {
 }
 
 /// Reads a file.
-pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
+pub fn parse(bytes: &[u8]) -> Result<Table<'_>, String> {
     let (mut names, mut sizes, mut types, mut counts) = (vec![], vec![], vec![], vec![]);
     let (mut points, mut data) = (None, None);
     let mut rest = bytes;
@@ -59,10 +58,10 @@ pub fn parse(bytes: &[u8]) -> Result<Scan, String> {
         .collect::<Result<_, String>>()?;
     match data.as_deref() {
         Some("ascii") => ascii(&fields, rest, points),
-        Some("binary") => scan_of(&columns(&fields, None), rest, points),
+        Some("binary") => Table::of_file(columns(&fields, None), points, rest),
         Some("binary_compressed") => {
             let whole = decompressed(rest, &fields, points)?;
-            scan_of(&columns(&fields, Some(points)), &whole, points)
+            Table::of_file(columns(&fields, Some(points)), points, whole)
         }
         other => Err(format!(
             "has DATA {}, which is unknown",
@@ -105,6 +104,7 @@ fn columns(fields: &[Field], points: Option<usize>) -> Vec<Column> {
                 } else {
                     step
                 },
+                is_big_endian: false,
             }
         })
         .filter(|column| column.stride > 0)
@@ -112,42 +112,16 @@ fn columns(fields: &[Field], points: Option<usize>) -> Vec<Column> {
 }
 
 /// Reads one line of numbers per point.
-fn ascii(fields: &[Field], text: &[u8], points: usize) -> Result<Scan, String> {
-    let text = std::str::from_utf8(text).map_err(|_utf8| "has data that is not text".to_owned())?;
-    let numbers: usize = fields.iter().map(|field| field.count).sum();
-    let mut bytes = Vec::new();
-    let mut rows = 0;
-    for (row, line) in text
-        .lines()
-        .filter(|line| !line.trim().is_empty())
-        .enumerate()
-    {
-        let words: Vec<&str> = line.split_whitespace().collect();
-        if words.len() != numbers {
-            return Err(format!(
-                "has {} numbers in point {row}, not {numbers}",
-                words.len()
-            ));
-        }
-        for word in words {
-            let number: f64 = (word.parse())
-                .map_err(|_word| format!("has `{word}` in point {row}, which is not a number"))?;
-            bytes.extend(number.to_le_bytes());
-        }
-        rows += 1;
-    }
-    if rows != points {
-        return Err(format!(
-            "is truncated: it has {rows} of {points} points; copy it again"
-        ));
-    }
+fn ascii<'a>(fields: &[Field], text: &'a [u8], points: usize) -> Result<Table<'a>, String> {
+    let numbers = fields.iter().map(|field| field.count).sum();
+    let bytes = numbers_of_text(lines_of(text)?, numbers, points)?;
     let as_f64 = |field: &Field| Field {
         name: field.name.clone(),
         number_type: NumberType::F64,
         count: field.count,
     };
     let fields: Vec<Field> = fields.iter().map(as_f64).collect();
-    scan_of(&columns(&fields, None), &bytes, points)
+    Table::of_file(columns(&fields, None), points, bytes)
 }
 
 /// Decompresses the data: its size, the size of what it contains, and both as LZF.
@@ -203,6 +177,11 @@ mod tests {
     use glam::Vec3;
 
     use super::*;
+    use crate::lidar::Scan;
+
+    fn read(bytes: &[u8]) -> Result<Scan, String> {
+        Ok(parse(bytes)?.points()?.0)
+    }
 
     const HEADER: &str = "# .PCD v0.7\nVERSION 0.7\nFIELDS intensity ring x y z\nSIZE 1 2 8 4 4\n\
         TYPE U U F F F\nCOUNT 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\n";
@@ -232,11 +211,12 @@ mod tests {
         let expected = Scan {
             points: vec![Vec3::new(1.5, -2.0, 0.25), Vec3::new(4.0, 5.0, 6.0)],
             intensities: vec![7.0, 9.0],
+            rings: vec![3, 4],
             ..Scan::default()
         };
         let ascii = b"7 3 1.5 -2 0.25\n9 4 4 5 6\n";
-        assert_eq!(parse(&file("ascii", ascii)).unwrap(), expected);
-        assert_eq!(parse(&file("binary", &binary())).unwrap(), expected);
+        assert_eq!(read(&file("ascii", ascii)).unwrap(), expected);
+        assert_eq!(read(&file("binary", &binary())).unwrap(), expected);
 
         // Field after field, as literals of at most 32 bytes.
         let rows = binary();
@@ -252,7 +232,7 @@ mod tests {
         }
         let sizes = [lzf.len() as u32, by_field.len() as u32].map(u32::to_le_bytes);
         let data = [sizes.concat(), lzf].concat();
-        assert_eq!(parse(&file("binary_compressed", &data)).unwrap(), expected);
+        assert_eq!(read(&file("binary_compressed", &data)).unwrap(), expected);
     }
 
     #[test]
@@ -269,7 +249,7 @@ mod tests {
     fn truncated_and_damaged_files_are_errors() {
         let whole = file("binary", &binary());
         for end in 0..whole.len() {
-            assert!(parse(&whole[..end]).is_err(), "{end} bytes");
+            assert!(read(&whole[..end]).is_err(), "{end} bytes");
         }
         for (from, to) in [
             ("POINTS 2", "POINTS 99999999999"),
@@ -279,9 +259,9 @@ mod tests {
         ] {
             let text = HEADER.replace(from, to);
             let bytes = [text.as_bytes(), b"DATA binary\n", &binary()].concat();
-            assert!(parse(&bytes).is_err(), "{to}");
+            assert!(read(&bytes).is_err(), "{to}");
         }
         let claimed = [u32::MAX.to_le_bytes(), 38_u32.to_le_bytes()].concat();
-        assert!(parse(&file("binary_compressed", &claimed)).is_err());
+        assert!(read(&file("binary_compressed", &claimed)).is_err());
     }
 }
