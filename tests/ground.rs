@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
+#[cfg(feature = "bags")]
+mod bag_writers;
 mod common;
 
 use std::fs;
@@ -175,6 +177,58 @@ fn a_single_scan_and_a_folder_without_labels_are_classified_too() {
         assert!(output.join("labels/000001.label").is_file());
         assert!(!stdout.contains("precision"), "{stdout}");
     }
+}
+
+/// A bag of the scans of a recording, on two topics.
+#[cfg(feature = "bags")]
+fn write_bag(path: &Path, scenes: &[LabelledScan]) {
+    use bag_writers::{Cloud, Kind, Recorded, mcap, point_cloud2};
+    let message = |(number, topic): (usize, &'static str)| {
+        let time_ns = 1_700_000_000_000_000_000 + 100_000_000 * number as u64;
+        let points = scenes[number].scan.points.iter();
+        let points: Vec<_> = points.map(|p| ([p.x, p.y, p.z, 0.0], 0, 0.0)).collect();
+        Recorded {
+            topic,
+            message_type: "sensor_msgs/msg/PointCloud2",
+            time_ns,
+            data: point_cloud2(Kind::CdrLittle, time_ns, "lidar", &Cloud::of(&points)),
+        }
+    };
+    let numbers = (0..scenes.len()).flat_map(|number| [(number, "/front"), (number, "/rear")]);
+    let messages: Vec<Recorded> = numbers.map(message).collect();
+    let options = ::mcap::WriteOptions::new().compression(None);
+    fs::write(path, mcap(options, "cdr", &messages)).unwrap();
+}
+
+#[cfg(feature = "bags")]
+#[test]
+fn scans_of_a_bag_have_the_labels_of_the_same_scans_as_files() {
+    let (folder, scenes) = recording();
+    let folder = folder.path();
+    write_bag(&folder.join("drive.mcap"), &scenes);
+    let call = |input: &str| {
+        fpmcl("ground")
+            .in_folder(folder)
+            .with(input)
+            .set("output_folder", &input.replace('.', "_"))
+            .set("plot_step", "0")
+    };
+    call("velodyne").succeeds();
+    call("drive.mcap").fails_with(&["several topics", "/front", "/rear"]);
+    call("drive.mcap").set("topic", "/rear").succeeds();
+    for number in 0..2 {
+        let labels = |output: &str| {
+            read_labels(&folder.join(format!("{output}/labels/{number:06}.label"))).unwrap()
+        };
+        assert_eq!(labels("drive_mcap"), labels("velodyne"));
+    }
+    let explain = |call: common::Fpmcl| {
+        let call = call.set("topic", "/front").with("--explain");
+        call.with("9").with("0").with("-1.7")
+    };
+    explain(call("drive.mcap")).fails_with(&["--explain needs one scan", "n_scans=1"]);
+    let one = explain(call("drive.mcap").set("start_idx", "1").set("n_scans", "1"));
+    assert!(one.succeeds().stdout.contains("point "));
 }
 
 #[test]

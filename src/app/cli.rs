@@ -308,11 +308,11 @@ pub struct CompareArgs {
 /// Arguments of `ground`.
 #[derive(Clone, Debug, Args)]
 pub struct GroundArgs {
-    /// Scan (.bin, .pcd, .ply, .npy), folder of scans, recording with velodyne/ and labels/, or configuration (.yml);
-    /// by default the configuration's scan_folder.
+    /// Scan (.bin, .pcd, .ply, .npy), recording (its folder, the folder of its scans, or a bag), or configuration
+    /// (.yml); by default the configuration's scan_folder.
     pub input: Option<PathBuf>,
 
-    /// Explain the decision at the point nearest to X Y Z in the lidar frame [m]; needs a scan.
+    /// Explain the decision at the point nearest to X Y Z in the lidar frame [m]; needs one scan.
     #[arg(
         long,
         value_names = ["X", "Y", "Z"],

@@ -114,14 +114,6 @@ pub fn scan_files(folder: &Path) -> Result<Vec<ScanFile>, RecordingError> {
     Ok(numbered(paths)?.into_iter().map(scan).collect())
 }
 
-/// The selected scans below a folder.
-pub fn selected_scans(
-    folder: &Path,
-    selection: &Selection,
-) -> Result<Vec<ScanFile>, RecordingError> {
-    Ok((selection.of(scan_files(folder)?, |scan| scan.number, folder)?).0)
-}
-
 /// The time in a name such as `1317384506.4.pcd`, or `1317384506400000000.bin` in nanoseconds [s]: since
 /// 1970, from 2001 on.
 fn time_in_name(path: &Path) -> Option<f64> {

@@ -22,7 +22,7 @@ pub mod output;
 pub mod progress;
 pub mod run_output;
 pub mod run_page;
-mod stages;
+pub(super) mod stages;
 pub mod version;
 
 use std::io::Write as _;

@@ -102,7 +102,7 @@ pub fn is_bag(path: &Path) -> bool {
 }
 
 /// Whether a path can be the name of a topic.
-fn is_topic(path: &Path) -> bool {
+pub fn is_topic(path: &Path) -> bool {
     path.starts_with("/") && !path.exists()
 }
 

@@ -6,14 +6,14 @@
 //! run          = H(localization, refinement settings, odometry)
 //! ```
 //!
-//! H is BLAKE3. Settings are the effective configuration without paths, so that a copied or renamed
+//! Scans are those that are selected, with the poses beside them, or a whole bag. H is BLAKE3. Settings are the effective configuration without paths, so that a copied or renamed
 //! folder keeps its results. A simulated drive is represented by its configuration instead of its
 //! files, which need not exist yet; drives of another executable are simulated again before use
 //! ([`Existing::Renew`](crate::app::commands::simulate::Existing::Renew)).
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::path::Path;
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result};
 use rayon::prelude::*;
@@ -21,6 +21,7 @@ use serde::Serialize;
 
 use super::plan::PlannedRun;
 use crate::app::commands::build_map::hash_of_scan;
+use crate::app::commands::stages::{is_bag, is_topic};
 use crate::app::commands::version;
 use crate::recording::{Recording, Selection};
 use crate::simulation::SimulationConfig;
@@ -94,18 +95,24 @@ impl KeyCache {
                 }
                 Ok(hash(&parts))
             }
+            Input::Scans(bag, _) if is_bag(bag) => self.file(bag),
             Input::Scans(folder, selection) => {
                 self.once(format!("{folder:?} {selection:?}"), || {
-                    let hashes = (Recording::open(folder, None, &selection)?.frames)
-                        .par_iter()
+                    let recording = Recording::open(folder, None, &selection)?;
+                    let mut hashes = (recording.frames.par_iter())
                         .map(|frame| {
                             let content = hash_of_scan(&frame.read()?);
                             Ok(format!("{} {} {content}", frame.number, frame.time_s))
                         })
                         .collect::<Result<Vec<String>>>()?;
+                    let files = recording.files;
+                    for path in files.poses.iter().chain(&files.calibration) {
+                        hashes.push(content(path)?);
+                    }
                     Ok(hash(&hashes))
                 })
             }
+            Input::Topic(name) => Ok(format!("{name:?}")),
             Input::File(path) => self.file(path),
         }
     }
@@ -151,25 +158,35 @@ struct Stage<'a> {
 /// The stages of a run: map, localization, refinement.
 fn stages(run: &PlannedRun) -> Result<[Stage<'_>; 3]> {
     let (map, query, refinement) = (&run.build_map, &run.localization, &run.refinement);
-    let file = |path| Input::new(run, path, None);
+    let file = |recording: &Path, path| match is_bag(recording) && is_topic(path) {
+        true => Input::Topic(path),
+        false => Input::new(run, path, None),
+    };
     let mut mapping = Stage {
         settings: settings(map)?,
         inputs: vec![Input::new(run, &map.scan_folder, Some(map.selection()))],
     };
     let of_map = map.pose_file.iter().chain(&map.calib_file);
-    mapping.inputs.extend(of_map.map(|path| file(path)));
+    mapping
+        .inputs
+        .extend(of_map.map(|path| file(&map.scan_folder, path)));
     let mut localization = Stage {
         settings: settings(query)?,
         inputs: vec![Input::new(run, &query.scan_folder, Some(query.selection()))],
     };
     let of_query = query.pose_file.iter().chain(&query.calib_file);
-    localization.inputs.extend(of_query.map(|path| file(path)));
+    localization
+        .inputs
+        .extend(of_query.map(|path| file(&query.scan_folder, path)));
     let odometry = query.odometry_file.iter();
-    localization.inputs.extend(odometry.map(|path| file(path)));
-    let odometry = refinement.iter().flat_map(|r| &r.odometry_file);
+    localization
+        .inputs
+        .extend(odometry.map(|path| file(&query.scan_folder, path)));
+    let odometry = (refinement.iter())
+        .filter_map(|refined| Some(file(&refined.scan_folder, refined.odometry_file.as_ref()?)));
     let refinement = Stage {
         settings: settings(refinement)?,
-        inputs: odometry.map(|path| file(path)).collect(),
+        inputs: odometry.collect(),
     };
     Ok([mapping, localization, refinement])
 }
@@ -178,9 +195,11 @@ fn stages(run: &PlannedRun) -> Result<[Stage<'_>; 3]> {
 enum Input<'a> {
     /// A part of a simulated drive: the drive, and the path below its folder.
     Simulated(&'a SimulationConfig, &'a Path),
-    /// Selected scans of a folder.
+    /// Selected scans of a folder, or a bag.
     Scans(&'a Path, Selection),
-    /// Any other file.
+    /// Topic of a bag.
+    Topic(&'a Path),
+    /// Any other file, or a folder of poses.
     File(&'a Path),
 }
 
@@ -202,7 +221,7 @@ impl<'a> Input<'a> {
     fn name(&self) -> Result<String> {
         Ok(match self {
             Self::Simulated(drive, path) => format!("{} {path:?}", settings(drive)?),
-            Self::Scans(path, _) | Self::File(path) => format!("{path:?}"),
+            Self::Scans(path, _) | Self::Topic(path) | Self::File(path) => format!("{path:?}"),
         })
     }
 }
@@ -216,9 +235,22 @@ fn settings(config: &impl Serialize) -> Result<String> {
     Ok(settings.to_string())
 }
 
+/// Hash of a file, or of those in a folder.
 fn content(path: &Path) -> Result<String> {
-    let bytes = fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-    Ok(blake3::hash(&bytes).to_hex().to_string())
+    let context = || format!("cannot read {}", path.display());
+    if path.is_dir() {
+        let entries = fs::read_dir(path).with_context(context)?;
+        let mut paths: Vec<PathBuf> = entries
+            .map(|entry| Ok(entry.with_context(context)?.path()))
+            .collect::<Result<_>>()?;
+        paths.sort();
+        let hashes: Result<Vec<String>> = paths.iter().map(|path| content(path)).collect();
+        return Ok(hash(&hashes?));
+    }
+    let mut hasher = blake3::Hasher::new();
+    let file = File::open(path).with_context(context)?;
+    hasher.update_reader(file).with_context(context)?;
+    Ok(hasher.finalize().to_hex().to_string())
 }
 
 /// Hash of a list of texts, 32 hexadecimal digits.
@@ -332,6 +364,66 @@ mod tests {
         fs::write(path("velodyne/000000.bin"), [1; 16]).unwrap();
         let after = KeyCache::default().keys(&run).unwrap();
         assert!(after.map != before.map && after.run != before.run);
+    }
+
+    #[cfg(feature = "bags")]
+    #[test]
+    fn a_byte_of_a_bag_and_the_names_of_its_topics_change_the_key() {
+        let folder = tempfile::tempdir().unwrap();
+        let bag = folder.path().join("drive.mcap");
+        fs::write(&bag, [0; 16]).unwrap();
+        let mut run = planned_run();
+        run.drives.clear();
+        run.build_map.scan_folder = bag.clone();
+        run.build_map.pose_file = Some("/slam/odometry".into());
+        run.build_map.calib_file = None;
+        run.localization.scan_folder = bag.clone();
+        run.localization.pose_file = None;
+        run.localization.calib_file = None;
+        run.localization.odometry_file = Some("/wheels/odometry".into());
+        run.refinement = None;
+        let keys = |run: &PlannedRun| KeyCache::default().keys(run).unwrap();
+        let before = keys(&run);
+        assert_eq!(keys(&run), before);
+        for (change, is_map) in [
+            (|run: &mut PlannedRun| run.build_map.topic = Some("/rear".to_owned())) as fn(&mut _),
+            |run| run.build_map.pose_file = Some("/other".into()),
+            |run| run.localization.odometry_file = Some("/other".into()),
+        ]
+        .into_iter()
+        .zip([true, true, false])
+        {
+            let mut other = run.clone();
+            change(&mut other);
+            let after = keys(&other);
+            assert_eq!(after.map != before.map, is_map);
+            assert_ne!(after.localization, before.localization);
+        }
+        fs::write(&bag, [1; 16]).unwrap();
+        assert_ne!(keys(&run).map, before.map);
+    }
+
+    #[test]
+    fn poses_of_the_recording_itself_change_the_key() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        fs::create_dir(path("velodyne")).unwrap();
+        fs::write(path("velodyne/000000.bin"), [0; 16]).unwrap();
+        let mut run = planned_run();
+        run.drives.clear();
+        run.build_map.scan_folder = folder.path().to_owned();
+        run.build_map.pose_file = None;
+        run.build_map.calib_file = None;
+        run.localization = LocalizationConfig {
+            scan_folder: path("velodyne"),
+            ..LocalizationConfig::default()
+        };
+        let map = |row: &str| {
+            fs::write(path("poses.txt"), row).unwrap();
+            KeyCache::default().keys(&run).unwrap().map
+        };
+        let before = map("1 0 0 0 0 1 0 0 0 0 1 0\n");
+        assert_ne!(map("1 0 0 1 0 1 0 0 0 0 1 0\n"), before);
     }
 
     #[test]

@@ -44,9 +44,9 @@ pub fn planned_runs(config: &ComparisonConfig) -> Result<Vec<PlannedRun>> {
                 )
             })?;
             let scan_folder = &run.build_map.scan_folder;
-            if sequence.optional && drives.is_empty() && !scan_folder.is_dir() {
+            if sequence.optional && drives.is_empty() && !scan_folder.exists() {
                 tracing::info!(
-                    "sequence {} is skipped: there is no folder {}",
+                    "sequence {} is skipped: there is no {}",
                     sequence.name,
                     scan_folder.display()
                 );

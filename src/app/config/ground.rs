@@ -13,9 +13,11 @@ use crate::validation::{InvalidValue, Validate, in_range};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct GroundCommandConfig {
-    /// Folder of the scans, `.bin`, `.pcd`, `.ply` or `.npy`.
+    /// Recording: its folder, the folder of its scans, or a bag.
     #[default("data/kitti/velodyne".into())]
     pub scan_folder: PathBuf,
+    /// Topic of the point clouds, in a bag with several.
+    pub topic: Option<String>,
     /// Folder of the true classes, `NNNNNN.label`; `None`: `labels` beside the scans, where it
     /// exists.
     pub label_folder: Option<PathBuf>,

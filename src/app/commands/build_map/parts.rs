@@ -226,9 +226,10 @@ pub fn joint_hash(hashes: impl IntoIterator<Item = Hash>) -> String {
     joint.finalize().to_hex().to_string()
 }
 
-/// Hash of the points of a scan.
+/// Hash of the points of a scan with their times.
 pub fn hash_of_scan(scan: &Scan) -> Hash {
     let numbers = scan.points.iter().flat_map(|point| point.to_array());
+    let numbers = numbers.chain(scan.times_s.iter().copied());
     let bytes: Vec<u8> = numbers.flat_map(f32::to_le_bytes).collect();
     blake3::hash(&bytes)
 }

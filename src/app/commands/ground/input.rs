@@ -6,24 +6,23 @@ use anyhow::{Result, bail, ensure};
 
 use crate::app::cli::GroundArgs;
 use crate::app::commands::input::require_folder;
+use crate::app::commands::stages::is_bag;
 use crate::app::config::{self, GroundCommandConfig};
 use crate::evaluation::LabelledPoints;
-use crate::recording::scan_list::selected_scans;
-use crate::recording::{scan_files, velodyne};
+use crate::recording::{Frame, Recording, ScanSource, scan_files, velodyne};
 
-/// A scan on disk.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ScanFiles {
-    /// Path relative to the folder of the scans, without extension.
+/// A scan and its labels.
+#[derive(Clone, Debug)]
+pub struct LabelledScan {
+    /// Path relative to the folder of the scans, without extension; of a bag, the number of the scan.
     pub name: PathBuf,
-    /// The file of the points.
-    pub scan_path: PathBuf,
+    frame: Frame,
     /// The file of the classes, if there is one.
     pub label_path: Option<PathBuf>,
 }
 
 /// Loads the configuration with the overrides of the command line; returns it with the path of the
-/// scan or of the folder of scans.
+/// scan or of the recording.
 pub fn load(args: &GroundArgs) -> Result<(GroundCommandConfig, PathBuf)> {
     let mut settings = args.settings.clone();
     if args.force {
@@ -43,44 +42,39 @@ pub fn load(args: &GroundArgs) -> Result<(GroundCommandConfig, PathBuf)> {
         let folder = config.scan_folder.clone();
         return Ok((config, folder));
     };
-    if path.is_dir() {
-        let velodyne = path.join("velodyne");
-        let folder = if velodyne.is_dir() {
-            velodyne
-        } else {
-            path.to_owned()
-        };
-        config.scan_folder = folder.clone();
-        return Ok((config, folder));
+    if path.is_dir() || is_bag(path) {
+        config.scan_folder = path.to_owned();
+        return Ok((config, path.to_owned()));
     }
     ensure!(
         scan_files::is_scan(path) || !path.exists(),
-        "{} is neither a folder nor a scan (.bin, .pcd, .ply, .npy) nor a configuration (.yml)",
+        "{} is neither a recording (a folder, .mcap, .db3 or .bag) nor a scan (.bin, .pcd, .ply, .npy) nor a configuration (.yml)",
         path.display()
     );
     Ok((config, path.to_owned()))
 }
 
-/// Lists the scan at a path, or the selected scans of a folder, in order.
-pub fn scans(path: &Path, config: &GroundCommandConfig) -> Result<Vec<ScanFiles>> {
-    if !is_scan(path) {
+/// Lists the scan at a path, or the selected scans of a recording, in order.
+pub fn scans(path: &Path, config: &GroundCommandConfig) -> Result<Vec<LabelledScan>> {
+    let labels = config.label_folder.as_deref();
+    if is_scan(path) {
+        let source = ScanSource::File {
+            path: path.to_owned(),
+            stamp_s: None,
+        };
+        let folder = path.parent().unwrap_or(path);
+        let frame = Frame::new(0, source, 0.0);
+        return Ok(vec![LabelledScan::new(frame, folder, labels)]);
+    }
+    if !is_bag(path) {
         require_folder("scan_folder", path)?;
     }
-    let (folder, scan_paths) = if is_scan(path) {
-        (path.parent().unwrap_or(path), vec![path.to_owned()])
-    } else {
-        let selected = selected_scans(path, &config.selection())?;
-        (path, selected.into_iter().map(|scan| scan.path).collect())
-    };
-    let files = |scan_path: PathBuf| {
-        let name = scan_path.strip_prefix(folder).unwrap_or(&scan_path);
-        ScanFiles {
-            name: name.with_extension(""),
-            label_path: label_path(&scan_path, name, config.label_folder.as_deref()),
-            scan_path,
-        }
-    };
-    Ok(scan_paths.into_iter().map(files).collect())
+    let recording = Recording::open(path, config.topic.as_deref(), &config.selection())?;
+    let folder = &recording.files.scans;
+    let frames = recording.frames.into_iter();
+    Ok(frames
+        .map(|frame| LabelledScan::new(frame, folder, labels))
+        .collect())
 }
 
 /// Whether a path names one scan, not a folder of scans.
@@ -102,10 +96,30 @@ fn label_path(scan_path: &Path, name: &Path, label_folder: Option<&Path>) -> Opt
     path.is_file().then_some(path)
 }
 
-impl ScanFiles {
+impl LabelledScan {
+    fn new(frame: Frame, folder: &Path, labels: Option<&Path>) -> Self {
+        let (name, label_path) = match &frame.source {
+            ScanSource::File { path, .. } => {
+                let name = path.strip_prefix(folder).unwrap_or(path);
+                (name.with_extension(""), label_path(path, name, labels))
+            }
+            #[cfg(feature = "bags")]
+            ScanSource::Message { index, .. } => {
+                let name = PathBuf::from(format!("{index:06}"));
+                let path = labels.map(|folder| folder.join(&name).with_extension("label"));
+                (name, path.filter(|path| path.is_file()))
+            }
+        };
+        Self {
+            name,
+            frame,
+            label_path,
+        }
+    }
+
     /// Reads points and classes.
     pub fn read(&self) -> Result<LabelledPoints> {
-        let points = scan_files::read(&self.scan_path)?.points;
+        let points = self.frame.read()?.points;
         let label_path = self.label_path.as_deref();
         let classes = label_path.map(velodyne::read_labels).transpose()?;
         if let (Some(path), Some(classes)) = (label_path, &classes) {
@@ -115,7 +129,7 @@ impl ScanFiles {
                 path.display(),
                 classes.len(),
                 points.len(),
-                self.scan_path.display()
+                self.frame.source
             );
         }
         Ok(LabelledPoints { points, classes })
@@ -123,7 +137,7 @@ impl ScanFiles {
 }
 
 /// Returns an error if the labels that are written would replace the true ones.
-pub fn check_overwrite(config: &GroundCommandConfig, scans: &[ScanFiles]) -> Result<()> {
+pub fn check_overwrite(config: &GroundCommandConfig, scans: &[LabelledScan]) -> Result<()> {
     let written = config.output_folder.join("labels");
     let collides = written.canonicalize().is_ok_and(|written| {
         let truth = scans.iter().filter_map(|scan| scan.label_path.as_ref());

@@ -19,9 +19,9 @@ mod simulated;
 use std::fmt::Write as _;
 use std::path::Path;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Context as _, Result, bail, ensure};
 
-use self::input::ScanFiles;
+use self::input::LabelledScan;
 use self::report::GroundReport;
 use super::claims::{Claims, Outputs};
 use super::interrupt::Interrupted;
@@ -59,15 +59,18 @@ pub fn run(args: &GroundArgs, context: &Context) -> Result<String> {
 /// Explains the confidence of the point nearest to a position.
 fn explain(config: &GroundCommandConfig, path: &Path, position: Vec3) -> Result<String> {
     ensure!(
-        input::is_scan(path),
-        "--explain needs one scan, but {} is a folder; give the path of one of its .bin files",
-        path.display()
-    );
-    ensure!(
         config.ground_method == GroundMethod::Fuzzy,
         "--explain needs fuzzy rules; set ground_method to fuzzy"
     );
-    let scan = input::scans(path, config)?.remove(0).read()?;
+    let scans = input::scans(path, config)?;
+    let [scan] = scans.as_slice() else {
+        bail!(
+            "--explain needs one scan, but {} has {}; give the path of one (.bin, .pcd, .ply, .npy), or select one with --set start_idx=N --set n_scans=1",
+            path.display(),
+            scans.len()
+        );
+    };
+    let scan = scan.read()?;
     let distance_m = |&index: &usize| scan.points[index].distance(position);
     let index = (0..scan.points.len())
         .filter(|&index| scan.points[index].is_finite())
@@ -92,7 +95,7 @@ fn explain(config: &GroundCommandConfig, path: &Path, position: Vec3) -> Result<
     Ok(text)
 }
 
-/// Segments the scan at a path or all selected scans of a folder, and writes the results.
+/// Segments the scan at a path or all selected scans of a recording, and writes the results.
 fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Result<GroundReport> {
     let scans = input::scans(path, config)?;
     let report_file = config.output_folder.join("ground.json");
@@ -152,7 +155,7 @@ fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Resu
 fn prepare(
     config: &GroundCommandConfig,
     context: &Context,
-    scans: &[ScanFiles],
+    scans: &[LabelledScan],
     report_file: &Path,
 ) -> Result<Claims> {
     let mut names = vec![
