@@ -109,7 +109,7 @@ fn files_of_the_user_among_the_outputs_are_refused() {
         &recording,
         "results/effective_evaluation.yml",
         call,
-        &["result_file"],
+        &["output_folder"],
     );
 }
 

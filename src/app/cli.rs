@@ -73,12 +73,14 @@ Examples:
   fpmcl refine --set result_file=results/localization.npz --backend cpu")]
     Refine(RefineArgs),
 
-    /// Compute the errors of a result against the ground truth.
+    /// Compute the errors of a result or a trajectory against the ground truth.
     #[command(after_help = "\
 Examples:
-  fpmcl evaluate results/localization.npz --set pose_file=poses.txt
+  fpmcl evaluate results/localization.npz --truth poses.txt
+  fpmcl evaluate trajectory.tum --truth poses.txt --calib calib.txt
+  fpmcl evaluate trajectory.tum --truth other.tum --align rigid
   fpmcl evaluate config/evaluation.yml")]
-    Evaluate(RunArgs),
+    Evaluate(EvaluateArgs),
 
     /// Compare configurations: sequences x configurations x seeds.
     #[command(after_help = "\
@@ -157,7 +159,7 @@ pub struct DoctorArgs {
 /// Configuration and machine.
 #[derive(Clone, Debug, Args)]
 pub struct ConfigArgs {
-    /// Configuration (.yml), or the input: a recording (build-map, localize), a point cloud (build-map) or a result (refine, evaluate). Without it, the command's file under config/ or, if there is none, built-in values.
+    /// Configuration (.yml), or the input: a recording (build-map, localize), a point cloud (build-map), a result (refine, evaluate) or a trajectory (evaluate). Without it, the command's file under config/ or, if there is none, built-in values.
     #[arg(value_name = "CONFIG | INPUT")]
     pub config: Option<PathBuf>,
 
@@ -259,6 +261,34 @@ pub struct RefineArgs {
     /// Map; by default that of the localization. Sets the key `map_file`.
     #[arg(long, value_name = "MAP")]
     pub map: Option<PathBuf>,
+}
+
+/// Arguments of `evaluate`.
+#[derive(Clone, Debug, Args)]
+pub struct EvaluateArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    pub run: RunArgs,
+
+    /// True poses: rows of KITTI or TUM, a folder oxts, or a topic of the recording; by default those in the result. Sets the key `pose_file`.
+    #[arg(long, value_name = "FILE")]
+    pub truth: Option<PathBuf>,
+
+    /// Calibration of the camera whose poses the truth has; sets the key `calib_file`.
+    #[arg(long, value_name = "FILE")]
+    pub calib: Option<PathBuf>,
+
+    /// Recording whose poses are the truth; sets the key `scan_folder`.
+    #[arg(long, value_name = "RECORDING")]
+    pub recording: Option<PathBuf>,
+
+    /// Alignment with the truth; by default none for a result in a map, and first for a trajectory. Sets the key `alignment`.
+    #[arg(long, value_name = "ALIGNMENT", value_parser = ["none", "first", "rigid"])]
+    pub align: Option<String>,
+
+    /// Folder of the report; sets the key `output_folder`.
+    #[arg(long, value_name = "FOLDER")]
+    pub output: Option<PathBuf>,
 }
 
 /// Arguments of `demo`.
@@ -400,7 +430,8 @@ impl Command {
             Self::BuildMap(args) => args.run.source.machine,
             Self::Localize(args) => args.run.source.machine,
             Self::Refine(args) => args.run.source.machine,
-            Self::Evaluate(args) | Self::Simulate(args) => args.source.machine,
+            Self::Evaluate(args) => args.run.source.machine,
+            Self::Simulate(args) => args.source.machine,
             Self::Compare(args) => args.source.machine,
             Self::Demo(args) => args.machine,
             Self::Ground(args) => args.machine,
@@ -428,11 +459,6 @@ fn is_config(path: &Path) -> bool {
 }
 
 impl RunArgs {
-    /// Settings of the flags that stand for a key, and of the argument, whose key this is.
-    pub fn flags_with_input(&self, key: &str) -> Vec<(String, String)> {
-        [path_settings(&[(key, self.source.input())]), self.flags()].concat()
-    }
-
     /// Settings of the flags that stand for a key.
     pub fn flags(&self) -> Vec<(String, String)> {
         let seed = self.seed.map(|seed| ("seed".to_owned(), seed.to_string()));
@@ -488,6 +514,22 @@ impl RefineArgs {
             ("map_file", self.map.as_deref()),
         ];
         [path_settings(&paths), self.run.flags()].concat()
+    }
+}
+
+impl EvaluateArgs {
+    /// Settings of the flags that stand for a key.
+    pub fn flags(&self) -> Vec<(String, String)> {
+        let paths = [
+            ("result_file", self.run.source.input()),
+            ("pose_file", self.truth.as_deref()),
+            ("calib_file", self.calib.as_deref()),
+            ("scan_folder", self.recording.as_deref()),
+            ("output_folder", self.output.as_deref()),
+        ];
+        let mut settings = path_settings(&paths);
+        settings.extend((self.align.clone()).map(|align| ("alignment".to_owned(), align)));
+        [settings, self.run.flags()].concat()
     }
 }
 

@@ -9,8 +9,9 @@
 //!
 //! of which the length of the translation and the angle of the rotation are reported. Sturm et al.,
 //! *A Benchmark for the Evaluation of RGB-D SLAM Systems*, IROS 2012, eq. 1 and 3; pairs are
-//! chosen as in evo (Grupp 2017), without alignment. Segments: Geiger, Lenz and
-//! Urtasun, *Are we ready for autonomous driving?*, CVPR 2012, as in the benchmark's devkit.
+//! chosen as in evo (Grupp 2017), without alignment. Segments are pairs a length apart along the
+//! *truth*, whose errors are divided by the length: Geiger, Lenz and Urtasun, *Are we ready for
+//! autonomous driving?*, CVPR 2012, as in the benchmark's devkit.
 
 use serde::{Deserialize, Serialize};
 
@@ -103,7 +104,25 @@ pub fn relative_pose_error(
     }))
 }
 
-/// Mean error per distance over segments of 100, 200, ..., 800 m.
+/// Lengths of the segments of the KITTI benchmark [m].
+pub const KITTI_LENGTHS_M: [f64; 8] = [100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0];
+/// The segments of the KITTI benchmark start at every tenth pose.
+pub const KITTI_FRAME_STEP: usize = 10;
+/// Lengths of the segments of short drives, which start at every pose [m].
+pub const SHORT_LENGTHS_M: [f64; 4] = [5.0, 10.0, 20.0, 50.0];
+
+/// Relative error of one segment of a trajectory.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Segment {
+    /// Nominal length [m].
+    pub length_m: f64,
+    /// Translation error per length (unitless).
+    pub translation: f64,
+    /// Rotation error per length [rad/m].
+    pub rotation_rad_per_m: f64,
+}
+
+/// Mean error per distance over segments.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SegmentErrors {
     /// Translation error per distance driven [%].
@@ -114,29 +133,63 @@ pub struct SegmentErrors {
     pub segments: usize,
 }
 
-/// KITTI's segment errors, starting at every tenth pose; `None` for a path under 100 m.
-pub fn kitti_segment_errors(estimates: &[Pose3], ground_truth: &[Pose3]) -> Option<SegmentErrors> {
-    const FRAME_STEP: usize = 10;
+impl SegmentErrors {
+    /// The mean over all segments, as the KITTI benchmark averages; `None` without segments.
+    pub fn mean_of<'a>(segments: impl IntoIterator<Item = &'a Segment>) -> Option<Self> {
+        let (translations, rotations): (Vec<f64>, Vec<f64>) = (segments.into_iter())
+            .map(|segment| (segment.translation, segment.rotation_rad_per_m))
+            .unzip();
+        Some(Self {
+            translation_percent: 100.0 * mean(&translations)?,
+            rotation_deg_per_m: mean(&rotations)?.to_degrees(),
+            segments: translations.len(),
+        })
+    }
+
+    /// Rotation error per distance driven [deg/100 m].
+    pub fn rotation_deg_per_100_m(&self) -> f64 {
+        100.0 * self.rotation_deg_per_m
+    }
+}
+
+/// The segments of given ascending lengths [m] that start at every `frame_step`-th pose. A segment ends at the first
+/// pose whose distance along the truth is at least that of the start and the length; its error is divided by
+/// the length.
+pub fn segments(
+    estimates: &[Pose3],
+    ground_truth: &[Pose3],
+    lengths_m: &[f64],
+    frame_step: usize,
+) -> Vec<Segment> {
     let driven_m = distances_m(ground_truth);
-    let (mut translations, mut rotations) = (Vec::new(), Vec::new());
-    for first in (0..ground_truth.len()).step_by(FRAME_STEP) {
-        for length_m in (1..=8).map(|hundreds| 100.0 * f64::from(hundreds)) {
+    let mut segments = Vec::new();
+    for first in (0..ground_truth.len()).step_by(frame_step.max(1)) {
+        for &length_m in lengths_m {
             let end_m = driven_m[first] + length_m;
-            let last = driven_m.partition_point(|&driven_m| driven_m <= end_m);
+            let last = driven_m.partition_point(|&driven_m| driven_m < end_m);
             if last >= ground_truth.len() {
                 break;
             }
             let true_step = ground_truth[first].inverse() * ground_truth[last];
-            let error = (estimates[first].inverse() * estimates[last]).inverse() * true_step;
-            translations.push(error.translation.vector.norm() / length_m);
-            rotations.push(error.rotation.angle() / length_m);
+            let error = true_step.inverse() * (estimates[first].inverse() * estimates[last]);
+            segments.push(Segment {
+                length_m,
+                translation: error.translation.vector.norm() / length_m,
+                rotation_rad_per_m: error.rotation.angle() / length_m,
+            });
         }
     }
-    Some(SegmentErrors {
-        translation_percent: 100.0 * mean(&translations)?,
-        rotation_deg_per_m: mean(&rotations)?.to_degrees(),
-        segments: translations.len(),
-    })
+    segments
+}
+
+/// KITTI's segment errors, 100 to 800 m from every tenth pose; `None` for a path under 100 m.
+pub fn kitti_segment_errors(estimates: &[Pose3], ground_truth: &[Pose3]) -> Option<SegmentErrors> {
+    SegmentErrors::mean_of(&segments(
+        estimates,
+        ground_truth,
+        &KITTI_LENGTHS_M,
+        KITTI_FRAME_STEP,
+    ))
 }
 
 #[cfg(test)]
@@ -234,12 +287,58 @@ mod tests {
     fn a_path_that_is_one_percent_too_long_has_a_segment_error_of_one_percent() {
         let truth = straight(1000, 1.0, 0.0);
         let errors = kitti_segment_errors(&straight(1000, 1.01, 0.0), &truth).unwrap();
-        // A segment ends at the first pose beyond its length: 101 m of 100 m.
-        assert_relative_eq!(errors.translation_percent, 1.0, epsilon = 0.01);
+        assert_relative_eq!(errors.translation_percent, 1.0, epsilon = 1e-9);
         assert_relative_eq!(errors.rotation_deg_per_m, 0.0, epsilon = 1e-12);
-        let turned = kitti_segment_errors(&straight(1000, 1.0, 1e-4), &truth).unwrap();
-        let expected = 1e-4_f64.to_degrees();
-        assert_relative_eq!(turned.rotation_deg_per_m, expected, max_relative = 0.01);
+        // 990 m: from 0, 10, ..., 980 m as far as each length fits.
+        let expected: usize = (1..=8)
+            .map(|hundreds| 1 + (999 - 100 * hundreds) / 10)
+            .sum();
+        assert_eq!(errors.segments, expected);
+    }
+
+    #[test]
+    fn the_rotation_error_of_a_segment_is_the_turn_per_metre() {
+        let (truth, turned) = (straight(1000, 1.0, 0.0), straight(1000, 1.0, 1e-4));
+        let expected = 100.0 * 1e-4_f64.to_degrees();
+        let errors = kitti_segment_errors(&turned, &truth).unwrap();
+        assert_relative_eq!(errors.rotation_deg_per_100_m(), expected, epsilon = 1e-6);
+        let short = segments(&turned, &truth, &SHORT_LENGTHS_M, 1);
+        let errors = SegmentErrors::mean_of(&short).unwrap();
+        assert_relative_eq!(errors.rotation_deg_per_100_m(), expected, epsilon = 1e-6);
+        assert_eq!(errors.segments, 995 + 990 + 980 + 950);
+    }
+
+    #[test]
+    fn segment_errors_do_not_depend_on_the_frame_of_either_trajectory() {
+        let elsewhere = Pose3::new(Vector3::new(4.0, 5.0, 6.0), Vector3::new(0.3, 0.2, 0.1));
+        // Rounded distances must not change where a segment ends.
+        let step_m = 1.0 + 1e-7;
+        let (truth, estimates) = (straight(300, step_m, 0.01), straight(300, 1.02, 0.0101));
+        let moved =
+            |poses: &[Pose3]| -> Vec<Pose3> { poses.iter().map(|pose| elsewhere * pose).collect() };
+        let here = segments(&estimates, &truth, &SHORT_LENGTHS_M, 1);
+        for (estimates, truth) in [
+            (moved(&estimates), truth.clone()),
+            (estimates.clone(), moved(&truth)),
+        ] {
+            let there = segments(&estimates, &truth, &SHORT_LENGTHS_M, 1);
+            assert_eq!(here.len(), there.len());
+            for (a, b) in here.iter().zip(&there) {
+                assert_relative_eq!(a.translation, b.translation, epsilon = 1e-9);
+                assert_relative_eq!(a.rotation_rad_per_m, b.rotation_rad_per_m, epsilon = 1e-9);
+            }
+        }
+    }
+
+    #[test]
+    fn a_segment_ends_at_the_first_pose_at_its_length_or_beyond() {
+        // Steps of 3 m: 5 m end at 6 m, 12 m at 12 m.
+        let truth = straight(5, 3.0, 0.0);
+        let estimates = straight(5, 3.3, 0.0);
+        let found = segments(&estimates, &truth, &[5.0, 12.0], 10);
+        assert_eq!(found.len(), 2);
+        assert_relative_eq!(found[0].translation, 0.6 / 5.0, epsilon = 1e-12);
+        assert_relative_eq!(found[1].translation, 1.2 / 12.0, epsilon = 1e-12);
     }
 
     #[test]

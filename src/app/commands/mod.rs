@@ -58,8 +58,7 @@ pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
         }
         Command::Evaluate(args) => {
             let base = EvaluationConfig::default;
-            let flags = args.flags_with_input("result_file");
-            let (config, context) = configured(args, flags, base, context)?;
+            let (config, context) = configured(&args.run, args.flags(), base, context)?;
             output::print(&evaluate::run(&config, &context)?.to_text())
         }
         Command::Simulate(args) => {

@@ -10,7 +10,7 @@ use super::output;
 use crate::app::plotting::color::{MCL, REFINED};
 use crate::app::plotting::{
     Animation, LineChart, LocalizationPicture, MapImage, MapPlot, Panel, PathPlot, Series,
-    error_chart, map_plot,
+    drift_chart, error_chart, map_plot,
 };
 use crate::app::results::{
     LocalizationResults, Report, RunSummary, TrajectoryReport, write_frames_csv, write_poses_npy,
@@ -20,7 +20,7 @@ use crate::evaluation::{
     TrajectoryMetrics, planar_errors,
 };
 use crate::files::folder_of;
-use crate::geometry::{Pose2, Pose3, StampedPose, TriangleMesh};
+use crate::geometry::{Pose2, Pose3, StampedPose, TriangleMesh, pose2_from_pose3};
 use crate::localization::{Estimate, ParticleSet};
 use crate::recording::Recording;
 use crate::recording::poses::{write_kitti, write_tum};
@@ -50,6 +50,14 @@ impl RunFiles {
         &self.folder
     }
 
+    /// The files of a result in another folder.
+    pub fn in_folder(result: &Path, folder: &Path) -> Self {
+        Self {
+            result: result.to_owned(),
+            folder: folder.to_owned(),
+        }
+    }
+
     /// The path of a file beside the result.
     pub fn file(&self, name: &str) -> PathBuf {
         self.folder.join(name)
@@ -57,10 +65,10 @@ impl RunFiles {
 
     /// The path of a plot in `plots/`, which is created if necessary, but not the folder above it.
     pub fn plot(&self, name: &str) -> Result<PathBuf> {
-        self.in_folder("plots", name)
+        self.in_subfolder("plots", name)
     }
 
-    fn in_folder(&self, folder: &str, name: &str) -> Result<PathBuf> {
+    fn in_subfolder(&self, folder: &str, name: &str) -> Result<PathBuf> {
         let folder = self.folder.join(folder);
         output::create_subfolder(&folder)?;
         Ok(folder.join(name))
@@ -207,6 +215,7 @@ pub fn evaluate(
             )?,
             None => None,
         },
+        trajectory: None,
     })
 }
 
@@ -239,8 +248,15 @@ pub fn draw_run(
 ) -> Result<()> {
     let image = mesh.map(|mesh| MapImage::of_colors(mesh, MAP_CELLS));
     let truth = results.ground_truth.as_deref();
-    let estimates = results.estimates.as_deref().unwrap_or_default();
-    let mut paths = vec![("MCL", MCL, estimates)];
+    let estimates = match (&results.estimates, &results.estimates_in_space) {
+        (Some(estimates), _) => estimates.clone(),
+        (None, Some(estimates)) => estimates.iter().map(pose2_from_pose3).collect(),
+        (None, None) => Vec::new(),
+    };
+    let estimates = estimates.as_slice();
+    let is_trajectory = results.particles.is_empty();
+    let name = if is_trajectory { "estimate" } else { "MCL" };
+    let mut paths = vec![(name, MCL, estimates)];
     paths.extend(
         results
             .refined
@@ -257,9 +273,12 @@ pub fn draw_run(
         map: image.as_ref(),
     }
     .save(&files.plot("path.png")?)?;
-    if let Some(truth) = truth {
+    if let Some(truth) = truth
+        && !is_trajectory
+    {
         draw_errors(files, results, estimates, truth)?;
     }
+    draw_drift(files, name, results)?;
     draw_runtimes(files, results)?;
     draw_particles(files, image.as_ref(), results)?;
     if let Some(mesh) = mesh {
@@ -297,6 +316,24 @@ fn draw_errors(
             .map(|it| ("refined", REFINED, errors(it))),
     );
     error_chart("Errors over time", x_name, &trajectories).save(&files.plot("errors.png")?)
+}
+
+/// Draws the errors in space against the distance driven.
+fn draw_drift(files: &RunFiles, name: &str, results: &LocalizationResults) -> Result<()> {
+    let Some(truth) = results.ground_truth_in_space.as_deref() else {
+        return Ok(());
+    };
+    let trajectories: Vec<_> = [
+        (name, MCL, &results.estimates_in_space),
+        ("refined", REFINED, &results.refined_in_space),
+    ]
+    .into_iter()
+    .filter_map(|(name, color, poses)| Some((name, color, poses.as_deref()?)))
+    .collect();
+    if trajectories.is_empty() {
+        return Ok(());
+    }
+    drift_chart(truth, &trajectories).save(&files.plot("drift.png")?)
 }
 
 fn draw_runtimes(files: &RunFiles, results: &LocalizationResults) -> Result<()> {
@@ -380,7 +417,7 @@ impl Movie {
         let t = estimate.pose.translation;
         let path = self
             .files
-            .in_folder("loc_plots", &format!("{number:06}.png"))?;
+            .in_subfolder("loc_plots", &format!("{number:06}.png"))?;
         LocalizationPicture {
             title: &format!("Frame {number}: {}", estimate.state.word()),
             map: Some(&self.map),

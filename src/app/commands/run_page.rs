@@ -11,6 +11,7 @@ use super::{output, version};
 use crate::app::plotting::palette;
 use crate::app::reporting::{Cell, Column, Page, PageElement, Section, Table};
 use crate::app::results::{MetricRow, Report, Value};
+use crate::evaluation::{LengthErrors, SpatialMetrics};
 
 /// Content of the page, apart from the files of the run.
 pub struct RunPage<'a> {
@@ -27,12 +28,17 @@ pub struct RunPage<'a> {
 }
 
 /// Pictures of a run: section, file name and caption.
-pub const PICTURES: [(&str, &str, &str); 7] = [
+pub const PICTURES: [(&str, &str, &str); 8] = [
     ("Trajectory", "path.png", "Path against ground truth"),
     (
         "Errors",
         "errors.png",
         "Position and heading error over time",
+    ),
+    (
+        "Drift",
+        "drift.png",
+        "Position and heading error against the distance driven along the truth, as evaluated and (dashed) after rigid alignment; relative errors against the length of the segments",
     ),
     ("Particles", "particles.png", "Particles of the first frame"),
     (
@@ -60,13 +66,14 @@ pub const TEXTS: [&str; 5] = [
 
 /// Writes the page of a run without timing and machine.
 pub fn write(files: &RunFiles, report: &Report) -> Result<()> {
-    let recording = report
-        .about
-        .get("recording")
-        .map_or("a run", String::as_str);
+    let named = |name| report.about.get(name).map(String::as_str);
+    let title = match report.trajectory {
+        Some(_) => format!("Trajectory {}", named("result").unwrap_or_default()),
+        None => format!("Localization in {}", named("recording").unwrap_or("a run")),
+    };
     RunPage {
         files,
-        title: &format!("Localization in {recording}"),
+        title: &title,
         report,
         stage_seconds: &BTreeMap::new(),
         machine: &BTreeMap::new(),
@@ -92,6 +99,11 @@ impl RunPage<'_> {
             let path = self.files.file("plots").join(name);
             let mut elements: Vec<PageElement> =
                 picture_or_error(&path, caption).into_iter().collect();
+            if title == "Drift" {
+                let in_space = self.report.in_space();
+                let tables = in_space.into_iter().filter_map(|it| segments(it.0, it.1));
+                elements.extend(tables.map(PageElement::Table));
+            }
             if title == "Timing" && !self.stage_seconds.is_empty() {
                 elements.push(PageElement::Table(stages(self.stage_seconds)));
             }
@@ -117,7 +129,13 @@ impl RunPage<'_> {
 /// Metrics of both trajectories with their definitions.
 fn metrics(report: &Report) -> Table {
     let has_refined = report.refined.is_some();
-    let titles = ["metric", "MCL", "refined", "unit", "definition"];
+    let titles = [
+        "metric",
+        report.estimate_title(),
+        "refined",
+        "unit",
+        "definition",
+    ];
     let cell = |value: Value| match value {
         Value::Number(number) => Cell::Number(number),
         Value::Count(count) => Cell::Number(count as f64),
@@ -131,13 +149,15 @@ fn metrics(report: &Report) -> Table {
         cells.extend([row.unit.into(), row.definition.into()]);
         cells
     };
-    let title = match report.mcl {
-        Some(_) => "Errors from the tenth frame on, without alignment",
-        None => "No true poses were given: what the run shows itself",
+    let alignment = report.about.get("alignment").map_or("none", String::as_str);
+    let title = match (&report.mcl, &report.trajectory) {
+        (Some(_), _) => format!("Errors from the tenth frame on; alignment: {alignment}"),
+        (None, Some(_)) => format!("Errors in six degrees of freedom; alignment: {alignment}"),
+        (None, None) => "No true poses were given: what the run shows itself".to_owned(),
     };
     Table {
         name: "numbers".to_owned(),
-        title: title.to_owned(),
+        title,
         note: String::new(),
         columns: titles
             .into_iter()
@@ -146,6 +166,35 @@ fn metrics(report: &Report) -> Table {
             .collect(),
         rows: report.joined_rows().into_iter().map(row).collect(),
     }
+}
+
+/// Relative errors of a trajectory by the length of the segments; `None` if it is shorter than all.
+fn segments(name: &str, metrics: &SpatialMetrics) -> Option<Table> {
+    let column = |name: &str, unit: &str| Column {
+        unit: unit.to_owned(),
+        ..Column::named(name)
+    };
+    let row = |it: &LengthErrors| {
+        vec![
+            it.length_m.into(),
+            it.errors.translation_percent.into(),
+            it.errors.rotation_deg_per_100_m().into(),
+            (it.errors.segments as f64).into(),
+        ]
+    };
+    (!metrics.by_length.is_empty()).then(|| Table {
+        name: format!("segments of {name}"),
+        title: format!("Mean errors over segments by their length: {name}"),
+        note: "From every frame up to 50 m, from every tenth from 100 m on; divided by the length."
+            .to_owned(),
+        columns: vec![
+            column("length", "m"),
+            column("translation error", "%"),
+            column("rotation error", "deg/100 m"),
+            Column::named("segments"),
+        ],
+        rows: metrics.by_length.iter().map(row).collect(),
+    })
 }
 
 fn stages(seconds: &BTreeMap<String, f64>) -> Table {

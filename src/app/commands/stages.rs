@@ -83,6 +83,11 @@ impl<'a> RecordingInputs<'a> {
         }
         #[cfg(not(feature = "bags"))]
         let _ = recording;
+        self.file_track(path)
+    }
+
+    /// Reads poses of the recording from a file or a folder `oxts`.
+    pub fn file_track(&self, path: &Path) -> Result<PoseTrack> {
         Ok(match self.body_from_lidar {
             Some(numbers) => PoseTrack::read_of_body(path, body_from_lidar(numbers))?,
             None => PoseTrack::read(path, self.calib_file)?,

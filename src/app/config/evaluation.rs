@@ -6,6 +6,8 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::check::{optional_path, path};
+use super::recording::mounting;
+use crate::evaluation::Alignment;
 use crate::validation::{InvalidValue, Validate, at_least_one, positive, require};
 
 /// Configuration of `evaluate`: the keys of range-mcl's `evaluation.yml`, then new ones.
@@ -14,14 +16,29 @@ use crate::validation::{InvalidValue, Validate, at_least_one, positive, require}
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct EvaluationConfig {
-    /// Result of `localize`, `refine` or range-mcl.
+    /// Result of `localize`, `refine` or range-mcl, or a trajectory of any origin, rows of KITTI or TUM.
     #[default("results/localization.npz".into())]
     pub result_file: PathBuf,
-    /// Poses of the recording, rows of KITTI or TUM, the ground truth; `None`: that in the result.
+    /// Calibration of the camera whose poses a trajectory has as rows of KITTI; `None`: they are those of the lidar.
+    pub result_calib_file: Option<PathBuf>,
+    /// The ground truth, rows of KITTI or TUM, a folder `oxts`, or a topic of a bag; `None`: the poses in
+    /// `scan_folder`, else those in the result.
     pub pose_file: Option<PathBuf>,
     /// Calibration of the recording, with its line `Tr`, for `pose_file`.
     /// `None`: the poses are those of the lidar.
     pub calib_file: Option<PathBuf>,
+    /// Pose x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose true poses are given; `None`: they
+    /// are those of the lidar.
+    pub body_from_lidar: Option<[f64; 6]>,
+    /// The recording whose poses are the ground truth; `None`: for a topic, that of the localization.
+    pub scan_folder: Option<PathBuf>,
+    /// Topic of the point clouds in a bag with several.
+    pub topic: Option<String>,
+    /// Alignment with the truth before errors are computed; `None`: none for a result in a map, and that of the
+    /// first pose for a trajectory.
+    pub alignment: Option<Alignment>,
+    /// Folder of the output; `None`: that of a result, and `NAME_evaluation` beside a trajectory `NAME.txt`.
+    pub output_folder: Option<PathBuf>,
     /// Whether to draw the trajectory.
     #[default(true)]
     pub plot_loc_traj: bool,
@@ -55,7 +72,15 @@ impl Validate for EvaluationConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         path("result_file", &self.result_file)?;
         optional_path("pose_file", self.pose_file.as_deref())?;
-        optional_path("calib_file", self.calib_file.as_deref())?;
+        for (key, value) in [
+            ("result_calib_file", &self.result_calib_file),
+            ("calib_file", &self.calib_file),
+            ("scan_folder", &self.scan_folder),
+            ("output_folder", &self.output_folder),
+        ] {
+            optional_path(key, value.as_deref())?;
+        }
+        mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
         self.selection().validate()?;
         positive("grid_resolution", self.grid_resolution)?;
         positive("converge_thres", self.converge_thres)?;

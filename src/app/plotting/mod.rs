@@ -12,6 +12,7 @@ mod view;
 // The pictures.
 mod animation;
 mod chart;
+mod drift;
 mod ground_plot;
 mod map_image;
 pub mod map_plot;
@@ -26,6 +27,7 @@ mod tests;
 pub use animation::Animation;
 pub use bitmap::Bitmap;
 pub use chart::{LineChart, Panel, Series};
+pub use drift::drift_chart;
 pub use ground_plot::GroundPlot;
 pub use map_image::MapImage;
 pub use map_plot::{MapPlot, ScalarMapPlot};

@@ -6,16 +6,19 @@ use std::path::Path;
 use anyhow::{Context as _, Result};
 
 use super::localization_results::LocalizationResults;
-use crate::evaluation::{PlanarError, distances_m, planar_errors};
+use crate::evaluation::{PlanarError, distances_m, drift, planar_errors};
 use crate::files::write_atomically;
-use crate::geometry::Pose2;
+use crate::geometry::{Pose2, Pose3};
 
-/// Writes the table; nothing without estimates.
+/// Writes the table; of a trajectory without particles, that of its errors in space. Nothing without estimates.
 pub fn write_frames_csv(path: &Path, results: &LocalizationResults) -> Result<()> {
-    let Some(estimates) = &results.estimates else {
-        return Ok(());
+    let table = match (&results.estimates, &results.estimates_in_space) {
+        (_, Some(estimates)) if results.particles.is_empty() => {
+            FrameTable::of_trajectory(results, estimates)
+        }
+        (Some(estimates), _) => FrameTable::new(results, estimates),
+        _ => return Ok(()),
     };
-    let table = FrameTable::new(results, estimates);
     write_atomically(path, |file| table.write(file))
         .with_context(|| format!("cannot write {}", path.display()))
 }
@@ -59,6 +62,35 @@ impl FrameTable {
             results.refine_runtimes_s.as_deref(),
             |time_s| 1e3 * time_s,
         );
+        table
+    }
+
+    /// Poses in space and their errors against the distance driven.
+    fn of_trajectory(results: &LocalizationResults, estimates: &[Pose3]) -> Self {
+        let truth = results.ground_truth_in_space.as_deref();
+        let errors = truth.map(|truth| drift(estimates, truth));
+        let errors = errors.as_deref();
+        let mut table = Self {
+            rows: results.len(),
+            columns: Vec::new(),
+        };
+        table.add("frame", Some(&results.frames), usize::to_string);
+        table.add_numbers("time_s", results.times_s.as_deref(), |time_s| *time_s);
+        table.add_numbers("distance_m", errors, |error| error.distance_m);
+        for (name, poses) in [("truth", truth), ("estimate", Some(estimates))] {
+            for (axis, letter) in ["x", "y", "z"].into_iter().enumerate() {
+                table.add_numbers(format!("{name}_{letter}_m"), poses, |pose| {
+                    pose.translation.vector[axis]
+                });
+            }
+        }
+        table.add_numbers("position_error_m", errors, |error| error.position_m);
+        table.add_numbers("heading_error_deg", errors, |error| {
+            error.heading_rad.to_degrees()
+        });
+        table.add_numbers("rotation_error_deg", errors, |error| {
+            error.rotation_rad.to_degrees()
+        });
         table
     }
 

@@ -17,13 +17,14 @@
 //! | `states` | (rows) | uint8 | state of the filter |
 //! | `selected_frames` | () | int64 | number of frames to localize; only where not all were |
 //!
-//! All but the first three are optional. In rows before `start_idx` they are NaN.
+//! All but the first three are optional, and so are `particles` where there are `frames`: a trajectory without a map.
+//! In rows before `start_idx` they are NaN.
 
 use anyhow::{Context as _, Result};
 use nalgebra::Matrix3;
 
 use crate::evaluation::{ParticleRow, RangeMclRules};
-use crate::geometry::{Pose2, Pose3};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 
 /// Particles of many frames, without the padding of the stored array.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -137,6 +138,15 @@ impl LocalizationResults {
         self.frames.is_empty()
     }
 
+    /// Times of the frames that were recorded [s]; `None` if ten frames per second were assumed.
+    pub fn recorded_times(&self) -> Option<&[f64]> {
+        let times_s = self.times_s.as_deref()?;
+        let assumed =
+            |(frame, time_s): (&usize, &f64)| (*frame as f64 / 10.0 - time_s).abs() < 1e-9;
+        let are_assumed = self.frames.iter().zip(times_s).all(assumed);
+        (!are_assumed).then_some(times_s)
+    }
+
     /// How many of the frames were localized, if not all.
     pub fn shortfall(&self) -> Option<String> {
         let found = self.len();
@@ -178,10 +188,14 @@ impl LocalizationResults {
         }
     }
 
-    /// The stored estimates, or if there are none, weighted means of the particles.
+    /// The stored estimates, or if there are none, weighted means of the particles; those in space, projected,
+    /// of a trajectory without particles.
     pub fn estimates_or_particle_means(&self, rules: &RangeMclRules) -> Result<Vec<Pose2>> {
         if let Some(estimates) = &self.estimates {
             return Ok(estimates.clone());
+        }
+        if let (true, Some(estimates)) = (self.particles.is_empty(), &self.estimates_in_space) {
+            return Ok(estimates.iter().map(pose2_from_pose3).collect());
         }
         let capacity = self.particles.capacity();
         (0..self.particles.len())

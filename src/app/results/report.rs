@@ -60,6 +60,9 @@ pub struct Report {
     pub mcl: Option<TrajectoryReport>,
     /// Errors of the refined trajectory, if there is one.
     pub refined: Option<TrajectoryReport>,
+    /// Errors of a trajectory that is not a result in a map.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trajectory: Option<SpatialMetrics>,
 }
 
 impl Report {
@@ -90,7 +93,7 @@ impl Report {
             text.push('\n');
         };
         let refined_title = self.refined.as_ref().map_or("", |_| "refined");
-        add_line("", "MCL", refined_title, "unit");
+        add_line("", self.estimate_title(), refined_title, "unit");
         for (row, refined) in &rows {
             let refined = refined.map_or(String::new(), |value| value.to_string());
             add_line(row.name, &row.value.to_string(), &refined, row.unit);
@@ -105,7 +108,8 @@ impl Report {
         let refined_rule = self.refined.as_ref().map_or("", |_| "---:|");
         let _ = writeln!(
             text,
-            "\n| | MCL |{refined_title} unit | definition |\n|---|---:|{refined_rule}---|---|"
+            "\n| | {} |{refined_title} unit | definition |\n|---|---:|{refined_rule}---|---|",
+            self.estimate_title()
         );
         for (row, refined) in self.joined_rows() {
             let refined = match (&self.refined, refined) {
@@ -128,9 +132,36 @@ impl Report {
     pub fn joined_rows(&self) -> Vec<(MetricRow, Option<Value>)> {
         let mut refined = self.refined.iter().flat_map(TrajectoryReport::rows);
         let errors = self.mcl.iter().flat_map(TrajectoryReport::rows);
+        let errors = errors.chain(self.trajectory.iter().flat_map(spatial_rows));
         let errors = errors.map(|row| (row, refined.next().map(|row| row.value)));
         let summary = self.summary.rows().into_iter().map(|row| (row, None));
         summary.chain(errors).collect()
+    }
+
+    /// Title of the column of the errors.
+    pub fn estimate_title(&self) -> &'static str {
+        match self.trajectory {
+            Some(_) => "estimate",
+            None => "MCL",
+        }
+    }
+
+    /// Errors in six degrees of freedom of each trajectory that has them, with its name.
+    pub fn in_space(&self) -> Vec<(&'static str, &SpatialMetrics)> {
+        [
+            (self.estimate_title(), self.trajectory.as_ref()),
+            (
+                self.estimate_title(),
+                self.mcl.as_ref().and_then(|it| it.in_space.as_ref()),
+            ),
+            (
+                "refined",
+                self.refined.as_ref().and_then(|it| it.in_space.as_ref()),
+            ),
+        ]
+        .into_iter()
+        .filter_map(|(name, metrics)| Some((name, metrics?)))
+        .collect()
     }
 
     fn about_lines(&self, prefix: &str) -> String {
@@ -171,6 +202,7 @@ mod tests {
             summary: RunSummary::default(),
             mcl: Some(trajectory(0.25)),
             refined: Some(trajectory(0.02)),
+            trajectory: None,
         }
     }
 

@@ -70,18 +70,21 @@ impl LocalizationResults {
     }
 
     fn write_to(&self, file: impl Write + Seek) -> io::Result<()> {
-        debug_assert_eq!(self.particles.len(), self.len());
+        let has_particles = !self.particles.is_empty();
+        debug_assert!(!has_particles || self.particles.len() == self.len());
         let leading = self.leading_rows();
         let rows = leading + self.len();
         let capacity = self.particles.capacity();
         let mut npz = NpzWriter::new(file);
-        npz.add(
-            "particles",
-            &[rows, capacity, 4],
-            repeat_n([0.0; 4], leading * capacity)
-                .chain((0..self.len()).flat_map(|row| self.padded_particles(row)))
-                .flatten(),
-        )?;
+        if has_particles || self.is_empty() {
+            npz.add(
+                "particles",
+                &[rows, capacity, 4],
+                repeat_n([0.0; 4], leading * capacity)
+                    .chain((0..self.len()).flat_map(|row| self.padded_particles(row)))
+                    .flatten(),
+            )?;
+        }
         npz.add("start_idx", &[], [leading as i64])?;
         npz.add("numParticles", &[], [capacity as i64])?;
         let frames = (0..leading).chain(self.frames.iter().copied());
@@ -201,13 +204,20 @@ impl<W: Write + Seek> RowWriter<W> {
     }
 }
 
-/// Reads the number of rows, the first row that was localized, and the particles from there on.
+/// Reads the number of rows, the first row that was localized, and the particles from there on; a trajectory has none.
 fn read_particles(path: &Path, npz: &mut NpzReader) -> Result<(usize, usize, ParticleLog)> {
     let [start_idx] = {
         let mut array = npz.required("start_idx")?;
         array.expect_shape(&[], "one number ()")?;
         array.next_row()?
     };
+    let rows = npz
+        .array("frames")?
+        .and_then(|array| array.shape.first().copied());
+    if let (None, Some(rows)) = (npz.array("particles")?, rows) {
+        let first = first_row(path, start_idx, rows)?;
+        return Ok((rows, first, ParticleLog::default()));
+    }
     let mut array = npz.required("particles")?;
     array.expect_shape(&[None, None, Some(4)], "(frames, N, 4)")?;
     let (rows, capacity) = (array.shape[0], array.shape[1]);
@@ -215,12 +225,7 @@ fn read_particles(path: &Path, npz: &mut NpzReader) -> Result<(usize, usize, Par
         // Any number of rows would need no data.
         array.expect_shape(&[Some(0), None, None], "(frames, N, 4) with N > 0")?;
     }
-    ensure!(
-        start_idx >= 0.0 && start_idx.fract() == 0.0 && (start_idx as usize) < rows.max(1),
-        "{}: start_idx is {start_idx}, but there are {rows} rows",
-        path.display()
-    );
-    let first = start_idx as usize;
+    let first = first_row(path, start_idx, rows)?;
     let mut log = ParticleLog::new(capacity);
     for row in 0..rows {
         let particles = next_particles(&mut array, row, capacity)?;
@@ -229,6 +234,16 @@ fn read_particles(path: &Path, npz: &mut NpzReader) -> Result<(usize, usize, Par
         }
     }
     Ok((rows, first, log))
+}
+
+/// The first row that was localized.
+fn first_row(path: &Path, start_idx: f64, rows: usize) -> Result<usize> {
+    ensure!(
+        start_idx >= 0.0 && start_idx.fract() == 0.0 && (start_idx as usize) < rows.max(1),
+        "{}: start_idx is {start_idx}, but there are {rows} rows",
+        path.display()
+    );
+    Ok(start_idx as usize)
 }
 
 /// Reads the number of frames to localize, which only a run that ended early wrote.

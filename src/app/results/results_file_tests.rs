@@ -334,3 +334,17 @@ fn inconsistent_arrays_are_errors_that_name_the_array() {
     let message = LocalizationResults::read(&path).unwrap_err().to_string();
     assert!(message.contains("`frames`, row 2: 5"), "{message}");
 }
+
+#[test]
+fn a_trajectory_without_particles_reads_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("odometry.npz");
+    for frames in [0..9, 4..13] {
+        let written = LocalizationResults {
+            particles: ParticleLog::default(),
+            ..results(frames)
+        };
+        written.write(&path).unwrap();
+        assert_same(&LocalizationResults::read(&path).unwrap(), &written);
+    }
+}

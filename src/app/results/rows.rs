@@ -103,11 +103,30 @@ pub fn metric_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
 
 /// The rows of the errors in six degrees of freedom.
 pub fn spatial_rows(metrics: &SpatialMetrics) -> Vec<MetricRow> {
+    [
+        absolute_rows(metrics),
+        aligned_rows(metrics),
+        segment_rows(metrics),
+    ]
+    .concat()
+}
+
+fn absolute_rows(metrics: &SpatialMetrics) -> Vec<MetricRow> {
+    let (position, rotation) = (&metrics.position_m, &metrics.rotation_rad);
     vec![
         MetricRow::new(
-            "position in space RMSE [m]: root mean square of the distance to the true position",
-            metrics.position_m.rmse,
+            "position in space RMSE [m]: root mean square of the distance to the true position (APE, Sturm et al. 2012, as evo)",
+            position.rmse,
         ),
+        MetricRow::new(
+            "position in space mean [m]: mean of the distance",
+            position.mean,
+        ),
+        MetricRow::new(
+            "position in space median [m]: half of the frames are nearer",
+            position.median,
+        ),
+        MetricRow::new("position in space max [m]: the worst frame", position.max),
         MetricRow::new(
             "height RMSE [m]: root mean square of the height difference",
             metrics.height_m.rmse,
@@ -118,12 +137,86 @@ pub fn spatial_rows(metrics: &SpatialMetrics) -> Vec<MetricRow> {
         ),
         MetricRow::new(
             "rotation RMSE [deg]: root mean square of the angle between the orientations",
-            metrics.rotation_rad.rmse.to_degrees(),
+            rotation.rmse.to_degrees(),
         ),
         MetricRow::new(
             "rotation max [deg]: the worst frame",
-            metrics.rotation_rad.max.to_degrees(),
+            rotation.max.to_degrees(),
         ),
+        MetricRow::new(
+            "position at the end [m]: distance of the last position to the true one",
+            metrics.end_position_m,
+        ),
+        MetricRow::new(
+            "rotation at the end [deg]: angle between the last orientations",
+            metrics.end_rotation_rad.to_degrees(),
+        ),
+        MetricRow::new(
+            "distance in space [m]: distance driven by the truth, with heights",
+            metrics.distance_m,
+        ),
+    ]
+}
+
+fn aligned_rows(metrics: &SpatialMetrics) -> Vec<MetricRow> {
+    let position = |number: fn(&Summary) -> f64| metrics.aligned_position_m.as_ref().map(number);
+    let rotation = metrics.aligned_rotation_rad.as_ref();
+    vec![
+        MetricRow::new(
+            "aligned position RMSE [m]: root mean square of the distance after rigid alignment, no scale (Umeyama 1991)",
+            position(|it| it.rmse),
+        ),
+        MetricRow::new(
+            "aligned position mean [m]: mean of this distance",
+            position(|it| it.mean),
+        ),
+        MetricRow::new(
+            "aligned position median [m]: half of the frames are nearer",
+            position(|it| it.median),
+        ),
+        MetricRow::new(
+            "aligned position max [m]: the worst frame",
+            position(|it| it.max),
+        ),
+        MetricRow::new(
+            "aligned rotation RMSE [deg]: root mean square of the angle after this alignment",
+            rotation.map(|it| it.rmse.to_degrees()),
+        ),
+    ]
+}
+
+fn segment_rows(metrics: &SpatialMetrics) -> Vec<MetricRow> {
+    let of_length = |description, length_m| {
+        let errors = metrics.of_length(length_m);
+        MetricRow::new(description, errors.map(|it| it.translation_percent))
+    };
+    let (kitti, short) = (metrics.kitti_segments, metrics.short_segments);
+    vec![
+        MetricRow::new(
+            "segments 100-800 m, translation [%]: mean error over segments of 100, 200, ..., 800 m from every tenth frame, per length, in space (Geiger et al. 2012)",
+            kitti.map(|it| it.translation_percent),
+        ),
+        MetricRow::new(
+            "segments 100-800 m, rotation [deg/100 m]: the same for rotation",
+            kitti.map(|it| it.rotation_deg_per_100_m()),
+        ),
+        MetricRow::new(
+            "segments 100-800 m: their number",
+            kitti.map(|it| it.segments),
+        ),
+        MetricRow::new(
+            "segments 5-50 m, translation [%]: mean error over segments of 5, 10, 20 and 50 m from every frame, per length, in space",
+            short.map(|it| it.translation_percent),
+        ),
+        MetricRow::new(
+            "segments 5-50 m, rotation [deg/100 m]: the same for rotation",
+            short.map(|it| it.rotation_deg_per_100_m()),
+        ),
+        MetricRow::new("segments 5-50 m: their number", short.map(|it| it.segments)),
+        of_length("segments 5 m, translation [%]: those of 5 m alone", 5.0),
+        of_length("segments 10 m, translation [%]: those of 10 m alone", 10.0),
+        of_length("segments 20 m, translation [%]: those of 20 m alone", 20.0),
+        of_length("segments 50 m, translation [%]: those of 50 m alone", 50.0),
     ]
 }
 
@@ -272,12 +365,12 @@ fn relative_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
             metrics.rpe_rotation_rad.map(|rpe| rpe.rmse.to_degrees()),
         ),
         MetricRow::new(
-            "KITTI segments, translation [%]: mean error over segments of 100 to 800 m per distance (Geiger et al. 2012)",
+            "KITTI segments, translation [%]: mean error over segments of 100 to 800 m per distance, in the plane (Geiger et al. 2012)",
             segments.map(|segments| segments.translation_percent),
         ),
         MetricRow::new(
-            "KITTI segments, rotation [deg/m]: the same for rotation",
-            segments.map(|segments| segments.rotation_deg_per_m),
+            "KITTI segments, rotation [deg/100 m]: the same for rotation",
+            segments.map(|segments| segments.rotation_deg_per_100_m()),
         ),
     ]
 }

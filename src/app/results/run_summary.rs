@@ -46,19 +46,14 @@ impl RunSummary {
         let path_m = steps
             .map(|(a, b)| (b.translation.vector - a.translation.vector).norm())
             .sum();
-        let times_s = results.times_s.as_deref().unwrap_or_default();
-        let assumed =
-            |(frame, time_s): (&usize, &f64)| (*frame as f64 / 10.0 - time_s).abs() < 1e-9;
-        let are_assumed = results.frames.iter().zip(times_s).all(assumed);
+        let times_s = results.recorded_times().unwrap_or_default();
         let duration_s = times_s.first().zip(times_s.last()).map(|(a, b)| b - a);
         Self {
             frames: results.len(),
             tracking: states.map(|_| tracked.len()),
             first_tracked: states.and_then(|_| Some(results.frames[*tracked.first()?])),
             path_m,
-            speed_m_per_s: duration_s
-                .filter(|&s| s > 0.0 && !are_assumed)
-                .map(|s| path_m / s),
+            speed_m_per_s: duration_s.filter(|&s| s > 0.0).map(|s| path_m / s),
             position_sigma_m: over_tracked(&|row| {
                 let position = covariance(row)?.fixed_view::<2, 2>(0, 0).into_owned();
                 Some(position.symmetric_eigenvalues().max().max(0.0).sqrt())

@@ -1,0 +1,274 @@
+//! `evaluate`: the errors of a result or of a trajectory.
+
+mod trajectory;
+mod truth;
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read as _;
+use std::path::Path;
+
+use anyhow::{Context as _, Result, ensure};
+
+use super::claims::{Claims, NPZ, Outputs};
+use super::run_output::{self, REPORT_FILES, RunFiles};
+use super::{Context, input, output, run_page};
+use crate::app::config::{self, EvaluationConfig, LocalizationConfig};
+use crate::app::results::{LocalizationResults, Report};
+use crate::evaluation::{Alignment, RangeMclRules};
+use crate::files::folder_of;
+use crate::geometry::TriangleMesh;
+use crate::map::{MappingPath, mesh_file};
+
+/// Compares a result of `localize`, `refine` or range-mcl, or any trajectory, with the ground truth.
+pub fn run(config: &EvaluationConfig, context: &Context) -> Result<Report> {
+    input::require_file("result_file", &config.result_file)?;
+    let files = output_files(config)?;
+    let main = files.file("effective_evaluation.yml");
+    let mut claims = prepare(config, context, &main)?;
+    let results = read(config)?;
+    run_output::warn_of_shortfall(&results, &config.result_file);
+    let mut about = about(config)?;
+    about.extend(run_output::shortfall(&results));
+    let results = selected(results, config)?;
+    let is_trajectory = results.particles.is_empty();
+    let (report, results, mesh) = match is_trajectory {
+        true => of_trajectory(config, results, about)?,
+        false => in_map(config, results, about)?,
+    };
+    if config.save_evaluation_results {
+        claims.begin(&main)?;
+        run_output::write_report(&files, &results, &report)?;
+        output::write_yaml(&main, config)?;
+    }
+    if config.plot_loc_traj {
+        run_output::draw_run(&files, mesh.as_ref(), &results)?;
+    }
+    if config.save_evaluation_results {
+        run_page::write(&files, &report)?;
+        claims.finish(&main)?;
+    }
+    Ok(report)
+}
+
+/// A report with the results that it is of, and the map.
+type Evaluated = (Report, LocalizationResults, Option<TriangleMesh>);
+
+/// Evaluates a result in a map.
+fn in_map(
+    config: &EvaluationConfig,
+    mut results: LocalizationResults,
+    mut about: BTreeMap<String, String>,
+) -> Result<Evaluated> {
+    let localized = localization_of(&config.result_file)?;
+    let track = truth::read_track(config, localized.as_ref())?;
+    let map = match track.is_some() || config.plot_loc_traj {
+        true => localized.as_ref().map_or(Ok(None), map_of)?,
+        false => None,
+    };
+    if let Some(mut track) = track {
+        if let Some((_, Some(path))) = &map {
+            track = track.in_map(&path.world_from_map);
+        }
+        let times_s = results.recorded_times().map(<[f64]>::to_vec);
+        results = truth::with_truth(results, times_s, &track, &config.result_file)?;
+    }
+    require_truth(&results, config)?;
+    let rules = RangeMclRules {
+        convergence_interval: config.convergence_interval,
+        converge_thres: config.converge_thres,
+        particle_select_ratio: config.particle_select_ratio,
+    };
+    results.estimates = Some(results.estimates_or_particle_means(&rules)?);
+    let alignment = config.alignment.unwrap_or(Alignment::None);
+    note(&mut about, alignment);
+    truth::align(&mut results, alignment)?;
+    let report = run_output::evaluate(&results, &rules, about)?;
+    Ok((report, results, map.map(|(mesh, _)| mesh)))
+}
+
+/// Evaluates a trajectory, which has no map.
+fn of_trajectory(
+    config: &EvaluationConfig,
+    mut results: LocalizationResults,
+    mut about: BTreeMap<String, String>,
+) -> Result<Evaluated> {
+    if let Some(mut track) = truth::read_track(config, None)? {
+        track.map_from_lidar = trajectory::in_world(&track);
+        let times_s = results.times_s.clone();
+        results = truth::with_truth(results, times_s, &track, &config.result_file)?;
+    }
+    require_truth(&results, config)?;
+    trajectory::level_camera_axes(&mut results);
+    let alignment = config.alignment.unwrap_or(Alignment::First);
+    note(&mut about, alignment);
+    truth::align(&mut results, alignment)?;
+    let report = trajectory::evaluate(&results, about)?;
+    Ok((report, results, None))
+}
+
+fn require_truth(results: &LocalizationResults, config: &EvaluationConfig) -> Result<()> {
+    ensure!(
+        results.ground_truth.is_some(),
+        "{} has no ground truth; set pose_file and calib_file to the poses of its recording",
+        config.result_file.display()
+    );
+    Ok(())
+}
+
+/// Notes the alignment in a report.
+fn note(about: &mut BTreeMap<String, String>, alignment: Alignment) {
+    let text = match alignment {
+        Alignment::None => "none",
+        Alignment::First => "at the first pose",
+        Alignment::Rigid => "rigid, least squares of the positions (Umeyama 1991), no scale",
+    };
+    about.insert("alignment".to_owned(), text.to_owned());
+}
+
+/// Whether a file is an archive of arrays; otherwise it is a trajectory as text.
+fn is_archive(path: &Path) -> Result<bool> {
+    let mut start = Vec::new();
+    File::open(path)
+        .and_then(|file| file.take(NPZ.len() as u64).read_to_end(&mut start))
+        .with_context(|| format!("cannot read {}", path.display()))?;
+    let is_named = path
+        .extension()
+        .is_some_and(|it| it.eq_ignore_ascii_case("npz"));
+    Ok(is_named || start == NPZ)
+}
+
+/// The outputs: by default beside a result, and in a folder of its own beside a trajectory.
+fn output_files(config: &EvaluationConfig) -> Result<RunFiles> {
+    let result = &config.result_file;
+    Ok(match &config.output_folder {
+        Some(folder) => RunFiles::in_folder(result, folder),
+        None if is_archive(result)? => RunFiles::beside(result),
+        None => {
+            let stem = result.file_stem().unwrap_or_default().to_string_lossy();
+            let folder = folder_of(result).join(format!("{stem}_evaluation"));
+            RunFiles::in_folder(result, &folder)
+        }
+    })
+}
+
+/// Reads the result, in metres.
+fn read(config: &EvaluationConfig) -> Result<LocalizationResults> {
+    let path = &config.result_file;
+    input::require_optional_file("result_calib_file", config.result_calib_file.as_deref())?;
+    let mut results = match is_archive(path)? {
+        true => LocalizationResults::read(path)?,
+        false => trajectory::read(path, config.result_calib_file.as_deref())?,
+    };
+    scale(&mut results, config.grid_resolution);
+    Ok(results)
+}
+
+/// Prepares the configured outputs; the effective configuration is the main one.
+fn prepare(config: &EvaluationConfig, context: &Context, main: &Path) -> Result<Claims> {
+    let reports = REPORT_FILES.iter();
+    let mut names: Vec<&str> = reports
+        .copied()
+        .filter(|_| config.save_evaluation_results)
+        .collect();
+    names.extend(config.plot_loc_traj.then_some("plots"));
+    if names.is_empty() {
+        return Claims::read(folder_of(main));
+    }
+    let optional = [
+        ("pose_file", &config.pose_file),
+        ("calib_file", &config.calib_file),
+        ("result_calib_file", &config.result_calib_file),
+    ];
+    let inputs = (optional.iter()).filter_map(|(key, path)| Some((*key, path.as_deref()?)));
+    let outputs = Outputs {
+        key: "output_folder",
+        main,
+        magic: None,
+        names: names.into_iter().map(str::to_owned).collect(),
+        inputs: inputs
+            .chain([("result_file", config.result_file.as_path())])
+            .chain(context.input())
+            .collect(),
+        force: true,
+    };
+    outputs.prepare()
+}
+
+/// The inputs and settings of the run from its report, and the evaluated files.
+fn about(config: &EvaluationConfig) -> Result<BTreeMap<String, String>> {
+    let report = RunFiles::beside(&config.result_file).file("report.json");
+    let mut about = if is_archive(&config.result_file)? && report.exists() {
+        Report::read_json(&report)?.about
+    } else {
+        BTreeMap::new()
+    };
+    let truth = config.pose_file.as_ref().or(config.scan_folder.as_ref());
+    for (name, path) in [("result", Some(&config.result_file)), ("truth", truth)] {
+        about.remove(name);
+        about.extend(path.map(|path| (name.to_owned(), path.display().to_string())));
+    }
+    Ok(about)
+}
+
+/// The configuration of the localization beside a result, if there is one.
+fn localization_of(result: &Path) -> Result<Option<LocalizationConfig>> {
+    let effective = RunFiles::beside(result).file("effective_localization.yml");
+    match effective.exists() {
+        true => Ok(Some(config::load(Some(&effective), &[])?)),
+        false => Ok(None),
+    }
+}
+
+/// The map of a run and its path; `None` if its file does not exist.
+fn map_of(localized: &LocalizationConfig) -> Result<Option<(TriangleMesh, Option<MappingPath>)>> {
+    if !localized.map_file.exists() {
+        tracing::info!("{} does not exist any more", localized.map_file.display());
+        return Ok(None);
+    }
+    Ok(Some(mesh_file::read(&localized.map_file)?))
+}
+
+/// Converts positions in grid cells to metres.
+fn scale(results: &mut LocalizationResults, grid_resolution_m: f64) {
+    if grid_resolution_m == 1.0 {
+        return;
+    }
+    let columns = [&mut results.estimates, &mut results.refined];
+    for pose in columns.into_iter().flatten().flatten() {
+        pose.translation.vector *= grid_resolution_m;
+    }
+    results.particles.scale_positions(grid_resolution_m as f32);
+    let columns = [
+        &mut results.estimates_in_space,
+        &mut results.refined_in_space,
+    ];
+    for pose in columns.into_iter().flatten().flatten() {
+        pose.translation.vector *= grid_resolution_m;
+    }
+}
+
+/// The results of the frames that the configuration selects.
+fn selected(
+    results: LocalizationResults,
+    config: &EvaluationConfig,
+) -> Result<LocalizationResults> {
+    let window = usize::try_from(config.n_scans).unwrap_or(usize::MAX);
+    let end = config.start_idx.saturating_add(window);
+    let rows: Vec<usize> = (0..results.len())
+        .filter(|&row| {
+            let frame = results.frames[row];
+            (config.start_idx..end).contains(&frame)
+        })
+        .step_by(config.frame_step)
+        .collect();
+    ensure!(
+        !rows.is_empty(),
+        "no frame of {} is selected; check start_idx, n_scans and frame_step",
+        config.result_file.display()
+    );
+    Ok(match rows.len() == results.len() {
+        true => results,
+        false => results.select(&rows),
+    })
+}

@@ -1,0 +1,96 @@
+//! Evaluation of a trajectory without a map: rows of TUM or KITTI, or a result without particles.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::{Context as _, Result};
+use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+
+use crate::app::results::{LocalizationResults, Report, RunSummary};
+use crate::evaluation::{SpatialMetrics, aligned, distances_m};
+use crate::geometry::Pose3;
+use crate::recording::PoseTrack;
+
+/// Share of the distance above which the axes of estimate and truth are suspected to differ [%].
+const OTHER_AXES_PERCENT: f64 = 20.0;
+
+/// Reads a trajectory: its poses in the world of the file.
+pub fn read(path: &Path, calib_file: Option<&Path>) -> Result<LocalizationResults> {
+    let track = PoseTrack::read(path, calib_file)?;
+    Ok(LocalizationResults {
+        frames: (0..track.map_from_lidar.len()).collect(),
+        estimates_in_space: Some(in_world(&track)),
+        times_s: track.times_s,
+        ..LocalizationResults::default()
+    })
+}
+
+/// The poses of a track in the world of its file; that of a camera, whose axes are those of a first pose, is turned
+/// like the poses: `inv(Tr) * P * Tr`.
+pub fn in_world(track: &PoseTrack) -> Vec<Pose3> {
+    let camera_from_lidar = track.calibration.cam0_from_lidar;
+    let is_camera = (camera_from_lidar * Vector3::x()).z > 0.7;
+    let world_from_map = match is_camera {
+        true => camera_from_lidar.inverse() * track.world_from_map,
+        false => track.world_from_map,
+    };
+    aligned(&world_from_map, &track.map_from_lidar)
+}
+
+/// Turns poses of a camera, which moves along its z axis, so that x is ahead and z is up: heights, headings and
+/// pictures from above need such axes, distances and angles do not depend on them.
+pub fn level_camera_axes(results: &mut LocalizationResults) {
+    let is_camera = results
+        .ground_truth_in_space
+        .as_deref()
+        .is_some_and(moves_along_z);
+    if !is_camera {
+        return;
+    }
+    let lidar_from_camera = Matrix3::new(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0);
+    let rotation = Rotation3::from_matrix_unchecked(lidar_from_camera);
+    let turn = Pose3::from_parts(
+        Translation3::identity(),
+        UnitQuaternion::from_rotation_matrix(&rotation),
+    );
+    let columns = [
+        &mut results.estimates_in_space,
+        &mut results.ground_truth_in_space,
+    ];
+    for pose in columns.into_iter().flatten().flatten() {
+        *pose = turn * *pose * turn.inverse();
+    }
+}
+
+/// Whether the sum of all steps, each in the frame of its pose, is mostly along z.
+fn moves_along_z(poses: &[Pose3]) -> bool {
+    let steps: Vector3<f64> = (poses.windows(2))
+        .map(|pair| (pair[0].inverse() * pair[1]).translation.vector)
+        .sum();
+    steps.z.abs() > steps.x.abs().max(steps.y.abs())
+}
+
+/// Errors of a trajectory with its true poses.
+pub fn evaluate(results: &LocalizationResults, about: BTreeMap<String, String>) -> Result<Report> {
+    let estimates = results.estimates_in_space.as_deref().unwrap_or_default();
+    let truth = results.ground_truth_in_space.as_deref().unwrap_or_default();
+    let metrics = SpatialMetrics::of(estimates, truth, 0)
+        .context("there are no poses with true poses to evaluate")?;
+    let error = metrics.short_segments.map(|it| it.translation_percent);
+    if let Some(percent) = error.filter(|&percent| percent > OTHER_AXES_PERCENT) {
+        tracing::warn!(
+            "the relative error is {percent:.0} % of the distance; check that both files are of one drive and have the same axes: poses of a camera need calib_file (the truth) or result_calib_file"
+        );
+    }
+    Ok(Report {
+        about,
+        summary: RunSummary {
+            frames: results.len(),
+            path_m: distances_m(estimates).last().copied().unwrap_or_default(),
+            ..RunSummary::default()
+        },
+        mcl: None,
+        refined: None,
+        trajectory: Some(metrics),
+    })
+}

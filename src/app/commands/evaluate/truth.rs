@@ -1,0 +1,182 @@
+//! The true poses of a result: where they are from, and how they are matched and aligned.
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result, ensure};
+
+use crate::app::commands::input;
+use crate::app::commands::stages::{RecordingInputs, is_topic};
+use crate::app::config::{EvaluationConfig, LocalizationConfig};
+use crate::app::results::LocalizationResults;
+use crate::evaluation::{Alignment, aligned};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
+use crate::recording::{Frame, PoseTrack, ScanSource, Selection};
+
+/// Difference of times that are the same [s].
+const SAME_S: f64 = 1e-4;
+
+/// Reads the configured true poses: `pose_file`, which may be a topic of the recording, else those that the recording
+/// contains. The recording of a topic is by default that of the localization.
+pub fn read_track(
+    config: &EvaluationConfig,
+    localized: Option<&LocalizationConfig>,
+) -> Result<Option<PoseTrack>> {
+    let scan_folder = config.scan_folder.as_deref();
+    let of_localization = localized.map(|it| it.scan_folder.as_path());
+    let topic = config.topic.as_deref();
+    let inputs = RecordingInputs {
+        scan_folder: scan_folder.or(of_localization).unwrap_or(Path::new("")),
+        topic: topic.or(localized.and_then(|it| it.topic.as_deref())),
+        pose_file: config.pose_file.as_deref(),
+        calib_file: config.calib_file.as_deref(),
+        body_from_lidar: config.body_from_lidar,
+    };
+    input::require_optional_file("calib_file", inputs.calib_file)?;
+    let recording = || inputs.open(&Selection::default());
+    match inputs.pose_file {
+        Some(path) => {
+            inputs.require_poses("pose_file", path)?;
+            if is_topic(path) {
+                return inputs.track(path, &recording()?).map(Some);
+            }
+            inputs.file_track(path).map(Some)
+        }
+        None if scan_folder.is_some() => inputs.own_track(&recording()?).map(Some),
+        None => Ok(None),
+    }
+}
+
+/// The results with their true poses: by time where both have one, interpolated between two rows of the track, else by
+/// number. Results without a true pose are left out with a warning, if they are not more than half.
+pub fn with_truth(
+    mut results: LocalizationResults,
+    times_s: Option<Vec<f64>>,
+    track: &PoseTrack,
+    result_file: &Path,
+) -> Result<LocalizationResults> {
+    let poses = match (&times_s, &track.times_s) {
+        (Some(times_s), Some(true_times_s)) => {
+            poses_by_time(&results, times_s, track, true_times_s, result_file)?
+        }
+        _ => poses_by_number(&results, track, result_file)?,
+    };
+    let rows: Vec<usize> = (0..poses.len())
+        .filter(|&row| poses[row].is_some())
+        .collect();
+    if rows.len() < results.len() {
+        results = results.select(&rows);
+    }
+    let truth: Vec<Pose3> = poses.into_iter().flatten().collect();
+    results.ground_truth = Some(truth.iter().map(pose2_from_pose3).collect());
+    results.ground_truth_in_space = Some(truth);
+    Ok(results)
+}
+
+fn poses_by_time(
+    results: &LocalizationResults,
+    times_s: &[f64],
+    track: &PoseTrack,
+    true_times_s: &[f64],
+    result_file: &Path,
+) -> Result<Vec<Option<Pose3>>> {
+    let (first_s, last_s) = (true_times_s[0], true_times_s[true_times_s.len() - 1]);
+    // An extrapolated pose is no truth.
+    let covered = first_s - SAME_S..=last_s + SAME_S;
+    let frames = results.frames.iter().zip(times_s);
+    let poses: Vec<Option<Pose3>> = frames
+        .map(|(&number, &time_s)| {
+            let frame = Frame::new(number, ScanSource::File(result_file.to_owned()), time_s);
+            let pose = track.pose_at(&frame, true);
+            pose.filter(|_pose| covered.contains(&time_s))
+        })
+        .collect();
+    let (count, found) = (poses.len(), poses.iter().flatten().count());
+    let ranges = || {
+        format!(
+            "those of {} are from {:.3} to {:.3} s, and the {} true poses of {} from {first_s:.3} to {last_s:.3} s",
+            result_file.display(),
+            times_s.first().copied().unwrap_or_default(),
+            times_s.last().copied().unwrap_or_default(),
+            true_times_s.len(),
+            track.path.display(),
+        )
+    };
+    ensure!(
+        found > 0 && 2 * found >= count,
+        "only {found} of {count} poses have a true pose at their time: {}; give the truth of this drive with times of the same clock, or select the frames that it covers with start_idx and n_scans",
+        ranges()
+    );
+    if found < count {
+        tracing::warn!(
+            "{} of {count} poses are left out, because there is no true pose at their time: {}",
+            count - found,
+            ranges()
+        );
+    }
+    Ok(poses)
+}
+
+fn poses_by_number(
+    results: &LocalizationResults,
+    track: &PoseTrack,
+    result_file: &Path,
+) -> Result<Vec<Option<Pose3>>> {
+    let poses = &track.map_from_lidar;
+    let last = results.frames.last().copied().unwrap_or_default();
+    ensure!(
+        last < poses.len(),
+        "{} has {} poses, but the result reaches frame {last}; pose_file and result_file belong to different recordings",
+        track.path.display(),
+        poses.len()
+    );
+    if results.particles.is_empty() && last + 1 != poses.len() {
+        tracing::warn!(
+            "{} ends at row {last}, and the {} rows of {} are matched by number; give both times (TUM) if they do not begin at the same frame",
+            result_file.display(),
+            poses.len(),
+            track.path.display()
+        );
+    }
+    Ok((results.frames.iter())
+        .map(|&frame| Some(poses[frame]))
+        .collect())
+}
+
+/// Aligns the estimates and the refined trajectory with the truth, each by a transform of its own.
+pub fn align(results: &mut LocalizationResults, alignment: Alignment) -> Result<()> {
+    if alignment == Alignment::None {
+        return Ok(());
+    }
+    let truth = results.ground_truth.clone().unwrap_or_default();
+    let truth_in_space = results.ground_truth_in_space.clone();
+    for (poses, in_space) in [
+        (&mut results.estimates, &mut results.estimates_in_space),
+        (&mut results.refined, &mut results.refined_in_space),
+    ] {
+        let transform = match (&*in_space, &truth_in_space, &*poses) {
+            (Some(estimates), Some(truth), _) => alignment.transform(estimates, truth),
+            (_, _, Some(estimates)) => alignment.transform(&level(estimates), &level(&truth)),
+            _ => continue,
+        };
+        let transform = transform.context(
+            "the positions are on a straight line, which determines no rigid alignment; set alignment to first",
+        )?;
+        if let Some(poses) = poses {
+            let moved = aligned(&transform, &level(poses));
+            *poses = moved.iter().map(pose2_from_pose3).collect();
+        }
+        if let Some(estimates) = in_space {
+            *estimates = aligned(&transform, estimates);
+        }
+        if let (Some(poses), Some(in_space)) = (poses, in_space) {
+            *poses = in_space.iter().map(pose2_from_pose3).collect();
+        }
+    }
+    Ok(())
+}
+
+fn level(poses: &[Pose2]) -> Vec<Pose3> {
+    (poses.iter())
+        .map(|pose| pose3_from_pose2(pose, 0.0))
+        .collect()
+}
