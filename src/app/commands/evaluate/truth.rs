@@ -85,7 +85,11 @@ fn poses_by_time(
     let frames = results.frames.iter().zip(times_s);
     let poses: Vec<Option<Pose3>> = frames
         .map(|(&number, &time_s)| {
-            let frame = Frame::new(number, ScanSource::File(result_file.to_owned()), time_s);
+            let source = ScanSource::File {
+                path: result_file.to_owned(),
+                stamp_s: None,
+            };
+            let frame = Frame::new(number, source, time_s);
             let pose = track.pose_at(&frame, true);
             pose.filter(|_pose| covered.contains(&time_s))
         })
