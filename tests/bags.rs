@@ -352,8 +352,10 @@ fn sizes_that_contradict_the_data_are_errors() {
         "{message}"
     );
     cloud.fields[0].0 = "z";
-    (cloud.width, cloud.height) = (0, 0);
-    assert!(read_cloud(&cloud).unwrap().is_empty());
+    for size in [(0, 0), (0, u32::MAX), (u32::MAX, 0)] {
+        (cloud.width, cloud.height) = size;
+        assert!(read_cloud(&cloud).unwrap().is_empty());
+    }
 }
 
 #[test]

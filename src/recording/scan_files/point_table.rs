@@ -195,7 +195,9 @@ impl<'a> Table<'a> {
             is_big_endian,
             ..
         } = column;
-        let rows = (0..self.height).map(move |row| row * self.row_step + offset);
+        // Rows without points may be billions.
+        let height = if self.width == 0 { 0 } else { self.height };
+        let rows = (0..height).map(move |row| row * self.row_step + offset);
         let offsets = rows.flat_map(move |row| (0..self.width).map(move |n| row + n * stride));
         let read = move |offset| number_type.read(&self.data, offset, is_big_endian);
         offsets.map(move |offset| read(offset).unwrap_or(f64::NAN))
