@@ -48,11 +48,13 @@ pub struct CloudPlan {
 }
 
 impl CloudPlan {
-    /// Prepares a cloud in the map frame [m]. Normals face the nearest of the positions of the sensor [m]; without
-    /// any, their orientation is propagated from the ground. Of the configuration, what follows the
-    /// preparation of scans is used, and the voxel size.
+    /// Prepares a cloud in the map frame [m]. Its normals are those given, one unit vector per point, else those of
+    /// planes of neighbours. They face the nearest of the positions of the sensor [m]; without any, given ones that
+    /// face up on the ground keep their orientation, and that of others is propagated from the ground. Of the
+    /// configuration, what follows the preparation of scans is used, and the voxel size.
     pub fn new(
         points: &[Vec3],
+        normals: Option<&[Vec3]>,
         sensor_positions: &[Vec3],
         config: &LocalMapConfig,
         on_event: &dyn Fn(BuildEvent) -> ControlFlow<()>,
@@ -66,7 +68,7 @@ impl CloudPlan {
             points.len() as f64 * 60.0,
             remedy,
         )?;
-        let mut cloud = voxels(points, config.scan.voxel_size_m)?;
+        let mut cloud = voxels(points, normals, config.scan.voxel_size_m)?;
         memory::require(
             "the neighbours in the cloud",
             cloud.len() as f64 * POINT_BYTES,
@@ -74,12 +76,13 @@ impl CloudPlan {
         )?;
 
         begin_stage("normals")?;
-        let normals = cloud_normals::estimate(&cloud.positions, &KdTree::new(&cloud.positions));
-        cloud.normals = normals
-            .iter()
-            .map(|normal| normal.unwrap_or_default())
-            .collect();
-        cloud.retain(|index| normals[index].is_some());
+        if normals.is_none() {
+            let tree = KdTree::new(&cloud.positions);
+            let estimated = cloud_normals::estimate(&cloud.positions, &tree);
+            let or_zero = estimated.iter().map(|normal| normal.unwrap_or_default());
+            cloud.normals = or_zero.collect();
+            cloud.retain(|index| estimated[index].is_some());
+        }
 
         begin_stage("ground")?;
         let ground = GroundSurface::of_points(&cloud.positions, &cloud.normals);
@@ -96,10 +99,11 @@ impl CloudPlan {
             .collect();
 
         begin_stage("orientation")?;
-        if sensor_positions.is_empty() {
+        let is_oriented = normals.is_some() && face_up(&cloud.normals, &is_ground);
+        if sensor_positions.is_empty() && !is_oriented {
             let tree = KdTree::new(&cloud.positions);
             cloud_normals::propagate(&cloud.positions, &mut cloud.normals, &is_ground, &tree);
-        } else {
+        } else if !sensor_positions.is_empty() {
             cloud_normals::face_sensor(&cloud.positions, &mut cloud.normals, sensor_positions);
         }
         let centers = blocks(&cloud.positions);
@@ -159,14 +163,31 @@ fn notify(
     }
 }
 
-/// The finite points, one per voxel.
-fn voxels(points: &[Vec3], voxel_m: f32) -> Result<PointCloud, BuildError> {
+/// Whether almost all normals of the ground point up, as they do if all are oriented.
+fn face_up(normals: &[Vec3], is_ground: &[bool]) -> bool {
+    /// Share of them, at least (unitless).
+    const MIN_UP: f32 = 0.95;
+    let ground = || normals.iter().zip(is_ground).filter(|(_, is)| **is);
+    let up = ground().filter(|(normal, _)| normal.z > 0.0).count();
+    up as f32 >= MIN_UP * ground().count() as f32
+}
+
+/// The finite points, one per voxel, with the normals that are given.
+fn voxels(
+    points: &[Vec3],
+    normals: Option<&[Vec3]>,
+    voxel_m: f32,
+) -> Result<PointCloud, BuildError> {
     let mut cloud = PointCloud::with_capacity(points.len());
-    for &point in points.iter().filter(|point| point.is_finite()) {
+    for (index, &point) in points.iter().enumerate() {
+        if !point.is_finite() {
+            continue;
+        }
         if point.abs().max_element() > FARTHEST_M {
             return Err(BuildError::CloudTooFar { position: point });
         }
-        cloud.push(point, Vec3::ZERO, 0.0);
+        let normal = normals.map_or(Vec3::ZERO, |normals| normals[index]);
+        cloud.push(point, normal, 0.0);
     }
     if u32::try_from(cloud.len()).is_err() {
         return Err(BuildError::CloudTooLarge {
@@ -231,7 +252,7 @@ mod tests {
 
     fn build(points: &[Vec3], sensor_positions: &[Vec3]) -> (CloudPlan, TriangleMesh) {
         let go_on = |_| ControlFlow::Continue(());
-        let plan = CloudPlan::new(points, sensor_positions, &config(), &go_on).unwrap();
+        let plan = CloudPlan::new(points, None, sensor_positions, &config(), &go_on).unwrap();
         let mut mesh = TriangleMesh::default();
         for block in 0..plan.blocks() {
             mesh.append(&plan.build_block(block, &go_on).unwrap().mesh);
@@ -277,10 +298,41 @@ mod tests {
     }
 
     #[test]
+    fn given_normals_are_used_as_they_are_and_oriented_if_they_are_not() {
+        let points = street();
+        let slope = Vec3::new(-0.02, 0.0, 1.0).normalize();
+        let inwards = |point: &Vec3| match point.y.abs() < 5.9 || point.z < 0.02 * point.x + 0.05 {
+            true => slope,
+            false => Vec3::new(0.0, -point.y.signum(), 0.0),
+        };
+        let given: Vec<Vec3> = points.iter().map(inwards).collect();
+        let alternating = given.iter().enumerate();
+        let alternating: Vec<Vec3> = alternating
+            .map(|(index, &normal)| if index % 2 == 0 { normal } else { -normal })
+            .collect();
+        let config = LocalMapConfig {
+            scan: crate::map::scan_cloud::ScanConfig {
+                voxel_size_m: 0.05,
+                ..config().scan
+            },
+            ..config()
+        };
+        let go_on = |_| ControlFlow::Continue(());
+        // Estimated ones would be those of neither surface at the edges.
+        for normals in [&given, &alternating] {
+            let plan = CloudPlan::new(&points, Some(normals), &[], &config, &go_on).unwrap();
+            assert_eq!(plan.cloud.len(), points.len());
+            for (index, (point, normal)) in points.iter().zip(&plan.cloud.normals).enumerate() {
+                assert!(normal.distance(given[index]) < 1e-5, "{point}: {normal}");
+            }
+        }
+    }
+
+    #[test]
     fn unusable_clouds_are_errors() {
         let error_of = |points: &[Vec3]| {
             let go_on = |_| ControlFlow::Continue(());
-            CloudPlan::new(points, &[], &config(), &go_on)
+            CloudPlan::new(points, None, &[], &config(), &go_on)
                 .err()
                 .unwrap()
         };
@@ -291,7 +343,7 @@ mod tests {
         let far = [Vec3::new(448_000.0, 5_400_000.0, 0.0)];
         assert!(matches!(error_of(&far), BuildError::CloudTooFar { .. }));
         let stop = |_| ControlFlow::Break(());
-        let stopped = CloudPlan::new(&street(), &[], &config(), &stop);
+        let stopped = CloudPlan::new(&street(), None, &[], &config(), &stop);
         assert!(matches!(stopped.err().unwrap(), BuildError::Interrupted));
     }
 }

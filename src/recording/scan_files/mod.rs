@@ -9,6 +9,8 @@ pub(super) mod point_times;
 
 use std::path::Path;
 
+use glam::Vec3;
+
 use self::point_table::Table;
 use self::point_times::set_times;
 use super::error::RecordingError;
@@ -68,10 +70,42 @@ pub fn read_stamped(path: &Path, stamp_s: Option<f64>) -> Result<ReadScan, Recor
             has_unknown_times: false,
         }),
     };
-    read.map_err(|problem| RecordingError::BadScan {
+    read.map_err(bad_scan(path))
+}
+
+/// A point cloud as it is read.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ReadCloud {
+    /// Positions [m].
+    pub points: Vec<Vec3>,
+    /// Normal of each point; `None` if the file has none.
+    pub normals: Option<Vec<Vec3>>,
+}
+
+/// Reads a point cloud with its normals, fields `nx` or `normal_x` and so on.
+pub fn read_cloud(path: &Path) -> Result<ReadCloud, RecordingError> {
+    let bytes = read_bytes(path)?;
+    let read = match table(path, &bytes) {
+        Some(table) => table.and_then(|table| {
+            Ok(ReadCloud {
+                points: table.points()?.0.points,
+                normals: table.normals(),
+            })
+        }),
+        None => bin::parse(&bytes).map(|scan| ReadCloud {
+            points: scan.points,
+            normals: None,
+        }),
+    };
+    read.map_err(bad_scan(path))
+}
+
+/// Adds the file to the problem of a scan.
+fn bad_scan(path: &Path) -> impl FnOnce(String) -> RecordingError {
+    |problem| RecordingError::BadScan {
         path: path.to_owned(),
         problem,
-    })
+    }
 }
 
 /// The table of a file whose format is that of its extension; `None` for `.bin`.

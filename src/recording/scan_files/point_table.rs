@@ -97,6 +97,9 @@ const TIME: [&str; 8] = [
     "offsettime",
 ];
 
+/// Names of the coordinates of normals.
+const NORMAL: [[&str; 2]; 3] = [["nx", "normal_x"], ["ny", "normal_y"], ["nz", "normal_z"]];
+
 /// Points, in rows.
 #[derive(Clone, Debug)]
 pub struct Table<'a> {
@@ -224,6 +227,12 @@ impl<'a> Table<'a> {
             ..Scan::default()
         };
         Ok((scan, times.into_iter().flatten().collect()))
+    }
+
+    /// Reads the normals of all points; `None` without columns of them.
+    pub fn normals(&self) -> Option<Vec<Vec3>> {
+        let [x, y, z] = NORMAL.map(|names| self.named(&names));
+        Some(self.vectors([x?, y?, z?]))
     }
 
     fn vectors(&self, [x, y, z]: [&Column; 3]) -> Vec<Vec3> {

@@ -13,9 +13,9 @@ use super::report::BuildReport;
 use crate::app::commands::interrupt::Interrupted;
 use crate::app::commands::{Context, input, output};
 use crate::app::config::BuildMapConfig;
-use crate::geometry::TriangleMesh;
+use crate::geometry::{TriangleMesh, Vec3};
 use crate::map::{BuildError, BuildEvent, CloudPlan, LocalMap, MappingPath};
-use crate::recording::scan_files;
+use crate::recording::scan_files::{self, ReadCloud};
 
 /// Meshes the cloud of a configuration.
 pub fn run(config: &BuildMapConfig, cloud_file: &Path, context: &Context) -> Result<BuildReport> {
@@ -58,10 +58,12 @@ fn build_blocks(
 ) -> Result<Vec<LocalMap>> {
     let kept = "nothing is kept of an unfinished map of a cloud";
     context.interrupt.keeps(kept.to_owned());
-    let points = clock.time("read", || scan_files::read(cloud_file))?.points;
+    let read = clock.time("read", || scan_files::read_cloud(cloud_file))?;
+    let normals = usable_normals(&read, cloud_file);
+    let points = read.points;
     let local_map = config.map().local_map;
     let prepare = || {
-        CloudPlan::new(&points, &[], &local_map, &|event| {
+        CloudPlan::new(&points, normals.as_deref(), &[], &local_map, &|event| {
             on_stage(event, context, clock)
         })
     };
@@ -81,6 +83,29 @@ fn build_blocks(
     }
     clock.end();
     Ok(blocks)
+}
+
+/// The normals of a cloud, if those of all points are unit vectors.
+fn usable_normals(cloud: &ReadCloud, path: &Path) -> Option<Vec<Vec3>> {
+    const TOLERANCE: f32 = 0.01;
+    let normals = cloud.normals.as_ref()?;
+    let is_unit = |normal: &Vec3| (normal.length() - 1.0).abs() <= TOLERANCE;
+    let pairs = cloud.points.iter().zip(normals);
+    let bad = pairs.filter(|(point, normal)| point.is_finite() && !is_unit(normal));
+    match bad.count() {
+        0 => {
+            tracing::info!("normals are those of {}", path.display());
+            Some(normals.clone())
+        }
+        bad => {
+            tracing::warn!(
+                "{}: normals are estimated, because {bad} of {} that it contains are no unit vectors",
+                path.display(),
+                normals.len()
+            );
+            None
+        }
+    }
 }
 
 fn on_stage(event: BuildEvent, context: &Context, clock: &StageClock) -> ControlFlow<()> {
