@@ -216,6 +216,14 @@ fn scans_of_a_bag_have_the_labels_of_the_same_scans_as_files() {
     call("velodyne").succeeds();
     call("drive.mcap").fails_with(&["several topics", "/front", "/rear"]);
     call("drive.mcap").set("topic", "/rear").succeeds();
+    let info = |topic: &str| {
+        fpmcl("info")
+            .in_folder(folder)
+            .with("drive.mcap")
+            .set("topic", topic)
+    };
+    info("null").fails_with(&["several topics"]);
+    assert!(info("/rear").succeeds().stdout.contains("2, 0 to 1"));
     for number in 0..2 {
         let labels = |output: &str| {
             read_labels(&folder.join(format!("{output}/labels/{number:06}.label"))).unwrap()

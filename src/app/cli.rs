@@ -39,7 +39,7 @@ Examples:
 /// The subcommands, in the order of their use.
 #[derive(Clone, Debug, Subcommand)]
 pub enum Command {
-    /// Describe a recording, a map or a result, and what is missing for which command.
+    /// Describe a recording, a scan, a map or a result, and what is missing for which command.
     #[command(after_help = "\
 Examples:
   fpmcl info drive_1/
@@ -191,8 +191,12 @@ pub struct RunArgs {
 /// Arguments of `info`.
 #[derive(Clone, Debug, Args)]
 pub struct InfoArgs {
-    /// Recording (its folder, the folder of its scans, or a bag), map (.ply), or result (.npz).
+    /// Recording (its folder, the folder of its scans, or a bag), scan or point cloud (.bin, .pcd, .ply, .npy), map (.ply), or result (.npz).
     pub path: PathBuf,
+
+    /// Set the key topic, the topic of the scans in a bag with several: topic=/NAME.
+    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
+    pub settings: Vec<(String, String)>,
 }
 
 /// Arguments of `build-map`.

@@ -44,7 +44,7 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// Opens a recording without reading its scans.
+    /// Opens a recording; of its scans, only the first one is read, if its points can have times.
     ///
     /// `path` is the folder of a recording in one of the layouts of [`Layout`], the folder of its scans, or a bag, of
     /// which `topic` is taken, or the only one with scans. Times are those of a bag, those in the names of the scans,
@@ -335,6 +335,25 @@ mod tests {
         fs::rename(copy, folder.path().join("velodyne/0.bin")).unwrap();
         let result = open(folder.path(), &Selection::default());
         assert!(matches!(result, Err(RecordingError::SameNumber { .. })));
+    }
+
+    #[test]
+    fn a_map_among_the_scans_is_none_of_them() {
+        let folder = recording(&["000000.bin", "000001.bin"], 2);
+        let ply = |faces: usize| {
+            let header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n\
+                property float z\nelement face";
+            let list = "property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n";
+            format!("{header} {faces}\n{list}{}", "3 0 1 2\n".repeat(faces))
+        };
+        let map = folder.path().join("velodyne/map.ply");
+        fs::write(&map, ply(1)).unwrap();
+        let recording = open(folder.path(), &Selection::default()).unwrap();
+        assert_eq!(numbers(&recording), [0, 1]);
+        // Points of the same name are a scan.
+        fs::write(&map, ply(0)).unwrap();
+        let result = open(folder.path(), &Selection::default());
+        assert!(matches!(result, Err(RecordingError::MixedNames { .. })));
     }
 
     #[cfg(unix)]

@@ -130,8 +130,8 @@ fn time_in_name(path: &Path) -> Option<f64> {
     }
 }
 
-/// All scans below a folder, sorted by path, without hidden files and folders. A folder that
-/// is linked more than once is read once.
+/// All scans below a folder, sorted by path, without hidden files and folders, and without meshes, such as a map. A
+/// folder that is linked more than once is read once.
 pub fn scan_paths(folder: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     let mut paths = Vec::new();
     let mut folders = vec![folder.to_owned()];
@@ -149,7 +149,7 @@ pub fn scan_paths(folder: &Path) -> Result<Vec<PathBuf>, RecordingError> {
             }
             if path.is_dir() {
                 folders.push(path);
-            } else if scan_files::is_scan(&path) {
+            } else if scan_files::is_scan(&path) && !scan_files::is_mesh(&path) {
                 paths.push(path);
             }
         }

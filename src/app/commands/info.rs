@@ -1,40 +1,62 @@
-//! `info`: what a recording, a map or a result contains, and what is missing for which command.
+//! `info`: what a recording, a scan, a map or a result contains, and what is missing for which command.
 
 use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::{Result, bail, ensure};
+use serde::{Deserialize, Serialize};
 
 use super::output;
 use super::stages::{self, is_bag, sample};
+use crate::app::cli::InfoArgs;
+use crate::app::config;
 use crate::app::results::{LocalizationResults, RunSummary};
 use crate::evaluation::RangeMclRules;
+use crate::geometry::Aabb;
 use crate::lidar::Scan;
 use crate::map::ply;
-use crate::recording::{PoseTrack, Recording, Selection};
+use crate::recording::{PoseTrack, Recording, Selection, scan_files};
 use crate::sensor::{self, BeamSource, SensorDescription};
+use crate::validation::{InvalidValue, Validate};
+
+/// Keys of `info`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct InfoConfig {
+    /// Topic of the point clouds, in a bag with several.
+    topic: Option<String>,
+}
+
+impl Validate for InfoConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        Ok(())
+    }
+}
 
 /// Describes what is at a path.
-pub fn run(path: &Path) -> Result<String> {
+pub fn run(args: &InfoArgs) -> Result<String> {
+    let path = args.path.as_path();
+    let config = config::with_settings(InfoConfig::default(), &args.settings)?;
     ensure!(
         path.exists(),
-        "{} does not exist; give a recording (a folder or a bag), a map (.ply) or a result (.npz)",
+        "{} does not exist; give a recording (a folder or a bag), a scan or point cloud, a map (.ply) or a result (.npz)",
         path.display()
     );
     let extension = path.extension().and_then(|extension| extension.to_str());
     match extension {
-        _ if path.is_dir() || is_bag(path) => recording(path),
-        Some("ply") => map(path),
+        _ if path.is_dir() || is_bag(path) => recording(path, config.topic.as_deref()),
         Some("npz") => result(path),
+        _ if scan_files::is_mesh(path) => map(path),
+        _ if scan_files::is_scan(path) => cloud(path),
         _ => bail!(
-            "{} is neither a recording (a folder, .mcap, .db3 or .bag) nor a map (.ply) nor a result (.npz)",
+            "{} is neither a recording (a folder, .mcap, .db3 or .bag) nor a scan or point cloud (.bin, .pcd, .ply, .npy) nor a map (.ply) nor a result (.npz)",
             path.display()
         ),
     }
 }
 
-fn recording(path: &Path) -> Result<String> {
-    let recording = Recording::open(path, None, &Selection::default())?;
+fn recording(path: &Path, topic: Option<&str>) -> Result<String> {
+    let recording = Recording::open(path, topic, &Selection::default())?;
     let frames = &recording.frames;
     let (first, last) = (&frames[0], &frames[frames.len() - 1]);
     let scans = sample(&recording)?;
@@ -135,15 +157,44 @@ fn track_in_words(track: &PoseTrack, recording: &Recording) -> String {
     text
 }
 
+/// A single scan, or a point cloud.
+fn cloud(path: &Path) -> Result<String> {
+    /// Points of the largest scans; more are a cloud of many scans, which show no sensor.
+    const MAX_SCAN: usize = 1_000_000;
+    let scan = scan_files::read(path)?;
+    let has_normals = scan_files::read_cloud(path)?.normals.is_some();
+    let normals = if has_normals { "yes" } else { "no" };
+    let finite = scan.points.iter().filter(|point| point.is_finite());
+    let mut rows = vec![
+        ("layout", "a scan, or a point cloud".to_owned()),
+        ("points", format!("{} ({})", scan.len(), fields(&scan))),
+        ("extent", extent(Aabb::of(finite.copied()))),
+        ("normals", normals.to_owned()),
+    ];
+    if scan.len() <= MAX_SCAN {
+        let sensor = sensor::infer(std::slice::from_ref(&scan));
+        if sensor.has_rows {
+            rows.extend(sensor_rows(&sensor));
+        }
+    }
+    let needs = "needs the folder of several scans, and a map: --map MAP";
+    rows.extend([
+        ("build-map", "ready; as a point cloud".to_owned()),
+        ("localize", needs.to_owned()),
+    ]);
+    Ok(output::rows(&rows))
+}
+
+fn extent(bounds: Aabb) -> String {
+    let size = bounds.max - bounds.min;
+    format!(
+        "{:.0} x {:.0} m, heights {:.1} to {:.1} m",
+        size.x, size.y, bounds.min.z, bounds.max.z
+    )
+}
+
 fn map(path: &Path) -> Result<String> {
     let (mesh, mapping_path) = ply::read_map(path)?;
-    let extent = [0, 1, 2].map(|axis| {
-        let along = mesh.vertices.iter().map(|vertex| vertex[axis]);
-        along.fold([f32::INFINITY, f32::NEG_INFINITY], |range, value| {
-            [range[0].min(value), range[1].max(value)]
-        })
-    });
-    let [[x_min, x_max], [y_min, y_max], [low, high]] = extent;
     let path = match mapping_path {
         Some(path) if !path.map_from_lidar.is_empty() => {
             format!("{} poses of the mapping drive", path.map_from_lidar.len())
@@ -152,14 +203,7 @@ fn map(path: &Path) -> Result<String> {
     };
     Ok(output::rows(&[
         ("triangles", mesh.triangles.len().to_string()),
-        (
-            "extent",
-            format!(
-                "{:.0} x {:.0} m, heights {low:.1} to {high:.1} m",
-                x_max - x_min,
-                y_max - y_min
-            ),
-        ),
+        ("extent", extent(Aabb::of(mesh.vertices.iter().copied()))),
         ("path", path),
     ]))
 }

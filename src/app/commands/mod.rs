@@ -40,7 +40,7 @@ use interrupt::Interrupted;
 /// Runs a command.
 pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
     match command {
-        Command::Info(args) => output::print(&info::run(&args.path)?),
+        Command::Info(args) => output::print(&info::run(args)?),
         Command::BuildMap(args) => {
             let base = BuildMapConfig::default;
             let (config, context) = configured(&args.run, args.flags(), base, context)?;

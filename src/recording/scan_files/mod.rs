@@ -7,6 +7,8 @@ mod ply;
 pub(super) mod point_table;
 pub(super) mod point_times;
 
+use std::fs::File;
+use std::io::BufReader;
 use std::path::Path;
 
 use glam::Vec3;
@@ -23,6 +25,12 @@ pub const EXTENSIONS: [&str; 4] = ["bin", "pcd", "ply", "npy"];
 /// Whether a file is a scan, by its extension.
 pub fn is_scan(path: &Path) -> bool {
     EXTENSIONS.iter().any(|known| has_extension(path, known))
+}
+
+/// Whether a file is a mesh, a `.ply` with faces.
+pub fn is_mesh(path: &Path) -> bool {
+    let file = || File::open(path).map(BufReader::new);
+    has_extension(path, "ply") && file().is_ok_and(ply::has_faces)
 }
 
 /// Whether the columns of a file have names, so that points can have times.

@@ -52,6 +52,14 @@ pub fn parse(bytes: &[u8]) -> Result<Table<'_>, String> {
     Table::of_file(columns, points, data)
 }
 
+/// Whether a file is a mesh, by its header.
+pub fn has_faces(file: impl BufRead) -> bool {
+    read_header(file).is_ok_and(|header| {
+        let faces = ["face", "tristrips"].map(|name| header.elements.get(name));
+        (faces.into_iter().flatten()).any(|element| element.count > 0)
+    })
+}
+
 fn read_header(file: impl BufRead) -> Result<Header, ParseError> {
     Parser::<DefaultElement>::new().read_header(&mut Reader::new(file))
 }

@@ -26,6 +26,11 @@ pub fn run(config: &BuildMapConfig, cloud_file: &Path, context: &Context) -> Res
         "cloud_file is {}, which is not a point cloud; its name must end in .pcd, .ply, .npy or .bin",
         cloud_file.display()
     );
+    ensure!(
+        !scan_files::is_mesh(cloud_file),
+        "cloud_file is {0}, which is a mesh already: it has faces; localize in it as it is, with --map {0}",
+        cloud_file.display()
+    );
     let mut claims = prepare(config, context)?;
     let clock = StageClock::default();
     let blocks = build_blocks(config, cloud_file, context, &clock)?;
