@@ -47,10 +47,18 @@ Examples:
   fpmcl info map.ply")]
     Info(InfoArgs),
 
-    /// Build a triangle-mesh map from scans with poses, or from a point cloud.
+    /// Find the poses of a recording from its scans, close loops and adjust all of them, or polish given poses.
     #[command(after_help = "\
 Examples:
-  fpmcl build-map drive_1/ --output map.ply   poses that the recording contains, or --poses
+  fpmcl odometry drive_1/ --output poses/
+  fpmcl odometry drive_1.mcap --output poses/
+  fpmcl odometry drive_1/ --poses gnss.txt --output polished/")]
+    Odometry(OdometryArgs),
+
+    /// Build a triangle-mesh map from scans, or from a point cloud.
+    #[command(after_help = "\
+Examples:
+  fpmcl build-map drive_1/ --output map.ply   poses that the recording contains, else from the scans
   fpmcl build-map cloud.pcd --output map.ply  a point cloud from elsewhere
   fpmcl build-map config/build_map.yml
   fpmcl build-map --set mesh_file=results/even.ply --set frame_step=2 --force")]
@@ -139,6 +147,7 @@ pub struct ConfigurationArgs {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 #[expect(missing_docs, reason = "they are named as the commands")]
 pub enum ConfiguredCommand {
+    Odometry,
     BuildMap,
     Localize,
     Refine,
@@ -159,7 +168,7 @@ pub struct DoctorArgs {
 /// Configuration and machine.
 #[derive(Clone, Debug, Args)]
 pub struct ConfigArgs {
-    /// Configuration (.yml), or the input: a recording (build-map, localize), a point cloud (build-map), a result (refine, evaluate) or a trajectory (evaluate). Without it, the command's file under config/ or, if there is none, built-in values.
+    /// Configuration (.yml), or the input: a recording (odometry, build-map, localize), a point cloud (build-map), a result (refine, evaluate) or a trajectory (evaluate). Without it, the command's file under config/ or, if there is none, built-in values.
     #[arg(value_name = "CONFIG | INPUT")]
     pub config: Option<PathBuf>,
 
@@ -199,6 +208,26 @@ pub struct InfoArgs {
     pub settings: Vec<(String, String)>,
 }
 
+/// Arguments of `odometry`.
+#[derive(Clone, Debug, Args)]
+pub struct OdometryArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    pub run: RunArgs,
+
+    /// Folder to write; sets the key `output_folder`.
+    #[arg(long, value_name = "FOLDER")]
+    pub output: Option<PathBuf>,
+
+    /// Poses to polish, rows of KITTI or TUM, or a topic of the bag; sets the key `pose_file`.
+    #[arg(long, value_name = "FILE")]
+    pub poses: Option<PathBuf>,
+
+    /// Calibration of the camera whose poses these are; sets the key `calib_file`.
+    #[arg(long, value_name = "FILE")]
+    pub calib: Option<PathBuf>,
+}
+
 /// Arguments of `build-map`.
 #[derive(Clone, Debug, Args)]
 pub struct BuildMapArgs {
@@ -210,7 +239,7 @@ pub struct BuildMapArgs {
     #[arg(long, value_name = "MAP")]
     pub output: Option<PathBuf>,
 
-    /// Poses of the recording, rows of KITTI or TUM, or a topic of the bag; by default those that it contains. Sets the key `pose_file`.
+    /// Poses of the recording, rows of KITTI or TUM, or a topic of the bag; by default those that it contains, else from the scans. Sets the key `pose_file`.
     #[arg(long, value_name = "FILE")]
     pub poses: Option<PathBuf>,
 
@@ -431,6 +460,7 @@ impl Command {
     /// Renderer and threads of this command.
     pub fn machine(&self) -> MachineArgs {
         match self {
+            Self::Odometry(args) => args.run.source.machine,
             Self::BuildMap(args) => args.run.source.machine,
             Self::Localize(args) => args.run.source.machine,
             Self::Refine(args) => args.run.source.machine,
@@ -468,6 +498,19 @@ impl RunArgs {
         let seed = self.seed.map(|seed| ("seed".to_owned(), seed.to_string()));
         let force = self.force.then(|| ("force".to_owned(), "true".to_owned()));
         seed.into_iter().chain(force).collect()
+    }
+}
+
+impl OdometryArgs {
+    /// Settings of the flags that stand for a key.
+    pub fn flags(&self) -> Vec<(String, String)> {
+        let paths = [
+            ("scan_folder", self.run.source.input()),
+            ("output_folder", self.output.as_deref()),
+            ("pose_file", self.poses.as_deref()),
+            ("calib_file", self.calib.as_deref()),
+        ];
+        [path_settings(&paths), self.run.flags()].concat()
     }
 }
 

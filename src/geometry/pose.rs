@@ -1,7 +1,7 @@
 //! Poses in the plane and in space, and the conversions between them.
 
 use glam::{Mat3, Vec3};
-use nalgebra::{Isometry2, Isometry3, Translation3, UnitQuaternion};
+use nalgebra::{Isometry2, Isometry3, Translation3, UnitQuaternion, Vector6};
 
 /// A pose or transform in the plane: x, y [m], heading [rad].
 pub type Pose2 = Isometry2<f64>;
@@ -29,6 +29,20 @@ pub fn pose3_from_pose2(pose: &Pose2, height_m: f64) -> Pose3 {
         Translation3::new(t.x, t.y, height_m),
         UnitQuaternion::from_euler_angles(0.0, 0.0, pose.rotation.angle()),
     )
+}
+
+/// The transform of a translation [m] and a rotation vector [rad].
+pub fn exponential(step: &Vector6<f64>) -> Pose3 {
+    Pose3::new(
+        step.fixed_rows::<3>(0).into(),
+        step.fixed_rows::<3>(3).into(),
+    )
+}
+
+/// The inverse of [`exponential`].
+pub fn logarithm(pose: &Pose3) -> Vector6<f64> {
+    let (t, r) = (pose.translation.vector, pose.rotation.scaled_axis());
+    Vector6::new(t.x, t.y, t.z, r.x, r.y, r.z)
 }
 
 /// A rigid transform in `f32` for many points: `p_a = a_from_b.apply(p_b)`.

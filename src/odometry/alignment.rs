@@ -8,11 +8,12 @@
 //! eq. 11), P the covariance of the prediction, scaled to the variance of the residuals. The scale of the kernel falls to that of the
 //! residuals. The covariance is cluster-robust over sectors of the azimuth, as in [`crate::registration`].
 
-use nalgebra::{Matrix6, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{Matrix6, Vector6};
 
 use super::degeneracy::Degeneracy;
 use super::residuals::{Equations, Match, Observation};
 use crate::geometry::Pose3;
+use crate::geometry::pose::{exponential, logarithm};
 
 /// Neighbouring residuals are correlated: so many count as one against the prediction.
 const CORRELATED: f64 = 10.0;
@@ -154,20 +155,6 @@ impl Problem<'_> {
         };
         (step.iter().all(|value| value.is_finite())).then_some((step, alignment))
     }
-}
-
-/// The transform of (translation [m], rotation vector [rad]).
-fn exponential(step: &Vector6<f64>) -> Pose3 {
-    Pose3::from_parts(
-        Vector3::new(step[0], step[1], step[2]).into(),
-        UnitQuaternion::from_scaled_axis(Vector3::new(step[3], step[4], step[5])),
-    )
-}
-
-/// The inverse of [`exponential`].
-fn logarithm(pose: &Pose3) -> Vector6<f64> {
-    let (t, r) = (pose.translation.vector, pose.rotation.scaled_axis());
-    Vector6::new(t.x, t.y, t.z, r.x, r.y, r.z)
 }
 
 fn median(values: &mut [f32]) -> Option<f64> {

@@ -17,22 +17,32 @@
 //! motion that is estimated; Magnusson, *The Three-Dimensional Normal-Distributions Transform* (2009), for
 //! distributions of points in voxels; Blanco-Claraco, *MOLA* (2025), for scales relative to the range.
 
+mod adjustment;
 mod alignment;
+mod block_system;
 mod config;
 mod degeneracy;
+mod drive;
+mod loops;
 mod odometer;
+mod places;
 mod pose_check;
+mod pose_graph;
 mod residuals;
 mod sampling;
 mod search;
 mod state;
 mod timing;
+mod trajectory;
 mod voxel_map;
 
+pub use adjustment::AdjustmentConfig;
 pub use config::OdometryConfig;
+pub use loops::{Loop, LoopVerdict};
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 pub use pose_check::{GivenPoses, MotionDifference, PoseCheck, PoseFit, PoseMeaning, check_poses};
 pub use timing::{TimingComparison, TimingError, compare_timings};
+pub use trajectory::{Trajectory, TrajectoryBuilder, TrajectoryConfig};
 
 #[cfg(test)]
 mod tests;

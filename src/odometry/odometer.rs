@@ -145,7 +145,8 @@ fn advance(
 }
 
 impl OdometryEstimate {
-    fn first(duration_s: f64) -> Self {
+    /// An estimate without motion.
+    pub(super) fn first(duration_s: f64) -> Self {
         Self {
             odom_from_lidar: Pose3::identity(),
             previous_from_current: Pose3::identity(),

@@ -2,11 +2,12 @@
 
 use std::collections::HashSet;
 
-use glam::Vec3;
+use glam::{DMat3, DQuat, DVec3, Vec3};
 
 use super::config::OdometryConfig;
 use super::voxel_map::{CellHasher, pack};
-use crate::lidar::{Scan, Sweep};
+use crate::geometry::Pose3;
+use crate::lidar::{Motion, Scan, Sweep};
 
 /// A measured point.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -27,6 +28,14 @@ pub struct Sample {
 }
 
 impl Sample {
+    /// Of a scan without enough points.
+    pub fn empty() -> Self {
+        Self {
+            points: vec![],
+            sweep: Sweep::spanning(std::iter::empty()),
+        }
+    }
+
     /// Samples a scan for a sensor of range `range_m`.
     pub fn of(scan: &Scan, range_m: f64, config: &OdometryConfig) -> Self {
         /// Larger times before or after the moment of the pose are errors [s].
@@ -51,6 +60,24 @@ impl Sample {
         Self { points, sweep }
     }
 
+    /// Points in the frame of a pose, compensated by the motion.
+    pub fn mapped(&self, odom_from_lidar: &Pose3, motion: Option<&Motion>) -> Vec<DVec3> {
+        let rotation = DMat3::from_quat(DQuat::from(odom_from_lidar.rotation));
+        let translation = DVec3::from(odom_from_lidar.translation.vector);
+        let still = Motion {
+            previous_from_current: Pose3::identity(),
+            duration_s: 1.0,
+        };
+        let compensation = self.sweep.transforms(motion.unwrap_or(&still));
+        (self.points.iter())
+            .map(|point| {
+                let in_lidar =
+                    compensation[self.sweep.interval(point.time_s)].apply(point.position);
+                rotation * in_lidar.as_dvec3() + translation
+            })
+            .collect()
+    }
+
     /// Points at a larger distance from each other.
     pub fn thinned(&self, voxel_m: f64) -> Vec<TimedPoint> {
         first_per_voxel(self.points.iter().copied(), voxel_m)
@@ -58,7 +85,7 @@ impl Sample {
 }
 
 /// The first point in each voxel.
-fn first_per_voxel(points: impl Iterator<Item = TimedPoint>, voxel_m: f64) -> Vec<TimedPoint> {
+pub fn first_per_voxel(points: impl Iterator<Item = TimedPoint>, voxel_m: f64) -> Vec<TimedPoint> {
     let per_m = (1.0 / voxel_m) as f32;
     let mut occupied = HashSet::<u64, CellHasher>::default();
     points

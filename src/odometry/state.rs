@@ -1,6 +1,5 @@
 //! State between scans: the local map, the pose, the motion, and how well it predicts.
 
-use glam::{DMat3, DQuat, DVec3};
 use nalgebra::Vector6;
 
 use super::alignment::{Alignment, Problem};
@@ -50,7 +49,7 @@ impl State {
             missed: 0,
         };
         let sample = state.sample(scan, config);
-        state.map.insert(&mapped(&sample, &Pose3::identity(), None));
+        state.map.insert(&sample.mapped(&Pose3::identity(), None));
         state.first = Some(sample);
         Some(state)
     }
@@ -174,7 +173,7 @@ impl State {
                 duration_s: problem.observation.duration_s,
             };
             let mut map = self.empty_map(config);
-            map.insert(&mapped(first, &self.odom_from_lidar, Some(&motion)));
+            map.insert(&first.mapped(&self.odom_from_lidar, Some(&motion)));
             let observation = Observation {
                 map: &map,
                 ..problem.observation
@@ -233,7 +232,7 @@ impl State {
         if let Some(first) = self.first.take() {
             self.map = self.empty_map(config);
             self.map
-                .insert(&mapped(&first, &self.odom_from_lidar, Some(&motion)));
+                .insert(&first.mapped(&self.odom_from_lidar, Some(&motion)));
             self.cost = found.cost;
         } else {
             let deviation = predicted.inverse() * found.odom_from_lidar;
@@ -250,7 +249,7 @@ impl State {
         self.motion = Some(motion);
         self.missed = 0;
         self.map
-            .insert(&mapped(sample, &self.odom_from_lidar, Some(&motion)));
+            .insert(&sample.mapped(&self.odom_from_lidar, Some(&motion)));
         let center = self.odom_from_lidar.translation.vector.into();
         self.map
             .remove_beyond(center, config.map_radius_share * self.range_m);
@@ -267,11 +266,8 @@ impl State {
         }
         let sample = self.sample(scan, config);
         self.map = self.empty_map(config);
-        self.map.insert(&mapped(
-            &sample,
-            &self.odom_from_lidar,
-            self.motion.as_ref(),
-        ));
+        self.map
+            .insert(&sample.mapped(&self.odom_from_lidar, self.motion.as_ref()));
         self.first = self.motion.is_none().then_some(sample);
         self.missed = 0;
         self.cost = config.max_cost;
@@ -305,21 +301,4 @@ impl State {
     fn sample(&self, scan: &Scan, config: &OdometryConfig) -> Sample {
         Sample::of(scan, self.range_m, config)
     }
-}
-
-/// Points in the odom frame, compensated by the motion.
-fn mapped(sample: &Sample, odom_from_lidar: &Pose3, motion: Option<&Motion>) -> Vec<DVec3> {
-    let rotation = DMat3::from_quat(DQuat::from(odom_from_lidar.rotation));
-    let translation = DVec3::from(odom_from_lidar.translation.vector);
-    let still = Motion {
-        previous_from_current: Pose3::identity(),
-        duration_s: 1.0,
-    };
-    let compensation = sample.sweep.transforms(motion.unwrap_or(&still));
-    (sample.points.iter())
-        .map(|point| {
-            let in_lidar = compensation[sample.sweep.interval(point.time_s)].apply(point.position);
-            rotation * in_lidar.as_dvec3() + translation
-        })
-        .collect()
 }

@@ -26,10 +26,11 @@
 //! Modelling by Registration of Multiple Range Images* (1992), for point to plane; Blais and Levine
 //! (1995) for projective association.
 
-use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, Vector6};
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
+use crate::geometry::pose::exponential;
 use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::Beam;
 use crate::rendering::{RangeRenderer, RenderError, SurfaceHit};
@@ -151,14 +152,6 @@ pub fn register(
         }
     }
     Ok(result)
-}
-
-/// The transform of a Gauss-Newton step in the lidar frame: translation [m], rotation vector [rad].
-fn exponential(step: &Vector6<f64>) -> Pose3 {
-    Pose3::from_parts(
-        Vector3::new(step[0], step[1], step[2]).into(),
-        UnitQuaternion::from_scaled_axis(Vector3::new(step[3], step[4], step[5])),
-    )
 }
 
 /// Linearized residuals of all beams that pass the gates.

@@ -9,6 +9,7 @@ pub mod evaluate;
 pub mod ground;
 mod info;
 pub mod localize;
+mod odometry;
 pub mod refine;
 pub mod simulate;
 // Shared by them.
@@ -17,12 +18,13 @@ mod context;
 mod input;
 pub mod interrupt;
 mod logging;
-mod odometry;
+mod motion_source;
 pub mod output;
 pub mod progress;
 pub mod run_output;
 pub mod run_page;
 pub(super) mod stages;
+mod trajectory;
 pub mod version;
 
 use std::io::Write as _;
@@ -31,7 +33,7 @@ use std::process::ExitCode;
 use crate::app::cli::{Command, ConfigurationArgs, ConfiguredCommand, RunArgs};
 use crate::app::config::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, ConfigError, EvaluationConfig,
-    GroundCommandConfig, LocalizationConfig, RefinementConfig,
+    GroundCommandConfig, LocalizationConfig, OdometryCommandConfig, RefinementConfig,
 };
 use crate::simulation::SimulationConfig;
 pub use context::Context;
@@ -45,6 +47,11 @@ pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
             let base = BuildMapConfig::default;
             let (config, context) = configured(&args.run, args.flags(), base, context)?;
             output::print(&build_map::run(&config, &context)?.table())
+        }
+        Command::Odometry(args) => {
+            let base = OdometryCommandConfig::default;
+            let (config, context) = configured(&args.run, args.flags(), base, context)?;
+            output::print(&odometry::run(&config, &context)?)
         }
         Command::Localize(args) => {
             let base = LocalizationConfig::default;
@@ -87,6 +94,7 @@ fn configuration(args: &ConfigurationArgs) -> &'static str {
     }
     match args.command {
         ConfiguredCommand::BuildMap => text::<BuildMapConfig>(args.full),
+        ConfiguredCommand::Odometry => text::<OdometryCommandConfig>(args.full),
         ConfiguredCommand::Localize => text::<LocalizationConfig>(args.full),
         ConfiguredCommand::Refine => text::<RefinementConfig>(args.full),
         ConfiguredCommand::Evaluate => text::<EvaluationConfig>(args.full),

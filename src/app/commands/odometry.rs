@@ -1,136 +1,224 @@
-//! Source of the motion between frames, and its description in reports.
+//! `odometry`: poses of a recording from its scans, with loops closed and all poses adjusted.
 
-use std::collections::VecDeque;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::Result;
-use rand::Rng;
+use serde::Serialize;
 
-use super::stages::RecordingInputs;
-use crate::app::config::OdometrySource;
+use super::claims::{Claims, Outputs};
+use super::stages::{RecordingInputs, SensorKeys};
+use super::trajectory::{self, TrajectorySummary};
+use super::{Context, output};
+use crate::app::config::{OdometryCommandConfig, RangeImageConfig};
+use crate::app::plotting::PathPlot;
+use crate::app::plotting::color::{ODOMETRY, REFINED};
+use crate::app::results::write_trajectory_npz;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
-use crate::lidar::Scan;
-use crate::localization::odometry::{demonstration_noise, increments, with_noise};
-use crate::odometry::{Odometer, OdometryConfig};
-use crate::recording::layout::Layout;
-use crate::recording::{Frame, PoseTrack, Recording};
+use crate::lidar::LidarModel;
+use crate::odometry::{Loop, OdometryEstimate, StepState, Trajectory};
+use crate::recording::poses::write_kitti;
+use crate::recording::{Frame, Recording};
+use crate::sensor::SensorDescription;
 
-/// The motion `previous_from_current` into each frame.
-pub enum MotionSource {
-    /// Known for all frames.
-    Given(Vec<Pose2>),
-    /// From the scans themselves, also from those between the selected ones.
-    Scans(Box<ScanOdometry>),
-    /// Not known.
-    Unknown,
+/// Report of a run.
+#[derive(Debug, Serialize)]
+struct OdometryReport {
+    #[serde(flatten)]
+    summary: TrajectorySummary,
+    /// What was inferred about the sensor.
+    sensor: Option<SensorDescription>,
+    /// Loops that were found.
+    found_loops: Vec<LoopReport>,
 }
 
-impl MotionSource {
-    /// Opens the configured source for the frames of a recording; returns also the file or, in a bag, the topic that
-    /// is used.
-    pub fn open(
-        source: OdometrySource,
-        file: Option<PathBuf>,
-        inputs: &RecordingInputs,
-        recording: &Recording,
-        rng: &mut impl Rng,
-    ) -> Result<(Self, Option<PathBuf>)> {
-        let motion = match (source, &file) {
-            (OdometrySource::None, _) => Self::Unknown,
-            (OdometrySource::File | OdometrySource::Auto, Some(file)) => {
-                inputs.require_poses("odometry_file", file)?;
-                Self::of_track(&inputs.track(file, recording)?, recording)?
-            }
-            // A bag may have a topic of odometry.
-            (OdometrySource::Auto, None) if recording.files.layout == Layout::Bag => {
-                match inputs.own_track(recording) {
-                    Ok(track) => {
-                        return Ok((Self::of_track(&track, recording)?, Some(track.path)));
-                    }
-                    Err(error) => {
-                        tracing::info!(
-                            "odometry from the scans, because the bag has none to use: {error}"
-                        );
-                        Self::of_scans(recording)?
-                    }
-                }
-            }
-            (OdometrySource::GroundTruth, _) => {
-                let poses = recording
-                    .frames
-                    .iter()
-                    .filter_map(|frame| frame.map_from_lidar);
-                let increments = increments(&poses.collect::<Vec<_>>());
-                Self::Given(with_noise(&increments, &demonstration_noise(), rng))
-            }
-            _ => Self::of_scans(recording)?,
-        };
-        Ok((motion, file))
-    }
-
-    fn of_scans(recording: &Recording) -> Result<Self> {
-        /// Larger steps are not bridged by the scans between.
-        const MAX_STEP: usize = 10;
-        let steps = recording.frames.windows(2);
-        let largest = steps.map(|pair| pair[1].number - pair[0].number).max();
-        let skipped = match largest.is_some_and(|step| step <= MAX_STEP) {
-            true => recording.skipped.clone(),
-            false => Vec::new(),
-        };
-        Ok(Self::Scans(Box::new(ScanOdometry {
-            odometer: Odometer::new(OdometryConfig::default())?,
-            skipped: skipped.into(),
-        })))
-    }
-
-    fn of_track(track: &PoseTrack, recording: &Recording) -> Result<Self> {
-        let mut last = Pose3::identity();
-        let poses = track.matched(&recording.frames, recording.has_times)?;
-        let known = poses.into_iter().map(|pose| {
-            last = pose.unwrap_or(last);
-            last
-        });
-        Ok(Self::Given(increments(&known.collect::<Vec<_>>())))
-    }
-
-    /// The motion into a frame by its row and scan; every scan has to be given, in order.
-    pub fn motion_to(&mut self, row: usize, frame: &Frame, scan: &Scan) -> Result<Option<Pose2>> {
-        Ok(match self {
-            Self::Given(increments) => increments.get(row).copied(),
-            Self::Scans(odometry) => Some(odometry.motion_to(frame, scan)?),
-            Self::Unknown => None,
-        })
-    }
+/// A loop in the report.
+#[derive(Debug, Serialize)]
+struct LoopReport {
+    /// Frame of the earlier visit.
+    first: usize,
+    /// Frame of the later visit.
+    second: usize,
+    /// Distance between the visits [m].
+    distance_m: f64,
+    /// Share of the surfaces in common, without the ground.
+    common_share: f64,
+    /// What became of it.
+    verdict: String,
 }
 
-/// Odometry of the scans.
-pub struct ScanOdometry {
-    odometer: Odometer,
-    /// The scans between the selected ones that were not registered yet.
-    skipped: VecDeque<Frame>,
+/// Finds the poses of the recording that a configuration names; returns the table of the run.
+pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<String> {
+    config.recording_inputs().require()?;
+    let folder = &config.output_folder;
+    let mut claims = prepare(config, context)?;
+    let mut resolved = config.clone();
+    let (recording, sensor) = open(&mut resolved)?;
+    let frames = trajectory::dense_frames(&recording);
+    let is_given = recording.track.is_some();
+    let found = trajectory::estimate(&frames, is_given, &config.trajectory, context)?;
+    let selected = |frame: &Frame| recording.frames.iter().any(|it| it.number == frame.number);
+    let rows: Vec<usize> = (0..frames.len())
+        .filter(|&row| selected(&frames[row]))
+        .collect();
+    let main = folder.join("report.json");
+    output::create_folder(folder)?;
+    claims.begin(&main)?;
+    write(folder, &recording, &frames, &rows, &found)?;
+    if config.visualize {
+        draw(&folder.join("path.png"), &found, is_given)?;
+    }
+    let summary = TrajectorySummary::of(&found);
+    let report = OdometryReport {
+        found_loops: found
+            .loops
+            .iter()
+            .map(|it| LoopReport::of(it, &frames))
+            .collect(),
+        summary,
+        sensor,
+    };
+    output::write_yaml(&folder.join("effective_odometry.yml"), &resolved)?;
+    output::write_json(&main, &report)?;
+    claims.finish(&main)?;
+    report.summary.warn();
+    Ok(output::rows(&report.summary.rows()))
 }
 
-impl ScanOdometry {
-    fn motion_to(&mut self, frame: &Frame, scan: &Scan) -> Result<Pose2> {
-        let mut motion = Pose3::identity();
-        while (self.skipped.front()).is_some_and(|between| between.number < frame.number) {
-            if let Some(between) = self.skipped.pop_front() {
-                motion *= self.odometer.step(&between.read()?)?.previous_from_current;
-            }
+fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> {
+    let mut names = vec![
+        "poses_tum.txt",
+        "poses_kitti.txt",
+        "odometry_tum.txt",
+        "trajectory.npz",
+        "frames.csv",
+        "effective_odometry.yml",
+    ];
+    names.extend(config.visualize.then_some("path.png"));
+    let mut inputs = config.recording_inputs().files();
+    inputs.extend(context.input());
+    let outputs = Outputs {
+        key: "output_folder",
+        main: &config.output_folder.join("report.json"),
+        magic: None,
+        names: names.into_iter().map(str::to_owned).collect(),
+        inputs,
+        force: config.force,
+    };
+    outputs.prepare()
+}
+
+impl OdometryCommandConfig {
+    /// The recording with its poses.
+    fn recording_inputs(&self) -> RecordingInputs<'_> {
+        RecordingInputs {
+            scan_folder: &self.scan_folder,
+            topic: self.topic.as_deref(),
+            pose_file: self.pose_file.as_deref(),
+            calib_file: self.calib_file.as_deref(),
+            body_from_lidar: self.body_from_lidar,
         }
-        motion *= self.odometer.step(scan)?.previous_from_current;
-        Ok(pose2_from_pose3(&motion))
     }
 }
 
-/// Description of the odometry for reports.
-pub fn description(source: OdometrySource, file: Option<&Path>) -> String {
-    match (source, file) {
-        (OdometrySource::None, _) => "none (constant velocity)".to_owned(),
-        (OdometrySource::File | OdometrySource::Auto, Some(file)) => file.display().to_string(),
-        (OdometrySource::GroundTruth, _) => {
-            "ground truth with noise (a demonstration, as in range-mcl)".to_owned()
+/// Opens the recording, with the poses to polish if there are any.
+fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Option<SensorDescription>)> {
+    let inputs = config.recording_inputs();
+    let mut recording = inputs.open(&config.selection())?;
+    if let Some(path) = &config.pose_file {
+        let track = inputs.track(path, &recording)?;
+        recording = recording.with_poses(track)?;
+        recording.skipped.clear();
+    }
+    let mut range_image = RangeImageConfig::of(&LidarModel::default());
+    range_image.height = None;
+    let keys = SensorKeys {
+        range_image: &mut range_image,
+        own_car_m: &mut None,
+        motion_compensation: &mut config.motion_compensation,
+    };
+    keys.resolve(recording)
+}
+
+/// Writes the poses of the selected frames.
+fn write(
+    folder: &Path,
+    recording: &Recording,
+    frames: &[Frame],
+    rows: &[usize],
+    found: &Trajectory,
+) -> Result<()> {
+    let frames: Vec<Frame> = rows.iter().map(|&row| frames[row].clone()).collect();
+    let poses: Vec<Pose3> = rows.iter().map(|&row| found.poses[row]).collect();
+    let steps: Vec<&OdometryEstimate> = rows.iter().map(|&row| &found.odometry[row]).collect();
+    let odometry: Vec<Pose3> = steps.iter().map(|step| step.odom_from_lidar).collect();
+    let (world_from_map, calibration) = recording.world();
+    trajectory::write_poses(&folder.join("poses_tum.txt"), &frames, &poses)?;
+    trajectory::write_poses(&folder.join("odometry_tum.txt"), &frames, &odometry)?;
+    output::write_file(&folder.join("poses_kitti.txt"), |file| {
+        write_kitti(file, &poses, &world_from_map, &calibration)
+    })?;
+    write_trajectory_npz(&folder.join("trajectory.npz"), &frames, &poses, &steps)?;
+    output::write_text(&folder.join("frames.csv"), &csv(&frames, &poses, &steps))
+}
+
+/// One row per frame.
+fn csv(frames: &[Frame], poses: &[Pose3], steps: &[&OdometryEstimate]) -> String {
+    let mut text = "frame,time_s,x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad,state,matched_share,residual_m,degenerate_directions,time_ms\n".to_owned();
+    for ((frame, pose), step) in frames.iter().zip(poses).zip(steps) {
+        let (t, angles) = (pose.translation.vector, pose.rotation.euler_angles());
+        let residual = step.residual_m.map_or(String::new(), |m| format!("{m:.5}"));
+        text += &format!(
+            "{},{:.6},{:.6},{:.6},{:.6},{:.8},{:.8},{:.8},{},{:.4},{residual},{},{:.3}\n",
+            frame.number,
+            frame.time_s,
+            t.x,
+            t.y,
+            t.z,
+            angles.0,
+            angles.1,
+            angles.2,
+            in_words(step.state),
+            step.matched_share,
+            step.degenerate_directions.len(),
+            1e3 * step.elapsed.as_secs_f64()
+        );
+    }
+    text
+}
+
+fn in_words(state: StepState) -> &'static str {
+    match state {
+        StepState::First => "first",
+        StepState::Registered => "registered",
+        StepState::Predicted => "predicted",
+    }
+}
+
+/// Draws the path before and after loops and adjustment.
+fn draw(path: &Path, found: &Trajectory, is_given: bool) -> Result<()> {
+    let planar = |poses: &mut dyn Iterator<Item = Pose3>| -> Vec<Pose2> {
+        poses.map(|pose| pose2_from_pose3(&pose)).collect()
+    };
+    let before = planar(&mut found.odometry.iter().map(|step| step.odom_from_lidar));
+    let after = planar(&mut found.poses.iter().copied());
+    let name = if is_given { "given" } else { "odometry" };
+    PathPlot {
+        title: "Path",
+        ground_truth: None,
+        paths: &[(name, ODOMETRY, &before), ("adjusted", REFINED, &after)],
+        map: None,
+    }
+    .save(path)
+}
+
+impl LoopReport {
+    fn of(found: &Loop, frames: &[Frame]) -> Self {
+        Self {
+            first: frames[found.first].number,
+            second: frames[found.second].number,
+            distance_m: found.first_from_second.translation.vector.norm(),
+            common_share: found.common_share,
+            verdict: format!("{:?}", found.verdict).to_lowercase(),
         }
-        _ => "from the scans".to_owned(),
     }
 }

@@ -8,9 +8,9 @@ use anyhow::{Result, ensure};
 
 use super::claims::{Claims, Outputs};
 use super::interrupt::Interrupted;
-use super::odometry::MotionSource;
+use super::motion_source::MotionSource;
 use super::run_output::{self, REFINEMENT_FILES, REPORT_FILES, RunFiles};
-use super::{Context, input, odometry, output, run_page};
+use super::{Context, input, motion_source, output, run_page};
 use crate::app::config::{self, LocalizationConfig, OdometrySource, RefinementConfig};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
@@ -269,7 +269,7 @@ fn write_run(
         (OdometrySource::Auto, None) if sequence.files.layout == Layout::Bag => {
             "that of the localization".to_owned()
         }
-        (source, file) => odometry::description(source, file.as_deref()),
+        (source, file) => motion_source::description(source, file.as_deref()),
     };
     let about = [
         ("recording", config.scan_folder.display().to_string()),

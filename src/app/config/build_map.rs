@@ -17,6 +17,21 @@ use crate::map::{LocalMapConfig, MapConfig};
 use crate::meshing::PoissonConfig;
 use crate::validation::{InvalidValue, Validate, in_range, require};
 
+/// Where the poses of the scans come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PoseSource {
+    /// Given, where there are any, otherwise as [`PoseSource::Odometry`].
+    #[default]
+    Auto,
+    /// Given.
+    Given,
+    /// Given, and adjusted so that the scans show the same surfaces.
+    Polished,
+    /// From the scans themselves: odometry, loops and adjustment.
+    Odometry,
+}
+
 /// Configuration of `build-map`: the keys of range-mcl's `build_map.yml`, then new ones.
 ///
 /// Defaults: the values of range-mcl.
@@ -36,6 +51,8 @@ pub struct BuildMapConfig {
     /// Pose x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose poses are given; `None`: they are
     /// those of the lidar.
     pub body_from_lidar: Option<[f64; 6]>,
+    /// Whether the poses are those of `pose_file` or the recording, or found from the scans.
+    pub poses: PoseSource,
     /// Output path of the map.
     #[default("results/map.ply".into())]
     pub mesh_file: PathBuf,

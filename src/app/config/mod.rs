@@ -14,6 +14,7 @@ mod comparison;
 mod evaluation;
 mod ground;
 mod localization;
+mod odometry_command;
 mod refinement;
 // What they share.
 mod check;
@@ -25,7 +26,7 @@ mod load;
 mod template;
 mod yaml;
 
-pub use build_map::BuildMapConfig;
+pub use build_map::{BuildMapConfig, PoseSource};
 pub use comparison::{
     ComparisonConfig, Contrast, Overrides, ParticleSweep, SequenceConfig, StageOverrides,
     VariantConfig, settings,
@@ -36,6 +37,7 @@ pub use ground::GroundCommandConfig;
 pub use load::{has_key, load, with_settings};
 pub use localization::{Initialization, LocalizationConfig, MotionModel};
 pub use odometry::OdometrySource;
+pub use odometry_command::OdometryCommandConfig;
 pub use recording::{MotionCompensation, RangeImageConfig, body_from_lidar};
 pub use refinement::RefinementConfig;
 pub use template::CommandConfig;

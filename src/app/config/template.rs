@@ -9,6 +9,7 @@ use super::comparison::ComparisonConfig;
 use super::evaluation::EvaluationConfig;
 use super::ground::GroundCommandConfig;
 use super::localization::LocalizationConfig;
+use super::odometry_command::OdometryCommandConfig;
 use super::refinement::RefinementConfig;
 use crate::recording::Selection;
 use crate::simulation::SimulationConfig;
@@ -42,6 +43,7 @@ macro_rules! command_config {
 }
 
 command_config!(BuildMapConfig, "build_map");
+command_config!(OdometryCommandConfig, "odometry");
 command_config!(LocalizationConfig, "localization");
 command_config!(RefinementConfig, "refinement");
 command_config!(EvaluationConfig, "evaluation", short);
@@ -67,6 +69,7 @@ macro_rules! selection {
 
 selection!(
     BuildMapConfig,
+    OdometryCommandConfig,
     LocalizationConfig,
     RefinementConfig,
     EvaluationConfig,

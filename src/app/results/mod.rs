@@ -6,6 +6,7 @@ mod npz;
 mod results_file;
 #[cfg(test)]
 mod results_file_tests;
+mod trajectory_file;
 // Tables and reports.
 mod frames;
 mod report;
@@ -21,3 +22,4 @@ pub use report::{Report, TrajectoryReport};
 pub use results_file::write_poses_npy;
 pub use rows::{MetricRow, Value};
 pub use run_summary::RunSummary;
+pub use trajectory_file::write_trajectory_npz;

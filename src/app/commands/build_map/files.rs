@@ -10,7 +10,7 @@ use crate::map::{MappingPath, ply};
 
 /// Prepares the outputs.
 pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
-    let mut extensions = vec!["report.json", "effective.yml"];
+    let mut extensions = vec!["report.json", "effective.yml", "poses_tum.txt"];
     if config.visualize {
         extensions.extend(["png", "residuals.png"]);
     }

@@ -1,4 +1,4 @@
-//! `build-map`: builds a triangle-mesh map from scans with poses.
+//! `build-map`: builds a triangle-mesh map from scans, whose poses are given or found first.
 
 mod clock;
 mod cloud;
@@ -6,6 +6,7 @@ mod files;
 mod parts;
 mod pictures;
 mod pose_check;
+mod poses;
 mod report;
 
 use std::collections::BTreeMap;
@@ -22,16 +23,18 @@ use self::files::{prepare, write_map};
 pub use self::parts::hash_of_scan;
 use self::parts::{Parts, hash_of_scans, joint_hash};
 pub use self::report::BuildReport;
+use super::claims::Claims;
 use super::interrupt::Interrupted;
+use super::trajectory::{TrajectorySummary, file_beside};
 use super::{Context, input, output, version};
-use crate::app::config::{self, BuildMapConfig};
+use crate::app::config::{self, BuildMapConfig, PoseSource};
 use crate::evaluation::map_quality::{self, BeamResidual};
 use crate::evaluation::{MapQuality, TruthAgreement};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::map::plan::{LocalMapPlan, key_scans, local_maps};
 use crate::map::{
-    BuildError, BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan, MappingPath, path_check,
-    ply, scan_agreement,
+    BuildError, BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan, MappingPath, ply,
+    scan_agreement,
 };
 use crate::recording::{Frame, Recording};
 use crate::sensor::SensorDescription;
@@ -49,7 +52,11 @@ fn run_with_scans(config: &BuildMapConfig, context: &Context) -> Result<BuildRep
     let started = Instant::now();
     let mut claims = prepare(config, context)?;
     let mut resolved = config.clone();
-    let (sequence, sensor) = open(&mut resolved)?;
+    let Opened {
+        sequence,
+        sensor,
+        trajectory,
+    } = open(&mut resolved, &mut claims, context)?;
     let config = &resolved;
     let (mapped, held_out) = hold_out(&sequence.frames, config);
     let clock = Arc::new(StageClock::default());
@@ -71,6 +78,7 @@ fn run_with_scans(config: &BuildMapConfig, context: &Context) -> Result<BuildRep
         mapped_frames: mapped.len(),
         held_out_frames: held_out.len(),
         sensor,
+        trajectory,
         stage_seconds: clock.seconds(),
         quality: MapQuality::of(&residuals),
         truth,
@@ -85,31 +93,48 @@ fn run_with_scans(config: &BuildMapConfig, context: &Context) -> Result<BuildRep
     Ok(report)
 }
 
-/// Opens the recording with its poses, and completes the configuration by what the scans show about the
+/// The recording of a map.
+struct Opened {
+    /// The recording with its poses.
+    sequence: Recording,
+    /// What was inferred about the sensor.
+    sensor: Option<SensorDescription>,
+    /// What the poses show about themselves, where they were found in this run.
+    trajectory: Option<TrajectorySummary>,
+}
+
+/// Opens the recording with its poses, or finds them, and completes the configuration by what the scans show about the
 /// sensor.
-fn open(config: &mut BuildMapConfig) -> Result<(Recording, Option<SensorDescription>)> {
+fn open(config: &mut BuildMapConfig, claims: &mut Claims, context: &Context) -> Result<Opened> {
     let inputs = config.recording_inputs();
     inputs.require()?;
     if let Some(path) = &config.truth_mesh {
         input::require_file("truth_mesh", path)?;
     }
-    let recording = inputs.open(&config.selection())?;
-    let track = match &config.pose_file {
-        Some(path) => inputs.track(path, &recording)?,
-        None => inputs.own_track(&recording)?,
-    };
-    let pose_file = track.path.clone();
-    let recording = recording.with_poses(track)?;
-    let poses = recording.frames.iter();
-    let poses = poses.filter_map(|frame| Some((frame.number, frame.map_from_lidar.as_ref()?)));
-    path_check::check(poses, config.max_step_m)
-        .with_context(|| format!("pose_file is {}", pose_file.display()))?;
-    let (recording, sensor) = config.sensor_keys().resolve(recording)?;
-    if config.check_poses {
-        pose_check::check(&recording)
+    let mut recording = inputs.open(&config.selection())?;
+    let given = poses::given(config, &recording)?;
+    let pose_file = given.as_ref().map(|track| track.path.clone());
+    if let (Some(track), Some(pose_file)) = (given, &pose_file) {
+        recording = recording.with_poses(track)?;
+        poses::check(&recording, config, pose_file)?;
+    }
+    let (mut sequence, sensor) = config.sensor_keys().resolve(recording)?;
+    if let Some(pose_file) = pose_file.filter(|_| config.check_poses) {
+        pose_check::check(&sequence)
             .with_context(|| format!("pose_file is {}", pose_file.display()))?;
     }
-    Ok((recording.compensated_by_poses(), sensor))
+    let mut trajectory = None;
+    if sequence.track.is_none() || config.poses == PoseSource::Polished {
+        (sequence, trajectory) = poses::find(sequence, config, context)?;
+        poses::check(&sequence, config, &file_beside(&config.mesh_file))?;
+    } else if let Some(name) = file_beside(&config.mesh_file).file_name() {
+        claims.remove(&[&name.to_string_lossy()])?;
+    }
+    Ok(Opened {
+        sequence: sequence.compensated_by_poses(),
+        sensor,
+        trajectory,
+    })
 }
 
 /// The key scans that build the map, and those that are held out to evaluate it.

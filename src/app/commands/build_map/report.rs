@@ -7,6 +7,7 @@ use std::time::Instant;
 use serde::Serialize;
 
 use crate::app::commands::output;
+use crate::app::commands::trajectory::TrajectorySummary;
 use crate::evaluation::{MapQuality, TruthAgreement};
 use crate::geometry::TriangleMesh;
 use crate::map::{LocalMapCounts, MappingPath};
@@ -23,6 +24,8 @@ pub struct BuildReport {
     pub held_out_frames: usize,
     /// What was inferred about the sensor; `None` if all of it was configured.
     pub sensor: Option<SensorDescription>,
+    /// What poses that were found in this run show about themselves.
+    pub trajectory: Option<TrajectorySummary>,
     /// Length of the path of the mapped scans [m].
     pub path_m: f64,
     /// Triangles of the map.
@@ -98,6 +101,10 @@ impl BuildReport {
                     self.mb_per_100m
                 ),
             ));
+        }
+        if let Some(trajectory) = &self.trajectory {
+            let found = trajectory.rows().into_iter();
+            rows.extend(found.filter(|(name, _)| !matches!(*name, "scans" | "path")));
         }
         let percent = |share: f64| format!("{:.1} %", 100.0 * share);
         let centimetres = |metres: f64| format!("{:.1} cm", 100.0 * metres);

@@ -14,9 +14,9 @@ use self::pictures::draw_example;
 use self::recorder::Run;
 use super::claims::{Claims, NPZ, Outputs};
 use super::interrupt::Interrupted;
-use super::odometry::MotionSource;
+use super::motion_source::MotionSource;
 use super::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES, RunFiles};
-use super::{Context, input, odometry, output, run_page};
+use super::{Context, input, motion_source, output, run_page};
 use crate::app::config::{Initialization, LocalizationConfig, MotionModel};
 use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::RangeMclRules;
@@ -275,7 +275,7 @@ fn warn_of_untracked_frames(results: &LocalizationResults) {
 
 /// Description of the run for the report.
 fn about(config: &LocalizationConfig, context: &Context, map: &Map) -> BTreeMap<String, String> {
-    let odometry = odometry::description(config.odometry, config.odometry_file.as_deref());
+    let odometry = motion_source::description(config.odometry, config.odometry_file.as_deref());
     let particles = format!("{} reduced to {}", config.num_particles, config.num_reduced);
     [
         ("recording", config.scan_folder.display().to_string()),

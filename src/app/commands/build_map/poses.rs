@@ -1,0 +1,100 @@
+//! Poses of the scans of a map: given, polished, or from the scans themselves.
+
+use std::fs;
+use std::path::Path;
+
+use anyhow::{Context as _, Result};
+
+use crate::app::commands::trajectory::{self, TrajectorySummary};
+use crate::app::commands::{Context, output, version};
+use crate::app::config::{BuildMapConfig, PoseSource};
+use crate::geometry::Pose3;
+use crate::odometry::TrajectoryConfig;
+use crate::recording::poses::write_tum;
+use crate::recording::{Frame, PoseTrack, Recording};
+
+/// The given poses of a recording; `None` if they are to be found from the scans.
+pub fn given(config: &BuildMapConfig, recording: &Recording) -> Result<Option<PoseTrack>> {
+    let inputs = config.recording_inputs();
+    if config.poses == PoseSource::Odometry {
+        return Ok(None);
+    }
+    if let Some(path) = &config.pose_file {
+        return inputs.track(path, recording).map(Some);
+    }
+    match inputs.own_track(recording) {
+        Err(error) if config.poses == PoseSource::Auto && recording.files.poses.is_none() => {
+            tracing::info!("poses from the scans: {error}");
+            Ok(None)
+        }
+        track => track.map(Some),
+    }
+}
+
+/// The recording with poses from its scans, or with its own ones polished. They are kept in a file beside the map, from
+/// which they are read where it belongs to the same scans; the summary is that of poses that were found now.
+pub fn find(
+    mut recording: Recording,
+    config: &BuildMapConfig,
+    context: &Context,
+) -> Result<(Recording, Option<TrajectorySummary>)> {
+    let path = trajectory::file_beside(&config.mesh_file);
+    let is_given = recording.track.is_some();
+    let frames = match is_given {
+        true => recording.frames.clone(),
+        false => trajectory::dense_frames(&recording),
+    };
+    let heading = format!("# fpmcl poses {}\n", inputs(&frames, is_given)?);
+    let is_found = fs::read_to_string(&path).is_ok_and(|text| text.starts_with(&heading));
+    let mut summary = None;
+    if is_found {
+        tracing::info!("the poses in {} are finished already", path.display());
+    } else {
+        let settings = TrajectoryConfig::default();
+        let found = trajectory::estimate(&frames, is_given, &settings, context)?;
+        let found_now = TrajectorySummary::of(&found);
+        found_now.warn();
+        summary = Some(found_now);
+        // Rows of the lidar in the world of the given poses.
+        let (world_from_map, _) = recording.world();
+        let poses: Vec<Pose3> = found
+            .poses
+            .iter()
+            .map(|pose| world_from_map * pose)
+            .collect();
+        let stamped = trajectory::stamped(&frames, &poses);
+        output::write_file(&path, |file| {
+            std::io::Write::write_all(file, heading.as_bytes())?;
+            write_tum(file, &stamped)
+        })?;
+    }
+    // Its rows have the times of the frames, also where these are assumed.
+    recording.has_times = true;
+    let recording = recording.with_poses(PoseTrack::read(&path, None)?)?;
+    Ok((recording, summary))
+}
+
+/// Hash of what the poses depend on; of a scan its place and size.
+fn inputs(frames: &[Frame], is_given: bool) -> Result<String> {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(version::program()?.as_bytes());
+    for frame in frames {
+        let source = frame.source.to_string();
+        let bytes = fs::metadata(Path::new(&source)).map_or(0, |file| file.len());
+        let given = frame.map_from_lidar.filter(|_| is_given);
+        let what = format!(
+            "{source} {bytes} {} {:?} {} {given:?}\n",
+            frame.time_s, frame.rotation, frame.is_timed
+        );
+        hasher.update(what.as_bytes());
+    }
+    Ok(hasher.finalize().to_hex().to_string())
+}
+
+/// Checks the poses against each other.
+pub fn check(recording: &Recording, config: &BuildMapConfig, path: &Path) -> Result<()> {
+    let poses = recording.frames.iter();
+    let poses = poses.filter_map(|frame| Some((frame.number, frame.map_from_lidar.as_ref()?)));
+    crate::map::path_check::check(poses, config.max_step_m)
+        .with_context(|| format!("pose_file is {}", path.display()))
+}

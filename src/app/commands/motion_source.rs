@@ -1,0 +1,136 @@
+//! Source of the motion between frames, and its description in reports.
+
+use std::collections::VecDeque;
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+use rand::Rng;
+
+use super::stages::RecordingInputs;
+use crate::app::config::OdometrySource;
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
+use crate::lidar::Scan;
+use crate::localization::odometry::{demonstration_noise, increments, with_noise};
+use crate::odometry::{Odometer, OdometryConfig};
+use crate::recording::layout::Layout;
+use crate::recording::{Frame, PoseTrack, Recording};
+
+/// The motion `previous_from_current` into each frame.
+pub enum MotionSource {
+    /// Known for all frames.
+    Given(Vec<Pose2>),
+    /// From the scans themselves, also from those between the selected ones.
+    Scans(Box<ScanOdometry>),
+    /// Not known.
+    Unknown,
+}
+
+impl MotionSource {
+    /// Opens the configured source for the frames of a recording; returns also the file or, in a bag, the topic that
+    /// is used.
+    pub fn open(
+        source: OdometrySource,
+        file: Option<PathBuf>,
+        inputs: &RecordingInputs,
+        recording: &Recording,
+        rng: &mut impl Rng,
+    ) -> Result<(Self, Option<PathBuf>)> {
+        let motion = match (source, &file) {
+            (OdometrySource::None, _) => Self::Unknown,
+            (OdometrySource::File | OdometrySource::Auto, Some(file)) => {
+                inputs.require_poses("odometry_file", file)?;
+                Self::of_track(&inputs.track(file, recording)?, recording)?
+            }
+            // A bag may have a topic of odometry.
+            (OdometrySource::Auto, None) if recording.files.layout == Layout::Bag => {
+                match inputs.own_track(recording) {
+                    Ok(track) => {
+                        return Ok((Self::of_track(&track, recording)?, Some(track.path)));
+                    }
+                    Err(error) => {
+                        tracing::info!(
+                            "odometry from the scans, because the bag has none to use: {error}"
+                        );
+                        Self::of_scans(recording)?
+                    }
+                }
+            }
+            (OdometrySource::GroundTruth, _) => {
+                let poses = recording
+                    .frames
+                    .iter()
+                    .filter_map(|frame| frame.map_from_lidar);
+                let increments = increments(&poses.collect::<Vec<_>>());
+                Self::Given(with_noise(&increments, &demonstration_noise(), rng))
+            }
+            _ => Self::of_scans(recording)?,
+        };
+        Ok((motion, file))
+    }
+
+    fn of_scans(recording: &Recording) -> Result<Self> {
+        /// Larger steps are not bridged by the scans between.
+        const MAX_STEP: usize = 10;
+        let steps = recording.frames.windows(2);
+        let largest = steps.map(|pair| pair[1].number - pair[0].number).max();
+        let skipped = match largest.is_some_and(|step| step <= MAX_STEP) {
+            true => recording.skipped.clone(),
+            false => Vec::new(),
+        };
+        Ok(Self::Scans(Box::new(ScanOdometry {
+            odometer: Odometer::new(OdometryConfig::default())?,
+            skipped: skipped.into(),
+        })))
+    }
+
+    fn of_track(track: &PoseTrack, recording: &Recording) -> Result<Self> {
+        let mut last = Pose3::identity();
+        let poses = track.matched(&recording.frames, recording.has_times)?;
+        let known = poses.into_iter().map(|pose| {
+            last = pose.unwrap_or(last);
+            last
+        });
+        Ok(Self::Given(increments(&known.collect::<Vec<_>>())))
+    }
+
+    /// The motion into a frame by its row and scan; every scan has to be given, in order.
+    pub fn motion_to(&mut self, row: usize, frame: &Frame, scan: &Scan) -> Result<Option<Pose2>> {
+        Ok(match self {
+            Self::Given(increments) => increments.get(row).copied(),
+            Self::Scans(odometry) => Some(odometry.motion_to(frame, scan)?),
+            Self::Unknown => None,
+        })
+    }
+}
+
+/// Odometry of the scans.
+pub struct ScanOdometry {
+    odometer: Odometer,
+    /// The scans between the selected ones that were not registered yet.
+    skipped: VecDeque<Frame>,
+}
+
+impl ScanOdometry {
+    fn motion_to(&mut self, frame: &Frame, scan: &Scan) -> Result<Pose2> {
+        let mut motion = Pose3::identity();
+        while (self.skipped.front()).is_some_and(|between| between.number < frame.number) {
+            if let Some(between) = self.skipped.pop_front() {
+                motion *= self.odometer.step(&between.read()?)?.previous_from_current;
+            }
+        }
+        motion *= self.odometer.step(scan)?.previous_from_current;
+        Ok(pose2_from_pose3(&motion))
+    }
+}
+
+/// Description of the odometry for reports.
+pub fn description(source: OdometrySource, file: Option<&Path>) -> String {
+    match (source, file) {
+        (OdometrySource::None, _) => "none (constant velocity)".to_owned(),
+        (OdometrySource::File | OdometrySource::Auto, Some(file)) => file.display().to_string(),
+        (OdometrySource::GroundTruth, _) => {
+            "ground truth with noise (a demonstration, as in range-mcl)".to_owned()
+        }
+        _ => "from the scans".to_owned(),
+    }
+}

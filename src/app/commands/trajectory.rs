@@ -1,0 +1,192 @@
+//! Poses of a recording from its scans, for `odometry` and `build-map`.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+use serde::Serialize;
+
+use super::interrupt::Interrupted;
+use super::{Context, output};
+use crate::geometry::{Pose3, StampedPose};
+use crate::odometry::{LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig};
+use crate::recording::poses::write_tum;
+use crate::recording::{Frame, Recording};
+
+/// Estimates the poses of frames, or polishes those that they have.
+pub fn estimate(
+    frames: &[Frame],
+    is_given: bool,
+    config: &TrajectoryConfig,
+    context: &Context,
+) -> Result<Trajectory> {
+    let kept = "nothing is written: loops and adjustment need all scans";
+    context.interrupt.keeps(kept.to_owned());
+    let mut builder = TrajectoryBuilder::new(config.clone())?;
+    let name = if is_given { "polish" } else { "odometry" };
+    let task = context.progress.task(name, frames.len());
+    for frame in frames {
+        if context.interrupt.requested() {
+            return Err(Interrupted { kept: kept.into() }.into());
+        }
+        let scan = frame.read()?;
+        match frame.map_from_lidar {
+            Some(pose) if is_given => builder.add_given(&scan, pose),
+            _ => {
+                builder.add(&scan)?;
+            }
+        }
+        task.advance(1);
+    }
+    task.note("loops and adjustment");
+    Ok(builder.finish())
+}
+
+/// Writes poses as rows of TUM with the times of frames.
+pub fn write_poses(path: &Path, frames: &[Frame], poses: &[Pose3]) -> Result<()> {
+    output::write_file(path, |file| write_tum(file, &stamped(frames, poses)))
+}
+
+/// Poses with the numbers and times of frames.
+pub fn stamped(frames: &[Frame], poses: &[Pose3]) -> Vec<StampedPose> {
+    (frames.iter().zip(poses))
+        .map(|(frame, &pose)| frame.stamped(pose))
+        .collect()
+}
+
+/// All frames of a recording from the first selected to the last, also those between.
+pub fn dense_frames(recording: &Recording) -> Vec<Frame> {
+    let mut frames: Vec<Frame> = (recording.frames.iter())
+        .chain(&recording.skipped)
+        .cloned()
+        .collect();
+    frames.sort_by_key(|frame| frame.number);
+    frames
+}
+
+/// What a trajectory shows about itself.
+#[derive(Clone, Debug, Serialize)]
+pub struct TrajectorySummary {
+    /// Number of scans.
+    pub scans: usize,
+    /// Scans whose pose was predicted, because they did not fit.
+    pub predicted: usize,
+    /// Scans that do not determine all of their motion.
+    pub degenerate: usize,
+    /// Length of the path [m].
+    pub path_m: f64,
+    /// Mean speed [m/s].
+    pub speed_m_per_s: f64,
+    /// Median and 95 % quantile of the time per scan, without loops and adjustment [s].
+    pub seconds_per_scan: Option<[f64; 2]>,
+    /// Loops that were found and accepted, are not confirmed, and contradict others.
+    pub loops: LoopCounts,
+    /// Root mean square of the distances between points and common planes, before and after the adjustment [m].
+    pub residuals_m: Option<[f64; 2]>,
+    /// Largest change of a position by loops and adjustment [m].
+    pub largest_change_m: f64,
+}
+
+/// Numbers of loops.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct LoopCounts {
+    /// The poses follow them.
+    pub accepted: usize,
+    /// No second loop confirms them.
+    pub unconfirmed: usize,
+    /// They contradict others.
+    pub contradicted: usize,
+}
+
+impl TrajectorySummary {
+    /// Of a trajectory.
+    pub fn of(trajectory: &Trajectory) -> Self {
+        let steps = &trajectory.odometry;
+        let positions = || trajectory.poses.iter().map(|pose| pose.translation.vector);
+        let path_m = (positions().zip(positions().skip(1)))
+            .map(|(a, b)| (b - a).norm())
+            .sum();
+        let duration_s: f64 = steps.iter().skip(1).map(|step| step.duration_s).sum();
+        let mut times_s: Vec<f64> = (steps.iter())
+            .map(|step| step.elapsed.as_secs_f64())
+            .filter(|&time_s| time_s > 0.0)
+            .collect();
+        times_s.sort_by(f64::total_cmp);
+        let quantile = |share: f64| Some(*times_s.get((share * times_s.len() as f64) as usize)?);
+        let counted = |verdict| {
+            let loops = trajectory.loops.iter();
+            loops.filter(|found| found.verdict == verdict).count()
+        };
+        Self {
+            scans: steps.len(),
+            predicted: (steps.iter())
+                .filter(|step| step.state == StepState::Predicted)
+                .count(),
+            degenerate: (steps.iter())
+                .filter(|step| !step.degenerate_directions.is_empty())
+                .count(),
+            path_m,
+            speed_m_per_s: path_m / duration_s.max(f64::MIN_POSITIVE),
+            seconds_per_scan: quantile(0.5).zip(quantile(0.95)).map(|(a, b)| [a, b]),
+            loops: LoopCounts {
+                accepted: counted(LoopVerdict::Accepted),
+                unconfirmed: counted(LoopVerdict::Unconfirmed),
+                contradicted: counted(LoopVerdict::Contradicted),
+            },
+            residuals_m: trajectory.residuals_m,
+            largest_change_m: (positions().zip(steps))
+                .map(|(found, step)| (found - step.odom_from_lidar.translation.vector).norm())
+                .fold(0.0, f64::max),
+        }
+    }
+
+    /// Rows of a table.
+    pub fn rows(&self) -> Vec<(&'static str, String)> {
+        let mut rows = vec![
+            ("scans", self.scans.to_string()),
+            ("path", format!("{:.1} m", self.path_m)),
+            ("speed", format!("{:.1} m/s", self.speed_m_per_s)),
+        ];
+        if let Some([median_s, p95_s]) = self.seconds_per_scan {
+            let [median_ms, p95_ms] = [1e3 * median_s, 1e3 * p95_s];
+            rows.push((
+                "time per scan",
+                format!("{median_ms:.0} ms, 95 % within {p95_ms:.0} ms"),
+            ));
+            rows.push(("predicted scans", self.predicted.to_string()));
+            rows.push(("degenerate scans", self.degenerate.to_string()));
+            let loops = &self.loops;
+            rows.push((
+                "loops",
+                format!(
+                    "{} accepted, {} unconfirmed, {} contradicted",
+                    loops.accepted, loops.unconfirmed, loops.contradicted
+                ),
+            ));
+        }
+        if let Some([before_m, after_m]) = self.residuals_m {
+            let [before_mm, after_mm] = [1e3 * before_m, 1e3 * after_m];
+            rows.push((
+                "distance from common planes",
+                format!("{before_mm:.1} mm, adjusted {after_mm:.1} mm"),
+            ));
+        }
+        rows.push(("largest change", format!("{:.3} m", self.largest_change_m)));
+        rows
+    }
+
+    /// Warns of scans that could not be registered.
+    pub fn warn(&self) {
+        if self.predicted > 0 {
+            tracing::warn!(
+                "{} of {} scans did not fit the scans before them: their poses are predicted",
+                self.predicted,
+                self.scans
+            );
+        }
+    }
+}
+
+/// The file of the poses of a map that was built without given ones.
+pub fn file_beside(mesh_file: &Path) -> PathBuf {
+    mesh_file.with_extension("poses_tum.txt")
+}

@@ -1,0 +1,57 @@
+//! The `.npz` file of a trajectory.
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result};
+
+use super::npz::NpzWriter;
+use crate::files::write_atomically;
+use crate::geometry::Pose3;
+use crate::odometry::{OdometryEstimate, StepState};
+use crate::recording::Frame;
+
+/// Writes one row per frame: `frames`, `times_s`, `map_from_lidar` and `odom_from_lidar` (rows, 4, 4),
+/// `motion_covariances` (rows, 6, 6) of the motion since the scan before: x, y, z, roll, pitch, yaw in the lidar
+/// frame [m, rad], and `states`: 0 first, 1 registered, 2 predicted.
+pub fn write_trajectory_npz(
+    path: &Path,
+    frames: &[Frame],
+    poses: &[Pose3],
+    steps: &[&OdometryEstimate],
+) -> Result<()> {
+    let count = frames.len();
+    let matrices = |poses: &mut dyn Iterator<Item = Pose3>| -> Vec<f64> {
+        // Columns of the transpose are rows of the matrix.
+        poses
+            .flat_map(|pose| pose.to_homogeneous().transpose().data.0.concat())
+            .collect()
+    };
+    let odometry = &mut steps.iter().map(|step| step.odom_from_lidar);
+    let covariances = steps
+        .iter()
+        .flat_map(|step| step.covariance.data.0.concat());
+    let state = |step: &&OdometryEstimate| match step.state {
+        StepState::First => 0_u8,
+        StepState::Registered => 1,
+        StepState::Predicted => 2,
+    };
+    write_atomically(path, |file| {
+        let mut npz = NpzWriter::new(file);
+        npz.add(
+            "frames",
+            &[count],
+            frames.iter().map(|frame| frame.number as u64),
+        )?;
+        npz.add("times_s", &[count], frames.iter().map(|frame| frame.time_s))?;
+        npz.add(
+            "map_from_lidar",
+            &[count, 4, 4],
+            matrices(&mut poses.iter().copied()),
+        )?;
+        npz.add("odom_from_lidar", &[count, 4, 4], matrices(odometry))?;
+        npz.add("motion_covariances", &[count, 6, 6], covariances)?;
+        npz.add("states", &[count], steps.iter().map(state))?;
+        npz.finish()
+    })
+    .with_context(|| format!("cannot write {}", path.display()))
+}

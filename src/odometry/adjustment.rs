@@ -1,0 +1,424 @@
+//! Bundle adjustment over planes: all poses of a drive, so that their scans show the same surfaces.
+//!
+//! Points of all scans are collected in voxels. Where they form a plane, every point has a residual to it, and the
+//! plane (its offset and two tilts, π) is adjusted together with the poses ξ:
+//!
+//! ```text
+//! r = n · (map_from_lidar p − c),    ∂r/∂ξ = (n, p × n) in the lidar frame,    ∂r/∂π = −g,  g = (1, u · x, v · x)
+//! (Σ w J Jᵀ − Σ over planes  C G⁻¹ Cᵀ) ξ = −Σ w J r + Σ over planes  C G⁻¹ Σ w g r,     C = Σ w J gᵀ,  G = Σ w g gᵀ
+//! ```
+//!
+//! The Schur complement leaves the poses, coupled wherever they see the same plane. Normals in succession stay
+//! close to the initial motion, and poses close to given ones, where there are any.
+//!
+//! Liu and Zhang, *BALM: Bundle Adjustment for Lidar Mapping* (RA-L 2021); Zhou et al., *Efficient Planar
+//! Bundle Adjustment* (ISMAR 2020), section 4, for the elimination.
+
+use glam::{DMat3, DQuat, DVec3};
+use nalgebra::{Matrix3, Matrix6, Matrix6x3, Vector3, Vector6};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
+
+use super::block_system::{BlockRow, BlockSystem};
+use super::drive::Drive;
+use super::pose_graph::Edge;
+use super::voxel_map::pack;
+use crate::geometry::pose::exponential;
+use crate::geometry::{PlaneSums, Pose3};
+use crate::validation::{InvalidValue, Validate, in_range, positive};
+
+/// Settings of the adjustment.
+///
+/// Defaults: our own values.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[serde(default, deny_unknown_fields)]
+pub struct AdjustmentConfig {
+    /// Edge of a voxel, in voxels of the odometry.
+    #[default(1.0)]
+    pub voxels: f64,
+    /// Maximum number of iterations.
+    #[default(10)]
+    pub iterations: usize,
+    /// Largest last step [m].
+    #[default(0.005)]
+    pub tolerance_m: f64,
+    /// Standard deviation of the motion between scans in succession: [m].
+    #[default(0.02)]
+    pub motion_m: f64,
+    /// The same of the rotation [deg].
+    #[default(0.2)]
+    pub motion_deg: f64,
+    /// Standard deviation of given poses [m].
+    #[default(0.3)]
+    pub given_m: f64,
+    /// The same of their rotations [deg].
+    #[default(1.0)]
+    pub given_deg: f64,
+}
+
+impl Validate for AdjustmentConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        in_range("voxels", self.voxels, 0.1..=10.0)?;
+        in_range("iterations", self.iterations, 1..=1000)?;
+        positive("tolerance_m", self.tolerance_m)?;
+        positive("motion_m", self.motion_m)?;
+        positive("motion_deg", self.motion_deg)?;
+        positive("given_m", self.given_m)?;
+        positive("given_deg", self.given_deg)
+    }
+}
+
+/// A plane through the points of several scans.
+struct Plane {
+    center: DVec3,
+    normal: DVec3,
+    /// Tangents, divided by the edge of the voxel.
+    tangents: [DVec3; 2],
+    /// G⁻¹
+    inverse: Matrix3<f64>,
+    /// Σ w g r
+    gradient: Vector3<f64>,
+    /// Its scans, and C of each.
+    couplings: Vec<(usize, Matrix6x3<f64>)>,
+}
+
+/// Points of a scan: in the lidar frame, and the plane of each.
+struct Row {
+    pose: Pose3,
+    in_map: Vec<DVec3>,
+    /// Indices of planes; `NONE` without one.
+    planes: Vec<u32>,
+}
+
+const NONE: u32 = u32::MAX;
+
+/// A point in a voxel.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Entry {
+    voxel: u64,
+    row: u32,
+    point: u32,
+}
+
+/// Adjusts the poses of a drive; given poses hold them, otherwise the first stays. Returns the root mean square of the
+/// residuals before and after [m]; `None` where no surfaces are in common.
+pub fn adjust(
+    drive: &mut Drive,
+    given: Option<&[Pose3]>,
+    config: &AdjustmentConfig,
+) -> Option<[f64; 2]> {
+    let along_path = motion_edges(&drive.poses, config);
+    let mut kernel_m = drive.voxel_m;
+    let mut result: Option<[f64; 2]> = None;
+    for _ in 0..config.iterations {
+        let (rows, planes) = associate(drive, config.voxels * drive.voxel_m, kernel_m);
+        let residuals = Residuals::of(&rows, &planes)?;
+        result = Some([
+            result.map_or(residuals.rms_m, |[first, _]| first),
+            residuals.rms_m,
+        ]);
+        let mut system = system(&rows, &planes, kernel_m, residuals.sigma_m);
+        for edge in &along_path {
+            edge.add_to(&mut system, &drive.poses, 1.0);
+        }
+        hold(&mut system, &drive.poses, given, config);
+        kernel_m = residuals.kernel_m.clamp(0.01 * drive.voxel_m, kernel_m);
+        let steps = system.solve()?;
+        let largest_m = (steps.iter())
+            .map(|step| step.fixed_rows::<3>(0).norm() + 10.0 * step.fixed_rows::<3>(3).norm())
+            .fold(0.0, f64::max);
+        for (pose, step) in drive.poses.iter_mut().zip(&steps) {
+            *pose *= exponential(step);
+        }
+        tracing::debug!(
+            largest_m,
+            rms_m = residuals.rms_m,
+            kernel_m,
+            planes = planes.len(),
+            "adjustment"
+        );
+        if largest_m < config.tolerance_m {
+            break;
+        }
+    }
+    result
+}
+
+/// The motion between scans in succession stays about the initial one.
+fn motion_edges(poses: &[Pose3], config: &AdjustmentConfig) -> Vec<Edge> {
+    let information = information(config.motion_m, config.motion_deg);
+    (poses.windows(2).enumerate())
+        .map(|(first, pair)| Edge {
+            first,
+            second: first + 1,
+            first_from_second: pair[0].inverse() * pair[1],
+            information,
+            is_loop: false,
+        })
+        .collect()
+}
+
+fn information(shift_m: f64, turn_deg: f64) -> Matrix6<f64> {
+    let [shift, turn] = [shift_m.powi(-2), turn_deg.to_radians().powi(-2)];
+    Matrix6::from_diagonal(&Vector6::new(shift, shift, shift, turn, turn, turn))
+}
+
+/// Holds the poses near given ones, or the first one where it is.
+fn hold(
+    system: &mut BlockSystem,
+    poses: &[Pose3],
+    given: Option<&[Pose3]>,
+    config: &AdjustmentConfig,
+) {
+    const HOLD: f64 = 1e12;
+    let Some(given) = given else {
+        system.add(0, &(Matrix6::identity() * HOLD), &Vector6::zeros());
+        return;
+    };
+    let information = information(config.given_m, config.given_deg);
+    for (row, (pose, given)) in poses.iter().zip(given).enumerate() {
+        let deviation = crate::geometry::pose::logarithm(&(given.inverse() * pose));
+        system.add(row, &information, &-(information * deviation));
+    }
+}
+
+/// Finds the planes, and the plane of each point.
+fn associate(drive: &Drive, edge_m: f64, kernel_m: f64) -> (Vec<Row>, Vec<Plane>) {
+    let mut rows: Vec<Row> = (0..drive.poses.len())
+        .into_par_iter()
+        .map(|row| {
+            let in_map = drive.points(row);
+            Row {
+                pose: drive.poses[row],
+                planes: vec![NONE; in_map.len()],
+                in_map,
+            }
+        })
+        .collect();
+    let mut entries: Vec<Entry> = (rows.par_iter().enumerate())
+        .flat_map_iter(|(number, row)| {
+            row.in_map
+                .iter()
+                .enumerate()
+                .map(move |(point, position)| Entry {
+                    voxel: pack((*position / edge_m).floor().as_ivec3()),
+                    row: number as u32,
+                    point: point as u32,
+                })
+        })
+        .collect();
+    entries.par_sort_unstable();
+    let voxels: Vec<&[Entry]> = entries.chunk_by(|a, b| a.voxel == b.voxel).collect();
+    let found: Vec<(Plane, &[Entry])> = (voxels.into_par_iter())
+        .filter_map(|voxel| Some((plane(&rows, voxel, edge_m, kernel_m)?, voxel)))
+        .collect();
+    let mut planes = Vec::with_capacity(found.len());
+    for (plane, voxel) in found {
+        for entry in voxel {
+            rows[entry.row as usize].planes[entry.point as usize] = planes.len() as u32;
+        }
+        planes.push(plane);
+    }
+    (rows, planes)
+}
+
+/// The plane through the points of a voxel, if several scans see one.
+fn plane(rows: &[Row], voxel: &[Entry], edge_m: f64, kernel_m: f64) -> Option<Plane> {
+    const MIN_POINTS: usize = 8;
+    /// Largest share of the smallest variance in the second one, and smallest one of the second in the largest.
+    const FLAT: f64 = 0.05;
+    const WIDE: f64 = 0.05;
+    /// Smallest eigenvalue of G, relative to the number of points.
+    const RIDGE: f64 = 1e-6;
+    if voxel.len() < MIN_POINTS || voxel[0].row == voxel[voxel.len() - 1].row {
+        return None;
+    }
+    let position = |entry: &Entry| rows[entry.row as usize].in_map[entry.point as usize];
+    let origin = position(&voxel[0]);
+    let (mut first, mut second) = (DVec3::ZERO, DMat3::ZERO);
+    for entry in voxel {
+        let p = position(entry) - origin;
+        first += p;
+        second += DMat3::from_cols(p * p.x, p * p.y, p * p.z);
+    }
+    let count = voxel.len() as f64;
+    let fit = PlaneSums::from_moments(glam::Vec3::ZERO, count, first, second).fit()?;
+    let [smallest, middle, largest] = fit.variances;
+    if smallest > FLAT * middle || middle < WIDE * largest {
+        return None;
+    }
+    let normal = fit.normal.as_dvec3().normalize();
+    let u = normal.any_orthonormal_vector();
+    let mut plane = Plane {
+        center: origin + first / count,
+        normal,
+        tangents: [u / edge_m, normal.cross(u) / edge_m],
+        inverse: Matrix3::zeros(),
+        gradient: Vector3::zeros(),
+        couplings: vec![],
+    };
+    let mut sums = Matrix3::identity() * (RIDGE * count);
+    for of_row in voxel.chunk_by(|a, b| a.row == b.row) {
+        let row = &rows[of_row[0].row as usize];
+        let lidar = LidarFrame::of(&row.pose);
+        let mut coupling = Matrix6x3::zeros();
+        for entry in of_row {
+            let at = plane.residual(position(entry), kernel_m);
+            sums += at.weight * at.by_plane * at.by_plane.transpose();
+            plane.gradient += at.weight * at.distance_m * at.by_plane;
+            let jacobian = lidar.jacobian(position(entry), plane.normal);
+            coupling += at.weight * jacobian * at.by_plane.transpose();
+        }
+        plane.couplings.push((of_row[0].row as usize, coupling));
+    }
+    plane.inverse = sums.try_inverse()?;
+    Some(plane)
+}
+
+/// The residual of a point.
+struct Residual {
+    distance_m: f64,
+    weight: f64,
+    /// g
+    by_plane: Vector3<f64>,
+}
+
+impl Plane {
+    fn residual(&self, position: DVec3, kernel_m: f64) -> Residual {
+        let offset = position - self.center;
+        let distance_m = self.normal.dot(offset);
+        let ratio = (distance_m / kernel_m).powi(2);
+        Residual {
+            distance_m,
+            weight: (1.0 + ratio).powi(-2),
+            by_plane: Vector3::new(
+                1.0,
+                self.tangents[0].dot(offset),
+                self.tangents[1].dot(offset),
+            ),
+        }
+    }
+}
+
+/// The frame of a scan.
+struct LidarFrame {
+    lidar_from_map: DMat3,
+    origin: DVec3,
+}
+
+impl LidarFrame {
+    fn of(map_from_lidar: &Pose3) -> Self {
+        let rotation = DMat3::from_quat(DQuat::from(map_from_lidar.rotation));
+        Self {
+            lidar_from_map: rotation.transpose(),
+            origin: map_from_lidar.translation.vector.into(),
+        }
+    }
+
+    /// Derivative of the distance of a point along a normal, both in the map frame, by the pose.
+    fn jacobian(&self, position: DVec3, normal: DVec3) -> Vector6<f64> {
+        let normal = self.lidar_from_map * normal;
+        let turn = (self.lidar_from_map * (position - self.origin)).cross(normal);
+        Vector6::new(normal.x, normal.y, normal.z, turn.x, turn.y, turn.z)
+    }
+}
+
+/// Statistics of the residuals.
+struct Residuals {
+    rms_m: f64,
+    sigma_m: f64,
+    kernel_m: f64,
+}
+
+impl Residuals {
+    fn of(rows: &[Row], planes: &[Plane]) -> Option<Self> {
+        /// Kernel in robust standard deviations.
+        const KERNEL_SIGMAS: f64 = 3.0;
+        let mut distances_m: Vec<f32> = (rows.par_iter())
+            .flat_map_iter(|row| {
+                (row.in_map.iter().zip(&row.planes)).filter_map(|(position, &plane)| {
+                    let plane = planes.get(plane as usize)?;
+                    Some(plane.normal.dot(*position - plane.center).abs() as f32)
+                })
+            })
+            .collect();
+        let middle = distances_m.len() / 2;
+        if distances_m.is_empty() {
+            return None;
+        }
+        let squares = distances_m
+            .iter()
+            .map(|&distance_m| f64::from(distance_m).powi(2));
+        let rms_m = (squares.sum::<f64>() / distances_m.len() as f64).sqrt();
+        let median = *distances_m.select_nth_unstable_by(middle, f32::total_cmp).1;
+        let sigma_m = (1.48 * f64::from(median)).max(1e-4);
+        Some(Self {
+            rms_m,
+            sigma_m,
+            kernel_m: KERNEL_SIGMAS * sigma_m,
+        })
+    }
+}
+
+/// The equations of all poses.
+fn system(rows: &[Row], planes: &[Plane], kernel_m: f64, sigma_m: f64) -> BlockSystem {
+    /// Points in succession are not independent: this number counts as one.
+    const CORRELATED: f64 = 10.0;
+    let scale = 1.0 / (CORRELATED * sigma_m * sigma_m);
+    let sums: Vec<BlockRow> = (rows.par_iter().enumerate())
+        .map(|(number, row)| block_row(number, row, planes, kernel_m, scale))
+        .collect();
+    let mut system = BlockSystem::new(rows.len());
+    system.add_rows(sums);
+    system
+}
+
+fn block_row(number: usize, row: &Row, planes: &[Plane], kernel_m: f64, scale: f64) -> BlockRow {
+    let lidar = LidarFrame::of(&row.pose);
+    let mut sums = BlockRow::default();
+    for (&position, &plane) in row.in_map.iter().zip(&row.planes) {
+        let Some(plane) = planes.get(plane as usize) else {
+            continue;
+        };
+        let at = plane.residual(position, kernel_m);
+        let jacobian = lidar.jacobian(position, plane.normal);
+        sums.diagonal += at.weight * jacobian * jacobian.transpose();
+        sums.right_side -= at.weight * at.distance_m * jacobian;
+    }
+    let mut seen: Vec<u32> = (row.planes.iter().copied())
+        .filter(|&plane| plane != NONE)
+        .collect();
+    seen.sort_unstable();
+    seen.dedup();
+    let mut beside: Vec<Option<Matrix6<f64>>> = vec![];
+    for plane in seen {
+        let plane = &planes[plane as usize];
+        let Ok(own) = plane
+            .couplings
+            .binary_search_by_key(&number, |entry| entry.0)
+        else {
+            continue;
+        };
+        let eliminated = plane.couplings[own].1 * plane.inverse;
+        sums.right_side += eliminated * plane.gradient;
+        sums.diagonal -= eliminated * plane.couplings[own].1.transpose();
+        // The other half of the matrix is its mirror image.
+        for (other, coupling) in &plane.couplings[own + 1..] {
+            let index = *other - number;
+            if beside.len() <= index {
+                beside.resize(index + 1, None);
+            }
+            let block = beside[index].get_or_insert_with(Matrix6::zeros);
+            block.gemm(-1.0, &eliminated, &coupling.transpose(), 1.0);
+        }
+    }
+    let blocks = beside.into_iter().enumerate();
+    BlockRow {
+        diagonal: sums.diagonal * scale,
+        right_side: sums.right_side * scale,
+        beside: blocks
+            .filter_map(|(index, block)| Some((number + index, block? * scale)))
+            .collect(),
+    }
+}

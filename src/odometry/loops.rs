@@ -1,0 +1,289 @@
+//! Loops: places where a drive comes back to, and the transforms between its visits.
+//!
+//! Candidates are the local maps that are nearest by the poses known so far, within their uncertainty, and those that
+//! look most similar ([`Place`]). A candidate is registered to the surfaces around the earlier visit and has to
+//! share them: not the ground, which looks the same everywhere. It counts if a second loop of other local
+//! maps confirms it: the drive from one visit to the other closes by both.
+
+use nalgebra::{Matrix6, UnitQuaternion, Vector3, Vector6};
+use rayon::prelude::*;
+
+use super::alignment::Problem;
+use super::drive::{Drive, LocalMap};
+use super::places::Place;
+use super::pose_graph::Edge;
+use super::residuals::Observation;
+use super::sampling::TimedPoint;
+use super::search::search;
+use super::voxel_map::{Shape, VoxelMap};
+use crate::geometry::Pose3;
+use crate::geometry::pose::logarithm;
+use crate::lidar::Sweep;
+
+/// A place that was visited twice.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Loop {
+    /// Row of the scan of the earlier visit.
+    pub first: usize,
+    /// Row of the scan of the later visit.
+    pub second: usize,
+    /// `p_first = first_from_second * p_second`.
+    pub first_from_second: Pose3,
+    /// Share of the surfaces in common, without the ground (unitless).
+    pub common_share: f64,
+    /// What became of it.
+    pub verdict: LoopVerdict,
+}
+
+/// What became of a loop.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LoopVerdict {
+    /// The poses follow it.
+    Accepted,
+    /// No second loop of other scans confirms it.
+    Unconfirmed,
+    /// It contradicts other loops and the odometry.
+    Contradicted,
+}
+
+/// A loop between local maps.
+#[derive(Clone, Debug)]
+pub struct FoundLoop {
+    /// Indices of the local maps, the earlier first.
+    pub maps: [usize; 2],
+    /// `p_first = first_from_second * p_second` between their centers.
+    pub first_from_second: Pose3,
+    /// Covariance of the registration (x, y, z, roll, pitch, yaw) in the second frame [m, rad].
+    pub covariance: Matrix6<f64>,
+    /// Share of the surfaces in common, without the ground (unitless).
+    pub common_share: f64,
+}
+
+/// Uncertainty of the motion along a path.
+#[derive(Clone, Copy, Debug)]
+pub struct Drift {
+    /// Position, as a share of the path (unitless).
+    pub share: f64,
+    /// Position, at least [m].
+    pub least_m: f64,
+}
+
+impl Drift {
+    /// Of a path.
+    pub fn after_m(&self, path_m: f64) -> f64 {
+        self.least_m + self.share * path_m
+    }
+}
+
+/// Finds loops between local maps.
+pub fn find(drive: &Drive, maps: &[LocalMap], drift: Drift) -> Vec<FoundLoop> {
+    /// Radius of the described surroundings, in ranges of the sensor.
+    const PLACE_RADIUS: f64 = 0.6;
+    let spacing_m = 2.0 * drive.voxel_m;
+    let points: Vec<Vec<TimedPoint>> = (maps.par_iter())
+        .map(|map| drive.local_points(map, spacing_m))
+        .collect();
+    let places: Vec<Place> = (points.par_iter())
+        .map(|points| Place::of(points, PLACE_RADIUS * drive.range_m))
+        .collect();
+    let search = LoopSearch {
+        drive,
+        maps,
+        points: &points,
+        places: &places,
+        drift,
+    };
+    (0..maps.len())
+        .into_par_iter()
+        .filter_map(|second| search.loop_to(second))
+        .collect()
+}
+
+struct LoopSearch<'a> {
+    drive: &'a Drive,
+    maps: &'a [LocalMap],
+    points: &'a [Vec<TimedPoint>],
+    places: &'a [Place],
+    drift: Drift,
+}
+
+impl LoopSearch<'_> {
+    /// The best loop from a local map to an earlier one.
+    fn loop_to(&self, second: usize) -> Option<FoundLoop> {
+        /// Least share of common surfaces.
+        const MIN_COMMON: f64 = 0.4;
+        (self.candidates(second).into_iter())
+            .filter_map(|(first, guess)| self.register(first, second, &guess))
+            .find(|found| found.common_share > MIN_COMMON)
+    }
+
+    /// Earlier local maps and the pose of the later one in them: the nearest, then those that look most similar.
+    fn candidates(&self, second: usize) -> Vec<(usize, Pose3)> {
+        /// Least path between the visits, in ranges: the local map of the odometry reaches so far.
+        const MIN_PATH: f64 = 1.5;
+        /// Distance of visits that share enough, in ranges.
+        const NEAR: f64 = 0.3;
+        const SIMILAR: usize = 2;
+        const MIN_SIMILARITY: f64 = 0.5;
+        let (drive, maps) = (self.drive, self.maps);
+        let poses = |map: usize| &drive.poses[maps[map].center];
+        let path_m = |first: usize| maps[second].travelled_m - maps[first].travelled_m;
+        let earlier = (0..second).filter(|&first| path_m(first) > MIN_PATH * drive.range_m);
+        let by_poses = |first: usize| poses(first).inverse() * poses(second);
+        let reachable: Vec<(usize, f64)> = earlier
+            .map(|first| (first, by_poses(first).translation.vector.norm()))
+            .filter(|&(first, distance_m)| {
+                distance_m < NEAR * drive.range_m + self.drift.after_m(path_m(first))
+            })
+            .collect();
+        let nearest = (reachable.iter().min_by(|a, b| a.1.total_cmp(&b.1)))
+            .map(|&(first, _)| (first, by_poses(first)));
+        let mut similar: Vec<(f64, usize, f64)> = (reachable.iter())
+            .map(|&(first, _)| {
+                let (similarity, heading) = self.places[first].similarity(&self.places[second]);
+                (similarity, first, heading)
+            })
+            .filter(|candidate| candidate.0 > MIN_SIMILARITY)
+            .collect();
+        similar.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let turned = |heading: f64| {
+            let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), heading);
+            Pose3::from_parts(nalgebra::Translation3::identity(), turn)
+        };
+        let similar =
+            (similar.into_iter().take(SIMILAR)).map(|(_, first, heading)| (first, turned(heading)));
+        nearest.into_iter().chain(similar).collect()
+    }
+
+    /// Registers the later local map to the surfaces around the earlier one.
+    fn register(&self, first: usize, second: usize, guess: &Pose3) -> Option<FoundLoop> {
+        /// Local maps on each side of the earlier one.
+        const AROUND: usize = 2;
+        /// Reach of the search, in ranges, and its step in voxels.
+        const REACH: f64 = 0.2;
+        const STEP: f64 = 4.0;
+        const TURN_RAD: f64 = 0.3;
+        let (drive, maps) = (self.drive, self.maps);
+        let around = first.saturating_sub(AROUND)..=(first + AROUND).min(second - 1);
+        let surfaces = drive.surfaces(maps[first].center, maps[around].iter());
+        let min_kernel_m = 0.1 * drive.voxel_m;
+        let reach_m = REACH * drive.range_m;
+        let (shift, turn) = (reach_m * reach_m, TURN_RAD * TURN_RAD);
+        let problem = Problem {
+            observation: Observation {
+                map: &surfaces,
+                points: &self.points[second],
+                sweep: Sweep::spanning(std::iter::empty()),
+                odom_from_previous: *guess,
+                duration_s: 1.0,
+                noise_m: min_kernel_m,
+            },
+            predicted: *guess,
+            prior: Vector6::new(shift, shift, shift, turn, turn, turn),
+            min_kernel_m,
+            iterations: 30,
+        };
+        let found = search(&problem, STEP * drive.voxel_m, reach_m)?;
+        if !found.degenerate_directions.is_empty() {
+            return None;
+        }
+        let first_from_second = found.odom_from_lidar;
+        Some(FoundLoop {
+            maps: [first, second],
+            first_from_second,
+            covariance: found.covariance,
+            common_share: common_share(&surfaces, &self.points[second], &first_from_second, drive),
+        })
+    }
+}
+
+/// Share of the points near the sensor that lie on the surfaces of another visit, without those on the ground.
+fn common_share(
+    surfaces: &VoxelMap,
+    points: &[TimedPoint],
+    first_from_second: &Pose3,
+    drive: &Drive,
+) -> f64 {
+    /// Radius in which points are compared, in ranges.
+    const RADIUS: f64 = 0.4;
+    /// Largest distance from a surface, in voxels.
+    const ON_SURFACE: f64 = 0.25;
+    /// Vertical component of the normal of the ground, at least.
+    const LEVEL: f64 = 0.8;
+    let radius_m = (RADIUS * drive.range_m) as f32;
+    let (mut common, mut compared) = (0_usize, 0_usize);
+    for point in points
+        .iter()
+        .filter(|point| point.position.length() < radius_m)
+    {
+        let position = nalgebra::Point3::from(point.position.as_dvec3());
+        let position = glam::DVec3::from((first_from_second * position).coords);
+        let surface = surfaces.surface(position);
+        let distance_m = surface.map(|surface| match surface.shape {
+            Shape::Plane(normal) => (
+                normal.dot(position - surface.center).abs(),
+                normal.z.abs() > LEVEL,
+            ),
+            Shape::Other(covariance) => {
+                let offset = position - surface.center;
+                let variance = covariance.x_axis.x + covariance.y_axis.y + covariance.z_axis.z;
+                let beyond = offset.length_squared() > 3.0 * variance;
+                (if beyond { f64::INFINITY } else { 0.0 }, false)
+            }
+        });
+        let (distance_m, is_level) = distance_m.unwrap_or((f64::INFINITY, false));
+        let is_common = distance_m < ON_SURFACE * drive.voxel_m;
+        if !is_level {
+            compared += 1;
+            common += usize::from(is_common);
+        }
+    }
+    common as f64 / compared.max(1) as f64
+}
+
+/// Which loops another one confirms: its local maps are not the same nor next to them, and the ways from one loop to the other over the
+/// first visit and over the second end at the same place.
+pub fn confirmed(drive: &Drive, maps: &[LocalMap], loops: &[FoundLoop], drift: Drift) -> Vec<bool> {
+    /// Longest path from one loop to the other, in ranges.
+    const NEAR: f64 = 3.0;
+    /// Angle per distance of the drift [rad/m], of points at the range.
+    const LEVER: f64 = 0.5;
+    let pose = |map: usize| &drive.poses[maps[map].center];
+    let path_m = |a: usize, b: usize| (maps[a].travelled_m - maps[b].travelled_m).abs();
+    let confirms = |one: &FoundLoop, other: &FoundLoop| {
+        let ([a, b], [c, d]) = (one.maps, other.maps);
+        let ways_m = path_m(a, c) + path_m(b, d);
+        let is_independent = b.abs_diff(d) >= 2 || a.abs_diff(c) >= 2 && b != d;
+        if !is_independent || ways_m > 2.0 * NEAR * drive.range_m {
+            return false;
+        }
+        let over_first = pose(a).inverse() * pose(c) * other.first_from_second;
+        let over_second = one.first_from_second * (pose(b).inverse() * pose(d));
+        let difference = logarithm(&(over_first.inverse() * over_second));
+        let shift_m = difference.fixed_rows::<3>(0).norm();
+        let turn_m = LEVER * drive.range_m * difference.fixed_rows::<3>(3).norm();
+        shift_m.max(turn_m) < drift.after_m(ways_m) + drive.voxel_m
+    };
+    (loops.iter())
+        .map(|one| loops.iter().any(|other| confirms(one, other)))
+        .collect()
+}
+
+impl FoundLoop {
+    /// The edge of the pose graph.
+    pub fn edge(&self, voxel_m: f64) -> Option<Edge> {
+        /// Standard deviations that local maps have within themselves: voxels, and [rad].
+        const FLOOR: f64 = 0.05;
+        const FLOOR_RAD: f64 = 0.002;
+        let [shift, turn] = [(FLOOR * voxel_m).powi(2), FLOOR_RAD.powi(2)];
+        let floor = Vector6::new(shift, shift, shift, turn, turn, turn);
+        let covariance = self.covariance + Matrix6::from_diagonal(&floor);
+        Some(Edge {
+            first: self.maps[0],
+            second: self.maps[1],
+            first_from_second: self.first_from_second,
+            information: covariance.try_inverse()?,
+            is_loop: true,
+        })
+    }
+}
