@@ -4,6 +4,7 @@
 //!
 //! | type | from | to |
 //! |---|---|---|
+//! | [`odometry::TrajectoryBuilder`] | scans of a drive | their poses: odometry, loops, adjustment |
 //! | [`map::MapBuilder`] | scans with their poses | a [`map::Map`] |
 //! | [`map::Map`] | a PLY file | mesh, ground, tiles and renderer; [`save`](map::Map::save) writes it |
 //! | [`localization::Localizer`] | a map, then scan by scan | an [`Estimate`](localization::Estimate): pose, covariance, state |

@@ -118,9 +118,13 @@ impl Localizer {
         let duration_s = self.sweep.duration_s(scan);
         let mut rng = stream(self.seed, FIRST_FRAME_STREAM + self.frames);
         self.frames += 1;
-        let motion = self.motion_during(scan, odometry, duration_s, &mut rng)?;
+        let before = self.filter.as_ref().and_then(ParticleFilter::attitude);
+        let known = match odometry {
+            Odometry::Motion(motion) => before.map(|_| self.attitude.after(&motion)),
+            _ => before,
+        };
+        let motion = self.motion_during(scan, odometry, known, duration_s, &mut rng)?;
         let image = self.sensor.range_image(scan, motion.as_ref());
-        let known = self.filter.as_ref().and_then(ParticleFilter::attitude);
         if let Some(attitude) = known.or_else(|| self.sensor.attitude(&image)) {
             self.attitude = attitude;
         }
@@ -131,6 +135,9 @@ impl Localizer {
         let filter = self.filter.insert(filter);
         filter.set_duration_s(duration_s);
         let mut estimate = filter.step(odometry, &image, &self.attitude, &mut rng)?;
+        if let Some(found) = filter.attitude().filter(|found| Some(*found) != before) {
+            self.attitude = found;
+        }
         let pose = Some(estimate.map_from_lidar).filter(|_| estimate.state == State::Tracking);
         let found = pose.and_then(|pose| self.sweep.around(&pose, duration_s));
         self.sweep.update(pose, scan, duration_s);
@@ -144,6 +151,7 @@ impl Localizer {
         &self,
         scan: &Scan,
         odometry: Odometry,
+        attitude: Option<SensorAttitude>,
         duration_s: f64,
         rng: &mut Generator,
     ) -> Result<Option<Motion>, LocalizerError> {
@@ -153,7 +161,7 @@ impl Localizer {
         let Some(filter) = self.filter.as_ref().filter(|_| !scan.times_s.is_empty()) else {
             return Ok(predicted);
         };
-        let Some(attitude) = filter.attitude() else {
+        let Some(attitude) = attitude else {
             return Ok(predicted);
         };
         let some = scan.every(STEP);

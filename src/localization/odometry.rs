@@ -16,6 +16,8 @@ use crate::geometry::{FARTHEST_M, Pose2, Pose3, pose2_from_pose3};
 pub enum Odometry {
     /// Measured: `previous_from_current`.
     Increment(Pose2),
+    /// Measured in space, such as by the odometry of the scans; roll and pitch follow it too.
+    Motion(Pose3),
     /// Commanded: velocities held since the previous frame.
     Velocity(VelocityCommand),
     /// Unknown: the motion into the previous frame is assumed to continue (constant velocity).
@@ -23,12 +25,20 @@ pub enum Odometry {
 }
 
 impl Odometry {
+    /// The motion in the plane; `None` if it is unknown.
+    pub(super) fn in_plane(&self) -> Option<Pose2> {
+        match self {
+            Self::Increment(increment) => Some(*increment),
+            Self::Motion(motion) => Some(pose2_from_pose3(motion)),
+            Self::Velocity(command) => Some(command.compose()),
+            Self::Unknown => None,
+        }
+    }
+
     /// Whether the motion is finite and stays on Earth.
     pub(super) fn is_possible(&self) -> bool {
-        let increment = match self {
-            Self::Increment(increment) => *increment,
-            Self::Velocity(command) => command.compose(),
-            Self::Unknown => return true,
+        let Some(increment) = self.in_plane() else {
+            return true;
         };
         let length_m = increment.translation.vector.norm();
         length_m <= FARTHEST_M && increment.rotation.angle().is_finite()

@@ -35,11 +35,7 @@ impl SweepMotion {
 
     /// Motion around the next frame before its pose is known; `None` if it is unknown.
     pub fn predict(&self, odometry: Odometry, duration_s: f64) -> Option<Motion> {
-        let measured = match odometry {
-            Odometry::Increment(increment) => Some(increment),
-            Odometry::Velocity(command) => Some(command.compose()),
-            Odometry::Unknown => None,
-        };
+        let measured = odometry.in_plane();
         let of_odometry = |increment| Motion {
             previous_from_current: pose3_from_pose2(&increment, 0.0),
             duration_s,

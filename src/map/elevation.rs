@@ -48,6 +48,14 @@ impl SensorAttitude {
         )
     }
 
+    /// The attitude after a motion in space, on a road that stays even.
+    pub fn after(&self, previous_from_current: &Pose3) -> Self {
+        let road_from_lidar = self.road_from_lidar() * previous_from_current;
+        let up = road_from_lidar.rotation.inverse() * Vector3::z();
+        let up = up.cast::<f32>();
+        Self::from_plane(Vec3::new(up.x, up.y, up.z), road_from_lidar.translation.z)
+    }
+
     /// Computes the attitude from the plane of the road in the lidar frame: its unit normal (up) and
     /// the distance of the sensor from it [m].
     pub fn from_plane(up_in_lidar: Vec3, height_m: f64) -> Self {

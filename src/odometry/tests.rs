@@ -11,7 +11,7 @@ use crate::lidar::{Rotation, RotationDirection, Scan};
 
 /// Surfaces: planes n · p = d within a box, and upright cylinders (x, y, radius) up to a height.
 #[derive(Default)]
-struct World {
+pub(super) struct World {
     planes: Vec<(Vector3<f64>, f64, [f64; 6])>,
     poles: Vec<[f64; 4]>,
 }
@@ -20,7 +20,7 @@ const UNBOUNDED: [f64; 6] = [-1e3, 1e3, -1e3, 1e3, -1e3, 1e3];
 
 impl World {
     /// A crossing: ground, house fronts with gaps, cross walls, poles.
-    fn crossing() -> Self {
+    pub(super) fn crossing() -> Self {
         let mut world = Self::default();
         world.planes.push((Vector3::z(), -1.7, UNBOUNDED));
         for (y, gaps) in [
@@ -47,6 +47,28 @@ impl World {
             (-13.0, -5.0),
         ] {
             world.poles.push([x, y, 0.15, 4.0]);
+        }
+        world
+    }
+
+    /// House fronts and poles along a round of radius 24 m about (0, 24), all different.
+    pub(super) fn around_a_block() -> Self {
+        let mut world = Self::default();
+        world.planes.push((Vector3::z(), -1.7, UNBOUNDED));
+        for number in 0..40 {
+            let varied = |factor: f64| (factor * f64::from(number)).sin();
+            let angle = 0.157 * f64::from(number) + 0.05 * varied(7.3);
+            let radius = if number % 2 == 0 { 34.0 } else { 13.0 } + 2.0 * varied(3.1);
+            let (x, y) = (radius * angle.cos(), 24.0 + radius * angle.sin());
+            let turned = angle + 0.4 * varied(5.7);
+            let normal = Vector3::new(turned.cos(), turned.sin(), 0.0);
+            let half = 2.5 + varied(9.1);
+            let height = 2.0 + 3.0 * varied(2.3);
+            let bounds = [x - half, x + half, y - half, y + half, -2.0, height];
+            (world.planes).push((normal, normal.dot(&Vector3::new(x, y, 0.0)), bounds));
+            let radius = 24.0 + 5.0 * varied(4.9).signum();
+            let angle = angle + 0.08;
+            (world.poles).push([radius * angle.cos(), 24.0 + radius * angle.sin(), 0.2, 3.0]);
         }
         world
     }
@@ -87,7 +109,7 @@ impl World {
     }
 
     /// A scan of 32 beams, by a sensor whose pose depends on the time after the moment of the scan.
-    fn scan(&self, pose_at: impl Fn(f64) -> Pose3, rotation: Option<Rotation>) -> Scan {
+    pub(super) fn scan(&self, pose_at: impl Fn(f64) -> Pose3, rotation: Option<Rotation>) -> Scan {
         const STEPS: u16 = 2000;
         const NOISE_M: f64 = 0.01;
         let mut scan = Scan::default();

@@ -299,3 +299,7 @@ fn move_along(poses: &mut [Pose3], maps: &[LocalMap], before: &[Pose3], after: &
         *pose = moved * interpolate_motion(&further, share);
     }
 }
+
+#[cfg(test)]
+#[path = "trajectory_tests.rs"]
+mod tests;

@@ -94,13 +94,31 @@ impl MotionSource {
     }
 
     /// The motion into a frame by its row and scan; every scan has to be given, in order.
-    pub fn motion_to(&mut self, row: usize, frame: &Frame, scan: &Scan) -> Result<Option<Pose2>> {
+    pub fn motion_to(
+        &mut self,
+        row: usize,
+        frame: &Frame,
+        scan: &Scan,
+    ) -> Result<Option<FrameMotion>> {
+        let planar = |increment: &Pose2| FrameMotion {
+            increment: *increment,
+            in_space: None,
+        };
         Ok(match self {
-            Self::Given(increments) => increments.get(row).copied(),
+            Self::Given(increments) => increments.get(row).map(planar),
             Self::Scans(odometry) => Some(odometry.motion_to(frame, scan)?),
             Self::Unknown => None,
         })
     }
+}
+
+/// The motion `previous_from_current` into a frame.
+#[derive(Clone, Copy, Debug)]
+pub struct FrameMotion {
+    /// In the plane.
+    pub increment: Pose2,
+    /// In space; `None` if it was measured in the plane.
+    pub in_space: Option<Pose3>,
 }
 
 /// Odometry of the scans.
@@ -111,7 +129,7 @@ pub struct ScanOdometry {
 }
 
 impl ScanOdometry {
-    fn motion_to(&mut self, frame: &Frame, scan: &Scan) -> Result<Pose2> {
+    fn motion_to(&mut self, frame: &Frame, scan: &Scan) -> Result<FrameMotion> {
         let mut motion = Pose3::identity();
         while (self.skipped.front()).is_some_and(|between| between.number < frame.number) {
             if let Some(between) = self.skipped.pop_front() {
@@ -119,7 +137,10 @@ impl ScanOdometry {
             }
         }
         motion *= self.odometer.step(scan)?.previous_from_current;
-        Ok(pose2_from_pose3(&motion))
+        Ok(FrameMotion {
+            increment: pose2_from_pose3(&motion),
+            in_space: Some(motion),
+        })
     }
 }
 

@@ -14,7 +14,6 @@ use crate::app::plotting::PathPlot;
 use crate::app::plotting::color::{ODOMETRY, REFINED};
 use crate::app::results::write_trajectory_npz;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
-use crate::lidar::LidarModel;
 use crate::odometry::{Loop, OdometryEstimate, StepState, Trajectory};
 use crate::recording::poses::write_kitti;
 use crate::recording::{Frame, Recording};
@@ -67,7 +66,7 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<String> 
     if config.visualize {
         draw(&folder.join("path.png"), &found, is_given)?;
     }
-    let summary = TrajectorySummary::of(&found);
+    let summary = TrajectorySummary::of(&found, recording.has_times);
     let report = OdometryReport {
         found_loops: found
             .loops
@@ -129,10 +128,8 @@ fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Option<SensorD
         recording = recording.with_poses(track)?;
         recording.skipped.clear();
     }
-    let mut range_image = RangeImageConfig::of(&LidarModel::default());
-    range_image.height = None;
     let keys = SensorKeys {
-        range_image: &mut range_image,
+        range_image: &mut RangeImageConfig::default(),
         own_car_m: &mut None,
         motion_compensation: &mut config.motion_compensation,
     };

@@ -225,9 +225,13 @@ fn increments(
         &mut stream(config.seed, ODOMETRY_STREAM),
     )?;
     let frames = sequence.frames.iter().enumerate();
-    let into_frame = |(row, frame): (usize, &Frame)| match &mut motion {
-        MotionSource::Scans(_) => motion.motion_to(row, frame, &frame.read()?),
-        _ => motion.motion_to(row, frame, &Scan::default()),
+    let into_frame = |(row, frame): (usize, &Frame)| {
+        let scan = match &motion {
+            MotionSource::Scans(_) => frame.read()?,
+            _ => Scan::default(),
+        };
+        let found = motion.motion_to(row, frame, &scan)?;
+        Ok(found.map(|motion| motion.increment))
     };
     frames.map(into_frame).collect()
 }

@@ -74,8 +74,8 @@ pub struct TrajectorySummary {
     pub degenerate: usize,
     /// Length of the path [m].
     pub path_m: f64,
-    /// Mean speed [m/s].
-    pub speed_m_per_s: f64,
+    /// Mean speed [m/s]; `None` where the times are assumed.
+    pub speed_m_per_s: Option<f64>,
     /// Median and 95 % quantile of the time per scan, without loops and adjustment [s].
     pub seconds_per_scan: Option<[f64; 2]>,
     /// Loops that were found and accepted, are not confirmed, and contradict others.
@@ -99,10 +99,10 @@ pub struct LoopCounts {
 
 impl TrajectorySummary {
     /// Of a trajectory.
-    pub fn of(trajectory: &Trajectory) -> Self {
+    pub fn of(trajectory: &Trajectory, has_times: bool) -> Self {
         let steps = &trajectory.odometry;
         let positions = || trajectory.poses.iter().map(|pose| pose.translation.vector);
-        let path_m = (positions().zip(positions().skip(1)))
+        let path_m: f64 = (positions().zip(positions().skip(1)))
             .map(|(a, b)| (b - a).norm())
             .sum();
         let duration_s: f64 = steps.iter().skip(1).map(|step| step.duration_s).sum();
@@ -125,7 +125,7 @@ impl TrajectorySummary {
                 .filter(|step| !step.degenerate_directions.is_empty())
                 .count(),
             path_m,
-            speed_m_per_s: path_m / duration_s.max(f64::MIN_POSITIVE),
+            speed_m_per_s: (has_times && duration_s > 0.0).then(|| path_m / duration_s),
             seconds_per_scan: quantile(0.5).zip(quantile(0.95)).map(|(a, b)| [a, b]),
             loops: LoopCounts {
                 accepted: counted(LoopVerdict::Accepted),
@@ -144,8 +144,10 @@ impl TrajectorySummary {
         let mut rows = vec![
             ("scans", self.scans.to_string()),
             ("path", format!("{:.1} m", self.path_m)),
-            ("speed", format!("{:.1} m/s", self.speed_m_per_s)),
         ];
+        if let Some(speed) = self.speed_m_per_s {
+            rows.push(("speed", format!("{speed:.1} m/s")));
+        }
         if let Some([median_s, p95_s]) = self.seconds_per_scan {
             let [median_ms, p95_ms] = [1e3 * median_s, 1e3 * p95_s];
             rows.push((

@@ -59,16 +59,12 @@ impl ParticleFilter {
 
     /// Motion into a frame.
     pub(super) fn increment(&self, odometry: Odometry) -> Pose2 {
-        match odometry {
-            Odometry::Increment(previous_from_current) => previous_from_current,
-            Odometry::Velocity(command) => command.compose(),
-            Odometry::Unknown => {
-                let last = self.last_increment.unwrap_or_else(Pose2::identity);
-                let share = self.duration_s / self.last_duration_s;
-                let translation = last.translation.vector * share;
-                Pose2::new(translation, last.rotation.angle() * share)
-            }
-        }
+        odometry.in_plane().unwrap_or_else(|| {
+            let last = self.last_increment.unwrap_or_else(Pose2::identity);
+            let share = self.duration_s / self.last_duration_s;
+            let translation = last.translation.vector * share;
+            Pose2::new(translation, last.rotation.angle() * share)
+        })
     }
 
     /// Without odometry every scan is used: nothing else shows whether the car moves.

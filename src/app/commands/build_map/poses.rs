@@ -52,7 +52,7 @@ pub fn find(
     } else {
         let settings = TrajectoryConfig::default();
         let found = trajectory::estimate(&frames, is_given, &settings, context)?;
-        let found_now = TrajectorySummary::of(&found);
+        let found_now = TrajectorySummary::of(&found, recording.has_times);
         found_now.warn();
         summary = Some(found_now);
         // Rows of the lidar in the world of the given poses.

@@ -14,7 +14,7 @@ use self::pictures::draw_example;
 use self::recorder::Run;
 use super::claims::{Claims, NPZ, Outputs};
 use super::interrupt::Interrupted;
-use super::motion_source::MotionSource;
+use super::motion_source::{FrameMotion, MotionSource};
 use super::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES, RunFiles};
 use super::{Context, input, motion_source, output, run_page};
 use crate::app::config::{Initialization, LocalizationConfig, MotionModel};
@@ -131,8 +131,9 @@ fn localize<'a>(
         let mut process = || {
             let scan = frame.read()?;
             let started = Instant::now();
-            let increment = motion.motion_to(row, frame, &scan)?;
-            let odometry = odometry_into(config.motion_model, increment, sequence, row);
+            let known = motion.motion_to(row, frame, &scan)?;
+            let increment = known.map(|motion| motion.increment);
+            let odometry = odometry_into(config.motion_model, known, sequence, row);
             let estimate = localizer.step(&scan, odometry)?;
             let runtime = started.elapsed();
             let refined = match &mut refiner {
@@ -172,14 +173,22 @@ fn start(config: &LocalizationConfig, recording: &Recording) -> Start {
 /// The odometry into a frame, in the form that the motion model needs.
 fn odometry_into(
     model: MotionModel,
-    increment: Option<Pose2>,
+    motion: Option<FrameMotion>,
     sequence: &Recording,
     row: usize,
 ) -> Odometry {
-    match (increment, model) {
-        (None, _) => Odometry::Unknown,
-        (Some(increment), MotionModel::TurnDriveTurn) => Odometry::Increment(increment),
-        (Some(increment), MotionModel::Velocity) => {
+    let Some(FrameMotion {
+        increment,
+        in_space,
+    }) = motion
+    else {
+        return Odometry::Unknown;
+    };
+    match model {
+        MotionModel::TurnDriveTurn => {
+            in_space.map_or(Odometry::Increment(increment), Odometry::Motion)
+        }
+        MotionModel::Velocity => {
             let times_s = [row.saturating_sub(1), row].map(|row| sequence.frames[row].time_s);
             let duration = Duration::from_secs_f64((times_s[1] - times_s[0]).max(0.0));
             Odometry::Velocity(VelocityCommand::driving(&increment, duration))

@@ -1,0 +1,126 @@
+//! Laws of trajectories of whole drives, on scans of a drawn world.
+
+use nalgebra::Vector3;
+use rand::{SeedableRng as _, rngs::StdRng};
+use rand_distr::{Distribution as _, StandardNormal};
+
+use super::super::tests::{World, drive};
+use super::*;
+
+/// A scan of the world every 0.25 s from a time on.
+fn scans(world: &World, first_s: f64, count: usize) -> (Vec<Scan>, Vec<Pose3>) {
+    let times_s = (0..count).map(|number| first_s + 0.25 * number as f64);
+    times_s
+        .map(|time_s| {
+            let mut scan = world.scan(|_| drive(time_s), None);
+            scan.time_s = Some(time_s);
+            (scan, drive(time_s))
+        })
+        .unzip()
+}
+
+fn noise(rng: &mut StdRng, shift_m: f64, turn_deg: f64) -> Pose3 {
+    let mut vector = |sigma: f64| {
+        Vector3::from_fn(|_, _| {
+            let deviate: f64 = StandardNormal.sample(rng);
+            sigma * deviate
+        })
+    };
+    Pose3::new(vector(shift_m), vector(turn_deg.to_radians()))
+}
+
+fn distance_m(a: &Pose3, b: &Pose3) -> f64 {
+    (a.translation.vector - b.translation.vector).norm()
+}
+
+#[test]
+fn given_poses_that_are_disturbed_by_5_cm_come_back_to_1_cm_in_their_frame() {
+    let (scans, truth) = scans(&World::crossing(), 0.0, 24);
+    let mut rng = StdRng::seed_from_u64(3);
+    let given: Vec<Pose3> = (truth.iter())
+        .map(|pose| pose * noise(&mut rng, 0.05, 0.1))
+        .collect();
+    let mut builder = TrajectoryBuilder::new(TrajectoryConfig::default()).unwrap();
+    for (scan, pose) in scans.iter().zip(&given) {
+        builder.add_given(scan, *pose);
+    }
+    let found = builder.finish().poses;
+    let errors = |poses: &[Pose3]| {
+        let motion = |poses: &[Pose3], row: usize| poses[row - 8].inverse() * poses[row];
+        let rows = 8..poses.len();
+        let squares = rows.map(|row| distance_m(&motion(poses, row), &motion(&truth, row)).powi(2));
+        (squares.sum::<f64>() / (poses.len() - 8) as f64).sqrt()
+    };
+    let (before, after) = (errors(&given), errors(&found));
+    assert!(before > 0.05 && after < 0.01, "{before} {after}");
+    let farthest = (found.iter().zip(&given)).map(|(a, b)| distance_m(a, b));
+    assert!(farthest.fold(0.0, f64::max) < 0.3);
+}
+
+#[test]
+fn a_round_closes_its_loop_and_takes_the_drift_away() {
+    // A round takes 25 s; the drive goes on for a fifth of another.
+    let (scans, truth) = scans(&World::around_a_block(), 0.0, 120);
+    let mut builder = TrajectoryBuilder::new(TrajectoryConfig {
+        adjust: false,
+        ..TrajectoryConfig::default()
+    })
+    .unwrap();
+    let drift = Pose3::new(
+        Vector3::new(0.01, 0.0, 0.005),
+        Vector3::new(0.0, 0.0, 0.0006),
+    );
+    let mut drifted = Pose3::identity();
+    for (row, scan) in scans.iter().enumerate() {
+        builder.keep(scan);
+        let motion = match row {
+            0 => Pose3::identity(),
+            row => truth[row - 1].inverse() * truth[row] * drift,
+        };
+        drifted *= motion;
+        builder.estimates.push(OdometryEstimate {
+            odom_from_lidar: drifted,
+            previous_from_current: motion,
+            state: StepState::Registered,
+            ..OdometryEstimate::first(0.25)
+        });
+    }
+    let found = builder.finish();
+    let error_m = |pose: &Pose3| distance_m(pose, &(truth[0].inverse() * truth[119]));
+    let before = error_m(&drifted);
+    let after = error_m(&found.poses[119]);
+    assert!(before > 2.0 && after < 0.2, "{before} {after}");
+    let accepted = (found.loops.iter()).filter(|it| it.verdict == LoopVerdict::Accepted);
+    assert!(accepted.clone().count() >= 2, "{:?}", found.loops);
+    for found in accepted {
+        let true_transform = truth[found.first].inverse() * truth[found.second];
+        let error_m = distance_m(&found.first_from_second, &true_transform);
+        assert!(error_m < 0.1, "{found:?}");
+    }
+}
+
+#[test]
+fn results_do_not_depend_on_the_number_of_threads() {
+    let (scans, _) = scans(&World::crossing(), 0.0, 8);
+    let poses = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+        pool.unwrap().install(|| {
+            let mut builder = TrajectoryBuilder::new(TrajectoryConfig::default()).unwrap();
+            for scan in &scans {
+                builder.add(scan).unwrap();
+            }
+            builder.finish().poses
+        })
+    };
+    assert_eq!(poses(1), poses(3));
+}
+
+#[test]
+fn scans_without_points_have_poses() {
+    let mut builder = TrajectoryBuilder::new(TrajectoryConfig::default()).unwrap();
+    assert_eq!(builder.clone().finish().poses, []);
+    for _ in 0..3 {
+        builder.add(&Scan::default()).unwrap();
+    }
+    assert_eq!(builder.finish().poses, [Pose3::identity(); 3]);
+}

@@ -1,0 +1,178 @@
+//! Poses from the scans themselves, through the binary: drive once, drive again.
+
+#![allow(clippy::unwrap_used, reason = "a failing test may panic")]
+
+mod common;
+
+use std::fs;
+use std::path::Path;
+
+use common::{fpmcl, json, real_recording, run, simulate_two_drives};
+use fpmcl::geometry::Pose3;
+use fpmcl::recording::PoseTrack;
+use fpmcl::recording::poses::read_tum;
+
+/// A street with a bend, scanned while the car moves, with traffic.
+const SIMULATION: &str = "\
+output_folder: street
+n_scans: 30
+path:
+- {length_m: 40, turn_deg: 30, grade_percent: 3}
+scanner:
+  beams: 32
+  azimuth_steps: 1000
+  rolling_shutter: true
+";
+
+/// True poses of a drive in the lidar frame of its first scan.
+fn truth(drive: &Path) -> PoseTrack {
+    PoseTrack::read(&drive.join("poses.txt"), Some(&drive.join("calib.txt"))).unwrap()
+}
+
+fn poses(file: &Path) -> Vec<Pose3> {
+    let rows = read_tum(file).unwrap();
+    rows.iter().map(|row| row.map_from_lidar).collect()
+}
+
+/// Root mean square of the distances of positions [m].
+fn rmse_m(found: &[Pose3], truth: &[Pose3]) -> f64 {
+    assert_eq!(found.len(), truth.len());
+    let squares = found
+        .iter()
+        .zip(truth)
+        .map(|(found, truth)| (found.translation.vector - truth.translation.vector).norm_squared());
+    (squares.sum::<f64>() / found.len() as f64).sqrt()
+}
+
+#[test]
+fn a_recording_is_enough_for_a_map_and_for_another_drive_in_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, SIMULATION);
+    let [first, second] = [1, 2].map(|drive| truth(&folder.join(format!("street/drive_{drive}"))));
+    for drive in ["drive_1", "drive_2"] {
+        for file in ["poses.txt", "odometry.txt"] {
+            fs::remove_file(folder.join("street").join(drive).join(file)).unwrap();
+        }
+    }
+
+    let table = run(folder, &["odometry", "street/drive_1", "--output", "poses"]);
+    assert!(table.contains("loops"), "{table}");
+    let found = poses(&folder.join("poses/poses_tum.txt"));
+    let error_m = rmse_m(&found, &first.map_from_lidar);
+    assert!(error_m < 0.03, "{error_m}");
+    let report = json(&folder.join("poses/report.json"));
+    assert_eq!(
+        (&report["scans"], &report["predicted"]),
+        (&30.into(), &0.into())
+    );
+    for file in [
+        "poses_kitti.txt",
+        "odometry_tum.txt",
+        "trajectory.npz",
+        "frames.csv",
+        "path.png",
+    ] {
+        assert!(folder.join("poses").join(file).is_file(), "{file}");
+    }
+    // The same bytes with one thread.
+    let again = [
+        "odometry",
+        "street/drive_1",
+        "--output",
+        "again",
+        "--threads",
+        "1",
+    ];
+    run(folder, &again);
+    for file in [
+        "poses_tum.txt",
+        "poses_kitti.txt",
+        "odometry_tum.txt",
+        "trajectory.npz",
+    ] {
+        let read = |output: &str| fs::read(folder.join(output).join(file)).unwrap();
+        assert!(read("poses") == read("again"), "{file}");
+    }
+
+    let build = [
+        "build-map",
+        "street/drive_1",
+        "--output",
+        "map.ply",
+        "--set",
+        "visualize=False",
+    ];
+    run(folder, &build);
+    let of_map = poses(&folder.join("map.poses_tum.txt"));
+    assert!(rmse_m(&of_map, &found) < 1e-4);
+    let map = fs::read(folder.join("map.ply")).unwrap();
+    // The poses beside the map serve another build.
+    let again = fpmcl("build-map").in_folder(folder).with("street/drive_1");
+    let again = again
+        .with("--output=map.ply")
+        .set("visualize", "False")
+        .with("--force");
+    let output = again.succeeds();
+    assert!(
+        output.stderr.contains("finished already"),
+        "{}",
+        output.stderr
+    );
+    assert!(fs::read(folder.join("map.ply")).unwrap() == map);
+
+    let localize = [
+        "localize",
+        "street/drive_2",
+        "--map",
+        "map.ply",
+        "--output",
+        "r/r.npz",
+    ];
+    run(
+        folder,
+        &[
+            &localize[..],
+            &["--backend", "cpu", "--set", "plot_loc_results=False"],
+        ]
+        .concat(),
+    );
+    let found = poses(&folder.join("r/mcl_tum.txt"));
+    let truth = second.in_map(&first.world_from_map).map_from_lidar;
+    let planar = |poses: &[Pose3]| -> Vec<Pose3> {
+        let flat = |pose: &Pose3| {
+            let t = pose.translation.vector;
+            Pose3::translation(t.x, t.y, 0.0)
+        };
+        poses.iter().map(flat).collect()
+    };
+    let error_m = rmse_m(&planar(&found[3..]), &planar(&truth[3..]));
+    assert!(error_m < 0.03, "{error_m}");
+}
+
+#[test]
+fn poses_that_were_found_without_compensation_are_polished_to_a_centimetre() {
+    let Some(recording) = real_recording("kitti-0926-drive-0005") else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let output = folder.path().join("polished");
+    fpmcl("odometry")
+        .with(&recording)
+        .with(format!(
+            "--poses={}",
+            recording.join("poses_uncompensated.txt").display()
+        ))
+        .with(format!("--calib={}", recording.join("calib.txt").display()))
+        .with(format!("--output={}", output.display()))
+        .succeeds();
+    let read = |file: &Path| {
+        PoseTrack::read(file, Some(&recording.join("calib.txt")))
+            .unwrap()
+            .map_from_lidar
+    };
+    let truth = read(&recording.join("poses.txt"));
+    let before_m = rmse_m(&read(&recording.join("poses_uncompensated.txt")), &truth);
+    let after_m = rmse_m(&read(&output.join("poses_kitti.txt")), &truth);
+    assert!(before_m > 0.05 && after_m < 0.015, "{before_m} {after_m}");
+}
