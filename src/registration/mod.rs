@@ -350,7 +350,7 @@ mod tests {
             found.unwrap().unwrap().planar_covariance()
         };
         let (a, b) = (covariance(&straight), covariance(&turned));
-        let turn = nalgebra::Rotation3::from_axis_angle(&Vector3::z_axis(), 1.0);
+        let turn = nalgebra::Rotation3::from_axis_angle(&nalgebra::Vector3::z_axis(), 1.0);
         let expected = turn.matrix() * a * turn.matrix().transpose();
         assert_relative_eq!(b, expected, epsilon = 0.05 * a.norm());
     }
