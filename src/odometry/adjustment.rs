@@ -41,13 +41,13 @@ pub struct AdjustmentConfig {
     #[default(10)]
     pub iterations: usize,
     /// Largest last step [m].
-    #[default(0.005)]
+    #[default(0.003)]
     pub tolerance_m: f64,
     /// Standard deviation of the motion between scans in succession: [m].
-    #[default(0.02)]
+    #[default(0.1)]
     pub motion_m: f64,
     /// The same of the rotation [deg].
-    #[default(0.2)]
+    #[default(1.0)]
     pub motion_deg: f64,
     /// Standard deviation of given poses [m].
     #[default(0.3)]
@@ -86,6 +86,8 @@ struct Plane {
 /// Points of a scan: in the lidar frame, and the plane of each.
 struct Row {
     pose: Pose3,
+    /// Scale of the robust kernel: a scan that is far from its place has a wider one.
+    kernel_m: f64,
     in_map: Vec<DVec3>,
     /// Indices of planes; `NONE` without one.
     planes: Vec<u32>,
@@ -108,22 +110,29 @@ pub fn adjust(
     given: Option<&[Pose3]>,
     config: &AdjustmentConfig,
 ) -> Option<[f64; 2]> {
+    /// Factors of the first voxels of given poses, whose scans may be too far from each other for common planes.
+    const COARSE: [f64; 4] = [4.0, 4.0, 2.0, 2.0];
     let along_path = motion_edges(&drive.poses, config);
-    let mut kernel_m = drive.voxel_m;
+    let coarse = if given.is_some() { &COARSE[..] } else { &[] };
+    let mut kernels_m = vec![drive.voxel_m; drive.poses.len()];
     let mut result: Option<[f64; 2]> = None;
-    for _ in 0..config.iterations {
-        let (rows, planes) = associate(drive, config.voxels * drive.voxel_m, kernel_m);
+    for iteration in 0..coarse.len() + config.iterations {
+        let factor = coarse.get(iteration).copied().unwrap_or(1.0);
+        let (rows, planes) = associate(drive, factor * config.voxels * drive.voxel_m, &kernels_m);
         let residuals = Residuals::of(&rows, &planes)?;
         result = Some([
             result.map_or(residuals.rms_m, |[first, _]| first),
             residuals.rms_m,
         ]);
-        let mut system = system(&rows, &planes, kernel_m, residuals.sigma_m);
+        let mut system = system(&rows, &planes, residuals.sigma_m);
         for edge in &along_path {
             edge.add_to(&mut system, &drive.poses, 1.0);
         }
         hold(&mut system, &drive.poses, given, config);
-        kernel_m = residuals.kernel_m.clamp(0.01 * drive.voxel_m, kernel_m);
+        let least_m = 0.01 * drive.voxel_m;
+        for (kernel_m, found_m) in kernels_m.iter_mut().zip(&residuals.kernels_m) {
+            *kernel_m = found_m.max(least_m).min(*kernel_m);
+        }
         let steps = system.solve()?;
         let largest_m = (steps.iter())
             .map(|step| step.fixed_rows::<3>(0).norm() + 10.0 * step.fixed_rows::<3>(3).norm())
@@ -134,11 +143,10 @@ pub fn adjust(
         tracing::debug!(
             largest_m,
             rms_m = residuals.rms_m,
-            kernel_m,
             planes = planes.len(),
             "adjustment"
         );
-        if largest_m < config.tolerance_m {
+        if iteration >= coarse.len() && largest_m < config.tolerance_m {
             break;
         }
     }
@@ -184,13 +192,14 @@ fn hold(
 }
 
 /// Finds the planes, and the plane of each point.
-fn associate(drive: &Drive, edge_m: f64, kernel_m: f64) -> (Vec<Row>, Vec<Plane>) {
+fn associate(drive: &Drive, edge_m: f64, kernels_m: &[f64]) -> (Vec<Row>, Vec<Plane>) {
     let mut rows: Vec<Row> = (0..drive.poses.len())
         .into_par_iter()
         .map(|row| {
             let in_map = drive.points(row);
             Row {
                 pose: drive.poses[row],
+                kernel_m: kernels_m[row],
                 planes: vec![NONE; in_map.len()],
                 in_map,
             }
@@ -211,7 +220,7 @@ fn associate(drive: &Drive, edge_m: f64, kernel_m: f64) -> (Vec<Row>, Vec<Plane>
     entries.par_sort_unstable();
     let voxels: Vec<&[Entry]> = entries.chunk_by(|a, b| a.voxel == b.voxel).collect();
     let found: Vec<(Plane, &[Entry])> = (voxels.into_par_iter())
-        .filter_map(|voxel| Some((plane(&rows, voxel, edge_m, kernel_m)?, voxel)))
+        .filter_map(|voxel| Some((plane(&rows, voxel, edge_m)?, voxel)))
         .collect();
     let mut planes = Vec::with_capacity(found.len());
     for (plane, voxel) in found {
@@ -224,7 +233,7 @@ fn associate(drive: &Drive, edge_m: f64, kernel_m: f64) -> (Vec<Row>, Vec<Plane>
 }
 
 /// The plane through the points of a voxel, if several scans see one.
-fn plane(rows: &[Row], voxel: &[Entry], edge_m: f64, kernel_m: f64) -> Option<Plane> {
+fn plane(rows: &[Row], voxel: &[Entry], edge_m: f64) -> Option<Plane> {
     const MIN_POINTS: usize = 8;
     /// Largest share of the smallest variance in the second one, and smallest one of the second in the largest.
     const FLAT: f64 = 0.05;
@@ -264,7 +273,7 @@ fn plane(rows: &[Row], voxel: &[Entry], edge_m: f64, kernel_m: f64) -> Option<Pl
         let lidar = LidarFrame::of(&row.pose);
         let mut coupling = Matrix6x3::zeros();
         for entry in of_row {
-            let at = plane.residual(position(entry), kernel_m);
+            let at = plane.residual(position(entry), row.kernel_m);
             sums += at.weight * at.by_plane * at.by_plane.transpose();
             plane.gradient += at.weight * at.distance_m * at.by_plane;
             let jacobian = lidar.jacobian(position(entry), plane.normal);
@@ -328,60 +337,71 @@ impl LidarFrame {
 struct Residuals {
     rms_m: f64,
     sigma_m: f64,
-    kernel_m: f64,
+    /// Scale of the robust kernel of each scan, from its residuals and from those of all.
+    kernels_m: Vec<f64>,
 }
 
 impl Residuals {
     fn of(rows: &[Row], planes: &[Plane]) -> Option<Self> {
         /// Kernel in robust standard deviations.
         const KERNEL_SIGMAS: f64 = 3.0;
-        let mut distances_m: Vec<f32> = (rows.par_iter())
-            .flat_map_iter(|row| {
-                (row.in_map.iter().zip(&row.planes)).filter_map(|(position, &plane)| {
+        let mut of_rows: Vec<Vec<f32>> = (rows.par_iter())
+            .map(|row| {
+                let points = row.in_map.iter().zip(&row.planes);
+                let distance_m = |(position, &plane): (&DVec3, &u32)| {
                     let plane = planes.get(plane as usize)?;
                     Some(plane.normal.dot(*position - plane.center).abs() as f32)
-                })
+                };
+                points.filter_map(distance_m).collect()
             })
             .collect();
-        let middle = distances_m.len() / 2;
-        if distances_m.is_empty() {
-            return None;
-        }
-        let squares = distances_m
+        let mut all_m = of_rows.concat();
+        let squares = all_m
             .iter()
             .map(|&distance_m| f64::from(distance_m).powi(2));
-        let rms_m = (squares.sum::<f64>() / distances_m.len() as f64).sqrt();
-        let median = *distances_m.select_nth_unstable_by(middle, f32::total_cmp).1;
-        let sigma_m = (1.48 * f64::from(median)).max(1e-4);
+        let rms_m = (squares.sum::<f64>() / all_m.len() as f64).sqrt();
+        let sigma_m = robust_sigma_m(&mut all_m)?;
+        let sigmas_m = of_rows.iter_mut().map(|of_row| robust_sigma_m(of_row));
         Some(Self {
+            kernels_m: sigmas_m
+                .map(|of_row| KERNEL_SIGMAS * of_row.map_or(sigma_m, |m| m.max(sigma_m)))
+                .collect(),
             rms_m,
             sigma_m,
-            kernel_m: KERNEL_SIGMAS * sigma_m,
         })
     }
 }
 
+/// Standard deviation of normal residuals with the same median [m].
+fn robust_sigma_m(distances_m: &mut [f32]) -> Option<f64> {
+    let middle = distances_m.len() / 2;
+    (!distances_m.is_empty()).then(|| {
+        let median = *distances_m.select_nth_unstable_by(middle, f32::total_cmp).1;
+        (1.48 * f64::from(median)).max(1e-4)
+    })
+}
+
 /// The equations of all poses.
-fn system(rows: &[Row], planes: &[Plane], kernel_m: f64, sigma_m: f64) -> BlockSystem {
+fn system(rows: &[Row], planes: &[Plane], sigma_m: f64) -> BlockSystem {
     /// Points in succession are not independent: this number counts as one.
     const CORRELATED: f64 = 10.0;
     let scale = 1.0 / (CORRELATED * sigma_m * sigma_m);
     let sums: Vec<BlockRow> = (rows.par_iter().enumerate())
-        .map(|(number, row)| block_row(number, row, planes, kernel_m, scale))
+        .map(|(number, row)| block_row(number, row, planes, scale))
         .collect();
     let mut system = BlockSystem::new(rows.len());
     system.add_rows(sums);
     system
 }
 
-fn block_row(number: usize, row: &Row, planes: &[Plane], kernel_m: f64, scale: f64) -> BlockRow {
+fn block_row(number: usize, row: &Row, planes: &[Plane], scale: f64) -> BlockRow {
     let lidar = LidarFrame::of(&row.pose);
     let mut sums = BlockRow::default();
     for (&position, &plane) in row.in_map.iter().zip(&row.planes) {
         let Some(plane) = planes.get(plane as usize) else {
             continue;
         };
-        let at = plane.residual(position, kernel_m);
+        let at = plane.residual(position, row.kernel_m);
         let jacobian = lidar.jacobian(position, plane.normal);
         sums.diagonal += at.weight * jacobian * jacobian.transpose();
         sums.right_side -= at.weight * at.distance_m * jacobian;
