@@ -35,7 +35,7 @@ fn distance_m(a: &Pose3, b: &Pose3) -> f64 {
 
 #[test]
 fn given_poses_that_are_disturbed_by_5_cm_come_back_to_1_cm_in_their_frame() {
-    let (scans, truth) = scans(&World::crossing(), 0.0, 24);
+    let (scans, truth) = scans(&World::around_a_block(), 0.0, 24);
     let mut rng = StdRng::seed_from_u64(3);
     let given: Vec<Pose3> = (truth.iter())
         .map(|pose| pose * noise(&mut rng, 0.05, 0.1))
