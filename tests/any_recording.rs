@@ -172,11 +172,12 @@ fn poses_are_matched_by_time_and_their_absence_is_explained() {
     // Another clock.
     tum(5000.0);
     build().fails_with(&["14 of 14 scans have no pose", "1700005000.000"]);
-    // No poses at all.
+    // No poses at all, where given ones are asked for.
     fpmcl("build-map")
         .in_folder(folder)
         .with("scans")
         .with("--output=other.ply")
+        .set("poses", "given")
         .fails_with(&["has no poses", "--poses"]);
 }
 

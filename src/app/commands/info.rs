@@ -87,7 +87,7 @@ fn recording(path: &Path, topic: Option<&str>) -> Result<String> {
     let has_poses = track.is_ok_and(|track| track.matched(frames, recording.has_times).is_ok());
     let build_map = match has_poses {
         true => "ready".to_owned(),
-        false => "needs poses: --poses FILE".to_owned(),
+        false => "ready; poses from the scans, or --poses FILE".to_owned(),
     };
     rows.extend([
         ("poses", poses),
