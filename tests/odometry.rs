@@ -12,7 +12,7 @@ use fpmcl::geometry::Pose3;
 use fpmcl::recording::PoseTrack;
 use fpmcl::recording::poses::read_tum;
 
-/// A street with a bend, scanned while the car moves, with traffic.
+/// A street with a bend and traffic.
 const SIMULATION: &str = "\
 output_folder: street
 n_scans: 30
@@ -21,7 +21,6 @@ path:
 scanner:
   beams: 32
   azimuth_steps: 1000
-  rolling_shutter: true
 ";
 
 /// True poses of a drive in the lidar frame of its first scan.
