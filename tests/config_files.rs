@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use fpmcl::app::config::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
-    Initialization, LocalizationConfig, RangeImageConfig, RefinementConfig,
+    Initialization, LocalizationConfig, OdometryCommandConfig, RangeImageConfig, RefinementConfig,
 };
 use fpmcl::lidar::LidarModel;
 use fpmcl::simulation::SimulationConfig;
@@ -58,6 +58,7 @@ fn check_round_trip(path: &Path) {
         "comparison.yml" | "comparison_kitti.yml" | "comparison_refiners.yml" => {
             round_trip::<ComparisonConfig>(path);
         }
+        "odometry.yml" => round_trip::<OdometryCommandConfig>(path),
         "ground.yml" => round_trip::<GroundCommandConfig>(path),
         _ => panic!("{} belongs to no command", path.display()),
     }
@@ -139,6 +140,7 @@ fn every_file_loads_and_its_effective_configuration_loads_to_an_equal_one() {
 #[test]
 fn the_built_in_texts_have_the_defaults_and_explain_every_key() {
     check_texts::<BuildMapConfig>();
+    check_texts::<OdometryCommandConfig>();
     check_texts::<LocalizationConfig>();
     check_texts::<RefinementConfig>();
     check_texts::<EvaluationConfig>();

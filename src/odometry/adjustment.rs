@@ -8,8 +8,8 @@
 //! (Σ w J Jᵀ − Σ over planes  C G⁻¹ Cᵀ) ξ = −Σ w J r + Σ over planes  C G⁻¹ Σ w g r,     C = Σ w J gᵀ,  G = Σ w g gᵀ
 //! ```
 //!
-//! The Schur complement leaves the poses, coupled wherever they see the same plane. Normals in succession stay
-//! close to the initial motion, and poses close to given ones, where there are any.
+//! The Schur complement leaves the poses, coupled wherever they see the same plane. Motions between scans in
+//! succession stay close to the initial ones, and poses close to given ones, where there are any.
 //!
 //! Liu and Zhang, *BALM: Bundle Adjustment for Lidar Mapping* (RA-L 2021); Zhou et al., *Efficient Planar
 //! Bundle Adjustment* (ISMAR 2020), section 4, for the elimination.
@@ -24,7 +24,7 @@ use super::block_system::{BlockRow, BlockSystem};
 use super::drive::Drive;
 use super::pose_graph::Edge;
 use super::voxel_map::pack;
-use crate::geometry::pose::exponential;
+use crate::geometry::pose::{exponential, logarithm};
 use crate::geometry::{PlaneSums, Pose3};
 use crate::validation::{InvalidValue, Validate, in_range, positive};
 
@@ -43,7 +43,7 @@ pub struct AdjustmentConfig {
     /// Largest last step [m].
     #[default(0.003)]
     pub tolerance_m: f64,
-    /// Standard deviation of the motion between scans in succession: [m].
+    /// Standard deviation of the motion between scans in succession [m].
     #[default(0.1)]
     pub motion_m: f64,
     /// The same of the rotation [deg].
@@ -186,7 +186,7 @@ fn hold(
     };
     let information = information(config.given_m, config.given_deg);
     for (row, (pose, given)) in poses.iter().zip(given).enumerate() {
-        let deviation = crate::geometry::pose::logarithm(&(given.inverse() * pose));
+        let deviation = logarithm(&(given.inverse() * pose));
         system.add(row, &information, &-(information * deviation));
     }
 }

@@ -12,6 +12,15 @@
 //! by Gauss-Newton on SE(3). Surfaces are principal components of the mapped points around q, at the finest scale
 //! at which they are a plane. The prediction is constant velocity. Lengths are shares of the sensor's range.
 //!
+//! [`TrajectoryBuilder`] does this for a whole drive and keeps a sample of each scan:
+//!
+//! ```text
+//! Odometer      pose of each scan, scan by scan
+//! loops         local maps of the path, recognized again by place and by looks, registered, confirmed by a second loop
+//! pose_graph    poses of the local maps, with a robust kernel for loops; the scans between move along
+//! adjustment    all poses and the planes that the scans have in common
+//! ```
+//!
 //! Vizzo et al., *KISS-ICP* (RA-L 2023), for the adaptive kernel; Lee et al., *GenZ-ICP* (RA-L 2025), for planar
 //! and other points blended by their share; Dellenbach et al., *CT-ICP* (ICRA 2022), for compensation by the
 //! motion that is estimated; Magnusson, *The Three-Dimensional Normal-Distributions Transform* (2009), for

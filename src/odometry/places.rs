@@ -89,7 +89,10 @@ mod tests {
         let noise = |n: u64| ((seed * 1000 + n) as f64 * 12.9898).sin().abs() as f32;
         (0..60)
             .flat_map(|object| {
-                let (angle, distance) = (noise(object) * 6.283, 5.0 + 40.0 * noise(object + 100));
+                let (angle, distance) = (
+                    noise(object) * std::f32::consts::TAU,
+                    5.0 + 40.0 * noise(object + 100),
+                );
                 let height = 1.0 + 8.0 * noise(object + 200);
                 (0..40).map(move |step| {
                     let along = 0.1 * step as f32;
