@@ -222,8 +222,10 @@ impl Recording {
 
 /// Time from the stamp of a scan of a file to its moment, the middle of its sweep [s]; 0 without times of points.
 fn moment_after_stamp_s(source: &ScanSource) -> Result<f64, RecordingError> {
-    let ScanSource::File { path, stamp_s } = source else {
-        return Ok(0.0);
+    let (path, stamp_s) = match source {
+        ScanSource::File { path, stamp_s } => (path, stamp_s),
+        #[cfg(feature = "bags")]
+        ScanSource::Message { .. } => return Ok(0.0),
     };
     if !scan_files::has_named_columns(path) {
         return Ok(0.0);
