@@ -20,6 +20,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
+use super::alignment::median;
 use super::block_system::{BlockRow, BlockSystem};
 use super::drive::Drive;
 use super::pose_graph::Edge;
@@ -374,11 +375,7 @@ impl Residuals {
 
 /// Standard deviation of normal residuals with the same median [m].
 fn robust_sigma_m(distances_m: &mut [f32]) -> Option<f64> {
-    let middle = distances_m.len() / 2;
-    (!distances_m.is_empty()).then(|| {
-        let median = *distances_m.select_nth_unstable_by(middle, f32::total_cmp).1;
-        (1.48 * f64::from(median)).max(1e-4)
-    })
+    median(distances_m).map(|median_m| (1.48 * median_m).max(1e-4))
 }
 
 /// The equations of all poses.

@@ -157,7 +157,8 @@ impl Problem<'_> {
     }
 }
 
-fn median(values: &mut [f32]) -> Option<f64> {
+/// The median, the upper one of an even number; `None` without values.
+pub fn median(values: &mut [f32]) -> Option<f64> {
     let middle = values.len() / 2;
     (!values.is_empty()).then(|| (*values.select_nth_unstable_by(middle, f32::total_cmp).1).into())
 }

@@ -38,8 +38,13 @@ pub struct LocalMap {
 impl Drive {
     /// Points of a scan in the map frame, compensated by the motion around it.
     pub fn points(&self, row: usize) -> Vec<DVec3> {
+        self.points_at(row, &self.poses[row])
+    }
+
+    /// The same points in the frame of another pose of the scan.
+    fn points_at(&self, row: usize, frame_from_lidar: &Pose3) -> Vec<DVec3> {
         let motion = Motion::along(&self.poses, &self.times_s, row);
-        self.samples[row].mapped(&self.poses[row], motion.as_ref())
+        self.samples[row].mapped(frame_from_lidar, motion.as_ref())
     }
 
     /// Lengths of the path up to each scan [m].
@@ -77,10 +82,8 @@ impl Drive {
     /// Points of a local map in the frame of its center, at least about `spacing_m` from each other.
     pub fn local_points(&self, map: &LocalMap, spacing_m: f64) -> Vec<TimedPoint> {
         let lidar_from_map = self.poses[map.center].inverse();
-        let points = evenly_spaced(&map.rows).flat_map(|row| {
-            let motion = Motion::along(&self.poses, &self.times_s, row);
-            self.samples[row].mapped(&(lidar_from_map * self.poses[row]), motion.as_ref())
-        });
+        let points = evenly_spaced(&map.rows)
+            .flat_map(|row| self.points_at(row, &(lidar_from_map * self.poses[row])));
         let still = points.map(|point| TimedPoint {
             position: point.as_vec3(),
             time_s: 0.0,
@@ -98,9 +101,7 @@ impl Drive {
         let lidar_from_map = self.poses[center].inverse();
         let mut surfaces = VoxelMap::new(self.voxel_m, VOXEL_POINTS);
         for row in maps.flat_map(|map| evenly_spaced(&map.rows)) {
-            let motion = Motion::along(&self.poses, &self.times_s, row);
-            let pose = lidar_from_map * self.poses[row];
-            surfaces.insert(&self.samples[row].mapped(&pose, motion.as_ref()));
+            surfaces.insert(&self.points_at(row, &(lidar_from_map * self.poses[row])));
         }
         surfaces
     }

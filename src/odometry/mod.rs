@@ -16,7 +16,7 @@
 //!
 //! ```text
 //! Odometer      pose of each scan, scan by scan
-//! loops         local maps of the path, recognized again by place and by looks, registered, confirmed by a second loop
+//! loops         local maps of the path, recognized by position and appearance, registered, confirmed by a second loop
 //! pose_graph    poses of the local maps, with a robust kernel for loops; the scans between move along
 //! adjustment    all poses and the planes that the scans have in common
 //! ```

@@ -6,7 +6,8 @@ use anyhow::Result;
 use serde::Serialize;
 
 use super::claims::{Claims, Outputs};
-use super::stages::{RecordingInputs, SensorKeys};
+use super::run_output::{self, RunFiles};
+use super::stages::SensorKeys;
 use super::trajectory::{self, TrajectorySummary};
 use super::{Context, output};
 use crate::app::config::{OdometryCommandConfig, RangeImageConfig};
@@ -15,7 +16,7 @@ use crate::app::plotting::color::{ODOMETRY, REFINED};
 use crate::app::results::write_trajectory_npz;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::odometry::{Loop, OdometryEstimate, StepState, Trajectory};
-use crate::recording::poses::write_kitti;
+use crate::recording::poses::write_tum;
 use crate::recording::{Frame, Recording};
 use crate::sensor::SensorDescription;
 
@@ -55,14 +56,19 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<String> 
     let frames = trajectory::dense_frames(&recording);
     let is_given = recording.track.is_some();
     let found = trajectory::estimate(&frames, is_given, &config.trajectory, context)?;
-    let selected = |frame: &Frame| recording.frames.iter().any(|it| it.number == frame.number);
+    let numbers: Vec<usize> = recording.frames.iter().map(|it| it.number).collect();
     let rows: Vec<usize> = (0..frames.len())
-        .filter(|&row| selected(&frames[row]))
+        .filter(|&row| numbers.binary_search(&frames[row].number).is_ok())
         .collect();
     let main = folder.join("report.json");
     output::create_folder(folder)?;
     claims.begin(&main)?;
-    write(folder, &recording, &frames, &rows, &found)?;
+    write(
+        &RunFiles::in_folder(&main, folder),
+        &recording,
+        &rows,
+        &found,
+    )?;
     if config.visualize {
         draw(&folder.join("path.png"), &found, is_given)?;
     }
@@ -106,19 +112,6 @@ fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> 
     outputs.prepare()
 }
 
-impl OdometryCommandConfig {
-    /// The recording with its poses.
-    fn recording_inputs(&self) -> RecordingInputs<'_> {
-        RecordingInputs {
-            scan_folder: &self.scan_folder,
-            topic: self.topic.as_deref(),
-            pose_file: self.pose_file.as_deref(),
-            calib_file: self.calib_file.as_deref(),
-            body_from_lidar: self.body_from_lidar,
-        }
-    }
-}
-
 /// Opens the recording, with the poses to polish if there are any.
 fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Option<SensorDescription>)> {
     let inputs = config.recording_inputs();
@@ -138,24 +131,21 @@ fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Option<SensorD
 
 /// Writes the poses of the selected frames.
 fn write(
-    folder: &Path,
+    files: &RunFiles,
     recording: &Recording,
-    frames: &[Frame],
     rows: &[usize],
     found: &Trajectory,
 ) -> Result<()> {
-    let frames: Vec<Frame> = rows.iter().map(|&row| frames[row].clone()).collect();
+    let frames = &recording.frames;
     let poses: Vec<Pose3> = rows.iter().map(|&row| found.poses[row]).collect();
     let steps: Vec<&OdometryEstimate> = rows.iter().map(|&row| &found.odometry[row]).collect();
     let odometry: Vec<Pose3> = steps.iter().map(|step| step.odom_from_lidar).collect();
-    let (world_from_map, calibration) = recording.world();
-    trajectory::write_poses(&folder.join("poses_tum.txt"), &frames, &poses)?;
-    trajectory::write_poses(&folder.join("odometry_tum.txt"), &frames, &odometry)?;
-    output::write_file(&folder.join("poses_kitti.txt"), |file| {
-        write_kitti(file, &poses, &world_from_map, &calibration)
+    run_output::write_trajectory(files, "poses", recording, &poses)?;
+    output::write_file(&files.file("odometry_tum.txt"), |file| {
+        write_tum(file, &trajectory::stamped(frames, &odometry))
     })?;
-    write_trajectory_npz(&folder.join("trajectory.npz"), &frames, &poses, &steps)?;
-    output::write_text(&folder.join("frames.csv"), &csv(&frames, &poses, &steps))
+    write_trajectory_npz(&files.file("trajectory.npz"), frames, &poses, &steps)?;
+    output::write_text(&files.file("frames.csv"), &csv(frames, &poses, &steps))
 }
 
 /// One row per frame.

@@ -7,6 +7,7 @@ use anyhow::{Result, bail};
 
 use super::claims::{Claims, Outputs};
 use super::output;
+use super::trajectory::stamped;
 use crate::app::plotting::color::{MCL, REFINED};
 use crate::app::plotting::{
     Animation, LineChart, LocalizationPicture, MapImage, MapPlot, Panel, PathPlot, Series,
@@ -20,7 +21,7 @@ use crate::evaluation::{
     TrajectoryMetrics, planar_errors,
 };
 use crate::files::folder_of;
-use crate::geometry::{Pose2, Pose3, StampedPose, TriangleMesh, pose2_from_pose3};
+use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
 use crate::localization::{Estimate, ParticleSet};
 use crate::recording::Recording;
 use crate::recording::poses::{write_kitti, write_tum};
@@ -129,10 +130,7 @@ pub fn write_trajectory(
     recording: &Recording,
     map_from_lidar: &[Pose3],
 ) -> Result<()> {
-    let trajectory: Vec<StampedPose> = (recording.frames.iter())
-        .zip(map_from_lidar)
-        .map(|(frame, &map_from_lidar)| frame.stamped(map_from_lidar))
-        .collect();
+    let trajectory = stamped(&recording.frames, map_from_lidar);
     let (world_from_map, calibration) = recording.world();
     output::write_file(&files.file(&format!("{name}_tum.txt")), |file| {
         write_tum(file, &trajectory)

@@ -6,8 +6,8 @@ use anyhow::{Context as _, Result};
 
 use super::{Context, input};
 use crate::app::config::{
-    BuildMapConfig, LocalizationConfig, MotionCompensation, RangeImageConfig, RefinementConfig,
-    body_from_lidar,
+    BuildMapConfig, LocalizationConfig, MotionCompensation, OdometryCommandConfig,
+    RangeImageConfig, RefinementConfig, body_from_lidar,
 };
 use crate::lidar::{LidarModel, PERIOD_S, Scan};
 use crate::map::scan_cloud::ScanConfig;
@@ -249,7 +249,7 @@ fn rotating(recording: Recording, compensation: Option<MotionCompensation>) -> R
     recording.rotating(rotation)
 }
 
-/// Adds the inputs of a configuration that names a recording and its sensor.
+/// Adds the inputs of a configuration that names a recording.
 macro_rules! recording_inputs {
     ($($config:ty),*) => {
         $(impl $config {
@@ -263,7 +263,21 @@ macro_rules! recording_inputs {
                     body_from_lidar: self.body_from_lidar,
                 }
             }
+        })*
+    };
+}
 
+recording_inputs!(
+    BuildMapConfig,
+    OdometryCommandConfig,
+    LocalizationConfig,
+    RefinementConfig
+);
+
+/// Adds the sensor of a configuration that describes it.
+macro_rules! sensor_keys {
+    ($($config:ty),*) => {
+        $(impl $config {
             /// The keys of the sensor.
             pub fn sensor_keys(&mut self) -> SensorKeys<'_> {
                 SensorKeys {
@@ -276,7 +290,7 @@ macro_rules! recording_inputs {
     };
 }
 
-recording_inputs!(BuildMapConfig, LocalizationConfig, RefinementConfig);
+sensor_keys!(BuildMapConfig, LocalizationConfig, RefinementConfig);
 
 /// Adds the inputs of a configuration that names also a map.
 macro_rules! inputs_in_map {

@@ -5,11 +5,10 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 use serde::Serialize;
 
+use super::Context;
 use super::interrupt::Interrupted;
-use super::{Context, output};
 use crate::geometry::{Pose3, StampedPose};
 use crate::odometry::{LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig};
-use crate::recording::poses::write_tum;
 use crate::recording::{Frame, Recording};
 
 /// Estimates the poses of frames, or polishes those that they have.
@@ -39,11 +38,6 @@ pub fn estimate(
     }
     task.note("loops and adjustment");
     Ok(builder.finish())
-}
-
-/// Writes poses as rows of TUM with the times of frames.
-pub fn write_poses(path: &Path, frames: &[Frame], poses: &[Pose3]) -> Result<()> {
-    output::write_file(path, |file| write_tum(file, &stamped(frames, poses)))
 }
 
 /// Poses with the numbers and times of frames.
