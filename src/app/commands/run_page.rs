@@ -183,7 +183,7 @@ fn segments(name: &str, metrics: &SpatialMetrics) -> Option<Table> {
         ]
     };
     (!metrics.by_length.is_empty()).then(|| Table {
-        name: format!("segments of {name}"),
+        name: format!("segments_{}", name.replace(' ', "_")),
         title: format!("Mean errors over segments by their length: {name}"),
         note: "From every frame up to 50 m, from every tenth from 100 m on; divided by the length."
             .to_owned(),

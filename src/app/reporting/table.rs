@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 /// Rows of cells under named columns.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Table {
-    /// Short name, suitable as a file name: `table_1`.
+    /// Short name, suitable as a file name and as the target of a link: letters, digits and `_` (`table_1`).
     pub name: String,
     /// Title, above the table.
     pub title: String,
