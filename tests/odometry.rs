@@ -150,6 +150,73 @@ fn a_recording_is_enough_for_a_map_and_for_another_drive_in_it() {
 }
 
 #[test]
+fn a_second_drive_is_added_to_the_map_of_the_first_in_its_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, SIMULATION);
+    let second = truth(&folder.join("street/drive_2"));
+    let build = |flags: &[&str]| {
+        let build = flags
+            .iter()
+            .fold(fpmcl("build-map"), |it, flag| it.with(flag));
+        build
+            .in_folder(folder)
+            .set("visualize", "False")
+            .with("--backend=cpu")
+    };
+    build(&["street/drive_1", "--output=map.ply", "--set=n_scans=18"]).succeeds();
+    let onto = ["street/drive_2", "--onto=map.ply", "--output=both.ply"];
+    let output = build(&onto).succeeds();
+    assert!(output.stdout.contains("added"), "{}", output.stdout);
+    // Its poses are in the world of the first drive.
+    let found = poses(&folder.join("both.poses_tum.txt"));
+    let error_m = rmse_m(&found, &second.in_map(&Pose3::identity()).map_from_lidar);
+    assert!(error_m < 0.05, "{error_m}");
+    let report = json(&folder.join("both.report.json"));
+    let changes = &report["changes"];
+    let area_m2 = |key: &str| changes[key].as_f64().unwrap();
+    // The older map ends before the street does; nothing but traffic has moved.
+    let added_m2 = area_m2("added_m2");
+    assert!(added_m2 > 300.0, "{changes}");
+    assert!(area_m2("gone_m2") < 0.05 * added_m2, "{changes}");
+    let triangles = |file: &str| json(&folder.join(file))["triangles"].as_u64().unwrap();
+    let joined = triangles("map.report.json") + changes["added_triangles"].as_u64().unwrap()
+        - changes["gone_triangles"].as_u64().unwrap();
+    assert_eq!(triangles("both.report.json"), joined);
+
+    // The same drive again: the poses beside the map serve, and the map is the same.
+    let map = fs::read(folder.join("both.ply")).unwrap();
+    let again = build(&onto).with("--force").with("--threads=1").succeeds();
+    assert!(
+        again.stderr.contains("finished already"),
+        "{}",
+        again.stderr
+    );
+    assert!(fs::read(folder.join("both.ply")).unwrap() == map);
+
+    // A drive elsewhere is not added.
+    let elsewhere = SIMULATION.replace("turn_deg: 30", "turn_deg: -50") + "seed: 7\n";
+    let other = folder.join("other");
+    fs::create_dir(&other).unwrap();
+    simulate_two_drives(&other, &elsewhere);
+    build(&[
+        "other/street/drive_2",
+        "--onto=map.ply",
+        "--output=lost.ply",
+    ])
+    .fails_with(&["not found in the map"]);
+    assert!(!folder.join("lost.ply").exists());
+
+    build(&[
+        "street/drive_2",
+        "--onto=map.ply",
+        "--output=map.ply",
+        "--force",
+    ])
+    .fails_with(&["mesh_file", "onto"]);
+}
+
+#[test]
 fn poses_that_were_found_without_compensation_are_polished_to_a_centimetre() {
     let Some(recording) = real_recording("kitti-0926-drive-0005") else {
         return;

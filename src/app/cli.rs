@@ -59,6 +59,7 @@ Examples:
     #[command(after_help = "\
 Examples:
   fpmcl build-map drive_1/ --output map.ply   poses that the recording contains, else from the scans
+  fpmcl build-map drive_2/ --onto map.ply --output map_2.ply   add what is new, replace what has changed
   fpmcl build-map cloud.pcd --output map.ply  a point cloud from elsewhere
   fpmcl build-map config/build_map.yml
   fpmcl build-map --set mesh_file=results/even.ply --set frame_step=2 --force")]
@@ -246,6 +247,10 @@ pub struct BuildMapArgs {
     /// Calibration of the camera whose poses these are; sets the key `calib_file`.
     #[arg(long, value_name = "FILE")]
     pub calib: Option<PathBuf>,
+
+    /// Map to which the recording is added: it is localized there, and what has changed is replaced. Sets the key `onto`.
+    #[arg(long, value_name = "MAP")]
+    pub onto: Option<PathBuf>,
 }
 
 /// Arguments of `localize`.
@@ -529,6 +534,7 @@ impl BuildMapArgs {
             ("mesh_file", self.output.as_deref()),
             ("pose_file", self.poses.as_deref()),
             ("calib_file", self.calib.as_deref()),
+            ("onto", self.onto.as_deref()),
         ];
         [path_settings(&paths), self.run.flags()].concat()
     }

@@ -32,6 +32,7 @@ pub mod tracking_loss;
 // The loop.
 pub mod filter;
 pub mod localizer;
+mod second_drive;
 
 pub use config::LocalizerConfig;
 pub use estimate::Estimate;
@@ -40,5 +41,6 @@ pub use initialization::StartSpread;
 pub use localizer::{Localizer, LocalizerError, Start};
 pub use odometry::Odometry;
 pub use particles::{Particle, ParticleSet};
+pub use second_drive::{SecondDrive, SecondDriveError};
 pub use sensor::{Sensor, SensorConfig};
 pub use tracking_loss::State;

@@ -16,6 +16,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use glam::Vec3;
 use rayon::prelude::*;
 
+use super::changes;
 use super::config::{MapConfig, MapOptions};
 use super::local_map::{self, LocalMap};
 use super::mapping_path::MappingPath;
@@ -126,6 +127,35 @@ impl MapBuilder {
         &self,
         scans: impl IntoIterator<Item = Result<(Scan, Pose3), E>>,
     ) -> Result<Map, BuildError> {
+        let (keys, poses) = self.key_scans(scans)?;
+        let plan = self.plan(poses)?;
+        let (mesh, _) = plan.build_all(&keys)?;
+        plan.finish(mesh)
+    }
+
+    /// Adds a newer drive to a map, in whose frame its poses are: what its beams pass through is removed, and what
+    /// the map does not have is added. See [`SecondDrive`](crate::localization::SecondDrive) for the poses.
+    pub fn extend<E: Into<ScanError>>(
+        &self,
+        map: &Map,
+        scans: impl IntoIterator<Item = Result<(Scan, Pose3), E>>,
+    ) -> Result<Map, BuildError> {
+        let (keys, poses) = self.key_scans(scans)?;
+        let plan = MapPlan {
+            older: Some(&map.mesh),
+            ..self.plan(poses)?
+        };
+        let (added, gone) = plan.build_all(&keys)?;
+        let path = map.path.extended_by(&plan.map_from_lidar);
+        let mesh = changes::joined(&map.mesh, &gone, &added);
+        Ok(Map::new(mesh, path, &self.options)?)
+    }
+
+    /// The key scans and their poses.
+    fn key_scans<E: Into<ScanError>>(
+        &self,
+        scans: impl IntoIterator<Item = Result<(Scan, Pose3), E>>,
+    ) -> Result<(Vec<Scan>, Vec<Pose3>), BuildError> {
         self.config.validate()?;
         let (mut keys, mut poses): (Vec<Scan>, Vec<Pose3>) = Default::default();
         for item in scans {
@@ -135,13 +165,7 @@ impl MapBuilder {
                 poses.push(pose);
             }
         }
-        let plan = self.plan(poses)?;
-        let mut mesh = TriangleMesh::default();
-        for local_map in &plan.local_maps {
-            let built = plan.build_local_map(local_map, &|key| Ok(keys[key].clone()))?;
-            mesh.append(&built.mesh);
-        }
-        plan.finish(mesh)
+        Ok((keys, poses))
     }
 
     /// Plans the local maps along the poses of the key scans.
@@ -159,6 +183,7 @@ impl MapBuilder {
         Ok(MapPlan {
             builder: self,
             classifier: config.ground.classifier()?,
+            older: None,
             ownership: Ownership::new(&map_from_lidar, &local_maps, reach_m),
             local_maps,
             map_from_lidar,
@@ -184,11 +209,25 @@ pub struct MapPlan<'a> {
     pub map_from_lidar: Vec<Pose3>,
     /// Ground classifier; by default that of the configuration.
     pub classifier: Box<dyn GroundClassifier>,
+    /// A map that the drive is added to, in the same frame.
+    pub older: Option<&'a TriangleMesh>,
     builder: &'a MapBuilder,
     ownership: Ownership,
 }
 
 impl MapPlan<'_> {
+    /// Builds all local maps; returns what they add, and the triangles of the older map that are gone, ascending.
+    fn build_all(&self, keys: &[Scan]) -> Result<(TriangleMesh, Vec<u32>), BuildError> {
+        let (mut mesh, mut gone) = (TriangleMesh::default(), vec![]);
+        for local_map in &self.local_maps {
+            let built = self.build_local_map(local_map, &|key| Ok(keys[key].clone()))?;
+            mesh.append(&built.mesh);
+            gone.extend(built.gone);
+        }
+        gone.sort_unstable();
+        Ok((mesh, gone))
+    }
+
     /// Builds a local map. `read_scan` returns a key scan by its index and is called from any thread.
     pub fn build_local_map(
         &self,
@@ -230,7 +269,8 @@ impl MapPlan<'_> {
             });
         }
         let begin_stage = |name| notify(BuildEvent::Stage(name));
-        let built = local_map::build(scans, plan.number, &self.ownership, config, begin_stage);
+        let region = (plan.number, &self.ownership);
+        let built = local_map::build(scans, region, self.older, config, begin_stage);
         let mut local_map = built.map_err(|error| match error {
             BuildError::Meshing(source) => BuildError::LocalMap {
                 number: plan.number,
@@ -312,6 +352,66 @@ mod tests {
             points,
             ..Scan::default()
         }
+    }
+
+    /// The same scan at a place along x, with a panel across the road at 7 m.
+    fn scan_before_panel(x_m: f64) -> Scan {
+        let mut scan = scan();
+        for point in &mut scan.points {
+            let share = (7.0 - x_m as f32) / point.x;
+            let at_panel = *point * share;
+            if (0.0..1.0).contains(&share) && at_panel.y.abs() < 2.0 && at_panel.z < 0.5 {
+                *point = at_panel;
+            }
+        }
+        scan
+    }
+
+    /// A drive along x, whose scans show the panel or not.
+    fn drive_towards_panel(is_there: bool) -> Vec<Result<(Scan, Pose3), ScanError>> {
+        let at = |x_m: f64| {
+            let scan = if is_there {
+                scan_before_panel(x_m)
+            } else {
+                scan()
+            };
+            Ok((scan, Pose3::translation(x_m, 0.0, 0.0)))
+        };
+        [0.0, 0.4, 0.8, 1.2, 1.6].map(at).into()
+    }
+
+    /// Area of the triangles of the panel [m²].
+    fn panel_m2(mesh: &TriangleMesh) -> f32 {
+        (0..mesh.triangles.len())
+            .filter(|&triangle| {
+                let center = mesh.corners(triangle).into_iter().sum::<Vec3>() / 3.0;
+                let normal = mesh.scaled_normal(triangle).normalize_or_zero();
+                (center.x - 7.0).abs() < 0.3 && center.y.abs() < 1.9 && normal.x.abs() > 0.8
+            })
+            .map(|triangle| 0.5 * mesh.scaled_normal(triangle).length())
+            .sum()
+    }
+
+    #[test]
+    fn a_newer_drive_adds_what_is_new_removes_what_is_gone_and_keeps_the_rest() {
+        let mut builder = builder();
+        builder.config.local_map.poisson.depth = 7;
+        builder.config.local_map.max_distance_m = 0.3;
+        let map_of = |is_there| builder.build(drive_towards_panel(is_there)).unwrap();
+        let (empty, blocked) = (map_of(false), map_of(true));
+        let extended = |map: &Map, is_there| {
+            let map = builder.extend(map, drive_towards_panel(is_there)).unwrap();
+            assert_eq!(map.path.map_from_lidar.len(), 10);
+            panel_m2(&map.mesh)
+        };
+        let (without, with) = (panel_m2(&empty.mesh), panel_m2(&blocked.mesh));
+        assert!(without < 0.2 && with > 3.0, "{without} {with}");
+        let same = extended(&blocked, true);
+        assert!((same - with).abs() < 0.2 * with, "{same} {with}");
+        let added = extended(&empty, true);
+        assert!(added > 0.8 * with, "{added} {with}");
+        let gone = extended(&blocked, false);
+        assert!(gone < 0.2 * with, "{gone} {with}");
     }
 
     /// Scans along x.

@@ -239,7 +239,7 @@ fn cells_within(radius: i32) -> impl Iterator<Item = (i32, i32)> {
 }
 
 /// Root of a tree of the union-find, whose paths are halved.
-fn root(parents: &mut [u32], mut index: u32) -> u32 {
+pub(super) fn root(parents: &mut [u32], mut index: u32) -> u32 {
     while parents[index as usize] != index {
         parents[index as usize] = parents[parents[index as usize] as usize];
         index = parents[index as usize];

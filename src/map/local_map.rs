@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
+use super::changes::{self, Changes};
 use super::confidence::{self, ConfidenceConfig};
 use super::plan::Ownership;
 use super::scan_cloud::{PointCounts, ScanCloud, ScanConfig};
@@ -106,8 +107,14 @@ pub struct LocalMapCounts {
     pub simplified_triangles: usize,
     /// Triangles in regions of neighbouring local maps.
     pub foreign_triangles: usize,
+    /// Triangles that the older map has already, where there is one.
+    #[serde(default)]
+    pub known_triangles: usize,
     /// Triangles of the finished local map.
     pub triangles: usize,
+    /// Triangles of the older map that are gone.
+    #[serde(default)]
+    pub gone_triangles: usize,
     /// Whether it had too few points to mesh.
     #[serde(default)]
     pub is_empty: bool,
@@ -118,6 +125,8 @@ pub struct LocalMapCounts {
 pub struct LocalMap {
     /// The part of the surface that it owns; empty where there were too few points.
     pub mesh: TriangleMesh,
+    /// Triangles of the older map that are gone, ascending.
+    pub gone: Vec<u32>,
     /// Numbers of points and triangles at each step.
     pub counts: LocalMapCounts,
     /// Median share of the points of a scan that are on surfaces of the next one, from 0 to 1; below
@@ -127,12 +136,13 @@ pub struct LocalMap {
     pub doubtful_scans: Vec<usize>,
 }
 
-/// Meshes the prepared scans of a local map and colours the mesh by ground confidence. `begin_stage`
-/// is called at the start of each stage and may end the work with an error.
+/// Meshes the prepared scans of a local map and colours the mesh by ground confidence; of an older map, it finds what
+/// is gone, and keeps what is not in it. `begin_stage` is called at the start of each stage and may end the work with an
+/// error.
 pub(super) fn build<E: From<MeshingError>>(
     scans: Vec<ScanCloud>,
-    number: usize,
-    ownership: &Ownership,
+    (number, ownership): (usize, &Ownership),
+    older: Option<&TriangleMesh>,
     config: &LocalMapConfig,
     begin_stage: impl Fn(&'static str) -> Result<(), E>,
 ) -> Result<LocalMap, E> {
@@ -159,10 +169,21 @@ pub(super) fn build<E: From<MeshingError>>(
         counts.crossed_triangles =
             visibility::remove_crossed_triangles(&mut mesh, &scans, &config.visibility);
     }
+    let mut changes = Changes::default();
+    if let Some(older) = older {
+        begin_stage("changes")?;
+        let region = (number, ownership);
+        changes = changes::compare(older, &mut mesh, &scans, region, &config.visibility);
+        counts.known_triangles = changes.known;
+        counts.gone_triangles = changes.gone.len();
+    }
     drop(scans);
 
     begin_stage("ground")?;
-    Ok(finish(mesh, &cloud, (number, ownership), config, counts))
+    Ok(LocalMap {
+        gone: changes.gone,
+        ..finish(mesh, &cloud, (number, ownership), config, counts)
+    })
 }
 
 /// Meshes oriented points with ground confidences, as [`build`] does after the preparation of the scans.

@@ -47,6 +47,14 @@ impl MappingPath {
             .collect()
     }
 
+    /// The path of a map to which a newer drive is added.
+    #[must_use]
+    pub fn extended_by(&self, map_from_lidar: &[Pose3]) -> Self {
+        let mut path = self.clone();
+        path.map_from_lidar.extend(map_from_lidar);
+        path
+    }
+
     /// Frame of a mesh without a mapping drive that was moved by an origin [m]; `None` if it was not moved.
     pub(super) fn at_origin(origin: DVec3) -> Option<Self> {
         (origin != DVec3::ZERO).then(|| Self {

@@ -7,6 +7,7 @@
 
 // From scans to a mesh.
 pub mod builder;
+pub mod changes;
 pub mod cloud;
 mod cloud_normals;
 pub mod confidence;

@@ -169,7 +169,7 @@ pub fn remove_crossed_triangles(
 }
 
 /// Returns which triangles more beams pass through than end on.
-fn crossed_triangles(
+pub(super) fn crossed_triangles(
     mesh: &TriangleMesh,
     scans: &[ScanCloud],
     config: &VisibilityConfig,

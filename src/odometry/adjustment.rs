@@ -9,7 +9,8 @@
 //! ```
 //!
 //! The Schur complement leaves the poses, coupled wherever they see the same plane. Motions between scans in
-//! succession stay close to the initial ones, and poses close to given ones, where there are any.
+//! succession stay close to the initial ones. Given poses hold the drive, or the surfaces of an older map, whose points
+//! are in G but move no pose; otherwise the first pose does.
 //!
 //! Liu and Zhang, *BALM: Bundle Adjustment for Lidar Mapping* (RA-L 2021); Zhou et al., *Efficient Planar
 //! Bundle Adjustment* (ISMAR 2020), section 4, for the elimination.
@@ -84,7 +85,18 @@ struct Plane {
     couplings: Vec<(usize, Matrix6x3<f64>)>,
 }
 
-/// Points of a scan: in the lidar frame, and the plane of each.
+/// What holds a drive in its frame.
+#[derive(Clone, Copy, Debug)]
+pub enum Held<'a> {
+    /// Its first pose.
+    First,
+    /// Given poses.
+    Given(&'a [Pose3]),
+    /// Points on the surfaces of a map.
+    Surfaces(&'a [DVec3]),
+}
+
+/// Points of a scan, or of the map as the last row: in the map frame, and the plane of each.
 struct Row {
     pose: Pose3,
     /// Scale of the robust kernel: a scan that is far from its place has a wider one.
@@ -104,32 +116,33 @@ struct Entry {
     point: u32,
 }
 
-/// Adjusts the poses of a drive; given poses hold them, otherwise the first stays. Returns the root mean square of the
-/// residuals before and after [m]; `None` where no surfaces are in common.
-pub fn adjust(
-    drive: &mut Drive,
-    given: Option<&[Pose3]>,
-    config: &AdjustmentConfig,
-) -> Option<[f64; 2]> {
+/// Adjusts the poses of a drive. Returns the root mean square of the residuals before and after [m]; `None` where no
+/// surfaces are in common.
+pub fn adjust(drive: &mut Drive, held: Held, config: &AdjustmentConfig) -> Option<[f64; 2]> {
     /// Factors of the first voxels of given poses, whose scans may be too far from each other for common planes.
     const COARSE: [f64; 4] = [4.0, 4.0, 2.0, 2.0];
     let along_path = motion_edges(&drive.poses, config);
-    let coarse = if given.is_some() { &COARSE[..] } else { &[] };
+    let coarse = match held {
+        Held::First => &[],
+        Held::Given(_) => &COARSE[..],
+        Held::Surfaces(_) => &COARSE[2..],
+    };
     let mut kernels_m = vec![drive.voxel_m; drive.poses.len()];
     let mut result: Option<[f64; 2]> = None;
     for iteration in 0..coarse.len() + config.iterations {
         let factor = coarse.get(iteration).copied().unwrap_or(1.0);
-        let (rows, planes) = associate(drive, factor * config.voxels * drive.voxel_m, &kernels_m);
+        let edge_m = factor * config.voxels * drive.voxel_m;
+        let (rows, planes) = associate(drive, held, edge_m, &kernels_m);
         let residuals = Residuals::of(&rows, &planes)?;
         result = Some([
             result.map_or(residuals.rms_m, |[first, _]| first),
             residuals.rms_m,
         ]);
-        let mut system = system(&rows, &planes, residuals.sigma_m);
+        let mut system = system(&rows[..drive.poses.len()], &planes, residuals.sigma_m);
         for edge in &along_path {
             edge.add_to(&mut system, &drive.poses, 1.0);
         }
-        hold(&mut system, &drive.poses, given, config);
+        hold(&mut system, &drive.poses, held, config);
         let least_m = 0.01 * drive.voxel_m;
         for (kernel_m, found_m) in kernels_m.iter_mut().zip(&residuals.kernels_m) {
             *kernel_m = found_m.max(least_m).min(*kernel_m);
@@ -173,17 +186,16 @@ fn information(shift_m: f64, turn_deg: f64) -> Matrix6<f64> {
     Matrix6::from_diagonal(&Vector6::new(shift, shift, shift, turn, turn, turn))
 }
 
-/// Holds the poses near given ones, or the first one where it is.
-fn hold(
-    system: &mut BlockSystem,
-    poses: &[Pose3],
-    given: Option<&[Pose3]>,
-    config: &AdjustmentConfig,
-) {
+/// Holds the poses near given ones, or the first one where it is; the surfaces of a map hold them by their planes.
+fn hold(system: &mut BlockSystem, poses: &[Pose3], held: Held, config: &AdjustmentConfig) {
     const HOLD: f64 = 1e12;
-    let Some(given) = given else {
-        system.add(0, &(Matrix6::identity() * HOLD), &Vector6::zeros());
-        return;
+    let given = match held {
+        Held::First => {
+            system.add(0, &(Matrix6::identity() * HOLD), &Vector6::zeros());
+            return;
+        }
+        Held::Surfaces(_) => return,
+        Held::Given(given) => given,
     };
     let information = information(config.given_m, config.given_deg);
     for (row, (pose, given)) in poses.iter().zip(given).enumerate() {
@@ -193,19 +205,27 @@ fn hold(
 }
 
 /// Finds the planes, and the plane of each point.
-fn associate(drive: &Drive, edge_m: f64, kernels_m: &[f64]) -> (Vec<Row>, Vec<Plane>) {
+fn associate(drive: &Drive, held: Held, edge_m: f64, kernels_m: &[f64]) -> (Vec<Row>, Vec<Plane>) {
     let mut rows: Vec<Row> = (0..drive.poses.len())
         .into_par_iter()
-        .map(|row| {
-            let in_map = drive.points(row);
-            Row {
-                pose: drive.poses[row],
-                kernel_m: kernels_m[row],
-                planes: vec![NONE; in_map.len()],
-                in_map,
-            }
+        .map(|row| Row {
+            pose: drive.poses[row],
+            kernel_m: kernels_m[row],
+            in_map: drive.points(row),
+            planes: vec![],
         })
         .collect();
+    if let Held::Surfaces(points) = held {
+        rows.push(Row {
+            pose: Pose3::identity(),
+            kernel_m: drive.voxel_m,
+            in_map: points.to_vec(),
+            planes: vec![],
+        });
+    }
+    rows.iter_mut()
+        .for_each(|row| row.planes = vec![NONE; row.in_map.len()]);
+    let scans = drive.poses.len();
     let mut entries: Vec<Entry> = (rows.par_iter().enumerate())
         .flat_map_iter(|(number, row)| {
             row.in_map
@@ -221,7 +241,7 @@ fn associate(drive: &Drive, edge_m: f64, kernels_m: &[f64]) -> (Vec<Row>, Vec<Pl
     entries.par_sort_unstable();
     let voxels: Vec<&[Entry]> = entries.chunk_by(|a, b| a.voxel == b.voxel).collect();
     let found: Vec<(Plane, &[Entry])> = (voxels.into_par_iter())
-        .filter_map(|voxel| Some((plane(&rows, voxel, edge_m)?, voxel)))
+        .filter_map(|voxel| Some((plane(&rows, scans, voxel, edge_m)?, voxel)))
         .collect();
     let mut planes = Vec::with_capacity(found.len());
     for (plane, voxel) in found {
@@ -233,8 +253,8 @@ fn associate(drive: &Drive, edge_m: f64, kernels_m: &[f64]) -> (Vec<Row>, Vec<Pl
     (rows, planes)
 }
 
-/// The plane through the points of a voxel, if several scans see one.
-fn plane(rows: &[Row], voxel: &[Entry], edge_m: f64) -> Option<Plane> {
+/// The plane through the points of a voxel, if several scans see one; the rows after those of the scans do not move.
+fn plane(rows: &[Row], scans: usize, voxel: &[Entry], edge_m: f64) -> Option<Plane> {
     const MIN_POINTS: usize = 8;
     /// Largest share of the smallest variance in the second one, and smallest one of the second in the largest.
     const FLAT: f64 = 0.05;
@@ -280,7 +300,10 @@ fn plane(rows: &[Row], voxel: &[Entry], edge_m: f64) -> Option<Plane> {
             let jacobian = lidar.jacobian(position(entry), plane.normal);
             coupling += at.weight * jacobian * at.by_plane.transpose();
         }
-        plane.couplings.push((of_row[0].row as usize, coupling));
+        let number = of_row[0].row as usize;
+        if number < scans {
+            plane.couplings.push((number, coupling));
+        }
     }
     plane.inverse = sums.try_inverse()?;
     Some(plane)

@@ -110,8 +110,6 @@ struct LoopSearch<'a> {
 impl LoopSearch<'_> {
     /// The best loop from a local map to an earlier one.
     fn loop_to(&self, second: usize) -> Option<FoundLoop> {
-        /// Least share of common surfaces.
-        const MIN_COMMON: f64 = 0.4;
         (self.candidates(second).into_iter())
             .filter_map(|(first, guess)| self.register(first, second, &guess))
             .find(|found| found.common_share > MIN_COMMON)
@@ -197,8 +195,11 @@ impl LoopSearch<'_> {
     }
 }
 
+/// Least share of common surfaces of two visits.
+pub const MIN_COMMON: f64 = 0.4;
+
 /// Share of the points near the sensor that lie on the surfaces of another visit, without those on the ground.
-fn common_share(
+pub fn common_share(
     surfaces: &VoxelMap,
     points: &[TimedPoint],
     first_from_second: &Pose3,

@@ -28,12 +28,14 @@
 
 mod adjustment;
 mod alignment;
+mod anchors;
 mod block_system;
 mod config;
 mod degeneracy;
 mod drive;
 mod loops;
 mod odometer;
+mod path_graph;
 mod places;
 mod pose_check;
 mod pose_graph;
@@ -46,6 +48,7 @@ mod trajectory;
 mod voxel_map;
 
 pub use adjustment::AdjustmentConfig;
+pub use anchors::NotInMap;
 pub use config::OdometryConfig;
 pub use loops::{Loop, LoopVerdict};
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};

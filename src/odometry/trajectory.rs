@@ -1,18 +1,20 @@
 //! The trajectory of a whole drive: odometry, loops, and the adjustment of all poses to common surfaces.
 
-use nalgebra::{Matrix6, Vector6};
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::adjustment::{AdjustmentConfig, adjust};
+use super::adjustment::{AdjustmentConfig, Held, adjust};
+use super::alignment::median;
+use super::anchors::{self, NotInMap, Placed};
 use super::config::OdometryConfig;
 use super::drive::{Drive, LocalMap};
 use super::loops::{self, Drift, FoundLoop, Loop, LoopVerdict};
-use super::odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
+use super::odometer::{Odometer, OdometryError, OdometryEstimate};
+use super::path_graph::{LOCAL_MAP, move_along, odometry_edges};
 use super::pose_graph::{Edge, optimize};
 use super::sampling::{Sample, sensor_range};
-use crate::geometry::Pose3;
-use crate::lidar::{Scan, interpolate_motion, interval_s};
+use crate::geometry::{Pose3, TriangleMesh};
+use crate::lidar::{Scan, interval_s};
 use crate::validation::{InvalidValue, Validate, in_range, nested};
 
 /// Settings of the trajectory of a drive.
@@ -49,7 +51,7 @@ impl Validate for TrajectoryConfig {
 pub struct Trajectory {
     /// `p_map = map_from_lidar * p_lidar` of each scan.
     pub poses: Vec<Pose3>,
-    /// Poses of the odometry alone.
+    /// Poses of the odometry alone, in the same frame.
     pub odometry: Vec<OdometryEstimate>,
     /// Loops that were found.
     pub loops: Vec<Loop>,
@@ -64,7 +66,7 @@ pub struct TrajectoryBuilder {
     odometer: Odometer,
     estimates: Vec<OdometryEstimate>,
     samples: Vec<Sample>,
-    ranges_m: Vec<f64>,
+    ranges_m: Vec<f32>,
     given: Vec<Pose3>,
     time_s: Option<f64>,
 }
@@ -121,41 +123,80 @@ impl TrajectoryBuilder {
             }
         });
         self.samples.push(sample);
-        self.ranges_m.extend(range_m);
+        self.ranges_m.extend(range_m.map(|range_m| range_m as f32));
         self.time_s = scan.time_s;
     }
 
     /// Closes loops, unless the poses are given, and adjusts the poses.
-    pub fn finish(mut self) -> Trajectory {
-        let mut trajectory = Trajectory {
-            poses: (self.estimates.iter())
-                .map(|estimate| estimate.odom_from_lidar)
-                .collect(),
+    pub fn finish(self) -> Trajectory {
+        let given = self.given.clone();
+        let is_given = !given.is_empty();
+        let (config, mut trajectory, drive) = self.into_drive();
+        let Some(mut drive) = drive else {
+            return trajectory;
+        };
+        if config.loops && !is_given {
+            trajectory.loops = close_loops(&mut drive, &trajectory.odometry);
+        }
+        if config.adjust {
+            let held = if is_given {
+                Held::Given(&given)
+            } else {
+                Held::First
+            };
+            trajectory.residuals_m = adjust(&mut drive, held, &config.adjustment);
+        }
+        trajectory.poses = drive.poses;
+        trajectory
+    }
+
+    /// Closes loops, moves the drive into a map in which some of its scans were found, and adjusts all poses to its
+    /// surfaces. `map_from_lidar` has the poses of the scans that were found.
+    pub fn finish_in_map(
+        self,
+        mesh: &TriangleMesh,
+        map_from_lidar: &[Option<Pose3>],
+    ) -> Result<Trajectory, NotInMap> {
+        let (config, mut trajectory, drive) = self.into_drive();
+        let mut drive = drive.ok_or(NotInMap)?;
+        if config.loops {
+            trajectory.loops = close_loops(&mut drive, &trajectory.odometry);
+        }
+        let (odometry, loops) = (&trajectory.odometry, &trajectory.loops);
+        let Placed {
+            map_from_odom,
+            surfaces,
+        } = anchors::place(&mut drive, mesh, map_from_lidar, odometry, loops)?;
+        for estimate in &mut trajectory.odometry {
+            estimate.odom_from_lidar = map_from_odom * estimate.odom_from_lidar;
+        }
+        if config.adjust {
+            let held = Held::Surfaces(&surfaces);
+            trajectory.residuals_m = adjust(&mut drive, held, &config.adjustment);
+        }
+        trajectory.poses = drive.poses;
+        Ok(trajectory)
+    }
+
+    /// The odometry, and the drive for loops and adjustment; `None` if no scan has enough points.
+    fn into_drive(mut self) -> (TrajectoryConfig, Trajectory, Option<Drive>) {
+        let poses: Vec<Pose3> = (self.estimates.iter())
+            .map(|estimate| estimate.odom_from_lidar)
+            .collect();
+        let drive = median(&mut self.ranges_m).map(|range_m| Drive {
+            samples: self.samples,
+            times_s: times_s(&self.estimates),
+            poses: poses.clone(),
+            range_m,
+            voxel_m: self.config.odometry.voxel_share * range_m,
+        });
+        let trajectory = Trajectory {
+            poses,
             odometry: self.estimates,
             loops: vec![],
             residuals_m: None,
         };
-        let middle = self.ranges_m.len() / 2;
-        if self.ranges_m.is_empty() {
-            return trajectory;
-        }
-        let range_m = *(self.ranges_m.select_nth_unstable_by(middle, f64::total_cmp)).1;
-        let mut drive = Drive {
-            samples: self.samples,
-            times_s: times_s(&trajectory.odometry),
-            poses: trajectory.poses.clone(),
-            range_m,
-            voxel_m: self.config.odometry.voxel_share * range_m,
-        };
-        let given = (!self.given.is_empty()).then_some(self.given);
-        if self.config.loops && given.is_none() {
-            trajectory.loops = close_loops(&mut drive, &trajectory.odometry);
-        }
-        if self.config.adjust {
-            trajectory.residuals_m = adjust(&mut drive, given.as_deref(), &self.config.adjustment);
-        }
-        trajectory.poses = drive.poses;
-        trajectory
+        (self.config, trajectory, drive)
     }
 }
 
@@ -174,8 +215,6 @@ fn times_s(estimates: &[OdometryEstimate]) -> Vec<f64> {
 
 /// Closes loops, twice: with better poses more are found.
 fn close_loops(drive: &mut Drive, odometry: &[OdometryEstimate]) -> Vec<Loop> {
-    /// Path of a local map, in ranges.
-    const LOCAL_MAP: f64 = 0.12;
     /// Drift of the odometry, as a share of the path, and what is left of it after the first round.
     const DRIFT: [f64; 2] = [0.02, 0.005];
     let maps = drive.local_maps(LOCAL_MAP * drive.range_m);
@@ -246,58 +285,6 @@ fn close(
         move_along(&mut drive.poses, maps, &centers, &optimized);
     }
     result
-}
-
-/// Edges of the pose graph between local maps in succession.
-fn odometry_edges(drive: &Drive, maps: &[LocalMap], odometry: &[OdometryEstimate]) -> Vec<Edge> {
-    /// Standard deviation of the motion: share of the path, and at least in voxels.
-    const SHARE: f64 = 0.003;
-    const FLOOR: f64 = 0.01;
-    /// Of the rotation [rad/m], and at least [rad].
-    const TURN_RAD_PER_M: f64 = 2e-4;
-    const TURN_FLOOR_RAD: f64 = 2e-4;
-    /// Factor where scans could not be registered.
-    const PREDICTED: f64 = 30.0;
-    (maps.windows(2).enumerate())
-        .map(|(first, pair)| {
-            let [a, b] = [pair[0].center, pair[1].center];
-            let first_from_second = drive.poses[a].inverse() * drive.poses[b];
-            let path_m = pair[1].travelled_m - pair[0].travelled_m;
-            let is_predicted =
-                (odometry[a + 1..=b].iter()).any(|step| step.state == StepState::Predicted);
-            let factor = if is_predicted { PREDICTED } else { 1.0 };
-            let shift = (factor * (SHARE * path_m + FLOOR * drive.voxel_m)).powi(-2);
-            let turn = (factor * (TURN_RAD_PER_M * path_m + TURN_FLOOR_RAD)).powi(-2);
-            Edge {
-                first,
-                second: first + 1,
-                first_from_second,
-                information: Matrix6::from_diagonal(&Vector6::new(
-                    shift, shift, shift, turn, turn, turn,
-                )),
-                is_loop: false,
-            }
-        })
-        .collect()
-}
-
-/// Moves all poses with the centers of their local maps; the correction changes evenly from one to the next.
-fn move_along(poses: &mut [Pose3], maps: &[LocalMap], before: &[Pose3], after: &[Pose3]) {
-    let correction = |map: usize| after[map] * before[map].inverse();
-    for (row, pose) in poses.iter_mut().enumerate() {
-        let next = maps.partition_point(|map| map.center <= row);
-        let last = next.saturating_sub(1);
-        let next = next.min(maps.len() - 1);
-        let span = maps[next].center - maps[last].center;
-        let share = match span {
-            0 => 0.0,
-            span => (row - maps[last].center) as f64 / span as f64,
-        };
-        // As motions of the pose itself, whose turns do not move it.
-        let moved = correction(last) * *pose;
-        let further = moved.inverse() * correction(next) * *pose;
-        *pose = moved * interpolate_motion(&further, share);
-    }
 }
 
 #[cfg(test)]

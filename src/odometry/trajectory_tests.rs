@@ -4,6 +4,7 @@ use nalgebra::Vector3;
 use rand::{SeedableRng as _, rngs::StdRng};
 use rand_distr::{Distribution as _, StandardNormal};
 
+use super::super::odometer::StepState;
 use super::super::tests::{World, drive};
 use super::*;
 
@@ -97,6 +98,50 @@ fn a_round_closes_its_loop_and_takes_the_drift_away() {
         let error_m = distance_m(&found.first_from_second, &true_transform);
         assert!(error_m < 0.1, "{found:?}");
     }
+}
+
+/// The walls, ground and boxes that a drawn world consists of, as a mesh in the frame of the first of some scans.
+fn surfaces_of(scans: &[Scan], poses: &[Pose3]) -> TriangleMesh {
+    let mut mesh = TriangleMesh::default();
+    for (scan, pose) in scans.iter().zip(poses) {
+        for point in &scan.points {
+            // Tiny triangles in the plane of the walls or of the ground.
+            let at = pose * nalgebra::Point3::from(point.as_dvec3());
+            let at = glam::DVec3::from(at.coords).as_vec3();
+            let first = mesh.vertices.len() as u32;
+            mesh.vertices.extend([at; 3]);
+            mesh.triangles.push([first, first + 1, first + 2]);
+        }
+    }
+    mesh
+}
+
+#[test]
+fn a_drive_that_leaves_a_map_is_in_its_frame_although_one_pose_in_it_is_wrong() {
+    let world = World::around_a_block();
+    let (mapped, mapped_poses) = scans(&world, 0.0, 24);
+    let mesh = surfaces_of(&mapped, &mapped_poses);
+    // The second drive begins in the map and leaves it; its poses in the map are rough.
+    let (second, truth) = scans(&world, 1.1, 28);
+    let mut builder = TrajectoryBuilder::new(TrajectoryConfig::default()).unwrap();
+    for scan in &second {
+        builder.add(scan).unwrap();
+    }
+    let mut rng = StdRng::seed_from_u64(5);
+    let mut found: Vec<Option<Pose3>> = (truth.iter().enumerate())
+        .map(|(row, pose)| (row < 14).then(|| pose * noise(&mut rng, 0.05, 0.3)))
+        .collect();
+    found[2] = Some(truth[2] * Pose3::translation(8.0, 3.0, 0.0));
+    let trajectory = builder.clone().finish_in_map(&mesh, &found).unwrap();
+    let errors_m: Vec<f64> = (trajectory.poses.iter().zip(&truth))
+        .map(|(pose, truth)| distance_m(pose, truth))
+        .collect();
+    let inside_m = errors_m[..14].iter().fold(0.0_f64, |a, b| a.max(*b));
+    let last_m = errors_m[27];
+    assert!(inside_m < 0.02 && last_m < 0.05, "{errors_m:?}");
+
+    let nowhere = builder.finish_in_map(&mesh, &[None; 28]);
+    assert_eq!(nowhere.unwrap_err(), NotInMap);
 }
 
 #[test]

@@ -120,7 +120,8 @@ impl EgoMotion {
         }
     }
 
-    /// Station on the path [m]; before the first and after the last scan the vehicle stands still.
+    /// Station on the path [m]; during the first and the last scan the vehicle keeps its speed, before and after
+    /// them it stands still.
     pub fn station_m(&self, time_s: f64) -> f64 {
         let index = time_s / SCAN_PERIOD_S;
         if let Some(kidnapped_at) = self.kidnapped_at
@@ -132,7 +133,12 @@ impl EgoMotion {
             let step_m = last_m - self.stations_m[kidnapped_at - 2];
             return last_m + (index - (kidnapped_at - 1) as f64) * step_m;
         }
-        interpolate(&self.stations_m, index)
+        let last = self.stations_m.len().saturating_sub(1) as f64;
+        let inside = index.clamp(0.0, last);
+        let beyond = (index - inside).clamp(-1.0, 1.0);
+        let at = |index: f64| interpolate(&self.stations_m, index);
+        let step_m = at(inside.max(1.0)) - at(inside.max(1.0) - 1.0);
+        at(inside) + beyond * step_m
     }
 
     /// Lidar pose at a time: `p_world = world_from_lidar * p_lidar`.

@@ -246,6 +246,10 @@ fn a_kidnapped_vehicle_is_displaced_without_its_odometry_noticing() {
     let last_s = 9.0 * SCAN_PERIOD_S;
     let drive = &simulation.ego_motion;
     assert!(drive.station_m(last_s + 0.09) - drive.station_m(last_s) < 1.5);
+    // So it does in the first half of the first revolution.
+    let first_m = [-0.05, 0.0, 0.05].map(|time_s| drive.station_m(time_s));
+    let [before_m, after_m] = [first_m[1] - first_m[0], first_m[2] - first_m[1]];
+    assert!((before_m - after_m).abs() < 1e-9 && before_m > 0.1);
     // A drive that ends before is not affected.
     let short = SimulationConfig {
         n_scans: 8,

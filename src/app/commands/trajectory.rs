@@ -1,13 +1,16 @@
 //! Poses of a recording from its scans, for `odometry` and `build-map`.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::Result;
 use serde::Serialize;
 
 use super::Context;
 use super::interrupt::Interrupted;
+use super::progress::Task;
 use crate::geometry::{Pose3, StampedPose};
+use crate::lidar::Scan;
 use crate::odometry::{LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig};
 use crate::recording::{Frame, Recording};
 
@@ -18,26 +21,39 @@ pub fn estimate(
     config: &TrajectoryConfig,
     context: &Context,
 ) -> Result<Trajectory> {
-    let kept = "nothing is written: loops and adjustment need all scans";
-    context.interrupt.keeps(kept.to_owned());
     let mut builder = TrajectoryBuilder::new(config.clone())?;
     let name = if is_given { "polish" } else { "odometry" };
+    let _task = each_scan(name, frames, context, |frame, scan| {
+        match frame.map_from_lidar {
+            Some(pose) if is_given => builder.add_given(scan, pose),
+            _ => {
+                builder.add(scan)?;
+            }
+        }
+        Ok(())
+    })?;
+    Ok(builder.finish())
+}
+
+/// Reads the scans of a trajectory one after the other, until an interruption; returns the progress, which goes on.
+pub fn each_scan(
+    name: &str,
+    frames: &[Frame],
+    context: &Context,
+    mut step: impl FnMut(&Frame, &Scan) -> Result<()>,
+) -> Result<Arc<Task>> {
+    let kept = "nothing is written: loops and adjustment need all scans";
+    context.interrupt.keeps(kept.to_owned());
     let task = context.progress.task(name, frames.len());
     for frame in frames {
         if context.interrupt.requested() {
             return Err(Interrupted { kept: kept.into() }.into());
         }
-        let scan = frame.read()?;
-        match frame.map_from_lidar {
-            Some(pose) if is_given => builder.add_given(&scan, pose),
-            _ => {
-                builder.add(&scan)?;
-            }
-        }
+        step(frame, &frame.read()?)?;
         task.advance(1);
     }
     task.note("loops and adjustment");
-    Ok(builder.finish())
+    Ok(task)
 }
 
 /// Poses with the numbers and times of frames.

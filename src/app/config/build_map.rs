@@ -53,6 +53,8 @@ pub struct BuildMapConfig {
     pub body_from_lidar: Option<[f64; 6]>,
     /// Whether the poses are those of `pose_file` or the recording, or found from the scans.
     pub poses: PoseSource,
+    /// Map to which the recording is added: it is localized in that map, and what has changed since is replaced.
+    pub onto: Option<PathBuf>,
     /// Output path of the map.
     #[default("results/map.ply".into())]
     pub mesh_file: PathBuf,
@@ -230,6 +232,15 @@ impl Validate for BuildMapConfig {
         optional_path("calib_file", self.calib_file.as_deref())?;
         mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
         optional_path("cloud_file", self.cloud_file.as_deref())?;
+        optional_path("onto", self.onto.as_deref())?;
+        if let Some(map) = &self.onto {
+            require(
+                self.cloud_file.is_none() && self.poses != PoseSource::Polished,
+                "onto",
+                map.display(),
+                "only scans are added to a map; their poses are adjusted to it: set cloud_file to null and poses to auto, or to given for those in the world of the map",
+            )?;
+        }
         path("mesh_file", &self.mesh_file)?;
         self.selection().validate()?;
         self.range_image.without_batches()?;

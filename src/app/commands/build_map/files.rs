@@ -13,6 +13,7 @@ pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
     let mut extensions = vec!["report.json", "effective.yml", "poses_tum.txt"];
     if config.visualize {
         extensions.extend(["png", "residuals.png"]);
+        extensions.extend(config.onto.is_some().then_some("changes.png"));
     }
     let name = |extension| {
         let path = config.mesh_file.with_extension(extension);
@@ -23,6 +24,7 @@ pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
     let optional = [
         ("cloud_file", &config.cloud_file),
         ("truth_mesh", &config.truth_mesh),
+        ("onto", &config.onto),
     ];
     inputs.extend((optional.iter()).filter_map(|(key, path)| Some((*key, path.as_deref()?))));
     inputs.extend(context.input());

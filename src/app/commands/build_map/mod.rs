@@ -3,6 +3,7 @@
 mod clock;
 mod cloud;
 mod files;
+mod onto;
 mod parts;
 mod pictures;
 mod pose_check;
@@ -20,8 +21,9 @@ use anyhow::{Context as _, Result};
 
 use self::clock::StageClock;
 use self::files::{prepare, write_map};
+use self::onto::{ChangesReport, OlderMap};
 pub use self::parts::hash_of_scan;
-use self::parts::{Parts, hash_of_scans, joint_hash};
+use self::parts::{Joined, Parts, hash_of_scans, joint_hash};
 pub use self::report::BuildReport;
 use super::claims::Claims;
 use super::interrupt::Interrupted;
@@ -56,22 +58,36 @@ fn run_with_scans(config: &BuildMapConfig, context: &Context) -> Result<BuildRep
         sequence,
         sensor,
         trajectory,
+        older,
     } = open(&mut resolved, &mut claims, context)?;
     let config = &resolved;
     let (mapped, held_out) = hold_out(&sequence.frames, config);
     let clock = Arc::new(StageClock::default());
-    let parts = Parts::open(&config.mesh_file, &inputs(config, &mapped)?)?;
-    let local_maps = build_parts(config, context, &mapped, &parts, &clock)?;
-    let mesh = clock.time("join", || parts.join(local_maps.len()))?;
-    let path = MappingPath {
-        world_from_map: sequence.world().0,
-        map_from_lidar: poses_of(&mapped),
+    let parts = Parts::open(&config.mesh_file, &inputs(config, &mapped, older.as_ref())?)?;
+    let older = older.as_ref();
+    let local_maps = build_parts(config, context, &mapped, (&parts, &clock), older)?;
+    let Joined { mesh: added, gone } = clock.time("join", || parts.join(local_maps.len()))?;
+    let poses = poses_of(&mapped);
+    let (mesh, path) = match older {
+        Some(older) => (older.join(&gone, &added), older.path.extended_by(&poses)),
+        None => {
+            let world_from_map = sequence.world().0;
+            let path = MappingPath {
+                world_from_map,
+                map_from_lidar: poses,
+            };
+            (added.clone(), path)
+        }
     };
     let residuals = clock.time("quality", || residuals(config, &mesh, &held_out))?;
     write_map(config, &mesh, &path, &mut claims)?;
     let truth = clock.time("truth", || agreement(config, &mesh, &path))?;
     if config.visualize {
         pictures::draw(config, &mesh, &path.map_from_lidar, &residuals)?;
+        if let Some(older) = older {
+            let picture = config.mesh_file.with_extension("changes.png");
+            onto::draw(older, &gone, &added, &picture)?;
+        }
     }
     let report = BuildReport {
         frames: sequence.frames.len(),
@@ -79,6 +95,7 @@ fn run_with_scans(config: &BuildMapConfig, context: &Context) -> Result<BuildRep
         held_out_frames: held_out.len(),
         sensor,
         trajectory,
+        changes: older.map(|older| ChangesReport::of(older, &gone, &added)),
         stage_seconds: clock.seconds(),
         quality: MapQuality::of(&residuals),
         truth,
@@ -101,6 +118,8 @@ struct Opened {
     sensor: Option<SensorDescription>,
     /// What the poses show about themselves, where they were found in this run.
     trajectory: Option<TrajectorySummary>,
+    /// The map to which the recording is added.
+    older: Option<OlderMap>,
 }
 
 /// Opens the recording with its poses, or finds them, and completes the configuration by what the scans show about the
@@ -111,8 +130,12 @@ fn open(config: &mut BuildMapConfig, claims: &mut Claims, context: &Context) -> 
     if let Some(path) = &config.truth_mesh {
         input::require_file("truth_mesh", path)?;
     }
+    let (older, older_map) = OlderMap::open(config, context)?.unzip();
     let mut recording = inputs.open(&config.selection())?;
-    let given = poses::given(config, &recording)?;
+    let given = poses::given(config, &recording)?.map(|track| match &older {
+        Some(older) => track.in_map(&older.path.world_from_map),
+        None => track,
+    });
     let pose_file = given.as_ref().map(|track| track.path.clone());
     if let (Some(track), Some(pose_file)) = (given, &pose_file) {
         recording = recording.with_poses(track)?;
@@ -125,7 +148,7 @@ fn open(config: &mut BuildMapConfig, claims: &mut Claims, context: &Context) -> 
     }
     let mut trajectory = None;
     if sequence.track.is_none() || config.poses == PoseSource::Polished {
-        (sequence, trajectory) = poses::find(sequence, config, context)?;
+        (sequence, trajectory) = poses::find(sequence, config, older_map.as_ref(), context)?;
         poses::check(&sequence, config, &file_beside(&config.mesh_file))?;
     } else if let Some(name) = file_beside(&config.mesh_file).file_name() {
         claims.remove(&[&name.to_string_lossy()])?;
@@ -134,6 +157,7 @@ fn open(config: &mut BuildMapConfig, claims: &mut Claims, context: &Context) -> 
         sequence: sequence.compensated_by_poses(),
         sensor,
         trajectory,
+        older,
     })
 }
 
@@ -160,8 +184,8 @@ fn build_parts(
     config: &BuildMapConfig,
     context: &Context,
     frames: &[Frame],
-    parts: &Parts,
-    clock: &Arc<StageClock>,
+    (parts, clock): (&Parts, &Arc<StageClock>),
+    older: Option<&OlderMap>,
 ) -> Result<Vec<LocalMapCounts>> {
     let poses = poses_of(frames);
     let planned = local_maps(&poses, config.local_map_size, config.overlap_m);
@@ -187,7 +211,8 @@ fn build_parts(
         },
         ..MapBuilder::new(config.map())
     };
-    let plan = builder.plan(poses)?;
+    let mut plan = builder.plan(poses)?;
+    plan.older = older.map(|older| &*older.mesh);
     let mut all = Vec::with_capacity(plan.local_maps.len());
     context.interrupt.keeps(kept(0, &plan, parts));
     for local_map in &plan.local_maps {
@@ -304,8 +329,8 @@ fn kept(finished: usize, plan: &MapPlan, parts: &Parts) -> String {
 }
 
 /// Inputs on which all local maps depend: the program, the configuration without the paths of outputs,
-/// and the poses. The content of the scans is recorded with each local map.
-fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
+/// the older map, and the poses. The content of the scans is recorded with each local map.
+fn inputs(config: &BuildMapConfig, frames: &[Frame], older: Option<&OlderMap>) -> Result<String> {
     let relevant = BuildMapConfig {
         mesh_file: PathBuf::new(),
         truth_mesh: None,
@@ -315,6 +340,9 @@ fn inputs(config: &BuildMapConfig, frames: &[Frame]) -> Result<String> {
     };
     let mut text = format!("# {}\n", version::program()?);
     text += &config::to_yaml(&relevant)?;
+    if let Some(older) = older {
+        writeln!(text, "onto {}", older.hash)?;
+    }
     for frame in frames {
         let path = &frame.source;
         let pose = frame.map_from_lidar.unwrap_or_default();

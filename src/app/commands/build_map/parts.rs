@@ -33,6 +33,18 @@ struct Part {
     /// Hash of the file of its mesh; `None` if it has no triangles.
     mesh_hash: Option<String>,
     counts: LocalMapCounts,
+    /// Triangles of the older map that are gone.
+    #[serde(default)]
+    gone: Vec<u32>,
+}
+
+/// What local maps add to a map, and what is gone from it.
+#[derive(Debug, Default)]
+pub struct Joined {
+    /// The mesh of all local maps.
+    pub mesh: TriangleMesh,
+    /// Triangles of the older map that are gone, ascending.
+    pub gone: Vec<u32>,
 }
 
 /// The folder of finished local maps of one build, locked.
@@ -104,22 +116,25 @@ impl Parts {
             scans_hash: scans_hash.to_owned(),
             mesh_hash,
             counts: local_map.counts.clone(),
+            gone: local_map.gone.clone(),
         };
         output::write_json(&counts, &part)
     }
 
     /// Joins the meshes of the local maps 0..count; an error if one is missing or damaged.
-    pub fn join(&self, count: usize) -> Result<TriangleMesh> {
-        let mut whole = TriangleMesh::default();
+    pub fn join(&self, count: usize) -> Result<Joined> {
+        let mut whole = Joined::default();
         for number in 0..count {
             let part = self.read(number).with_context(|| {
                 let folder = self.folder.display();
                 format!("{folder} has lost local map {number}; run the same command again")
             })?;
             if part.mesh_hash.is_some() {
-                whole.append(&ply::read(&self.mesh_file(number))?);
+                whole.mesh.append(&ply::read(&self.mesh_file(number))?);
             }
+            whole.gone.extend(part.gone);
         }
+        whole.gone.sort_unstable();
         Ok(whole)
     }
 
@@ -200,7 +215,8 @@ fn lock(folder: &Path, mesh_file: &Path) -> Result<File> {
     }
 }
 
-fn hash_of_file(path: &Path) -> Result<String> {
+/// BLAKE3 hash of a file.
+pub fn hash_of_file(path: &Path) -> Result<String> {
     let mut hasher = blake3::Hasher::new();
     (File::open(path).and_then(|file| hasher.update_reader(file).map(drop)))
         .with_context(|| format!("cannot read {}", path.display()))?;
@@ -272,7 +288,7 @@ mod tests {
         assert_eq!(again.finished(1, || Ok("0123".into())).unwrap().scans, 7);
         assert_eq!(again.finished(1, || Ok("4567".into())), None);
         assert_eq!(again.finished(2, || Ok("0123".into())), None);
-        let whole = again.join(2).unwrap();
+        let whole = again.join(2).unwrap().mesh;
         assert_eq!(whole.vertices[0].x, 0.5);
         assert_eq!(whole.vertices[3].x, 1.5);
     }
@@ -331,6 +347,6 @@ mod tests {
         parts.save(0, &local_map(0.5), "0123").unwrap();
         parts.save(0, &LocalMap::default(), "").unwrap();
         assert!(parts.finished(0, || Ok("".into())).is_some());
-        assert!(parts.join(1).unwrap().triangles.is_empty());
+        assert!(parts.join(1).unwrap().mesh.triangles.is_empty());
     }
 }

@@ -5,10 +5,13 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result};
 
+use super::onto;
+use super::parts::hash_of_file;
 use crate::app::commands::trajectory::{self, TrajectorySummary};
 use crate::app::commands::{Context, output, version};
 use crate::app::config::{BuildMapConfig, PoseSource};
 use crate::geometry::Pose3;
+use crate::map::Map;
 use crate::odometry::TrajectoryConfig;
 use crate::recording::poses::write_tum;
 use crate::recording::{Frame, PoseTrack, Recording};
@@ -17,6 +20,13 @@ use crate::recording::{Frame, PoseTrack, Recording};
 pub fn given(config: &BuildMapConfig, recording: &Recording) -> Result<Option<PoseTrack>> {
     let inputs = config.recording_inputs();
     if config.poses == PoseSource::Odometry {
+        return Ok(None);
+    }
+    if let (Some(map), PoseSource::Auto) = (&config.onto, config.poses) {
+        let map = map.display();
+        tracing::info!(
+            "poses from the scans in {map}; `poses: given` takes those of the recording"
+        );
         return Ok(None);
     }
     if let Some(path) = &config.pose_file {
@@ -31,11 +41,12 @@ pub fn given(config: &BuildMapConfig, recording: &Recording) -> Result<Option<Po
     }
 }
 
-/// The recording with poses from its scans, or with its own ones polished. They are kept in a file beside the map, from
+/// The recording with poses from its scans, in an older map where there is one, or with its own ones polished. They are kept in a file beside the map, from
 /// which they are read where it belongs to the same scans; the summary is that of poses that were found now.
 pub fn find(
     mut recording: Recording,
     config: &BuildMapConfig,
+    older: Option<&Map>,
     context: &Context,
 ) -> Result<(Recording, Option<TrajectorySummary>)> {
     let path = trajectory::file_beside(&config.mesh_file);
@@ -44,19 +55,25 @@ pub fn find(
         true => recording.frames.clone(),
         false => trajectory::dense_frames(&recording),
     };
-    let heading = format!("# fpmcl poses {}\n", inputs(&frames, is_given)?);
+    let map_hash = config.onto.as_deref().map(hash_of_file).transpose()?;
+    let hash = inputs(&frames, is_given, map_hash.as_deref())?;
+    let heading = format!("# fpmcl poses {hash}\n");
     let is_found = fs::read_to_string(&path).is_ok_and(|text| text.starts_with(&heading));
+    let world = older.map(|map| map.path.world_from_map);
     let mut summary = None;
     if is_found {
         tracing::info!("the poses in {} are finished already", path.display());
     } else {
         let settings = TrajectoryConfig::default();
-        let found = trajectory::estimate(&frames, is_given, &settings, context)?;
+        let found = match older {
+            Some(map) => onto::find(&frames, map, config, context)?,
+            None => trajectory::estimate(&frames, is_given, &settings, context)?,
+        };
         let found_now = TrajectorySummary::of(&found, recording.has_times);
         found_now.warn();
         summary = Some(found_now);
-        // Rows of the lidar in the world of the given poses.
-        let (world_from_map, _) = recording.world();
+        // Rows of the lidar in the world of the given poses, or of the older map.
+        let world_from_map = world.unwrap_or(recording.world().0);
         let poses: Vec<Pose3> = found
             .poses
             .iter()
@@ -70,13 +87,17 @@ pub fn find(
     }
     // Its rows have the times of the frames, also where these are assumed.
     recording.has_times = true;
-    let recording = recording.with_poses(PoseTrack::read(&path, None)?)?;
-    Ok((recording, summary))
+    let mut track = PoseTrack::read(&path, None)?;
+    if let Some(world_from_map) = world {
+        track = track.in_map(&world_from_map);
+    }
+    Ok((recording.with_poses(track)?, summary))
 }
 
 /// Hash of what the poses depend on; of a scan its place and size.
-fn inputs(frames: &[Frame], is_given: bool) -> Result<String> {
+fn inputs(frames: &[Frame], is_given: bool, map_hash: Option<&str>) -> Result<String> {
     let mut hasher = blake3::Hasher::new();
+    hasher.update(map_hash.unwrap_or_default().as_bytes());
     hasher.update(version::program()?.as_bytes());
     for frame in frames {
         let source = frame.source.to_string();

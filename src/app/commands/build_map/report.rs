@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use super::onto::ChangesReport;
 use crate::app::commands::output;
 use crate::app::commands::trajectory::TrajectorySummary;
 use crate::evaluation::{MapQuality, TruthAgreement};
@@ -26,6 +27,8 @@ pub struct BuildReport {
     pub sensor: Option<SensorDescription>,
     /// What poses that were found in this run show about themselves.
     pub trajectory: Option<TrajectorySummary>,
+    /// What changed in the older map, where there is one.
+    pub changes: Option<ChangesReport>,
     /// Length of the path of the mapped scans [m].
     pub path_m: f64,
     /// Triangles of the map.
@@ -102,6 +105,7 @@ impl BuildReport {
                 ),
             ));
         }
+        rows.extend(self.changes.iter().flat_map(ChangesReport::rows));
         if let Some(trajectory) = &self.trajectory {
             let found = trajectory.rows().into_iter();
             rows.extend(found.filter(|(name, _)| !matches!(*name, "scans" | "path")));

@@ -1,0 +1,155 @@
+//! The older map to which a build adds a newer drive.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::Result;
+use serde::Serialize;
+
+use super::parts::hash_of_file;
+use crate::app::commands::stages::MapInputs;
+use crate::app::commands::{Context, input, trajectory};
+use crate::app::config::{BuildMapConfig, LocalizationConfig};
+use crate::app::plotting::MapPlot;
+use crate::geometry::{TriangleMesh, pose2_from_pose3};
+use crate::localization::SecondDrive;
+use crate::map::{Map, MappingPath, changes};
+use crate::odometry::{Trajectory, TrajectoryConfig};
+use crate::recording::Frame;
+
+/// A map that is extended.
+pub struct OlderMap {
+    /// Its file.
+    pub file: PathBuf,
+    /// Hash of the file.
+    pub hash: String,
+    /// Its surface.
+    pub mesh: Arc<TriangleMesh>,
+    /// Its frame and path.
+    pub path: Arc<MappingPath>,
+}
+
+impl OlderMap {
+    /// Reads the map of the key `onto`; `None` without one.
+    pub fn open(config: &BuildMapConfig, context: &Context) -> Result<Option<(Self, Map)>> {
+        let Some(file) = &config.onto else {
+            return Ok(None);
+        };
+        input::require_file("onto", file)?;
+        let inputs = MapInputs {
+            map_file: file,
+            map_pose_file: None,
+            map_calib_file: None,
+        };
+        let map = inputs.load(Some(config.range_image.batch_size()), context)?;
+        let older = Self {
+            file: file.clone(),
+            hash: hash_of_file(file)?,
+            mesh: map.mesh.clone(),
+            path: map.path.clone(),
+        };
+        Ok(Some((older, map)))
+    }
+
+    /// The map with a newer drive.
+    pub fn join(&self, gone: &[u32], added: &TriangleMesh) -> TriangleMesh {
+        changes::joined(&self.mesh, gone, added)
+    }
+}
+
+/// Finds the trajectory of scans in a map.
+pub fn find(
+    frames: &[Frame],
+    map: &Map,
+    config: &BuildMapConfig,
+    context: &Context,
+) -> Result<Trajectory> {
+    let localization = LocalizationConfig {
+        range_image: config.range_image.clone(),
+        own_car_m: config.own_car_m,
+        ground_method: config.ground_method,
+        fuzzy: config.fuzzy.clone(),
+        pca: config.pca,
+        ..LocalizationConfig::default()
+    };
+    let settings = TrajectoryConfig::default();
+    let mut drive = SecondDrive::new(map, localization.localizer(), settings, config.seed)?;
+    let _task = trajectory::each_scan("localize", frames, context, |_, scan| {
+        drive.add(scan)?;
+        Ok(())
+    })?;
+    let (found, all) = (drive.found(), frames.len());
+    tracing::info!("{found} of {all} scans are found in the older map");
+    Ok(drive.finish()?)
+}
+
+/// What a drive changed in an older map.
+#[derive(Clone, Debug, Serialize)]
+pub struct ChangesReport {
+    /// The older map.
+    pub onto: PathBuf,
+    /// Triangles of the older map that are gone.
+    pub gone_triangles: usize,
+    /// Their area [m²].
+    pub gone_m2: f64,
+    /// Triangles that were added.
+    pub added_triangles: usize,
+    /// Their area [m²].
+    pub added_m2: f64,
+}
+
+impl ChangesReport {
+    /// Of triangles that are gone, and a mesh that was added.
+    pub fn of(older: &OlderMap, gone: &[u32], added: &TriangleMesh) -> Self {
+        let area_m2 = |mesh: &TriangleMesh, triangles: &mut dyn Iterator<Item = usize>| -> f64 {
+            let doubled = triangles.map(|it| f64::from(mesh.scaled_normal(it).length()));
+            0.5 * doubled.sum::<f64>()
+        };
+        Self {
+            onto: older.file.clone(),
+            gone_triangles: gone.len(),
+            gone_m2: area_m2(&older.mesh, &mut gone.iter().map(|&it| it as usize)),
+            added_triangles: added.triangles.len(),
+            added_m2: area_m2(added, &mut (0..added.triangles.len())),
+        }
+    }
+
+    /// Rows of the table on standard output.
+    pub fn rows(&self) -> Vec<(&'static str, String)> {
+        let area = |m2: f64, triangles: usize| format!("{m2:.0} m², {triangles} triangles");
+        vec![
+            ("gone", area(self.gone_m2, self.gone_triangles)),
+            ("added", area(self.added_m2, self.added_triangles)),
+        ]
+    }
+}
+
+/// Draws the older map with what is gone and what was added.
+pub fn draw(older: &OlderMap, gone: &[u32], added: &TriangleMesh, picture: &Path) -> Result<()> {
+    const KEPT: [u8; 3] = [200, 200, 200];
+    const GONE: [u8; 3] = [214, 39, 40];
+    const ADDED: [u8; 3] = [44, 160, 44];
+    let painted = |mesh: &TriangleMesh, color: [u8; 3]| TriangleMesh {
+        colors: vec![color; mesh.vertices.len()],
+        ..mesh.clone()
+    };
+    let mut mesh = painted(&older.mesh, KEPT);
+    let mut lost = painted(&older.mesh, GONE);
+    let is_gone = |triangle: usize| gone.binary_search(&(triangle as u32)).is_ok();
+    mesh.retain_triangles(|triangle, _| !is_gone(triangle));
+    lost.retain_triangles(|triangle, _| is_gone(triangle));
+    mesh.append(&painted(added, ADDED));
+    mesh.append(&lost);
+    let path: Vec<_> = (older.path.map_from_lidar.iter())
+        .map(pose2_from_pose3)
+        .collect();
+    MapPlot {
+        title: "Changes of the map",
+        mesh: &mesh,
+        path: Some(("older mapping trajectory", &path)),
+        keys: &[("kept", KEPT), ("gone", GONE), ("added", ADDED)],
+    }
+    .save(picture)?;
+    tracing::info!("drew {}", picture.display());
+    Ok(())
+}

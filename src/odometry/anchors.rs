@@ -1,0 +1,197 @@
+//! A drive in an older map: poses of scans that were found in it hold the drive.
+//!
+//! The drive is first moved as a whole, by the scan whose pose in the map the most others agree with, and
+//! then bent: a pose graph over its local maps, the motions between them, its loops and the map, with a robust kernel for
+//! loops and for poses in the map. A pose in the map counts if the map has the surfaces around it, as those of a loop.
+
+use std::collections::HashSet;
+
+use glam::{DVec3, IVec3};
+use nalgebra::{Matrix6, Vector6};
+
+use super::drive::{Drive, LocalMap};
+use super::loops::{Loop, LoopVerdict, MIN_COMMON, common_share};
+use super::odometer::OdometryEstimate;
+use super::path_graph::{LOCAL_MAP, move_along, odometry_edges};
+use super::pose_graph::{Edge, optimize};
+use super::voxel_map::{CellHasher, VoxelMap, pack};
+use crate::geometry::{Pose3, TriangleMesh};
+
+/// The drive was not found in the map.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "the recording was not found in the map, or its scans were found at places that contradict its motion: it may be of another road"
+)]
+pub struct NotInMap;
+
+/// A drive that was moved into a map.
+pub struct Placed {
+    /// Transform of the frame of the odometry.
+    pub map_from_odom: Pose3,
+    /// Points on the surfaces of the map around the drive, evenly spread.
+    pub surfaces: Vec<DVec3>,
+}
+
+/// Moves the poses of a drive into a map in which some of its scans were found.
+pub fn place(
+    drive: &mut Drive,
+    mesh: &TriangleMesh,
+    map_from_lidar: &[Option<Pose3>],
+    odometry: &[OdometryEstimate],
+    loops: &[Loop],
+) -> Result<Placed, NotInMap> {
+    /// Distance between points on the surfaces, in voxels.
+    const SPACING: f64 = 0.25;
+    let found: Vec<(usize, Pose3)> = (map_from_lidar.iter().enumerate())
+        .filter_map(|(row, pose)| Some((row, (*pose)?)))
+        .collect();
+    let map_from_odom = common_transform(drive, &found).ok_or(NotInMap)?;
+    for pose in &mut drive.poses {
+        *pose = map_from_odom * *pose;
+    }
+    let maps = drive.local_maps(LOCAL_MAP * drive.range_m);
+    let surfaces = surface_points(mesh, drive, SPACING * drive.voxel_m);
+    let mut voxels = VoxelMap::new(drive.voxel_m, f32::MAX);
+    voxels.insert(&surfaces);
+    let in_map: Vec<Edge> = map_edges(drive, &maps, &found)
+        .into_iter()
+        .filter(|edge| {
+            let points = drive.local_points(&maps[edge.second - 1], 2.0 * drive.voxel_m);
+            common_share(&voxels, &points, &edge.first_from_second, drive) > MIN_COMMON
+        })
+        .collect();
+    if in_map.is_empty() {
+        return Err(NotInMap);
+    }
+    // The map is the first pose of the graph.
+    let mut edges = odometry_edges(drive, &maps, odometry);
+    edges.extend(loop_edges(&maps, loops));
+    for edge in &mut edges {
+        edge.first += 1;
+        edge.second += 1;
+    }
+    edges.extend(in_map);
+    let centers: Vec<Pose3> = maps.iter().map(|map| drive.poses[map.center]).collect();
+    let mut poses = vec![Pose3::identity()];
+    poses.extend(&centers);
+    if let Some((optimized, _)) = optimize(&poses, &edges) {
+        move_along(&mut drive.poses, &maps, &centers, &optimized[1..]);
+    }
+    Ok(Placed {
+        map_from_odom,
+        surfaces,
+    })
+}
+
+/// The transform from the frame of the odometry that agrees with the most scans.
+fn common_transform(drive: &Drive, found: &[(usize, Pose3)]) -> Option<Pose3> {
+    /// Number of transforms that are compared.
+    const CANDIDATES: usize = 200;
+    /// Difference of the positions of a scan that agrees: share of the path, and at least in voxels.
+    const DRIFT: f64 = 0.02;
+    const NEAR: f64 = 1.0;
+    let travelled_m = drive.travelled_m();
+    let agreeing = |&(row, map_from_odom): &(usize, Pose3)| {
+        let agrees = |(other, pose): &&(usize, Pose3)| {
+            let moved = map_from_odom * drive.poses[*other];
+            let path_m = (travelled_m[*other] - travelled_m[row]).abs();
+            let distance_m = (moved.translation.vector - pose.translation.vector).norm();
+            distance_m < NEAR * drive.voxel_m + DRIFT * path_m
+        };
+        found.iter().filter(agrees).count()
+    };
+    let step = found.len().div_ceil(CANDIDATES).max(1);
+    let candidates =
+        (found.iter().step_by(step)).map(|(row, pose)| (*row, pose * drive.poses[*row].inverse()));
+    let mut best: Option<(usize, Pose3)> = None;
+    for candidate in candidates {
+        let count = agreeing(&candidate);
+        if best.is_none_or(|(most, _)| count > most) {
+            best = Some((count, candidate.1));
+        }
+    }
+    // Places that look alike do not agree with the odometry.
+    best.filter(|(count, _)| 2 * count > found.len())
+        .map(|(_, map_from_odom)| map_from_odom)
+}
+
+fn information(shift_m: f64, turn_rad: f64) -> Matrix6<f64> {
+    let [shift, turn] = [shift_m.powi(-2), turn_rad.powi(-2)];
+    Matrix6::from_diagonal(&Vector6::new(shift, shift, shift, turn, turn, turn))
+}
+
+/// The loops that the poses follow.
+fn loop_edges(maps: &[LocalMap], loops: &[Loop]) -> Vec<Edge> {
+    /// Standard deviations [m], [rad].
+    const SHIFT_M: f64 = 0.05;
+    const TURN_RAD: f64 = 0.005;
+    let map_of = |row: usize| maps.partition_point(|map| map.rows.end <= row);
+    (loops.iter())
+        .filter(|found| found.verdict == LoopVerdict::Accepted)
+        .map(|found| Edge {
+            first: map_of(found.first),
+            second: map_of(found.second),
+            first_from_second: found.first_from_second,
+            information: information(SHIFT_M, TURN_RAD),
+            is_loop: true,
+        })
+        .collect()
+}
+
+/// For each local map, the scan nearest to its center that was found in the map.
+fn map_edges(drive: &Drive, maps: &[LocalMap], found: &[(usize, Pose3)]) -> Vec<Edge> {
+    /// Standard deviations of a pose in the map [m], [rad]: the tilt is that of the ground.
+    const SHIFT_M: f64 = 0.1;
+    const TURN_RAD: f64 = 0.01;
+    (maps.iter().enumerate())
+        .filter_map(|(number, map)| {
+            let within = found.partition_point(|(row, _)| *row < map.rows.start)
+                ..found.partition_point(|(row, _)| *row < map.rows.end);
+            let nearest = found[within]
+                .iter()
+                .min_by_key(|(row, _)| row.abs_diff(map.center));
+            let (row, pose) = nearest?;
+            let lidar_from_center = drive.poses[*row].inverse() * drive.poses[map.center];
+            Some(Edge {
+                first: 0,
+                second: number + 1,
+                first_from_second: pose * lidar_from_center,
+                information: information(SHIFT_M, TURN_RAD),
+                is_loop: true,
+            })
+        })
+        .collect()
+}
+
+/// Points on the surfaces of a mesh within about the range of the sensor from a drive, one per voxel of the spacing.
+pub fn surface_points(mesh: &TriangleMesh, drive: &Drive, spacing_m: f64) -> Vec<DVec3> {
+    let cell_of = |point: DVec3| (point / drive.range_m).floor().as_ivec3();
+    let mut near = HashSet::<u64, CellHasher>::default();
+    for pose in &drive.poses {
+        let center = cell_of(pose.translation.vector.into());
+        for index in 0..27 {
+            near.insert(pack(
+                center + IVec3::new(index % 3, index / 3 % 3, index / 9) - 1,
+            ));
+        }
+    }
+    let mut occupied = HashSet::<u64, CellHasher>::default();
+    let mut points = vec![];
+    for triangle in 0..mesh.triangles.len() {
+        let [a, b, c] = mesh.corners(triangle).map(glam::Vec3::as_dvec3);
+        if !near.contains(&pack(cell_of((a + b + c) / 3.0))) {
+            continue;
+        }
+        let (u, v) = (b - a, c - a);
+        let longest_m = u.length().max(v.length()).max((c - b).length());
+        let count = (longest_m / spacing_m).ceil().max(1.0);
+        let grid = (0..count as usize).flat_map(|i| (0..count as usize - i).map(move |j| (i, j)));
+        points.extend(
+            grid.map(|(i, j)| {
+                a + (i as f64 + 1.0 / 3.0) / count * u + (j as f64 + 1.0 / 3.0) / count * v
+            })
+            .filter(|point| occupied.insert(pack((point / spacing_m).floor().as_ivec3()))),
+        );
+    }
+    points
+}

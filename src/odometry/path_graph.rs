@@ -1,0 +1,68 @@
+//! The pose graph of a drive: its local maps, the motions between them, and the scans that move with them.
+
+use nalgebra::{Matrix6, Vector6};
+
+use super::drive::{Drive, LocalMap};
+use super::odometer::{OdometryEstimate, StepState};
+use super::pose_graph::Edge;
+use crate::geometry::Pose3;
+use crate::lidar::interpolate_motion;
+
+/// Path of a local map, in ranges.
+pub const LOCAL_MAP: f64 = 0.12;
+
+/// Edges of the pose graph between local maps in succession.
+pub fn odometry_edges(
+    drive: &Drive,
+    maps: &[LocalMap],
+    odometry: &[OdometryEstimate],
+) -> Vec<Edge> {
+    /// Standard deviation of the motion: share of the path, and at least in voxels.
+    const SHARE: f64 = 0.003;
+    const FLOOR: f64 = 0.01;
+    /// Of the rotation [rad/m], and at least [rad].
+    const TURN_RAD_PER_M: f64 = 2e-4;
+    const TURN_FLOOR_RAD: f64 = 2e-4;
+    /// Factor where scans could not be registered.
+    const PREDICTED: f64 = 30.0;
+    (maps.windows(2).enumerate())
+        .map(|(first, pair)| {
+            let [a, b] = [pair[0].center, pair[1].center];
+            let first_from_second = drive.poses[a].inverse() * drive.poses[b];
+            let path_m = pair[1].travelled_m - pair[0].travelled_m;
+            let is_predicted =
+                (odometry[a + 1..=b].iter()).any(|step| step.state == StepState::Predicted);
+            let factor = if is_predicted { PREDICTED } else { 1.0 };
+            let shift = (factor * (SHARE * path_m + FLOOR * drive.voxel_m)).powi(-2);
+            let turn = (factor * (TURN_RAD_PER_M * path_m + TURN_FLOOR_RAD)).powi(-2);
+            Edge {
+                first,
+                second: first + 1,
+                first_from_second,
+                information: Matrix6::from_diagonal(&Vector6::new(
+                    shift, shift, shift, turn, turn, turn,
+                )),
+                is_loop: false,
+            }
+        })
+        .collect()
+}
+
+/// Moves all poses with the centers of their local maps; the correction changes evenly from one to the next.
+pub fn move_along(poses: &mut [Pose3], maps: &[LocalMap], before: &[Pose3], after: &[Pose3]) {
+    let correction = |map: usize| after[map] * before[map].inverse();
+    for (row, pose) in poses.iter_mut().enumerate() {
+        let next = maps.partition_point(|map| map.center <= row);
+        let last = next.saturating_sub(1);
+        let next = next.min(maps.len() - 1);
+        let span = maps[next].center - maps[last].center;
+        let share = match span {
+            0 => 0.0,
+            span => (row - maps[last].center) as f64 / span as f64,
+        };
+        // As motions of the pose itself, whose turns do not move it.
+        let moved = correction(last) * *pose;
+        let further = moved.inverse() * correction(next) * *pose;
+        *pose = moved * interpolate_motion(&further, share);
+    }
+}
