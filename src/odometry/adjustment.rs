@@ -129,6 +129,7 @@ pub fn adjust(drive: &mut Drive, held: Held, config: &AdjustmentConfig) -> Optio
     };
     let mut kernels_m = vec![drive.voxel_m; drive.poses.len()];
     let mut result: Option<[f64; 2]> = None;
+    let first = drive.poses.first().copied().unwrap_or_default();
     for iteration in 0..coarse.len() + config.iterations {
         let factor = coarse.get(iteration).copied().unwrap_or(1.0);
         let edge_m = factor * config.voxels * drive.voxel_m;
@@ -164,6 +165,13 @@ pub fn adjust(drive: &mut Drive, held: Held, config: &AdjustmentConfig) -> Optio
             break;
         }
     }
+    if matches!(held, Held::First) {
+        // All move with the first: to move it alone against the others would take many steps.
+        let as_before = first * drive.poses[0].inverse();
+        for pose in &mut drive.poses {
+            *pose = as_before * *pose;
+        }
+    }
     result
 }
 
@@ -186,12 +194,14 @@ fn information(shift_m: f64, turn_deg: f64) -> Matrix6<f64> {
     Matrix6::from_diagonal(&Vector6::new(shift, shift, shift, turn, turn, turn))
 }
 
-/// Holds the poses near given ones, or the first one where it is; the surfaces of a map hold them by their planes.
+/// Holds the poses near given ones, or damps the first one, without which they could move together; the surfaces of a map
+/// hold them by their planes.
 fn hold(system: &mut BlockSystem, poses: &[Pose3], held: Held, config: &AdjustmentConfig) {
-    const HOLD: f64 = 1e12;
+    /// Information of the damping [1/m², 1/rad²].
+    const DAMPING: f64 = 1.0;
     let given = match held {
         Held::First => {
-            system.add(0, &(Matrix6::identity() * HOLD), &Vector6::zeros());
+            system.add(0, &(Matrix6::identity() * DAMPING), &Vector6::zeros());
             return;
         }
         Held::Surfaces(_) => return,

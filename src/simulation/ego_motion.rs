@@ -120,8 +120,7 @@ impl EgoMotion {
         }
     }
 
-    /// Station on the path [m]; during the first and the last scan the vehicle keeps its speed, before and after
-    /// them it stands still.
+    /// Station on the path [m]; before the first and after the last scan the vehicle stands still.
     pub fn station_m(&self, time_s: f64) -> f64 {
         let index = time_s / SCAN_PERIOD_S;
         if let Some(kidnapped_at) = self.kidnapped_at
@@ -133,16 +132,23 @@ impl EgoMotion {
             let step_m = last_m - self.stations_m[kidnapped_at - 2];
             return last_m + (index - (kidnapped_at - 1) as f64) * step_m;
         }
-        let last = self.stations_m.len().saturating_sub(1) as f64;
-        let inside = index.clamp(0.0, last);
-        let beyond = (index - inside).clamp(-1.0, 1.0);
-        let at = |index: f64| interpolate(&self.stations_m, index);
-        let step_m = at(inside.max(1.0)) - at(inside.max(1.0) - 1.0);
-        at(inside) + beyond * step_m
+        interpolate(&self.stations_m, index)
     }
 
-    /// Lidar pose at a time: `p_world = world_from_lidar * p_lidar`.
+    /// Lidar pose at a time: `p_world = world_from_lidar * p_lidar`. During the first revolution the vehicle comes from
+    /// where it would go backwards, and so on during the last one, so that neither begins or ends with a jerk.
     pub fn world_from_lidar(&self, ground: &GroundField, time_s: f64) -> Pose3 {
+        let last_s = self.stations_m.len().saturating_sub(1) as f64 * SCAN_PERIOD_S;
+        let end_s = time_s.clamp(0.0, last_s);
+        if end_s == time_s {
+            return self.inside(ground, time_s);
+        }
+        let [end, mirrored] = [end_s, 2.0 * end_s - time_s].map(|s| self.inside(ground, s));
+        end * mirrored.inverse() * end
+    }
+
+    /// Lidar pose at a time of the drive.
+    fn inside(&self, ground: &GroundField, time_s: f64) -> Pose3 {
         let station_m = self.station_m(time_s);
         let point = self.centreline.at(station_m);
         let lateral_m = |station_m: f64| {
