@@ -22,6 +22,7 @@ use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::scan::Scan;
+use crate::geometry::pose::{exponential, logarithm};
 use crate::geometry::{Pose3, Rigid3f};
 
 /// Duration of a revolution, and time between scans, where nothing shows it [s].
@@ -68,16 +69,35 @@ pub struct Motion {
 }
 
 impl Motion {
-    /// The motion around a row of a trajectory, from the row before to the row after; `None` if there is
-    /// only one row, or if the times do not ascend.
+    /// The motion around a row of a trajectory, from the row before to the row after; at an end, extrapolated from the
+    /// two steps beside it. `None` if there is only one row, or if the times do not ascend.
     pub fn along(map_from_lidar: &[Pose3], times_s: &[f64], row: usize) -> Option<Self> {
-        let before = row.saturating_sub(1);
-        let after = (row + 1).min(map_from_lidar.len() - 1);
-        let motion = Self {
-            previous_from_current: map_from_lidar[before].inverse() * map_from_lidar[after],
-            duration_s: times_s[after] - times_s[before],
+        let last = map_from_lidar.len() - 1;
+        let between = |first: usize, second: usize| Self {
+            previous_from_current: map_from_lidar[first].inverse() * map_from_lidar[second],
+            duration_s: times_s[second] - times_s[first],
+        };
+        let motion = match row {
+            0 if last >= 2 => between(0, 1).beyond(&between(1, 2)),
+            row if row == last && last >= 2 => {
+                between(last - 1, last).beyond(&between(last - 2, last - 1))
+            }
+            row => between(row.saturating_sub(1), (row + 1).min(last)),
         };
         (motion.duration_s > 0.0).then_some(motion)
+    }
+
+    /// The motion at the end of a step that lies away from another step, at an even acceleration.
+    fn beyond(&self, other: &Self) -> Self {
+        let share = self.duration_s / (self.duration_s + other.duration_s);
+        let ratio = self.duration_s / other.duration_s;
+        let [own, beside] = [self, other].map(|it| logarithm(&it.previous_from_current));
+        let twist = own * (1.0 + share) - beside * (share * ratio);
+        let is_finite = twist.iter().all(|number| number.is_finite());
+        Self {
+            previous_from_current: exponential(&if is_finite { twist } else { own }),
+            ..*self
+        }
     }
 
     /// The motion in a time; backward if it is negative.
@@ -175,6 +195,25 @@ mod tests {
             assert_relative_eq!(sum, motion(), epsilon = 1.5 * 0.06_f64.powi(2) / 6.0);
         }
         assert_eq!(interpolate_motion(&motion(), 0.0), Pose3::identity());
+    }
+
+    #[test]
+    fn the_motion_of_an_accelerated_drive_is_exact_in_every_row() {
+        // x = 2 t + 3 t², at uneven times.
+        let times_s = [0.0, 0.1, 0.25, 0.3, 0.4];
+        let poses = times_s.map(|t| Pose3::translation(2.0 * t + 3.0 * t * t, 0.0, 0.0));
+        for (row, time_s) in [(0, 0.0), (4, 0.4)] {
+            let motion = Motion::along(&poses, &times_s, row).unwrap();
+            let speed = motion.previous_from_current.translation.x / motion.duration_s;
+            assert_relative_eq!(speed, 2.0 + 6.0 * time_s, epsilon = 1e-9);
+        }
+        let motion = Motion::along(&poses[..2], &times_s, 0).unwrap();
+        assert_relative_eq!(
+            motion.previous_from_current.translation.x,
+            0.23,
+            epsilon = 1e-12
+        );
+        assert_eq!(Motion::along(&poses[..1], &times_s, 0), None);
     }
 
     fn rotation(direction: RotationDirection) -> Rotation {
