@@ -3,6 +3,9 @@
 //! Without [`set_budget`] there is no limit. Estimates are beside the calls of [`require`]; they are
 //! upper bounds of what grows with a configuration or an input, not of everything.
 
+use std::fs::File;
+use std::io::{self, Read as _};
+use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Largest amount that a stage may need [bytes].
@@ -11,7 +14,7 @@ static BUDGET: AtomicU64 = AtomicU64::new(u64::MAX);
 const GIB: f64 = (1_u64 << 30) as f64;
 
 /// A stage needs more memory than the budget.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 #[error(
     "{what} would need {needed_gib:.1} GiB of memory, more than the budget of {budget_gib:.1} GiB; {remedy}, or raise the budget with --memory"
 )]
@@ -43,4 +46,29 @@ pub fn require(what: &'static str, bytes: f64, remedy: &'static str) -> Result<(
         budget_gib: budget / GIB,
         remedy,
     })
+}
+
+/// Reads a whole file within the budget, also one whose size is not known before, such as a pipe.
+pub fn read_file(path: &Path) -> io::Result<Vec<u8>> {
+    /// Memory for the content and what is made of it, in sizes of the file.
+    const COPIES: u64 = 2;
+    let file = File::open(path)?;
+    let require = |bytes: u64| {
+        let needed = COPIES.saturating_mul(bytes) as f64;
+        require("the content of the file", needed, "give a smaller one")
+            .map_err(|error| io::Error::new(io::ErrorKind::FileTooLarge, error))
+    };
+    let size = file.metadata()?.len();
+    require(size)?;
+    let limit = (BUDGET.load(Ordering::Relaxed) / COPIES).saturating_add(1);
+    let mut bytes = Vec::with_capacity(size as usize);
+    file.take(limit).read_to_end(&mut bytes)?;
+    require(bytes.len() as u64)?;
+    Ok(bytes)
+}
+
+/// Reads a whole text file within the budget.
+pub fn read_text(path: &Path) -> io::Result<String> {
+    String::from_utf8(read_file(path)?)
+        .map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error.utf8_error()))
 }

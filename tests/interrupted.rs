@@ -401,6 +401,27 @@ fn a_busy_refinement_ends_in_time_and_leaves_the_result_unchanged() {
 }
 
 #[test]
+fn a_busy_odometry_ends_in_time_and_writes_nothing() {
+    let recording = Recording::street(12);
+    let scan = PipedScan::new(&recording, 11);
+    for (signal, arguments) in [
+        ("-INT", ["odometry", "velodyne", "--output=out"]),
+        (
+            "-TERM",
+            ["build-map", "build_map.yml", "--set=poses=odometry"],
+        ),
+    ] {
+        overdue(signal, &recording, &arguments, &scan);
+        for file in ["out/poses_tum.txt", "map.poses_tum.txt", "map.ply"] {
+            assert!(!recording.path(file).exists(), "{file}");
+        }
+    }
+    scan.restore();
+    let call = common::fpmcl("odometry").in_folder(recording.folder());
+    call.with("velodyne").with("--output=out").succeeds();
+}
+
+#[test]
 fn a_busy_ground_segmentation_ends_in_time() {
     let recording = Recording::street(3);
     let scan = PipedScan::new(&recording, 1);

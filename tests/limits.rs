@@ -5,7 +5,12 @@
 
 mod common;
 
-use common::{Recording, fpmcl, json};
+use std::fs::{self, File};
+use std::io::Write as _;
+use std::path::Path;
+
+use common::{Recording, fpmcl, json, run};
+use zip::write::SimpleFileOptions;
 
 /// A budget that no stage fits in [GiB].
 const TINY: &str = "--memory=0.01";
@@ -177,4 +182,126 @@ fn the_size_of_an_octree_cell_is_reported_and_bounded() {
         "raise depth, which is 4",
         "extend over",
     ]);
+}
+
+/// Writes an array of zeros: a header that claims a shape, and the number of bytes that follow it.
+fn write_array(zip: &mut zip::ZipWriter<File>, name: &str, shape: &str, bytes: usize) {
+    let kind = if name == "start_idx" { "<i8" } else { "<f4" };
+    let mut header = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}");
+    header += &" ".repeat(63 - (10 + header.len()) % 64);
+    header.push('\n');
+    zip.start_file(format!("{name}.npy"), SimpleFileOptions::default())
+        .unwrap();
+    zip.write_all(b"\x93NUMPY\x01\x00").unwrap();
+    zip.write_all(&(header.len() as u16).to_le_bytes()).unwrap();
+    zip.write_all(header.as_bytes()).unwrap();
+    let zeros = vec![0; 1 << 20];
+    let mut left = bytes;
+    while left > 0 {
+        let written = left.min(zeros.len());
+        zip.write_all(&zeros[..written]).unwrap();
+        left -= written;
+    }
+}
+
+#[test]
+fn archives_that_claim_more_than_they_hold_or_unpack_to_more_than_the_budget_are_refused() {
+    let recording = Recording::street(2);
+    recording.fpmcl("build-map").succeeds();
+    let file = "results/localization.npz";
+    fs::create_dir(recording.path("results")).unwrap();
+    let no_particles = "(frames, N, 4) with N > 0 is needed";
+    for (shape, bytes, message) in [
+        ("(1000000000, 0, 4)", 0, no_particles),
+        ("(1000000000, 1000000000, 4)", 0, "but there are 0"),
+        // 16 MB of zeros are 16 kB.
+        (
+            "(1, 1000000, 4)",
+            16_000_000,
+            "more than the budget of 0.0 GiB",
+        ),
+    ] {
+        let mut zip = zip::ZipWriter::new(File::create(recording.path(file)).unwrap());
+        write_array(&mut zip, "particles", shape, bytes);
+        write_array(&mut zip, "start_idx", "()", 8);
+        zip.finish().unwrap();
+        assert!(recording.bytes(file).len() < 20_000);
+        for command in ["info", "evaluate"] {
+            let call = fpmcl(command).in_folder(recording.folder()).with(file);
+            let budget = (command == "evaluate").then_some(TINY);
+            if budget.is_some() || bytes == 0 {
+                let call = budget.into_iter().fold(call, common::Fpmcl::with);
+                call.fails_with(&[file, "particles", message]);
+            }
+        }
+        let call = recording.fpmcl("refine").with(TINY);
+        call.fails_with(&[file, "particles", message]);
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn files_without_end_are_refused() {
+    let recording = Recording::street(2);
+    let endless = Path::new("/dev/zero");
+    let parts = [
+        "/dev/zero",
+        "the content of the file",
+        "more than the budget",
+    ];
+    let build = || recording.fpmcl("build-map").with("--memory=0.1");
+    for key in ["pose_file", "calib_file"] {
+        build().set(key, "/dev/zero").fails_with(&parts);
+    }
+    let call = fpmcl("simulate").with(endless).with("--memory=0.1");
+    call.fails_with(&parts);
+}
+
+#[test]
+fn the_odometry_of_scans_that_all_see_the_same_is_within_the_budget() {
+    let recording = Recording::street(1);
+    let odometry = |scans: usize, memory: &str| {
+        for scan in 1..scans {
+            let copy = recording.path(&format!("velodyne/{scan:06}.bin"));
+            fs::copy(recording.path("velodyne/000000.bin"), copy).unwrap();
+        }
+        let call = fpmcl("odometry").in_folder(recording.folder());
+        call.with("velodyne")
+            .with("--output=out")
+            .with("--force")
+            .with(format!("--memory={memory}"))
+    };
+    odometry(8, "0.06").succeeds();
+    odometry(260, "0.06").fails_with(&[
+        "the adjustment of scans that see the same surfaces would need 0.1 GiB",
+        "select fewer scans with start_idx and n_scans",
+    ]);
+    odometry(260, "0.01").fails_with(&["the points of all scans", "n_scans"]);
+}
+
+/// Runs where there is a graphics adapter.
+#[test]
+#[allow(clippy::print_stderr, reason = "a skipped test reports it")]
+fn the_batches_of_a_graphics_device_are_within_the_budget() {
+    if run(Path::new("."), &["doctor", "--measure=0"]).contains("adapter           none") {
+        eprintln!("not run: no graphics adapter");
+        return;
+    }
+    let recording = Recording::street(2);
+    recording.fpmcl("build-map").succeeds();
+    let call = fpmcl("localize").in_folder(recording.folder());
+    let stderr = call
+        .with("localization.yml")
+        .with("--backend=gpu")
+        .with(TINY)
+        .exits_with(1)
+        .stderr;
+    // Drivers may print there, too.
+    for part in [
+        "the graphics device would need",
+        "--backend cpu",
+        "--memory",
+    ] {
+        assert!(stderr.contains(part), "{stderr}");
+    }
 }

@@ -158,6 +158,48 @@ fn ground_and_compare_keep_files_of_the_user() {
 }
 
 #[test]
+fn odometry_keeps_files_of_the_user_and_its_inputs() {
+    let recording = Recording::street(4);
+    let odometry = |output: &str| {
+        let call = fpmcl("odometry").in_folder(recording.folder());
+        call.with("velodyne").with(format!("--output={output}"))
+    };
+    fs::create_dir(recording.path("out")).unwrap();
+    for name in ["poses_tum.txt", "report.json", "path.png"] {
+        let file = format!("out/{name}");
+        recording.write(&file, "of the user");
+        let parts = ["was not written by fpmcl", "output_folder"];
+        refuses(&recording, &file, || odometry("out"), &parts);
+        fs::remove_file(recording.path(&file)).unwrap();
+    }
+    odometry("out").succeeds();
+    odometry("out").fails_with(&["out/report.json exists", "--force"]);
+    let before = recording.bytes("out/poses_tum.txt");
+    let polish = odometry("out").with("--poses=out/poses_tum.txt");
+    polish
+        .with("--force")
+        .fails_with(&["out/poses_tum.txt would be replaced", "pose_file"]);
+    assert!(recording.bytes("out/poses_tum.txt") == before);
+    odometry("poses.txt").fails_with(&["output_folder is poses.txt, and nothing can be written"]);
+
+    // The poses that build-map finds are an output beside the map.
+    recording.write("map.poses_tum.txt", "of the user");
+    let build = || recording.fpmcl("build-map").set("poses", "odometry");
+    let parts = ["was not written by fpmcl", "mesh_file"];
+    refuses(&recording, "map.poses_tum.txt", build, &parts);
+    fs::remove_file(recording.path("map.poses_tum.txt")).unwrap();
+    build().succeeds();
+    let given = || {
+        let call = recording.fpmcl("build-map").with("--force");
+        call.set("pose_file", "map.poses_tum.txt")
+            .set("calib_file", "null")
+    };
+    let before = recording.bytes("map.poses_tum.txt");
+    given().fails_with(&["map.poses_tum.txt would be replaced", "pose_file"]);
+    assert!(recording.bytes("map.poses_tum.txt") == before);
+}
+
+#[test]
 fn an_output_that_is_an_input_is_refused() {
     let recording = mapped(4);
     let build =

@@ -52,6 +52,40 @@ fn a_jump_of_the_poses_is_an_error_that_can_be_allowed() {
 }
 
 #[test]
+fn given_poses_that_jump_stop_the_odometry_and_are_named() {
+    let recording = Recording::street(8);
+    recording.write("poses.txt", &with_frame_at(8, 4, (0.0, 1002.0)));
+    let odometry = || {
+        let call = fpmcl("odometry").in_folder(recording.folder());
+        call.with("velodyne")
+            .with("--poses=poses.txt")
+            .with("--calib=calib.txt")
+            .with("--output=out")
+    };
+    odometry().fails_with(&["pose_file is poses.txt", "the pose of frame 4 is wrong"]);
+    assert!(!recording.path("out/poses_tum.txt").exists());
+    recording.write("poses.txt", &with_frame_at(8, 7, (0.0, 73.5)));
+    odometry().fails_with(&["jump by 70 m from frame 6 to frame 7", "max_step_m"]);
+    odometry().set("max_step_m", "100").succeeds();
+}
+
+#[test]
+fn senseless_times_stop_the_odometry() {
+    let recording = Recording::street(3);
+    for (times, part) in [
+        ("0\n0.1\n0.1\n", "frame 2 at 0.1 s is not later"),
+        ("0\n0.1\n1e300\n", "1e300 is beyond any time"),
+        ("0\nnan\n0.2\n", "`nan` is not a finite number"),
+    ] {
+        recording.write("times.txt", times);
+        let call = fpmcl("odometry").in_folder(recording.folder());
+        call.with("velodyne")
+            .with("--output=out")
+            .fails_with(&["times.txt", part]);
+    }
+}
+
+#[test]
 fn one_displaced_pose_is_warned_about_with_its_frame() {
     let recording = Recording::street(9);
     recording.write("poses.txt", &with_frame_at(9, 5, (3.0, 2.5)));

@@ -7,7 +7,7 @@ use super::tracking_loss::State;
 use crate::geometry::Pose3;
 use crate::lidar::Scan;
 use crate::map::Map;
-use crate::odometry::{NotInMap, OdometryError, Trajectory, TrajectoryBuilder, TrajectoryConfig};
+use crate::odometry::{OdometryError, PlacementError, Trajectory, TrajectoryBuilder, TrajectoryConfig};
 
 /// Why a scan of a second drive cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -58,7 +58,7 @@ impl SecondDrive {
     }
 
     /// Closes loops and adjusts all poses to the surfaces of the map.
-    pub fn finish(self) -> Result<Trajectory, NotInMap> {
+    pub fn finish(self) -> Result<Trajectory, PlacementError> {
         self.builder.finish_in_map(&self.map.mesh, &self.found)
     }
 }

@@ -1,6 +1,5 @@
 //! Mesh files of maps: PLY, OBJ and STL, by the ending of the name or by the first bytes.
 
-use std::fs;
 use std::path::Path;
 
 use glam::DVec3;
@@ -10,6 +9,7 @@ use super::mesh_error::{MeshFileError, MeshFileProblem};
 use super::mesh_origin::{Precision, relative};
 use super::{obj, ply, stl};
 use crate::geometry::TriangleMesh;
+use crate::memory;
 
 /// Reads the mesh of a map, and its path and frame if they are in the file.
 ///
@@ -24,7 +24,7 @@ pub fn read(path: &Path) -> Result<(TriangleMesh, Option<MappingPath>), MeshFile
         _ if ply::is_ply(path) => return ply::read_map(path),
         _ => return Err(MeshFileProblem::UnknownFormat.of(path)),
     };
-    let bytes = fs::read(path).map_err(|error| MeshFileProblem::Read(error).of(path))?;
+    let bytes = memory::read_file(path).map_err(|error| MeshFileProblem::Read(error).of(path))?;
     let read = parse(&bytes)
         .and_then(|((vertices, triangles), precision)| mesh_of(&vertices, triangles, precision));
     read.map_err(|problem: MeshFileProblem| problem.of(path))

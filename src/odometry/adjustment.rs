@@ -25,9 +25,11 @@ use super::alignment::median;
 use super::block_system::{BlockRow, BlockSystem};
 use super::drive::Drive;
 use super::pose_graph::Edge;
+use super::trajectory::SHORTER;
 use super::voxel_map::pack;
 use crate::geometry::pose::{exponential, logarithm};
 use crate::geometry::{PlaneSums, Pose3};
+use crate::memory::{self, MemoryError};
 use crate::validation::{InvalidValue, Validate, in_range, positive};
 
 /// Settings of the adjustment.
@@ -108,6 +110,18 @@ struct Row {
 
 const NONE: u32 = u32::MAX;
 
+impl Row {
+    /// The planes of the scan, each once.
+    fn planes_once(&self) -> Vec<u32> {
+        let mut seen: Vec<u32> = (self.planes.iter().copied())
+            .filter(|&plane| plane != NONE)
+            .collect();
+        seen.sort_unstable();
+        seen.dedup();
+        seen
+    }
+}
+
 /// A point in a voxel.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Entry {
@@ -118,7 +132,11 @@ struct Entry {
 
 /// Adjusts the poses of a drive. Returns the root mean square of the residuals before and after [m]; `None` where no
 /// surfaces are in common.
-pub fn adjust(drive: &mut Drive, held: Held, config: &AdjustmentConfig) -> Option<[f64; 2]> {
+pub fn adjust(
+    drive: &mut Drive,
+    held: Held,
+    config: &AdjustmentConfig,
+) -> Result<Option<[f64; 2]>, MemoryError> {
     /// Factors of the first voxels of given poses, whose scans may be too far from each other for common planes.
     const COARSE: [f64; 4] = [4.0, 4.0, 2.0, 2.0];
     let along_path = motion_edges(&drive.poses, config);
@@ -134,7 +152,10 @@ pub fn adjust(drive: &mut Drive, held: Held, config: &AdjustmentConfig) -> Optio
         let factor = coarse.get(iteration).copied().unwrap_or(1.0);
         let edge_m = factor * config.voxels * drive.voxel_m;
         let (rows, planes) = associate(drive, held, edge_m, &kernels_m);
-        let residuals = Residuals::of(&rows, &planes)?;
+        let Some(residuals) = Residuals::of(&rows, &planes) else {
+            return Ok(None);
+        };
+        require_memory(&rows, &planes)?;
         result = Some([
             result.map_or(residuals.rms_m, |[first, _]| first),
             residuals.rms_m,
@@ -148,7 +169,9 @@ pub fn adjust(drive: &mut Drive, held: Held, config: &AdjustmentConfig) -> Optio
         for (kernel_m, found_m) in kernels_m.iter_mut().zip(&residuals.kernels_m) {
             *kernel_m = found_m.max(least_m).min(*kernel_m);
         }
-        let steps = system.solve()?;
+        let Some(steps) = system.solve() else {
+            return Ok(None);
+        };
         let largest_m = (steps.iter())
             .map(|step| step.fixed_rows::<3>(0).norm() + 10.0 * step.fixed_rows::<3>(3).norm())
             .fold(0.0, f64::max);
@@ -172,7 +195,30 @@ pub fn adjust(drive: &mut Drive, held: Held, config: &AdjustmentConfig) -> Optio
             *pose = as_before * *pose;
         }
     }
-    result
+    Ok(result)
+}
+
+/// Requires the memory of the equations: all scans of a car that stands see the same planes.
+fn require_memory(rows: &[Row], planes: &[Plane]) -> Result<(), MemoryError> {
+    /// Memory of the blocks of two scans that see a plane in common [bytes].
+    const PAIR_BYTES: f64 = 2400.0;
+    let later_scans = |(number, row): (usize, &Row)| {
+        let mut is_seen = vec![false; rows.len() - number];
+        for plane in row.planes_once() {
+            let couplings = &planes[plane as usize].couplings;
+            let later = couplings.partition_point(|(other, _)| *other <= number);
+            for (other, _) in &couplings[later..] {
+                is_seen[other - number] = true;
+            }
+        }
+        is_seen.into_iter().filter(|&is_seen| is_seen).count()
+    };
+    let pairs: usize = rows.par_iter().enumerate().map(later_scans).sum();
+    memory::require(
+        "the adjustment of scans that see the same surfaces",
+        pairs as f64 * PAIR_BYTES,
+        SHORTER,
+    )
 }
 
 /// The motion between scans in succession stays about the initial one.
@@ -436,13 +482,8 @@ fn block_row(number: usize, row: &Row, planes: &[Plane], scale: f64) -> BlockRow
         sums.diagonal += at.weight * jacobian * jacobian.transpose();
         sums.right_side -= at.weight * at.distance_m * jacobian;
     }
-    let mut seen: Vec<u32> = (row.planes.iter().copied())
-        .filter(|&plane| plane != NONE)
-        .collect();
-    seen.sort_unstable();
-    seen.dedup();
     let mut beside: Vec<Option<Matrix6<f64>>> = vec![];
-    for plane in seen {
+    for plane in row.planes_once() {
         let plane = &planes[plane as usize];
         let Ok(own) = plane
             .couplings

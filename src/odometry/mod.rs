@@ -54,7 +54,7 @@ pub use loops::{Loop, LoopVerdict};
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 pub use pose_check::{GivenPoses, MotionDifference, PoseCheck, PoseFit, PoseMeaning, check_poses};
 pub use timing::{TimingComparison, TimingError, compare_timings};
-pub use trajectory::{Trajectory, TrajectoryBuilder, TrajectoryConfig};
+pub use trajectory::{PlacementError, Trajectory, TrajectoryBuilder, TrajectoryConfig};
 
 #[cfg(test)]
 mod tests;

@@ -8,6 +8,7 @@ use super::config::OdometryConfig;
 use super::state::State;
 use crate::geometry::Pose3;
 use crate::lidar::{Scan, interval_s};
+use crate::memory::MemoryError;
 use crate::validation::{InvalidValue, Validate as _};
 
 /// A scan that cannot be the next one.
@@ -23,6 +24,9 @@ pub enum OdometryError {
         /// Time of the scan [s].
         time_s: f64,
     },
+    /// The scans do not fit the budget of memory.
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
 }
 
 /// How the pose of a scan was found.

@@ -15,6 +15,7 @@ use super::pose_graph::{Edge, optimize};
 use super::sampling::{Sample, sensor_range};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::lidar::{Scan, interval_s};
+use crate::memory::{self, MemoryError};
 use crate::validation::{InvalidValue, Validate, in_range, nested};
 
 /// Settings of the trajectory of a drive.
@@ -69,7 +70,26 @@ pub struct TrajectoryBuilder {
     ranges_m: Vec<f32>,
     given: Vec<Pose3>,
     time_s: Option<f64>,
+    /// Number of points of all samples.
+    points: usize,
 }
+
+/// Why a drive cannot be moved into a map.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum PlacementError {
+    /// It was not found there.
+    #[error(transparent)]
+    NotInMap(#[from] NotInMap),
+    /// Its scans do not fit the budget of memory.
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
+}
+
+/// Memory of a point for loops and adjustment [bytes].
+const POINT_BYTES: f64 = 120.0;
+
+/// Remedy for a drive that exceeds the budget of memory.
+pub(super) const SHORTER: &str = "select fewer scans with start_idx and n_scans";
 
 impl TrajectoryBuilder {
     /// A trajectory without scans.
@@ -83,20 +103,21 @@ impl TrajectoryBuilder {
             ranges_m: vec![],
             given: vec![],
             time_s: None,
+            points: 0,
         })
     }
 
     /// Registers the next scan, and keeps a sample of its points.
     pub fn add(&mut self, scan: &Scan) -> Result<&OdometryEstimate, OdometryError> {
         let estimate = self.odometer.step(scan)?;
-        self.keep(scan);
+        self.keep(scan)?;
         self.estimates.push(estimate);
         let last = self.estimates.len() - 1;
         Ok(&self.estimates[last])
     }
 
     /// Keeps a sample of the next scan, whose pose is given; all or none of the poses of a drive are.
-    pub fn add_given(&mut self, scan: &Scan, map_from_lidar: Pose3) {
+    pub fn add_given(&mut self, scan: &Scan, map_from_lidar: Pose3) -> Result<(), MemoryError> {
         let last = self.given.last().unwrap_or(&map_from_lidar);
         let times_s = self.time_s.zip(scan.time_s);
         self.estimates.push(OdometryEstimate {
@@ -108,10 +129,10 @@ impl TrajectoryBuilder {
             })
         });
         self.given.push(map_from_lidar);
-        self.keep(scan);
+        self.keep(scan)
     }
 
-    fn keep(&mut self, scan: &Scan) {
+    fn keep(&mut self, scan: &Scan) -> Result<(), MemoryError> {
         let config = &self.config.odometry;
         let range_m = sensor_range(scan);
         let sample = range_m.map_or_else(Sample::empty, |range_m| {
@@ -122,18 +143,24 @@ impl TrajectoryBuilder {
                 ..sample
             }
         });
+        self.points += sample.points.len();
         self.samples.push(sample);
         self.ranges_m.extend(range_m.map(|range_m| range_m as f32));
         self.time_s = scan.time_s;
+        memory::require(
+            "the points of all scans",
+            self.points as f64 * POINT_BYTES,
+            SHORTER,
+        )
     }
 
     /// Closes loops, unless the poses are given, and adjusts the poses.
-    pub fn finish(self) -> Trajectory {
+    pub fn finish(self) -> Result<Trajectory, MemoryError> {
         let given = self.given.clone();
         let is_given = !given.is_empty();
         let (config, mut trajectory, drive) = self.into_drive();
         let Some(mut drive) = drive else {
-            return trajectory;
+            return Ok(trajectory);
         };
         if config.loops && !is_given {
             trajectory.loops = close_loops(&mut drive, &trajectory.odometry);
@@ -144,10 +171,10 @@ impl TrajectoryBuilder {
             } else {
                 Held::First
             };
-            trajectory.residuals_m = adjust(&mut drive, held, &config.adjustment);
+            trajectory.residuals_m = adjust(&mut drive, held, &config.adjustment)?;
         }
         trajectory.poses = drive.poses;
-        trajectory
+        Ok(trajectory)
     }
 
     /// Closes loops, moves the drive into a map in which some of its scans were found, and adjusts all poses to its
@@ -156,7 +183,7 @@ impl TrajectoryBuilder {
         self,
         mesh: &TriangleMesh,
         map_from_lidar: &[Option<Pose3>],
-    ) -> Result<Trajectory, NotInMap> {
+    ) -> Result<Trajectory, PlacementError> {
         let (config, mut trajectory, drive) = self.into_drive();
         let mut drive = drive.ok_or(NotInMap)?;
         if config.loops {
@@ -172,7 +199,7 @@ impl TrajectoryBuilder {
         }
         if config.adjust {
             let held = Held::Surfaces(&surfaces);
-            trajectory.residuals_m = adjust(&mut drive, held, &config.adjustment);
+            trajectory.residuals_m = adjust(&mut drive, held, &config.adjustment)?;
         }
         trajectory.poses = drive.poses;
         Ok(trajectory)

@@ -111,7 +111,7 @@ pub enum RecordingError {
         time_s: f64,
         previous_s: f64,
     },
-    #[error("{}, line {line}: {value} is beyond any {quantity} of a recording, {limit}", path.display())]
+    #[error("{}, line {line}: {value:e} is beyond any {quantity} of a recording, {limit}", path.display())]
     OutOfRange {
         path: PathBuf,
         line: usize,

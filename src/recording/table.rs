@@ -1,12 +1,12 @@
 //! Text files with rows of numbers.
 
-use std::fs;
 use std::path::Path;
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
 
 use super::error::RecordingError;
 use crate::geometry::{FARTHEST_M, Pose3};
+use crate::memory;
 
 /// Reads the rows of a file with their line numbers, without blank lines and comments (`#`).
 pub fn read_rows(path: &Path) -> Result<Vec<(usize, Vec<f64>)>, RecordingError> {
@@ -19,7 +19,7 @@ pub fn read_rows(path: &Path) -> Result<Vec<(usize, Vec<f64>)>, RecordingError> 
 
 /// Reads a whole file as text, without the byte order mark that some editors write.
 pub fn read_text(path: &Path) -> Result<String, RecordingError> {
-    let mut text = fs::read_to_string(path).map_err(RecordingError::read(path))?;
+    let mut text = memory::read_text(path).map_err(RecordingError::read(path))?;
     if text.starts_with('\u{feff}') {
         text.remove(0);
     }

@@ -1,11 +1,11 @@
 //! Writing of scans (`.bin`: float32 x, y, z, intensity), and SemanticKITTI labels (`.label`: u32).
 
-use std::fs;
 use std::io::{self, Write};
 use std::path::Path;
 
 use super::error::RecordingError;
 use crate::lidar::Scan;
+use crate::memory;
 
 /// Writes a scan.
 pub fn write_scan(mut writer: impl Write, scan: &Scan) -> io::Result<()> {
@@ -38,7 +38,7 @@ pub fn write_labels(mut writer: impl Write, classes: &[u16]) -> io::Result<()> {
 }
 
 pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, RecordingError> {
-    fs::read(path).map_err(RecordingError::read(path))
+    memory::read_file(path).map_err(RecordingError::read(path))
 }
 
 fn records<'a, const SIZE: usize>(
@@ -60,6 +60,8 @@ fn records<'a, const SIZE: usize>(
 #[cfg(test)]
 mod tests {
     use glam::Vec3;
+
+    use std::fs;
 
     use super::*;
     use crate::recording::scan_files;

@@ -61,8 +61,9 @@ impl Outputs<'_> {
             self.check(&folder.join(name), &claims)?;
         }
         let context = || {
-            let (key, main) = (self.key, self.main.display());
-            format!("{key} is {main}, and nothing can be written there; choose another {key}")
+            let path = self.magic.map_or(folder, |_| self.main).display();
+            let key = self.key;
+            format!("{key} is {path}, and nothing can be written there; choose another {key}")
         };
         output::create_folder(folder).with_context(context)?;
         temporary_beside(self.main).with_context(context)?;

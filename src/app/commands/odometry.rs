@@ -119,6 +119,7 @@ fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Option<SensorD
     if let Some(path) = &config.pose_file {
         let track = inputs.track(path, &recording)?;
         recording = recording.with_poses(track)?;
+        trajectory::check(&recording, config.max_step_m, path)?;
         recording.skipped.clear();
     }
     let keys = SensorKeys {

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::Result;
+use anyhow::{Context as _, Result};
 use serde::Serialize;
 
 use super::Context;
@@ -11,6 +11,7 @@ use super::interrupt::Interrupted;
 use super::progress::Task;
 use crate::geometry::{Pose3, StampedPose};
 use crate::lidar::Scan;
+use crate::map::path_check;
 use crate::odometry::{LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig};
 use crate::recording::{Frame, Recording};
 
@@ -25,14 +26,14 @@ pub fn estimate(
     let name = if is_given { "polish" } else { "odometry" };
     let _task = each_scan(name, frames, context, |frame, scan| {
         match frame.map_from_lidar {
-            Some(pose) if is_given => builder.add_given(scan, pose),
+            Some(pose) if is_given => builder.add_given(scan, pose)?,
             _ => {
                 builder.add(scan)?;
             }
         }
         Ok(())
     })?;
-    Ok(builder.finish())
+    Ok(builder.finish()?)
 }
 
 /// Reads the scans of a trajectory one after the other, until an interruption; returns the progress, which goes on.
@@ -196,6 +197,13 @@ impl TrajectorySummary {
             );
         }
     }
+}
+
+/// Checks the poses of a recording, which are from a file, against each other.
+pub fn check(recording: &Recording, max_step_m: f64, path: &Path) -> Result<()> {
+    let poses = recording.frames.iter();
+    let poses = poses.filter_map(|frame| Some((frame.number, frame.map_from_lidar.as_ref()?)));
+    path_check::check(poses, max_step_m).with_context(|| format!("pose_file is {}", path.display()))
 }
 
 /// The file of the poses of a map that was built without given ones.

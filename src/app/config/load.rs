@@ -1,6 +1,5 @@
 //! Loading, overriding and writing of configurations.
 
-use std::fs;
 use std::path::Path;
 
 use serde::Serialize;
@@ -9,6 +8,7 @@ use serde::de::DeserializeOwned;
 use super::error::{self, ConfigError};
 use super::template::CommandConfig;
 use super::yaml::{self, keys, to_yaml};
+use crate::memory;
 use crate::validation::Validate;
 
 /// Loads and validates the configuration of a command from `path`, else from its default path
@@ -22,7 +22,7 @@ pub fn load<T: CommandConfig>(
     let Some(path) = path.or(default_path.exists().then_some(default_path)) else {
         return load_text("built-in configuration", T::SHORT, settings);
     };
-    let text = fs::read_to_string(path).map_err(|source| ConfigError::Read {
+    let text = memory::read_text(path).map_err(|source| ConfigError::Read {
         path: path.to_owned(),
         source,
     })?;

@@ -8,7 +8,7 @@ use smart_default::SmartDefault;
 use super::check::{optional_path, path};
 use super::recording::{MotionCompensation, mounting};
 use crate::odometry::TrajectoryConfig;
-use crate::validation::{InvalidValue, Validate};
+use crate::validation::{InvalidValue, Validate, positive};
 
 /// Configuration of `odometry`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
@@ -37,6 +37,9 @@ pub struct OdometryCommandConfig {
     /// Step between frames: n uses every n-th frame.
     #[default(1)]
     pub frame_step: usize,
+    /// Largest distance between successive given poses [m]; a larger one is an error of the poses.
+    #[default(50.0)]
+    pub max_step_m: f64,
     /// Times of the points for motion compensation; `None` for scans that are compensated already.
     #[default(Some(MotionCompensation::Auto))]
     pub motion_compensation: Option<MotionCompensation>,
@@ -57,6 +60,7 @@ impl Validate for OdometryCommandConfig {
         mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
         path("output_folder", &self.output_folder)?;
         self.selection().validate()?;
+        positive("max_step_m", self.max_step_m)?;
         crate::validation::nested("trajectory", &self.trajectory)
     }
 }

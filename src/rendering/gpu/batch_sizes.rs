@@ -1,5 +1,6 @@
 //! Amounts of work per submission to the device.
 
+use super::batches::IN_FLIGHT;
 use crate::rendering::backend::AdapterKind;
 
 /// Limits of one submission.
@@ -20,6 +21,13 @@ pub(super) struct BatchSizes {
 }
 
 impl BatchSizes {
+    /// Memory of the batches in flight: their results, a copy of these that is read back, and directions [bytes].
+    pub fn bytes(&self) -> f64 {
+        let results = 2 * self.ranges.max(self.directions) * size_of::<f32>();
+        let directions = self.directions * size_of::<[f32; 4]>();
+        (IN_FLIGHT * results + directions) as f64
+    }
+
     /// Work for a fraction of a second, and 16 MB of results; on a software adapter for some
     /// seconds.
     pub fn of(kind: AdapterKind) -> Self {

@@ -6,7 +6,7 @@ use super::device::{Gpu, InFlight};
 use crate::rendering::RenderError;
 
 /// One is read back, one runs, one is queued.
-const IN_FLIGHT: usize = 3;
+pub(super) const IN_FLIGHT: usize = 3;
 
 /// Starts every batch, and finishes it before more than [`IN_FLIGHT`] have been started.
 pub(super) fn run<B>(

@@ -7,6 +7,7 @@ use super::device::Gpu;
 use super::layout::Pose;
 use super::two_level::{DeviceTile, TwoLevelBvh};
 use crate::geometry::{Pose3, TriangleMesh};
+use crate::memory;
 use crate::rendering::RenderError;
 
 /// Buffers of the map and their layout.
@@ -28,6 +29,12 @@ impl DeviceMap {
             size_of_val(bvh.nodes.as_slice()) as u64,
         ];
         check_sizes(&sizes, gpu.max_binding_bytes())?;
+        // Here, on the way to the device, and on a device that shares the memory.
+        memory::require(
+            "the graphics device",
+            3.0 * (sizes[0] + sizes[1]) as f64 + gpu.batch_sizes.bytes(),
+            "choose a smaller map, use --backend cpu",
+        )?;
         let map = Self {
             nodes: gpu.upload("nodes", &bvh.nodes, BufferUsages::STORAGE),
             triangles: gpu.upload("triangles", &bvh.triangles, BufferUsages::STORAGE),

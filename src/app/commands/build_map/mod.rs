@@ -27,7 +27,7 @@ use self::parts::{Joined, Parts, hash_of_scans, joint_hash};
 pub use self::report::BuildReport;
 use super::claims::Claims;
 use super::interrupt::Interrupted;
-use super::trajectory::{TrajectorySummary, file_beside};
+use super::trajectory::{self, TrajectorySummary, file_beside};
 use super::{Context, input, output, version};
 use crate::app::config::{self, BuildMapConfig, PoseSource};
 use crate::evaluation::map_quality::{self, BeamResidual};
@@ -139,7 +139,7 @@ fn open(config: &mut BuildMapConfig, claims: &mut Claims, context: &Context) -> 
     let pose_file = given.as_ref().map(|track| track.path.clone());
     if let (Some(track), Some(pose_file)) = (given, &pose_file) {
         recording = recording.with_poses(track)?;
-        poses::check(&recording, config, pose_file)?;
+        trajectory::check(&recording, config.max_step_m, pose_file)?;
     }
     let (mut sequence, sensor) = config.sensor_keys().resolve(recording)?;
     if let Some(pose_file) = pose_file.filter(|_| config.check_poses) {
@@ -149,7 +149,8 @@ fn open(config: &mut BuildMapConfig, claims: &mut Claims, context: &Context) -> 
     let mut trajectory = None;
     if sequence.track.is_none() || config.poses == PoseSource::Polished {
         (sequence, trajectory) = poses::find(sequence, config, older_map.as_ref(), context)?;
-        poses::check(&sequence, config, &file_beside(&config.mesh_file))?;
+        let found = file_beside(&config.mesh_file);
+        trajectory::check(&sequence, config.max_step_m, &found)?;
     } else if let Some(name) = file_beside(&config.mesh_file).file_name() {
         claims.remove(&[&name.to_string_lossy()])?;
     }

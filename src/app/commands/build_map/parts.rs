@@ -50,8 +50,17 @@ pub struct Joined {
 /// The folder of finished local maps of one build, locked.
 pub struct Parts {
     folder: PathBuf,
-    /// Released by the operating system, also after a crash.
-    _lock: File,
+    _lock: Lock,
+}
+
+/// A locked file; the operating system releases it after a crash.
+struct Lock(File);
+
+impl Drop for Lock {
+    fn drop(&mut self) {
+        // Closing the file is not enough: a process that is being started holds a copy of it for a moment.
+        let _ = self.0.unlock();
+    }
 }
 
 impl Parts {
@@ -199,13 +208,13 @@ fn entries(folder: &Path) -> Result<Vec<fs::DirEntry>> {
 }
 
 /// Locks a folder of parts; an error if another build has locked it.
-fn lock(folder: &Path, mesh_file: &Path) -> Result<File> {
+fn lock(folder: &Path, mesh_file: &Path) -> Result<Lock> {
     let path = folder.join(LOCK_FILE);
     let context = || format!("cannot lock {}", path.display());
     let file = File::create(&path).with_context(context)?;
     match file.try_lock() {
         // A build that has just ended removes its lock.
-        Ok(()) if path.exists() => Ok(file),
+        Ok(()) if path.exists() => Ok(Lock(file)),
         Ok(()) | Err(TryLockError::WouldBlock) => bail!(
             "{} is being built by another build-map, which has locked {}; wait for it, or choose another mesh_file",
             mesh_file.display(),
@@ -306,6 +315,19 @@ mod tests {
                 .finished(0, || Ok("0123".into())),
             None
         );
+    }
+
+    #[test]
+    fn a_build_that_ended_is_not_locked_by_copies_of_its_lock() {
+        let folder = tempfile::tempdir().unwrap();
+        let map = folder.path().join("map.ply");
+        let parts = Parts::open(&map, INPUTS).unwrap();
+        assert!(Parts::open(&map, INPUTS).is_err());
+        // As of a process that another thread is just starting.
+        let copy = parts._lock.0.try_clone().unwrap();
+        drop(parts);
+        assert!(Parts::open(&map, INPUTS).is_ok());
+        drop(copy);
     }
 
     #[test]

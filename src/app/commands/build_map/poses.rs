@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use anyhow::{Context as _, Result};
+use anyhow::Result;
 
 use super::onto;
 use super::parts::hash_of_file;
@@ -85,6 +85,10 @@ pub fn find(
             write_tum(file, &stamped)
         })?;
     }
+    context.interrupt.keeps(format!(
+        "the poses are kept in {}; run the same command again to continue",
+        path.display()
+    ));
     // Its rows have the times of the frames, also where these are assumed.
     recording.has_times = true;
     let mut track = PoseTrack::read(&path, None)?;
@@ -110,12 +114,4 @@ fn inputs(frames: &[Frame], is_given: bool, map_hash: Option<&str>) -> Result<St
         hasher.update(what.as_bytes());
     }
     Ok(hasher.finalize().to_hex().to_string())
-}
-
-/// Checks the poses against each other.
-pub fn check(recording: &Recording, config: &BuildMapConfig, path: &Path) -> Result<()> {
-    let poses = recording.frames.iter();
-    let poses = poses.filter_map(|frame| Some((frame.number, frame.map_from_lidar.as_ref()?)));
-    crate::map::path_check::check(poses, config.max_step_m)
-        .with_context(|| format!("pose_file is {}", path.display()))
 }

@@ -73,7 +73,6 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         || {
             let mut run = recorded();
             write_results(config, &files, &sequence, &mut run)?;
-            run.claims.finish(&files.result)?;
             Ok(kept(&run))
         },
     )?;
@@ -214,7 +213,12 @@ fn write_results(
     } else {
         run.claims.remove(&REFINEMENT_FILES)?;
     }
-    output::write_yaml(&files.file("effective_localization.yml"), config)
+    output::write_yaml(&files.file("effective_localization.yml"), config)?;
+    // The frames of an interrupted run are kept; a whole run lacks its report and pictures still.
+    match run.results.len() < sequence.frames.len() {
+        true => run.claims.finish(&files.result),
+        false => Ok(()),
+    }
 }
 
 /// Writes report, plots and page, and returns the report.
