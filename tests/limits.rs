@@ -271,12 +271,12 @@ fn the_odometry_of_scans_that_all_see_the_same_is_within_the_budget() {
             .with("--force")
             .with(format!("--memory={memory}"))
     };
-    odometry(8, "0.06").succeeds();
-    odometry(260, "0.06").fails_with(&[
+    odometry(8, "0.09").succeeds();
+    odometry(320, "0.09").fails_with(&[
         "the adjustment of scans that see the same surfaces would need 0.1 GiB",
         "select fewer scans with start_idx and n_scans",
     ]);
-    odometry(260, "0.01").fails_with(&["the points of all scans", "n_scans"]);
+    odometry(320, "0.01").fails_with(&["the points of all scans", "n_scans"]);
 }
 
 /// Runs where there is a graphics adapter.

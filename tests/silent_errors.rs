@@ -199,6 +199,44 @@ fn files_that_are_no_scans_do_not_renumber_the_recording() {
     call.fails_with(&["1.bin", "have the same number"]);
 }
 
+#[cfg(unix)]
+#[test]
+fn links_that_loop_do_not_multiply_the_recording() {
+    let recording = mapped(3);
+    recording.fpmcl("localize").succeeds();
+    let expected = recording.bytes("results/mcl_tum.txt");
+    for (link, to) in [("velodyne/again", ".."), ("again", ".")] {
+        std::os::unix::fs::symlink(to, recording.path(link)).unwrap();
+    }
+    let call = recording.fpmcl("localize").with("--force");
+    call.set("scan_folder", ".").succeeds();
+    assert!(recording.bytes("results/mcl_tum.txt") == expected);
+}
+
+#[test]
+fn numbers_of_other_names_and_types_in_a_map_are_read_and_missing_ones_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let info = |vertex: &str, rows: &str, index: &str| {
+        let text = format!(
+            "ply\nformat ascii 1.0\nelement vertex 3\n{vertex}element face 1\nproperty list uchar {index} vertex_indices\nend_header\n{rows}3 0 1 2\n"
+        );
+        fs::write(folder.path().join("map.ply"), text).unwrap();
+        fpmcl("info").in_folder(folder.path()).with("map.ply")
+    };
+    let xyz = "property float x\nproperty float y\nproperty float z\n";
+    let rows = "0 0 0\n10 0 0\n0 10 0\n";
+    let [upper, integer] = [xyz.to_uppercase(), xyz.replace("float z", "int z")];
+    let upper = upper.replace("PROPERTY FLOAT", "property float");
+    for (vertex, index) in [(xyz, "short"), (&upper, "int"), (&integer, "uint")] {
+        let text = info(vertex, rows, index).succeeds().stdout;
+        assert!(text.contains("10 x 10 m"), "{text}");
+    }
+    let without_z = xyz.replace("property float z\n", "");
+    let named = "no property `z` of `vertex`";
+    info(&without_z, "0 0\n10 0\n0 10\n", "int").fails_with(&["map.ply", named]);
+    info("", "\n\n\n", "int").fails_with(&["map.ply", "no property `x` of `vertex`"]);
+}
+
 #[test]
 fn text_files_with_a_byte_order_mark_and_line_ends_of_windows_are_read() {
     let recording = mapped(3);
@@ -220,6 +258,28 @@ fn a_run_too_short_for_the_check_of_range_mcl_is_not_a_success() {
     assert!(row.unwrap().contains("not checked"), "{table}");
     let report = json(&recording.path("results/report.json"));
     assert!(report["mcl"]["range_mcl"]["success"].is_null());
+}
+
+#[test]
+fn a_result_of_range_mcl_is_refined_with_its_report() {
+    let recording = mapped(4);
+    recording.fpmcl("localize").succeeds();
+    // Its results have these two arrays.
+    let ours = fs::File::open(recording.path("results/localization.npz")).unwrap();
+    let mut ours = zip::ZipArchive::new(ours).unwrap();
+    fs::create_dir(recording.path("range_mcl")).unwrap();
+    let theirs = fs::File::create(recording.path("range_mcl/localization.npz")).unwrap();
+    let mut theirs = zip::ZipWriter::new(theirs);
+    for name in ["particles.npy", "start_idx.npy"] {
+        let array = ours.by_name(name).unwrap();
+        theirs.raw_copy_file(array).unwrap();
+    }
+    theirs.finish().unwrap();
+    let call = recording.fpmcl("refine");
+    let file = "range_mcl/localization.npz";
+    call.set("result_file", file).succeeds();
+    let report = json(&recording.path("range_mcl/report.json"));
+    assert_eq!(report["summary"]["frames"], 4, "{report}");
 }
 
 #[test]

@@ -23,9 +23,8 @@ use smart_default::SmartDefault;
 
 use super::alignment::median;
 use super::block_system::{BlockRow, BlockSystem};
-use super::drive::Drive;
+use super::drive::{Drive, SHORTER};
 use super::pose_graph::Edge;
-use super::trajectory::SHORTER;
 use super::voxel_map::pack;
 use crate::geometry::pose::{exponential, logarithm};
 use crate::geometry::{PlaneSums, Pose3};

@@ -9,6 +9,9 @@ use super::voxel_map::VoxelMap;
 use crate::geometry::Pose3;
 use crate::lidar::Motion;
 
+/// Remedy for a drive that exceeds the budget of memory.
+pub const SHORTER: &str = "select fewer scans with start_idx and n_scans";
+
 /// Samples of the scans of a drive, and their poses.
 #[derive(Clone, Debug)]
 pub struct Drive {

@@ -7,7 +7,7 @@ use super::adjustment::{AdjustmentConfig, Held, adjust};
 use super::alignment::median;
 use super::anchors::{self, NotInMap, Placed};
 use super::config::OdometryConfig;
-use super::drive::{Drive, LocalMap};
+use super::drive::{Drive, LocalMap, SHORTER};
 use super::loops::{self, Drift, FoundLoop, Loop, LoopVerdict};
 use super::odometer::{Odometer, OdometryError, OdometryEstimate};
 use super::path_graph::{LOCAL_MAP, move_along, odometry_edges};
@@ -87,9 +87,6 @@ pub enum PlacementError {
 
 /// Memory of a point for loops and adjustment [bytes].
 const POINT_BYTES: f64 = 120.0;
-
-/// Remedy for a drive that exceeds the budget of memory.
-pub(super) const SHORTER: &str = "select fewer scans with start_idx and n_scans";
 
 impl TrajectoryBuilder {
     /// A trajectory without scans.

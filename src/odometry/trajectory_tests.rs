@@ -73,7 +73,7 @@ fn a_round_closes_its_loop_and_takes_the_drift_away() {
     );
     let mut drifted = Pose3::identity();
     for (row, scan) in scans.iter().enumerate() {
-        builder.keep(scan);
+        builder.keep(scan).unwrap();
         let motion = match row {
             0 => Pose3::identity(),
             row => truth[row - 1].inverse() * truth[row] * drift,

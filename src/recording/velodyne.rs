@@ -59,9 +59,9 @@ fn records<'a, const SIZE: usize>(
 
 #[cfg(test)]
 mod tests {
-    use glam::Vec3;
-
     use std::fs;
+
+    use glam::Vec3;
 
     use super::*;
     use crate::recording::scan_files;

@@ -1,7 +1,9 @@
 //! Amounts of work per submission to the device.
 
-use super::batches::IN_FLIGHT;
 use crate::rendering::backend::AdapterKind;
+
+/// Number of batches at the same time: one is read back, one runs, one is queued.
+pub(super) const IN_FLIGHT: usize = 3;
 
 /// Limits of one submission.
 #[derive(Clone, Copy, Debug)]

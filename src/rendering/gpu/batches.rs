@@ -2,11 +2,9 @@
 
 use std::collections::VecDeque;
 
+use super::batch_sizes::IN_FLIGHT;
 use super::device::{Gpu, InFlight};
 use crate::rendering::RenderError;
-
-/// One is read back, one runs, one is queued.
-pub(super) const IN_FLIGHT: usize = 3;
 
 /// Starts every batch, and finishes it before more than [`IN_FLIGHT`] have been started.
 pub(super) fn run<B>(
