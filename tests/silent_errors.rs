@@ -205,11 +205,8 @@ fn links_that_loop_do_not_multiply_the_recording() {
     let recording = mapped(3);
     recording.fpmcl("localize").succeeds();
     let expected = recording.bytes("results/mcl_tum.txt");
-    for (link, to) in [("velodyne/again", ".."), ("again", ".")] {
-        std::os::unix::fs::symlink(to, recording.path(link)).unwrap();
-    }
-    let call = recording.fpmcl("localize").with("--force");
-    call.set("scan_folder", ".").succeeds();
+    std::os::unix::fs::symlink(".", recording.path("velodyne/again")).unwrap();
+    recording.fpmcl("localize").with("--force").succeeds();
     assert!(recording.bytes("results/mcl_tum.txt") == expected);
 }
 
