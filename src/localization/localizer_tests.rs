@@ -1,5 +1,6 @@
 //! The localizer on scans as values.
 
+use glam::Vec3;
 use nalgebra::Vector2;
 
 use super::*;
@@ -84,6 +85,32 @@ fn the_same_seed_gives_identical_estimates() {
         assert_eq!(a.particles, b.particles);
     }
     assert_ne!(a[3].pose, other[3].pose);
+}
+
+#[test]
+fn a_change_of_the_scans_by_a_millimetre_changes_the_estimates_by_less() {
+    let world = TestWorld::street();
+    let truth = drive(&world, 10.0, 10);
+    let run = |changed_m: f32| {
+        let start = near(&truth[0]);
+        let mut localizer = Localizer::new(&world.map(), config(), start, 3).unwrap();
+        let step = |pair: &[Pose2]| {
+            let mut scan = scan(&world, &pair[1]);
+            // One of eleven thousand points is farther away, and one is missing.
+            let far = scan.points[7000].length();
+            scan.points[7000] *= 1.0 + changed_m / far.max(1.0);
+            if changed_m > 0.0 {
+                scan.points[5000] = Vec3::ZERO;
+            }
+            let odometry = Odometry::Increment(pair[0].inverse() * pair[1]);
+            localizer.step(&scan, odometry).unwrap()
+        };
+        truth.windows(2).map(step).collect::<Vec<_>>()
+    };
+    for (number, (a, b)) in run(0.0).iter().zip(&run(1e-3)).enumerate() {
+        let apart_m = error_m(a, &b.pose);
+        assert!(apart_m < 1e-3, "frame {number}: {apart_m} m");
+    }
 }
 
 #[test]

@@ -16,7 +16,7 @@ use smart_default::SmartDefault;
 
 use super::particles::Particle;
 use crate::geometry::{Pose3, Rigid3f, Vec3};
-use crate::lidar::{Beam, RangeImage};
+use crate::lidar::{Beam, LidarModel, RangeImage};
 use crate::map::{GroundPatch, Map, SensorAttitude};
 use crate::rendering::{RangeDifference, RangeRenderer, RenderError};
 use crate::validation::{
@@ -152,9 +152,8 @@ pub fn choose_beams(
     let largest = (road_share * count as f64).round() as usize;
     let proportional = count * road.len() / (road.len() + rest.len()).max(1);
     let of_road = proportional.min(largest);
-    let width = image.model.width;
-    let mut chosen = evenly_spread(&road, of_road, width, rng);
-    chosen.extend(evenly_spread(&rest, count - of_road, width, rng));
+    let mut chosen = evenly_spread(&road, of_road, &image.model, rng);
+    chosen.extend(evenly_spread(&rest, count - of_road, &image.model, rng));
     chosen.sort_unstable();
     chosen
         .into_iter()
@@ -167,13 +166,18 @@ pub fn choose_beams(
 /// The pixel of a column c is chosen if frac(c φ + u) is less than the requested share of the list, with the golden
 /// ratio φ, whose multiples are spread most evenly, and a random u for each row. Whether a pixel is chosen
 /// hardly depends on the others, so that almost equal scans give almost equal samples.
-fn evenly_spread(list: &[usize], count: usize, width: usize, rng: &mut impl Rng) -> Vec<usize> {
+fn evenly_spread(
+    list: &[usize],
+    count: usize,
+    model: &LidarModel,
+    rng: &mut impl Rng,
+) -> Vec<usize> {
     const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
     let share = count as f64 / list.len().max(1) as f64;
-    let rows = list.last().map_or(0, |last| last / width + 1);
-    let offsets: Vec<f64> = (0..rows).map(|_| rng.random()).collect();
+    // Of all rows, so that the numbers that are drawn afterwards do not depend on the scan.
+    let offsets: Vec<f64> = (0..model.height).map(|_| rng.random()).collect();
     let is_chosen = |&pixel: &usize| {
-        let (row, column) = (pixel / width, pixel % width);
+        let (row, column) = (pixel / model.width, pixel % model.width);
         (column as f64 * GOLDEN_RATIO + offsets[row]).fract() < share
     };
     list.iter().copied().filter(is_chosen).collect()
@@ -259,7 +263,6 @@ mod tests {
 
     use super::*;
     use crate::geometry::Pose2;
-    use crate::lidar::LidarModel;
     use crate::map::test_world::TestWorld;
 
     #[test]

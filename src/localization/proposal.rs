@@ -43,11 +43,12 @@ pub struct ProposalConfig {
     #[default(0.4)]
     pub road_share: f64,
     /// Number of beams that weight the particles.
-    #[default(300)]
+    #[default(600)]
     pub weighed_beams: usize,
     /// Registration of the scan with the map. Sampling and weighting add variance, which covers the
-    /// rest of the map error: with a larger `map_error_m` the covariances of simulated drives are too large.
-    #[default(RegistrationConfig { map_error_m: 0.001, ..RegistrationConfig::default() })]
+    /// rest of the map error: with a larger `map_error_m` the covariances of simulated drives are too large. The last
+    /// step is so small that the estimate does not depend on whether there is one more.
+    #[default(RegistrationConfig { map_error_m: 0.001, tolerance_m: 1e-4, ..RegistrationConfig::default() })]
     pub registration: RegistrationConfig,
     /// Factor k of the standard deviations of the proposal, at least 1, so that its tails are heavier than
     /// those of the target (unitless).

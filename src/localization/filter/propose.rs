@@ -22,6 +22,8 @@ pub(super) struct Proposal {
     /// Already widened.
     proposal: Gaussian,
     beams: Vec<Beam>,
+    /// Beams that weight the samples. Not every n-th of `beams`: one more or less there would change them all.
+    weighed_beams: Vec<Beam>,
     /// Height of the ground [m].
     level_m: f64,
     attitude: SensorAttitude,
@@ -65,7 +67,8 @@ impl ParticleFilter {
         let Some(patch) = self.patch_at(&mean).or(self.patch) else {
             return Ok(None);
         };
-        let beams = choose_beams(scan, config.beams, config.road_share, attitude, rng);
+        let mut choose = |count| choose_beams(scan, count, config.road_share, attitude, rng);
+        let (beams, weighed_beams) = (choose(config.beams), choose(config.weighed_beams));
         let start = patch.lift(&mean, attitude);
         let Some(found) = register(&*self.map.renderer, &beams, &start, &config.registration)?
         else {
@@ -87,6 +90,7 @@ impl ParticleFilter {
                 prior,
                 proposal,
                 beams,
+                weighed_beams,
                 level_m: patch.height_m,
                 attitude: patch.attitude_of(&found.map_from_lidar),
             }))
@@ -103,15 +107,14 @@ impl ParticleFilter {
             prior,
             proposal,
             beams,
+            weighed_beams,
             level_m,
             attitude,
         } = proposal;
         let poses = proposal.sample(self.config.num_reduced, rng);
         let particle = |pose| Particle::new(pose, Some(level_m));
         self.particles = ParticleSet::uniform(poses.into_iter().map(particle));
-        let step = beams.len().div_ceil(self.config.proposal.weighed_beams);
-        let compared: Vec<Beam> = beams.iter().step_by(step.max(1)).copied().collect();
-        let (mut logs, costs_m) = self.log_likelihoods(&compared, &attitude)?;
+        let (mut logs, costs_m) = self.log_likelihoods(&weighed_beams, &attitude)?;
         for (log, pose) in logs.iter_mut().zip(self.particles.poses()) {
             *log += prior.log_density(pose) - proposal.log_density(pose);
         }
