@@ -8,6 +8,9 @@
 //! lost  ⇔  fast < min_agreement  ∨  fast < lost_fraction · slow
 //! ```
 //!
+//! A place that was found by a search is confirmed by the share of one scan if nearly all of its beams agree, else by
+//! those of several scans in turn: many places agree with a single scan of few beams.
+//!
 //! Augmented MCL (Thrun, Burgard and Fox, *Probabilistic Robotics*, 2005, table 8.3) averages the
 //! likelihood instead; here traffic in front of the map must not raise an alarm, so that beams that
 //! end in front of the map are not counted.
@@ -61,6 +64,12 @@ pub struct TrackingLossConfig {
     /// Tracking is lost below this fraction of the slow average (unitless).
     #[default(0.75)]
     pub lost_fraction: f64,
+    /// A place that was found is the right one from this share of agreeing beams on (unitless).
+    #[default(0.85)]
+    pub sure_agreement: f64,
+    /// Updates in turn with lower shares, none below `min_agreement`, that confirm it nevertheless.
+    #[default(3)]
+    pub confirming_updates: usize,
     /// Updates without convergence after which the search restarts.
     #[default(25)]
     pub patience: usize,
@@ -85,6 +94,8 @@ impl Validate for TrackingLossConfig {
         )?;
         fraction("min_agreement", self.min_agreement)?;
         fraction("lost_fraction", self.lost_fraction)?;
+        fraction("sure_agreement", self.sure_agreement)?;
+        at_least_one("confirming_updates", self.confirming_updates)?;
         at_least_one("patience", self.patience)?;
         positive("max_spread_m", self.max_spread_m)
     }
@@ -95,6 +106,8 @@ impl Validate for TrackingLossConfig {
 pub struct AgreementMonitor {
     fast: Option<f64>,
     slow: Option<f64>,
+    /// Updates in turn that agree with a place that was found.
+    confirming: usize,
 }
 
 impl AgreementMonitor {
@@ -109,6 +122,23 @@ impl AgreementMonitor {
         };
         follow(&mut self.fast, config.fast_rate);
         follow(&mut self.slow, config.slow_rate);
+    }
+
+    /// Whether the place is confirmed to which the filter has converged, or not, in this update. Without a share
+    /// nothing contradicts it.
+    pub fn confirm(
+        &mut self,
+        is_converged: bool,
+        agreement: Option<f64>,
+        config: &TrackingLossConfig,
+    ) -> bool {
+        let agreement = agreement.unwrap_or(config.min_agreement);
+        self.confirming = match is_converged && agreement >= config.min_agreement {
+            true if agreement >= config.sure_agreement => config.confirming_updates,
+            true => self.confirming + 1,
+            false => 0,
+        };
+        self.confirming >= config.confirming_updates
     }
 
     /// Whether tracking is lost.
@@ -147,6 +177,26 @@ mod tests {
         assert!(!after(&frames));
         frames.extend([0.5; 4]);
         assert!(after(&frames));
+    }
+
+    #[test]
+    fn one_scan_confirms_a_place_only_if_nearly_all_beams_agree() {
+        let config = TrackingLossConfig::default();
+        let confirmed_after = |agreements: &[Option<f64>]| {
+            let mut monitor = AgreementMonitor::default();
+            let mut updates = agreements.iter();
+            updates.position(|&agreement| monitor.confirm(true, agreement, &config))
+        };
+        assert_eq!(confirmed_after(&[Some(0.95)]), Some(0));
+        assert_eq!(confirmed_after(&[Some(0.78), Some(0.7), Some(0.04)]), None);
+        assert_eq!(confirmed_after(&[Some(0.6); 4]), Some(2));
+        assert_eq!(confirmed_after(&[None; 4]), Some(2));
+        // An update without convergence restarts the count.
+        let mut monitor = AgreementMonitor::default();
+        for is_converged in [true, true, false, true, true] {
+            assert!(!monitor.confirm(is_converged, Some(0.7), &config));
+        }
+        assert!(monitor.confirm(true, Some(0.7), &config));
     }
 
     #[test]

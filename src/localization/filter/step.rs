@@ -136,12 +136,13 @@ impl ParticleFilter {
         let covariance = self.particles.covariance_about(&self.particles.mean());
         let is_wide = self.state == State::Tracking && spread(&covariance).0 > config.max_spread_m;
         let is_lost = is_wide || self.agreement.is_lost(config);
+        let is_found = self.agreement.confirm(is_converged, agreement, config);
         let is_stuck = self.updates_in_state >= config.patience;
         let next = match self.state {
             _ if is_lost => State::Lost,
-            State::Searching if is_converged => State::Tracking,
+            State::Searching if is_found => State::Tracking,
             State::Searching if is_stuck => State::Lost,
-            State::Lost if is_converged => State::Tracking,
+            State::Lost if is_found => State::Tracking,
             state => state,
         };
         self.updates_in_state = match next == self.state {
