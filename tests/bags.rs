@@ -9,10 +9,10 @@ mod bag_writers;
 use std::fs;
 use std::path::Path;
 
-use fpmcl::geometry::Vec3;
+use fpmcl::geometry::{Pose3, Vec3};
 use fpmcl::lidar::Scan;
 use fpmcl::recording::bags::{FramePose, TopicKind};
-use fpmcl::recording::{Bag, RecordingError, scan_files};
+use fpmcl::recording::{Bag, PoseTrack, RecordingError, scan_files};
 use rayon::prelude::*;
 
 use bag_writers::{
@@ -464,6 +464,22 @@ fn topics_that_cannot_be_taken_are_errors_that_list_the_others() {
 }
 
 #[test]
+fn poses_without_the_name_of_a_body_need_its_mounting() {
+    let data = pose_stamped(
+        Kind::CdrLittle,
+        START_NS,
+        "map",
+        &[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0],
+    );
+    let (_folder, bag) = bag_of("geometry_msgs/msg/PoseStamped", data);
+    let read = |body_from_lidar| PoseTrack::read_topic(&bag, None, "/points", body_from_lidar);
+    let message = read(None).unwrap_err().to_string();
+    assert!(message.contains("body_from_lidar"), "{message}");
+    let track = read(Some(Pose3::identity())).unwrap();
+    assert_eq!(track.world_from_map.translation.z, 3.0);
+}
+
+#[test]
 fn quaternions_and_positions_that_are_none_are_errors() {
     let unknown = [0.0; 7];
     let far = [1e9, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
@@ -490,6 +506,24 @@ fn read_all(path: &Path, bytes: &[u8]) -> Result<Content, String> {
         assert!(message.contains(name), "{message}");
         message
     })
+}
+
+#[test]
+fn a_chunk_with_another_checksum_is_damaged() {
+    let folder = tempfile::tempdir().unwrap();
+    let messages = recording(Kind::CdrLittle);
+    let options = mcap::WriteOptions::new().compression(None);
+    let mut file = mcap_compressed(&mcap(options, "cdr", &messages), "zstd");
+    let path = folder.path().join("chunks.mcap");
+    read_all(&path, &file).unwrap();
+    // Magic bytes and records before the first chunk, its head, times and size.
+    let mut at = 8;
+    while file[at] != 0x06 {
+        at += 9 + u64::from_le_bytes(*file[at + 1..].first_chunk().unwrap()) as usize;
+    }
+    file[at + 9 + 24] ^= 1;
+    let message = read_all(&path, &file).unwrap_err();
+    assert!(message.contains("checksum"), "{message}");
 }
 
 #[test]

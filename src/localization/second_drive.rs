@@ -7,7 +7,9 @@ use super::tracking_loss::State;
 use crate::geometry::Pose3;
 use crate::lidar::Scan;
 use crate::map::Map;
-use crate::odometry::{OdometryError, PlacementError, Trajectory, TrajectoryBuilder, TrajectoryConfig};
+use crate::odometry::{
+    OdometryError, PlacementError, Trajectory, TrajectoryBuilder, TrajectoryConfig,
+};
 
 /// Why a scan of a second drive cannot be used.
 #[derive(Debug, thiserror::Error)]

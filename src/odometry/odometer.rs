@@ -34,6 +34,8 @@ pub enum OdometryError {
 pub enum StepState {
     /// There is no scan before it: the origin.
     First,
+    /// Given, not measured.
+    Given,
     /// Registered to the local map.
     Registered,
     /// Predicted by constant velocity; the scan is not mapped. It has too few points, it does not fit the local

@@ -120,6 +120,7 @@ impl TrajectoryBuilder {
         self.estimates.push(OdometryEstimate {
             odom_from_lidar: map_from_lidar,
             previous_from_current: last.inverse() * map_from_lidar,
+            state: StepState::Given,
             ..OdometryEstimate::first(match times_s {
                 Some((before_s, time_s)) if time_s > before_s => interval_s(before_s, time_s),
                 _ => self.config.odometry.period_s,

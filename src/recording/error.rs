@@ -76,6 +76,10 @@ pub enum RecordingError {
     #[error("{} has no poses (poses.txt, poses_tum.txt, poses.tum or oxts); name their file with --poses, or in pose_file", path.display())]
     NoPoseFile { path: PathBuf },
     #[error(
+        "the poses of {topic} do not name the body that they are of; give its lidar's pose with body_from_lidar, [0, 0, 0, 0, 0, 0] if they are poses of the lidar"
+    )]
+    NoBody { topic: String },
+    #[error(
         "the poses of {topic} are those of {body}, and no static transform leads from it to {lidar}, the frame of the scans; record tf_static, or give the poses as a file with --poses and the mounting with body_from_lidar"
     )]
     NoMounting {

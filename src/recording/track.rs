@@ -79,6 +79,10 @@ impl PoseTrack {
         };
         let found = match body_from_lidar {
             Some(given) => Some(given),
+            None if first.child.is_empty() => {
+                let topic = topic.clone();
+                return Err(RecordingError::NoBody { topic });
+            }
             None => bag.body_from_lidar(&first.child, scan_topic)?,
         };
         let Some(body_from_lidar) = found else {

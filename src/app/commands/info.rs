@@ -161,8 +161,8 @@ fn track_in_words(track: &PoseTrack, recording: &Recording) -> String {
 fn cloud(path: &Path) -> Result<String> {
     /// Points of the largest scans; more are a cloud of many scans, which show no sensor.
     const MAX_SCAN: usize = 1_000_000;
-    let scan = scan_files::read(path)?;
-    let has_normals = scan_files::read_cloud(path)?.normals.is_some();
+    let cloud = scan_files::read_cloud(path)?;
+    let (scan, has_normals) = (cloud.scan, cloud.normals.is_some());
     let normals = if has_normals { "yes" } else { "no" };
     let finite = scan.points.iter().filter(|point| point.is_finite());
     let mut rows = vec![

@@ -119,7 +119,8 @@ fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Option<SensorD
     if let Some(path) = &config.pose_file {
         let track = inputs.track(path, &recording)?;
         recording = recording.with_poses(track)?;
-        trajectory::check(&recording, config.max_step_m, path)?;
+        let origin = format!("pose_file is {}", path.display());
+        trajectory::check(&recording, config.max_step_m, &origin)?;
         recording.skipped.clear();
     }
     let keys = SensorKeys {
@@ -179,6 +180,7 @@ fn in_words(state: StepState) -> &'static str {
         StepState::First => "first",
         StepState::Registered => "registered",
         StepState::Predicted => "predicted",
+        StepState::Given => "given",
     }
 }
 

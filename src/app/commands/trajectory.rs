@@ -199,11 +199,11 @@ impl TrajectorySummary {
     }
 }
 
-/// Checks the poses of a recording, which are from a file, against each other.
-pub fn check(recording: &Recording, max_step_m: f64, path: &Path) -> Result<()> {
+/// Checks the poses of a recording against each other; `origin` says where they are from.
+pub fn check(recording: &Recording, max_step_m: f64, origin: &str) -> Result<()> {
     let poses = recording.frames.iter();
     let poses = poses.filter_map(|frame| Some((frame.number, frame.map_from_lidar.as_ref()?)));
-    path_check::check(poses, max_step_m).with_context(|| format!("pose_file is {}", path.display()))
+    path_check::check(poses, max_step_m).with_context(|| origin.to_owned())
 }
 
 /// The file of the poses of a map that was built without given ones.

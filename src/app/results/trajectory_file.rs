@@ -34,6 +34,7 @@ pub fn write_trajectory_npz(
         StepState::First => 0_u8,
         StepState::Registered => 1,
         StepState::Predicted => 2,
+        StepState::Given => 3,
     };
     write_atomically(path, |file| {
         let mut npz = NpzWriter::new(file);

@@ -276,11 +276,16 @@ fn body(source: &mut dyn Read, expected: u8) -> Result<Vec<u8>, String> {
 fn chunk(source: &mut dyn Read) -> Result<Vec<u8>, String> {
     let body = body(source, op::CHUNK)?;
     let mut fields = fields(&body)?;
-    let (_start, _end, size, _checksum) =
+    let (_start, _end, size, checksum) =
         (fields.u64()?, fields.u64()?, fields.u64()?, fields.u32()?);
     let (compression, length) = (fields.text()?, fields.u64()?);
     let length = usize::try_from(length).map_err(|_large| truncated())?;
-    decompress(&compression, fields.bytes(length)?, size)
+    let data = decompress(&compression, fields.bytes(length)?, size)?;
+    // 0: the recorder wrote none.
+    if checksum != 0 && checksum != crc32fast::hash(&data) {
+        return Err("has a damaged chunk: its checksum differs".to_owned());
+    }
+    Ok(data)
 }
 
 fn message(source: &mut dyn Read) -> Result<Vec<u8>, String> {

@@ -60,16 +60,7 @@ pub fn read(path: &Path) -> Result<Scan, RecordingError> {
 pub fn read_stamped(path: &Path, stamp_s: Option<f64>) -> Result<ReadScan, RecordingError> {
     let bytes = read_bytes(path)?;
     let read = match table(path, &bytes) {
-        Some(table) => table.and_then(|table| {
-            let (mut scan, numbers) = table.points()?;
-            let has_times =
-                set_times(&mut scan, &numbers, stamp_s) || set_times(&mut scan, &numbers, None);
-            scan.time_s = scan.time_s.or(stamp_s);
-            Ok(ReadScan {
-                scan,
-                has_unknown_times: !has_times,
-            })
-        }),
+        Some(table) => table.and_then(|table| scan_of(&table, stamp_s)),
         None => bin::parse(&bytes).map(|scan| ReadScan {
             scan: Scan {
                 time_s: stamp_s,
@@ -81,11 +72,21 @@ pub fn read_stamped(path: &Path, stamp_s: Option<f64>) -> Result<ReadScan, Recor
     read.map_err(bad_scan(path))
 }
 
+fn scan_of(table: &Table, stamp_s: Option<f64>) -> Result<ReadScan, String> {
+    let (mut scan, numbers) = table.points()?;
+    let has_times = set_times(&mut scan, &numbers, stamp_s) || set_times(&mut scan, &numbers, None);
+    scan.time_s = scan.time_s.or(stamp_s);
+    Ok(ReadScan {
+        scan,
+        has_unknown_times: !has_times,
+    })
+}
+
 /// A point cloud as it is read.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ReadCloud {
-    /// Positions [m].
-    pub points: Vec<Vec3>,
+    /// Its points, as those of a scan.
+    pub scan: Scan,
     /// Normal of each point; `None` if the file has none.
     pub normals: Option<Vec<Vec3>>,
 }
@@ -96,12 +97,12 @@ pub fn read_cloud(path: &Path) -> Result<ReadCloud, RecordingError> {
     let read = match table(path, &bytes) {
         Some(table) => table.and_then(|table| {
             Ok(ReadCloud {
-                points: table.points()?.0.points,
+                scan: scan_of(&table, None)?.scan,
                 normals: table.normals(),
             })
         }),
         None => bin::parse(&bytes).map(|scan| ReadCloud {
-            points: scan.points,
+            scan,
             normals: None,
         }),
     };

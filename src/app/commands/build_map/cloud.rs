@@ -65,7 +65,7 @@ fn build_blocks(
     context.interrupt.keeps(kept.to_owned());
     let read = clock.time("read", || scan_files::read_cloud(cloud_file))?;
     let normals = usable_normals(&read, cloud_file);
-    let points = read.points;
+    let points = read.scan.points;
     let local_map = config.map().local_map;
     let prepare = || {
         CloudPlan::new(&points, normals.as_deref(), &[], &local_map, &|event| {
@@ -95,7 +95,7 @@ fn usable_normals(cloud: &ReadCloud, path: &Path) -> Option<Vec<Vec3>> {
     const TOLERANCE: f32 = 0.01;
     let normals = cloud.normals.as_ref()?;
     let is_unit = |normal: &Vec3| (normal.length() - 1.0).abs() <= TOLERANCE;
-    let pairs = cloud.points.iter().zip(normals);
+    let pairs = cloud.scan.points.iter().zip(normals);
     let bad = pairs.filter(|(point, normal)| point.is_finite() && !is_unit(normal));
     match bad.count() {
         0 => {

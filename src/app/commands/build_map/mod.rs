@@ -139,7 +139,8 @@ fn open(config: &mut BuildMapConfig, claims: &mut Claims, context: &Context) -> 
     let pose_file = given.as_ref().map(|track| track.path.clone());
     if let (Some(track), Some(pose_file)) = (given, &pose_file) {
         recording = recording.with_poses(track)?;
-        trajectory::check(&recording, config.max_step_m, pose_file)?;
+        let origin = format!("pose_file is {}", pose_file.display());
+        trajectory::check(&recording, config.max_step_m, &origin)?;
     }
     let (mut sequence, sensor) = config.sensor_keys().resolve(recording)?;
     if let Some(pose_file) = pose_file.filter(|_| config.check_poses) {
@@ -150,7 +151,8 @@ fn open(config: &mut BuildMapConfig, claims: &mut Claims, context: &Context) -> 
     if sequence.track.is_none() || config.poses == PoseSource::Polished {
         (sequence, trajectory) = poses::find(sequence, config, older_map.as_ref(), context)?;
         let found = file_beside(&config.mesh_file);
-        trajectory::check(&sequence, config.max_step_m, &found)?;
+        let origin = format!("the poses from the scans are in {}", found.display());
+        trajectory::check(&sequence, config.max_step_m, &origin)?;
     } else if let Some(name) = file_beside(&config.mesh_file).file_name() {
         claims.remove(&[&name.to_string_lossy()])?;
     }
