@@ -265,6 +265,7 @@ fn recordings() {
             }
             for frame in &sequence
                 .rotating(Some(Rotation {
+                    start_rad: 0.4,
                     direction: RotationDirection::Clockwise,
                     period_s: 0.1,
                 }))

@@ -7,23 +7,25 @@
 //! p = exp(t / T · log(previous_from_current)) · p_measured       T: duration of the motion
 //! ```
 //!
-//! Where the data have no times, they follow from the azimuth α of a sensor that turns once in a period P
-//! and whose pose is that of facing forward:
+//! Where the data have no times, they follow from the azimuth α of a sensor that turns once in a period P,
+//! from an azimuth α₀ on, and whose pose is that of the middle of the revolution:
 //!
 //! ```text
-//! t = −α P / 2π  clockwise,   +α P / 2π  counter-clockwise
+//! t = −(α − α₀ − π) P / 2π  clockwise,   +(α − α₀ − π) P / 2π  counter-clockwise,   −P/2 ≤ t < P/2
 //! ```
 //!
+//! With α₀ = π, as of KITTI, the revolution starts behind and the pose is that of facing forward.
 //! Geiger et al., *Vision meets Robotics: The KITTI Dataset* (2013), section III, for the time stamp.
 
 use std::f32::consts::TAU;
+use std::f64::consts::PI;
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
 use super::scan::Scan;
 use crate::geometry::pose::{exponential, logarithm};
-use crate::geometry::{Pose3, Rigid3f};
+use crate::geometry::{Pose3, Rigid3f, wrap_angle};
 
 /// Duration of a revolution, and time between scans, where nothing shows it [s].
 pub const PERIOD_S: f64 = 0.1;
@@ -45,16 +47,22 @@ pub struct Rotation {
     pub direction: RotationDirection,
     /// Duration of a revolution [s].
     pub period_s: f64,
+    /// Azimuth at which a revolution starts, counter-clockwise from the x axis [rad].
+    pub start_rad: f64,
 }
 
 impl Rotation {
-    /// Time of each point from its azimuth, zero in front [s].
+    /// Time of each point from its azimuth, zero in the middle of the revolution [s].
     pub fn point_times(&self, points: &[Vec3]) -> Vec<f32> {
-        let period_s = match self.direction {
-            RotationDirection::Clockwise => -self.period_s,
-            RotationDirection::CounterClockwise => self.period_s,
-        } as f32;
-        let time = |point: &Vec3| point.y.atan2(point.x) / TAU * period_s;
+        let sense = match self.direction {
+            RotationDirection::Clockwise => -1.0,
+            RotationDirection::CounterClockwise => 1.0,
+        };
+        let (middle_rad, period_s) = (wrap_angle(self.start_rad + PI) as f32, self.period_s as f32);
+        let time = |point: &Vec3| {
+            let turns = sense * (point.y.atan2(point.x) - middle_rad) / TAU;
+            (turns - (turns + 0.5).floor()) * period_s
+        };
         points.iter().map(time).collect()
     }
 }
@@ -220,6 +228,7 @@ mod tests {
         Rotation {
             direction,
             period_s: 0.1,
+            start_rad: PI,
         }
     }
 
@@ -263,6 +272,29 @@ mod tests {
         assert_eq!(times, [0.0, -0.025, 0.025]);
         let times = rotation(RotationDirection::CounterClockwise).point_times(&points);
         assert_eq!(times, [0.0, 0.025, -0.025]);
+    }
+
+    #[test]
+    fn times_ascend_over_a_revolution_from_its_start_on_and_are_zero_in_its_middle() {
+        for (direction, sense) in [
+            (RotationDirection::Clockwise, -1.0_f32),
+            (RotationDirection::CounterClockwise, 1.0),
+        ] {
+            for start_rad in [0.0, 0.7, -2.5, 3.1, 6.0] {
+                let rotation = Rotation {
+                    start_rad,
+                    ..rotation(direction)
+                };
+                let at = |turns: f32| {
+                    let azimuth = start_rad as f32 + sense * turns * TAU;
+                    Vec3::new(azimuth.cos(), azimuth.sin(), 0.0)
+                };
+                let times = rotation.point_times(&[0.01, 0.25, 0.5, 0.75, 0.99].map(at));
+                for (found, expected) in times.iter().zip([-0.049, -0.025, 0.0, 0.025, 0.049]) {
+                    assert_relative_eq!(*found, expected, epsilon = 1e-6);
+                }
+            }
+        }
     }
 
     #[test]

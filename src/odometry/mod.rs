@@ -53,7 +53,7 @@ pub use config::OdometryConfig;
 pub use loops::{Loop, LoopVerdict};
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 pub use pose_check::{GivenPoses, MotionDifference, PoseCheck, PoseFit, PoseMeaning, check_poses};
-pub use timing::{TimingComparison, TimingError, compare_timings};
+pub use timing::{TimingComparison, TimingError, compare_timings, order_of_firing};
 pub use trajectory::{PlacementError, Trajectory, TrajectoryBuilder, TrajectoryConfig};
 
 #[cfg(test)]

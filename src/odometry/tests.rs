@@ -6,7 +6,7 @@ use rand::{SeedableRng as _, rngs::StdRng};
 use rand_distr::{Distribution as _, StandardNormal};
 
 use super::*;
-use crate::geometry::Pose3;
+use crate::geometry::{Pose3, wrap_angle};
 use crate::lidar::{Rotation, RotationDirection, Scan};
 
 /// Surfaces: planes n · p = d within a box, and upright cylinders (x, y, radius) up to a height.
@@ -161,6 +161,7 @@ pub(super) fn drive(time_s: f64) -> Pose3 {
 const CLOCKWISE: Rotation = Rotation {
     direction: RotationDirection::Clockwise,
     period_s: 0.1,
+    start_rad: std::f64::consts::PI,
 };
 
 /// Scans of the drive, ten per second; with a rotation they are not compensated.
@@ -379,23 +380,60 @@ fn times_of_scans_must_ascend() {
 
 #[test]
 fn the_times_that_fit_are_found() {
-    let counter_clockwise = Rotation {
-        direction: RotationDirection::CounterClockwise,
-        ..CLOCKWISE
-    };
-    let candidates = [None, Some(CLOCKWISE), Some(counter_clockwise)];
     let best = |scans: &[Scan]| {
         let config = OdometryConfig::default();
-        compare_timings(scans, &candidates, &config).unwrap().best
+        let found = compare_timings(scans, CLOCKWISE.period_s, &config).unwrap();
+        found.best.map(|best| found.residuals_m[best].0)
     };
-    for (index, &candidate) in candidates.iter().enumerate() {
-        assert_eq!(
-            best(&drive_scans(8, candidate)),
-            Some(index),
-            "{candidate:?}"
-        );
+    let rotations = [
+        (RotationDirection::Clockwise, 180.0_f64),
+        (RotationDirection::CounterClockwise, 180.0),
+        (RotationDirection::Clockwise, 90.0),
+        (RotationDirection::CounterClockwise, 0.0),
+    ];
+    for (direction, start_deg) in rotations {
+        let rotation = Rotation {
+            direction,
+            start_rad: start_deg.to_radians(),
+            ..CLOCKWISE
+        };
+        let found = best(&drive_scans(8, Some(rotation))).flatten().unwrap();
+        let apart_rad = wrap_angle(found.start_rad - rotation.start_rad);
+        assert_eq!(found.direction, direction, "{start_deg}");
+        assert!(apart_rad.abs() < 0.01, "{start_deg}: {apart_rad}");
     }
+    assert_eq!(best(&drive_scans(8, None)), Some(None));
     let world = World::crossing();
     let at_rest = world.scan(|_| drive(0.0), None);
     assert_eq!(best(&vec![at_rest; 8]), None);
+}
+
+#[test]
+fn the_order_of_firing_shows_where_a_revolution_starts() {
+    for (direction, sense) in [
+        (RotationDirection::Clockwise, -1.0_f32),
+        (RotationDirection::CounterClockwise, 1.0),
+    ] {
+        for start in [0.3_f32, -2.0, 3.0] {
+            let azimuths = (0..3600).flat_map(|step| {
+                let azimuth = start + sense * std::f32::consts::TAU * step as f32 / 3600.0;
+                // Beams of one column are up to 3 degrees apart.
+                [0.0, 0.05, -0.05].map(|aside| azimuth + aside)
+            });
+            let points: Vec<Vec3> = azimuths
+                .map(|azimuth| 9.0 * Vec3::new(azimuth.cos(), azimuth.sin(), 0.1))
+                .collect();
+            let scan = |points| Scan {
+                points,
+                ..Scan::default()
+            };
+            let found = order_of_firing(&scan(points.clone()));
+            let (found, start_rad) = found.unwrap();
+            assert_eq!(found, direction);
+            assert!((start_rad - f64::from(start)).abs() < 0.06, "{start_rad}");
+            // One beam after the other, as in the files of KITTI.
+            let rows = (0..3).flat_map(|beam| points.iter().skip(beam).step_by(3));
+            assert_eq!(order_of_firing(&scan(rows.copied().collect())), None);
+        }
+    }
 }

@@ -9,7 +9,7 @@ use super::anchors::{self, NotInMap, Placed};
 use super::config::OdometryConfig;
 use super::drive::{Drive, LocalMap, SHORTER};
 use super::loops::{self, Drift, FoundLoop, Loop, LoopVerdict};
-use super::odometer::{Odometer, OdometryError, OdometryEstimate};
+use super::odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 use super::path_graph::{LOCAL_MAP, move_along, odometry_edges};
 use super::pose_graph::{Edge, optimize};
 use super::sampling::{Sample, sensor_range};

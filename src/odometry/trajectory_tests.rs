@@ -4,7 +4,6 @@ use nalgebra::Vector3;
 use rand::{SeedableRng as _, rngs::StdRng};
 use rand_distr::{Distribution as _, StandardNormal};
 
-use super::super::odometer::StepState;
 use super::super::tests::{World, drive};
 use super::*;
 

@@ -9,7 +9,8 @@ use crate::app::config::{
     BuildMapConfig, LocalizationConfig, MotionCompensation, OdometryCommandConfig,
     RangeImageConfig, RefinementConfig, body_from_lidar,
 };
-use crate::lidar::{LidarModel, PERIOD_S, Scan};
+use crate::geometry::wrap_angle;
+use crate::lidar::{LidarModel, PERIOD_S, Rotation, Scan};
 use crate::map::scan_cloud::ScanConfig;
 use crate::map::{Map, MapOptions, MappingPath, mesh_file};
 use crate::odometry::{OdometryConfig, TimingComparison, compare_timings};
@@ -347,49 +348,59 @@ fn period_s(recording: &Recording) -> f64 {
     }
 }
 
-/// Choices of the times of points, with their names.
-const TIMINGS: [(Option<MotionCompensation>, &str); 3] = [
-    (None, "compensated already"),
-    (Some(MotionCompensation::Clockwise), "clockwise"),
-    (
-        Some(MotionCompensation::CounterClockwise),
-        "counter-clockwise",
-    ),
-];
-
 /// The rotation that makes consecutive scans fit best; `None` if they fit best as they are, or if nothing shows it.
 fn fitting_rotation(recording: &Recording) -> Result<Option<MotionCompensation>> {
     let Some(compared) = compared_timings(recording)? else {
         return Ok(None);
     };
-    let name = (compared.best).map_or("undecided, none", |best| TIMINGS[best].1);
+    let best = compared.best.map(|best| compared.residuals_m[best].0);
+    let name = best.map_or("undecided, none".to_owned(), timing_in_words);
     tracing::info!(
         "motion compensation: {name}; distances between scans: {}",
         residuals_in_words(&compared)
     );
-    Ok(TIMINGS[compared.best.unwrap_or(0)].0)
+    Ok(best.flatten().map(|best| MotionCompensation::of(&best)))
 }
 
 /// Warns if another rotation than the configured one makes consecutive scans fit best.
 fn warn_of_contradiction(recording: &Recording, configured: MotionCompensation) -> Result<()> {
+    /// Starts of the revolution that are nearer are the same [rad].
+    const SAME_START_RAD: f64 = 0.5;
     let Some(compared) = compared_timings(recording)? else {
         return Ok(());
     };
-    if let Some((choice, name)) = compared.best.map(|best| TIMINGS[best])
-        && choice != Some(configured)
+    let configured = configured.rotation(PERIOD_S);
+    let is_same = |found: Rotation, configured: Rotation| {
+        let apart_rad = wrap_angle(found.start_rad - configured.start_rad).abs();
+        found.direction == configured.direction && apart_rad < SAME_START_RAD
+    };
+    if let Some(best) = compared.best.map(|best| compared.residuals_m[best].0)
+        && !(best.zip(configured)).is_some_and(|(best, configured)| is_same(best, configured))
     {
         tracing::warn!(
-            "the scans fit best as {name}, not as motion_compensation says; distances between scans: {}",
+            "the scans fit best as {}, not as motion_compensation says; distances between scans: {}",
+            timing_in_words(best),
             residuals_in_words(&compared)
         );
     }
     Ok(())
 }
 
+/// Times of points in words, as the key has them.
+fn timing_in_words(timing: Option<Rotation>) -> String {
+    match timing {
+        None => "compensated already".to_owned(),
+        Some(rotation) => {
+            let text = MotionCompensation::of(&rotation).to_string();
+            text.replace("counter_clockwise", "counter-clockwise")
+        }
+    }
+}
+
 fn residuals_in_words(compared: &TimingComparison) -> String {
-    let residuals = compared.residuals_m.iter().zip(TIMINGS);
+    let residuals = compared.residuals_m.iter();
     let words: Vec<String> = residuals
-        .map(|((_, m), (_, name))| format!("{name} {:.1} mm", 1e3 * m))
+        .map(|(timing, m)| format!("{} {:.1} mm", timing_in_words(*timing), 1e3 * m))
         .collect();
     words.join(", ")
 }
@@ -415,13 +426,8 @@ fn compared_timings(recording: &Recording) -> Result<Option<TimingComparison>> {
     if scans.iter().any(|scan| !scan.times_s.is_empty()) {
         return Ok(None);
     }
-    let period_s = period_s(recording);
-    let candidates = TIMINGS.map(|(choice, _)| choice.and_then(|it| it.rotation(period_s)));
-    Ok(Some(compare_timings(
-        &scans,
-        &candidates,
-        &OdometryConfig::default(),
-    )?))
+    let config = OdometryConfig::default();
+    Ok(Some(compare_timings(&scans, period_s(recording), &config)?))
 }
 
 /// Some scans, spread over the recording.

@@ -1,5 +1,6 @@
 //! Keys of recordings and sensors that several commands share.
 
+use std::fmt;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -11,29 +12,98 @@ use crate::lidar::{LidarModel, Rotation, RotationDirection};
 use crate::validation::{InvalidValue, Validate, in_range, require};
 
 /// Times of points that the data do not have, for motion compensation.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
 pub enum MotionCompensation {
     /// Times of the data, else the rotation that fits consecutive scans best.
     Auto,
-    /// Times from a clockwise rotation, seen from above.
-    Clockwise,
-    /// Times from a counter-clockwise rotation.
-    CounterClockwise,
+    /// Times from a rotation, written as `clockwise`, seen from above, or `counter_clockwise from 90`.
+    Rotation {
+        /// Sense of rotation.
+        direction: RotationDirection,
+        /// Azimuth at which a revolution starts, counter-clockwise from the x axis [deg].
+        start_deg: f64,
+    },
 }
 
+/// Azimuth at which a revolution starts that is not given: behind, as of KITTI [deg].
+const BEHIND_DEG: f64 = 180.0;
+
 impl MotionCompensation {
+    /// Times from a rotation, whose start is rounded to a degree.
+    pub fn of(rotation: &Rotation) -> Self {
+        Self::Rotation {
+            direction: rotation.direction,
+            start_deg: rotation.start_rad.to_degrees().round().rem_euclid(360.0),
+        }
+    }
+
     /// The configured rotation; `None` if it has to be inferred.
     pub fn rotation(self, period_s: f64) -> Option<Rotation> {
-        let direction = match self {
-            Self::Auto => return None,
-            Self::Clockwise => RotationDirection::Clockwise,
-            Self::CounterClockwise => RotationDirection::CounterClockwise,
-        };
-        Some(Rotation {
+        match self {
+            Self::Auto => None,
+            Self::Rotation {
+                direction,
+                start_deg,
+            } => Some(Rotation {
+                direction,
+                period_s,
+                start_rad: start_deg.to_radians(),
+            }),
+        }
+    }
+}
+
+impl fmt::Display for MotionCompensation {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self::Rotation {
             direction,
-            period_s,
-        })
+            start_deg,
+        } = *self
+        else {
+            return formatter.write_str("auto");
+        };
+        formatter.write_str(match direction {
+            RotationDirection::Clockwise => "clockwise",
+            RotationDirection::CounterClockwise => "counter_clockwise",
+        })?;
+        match start_deg == BEHIND_DEG {
+            true => Ok(()),
+            false => write!(formatter, " from {start_deg}"),
+        }
+    }
+}
+
+impl From<MotionCompensation> for String {
+    fn from(compensation: MotionCompensation) -> Self {
+        compensation.to_string()
+    }
+}
+
+impl TryFrom<String> for MotionCompensation {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        let (direction, start) = match text.split_once(" from ") {
+            Some((direction, start)) => (direction.trim(), start.trim().parse().ok()),
+            None => (text.as_str(), Some(BEHIND_DEG)),
+        };
+        let start_deg = start.filter(|deg: &f64| (-360.0..=360.0).contains(deg));
+        let direction = match direction {
+            "auto" if direction == text => return Ok(Self::Auto),
+            "clockwise" => Some(RotationDirection::Clockwise),
+            "counter_clockwise" => Some(RotationDirection::CounterClockwise),
+            _ => None,
+        };
+        match (direction, start_deg) {
+            (Some(direction), Some(start_deg)) => Ok(Self::Rotation {
+                direction,
+                start_deg,
+            }),
+            _ => Err(format!(
+                "`{text}` is not one of auto, clockwise, counter_clockwise, or with the azimuth at which a revolution starts [deg] `clockwise from 90`"
+            )),
+        }
     }
 }
 
