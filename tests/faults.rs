@@ -232,7 +232,10 @@ impl Row {
     /// Notes an error that is not one line.
     fn check_error(&mut self, ended: &Ended) {
         let lines = ended.stderr.lines();
-        let errors = lines.filter(|line| line.starts_with("error: ")).count();
+        // A command that does not look up is ended by another thread, which logs why.
+        let starts = ["error: ", "ERROR "];
+        let errors = lines.filter(|line| starts.iter().any(|start| line.starts_with(start)));
+        let errors = errors.count();
         if ended.stderr.contains("panicked") || errors != 1 {
             self.note(format!("{:?}: {}", ended.status, ended.stderr.trim()));
         } else {

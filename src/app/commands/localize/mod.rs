@@ -36,6 +36,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     input::require_file("map_file", &config.map_file)?;
     config.recording_inputs().require()?;
     let files = RunFiles::beside(&config.result_path);
+    context.interrupt.keeps("no frame was finished");
     let claims = prepare(config, context, &files)?;
     let map = config
         .map_inputs()
