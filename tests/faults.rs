@@ -231,11 +231,10 @@ impl Row {
 
     /// Notes an error that is not one line.
     fn check_error(&mut self, ended: &Ended) {
-        let lines = ended.stderr.lines();
         // A command that does not look up is ended by another thread, which logs why.
-        let starts = ["error: ", "ERROR "];
-        let errors = lines.filter(|line| starts.iter().any(|start| line.starts_with(start)));
-        let errors = errors.count();
+        let starts = ["error: ", "ERROR interrupted"];
+        let is_error = |line: &&str| starts.iter().any(|start| line.starts_with(start));
+        let errors = ended.stderr.lines().filter(is_error).count();
         if ended.stderr.contains("panicked") || errors != 1 {
             self.note(format!("{:?}: {}", ended.status, ended.stderr.trim()));
         } else {
