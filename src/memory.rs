@@ -61,7 +61,8 @@ pub fn read_file(path: &Path) -> io::Result<Vec<u8>> {
     let size = file.metadata()?.len();
     require(size)?;
     let limit = (BUDGET.load(Ordering::Relaxed) / COPIES).saturating_add(1);
-    let mut bytes = Vec::with_capacity(size as usize);
+    let mut bytes = Vec::new();
+    bytes.try_reserve_exact(usize::try_from(size).unwrap_or(usize::MAX))?;
     file.take(limit).read_to_end(&mut bytes)?;
     require(bytes.len() as u64)?;
     Ok(bytes)

@@ -78,7 +78,7 @@ pub struct Motion {
 
 impl Motion {
     /// The motion around a row of a trajectory, from the row before to the row after; at an end, extrapolated from the
-    /// two steps beside it. `None` if there is only one row, or if the times do not ascend.
+    /// two steps beside it if these last about as long. `None` if there is only one row, or if its times do not ascend.
     pub fn along(map_from_lidar: &[Pose3], times_s: &[f64], row: usize) -> Option<Self> {
         let last = map_from_lidar.len() - 1;
         let between = |first: usize, second: usize| Self {
@@ -95,15 +95,19 @@ impl Motion {
         (motion.duration_s > 0.0).then_some(motion)
     }
 
-    /// The motion at the end of a step that lies away from another step, at an even acceleration.
+    /// The motion at the outer end of this step, extrapolated at constant acceleration from this step and its neighbour.
     fn beyond(&self, other: &Self) -> Self {
-        let share = self.duration_s / (self.duration_s + other.duration_s);
+        /// Largest ratio of the durations: beyond it the noise of the shorter step would decide.
+        const MAX_RATIO: f64 = 3.0;
         let ratio = self.duration_s / other.duration_s;
+        if !(0.0..=MAX_RATIO).contains(&ratio) {
+            return *self;
+        }
+        let share = self.duration_s / (self.duration_s + other.duration_s);
         let [own, beside] = [self, other].map(|it| logarithm(&it.previous_from_current));
         let twist = own * (1.0 + share) - beside * (share * ratio);
-        let is_finite = twist.iter().all(|number| number.is_finite());
         Self {
-            previous_from_current: exponential(&if is_finite { twist } else { own }),
+            previous_from_current: exponential(&twist),
             ..*self
         }
     }

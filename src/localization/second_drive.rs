@@ -47,10 +47,13 @@ impl SecondDrive {
 
     /// Registers the next scan to those before it, and localizes it in the map.
     pub fn add(&mut self, scan: &Scan) -> Result<State, SecondDriveError> {
+        self.found.push(None);
         let motion = self.builder.add(scan)?.previous_from_current;
         let estimate = self.localizer.step(scan, Odometry::Motion(motion))?;
         let is_found = estimate.state == State::Tracking && estimate.on_mapped_ground;
-        (self.found).push(is_found.then_some(estimate.map_from_lidar));
+        if let Some(last) = self.found.last_mut() {
+            *last = is_found.then_some(estimate.map_from_lidar);
+        }
         Ok(estimate.state)
     }
 

@@ -3,8 +3,8 @@
 //!
 //! Each local map of the newer drive judges the older triangles in the region that it owns, by the free-space votes of its
 //! scans (see [`visibility`]). A new triangle whose corners and center lie on
-//! older surfaces that are kept is known already. Patches of less than half a square metre are noise of the surfaces
-//! and change nothing. Borders between older and added surfaces are not welded.
+//! older surfaces that are kept is already known and dropped. Connected patches of less than half a square metre are noise and
+//! change nothing. Borders between older and added surfaces are not welded.
 
 use glam::Vec3;
 use rayon::prelude::*;
@@ -39,7 +39,12 @@ pub(super) fn compare(
     (number, ownership): (usize, &Ownership),
     config: &VisibilityConfig,
 ) -> Changes {
-    let bounds = mesh.bounds();
+    // Beams lie between the scans and the surfaces on which they end.
+    let mut bounds = mesh.bounds();
+    for scan in scans {
+        bounds.min = bounds.min.min(scan.map_from_lidar.translation);
+        bounds.max = bounds.max.max(scan.map_from_lidar.translation);
+    }
     let (min, max) = (bounds.min - SAME_M, bounds.max + SAME_M);
     let overlaps = |triangle: usize| {
         let corners = older.corners(triangle);
@@ -50,11 +55,13 @@ pub(super) fn compare(
     let numbers: Vec<usize> = (0..older.triangles.len())
         .filter(|&triangle| overlaps(triangle))
         .collect();
-    let mut near = older.clone();
-    near.colors.clear();
-    near.triangles = (numbers.iter())
-        .map(|&triangle| older.triangles[triangle])
-        .collect();
+    let mut near = TriangleMesh {
+        vertices: older.vertices.clone(),
+        triangles: (numbers.iter())
+            .map(|&triangle| older.triangles[triangle])
+            .collect(),
+        ..TriangleMesh::default()
+    };
     near.drop_unreferenced_vertices();
     let crossed = match config.enabled {
         true => in_patches(&near, &visibility::crossed_triangles(&near, scans, config)),
@@ -77,7 +84,7 @@ pub(super) fn compare(
     }
 }
 
-/// Which of some triangles form a patch that is large enough.
+/// Which selected triangles belong to connected patches of at least [`MIN_PATCH_M2`].
 fn in_patches(mesh: &TriangleMesh, is_some: &[bool]) -> Vec<bool> {
     let mut parents: Vec<u32> = (0..mesh.vertices.len() as u32).collect();
     let some = || (mesh.triangles.iter().zip(is_some).enumerate()).filter(|(_, (_, is))| **is);

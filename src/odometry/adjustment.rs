@@ -24,7 +24,7 @@ use smart_default::SmartDefault;
 use super::alignment::median;
 use super::block_system::{BlockRow, BlockSystem};
 use super::drive::{Drive, SHORTER};
-use super::pose_graph::Edge;
+use super::pose_graph::{Edge, information};
 use super::voxel_map::pack;
 use crate::geometry::pose::{exponential, logarithm};
 use crate::geometry::{PlaneSums, Pose3};
@@ -86,7 +86,7 @@ struct Plane {
     couplings: Vec<(usize, Matrix6x3<f64>)>,
 }
 
-/// What holds a drive in its frame.
+/// Constraint that fixes the frame of a drive.
 #[derive(Clone, Copy, Debug)]
 pub enum Held<'a> {
     /// Its first pose.
@@ -152,7 +152,7 @@ pub fn adjust(
         let edge_m = factor * config.voxels * drive.voxel_m;
         let (rows, planes) = associate(drive, held, edge_m, &kernels_m);
         let Some(residuals) = Residuals::of(&rows, &planes) else {
-            return Ok(None);
+            break;
         };
         require_memory(&rows, &planes)?;
         result = Some([
@@ -169,7 +169,7 @@ pub fn adjust(
             *kernel_m = found_m.max(least_m).min(*kernel_m);
         }
         let Some(steps) = system.solve() else {
-            return Ok(None);
+            break;
         };
         let largest_m = (steps.iter())
             .map(|step| step.fixed_rows::<3>(0).norm() + 10.0 * step.fixed_rows::<3>(3).norm())
@@ -187,9 +187,9 @@ pub fn adjust(
             break;
         }
     }
-    if matches!(held, Held::First) {
+    if let (Held::First, Some(moved)) = (held, drive.poses.first()) {
         // All move with the first: to move it alone against the others would take many steps.
-        let as_before = first * drive.poses[0].inverse();
+        let as_before = first * moved.inverse();
         for pose in &mut drive.poses {
             *pose = as_before * *pose;
         }
@@ -222,7 +222,7 @@ fn require_memory(rows: &[Row], planes: &[Plane]) -> Result<(), MemoryError> {
 
 /// The motion between scans in succession stays about the initial one.
 fn motion_edges(poses: &[Pose3], config: &AdjustmentConfig) -> Vec<Edge> {
-    let information = information(config.motion_m, config.motion_deg);
+    let information = information(config.motion_m, config.motion_deg.to_radians());
     (poses.windows(2).enumerate())
         .map(|(first, pair)| Edge {
             first,
@@ -234,13 +234,8 @@ fn motion_edges(poses: &[Pose3], config: &AdjustmentConfig) -> Vec<Edge> {
         .collect()
 }
 
-fn information(shift_m: f64, turn_deg: f64) -> Matrix6<f64> {
-    let [shift, turn] = [shift_m.powi(-2), turn_deg.to_radians().powi(-2)];
-    Matrix6::from_diagonal(&Vector6::new(shift, shift, shift, turn, turn, turn))
-}
-
-/// Holds the poses near given ones, or damps the first one, without which they could move together; the surfaces of a map
-/// hold them by their planes.
+/// Keeps the poses near given ones, or damps the first one, because otherwise all could move together; in a map its
+/// planes fix them.
 fn hold(system: &mut BlockSystem, poses: &[Pose3], held: Held, config: &AdjustmentConfig) {
     /// Information of the damping [1/m², 1/rad²].
     const DAMPING: f64 = 1.0;
@@ -252,7 +247,7 @@ fn hold(system: &mut BlockSystem, poses: &[Pose3], held: Held, config: &Adjustme
         Held::Surfaces(_) => return,
         Held::Given(given) => given,
     };
-    let information = information(config.given_m, config.given_deg);
+    let information = information(config.given_m, config.given_deg.to_radians());
     for (row, (pose, given)) in poses.iter().zip(given).enumerate() {
         let deviation = logarithm(&(given.inverse() * pose));
         system.add(row, &information, &-(information * deviation));

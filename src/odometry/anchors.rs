@@ -1,21 +1,21 @@
 //! A drive in an older map: poses of scans that were found in it hold the drive.
 //!
-//! The drive is first moved as a whole, by the scan whose pose in the map the most others agree with, and
+//! The drive is first moved as a whole, by the scan whose pose in the map agrees with the positions of the most others, and
 //! then bent: a pose graph over its local maps, the motions between them, its loops and the map, with a robust kernel for
 //! loops and for poses in the map. A pose in the map counts if the map has the surfaces around it, as those of a loop.
 
 use std::collections::HashSet;
 
 use glam::{DVec3, IVec3};
-use nalgebra::{Matrix6, Vector6};
 
-use super::drive::{Drive, LocalMap};
+use super::drive::{Drive, LocalMap, POINT_BYTES, SHORTER};
 use super::loops::{Loop, LoopVerdict, MIN_COMMON, common_share};
 use super::odometer::OdometryEstimate;
 use super::path_graph::{LOCAL_MAP, move_along, odometry_edges};
-use super::pose_graph::{Edge, optimize};
+use super::pose_graph::{Edge, information, optimize};
 use super::voxel_map::{CellHasher, VoxelMap, pack};
 use crate::geometry::{Pose3, TriangleMesh};
+use crate::memory::{self, MemoryError};
 
 /// The drive was not found in the map.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -23,6 +23,17 @@ use crate::geometry::{Pose3, TriangleMesh};
     "the recording was not found in the map, or its scans were found at places that contradict its motion: it may be of another road"
 )]
 pub struct NotInMap;
+
+/// Why a drive cannot be moved into a map.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum PlacementError {
+    /// It was not found there.
+    #[error(transparent)]
+    NotInMap(#[from] NotInMap),
+    /// Its scans do not fit the budget of memory.
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
+}
 
 /// A drive that was moved into a map.
 pub struct Placed {
@@ -39,10 +50,11 @@ pub fn place(
     map_from_lidar: &[Option<Pose3>],
     odometry: &[OdometryEstimate],
     loops: &[Loop],
-) -> Result<Placed, NotInMap> {
+) -> Result<Placed, PlacementError> {
     /// Distance between points on the surfaces, in voxels.
     const SPACING: f64 = 0.25;
-    let found: Vec<(usize, Pose3)> = (map_from_lidar.iter().enumerate())
+    let rows = map_from_lidar.iter().take(drive.poses.len());
+    let found: Vec<(usize, Pose3)> = (rows.enumerate())
         .filter_map(|(row, pose)| Some((row, (*pose)?)))
         .collect();
     let map_from_odom = common_transform(drive, &found).ok_or(NotInMap)?;
@@ -50,7 +62,7 @@ pub fn place(
         *pose = map_from_odom * *pose;
     }
     let maps = drive.local_maps(LOCAL_MAP * drive.range_m);
-    let surfaces = surface_points(mesh, drive, SPACING * drive.voxel_m);
+    let surfaces = surface_points(mesh, drive, SPACING * drive.voxel_m)?;
     let mut voxels = VoxelMap::new(drive.voxel_m, f32::MAX);
     voxels.insert(&surfaces);
     let in_map: Vec<Edge> = map_edges(drive, &maps, &found)
@@ -61,11 +73,11 @@ pub fn place(
         })
         .collect();
     if in_map.is_empty() {
-        return Err(NotInMap);
+        return Err(NotInMap.into());
     }
     // The map is the first pose of the graph.
     let mut edges = odometry_edges(drive, &maps, odometry);
-    edges.extend(loop_edges(&maps, loops));
+    edges.extend(loop_edges(drive, &maps, loops));
     for edge in &mut edges {
         edge.first += 1;
         edge.second += 1;
@@ -115,25 +127,26 @@ fn common_transform(drive: &Drive, found: &[(usize, Pose3)]) -> Option<Pose3> {
         .map(|(_, map_from_odom)| map_from_odom)
 }
 
-fn information(shift_m: f64, turn_rad: f64) -> Matrix6<f64> {
-    let [shift, turn] = [shift_m.powi(-2), turn_rad.powi(-2)];
-    Matrix6::from_diagonal(&Vector6::new(shift, shift, shift, turn, turn, turn))
-}
-
-/// The loops that the poses follow.
-fn loop_edges(maps: &[LocalMap], loops: &[Loop]) -> Vec<Edge> {
+/// The loops that the poses follow, between the centers of their local maps.
+fn loop_edges(drive: &Drive, maps: &[LocalMap], loops: &[Loop]) -> Vec<Edge> {
     /// Standard deviations [m], [rad].
     const SHIFT_M: f64 = 0.05;
     const TURN_RAD: f64 = 0.005;
+    let motion = |a: usize, b: usize| drive.poses[a].inverse() * drive.poses[b];
     let map_of = |row: usize| maps.partition_point(|map| map.rows.end <= row);
     (loops.iter())
         .filter(|found| found.verdict == LoopVerdict::Accepted)
-        .map(|found| Edge {
-            first: map_of(found.first),
-            second: map_of(found.second),
-            first_from_second: found.first_from_second,
-            information: information(SHIFT_M, TURN_RAD),
-            is_loop: true,
+        .map(|found| {
+            let [first, second] = [found.first, found.second].map(map_of);
+            Edge {
+                first,
+                second,
+                first_from_second: motion(maps[first].center, found.first)
+                    * found.first_from_second
+                    * motion(found.second, maps[second].center),
+                information: information(SHIFT_M, TURN_RAD),
+                is_loop: true,
+            }
         })
         .collect()
 }
@@ -164,7 +177,11 @@ fn map_edges(drive: &Drive, maps: &[LocalMap], found: &[(usize, Pose3)]) -> Vec<
 }
 
 /// Points on the surfaces of a mesh within about the range of the sensor from a drive, one per voxel of the spacing.
-pub fn surface_points(mesh: &TriangleMesh, drive: &Drive, spacing_m: f64) -> Vec<DVec3> {
+fn surface_points(
+    mesh: &TriangleMesh,
+    drive: &Drive,
+    spacing_m: f64,
+) -> Result<Vec<DVec3>, MemoryError> {
     let cell_of = |point: DVec3| (point / drive.range_m).floor().as_ivec3();
     let mut near = HashSet::<u64, CellHasher>::default();
     for pose in &drive.poses {
@@ -175,11 +192,16 @@ pub fn surface_points(mesh: &TriangleMesh, drive: &Drive, spacing_m: f64) -> Vec
             ));
         }
     }
+    // The box in which these cells lie.
+    let positions = || (drive.poses.iter()).map(|pose| DVec3::from(pose.translation.vector));
+    let low = positions().fold(DVec3::INFINITY, DVec3::min) - 2.0 * drive.range_m;
+    let high = positions().fold(DVec3::NEG_INFINITY, DVec3::max) + 2.0 * drive.range_m;
     let mut occupied = HashSet::<u64, CellHasher>::default();
     let mut points = vec![];
     for triangle in 0..mesh.triangles.len() {
         let [a, b, c] = mesh.corners(triangle).map(glam::Vec3::as_dvec3);
-        if !near.contains(&pack(cell_of((a + b + c) / 3.0))) {
+        let is_apart = a.min(b).min(c).cmpgt(high).any() || a.max(b).max(c).cmplt(low).any();
+        if is_apart {
             continue;
         }
         let (u, v) = (b - a, c - a);
@@ -190,8 +212,14 @@ pub fn surface_points(mesh: &TriangleMesh, drive: &Drive, spacing_m: f64) -> Vec
             grid.map(|(i, j)| {
                 a + (i as f64 + 1.0 / 3.0) / count * u + (j as f64 + 1.0 / 3.0) / count * v
             })
+            .filter(|point| near.contains(&pack(cell_of(*point))))
             .filter(|point| occupied.insert(pack((point / spacing_m).floor().as_ivec3()))),
         );
+        memory::require(
+            "the surfaces of the older map",
+            points.len() as f64 * POINT_BYTES,
+            SHORTER,
+        )?;
     }
-    points
+    Ok(points)
 }

@@ -12,6 +12,9 @@ use crate::lidar::Motion;
 /// Remedy for a drive that exceeds the budget of memory.
 pub const SHORTER: &str = "select fewer scans with start_idx and n_scans";
 
+/// Memory of a point for loops and adjustment [bytes].
+pub const POINT_BYTES: f64 = 120.0;
+
 /// Samples of the scans of a drive, and their poses.
 #[derive(Clone, Debug)]
 pub struct Drive {

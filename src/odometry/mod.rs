@@ -48,13 +48,13 @@ mod trajectory;
 mod voxel_map;
 
 pub use adjustment::AdjustmentConfig;
-pub use anchors::NotInMap;
+pub use anchors::{NotInMap, PlacementError};
 pub use config::OdometryConfig;
 pub use loops::{Loop, LoopVerdict};
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 pub use pose_check::{GivenPoses, MotionDifference, PoseCheck, PoseFit, PoseMeaning, check_poses};
 pub use timing::{TimingComparison, TimingError, compare_timings, order_of_firing};
-pub use trajectory::{PlacementError, Trajectory, TrajectoryBuilder, TrajectoryConfig};
+pub use trajectory::{Trajectory, TrajectoryBuilder, TrajectoryConfig};
 
 #[cfg(test)]
 mod tests;

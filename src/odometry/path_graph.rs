@@ -1,10 +1,8 @@
 //! The pose graph of a drive: its local maps, the motions between them, and the scans that move with them.
 
-use nalgebra::{Matrix6, Vector6};
-
 use super::drive::{Drive, LocalMap};
 use super::odometer::{OdometryEstimate, StepState};
-use super::pose_graph::Edge;
+use super::pose_graph::{Edge, information};
 use crate::geometry::Pose3;
 use crate::lidar::interpolate_motion;
 
@@ -33,15 +31,13 @@ pub fn odometry_edges(
             let is_predicted =
                 (odometry[a + 1..=b].iter()).any(|step| step.state == StepState::Predicted);
             let factor = if is_predicted { PREDICTED } else { 1.0 };
-            let shift = (factor * (SHARE * path_m + FLOOR * drive.voxel_m)).powi(-2);
-            let turn = (factor * (TURN_RAD_PER_M * path_m + TURN_FLOOR_RAD)).powi(-2);
+            let shift_m = factor * (SHARE * path_m + FLOOR * drive.voxel_m);
+            let turn_rad = factor * (TURN_RAD_PER_M * path_m + TURN_FLOOR_RAD);
             Edge {
                 first,
                 second: first + 1,
                 first_from_second,
-                information: Matrix6::from_diagonal(&Vector6::new(
-                    shift, shift, shift, turn, turn, turn,
-                )),
+                information: information(shift_m, turn_rad),
                 is_loop: false,
             }
         })

@@ -33,6 +33,12 @@ pub struct Edge {
     pub is_loop: bool,
 }
 
+/// Information of independent errors of these standard deviations: of the position [m] and of the rotation [rad].
+pub fn information(shift_m: f64, turn_rad: f64) -> Matrix6<f64> {
+    let [shift, turn] = [shift_m.powi(-2), turn_rad.powi(-2)];
+    Matrix6::from_diagonal(&Vector6::new(shift, shift, shift, turn, turn, turn))
+}
+
 /// Residual of an edge and its derivatives by the two poses.
 pub struct LinearizedEdge {
     residual: Vector6<f64>,

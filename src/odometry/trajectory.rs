@@ -5,9 +5,9 @@ use smart_default::SmartDefault;
 
 use super::adjustment::{AdjustmentConfig, Held, adjust};
 use super::alignment::median;
-use super::anchors::{self, NotInMap, Placed};
+use super::anchors::{self, NotInMap, Placed, PlacementError};
 use super::config::OdometryConfig;
-use super::drive::{Drive, LocalMap, SHORTER};
+use super::drive::{Drive, LocalMap, POINT_BYTES, SHORTER};
 use super::loops::{self, Drift, FoundLoop, Loop, LoopVerdict};
 use super::odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 use super::path_graph::{LOCAL_MAP, move_along, odometry_edges};
@@ -47,12 +47,13 @@ impl Validate for TrajectoryConfig {
     }
 }
 
-/// Poses of a drive, in the lidar frame of its first scan or that of the given poses.
+/// Poses of a drive, in the lidar frame of its first scan, that of the given poses, or that of the map in which it was
+/// found.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trajectory {
     /// `p_map = map_from_lidar * p_lidar` of each scan.
     pub poses: Vec<Pose3>,
-    /// Poses of the odometry alone, in the same frame.
+    /// Poses of the odometry alone; in a map, moved as a whole to where most of them agree with it.
     pub odometry: Vec<OdometryEstimate>,
     /// Loops that were found.
     pub loops: Vec<Loop>,
@@ -74,20 +75,6 @@ pub struct TrajectoryBuilder {
     points: usize,
 }
 
-/// Why a drive cannot be moved into a map.
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-pub enum PlacementError {
-    /// It was not found there.
-    #[error(transparent)]
-    NotInMap(#[from] NotInMap),
-    /// Its scans do not fit the budget of memory.
-    #[error(transparent)]
-    Memory(#[from] MemoryError),
-}
-
-/// Memory of a point for loops and adjustment [bytes].
-const POINT_BYTES: f64 = 120.0;
-
 impl TrajectoryBuilder {
     /// A trajectory without scans.
     pub fn new(config: TrajectoryConfig) -> Result<Self, InvalidValue> {
@@ -107,8 +94,8 @@ impl TrajectoryBuilder {
     /// Registers the next scan, and keeps a sample of its points.
     pub fn add(&mut self, scan: &Scan) -> Result<&OdometryEstimate, OdometryError> {
         let estimate = self.odometer.step(scan)?;
-        self.keep(scan)?;
         self.estimates.push(estimate);
+        self.keep(scan)?;
         let last = self.estimates.len() - 1;
         Ok(&self.estimates[last])
     }

@@ -213,8 +213,9 @@ impl PoseTrack {
         let poses = &self.map_from_lidar;
         let Some(times_s) = self.times_s.as_ref().filter(|_| have_times) else {
             let pose = *poses.get(frame.number)?;
-            let first = frame.number.saturating_sub(1);
-            let around = first..(frame.number + 2).min(poses.len());
+            // Two rows to each side: at an end the motion follows from the two steps beside it.
+            let first = frame.number.saturating_sub(2);
+            let around = first..(frame.number + 3).min(poses.len());
             let assumed_s = |row| PERIOD_S * row as f64;
             let times_s: Vec<f64> = match &self.times_s {
                 Some(times_s) => times_s[around.clone()].to_vec(),

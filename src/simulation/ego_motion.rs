@@ -135,8 +135,8 @@ impl EgoMotion {
         interpolate(&self.stations_m, index)
     }
 
-    /// Lidar pose at a time: `p_world = world_from_lidar * p_lidar`. During the first revolution the vehicle comes from
-    /// where it would go backwards, and so on during the last one, so that neither begins or ends with a jerk.
+    /// Lidar pose at a time: `p_world = world_from_lidar * p_lidar`. Before the first and after the last scan the motion is
+    /// mirrored at that scan, so that the velocity is continuous there.
     pub fn world_from_lidar(&self, ground: &GroundField, time_s: f64) -> Pose3 {
         let last_s = self.stations_m.len().saturating_sub(1) as f64 * SCAN_PERIOD_S;
         let end_s = time_s.clamp(0.0, last_s);

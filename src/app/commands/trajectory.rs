@@ -36,7 +36,7 @@ pub fn estimate(
     Ok(builder.finish()?)
 }
 
-/// Reads the scans of a trajectory one after the other, until an interruption; returns the progress, which goes on.
+/// Reads the scans in order and passes each to `step`, until an interruption; returns the progress, which is still open.
 pub fn each_scan(
     name: &str,
     frames: &[Frame],

@@ -34,7 +34,13 @@ impl MotionCompensation {
     pub fn of(rotation: &Rotation) -> Self {
         Self::Rotation {
             direction: rotation.direction,
-            start_deg: rotation.start_rad.to_degrees().round().rem_euclid(360.0),
+            // No negative zero.
+            start_deg: rotation
+                .start_rad
+                .to_degrees()
+                .round()
+                .rem_euclid(360.0)
+                .abs(),
         }
     }
 

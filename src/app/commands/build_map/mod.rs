@@ -35,8 +35,8 @@ use crate::evaluation::{MapQuality, TruthAgreement};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::map::plan::{LocalMapPlan, key_scans, local_maps};
 use crate::map::{
-    BuildError, BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan, MappingPath, ply,
-    scan_agreement,
+    BuildError, BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan, MappingPath, changes,
+    ply, scan_agreement,
 };
 use crate::recording::{Frame, Recording};
 use crate::sensor::SensorDescription;
@@ -68,15 +68,18 @@ fn run_with_scans(config: &BuildMapConfig, context: &Context) -> Result<BuildRep
     let local_maps = build_parts(config, context, &mapped, (&parts, &clock), older)?;
     let Joined { mesh: added, gone } = clock.time("join", || parts.join(local_maps.len()))?;
     let poses = poses_of(&mapped);
-    let (mesh, path) = match older {
-        Some(older) => (older.join(&gone, &added), older.path.extended_by(&poses)),
+    let (mesh, added, path) = match older {
+        Some(older) => {
+            let mesh = changes::joined(&older.mesh, &gone, &added);
+            (mesh, added, older.path.extended_by(&poses))
+        }
         None => {
             let world_from_map = sequence.world().0;
             let path = MappingPath {
                 world_from_map,
                 map_from_lidar: poses,
             };
-            (added.clone(), path)
+            (added, TriangleMesh::default(), path)
         }
     };
     let residuals = clock.time("quality", || residuals(config, &mesh, &held_out))?;
@@ -149,7 +152,12 @@ fn open(config: &mut BuildMapConfig, claims: &mut Claims, context: &Context) -> 
     }
     let mut trajectory = None;
     if sequence.track.is_none() || config.poses == PoseSource::Polished {
-        (sequence, trajectory) = poses::find(sequence, config, older_map.as_ref(), context)?;
+        (sequence, trajectory) = poses::find(
+            sequence,
+            config,
+            older.as_ref().zip(older_map.as_ref()),
+            context,
+        )?;
         let found = file_beside(&config.mesh_file);
         let origin = format!("the poses from the scans are in {}", found.display());
         trajectory::check(&sequence, config.max_step_m, &origin)?;

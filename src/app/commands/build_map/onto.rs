@@ -50,10 +50,18 @@ impl OlderMap {
         };
         Ok(Some((older, map)))
     }
+}
 
-    /// The map with a newer drive.
-    pub fn join(&self, gone: &[u32], added: &TriangleMesh) -> TriangleMesh {
-        changes::joined(&self.mesh, gone, added)
+/// How the scans are localized in the older map.
+pub fn localization(config: &BuildMapConfig) -> LocalizationConfig {
+    LocalizationConfig {
+        range_image: config.range_image.clone(),
+        own_car_m: config.own_car_m,
+        ground_method: config.ground_method,
+        fuzzy: config.fuzzy.clone(),
+        pca: config.pca,
+        seed: config.seed,
+        ..LocalizationConfig::default()
     }
 }
 
@@ -64,16 +72,11 @@ pub fn find(
     config: &BuildMapConfig,
     context: &Context,
 ) -> Result<Trajectory> {
-    let localization = LocalizationConfig {
-        range_image: config.range_image.clone(),
-        own_car_m: config.own_car_m,
-        ground_method: config.ground_method,
-        fuzzy: config.fuzzy.clone(),
-        pca: config.pca,
-        ..LocalizationConfig::default()
-    };
-    let settings = TrajectoryConfig::default();
-    let mut drive = SecondDrive::new(map, localization.localizer(), settings, config.seed)?;
+    let (localizer, settings) = (
+        localization(config).localizer(),
+        TrajectoryConfig::default(),
+    );
+    let mut drive = SecondDrive::new(map, localizer, settings, config.seed)?;
     let _task = trajectory::each_scan("localize", frames, context, |_, scan| {
         drive.add(scan)?;
         Ok(())
@@ -133,12 +136,10 @@ pub fn draw(older: &OlderMap, gone: &[u32], added: &TriangleMesh, picture: &Path
         colors: vec![color; mesh.vertices.len()],
         ..mesh.clone()
     };
-    let mut mesh = painted(&older.mesh, KEPT);
     let mut lost = painted(&older.mesh, GONE);
     let is_gone = |triangle: usize| gone.binary_search(&(triangle as u32)).is_ok();
-    mesh.retain_triangles(|triangle, _| !is_gone(triangle));
     lost.retain_triangles(|triangle, _| is_gone(triangle));
-    mesh.append(&painted(added, ADDED));
+    let mut mesh = changes::joined(&painted(&older.mesh, KEPT), gone, &painted(added, ADDED));
     mesh.append(&lost);
     let path: Vec<_> = (older.path.map_from_lidar.iter())
         .map(pose2_from_pose3)

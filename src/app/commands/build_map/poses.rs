@@ -5,11 +5,10 @@ use std::path::Path;
 
 use anyhow::Result;
 
-use super::onto;
-use super::parts::hash_of_file;
+use super::onto::{self, OlderMap};
 use crate::app::commands::trajectory::{self, TrajectorySummary};
 use crate::app::commands::{Context, output, version};
-use crate::app::config::{BuildMapConfig, PoseSource};
+use crate::app::config::{self, BuildMapConfig, PoseSource};
 use crate::geometry::Pose3;
 use crate::map::Map;
 use crate::odometry::TrajectoryConfig;
@@ -24,9 +23,15 @@ pub fn given(config: &BuildMapConfig, recording: &Recording) -> Result<Option<Po
     }
     if let (Some(map), PoseSource::Auto) = (&config.onto, config.poses) {
         let map = map.display();
-        tracing::info!(
-            "poses from the scans in {map}; `poses: given` takes those of the recording"
-        );
+        match &config.pose_file {
+            Some(path) => tracing::warn!(
+                "pose_file {} is not used: the poses are found from the scans in {map}; set poses to given if they are in the world of that map",
+                path.display()
+            ),
+            None => tracing::info!(
+                "the poses are found from the scans in {map}; set poses to given to use those of the recording"
+            ),
+        }
         return Ok(None);
     }
     if let Some(path) = &config.pose_file {
@@ -46,7 +51,7 @@ pub fn given(config: &BuildMapConfig, recording: &Recording) -> Result<Option<Po
 pub fn find(
     mut recording: Recording,
     config: &BuildMapConfig,
-    older: Option<&Map>,
+    older: Option<(&OlderMap, &Map)>,
     context: &Context,
 ) -> Result<(Recording, Option<TrajectorySummary>)> {
     let path = trajectory::file_beside(&config.mesh_file);
@@ -55,18 +60,21 @@ pub fn find(
         true => recording.frames.clone(),
         false => trajectory::dense_frames(&recording),
     };
-    let map_hash = config.onto.as_deref().map(hash_of_file).transpose()?;
-    let hash = inputs(&frames, is_given, map_hash.as_deref())?;
+    let localized_by = match older {
+        Some((older, _)) => older.hash.clone() + &config::to_yaml(&onto::localization(config))?,
+        None => String::new(),
+    };
+    let hash = inputs(&frames, is_given, &localized_by)?;
     let heading = format!("# fpmcl poses {hash}\n");
     let is_found = fs::read_to_string(&path).is_ok_and(|text| text.starts_with(&heading));
-    let world = older.map(|map| map.path.world_from_map);
+    let world = older.map(|(_, map)| map.path.world_from_map);
     let mut summary = None;
     if is_found {
         tracing::info!("the poses in {} are finished already", path.display());
     } else {
         let settings = TrajectoryConfig::default();
         let found = match older {
-            Some(map) => onto::find(&frames, map, config, context)?,
+            Some((_, map)) => onto::find(&frames, map, config, context)?,
             None => trajectory::estimate(&frames, is_given, &settings, context)?,
         };
         let found_now = TrajectorySummary::of(&found, recording.has_times);
@@ -98,10 +106,10 @@ pub fn find(
     Ok((recording.with_poses(track)?, summary))
 }
 
-/// Hash of what the poses depend on; of a scan its place and size.
-fn inputs(frames: &[Frame], is_given: bool, map_hash: Option<&str>) -> Result<String> {
+/// Hash of what the poses depend on, also the older map and how scans are localized there; of a scan its place and size.
+fn inputs(frames: &[Frame], is_given: bool, localized_by: &str) -> Result<String> {
     let mut hasher = blake3::Hasher::new();
-    hasher.update(map_hash.unwrap_or_default().as_bytes());
+    hasher.update(localized_by.as_bytes());
     hasher.update(version::program()?.as_bytes());
     for frame in frames {
         let source = frame.source.to_string();
