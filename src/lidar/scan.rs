@@ -62,6 +62,26 @@ impl Scan {
         }
     }
 
+    /// Adds an angle to the elevations of all points [rad]: corrects beams that are mounted higher than they say.
+    pub fn raise(&mut self, angle_rad: f64) {
+        if angle_rad == 0.0 {
+            return;
+        }
+        let (sin, cos) = angle_rad.sin_cos();
+        for point in &mut self.points {
+            let [x, y, z] = point.to_array().map(f64::from);
+            let horizontal_m = x.hypot(y);
+            let raised_m = horizontal_m * cos - z * sin;
+            // A point straight above or below has no azimuth.
+            let factor = match horizontal_m > 0.0 {
+                true => raised_m / horizontal_m,
+                false => 1.0,
+            };
+            let z = horizontal_m * sin + z * cos;
+            *point = [factor * x, factor * y, z].map(|m| m as f32).into();
+        }
+    }
+
     /// Removes points that are not finite or outside the range limits of the model; returns their
     /// number.
     pub fn drop_invalid(&mut self, model: &LidarModel) -> usize {
@@ -137,6 +157,27 @@ mod tests {
         let centered = scan.clone();
         scan.center_times();
         assert_eq!(scan, centered);
+    }
+
+    #[test]
+    fn raised_points_keep_range_and_azimuth() {
+        let mut scan = Scan {
+            points: vec![
+                Vec3::new(3.0, -4.0, 1.0),
+                Vec3::new(-30.0, 2.0, -8.0),
+                Vec3::new(0.0, 0.0, 2.0),
+            ],
+            ..Scan::default()
+        };
+        let before = scan.points.clone();
+        scan.raise(0.01);
+        let elevation = |p: &Vec3| p.z.atan2(p.x.hypot(p.y));
+        for (a, b) in before.iter().zip(&scan.points).take(2) {
+            assert!((elevation(b) - elevation(a) - 0.01).abs() < 1e-6);
+            assert!((a.length() - b.length()).abs() < 1e-5);
+            assert!((a.y.atan2(a.x) - b.y.atan2(b.x)).abs() < 1e-6);
+        }
+        assert!(scan.points.iter().all(|point| point.is_finite()));
     }
 
     #[test]

@@ -61,12 +61,17 @@ impl BlockSystem {
 
     /// The solution; `None` if the system is not positive definite.
     pub fn solve(&self) -> Option<Vec<Vector6<f64>>> {
+        self.solve_for(&self.right_side)
+    }
+
+    /// The solution for another right side; `None` if the system is not positive definite.
+    pub fn solve_for(&self, right_side: &[Vector6<f64>]) -> Option<Vec<Vector6<f64>>> {
         /// Residual relative to the right side.
         const TOLERANCE: f64 = 1e-4;
         const MAX_ITERATIONS: usize = 300;
         let factors = self.factorize()?;
         let mut solution = vec![Vector6::zeros(); self.diagonal.len()];
-        let mut residual = self.right_side.clone();
+        let mut residual = right_side.to_vec();
         let limit = TOLERANCE * TOLERANCE * dot(&residual, &residual);
         let mut preconditioned = factors.solve(&residual);
         let mut direction = preconditioned.clone();

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::adjustment::{AdjustmentConfig, Held, adjust};
+use super::adjustment::{Adjusted, AdjustmentConfig, Held, adjust};
 use super::alignment::median;
 use super::anchors::{self, NotInMap, Placed, PlacementError};
 use super::config::OdometryConfig;
@@ -57,8 +57,8 @@ pub struct Trajectory {
     pub odometry: Vec<OdometryEstimate>,
     /// Loops that were found.
     pub loops: Vec<Loop>,
-    /// Root mean square of the distances between points and common planes, before and after the adjustment [m].
-    pub residuals_m: Option<[f64; 2]>,
+    /// What the adjustment of all poses has found; `None` without one.
+    pub adjusted: Option<Adjusted>,
 }
 
 /// Finds the trajectory of a drive, scan by scan.
@@ -156,7 +156,7 @@ impl TrajectoryBuilder {
             } else {
                 Held::First
             };
-            trajectory.residuals_m = adjust(&mut drive, held, &config.adjustment)?;
+            trajectory.adjusted = adjust(&mut drive, held, &config.adjustment)?;
         }
         trajectory.poses = drive.poses;
         Ok(trajectory)
@@ -184,7 +184,7 @@ impl TrajectoryBuilder {
         }
         if config.adjust {
             let held = Held::Surfaces(&surfaces);
-            trajectory.residuals_m = adjust(&mut drive, held, &config.adjustment)?;
+            trajectory.adjusted = adjust(&mut drive, held, &config.adjustment)?;
         }
         trajectory.poses = drive.poses;
         Ok(trajectory)
@@ -206,7 +206,7 @@ impl TrajectoryBuilder {
             poses,
             odometry: self.estimates,
             loops: vec![],
-            residuals_m: None,
+            adjusted: None,
         };
         (self.config, trajectory, drive)
     }

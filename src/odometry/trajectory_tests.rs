@@ -168,3 +168,25 @@ fn scans_without_points_have_poses() {
     }
     assert_eq!(builder.finish().unwrap().poses, [Pose3::identity(); 3]);
 }
+
+#[test]
+fn the_bias_of_the_elevations_follows_from_surfaces_seen_from_far_and_near() {
+    let (scans, _) = scans(&World::around_a_block(), 0.0, 24);
+    let found_deg = |bias_deg: f64| {
+        let mut builder = TrajectoryBuilder::new(TrajectoryConfig::default()).unwrap();
+        for scan in &scans {
+            let mut scan = scan.clone();
+            scan.raise(-bias_deg.to_radians());
+            builder.add(&scan).unwrap();
+        }
+        let adjusted = builder.finish().unwrap().adjusted.unwrap();
+        adjusted.elevation_bias.unwrap()
+    };
+    let none = found_deg(0.0);
+    assert!(none.deg.abs() < 0.03 && !none.is_significant(), "{none:?}");
+    for bias_deg in [-0.3, 0.3] {
+        let found = found_deg(bias_deg);
+        assert!((found.deg / bias_deg - 1.0).abs() < 0.4, "{found:?}");
+        assert!(found.is_significant(), "{found:?}");
+    }
+}

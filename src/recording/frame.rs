@@ -69,6 +69,8 @@ pub struct Frame {
     pub rotation: Option<Rotation>,
     /// Whether the points have times; otherwise the scan is taken as compensated.
     pub is_timed: bool,
+    /// Angle that is added to the elevations of all points when the scan is read [rad].
+    pub elevation_bias_rad: f64,
     /// Motion by which the scan is deskewed when it is read; `None` if it is not.
     pub motion: Option<Motion>,
 }
@@ -83,6 +85,7 @@ impl Frame {
             map_from_lidar: None,
             rotation: None,
             is_timed: true,
+            elevation_bias_rad: 0.0,
             motion: None,
         }
     }
@@ -91,6 +94,7 @@ impl Frame {
     pub fn read(&self) -> Result<Scan, RecordingError> {
         let mut scan = self.source.read()?;
         scan.time_s = scan.time_s.or(Some(self.time_s));
+        scan.raise(self.elevation_bias_rad);
         if let (true, Some(rotation)) = (scan.times_s.is_empty(), &self.rotation) {
             scan.times_s = rotation.point_times(&scan.points);
         }

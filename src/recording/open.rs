@@ -190,6 +190,15 @@ impl Recording {
         self
     }
 
+    /// The same recording, with an angle added to the elevations of all points [rad].
+    #[must_use]
+    pub fn with_elevation_bias(mut self, bias_rad: f64) -> Self {
+        for frame in self.frames.iter_mut().chain(&mut self.skipped) {
+            frame.elevation_bias_rad = bias_rad;
+        }
+        self
+    }
+
     /// The same recording, whose points have times from the rotation of the sensor where the data have none.
     #[must_use]
     pub fn rotating(mut self, rotation: Option<Rotation>) -> Self {

@@ -28,6 +28,7 @@ pub struct RecordingInputs<'a> {
     pub pose_file: Option<&'a Path>,
     pub calib_file: Option<&'a Path>,
     pub body_from_lidar: Option<[f64; 6]>,
+    pub elevation_bias_deg: f64,
 }
 
 impl<'a> RecordingInputs<'a> {
@@ -63,7 +64,8 @@ impl<'a> RecordingInputs<'a> {
 
     /// Opens the selected frames of the recording.
     pub fn open(&self, selection: &Selection) -> Result<Recording> {
-        Ok(Recording::open(self.scan_folder, self.topic, selection)?)
+        let recording = Recording::open(self.scan_folder, self.topic, selection)?;
+        Ok(recording.with_elevation_bias(self.elevation_bias_deg.to_radians()))
     }
 
     /// The poses that the recording contains.
@@ -262,6 +264,7 @@ macro_rules! recording_inputs {
                     pose_file: self.pose_file.as_deref(),
                     calib_file: self.calib_file.as_deref(),
                     body_from_lidar: self.body_from_lidar,
+                    elevation_bias_deg: self.elevation_bias_deg,
                 }
             }
         })*

@@ -12,7 +12,9 @@ use super::progress::Task;
 use crate::geometry::{Pose3, StampedPose};
 use crate::lidar::Scan;
 use crate::map::path_check;
-use crate::odometry::{LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig};
+use crate::odometry::{
+    ElevationBias, LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig,
+};
 use crate::recording::{Frame, Recording};
 
 /// Estimates the poses of frames, or polishes those that they have.
@@ -93,6 +95,8 @@ pub struct TrajectorySummary {
     pub loops: LoopCounts,
     /// Root mean square of the distances between points and common planes, before and after the adjustment [m].
     pub residuals_m: Option<[f64; 2]>,
+    /// Angle to add to the elevations of all points so that surfaces fit themselves best.
+    pub elevation_bias: Option<ElevationBias>,
     /// Largest change of a position by loops and adjustment [m].
     pub largest_change_m: f64,
 }
@@ -143,7 +147,8 @@ impl TrajectorySummary {
                 unconfirmed: counted(LoopVerdict::Unconfirmed),
                 contradicted: counted(LoopVerdict::Contradicted),
             },
-            residuals_m: trajectory.residuals_m,
+            residuals_m: trajectory.adjusted.map(|adjusted| adjusted.residuals_m),
+            elevation_bias: (trajectory.adjusted).and_then(|adjusted| adjusted.elevation_bias),
             largest_change_m: (positions().zip(steps))
                 .map(|(found, step)| (found - step.odom_from_lidar.translation.vector).norm())
                 .fold(0.0, f64::max),
@@ -183,17 +188,32 @@ impl TrajectorySummary {
                 format!("{before_mm:.1} mm, adjusted {after_mm:.1} mm"),
             ));
         }
+        if let Some(bias) = self.elevation_bias {
+            rows.push((
+                "elevation bias",
+                format!(
+                    "{:.2} deg, standard deviation {:.3} deg",
+                    bias.deg, bias.sigma_deg
+                ),
+            ));
+        }
         rows.push(("largest change", format!("{:.3} m", self.largest_change_m)));
         rows
     }
 
-    /// Warns of scans that could not be registered.
+    /// Warns of scans that could not be registered, and says what may be wrong with the elevations.
     pub fn warn(&self) {
         if self.predicted > 0 {
             tracing::warn!(
                 "{} of {} scans did not fit the scans before them: their poses are predicted",
                 self.predicted,
                 self.scans
+            );
+        }
+        if let Some(bias) = self.elevation_bias.filter(ElevationBias::is_significant) {
+            tracing::info!(
+                "surfaces fit themselves better with {:.2} degrees added to the elevations of all points: try elevation_bias_deg",
+                bias.deg
             );
         }
     }

@@ -159,6 +159,8 @@ pub struct BuildMapConfig {
     /// those of KITTI odometry.
     #[default(Some(MotionCompensation::Auto))]
     pub motion_compensation: Option<MotionCompensation>,
+    /// Angle to add to the elevations of all points [deg].
+    pub elevation_bias_deg: f64,
     /// Seed of all random choices.
     pub seed: u64,
     /// Whether to replace an existing map.
@@ -231,6 +233,7 @@ impl Validate for BuildMapConfig {
         optional_path("pose_file", self.pose_file.as_deref())?;
         optional_path("calib_file", self.calib_file.as_deref())?;
         mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
+        in_range("elevation_bias_deg", self.elevation_bias_deg, -5.0..=5.0)?;
         optional_path("cloud_file", self.cloud_file.as_deref())?;
         optional_path("onto", self.onto.as_deref())?;
         if let Some(map) = &self.onto {

@@ -157,6 +157,8 @@ pub struct LocalizationConfig {
     /// those of KITTI odometry.
     #[default(Some(MotionCompensation::Auto))]
     pub motion_compensation: Option<MotionCompensation>,
+    /// Angle to add to the elevations of all points [deg].
+    pub elevation_bias_deg: f64,
     /// Whether to refine every frame while tracking.
     pub refine: bool,
     /// Parameters of the refinement.
@@ -281,6 +283,7 @@ impl Validate for LocalizationConfig {
         optional_path("pose_file", self.pose_file.as_deref())?;
         optional_path("calib_file", self.calib_file.as_deref())?;
         mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
+        in_range("elevation_bias_deg", self.elevation_bias_deg, -5.0..=5.0)?;
         path("result_path", &self.result_path)?;
         self.selection().validate()?;
         (self.odometry).validate(self.odometry_file.as_deref(), self.pose_file.as_deref())?;

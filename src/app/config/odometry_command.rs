@@ -8,7 +8,7 @@ use smart_default::SmartDefault;
 use super::check::{optional_path, path};
 use super::recording::{MotionCompensation, mounting};
 use crate::odometry::TrajectoryConfig;
-use crate::validation::{InvalidValue, Validate, positive};
+use crate::validation::{InvalidValue, Validate, in_range, positive};
 
 /// Configuration of `odometry`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
@@ -43,6 +43,8 @@ pub struct OdometryCommandConfig {
     /// Times of the points for motion compensation; `None` for scans that are compensated already.
     #[default(Some(MotionCompensation::Auto))]
     pub motion_compensation: Option<MotionCompensation>,
+    /// Angle to add to the elevations of all points [deg].
+    pub elevation_bias_deg: f64,
     /// Whether to draw the path.
     #[default(true)]
     pub visualize: bool,
@@ -58,6 +60,7 @@ impl Validate for OdometryCommandConfig {
         optional_path("pose_file", self.pose_file.as_deref())?;
         optional_path("calib_file", self.calib_file.as_deref())?;
         mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
+        in_range("elevation_bias_deg", self.elevation_bias_deg, -5.0..=5.0)?;
         path("output_folder", &self.output_folder)?;
         self.selection().validate()?;
         positive("max_step_m", self.max_step_m)?;

@@ -13,7 +13,7 @@ use crate::localization::SensorConfig;
 use crate::localization::observation::ObservationConfig;
 use crate::map::scan_cloud::ScanConfig;
 use crate::refinement::{self, RefinerConfig};
-use crate::validation::{InvalidValue, Validate, nested};
+use crate::validation::{InvalidValue, Validate, in_range, nested};
 
 /// Configuration of `refine`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -75,6 +75,8 @@ pub struct RefinementConfig {
     /// Times of the points for motion compensation; `None` for scans that are compensated already, such as
     /// those of KITTI odometry.
     pub motion_compensation: Option<MotionCompensation>,
+    /// Angle to add to the elevations of all points [deg].
+    pub elevation_bias_deg: f64,
     /// Seed of all random choices.
     pub seed: u64,
     /// Whether to replace existing refined poses.
@@ -117,6 +119,7 @@ impl RefinementConfig {
             observation: localization.observation,
             refinement: refinement::RefinementConfig::default(),
             motion_compensation: localization.motion_compensation,
+            elevation_bias_deg: localization.elevation_bias_deg,
             seed: localization.seed,
             force: localization.force,
         }
@@ -167,6 +170,7 @@ impl Validate for RefinementConfig {
         optional_path("pose_file", self.pose_file.as_deref())?;
         optional_path("calib_file", self.calib_file.as_deref())?;
         mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
+        in_range("elevation_bias_deg", self.elevation_bias_deg, -5.0..=5.0)?;
         path("result_file", &self.result_file)?;
         self.selection().validate()?;
         (self.odometry).validate(self.odometry_file.as_deref(), self.pose_file.as_deref())?;

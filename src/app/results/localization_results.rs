@@ -20,7 +20,7 @@
 //! All but the first three are optional, and so are `particles` where there are `frames`: a trajectory without a map.
 //! In rows before `start_idx` they are NaN.
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, ensure};
 use nalgebra::Matrix3;
 
 use crate::evaluation::{ParticleRow, RangeMclRules};
@@ -197,6 +197,10 @@ impl LocalizationResults {
         if let (true, Some(estimates)) = (self.particles.is_empty(), &self.estimates_in_space) {
             return Ok(estimates.iter().map(pose2_from_pose3).collect());
         }
+        ensure!(
+            self.particles.len() == self.len(),
+            "the file holds neither estimates nor particles; run localize again"
+        );
         let capacity = self.particles.capacity();
         (0..self.particles.len())
             .map(|row| {

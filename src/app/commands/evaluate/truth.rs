@@ -30,6 +30,7 @@ pub fn read_track(
         pose_file: config.pose_file.as_deref(),
         calib_file: config.calib_file.as_deref(),
         body_from_lidar: config.body_from_lidar,
+        elevation_bias_deg: 0.0,
     };
     input::require_optional_file("calib_file", inputs.calib_file)?;
     let recording = || inputs.open(&Selection::default());
