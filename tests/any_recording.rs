@@ -8,9 +8,10 @@ use std::fs;
 use std::path::Path;
 
 use common::{Fpmcl, Output, fpmcl, json, real_recording, run, simulate_two_drives};
-use fpmcl::geometry::Pose3;
+use fpmcl::geometry::{Pose3, StampedPose};
 use fpmcl::recording::PoseTrack;
-use fpmcl::recording::poses::read_tum;
+use fpmcl::recording::poses::{read_tum, write_tum};
+use nalgebra::{UnitQuaternion, Vector3};
 use serde_json::Value;
 
 /// A street with a bend, scanned by 32 beams that are not evenly spaced, without times.
@@ -124,6 +125,70 @@ fn two_folders_are_enough_for_a_map_and_a_trajectory_in_it() {
     localize(folder, "street/drive_2", "word/r.npz")
         .with("--start=here")
         .rejects_usage_with(&["12.5,-3,90"]);
+}
+
+/// Writes poses of drive 2 that are off by a shift [m] and a turn about the vertical axis.
+fn write_rough_poses(path: &Path, truth: &[Pose3], shift_m: [f64; 2], turn_deg: f64) {
+    let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, turn_deg.to_radians());
+    let rows = truth.iter().enumerate().map(|(frame, pose)| StampedPose {
+        frame,
+        time_s: 0.1 * frame as f64,
+        map_from_lidar: Pose3::from_parts(
+            (pose.translation.vector + Vector3::new(shift_m[0], shift_m[1], 0.0)).into(),
+            pose.rotation * turn,
+        ),
+    });
+    let mut text = Vec::new();
+    write_tum(&mut text, &rows.collect::<Vec<_>>()).unwrap();
+    fs::write(path, text).unwrap();
+}
+
+#[test]
+fn a_rough_trajectory_comes_to_centimetres_and_one_from_elsewhere_is_marked() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, SIMULATION);
+    let build = ["build-map", "street/drive_1", "--output", "map.ply"];
+    run(folder, &build);
+    let truth = truth(folder);
+    let refine = |track: &str| {
+        fpmcl("refine")
+            .in_folder(folder)
+            .with(track)
+            .with("--recording=street/drive_2")
+            .with("--map=map.ply")
+            .with("--backend=cpu")
+            .set("plot_loc_results", "False")
+    };
+    let error_m = |result: &str, row: usize| {
+        let found = read_tum(&folder.join(result).join("refined_tum.txt")).unwrap();
+        let off = found[row].map_from_lidar.translation.vector - truth[row].translation.vector;
+        off.xy().norm()
+    };
+    let rough = folder.join("gps.txt");
+    write_rough_poses(&rough, &truth, [1.8, -1.2], 12.0);
+    let before = fs::read(&rough).unwrap();
+    refine("gps.txt").with("--uncertainty=1,8").succeeds();
+    for row in 0..truth.len() {
+        let error_m = error_m("gps_refined", row);
+        assert!(error_m < 0.06, "{row}: {error_m} m");
+    }
+    assert_eq!(fs::read(&rough).unwrap(), before);
+    let report = json(&folder.join("gps_refined/report.json"));
+    assert_eq!(report["summary"]["tracking"], 14);
+    refine("gps.txt").fails_with(&["refined.npz exists", "--force"]);
+
+    // From where the uncertainty does not reach the truth, nothing is claimed.
+    write_rough_poses(&folder.join("far.txt"), &truth, [400.0, 0.0], 0.0);
+    let output = refine("far.txt").with("--output=far/r.npz").succeeds();
+    assert!(
+        output.stderr.contains("14 of 14 poses"),
+        "{}",
+        output.stderr
+    );
+    assert!((error_m("far", 5) - 400.0).abs() < 1e-3);
+    let report = json(&folder.join("far/report.json"));
+    assert_eq!(report["summary"]["tracking"], 0);
 }
 
 #[test]

@@ -74,10 +74,11 @@ Examples:
   fpmcl localize drive_2/ --map map.ply --set numParticles=1000 --seed 7")]
     Localize(LocalizeArgs),
 
-    /// Refine the trajectory that `localize` found.
+    /// Refine the trajectory that `localize` found, or a rough one from anywhere.
     #[command(after_help = "\
 Examples:
   fpmcl refine results/localization.npz       recording and map are those of the localization
+  fpmcl refine gps_track.txt --recording drive_2/ --map map.ply --uncertainty 2,15
   fpmcl refine config/refinement.yml
   fpmcl refine --set result_file=results/localization.npz --backend cpu")]
     Refine(RefineArgs),
@@ -299,6 +300,22 @@ pub struct RefineArgs {
     /// Map; by default that of the localization. Sets the key `map_file`.
     #[arg(long, value_name = "MAP")]
     pub map: Option<PathBuf>,
+
+    /// Standard deviations of the poses of a trajectory [m, deg]; sets the key `uncertainty`.
+    #[arg(long, value_name = "POSITION,HEADING")]
+    pub uncertainty: Option<String>,
+
+    /// True poses of the recording for the report; sets the key `pose_file`.
+    #[arg(long, value_name = "FILE")]
+    pub truth: Option<PathBuf>,
+
+    /// Calibration of the camera whose poses these, and those of a trajectory, are; sets the key `calib_file`.
+    #[arg(long, value_name = "FILE")]
+    pub calib: Option<PathBuf>,
+
+    /// Result to write of a trajectory (.npz); sets the key `output_file`.
+    #[arg(long, value_name = "RESULT")]
+    pub output: Option<PathBuf>,
 }
 
 /// Arguments of `evaluate`.
@@ -565,8 +582,14 @@ impl RefineArgs {
             ("result_file", self.run.source.input()),
             ("scan_folder", self.recording.as_deref()),
             ("map_file", self.map.as_deref()),
+            ("pose_file", self.truth.as_deref()),
+            ("calib_file", self.calib.as_deref()),
+            ("output_file", self.output.as_deref()),
         ];
-        [path_settings(&paths), self.run.flags()].concat()
+        let mut settings = path_settings(&paths);
+        let uncertainty = self.uncertainty.as_ref();
+        settings.extend(uncertainty.map(|given| ("uncertainty".to_owned(), format!("[{given}]"))));
+        [settings, self.run.flags()].concat()
     }
 }
 

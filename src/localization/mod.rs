@@ -43,4 +43,4 @@ pub use odometry::Odometry;
 pub use particles::{Particle, ParticleSet};
 pub use second_drive::{SecondDrive, SecondDriveError};
 pub use sensor::{Sensor, SensorConfig};
-pub use tracking_loss::State;
+pub use tracking_loss::{State, TrackingLossConfig};

@@ -45,14 +45,29 @@ impl Odometry {
     }
 }
 
-/// Increments between consecutive poses in the plane of the car, one per pose; the first is the
-/// identity.
-pub fn increments(world_from_lidar: &[Pose3]) -> Vec<Pose2> {
-    let first = world_from_lidar.first().map(|_| Pose2::identity());
+/// Motions `previous_from_current` between consecutive poses, one per pose; the first is the identity.
+pub fn motions(world_from_lidar: &[Pose3]) -> Vec<Pose3> {
+    let first = world_from_lidar.first().map(|_| Pose3::identity());
     let steps = world_from_lidar
         .windows(2)
-        .map(|pair| pose2_from_pose3(&(pair[0].inverse() * pair[1])));
+        .map(|pair| pair[0].inverse() * pair[1]);
     first.into_iter().chain(steps).collect()
+}
+
+/// The same motions in the plane of the car.
+pub fn increments(world_from_lidar: &[Pose3]) -> Vec<Pose2> {
+    let motions = motions(world_from_lidar);
+    motions.iter().map(pose2_from_pose3).collect()
+}
+
+/// Whether motions were measured in space: those of wheels stay in the plane of the car.
+pub fn are_in_space(motions: &[Pose3]) -> bool {
+    const LEAST_M: f64 = 1e-3;
+    const LEAST_RAD: f64 = 1e-4;
+    motions.iter().any(|motion| {
+        let up = motion.rotation * nalgebra::Vector3::z();
+        motion.translation.z.abs() > LEAST_M || up.xy().norm() > LEAST_RAD
+    })
 }
 
 /// Increments with noise on turn, drive and turn; the first, which is no motion, is unchanged. With

@@ -103,7 +103,37 @@ impl TestWorld {
         };
         let (tiles, ground) = (self.tiles.clone(), self.ground.clone());
         let renderer = std::sync::Arc::new(self.clone());
-        Map::from_parts(TriangleMesh::default(), path, tiles, ground, renderer)
+        Map::from_parts(self.walls(), path, tiles, ground, renderer)
+    }
+
+    /// The sides of the boxes.
+    fn walls(&self) -> TriangleMesh {
+        let mut mesh = TriangleMesh::default();
+        for (low, high) in &self.boxes {
+            let around = [
+                (low.x, low.y),
+                (high.x, low.y),
+                (high.x, high.y),
+                (low.x, high.y),
+            ];
+            for side in 0..4 {
+                let first = mesh.vertices.len() as u32;
+                for (corner, z) in [
+                    (side, low.z),
+                    (side + 1, low.z),
+                    (side + 1, high.z),
+                    (side, high.z),
+                ] {
+                    let (x, y) = around[corner % 4];
+                    let p = self.map_from_street * Point2::new(f64::from(x), f64::from(y));
+                    mesh.vertices.push(Vec3::new(p.x as f32, p.y as f32, z));
+                }
+                for [a, b, c] in [[0, 1, 2], [0, 2, 3]] {
+                    mesh.triangles.push([first + a, first + b, first + c]);
+                }
+            }
+        }
+        mesh
     }
 
     /// A pose of the street in the map.

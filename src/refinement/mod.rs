@@ -2,7 +2,8 @@
 //!
 //! > [`TrajectoryRefiner`] takes the frames of a [`trajectory`]; [`refiner`] searches a better pose of
 //! > each with a [`swarm`] that minimizes the [`objective`], and finishes with Gauss-Newton
-//! > ([`registration`](crate::registration)); [`smoothing`] combines all frames with the odometry.
+//! > ([`registration`](crate::registration)); from metres away a [`wide_search`] over [`upright`] surfaces comes
+//! > first; [`smoothing`] combines all frames with the odometry.
 //!
 //! No step makes an estimate worse by its own measure: what does not lower the cost is rejected.
 
@@ -11,6 +12,8 @@ pub mod refiner;
 pub mod smoothing;
 pub mod swarm;
 pub mod trajectory;
+pub mod upright;
+pub mod wide_search;
 
 pub use objective::FrameObjective;
 pub use refiner::{Method, RefinedFrame, RefinementConfig, refine_frame};
@@ -18,6 +21,7 @@ pub use smoothing::{FramePrior, SmoothingConfig, smooth};
 pub use trajectory::{
     FrameResult, InitialEstimate, RefinedTrajectory, RefinerConfig, RefinerError, TrajectoryRefiner,
 };
+pub use wide_search::WideSearchConfig;
 
 #[cfg(test)]
 impl crate::map::test_world::TestWorld {

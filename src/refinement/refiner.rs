@@ -1,6 +1,7 @@
 //! Refinement of one frame: the swarm searches around the estimate, Gauss-Newton finishes.
 //!
-//! Each is optional, and the result of each is accepted only if it lowers the objective.
+//! Each is optional, and the result of each is accepted only if it lowers the objective. With both, the swarm searches
+//! where the uncertainty of the estimate exceeds the basin of Gauss-Newton, and only there.
 
 use nalgebra::Matrix3;
 use rand::Rng;
@@ -10,6 +11,8 @@ use smart_default::SmartDefault;
 use super::objective::FrameObjective;
 use super::smoothing::SmoothingConfig;
 use super::swarm::{Dimension, SwarmConfig, minimize};
+use super::upright::UprightSurfaces;
+use super::wide_search::{self, WideSearchConfig};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::Beam;
 use crate::map::SensorAttitude;
@@ -29,7 +32,7 @@ pub enum Method {
     Swarm,
     /// Gauss-Newton.
     GaussNewton,
-    /// The swarm, then Gauss-Newton.
+    /// The swarm where the estimate may be outside the basin of Gauss-Newton, then Gauss-Newton.
     Both,
 }
 
@@ -62,11 +65,19 @@ pub struct RefinementConfig {
     #[default(0.01)]
     pub min_reach_rad: f64,
     /// Largest reach in x and y [m].
-    #[default(1.0)]
+    #[default(10.0)]
     pub max_reach_m: f64,
     /// Largest reach in heading [rad].
-    #[default(0.1)]
+    #[default(1.0)]
     pub max_reach_rad: f64,
+    /// Reach in x and y within which Gauss-Newton needs no swarm [m].
+    #[default(0.3)]
+    pub basin_m: f64,
+    /// The same in heading [rad].
+    #[default(0.04)]
+    pub basin_rad: f64,
+    /// The search from farther away.
+    pub wide_search: WideSearchConfig,
     /// Increase of the mean cost that makes a pose e times less likely, for covariances [m].
     #[default(0.001)]
     pub scale_m: f64,
@@ -77,6 +88,9 @@ impl Validate for RefinementConfig {
         nested("swarm", &self.swarm)?;
         in_range("swarm_beams", self.swarm_beams, 1..=1_000_000)?;
         nested("gauss_newton", &self.gauss_newton)?;
+        nested("wide_search", &self.wide_search)?;
+        not_negative("basin_m", self.basin_m)?;
+        not_negative("basin_rad", self.basin_rad)?;
         nested("smoothing", &self.smoothing)?;
         not_negative("reach_sigmas", self.reach_sigmas)?;
         positive("min_reach_m", self.min_reach_m)?;
@@ -90,6 +104,27 @@ impl Validate for RefinementConfig {
         ordered("max_reach_m", self.max_reach_m, "min_reach_m", m)?;
         ordered("max_reach_rad", self.max_reach_rad, "min_reach_rad", rad)?;
         positive("scale_m", self.scale_m)
+    }
+}
+
+impl RefinementConfig {
+    /// Reach of the search for an estimate with a covariance: x, y [m], heading [rad].
+    pub fn reach(&self, covariance: &Matrix3<f64>) -> [f64; 3] {
+        let reach = |axis: usize, least: f64, most: f64| {
+            let sigma = covariance[(axis, axis)].max(0.0).sqrt();
+            (self.reach_sigmas * sigma).clamp(least, most)
+        };
+        [
+            reach(0, self.min_reach_m, self.max_reach_m),
+            reach(1, self.min_reach_m, self.max_reach_m),
+            reach(2, self.min_reach_rad, self.max_reach_rad),
+        ]
+    }
+
+    /// Whether an estimate may be outside the basin of Gauss-Newton, so that both steps are needed.
+    pub fn is_wide(&self, covariance: &Matrix3<f64>) -> bool {
+        let [x, y, heading] = self.reach(covariance);
+        self.method == Method::Both && (x.max(y) > self.basin_m || heading > self.basin_rad)
     }
 }
 
@@ -113,19 +148,26 @@ pub struct RefinedFrame {
 }
 
 /// Refines an estimate with its covariance of (x, y, heading). The attitude of the objective is an
-/// initial value, which is first fitted to the mapped ground. `None` where there is no ground under the
-/// estimate or the scan has no beams.
+/// initial value, which is first fitted to the mapped ground. With `surfaces`, those of the map, the swarm searches as
+/// far as the covariance asks for. `None` where there is no ground under the estimate or the scan has no beams.
 pub fn refine_frame(
     objective: &FrameObjective<'_>,
     estimate: &Pose2,
     covariance: &Matrix3<f64>,
+    surfaces: Option<&UprightSurfaces>,
     config: &RefinementConfig,
     rng: &mut impl Rng,
 ) -> Result<Option<RefinedFrame>, RenderError> {
-    let objective = &objective.with_fitted_attitude(estimate);
+    let reach = config.reach(covariance);
+    let distance_m = surfaces.map_or(0.0, |_| reach[0].max(reach[1]));
+    let objective = &match surfaces {
+        Some(_) => *objective,
+        None => objective.with_fitted_attitude(estimate),
+    };
     let Some(lifted) = objective
-        .lift(estimate, None)
+        .patch_within(estimate, distance_m)
         .filter(|_| !objective.beams.is_empty())
+        .map(|patch| patch.lift(estimate, &objective.attitude))
     else {
         return Ok(None);
     };
@@ -139,8 +181,10 @@ pub fn refine_frame(
         cost_before_m,
         cost_after_m: cost_before_m,
     };
-    if matches!(config.method, Method::Swarm | Method::Both) {
-        search(objective, &mut frame, config, rng)?;
+    match surfaces {
+        Some(surfaces) => search_widely(objective, &mut frame, surfaces, config, rng)?,
+        None if config.method == Method::Swarm => search(objective, &mut frame, config, rng)?,
+        None => {}
     }
     let finished = match config.method {
         Method::GaussNewton | Method::Both => finish(objective, &mut frame, config)?,
@@ -158,6 +202,33 @@ pub fn refine_frame(
         };
     }
     Ok(Some(frame))
+}
+
+/// Searches for a better pose with swarms over the surfaces of the map.
+fn search_widely(
+    objective: &FrameObjective<'_>,
+    frame: &mut RefinedFrame,
+    surfaces: &UprightSurfaces,
+    config: &RefinementConfig,
+    rng: &mut impl Rng,
+) -> Result<(), RenderError> {
+    let found = wide_search::search(
+        objective,
+        surfaces,
+        &frame.pose,
+        config.reach(&frame.covariance),
+        &config.gauss_newton,
+        &config.wide_search,
+        rng,
+    )?;
+    if let Some((map_from_lidar, cost_m)) = found
+        && cost_m < frame.cost_after_m
+    {
+        frame.pose = pose2_from_pose3(&map_from_lidar);
+        frame.map_from_lidar = map_from_lidar;
+        frame.cost_after_m = cost_m;
+    }
+    Ok(())
 }
 
 /// Searches for a better pose with the swarm.
@@ -199,23 +270,15 @@ fn search_space(
     covariance: &Matrix3<f64>,
     config: &RefinementConfig,
 ) -> [Dimension; 3] {
-    let reach = |axis: usize, least: f64, most: f64| {
-        let sigma = covariance[(axis, axis)].max(0.0).sqrt();
-        (config.reach_sigmas * sigma).clamp(least, most)
-    };
-    let dimension = |start: f64, reach: f64, is_circular: bool| Dimension {
-        start,
-        spread: 0.5 * reach,
-        reach,
-        is_circular,
-    };
-    let (least, most) = (config.min_reach_m, config.max_reach_m);
-    let turn = reach(2, config.min_reach_rad, config.max_reach_rad);
-    [
-        dimension(pose.translation.x, reach(0, least, most), false),
-        dimension(pose.translation.y, reach(1, least, most), false),
-        dimension(pose.rotation.angle(), turn, true),
-    ]
+    let reach = config.reach(covariance);
+    let t = pose.translation;
+    let start = [t.x, t.y, pose.rotation.angle()];
+    [0, 1, 2].map(|axis| Dimension {
+        start: start[axis],
+        spread: 0.5 * reach[axis],
+        reach: reach[axis],
+        is_circular: axis == 2,
+    })
 }
 
 fn pose_of(&[x, y, heading_rad]: &[f64; 3]) -> Pose2 {
@@ -262,7 +325,14 @@ mod tests {
             ..RefinementConfig::default()
         };
         let mut rng = StdRng::seed_from_u64(seed);
-        let frame = refine_frame(&objective, &(truth * off), &covariance, &config, &mut rng);
+        let frame = refine_frame(
+            &objective,
+            &(truth * off),
+            &covariance,
+            None,
+            &config,
+            &mut rng,
+        );
         (frame.unwrap().unwrap(), truth)
     }
 
@@ -313,13 +383,13 @@ mod tests {
         let covariance = Matrix3::identity();
         let empty = world.objective(&[]);
         assert_eq!(
-            refine_frame(&empty, &truth, &covariance, &config, &mut rng).unwrap(),
+            refine_frame(&empty, &truth, &covariance, None, &config, &mut rng).unwrap(),
             None
         );
         let off = Pose2::translation(1e5, 0.0);
         let objective = world.objective(&beams);
         assert_eq!(
-            refine_frame(&objective, &off, &covariance, &config, &mut rng).unwrap(),
+            refine_frame(&objective, &off, &covariance, None, &config, &mut rng).unwrap(),
             None
         );
     }

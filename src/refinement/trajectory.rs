@@ -8,6 +8,7 @@
 //! The trajectory is split where tracking was lost, because the odometry may not describe how the car
 //! came from before the loss to after it; frames without an estimate are bridged by the odometry.
 
+use std::cell::OnceCell;
 use std::ops::Range;
 
 use nalgebra::{Matrix3, Vector3};
@@ -15,10 +16,11 @@ use nalgebra::{Matrix3, Vector3};
 use super::objective::FrameObjective;
 use super::refiner::{RefinementConfig, refine_frame};
 use super::smoothing::{self, FramePrior, smooth};
-use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
-use crate::lidar::{Motion, RangeImage, Scan};
-use crate::localization::observation::{ObservationConfig, choose_beams};
-use crate::localization::{Estimate, Sensor, SensorConfig, State};
+use super::upright::UprightSurfaces;
+use crate::geometry::{Pose2, Pose3, Vec3, pose3_from_pose2};
+use crate::lidar::{Beam, Motion, RangeImage, Scan};
+use crate::localization::observation::{ObservationConfig, agreement, choose_beams};
+use crate::localization::{Estimate, Sensor, SensorConfig, State, TrackingLossConfig};
 use crate::map::{Map, SensorAttitude};
 use crate::random::{Generator, stream};
 use crate::rendering::RenderError;
@@ -56,6 +58,9 @@ pub struct InitialEstimate {
     pub state: State,
     /// Motion of the sensor, by which the scan is deskewed.
     pub motion: Option<Motion>,
+    /// Motion `previous_from_current` since the frame before, which predicts the pose where the estimate is too
+    /// uncertain for Gauss-Newton.
+    pub increment: Option<Pose2>,
 }
 
 impl InitialEstimate {
@@ -66,6 +71,7 @@ impl InitialEstimate {
             covariance: None,
             state: State::Tracking,
             motion: None,
+            increment: None,
         }
     }
 }
@@ -77,6 +83,7 @@ impl From<&Estimate> for InitialEstimate {
             covariance: Some(estimate.covariance),
             state: estimate.state,
             motion: estimate.motion,
+            increment: None,
         }
     }
 }
@@ -120,6 +127,8 @@ pub struct RefinedTrajectory {
     pub unmapped: usize,
     /// Whether the trajectory was smoothed.
     pub is_smoothed: bool,
+    /// State of each frame: `Searching` where its estimate was uncertain and it could not be placed.
+    pub states: Vec<State>,
 }
 
 /// Why a trajectory cannot be refined.
@@ -143,6 +152,10 @@ pub struct TrajectoryRefiner {
     seed: u64,
     sensor: Sensor,
     frames: Vec<FrameResult>,
+    /// Upright surfaces of the map, for wide searches.
+    surfaces: OnceCell<UprightSurfaces>,
+    /// `refined * estimate⁻¹` of the last frame that was placed.
+    correction: Option<Pose2>,
 }
 
 impl TrajectoryRefiner {
@@ -155,10 +168,13 @@ impl TrajectoryRefiner {
             config,
             seed,
             frames: Vec::new(),
+            surfaces: OnceCell::new(),
+            correction: None,
         })
     }
 
-    /// Refines the next frame. A frame whose state is not `Tracking` keeps its estimate.
+    /// Refines the next frame. A frame whose state is not `Tracking` keeps its estimate, and so does one that cannot
+    /// be placed although its estimate is uncertain: its state is then `Searching`.
     pub fn add(
         &mut self,
         scan: &Scan,
@@ -178,7 +194,13 @@ impl TrajectoryRefiner {
                 .and_then(|previous| previous.level_m),
         };
         if frame.state == State::Tracking {
-            self.refine(&image, &mut frame, &mut rng)?;
+            if self.config.refinement.is_wide(&frame.covariance) {
+                frame = self.place(&image, estimate, frame, &mut rng)?;
+                let correction = frame.pose * estimate.pose.inverse();
+                self.correction = frame.is_tracked().then_some(correction).or(self.correction);
+            } else {
+                self.refine(&image, &mut frame, &mut rng)?;
+            }
         }
         self.frames.push(frame);
         Ok(&self.frames[self.frames.len() - 1])
@@ -196,12 +218,49 @@ impl TrajectoryRefiner {
             .unwrap_or_else(|| self.config.sensor.assumed_attitude())
     }
 
+    /// Places a frame whose estimate is uncertain: near the pose that follows from the frame before, or from the
+    /// correction of the last one that was placed; otherwise by a search around the estimate.
+    fn place(
+        &self,
+        image: &RangeImage,
+        estimate: &InitialEstimate,
+        frame: FrameResult,
+        rng: &mut Generator,
+    ) -> Result<FrameResult, RefinerError> {
+        let previous = self.frames.last().filter(|previous| previous.is_tracked());
+        let predicted = previous
+            .zip(estimate.increment)
+            .map(|(previous, increment)| previous.pose * increment);
+        let corrected = self.correction.map(|correction| correction * estimate.pose);
+        let near = (predicted.into_iter().chain(corrected)).map(|pose| FrameResult {
+            pose,
+            covariance: Matrix3::zeros(),
+            ..frame.clone()
+        });
+        // What the uncertainty says, then twice as far.
+        let far = [1.0, 4.0].map(|factor| FrameResult {
+            covariance: factor * frame.covariance,
+            level_m: None,
+            ..frame.clone()
+        });
+        for mut start in near.chain(far) {
+            if self.refine(image, &mut start, rng)? {
+                return Ok(start);
+            }
+        }
+        Ok(FrameResult {
+            state: State::Searching,
+            ..frame
+        })
+    }
+
+    /// Refines a frame; whether most of its beams agree with the map afterwards.
     fn refine(
         &self,
         image: &RangeImage,
         frame: &mut FrameResult,
         rng: &mut Generator,
-    ) -> Result<(), RefinerError> {
+    ) -> Result<bool, RefinerError> {
         let observation = &self.config.observation;
         let (count, road_share) = (observation.beams, observation.road_share);
         let beams = choose_beams(image, count, road_share, &frame.attitude, rng);
@@ -217,15 +276,36 @@ impl TrajectoryRefiner {
             objective = objective.on_best_level(&frame.pose)?;
         }
         let config = &self.config.refinement;
-        let refined = refine_frame(&objective, &frame.pose, &frame.covariance, config, rng)?;
-        if let Some(refined) = refined {
-            frame.pose = refined.pose;
-            frame.map_from_lidar = Some(refined.map_from_lidar);
-            frame.covariance = refined.covariance;
-            frame.attitude = refined.attitude;
-            frame.level_m = refined.level_m.or(frame.level_m);
-        }
-        Ok(())
+        let (pose, covariance) = (&frame.pose, &frame.covariance);
+        let surfaces = (config.is_wide(covariance)).then(|| {
+            let of_map = || UprightSurfaces::of(&self.map.mesh);
+            self.surfaces.get_or_init(of_map)
+        });
+        let Some(refined) = refine_frame(&objective, pose, covariance, surfaces, config, rng)?
+        else {
+            return Ok(false);
+        };
+        frame.pose = refined.pose;
+        frame.map_from_lidar = Some(refined.map_from_lidar);
+        frame.covariance = refined.covariance;
+        frame.attitude = refined.attitude;
+        frame.level_m = refined.level_m.or(frame.level_m);
+        self.agrees(&beams, &refined.map_from_lidar)
+    }
+
+    /// Whether most of the beams end on the surfaces of the map, and few behind them.
+    fn agrees(&self, beams: &[Beam], map_from_lidar: &Pose3) -> Result<bool, RefinerError> {
+        /// Least share of agreeing beams among all.
+        const MIN_SHARE: f64 = 0.4;
+        let config = TrackingLossConfig::default();
+        let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
+        let rendered_m = &self.map.renderer.cast(&[*map_from_lidar], &directions)?[0];
+        let hits = (beams.iter().zip(rendered_m))
+            .filter(|(beam, rendered_m)| (beam.range_m - *rendered_m).abs() <= config.tolerance_m)
+            .count();
+        let share = agreement(beams, rendered_m, config.tolerance_m);
+        Ok(share.is_some_and(|share| share >= config.sure_agreement)
+            && hits as f64 >= MIN_SHARE * beams.len() as f64)
     }
 
     /// Smooths the trajectory with the odometry `previous_from_current` into each frame (the first is
@@ -255,6 +335,7 @@ impl TrajectoryRefiner {
             untracked,
             unmapped: frames.len() - untracked - refined,
             is_smoothed: increments.is_some() && is_measured,
+            states: frames.iter().map(|frame| frame.state).collect(),
         })
     }
 
@@ -384,6 +465,7 @@ mod tests {
             covariance: None,
             state: State::Tracking,
             motion: None,
+            increment: None,
         };
         let refined = refiner.add(&scan, &estimate).unwrap();
         let off_m = (refined.pose.translation.vector - truth.translation.vector).norm();

@@ -8,9 +8,9 @@ use rand::Rng;
 
 use super::stages::RecordingInputs;
 use crate::app::config::OdometrySource;
-use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
 use crate::lidar::Scan;
-use crate::localization::odometry::{demonstration_noise, increments, with_noise};
+use crate::localization::odometry::{are_in_space, demonstration_noise, motions, with_noise};
 use crate::odometry::{Odometer, OdometryConfig};
 use crate::recording::layout::Layout;
 use crate::recording::{Frame, PoseTrack, Recording};
@@ -18,7 +18,7 @@ use crate::recording::{Frame, PoseTrack, Recording};
 /// The motion `previous_from_current` into each frame.
 pub enum MotionSource {
     /// Known for all frames.
-    Given(Vec<Pose2>),
+    Given(Vec<FrameMotion>),
     /// From the scans themselves, also from those between the selected ones.
     Scans(Box<ScanOdometry>),
     /// Not known.
@@ -60,8 +60,14 @@ impl MotionSource {
                     .frames
                     .iter()
                     .filter_map(|frame| frame.map_from_lidar);
-                let increments = increments(&poses.collect::<Vec<_>>());
-                Self::Given(with_noise(&increments, &demonstration_noise(), rng))
+                let motions = motions(&poses.collect::<Vec<_>>());
+                let increments: Vec<Pose2> = motions.iter().map(pose2_from_pose3).collect();
+                let noisy = with_noise(&increments, &demonstration_noise(), rng);
+                let moved = motions.iter().zip(&increments).zip(&noisy);
+                let with_noise = moved.map(|((motion, increment), noisy)| {
+                    motion * pose3_from_pose2(&(increment.inverse() * noisy), 0.0)
+                });
+                Self::given(with_noise.collect(), &noisy)
             }
             _ => Self::of_scans(recording)?,
         };
@@ -90,7 +96,22 @@ impl MotionSource {
             last = pose.unwrap_or(last);
             last
         });
-        Ok(Self::Given(increments(&known.collect::<Vec<_>>())))
+        let motions = motions(&known.collect::<Vec<_>>());
+        let increments: Vec<Pose2> = motions.iter().map(pose2_from_pose3).collect();
+        Ok(Self::given(motions, &increments))
+    }
+
+    /// Known motions in space and in the plane; only the latter if all stay in the plane.
+    fn given(motions: Vec<Pose3>, increments: &[Pose2]) -> Self {
+        let are_in_space = are_in_space(&motions);
+        let both = motions.into_iter().zip(increments);
+        Self::Given(
+            both.map(|(motion, &increment)| FrameMotion {
+                increment,
+                in_space: are_in_space.then_some(motion),
+            })
+            .collect(),
+        )
     }
 
     /// The motion into a frame by its row and scan; every scan has to be given, in order.
@@ -100,12 +121,8 @@ impl MotionSource {
         frame: &Frame,
         scan: &Scan,
     ) -> Result<Option<FrameMotion>> {
-        let planar = |increment: &Pose2| FrameMotion {
-            increment: *increment,
-            in_space: None,
-        };
         Ok(match self {
-            Self::Given(increments) => increments.get(row).map(planar),
+            Self::Given(motions) => motions.get(row).copied(),
             Self::Scans(odometry) => Some(odometry.motion_to(frame, scan)?),
             Self::Unknown => None,
         })

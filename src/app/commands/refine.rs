@@ -1,12 +1,13 @@
-//! `refine`: refines the trajectory of `localize` frame by frame and smooths it.
+//! `refine`: refines the trajectory of `localize`, or one from anywhere, frame by frame and smooths it.
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Result, ensure};
+use nalgebra::Matrix3;
 
-use super::claims::{Claims, Outputs};
+use super::claims::{Claims, NPZ, Outputs};
 use super::interrupt::Interrupted;
 use super::motion_source::MotionSource;
 use super::run_output::{self, REFINEMENT_FILES, REPORT_FILES, RunFiles};
@@ -22,7 +23,7 @@ use crate::localization::odometry::demonstration_noise;
 use crate::map::Map;
 use crate::random::stream;
 use crate::recording::layout::Layout;
-use crate::recording::{Frame, Recording};
+use crate::recording::{Calibration, Frame, Recording};
 use crate::refinement::{
     InitialEstimate, RefinedTrajectory, RefinerConfig, SmoothingConfig, TrajectoryRefiner,
 };
@@ -35,10 +36,13 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
     input::require_file("map_file", &config.map_file)?;
     config.recording_inputs().require()?;
-    let files = RunFiles::beside(&config.result_file);
-    let main = files.file("effective_refinement.yml");
-    let mut claims = prepare(config, context, &main)?;
-    let mut results = LocalizationResults::read(&config.result_file)?;
+    let files = RunFiles::beside(&config.output());
+    let (mut claims, main) = prepare(config, context, &files)?;
+    let is_trajectory = config.is_trajectory();
+    let mut results = match is_trajectory {
+        true => LocalizationResults::default(),
+        false => LocalizationResults::read(&config.result_file)?,
+    };
     let is_unfinished = claims.state(&main) == Some("unfinished");
     ensure!(
         results.refined.is_none() || config.force || is_unfinished,
@@ -48,12 +52,18 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     run_output::warn_of_shortfall(&results, &config.result_file);
     let map = config.map_inputs().load(None, context)?;
     let mut resolved = config.clone();
-    let sequence = resolved.open_in_map(&map)?;
+    let mut sequence = resolved.open_in_map(&map)?;
     let config = &resolved;
+    if is_trajectory {
+        results = follow(config, &map, &mut sequence)?;
+    }
     let sequence = frames_of(sequence, &results, config)?;
     let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
     let increments = increments(config, &sequence, &results)?;
-    let starts = initial_estimates(&results, &estimates);
+    let starts = match is_trajectory {
+        true => rough_estimates(config, &results, &estimates, &increments),
+        false => initial_estimates(&results, &estimates),
+    };
     let (refined, runtimes_s) = refine(config, context, &map, &sequence, &starts, &increments)?;
     let truth = sequence.frames.iter().map(|frame| frame.map_from_lidar);
     let truth: Option<Vec<Pose3>> = truth.collect();
@@ -61,6 +71,10 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     results.ground_truth = (results.ground_truth.take()).or(truth.as_deref().map(planar));
     results.ground_truth_in_space = results.ground_truth_in_space.take().or(truth);
     results.estimates = Some(estimates);
+    if is_trajectory {
+        let states = refined.states.iter();
+        results.states = Some(states.map(|state| *state as u8).collect());
+    }
     results.refined = Some(refined.poses.clone());
     results.refined_in_space = Some(refined.map_from_lidar.clone());
     results.refined_covariances = Some(refined.covariances.clone());
@@ -87,27 +101,106 @@ pub fn base_config(result: Option<&Path>) -> RefinementConfig {
     )
 }
 
-/// Prepares the outputs; the effective configuration is the main one, as the result exists already.
-fn prepare(config: &RefinementConfig, context: &Context, main: &Path) -> Result<Claims> {
-    ensure!(
-        fs::symlink_metadata(&config.result_file)?.is_file(),
-        "result_file is {}, which is not a regular file; refine replaces it: give the path of the file itself",
-        config.result_file.display()
-    );
+/// Prepares the outputs, of which the second value is the main one: the result of a trajectory, or the effective
+/// configuration of a result, which exists already.
+fn prepare(
+    config: &RefinementConfig,
+    context: &Context,
+    files: &RunFiles,
+) -> Result<(Claims, PathBuf)> {
     let mut names: Vec<&str> = [REPORT_FILES, REFINEMENT_FILES].concat();
     names.push("ground_truth_poses.npy");
     names.extend(config.plot_loc_results.then_some("plots"));
+    let effective = "effective_refinement.yml";
+    let is_trajectory = config.is_trajectory();
+    let (key, main) = match is_trajectory {
+        true => ("output_file", files.result.clone()),
+        false => ("result_file", files.file(effective)),
+    };
+    names.retain(|&name| !is_trajectory || name != effective);
+    names.extend(is_trajectory.then_some(effective));
+    ensure!(
+        is_trajectory || fs::symlink_metadata(&config.result_file)?.is_file(),
+        "result_file is {}, which is not a regular file; refine replaces it: give the path of the file itself",
+        config.result_file.display()
+    );
+    let mut inputs = config.input_files(context);
+    inputs.extend(is_trajectory.then_some(("result_file", config.result_file.as_path())));
     let outputs = Outputs {
-        key: "result_file",
-        main,
-        magic: None,
+        key,
+        main: &main,
+        magic: is_trajectory.then_some(NPZ),
         names: names.into_iter().map(str::to_owned).collect(),
-        inputs: config.input_files(context),
-        force: true,
+        inputs,
+        force: config.force || !is_trajectory,
     };
     let claims = outputs.prepare()?;
-    remove_abandoned(&config.result_file)?;
-    Ok(claims)
+    remove_abandoned(&files.result)?;
+    Ok((claims, main))
+}
+
+/// The frames of a recording that a trajectory has poses of, and these poses as a result.
+fn follow(
+    config: &RefinementConfig,
+    map: &Map,
+    sequence: &mut Recording,
+) -> Result<LocalizationResults> {
+    let track = config
+        .recording_inputs()
+        .track(&config.result_file, sequence)?;
+    // Poses of a lidar are in the frame of the map, those of a camera in the world of its drive.
+    let world_from_map = match track.calibration == Calibration::identity() {
+        true => Pose3::identity(),
+        false => map.path.world_from_map,
+    };
+    let track = track.in_map(&world_from_map);
+    let mut poses = track.matched(&sequence.frames, sequence.has_times)?;
+    let is_known: Vec<bool> = poses.iter().map(Option::is_some).collect();
+    let mut known = is_known.iter();
+    sequence.frames.retain(|_| known.next() == Some(&true));
+    poses.retain(Option::is_some);
+    let map_from_lidar: Vec<Pose3> = poses.into_iter().flatten().collect();
+    let frames = &sequence.frames;
+    Ok(LocalizationResults {
+        frames: frames.iter().map(|frame| frame.number).collect(),
+        estimates: Some(map_from_lidar.iter().map(pose2_from_pose3).collect()),
+        estimates_in_space: Some(map_from_lidar),
+        times_s: Some(frames.iter().map(|frame| frame.time_s).collect()),
+        ..LocalizationResults::default()
+    })
+}
+
+/// The poses of a rough trajectory with their uncertainty; scans are deskewed by the odometry.
+fn rough_estimates(
+    config: &RefinementConfig,
+    results: &LocalizationResults,
+    estimates: &[Pose2],
+    increments: &[Option<Pose2>],
+) -> Vec<InitialEstimate> {
+    let [position_m, heading_deg] = config.uncertainty;
+    let variance = position_m * position_m;
+    let variances = [variance, variance, heading_deg.to_radians().powi(2)];
+    let is_known = increments.iter().all(Option::is_some);
+    let mut pose = Pose2::identity();
+    let driven: Vec<Pose3> = (increments.iter().skip(1).flatten())
+        .map(|increment| {
+            pose *= increment;
+            pose3_from_pose2(&pose, 0.0)
+        })
+        .collect();
+    let driven = [vec![Pose3::identity()], driven].concat();
+    let motion = |row: usize| {
+        let times_s = results.times_s.as_ref().filter(|_| is_known)?;
+        Motion::along(&driven, times_s, row)
+    };
+    let rough = |(row, pose): (usize, &Pose2)| InitialEstimate {
+        pose: *pose,
+        covariance: Some(Matrix3::from_diagonal(&variances.into())),
+        state: State::Tracking,
+        motion: motion(row),
+        increment: increments[row].filter(|_| row > 0),
+    };
+    estimates.iter().enumerate().map(rough).collect()
 }
 
 /// The frames of the sequence that the result contains, in its order.
@@ -150,6 +243,7 @@ fn initial_estimates(results: &LocalizationResults, estimates: &[Pose2]) -> Vec<
         covariance: results.covariances.as_ref().map(|all| all[row]),
         state: state(row),
         motion: motion(row),
+        increment: None,
     };
     estimates.iter().enumerate().map(initial).collect()
 }
@@ -184,16 +278,26 @@ fn refine(
     let is_used = config.odometry != OdometrySource::None;
     ensure!(known.is_some() || !is_used, "the odometry has gaps");
     let refined = refiner.finish(known.as_deref().filter(|_| is_used))?;
-    report_unrefined(&refined);
+    report_unrefined(&refined, config.is_trajectory());
     Ok((refined, runtimes_s))
 }
 
-fn report_unrefined(refined: &RefinedTrajectory) {
+fn report_unrefined(refined: &RefinedTrajectory, is_trajectory: bool) {
     let smoothed = match refined.is_smoothed {
         true => ", only smoothed",
         false => "",
     };
-    if refined.untracked > 0 {
+    if is_trajectory && refined.untracked > 0 {
+        let moved = match refined.is_smoothed {
+            true => "follow from the others by the odometry",
+            false => "are unchanged",
+        };
+        tracing::warn!(
+            "{} of {} poses could not be placed in the map: they {moved}; their state is searching. If the trajectory may be farther off, give a larger --uncertainty",
+            refined.untracked,
+            refined.poses.len()
+        );
+    } else if refined.untracked > 0 {
         tracing::info!(
             "{} frames in which the filter was not tracking are not refined{smoothed}",
             refined.untracked

@@ -13,7 +13,7 @@ use crate::localization::SensorConfig;
 use crate::localization::observation::ObservationConfig;
 use crate::map::scan_cloud::ScanConfig;
 use crate::refinement::{self, RefinerConfig};
-use crate::validation::{InvalidValue, Validate, in_range, nested};
+use crate::validation::{InvalidValue, Validate, in_range, nested, require};
 
 /// Configuration of `refine`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -36,8 +36,13 @@ pub struct RefinementConfig {
     /// Pose x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose poses are given; `None`: they are
     /// those of the lidar.
     pub body_from_lidar: Option<[f64; 6]>,
-    /// Result of `localize`, to which the refined poses are added.
+    /// Result of `localize`, to which the refined poses are added, or a trajectory in the frame of the map, rows of TUM
+    /// or KITTI.
     pub result_file: PathBuf,
+    /// Result to write of a trajectory; `None`: `refined.npz` in a folder that is named after it.
+    pub output_file: Option<PathBuf>,
+    /// Standard deviations of the poses of a trajectory: position [m] and heading [deg].
+    pub uncertainty: [f64; 2],
     /// Whether to draw the final plots.
     pub plot_loc_results: bool,
     /// First frame of the recording.
@@ -102,6 +107,8 @@ impl RefinementConfig {
             pose_file: localization.pose_file,
             calib_file: localization.calib_file,
             result_file: localization.result_path,
+            output_file: None,
+            uncertainty: [1.0, 10.0],
             plot_loc_results: true,
             start_idx: localization.start_idx,
             n_scans: localization.n_scans,
@@ -124,6 +131,27 @@ impl RefinementConfig {
             force: localization.force,
         }
     }
+
+    /// Whether a trajectory is refined, and not a result of `localize`.
+    pub fn is_trajectory(&self) -> bool {
+        self.result_file
+            .extension()
+            .is_none_or(|extension| extension != "npz")
+    }
+
+    /// The result that is written.
+    pub fn output(&self) -> PathBuf {
+        if !self.is_trajectory() {
+            return self.result_file.clone();
+        }
+        let beside = || {
+            let mut name = self.result_file.file_stem().unwrap_or_default().to_owned();
+            name.push("_refined");
+            self.result_file.with_file_name(name).join("refined.npz")
+        };
+        self.output_file.clone().unwrap_or_else(beside)
+    }
+
     /// The ground classifier of the scans and its parameters.
     pub fn ground(&self) -> GroundConfig {
         GroundConfig {
@@ -172,6 +200,16 @@ impl Validate for RefinementConfig {
         mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
         in_range("elevation_bias_deg", self.elevation_bias_deg, -5.0..=5.0)?;
         path("result_file", &self.result_file)?;
+        optional_path("output_file", self.output_file.as_deref())?;
+        let [position_m, heading_deg] = self.uncertainty;
+        let is_possible =
+            (0.0..=100.0).contains(&position_m) && (0.0..=180.0).contains(&heading_deg);
+        require(
+            is_possible,
+            "uncertainty",
+            format!("{:?}", self.uncertainty),
+            "give a position within 100 m and a heading within 180 degrees",
+        )?;
         self.selection().validate()?;
         (self.odometry).validate(self.odometry_file.as_deref(), self.pose_file.as_deref())?;
         nested("range_image", &self.range_image)?;
