@@ -11,7 +11,8 @@
 //! choose among them.
 
 use nalgebra::Vector2;
-use rand::Rng;
+use rand::{Rng, RngExt as _};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
@@ -20,6 +21,7 @@ use super::swarm::{Dimension, SwarmConfig, minimize};
 use super::upright::{UprightSurfaces, is_upright_height};
 use crate::geometry::{Pose2, Pose3, Rigid3f, pose2_from_pose3};
 use crate::lidar::Beam;
+use crate::random::stream;
 use crate::registration::{RegistrationConfig, register};
 use crate::rendering::RenderError;
 use crate::validation::{InvalidValue, Validate, in_range, nested, positive};
@@ -31,7 +33,7 @@ use crate::validation::{InvalidValue, Validate, in_range, nested, positive};
 #[serde(default, deny_unknown_fields)]
 pub struct WideSearchConfig {
     /// Swarms, each of which may end in another minimum.
-    #[default(8)]
+    #[default(6)]
     pub swarms: usize,
     /// Each swarm.
     #[default(SwarmConfig {
@@ -108,13 +110,16 @@ pub fn search(
         is_circular: axis == 2,
     };
     let dimensions = [0, 1, 2].map(dimension);
-    let mut minima = vec![];
-    for _ in 0..config.swarms {
-        let batch = |positions: &[[f64; 3]]| {
-            Ok::<_, RenderError>(positions.iter().map(mean_distance_m).collect())
-        };
-        minima.push(minimize(&dimensions, &config.swarm, batch, rng)?);
-    }
+    // Each with a stream of its own, for the same result with any number of threads.
+    let seeds: Vec<u64> = (0..config.swarms).map(|_| rng.random()).collect();
+    let mut minima = (seeds.into_par_iter())
+        .map(|seed| {
+            let batch = |positions: &[[f64; 3]]| {
+                Ok::<_, RenderError>(positions.iter().map(mean_distance_m).collect())
+            };
+            minimize(&dimensions, &config.swarm, batch, &mut stream(seed, 0))
+        })
+        .collect::<Result<Vec<_>, _>>()?;
     minima.sort_by(|a, b| a.1.total_cmp(&b.1));
     let mut best: Option<(Pose3, f64)> = None;
     for pose in distinct(&minima, config.minima) {
