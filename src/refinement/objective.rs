@@ -43,13 +43,12 @@ impl FrameObjective<'_> {
     /// The ground under a pose, or the nearest part of it within a distance [m].
     pub fn patch_within(&self, pose: &Pose2, distance_m: f64) -> Option<GroundPatch> {
         let t = pose.translation.vector;
-        let farther = [2.0, 4.0, 8.0]
-            .into_iter()
-            .filter(|&m| m <= distance_m + 2.0);
-        (self.ground.patch_under(pose, self.level_m)).or_else(|| {
-            let mut radii_m = farther;
-            radii_m.find_map(|radius_m| self.ground.patch_at(t.x, t.y, radius_m, self.level_m))
-        })
+        let nearest = || {
+            let radii_m = [4.0, 8.0].into_iter();
+            (radii_m.filter(|&radius_m| radius_m <= distance_m + 2.0))
+                .find_map(|radius_m| self.ground.patch_at(t.x, t.y, radius_m, self.level_m))
+        };
+        self.ground.patch_under(pose, self.level_m).or_else(nearest)
     }
 
     /// Returns the objective with the attitude fitted at a pose, so that the beams on the road end on the

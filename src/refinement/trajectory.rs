@@ -244,7 +244,10 @@ impl TrajectoryRefiner {
             ..frame.clone()
         });
         for mut start in near.chain(far) {
-            if self.refine(image, &mut start, rng)? {
+            let beams = self.refine(image, &mut start, rng)?;
+            if let (Some(beams), Some(pose)) = (beams, &start.map_from_lidar)
+                && self.agrees(&beams, pose)?
+            {
                 return Ok(start);
             }
         }
@@ -254,13 +257,13 @@ impl TrajectoryRefiner {
         })
     }
 
-    /// Refines a frame; whether most of its beams agree with the map afterwards.
+    /// Refines a frame; the beams that were compared, or `None` where it cannot be refined.
     fn refine(
         &self,
         image: &RangeImage,
         frame: &mut FrameResult,
         rng: &mut Generator,
-    ) -> Result<bool, RefinerError> {
+    ) -> Result<Option<Vec<Beam>>, RefinerError> {
         let observation = &self.config.observation;
         let (count, road_share) = (observation.beams, observation.road_share);
         let beams = choose_beams(image, count, road_share, &frame.attitude, rng);
@@ -283,14 +286,14 @@ impl TrajectoryRefiner {
         });
         let Some(refined) = refine_frame(&objective, pose, covariance, surfaces, config, rng)?
         else {
-            return Ok(false);
+            return Ok(None);
         };
         frame.pose = refined.pose;
         frame.map_from_lidar = Some(refined.map_from_lidar);
         frame.covariance = refined.covariance;
         frame.attitude = refined.attitude;
         frame.level_m = refined.level_m.or(frame.level_m);
-        self.agrees(&beams, &refined.map_from_lidar)
+        Ok(Some(beams))
     }
 
     /// Whether most of the beams end on the surfaces of the map, and few behind them.

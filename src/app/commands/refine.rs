@@ -52,10 +52,10 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     run_output::warn_of_shortfall(&results, &config.result_file);
     let map = config.map_inputs().load(None, context)?;
     let mut resolved = config.clone();
-    let mut sequence = resolved.open_in_map(&map)?;
+    let sequence = resolved.open_in_map(&map)?;
     let config = &resolved;
     if is_trajectory {
-        results = follow(config, &map, &mut sequence)?;
+        results = follow(config, &map, &sequence)?;
     }
     let sequence = frames_of(sequence, &results, config)?;
     let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
@@ -111,14 +111,11 @@ fn prepare(
     let mut names: Vec<&str> = [REPORT_FILES, REFINEMENT_FILES].concat();
     names.push("ground_truth_poses.npy");
     names.extend(config.plot_loc_results.then_some("plots"));
-    let effective = "effective_refinement.yml";
     let is_trajectory = config.is_trajectory();
     let (key, main) = match is_trajectory {
         true => ("output_file", files.result.clone()),
-        false => ("result_file", files.file(effective)),
+        false => ("result_file", files.file("effective_refinement.yml")),
     };
-    names.retain(|&name| !is_trajectory || name != effective);
-    names.extend(is_trajectory.then_some(effective));
     ensure!(
         is_trajectory || fs::symlink_metadata(&config.result_file)?.is_file(),
         "result_file is {}, which is not a regular file; refine replaces it: give the path of the file itself",
@@ -143,7 +140,7 @@ fn prepare(
 fn follow(
     config: &RefinementConfig,
     map: &Map,
-    sequence: &mut Recording,
+    sequence: &Recording,
 ) -> Result<LocalizationResults> {
     let track = config
         .recording_inputs()
@@ -154,18 +151,14 @@ fn follow(
         false => map.path.world_from_map,
     };
     let track = track.in_map(&world_from_map);
-    let mut poses = track.matched(&sequence.frames, sequence.has_times)?;
-    let is_known: Vec<bool> = poses.iter().map(Option::is_some).collect();
-    let mut known = is_known.iter();
-    sequence.frames.retain(|_| known.next() == Some(&true));
-    poses.retain(Option::is_some);
-    let map_from_lidar: Vec<Pose3> = poses.into_iter().flatten().collect();
-    let frames = &sequence.frames;
+    let poses = track.matched(&sequence.frames, sequence.has_times)?;
+    let known: Vec<(&Frame, Pose3)> = (sequence.frames.iter().zip(poses))
+        .filter_map(|(frame, pose)| Some((frame, pose?)))
+        .collect();
     Ok(LocalizationResults {
-        frames: frames.iter().map(|frame| frame.number).collect(),
-        estimates: Some(map_from_lidar.iter().map(pose2_from_pose3).collect()),
-        estimates_in_space: Some(map_from_lidar),
-        times_s: Some(frames.iter().map(|frame| frame.time_s).collect()),
+        frames: known.iter().map(|(frame, _)| frame.number).collect(),
+        estimates_in_space: Some(known.iter().map(|(_, pose)| *pose).collect()),
+        times_s: Some(known.iter().map(|(frame, _)| frame.time_s).collect()),
         ..LocalizationResults::default()
     })
 }
