@@ -11,22 +11,30 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// Largest amount that a stage may need [bytes].
 static BUDGET: AtomicU64 = AtomicU64::new(u64::MAX);
 
-const GIB: f64 = (1_u64 << 30) as f64;
-
 /// A stage needs more memory than the budget.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 #[error(
-    "{what} would need {needed_gib:.1} GiB of memory, more than the budget of {budget_gib:.1} GiB; {remedy}, or raise the budget with --memory"
+    "{what} would need {} of memory, more than the budget of {}; {remedy}, or raise the budget with --memory",
+    amount(*needed_bytes), amount(*budget_bytes)
 )]
 pub struct MemoryError {
     /// What needs it.
     pub what: &'static str,
-    /// Estimate [GiB].
-    pub needed_gib: f64,
-    /// Budget [GiB].
-    pub budget_gib: f64,
+    /// Estimate [bytes].
+    pub needed_bytes: f64,
+    /// Budget [bytes].
+    pub budget_bytes: f64,
     /// What to change.
     pub remedy: &'static str,
+}
+
+/// Words for an amount of memory.
+fn amount(bytes: f64) -> String {
+    const MIB: f64 = (1_u64 << 20) as f64;
+    match bytes / MIB {
+        mib if mib < 1024.0 => format!("{mib:.1} MiB"),
+        mib => format!("{:.1} GiB", mib / 1024.0),
+    }
 }
 
 /// Sets the budget of the process [bytes].
@@ -42,8 +50,8 @@ pub fn require(what: &'static str, bytes: f64, remedy: &'static str) -> Result<(
     }
     Err(MemoryError {
         what,
-        needed_gib: bytes / GIB,
-        budget_gib: budget / GIB,
+        needed_bytes: bytes,
+        budget_bytes: budget,
         remedy,
     })
 }

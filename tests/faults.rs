@@ -45,6 +45,17 @@ const STAGES: &[Stage] = &[
         before: &[],
     },
     Stage {
+        name: "build-map onto a map",
+        arguments: &[
+            "build-map",
+            "velodyne",
+            "--onto=results/map.ply",
+            "--output=results/both.ply",
+            "--backend=cpu",
+        ],
+        before: &["build-map"],
+    },
+    Stage {
         name: "odometry",
         arguments: &["odometry", "velodyne", "--output=results"],
         before: &[],
@@ -58,6 +69,20 @@ const STAGES: &[Stage] = &[
         name: "refine",
         arguments: &["refine", "refinement.yml", "--backend=cpu"],
         before: &["build-map", "localize"],
+    },
+    Stage {
+        name: "refine a trajectory",
+        arguments: &[
+            "refine",
+            "poses.txt",
+            "--calib=calib.txt",
+            "--recording=velodyne",
+            "--map=results/map.ply",
+            "--output=results/refined.npz",
+            "--uncertainty=0.5,3",
+            "--backend=cpu",
+        ],
+        before: &["build-map"],
     },
     Stage {
         name: "compare",
