@@ -8,7 +8,9 @@ use std::fs;
 use std::path::Path;
 
 use common::{Fpmcl, Output, fpmcl, json, real_recording, run, simulate_two_drives};
+use fpmcl::app::results::LocalizationResults;
 use fpmcl::geometry::{Pose3, StampedPose};
+use fpmcl::map::ply;
 use fpmcl::recording::PoseTrack;
 use fpmcl::recording::poses::{read_tum, write_tum};
 use nalgebra::{UnitQuaternion, Vector3};
@@ -189,6 +191,54 @@ fn a_rough_trajectory_comes_to_centimetres_and_one_from_elsewhere_is_marked() {
     assert!((error_m("far", 5) - 400.0).abs() < 1e-3);
     let report = json(&folder.join("far/report.json"));
     assert_eq!(report["summary"]["tracking"], 0);
+}
+
+/// A straight street that the sensor sees 18 m of.
+const SHORT_SIGHTED: &str = "\
+output_folder: street
+n_scans: 70
+path:
+- {length_m: 120, turn_deg: 20, grade_percent: 1}
+scanner: {beams: 32, azimuth_steps: 600, max_range_m: 18}
+";
+
+#[test]
+fn where_the_map_ends_the_odometry_carries_on_with_growing_covariance() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, SHORT_SIGHTED);
+    let build = ["build-map", "street/drive_1", "--output", "whole.ply"];
+    run(folder, &build);
+    // No surface from 5 to 48 m: for about 15 m of the way no beam meets the map.
+    let (mut mesh, path) = ply::read_map(&folder.join("whole.ply")).unwrap();
+    let vertices = mesh.vertices.clone();
+    let is_ahead = |vertex: &u32| (5.0..48.0).contains(&vertices[*vertex as usize].x);
+    mesh.triangles
+        .retain(|triangle| !triangle.iter().any(is_ahead));
+    ply::write(&folder.join("map.ply"), &mesh, path.as_ref()).unwrap();
+    localize(folder, "street/drive_2", "run/r.npz").succeeds();
+
+    let truth = truth(folder);
+    let results = LocalizationResults::read(&folder.join("run/r.npz")).unwrap();
+    let agreements = results.agreements.as_ref().unwrap();
+    // Where no beam meets the map there is nothing to agree with.
+    let unmapped: Vec<usize> = (0..results.len())
+        .filter(|&row| agreements[row] < 0.0)
+        .collect();
+    let (&first, &last) = (unmapped.first().unwrap(), unmapped.last().unwrap());
+    assert!(unmapped.len() >= 10, "{unmapped:?}");
+    let covariances = results.covariances.as_ref().unwrap();
+    let deviation_m = |row: usize| (covariances[row][(0, 0)] + covariances[row][(1, 1)]).sqrt();
+    let (before, after) = (deviation_m(first - 4), deviation_m(69));
+    let inside = (unmapped.iter().map(|&row| deviation_m(row))).fold(0.0, f64::max);
+    assert!(
+        inside > 5.0 * before.max(after),
+        "{before} {inside} {after} m"
+    );
+    let result = folder.join("run/r.npz");
+    assert!(largest_error_m(&result, &truth, 0) < 3.0 * inside);
+    let error_m = largest_error_m(&result, &truth, last + 5);
+    assert!(error_m < 0.05, "{error_m} m after the map is back");
 }
 
 #[test]
