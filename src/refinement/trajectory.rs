@@ -2,11 +2,13 @@
 //!
 //! ```text
 //! frame by frame    swarm, Gauss-Newton                                  refiner
+//! not tracked       from the frame before by the odometry, else from the frame after
 //! all frames        min  frames (robust) + odometry between neighbours   smoothing
 //! ```
 //!
-//! The trajectory is split where tracking was lost, because the odometry may not describe how the car
-//! came from before the loss to after it; frames without an estimate are bridged by the odometry.
+//! The trajectory is split where tracking was lost and where the odometry contradicts the frames, because it
+//! may not describe how the car came from before the loss to after it; frames without an estimate are
+//! bridged by the odometry.
 
 use std::cell::OnceCell;
 use std::ops::Range;
@@ -54,12 +56,12 @@ pub struct InitialEstimate {
     /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²]; `None` for standard
     /// deviations of 0.2 m and 0.6 degrees.
     pub covariance: Option<Matrix3<f64>>,
-    /// State of the filter. Only tracked frames are refined.
+    /// State of the filter. Frames that were not tracked are placed from their neighbours.
     pub state: State,
     /// Motion of the sensor, by which the scan is deskewed.
     pub motion: Option<Motion>,
-    /// Motion `previous_from_current` since the frame before, which predicts the pose where the estimate is too
-    /// uncertain for Gauss-Newton.
+    /// Motion `previous_from_current` since the frame before, which predicts the pose where the frame was not tracked or
+    /// the estimate is too uncertain for Gauss-Newton.
     pub increment: Option<Pose2>,
 }
 
@@ -120,7 +122,7 @@ pub struct RefinedTrajectory {
     pub map_from_lidar: Vec<Pose3>,
     /// Covariances of (x, y, heading) in the axes of the map [m², m·rad, rad²].
     pub covariances: Vec<Matrix3<f64>>,
-    /// Frames that were not refined because the filter was not tracking.
+    /// Frames that the filter did not track and that could not be placed from their neighbours.
     pub untracked: usize,
     /// Tracked frames that were not refined because there is no mapped ground under the car, or no
     /// beam in the scan.
@@ -173,8 +175,9 @@ impl TrajectoryRefiner {
         })
     }
 
-    /// Refines the next frame. A frame whose state is not `Tracking` keeps its estimate, and so does one that cannot
-    /// be placed although its estimate is uncertain: its state is then `Searching`.
+    /// Refines the next frame. One whose estimate is uncertain, or whose state is not `Tracking`, is placed from the
+    /// frame before by the odometry; where the scan does not agree with the map there, it keeps its estimate, and a
+    /// tracked one gets the state `Searching`.
     pub fn add(
         &mut self,
         scan: &Scan,
@@ -193,17 +196,67 @@ impl TrajectoryRefiner {
                 .filter(|_| estimate.state != State::Lost)
                 .and_then(|previous| previous.level_m),
         };
-        if frame.state == State::Tracking {
-            if self.config.refinement.is_wide(&frame.covariance) {
-                frame = self.place(&image, estimate, frame, &mut rng)?;
-                let correction = frame.pose * estimate.pose.inverse();
-                self.correction = frame.is_tracked().then_some(correction).or(self.correction);
-            } else {
-                self.refine(&image, &mut frame, &mut rng)?;
+        let is_tracked = frame.is_tracked();
+        if is_tracked && !self.config.refinement.is_wide(&frame.covariance) {
+            self.refine(&image, &mut frame, &mut rng)?;
+        } else {
+            let previous = previous.filter(|previous| previous.is_tracked());
+            let predicted = (previous.zip(estimate.increment))
+                .map(|(previous, increment)| previous.pose * increment);
+            let corrected = self.correction.map(|correction| correction * estimate.pose);
+            let near = (predicted.into_iter()).chain(corrected.filter(|_| is_tracked));
+            // What the uncertainty says, then twice as far.
+            let far = [1.0, 4.0].map(|factor| FrameResult {
+                covariance: factor * frame.covariance,
+                level_m: None,
+                ..frame.clone()
+            });
+            let far = far.into_iter().filter(|_| is_tracked);
+            let starts = near.map(|pose| frame.near(pose)).chain(far);
+            let placed = self.place(&image, starts, &mut rng)?;
+            if let Some(placed) = &placed
+                && is_tracked
+            {
+                self.correction = Some(placed.pose * estimate.pose.inverse());
             }
+            let unplaced = FrameResult {
+                state: match is_tracked {
+                    true => State::Searching,
+                    false => frame.state,
+                },
+                ..frame
+            };
+            frame = placed.unwrap_or(unplaced);
         }
         self.frames.push(frame);
         Ok(&self.frames[self.frames.len() - 1])
+    }
+
+    /// Whether a frame has no pose in the map, and the one after it has.
+    pub fn is_before_tracked(&self, row: usize) -> bool {
+        let is_tracked = |row: usize| self.frames.get(row).map(FrameResult::is_tracked);
+        is_tracked(row) == Some(false) && is_tracked(row + 1) == Some(true)
+    }
+
+    /// Places a frame before one that has a pose in the map, by the odometry `row_from_next`; where its scan does not
+    /// agree with the map there, it stays as it is.
+    pub fn place_before(
+        &mut self,
+        row: usize,
+        scan: &Scan,
+        motion: Option<&Motion>,
+        row_from_next: &Pose2,
+    ) -> Result<(), RefinerError> {
+        if self.is_before_tracked(row) {
+            let mut rng = stream(self.seed, row as u64);
+            let image = self.sensor.range_image(scan, motion);
+            let next = &self.frames[row + 1];
+            let start = next.near(next.pose * row_from_next.inverse());
+            if let Some(placed) = self.place(&image, [start], &mut rng)? {
+                self.frames[row] = placed;
+            }
+        }
+        Ok(())
     }
 
     /// Attitude of the sensor in the next frame. That of a registered frame is more accurate than the
@@ -218,43 +271,22 @@ impl TrajectoryRefiner {
             .unwrap_or_else(|| self.config.sensor.assumed_attitude())
     }
 
-    /// Places a frame whose estimate is uncertain: near the pose that follows from the frame before, or from the
-    /// correction of the last one that was placed; otherwise by a search around the estimate.
+    /// Refines a frame from each start until it agrees with the map.
     fn place(
         &self,
         image: &RangeImage,
-        estimate: &InitialEstimate,
-        frame: FrameResult,
+        starts: impl IntoIterator<Item = FrameResult>,
         rng: &mut Generator,
-    ) -> Result<FrameResult, RefinerError> {
-        let previous = self.frames.last().filter(|previous| previous.is_tracked());
-        let predicted = previous
-            .zip(estimate.increment)
-            .map(|(previous, increment)| previous.pose * increment);
-        let corrected = self.correction.map(|correction| correction * estimate.pose);
-        let near = (predicted.into_iter().chain(corrected)).map(|pose| FrameResult {
-            pose,
-            covariance: Matrix3::zeros(),
-            ..frame.clone()
-        });
-        // What the uncertainty says, then twice as far.
-        let far = [1.0, 4.0].map(|factor| FrameResult {
-            covariance: factor * frame.covariance,
-            level_m: None,
-            ..frame.clone()
-        });
-        for mut start in near.chain(far) {
+    ) -> Result<Option<FrameResult>, RefinerError> {
+        for mut start in starts {
             let beams = self.refine(image, &mut start, rng)?;
             if let (Some(beams), Some(pose)) = (beams, &start.map_from_lidar)
                 && self.agrees(&beams, pose)?
             {
-                return Ok(start);
+                return Ok(Some(start));
             }
         }
-        Ok(FrameResult {
-            state: State::Searching,
-            ..frame
-        })
+        Ok(None)
     }
 
     /// Refines a frame; the beams that were compared, or `None` where it cannot be refined.
@@ -325,7 +357,7 @@ impl TrajectoryRefiner {
                     increments: increments.len(),
                 });
             }
-            for rows in self.tracked_stretches() {
+            for rows in self.tracked_stretches(increments) {
                 self.smooth_stretch(rows, increments, &mut poses, &mut covariances);
             }
         }
@@ -342,19 +374,31 @@ impl TrajectoryRefiner {
         })
     }
 
-    /// The stretches between frames in which tracking was lost, of which a frame is measured.
-    fn tracked_stretches(&self) -> Vec<Range<usize>> {
-        let is_lost = |frame: &FrameResult| frame.state == State::Lost;
-        let mut stretches = Vec::new();
-        let mut start = 0;
-        for stretch in self.frames.chunk_by(|a, b| is_lost(a) == is_lost(b)) {
-            let rows = start..start + stretch.len();
-            start = rows.end;
-            if !is_lost(&stretch[0]) && stretch.iter().any(FrameResult::is_tracked) {
-                stretches.push(rows);
-            }
-        }
-        stretches
+    /// The stretches, of which a frame is measured, between frames in which tracking was lost, and between neighbours
+    /// whose poses the odometry contradicts.
+    fn tracked_stretches(&self, increments: &[Pose2]) -> Vec<Range<usize>> {
+        /// What is no error of an odometry: share of the way, distance [m] and turn [rad].
+        const SHARE: f64 = 0.2;
+        const DISTANCE_M: f64 = 1.0;
+        const TURN_RAD: f64 = 0.2;
+        let frames = &self.frames;
+        let contradicts = |row: usize| {
+            let (a, b) = (&frames[row - 1], &frames[row]);
+            let moved = a.pose.inverse() * b.pose;
+            let off = increments[row].inverse() * moved;
+            let limit_m = DISTANCE_M + SHARE * moved.translation.vector.norm();
+            (a.is_tracked() && b.is_tracked())
+                && (off.translation.vector.norm() > limit_m
+                    || off.rotation.angle().abs() > TURN_RAD)
+        };
+        let is_lost = |row: usize| frames[row].state == State::Lost;
+        let rows: Vec<usize> = (0..frames.len()).collect();
+        rows.chunk_by(|&a, &b| is_lost(a) == is_lost(b) && !contradicts(b))
+            .map(|stretch| stretch[0]..stretch[0] + stretch.len())
+            .filter(|rows| {
+                !is_lost(rows.start) && frames[rows.clone()].iter().any(FrameResult::is_tracked)
+            })
+            .collect()
     }
 
     fn smooth_stretch(
@@ -397,6 +441,16 @@ impl TrajectoryRefiner {
 }
 
 impl FrameResult {
+    /// The same frame at a pose that the odometry predicts.
+    fn near(&self, pose: Pose2) -> Self {
+        Self {
+            pose,
+            covariance: Matrix3::zeros(),
+            state: State::Tracking,
+            ..self.clone()
+        }
+    }
+
     fn is_tracked(&self) -> bool {
         self.state == State::Tracking
     }
@@ -446,6 +500,90 @@ mod tests {
         let refined = refiner.finish(Some(&increments)).unwrap();
         assert!(refined.is_smoothed);
         assert_eq!((refined.untracked, refined.unmapped), (1, 0));
+        for (before, after) in before.iter().zip(&refined.poses) {
+            let off_m = (after.translation.vector - before.translation.vector).norm();
+            assert!(off_m < 1e-6, "{off_m}");
+        }
+    }
+
+    #[test]
+    fn frames_that_were_not_tracked_are_placed_from_their_neighbours_or_stay() {
+        let world = TestWorld::street();
+        let truth: Vec<Pose2> = (0..6)
+            .map(|row| world.pose_at(10.0 + f64::from(row), 0.0, 0.0))
+            .collect();
+        let increments: Vec<Pose2> = (0..6_usize)
+            .map(|row| truth[row.saturating_sub(1)].inverse() * truth[row])
+            .collect();
+        let scans: Vec<Scan> = (truth.iter())
+            .map(|pose| Scan {
+                points: world.scan(pose).points,
+                ..Scan::default()
+            })
+            .collect();
+        let wrong = Pose2::translation(8.0, 0.5);
+        let places = |elsewhere: Option<usize>| {
+            let mut refiner =
+                TrajectoryRefiner::new(&world.map(), RefinerConfig::default(), 0).unwrap();
+            // The filter knows its pose in frames 2 and 3 only.
+            for row in 0..6 {
+                let (pose, state) = match row {
+                    2 | 3 => (truth[row], State::Tracking),
+                    _ => (truth[row] * wrong, State::Searching),
+                };
+                let estimate = InitialEstimate {
+                    state,
+                    increment: (row > 0).then_some(increments[row]),
+                    ..InitialEstimate::tracked(pose)
+                };
+                let seen = elsewhere
+                    .filter(|&of| of == row)
+                    .map_or(row, |_| (row + 4) % 6);
+                refiner.add(&scans[seen], &estimate).unwrap();
+            }
+            for row in (0..5).rev() {
+                let back = &increments[row + 1];
+                refiner.place_before(row, &scans[row], None, back).unwrap();
+            }
+            refiner.finish(None).unwrap()
+        };
+        let off_m = |refined: &RefinedTrajectory, row: usize| {
+            (refined.poses[row].translation.vector - truth[row].translation.vector).norm()
+        };
+        let refined = places(None);
+        assert_eq!(refined.untracked, 0);
+        for row in 0..6 {
+            assert!(
+                off_m(&refined, row) < 0.02,
+                "{row}: {}",
+                off_m(&refined, row)
+            );
+        }
+        // A scan that was taken elsewhere does not agree with the map where the odometry leads.
+        let refined = places(Some(5));
+        assert_eq!(refined.untracked, 1);
+        assert!(off_m(&refined, 4) < 0.02 && off_m(&refined, 5) > 5.0);
+    }
+
+    #[test]
+    fn an_odometry_that_contradicts_the_frames_does_not_bend_them() {
+        let map = TestWorld::street().map();
+        let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), 0).unwrap();
+        for row in 0..20 {
+            let jump_m = if row > 10 { 50.0 } else { 0.0 };
+            let pose = Pose2::translation(f64::from(row) + jump_m, 0.0);
+            refiner.frames.push(FrameResult {
+                pose,
+                map_from_lidar: Some(pose3_from_pose2(&pose, 0.0)),
+                covariance: Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-6)),
+                state: State::Tracking,
+                attitude: SensorAttitude::default(),
+                level_m: None,
+            });
+        }
+        let before: Vec<Pose2> = refiner.frames.iter().map(|frame| frame.pose).collect();
+        let increments = vec![Pose2::translation(1.0, 0.0); 20];
+        let refined = refiner.finish(Some(&increments)).unwrap();
         for (before, after) in before.iter().zip(&refined.poses) {
             let off_m = (after.translation.vector - before.translation.vector).norm();
             assert!(off_m < 1e-6, "{off_m}");

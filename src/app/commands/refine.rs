@@ -62,7 +62,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let increments = increments(config, &sequence, &results)?;
     let starts = match is_trajectory {
         true => rough_estimates(config, &results, &estimates, &increments),
-        false => initial_estimates(&results, &estimates),
+        false => initial_estimates(&results, &estimates, &increments),
     };
     let (refined, runtimes_s) = refine(config, context, &map, &sequence, &starts, &increments)?;
     let truth = sequence.frames.iter().map(|frame| frame.map_from_lidar);
@@ -173,19 +173,8 @@ fn rough_estimates(
     let [position_m, heading_deg] = config.uncertainty;
     let variance = position_m * position_m;
     let variances = [variance, variance, heading_deg.to_radians().powi(2)];
-    let is_known = increments.iter().all(Option::is_some);
-    let mut pose = Pose2::identity();
-    let driven: Vec<Pose3> = (increments.iter().skip(1).flatten())
-        .map(|increment| {
-            pose *= increment;
-            pose3_from_pose2(&pose, 0.0)
-        })
-        .collect();
-    let driven = [vec![Pose3::identity()], driven].concat();
-    let motion = |row: usize| {
-        let times_s = results.times_s.as_ref().filter(|_| is_known)?;
-        Motion::along(&driven, times_s, row)
-    };
+    let driven = driven(increments);
+    let motion = |row: usize| Motion::along(driven.as_ref()?, results.times_s.as_ref()?, row);
     let rough = |(row, pose): (usize, &Pose2)| InitialEstimate {
         pose: *pose,
         covariance: Some(Matrix3::from_diagonal(&variances.into())),
@@ -194,6 +183,18 @@ fn rough_estimates(
         increment: increments[row].filter(|_| row > 0),
     };
     estimates.iter().enumerate().map(rough).collect()
+}
+
+/// Where the odometry leads from the first frame; `None` if it has gaps.
+fn driven(increments: &[Option<Pose2>]) -> Option<Vec<Pose3>> {
+    let mut pose = Pose2::identity();
+    let after = |increment: &Option<Pose2>| {
+        pose *= (*increment)?;
+        Some(pose3_from_pose2(&pose, 0.0))
+    };
+    let start = increments.first().map(|_| Some(Pose3::identity()));
+    let rest = increments.iter().skip(1).map(after);
+    start.into_iter().chain(rest).collect()
 }
 
 /// The frames of the sequence that the result contains, in its order.
@@ -216,7 +217,11 @@ fn frames_of(
 }
 
 /// The estimates with the states of the filter; a result without states was tracking throughout.
-fn initial_estimates(results: &LocalizationResults, estimates: &[Pose2]) -> Vec<InitialEstimate> {
+fn initial_estimates(
+    results: &LocalizationResults,
+    estimates: &[Pose2],
+    increments: &[Option<Pose2>],
+) -> Vec<InitialEstimate> {
     let state = |row: usize| match &results.states {
         Some(states) if states[row] == State::Lost as u8 => State::Lost,
         Some(states) if states[row] == State::Searching as u8 => State::Searching,
@@ -225,18 +230,23 @@ fn initial_estimates(results: &LocalizationResults, estimates: &[Pose2]) -> Vec<
     let in_space: Vec<Pose3> = (estimates.iter())
         .map(|pose| pose3_from_pose2(pose, 0.0))
         .collect();
+    let driven = driven(increments);
     let motion = |row: usize| {
         let around = row.saturating_sub(1)..=(row + 1).min(estimates.len() - 1);
         let is_known = around.into_iter().all(|row| state(row) == State::Tracking);
-        let times_s = results.times_s.as_ref().filter(|_| is_known)?;
-        Motion::along(&in_space, times_s, row)
+        let poses = if is_known {
+            Some(&in_space)
+        } else {
+            driven.as_ref()
+        };
+        Motion::along(poses?, results.times_s.as_ref()?, row)
     };
     let initial = |(row, pose): (usize, &Pose2)| InitialEstimate {
         pose: *pose,
         covariance: results.covariances.as_ref().map(|all| all[row]),
         state: state(row),
         motion: motion(row),
-        increment: None,
+        increment: increments[row].filter(|_| row > 0),
     };
     estimates.iter().enumerate().map(initial).collect()
 }
@@ -267,6 +277,19 @@ fn refine(
         task.advance(1);
     }
     drop(task);
+    for row in (0..starts.len()).rev() {
+        if refiner.is_before_tracked(row)
+            && let Some(increment) = &increments[row + 1]
+        {
+            if context.interrupt.requested() {
+                return Err(Interrupted { kept }.into());
+            }
+            let started = Instant::now();
+            let scan = sequence.frames[row].read()?;
+            refiner.place_before(row, &scan, starts[row].motion.as_ref(), increment)?;
+            runtimes_s[row] += started.elapsed().as_secs_f64();
+        }
+    }
     let known: Option<Vec<Pose2>> = increments.iter().copied().collect();
     let is_used = config.odometry != OdometrySource::None;
     ensure!(known.is_some() || !is_used, "the odometry has gaps");
@@ -292,7 +315,7 @@ fn report_unrefined(refined: &RefinedTrajectory, is_trajectory: bool) {
         );
     } else if refined.untracked > 0 {
         tracing::info!(
-            "{} frames in which the filter was not tracking are not refined{smoothed}",
+            "{} frames in which the filter was not tracking cannot be placed from their neighbours{smoothed}",
             refined.untracked
         );
     }
