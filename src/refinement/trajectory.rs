@@ -74,6 +74,36 @@ impl InitialEstimate {
             increment: None,
         }
     }
+
+    /// The poses of a rough trajectory with standard deviations of position [m] and heading [rad], and the increments
+    /// of its odometry `previous_from_current`, of which the first is ignored. Scans are deskewed by the odometry, if all
+    /// of it and the times of the poses [s] are known.
+    pub fn of_rough(
+        poses: &[Pose2],
+        [position_m, heading_rad]: [f64; 2],
+        increments: &[Option<Pose2>],
+        times_s: Option<&[f64]>,
+    ) -> Vec<Self> {
+        let variances = [position_m, position_m, heading_rad].map(|deviation| deviation.powi(2));
+        let is_known = increments.iter().all(Option::is_some);
+        let mut pose = Pose2::identity();
+        let driven: Vec<Pose3> = (increments.iter().skip(1).flatten())
+            .map(|increment| {
+                pose *= increment;
+                pose3_from_pose2(&pose, 0.0)
+            })
+            .collect();
+        let driven = [vec![Pose3::identity()], driven].concat();
+        let times_s = times_s.filter(|_| is_known);
+        let rough = |(row, pose): (usize, &Pose2)| Self {
+            pose: *pose,
+            covariance: Some(Matrix3::from_diagonal(&variances.into())),
+            state: State::Tracking,
+            motion: times_s.and_then(|times_s| Motion::along(&driven, times_s, row)),
+            increment: increments[row].filter(|_| row > 0),
+        };
+        poses.iter().enumerate().map(rough).collect()
+    }
 }
 
 impl From<&Estimate> for InitialEstimate {

@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Result, ensure};
-use nalgebra::Matrix3;
 
 use super::claims::{Claims, NPZ, Outputs};
 use super::interrupt::Interrupted;
@@ -61,7 +60,12 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
     let increments = increments(config, &sequence, &results)?;
     let starts = match is_trajectory {
-        true => rough_estimates(config, &results, &estimates, &increments),
+        true => {
+            let [position_m, heading_deg] = config.uncertainty;
+            let deviations = [position_m, heading_deg.to_radians()];
+            let times_s = results.times_s.as_deref();
+            InitialEstimate::of_rough(&estimates, deviations, &increments, times_s)
+        }
         false => initial_estimates(&results, &estimates),
     };
     let (refined, runtimes_s) = refine(config, context, &map, &sequence, &starts, &increments)?;
@@ -168,39 +172,6 @@ fn follow(
         times_s: Some(frames.iter().map(|frame| frame.time_s).collect()),
         ..LocalizationResults::default()
     })
-}
-
-/// The poses of a rough trajectory with their uncertainty; scans are deskewed by the odometry.
-fn rough_estimates(
-    config: &RefinementConfig,
-    results: &LocalizationResults,
-    estimates: &[Pose2],
-    increments: &[Option<Pose2>],
-) -> Vec<InitialEstimate> {
-    let [position_m, heading_deg] = config.uncertainty;
-    let variance = position_m * position_m;
-    let variances = [variance, variance, heading_deg.to_radians().powi(2)];
-    let is_known = increments.iter().all(Option::is_some);
-    let mut pose = Pose2::identity();
-    let driven: Vec<Pose3> = (increments.iter().skip(1).flatten())
-        .map(|increment| {
-            pose *= increment;
-            pose3_from_pose2(&pose, 0.0)
-        })
-        .collect();
-    let driven = [vec![Pose3::identity()], driven].concat();
-    let motion = |row: usize| {
-        let times_s = results.times_s.as_ref().filter(|_| is_known)?;
-        Motion::along(&driven, times_s, row)
-    };
-    let rough = |(row, pose): (usize, &Pose2)| InitialEstimate {
-        pose: *pose,
-        covariance: Some(Matrix3::from_diagonal(&variances.into())),
-        state: State::Tracking,
-        motion: motion(row),
-        increment: increments[row].filter(|_| row > 0),
-    };
-    estimates.iter().enumerate().map(rough).collect()
 }
 
 /// The frames of the sequence that the result contains, in its order.
