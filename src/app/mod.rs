@@ -7,3 +7,27 @@ pub mod config;
 pub mod plotting;
 pub mod reporting;
 pub mod results;
+
+use std::ffi::OsString;
+
+use clap::Parser as _;
+
+use cli::Cli;
+use commands::Context;
+
+/// The program: parses a command line, whose first argument is the name of the program, starts logging, runs the
+/// command, and reports its error; returns the exit code. Wrong usage and requests for help end the process.
+pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
+    let cli = Cli::parse_from(arguments);
+    let run = || {
+        let context = Context::new(cli.level(), cli.command.machine())?;
+        commands::run(&cli.command, &context)
+    };
+    match run() {
+        Ok(()) => 0,
+        Err(error) => {
+            commands::report(&error);
+            commands::exit_code(&error)
+        }
+    }
+}

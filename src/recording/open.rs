@@ -181,6 +181,13 @@ impl Recording {
         self.frames.iter().map(read)
     }
 
+    /// All frames from the first selected one to the last, also those between, ascending.
+    pub fn dense_frames(&self) -> Vec<Frame> {
+        let mut frames: Vec<Frame> = (self.frames.iter().chain(&self.skipped)).cloned().collect();
+        frames.sort_by_key(|frame| frame.number);
+        frames
+    }
+
     /// The same recording, whose scans are compensated already: times of points are ignored.
     #[must_use]
     pub fn compensated(mut self) -> Self {

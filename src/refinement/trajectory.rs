@@ -76,6 +76,41 @@ impl InitialEstimate {
             increment: None,
         }
     }
+
+    /// The poses of a rough trajectory with standard deviations of position [m] and heading [rad], and the increments
+    /// of its odometry `previous_from_current`, of which the first is ignored. Scans are deskewed by the odometry, if all
+    /// of it and the times of the poses [s] are known.
+    pub fn of_rough(
+        poses: &[Pose2],
+        [position_m, heading_rad]: [f64; 2],
+        increments: &[Option<Pose2>],
+        times_s: Option<&[f64]>,
+    ) -> Vec<Self> {
+        let variances = [position_m, position_m, heading_rad].map(|deviation| deviation.powi(2));
+        let driven = Self::driven(increments);
+        let motion = |row: usize| Motion::along(driven.as_ref()?, times_s?, row);
+        let rough = |(row, pose): (usize, &Pose2)| Self {
+            pose: *pose,
+            covariance: Some(Matrix3::from_diagonal(&variances.into())),
+            state: State::Tracking,
+            motion: motion(row),
+            increment: increments[row].filter(|_| row > 0),
+        };
+        poses.iter().enumerate().map(rough).collect()
+    }
+
+    /// Where increments `previous_from_current`, of which the first is ignored, lead from the first pose; `None` if one is
+    /// missing.
+    pub fn driven(increments: &[Option<Pose2>]) -> Option<Vec<Pose3>> {
+        let mut pose = Pose2::identity();
+        let after = |increment: &Option<Pose2>| {
+            pose *= (*increment)?;
+            Some(pose3_from_pose2(&pose, 0.0))
+        };
+        let start = increments.first().map(|_| Some(Pose3::identity()));
+        let rest = increments.iter().skip(1).map(after);
+        start.into_iter().chain(rest).collect()
+    }
 }
 
 impl From<&Estimate> for InitialEstimate {

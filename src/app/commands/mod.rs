@@ -23,12 +23,11 @@ pub mod output;
 pub mod progress;
 pub mod run_output;
 pub mod run_page;
-pub(super) mod stages;
+pub mod stages;
 mod trajectory;
 pub mod version;
 
 use std::io::Write as _;
-use std::process::ExitCode;
 
 use crate::app::cli::{Command, ConfigurationArgs, ConfiguredCommand, RunArgs};
 use crate::app::config::{
@@ -106,13 +105,14 @@ fn configuration(args: &ConfigurationArgs) -> &'static str {
 
 /// Prints an error with its causes on standard error.
 pub fn report(error: &anyhow::Error) {
+    let text = format!("error: {}\n", format_error_chain(error));
     // There is nowhere to report that standard error is closed.
-    let _ = std::io::stderr().write_all(format_error_chain(error).as_bytes());
+    let _ = std::io::stderr().write_all(text.as_bytes());
 }
 
 /// Exit code of a failed run: 130 if it was interrupted, as in shells, else 1; 2 is wrong usage.
-pub fn exit_code(error: &anyhow::Error) -> ExitCode {
-    ExitCode::from(if error.is::<Interrupted>() { 130 } else { 1 })
+pub fn exit_code(error: &anyhow::Error) -> u8 {
+    if error.is::<Interrupted>() { 130 } else { 1 }
 }
 
 /// Loads the configuration of a command, and notes its file. Where the argument of the command is no
@@ -147,7 +147,7 @@ fn with_flags<T: CommandConfig>(
 }
 
 /// Formats an error and its causes, without repetitions.
-fn format_error_chain(error: &anyhow::Error) -> String {
+pub fn format_error_chain(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
         let words = cause.to_string();
@@ -155,14 +155,14 @@ fn format_error_chain(error: &anyhow::Error) -> String {
             continue;
         }
         text += match (text.is_empty(), cause.is::<std::io::Error>()) {
-            (true, _) => "error: ",
+            (true, _) => "",
             // What the operating system reports, such as a full disk.
             (false, true) => ": ",
             (false, false) => "\n  because: ",
         };
         text += &words;
     }
-    text + "\n"
+    text
 }
 
 #[cfg(test)]
@@ -206,7 +206,7 @@ mod tests {
         .context("while building the map");
         assert_eq!(
             format_error_chain(&error),
-            "error: while building the map\n  because: cannot read poses.txt: no such file\n"
+            "while building the map\n  because: cannot read poses.txt: no such file"
         );
     }
 
@@ -217,8 +217,8 @@ mod tests {
         });
         assert_eq!(
             exit_code(&interrupted.context("while building the map")),
-            ExitCode::from(130)
+            130
         );
-        assert_eq!(exit_code(&anyhow::anyhow!("else")), ExitCode::from(1));
+        assert_eq!(exit_code(&anyhow::anyhow!("else")), 1);
     }
 }

@@ -53,7 +53,7 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<String> 
     let mut claims = prepare(config, context)?;
     let mut resolved = config.clone();
     let (recording, sensor) = open(&mut resolved)?;
-    let frames = trajectory::dense_frames(&recording);
+    let frames = recording.dense_frames();
     let is_given = recording.track.is_some();
     let found = trajectory::estimate(&frames, is_given, &config.trajectory, context)?;
     let numbers: Vec<usize> = recording.frames.iter().map(|it| it.number).collect();

@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Result, ensure};
-use nalgebra::Matrix3;
 
 use super::claims::{Claims, NPZ, Outputs};
 use super::interrupt::Interrupted;
@@ -61,7 +60,12 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
     let increments = increments(config, &sequence, &results)?;
     let starts = match is_trajectory {
-        true => rough_estimates(config, &results, &estimates, &increments),
+        true => {
+            let [position_m, heading_deg] = config.uncertainty;
+            let deviations = [position_m, heading_deg.to_radians()];
+            let times_s = results.times_s.as_deref();
+            InitialEstimate::of_rough(&estimates, deviations, &increments, times_s)
+        }
         false => initial_estimates(&results, &estimates, &increments),
     };
     let (refined, runtimes_s) = refine(config, context, &map, &sequence, &starts, &increments)?;
@@ -163,40 +167,6 @@ fn follow(
     })
 }
 
-/// The poses of a rough trajectory with their uncertainty; scans are deskewed by the odometry.
-fn rough_estimates(
-    config: &RefinementConfig,
-    results: &LocalizationResults,
-    estimates: &[Pose2],
-    increments: &[Option<Pose2>],
-) -> Vec<InitialEstimate> {
-    let [position_m, heading_deg] = config.uncertainty;
-    let variance = position_m * position_m;
-    let variances = [variance, variance, heading_deg.to_radians().powi(2)];
-    let driven = driven(increments);
-    let motion = |row: usize| Motion::along(driven.as_ref()?, results.times_s.as_ref()?, row);
-    let rough = |(row, pose): (usize, &Pose2)| InitialEstimate {
-        pose: *pose,
-        covariance: Some(Matrix3::from_diagonal(&variances.into())),
-        state: State::Tracking,
-        motion: motion(row),
-        increment: increments[row].filter(|_| row > 0),
-    };
-    estimates.iter().enumerate().map(rough).collect()
-}
-
-/// Where the odometry leads from the first frame; `None` if it has gaps.
-fn driven(increments: &[Option<Pose2>]) -> Option<Vec<Pose3>> {
-    let mut pose = Pose2::identity();
-    let after = |increment: &Option<Pose2>| {
-        pose *= (*increment)?;
-        Some(pose3_from_pose2(&pose, 0.0))
-    };
-    let start = increments.first().map(|_| Some(Pose3::identity()));
-    let rest = increments.iter().skip(1).map(after);
-    start.into_iter().chain(rest).collect()
-}
-
 /// The frames of the sequence that the result contains, in its order.
 fn frames_of(
     mut sequence: Recording,
@@ -230,7 +200,7 @@ fn initial_estimates(
     let in_space: Vec<Pose3> = (estimates.iter())
         .map(|pose| pose3_from_pose2(pose, 0.0))
         .collect();
-    let driven = driven(increments);
+    let driven = InitialEstimate::driven(increments);
     let motion = |row: usize| {
         let around = row.saturating_sub(1)..=(row + 1).min(estimates.len() - 1);
         let is_known = around.into_iter().all(|row| state(row) == State::Tracking);

@@ -23,11 +23,17 @@ const SENSOR_SCANS: usize = 10;
 /// Keys of a recording.
 #[derive(Clone, Copy)]
 pub struct RecordingInputs<'a> {
+    /// The folder, or the bag.
     pub scan_folder: &'a Path,
+    /// Topic of the scans of a bag.
     pub topic: Option<&'a str>,
+    /// Poses of the recording.
     pub pose_file: Option<&'a Path>,
+    /// Calibration to which the poses belong.
     pub calib_file: Option<&'a Path>,
+    /// Pose of the lidar on the body whose poses are given: x, y, z [m], roll, pitch, yaw [deg].
     pub body_from_lidar: Option<[f64; 6]>,
+    /// Angle to add to the elevations of all points [deg].
     pub elevation_bias_deg: f64,
 }
 
@@ -116,6 +122,7 @@ pub fn is_topic(path: &Path) -> bool {
 
 /// Keys of a map.
 pub struct MapInputs<'a> {
+    /// The map.
     pub map_file: &'a Path,
     /// Poses that the map was built with; for maps of range-mcl.
     pub map_pose_file: Option<&'a Path>,
@@ -194,8 +201,11 @@ impl<'a> MapInputs<'a> {
 
 /// Keys of the sensor that are inferred where they are not given.
 pub struct SensorKeys<'a> {
+    /// Projection and limits of range.
     pub range_image: &'a mut RangeImageConfig,
+    /// Box of the own car.
     pub own_car_m: &'a mut Option<[f32; 4]>,
+    /// Times of the points.
     pub motion_compensation: &'a mut Option<MotionCompensation>,
 }
 
@@ -226,13 +236,7 @@ impl SensorKeys<'_> {
         let scans = sample(&recording)?;
         let sensor = sensor::infer(&scans);
         tracing::info!("sensor: {}", description(&sensor));
-        self.range_image.resolve(&sensor.lidar, sensor.has_rows);
-        let default_m = ScanConfig::default().own_car_m;
-        let own_car_m = match sensor.is_moving {
-            true => sensor.own_car_m,
-            false => default_m,
-        };
-        let own_car_m = *self.own_car_m.get_or_insert(own_car_m);
+        let own_car_m = apply(&sensor, self.range_image, self.own_car_m);
         warn_of_dropped_points(&scans, &self.range_image.model(), own_car_m);
         if is_auto && scans.iter().all(|scan| scan.times_s.is_empty()) {
             let is_spinning = sensor.has_rows && sensor.horizontal_fov_deg > SPINNING_DEG;
@@ -243,6 +247,19 @@ impl SensorKeys<'_> {
         }
         Ok((rotating(recording, *self.motion_compensation), Some(sensor)))
     }
+}
+
+/// Sets the keys of a sensor that are not given; returns the box of the own car.
+pub fn apply(
+    sensor: &SensorDescription,
+    range_image: &mut RangeImageConfig,
+    own_car_m: &mut Option<[f32; 4]>,
+) -> [f32; 4] {
+    range_image.resolve(&sensor.lidar, sensor.has_rows);
+    *own_car_m.get_or_insert(match sensor.is_moving {
+        true => sensor.own_car_m,
+        false => ScanConfig::default().own_car_m,
+    })
 }
 
 /// The recording, whose points have times from the rotation of the sensor where the data have none.

@@ -66,16 +66,6 @@ pub fn stamped(frames: &[Frame], poses: &[Pose3]) -> Vec<StampedPose> {
         .collect()
 }
 
-/// All frames of a recording from the first selected to the last, also those between.
-pub fn dense_frames(recording: &Recording) -> Vec<Frame> {
-    let mut frames: Vec<Frame> = (recording.frames.iter())
-        .chain(&recording.skipped)
-        .cloned()
-        .collect();
-    frames.sort_by_key(|frame| frame.number);
-    frames
-}
-
 /// What a trajectory shows about itself.
 #[derive(Clone, Debug, Serialize)]
 pub struct TrajectorySummary {

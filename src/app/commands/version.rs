@@ -1,19 +1,32 @@
 //! Identification of this program, by which results of another build are recognized.
 
-use std::sync::LazyLock;
+use std::io;
+use std::path::PathBuf;
+use std::sync::{LazyLock, OnceLock};
 
 use anyhow::{Context as _, Result};
 
 /// Version of the package.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// BLAKE3 hash of the running executable, 16 hexadecimal digits.
+/// The file with this code, if it is not the executable of the process.
+static LIBRARY: OnceLock<PathBuf> = OnceLock::new();
+
+/// Sets the file with this code, where it is a library of another program, such as an interpreter; before the first
+/// command.
+pub fn set_library(path: PathBuf) {
+    // The first one stays: a process has one.
+    let _ = LIBRARY.set(path);
+}
+
+/// BLAKE3 hash of the running executable or of the library with this code, 16 hexadecimal digits.
 ///
 /// Results are reused only by the executable that made them: any change of the source, of a
 /// dependency or of the compiler changes it.
 pub fn executable_hash() -> Result<&'static str> {
-    static HASH: LazyLock<std::io::Result<String>> = LazyLock::new(|| {
-        let executable = std::fs::read(std::env::current_exe()?)?;
+    static HASH: LazyLock<io::Result<String>> = LazyLock::new(|| {
+        let path = LIBRARY.get().cloned();
+        let executable = std::fs::read(path.map_or_else(std::env::current_exe, Ok)?)?;
         Ok(blake3::hash(&executable).to_hex()[..16].to_owned())
     });
     HASH.as_deref()

@@ -58,7 +58,7 @@ pub fn find(
     let is_given = recording.track.is_some();
     let frames = match is_given {
         true => recording.frames.clone(),
-        false => trajectory::dense_frames(&recording),
+        false => recording.dense_frames(),
     };
     let localized_by = match older {
         Some((older, _)) => older.hash.clone() + &config::to_yaml(&onto::localization(config))?,

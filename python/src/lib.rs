@@ -1,0 +1,51 @@
+//! Python package of fpmcl: the library on NumPy arrays, and the program.
+//!
+//! Each function converts its arguments, releases the interpreter lock, calls the library, and converts the result.
+//! Comments of what is exported are the docstrings; `package/fpmcl/__init__.pyi` has the types.
+
+mod arrays;
+mod errors;
+mod localizer;
+mod logging;
+mod map;
+mod recording;
+mod settings;
+mod trajectory;
+
+use std::ffi::OsString;
+use std::path::PathBuf;
+
+use fpmcl::app;
+use fpmcl::app::commands::version;
+use pyo3::prelude::*;
+
+#[pymodule]
+mod _fpmcl {
+    #[pymodule_export]
+    use super::errors::Error;
+    #[pymodule_export]
+    use super::localizer::{Estimate, Localizer};
+    #[pymodule_export]
+    use super::main;
+    #[pymodule_export]
+    use super::map::{Map, cast_rays, classify_ground};
+    #[pymodule_export]
+    use super::recording::{Recording, Scan, Sensor, infer_sensor, read_recording};
+    #[pymodule_export]
+    use super::trajectory::{RefinedTrajectory, Trajectory, odometry, refine};
+
+    #[pymodule_init]
+    fn init(module: &pyo3::Bound<'_, pyo3::types::PyModule>) -> pyo3::PyResult<()> {
+        use pyo3::types::PyModuleMethods as _;
+        module.add("__version__", fpmcl::app::commands::version::VERSION)
+    }
+}
+
+/// Runs the program with the arguments of the process; returns its exit code.
+#[pyfunction]
+fn main(py: Python<'_>) -> PyResult<u8> {
+    let arguments: Vec<OsString> = py.import("sys")?.getattr("argv")?.extract()?;
+    let library: PathBuf = py.import("fpmcl._fpmcl")?.getattr("__file__")?.extract()?;
+    version::set_library(library);
+    Ok(py.detach(|| app::main(arguments)))
+}

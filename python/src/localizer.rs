@@ -1,0 +1,259 @@
+//! Localization, scan by scan.
+
+use fpmcl::app::config::{LocalizationConfig, OdometrySource};
+use fpmcl::geometry::Pose3;
+use fpmcl::localization::{self, LocalizerError, Odometry, Start};
+use fpmcl::odometry::{Odometer, OdometryConfig};
+use fpmcl::{lidar, sensor};
+use numpy::ndarray::Array2;
+use numpy::{IntoPyArray as _, PyArray1, PyArray2, PyUntypedArrayMethods as _};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::arrays::{self, Numbers, Numbers1, Numbers2};
+use crate::errors::{raised, released};
+use crate::map::Map;
+use crate::recording::{Scan, Sensor};
+use crate::settings;
+
+/// Estimates the pose of a car in a map from its scans. The same seed gives the same estimates.
+///
+/// ``start``: ``"anywhere"`` (the default), ``"road"`` (anywhere along the mapping drive), or a pose nearby: (3,), x, y
+/// [m] and heading [rad], or (4, 4). ``sensor``: by default inferred from the first scan, which does not show the own car;
+/// better that of a Recording. Settings: ``fpmcl config localize --full``, such as ``seed``, ``numParticles``, and
+/// ``odometry="none"`` for constant velocity where no motion is given.
+#[pyclass(module = "fpmcl")]
+pub struct Localizer {
+    map: fpmcl::map::Map,
+    config: LocalizationConfig,
+    start: Start,
+    /// `None` until the sensor is known.
+    localizer: Option<localization::Localizer>,
+    /// Motion from the scans; `None` if it is given or not to be used.
+    odometer: Option<Odometer>,
+}
+
+#[pymethods]
+impl Localizer {
+    #[new]
+    #[pyo3(signature = (map, start=None, *, sensor=None, **settings))]
+    fn new(
+        map: &Map,
+        start: Option<&Bound<'_, PyAny>>,
+        sensor: Option<Sensor>,
+        settings: Option<&Bound<'_, PyDict>>,
+    ) -> PyResult<Self> {
+        let config = settings::of_stage(LocalizationConfig::default(), settings)?;
+        let odometer = match config.odometry {
+            OdometrySource::None => None,
+            _ => Some(Odometer::new(OdometryConfig::default()).map_err(raised)?),
+        };
+        let mut new = Self {
+            map: map.map.clone(),
+            start: start_of(start, &config)?,
+            config,
+            localizer: None,
+            odometer,
+        };
+        if let Some(sensor) = sensor {
+            new.begin(&sensor).map_err(raised)?;
+        }
+        Ok(new)
+    }
+
+    /// Estimates the pose of the next scan.
+    ///
+    /// ``points``: a Scan, or (N, 3) in the frame of the lidar [m]. ``motion``: since the previous scan,
+    /// ``p_previous = motion @ p``, (4, 4), or (3,), x, y [m] and heading [rad]; by default from the scans themselves, until
+    /// one is given. ``times``: (N,), when each point was measured, after ``time`` [s]; without, points are taken as deskewed.
+    /// ``time``: the moment of the pose [s].
+    ///
+    /// Raises Error if the start is not in the map, or if the motion is impossible.
+    #[pyo3(signature = (points, motion=None, times=None, *, time=None))]
+    fn step(
+        &mut self,
+        py: Python<'_>,
+        points: &Bound<'_, PyAny>,
+        motion: Option<Numbers<'_, f64>>,
+        times: Option<Numbers1<'_, f32>>,
+        time: Option<f64>,
+    ) -> PyResult<Estimate> {
+        let motion = motion.map(|motion| Given::of(&motion)).transpose()?;
+        if let Ok(scan) = points.cast::<Scan>() {
+            if times.is_some() || time.is_some() {
+                return Err(PyValueError::new_err(
+                    "times are given twice: a Scan contains them; give points as an array instead",
+                ));
+            }
+            let scan = &scan.get().scan;
+            let (estimate, motion) = released(py, || self.advance(scan, motion))?;
+            return Ok(Estimate::new(py, estimate, motion));
+        }
+        let points: Numbers2<'_, f32> = points.extract()?;
+        let scan = Scan::new(points, times, time, None, None)?.scan;
+        let (estimate, motion) = released(py, || self.advance(&scan, motion))?;
+        Ok(Estimate::new(py, estimate, motion))
+    }
+}
+
+impl Localizer {
+    fn begin(&mut self, sensor: &Sensor) -> Result<(), LocalizerError> {
+        let config = &mut self.config;
+        sensor.apply(&mut config.range_image, &mut config.own_car_m);
+        let (start, seed) = (self.start.clone(), config.seed);
+        let localizer = localization::Localizer::new(&self.map, config.localizer(), start, seed)?;
+        self.localizer = Some(localizer);
+        Ok(())
+    }
+
+    /// Localizes the next scan; returns also the motion that was used.
+    fn advance(
+        &mut self,
+        scan: &lidar::Scan,
+        given: Option<Given>,
+    ) -> anyhow::Result<(localization::Estimate, Option<Pose3>)> {
+        if self.localizer.is_none() {
+            let sensor = Sensor(sensor::infer(std::slice::from_ref(scan)));
+            self.begin(&sensor)?;
+        }
+        let odometry = match (given, &mut self.odometer) {
+            (Some(given), odometer) => {
+                // It has not seen all scans from here on.
+                *odometer = None;
+                given.0
+            }
+            (None, Some(odometer)) => Odometry::Motion(odometer.step(scan)?.previous_from_current),
+            (None, None) => Odometry::Unknown,
+        };
+        let motion = match odometry {
+            Odometry::Motion(motion) => Some(motion),
+            Odometry::Increment(increment) => Some(arrays::in_space(&increment)),
+            _ => None,
+        };
+        let localizer = self.localizer.as_mut();
+        let localizer = localizer.ok_or_else(|| anyhow::anyhow!("the sensor is not known"))?;
+        Ok((localizer.step(scan, odometry)?, motion))
+    }
+}
+
+/// A motion that is given.
+struct Given(Odometry);
+
+impl Given {
+    fn of(motion: &Numbers<'_, f64>) -> PyResult<Self> {
+        Ok(Self(match motion.ndim() {
+            2 => Odometry::Motion(arrays::pose("motion", motion)?),
+            _ => Odometry::Increment(arrays::planar("motion", motion)?),
+        }))
+    }
+}
+
+/// Where the car starts: anywhere, `"road"`, or near a pose.
+fn start_of(start: Option<&Bound<'_, PyAny>>, config: &LocalizationConfig) -> PyResult<Start> {
+    let Some(start) = start else {
+        return Ok(Start::Anywhere);
+    };
+    if let Ok(word) = start.extract::<String>() {
+        return match word.as_str() {
+            "anywhere" => Ok(Start::Anywhere),
+            "road" => Ok(Start::Road),
+            _ => Err(PyValueError::new_err(format!(
+                "start is {word:?}; it must be \"anywhere\", \"road\" or a pose"
+            ))),
+        };
+    }
+    let pose: Numbers<'_, f64> = start.extract()?;
+    let spread = config.start.clone();
+    Ok(match pose.ndim() {
+        2 => Start::near(&arrays::pose("start", &pose)?, spread),
+        _ => Start::Pose {
+            map_from_lidar: arrays::planar("start", &pose)?,
+            height_m: None,
+            spread,
+        },
+    })
+}
+
+/// Pose of a scan with its uncertainty.
+#[pyclass(frozen, module = "fpmcl")]
+pub struct Estimate {
+    pub estimate: localization::Estimate,
+    /// Pose in space, aligned to the ground of the map, (4, 4).
+    #[pyo3(get)]
+    pose: Py<PyArray2<f64>>,
+    /// Pose seen from above: x, y [m], heading [rad], (3,).
+    #[pyo3(get)]
+    planar: Py<PyArray1<f64>>,
+    /// Covariance of x, y, heading in the axes of the map, (3, 3) [m², m rad, rad²].
+    #[pyo3(get)]
+    covariance: Py<PyArray2<f64>>,
+    /// Standard deviations of x, y [m], heading [rad], (3,).
+    #[pyo3(get)]
+    standard_deviations: Py<PyArray1<f64>>,
+    /// ``"searching"``, ``"tracking"``, or ``"lost"``: then the pose must not be used.
+    #[pyo3(get)]
+    state: &'static str,
+    /// Share of beams above the road that agree with the map; None where unknown.
+    #[pyo3(get)]
+    agreement: Option<f64>,
+    /// Mean cost of the particles [m]; None where the scan was not used.
+    #[pyo3(get)]
+    mean_cost: Option<f64>,
+    /// Effective number of particles after the update, before resampling.
+    #[pyo3(get)]
+    effective_sample_size: f64,
+    /// Whether the scan was used; it is not while the car moved too little.
+    #[pyo3(get)]
+    updated: bool,
+    /// Whether there is mapped ground under the estimate.
+    #[pyo3(get)]
+    on_mapped_ground: bool,
+    /// The motion since the previous scan that was used, (4, 4); None if it is not known.
+    #[pyo3(get)]
+    motion: Option<Py<PyArray2<f64>>>,
+}
+
+impl Estimate {
+    fn new(py: Python<'_>, estimate: localization::Estimate, motion: Option<Pose3>) -> Self {
+        let deviations = estimate.standard_deviations();
+        Self {
+            pose: arrays::of_pose(py, &estimate.map_from_lidar).unbind(),
+            planar: arrays::of_planar(py, &estimate.pose).unbind(),
+            covariance: arrays::of_matrix(py, &estimate.covariance).unbind(),
+            standard_deviations: PyArray1::from_slice(py, &deviations).unbind(),
+            state: estimate.state.word(),
+            agreement: estimate.agreement,
+            mean_cost: estimate.mean_cost_m,
+            effective_sample_size: estimate.effective_sample_size,
+            updated: estimate.updated,
+            on_mapped_ground: estimate.on_mapped_ground,
+            motion: motion.map(|motion| arrays::of_pose(py, &motion).unbind()),
+            estimate,
+        }
+    }
+}
+
+#[pymethods]
+impl Estimate {
+    /// Particles: x, y [m], heading [rad], weight, (M, 4).
+    #[getter]
+    fn particles<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+        let particles = self.estimate.particles.particles().iter();
+        let rows = particles.map(|particle| {
+            let pose = particle.map_from_lidar;
+            let t = pose.translation;
+            [t.x, t.y, pose.rotation.angle(), particle.weight]
+        });
+        Array2::from(rows.collect::<Vec<_>>()).into_pyarray(py)
+    }
+
+    fn __repr__(&self) -> String {
+        let (t, state) = (self.estimate.pose.translation, self.state);
+        let [x_m, y_m, _heading_rad] = self.estimate.standard_deviations();
+        format!(
+            "<fpmcl.Estimate: {state}, x {:.3} ± {x_m:.3} m, y {:.3} ± {y_m:.3} m>",
+            t.x, t.y
+        )
+    }
+}

@@ -1,0 +1,277 @@
+//! Maps, rays and ground.
+
+use std::ops::ControlFlow;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use anyhow::anyhow;
+use fpmcl::app::config::{BuildMapConfig, LocalizationConfig};
+use fpmcl::geometry::Pose3;
+use fpmcl::lidar::Motion;
+use fpmcl::map::{self, BuildError, MapBuilder, MapOptions, MappingPath};
+use fpmcl::rendering::Backend;
+use numpy::ndarray::Array2;
+use numpy::{
+    IntoPyArray as _, PyArray1, PyArray2, PyArray3, PyArrayDyn, PyUntypedArrayMethods as _,
+};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::arrays::{self, Numbers, Numbers2};
+use crate::errors::{of_scan, raised, released};
+use crate::recording::{Recording, Scans, Sensor, without_poses};
+use crate::settings;
+
+/// A triangle mesh with its ground and the path of its mapping drive; immutable.
+#[pyclass(frozen, module = "fpmcl")]
+pub struct Map {
+    pub map: map::Map,
+}
+
+#[pymethods]
+impl Map {
+    /// Reads a map, or a mesh from elsewhere (PLY, OBJ, STL).
+    ///
+    /// ``backend``: what renders it, ``"auto"``, ``"cpu"`` or ``"gpu"``.
+    #[staticmethod]
+    #[pyo3(signature = (path, *, backend="auto"))]
+    fn load(py: Python<'_>, path: PathBuf, backend: &str) -> PyResult<Self> {
+        let options = options(backend)?;
+        let map = released(py, || map::Map::load(&path, &options))?;
+        Ok(Self { map })
+    }
+
+    /// Writes the map as a PLY file, which is complete by itself; an existing file is replaced.
+    fn save(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
+        released(py, || self.map.save(&path))
+    }
+
+    /// Builds a map.
+    ///
+    /// ``scans``: a Recording, or an iterable of Scans and of arrays (N, 3) [m], which are taken as deskewed.
+    /// ``poses``: (N, 4, 4), one per scan, into the frame of the map; by default those of the recording. Scans with times
+    /// are deskewed by them. ``sensor``: by default inferred from the scans. Settings: ``fpmcl config build-map --full``.
+    ///
+    /// Raises Error if there are no poses, or if poses and scans do not fit each other.
+    #[staticmethod]
+    #[pyo3(signature = (scans, poses=None, *, sensor=None, backend="auto", **settings))]
+    fn build(
+        py: Python<'_>,
+        scans: &Bound<'_, PyAny>,
+        poses: Option<Numbers<'_, f64>>,
+        sensor: Option<Sensor>,
+        backend: &str,
+        settings: Option<&Bound<'_, PyDict>>,
+    ) -> PyResult<Self> {
+        let mut config = settings::of_stage(BuildMapConfig::default(), settings)?;
+        let drive = Drive::of(scans, poses)?;
+        let sensor = drive.scans.sensor(py, sensor)?;
+        sensor.apply(&mut config.range_image, &mut config.own_car_m);
+        let raised_signal = Arc::new(Mutex::new(None));
+        let signal = raised_signal.clone();
+        let builder = MapBuilder {
+            options: options(backend)?,
+            on_event: Box::new(
+                move |_event| match Python::attach(|py| py.check_signals()) {
+                    Ok(()) => ControlFlow::Continue(()),
+                    Err(interrupt) => {
+                        *signal.lock().unwrap_or_else(PoisonError::into_inner) = Some(interrupt);
+                        ControlFlow::Break(())
+                    }
+                },
+            ),
+            ..MapBuilder::new(config.map())
+        };
+        let built = released(py, || drive.build(&builder));
+        let signal = raised_signal
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .take();
+        match signal {
+            Some(interrupt) => Err(interrupt),
+            None => built.map(|map| Self { map }),
+        }
+    }
+
+    /// Vertices, (V, 3) float32 [m]; read-only, not a copy.
+    #[getter]
+    fn vertices<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
+        arrays::view_of_vectors(&slf.get().map.mesh.vertices, slf.as_any())
+    }
+
+    /// Indices of the vertices of each triangle, (T, 3) uint32; read-only, not a copy.
+    #[getter]
+    fn triangles<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArrayDyn<u32>>> {
+        let triangles = &slf.get().map.mesh.triangles;
+        arrays::view(
+            triangles.as_flattened(),
+            &[triangles.len(), 3],
+            slf.as_any(),
+        )
+    }
+
+    /// Colours of the vertices, red, green, blue, (V, 3) uint8; red is ground. Read-only, not a copy.
+    #[getter]
+    fn colors<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArrayDyn<u8>>> {
+        let colors = &slf.get().map.mesh.colors;
+        arrays::view(colors.as_flattened(), &[colors.len(), 3], slf.as_any())
+    }
+
+    /// Poses of the mapping drive, (K, 4, 4).
+    #[getter]
+    fn path<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray3<f64>> {
+        arrays::of_poses(py, &self.map.path.map_from_lidar)
+    }
+
+    /// Pose of the map in the world of the poses that it was built with, (4, 4).
+    #[getter]
+    fn world_from_map<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray2<f64>> {
+        arrays::of_pose(py, &self.map.path.world_from_map)
+    }
+
+    /// What renders the map.
+    #[getter]
+    fn renderer(&self) -> String {
+        self.map.renderer.name()
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<fpmcl.Map: {} triangles>", self.map.mesh.triangles.len())
+    }
+}
+
+fn options(backend: &str) -> PyResult<MapOptions> {
+    let backend = match backend {
+        "auto" => Backend::Auto,
+        "cpu" => Backend::Cpu,
+        "gpu" => Backend::Gpu,
+        _ => {
+            return Err(PyValueError::new_err(format!(
+                "backend is {backend:?}; it must be \"auto\", \"cpu\" or \"gpu\""
+            )));
+        }
+    };
+    Ok(MapOptions {
+        backend,
+        ..MapOptions::default()
+    })
+}
+
+/// Scans with their poses.
+struct Drive {
+    scans: Scans,
+    map_from_lidar: Vec<Pose3>,
+    /// Motion of the sensor around each scan, by which it is deskewed; `None` if it is unknown.
+    motions: Vec<Option<Motion>>,
+    world_from_map: Pose3,
+}
+
+impl Drive {
+    /// The poses are the given ones, else those of the recording.
+    fn of(scans: &Bound<'_, PyAny>, poses: Option<Numbers<'_, f64>>) -> PyResult<Self> {
+        let recording = scans.cast::<Recording>().ok().map(Bound::get);
+        let scans = Scans::of(scans)?;
+        let Some(poses) = poses else {
+            let recording = recording.ok_or_else(without_poses)?;
+            let map_from_lidar = recording.given().ok_or_else(without_poses)?;
+            let compensated = recording.recording.clone().compensated_by_poses();
+            return Ok(Self {
+                motions: (compensated.frames.iter())
+                    .map(|frame| frame.motion)
+                    .collect(),
+                world_from_map: compensated.world().0,
+                scans,
+                map_from_lidar,
+            });
+        };
+        let map_from_lidar = arrays::poses("poses", &poses)?;
+        if map_from_lidar.len() != scans.len() {
+            return Err(raised(anyhow!(
+                "there are {} poses for {} scans; give one per scan",
+                map_from_lidar.len(),
+                scans.len()
+            )));
+        }
+        let times_s = scans.times_s();
+        let motion = |row| Motion::along(&map_from_lidar, times_s.as_ref()?, row);
+        Ok(Self {
+            motions: (0..scans.len()).map(motion).collect(),
+            world_from_map: Pose3::identity(),
+            scans,
+            map_from_lidar,
+        })
+    }
+
+    fn build(&self, builder: &MapBuilder) -> anyhow::Result<map::Map> {
+        let scans = self.map_from_lidar.iter().zip(&self.motions).enumerate();
+        let scans = scans.map(|(row, (pose, motion))| {
+            let mut scan = self.scans.read(row)?.into_owned();
+            if let Some(motion) = motion {
+                motion.deskew(&mut scan);
+            }
+            anyhow::Ok((scan, *pose))
+        });
+        let mut map = builder.build(scans).map_err(|error| match error {
+            BuildError::Scan(error) => of_scan(error),
+            error => error.into(),
+        })?;
+        map.path = Arc::new(MappingPath {
+            world_from_map: self.world_from_map,
+            map_from_lidar: map.path.map_from_lidar.clone(),
+        });
+        Ok(map)
+    }
+}
+
+/// Casts rays at a map: ranges along directions from the origin of the lidar, infinite without a hit [m].
+///
+/// ``poses``: (4, 4) or (P, 4, 4). ``directions``: (N, 3), unit vectors in the frame of the lidar; float32 without a copy
+/// if contiguous. Returns (N,) float32, or (P, N).
+#[pyfunction]
+pub fn cast_rays<'py>(
+    py: Python<'py>,
+    map: &Map,
+    poses: Numbers<'py, f64>,
+    directions: Numbers2<'py, f32>,
+) -> PyResult<Bound<'py, PyAny>> {
+    /// Largest deviation of the length of a direction (unitless).
+    const TOLERANCE: f32 = 1e-3;
+    let map_from_lidar = arrays::poses("poses", &poses)?;
+    let directions = arrays::vectors("directions", &directions)?;
+    let not_unit = |direction: &glam::Vec3| !((direction.length() - 1.0).abs() < TOLERANCE);
+    if let Some(row) = directions.iter().position(not_unit) {
+        return Err(PyValueError::new_err(format!(
+            "direction {row} is {}, which is no unit vector; divide directions by their lengths",
+            directions[row]
+        )));
+    }
+    let mut ranges = released(py, || map.map.renderer.cast(&map_from_lidar, &directions))?;
+    Ok(match (poses.ndim(), ranges.len()) {
+        (2, 1) => ranges.swap_remove(0).into_pyarray(py).into_any(),
+        (_, count) => Array2::from_shape_vec((count, directions.len()), ranges.concat())
+            .map_err(raised)?
+            .into_pyarray(py)
+            .into_any(),
+    })
+}
+
+/// Returns the confidence that each point of a scan is ground, (N,) float32, 0 to 1.
+///
+/// ``points``: (N, 3), one revolution in the frame of the lidar [m]; float32 without a copy if contiguous. Settings:
+/// ``ground_method`` (``"fuzzy"``, ``"pca"``, ``"ransac"``) and its keys, as in ``fpmcl config localize --full``.
+#[pyfunction]
+#[pyo3(signature = (points, **settings))]
+pub fn classify_ground<'py>(
+    py: Python<'py>,
+    points: Numbers2<'py, f32>,
+    settings: Option<&Bound<'_, PyDict>>,
+) -> PyResult<Bound<'py, PyArray1<f32>>> {
+    let config = settings::of_stage(LocalizationConfig::default(), settings)?;
+    let points = arrays::vectors("points", &points)?;
+    let confidence = released(py, || {
+        let classifier = config.ground().classifier()?;
+        anyhow::Ok(classifier.ground_confidence(&points))
+    })?;
+    Ok(confidence.into_pyarray(py))
+}
