@@ -180,6 +180,24 @@ fn a_rough_trajectory_comes_to_centimetres_and_one_from_elsewhere_is_marked() {
     assert_eq!(report["summary"]["tracking"], 14);
     refine("gps.txt").fails_with(&["refined.npz exists", "--force"]);
 
+    // A track that leaves the truth is followed by the odometry, and the distance is reported.
+    let mut turned = truth.clone();
+    for pose in &mut turned {
+        let angle_rad = 1.2;
+        let first = truth[0].translation.vector;
+        let offset = pose.translation.vector - first;
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad);
+        pose.translation.vector = first + turn * offset;
+    }
+    write_rough_poses(&folder.join("turned.txt"), &turned, [0.3, 0.2], 3.0);
+    let output = refine("turned.txt").with("--uncertainty=0.5,8").succeeds();
+    assert!(
+        output.stderr.contains("in the frame of the map"),
+        "{}",
+        output.stderr
+    );
+    assert!(error_m("turned_refined", 12) < 0.06);
+
     // From where the uncertainty does not reach the truth, nothing is claimed.
     write_rough_poses(&folder.join("far.txt"), &truth, [400.0, 0.0], 0.0);
     let output = refine("far.txt").with("--output=far/r.npz").succeeds();

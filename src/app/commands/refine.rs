@@ -74,11 +74,12 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let planar = |truth: &[Pose3]| truth.iter().map(pose2_from_pose3).collect();
     results.ground_truth = (results.ground_truth.take()).or(truth.as_deref().map(planar));
     results.ground_truth_in_space = results.ground_truth_in_space.take().or(truth);
-    results.estimates = Some(estimates);
     if is_trajectory {
+        warn_of_distance(config, &estimates, &refined);
         let states = refined.states.iter();
         results.states = Some(states.map(|state| *state as u8).collect());
     }
+    results.estimates = Some(estimates);
     results.refined = Some(refined.poses.clone());
     results.refined_in_space = Some(refined.map_from_lidar.clone());
     results.refined_covariances = Some(refined.covariances.clone());
@@ -293,6 +294,27 @@ fn report_unrefined(refined: &RefinedTrajectory, is_trajectory: bool) {
         tracing::warn!(
             "{} frames are not refined{smoothed}: there is no mapped ground under the car, or no beam in the scan",
             refined.unmapped
+        );
+    }
+}
+
+/// Warns of placed poses that are farther from a trajectory than its uncertainty allows: it may be in another frame.
+fn warn_of_distance(config: &RefinementConfig, estimates: &[Pose2], refined: &RefinedTrajectory) {
+    /// Standard deviations within which the median of the distances is.
+    const DEVIATIONS: f64 = 3.0;
+    let [position_m, _] = config.uncertainty;
+    let rows = estimates.iter().zip(&refined.poses).zip(&refined.states);
+    let placed = rows.filter(|(_, state)| **state == State::Tracking);
+    let mut distances_m: Vec<f64> = placed
+        .map(|((a, b), _)| (b.translation.vector - a.translation.vector).norm())
+        .collect();
+    distances_m.sort_by(f64::total_cmp);
+    let Some(median_m) = distances_m.get(distances_m.len() / 2) else {
+        return;
+    };
+    if *median_m > DEVIATIONS * position_m {
+        tracing::warn!(
+            "half of the placed poses are {median_m:.1} m or more from the trajectory, whose uncertainty is {position_m} m: is it in the frame of the map, or is a calibration missing?"
         );
     }
 }
