@@ -6,6 +6,7 @@
 //! curvature        change of slope along the azimuth of the beam, from below to above: positive
 //!                  where the surface turns upwards, as at the foot of a wall
 //! height           above the local ground, see [`terrain`](super::terrain)
+//! relief           height of the highest point of the polar cell that a car does not pass beneath
 //! ```
 
 use glam::Vec3;
@@ -28,6 +29,10 @@ pub struct FeatureConfig {
     /// Points nearer to the sensor's axis belong to the own car and are not ground [m].
     #[default(2.0)]
     pub min_distance_m: f32,
+    /// Points higher above the ground than this do not count for the relief around them: a car
+    /// passes beneath [m].
+    #[default(2.0)]
+    pub clearance_m: f32,
     /// Parameters of the elevation map above which the height of a point is measured.
     pub terrain: TerrainConfig,
 }
@@ -36,9 +41,12 @@ impl Validate for FeatureConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         in_range("spacing_m", self.spacing_m, 0.001..=10.0)?;
         not_negative("min_distance_m", self.min_distance_m)?;
+        positive("clearance_m", self.clearance_m)?;
         positive("terrain.step_m", self.terrain.step_m)?;
         not_negative("terrain.max_slope", self.terrain.max_slope)?;
         positive("terrain.max_jump_m", self.terrain.max_jump_m)?;
+        not_negative("terrain.max_fall_slope", self.terrain.max_fall_slope)?;
+        positive("terrain.max_fall_m", self.terrain.max_fall_m)?;
         positive("terrain.start_radius_m", self.terrain.start_radius_m)?;
         positive("terrain.max_low_slope_rad", self.terrain.max_low_slope_rad)
     }
@@ -56,22 +64,26 @@ pub struct Features {
     pub curvature_deg: f32,
     /// Height above the local ground [m].
     pub height_m: f32,
+    /// Height of the highest point around, above the local ground or, of a point below that, above
+    /// the point itself [m].
+    pub relief_m: f32,
 }
 
 impl Features {
     /// Names in rules, in the order of [`to_array`](Self::to_array).
-    pub const NAMES: [&str; 4] = ["slope", "height_variance", "curvature", "height"];
+    pub const NAMES: [&str; 5] = ["slope", "height_variance", "curvature", "height", "relief"];
     /// Units, in the same order.
-    pub const UNITS: [&str; 4] = ["deg", "m", "deg", "m"];
+    pub const UNITS: [&str; 5] = ["deg", "m", "deg", "m", "m"];
 
     /// Returns the inputs of a fuzzy system.
     #[inline]
-    pub fn to_array(&self) -> [f32; 4] {
+    pub fn to_array(&self) -> [f32; 5] {
         [
             self.slope_deg,
             self.height_variance_m,
             self.curvature_deg,
             self.height_m,
+            self.relief_m,
         ]
     }
 }
@@ -81,27 +93,41 @@ pub(super) struct ScanFeatures {
     positions: Vec<Option<PolarPosition>>,
     shapes: Vec<Shape>,
     terrain: Terrain,
+    /// Heights of the points above the local ground [m].
+    heights_m: Vec<f32>,
+    /// The greatest of these below the clearance, per cell [m].
+    tops_m: Vec<f32>,
 }
 
 impl ScanFeatures {
     /// Analyses the points of a scan in the lidar frame.
     pub(super) fn new(points: &[Vec3], config: &FeatureConfig) -> Self {
         let index = ScanIndex::new(points, config.min_distance_m, config.spacing_m);
-        let shapes = index.shapes();
+        let (shapes, cells) = (index.shapes(), index.grid.len());
         let terrain = Terrain::estimate(index.grid, &index.positions, &shapes, &config.terrain);
+        let heights_m: Vec<f32> = index
+            .positions
+            .par_iter()
+            .with_min_len(MIN_POINTS_PER_TASK)
+            .map(|position| position.map_or(f32::NAN, |p| p.z - terrain.height_at(&p)))
+            .collect();
         Self {
+            tops_m: tops(&index.positions, &heights_m, cells, config.clearance_m),
             positions: index.positions,
             shapes,
             terrain,
+            heights_m,
         }
     }
 
     /// Returns the features of every point; `None` for points that are not finite, on the own car
     /// or out of range.
     pub(super) fn features(&self) -> Vec<Option<Features>> {
-        let points = self.positions.iter().zip(&self.shapes);
+        let points = self.positions.iter().zip(&self.shapes).zip(&self.heights_m);
         points
-            .map(|(position, shape)| Some(self.features_at(position.as_ref()?, shape)))
+            .map(|((position, shape), &height_m)| {
+                Some(self.features_at(position.as_ref()?, shape, height_m))
+            })
             .collect()
     }
 
@@ -109,19 +135,21 @@ impl ScanFeatures {
     /// points without features.
     pub(super) fn map_blocks(
         &self,
-        map: impl Fn(&[[f32; BLOCK]; 4]) -> [f32; BLOCK] + Sync,
+        map: impl Fn(&[[f32; BLOCK]; 5]) -> [f32; BLOCK] + Sync,
     ) -> Vec<f32> {
         let mut results = vec![0.0; self.positions.len()];
         results
             .par_chunks_mut(BLOCK)
             .zip(self.positions.par_chunks(BLOCK))
             .zip(self.shapes.par_chunks(BLOCK))
+            .zip(self.heights_m.par_chunks(BLOCK))
             .with_min_len(MIN_POINTS_PER_TASK / BLOCK)
-            .for_each(|((results, positions), shapes)| {
-                let mut block = [[0.0; BLOCK]; 4];
-                for (row, (position, shape)) in positions.iter().zip(shapes).enumerate() {
+            .for_each(|(((results, positions), shapes), heights_m)| {
+                let mut block = [[0.0; BLOCK]; 5];
+                let points = positions.iter().zip(shapes).zip(heights_m);
+                for (row, ((position, shape), &height_m)) in points.enumerate() {
                     if let Some(position) = position {
-                        let features = self.features_at(position, shape).to_array();
+                        let features = self.features_at(position, shape, height_m).to_array();
                         for (column, feature) in block.iter_mut().zip(features) {
                             column[row] = feature;
                         }
@@ -136,14 +164,34 @@ impl ScanFeatures {
     }
 
     #[inline]
-    fn features_at(&self, position: &PolarPosition, shape: &Shape) -> Features {
+    fn features_at(&self, position: &PolarPosition, shape: &Shape, height_m: f32) -> Features {
+        let top_m = self.tops_m[position.cell()].max(height_m);
         Features {
             slope_deg: shape.slope_rad.to_degrees(),
             curvature_deg: shape.curvature_rad.to_degrees(),
             height_variance_m: self.terrain.height_above_lows_m(position),
-            height_m: position.z - self.terrain.height_at(position),
+            height_m,
+            relief_m: top_m - height_m.min(0.0),
         }
     }
+}
+
+/// Returns the greatest height below the clearance in every cell; minus infinity without points.
+fn tops(
+    positions: &[Option<PolarPosition>],
+    heights_m: &[f32],
+    cells: usize,
+    clearance_m: f32,
+) -> Vec<f32> {
+    let mut tops_m = vec![f32::NEG_INFINITY; cells];
+    for (position, &height_m) in positions.iter().zip(heights_m) {
+        let Some(position) = position else { continue };
+        let top_m = &mut tops_m[position.cell()];
+        if height_m > *top_m && height_m < clearance_m {
+            *top_m = height_m;
+        }
+    }
+    tops_m
 }
 
 /// Returns the unit surface normals of all points, of arbitrary sign; `None` without neighbours.
