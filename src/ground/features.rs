@@ -29,10 +29,6 @@ pub struct FeatureConfig {
     /// Points nearer to the sensor's axis belong to the own car and are not ground [m].
     #[default(2.0)]
     pub min_distance_m: f32,
-    /// Points higher above the ground than this do not count for the relief around them: a car
-    /// passes beneath [m].
-    #[default(2.0)]
-    pub clearance_m: f32,
     /// Parameters of the elevation map above which the height of a point is measured.
     pub terrain: TerrainConfig,
 }
@@ -41,12 +37,12 @@ impl Validate for FeatureConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         in_range("spacing_m", self.spacing_m, 0.001..=10.0)?;
         not_negative("min_distance_m", self.min_distance_m)?;
-        positive("clearance_m", self.clearance_m)?;
         positive("terrain.step_m", self.terrain.step_m)?;
         not_negative("terrain.max_slope", self.terrain.max_slope)?;
         positive("terrain.max_jump_m", self.terrain.max_jump_m)?;
         not_negative("terrain.max_fall_slope", self.terrain.max_fall_slope)?;
         positive("terrain.max_fall_m", self.terrain.max_fall_m)?;
+        positive("terrain.clearance_m", self.terrain.clearance_m)?;
         positive("terrain.start_radius_m", self.terrain.start_radius_m)?;
         positive("terrain.max_low_slope_rad", self.terrain.max_low_slope_rad)
     }
@@ -93,41 +89,27 @@ pub(super) struct ScanFeatures {
     positions: Vec<Option<PolarPosition>>,
     shapes: Vec<Shape>,
     terrain: Terrain,
-    /// Heights of the points above the local ground [m].
-    heights_m: Vec<f32>,
-    /// The greatest of these below the clearance, per cell [m].
-    tops_m: Vec<f32>,
 }
 
 impl ScanFeatures {
     /// Analyses the points of a scan in the lidar frame.
     pub(super) fn new(points: &[Vec3], config: &FeatureConfig) -> Self {
         let index = ScanIndex::new(points, config.min_distance_m, config.spacing_m);
-        let (shapes, cells) = (index.shapes(), index.grid.len());
+        let shapes = index.shapes();
         let terrain = Terrain::estimate(index.grid, &index.positions, &shapes, &config.terrain);
-        let heights_m: Vec<f32> = index
-            .positions
-            .par_iter()
-            .with_min_len(MIN_POINTS_PER_TASK)
-            .map(|position| position.map_or(f32::NAN, |p| p.z - terrain.height_at(&p)))
-            .collect();
         Self {
-            tops_m: tops(&index.positions, &heights_m, cells, config.clearance_m),
             positions: index.positions,
             shapes,
             terrain,
-            heights_m,
         }
     }
 
     /// Returns the features of every point; `None` for points that are not finite, on the own car
     /// or out of range.
     pub(super) fn features(&self) -> Vec<Option<Features>> {
-        let points = self.positions.iter().zip(&self.shapes).zip(&self.heights_m);
+        let points = self.positions.iter().zip(&self.shapes);
         points
-            .map(|((position, shape), &height_m)| {
-                Some(self.features_at(position.as_ref()?, shape, height_m))
-            })
+            .map(|(position, shape)| Some(self.features_at(position.as_ref()?, shape)))
             .collect()
     }
 
@@ -142,14 +124,12 @@ impl ScanFeatures {
             .par_chunks_mut(BLOCK)
             .zip(self.positions.par_chunks(BLOCK))
             .zip(self.shapes.par_chunks(BLOCK))
-            .zip(self.heights_m.par_chunks(BLOCK))
             .with_min_len(MIN_POINTS_PER_TASK / BLOCK)
-            .for_each(|(((results, positions), shapes), heights_m)| {
+            .for_each(|((results, positions), shapes)| {
                 let mut block = [[0.0; BLOCK]; 5];
-                let points = positions.iter().zip(shapes).zip(heights_m);
-                for (row, ((position, shape), &height_m)) in points.enumerate() {
+                for (row, (position, shape)) in positions.iter().zip(shapes).enumerate() {
                     if let Some(position) = position {
-                        let features = self.features_at(position, shape, height_m).to_array();
+                        let features = self.features_at(position, shape).to_array();
                         for (column, feature) in block.iter_mut().zip(features) {
                             column[row] = feature;
                         }
@@ -164,34 +144,16 @@ impl ScanFeatures {
     }
 
     #[inline]
-    fn features_at(&self, position: &PolarPosition, shape: &Shape, height_m: f32) -> Features {
-        let top_m = self.tops_m[position.cell()].max(height_m);
+    fn features_at(&self, position: &PolarPosition, shape: &Shape) -> Features {
+        let height_m = position.z - self.terrain.height_at(position);
         Features {
             slope_deg: shape.slope_rad.to_degrees(),
             curvature_deg: shape.curvature_rad.to_degrees(),
             height_variance_m: self.terrain.height_above_lows_m(position),
             height_m,
-            relief_m: top_m - height_m.min(0.0),
+            relief_m: self.terrain.top_m(position).max(height_m) - height_m.min(0.0),
         }
     }
-}
-
-/// Returns the greatest height below the clearance in every cell; minus infinity without points.
-fn tops(
-    positions: &[Option<PolarPosition>],
-    heights_m: &[f32],
-    cells: usize,
-    clearance_m: f32,
-) -> Vec<f32> {
-    let mut tops_m = vec![f32::NEG_INFINITY; cells];
-    for (position, &height_m) in positions.iter().zip(heights_m) {
-        let Some(position) = position else { continue };
-        let top_m = &mut tops_m[position.cell()];
-        if height_m > *top_m && height_m < clearance_m {
-            *top_m = height_m;
-        }
-    }
-    tops_m
 }
 
 /// Returns the unit surface normals of all points, of arbitrary sign; `None` without neighbours.
