@@ -62,7 +62,7 @@ fn fuzzy(config: FuzzyConfig) -> FuzzyGround {
 }
 
 #[divan::bench(args = COLUMNS)]
-fn fuzzy_with_four_features(bencher: Bencher, columns: usize) {
+fn fuzzy_with_all_features(bencher: Bencher, columns: usize) {
     classify(bencher, &fuzzy(FuzzyConfig::default()), columns);
 }
 

@@ -219,16 +219,16 @@ fn an_invalid_rule_is_reported_with_its_line_and_the_nearest_word() {
     for (command, text) in [("build-map", fuzzy), ("ground", ground.as_str())] {
         for (right, wrong, key, message) in [
             (
-                "raised AND height_variance IS high",
-                "raised AND hight_variance IS high",
-                "fuzzy.rules[10]",
+                "steep AND height_variance IS low",
+                "steep AND hight_variance IS low",
+                "fuzzy.rules[5]",
                 "unknown variable `hight_variance`; the nearest is `height_variance`",
             ),
             (
-                "IF height IS above THEN",
-                "IF height above THEN",
-                "fuzzy.rules[13]",
-                "expected IS, found `above`",
+                "AND height IS raised THEN",
+                "AND height raised THEN",
+                "fuzzy.rules[8]",
+                "expected IS, found `raised`",
             ),
             (
                 "{trapezoid: [-0.45, -0.15,",

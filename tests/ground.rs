@@ -68,7 +68,7 @@ fn a_decision_is_explained_by_the_rules_that_fired() {
         let text = call.with(x).with(y).with(z).succeeds().stdout;
         assert!(text.contains(&format!("point {index} at ")), "{text}");
         assert!(text.contains(&format!("class {class}")), "{text}");
-        for feature in ["slope", "height_variance", "curvature", "height"] {
+        for feature in ["slope", "height_variance", "curvature", "height", "relief"] {
             assert!(text.contains(feature), "{text}");
         }
         text
@@ -83,7 +83,7 @@ fn a_decision_is_explained_by_the_rules_that_fired() {
     );
     let wall = explanation(fpmcl::simulation::classes::BUILDING, 0.0);
     assert!(
-        wall.contains("IF height IS above THEN ground IS low"),
+        wall.contains("IF relief IS high AND height IS raised THEN ground IS low"),
         "{wall}"
     );
     assert!(wall.contains("definitely not ground"), "{wall}");

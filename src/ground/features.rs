@@ -6,6 +6,7 @@
 //! curvature        change of slope along the azimuth of the beam, from below to above: positive
 //!                  where the surface turns upwards, as at the foot of a wall
 //! height           above the local ground, see [`terrain`](super::terrain)
+//! relief           height of the highest point of the polar cell that a car does not pass beneath
 //! ```
 
 use glam::Vec3;
@@ -39,6 +40,9 @@ impl Validate for FeatureConfig {
         positive("terrain.step_m", self.terrain.step_m)?;
         not_negative("terrain.max_slope", self.terrain.max_slope)?;
         positive("terrain.max_jump_m", self.terrain.max_jump_m)?;
+        not_negative("terrain.max_fall_slope", self.terrain.max_fall_slope)?;
+        positive("terrain.max_fall_m", self.terrain.max_fall_m)?;
+        positive("terrain.clearance_m", self.terrain.clearance_m)?;
         positive("terrain.start_radius_m", self.terrain.start_radius_m)?;
         positive("terrain.max_low_slope_rad", self.terrain.max_low_slope_rad)
     }
@@ -56,22 +60,26 @@ pub struct Features {
     pub curvature_deg: f32,
     /// Height above the local ground [m].
     pub height_m: f32,
+    /// Height of the highest point around, above the local ground or, of a point below that, above
+    /// the point itself [m].
+    pub relief_m: f32,
 }
 
 impl Features {
     /// Names in rules, in the order of [`to_array`](Self::to_array).
-    pub const NAMES: [&str; 4] = ["slope", "height_variance", "curvature", "height"];
+    pub const NAMES: [&str; 5] = ["slope", "height_variance", "curvature", "height", "relief"];
     /// Units, in the same order.
-    pub const UNITS: [&str; 4] = ["deg", "m", "deg", "m"];
+    pub const UNITS: [&str; 5] = ["deg", "m", "deg", "m", "m"];
 
     /// Returns the inputs of a fuzzy system.
     #[inline]
-    pub fn to_array(&self) -> [f32; 4] {
+    pub fn to_array(&self) -> [f32; 5] {
         [
             self.slope_deg,
             self.height_variance_m,
             self.curvature_deg,
             self.height_m,
+            self.relief_m,
         ]
     }
 }
@@ -109,7 +117,7 @@ impl ScanFeatures {
     /// points without features.
     pub(super) fn map_blocks(
         &self,
-        map: impl Fn(&[[f32; BLOCK]; 4]) -> [f32; BLOCK] + Sync,
+        map: impl Fn(&[[f32; BLOCK]; 5]) -> [f32; BLOCK] + Sync,
     ) -> Vec<f32> {
         let mut results = vec![0.0; self.positions.len()];
         results
@@ -118,7 +126,7 @@ impl ScanFeatures {
             .zip(self.shapes.par_chunks(BLOCK))
             .with_min_len(MIN_POINTS_PER_TASK / BLOCK)
             .for_each(|((results, positions), shapes)| {
-                let mut block = [[0.0; BLOCK]; 4];
+                let mut block = [[0.0; BLOCK]; 5];
                 for (row, (position, shape)) in positions.iter().zip(shapes).enumerate() {
                     if let Some(position) = position {
                         let features = self.features_at(position, shape).to_array();
@@ -137,11 +145,13 @@ impl ScanFeatures {
 
     #[inline]
     fn features_at(&self, position: &PolarPosition, shape: &Shape) -> Features {
+        let height_m = position.z - self.terrain.height_at(position);
         Features {
             slope_deg: shape.slope_rad.to_degrees(),
             curvature_deg: shape.curvature_rad.to_degrees(),
             height_variance_m: self.terrain.height_above_lows_m(position),
-            height_m: position.z - self.terrain.height_at(position),
+            height_m,
+            relief_m: self.terrain.top_m(position).max(height_m) - height_m.min(0.0),
         }
     }
 }

@@ -1,4 +1,7 @@
 //! Ground segmentation by fuzzy rules over the features of each point.
+//!
+//! Where nothing around stands up from the ground (low relief) every point is ground: road, kerb,
+//! grass. Where something does, slope and curvature separate it from the ground at its foot.
 
 use std::fmt;
 
@@ -26,7 +29,7 @@ pub struct FuzzyConfig {
     /// Method of inference.
     pub inference: Inference,
     /// Fuzzy sets of the features `slope` [deg], `height_variance` [m], `curvature` [deg],
-    /// `height` [m], and of the output `ground` [0, 1].
+    /// `height` [m], `relief` [m], and of the output `ground` [0, 1].
     pub variables: Vocabulary,
     /// The rule base: `IF slope IS gentle AND curvature IS flat THEN ground IS high`.
     pub rules: Vec<String>,
@@ -37,16 +40,16 @@ pub struct FuzzyConfig {
 }
 
 impl Default for FuzzyConfig {
-    /// Four features; tuned on the even-numbered of 21 labelled scans and on simulated streets.
+    /// All features; see [`TerrainConfig`](super::TerrainConfig) for how the values were chosen.
     fn default() -> Self {
         Self {
             features: FeatureConfig::default(),
             operators: Operators::MinMax,
             inference: Inference::Mamdani,
             variables: vocabulary(&[
-                ("slope", "gentle", MembershipFunction::LeftShoulder([13.0, 23.0])),
-                ("slope", "moderate", MembershipFunction::Triangle([13.0, 23.0, 100.0])),
-                ("slope", "steep", MembershipFunction::RightShoulder([23.0, 100.0])),
+                ("slope", "gentle", MembershipFunction::LeftShoulder([20.0, 40.0])),
+                ("slope", "moderate", MembershipFunction::Triangle([20.0, 40.0, 100.0])),
+                ("slope", "steep", MembershipFunction::RightShoulder([40.0, 100.0])),
                 ("height_variance", "low", MembershipFunction::LeftShoulder([0.01, 0.11])),
                 ("height_variance", "medium", MembershipFunction::Triangle([0.01, 0.11, 0.4])),
                 ("height_variance", "high", MembershipFunction::RightShoulder([0.11, 0.4])),
@@ -55,23 +58,22 @@ impl Default for FuzzyConfig {
                 ("curvature", "sharp", MembershipFunction::RightShoulder([55.0, 65.0])),
                 ("height", "sunken", MembershipFunction::LeftShoulder([-0.45, -0.15])),
                 ("height", "level", MembershipFunction::Trapezoid([-0.45, -0.15, 0.03, 0.11])),
-                ("height", "raised", MembershipFunction::Triangle([0.03, 0.11, 0.22])),
-                ("height", "above", MembershipFunction::RightShoulder([0.11, 0.22])),
+                ("height", "raised", MembershipFunction::RightShoulder([0.03, 0.11])),
+                ("relief", "low", MembershipFunction::LeftShoulder([0.15, 0.3])),
+                ("relief", "high", MembershipFunction::RightShoulder([0.15, 0.3])),
             ]),
             rules: [
+                "IF relief IS low AND height IS NOT sunken THEN ground IS high",
                 "IF height IS level AND slope IS gentle AND curvature IS NOT sharp THEN ground IS high",
                 "IF height IS level AND slope IS moderate AND curvature IS flat THEN ground IS high",
-                "IF height IS level AND slope IS moderate AND curvature IS curved THEN ground IS medium",
+                "IF relief IS high AND height IS level AND slope IS moderate AND curvature IS curved THEN ground IS medium",
                 "IF height IS level AND slope IS steep AND height_variance IS low THEN ground IS high",
-                "IF height IS level AND slope IS steep AND height_variance IS NOT low THEN ground IS low",
-                "IF height IS level AND curvature IS sharp THEN ground IS low",
-                "IF height IS sunken AND slope IS gentle THEN ground IS high",
+                "IF relief IS high AND height IS level AND slope IS steep AND height_variance IS NOT low THEN ground IS low",
+                "IF relief IS high AND height IS level AND curvature IS sharp THEN ground IS low",
+                "IF relief IS high AND height IS raised THEN ground IS low",
+                "IF relief IS low AND height IS sunken AND slope IS gentle THEN ground IS high",
+                "IF relief IS high AND height IS sunken THEN ground IS low",
                 "IF height IS sunken AND slope IS NOT gentle THEN ground IS low",
-                "IF height IS raised AND slope IS gentle AND curvature IS flat AND height_variance IS NOT high THEN ground IS high",
-                "IF height IS raised AND height_variance IS high THEN ground IS low",
-                "IF height IS raised AND curvature IS NOT flat THEN ground IS low",
-                "IF height IS raised AND slope IS NOT gentle THEN ground IS low",
-                "IF height IS above THEN ground IS low",
             ]
             .map(str::to_owned)
             .to_vec(),
@@ -91,7 +93,7 @@ impl Validate for FuzzyConfig {
 }
 
 impl FuzzyConfig {
-    /// A rule base of three features, without the height above the local ground.
+    /// A rule base of three features, without height and relief.
     pub fn three_features() -> Self {
         Self {
             variables: vocabulary(&[

@@ -36,6 +36,8 @@ pub struct FuzzySystem {
     inputs: Vec<Variable>,
     /// Input index and membership function of every input set, in the order of [`Clause::set`].
     sets: Vec<(usize, MembershipFunction)>,
+    /// Whether a rule contains the input set.
+    is_used: Vec<bool>,
     /// The clauses of all rules in one list, for locality in memory.
     clauses: Vec<Clause>,
     operators: Operators,
@@ -85,6 +87,8 @@ impl FuzzySystem {
         };
         let in_input = |(index, input)| functions(input).into_iter().map(move |f| (index, f));
         let sets: Vec<_> = inputs.iter().enumerate().flat_map(in_input).collect();
+        let in_rule = |set| clauses.iter().any(|clause: &Clause| clause.set == set);
+        let is_used = (0..sets.len()).map(in_rule).collect();
         let outputs = functions(&output);
         if sets.len() > MAX_SETS || outputs.len() > MAX_SETS {
             let (inputs, outputs) = (sets.len(), outputs.len());
@@ -102,6 +106,7 @@ impl FuzzySystem {
         Ok(Self {
             inputs,
             sets,
+            is_used,
             clauses,
             operators,
             inference,
@@ -147,12 +152,15 @@ impl FuzzySystem {
         strengths
     }
 
-    /// Returns the degrees of membership in all input sets.
+    /// Returns the degrees of membership in the input sets that rules contain.
     #[inline]
     fn fuzzify<const N: usize>(&self, inputs: &[[f32; N]]) -> [[f32; N]; MAX_SETS] {
         let mut degrees = [[0.0; N]; MAX_SETS];
-        for (degrees, (input, function)) in degrees.iter_mut().zip(&self.sets) {
-            function.degrees(&inputs[*input], degrees);
+        let sets = self.sets.iter().zip(&self.is_used);
+        for (degrees, ((input, function), is_used)) in degrees.iter_mut().zip(sets) {
+            if *is_used {
+                function.degrees(&inputs[*input], degrees);
+            }
         }
         degrees
     }

@@ -1,6 +1,6 @@
 //! Ground segmentation: the confidence, 0 to 1, that each point of a scan is ground.
 //!
-//! [`FuzzyGround`] fuzzifies three or four features of a point and infers the confidence from a
+//! [`FuzzyGround`] fuzzifies three or five features of a point and infers the confidence from a
 //! rule base in words, which can be explained. [`PcaGround`] and [`RansacGround`] are baselines.
 
 // The interface, and the choice between its implementations.

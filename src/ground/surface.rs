@@ -2,8 +2,8 @@
 //!
 //! The normal is the cross product of the surface's tangents, the differences of the neighbours
 //! above and below, left and right in an image of directions. A neighbour is the first one at
-//! least `spacing_m` away, so that noise does not tilt it; where it is missing, the point itself
-//! takes its place.
+//! least `spacing_m` away, so that noise does not tilt it; where it is missing, or so far away that
+//! it lies on another surface, the point itself takes its place.
 
 use std::f32::consts::{FRAC_PI_2, PI};
 
@@ -19,6 +19,10 @@ pub(super) const BLOCK: usize = 32;
 pub(super) const MIN_POINTS_PER_TASK: usize = 1024;
 /// Maximum number of columns between a point and its neighbours at the sides.
 const MAX_COLUMNS: f32 = 5.0;
+
+/// A neighbour above or below that is farther away than the opposite one by this factor lies on
+/// another surface, such as the crest of a road before a wall, unitless.
+const MAX_GAP_RATIO: f32 = 2.0;
 
 /// Slope and curvature of the surface at a point.
 #[derive(Clone, Copy, Debug)]
@@ -92,7 +96,7 @@ impl<'a> ScanIndex<'a> {
                     let index = block * BLOCK + row;
                     let seen = &returns[index];
                     let neighbours = self.neighbours(index, seen.point, seen.distance_m);
-                    surfaces.set(row, &neighbours, seen.point);
+                    surfaces.set(row, &neighbours, seen.point, self.spacing_m);
                 }
                 shapes.copy_from_slice(&surfaces.shapes()[..shapes.len()]);
             });
@@ -114,7 +118,7 @@ impl<'a> ScanIndex<'a> {
                 }
                 let neighbours = self.neighbours(index, point, point.truncate().length());
                 let mut surface = Surfaces::<1>::unknown();
-                surface.set(0, &neighbours, point);
+                surface.set(0, &neighbours, point, self.spacing_m);
                 surface.shapes()[0]
             })
             .collect()
@@ -129,7 +133,7 @@ impl<'a> ScanIndex<'a> {
             .map(|(&point, cell)| {
                 let index = self.image.return_of((*cell)?)?;
                 let neighbours = self.neighbours(index, point, point.truncate().length());
-                let (along, across) = neighbours.tangents(point)?;
+                let (along, across) = neighbours.tangents(point, self.spacing_m)?;
                 along.cross(across).try_normalize()
             })
             .collect()
@@ -160,8 +164,17 @@ struct Neighbours {
 
 impl Neighbours {
     /// Vertical and horizontal tangent; `None` without vertical neighbours.
-    fn tangents(&self, point: Vec3) -> Option<(Vec3, Vec3)> {
-        let along = difference(self.up, self.down)?;
+    fn tangents(&self, point: Vec3, spacing_m: f32) -> Option<(Vec3, Vec3)> {
+        let (mut up, mut down) = (self.up, self.down);
+        if let (Some(above), Some(below)) = (up, down) {
+            let is_near = |near: Vec3, far: Vec3| {
+                let reach = near.length_squared().max(spacing_m * spacing_m);
+                far.length_squared() <= MAX_GAP_RATIO * MAX_GAP_RATIO * reach
+            };
+            up = up.filter(|_| is_near(below, above));
+            down = down.filter(|_| is_near(above, below));
+        }
+        let along = difference(up, down)?;
         // Without neighbours at the sides the surface is assumed to be level across the beam.
         let level = Vec3::new(-point.y, point.x, 0.0);
         Some((along, difference(self.left, self.right).unwrap_or(level)))
@@ -232,8 +245,8 @@ impl<const N: usize> Surfaces<N> {
     }
 
     #[inline]
-    fn set(&mut self, row: usize, neighbours: &Neighbours, point: Vec3) {
-        let Some((along, across)) = neighbours.tangents(point) else {
+    fn set(&mut self, row: usize, neighbours: &Neighbours, point: Vec3, spacing_m: f32) {
+        let Some((along, across)) = neighbours.tangents(point, spacing_m) else {
             return;
         };
         for axis in 0..3 {

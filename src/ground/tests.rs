@@ -188,6 +188,7 @@ fn an_explanation_contains_the_confidence_and_the_rules_that_fired() {
         height_variance_m: 0.02,
         curvature_deg: 3.0,
         height_m: 0.0,
+        relief_m: 0.05,
     };
     let explanation = classifier.explain(&road);
     assert_eq!(explanation.confidence, classifier.confidence(&road));
@@ -203,6 +204,7 @@ fn an_explanation_contains_the_confidence_and_the_rules_that_fired() {
 
     let roof = Features {
         height_m: 1.4,
+        relief_m: 1.4,
         ..road
     };
     let explanation = classifier.explain(&roof);

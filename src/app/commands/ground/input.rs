@@ -87,13 +87,19 @@ fn has_extension(path: &Path, extension: &str) -> bool {
 }
 
 /// The existing label file of a scan: of the same name in `label_folder`, by default in `labels`
-/// beside the folder of the scans.
+/// beside the folder of the scans. That of nuScenes' `000000.pcd.bin` is `000000.label`.
 fn label_path(scan_path: &Path, name: &Path, label_folder: Option<&Path>) -> Option<PathBuf> {
     let depth = name.components().count();
-    let beside = || Some(scan_path.ancestors().nth(depth + 1)?.join("labels"));
-    let folder = label_folder.map(Path::to_owned).or_else(beside)?;
-    let path = folder.join(name).with_extension("label");
-    path.is_file().then_some(path)
+    let beside = |depth| Some(scan_path.ancestors().nth(depth + 1)?.join("labels"));
+    let stem = name.file_stem()?;
+    let candidates = match label_folder {
+        Some(folder) => [folder.join(name), folder.join(stem)],
+        None => [beside(depth)?.join(name), beside(1)?.join(stem)],
+    };
+    candidates
+        .map(|path| path.with_extension("label"))
+        .into_iter()
+        .find(|path| path.is_file())
 }
 
 impl LabelledScan {
@@ -151,4 +157,31 @@ pub fn check_overwrite(config: &GroundCommandConfig, scans: &[LabelledScan]) -> 
         written.display()
     );
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn labels_are_found_beside_the_folder_of_the_scans_with_one_or_two_extensions() {
+        let folder = tempfile::tempdir().unwrap();
+        let labels = folder.path().join("labels");
+        std::fs::create_dir(&labels).unwrap();
+        let expected = labels.join("000007.label");
+        std::fs::write(&expected, []).unwrap();
+        for (scans, name) in [
+            ("velodyne", "000007.bin"),
+            ("", "lidar/000007.pcd.bin"),
+            ("lidar", "000007.pcd.bin"),
+        ] {
+            let scan = folder.path().join(scans).join(name);
+            for label_folder in [None, Some(labels.as_path())] {
+                let found = label_path(&scan, Path::new(name), label_folder);
+                assert_eq!(found.as_ref(), Some(&expected), "{name}");
+            }
+        }
+        let other = folder.path().join("velodyne/000008.bin");
+        assert_eq!(label_path(&other, Path::new("000008.bin"), None), None);
+    }
 }
