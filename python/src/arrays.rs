@@ -8,7 +8,7 @@ use nalgebra::{Matrix3, Matrix4, Rotation3, UnitQuaternion, Vector2, Vector3};
 use numpy::ndarray::{Array2, Array3, ArrayView};
 use numpy::{
     AllowTypeChange, Element, IntoPyArray as _, PyArray1, PyArray2, PyArray3, PyArrayDyn,
-    PyArrayLike1, PyArrayLike2, PyArrayLikeDyn, PyArrayMethods as _, PyUntypedArrayMethods as _,
+    PyArrayLike1, PyArrayLike2, PyArrayLikeDyn, PyUntypedArrayMethods as _,
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -25,10 +25,10 @@ pub fn vectors<'a>(name: &str, array: &'a Numbers2<'_, f32>) -> PyResult<Cow<'a,
     if array.shape()[1] != 3 {
         return Err(wrong_shape(name, array.shape(), "(N, 3)"));
     }
-    Ok(match array.as_slice() {
-        Ok(numbers) => Cow::Borrowed(bytemuck::cast_slice(numbers)),
-        Err(_not_contiguous) => {
-            let rows = array.as_array();
+    let rows = array.as_array();
+    Ok(match rows.to_slice() {
+        Some(numbers) => Cow::Borrowed(bytemuck::cast_slice(numbers)),
+        None => {
             let vector = |row: ArrayView<'_, f32, _>| Vec3::new(row[0], row[1], row[2]);
             Cow::Owned(rows.rows().into_iter().map(vector).collect())
         }
@@ -170,7 +170,8 @@ pub fn view<'py, T: Element>(
     // SAFETY: `values` belong to a frozen class or to what it shares, which never changes them; the array keeps `owner`
     // alive, and nothing writes through it.
     let array = unsafe { PyArrayDyn::borrow_from_array(&values, owner.clone()) };
-    array.readwrite().make_nonwriteable();
+    // Not through an exclusive borrow, which fails while another thread reads a view of the same owner.
+    array.call_method1("setflags", (false,))?;
     Ok(array)
 }
 
