@@ -55,7 +55,10 @@ fn check_round_trip(path: &Path) {
         "refinement.yml" | "refinement_stereo.yml" => round_trip::<RefinementConfig>(path),
         "evaluation.yml" => round_trip::<EvaluationConfig>(path),
         "simulation.yml" => round_trip::<SimulationConfig>(path),
-        "comparison.yml" | "comparison_kitti.yml" | "comparison_refiners.yml" => {
+        "comparison.yml"
+        | "comparison_kitti.yml"
+        | "comparison_refiners.yml"
+        | "hard_cases.yml" => {
             round_trip::<ComparisonConfig>(path);
         }
         "odometry.yml" => round_trip::<OdometryCommandConfig>(path),

@@ -111,6 +111,10 @@ fn simulations_are_bounded() {
         ("scanner.beams", "1000000000000", "4096"),
         ("scanner.azimuth_steps", "65537", "65536"),
         ("odometry.step_noise_m", "1e300", "100"),
+        ("given_poses.noise_m", "1e300", "100"),
+        ("street.changes.foliage_m", "1e300", "5"),
+        ("street.structures", "[{to_m: 1e9}]", "101000"),
+        ("street.structures", "[{spacing_m: 1e-9}]", "10000"),
     ] {
         refuses("simulate", key, value, limit);
     }

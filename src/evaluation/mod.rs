@@ -17,6 +17,7 @@ pub mod smoothness;
 pub mod spatial;
 pub mod statistics;
 mod surface_distance;
+pub mod trust;
 
 pub use alignment::{Alignment, aligned, rigid_alignment};
 pub use convergence::{Convergence, StrictSuccess};

@@ -6,6 +6,7 @@
 
 pub mod angle;
 pub mod cloud;
+pub mod degeneracy;
 pub mod grid;
 pub mod kd_tree;
 pub mod mesh;
@@ -17,6 +18,7 @@ pub mod trajectory;
 
 pub use angle::{circular_mean, wrap_angle};
 pub use cloud::PointCloud;
+pub use degeneracy::Degeneracy;
 pub use grid::Grid2;
 pub use kd_tree::KdTree;
 pub use mesh::{Aabb, TriangleMesh};

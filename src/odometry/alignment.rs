@@ -10,10 +10,9 @@
 
 use nalgebra::{Matrix6, Vector6};
 
-use super::degeneracy::Degeneracy;
 use super::residuals::{Equations, Match, Observation};
-use crate::geometry::Pose3;
 use crate::geometry::pose::{exponential, logarithm};
+use crate::geometry::{Degeneracy, Pose3};
 
 /// Neighbouring residuals are correlated: so many count as one against the prediction.
 const CORRELATED: f64 = 10.0;

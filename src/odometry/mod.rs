@@ -31,7 +31,6 @@ mod alignment;
 mod anchors;
 mod block_system;
 mod config;
-mod degeneracy;
 mod drive;
 mod elevation_bias;
 mod loops;

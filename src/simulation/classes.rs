@@ -1,5 +1,7 @@
 //! SemanticKITTI classes that occur in the simulated world (Behley et al., ICCV 2019).
 
+/// Returns that no surface gave.
+pub const OUTLIER: u16 = 1;
 /// Parked passenger cars.
 pub const CAR: u16 = 10;
 /// Parked trucks and delivery vans.

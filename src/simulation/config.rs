@@ -7,6 +7,7 @@ use smart_default::SmartDefault;
 
 use super::centreline::PathSegment;
 use super::ego_motion::MotionConfig;
+use super::given_poses::GivenPosesConfig;
 use super::odometry::OdometryConfig;
 use super::scanner::ScannerConfig;
 use super::street_config::StreetConfig;
@@ -49,6 +50,8 @@ pub struct SimulationConfig {
     pub scanner: ScannerConfig,
     /// The odometry written beside the true poses.
     pub odometry: OdometryConfig,
+    /// Errors of the poses that the drive comes with, to build a map with; without errors they are the true ones.
+    pub given_poses: GivenPosesConfig,
 }
 
 impl SimulationConfig {
@@ -74,7 +77,8 @@ impl Validate for SimulationConfig {
         nested("motion", &self.motion)?;
         nested("traffic", &self.traffic)?;
         nested("scanner", &self.scanner)?;
-        nested("odometry", &self.odometry)
+        nested("odometry", &self.odometry)?;
+        nested("given_poses", &self.given_poses)
     }
 }
 

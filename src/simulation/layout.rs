@@ -1,6 +1,8 @@
 //! Layout of the street before anything has a shape: roads, parking bays, the square, and the
 //! occupied ground.
 
+use std::ops::Range;
+
 use glam::DVec2;
 use rand::{Rng, RngExt as _};
 
@@ -149,6 +151,16 @@ impl Footprint {
 pub struct Occupancy(Vec<Footprint>);
 
 impl Occupancy {
+    /// Number of occupied rectangles.
+    pub fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    /// Makes those of a range of numbers free again.
+    pub fn release(&mut self, numbers: Range<usize>) {
+        self.0.drain(numbers);
+    }
+
     /// Occupies a rectangle if it is free; returns whether it was.
     pub fn claim(&mut self, footprint: Footprint) -> bool {
         let is_free = !self.0.iter().any(|occupied| occupied.overlaps(&footprint));

@@ -28,9 +28,11 @@ mod layout;
 mod random;
 mod street;
 mod street_config;
+mod structure;
 // Drives and measurements.
 mod config;
 mod ego_motion;
+mod given_poses;
 mod odometry;
 mod scanner;
 mod scenes;
@@ -45,19 +47,23 @@ pub use builder::{LabelledMesh, Material};
 pub use centreline::{Centreline, CentrelinePoint, PathSegment};
 pub use config::{SimulationConfig, SimulationError};
 pub use ego_motion::{EgoMotion, MotionConfig, SCAN_PERIOD_S};
+pub use given_poses::GivenPosesConfig;
 pub use ground::{GroundField, GroundSample, GroundZone};
 pub use odometry::OdometryConfig;
 pub use scanner::{LabelledScan, ScannerConfig};
 pub use scenes::{crest_scene, kerb_scene, slope_scene};
 pub use street::Street;
-pub use street_config::{CrossSectionConfig, StreetConfig};
+pub use street_config::{ChangesConfig, CrossSectionConfig, StreetConfig};
+pub use structure::Structure;
 pub use traffic::TrafficConfig;
 
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
 use crate::memory::{self, MemoryError};
+use crate::random::Generator;
 use crate::recording::Calibration;
 use crate::validation::Validate as _;
 use centreline::SHORTEST_M;
+use given_poses::bent_poses;
 use odometry::drifting_odometry;
 use random::{Purpose, stream};
 use scanner::{ScanTarget, simulate_scan};
@@ -69,6 +75,8 @@ pub struct Simulation {
     pub street: Street,
     /// Motion of the lidar.
     pub ego_motion: EgoMotion,
+    /// Motion on drive 1, which is mapped.
+    mapping_motion: EgoMotion,
     config: SimulationConfig,
     traffic: Traffic,
     street_target: ScanTarget,
@@ -84,15 +92,13 @@ impl Simulation {
         config.validate()?;
         let (path, stations_m) = driven_path(config, recorded)?;
         let length_m = path.length_m();
-        require_memory(&path, &config.street.ground)?;
+        require_memory(&path, &config.street)?;
         let street = Street::new(&path, &config.street, config.seed);
-        let mut ego_motion = EgoMotion::new(
-            path,
-            stations_m.as_deref(),
-            &config.motion,
-            config.seed,
-            config.drive,
-        );
+        let motion_on = |drive| {
+            let recorded_m = stations_m.as_deref();
+            EgoMotion::new(path.clone(), recorded_m, &config.motion, config.seed, drive)
+        };
+        let (mut ego_motion, mapping_motion) = (motion_on(config.drive), motion_on(1));
         let traffic = Traffic::new(
             &ego_motion,
             config.street.lane_width_m,
@@ -115,6 +121,7 @@ impl Simulation {
             config: config.clone(),
             street,
             ego_motion,
+            mapping_motion,
             traffic,
         })
     }
@@ -138,7 +145,7 @@ impl Simulation {
 
     /// The poses that odometry reports, in the world frame, starting at the true first pose.
     pub fn odometry(&self) -> Vec<Pose3> {
-        let mut poses = self.poses();
+        let mut poses = self.poses_at_given_times(&self.ego_motion, self.frames());
         // A drive that ends before the vehicle is displaced is not affected.
         let kidnapped_at = self.ego_motion.kidnapped_at;
         if let Some(frame) = kidnapped_at.filter(|&frame| frame < poses.len()) {
@@ -155,6 +162,41 @@ impl Simulation {
             self.config.drive.into(),
         );
         drifting_odometry(&poses, &self.config.odometry, &mut rng)
+    }
+
+    /// The poses that the drive comes with, world frame.
+    pub fn given_poses(&self) -> Vec<Pose3> {
+        let config = &self.config.given_poses;
+        let mut rng = self.given_stream(self.config.drive);
+        let poses = self.poses_at_given_times(&self.ego_motion, self.frames());
+        let poses = config.without_noise(&poses, &mut rng);
+        config.with_noise(&poses, &mut rng)
+    }
+
+    /// The true poses, as the map of drive 1 has them that is built with its given poses.
+    pub fn poses_in_map(&self) -> Vec<Pose3> {
+        let frames = self.mapping_motion.stations_m.len();
+        let true_pose = |frame| {
+            let ground = &self.street.ground;
+            self.mapping_motion.world_from_lidar(ground, time_s(frame))
+        };
+        let mapped: Vec<Pose3> = (0..frames).map(true_pose).collect();
+        let given = self.poses_at_given_times(&self.mapping_motion, frames);
+        let config = &self.config.given_poses;
+        let given = config.without_noise(&given, &mut self.given_stream(1));
+        bent_poses(&self.poses(), &mapped, &given)
+    }
+
+    fn given_stream(&self, drive: u32) -> Generator {
+        stream(self.config.seed, Purpose::GivenPoses, drive.into())
+    }
+
+    /// Poses at the times to which the scans are stamped.
+    fn poses_at_given_times(&self, motion: &EgoMotion, frames: usize) -> Vec<Pose3> {
+        let delay_s = self.config.given_poses.delay_s;
+        (0..frames)
+            .map(|frame| motion.world_from_lidar(&self.street.ground, time_s(frame) + delay_s))
+            .collect()
     }
 
     /// Surfaces of the traffic at a scan, world frame.
@@ -223,11 +265,20 @@ fn driven_path(
     Ok((path, None))
 }
 
+/// Memory of a sample of the ground, and of the triangles of a cell with their hierarchy [bytes].
+const SAMPLE_BYTES: f64 = 16.0;
+const CELL_BYTES: f64 = 1000.0;
+
 /// Requires the memory of the ground: its samples in the rectangle around the path and side streets, and
-/// its triangles with their hierarchy within reach of the path.
-fn require_memory(path: &Centreline, ground: &CrossSectionConfig) -> Result<(), MemoryError> {
-    const SAMPLE_BYTES: f64 = 16.0;
-    const CELL_BYTES: f64 = 1000.0;
+/// its triangles with their hierarchy within reach of the path; and that of the structures.
+fn require_memory(path: &Centreline, street: &StreetConfig) -> Result<(), MemoryError> {
+    let ground = &street.ground;
+    let area_m2: f64 = street.structures.iter().map(Structure::area_m2).sum();
+    memory::require(
+        "the structures of the street",
+        area_m2 * CELL_BYTES,
+        "shorten those of street.structures",
+    )?;
     let (mut min, mut max) = (path.at(0.0).position, path.at(0.0).position);
     let length_m = path.length_m();
     for step in 0..=(length_m / 10.0) as usize {

@@ -18,6 +18,8 @@ pub(super) enum Purpose {
     Scan = 9,
     Odometry = 10,
     Square = 11,
+    Change = 12,
+    GivenPoses = 13,
 }
 
 /// Stream number `index` of a purpose: the only source of generators in this module.

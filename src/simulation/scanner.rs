@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::builder::{LabelledMesh, Material};
+use super::classes;
 use super::ego_motion::SCAN_PERIOD_S;
 use crate::geometry::{Pose3, Rigid3f};
 use crate::lidar::{LidarModel, Scan};
@@ -62,6 +63,8 @@ pub struct ScannerConfig {
     /// Share of all returns that is lost at random, 0 to 1.
     #[default(0.02)]
     pub dropout_share: f64,
+    /// Share of the beams that return from a drop of rain before they reach a surface, 0 to 1.
+    pub false_return_share: f64,
     /// Whether the sensor moves during a revolution; `false` gives motion-compensated scans.
     pub rolling_shutter: bool,
 }
@@ -93,7 +96,8 @@ impl Validate for ScannerConfig {
         )?;
         in_range("reach_m", self.reach_m, 1.0..=10_000.0)?;
         not_negative("range_noise_m", self.range_noise_m)?;
-        fraction("dropout_share", self.dropout_share)
+        fraction("dropout_share", self.dropout_share)?;
+        fraction("false_return_share", self.false_return_share)
     }
 }
 
@@ -216,6 +220,12 @@ fn measure(
     let limits_m = config.min_range_m as f32..config.max_range_m as f32;
     let mut labelled = LabelledScan::default();
     for (&direction, echo) in directions.iter().zip(echoes) {
+        if let Some(range_m) = rain_return_m(config, echo.as_ref(), rng) {
+            labelled.scan.points.push(direction * range_m);
+            labelled.scan.intensities.push(0.02);
+            labelled.classes.push(classes::OUTLIER);
+            continue;
+        }
         let Some(echo) = echo else { continue };
         let dropout: f64 = rng.random();
         let detection: f32 = rng.random();
@@ -234,6 +244,19 @@ fn measure(
         labelled.classes.push(echo.material.class);
     }
     labelled
+}
+
+/// Range of a return from rain [m]: exponentially distributed, since near drops hide those behind them.
+fn rain_return_m(config: &ScannerConfig, echo: Option<&Echo>, rng: &mut impl Rng) -> Option<f32> {
+    /// Mean range beyond the least one [m].
+    const MEAN_M: f32 = 5.0;
+    // Without rain no numbers are drawn: those of the surfaces are the same.
+    if config.false_return_share == 0.0 || !rng.random_bool(config.false_return_share) {
+        return None;
+    }
+    let range_m = config.min_range_m as f32 - MEAN_M * (1.0 - rng.random::<f32>()).ln();
+    let limit_m = echo.map_or(f32::INFINITY, |echo| echo.range_m);
+    (range_m < limit_m.min(config.max_range_m as f32)).then_some(range_m)
 }
 
 /// r_max of a surface [m].
@@ -305,6 +328,7 @@ mod tests {
         reach_m: 1e4,
         range_noise_m: 0.0,
         dropout_share: 0.0,
+        false_return_share: 0.0,
         rolling_shutter: false,
     };
 
@@ -376,6 +400,25 @@ mod tests {
         let kept = scan(&config, |_| Pose3::identity()).scan.len() as f64 / n;
         // Four standard errors of a share.
         assert_relative_eq!(kept, 0.9, epsilon = 4.0 * (0.09 / n).sqrt());
+    }
+
+    #[test]
+    fn the_configured_share_of_beams_returns_from_rain_before_the_walls() {
+        let config = ScannerConfig {
+            false_return_share: 0.1,
+            ..EXACT
+        };
+        let labelled = scan(&config, |_| Pose3::identity());
+        let is_rain = |class: &&u16| **class == classes::OUTLIER;
+        let n = (64 * 360) as f64;
+        let share = labelled.classes.iter().filter(is_rain).count() as f64 / n;
+        // A tenth, without the drops behind the walls at 10 to 15 m: e^(-9.5/5) to e^(-13.6/5) of them.
+        assert!((0.08..0.097).contains(&share), "{share}");
+        for (point, class) in labelled.scan.points.iter().zip(&labelled.classes) {
+            let reach = point.abs().max_element();
+            assert!(reach < 10.001 && (*class == classes::OUTLIER || reach > 9.999));
+        }
+        assert_eq!(labelled.scan.len(), 64 * 360);
     }
 
     #[test]

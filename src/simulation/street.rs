@@ -3,13 +3,14 @@
 
 use std::f64::consts::TAU;
 
-use glam::DVec2;
+use glam::{DVec2, Vec3};
 use rand::RngExt as _;
 use rand_chacha::ChaCha8Rng;
 
 use super::builder::{LabelledMesh, MeshBuilder};
 use super::buildings::{HouseShape, add_garage, add_house};
 use super::centreline::{Centreline, CentrelinePoint};
+use super::classes;
 use super::furniture::{Barrier, add_box, add_bush, add_lamp, add_monument, add_sign, add_tree};
 use super::ground::GroundField;
 use super::ground_mesh::ground_mesh;
@@ -44,17 +45,61 @@ impl Street {
         if let Some(square) = &layout.square {
             site.fill_square(square, &mut stream(seed, Purpose::Square, 0));
         }
+        let before = site.mark();
         site.park_cars(&layout.bays, &mut stream(seed, Purpose::ParkedCar, 0));
+        let parked = before.1..site.occupied.len();
+        if config.changes.parked_cars {
+            // Their ground stays occupied until all else is built, which is the same without them.
+            site.remove_surface_after(before.0);
+        }
         for (number, road) in layout.roads.iter().enumerate() {
             for (side, offset) in [(1.0, 0), (-1.0, 1)] {
                 let side = RoadSide { road, side };
                 let index = 2 * number as u64 + offset;
-                site.add_houses(side, &mut stream(seed, Purpose::House, index));
+                let (mut houses, mut changes) = (
+                    stream(seed, Purpose::House, index),
+                    stream(seed, Purpose::Change, 16 + index),
+                );
+                site.add_houses(side, &mut houses, &mut changes);
                 site.add_furniture(side, &mut stream(seed, Purpose::Furniture, index));
                 site.add_plants(side, &mut stream(seed, Purpose::Plant, index));
             }
         }
-        site.street
+        if config.changes.parked_cars {
+            site.occupied.release(parked);
+            site.park_cars(&layout.bays, &mut stream(seed, Purpose::Change, 1));
+        }
+        let Self {
+            mut surface,
+            ground,
+        } = site.street;
+        for structure in &config.structures {
+            structure.add_to(&mut surface, path, &ground);
+        }
+        if config.changes.foliage_m > 0.0 {
+            displace_foliage(&mut surface, config.changes.foliage_m as f32, seed);
+        }
+        Self { surface, ground }
+    }
+}
+
+/// Displaces the surfaces of crowns, bushes and hedges by waves of a metre or two.
+fn displace_foliage(surface: &mut LabelledMesh, largest_m: f32, seed: u64) {
+    let mut rng = stream(seed, Purpose::Change, 2);
+    let waves: [[Vec3; 2]; 3] = [(); 3].map(|()| {
+        [(); 2].map(|()| Vec3::from_array([(); 3].map(|()| rng.random_range(-6.0..6.0))))
+    });
+    let LabelledMesh { mesh, materials } = surface;
+    for (corners, material) in mesh.triangles.iter().zip(materials) {
+        if material.class == classes::VEGETATION {
+            for &corner in corners {
+                // Each triangle has vertices of its own.
+                let vertex = &mut mesh.vertices[corner as usize];
+                let place = *vertex;
+                let shift = waves.map(|[wave, phase]| (wave.dot(place) + phase.x).sin());
+                *vertex += largest_m * Vec3::from_array(shift);
+            }
+        }
     }
 }
 
@@ -101,6 +146,21 @@ impl Site<'_> {
     fn upright(&mut self, position: DVec2, forward: DVec2) -> MeshBuilder<'_> {
         let world_from_local = self.street.ground.upright_frame(position, forward);
         MeshBuilder::new(&mut self.street.surface, world_from_local)
+    }
+
+    /// Number of triangles and of occupied places so far.
+    fn mark(&self) -> (usize, usize) {
+        (self.street.surface.materials.len(), self.occupied.len())
+    }
+
+    /// Removes the triangles from a number on, which have three vertices each.
+    fn remove_surface_after(&mut self, triangles: usize) {
+        let LabelledMesh { mesh, materials } = &mut self.street.surface;
+        let kept = mesh.triangles.get(triangles).map(|corners| corners[0]);
+        mesh.vertices
+            .truncate(kept.map_or(mesh.vertices.len(), |first| first as usize));
+        mesh.triangles.truncate(triangles);
+        materials.truncate(triangles);
     }
 
     fn fill_square(&mut self, square: &Footprint, rng: &mut ChaCha8Rng) {
@@ -165,7 +225,7 @@ impl Site<'_> {
         }
     }
 
-    fn add_houses(&mut self, side: RoadSide, rng: &mut ChaCha8Rng) {
+    fn add_houses(&mut self, side: RoadSide, rng: &mut ChaCha8Rng, changes: &mut ChaCha8Rng) {
         let mut station_m = rng.random_range(2.0..10.0);
         while station_m < side.length_m() - 4.0 {
             if !rng.random_bool(self.config.built_share) {
@@ -187,11 +247,15 @@ impl Site<'_> {
             };
             let jitter = DVec2::from_angle(rng.random_range(-0.04..0.04));
             let along = jitter.rotate(side.side * side.at(middle_m).forward);
+            let (triangles, _) = self.mark();
             let mut builder = self.upright(front, along);
             if is_garage {
                 add_garage(&mut builder, rng);
             } else {
                 add_house(&mut builder, &shape, rng);
+                if changes.random_bool(self.config.changes.demolished_share) {
+                    self.remove_surface_after(triangles);
+                }
             }
             let gap_m = if rng.random_bool(0.3) {
                 0.3

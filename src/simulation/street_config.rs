@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
+use super::structure::Structure;
 use crate::validation::{InvalidValue, Validate, fraction, in_range, nested};
 
 /// The street and what stands along it.
@@ -32,9 +33,53 @@ pub struct StreetConfig {
     /// Trees and bushes per 100 m of each side.
     #[default(16.0)]
     pub plants_per_100_m: f64,
+    /// Structures along the path: tunnels, guard rails, embankments, yards, hoardings.
+    pub structures: Vec<Structure>,
+    /// What is different from the street of the seed.
+    pub changes: ChangesConfig,
     /// The cross-section.
     pub ground: CrossSectionConfig,
 }
+
+/// What has changed along a street since another drive, a test of localization in an older map.
+///
+/// Defaults: nothing.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ChangesConfig {
+    /// Whether other cars are parked in the bays.
+    pub parked_cars: bool,
+    /// Largest displacement of the surface of crowns, bushes and hedges along each axis [m].
+    pub foliage_m: f64,
+    /// Share of the houses that were torn down, 0 to 1.
+    pub demolished_share: f64,
+}
+
+impl Validate for ChangesConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        in_range("foliage_m", self.foliage_m, 0.0..=5.0)?;
+        fraction("demolished_share", self.demolished_share)
+    }
+}
+
+#[cfg(test)]
+impl StreetConfig {
+    /// Road and ground with nothing on them.
+    pub fn bare() -> Self {
+        Self {
+            has_square: false,
+            side_street_spacing_m: 1e6,
+            built_share: 0.0,
+            parked_share: 0.0,
+            lamp_spacing_m: 1e6,
+            plants_per_100_m: 0.001,
+            ..Self::default()
+        }
+    }
+}
+
+/// Largest number of structures.
+const MAX_STRUCTURES: usize = 200;
 
 impl Validate for StreetConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
@@ -48,6 +93,11 @@ impl Validate for StreetConfig {
         fraction("parked_share", self.parked_share)?;
         in_range("lamp_spacing_m", self.lamp_spacing_m, 6.0..=1e6)?;
         in_range("plants_per_100_m", self.plants_per_100_m, 0.001..=1000.0)?;
+        in_range("structures", self.structures.len(), 0..=MAX_STRUCTURES)?;
+        for (index, structure) in self.structures.iter().enumerate() {
+            nested(&format!("structures.{}", index + 1), structure)?;
+        }
+        nested("changes", &self.changes)?;
         nested("ground", &self.ground)
     }
 }

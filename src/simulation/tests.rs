@@ -464,3 +464,79 @@ fn the_default_configuration_is_the_file_in_config() {
         serde_yaml::from_str(include_str!("../../config/simulation.yml")).unwrap();
     assert_eq!(file, SimulationConfig::default());
 }
+
+#[test]
+fn changes_leave_everything_else_of_the_street_where_it_is() {
+    let count = |street: &Street, class: u16| {
+        let materials = street.surface.materials.iter();
+        materials.filter(|material| material.class == class).count()
+    };
+    let changed = |changes: ChangesConfig| {
+        let mut config = small();
+        config.street.changes = changes;
+        simulate(&config).street
+    };
+    let before = changed(ChangesConfig::default());
+    let others = changed(ChangesConfig {
+        parked_cars: true,
+        ..ChangesConfig::default()
+    });
+    let vertices_of = |street: &Street, class: u16| -> Vec<Vec3> {
+        let LabelledMesh { mesh, materials } = &street.surface;
+        let chosen = (0..materials.len()).filter(|&k| materials[k].class == class);
+        chosen.flat_map(|triangle| mesh.corners(triangle)).collect()
+    };
+    use classes::{BUILDING, CAR, POLE, TRUNK, VEGETATION};
+    for class in [BUILDING, POLE, TRUNK, VEGETATION] {
+        assert_eq!(
+            vertices_of(&before, class),
+            vertices_of(&others, class),
+            "{class}"
+        );
+    }
+    assert_ne!(vertices_of(&before, CAR), vertices_of(&others, CAR));
+    assert!(count(&others, CAR) > 0);
+
+    let demolished = changed(ChangesConfig {
+        demolished_share: 0.5,
+        ..ChangesConfig::default()
+    });
+    let share = count(&demolished, BUILDING) as f64 / count(&before, BUILDING) as f64;
+    assert!((0.2..0.8).contains(&share), "{share}");
+    assert_eq!(
+        vertices_of(&before, VEGETATION),
+        vertices_of(&demolished, VEGETATION)
+    );
+
+    let grown = changed(ChangesConfig {
+        foliage_m: 0.3,
+        ..ChangesConfig::default()
+    });
+    assert_eq!(vertices_of(&before, TRUNK), vertices_of(&grown, TRUNK));
+    let (old, new) = (
+        vertices_of(&before, VEGETATION),
+        vertices_of(&grown, VEGETATION),
+    );
+    let shifts = old
+        .iter()
+        .zip(&new)
+        .map(|(a, b)| (*b - *a).abs().max_element());
+    let shifts: Vec<f32> = shifts.collect();
+    assert!(shifts.iter().all(|&shift_m| shift_m < 0.301));
+    assert!(shifts.iter().sum::<f32>() / shifts.len() as f32 > 0.1);
+}
+
+#[test]
+fn given_poses_of_delayed_stamps_are_those_of_later() {
+    let mut config = small();
+    config.given_poses.delay_s = 0.1;
+    let simulation = simulate(&config);
+    let (truth, given) = (simulation.poses(), simulation.given_poses());
+    for (next, given) in truth[1..].iter().zip(&given) {
+        assert_relative_eq!(next, given, epsilon = 1e-9);
+    }
+    // Drive 1 itself is where its given poses are.
+    for (in_map, given) in simulation.poses_in_map().iter().zip(&given) {
+        assert_relative_eq!(in_map, given, epsilon = 1e-9);
+    }
+}

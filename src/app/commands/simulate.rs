@@ -7,6 +7,7 @@
 //! drive_1/street.ply                the static world in the map frame: ground truth of a map
 //! drive_1/executable.txt            hash of the executable that wrote the drive, written first
 //! drive_1/simulation.yml            the configuration
+//! drive_1/given_poses.txt poses_in_map.txt    only where the configuration gives poses with errors
 //! drive_1/poses.txt                 written last
 //! ```
 //!
@@ -44,6 +45,11 @@ pub enum Existing {
     /// Replaces any drive.
     Replace,
 }
+
+/// Poses with the errors of the configuration; only where it has some.
+pub const GIVEN_POSES_FILE: &str = "given_poses.txt";
+/// True poses in the map that is built with the given poses of drive 1; only where these have errors.
+pub const POSES_IN_MAP_FILE: &str = "poses_in_map.txt";
 
 const EXECUTABLE_FILE: &str = "executable.txt";
 
@@ -105,7 +111,7 @@ fn write_drive(
     } else {
         write_constants(config, &simulation)?;
         let kept = write_scans(&simulation, &folder, progress, interrupt)?;
-        write_tables(&simulation, &folder)?;
+        write_tables(config, &simulation)?;
         kept
     };
     Ok(SimulationReport {
@@ -221,7 +227,7 @@ fn folder_state(config: &SimulationConfig, simulation: &Simulation) -> Result<Fo
         // A recorded path is the same if its poses are, wherever its file is.
         Ok(poses) if poses != poses_text(simulation)? => FolderState::Foreign,
         Ok(_) if !is_same_executable => FolderState::Outdated,
-        Ok(_) if has_all_files(&folder, simulation.frames()) => FolderState::Complete,
+        Ok(_) if has_all_files(config, simulation.frames()) => FolderState::Complete,
         Ok(_) => FolderState::Incomplete,
         Err(_) if is_same_path => FolderState::Incomplete,
         Err(_) => FolderState::Foreign,
@@ -249,9 +255,13 @@ fn map_frame() -> MapFrame {
     }
 }
 
-fn has_all_files(folder: &Path, frames: usize) -> bool {
-    let tables = ["street.ply", "calib.txt", "times.txt", "odometry.txt"];
-    let mut scans = (0..frames).flat_map(|frame| scan_files(folder, frame));
+fn has_all_files(config: &SimulationConfig, frames: usize) -> bool {
+    let folder = config.drive_folder();
+    let mut tables = vec!["street.ply", "calib.txt", "times.txt", "odometry.txt"];
+    if config.given_poses.has_errors() {
+        tables.extend([GIVEN_POSES_FILE, POSES_IN_MAP_FILE]);
+    }
+    let mut scans = (0..frames).flat_map(|frame| scan_files(&folder, frame));
     tables.iter().all(|name| folder.join(name).exists()) && scans.all(|path| path.exists())
 }
 
@@ -338,17 +348,21 @@ fn write_scans(
 }
 
 /// Writes calibration, times, odometry and, last, the poses.
-fn write_tables(simulation: &Simulation, folder: &Path) -> Result<()> {
+fn write_tables(config: &SimulationConfig, simulation: &Simulation) -> Result<()> {
+    let folder = config.drive_folder();
     write_file(&folder.join("calib.txt"), |file| calibration().write(file))?;
     let times_s = simulation.times_s();
     write_file(&folder.join("times.txt"), |file| {
         write_times(file, &times_s)
     })?;
     let frame = map_frame();
-    for (name, poses) in [
-        ("odometry.txt", simulation.odometry()),
-        ("poses.txt", simulation.poses()),
-    ] {
+    let mut tables = vec![("odometry.txt", simulation.odometry())];
+    if config.given_poses.has_errors() {
+        tables.push((GIVEN_POSES_FILE, simulation.given_poses()));
+        tables.push((POSES_IN_MAP_FILE, simulation.poses_in_map()));
+    }
+    tables.push(("poses.txt", simulation.poses()));
+    for (name, poses) in tables {
         write_file(&folder.join(name), |file| {
             write_kitti(file, &poses, &frame.world_from_map(), &frame.calibration)
         })?;

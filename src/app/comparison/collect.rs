@@ -10,11 +10,14 @@ use super::layout::Layout;
 use super::plan::PlannedRun;
 use super::record::RunRecord;
 use super::results::ComparisonResults;
-use super::{keys, page, tables};
+use super::{cases, keys, page, tables};
 use crate::app::commands::claims::Outputs;
 use crate::app::commands::{Context, output, version};
 use crate::app::config::ComparisonConfig;
 use crate::app::reporting::{Table, csv, markdown, text};
+
+/// Page of the sequences that are described as hard cases.
+const CASES_FILE: &str = "cases.md";
 
 /// `comparison.json`.
 #[derive(Serialize)]
@@ -52,6 +55,9 @@ pub fn collect(
     write_tables(&tables, &layout.root)?;
     let page = page::page(&results, &tables, runs, layout)?;
     output::write_text(&layout.root.join("report.html"), &page.to_html())?;
+    if let Some(text) = cases::page(&results, &version::program()?) {
+        output::write_text(&layout.root.join(CASES_FILE), &text)?;
+    }
     output::write_yaml(&layout.root.join("effective_comparison.yml"), config)?;
     let file = ComparisonFile {
         program: version::program()?,
@@ -100,6 +106,7 @@ fn read_results<'a>(
 
 fn prepare(tables: &[Table], folder: &Path, context: &Context) -> Result<()> {
     let fixed = [
+        CASES_FILE,
         "tables.txt",
         "tables.md",
         "report.html",

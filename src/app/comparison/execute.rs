@@ -20,7 +20,9 @@ use crate::app::commands::simulate::{self, Existing};
 use crate::app::commands::{Context, build_map, localize, output, refine, version};
 use crate::app::config::{BuildMapConfig, LocalizationConfig, RefinementConfig};
 use crate::app::results::{LocalizationResults, Report, TrajectoryReport};
+use crate::evaluation::trust::{Trust, TrustedRun, places};
 use crate::evaluation::{EvaluatedTrajectory, RangeMclRules};
+use crate::localization::State;
 
 const MAP_FILE: &str = "map.ply";
 const RESULT_FILE: &str = "localization.npz";
@@ -107,6 +109,10 @@ impl<'a> Executor<'a> {
             program: version::program()?,
             machine: self.machine(stages.report.as_ref()),
             stage_seconds: stages.seconds,
+            trust: match &outcome {
+                Outcome::Finished(_) => trust(&folder.join(RESULT_FILE))?,
+                Outcome::Failed(_) => None,
+            },
             outcome,
         };
         if let Some(report) = &stages.report {
@@ -279,6 +285,40 @@ fn evaluate(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
         .as_deref()
         .zip(results.ground_truth_in_space.as_deref());
     run_output::evaluate_trajectory(&trajectory, in_space, &RangeMclRules::default())
+}
+
+/// Trust in the states of the filter; `None` where the result lacks what it needs.
+fn trust(result: &Path) -> Result<Option<Trust>> {
+    let results = LocalizationResults::read(result)?;
+    let columns = (results.estimates.as_deref())
+        .zip(results.ground_truth.as_deref())
+        .zip(results.covariances.as_deref())
+        .zip(results.states.as_deref());
+    let Some((((estimates, ground_truth), covariances), states)) = columns else {
+        return Ok(None);
+    };
+    let is_tracking: Vec<bool> = (states.iter())
+        .map(|&state| state == State::Tracking as u8)
+        .collect();
+    // Frames without times are a tenth of a second apart.
+    let by_number = || (0..states.len()).map(|row| 0.1 * row as f64).collect();
+    let mut trust = Trust::of(&TrustedRun {
+        estimates,
+        ground_truth,
+        covariances,
+        is_tracking: &is_tracking,
+        times_s: &results.times_s.unwrap_or_else(by_number),
+    });
+    let searching = is_tracking
+        .iter()
+        .take_while(|&&tracking| !tracking)
+        .count();
+    let mut places: Vec<usize> = (0..searching.min(results.particles.len()))
+        .map(|row| places(results.particles.frame(row)))
+        .collect();
+    places.sort_unstable();
+    trust.places = places.get(places.len() / 2).copied();
+    Ok(Some(trust))
 }
 
 /// Name of the processor, on systems with `/proc/cpuinfo`.

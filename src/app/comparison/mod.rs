@@ -53,6 +53,7 @@ mod layout;
 mod plan;
 mod record;
 // Evaluation of the records.
+mod cases;
 mod collect;
 mod measures;
 mod page;

@@ -29,7 +29,7 @@ pub fn page(
         let tables = tables.iter().filter(|t| names.contains(&t.name.as_str()));
         tables.cloned().map(PageElement::Table).collect()
     };
-    let mut sequences = elements(&["by_sequence"]);
+    let mut sequences = elements(&["by_sequence", "states"]);
     sequences.extend(pictures::errors_of_runs(results, layout)?);
     let mut sections = vec![
         section("Missing runs", missing_runs(results, planned)),
@@ -206,11 +206,13 @@ fn overrides_table(config: &ComparisonConfig) -> Table {
         ]
     };
     let base = &config.base;
-    let elements = stages(&base.build_map, &base.localization, &base.refinement);
+    let mut elements = stages(&base.build_map, &base.localization, &base.refinement);
+    elements.push(("simulation", &base.simulation));
     let mut rows = vec![row("all".to_owned(), &elements)];
     for it in &config.sequences {
         let mut elements = stages(&it.build_map, &it.localization, &it.refinement);
         elements.extend(it.simulation.iter().map(|keys| ("simulation", keys)));
+        elements.push(("second_drive", &it.second_drive));
         rows.push(row(format!("sequence {}", it.name), &elements));
     }
     for it in &config.configurations {

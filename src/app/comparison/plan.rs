@@ -5,6 +5,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::record::RunId;
+use crate::app::commands::simulate::{GIVEN_POSES_FILE, POSES_IN_MAP_FILE};
 use crate::app::config::{
     self, BuildMapConfig, ComparisonConfig, LocalizationConfig, OdometrySource, Overrides,
     RefinementConfig, SequenceConfig, VariantConfig, settings,
@@ -76,14 +77,17 @@ fn drives(config: &ComparisonConfig, sequence: &SequenceConfig) -> Result<Vec<Si
     let Some(overrides) = &sequence.simulation else {
         return Ok(Vec::new());
     };
-    let street = with_overrides(SimulationConfig::default(), "simulation", &[overrides])?;
     let output_folder = config.output_folder.join("sequences").join(&sequence.name);
     let drive = |drive| SimulationConfig {
         output_folder: output_folder.clone(),
         drive,
-        ..street.clone()
+        ..SimulationConfig::default()
     };
-    Ok(vec![drive(1), drive(2)])
+    let base = &config.base.simulation;
+    let first = with_overrides(drive(1), "simulation", &[base, overrides])?;
+    let second = [base, overrides, &sequence.second_drive];
+    let second = with_overrides(drive(2), "second_drive", &second)?;
+    Ok(vec![first, second])
 }
 
 /// The run of a configuration in a sequence, with seed 0.
@@ -99,6 +103,7 @@ fn planned_run(
     };
     let mut localization = LocalizationConfig::default();
     if let [first, second] = drives {
+        let has_errors = first.given_poses.has_errors();
         let [first, second] = [first, second].map(SimulationConfig::drive_folder);
         build_map.scan_folder = first.join("velodyne");
         build_map.pose_file = Some(first.join("poses.txt"));
@@ -108,6 +113,10 @@ fn planned_run(
         localization.calib_file = Some(second.join("calib.txt"));
         localization.odometry = OdometrySource::File;
         localization.odometry_file = Some(second.join("odometry.txt"));
+        if has_errors {
+            build_map.pose_file = Some(first.join(GIVEN_POSES_FILE));
+            localization.pose_file = Some(second.join(POSES_IN_MAP_FILE));
+        }
     }
     let base = &config.base;
     let build_map = with_overrides(
@@ -284,6 +293,22 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
             panic!("{run:?}")
         };
         assert_eq!((first.seed, first.drive, second.drive), (7, 1, 2));
+    }
+
+    #[test]
+    fn keys_of_the_second_drive_do_not_change_the_first_and_given_poses_are_mapped() {
+        let text = TEXT.replace(
+            "simulation: {seed: 7, n_scans: 20}",
+            "simulation: {given_poses.noise_m: 0.02}\n  second_drive: {scanner.range_noise_m: 0.07}",
+        );
+        let runs = planned(&text.replace("base:", "base:\n  simulation: {n_scans: 9}")).unwrap();
+        let run = find(&runs, "town/PCA-MCL/3");
+        let noises = [0, 1].map(|drive| run.drives[drive].scanner.range_noise_m);
+        assert_eq!(noises, [0.02, 0.07]);
+        assert!(run.drives.iter().all(|drive| drive.n_scans == 9));
+        let pose_file = |path: &Option<std::path::PathBuf>| path.clone().unwrap();
+        assert!(pose_file(&run.build_map.pose_file).ends_with("drive_1/given_poses.txt"));
+        assert!(pose_file(&run.localization.pose_file).ends_with("drive_2/poses_in_map.txt"));
     }
 
     #[test]

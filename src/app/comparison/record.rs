@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::app::results::TrajectoryReport;
 use crate::evaluation::TrajectoryMetrics;
+use crate::evaluation::trust::Trust;
 
 /// Name of the record in the folder of its run; written last.
 pub const RECORD_FILE: &str = "run.json";
@@ -76,6 +77,9 @@ pub struct RunRecord {
     pub machine: BTreeMap<String, String>,
     /// Wall time per stage, shared stages included [s].
     pub stage_seconds: BTreeMap<String, f64>,
+    /// Trust in the states and covariances of the filter; absent if the run failed.
+    #[serde(default)]
+    pub trust: Option<Trust>,
     /// Outcome of the run.
     pub outcome: Outcome,
 }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 
+use super::cases;
 use super::measures::{Measure, SELECTED, TABLE_1, TABLE_2};
 use super::record::RunRecord;
 use super::results::{ComparisonResults, success_rate, value};
@@ -19,6 +20,7 @@ pub fn tables(results: &ComparisonResults) -> Vec<Table> {
         differences(results),
         by_sequence(results),
         timing(results),
+        cases::states(results),
     ];
     if !results.sweep.is_empty() {
         tables.push(particles(results));

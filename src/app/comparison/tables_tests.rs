@@ -42,6 +42,7 @@ fn run(sequence: &str, configuration: &str, seed: u64, error_m: f64) -> RunRecor
         program: String::new(),
         machine: [].into(),
         stage_seconds: [].into(),
+        trust: None,
         outcome: Outcome::Finished(Box::new(report)),
     }
 }

@@ -41,6 +41,8 @@ pub struct ComparisonConfig {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct StageOverrides {
+    /// Keys of `simulation.yml`, for simulated sequences.
+    pub simulation: Overrides,
     /// Keys of `build_map.yml`.
     pub build_map: Overrides,
     /// Keys of `localization.yml`.
@@ -55,11 +57,17 @@ pub struct StageOverrides {
 pub struct SequenceConfig {
     /// Name in tables and folders.
     pub name: String,
+    /// What is hard about it, for the page of cases; empty for sequences that are no cases.
+    pub about: String,
+    /// What was tried against its failures, for the page of cases.
+    pub tried: String,
     /// Whether to skip the sequence, with a log message, if its files are missing.
     pub optional: bool,
     /// Keys of `simulation.yml` for a simulated sequence, of which drive 1 is mapped and drive 2
     /// localized; `None` for a recording.
     pub simulation: Option<Overrides>,
+    /// Keys of `simulation.yml` for drive 2 alone.
+    pub second_drive: Overrides,
     /// Keys of `build_map.yml`, such as the files of a recording.
     pub build_map: Overrides,
     /// Keys of `localization.yml`.

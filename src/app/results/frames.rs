@@ -4,8 +4,10 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use anyhow::{Context as _, Result};
+use nalgebra::Matrix3;
 
 use super::localization_results::LocalizationResults;
+use crate::evaluation::trust::Axes;
 use crate::evaluation::{PlanarError, distances_m, drift, planar_errors};
 use crate::files::write_atomically;
 use crate::geometry::{Pose2, Pose3};
@@ -48,6 +50,7 @@ impl FrameTable {
         table.add_poses("truth", truth);
         table.add_poses("mcl", Some(estimates));
         table.add_errors("mcl", Some(estimates), truth);
+        table.add_deviations(results.covariances.as_deref(), estimates);
         table.add_poses("refined", refined);
         table.add_errors("refined", refined, truth);
         table.add("particles", particles.as_deref(), usize::to_string);
@@ -142,6 +145,25 @@ impl FrameTable {
         });
     }
 
+    /// Adds the axes of the covariance of the position: a long one is a direction that the scene does not constrain.
+    fn add_deviations(&mut self, covariances: Option<&[Matrix3<f64>]>, estimates: &[Pose2]) {
+        let axes: Option<Vec<Axes>> = covariances.map(|covariances| {
+            let pairs = covariances.iter().zip(estimates);
+            pairs
+                .map(|(covariance, pose)| Axes::of(covariance, pose))
+                .collect()
+        });
+        let axes = axes.as_deref();
+        self.add_numbers("mcl_sigma_long_m", axes, |axes| axes.long_m);
+        self.add_numbers("mcl_sigma_short_m", axes, |axes| axes.short_m);
+        self.add_numbers("mcl_long_axis_from_forward_deg", axes, |axes| {
+            axes.long_from_forward_rad.to_degrees()
+        });
+        self.add_numbers("mcl_sigma_heading_deg", covariances, |covariance| {
+            covariance[(2, 2)].max(0.0).sqrt().to_degrees()
+        });
+    }
+
     fn write(&self, file: &mut impl Write) -> io::Result<()> {
         let mut writer = csv::Writer::from_writer(file);
         writer.write_record(self.columns.iter().map(|(title, _)| title))?;
@@ -176,6 +198,7 @@ mod tests {
             estimates: Some(estimates),
             ground_truth: Some(truth),
             runtimes_s: Some(vec![0.01, 0.02, 0.03]),
+            covariances: Some(vec![Matrix3::from_diagonal(&[0.01, 4.0, 1e-4].into()); 3]),
             ..LocalizationResults::default()
         };
         write_frames_csv(&path, &results).unwrap();
@@ -193,6 +216,10 @@ mod tests {
         assert_eq!(cell(2, "mcl_across_error_m"), "0.2500");
         assert_eq!(cell(2, "runtime_ms"), "20.0000");
         assert_eq!(cell(2, "particles"), "2");
+        assert_eq!(cell(2, "mcl_sigma_long_m"), "2.0000");
+        assert_eq!(cell(2, "mcl_sigma_short_m"), "0.1000");
+        // Along y of the map, of a car that heads 0.1 rad to the left of x.
+        assert_eq!(cell(2, "mcl_long_axis_from_forward_deg"), "84.2704");
         assert_eq!(cell(2, "time_s"), "");
         assert_eq!(cell(2, "refined_x_m"), "");
     }
