@@ -239,8 +239,8 @@ pub fn cast_rays<'py>(
     const TOLERANCE: f32 = 1e-3;
     let map_from_lidar = arrays::poses("poses", &poses)?;
     let directions = arrays::vectors("directions", &directions)?;
-    let not_unit = |direction: &glam::Vec3| !((direction.length() - 1.0).abs() < TOLERANCE);
-    if let Some(row) = directions.iter().position(not_unit) {
+    let is_unit = |direction: &glam::Vec3| (direction.length() - 1.0).abs() < TOLERANCE;
+    if let Some(row) = directions.iter().position(|it| !is_unit(it)) {
         return Err(PyValueError::new_err(format!(
             "direction {row} is {}, which is no unit vector; divide directions by their lengths",
             directions[row]

@@ -155,7 +155,7 @@ impl Sensor {
     /// Height above the ground [m]; None where too little ground is visible.
     #[getter]
     fn height(&self) -> Option<f64> {
-        Some(self.0.mounting.as_ref()?.height_m.into())
+        Some(self.0.mounting.as_ref()?.height_m)
     }
 
     /// Rectangle with returns of the own car: x_min, x_max, y_min, y_max, frame of the lidar [m]; None if there are none.
