@@ -77,16 +77,16 @@ impl SmoothingConfig {
         if pairs.len() < MIN_PAIRS {
             return self.clone();
         }
-        let median = |value: &dyn Fn(&(Vector3<f64>, Vector3<f64>)) -> f64| {
-            let mut values: Vec<f64> = pairs.iter().map(value).collect();
+        let median = |values: &mut dyn Iterator<Item = f64>| {
+            let mut values: Vec<f64> = values.collect();
             values.sort_by(f64::total_cmp);
             values[values.len() / 2]
         };
         // A variance by the median of n differences has a relative standard deviation of 2.3 / sqrt(n).
         let certain = 6.0 / (pairs.len() as f64).sqrt();
         let noise = |axis: usize, least: f64| {
-            let difference = SIGMA_PER_MEDIAN * median(&|pair| pair.0[axis]);
-            let explained = (1.0 + certain) * median(&|pair| pair.1[axis]);
+            let difference = SIGMA_PER_MEDIAN * median(&mut pairs.iter().map(|pair| pair.0[axis]));
+            let explained = (1.0 + certain) * median(&mut pairs.iter().map(|pair| pair.1[axis]));
             let variance = difference.powi(2) - explained;
             variance.max(least * least).sqrt()
         };
