@@ -74,7 +74,7 @@ impl Street {
             ground,
         } = site.street;
         for structure in &config.structures {
-            structure.add_to(&mut surface, path, &ground);
+            structure.add_to(&mut surface, path, &|at| ground.at(at).height_m);
         }
         if config.changes.foliage_m > 0.0 {
             displace_foliage(&mut surface, config.changes.foliage_m as f32, seed);

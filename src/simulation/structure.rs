@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 use super::builder::{LabelledMesh, Material, MeshBuilder};
 use super::centreline::Centreline;
 use super::classes;
-use super::ground::GroundField;
 use crate::geometry::{Pose3, Rigid3f};
 use crate::validation::{InvalidValue, Validate, in_range, require};
 
@@ -77,8 +76,13 @@ impl Structure {
         around_m * length_m
     }
 
-    /// Adds the surface to a mesh in the world frame.
-    pub fn add_to(&self, target: &mut LabelledMesh, path: &Centreline, ground: &GroundField) {
+    /// Adds the surface to a mesh in the world frame, in which the road has a height [m] at each position.
+    pub fn add_to(
+        &self,
+        target: &mut LabelledMesh,
+        path: &Centreline,
+        road_m: &impl Fn(DVec2) -> f32,
+    ) {
         let mut builder = MeshBuilder::new(target, Rigid3f::from(&Pose3::identity()));
         let Material { class, reflectance } = Material::new(classes::OTHER_STRUCTURE, REFLECTANCE);
         builder.set_material(class, reflectance);
@@ -86,7 +90,7 @@ impl Structure {
             let steps = ((to_m - from_m) / STEP_M).ceil().max(1.0) as usize;
             let rings: Vec<Vec<Vec3>> = (0..=steps)
                 .map(|step| from_m + (to_m - from_m) * step as f64 / steps as f64)
-                .map(|station_m| self.corners_at(station_m, path, ground))
+                .map(|station_m| self.corners_at(station_m, path, road_m))
                 .collect();
             for pair in rings.windows(2) {
                 for corner in 0..self.outline.len() {
@@ -119,9 +123,14 @@ impl Structure {
         })
     }
 
-    fn corners_at(&self, station_m: f64, path: &Centreline, ground: &GroundField) -> Vec<Vec3> {
+    fn corners_at(
+        &self,
+        station_m: f64,
+        path: &Centreline,
+        road_m: &impl Fn(DVec2) -> f32,
+    ) -> Vec<Vec3> {
         let point = path.at(station_m);
-        let road_m = ground.at(point.position).height_m;
+        let road_m = road_m(point.position);
         let corner = |&[left_m, height_m]: &[f64; 2]| {
             let place = point.beside(left_m);
             Vec3::new(place.x as f32, place.y as f32, road_m + height_m as f32)

@@ -56,7 +56,7 @@ pub fn page(results: &ComparisonResults, program: &str) -> Option<String> {
         let _ = write!(text, "\n## {}\n\n{}\n", case.name, case.about);
         let _ = write!(
             text,
-            "\n![{0}: map and path](hard-cases/{0}.png)\n",
+            "\n![{0}: map and path](plots/paths_{0}.png)\n",
             case.name
         );
         for variant in &results.config.configurations {
