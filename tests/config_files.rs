@@ -56,6 +56,7 @@ fn check_round_trip(path: &Path) {
         "evaluation.yml" => round_trip::<EvaluationConfig>(path),
         "simulation.yml" => round_trip::<SimulationConfig>(path),
         "comparison.yml"
+        | "comparison_hard_starts.yml"
         | "comparison_kitti.yml"
         | "comparison_refiners.yml"
         | "hard_cases.yml" => {

@@ -113,10 +113,18 @@ fn simulations_are_bounded() {
         ("odometry.step_noise_m", "1e300", "100"),
         ("given_poses.noise_m", "1e300", "100"),
         ("street.changes.foliage_m", "1e300", "5"),
-        ("street.structures", "[{to_m: 1e9}]", "101000"),
-        ("street.structures", "[{spacing_m: 1e-9}]", "10000"),
     ] {
         refuses("simulate", key, value, limit);
+    }
+    for (value, parts) in [
+        ("[{to_m: 1e9}]", ["street.structures.1.to_m is ", "101000"]),
+        (
+            "[{spacing_m: 1e-9}]",
+            ["street.structures.1.spacing_m is ", "10000"],
+        ),
+    ] {
+        let call = fpmcl("simulate").set("street.structures", value);
+        call.fails_with(&parts);
     }
 }
 
