@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
 use tracing::level_filters::LevelFilter;
 
+use crate::app::commands::output::Form;
 use crate::app::comparison::RunId;
 use crate::recording::scan_files;
 use crate::rendering::Backend;
@@ -21,6 +22,14 @@ pub struct Cli {
     /// Print details; twice for everything.
     #[arg(short, long, global = true, action = ArgAction::Count)]
     pub verbose: u8,
+
+    /// Print all rows of tables, not the twelve most important ones only.
+    #[arg(long, global = true)]
+    pub all: bool,
+
+    /// Print JSON instead of tables.
+    #[arg(long, global = true)]
+    pub json: bool,
 
     /// The command.
     #[command(subcommand)]
@@ -92,6 +101,14 @@ Examples:
   fpmcl evaluate config/evaluation.yml")]
     Evaluate(EvaluateArgs),
 
+    /// Write a result or a map in the formats of viewers: MCAP for Foxglove and rerun, glTF for others.
+    #[command(after_help = "\
+Examples:
+  fpmcl export results/localization.npz --mcap run.mcap
+  fpmcl export results/localization.npz --glb run.glb
+  fpmcl export map.ply --glb map.glb")]
+    Export(ExportArgs),
+
     /// Compare configurations: sequences x configurations x seeds.
     #[command(after_help = "\
 Examples:
@@ -131,6 +148,35 @@ Examples:
 
     /// Show instruction sets, graphics adapters and ray-casting speed of this machine.
     Doctor(DoctorArgs),
+
+    /// Print the completions of a shell.
+    #[command(after_help = "\
+Examples:
+  fpmcl completions bash > ~/.local/share/bash-completion/completions/fpmcl
+  fpmcl completions zsh > ~/.zfunc/_fpmcl")]
+    Completions(CompletionsArgs),
+
+    /// Print the manual page, of the program or of a command.
+    #[command(after_help = "\
+Examples:
+  fpmcl man | man -l -
+  fpmcl man localize > ~/.local/share/man/man1/fpmcl-localize.1")]
+    Man(ManArgs),
+}
+
+/// Arguments of `completions`.
+#[derive(Clone, Debug, Args)]
+pub struct CompletionsArgs {
+    /// The shell.
+    #[arg(value_enum)]
+    pub shell: clap_complete::Shell,
+}
+
+/// Arguments of `man`.
+#[derive(Clone, Debug, Args)]
+pub struct ManArgs {
+    /// The command; by default the whole program.
+    pub command: Option<String>,
 }
 
 /// Arguments of `config`.
@@ -284,6 +330,10 @@ pub struct LocalizeArgs {
     /// Result to write (.npz); sets the key `result_path`.
     #[arg(long, value_name = "RESULT")]
     pub output: Option<PathBuf>,
+
+    /// Log to write afterwards, for Foxglove and rerun (.mcap), as `export` does.
+    #[arg(long, value_name = "FILE")]
+    pub mcap: Option<PathBuf>,
 }
 
 /// Arguments of `refine`.
@@ -344,6 +394,38 @@ pub struct EvaluateArgs {
     /// Folder of the report; sets the key `output_folder`.
     #[arg(long, value_name = "FOLDER")]
     pub output: Option<PathBuf>,
+}
+
+/// Arguments of `export`.
+#[derive(Clone, Debug, Args)]
+#[command(group = clap::ArgGroup::new("format").required(true).multiple(true))]
+pub struct ExportArgs {
+    /// Result of `localize` or `refine` (.npz), or a map (.ply, .obj, .stl).
+    pub input: PathBuf,
+
+    /// Log to write: poses with covariances, states, particles, scans in the map frame, the map (.mcap).
+    #[arg(long, value_name = "FILE", group = "format")]
+    pub mcap: Option<PathBuf>,
+
+    /// Model to write: the map, and the path of a result colored by its error (.glb).
+    #[arg(long, value_name = "FILE", group = "format")]
+    pub glb: Option<PathBuf>,
+
+    /// Recording of the result; by default that of its localization.
+    #[arg(long, value_name = "RECORDING")]
+    pub recording: Option<PathBuf>,
+
+    /// Map of the result; by default that of its localization.
+    #[arg(long, value_name = "MAP")]
+    pub map: Option<PathBuf>,
+
+    /// Largest number of points per scan in a log; 0 for a log without scans.
+    #[arg(long, value_name = "N", default_value_t = 30_000)]
+    pub points: usize,
+
+    /// Replace existing files.
+    #[arg(long)]
+    pub force: bool,
 }
 
 /// Arguments of `demo`.
@@ -467,6 +549,15 @@ impl From<BackendArg> for Backend {
 }
 
 impl Cli {
+    /// Form of what is printed on standard output.
+    pub fn form(&self) -> Form {
+        match (self.json, self.all) {
+            (true, _) => Form::Json,
+            (false, true) => Form::All,
+            (false, false) => Form::Main,
+        }
+    }
+
     /// Least important messages on standard error.
     pub fn level(&self) -> LevelFilter {
         match (self.quiet, self.verbose) {
@@ -491,7 +582,12 @@ impl Command {
             Self::Compare(args) => args.source.machine,
             Self::Demo(args) => args.machine,
             Self::Ground(args) => args.machine,
-            Self::Config(_) | Self::Doctor(_) | Self::Info(_) => MachineArgs::default(),
+            Self::Completions(_)
+            | Self::Config(_)
+            | Self::Doctor(_)
+            | Self::Export(_)
+            | Self::Info(_)
+            | Self::Man(_) => MachineArgs::default(),
         }
     }
 }
@@ -590,6 +686,21 @@ impl RefineArgs {
         let uncertainty = self.uncertainty.as_ref();
         settings.extend(uncertainty.map(|given| ("uncertainty".to_owned(), format!("[{given}]"))));
         [settings, self.run.flags()].concat()
+    }
+}
+
+impl ExportArgs {
+    /// A log of a result.
+    pub fn log_of(result: &Path, log: &Path, force: bool) -> Self {
+        Self {
+            input: result.to_owned(),
+            mcap: Some(log.to_owned()),
+            glb: None,
+            recording: None,
+            map: None,
+            points: 30_000,
+            force,
+        }
     }
 }
 

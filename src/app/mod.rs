@@ -4,6 +4,7 @@ pub mod cli;
 pub mod commands;
 pub mod comparison;
 pub mod config;
+pub mod export;
 pub mod plotting;
 pub mod reporting;
 pub mod results;
@@ -21,7 +22,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     let cli = Cli::parse_from(arguments);
     let run = || {
         let context = Context::new(cli.level(), cli.command.machine())?;
-        commands::run(&cli.command, &context)
+        commands::run(&cli.command, cli.form(), &context)
     };
     match run() {
         Ok(()) => 0,

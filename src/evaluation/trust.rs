@@ -8,12 +8,13 @@
 //! inside      share of tracking frames with  eᵀ Σ⁻¹ e ≤ 7.815,  e = (x, y, heading),   95 % of χ² with 3 degrees
 //! ```
 
-use nalgebra::{Matrix2, Matrix3, Vector3};
+use nalgebra::{Matrix2, Matrix3};
 use serde::{Deserialize, Serialize};
 
-use super::planar::planar_errors;
+use super::planar::{PlanarError, planar_errors};
 use super::range_mcl::ParticleRow;
-use crate::geometry::{Pose2, wrap_angle};
+use crate::geometry::Pose2;
+use crate::statistics::median;
 
 /// Position error from which on a frame is wrong [m].
 pub const WRONG_M: f64 = 0.5;
@@ -75,7 +76,8 @@ impl Trust {
         let tracked: Vec<usize> = (0..errors.len()).filter(|&k| run.is_tracking[k]).collect();
         let is_wrong = |k: usize| errors[k].distance_m() > WRONG_M;
         let first = tracked.first().copied();
-        let inside = tracked.iter().filter(|&&k| is_inside(run, k)).count();
+        let is_inside = |k: usize| is_inside(&errors[k], &run.covariances[k]);
+        let inside = tracked.iter().filter(|&&k| is_inside(k)).count();
         let widest = (tracked
             .iter()
             .map(|&k| Axes::of(&run.covariances[k], &run.estimates[k])))
@@ -155,21 +157,11 @@ pub fn places(particles: &[ParticleRow]) -> usize {
         .count()
 }
 
-fn is_inside(run: &TrustedRun, frame: usize) -> bool {
+fn is_inside(error: &PlanarError, covariance: &Matrix3<f64>) -> bool {
     const QUANTILE: f64 = 7.815;
-    let (estimate, truth) = (&run.estimates[frame], &run.ground_truth[frame]);
-    let offset = truth.translation.vector - estimate.translation.vector;
-    let turn = wrap_angle(truth.rotation.angle() - estimate.rotation.angle());
-    let error = Vector3::new(offset.x, offset.y, turn);
-    let inverse = run.covariances[frame].try_inverse();
+    let error = error.offset_in_map.push(error.turn_rad);
+    let inverse = covariance.try_inverse();
     inverse.is_some_and(|inverse| error.dot(&(inverse * error)) <= QUANTILE)
-}
-
-/// Median of some values; `None` without values.
-fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let mut values: Vec<f64> = values.collect();
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied()
 }
 
 /// Longest time during which successive frames meet a condition, up to the frame after the last of them [s].
@@ -190,6 +182,7 @@ fn longest_s(times_s: &[f64], holds: impl Fn(usize) -> bool) -> f64 {
 #[cfg(test)]
 mod tests {
     use approx::assert_relative_eq;
+    use nalgebra::Vector3;
 
     use super::*;
 

@@ -33,6 +33,13 @@ pub enum State {
 }
 
 impl State {
+    /// The state of a number in a result; `None` if it is of no state.
+    pub fn of_number(number: u8) -> Option<Self> {
+        [Self::Searching, Self::Tracking, Self::Lost]
+            .into_iter()
+            .find(|state| *state as u8 == number)
+    }
+
     /// Name of the state in reports.
     pub fn word(self) -> &'static str {
         match self {

@@ -19,6 +19,7 @@ use super::odometer::{Odometer, OdometryEstimate, StepState};
 use super::timing::TimingError;
 use crate::geometry::Pose3;
 use crate::lidar::Scan;
+use crate::statistics::median;
 
 /// Poses as they are given.
 #[derive(Clone, Copy, Debug)]
@@ -103,11 +104,8 @@ impl MotionDifference {
     const RADIUS_M: f64 = 10.0;
 
     fn median(differences: &[Pose3]) -> Self {
-        let median = |value: &dyn Fn(&Pose3) -> f64| {
-            let mut values: Vec<f64> = differences.iter().map(value).collect();
-            values.sort_by(f64::total_cmp);
-            values.get(values.len() / 2).copied().unwrap_or(0.0)
-        };
+        let median =
+            |value: &dyn Fn(&Pose3) -> f64| median(differences.iter().map(value)).unwrap_or(0.0);
         let translation_m = |pose: &Pose3| pose.translation.vector.norm();
         let rotation_rad = |pose: &Pose3| pose.rotation.angle();
         Self {

@@ -16,6 +16,7 @@ use smart_default::SmartDefault;
 
 use crate::geometry::Pose2;
 use crate::localization::particles::deviation;
+use crate::statistics::median;
 use crate::validation::{InvalidValue, Validate, in_range, positive};
 
 /// Least noise of the odometry and robustness against wrong frames.
@@ -60,7 +61,7 @@ impl SmoothingConfig {
         const MIN_PAIRS: usize = 10;
         /// Standard deviations per median of the magnitudes of a normal distribution.
         const SIGMA_PER_MEDIAN: f64 = 1.4826;
-        let pairs: Vec<(Vector3<f64>, Vector3<f64>)> = (priors.windows(2))
+        let (differences, explained): (Vec<Vector3<f64>>, Vec<Vector3<f64>>) = (priors.windows(2))
             .zip(increments.get(1..).unwrap_or_default())
             .filter_map(|(pair, increment)| {
                 let (a, b) = (pair[0].as_ref()?, pair[1].as_ref()?);
@@ -73,20 +74,18 @@ impl SmoothingConfig {
                     sum.diagonal(),
                 ))
             })
-            .collect();
-        if pairs.len() < MIN_PAIRS {
+            .unzip();
+        if differences.len() < MIN_PAIRS {
             return self.clone();
         }
-        let median = |values: &mut dyn Iterator<Item = f64>| {
-            let mut values: Vec<f64> = values.collect();
-            values.sort_by(f64::total_cmp);
-            values[values.len() / 2]
+        let median_of = |values: &[Vector3<f64>], axis: usize| {
+            median(values.iter().map(|value| value[axis])).unwrap_or(0.0)
         };
         // A variance by the median of n differences has a relative standard deviation of 2.3 / sqrt(n).
-        let certain = 6.0 / (pairs.len() as f64).sqrt();
+        let certain = 6.0 / (differences.len() as f64).sqrt();
         let noise = |axis: usize, least: f64| {
-            let difference = SIGMA_PER_MEDIAN * median(&mut pairs.iter().map(|pair| pair.0[axis]));
-            let explained = (1.0 + certain) * median(&mut pairs.iter().map(|pair| pair.1[axis]));
+            let difference = SIGMA_PER_MEDIAN * median_of(&differences, axis);
+            let explained = (1.0 + certain) * median_of(&explained, axis);
             let variance = difference.powi(2) - explained;
             variance.max(least * least).sqrt()
         };

@@ -7,6 +7,7 @@ use std::f64::consts::TAU;
 
 use super::beam::angles;
 use crate::lidar::{RotationDirection, Scan};
+use crate::statistics::median;
 
 /// Frames per second of sensors, at least and at most [s].
 const PERIODS_S: std::ops::RangeInclusive<f64> = 0.019..=0.22;
@@ -54,10 +55,4 @@ fn bounds(scan: &Scan) -> Option<(f64, f64)> {
     let times = || scan.times_s.iter().map(|&time_s| f64::from(time_s));
     let (first, last) = (times().reduce(f64::min)?, times().reduce(f64::max)?);
     (first < last && last - first < 1e3).then_some((first, last))
-}
-
-fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let mut values: Vec<f64> = values.collect();
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied()
 }

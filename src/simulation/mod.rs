@@ -138,14 +138,12 @@ impl Simulation {
 
     /// True lidar poses of all scans: `p_world = world_from_lidar * p_lidar`.
     pub fn poses(&self) -> Vec<Pose3> {
-        (0..self.frames())
-            .map(|frame| self.world_from_lidar(time_s(frame)))
-            .collect()
+        self.poses_on(&self.ego_motion, 0.0)
     }
 
     /// The poses that odometry reports, in the world frame, starting at the true first pose.
     pub fn odometry(&self) -> Vec<Pose3> {
-        let mut poses = self.poses_at_given_times(&self.ego_motion, self.frames());
+        let mut poses = self.poses_on(&self.ego_motion, self.delay_s());
         // A drive that ends before the vehicle is displaced is not affected.
         let kidnapped_at = self.ego_motion.kidnapped_at;
         if let Some(frame) = kidnapped_at.filter(|&frame| frame < poses.len()) {
@@ -168,22 +166,17 @@ impl Simulation {
     pub fn given_poses(&self) -> Vec<Pose3> {
         let config = &self.config.given_poses;
         let mut rng = self.given_stream(self.config.drive);
-        let poses = self.poses_at_given_times(&self.ego_motion, self.frames());
+        let poses = self.poses_on(&self.ego_motion, self.delay_s());
         let poses = config.without_noise(&poses, &mut rng);
         config.with_noise(&poses, &mut rng)
     }
 
     /// The true poses, as the map of drive 1 has them that is built with its given poses.
     pub fn poses_in_map(&self) -> Vec<Pose3> {
-        let frames = self.mapping_motion.stations_m.len();
-        let true_pose = |frame| {
-            let ground = &self.street.ground;
-            self.mapping_motion.world_from_lidar(ground, time_s(frame))
-        };
-        let mapped: Vec<Pose3> = (0..frames).map(true_pose).collect();
-        let given = self.poses_at_given_times(&self.mapping_motion, frames);
+        let mapped = self.poses_on(&self.mapping_motion, 0.0);
+        let delayed = self.poses_on(&self.mapping_motion, self.delay_s());
         let config = &self.config.given_poses;
-        let given = config.without_noise(&given, &mut self.given_stream(1));
+        let given = config.without_noise(&delayed, &mut self.given_stream(1));
         bent_poses(&self.poses(), &mapped, &given)
     }
 
@@ -191,10 +184,13 @@ impl Simulation {
         stream(self.config.seed, Purpose::GivenPoses, drive.into())
     }
 
-    /// Poses at the times to which the scans are stamped.
-    fn poses_at_given_times(&self, motion: &EgoMotion, frames: usize) -> Vec<Pose3> {
-        let delay_s = self.config.given_poses.delay_s;
-        (0..frames)
+    fn delay_s(&self) -> f64 {
+        self.config.given_poses.delay_s
+    }
+
+    /// True poses on a drive, a delay after each of its scans.
+    fn poses_on(&self, motion: &EgoMotion, delay_s: f64) -> Vec<Pose3> {
+        (0..motion.stations_m.len())
             .map(|frame| motion.world_from_lidar(&self.street.ground, time_s(frame) + delay_s))
             .collect()
     }

@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 
+use super::output::{Form, Printed};
 use super::simulate::{self, Existing};
 use super::{Context, build_map, localize, refine};
 use crate::app::cli::DemoArgs;
@@ -15,8 +16,8 @@ use crate::simulation::SimulationConfig;
 const FRAMES: usize = 160;
 
 /// Simulates two drives through one street, builds a map from the first, localizes the second in
-/// it, refines and evaluates its trajectory; returns the table for standard output.
-pub fn run(args: &DemoArgs, context: &Context) -> Result<String> {
+/// it, refines and evaluates its trajectory; returns what to print.
+pub fn run(args: &DemoArgs, context: &Context) -> Result<Printed> {
     let started = Instant::now();
     let seed = args.seed.unwrap_or(1);
     let street = args.output.join("street");
@@ -45,15 +46,21 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<String> {
     let refinement = RefinementConfig::of(localization);
     let report = refine::run(&refinement, context).context("while refining")?;
 
-    Ok(format!(
-        "{}\n{}\n{:<24} {:>13.1} s\n{:<24} {}\n",
-        build.table(),
-        report.to_text(),
-        "all of it took",
-        started.elapsed().as_secs_f64(),
-        "pictures",
-        args.output.join("plots").display()
-    ))
+    let seconds = started.elapsed().as_secs_f64();
+    let page = args.output.join("report.html");
+    let text = |form: Form, all: bool| -> Result<String> {
+        Ok(format!(
+            "{}\n{}\nall of it took {seconds:.1} s; open {}\n",
+            build.printed()?.in_form(form),
+            report.to_text(all),
+            page.display()
+        ))
+    };
+    Printed::parts(text(Form::Main, false)?, text(Form::All, true)?).with_json(&serde_json::json!({
+        "build_map": build,
+        "localization": report,
+        "seconds": seconds,
+    }))
 }
 
 fn build_map_config(output: &Path, drive: &Path, seed: u64) -> BuildMapConfig {

@@ -1,11 +1,12 @@
 //! `doctor`: instruction sets, graphics adapters and rendering speed of this machine.
 
+use std::collections::BTreeMap;
 use std::env::consts::{ARCH, OS};
-use std::fmt::Write as _;
 use std::thread::available_parallelism;
 use std::time::{Duration, Instant};
 
-use super::{Context, output, version};
+use super::output::Printed;
+use super::{Context, version};
 use crate::app::cli::DoctorArgs;
 use crate::lidar::LidarModel;
 use crate::map::{TileConfig, TileGrid, tiles};
@@ -16,8 +17,8 @@ use crate::simulation::{Simulation, SimulationConfig};
 /// Number of poses whose images are rendered at once, as in the benchmark.
 const POSES: usize = 8;
 
-/// Prints the properties of this machine, one per line.
-pub(super) fn run(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
+/// The properties of this machine, one per line.
+pub(super) fn run(args: &DoctorArgs, context: &Context) -> anyhow::Result<Printed> {
     let choice = selection::choose(Backend::Auto)?;
     let processors = available_parallelism().map_or("unknown".to_owned(), |n| n.to_string());
     let graphics = if cfg!(feature = "gpu") {
@@ -42,11 +43,15 @@ pub(super) fn run(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
         let time = Duration::from_secs(args.measure);
         rows.push(("rays", rays_per_second(time, context)?));
     }
-    let mut table = String::new();
-    for (what, value) in rows {
-        writeln!(table, "{what:<18}{value}")?;
-    }
-    output::print(&table)
+    let table = (rows.iter()).map(|(what, value)| format!("{what:<18}{value}\n"));
+    let json: BTreeMap<&str, Vec<&str>> =
+        rows.iter()
+            .fold(BTreeMap::new(), |mut json, (what, value)| {
+                // A machine may have several adapters.
+                json.entry(*what).or_default().push(value);
+                json
+            });
+    Printed::text(table.collect::<String>()).with_json(&json)
 }
 
 /// An adapter, its driver, and the reason if it cannot be used.

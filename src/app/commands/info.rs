@@ -6,7 +6,7 @@ use std::path::Path;
 use anyhow::{Result, bail, ensure};
 use serde::{Deserialize, Serialize};
 
-use super::output;
+use super::output::Printed;
 use super::stages::{self, is_bag, sample};
 use crate::app::cli::InfoArgs;
 use crate::app::config;
@@ -34,7 +34,7 @@ impl Validate for InfoConfig {
 }
 
 /// Describes what is at a path.
-pub fn run(args: &InfoArgs) -> Result<String> {
+pub fn run(args: &InfoArgs) -> Result<Printed> {
     let path = args.path.as_path();
     let config = config::with_settings(InfoConfig::default(), &args.settings)?;
     ensure!(
@@ -55,7 +55,7 @@ pub fn run(args: &InfoArgs) -> Result<String> {
     }
 }
 
-fn recording(path: &Path, topic: Option<&str>) -> Result<String> {
+fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
     let recording = Recording::open(path, topic, &Selection::default())?;
     let frames = &recording.frames;
     let (first, last) = (&frames[0], &frames[frames.len() - 1]);
@@ -94,7 +94,7 @@ fn recording(path: &Path, topic: Option<&str>) -> Result<String> {
         ("build-map", build_map),
         ("localize", "ready; needs a map: --map MAP".to_owned()),
     ]);
-    Ok(output::rows(&rows))
+    Ok(Printed::rows(&rows))
 }
 
 /// The fields of the points.
@@ -158,7 +158,7 @@ fn track_in_words(track: &PoseTrack, recording: &Recording) -> String {
 }
 
 /// A single scan, or a point cloud.
-fn cloud(path: &Path) -> Result<String> {
+fn cloud(path: &Path) -> Result<Printed> {
     /// Points of the largest scans; more are a cloud of many scans, which show no sensor.
     const MAX_SCAN: usize = 1_000_000;
     let cloud = scan_files::read_cloud(path)?;
@@ -182,7 +182,7 @@ fn cloud(path: &Path) -> Result<String> {
         ("build-map", "ready; as a point cloud".to_owned()),
         ("localize", needs.to_owned()),
     ]);
-    Ok(output::rows(&rows))
+    Ok(Printed::rows(&rows))
 }
 
 fn extent(bounds: Aabb) -> String {
@@ -193,7 +193,7 @@ fn extent(bounds: Aabb) -> String {
     )
 }
 
-fn map(path: &Path) -> Result<String> {
+fn map(path: &Path) -> Result<Printed> {
     let (mesh, mapping_path) = ply::read_map(path)?;
     let path = match mapping_path {
         Some(path) if !path.map_from_lidar.is_empty() => {
@@ -201,14 +201,14 @@ fn map(path: &Path) -> Result<String> {
         }
         _ => "none".to_owned(),
     };
-    Ok(output::rows(&[
+    Ok(Printed::rows(&[
         ("triangles", mesh.triangles.len().to_string()),
         ("extent", extent(Aabb::of(mesh.vertices.iter().copied()))),
         ("path", path),
     ]))
 }
 
-fn result(path: &Path) -> Result<String> {
+fn result(path: &Path) -> Result<Printed> {
     let results = LocalizationResults::read(path)?;
     let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
     let summary = RunSummary::of(&results, &estimates);
@@ -218,5 +218,5 @@ fn result(path: &Path) -> Result<String> {
         .collect();
     rows.push(("refined", yes(results.refined.is_some())));
     rows.push(("true poses", yes(results.ground_truth.is_some())));
-    Ok(output::rows(&rows))
+    Ok(Printed::rows(&rows))
 }

@@ -6,6 +6,7 @@ mod compare;
 mod demo;
 mod doctor;
 pub mod evaluate;
+mod export;
 pub mod ground;
 mod info;
 pub mod localize;
@@ -18,6 +19,7 @@ mod context;
 mod input;
 pub mod interrupt;
 mod logging;
+mod manual;
 mod motion_source;
 pub mod output;
 pub mod progress;
@@ -29,44 +31,62 @@ pub mod version;
 
 use std::io::Write as _;
 
-use crate::app::cli::{Command, ConfigurationArgs, ConfiguredCommand, RunArgs};
+use serde::Serialize;
+
+use crate::app::cli::{Command, ConfigurationArgs, ConfiguredCommand, ExportArgs, RunArgs};
 use crate::app::config::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, ConfigError, EvaluationConfig,
     GroundCommandConfig, LocalizationConfig, OdometryCommandConfig, RefinementConfig,
 };
+use crate::app::results::Report;
 use crate::simulation::SimulationConfig;
 pub use context::Context;
 use interrupt::Interrupted;
+use output::{Form, Printed};
 
-/// Runs a command.
-pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
+/// Runs a command, and prints its output in a form.
+pub fn run(command: &Command, form: Form, context: &Context) -> anyhow::Result<()> {
+    output::print(&printed(command, context)?.in_form(form))
+}
+
+fn printed(command: &Command, context: &Context) -> anyhow::Result<Printed> {
     match command {
-        Command::Info(args) => output::print(&info::run(args)?),
+        Command::Info(args) => info::run(args),
         Command::BuildMap(args) => {
             let base = BuildMapConfig::default;
             let (config, context) = configured(&args.run, args.flags(), base, context)?;
-            output::print(&build_map::run(&config, &context)?.table())
+            build_map::run(&config, &context)?.printed()
         }
         Command::Odometry(args) => {
             let base = OdometryCommandConfig::default;
             let (config, context) = configured(&args.run, args.flags(), base, context)?;
-            output::print(&odometry::run(&config, &context)?)
+            odometry::run(&config, &context)
         }
         Command::Localize(args) => {
             let base = LocalizationConfig::default;
             let (config, context) = configured(&args.run, args.flags(), base, context)?;
-            output::print(&localize::run(&config, &context)?.to_text())
+            let log = args.mcap.as_ref();
+            let log = log.map(|path| ExportArgs::log_of(&config.result_path, path, config.force));
+            if let Some(log) = &log {
+                export::check(log, &context)?;
+            }
+            let report = localize::run(&config, &context)?;
+            if let Some(log) = &log {
+                export::run(log, &context)?;
+            }
+            of_report(&report)
         }
         Command::Refine(args) => {
             let base = || refine::base_config(args.run.source.input());
             let (config, context) = configured(&args.run, args.flags(), base, context)?;
-            output::print(&refine::run(&config, &context)?.to_text())
+            of_report(&refine::run(&config, &context)?)
         }
         Command::Evaluate(args) => {
             let base = EvaluationConfig::default;
             let (config, context) = configured(&args.run, args.flags(), base, context)?;
-            output::print(&evaluate::run(&config, &context)?.to_text())
+            of_report(&evaluate::run(&config, &context)?)
         }
+        Command::Export(args) => export::run(args, context),
         Command::Simulate(args) => {
             let settings = with_flags::<SimulationConfig>(args, args.flags())?;
             let path = args.source.config.as_deref();
@@ -76,20 +96,26 @@ pub fn run(command: &Command, context: &Context) -> anyhow::Result<()> {
                 true => simulate::Existing::Replace,
                 false => simulate::Existing::Keep,
             };
-            output::print(&simulate::run(&config, existing, &context)?)
+            simulate::run(&config, existing, &context)
         }
-        Command::Compare(args) => output::print(&compare::run(args, context)?),
-        Command::Demo(args) => output::print(&demo::run(args, context)?),
-        Command::Ground(args) => output::print(&ground::run(args, context)?),
-        Command::Config(args) => output::print(configuration(args)),
+        Command::Compare(args) => Ok(Printed::text(compare::run(args, context)?)),
+        Command::Demo(args) => demo::run(args, context),
+        Command::Ground(args) => ground::run(args, context),
+        Command::Config(args) => configuration(args),
         Command::Doctor(args) => doctor::run(args, context),
+        Command::Completions(args) => Ok(Printed::text(manual::completions(args.shell)?)),
+        Command::Man(args) => Ok(Printed::text(manual::page(args.command.as_deref())?)),
     }
 }
 
-/// The configuration file of a command: the keys that people change, or all of them.
-fn configuration(args: &ConfigurationArgs) -> &'static str {
-    fn text<T: CommandConfig>(full: bool) -> &'static str {
-        if full { T::FULL } else { T::SHORT }
+fn of_report(report: &Report) -> anyhow::Result<Printed> {
+    Printed::parts(report.to_text(false), report.to_text(true)).with_json(report)
+}
+
+/// The configuration file of a command: the keys that people change, or all of them; in JSON, the defaults.
+fn configuration(args: &ConfigurationArgs) -> anyhow::Result<Printed> {
+    fn text<T: CommandConfig + Default + Serialize>(full: bool) -> anyhow::Result<Printed> {
+        Printed::text(if full { T::FULL } else { T::SHORT }).with_json(&T::default())
     }
     match args.command {
         ConfiguredCommand::BuildMap => text::<BuildMapConfig>(args.full),

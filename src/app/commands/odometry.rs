@@ -6,6 +6,7 @@ use anyhow::Result;
 use serde::Serialize;
 
 use super::claims::{Claims, Outputs};
+use super::output::Printed;
 use super::run_output::{self, RunFiles};
 use super::stages::SensorKeys;
 use super::trajectory::{self, TrajectorySummary};
@@ -46,8 +47,8 @@ struct LoopReport {
     verdict: String,
 }
 
-/// Finds the poses of the recording that a configuration names; returns the table of the run.
-pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<String> {
+/// Finds the poses of the recording that a configuration names; returns what to print.
+pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed> {
     config.recording_inputs().require()?;
     let folder = &config.output_folder;
     let mut claims = prepare(config, context)?;
@@ -86,7 +87,7 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<String> 
     output::write_json(&main, &report)?;
     claims.finish(&main)?;
     report.summary.warn();
-    Ok(output::rows(&report.summary.rows()))
+    Printed::rows(&report.summary.rows()).with_json(&report)
 }
 
 fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> {

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use serde::Serialize;
+use serde_json::Value;
 
 use crate::app::config::to_yaml;
 use crate::files::write_atomically;
@@ -36,11 +37,80 @@ pub fn write_yaml(path: &Path, config: &impl Serialize) -> anyhow::Result<()> {
     write_text(path, &to_yaml(config)?)
 }
 
-/// Formats rows of a name and a value for standard output.
-pub fn rows(rows: &[(&str, String)]) -> String {
-    rows.iter()
-        .map(|(name, value)| format!("{name:<24} {value:>14}\n"))
-        .collect()
+/// What a command prints: for people, the main part or all of it, or for programs.
+#[derive(Clone, Debug)]
+pub struct Printed {
+    main: String,
+    all: String,
+    json: Value,
+}
+
+/// How much is printed, and in which form.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Form {
+    /// Tables of at most twelve rows.
+    Main,
+    /// Whole tables.
+    All,
+    /// JSON.
+    Json,
+}
+
+impl Printed {
+    /// Text that is printed as a whole; in JSON, a string.
+    pub fn text(text: impl Into<String>) -> Self {
+        let text = text.into();
+        Self {
+            main: text.clone(),
+            json: Value::from(text.trim_end()),
+            all: text,
+        }
+    }
+
+    /// Rows of a name and a value, most important first; in JSON, an object.
+    pub fn rows(rows: &[(&str, String)]) -> Self {
+        const MAIN: usize = 12;
+        let lines = |rows: &[(&str, String)]| -> String {
+            let line = |(name, value): &(&str, String)| format!("{name:<24} {value:>14}\n");
+            rows.iter().map(line).collect()
+        };
+        let mut main = lines(&rows[..rows.len().min(MAIN)]);
+        if rows.len() > MAIN {
+            main += &format!("{} more rows: --all\n", rows.len() - MAIN);
+        }
+        let entries = rows
+            .iter()
+            .map(|(name, value)| ((*name).to_owned(), Value::from(value.as_str())));
+        Self {
+            main,
+            all: lines(rows),
+            json: Value::Object(entries.collect()),
+        }
+    }
+
+    /// The main part and all of a text.
+    pub fn parts(main: String, all: String) -> Self {
+        Self {
+            json: Value::from(all.trim_end()),
+            main,
+            all,
+        }
+    }
+
+    /// The same with another value for programs.
+    pub fn with_json(self, value: &impl Serialize) -> anyhow::Result<Self> {
+        let json = serde_json::to_value(value).context("cannot serialize the output")?;
+        Ok(Self { json, ..self })
+    }
+
+    /// The text in a form.
+    pub fn in_form(&self, form: Form) -> String {
+        match form {
+            Form::Main => self.main.clone(),
+            Form::All => self.all.clone(),
+            Form::Json => format!("{:#}\n", self.json),
+        }
+    }
 }
 
 /// Creates a folder and those above it.
@@ -68,7 +138,7 @@ pub fn remove_if_exists(path: &Path) -> anyhow::Result<()> {
     }
 }
 
-/// Prints to standard output; a closed pipe is not an error.
+/// Prints a text to standard output; a closed pipe is not an error.
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut stdout = io::stdout().lock();
     match stdout

@@ -26,6 +26,7 @@ use crate::recording::{Calibration, Frame, Recording};
 use crate::refinement::{
     InitialEstimate, RefinedTrajectory, RefinerConfig, SmoothingConfig, TrajectoryRefiner,
 };
+use crate::statistics::median;
 
 /// Random stream of the noise on the odometry; the refiner has its own streams.
 const ODOMETRY_STREAM: u64 = u64::MAX;
@@ -193,10 +194,9 @@ fn initial_estimates(
     estimates: &[Pose2],
     increments: &[Option<Pose2>],
 ) -> Vec<InitialEstimate> {
-    let state = |row: usize| match &results.states {
-        Some(states) if states[row] == State::Lost as u8 => State::Lost,
-        Some(states) if states[row] == State::Searching as u8 => State::Searching,
-        _ => State::Tracking,
+    let state = |row: usize| {
+        let number = results.states.as_ref().map(|states| states[row]);
+        number.and_then(State::of_number).unwrap_or(State::Tracking)
     };
     let in_space: Vec<Pose3> = (estimates.iter())
         .map(|pose| pose3_from_pose2(pose, 0.0))
@@ -305,14 +305,11 @@ fn warn_of_distance(config: &RefinementConfig, estimates: &[Pose2], refined: &Re
     let [position_m, _] = config.uncertainty;
     let rows = estimates.iter().zip(&refined.poses).zip(&refined.states);
     let placed = rows.filter(|(_, state)| **state == State::Tracking);
-    let mut distances_m: Vec<f64> = placed
-        .map(|((a, b), _)| (b.translation.vector - a.translation.vector).norm())
-        .collect();
-    distances_m.sort_by(f64::total_cmp);
-    let Some(median_m) = distances_m.get(distances_m.len() / 2) else {
-        return;
-    };
-    if *median_m > DEVIATIONS * position_m {
+    let distances_m =
+        placed.map(|((a, b), _)| (b.translation.vector - a.translation.vector).norm());
+    if let Some(median_m) = median(distances_m)
+        && median_m > DEVIATIONS * position_m
+    {
         tracing::warn!(
             "half of the placed poses are {median_m:.1} m or more from the trajectory, whose uncertainty is {position_m} m: is it in the frame of the map, or is a calibration missing?"
         );

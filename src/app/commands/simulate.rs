@@ -24,7 +24,7 @@ use anyhow::{Context as _, Result, bail, ensure};
 use rayon::prelude::*;
 
 use super::interrupt::{Interrupt, Interrupted};
-use super::output::{self, write_file};
+use super::output::{self, Printed, write_file};
 use super::progress::Task;
 use super::{Context, version};
 use crate::files::remove_abandoned;
@@ -73,7 +73,7 @@ pub struct SimulationReport {
 }
 
 /// Simulates a drive and shows its progress; returns the table for standard output.
-pub fn run(config: &SimulationConfig, existing: Existing, context: &Context) -> Result<String> {
+pub fn run(config: &SimulationConfig, existing: Existing, context: &Context) -> Result<Printed> {
     let task: OnceLock<Arc<Task>> = OnceLock::new();
     let progress = |_done: usize, all: usize| {
         task.get_or_init(|| context.progress.task("simulate", all))
@@ -88,7 +88,7 @@ pub fn run(config: &SimulationConfig, existing: Existing, context: &Context) -> 
         ("path", format!("{:.1} m", report.driven_m)),
         ("triangles of the street", report.triangles.to_string()),
     ];
-    Ok(output::rows(&rows))
+    Ok(Printed::rows(&rows))
 }
 
 /// Simulates a drive and writes what is missing of it. `progress` gets the number of finished

@@ -6,6 +6,7 @@ use super::record::RunRecord;
 use super::results::ComparisonResults;
 use crate::app::reporting::{Cell, Column, Table, markdown};
 use crate::evaluation::trust::Trust;
+use crate::statistics::median;
 
 /// Title of the table of states.
 const TITLE: &str = "States that can be trusted";
@@ -48,7 +49,7 @@ pub fn page(results: &ComparisonResults, program: &str) -> Option<String> {
     let seeds = results.config.seeds.len();
     let _ = writeln!(
         text,
-        "{program}; {}; {seeds} seeds.\n",
+        "{program}; {}; seeds: {seeds}.\n",
         machine.unwrap_or_default()
     );
     text.push_str(&markdown::table(&states(results)));
@@ -56,14 +57,18 @@ pub fn page(results: &ComparisonResults, program: &str) -> Option<String> {
         let _ = write!(text, "\n## {}\n\n{}\n", case.name, case.about);
         let _ = write!(
             text,
-            "\n![{0}: map and path](plots/paths_{0}.png)\n",
+            "\n![{0}: errors over time](plots/errors_{0}.png)\n",
             case.name
         );
         for variant in &results.config.configurations {
             let runs = results.runs(&case.name, &variant.name);
             let found = verdict(&runs);
             if found != HOLDS {
-                let _ = write!(text, "\n**{}: {found}.**\n", variant.name);
+                let _ = write!(
+                    text,
+                    "\n**{}: {found}.**\n\n![{1}: path](plots/paths_{1}.png)\n",
+                    variant.name, case.name
+                );
             }
         }
         if !case.tried.is_empty() {
@@ -112,7 +117,7 @@ fn columns() -> Vec<Column> {
     [
         ("case", "", ""),
         ("configuration", "", ""),
-        ("verdict", "", "whether no run has a frame that is wrong while tracking, and every run is tracking at last once"),
+        ("verdict", "", "whether no run has a frame that is wrong while tracking, and every run is tracking at least once"),
         ("frames", "", "per run"),
         ("wrong", "", "frames of all runs that are off by more than 0.5 m while tracking; must be 0"),
         ("right but unsure", "", "frames within 0.5 m that are not tracking"),
@@ -134,16 +139,10 @@ fn columns() -> Vec<Column> {
 
 fn cells(runs: &[&RunRecord]) -> Vec<Cell> {
     let trusts: Vec<&Trust> = runs.iter().filter_map(|run| run.trust.as_ref()).collect();
-    let all = |value: fn(&Trust) -> Option<f64>| -> Vec<f64> {
-        let mut values: Vec<f64> = trusts.iter().filter_map(|trust| value(trust)).collect();
-        values.sort_by(f64::total_cmp);
-        values
-    };
-    let worst = |value| -> Cell { all(value).last().copied().into() };
-    let median = |value| -> Cell {
-        let values = all(value);
-        values.get(values.len() / 2).copied().into()
-    };
+    type Value = fn(&Trust) -> Option<f64>;
+    let all = |value: Value| trusts.iter().filter_map(move |trust| value(trust));
+    let worst = |value: Value| -> Cell { all(value).reduce(f64::max).into() };
+    let median = |value: Value| -> Cell { median(all(value)).into() };
     let wrong: usize = trusts.iter().map(|trust| trust.wrong).sum();
     vec![
         Cell::Text(verdict(runs)),

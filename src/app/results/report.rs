@@ -1,4 +1,4 @@
-//! The report of a run: a JSON file for programs, tables for people.
+//! The report of a run: a JSON file for programs, a verdict and tables for people.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -7,9 +7,40 @@ use std::path::Path;
 use anyhow::{Context as _, Result, anyhow};
 use serde::{Deserialize, Serialize};
 
-use super::rows::{MetricRow, Value, metric_rows, spatial_rows};
+use super::rows::{MetricRow, Value, length, metric_rows, spatial_rows};
 use super::run_summary::RunSummary;
 use crate::evaluation::{RangeMclErrors, SpatialMetrics, TrajectoryMetrics};
+
+/// The most important rows of every kind of report, of which each has at most twelve.
+const MAIN_ROWS: [&str; 24] = [
+    // Of a run without true poses.
+    "frames",
+    "tracking",
+    "path",
+    "position sigma median",
+    "position sigma p95",
+    "heading sigma median",
+    "agreement median",
+    // Against true poses in a map.
+    "position RMSE",
+    "position median",
+    "position max",
+    "heading RMSE",
+    "heading max",
+    "runtime p50",
+    // Of a trajectory in space.
+    "position in space RMSE",
+    "position in space max",
+    "height RMSE",
+    "rotation RMSE",
+    "position at the end",
+    "aligned position RMSE",
+    "segments 100-800 m, translation",
+    "segments 100-800 m, rotation",
+    "segments 5-50 m, translation",
+    "segments 5-50 m, rotation",
+    "distance in space",
+];
 
 /// Errors of one trajectory.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -78,13 +109,19 @@ impl Report {
         })
     }
 
-    /// A table for the terminal: one column per trajectory, numbers right-aligned.
-    pub fn to_text(&self) -> String {
-        let rows = self.joined_rows();
+    /// The verdict and a table for the terminal: one column per trajectory, numbers right-aligned. The main rows
+    /// only, or all of them with the inputs and settings.
+    pub fn to_text(&self, all: bool) -> String {
+        let mut rows = self.joined_rows();
+        let count = rows.len();
+        if !all {
+            rows.retain(|(row, _)| self.is_main(row));
+        }
         let width = rows.iter().map(|(row, _)| row.name.len()).max();
         let width = width.unwrap_or(0);
-        let mut text = self.about_lines("");
-        if !text.is_empty() {
+        let mut text = format!("{}\n\n", self.verdict());
+        if all && !self.about.is_empty() {
+            text += &self.about_lines("");
             text.push('\n');
         }
         let mut add_line = |name: &str, mcl: &str, refined: &str, unit: &str| {
@@ -98,7 +135,47 @@ impl Report {
             let refined = refined.map_or(String::new(), |value| value.to_string());
             add_line(row.name, &row.value.to_string(), &refined, row.unit);
         }
+        if rows.len() < count {
+            let _ = writeln!(text, "{} more rows: --all", count - rows.len());
+        }
         text
+    }
+
+    /// Whether a row is among the most important ones of this report.
+    pub fn is_main(&self, row: &MetricRow) -> bool {
+        // In a map the planar errors are the main ones.
+        let is_planar = self.mcl.is_some();
+        let is_spatial = MAIN_ROWS[13..].contains(&row.name);
+        MAIN_ROWS.contains(&row.name) && !(is_planar && is_spatial)
+    }
+
+    /// What the run found, in one or two sentences.
+    pub fn verdict(&self) -> String {
+        let found = match self.trajectory {
+            Some(_) => None,
+            None => Some(self.summary.verdict()),
+        };
+        let accuracy = match (&self.mcl, &self.trajectory) {
+            (Some(mcl), _) => accuracy(&mcl.metrics, self.refined.as_ref().map(|it| &it.metrics)),
+            (None, Some(trajectory)) => {
+                let aligned = trajectory.aligned_position_m.as_ref();
+                let aligned =
+                    aligned.map(|it| format!(", {} after rigid alignment", length(it.rmse)));
+                format!(
+                    "{} and {:.2} deg (RMS) from the true poses over {:.0} m{}.",
+                    length(trajectory.position_m.rmse),
+                    trajectory.rotation_rad.rmse.to_degrees(),
+                    trajectory.distance_m,
+                    aligned.unwrap_or_default()
+                )
+            }
+            (None, None) => "No true poses were given.".to_owned(),
+        };
+        found
+            .into_iter()
+            .chain([accuracy])
+            .collect::<Vec<_>>()
+            .join(" ")
     }
 
     /// The same table in Markdown, with definitions.
@@ -128,14 +205,18 @@ impl Report {
         text
     }
 
-    /// Rows of the summary, then each error of the filter with that of the refined trajectory.
+    /// Rows of the summary, then each error of the filter with that of the refined trajectory; no row of which
+    /// nothing is known.
     pub fn joined_rows(&self) -> Vec<(MetricRow, Option<Value>)> {
         let mut refined = self.refined.iter().flat_map(TrajectoryReport::rows);
         let errors = self.mcl.iter().flat_map(TrajectoryReport::rows);
         let errors = errors.chain(self.trajectory.iter().flat_map(spatial_rows));
         let errors = errors.map(|row| (row, refined.next().map(|row| row.value)));
         let summary = self.summary.rows().into_iter().map(|row| (row, None));
-        summary.chain(errors).collect()
+        let is_known = |(row, refined): &(MetricRow, Option<Value>)| {
+            row.value != Value::Absent || refined.is_some_and(|value| value != Value::Absent)
+        };
+        summary.chain(errors).filter(is_known).collect()
     }
 
     /// Title of the column of the errors.
@@ -168,6 +249,32 @@ impl Report {
         (self.about.iter())
             .map(|(name, value)| format!("{prefix}{name}: {value}\n"))
             .collect()
+    }
+}
+
+/// Errors against true poses in a sentence.
+fn accuracy(mcl: &TrajectoryMetrics, refined: Option<&TrajectoryMetrics>) -> String {
+    let errors = |it: &TrajectoryMetrics| {
+        let heading_deg = it.heading_rad.rmse.to_degrees();
+        format!(
+            "{} and {heading_deg:.3} deg (RMS)",
+            length(it.position_m.rmse)
+        )
+    };
+    let worst = |it: &TrajectoryMetrics| length(it.position_m.max);
+    match refined {
+        None => format!(
+            "{} from the true poses, at most {}.",
+            errors(mcl),
+            worst(mcl)
+        ),
+        Some(refined) => format!(
+            "{} from the true poses, at most {}; refined {}, at most {}.",
+            errors(mcl),
+            worst(mcl),
+            errors(refined),
+            worst(refined)
+        ),
     }
 }
 
@@ -220,7 +327,7 @@ mod tests {
 
     #[test]
     fn columns_are_aligned_and_units_stand_beside_the_numbers() {
-        let text = report().to_text();
+        let text = report().to_text(true);
         let line = |name: &str| text.lines().find(|line| line.starts_with(name)).unwrap();
         let words: Vec<&str> = line("position RMSE").split_whitespace().collect();
         assert_eq!(words, ["position", "RMSE", "0.2500", "0.0200", "m"]);
@@ -234,6 +341,20 @@ mod tests {
             "{text}"
         );
         assert!(line("runtime p50").ends_with("ms"), "{text}");
+    }
+
+    #[test]
+    fn the_verdict_comes_first_and_at_most_twelve_rows_without_all() {
+        let report = report();
+        let (short, all) = (report.to_text(false), report.to_text(true));
+        let verdict =
+            "25.0 cm and 0.000 deg (RMS) from the true poses, at most 25.0 cm; refined 2.0 cm";
+        assert!(short.lines().next().unwrap().contains(verdict), "{short}");
+        let rows = |text: &str| text.lines().filter(|line| line.contains("  ")).count() - 1;
+        assert!(rows(&short) <= 12 && rows(&all) > 30, "{short}");
+        let rest = format!("{} more rows: --all", rows(&all) - 1 - rows(&short));
+        assert!(short.contains(&rest), "{short}");
+        assert!(!all.lines().any(|line| line.ends_with("  -")), "{all}");
     }
 
     #[test]

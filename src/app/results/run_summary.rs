@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::localization_results::LocalizationResults;
-use super::rows::MetricRow;
+use super::rows::{MetricRow, length};
 use crate::evaluation::Summary;
 use crate::geometry::Pose2;
 use crate::localization::State;
@@ -63,6 +63,29 @@ impl RunSummary {
                 let share = results.agreements.as_ref()?[row];
                 (share >= 0.0).then_some(share)
             }),
+        }
+    }
+
+    /// Where and how long the run was tracking, and how sure it is of itself, in a sentence.
+    pub fn verdict(&self) -> String {
+        let sure = match (&self.position_sigma_m, &self.agreement) {
+            (Some(sigma), Some(agreement)) => format!(
+                ", with a standard deviation of {} and {:.0} % of the beams above the road on the map (medians)",
+                length(sigma.median),
+                100.0 * agreement.median
+            ),
+            _ => String::new(),
+        };
+        match (self.first_tracked, self.tracking) {
+            (Some(first), Some(tracking)) => format!(
+                "Found in frame {first}, tracking in {tracking} of {} frames{sure}.",
+                self.frames
+            ),
+            (None, Some(_)) => format!(
+                "Not found: tracking in none of {} frames; the poses must not be used.",
+                self.frames
+            ),
+            (_, None) => format!("{} frames{sure}.", self.frames),
         }
     }
 

@@ -4,10 +4,11 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Instant;
 
+use anyhow::Result;
 use serde::Serialize;
 
 use super::onto::ChangesReport;
-use crate::app::commands::output;
+use crate::app::commands::output::Printed;
 use crate::app::commands::trajectory::TrajectorySummary;
 use crate::evaluation::{MapQuality, TruthAgreement};
 use crate::geometry::TriangleMesh;
@@ -80,11 +81,14 @@ impl BuildReport {
         }
     }
 
-    /// The table on standard output.
-    pub fn table(&self) -> String {
+    /// The table on standard output, most important rows first.
+    pub fn printed(&self) -> Result<Printed> {
+        Printed::rows(&self.rows()).with_json(self)
+    }
+
+    fn rows(&self) -> Vec<(&'static str, String)> {
         let mut rows = vec![
             ("time", format!("{:.1} s", self.seconds)),
-            ("octree cell", format!("{:.2} m", self.octree_cell_m)),
             ("triangles", self.triangles.to_string()),
             ("size", format!("{:.1} MB", self.map_mb)),
         ];
@@ -96,38 +100,42 @@ impl BuildReport {
                 [("scans", scans), ("path", format!("{:.1} m", self.path_m))],
             );
             rows.insert(3, ("rate", format!("{rate:.1} scans/s")));
-            rows.push((
-                "per 100 m",
-                format!(
-                    "{:.0} k, {:.1} MB",
-                    self.triangles_per_100m / 1e3,
-                    self.mb_per_100m
-                ),
-            ));
         }
         rows.extend(self.changes.iter().flat_map(ChangesReport::rows));
+        rows.extend(self.quality_rows());
         if let Some(trajectory) = &self.trajectory {
             let found = trajectory.rows().into_iter();
             rows.extend(found.filter(|(name, _)| !matches!(*name, "scans" | "path")));
         }
+        let [thousands, megabytes] = [self.triangles_per_100m / 1e3, self.mb_per_100m];
+        if self.mapped_frames > 0 {
+            rows.push(("per 100 m", format!("{thousands:.0} k, {megabytes:.1} MB")));
+        }
+        rows.push(("octree cell", format!("{:.2} m", self.octree_cell_m)));
+        rows
+    }
+
+    /// Quality along held-out beams, and agreement with the true surface, where they are known.
+    fn quality_rows(&self) -> Vec<(&'static str, String)> {
+        let mut rows = Vec::new();
         let percent = |share: f64| format!("{:.1} %", 100.0 * share);
         let centimetres = |metres: f64| format!("{:.1} cm", 100.0 * metres);
         if let Some(quality) = &self.quality {
             rows.extend([
-                ("beams evaluated", quality.beams.to_string()),
-                ("early", percent(quality.early)),
-                ("late", percent(quality.late)),
-                ("miss", percent(quality.miss)),
-                (
-                    "beam-plane median",
-                    centimetres(quality.beam_plane_median_m),
-                ),
+                ("points within 10 cm", percent(quality.point_within_10cm)),
                 (
                     "beam-plane within 10 cm",
                     percent(quality.beam_plane_within_10cm),
                 ),
-                ("points within 10 cm", percent(quality.point_within_10cm)),
+                (
+                    "beam-plane median",
+                    centimetres(quality.beam_plane_median_m),
+                ),
+                ("early", percent(quality.early)),
+                ("miss", percent(quality.miss)),
+                ("late", percent(quality.late)),
                 ("ray residual median", centimetres(quality.ray_median_m)),
+                ("beams evaluated", quality.beams.to_string()),
             ]);
         }
         if let Some(truth) = &self.truth {
@@ -138,6 +146,6 @@ impl BuildReport {
                 ("median to the truth", centimetres(truth.median_m)),
             ]);
         }
-        output::rows(&rows)
+        rows
     }
 }

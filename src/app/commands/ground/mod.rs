@@ -23,9 +23,10 @@ use anyhow::{Context as _, Result, bail, ensure};
 
 use self::input::LabelledScan;
 use self::report::GroundReport;
+use super::Context;
 use super::claims::{Claims, Outputs};
 use super::interrupt::Interrupted;
-use super::{Context, output};
+use super::output::{self, Printed};
 use crate::app::cli::GroundArgs;
 use crate::app::config::{CommandConfig as _, GroundCommandConfig};
 use crate::app::plotting::color::Colormap;
@@ -41,18 +42,21 @@ const GROUND_CLASS: u16 = 40;
 /// SemanticKITTI class of all other points.
 const OTHER_CLASS: u16 = 99;
 
-/// Segments scans, explains a point, or compares the methods on simulated scenes; returns the text
-/// for standard output.
-pub fn run(args: &GroundArgs, context: &Context) -> Result<String> {
+/// Segments scans, explains a point, or compares the methods on simulated scenes; returns what to
+/// print.
+pub fn run(args: &GroundArgs, context: &Context) -> Result<Printed> {
     let (config, path) = input::load(args)?;
     if args.simulated {
-        return simulated::run(&config, context);
+        return Ok(Printed::text(simulated::run(&config, context)?));
     }
     let path_of_config = args.config.as_deref().or(args.input.as_deref());
     let context = &context.with_config_file(path_of_config, GroundCommandConfig::PATH);
     match args.explain.as_deref() {
-        Some(&[x, y, z]) => explain(&config, &path, Vec3::new(x, y, z)),
-        _ => Ok(segment(&config, &path, context)?.to_text()),
+        Some(&[x, y, z]) => Ok(Printed::text(explain(&config, &path, Vec3::new(x, y, z))?)),
+        _ => {
+            let report = segment(&config, &path, context)?;
+            Printed::text(report.to_text()).with_json(&report)
+        }
     }
 }
 

@@ -1,0 +1,200 @@
+//! `export`: a result or a map in the formats of viewers.
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result, ensure};
+
+use super::claims::{Claims, Outputs};
+use super::interrupt::Interrupted;
+use super::output::Printed;
+use super::{Context, input, output, refine, run_output};
+use crate::app::cli::ExportArgs;
+use crate::app::config::RefinementConfig;
+use crate::app::export::{Model, Ribbon, RunLog, write_mcap};
+use crate::app::plotting::color::{Colormap, TRUTH};
+use crate::app::results::LocalizationResults;
+use crate::evaluation::planar_errors;
+use crate::geometry::{Pose3, TriangleMesh, pose2_from_pose3};
+use crate::map::mesh_file;
+use crate::recording::{Frame, scan_files};
+
+/// First bytes of the files.
+const MCAP: &[u8] = b"\x89MCAP0\r\n";
+const GLB: &[u8] = b"glTF";
+
+/// Writes the requested files.
+pub fn run(args: &ExportArgs, context: &Context) -> Result<Printed> {
+    input::require_file("the input", &args.input)?;
+    let claims = check(args, context)?;
+    let is_map = !args
+        .input
+        .extension()
+        .is_some_and(|it| it.eq_ignore_ascii_case("npz"));
+    match is_map {
+        true => export_map(args)?,
+        false => export_result(args, context)?,
+    }
+    let mut written = Vec::new();
+    for (mut claims, path) in claims {
+        claims.finish(path)?;
+        let megabytes = std::fs::metadata(path).map_or(0.0, |file| file.len() as f64 / 1e6);
+        written.push(("written", format!("{}, {megabytes:.1} MB", path.display())));
+    }
+    Ok(Printed::rows(&written))
+}
+
+/// Checks and claims the files to write.
+pub fn check<'a>(args: &'a ExportArgs, context: &'a Context) -> Result<Vec<(Claims, &'a Path)>> {
+    let formats = [("--mcap", &args.mcap, MCAP), ("--glb", &args.glb, GLB)];
+    let optional = [("--recording", &args.recording), ("--map", &args.map)];
+    let optional = optional
+        .iter()
+        .filter_map(|(key, path)| Some((*key, path.as_deref()?)));
+    let inputs = optional
+        .chain([("the input", args.input.as_path())])
+        .chain(context.input());
+    let inputs: Vec<(&str, &Path)> = inputs.collect();
+    let requested = formats
+        .into_iter()
+        .filter_map(|(key, path, magic)| Some((key, path.as_deref()?, magic)));
+    requested
+        .map(|(key, main, magic)| {
+            let outputs = Outputs {
+                key,
+                main,
+                magic: Some(magic),
+                names: Vec::new(),
+                inputs: inputs.clone(),
+                force: args.force,
+            };
+            Ok((outputs.prepare()?, main))
+        })
+        .collect()
+}
+
+fn export_map(args: &ExportArgs) -> Result<()> {
+    let path = args.input.display();
+    ensure!(
+        scan_files::is_mesh(&args.input),
+        "{path} is neither a result (.npz) nor a map (.ply, .obj, .stl)"
+    );
+    ensure!(
+        args.mcap.is_none(),
+        "{path} is a map: a log is written of a result (.npz); give --glb FILE"
+    );
+    let (mesh, _) = mesh_file::read(&args.input)?;
+    let mut model = Model::default();
+    model.add_mesh("map", &mesh);
+    write_model(args, &model)
+}
+
+fn export_result(args: &ExportArgs, context: &Context) -> Result<()> {
+    let results = LocalizationResults::read(&args.input)?;
+    run_output::warn_of_shortfall(&results, &args.input);
+    let mut config = refine::base_config(Some(&args.input));
+    if let Some(map) = &args.map {
+        config.map_file.clone_from(map);
+    }
+    if let Some(recording) = &args.recording {
+        config.scan_folder.clone_from(recording);
+    }
+    input::require_file("the map of the result (--map MAP)", &config.map_file)?;
+    let (mesh, _) = mesh_file::read(&config.map_file)?;
+    if args.glb.is_some() {
+        write_model(args, &model_of(&mesh, &results)?)?;
+    }
+    let Some(path) = &args.mcap else {
+        return Ok(());
+    };
+    let frames = match args.points {
+        0 => None,
+        _ => Some(frames_of(&mut config, &results)?),
+    };
+    let run = RunLog {
+        results: &results,
+        frames: frames.as_deref(),
+        mesh: Some(&mesh),
+        max_points: args.points,
+    };
+    let task = context.progress.task("export", results.len());
+    output::write_file(path, |file| {
+        write_mcap(&run, file, || {
+            task.advance(1);
+            match context.interrupt.requested() {
+                true => Err(Interrupted {
+                    kept: "nothing was written".to_owned(),
+                }
+                .into()),
+                false => Ok(()),
+            }
+        })
+    })
+}
+
+/// The frames of a result in its recording.
+fn frames_of(config: &mut RefinementConfig, results: &LocalizationResults) -> Result<Vec<Frame>> {
+    let recording = config.recording_inputs().open(&config.selection());
+    let recording = recording.context("the scans of the result cannot be read; give --recording RECORDING, or --points 0 for a log without scans")?;
+    let (recording, _) = config.sensor_keys().resolve(recording)?;
+    let mut frames = recording.frames;
+    frames.retain(|frame| results.frames.binary_search(&frame.number).is_ok());
+    ensure!(
+        frames.len() == results.len(),
+        "{} has {} of the {} frames of the result; give --recording RECORDING",
+        config.scan_folder.display(),
+        frames.len(),
+        results.len()
+    );
+    Ok(frames)
+}
+
+/// The map with the path, colored by its error where there is a truth.
+fn model_of(mesh: &TriangleMesh, results: &LocalizationResults) -> Result<Model> {
+    let found = results
+        .refined_in_space
+        .as_ref()
+        .or(results.estimates_in_space.as_ref());
+    let found = found.context("the result holds no poses in space; run localize again")?;
+    let mut model = Model::default();
+    model.add_mesh("map", mesh);
+    let truth = results.ground_truth_in_space.as_deref();
+    let (name, colors) = match truth {
+        Some(truth) => colored_by_error(found, truth),
+        None => (
+            "path".to_owned(),
+            vec![Colormap::Viridis.at(0.0); found.len()],
+        ),
+    };
+    model.add_ribbon(&Ribbon {
+        name: &name,
+        path: found,
+        colors,
+    });
+    if let Some(truth) = truth {
+        model.add_ribbon(&Ribbon {
+            name: "true path",
+            path: truth,
+            colors: vec![TRUTH; truth.len()],
+        });
+    }
+    Ok(model)
+}
+
+/// Name and colors of a path by its planar error; the largest error has the lightest color.
+fn colored_by_error(found: &[Pose3], truth: &[Pose3]) -> (String, Vec<[u8; 3]>) {
+    let [found, truth] =
+        [found, truth].map(|poses| -> Vec<_> { poses.iter().map(pose2_from_pose3).collect() });
+    let errors: Vec<f64> = (planar_errors(&found, &truth).iter())
+        .map(|error| error.distance_m())
+        .collect();
+    let largest_m = errors.iter().copied().fold(0.0, f64::max);
+    let color = |error_m: &f64| Colormap::Viridis.at(error_m / largest_m.max(1e-9));
+    let name = format!("path, position error 0 to {:.1} cm", 100.0 * largest_m);
+    (name, errors.iter().map(color).collect())
+}
+
+fn write_model(args: &ExportArgs, model: &Model) -> Result<()> {
+    args.glb.as_ref().map_or(Ok(()), |path| {
+        output::write_file(path, |file| model.write(file))
+    })
+}
