@@ -8,23 +8,27 @@ use anyhow::{Result, bail};
 use super::claims::{Claims, Outputs};
 use super::output;
 use super::trajectory::stamped;
-use crate::app::plotting::color::{MCL, REFINED};
+use crate::app::plotting::color::{MCL, REFINED, Rgb, STATES};
 use crate::app::plotting::{
-    Animation, LineChart, LocalizationPicture, MapImage, MapPlot, Panel, PathPlot, Series,
-    drift_chart, error_chart, map_plot,
+    Animation, InteractivePath, LineChart, LocalizationPicture, MapImage, MapPlot, Mark, Panel,
+    PathPlot, Series, drift_chart, error_chart, map_plot,
 };
 use crate::app::results::{
     LocalizationResults, Report, RunSummary, TrajectoryReport, write_frames_csv, write_poses_npy,
 };
+use crate::evaluation::trust::Axes;
 use crate::evaluation::{
     EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, SpatialMetrics,
     TrajectoryMetrics, planar_errors,
 };
 use crate::files::folder_of;
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
-use crate::localization::{Estimate, ParticleSet};
+use crate::localization::{Estimate, ParticleSet, State};
 use crate::recording::Recording;
 use crate::recording::poses::{write_kitti, write_tum};
+
+/// Content of the interactive path, beside the pictures.
+pub const INTERACTIVE: &str = "path.json";
 
 /// Cells along the longer side of the map image in plots.
 const MAP_CELLS: usize = 1400;
@@ -271,11 +275,18 @@ pub fn draw_run(
         map: image.as_ref(),
     }
     .save(&files.plot("path.png")?)?;
+    InteractivePath {
+        results,
+        estimates,
+        map: image.as_ref(),
+    }
+    .save(&files.plot(INTERACTIVE)?)?;
     if let Some(truth) = truth
         && !is_trajectory
     {
         draw_errors(files, results, estimates, truth)?;
     }
+    draw_states(files, results, estimates)?;
     draw_drift(files, name, results)?;
     draw_runtimes(files, results)?;
     draw_particles(files, image.as_ref(), results)?;
@@ -332,6 +343,64 @@ fn draw_drift(files: &RunFiles, name: &str, results: &LocalizationResults) -> Re
         return Ok(());
     }
     drift_chart(truth, &trajectories).save(&files.plot("drift.png")?)
+}
+
+/// Draws how sure the run was of each frame: the standard deviation, and the agreement by state.
+fn draw_states(files: &RunFiles, results: &LocalizationResults, estimates: &[Pose2]) -> Result<()> {
+    let (Some(states), Some(covariances)) = (&results.states, &results.covariances) else {
+        return Ok(());
+    };
+    let times_s = results.recorded_times();
+    let x = |row: usize| match times_s {
+        Some(times_s) => times_s[row] - times_s[0],
+        None => results.frames[row] as f64,
+    };
+    let sigma_cm = |row: usize| 100.0 * Axes::of(&covariances[row], &estimates[row]).long_m;
+    let agreements = results.agreements.as_deref().unwrap_or_default();
+    let in_state = |(state, color): (State, Rgb)| Series {
+        mark: Mark::Dots,
+        ..Series::line(
+            state.word(),
+            color,
+            (0..agreements.len())
+                .filter(|&row| states[row] == state as u8 && agreements[row] >= 0.0)
+                .map(|row| (x(row), 100.0 * agreements[row])),
+        )
+    };
+    let mut panels = vec![Panel {
+        y_name: "standard deviation [cm]".to_owned(),
+        series: vec![Series::line(
+            "of the position, MCL",
+            MCL,
+            (0..results.len()).map(|row| (x(row), sigma_cm(row))),
+        )],
+        clip_outliers: true,
+        ..Panel::default()
+    }];
+    let by_state: Vec<Series> = STATES
+        .into_iter()
+        .map(in_state)
+        .filter(|it| !it.points.is_empty())
+        .collect();
+    if !by_state.is_empty() {
+        panels.push(Panel {
+            y_name: "beams on the map [%]".to_owned(),
+            series: by_state,
+            ..Panel::default()
+        });
+    }
+    LineChart {
+        title: "States over time".to_owned(),
+        x_name: if times_s.is_some() {
+            "time from the start [s]"
+        } else {
+            "frame"
+        }
+        .to_owned(),
+        panels,
+        marks: Vec::new(),
+    }
+    .save(&files.plot("states.png")?)
 }
 
 fn draw_runtimes(files: &RunFiles, results: &LocalizationResults) -> Result<()> {

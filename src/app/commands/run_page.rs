@@ -1,4 +1,4 @@
-//! The page of a run: metrics, pictures, timing, configuration.
+//! The page of a run: verdict, path, pictures, numbers, definitions, configuration.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -6,7 +6,7 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result};
 
-use super::run_output::RunFiles;
+use super::run_output::{INTERACTIVE, RunFiles};
 use super::{output, version};
 use crate::app::plotting::palette;
 use crate::app::reporting::{Cell, Column, Page, PageElement, Section, Table};
@@ -27,13 +27,22 @@ pub struct RunPage<'a> {
     pub machine: &'a BTreeMap<String, String>,
 }
 
-/// Pictures of a run: section, file name and caption.
+/// Pictures of a run after the path: section, file name and caption.
 pub const PICTURES: [(&str, &str, &str); 8] = [
-    ("Trajectory", "path.png", "Path against ground truth"),
     (
         "Errors",
         "errors.png",
         "Position and heading error over time",
+    ),
+    (
+        "One scan",
+        "range_images.png",
+        "Observed, rendered from the estimate, and their difference",
+    ),
+    (
+        "States",
+        "states.png",
+        "Standard deviation that the filter states, and share of the beams above the road that end on a surface of the map",
     ),
     (
         "Drift",
@@ -41,11 +50,6 @@ pub const PICTURES: [(&str, &str, &str); 8] = [
         "Position and heading error against the distance driven along the truth, as evaluated and (dashed) after rigid alignment; relative errors against the length of the segments",
     ),
     ("Particles", "particles.png", "Particles of the first frame"),
-    (
-        "Range images",
-        "range_images.png",
-        "Observed, rendered from the estimate, and their difference",
-    ),
     ("Map", "map.png", "Map from above with the path of the car"),
     (
         "Likelihood",
@@ -66,10 +70,11 @@ pub const TEXTS: [&str; 5] = [
 
 /// Writes the page of a run without timing and machine.
 pub fn write(files: &RunFiles, report: &Report) -> Result<()> {
-    let named = |name| report.about.get(name).map(String::as_str);
-    let title = match report.trajectory {
-        Some(_) => format!("Trajectory {}", named("result").unwrap_or_default()),
-        None => format!("Localization in {}", named("recording").unwrap_or("a run")),
+    let named = |name| report.about.get(name).map(|path| short_name(path));
+    let title = match (report.trajectory.is_some(), named("map")) {
+        (true, _) => named("result").unwrap_or_default(),
+        (false, Some(map)) => format!("{} in {map}", named("recording").unwrap_or_default()),
+        (false, None) => named("recording").unwrap_or_else(|| "A run".to_owned()),
     };
     RunPage {
         files,
@@ -79,6 +84,19 @@ pub fn write(files: &RunFiles, report: &Report) -> Result<()> {
         machine: &BTreeMap::new(),
     }
     .write()
+}
+
+/// The last part of a path; of a folder of scans, the recording that it is in.
+fn short_name(path: &str) -> String {
+    let mut parts = Path::new(path)
+        .components()
+        .rev()
+        .map(|part| part.as_os_str().to_string_lossy());
+    let last = parts.next().unwrap_or_default();
+    match (last == "velodyne", parts.next()) {
+        (true, Some(folder)) => folder.into_owned(),
+        _ => last.into_owned(),
+    }
 }
 
 impl RunPage<'_> {
@@ -92,9 +110,7 @@ impl RunPage<'_> {
             title: title.to_owned(),
             elements,
         };
-        let about = PageElement::Facts(facts(&self.report.about));
-        let metrics = PageElement::Table(metrics(self.report));
-        let mut sections = vec![section("Metrics", vec![about, metrics])];
+        let mut sections = vec![section("Path", self.path()?)];
         for (title, name, caption) in PICTURES {
             let path = self.files.file("plots").join(name);
             let mut elements: Vec<PageElement> =
@@ -107,35 +123,66 @@ impl RunPage<'_> {
             if title == "Timing" && !self.stage_seconds.is_empty() {
                 elements.push(PageElement::Table(stages(self.stage_seconds)));
             }
-            if !elements.is_empty() {
-                sections.push(section(title, elements));
+            sections.push(section(title, elements));
+            if title == "States" {
+                sections.push(section("Numbers", numbers(self.report)));
             }
         }
-        let mut versions = vec![("program".to_owned(), version::program()?)];
-        versions.extend(facts(self.machine));
-        let mut elements = vec![PageElement::Facts(versions)];
+        let mut settings = vec![("program".to_owned(), version::program()?)];
+        settings.extend(facts(&self.report.about));
+        settings.extend(facts(self.machine));
+        let mut elements = vec![PageElement::Facts(settings)];
         for name in TEXTS {
             elements.extend(collapsed(&self.files.file(name), name)?);
         }
-        sections.push(section("Configuration and versions", elements));
+        sections.push(section("Definitions", vec![definitions(self.report)]));
+        sections.push(section("Inputs and settings", elements));
+        sections.retain(|section| !section.elements.is_empty());
         Ok(Page {
             title: self.title.to_owned(),
-            subtitle: format!("Result: {}", self.files.result.display()),
+            verdict: self.report.verdict(),
+            subtitle: self.files.result.display().to_string(),
             sections,
         })
     }
+
+    /// The interactive path, and the view of the map.
+    fn path(&self) -> Result<Vec<PageElement>> {
+        let plots = self.files.file("plots");
+        let content = plots.join(INTERACTIVE);
+        let mut elements = Vec::new();
+        if content.exists() {
+            let json = fs::read_to_string(&content);
+            elements.push(PageElement::Interactive {
+                json: json.with_context(|| format!("cannot read {}", content.display()))?,
+                caption: "Path over the map, colored by error or state. Point at a frame: its scan is drawn where the estimate puts it. Wheel or pinch to zoom, drag to move, double click to see all.".to_owned(),
+            });
+        }
+        elements.extend(picture_or_error(
+            &plots.join("view.png"),
+            "Map with the path",
+        ));
+        elements.extend(picture_or_error(&plots.join("path.png"), "Path from above"));
+        Ok(elements)
+    }
 }
 
-/// Metrics of both trajectories with their definitions.
-fn metrics(report: &Report) -> Table {
+/// The main metrics of both trajectories, and all of them.
+fn numbers(report: &Report) -> Vec<PageElement> {
+    let mut main = metrics(report, |row| report.is_main(row));
+    main.name = "numbers".to_owned();
+    let all = Table {
+        name: "all_numbers".to_owned(),
+        title: "All numbers".to_owned(),
+        ..metrics(report, |_row| true)
+    };
+    vec![PageElement::Table(main), PageElement::CollapsedTable(all)]
+}
+
+/// Metrics of both trajectories.
+fn metrics(report: &Report, is_shown: impl Fn(&MetricRow) -> bool) -> Table {
     let has_refined = report.refined.is_some();
-    let titles = [
-        "metric",
-        report.estimate_title(),
-        "refined",
-        "unit",
-        "definition",
-    ];
+    let titles = ["metric", report.estimate_title(), "refined", "unit"];
     let cell = |value: Value| match value {
         Value::Number(number) => Cell::Number(number),
         Value::Count(count) => Cell::Number(count as f64),
@@ -146,7 +193,7 @@ fn metrics(report: &Report) -> Table {
         if has_refined {
             cells.push(refined.map_or(Cell::Text(String::new()), cell));
         }
-        cells.extend([row.unit.into(), row.definition.into()]);
+        cells.push(row.unit.into());
         cells
     };
     let alignment = report.about.get("alignment").map_or("none", String::as_str);
@@ -155,8 +202,9 @@ fn metrics(report: &Report) -> Table {
         (None, Some(_)) => format!("Errors in six degrees of freedom; alignment: {alignment}"),
         (None, None) => "No true poses were given: what the run shows itself".to_owned(),
     };
+    let rows = report.joined_rows().into_iter();
     Table {
-        name: "numbers".to_owned(),
+        name: String::new(),
         title,
         note: String::new(),
         columns: titles
@@ -164,8 +212,21 @@ fn metrics(report: &Report) -> Table {
             .filter(|title| has_refined || *title != "refined")
             .map(Column::named)
             .collect(),
-        rows: report.joined_rows().into_iter().map(row).collect(),
+        rows: rows.filter(|(row, _)| is_shown(row)).map(row).collect(),
     }
+}
+
+/// What each number is.
+fn definitions(report: &Report) -> PageElement {
+    let term = |row: &MetricRow| match row.unit {
+        "" => row.name.to_owned(),
+        unit => format!("{} [{unit}]", row.name),
+    };
+    let rows = report.joined_rows().into_iter();
+    PageElement::Definitions(
+        rows.map(|(row, _)| (term(&row), row.definition.to_owned()))
+            .collect(),
+    )
 }
 
 /// Relative errors of a trajectory by the length of the segments; `None` if it is shorter than all.

@@ -55,6 +55,7 @@ pub fn page(
     sections.retain(|section| !section.elements.is_empty());
     Ok(Page {
         title: "Comparison".to_owned(),
+        verdict: String::new(),
         subtitle: format!(
             "{} configurations, sequences {}; {} of {} runs.",
             results.config.configurations.len(),

@@ -4,6 +4,8 @@
 //! Magnitudes have the colormap viridis (van der Walt and Smith 2015), whose lightness increases
 //! uniformly, differences ColorBrewer's red and blue (Brewer 1994), white at zero.
 
+use crate::localization::State;
+
 /// Red, green and blue, 0 to 255.
 pub type Rgb = [u8; 3];
 
@@ -15,6 +17,12 @@ pub const MCL: Rgb = [213, 94, 0];
 pub const REFINED: Rgb = [0, 114, 178];
 /// Color of odometry.
 pub const ODOMETRY: Rgb = [204, 121, 167];
+/// Colors of the states of the filter.
+pub const STATES: [(State, Rgb); 3] = [
+    (State::Tracking, [0, 158, 115]),
+    (State::Searching, [230, 159, 0]),
+    (State::Lost, [200, 30, 30]),
+];
 /// Colors of further series, in this order.
 pub const SERIES: [Rgb; 6] = [
     REFINED,

@@ -3,6 +3,7 @@
 use anyhow::Result;
 use glam::Vec3;
 
+use super::bitmap::Bitmap;
 use super::color::{MISSING, Rgb, WHITE, blend};
 use super::sheet::Sheet;
 use super::view::View;
@@ -134,6 +135,14 @@ impl MapImage {
                 }
             }
         }
+    }
+
+    /// The raster, white where there is no surface, with its left and upper edge and the edge of a cell [m].
+    pub fn bitmap(&self) -> (Bitmap, [f64; 3]) {
+        let cell =
+            |x: u32, y: u32| self.cells[y as usize * self.width + x as usize].unwrap_or(WHITE);
+        let bitmap = Bitmap::from_fn(self.width as u32, self.height as u32, cell);
+        (bitmap, [self.x_min, self.y_max, self.cell_m])
     }
 
     /// Color at a position; `None` where there is no surface.

@@ -23,7 +23,8 @@ pub fn with_palette(path: &Path) -> Result<Vec<u8>> {
     encoded(&image).with_context(|| format!("cannot reduce the colors of {}", path.display()))
 }
 
-fn encoded(image: &Bitmap) -> Result<Vec<u8>, png::EncodingError> {
+/// Encodes a picture with a palette.
+pub fn encoded(image: &Bitmap) -> Result<Vec<u8>, png::EncodingError> {
     let (palette, index) = palette_of(image);
     let mut bytes = Vec::new();
     let mut encoder = png::Encoder::new(&mut bytes, image.width, image.height);

@@ -10,13 +10,16 @@ use super::{Table, html};
 
 const STYLE: &str = include_str!("page.css");
 const SCRIPT: &str = include_str!("page.js");
+const INTERACTIVE_SCRIPT: &str = include_str!("interactive.js");
 
 /// One HTML file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Page {
     /// Title of the window and of the page.
     pub title: String,
-    /// Sentence below the title.
+    /// The answer, below the title.
+    pub verdict: String,
+    /// Sentence below the verdict.
     pub subtitle: String,
     /// Sections from the top; their titles make the table of contents.
     pub sections: Vec<Section>,
@@ -47,6 +50,17 @@ pub enum PageElement {
         /// Caption.
         caption: String,
     },
+    /// Interactive path, whose content is JSON.
+    Interactive {
+        /// Content.
+        json: String,
+        /// Caption.
+        caption: String,
+    },
+    /// Table, collapsed under its title.
+    CollapsedTable(Table),
+    /// Terms with their definitions.
+    Definitions(Vec<(String, String)>),
     /// Preformatted text, collapsed under its name.
     Collapsed {
         /// Name, always visible.
@@ -57,6 +71,11 @@ pub enum PageElement {
 }
 
 impl Page {
+    fn is_interactive(&self) -> bool {
+        let mut elements = self.sections.iter().flat_map(|section| &section.elements);
+        elements.any(|element| matches!(element, PageElement::Interactive { .. }))
+    }
+
     /// Renders the file.
     pub fn to_html(&self) -> String {
         let page = html! {
@@ -72,7 +91,8 @@ impl Page {
                     main {
                         header {
                             h1 { (self.title) }
-                            p { (self.subtitle) }
+                            @if !self.verdict.is_empty() { p.verdict { (self.verdict) } }
+                            p.note { (self.subtitle) }
                             nav {
                                 @for (index, section) in self.sections.iter().enumerate() {
                                     a href={ "#section-" (index) } { (section.title) }
@@ -87,6 +107,7 @@ impl Page {
                         }
                     }
                     script { (PreEscaped(SCRIPT)) }
+                    @if self.is_interactive() { script { (PreEscaped(INTERACTIVE_SCRIPT)) } }
                 }
             }
         };
@@ -113,6 +134,27 @@ impl PageElement {
                     figcaption { (caption) }
                 }
             },
+            Self::Interactive { json, caption } => html! {
+                figure.interactive {
+                    canvas aria-label=(caption) {}
+                    input type="range" min="0" value="0" aria-label="Frame";
+                    output {}
+                    figcaption { (caption) }
+                    // No text of the content ends the element.
+                    script type="application/json" { (PreEscaped(json.replace('<', "\\u003c"))) }
+                }
+            },
+            Self::CollapsedTable(table) => html! {
+                details {
+                    summary { (table.title) }
+                    (html::table(table))
+                }
+            },
+            Self::Definitions(terms) => html! {
+                dl {
+                    @for (term, definition) in terms { dt { (term) } dd { (definition) } }
+                }
+            },
             Self::Collapsed { name, text } => html! {
                 details {
                     summary { (name) }
@@ -132,6 +174,7 @@ mod tests {
         Page {
             title: "A <run>".to_owned(),
             subtitle: "of a street".to_owned(),
+            verdict: String::new(),
             sections: vec![
                 Section {
                     title: "Errors".to_owned(),

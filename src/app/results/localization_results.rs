@@ -15,16 +15,21 @@
 //! | `times_s`, `runtimes_s`, `refine_runtimes_s` | (rows) | float64 | time of the frame; computing time [s] |
 //! | `agreements` | (rows) | float64 | share of beams above the road that agree with the map, −1 where unknown |
 //! | `states` | (rows) | uint8 | state of the filter |
+//! | `scan_outlines` | (rows, 512) | int16 | x, y of up to 256 points of the scan at the height of the sensor, in the lidar frame [cm]; zeros after the last |
 //! | `selected_frames` | () | int64 | number of frames to localize; only where not all were |
 //!
 //! All but the first three are optional, and so are `particles` where there are `frames`: a trajectory without a map.
 //! In rows before `start_idx` they are NaN.
 
+use std::ops::RangeInclusive;
+
 use anyhow::{Context as _, Result, ensure};
+use glam::Vec3;
 use nalgebra::Matrix3;
 
 use crate::evaluation::{ParticleRow, RangeMclRules};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
+use crate::lidar::{Motion, Scan};
 
 /// Particles of many frames, without the padding of the stored array.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -88,6 +93,43 @@ impl ParticleLog {
     }
 }
 
+/// Horizontal positions of points of a scan in the lidar frame [cm].
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ScanOutline(pub Vec<[i16; 2]>);
+
+impl ScanOutline {
+    /// Largest number of points.
+    pub const MAX: usize = 256;
+
+    /// Points at the height of the sensor, at even distances in the order of the scan, moved to the moment of its pose.
+    pub fn of(scan: &Scan, motion: Option<&Motion>) -> Self {
+        const HEIGHTS_M: RangeInclusive<f32> = -1.0..=1.0;
+        /// Largest coordinate that is kept, that of the type [m].
+        const FARTHEST_M: f32 = 327.0;
+        let is_seen = |point: &Vec3| {
+            HEIGHTS_M.contains(&point.z) && point.truncate().abs().max_element() < FARTHEST_M
+        };
+        let seen: Vec<usize> = (0..scan.len())
+            .filter(|&k| is_seen(&scan.points[k]))
+            .collect();
+        let step = seen.len().div_ceil(Self::MAX).max(1);
+        let chosen: Vec<usize> = seen.into_iter().step_by(step).collect();
+        let mut outline = Scan {
+            points: chosen.iter().map(|&k| scan.points[k]).collect(),
+            times_s: (chosen.iter())
+                .filter_map(|&k| scan.times_s.get(k).copied())
+                .collect(),
+            ..Scan::default()
+        };
+        if let Some(motion) = motion {
+            motion.deskew(&mut outline);
+        }
+        let centimetres =
+            |point: &Vec3| [point.x, point.y].map(|metres| (100.0 * metres).round() as i16);
+        Self(outline.points.iter().map(centimetres).collect())
+    }
+}
+
 /// Results of a run, one row per localized frame; `None` if not computed or not known.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LocalizationResults {
@@ -123,6 +165,8 @@ pub struct LocalizationResults {
     pub agreements: Option<Vec<f64>>,
     /// State of the filter as a number.
     pub states: Option<Vec<u8>>,
+    /// Outlines of the scans, for pictures.
+    pub scan_outlines: Option<Vec<ScanOutline>>,
     /// Number of frames to localize; a file has it only if the run ended before the last of them.
     pub selected: Option<usize>,
 }
@@ -184,6 +228,7 @@ impl LocalizationResults {
             refine_runtimes_s: pick(&self.refine_runtimes_s, rows),
             agreements: pick(&self.agreements, rows),
             states: pick(&self.states, rows),
+            scan_outlines: pick(&self.scan_outlines, rows),
             selected: None,
         }
     }

@@ -17,7 +17,7 @@ mod run_summary;
 pub(crate) mod kitti_07_tests;
 
 pub use frames::write_frames_csv;
-pub use localization_results::{LocalizationResults, ParticleLog};
+pub use localization_results::{LocalizationResults, ParticleLog, ScanOutline};
 pub use report::{Report, TrajectoryReport};
 pub use results_file::write_poses_npy;
 pub use rows::{MetricRow, Value};

@@ -144,7 +144,7 @@ fn unreadable(error: &io::Error) -> String {
 
 fn not_numbers(found: &DType) -> anyhow::Error {
     anyhow!(
-        "its elements are of type {}, but numbers are needed (float32, float64, int32, int64, uint8 or bool); convert it with numpy.asarray(array, float)",
+        "its elements are of type {}, but numbers are needed (float32, float64, int16, int32, int64, uint8 or bool); convert it with numpy.asarray(array, float)",
         found.descr()
     )
 }
@@ -170,6 +170,7 @@ fn open_array<'a>(mut entry: io::Take<impl Read + 'a>) -> Result<(Vec<usize>, Nu
     let numbers = match (element.type_char(), element.size_field()) {
         (TypeChar::Float, 4) => numbers::<f32>(file, f64::from),
         (TypeChar::Float, 8) => numbers::<f64>(file, |number| number),
+        (TypeChar::Int, 2) => numbers::<i16>(file, f64::from),
         (TypeChar::Int, 4) => numbers::<i32>(file, f64::from),
         (TypeChar::Int, 8) => numbers::<i64>(file, |number| number as f64),
         (TypeChar::Uint, 1) => numbers::<u8>(file, f64::from),

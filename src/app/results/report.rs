@@ -12,13 +12,12 @@ use super::run_summary::RunSummary;
 use crate::evaluation::{RangeMclErrors, SpatialMetrics, TrajectoryMetrics};
 
 /// The most important rows of every kind of report, of which each has at most twelve.
-const MAIN_ROWS: [&str; 24] = [
+const MAIN_ROWS: [&str; 23] = [
     // Of a run without true poses.
     "frames",
     "tracking",
     "path",
     "position sigma median",
-    "position sigma p95",
     "heading sigma median",
     "agreement median",
     // Against true poses in a map.
@@ -145,7 +144,7 @@ impl Report {
     pub fn is_main(&self, row: &MetricRow) -> bool {
         // In a map the planar errors are the main ones.
         let is_planar = self.mcl.is_some();
-        let is_spatial = MAIN_ROWS[13..].contains(&row.name);
+        let is_spatial = MAIN_ROWS[12..].contains(&row.name);
         MAIN_ROWS.contains(&row.name) && !(is_planar && is_spatial)
     }
 

@@ -7,7 +7,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result, anyhow, ensure};
 use nalgebra::{Matrix3, Quaternion, Translation3, UnitQuaternion, Vector2};
 
-use super::localization_results::{LocalizationResults, ParticleLog};
+use super::localization_results::{LocalizationResults, ParticleLog, ScanOutline};
 use super::npz::{Array, NpzReader, NpzWriter, write_npy};
 use crate::evaluation::ParticleRow;
 use crate::files::write_atomically;
@@ -15,6 +15,9 @@ use crate::geometry::{Pose2, Pose3};
 
 /// Largest number of particles in empty rows, 4 GiB of zeros.
 const MOST_EMPTY_PARTICLES: usize = 1 << 28;
+
+/// Numbers in a row of an outline.
+const OUTLINE_NUMBERS: usize = 2 * ScanOutline::MAX;
 
 impl LocalizationResults {
     /// Reads a file of fpmcl or of range-mcl.
@@ -56,6 +59,7 @@ impl LocalizationResults {
             refine_runtimes_s: file.rows("refine_runtimes_s", |[time_s]| time_s)?,
             agreements: file.rows("agreements", |[share]| share)?,
             states: file.states()?,
+            scan_outlines: file.rows("scan_outlines", outline_from_row)?,
             selected,
         })
     }
@@ -115,6 +119,7 @@ impl LocalizationResults {
         file.numbers("refine_runtimes_s", &self.refine_runtimes_s, f64::NAN)?;
         file.numbers("agreements", &self.agreements, f64::NAN)?;
         file.numbers("states", &self.states, 0)?;
+        file.outlines(&self.scan_outlines)?;
         file.npz.finish()
     }
 
@@ -173,6 +178,20 @@ fn row_from_matrix(matrix: &Matrix3<f64>) -> [f64; 9] {
     std::array::from_fn(|index| matrix[(index / 3, index % 3)])
 }
 
+/// The points of a row up to the last that is not zero.
+fn outline_from_row(row: [f64; OUTLINE_NUMBERS]) -> ScanOutline {
+    let mut points: Vec<[i16; 2]> = row
+        .as_chunks()
+        .0
+        .iter()
+        .map(|point: &[f64; 2]| point.map(|it| it as i16))
+        .collect();
+    while points.last() == Some(&[0, 0]) {
+        points.pop();
+    }
+    ScanOutline(points)
+}
+
 /// Writes arrays of one row per frame after `leading` empty rows.
 struct RowWriter<W: Write + Seek> {
     npz: NpzWriter<W>,
@@ -190,6 +209,19 @@ impl<W: Write + Seek> RowWriter<W> {
         let numbers = repeat_n([f64::NAN; N], self.leading).chain(items.iter().map(row));
         let shape = [self.leading + items.len(), N];
         self.npz.add(name, &shape, numbers.flatten())
+    }
+
+    fn outlines(&mut self, items: &Option<Vec<ScanOutline>>) -> io::Result<()> {
+        let Some(items) = items else { return Ok(()) };
+        let shape = [self.leading + items.len(), OUTLINE_NUMBERS];
+        let row = |outline: &ScanOutline| -> Vec<i16> {
+            let mut row = outline.0.concat();
+            row.resize(OUTLINE_NUMBERS, 0);
+            row
+        };
+        let numbers = repeat_n(0, self.leading * OUTLINE_NUMBERS);
+        let numbers = numbers.chain(items.iter().flat_map(row));
+        self.npz.add("scan_outlines", &shape, numbers)
     }
 
     fn numbers<T: npyz::AutoSerialize + Copy>(

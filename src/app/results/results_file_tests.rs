@@ -8,7 +8,7 @@ use npyz::{DType, NpyFile, WriterBuilder as _};
 use zip::write::SimpleFileOptions;
 
 use super::npz::NpzWriter;
-use super::{LocalizationResults, ParticleLog};
+use super::{LocalizationResults, ParticleLog, ScanOutline};
 use crate::geometry::{Pose2, Pose3};
 
 fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
@@ -29,6 +29,11 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
     };
     let numbers = |scale: f64| Some(frames.iter().map(|&f| scale * f as f64).collect());
     let matrix = |&frame: &usize| Matrix3::from_diagonal_element(1.0 + frame as f64);
+    // Of 0 to 3 points.
+    let outline = |&frame: &usize| {
+        let points = (0..frame % 4).map(|k| [-100 * k as i16, frame as i16]);
+        ScanOutline(points.collect())
+    };
     LocalizationResults {
         particles,
         estimates: poses(0.1),
@@ -45,6 +50,7 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
         refine_runtimes_s: numbers(0.02),
         agreements: numbers(0.001),
         states: Some(frames.iter().map(|&frame| frame as u8 % 3).collect()),
+        scan_outlines: Some((frames.iter()).map(outline).collect()),
         selected: Some(40),
         frames,
     }

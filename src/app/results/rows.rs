@@ -403,7 +403,7 @@ fn runtime_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
             "runtime of first frame [ms]: the first frame of the run, with the start in it",
             metrics.first_runtime_s.map(|time_s| 1e3 * time_s),
         ),
-        MetricRow::new("frames: frames that count", metrics.frames),
+        MetricRow::new("evaluated frames: frames that count", metrics.frames),
         MetricRow::new(
             "distance [m]: distance driven in them, by the truth",
             metrics.distance_m,

@@ -141,7 +141,7 @@ fn localize<'a>(
                 None => None,
             };
             let runtimes = [runtime, started.elapsed() - runtime];
-            recorded().record(frame, increment, &estimate, refined, runtimes)
+            recorded().record(frame, increment, &scan, &estimate, refined, runtimes)
         };
         if let Err(error) = process() {
             recorded().failure = Some(error);

@@ -8,8 +8,9 @@ use crate::app::commands::claims::Claims;
 use crate::app::commands::interrupt::Interrupted;
 use crate::app::commands::run_output::{self, Movie, RunFiles};
 use crate::app::config::LocalizationConfig;
-use crate::app::results::{LocalizationResults, ParticleLog};
+use crate::app::results::{LocalizationResults, ParticleLog, ScanOutline};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
+use crate::lidar::{Motion, Scan};
 use crate::localization::Estimate;
 use crate::map::Map;
 use crate::memory;
@@ -56,6 +57,7 @@ impl Run {
                 runtimes_s: Some(Vec::new()),
                 agreements: Some(Vec::new()),
                 states: Some(Vec::new()),
+                scan_outlines: Some(Vec::new()),
                 refined: config.refine.then(Vec::new),
                 refined_covariances: config.refine.then(Vec::new),
                 refine_runtimes_s: config.refine.then(Vec::new),
@@ -76,6 +78,7 @@ impl Run {
         &mut self,
         frame: &Frame,
         increment: Option<Pose2>,
+        scan: &Scan,
         estimate: &Estimate,
         refined: Option<&FrameResult>,
         [runtime, refine_runtime]: [Duration; 2],
@@ -105,6 +108,17 @@ impl Run {
             increment.unwrap_or_else(Pose2::identity),
         );
         push(&mut results.covariances, estimate.covariance);
+        let motion = (results.times_s.as_ref().and_then(|all| all.last()))
+            .zip(self.map_from_lidar.last())
+            .map(|(&before_s, before)| Motion {
+                previous_from_current: before.inverse() * estimate.map_from_lidar,
+                duration_s: frame.time_s - before_s,
+            });
+        let motion = motion.filter(|motion| motion.duration_s > 0.0);
+        push(
+            &mut results.scan_outlines,
+            ScanOutline::of(scan, motion.as_ref()),
+        );
         push(&mut results.times_s, frame.time_s);
         push(&mut results.runtimes_s, runtime.as_secs_f64());
         push(&mut results.agreements, estimate.agreement.unwrap_or(-1.0));
