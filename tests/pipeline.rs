@@ -105,7 +105,7 @@ fn evaluation_keeps_the_details_of_the_run(folder: &Path) {
         ["path.png", "particles.png", "map.png"].map(|name| results.join("plots").join(name));
     let drawn = pictures.each_ref().map(|path| fs::read(path).unwrap());
     let before = json(&results.join("report.json"));
-    let evaluated = run(folder, &["evaluate", "evaluation.yml"]);
+    let evaluated = run(folder, &["evaluate", "evaluation.yml", "--all"]);
     assert!(evaluated.contains("range-mcl success"), "{evaluated}");
     assert!(drawn == pictures.each_ref().map(|path| fs::read(path).unwrap()));
     let after = json(&results.join("report.json"));

@@ -7,6 +7,7 @@ from pathlib import Path
 import fpmcl
 import numpy as np
 import pytest
+from conftest import run
 
 
 @pytest.fixture(scope="module")
@@ -83,3 +84,17 @@ def test_a_message_is_that_of_the_program(folder):
     program = Path(sys.executable).with_name("fpmcl")
     failed = subprocess.run([program, "info", missing], capture_output=True, text=True, check=False)
     assert "none.ply" in str(error.value) and "none.ply" in failed.stderr
+
+
+def test_a_log_is_read_by_the_package_mcap(folder, tmp_path):
+    reader = pytest.importorskip("mcap.reader")
+    log = tmp_path / "run.mcap"
+    run("export", folder / "run/localization.npz", "--mcap", log, cwd=folder)
+    with log.open("rb") as file:
+        summary = reader.make_reader(file).get_summary()
+        counts = {
+            summary.channels[channel].topic: count
+            for channel, count in summary.statistics.channel_message_counts.items()
+        }
+    assert counts["/scan"] == counts["/refined"] == 12
+    assert counts["/map"] == 1

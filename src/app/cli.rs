@@ -3,7 +3,7 @@
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
-use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
+use clap::{ArgAction, Args, CommandFactory as _, Parser, Subcommand, ValueEnum};
 use tracing::level_filters::LevelFilter;
 
 use crate::app::commands::output::Form;
@@ -420,7 +420,7 @@ pub struct ExportArgs {
     pub map: Option<PathBuf>,
 
     /// Largest number of points per scan in a log; 0 for a log without scans.
-    #[arg(long, value_name = "N", default_value_t = 30_000)]
+    #[arg(long, value_name = "N", default_value_t = Self::POINTS)]
     pub points: usize,
 
     /// Replace existing files.
@@ -558,6 +558,26 @@ impl Cli {
         }
     }
 
+    /// The completions of a shell.
+    pub fn completions(shell: clap_complete::Shell) -> Vec<u8> {
+        let mut text = Vec::new();
+        clap_complete::generate(shell, &mut Self::command(), "fpmcl", &mut text);
+        text
+    }
+
+    /// The manual page of the program or of one of its commands, in roff; `None` if there is no such command.
+    pub fn manual(command: Option<&str>) -> Option<std::io::Result<Vec<u8>>> {
+        let mut program = Self::command();
+        program.build();
+        let page = match command {
+            None => program,
+            Some(name) => program.find_subcommand(name)?.clone(),
+        };
+        let mut text = Vec::new();
+        let rendered = clap_mangen::Man::new(page).render(&mut text);
+        Some(rendered.map(|()| text))
+    }
+
     /// Least important messages on standard error.
     pub fn level(&self) -> LevelFilter {
         match (self.quiet, self.verbose) {
@@ -690,15 +710,18 @@ impl RefineArgs {
 }
 
 impl ExportArgs {
-    /// A log of a result.
-    pub fn log_of(result: &Path, log: &Path, force: bool) -> Self {
+    /// Default of `points`.
+    const POINTS: usize = 30_000;
+
+    /// A log of a result in a map.
+    pub fn log_of(result: &Path, map: &Path, log: &Path, force: bool) -> Self {
         Self {
             input: result.to_owned(),
             mcap: Some(log.to_owned()),
             glb: None,
             recording: None,
-            map: None,
-            points: 30_000,
+            map: Some(map.to_owned()),
+            points: Self::POINTS,
             force,
         }
     }
@@ -763,8 +786,6 @@ fn setting(text: &str) -> Result<(String, String), &'static str> {
 
 #[cfg(test)]
 mod tests {
-    use clap::CommandFactory as _;
-
     use super::*;
 
     #[test]

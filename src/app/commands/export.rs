@@ -46,14 +46,15 @@ pub fn run(args: &ExportArgs, context: &Context) -> Result<Printed> {
 /// Checks and claims the files to write.
 pub fn check<'a>(args: &'a ExportArgs, context: &'a Context) -> Result<Vec<(Claims, &'a Path)>> {
     let formats = [("--mcap", &args.mcap, MCAP), ("--glb", &args.glb, GLB)];
-    let optional = [("--recording", &args.recording), ("--map", &args.map)];
-    let optional = optional
-        .iter()
-        .filter_map(|(key, path)| Some((*key, path.as_deref()?)));
-    let inputs = optional
-        .chain([("the input", args.input.as_path())])
-        .chain(context.input());
-    let inputs: Vec<(&str, &Path)> = inputs.collect();
+    let base = refine::base_config(Some(&args.input));
+    let map = args.map.as_deref().unwrap_or(&base.map_file);
+    let recording = args.recording.as_deref().unwrap_or(&base.scan_folder);
+    let inputs = [
+        ("the input", args.input.as_path()),
+        ("the map", map),
+        ("the recording", recording),
+    ];
+    let inputs: Vec<(&str, &Path)> = inputs.into_iter().chain(context.input()).collect();
     let requested = formats
         .into_iter()
         .filter_map(|(key, path, magic)| Some((key, path.as_deref()?, magic)));

@@ -19,7 +19,6 @@ mod context;
 mod input;
 pub mod interrupt;
 mod logging;
-mod manual;
 mod motion_source;
 pub mod output;
 pub mod progress;
@@ -31,9 +30,10 @@ pub mod version;
 
 use std::io::Write as _;
 
+use anyhow::anyhow;
 use serde::Serialize;
 
-use crate::app::cli::{Command, ConfigurationArgs, ConfiguredCommand, ExportArgs, RunArgs};
+use crate::app::cli::{Cli, Command, ConfigurationArgs, ConfiguredCommand, ExportArgs, RunArgs};
 use crate::app::config::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, ConfigError, EvaluationConfig,
     GroundCommandConfig, LocalizationConfig, OdometryCommandConfig, RefinementConfig,
@@ -66,7 +66,9 @@ fn printed(command: &Command, context: &Context) -> anyhow::Result<Printed> {
             let base = LocalizationConfig::default;
             let (config, context) = configured(&args.run, args.flags(), base, context)?;
             let log = args.mcap.as_ref();
-            let log = log.map(|path| ExportArgs::log_of(&config.result_path, path, config.force));
+            let log = log.map(|path| {
+                ExportArgs::log_of(&config.result_path, &config.map_file, path, config.force)
+            });
             if let Some(log) = &log {
                 export::check(log, &context)?;
             }
@@ -103,8 +105,15 @@ fn printed(command: &Command, context: &Context) -> anyhow::Result<Printed> {
         Command::Ground(args) => ground::run(args, context),
         Command::Config(args) => configuration(args),
         Command::Doctor(args) => doctor::run(args, context),
-        Command::Completions(args) => Ok(Printed::text(manual::completions(args.shell)?)),
-        Command::Man(args) => Ok(Printed::text(manual::page(args.command.as_deref())?)),
+        Command::Completions(args) => Ok(Printed::text(String::from_utf8(Cli::completions(
+            args.shell,
+        ))?)),
+        Command::Man(args) => {
+            let name = args.command.as_deref();
+            let missing = || anyhow!("there is no command {}", name.unwrap_or_default());
+            let page = Cli::manual(name).ok_or_else(missing)??;
+            Ok(Printed::text(String::from_utf8(page)?))
+        }
     }
 }
 
@@ -196,7 +205,6 @@ mod tests {
     use clap::Parser as _;
 
     use super::*;
-    use crate::app::cli::Cli;
     use crate::recording::RecordingError;
 
     fn loaded<T: CommandConfig>(arguments: &[&str]) -> T {

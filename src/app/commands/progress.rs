@@ -1,18 +1,22 @@
 //! Progress of long tasks: bars on a terminal, a line every few seconds elsewhere.
 
+use std::fmt::Write;
 use std::io::{IsTerminal as _, Write as _};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 use tracing::level_filters::LevelFilter;
 
 /// Time between two lines without a terminal.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
 
 /// Layout of a bar.
-const TEMPLATE: &str = "{prefix:14} {wide_bar} {pos}/{len} {per_sec} {eta} left {msg}";
+const TEMPLATE: &str = "{prefix:14} {wide_bar} {items} {left} {msg}";
+
+/// Parts into which a step is divided, for work that goes on after all scans are read.
+const PARTS: u64 = 1000;
 
 /// Display of the progress of tasks; by default there is none.
 #[derive(Clone, Debug, Default)]
@@ -49,7 +53,7 @@ impl Progress {
     /// Starts a task of `total` steps, which are counted by [`Task::advance`]; it ends when it is
     /// dropped.
     pub fn task(&self, name: &str, total: usize) -> Arc<Task> {
-        let total = Some(total as u64);
+        let total = Some(PARTS * total as u64);
         let mut bar = ProgressBar::with_draw_target(total, ProgressDrawTarget::hidden());
         if let Self::Bars(bars) = self {
             bar = bars.add(bar);
@@ -81,10 +85,30 @@ impl Progress {
 impl Task {
     /// Counts completed steps.
     pub fn advance(&self, steps: usize) {
-        self.bar.inc(steps as u64);
+        self.bar.inc(PARTS * steps as u64);
         if self.line_is_due() {
             self.write_line();
         }
+    }
+
+    /// Sets the completed share of all steps, 0 to 1.
+    pub fn set_share(&self, share: f64) {
+        self.bar.set_position(self.parts(share));
+        if self.line_is_due() {
+            self.write_line();
+        }
+    }
+
+    /// Counts a share of all steps.
+    pub fn advance_share(&self, share: f64) {
+        self.bar.inc(self.parts(share));
+        if self.line_is_due() {
+            self.write_line();
+        }
+    }
+
+    fn parts(&self, share: f64) -> u64 {
+        (share * self.bar.length().unwrap_or(0) as f64).round() as u64
     }
 
     /// Shows a short text beside the bar, such as the current error.
@@ -106,7 +130,7 @@ impl Task {
     }
 
     fn write_line(&self) {
-        let (done, total) = (self.bar.position(), self.bar.length().unwrap_or(0));
+        let (done, total) = (self.bar.position() / PARTS, self.bar.length().unwrap_or(0) / PARTS);
         let line = line(&self.name, done, total, self.bar.elapsed());
         // A failure to show progress must not stop the task.
         let _ = writeln!(std::io::stderr(), "{line}");
@@ -127,21 +151,44 @@ impl Drop for Task {
 }
 
 fn style() -> ProgressStyle {
-    ProgressStyle::with_template(TEMPLATE).unwrap_or_else(|_| ProgressStyle::default_bar())
+    let style = ProgressStyle::with_template(TEMPLATE);
+    style
+        .unwrap_or_else(|_| ProgressStyle::default_bar())
+        .with_key("items", |state: &ProgressState, text: &mut dyn Write| {
+            let (done, total) = (state.pos() / PARTS, state.len().unwrap_or(0) / PARTS);
+            // There is nowhere to report that the terminal is closed.
+            let _ = write!(text, "{done}/{total}, {}", rate(done, state.elapsed()));
+        })
+        .with_key("left", |state: &ProgressState, text: &mut dyn Write| {
+            let is_running = state.len().is_some_and(|length| state.pos() < length);
+            if is_running && state.pos() > 0 {
+                let _ = write!(text, "{:.0} s left", state.eta().as_secs_f64().ceil());
+            }
+        })
 }
 
-/// Formats a line such as `localize: 40 of 160 (25 %), 8.0 per second, 15 s left`.
+/// Steps per second, or seconds per step where these are less than one.
+fn rate(done: u64, elapsed: Duration) -> String {
+    let per_second = done as f64 / elapsed.as_secs_f64().max(1e-3);
+    match per_second {
+        rate if rate >= 100.0 => format!("{rate:.0}/s"),
+        rate if rate >= 1.0 || done == 0 => format!("{rate:.1}/s"),
+        rate => format!("{:.1} s each", 1.0 / rate),
+    }
+}
+
+/// Formats a line such as `localize: 40 of 160 (25 %), 8.0/s, 15 s left`.
 fn line(name: &str, done: u64, total: u64, elapsed: Duration) -> String {
     let percent = 100 * done / total.max(1);
-    let per_second = done as f64 / elapsed.as_secs_f64().max(1e-3);
+    let seconds = elapsed.as_secs_f64();
     let rest = if done >= total {
-        format!("{:.1} s", elapsed.as_secs_f64())
+        format!("{seconds:.1} s")
     } else if done == 0 {
         "time left unknown".to_owned()
     } else {
-        format!("{:.0} s left", (total - done) as f64 / per_second)
+        format!("{:.0} s left", (total - done) as f64 * seconds / done as f64)
     };
-    format!("{name}: {done} of {total} ({percent} %), {per_second:.1} per second, {rest}")
+    format!("{name}: {done} of {total} ({percent} %), {}, {rest}", rate(done, elapsed))
 }
 
 #[cfg(test)]
@@ -152,15 +199,15 @@ mod tests {
     fn a_line_has_share_rate_and_time_left() {
         assert_eq!(
             line("localize", 40, 160, Duration::from_secs(5)),
-            "localize: 40 of 160 (25 %), 8.0 per second, 15 s left"
+            "localize: 40 of 160 (25 %), 8.0/s, 15 s left"
         );
         assert_eq!(
             line("localize", 160, 160, Duration::from_secs(20)),
-            "localize: 160 of 160 (100 %), 8.0 per second, 20.0 s"
+            "localize: 160 of 160 (100 %), 8.0/s, 20.0 s"
         );
         assert_eq!(
             line("localize", 0, 160, Duration::ZERO),
-            "localize: 0 of 160 (0 %), 0.0 per second, time left unknown"
+            "localize: 0 of 160 (0 %), 0.0/s, time left unknown"
         );
     }
 
@@ -172,7 +219,15 @@ mod tests {
                 scope.spawn(|| (0..100).for_each(|_| task.advance(1)));
             }
         });
-        assert_eq!(task.bar.position(), 400);
+        assert_eq!(task.bar.position(), 400 * PARTS);
+        task.set_share(0.5);
+        assert_eq!(task.bar.position(), 200 * PARTS);
+    }
+
+    #[test]
+    fn a_rate_has_sensible_digits() {
+        let rates = [(500, 2), (9, 2), (1, 4), (0, 4)].map(|(done, s)| rate(done, Duration::from_secs(s)));
+        assert_eq!(rates, ["250/s", "4.5/s", "4.0 s each", "0.0/s"]);
     }
 
     #[test]

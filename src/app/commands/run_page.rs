@@ -72,7 +72,7 @@ pub const TEXTS: [&str; 5] = [
 pub fn write(files: &RunFiles, report: &Report) -> Result<()> {
     let named = |name| report.about.get(name).map(|path| short_name(path));
     let title = match (report.trajectory.is_some(), named("map")) {
-        (true, _) => named("result").unwrap_or_default(),
+        (true, _) => format!("Trajectory {}", named("result").unwrap_or_default()),
         (false, Some(map)) => format!("{} in {map}", named("recording").unwrap_or_default()),
         (false, None) => named("recording").unwrap_or_else(|| "A run".to_owned()),
     };

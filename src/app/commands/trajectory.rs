@@ -26,7 +26,7 @@ pub fn estimate(
 ) -> Result<Trajectory> {
     let mut builder = TrajectoryBuilder::new(config.clone())?;
     let name = if is_given { "polish" } else { "odometry" };
-    let _task = each_scan(name, frames, context, |frame, scan| {
+    let task = each_scan(name, frames, context, |frame, scan| {
         match frame.map_from_lidar {
             Some(pose) if is_given => builder.add_given(scan, pose)?,
             _ => {
@@ -35,7 +35,9 @@ pub fn estimate(
         }
         Ok(())
     })?;
-    Ok(builder.finish()?)
+    let found = builder.finish()?;
+    task.set_share(1.0);
+    Ok(found)
 }
 
 /// Reads the scans in order and passes each to `step`, until an interruption; returns the progress, which is still open.
@@ -45,6 +47,8 @@ pub fn each_scan(
     context: &Context,
     mut step: impl FnMut(&Frame, &Scan) -> Result<()>,
 ) -> Result<Arc<Task>> {
+    /// About the share of the work until all scans are read; the rest are loops and adjustment.
+    const SHARE: f64 = 0.5;
     let kept = "nothing is written: loops and adjustment need all scans";
     context.interrupt.keeps(kept.to_owned());
     let task = context.progress.task(name, frames.len());
@@ -53,7 +57,7 @@ pub fn each_scan(
             return Err(Interrupted { kept: kept.into() }.into());
         }
         step(frame, &frame.read()?)?;
-        task.advance(1);
+        task.advance_share(SHARE / frames.len() as f64);
     }
     task.note("loops and adjustment");
     Ok(task)

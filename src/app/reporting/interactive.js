@@ -66,7 +66,7 @@ function interactive(figure) {
     const pose = at(run.poses, frame);
     const [sine, cosine] = [Math.sin(pose.heading), Math.cos(pose.heading)];
     ink.fillStyle = "#c8009c";
-    const size = 2.5 * devicePixelRatio;
+    const size = 3.5 * devicePixelRatio;
     const start = starts[frame] ?? 0;
     for (let k = start; k < start + 2 * (run.scans?.counts[frame] ?? 0); k += 2) {
       const [forward, left] = [points[k] / 100, points[k + 1] / 100];

@@ -351,7 +351,7 @@ mod tests {
         assert!(short.lines().next().unwrap().contains(verdict), "{short}");
         let rows = |text: &str| text.lines().filter(|line| line.contains("  ")).count() - 1;
         assert!(rows(&short) <= 12 && rows(&all) > 30, "{short}");
-        let rest = format!("{} more rows: --all", rows(&all) - 1 - rows(&short));
+        let rest = format!("{} more rows: --all", rows(&all) - rows(&short));
         assert!(short.contains(&rest), "{short}");
         assert!(!all.lines().any(|line| line.ends_with("  -")), "{all}");
     }

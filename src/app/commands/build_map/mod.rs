@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
@@ -27,6 +27,7 @@ use self::parts::{Joined, Parts, hash_of_scans, joint_hash};
 pub use self::report::BuildReport;
 use super::claims::Claims;
 use super::interrupt::Interrupted;
+use super::progress::Task;
 use super::trajectory::{self, TrajectorySummary, file_beside};
 use super::{Context, input, output, version};
 use crate::app::config::{self, BuildMapConfig, PoseSource};
@@ -65,7 +66,8 @@ fn run_with_scans(config: &BuildMapConfig, context: &Context) -> Result<BuildRep
     let clock = Arc::new(StageClock::default());
     let parts = Parts::open(&config.mesh_file, &inputs(config, &mapped, older.as_ref())?)?;
     let older = older.as_ref();
-    let local_maps = build_parts(config, context, &mapped, (&parts, &clock), older)?;
+    let (local_maps, task) = build_parts(config, context, &mapped, (&parts, &clock), older)?;
+    task.note("joining");
     let Joined { mesh: added, gone } = clock.time("join", || parts.join(local_maps.len()))?;
     let poses = poses_of(&mapped);
     let (mesh, added, path) = match older {
@@ -85,6 +87,7 @@ fn run_with_scans(config: &BuildMapConfig, context: &Context) -> Result<BuildRep
     let residuals = clock.time("quality", || residuals(config, &mesh, &held_out))?;
     write_map(config, &mesh, &path, &mut claims)?;
     let truth = clock.time("truth", || agreement(config, &mesh, &path))?;
+    task.note("pictures");
     if config.visualize {
         pictures::draw(config, &mesh, &path.map_from_lidar, &residuals)?;
         if let Some(older) = older {
@@ -108,6 +111,7 @@ fn run_with_scans(config: &BuildMapConfig, context: &Context) -> Result<BuildRep
     };
     output::write_json(&config.mesh_file.with_extension("report.json"), &report)?;
     output::write_yaml(&config.mesh_file.with_extension("effective.yml"), config)?;
+    task.set_share(1.0);
     parts.remove()?;
     claims.finish(&config.mesh_file)?;
     Ok(report)
@@ -190,29 +194,85 @@ fn poses_of(frames: &[Frame]) -> Vec<Pose3> {
     poses.map(Option::unwrap_or_default).collect()
 }
 
-/// Builds the local maps that are not finished yet; returns the counts of all.
+/// Stages of a local map, and about the share of its time before each.
+const STAGES: [(&str, f64); 6] = [
+    ("scans", 0.0),
+    ("moving points", 0.4),
+    ("surface", 0.65),
+    ("false surfaces", 0.85),
+    ("changes", 0.95),
+    ("ground", 0.97),
+];
+
+/// Share of all work that is left when the local maps are finished.
+const JOINING: f64 = 0.03;
+
+/// Progress through the local maps, in scans.
+struct MapProgress {
+    task: Arc<Task>,
+    scans: usize,
+    /// Scans of the finished local maps, and of the current one.
+    state: Mutex<(usize, usize)>,
+}
+
+impl MapProgress {
+    /// Begins a local map after the ones before it.
+    fn begin(&self, scans: usize) {
+        let mut state = self.state();
+        *state = (state.0 + state.1, scans);
+        self.show(&state, 0.0);
+    }
+
+    /// Begins a stage; stages that come again do not move back.
+    fn begin_stage(&self, name: &str) {
+        self.task.note(name);
+        if let Some((_, share)) = STAGES.iter().find(|(stage, _)| *stage == name) {
+            self.show(&self.state(), *share);
+        }
+    }
+
+    fn end_scan(&self) {
+        self.task.advance_share(STAGES[1].1 * (1.0 - JOINING) / self.scans.max(1) as f64);
+    }
+
+    fn show(&self, &(finished, current): &(usize, usize), share: f64) {
+        let done = finished as f64 + share * current as f64;
+        self.task.set_share((1.0 - JOINING) * done / self.scans.max(1) as f64);
+    }
+
+    fn state(&self) -> MutexGuard<'_, (usize, usize)> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Builds the local maps that are not finished yet; returns the counts of all, and the progress, which is still open.
 fn build_parts(
     config: &BuildMapConfig,
     context: &Context,
     frames: &[Frame],
     (parts, clock): (&Parts, &Arc<StageClock>),
     older: Option<&OlderMap>,
-) -> Result<Vec<LocalMapCounts>> {
+) -> Result<(Vec<LocalMapCounts>, Arc<Task>)> {
     let poses = poses_of(frames);
     let planned = local_maps(&poses, config.local_map_size, config.overlap_m);
-    let scans = planned.iter().map(|local_map| local_map.used.len()).sum();
-    let task = context.progress.task("build-map", scans);
+    // Scans in two local maps count once, in the one that owns them.
+    let task = context.progress.task("build-map", frames.len());
+    let progress = Arc::new(MapProgress {
+        task: task.clone(),
+        scans: planned.iter().map(|local_map| local_map.used.len()).sum(),
+        state: Mutex::default(),
+    });
     let builder = MapBuilder {
         on_event: {
-            let (task, clock) = (task.clone(), clock.clone());
+            let (progress, clock) = (progress.clone(), clock.clone());
             let interrupt = context.interrupt.clone();
             Box::new(move |event| {
                 match event {
                     BuildEvent::Stage(name) => {
-                        task.note(name);
+                        progress.begin_stage(name);
                         clock.begin(name);
                     }
-                    BuildEvent::ScanPrepared => task.advance(1),
+                    BuildEvent::ScanPrepared => progress.end_scan(),
                 }
                 match interrupt.requested() {
                     true => ControlFlow::Break(()),
@@ -228,11 +288,11 @@ fn build_parts(
     context.interrupt.keeps(kept(0, &plan, parts));
     for local_map in &plan.local_maps {
         let used = &frames[local_map.used.clone()];
+        progress.begin(used.len());
         let counts = match parts.finished(local_map.number, || hash_of_scans(used)) {
             Some(counts) => {
                 let (number, count) = (local_map.number + 1, plan.local_maps.len());
                 tracing::info!("local map {number} of {count} is finished already");
-                task.advance(counts.scans);
                 counts
             }
             None => {
@@ -244,7 +304,8 @@ fn build_parts(
         all.push(counts);
         context.interrupt.keeps(kept(all.len(), &plan, parts));
     }
-    Ok(all)
+    progress.begin(0);
+    Ok((all, task))
 }
 
 /// Builds a local map and keeps it.

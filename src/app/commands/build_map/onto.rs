@@ -77,13 +77,15 @@ pub fn find(
         TrajectoryConfig::default(),
     );
     let mut drive = SecondDrive::new(map, localizer, settings, config.seed)?;
-    let _task = trajectory::each_scan("localize", frames, context, |_, scan| {
+    let task = trajectory::each_scan("localize", frames, context, |_, scan| {
         drive.add(scan)?;
         Ok(())
     })?;
     let (found, all) = (drive.found(), frames.len());
     tracing::info!("{found} of {all} scans are found in the older map");
-    Ok(drive.finish()?)
+    let trajectory = drive.finish()?;
+    task.set_share(1.0);
+    Ok(trajectory)
 }
 
 /// What a drive changed in an older map.
