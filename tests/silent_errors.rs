@@ -326,9 +326,5 @@ fn a_run_that_is_lost_says_so_even_when_quiet() {
         output.stderr,
         output.stdout
     );
-    assert!(
-        output.stdout.contains("racking in "),
-        "{}",
-        output.stdout
-    );
+    assert!(output.stdout.contains("racking in "), "{}", output.stdout);
 }

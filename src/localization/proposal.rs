@@ -8,7 +8,7 @@
 //! prior      N(m, P)       the predicted particles
 //! scan       N(s, S)       registration of the scan with the map, starting at m
 //! proposal   N(q, k² Q)    Q = (P⁻¹ + S⁻¹)⁻¹,   q = m + Q S⁻¹ (s − m)
-//! weight     w ∝ p(scan | x, map)ᵝ N(x; m, P) / N(x; q, k² Q)
+//! weight     w ∝ (p(scan | x, map) N(x; m, P) / N(x; q, k² Q))ᵝ        β: tempering
 //! ```
 //!
 //! The registration also estimates height, roll and pitch, which all particles share.

@@ -130,7 +130,10 @@ impl Task {
     }
 
     fn write_line(&self) {
-        let (done, total) = (self.bar.position() / PARTS, self.bar.length().unwrap_or(0) / PARTS);
+        let (done, total) = (
+            self.bar.position() / PARTS,
+            self.bar.length().unwrap_or(0) / PARTS,
+        );
         let line = line(&self.name, done, total, self.bar.elapsed());
         // A failure to show progress must not stop the task.
         let _ = writeln!(std::io::stderr(), "{line}");
@@ -186,9 +189,15 @@ fn line(name: &str, done: u64, total: u64, elapsed: Duration) -> String {
     } else if done == 0 {
         "time left unknown".to_owned()
     } else {
-        format!("{:.0} s left", (total - done) as f64 * seconds / done as f64)
+        format!(
+            "{:.0} s left",
+            (total - done) as f64 * seconds / done as f64
+        )
     };
-    format!("{name}: {done} of {total} ({percent} %), {}, {rest}", rate(done, elapsed))
+    format!(
+        "{name}: {done} of {total} ({percent} %), {}, {rest}",
+        rate(done, elapsed)
+    )
 }
 
 #[cfg(test)]
@@ -226,7 +235,8 @@ mod tests {
 
     #[test]
     fn a_rate_has_sensible_digits() {
-        let rates = [(500, 2), (9, 2), (1, 4), (0, 4)].map(|(done, s)| rate(done, Duration::from_secs(s)));
+        let rates =
+            [(500, 2), (9, 2), (1, 4), (0, 4)].map(|(done, s)| rate(done, Duration::from_secs(s)));
         assert_eq!(rates, ["250/s", "4.5/s", "4.0 s each", "0.0/s"]);
     }
 

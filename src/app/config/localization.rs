@@ -26,7 +26,7 @@ use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative, 
 
 /// Configuration of `localize`: the keys of range-mcl's `localization.yml`, then new ones.
 ///
-/// Defaults: the values of range-mcl.
+/// Defaults: the values of range-mcl where it has the key.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct LocalizationConfig {
@@ -133,10 +133,10 @@ pub struct LocalizationConfig {
     pub odometry_noise: OdometryNoise,
     /// Noise of the velocity model.
     pub velocity_noise: VelocityNoise,
-    /// Noise of constant velocity, without odometry, per frame.
+    /// Noise of constant velocity, without odometry, per 0.1 s.
     #[default(LocalizerConfig::default().constant_velocity)]
     pub constant_velocity_noise: OdometryNoise,
-    /// The same before the velocity is known, per frame.
+    /// The same before the velocity is known, per 0.1 s.
     #[default(LocalizerConfig::default().unknown_velocity)]
     pub unknown_velocity_noise: OdometryNoise,
     /// Observation model.

@@ -12,7 +12,7 @@ use crate::recording::Frame;
 
 /// Writes one row per frame: `frames`, `times_s`, `map_from_lidar` and `odom_from_lidar` (rows, 4, 4),
 /// `motion_covariances` (rows, 6, 6) of the motion since the scan before: x, y, z, roll, pitch, yaw in the lidar
-/// frame [m, rad], and `states`: 0 first, 1 registered, 2 predicted.
+/// frame [m, rad], and `states`: 0 first, 1 registered, 2 predicted, 3 given.
 pub fn write_trajectory_npz(
     path: &Path,
     frames: &[Frame],

@@ -232,12 +232,14 @@ impl MapProgress {
     }
 
     fn end_scan(&self) {
-        self.task.advance_share(STAGES[1].1 * (1.0 - JOINING) / self.scans.max(1) as f64);
+        self.task
+            .advance_share(STAGES[1].1 * (1.0 - JOINING) / self.scans.max(1) as f64);
     }
 
     fn show(&self, &(finished, current): &(usize, usize), share: f64) {
         let done = finished as f64 + share * current as f64;
-        self.task.set_share((1.0 - JOINING) * done / self.scans.max(1) as f64);
+        self.task
+            .set_share((1.0 - JOINING) * done / self.scans.max(1) as f64);
     }
 
     fn state(&self) -> MutexGuard<'_, (usize, usize)> {
