@@ -112,6 +112,13 @@ pub fn refine(
             refiner.add(&*scans.read(row)?, start)?;
             Python::attach(|py| py.check_signals())?;
         }
+        if let Some(increments) = &increments {
+            let increments: Vec<Option<Pose2>> = increments.iter().copied().map(Some).collect();
+            refiner.place_backwards(&starts, &increments, |row| {
+                Python::attach(|py| py.check_signals())?;
+                anyhow::Ok(scans.read(row)?.into_owned())
+            })?;
+        }
         anyhow::Ok(refiner.finish(increments.as_deref())?)
     })?;
     Ok(RefinedTrajectory {

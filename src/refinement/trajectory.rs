@@ -267,29 +267,46 @@ impl TrajectoryRefiner {
         Ok(&self.frames[self.frames.len() - 1])
     }
 
+    /// Places frames before those that have poses in the map, from the last to the first, by the odometry into each
+    /// frame, whose first entry is ignored; `read` reads the scan of a row.
+    pub fn place_backwards<E: From<RefinerError>>(
+        &mut self,
+        starts: &[InitialEstimate],
+        increments: &[Option<Pose2>],
+        mut read: impl FnMut(usize) -> Result<Scan, E>,
+    ) -> Result<(), E> {
+        for row in (0..self.frames.len()).rev() {
+            if self.is_before_tracked(row)
+                && let Some(increment) = &increments[row + 1]
+            {
+                let scan = read(row)?;
+                self.place_before(row, &scan, starts[row].motion.as_ref(), increment)?;
+            }
+        }
+        Ok(())
+    }
+
     /// Whether a frame has no pose in the map, and the one after it has.
-    pub fn is_before_tracked(&self, row: usize) -> bool {
+    fn is_before_tracked(&self, row: usize) -> bool {
         let is_tracked = |row: usize| self.frames.get(row).map(FrameResult::is_tracked);
         is_tracked(row) == Some(false) && is_tracked(row + 1) == Some(true)
     }
 
     /// Places a frame before one that has a pose in the map, by the odometry `row_from_next`; where its scan does not
     /// agree with the map there, it stays as it is.
-    pub fn place_before(
+    fn place_before(
         &mut self,
         row: usize,
         scan: &Scan,
         motion: Option<&Motion>,
         row_from_next: &Pose2,
     ) -> Result<(), RefinerError> {
-        if self.is_before_tracked(row) {
-            let mut rng = stream(self.seed, row as u64);
-            let image = self.sensor.range_image(scan, motion);
-            let next = &self.frames[row + 1];
-            let start = next.near(next.pose * row_from_next.inverse());
-            if let Some(placed) = self.place(&image, [start], &mut rng)? {
-                self.frames[row] = placed;
-            }
+        let mut rng = stream(self.seed, row as u64);
+        let image = self.sensor.range_image(scan, motion);
+        let next = &self.frames[row + 1];
+        let start = next.near(next.pose * row_from_next.inverse());
+        if let Some(placed) = self.place(&image, [start], &mut rng)? {
+            self.frames[row] = placed;
         }
         Ok(())
     }
@@ -560,6 +577,7 @@ mod tests {
         let places = |elsewhere: Option<usize>| {
             let mut refiner =
                 TrajectoryRefiner::new(&world.map(), RefinerConfig::default(), 0).unwrap();
+            let mut starts = Vec::new();
             // The filter knows its pose in frames 2 and 3 only.
             for row in 0..6 {
                 let (pose, state) = match row {
@@ -575,11 +593,11 @@ mod tests {
                     .filter(|&of| of == row)
                     .map_or(row, |_| (row + 4) % 6);
                 refiner.add(&scans[seen], &estimate).unwrap();
+                starts.push(estimate);
             }
-            for row in (0..5).rev() {
-                let back = &increments[row + 1];
-                refiner.place_before(row, &scans[row], None, back).unwrap();
-            }
+            let back: Vec<Option<Pose2>> = increments.iter().copied().map(Some).collect();
+            let read = |row: usize| Ok::<_, RefinerError>(scans[row].clone());
+            refiner.place_backwards(&starts, &back, read).unwrap();
             refiner.finish(None).unwrap()
         };
         let off_m = |refined: &RefinedTrajectory, row: usize| {

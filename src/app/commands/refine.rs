@@ -248,19 +248,12 @@ fn refine(
         task.advance(1);
     }
     drop(task);
-    for row in (0..starts.len()).rev() {
-        if refiner.is_before_tracked(row)
-            && let Some(increment) = &increments[row + 1]
-        {
-            if context.interrupt.requested() {
-                return Err(Interrupted { kept }.into());
-            }
-            let started = Instant::now();
-            let scan = sequence.frames[row].read()?;
-            refiner.place_before(row, &scan, starts[row].motion.as_ref(), increment)?;
-            runtimes_s[row] += started.elapsed().as_secs_f64();
+    refiner.place_backwards(starts, increments, |row| {
+        if context.interrupt.requested() {
+            return Err(Interrupted { kept: kept.clone() }.into());
         }
-    }
+        anyhow::Ok(sequence.frames[row].read()?)
+    })?;
     let known: Option<Vec<Pose2>> = increments.iter().copied().collect();
     let is_used = config.odometry != OdometrySource::None;
     ensure!(known.is_some() || !is_used, "the odometry has gaps");
