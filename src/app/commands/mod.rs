@@ -110,7 +110,12 @@ fn printed(command: &Command, context: &Context) -> anyhow::Result<Printed> {
         ))?)),
         Command::Man(args) => {
             let name = args.command.as_deref();
-            let missing = || anyhow!("there is no command {}", name.unwrap_or_default());
+            let missing = || {
+                anyhow!(
+                    "there is no command {}; fpmcl --help lists all",
+                    name.unwrap_or_default()
+                )
+            };
             let page = Cli::manual(name).ok_or_else(missing)??;
             Ok(Printed::text(String::from_utf8(page)?))
         }

@@ -71,7 +71,11 @@ impl Printed {
     pub fn rows(rows: &[(&str, String)]) -> Self {
         const MAIN: usize = 12;
         let lines = |rows: &[(&str, String)]| -> String {
-            let line = |(name, value): &(&str, String)| format!("{name:<24} {value:>14}\n");
+            let line = |(name, value): &(&str, String)| match value.starts_with(char::is_alphabetic)
+            {
+                true => format!("{name:<24} {value}\n"),
+                false => format!("{name:<24} {value:>14}\n"),
+            };
             rows.iter().map(line).collect()
         };
         let mut main = lines(&rows[..rows.len().min(MAIN)]);

@@ -11,6 +11,8 @@ use crate::app::commands::run_page::{PICTURES, TEXTS, collapsed, picture};
 use crate::app::commands::version;
 use crate::app::config::{self, ComparisonConfig, Overrides, settings};
 use crate::app::reporting::{Cell, Column, Page, PageElement, Section, Table};
+use crate::app::results::length;
+use crate::evaluation::Summary;
 
 /// Pictures of a run that the comparison has for all configurations together.
 const COMBINED_PICTURES: [&str; 2] = ["path.png", "errors.png"];
@@ -27,7 +29,8 @@ pub fn page(
 ) -> Result<Page> {
     let elements = |names: &[&str]| -> Vec<PageElement> {
         let tables = tables.iter().filter(|t| names.contains(&t.name.as_str()));
-        tables.cloned().map(PageElement::Table).collect()
+        let tables = tables.cloned().map(Table::without_absent_columns);
+        tables.map(PageElement::Table).collect()
     };
     let mut sequences = elements(&["by_sequence", "states"]);
     sequences.extend(pictures::errors_of_runs(results, layout)?);
@@ -54,17 +57,51 @@ pub fn page(
     ]);
     sections.retain(|section| !section.elements.is_empty());
     Ok(Page {
-        title: "Comparison".to_owned(),
-        verdict: String::new(),
+        title: format!("Comparison on {}", results.sequences.join(", ")),
+        verdict: verdict(results),
         subtitle: format!(
-            "{} configurations, sequences {}; {} of {} runs.",
+            "{} configurations, {} sequences; {} of {} runs.",
             results.config.configurations.len(),
-            results.sequences.join(", "),
+            results.sequences.len(),
             results.all_records().count(),
             planned.len()
         ),
         sections,
     })
+}
+
+/// Mean error and success of each configuration over all its runs, best first.
+fn verdict(results: &ComparisonResults) -> String {
+    let mut configurations: Vec<(f64, String)> = Vec::new();
+    for variant in &results.config.configurations {
+        let runs: Vec<&RunRecord> = results.runs_by_sequence(&variant.name).concat();
+        let errors: Vec<_> = runs.iter().filter_map(|run| run.metrics()).collect();
+        let Some(position) = Summary::of(
+            &errors
+                .iter()
+                .map(|it| it.position_m.rmse)
+                .collect::<Vec<_>>(),
+        ) else {
+            continue;
+        };
+        let successes = runs.iter().filter(|run| run.is_success()).count();
+        let text = format!(
+            "{} {}, {successes} of {} runs successful",
+            variant.name,
+            length(position.mean),
+            runs.len()
+        );
+        configurations.push((position.mean, text));
+    }
+    configurations.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let texts: Vec<String> = configurations.into_iter().map(|(_, text)| text).collect();
+    match texts.is_empty() {
+        true => String::new(),
+        false => format!(
+            "Position error (RMS, mean of all runs): {}.",
+            texts.join("; ")
+        ),
+    }
 }
 
 fn section(title: &str, elements: Vec<PageElement>) -> Section {

@@ -101,6 +101,20 @@ impl PairedDifference {
 }
 
 impl Table {
+    /// The table without columns of which nothing is known.
+    #[must_use]
+    pub fn without_absent_columns(mut self) -> Self {
+        let is_known = |column: usize| self.rows.iter().any(|row| row[column] != Cell::Absent);
+        let known: Vec<bool> = (0..self.columns.len()).map(is_known).collect();
+        let mut kept = known.iter();
+        self.columns.retain(|_| kept.next() == Some(&true));
+        for row in &mut self.rows {
+            let mut kept = known.iter();
+            row.retain(|_| kept.next() == Some(&true));
+        }
+        self
+    }
+
     /// Whether any cell of a column is a number.
     pub(super) fn is_numeric(&self, column: usize) -> bool {
         self.rows.iter().any(|row| row[column].number().is_some())
@@ -177,5 +191,23 @@ impl From<f64> for Cell {
 impl From<&str> for Cell {
     fn from(text: &str) -> Self {
         Self::Text(text.to_owned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::example;
+    use super::*;
+
+    #[test]
+    fn a_column_without_any_value_is_left_out_and_no_other() {
+        let table = example();
+        assert_eq!(table.clone().without_absent_columns(), table);
+        let mut unknown = table.clone();
+        unknown.columns.insert(1, Column::named("claimed"));
+        for row in &mut unknown.rows {
+            row.insert(1, Cell::Absent);
+        }
+        assert_eq!(unknown.without_absent_columns(), table);
     }
 }

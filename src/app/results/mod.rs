@@ -20,6 +20,6 @@ pub use frames::write_frames_csv;
 pub use localization_results::{LocalizationResults, ParticleLog, ScanOutline};
 pub use report::{Report, TrajectoryReport};
 pub use results_file::write_poses_npy;
-pub use rows::{MetricRow, Value};
+pub use rows::{MetricRow, Value, length};
 pub use run_summary::RunSummary;
 pub use trajectory_file::write_trajectory_npz;

@@ -62,7 +62,7 @@ impl<T: Into<Value>> From<Option<T>> for Value {
 }
 
 /// A length in centimetres, from a metre on in metres.
-pub(super) fn length(length_m: f64) -> String {
+pub fn length(length_m: f64) -> String {
     match length_m < 1.0 {
         true => format!("{:.1} cm", 100.0 * length_m),
         false => format!("{length_m:.1} m"),
