@@ -28,8 +28,13 @@ pub struct RunPage<'a> {
 }
 
 /// Pictures of a run: section, file name and caption.
-pub const PICTURES: [(&str, &str, &str); 8] = [
-    ("Trajectory", "path.png", "Path against ground truth"),
+pub const PICTURES: [(&str, &str, &str); 9] = [
+    ("View", "view.png", "Map with the path"),
+    (
+        "Trajectory",
+        "path.png",
+        "Path, colored by its position error, or without ground truth by its standard deviation",
+    ),
     (
         "Errors",
         "errors.png",
@@ -40,7 +45,11 @@ pub const PICTURES: [(&str, &str, &str); 8] = [
         "drift.png",
         "Position and heading error against the distance driven along the truth, as evaluated and (dashed) after rigid alignment; relative errors against the length of the segments",
     ),
-    ("Particles", "particles.png", "Particles of the first frame"),
+    (
+        "Particles",
+        "particles.png",
+        "Particles from the first frame to the last",
+    ),
     (
         "Range images",
         "range_images.png",
