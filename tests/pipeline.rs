@@ -83,8 +83,8 @@ fn a_drive_is_localized_and_refined_in_the_map_of_another_drive() {
         assert!(output.contains(row), "no `{row}` in: {output}");
     }
     let picture = |name: &str| Picture::read(&plots.join(name));
-    // The path that is drawn last may cover all others.
-    picture("path.png").shows(&[REFINED]);
+    picture("view.png").shows(&[REFINED]);
+    picture("path.png").shows(&[REFINED, TRUTH]);
     picture("errors.png").shows_at_least(400, &[MCL, REFINED]);
     picture("runtime.png").shows(&[MCL, REFINED]);
     picture("particles.png").shows(&[MCL]);

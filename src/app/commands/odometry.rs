@@ -197,6 +197,7 @@ fn draw(path: &Path, found: &Trajectory, is_given: bool) -> Result<()> {
         title: "Path",
         ground_truth: None,
         paths: &[(name, ODOMETRY, &before), ("adjusted", REFINED, &after)],
+        numbers: None,
         map: None,
     }
     .save(path)

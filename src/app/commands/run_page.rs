@@ -49,7 +49,11 @@ pub const PICTURES: [(&str, &str, &str); 8] = [
         "drift.png",
         "Position and heading error against the distance driven along the truth, as evaluated and (dashed) after rigid alignment; relative errors against the length of the segments",
     ),
-    ("Particles", "particles.png", "Particles of the first frame"),
+    (
+        "Particles",
+        "particles.png",
+        "Particles from the first frame to the last",
+    ),
     ("Map", "map.png", "Map from above with the path of the car"),
     (
         "Likelihood",
@@ -162,7 +166,7 @@ impl RunPage<'_> {
             &plots.join("view.png"),
             "Map with the path",
         ));
-        elements.extend(picture_or_error(&plots.join("path.png"), "Path from above"));
+        elements.extend(picture_or_error(&plots.join("path.png"), "Path, colored by its position error, or without ground truth by its standard deviation"));
         Ok(elements)
     }
 }

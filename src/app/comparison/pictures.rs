@@ -5,7 +5,7 @@ use anyhow::Result;
 use super::layout::Layout;
 use super::record::RunRecord;
 use super::results::{ComparisonResults, success_rate};
-use crate::app::commands::{output, run_page::picture};
+use crate::app::commands::{output, run_output::time_axis, run_page::picture};
 use crate::app::plotting::color::{Rgb, SERIES};
 use crate::app::plotting::{LineChart, Mark, Panel, PathPlot, Series, error_chart};
 use crate::app::reporting::{PageElement, SuccessRate};
@@ -41,8 +41,9 @@ pub fn errors_of_runs(results: &ComparisonResults, layout: &Layout) -> Result<Op
     let chart = LineChart {
         title: "Average positional error of every run".to_owned(),
         x_name: "seed".to_owned(),
+        is_x_whole: true,
         panels: panels.filter(|panel| !panel.series.is_empty()).collect(),
-        marks: Vec::new(),
+        ..LineChart::default()
     };
     let caption = "Average positional error of every run over its seed";
     save_chart("runs.png", caption, &chart, layout)
@@ -81,6 +82,7 @@ pub fn success_rates(results: &ComparisonResults, layout: &Layout) -> Result<Opt
             vec![panel]
         },
         marks: rates.iter().map(|(n, _)| (x(*n), n.to_string())).collect(),
+        ..LineChart::default()
     };
     let caption = "Success rate against the number of particles, dashed: 95 % interval (Wilson)";
     save_chart("success.png", caption, &chart, layout)
@@ -109,20 +111,24 @@ pub fn trajectories(
         title: &format!("{sequence}: paths against ground truth"),
         ground_truth: Some(&first.truth),
         paths: &paths.collect::<Vec<_>>(),
+        numbers: None,
         map: None,
     }
     .save(&plot)?;
     let paths = picture(&plot, &format!("Paths of all configurations ({seeds})"))?;
     let errors = trajectories.iter().map(|it| {
-        let frames = it.frames.iter().map(|&frame| frame as f64);
-        let errors = frames.zip(planar_errors(&it.poses, &it.truth));
+        let errors = it
+            .time
+            .iter()
+            .copied()
+            .zip(planar_errors(&it.poses, &it.truth));
         (it.name.as_str(), it.color, errors.collect())
     });
     let title = format!("{sequence}: errors over time");
     let errors = save_chart(
         &format!("errors_{sequence}.png"),
         &format!("Position and heading error over time ({seeds})"),
-        &error_chart(&title, "frame", &errors.collect::<Vec<_>>()),
+        &error_chart(&title, first.time_name, &errors.collect::<Vec<_>>()),
         layout,
     )?;
     Ok([paths, errors].into_iter().flatten().collect())
@@ -133,7 +139,9 @@ struct Trajectory {
     name: String,
     color: Rgb,
     seed: u64,
-    frames: Vec<usize>,
+    /// Horizontal axis of charts.
+    time_name: &'static str,
+    time: Vec<f64>,
     poses: Vec<Pose2>,
     truth: Vec<Pose2>,
 }
@@ -163,11 +171,13 @@ fn read_trajectory(record: &RunRecord, color: Rgb, layout: &Layout) -> Option<Tr
     let results = LocalizationResults::read(&path)
         .inspect_err(|error| tracing::warn!("{} is not plotted: {error:#}", record.id))
         .ok()?;
+    let (time_name, time) = time_axis(&results);
     Some(Trajectory {
         name: record.id.configuration.clone(),
         color,
         seed: record.id.seed,
-        frames: results.frames,
+        time_name,
+        time,
         poses: results.refined.or(results.estimates)?,
         truth: results.ground_truth?,
     })

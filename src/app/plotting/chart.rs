@@ -7,7 +7,7 @@ use anyhow::{Context as _, Result};
 use super::bitmap::Bitmap;
 use super::color::{INK, Rgb, WHITE};
 use super::sheet::{self, HPos, Point, Rect, Sheet, TICK, VPos, save_png, stroke, text_style};
-use super::view::{AxisRange, LegendEntry, Mark, View, legend};
+use super::view::{AxisRange, LINE, LegendEntry, Mark, View, legend};
 
 const WIDTH: f64 = 1400.0;
 const LEFT: f64 = 118.0;
@@ -55,15 +55,19 @@ pub struct Panel {
     pub clip_outliers: bool,
 }
 
-/// Panels over a common x axis, except those that have a separate one.
+/// Panels over a common x axis, except those that have a separate one, row by row.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LineChart {
     /// Title.
     pub title: String,
     /// Name of the common x axis with its unit.
     pub x_name: String,
+    /// Whether the numbers on the common x axis are whole, such as those of frames.
+    pub is_x_whole: bool,
     /// Panels from the top.
     pub panels: Vec<Panel>,
+    /// Number of panels beside each other, at least one.
+    pub columns: usize,
     /// Vertical lines: x and label.
     pub marks: Vec<(f64, String)>,
 }
@@ -76,28 +80,51 @@ impl LineChart {
 
     fn draw(&self) -> Result<Bitmap> {
         let x = x_range(&self.panels).context("there is nothing to draw: all series are empty")?;
-        let panel_height = LEGEND + PANEL + BELOW_PANEL;
-        let height = HEADER + self.panels.len() as f64 * panel_height;
+        // Whole numbers at the ends are not on the frame.
+        let x = if self.is_x_whole { x.padded(0.5) } else { x };
+        let columns = self.columns.max(1);
+        let panel_height = self.legend_height() + PANEL + BELOW_PANEL;
+        let height = HEADER + self.panels.len().div_ceil(columns) as f64 * panel_height;
         sheet::draw((WIDTH as u32, height as u32), |sheet| {
             sheet.title(&self.title, LEFT)?;
             for (number, panel) in self.panels.iter().enumerate() {
-                self.draw_panel(sheet, panel, x, HEADER + number as f64 * panel_height)?;
+                let left = (number % columns) as f64 * WIDTH / columns as f64;
+                let top = HEADER + (number / columns) as f64 * panel_height;
+                self.draw_panel(sheet, panel, x, (left, top))?;
             }
             Ok(())
         })
     }
 
-    fn draw_panel(&self, sheet: &Sheet, panel: &Panel, x: AxisRange, top: f64) -> Result<()> {
+    /// Height of the legend of a panel: narrow panels have a line per entry.
+    fn legend_height(&self) -> f64 {
+        if self.columns > 1 {
+            LEGEND + LINE
+        } else {
+            LEGEND
+        }
+    }
+
+    fn draw_panel(
+        &self,
+        sheet: &Sheet,
+        panel: &Panel,
+        x: AxisRange,
+        (left, top): Point,
+    ) -> Result<()> {
+        let right = left + WIDTH / self.columns.max(1) as f64 - RIGHT;
         let named = panel.series.iter().filter(|series| !series.name.is_empty());
         let entries: Vec<LegendEntry> = named
             .map(|series| LegendEntry::new(&series.name, series.color, series.mark))
             .collect();
-        legend(sheet, &entries, (LEFT, top + 12.0), WIDTH - RIGHT)?;
+        let left = left + LEFT;
+        legend(sheet, &entries, (left, top + 12.0), right)?;
+        let top = top + self.legend_height();
         let rect = Rect {
-            left: LEFT,
-            top: top + LEGEND,
-            right: WIDTH - RIGHT,
-            bottom: top + LEGEND + PANEL,
+            left,
+            top,
+            right,
+            bottom: top + PANEL,
         };
         let (x_name, x) = match &panel.own_x_name {
             Some(name) => (name, x_range([panel]).unwrap_or(x)),
@@ -105,17 +132,25 @@ impl LineChart {
         };
         let (y, cut_off) = panel.y_range();
         let view = View { rect, x, y };
-        view.grid(sheet)?;
+        let x_ticks = match self.is_x_whole && panel.own_x_name.is_none() {
+            true => view.whole_x_ticks(),
+            false => view.x_ticks(),
+        };
+        view.grid(sheet, &x_ticks)?;
         self.draw_marks(sheet, &view)?;
         for series in &panel.series {
             series.draw(sheet, &view)?;
         }
         if let Some(highest) = cut_off {
-            let text = format!("some values are above, up to {highest:.1}");
+            let text = format!(
+                "some values are above, up to {} {}",
+                rounded(highest),
+                panel.unit()
+            );
             let style = text_style(TICK, HPos::Right, VPos::Top);
             sheet.text(&text, (rect.right - 10.0, rect.top + 8.0), &style)?;
         }
-        view.frame(sheet, &view.x_ticks(), [x_name, &panel.y_name])
+        view.frame(sheet, &x_ticks, [x_name, &panel.y_name])
     }
 
     fn draw_marks(&self, sheet: &Sheet, view: &View) -> Result<()> {
@@ -138,6 +173,12 @@ fn x_range<'a>(panels: impl IntoIterator<Item = &'a Panel>) -> Option<AxisRange>
 }
 
 impl Panel {
+    /// Unit in the name of the y axis, empty without.
+    fn unit(&self) -> &str {
+        let in_brackets = self.y_name.split_once('[').map_or("", |(_, unit)| unit);
+        in_brackets.trim_end_matches(']')
+    }
+
     /// Range of the y axis, and the highest value if it is cut off.
     fn y_range(&self) -> (AxisRange, Option<f64>) {
         let points = self.series.iter().flat_map(|series| &series.points);
@@ -156,6 +197,12 @@ impl Panel {
         let range = AxisRange::new(bottom - below, top + margin);
         (range, clipped.then_some(highest))
     }
+}
+
+/// A positive number with two digits or all digits before the point.
+fn rounded(number: f64) -> String {
+    let decimals = (1.0 - number.log10().floor()).clamp(0.0, 9.0) as usize;
+    format!("{number:.decimals$}")
 }
 
 impl Series {
@@ -212,6 +259,13 @@ mod tests {
         let (range, cut_off) = many.y_range();
         assert!(range.max > 30.0);
         assert_eq!(cut_off, None);
+    }
+
+    #[test]
+    fn the_highest_value_is_noted_in_the_unit_of_the_axis() {
+        assert_eq!(panel(vec![]).unit(), "m");
+        let values = [1234.5, 45.2, 4.52, 0.0452].map(rounded);
+        assert_eq!(values, ["1234", "45", "4.5", "0.045"]);
     }
 
     #[test]

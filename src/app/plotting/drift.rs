@@ -67,6 +67,6 @@ pub fn drift_chart(truth: &[Pose3], trajectories: &[(&str, Rgb, &[Pose3])]) -> L
         title: "Error against the distance driven, and over segments".to_owned(),
         x_name: "distance [m]".to_owned(),
         panels: panels.into_iter().filter(has_points).collect(),
-        marks: Vec::new(),
+        ..LineChart::default()
     }
 }

@@ -165,16 +165,16 @@ impl MapImage {
 }
 
 /// Sum of the weighted values.
-fn interpolated(values: [f32; 3], weights: [f32; 3]) -> f32 {
+pub(super) fn interpolated(values: [f32; 3], weights: [f32; 3]) -> f32 {
     let weighted = values.iter().zip(weights);
     weighted.map(|(value, weight)| value * weight).sum()
 }
 
-/// Brightness of a surface, independent of its orientation up or down.
+/// Brightness of a surface, independent of its orientation up or down; 1 if it is level.
 fn shade(scaled_normal: Vec3) -> f64 {
     let normal = scaled_normal.normalize_or(Vec3::Z);
     let up = if normal.z < 0.0 { -normal } else { normal };
-    0.35 + 0.65 * f64::from(up.dot(LIGHT.normalize()).max(0.0))
+    0.4 + 0.6 * f64::from(up.dot(LIGHT).max(0.0) / LIGHT.z)
 }
 
 #[cfg(test)]

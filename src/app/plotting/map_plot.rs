@@ -1,6 +1,5 @@
 //! The map from above, in its own colors or colored by a number.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Result, ensure};
@@ -9,7 +8,7 @@ use super::MapImage;
 use super::bitmap::Bitmap;
 use super::color::{Colormap, MISSING, Rgb, TRUTH, WHITE};
 use super::sheet::{save_png, stroke};
-use super::top_view::{TopView, positions};
+use super::top_view::{TopView, WIDTH, positions};
 use super::view::{AxisRange, ColorBar, LegendEntry, Mark};
 use crate::geometry::{Pose2, TriangleMesh};
 
@@ -45,25 +44,6 @@ impl MapPlot<'_> {
             draw(self.title, self.mesh, legend, None, image, poses),
         )
     }
-}
-
-/// Most frequent colors of ground (more red than blue) and of the rest, for the legend of a map
-/// from a file; none for a map without colors.
-pub fn ground_and_rest(mesh: &TriangleMesh) -> Vec<(&'static str, Rgb)> {
-    let most_frequent = |is_ground: bool| {
-        let mut counts = BTreeMap::<Rgb, usize>::new();
-        for &color in &mesh.colors {
-            if (color[0] > color[2]) == is_ground {
-                *counts.entry(color).or_default() += 1;
-            }
-        }
-        let most = counts.into_iter().max_by_key(|&(_, count)| count);
-        most.map(|(color, _)| color)
-    };
-    [("ground", true), ("rest", false)]
-        .into_iter()
-        .filter_map(|(name, is_ground)| Some((name, most_frequent(is_ground)?)))
-        .collect()
 }
 
 /// The map from above, colored by a number per vertex, such as a residual.
@@ -135,6 +115,7 @@ fn draw(
     };
     let view = TopView {
         title,
+        width: WIDTH,
         legend,
         x: range(bounds.min.x, bounds.max.x),
         y: range(bounds.min.y, bounds.max.y),
@@ -147,23 +128,4 @@ fn draw(
         sheet.polyline(&path, &view.rect, stroke(WHITE, 5.0))?;
         sheet.polyline(&path, &view.rect, stroke(TRUTH, 2.5))
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_legend_of_a_map_has_the_colors_of_the_map() {
-        let colored = |colors: &[Rgb]| TriangleMesh {
-            colors: colors.to_vec(),
-            ..TriangleMesh::default()
-        };
-        let (earth, wall) = ([120, 80, 30], [40, 40, 90]);
-        let map = colored(&[earth, wall, earth, [200, 0, 0], wall]);
-        let expected = vec![("ground", earth), ("rest", wall)];
-        assert_eq!(ground_and_rest(&map), expected);
-        assert_eq!(ground_and_rest(&colored(&[wall])), expected[1..]);
-        assert_eq!(ground_and_rest(&colored(&[])), []);
-    }
 }

@@ -7,9 +7,9 @@ use anyhow::{Context as _, Result};
 use super::MapImage;
 use super::bitmap::Bitmap;
 use super::color::{Colormap, MCL, Rgb, TRUTH, WHITE};
-use super::sheet::{Point, Sheet, save_png, stroke};
-use super::top_view::{TopView, positions};
-use super::view::{AxisRange, ColorBar, LegendEntry, Mark, View};
+use super::sheet::{self, Point, Sheet, save_png, stroke};
+use super::top_view::{TopView, WIDTH, positions};
+use super::view::{AxisRange, ColorBar, LegendEntry, Mark, View, legend};
 use crate::evaluation::ParticleRow;
 use crate::geometry::Pose2;
 
@@ -39,11 +39,13 @@ impl LocalizationPicture<'_> {
     }
 
     fn draw(&self) -> Result<Bitmap> {
+        const NARROWEST_M: f64 = 24.0;
         let (x, y) = self
-            .extent()
+            .extent(NARROWEST_M)
             .context("there is nothing to draw: there are no particles and no poses")?;
         let view = TopView {
             title: self.title,
+            width: WIDTH,
             legend: self.legend(),
             x,
             y,
@@ -53,29 +55,51 @@ impl LocalizationPicture<'_> {
                 name: "weight / largest",
             }),
         };
-        view.draw(|sheet, view| {
-            if let Some(map) = self.map {
-                map.draw(sheet, view, 0.65)?;
+        view.draw(|sheet, view| self.draw_content(sheet, view, 1.0))
+    }
+
+    /// Draws map, particles and poses, these with arrows of a relative size.
+    fn draw_content(&self, sheet: &Sheet, view: &View, size: f64) -> Result<()> {
+        if let Some(map) = self.map {
+            map.draw(sheet, view, 0.5)?;
+        }
+        let driven = positions(self.driven, view);
+        sheet.dashes(&driven, &view.rect, stroke(TRUTH, 2.5), (8.0, 6.0))?;
+        self.draw_particles(sheet, view)?;
+        // The thinner arrow is on top, so that both are visible where they agree.
+        for (pose, color, width, length) in [
+            (self.ground_truth, TRUTH, 11.0, 68.0),
+            (self.estimate, MCL, 6.0, 52.0),
+        ] {
+            if let Some(pose) = pose {
+                draw_arrow(sheet, view, &pose, color, [width * size, length * size])?;
             }
-            let driven = positions(self.driven, view);
-            sheet.dashes(&driven, &view.rect, stroke(TRUTH, 2.5), (8.0, 6.0))?;
-            self.draw_particles(sheet, view)?;
-            // The thinner arrow is on top, so that both are visible where they agree.
-            for (pose, color, width, length) in [
-                (self.ground_truth, TRUTH, 11.0, 68.0),
-                (self.estimate, MCL, 6.0, 52.0),
-            ] {
-                if let Some(pose) = pose {
-                    draw_arrow(sheet, view, &pose, color, width, length)?;
-                }
-            }
-            Ok(())
-        })
+        }
+        Ok(())
+    }
+
+    /// Draws half as wide, without legend, in the same size for all frames.
+    fn draw_panel(&self) -> Result<Bitmap> {
+        const SHAPE: f64 = 0.7;
+        // Particles that have converged are apart.
+        const NARROWEST_M: f64 = 0.06;
+        let (x, y) = self
+            .extent(NARROWEST_M)
+            .context("there is nothing to draw: there are no particles and no poses")?;
+        let width_m = x.length().max(y.length() / SHAPE);
+        let view = TopView {
+            title: self.title,
+            width: 0.5 * WIDTH,
+            legend: Vec::new(),
+            x: x.at_least(width_m),
+            y: y.at_least(SHAPE * width_m),
+            color_bar: None,
+        };
+        view.draw(|sheet, view| self.draw_content(sheet, view, 0.6))
     }
 
     /// Visible ranges of x and y: the window, or particles and poses with a margin.
-    fn extent(&self) -> Option<(AxisRange, AxisRange)> {
-        const NARROWEST_M: f64 = 24.0;
+    fn extent(&self, narrowest_m: f64) -> Option<(AxisRange, AxisRange)> {
         let around = |center: f64| AxisRange::new(center, center);
         if let Some(([x, y], width_m)) = self.window {
             return Some((
@@ -92,16 +116,20 @@ impl LocalizationPicture<'_> {
             let range = AxisRange::of(points.iter().map(|point| point[axis]))?;
             Some(range.padded(0.06 * range.length()).at_least(narrowest_m))
         };
-        Some((range(0, NARROWEST_M)?, range(1, 0.6 * NARROWEST_M)?))
+        Some((range(0, narrowest_m)?, range(1, 0.6 * narrowest_m)?))
     }
 
     fn legend(&self) -> Vec<LegendEntry> {
         let count = format!("{} particles, colored by weight", self.particles.len());
-        let mut entries = vec![LegendEntry::new(
-            count,
-            Colormap::Viridis.at(0.0),
-            Mark::Dots,
-        )];
+        let particles = LegendEntry::new(count, Colormap::Viridis.at(0.0), Mark::Dots);
+        [particles]
+            .into_iter()
+            .chain(self.legend_of_poses())
+            .collect()
+    }
+
+    fn legend_of_poses(&self) -> Vec<LegendEntry> {
+        let mut entries = Vec::new();
         let truth = self
             .ground_truth
             .map(|_| ("ground truth", TRUTH, Mark::Line));
@@ -138,14 +166,63 @@ impl LocalizationPicture<'_> {
     }
 }
 
+/// Frames beside and below each other, two in a row.
+#[derive(Clone, Copy, Debug)]
+pub struct ParticlePanels<'a> {
+    /// Title.
+    pub title: &'a str,
+    /// Frames; each is drawn around its particles and poses.
+    pub frames: &'a [LocalizationPicture<'a>],
+}
+
+impl ParticlePanels<'_> {
+    /// Writes the picture.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        save_png(path, self.draw())
+    }
+
+    fn draw(&self) -> Result<Bitmap> {
+        const HEADER: f64 = 92.0;
+        let panels = self.frames.iter().map(LocalizationPicture::draw_panel);
+        let panels: Vec<Bitmap> = panels.collect::<Result<_>>()?;
+        let first = panels
+            .first()
+            .context("there is nothing to draw: there are no frames")?;
+        let height = HEADER as u32 + panels.len().div_ceil(2) as u32 * first.height;
+        let mut picture = sheet::draw((WIDTH as u32, height), |sheet| {
+            const LEFT: f64 = 118.0;
+            sheet.title(self.title, LEFT)?;
+            let [light, heavy] = [0.0, 1.0].map(|share| Colormap::Viridis.at(share));
+            let mut entries = vec![
+                LegendEntry::new("particle of small weight", light, Mark::Dots),
+                LegendEntry::new("largest weight", heavy, Mark::Dots),
+            ];
+            entries.extend(
+                self.frames
+                    .iter()
+                    .flat_map(LocalizationPicture::legend_of_poses)
+                    .take(2),
+            );
+            legend(sheet, &entries, (LEFT, 70.0), WIDTH)
+        })?;
+        for (number, panel) in (0..).zip(&panels) {
+            let place = (
+                number % 2 * panel.width,
+                HEADER as u32 + number / 2 * panel.height,
+            );
+            picture.paste(panel, place);
+        }
+        Ok(picture)
+    }
+}
+
 /// Draws an arrow with a white border, whose tail is at the pose; width and length in pixels.
 fn draw_arrow(
     sheet: &Sheet,
     view: &View,
     pose: &Pose2,
     color: Rgb,
-    width: f64,
-    length: f64,
+    [width, length]: [f64; 2],
 ) -> Result<()> {
     let tail = view.at(pose.translation.x, pose.translation.y);
     if !view.rect.contains(tail) {

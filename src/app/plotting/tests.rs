@@ -12,7 +12,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 use super::color::{Colormap, MCL, MISSING, REFINED, Rgb, TRUTH};
 use super::*;
 use crate::evaluation::{RangeMclRules, planar_errors};
-use crate::geometry::{Pose2, TriangleMesh, Vec3};
+use crate::geometry::{Pose2, Pose3, TriangleMesh, Vec3, pose2_from_pose3, pose3_from_pose2};
 use crate::lidar::{LidarModel, RangeImage};
 
 /// Folder of the pictures: the one requested, or a temporary one.
@@ -180,11 +180,29 @@ fn the_path_is_drawn_over_the_truth_and_over_the_map() {
         title: "Path against ground truth",
         ground_truth: Some(&truth),
         paths: &paths,
+        numbers: None,
         map: Some(&map),
     };
     plot.save(&gallery.path("path_on_map.png")).unwrap();
     let colors = [(REFINED, 300), (TRUTH, 300), (MCL, 50)];
     assert_picture(&gallery.path("path_on_map.png"), &colors);
+
+    // Colored by its error; the trajectories apart are in the corner.
+    let path = gallery.path("path_colored.png");
+    let errors = planar_errors(&refined, &truth);
+    let errors_cm: Vec<f64> = errors.iter().map(|it| 100.0 * it.distance_m()).collect();
+    PathPlot {
+        numbers: Some(("position error, refined [cm]", &errors_cm)),
+        ..plot
+    }
+    .save(&path)
+    .unwrap();
+    let colors = [
+        (REFINED, 200),
+        (TRUTH, 300),
+        (Colormap::Viridis.at(1.0), 10),
+    ];
+    assert_picture(&path, &colors);
 
     // A short straight drive: thirty metres by two.
     let path = gallery.path("path_short.png");
@@ -215,6 +233,7 @@ fn the_run_of_range_mcl_on_kitti_07_is_drawn() {
         title: "KITTI 07, range-mcl against ground truth",
         ground_truth: Some(&truth),
         paths: &[("MCL", MCL, &estimates)],
+        numbers: None,
         map: None,
     }
     .save(&path)
@@ -243,7 +262,7 @@ fn errors_are_drawn_for_both_trajectories() {
         ("MCL", MCL, errors(noisy(&truth, 0.5, 6))),
         ("refined", REFINED, errors(noisy(&truth, 0.1, 0))),
     ];
-    let chart = error_chart("Error over time", "time [s]", &trajectories);
+    let chart = error_chart("Error over time", "time from the start [s]", &trajectories);
     chart.save(&path).unwrap();
     assert_picture(&path, &[(MCL, 1000), (REFINED, 1000)]);
 }
@@ -274,6 +293,165 @@ fn particles_are_drawn_on_the_map_spread_and_concentrated() {
         .unwrap();
         assert_picture(&path, &[(MCL, 100), (TRUTH, 100)]);
     }
+}
+
+#[test]
+fn particles_of_several_frames_are_drawn_beside_each_other() {
+    let gallery = Gallery::open();
+    let truth = street(300);
+    let map = MapImage::of_colors(&relief(&town(&truth), &[]), 2500);
+    let clouds = [(0, 15.0), (3, 4.0), (10, 0.5), (250, 0.1)];
+    let clouds = clouds.map(|(row, spread_m)| (row, cloud(&truth[row], spread_m, 500)));
+    let frames = clouds
+        .each_ref()
+        .map(|(row, particles)| LocalizationPicture {
+            title: "Frame",
+            map: Some(&map),
+            particles,
+            estimate: Some(truth[*row]),
+            ground_truth: Some(truth[*row]),
+            ..LocalizationPicture::default()
+        });
+    let path = gallery.path("particles.png");
+    let panels = ParticlePanels {
+        title: "Particles",
+        frames: &frames,
+    };
+    panels.save(&path).unwrap();
+    let image = assert_picture(&path, &[(MCL, 400), (TRUTH, 400)]);
+    // Each quarter has its estimate.
+    for (left, top) in [
+        (0, 0),
+        (700, 0),
+        (0, image.height / 2),
+        (700, image.height / 2),
+    ] {
+        let quarter = (0..350_000).map(|k| image.pixel(left + k % 700, top + k / 700));
+        assert!(
+            quarter.filter(|color| *color == MCL).count() > 50,
+            "{left} {top}"
+        );
+    }
+
+    let error = ParticlePanels {
+        frames: &[],
+        ..panels
+    }
+    .save(&path)
+    .unwrap_err();
+    assert!(format!("{error:#}").contains("no frames"), "{error:#}");
+}
+
+#[test]
+fn the_map_is_drawn_obliquely_with_the_path() {
+    let gallery = Gallery::open();
+    let truth = street(300);
+    let path: Vec<Pose3> = (truth.iter())
+        .map(|pose| pose3_from_pose2(pose, 0.0))
+        .collect();
+    let town = town(&truth);
+    let picture = gallery.path("view.png");
+    ObliqueView {
+        mesh: &relief(&town, &path),
+        name: "path",
+        color: REFINED,
+        path: &path,
+    }
+    .save(&picture)
+    .unwrap();
+    let image = assert_picture(&picture, &[(REFINED, 1000)]);
+    // Ground in the light, a little darker on slopes, and not red.
+    let ground = image.pixels.iter().filter(|[red, green, blue]| {
+        *red > 190 && red > blue && red - blue < 25 && green.abs_diff(*red) < 15
+    });
+    assert!(ground.count() > 50_000);
+    assert!(
+        image
+            .pixels
+            .iter()
+            .all(|[red, _, blue]| red.abs_diff(*blue) < 190)
+    );
+
+    let empty = ObliqueView {
+        mesh: &town,
+        name: "path",
+        color: REFINED,
+        path: &[],
+    };
+    let error = empty.save(&picture).unwrap_err();
+    assert!(
+        format!("{error:#}").contains("the path is empty"),
+        "{error:#}"
+    );
+}
+
+/// Three rooms in a row with doors between them, 1.3 m below the sensor, in one color; all surfaces have
+/// two sides.
+fn rooms() -> (TriangleMesh, Vec<Pose3>) {
+    let mut mesh = TriangleMesh::default();
+    let mut quad = |corners: [[f32; 3]; 4]| {
+        for corners in [corners, [3, 2, 1, 0].map(|corner| corners[corner])] {
+            mesh.append(&TriangleMesh {
+                vertices: corners.map(Vec3::from_array).to_vec(),
+                triangles: vec![[0, 1, 2], [0, 2, 3]],
+                ..TriangleMesh::default()
+            });
+        }
+    };
+    let (low, high) = (-1.3, 1.3);
+    for z in [low, high] {
+        quad([
+            [0.0, -3.0, z],
+            [18.0, -3.0, z],
+            [18.0, 3.0, z],
+            [0.0, 3.0, z],
+        ]);
+    }
+    let mut wall = |a: [f32; 2], b: [f32; 2], low: f32| {
+        let [[ax, ay], [bx, by]] = [a, b];
+        quad([[ax, ay, low], [bx, by, low], [bx, by, high], [ax, ay, high]]);
+    };
+    for y in [-3.0, 3.0] {
+        wall([0.0, y], [18.0, y], low);
+    }
+    for x in [0.0, 6.0, 12.0, 18.0] {
+        wall([x, -3.0], [x, -0.5], low);
+        wall([x, 0.5], [x, 3.0], low);
+        wall([x, -0.5], [x, 0.5], 0.8);
+    }
+    let path = (2..33).map(|k| 0.5 * f64::from(k));
+    let path = path.map(|x| Pose3::translation(x, 0.8 * (1.05 * x).sin(), 0.0));
+    (mesh, path.collect())
+}
+
+#[test]
+fn indoors_the_path_is_visible_from_above() {
+    let gallery = Gallery::open();
+    let (rooms, path) = rooms();
+    let relief = relief(&rooms, &path);
+    let is_above = |triangle| relief.corners(triangle).iter().all(|corner| corner.z > 0.7);
+    assert!(!(0..relief.triangles.len()).any(is_above));
+    let planar: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
+    let map = gallery.path("rooms_map.png");
+    MapPlot {
+        title: "Rooms",
+        mesh: &relief,
+        path: Some(("path", &planar)),
+        keys: &relief::KEYS,
+    }
+    .save(&map)
+    .unwrap();
+    assert_picture(&map, &[(TRUTH, 300)]);
+    let view = gallery.path("rooms_view.png");
+    ObliqueView {
+        mesh: &relief,
+        name: "path",
+        color: REFINED,
+        path: &path,
+    }
+    .save(&view)
+    .unwrap();
+    assert_picture(&view, &[(REFINED, 2000), (relief::GROUND, 0)]);
 }
 
 #[test]
@@ -451,10 +629,10 @@ fn line_charts_are_drawn() {
                     ..Series::line("measured", color::SERIES[2], peak(0.3).step_by(4))
                 },
             ],
-            clip_outliers: false,
             ..Panel::default()
         }],
         marks: vec![(0.0, "truth".to_owned())],
+        ..LineChart::default()
     }
     .save(&path)
     .unwrap();
@@ -472,6 +650,7 @@ fn a_folder_that_cannot_be_written_is_named() {
         title: "",
         ground_truth: Some(&truth),
         paths: &[],
+        numbers: None,
         map: None,
     };
     let error = plot.save(&file.join("path.png")).unwrap_err();

@@ -7,9 +7,14 @@ use super::sheet::{self, Point, Rect, Sheet};
 use super::view::{AxisRange, ColorBar, LegendEntry, View, legend};
 use crate::geometry::Pose2;
 
-/// Picture of the x-y plane, 1,400 pixels wide, without its content.
+/// Width of a picture [px].
+pub const WIDTH: f64 = 1400.0;
+
+/// Picture of the x-y plane without its content.
 pub struct TopView<'a> {
     pub title: &'a str,
+    /// Width [px].
+    pub width: f64,
     pub legend: Vec<LegendEntry>,
     /// Visible range of x [m].
     pub x: AxisRange,
@@ -21,27 +26,28 @@ pub struct TopView<'a> {
 impl TopView<'_> {
     /// Draws the picture; `content` draws over the grid and below the frame.
     pub fn draw(&self, content: impl FnOnce(&Sheet, &View) -> Result<()>) -> Result<Bitmap> {
-        const WIDTH: f64 = 1400.0;
         const LEFT: f64 = 118.0;
-        const TOP: f64 = 96.0;
-        let right = WIDTH
+        // The legend is in a line of its own.
+        let top = if self.legend.is_empty() { 66.0 } else { 96.0 };
+        let right = self.width
             - if self.color_bar.is_some() {
                 150.0
             } else {
                 30.0
             };
-        let height = ((right - LEFT) * self.y.length() / self.x.length()).clamp(380.0, 1150.0);
+        let height = ((right - LEFT) * self.y.length() / self.x.length())
+            .clamp(0.27 * self.width, 0.82 * self.width);
         let rect = Rect {
             left: LEFT,
-            top: TOP,
+            top,
             right,
-            bottom: TOP + height.round(),
+            bottom: top + height.round(),
         };
         let view = View::equal(rect, self.x, self.y);
-        sheet::draw((WIDTH as u32, (rect.bottom + 74.0) as u32), |sheet| {
+        sheet::draw((self.width as u32, (rect.bottom + 74.0) as u32), |sheet| {
             sheet.title(self.title, LEFT)?;
             legend(sheet, &self.legend, (LEFT, 70.0), right)?;
-            view.grid(sheet)?;
+            view.grid(sheet, &view.x_ticks())?;
             content(sheet, &view)?;
             view.frame(sheet, &view.x_ticks(), ["x [m]", "y [m]"])?;
             view.scale_bar(sheet)?;

@@ -79,9 +79,9 @@ impl View {
     }
 
     /// Draws thin lines at the ticks.
-    pub fn grid(&self, sheet: &Sheet) -> Result<()> {
+    pub fn grid(&self, sheet: &Sheet, x_ticks: &Ticks) -> Result<()> {
         let Rect { left, right, .. } = self.rect;
-        for x in self.x_ticks().places {
+        for &x in &x_ticks.places {
             let (column, bottom) = self.at(x, self.y.min);
             sheet.line((column, self.rect.top), (column, bottom), stroke(GRID, 1.0))?;
         }
@@ -121,6 +121,11 @@ impl View {
         Ticks::of(self.x, self.rect.width() / 110.0)
     }
 
+    /// Ticks of an x axis of whole numbers.
+    pub fn whole_x_ticks(&self) -> Ticks {
+        Ticks::every(self.x_ticks().step.max(1.0), self.x)
+    }
+
     fn y_ticks(&self) -> Ticks {
         // On a map both axes have ticks at the same distance.
         let y_scale = self.rect.height() / self.y.length();
@@ -132,15 +137,28 @@ impl View {
 
     /// Draws a bar of a round length above the upper right corner, for maps.
     pub fn scale_bar(&self, sheet: &Sheet) -> Result<()> {
-        let length = round_step(0.12 * self.x.length());
-        let (right, row) = (self.rect.right, self.rect.top - 26.0);
+        self.bar_at(sheet, (self.rect.right, self.rect.top - 26.0), 0.12)
+    }
+
+    /// Draws the bar inside, in the lower right corner.
+    pub fn scale_bar_inside(&self, sheet: &Sheet) -> Result<()> {
+        self.bar_at(
+            sheet,
+            (self.rect.right - 14.0, self.rect.bottom - 18.0),
+            0.3,
+        )
+    }
+
+    /// Draws a bar of about a share of the width that ends at a point.
+    fn bar_at(&self, sheet: &Sheet, (right, row): Point, share: f64) -> Result<()> {
+        let length = round_step(share * self.x.length());
         let left = right - length * self.scale();
         sheet.line((left, row), (right, row), stroke(INK, 3.0))?;
         for end in [left, right] {
             sheet.line((end, row - 6.0), (end, row + 6.0), stroke(INK, 2.0))?;
         }
         let beside = text_style(TICK, HPos::Right, VPos::Center);
-        sheet.text(&format!("{length} m"), (left - 10.0, row), &beside)
+        sheet.text(&in_metres(length), (left - 10.0, row), &beside)
     }
 }
 
@@ -201,6 +219,15 @@ fn round_step(length: f64) -> f64 {
     }
 }
 
+/// A length with its unit: centimetres below a metre.
+fn in_metres(length_m: f64) -> String {
+    if length_m < 1.0 {
+        format!("{} cm", (1e4 * length_m).round() / 100.0)
+    } else {
+        format!("{length_m} m")
+    }
+}
+
 /// How data are drawn, and their key in the legend.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mark {
@@ -251,9 +278,11 @@ impl LegendEntry {
     }
 }
 
+/// Height of a line of a legend [px].
+pub const LINE: f64 = 28.0;
+
 /// Draws a legend from a point to the right; entries beyond `right` wrap to the next line.
 pub fn legend(sheet: &Sheet, entries: &[LegendEntry], at: Point, right: f64) -> Result<()> {
-    const LINE: f64 = 28.0;
     let style = text_style(TICK + 1.0, HPos::Left, VPos::Center);
     let (mut x, mut y) = at;
     for entry in entries {
@@ -355,6 +384,25 @@ mod tests {
             for (place, text) in ticks.labelled() {
                 assert!(place >= range.min - 1e-9 && place <= range.max + 1e-9);
                 assert_relative_eq!(text.parse::<f64>().unwrap(), place, epsilon = 1e-9);
+            }
+        }
+    }
+
+    #[test]
+    fn ticks_of_whole_numbers_are_whole() {
+        let rect = Rect {
+            left: 0.0,
+            top: 0.0,
+            right: 1200.0,
+            bottom: 300.0,
+        };
+        for (min, max) in [(0.5, 1.5), (0.5, 3.5), (0.0, 7.0), (-0.5, 1200.0)] {
+            let x = AxisRange::new(min, max);
+            let view = View { rect, x, y: x };
+            let ticks = view.whole_x_ticks();
+            assert!(!ticks.places.is_empty());
+            for (place, text) in ticks.labelled() {
+                assert_eq!(text.parse::<i64>().unwrap() as f64, place);
             }
         }
     }

@@ -1,10 +1,10 @@
-//! Pictures of a map from above.
+//! Pictures of a map.
 
 use anyhow::Result;
 
 use crate::app::config::BuildMapConfig;
-use crate::app::plotting::color::Colormap;
-use crate::app::plotting::{MapPlot, ScalarMapPlot};
+use crate::app::plotting::color::{Colormap, TRUTH};
+use crate::app::plotting::{MapPlot, ObliqueView, ScalarMapPlot, relief};
 use crate::evaluation::map_quality::{BeamResidual, vertex_residuals};
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
 
@@ -18,17 +18,28 @@ pub fn draw(
     path: &[Pose3],
     residuals: &[BeamResidual],
 ) -> Result<()> {
-    let colors = config.map().local_map;
     let driven: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
+    let relief = relief(mesh, path);
     let picture = config.mesh_file.with_extension("png");
     MapPlot {
         title: "Map from above",
-        mesh,
+        mesh: &relief,
         path: Some(("mapping trajectory", &driven)),
-        keys: &[("ground", colors.ground_color), ("rest", colors.rest_color)],
+        keys: &relief::KEYS,
     }
     .save(&picture)?;
     tracing::info!("drew {}", picture.display());
+    if !path.is_empty() {
+        let picture = config.mesh_file.with_extension("view.png");
+        ObliqueView {
+            mesh: &relief,
+            name: "mapping trajectory",
+            color: TRUTH,
+            path,
+        }
+        .save(&picture)?;
+        tracing::info!("drew {}", picture.display());
+    }
     if residuals.is_empty() {
         return Ok(());
     }

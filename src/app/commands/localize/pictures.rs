@@ -4,7 +4,7 @@ use anyhow::{Context as _, Result};
 
 use crate::app::commands::run_output::RunFiles;
 use crate::app::config::LocalizationConfig;
-use crate::app::plotting::color::{MCL, REFINED};
+use crate::app::plotting::color::{MCL, REFINED, Rgb};
 use crate::app::plotting::{LineChart, Panel, RangeImageStrip, Series};
 use crate::geometry::{Pose3, pose2_from_pose3};
 use crate::lidar::RangeImage;
@@ -90,32 +90,58 @@ fn draw_likelihood(
     ];
     let mut panels = Vec::new();
     for direction in Direction::ALL {
-        let (axis, unit) = match direction {
-            Direction::Along => ("along", "m"),
-            Direction::Across => ("across", "m"),
-            Direction::Heading => ("heading", "deg"),
-        };
-        let mut series = Vec::new();
+        let mut profiles = Vec::new();
         for (model, color, observation) in models {
             let points = profile(&view, &center, direction, observation)?;
-            let width = match width_at_half(&points) {
-                Some(width) => format!("{width:.3} {unit} wide at half height"),
-                None => "wider than shown at half height".to_owned(),
-            };
-            series.push(Series::line(&format!("{model}: {width}"), color, points));
+            profiles.push((model, color, points));
         }
-        panels.push(Panel {
-            y_name: "likelihood / peak".to_owned(),
-            own_x_name: Some(format!("offset {axis} [{unit}]")),
-            series,
-            clip_outliers: false,
-        });
+        panels.extend(likelihood_panels(direction, &profiles));
     }
     LineChart {
         title: format!("Frame {}: likelihood around the {name}", frame.number),
-        x_name: String::new(),
         panels,
+        columns: 2,
         marks: vec![(0.0, name.to_owned())],
+        ..LineChart::default()
     }
     .save(&files.plot("likelihood.png")?)
+}
+
+/// Name, color and points of a profile of the likelihood.
+type Profile<'a> = (&'a str, Rgb, Vec<(f64, f64)>);
+
+/// Panels of one direction: all profiles, and the last one at the scale of its own width.
+fn likelihood_panels(direction: Direction, profiles: &[Profile]) -> Vec<Panel> {
+    /// Visible part on each side, in widths at half height.
+    const ZOOM: f64 = 3.0;
+    let (axis, unit, fine_unit, fine, decimals) = match direction {
+        Direction::Along => ("along", "m", "cm", 100.0, 1),
+        Direction::Across => ("across", "m", "cm", 100.0, 1),
+        Direction::Heading => ("heading", "deg", "deg", 1.0, 3),
+    };
+    let panel = |unit: &str, series: Vec<Series>| Panel {
+        y_name: "likelihood / peak".to_owned(),
+        own_x_name: Some(format!("offset {axis} [{unit}]")),
+        series,
+        ..Panel::default()
+    };
+    let all = profiles.iter().map(|(model, color, points)| {
+        let width = match width_at_half(points) {
+            Some(width) => format!(
+                "{:.decimals$} {fine_unit} wide at half height",
+                fine * width
+            ),
+            None => "wider than shown at half height".to_owned(),
+        };
+        Series::line(&format!("{model}: {width}"), *color, points.iter().copied())
+    });
+    let mut panels = vec![panel(unit, all.collect())];
+    if let Some((model, color, points)) = profiles.last() {
+        let reach = width_at_half(points).map_or(f64::INFINITY, |width| ZOOM * width);
+        let near = points.iter().filter(|(offset, _)| offset.abs() <= reach);
+        let near = near.map(|(offset, likelihood)| (fine * offset, *likelihood));
+        let series = Series::line(&format!("{model}, enlarged"), *color, near);
+        panels.push(panel(fine_unit, vec![series]));
+    }
+    panels
 }

@@ -67,7 +67,7 @@ impl Run {
             claims,
             map_from_lidar: Vec::new(),
             refined: Vec::new(),
-            movie: config.visualize.then(|| Movie::begin(files, &map.mesh)),
+            movie: config.visualize.then(|| Movie::begin(files, map)),
             off_ground: 0,
             failure: None,
         }
