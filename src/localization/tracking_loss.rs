@@ -83,6 +83,10 @@ pub struct TrackingLossConfig {
     /// Tracking is lost where the distribution is wider than this, as outside the map: √(σ_x² + σ_y²) [m].
     #[default(2.0)]
     pub max_spread_m: f64,
+    /// Largest standard deviation of the position, along its long axis, with which a frame is reported as tracked [m]:
+    /// with more the pose is still followed, and reported as searching.
+    #[default(0.2)]
+    pub sure_spread_m: f64,
 }
 
 impl Validate for TrackingLossConfig {
@@ -104,7 +108,8 @@ impl Validate for TrackingLossConfig {
         fraction("sure_agreement", self.sure_agreement)?;
         at_least_one("confirming_updates", self.confirming_updates)?;
         at_least_one("patience", self.patience)?;
-        positive("max_spread_m", self.max_spread_m)
+        positive("max_spread_m", self.max_spread_m)?;
+        positive("sure_spread_m", self.sure_spread_m)
     }
 }
 

@@ -31,11 +31,14 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Update, RenderError> {
-        let rounds = match self.state {
-            State::Tracking => self.config.tempering.tracking_rounds,
-            State::Searching | State::Lost => self.config.tempering.searching_rounds,
+        let tempering = &self.config.tempering;
+        let (mut remaining, rounds) = match self.state {
+            State::Tracking => (1.0, tempering.tracking_rounds),
+            State::Searching | State::Lost => {
+                (tempering.searching_power, tempering.searching_rounds)
+            }
         };
-        let (mut remaining, mut round) = (1.0, 1);
+        let mut round = 1;
         loop {
             let observation = &self.config.observation;
             let count = observation.beams_for(self.particles.len());

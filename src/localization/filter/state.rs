@@ -123,11 +123,23 @@ impl ParticleFilter {
             effective_sample_size: particles.effective_sample_size(),
             mean_cost_m: None,
             agreement: None,
-            state: self.state,
+            state: self.reported_state(&covariance),
             updated: false,
             on_mapped_ground: found.is_some(),
             motion: None,
             particles,
+        }
+    }
+
+    /// The state, of a frame whose estimate has a covariance: tracking only if that is small.
+    pub(super) fn reported_state(&self, covariance: &Matrix3<f64>) -> State {
+        let position = covariance.fixed_view::<2, 2>(0, 0).into_owned();
+        let largest_m = position.symmetric_eigenvalues().max().max(0.0).sqrt();
+        match self.state {
+            State::Tracking if largest_m > self.config.tracking_loss.sure_spread_m => {
+                State::Searching
+            }
+            state => state,
         }
     }
 

@@ -44,7 +44,7 @@ impl ParticleFilter {
             self.agreement_at(&estimate.map_from_lidar, &update.beams, &update.attitude)?;
         self.attitude = Some(update.attitude);
         self.change_state(estimate.agreement, odometry);
-        estimate.state = self.state;
+        estimate.state = self.reported_state(&estimate.covariance);
         self.prepare_next(scan, attitude, rng)?;
         Ok(estimate)
     }
