@@ -225,7 +225,7 @@ impl Camera {
     }
 
     /// Direction to the light: from behind the camera, a little from the left.
-    fn to_light(&self) -> Vec3 {
+    fn light(&self) -> Vec3 {
         let ahead = Vec3::new(self.forward.x, self.forward.y, 0.0).normalize_or(Vec3::X);
         (-0.5 * self.right - 0.7 * ahead + 1.1 * Vec3::Z).normalize()
     }
@@ -337,7 +337,7 @@ impl Front {
         let surfaces: Vec<Option<Surface>> = (hits.iter().zip(directions))
             .map(|(hit, &direction)| self.surface(camera.eye, direction, hit))
             .collect();
-        let to_light = camera.to_light();
+        let to_light = camera.light();
         let is_lit = self.is_lit(&surfaces, to_light);
         let colors = surfaces.into_iter().zip(is_lit).map(|(surface, is_lit)| {
             surface.map_or(WHITE, |surface| surface.shaded(to_light, is_lit))
