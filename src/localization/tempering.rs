@@ -27,8 +27,9 @@ pub struct TemperingConfig {
     /// unchanged, as range-mcl does.
     #[default(0.2)]
     pub min_effective_fraction: f64,
-    /// Largest power of the likelihood of a frame while searching (unitless). Places whose mean costs differ by less
-    /// than maps are off are not decided between in one frame: with 0.2, one centimetre is a factor of e.
+    /// Largest power of the likelihood of a frame while the particles are in several places (unitless). Places whose mean
+    /// costs differ by less than maps are off are not decided between in one frame: with 0.2, one centimetre is a
+    /// factor of e.
     #[default(0.2)]
     pub searching_power: f64,
     /// Rounds of reweighting and resampling per frame while searching.

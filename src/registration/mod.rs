@@ -28,7 +28,7 @@
 //! Modelling by Registration of Multiple Range Images* (1992), for point to plane; Blais and Levine
 //! (1995) for projective association.
 
-use nalgebra::{Matrix3, Matrix6, Vector6};
+use nalgebra::{Matrix2, Matrix3, Matrix6, Vector2, Vector6};
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
@@ -234,7 +234,9 @@ fn solve(
     let cholesky = information.cholesky()?;
     let step = cholesky.solve(&right_side);
     let outer_products: Matrix6<f64> = sector_gradients.iter().map(|g| g * g.transpose()).sum();
-    let inverse = without_noise_of_normals(&information, weights)?.try_inverse()?;
+    let horizontal = Horizontal::of(&information, weights)?;
+    let inverse = horizontal.corrected(&information).try_inverse()?;
+    let step = horizontal.determined(step);
     let mut covariance = inverse * (squares / weights) + inverse * outer_products * inverse;
     for axis in 0..3 {
         covariance[(axis, axis)] += config.map_error_m.powi(2);
@@ -247,25 +249,52 @@ fn solve(
         .then_some((step, covariance))
 }
 
-/// The information without that of the noise of the normals in the horizontal directions.
-fn without_noise_of_normals(information: &Matrix6<f64>, weights: f64) -> Option<Matrix6<f64>> {
-    /// Standard deviation of a normal: 3 mm over the 9 cm of a cell [rad].
-    const NORMAL_RAD: f64 = 0.03;
-    /// Share of its information that a direction keeps at least, so that the matrix stays positive definite.
-    const LEAST: f64 = 1e-3;
-    // Information on x and y while all other components are estimated, too.
-    let covariance = information.try_inverse()?;
-    let horizontal = covariance.fixed_view::<2, 2>(0, 0).into_owned();
-    let eigen = horizontal.try_inverse()?.symmetric_eigen();
-    let mut corrected = *information;
-    for axis in 0..2 {
-        let found = eigen.eigenvalues[axis];
-        let kept = (found - weights * NORMAL_RAD.powi(2)).max(LEAST * found);
-        let direction = eigen.eigenvectors.column(axis);
-        let mut part = corrected.fixed_view_mut::<2, 2>(0, 0);
-        part -= (found - kept) * direction * direction.transpose();
+/// What the scan shows of the horizontal position, without what the noise of the normals seems to show.
+struct Horizontal {
+    /// Directions in the lidar frame.
+    directions: Matrix2<f64>,
+    /// Information on each direction while all other components are estimated, too.
+    found: Vector2<f64>,
+    /// The part of it that is not noise, positive.
+    kept: Vector2<f64>,
+}
+
+impl Horizontal {
+    /// Of an information matrix with a sum of weights; `None` if it is singular.
+    fn of(information: &Matrix6<f64>, weights: f64) -> Option<Self> {
+        /// Standard deviation of a normal: 3 mm over the 9 cm of a cell [rad].
+        const NORMAL_RAD: f64 = 0.03;
+        /// Share of its information that a direction keeps at least, so that the matrix stays positive definite.
+        const LEAST: f64 = 1e-3;
+        let covariance = information.try_inverse()?;
+        let horizontal = covariance.fixed_view::<2, 2>(0, 0).into_owned();
+        let eigen = horizontal.try_inverse()?.symmetric_eigen();
+        let kept = |found: f64| (found - weights * NORMAL_RAD.powi(2)).max(LEAST * found);
+        Some(Self {
+            directions: eigen.eigenvectors,
+            found: eigen.eigenvalues,
+            kept: eigen.eigenvalues.map(kept),
+        })
     }
-    Some(corrected)
+
+    /// The information without that of the noise.
+    fn corrected(&self, information: &Matrix6<f64>) -> Matrix6<f64> {
+        let noise = Matrix2::from_diagonal(&(self.found - self.kept));
+        let mut corrected = *information;
+        let mut part = corrected.fixed_view_mut::<2, 2>(0, 0);
+        part -= self.directions * noise * self.directions.transpose();
+        corrected
+    }
+
+    /// A step without the directions of which only noise is known (Zhang, Kaess and Singh, *On Degeneracy of
+    /// Optimization-based State Estimation Problems*, 2016).
+    fn determined(&self, mut step: Vector6<f64>) -> Vector6<f64> {
+        let shares = Matrix2::from_diagonal(&self.kept.component_div(&self.found));
+        let mut part = step.fixed_rows_mut::<2>(0);
+        let moved = self.directions * shares * self.directions.transpose() * &part;
+        part.copy_from(&moved);
+        step
+    }
 }
 
 #[cfg(test)]
@@ -327,6 +356,38 @@ mod tests {
         let found = found.unwrap().unwrap();
         assert_relative_eq!(found.map_from_lidar, expected, epsilon = 3e-3);
         assert!(found.covariance.cholesky().is_some());
+    }
+
+    #[test]
+    fn noise_of_normals_along_a_tunnel_is_no_information() {
+        // Walls along x, a floor and a ceiling, whose normals have a noise of 0.02 rad.
+        let mut information = Matrix6::zeros();
+        for k in 0..1200 {
+            let (sine, cosine) = (0.3 * f64::from(k)).sin_cos();
+            let noise = Vector6::new(0.028 * sine, 0.0, 0.0, 0.0, 0.0, 0.0);
+            let lever = 20.0 * cosine;
+            let jacobian = match k % 2 {
+                0 => Vector6::new(0.0, 1.0, 0.0, 1.5 * sine, 0.0, lever),
+                _ => Vector6::new(0.0, 0.0, 1.0, 3.0 * sine, lever, 0.0),
+            } + noise;
+            information += jacobian * jacobian.transpose();
+        }
+        let horizontal = Horizontal::of(&information, 1200.0).unwrap();
+        let sigma = |information: &Matrix6<f64>, axis: usize| {
+            information.try_inverse().unwrap()[(axis, axis)].sqrt()
+        };
+        let corrected = horizontal.corrected(&information);
+        assert!(corrected.cholesky().is_some());
+        assert!(sigma(&corrected, 0) > 30.0 * sigma(&information, 0));
+        assert_relative_eq!(
+            sigma(&corrected, 1),
+            sigma(&information, 1),
+            max_relative = 0.01
+        );
+        let step = horizontal.determined(Vector6::new(1.0, 1.0, 1.0, 0.1, 0.1, 0.1));
+        assert!(step.x.abs() < 0.01, "{step}");
+        assert_relative_eq!(step.y, 1.0, epsilon = 0.01);
+        assert_relative_eq!(step.z, 1.0);
     }
 
     #[test]

@@ -31,23 +31,20 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Update, RenderError> {
-        let tempering = &self.config.tempering;
-        let (mut remaining, rounds) = match self.state {
-            State::Tracking => (1.0, tempering.tracking_rounds),
-            State::Searching | State::Lost => {
-                (tempering.searching_power, tempering.searching_rounds)
-            }
+        let rounds = match self.state {
+            State::Tracking => self.config.tempering.tracking_rounds,
+            State::Searching | State::Lost => self.config.tempering.searching_rounds,
         };
-        let mut round = 1;
+        let (mut power, mut round) = (0.0, 1);
         loop {
             let observation = &self.config.observation;
             let count = observation.beams_for(self.particles.len());
             let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
             let refined = self.refined_attitude(scan, attitude);
             let (logs, costs_m) = self.log_likelihoods(&beams, &refined)?;
-            let used = self.reweight(&logs, remaining);
-            remaining -= used;
-            if round >= rounds || remaining <= 0.0 || used <= 0.0 {
+            let used = self.reweight(&logs, self.largest_power() - power);
+            power += used;
+            if round >= rounds || power >= self.largest_power() || used <= 0.0 {
                 return Ok(Update {
                     costs_m,
                     beams,
@@ -56,6 +53,14 @@ impl ParticleFilter {
             }
             self.resample(rng);
             round += 1;
+        }
+    }
+
+    /// Largest power of the likelihood of a frame: a single place is found as exactly as the scan shows it.
+    fn largest_power(&self) -> f64 {
+        match self.state == State::Tracking || self.is_narrow() {
+            true => 1.0,
+            false => self.config.tempering.searching_power,
         }
     }
 
