@@ -2,6 +2,9 @@
 const defects = [];
 let titles = 0;
 for (const table of document.querySelectorAll("table")) {
+  // What is collapsed has no place to click.
+  const folded = table.closest("details");
+  if (folded) folded.open = true;
   const body = table.tBodies[0];
   const rows = body.rows.length;
   for (const head of table.tHead.rows[0].cells) {

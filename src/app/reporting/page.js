@@ -34,6 +34,8 @@ function follow() {
   const head = table && table.tHead.rows[0].cells[column - 1];
   if (!head) return;
   sort(head, !down);
+  const folded = table.closest("details");
+  if (folded) folded.open = true;
   table.scrollIntoView();
 }
 addEventListener("hashchange", follow);
