@@ -27,6 +27,9 @@ pub struct RunPage<'a> {
     pub machine: &'a BTreeMap<String, String>,
 }
 
+/// File name and caption of the oblique view.
+pub const VIEW: (&str, &str) = ("view.png", "Map with the path");
+
 /// Pictures of a run after the path: section, file name and caption.
 pub const PICTURES: [(&str, &str, &str); 8] = [
     (
@@ -162,10 +165,7 @@ impl RunPage<'_> {
                 caption: "Path over the map, colored by error or state. Point at a frame: its scan is drawn where the estimate puts it. Wheel or pinch to zoom, drag to move, double click to see all.".to_owned(),
             });
         }
-        elements.extend(picture_or_error(
-            &plots.join("view.png"),
-            "Map with the path",
-        ));
+        elements.extend(picture_or_error(&plots.join(VIEW.0), VIEW.1));
         elements.extend(picture_or_error(&plots.join("path.png"), "Path, colored by its position error, or without ground truth by its standard deviation"));
         Ok(elements)
     }

@@ -7,15 +7,15 @@ use super::pictures;
 use super::plan::PlannedRun;
 use super::record::{Outcome, RunRecord};
 use super::results::ComparisonResults;
-use crate::app::commands::run_page::{PICTURES, TEXTS, collapsed, picture};
+use crate::app::commands::run_page::{PICTURES, TEXTS, VIEW, collapsed, picture};
 use crate::app::commands::version;
 use crate::app::config::{self, ComparisonConfig, Overrides, settings};
 use crate::app::reporting::{Cell, Column, Page, PageElement, Section, Table};
 use crate::app::results::length;
 use crate::evaluation::Summary;
 
-/// Pictures of a run that the comparison has for all configurations together.
-const COMBINED_PICTURES: [&str; 2] = ["path.png", "errors.png"];
+/// Picture of a run that the comparison has for all configurations together.
+const COMBINED_PICTURE: &str = "errors.png";
 
 /// Maximum number of missing runs to list.
 const MAX_LISTED: usize = 20;
@@ -60,11 +60,10 @@ pub fn page(
         title: format!("Comparison on {}", results.sequences.join(", ")),
         verdict: verdict(results),
         subtitle: format!(
-            "{} configurations, {} sequences; {} of {} runs.",
-            results.config.configurations.len(),
-            results.sequences.len(),
+            "{} of {} runs of {} configurations.",
             results.all_records().count(),
-            planned.len()
+            planned.len(),
+            results.config.configurations.len()
         ),
         sections,
     })
@@ -167,8 +166,9 @@ fn sequence_elements(
         run.id
     )));
     let mut omitted = Vec::new();
-    for (_, name, caption) in PICTURES {
-        if COMBINED_PICTURES.contains(&name) {
+    let pictures = PICTURES.map(|(_, name, caption)| (name, caption));
+    for (name, caption) in [VIEW].into_iter().chain(pictures) {
+        if name == COMBINED_PICTURE {
             continue;
         }
         let path = layout.run(&run.id).join("plots").join(name);
