@@ -2,7 +2,7 @@
 
 use rand::Rng;
 
-use super::state::ParticleFilter;
+use super::state::{ParticleFilter, has_several_places};
 use crate::lidar::RangeImage;
 use crate::localization::initialization::from_panoramas;
 use crate::localization::particles::ParticleSet;
@@ -52,6 +52,7 @@ impl ParticleFilter {
         let before = self.particles.particles();
         particles.extend(kept.into_iter().map(|index| before[index]));
         self.particles = ParticleSet::uniform(particles);
+        self.has_several_places = has_several_places(&self.particles);
         // Valid until the next update.
         self.estimate = self.particles.mean();
         self.covariance = self.particles.covariance_about(&self.estimate);

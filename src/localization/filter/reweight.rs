@@ -58,9 +58,9 @@ impl ParticleFilter {
 
     /// Largest power of the likelihood of a frame: a single place is found as exactly as the scan shows it.
     fn largest_power(&self) -> f64 {
-        match self.state == State::Tracking || self.is_narrow() {
-            true => 1.0,
-            false => self.config.tempering.searching_power,
+        match self.has_several_places && self.state != State::Tracking && !self.is_narrow() {
+            true => self.config.tempering.searching_power,
+            false => 1.0,
         }
     }
 

@@ -9,7 +9,7 @@ use crate::lidar::PERIOD_S;
 use crate::localization::config::LocalizerConfig;
 use crate::localization::convergence::is_narrow;
 use crate::localization::estimate::Estimate;
-use crate::localization::particles::ParticleSet;
+use crate::localization::particles::{ParticleSet, spread};
 use crate::localization::tracking_loss::{AgreementMonitor, State};
 use crate::map::{GroundPatch, Map, PanoramaRequest, SensorAttitude};
 
@@ -43,7 +43,16 @@ pub struct ParticleFilter {
     pub(super) state: State,
     pub(super) agreement: AgreementMonitor,
     pub(super) updates_in_state: usize,
+    /// Whether the search began with particles in several places.
+    pub(super) has_several_places: bool,
     pub(super) is_first: bool,
+}
+
+/// Whether particles are farther apart than the uncertainty of a known start.
+pub(super) fn has_several_places(particles: &ParticleSet) -> bool {
+    /// Standard deviation of the position around a known start, at most [m].
+    const ONE_PLACE_M: f64 = 10.0;
+    spread(&particles.covariance_about(&particles.mean())).0 > ONE_PLACE_M
 }
 
 impl ParticleFilter {
@@ -61,6 +70,7 @@ impl ParticleFilter {
             map,
             restart,
             covariance: particles.covariance_about(&estimate),
+            has_several_places: has_several_places(&particles),
             particles,
             pending: Pose2::identity(),
             pending_duration: Duration::ZERO,
