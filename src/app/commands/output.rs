@@ -60,11 +60,7 @@ impl Printed {
     /// Text that is printed as a whole; in JSON, a string.
     pub fn text(text: impl Into<String>) -> Self {
         let text = text.into();
-        Self {
-            main: text.clone(),
-            json: Value::from(text.trim_end()),
-            all: text,
-        }
+        Self::parts(text.clone(), text)
     }
 
     /// Rows of a name and a value, most important first; in JSON, an object.

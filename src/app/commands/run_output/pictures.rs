@@ -11,7 +11,7 @@ use crate::app::plotting::{
     Animation, FRAME, InteractivePath, LineChart, LocalizationPicture, MapImage, MapPlot, Mark,
     ObliqueView, Panel, ParticlePanels, PathPlot, Series, drift_chart, error_chart, relief,
 };
-use crate::app::results::LocalizationResults;
+use crate::app::results::{LocalizationResults, length};
 use crate::evaluation::trust::Axes;
 use crate::evaluation::{ParticleRow, planar_errors};
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
@@ -291,10 +291,7 @@ fn draw_particles(
     let moments = moments(results);
     let titles = moments.iter().map(|&row| {
         let spread_m = spread_m(results.particles.frame(row)).unwrap_or(0.0);
-        let spread = match spread_m < 1.0 {
-            true => format!("{:.1} cm", 100.0 * spread_m),
-            false => format!("{spread_m:.1} m"),
-        };
+        let spread = length(spread_m);
         format!("Frame {}: spread {spread}", results.frames[row])
     });
     let titles: Vec<String> = titles.collect();
