@@ -3,6 +3,7 @@
 use super::convergence::ConvergenceConfig;
 use super::motion::{OdometryNoise, VelocityNoise};
 use super::observation::ObservationConfig;
+use super::places::PlacesConfig;
 use super::proposal::ProposalConfig;
 use super::resampling::{KldConfig, ResamplingConfig};
 use super::sensor::SensorConfig;
@@ -45,6 +46,8 @@ pub struct LocalizerConfig {
     pub observation: ObservationConfig,
     /// Tempering of the likelihood.
     pub tempering: TemperingConfig,
+    /// Search among several places.
+    pub places: PlacesConfig,
     /// Proposal distribution while tracking.
     pub proposal: ProposalConfig,
     /// Resampling.
@@ -93,6 +96,7 @@ impl Validate for LocalizerConfig {
         nested("unknown_velocity_noise", &self.unknown_velocity)?;
         nested("observation", &self.observation)?;
         nested("tempering", &self.tempering)?;
+        nested("places", &self.places)?;
         nested("proposal", &self.proposal)?;
         nested("resampling", &self.resampling)?;
         nested("kld", &self.kld)?;

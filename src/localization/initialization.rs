@@ -2,8 +2,8 @@
 //!
 //! ```text
 //! pose known   x₀ + U(±5 m), y₀ + U(±5 m), θ₀ + U(±30°)
-//! else         a cell of the road or of the map with probability ∝ exp(−cost / scale),
-//!              uniform in the cell, its best heading + N(0, yaw_sigma²)
+//! else         a cell of the road or of the map, half of the particles with probability ∝ exp(−cost / scale) and
+//!              half in the best cell of each place; uniform in the cell, its best heading + N(0, yaw_sigma²)
 //! ```
 //!
 //! Chen et al., *Range Image-based LiDAR Localization for Autonomous Vehicles*, ICRA 2021, for the
@@ -16,10 +16,11 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::particles::Particle;
+use super::places::{PlacesConfig, best_of_each};
 use super::resampling::systematic;
 use crate::geometry::Pose2;
 use crate::lidar::RangeImage;
-use crate::map::{PanoramaIndex, SensorAttitude};
+use crate::map::{PanoramaIndex, PanoramaSeed, SensorAttitude};
 use crate::validation::{InvalidValue, Validate, not_negative};
 
 /// Shape of the initial distribution.
@@ -83,25 +84,30 @@ pub fn around(
     (0..count).map(&mut particle).collect()
 }
 
-/// Samples particles in the cells whose panoramas resemble the scan, in proportion to the likelihoods of
-/// the cells. Empty without cells.
+/// Samples particles in the cells whose panoramas resemble the scan: half of them in proportion to the likelihoods of
+/// the cells, and half equally in the best cells of the places. Empty without cells.
 pub fn from_panoramas(
     index: &PanoramaIndex,
     scan: &RangeImage,
     attitude: &SensorAttitude,
     count: usize,
+    places: &PlacesConfig,
     rng: &mut impl Rng,
 ) -> Vec<Particle> {
     let seeds = index.search(scan, attitude);
-    let Some(best) = seeds.first() else {
+    let Some(first) = seeds.first() else {
         return Vec::new();
     };
     let mut weights: Vec<f64> = seeds
         .iter()
-        .map(|seed| ((best.cost_m - seed.cost_m) / index.config.scale_m).exp())
+        .map(|seed| ((first.cost_m - seed.cost_m) / index.config.scale_m).exp())
         .collect();
     let sum: f64 = weights.iter().sum();
-    weights.iter_mut().for_each(|weight| *weight /= sum);
+    weights.iter_mut().for_each(|weight| *weight *= 0.5 / sum);
+    let best = best_of_places(&seeds, places);
+    for &place in &best {
+        weights[place] += 0.5 / best.len() as f64;
+    }
     let half_column_rad = std::f64::consts::PI / index.model.width as f64;
     let chosen = systematic(&weights, count, rng);
     let sample = |number: usize| {
@@ -113,6 +119,15 @@ pub fn from_panoramas(
         Particle::new(map_from_lidar, Some(seed.level_m))
     };
     chosen.into_iter().map(sample).collect()
+}
+
+/// The cells of least cost, one of each place.
+fn best_of_places(seeds: &[PanoramaSeed], config: &PlacesConfig) -> Vec<usize> {
+    let poses: Vec<Pose2> = (seeds.iter())
+        .map(|seed| Pose2::new(seed.center.coords, seed.heading_rad))
+        .collect();
+    let costs_m: Vec<_> = seeds.iter().map(|seed| Some(seed.cost_m)).collect();
+    best_of_each(&poses, &costs_m, config.most, config.radius_m)
 }
 
 /// Samples a position in a square cell [m].
@@ -184,7 +199,14 @@ mod tests {
         };
         let index = world.map().panoramas(&request).unwrap();
         let scan = world.scan(&truth);
-        let particles = from_panoramas(&index, &scan, &SensorAttitude::default(), 1000, &mut rng);
+        let particles = from_panoramas(
+            &index,
+            &scan,
+            &SensorAttitude::default(),
+            1000,
+            &PlacesConfig::default(),
+            &mut rng,
+        );
         let near = particles
             .iter()
             .map(|particle| particle.map_from_lidar.translation.vector)

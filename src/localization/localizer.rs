@@ -187,7 +187,14 @@ impl Localizer {
             }
             Start::Road | Start::Anywhere => {
                 let index = self.map.panoramas(&request)?;
-                from_panoramas(&index, image, &self.attitude, count, &mut rng)
+                from_panoramas(
+                    &index,
+                    image,
+                    &self.attitude,
+                    count,
+                    &self.config.places,
+                    &mut rng,
+                )
             }
         };
         let Some(first) = particles.first() else {

@@ -2,7 +2,8 @@
 //!
 //! > [`Localizer`] turns scans into range images with the attitude of the sensor ([`sensor`]) and feeds the
 //! > particle [`filter`]: [`initialization`] samples the first particles, [`motion`] moves them by the
-//! > [`odometry`], [`observation`] weights them, [`resampling`] keeps the likely ones, [`convergence`]
+//! > [`odometry`], [`observation`] weights them, [`resampling`] keeps the likely ones, [`places`]
+//! > compares those that are far apart, [`convergence`]
 //! > decides when few are enough and [`tracking_loss`] when none is right. [`likelihood`] shows how
 //! > peaked the likelihood is.
 //!
@@ -22,6 +23,7 @@ mod sweep;
 pub mod initialization;
 pub mod motion;
 pub mod observation;
+pub mod places;
 pub mod proposal;
 pub mod resampling;
 pub mod tempering;

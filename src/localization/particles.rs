@@ -59,6 +59,16 @@ impl ParticleSet {
         Self { particles }
     }
 
+    /// At least one particle of positive weight; the weights are normalized.
+    pub fn weighted(mut particles: Vec<Particle>) -> Self {
+        let sum: f64 = particles.iter().map(|particle| particle.weight).sum();
+        debug_assert!(sum > 0.0, "a distribution needs weight");
+        for particle in &mut particles {
+            particle.weight /= sum;
+        }
+        Self { particles }
+    }
+
     /// Number of particles.
     pub fn len(&self) -> usize {
         self.particles.len()

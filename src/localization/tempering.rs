@@ -15,7 +15,7 @@
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use crate::validation::{InvalidValue, Validate, fraction, in_range, positive};
+use crate::validation::{InvalidValue, Validate, fraction, in_range};
 
 /// Tempering of the likelihood within a frame.
 ///
@@ -27,11 +27,6 @@ pub struct TemperingConfig {
     /// unchanged, as range-mcl does.
     #[default(0.2)]
     pub min_effective_fraction: f64,
-    /// Largest power of the likelihood of a frame while the particles are in several places (unitless). Places whose mean
-    /// costs differ by less than maps are off are not decided between in one frame: with 0.2, one centimetre is a
-    /// factor of e.
-    #[default(0.2)]
-    pub searching_power: f64,
     /// Rounds of reweighting and resampling per frame while searching.
     #[default(4)]
     pub searching_rounds: usize,
@@ -43,8 +38,6 @@ pub struct TemperingConfig {
 impl Validate for TemperingConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         fraction("min_effective_fraction", self.min_effective_fraction)?;
-        positive("searching_power", self.searching_power)?;
-        fraction("searching_power", self.searching_power)?;
         in_range("searching_rounds", self.searching_rounds, 1..=100)?;
         in_range("tracking_rounds", self.tracking_rounds, 1..=100)
     }

@@ -239,7 +239,7 @@ impl PanoramaIndex {
             .collect();
         coarse.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         let kept = (self.config.refined_share * coarse.len() as f64).ceil() as usize;
-        coarse.truncate(kept.max(1));
+        self.keep_best_and_one_per_square(&mut coarse, kept.max(1));
         let mut seeds: Vec<PanoramaSeed> = coarse
             .par_iter()
             .map(|&(_, cell)| {
@@ -257,6 +257,19 @@ impl PanoramaIndex {
         // Stable: cells of equal cost keep their order.
         seeds.sort_by(|a, b| a.cost_m.total_cmp(&b.cost_m));
         seeds
+    }
+
+    /// Keeps the first cells of a list, and the first one in each square: where little stands around the road, a
+    /// coarse panorama hardly shows which place is right.
+    fn keep_best_and_one_per_square(&self, cells: &mut Vec<(f32, usize)>, best: usize) {
+        const SQUARE_M: f64 = 5.0;
+        let mut squares = BTreeSet::new();
+        let mut rank = 0;
+        cells.retain(|&(_, cell)| {
+            let square = (self.places[cell].0.coords / SQUARE_M).map(|m| m.floor() as i64);
+            rank += 1;
+            squares.insert([square.x, square.y]) || rank <= best
+        });
     }
 }
 

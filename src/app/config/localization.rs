@@ -14,6 +14,7 @@ use crate::localization::convergence::ConvergenceConfig;
 use crate::localization::initialization::StartSpread;
 use crate::localization::motion::{OdometryNoise, VelocityNoise};
 use crate::localization::observation::ObservationConfig;
+use crate::localization::places::PlacesConfig;
 use crate::localization::proposal::ProposalConfig;
 use crate::localization::resampling::{KldConfig, ResamplingConfig};
 use crate::localization::tempering::TemperingConfig;
@@ -143,6 +144,8 @@ pub struct LocalizationConfig {
     pub observation: ObservationConfig,
     /// Tempering of the likelihood within a frame.
     pub tempering: TemperingConfig,
+    /// Search among several places.
+    pub places: PlacesConfig,
     /// Proposal distribution while tracking.
     pub proposal: ProposalConfig,
     /// Resampling.
@@ -206,6 +209,7 @@ impl LocalizationConfig {
             unknown_velocity: self.unknown_velocity_noise.clone(),
             observation: self.observation.clone(),
             tempering: self.tempering.clone(),
+            places: self.places.clone(),
             proposal: self.proposal.clone(),
             resampling: self.resampling.clone(),
             kld: self.kld.clone(),

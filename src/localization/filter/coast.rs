@@ -14,7 +14,11 @@ impl ParticleFilter {
         let mut particles = self.particles.clone();
         particles.propagate(|pose| pose * self.pending);
         let covariance = self.covariance_after_pending(odometry);
-        self.estimate_of(particles, covariance, attitude)
+        let pose = match self.compares_places() {
+            true => self.estimate * self.pending,
+            false => particles.mean(),
+        };
+        self.estimate_of(pose, particles, covariance, attitude)
     }
 
     /// Covariance of the last estimate, propagated by the motion since then [m², m·rad, rad²]:

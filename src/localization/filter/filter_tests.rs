@@ -12,6 +12,7 @@ use crate::lidar::{LidarModel, RangeImage};
 use crate::localization::initialization::{StartSpread, around, from_panoramas};
 use crate::localization::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand};
 use crate::localization::odometry::{increments, with_noise};
+use crate::localization::places::PlacesConfig;
 use crate::localization::{Estimate, LocalizerConfig, Odometry, ParticleSet, State};
 use crate::map::test_world::TestWorld;
 use crate::map::{PanoramaConfig, PanoramaRequest, SearchRegion, SensorAttitude};
@@ -414,7 +415,14 @@ fn a_start_anywhere_converges() {
         let truth = drive(&world, from_x, 20);
         let mut rng = StdRng::seed_from_u64(seed);
         let scan = world.scan(&truth[0]);
-        let start = from_panoramas(&index, &scan, &SensorAttitude::default(), 1000, &mut rng);
+        let start = from_panoramas(
+            &index,
+            &scan,
+            &SensorAttitude::default(),
+            1000,
+            &PlacesConfig::default(),
+            &mut rng,
+        );
         let mut filter = ParticleFilter::new(
             LocalizerConfig::of_test(1000),
             world.map(),

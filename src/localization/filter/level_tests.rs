@@ -8,6 +8,7 @@ use super::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
 use crate::lidar::{LidarModel, RangeImage};
 use crate::localization::initialization::{StartSpread, around, from_panoramas};
+use crate::localization::places::PlacesConfig;
 use crate::localization::{LocalizerConfig, Odometry, ParticleSet, State};
 use crate::map::{
     GroundMap, GroundPatch, Map, MappingPath, PanoramaConfig, PanoramaRequest, SearchRegion,
@@ -232,7 +233,14 @@ fn a_start_anywhere_finds_its_level() {
     for (seed, truth) in [(3, &upper_drive()[44..]), (4, &lower_drive()[31..])] {
         let mut rng = StdRng::seed_from_u64(seed);
         let scan = crossing.scan(&truth[0]);
-        let start = from_panoramas(&index, &scan, &SensorAttitude::default(), 500, &mut rng);
+        let start = from_panoramas(
+            &index,
+            &scan,
+            &SensorAttitude::default(),
+            500,
+            &PlacesConfig::default(),
+            &mut rng,
+        );
         let filter = ParticleFilter::new(
             LocalizerConfig::of_test(500),
             crossing.map.clone(),

@@ -7,8 +7,9 @@
 //! resample       when few particles carry the weight     resampling
 //! ```
 //!
-//! While the filter searches, reweighting and resampling alternate several times within one frame,
-//! with an increasingly peaked likelihood (annealing). Once the distribution is narrow, `num_reduced`
+//! While the filter searches around one place, reweighting and resampling alternate several times within one frame,
+//! with an increasingly peaked likelihood (annealing); several places are compared as such
+//! ([`places`](super::places)). Once the distribution is narrow, `num_reduced`
 //! particles are enough; they are sampled where odometry and scan agree
 //! ([`proposal`](super::proposal)).
 
@@ -18,6 +19,7 @@ mod coast;
 mod propose;
 mod resample;
 mod reweight;
+mod search;
 mod step;
 
 pub use state::ParticleFilter;

@@ -123,6 +123,7 @@ impl ParticleFilter {
             costs_m,
             beams,
             attitude,
+            place: None,
         })
     }
 }

@@ -2,7 +2,7 @@
 
 use rand::Rng;
 
-use super::state::{ParticleFilter, has_several_places};
+use super::state::{ParticleFilter, Search};
 use crate::lidar::RangeImage;
 use crate::localization::initialization::from_panoramas;
 use crate::localization::particles::ParticleSet;
@@ -25,7 +25,9 @@ impl ParticleFilter {
         let size = self.particles.len();
         let threshold = self.config.resampling.min_effective_fraction * size as f64;
         let shrinks = self.state == State::Tracking && size != self.config.num_reduced;
-        if shrinks || self.particles.effective_sample_size() < threshold {
+        let is_depleted =
+            !self.compares_places() && self.particles.effective_sample_size() < threshold;
+        if shrinks || is_depleted {
             self.resample(rng);
         }
         Ok(())
@@ -44,7 +46,7 @@ impl ParticleFilter {
         };
         let index = self.map.panoramas(request)?;
         let count = self.config.num_particles;
-        let mut particles = from_panoramas(&index, scan, attitude, count, rng);
+        let mut particles = from_panoramas(&index, scan, attitude, count, &self.config.places, rng);
         if particles.is_empty() {
             return Ok(false);
         }
@@ -52,7 +54,7 @@ impl ParticleFilter {
         let before = self.particles.particles();
         particles.extend(kept.into_iter().map(|index| before[index]));
         self.particles = ParticleSet::uniform(particles);
-        self.has_several_places = has_several_places(&self.particles);
+        self.search = Search::of(&self.particles);
         // Valid until the next update.
         self.estimate = self.particles.mean();
         self.covariance = self.particles.covariance_about(&self.estimate);

@@ -3,7 +3,7 @@
 use rand::Rng;
 
 use super::state::ParticleFilter;
-use crate::geometry::Pose3;
+use crate::geometry::{Pose2, Pose3};
 use crate::lidar::{Beam, RangeImage};
 use crate::localization::estimate::Estimate;
 use crate::localization::observation::{choose_beams, costs, ground_patch_of, near_points};
@@ -21,11 +21,28 @@ pub(super) struct Update {
     pub(super) beams: Vec<Beam>,
     /// Attitude of the sensor as estimated in this frame.
     pub(super) attitude: SensorAttitude,
+    /// Pose of the likeliest of several places.
+    pub(super) place: Option<Pose2>,
 }
 
 impl ParticleFilter {
+    /// Reweights particles of a wide distribution by the scan.
+    pub(super) fn reweight_widely(
+        &mut self,
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+        rng: &mut impl Rng,
+    ) -> Result<Update, RenderError> {
+        if self.compares_places()
+            && let Some(update) = self.search_places(scan, attitude, rng)?
+        {
+            return Ok(update);
+        }
+        self.reweight_in_rounds(scan, attitude, rng)
+    }
+
     /// Reweights the particles by the scan, in one round or several.
-    pub(super) fn reweight_in_rounds(
+    fn reweight_in_rounds(
         &mut self,
         scan: &RangeImage,
         attitude: &SensorAttitude,
@@ -42,25 +59,18 @@ impl ParticleFilter {
             let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
             let refined = self.refined_attitude(scan, attitude);
             let (logs, costs_m) = self.log_likelihoods(&beams, &refined)?;
-            let used = self.reweight(&logs, self.largest_power() - power);
+            let used = self.reweight(&logs, 1.0 - power);
             power += used;
-            if round >= rounds || power >= self.largest_power() || used <= 0.0 {
+            if round >= rounds || power >= 1.0 || used <= 0.0 {
                 return Ok(Update {
                     costs_m,
                     beams,
                     attitude: self.refined_attitude(scan, attitude),
+                    place: None,
                 });
             }
             self.resample(rng);
             round += 1;
-        }
-    }
-
-    /// Largest power of the likelihood of a frame: a single place is found as exactly as the scan shows it.
-    fn largest_power(&self) -> f64 {
-        match self.has_several_places && self.state != State::Tracking && !self.is_narrow() {
-            true => self.config.tempering.searching_power,
-            false => 1.0,
         }
     }
 
@@ -94,9 +104,13 @@ impl ParticleFilter {
 
     /// Estimate of an updated frame, which is kept for the next frames.
     pub(super) fn updated_estimate(&mut self, update: &Update) -> Estimate {
-        self.covariance = self.particles.covariance_of_estimate();
+        let pose = update.place.unwrap_or_else(|| self.particles.mean());
+        self.covariance = match update.place {
+            Some(_) => self.particles.covariance_about(&pose),
+            None => self.particles.covariance_of_estimate(),
+        };
         let particles = self.particles.clone();
-        let mut estimate = self.estimate_of(particles, self.covariance, &update.attitude);
+        let mut estimate = self.estimate_of(pose, particles, self.covariance, &update.attitude);
         estimate.updated = true;
         estimate.mean_cost_m = weighted_mean(&self.particles, &update.costs_m);
         let is_narrow = self.is_narrow();

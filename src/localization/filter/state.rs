@@ -43,16 +43,31 @@ pub struct ParticleFilter {
     pub(super) state: State,
     pub(super) agreement: AgreementMonitor,
     pub(super) updates_in_state: usize,
-    /// Whether the search began with particles in several places.
-    pub(super) has_several_places: bool,
+    pub(super) search: Search,
     pub(super) is_first: bool,
 }
 
-/// Whether particles are farther apart than the uncertainty of a known start.
-pub(super) fn has_several_places(particles: &ParticleSet) -> bool {
-    /// Standard deviation of the position around a known start, at most [m].
-    const ONE_PLACE_M: f64 = 10.0;
-    spread(&particles.covariance_about(&particles.mean())).0 > ONE_PLACE_M
+/// What the particles represent until the filter tracks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Search {
+    /// The surroundings of a known start.
+    Around,
+    /// Many places, none of them registered yet.
+    Anywhere,
+    /// Places with their weights.
+    Places,
+}
+
+impl Search {
+    /// Of particles with which a search starts.
+    pub fn of(particles: &ParticleSet) -> Self {
+        /// Standard deviation of the position around a known start, at most [m].
+        const AROUND_M: f64 = 10.0;
+        match spread(&particles.covariance_about(&particles.mean())).0 > AROUND_M {
+            true => Self::Anywhere,
+            false => Self::Around,
+        }
+    }
 }
 
 impl ParticleFilter {
@@ -70,7 +85,7 @@ impl ParticleFilter {
             map,
             restart,
             covariance: particles.covariance_about(&estimate),
-            has_several_places: has_several_places(&particles),
+            search: Search::of(&particles),
             particles,
             pending: Pose2::identity(),
             pending_duration: Duration::ZERO,
@@ -113,11 +128,11 @@ impl ParticleFilter {
     /// the last known ground.
     pub(super) fn estimate_of(
         &mut self,
+        pose: Pose2,
         particles: ParticleSet,
         covariance: Matrix3<f64>,
         attitude: &SensorAttitude,
     ) -> Estimate {
-        let pose = particles.mean();
         let found = self.patch_at(&pose);
         self.patch = found.or(self.patch);
         let level = GroundPatch {

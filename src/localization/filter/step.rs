@@ -37,7 +37,7 @@ impl ParticleFilter {
         self.propagate(odometry, rng);
         let update = match self.propose(scan, attitude, rng)? {
             Some(proposal) => self.sample_and_weight(proposal, rng)?,
-            None => self.reweight_in_rounds(scan, attitude, rng)?,
+            None => self.reweight_widely(scan, attitude, rng)?,
         };
         let mut estimate = self.updated_estimate(&update);
         estimate.agreement =
@@ -137,6 +137,8 @@ impl ParticleFilter {
         let is_wide = self.state == State::Tracking && spread(&covariance).0 > config.max_spread_m;
         let is_lost = is_wide || self.agreement.is_lost(config);
         let is_found = self.agreement.confirm(is_converged, agreement, config);
+        // Places that look alike and agree with the scan are told apart by driving.
+        let are_alike = self.compares_places() && agreement >= Some(config.min_agreement);
         let is_stuck = self.updates_in_state >= config.patience;
         let next = match self.state {
             _ if is_lost => State::Lost,
@@ -145,7 +147,7 @@ impl ParticleFilter {
             State::Lost if is_found => State::Tracking,
             state => state,
         };
-        self.updates_in_state = match next == self.state {
+        self.updates_in_state = match next == self.state && !are_alike {
             true => self.updates_in_state + 1,
             false => 0,
         };

@@ -1,0 +1,220 @@
+//! Search among several places ([`places`](crate::localization::places)): each is registered with the map, and its
+//! particles are sampled around the registered pose.
+
+use nalgebra::{Matrix3, Vector3};
+use rand::Rng;
+use rayon::prelude::*;
+
+use super::reweight::Update;
+use super::state::{ParticleFilter, Search};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
+use crate::lidar::{Beam, RangeImage};
+use crate::localization::observation::{choose_beams, costs, ground_patch_of};
+use crate::localization::particles::{Particle, ParticleSet};
+use crate::localization::places::{best_of_each, is_same, weights_after, weights_in};
+use crate::localization::proposal::{Gaussian, regular};
+use crate::localization::tracking_loss::State;
+use crate::map::{GroundPatch, SensorAttitude};
+use crate::registration::{RegistrationConfig, register};
+use crate::rendering::RenderError;
+
+/// A place where the car may be.
+struct Place {
+    /// Registered pose where registration succeeded, else that of a particle.
+    map_from_lidar: Pose3,
+    distribution: Gaussian,
+    patch: GroundPatch,
+}
+
+impl Place {
+    fn pose(&self) -> &Pose2 {
+        &self.distribution.mean
+    }
+}
+
+impl ParticleFilter {
+    /// Whether places are compared instead of particles.
+    pub(super) fn compares_places(&self) -> bool {
+        let is_far_apart = self.search != Search::Around && !self.is_narrow();
+        self.config.proposal.scan && self.state != State::Tracking && is_far_apart
+    }
+
+    /// Registers each place, weights them, and samples particles around each; `None` if no place is on the map.
+    pub(super) fn search_places(
+        &mut self,
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+        rng: &mut impl Rng,
+    ) -> Result<Option<Update>, RenderError> {
+        let (config, observation) = (self.config.places.clone(), &self.config.observation);
+        let count = observation.beams_for(self.particles.len());
+        let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
+        let (_, costs_m) = self.log_likelihoods(&beams, attitude)?;
+        let poses = self.particles.poses();
+        let seeds = best_of_each(poses, &costs_m, config.most, config.radius_m);
+        let places = self.registered_places(&seeds, scan, attitude, rng)?;
+        let observation = &self.config.observation;
+        let beams = choose_beams(
+            scan,
+            observation.beams,
+            observation.road_share,
+            attitude,
+            rng,
+        );
+        let costs_m = self.costs_of_places(&places, &beams)?;
+
+        let found = best_of_each(
+            places.iter().map(Place::pose),
+            &costs_m,
+            config.most,
+            config.radius_m,
+        );
+        let (places, costs_m): (Vec<&Place>, Vec<f64>) = (found.iter())
+            .filter_map(|&index| Some((&places[index], costs_m[index]?)))
+            .unzip();
+        let before = self.weights_before(&places, config.radius_m);
+        let weights = weights_after(&before, &costs_m, &config);
+        let Some(best) = (0..places.len()).max_by(|&a, &b| weights[a].total_cmp(&weights[b]))
+        else {
+            return Ok(None);
+        };
+        for (k, place) in places.iter().enumerate() {
+            let sigma = place.distribution.covariance;
+            eprintln!(
+                "PLACE {k} {:.2} {:.2} {:.3} cost {:.4} before {:.4} after {:.6} sd {:.3} {:.3} {:.4}",
+                place.pose().translation.x,
+                place.pose().translation.y,
+                place.pose().rotation.angle(),
+                costs_m[k],
+                before[k],
+                weights[k],
+                sigma[(0, 0)].sqrt(),
+                sigma[(1, 1)].sqrt(),
+                sigma[(2, 2)].sqrt()
+            );
+        }
+        let attitude = places[best].patch.attitude_of(&places[best].map_from_lidar);
+        let costs_m = self.sample_places(&places, &weights, &costs_m, rng);
+        self.search = Search::Places;
+        Ok(Some(Update {
+            costs_m,
+            beams,
+            attitude,
+            place: Some(*places[best].pose()),
+        }))
+    }
+
+    /// Registers the scan at particles, with a wide kernel first.
+    fn registered_places(
+        &self,
+        seeds: &[usize],
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+        rng: &mut impl Rng,
+    ) -> Result<Vec<Place>, RenderError> {
+        /// Number of registered beams.
+        const BEAMS: usize = 800;
+        /// Scale of the robust kernel for particles that are a metre off [m].
+        const WIDE_KERNEL_M: f64 = 0.4;
+        let config = &self.config.proposal;
+        let beams = choose_beams(scan, BEAMS, config.road_share, attitude, rng);
+        let exact = &config.registration;
+        let wide = RegistrationConfig {
+            kernel_m: exact.kernel_m.max(WIDE_KERNEL_M),
+            tolerance_m: 0.01,
+            ..exact.clone()
+        };
+        let radius_m = self.config.places.radius_m;
+        let place = |&seed: &usize| {
+            let particle = &self.particles.particles()[seed];
+            let Some(patch) = ground_patch_of(particle, &self.map, None) else {
+                return Ok(None);
+            };
+            let start = particle.map_from_lidar;
+            let mut pose = patch.lift(&start, attitude);
+            let mut covariance = None;
+            for config in [&wide, exact] {
+                let found = register(&*self.map.renderer, &beams, &pose, config)?;
+                let is_here = |pose: &Pose3| is_same(&start, &pose2_from_pose3(pose), radius_m);
+                let Some(found) = found.filter(|found| is_here(&found.map_from_lidar)) else {
+                    break;
+                };
+                pose = found.map_from_lidar;
+                covariance = Some(found.planar_covariance());
+            }
+            let mean = pose2_from_pose3(&pose);
+            Ok(within_place(covariance, radius_m)
+                .and_then(|covariance| Gaussian::new(mean, covariance))
+                .map(|distribution| Place {
+                    map_from_lidar: pose,
+                    distribution,
+                    patch,
+                }))
+        };
+        let places: Result<Vec<_>, RenderError> = seeds.par_iter().map(place).collect();
+        Ok(places?.into_iter().flatten().collect())
+    }
+
+    fn costs_of_places(
+        &self,
+        places: &[Place],
+        beams: &[Beam],
+    ) -> Result<Vec<Option<f64>>, RenderError> {
+        let poses: Vec<_> = places
+            .iter()
+            .map(|place| Some(place.map_from_lidar))
+            .collect();
+        let difference = self.config.observation.difference();
+        costs(&*self.map.renderer, &poses, beams, &difference)
+    }
+
+    /// Weights of the places in the prediction. Those of the first scan are equal: the panoramas from which the
+    /// particles were sampled have compared the same scan.
+    fn weights_before(&self, places: &[&Place], radius_m: f64) -> Vec<f64> {
+        let poses: Vec<Pose2> = places.iter().map(|place| *place.pose()).collect();
+        let weights = weights_in(&poses, self.particles.particles(), radius_m);
+        match self.search == Search::Places && weights.iter().sum::<f64>() > 0.0 {
+            true => weights,
+            false => vec![1.0; places.len()],
+        }
+    }
+
+    /// Samples the particles of the places, in proportion to their weights and at least a few for each; returns
+    /// the costs of the particles [m].
+    fn sample_places(
+        &mut self,
+        places: &[&Place],
+        weights: &[f64],
+        costs_m: &[f64],
+        rng: &mut impl Rng,
+    ) -> Vec<Option<f64>> {
+        let most = self.config.num_reduced;
+        let least = most.div_ceil(4);
+        let (mut particles, mut costs) = (Vec::new(), Vec::new());
+        for ((place, &weight), &cost_m) in places.iter().zip(weights).zip(costs_m) {
+            if weight == 0.0 {
+                continue;
+            }
+            let count = ((weight * most as f64) as usize).max(least);
+            let poses = place.distribution.sample(count, rng);
+            particles.extend(poses.into_iter().map(|pose| Particle {
+                weight: weight / count as f64,
+                ..Particle::new(pose, Some(place.patch.height_m))
+            }));
+            costs.extend(std::iter::repeat_n(Some(cost_m), count));
+        }
+        self.particles = ParticleSet::weighted(particles);
+        costs
+    }
+}
+
+/// Covariance of the pose in a place: that of its registration, if any, and at most as wide as the place.
+fn within_place(registered: Option<Matrix3<f64>>, radius_m: f64) -> Option<Matrix3<f64>> {
+    let place = Matrix3::from_diagonal(&Vector3::new(0.5 * radius_m, 0.5 * radius_m, 0.2))
+        .map(|sigma: f64| sigma.powi(2));
+    let Some(registered) = registered else {
+        return Some(place);
+    };
+    let information = regular(&registered).try_inverse()? + place.try_inverse()?;
+    information.try_inverse()
+}

@@ -1,0 +1,185 @@
+//! Places where the car may be, while the particles are far apart.
+//!
+//! After a start anywhere few particles are near the right pose, and their costs depend on how near they are more than on
+//! how well the scan fits there. The best particle of each place is therefore registered with the map, and places are
+//! compared by the mean costs d of the registered poses:
+//!
+//! ```text
+//! W_p ∝ W_p · exp(−max(0, d_p − min d − d₀) / s)          W_p: weight of the particles of place p before
+//! ```
+//!
+//! Maps are off by d₀: costs that differ by less decide nothing, so that places that look alike remain until driving
+//! tells them apart. Each place keeps a number of particles however small its weight is. Milstein, Sánchez and
+//! Williamson, *Robust Global Localization Using Clustered Particle Filtering*, AAAI 2002, for particles per cluster.
+
+use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
+
+use super::particles::Particle;
+use crate::geometry::Pose2;
+use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
+
+/// Search among several places.
+///
+/// Defaults: values of this project.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[serde(default, deny_unknown_fields)]
+pub struct PlacesConfig {
+    /// Largest number of places that are registered in a frame.
+    #[default(40)]
+    pub most: usize,
+    /// Distance up to which poses of like heading are in the same place [m].
+    #[default(5.0)]
+    pub radius_m: f64,
+    /// Difference of mean costs that decides nothing between places, d₀ [m].
+    #[default(0.01)]
+    pub tolerance_m: f64,
+    /// Scale s: a mean cost that is larger by s beyond that is e times less likely [m].
+    #[default(0.005)]
+    pub scale_m: f64,
+}
+
+impl Validate for PlacesConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        in_range("most", self.most, 1..=1000)?;
+        positive("radius_m", self.radius_m)?;
+        not_negative("tolerance_m", self.tolerance_m)?;
+        positive("scale_m", self.scale_m)
+    }
+}
+
+/// Weight below which a place is given up (unitless).
+const LEAST_WEIGHT: f64 = 1e-6;
+
+/// Whether two poses are in the same place.
+pub fn is_same(a: &Pose2, b: &Pose2, radius_m: f64) -> bool {
+    const SAME_HEADING_RAD: f64 = std::f64::consts::FRAC_PI_4;
+    let between = a.inverse() * b;
+    between.translation.vector.norm() < radius_m
+        && between.rotation.angle().abs() < SAME_HEADING_RAD
+}
+
+/// Indices of the poses of least cost in each of at most `most` places; poses without a cost are left out.
+pub fn best_of_each<'a>(
+    poses: impl IntoIterator<Item = &'a Pose2>,
+    costs_m: &[Option<f64>],
+    most: usize,
+    radius_m: f64,
+) -> Vec<usize> {
+    let poses: Vec<&Pose2> = poses.into_iter().collect();
+    let mut ascending: Vec<(f64, usize)> = (costs_m.iter().zip(0..))
+        .filter_map(|(cost_m, index)| Some(((*cost_m)?, index)))
+        .collect();
+    ascending.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut chosen: Vec<usize> = Vec::new();
+    for (_, index) in ascending {
+        if chosen.len() == most {
+            break;
+        }
+        if !(chosen.iter()).any(|&other| is_same(poses[other], poses[index], radius_m)) {
+            chosen.push(index);
+        }
+    }
+    chosen
+}
+
+/// Weights of the particles in each place; a particle counts for the first place that it is in.
+pub fn weights_in(places: &[Pose2], particles: &[Particle], radius_m: f64) -> Vec<f64> {
+    let mut weights = vec![0.0; places.len()];
+    for particle in particles {
+        let is_here = |place: &Pose2| is_same(place, &particle.map_from_lidar, radius_m);
+        if let Some(place) = places.iter().position(is_here) {
+            weights[place] += particle.weight;
+        }
+    }
+    weights
+}
+
+/// Weights of places after a scan, which sum to one: those before, and the costs of the registered poses [m]. Places
+/// that are given up have none.
+pub fn weights_after(before: &[f64], costs_m: &[f64], config: &PlacesConfig) -> Vec<f64> {
+    let least_m = costs_m.iter().copied().fold(f64::INFINITY, f64::min);
+    let likelihood =
+        |cost_m: f64| (-(cost_m - least_m - config.tolerance_m).max(0.0) / config.scale_m).exp();
+    let mut weights: Vec<f64> = (before.iter().zip(costs_m))
+        .map(|(weight, &cost_m)| weight * likelihood(cost_m))
+        .collect();
+    for least in [0.0, LEAST_WEIGHT] {
+        let sum: f64 = weights.iter().sum();
+        for weight in &mut weights {
+            *weight = if *weight >= least * sum {
+                *weight / sum
+            } else {
+                0.0
+            };
+        }
+    }
+    weights
+}
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+    use nalgebra::Vector2;
+
+    use super::super::particles::ParticleSet;
+    use super::*;
+
+    fn at(x: f64, heading_rad: f64) -> Pose2 {
+        Pose2::new(Vector2::new(x, 0.0), heading_rad)
+    }
+
+    #[test]
+    fn the_best_of_each_place_is_chosen_whatever_the_number_of_particles_there() {
+        let poses = [
+            at(0.0, 0.0),
+            at(1.0, 0.1),
+            at(70.0, 0.0),
+            at(0.5, 3.0),
+            at(900.0, 0.0),
+        ];
+        let costs_m = [Some(0.3), Some(0.1), Some(0.4), Some(0.2), None];
+        assert_eq!(best_of_each(&poses, &costs_m, 9, 5.0), [1, 3, 2]);
+        assert_eq!(best_of_each(&poses, &costs_m, 2, 5.0), [1, 3]);
+    }
+
+    #[test]
+    fn costs_that_differ_by_less_than_maps_are_off_decide_nothing() {
+        let config = PlacesConfig::default();
+        let mut weights = vec![0.5, 0.5];
+        for _ in 0..1000 {
+            weights = weights_after(&weights, &[0.050, 0.059], &config);
+        }
+        assert_relative_eq!(weights[0], 0.5, epsilon = 1e-9);
+        // 1 cm more than that is two scales.
+        let weights = weights_after(&weights, &[0.05, 0.07], &config);
+        assert_relative_eq!(weights[1] / weights[0], (-2.0_f64).exp(), epsilon = 1e-9);
+    }
+
+    #[test]
+    fn weights_sum_to_one_and_a_common_offset_of_the_costs_changes_nothing() {
+        let config = PlacesConfig::default();
+        let before = [0.2, 0.5, 0.3];
+        let (a, b) = ([0.1, 0.13, 0.3], [0.5, 0.53, 0.7]);
+        let (a, b) = (
+            weights_after(&before, &a, &config),
+            weights_after(&before, &b, &config),
+        );
+        assert_relative_eq!(a.iter().sum::<f64>(), 1.0, epsilon = 1e-12);
+        for (a, b) in a.iter().zip(&b) {
+            assert_relative_eq!(*a, *b, epsilon = 1e-9);
+        }
+        assert_eq!(a[2], 0.0, "a place of no weight is given up");
+    }
+
+    #[test]
+    fn a_particle_counts_for_one_place() {
+        let set = ParticleSet::uniform([at(0.0, 0.0), at(4.0, 0.0), at(70.0, 0.0), at(200.0, 0.0)]);
+        let weights = weights_in(
+            &[at(2.0, 0.0), at(5.0, 0.0), at(71.0, 0.0)],
+            set.particles(),
+            5.0,
+        );
+        assert_eq!(weights, [0.5, 0.0, 0.25]);
+    }
+}
