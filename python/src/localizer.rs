@@ -197,6 +197,9 @@ pub struct Estimate {
     /// Share of beams above the road that agree with the map; None where unknown.
     #[pyo3(get)]
     agreement: Option<f64>,
+    /// Number of places where the car may be: 1 while the search does not compare several.
+    #[pyo3(get)]
+    places: usize,
     /// Mean cost of the particles [m]; None where the scan was not used.
     #[pyo3(get)]
     mean_cost: Option<f64>,
@@ -224,6 +227,7 @@ impl Estimate {
             standard_deviations: PyArray1::from_slice(py, &deviations).unbind(),
             state: estimate.state.word(),
             agreement: estimate.agreement,
+            places: estimate.places,
             mean_cost: estimate.mean_cost_m,
             effective_sample_size: estimate.effective_sample_size,
             updated: estimate.updated,

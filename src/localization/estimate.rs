@@ -28,6 +28,8 @@ pub struct Estimate {
     pub mean_cost_m: Option<f64>,
     /// Share of beams above the road that agree with the map at the estimate; `None` where unknown.
     pub agreement: Option<f64>,
+    /// Number of places where the car may be: 1 while the search does not compare several.
+    pub places: usize,
     /// Searching, tracking or lost.
     pub state: State,
     /// Whether the scan was used; it is not while the car moved too little.

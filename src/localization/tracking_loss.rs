@@ -9,7 +9,8 @@
 //! ```
 //!
 //! A place that was found by a search is confirmed by the share of one scan if nearly all of its beams agree, else by
-//! those of several scans in turn: many places agree with a single scan of few beams.
+//! those of several scans in turn: many places agree with a single scan of few beams. A pose that was uncertain in
+//! between, as along a tunnel, is confirmed by a share that is not below the slow average.
 //!
 //! Augmented MCL (Thrun, Burgard and Fox, *Probabilistic Robotics*, 2005, table 8.3) averages the
 //! likelihood instead; here traffic in front of the map must not raise an alarm, so that beams that
@@ -160,6 +161,14 @@ impl AgreementMonitor {
         };
         fast < config.min_agreement || fast < config.lost_fraction * slow
     }
+
+    /// Whether a share confirms a pose that was uncertain: it is as large as usual here, or nearly all beams agree.
+    /// Without a share nothing contradicts it.
+    pub fn is_usual(&self, agreement: Option<f64>, config: &TrackingLossConfig) -> bool {
+        agreement.is_none_or(|share| {
+            share >= config.sure_agreement || self.slow.is_none_or(|slow| share >= slow)
+        })
+    }
 }
 
 #[cfg(test)]
@@ -189,6 +198,21 @@ mod tests {
         assert!(!after(&frames));
         frames.extend([0.5; 4]);
         assert!(after(&frames));
+    }
+
+    #[test]
+    fn an_uncertain_pose_is_confirmed_by_as_many_beams_as_usual_here() {
+        let config = TrackingLossConfig::default();
+        let mut monitor = AgreementMonitor::default();
+        (0..100).for_each(|_| monitor.observe(Some(0.98), &config));
+        // Two metres off behind a tunnel of which every scan agreed.
+        (0..10).for_each(|_| monitor.observe(Some(0.77), &config));
+        assert!(!monitor.is_usual(Some(0.77), &config));
+        assert!(monitor.is_usual(Some(0.9), &config));
+        // Where a street has changed, fewer beams always agree.
+        let mut changed = AgreementMonitor::default();
+        (0..100).for_each(|_| changed.observe(Some(0.7), &config));
+        assert!(changed.is_usual(Some(0.71), &config));
     }
 
     #[test]

@@ -13,6 +13,7 @@
 //! 4 · rows · columns bytes per cell: with the defaults 4.3 kB, 12 MB for 700 m of road in cells of one
 //! metre. Where roads cross above one another, a cell has one panorama per level.
 
+use std::collections::BTreeSet;
 use std::f32::consts::TAU;
 use std::ops::RangeInclusive;
 

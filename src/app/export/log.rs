@@ -261,6 +261,7 @@ impl Trajectories {
             "state": state,
             "particles": (!results.particles.is_empty()).then(|| results.particles.frame(row).len()),
             "agreement": agreement.filter(|&share| share >= 0.0),
+            "places": results.places.as_ref().map(|all| all[row] as u64),
             "sigma_long_m": axes.map(|axes| axes.long_m),
             "sigma_short_m": axes.map(|axes| axes.short_m),
             "sigma_heading_deg": covariance.map(|it| it[(2, 2)].max(0.0).sqrt().to_degrees()),

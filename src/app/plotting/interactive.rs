@@ -90,6 +90,7 @@ impl InteractivePath<'_> {
             "heading_errors_deg": heading_errors_deg,
             "sigmas_cm": sigmas_m,
             "agreements": results.agreements,
+            "places": results.places,
             "states": states,
             "state_colors": Value::Object(colors.into_iter().collect()),
             "colormap": (0..10).map(|k| css(Colormap::Viridis.at(f64::from(k) / 9.0))).collect::<Vec<_>>(),

@@ -92,6 +92,7 @@ function interactive(figure) {
     const parts = [`frame ${run.frames[frame]}`];
     if (run.times_s) parts.push(`${(run.times_s[frame] - run.times_s[0]).toFixed(1)} s`);
     if (run.states) parts.push(run.states[frame]);
+    if (run.places && run.places[frame] > 1) parts.push(`one of ${run.places[frame]} places`);
     if (run.errors_cm)
       parts.push(`${run.errors_cm[frame].toFixed(1)} cm and ${run.heading_errors_deg[frame].toFixed(3)} deg off`);
     if (run.sigmas_cm) parts.push(`standard deviation ${run.sigmas_cm[frame].toFixed(1)} cm`);

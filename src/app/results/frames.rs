@@ -56,6 +56,8 @@ impl FrameTable {
         table.add("particles", particles.as_deref(), usize::to_string);
         let agreements = results.agreements.as_deref();
         table.add_numbers("agreement", agreements, |share| *share);
+        let places = results.places.as_deref();
+        table.add_numbers("places", places, |places| *places);
         table.add("state", results.states.as_deref(), u8::to_string);
         table.add_numbers("runtime_ms", results.runtimes_s.as_deref(), |time_s| {
             1e3 * time_s

@@ -14,6 +14,7 @@
 //! | `covariances`, `refined_covariances` | (rows, 9) | float64 | of x, y, heading, row-major [m², m rad, rad²] |
 //! | `times_s`, `runtimes_s`, `refine_runtimes_s` | (rows) | float64 | time of the frame; computing time [s] |
 //! | `agreements` | (rows) | float64 | share of beams above the road that agree with the map, −1 where unknown |
+//! | `places` | (rows) | float64 | number of places where the car may be |
 //! | `states` | (rows) | uint8 | state of the filter |
 //! | `scan_outlines` | (rows, 512) | int16 | x, y of up to 256 points of the scan at the height of the sensor, in the lidar frame [cm]; zeros after the last |
 //! | `selected_frames` | () | int64 | number of frames to localize; only where not all were |
@@ -163,6 +164,8 @@ pub struct LocalizationResults {
     pub refine_runtimes_s: Option<Vec<f64>>,
     /// Share of the beams above the road that agree with the map, −1 where unknown (unitless).
     pub agreements: Option<Vec<f64>>,
+    /// Number of places where the car may be.
+    pub places: Option<Vec<f64>>,
     /// State of the filter as a number.
     pub states: Option<Vec<u8>>,
     /// Outlines of the scans, for pictures.
@@ -227,6 +230,7 @@ impl LocalizationResults {
             runtimes_s: pick(&self.runtimes_s, rows),
             refine_runtimes_s: pick(&self.refine_runtimes_s, rows),
             agreements: pick(&self.agreements, rows),
+            places: pick(&self.places, rows),
             states: pick(&self.states, rows),
             scan_outlines: pick(&self.scan_outlines, rows),
             selected: None,

@@ -58,6 +58,7 @@ impl LocalizationResults {
             runtimes_s: file.rows("runtimes_s", |[time_s]| time_s)?,
             refine_runtimes_s: file.rows("refine_runtimes_s", |[time_s]| time_s)?,
             agreements: file.rows("agreements", |[share]| share)?,
+            places: file.rows("places", |[places]| places)?,
             states: file.states()?,
             scan_outlines: file.rows("scan_outlines", outline_from_row)?,
             selected,
@@ -118,6 +119,7 @@ impl LocalizationResults {
         file.numbers("runtimes_s", &self.runtimes_s, f64::NAN)?;
         file.numbers("refine_runtimes_s", &self.refine_runtimes_s, f64::NAN)?;
         file.numbers("agreements", &self.agreements, f64::NAN)?;
+        file.numbers("places", &self.places, f64::NAN)?;
         file.numbers("states", &self.states, 0)?;
         file.outlines(&self.scan_outlines)?;
         file.npz.finish()

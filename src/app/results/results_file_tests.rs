@@ -49,6 +49,7 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
         runtimes_s: numbers(0.01),
         refine_runtimes_s: numbers(0.02),
         agreements: numbers(0.001),
+        places: numbers(1.0),
         states: Some(frames.iter().map(|&frame| frame as u8 % 3).collect()),
         scan_outlines: Some((frames.iter()).map(outline).collect()),
         selected: Some(40),

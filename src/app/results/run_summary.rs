@@ -18,6 +18,8 @@ pub struct RunSummary {
     pub tracking: Option<usize>,
     /// Number of the first frame in which it was tracking.
     pub first_tracked: Option<usize>,
+    /// Number of frames in which the car may have been in several places.
+    pub ambiguous: Option<usize>,
     /// Length of the found path [m].
     pub path_m: f64,
     /// Mean speed [m/s]; `None` without times, and if ten frames per second were assumed.
@@ -52,6 +54,8 @@ impl RunSummary {
             frames: results.len(),
             tracking: states.map(|_| tracked.len()),
             first_tracked: states.and_then(|_| Some(results.frames[*tracked.first()?])),
+            ambiguous: (results.places.as_ref())
+                .map(|places| places.iter().filter(|&&places| places > 1.0).count()),
             path_m,
             speed_m_per_s: duration_s.filter(|&s| s > 0.0).map(|s| path_m / s),
             position_sigma_m: over_tracked(&|row| {
@@ -76,13 +80,19 @@ impl RunSummary {
             ),
             _ => String::new(),
         };
+        let several = match self.ambiguous {
+            Some(count @ 1..) => {
+                format!(" In {count} frames the car may have been in several places.")
+            }
+            _ => String::new(),
+        };
         match (self.first_tracked, self.tracking) {
             (Some(first), Some(tracking)) => format!(
-                "Found in frame {first}, tracking in {tracking} of {} frames{sure}.",
+                "Found in frame {first}, tracking in {tracking} of {} frames{sure}.{several}",
                 self.frames
             ),
             (None, Some(_)) => format!(
-                "Not found: tracking in none of {} frames; the poses must not be used.",
+                "Not found: tracking in none of {} frames; the poses must not be used.{several}",
                 self.frames
             ),
             (_, None) => format!("{} frames{sure}.", self.frames),
@@ -100,6 +110,12 @@ impl RunSummary {
                 MetricRow::new("tracking: number of frames in which the filter was tracking", tracking),
                 MetricRow::new("first tracked frame: number of the first frame in which the filter was tracking", self.first_tracked),
             ]);
+        }
+        if let Some(count @ 1..) = self.ambiguous {
+            rows.push(MetricRow::new(
+                "ambiguous: number of frames in which the car may have been in several places",
+                count,
+            ));
         }
         rows.push(MetricRow::new(
             "path [m]: length of the found path",

@@ -39,6 +39,14 @@ impl ParticleFilter {
         self.config.proposal.scan && self.state != State::Tracking && is_far_apart
     }
 
+    /// Number of places where the car may be.
+    pub(super) fn likely_places(&self) -> usize {
+        match self.search {
+            Search::Places { likely } if self.compares_places() => likely,
+            _ => 1,
+        }
+    }
+
     /// Registers each place, weights them, and samples particles around each; `None` if no place is on the map.
     pub(super) fn search_places(
         &mut self,
@@ -46,6 +54,8 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Option<Update>, RenderError> {
+        /// Weight of a place that is likely (unitless).
+        const LIKELY: f64 = 0.01;
         let (config, observation) = (self.config.places.clone(), &self.config.observation);
         let count = observation.beams_for(self.particles.len());
         let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
@@ -78,24 +88,10 @@ impl ParticleFilter {
         else {
             return Ok(None);
         };
-        for (k, place) in places.iter().enumerate() {
-            let sigma = place.distribution.covariance;
-            eprintln!(
-                "PLACE {k} {:.2} {:.2} {:.3} cost {:.4} before {:.4} after {:.6} sd {:.3} {:.3} {:.4}",
-                place.pose().translation.x,
-                place.pose().translation.y,
-                place.pose().rotation.angle(),
-                costs_m[k],
-                before[k],
-                weights[k],
-                sigma[(0, 0)].sqrt(),
-                sigma[(1, 1)].sqrt(),
-                sigma[(2, 2)].sqrt()
-            );
-        }
         let attitude = places[best].patch.attitude_of(&places[best].map_from_lidar);
         let costs_m = self.sample_places(&places, &weights, &costs_m, rng);
-        self.search = Search::Places;
+        let likely = weights.iter().filter(|&&weight| weight >= LIKELY).count();
+        self.search = Search::Places { likely };
         Ok(Some(Update {
             costs_m,
             beams,
@@ -173,7 +169,7 @@ impl ParticleFilter {
     fn weights_before(&self, places: &[&Place], radius_m: f64) -> Vec<f64> {
         let poses: Vec<Pose2> = places.iter().map(|place| *place.pose()).collect();
         let weights = weights_in(&poses, self.particles.particles(), radius_m);
-        match self.search == Search::Places && weights.iter().sum::<f64>() > 0.0 {
+        match matches!(self.search, Search::Places { .. }) && weights.iter().sum::<f64>() > 0.0 {
             true => weights,
             false => vec![1.0; places.len()],
         }

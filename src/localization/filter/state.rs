@@ -43,6 +43,8 @@ pub struct ParticleFilter {
     pub(super) state: State,
     pub(super) agreement: AgreementMonitor,
     pub(super) updates_in_state: usize,
+    /// Whether the pose was confirmed since the distribution was last too wide for it to be called tracked.
+    pub(super) is_sure: bool,
     pub(super) search: Search,
     pub(super) is_first: bool,
 }
@@ -55,7 +57,10 @@ pub(super) enum Search {
     /// Many places, none of them registered yet.
     Anywhere,
     /// Places with their weights.
-    Places,
+    Places {
+        /// Number of places that are likely.
+        likely: usize,
+    },
 }
 
 impl Search {
@@ -98,6 +103,7 @@ impl ParticleFilter {
             state: State::Searching,
             agreement: AgreementMonitor::default(),
             updates_in_state: 0,
+            is_sure: true,
             is_first: true,
         }
     }
@@ -148,6 +154,7 @@ impl ParticleFilter {
             effective_sample_size: particles.effective_sample_size(),
             mean_cost_m: None,
             agreement: None,
+            places: self.likely_places(),
             state: self.reported_state(&covariance),
             updated: false,
             on_mapped_ground: found.is_some(),
@@ -158,14 +165,17 @@ impl ParticleFilter {
 
     /// The state, of a frame whose estimate has a covariance: tracking only if that is small.
     pub(super) fn reported_state(&self, covariance: &Matrix3<f64>) -> State {
-        let position = covariance.fixed_view::<2, 2>(0, 0).into_owned();
-        let largest_m = position.symmetric_eigenvalues().max().max(0.0).sqrt();
         match self.state {
-            State::Tracking if largest_m > self.config.tracking_loss.sure_spread_m => {
-                State::Searching
-            }
+            State::Tracking if !self.is_sure || self.is_too_wide(covariance) => State::Searching,
             state => state,
         }
+    }
+
+    /// Whether a position with a covariance is too uncertain to be called tracked.
+    pub(super) fn is_too_wide(&self, covariance: &Matrix3<f64>) -> bool {
+        let position = covariance.fixed_view::<2, 2>(0, 0).into_owned();
+        let largest_m = position.symmetric_eigenvalues().max().max(0.0).sqrt();
+        largest_m > self.config.tracking_loss.sure_spread_m
     }
 
     /// Ground patch under a pose near the particles.

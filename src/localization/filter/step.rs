@@ -44,6 +44,11 @@ impl ParticleFilter {
             self.agreement_at(&estimate.map_from_lidar, &update.beams, &update.attitude)?;
         self.attitude = Some(update.attitude);
         self.change_state(estimate.agreement, odometry);
+        self.is_sure = self.state != State::Tracking
+            || !self.is_too_wide(&estimate.covariance)
+                && (self.is_sure
+                    || (self.agreement).is_usual(estimate.agreement, &self.config.tracking_loss));
+        estimate.places = self.likely_places();
         estimate.state = self.reported_state(&estimate.covariance);
         self.prepare_next(scan, attitude, rng)?;
         Ok(estimate)

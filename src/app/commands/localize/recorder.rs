@@ -56,6 +56,7 @@ impl Run {
                 times_s: Some(Vec::new()),
                 runtimes_s: Some(Vec::new()),
                 agreements: Some(Vec::new()),
+                places: Some(Vec::new()),
                 states: Some(Vec::new()),
                 scan_outlines: Some(Vec::new()),
                 refined: config.refine.then(Vec::new),
@@ -122,6 +123,7 @@ impl Run {
         push(&mut results.times_s, frame.time_s);
         push(&mut results.runtimes_s, runtime.as_secs_f64());
         push(&mut results.agreements, estimate.agreement.unwrap_or(-1.0));
+        push(&mut results.places, estimate.places as f64);
         push(&mut results.states, estimate.state as u8);
         let refined_pose = refined.map_or(estimate.pose, |refined| refined.pose);
         let covariance = refined.map_or(estimate.covariance, |refined| refined.covariance);
