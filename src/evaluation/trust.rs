@@ -12,7 +12,6 @@ use nalgebra::{Matrix2, Matrix3};
 use serde::{Deserialize, Serialize};
 
 use super::planar::{PlanarError, planar_errors};
-use super::range_mcl::ParticleRow;
 use crate::geometry::Pose2;
 use crate::statistics::median;
 
@@ -65,8 +64,8 @@ pub struct Trust {
     pub narrowest_m: Option<f64>,
     /// Angle between that axis and the direction of the car, at most a right angle [rad].
     pub widest_direction_rad: Option<f64>,
-    /// Median number of places that the particles are in, over the frames before the first that is tracking.
-    pub places: Option<usize>,
+    /// Median number of places where the car may be, over the frames before the first that is tracking.
+    pub places: Option<f64>,
 }
 
 impl Trust {
@@ -132,29 +131,6 @@ impl Axes {
             long_from_forward_rad: along.dot(&forward).abs().min(1.0).acos(),
         }
     }
-}
-
-/// Number of places, farther than 5 m from each other, with at least a twentieth of the weight each.
-pub fn places(particles: &[ParticleRow]) -> usize {
-    const RADIUS_M: f32 = 5.0;
-    const LEAST_SHARE: f32 = 0.05;
-    let mut order: Vec<&ParticleRow> = particles.iter().collect();
-    order.sort_by(|a, b| b[3].total_cmp(&a[3]));
-    let mut found: Vec<[f32; 3]> = Vec::new();
-    for &&[x, y, _, weight] in &order {
-        match found
-            .iter_mut()
-            .find(|place| (place[0] - x).hypot(place[1] - y) < RADIUS_M)
-        {
-            Some(place) => place[2] += weight,
-            None => found.push([x, y, weight]),
-        }
-    }
-    let all: f32 = found.iter().map(|place| place[2]).sum();
-    found
-        .iter()
-        .filter(|place| place[2] >= LEAST_SHARE * all)
-        .count()
 }
 
 fn is_inside(error: &PlanarError, covariance: &Matrix3<f64>) -> bool {
@@ -236,13 +212,5 @@ mod tests {
         assert_relative_eq!(axes.long_m, 1.0, epsilon = 1e-9);
         assert_relative_eq!(axes.short_m, 0.1, epsilon = 1e-9);
         assert_relative_eq!(axes.long_from_forward_rad, 0.0, epsilon = 1e-6);
-    }
-
-    #[test]
-    fn places_of_little_weight_do_not_count() {
-        let at = |x: f32, weight: f32| [x, 0.0, 0.0, weight];
-        assert_eq!(places(&[at(0.0, 0.5), at(1.0, 0.2), at(70.0, 0.3)]), 2);
-        assert_eq!(places(&[at(0.0, 0.97), at(70.0, 0.03)]), 1);
-        assert_eq!(places(&[]), 0);
     }
 }

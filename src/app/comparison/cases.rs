@@ -131,7 +131,7 @@ fn columns() -> Vec<Column> {
         ("widest", "m", "largest standard deviation along any axis while tracking"),
         ("across it", "m", "standard deviation across that axis in the same frame"),
         ("direction", "deg", "angle of that axis to the direction of the car"),
-        ("places", "", "places 5 m apart with a twentieth of the weight of the particles each, before the first frame that is tracking"),
+        ("places", "", "places where the car may be, before the first frame that is tracking"),
     ]
     .map(column)
     .into()
@@ -159,6 +159,6 @@ fn cells(runs: &[&RunRecord]) -> Vec<Cell> {
         median(|trust| trust.widest_m),
         median(|trust| trust.narrowest_m),
         median(|trust| trust.widest_direction_rad.map(f64::to_degrees)),
-        median(|trust| trust.places.map(|count| count as f64)),
+        median(|trust| trust.places),
     ]
 }

@@ -20,9 +20,10 @@ use crate::app::commands::simulate::{self, Existing};
 use crate::app::commands::{Context, build_map, localize, output, refine, version};
 use crate::app::config::{BuildMapConfig, LocalizationConfig, RefinementConfig};
 use crate::app::results::{LocalizationResults, Report, TrajectoryReport};
-use crate::evaluation::trust::{Trust, TrustedRun, places};
+use crate::evaluation::trust::{Trust, TrustedRun};
 use crate::evaluation::{EvaluatedTrajectory, RangeMclRules};
 use crate::localization::State;
+use crate::statistics::median;
 
 const MAP_FILE: &str = "map.ply";
 const RESULT_FILE: &str = "localization.npz";
@@ -313,11 +314,8 @@ fn trust(result: &Path) -> Result<Option<Trust>> {
         .iter()
         .take_while(|&&tracking| !tracking)
         .count();
-    let mut places: Vec<usize> = (0..searching.min(results.particles.len()))
-        .map(|row| places(results.particles.frame(row)))
-        .collect();
-    places.sort_unstable();
-    trust.places = places.get(places.len() / 2).copied();
+    let places = results.places.as_deref().unwrap_or_default();
+    trust.places = median(places.iter().take(searching).copied());
     Ok(Some(trust))
 }
 
