@@ -1,6 +1,8 @@
 //! Search among several places ([`places`](crate::localization::places)): each is registered with the map, and its
 //! particles are sampled around the registered pose.
 
+use std::collections::BTreeSet;
+
 use nalgebra::{Matrix3, Vector3};
 use rand::Rng;
 use rayon::prelude::*;
@@ -47,7 +49,7 @@ impl ParticleFilter {
         }
     }
 
-    /// Registers each place, weights them, and samples particles around each; `None` if no place is on the map.
+    /// Registers the best particles of each place, weights them, and samples particles around each; `None` if no place is on the map.
     pub(super) fn search_places(
         &mut self,
         scan: &RangeImage,
@@ -56,12 +58,21 @@ impl ParticleFilter {
     ) -> Result<Option<Update>, RenderError> {
         /// Weight of a place that is likely (unitless).
         const LIKELY: f64 = 0.01;
+        /// Distance between particles that are registered besides the best one of each place [m].
+        const SEED_RADIUS_M: f64 = 1.0;
         let (config, observation) = (self.config.places.clone(), &self.config.observation);
         let count = observation.beams_for(self.particles.len());
         let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
         let (_, costs_m) = self.log_likelihoods(&beams, attitude)?;
-        let poses = self.particles.poses();
-        let seeds = best_of_each(poses, &costs_m, config.most, config.radius_m);
+        // Along a street without much structure a place has several optima.
+        let best = |radius_m| {
+            let poses = self.particles.poses();
+            best_of_each(poses, &costs_m, config.most, radius_m)
+        };
+        let seeds: BTreeSet<usize> = (best(config.radius_m).into_iter())
+            .chain(best(SEED_RADIUS_M))
+            .collect();
+        let seeds: Vec<usize> = seeds.into_iter().collect();
         let places = self.registered_places(&seeds, scan, attitude, rng)?;
         let observation = &self.config.observation;
         let beams = choose_beams(
