@@ -159,7 +159,9 @@ fn pool(threads: usize) -> ThreadPool {
 }
 
 fn renderer() -> CpuRenderer {
-    CpuRenderer::new(&street::tiles(&street::street(SEED), 100.0))
+    let mut street = street::street(SEED);
+    street.snap();
+    CpuRenderer::new(&street::tiles(&street, 100.0))
 }
 
 fn at(position: Vec3) -> Pose3 {

@@ -2,6 +2,10 @@
 
 use glam::Vec3;
 
+/// Step of the lattice of map vertices, 0.49 mm: a power of two, so that sums and differences of its points are exact
+/// in `f32` up to 8 km [m].
+pub const STEP_M: f32 = 1.0 / 2048.0;
+
 /// Triangles over shared vertices. `normals` and `colors` are per vertex; either is empty
 /// if unknown, otherwise as long as `vertices`.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -28,6 +32,14 @@ impl TriangleMesh {
     pub fn scaled_normal(&self, triangle: usize) -> Vec3 {
         let [a, b, c] = self.corners(triangle);
         (b - a).cross(c - a)
+    }
+
+    /// Moves each vertex to the nearest point of a lattice of [`STEP_M`], by at most 0.43 mm: ray casting keeps such
+    /// triangles in less than half of the memory.
+    pub fn snap(&mut self) {
+        for vertex in &mut self.vertices {
+            *vertex = (*vertex / STEP_M).round() * STEP_M;
+        }
     }
 
     /// Appends another mesh without merging vertices. Normals and colors are kept if both have them.

@@ -26,8 +26,8 @@ const GROUND_CELL_M: f64 = 0.5;
 /// Extents between which a map in metres lies [m].
 const PLAUSIBLE_M: RangeInclusive<f32> = 2.0..=20_000.0;
 
-/// Memory per triangle, in the mesh, the tiles and the renderer's hierarchy [bytes].
-const TRIANGLE_BYTES: f64 = 300.0;
+/// Memory per triangle while a map is prepared: mesh, tiles and hierarchies [bytes].
+const TRIANGLE_BYTES: f64 = 150.0;
 
 /// Memory per tile [bytes].
 const TILE_BYTES: f64 = 1000.0;
@@ -76,15 +76,16 @@ pub enum MapError {
 }
 
 impl Map {
-    /// Prepares a mesh in the map frame.
+    /// Prepares a mesh in the map frame. Its vertices are [snapped](TriangleMesh::snap) to a lattice of 0.49 mm.
     ///
     /// The ground consists of the triangles with more red than blue, as `build-map` and range-mcl
     /// colour them; in a mesh without such colours, it is found by its shape (see `ground_surface`).
     pub fn new(
-        mesh: TriangleMesh,
+        mut mesh: TriangleMesh,
         path: MappingPath,
         options: &MapOptions,
     ) -> Result<Self, MapError> {
+        mesh.snap();
         let triangles = mesh.triangles.len();
         if (0..triangles).all(|triangle| mesh.scaled_normal(triangle) == glam::Vec3::ZERO) {
             return Err(MapError::NoArea { triangles });

@@ -1,55 +1,42 @@
 //! All surfaces along a ray, not only the nearest.
 //!
 //! The boxes have to be traversed to the end of the ray, so neighbouring rays have less to share:
-//! the rays are single, in the binary hierarchy.
+//! the rays are single.
 
 use glam::DVec3;
 
-use super::Hit;
+use super::Place;
+use super::simd::Baseline;
 use super::single::SingleRay;
-use super::traversal::{FAR_TOLERANCE, Traverse};
-use super::triangle::{TRIANGLES, TriangleBlock};
-use crate::geometry::Vec3;
+use super::traversal::{Leaf, Traverse};
+use super::triangle::TriangleBlock;
+use super::wide::{BoxGrid, CHILDREN, WideNode};
 
-/// A ray that visits all its hits.
+/// A ray that visits all its hits: their ranges and places.
 pub(super) struct AllHits<F> {
-    pub origin: DVec3,
     pub ray: SingleRay,
     pub visit: F,
 }
 
-impl<F: FnMut(Hit)> Traverse for AllHits<F> {
-    type Origin = Vec3;
+impl<F: FnMut(f32, Place)> Traverse<Baseline> for AllHits<F> {
+    type Origin = <SingleRay as Traverse<Baseline>>::Origin;
 
-    fn relative_to(&self, middle: DVec3) -> Vec3 {
-        (self.origin - middle).as_vec3()
+    fn relative_to(&self, simd: Baseline, middle: DVec3, grid: &BoxGrid) -> Self::Origin {
+        self.ray.relative_to(simd, middle, grid)
     }
 
-    #[inline(always)]
-    fn enters<const COHERENT: bool>(&self, origin: Vec3, bounds: &[f32; 6]) -> bool {
-        let (mut near, mut far) = (0.0, self.ray.until_m);
-        for (axis, [entry, exit]) in self.ray.sides.into_iter().enumerate() {
-            let entry = (bounds[entry] - origin[axis]) * self.ray.inverse[axis];
-            let exit = (bounds[exit] - origin[axis]) * self.ray.inverse[axis];
-            near = if entry > near { entry } else { near };
-            far = if exit < far { exit } else { far };
-        }
-        near <= far * FAR_TOLERANCE
+    fn enter(&self, simd: Baseline, ray: &Self::Origin, node: &WideNode) -> (u32, [f32; CHILDREN]) {
+        self.ray.enter(simd, ray, node)
     }
 
-    /// The order of the hits is that of the hierarchy, whatever the direction.
-    fn is_backwards(&self, _: usize) -> bool {
-        false
+    fn until_m(&self) -> f32 {
+        Traverse::<Baseline>::until_m(&self.ray)
     }
 
-    #[inline(always)]
-    fn intersect(&mut self, origin: Vec3, block: &TriangleBlock, _: u32) {
-        let (hits, range_m) = self.ray.hits(origin, block);
-        for lane in (0..TRIANGLES).filter(|lane| hits >> lane & 1 == 1) {
-            (self.visit)(Hit {
-                range_m: range_m[lane],
-                triangle: block.indices[lane],
-            });
+    fn intersect(&mut self, _: Baseline, ray: &Self::Origin, block: &TriangleBlock, leaf: Leaf) {
+        let (hits, range_m) = self.ray.hits(ray.origin, block);
+        for lane in (0..block.count).filter(|lane| hits >> lane & 1 == 1) {
+            (self.visit)(range_m[lane], Place::new(leaf, lane));
         }
     }
 }
@@ -59,9 +46,8 @@ mod tests {
     use rand::{RngExt as _, SeedableRng as _};
     use rand_chacha::ChaCha8Rng;
 
-    use super::*;
-    use crate::geometry::TriangleMesh;
-    use crate::raycasting::Scene;
+    use crate::geometry::{TriangleMesh, Vec3};
+    use crate::raycasting::{Hit, Scene};
 
     /// Squares across the x axis, one per metre from 1 m on.
     fn sheets(count: usize) -> TriangleMesh {

@@ -4,7 +4,7 @@
 //! Built top-down by the surface area heuristic over binned centroids,
 //!
 //! ```text
-//! cost(split) = area(left) · |left| + area(right) · |right|
+//! cost(split) = area(left) · |left| + area(right) · |right|        |·|: number of leaves, if full
 //! ```
 //!
 //! Wald, *On fast Construction of SAH-based Bounding Volume Hierarchies*, RT 2007. Large subtrees
@@ -13,7 +13,6 @@
 use std::ops::Range;
 
 use glam::Vec4;
-use rayon::prelude::*;
 
 use crate::geometry::Aabb;
 
@@ -72,7 +71,7 @@ pub(crate) struct BvhNode {
 impl BvhNode {
     fn new(bounds: [Box4; 2], children: [NodeRef; 2], axis: usize) -> Self {
         Self {
-            bounds: bounds.map(|b| [b.min.x, b.min.y, b.min.z, b.max.x, b.max.y, b.max.z]),
+            bounds: bounds.map(Box4::to_array),
             children,
             axis: axis as u32,
         }
@@ -85,6 +84,8 @@ pub(crate) struct Bvh {
     pub nodes: Vec<BvhNode>,
     /// `None` without primitives.
     pub root: Option<NodeRef>,
+    /// Box of all primitives: lower corner x, y, z, then upper corner x, y, z.
+    pub bounds: [f32; 6],
 }
 
 impl Bvh {
@@ -95,7 +96,9 @@ impl Bvh {
             return Default::default();
         }
         let leaf_size = leaf_size.max(1);
-        let tree = Subtree::build_parallel(Interval::of_all(&mut prims), leaf_size, 0);
+        let all = Interval::of_all(&mut prims);
+        let bounds = all.bounds.prims.to_array();
+        let tree = Subtree::build_parallel(all, leaf_size, 0);
         let leaves = Leaves {
             ranges: tree.leaves,
             order: prims.iter().map(PrimRef::index).collect(),
@@ -103,6 +106,7 @@ impl Bvh {
         let bvh = Self {
             nodes: tree.nodes,
             root: Some(tree.root),
+            bounds,
         };
         (bvh, leaves)
     }
@@ -115,13 +119,6 @@ pub(crate) struct Leaves {
     pub ranges: Vec<Range<u32>>,
     /// Indices of the primitives, leaf by leaf.
     pub order: Vec<u32>,
-}
-
-impl Leaves {
-    /// The indices of the primitives, leaf by leaf, on all threads of the current pool.
-    pub fn par_iter(&self) -> impl IndexedParallelIterator<Item = &[u32]> {
-        (self.ranges.par_iter()).map(|range| &self.order[range.start as usize..range.end as usize])
-    }
 }
 
 /// A part of the tree that numbers its own nodes and leaves from zero.
@@ -142,7 +139,7 @@ impl Subtree {
             tree.root = tree.build(interval, leaf_size, depth);
             return tree;
         }
-        let (axis, [left, right]) = interval.split(depth);
+        let (axis, [left, right]) = interval.split(leaf_size, depth);
         let bounds = [left.bounds.prims, right.bounds.prims];
         let (left, right) = rayon::join(
             || Self::build_parallel(left, leaf_size, depth + 1),
@@ -159,7 +156,7 @@ impl Subtree {
             self.leaves.push(interval.first as u32..end as u32);
             return NodeRef::leaf(self.leaves.len() - 1);
         }
-        let (axis, sides) = interval.split(depth);
+        let (axis, sides) = interval.split(leaf_size, depth);
         let bounds = [sides[0].bounds.prims, sides[1].bounds.prims];
         let index = self.nodes.len();
         self.nodes
@@ -211,6 +208,11 @@ impl Box4 {
             min: self.min.min(other.min),
             max: self.max.max(other.max),
         }
+    }
+
+    fn to_array(self) -> [f32; 6] {
+        let Self { min, max } = self;
+        [min.x, min.y, min.z, max.x, max.y, max.z]
     }
 
     /// Half the surface area; 0 for the empty box.
@@ -293,9 +295,9 @@ impl<'a> Interval<'a> {
 
     /// Partitions the primitives by the best split; returns its axis and both sides, neither of
     /// which is empty.
-    fn split(self, depth: usize) -> (usize, [Self; 2]) {
+    fn split(self, leaf_size: usize, depth: usize) -> (usize, [Self; 2]) {
         let split = (depth < HALVING_DEPTH)
-            .then(|| Split::best(self.prims, &self.bounds.centroids))
+            .then(|| Split::best(self.prims, &self.bounds.centroids, leaf_size))
             .flatten();
         let (axis, middle, bounds) = match split {
             Some(split) => {
@@ -367,7 +369,7 @@ struct Split {
 
 impl Split {
     /// The split of least cost over all axes; `None` if none has primitives on both sides.
-    fn best(prims: &[PrimRef], centroids: &Box4) -> Option<Self> {
+    fn best(prims: &[PrimRef], centroids: &Box4, leaf_size: usize) -> Option<Self> {
         let mapping = BinMapping::new(centroids, prims.len())?;
         let mut bounds = [[Box4::EMPTY; MAX_BINS]; 3];
         let mut counts = [[0_u32; MAX_BINS]; 3];
@@ -382,7 +384,11 @@ impl Split {
         let used = mapping.last as usize + 1;
         let mut best: Option<(f32, usize, usize)> = None;
         for axis in 0..3 {
-            let costs = split_costs(&bounds[axis][..used], &counts[axis][..used]);
+            let costs = split_costs(
+                &bounds[axis][..used],
+                &counts[axis][..used],
+                leaf_size as u32,
+            );
             for (bin, &cost) in costs[..used - 1].iter().enumerate() {
                 if cost.is_finite() && best.is_none_or(|(least, ..)| cost < least) {
                     best = Some((cost, axis, bin));
@@ -412,20 +418,21 @@ impl Split {
     }
 }
 
-/// area · count on both sides of the split after each bin; infinite if a side is empty.
-fn split_costs(bounds: &[Box4], counts: &[u32]) -> [f32; MAX_BINS] {
+/// area · number of full leaves on both sides of the split after each bin; infinite if a side is empty.
+fn split_costs(bounds: &[Box4], counts: &[u32], leaf_size: u32) -> [f32; MAX_BINS] {
     let mut costs = [0.0; MAX_BINS];
     let bins = bounds.iter().zip(counts);
     let splits = &mut costs[..bounds.len() - 1];
-    add_side_costs(splits.iter_mut().rev(), bins.clone().rev());
-    add_side_costs(splits.iter_mut(), bins);
+    add_side_costs(splits.iter_mut().rev(), bins.clone().rev(), leaf_size);
+    add_side_costs(splits.iter_mut(), bins, leaf_size);
     costs
 }
 
-/// Adds area · count of the bins so far to the cost of each split.
+/// Adds area · number of leaves of the bins so far to the cost of each split.
 fn add_side_costs<'a>(
     costs: impl Iterator<Item = &'a mut f32>,
     bins: impl Iterator<Item = (&'a Box4, &'a u32)>,
+    leaf_size: u32,
 ) {
     let (mut side, mut total) = (Box4::EMPTY, 0);
     for (cost, (bounds, count)) in costs.zip(bins) {
@@ -434,7 +441,7 @@ fn add_side_costs<'a>(
         *cost += if total == 0 {
             f32::INFINITY
         } else {
-            side.half_area() * total as f32
+            side.half_area() * total.div_ceil(leaf_size) as f32
         };
     }
 }

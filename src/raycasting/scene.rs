@@ -5,10 +5,12 @@ mod cast;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-use super::NO_SLOT;
+use super::Hit;
 use super::bvh::{Bvh, PrimRef};
-use super::triangle::{TRIANGLES, TriangleBlock, is_proper};
+use super::leaves::Leaves;
+use super::triangle::{TRIANGLES, is_proper};
 use super::wide::WideBvh;
+use crate::geometry::mesh::STEP_M;
 use crate::geometry::{Aabb, TriangleMesh};
 
 /// Boxes are enlarged by this part of the extent of the scene: more than rounding moves an edge.
@@ -22,23 +24,19 @@ pub struct Scene {
     /// Origin of the boxes of the tiles, in the frame of the scene [m].
     middle: DVec3,
     /// Hierarchy over the tiles.
-    top: Bvh,
-    wide_top: WideBvh,
-    tiles: Vec<TileBvh>,
-    /// One per leaf of each tile.
-    blocks: Vec<TriangleBlock>,
-    /// Slot of each triangle: its block times [`TRIANGLES`] plus its lane; or [`NO_SLOT`].
-    slots: Vec<u32>,
+    top: WideBvh,
+    tiles: Vec<Tile>,
 }
 
-/// Hierarchy over the triangles of a tile.
-#[derive(Clone, Debug, Default)]
-struct TileBvh {
+/// Triangles of a tile under a hierarchy.
+#[derive(Clone, Debug)]
+struct Tile {
+    /// In the frame of the scene.
+    bounds: Aabb,
     /// Origin of its coordinates in the frame of the scene [m].
     middle: DVec3,
-    bvh: Bvh,
-    wide_bvh: WideBvh,
-    first_block: usize,
+    bvh: WideBvh,
+    leaves: Leaves,
 }
 
 impl Scene {
@@ -60,80 +58,59 @@ impl Scene {
                 (mesh, first as u32)
             })
             .collect();
-        let parts: Vec<Part> = numbered
+        let tiles: Vec<Tile> = numbered
             .into_par_iter()
-            .filter_map(|(mesh, first_triangle)| Part::build(mesh, first_triangle))
+            .filter_map(|(mesh, first_triangle)| Tile::build(mesh, first_triangle))
             .collect();
-        Self::join(parts, triangles)
+        Self::join(tiles)
     }
 
-    fn join(mut parts: Vec<Part>, triangles: usize) -> Self {
-        let whole = parts
+    fn join(tiles: Vec<Tile>) -> Self {
+        let whole = tiles
             .iter()
-            .fold(Aabb::EMPTY, |whole, part| whole.union(part.bounds));
+            .fold(Aabb::EMPTY, |whole, tile| whole.union(tile.bounds));
         let middle = if whole.is_empty() {
             Vec3::ZERO
         } else {
             middle_of(&whole)
         };
-        let prims = parts.iter().zip(0..).map(|(part, index)| {
+        let prims = tiles.iter().zip(0..).map(|(tile, index)| {
             let relative = Aabb {
-                min: part.bounds.min - middle,
-                max: part.bounds.max - middle,
+                min: (tile.bounds.min - middle) / STEP_M,
+                max: (tile.bounds.max - middle) / STEP_M,
             };
             padded_prim(relative, &whole, index)
         });
-        let (top, leaves) = Bvh::build(prims.collect(), 1);
-        let mut blocks = Vec::with_capacity(parts.iter().map(|part| part.blocks.len()).sum());
-        let tiles = leaves
-            .order
-            .iter()
-            .map(|&index| {
-                let part = &mut parts[index as usize];
-                part.tile.first_block = blocks.len();
-                blocks.append(&mut part.blocks);
-                std::mem::take(&mut part.tile)
-            })
-            .collect();
+        let (top, of_leaves) = Bvh::build(prims.collect(), 1);
+        let (top, leaves) = WideBvh::of(&top);
+        let mut tiles: Vec<Option<Tile>> = tiles.into_iter().map(Some).collect();
+        let tile_of = |leaf: usize| {
+            let place = of_leaves.ranges[leaf].start as usize;
+            tiles[of_leaves.order[place] as usize].take()
+        };
         Self {
             middle: middle.as_dvec3(),
-            wide_top: WideBvh::of(&top),
             top,
-            tiles,
-            slots: slots_of(&blocks, triangles),
-            blocks,
+            tiles: leaves.into_iter().filter_map(tile_of).collect(),
         }
     }
 
-    /// The unit normal of a triangle by the right-hand rule; `None` if it is never hit.
-    pub fn normal(&self, triangle: u32) -> Option<Vec3> {
-        let slot = *self.slots.get(triangle as usize)?;
-        (slot != NO_SLOT).then(|| {
-            let slot = slot as usize;
-            self.blocks[slot / TRIANGLES].normal(slot % TRIANGLES)
-        })
+    /// The unit normal of the triangle of a hit of this scene by the right-hand rule; `None` if there is none.
+    pub fn normal(&self, hit: &Hit) -> Option<Vec3> {
+        let leaf = hit.place.leaf;
+        let tile = self.tiles.get(leaf.tile as usize)?;
+        let block = tile.leaves.block(leaf.index as usize);
+        Some(block.normal(hit.place.lane as usize))
+    }
+
+    /// Memory of the hierarchies and the triangles [bytes].
+    pub fn bytes(&self) -> usize {
+        let of_tile = |tile: &Tile| tile.bvh.bytes() + tile.leaves.bytes();
+        self.top.bytes() + self.tiles.iter().map(of_tile).sum::<usize>()
     }
 }
 
-fn slots_of(blocks: &[TriangleBlock], triangles: usize) -> Vec<u32> {
-    let mut slots = vec![NO_SLOT; triangles];
-    for (number, block) in blocks.iter().enumerate() {
-        for lane in (0..TRIANGLES).filter(|&lane| block.has(lane)) {
-            slots[block.indices[lane] as usize] = (number * TRIANGLES + lane) as u32;
-        }
-    }
-    slots
-}
-
-/// A tile while the scene is built.
-struct Part {
-    /// In the frame of the scene.
-    bounds: Aabb,
-    tile: TileBvh,
-    blocks: Vec<TriangleBlock>,
-}
-
-impl Part {
+impl Tile {
     /// `None` if no triangle of the mesh can be hit.
     fn build(mesh: &TriangleMesh, first_triangle: u32) -> Option<Self> {
         let usable: Vec<u32> = (0..mesh.triangles.len())
@@ -147,37 +124,39 @@ impl Part {
             return None;
         }
         let middle = middle_of(&bounds);
-        let local = |triangle: u32| corners(triangle).map(|corner| corner - middle);
+        let local = |triangle: u32| corners(triangle).map(|corner| (corner - middle) / STEP_M);
         let prims = usable
             .into_par_iter()
             .map(|triangle| padded_prim(Aabb::of(local(triangle)), &bounds, triangle));
-        let (bvh, leaves) = Bvh::build(prims.collect(), TRIANGLES);
-        let block =
-            |leaf: &[u32]| TriangleBlock::new(leaf.iter().map(|&t| (local(t), first_triangle + t)));
-        let (blocks, wide_bvh) = rayon::join(
-            || leaves.par_iter().map(block).collect(),
-            || WideBvh::of(&bvh),
-        );
+        let (bvh, of_leaves) = Bvh::build(prims.collect(), TRIANGLES);
+        let (bvh, order) = WideBvh::of(&bvh);
+        let mut leaves = Leaves::default();
+        for leaf in order {
+            let range = &of_leaves.ranges[leaf];
+            let triangles = &of_leaves.order[range.start as usize..range.end as usize];
+            let of_leaf: Vec<([Vec3; 3], u32)> = (triangles.iter())
+                .map(|&triangle| (local(triangle), first_triangle + triangle))
+                .collect();
+            leaves.push(&of_leaf);
+        }
+        leaves.shrink_to_fit();
         Some(Self {
             bounds,
-            tile: TileBvh {
-                middle: middle.as_dvec3(),
-                bvh,
-                wide_bvh,
-                first_block: 0,
-            },
-            blocks,
+            middle: middle.as_dvec3(),
+            bvh,
+            leaves,
         })
     }
 }
 
+/// The middle of a box, on the lattice of maps.
 fn middle_of(bounds: &Aabb) -> Vec3 {
-    bounds.min.midpoint(bounds.max)
+    (bounds.min.midpoint(bounds.max) / STEP_M).round() * STEP_M
 }
 
-/// A primitive whose box is enlarged by the rounding errors in a scene of this size.
+/// A primitive whose box [steps] is enlarged by the rounding errors in a scene of this size.
 fn padded_prim(bounds: Aabb, whole: &Aabb, index: u32) -> PrimRef {
-    let padding = Vec3::splat(PADDING * whole.size().max_element());
+    let padding = Vec3::splat(PADDING * whole.size().max_element() / STEP_M);
     let padded = Aabb {
         min: bounds.min - padding,
         max: bounds.max + padding,

@@ -41,6 +41,7 @@ pub(super) trait Simd: Copy {
 
     fn load(self, numbers: [f32; WIDTH]) -> Self::F32x8;
     fn splat(self, number: f32) -> Self::F32x8;
+    fn whole(self, numbers: [u16; WIDTH]) -> Self::F32x8;
 }
 
 /// Work that is compiled for each instruction set. All that it calls must be `inline(always)`.
@@ -113,6 +114,10 @@ impl Simd for Baseline {
     #[inline(always)]
     fn splat(self, number: f32) -> Vec4Pair {
         Vec4Pair(Vec4::splat(number), Vec4::splat(number))
+    }
+    #[inline(always)]
+    fn whole(self, numbers: [u16; WIDTH]) -> Vec4Pair {
+        self.load(numbers.map(f32::from))
     }
 }
 
@@ -210,6 +215,13 @@ mod avx2 {
         #[inline(always)]
         fn splat(self, number: f32) -> F32x8 {
             self.load([number; WIDTH])
+        }
+        #[inline(always)]
+        fn whole(self, numbers: [u16; WIDTH]) -> F32x8 {
+            let numbers = bytemuck::cast(numbers);
+            // SAFETY: `self` proves that the CPU has AVX2.
+            let lanes = unsafe { _mm256_cvtepi32_ps(_mm256_cvtepu16_epi32(numbers)) };
+            F32x8(lanes, self)
         }
     }
 

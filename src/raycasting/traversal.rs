@@ -1,80 +1,223 @@
-//! Depth-first traversal of a binary hierarchy by rays that stay together.
+//! Depth-first traversal of a wide hierarchy by one or more rays, near children first.
 
 use glam::DVec3;
 
-use super::bvh::{Bvh, MAX_DEPTH, NodeRef};
-use super::triangle::TriangleBlock;
+use super::bvh::{MAX_DEPTH, NodeRef};
+use super::simd::{Lanes, Simd};
+use super::triangle::{TriangleBlock, Vectors};
+use super::wide::{BoxGrid, CHILDREN, WideBvh, WideNode};
+use crate::geometry::Vec3;
 
 /// Rounding of the slab test, see Ize, *Robust BVH Ray Traversal*, JCGT 2013.
 pub(super) const FAR_TOLERANCE: f32 = 1.0 + 8.0 * f32::EPSILON;
 /// Largest inverse of a coordinate of a direction, so that 0 · ∞ does not occur.
 const MAX_INVERSE: f32 = 1e18;
 
+/// Most nodes on the stack: all but one child of each node on the way down.
+const MAX_STACK: usize = (CHILDREN - 1) * MAX_DEPTH + CHILDREN;
+
 /// One or more rays that traverse a hierarchy together.
-pub(super) trait Traverse {
-    /// Origin of the rays in the frame of a hierarchy.
-    type Origin: Copy;
+pub(super) trait Traverse<S: Simd> {
+    /// The rays in the frame of a hierarchy.
+    type Origin;
 
-    /// The origin relative to that of a hierarchy.
-    fn relative_to(&self, middle: DVec3) -> Self::Origin;
+    /// The rays relative to the origin of a hierarchy with a grid.
+    fn relative_to(&self, simd: S, middle: DVec3, grid: &BoxGrid) -> Self::Origin;
 
-    /// Whether any ray enters a box before its nearest hit. `COHERENT` promises that all rays
-    /// have the signs of the first one.
-    fn enters<const COHERENT: bool>(&self, origin: Self::Origin, bounds: &[f32; 6]) -> bool;
+    /// The children of a node that the rays may enter before their nearest hits: a bit mask, and the ranges at
+    /// which they enter them, or lower [m].
+    fn enter(&self, simd: S, origin: &Self::Origin, node: &WideNode) -> (u32, [f32; CHILDREN]);
 
-    /// Whether the second child of a node that is split along an axis comes first.
-    fn is_backwards(&self, axis: usize) -> bool;
+    /// Nodes that are entered farther away are of no interest [m].
+    fn until_m(&self) -> f32;
 
-    /// Intersects the triangles of a leaf; `first_slot` is the slot of its first triangle.
-    fn intersect(&mut self, origin: Self::Origin, block: &TriangleBlock, first_slot: u32);
+    /// Intersects the triangles of a leaf of a tile.
+    fn intersect(&mut self, simd: S, origin: &Self::Origin, block: &TriangleBlock, leaf: Leaf);
 }
 
-/// The leaves that rays enter, near ones first.
-pub(super) struct Traversal<'a, R: Traverse, const COHERENT: bool> {
-    bvh: &'a Bvh,
-    origin: R::Origin,
-    stack: [NodeRef; MAX_DEPTH],
+/// A leaf among all.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Leaf {
+    pub tile: u32,
+    pub index: u32,
+}
+
+impl Leaf {
+    /// No leaf.
+    pub const NONE: Self = Self {
+        tile: u32::MAX,
+        index: u32::MAX,
+    };
+}
+
+/// Ranges at which rays enter or leave boxes, from the bounds of the boxes in steps: per axis, a factor and a
+/// summand [m].
+#[derive(Clone, Copy)]
+pub(super) struct Slope<L> {
+    factor: Vectors<L>,
+    summand: Vectors<L>,
+}
+
+impl<L: Lanes> Slope<L> {
+    /// Of an origin, and of the inverses of the coordinates of a direction.
+    #[inline(always)]
+    pub fn new<S: Simd<F32x8 = L>>(
+        simd: S,
+        grid: &BoxGrid,
+        origin: Vec3,
+        inverse: &[f32; 3],
+    ) -> Self {
+        let factor = |axis: usize| simd.splat(grid.cells[axis] * inverse[axis]);
+        let summand = |axis: usize| simd.splat((grid.origin[axis] - origin[axis]) * inverse[axis]);
+        Self {
+            factor: [factor(0), factor(1), factor(2)],
+            summand: [summand(0), summand(1), summand(2)],
+        }
+    }
+}
+
+/// The children of a node between whose entry and exit there is a range from `from_m` to `until_m`: a bit mask, and
+/// the ranges of entry [m].
+#[inline(always)]
+pub(super) fn enter<S: Simd>(
+    simd: S,
+    node: &WideNode,
+    sides: &[[usize; 2]; 3],
+    [entry, exit]: [&Slope<S::F32x8>; 2],
+    [from_m, until_m]: [f32; 2],
+) -> (u32, [f32; CHILDREN]) {
+    let (mut near, mut far) = (simd.splat(from_m), simd.splat(until_m));
+    for (axis, [first, last]) in sides.iter().enumerate() {
+        let at = |slope: &Slope<S::F32x8>, side: usize| {
+            simd.whole(node.bounds[side]) * slope.factor[axis] + slope.summand[axis]
+        };
+        near = near.max(at(entry, *first));
+        far = far.min(at(exit, *last));
+    }
+    let entered = near.le(far * FAR_TOLERANCE) & node.mask();
+    (entered, near.to_array())
+}
+
+/// A node that rays enter, to be visited later.
+#[derive(Clone, Copy)]
+struct Pending {
+    node: NodeRef,
+    /// Range at which they enter it [m].
+    near_m: f32,
+}
+
+/// Memory of a traversal, to be used again.
+pub(super) struct Stack {
+    pending: [Pending; MAX_STACK],
     count: usize,
 }
 
-impl<'a, R: Traverse, const COHERENT: bool> Traversal<'a, R, COHERENT> {
+impl Stack {
+    const ROOT: Pending = Pending {
+        node: NodeRef::inner(0),
+        near_m: 0.0,
+    };
+
+    pub fn new() -> Self {
+        Self {
+            pending: [Self::ROOT; MAX_STACK],
+            count: 0,
+        }
+    }
+
+    /// The next node that is entered before a range.
+    #[inline(always)]
+    fn pop(&mut self, until_m: f32) -> Option<NodeRef> {
+        while self.count > 0 {
+            self.count -= 1;
+            let next = self.pending[self.count];
+            if next.near_m <= until_m * FAR_TOLERANCE {
+                return Some(next.node);
+            }
+        }
+        None
+    }
+
+    /// Inserts a node below the nearer ones of those from `first` on.
+    #[inline(always)]
+    fn insert(&mut self, new: Pending, first: usize) {
+        let mut place = self.count;
+        self.pending[place] = new;
+        self.count += 1;
+        while place > first && self.pending[place - 1].near_m < new.near_m {
+            self.pending[place] = self.pending[place - 1];
+            place -= 1;
+        }
+        self.pending[place] = new;
+    }
+}
+
+/// The leaves that rays enter, near ones first.
+pub(super) struct Traversal<'a, S: Simd, R: Traverse<S>> {
+    simd: S,
+    bvh: &'a WideBvh,
+    origin: &'a R::Origin,
+    stack: &'a mut Stack,
+}
+
+impl<'a, S: Simd, R: Traverse<S>> Traversal<'a, S, R> {
     /// Starts at the root; `origin` is relative to that of the hierarchy.
     #[inline(always)]
-    pub fn new(bvh: &'a Bvh, origin: R::Origin) -> Self {
+    pub fn new(simd: S, bvh: &'a WideBvh, origin: &'a R::Origin, stack: &'a mut Stack) -> Self {
+        stack.pending[0] = Stack::ROOT;
+        stack.count = usize::from(!bvh.nodes.is_empty());
         Self {
+            simd,
             bvh,
             origin,
-            stack: [bvh.root.unwrap_or(NodeRef::leaf(0)); MAX_DEPTH],
-            count: usize::from(bvh.root.is_some()),
+            stack,
         }
     }
 
     /// The next leaf that any of the rays enters before its nearest hit.
     #[inline(always)]
     pub fn next_leaf(&mut self, rays: &R) -> Option<usize> {
-        while self.count > 0 {
-            self.count -= 1;
-            let mut current = self.stack[self.count];
+        while let Some(mut current) = self.stack.pop(rays.until_m()) {
             loop {
                 if current.is_leaf() {
                     return Some(current.index());
                 }
-                let node = &self.bvh.nodes[current.index()];
-                let near = usize::from(rays.is_backwards(node.axis as usize));
-                let enters_near = rays.enters::<COHERENT>(self.origin, &node.bounds[near]);
-                let enters_far = rays.enters::<COHERENT>(self.origin, &node.bounds[1 - near]);
-                if enters_near & enters_far {
-                    self.stack[self.count] = node.children[1 - near];
-                    self.count += 1;
-                }
-                if enters_near | enters_far {
-                    current = node.children[if enters_near { near } else { 1 - near }];
-                } else {
+                let Some(nearest) = self.open(rays, current.index()) else {
                     break;
-                }
+                };
+                current = nearest;
             }
         }
         None
+    }
+
+    /// The nearest child that the rays enter; the others go onto the stack.
+    #[inline(always)]
+    fn open(&mut self, rays: &R, index: usize) -> Option<NodeRef> {
+        let node = &self.bvh.nodes[index];
+        let (mut entered, near_m) = rays.enter(self.simd, self.origin, node);
+        if entered == 0 {
+            return None;
+        }
+        let mut nearest = entered.trailing_zeros() as usize % CHILDREN;
+        entered &= entered - 1;
+        if entered == 0 {
+            return Some(node.child(nearest));
+        }
+        let first = self.stack.count;
+        while entered != 0 {
+            let mut other = entered.trailing_zeros() as usize % CHILDREN;
+            entered &= entered - 1;
+            if near_m[other] < near_m[nearest] {
+                std::mem::swap(&mut other, &mut nearest);
+            }
+            let other = Pending {
+                node: node.child(other),
+                near_m: near_m[other],
+            };
+            self.stack.insert(other, first);
+        }
+        Some(node.child(nearest))
     }
 }
 

@@ -14,7 +14,6 @@
 
 use glam::Vec4;
 
-use super::Hit;
 use super::simd::{Lanes, Simd};
 use crate::geometry::Vec3;
 
@@ -38,40 +37,16 @@ pub(crate) fn is_proper(corners: [Vec3; 3]) -> bool {
     twice_area.is_finite() && twice_area > THINNEST * longest_squared
 }
 
-/// The triangles of a leaf in lanes, and their indices: 160 bytes.
+/// The triangles of a leaf in lanes.
 #[derive(Clone, Copy, Debug)]
-#[repr(C, align(32))]
 pub(super) struct TriangleBlock {
-    /// Corners A, B, C.
+    /// Corners A, B, C; those of the last triangle in empty lanes.
     pub corners: [Vectors<Vec4>; 3],
-    /// In the mesh.
-    pub indices: [u32; TRIANGLES],
+    /// Number of triangles.
+    pub count: usize,
 }
 
 impl TriangleBlock {
-    /// Corners and indices of up to [`TRIANGLES`] triangles.
-    pub fn new(triangles: impl IntoIterator<Item = ([Vec3; 3], u32)>) -> Self {
-        let mut block = Self {
-            corners: [[Vec4::NAN; 3]; 3],
-            indices: [Hit::NO_TRIANGLE; TRIANGLES],
-        };
-        for (lane, (corners, index)) in triangles.into_iter().enumerate() {
-            for (corner, position) in corners.into_iter().enumerate() {
-                for axis in 0..3 {
-                    block.corners[corner][axis][lane] = position[axis];
-                }
-            }
-            block.indices[lane] = index;
-        }
-        block
-    }
-
-    /// Whether there is a triangle in this lane; all lanes after an empty one are empty.
-    #[inline(always)]
-    pub fn has(&self, lane: usize) -> bool {
-        self.indices[lane] != Hit::NO_TRIANGLE
-    }
-
     /// The unit normal of a triangle by the right-hand rule.
     pub fn normal(&self, lane: usize) -> Vec3 {
         let [a, b, c] = self

@@ -1,9 +1,12 @@
-//! Wide bounding volume hierarchy: one ray against the boxes of eight children at once.
+//! Wide bounding volume hierarchy: rays against the boxes of up to eight children at once.
 //!
 //! Made from the binary hierarchy: of the children of a node the one with the largest surface is
 //! replaced by its own two, until there are eight. After Wald, Benthin and Boulos,
 //! *Getting Rid of Packets: Efficient SIMD Single-Ray Traversal using Multi-branching BVHs*,
 //! RT 2008.
+//!
+//! The boxes of the children are stored in 65,535 steps per axis over the box of the whole
+//! hierarchy, rounded outwards, and the children of one kind lie one after the other: 108 bytes.
 
 use super::bvh::{Bvh, NodeRef};
 use super::simd::WIDTH;
@@ -13,51 +16,150 @@ pub(super) const CHILDREN: usize = WIDTH;
 /// Lower corner x, y, z, then upper corner x, y, z.
 type Bounds = [f32; 6];
 
-/// Eight children and their boxes.
-#[derive(Clone, Copy, Debug)]
+/// Up to eight children and their boxes.
+#[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(64))]
 pub(super) struct WideNode {
-    /// Lower x of each child, lower y, …, upper z.
-    pub bounds: [[f32; CHILDREN]; 6],
-    /// An inverted box marks an absent child.
-    pub children: [NodeRef; CHILDREN],
+    /// Lower x of each child, lower y, …, upper z, in steps of the [`BoxGrid`].
+    pub bounds: [[u16; CHILDREN]; 6],
+    first_inner: u32,
+    first_leaf: u32,
+    /// Number of inner children, which are the first ones.
+    inner: u8,
+    /// Number of all.
+    children: u8,
+}
+
+impl WideNode {
+    /// Bit mask of the children.
+    #[inline(always)]
+    pub fn mask(&self) -> u32 {
+        (1 << self.children) - 1
+    }
+
+    #[inline(always)]
+    pub fn child(&self, place: usize) -> NodeRef {
+        let inner = usize::from(self.inner);
+        match place < inner {
+            true => NodeRef::inner(self.first_inner as usize + place),
+            false => NodeRef::leaf(self.first_leaf as usize + place - inner),
+        }
+    }
+}
+
+/// Grid of the boxes of a hierarchy.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct BoxGrid {
+    /// Where a bound of zero lies [steps of the lattice].
+    pub origin: [f32; 3],
+    /// Powers of two [steps of the lattice].
+    pub cells: [f32; 3],
+}
+
+impl BoxGrid {
+    /// Steps that the boxes take up at most; the rest is for rounding.
+    const STEPS: f64 = 65_500.0;
+
+    /// A grid over a box.
+    fn over(bounds: &Bounds) -> Self {
+        let mut grid = Self::default();
+        for axis in 0..3 {
+            let [min, max] = [bounds[axis], bounds[axis + 3]].map(f64::from);
+            let step_m = ((max - min) / Self::STEPS).max(1e-30).log2().ceil().exp2();
+            grid.cells[axis] = step_m as f32;
+            grid.origin[axis] = (min - 2.0 * step_m) as f32;
+        }
+        grid
+    }
+
+    /// A bound in steps, rounded outwards.
+    fn steps(&self, side: usize, bound: f32) -> u16 {
+        /// Boxes are enlarged by this part of a step: more than rounding moves a side.
+        const SLACK: f64 = 0.05;
+        let axis = side % 3;
+        let steps = (f64::from(bound) - f64::from(self.origin[axis])) / f64::from(self.cells[axis]);
+        match side < 3 {
+            true => (steps - SLACK).floor() as u16,
+            false => (steps + SLACK).ceil() as u16,
+        }
+    }
+
+    /// The box of a child of a node.
+    #[inline(always)]
+    pub fn bounds_of(&self, node: &WideNode, place: usize) -> Bounds {
+        let bound = |side: usize| {
+            let axis = side % 3;
+            f32::from(node.bounds[side][place]) * self.cells[axis] + self.origin[axis]
+        };
+        [bound(0), bound(1), bound(2), bound(3), bound(4), bound(5)]
+    }
 }
 
 /// The hierarchy; its root is the first node.
 #[derive(Clone, Debug, Default)]
 pub(super) struct WideBvh {
+    pub grid: BoxGrid,
     pub nodes: Vec<WideNode>,
 }
 
 impl WideBvh {
-    /// The hierarchy of the same leaves with fewer nodes.
-    pub fn of(bvh: &Bvh) -> Self {
-        let mut wide = Self::default();
-        match bvh.root {
-            Some(root) if root.is_leaf() => {
-                let everywhere = [[f32::NEG_INFINITY; 3], [f32::INFINITY; 3]];
-                wide.nodes.push(node(&[(bounds_of(everywhere), root)]));
-            }
-            Some(root) => {
-                wide.add(bvh, root);
-            }
-            None => {}
+    /// The hierarchy of the same leaves with fewer nodes, and the leaves in its order.
+    pub fn of(bvh: &Bvh) -> (Self, Vec<usize>) {
+        let mut leaves = Vec::new();
+        let mut wide = Self {
+            grid: BoxGrid::over(&bvh.bounds),
+            nodes: Vec::new(),
+        };
+        if let Some(root) = bvh.root {
+            wide.nodes.push(WideNode::default());
+            let children = match root.is_leaf() {
+                true => vec![(bvh.bounds, root)],
+                false => descendants(bvh, root),
+            };
+            wide.set(0, bvh, children, &mut leaves);
         }
-        wide
+        wide.nodes.shrink_to_fit();
+        (wide, leaves)
     }
 
-    /// Adds an inner node of the binary hierarchy and all below it.
-    fn add(&mut self, bvh: &Bvh, inner: NodeRef) -> NodeRef {
-        let mut children = descendants(bvh, inner);
-        let index = self.nodes.len();
-        self.nodes.push(node(&[]));
-        for (_, child) in &mut children {
-            if !child.is_leaf() {
-                *child = self.add(bvh, *child);
+    /// Memory [bytes].
+    pub fn bytes(&self) -> usize {
+        size_of_val(&*self.nodes)
+    }
+
+    /// Sets a node, and adds all below it.
+    fn set(
+        &mut self,
+        index: usize,
+        bvh: &Bvh,
+        mut children: Vec<(Bounds, NodeRef)>,
+        leaves: &mut Vec<usize>,
+    ) {
+        children.sort_by_key(|(_, child)| child.is_leaf());
+        let inner = children
+            .iter()
+            .filter(|(_, child)| !child.is_leaf())
+            .count();
+        let first_inner = self.nodes.len();
+        let node = &mut self.nodes[index];
+        *node = WideNode {
+            first_inner: first_inner as u32,
+            first_leaf: leaves.len() as u32,
+            inner: inner as u8,
+            children: children.len() as u8,
+            ..WideNode::default()
+        };
+        for (place, (bounds, _)) in children.iter().enumerate() {
+            for (side, &bound) in bounds.iter().enumerate() {
+                node.bounds[side][place] = self.grid.steps(side, bound);
             }
         }
-        self.nodes[index] = node(&children);
-        NodeRef::inner(index)
+        leaves.extend(children[inner..].iter().map(|(_, leaf)| leaf.index()));
+        self.nodes
+            .resize_with(first_inner + inner, WideNode::default);
+        for (place, (_, child)) in children[..inner].iter().enumerate() {
+            self.set(first_inner + place, bvh, descendants(bvh, *child), leaves);
+        }
     }
 }
 
@@ -81,26 +183,59 @@ fn descendants(bvh: &Bvh, inner: NodeRef) -> Vec<(Bounds, NodeRef)> {
     found
 }
 
-fn node(children: &[(Bounds, NodeRef)]) -> WideNode {
-    let inverted = bounds_of([[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]]);
-    let mut node = WideNode {
-        bounds: inverted.map(|side| [side; CHILDREN]),
-        children: [NodeRef::leaf(0); CHILDREN],
-    };
-    for (place, (bounds, child)) in children.iter().enumerate() {
-        for (side, bound) in bounds.iter().enumerate() {
-            node.bounds[side][place] = *bound;
-        }
-        node.children[place] = *child;
-    }
-    node
-}
-
-fn bounds_of([[a, b, c], [d, e, f]]: [[f32; 3]; 2]) -> Bounds {
-    [a, b, c, d, e, f]
-}
-
 fn half_area(bounds: &Bounds) -> f32 {
     let [x, y, z] = [0, 1, 2].map(|axis| bounds[axis + 3] - bounds[axis]);
     x * y + y * z + z * x
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+
+    use super::super::bvh::PrimRef;
+    use super::*;
+    use crate::geometry::Aabb;
+
+    #[test]
+    fn every_leaf_has_one_place_and_lies_in_its_box() {
+        let boxes: Vec<Aabb> = (0..500_u16)
+            .map(|number| {
+                let along = |step: f32| 9e4 * (f32::from(number) * step).fract();
+                let min = Vec3::new(along(0.618), along(0.755), 0.01 * along(0.57));
+                let size = Vec3::new(70.0, 1e-3 * f32::from(number), 0.0);
+                Aabb {
+                    min,
+                    max: min + size,
+                }
+            })
+            .collect();
+        let prims = boxes
+            .iter()
+            .zip(0..)
+            .map(|(bounds, index)| PrimRef::new(*bounds, index));
+        let (bvh, of_leaves) = Bvh::build(prims.collect(), 1);
+        let (wide, order) = WideBvh::of(&bvh);
+        let mut found = vec![0; boxes.len()];
+        for node in &wide.nodes {
+            for place in 0..usize::from(node.children) {
+                let child = node.child(place);
+                if !child.is_leaf() {
+                    continue;
+                }
+                let prim = of_leaves.order[order[child.index()]] as usize;
+                found[prim] += 1;
+                let [a, b, c, d, e, f] = wide.grid.bounds_of(node, place);
+                let Aabb { min, max } = boxes[prim];
+                assert!(Vec3::new(a, b, c).cmple(min).all() && max.cmple(Vec3::new(d, e, f)).all());
+                // Two steps of the grid on either side.
+                let cells = Vec3::from_array(wide.grid.cells);
+                assert!(
+                    (Vec3::new(d, e, f) - Vec3::new(a, b, c))
+                        .cmple(max - min + 4.0 * cells)
+                        .all()
+                );
+            }
+        }
+        assert!(found.iter().all(|&count| count == 1));
+    }
 }

@@ -295,7 +295,7 @@ impl RangeRenderer for CpuRenderer {
         let rotation = rotation_of(map_from_lidar);
         let mut surfaces = vec![None; directions.len()];
         for (&ray, hit) in beams.order.iter().zip(pieces.into_iter().flatten()) {
-            surfaces[ray as usize] = self.scene.normal(hit.triangle).map(|normal| SurfaceHit {
+            surfaces[ray as usize] = self.scene.normal(&hit).map(|normal| SurfaceHit {
                 range_m: hit.range_m,
                 normal_in_map: facing(normal, rotation * directions[ray as usize]),
             });

@@ -246,7 +246,7 @@ fn best_camera(scene: &Scene, seen: &[Vec3], path: &[Vec3], is_one_sided: bool) 
             let mut is_visible = true;
             let until_m = ray.length() - ABOVE_GROUND_M;
             scene.for_each_hit(camera.eye, direction, until_m, |hit| {
-                let normal = scene.normal(hit.triangle);
+                let normal = scene.normal(&hit);
                 is_visible &= is_one_sided && normal.is_some_and(|it| it.dot(direction) > 0.0);
             });
             is_visible
@@ -347,7 +347,7 @@ impl Front {
 
     /// The surface at a hit; `None` for a miss.
     fn surface(&self, eye: Vec3, direction: Vec3, hit: &Hit) -> Option<Surface> {
-        let face = self.scene.normal(hit.triangle)?;
+        let face = self.scene.normal(hit)?;
         let triangle = hit.triangle as usize;
         let point = eye + hit.range_m * direction;
         let [a, b, c] = self.mesh.corners(triangle);

@@ -5,11 +5,10 @@ use glam::{DVec3, Vec3};
 use super::Scene;
 use crate::raycasting::all_hits::AllHits;
 use crate::raycasting::packet::{Origin, Packet};
-use crate::raycasting::simd::{Simd, SimdTask, dispatch};
-use crate::raycasting::single::{SingleRay, Stack, WideTraversal};
-use crate::raycasting::traversal::{Traversal, Traverse};
-use crate::raycasting::triangle::TRIANGLES;
-use crate::raycasting::{Hit, NO_SLOT, RAYS, Reach};
+use crate::raycasting::simd::{Baseline, Simd, SimdTask, dispatch};
+use crate::raycasting::single::SingleRay;
+use crate::raycasting::traversal::{Leaf, Stack, Traversal, Traverse};
+use crate::raycasting::{Hit, Place, RAYS, Reach};
 
 impl Scene {
     /// Casts rays from one origin along unit directions, all in the frame of the mesh, and writes
@@ -98,13 +97,11 @@ impl Scene {
         origin: Vec3,
         direction: Vec3,
         until_m: f32,
-        visit: impl FnMut(Hit),
+        mut visit: impl FnMut(Hit),
     ) {
-        self.traverse::<_, true>(&mut AllHits {
-            origin: origin.as_dvec3(),
-            ray: SingleRay::new(direction, Reach::until(until_m)),
-            visit,
-        });
+        let ray = SingleRay::new(origin.as_dvec3(), direction, Reach::until(until_m));
+        let visit = |range_m, place| visit(self.hit(range_m, place));
+        self.traverse(Baseline, &mut AllHits { ray, visit }, &mut stacks());
     }
 
     pub(in crate::raycasting) fn task<'a, O, D, R>(
@@ -126,60 +123,68 @@ impl Scene {
     }
 
     #[inline(always)]
-    fn cast_packet<S: Simd, O: Origin<S>>(&self, packet: &mut Packet<S, O>) {
-        if packet.is_coherent {
-            self.traverse::<_, true>(packet);
-        } else {
-            self.traverse::<_, false>(packet);
-        }
-    }
-
-    #[inline(always)]
-    fn traverse<R: Traverse, const COHERENT: bool>(&self, rays: &mut R) {
-        let origin = rays.relative_to(self.middle);
-        let mut tiles = Traversal::<R, COHERENT>::new(&self.top, origin);
-        while let Some(tile) = tiles.next_leaf(rays) {
-            let tile = &self.tiles[tile];
-            let origin = rays.relative_to(tile.middle);
-            let mut leaves = Traversal::<R, COHERENT>::new(&tile.bvh, origin);
-            while let Some(leaf) = leaves.next_leaf(rays) {
-                let block = tile.first_block + leaf;
-                rays.intersect(origin, &self.blocks[block], (block * TRIANGLES) as u32);
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn cast_ray<S: Simd>(
+    fn traverse<S: Simd, R: Traverse<S>>(
         &self,
         simd: S,
-        origin: DVec3,
-        ray: &mut SingleRay,
+        rays: &mut R,
         [top_stack, tile_stack]: &mut [Stack; 2],
     ) {
-        let from_middle = (origin - self.middle).as_vec3();
-        let mut tiles = WideTraversal::new(simd, ray, &self.wide_top, from_middle, top_stack);
-        while let Some(tile) = tiles.next_leaf(ray) {
-            let tile = &self.tiles[tile];
-            let origin = (origin - tile.middle).as_vec3();
-            let mut leaves = WideTraversal::new(simd, ray, &tile.wide_bvh, origin, tile_stack);
-            while let Some(leaf) = leaves.next_leaf(ray) {
-                ray.intersect(origin, &self.blocks[tile.first_block + leaf]);
+        let relative = rays.relative_to(simd, self.middle, &self.top.grid);
+        let mut tiles = Traversal::new(simd, &self.top, &relative, top_stack);
+        while let Some(number) = tiles.next_leaf(rays) {
+            let tile = &self.tiles[number];
+            let relative = rays.relative_to(simd, tile.middle, &tile.bvh.grid);
+            let mut leaves = Traversal::new(simd, &tile.bvh, &relative, tile_stack);
+            while let Some(index) = leaves.next_leaf(rays) {
+                let leaf = Leaf {
+                    tile: number as u32,
+                    index: index as u32,
+                };
+                rays.intersect(simd, &relative, &tile.leaves.block(index), leaf);
             }
         }
     }
 
+    /// Nearest hits of rays that are neighbours: together if their directions have the same signs.
     #[inline(always)]
-    fn hit(&self, range_m: f32, slot: u32) -> Hit {
-        if slot == NO_SLOT {
+    fn cast_packet<S: Simd, O: Origin<S>>(
+        &self,
+        simd: S,
+        origin: &O,
+        directions: &[Vec3; RAYS],
+        reaches: &[Reach; RAYS],
+        stacks: &mut [Stack; 2],
+    ) -> ([f32; RAYS], [Place; RAYS]) {
+        if let Some(mut packet) = Packet::new(simd, origin, directions, reaches) {
+            self.traverse(simd, &mut packet, stacks);
+            return (packet.range_m, packet.place);
+        }
+        let (mut range_m, mut place) = ([f32::INFINITY; RAYS], [Place::NONE; RAYS]);
+        for ray in 0..RAYS {
+            let mut single = SingleRay::new(origin.of_ray(ray), directions[ray], reaches[ray]);
+            self.traverse(simd, &mut single, stacks);
+            (range_m[ray], place[ray]) = (single.range_m, single.place);
+        }
+        (range_m, place)
+    }
+
+    #[inline(always)]
+    fn hit(&self, range_m: f32, place: Place) -> Hit {
+        if place == Place::NONE {
             return Hit::MISS;
         }
-        let slot = slot as usize;
+        let leaves = &self.tiles[place.leaf.tile as usize].leaves;
         Hit {
             range_m,
-            triangle: self.blocks[slot / TRIANGLES].indices[slot % TRIANGLES],
+            triangle: leaves.index(place.leaf.index as usize, place.lane as usize),
+            place,
         }
     }
+}
+
+/// Memory of the traversals of the hierarchy over the tiles and of that of a tile.
+fn stacks() -> [Stack; 2] {
+    [Stack::new(), Stack::new()]
 }
 
 /// Rays to cast, and where their results go.
@@ -195,19 +200,20 @@ pub(in crate::raycasting) struct CastTask<'a, O, D, R> {
 impl SimdTask for CastTask<'_, DVec3, Vec3, Hit> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
+        let mut stacks = stacks();
         let chunks = self.directions.chunks(RAYS).zip(self.reaches.chunks(RAYS));
         for ((directions, reaches), hits) in chunks.zip(self.results.chunks_mut(RAYS)) {
             // The last ray fills the empty places.
             let last = directions.len() - 1;
-            let mut packet = Packet::new(
+            let (range_m, place) = self.scene.cast_packet(
                 simd,
                 &self.origin,
                 &std::array::from_fn(|ray| directions[ray.min(last)]),
                 &std::array::from_fn(|ray| reaches[ray.min(last)]),
+                &mut stacks,
             );
-            self.scene.cast_packet(&mut packet);
             for (ray, hit) in hits.iter_mut().enumerate() {
-                *hit = self.scene.hit(packet.range_m[ray], packet.slot[ray]);
+                *hit = self.scene.hit(range_m[ray], place[ray]);
             }
         }
     }
@@ -217,11 +223,12 @@ impl SimdTask for CastTask<'_, DVec3, Vec3, Hit> {
 impl SimdTask for CastTask<'_, [DVec3; RAYS], [Vec3; RAYS], [f32; RAYS]> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
+        let mut stacks = stacks();
         let bundles = self.directions.iter().zip(self.reaches);
         for ((directions, &reach), ranges_m) in bundles.zip(self.results) {
-            let mut packet = Packet::new(simd, &self.origin, directions, &[reach; RAYS]);
-            self.scene.cast_packet(&mut packet);
-            *ranges_m = packet.range_m;
+            let reaches = [reach; RAYS];
+            (*ranges_m, _) =
+                (self.scene).cast_packet(simd, &self.origin, directions, &reaches, &mut stacks);
         }
     }
 }
@@ -230,16 +237,16 @@ impl SimdTask for CastTask<'_, [DVec3; RAYS], [Vec3; RAYS], [f32; RAYS]> {
 impl SimdTask for CastTask<'_, DVec3, Vec3, f32> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let mut stacks = [Stack::new(), Stack::new()];
+        let mut stacks = stacks();
         let rays = self.directions.iter().zip(self.reaches);
         for ((&direction, &reach), range_m) in rays.zip(self.results) {
-            let mut ray = SingleRay::new(direction, reach);
+            let mut ray = SingleRay::new(self.origin, direction, reach);
             if reach.is_window {
                 ray = ray.between(reach.enough_m, reach.until_m);
             }
             let mut is_last = !reach.is_window;
             loop {
-                (self.scene).cast_ray(simd, self.origin, &mut ray, &mut stacks);
+                (self.scene).traverse(simd, &mut ray, &mut stacks);
                 if is_last || ray.range_m == f32::INFINITY {
                     break;
                 }
