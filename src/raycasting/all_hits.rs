@@ -5,10 +5,10 @@
 
 use glam::DVec3;
 
-use super::Place;
+use super::place::{Leaf, Place};
 use super::simd::Baseline;
 use super::single::SingleRay;
-use super::traversal::{Leaf, Traverse};
+use super::traversal::Traverse;
 use super::triangle::TriangleBlock;
 use super::wide::{BoxGrid, CHILDREN, WideNode};
 

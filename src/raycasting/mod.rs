@@ -11,6 +11,7 @@ mod all_hits;
 pub(crate) mod bvh;
 mod leaves;
 mod packet;
+mod place;
 mod scene;
 mod simd;
 mod single;
@@ -18,8 +19,8 @@ mod traversal;
 mod triangle;
 mod wide;
 
+use place::Place;
 pub use scene::Scene;
-use traversal::Leaf;
 #[cfg(feature = "gpu")]
 pub(crate) use triangle::is_proper;
 
@@ -37,25 +38,6 @@ pub struct Hit {
     /// Index of the triangle in the mesh, or [`Hit::NO_TRIANGLE`].
     pub triangle: u32,
     place: Place,
-}
-
-/// Where a triangle is in a scene.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Place {
-    leaf: Leaf,
-    lane: u32,
-}
-
-impl Place {
-    const NONE: Self = Self {
-        leaf: Leaf::NONE,
-        lane: 0,
-    };
-
-    fn new(leaf: Leaf, lane: usize) -> Self {
-        let lane = lane as u32;
-        Self { leaf, lane }
-    }
 }
 
 impl Hit {

@@ -12,13 +12,12 @@
 
 use glam::DVec3;
 
+use super::place::{Leaf, Place};
 use super::simd::{Lanes, Simd};
-use super::traversal::{
-    FAR_TOLERANCE, Leaf, Slope, Traverse, enter, entry_and_exit, limited_inverse,
-};
+use super::traversal::{FAR_TOLERANCE, Slope, Traverse, enter, entry_and_exit, limited_inverse};
 use super::triangle::{TRIANGLES, TriangleBlock, Triangles, Vectors, splat_lane};
 use super::wide::{BoxGrid, CHILDREN, WideNode};
-use super::{NEAREST_M, Place, RAYS, Reach};
+use super::{NEAREST_M, RAYS, Reach};
 use crate::geometry::Vec3;
 use crate::geometry::mesh::STEP_M;
 

@@ -5,11 +5,12 @@
 
 use glam::{DVec3, Vec4};
 
+use super::place::{Leaf, Place};
 use super::simd::{Lanes, Simd};
-use super::traversal::{Leaf, Slope, Traverse, enter, entry_and_exit, limited_inverse};
+use super::traversal::{Slope, Traverse, enter, entry_and_exit, limited_inverse};
 use super::triangle::{TRIANGLES, TriangleBlock, splat};
 use super::wide::{BoxGrid, CHILDREN, WideNode};
-use super::{NEAREST_M, Place, Reach};
+use super::{NEAREST_M, Reach};
 use crate::geometry::Vec3;
 use crate::geometry::mesh::STEP_M;
 

@@ -3,6 +3,7 @@
 use glam::DVec3;
 
 use super::bvh::{MAX_DEPTH, NodeRef};
+use super::place::Leaf;
 use super::simd::{Lanes, Simd};
 use super::triangle::{TriangleBlock, Vectors};
 use super::wide::{BoxGrid, CHILDREN, WideBvh, WideNode};
@@ -33,21 +34,6 @@ pub(super) trait Traverse<S: Simd> {
 
     /// Intersects the triangles of a leaf of a tile.
     fn intersect(&mut self, simd: S, origin: &Self::Origin, block: &TriangleBlock, leaf: Leaf);
-}
-
-/// A leaf among all.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Leaf {
-    pub tile: u32,
-    pub index: u32,
-}
-
-impl Leaf {
-    /// No leaf.
-    pub const NONE: Self = Self {
-        tile: u32::MAX,
-        index: u32::MAX,
-    };
 }
 
 /// Ranges at which rays enter or leave boxes, from the bounds of the boxes in steps: per axis, a factor and a

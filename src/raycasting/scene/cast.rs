@@ -5,10 +5,11 @@ use glam::{DVec3, Vec3};
 use super::Scene;
 use crate::raycasting::all_hits::AllHits;
 use crate::raycasting::packet::{Origin, Packet};
+use crate::raycasting::place::{Leaf, Place};
 use crate::raycasting::simd::{Baseline, Simd, SimdTask, dispatch};
 use crate::raycasting::single::SingleRay;
-use crate::raycasting::traversal::{Leaf, Stack, Traversal, Traverse};
-use crate::raycasting::{Hit, Place, RAYS, Reach};
+use crate::raycasting::traversal::{Stack, Traversal, Traverse};
+use crate::raycasting::{Hit, RAYS, Reach};
 
 impl Scene {
     /// Casts rays from one origin along unit directions, all in the frame of the mesh, and writes
