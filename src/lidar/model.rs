@@ -120,35 +120,6 @@ impl LidarModel {
         self.min_range < range_m && range_m < self.max_range
     }
 
-    /// Row-major index of the pixel of a direction of any length; `None` above or below the field of
-    /// view.
-    pub fn pixel_of(&self, direction: Vec3) -> Option<usize> {
-        let elevation_rad = (direction.z / direction.length()).asin();
-        let row = self.row_of(elevation_rad)?;
-        let azimuth_rad = direction.y.atan2(direction.x);
-        let column = 0.5 * (1.0 - azimuth_rad / PI) * self.width as f32;
-        // An azimuth of exactly -π wraps to column 0.
-        Some(row * self.width + column as usize % self.width)
-    }
-
-    /// Row of an elevation; `None` outside the field of view or if it is not a number.
-    fn row_of(&self, elevation_rad: f32) -> Option<usize> {
-        let Some(elevations) = &self.elevations else {
-            let row = (self.fov_up_rad() - elevation_rad) / self.fov_rad() * self.height as f32;
-            return (row >= 0.0 && row < self.height as f32).then_some(row as usize);
-        };
-        let deg = elevation_rad.to_degrees();
-        let below = elevations.partition_point(|&row| row > deg);
-        let nearer = |row: usize| (elevations[row] - deg).abs();
-        let row = match below {
-            0 => 0,
-            row if row == elevations.len() => row - 1,
-            row if nearer(row - 1) <= nearer(row) => row - 1,
-            row => row,
-        };
-        (nearer(row) <= 0.5 * self.row_spacing_rad(row).to_degrees()).then_some(row)
-    }
-
     /// Elevation of the centre of a row [rad].
     pub fn elevation_rad(&self, row: usize) -> f32 {
         match &self.elevations {
@@ -204,13 +175,15 @@ impl LidarModel {
 
 #[cfg(test)]
 mod tests {
+    use super::super::projection::Projection;
     use super::*;
 
     #[test]
     fn every_pixel_center_projects_into_its_pixel() {
         let model = LidarModel::default();
+        let projection = Projection::of(&model);
         for index in 0..model.len() {
-            assert_eq!(model.pixel_of(model.direction_of(index)), Some(index));
+            assert_eq!(projection.pixel_of(model.direction_of(index)), Some(index));
         }
     }
 
@@ -223,10 +196,15 @@ mod tests {
             elevations: Some(elevations.into()),
             ..LidarModel::default()
         };
+        let projection = Projection::of(&model);
         for index in 0..model.len() {
-            assert_eq!(model.pixel_of(model.direction_of(index)), Some(index));
+            assert_eq!(projection.pixel_of(model.direction_of(index)), Some(index));
         }
-        let row_at = |deg: f32| model.row_of(deg.to_radians());
+        let row_at = |deg: f32| {
+            let (sine, cosine) = deg.to_radians().sin_cos();
+            let pixel = projection.pixel_of(Vec3::new(cosine, 0.0, sine))?;
+            Some(pixel / model.width)
+        };
         assert_eq!(
             [14.0, 9.0, 0.4, 0.6, -1.2].map(row_at),
             [0, 1, 3, 2, 4].map(Some)
@@ -237,7 +215,7 @@ mod tests {
     #[test]
     fn columns_increase_clockwise_from_backward() {
         let model = LidarModel::default();
-        let column = |direction| model.pixel_of(direction).unwrap() % model.width;
+        let column = |direction| Projection::of(&model).pixel_of(direction).unwrap() % model.width;
         assert_eq!(column(Vec3::new(1.0, 0.0, 0.0)), 450);
         assert_eq!(column(Vec3::new(0.0, -1.0, 0.0)), 675);
         assert_eq!(column(Vec3::new(0.0, 1.0, 0.0)), 225);
@@ -250,7 +228,7 @@ mod tests {
         let model = LidarModel::default();
         let at = |elevation_deg: f32| {
             let elevation = elevation_deg.to_radians();
-            model.pixel_of(Vec3::new(elevation.cos(), 0.0, elevation.sin()))
+            Projection::of(&model).pixel_of(Vec3::new(elevation.cos(), 0.0, elevation.sin()))
         };
         assert_eq!(at(3.1), None);
         assert_eq!(at(2.99).unwrap() / model.width, 0);
@@ -261,8 +239,8 @@ mod tests {
     #[test]
     fn an_invalid_direction_has_no_pixel() {
         let model = LidarModel::default();
-        assert_eq!(model.pixel_of(Vec3::ZERO), None);
-        assert_eq!(model.pixel_of(Vec3::NAN), None);
+        assert_eq!(Projection::of(&model).pixel_of(Vec3::ZERO), None);
+        assert_eq!(Projection::of(&model).pixel_of(Vec3::NAN), None);
     }
 
     #[test]

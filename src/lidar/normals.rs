@@ -71,8 +71,6 @@ impl Validate for NormalConfig {
     }
 }
 
-/// Pixels of the neighborhood on each side of its center.
-const RADIUS: isize = 2;
 /// Largest stride between the pixels of a neighborhood.
 const MAX_STRIDE: isize = 4;
 /// Column and row offsets of the eight outer neighbors, clockwise.
@@ -93,43 +91,60 @@ pub fn estimate_normals(image: &RangeImage, config: &NormalConfig) -> Vec<Option
     (0..image.model.height)
         .into_par_iter()
         .flat_map_iter(|row| {
-            (0..image.model.width).map(move |column| normal_at(image, config, row, column))
+            let spacing_rad = image.model.row_spacing_rad(row);
+            (0..image.model.width)
+                .map(move |column| normal_at(image, config, [row, column], spacing_rad))
         })
         .collect()
 }
 
-/// The returns around a pixel.
+/// Most returns around a pixel.
+const NEIGHBORS: usize = 24;
+
+/// The returns around a pixel, relative to its own.
 struct Neighborhood {
-    points: [Vec3; 24],
+    /// x, y and z; far away where there is no return.
+    offsets: [[f32; NEIGHBORS]; 3],
     count: usize,
     outer: [Option<Vec3>; 8],
 }
 
-fn normal_at(image: &RangeImage, config: &NormalConfig, row: usize, column: usize) -> Option<Vec3> {
+fn normal_at(
+    image: &RangeImage,
+    config: &NormalConfig,
+    [row, column]: [usize; 2],
+    row_spacing_rad: f32,
+) -> Option<Vec3> {
     let index = row * image.model.width + column;
     if !image.has_return(index) {
         return None;
     }
     let (point, range_m) = (image.points[index], image.ranges[index]);
-    let neighborhood = Neighborhood::gather(image, config, row as isize, column as isize);
-    let points = &neighborhood.points[..neighborhood.count];
+    let stride = |angle_rad: f32| {
+        ((config.spacing_m / (range_m * angle_rad)).round() as isize).clamp(1, MAX_STRIDE)
+    };
+    let column_spacing_rad = std::f32::consts::TAU / image.model.width as f32;
+    let strides = [stride(row_spacing_rad), stride(column_spacing_rad)];
+    let neighborhood = Neighborhood::gather(image, [row as isize, column as isize], strides);
     let tolerance_m = |normal: Vec3| {
         let cosine = normal.dot(point).abs() / range_m;
         let across_m = config.tolerance_m + config.relative_tolerance * range_m;
         across_m.min(config.beam_tolerance_m * cosine)
     };
-    let hypothesis = neighborhood.best_plane(point, tolerance_m)?;
+    let hypothesis = neighborhood.best_plane(tolerance_m)?;
     let tolerance_m = tolerance_m(hypothesis);
     let min_inliers = config
         .min_support
-        .max((config.min_share * points.len() as f32) as usize);
+        .max((config.min_share * neighborhood.count as f32) as usize);
 
     let mut sums = PlaneSums::about(point);
     sums.add(point);
     let mut inliers = 0;
-    for &neighbor in points {
-        if hypothesis.dot(neighbor - point).abs() < tolerance_m {
-            sums.add(neighbor);
+    let distances_m = neighborhood.distances_m(hypothesis);
+    for (number, distance_m) in distances_m[..neighborhood.count].iter().enumerate() {
+        if *distance_m < tolerance_m {
+            let [x, y, z] = neighborhood.offsets.map(|axis| axis[number]);
+            sums.add(point + Vec3::new(x, y, z));
             inliers += 1;
         }
     }
@@ -143,59 +158,79 @@ fn normal_at(image: &RangeImage, config: &NormalConfig, row: usize, column: usiz
 }
 
 impl Neighborhood {
-    fn gather(image: &RangeImage, config: &NormalConfig, row: isize, column: isize) -> Self {
-        let model = &image.model;
-        let (height, width) = (model.height as isize, model.width as isize);
-        let range_m = image.ranges[(row * width + column) as usize];
-        let stride = |angle_rad: f32| {
-            ((config.spacing_m / (range_m * angle_rad)).round() as isize).clamp(1, MAX_STRIDE)
-        };
-        let column_stride = stride(std::f32::consts::TAU / model.width as f32);
-        let row_stride = stride(model.row_spacing_rad(row as usize));
-
+    /// The returns of every `strides`-th row and column around one.
+    fn gather(image: &RangeImage, [row, column]: [isize; 2], strides: [isize; 2]) -> Self {
+        /// So far away that it supports no plane [m].
+        const NOWHERE_M: f32 = 1e9;
+        let (height, width) = (image.model.height as isize, image.model.width as isize);
+        let point = image.points[(row * width + column) as usize];
+        let offsets = [-2, -1, 0, 1, 2_isize];
+        let columns = offsets.map(|right| (column + right * strides[1]).rem_euclid(width));
         let mut found = Self {
-            points: [Vec3::ZERO; 24],
+            offsets: [[NOWHERE_M; NEIGHBORS]; 3],
             count: 0,
             outer: [None; 8],
         };
-        let point_at = |down: isize, right: isize| {
-            let row = row + down * row_stride;
+        let mut grid = [[None; 5]; 5];
+        for (down, line) in grid.iter_mut().enumerate() {
+            let row = row + offsets[down] * strides[0];
             if !(0..height).contains(&row) {
-                return None;
+                continue;
             }
-            let column = (column + right * column_stride).rem_euclid(width);
-            let index = (row * width + column) as usize;
-            image.has_return(index).then(|| image.points[index])
-        };
-        for down in -RADIUS..=RADIUS {
-            for right in -RADIUS..=RADIUS {
-                if let (Some(point), false) = (point_at(down, right), (down, right) == (0, 0)) {
-                    found.points[found.count] = point;
-                    found.count += 1;
+            for (right, cell) in line.iter_mut().enumerate() {
+                let index = (row * width + columns[right]) as usize;
+                if [down, right] == [2, 2] || !image.has_return(index) {
+                    continue;
                 }
+                let offset = image.points[index] - point;
+                *cell = Some(offset);
+                found.offsets[0][found.count] = offset.x;
+                found.offsets[1][found.count] = offset.y;
+                found.offsets[2][found.count] = offset.z;
+                found.count += 1;
             }
         }
         for (outer, (right, down)) in found.outer.iter_mut().zip(OUTER) {
-            *outer = point_at(RADIUS * down, RADIUS * right).or_else(|| point_at(down, right));
+            let at =
+                |radius: isize| grid[(2 + radius * down) as usize][(2 + radius * right) as usize];
+            *outer = at(2).or(at(1));
         }
         found
     }
 
-    /// The unit normal of the plane through `point` that has the largest support.
-    fn best_plane(&self, point: Vec3, tolerance_m: impl Fn(Vec3) -> f32) -> Option<Vec3> {
+    /// Distances to the plane through the pixel's return with a unit normal [m].
+    fn distances_m(&self, normal: Vec3) -> [f32; NEIGHBORS] {
+        let [x, y, z] = &self.offsets;
+        let mut distances_m = [0.0; NEIGHBORS];
+        for number in 0..NEIGHBORS {
+            let along = normal.x * x[number] + normal.y * y[number] + normal.z * z[number];
+            distances_m[number] = along.abs();
+        }
+        distances_m
+    }
+
+    /// The unit normal of the plane through the pixel's return that has the largest support.
+    fn best_plane(&self, tolerance_m: impl Fn(Vec3) -> f32) -> Option<Vec3> {
+        /// Sums that are made side by side.
+        const LANES: usize = 8;
         let mut best = (0.0, None);
         for first in 0..8 {
             let (Some(a), Some(b)) = (self.outer[first], self.outer[(first + 2) % 8]) else {
                 continue;
             };
-            let Some(normal) = (a - point).cross(b - point).try_normalize() else {
+            let Some(normal) = a.cross(b).try_normalize() else {
                 continue;
             };
-            let tolerance_m = tolerance_m(normal);
-            let support: f32 = self.points[..self.count]
-                .iter()
-                .map(|&other| (1.0 - normal.dot(other - point).abs() / tolerance_m).max(0.0))
-                .sum();
+            let per_tolerance = 1.0 / tolerance_m(normal);
+            let distances_m = self.distances_m(normal);
+            let mut sums = [0.0_f32; LANES];
+            for distances_m in distances_m.chunks_exact(LANES) {
+                for lane in 0..LANES {
+                    let support = 1.0 - distances_m[lane] * per_tolerance;
+                    sums[lane] += if support > 0.0 { support } else { 0.0 };
+                }
+            }
+            let support: f32 = sums.iter().sum();
             if support > best.0 {
                 best = (support, Some(normal));
             }

@@ -3,6 +3,7 @@
 use glam::Vec3;
 
 use super::model::LidarModel;
+use super::projection::Projection;
 use super::scan::Beam;
 
 /// Range of a pixel without a return.
@@ -33,12 +34,13 @@ impl RangeImage {
             points: vec![Vec3::ZERO; model.len()],
             point_indices: vec![NO_POINT; model.len()],
         };
+        let projection = Projection::of(model);
         for (point_index, &point) in points.iter().enumerate() {
             let range_m = point.length();
             if !model.accepts_range(range_m) {
                 continue;
             }
-            let Some(index) = model.pixel_of(point) else {
+            let Some(index) = projection.pixel_of(point) else {
                 continue;
             };
             if range_m < image.ranges[index] {
@@ -122,7 +124,7 @@ mod tests {
         let points = [Vec3::new(8.0, 3.0, -1.0), Vec3::new(-7.0, 1.0, 0.1)];
         let image = RangeImage::project(&points, &model);
         for (number, &point) in points.iter().enumerate() {
-            let index = model.pixel_of(point).unwrap();
+            let index = Projection::of(&model).pixel_of(point).unwrap();
             assert_eq!(image.point_index(index), Some(number));
             let beam = image.beam(index).unwrap();
             assert!((beam.point() - point).length() < 1e-5);

@@ -439,7 +439,6 @@ mod tests {
             assert!(built.counts.triangles > 100, "{:?}", built.counts);
             mesh.append(&built.mesh);
         }
-        mesh.snap();
         assert!(*map.mesh == mesh);
         assert_eq!(map.path.map_from_lidar, poses);
         let joined = plan.finish(mesh).unwrap();

@@ -240,6 +240,7 @@ fn finish(
     meshing::split_fans(&mut mesh);
     let is_held = seam::on_border(&mesh.vertices, ownership, number);
     finish_ground(&mut mesh, cloud, &is_held, config, &mut counts);
+    mesh.snap();
     counts.triangles = mesh.triangles.len();
     LocalMap {
         mesh,

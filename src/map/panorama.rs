@@ -27,7 +27,7 @@ use super::cells::{self, ROAD_HALF_WIDTH_M};
 use super::elevation::{GroundMap, SensorAttitude};
 use super::tiles::TileGrid;
 use crate::geometry::{Pose2, Pose3, Rigid3f, pose2_from_pose3, wrap_angle};
-use crate::lidar::{LidarModel, RangeImage};
+use crate::lidar::{LidarModel, Projection, RangeImage};
 use crate::memory::{self, MemoryError};
 use crate::rendering::{RangeRenderer, RenderError};
 use crate::validation::{InvalidValue, Validate, fraction, in_range, not_negative, positive};
@@ -344,11 +344,11 @@ impl DoubledScan {
     /// range by the limit, at all headings.
     fn new(scan: &RangeImage, attitude: &SensorAttitude, model: &LidarModel) -> Self {
         let road_from_lidar = Rigid3f::from(&attitude.road_from_lidar());
-        let directions = model.directions();
+        let (directions, projection) = (model.directions(), Projection::of(model));
         let mut nearest = vec![(-1.0_f32, -FAR_M); model.len()];
         for beam in scan.beams() {
             let direction: Vec3 = road_from_lidar.rotate(beam.direction);
-            let Some(index) = model.pixel_of(direction) else {
+            let Some(index) = projection.pixel_of(direction) else {
                 continue;
             };
             let closeness = direction.dot(directions[index]);

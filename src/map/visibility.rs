@@ -26,7 +26,7 @@ use smart_default::SmartDefault;
 
 use super::scan_cloud::ScanCloud;
 use crate::geometry::TriangleMesh;
-use crate::lidar::LidarModel;
+use crate::lidar::{LidarModel, Projection};
 use crate::raycasting::Scene;
 use crate::validation::{InvalidValue, Validate, at_least_one, in_range, not_negative};
 
@@ -98,6 +98,7 @@ pub fn static_points(
     config: &VisibilityConfig,
 ) -> Vec<Vec<bool>> {
     let voters = spread(scans.len(), config.point_voters);
+    let projection = Projection::of(model);
     scans
         .par_iter()
         .enumerate()
@@ -107,8 +108,16 @@ pub fn static_points(
                 .iter()
                 .map(|&point| {
                     let (mut through, mut seen) = (0_u32, 0_u32);
-                    for &voter in voters.iter().filter(|&&voter| voter != own) {
-                        match vote(&scans[voter], point, model, config) {
+                    for (number, &voter) in voters.iter().enumerate() {
+                        // Whatever the others vote, the point is static.
+                        let most = through + (voters.len() - number) as u32;
+                        if most < config.point_votes || 2 * most <= seen {
+                            break;
+                        }
+                        if voter == own {
+                            continue;
+                        }
+                        match vote(&scans[voter], point, model, &projection, config) {
                             Vote::Through => through += 1,
                             Vote::Seen => seen += 1,
                             Vote::Unknown => {}
@@ -137,7 +146,13 @@ enum Vote {
 }
 
 /// Vote of a scan on a point of the map.
-fn vote(scan: &ScanCloud, point: Vec3, model: &LidarModel, config: &VisibilityConfig) -> Vote {
+fn vote(
+    scan: &ScanCloud,
+    point: Vec3,
+    model: &LidarModel,
+    projection: &Projection,
+    config: &VisibilityConfig,
+) -> Vote {
     const SEEN_WITHIN_M: f32 = 0.3;
     let point_in_lidar =
         scan.map_from_lidar.rotation.transpose() * (point - scan.map_from_lidar.translation);
@@ -145,7 +160,7 @@ fn vote(scan: &ScanCloud, point: Vec3, model: &LidarModel, config: &VisibilityCo
     if !model.accepts_range(range_m) {
         return Vote::Unknown;
     }
-    let Some(pixel) = model.pixel_of(point_in_lidar) else {
+    let Some(pixel) = projection.pixel_of(point_in_lidar) else {
         return Vote::Unknown;
     };
     let free_m = scan.free_range_m[pixel];

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::lidar::{LidarModel, RangeImage, Scan};
+use crate::lidar::{LidarModel, Projection, RangeImage, Scan};
 
 /// Number of points of a scan that a range image loses, by reason; kept and lost ones are all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -86,13 +86,14 @@ impl DroppedPoints {
         counts.without_return = scan.drop_invalid(&any_range);
         counts.own_car = scan.drop_inside(own_car_m);
         let image = RangeImage::project(&scan.points, lidar);
+        let projection = Projection::of(lidar);
         for (number, &point) in scan.points.iter().enumerate() {
             let range_m = point.length();
             if range_m <= lidar.min_range {
                 counts.too_near += 1;
             } else if range_m >= lidar.max_range {
                 counts.too_far += 1;
-            } else if let Some(pixel) = lidar.pixel_of(point) {
+            } else if let Some(pixel) = projection.pixel_of(point) {
                 let nearest = image.points[pixel];
                 if image.point_index(pixel) == Some(number) {
                     continue;
