@@ -75,7 +75,10 @@ pub struct TrackingLossConfig {
     /// A place that was found is the right one from this share of agreeing beams on (unitless).
     #[default(0.85)]
     pub sure_agreement: f64,
-    /// Updates in turn with lower shares, none below `min_agreement`, that confirm it nevertheless.
+    /// Least share of updates that confirm it in turn (unitless).
+    #[default(0.7)]
+    pub confirming_agreement: f64,
+    /// Number of these updates.
     #[default(3)]
     pub confirming_updates: usize,
     /// Updates without convergence after which the search restarts.
@@ -107,6 +110,7 @@ impl Validate for TrackingLossConfig {
         fraction("min_agreement", self.min_agreement)?;
         fraction("lost_fraction", self.lost_fraction)?;
         fraction("sure_agreement", self.sure_agreement)?;
+        fraction("confirming_agreement", self.confirming_agreement)?;
         at_least_one("confirming_updates", self.confirming_updates)?;
         at_least_one("patience", self.patience)?;
         positive("max_spread_m", self.max_spread_m)?;
@@ -145,11 +149,11 @@ impl AgreementMonitor {
         agreement: Option<f64>,
         config: &TrackingLossConfig,
     ) -> bool {
-        let agreement = agreement.unwrap_or(config.min_agreement);
-        self.confirming = match is_converged && agreement >= config.min_agreement {
+        let agreement = agreement.unwrap_or(config.confirming_agreement);
+        self.confirming = match is_converged {
             true if agreement >= config.sure_agreement => config.confirming_updates,
-            true => self.confirming + 1,
-            false => 0,
+            true if agreement >= config.confirming_agreement => self.confirming + 1,
+            _ => 0,
         };
         self.confirming >= config.confirming_updates
     }
@@ -225,7 +229,9 @@ mod tests {
         };
         assert_eq!(confirmed_after(&[Some(0.95)]), Some(0));
         assert_eq!(confirmed_after(&[Some(0.78), Some(0.7), Some(0.04)]), None);
-        assert_eq!(confirmed_after(&[Some(0.6); 4]), Some(2));
+        assert_eq!(confirmed_after(&[Some(0.75); 4]), Some(2));
+        // Places 3 m from the right one agree as well as this.
+        assert_eq!(confirmed_after(&[Some(0.6); 9]), None);
         assert_eq!(confirmed_after(&[None; 4]), Some(2));
         // An update without convergence restarts the count.
         let mut monitor = AgreementMonitor::default();

@@ -49,7 +49,8 @@ impl ParticleFilter {
         }
     }
 
-    /// Registers the best particles of each place, weights them, and samples particles around each; `None` if no place is on the map.
+    /// Registers the best particles of each place, weights the places, and samples particles around each; `None` if no
+    /// place is on the map.
     pub(super) fn search_places(
         &mut self,
         scan: &RangeImage,
@@ -58,41 +59,20 @@ impl ParticleFilter {
     ) -> Result<Option<Update>, RenderError> {
         /// Weight of a place that is likely (unitless).
         const LIKELY: f64 = 0.01;
-        /// Distance between particles that are registered besides the best one of each place [m].
-        const SEED_RADIUS_M: f64 = 1.0;
-        let (config, observation) = (self.config.places.clone(), &self.config.observation);
-        let count = observation.beams_for(self.particles.len());
-        let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
-        let (_, costs_m) = self.log_likelihoods(&beams, attitude)?;
-        // Along a street without much structure a place has several optima.
-        let best = |radius_m| {
-            let poses = self.particles.poses();
-            best_of_each(poses, &costs_m, config.most, radius_m)
-        };
-        let seeds: BTreeSet<usize> = (best(config.radius_m).into_iter())
-            .chain(best(SEED_RADIUS_M))
-            .collect();
-        let seeds: Vec<usize> = seeds.into_iter().collect();
-        let places = self.registered_places(&seeds, scan, attitude, rng)?;
-        let observation = &self.config.observation;
-        let beams = choose_beams(
-            scan,
-            observation.beams,
-            observation.road_share,
-            attitude,
-            rng,
+        let config = self.config.places.clone();
+        let seeds = self.best_particles(scan, attitude, rng)?;
+        let registered = self.registered_places(&seeds, scan, attitude, rng)?;
+        let (count, road_share) = (
+            self.config.observation.beams,
+            self.config.observation.road_share,
         );
-        let costs_m = self.costs_of_places(&places, &beams)?;
-
-        let found = best_of_each(
-            places.iter().map(Place::pose),
-            &costs_m,
-            config.most,
-            config.radius_m,
-        );
-        let (places, costs_m): (Vec<&Place>, Vec<f64>) = (found.iter())
-            .filter_map(|&index| Some((&places[index], costs_m[index]?)))
-            .unzip();
+        let beams = choose_beams(scan, count, road_share, attitude, rng);
+        let costs_m = self.costs_of_places(&registered, &beams)?;
+        let poses = registered.iter().map(Place::pose);
+        let (places, costs_m): (Vec<&Place>, Vec<f64>) =
+            (best_of_each(poses, &costs_m, config.most, config.radius_m).into_iter())
+                .filter_map(|index| Some((&registered[index], costs_m[index]?)))
+                .unzip();
         let before = self.weights_before(&places, config.radius_m);
         let weights = weights_after(&before, &costs_m, &config);
         let Some(best) = (0..places.len()).max_by(|&a, &b| weights[a].total_cmp(&weights[b]))
@@ -109,6 +89,26 @@ impl ParticleFilter {
             attitude,
             place: Some(*places[best].pose()),
         }))
+    }
+
+    /// Indices of the best particle of each place, and of the best ones that are a metre apart: along a street without
+    /// much structure a place has several optima.
+    fn best_particles(
+        &mut self,
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+        rng: &mut impl Rng,
+    ) -> Result<Vec<usize>, RenderError> {
+        const APART_M: f64 = 1.0;
+        let observation = &self.config.observation;
+        let count = observation.beams_for(self.particles.len());
+        let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
+        let (_, costs_m) = self.log_likelihoods(&beams, attitude)?;
+        let config = &self.config.places;
+        let best = [config.radius_m, APART_M]
+            .map(|radius_m| best_of_each(self.particles.poses(), &costs_m, config.most, radius_m));
+        let unique: BTreeSet<usize> = best.into_iter().flatten().collect();
+        Ok(unique.into_iter().collect())
     }
 
     /// Registers the scan at particles, with a wide kernel first.
