@@ -6,8 +6,12 @@ mod common;
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::path::Path;
 
 use common::{Fpmcl, Recording, fpmcl};
+use fpmcl::geometry::{Vec3, surface_area_m2};
+use fpmcl::map::mesh_file;
+use fpmcl::recording::scan_files;
 use serde_json::Value;
 
 const RESULT: &str = "results/localization.npz";
@@ -139,4 +143,155 @@ fn nothing_is_replaced_that_is_no_export() {
     export(&recording, &["poses.txt", "--glb", "a.glb"]).fails_with(&["poses.txt", ".npz"]);
     export(&recording, &[RESULT]).rejects_usage_with(&["--mcap"]);
     assert!(before == recording.bytes("run.mcap"));
+}
+
+const TILES: &str = "autoware/pointcloud_map.pcd";
+const METADATA: &str = "autoware/pointcloud_map_metadata.yaml";
+
+/// A recording with its map.
+fn mapped() -> Recording {
+    let recording = Recording::street(FRAMES);
+    recording.fpmcl("build-map").succeeds();
+    recording
+}
+
+/// Lines of the metadata without comments, as keys and values.
+fn metadata(recording: &Recording) -> Vec<(String, String)> {
+    let text = String::from_utf8(recording.bytes(METADATA)).unwrap();
+    let lines = text.lines().filter(|line| !line.starts_with('#'));
+    lines
+        .map(|line| {
+            let (key, value) = line.split_once(": ").unwrap();
+            (key.to_owned(), value.to_owned())
+        })
+        .collect()
+}
+
+/// Lower corners [m] and points of the tiles that the metadata name.
+fn tiles(recording: &Recording) -> Vec<([i32; 2], Vec<Vec3>)> {
+    let metadata = metadata(recording).into_iter().skip(2);
+    metadata
+        .map(|(name, corner)| {
+            let numbers = corner.trim_matches(['[', ']']).split(", ");
+            let corner: Vec<i32> = numbers.map(|number| number.parse().unwrap()).collect();
+            let path = recording.path(TILES).join(name);
+            let points = scan_files::read(&path).unwrap().points;
+            (corner.try_into().unwrap(), points)
+        })
+        .collect()
+}
+
+/// Names of the files of a folder.
+fn names(folder: &Path) -> Vec<String> {
+    let entries = fs::read_dir(folder).unwrap();
+    let mut names: Vec<String> = entries
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn tiles_hold_points_of_the_map_each_in_its_square() {
+    let recording = mapped();
+    export(
+        &recording,
+        &["map.ply", "--pcd", "autoware", "--glb", "map.glb"],
+    )
+    .succeeds();
+    let (mesh, _) = mesh_file::read(&recording.path("map.ply")).unwrap();
+    let tiles = tiles(&recording);
+    assert!(tiles.len() > 3);
+    assert_eq!(names(&recording.path(TILES)).len(), tiles.len());
+    for (corner_m, points) in &tiles {
+        for point in points {
+            for (low_m, x) in corner_m.iter().zip([point.x, point.y]) {
+                let from_corner_m = f64::from(x) - f64::from(*low_m);
+                assert!((0.0..20.0).contains(&from_corner_m), "{corner_m:?} {point}");
+            }
+        }
+    }
+    let points: Vec<Vec3> = tiles.into_iter().flat_map(|(_, points)| points).collect();
+    let squares = surface_area_m2(&mesh) / (0.2 * 0.2);
+    assert!((points.len() as f64 - squares).abs() <= 1.0, "{squares}");
+    let bounds = mesh.bounds();
+    let is_within = |&point: &Vec3| point.cmpge(bounds.min).all() && point.cmple(bounds.max).all();
+    assert!(points.iter().all(is_within));
+    assert!(recording.path("map.glb").exists());
+}
+
+#[test]
+fn tiles_have_the_requested_side_and_spacing_and_the_same_bytes_again() {
+    let recording = mapped();
+    let call = |folder: &str| {
+        let arguments = ["map.ply", "--spacing", "0.5", "--tile-size", "10", "--pcd"];
+        export(&recording, &arguments).with(folder).succeeds();
+    };
+    call("autoware");
+    call("again");
+    let side = |key: &str| (key.to_owned(), "10.0".to_owned());
+    assert_eq!(
+        metadata(&recording)[..2],
+        [side("x_resolution"), side("y_resolution")]
+    );
+    let (mesh, _) = mesh_file::read(&recording.path("map.ply")).unwrap();
+    let points: usize = tiles(&recording).iter().map(|(_, it)| it.len()).sum();
+    assert!((points as f64 - surface_area_m2(&mesh) / 0.25).abs() <= 1.0);
+    let again = recording.path("again");
+    assert_eq!(
+        recording.bytes(METADATA),
+        fs::read(again.join("pointcloud_map_metadata.yaml")).unwrap()
+    );
+    for name in names(&recording.path(TILES)) {
+        let path = again.join("pointcloud_map.pcd").join(&name);
+        assert!(recording.bytes(&format!("{TILES}/{name}")) == fs::read(path).unwrap());
+    }
+}
+
+#[test]
+fn tiles_of_an_earlier_export_are_replaced_with_force_and_files_of_others_are_kept() {
+    let recording = mapped();
+    let call = |arguments: &[&str]| {
+        let call = export(&recording, &["map.ply", "--pcd", "autoware"]);
+        arguments.iter().fold(call, Fpmcl::with)
+    };
+    call(&["--tile-size", "5"]).succeeds();
+    let small = names(&recording.path(TILES));
+    recording.write(&format!("{TILES}/mine.pcd"), "mine");
+    call(&[]).fails_with(&["pointcloud_map_metadata.yaml", "--force"]);
+    call(&["--force"]).succeeds();
+    let tiles = tiles(&recording);
+    assert!(tiles.len() < small.len());
+    assert_eq!(names(&recording.path(TILES)).len(), tiles.len() + 1);
+    assert_eq!(recording.bytes(&format!("{TILES}/mine.pcd")), b"mine");
+
+    fs::create_dir_all(recording.path("other/pointcloud_map.pcd")).unwrap();
+    let other = |arguments: &[&str]| export(&recording, arguments).with("--pcd").with("other");
+    other(&["map.ply", "--force"]).fails_with(&["pointcloud_map.pcd", "not written by fpmcl"]);
+    assert!(names(&recording.path("other/pointcloud_map.pcd")).is_empty());
+}
+
+#[test]
+fn a_spacing_that_fits_neither_memory_nor_map_is_an_error() {
+    let recording = mapped();
+    let call = |spacing| {
+        export(
+            &recording,
+            &["map.ply", "--pcd", "autoware", "--spacing", spacing],
+        )
+    };
+    call("0").rejects_usage_with(&["0.001 to 100"]);
+    let message = ["the points of the tiles", "--spacing", "--memory"];
+    call("0.001").with("--memory=0.1").fails_with(&message);
+    call("100").fails_with(&["too little", "--spacing"]);
+    assert!(!recording.path(TILES).exists());
+    export(&recording, &["map.ply", "--glb", "a.glb", "--spacing", "1"])
+        .rejects_usage_with(&["--pcd"]);
+}
+
+#[test]
+fn a_result_is_exported_with_the_tiles_of_its_map() {
+    let recording = localized();
+    export(&recording, &[RESULT, "--pcd", "autoware"]).succeeds();
+    assert!(tiles(&recording).len() > 3);
 }

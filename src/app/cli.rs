@@ -101,12 +101,12 @@ Examples:
   fpmcl evaluate config/evaluation.yml")]
     Evaluate(EvaluateArgs),
 
-    /// Write a result or a map in the formats of viewers: MCAP for Foxglove and rerun, glTF for others.
+    /// Write a result or a map for other programs: MCAP for Foxglove and rerun, glTF for viewers, PCD for Autoware.
     #[command(after_help = "\
 Examples:
   fpmcl export results/localization.npz --mcap run.mcap
   fpmcl export results/localization.npz --glb run.glb
-  fpmcl export map.ply --glb map.glb")]
+  fpmcl export map.ply --glb map.glb --pcd autoware_map/")]
     Export(ExportArgs),
 
     /// Compare configurations: sequences x configurations x seeds.
@@ -411,6 +411,19 @@ pub struct ExportArgs {
     #[arg(long, value_name = "FILE", group = "format")]
     pub glb: Option<PathBuf>,
 
+    /// Folder to write the map to as point cloud tiles, for Autoware: `pointcloud_map.pcd/` and
+    /// `pointcloud_map_metadata.yaml`.
+    #[arg(long, value_name = "FOLDER", group = "format")]
+    pub pcd: Option<PathBuf>,
+
+    /// Spacing of the points of tiles: one point per square of the surface [m].
+    #[arg(long, value_name = "M", requires = "pcd", value_parser = spacing, default_value_t = Self::SPACING_M)]
+    pub spacing: f64,
+
+    /// Side of tiles [m].
+    #[arg(long, value_name = "M", requires = "pcd", value_parser = clap::value_parser!(u16).range(1..=1000), default_value_t = Self::TILE_SIZE_M)]
+    pub tile_size: u16,
+
     /// Recording of the result; by default that of its localization.
     #[arg(long, value_name = "RECORDING")]
     pub recording: Option<PathBuf>,
@@ -422,6 +435,10 @@ pub struct ExportArgs {
     /// Largest number of points per scan in a log; 0 for a log without scans.
     #[arg(long, value_name = "N", default_value_t = Self::POINTS)]
     pub points: usize,
+
+    /// Largest memory that a stage may plan for; by default half of the machine's.
+    #[arg(long, value_name = "GIB", value_parser = gibibytes)]
+    pub memory: Option<f64>,
 
     /// Replace existing files.
     #[arg(long)]
@@ -602,10 +619,13 @@ impl Command {
             Self::Compare(args) => args.source.machine,
             Self::Demo(args) => args.machine,
             Self::Ground(args) => args.machine,
+            Self::Export(args) => MachineArgs {
+                memory: args.memory,
+                ..MachineArgs::default()
+            },
             Self::Completions(_)
             | Self::Config(_)
             | Self::Doctor(_)
-            | Self::Export(_)
             | Self::Info(_)
             | Self::Man(_) => MachineArgs::default(),
         }
@@ -712,6 +732,10 @@ impl RefineArgs {
 impl ExportArgs {
     /// Default of `points`.
     const POINTS: usize = 30_000;
+    /// Default of `spacing` [m].
+    const SPACING_M: f64 = 0.2;
+    /// Default of `tile_size` [m]: that of Autoware.
+    const TILE_SIZE_M: u16 = 20;
 
     /// A log of a result in a map.
     pub fn log_of(result: &Path, map: &Path, log: &Path, force: bool) -> Self {
@@ -719,9 +743,13 @@ impl ExportArgs {
             input: result.to_owned(),
             mcap: Some(log.to_owned()),
             glb: None,
+            pcd: None,
+            spacing: Self::SPACING_M,
+            tile_size: Self::TILE_SIZE_M,
             recording: None,
             map: Some(map.to_owned()),
             points: Self::POINTS,
+            memory: None,
             force,
         }
     }
@@ -771,6 +799,14 @@ fn gibibytes(text: &str) -> Result<f64, &'static str> {
     match text.parse::<f64>() {
         Ok(number) if (0.01..=1e6).contains(&number) => Ok(number),
         _ => Err("give a number from 0.01 to 1000000, such as 8"),
+    }
+}
+
+/// Parses a spacing of points [m].
+fn spacing(text: &str) -> Result<f64, &'static str> {
+    match text.parse::<f64>() {
+        Ok(number) if (0.001..=100.0).contains(&number) => Ok(number),
+        _ => Err("give a number from 0.001 to 100, such as 0.2"),
     }
 }
 

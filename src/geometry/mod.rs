@@ -14,6 +14,7 @@ pub mod morton;
 pub mod plane;
 pub mod ply_vertex;
 pub mod pose;
+pub mod surface_samples;
 pub mod trajectory;
 
 pub use angle::{circular_mean, wrap_angle};
@@ -25,6 +26,7 @@ pub use mesh::{Aabb, TriangleMesh};
 pub use plane::{PlaneFit, PlaneSums};
 pub use ply_vertex::PlyVertex;
 pub use pose::{FARTHEST_M, Pose2, Pose3, Rigid3f, pose2_from_pose3, pose3_from_pose2, yaw};
+pub use surface_samples::{sample_surface, surface_area_m2};
 pub use trajectory::StampedPose;
 
 pub use glam::Vec3;

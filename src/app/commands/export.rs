@@ -1,6 +1,8 @@
-//! `export`: a result or a map in the formats of viewers.
+//! `export`: a result or a map in the formats of other programs.
 
-use std::path::Path;
+mod tiles;
+
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
 
@@ -10,6 +12,7 @@ use super::output::Printed;
 use super::{Context, input, output, refine, run_output};
 use crate::app::cli::ExportArgs;
 use crate::app::config::RefinementConfig;
+use crate::app::export::tiles::TILES_FOLDER;
 use crate::app::export::{Model, Ribbon, RunLog, write_mcap};
 use crate::app::plotting::color::{Colormap, TRUTH};
 use crate::app::results::LocalizationResults;
@@ -30,22 +33,28 @@ pub fn run(args: &ExportArgs, context: &Context) -> Result<Printed> {
         .input
         .extension()
         .is_some_and(|it| it.eq_ignore_ascii_case("npz"));
-    match is_map {
-        true => export_map(args)?,
+    let tiles = match is_map {
+        true => export_map(args, context)?,
         false => export_result(args, context)?,
-    }
+    };
     let mut written = Vec::new();
     for (mut claims, path) in claims {
-        claims.finish(path)?;
-        let megabytes = std::fs::metadata(path).map_or(0.0, |file| file.len() as f64 / 1e6);
+        claims.finish(&path)?;
+        let megabytes = std::fs::metadata(&path).map_or(0.0, |file| file.len() as f64 / 1e6);
         written.push(("written", format!("{}, {megabytes:.1} MB", path.display())));
     }
+    written.extend(tiles);
     Ok(Printed::rows(&written))
 }
 
 /// Checks and claims the files to write.
-pub fn check<'a>(args: &'a ExportArgs, context: &'a Context) -> Result<Vec<(Claims, &'a Path)>> {
-    let formats = [("--mcap", &args.mcap, MCAP), ("--glb", &args.glb, GLB)];
+pub fn check(args: &ExportArgs, context: &Context) -> Result<Vec<(Claims, PathBuf)>> {
+    let metadata = args.pcd.as_deref().map(tiles::metadata_file);
+    let formats: [(_, _, _, &[&str]); 3] = [
+        ("--mcap", &args.mcap, Some(MCAP), &[]),
+        ("--glb", &args.glb, Some(GLB), &[]),
+        ("--pcd", &metadata, None, &[TILES_FOLDER]),
+    ];
     let base = refine::base_config(Some(&args.input));
     let map = args.map.as_deref().unwrap_or(&base.map_file);
     let recording = args.recording.as_deref().unwrap_or(&base.scan_folder);
@@ -57,23 +66,24 @@ pub fn check<'a>(args: &'a ExportArgs, context: &'a Context) -> Result<Vec<(Clai
     let inputs: Vec<(&str, &Path)> = inputs.into_iter().chain(context.input()).collect();
     let requested = formats
         .into_iter()
-        .filter_map(|(key, path, magic)| Some((key, path.as_deref()?, magic)));
+        .filter_map(|(key, path, magic, names)| Some((key, path.as_deref()?, magic, names)));
     requested
-        .map(|(key, main, magic)| {
+        .map(|(key, main, magic, names)| {
             let outputs = Outputs {
                 key,
                 main,
-                magic: Some(magic),
-                names: Vec::new(),
+                magic,
+                names: names.iter().map(|&name| name.to_owned()).collect(),
                 inputs: inputs.clone(),
                 force: args.force,
             };
-            Ok((outputs.prepare()?, main))
+            Ok((outputs.prepare()?, main.to_owned()))
         })
         .collect()
 }
 
-fn export_map(args: &ExportArgs) -> Result<()> {
+/// Exports a map; returns what to print of its tiles.
+fn export_map(args: &ExportArgs, context: &Context) -> Result<Vec<(&'static str, String)>> {
     let path = args.input.display();
     ensure!(
         scan_files::is_mesh(&args.input),
@@ -81,15 +91,19 @@ fn export_map(args: &ExportArgs) -> Result<()> {
     );
     ensure!(
         args.mcap.is_none(),
-        "{path} is a map: a log is written of a result (.npz); give --glb FILE"
+        "{path} is a map: a log is written of a result (.npz); give --glb FILE or --pcd FOLDER"
     );
-    let (mesh, _) = mesh_file::read(&args.input)?;
-    let mut model = Model::default();
-    model.add_mesh("map", &mesh);
-    write_model(args, &model)
+    let (mesh, path) = mesh_file::read(&args.input)?;
+    if args.glb.is_some() {
+        let mut model = Model::default();
+        model.add_mesh("map", &mesh);
+        write_model(args, &model)?;
+    }
+    tiles::write(args, &mesh, path.as_ref(), context)
 }
 
-fn export_result(args: &ExportArgs, context: &Context) -> Result<()> {
+/// Exports a result with its map; returns what to print of the tiles of the map.
+fn export_result(args: &ExportArgs, context: &Context) -> Result<Vec<(&'static str, String)>> {
     let results = LocalizationResults::read(&args.input)?;
     run_output::warn_of_shortfall(&results, &args.input);
     let mut config = refine::base_config(Some(&args.input));
@@ -100,26 +114,30 @@ fn export_result(args: &ExportArgs, context: &Context) -> Result<()> {
         config.scan_folder.clone_from(recording);
     }
     input::require_file("the map of the result (--map MAP)", &config.map_file)?;
-    let (mesh, _) = mesh_file::read(&config.map_file)?;
+    let (mesh, path) = mesh_file::read(&config.map_file)?;
     if args.glb.is_some() {
         write_model(args, &model_of(&mesh, &results)?)?;
     }
-    let Some(path) = &args.mcap else {
-        return Ok(());
-    };
-    let frames = match args.points {
-        0 => None,
-        _ => Some(frames_of(&mut config, &results)?),
-    };
-    let run = RunLog {
-        results: &results,
-        frames: frames.as_deref(),
-        mesh: Some(&mesh),
-        max_points: args.points,
-    };
-    let task = context.progress.task("export", results.len());
+    if let Some(log) = &args.mcap {
+        let frames = match args.points {
+            0 => None,
+            _ => Some(frames_of(&mut config, &results)?),
+        };
+        let run = RunLog {
+            results: &results,
+            frames: frames.as_deref(),
+            mesh: Some(&mesh),
+            max_points: args.points,
+        };
+        write_log(log, &run, context)?;
+    }
+    tiles::write(args, &mesh, path.as_ref(), context)
+}
+
+fn write_log(path: &Path, run: &RunLog, context: &Context) -> Result<()> {
+    let task = context.progress.task("export", run.results.len());
     output::write_file(path, |file| {
-        write_mcap(&run, file, || {
+        write_mcap(run, file, || {
             task.advance(1);
             match context.interrupt.requested() {
                 true => Err(Interrupted {
