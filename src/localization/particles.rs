@@ -202,6 +202,12 @@ pub fn deviation(pose: &Pose2, center: &Pose2) -> Vector3<f64> {
     offset.push(turn_rad)
 }
 
+/// Standard deviation of the position along the long axis of a covariance of (x, y, heading) [m].
+pub fn long_axis_m(covariance: &Matrix3<f64>) -> f64 {
+    let position = covariance.fixed_view::<2, 2>(0, 0).into_owned();
+    position.symmetric_eigenvalues().max().max(0.0).sqrt()
+}
+
 /// Standard deviations of a covariance of (x, y, heading): position as √(σ_x² + σ_y²) [m], heading [rad].
 pub fn spread(covariance: &Matrix3<f64>) -> (f64, f64) {
     (

@@ -19,13 +19,18 @@ pub(super) struct AllHits<F> {
 }
 
 impl<F: FnMut(f32, Place)> Traverse<Baseline> for AllHits<F> {
-    type Origin = <SingleRay as Traverse<Baseline>>::Origin;
+    type Relative = <SingleRay as Traverse<Baseline>>::Relative;
 
-    fn relative_to(&self, simd: Baseline, middle: DVec3, grid: &BoxGrid) -> Self::Origin {
+    fn relative_to(&self, simd: Baseline, middle: DVec3, grid: &BoxGrid) -> Self::Relative {
         self.ray.relative_to(simd, middle, grid)
     }
 
-    fn enter(&self, simd: Baseline, ray: &Self::Origin, node: &WideNode) -> (u32, [f32; CHILDREN]) {
+    fn enter(
+        &self,
+        simd: Baseline,
+        ray: &Self::Relative,
+        node: &WideNode,
+    ) -> (u32, [f32; CHILDREN]) {
         self.ray.enter(simd, ray, node)
     }
 
@@ -33,7 +38,7 @@ impl<F: FnMut(f32, Place)> Traverse<Baseline> for AllHits<F> {
         Traverse::<Baseline>::until_m(&self.ray)
     }
 
-    fn intersect(&mut self, _: Baseline, ray: &Self::Origin, block: &TriangleBlock, leaf: Leaf) {
+    fn intersect(&mut self, _: Baseline, ray: &Self::Relative, block: &TriangleBlock, leaf: Leaf) {
         let (hits, range_m) = self.ray.hits(ray.origin, block);
         for lane in (0..block.count).filter(|lane| hits >> lane & 1 == 1) {
             (self.visit)(range_m[lane], Place::new(leaf, lane));

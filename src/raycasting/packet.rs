@@ -151,10 +151,10 @@ pub(super) struct RelativePacket<L, R> {
 }
 
 impl<S: Simd, O: Origin<S>> Traverse<S> for Packet<'_, S, O> {
-    type Origin = RelativePacket<S::F32x8, O::Relative>;
+    type Relative = RelativePacket<S::F32x8, O::Relative>;
 
     #[inline(always)]
-    fn relative_to(&self, simd: S, middle: DVec3, grid: &BoxGrid) -> Self::Origin {
+    fn relative_to(&self, simd: S, middle: DVec3, grid: &BoxGrid) -> Self::Relative {
         let origin = self.origin.relative_to(simd, middle);
         let [low, high] = O::interval(origin);
         let [mut nearest, mut farthest] = [high, low];
@@ -176,7 +176,7 @@ impl<S: Simd, O: Origin<S>> Traverse<S> for Packet<'_, S, O> {
     }
 
     #[inline(always)]
-    fn enter(&self, simd: S, rays: &Self::Origin, node: &WideNode) -> (u32, [f32; CHILDREN]) {
+    fn enter(&self, simd: S, rays: &Self::Relative, node: &WideNode) -> (u32, [f32; CHILDREN]) {
         let [entry, exit] = &rays.slopes;
         let range_m = [0.0, self.farthest_m];
         let (mut left, near_m) = enter(simd, node, &self.sides, [entry, exit], range_m);
@@ -197,7 +197,7 @@ impl<S: Simd, O: Origin<S>> Traverse<S> for Packet<'_, S, O> {
     }
 
     #[inline(always)]
-    fn intersect(&mut self, simd: S, rays: &Self::Origin, block: &TriangleBlock, leaf: Leaf) {
+    fn intersect(&mut self, simd: S, rays: &Self::Relative, block: &TriangleBlock, leaf: Leaf) {
         O::intersect(self, simd, rays.origin, block, leaf);
     }
 }

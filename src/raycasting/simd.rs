@@ -41,6 +41,7 @@ pub(super) trait Simd: Copy {
 
     fn load(self, numbers: [f32; WIDTH]) -> Self::F32x8;
     fn splat(self, number: f32) -> Self::F32x8;
+    /// Whole numbers as floats.
     fn whole(self, numbers: [u16; WIDTH]) -> Self::F32x8;
 }
 

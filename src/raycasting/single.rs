@@ -89,17 +89,17 @@ pub(super) struct RelativeRay<L> {
 }
 
 impl<S: Simd> Traverse<S> for SingleRay {
-    type Origin = RelativeRay<S::F32x8>;
+    type Relative = RelativeRay<S::F32x8>;
 
     #[inline(always)]
-    fn relative_to(&self, simd: S, middle: DVec3, grid: &BoxGrid) -> Self::Origin {
+    fn relative_to(&self, simd: S, middle: DVec3, grid: &BoxGrid) -> Self::Relative {
         let origin = (self.origin - middle).as_vec3() / STEP_M;
         let slope = Slope::new(simd, grid, origin, &self.inverse);
         RelativeRay { origin, slope }
     }
 
     #[inline(always)]
-    fn enter(&self, simd: S, ray: &Self::Origin, node: &WideNode) -> (u32, [f32; CHILDREN]) {
+    fn enter(&self, simd: S, ray: &Self::Relative, node: &WideNode) -> (u32, [f32; CHILDREN]) {
         let range_m = [self.from_m, self.until_m];
         enter(simd, node, &self.sides, [&ray.slope, &ray.slope], range_m)
     }
@@ -111,7 +111,7 @@ impl<S: Simd> Traverse<S> for SingleRay {
 
     /// Keeps the nearest hit if it is nearer than those before.
     #[inline(always)]
-    fn intersect(&mut self, _: S, ray: &Self::Origin, block: &TriangleBlock, leaf: Leaf) {
+    fn intersect(&mut self, _: S, ray: &Self::Relative, block: &TriangleBlock, leaf: Leaf) {
         let (mut hits, range_m) = self.hits(ray.origin, block);
         while hits != 0 {
             let lane = hits.trailing_zeros() as usize % TRIANGLES;

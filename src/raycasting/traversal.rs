@@ -20,23 +20,23 @@ const MAX_STACK: usize = (CHILDREN - 1) * MAX_DEPTH + CHILDREN;
 /// One or more rays that traverse a hierarchy together.
 pub(super) trait Traverse<S: Simd> {
     /// The rays in the frame of a hierarchy.
-    type Origin;
+    type Relative;
 
-    /// The rays relative to the origin of a hierarchy with a grid.
-    fn relative_to(&self, simd: S, middle: DVec3, grid: &BoxGrid) -> Self::Origin;
+    /// The rays in the frame of a hierarchy with its middle and its grid.
+    fn relative_to(&self, simd: S, middle: DVec3, grid: &BoxGrid) -> Self::Relative;
 
     /// The children of a node that the rays may enter before their nearest hits: a bit mask, and the ranges at
     /// which they enter them, or lower [m].
-    fn enter(&self, simd: S, origin: &Self::Origin, node: &WideNode) -> (u32, [f32; CHILDREN]);
+    fn enter(&self, simd: S, rays: &Self::Relative, node: &WideNode) -> (u32, [f32; CHILDREN]);
 
     /// Nodes that are entered farther away are of no interest [m].
     fn until_m(&self) -> f32;
 
     /// Intersects the triangles of a leaf of a tile.
-    fn intersect(&mut self, simd: S, origin: &Self::Origin, block: &TriangleBlock, leaf: Leaf);
+    fn intersect(&mut self, simd: S, rays: &Self::Relative, block: &TriangleBlock, leaf: Leaf);
 }
 
-/// Ranges at which rays enter or leave boxes, from the bounds of the boxes in steps: per axis, a factor and a
+/// Ranges at which rays enter or leave boxes, from the bounds of the boxes in cells: per axis, a factor and a
 /// summand [m].
 #[derive(Clone, Copy)]
 pub(super) struct Slope<L> {
@@ -45,7 +45,7 @@ pub(super) struct Slope<L> {
 }
 
 impl<L: Lanes> Slope<L> {
-    /// Of an origin, and of the inverses of the coordinates of a direction.
+    /// Of an origin [steps of the lattice], and of the inverses of the coordinates of a direction [m per step].
     #[inline(always)]
     pub fn new<S: Simd<F32x8 = L>>(
         simd: S,
@@ -53,7 +53,7 @@ impl<L: Lanes> Slope<L> {
         origin: Vec3,
         inverse: &[f32; 3],
     ) -> Self {
-        let factor = |axis: usize| simd.splat(grid.cells[axis] * inverse[axis]);
+        let factor = |axis: usize| simd.splat(grid.cell[axis] * inverse[axis]);
         let summand = |axis: usize| simd.splat((grid.origin[axis] - origin[axis]) * inverse[axis]);
         Self {
             factor: [factor(0), factor(1), factor(2)],
@@ -142,20 +142,20 @@ impl Stack {
 pub(super) struct Traversal<'a, S: Simd, R: Traverse<S>> {
     simd: S,
     bvh: &'a WideBvh,
-    origin: &'a R::Origin,
+    relative: &'a R::Relative,
     stack: &'a mut Stack,
 }
 
 impl<'a, S: Simd, R: Traverse<S>> Traversal<'a, S, R> {
-    /// Starts at the root; `origin` is relative to that of the hierarchy.
+    /// Starts at the root, with the rays in the frame of the hierarchy.
     #[inline(always)]
-    pub fn new(simd: S, bvh: &'a WideBvh, origin: &'a R::Origin, stack: &'a mut Stack) -> Self {
+    pub fn new(simd: S, bvh: &'a WideBvh, relative: &'a R::Relative, stack: &'a mut Stack) -> Self {
         stack.pending[0] = Stack::ROOT;
         stack.count = usize::from(!bvh.nodes.is_empty());
         Self {
             simd,
             bvh,
-            origin,
+            relative,
             stack,
         }
     }
@@ -181,7 +181,7 @@ impl<'a, S: Simd, R: Traverse<S>> Traversal<'a, S, R> {
     #[inline(always)]
     fn open(&mut self, rays: &R, index: usize) -> Option<NodeRef> {
         let node = &self.bvh.nodes[index];
-        let (mut entered, near_m) = rays.enter(self.simd, self.origin, node);
+        let (mut entered, near_m) = rays.enter(self.simd, self.relative, node);
         if entered == 0 {
             return None;
         }

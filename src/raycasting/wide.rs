@@ -5,8 +5,9 @@
 //! *Getting Rid of Packets: Efficient SIMD Single-Ray Traversal using Multi-branching BVHs*,
 //! RT 2008.
 //!
-//! The boxes of the children are stored in 65,535 steps per axis over the box of the whole
-//! hierarchy, rounded outwards, and the children of one kind lie one after the other: 108 bytes.
+//! The boxes of the children are stored in cells of a grid over the box of the whole hierarchy,
+//! up to 65,500 per axis, rounded outwards, and the children of one kind lie one after the other:
+//! 128 bytes, two cache lines.
 
 use super::bvh::{Bvh, NodeRef};
 use super::simd::WIDTH;
@@ -20,7 +21,7 @@ type Bounds = [f32; 6];
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(64))]
 pub(super) struct WideNode {
-    /// Lower x of each child, lower y, …, upper z, in steps of the [`BoxGrid`].
+    /// Lower x of each child, lower y, …, upper z, in cells of the [`BoxGrid`].
     pub bounds: [[u16; CHILDREN]; 6],
     first_inner: u32,
     first_leaf: u32,
@@ -52,44 +53,44 @@ impl WideNode {
 pub(super) struct BoxGrid {
     /// Where a bound of zero lies [steps of the lattice].
     pub origin: [f32; 3],
-    /// Powers of two [steps of the lattice].
-    pub cells: [f32; 3],
+    /// Sides of a cell, powers of two [steps of the lattice].
+    pub cell: [f32; 3],
 }
 
 impl BoxGrid {
-    /// Steps that the boxes take up at most; the rest is for rounding.
-    const STEPS: f64 = 65_500.0;
+    /// Cells that the boxes take up at most; the rest is for rounding.
+    const CELLS: f64 = 65_500.0;
 
     /// A grid over a box.
     fn over(bounds: &Bounds) -> Self {
         let mut grid = Self::default();
         for axis in 0..3 {
             let [min, max] = [bounds[axis], bounds[axis + 3]].map(f64::from);
-            let step_m = ((max - min) / Self::STEPS).max(1e-30).log2().ceil().exp2();
-            grid.cells[axis] = step_m as f32;
-            grid.origin[axis] = (min - 2.0 * step_m) as f32;
+            let cell = ((max - min) / Self::CELLS).max(1e-30).log2().ceil().exp2();
+            grid.cell[axis] = cell as f32;
+            grid.origin[axis] = (min - 2.0 * cell) as f32;
         }
         grid
     }
 
-    /// A bound in steps, rounded outwards.
-    fn steps(&self, side: usize, bound: f32) -> u16 {
-        /// Boxes are enlarged by this part of a step: more than rounding moves a side.
+    /// A bound [steps of the lattice] in cells, rounded outwards.
+    fn cell_of(&self, side: usize, bound: f32) -> u16 {
+        /// Boxes are enlarged by this part of a cell: more than rounding moves a side.
         const SLACK: f64 = 0.05;
         let axis = side % 3;
-        let steps = (f64::from(bound) - f64::from(self.origin[axis])) / f64::from(self.cells[axis]);
+        let cells = (f64::from(bound) - f64::from(self.origin[axis])) / f64::from(self.cell[axis]);
         match side < 3 {
-            true => (steps - SLACK).floor() as u16,
-            false => (steps + SLACK).ceil() as u16,
+            true => (cells - SLACK).floor() as u16,
+            false => (cells + SLACK).ceil() as u16,
         }
     }
 
-    /// The box of a child of a node.
+    /// The box of a child of a node [steps of the lattice].
     #[inline(always)]
     pub fn bounds_of(&self, node: &WideNode, place: usize) -> Bounds {
         let bound = |side: usize| {
             let axis = side % 3;
-            f32::from(node.bounds[side][place]) * self.cells[axis] + self.origin[axis]
+            f32::from(node.bounds[side][place]) * self.cell[axis] + self.origin[axis]
         };
         [bound(0), bound(1), bound(2), bound(3), bound(4), bound(5)]
     }
@@ -151,7 +152,7 @@ impl WideBvh {
         };
         for (place, (bounds, _)) in children.iter().enumerate() {
             for (side, &bound) in bounds.iter().enumerate() {
-                node.bounds[side][place] = self.grid.steps(side, bound);
+                node.bounds[side][place] = self.grid.cell_of(side, bound);
             }
         }
         leaves.extend(children[inner..].iter().map(|(_, leaf)| leaf.index()));
@@ -227,11 +228,11 @@ mod tests {
                 let [a, b, c, d, e, f] = wide.grid.bounds_of(node, place);
                 let Aabb { min, max } = boxes[prim];
                 assert!(Vec3::new(a, b, c).cmple(min).all() && max.cmple(Vec3::new(d, e, f)).all());
-                // Two steps of the grid on either side.
-                let cells = Vec3::from_array(wide.grid.cells);
+                // Two cells of the grid on either side.
+                let cell = Vec3::from_array(wide.grid.cell);
                 assert!(
                     (Vec3::new(d, e, f) - Vec3::new(a, b, c))
-                        .cmple(max - min + 4.0 * cells)
+                        .cmple(max - min + 4.0 * cell)
                         .all()
                 );
             }

@@ -7,6 +7,7 @@ use super::rows::{MetricRow, length};
 use crate::evaluation::Summary;
 use crate::geometry::Pose2;
 use crate::localization::State;
+use crate::localization::particles::long_axis_m;
 
 /// States, uncertainty and agreement with the map over the frames of a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -58,10 +59,7 @@ impl RunSummary {
                 .map(|places| places.iter().filter(|&&places| places > 1.0).count()),
             path_m,
             speed_m_per_s: duration_s.filter(|&s| s > 0.0).map(|s| path_m / s),
-            position_sigma_m: over_tracked(&|row| {
-                let position = covariance(row)?.fixed_view::<2, 2>(0, 0).into_owned();
-                Some(position.symmetric_eigenvalues().max().max(0.0).sqrt())
-            }),
+            position_sigma_m: over_tracked(&|row| Some(long_axis_m(&covariance(row)?))),
             heading_sigma_rad: over_tracked(&|row| Some(covariance(row)?[(2, 2)].max(0.0).sqrt())),
             agreement: over_tracked(&|row| {
                 let share = results.agreements.as_ref()?[row];

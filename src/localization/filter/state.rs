@@ -9,7 +9,7 @@ use crate::lidar::PERIOD_S;
 use crate::localization::config::LocalizerConfig;
 use crate::localization::convergence::is_narrow;
 use crate::localization::estimate::Estimate;
-use crate::localization::particles::{ParticleSet, spread};
+use crate::localization::particles::{ParticleSet, long_axis_m, spread};
 use crate::localization::tracking_loss::{AgreementMonitor, State};
 use crate::map::{GroundPatch, Map, PanoramaRequest, SensorAttitude};
 
@@ -173,9 +173,7 @@ impl ParticleFilter {
 
     /// Whether a position with a covariance is too uncertain to be called tracked.
     pub(super) fn is_too_wide(&self, covariance: &Matrix3<f64>) -> bool {
-        let position = covariance.fixed_view::<2, 2>(0, 0).into_owned();
-        let largest_m = position.symmetric_eigenvalues().max().max(0.0).sqrt();
-        largest_m > self.config.tracking_loss.sure_spread_m
+        long_axis_m(covariance) > self.config.tracking_loss.sure_spread_m
     }
 
     /// Ground patch under a pose near the particles.
