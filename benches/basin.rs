@@ -12,7 +12,9 @@
 
 #![allow(clippy::print_stdout, reason = "the table")]
 
-use std::path::{Path, PathBuf};
+mod process;
+
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -60,11 +62,7 @@ const PLACERS: [(&str, Placer); 6] = [
 ];
 
 fn main() -> Result<(), Failure> {
-    let arguments: Vec<PathBuf> = (std::env::args_os().skip(1))
-        .map(PathBuf::from)
-        .filter(|argument| argument != Path::new("--bench"))
-        .collect();
-    let [map_file, recording] = arguments.as_slice() else {
+    let [map_file, recording] = &*process::files() else {
         println!("skipped: give a map and a recording with poses");
         return Ok(());
     };
@@ -254,18 +252,24 @@ impl RangeRenderer for Counting {
         self.inner.render(poses, model)
     }
 
-    fn cast(&self, poses: &[Pose3], directions: &[Vec3]) -> Result<Vec<Vec<f32>>, RenderError> {
+    fn cast(
+        &self,
+        poses: &[Pose3],
+        directions: &[Vec3],
+        until_m: f32,
+    ) -> Result<Vec<Vec<f32>>, RenderError> {
         self.count(poses.len() * directions.len());
-        self.inner.cast(poses, directions)
+        self.inner.cast(poses, directions, until_m)
     }
 
     fn surfaces(
         &self,
         pose: &Pose3,
         directions: &[Vec3],
+        until_m: f32,
     ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
         self.count(directions.len());
-        self.inner.surfaces(pose, directions)
+        self.inner.surfaces(pose, directions, until_m)
     }
 
     fn compare(

@@ -26,6 +26,8 @@
     reason = "a bench stops at the first error and prints its measurements"
 )]
 
+mod process;
+
 use std::path::Path;
 use std::time::Instant;
 
@@ -191,7 +193,7 @@ fn run_once(count: usize, depth: u32) {
         "{count} points, depth {depth}: {:.2} s wall, {:.2} s CPU, peak {} MB, {} triangles",
         start.elapsed().as_secs_f64(),
         cpu_s() - cpu,
-        peak_mb(),
+        process::memory_mib("VmHWM"),
         surface.mesh.triangles.len()
     );
     evaluate(&surface.mesh);
@@ -293,12 +295,4 @@ fn cpu_s() -> f64 {
             .unwrap_or(0.0)
     };
     (ticks(11) + ticks(12)) / 100.0
-}
-
-/// Peak resident memory of this process (Linux; 0 elsewhere) [MB].
-fn peak_mb() -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
-    let kb = line.and_then(|line| line.split_whitespace().next()?.parse::<u64>().ok());
-    kb.unwrap_or(0) / 1024
 }

@@ -18,7 +18,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     map.save(map_file)?;
     println!(
         "{} triangles, {} key scans",
-        map.mesh.triangles.len(),
+        map.triangle_count(),
         map.path.map_from_lidar.len()
     );
     Ok(())

@@ -68,7 +68,7 @@
 //!
 //! | layer | modules |
 //! |---|---|
-//! | foundations | [`files`], [`geometry`], [`memory`], [`random`], [`statistics`], [`validation`] |
+//! | foundations | [`files`], [`geometry`], [`memory`], [`random`], [`shared_bytes`], `simd`, [`statistics`], [`validation`] |
 //! | sensor and rays | [`lidar`], [`raycasting`] |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
 //! | map | [`map`], [`odometry`], [`registration`], [`sensor`], [`simulation`] |
@@ -88,6 +88,8 @@ pub mod files;
 pub mod geometry;
 pub mod memory;
 pub mod random;
+pub mod shared_bytes;
+mod simd;
 pub mod statistics;
 pub mod validation;
 // Sensor and rays.

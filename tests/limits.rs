@@ -136,7 +136,7 @@ fn a_budget_of_memory_that_does_not_suffice_is_an_error_that_names_what_needs_it
     let expected = |what, key| [&parts[..], &[what, key]].concat();
     build().fails_with(&expected("the octree of the surface", "depth"));
     (build().set("range_image.height", "1024")).fails_with(&expected("range images", "width"));
-    (build().set("crop_x", "500")).fails_with(&expected("the plane around the drive", "crop_x"));
+    (build().set("crop_x", "500")).fails_with(&expected("the plane around a local map", "crop_x"));
     assert!(!recording.path("map.ply").exists());
 
     recording.fpmcl("build-map").succeeds();
@@ -144,7 +144,10 @@ fn a_budget_of_memory_that_does_not_suffice_is_an_error_that_names_what_needs_it
     let search = localize().set("initialization", "extent");
     (search.set("grid_res", "0.05")).fails_with(&expected("the search grid", "grid_res"));
     let search = localize().set("initialization", "corridor");
-    (search.set("grid_res", "0.05")).fails_with(&expected("the panoramas", "panorama.rows"));
+    let search = search
+        .set("grid_res", "0.05")
+        .set("panorama.columns", "360");
+    search.fails_with(&expected("the panoramas", "panorama.rows"));
     assert!(!recording.path("results/localization.npz").exists());
 
     let street = fpmcl("simulate").with(TINY);

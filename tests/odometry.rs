@@ -9,8 +9,11 @@ use std::path::Path;
 
 use common::{fpmcl, json, real_recording, run, simulate_two_drives};
 use fpmcl::geometry::Pose3;
+use fpmcl::map::mapped_ply::MappedPly;
+use fpmcl::map::ply;
 use fpmcl::recording::PoseTrack;
 use fpmcl::recording::poses::read_tum;
+use glam::DVec3;
 
 /// A street with a bend and traffic.
 const SIMULATION: &str = "\
@@ -183,6 +186,21 @@ fn a_second_drive_is_added_to_the_map_of_the_first_in_its_frame() {
     let joined = triangles("map.report.json") + changes["added_triangles"].as_u64().unwrap()
         - changes["gone_triangles"].as_u64().unwrap();
     assert_eq!(triangles("both.report.json"), joined);
+
+    // A thousand kilometres away, the poses in the world are the same.
+    let mut older = MappedPly::open(&folder.join("map.ply")).unwrap();
+    older.origin = DVec3::new(1_024_000.0, -1_024_000.0, 0.0);
+    let map_from_near = Pose3::translation(older.origin.x, older.origin.y, 0.0);
+    let mut path = older.path.clone().unwrap();
+    path.world_from_map *= map_from_near.inverse();
+    for pose in &mut path.map_from_lidar {
+        *pose = map_from_near * *pose;
+    }
+    ply::write_joined(&folder.join("far.ply"), &[&older], Some(&path)).unwrap();
+    build(&["street/drive_2", "--onto=far.ply", "--output=far_both.ply"]).succeeds();
+    let far = poses(&folder.join("far_both.poses_tum.txt"));
+    let apart_m = rmse_m(&far, &found);
+    assert!(apart_m < 2e-4, "{apart_m}");
 
     // The same drive again: the poses beside the map serve, and the map is the same.
     let map = fs::read(folder.join("both.ply")).unwrap();

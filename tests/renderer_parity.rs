@@ -10,20 +10,22 @@ mod common;
 
 use std::path::Path;
 
-use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
+use fpmcl::geometry::{Pose2, Pose3, TriangleMesh, Vec3};
 use fpmcl::lidar::{Beam, LidarModel, RangeImage};
+use fpmcl::localization::observation::ObservationConfig;
+use fpmcl::localization::particles::ParticleSet;
 use fpmcl::rendering::cpu::CpuRenderer;
 use fpmcl::rendering::gpu::{GpuRenderer, ImageMethod};
-use fpmcl::rendering::{Backend, RangeDifference, RangeRenderer, RenderError};
+use fpmcl::rendering::{Backend, RangeDifference, RangeRenderer, RenderError, RenderingMethod};
 
 use brute_force::{BruteForce, room, street};
 
-const METHODS: [ImageMethod; 2] = [ImageMethod::Cast, ImageMethod::Draw];
+const METHODS: [ImageMethod; 2] = [ImageMethod::Cast, ImageMethod::Raster];
 
 /// A renderer on any adapter; `None`, with a message, without one.
 #[expect(clippy::print_stderr, reason = "a skipped test reports it")]
 fn renderer(tiles: &[TriangleMesh]) -> Option<GpuRenderer> {
-    match GpuRenderer::new(tiles, Backend::Gpu, None) {
+    match GpuRenderer::new(tiles, (Backend::Gpu, RenderingMethod::Auto), None) {
         Ok(renderer) => Some(renderer),
         Err(RenderError::NoAdapter) => {
             let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|value| value == "1");
@@ -136,7 +138,9 @@ fn rendering_equals_casting_along_the_centre_rays() {
         ..small_model()
     };
     let poses = street_poses();
-    let rows = renderer.cast(&poses, &model.directions()).unwrap();
+    let rows = renderer
+        .cast(&poses, &model.directions(), f32::INFINITY)
+        .unwrap();
     for method in METHODS {
         assert_eq!(renderer.render_by(method, &poses, &model).unwrap(), rows);
     }
@@ -160,7 +164,7 @@ fn rays_in_any_direction_agree_with_brute_force() {
         .chain(spiral)
         .collect();
     let poses = street_poses();
-    let rows = renderer.cast(&poses, &directions).unwrap();
+    let rows = renderer.cast(&poses, &directions, f32::INFINITY).unwrap();
     let truth = BruteForce::new(&tiles);
     for (pose, row) in poses.iter().zip(&rows) {
         assert_ranges_agree(&truth, pose, &directions, row, "cast");
@@ -364,53 +368,208 @@ fn cpu_and_gpu_render_the_same_map_of_drive_0005() {
     }
 }
 
+/// The street on the lattice of maps, alone or 3 km from the middle of a map.
+fn streets_of_maps() -> [(&'static str, Vec<TriangleMesh>); 2] {
+    let mut near = street();
+    near.iter_mut().for_each(TriangleMesh::snap);
+    let mut outskirts = room(1.0, 1);
+    for vertex in &mut outskirts.vertices {
+        *vertex += Vec3::new(4800.0, -3600.0, 0.0);
+    }
+    let far = [near.clone(), vec![outskirts]].concat();
+    [
+        ("at the middle of the map", near),
+        ("3 km from the middle", far),
+    ]
+}
+
+/// A scan with noise of a few centimetres from a pose, and particles around it as while tracking.
+#[expect(clippy::unwrap_used, reason = "a failing test may panic")]
+fn scan_and_particles(cpu: &CpuRenderer) -> (RangeImage, Vec<Pose3>) {
+    let at = pose(3.1234, -1.2345, 1.7654, [0.02, -0.03, 1.1]);
+    let model = LidarModel::default();
+    let mut ranges = cpu.render(&[at], &model).unwrap().remove(0);
+    for (range_m, pixel) in ranges.iter_mut().zip(0_u16..) {
+        *range_m += 0.04 * (0.7 * f32::from(pixel)).sin();
+    }
+    let offset = |i: f64| {
+        let [x, y, turn] = [0.755, 0.570, 0.618].map(|step: f64| (i * step).fract() - 0.5);
+        at * pose(0.1 * x, 0.1 * y, 0.0, [0.0, 0.0, 0.006 * turn])
+    };
+    let particles = (0..100).map(f64::from).map(offset).collect();
+    (RangeImage::from_ranges(ranges, &model), particles)
+}
+
+/// Normalized weights of equal particles after an update by their mean costs.
+fn weights(config: &ObservationConfig, costs_m: &[f32]) -> Vec<f64> {
+    let mut particles = ParticleSet::uniform(vec![Pose2::identity(); costs_m.len()]);
+    let log = |cost_m: &f32| config.log_likelihood(f64::from(*cost_m));
+    particles.reweight(&costs_m.iter().map(log).collect::<Vec<_>>());
+    particles.weights()
+}
+
+/// Checks that weights differ by at most a factor of `1 + tolerance`, and that they are worth comparing.
+#[expect(clippy::unwrap_used, reason = "a failing test may panic")]
+fn assert_weights_agree(one: &[f64], other: &[f64], tolerance: f64, what: &str) {
+    let ratio = |(a, b): (&f64, &f64)| (a / b).ln().abs();
+    let largest = std::iter::zip(one, other).map(ratio).fold(0.0, f64::max);
+    assert!(
+        largest <= tolerance.ln_1p(),
+        "{what}: a factor of exp({largest:e})"
+    );
+    let [least, most] = [f64::min, f64::max].map(|f| one.iter().copied().reduce(f).unwrap());
+    assert!(
+        least > 0.0 && most > 1.01 * least,
+        "{what}: {least} to {most}"
+    );
+}
+
+/// Beams without those that pass an edge from some particle, so that rounding decides which surface they end on; these are
+/// at most one of 10,000 rays.
+#[expect(clippy::unwrap_used, reason = "a failing test may panic")]
+fn beams_beside_edges(
+    beams: &[Beam],
+    particles: &[Pose3],
+    renderers: [&dyn RangeRenderer; 2],
+    tiles: &[TriangleMesh],
+) -> Vec<Beam> {
+    let truth = BruteForce::new(tiles);
+    let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
+    let cast = |renderer: &dyn RangeRenderer| renderer.cast(particles, &directions, f32::INFINITY);
+    let [one, other] = renderers.map(|renderer| cast(renderer).unwrap());
+    let mut passes_edge = vec![false; beams.len()];
+    let mut count = 0;
+    for (pose, (one, other)) in particles.iter().zip(one.iter().zip(&other)) {
+        for (beam, &direction) in directions.iter().enumerate() {
+            let [one_m, other_m] = [one[beam], other[beam]];
+            if !agree(f64::from(one_m), other_m) {
+                let near = ranges_nearby(&truth, pose, direction);
+                let is_near = |range_m| near.iter().any(|&near_m| agree(near_m, range_m));
+                assert!(
+                    is_near(one_m) && is_near(other_m),
+                    "{one_m} m and {other_m} m"
+                );
+                (passes_edge[beam], count) = (true, count + 1);
+            }
+        }
+    }
+    assert!(count * 10_000 <= beams.len() * particles.len(), "{count}");
+    let kept = beams
+        .iter()
+        .zip(&passes_edge)
+        .filter(|(_, passes)| !**passes);
+    kept.map(|(beam, _)| *beam).collect()
+}
+
 #[test]
 fn cpu_and_gpu_give_particles_the_same_weights() {
+    /// A mean cost that differs by 4 µm, the step of a range of 50 m in `f32`, with the scale of 2 mm. With a hundred
+    /// particles, resampling changes a weight by about its own size.
+    const TOLERANCE: f64 = 0.002;
+    for (place, tiles) in streets_of_maps() {
+        let Some(gpu) = renderer(&tiles) else {
+            return;
+        };
+        let cpu = CpuRenderer::new(&tiles);
+        let (scan, particles) = scan_and_particles(&cpu);
+        let config = ObservationConfig::default();
+        for count in [300, 600, 3600] {
+            let every = scan.beams().count() / count;
+            let beams: Vec<Beam> = scan.beams().step_by(every).collect();
+            let beams = beams_beside_edges(&beams, &particles, [&cpu, &gpu], &tiles);
+            let [by_cpu, by_gpu] = [&cpu as &dyn RangeRenderer, &gpu].map(|renderer| {
+                let costs_m = renderer.compare(&particles, &beams, &config.difference());
+                weights(&config, &costs_m.unwrap())
+            });
+            let what = format!("{place}, {count} beams");
+            assert_weights_agree(&by_cpu, &by_gpu, TOLERANCE, &what);
+        }
+    }
+}
+
+#[test]
+fn both_methods_give_particles_the_same_weights_by_whole_images() {
+    /// Ranges are the same bits; they are added up in another order.
+    const OF_SUMS: f64 = 1e-5;
+    /// Of 50,000 pixels, a few pass an edge of a house on the other side, which moves the mean by a tenth of a millimetre
+    /// each: a ten-thousandth of the weight with a standard deviation of 2 m.
+    const OF_EDGES: f64 = 1e-3;
+    let config = ObservationConfig::reference();
+    for (place, tiles) in streets_of_maps() {
+        let Some(gpu) = renderer(&tiles) else {
+            return;
+        };
+        let cpu = CpuRenderer::new(&tiles);
+        let (scan, particles) = scan_and_particles(&cpu);
+        // As far apart as particles of a search, so that the wide likelihood tells them apart.
+        let start = particles[0];
+        let particles: Vec<Pose3> = (particles[..20].iter())
+            .map(|near| {
+                near * pose(
+                    30.0 * (near.translation.x - start.translation.x),
+                    1.0,
+                    0.0,
+                    [0.0; 3],
+                )
+            })
+            .collect();
+        let difference = config.difference();
+        let [cast, raster] = METHODS.map(|method| {
+            let costs_m = gpu.compare_images_by(method, &particles, &scan, &difference);
+            weights(&config, &costs_m.unwrap())
+        });
+        let by_cpu = cpu.compare_images(&particles, &scan, &difference).unwrap();
+        assert_weights_agree(&cast, &raster, OF_SUMS, place);
+        assert_weights_agree(&weights(&config, &by_cpu), &cast, OF_EDGES, place);
+        let chosen = gpu.compare_images(&particles, &scan, &difference).unwrap();
+        assert_weights_agree(&weights(&config, &chosen), &cast, OF_SUMS, place);
+    }
+}
+
+#[test]
+fn comparing_images_is_rendering_them_and_counting_the_costs() {
     let tiles = street();
-    let Some(renderer) = renderer(&tiles) else {
+    let Some(gpu) = renderer(&tiles) else {
         return;
     };
     let cpu = CpuRenderer::new(&tiles);
-    let at = pose(3.1, -1.2, 1.76, [0.02, -0.03, 1.1]);
-    let model = small_model();
-    let image = cpu.render(&[at], &model).unwrap().remove(0);
-    let beams: Vec<Beam> = RangeImage::from_ranges(image, &model)
-        .beams()
-        .step_by(3)
-        .collect();
-    let particles: Vec<Pose3> = (0..60)
-        .map(|i| {
-            let i = f64::from(i);
-            let offset = pose(
-                i.sin(),
-                (1.7 * i).cos(),
-                0.0,
-                [0.0, 0.0, 0.02 * (0.9 * i).sin()],
-            );
-            at * offset
-        })
-        .collect();
-    for (difference, sigma) in [
-        (RangeDifference::UNLIMITED, 2.0),
-        (RangeDifference::truncated(0.5), 0.05),
-    ] {
-        let weights = |costs: Vec<f32>| -> Vec<f64> {
-            let likelihood = |cost: &f32| (-0.5 * (f64::from(*cost) / sigma).powi(2)).exp();
-            let likelihoods: Vec<f64> = costs.iter().map(likelihood).collect();
-            let sum: f64 = likelihoods.iter().sum();
-            likelihoods
-                .iter()
-                .map(|likelihood| likelihood / sum)
-                .collect()
-        };
-        let by_gpu = weights(renderer.compare(&particles, &beams, &difference).unwrap());
-        let by_cpu = weights(cpu.compare(&particles, &beams, &difference).unwrap());
-        for (gpu, cpu) in by_gpu.iter().zip(&by_cpu) {
-            assert!((gpu - cpu).abs() < 1e-4, "{difference:?}: {gpu} {cpu}");
+    // A car is nearer than the least range, the ends of the street farther than the greatest.
+    let model = LidarModel {
+        min_range: 5.0,
+        max_range: 30.0,
+        ..small_model()
+    };
+    let poses = street_poses();
+    let ranges = cpu.render(&poses[..1], &model).unwrap().remove(0);
+    let scan = RangeImage::from_ranges(ranges, &model);
+    let limited = RangeDifference {
+        short_m: 0.4,
+        long_m: 0.8,
+        no_surface_m: 0.4,
+    };
+    for difference in [RangeDifference::UNLIMITED, limited] {
+        let images = cpu.render(&poses, &model).unwrap();
+        let expected = images.iter().map(|image| {
+            let returns = (0..model.len()).filter(|&pixel| scan.has_return(pixel));
+            let costs = returns.map(|pixel| difference.cost(scan.ranges[pixel], image[pixel]));
+            let costs: Vec<f64> = costs.map(f64::from).collect();
+            costs.iter().sum::<f64>() / costs.len() as f64
+        });
+        let expected: Vec<f64> = expected.collect();
+        assert!(expected[0] == 0.0 && expected[1] > 0.1, "{expected:?}");
+        let by_cpu = cpu.compare_images(&poses, &scan, &difference).unwrap();
+        let by_gpu = METHODS.map(|method| {
+            let costs_m = gpu.compare_images_by(method, &poses, &scan, &difference);
+            costs_m.unwrap()
+        });
+        for costs_m in [&by_cpu, &by_gpu[0], &by_gpu[1]] {
+            for (cost_m, expected) in costs_m.iter().zip(&expected) {
+                assert!(
+                    (f64::from(*cost_m) - expected).abs() < 2e-3,
+                    "{cost_m} {expected}"
+                );
+            }
         }
-        let min = by_cpu.iter().copied().fold(f64::INFINITY, f64::min);
-        let max = by_cpu.iter().copied().fold(0.0, f64::max);
-        assert!(max > 1.2 * min, "all weights are equal");
     }
 }
 
@@ -460,7 +619,7 @@ fn ranges_far_from_the_map_origin_agree_with_brute_force() {
         .map(|pose| translation * pose)
         .collect();
     let directions: Vec<Vec3> = small_model().directions().into_iter().step_by(7).collect();
-    let rows = renderer.cast(&poses, &directions).unwrap();
+    let rows = renderer.cast(&poses, &directions, f32::INFINITY).unwrap();
     for (pose, row) in poses.iter().zip(&rows) {
         assert_ranges_agree(&truth, pose, &directions, row, "far away");
     }
@@ -502,9 +661,54 @@ fn without_poses_or_rays_the_result_is_empty() {
         assert!(renderer.render_by(method, &[], &model).unwrap().is_empty());
     }
     assert_eq!(
-        renderer.cast(&street_poses(), &[]).unwrap(),
+        renderer.cast(&street_poses(), &[], f32::INFINITY).unwrap(),
         vec![Vec::<f32>::new(); 3]
     );
     let costs = renderer.compare(&street_poses(), &[], &RangeDifference::UNLIMITED);
     assert_eq!(costs.unwrap(), [0.0; 3]);
+}
+
+#[test]
+fn the_program_rasterizes_or_casts_whole_images_with_the_same_result() {
+    if renderer(&street()).is_none() {
+        return;
+    }
+    let recording = common::Recording::street(6);
+    recording.fpmcl("build-map").succeeds();
+    let localize = |backend: &str, method: &str| {
+        common::fpmcl("localize")
+            .in_folder(recording.folder())
+            .with("localization.yml")
+            .with(format!("--backend={backend}"))
+            .set("observation.likelihood", "reference")
+            .set("proposal.scan", "False")
+            .set("rendering.method", method)
+            .set(
+                "result_path",
+                &format!("{backend}_{method}/localization.npz"),
+            )
+    };
+    let errors_m = ["raster", "cast", "auto"].map(|method| {
+        let printed = localize("gpu", method).succeeds().stderr;
+        let measured = "ms by casting rays and";
+        assert_eq!(printed.contains(measured), method == "auto", "{printed}");
+        let table = recording.bytes(&format!("gpu_{method}/frames.csv"));
+        let table = String::from_utf8(table).unwrap();
+        let mut rows = table.lines().map(|row| row.split(',').collect::<Vec<_>>());
+        let names = rows.next().unwrap();
+        let column = names
+            .iter()
+            .position(|name| *name == "mcl_position_error_m");
+        let error_m = |row: Vec<&str>| row[column.unwrap()].parse::<f64>().unwrap();
+        rows.map(error_m).collect::<Vec<_>>()
+    });
+    assert!(
+        errors_m[0].len() == 6 && errors_m[0].iter().all(|m| *m < 5.0),
+        "{errors_m:?}"
+    );
+    for other in &errors_m[1..] {
+        let apart = std::iter::zip(&errors_m[0], other).map(|(a, b)| (a - b).abs());
+        assert!(apart.fold(0.0, f64::max) < 1e-3, "{errors_m:?}");
+    }
+    localize("cpu", "raster").fails_with(&["rendering.method is raster", "--backend gpu"]);
 }

@@ -19,7 +19,7 @@ use crate::settings;
 
 /// Estimates the pose of a car in a map from its scans. The same seed gives the same estimates.
 ///
-/// ``start``: ``"anywhere"`` (the default), ``"road"`` (anywhere along the mapping drive), or a pose nearby: (3,), x, y
+/// ``start``: ``"anywhere"`` (the default in maps of up to 1 km²), ``"road"`` (anywhere along the mapping drive), or a pose nearby: (3,), x, y
 /// [m] and heading [rad], or (4, 4). ``sensor``: by default inferred from the first scan, which does not show the own car;
 /// better that of a Recording. Settings: ``fpmcl config localize --full``, such as ``seed``, ``numParticles``, and
 /// ``odometry="none"`` for constant velocity where no motion is given.
@@ -51,7 +51,7 @@ impl Localizer {
         };
         let mut new = Self {
             map: map.map.clone(),
-            start: start_of(start, &config)?,
+            start: start_of(start, &config, &map.map)?,
             config,
             localizer: None,
             odometer,
@@ -149,10 +149,14 @@ impl Given {
     }
 }
 
-/// Where the car starts: anywhere, `"road"`, or near a pose.
-fn start_of(start: Option<&Bound<'_, PyAny>>, config: &LocalizationConfig) -> PyResult<Start> {
+/// Where the car starts: `"anywhere"`, `"road"`, or near a pose; `None` if that is unknown.
+fn start_of(
+    start: Option<&Bound<'_, PyAny>>,
+    config: &LocalizationConfig,
+    map: &fpmcl::map::Map,
+) -> PyResult<Start> {
     let Some(start) = start else {
-        return Ok(Start::Anywhere);
+        return Ok(Start::unknown(map));
     };
     if let Ok(word) = start.extract::<String>() {
         return match word.as_str() {

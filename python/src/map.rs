@@ -2,11 +2,11 @@
 
 use std::ops::ControlFlow;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use anyhow::anyhow;
 use fpmcl::app::config::{BuildMapConfig, LocalizationConfig};
-use fpmcl::geometry::Pose3;
+use fpmcl::geometry::{Pose3, TriangleMesh};
 use fpmcl::lidar::Motion;
 use fpmcl::map::{self, BuildError, MapBuilder, MapOptions, MappingPath};
 use fpmcl::rendering::Backend;
@@ -27,6 +27,27 @@ use crate::settings;
 #[pyclass(frozen, module = "fpmcl")]
 pub struct Map {
     pub map: map::Map,
+    /// Read on first use, for the views.
+    mesh: OnceLock<Arc<TriangleMesh>>,
+}
+
+impl From<map::Map> for Map {
+    fn from(map: map::Map) -> Self {
+        Self {
+            map,
+            mesh: OnceLock::new(),
+        }
+    }
+}
+
+impl Map {
+    fn mesh(&self) -> PyResult<&TriangleMesh> {
+        if let Some(mesh) = self.mesh.get() {
+            return Ok(mesh);
+        }
+        let mesh = self.map.mesh().map_err(raised)?;
+        Ok(self.mesh.get_or_init(|| mesh))
+    }
 }
 
 #[pymethods]
@@ -39,7 +60,7 @@ impl Map {
     fn load(py: Python<'_>, path: PathBuf, backend: &str) -> PyResult<Self> {
         let options = options(backend)?;
         let map = released(py, || map::Map::load(&path, &options))?;
-        Ok(Self { map })
+        Ok(Self::from(map))
     }
 
     /// Writes the map as a PLY file, which is complete by itself; an existing file is replaced.
@@ -90,20 +111,20 @@ impl Map {
             .take();
         match signal {
             Some(interrupt) => Err(interrupt),
-            None => built.map(|map| Self { map }),
+            None => built.map(Self::from),
         }
     }
 
     /// Vertices, (V, 3) float32 [m]; read-only, not a copy.
     #[getter]
     fn vertices<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArrayDyn<f32>>> {
-        arrays::view_of_vectors(&slf.get().map.mesh.vertices, slf.as_any())
+        arrays::view_of_vectors(&slf.get().mesh()?.vertices, slf.as_any())
     }
 
     /// Indices of the vertices of each triangle, (T, 3) uint32; read-only, not a copy.
     #[getter]
     fn triangles<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArrayDyn<u32>>> {
-        let triangles = &slf.get().map.mesh.triangles;
+        let triangles = &slf.get().mesh()?.triangles;
         arrays::view(
             triangles.as_flattened(),
             &[triangles.len(), 3],
@@ -114,7 +135,7 @@ impl Map {
     /// Colours of the vertices, red, green, blue, (V, 3) uint8; red is ground. Read-only, not a copy.
     #[getter]
     fn colors<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyArrayDyn<u8>>> {
-        let colors = &slf.get().map.mesh.colors;
+        let colors = &slf.get().mesh()?.colors;
         arrays::view(colors.as_flattened(), &[colors.len(), 3], slf.as_any())
     }
 
@@ -137,7 +158,7 @@ impl Map {
     }
 
     fn __repr__(&self) -> String {
-        format!("<fpmcl.Map: {} triangles>", self.map.mesh.triangles.len())
+        format!("<fpmcl.Map: {} triangles>", self.map.triangle_count())
     }
 }
 
@@ -246,7 +267,11 @@ pub fn cast_rays<'py>(
             directions[row]
         )));
     }
-    let mut ranges = released(py, || map.map.renderer.cast(&map_from_lidar, &directions))?;
+    let mut ranges = released(py, || {
+        map.map
+            .renderer
+            .cast(&map_from_lidar, &directions, f32::INFINITY)
+    })?;
     Ok(match (poses.ndim(), ranges.len()) {
         (2, 1) => ranges.swap_remove(0).into_pyarray(py).into_any(),
         (_, count) => Array2::from_shape_vec((count, directions.len()), ranges.concat())

@@ -298,6 +298,29 @@ pub struct BuildMapArgs {
     /// Map to which the recording is added: it is localized there, and what has changed is replaced. Sets the key `onto`.
     #[arg(long, value_name = "MAP")]
     pub onto: Option<PathBuf>,
+
+    /// Find the poses, print one independent command per local map that is not finished, and exit.
+    #[arg(long, group = "part")]
+    pub list_jobs: bool,
+
+    /// Build one local map only, by its number.
+    #[arg(long, value_name = "NUMBER", group = "part")]
+    pub job: Option<usize>,
+
+    /// Join the local maps that jobs have built.
+    #[arg(long, group = "part")]
+    pub collect: bool,
+}
+
+/// A part of the work of `build-map`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BuildPart {
+    /// Find the poses, and print a command per local map that is not finished.
+    List,
+    /// Build a local map by its number.
+    LocalMap(usize),
+    /// Join the finished local maps.
+    Collect,
 }
 
 /// Arguments of `localize`.
@@ -673,6 +696,15 @@ impl OdometryArgs {
 }
 
 impl BuildMapArgs {
+    /// The part of the work that is asked for; `None` for all of it.
+    pub fn part(&self) -> Option<BuildPart> {
+        match self.job {
+            Some(number) => Some(BuildPart::LocalMap(number)),
+            None if self.list_jobs => Some(BuildPart::List),
+            None => self.collect.then_some(BuildPart::Collect),
+        }
+    }
+
     /// Settings of the flags that stand for a key.
     pub fn flags(&self) -> Vec<(String, String)> {
         let input = self.run.source.input();

@@ -12,9 +12,9 @@
 //! the scan, or a hole); miss: no surface. The distance of the returns to the nearest surface shows
 //! how much of the world is in the map.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
-use glam::{IVec3, Vec3};
+use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -31,7 +31,7 @@ pub(super) const NEAR_M: f32 = 0.1;
 /// Shorter beams are not evaluated [m].
 const NEAREST_M: f32 = 3.0;
 /// Edge of the cells in which residuals are averaged for a picture [m].
-const PICTURE_CELL_M: f32 = 0.5;
+const PICTURE_CELL_M: f64 = 0.5;
 /// Every n-th beam is evaluated.
 const BEAM_STEP: usize = 7;
 
@@ -112,28 +112,6 @@ pub fn residuals<E: Send>(
     Ok(beams)
 }
 
-/// Returns per vertex the mean beam-plane distance around it, for a picture [m]; NaN where no beam was
-/// evaluated. Gross residuals count as 0.5 m.
-pub fn vertex_residuals(mesh: &TriangleMesh, beams: &[BeamResidual]) -> Vec<f32> {
-    let cell_of = |point: Vec3| (point / PICTURE_CELL_M).floor().as_ivec3();
-    let mut cells: HashMap<IVec3, (f32, f32)> = HashMap::new();
-    for beam in beams {
-        if let Some(point) = beam.stopped_at {
-            let (sum, count) = cells.entry(cell_of(point)).or_default();
-            *sum += beam.beam_plane_m.min(GROSS_M);
-            *count += 1.0;
-        }
-    }
-    mesh.vertices
-        .iter()
-        .map(|&vertex| {
-            cells
-                .get(&cell_of(vertex))
-                .map_or(f32::NAN, |(sum, count)| sum / count)
-        })
-        .collect()
-}
-
 fn compare(
     mesh: &TriangleMesh,
     scene: &Scene,
@@ -172,44 +150,116 @@ fn compare(
         .collect()
 }
 
-impl MapQuality {
-    /// Summarizes residuals; `None` without any.
-    pub fn of(residuals: &[BeamResidual]) -> Option<Self> {
-        let hits: Vec<&BeamResidual> = residuals
-            .iter()
-            .filter(|beam| beam.residual_m.is_finite())
-            .collect();
-        if hits.is_empty() {
-            return None;
+/// Sums over the residuals of any number of scans, in bounded memory.
+#[derive(Clone, Debug, Default)]
+pub struct ResidualSums {
+    beams: usize,
+    hits: usize,
+    early: usize,
+    late: usize,
+    near_plane: usize,
+    near_point: usize,
+    beam_plane_m: Quantiles,
+    point_m: Quantiles,
+    ray_m: Quantiles,
+    bias_m: Quantiles,
+    /// Sum and number of the distances in cells of [`PICTURE_CELL_M`] where beams end.
+    cells: HashMap<IVec3, (f32, f32)>,
+}
+
+impl ResidualSums {
+    /// Adds the residuals of scans, whose points are relative to `origin` [m].
+    pub fn add(&mut self, residuals: &[BeamResidual], origin: DVec3) {
+        for beam in residuals {
+            self.beams += 1;
+            self.near_point += usize::from(beam.point_m < NEAR_M);
+            self.point_m.add(beam.point_m);
+            if beam.residual_m.is_finite() {
+                self.hits += 1;
+                self.early += usize::from(beam.residual_m < -GROSS_M);
+                self.late += usize::from(beam.residual_m > GROSS_M);
+                self.near_plane += usize::from(beam.beam_plane_m < NEAR_M);
+                self.beam_plane_m.add(beam.beam_plane_m);
+                self.ray_m.add(beam.residual_m.abs());
+                self.bias_m.add(beam.residual_m);
+            }
+            if let Some(point) = beam.stopped_at {
+                let cell = picture_cell(origin + point.as_dvec3());
+                let (sum, count) = self.cells.entry(cell).or_default();
+                *sum += beam.beam_plane_m.min(GROSS_M);
+                *count += 1.0;
+            }
         }
-        let share = |count: usize| count as f64 / residuals.len() as f64;
-        let count =
-            |of: &dyn Fn(&BeamResidual) -> bool| share(hits.iter().filter(|beam| of(beam)).count());
-        Some(Self {
-            beams: residuals.len(),
-            early: count(&|beam| beam.residual_m < -GROSS_M),
-            late: count(&|beam| beam.residual_m > GROSS_M),
-            miss: share(residuals.len() - hits.len()),
-            beam_plane_median_m: median(hits.iter().map(|beam| beam.beam_plane_m)),
-            beam_plane_within_10cm: count(&|beam| beam.beam_plane_m < NEAR_M),
-            point_median_m: median(residuals.iter().map(|beam| beam.point_m)),
-            point_within_10cm: share(
-                residuals
-                    .iter()
-                    .filter(|beam| beam.point_m < NEAR_M)
-                    .count(),
-            ),
-            ray_median_m: median(hits.iter().map(|beam| beam.residual_m.abs())),
-            bias_m: median(hits.iter().map(|beam| beam.residual_m)),
+    }
+
+    /// The summary; `None` where no beam hit the map.
+    pub fn quality(&self) -> Option<MapQuality> {
+        let share = |count: usize| count as f64 / self.beams as f64;
+        (self.hits > 0).then(|| MapQuality {
+            beams: self.beams,
+            early: share(self.early),
+            late: share(self.late),
+            miss: share(self.beams - self.hits),
+            beam_plane_median_m: self.beam_plane_m.median(),
+            beam_plane_within_10cm: share(self.near_plane),
+            point_median_m: self.point_m.median(),
+            point_within_10cm: share(self.near_point),
+            ray_median_m: self.ray_m.median(),
+            bias_m: self.bias_m.median(),
+        })
+    }
+
+    /// Per vertex the mean beam-plane distance around it, for a picture [m]; NaN where no beam was evaluated. Gross
+    /// residuals count as 0.5 m.
+    pub fn at_vertices(&self, mesh: &TriangleMesh) -> Vec<f32> {
+        let mean = |vertex: &Vec3| {
+            let cell = self.cells.get(&picture_cell(vertex.as_dvec3()));
+            cell.map_or(f32::NAN, |(sum, count)| sum / count)
+        };
+        mesh.vertices.iter().map(mean).collect()
+    }
+}
+
+fn picture_cell(point: DVec3) -> IVec3 {
+    (point / PICTURE_CELL_M).floor().as_ivec3()
+}
+
+/// Numbers of values in intervals of a thousandth of the values.
+#[derive(Clone, Debug, Default)]
+struct Quantiles {
+    counts: BTreeMap<i32, usize>,
+}
+
+impl Quantiles {
+    /// Bits of the fraction that are ignored.
+    const DROPPED_BITS: u32 = 13;
+
+    fn add(&mut self, value: f32) {
+        *self
+            .counts
+            .entry(ordered(value.to_bits().cast_signed()) >> Self::DROPPED_BITS)
+            .or_default() += 1;
+    }
+
+    /// The middle of the interval of the median; NaN without values.
+    fn median(&self) -> f64 {
+        let half = self.counts.values().sum::<usize>() / 2;
+        let mut below = 0;
+        let found = self.counts.iter().find(|(_, count)| {
+            below += **count;
+            below > half
+        });
+        found.map_or(f64::NAN, |(interval, _)| {
+            let middle = (interval << Self::DROPPED_BITS) + (1 << (Self::DROPPED_BITS - 1));
+            let value = f32::from_bits(ordered(middle).cast_unsigned());
+            f64::from(if value.is_nan() { f32::INFINITY } else { value })
         })
     }
 }
 
-fn median(values: impl Iterator<Item = f32>) -> f64 {
-    let mut values: Vec<f32> = values.collect();
-    let middle = values.len() / 2;
-    let (_, median, _) = values.select_nth_unstable_by(middle, f32::total_cmp);
-    f64::from(*median)
+/// The bits of a float as a number of the same order, and back.
+fn ordered(bits: i32) -> i32 {
+    bits ^ ((bits >> 31).cast_unsigned() >> 1).cast_signed()
 }
 
 #[cfg(test)]
@@ -232,7 +282,12 @@ mod tests {
     fn quality_of(wall_x: f32, points: &[Vec3]) -> MapQuality {
         let mesh = wall(wall_x);
         let identity = Rigid3f::from(&crate::geometry::Pose3::identity());
-        MapQuality::of(&compare(&mesh, &Scene::new(&mesh), &identity, points)).unwrap()
+        let mut sums = ResidualSums::default();
+        for point in points {
+            let residuals = compare(&mesh, &Scene::new(&mesh), &identity, &[*point]);
+            sums.add(&residuals, DVec3::ZERO);
+        }
+        sums.quality().unwrap()
     }
 
     #[test]
@@ -264,9 +319,31 @@ mod tests {
             stopped_at: Some(Vec3::new(x, 0.2, 0.2)),
         };
         let beams = [beam(0.1, 10.1), beam(9.0, 10.3), beam(0.2, 12.0)];
-        let values = vertex_residuals(&mesh, &beams);
+        let mut sums = ResidualSums::default();
+        sums.add(&beams[..2], DVec3::ZERO);
+        // As in a frame 2 m away.
+        let moved = beams.map(|beam| BeamResidual {
+            stopped_at: beam.stopped_at.map(|point| point - 2.0 * Vec3::X),
+            ..beam
+        });
+        sums.add(&moved[2..], 2.0 * DVec3::X);
+        let values = sums.at_vertices(&mesh);
         assert!((values[0] - 0.3).abs() < 1e-6);
         assert!(values[1].is_nan());
+    }
+
+    #[test]
+    fn a_median_is_that_of_the_sorted_values_to_a_thousandth() {
+        let values: Vec<f32> = (0..501).map(|i| (i as f32 * 0.37).sin().powi(3)).collect();
+        let mut sorted = values.clone();
+        sorted.sort_unstable_by(f32::total_cmp);
+        let mut quantiles = Quantiles::default();
+        assert!(quantiles.median().is_nan());
+        values.iter().for_each(|&value| quantiles.add(value));
+        let expected = f64::from(sorted[250]);
+        assert!((quantiles.median() - expected).abs() <= 1e-3 * expected.abs());
+        (0..600).for_each(|_| quantiles.add(f32::INFINITY));
+        assert_eq!(quantiles.median(), f64::INFINITY);
     }
 
     #[test]

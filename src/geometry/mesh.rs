@@ -1,10 +1,15 @@
 //! Triangle meshes with vertex normals and colors, and axis-aligned boxes.
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 
 /// Step of the lattice of map vertices, 0.49 mm: a power of two, so that sums and differences of its points are exact
 /// in `f32` up to 8 km [m].
 pub const STEP_M: f32 = 1.0 / 2048.0;
+
+/// The nearest point of the lattice of map vertices.
+pub fn on_lattice(position: DVec3) -> DVec3 {
+    (position / f64::from(STEP_M)).round() * f64::from(STEP_M)
+}
 
 /// Triangles over shared vertices. `normals` and `colors` are per vertex; either is empty
 /// if unknown, otherwise as long as `vertices`.

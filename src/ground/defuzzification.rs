@@ -50,14 +50,29 @@ impl CentroidDefuzzifier {
     }
 
     /// Returns the centroids for `N` columns of firing strengths, `strengths[set][column]`.
-    #[inline]
+    #[inline(always)]
     pub(super) fn defuzzify<const N: usize>(&self, strengths: &[[f32; N]]) -> [f32; N] {
-        std::array::from_fn(|i| match strengths {
-            [a, b, c] if a[i].max(b[i]).max(c[i]) >= MIN_TABULATED => {
-                self.interpolate([a[i], b[i], c[i]])
+        let [a, b, c] = strengths else {
+            return std::array::from_fn(|i| self.integrate(strengths.iter().map(|set| set[i])));
+        };
+        // The strengths of neighbouring points are mostly the same.
+        let mut last = ([0.0; 3], UNDECIDED);
+        std::array::from_fn(|i| {
+            let strengths = [a[i], b[i], c[i]];
+            if strengths != last.0 {
+                last = (strengths, self.centroid(strengths));
             }
-            _ => self.integrate(strengths.iter().map(|set| set[i])),
+            last.1
         })
+    }
+
+    /// Returns the centroid for the firing strengths of three output sets.
+    fn centroid(&self, strengths: [f32; 3]) -> f32 {
+        if strengths.into_iter().fold(0.0, f32::max) >= MIN_TABULATED {
+            self.interpolate(strengths)
+        } else {
+            self.integrate(strengths.into_iter())
+        }
     }
 
     /// Integrates the centroid over the union of the implied output sets; [`UNDECIDED`] where all

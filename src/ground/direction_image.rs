@@ -10,9 +10,11 @@ use glam::Vec3;
 /// of elevation: finer than the beams of any sensor, so that these need not be known.
 #[derive(Clone, Debug)]
 pub(super) struct DirectionImage {
-    /// One more than the index of a return, 0 where there is none. Column by column, because
-    /// neighbours are mostly searched vertically, with empty rows below each column.
-    cells: Vec<u32>,
+    /// Ranks of the returns in their columns, from 1; 0 where there is none. Column by column,
+    /// because neighbours are mostly searched vertically, with empty rows below each column.
+    ranks: Vec<u8>,
+    /// Number of returns in the columns before each column.
+    starts: Vec<u32>,
     /// Returns in the order of their cells: neighbours in the image are neighbours in memory.
     returns: Vec<Return>,
 }
@@ -24,8 +26,6 @@ pub(super) struct Return {
     pub(super) point: Vec3,
     /// Distance from the sensor's axis [m].
     pub(super) distance_m: f32,
-    /// Index of the point in the scan.
-    pub(super) number: u32,
     cell: u32,
 }
 
@@ -35,7 +35,7 @@ pub(super) struct Cell(NonZeroU32);
 
 impl Cell {
     /// Returns the cell of a direction; `None` outside the elevations at which ground is visible.
-    #[inline]
+    #[inline(always)]
     pub(super) fn of(z: f32, distance_m: f32, azimuth_rad: f32) -> Option<Self> {
         type Image = DirectionImage;
         let row = (z / distance_m - Image::TAN_BOTTOM) * Image::ROWS_PER_TAN;
@@ -68,36 +68,53 @@ impl DirectionImage {
     const ROWS_PER_TAN: f32 = 1.0 / 0.007;
 
     /// Builds the image of points with their cells, if they have one.
-    pub(super) fn new(points: &[Vec3], cells_of_points: &[Option<Cell>]) -> Self {
-        // First one more than the index of the nearest point of a cell, then that of its return.
-        let mut cells = vec![0; Self::COLUMNS * Self::STRIDE + 1];
-        let squared_distance = |number: usize| points[number].truncate().length_squared();
+    pub(super) fn new(points: &[Vec3], cells: &[Option<Cell>]) -> Self {
+        let mut ranks = vec![0; Self::COLUMNS * Self::STRIDE + 1];
+        for cell in cells.iter().flatten() {
+            ranks[cell.index()] = 1;
+        }
         let mut count = 0;
-        for (number, cell) in cells_of_points.iter().enumerate() {
-            let Some(cell) = cell else { continue };
-            let nearest: &mut u32 = &mut cells[cell.index()];
-            if *nearest == 0 {
-                count += 1;
-                *nearest = number as u32 + 1;
-            } else if squared_distance(number) < squared_distance(*nearest as usize - 1) {
-                *nearest = number as u32 + 1;
+        let mut rank_column = |column: &mut [u8]| {
+            let start = count as u32;
+            let mut rank = 0;
+            // Without branches, which would be mispredicted.
+            for cell in column {
+                rank += *cell;
+                *cell *= rank;
+            }
+            count += usize::from(rank);
+            start
+        };
+        let columns = ranks.chunks_exact_mut(Self::STRIDE);
+        let starts = columns.map(&mut rank_column).collect();
+        let mut image = Self {
+            ranks,
+            starts,
+            returns: Vec::new(),
+        };
+
+        const NONE: u32 = u32::MAX;
+        let squared_distance = |number: u32| points[number as usize].truncate().length_squared();
+        let mut nearest = vec![NONE; count];
+        for (number, cell) in (0_u32..).zip(cells) {
+            let Some(index) = cell.and_then(|cell| image.return_of(cell)) else {
+                continue;
+            };
+            let nearest = &mut nearest[index];
+            if *nearest == NONE || squared_distance(number) < squared_distance(*nearest) {
+                *nearest = number;
             }
         }
-        let mut returns = Vec::with_capacity(count);
-        for (index, cell) in cells.iter_mut().enumerate() {
-            if *cell != 0 {
-                let number = *cell - 1;
-                let point = points[number as usize];
-                returns.push(Return {
-                    point,
-                    distance_m: point.truncate().length(),
-                    number,
-                    cell: index as u32,
-                });
-                *cell = returns.len() as u32;
-            }
-        }
-        Self { cells, returns }
+        let to_return = |number: u32| {
+            let point = points[number as usize];
+            Some(Return {
+                point,
+                distance_m: point.truncate().length(),
+                cell: cells[number as usize]?.index() as u32,
+            })
+        };
+        image.returns = nearest.into_iter().filter_map(to_return).collect();
+        image
     }
 
     /// All returns, column by column, upwards.
@@ -108,7 +125,13 @@ impl DirectionImage {
     /// Index of the return of a cell.
     #[inline]
     pub(super) fn return_of(&self, cell: Cell) -> Option<usize> {
-        (self.cells[cell.index()] as usize).checked_sub(1)
+        self.index_at(cell.index())
+    }
+
+    #[inline]
+    fn index_at(&self, cell: usize) -> Option<usize> {
+        let rank = usize::from(self.ranks[cell]).checked_sub(1)?;
+        Some(self.starts[cell / Self::STRIDE] as usize + rank)
     }
 
     /// The returns above a return, nearest first.
@@ -136,6 +159,36 @@ impl DirectionImage {
         let cell = column * Self::STRIDE + row;
         [cell, cell + 1, cell - 1]
             .into_iter()
-            .filter_map(|cell| Some(&self.returns[(self.cells[cell] as usize).checked_sub(1)?]))
+            .filter_map(|cell| Some(&self.returns[self.index_at(cell)?]))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    #[test]
+    fn the_return_of_every_cell_is_its_nearest_point() {
+        let mut rng = ChaCha8Rng::seed_from_u64(2);
+        let points: Vec<Vec3> = (0..50_000)
+            .map(|_| Vec3::from_array([15.0, 15.0, 3.0].map(|far| rng.random_range(-far..far))))
+            .collect();
+        let cell =
+            |point: &Vec3| Cell::of(point.z, point.truncate().length(), point.y.atan2(point.x));
+        let cells: Vec<Option<Cell>> = points.iter().map(cell).collect();
+        let image = DirectionImage::new(&points, &cells);
+        assert!(image.returns.is_sorted_by_key(|seen| seen.cell));
+        let mut is_reached = vec![false; image.returns.len()];
+        for (point, cell) in points.iter().zip(&cells) {
+            let Some(cell) = *cell else { continue };
+            let index = image.return_of(cell).unwrap();
+            assert_eq!(image.returns[index].cell as usize, cell.index());
+            assert!(image.returns[index].distance_m <= point.truncate().length());
+            is_reached[index] |= image.returns[index].point == *point;
+        }
+        assert!(is_reached.iter().all(|&is_reached| is_reached));
     }
 }

@@ -14,9 +14,11 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
+use super::inference::FuzzySystem;
 use super::polar_grid::PolarPosition;
 use super::surface::{BLOCK, MIN_POINTS_PER_TASK, ScanIndex, Shape};
 use super::terrain::{Terrain, TerrainConfig};
+use crate::simd::{Simd, SimdTask, dispatch};
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Parameters of the features.
@@ -109,49 +111,74 @@ impl ScanFeatures {
     pub(super) fn features(&self) -> Vec<Option<Features>> {
         let points = self.positions.iter().zip(&self.shapes);
         points
-            .map(|(position, shape)| Some(self.features_at(position.as_ref()?, shape)))
+            .map(|(position, shape)| Some(Features::new(position.as_ref()?, shape, &self.terrain)))
             .collect()
     }
 
-    /// Maps the features of every point, `block[feature][point]`, to a number, in parallel; 0 for
-    /// points without features.
-    pub(super) fn map_blocks(
-        &self,
-        map: impl Fn(&[[f32; BLOCK]; 5]) -> [f32; BLOCK] + Sync,
-    ) -> Vec<f32> {
+    /// Infers the output of a fuzzy system for every point, in parallel; 0 for points without
+    /// features.
+    pub(super) fn infer(&self, system: &FuzzySystem) -> Vec<f32> {
         let mut results = vec![0.0; self.positions.len()];
         results
-            .par_chunks_mut(BLOCK)
-            .zip(self.positions.par_chunks(BLOCK))
-            .zip(self.shapes.par_chunks(BLOCK))
-            .with_min_len(MIN_POINTS_PER_TASK / BLOCK)
+            .par_chunks_mut(MIN_POINTS_PER_TASK)
+            .zip(self.positions.par_chunks(MIN_POINTS_PER_TASK))
+            .zip(self.shapes.par_chunks(MIN_POINTS_PER_TASK))
             .for_each(|((results, positions), shapes)| {
-                let mut block = [[0.0; BLOCK]; 5];
-                for (row, (position, shape)) in positions.iter().zip(shapes).enumerate() {
-                    if let Some(position) = position {
-                        let features = self.features_at(position, shape).to_array();
-                        for (column, feature) in block.iter_mut().zip(features) {
-                            column[row] = feature;
-                        }
-                    }
-                }
-                let mapped = map(&block);
-                for ((result, position), mapped) in results.iter_mut().zip(positions).zip(mapped) {
-                    *result = if position.is_some() { mapped } else { 0.0 };
-                }
+                dispatch(InferenceTask {
+                    terrain: &self.terrain,
+                    system,
+                    positions,
+                    shapes,
+                    results,
+                });
             });
         results
     }
+}
 
-    #[inline]
-    fn features_at(&self, position: &PolarPosition, shape: &Shape) -> Features {
-        let height_m = position.z - self.terrain.height_at(position);
-        Features {
+impl Features {
+    #[inline(always)]
+    fn new(position: &PolarPosition, shape: &Shape, terrain: &Terrain) -> Self {
+        let height_m = position.z - terrain.height_at(position);
+        Self {
             slope_deg: shape.slope_rad.to_degrees(),
             curvature_deg: shape.curvature_rad.to_degrees(),
-            height_variance_m: self.terrain.height_above_lows_m(position),
+            height_variance_m: terrain.height_above_lows_m(position),
             height_m,
-            relief_m: self.terrain.top_m(position).max(height_m) - height_m.min(0.0),
+            relief_m: terrain.top_m(position).max(height_m) - height_m.min(0.0),
+        }
+    }
+}
+
+/// Inference for some points of a scan.
+struct InferenceTask<'a> {
+    terrain: &'a Terrain,
+    system: &'a FuzzySystem,
+    positions: &'a [Option<PolarPosition>],
+    shapes: &'a [Shape],
+    results: &'a mut [f32],
+}
+
+impl SimdTask for InferenceTask<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let blocks = (self.results.chunks_mut(BLOCK))
+            .zip(self.positions.chunks(BLOCK))
+            .zip(self.shapes.chunks(BLOCK));
+        for ((results, positions), shapes) in blocks {
+            let mut block = [[0.0; BLOCK]; 5];
+            for (row, (position, shape)) in positions.iter().zip(shapes).enumerate() {
+                if let Some(position) = position {
+                    let features = Features::new(position, shape, self.terrain).to_array();
+                    for (column, feature) in block.iter_mut().zip(features) {
+                        column[row] = feature;
+                    }
+                }
+            }
+            let inferred = self.system.infer_block(&block);
+            for ((result, position), inferred) in results.iter_mut().zip(positions).zip(inferred) {
+                *result = if position.is_some() { inferred } else { 0.0 };
+            }
         }
     }
 }

@@ -221,7 +221,7 @@ impl FuzzyGround {
 impl GroundClassifier for FuzzyGround {
     fn ground_confidence(&self, points: &[Vec3]) -> Vec<f32> {
         let features = ScanFeatures::new(points, &self.config.features);
-        features.map_blocks(|block| self.system.infer_block(block))
+        features.infer(&self.system)
     }
 }
 

@@ -123,7 +123,7 @@ impl FuzzySystem {
 
     /// Infers `N` outputs from `inputs[input][column]`. The inner loops run over the block, so that
     /// they are vectorized; nothing is allocated.
-    #[inline]
+    #[inline(always)]
     pub fn infer_block<const N: usize>(&self, inputs: &[[f32; N]]) -> [f32; N] {
         debug_assert_eq!(inputs.len(), self.inputs.len());
         let degrees = self.fuzzify(inputs);
@@ -153,7 +153,7 @@ impl FuzzySystem {
     }
 
     /// Returns the degrees of membership in the input sets that rules contain.
-    #[inline]
+    #[inline(always)]
     fn fuzzify<const N: usize>(&self, inputs: &[[f32; N]]) -> [[f32; N]; MAX_SETS] {
         let mut degrees = [[0.0; N]; MAX_SETS];
         let sets = self.sets.iter().zip(&self.is_used);
@@ -166,7 +166,7 @@ impl FuzzySystem {
     }
 
     /// Calls `visit` with output set and firing strengths of every rule, in order.
-    #[inline]
+    #[inline(always)]
     fn fire<const N: usize>(
         &self,
         degrees: &[[f32; N]; MAX_SETS],
@@ -180,22 +180,20 @@ impl FuzzySystem {
                 (0.0, 1.0)
             };
             let degrees = &degrees[clause.set % MAX_SETS];
-            for (all, &degree) in all.iter_mut().zip(degrees) {
+            combine(&mut all, degrees, |all, degree| {
                 let degree = offset + sign * degree;
-                *all = match self.operators {
-                    Operators::MinMax => min(*all, degree),
-                    Operators::Product => *all * degree,
-                };
-            }
+                match self.operators {
+                    Operators::MinMax => all.min(degree),
+                    Operators::Product => all * degree,
+                }
+            });
             if let Then::And = clause.then {
                 continue;
             }
-            for (any, &all) in any.iter_mut().zip(&all) {
-                *any = match self.operators {
-                    Operators::MinMax => max(*any, all),
-                    Operators::Product => *any + all - *any * all,
-                };
-            }
+            combine(&mut any, &all, |any, all| match self.operators {
+                Operators::MinMax => any.max(all),
+                Operators::Product => any + all - any * all,
+            });
             all = [1.0; N];
             if let Then::Consequent(output) = clause.then {
                 visit(output, &any);
@@ -204,7 +202,7 @@ impl FuzzySystem {
         }
     }
 
-    #[inline]
+    #[inline(always)]
     fn infer_sugeno<const N: usize>(&self, degrees: &[[f32; N]; MAX_SETS]) -> [f32; N] {
         let (mut sums, mut weights) = ([0.0_f32; N], [0.0_f32; N]);
         self.fire(degrees, |output, strengths| {
@@ -218,16 +216,14 @@ impl FuzzySystem {
         std::array::from_fn(|i| if weights[i] > 0.0 { mean(i) } else { UNDECIDED })
     }
 
-    #[inline]
+    #[inline(always)]
     fn infer_mamdani<const N: usize>(&self, degrees: &[[f32; N]; MAX_SETS]) -> [f32; N] {
         let mut strongest = [[0.0_f32; N]; MAX_SETS];
         // Rules of one output set are joined by max before implication: the same as after, because
         // implication is monotone.
         self.fire(degrees, |output, strengths| {
             let strongest = &mut strongest[output % MAX_SETS];
-            for (strongest, &strength) in strongest.iter_mut().zip(strengths) {
-                *strongest = max(*strongest, strength);
-            }
+            combine(strongest, strengths, f32::max);
         });
         self.defuzzifier.defuzzify(&strongest[..self.peaks.len()])
     }
@@ -238,16 +234,13 @@ fn columns(inputs: &[f32]) -> Vec<[f32; 1]> {
     inputs.iter().map(|&input| [input]).collect()
 }
 
-/// The smaller of two numbers, neither NaN: one instruction, unlike `f32::min`.
-#[inline]
-fn min(a: f32, b: f32) -> f32 {
-    if a < b { a } else { b }
-}
-
-/// The larger of two numbers, neither NaN.
-#[inline]
-fn max(a: f32, b: f32) -> f32 {
-    if a > b { a } else { b }
+/// Combines each number of `a` with that of `b`. With the minima and maxima of the standard library
+/// all are stored; a comparison stores only some, which the next load would have to wait for.
+#[inline(always)]
+fn combine<const N: usize>(a: &mut [f32; N], b: &[f32; N], f: impl Fn(f32, f32) -> f32) {
+    for (a, &b) in a.iter_mut().zip(b) {
+        *a = f(*a, b);
+    }
 }
 
 fn check(vocabulary: &Vocabulary, inputs: &[&str], output: &str) -> Result<(), InvalidValue> {

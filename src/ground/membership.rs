@@ -42,7 +42,7 @@ impl MembershipFunction {
     }
 
     /// Computes the degrees of membership of `N` numbers.
-    #[inline]
+    #[inline(always)]
     pub(super) fn degrees<const N: usize>(&self, xs: &[f32; N], degrees: &mut [f32; N]) {
         let pairs = degrees.iter_mut().zip(xs);
         // One loop per shape, so that each is vectorized.
@@ -129,7 +129,7 @@ impl fmt::Display for MembershipFunction {
 }
 
 /// A flank that is 0 up to `a` and 1 from `b` on; a step where both are equal; 0 for NaN.
-#[inline]
+#[inline(always)]
 fn rise(x: f32, a: f32, b: f32) -> f32 {
     // NaN where a = b, but then it is not used.
     let between = (x - a) / (b - a);
@@ -143,7 +143,7 @@ fn rise(x: f32, a: f32, b: f32) -> f32 {
 }
 
 /// A flank that is 1 up to `a` and 0 from `b` on; 0 for NaN.
-#[inline]
+#[inline(always)]
 fn fall(x: f32, a: f32, b: f32) -> f32 {
     rise(-x, -b, -a)
 }

@@ -79,7 +79,7 @@ impl PolarGrid {
     }
 
     /// Returns the position of a point; `None` beyond the last ring.
-    #[inline]
+    #[inline(always)]
     pub(super) fn locate(
         &self,
         z: f32,
@@ -106,7 +106,7 @@ impl PolarGrid {
 
 impl PolarPosition {
     /// Index of the cell.
-    #[inline]
+    #[inline(always)]
     pub(super) fn cell(&self) -> usize {
         self.cell.get() as usize - 1
     }

@@ -12,6 +12,7 @@ use rayon::prelude::*;
 
 use super::direction_image::{Cell, DirectionImage, Return};
 use super::polar_grid::{PolarGrid, PolarPosition};
+use crate::simd::{Simd, SimdTask, dispatch};
 
 /// Points that are processed together in vectorized loops.
 pub(super) const BLOCK: usize = 32;
@@ -54,23 +55,21 @@ impl<'a> ScanIndex<'a> {
     /// Indexes the points that are at least `min_distance_m` away from the sensor's axis.
     pub(super) fn new(points: &'a [Vec3], min_distance_m: f32, spacing_m: f32) -> Self {
         let grid = PolarGrid::new();
-        let locate = |&point: &Vec3| {
-            let distance_m = point.truncate().length();
-            if !(distance_m >= min_distance_m && point.z.is_finite()) {
-                return (None, None);
-            }
-            let azimuth_rad = coarse_atan2(point.y, point.x);
-            match grid.locate(point.z, distance_m, azimuth_rad) {
-                None => (None, None),
-                position => (position, Cell::of(point.z, distance_m, azimuth_rad)),
-            }
-        };
-        let (mut positions, mut cells) = (Vec::new(), Vec::new());
-        points
-            .par_iter()
-            .with_min_len(MIN_POINTS_PER_TASK)
-            .map(locate)
-            .unzip_into_vecs(&mut positions, &mut cells);
+        let mut positions = vec![None; points.len()];
+        let mut cells = vec![None; points.len()];
+        positions
+            .par_chunks_mut(MIN_POINTS_PER_TASK)
+            .zip(cells.par_chunks_mut(MIN_POINTS_PER_TASK))
+            .zip(points.par_chunks(MIN_POINTS_PER_TASK))
+            .for_each(|((positions, cells), points)| {
+                dispatch(LocationTask {
+                    points,
+                    min_distance_m,
+                    grid: &grid,
+                    positions,
+                    cells,
+                });
+            });
         Self {
             points,
             spacing_m,
@@ -85,43 +84,57 @@ impl<'a> ScanIndex<'a> {
     /// direction, and shared with the points close to it.
     pub(super) fn shapes(&self) -> Vec<Shape> {
         let returns = self.image.returns();
-        let mut shapes = vec![Shape::UNKNOWN; returns.len()];
-        shapes
+        let mut shared = vec![Shape::UNKNOWN; returns.len()];
+        shared
             .par_chunks_mut(BLOCK)
             .enumerate()
             .with_min_len(MIN_POINTS_PER_TASK / BLOCK)
             .for_each(|(block, shapes)| {
-                let mut surfaces = Surfaces::<BLOCK>::unknown();
-                for row in 0..shapes.len() {
-                    let index = block * BLOCK + row;
-                    let seen = &returns[index];
-                    let neighbours = self.neighbours(index, seen.point, seen.distance_m);
-                    surfaces.set(row, &neighbours, seen.point, self.spacing_m);
-                }
-                shapes.copy_from_slice(&surfaces.shapes()[..shapes.len()]);
+                let of_return = |index: usize| (index, returns[index].point);
+                let indices = block * BLOCK..block * BLOCK + shapes.len();
+                let computed = self.shapes_at(indices.map(of_return));
+                shapes.copy_from_slice(&computed[..shapes.len()]);
             });
-        self.points
-            .par_iter()
-            .zip(&self.cells)
-            .enumerate()
-            .with_min_len(MIN_POINTS_PER_TASK)
-            .map(|(number, (&point, cell))| {
-                let Some(index) = cell.and_then(|cell| self.image.return_of(cell)) else {
-                    return Shape::UNKNOWN;
-                };
-                let seen = &returns[index];
-                let squared_gap = seen.point.distance_squared(point);
-                if seen.number == number as u32
-                    || squared_gap < 0.25 * self.spacing_m * self.spacing_m
-                {
-                    return shapes[index];
+        let mut shapes = vec![Shape::UNKNOWN; self.points.len()];
+        shapes
+            .par_chunks_mut(MIN_POINTS_PER_TASK)
+            .zip(self.points.par_chunks(MIN_POINTS_PER_TASK))
+            .zip(self.cells.par_chunks(MIN_POINTS_PER_TASK))
+            .for_each(|((shapes, points), cells)| {
+                // Points that are far from the return in their cell.
+                let mut far = Vec::new();
+                for (row, (&point, cell)) in points.iter().zip(cells).enumerate() {
+                    let Some(index) = cell.and_then(|cell| self.image.return_of(cell)) else {
+                        continue;
+                    };
+                    let squared_gap = returns[index].point.distance_squared(point);
+                    if squared_gap < 0.25 * self.spacing_m * self.spacing_m {
+                        shapes[row] = shared[index];
+                    } else {
+                        far.push((row, index));
+                    }
                 }
-                let neighbours = self.neighbours(index, point, point.truncate().length());
-                let mut surface = Surfaces::<1>::unknown();
-                surface.set(0, &neighbours, point, self.spacing_m);
-                surface.shapes()[0]
-            })
-            .collect()
+                for far in far.chunks(BLOCK) {
+                    let at_point = |&(row, index): &(usize, usize)| (index, points[row]);
+                    let computed = self.shapes_at(far.iter().map(at_point));
+                    for (&(row, _), shape) in far.iter().zip(computed) {
+                        shapes[row] = shape;
+                    }
+                }
+            });
+        shapes
+    }
+
+    /// Computes the shapes at up to [`BLOCK`] points, each with the index of the return in its
+    /// cell.
+    #[inline]
+    fn shapes_at(&self, points: impl Iterator<Item = (usize, Vec3)>) -> [Shape; BLOCK] {
+        let mut surfaces = Surfaces::<BLOCK>::unknown();
+        for (row, (index, point)) in points.enumerate() {
+            let neighbours = self.neighbours(index, point, point.truncate().length());
+            surfaces.set(row, &neighbours, point, self.spacing_m);
+        }
+        surfaces.shapes()
     }
 
     /// Returns the unit surface normals of all points, of arbitrary sign; `None` without neighbours.
@@ -150,6 +163,41 @@ impl<'a> ScanIndex<'a> {
             down: first_spaced(self.image.below(index), point, self.spacing_m),
             left: beside(columns),
             right: beside(-columns),
+        }
+    }
+}
+
+/// The search for the cells of some points of a scan.
+struct LocationTask<'a> {
+    points: &'a [Vec3],
+    min_distance_m: f32,
+    grid: &'a PolarGrid,
+    positions: &'a mut [Option<PolarPosition>],
+    cells: &'a mut [Option<Cell>],
+}
+
+impl SimdTask for LocationTask<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let blocks = (self.points.chunks(BLOCK))
+            .zip(self.positions.chunks_mut(BLOCK))
+            .zip(self.cells.chunks_mut(BLOCK));
+        for ((points, positions), cells) in blocks {
+            let mut distances_m = [0.0; BLOCK];
+            let mut azimuths_rad = [0.0; BLOCK];
+            let directions = distances_m.iter_mut().zip(&mut azimuths_rad);
+            for ((distance_m, azimuth_rad), point) in directions.zip(points) {
+                *distance_m = point.truncate().length();
+                *azimuth_rad = coarse_atan2(point.y, point.x);
+            }
+            for (i, point) in points.iter().enumerate() {
+                let (distance_m, azimuth_rad) = (distances_m[i], azimuths_rad[i]);
+                if distance_m >= self.min_distance_m && point.z.is_finite() {
+                    positions[i] = self.grid.locate(point.z, distance_m, azimuth_rad);
+                    let cell = || Cell::of(point.z, distance_m, azimuth_rad);
+                    cells[i] = positions[i].and_then(|_| cell());
+                }
+            }
         }
     }
 }
@@ -291,7 +339,7 @@ impl<const N: usize> Surfaces<N> {
 }
 
 /// `atan2` to 2e-4 rad, which suffices to choose a cell; several times faster than the exact one.
-#[inline]
+#[inline(always)]
 fn coarse_atan2(y: f32, x: f32) -> f32 {
     let (ax, ay) = (x.abs(), y.abs());
     // Selections instead of branches, so that loops over it are vectorized.

@@ -110,14 +110,14 @@ impl Terrain {
     }
 
     /// Root mean square of a point's height above the low points of the nine cells around [m].
-    #[inline]
+    #[inline(always)]
     pub(super) fn height_above_lows_m(&self, position: &PolarPosition) -> f32 {
         let (mean, variance) = self.surroundings[position.cell()];
         ((position.z - mean).powi(2) + variance).sqrt()
     }
 
     /// Height of the ground, bilinear between the middles of the cells [m].
-    #[inline]
+    #[inline(always)]
     pub(super) fn height_at(&self, position: &PolarPosition) -> f32 {
         let (r, s) = (
             (position.ring - 0.5).max(0.0),
@@ -134,7 +134,7 @@ impl Terrain {
     }
 
     /// Height of the highest point around a point, below the clearance, above the ground [m].
-    #[inline]
+    #[inline(always)]
     pub(super) fn top_m(&self, position: &PolarPosition) -> f32 {
         let cell = position.cell();
         self.tops[cell] - self.heights[cell]
@@ -265,26 +265,38 @@ impl Terrain {
         }
     }
 
-    /// Smooths unknown heights between their neighbours.
+    /// Smooths unknown heights between their neighbours, in several passes.
     fn fill(&mut self) {
         const PASSES: usize = 6;
-        for _ in 0..PASSES {
-            for cell in SECTORS..self.heights.len() - SECTORS {
-                if self.known[cell] {
-                    continue;
+        // A pass may run this many cells behind the one before instead of after it: where it is,
+        // the neighbours are done. Then the divisions of a pass do not wait for each other.
+        const LAG: usize = SECTORS + 1;
+        let inner = SECTORS..self.heights.len() - SECTORS;
+        let unknown: Vec<usize> = inner.filter(|&cell| !self.known[cell]).collect();
+        let weight = |&is_known: &bool| if is_known { 2.0 } else { 0.5 };
+        let weights: Vec<f32> = self.known.iter().map(weight).collect();
+        for first in 0..unknown.len() + (PASSES - 1) * LAG {
+            for pass in 0..PASSES {
+                let index = first.wrapping_sub(pass * LAG);
+                if let Some(&cell) = unknown.get(index) {
+                    smooth(&mut self.heights, &weights, cell);
                 }
-                let [before, after] = beside(cell % SECTORS);
-                let row = cell - cell % SECTORS;
-                let (mut sum, mut weights) = (self.heights[cell], 1.0);
-                for neighbour in [cell - SECTORS, cell + SECTORS, row + before, row + after] {
-                    let weight = if self.known[neighbour] { 2.0 } else { 0.5 };
-                    sum += weight * self.heights[neighbour];
-                    weights += weight;
-                }
-                self.heights[cell] = sum / weights;
             }
         }
     }
+}
+
+/// Replaces a height by the weighted mean of itself and its four neighbours.
+#[inline]
+fn smooth(heights: &mut [f32], weights: &[f32], cell: usize) {
+    let [before, after] = beside(cell % SECTORS);
+    let row = cell - cell % SECTORS;
+    let (mut sum, mut total) = (heights[cell], 1.0);
+    for neighbour in [cell - SECTORS, cell + SECTORS, row + before, row + after] {
+        sum += weights[neighbour] * heights[neighbour];
+        total += weights[neighbour];
+    }
+    heights[cell] = sum / total;
 }
 
 /// The two lowest heights of a cell [m].
@@ -378,4 +390,42 @@ fn fit_plane(points: &[Vec3], [a, b, c]: [f32; 3], tolerance_m: f32) -> Option<[
     matrix.y_axis.y += 10.0;
     matrix.z_axis.z += 10.0;
     (count >= 3).then(|| (matrix.inverse() * right).to_array())
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    #[test]
+    fn interleaved_passes_fill_as_passes_one_after_the_other() {
+        let grid = PolarGrid::new();
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        // No cell is known far away, as beyond the reach of most scans.
+        let is_known = |cell| cell < grid.len() / 2 && rng.random_bool(0.3);
+        let known: Vec<bool> = (0..grid.len()).map(is_known).collect();
+        let heights: Vec<f32> = known.iter().map(|_| rng.random_range(-3.0..1.0)).collect();
+        let weight = |&is_known: &bool| if is_known { 2.0 } else { 0.5 };
+        let weights: Vec<f32> = known.iter().map(weight).collect();
+        let mut expected = heights.clone();
+        for _ in 0..6 {
+            let inner = SECTORS..grid.len() - SECTORS;
+            for cell in inner.filter(|&cell| !known[cell]) {
+                smooth(&mut expected, &weights, cell);
+            }
+        }
+        let mut terrain = Terrain {
+            lows: Vec::new(),
+            surroundings: Vec::new(),
+            heights,
+            known,
+            slopes: Vec::new(),
+            tops: Vec::new(),
+            grid,
+        };
+        terrain.fill();
+        assert_eq!(terrain.heights, expected);
+    }
 }

@@ -213,6 +213,8 @@ impl Neighborhood {
     fn best_plane(&self, tolerance_m: impl Fn(Vec3) -> f32) -> Option<Vec3> {
         /// Sums that are made side by side.
         const LANES: usize = 8;
+        /// With this share of the largest possible support, others are not tried: they have about the same inliers.
+        const ENOUGH: f32 = 0.8;
         let mut best = (0.0, None);
         for first in 0..8 {
             let (Some(a), Some(b)) = (self.outer[first], self.outer[(first + 2) % 8]) else {
@@ -233,6 +235,9 @@ impl Neighborhood {
             let support: f32 = sums.iter().sum();
             if support > best.0 {
                 best = (support, Some(normal));
+            }
+            if support > ENOUGH * self.count as f32 {
+                break;
             }
         }
         best.1

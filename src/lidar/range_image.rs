@@ -94,6 +94,15 @@ impl RangeImage {
         })
     }
 
+    /// The measured ranges along the centre rays of their pixels, row-major.
+    pub fn center_beams(&self) -> impl Iterator<Item = Beam> {
+        let returns = (0..self.ranges.len()).filter(|&index| self.has_return(index));
+        returns.map(|index| Beam {
+            direction: self.model.direction_of(index),
+            range_m: self.ranges[index],
+        })
+    }
+
     /// All beams with a return, row-major.
     pub fn beams(&self) -> impl Iterator<Item = Beam> {
         (0..self.ranges.len()).filter_map(|index| self.beam(index))

@@ -21,6 +21,7 @@ use super::resampling::systematic;
 use crate::geometry::Pose2;
 use crate::lidar::RangeImage;
 use crate::map::{PanoramaIndex, PanoramaSeed, SensorAttitude};
+use crate::rendering::RenderError;
 use crate::validation::{InvalidValue, Validate, not_negative};
 
 /// Shape of the initial distribution.
@@ -93,10 +94,10 @@ pub fn from_panoramas(
     count: usize,
     places: &PlacesConfig,
     rng: &mut impl Rng,
-) -> Vec<Particle> {
-    let seeds = index.search(scan, attitude);
+) -> Result<Vec<Particle>, RenderError> {
+    let seeds = index.search(scan, attitude)?;
     let Some(first) = seeds.first() else {
-        return Vec::new();
+        return Ok(Vec::new());
     };
     let mut weights: Vec<f64> = seeds
         .iter()
@@ -118,7 +119,7 @@ pub fn from_panoramas(
         let map_from_lidar = Pose2::new(position, seed.heading_rad + turn_rad);
         Particle::new(map_from_lidar, Some(seed.level_m))
     };
-    chosen.into_iter().map(sample).collect()
+    Ok(chosen.into_iter().map(sample).collect())
 }
 
 /// The cells of least cost, one of each place.
@@ -206,7 +207,8 @@ mod tests {
             1000,
             &PlacesConfig::default(),
             &mut rng,
-        );
+        )
+        .unwrap();
         let near = particles
             .iter()
             .map(|particle| particle.map_from_lidar.translation.vector)

@@ -40,6 +40,17 @@ pub enum Start {
 }
 
 impl Start {
+    /// Without knowledge: anywhere on the ground, or, in a map of more than 1 km² that has a path, on its road. All ground
+    /// of a city has too many places for panoramas of each.
+    pub fn unknown(map: &Map) -> Self {
+        const LARGE_M2: f64 = 1e6;
+        let area_m2 = map.tiles.len() as f64 * map.tiles.side_m.powi(2);
+        match area_m2 > LARGE_M2 && !map.path.map_from_lidar.is_empty() {
+            true => Self::Road,
+            false => Self::Anywhere,
+        }
+    }
+
     /// Near a known pose in space.
     pub fn near(map_from_lidar: &Pose3, spread: StartSpread) -> Self {
         Self::Pose {
@@ -194,7 +205,7 @@ impl Localizer {
                     count,
                     &self.config.places,
                     &mut rng,
-                )
+                )?
             }
         };
         let Some(first) = particles.first() else {
@@ -213,21 +224,17 @@ impl Localizer {
 
     /// The panoramas for a start without a pose and for a restart after a loss.
     fn panorama_request(&self) -> PanoramaRequest {
-        /// Heights are rounded, so that drives of one car share the panoramas [m].
-        const HEIGHT_STEP_M: f64 = 0.05;
+        /// Heights that are not configured are rounded, so that drives of one car share the panoramas [m].
+        const HEIGHT_STEP_M: f64 = 0.25;
         let region = match self.start {
             Start::Pose { .. } | Start::Road => SearchRegion::Road,
             Start::Anywhere => SearchRegion::Anywhere,
         };
-        let height_m = self
-            .config
-            .sensor
-            .height_m
-            .unwrap_or(self.attitude.height_m);
+        let rounded_m = (self.attitude.height_m / HEIGHT_STEP_M).round() * HEIGHT_STEP_M;
         PanoramaRequest {
             region,
             lidar: self.config.sensor.lidar.clone(),
-            sensor_height_m: (height_m / HEIGHT_STEP_M).round() * HEIGHT_STEP_M,
+            sensor_height_m: self.config.sensor.height_m.unwrap_or(rounded_m),
             config: self.config.panorama.clone(),
         }
     }

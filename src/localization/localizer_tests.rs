@@ -8,6 +8,7 @@ use crate::lidar::LidarModel;
 use crate::localization::State;
 use crate::localization::sensor::SensorConfig;
 use crate::map::test_world::TestWorld;
+use crate::map::{MappingPath, TileConfig, TileGrid};
 
 /// A localizer runs on one thread at a time, a map is shared by several.
 const _: () = {
@@ -124,6 +125,24 @@ fn every_start_finds_the_car_in_the_street() {
         assert!(error_m < 0.05, "{start:?}: {error_m} m");
         assert_eq!(last.state, State::Tracking, "{start:?}");
     }
+}
+
+#[test]
+fn an_unknown_start_is_on_the_road_of_a_large_map_and_anywhere_in_others() {
+    let mut map = TestWorld::street().map();
+    assert_eq!(Start::unknown(&map), Start::Anywhere);
+    let poses: Vec<Pose3> = (0..2000)
+        .map(|number| Pose3::translation(5.0 * f64::from(number), 0.0, 1.73))
+        .collect();
+    map.tiles = TileGrid::around(&poses, &TileConfig::default()).into();
+    map.path = MappingPath {
+        map_from_lidar: poses,
+        ..MappingPath::default()
+    }
+    .into();
+    assert_eq!(Start::unknown(&map), Start::Road);
+    map.path = MappingPath::default().into();
+    assert_eq!(Start::unknown(&map), Start::Anywhere);
 }
 
 #[test]

@@ -6,9 +6,10 @@
 //! L = exp(−d / s)          robust: |difference| up to a limit
 //! ```
 //!
-//! The beams are an evenly spread sample of the scan, the same for all particles of a frame, and are
-//! cast along the directions in which they were measured. Chen et al., *Range Image-based LiDAR
-//! Localization for Autonomous Vehicles*, ICRA 2021, eq. 6, for the reference.
+//! Robust: the beams are an evenly spread sample of the scan, the same for all particles of a frame, and are
+//! cast along the directions in which they were measured. Reference: the beams are the pixels with a return of the
+//! whole range image, and the map is rendered at their centres, within the limits of the range. Chen et al., *Range
+//! Image-based LiDAR Localization for Autonomous Vehicles*, ICRA 2021, eq. 6, for the reference.
 
 use rand::{Rng, RngExt as _};
 use serde::{Deserialize, Serialize};
@@ -27,9 +28,9 @@ use crate::validation::{
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Likelihood {
-    /// Gaussian of the mean |difference| without limits, as in range-mcl.
+    /// Gaussian of the mean |difference| of whole range images without limits, as in range-mcl.
     Reference,
-    /// Exponential of the mean |difference| with limits.
+    /// Exponential of the mean |difference| along beams with limits.
     Robust,
 }
 
@@ -86,7 +87,7 @@ impl Validate for ObservationConfig {
 }
 
 impl ObservationConfig {
-    /// The likelihood of range-mcl, on our beams: no limits, σ = 2 m.
+    /// The likelihood of range-mcl: no limits, σ = 2 m.
     pub fn reference() -> Self {
         Self {
             likelihood: Likelihood::Reference,
@@ -197,21 +198,44 @@ pub fn near_points(image: &RangeImage) -> Vec<Vec3> {
         .collect()
 }
 
-/// Returns the mean cost of the beams at each pose [m]; `None` for poses off the map.
+/// Returns the mean cost of beams at each pose [m]; `None` for poses off the map.
 pub fn costs(
     renderer: &dyn RangeRenderer,
     map_from_lidar: &[Option<Pose3>],
     beams: &[Beam],
     difference: &RangeDifference,
 ) -> Result<Vec<Option<f64>>, RenderError> {
+    costs_by(map_from_lidar, |on_map| {
+        renderer.compare(on_map, beams, difference)
+    })
+}
+
+/// Returns the mean cost of a scan at each pose [m], of the beams or, for the reference likelihood, of the whole image;
+/// `None` for poses off the map.
+pub fn costs_of_scan(
+    renderer: &dyn RangeRenderer,
+    map_from_lidar: &[Option<Pose3>],
+    (scan, beams): (&RangeImage, &[Beam]),
+    config: &ObservationConfig,
+) -> Result<Vec<Option<f64>>, RenderError> {
+    let difference = config.difference();
+    match config.likelihood {
+        Likelihood::Robust => costs(renderer, map_from_lidar, beams, &difference),
+        Likelihood::Reference => costs_by(map_from_lidar, |on_map| {
+            renderer.compare_images(on_map, scan, &difference)
+        }),
+    }
+}
+
+fn costs_by(
+    map_from_lidar: &[Option<Pose3>],
+    compare: impl FnOnce(&[Pose3]) -> Result<Vec<f32>, RenderError>,
+) -> Result<Vec<Option<f64>>, RenderError> {
     let on_map: Vec<Pose3> = map_from_lidar.iter().flatten().copied().collect();
-    let mut rendered = renderer
-        .compare(&on_map, beams, difference)?
-        .into_iter()
-        .map(f64::from);
+    let mut compared = compare(&on_map)?.into_iter().map(f64::from);
     Ok(map_from_lidar
         .iter()
-        .map(|pose| pose.as_ref().and_then(|_| rendered.next()))
+        .map(|pose| pose.as_ref().and_then(|_| compared.next()))
         .collect())
 }
 
@@ -226,6 +250,20 @@ pub fn ground_patch_of(
     map.tiles.valid_tile_of(pose)?;
     let patch = map.ground.patch_under(pose, particle.level_m);
     patch.or(remembered.copied())
+}
+
+/// Ranges of the map along beams from a pose, as far as their [`agreement`] depends on them [m].
+pub fn ranges_along(
+    renderer: &dyn RangeRenderer,
+    map_from_lidar: &Pose3,
+    beams: &[Beam],
+    tolerance_m: f32,
+) -> Result<Vec<f32>, RenderError> {
+    let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
+    let farthest_m = beams.iter().map(|beam| beam.range_m).fold(0.0, f32::max);
+    let until_m = farthest_m + 2.0 * tolerance_m;
+    let mut rows = renderer.cast(&[*map_from_lidar], &directions, until_m)?;
+    Ok(rows.pop().unwrap_or_default())
 }
 
 /// Returns the share of beams that end on a surface of the map, among those that reach one; `None` for

@@ -1,17 +1,23 @@
 //! A second drive in the map of a first one: the trajectory of its scans, in the frame of that map.
 
+use std::sync::Arc;
+
+use glam::DVec3;
+use nalgebra::Point2;
+
 use super::config::LocalizerConfig;
 use super::localizer::{Localizer, LocalizerError, Start};
 use super::odometry::Odometry;
 use super::tracking_loss::State;
 use crate::geometry::Pose3;
 use crate::lidar::Scan;
-use crate::map::Map;
+use crate::map::plan::origin_near;
+use crate::map::{Map, MapError};
 use crate::odometry::{
     OdometryError, PlacementError, Trajectory, TrajectoryBuilder, TrajectoryConfig,
 };
 
-/// Why a scan of a second drive cannot be used.
+/// Why a second drive, or a scan of it, cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum SecondDriveError {
@@ -19,6 +25,10 @@ pub enum SecondDriveError {
     Odometry(#[from] OdometryError),
     #[error(transparent)]
     Localizer(#[from] LocalizerError),
+    #[error(transparent)]
+    Map(#[from] MapError),
+    #[error(transparent)]
+    Placement(#[from] PlacementError),
 }
 
 /// Finds the trajectory of a drive in a map, scan by scan; the drive may begin anywhere, and leave the map.
@@ -39,7 +49,7 @@ impl SecondDrive {
     ) -> Result<Self, LocalizerError> {
         Ok(Self {
             map: map.clone(),
-            localizer: Localizer::new(map, localizer, Start::Anywhere, seed)?,
+            localizer: Localizer::new(map, localizer, Start::unknown(map), seed)?,
             builder: TrajectoryBuilder::new(trajectory)?,
             found: vec![],
         })
@@ -63,7 +73,30 @@ impl SecondDrive {
     }
 
     /// Closes loops and adjusts all poses to the surfaces of the map.
-    pub fn finish(self) -> Result<Trajectory, PlacementError> {
-        self.builder.finish_in_map(&self.map.mesh, &self.found)
+    pub fn finish(self) -> Result<Trajectory, SecondDriveError> {
+        /// The map is needed around the scans that were found, as far as a sensor sees [m].
+        const RADIUS_M: f64 = 150.0;
+        let found = self.found.iter().flatten();
+        let positions: Vec<Point2<f64>> = found
+            .map(|pose| pose.translation.vector.xy().into())
+            .collect();
+        // Vertices are single numbers: they are exact only near the origin of their coordinates.
+        let first = positions.first().copied().unwrap_or_default();
+        let origin = origin_near(DVec3::new(first.x, first.y, 0.0));
+        let map_from_local = Pose3::translation(origin.x, origin.y, origin.z);
+        let mesh = match positions.is_empty() {
+            true => Arc::default(),
+            false => (self.map).mesh_near(&positions, RADIUS_M, origin, u64::MAX)?,
+        };
+        let found: Vec<Option<Pose3>> = (self.found.iter())
+            .map(|pose| pose.map(|pose| map_from_local.inverse() * pose))
+            .collect();
+        let mut trajectory = (self.builder).finish_in_map(&mesh, &found)?;
+        let odometry = trajectory.odometry.iter_mut();
+        let odometry = odometry.map(|estimate| &mut estimate.odom_from_lidar);
+        for pose in trajectory.poses.iter_mut().chain(odometry) {
+            *pose = map_from_local * *pose;
+        }
+        Ok(trajectory)
     }
 }

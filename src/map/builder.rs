@@ -13,16 +13,18 @@ use std::error::Error;
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
+use nalgebra::{Translation3, Vector3};
 use rayon::prelude::*;
 
 use super::changes;
 use super::config::{MapConfig, MapOptions};
 use super::local_map::{self, LocalMap};
 use super::mapping_path::MappingPath;
+use super::mesh_view::MeshView;
 use super::model::{Map, MapError};
 use super::path_check::{self, ImplausiblePath};
-use super::plan::{self, LocalMapPlan, Ownership};
+use super::plan::{self, Domain, LocalMapPlan, Ownership, origin_near};
 use super::scan_agreement;
 use super::scan_cloud::ScanCloud;
 use crate::geometry::{Pose3, TriangleMesh};
@@ -122,7 +124,8 @@ impl MapBuilder {
 
     /// Builds a map from scans with their poses, `p_map = map_from_lidar * p_lidar`.
     ///
-    /// Keeps the key scans in memory, about 1.5 MB for each scan of 120,000 points.
+    /// Keeps the key scans in memory, about 1.5 MB for each scan of 120,000 points, and the map: in single precision,
+    /// which resolves millimetres up to 8 km from its origin.
     pub fn build<E: Into<ScanError>>(
         &self,
         scans: impl IntoIterator<Item = Result<(Scan, Pose3), E>>,
@@ -141,13 +144,14 @@ impl MapBuilder {
         scans: impl IntoIterator<Item = Result<(Scan, Pose3), E>>,
     ) -> Result<Map, BuildError> {
         let (keys, poses) = self.key_scans(scans)?;
+        let older = map.mesh()?;
         let plan = MapPlan {
-            older: Some(&map.mesh),
+            older: Some(&*older),
             ..self.plan(poses)?
         };
         let (added, gone) = plan.build_all(&keys)?;
         let path = map.path.extended_by(&plan.map_from_lidar);
-        let mesh = changes::joined(&map.mesh, &gone, &added);
+        let mesh = changes::joined(&older, &gone, &added);
         Ok(Map::new(mesh, path, &self.options)?)
     }
 
@@ -178,13 +182,13 @@ impl MapBuilder {
         path_check::check(map_from_lidar.iter().enumerate(), config.max_step_m)?;
         let local_maps = plan::local_maps(&map_from_lidar, config.local_map_size, config.overlap_m);
         let reach_m = f64::from(config.local_map.scan.crop_m.length());
-        Ownership::require_memory(&map_from_lidar, reach_m)?;
+        Ownership::require_memory(&map_from_lidar, &local_maps, reach_m)?;
         require_memory_of_images(&config.local_map.scan.range_image)?;
         Ok(MapPlan {
             builder: self,
             classifier: config.ground.classifier()?,
             older: None,
-            ownership: Ownership::new(&map_from_lidar, &local_maps, reach_m),
+            ownership: Ownership::new(&map_from_lidar, &local_maps),
             local_maps,
             map_from_lidar,
         })
@@ -210,7 +214,7 @@ pub struct MapPlan<'a> {
     /// Ground classifier; by default that of the configuration.
     pub classifier: Box<dyn GroundClassifier>,
     /// A map that the drive is added to, in the same frame.
-    pub older: Option<&'a TriangleMesh>,
+    pub older: Option<&'a dyn MeshView>,
     builder: &'a MapBuilder,
     ownership: Ownership,
 }
@@ -221,7 +225,7 @@ impl MapPlan<'_> {
         let (mut mesh, mut gone) = (TriangleMesh::default(), vec![]);
         for local_map in &self.local_maps {
             let built = self.build_local_map(local_map, &|key| Ok(keys[key].clone()))?;
-            mesh.append(&built.mesh);
+            mesh.append(&built.in_map());
             gone.extend(built.gone);
         }
         gone.sort_unstable();
@@ -240,11 +244,14 @@ impl MapPlan<'_> {
             ControlFlow::Break(()) => Err(BuildError::Interrupted),
         };
         notify(BuildEvent::Stage("scans"))?;
+        let middle = &self.map_from_lidar[plan.own.start.midpoint(plan.own.end)];
+        let origin = origin_near(DVec3::from_slice(middle.translation.vector.as_slice()));
+        let offset = Vector3::from(origin.to_array());
         let held_bytes = AtomicUsize::new(0);
         let prepare = |index: usize| {
             let scan = read_scan(index).map_err(BuildError::Scan)?;
-            let pose = &self.map_from_lidar[index];
-            let prepared = ScanCloud::prepare(scan, pose, &config.scan, &*self.classifier);
+            let pose = Translation3::from(-offset) * self.map_from_lidar[index];
+            let prepared = ScanCloud::prepare(scan, &pose, &config.scan, &*self.classifier);
             let bytes = held_bytes.fetch_add(prepared.bytes(), Ordering::Relaxed);
             memory::require(
                 "the scans of a local map",
@@ -269,8 +276,12 @@ impl MapPlan<'_> {
             });
         }
         let begin_stage = |name| notify(BuildEvent::Stage(name));
-        let region = (plan.number, &self.ownership);
-        let built = local_map::build(scans, region, self.older, config, begin_stage);
+        let domain = Domain {
+            number: plan.number,
+            origin,
+            ownership: &self.ownership,
+        };
+        let built = local_map::build(scans, domain, self.older, config, begin_stage);
         let mut local_map = built.map_err(|error| match error {
             BuildError::Meshing(source) => BuildError::LocalMap {
                 number: plan.number,
@@ -402,9 +413,12 @@ mod tests {
         let extended = |map: &Map, is_there| {
             let map = builder.extend(map, drive_towards_panel(is_there)).unwrap();
             assert_eq!(map.path.map_from_lidar.len(), 10);
-            panel_m2(&map.mesh)
+            panel_m2(&map.mesh().unwrap())
         };
-        let (without, with) = (panel_m2(&empty.mesh), panel_m2(&blocked.mesh));
+        let (without, with) = (
+            panel_m2(&empty.mesh().unwrap()),
+            panel_m2(&blocked.mesh().unwrap()),
+        );
         assert!(without < 0.2 && with > 3.0, "{without} {with}");
         let same = extended(&blocked, true);
         assert!((same - with).abs() < 0.2 * with, "{same} {with}");
@@ -437,12 +451,12 @@ mod tests {
         for local_map in &plan.local_maps {
             let built = plan.build_local_map(local_map, &|_| Ok(scan())).unwrap();
             assert!(built.counts.triangles > 100, "{:?}", built.counts);
-            mesh.append(&built.mesh);
+            mesh.append(&built.in_map());
         }
-        assert!(*map.mesh == mesh);
+        assert!(*map.mesh().unwrap() == mesh);
         assert_eq!(map.path.map_from_lidar, poses);
         let joined = plan.finish(mesh).unwrap();
-        assert!(joined.mesh == map.mesh && joined.path == map.path);
+        assert!(joined.mesh().unwrap() == map.mesh().unwrap() && joined.path == map.path);
     }
 
     #[test]
@@ -459,7 +473,7 @@ mod tests {
         let path = folder.path().join("map.ply");
         map.save(&path).unwrap();
         let loaded = Map::load(&path, &builder.options).unwrap();
-        assert!(loaded.mesh == map.mesh);
+        assert!(loaded.mesh().unwrap() == map.mesh().unwrap());
         assert_eq!(loaded.path, map.path);
     }
 

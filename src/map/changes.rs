@@ -6,11 +6,12 @@
 //! older surfaces that are kept is already known and dropped. Connected patches of less than half a square metre are noise and
 //! change nothing. Borders between older and added surfaces are not welded.
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::ground_surface::root;
-use super::plan::Ownership;
+use super::mesh_view::{MeshView, part_on_lattice};
+use super::plan::Domain;
 use super::scan_cloud::ScanCloud;
 use super::visibility::{self, VisibilityConfig};
 use crate::geometry::TriangleMesh;
@@ -33,10 +34,10 @@ pub struct Changes {
 
 /// Compares the new mesh of a local map with an older map, and removes what is known from it.
 pub(super) fn compare(
-    older: &TriangleMesh,
+    older: &dyn MeshView,
     mesh: &mut TriangleMesh,
     scans: &[ScanCloud],
-    (number, ownership): (usize, &Ownership),
+    domain: Domain,
     config: &VisibilityConfig,
 ) -> Changes {
     // Beams lie between the scans and the surfaces on which they end.
@@ -46,35 +47,30 @@ pub(super) fn compare(
         bounds.max = bounds.max.max(scan.map_from_lidar.translation);
     }
     let (min, max) = (bounds.min - SAME_M, bounds.max + SAME_M);
-    let overlaps = |triangle: usize| {
-        let corners = older.corners(triangle);
-        let low = corners[0].min(corners[1]).min(corners[2]);
-        let high = corners[0].max(corners[1]).max(corners[2]);
-        low.cmple(max).all() && high.cmpge(min).all()
+    let (min, max) = (
+        domain.origin + min.as_dvec3(),
+        domain.origin + max.as_dvec3(),
+    );
+    let overlaps = |triangle: &u32| {
+        let [a, b, c] = older.corners(*triangle as usize);
+        a.min(b).min(c).cmple(max).all() && a.max(b).max(c).cmpge(min).all()
     };
-    let numbers: Vec<usize> = (0..older.triangles.len())
-        .filter(|&triangle| overlaps(triangle))
+    let numbers: Vec<u32> = (0..older.triangles() as u32)
+        .into_par_iter()
+        .filter(overlaps)
         .collect();
-    let mut near = TriangleMesh {
-        vertices: older.vertices.clone(),
-        triangles: (numbers.iter())
-            .map(|&triangle| older.triangles[triangle])
-            .collect(),
-        ..TriangleMesh::default()
-    };
-    near.drop_unreferenced_vertices();
+    let mut near = part_on_lattice(older, &numbers, domain.origin);
     let crossed = match config.enabled {
         true => in_patches(&near, &visibility::crossed_triangles(&near, scans, config)),
         false => vec![false; numbers.len()],
     };
-    let is_owned = |triangle: usize| {
-        let center = older.corners(triangle).into_iter().sum::<Vec3>() / 3.0;
-        let cell = (ownership.grid()).cell_at(center.x.into(), center.y.into());
-        cell.and_then(|(column, row)| ownership.owner_of(column, row)) == Some(number)
+    let is_owned = |triangle: u32| {
+        let center = older.corners(triangle as usize).into_iter().sum::<DVec3>() / 3.0;
+        domain.ownership.owner_at(center.x, center.y) == domain.number
     };
     let gone = (numbers.iter().zip(&crossed))
         .filter(|&(&triangle, &is_crossed)| is_crossed && is_owned(triangle))
-        .map(|(&triangle, _)| triangle as u32)
+        .map(|(&triangle, _)| triangle)
         .collect();
     near.retain_triangles(|triangle, _| !crossed[triangle]);
     let is_new = in_patches(mesh, &unknown(&near, mesh));

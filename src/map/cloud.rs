@@ -10,14 +10,14 @@
 
 use std::ops::ControlFlow;
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use nalgebra::Point2;
 
 use super::builder::{BuildError, BuildEvent};
 use super::cloud_normals;
 use super::ground_surface::GroundSurface;
 use super::local_map::{self, LocalMap, LocalMapConfig};
-use super::plan::{LocalMapPlan, Ownership};
+use super::plan::{Domain, LocalMapPlan, Ownership};
 use crate::geometry::{Aabb, KdTree, PointCloud, Pose3};
 use crate::memory;
 use crate::validation::Validate as _;
@@ -119,13 +119,11 @@ impl CloudPlan {
             used: number..number + 1,
         };
         let plans: Vec<LocalMapPlan> = (0..poses.len()).map(plan).collect();
-        let reach_m = f64::from(0.5 * BLOCK_M + OVERLAP_M);
-        Ownership::require_memory(&poses, reach_m)?;
         Ok(Self {
             cloud,
             config: config.clone(),
             centers,
-            ownership: Ownership::new(&poses, &plans, reach_m),
+            ownership: Ownership::new(&poses, &plans),
         })
     }
 
@@ -149,7 +147,12 @@ impl CloudPlan {
             }
         }
         let begin_stage = |name| notify(on_event, name);
-        local_map::build_of_cloud(&cloud, number, &self.ownership, &self.config, begin_stage)
+        let domain = Domain {
+            number,
+            origin: DVec3::ZERO,
+            ownership: &self.ownership,
+        };
+        local_map::build_of_cloud(&cloud, domain, &self.config, begin_stage)
     }
 }
 

@@ -6,7 +6,7 @@ use smart_default::SmartDefault;
 use super::local_map::LocalMapConfig;
 use super::tiles::TileConfig;
 use crate::ground::GroundConfig;
-use crate::rendering::Backend;
+use crate::rendering::{Backend, RenderingMethod};
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Everything that can be configured about building a map.
@@ -48,6 +48,8 @@ impl Validate for MapConfig {
 pub struct MapOptions {
     /// Processor that renders the map.
     pub backend: Backend,
+    /// Method to render whole range images.
+    pub method: RenderingMethod,
     /// Largest number of poses rendered at once; `None` for no limit.
     pub max_poses: Option<usize>,
     /// Division into tiles.

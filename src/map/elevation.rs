@@ -13,13 +13,15 @@
 //! Where roads cross above one another the map has several levels. The height of the last known
 //! ground selects the level.
 
+use std::sync::Arc;
+
 use glam::Vec3;
 use nalgebra::{
     Matrix3, Point2, Point3, Rotation3, Translation3, UnitQuaternion, Vector2, Vector3,
 };
 use smart_default::SmartDefault;
 
-use super::heights::{HeightReader, Heights, LEVEL_GAP_M};
+use super::heights::{ChunkSource, HeightReader, Heights, LEVEL_GAP_M};
 use crate::geometry::{Pose2, Pose3, TriangleMesh};
 
 /// Radius of the ground that carries a car, about its wheelbase [m].
@@ -116,7 +118,7 @@ impl GroundPatch {
 }
 
 /// Elevation map: heights of the ground on a grid, with several levels under bridges.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct GroundMap {
     heights: Heights,
 }
@@ -126,7 +128,17 @@ impl GroundMap {
     pub fn from_mesh(mesh: &TriangleMesh, is_ground: impl Fn(usize) -> bool, cell_m: f64) -> Self {
         let ground = (0..mesh.triangles.len()).filter(|&triangle| is_ground(triangle));
         Self {
-            heights: Heights::of_triangles(ground.map(|triangle| mesh.corners(triangle)), cell_m),
+            heights: Heights::of_triangles(
+                ground.map(|triangle| mesh.corners(triangle).map(|corner| corner.as_dvec3())),
+                cell_m,
+            ),
+        }
+    }
+
+    /// The elevation map whose chunks a source supplies, in cells of `cell_m`.
+    pub(super) fn over(chunks: Arc<dyn ChunkSource>, cell_m: f64) -> Self {
+        Self {
+            heights: Heights::over(chunks, cell_m),
         }
     }
 

@@ -72,7 +72,7 @@ impl GroundSurface {
                 let mut add = |(column, row): (i64, i64), height_m: f64| {
                     samples.push((column as i32, row as i32, height_m as f32));
                 };
-                rasterize(corners, CELL_M, &mut add);
+                rasterize(corners.map(|corner| corner.as_dvec3()), CELL_M, &mut add);
                 let center = centroid(corners);
                 let (column, row) = cell_of(center);
                 samples.push((column, row, center.z));

@@ -12,11 +12,14 @@
 //! *Multi-Level Surface Maps for Outdoor Terrain Mapping and Loop Closing*, IROS 2006): the heights of
 //! a cell are clustered by single linkage, and each level is the mean of a cluster.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
+use std::fmt::Debug;
+use std::sync::Arc;
 
+use glam::DVec3;
 use nalgebra::{Point2, Vector3};
 
-use crate::geometry::Vec3;
+use crate::shared_bytes::SharedBytes;
 
 /// Cells along the edge of a chunk.
 const CHUNK_CELLS: i64 = 64;
@@ -27,32 +30,49 @@ const MAX_EDGE_M: f64 = 500.0;
 /// Smallest distance of two levels, less than the clearance that any vehicle needs [m].
 pub(super) const LEVEL_GAP_M: f64 = 2.0;
 
-/// Column and row of a cell.
-type Cell = (i64, i64);
+/// Edge of a cell of the ground of a map [m].
+pub(super) const GROUND_CELL_M: f64 = 0.5;
 
-/// Levels of the cells of a chunk, the lowest of each cell first; NaN where a cell has no such
-/// level [m].
-type ChunkLevels = Vec<Box<[f32]>>;
+/// Cells of a chunk.
+const CELLS: usize = (CHUNK_CELLS * CHUNK_CELLS) as usize;
 
-/// Heights of the levels of all cells.
-#[derive(Clone, Debug, PartialEq)]
+/// Column and row of a cell, or of a chunk.
+pub(super) type Cell = (i64, i64);
+
+/// Heights of the levels of all cells. Clones share them.
+#[derive(Clone, Debug)]
 pub(super) struct Heights {
     /// Edge of a cell [m].
     pub cell_m: f64,
-    chunks: HashMap<Cell, ChunkLevels>,
+    chunks: Arc<dyn ChunkSource>,
+}
+
+/// Supplies chunks: level by level the heights of their cells [m], the lowest level of each cell first; NaN where a
+/// cell has no such level.
+pub(super) trait ChunkSource: Debug + Send + Sync {
+    /// The numbers of a chunk, `f32`; `None` where there is no ground.
+    fn chunk(&self, chunk: Cell) -> Option<SharedBytes>;
+}
+
+/// Chunks in memory.
+pub(super) type Chunks = BTreeMap<Cell, SharedBytes>;
+
+impl ChunkSource for Chunks {
+    fn chunk(&self, chunk: Cell) -> Option<SharedBytes> {
+        self.get(&chunk).cloned()
+    }
 }
 
 impl Heights {
     /// Averages the heights of triangles per cell and level: one sample in each cell whose centre a
     /// triangle covers, and one at each of its corners.
-    pub fn of_triangles(corners: impl Iterator<Item = [Vec3; 3]>, cell_m: f64) -> Self {
-        let mut samples = HeightSamples::default();
-        for corners in corners {
-            rasterize(corners, cell_m, &mut |cell, height_m| {
-                samples.add(cell, height_m)
-            });
-        }
-        samples.into_heights(cell_m)
+    pub fn of_triangles(corners: impl Iterator<Item = [DVec3; 3]>, cell_m: f64) -> Self {
+        Self::over(Arc::new(chunks_of_triangles(corners, cell_m)), cell_m)
+    }
+
+    /// Heights that a source supplies.
+    pub fn over(chunks: Arc<dyn ChunkSource>, cell_m: f64) -> Self {
+        Self { cell_m, chunks }
     }
 
     /// One height for every cell of a rectangle.
@@ -64,7 +84,7 @@ impl Heights {
                 samples.add((column, row), height_m);
             }
         }
-        samples.into_heights(cell_m)
+        Self::over(Arc::new(samples.into_chunks()), cell_m)
     }
 
     /// Returns the cell of a position; `None` if a coordinate is not finite.
@@ -86,27 +106,37 @@ impl Heights {
     }
 }
 
-/// Reads heights and caches the last chunk: neighbouring cells mostly share one.
+/// The chunks of triangles, in any order.
+pub(super) fn chunks_of_triangles(
+    corners: impl Iterator<Item = [DVec3; 3]>,
+    cell_m: f64,
+) -> Chunks {
+    let mut samples = HeightSamples::default();
+    for corners in corners {
+        rasterize(corners, cell_m, &mut |cell, height_m| {
+            samples.add(cell, height_m)
+        });
+    }
+    samples.into_chunks()
+}
+
+/// Reads heights and keeps the last chunk: neighbouring cells mostly share one.
 pub(super) struct HeightReader<'a> {
     heights: &'a Heights,
-    last: Option<(Cell, &'a [Box<[f32]>])>,
+    last: Option<(Cell, Option<SharedBytes>)>,
 }
 
 impl HeightReader<'_> {
     /// Returns the levels of a cell, the lowest first [m].
     pub fn levels_m(&mut self, cell: Cell) -> impl Iterator<Item = f64> {
         let (chunk, offset) = chunk_of(cell);
-        let levels = match self.last {
-            Some((last, levels)) if last == chunk => levels,
-            _ => self
-                .heights
-                .chunks
-                .get(&chunk)
-                .map_or(&[][..], Vec::as_slice),
-        };
-        self.last = Some((chunk, levels));
-        levels
-            .iter()
+        if !matches!(&self.last, Some((last, _)) if *last == chunk) {
+            self.last = Some((chunk, self.heights.chunks.chunk(chunk)));
+        }
+        let bytes = self.last.as_ref().and_then(|(_, bytes)| bytes.as_deref());
+        let heights_m: &[f32] = bytes.map_or(&[], bytemuck::cast_slice);
+        heights_m
+            .chunks_exact(CELLS)
             .map(move |cells| f64::from(cells[offset]))
             .take_while(|height_m| !height_m.is_nan())
     }
@@ -138,7 +168,7 @@ impl HeightSamples {
     /// it connects are merged.
     fn add(&mut self, cell: Cell, height_m: f64) {
         let (chunk, offset) = chunk_of(cell);
-        let empty = || vec![Vec::new(); (CHUNK_CELLS * CHUNK_CELLS) as usize].into();
+        let empty = || vec![Vec::new(); CELLS].into();
         let clusters = &mut self.chunks.entry(chunk).or_insert_with(empty)[offset];
         let mut added = HeightCluster {
             low_m: height_m,
@@ -161,21 +191,19 @@ impl HeightSamples {
         clusters.insert(index, added);
     }
 
-    fn into_heights(self, cell_m: f64) -> Heights {
+    fn into_chunks(self) -> Chunks {
         let mean_m = |cluster: &HeightCluster| (cluster.sum_m / cluster.count) as f32;
-        let levels = |cells: &[Vec<HeightCluster>]| -> ChunkLevels {
+        let levels = |cells: &[Vec<HeightCluster>]| {
             let most = cells.iter().map(Vec::len).max().unwrap_or(0);
             let level_m = |clusters: &Vec<_>, level| clusters.get(level).map_or(f32::NAN, mean_m);
-            (0..most)
-                .map(|level| cells.iter().map(|cell| level_m(cell, level)).collect())
-                .collect()
+            let heights_m: Vec<f32> = (0..most)
+                .flat_map(|level| cells.iter().map(move |cell| level_m(cell, level)))
+                .collect();
+            SharedBytes::from(bytemuck::cast_slice(&heights_m))
         };
-        Heights {
-            cell_m,
-            chunks: (self.chunks.into_iter())
-                .map(|(chunk, cells)| (chunk, levels(&cells)))
-                .collect(),
-        }
+        (self.chunks.into_iter())
+            .map(|(chunk, cells)| (chunk, levels(&cells)))
+            .collect()
     }
 }
 
@@ -184,6 +212,26 @@ fn chunk_of((column, row): Cell) -> (Cell, usize) {
     let chunk = (column.div_euclid(CHUNK_CELLS), row.div_euclid(CHUNK_CELLS));
     let offset = row.rem_euclid(CHUNK_CELLS) * CHUNK_CELLS + column.rem_euclid(CHUNK_CELLS);
     (chunk, offset as usize)
+}
+
+/// The chunks that a triangle may have heights in; none for an artefact.
+pub(super) fn chunks_reached([a, b, c]: [DVec3; 3], cell_m: f64) -> impl Iterator<Item = Cell> {
+    let (min, max) = (a.min(b).min(c), a.max(b).max(c));
+    let chunk_at = |corner: DVec3| {
+        let (column, row) = cell_of(Point2::new(corner.x, corner.y), cell_m);
+        (column.div_euclid(CHUNK_CELLS), row.div_euclid(CHUNK_CELLS))
+    };
+    let is_small =
+        (b - a).truncate().length() <= MAX_EDGE_M && (c - a).truncate().length() <= MAX_EDGE_M;
+    let (first, last) = (chunk_at(min), chunk_at(max));
+    let last_row = if is_small { last.1 } else { first.1 - 1 };
+    (first.1..=last_row).flat_map(move |row| (first.0..=last.0).map(move |column| (column, row)))
+}
+
+/// Middle of a chunk of cells of an edge.
+pub(super) fn middle_of_chunk((column, row): Cell, cell_m: f64) -> Point2<f64> {
+    let edge_m = CHUNK_CELLS as f64 * cell_m;
+    Point2::new((column as f64 + 0.5) * edge_m, (row as f64 + 0.5) * edge_m)
 }
 
 /// Cell of a position.
@@ -197,8 +245,8 @@ fn center_of((column, row): Cell, cell_m: f64) -> Point2<f64> {
 }
 
 /// Adds the heights of a triangle at the centres of cells that it covers, and those of its corners.
-pub(super) fn rasterize(corners: [Vec3; 3], cell_m: f64, add: &mut impl FnMut(Cell, f64)) {
-    let [a, b, c] = corners.map(|corner| Vector3::new(corner.x, corner.y, corner.z).cast::<f64>());
+pub(super) fn rasterize(corners: [DVec3; 3], cell_m: f64, add: &mut impl FnMut(Cell, f64)) {
+    let [a, b, c] = corners.map(|corner| Vector3::from(corner.to_array()));
     let (ab, ac) = (b - a, c - a);
     if ab.xy().norm().max(ac.xy().norm()) > MAX_EDGE_M {
         return;
@@ -240,20 +288,22 @@ mod tests {
 
     #[test]
     fn an_outlier_triangle_allocates_only_its_own_chunks() {
-        let near = [Vec3::ZERO, Vec3::X, Vec3::Y];
-        let far = near.map(|corner| corner + Vec3::new(1.0e9, -1.0e9, 0.0));
-        let degenerate = [Vec3::ZERO, Vec3::X, Vec3::new(0.0, 1.0e30, 0.0)];
+        let near = [DVec3::ZERO, DVec3::X, DVec3::Y];
+        let far = near.map(|corner| corner + DVec3::new(1.0e9, -1.0e9, 0.0));
+        let degenerate = [DVec3::ZERO, DVec3::X, DVec3::new(0.0, 1.0e30, 0.0)];
         let heights = Heights::of_triangles([near, far, degenerate].into_iter(), 0.25);
-        assert_eq!(heights.chunks.len(), 2);
+        let chunks = chunks_of_triangles([near, far, degenerate].into_iter(), 0.25);
+        assert_eq!(chunks.len(), 2);
         assert_eq!(heights.reader().nearest_m((1, 1), 5.0), Some(0.0));
         assert_eq!(heights.reader().nearest_m((1000, 1), 0.0), None);
     }
 
     #[test]
     fn heights_farther_apart_than_the_gap_are_levels_and_a_height_between_merges_them() {
-        let slab =
-            |height: f32| [Vec3::ZERO, Vec3::X, Vec3::Y].map(|corner| corner + Vec3::Z * height);
-        let levels = |heights_m: &[f32]| {
+        let slab = |height: f64| {
+            [DVec3::ZERO, DVec3::X, DVec3::Y].map(|corner| corner + DVec3::Z * height)
+        };
+        let levels = |heights_m: &[f64]| {
             let heights = Heights::of_triangles(heights_m.iter().map(|&height| slab(height)), 0.25);
             heights.reader().levels_m((0, 0)).collect::<Vec<_>>()
         };
@@ -266,9 +316,9 @@ mod tests {
     #[test]
     fn a_reader_returns_the_same_heights_in_any_order() {
         let climbing = [
-            Vec3::new(-40.0, -40.0, -4.0),
-            Vec3::new(40.0, -40.0, 4.0),
-            Vec3::new(-40.0, 40.0, -4.0),
+            DVec3::new(-40.0, -40.0, -4.0),
+            DVec3::new(40.0, -40.0, 4.0),
+            DVec3::new(-40.0, 40.0, -4.0),
         ];
         let heights = Heights::of_triangles([climbing].into_iter(), 0.5);
         let mut reader = heights.reader();

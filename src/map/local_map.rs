@@ -1,11 +1,13 @@
 //! A local map: the mesh of the scans of a stretch of road.
 
+use glam::{DVec3, Vec3};
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::changes::{self, Changes};
 use super::confidence::{self, ConfidenceConfig};
-use super::plan::Ownership;
+use super::mesh_view::MeshView;
+use super::plan::Domain;
 use super::scan_cloud::{PointCounts, ScanCloud, ScanConfig};
 use super::seam;
 use super::vertex_ground;
@@ -125,6 +127,8 @@ pub struct LocalMapCounts {
 pub struct LocalMap {
     /// The part of the surface that it owns; empty where there were too few points.
     pub mesh: TriangleMesh,
+    /// Origin of the coordinates of its mesh in the map frame [m], not zero far away from that of the map.
+    pub origin: DVec3,
     /// Triangles of the older map that are gone, ascending.
     pub gone: Vec<u32>,
     /// Numbers of points and triangles at each step.
@@ -136,13 +140,24 @@ pub struct LocalMap {
     pub doubtful_scans: Vec<usize>,
 }
 
+impl LocalMap {
+    /// Its mesh in the map frame, rounded to single precision.
+    pub fn in_map(&self) -> TriangleMesh {
+        let position = |vertex: &Vec3| (self.origin + vertex.as_dvec3()).as_vec3();
+        TriangleMesh {
+            vertices: self.mesh.vertices.iter().map(position).collect(),
+            ..self.mesh.clone()
+        }
+    }
+}
+
 /// Meshes the prepared scans of a local map and colours the mesh by ground confidence; of an older map, it finds what
 /// is gone, and keeps what is not in it. `begin_stage` is called at the start of each stage and may end the work with an
 /// error.
 pub(super) fn build<E: From<MeshingError>>(
     scans: Vec<ScanCloud>,
-    (number, ownership): (usize, &Ownership),
-    older: Option<&TriangleMesh>,
+    domain: Domain,
+    older: Option<&dyn MeshView>,
     config: &LocalMapConfig,
     begin_stage: impl Fn(&'static str) -> Result<(), E>,
 ) -> Result<LocalMap, E> {
@@ -172,8 +187,7 @@ pub(super) fn build<E: From<MeshingError>>(
     let mut changes = Changes::default();
     if let Some(older) = older {
         begin_stage("changes")?;
-        let region = (number, ownership);
-        changes = changes::compare(older, &mut mesh, &scans, region, &config.visibility);
+        changes = changes::compare(older, &mut mesh, &scans, domain, &config.visibility);
         counts.known_triangles = changes.known;
         counts.gone_triangles = changes.gone.len();
     }
@@ -182,15 +196,14 @@ pub(super) fn build<E: From<MeshingError>>(
     begin_stage("ground")?;
     Ok(LocalMap {
         gone: changes.gone,
-        ..finish(mesh, &cloud, (number, ownership), config, counts)
+        ..finish(mesh, &cloud, domain, config, counts)
     })
 }
 
 /// Meshes oriented points with ground confidences, as [`build`] does after the preparation of the scans.
 pub(super) fn build_of_cloud<E: From<MeshingError>>(
     cloud: &PointCloud,
-    number: usize,
-    ownership: &Ownership,
+    domain: Domain,
     config: &LocalMapConfig,
     begin_stage: impl Fn(&'static str) -> Result<(), E>,
 ) -> Result<LocalMap, E> {
@@ -203,7 +216,7 @@ pub(super) fn build_of_cloud<E: From<MeshingError>>(
         });
     };
     begin_stage("ground")?;
-    Ok(finish(mesh, cloud, (number, ownership), config, counts))
+    Ok(finish(mesh, cloud, domain, config, counts))
 }
 
 /// Reconstructs and trims the surface; `None` where there are too few points.
@@ -232,18 +245,20 @@ fn surface(
 fn finish(
     mut mesh: TriangleMesh,
     cloud: &PointCloud,
-    (number, ownership): (usize, &Ownership),
+    domain: Domain,
     config: &LocalMapConfig,
     mut counts: LocalMapCounts,
 ) -> LocalMap {
-    counts.foreign_triangles = seam::keep_own(&mut mesh, ownership, number);
+    let region = domain.region(&mesh.bounds());
+    counts.foreign_triangles = seam::keep_own(&mut mesh, &region, domain.origin);
     meshing::split_fans(&mut mesh);
-    let is_held = seam::on_border(&mesh.vertices, ownership, number);
+    let is_held = seam::on_border(&mesh.vertices, &region, domain.origin);
     finish_ground(&mut mesh, cloud, &is_held, config, &mut counts);
     mesh.snap();
     counts.triangles = mesh.triangles.len();
     LocalMap {
         mesh,
+        origin: domain.origin,
         counts,
         ..LocalMap::default()
     }
@@ -340,8 +355,6 @@ fn finish_ground(
 
 #[cfg(test)]
 mod tests {
-    use glam::Vec3;
-
     use super::*;
     use crate::geometry::{Pose3, Rigid3f};
 

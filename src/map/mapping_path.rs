@@ -35,11 +35,8 @@ impl MappingPath {
     /// Returns the comments of the PLY file.
     pub fn to_comments(&self) -> Vec<String> {
         let line = |key: &str, pose: &Pose3| {
-            let (t, q) = (pose.translation, pose.rotation);
-            format!(
-                "{key} {} {} {} {} {} {} {}",
-                t.x, t.y, t.z, q.i, q.j, q.k, q.w
-            )
+            let [x, y, z, i, j, k, w] = numbers_of_pose(pose);
+            format!("{key} {x} {y} {z} {i} {j} {k} {w}")
         };
         let poses = self.map_from_lidar.iter().map(|pose| line(POSE, pose));
         std::iter::once(line(WORLD, &self.world_from_map))
@@ -100,11 +97,21 @@ fn pose(numbers: &str, comment: &str) -> Result<Pose3, BadPathComment> {
     if !is_on_earth || (quaternion.norm() - 1.0).abs() > 1e-6 {
         return Err(bad());
     }
-    // Not normalized again, so that the same bits come back.
-    Ok(Pose3::from_parts(
-        Translation3::new(x, y, z),
-        UnitQuaternion::new_unchecked(quaternion),
-    ))
+    Ok(pose_of_numbers(&[x, y, z, i, j, k, w]))
+}
+
+/// A pose as numbers: translation [m], then the quaternion i, j, k, w.
+pub(super) type PoseNumbers = [f64; 7];
+
+pub(super) fn numbers_of_pose(pose: &Pose3) -> PoseNumbers {
+    let (t, q) = (pose.translation, pose.rotation);
+    [t.x, t.y, t.z, q.i, q.j, q.k, q.w]
+}
+
+/// The same bits again: the quaternion is not normalized.
+pub(super) fn pose_of_numbers(&[x, y, z, i, j, k, w]: &PoseNumbers) -> Pose3 {
+    let rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k));
+    Pose3::from_parts(Translation3::new(x, y, z), rotation)
 }
 
 #[cfg(test)]

@@ -64,8 +64,10 @@ pub enum MeshFileProblem {
     NotStl,
     #[error("has no triangles; build the map again, or choose another map_file")]
     NoTriangles,
-    #[error("has {0} vertices, more than the 4 billion that can be numbered; divide the map")]
-    TooManyVertices(usize),
+    #[error(
+        "has {0} vertices or triangles, more than the 4 billion that can be numbered; divide the map"
+    )]
+    TooLarge(usize),
     #[error(
         "is damaged: face {face} uses vertex {vertex}, but there are {vertices}; build the map again"
     )]
@@ -84,6 +86,14 @@ pub enum MeshFileProblem {
         "has coordinates up to {farthest_m:.0} m in single precision, which resolves only {resolution_cm:.0} cm there; subtract an offset before exporting, or export a PLY of doubles or an OBJ"
     )]
     TooCoarse { farthest_m: f64, resolution_cm: f64 },
+}
+
+/// Requires that so many vertices or triangles can be numbered.
+pub(super) fn require_numbers(count: usize) -> Result<(), MeshFileProblem> {
+    match u32::try_from(count) {
+        Ok(_) => Ok(()),
+        Err(_) => Err(MeshFileProblem::TooLarge(count)),
+    }
 }
 
 impl MeshFileProblem {

@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::DVec3;
 
 use super::mapping_path::MappingPath;
-use super::mesh_error::{MeshFileError, MeshFileProblem};
+use super::mesh_error::{MeshFileError, MeshFileProblem, require_numbers};
 use super::mesh_origin::{Precision, relative};
 use super::{obj, ply, stl};
 use crate::geometry::TriangleMesh;
@@ -39,9 +39,7 @@ fn mesh_of(
     if triangles.is_empty() {
         return Err(MeshFileProblem::NoTriangles);
     }
-    if u32::try_from(vertices.len()).is_err() {
-        return Err(MeshFileProblem::TooManyVertices(vertices.len()));
-    }
+    require_numbers(vertices.len().max(triangles.len()))?;
     let (origin, vertices) = relative(vertices, precision)?;
     let mesh = TriangleMesh {
         vertices,

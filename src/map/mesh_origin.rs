@@ -10,7 +10,7 @@ use super::mesh_error::MeshFileProblem;
 use crate::geometry::FARTHEST_M;
 
 /// Largest coordinate that single precision resolves to half a millimetre [m].
-const PRECISE_M: f64 = 8192.0;
+pub(super) const PRECISE_M: f64 = 8192.0;
 
 /// Precision of the coordinates in a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

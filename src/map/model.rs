@@ -1,45 +1,53 @@
 //! The map that a car is localized in.
 
+use std::io;
 use std::ops::RangeInclusive;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
+use nalgebra::Point2;
 
 use super::config::MapOptions;
 use super::elevation::GroundMap;
 use super::ground_surface::GroundSurface;
+use super::heights::{Chunks, GROUND_CELL_M, chunks_of_triangles};
+use super::mapped_ply::MappedPly;
 use super::mapping_path::MappingPath;
 use super::mesh_error::MeshFileError;
 use super::mesh_file;
+use super::mesh_view::MeshView;
 use super::panorama::{PanoramaIndex, PanoramaRequest};
+use super::panorama_file::Panoramas;
 use super::ply;
-use super::tiles::{self, TileGrid};
-use super::vertex_ground::is_ground_color;
-use crate::geometry::TriangleMesh;
+use super::tile_store::TileStore;
+use super::tiles::{self, TileConfig, TileGrid, TileIndex};
+use super::vertex_ground::{GROUND, REST};
+use crate::geometry::mesh::on_lattice;
+use crate::geometry::{Aabb, TriangleMesh};
 use crate::memory::{self, MemoryError};
-use crate::rendering::{RangeRenderer, RenderError, renderer};
-
-/// Cell size of the elevation of the ground [m].
-const GROUND_CELL_M: f64 = 0.5;
+use crate::rendering::selection::{self, BackendChoice};
+use crate::rendering::{RangeRenderer, RenderError};
 
 /// Extents between which a map in metres lies [m].
 const PLAUSIBLE_M: RangeInclusive<f32> = 2.0..=20_000.0;
 
-/// Memory per triangle while a map is prepared: mesh, tiles and hierarchies [bytes].
-const TRIANGLE_BYTES: f64 = 150.0;
+/// Memory per triangle while a mapped file is divided into tiles: its index, as one of a tile and of the ground [bytes].
+const DIVIDED_BYTES: f64 = 16.0;
 
-/// Memory per tile [bytes].
-const TILE_BYTES: f64 = 1000.0;
+/// What to do about a map that needs too much memory.
+const SMALLER_MAP: &str = "build a smaller map with a larger simplify_resolution";
+
+/// Memory per triangle while a map is prepared: mesh, ground, tiles and hierarchies [bytes].
+const TRIANGLE_BYTES: f64 = 150.0;
 
 /// A mesh prepared for localization, with its tile grid, elevation map, renderer and the path of the
 /// mapping drive. All poses in it are `map_from_lidar`.
 ///
-/// Clones share their data.
+/// A map that is [loaded](Self::load) keeps in memory what is around the car. Clones share their data.
 #[derive(Clone)]
 pub struct Map {
-    /// The surface, map frame.
-    pub mesh: Arc<TriangleMesh>,
+    surface: Surface,
     /// Frame of the map and path of the mapping drive.
     pub path: Arc<MappingPath>,
     /// Division of the plane into tiles, and which of them the mapping drive visited.
@@ -50,6 +58,16 @@ pub struct Map {
     pub renderer: Arc<dyn RangeRenderer>,
     /// The panoramas of the last request.
     panoramas: Arc<Mutex<Option<CachedPanoramas>>>,
+}
+
+/// Where the triangles of a map are.
+#[derive(Clone)]
+enum Surface {
+    Memory(Arc<TriangleMesh>),
+    Disk {
+        mesh_file: PathBuf,
+        tiles: Arc<TileStore>,
+    },
 }
 
 /// Rendered panoramas and the request that they answer.
@@ -85,31 +103,25 @@ impl Map {
         path: MappingPath,
         options: &MapOptions,
     ) -> Result<Self, MapError> {
-        mesh.snap();
-        let triangles = mesh.triangles.len();
-        if (0..triangles).all(|triangle| mesh.scaled_normal(triangle) == glam::Vec3::ZERO) {
-            return Err(MapError::NoArea { triangles });
-        }
-        let has_path = !path.map_from_lidar.is_empty();
-        let bounds = mesh.bounds();
-        let tiles = match has_path {
-            true => TileGrid::count(&path.map_from_lidar, &options.tiles),
-            false => TileGrid::count_of_mesh(&bounds, &options.tiles),
-        };
-        memory::require(
-            "the map",
-            triangles as f64 * TRIANGLE_BYTES + tiles * TILE_BYTES,
-            "choose a smaller map, or check the poses of its mapping drive",
-        )?;
-        let ground = ground_of(&mesh, has_path)?;
-        let tiles = match has_path {
-            true => TileGrid::around(&path.map_from_lidar, &options.tiles),
-            false => TileGrid::of_mesh(&mesh, &options.tiles),
-        };
-        let parts = tiles::cut(&mesh, &tiles);
-        let renderer = renderer(&parts, options.backend, options.max_poses)?;
-        drop(parts);
-        Ok(Self::from_parts(mesh, path, tiles, ground, renderer.into()))
+        let (chunks, _) = prepare(&mut mesh, &path)?;
+        let choice = selection::choose(options.backend, options.method)?;
+        Self::in_memory(mesh, path, chunks, options, &choice)
+    }
+
+    fn in_memory(
+        mesh: TriangleMesh,
+        path: MappingPath,
+        chunks: Chunks,
+        options: &MapOptions,
+        choice: &BackendChoice,
+    ) -> Result<Self, MapError> {
+        let (indices, parts): (Vec<TileIndex>, Vec<TriangleMesh>) =
+            tiles::cut(&mesh, options.tiles.side_m).into_iter().unzip();
+        let boxes = std::iter::zip(indices, parts.iter().map(TriangleMesh::bounds));
+        let tiles = grid_of(&path, boxes, &options.tiles);
+        let renderer = choice.renderer(&parts, options.max_poses)?;
+        let ground = GroundMap::over(Arc::new(chunks), GROUND_CELL_M);
+        Ok(Self::from_parts(mesh, path, tiles, ground, renderer))
     }
 
     /// Assembles a map from its parts.
@@ -121,7 +133,7 @@ impl Map {
         renderer: Arc<dyn RangeRenderer>,
     ) -> Self {
         Self {
-            mesh: mesh.into(),
+            surface: Surface::Memory(mesh.into()),
             path: path.into(),
             tiles: tiles.into(),
             ground: ground.into(),
@@ -130,17 +142,138 @@ impl Map {
         }
     }
 
-    /// Reads a map that [`save`](Self::save) or `build-map` wrote, or a mesh from elsewhere (PLY, OBJ or
-    /// STL). A map of range-mcl does not contain the path of its mapping drive: give
-    /// [`mesh_file::read`] and that path to [`new`](Self::new).
-    pub fn load(path: &Path, options: &MapOptions) -> Result<Self, MapError> {
-        let (mesh, mapping_path) = mesh_file::read(path)?;
-        Self::new(mesh, mapping_path.unwrap_or_default(), options)
+    /// Opens a map that [`save`](Self::save) or `build-map` wrote, or a mesh from elsewhere (PLY, OBJ or
+    /// STL).
+    ///
+    /// On first use, and when the mesh has changed, it is divided into tiles, in a folder beside it whose name is that
+    /// of the file with `.tiles`; of these, those around the car are kept in memory, and on a graphics card. Where that folder
+    /// cannot be written, all of the map is.
+    pub fn load(mesh_file: &Path, options: &MapOptions) -> Result<Self, MapError> {
+        Self::load_with_path(mesh_file, None, options)
+    }
+
+    /// Opens a map like [`load`](Self::load), with the path of its mapping drive if it is not in the file: maps of
+    /// range-mcl do not contain theirs.
+    pub fn load_with_path(
+        mesh_file: &Path,
+        given: Option<MappingPath>,
+        options: &MapOptions,
+    ) -> Result<Self, MapError> {
+        let side_m = options.tiles.side_m;
+        let choice = selection::choose(options.backend, options.method)?;
+        let on_disk = |store, given| Self::on_disk((mesh_file, store), given, options, &choice);
+        if let Ok(Some(store)) = TileStore::open(mesh_file, given.is_some(), side_m) {
+            return on_disk(store, given);
+        }
+        let has_given = given.is_some();
+        // Of the file before it is opened: what is opened is not of an earlier file.
+        let source = TileStore::source(mesh_file, has_given, side_m).ok();
+        let divide =
+            |mesh: &dyn MeshView, own: Option<MappingPath>, is_ground: &dyn Fn(usize) -> bool| {
+                let source = source.ok_or(io::ErrorKind::NotFound)?;
+                TileStore::make(mesh_file, source, mesh, is_ground, own)
+            };
+        if let Some(mesh) = MappedPly::open(mesh_file)
+            && has_red_ground(&mesh, mesh.has_path() || has_given)
+        {
+            let bytes = mesh.triangles() as f64 * DIVIDED_BYTES;
+            memory::require("the tiles of the map", bytes, SMALLER_MAP)?;
+            if let Ok(store) = divide(&mesh, mesh.path.clone(), &|triangle| mesh.is_red(triangle)) {
+                return on_disk(store, given);
+            }
+        }
+        let (mut mesh, own) = mesh_file::read(mesh_file)?;
+        let path = own.clone().or_else(|| given.clone()).unwrap_or_default();
+        let (chunks, is_ground) = prepare(&mut mesh, &path)?;
+        match divide(&mesh, own, &|triangle| is_ground[triangle]) {
+            Ok(store) => return on_disk(store, given),
+            Err(error) => tracing::info!(
+                "the tiles of {} cannot be written beside it ({error}): all of it is kept in memory",
+                mesh_file.display()
+            ),
+        }
+        Self::in_memory(mesh, path, chunks, options, &choice)
+    }
+
+    fn on_disk(
+        (mesh_file, store): (&Path, TileStore),
+        given: Option<MappingPath>,
+        options: &MapOptions,
+        choice: &BackendChoice,
+    ) -> Result<Self, MapError> {
+        let path = store.path.clone().or(given).unwrap_or_default();
+        let tiles = grid_of(&path, store.boxes(), &options.tiles);
+        let store = Arc::new(store);
+        let renderer = choice.renderer_over(&store, options.max_poses)?;
+        Ok(Self {
+            surface: Surface::Disk {
+                mesh_file: mesh_file.to_owned(),
+                tiles: store.clone(),
+            },
+            path: path.into(),
+            tiles: tiles.into(),
+            ground: GroundMap::over(store, GROUND_CELL_M).into(),
+            renderer,
+            panoramas: Arc::default(),
+        })
     }
 
     /// Writes the map as a PLY file that is complete by itself; see [`ply::write`].
     pub fn save(&self, path: &Path) -> Result<(), MapError> {
-        Ok(ply::write(path, &self.mesh, Some(&self.path))?)
+        Ok(ply::write(path, &*self.mesh()?, Some(&self.path))?)
+    }
+
+    /// Number of triangles.
+    pub fn triangle_count(&self) -> u64 {
+        match &self.surface {
+            Surface::Memory(mesh) => mesh.triangles.len() as u64,
+            Surface::Disk { tiles, .. } => tiles.triangles(),
+        }
+    }
+
+    /// The whole surface, map frame. That of a map on disk is read from its file again, on the lattice of maps.
+    pub fn mesh(&self) -> Result<Arc<TriangleMesh>, MapError> {
+        match &self.surface {
+            Surface::Memory(mesh) => Ok(mesh.clone()),
+            Surface::Disk { mesh_file, .. } => {
+                let (mut mesh, _) = mesh_file::read(mesh_file)?;
+                mesh.snap();
+                Ok(mesh.into())
+            }
+        }
+    }
+
+    /// The surface around some positions [m] (without any, everywhere), at least as far as `radius_m`, relative to
+    /// `origin` in the map frame: that of the tiles there, or, of a map in memory, all of it. Of tiles, ground is red and the rest blue, and there are no
+    /// normals; if they have more than `most_triangles`, vertices are merged in cells, for pictures.
+    pub fn mesh_near(
+        &self,
+        positions: &[Point2<f64>],
+        radius_m: f64,
+        origin: DVec3,
+        most_triangles: u64,
+    ) -> Result<Arc<TriangleMesh>, MapError> {
+        let tiles = match &self.surface {
+            Surface::Memory(mesh) if origin == DVec3::ZERO => return Ok(mesh.clone()),
+            Surface::Memory(mesh) => {
+                let relative = |vertex: &Vec3| (vertex.as_dvec3() - origin).as_vec3();
+                let mut moved = TriangleMesh::clone(mesh);
+                moved.vertices = mesh.vertices.iter().map(relative).collect();
+                return Ok(moved.into());
+            }
+            Surface::Disk { tiles, .. } => tiles,
+        };
+        let is_near = |bounds: &Aabb| {
+            let [min, max] = [bounds.min, bounds.max].map(|corner| corner.as_dvec3());
+            positions.is_empty()
+                || positions.iter().any(|position| {
+                    let x_m = (min.x - position.x).max(position.x - max.x).max(0.0);
+                    let y_m = (min.y - position.y).max(position.y - max.y).max(0.0);
+                    x_m.hypot(y_m) <= radius_m
+                })
+        };
+        let mesh = tiles.mesh_of(origin, most_triangles, is_near);
+        Ok(mesh.map_err(RenderError::from)?.into())
     }
 
     /// Returns the panoramas of the cells in which place recognition searches. They are rendered if the
@@ -150,16 +283,7 @@ impl Map {
         match &*last {
             Some((made_for, index)) if made_for == request => Ok(index.clone()),
             _ => {
-                request.require_memory(&self.path.map_from_lidar, &self.tiles)?;
-                let cells = request.cells(&self.path.map_from_lidar, &self.tiles);
-                let index = PanoramaIndex::build(
-                    &cells,
-                    &*self.renderer,
-                    &self.ground,
-                    &self.tiles,
-                    request,
-                )?;
-                let index = Arc::new(index);
+                let index = Arc::new(self.find_panoramas(request)?);
                 *last = Some((request.clone(), index.clone()));
                 Ok(index)
             }
@@ -167,22 +291,106 @@ impl Map {
     }
 }
 
-/// Builds the elevation map of the red triangles; in a mesh without any, of the ground found by its shape.
-///
-/// Colours of a mesh without a mapping drive mark the ground only if they are between red and blue: others
-/// are those of a photograph.
-fn ground_of(mesh: &TriangleMesh, has_path: bool) -> Result<GroundMap, MapError> {
-    let is_marked = has_path || mesh.colors.iter().all(|[_, green, _]| *green == 0);
-    let is_red = |triangle: usize| {
-        let mut vertices = mesh.triangles[triangle].iter();
-        vertices.all(|&vertex| {
-            mesh.colors
-                .get(vertex as usize)
-                .is_some_and(is_ground_color)
-        })
-    };
-    if is_marked && (0..mesh.triangles.len()).any(is_red) {
-        return Ok(GroundMap::from_mesh(mesh, is_red, GROUND_CELL_M));
+impl Map {
+    /// Opens the panoramas of a map on disk that were made before, or renders them.
+    fn find_panoramas(&self, request: &PanoramaRequest) -> Result<PanoramaIndex, RenderError> {
+        let mut path = crc32fast::Hasher::new();
+        for pose in &self.path.map_from_lidar {
+            path.update(bytemuck::cast_slice(pose.translation.vector.as_slice()));
+        }
+        let words = format!("{} along {:08x}", request.words(), path.finalize());
+        let file = match &self.surface {
+            Surface::Memory(_) => None,
+            Surface::Disk { tiles, .. } => Some(tiles.file_of_panoramas(&words)),
+        };
+        if let Some(file) = &file
+            && let Some(panoramas) = Panoramas::open(file, &words)
+        {
+            return Ok(PanoramaIndex::over(panoramas, request));
+        }
+        request.require_memory(&self.path.map_from_lidar, &self.tiles)?;
+        let cells = request.cells(&self.path.map_from_lidar, &self.tiles);
+        let file = file.as_ref().map(|file| (&**file, &*words));
+        let (renderer, ground) = (&*self.renderer, &self.ground);
+        PanoramaIndex::build(&cells, renderer, ground, &self.tiles, request, file)
+    }
+}
+
+/// Moves the vertices of a mesh to the lattice of maps and finds its ground: chunks of the elevation map, and which
+/// triangles are ground.
+fn prepare(mesh: &mut TriangleMesh, path: &MappingPath) -> Result<(Chunks, Vec<bool>), MapError> {
+    mesh.snap();
+    let triangles = mesh.triangles.len();
+    if (0..triangles).all(|triangle| mesh.scaled_normal(triangle) == Vec3::ZERO) {
+        return Err(MapError::NoArea { triangles });
+    }
+    memory::require("the map", triangles as f64 * TRIANGLE_BYTES, SMALLER_MAP)?;
+    let is_ground = ground_of(mesh, !path.map_from_lidar.is_empty())?;
+    let ground = (0..triangles).filter(|&triangle| is_ground[triangle]);
+    let corners = ground.map(|triangle| MeshView::corners(mesh, triangle));
+    Ok((chunks_of_triangles(corners, GROUND_CELL_M), is_ground))
+}
+
+/// The tiles around the path of the mapping drive; without one, those of the triangles.
+fn grid_of(
+    path: &MappingPath,
+    boxes: impl IntoIterator<Item = (TileIndex, Aabb)>,
+    config: &TileConfig,
+) -> TileGrid {
+    match path.map_from_lidar.is_empty() {
+        true => TileGrid::of_boxes(boxes, config.side_m),
+        false => TileGrid::around(&path.map_from_lidar, config),
+    }
+}
+
+/// The surface of a mesh file, to which that of a newer drive can be added: with normals, ground red and the rest blue. A
+/// file that has all of this is mapped into memory, others are read.
+pub fn surface_of(mesh_file: &Path) -> Result<Arc<dyn MeshView>, MapError> {
+    if let Some(mesh) = MappedPly::open(mesh_file)
+        && mesh.has_normals()
+        && has_red_ground(&mesh, mesh.has_path())
+    {
+        return Ok(Arc::new(mesh));
+    }
+    let (mut mesh, path) = mesh_file::read(mesh_file)?;
+    let has_path = path.is_some_and(|path| !path.map_from_lidar.is_empty());
+    if !has_red_ground(&mesh, has_path) {
+        let is_ground = ground_of(&mesh, has_path)?;
+        mesh.colors = vec![REST; mesh.vertices.len()];
+        for (corners, _) in std::iter::zip(&mesh.triangles, is_ground).filter(|(_, ground)| *ground)
+        {
+            for &vertex in corners {
+                mesh.colors[vertex as usize] = GROUND;
+            }
+        }
+    }
+    if mesh.normals.is_empty() {
+        mesh.compute_normals();
+    }
+    Ok(Arc::new(mesh))
+}
+
+/// Whether triangles that have an area are red: the ground of maps. Colours of a mesh without a mapping drive mark the
+/// ground only if they are between red and blue: others are those of a photograph.
+fn has_red_ground(mesh: &dyn MeshView, has_path: bool) -> bool {
+    let mut vertices = 0..mesh.vertices() as u32;
+    (has_path || vertices.all(|vertex| mesh.vertex(vertex).color[1] == 0))
+        && (0..mesh.triangles())
+            .any(|triangle| mesh.is_red(triangle) && has_area(mesh.corners(triangle)))
+}
+
+/// Whether a triangle has an area once its corners are on the lattice of maps.
+fn has_area(corners: [DVec3; 3]) -> bool {
+    let [a, b, c] = corners.map(on_lattice);
+    (b - a).cross(c - a) != DVec3::ZERO
+}
+
+/// Finds the ground: the red triangles; in a mesh without any, those that their shape tells.
+fn ground_of(mesh: &TriangleMesh, has_path: bool) -> Result<Vec<bool>, MapError> {
+    if has_red_ground(mesh, has_path) {
+        return Ok((0..mesh.triangles.len())
+            .map(|triangle| mesh.is_red(triangle))
+            .collect());
     }
     warn_of_extent(mesh);
     let ground = GroundSurface::of_mesh(mesh);
@@ -199,8 +407,10 @@ fn ground_of(mesh: &TriangleMesh, has_path: bool) -> Result<GroundMap, MapError>
         );
     }
     tracing::info!("the map has no ground marked red: {area_m2:.0} m² were found by their shape");
-    let is_ground = |triangle| ground.has_triangle(mesh, triangle);
-    Ok(GroundMap::from_mesh(mesh, is_ground, GROUND_CELL_M))
+    let triangles = 0..mesh.triangles.len();
+    Ok(triangles
+        .map(|triangle| ground.has_triangle(mesh, triangle))
+        .collect())
 }
 
 /// Warns of an extent that is not that of a map in metres.
@@ -228,5 +438,73 @@ fn hint(is_y_up: bool) -> &'static str {
     match is_y_up {
         true => " if its y axis pointed up: export it with z up, or turn it by 90 degrees about x",
         false => "; the z axis of a map points up and its unit is the metre",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A road of 100 m, 12 m wide, between walls of 6 m.
+    fn street() -> TriangleMesh {
+        let mut mesh = TriangleMesh::default();
+        let mut add = |origin: Vec3, across: Vec3, color: [u8; 3]| {
+            for (a, b) in (0..100).flat_map(|along| (0..6).map(move |row| (along, row))) {
+                let corner = |along: u8, row: u8| {
+                    origin + f32::from(along) * Vec3::X + f32::from(row) * across
+                };
+                let first = mesh.vertices.len() as u32;
+                let corners = [(a, b), (a + 1, b), (a + 1, b + 1), (a, b + 1)];
+                (mesh.vertices).extend(corners.map(|(along, row)| corner(along, row)));
+                mesh.colors.extend([color; 4]);
+                (mesh.triangles).extend([[0, 1, 2], [0, 2, 3]].map(|it| it.map(|at| first + at)));
+            }
+        };
+        add(-6.0 * Vec3::Y, 2.0 * Vec3::Y, GROUND);
+        add(-6.0 * Vec3::Y, Vec3::Z, REST);
+        add(6.0 * Vec3::Y, Vec3::Z, REST);
+        mesh
+    }
+
+    /// Area of the red triangles, and of all [m²].
+    fn areas_m2(mesh: &dyn MeshView) -> [f64; 2] {
+        let area_m2 = |is_counted: &dyn Fn(usize) -> bool| -> f64 {
+            let triangles = (0..mesh.triangles()).filter(|&triangle| is_counted(triangle));
+            triangles.map(|triangle| mesh.area_m2(triangle)).sum()
+        };
+        [
+            area_m2(&|triangle| mesh.is_red(triangle)),
+            area_m2(&|_| true),
+        ]
+    }
+
+    #[test]
+    fn a_surface_to_which_a_drive_is_added_has_red_ground_and_normals_whatever_the_file_has() {
+        let whole = street();
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("map.ply");
+        let mut photographed = whole.clone();
+        photographed.colors = vec![[120, 90, 80]; whole.vertices.len()];
+        for mesh in [&whole, &photographed] {
+            ply::write(&file, mesh, None).unwrap();
+            let surface = surface_of(&file).unwrap();
+            let ([red, all], [expected, expected_all]) = (areas_m2(&*surface), areas_m2(&whole));
+            assert!((all - expected_all).abs() < 1e-3 * expected_all);
+            assert!((red - expected).abs() < 0.1 * expected, "{red} {expected}");
+        }
+        // Rows of vertices without normals, as other programs write them.
+        let header = "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\n\
+             property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\n\
+             element face 1\nproperty list uchar int vertex_indices\nend_header\n";
+        let mut bytes = header.as_bytes().to_vec();
+        for position in [[0.0_f32, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]] {
+            bytes.extend(position.into_iter().flat_map(f32::to_le_bytes));
+            bytes.extend([255, 0, 0]);
+        }
+        bytes.push(3);
+        bytes.extend([0, 1, 2].into_iter().flat_map(i32::to_le_bytes));
+        std::fs::write(&file, bytes).unwrap();
+        let surface = surface_of(&file).unwrap();
+        assert_eq!(surface.vertex(1).normal, Vec3::X);
     }
 }

@@ -8,13 +8,17 @@
 
 use std::ops::Range;
 
+use glam::{DVec3, Vec3};
 use nalgebra::Point2;
 
-use crate::geometry::{Grid2, Pose3};
+use crate::geometry::{Aabb, Grid2, Pose3};
 use crate::memory::{self, MemoryError};
 
 /// Edge of the cells in which ownership is decided [m].
 const OWNER_CELL_M: f64 = 0.5;
+
+/// Origins of local maps are multiples of it [m]: their coordinates and the edges of cells are exact in `f32`.
+const ORIGIN_STEP_M: f64 = 4096.0;
 
 /// The scans of one local map.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -71,101 +75,178 @@ fn distance_m(a: &Pose3, b: &Pose3) -> f64 {
 }
 
 /// Owner of each cell of the plane: the local map of the nearest key scan.
+///
+/// Cells begin at multiples of their edge. Nothing is kept per cell of the plane: each local map asks for the region
+/// around itself.
 #[derive(Clone, Debug)]
 pub struct Ownership {
-    grid: Grid2,
+    /// Of the key scans, map frame [m].
+    positions: Vec<Point2<f64>>,
+    /// Number of the local map of each key scan.
     owners: Vec<u32>,
 }
 
+/// A local map in the plane.
+#[derive(Clone, Copy, Debug)]
+pub struct Domain<'a> {
+    /// Number of the local map.
+    pub number: usize,
+    /// Origin of its coordinates in the map frame [m].
+    pub origin: DVec3,
+    /// Owners of the plane.
+    pub ownership: &'a Ownership,
+}
+
+/// The cells that a local map owns in a rectangle of the plane.
+#[derive(Clone, Debug)]
+pub struct Region {
+    /// The cells of the rectangle, map frame.
+    pub grid: Grid2,
+    is_own: Vec<bool>,
+}
+
 impl Ownership {
-    /// Requires the memory of the plane within `reach_m` of the poses, of about 48 MB per square
-    /// kilometre.
-    pub fn require_memory(poses: &[Pose3], reach_m: f64) -> Result<(), MemoryError> {
-        const CELL_BYTES: f64 = 12.0;
-        let extent_m = |axis: usize| {
-            let along = poses.iter().map(|pose| pose.translation.vector[axis]);
-            let max = along.clone().fold(f64::NEG_INFINITY, f64::max);
-            max - along.fold(f64::INFINITY, f64::min) + 2.0 * reach_m
+    /// Assigns the plane to the local maps of key scans; `poses` are their `map_from_lidar`.
+    pub fn new(poses: &[Pose3], plans: &[LocalMapPlan]) -> Self {
+        let mut owners = vec![0; poses.len()];
+        for plan in plans {
+            owners[plan.own.clone()].fill(plan.number as u32);
+        }
+        let positions = poses.iter().map(|pose| pose.translation.vector.xy().into());
+        Self {
+            positions: positions.collect(),
+            owners,
+        }
+    }
+
+    /// Requires the memory of the plane within `reach_m` of the scans of any local map.
+    pub fn require_memory(
+        poses: &[Pose3],
+        plans: &[LocalMapPlan],
+        reach_m: f64,
+    ) -> Result<(), MemoryError> {
+        const CELL_BYTES: f64 = 10.0;
+        let area_m2 = |plan: &LocalMapPlan| {
+            let extent_m = |axis: usize| {
+                let scans = &poses[plan.used.clone()];
+                let along = scans.iter().map(|pose| pose.translation.vector[axis]);
+                let max = along.clone().fold(f64::NEG_INFINITY, f64::max);
+                max - along.fold(f64::INFINITY, f64::min) + 2.0 * reach_m
+            };
+            extent_m(0) * extent_m(1)
         };
+        let largest_m2 = plans.iter().map(area_m2).fold(0.0, f64::max);
         memory::require(
-            "the plane around the drive",
-            extent_m(0) * extent_m(1) / OWNER_CELL_M.powi(2) * CELL_BYTES,
-            "map a shorter drive (start_idx, n_scans), lower crop_x and crop_y, or check the poses",
+            "the plane around a local map",
+            largest_m2 / OWNER_CELL_M.powi(2) * CELL_BYTES,
+            "lower local_map_size, crop_x and crop_y, or check the poses",
         )
     }
 
-    /// Assigns the plane within `reach_m` of a key scan; `poses` are `map_from_lidar` of the key scans.
-    pub fn new(poses: &[Pose3], plans: &[LocalMapPlan], reach_m: f64) -> Self {
-        let positions: Vec<Point2<f64>> = poses
-            .iter()
-            .map(|pose| pose.translation.vector.xy().into())
+    /// The cells that a local map owns in a rectangle [m], map frame.
+    pub fn region(&self, number: usize, min: Point2<f64>, max: Point2<f64>) -> Region {
+        let grid = Grid2::covering(lower_corner(min), max, OWNER_CELL_M);
+        let is_own = (self.nearest_scans(&grid).into_iter())
+            .map(|scan| self.owners[scan] as usize == number)
             .collect();
-        let corner = |pick: fn(f64, f64) -> f64, start: f64, margin_m: f64| {
-            let along =
-                |axis: usize| positions.iter().map(|p| p[axis]).fold(start, pick) + margin_m;
-            Point2::new(along(0), along(1))
-        };
-        let grid = Grid2::covering(
-            corner(f64::min, f64::INFINITY, -reach_m),
-            corner(f64::max, f64::NEG_INFINITY, reach_m),
-            OWNER_CELL_M,
-        );
-        let mut owner_of_scan = vec![0; poses.len()];
-        for plan in plans {
-            owner_of_scan[plan.own.clone()].fill(plan.number as u32);
-        }
-        let owners = nearest_positions(&grid, &positions)
-            .into_iter()
-            .map(|scan| owner_of_scan[scan])
-            .collect();
-        Self { grid, owners }
+        Region { grid, is_own }
     }
 
-    /// Returns the grid in whose cells ownership is decided.
-    pub fn grid(&self) -> &Grid2 {
-        &self.grid
+    /// The local map that owns the cell of a position [m], map frame.
+    pub fn owner_at(&self, x: f64, y: f64) -> usize {
+        let corner = lower_corner(Point2::new(x, y));
+        let center = corner.map(|along| along + 0.5 * OWNER_CELL_M);
+        let squared = |scan: &usize| (self.positions[*scan] - center).norm_squared();
+        let scans = 0..self.positions.len();
+        let nearest = scans.min_by(|a, b| squared(a).total_cmp(&squared(b)));
+        nearest.map_or(0, |scan| self.owners[scan] as usize)
     }
 
-    /// Returns the number of the local map that owns a cell; `None` outside the grid.
-    pub fn owner_of(&self, column: usize, row: usize) -> Option<usize> {
-        let is_inside = column < self.grid.columns && row < self.grid.rows;
-        is_inside.then(|| self.owners[row * self.grid.columns + column] as usize)
-    }
-}
-
-/// Returns for each cell of a grid the index of the position nearest to its center, the first among
-/// equals; there must be at least one position.
-///
-/// Only positions that are nearest to some point of a square of cells are compared: by the triangle
-/// inequality they lie within the least distance from the center of the square plus its diameter.
-fn nearest_positions(grid: &Grid2, positions: &[Point2<f64>]) -> Vec<usize> {
-    const SQUARE_CELLS: usize = 16;
-    // Diameter of the circle around a square, rounded up.
-    let diameter_m = 1.5 * SQUARE_CELLS as f64 * grid.cell_m;
-    let mut nearest = vec![0; grid.len()];
-    for first_row in (0..grid.rows).step_by(SQUARE_CELLS) {
-        for first_column in (0..grid.columns).step_by(SQUARE_CELLS) {
-            let corner = grid.center(first_column, first_row);
-            let center = corner.map(|m| m + 0.5 * (SQUARE_CELLS - 1) as f64 * grid.cell_m);
-            let distances_m: Vec<f64> = positions.iter().map(|p| (p - center).norm()).collect();
-            let reach_m = distances_m.iter().copied().fold(f64::INFINITY, f64::min) + diameter_m;
-            let candidates: Vec<usize> = (0..positions.len())
-                .filter(|&i| distances_m[i] <= reach_m)
-                .collect();
-            for row in first_row..grid.rows.min(first_row + SQUARE_CELLS) {
-                for column in first_column..grid.columns.min(first_column + SQUARE_CELLS) {
-                    let cell = grid.center(column, row);
-                    let squared = |i: usize| (positions[i] - cell).norm_squared();
-                    nearest[row * grid.columns + column] = candidates
-                        .iter()
-                        .copied()
-                        .min_by(|&a, &b| squared(a).total_cmp(&squared(b)))
-                        .unwrap_or(0);
+    /// Returns for each cell of a grid the index of the key scan nearest to its center, the first among equals;
+    /// there must be at least one.
+    ///
+    /// Only scans that are nearest to some point of the grid, and of a square of its cells, are compared: by the
+    /// triangle inequality they lie within the least distance from the center of the square plus its diameter.
+    fn nearest_scans(&self, grid: &Grid2) -> Vec<usize> {
+        const SQUARE_CELLS: usize = 16;
+        let all: Vec<usize> = (0..self.positions.len()).collect();
+        let near_grid = self.nearest_to_square(&all, grid, (0, 0), grid.columns.max(grid.rows));
+        let mut nearest = vec![0; grid.len()];
+        for first_row in (0..grid.rows).step_by(SQUARE_CELLS) {
+            for first_column in (0..grid.columns).step_by(SQUARE_CELLS) {
+                let first = (first_column, first_row);
+                let candidates = self.nearest_to_square(&near_grid, grid, first, SQUARE_CELLS);
+                for row in first_row..grid.rows.min(first_row + SQUARE_CELLS) {
+                    for column in first_column..grid.columns.min(first_column + SQUARE_CELLS) {
+                        let cell = grid.center(column, row);
+                        let squared = |i: usize| (self.positions[i] - cell).norm_squared();
+                        nearest[row * grid.columns + column] = candidates
+                            .iter()
+                            .copied()
+                            .min_by(|&a, &b| squared(a).total_cmp(&squared(b)))
+                            .unwrap_or(0);
+                    }
                 }
             }
         }
+        nearest
     }
-    nearest
+
+    /// Those of some scans that may be nearest to a point of a square of cells.
+    fn nearest_to_square(
+        &self,
+        scans: &[usize],
+        grid: &Grid2,
+        (column, row): (usize, usize),
+        cells: usize,
+    ) -> Vec<usize> {
+        // Diameter of the circle around the square, rounded up.
+        let diameter_m = 1.5 * cells as f64 * grid.cell_m;
+        let corner = grid.center(column, row);
+        let center = corner.map(|m| m + 0.5 * (cells - 1) as f64 * grid.cell_m);
+        let distance_m = |scan: &usize| (self.positions[*scan] - center).norm();
+        let least_m = scans.iter().map(distance_m).fold(f64::INFINITY, f64::min);
+        let is_near = |scan: &usize| distance_m(scan) <= least_m + diameter_m;
+        scans.iter().copied().filter(is_near).collect()
+    }
+}
+
+/// The origin of the coordinates of what is around a position [m], map frame: that of the map where it is nearer than 2 km.
+pub fn origin_near(position: DVec3) -> DVec3 {
+    (position / ORIGIN_STEP_M).round() * ORIGIN_STEP_M
+}
+
+impl Domain<'_> {
+    /// The cells that it owns within and beside a box in its coordinates.
+    pub fn region(&self, bounds: &Aabb) -> Region {
+        let bounds = if bounds.is_empty() {
+            Aabb::of([Vec3::ZERO])
+        } else {
+            *bounds
+        };
+        let corner = |corner: Vec3, margin_m: f64| {
+            let corner = self.origin + corner.as_dvec3() + margin_m;
+            Point2::new(corner.x, corner.y)
+        };
+        let (min, max) = (
+            corner(bounds.min, -OWNER_CELL_M),
+            corner(bounds.max, OWNER_CELL_M),
+        );
+        self.ownership.region(self.number, min, max)
+    }
+}
+
+impl Region {
+    /// Whether a cell of the grid is owned; none outside it is.
+    pub fn contains(&self, column: usize, row: usize) -> bool {
+        let is_inside = column < self.grid.columns && row < self.grid.rows;
+        is_inside && self.is_own[row * self.grid.columns + column]
+    }
+}
+
+/// Lower corner of the cell of a position [m].
+fn lower_corner(position: Point2<f64>) -> Point2<f64> {
+    position.map(|along| (along / OWNER_CELL_M).floor() * OWNER_CELL_M)
 }
 
 #[cfg(test)]
@@ -199,34 +280,38 @@ mod tests {
     #[test]
     fn a_cell_is_owned_by_the_local_map_of_the_nearest_scan() {
         let poses = drive((0..20).map(f64::from));
-        let plans = local_maps(&poses, 10, 2.0);
-        let ownership = Ownership::new(&poses, &plans, 30.0);
-        let owner_at = |x: f64, y: f64| {
-            let (column, row) = ownership.grid().cell_at(x, y)?;
-            ownership.owner_of(column, row)
-        };
-        assert_eq!(owner_at(3.0, 20.0), Some(0));
-        assert_eq!(owner_at(9.1, -20.0), Some(0));
-        assert_eq!(owner_at(9.9, -20.0), Some(1));
-        assert_eq!(owner_at(40.0, 0.0), Some(1));
-        assert_eq!(owner_at(60.0, 0.0), None);
+        let ownership = Ownership::new(&poses, &local_maps(&poses, 10, 2.0));
+        for (x, y, owner) in [
+            (3.0, 20.0, 0),
+            (9.1, -20.0, 0),
+            (9.9, -20.0, 1),
+            (4e6, 0.0, 1),
+        ] {
+            assert_eq!(ownership.owner_at(x, y), owner);
+            for number in 0..2 {
+                let region = ownership.region(number, [x, y].into(), [x + 0.3, y + 0.3].into());
+                assert_eq!(region.contains(0, 0), number == owner, "{x} {y}");
+            }
+        }
     }
 
     #[test]
-    fn nearest_positions_agree_with_comparing_all() {
-        let positions: Vec<Point2<f64>> = (0..60)
-            .map(|i| Point2::new(f64::from(i).sin() * 40.0, f64::from(i) * 0.9))
+    fn regions_agree_with_comparing_all_scans_and_do_not_depend_on_their_rectangle() {
+        let poses: Vec<Pose3> = (0..60)
+            .map(|i| Pose3::translation(f64::from(i).sin() * 40.0, f64::from(i) * 0.9, 0.0))
             .collect();
-        let grid = Grid2::covering(Point2::new(-50.0, -10.0), Point2::new(49.0, 70.0), 0.7);
-        let nearest = nearest_positions(&grid, &positions);
-        for (index, &found) in nearest.iter().enumerate() {
-            let center = grid.center(index % grid.columns, index / grid.columns);
-            let squared = |p: &Point2<f64>| (p - center).norm_squared();
-            assert!(
-                positions
-                    .iter()
-                    .all(|p| squared(p) >= squared(&positions[found]))
-            );
+        let ownership = Ownership::new(&poses, &local_maps(&poses, 7, 2.0));
+        for (min, max) in [([-50.1, -10.2], [49.0, 70.0]), ([3.3, 4.4], [20.0, 9.0])] {
+            for number in 0..9 {
+                let region = ownership.region(number, min.into(), max.into());
+                for row in 0..region.grid.rows {
+                    for column in 0..region.grid.columns {
+                        let center = region.grid.center(column, row);
+                        let is_own = ownership.owner_at(center.x, center.y) == number;
+                        assert_eq!(region.contains(column, row), is_own);
+                    }
+                }
+            }
         }
     }
 }

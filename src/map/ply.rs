@@ -1,6 +1,6 @@
 //! PLY files of meshes and points.
 //!
-//! Meshes are written as binary little-endian with vertex x y z, nx ny nz, red green blue and
+//! Meshes are written as binary little-endian with vertex x y z (double beyond 8 km), nx ny nz, red green blue and
 //! triangles. Files of range-mcl, Open3D, MeshLab and CloudCompare are read (float or double, ASCII or
 //! binary, `vertex_indices` or `vertex_index`, polygons are triangulated); the counts of the header
 //! are checked against the size of the file before anything is allocated.
@@ -17,15 +17,20 @@ use ply_rs::ply::{
 };
 
 use super::mapping_path::MappingPath;
-use super::mesh_error::{MeshFileError, MeshFileProblem};
-use super::mesh_origin::{self, Precision};
+use super::mesh_error::{MeshFileError, MeshFileProblem, require_numbers};
+use super::mesh_origin::{self, PRECISE_M, Precision};
 use super::mesh_polygons::{fan, require_vertices};
+use super::mesh_view::MeshView;
 use crate::files::write_atomically;
 use crate::geometry::{PlyVertex, TriangleMesh};
 
+/// What a file of this program begins with.
+pub(super) const START: &str = "ply\nformat binary_little_endian 1.0\n";
 const POSITION: &str = "property float x\nproperty float y\nproperty float z\n";
+const POSITION_F64: &str = "property double x\nproperty double y\nproperty double z\n";
 const NORMAL: &str = "property float nx\nproperty float ny\nproperty float nz\n";
 const COLOR: &str = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
+const FACE: &str = "property list uchar uint vertex_indices\n";
 
 /// Writes a mesh. Missing normals are computed, missing colours are grey. That of a map has its frame
 /// and the path of the mapping drive as comments; see [`MappingPath`].
@@ -36,36 +41,64 @@ pub fn write(
     mesh: &TriangleMesh,
     mapping_path: Option<&MappingPath>,
 ) -> Result<(), MeshFileError> {
-    let computed;
-    let normals = if mesh.normals.len() == mesh.vertices.len() {
-        &mesh.normals
-    } else {
-        let mut copy = mesh.clone();
-        copy.compute_normals();
-        computed = copy.normals;
-        &computed
+    if mesh.normals.len() == mesh.vertices.len() {
+        return write_joined(path, &[mesh], mapping_path);
+    }
+    let mut mesh = mesh.clone();
+    mesh.compute_normals();
+    write_joined(path, &[&mesh], mapping_path)
+}
+
+/// Writes meshes as one, the vertices and triangles of one after those of the other, like [`write`]. Coordinates are
+/// double where one is beyond 8 km, so that millimetres are kept.
+pub fn write_joined(
+    path: &Path,
+    meshes: &[&dyn MeshView],
+    mapping_path: Option<&MappingPath>,
+) -> Result<(), MeshFileError> {
+    let count = |of: fn(&dyn MeshView) -> usize| meshes.iter().map(|mesh| of(*mesh)).sum::<usize>();
+    let [vertices, triangles] = [
+        count(|mesh| mesh.vertices()),
+        count(|mesh| mesh.triangles()),
+    ];
+    require_numbers(vertices.max(triangles)).map_err(|problem| problem.of(path))?;
+    let is_far = |mesh: &&dyn MeshView| {
+        let mut vertices = 0..mesh.vertices() as u32;
+        vertices.any(|vertex| mesh.position(vertex).abs().max_element() > PRECISE_M)
     };
+    let is_double = meshes.iter().any(is_far);
+    let position = if is_double { POSITION_F64 } else { POSITION };
     let comments = mapping_path.map_or_else(Vec::new, MappingPath::to_comments);
     let comments: String = (comments.iter())
         .map(|comment| format!("comment {comment}\n"))
         .collect();
     let header = format!(
-        "{comments}element vertex {}\n{POSITION}{NORMAL}{COLOR}\
-         element face {}\nproperty list uchar uint vertex_indices\n",
-        mesh.vertices.len(),
-        mesh.triangles.len()
+        "{comments}element vertex {vertices}\n{position}{NORMAL}{COLOR}element face {triangles}\n{FACE}"
     );
     write_file(path, &header, |out| {
-        for (index, (position, normal)) in mesh.vertices.iter().zip(normals).enumerate() {
-            write_floats(out, &position.to_array())?;
-            write_floats(out, &normal.to_array())?;
-            out.write_all(mesh.colors.get(index).unwrap_or(&[128; 3]))?;
-        }
-        for triangle in &mesh.triangles {
-            out.write_all(&[3])?;
-            for index in triangle {
-                out.write_all(&index.to_le_bytes())?;
+        for mesh in meshes {
+            for index in 0..mesh.vertices() as u32 {
+                let vertex = mesh.vertex(index);
+                if is_double {
+                    for coordinate in vertex.position.to_array() {
+                        out.write_all(&coordinate.to_le_bytes())?;
+                    }
+                } else {
+                    write_floats(out, &vertex.position.as_vec3().to_array())?;
+                }
+                write_floats(out, &vertex.normal.to_array())?;
+                out.write_all(&vertex.color)?;
             }
+        }
+        let mut first = 0;
+        for mesh in meshes {
+            for triangle in 0..mesh.triangles() {
+                out.write_all(&[3])?;
+                for index in mesh.triangle(triangle) {
+                    out.write_all(&(first + index).to_le_bytes())?;
+                }
+            }
+            first += mesh.vertices() as u32;
         }
         out.flush()?;
         out.get_ref().sync_all()
@@ -103,10 +136,7 @@ fn write_file(
     write_rows: impl FnOnce(&mut BufWriter<&mut File>) -> io::Result<()>,
 ) -> Result<(), MeshFileError> {
     write_atomically(path, |out| {
-        write!(
-            out,
-            "ply\nformat binary_little_endian 1.0\n{header}end_header\n"
-        )?;
+        writeln!(out, "{START}{header}end_header")?;
         write_rows(out)
     })
     .map_err(|error| MeshFileProblem::Write(error).of(path))
@@ -316,7 +346,9 @@ fn triangles_of(faces: &[Face], vertices: usize) -> Result<Vec<[u32; 3]>, MeshFi
 mod tests {
     use std::fs;
 
+    use super::super::mapped_ply::MappedPly;
     use super::*;
+    use crate::geometry::Pose3;
 
     fn mesh() -> TriangleMesh {
         TriangleMesh {
@@ -340,6 +372,79 @@ mod tests {
         let path = folder.path().join("map.ply");
         write(&path, &mesh(), None).unwrap();
         assert_eq!(read(&path).unwrap(), mesh());
+    }
+
+    #[test]
+    fn a_written_mesh_that_is_mapped_has_the_same_rows() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.ply");
+        let driven = MappingPath {
+            map_from_lidar: vec![Pose3::translation(1.0 / 3.0, 2.0, 0.0); 3],
+            ..MappingPath::default()
+        };
+        write(&path, &mesh(), Some(&driven)).unwrap();
+        let mapped = MappedPly::open(&path).unwrap();
+        assert_eq!(mapped.path, Some(driven));
+        assert_eq!(MeshView::triangles(&mapped), 2);
+        for vertex in 0..4 {
+            assert_eq!(mapped.vertex(vertex), MeshView::vertex(&mesh(), vertex));
+        }
+        for triangle in 0..2 {
+            assert_eq!(mapped.triangle(triangle), mesh().triangles[triangle]);
+        }
+    }
+
+    #[test]
+    fn joined_meshes_keep_their_bits_a_thousand_kilometres_away_and_stay_single_precision_nearby() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.ply");
+        write(&path, &mesh(), None).unwrap();
+        for (away_m, coordinate_bytes) in [(4096.0, 4), (1_003_520.0, 8)] {
+            let mut far = MappedPly::open(&path).unwrap();
+            far.origin = DVec3::new(away_m, -away_m, 0.0);
+            let joined = folder.path().join("joined.ply");
+            let near = mesh();
+            let frame = MappingPath::default();
+            write_joined(&joined, &[&near, &far], Some(&frame)).unwrap();
+            let mapped = MappedPly::open(&joined).unwrap();
+            for index in 0..4 {
+                assert_eq!(mapped.vertex(index), MeshView::vertex(&near, index));
+                assert_eq!(mapped.vertex(index + 4), far.vertex(index));
+            }
+            assert_eq!(mapped.triangle(3), far.triangle(1).map(|index| index + 4));
+            let rows = 8 * (3 * coordinate_bytes + 15) + 4 * 13;
+            let bytes = fs::read(&joined).unwrap();
+            assert!(bytes[bytes.len() - rows - 11..].starts_with(b"end_header\n"));
+            assert_eq!(read(&joined).unwrap().triangles.len(), 4);
+        }
+    }
+
+    #[test]
+    fn a_file_with_a_fault_or_of_another_layout_is_not_mapped() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.ply");
+        write(&path, &mesh(), None).unwrap();
+        let good = fs::read(&path).unwrap();
+        let faces = good.len() - 26;
+        let changes: [(usize, &[u8]); 4] = [
+            (faces, &[4]),
+            (faces + 1, &[4]),
+            (faces - 27, &f32::NAN.to_le_bytes()),
+            (faces - 27, &1e9_f32.to_le_bytes()),
+        ];
+        for (at, change) in changes {
+            let mut bytes = good.clone();
+            bytes[at..at + change.len()].copy_from_slice(change);
+            fs::write(&path, &bytes).unwrap();
+            assert!(MappedPly::open(&path).is_none(), "{change:?} at {at}");
+        }
+        for length in [0, 30, faces - 40, good.len() - 1] {
+            fs::write(&path, &good[..length]).unwrap();
+            assert!(MappedPly::open(&path).is_none(), "{length}");
+        }
+        let text = String::from_utf8_lossy(&good).replace("float nx", "double nx");
+        fs::write(&path, text.as_bytes()).unwrap();
+        assert!(MappedPly::open(&path).is_none());
     }
 
     #[test]

@@ -13,19 +13,19 @@
 use std::collections::HashMap;
 use std::ops::{Range, RangeInclusive};
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 
-use super::plan::Ownership;
+use super::plan::Region;
 use crate::geometry::TriangleMesh;
 
 /// An ear with more than this share of a polygon is not cut off: the remainder would be a line of
 /// vertices along a straight edge (unitless).
 const MAX_EAR_SHARE: f32 = 0.9999;
 
-/// Clips a mesh to what a local map owns; returns the number of triangles of which nothing is left.
-/// Normals of new vertices are interpolated; colours are dropped.
-pub(super) fn keep_own(mesh: &mut TriangleMesh, ownership: &Ownership, number: usize) -> usize {
-    let region = OwnRegion::new(ownership, number);
+/// Clips a mesh, whose vertices are relative to `origin` [m], to what a local map owns; returns the number of triangles
+/// of which nothing is left. Normals of new vertices are interpolated; colours are dropped.
+pub(super) fn keep_own(mesh: &mut TriangleMesh, region: &Region, origin: DVec3) -> usize {
+    let region = OwnRegion::new(region, origin);
     let mut clipper = Clipper {
         region: &region,
         vertices: std::mem::take(&mut mesh.vertices),
@@ -61,9 +61,9 @@ pub(super) fn keep_own(mesh: &mut TriangleMesh, ownership: &Ownership, number: u
     foreign
 }
 
-/// Returns which vertices lie on the border of what a local map owns.
-pub(super) fn on_border(vertices: &[Vec3], ownership: &Ownership, number: usize) -> Vec<bool> {
-    let region = OwnRegion::new(ownership, number);
+/// Returns which vertices, relative to `origin` [m], lie on the border of what a local map owns.
+pub(super) fn on_border(vertices: &[Vec3], region: &Region, origin: DVec3) -> Vec<bool> {
+    let region = OwnRegion::new(region, origin);
     let touches_foreign = |vertex: &Vec3| {
         let mut columns = region.touching(0, vertex.x);
         columns.any(|column| {
@@ -85,27 +85,25 @@ enum Overlap {
 /// The cells of a local map and the grid lines around them. Cells are counted from 1; cell 0 and the
 /// last one reach from the edge of the grid to infinity.
 struct OwnRegion<'a> {
-    ownership: &'a Ownership,
-    number: usize,
+    region: &'a Region,
     /// Lines between the columns and between the rows, rounded once, with lines at infinity at both
     /// ends [m]: cell i lies between the lines i and i + 1.
     lines: [Vec<f32>; 2],
 }
 
 impl<'a> OwnRegion<'a> {
-    fn new(ownership: &'a Ownership, number: usize) -> Self {
-        let grid = ownership.grid();
+    fn new(region: &'a Region, relative_to: DVec3) -> Self {
+        let grid = &region.grid;
         let lines = |origin: f64, count: usize| {
             let inner = (0..=count).map(|line| (origin + line as f64 * grid.cell_m) as f32);
             let lower = std::iter::once(f32::NEG_INFINITY);
             lower.chain(inner).chain([f32::INFINITY]).collect()
         };
         Self {
-            ownership,
-            number,
+            region,
             lines: [
-                lines(grid.origin.x, grid.columns),
-                lines(grid.origin.y, grid.rows),
+                lines(grid.origin.x - relative_to.x, grid.columns),
+                lines(grid.origin.y - relative_to.y, grid.rows),
             ],
         }
     }
@@ -114,7 +112,7 @@ impl<'a> OwnRegion<'a> {
         let (Some(column), Some(row)) = (column.checked_sub(1), row.checked_sub(1)) else {
             return false;
         };
-        self.ownership.owner_of(column, row) == Some(self.number)
+        self.region.contains(column, row)
     }
 
     fn overlap(&self, [a, b, c]: [Vec3; 3]) -> Overlap {

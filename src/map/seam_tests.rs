@@ -2,10 +2,10 @@
 
 use std::collections::HashSet;
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
-use super::plan::{Ownership, local_maps};
+use super::plan::{Domain, Ownership, Region, local_maps};
 use super::seam::{keep_own, on_border};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::raycasting::Scene;
@@ -20,7 +20,12 @@ fn ownership() -> Ownership {
             Pose3::translation(4.0 * turn.sin(), 4.0 * turn.cos(), 0.0)
         })
         .collect();
-    Ownership::new(&poses, &local_maps(&poses, 3, 1.0), 20.0)
+    Ownership::new(&poses, &local_maps(&poses, 3, 1.0))
+}
+
+/// What a local map owns of the bumpy ground and beside it.
+fn region(ownership: &Ownership, number: usize) -> Region {
+    ownership.region(number, [-9.0, -9.0].into(), [9.0, 9.0].into())
 }
 
 /// Bumpy ground of 16 m x 16 m with random vertices.
@@ -51,7 +56,7 @@ fn pieces(whole: &TriangleMesh, ownership: &Ownership) -> Vec<TriangleMesh> {
     (0..LOCAL_MAPS)
         .map(|number| {
             let mut piece = whole.clone();
-            keep_own(&mut piece, ownership, number);
+            keep_own(&mut piece, &region(ownership, number), DVec3::ZERO);
             piece
         })
         .collect()
@@ -69,7 +74,7 @@ fn clipped_neighbours_of_different_meshes_have_no_gap_and_no_overlap() {
     let mut joined = TriangleMesh::default();
     for (number, seed) in (0..LOCAL_MAPS).zip(1..) {
         let mut mesh = bumpy(seed);
-        keep_own(&mut mesh, &ownership, number);
+        keep_own(&mut mesh, &region(&ownership, number), DVec3::ZERO);
         joined.append(&mesh);
     }
     let scene = Scene::new(&joined);
@@ -119,7 +124,6 @@ fn a_piece_is_open_only_at_the_rim_of_the_mesh_and_along_the_border() {
             .flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]])
             .collect();
         assert_eq!(edges.len(), 3 * piece.triangles.len(), "an edge twice");
-        let grid = ownership.grid();
         for [from, to] in piece
             .triangles
             .iter()
@@ -132,10 +136,8 @@ fn a_piece_is_open_only_at_the_rim_of_the_mesh_and_along_the_border() {
             }
             let middle = 0.5 * (a + b).truncate();
             let across = (b - a).truncate().perp().normalize() * 0.01;
-            let [left, right] = [middle + across, middle - across].map(|point| {
-                let (column, row) = grid.cell_at(point.x.into(), point.y.into()).unwrap();
-                ownership.owner_of(column, row)
-            });
+            let [left, right] = [middle + across, middle - across]
+                .map(|point| ownership.owner_at(point.x.into(), point.y.into()));
             assert_ne!(left, right, "a crack from {a} to {b}");
         }
     }
@@ -149,7 +151,7 @@ fn the_vertices_on_the_border_are_new_ones() {
         .map(|vertex| vertex.to_array().map(f32::to_bits))
         .collect();
     for (number, piece) in pieces(&whole, &ownership).iter().enumerate() {
-        let on_border = on_border(&piece.vertices, &ownership, number);
+        let on_border = on_border(&piece.vertices, &region(&ownership, number), DVec3::ZERO);
         assert!(on_border.contains(&true));
         for (vertex, on_border) in piece.vertices.iter().zip(on_border) {
             // Triangles across the border are divided at lines between own cells too.
@@ -162,11 +164,36 @@ fn the_vertices_on_the_border_are_new_ones() {
 #[test]
 fn a_mesh_without_a_border_stays_unchanged() {
     let poses = [Pose3::identity()];
-    let ownership = Ownership::new(&poses, &local_maps(&poses, 3, 1.0), 20.0);
+    let ownership = Ownership::new(&poses, &local_maps(&poses, 3, 1.0));
     let whole = bumpy(1);
     let mut own = whole.clone();
-    assert_eq!(keep_own(&mut own, &ownership, 0), 0);
+    let own_region = region(&ownership, 0);
+    assert_eq!(keep_own(&mut own, &own_region, DVec3::ZERO), 0);
     assert!(own == whole);
-    assert_eq!(keep_own(&mut own, &ownership, 1), whole.triangles.len());
+    let other_region = region(&ownership, 1);
+    let foreign = keep_own(&mut own, &other_region, DVec3::ZERO);
+    assert_eq!(foreign, whole.triangles.len());
     assert!(own.vertices.is_empty());
+}
+
+#[test]
+fn far_from_the_origin_of_the_map_a_mesh_is_clipped_as_near_it() {
+    let far = DVec3::new(1_003_520.0, -49_152.0, 0.0);
+    let scans: Vec<[f64; 2]> = vec![[-2.0, 0.3], [2.0, -0.1]];
+    let at = |origin: DVec3| {
+        let pose =
+            |scan: &[f64; 2]| Pose3::translation(origin.x + scan[0], origin.y + scan[1], 0.0);
+        let poses: Vec<Pose3> = scans.iter().map(pose).collect();
+        let ownership = Ownership::new(&poses, &local_maps(&poses, 1, 0.0));
+        let domain = Domain {
+            number: 0,
+            origin,
+            ownership: &ownership,
+        };
+        let mut mesh = bumpy(3);
+        let region = domain.region(&mesh.bounds());
+        keep_own(&mut mesh, &region, origin);
+        mesh
+    };
+    assert!(at(far) == at(DVec3::ZERO));
 }

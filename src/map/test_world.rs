@@ -212,7 +212,7 @@ impl RangeRenderer for TestWorld {
     }
 
     fn render(&self, poses: &[Pose3], model: &LidarModel) -> Result<Vec<Vec<f32>>, RenderError> {
-        let images = self.cast(poses, &model.directions())?;
+        let images = self.cast(poses, &model.directions(), f32::INFINITY)?;
         let limit = |range: f32| {
             if model.accepts_range(range) {
                 range
@@ -226,12 +226,22 @@ impl RangeRenderer for TestWorld {
             .collect())
     }
 
-    fn cast(&self, poses: &[Pose3], directions: &[Vec3]) -> Result<Vec<Vec<f32>>, RenderError> {
+    fn cast(
+        &self,
+        poses: &[Pose3],
+        directions: &[Vec3],
+        until_m: f32,
+    ) -> Result<Vec<Vec<f32>>, RenderError> {
         use rayon::prelude::*;
-        Ok(poses
-            .par_iter()
-            .map(|pose| self.ranges(pose, directions))
-            .collect())
+        let limited = |range_m: f32| match range_m < until_m {
+            true => range_m,
+            false => f32::INFINITY,
+        };
+        let ranges = |pose| {
+            let ranges = self.ranges(pose, directions);
+            ranges.into_iter().map(limited).collect()
+        };
+        Ok(poses.par_iter().map(ranges).collect())
     }
 
     fn compare(
@@ -249,7 +259,7 @@ impl RangeRenderer for TestWorld {
             costs.sum::<f32>() / beams.len().max(1) as f32
         };
         Ok(self
-            .cast(poses, &directions)?
+            .cast(poses, &directions, f32::INFINITY)?
             .into_iter()
             .map(mean)
             .collect())

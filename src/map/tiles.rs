@@ -8,10 +8,13 @@
 //! the mapping poses; a tile is valid where more than one mapping pose is near its centre, as in
 //! range-mcl (Chen et al., ICRA 2021, section III-D).
 
+use std::collections::{BTreeMap, HashMap, HashSet};
+
 use nalgebra::Point2;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
+use super::mesh_view::MeshView;
 use crate::geometry::{Aabb, Pose2, Pose3, TriangleMesh, Vec3};
 
 /// Division of the map into tiles.
@@ -28,111 +31,146 @@ pub struct TileConfig {
     pub margin_m: f64,
 }
 
-/// Number of a tile in its grid, row-major with x fastest.
+/// A tile: its centre in sides.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct TileIndex(pub usize);
+pub struct TileIndex {
+    /// Along x.
+    pub column: i64,
+    /// Along y.
+    pub row: i64,
+}
+
+impl TileIndex {
+    /// The tile of a position, for tiles of a side.
+    pub fn of(x: f64, y: f64, side_m: f64) -> Self {
+        let [column, row] = [x, y].map(|along| (along / side_m + 0.5).floor() as i64);
+        Self { column, row }
+    }
+
+    /// All tiles from one to another.
+    pub(super) fn range(first: Self, last: Self) -> impl Iterator<Item = Self> {
+        let columns =
+            move |row| (first.column..=last.column).map(move |column| Self { column, row });
+        (first.row..=last.row).flat_map(columns)
+    }
+
+    /// The tile `count` tiles farther along x and y.
+    fn plus(self, count: i64) -> Self {
+        Self {
+            column: self.column + count,
+            row: self.row + count,
+        }
+    }
+
+    fn min(self, other: Self) -> Self {
+        Self {
+            column: self.column.min(other.column),
+            row: self.row.min(other.row),
+        }
+    }
+
+    fn max(self, other: Self) -> Self {
+        Self {
+            column: self.column.max(other.column),
+            row: self.row.max(other.row),
+        }
+    }
+}
 
 /// Square tiles around the path of the mapping drive.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TileGrid {
     /// Side of a tile [m].
     pub side_m: f64,
-    /// Number of tiles along x.
-    pub columns: usize,
-    /// Number of tiles along y.
-    pub rows: usize,
-    /// Centre of tile 0 in sides; the centres of all tiles are whole numbers of sides.
-    first: (i64, i64),
-    valid: Vec<bool>,
+    /// The first and the last tile along both axes.
+    range: [TileIndex; 2],
+    valid: HashSet<TileIndex>,
 }
 
 impl TileGrid {
     /// Covers mapping poses (`map_from_lidar`) and a margin around them. Without poses, one invalid tile
     /// around the origin.
     pub fn around<'a>(poses: impl IntoIterator<Item = &'a Pose3>, config: &TileConfig) -> Self {
-        let positions: Vec<Point2<f64>> = poses
-            .into_iter()
-            .map(|pose| Point2::from(pose.translation.vector.xy()))
-            .collect();
-        let [(first_x, columns), (first_y, rows)] =
-            [0, 1].map(|axis| range(positions.iter().map(|p| p.coords[axis]), config));
-        let mut grid = Self {
-            side_m: config.side_m,
-            columns,
-            rows,
-            first: (first_x, first_y),
-            valid: Vec::new(),
-        };
+        let side_m = config.side_m;
         // Radius around the centre of a tile in which mapping poses are counted.
-        let reach_m = config.margin_m + 0.25 * config.side_m;
-        grid.valid = grid
-            .indices()
-            .map(|tile| {
-                let center = grid.center(tile);
-                let near = |position: &&Point2<f64>| (**position - center).norm() < reach_m;
-                positions.iter().filter(near).count() > 1
-            })
-            .collect();
-        grid
-    }
-
-    /// Covers a mesh without a mapping drive; the tiles with triangles are valid.
-    pub fn of_mesh(mesh: &TriangleMesh, config: &TileConfig) -> Self {
-        let bounds = mesh.bounds();
-        let [(first_x, columns), (first_y, rows)] = ranges(&bounds, config);
-        let mut grid = Self {
-            side_m: config.side_m,
-            columns,
-            rows,
-            first: (first_x, first_y),
-            valid: vec![false; columns * rows],
-        };
-        for triangle in 0..mesh.triangles.len() {
-            for corner in mesh.corners(triangle) {
-                let tile = grid.nearest_tile(corner);
-                grid.valid[tile.0] = true;
+        let reach_m = config.margin_m + 0.25 * side_m;
+        let mut corners = [[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]];
+        let mut counts: HashMap<TileIndex, usize> = HashMap::new();
+        for pose in poses {
+            let position = Point2::from(pose.translation.vector.xy());
+            let at =
+                |offset_m: f64| TileIndex::of(position.x + offset_m, position.y + offset_m, side_m);
+            for tile in TileIndex::range(at(-reach_m), at(reach_m)) {
+                if (position - center(tile, side_m)).norm() < reach_m {
+                    *counts.entry(tile).or_default() += 1;
+                }
+            }
+            for axis in 0..2 {
+                corners[0][axis] = corners[0][axis].min(position[axis]);
+                corners[1][axis] = corners[1][axis].max(position[axis]);
             }
         }
-        grid
+        let [min, max] = match counts.is_empty() {
+            true => [[0.0; 2]; 2],
+            false => corners,
+        };
+        let first = |axis: usize| ((min[axis] - config.margin_m) / side_m + 0.5).floor() as i64;
+        let last = |axis: usize| ((max[axis] + config.margin_m) / side_m - 0.5).ceil() as i64;
+        let first = TileIndex {
+            column: first(0),
+            row: first(1),
+        };
+        let last = TileIndex {
+            column: last(0),
+            row: last(1),
+        };
+        let visited = counts.into_iter().filter(|(_, count)| *count > 1);
+        Self {
+            side_m,
+            range: [first, first.max(last)],
+            valid: visited.map(|(tile, _)| tile).collect(),
+        }
     }
 
-    /// Number of tiles of [`of_mesh`](Self::of_mesh) for a mesh of a bounding box.
-    pub fn count_of_mesh(bounds: &Aabb, config: &TileConfig) -> f64 {
-        ranges(bounds, config)
-            .iter()
-            .map(|(_, count)| *count as f64)
-            .product()
+    /// Covers a mesh without a mapping drive, given by the boxes of the triangles of its tiles; the tiles that
+    /// these reach are valid.
+    pub fn of_boxes(boxes: impl IntoIterator<Item = (TileIndex, Aabb)>, side_m: f64) -> Self {
+        /// A triangle that reaches farther is an artefact [tiles].
+        const REACH: i64 = 50;
+        let mut valid = HashSet::new();
+        let mut range: Option<[TileIndex; 2]> = None;
+        for (tile, bounds) in boxes {
+            let at = |corner: Vec3| TileIndex::of(corner.x.into(), corner.y.into(), side_m);
+            let first = at(bounds.min).max(tile.plus(-REACH));
+            let last = at(bounds.max).min(tile.plus(REACH));
+            valid.extend(TileIndex::range(first, last));
+            let [least, most] = range.unwrap_or([first, last]);
+            range = Some([least.min(first), most.max(last)]);
+        }
+        Self {
+            side_m,
+            range: range.unwrap_or([TileIndex::of(0.0, 0.0, side_m); 2]),
+            valid,
+        }
     }
 
-    /// Number of tiles of [`around`](Self::around).
-    pub fn count(poses: &[Pose3], config: &TileConfig) -> f64 {
-        let positions = || poses.iter().map(|pose| pose.translation.vector);
-        let along = |axis: usize| range(positions().map(|p| p[axis]), config).1 as f64;
-        along(0) * along(1)
-    }
-
-    /// Number of tiles.
+    /// Number of valid tiles.
     pub fn len(&self) -> usize {
-        self.columns * self.rows
+        self.valid.len()
     }
 
-    /// Whether there are no tiles.
+    /// Whether there are no valid tiles.
     pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// Returns all tiles in order.
-    pub fn indices(&self) -> impl Iterator<Item = TileIndex> + use<> {
-        (0..self.len()).map(TileIndex)
+        self.valid.is_empty()
     }
 
     /// Returns the tile of a position; `None` outside the grid.
     pub fn tile_at(&self, x: f64, y: f64) -> Option<TileIndex> {
-        let column = (x / self.side_m + 0.5).floor() - self.first.0 as f64;
-        let row = (y / self.side_m + 0.5).floor() - self.first.1 as f64;
-        let inside =
-            column >= 0.0 && row >= 0.0 && column < self.columns as f64 && row < self.rows as f64;
-        inside.then(|| TileIndex(row as usize * self.columns + column as usize))
+        let tile = TileIndex::of(x, y, self.side_m);
+        let [first, last] = self.range;
+        let is_inside = (first.column..=last.column).contains(&tile.column)
+            && (first.row..=last.row).contains(&tile.row);
+        (is_inside && x.is_finite() && y.is_finite()).then_some(tile)
     }
 
     /// Returns the valid tile of a pose; `None` outside the grid and in tiles that the mapping drive did
@@ -145,108 +183,91 @@ impl TileGrid {
 
     /// Whether the mapping drive visited a tile.
     pub fn is_valid(&self, tile: TileIndex) -> bool {
-        self.valid[tile.0]
+        self.valid.contains(&tile)
     }
 
     /// Returns the centre of a tile [m].
     pub fn center(&self, tile: TileIndex) -> Point2<f64> {
-        let (column, row) = (tile.0 % self.columns, tile.0 / self.columns);
-        Point2::new(
-            (self.first.0 + column as i64) as f64 * self.side_m,
-            (self.first.1 + row as i64) as f64 * self.side_m,
-        )
+        center(tile, self.side_m)
     }
 
     /// Returns the lower and upper corner of the rectangle that all tiles cover [m].
     pub fn extent(&self) -> (Point2<f64>, Point2<f64>) {
         let half = nalgebra::Vector2::repeat(0.5 * self.side_m);
-        (
-            self.center(TileIndex(0)) - half,
-            self.center(TileIndex(self.len() - 1)) + half,
-        )
-    }
-
-    /// Returns the tile of a position, outside the grid the nearest one.
-    fn nearest_tile(&self, point: Vec3) -> TileIndex {
-        let cell = |coordinate: f32, first: i64, cells: usize| {
-            let cell = (f64::from(coordinate) / self.side_m + 0.5).floor() - first as f64;
-            cell.clamp(0.0, (cells - 1) as f64) as usize
-        };
-        let column = cell(point.x, self.first.0, self.columns);
-        let row = cell(point.y, self.first.1, self.rows);
-        TileIndex(row * self.columns + column)
+        let [first, last] = self.range;
+        (self.center(first) - half, self.center(last) + half)
     }
 }
 
-/// The first tile and the number of tiles along x and y that cover a box.
-fn ranges(bounds: &Aabb, config: &TileConfig) -> [(i64, usize); 2] {
-    [0, 1].map(|axis| {
-        span(
-            f64::from(bounds.min[axis]),
-            f64::from(bounds.max[axis]),
-            config.side_m,
-        )
-    })
+fn center(tile: TileIndex, side_m: f64) -> Point2<f64> {
+    Point2::new(tile.column as f64 * side_m, tile.row as f64 * side_m)
 }
 
-/// The first tile along an axis and the number of tiles that cover positions and a margin around them.
-fn range(positions_m: impl Iterator<Item = f64>, config: &TileConfig) -> (i64, usize) {
-    let (min, max) = positions_m.fold((0.0, 0.0), |(min, max), at| {
-        (f64::min(min, at), f64::max(max, at))
-    });
-    span(min - config.margin_m, max + config.margin_m, config.side_m)
-}
-
-/// The first tile along an axis and the number of tiles that cover an interval.
-fn span(min_m: f64, max_m: f64, side_m: f64) -> (i64, usize) {
-    let first = (min_m / side_m + 0.5).floor() as i64;
-    let last = (max_m / side_m - 0.5).ceil() as i64;
-    (first, (last - first + 1).max(1) as usize)
-}
-
-/// Divides a mesh into one mesh per tile, in the order of the tiles; some may be empty.
+/// Divides a mesh into one mesh per tile that holds triangles, in the order of the tiles.
 ///
-/// Each triangle is assigned to the tile of its centroid, outside the grid to the nearest tile. The
-/// order of triangles and vertices is preserved.
-pub fn cut(mesh: &TriangleMesh, grid: &TileGrid) -> Vec<TriangleMesh> {
-    let mut triangles_of: Vec<Vec<usize>> = vec![Vec::new(); grid.len()];
-    for triangle in 0..mesh.triangles.len() {
-        let [a, b, c] = mesh.corners(triangle);
-        let tile = grid.nearest_tile((a + b + c) / 3.0);
-        triangles_of[tile.0].push(triangle);
-    }
-    let mut local_index = vec![u32::MAX; mesh.vertices.len()];
-    triangles_of
-        .iter()
-        .map(|triangles| extract(mesh, triangles, &mut local_index))
+/// Each triangle is assigned to the tile of its centroid. The order of triangles and vertices is preserved.
+pub fn cut(mesh: &TriangleMesh, side_m: f64) -> Vec<(TileIndex, TriangleMesh)> {
+    let mut extractor = Extractor::of(mesh);
+    triangles_of_tiles(mesh, side_m)
+        .into_iter()
+        .map(|(tile, triangles)| (tile, extractor.extract(&triangles)))
         .collect()
 }
 
-/// Extracts the mesh of some triangles. `local_index` is scratch space: one entry per vertex of `mesh`, all
-/// `u32::MAX` before and after.
-fn extract(mesh: &TriangleMesh, triangles: &[usize], local_index: &mut [u32]) -> TriangleMesh {
-    let mut used: Vec<u32> = triangles
-        .iter()
-        .flat_map(|&triangle| mesh.triangles[triangle])
-        .collect();
-    used.sort_unstable();
-    used.dedup();
-    for (local, &vertex) in used.iter().enumerate() {
-        local_index[vertex as usize] = local as u32;
+/// The triangles of each tile that holds any: those whose centroids are in it.
+pub(super) fn triangles_of_tiles(
+    mesh: &dyn MeshView,
+    side_m: f64,
+) -> BTreeMap<TileIndex, Vec<u32>> {
+    let mut triangles_of: BTreeMap<TileIndex, Vec<u32>> = BTreeMap::new();
+    for triangle in 0..mesh.triangles() {
+        let [a, b, c] = mesh.corners(triangle);
+        let middle = (a + b + c) / 3.0;
+        let tile = TileIndex::of(middle.x, middle.y, side_m);
+        triangles_of.entry(tile).or_default().push(triangle as u32);
     }
-    let part = TriangleMesh {
-        vertices: pick(&mesh.vertices, &used),
-        normals: pick(&mesh.normals, &used),
-        colors: pick(&mesh.colors, &used),
-        triangles: triangles
-            .iter()
-            .map(|&triangle| mesh.triangles[triangle].map(|v| local_index[v as usize]))
-            .collect(),
-    };
-    for &vertex in &used {
-        local_index[vertex as usize] = u32::MAX;
+    triangles_of
+}
+
+/// Extracts parts of a mesh.
+struct Extractor<'a> {
+    mesh: &'a TriangleMesh,
+    /// Index of each vertex in the part that is being extracted; `u32::MAX` for those that are not in it.
+    local_index: Vec<u32>,
+}
+
+impl<'a> Extractor<'a> {
+    fn of(mesh: &'a TriangleMesh) -> Self {
+        Self {
+            mesh,
+            local_index: vec![u32::MAX; mesh.vertices.len()],
+        }
     }
-    part
+
+    /// The mesh of some triangles.
+    fn extract(&mut self, triangles: &[u32]) -> TriangleMesh {
+        let (mesh, local_index) = (self.mesh, &mut self.local_index);
+        let corners = |triangle: u32| mesh.triangles[triangle as usize];
+        let mut used: Vec<u32> = triangles.iter().flat_map(|&t| corners(t)).collect();
+        used.sort_unstable();
+        used.dedup();
+        for (local, &vertex) in used.iter().enumerate() {
+            local_index[vertex as usize] = local as u32;
+        }
+        let part = TriangleMesh {
+            vertices: pick(&mesh.vertices, &used),
+            normals: pick(&mesh.normals, &used),
+            colors: pick(&mesh.colors, &used),
+            triangles: triangles
+                .iter()
+                .map(|&triangle| corners(triangle).map(|v| local_index[v as usize]))
+                .collect(),
+        };
+        for &vertex in &used {
+            local_index[vertex as usize] = u32::MAX;
+        }
+        part
+    }
 }
 
 /// Returns the entries of a column at some rows; an empty column stays empty.
@@ -292,8 +313,9 @@ mod tests {
     #[test]
     fn one_tile_is_centred_at_the_origin_and_every_tile_contains_its_centre() {
         let grid = grid(&[(0.0, 0.0), (230.0, -130.0)]);
-        assert!(grid.indices().any(|t| grid.center(t) == Point2::origin()));
-        for tile in grid.indices() {
+        let origin = grid.tile_at(0.0, 0.0).unwrap();
+        assert_eq!(grid.center(origin), Point2::origin());
+        for tile in TileIndex::range(grid.range[0], grid.range[1]) {
             let center = grid.center(tile);
             assert_eq!(grid.tile_at(center.x, center.y), Some(tile));
         }
@@ -305,7 +327,10 @@ mod tests {
         let (min, max) = grid.extent();
         assert!(min.x <= -50.0 && min.y <= -70.0 && max.x >= 180.0 && max.y >= 50.0);
         // -50 .. 180 and -70 .. 50: tiles 0, 1, 2 and -1, 0.
-        assert_eq!((grid.columns, grid.rows), (3, 2));
+        assert_eq!(
+            (min, max),
+            (Point2::new(-50.0, -150.0), Point2::new(250.0, 50.0))
+        );
     }
 
     #[test]
@@ -333,12 +358,11 @@ mod tests {
     #[test]
     fn every_triangle_is_in_exactly_one_tile_with_its_corners_and_colors() {
         let mesh = sheet();
-        let grid = grid(&[(0.0, 0.0), (60.0, 0.0)]);
-        let parts = cut(&mesh, &grid);
-        assert_eq!(parts.len(), grid.len());
+        let parts = cut(&mesh, 100.0);
+        assert_eq!(parts.len(), 15);
         let mut found: Vec<_> = parts
             .iter()
-            .flat_map(|part| {
+            .flat_map(|(_, part)| {
                 (0..part.triangles.len()).map(|triangle| {
                     let color = part.colors[part.triangles[triangle][0] as usize];
                     (color, part.corners(triangle).map(|c| c.to_array()))
@@ -357,20 +381,33 @@ mod tests {
         assert!(
             parts
                 .iter()
-                .all(|part| part.vertices.len() == 3 * part.triangles.len())
+                .all(|(_, part)| part.vertices.len() == 3 * part.triangles.len())
         );
     }
 
     #[test]
-    fn a_triangle_inside_the_grid_is_in_the_tile_of_its_centroid() {
+    fn a_triangle_is_in_the_tile_of_its_centroid() {
         let mesh = sheet();
         let grid = grid(&[(-150.0, -20.0), (150.0, 60.0)]);
-        for (part, tile) in cut(&mesh, &grid).iter().zip(grid.indices()) {
+        for (tile, part) in cut(&mesh, 100.0) {
             for triangle in 0..part.triangles.len() {
                 let [a, b, c] = part.corners(triangle);
                 let centroid = ((a + b + c) / 3.0).as_dvec3();
                 assert_eq!(grid.tile_at(centroid.x, centroid.y), Some(tile));
             }
         }
+    }
+
+    #[test]
+    fn tiles_that_a_triangle_reaches_are_valid() {
+        let tile = TileIndex::of(0.0, 0.0, 100.0);
+        let wide = Aabb {
+            min: Vec3::new(-140.0, 0.0, 0.0),
+            max: Vec3::new(1e7, 60.0, 0.0),
+        };
+        let grid = TileGrid::of_boxes([(tile, wide)], 100.0);
+        let is_valid = |x: f64, y: f64| grid.valid_tile_of(&Pose2::translation(x, y)).is_some();
+        assert!(is_valid(-130.0, 10.0) && is_valid(4900.0, 70.0));
+        assert!(!is_valid(-160.0, 10.0) && !is_valid(0.0, -60.0) && !is_valid(1e6, 0.0));
     }
 }

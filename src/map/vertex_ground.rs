@@ -11,6 +11,10 @@ use rayon::prelude::*;
 
 use crate::geometry::{PointCloud, TriangleMesh};
 
+/// Colours of the ground and of the rest of a map.
+pub(super) const GROUND: [u8; 3] = [255, 0, 0];
+pub(super) const REST: [u8; 3] = [0, 0, 255];
+
 /// Smallest distance of a colour from the middle (unitless), more than the error of rounding to
 /// bytes.
 const MIN_CONTRAST: f32 = 0.01;

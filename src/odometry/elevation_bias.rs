@@ -13,13 +13,13 @@
 use glam::DVec3;
 use nalgebra::{Vector3, Vector6};
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::block_system::BlockSystem;
 use super::planes::{LidarFrame, Plane, Row};
 
 /// Angle to add to the elevations of all beams, so that surfaces fit themselves best.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ElevationBias {
     /// The angle [deg].
     pub deg: f64,

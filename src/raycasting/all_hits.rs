@@ -6,11 +6,11 @@
 use glam::DVec3;
 
 use super::place::{Leaf, Place};
-use super::simd::Baseline;
 use super::single::SingleRay;
 use super::traversal::Traverse;
 use super::triangle::TriangleBlock;
 use super::wide::{BoxGrid, CHILDREN, WideNode};
+use crate::simd::Baseline;
 
 /// A ray that visits all its hits: their ranges and places.
 pub(super) struct AllHits<F> {

@@ -4,6 +4,7 @@
 //! numbers of steps from one of them, which fit into 16 bits up to 32 m: 100 bytes for four
 //! triangles. Leaves with other corners take 160 bytes more. Both give the same corners, bit by bit.
 
+use bytemuck::{Pod, Zeroable};
 use glam::Vec4;
 
 use super::Hit;
@@ -13,9 +14,9 @@ use crate::geometry::Vec3;
 use crate::geometry::mesh::STEP_M;
 
 /// Corners in steps, relative to an origin, and indices.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
-struct LatticeLeaf {
+pub(super) struct LatticeLeaf {
     /// Relative to the middle of the tile [steps].
     origin: [f32; 3],
     /// Corners A, B, C, axis by axis, relative to the origin [steps].
@@ -24,26 +25,33 @@ struct LatticeLeaf {
 }
 
 /// Corners in numbers of steps that are not whole, and indices.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
-struct ExactLeaf {
+pub(super) struct ExactLeaf {
     /// Corners A, B, C, axis by axis, relative to the middle of the tile [steps].
     corners: [[[f32; TRIANGLES]; 3]; 3],
     indices: [u32; TRIANGLES],
 }
 
 /// Triangles of the leaves of a tile.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Leaves {
-    on_lattice: Vec<LatticeLeaf>,
+#[derive(Clone, Copy)]
+pub(super) struct Leaves<'a> {
+    pub on_lattice: &'a [LatticeLeaf],
     /// The leaves of which not all corners lie on the lattice.
-    exact: Vec<ExactLeaf>,
+    pub exact: &'a [ExactLeaf],
+}
+
+/// Leaves to which others can be added.
+#[derive(Default)]
+pub(super) struct LeafList {
+    pub on_lattice: Vec<LatticeLeaf>,
+    pub exact: Vec<ExactLeaf>,
 }
 
 /// Origin of a leaf whose corners are elsewhere: at the place in `exact` that the first two of its corners give.
 const ELSEWHERE: f32 = f32::INFINITY;
 
-impl Leaves {
+impl LeafList {
     /// Adds a leaf of at least one triangle: corners relative to the middle of the tile [steps], and indices in the
     /// mesh.
     pub fn push(&mut self, triangles: &[([Vec3; 3], u32)]) {
@@ -67,16 +75,16 @@ impl Leaves {
         self.on_lattice.push(leaf);
     }
 
-    pub fn shrink_to_fit(&mut self) {
-        self.on_lattice.shrink_to_fit();
-        self.exact.shrink_to_fit();
+    #[cfg(test)]
+    fn leaves(&self) -> Leaves<'_> {
+        Leaves {
+            on_lattice: &self.on_lattice,
+            exact: &self.exact,
+        }
     }
+}
 
-    /// Memory [bytes].
-    pub fn bytes(&self) -> usize {
-        size_of_val(&*self.on_lattice) + size_of_val(&*self.exact)
-    }
-
+impl Leaves<'_> {
     /// The triangles of a leaf.
     #[inline(always)]
     pub fn block(&self, leaf: usize) -> TriangleBlock {
@@ -207,9 +215,10 @@ mod tests {
             vec![([Vec3::ZERO, 65_536.0 * Vec3::X, Vec3::Y], 12)],
             vec![(at(0.0).map(|corner| 1024.0 * corner), 13)],
         ];
-        let mut leaves = Leaves::default();
-        triangles.iter().for_each(|leaf| leaves.push(leaf));
-        assert_eq!(leaves.exact.len(), 3);
+        let mut list = LeafList::default();
+        triangles.iter().for_each(|leaf| list.push(leaf));
+        assert_eq!(list.exact.len(), 3);
+        let leaves = list.leaves();
         for (number, leaf) in triangles.iter().enumerate() {
             let block = leaves.block(number);
             assert_eq!(block.count, leaf.len());

@@ -13,19 +13,23 @@ mod leaves;
 mod packet;
 mod place;
 mod scene;
-mod simd;
 mod single;
+mod source;
+mod tile;
 mod traversal;
 mod triangle;
 mod wide;
 
+use crate::simd::WIDE;
 use place::Place;
-pub use scene::Scene;
+pub use scene::{Scene, TileSource};
+pub use source::{SceneSource, TileError, TileProblem, TriangleSource};
+pub use tile::Tile;
 #[cfg(feature = "gpu")]
 pub(crate) use triangle::is_proper;
 
 /// Rays per packet.
-pub const RAYS: usize = 8;
+pub const RAYS: usize = WIDE;
 
 /// Nearest range at which a surface is hit [m]: a ray does not hit the surface that it starts on.
 pub const NEAREST_M: f32 = 1e-4;

@@ -1,4 +1,4 @@
-//! Packets: eight rays that traverse the hierarchy together.
+//! Packets: sixteen rays that traverse the hierarchy together.
 //!
 //! The rays of a packet are neighbouring beams from one origin, or the same beam from the origins
 //! of poses that are close to each other (a *bundle*): neighbouring beams diverge with range, those
@@ -13,20 +13,20 @@
 use glam::DVec3;
 
 use super::place::{Leaf, Place};
-use super::simd::{Lanes, Simd};
 use super::traversal::{FAR_TOLERANCE, Slope, Traverse, enter, entry_and_exit, limited_inverse};
 use super::triangle::{TRIANGLES, TriangleBlock, Triangles, Vectors, splat_lane};
 use super::wide::{BoxGrid, CHILDREN, WideNode};
 use super::{NEAREST_M, RAYS, Reach};
 use crate::geometry::Vec3;
 use crate::geometry::mesh::STEP_M;
+use crate::simd::{Lanes, Simd};
 
-/// Eight rays and their nearest hits so far.
+/// Sixteen rays and their nearest hits so far.
 pub(super) struct Packet<'a, S: Simd, O> {
     origin: &'a O,
-    direction: Vectors<S::F32x8>,
+    direction: Vectors<S::F32x16>,
     /// Inverses of the coordinates of the directions [m per step].
-    inverse: Vectors<S::F32x8>,
+    inverse: Vectors<S::F32x16>,
     /// The inverses of least and of largest magnitude per axis.
     least_and_largest: [[f32; 3]; 2],
     /// Per axis, the bounds through which the rays enter and leave a box.
@@ -92,8 +92,8 @@ impl<'a, S: Simd, O: Origin<S>> Packet<'a, S, O> {
     /// Whether any ray enters a box before its nearest hit.
     #[inline(always)]
     fn enters(&self, simd: S, origin: O::Relative, bounds: &[f32; 6]) -> bool {
-        let mut near = simd.splat(0.0);
-        let mut far = simd.load(self.until_m);
+        let mut near = simd.splat_wide(0.0);
+        let mut far = simd.load_wide(self.until_m);
         for axis in 0..3 {
             let [entry, exit] = self.sides[axis];
             let entry = O::offset(simd, origin, axis, bounds[entry]);
@@ -106,13 +106,14 @@ impl<'a, S: Simd, O: Origin<S>> Packet<'a, S, O> {
 
     /// Intersects one triangle, relative to the origins of the rays.
     #[inline(always)]
-    fn intersect_triangle(&mut self, simd: S, triangle: &Triangles<S::F32x8>, place: Place) {
+    fn intersect_triangle(&mut self, simd: S, triangle: &Triangles<S::F32x16>, place: Place) {
         let Some((inside, steps)) = triangle.intersect(self.direction) else {
             return;
         };
         let range_m = steps * STEP_M;
-        let mut hits =
-            inside & range_m.lt(simd.load(self.until_m)) & simd.splat(NEAREST_M).lt(range_m);
+        let mut hits = inside
+            & range_m.lt(simd.load_wide(self.until_m))
+            & simd.splat_wide(NEAREST_M).lt(range_m);
         if hits == 0 {
             return;
         }
@@ -216,7 +217,7 @@ pub(super) trait Origin<S: Simd> {
     fn interval(origin: Self::Relative) -> [Vec3; 2];
 
     /// `coordinate − origin` along an axis, per ray.
-    fn offset(simd: S, origin: Self::Relative, axis: usize, coordinate: f32) -> S::F32x8;
+    fn offset(simd: S, origin: Self::Relative, axis: usize, coordinate: f32) -> S::F32x16;
 
     /// See [`Traverse::intersect`].
     fn intersect(
@@ -248,8 +249,8 @@ impl<S: Simd> Origin<S> for DVec3 {
     }
 
     #[inline(always)]
-    fn offset(simd: S, origin: Vec3, axis: usize, coordinate: f32) -> S::F32x8 {
-        simd.splat(coordinate - origin[axis])
+    fn offset(simd: S, origin: Vec3, axis: usize, coordinate: f32) -> S::F32x16 {
+        simd.splat_wide(coordinate - origin[axis])
     }
 
     #[inline(always)]
@@ -276,7 +277,7 @@ pub(super) struct Origins<L> {
 }
 
 impl<S: Simd> Origin<S> for [DVec3; RAYS] {
-    type Relative = Origins<S::F32x8>;
+    type Relative = Origins<S::F32x16>;
 
     #[inline(always)]
     fn of_ray(&self, ray: usize) -> DVec3 {
@@ -304,8 +305,8 @@ impl<S: Simd> Origin<S> for [DVec3; RAYS] {
     }
 
     #[inline(always)]
-    fn offset(simd: S, origin: Self::Relative, axis: usize, coordinate: f32) -> S::F32x8 {
-        simd.splat(coordinate) - origin.of_rays[axis]
+    fn offset(simd: S, origin: Self::Relative, axis: usize, coordinate: f32) -> S::F32x16 {
+        simd.splat_wide(coordinate) - origin.of_rays[axis]
     }
 
     #[inline(always)]
@@ -331,6 +332,6 @@ fn per_axis(vectors: &[Vec3; RAYS]) -> [[f32; RAYS]; 3] {
 }
 
 #[inline(always)]
-fn load<S: Simd>(simd: S, [x, y, z]: [[f32; RAYS]; 3]) -> Vectors<S::F32x8> {
-    [simd.load(x), simd.load(y), simd.load(z)]
+fn load<S: Simd>(simd: S, [x, y, z]: [[f32; RAYS]; 3]) -> Vectors<S::F32x16> {
+    [simd.load_wide(x), simd.load_wide(y), simd.load_wide(z)]
 }

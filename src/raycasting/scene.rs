@@ -2,41 +2,50 @@
 
 mod cast;
 
+use std::fmt::Debug;
+use std::sync::Arc;
+
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::Hit;
-use super::bvh::{Bvh, PrimRef};
-use super::leaves::Leaves;
-use super::triangle::{TRIANGLES, is_proper};
+use super::bvh::Bvh;
+use super::tile::{Tile, middle_of, padded_prim};
 use super::wide::WideBvh;
 use crate::geometry::mesh::STEP_M;
 use crate::geometry::{Aabb, TriangleMesh};
 
-/// Boxes are enlarged by this part of the extent of the scene: more than rounding moves an edge.
-const PADDING: f32 = 16.0 * f32::EPSILON;
-
-/// Triangles that rays can be cast at, from both sides.
+/// Triangles that rays can be cast at, from both sides. Clones share them.
 ///
 /// Triangles that are degenerate or not finite are never hit.
 #[derive(Clone, Debug)]
 pub struct Scene {
-    /// Origin of the boxes of the tiles, in the frame of the scene [m].
-    middle: DVec3,
-    /// Hierarchy over the tiles.
-    top: WideBvh,
-    tiles: Vec<Tile>,
+    top: Arc<Top>,
+    tiles: Arc<dyn TileSource>,
 }
 
-/// Triangles of a tile under a hierarchy.
-#[derive(Clone, Debug)]
-struct Tile {
-    /// In the frame of the scene.
-    bounds: Aabb,
-    /// Origin of its coordinates in the frame of the scene [m].
+/// Supplies the tiles of a scene when rays enter their boxes.
+pub trait TileSource: Debug + Send + Sync {
+    /// A tile by its number; `None` where it cannot be had, which is as if it were empty.
+    fn tile(&self, number: usize) -> Option<&Tile>;
+}
+
+impl TileSource for Vec<Tile> {
+    fn tile(&self, number: usize) -> Option<&Tile> {
+        self.get(number)
+    }
+}
+
+/// Hierarchy over the boxes of the tiles.
+#[derive(Debug)]
+struct Top {
+    /// Origin of the boxes in the frame of the scene [m].
     middle: DVec3,
     bvh: WideBvh,
-    leaves: Leaves,
+    /// Number of the tile in each leaf.
+    numbers: Vec<u32>,
+    /// Number of the triangles in the meshes before each tile.
+    first_triangles: Vec<u32>,
 }
 
 impl Scene {
@@ -58,108 +67,73 @@ impl Scene {
                 (mesh, first as u32)
             })
             .collect();
-        let tiles: Vec<Tile> = numbered
+        let (tiles, first_triangles): (Vec<Tile>, Vec<u32>) = numbered
             .into_par_iter()
-            .filter_map(|(mesh, first_triangle)| Tile::build(mesh, first_triangle))
-            .collect();
-        Self::join(tiles)
+            .filter_map(|(mesh, first)| Some((Tile::of_mesh(mesh)?, first)))
+            .unzip();
+        let bounds: Vec<Aabb> = tiles.iter().map(Tile::bounds).collect();
+        Self::over(&bounds, first_triangles, Arc::new(tiles))
     }
 
-    fn join(tiles: Vec<Tile>) -> Self {
-        let whole = tiles
+    /// Builds a hierarchy over tiles, of which only the boxes are known yet. `first_triangles` is added to the indices
+    /// of the triangles of each.
+    pub fn over(bounds: &[Aabb], first_triangles: Vec<u32>, tiles: Arc<dyn TileSource>) -> Self {
+        let whole = bounds
             .iter()
-            .fold(Aabb::EMPTY, |whole, tile| whole.union(tile.bounds));
+            .fold(Aabb::EMPTY, |whole, bounds| whole.union(*bounds));
         let middle = if whole.is_empty() {
             Vec3::ZERO
         } else {
             middle_of(&whole)
         };
-        let prims = tiles.iter().zip(0..).map(|(tile, index)| {
+        let boxes = bounds
+            .iter()
+            .zip(0..)
+            .filter(|(bounds, _)| !bounds.is_empty());
+        let prims = boxes.map(|(bounds, index)| {
             let relative = Aabb {
-                min: (tile.bounds.min - middle) / STEP_M,
-                max: (tile.bounds.max - middle) / STEP_M,
+                min: (bounds.min - middle) / STEP_M,
+                max: (bounds.max - middle) / STEP_M,
             };
             padded_prim(relative, &whole, index)
         });
         let (top, of_leaves) = Bvh::build(prims.collect(), 1);
-        let (top, leaves) = WideBvh::of(&top);
-        let mut tiles: Vec<Option<Tile>> = tiles.into_iter().map(Some).collect();
-        let tile_of = |leaf: usize| {
-            let place = of_leaves.ranges[leaf].start as usize;
-            tiles[of_leaves.order[place] as usize].take()
+        let (bvh, leaves) = WideBvh::of(&top);
+        let number_of = |leaf: usize| of_leaves.order[of_leaves.ranges[leaf].start as usize];
+        let top = Top {
+            middle: middle.as_dvec3(),
+            bvh,
+            numbers: leaves.into_iter().map(number_of).collect(),
+            first_triangles,
         };
         Self {
-            middle: middle.as_dvec3(),
-            top,
-            tiles: leaves.into_iter().filter_map(tile_of).collect(),
+            top: top.into(),
+            tiles,
+        }
+    }
+
+    /// The same scene with tiles from another source.
+    #[must_use]
+    pub fn with_tiles(&self, tiles: Arc<dyn TileSource>) -> Self {
+        Self {
+            top: self.top.clone(),
+            tiles,
         }
     }
 
     /// The unit normal of the triangle of a hit of this scene by the right-hand rule; `None` if there is none.
     pub fn normal(&self, hit: &Hit) -> Option<Vec3> {
         let leaf = hit.place.leaf;
-        let tile = self.tiles.get(leaf.tile as usize)?;
-        let block = tile.leaves.block(leaf.index as usize);
+        let tile = self.tiles.tile(leaf.tile as usize)?;
+        let block = tile.parts().leaves.block(leaf.index as usize);
         Some(block.normal(hit.place.lane as usize))
     }
 
     /// Memory of the hierarchies and the triangles [bytes].
     pub fn bytes(&self) -> usize {
-        let of_tile = |tile: &Tile| tile.bvh.bytes() + tile.leaves.bytes();
-        self.top.bytes() + self.tiles.iter().map(of_tile).sum::<usize>()
+        let top = size_of_val(&*self.top.bvh.nodes);
+        let numbers = 0..self.top.numbers.len();
+        let tiles = numbers.filter_map(|number| self.tiles.tile(number));
+        top + tiles.map(|tile| tile.as_bytes().len()).sum::<usize>()
     }
-}
-
-impl Tile {
-    /// `None` if no triangle of the mesh can be hit.
-    fn build(mesh: &TriangleMesh, first_triangle: u32) -> Option<Self> {
-        let usable: Vec<u32> = (0..mesh.triangles.len())
-            .into_par_iter()
-            .filter(|&triangle| is_proper(mesh.corners(triangle)))
-            .map(|triangle| triangle as u32)
-            .collect();
-        let corners = |triangle: u32| mesh.corners(triangle as usize);
-        let bounds = Aabb::of(usable.iter().flat_map(|&triangle| corners(triangle)));
-        if bounds.is_empty() {
-            return None;
-        }
-        let middle = middle_of(&bounds);
-        let local = |triangle: u32| corners(triangle).map(|corner| (corner - middle) / STEP_M);
-        let prims = usable
-            .into_par_iter()
-            .map(|triangle| padded_prim(Aabb::of(local(triangle)), &bounds, triangle));
-        let (bvh, of_leaves) = Bvh::build(prims.collect(), TRIANGLES);
-        let (bvh, order) = WideBvh::of(&bvh);
-        let mut leaves = Leaves::default();
-        for leaf in order {
-            let range = &of_leaves.ranges[leaf];
-            let triangles = &of_leaves.order[range.start as usize..range.end as usize];
-            let of_leaf: Vec<([Vec3; 3], u32)> = (triangles.iter())
-                .map(|&triangle| (local(triangle), first_triangle + triangle))
-                .collect();
-            leaves.push(&of_leaf);
-        }
-        leaves.shrink_to_fit();
-        Some(Self {
-            bounds,
-            middle: middle.as_dvec3(),
-            bvh,
-            leaves,
-        })
-    }
-}
-
-/// The middle of a box, on the lattice of maps.
-fn middle_of(bounds: &Aabb) -> Vec3 {
-    (bounds.min.midpoint(bounds.max) / STEP_M).round() * STEP_M
-}
-
-/// A primitive whose box [steps] is enlarged by the rounding errors in a scene of this size.
-fn padded_prim(bounds: Aabb, whole: &Aabb, index: u32) -> PrimRef {
-    let padding = Vec3::splat(PADDING * whole.size().max_element() / STEP_M);
-    let padded = Aabb {
-        min: bounds.min - padding,
-        max: bounds.max + padding,
-    };
-    PrimRef::new(padded, index)
 }

@@ -6,13 +6,13 @@
 use glam::{DVec3, Vec4};
 
 use super::place::{Leaf, Place};
-use super::simd::{Lanes, Simd};
 use super::traversal::{Slope, Traverse, enter, entry_and_exit, limited_inverse};
 use super::triangle::{TRIANGLES, TriangleBlock, splat};
 use super::wide::{BoxGrid, CHILDREN, WideNode};
 use super::{NEAREST_M, Reach};
 use crate::geometry::Vec3;
 use crate::geometry::mesh::STEP_M;
+use crate::simd::{Lanes, Simd};
 
 /// A ray and its nearest hit so far.
 #[derive(Clone, Copy)]

@@ -1,9 +1,11 @@
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 
-use super::simd::{Baseline, SimdTask as _};
 use super::*;
 use crate::geometry::{TriangleMesh, Vec3};
+#[cfg(target_arch = "x86_64")]
+use crate::simd::avx2::Avx2;
+use crate::simd::{Baseline, SimdTask, dispatch};
 
 /// Random triangles in a cube of 20 m.
 fn soup(triangles: usize, size_m: f32, rng: &mut ChaCha8Rng) -> TriangleMesh {
@@ -353,6 +355,36 @@ fn if_any_near_surface_is_enough_one_is_found() {
     assert_ne!(hits, nearest);
 }
 
+/// Instruction sets of this CPU.
+enum InstructionSet {
+    Baseline,
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+    Best,
+}
+
+impl InstructionSet {
+    fn run(&self, task: impl SimdTask) {
+        match self {
+            Self::Baseline => task.run(Baseline),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => match Avx2::detect() {
+                Some(avx2) => avx2.run(task),
+                None => dispatch(task),
+            },
+            Self::Best => dispatch(task),
+        }
+    }
+}
+
+/// Expects results that are the same with every instruction set.
+fn expect_the_same<R: PartialEq>(mut cast: impl FnMut(InstructionSet) -> R) {
+    let portable = cast(InstructionSet::Baseline);
+    #[cfg(target_arch = "x86_64")]
+    assert!(cast(InstructionSet::Avx2) == portable);
+    assert!(cast(InstructionSet::Best) == portable);
+}
+
 #[test]
 fn every_instruction_set_gives_the_same_bits() {
     let mut rng = ChaCha8Rng::seed_from_u64(7);
@@ -361,18 +393,12 @@ fn every_instruction_set_gives_the_same_bits() {
         let origin = 10.0 * in_cube(&mut rng).as_dvec3();
         let directions: Vec<Vec3> = (0..333).map(|_| direction(&mut rng)).collect();
         let reach = vec![Reach::UNLIMITED; directions.len()];
-        let mut fast = vec![Hit::MISS; directions.len()];
-        let mut portable = fast.clone();
-        scene.cast_packets(origin, &directions, &reach, &mut fast);
-        scene
-            .task(origin, &directions, &reach, &mut portable)
-            .run(Baseline);
-        let bits = |hits: &[Hit]| -> Vec<(u32, u32)> {
-            hits.iter()
-                .map(|hit| (hit.range_m.to_bits(), hit.triangle))
-                .collect()
-        };
-        assert_eq!(bits(&fast), bits(&portable));
+        let mut hits = vec![Hit::MISS; directions.len()];
+        expect_the_same(|set| {
+            set.run(scene.task(origin, &directions, &reach, &mut hits));
+            let bits = hits.iter().map(|hit| (hit.range_m.to_bits(), hit.triangle));
+            bits.collect::<Vec<_>>()
+        });
     }
 }
 
@@ -523,17 +549,16 @@ fn every_instruction_set_gives_single_rays_the_same_bits() {
         };
         let origin = in_cube(&mut rng);
         let directions: Vec<Vec3> = (0..2000).map(|_| direction(&mut rng)).collect();
-        let fast = cast_single(&scene, origin, &directions, reach);
-        let mut portable = fast.clone();
         let reaches = vec![reach; directions.len()];
-        scene
-            .task(origin.as_dvec3(), &directions, &reaches, &mut portable)
-            .run(Baseline);
-        assert_eq!(fast, portable);
+        let mut ranges_m = vec![0.0; directions.len()];
+        expect_the_same(|set| {
+            set.run(scene.task(origin.as_dvec3(), &directions, &reaches, &mut ranges_m));
+            ranges_m.clone()
+        });
     }
 }
 
-/// Eight origins within `spread_m` of one, and bundles of rays from them within `turn` of random
+/// Origins within `spread_m` of one, and bundles of rays from them within `turn` of random
 /// directions.
 fn bundles(
     middle: Vec3,
@@ -586,7 +611,10 @@ fn a_ray_in_a_bundle_hits_what_it_hits_as_single_ray() {
 fn no_ray_of_a_bundle_passes_through_an_edge_or_a_corner() {
     let scene = Scene::new(&cube(2.0));
     let corners: Vec<Vec3> = cube(2.0).vertices;
-    let origins = [0.0, 0.1, -0.1, 0.2, -0.2, 0.3, -0.3, 0.4].map(|x| Vec3::new(x, -x, 0.5 * x));
+    let origins: [Vec3; RAYS] = std::array::from_fn(|ray| {
+        let x = 0.05 * (ray as f32 - 8.0);
+        Vec3::new(x, -x, 0.5 * x)
+    });
     // From every origin exactly towards the same place on an edge or a diagonal.
     let ends: Vec<Vec3> = corners
         .iter()
@@ -646,12 +674,10 @@ fn every_instruction_set_gives_bundles_the_same_bits() {
         let (origins, directions) = bundles(in_cube(&mut rng), spread_m, turn, &mut rng);
         let from = origins.map(|origin| origin.as_dvec3());
         let reach = vec![Reach::until(12.0); directions.len()];
-        let mut fast = vec![[0.0; RAYS]; directions.len()];
-        let mut portable = fast.clone();
-        scene.cast_bundles(&from, &directions, &reach, &mut fast);
-        scene
-            .task(from, &directions, &reach, &mut portable)
-            .run(Baseline);
-        assert_eq!(fast, portable);
+        let mut ranges_m = vec![[0.0; RAYS]; directions.len()];
+        expect_the_same(|set| {
+            set.run(scene.task(from, &directions, &reach, &mut ranges_m));
+            ranges_m.clone()
+        });
     }
 }

@@ -4,10 +4,10 @@ use glam::DVec3;
 
 use super::bvh::{MAX_DEPTH, NodeRef};
 use super::place::Leaf;
-use super::simd::{Lanes, Simd};
 use super::triangle::{TriangleBlock, Vectors};
-use super::wide::{BoxGrid, CHILDREN, WideBvh, WideNode};
+use super::wide::{BoxGrid, CHILDREN, WideNode};
 use crate::geometry::Vec3;
+use crate::simd::{Lanes, Simd};
 
 /// Rounding of the slab test, see Ize, *Robust BVH Ray Traversal*, JCGT 2013.
 pub(super) const FAR_TOLERANCE: f32 = 1.0 + 8.0 * f32::EPSILON;
@@ -141,7 +141,7 @@ impl Stack {
 /// The leaves that rays enter, near ones first.
 pub(super) struct Traversal<'a, S: Simd, R: Traverse<S>> {
     simd: S,
-    bvh: &'a WideBvh,
+    nodes: &'a [WideNode],
     relative: &'a R::Relative,
     stack: &'a mut Stack,
 }
@@ -149,12 +149,17 @@ pub(super) struct Traversal<'a, S: Simd, R: Traverse<S>> {
 impl<'a, S: Simd, R: Traverse<S>> Traversal<'a, S, R> {
     /// Starts at the root, with the rays in the frame of the hierarchy.
     #[inline(always)]
-    pub fn new(simd: S, bvh: &'a WideBvh, relative: &'a R::Relative, stack: &'a mut Stack) -> Self {
+    pub fn new(
+        simd: S,
+        nodes: &'a [WideNode],
+        relative: &'a R::Relative,
+        stack: &'a mut Stack,
+    ) -> Self {
         stack.pending[0] = Stack::ROOT;
-        stack.count = usize::from(!bvh.nodes.is_empty());
+        stack.count = usize::from(!nodes.is_empty());
         Self {
             simd,
-            bvh,
+            nodes,
             relative,
             stack,
         }
@@ -180,7 +185,7 @@ impl<'a, S: Simd, R: Traverse<S>> Traversal<'a, S, R> {
     /// The nearest child that the rays enter; the others go onto the stack.
     #[inline(always)]
     fn open(&mut self, rays: &R, index: usize) -> Option<NodeRef> {
-        let node = &self.bvh.nodes[index];
+        let node = &self.nodes[index];
         let (mut entered, near_m) = rays.enter(self.simd, self.relative, node);
         if entered == 0 {
             return None;

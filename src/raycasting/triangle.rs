@@ -14,8 +14,8 @@
 
 use glam::Vec4;
 
-use super::simd::{Lanes, Simd};
 use crate::geometry::Vec3;
+use crate::simd::{Lanes, Simd};
 
 /// Triangles per block.
 pub(super) const TRIANGLES: usize = 4;
@@ -113,11 +113,11 @@ impl<L: Lanes> Triangles<L> {
 impl Triangles<Vec4> {
     /// The triangle of one lane in all lanes.
     #[inline(always)]
-    pub fn splat<S: Simd>(&self, simd: S, lane: usize) -> Triangles<S::F32x8> {
+    pub fn splat<S: Simd>(&self, simd: S, lane: usize) -> Triangles<S::F32x16> {
         Triangles {
             corners: splat_lane(simd, self.corners, lane),
             edges: splat_lane(simd, self.edges, lane),
-            tolerance: simd.splat(self.tolerance[lane]),
+            tolerance: simd.splat_wide(self.tolerance[lane]),
         }
     }
 }
@@ -136,9 +136,9 @@ pub(super) fn splat_lane<S: Simd>(
     simd: S,
     [a, b, c]: [Vectors<Vec4>; 3],
     lane: usize,
-) -> [Vectors<S::F32x8>; 3] {
+) -> [Vectors<S::F32x16>; 3] {
     let of_lane = |v: Vectors<Vec4>| [v[0][lane], v[1][lane], v[2][lane]];
-    let splat_one = |v: Vectors<Vec4>| splat(of_lane(v), |number| simd.splat(number));
+    let splat_one = |v: Vectors<Vec4>| splat(of_lane(v), |number| simd.splat_wide(number));
     [splat_one(a), splat_one(b), splat_one(c)]
 }
 

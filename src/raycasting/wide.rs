@@ -9,8 +9,10 @@
 //! up to 65,500 per axis, rounded outwards, and the children of one kind lie one after the other:
 //! 128 bytes, two cache lines.
 
+use bytemuck::{Pod, Zeroable};
+
 use super::bvh::{Bvh, NodeRef};
-use super::simd::WIDTH;
+use crate::simd::WIDTH;
 
 /// Children of a node.
 pub(super) const CHILDREN: usize = WIDTH;
@@ -18,7 +20,7 @@ pub(super) const CHILDREN: usize = WIDTH;
 type Bounds = [f32; 6];
 
 /// Up to eight children and their boxes.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
 #[repr(C, align(64))]
 pub(super) struct WideNode {
     /// Lower x of each child, lower y, …, upper z, in cells of the [`BoxGrid`].
@@ -29,6 +31,7 @@ pub(super) struct WideNode {
     inner: u8,
     /// Number of all.
     children: u8,
+    unused: [u8; 22],
 }
 
 impl WideNode {
@@ -49,7 +52,8 @@ impl WideNode {
 }
 
 /// Grid of the boxes of a hierarchy.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Pod, Zeroable)]
+#[repr(C)]
 pub(super) struct BoxGrid {
     /// Where a bound of zero lies [steps of the lattice].
     pub origin: [f32; 3],
@@ -119,13 +123,7 @@ impl WideBvh {
             };
             wide.set(0, bvh, children, &mut leaves);
         }
-        wide.nodes.shrink_to_fit();
         (wide, leaves)
-    }
-
-    /// Memory [bytes].
-    pub fn bytes(&self) -> usize {
-        size_of_val(&*self.nodes)
     }
 
     /// Sets a node, and adds all below it.

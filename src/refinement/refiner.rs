@@ -147,25 +147,49 @@ pub struct RefinedFrame {
     pub cost_after_m: f64,
 }
 
+impl RefinedFrame {
+    /// Takes a pose if its cost is lower.
+    fn accept(&mut self, found: Option<(Pose3, f64)>) {
+        if let Some((map_from_lidar, cost_m)) = found
+            && cost_m < self.cost_after_m
+        {
+            self.pose = pose2_from_pose3(&map_from_lidar);
+            self.map_from_lidar = map_from_lidar;
+            self.cost_after_m = cost_m;
+        }
+    }
+}
+
+/// How far from the right pose an estimate may be.
+#[derive(Clone, Copy)]
+pub enum Distance<'a> {
+    /// Inside the basin of Gauss-Newton.
+    InBasin,
+    /// About half a metre: Gauss-Newton begins with a wide kernel.
+    Near,
+    /// As far as its covariance says: the swarm searches among these surfaces of the map.
+    Far(&'a UprightSurfaces),
+}
+
 /// Refines an estimate with its covariance of (x, y, heading). The attitude of the objective is an
-/// initial value, which is first fitted to the mapped ground. With `surfaces`, those of the map, the swarm searches as
-/// far as the covariance asks for. `None` where there is no ground under the estimate or the scan has no beams.
+/// initial value, which is first fitted to the mapped ground. `None` where there is no ground under the estimate or
+/// the scan has no beams.
 pub fn refine_frame(
     objective: &FrameObjective<'_>,
     estimate: &Pose2,
     covariance: &Matrix3<f64>,
-    surfaces: Option<&UprightSurfaces>,
+    distance: Distance<'_>,
     config: &RefinementConfig,
     rng: &mut impl Rng,
 ) -> Result<Option<RefinedFrame>, RenderError> {
     let reach = config.reach(covariance);
-    let distance_m = surfaces.map_or(0.0, |_| reach[0].max(reach[1]));
-    let objective = &match surfaces {
-        Some(_) => *objective,
-        None => objective.with_fitted_attitude(estimate),
+    let (objective, reach_m) = match distance {
+        Distance::Far(_) => (*objective, reach[0].max(reach[1])),
+        Distance::InBasin | Distance::Near => (objective.with_fitted_attitude(estimate), 0.0),
     };
+    let objective = &objective;
     let Some(lifted) = objective
-        .patch_within(estimate, distance_m)
+        .patch_within(estimate, reach_m)
         .filter(|_| !objective.beams.is_empty())
         .map(|patch| patch.lift(estimate, &objective.attitude))
     else {
@@ -181,10 +205,20 @@ pub fn refine_frame(
         cost_before_m,
         cost_after_m: cost_before_m,
     };
-    match surfaces {
-        Some(surfaces) => search_widely(objective, &mut frame, surfaces, config, rng)?,
-        None if config.method == Method::Swarm => search(objective, &mut frame, config, rng)?,
-        None => {}
+    match distance {
+        Distance::Far(surfaces) => search_widely(objective, &mut frame, surfaces, config, rng)?,
+        _ if config.method == Method::Swarm => search(objective, &mut frame, config, rng)?,
+        Distance::Near if config.method == Method::Both => {
+            let (gauss_newton, wide) = (&config.gauss_newton, &config.wide_search);
+            frame.accept(wide_search::finish(
+                objective,
+                estimate,
+                0.0,
+                gauss_newton,
+                wide,
+            )?);
+        }
+        _ => {}
     }
     let finished = match config.method {
         Method::GaussNewton | Method::Both => finish(objective, &mut frame, config)?,
@@ -221,13 +255,7 @@ fn search_widely(
         &config.wide_search,
         rng,
     )?;
-    if let Some((map_from_lidar, cost_m)) = found
-        && cost_m < frame.cost_after_m
-    {
-        frame.pose = pose2_from_pose3(&map_from_lidar);
-        frame.map_from_lidar = map_from_lidar;
-        frame.cost_after_m = cost_m;
-    }
+    frame.accept(found);
     Ok(())
 }
 
@@ -329,7 +357,7 @@ mod tests {
             &objective,
             &(truth * off),
             &covariance,
-            None,
+            Distance::InBasin,
             &config,
             &mut rng,
         );
@@ -383,13 +411,29 @@ mod tests {
         let covariance = Matrix3::identity();
         let empty = world.objective(&[]);
         assert_eq!(
-            refine_frame(&empty, &truth, &covariance, None, &config, &mut rng).unwrap(),
+            refine_frame(
+                &empty,
+                &truth,
+                &covariance,
+                Distance::InBasin,
+                &config,
+                &mut rng
+            )
+            .unwrap(),
             None
         );
         let off = Pose2::translation(1e5, 0.0);
         let objective = world.objective(&beams);
         assert_eq!(
-            refine_frame(&objective, &off, &covariance, None, &config, &mut rng).unwrap(),
+            refine_frame(
+                &objective,
+                &off,
+                &covariance,
+                Distance::InBasin,
+                &config,
+                &mut rng
+            )
+            .unwrap(),
             None
         );
     }

@@ -10,20 +10,22 @@
 //! may not describe how the car came from before the loss to after it; frames without an estimate are
 //! bridged by the odometry.
 
-use std::cell::OnceCell;
+use std::cell::RefCell;
 use std::ops::Range;
+use std::sync::{Arc, Weak};
 
-use nalgebra::{Matrix3, Vector3};
+use glam::DVec3;
+use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::objective::FrameObjective;
-use super::refiner::{RefinementConfig, refine_frame};
+use super::refiner::{Distance, RefinementConfig, refine_frame};
 use super::smoothing::{self, FramePrior, smooth};
 use super::upright::UprightSurfaces;
-use crate::geometry::{Pose2, Pose3, Vec3, pose3_from_pose2};
+use crate::geometry::{Pose2, Pose3, TriangleMesh, pose3_from_pose2};
 use crate::lidar::{Beam, Motion, RangeImage, Scan};
-use crate::localization::observation::{ObservationConfig, agreement, choose_beams};
+use crate::localization::observation::{ObservationConfig, agreement, choose_beams, ranges_along};
 use crate::localization::{Estimate, Sensor, SensorConfig, State, TrackingLossConfig};
-use crate::map::{Map, SensorAttitude};
+use crate::map::{Map, MapError, SensorAttitude};
 use crate::random::{Generator, stream};
 use crate::rendering::RenderError;
 use crate::validation::{InvalidValue, Validate, nested};
@@ -176,10 +178,20 @@ pub enum RefinerError {
     Invalid(#[from] InvalidValue),
     #[error(transparent)]
     Render(#[from] RenderError),
+    #[error(transparent)]
+    Map(#[from] MapError),
     #[error(
         "there are {increments} odometry increments for {frames} frames; give one per frame, the first of which is ignored"
     )]
     IncrementCount { frames: usize, increments: usize },
+}
+
+/// Upright surfaces around a square.
+struct NearbySurfaces {
+    square: Vector2<i64>,
+    /// Where they come from.
+    mesh: Weak<TriangleMesh>,
+    surfaces: Arc<UprightSurfaces>,
 }
 
 /// Refines a trajectory: [`add`](Self::add) every frame in order, then [`finish`](Self::finish).
@@ -189,8 +201,8 @@ pub struct TrajectoryRefiner {
     seed: u64,
     sensor: Sensor,
     frames: Vec<FrameResult>,
-    /// Upright surfaces of the map, for wide searches.
-    surfaces: OnceCell<UprightSurfaces>,
+    /// Upright surfaces of the map around the last wide search.
+    surfaces: RefCell<Option<NearbySurfaces>>,
     /// `refined * estimate⁻¹` of the last frame that was placed.
     correction: Option<Pose2>,
 }
@@ -205,7 +217,7 @@ impl TrajectoryRefiner {
             config,
             seed,
             frames: Vec::new(),
-            surfaces: OnceCell::new(),
+            surfaces: RefCell::default(),
             correction: None,
         })
     }
@@ -233,7 +245,7 @@ impl TrajectoryRefiner {
         };
         let is_tracked = frame.is_tracked();
         if is_tracked && !self.config.refinement.is_wide(&frame.covariance) {
-            self.refine(&image, &mut frame, &mut rng)?;
+            self.refine(&image, &mut frame, Distance::InBasin, &mut rng)?;
         } else {
             let previous = previous.filter(|previous| previous.is_tracked());
             let predicted = (previous.zip(estimate.increment))
@@ -331,7 +343,7 @@ impl TrajectoryRefiner {
         rng: &mut Generator,
     ) -> Result<Option<FrameResult>, RefinerError> {
         for mut start in starts {
-            let beams = self.refine(image, &mut start, rng)?;
+            let beams = self.refine(image, &mut start, Distance::Near, rng)?;
             if let (Some(beams), Some(pose)) = (beams, &start.map_from_lidar)
                 && self.agrees(&beams, pose)?
             {
@@ -341,11 +353,13 @@ impl TrajectoryRefiner {
         Ok(None)
     }
 
-    /// Refines a frame; the beams that were compared, or `None` where it cannot be refined.
+    /// Refines a frame that is `distance` off, or farther if its covariance says so; the beams that were compared, or
+    /// `None` where it cannot be refined.
     fn refine(
         &self,
         image: &RangeImage,
         frame: &mut FrameResult,
+        distance: Distance<'_>,
         rng: &mut Generator,
     ) -> Result<Option<Vec<Beam>>, RefinerError> {
         let observation = &self.config.observation;
@@ -364,11 +378,12 @@ impl TrajectoryRefiner {
         }
         let config = &self.config.refinement;
         let (pose, covariance) = (&frame.pose, &frame.covariance);
-        let surfaces = (config.is_wide(covariance)).then(|| {
-            let of_map = || UprightSurfaces::of(&self.map.mesh);
-            self.surfaces.get_or_init(of_map)
-        });
-        let Some(refined) = refine_frame(&objective, pose, covariance, surfaces, config, rng)?
+        let surfaces = match config.is_wide(covariance) {
+            true => Some(self.surfaces_near(pose)?),
+            false => None,
+        };
+        let distance = surfaces.as_deref().map_or(distance, Distance::Far);
+        let Some(refined) = refine_frame(&objective, pose, covariance, distance, config, rng)?
         else {
             return Ok(None);
         };
@@ -380,17 +395,47 @@ impl TrajectoryRefiner {
         Ok(Some(beams))
     }
 
+    /// Upright surfaces of the map, at least as far from a pose as a wide search looks.
+    fn surfaces_near(&self, pose: &Pose2) -> Result<Arc<UprightSurfaces>, RefinerError> {
+        /// The surfaces are those around the middle of a square of this edge, and serve all poses in it [m].
+        const SQUARE_M: f64 = 50.0;
+        let square = (pose.translation.vector / SQUARE_M).map(|along| along.floor() as i64);
+        let mut last = self.surfaces.borrow_mut();
+        if let Some(last) = &*last
+            && last.square == square
+        {
+            return Ok(last.surfaces.clone());
+        }
+        let config = &self.config.refinement;
+        let middle = square.map(|number| (number as f64 + 0.5) * SQUARE_M);
+        let radius_m = SQUARE_M + config.wide_search.range_m + config.max_reach_m;
+        let mesh = self
+            .map
+            .mesh_near(&[middle.into()], radius_m, DVec3::ZERO, u64::MAX)?;
+        let surfaces = match &*last {
+            // Of a map in memory there is one mesh only.
+            Some(last) if last.mesh.upgrade().is_some() => last.surfaces.clone(),
+            _ => Arc::new(UprightSurfaces::of(&mesh)),
+        };
+        *last = Some(NearbySurfaces {
+            square,
+            mesh: Arc::downgrade(&mesh),
+            surfaces: surfaces.clone(),
+        });
+        Ok(surfaces)
+    }
+
     /// Whether most of the beams end on the surfaces of the map, and few behind them.
     fn agrees(&self, beams: &[Beam], map_from_lidar: &Pose3) -> Result<bool, RefinerError> {
         /// Least share of agreeing beams among all.
         const MIN_SHARE: f64 = 0.4;
         let config = TrackingLossConfig::default();
-        let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
-        let rendered_m = &self.map.renderer.cast(&[*map_from_lidar], &directions)?[0];
-        let hits = (beams.iter().zip(rendered_m))
-            .filter(|(beam, rendered_m)| (beam.range_m - *rendered_m).abs() <= config.tolerance_m)
+        let renderer = &*self.map.renderer;
+        let rendered_m = ranges_along(renderer, map_from_lidar, beams, config.tolerance_m)?;
+        let hits = (beams.iter().zip(&rendered_m))
+            .filter(|(beam, rendered_m)| (beam.range_m - **rendered_m).abs() <= config.tolerance_m)
             .count();
-        let share = agreement(beams, rendered_m, config.tolerance_m);
+        let share = agreement(beams, &rendered_m, config.tolerance_m);
         Ok(share.is_some_and(|share| share >= config.sure_agreement)
             && hits as f64 >= MIN_SHARE * beams.len() as f64)
     }

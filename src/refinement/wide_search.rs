@@ -153,8 +153,9 @@ fn distinct(minima: &[([f64; 3], f64)], count: usize) -> Vec<Pose2> {
     kept
 }
 
-/// Gauss-Newton with the wide kernel, then with that of the frame; the pose and its cost.
-fn finish(
+/// Gauss-Newton with the wide kernel, then with that of the frame; the pose and its cost. `None` where the map has no
+/// ground within `reach_m`.
+pub(super) fn finish(
     objective: &FrameObjective<'_>,
     pose: &Pose2,
     reach_m: f64,
@@ -211,7 +212,7 @@ mod tests {
     fn a_pose_metres_and_tens_of_degrees_off_is_found() {
         let world = TestWorld::street();
         let map = world.map();
-        let surfaces = UprightSurfaces::of(&map.mesh);
+        let surfaces = UprightSurfaces::of(&map.mesh().unwrap());
         let truth = world.pose_at(18.0, 0.2, 0.05);
         let beams: Vec<Beam> = world.scan(&truth).beams().step_by(5).collect();
         let objective = world.objective(&beams);

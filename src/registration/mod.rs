@@ -156,6 +156,9 @@ pub fn register(
     Ok(result)
 }
 
+/// Gate on the distance along the beam, in kernel widths, for grazing incidence.
+const GATE_ALONG: f64 = 20.0;
+
 /// Linearized residuals of all beams that pass the gates.
 fn linearize(
     renderer: &dyn RangeRenderer,
@@ -164,7 +167,9 @@ fn linearize(
     pose: &Pose3,
     config: &RegistrationConfig,
 ) -> Result<Vec<Residual>, RenderError> {
-    let hits = renderer.surfaces(pose, directions)?;
+    let farthest_m = beams.iter().map(|beam| beam.range_m).fold(0.0, f32::max);
+    let until_m = farthest_m + (GATE_ALONG * config.kernel_m) as f32;
+    let hits = renderer.surfaces(pose, directions, until_m)?;
     let lidar_from_map = Rigid3f::from(&pose.inverse());
     let residual = |(beam, hit): (&Beam, &Option<SurfaceHit>)| {
         residual(beam, hit.as_ref()?, &lidar_from_map, config)
@@ -182,8 +187,6 @@ fn residual(
 ) -> Option<Residual> {
     /// Gate on the distance to the plane, in kernel widths.
     const GATE_ACROSS: f64 = 5.0;
-    /// Gate on the distance along the beam, in kernel widths, for grazing incidence.
-    const GATE_ALONG: f64 = 20.0;
     let normal = lidar_from_map.rotate(hit.normal_in_map);
     let excess_m = f64::from(beam.range_m - hit.range_m);
     let value_m = excess_m * f64::from(normal.dot(beam.direction));

@@ -1,4 +1,4 @@
-//! Rendering backends: what can be requested, and the graphics adapters that may provide it.
+//! Rendering backends and methods: what can be requested, and the graphics adapters that may provide it.
 
 use std::fmt;
 
@@ -15,6 +15,19 @@ pub enum Backend {
     Cpu,
     /// Any graphics adapter, including software adapters; an error without one.
     Gpu,
+}
+
+/// Requested method to render whole range images on a graphics adapter, `rendering.method`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RenderingMethod {
+    /// The faster one, by a measurement; on the CPU rays.
+    #[default]
+    Auto,
+    /// Triangles, drawn by the rasterizer of a graphics adapter.
+    Raster,
+    /// Rays.
+    Cast,
 }
 
 /// Type of a graphics adapter, best first.

@@ -11,15 +11,19 @@
 //! whose ranges differ by about a millimetre at grazing angles. Otherwise what a pose sees never
 //! depends on the other poses.
 
+use std::sync::Arc;
+
 use glam::{DVec3, Mat3};
 use rayon::prelude::*;
 
-use super::order::{bundle_width_m, coherent_order, packet_width_m, pixel_order, pose_order};
+use super::order::{
+    bundle_width_m, coherent_order, packet_width_m, pixel_order, pose_order, poses_by_square,
+};
 
 use super::{RangeDifference, RangeRenderer, RenderError, SurfaceHit, facing};
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh, Vec3};
-use crate::lidar::{Beam, LidarModel};
-use crate::raycasting::{Hit, RAYS, Reach, Scene};
+use crate::lidar::{Beam, LidarModel, RangeImage};
+use crate::raycasting::{Hit, RAYS, Reach, Scene, SceneSource};
 
 /// Beams that one thread casts at a time.
 const RAYS_PER_PIECE: usize = 64;
@@ -41,7 +45,7 @@ const ROUNDING: f32 = 1e-6;
 /// Casts rays at the tiles of a map.
 #[derive(Clone, Debug)]
 pub struct CpuRenderer {
-    scene: Scene,
+    scenes: Arc<dyn SceneSource>,
     /// Maximum number of poses rendered at once, which bounds the memory.
     pub max_poses: usize,
 }
@@ -49,8 +53,13 @@ pub struct CpuRenderer {
 impl CpuRenderer {
     /// Prepares the tiles of a map, in the map frame; a triangle is in one of them.
     pub fn new(tiles: &[TriangleMesh]) -> Self {
+        Self::over(Arc::new(Scene::of_tiles(tiles)))
+    }
+
+    /// Renders what a source supplies.
+    pub fn over(scenes: Arc<dyn SceneSource>) -> Self {
         Self {
-            scene: Scene::of_tiles(tiles),
+            scenes,
             max_poses: usize::MAX,
         }
     }
@@ -62,11 +71,21 @@ impl CpuRenderer {
         map_from_lidar: &[Pose3],
         beams: &CastBeams,
         summarize: impl Fn(&[u32], &[f32]) -> T + Sync,
-    ) -> Vec<Vec<T>> {
-        let batches = map_from_lidar.chunks(self.max_poses.max(1));
-        batches
-            .flat_map(|poses| self.map_batch(poses, beams, &summarize))
-            .collect()
+    ) -> Result<Vec<Vec<T>>, RenderError> {
+        let mut pieces: Vec<Vec<T>> = map_from_lidar.iter().map(|_| Vec::new()).collect();
+        for square in poses_by_square(map_from_lidar) {
+            for numbers in square.chunks(self.max_poses.max(1)) {
+                let poses: Vec<Pose3> = (numbers.iter())
+                    .map(|&number| map_from_lidar[number])
+                    .collect();
+                let of_poses = self.map_batch(&poses, beams, &summarize);
+                for (&number, of_pose) in numbers.iter().zip(of_poses) {
+                    pieces[number] = of_pose;
+                }
+            }
+        }
+        self.scenes.check()?;
+        Ok(pieces)
     }
 
     fn map_batch<T: Send>(
@@ -81,6 +100,8 @@ impl CpuRenderer {
             .map(|&pose| map_from_lidar[pose as usize])
             .collect();
         let grouping = Grouping::of(&poses, beams);
+        let origins: Vec<DVec3> = poses.iter().map(origin_of).collect();
+        let scene = &self.scenes.scene(&origins);
         let groups: Vec<&[Pose3]> = poses.chunks(grouping.poses_at_once()).collect();
         let pieces: Vec<&[u32]> = beams.order.chunks(RAYS_PER_PIECE).collect();
         // Pose by pose for a few beams: the nodes that these enter stay in the cache.
@@ -90,9 +111,9 @@ impl CpuRenderer {
                 let rays = pieces[number / groups.len()];
                 let group = groups[number % groups.len()];
                 let ranges = match grouping {
-                    Grouping::Packets => vec![self.cast_packets(&group[0], rays, beams)],
-                    Grouping::Bundles => self.cast_bundles(group, rays, beams),
-                    Grouping::Single => vec![self.cast_single(&group[0], rays, beams)],
+                    Grouping::Packets => vec![cast_packets(scene, &group[0], rays, beams)],
+                    Grouping::Bundles => cast_bundles(scene, group, rays, beams),
+                    Grouping::Single => vec![cast_single(scene, &group[0], rays, beams)],
                 };
                 ranges
                     .iter()
@@ -110,57 +131,42 @@ impl CpuRenderer {
         per_pose
     }
 
-    /// Nearest hits of some beams of one pose.
-    fn hits(&self, map_from_lidar: &Pose3, rays: &[u32], beams: &CastBeams) -> Vec<Hit> {
-        let (directions, reaches) = beams.in_map(map_from_lidar, rays);
-        let mut hits = vec![Hit::MISS; rays.len()];
-        let origin = origin_of(map_from_lidar);
-        self.scene
-            .cast_packets(origin, &directions, &reaches, &mut hits);
-        hits
-    }
-
-    /// Ranges of some beams of one pose.
-    fn cast_packets(&self, map_from_lidar: &Pose3, rays: &[u32], beams: &CastBeams) -> Vec<f32> {
-        let hits = self.hits(map_from_lidar, rays, beams);
-        hits.iter().map(|hit| hit.range_m).collect()
-    }
-
-    /// Ranges of some beams of one pose.
-    fn cast_single(&self, map_from_lidar: &Pose3, rays: &[u32], beams: &CastBeams) -> Vec<f32> {
-        let (directions, reaches) = beams.in_map(map_from_lidar, rays);
-        let mut ranges = vec![f32::INFINITY; rays.len()];
-        let origin = origin_of(map_from_lidar);
-        self.scene
-            .cast_single(origin, &directions, &reaches, &mut ranges);
-        ranges
-    }
-
-    /// Ranges of some beams of up to [`RAYS`] poses, pose by pose.
-    fn cast_bundles(
+    /// Mean over the beams of the cost of the range along each, one number per pose; 0 without beams.
+    fn mean_costs(
         &self,
         map_from_lidar: &[Pose3],
-        rays: &[u32],
-        beams: &CastBeams,
-    ) -> Vec<Vec<f32>> {
-        // The last pose fills the empty places.
-        let last = map_from_lidar.len() - 1;
-        let poses: [&Pose3; RAYS] = std::array::from_fn(|place| &map_from_lidar[place.min(last)]);
-        let rotations = poses.map(rotation_of);
-        let (directions, reaches): (Vec<[Vec3; RAYS]>, Vec<Reach>) =
-            beams.rotated(rays, |direction| rotations.map(|r| r * direction));
-        let mut ranges = vec![[f32::INFINITY; RAYS]; rays.len()];
-        let origins = poses.map(origin_of);
-        self.scene
-            .cast_bundles(&origins, &directions, &reaches, &mut ranges);
-        (0..map_from_lidar.len())
-            .map(|place| ranges.iter().map(|ranges| ranges[place]).collect())
-            .collect()
+        beams: &[Beam],
+        reach: impl Fn(&Beam) -> Reach,
+        cost: impl Fn(&Beam, f32) -> f32 + Sync,
+    ) -> Result<Vec<f32>, RenderError> {
+        if beams.is_empty() {
+            return Ok(vec![0.0; map_from_lidar.len()]);
+        }
+        let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
+        let to_cast = CastBeams {
+            order: coherent_order(&directions),
+            reaches: beams.iter().map(reach).collect(),
+            directions,
+        };
+        let sums = self.map_pieces(map_from_lidar, &to_cast, |rays, ranges| {
+            let costs = rays
+                .iter()
+                .zip(ranges)
+                .map(|(&ray, &range_m)| f64::from(cost(&beams[ray as usize], range_m)));
+            costs.sum::<f64>()
+        })?;
+        let mean = |sums: Vec<f64>| (sums.iter().sum::<f64>() / beams.len() as f64) as f32;
+        Ok(sums.into_iter().map(mean).collect())
     }
 
     /// Ranges of every pose, in the order of the beams.
-    fn ranges(&self, map_from_lidar: &[Pose3], beams: &CastBeams) -> Vec<Vec<f32>> {
-        self.map_pieces(map_from_lidar, beams, |_, ranges| ranges.to_vec())
+    fn ranges(
+        &self,
+        map_from_lidar: &[Pose3],
+        beams: &CastBeams,
+    ) -> Result<Vec<Vec<f32>>, RenderError> {
+        let pieces = self.map_pieces(map_from_lidar, beams, |_, ranges| ranges.to_vec())?;
+        Ok(pieces
             .into_par_iter()
             .map(|pieces| {
                 let mut ranges = vec![f32::INFINITY; beams.order.len()];
@@ -169,8 +175,58 @@ impl CpuRenderer {
                 }
                 ranges
             })
-            .collect()
+            .collect())
     }
+}
+
+/// Nearest hits of some beams of one pose.
+fn hits(scene: &Scene, map_from_lidar: &Pose3, rays: &[u32], beams: &CastBeams) -> Vec<Hit> {
+    let (directions, reaches) = beams.in_map(map_from_lidar, rays);
+    let mut hits = vec![Hit::MISS; rays.len()];
+    let origin = origin_of(map_from_lidar);
+    scene.cast_packets(origin, &directions, &reaches, &mut hits);
+    hits
+}
+
+/// Ranges of some beams of one pose.
+fn cast_packets(
+    scene: &Scene,
+    map_from_lidar: &Pose3,
+    rays: &[u32],
+    beams: &CastBeams,
+) -> Vec<f32> {
+    let hits = hits(scene, map_from_lidar, rays, beams);
+    hits.iter().map(|hit| hit.range_m).collect()
+}
+
+/// Ranges of some beams of one pose.
+fn cast_single(scene: &Scene, map_from_lidar: &Pose3, rays: &[u32], beams: &CastBeams) -> Vec<f32> {
+    let (directions, reaches) = beams.in_map(map_from_lidar, rays);
+    let mut ranges = vec![f32::INFINITY; rays.len()];
+    let origin = origin_of(map_from_lidar);
+    scene.cast_single(origin, &directions, &reaches, &mut ranges);
+    ranges
+}
+
+/// Ranges of some beams of up to [`RAYS`] poses, pose by pose.
+fn cast_bundles(
+    scene: &Scene,
+    map_from_lidar: &[Pose3],
+    rays: &[u32],
+    beams: &CastBeams,
+) -> Vec<Vec<f32>> {
+    // The last pose fills the empty places.
+    let last = map_from_lidar.len() - 1;
+    let poses: [&Pose3; RAYS] = std::array::from_fn(|place| &map_from_lidar[place.min(last)]);
+    let rotations = poses.map(rotation_of);
+    let (directions, reaches): (Vec<[Vec3; RAYS]>, Vec<Reach>) =
+        beams.rotated(rays, |direction| rotations.map(|r| r * direction));
+    let mut ranges = vec![[f32::INFINITY; RAYS]; rays.len()];
+    let origins = poses.map(origin_of);
+    scene.cast_bundles(&origins, &directions, &reaches, &mut ranges);
+    (0..map_from_lidar.len())
+        .map(|place| ranges.iter().map(|ranges| ranges[place]).collect())
+        .collect()
 }
 
 /// Which rays traverse the scene together.
@@ -215,11 +271,11 @@ struct CastBeams {
 }
 
 impl CastBeams {
-    /// Beams that look for the nearest surface at any range.
-    fn unlimited(directions: &[Vec3]) -> Self {
+    /// Beams that look for the nearest surface that is nearer than a range [m].
+    fn until(directions: &[Vec3], until_m: f32) -> Self {
         Self {
             directions: directions.to_vec(),
-            reaches: vec![Reach::UNLIMITED; directions.len()],
+            reaches: vec![Reach::until(until_m); directions.len()],
             order: coherent_order(directions),
         }
     }
@@ -262,7 +318,7 @@ impl RangeRenderer for CpuRenderer {
             reaches: vec![Reach::until(model.max_range); model.len()],
             order: pixel_order(model),
         };
-        let mut images = self.ranges(map_from_lidar, &beams);
+        let mut images = self.ranges(map_from_lidar, &beams)?;
         for range_m in images.iter_mut().flatten() {
             if !model.accepts_range(*range_m) {
                 *range_m = f32::INFINITY;
@@ -275,9 +331,10 @@ impl RangeRenderer for CpuRenderer {
         &self,
         map_from_lidar: &[Pose3],
         directions: &[Vec3],
+        until_m: f32,
     ) -> Result<Vec<Vec<f32>>, RenderError> {
-        let beams = CastBeams::unlimited(directions);
-        Ok(self.ranges(map_from_lidar, &beams))
+        let beams = CastBeams::until(directions, until_m);
+        self.ranges(map_from_lidar, &beams)
     }
 
     /// The normals are those of the triangles themselves.
@@ -285,17 +342,20 @@ impl RangeRenderer for CpuRenderer {
         &self,
         map_from_lidar: &Pose3,
         directions: &[Vec3],
+        until_m: f32,
     ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
-        let beams = CastBeams::unlimited(directions);
+        let beams = CastBeams::until(directions, until_m);
+        let scene = self.scenes.scene(&[origin_of(map_from_lidar)]);
         let pieces: Vec<Vec<Hit>> = beams
             .order
             .par_chunks(RAYS_PER_PIECE)
-            .map(|rays| self.hits(map_from_lidar, rays, &beams))
+            .map(|rays| hits(&scene, map_from_lidar, rays, &beams))
             .collect();
+        self.scenes.check()?;
         let rotation = rotation_of(map_from_lidar);
         let mut surfaces = vec![None; directions.len()];
         for (&ray, hit) in beams.order.iter().zip(pieces.into_iter().flatten()) {
-            surfaces[ray as usize] = self.scene.normal(&hit).map(|normal| SurfaceHit {
+            surfaces[ray as usize] = scene.normal(&hit).map(|normal| SurfaceHit {
                 range_m: hit.range_m,
                 normal_in_map: facing(normal, rotation * directions[ray as usize]),
             });
@@ -309,27 +369,25 @@ impl RangeRenderer for CpuRenderer {
         beams: &[Beam],
         difference: &RangeDifference,
     ) -> Result<Vec<f32>, RenderError> {
-        if beams.is_empty() {
-            return Ok(vec![0.0; map_from_lidar.len()]);
-        }
-        let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
-        let reaches = beams
-            .iter()
-            .map(|beam| deciding_reach(beam, difference))
-            .collect();
-        let to_cast = CastBeams {
-            order: coherent_order(&directions),
-            directions,
-            reaches,
+        let reach = |beam: &Beam| deciding_reach(beam, difference);
+        let cost = |beam: &Beam, range_m| difference.cost(beam.range_m, range_m);
+        self.mean_costs(map_from_lidar, beams, reach, cost)
+    }
+
+    fn compare_images(
+        &self,
+        map_from_lidar: &[Pose3],
+        measured: &RangeImage,
+        difference: &RangeDifference,
+    ) -> Result<Vec<f32>, RenderError> {
+        let (model, beams) = (&measured.model, measured.center_beams().collect::<Vec<_>>());
+        let reach = |_: &Beam| Reach::until(model.max_range);
+        let cost = |beam: &Beam, range_m| {
+            let is_seen = model.accepts_range(range_m);
+            let rendered_m = if is_seen { range_m } else { f32::INFINITY };
+            difference.cost(beam.range_m, rendered_m)
         };
-        let sums = self.map_pieces(map_from_lidar, &to_cast, |rays, ranges| {
-            let costs = rays.iter().zip(ranges).map(|(&ray, &range_m)| {
-                f64::from(difference.cost(beams[ray as usize].range_m, range_m))
-            });
-            costs.sum::<f64>()
-        });
-        let mean = |sums: Vec<f64>| (sums.iter().sum::<f64>() / beams.len() as f64) as f32;
-        Ok(sums.into_iter().map(mean).collect())
+        self.mean_costs(map_from_lidar, &beams, reach, cost)
     }
 }
 

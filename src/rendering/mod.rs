@@ -1,7 +1,7 @@
 //! Expected ranges: the map as the sensor would see it from any pose.
 //!
-//! Range images at pixel centres are for pictures, arbitrary beams for weights: an observation is
-//! compared along the very directions that were measured.
+//! The product's own likelihood compares beams along the very directions that were measured; that of range-mcl compares
+//! whole range images, rendered at pixel centres.
 
 pub mod backend;
 pub mod cpu;
@@ -10,13 +10,15 @@ pub mod gpu;
 mod order;
 pub mod selection;
 
-pub use backend::Backend;
+pub use backend::{Backend, RenderingMethod};
 pub use cpu::CpuRenderer;
-pub use selection::renderer;
+
+use std::sync::Arc;
 
 use crate::geometry::{Pose3, Rigid3f, Vec3};
-use crate::lidar::{Beam, LidarModel};
+use crate::lidar::{Beam, LidarModel, RangeImage};
 use crate::memory::MemoryError;
+use crate::raycasting::TileError;
 
 /// Renders the map from many poses at once. Ranges are infinite where there is no surface.
 pub trait RangeRenderer: Send + Sync {
@@ -31,14 +33,17 @@ pub trait RangeRenderer: Send + Sync {
         model: &LidarModel,
     ) -> Result<Vec<Vec<f32>>, RenderError>;
 
-    /// Ranges along unit directions of the lidar frame, one row per pose [m].
+    /// Ranges along unit directions of the lidar frame, one row per pose [m]. Surfaces at `until_m` or farther do not
+    /// count.
     fn cast(
         &self,
         map_from_lidar: &[Pose3],
         directions: &[Vec3],
+        until_m: f32,
     ) -> Result<Vec<Vec<f32>>, RenderError>;
 
-    /// Nearest surfaces along unit directions of the lidar frame, with their normals.
+    /// Nearest surfaces along unit directions of the lidar frame, with their normals. Surfaces at `until_m` or farther
+    /// do not count.
     ///
     /// By default those of the plane through the ends of three rays that are close together; rays
     /// whose neighbours hit nothing hit nothing here.
@@ -46,6 +51,7 @@ pub trait RangeRenderer: Send + Sync {
         &self,
         map_from_lidar: &Pose3,
         directions: &[Vec3],
+        until_m: f32,
     ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
         /// Angle between the three rays [rad]: two millimetres at two metres.
         const APART_RAD: f32 = 1e-3;
@@ -56,7 +62,7 @@ pub trait RangeRenderer: Send + Sync {
             bundles.push((direction + APART_RAD * aside).normalize());
             bundles.push((direction + APART_RAD * above).normalize());
         }
-        let ranges = self.cast(&[*map_from_lidar], &bundles)?;
+        let ranges = self.cast(&[*map_from_lidar], &bundles, until_m)?;
         let map_from_lidar = Rigid3f::from(map_from_lidar);
         let surface = |(rays, ranges_m): (&[Vec3], &[f32])| {
             let end = |ray: usize| rays[ray] * ranges_m[ray];
@@ -83,6 +89,30 @@ pub trait RangeRenderer: Send + Sync {
         beams: &[Beam],
         difference: &RangeDifference,
     ) -> Result<Vec<f32>, RenderError>;
+
+    /// Mean [`RangeDifference::cost`] of the pixels with a return between a measured range image and those that
+    /// [`render`](Self::render) renders, one number per pose [m]; 0 without returns.
+    fn compare_images(
+        &self,
+        map_from_lidar: &[Pose3],
+        measured: &RangeImage,
+        difference: &RangeDifference,
+    ) -> Result<Vec<f32>, RenderError> {
+        /// 15 MB of ranges at 64 x 900 pixels.
+        const IMAGES_AT_ONCE: usize = 64;
+        let returns = || (0..measured.ranges.len()).filter(|&pixel| measured.has_return(pixel));
+        let count = returns().count().max(1) as f64;
+        let mean_cost = |rendered: Vec<f32>| {
+            let cost = |pixel: usize| difference.cost(measured.ranges[pixel], rendered[pixel]);
+            (returns().map(cost).map(f64::from).sum::<f64>() / count) as f32
+        };
+        let mut costs = Vec::with_capacity(map_from_lidar.len());
+        for poses in map_from_lidar.chunks(IMAGES_AT_ONCE) {
+            let images = self.render(poses, &measured.model)?;
+            costs.extend(images.into_iter().map(mean_cost));
+        }
+        Ok(costs)
+    }
 }
 
 /// Surface of the map that a ray hits.
@@ -159,6 +189,10 @@ fn facing(normal: Vec3, direction: Vec3) -> Vec3 {
 pub enum RenderError {
     #[error("there is no graphics adapter; use --backend cpu")]
     NoAdapter,
+    #[error(
+        "rendering.method is raster, but the map is rendered on the CPU, because {reason}, which only casts rays; use --backend gpu, or set rendering.method to auto or cast"
+    )]
+    NothingToRasterize { reason: String },
     #[error("the graphics device was lost ({reason}); run again, or use --backend cpu")]
     DeviceLost { reason: String },
     #[error("the graphics device refused the work ({reason}); use --backend cpu")]
@@ -169,6 +203,8 @@ pub enum RenderError {
     MapTooLarge { needed: u64, limit: u64 },
     #[error(transparent)]
     Memory(#[from] MemoryError),
+    #[error(transparent)]
+    Tile(#[from] Arc<TileError>),
 }
 
 #[cfg(test)]

@@ -1,5 +1,7 @@
 //! Processing order of rays and poses: neighbours in the list are neighbours in space.
 
+use std::collections::BTreeMap;
+
 use nalgebra::Vector3;
 
 use crate::geometry::{Pose3, Vec3, morton};
@@ -47,6 +49,18 @@ pub(super) fn coherent_order(directions: &[Vec3]) -> Vec<u32> {
         .collect();
     keyed.sort_unstable();
     keyed.into_iter().map(|(_, ray)| ray).collect()
+}
+
+/// Indices of poses, square of the plane by square: what is around one square is in memory at a time.
+pub(super) fn poses_by_square(poses: &[Pose3]) -> Vec<Vec<usize>> {
+    const SQUARE_M: f64 = 200.0;
+    let mut squares: BTreeMap<[i64; 2], Vec<usize>> = BTreeMap::new();
+    for (number, pose) in poses.iter().enumerate() {
+        let place = pose.translation.vector;
+        let square = [place.x, place.y].map(|along| (along / SQUARE_M).floor() as i64);
+        squares.entry(square).or_default().push(number);
+    }
+    squares.into_values().collect()
 }
 
 /// Indices of poses along a Z-order curve over positions and headings: neighbours see about the

@@ -4,9 +4,14 @@
 //! software adapter (a graphics driver that runs on the CPU): the ray packets of the CPU renderer
 //! do the same work many times faster.
 
-use super::backend::{AdapterReport, Backend, best_adapter};
+use std::sync::Arc;
+
+use super::backend::{AdapterReport, Backend, RenderingMethod, best_adapter};
+#[cfg(feature = "gpu")]
+use super::gpu::GpuRenderer;
 use super::{CpuRenderer, RangeRenderer, RenderError};
 use crate::geometry::TriangleMesh;
+use crate::raycasting::{SceneSource, TriangleSource};
 
 /// Selected renderer, the adapters that were considered, and the reason.
 #[derive(Clone, Debug, PartialEq)]
@@ -17,6 +22,8 @@ pub struct BackendChoice {
     pub reason: String,
     /// All graphics adapters of this machine, best first.
     pub adapters: Vec<AdapterReport>,
+    /// What was requested.
+    pub request: (Backend, RenderingMethod),
 }
 
 impl BackendChoice {
@@ -29,39 +36,68 @@ impl BackendChoice {
     }
 }
 
-/// Prepares the tiles of a map, in the map frame, for rendering on the requested backend, at most
-/// `max_poses` poses at once (range-mcl's `max_instance`), which bounds the memory.
-///
-/// # Errors
-/// [`RenderError::NoAdapter`] if a graphics adapter is requested and there is none, and the errors
-/// of the graphics device.
-pub fn renderer(
-    tiles: &[TriangleMesh],
-    backend: Backend,
-    max_poses: Option<usize>,
-) -> Result<Box<dyn RangeRenderer>, RenderError> {
-    let choice = choose(backend)?;
-    tracing::info!("rendering on {} because {}", choice.name(), choice.reason);
-    #[cfg(feature = "gpu")]
-    if choice.adapter.is_some() {
-        let renderer = super::gpu::GpuRenderer::new(tiles, backend, max_poses)?;
-        return Ok(Box::new(renderer));
+impl BackendChoice {
+    /// Prepares the tiles of a map, in the map frame, for rendering at most `max_poses` poses at once (range-mcl's
+    /// `max_instance`), which bounds the memory. Reports the renderer and the reason to the log.
+    ///
+    /// # Errors
+    /// Those of the graphics device.
+    pub fn renderer(
+        &self,
+        tiles: &[TriangleMesh],
+        max_poses: Option<usize>,
+    ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
+        self.report();
+        #[cfg(feature = "gpu")]
+        if self.adapter.is_some() {
+            return Ok(Arc::new(GpuRenderer::new(tiles, self.request, max_poses)?));
+        }
+        Ok(on_cpu(CpuRenderer::new(tiles), max_poses))
     }
-    let mut renderer = CpuRenderer::new(tiles);
+
+    /// As [`renderer`](Self::renderer), with tiles that are read, and on a graphics adapter uploaded, when rays may reach
+    /// them.
+    ///
+    /// # Errors
+    /// As [`renderer`](Self::renderer).
+    pub fn renderer_over<S: SceneSource + TriangleSource + 'static>(
+        &self,
+        source: &Arc<S>,
+        max_poses: Option<usize>,
+    ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
+        self.report();
+        #[cfg(feature = "gpu")]
+        if self.adapter.is_some() {
+            return Ok(Arc::new(GpuRenderer::over(
+                source,
+                self.request,
+                max_poses,
+            )?));
+        }
+        Ok(on_cpu(CpuRenderer::over(source.clone()), max_poses))
+    }
+
+    fn report(&self) {
+        tracing::info!("rendering on {} because {}", self.name(), self.reason);
+    }
+}
+
+fn on_cpu(mut renderer: CpuRenderer, max_poses: Option<usize>) -> Arc<dyn RangeRenderer> {
     renderer.max_poses = max_poses.unwrap_or(usize::MAX);
-    Ok(Box::new(renderer))
+    Arc::new(renderer)
 }
 
 /// Selects one of the graphics adapters of this machine, or the CPU.
 ///
 /// # Errors
-/// [`RenderError::NoAdapter`] if a graphics adapter is requested and there is none.
-pub fn choose(backend: Backend) -> Result<BackendChoice, RenderError> {
+/// [`RenderError::NoAdapter`] if a graphics adapter is requested and there is none,
+/// [`RenderError::NothingToRasterize`] if the CPU is selected and rasterizing is requested.
+pub fn choose(backend: Backend, method: RenderingMethod) -> Result<BackendChoice, RenderError> {
     let adapters = match backend {
         Backend::Cpu => Vec::new(),
         Backend::Auto | Backend::Gpu => adapters(),
     };
-    choose_among(adapters, backend)
+    choose_among(adapters, backend, method)
 }
 
 /// All graphics adapters of this machine, best first; none without the feature `gpu`.
@@ -75,6 +111,7 @@ fn adapters() -> Vec<AdapterReport> {
 fn choose_among(
     adapters: Vec<AdapterReport>,
     backend: Backend,
+    method: RenderingMethod,
 ) -> Result<BackendChoice, RenderError> {
     let adapter = best_adapter(&adapters, backend);
     let reason = match (backend, adapter) {
@@ -86,10 +123,14 @@ fn choose_among(
         (Backend::Auto, Some(index)) => format!("it is the best {}", adapters[index].kind),
         (Backend::Auto, None) => reason_for_cpu(&adapters),
     };
+    if adapter.is_none() && method == RenderingMethod::Raster {
+        return Err(RenderError::NothingToRasterize { reason });
+    }
     Ok(BackendChoice {
         adapter,
         reason,
         adapters,
+        request: (backend, method),
     })
 }
 
@@ -131,7 +172,12 @@ mod tests {
         let card = adapter("card", AdapterKind::Discrete);
         let chip = adapter("chip", AdapterKind::Integrated);
         let software = adapter("software", AdapterKind::Software);
-        let choice = choose_among(vec![software, chip, card], Backend::Auto).unwrap();
+        let choice = choose_among(
+            vec![software, chip, card],
+            Backend::Auto,
+            RenderingMethod::Auto,
+        )
+        .unwrap();
         assert_eq!(choice.adapter, Some(2));
         assert!(choice.reason.contains("discrete"), "{}", choice.reason);
     }
@@ -139,7 +185,7 @@ mod tests {
     #[test]
     fn auto_never_selects_a_software_adapter_and_names_it() {
         let software = adapter("llvmpipe", AdapterKind::Software);
-        let choice = choose_among(vec![software], Backend::Auto).unwrap();
+        let choice = choose_among(vec![software], Backend::Auto, RenderingMethod::Auto).unwrap();
         assert_eq!(choice.adapter, None);
         assert!(choice.reason.contains("llvmpipe"), "{}", choice.reason);
     }
@@ -147,10 +193,10 @@ mod tests {
     #[test]
     fn a_requested_graphics_adapter_may_be_a_software_adapter() {
         let software = adapter("llvmpipe", AdapterKind::Software);
-        let choice = choose_among(vec![software], Backend::Gpu).unwrap();
+        let choice = choose_among(vec![software], Backend::Gpu, RenderingMethod::Raster).unwrap();
         assert_eq!(choice.adapter, Some(0));
         assert!(matches!(
-            choose_among(Vec::new(), Backend::Gpu),
+            choose_among(Vec::new(), Backend::Gpu, RenderingMethod::Raster),
             Err(RenderError::NoAdapter)
         ));
     }
@@ -161,9 +207,29 @@ mod tests {
             obstacle: Some("it has no compute shaders"),
             ..adapter("old", AdapterKind::Discrete)
         };
-        let choice = choose_among(vec![old.clone()], Backend::Auto).unwrap();
+        let choice = choose_among(vec![old.clone()], Backend::Auto, RenderingMethod::Auto).unwrap();
         assert_eq!(choice.adapter, None);
         assert!(choice.reason.contains("compute"), "{}", choice.reason);
-        assert!(choose_among(vec![old], Backend::Gpu).is_err());
+        assert!(choose_among(vec![old], Backend::Gpu, RenderingMethod::Raster).is_err());
+    }
+
+    #[test]
+    fn the_cpu_does_not_rasterize_and_the_error_says_why_it_was_selected_and_what_to_do() {
+        let software = adapter("llvmpipe", AdapterKind::Software);
+        for (adapters, backend, why) in [
+            (vec![software], Backend::Auto, "llvmpipe"),
+            (Vec::new(), Backend::Cpu, "it was requested"),
+        ] {
+            let error = choose_among(adapters, backend, RenderingMethod::Raster).unwrap_err();
+            let message = error.to_string();
+            for part in [
+                "rendering.method is raster",
+                why,
+                "--backend gpu",
+                "auto or cast",
+            ] {
+                assert!(message.contains(part), "{message}");
+            }
+        }
     }
 }

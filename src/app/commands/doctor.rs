@@ -2,31 +2,45 @@
 
 use std::collections::BTreeMap;
 use std::env::consts::{ARCH, OS};
+use std::sync::Arc;
 use std::thread::available_parallelism;
 use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use nalgebra::Vector3;
 
 use super::output::Printed;
 use super::{Context, version};
 use crate::app::cli::DoctorArgs;
-use crate::lidar::LidarModel;
-use crate::map::{TileConfig, TileGrid, tiles};
-use crate::rendering::backend::AdapterReport;
-use crate::rendering::{Backend, renderer, selection};
+use crate::geometry::{Pose3, TriangleMesh};
+use crate::lidar::{Beam, LidarModel, RangeImage};
+use crate::localization::observation::ObservationConfig;
+use crate::map::{TileConfig, tiles};
+use crate::rendering::backend::{AdapterReport, best_adapter};
+use crate::rendering::{
+    Backend, CpuRenderer, RangeDifference, RangeRenderer, RenderError, RenderingMethod, selection,
+};
 use crate::simulation::{Simulation, SimulationConfig};
 
-/// Number of poses whose images are rendered at once, as in the benchmark.
-const POSES: usize = 8;
+/// Number of images that are compared at once.
+const IMAGES: usize = 8;
+/// Number of particles that are compared at once, and of beams of each, as while a search converges.
+const PARTICLES: usize = 1000;
+const BEAMS: usize = 600;
+
+/// What and how much.
+type Row = (&'static str, String);
 
 /// The properties of this machine, one per line.
-pub(super) fn run(args: &DoctorArgs, context: &Context) -> anyhow::Result<Printed> {
-    let choice = selection::choose(Backend::Auto)?;
+pub(super) fn run(args: &DoctorArgs, context: &Context) -> Result<Printed> {
+    let choice = selection::choose(Backend::Auto, RenderingMethod::Auto)?;
     let processors = available_parallelism().map_or("unknown".to_owned(), |n| n.to_string());
     let graphics = if cfg!(feature = "gpu") {
         "built in"
     } else {
         "not built in; build with the feature gpu"
     };
-    let mut rows = vec![
+    let mut rows: Vec<Row> = vec![
         ("fpmcl", version::VERSION.to_owned()),
         ("system", format!("{OS} on {ARCH}")),
         ("instruction sets", instruction_sets()),
@@ -41,7 +55,7 @@ pub(super) fn run(args: &DoctorArgs, context: &Context) -> anyhow::Result<Printe
     ));
     if args.measure > 0 {
         let time = Duration::from_secs(args.measure);
-        rows.push(("rays", rays_per_second(time, context)?));
+        rows.extend(measurements(time, &choice.adapters)?);
     }
     let table = (rows.iter()).map(|(what, value)| format!("{what:<18}{value}\n"));
     let json: BTreeMap<&str, Vec<&str>> =
@@ -69,28 +83,151 @@ fn adapter(report: &AdapterReport) -> String {
     )
 }
 
-/// Rays per second for range images of the simulated street.
-fn rays_per_second(time: Duration, context: &Context) -> anyhow::Result<String> {
-    let simulation = Simulation::new(&SimulationConfig::default(), None)?;
-    let street = &simulation.street.surface.mesh;
-    let (poses, model) = (simulation.poses(), LidarModel::default());
-    let grid = TileGrid::around(&poses, &TileConfig::default());
-    let renderer = renderer(&tiles::cut(street, &grid), context.backend, None)?;
-    let step = poses.len().div_ceil(POSES);
-    let poses: Vec<_> = poses.into_iter().step_by(step).collect();
-    let (start, mut rays) = (Instant::now(), 0);
-    while start.elapsed() < time {
-        renderer.render(&poses, &model)?;
-        rays += poses.len() * model.len();
+/// Rays per second of the CPU and of the best graphics adapter, if there is one, and how far apart the weights are that they
+/// give particles.
+fn measurements(time: Duration, adapters: &[AdapterReport]) -> Result<Vec<Row>> {
+    let workload = Workload::new()?;
+    let cpu = workload.renderer(Backend::Cpu, RenderingMethod::Cast)?;
+    let has_adapter = best_adapter(adapters, Backend::Gpu).is_some();
+    let time = time / if has_adapter { 5 } else { 2 };
+    let mut rows = vec![
+        ("rays", workload.images("cast", time, &*cpu)?),
+        ("rays", workload.beams(time, &*cpu)?),
+    ];
+    if !has_adapter {
+        return Ok(rows);
     }
-    Ok(format!(
-        "{:.2} M per second, images of {} x {} in a street of {} triangles by {}",
-        rays as f64 / start.elapsed().as_secs_f64() * 1e-6,
-        model.height,
-        model.width,
-        street.triangles.len(),
-        renderer.name()
-    ))
+    let gpu = workload.renderer(Backend::Gpu, RenderingMethod::Cast)?;
+    rows.push(("rays", workload.images("cast", time, &*gpu)?));
+    rows.push(("rays", workload.beams(time, &*gpu)?));
+    let rasterized = match workload.renderer(Backend::Gpu, RenderingMethod::Raster) {
+        Ok(gpu) => workload.images("rasterized", time, &*gpu)?,
+        Err(error) => error.to_string(),
+    };
+    rows.push(("rays", rasterized));
+    rows.push(("weights", workload.weights(&*cpu, &*gpu)?));
+    Ok(rows)
+}
+
+/// The simulated street, a scan of it, and particles around its pose.
+struct Workload {
+    tiles: Vec<TriangleMesh>,
+    triangles: usize,
+    scan: RangeImage,
+    /// Every few pixels of it.
+    beams: Vec<Beam>,
+    particles: Vec<Pose3>,
+    observation: ObservationConfig,
+}
+
+impl Workload {
+    fn new() -> Result<Self> {
+        let simulation = Simulation::new(&SimulationConfig::default(), None)?;
+        let mut street = simulation.street.surface.mesh.clone();
+        street.snap();
+        let tiles = tiles::cut(&street, TileConfig::default().side_m);
+        let tiles: Vec<TriangleMesh> = tiles.into_iter().map(|(_, tile)| tile).collect();
+        let (poses, model) = (simulation.poses(), LidarModel::default());
+        let pose = poses[poses.len() / 2];
+        let ranges = CpuRenderer::new(&tiles).render(&[pose], &model)?.concat();
+        let scan = RangeImage::from_ranges(ranges, &model);
+        let every = (scan.beams().count() / BEAMS).max(1);
+        // Evenly spread (Weyl sequences).
+        let spread = |number: usize, step: f64| (number as f64 * step).fract() - 0.5;
+        let particle = |number| {
+            let [x, y, turn] = [0.755, 0.570, 0.618].map(|step| spread(number, step));
+            pose * Pose3::new(Vector3::new(x, y, 0.0), Vector3::z() * (0.05 * turn))
+        };
+        Ok(Self {
+            triangles: street.triangles.len(),
+            beams: scan.beams().step_by(every).collect(),
+            scan,
+            tiles,
+            particles: (0..PARTICLES).map(particle).collect(),
+            observation: ObservationConfig::default(),
+        })
+    }
+
+    fn renderer(
+        &self,
+        backend: Backend,
+        method: RenderingMethod,
+    ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
+        selection::choose(backend, method)?.renderer(&self.tiles, None)
+    }
+
+    /// Speed with which whole images are compared.
+    fn images(&self, how: &str, time: Duration, renderer: &dyn RangeRenderer) -> Result<String> {
+        let (poses, unlimited) = (&self.particles[..IMAGES], RangeDifference::UNLIMITED);
+        let pixels = self.scan.beams().count();
+        let rays = rays_per_second(time, poses.len() * pixels, || {
+            renderer.compare_images(poses, &self.scan, &unlimited)
+        })?;
+        Ok(format!(
+            "{:.2} M per second, images of {} x {} {how}, {:.2} ms each, in a street of {} triangles by {}",
+            1e-6 * rays,
+            self.scan.model.height,
+            self.scan.model.width,
+            1e3 * pixels as f64 / rays,
+            self.triangles,
+            renderer.name()
+        ))
+    }
+
+    /// Speed with which beams are compared.
+    fn beams(&self, time: Duration, renderer: &dyn RangeRenderer) -> Result<String> {
+        let difference = self.observation.difference();
+        let count = self.particles.len() * self.beams.len();
+        let rays = rays_per_second(time, count, || {
+            renderer.compare(&self.particles, &self.beams, &difference)
+        })?;
+        Ok(format!(
+            "{:.2} M per second, {} beams of each of {} particles, {:.2} ms, by {}",
+            1e-6 * rays,
+            self.beams.len(),
+            self.particles.len(),
+            1e3 * count as f64 / rays,
+            renderer.name()
+        ))
+    }
+
+    /// How far apart the likelihoods of the particles are by two renderers.
+    fn weights(&self, cpu: &dyn RangeRenderer, gpu: &dyn RangeRenderer) -> Result<String> {
+        let difference = self.observation.difference();
+        let logs = |renderer: &dyn RangeRenderer| -> Result<Vec<f64>> {
+            let costs_m = renderer.compare(&self.particles, &self.beams, &difference)?;
+            let logs = costs_m.into_iter().map(f64::from);
+            Ok(logs
+                .map(|cost_m| self.observation.log_likelihood(cost_m))
+                .collect())
+        };
+        let (cpu, gpu) = (logs(cpu)?, logs(gpu)?);
+        let mut apart: Vec<f64> = cpu.iter().zip(&gpu).map(|(a, b)| (a - b).abs()).collect();
+        apart.sort_by(f64::total_cmp);
+        // A beam that passes an edge within rounding may end on either side of it.
+        let per_cent = |share: usize| 100.0 * apart[(apart.len() - 1) * share / 100].exp_m1();
+        Ok(format!(
+            "of 99 % of the particles within {:.3} % of those of the CPU, of all within {:.3} %",
+            per_cent(99),
+            per_cent(100)
+        ))
+    }
+}
+
+/// Rays per second of work with a number of rays, repeated for a time.
+fn rays_per_second<T>(
+    time: Duration,
+    rays: usize,
+    work: impl Fn() -> Result<T, RenderError>,
+) -> Result<f64> {
+    // Drivers finish shaders with their first use.
+    work()?;
+    let (start, mut times) = (Instant::now(), 0);
+    while times == 0 || start.elapsed() < time {
+        work()?;
+        times += 1;
+    }
+    Ok((rays * times) as f64 / start.elapsed().as_secs_f64())
 }
 
 /// The vector instructions that the ray caster can use.

@@ -55,7 +55,10 @@ fn printed(command: &Command, context: &Context) -> anyhow::Result<Printed> {
         Command::BuildMap(args) => {
             let base = BuildMapConfig::default;
             let (config, context) = configured(&args.run, args.flags(), base, context)?;
-            build_map::run(&config, &context)?.printed()
+            match args.part() {
+                Some(part) => build_map::run_part(&config, part, &context),
+                None => build_map::run(&config, &context)?.printed(),
+            }
         }
         Command::Odometry(args) => {
             let base = OdometryCommandConfig::default;

@@ -19,7 +19,7 @@ use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
 use crate::lidar::{Motion, Scan};
 use crate::localization::State;
 use crate::localization::odometry::demonstration_noise;
-use crate::map::Map;
+use crate::map::{Map, MapOptions};
 use crate::random::stream;
 use crate::recording::layout::Layout;
 use crate::recording::{Calibration, Frame, Recording};
@@ -41,7 +41,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let is_trajectory = config.is_trajectory();
     let mut results = match is_trajectory {
         true => LocalizationResults::default(),
-        false => LocalizationResults::read(&config.result_file)?,
+        false => without_rounding_errors(LocalizationResults::read(&config.result_file)?),
     };
     let is_unfinished = claims.state(&main) == Some("unfinished");
     ensure!(
@@ -50,7 +50,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
         config.result_file.display()
     );
     run_output::warn_of_shortfall(&results, &config.result_file);
-    let map = config.map_inputs().load(None, context)?;
+    let map = config.map_inputs().load(MapOptions::default(), context)?;
     let mut resolved = config.clone();
     let sequence = resolved.open_in_map(&map)?;
     let config = &resolved;
@@ -186,6 +186,20 @@ fn frames_of(
         sequence.frames.len()
     );
     Ok(sequence)
+}
+
+/// A result whose estimates and odometry are on a lattice of a nanometre and a nanoradian: the same after they have
+/// been written and read again, which changes their last bits, so that refining again gives the same poses.
+fn without_rounding_errors(mut results: LocalizationResults) -> LocalizationResults {
+    const PER_STEP: f64 = (1_u64 << 30) as f64;
+    let rounded = |value: f64| (value * PER_STEP).round() / PER_STEP;
+    let on_lattice = |pose: &mut Pose2| {
+        let place = pose.translation.vector.map(rounded);
+        *pose = Pose2::new(place, rounded(pose.rotation.angle()));
+    };
+    (results.estimates.iter_mut().flatten()).for_each(on_lattice);
+    (results.odometry.iter_mut().flatten()).for_each(on_lattice);
+    results
 }
 
 /// The estimates with the states of the filter; a result without states was tracking throughout.
@@ -394,7 +408,8 @@ fn write_run(
     ));
     drop(saving);
     if config.plot_loc_results {
-        run_output::draw_run(files, Some(&map.mesh), results)?;
+        let mesh = run_output::map_around(map, results.estimates.iter().flatten())?;
+        run_output::draw_run(files, Some(&mesh), results)?;
     }
     run_page::write(files, &report)?;
     Ok(report)

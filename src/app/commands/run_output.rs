@@ -23,7 +23,7 @@ use crate::localization::ParticleSet;
 use crate::recording::Recording;
 use crate::recording::poses::{write_kitti, write_tum};
 
-pub use pictures::{Movie, draw_run, time_axis};
+pub use pictures::{MOST_TRIANGLES, Movie, draw_run, map_around, time_axis};
 
 /// Content of the interactive path, beside the pictures.
 pub const INTERACTIVE: &str = "path.json";

@@ -12,7 +12,7 @@ use crate::app::config::{
 use crate::geometry::wrap_angle;
 use crate::lidar::{LidarModel, PERIOD_S, Rotation, Scan};
 use crate::map::scan_cloud::ScanConfig;
-use crate::map::{Map, MapOptions, MappingPath, mesh_file};
+use crate::map::{Map, MapOptions, MappingPath};
 use crate::odometry::{OdometryConfig, TimingComparison, compare_timings};
 use crate::recording::{PoseTrack, Recording, Selection};
 use crate::sensor::{self, DroppedPoints, SensorDescription};
@@ -139,25 +139,19 @@ impl<'a> MapInputs<'a> {
         files
     }
 
-    /// Reads the map and prepares it for rendering at most `max_poses` poses at once.
-    pub fn load(&self, max_poses: Option<usize>, context: &Context) -> Result<Map> {
-        let (mesh, path) = mesh_file::read(self.map_file)?;
-        let path = match self.given_path()? {
-            Some(given) if path.is_none() => given,
-            _ => path.unwrap_or_default(),
-        };
-        self.report_frame(&path);
+    /// Reads the map and prepares it for rendering on the backend of the context, with the other options given.
+    pub fn load(&self, options: MapOptions, context: &Context) -> Result<Map> {
         let options = MapOptions {
             backend: context.backend,
-            max_poses,
-            ..MapOptions::default()
+            ..options
         };
-        let map = Map::new(mesh, path, &options)
+        let map = Map::load_with_path(self.map_file, self.given_path()?, &options)
             .with_context(|| format!("map_file is {}", self.map_file.display()))?;
+        self.report_frame(&map.path);
         tracing::info!(
             "map {}: {} triangles in {} tiles, rendered by {}",
             self.map_file.display(),
-            map.mesh.triangles.len(),
+            map.triangle_count(),
             map.tiles.len(),
             map.renderer.name()
         );

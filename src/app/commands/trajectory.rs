@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context as _, Result};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::Context;
 use super::interrupt::Interrupted;
@@ -71,7 +71,7 @@ pub fn stamped(frames: &[Frame], poses: &[Pose3]) -> Vec<StampedPose> {
 }
 
 /// What a trajectory shows about itself.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct TrajectorySummary {
     /// Number of scans.
     pub scans: usize,
@@ -96,7 +96,7 @@ pub struct TrajectorySummary {
 }
 
 /// Numbers of loops.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct LoopCounts {
     /// The poses follow them.
     pub accepted: usize,
@@ -107,6 +107,14 @@ pub struct LoopCounts {
 }
 
 impl TrajectorySummary {
+    /// The same for every run.
+    pub fn without_times(&self) -> Self {
+        Self {
+            seconds_per_scan: None,
+            ..self.clone()
+        }
+    }
+
     /// Of a trajectory.
     pub fn of(trajectory: &Trajectory, has_times: bool) -> Self {
         let steps = &trajectory.odometry;

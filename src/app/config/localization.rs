@@ -13,16 +13,17 @@ use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGr
 use crate::localization::convergence::ConvergenceConfig;
 use crate::localization::initialization::StartSpread;
 use crate::localization::motion::{OdometryNoise, VelocityNoise};
-use crate::localization::observation::ObservationConfig;
+use crate::localization::observation::{Likelihood, ObservationConfig};
 use crate::localization::places::PlacesConfig;
 use crate::localization::proposal::ProposalConfig;
 use crate::localization::resampling::{KldConfig, ResamplingConfig};
 use crate::localization::tempering::TemperingConfig;
 use crate::localization::tracking_loss::TrackingLossConfig;
 use crate::localization::{LocalizerConfig, SensorConfig};
-use crate::map::PanoramaConfig;
 use crate::map::scan_cloud::ScanConfig;
+use crate::map::{MapOptions, PanoramaConfig};
 use crate::refinement::{RefinementConfig, RefinerConfig};
+use crate::rendering::RenderingMethod;
 use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative, require};
 
 /// Configuration of `localize`: the keys of range-mcl's `localization.yml`, then new ones.
@@ -87,6 +88,8 @@ pub struct LocalizationConfig {
     pub save_result: bool,
     /// Size and limits of the range images, and their rendering.
     pub range_image: RangeImageConfig,
+    /// Rendering of the range images that the reference likelihood compares.
+    pub rendering: RenderingConfig,
 
     /// Number of scans from `start_idx` on; -1 for all.
     #[default(-1)]
@@ -172,6 +175,14 @@ pub struct LocalizationConfig {
     pub force: bool,
 }
 
+/// Rendering of whole range images.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RenderingConfig {
+    /// Method.
+    pub method: RenderingMethod,
+}
+
 /// Initial distribution of the particles.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -220,6 +231,15 @@ impl LocalizationConfig {
             tracking_loss: self.vigilance.clone(),
             sensor: self.sensor(),
             panorama: self.panorama_config(),
+        }
+    }
+
+    /// How the map is prepared, on the default backend.
+    pub fn map_options(&self) -> MapOptions {
+        MapOptions {
+            method: self.rendering.method,
+            max_poses: Some(self.range_image.batch_size()),
+            ..MapOptions::default()
         }
     }
 
@@ -296,6 +316,13 @@ impl Validate for LocalizationConfig {
         not_negative("yaw_sigma", self.yaw_sigma)?;
         nested("start", &self.start)?;
         self.localizer().validate()?;
+        require(
+            self.rendering.method != RenderingMethod::Raster
+                || self.observation.likelihood == Likelihood::Reference,
+            "rendering.method",
+            "raster",
+            "observation.likelihood: robust compares along the measured beams, which are always cast; set it to reference, or rendering.method to auto or cast",
+        )?;
         nested("refinement", &self.refinement)?;
         nested("range_image", &self.range_image)
     }

@@ -422,7 +422,8 @@ fn a_start_anywhere_converges() {
             1000,
             &PlacesConfig::default(),
             &mut rng,
-        );
+        )
+        .unwrap();
         let mut filter = ParticleFilter::new(
             LocalizerConfig::of_test(1000),
             world.map(),

@@ -240,7 +240,8 @@ fn a_start_anywhere_finds_its_level() {
             500,
             &PlacesConfig::default(),
             &mut rng,
-        );
+        )
+        .unwrap();
         let filter = ParticleFilter::new(
             LocalizerConfig::of_test(500),
             crossing.map.clone(),

@@ -101,6 +101,7 @@ impl ParticleFilter {
     pub(super) fn sample_and_weight(
         &mut self,
         proposal: Proposal,
+        scan: &RangeImage,
         rng: &mut impl Rng,
     ) -> Result<Update, RenderError> {
         let Proposal {
@@ -114,7 +115,7 @@ impl ParticleFilter {
         let poses = proposal.sample(self.config.num_reduced, rng);
         let particle = |pose| Particle::new(pose, Some(level_m));
         self.particles = ParticleSet::uniform(poses.into_iter().map(particle));
-        let (mut logs, costs_m) = self.log_likelihoods(&weighed_beams, &attitude)?;
+        let (mut logs, costs_m) = self.log_likelihoods((scan, &weighed_beams), &attitude)?;
         for (log, pose) in logs.iter_mut().zip(self.particles.poses()) {
             *log += prior.log_density(pose) - proposal.log_density(pose);
         }

@@ -46,7 +46,8 @@ impl ParticleFilter {
         };
         let index = self.map.panoramas(request)?;
         let count = self.config.num_particles;
-        let mut particles = from_panoramas(&index, scan, attitude, count, &self.config.places, rng);
+        let places = &self.config.places;
+        let mut particles = from_panoramas(&index, scan, attitude, count, places, rng)?;
         if particles.is_empty() {
             return Ok(false);
         }

@@ -6,7 +6,7 @@ use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3};
 use crate::lidar::{Beam, RangeImage};
 use crate::localization::estimate::Estimate;
-use crate::localization::observation::{choose_beams, costs, ground_patch_of, near_points};
+use crate::localization::observation::{choose_beams, costs_of_scan, ground_patch_of, near_points};
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::tempering::exponent;
 use crate::localization::tracking_loss::State;
@@ -58,7 +58,7 @@ impl ParticleFilter {
             let count = observation.beams_for(self.particles.len());
             let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
             let refined = self.refined_attitude(scan, attitude);
-            let (logs, costs_m) = self.log_likelihoods(&beams, &refined)?;
+            let (logs, costs_m) = self.log_likelihoods((scan, &beams), &refined)?;
             let used = self.reweight(&logs, 1.0 - power);
             power += used;
             if round >= rounds || power >= 1.0 || used <= 0.0 {
@@ -74,16 +74,15 @@ impl ParticleFilter {
         }
     }
 
-    /// Log-likelihoods of the particles, up to a constant, and their mean costs [m].
+    /// Log-likelihoods of the particles given a scan and a sample of its beams, up to a constant, and their mean costs [m].
     pub(super) fn log_likelihoods(
         &mut self,
-        beams: &[Beam],
+        scan_and_beams: (&RangeImage, &[Beam]),
         attitude: &SensorAttitude,
     ) -> Result<(Vec<f64>, Vec<Option<f64>>), RenderError> {
         let poses = self.align_to_ground(attitude);
         let observation = &self.config.observation;
-        let difference = observation.difference();
-        let costs = costs(&*self.map.renderer, &poses, beams, &difference)?;
+        let costs = costs_of_scan(&*self.map.renderer, &poses, scan_and_beams, observation)?;
         let log = |cost: &Option<f64>| {
             cost.map_or(observation.floor_log_likelihood(), |cost_m| {
                 observation.log_likelihood(cost_m)

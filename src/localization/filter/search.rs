@@ -11,7 +11,7 @@ use super::reweight::Update;
 use super::state::{ParticleFilter, Search};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
-use crate::localization::observation::{choose_beams, costs, ground_patch_of};
+use crate::localization::observation::{choose_beams, costs_of_scan, ground_patch_of};
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::places::{best_of_each, is_same, weights_after, weights_in};
 use crate::localization::proposal::{Gaussian, regular};
@@ -67,7 +67,7 @@ impl ParticleFilter {
             self.config.observation.road_share,
         );
         let beams = choose_beams(scan, count, road_share, attitude, rng);
-        let costs_m = self.costs_of_places(&registered, &beams)?;
+        let costs_m = self.costs_of_places(&registered, (scan, &beams))?;
         let poses = registered.iter().map(Place::pose);
         let (places, costs_m): (Vec<&Place>, Vec<f64>) =
             (best_of_each(poses, &costs_m, config.most, config.radius_m).into_iter())
@@ -103,7 +103,7 @@ impl ParticleFilter {
         let observation = &self.config.observation;
         let count = observation.beams_for(self.particles.len());
         let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
-        let (_, costs_m) = self.log_likelihoods(&beams, attitude)?;
+        let (_, costs_m) = self.log_likelihoods((scan, &beams), attitude)?;
         let config = &self.config.places;
         let best = [config.radius_m, APART_M]
             .map(|radius_m| best_of_each(self.particles.poses(), &costs_m, config.most, radius_m));
@@ -165,14 +165,14 @@ impl ParticleFilter {
     fn costs_of_places(
         &self,
         places: &[Place],
-        beams: &[Beam],
+        scan_and_beams: (&RangeImage, &[Beam]),
     ) -> Result<Vec<Option<f64>>, RenderError> {
         let poses: Vec<_> = places
             .iter()
             .map(|place| Some(place.map_from_lidar))
             .collect();
-        let difference = self.config.observation.difference();
-        costs(&*self.map.renderer, &poses, beams, &difference)
+        let observation = &self.config.observation;
+        costs_of_scan(&*self.map.renderer, &poses, scan_and_beams, observation)
     }
 
     /// Weights of the places in the prediction. Those of the first scan are equal: the panoramas from which the

@@ -10,7 +10,7 @@ use crate::lidar::{Beam, PERIOD_S, RangeImage};
 use crate::localization::convergence::is_converged;
 use crate::localization::estimate::Estimate;
 use crate::localization::motion::{TurnDriveTurn, VelocityCommand};
-use crate::localization::observation::{above_road, agreement};
+use crate::localization::observation::{above_road, agreement, ranges_along};
 use crate::localization::odometry::Odometry;
 use crate::localization::particles::spread;
 use crate::localization::resampling::systematic;
@@ -36,7 +36,7 @@ impl ParticleFilter {
         }
         self.propagate(odometry, rng);
         let update = match self.propose(scan, attitude, rng)? {
-            Some(proposal) => self.sample_and_weight(proposal, rng)?,
+            Some(proposal) => self.sample_and_weight(proposal, scan, rng)?,
             None => self.reweight_widely(scan, attitude, rng)?,
         };
         let mut estimate = self.updated_estimate(&update);
@@ -121,12 +121,9 @@ impl ParticleFilter {
         /// Kerbs and low plants do not distinguish places [m].
         const CLEARANCE_M: f32 = 0.5;
         let beams = above_road(beams, attitude, CLEARANCE_M);
-        let directions: Vec<_> = beams.iter().map(|beam| beam.direction).collect();
-        let rendered = self.map.renderer.cast(&[*map_from_lidar], &directions)?;
         let tolerance_m = self.config.tracking_loss.tolerance_m;
-        Ok(rendered
-            .first()
-            .and_then(|rendered_m| agreement(&beams, rendered_m, tolerance_m)))
+        let rendered_m = ranges_along(&*self.map.renderer, map_from_lidar, &beams, tolerance_m)?;
+        Ok(agreement(&beams, &rendered_m, tolerance_m))
     }
 
     fn change_state(&mut self, agreement: Option<f64>, odometry: Odometry) {

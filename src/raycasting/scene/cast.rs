@@ -6,10 +6,10 @@ use super::Scene;
 use crate::raycasting::all_hits::AllHits;
 use crate::raycasting::packet::{Origin, Packet};
 use crate::raycasting::place::{Leaf, Place};
-use crate::raycasting::simd::{Baseline, Simd, SimdTask, dispatch};
 use crate::raycasting::single::SingleRay;
 use crate::raycasting::traversal::{Stack, Traversal, Traverse};
 use crate::raycasting::{Hit, RAYS, Reach};
+use crate::simd::{Baseline, Simd, SimdTask, dispatch};
 
 impl Scene {
     /// Casts rays from one origin along unit directions, all in the frame of the mesh, and writes
@@ -130,18 +130,23 @@ impl Scene {
         rays: &mut R,
         [top_stack, tile_stack]: &mut [Stack; 2],
     ) {
-        let relative = rays.relative_to(simd, self.middle, &self.top.grid);
-        let mut tiles = Traversal::new(simd, &self.top, &relative, top_stack);
-        while let Some(number) = tiles.next_leaf(rays) {
-            let tile = &self.tiles[number];
-            let relative = rays.relative_to(simd, tile.middle, &tile.bvh.grid);
-            let mut leaves = Traversal::new(simd, &tile.bvh, &relative, tile_stack);
+        let top = &*self.top;
+        let relative = rays.relative_to(simd, top.middle, &top.bvh.grid);
+        let mut tiles = Traversal::new(simd, &top.bvh.nodes, &relative, top_stack);
+        while let Some(leaf) = tiles.next_leaf(rays) {
+            let number = top.numbers[leaf];
+            let Some(tile) = self.tiles.tile(number as usize) else {
+                continue;
+            };
+            let parts = tile.parts();
+            let relative = rays.relative_to(simd, tile.middle(), tile.grid());
+            let mut leaves = Traversal::new(simd, parts.nodes, &relative, tile_stack);
             while let Some(index) = leaves.next_leaf(rays) {
                 let leaf = Leaf {
-                    tile: number as u32,
+                    tile: number,
                     index: index as u32,
                 };
-                rays.intersect(simd, &relative, &tile.leaves.block(index), leaf);
+                rays.intersect(simd, &relative, &parts.leaves.block(index), leaf);
             }
         }
     }
@@ -171,13 +176,15 @@ impl Scene {
 
     #[inline(always)]
     fn hit(&self, range_m: f32, place: Place) -> Hit {
-        if place == Place::NONE {
+        let number = place.leaf.tile as usize;
+        let Some(tile) = self.tiles.tile(number) else {
             return Hit::MISS;
-        }
-        let leaves = &self.tiles[place.leaf.tile as usize].leaves;
+        };
+        let leaves = tile.parts().leaves;
+        let index = leaves.index(place.leaf.index as usize, place.lane as usize);
         Hit {
             range_m,
-            triangle: leaves.index(place.leaf.index as usize, place.lane as usize),
+            triangle: self.top.first_triangles[number] + index,
             place,
         }
     }

@@ -129,7 +129,7 @@ fn comparing_is_casting_and_counting_the_cost() {
     let renderer = CpuRenderer::new(&hills(Vec3::ZERO));
     let (poses, beams) = (poses(20), beams(1000));
     let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
-    let rows = renderer.cast(&poses, &directions).unwrap();
+    let rows = renderer.cast(&poses, &directions, f32::INFINITY).unwrap();
     let differences = [
         RangeDifference::UNLIMITED,
         RangeDifference::truncated(0.5),
@@ -166,7 +166,9 @@ fn a_cast_along_the_pixels_is_the_image() {
     let image = renderer.render(&poses(2), &model).unwrap();
     assert_eq!(
         image,
-        renderer.cast(&poses(2), &model.directions()).unwrap()
+        renderer
+            .cast(&poses(2), &model.directions(), f32::INFINITY)
+            .unwrap()
     );
 }
 
@@ -182,7 +184,9 @@ fn a_wall_is_seen_with_its_range_and_its_normal_towards_the_sensor() {
     let quarter = UnitQuaternion::from_euler_angles(0.0, 0.0, std::f64::consts::FRAC_PI_2);
     let pose = Isometry3::from_parts(Translation3::new(1.0, 0.5, 0.0), quarter);
     // Ahead of the turned sensor is +y of the map, so +x is on its right.
-    let surfaces = renderer.surfaces(&pose, &[Vec3::NEG_Y, Vec3::Y]).unwrap();
+    let surfaces = renderer
+        .surfaces(&pose, &[Vec3::NEG_Y, Vec3::Y], f32::INFINITY)
+        .unwrap();
     let hit = surfaces[0].unwrap();
     assert!((hit.range_m - 4.0).abs() < 1e-6);
     assert!((hit.normal_in_map - Vec3::NEG_X).length() < 1e-6);
@@ -204,8 +208,13 @@ fn normals_from_three_rays_are_those_of_the_triangles() {
         ) -> Result<Vec<Vec<f32>>, RenderError> {
             self.0.render(poses, model)
         }
-        fn cast(&self, poses: &[Pose3], directions: &[Vec3]) -> Result<Vec<Vec<f32>>, RenderError> {
-            self.0.cast(poses, directions)
+        fn cast(
+            &self,
+            poses: &[Pose3],
+            directions: &[Vec3],
+            until_m: f32,
+        ) -> Result<Vec<Vec<f32>>, RenderError> {
+            self.0.cast(poses, directions, until_m)
         }
         fn compare(
             &self,
@@ -226,9 +235,11 @@ fn normals_from_three_rays_are_those_of_the_triangles() {
     let turned = UnitQuaternion::from_euler_angles(0.1, -0.2, 0.3);
     let pose = Isometry3::from_parts(Translation3::new(1.0, 0.5, 0.0), turned);
     let directions = [Vec3::X, Vec3::new(0.8, 0.6, 0.0), Vec3::NEG_X, Vec3::Y];
-    let exact = renderer.surfaces(&pose, &directions).unwrap();
+    let exact = renderer
+        .surfaces(&pose, &directions, f32::INFINITY)
+        .unwrap();
     let rough = WithoutTriangles(renderer)
-        .surfaces(&pose, &directions)
+        .surfaces(&pose, &directions, f32::INFINITY)
         .unwrap();
     assert_eq!(exact.iter().flatten().count(), 2);
     for (exact, rough) in exact.iter().zip(&rough) {
@@ -258,7 +269,7 @@ fn out_of_the_map_there_is_nothing() {
     }
     let costs = empty.compare(&[far], &beams(7), &RangeDifference::truncated(0.5));
     assert_eq!(costs.unwrap(), [0.5]);
-    assert!(renderer.cast(&[far], &[]).unwrap()[0].is_empty());
+    assert!(renderer.cast(&[far], &[], f32::INFINITY).unwrap()[0].is_empty());
     assert_eq!(
         renderer
             .compare(&[far], &[], &RangeDifference::UNLIMITED)
@@ -351,7 +362,10 @@ fn looking_at_the_end_of_a_beam_first_changes_no_cost() {
     let renderer = CpuRenderer::new(&hills(Vec3::new(0.0, 0.0, 1.7)));
     // As one of the poses sees the hills, some a little off and some far, above the ground.
     let directions: Vec<Vec3> = beams(2000).iter().map(|beam| beam.direction).collect();
-    let seen = renderer.cast(&poses(1), &directions).unwrap().concat();
+    let seen = renderer
+        .cast(&poses(1), &directions, f32::INFINITY)
+        .unwrap()
+        .concat();
     let beams: Vec<Beam> = std::iter::zip(directions, seen)
         .zip([0.0, 0.2, -0.2, 0.6, -0.6, 3.0].into_iter().cycle())
         .map(|((direction, range_m), off_m)| Beam {

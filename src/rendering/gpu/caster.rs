@@ -1,4 +1,4 @@
-//! Rays and beams cast by compute shaders; twin of `caster.wgsl` and `reduce.wgsl`.
+//! Rays and beams cast by compute shaders; twin of `caster.wgsl`.
 
 use std::ops::Range;
 
@@ -7,8 +7,9 @@ use wgpu::{BindGroup, Buffer, BufferUsages, CommandEncoder, ComputePipeline};
 use super::batches;
 use super::device::{Gpu, InFlight};
 use super::device_map::DeviceMap;
-use super::layout::{BEAMS_PER_GROUP, FAR, LANES, Pose, Query, Reduction};
+use super::layout::{FAR, LANES, Pose, Query};
 use super::shaders;
+use super::sums::{PartialSums, Summation, read_back, results};
 use crate::geometry::Vec3;
 use crate::lidar::Beam;
 use crate::rendering::order::coherent_order;
@@ -18,13 +19,36 @@ use crate::rendering::{RangeDifference, RenderError};
 pub(super) struct Caster {
     cast: Kernel,
     compare: Kernel,
-    reduce: ComputePipeline,
+    summation: Summation,
+    pipelines: Pipelines,
 }
 
 /// A pipeline and the map bound to it.
 struct Kernel {
     pipeline: ComputePipeline,
     map: BindGroup,
+}
+
+/// Pipelines for maps of a depth.
+#[derive(Clone)]
+struct Pipelines {
+    cast: ComputePipeline,
+    compare: ComputePipeline,
+    /// Longest path to a leaf that they can follow [nodes].
+    depth: usize,
+}
+
+impl Pipelines {
+    /// For hierarchies that are a little deeper, too: tiles that follow need no others.
+    fn new(gpu: &Gpu, depth: usize) -> Self {
+        let depth = depth.next_multiple_of(8);
+        let source = shaders::caster(depth);
+        Self {
+            cast: shaders::pipeline(gpu, &source, "cast_rays"),
+            compare: shaders::pipeline(gpu, &source, "compare_beams"),
+            depth,
+        }
+    }
 }
 
 /// Some of the poses with some of the directions.
@@ -36,18 +60,22 @@ struct Batch {
 }
 
 impl Caster {
-    pub fn new(gpu: &Gpu, map: &DeviceMap) -> Self {
-        let source = shaders::caster(map.depth);
-        let kernel = |entry_point| {
-            let pipeline = pipeline(gpu, &source, entry_point);
-            let buffers = [&map.nodes, &map.triangles];
-            let map = bind(gpu, &pipeline, 0, &buffers);
-            Kernel { pipeline, map }
+    /// For a map; with the pipelines of the previous one, if any, where they serve.
+    pub fn new(gpu: &Gpu, map: &DeviceMap, previous: Option<&Self>) -> Self {
+        let pipelines = previous.map(|previous| previous.pipelines.clone());
+        let pipelines = pipelines
+            .filter(|pipelines| pipelines.depth >= map.depth)
+            .unwrap_or_else(|| Pipelines::new(gpu, map.depth));
+        let kernel = |pipeline: &ComputePipeline| Kernel {
+            map: bind(gpu, pipeline, 0, &[&map.nodes, &map.triangles]),
+            pipeline: pipeline.clone(),
         };
+        let summation = previous.map(|previous| previous.summation.clone());
         Self {
-            cast: kernel("cast_rays"),
-            compare: kernel("compare_beams"),
-            reduce: pipeline(gpu, shaders::REDUCE, "reduce"),
+            cast: kernel(&pipelines.cast),
+            compare: kernel(&pipelines.compare),
+            summation: summation.unwrap_or_else(|| Summation::new(gpu)),
+            pipelines,
         }
     }
 
@@ -82,17 +110,21 @@ impl Caster {
         Ok(rows)
     }
 
-    /// Mean cost of the beams, one number per pose; 0 without beams.
+    /// Mean cost of the beams, one number per pose; 0 without beams. Surfaces outside of the range limits are not seen [m].
     pub fn compare(
         &self,
         gpu: &Gpu,
         map: &DeviceMap,
         poses: &[Pose],
-        (beams, difference): (&[Beam], &RangeDifference),
+        (beams, difference, [min_m, max_m]): (&[Beam], &RangeDifference, [f32; 2]),
     ) -> Result<Vec<f32>, RenderError> {
         let directions: Vec<Vec3> = beams.iter().map(|beam| beam.direction).collect();
         let parts = parts(gpu, &directions, |index, _| beams[index].range_m);
-        let query = Query::new(map, difference);
+        let query = Query {
+            min_m,
+            far_m: max_m.min(FAR),
+            ..Query::new(map, difference)
+        };
         let mut totals = vec![0.0_f64; poses.len()];
         batches::run(
             gpu,
@@ -139,31 +171,16 @@ impl Caster {
         poses: &[Pose],
         (rays, count): (&Buffer, usize),
     ) -> InFlight {
-        let groups = (count as u32).div_ceil(BEAMS_PER_GROUP);
-        let per_number = size_of::<f32>() as u64;
-        let sums = results(gpu, poses.len() as u64 * u64::from(groups) * per_number);
-        let bytes = poses.len() as u64 * per_number;
-        let totals = results(gpu, bytes);
+        let sums = PartialSums::new(gpu, poses.len(), count);
         let query = Query {
             rays: count as u32,
-            groups,
+            groups: sums.groups,
             ..query
         };
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         self.compare
-            .encode(gpu, &mut encoder, query, poses, [rays, &sums]);
-        let reduction = Reduction {
-            terms: groups,
-            unused: [0; 3],
-        };
-        let reduction = gpu.upload("reduction", &[reduction], BufferUsages::UNIFORM);
-        let bound = bind(gpu, &self.reduce, 0, &[&reduction, &sums, &totals]);
-        let mut pass = encoder.begin_compute_pass(&Default::default());
-        pass.set_pipeline(&self.reduce);
-        pass.set_bind_group(0, &bound, &[]);
-        pass.dispatch_workgroups(poses.len() as u32, 1, 1);
-        drop(pass);
-        read_back(gpu, encoder, &totals, bytes)
+            .encode(gpu, &mut encoder, query, poses, [rays, &sums.buffer]);
+        self.summation.submit(gpu, encoder, &sums)
     }
 }
 
@@ -195,7 +212,7 @@ impl Query {
             rays: 0,
             groups: 0,
             root: map.root,
-            unused: 0,
+            min_m: 0.0,
             far_m: FAR,
             short_m: difference.short_m.min(FAR),
             long_m: difference.long_m.min(FAR),
@@ -237,7 +254,9 @@ fn parts(gpu: &Gpu, directions: &[Vec3], fourth: impl Fn(usize, u32) -> f32) -> 
 fn batches_of(gpu: &Gpu, poses: usize, parts: &[RayPart], rays_per_batch: usize) -> Vec<Batch> {
     let mut batches = Vec::new();
     for (number, part) in parts.iter().enumerate() {
-        let step = (rays_per_batch / part.rays).clamp(1, gpu.batch_sizes.poses);
+        let step = gpu
+            .batch_sizes
+            .poses_per_batch(poses, part.rays, rays_per_batch);
         for first in (0..poses).step_by(step) {
             batches.push(Batch {
                 poses: first..poses.min(first + step),
@@ -249,32 +268,8 @@ fn batches_of(gpu: &Gpu, poses: usize, parts: &[RayPart], rays_per_batch: usize)
     batches
 }
 
-fn pipeline(gpu: &Gpu, source: &str, entry_point: &str) -> ComputePipeline {
-    let module = shaders::module(gpu, source);
-    gpu.device
-        .create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-            label: Some(entry_point),
-            layout: None,
-            module: &module,
-            entry_point: Some(entry_point),
-            compilation_options: wgpu::PipelineCompilationOptions::default(),
-            cache: None,
-        })
-}
-
 /// Binds buffers to the bindings 0, 1, 2 … of a group.
 fn bind(gpu: &Gpu, pipeline: &ComputePipeline, group: u32, buffers: &[&Buffer]) -> BindGroup {
     let layout = pipeline.get_bind_group_layout(group);
     shaders::bind(gpu, &layout, buffers)
-}
-
-fn results(gpu: &Gpu, bytes: u64) -> Buffer {
-    let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC;
-    gpu.buffer("results", bytes, usage)
-}
-
-fn read_back(gpu: &Gpu, mut encoder: CommandEncoder, results: &Buffer, bytes: u64) -> InFlight {
-    let staging = gpu.staging(bytes);
-    encoder.copy_buffer_to_buffer(results, 0, &staging, 0, bytes);
-    gpu.submit(encoder, staging, bytes)
 }

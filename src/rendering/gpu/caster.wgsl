@@ -1,12 +1,11 @@
 // Ray casting through a bounding volume hierarchy, nearer child first; ranges are written
 // (`cast_rays`) or compared with measured ones (`compare_beams`).
 //
-// `ray.wgsl` is prepended to this text. Keep in sync with `layout.rs`: `Node`, `Query`, `LEAF`,
-// `LANES`, `BEAMS_PER_GROUP`, and the bits of a node reference; `STACK_SIZE` is replaced by
+// `ray.wgsl` is prepended to this text; `cost.wgsl` is prepended to this text; `sum.wgsl` is prepended to this text.
+// Keep in sync with `layout.rs`: `Node`, `Query`, `LEAF`, `BEAMS_PER_GROUP`, and the bits of a node reference; `STACK_SIZE` is replaced by
 // `shaders.rs` with the depth of the hierarchy.
 
 const STACK_SIZE: u32 = 64u;
-const LANES: u32 = 64u;
 const BEAMS_PER_GROUP: u32 = 256u;
 
 // A node reference is the index of a node, or LEAF | number of triangles << 28 | first triangle.
@@ -30,7 +29,8 @@ struct Query {
     groups: u32,
     // Reference to the root.
     root: u32,
-    unused: u32,
+    // Surfaces up to this range hide what is behind them, but are not seen [m].
+    min_m: f32,
     // Surfaces at this range or farther are not hit [m].
     far_m: f32,
     // As in `RangeDifference` [m].
@@ -49,9 +49,9 @@ struct Query {
 
 // Range at which a ray enters a box, FAR if it does not before `far_m`. The exit is enlarged by more
 // than the rounding of divisions (2.5 units in the last place): a ray along a face enters the box.
-fn entry(low: vec3f, high: vec3f, origin: vec3f, inverse: vec3f, far_m: f32) -> f32 {
-    let one = (low - origin) * inverse;
-    let other = (high - origin) * inverse;
+fn entry(low: vec3f, high: vec3f, pose: Pose, inverse: vec3f, far_m: f32) -> f32 {
+    let one = from_origin(pose, low) * inverse;
+    let other = from_origin(pose, high) * inverse;
     let near = min(one, other);
     let far = max(one, other);
     let enters = max(max(near.x, near.y), max(near.z, 0.0));
@@ -66,7 +66,7 @@ fn inverse_of(direction: vec3f) -> vec3f {
 }
 
 // Range of the nearest surface before `far_m`; any that is at most `enough_m` will do.
-fn nearest(origin: vec3f, direction: vec3f, far_m: f32, enough_m: f32) -> f32 {
+fn nearest(pose: Pose, direction: vec3f, far_m: f32, enough_m: f32) -> f32 {
     let inverse = inverse_of(direction);
     var best = far_m;
     var stack: array<u32, STACK_SIZE>;
@@ -78,15 +78,15 @@ fn nearest(origin: vec3f, direction: vec3f, far_m: f32, enough_m: f32) -> f32 {
             let first = child & 0x0fffffffu;
             let end = first + ((child >> 28u) & 7u);
             for (var i = first; i < end; i++) {
-                best = min(best, range_to(triangles[i], origin, direction));
+                best = min(best, range_to(triangles[i], pose, direction));
             }
             if best <= enough_m {
                 return best;
             }
         } else {
             let node = nodes[child];
-            let left = entry(node.left_min, node.left_max, origin, inverse, best);
-            let right = entry(node.right_min, node.right_max, origin, inverse, best);
+            let left = entry(node.left_min, node.left_max, pose, inverse, best);
+            let right = entry(node.right_min, node.right_max, pose, inverse, best);
             let left_first = left <= right;
             if min(left, right) < FAR {
                 if max(left, right) < FAR {
@@ -120,34 +120,24 @@ fn cast_rays(@builtin(global_invocation_id) id: vec3u) {
     let pose = poses[id.y];
     let ray = rays[id.x];
     let direction = direction_in_map(pose, ray.xyz);
-    let range_m = nearest(pose.origin.xyz, direction, query.far_m, -1.0);
+    let range_m = nearest(pose, direction, query.far_m, -1.0);
     results[id.y * query.rays + bitcast<u32>(ray.w)] = range_m;
-}
-
-// Keep in sync with `RangeDifference::cost` in `mod.rs` of `rendering`.
-fn cost(measured_m: f32, rendered_m: f32) -> f32 {
-    if rendered_m >= FAR {
-        return min(measured_m, query.no_surface_m);
-    }
-    if rendered_m >= measured_m {
-        return min(rendered_m - measured_m, query.short_m);
-    }
-    return min(measured_m - rendered_m, query.long_m);
 }
 
 // A ray is traced only as far as it can change the cost: a surface nearer than measured - long_m
 // costs long_m at any range; one farther than measured + short_m costs short_m, and if no surface
-// at all costs as much, it does not matter whether there is one.
+// at all costs as much, it does not matter whether there is one. Which surface is the nearest matters always where one
+// may be too near to be seen.
 fn cost_of(pose: Pose, beam: vec4f) -> f32 {
     let measured_m = beam.w;
-    let nothing_is_short = min(measured_m, query.no_surface_m) == query.short_m;
-    let far_m = select(query.far_m, measured_m + query.short_m, nothing_is_short);
+    let limits = Limits(query.short_m, query.long_m, query.no_surface_m);
+    let nothing_is_short = min(measured_m, limits.no_surface_m) == limits.short_m;
+    let far_m = select(query.far_m, min(query.far_m, measured_m + limits.short_m), nothing_is_short);
     let direction = direction_in_map(pose, beam.xyz);
-    let enough_m = measured_m - query.long_m;
-    return cost(measured_m, nearest(pose.origin.xyz, direction, far_m, enough_m));
+    let enough_m = select(measured_m - limits.long_m, -1.0, query.min_m > 0.0);
+    let range_m = nearest(pose, direction, far_m, enough_m);
+    return cost(measured_m, select(FAR, range_m, range_m > query.min_m), limits);
 }
-
-var<workgroup> sums: array<f32, LANES>;
 
 @compute @workgroup_size(64)
 fn compare_beams(
@@ -160,15 +150,8 @@ fn compare_beams(
     for (var i = first; i < end; i += LANES) {
         sum += cost_of(poses[group.y], rays[i]);
     }
-    sums[lane] = sum;
-    workgroupBarrier();
-    for (var half = LANES / 2u; half > 0u; half /= 2u) {
-        if lane < half {
-            sums[lane] += sums[lane + half];
-        }
-        workgroupBarrier();
-    }
+    let total = sum_over_lanes(lane, sum);
     if lane == 0u {
-        results[group.y * query.groups + group.x] = sums[0];
+        results[group.y * query.groups + group.x] = total;
     }
 }

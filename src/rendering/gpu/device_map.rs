@@ -21,9 +21,13 @@ pub(super) struct DeviceMap {
 }
 
 impl DeviceMap {
-    /// Builds the hierarchy and uploads it.
+    /// Builds the hierarchy over all tiles of a map and uploads it.
     pub fn upload(gpu: &Gpu, tiles: &[TriangleMesh]) -> Result<Self, RenderError> {
-        let bvh = TwoLevelBvh::build(tiles);
+        Self::of_hierarchy(gpu, TwoLevelBvh::build(tiles))
+    }
+
+    /// Uploads a hierarchy.
+    pub fn of_hierarchy(gpu: &Gpu, bvh: TwoLevelBvh) -> Result<Self, RenderError> {
         let sizes = [
             size_of_val(bvh.triangles.as_slice()) as u64,
             size_of_val(bvh.nodes.as_slice()) as u64,

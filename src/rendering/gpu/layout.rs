@@ -1,17 +1,18 @@
 //! Memory layout of the data that the shaders read.
 //!
-//! Keep in sync with `ray.wgsl`, `caster.wgsl`, `reduce.wgsl` and `raster.wgsl`; a test compares
-//! the sizes, and the parity tests the rest.
+//! Keep in sync with `ray.wgsl`, `cost.wgsl`, `sum.wgsl`, `caster.wgsl`, `pixels.wgsl`, `reduce.wgsl` and
+//! `raster.wgsl`; a test compares the sizes, and the parity tests the rest.
 
 use bytemuck::{Pod, Zeroable};
 
+use crate::geometry::mesh::STEP_M;
 use crate::geometry::{Pose3, Vec3};
 
 /// Range without a surface: WGSL has no infinity.
 pub(super) const FAR: f32 = 3.0e38;
 /// Threads per work group.
 pub(super) const LANES: u32 = 64;
-/// Beams per work group.
+/// Beams or pixels per work group.
 pub(super) const BEAMS_PER_GROUP: u32 = 256;
 /// Two rectangles of two triangles: one in the image, one for what lies beyond its seam.
 pub(super) const VERTICES_PER_TRIANGLE: u32 = 12;
@@ -55,12 +56,18 @@ impl Triangle {
     }
 }
 
-/// A pose relative to the centre of the map: the axes of the lidar frame, and its origin [m].
+/// A pose relative to the centre of the map: the axes of the lidar frame, and its origin, which is the sum of a point on
+/// the lattice of maps and a remainder [m].
+///
+/// The difference of a corner and a point on the lattice is exact within 8 km, so that a range is as accurate far from
+/// the centre of the map as near it: a rounded origin moves all ranges of a pose by up to 0.2 mm, and their mean cost with
+/// them.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub(super) struct Pose {
     pub axes: [[f32; 4]; 3],
     pub origin: [f32; 4],
+    pub remainder: [f32; 4],
 }
 
 impl Pose {
@@ -68,9 +75,13 @@ impl Pose {
     pub fn new(map_from_lidar: &Pose3, center: nalgebra::Vector3<f64>) -> Self {
         let rotation = map_from_lidar.rotation.to_rotation_matrix();
         let four = |v: nalgebra::Vector3<f64>| [v.x as f32, v.y as f32, v.z as f32, 0.0];
+        let step_m = f64::from(STEP_M);
+        let exact = map_from_lidar.translation.vector - center;
+        let origin = exact.map(|along| f64::from(((along / step_m).round() * step_m) as f32));
         Self {
             axes: [0, 1, 2].map(|axis| four(rotation.matrix().column(axis).into_owned())),
-            origin: four(map_from_lidar.translation.vector - center),
+            origin: four(origin),
+            remainder: four(exact - origin),
         }
     }
 }
@@ -85,12 +96,44 @@ pub(super) struct Query {
     pub groups: u32,
     /// Reference to the root.
     pub root: u32,
-    pub unused: u32,
+    /// Surfaces up to this range hide what is behind them, but are not seen [m].
+    pub min_m: f32,
     /// Surfaces at this range or farther are not hit [m].
     pub far_m: f32,
     pub short_m: f32,
     pub long_m: f32,
     pub no_surface_m: f32,
+}
+
+/// A pixel with a return.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub(super) struct Pixel {
+    /// Row-major index.
+    pub index: u32,
+    pub range_m: f32,
+}
+
+/// Parameters of the comparison of drawn images with a measured one.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub(super) struct Comparison {
+    /// Number of pixels with a return.
+    pub pixels: u32,
+    /// Work groups per image.
+    pub groups: u32,
+    pub width: u32,
+    pub height: u32,
+    /// Images side by side in the atlas.
+    pub columns: u32,
+    /// Pixels between rows of the atlas.
+    pub stride: u32,
+    pub min_m: f32,
+    pub max_m: f32,
+    pub short_m: f32,
+    pub long_m: f32,
+    pub no_surface_m: f32,
+    pub unused: u32,
 }
 
 /// Number of terms of the sum of a pose.

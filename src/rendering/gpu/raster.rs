@@ -1,20 +1,28 @@
-//! Range images by drawing, one instance per pose and tile; twin of `raster.wgsl`.
+//! Range images by drawing, one instance per pose and tile; twin of `raster.wgsl` and `pixels.wgsl`.
 
 use std::ops::Range;
 
-use wgpu::{BufferUsages, RenderPipeline, TextureFormat, TextureUsages};
+use wgpu::{
+    Buffer, BufferUsages, CommandEncoder, ComputePipeline, RenderPipeline, TextureFormat,
+    TextureUsages,
+};
 
+use super::batch_sizes::IN_FLIGHT;
 use super::batches;
 use super::device::{Gpu, InFlight};
 use super::device_map::DeviceMap;
-use super::layout::{self, FAR, Pose, VERTICES_PER_TRIANGLE};
+use super::layout::{self, FAR, Pixel, Pose, VERTICES_PER_TRIANGLE};
 use super::shaders;
+use super::sums::{PartialSums, Summation};
 use crate::geometry::Vec3;
-use crate::lidar::LidarModel;
-use crate::rendering::RenderError;
+use crate::lidar::{LidarModel, RangeImage};
+use crate::memory;
+use crate::rendering::{RangeDifference, RenderError};
 
-/// Maximum number of pixels in an atlas, unless a single image has more: 64 MB of ranges.
-const PIXELS_PER_ATLAS: usize = 1 << 24;
+/// Maximum number of pixels in an atlas, unless a single image has more: 16 MB of ranges.
+const PIXELS_PER_ATLAS: usize = 1 << 22;
+/// Memory of a pixel of an atlas: range, depth, and a copy of the range [bytes].
+const PIXEL_BYTES: usize = 12;
 /// Rows of a texture are copied in multiples of 256 bytes.
 const ROW_PIXELS: u32 = wgpu::COPY_BYTES_PER_ROW_ALIGNMENT / 4;
 const RANGES: TextureFormat = TextureFormat::R32Uint;
@@ -22,9 +30,19 @@ const DEPTH: TextureFormat = TextureFormat::Depth32Float;
 /// Depth is range / limit; this limit keeps it a normal number.
 const MAX_LIMIT_M: f32 = 1e30;
 
-/// Render pipeline of range images.
+/// Render pipeline of range images, and what compares them.
 pub(super) struct Rasterizer {
     pipeline: RenderPipeline,
+    comparison: ComputePipeline,
+    summation: Summation,
+}
+
+/// Images that are drawn.
+struct Drawing<'a> {
+    model: &'a LidarModel,
+    atlas: AtlasLayout,
+    /// Centre rays of the pixels.
+    directions: Buffer,
 }
 
 /// Positions of images in a texture.
@@ -58,6 +76,10 @@ impl AtlasLayout {
 
     fn pixels(&self) -> usize {
         self.width as usize * self.height as usize
+    }
+
+    fn bytes(&self) -> u64 {
+        (self.pixels() * size_of::<f32>()) as u64
     }
 
     /// Cuts an image out of the texels of the texture.
@@ -143,7 +165,16 @@ impl Rasterizer {
                 multiview_mask: None,
                 cache: None,
             });
-        Self { pipeline }
+        Self {
+            pipeline,
+            comparison: shaders::pipeline(gpu, shaders::PIXELS, "compare_pixels"),
+            summation: Summation::new(gpu),
+        }
+    }
+
+    /// Whether an image fits a texture.
+    pub fn fits(gpu: &Gpu, model: &LidarModel) -> bool {
+        AtlasLayout::fitting(1, model, gpu.limits.max_texture_dimension_2d).is_some()
     }
 
     /// Ranges of all pixels, one image per pose; [`FAR`] or more where no surface is nearer than
@@ -155,27 +186,17 @@ impl Rasterizer {
         poses: &[Pose],
         model: &LidarModel,
     ) -> Result<Vec<Vec<f32>>, RenderError> {
-        let largest = gpu.limits.max_texture_dimension_2d;
-        let vertices = map.triangle_count() * VERTICES_PER_TRIANGLE as usize;
-        let images = (gpu.batch_sizes.vertices / vertices.max(1)).min(gpu.batch_sizes.images);
-        let atlas_layout = AtlasLayout::fitting(images.min(poses.len()), model, largest)
-            .ok_or_else(|| {
-                let (width, height) = (model.width, model.height);
-                RenderError::DeviceRefused {
-                    reason: format!("images of {width}x{height} pixels, textures have {largest}"),
-                }
-            })?;
-        let directions: Vec<[f32; 4]> = model
-            .directions()
-            .iter()
-            .map(|direction| direction.extend(0.0).to_array())
-            .collect();
-        let directions = gpu.upload("directions", &directions, BufferUsages::STORAGE);
+        let drawing = Drawing::new(gpu, map, poses.len(), model)?;
+        let atlas_layout = &drawing.atlas;
         let mut images = Vec::with_capacity(poses.len());
         batches::run(
             gpu,
             poses.chunks(atlas_layout.images()),
-            |batch| self.start(gpu, map, batch, (model, &atlas_layout, &directions)),
+            |batch| {
+                let staging = gpu.staging(atlas_layout.bytes());
+                let encoder = self.encode(gpu, map, batch, (&drawing, &staging));
+                gpu.submit(encoder, staging, atlas_layout.bytes())
+            },
             |batch, texels| {
                 images
                     .extend((0..batch.len()).map(|slot| atlas_layout.image(&texels, slot, model)));
@@ -184,13 +205,71 @@ impl Rasterizer {
         Ok(images)
     }
 
-    fn start(
+    /// Mean cost of the pixels of a measured image that have a return, one number per pose; 0 without returns.
+    pub fn compare(
         &self,
         gpu: &Gpu,
         map: &DeviceMap,
         poses: &[Pose],
-        (model, atlas_layout, directions): (&LidarModel, &AtlasLayout, &wgpu::Buffer),
+        (measured, difference): (&RangeImage, &RangeDifference),
+    ) -> Result<Vec<f32>, RenderError> {
+        let drawing = Drawing::new(gpu, map, poses.len(), &measured.model)?;
+        let pixels: Vec<Pixel> = (0..measured.ranges.len())
+            .filter(|&index| measured.has_return(index))
+            .map(|index| Pixel {
+                index: index as u32,
+                range_m: measured.ranges[index],
+            })
+            .collect();
+        let comparison = layout::Comparison::new(&drawing, pixels.len(), difference);
+        let count = pixels.len().max(1) as f64;
+        let pixels = gpu.upload("pixels", &pixels, BufferUsages::STORAGE);
+        let mut costs = Vec::with_capacity(poses.len());
+        batches::run(
+            gpu,
+            poses.chunks(drawing.atlas.images()),
+            |batch| self.start_compare(gpu, map, batch, (&drawing, &pixels, comparison)),
+            |_, sums| costs.extend(sums.iter().map(|sum| (f64::from(*sum) / count) as f32)),
+        )?;
+        Ok(costs)
+    }
+
+    fn start_compare(
+        &self,
+        gpu: &Gpu,
+        map: &DeviceMap,
+        poses: &[Pose],
+        (drawing, pixels, comparison): (&Drawing, &Buffer, layout::Comparison),
     ) -> InFlight {
+        let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST;
+        let ranges = gpu.buffer("ranges", drawing.atlas.bytes(), usage);
+        let mut encoder = self.encode(gpu, map, poses, (drawing, &ranges));
+        let sums = PartialSums::new(gpu, poses.len(), comparison.pixels as usize);
+        let comparison = layout::Comparison {
+            groups: sums.groups,
+            ..comparison
+        };
+        let comparison = gpu.upload("comparison", &[comparison], BufferUsages::UNIFORM);
+        let layout = self.comparison.get_bind_group_layout(0);
+        let buffers = [&comparison, &ranges, pixels, &sums.buffer];
+        let bound = shaders::bind(gpu, &layout, &buffers);
+        let mut pass = encoder.begin_compute_pass(&Default::default());
+        pass.set_pipeline(&self.comparison);
+        pass.set_bind_group(0, &bound, &[]);
+        pass.dispatch_workgroups(sums.groups, poses.len() as u32, 1);
+        drop(pass);
+        self.summation.submit(gpu, encoder, &sums)
+    }
+
+    /// Draws the images of a batch and copies them to a buffer.
+    fn encode(
+        &self,
+        gpu: &Gpu,
+        map: &DeviceMap,
+        poses: &[Pose],
+        (drawing, target): (&Drawing, &Buffer),
+    ) -> CommandEncoder {
+        let (model, atlas_layout) = (drawing.model, &drawing.atlas);
         let far_m = model.max_range.min(MAX_LIMIT_M);
         let instances = Instances::of(map, poses, far_m);
         let slots = gpu.upload("slots", &instances.slots, BufferUsages::VERTEX);
@@ -202,7 +281,7 @@ impl Rasterizer {
         );
         let atlas = gpu.upload("atlas", &[atlas], BufferUsages::UNIFORM);
         let poses = gpu.upload("poses", poses, BufferUsages::STORAGE);
-        let buffers = [&map.triangles, &atlas, &poses, directions];
+        let buffers = [&map.triangles, &atlas, &poses, &drawing.directions];
         let bound = shaders::bind(gpu, &self.pipeline.get_bind_group_layout(0), &buffers);
 
         let ranges = texture(gpu, atlas_layout, RANGES);
@@ -219,12 +298,10 @@ impl Rasterizer {
                 }
             }
         }
-        let bytes = (atlas_layout.pixels() * size_of::<f32>()) as u64;
-        let staging = gpu.staging(bytes);
         encoder.copy_texture_to_buffer(
             ranges.as_image_copy(),
             wgpu::TexelCopyBufferInfo {
-                buffer: &staging,
+                buffer: target,
                 layout: wgpu::TexelCopyBufferLayout {
                     offset: 0,
                     bytes_per_row: Some(atlas_layout.width * 4),
@@ -233,7 +310,66 @@ impl Rasterizer {
             },
             ranges.size(),
         );
-        gpu.submit(encoder, staging, bytes)
+        encoder
+    }
+}
+
+impl<'a> Drawing<'a> {
+    /// Cuts the images of so many poses into atlases.
+    fn new(
+        gpu: &Gpu,
+        map: &DeviceMap,
+        poses: usize,
+        model: &'a LidarModel,
+    ) -> Result<Self, RenderError> {
+        let largest = gpu.limits.max_texture_dimension_2d;
+        let sizes = &gpu.batch_sizes;
+        let vertices = map.triangle_count() * VERTICES_PER_TRIANGLE as usize;
+        let images = sizes
+            .poses_per_batch(poses, model.len(), sizes.ranges.max(PIXELS_PER_ATLAS))
+            .min(sizes.vertices / vertices.max(1))
+            .min(sizes.images);
+        let atlas = AtlasLayout::fitting(images, model, largest).ok_or_else(|| {
+            let (width, height) = (model.width, model.height);
+            RenderError::DeviceRefused {
+                reason: format!("images of {width}x{height} pixels, textures have {largest}"),
+            }
+        })?;
+        memory::require(
+            "the range images on the graphics device",
+            (IN_FLIGHT * atlas.pixels() * PIXEL_BYTES) as f64,
+            "set rendering.method to cast, use --backend cpu",
+        )?;
+        let directions: Vec<[f32; 4]> = model
+            .directions()
+            .iter()
+            .map(|direction| direction.extend(0.0).to_array())
+            .collect();
+        Ok(Self {
+            model,
+            atlas,
+            directions: gpu.upload("directions", &directions, BufferUsages::STORAGE),
+        })
+    }
+}
+
+impl layout::Comparison {
+    fn new(drawing: &Drawing, pixels: usize, difference: &RangeDifference) -> Self {
+        let Drawing { model, atlas, .. } = drawing;
+        Self {
+            pixels: pixels as u32,
+            groups: 0,
+            width: model.width as u32,
+            height: model.height as u32,
+            columns: atlas.columns as u32,
+            stride: atlas.width,
+            min_m: model.min_range,
+            max_m: model.max_range.min(FAR),
+            short_m: difference.short_m.min(FAR),
+            long_m: difference.long_m.min(FAR),
+            no_surface_m: difference.no_surface_m.min(FAR),
+            unused: 0,
+        }
     }
 }
 

@@ -56,7 +56,7 @@ struct Rectangle {
 const NOTHING: Rectangle = Rectangle(vec2i(1, 0), vec2i(1, 0));
 
 fn point_in_lidar(pose: Pose, point: vec3f) -> vec3f {
-    let p = point - pose.origin.xyz;
+    let p = from_origin(pose, point);
     return vec3f(dot(pose.x_axis.xyz, p), dot(pose.y_axis.xyz, p), dot(pose.z_axis.xyz, p));
 }
 
@@ -197,7 +197,7 @@ fn cast_pixel(corner: Corner) -> Fragment {
     let direction = directions[pixel.y * atlas.width + pixel.x].xyz;
     let range_m = range_to(
         triangles[corner.triangle],
-        pose.origin.xyz,
+        pose,
         direction_in_map(pose, direction),
     );
     if range_m >= atlas.far_m {

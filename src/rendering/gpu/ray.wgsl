@@ -1,4 +1,4 @@
-// Ray-triangle intersection. Prepended to `caster.wgsl` and `raster.wgsl`, so that both find the same range to the last bit.
+// Ray-triangle intersection. Prepended to `caster.wgsl` and `raster.wgsl`, among others, so that both find the same range to the last bit.
 //
 // Keep in sync with `layout.rs`: `FAR`, `Triangle`, `Pose`; and with `raycasting`: `NEAREST_M`.
 
@@ -13,12 +13,18 @@ struct Triangle {
     c: vec4f,
 }
 
-// p_map = x_axis * p.x + y_axis * p.y + z_axis * p.z + origin
+// p_map = x_axis * p.x + y_axis * p.y + z_axis * p.z + origin + remainder, the origin on the lattice of maps
 struct Pose {
     x_axis: vec4f,
     y_axis: vec4f,
     z_axis: vec4f,
     origin: vec4f,
+    remainder: vec4f,
+}
+
+// From the origin of the lidar to a point, in the axes of the map; the first difference is exact on the lattice of maps.
+fn from_origin(pose: Pose, point: vec3f) -> vec3f {
+    return (point - pose.origin.xyz) - pose.remainder.xyz;
 }
 
 fn direction_in_map(pose: Pose, direction: vec3f) -> vec3f {
@@ -34,10 +40,10 @@ fn side_of_edge(p: vec3f, q: vec3f, direction: vec3f) -> f32 {
 
 // Distance along a unit direction to a triangle, from either of its sides; FAR where it is
 // missed. The distance is that to the plane of the triangle.
-fn range_to(triangle: Triangle, origin: vec3f, direction: vec3f) -> f32 {
-    let a = triangle.a.xyz - origin;
-    let b = triangle.b.xyz - origin;
-    let c = triangle.c.xyz - origin;
+fn range_to(triangle: Triangle, pose: Pose, direction: vec3f) -> f32 {
+    let a = from_origin(pose, triangle.a.xyz);
+    let b = from_origin(pose, triangle.b.xyz);
+    let c = from_origin(pose, triangle.c.xyz);
     let u = side_of_edge(a, b, direction);
     let v = side_of_edge(b, c, direction);
     let w = side_of_edge(c, a, direction);

@@ -1,9 +1,7 @@
 // Sums the costs of the work groups of a pose, one pose per work group, always in the same order.
-// Dispatched by `caster.rs`.
+// Dispatched by `sums.rs`.
 //
-// Keep in sync with `layout.rs`: `Reduction`, `LANES`.
-
-const LANES: u32 = 64u;
+// `sum.wgsl` is prepended to this text. Keep in sync with `layout.rs`: `Reduction`.
 
 struct Reduction {
     // Numbers per pose.
@@ -17,8 +15,6 @@ struct Reduction {
 @group(0) @binding(1) var<storage, read> terms: array<f32>;
 @group(0) @binding(2) var<storage, read_write> totals: array<f32>;
 
-var<workgroup> sums: array<f32, LANES>;
-
 @compute @workgroup_size(64)
 fn reduce(
     @builtin(workgroup_id) group: vec3u,
@@ -29,15 +25,8 @@ fn reduce(
     for (var i = lane; i < reduction.terms; i += LANES) {
         sum += terms[start + i];
     }
-    sums[lane] = sum;
-    workgroupBarrier();
-    for (var half = LANES / 2u; half > 0u; half /= 2u) {
-        if lane < half {
-            sums[lane] += sums[lane + half];
-        }
-        workgroupBarrier();
-    }
+    let total = sum_over_lanes(lane, sum);
     if lane == 0u {
-        totals[group.x] = sums[0];
+        totals[group.x] = total;
     }
 }

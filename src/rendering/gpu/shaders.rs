@@ -1,13 +1,27 @@
 //! Sources of the shaders.
 
-use wgpu::{BindGroup, BindGroupDescriptor, BindGroupEntry, BindGroupLayout, Buffer};
+use wgpu::{
+    BindGroup, BindGroupDescriptor, BindGroupEntry, BindGroupLayout, Buffer, ComputePipeline,
+};
 
 use super::device::Gpu;
 
 /// Casts rays and compares beams.
-const CASTER: &str = concat!(include_str!("ray.wgsl"), include_str!("caster.wgsl"));
+const CASTER: &str = concat!(
+    include_str!("ray.wgsl"),
+    include_str!("cost.wgsl"),
+    include_str!("sum.wgsl"),
+    include_str!("caster.wgsl")
+);
+/// Compares range images.
+pub(super) const PIXELS: &str = concat!(
+    include_str!("ray.wgsl"),
+    include_str!("cost.wgsl"),
+    include_str!("sum.wgsl"),
+    include_str!("pixels.wgsl")
+);
 /// Sums costs.
-pub(super) const REDUCE: &str = include_str!("reduce.wgsl");
+pub(super) const REDUCE: &str = concat!(include_str!("sum.wgsl"), include_str!("reduce.wgsl"));
 /// Draws range images.
 pub(super) const RASTER: &str = concat!(include_str!("ray.wgsl"), include_str!("raster.wgsl"));
 
@@ -18,6 +32,20 @@ const STACK_SIZE: &str = "const STACK_SIZE: u32 = 64u;";
 pub(super) fn caster(depth: usize) -> String {
     let stack_size = format!("const STACK_SIZE: u32 = {}u;", depth.max(1));
     CASTER.replace(STACK_SIZE, &stack_size)
+}
+
+/// A compute pipeline of one entry point.
+pub(super) fn pipeline(gpu: &Gpu, source: &str, entry_point: &str) -> ComputePipeline {
+    let module = module(gpu, source);
+    gpu.device
+        .create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(entry_point),
+            layout: None,
+            module: &module,
+            entry_point: Some(entry_point),
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            cache: None,
+        })
 }
 
 pub(super) fn module(gpu: &Gpu, source: &str) -> wgpu::ShaderModule {
@@ -62,6 +90,8 @@ mod tests {
             (CASTER, "Triangle", size_of::<layout::Triangle>()),
             (CASTER, "Pose", size_of::<layout::Pose>()),
             (CASTER, "Query", size_of::<layout::Query>()),
+            (PIXELS, "Pixel", size_of::<layout::Pixel>()),
+            (PIXELS, "Comparison", size_of::<layout::Comparison>()),
             (REDUCE, "Reduction", size_of::<layout::Reduction>()),
             (RASTER, "Atlas", size_of::<layout::Atlas>()),
         ];
@@ -91,6 +121,11 @@ mod tests {
             (REDUCE, "const LANES: u32 = 64u;", layout::LANES == 64),
             (
                 CASTER,
+                "const BEAMS_PER_GROUP: u32 = 256u;",
+                layout::BEAMS_PER_GROUP == 256,
+            ),
+            (
+                PIXELS,
                 "const BEAMS_PER_GROUP: u32 = 256u;",
                 layout::BEAMS_PER_GROUP == 256,
             ),

@@ -3,10 +3,15 @@
 //! What is rendered is compared in `tests/renderer_parity.rs`. Without any adapter these tests
 //! say that they did not run, unless `FPMCL_REQUIRE_GPU=1`.
 
+use std::cell::RefCell;
+
+use glam::DVec3;
 use nalgebra::Vector3;
 
 use super::batch_sizes::BatchSizes;
 use super::*;
+use crate::geometry::Aabb;
+use crate::raycasting::{Scene, TileError};
 
 /// A floor of 30 m by 30 m with steps up.
 fn stairs() -> TriangleMesh {
@@ -29,7 +34,7 @@ fn stairs() -> TriangleMesh {
 }
 
 fn renderer() -> Option<GpuRenderer> {
-    match GpuRenderer::new(&[stairs()], Backend::Gpu, None) {
+    match GpuRenderer::new(&[stairs()], (Backend::Gpu, RenderingMethod::Auto), None) {
         Ok(renderer) => Some(renderer),
         Err(RenderError::NoAdapter) => {
             let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|value| value == "1");
@@ -71,7 +76,7 @@ fn an_image_is_the_same_whichever_batch_it_was_in() {
     };
     // The last batch is not full.
     let poses = poses(50);
-    for method in [ImageMethod::Cast, ImageMethod::Draw] {
+    for method in [ImageMethod::Cast, ImageMethod::Raster] {
         let together = renderer.render_by(method, &poses, &model()).unwrap();
         assert!(together.iter().flatten().any(|range_m| range_m.is_finite()));
         let sizes = renderer.gpu.batch_sizes;
@@ -128,7 +133,7 @@ fn a_map_that_the_device_cannot_bind_is_an_error_that_says_how_large_it_is() {
         return;
     };
     renderer.gpu.limits.max_storage_buffer_binding_size = 1 << 16;
-    let error = DeviceMap::upload(&renderer.gpu, &[stairs()]).err();
+    let error = device_map::DeviceMap::upload(&renderer.gpu, &[stairs()]).err();
     assert!(
         matches!(
             error,
@@ -187,10 +192,176 @@ fn an_image_that_fits_no_texture_can_be_cast_but_not_drawn() {
         width: renderer.gpu.limits.max_texture_dimension_2d as usize + 1,
         ..model()
     };
-    let drawn = renderer.render_by(ImageMethod::Draw, &poses(1), &wide);
+    let drawn = renderer.render_by(ImageMethod::Raster, &poses(1), &wide);
     assert!(matches!(drawn, Err(RenderError::DeviceRefused { .. })));
     assert_eq!(
         renderer.render(&poses(1), &wide).unwrap()[0].len(),
         wide.width
     );
+}
+
+#[test]
+fn several_batches_are_started_before_the_first_is_read() {
+    let Some(renderer) = renderer() else {
+        return;
+    };
+    let gpu = &renderer.gpu;
+    let order = RefCell::new(Vec::new());
+    let start = |batch: &usize| {
+        order.borrow_mut().push(("start", *batch));
+        let encoder = gpu.device.create_command_encoder(&Default::default());
+        sums::read_back(gpu, encoder, &sums::results(gpu, 64), 64)
+    };
+    let finish = |batch, _| order.borrow_mut().push(("finish", batch));
+    batches::run(gpu, 0..5, start, finish).unwrap();
+    let expected = [
+        ("start", 0),
+        ("start", 1),
+        ("start", 2),
+        ("finish", 0),
+        ("start", 3),
+        ("finish", 1),
+        ("start", 4),
+        ("finish", 2),
+        ("finish", 3),
+        ("finish", 4),
+    ];
+    assert_eq!(*order.borrow(), expected);
+}
+
+#[test]
+fn images_are_compared_by_the_faster_method_also_where_they_fit_no_texture() {
+    let Some(renderer) = renderer() else {
+        return;
+    };
+    let wide = LidarModel {
+        height: 1,
+        width: renderer.gpu.limits.max_texture_dimension_2d as usize + 1,
+        ..model()
+    };
+    for (model, methods) in [
+        (wide, &[ImageMethod::Cast][..]),
+        (model(), &[ImageMethod::Cast, ImageMethod::Raster]),
+    ] {
+        let scan = renderer.render(&poses(1), &model).unwrap().remove(0);
+        let scan = RangeImage::from_ranges(scan, &model);
+        let unlimited = RangeDifference::UNLIMITED;
+        let faster = renderer.faster_method(&poses(3), &scan, &unlimited);
+        assert!(methods.contains(&faster.unwrap()));
+    }
+    let scan = renderer.render(&poses(1), &model()).unwrap().remove(0);
+    let scan = RangeImage::from_ranges(scan, &model());
+    let compare =
+        |count| renderer.compare_images(&poses(count), &scan, &RangeDifference::UNLIMITED);
+    assert!(compare(0).unwrap().is_empty() && renderer.method.get().is_none());
+    assert_eq!(compare(3).unwrap()[0], 0.0);
+    assert!(renderer.method.get().is_some());
+}
+
+/// A street of tiles that are 40 m apart.
+#[derive(Debug)]
+struct Street {
+    tiles: Vec<TriangleMesh>,
+    scene: Scene,
+}
+
+impl Street {
+    fn new(count: u8) -> Self {
+        let tile = |number| {
+            let mut tile = stairs();
+            for vertex in &mut tile.vertices {
+                *vertex += Vec3::new(40.0 * f32::from(number), 0.0, 0.1 * f32::from(number));
+            }
+            tile
+        };
+        let tiles: Vec<TriangleMesh> = (0..count).map(tile).collect();
+        Self {
+            scene: Scene::of_tiles(&tiles),
+            tiles,
+        }
+    }
+}
+
+impl TriangleSource for Street {
+    fn tiles(&self) -> Vec<(Aabb, u64)> {
+        let of = |tile: &TriangleMesh| (tile.bounds(), tile.triangles.len() as u64);
+        self.tiles.iter().map(of).collect()
+    }
+
+    fn triangles(&self, tile: usize) -> Result<Vec<[DVec3; 3]>, Arc<TileError>> {
+        let mesh = &self.tiles[tile];
+        let corners = |triangle| mesh.corners(triangle).map(|corner| corner.as_dvec3());
+        Ok((0..mesh.triangles.len()).map(corners).collect())
+    }
+}
+
+impl SceneSource for Street {
+    fn scene(&self, _: &[DVec3]) -> Scene {
+        self.scene.clone()
+    }
+
+    fn check(&self) -> Result<(), Arc<TileError>> {
+        Ok(())
+    }
+}
+
+#[test]
+fn tiles_come_and_go_with_the_poses_and_nothing_looks_different() {
+    /// Those within reach of a car are four, with those ahead seven; those within reach of a square of 200 m are seven.
+    const FEW_TILES: u64 = 5;
+    const TILES: u64 = 8;
+    let Some(renderer) = renderer() else {
+        return;
+    };
+    drop(renderer);
+    let street = Arc::new(Street::new(20));
+    let request = (Backend::Gpu, RenderingMethod::Auto);
+    let whole = GpuRenderer::new(&street.tiles, request, None).unwrap();
+    let mut part = GpuRenderer::over(&street, request, None).unwrap();
+    let tile_bytes = street.tiles[0].triangles.len() as u64 * resident::TRIANGLE_BYTES;
+    part.map.set_budget(FEW_TILES * tile_bytes);
+    let model = LidarModel {
+        max_range: 50.0,
+        ..model()
+    };
+    let at = |x: f64| Pose3::translation(x, 1.25, 3.0 + 0.0025 * x);
+    let mut seen = std::collections::BTreeSet::new();
+    for step in 0..16_u8 {
+        let poses = [at(50.0 * f64::from(step)), at(50.0 * f64::from(step) + 5.0)];
+        for method in [ImageMethod::Cast, ImageMethod::Raster] {
+            let [expected, images] = [&whole, &part].map(|r| r.render_by(method, &poses, &model));
+            let images = images.unwrap();
+            assert!(images == expected.unwrap(), "{step} {method:?}");
+            assert!(images.iter().flatten().any(|range_m| range_m.is_finite()));
+        }
+        let there = part.map.tiles_there();
+        assert!(there.len() as u64 <= FEW_TILES, "{there:?}");
+        seen.extend(there);
+    }
+    assert_eq!(seen.len(), 20);
+    assert!(!part.map.tiles_there().contains(&0));
+
+    // Poses along the whole street are more than the device holds: they are rendered part by part.
+    part.map.set_budget(TILES * tile_bytes);
+    let poses: Vec<Pose3> = (0..30_u8).map(|i| at(26.0 * f64::from(29 - i))).collect();
+    let directions = model.directions();
+    let [expected, rows] = [&whole, &part].map(|r| r.cast(&poses, &directions, 20.0).unwrap());
+    assert!(rows == expected);
+    let beams: Vec<Beam> = std::iter::zip(directions, &rows[0])
+        .filter(|(_, range_m)| range_m.is_finite())
+        .map(|(direction, &range_m)| Beam { direction, range_m })
+        .collect();
+    let near = RangeDifference::truncated(0.5);
+    let [expected, costs] = [&whole, &part].map(|r| r.compare(&poses, &beams, &near).unwrap());
+    assert!(costs == expected);
+    assert!(part.map.tiles_there().len() as u64 <= TILES);
+
+    // What reaches the whole map is left to the CPU.
+    let far = RangeDifference::UNLIMITED;
+    let there = part.map.tiles_there();
+    let [expected, costs] = [&whole, &part].map(|r| r.compare(&poses, &beams, &far).unwrap());
+    for (cost, expected) in costs.iter().zip(&expected) {
+        assert!((cost - expected).abs() < 1e-3, "{cost} {expected}");
+    }
+    assert_eq!(part.map.tiles_there(), there);
 }

@@ -5,11 +5,13 @@
 //! of the map, subtracted in `f64`.
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::layout::{self, Node, Triangle};
+use crate::geometry::mesh::STEP_M;
 use crate::geometry::{Aabb, TriangleMesh};
 use crate::raycasting::bvh::{Bvh, Leaves, NodeRef, PrimRef};
 use crate::raycasting::is_proper;
@@ -50,11 +52,17 @@ pub(super) struct TwoLevelBvh {
 impl TwoLevelBvh {
     /// Builds the hierarchies; triangles that are degenerate or not finite are left out.
     pub fn build(tiles: &[TriangleMesh]) -> Self {
-        let center = center_of(tiles);
-        let bottom_levels: Vec<BottomLevel> = tiles
-            .par_iter()
-            .map(|mesh| BottomLevel::build(mesh, center))
-            .collect();
+        let center = center_of(tiles.iter().map(TriangleMesh::bounds));
+        let level = |mesh: &TriangleMesh| {
+            let triangles = 0..mesh.triangles.len();
+            let corners = |triangle| mesh.corners(triangle).map(|corner| corner.as_dvec3());
+            BottomLevel::build(triangles.map(corners), center).into()
+        };
+        Self::over(center, &tiles.par_iter().map(level).collect::<Vec<_>>())
+    }
+
+    /// Builds the hierarchy over those of tiles.
+    pub fn over(center: DVec3, bottom_levels: &[Arc<BottomLevel>]) -> Self {
         let mut hierarchy = Self {
             center,
             nodes: Vec::new(),
@@ -73,7 +81,7 @@ impl TwoLevelBvh {
     }
 
     /// Appends a tile; returns the reference to its root, `None` if it has no triangles.
-    fn append(&mut self, bottom: BottomLevel) -> Option<u32> {
+    fn append(&mut self, bottom: &BottomLevel) -> Option<u32> {
         let root = bottom.bvh.root?;
         let (first_node, first) = (self.nodes.len(), self.triangles.len());
         let refer = |node: NodeRef| {
@@ -137,18 +145,18 @@ impl TwoLevelBvh {
 }
 
 /// Hierarchy of a tile that numbers its own triangles from zero.
-struct BottomLevel {
+pub(super) struct BottomLevel {
     bvh: Bvh,
     leaves: Leaves,
     corners: Vec<[Vec3; 3]>,
 }
 
 impl BottomLevel {
-    fn build(mesh: &TriangleMesh, center: DVec3) -> Self {
-        let corners: Vec<[Vec3; 3]> = (0..mesh.triangles.len())
-            .map(|triangle| mesh.corners(triangle))
-            .filter(|&corners| is_proper(corners))
-            .map(|corners| corners.map(|corner| (corner.as_dvec3() - center).as_vec3()))
+    /// Of the corners of triangles and the centre of the map, both in its frame [m].
+    pub fn build(triangles: impl Iterator<Item = [DVec3; 3]>, center: DVec3) -> Self {
+        let corners: Vec<[Vec3; 3]> = triangles
+            .map(|corners| corners.map(|corner| (corner - center).as_vec3()))
+            .filter(|corners| is_proper(*corners))
             .collect();
         let triangles = corners.iter().zip(0..);
         let prims = triangles.map(|(corners, index)| PrimRef::new(Aabb::of(*corners), index));
@@ -161,14 +169,15 @@ impl BottomLevel {
     }
 }
 
-fn center_of(tiles: &[TriangleMesh]) -> DVec3 {
-    let vertices = tiles.iter().flat_map(|tile| &tile.vertices);
-    let bounds = Aabb::of(vertices.copied().filter(|vertex| vertex.is_finite()));
+/// Middle of boxes on the lattice of maps, so that coordinates relative to it are exact; the origin without boxes.
+pub(super) fn center_of(boxes: impl Iterator<Item = Aabb>) -> DVec3 {
+    let bounds = boxes.fold(Aabb::EMPTY, Aabb::union);
     if bounds.is_empty() {
-        DVec3::ZERO
-    } else {
-        0.5 * (bounds.min.as_dvec3() + bounds.max.as_dvec3())
+        return DVec3::ZERO;
     }
+    let step_m = f64::from(STEP_M);
+    let middle = 0.5 * (bounds.min.as_dvec3() + bounds.max.as_dvec3());
+    (middle / step_m).round() * step_m
 }
 
 fn node(bounds: [[f32; 6]; 2], children: [u32; 2]) -> Node {

@@ -13,7 +13,9 @@ use super::report::BuildReport;
 use crate::app::commands::interrupt::Interrupted;
 use crate::app::commands::{Context, input, output};
 use crate::app::config::BuildMapConfig;
-use crate::geometry::{TriangleMesh, Vec3};
+use crate::evaluation::map_quality::ResidualSums;
+use crate::geometry::Vec3;
+use crate::map::mesh_view::MeshView;
 use crate::map::{BuildError, BuildEvent, CloudPlan, LocalMap, MappingPath};
 use crate::recording::scan_files::{self, ReadCloud};
 
@@ -33,20 +35,23 @@ pub fn run(config: &BuildMapConfig, cloud_file: &Path, context: &Context) -> Res
     );
     let mut claims = prepare(config, context)?;
     let clock = StageClock::default();
-    let blocks = build_blocks(config, cloud_file, context, &clock)?;
-    let mut mesh = TriangleMesh::default();
-    blocks.iter().for_each(|block| mesh.append(&block.mesh));
+    let mut blocks = build_blocks(config, cloud_file, context, &clock)?;
+    for block in &mut blocks {
+        block.mesh.compute_normals();
+    }
+    let meshes: Vec<&dyn MeshView> = blocks.iter().map(|block| &block.mesh as _).collect();
     let path = MappingPath::default();
-    write_map(config, &mesh, &path, &mut claims)?;
+    write_map(config, &meshes, &path, &mut claims)?;
+    let triangles = meshes.iter().map(|mesh| mesh.triangles()).sum();
     if config.visualize {
-        pictures::draw(config, &mesh, &[], &[])?;
+        pictures::draw(config, &meshes, &[], &ResidualSums::default())?;
     }
     let cells_m = blocks.iter().map(|block| block.counts.cell_m);
     let report = BuildReport {
         stage_seconds: clock.seconds(),
         octree_cell_m: cells_m.fold(0.0, f32::max),
         local_maps: blocks.into_iter().map(|block| block.counts).collect(),
-        ..BuildReport::of_map(&mesh, &path, &config.mesh_file, started)
+        ..BuildReport::of_map(triangles, &path, &config.mesh_file, started)
     };
     output::write_json(&config.mesh_file.with_extension("report.json"), &report)?;
     output::write_yaml(&config.mesh_file.with_extension("effective.yml"), config)?;

@@ -5,7 +5,7 @@ use anyhow::Result;
 use crate::app::commands::Context;
 use crate::app::commands::claims::{Claims, Outputs, PLY};
 use crate::app::config::BuildMapConfig;
-use crate::geometry::TriangleMesh;
+use crate::map::mesh_view::MeshView;
 use crate::map::{MappingPath, ply};
 
 /// Prepares the outputs.
@@ -39,15 +39,15 @@ pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
     outputs.prepare()
 }
 
-/// Writes the map.
+/// Writes meshes as the map.
 pub fn write_map(
     config: &BuildMapConfig,
-    mesh: &TriangleMesh,
+    meshes: &[&dyn MeshView],
     path: &MappingPath,
     claims: &mut Claims,
 ) -> Result<()> {
     anyhow::ensure!(
-        !mesh.triangles.is_empty(),
+        meshes.iter().any(|mesh| mesh.triangles() > 0),
         "the map has no triangles: {} has no points left to mesh; check range_image, crop_x, crop_y and crop_z",
         config
             .cloud_file
@@ -56,5 +56,5 @@ pub fn write_map(
             .display()
     );
     claims.begin(&config.mesh_file)?;
-    Ok(ply::write(&config.mesh_file, mesh, Some(path))?)
+    Ok(ply::write_joined(&config.mesh_file, meshes, Some(path))?)
 }

@@ -7,13 +7,15 @@ use anyhow::Result;
 use serde::Serialize;
 
 use super::parts::hash_of_file;
+use crate::app::commands::run_output::MOST_TRIANGLES;
 use crate::app::commands::stages::MapInputs;
 use crate::app::commands::{Context, input, trajectory};
 use crate::app::config::{BuildMapConfig, LocalizationConfig};
 use crate::app::plotting::MapPlot;
-use crate::geometry::{TriangleMesh, pose2_from_pose3};
+use crate::geometry::pose2_from_pose3;
 use crate::localization::SecondDrive;
-use crate::map::{Map, MappingPath, changes};
+use crate::map::mesh_view::{MeshView, Without, reduced};
+use crate::map::{Map, MapOptions, MappingPath, surface_of};
 use crate::odometry::{Trajectory, TrajectoryConfig};
 use crate::recording::Frame;
 
@@ -24,7 +26,7 @@ pub struct OlderMap {
     /// Hash of the file.
     pub hash: String,
     /// Its surface.
-    pub mesh: Arc<TriangleMesh>,
+    pub mesh: Arc<dyn MeshView>,
     /// Its frame and path.
     pub path: Arc<MappingPath>,
 }
@@ -41,11 +43,15 @@ impl OlderMap {
             map_pose_file: None,
             map_calib_file: None,
         };
-        let map = inputs.load(Some(config.range_image.batch_size()), context)?;
+        let options = MapOptions {
+            max_poses: Some(config.range_image.batch_size()),
+            ..MapOptions::default()
+        };
+        let map = inputs.load(options, context)?;
         let older = Self {
             file: file.clone(),
             hash: hash_of_file(file)?,
-            mesh: map.mesh.clone(),
+            mesh: surface_of(file)?,
             path: map.path.clone(),
         };
         Ok(Some((older, map)))
@@ -104,18 +110,19 @@ pub struct ChangesReport {
 }
 
 impl ChangesReport {
-    /// Of triangles that are gone, and a mesh that was added.
-    pub fn of(older: &OlderMap, gone: &[u32], added: &TriangleMesh) -> Self {
-        let area_m2 = |mesh: &TriangleMesh, triangles: &mut dyn Iterator<Item = usize>| -> f64 {
-            let doubled = triangles.map(|it| f64::from(mesh.scaled_normal(it).length()));
-            0.5 * doubled.sum::<f64>()
+    /// Of triangles that are gone, and meshes that were added.
+    pub fn of(older: &OlderMap, gone: &[u32], added: &[&dyn MeshView]) -> Self {
+        let of_mesh = |mesh: &dyn MeshView| -> f64 {
+            let triangles = 0..mesh.triangles();
+            triangles.map(|triangle| mesh.area_m2(triangle)).sum()
         };
+        let gone_m2 = gone.iter().map(|&it| older.mesh.area_m2(it as usize));
         Self {
             onto: older.file.clone(),
             gone_triangles: gone.len(),
-            gone_m2: area_m2(&older.mesh, &mut gone.iter().map(|&it| it as usize)),
-            added_triangles: added.triangles.len(),
-            added_m2: area_m2(added, &mut (0..added.triangles.len())),
+            gone_m2: gone_m2.sum(),
+            added_triangles: added.iter().map(|mesh| mesh.triangles()).sum(),
+            added_m2: added.iter().map(|mesh| of_mesh(*mesh)).sum(),
         }
     }
 
@@ -129,20 +136,24 @@ impl ChangesReport {
     }
 }
 
-/// Draws the older map with what is gone and what was added.
-pub fn draw(older: &OlderMap, gone: &[u32], added: &TriangleMesh, picture: &Path) -> Result<()> {
+/// Draws what is left of the older map, with what is gone and what was added.
+pub fn draw(
+    older: &OlderMap,
+    kept: &dyn MeshView,
+    gone: &[u32],
+    added: &[&dyn MeshView],
+    picture: &Path,
+) -> Result<()> {
     const KEPT: [u8; 3] = [200, 200, 200];
     const GONE: [u8; 3] = [214, 39, 40];
     const ADDED: [u8; 3] = [44, 160, 44];
-    let painted = |mesh: &TriangleMesh, color: [u8; 3]| TriangleMesh {
-        colors: vec![color; mesh.vertices.len()],
-        ..mesh.clone()
-    };
-    let mut lost = painted(&older.mesh, GONE);
-    let is_gone = |triangle: usize| gone.binary_search(&(triangle as u32)).is_ok();
-    lost.retain_triangles(|triangle, _| is_gone(triangle));
-    let mut mesh = changes::joined(&painted(&older.mesh, KEPT), gone, &painted(added, ADDED));
-    mesh.append(&lost);
+    let is_kept = |triangle: &u32| gone.binary_search(triangle).is_err();
+    let others: Vec<u32> = (0..older.mesh.triangles() as u32).filter(is_kept).collect();
+    let lost = Without::new(&*older.mesh, &others);
+    let mut parts: Vec<(&dyn MeshView, _)> = vec![(kept, Some(KEPT))];
+    parts.extend(added.iter().map(|mesh| (*mesh, Some(ADDED))));
+    parts.push((&lost, Some(GONE)));
+    let mesh = reduced(&parts, MOST_TRIANGLES);
     let path: Vec<_> = (older.path.map_from_lidar.iter())
         .map(pose2_from_pose3)
         .collect();

@@ -2,22 +2,26 @@
 
 use anyhow::Result;
 
+use crate::app::commands::run_output::MOST_TRIANGLES;
 use crate::app::config::BuildMapConfig;
 use crate::app::plotting::color::{Colormap, TRUTH};
 use crate::app::plotting::{MapPlot, ObliqueView, ScalarMapPlot, relief};
-use crate::evaluation::map_quality::{BeamResidual, vertex_residuals};
-use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
+use crate::evaluation::map_quality::ResidualSums;
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
+use crate::map::mesh_view::{MeshView, reduced};
 
 /// Residual at the end of the colour bar [m].
 const PICTURE_LIMIT_M: f64 = 0.2;
 
-/// Draws the map with the path of the mapping drive, and its residuals where scans were held out.
+/// Draws the map of some meshes with the path of the mapping drive, and its residuals where scans were held out.
 pub fn draw(
     config: &BuildMapConfig,
-    mesh: &TriangleMesh,
+    meshes: &[&dyn MeshView],
     path: &[Pose3],
-    residuals: &[BeamResidual],
+    residuals: &ResidualSums,
 ) -> Result<()> {
+    let in_own_colors: Vec<_> = meshes.iter().map(|mesh| (*mesh, None)).collect();
+    let mesh = &reduced(&in_own_colors, MOST_TRIANGLES);
     let driven: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
     let relief = relief(mesh, path);
     let picture = config.mesh_file.with_extension("png");
@@ -40,14 +44,14 @@ pub fn draw(
         .save(&picture)?;
         tracing::info!("drew {}", picture.display());
     }
-    if residuals.is_empty() {
+    if residuals.quality().is_none() {
         return Ok(());
     }
     let picture = config.mesh_file.with_extension("residuals.png");
     ScalarMapPlot {
         title: "Distance of held-out beams to the surface that they hit",
         mesh,
-        values: &vertex_residuals(mesh, residuals),
+        values: &residuals.at_vertices(mesh),
         value_name: "mean beam-plane distance [m]",
         limits: (0.0, PICTURE_LIMIT_M),
         colormap: Colormap::Viridis,

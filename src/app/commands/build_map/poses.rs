@@ -1,11 +1,13 @@
 //! Poses of the scans of a map: given, polished, or from the scans themselves.
 
 use std::fs;
+use std::io::Write as _;
 use std::path::Path;
 
-use anyhow::Result;
+use anyhow::{Result, ensure};
 
 use super::onto::{self, OlderMap};
+use super::parts::{Role, not_listed};
 use crate::app::commands::trajectory::{self, TrajectorySummary};
 use crate::app::commands::{Context, output, version};
 use crate::app::config::{self, BuildMapConfig, PoseSource};
@@ -14,6 +16,9 @@ use crate::map::Map;
 use crate::odometry::TrajectoryConfig;
 use crate::recording::poses::write_tum;
 use crate::recording::{Frame, PoseTrack, Recording};
+
+/// Start of the line of a file of poses with their summary.
+const SUMMARY: &str = "# ";
 
 /// The given poses of a recording; `None` if they are to be found from the scans.
 pub fn given(config: &BuildMapConfig, recording: &Recording) -> Result<Option<PoseTrack>> {
@@ -46,12 +51,14 @@ pub fn given(config: &BuildMapConfig, recording: &Recording) -> Result<Option<Po
     }
 }
 
-/// The recording with poses from its scans, in an older map where there is one, or with its own ones polished. They are kept in a file beside the map, from
-/// which they are read where it belongs to the same scans; the summary is that of poses that were found now.
+/// The recording with poses from its scans, in an older map where there is one, or with its own ones polished, and what
+/// they show about themselves. Both are kept in a file beside the map, from which they are read where it belongs to the
+/// same scans; otherwise only a build finds them.
 pub fn find(
     mut recording: Recording,
     config: &BuildMapConfig,
     older: Option<(&OlderMap, &Map)>,
+    role: Role,
     context: &Context,
 ) -> Result<(Recording, Option<TrajectorySummary>)> {
     let path = trajectory::file_beside(&config.mesh_file);
@@ -66,12 +73,14 @@ pub fn find(
     };
     let hash = inputs(&frames, is_given, &localized_by)?;
     let heading = format!("# fpmcl poses {hash}\n");
-    let is_found = fs::read_to_string(&path).is_ok_and(|text| text.starts_with(&heading));
+    let found = fs::read_to_string(&path).unwrap_or_default();
+    let found = found.strip_prefix(&heading).and_then(summary_in);
     let world = older.map(|(_, map)| map.path.world_from_map);
-    let mut summary = None;
-    if is_found {
+    let mut summary = found;
+    if summary.is_some() {
         tracing::info!("the poses in {} are finished already", path.display());
     } else {
+        ensure!(role == Role::Build, not_listed(&config.mesh_file));
         let settings = TrajectoryConfig::default();
         let found = match older {
             Some((_, map)) => onto::find(&frames, map, config, context)?,
@@ -79,6 +88,7 @@ pub fn find(
         };
         let found_now = TrajectorySummary::of(&found, recording.has_times);
         found_now.warn();
+        let kept = serde_json::to_string(&found_now.without_times())?;
         summary = Some(found_now);
         // Rows of the lidar in the world of the given poses, or of the older map.
         let world_from_map = world.unwrap_or(recording.world().0);
@@ -89,7 +99,7 @@ pub fn find(
             .collect();
         let stamped = trajectory::stamped(&frames, &poses);
         output::write_file(&path, |file| {
-            std::io::Write::write_all(file, heading.as_bytes())?;
+            writeln!(file, "{heading}{SUMMARY}{kept}")?;
             write_tum(file, &stamped)
         })?;
     }
@@ -104,6 +114,11 @@ pub fn find(
         track = track.in_map(&world_from_map);
     }
     Ok((recording.with_poses(track)?, summary))
+}
+
+/// The summary of poses, after the heading of their file.
+fn summary_in(text: &str) -> Option<TrajectorySummary> {
+    serde_json::from_str(text.strip_prefix(SUMMARY)?.lines().next()?).ok()
 }
 
 /// Hash of what the poses depend on, also the older map and how scans are localized there; of a scan its place and size.

@@ -11,7 +11,6 @@ use super::onto::ChangesReport;
 use crate::app::commands::output::Printed;
 use crate::app::commands::trajectory::TrajectorySummary;
 use crate::evaluation::{MapQuality, TruthAgreement};
-use crate::geometry::TriangleMesh;
 use crate::map::{LocalMapCounts, MappingPath};
 use crate::sensor::SensorDescription;
 
@@ -57,7 +56,7 @@ pub struct BuildReport {
 impl BuildReport {
     /// The size of a written map, per length of its path, and the time since the build started.
     pub fn of_map(
-        mesh: &TriangleMesh,
+        triangles: usize,
         path: &MappingPath,
         mesh_file: &Path,
         started: Instant,
@@ -72,9 +71,9 @@ impl BuildReport {
         let per_100m = |amount: f64| 100.0 * amount / f64::max(path_m, 1.0);
         Self {
             path_m,
-            triangles: mesh.triangles.len(),
+            triangles,
             map_mb,
-            triangles_per_100m: per_100m(mesh.triangles.len() as f64),
+            triangles_per_100m: per_100m(triangles as f64),
             mb_per_100m: per_100m(map_mb),
             seconds: started.elapsed().as_secs_f64(),
             ..Self::default()

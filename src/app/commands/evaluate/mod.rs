@@ -18,6 +18,8 @@ use crate::app::results::{LocalizationResults, Report};
 use crate::evaluation::{Alignment, RangeMclRules};
 use crate::files::folder_of;
 use crate::geometry::TriangleMesh;
+use crate::map::mapped_ply::MappedPly;
+use crate::map::mesh_view::reduced;
 use crate::map::{MappingPath, mesh_file};
 
 /// Compares a result of `localize`, `refine` or range-mcl, or any trajectory, with the ground truth.
@@ -220,13 +222,19 @@ fn localization_of(result: &Path) -> Result<Option<LocalizationConfig>> {
     }
 }
 
-/// The map of a run and its path; `None` if its file does not exist.
+/// The map of a run for pictures, a large one coarser, and its path; `None` if its file does not exist.
 fn map_of(localized: &LocalizationConfig) -> Result<Option<(TriangleMesh, Option<MappingPath>)>> {
     if !localized.map_file.exists() {
         tracing::info!("{} does not exist any more", localized.map_file.display());
         return Ok(None);
     }
-    Ok(Some(mesh_file::read(&localized.map_file)?))
+    Ok(Some(match MappedPly::open(&localized.map_file) {
+        Some(mesh) => {
+            let drawn = reduced(&[(&mesh, None)], run_output::MOST_TRIANGLES);
+            (drawn, mesh.path)
+        }
+        None => mesh_file::read(&localized.map_file)?,
+    }))
 }
 
 /// Converts positions in grid cells to metres.

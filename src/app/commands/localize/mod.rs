@@ -38,9 +38,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     let files = RunFiles::beside(&config.result_path);
     context.interrupt.keeps("no frame was finished");
     let claims = prepare(config, context, &files)?;
-    let map = config
-        .map_inputs()
-        .load(Some(config.range_image.batch_size()), context)?;
+    let map = config.map_inputs().load(config.map_options(), context)?;
     let mut resolved = config.clone();
     let sequence = resolved.open_in_map(&map)?;
     let (motion, odometry_file) = MotionSource::open(
@@ -59,7 +57,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         &files,
         sequence.frames.len(),
         claims,
-    ));
+    )?);
     let recorded = || run.lock().unwrap_or_else(PoisonError::into_inner);
     let kept = |run: &Run| run.kept(config, sequence.frames.len());
     context.interrupt.supervise(
@@ -118,7 +116,7 @@ fn localize<'a>(
     motion: &Mutex<MotionSource>,
     recorded: &dyn Fn() -> MutexGuard<'a, Run>,
 ) -> Result<()> {
-    let start = start(config, sequence);
+    let start = start(config, map, sequence);
     let mut motion = motion.lock().unwrap_or_else(PoisonError::into_inner);
     let mut localizer = Localizer::new(map, config.localizer(), start, config.seed)?;
     let refiner = || TrajectoryRefiner::new(map, config.refiner(), config.seed);
@@ -153,7 +151,7 @@ fn localize<'a>(
 }
 
 /// Where the particles start.
-fn start(config: &LocalizationConfig, recording: &Recording) -> Start {
+fn start(config: &LocalizationConfig, map: &Map, recording: &Recording) -> Start {
     let spread = config.start.clone();
     match (config.initialization(), config.initial_pose) {
         (Initialization::Tracking, Some([x, y, heading_deg])) => Start::Pose {
@@ -166,7 +164,16 @@ fn start(config: &LocalizationConfig, recording: &Recording) -> Start {
             Start::near(&truth, spread)
         }
         (Initialization::Corridor, _) => Start::Road,
-        (Initialization::Extent, _) => Start::Anywhere,
+        (Initialization::Extent, _) if config.initialization.is_some() => Start::Anywhere,
+        (Initialization::Extent, _) => {
+            let start = Start::unknown(map);
+            if start == Start::Road {
+                tracing::info!(
+                    "the map is large: an unknown start is searched along its road; set initialization to extent to search all ground"
+                );
+            }
+            start
+        }
     }
 }
 
@@ -241,7 +248,8 @@ fn write_run(
         run_output::write_report(files, results, &report)?;
     }
     if config.plot_loc_results {
-        run_output::draw_run(files, Some(&map.mesh), results)?;
+        let mesh = run_output::map_around(map, results.estimates.iter().flatten())?;
+        run_output::draw_run(files, Some(&mesh), results)?;
         draw_example(config, files, map, sequence, &run.map_from_lidar)?;
     }
     if config.save_result {

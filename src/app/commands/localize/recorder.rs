@@ -41,9 +41,9 @@ impl Run {
         files: &RunFiles,
         selected: usize,
         claims: Claims,
-    ) -> Self {
+    ) -> Result<Self> {
         let empty = || Some(Vec::new());
-        Self {
+        Ok(Self {
             results: LocalizationResults {
                 particles: ParticleLog::new(config.num_particles),
                 estimates: empty(),
@@ -68,10 +68,13 @@ impl Run {
             claims,
             map_from_lidar: Vec::new(),
             refined: Vec::new(),
-            movie: config.visualize.then(|| Movie::begin(files, map)),
+            movie: match config.visualize {
+                true => Some(Movie::begin(files, map)?),
+                false => None,
+            },
             off_ground: 0,
             failure: None,
-        }
+        })
     }
 
     /// Adds a frame; `runtimes` are those of the filter and of the refinement.

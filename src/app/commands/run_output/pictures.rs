@@ -2,8 +2,10 @@
 
 use std::cmp::Reverse;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use anyhow::Result;
+use glam::DVec3;
 
 use super::{INTERACTIVE, RunFiles};
 use crate::app::plotting::color::{MCL, REFINED, Rgb, STATES};
@@ -20,6 +22,9 @@ use crate::map::Map;
 
 /// Cells along the longer side of the map image in plots.
 const MAP_CELLS: usize = 1400;
+
+/// Triangles of a map in pictures; larger maps are drawn coarser.
+pub const MOST_TRIANGLES: usize = 2_000_000;
 
 /// Number of frames whose particles are drawn.
 const MOMENTS: usize = 4;
@@ -51,6 +56,22 @@ pub fn draw_run(
         Some(relief) => draw_map(files, relief, &path, &trajectories),
         None => Ok(()),
     }
+}
+
+/// The map around some poses, for pictures: of large maps coarser.
+pub fn map_around<'a>(
+    map: &Map,
+    poses: impl IntoIterator<Item = &'a Pose2>,
+) -> Result<Arc<TriangleMesh>> {
+    /// What is shown beside the poses [m].
+    const RADIUS_M: f64 = 100.0;
+    let most_triangles = MOST_TRIANGLES as u64;
+    if map.triangle_count() <= most_triangles {
+        return Ok(map.mesh()?);
+    }
+    let places = poses.into_iter().map(|pose| pose.translation.vector.into());
+    let places: Vec<_> = places.collect();
+    Ok(map.mesh_near(&places, RADIUS_M, DVec3::ZERO, most_triangles)?)
 }
 
 /// Name and values of the horizontal axis of charts over the frames of a run.
@@ -405,13 +426,16 @@ pub struct Movie {
 
 impl Movie {
     /// Prepares the map image of the pictures.
-    pub fn begin(files: &RunFiles, map: &Map) -> Self {
-        let relief = relief(&map.mesh, &map.path.map_from_lidar);
-        Self {
+    pub fn begin(files: &RunFiles, map: &Map) -> Result<Self> {
+        let path = &map.path.map_from_lidar;
+        let places: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
+        let mesh = map_around(map, &places)?;
+        let relief = relief(&mesh, path);
+        Ok(Self {
             files: files.clone(),
             map: MapImage::of_colors(&relief, MAP_CELLS),
             pictures: Vec::new(),
-        }
+        })
     }
 
     /// Draws the last frame of the results.

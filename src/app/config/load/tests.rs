@@ -6,6 +6,7 @@ use crate::app::config::{
     BuildMapConfig, EvaluationConfig, GroundCommandConfig, Initialization, LocalizationConfig,
     OdometrySource, RangeImageConfig, RefinementConfig,
 };
+use crate::rendering::RenderingMethod;
 
 /// Loads a configuration from a text.
 fn load_text<T: CommandConfig>(text: &str, settings: &[(&str, &str)]) -> Result<T, ConfigError> {
@@ -241,6 +242,7 @@ fn an_invalid_value_is_reported_with_key_value_and_remedy() {
         ("move_thres", ".inf"),
         ("odometry", "file"),
         ("map_file", "''"),
+        ("rendering.method", "raster"),
     ] {
         let message = message_of("", &[(key, value)]);
         assert_contains(&message, &[&format!("--set {key}={value}: {key} is ")]);
@@ -313,6 +315,18 @@ fn a_known_start_and_the_true_odometry_need_their_poses() {
     assert_contains(&message_of(text, &[]), &["initial_pose", "metres"]);
     let text = "calib_file: calib.txt\nbody_from_lidar: [0, 0, 1.7, 0, 0, 0]\n";
     assert_contains(&message_of(text, &[]), &["calib_file or body_from_lidar"]);
+}
+
+#[test]
+fn only_whole_range_images_are_rasterized() {
+    let text = "rendering: {method: raster}\n";
+    assert_contains(
+        &message_of(text, &[]),
+        &["rendering.method is raster", "reference"],
+    );
+    let reference = ("observation.likelihood", "reference");
+    let config: LocalizationConfig = load_text(text, &[reference]).unwrap();
+    assert_eq!(config.map_options().method, RenderingMethod::Raster);
 }
 
 #[test]

@@ -1,0 +1,151 @@
+//! The recording of a map, with its poses.
+
+use std::fmt::Write as _;
+use std::path::PathBuf;
+
+use anyhow::{Context as _, Result};
+
+use super::files::prepare;
+use super::onto::OlderMap;
+use super::parts::{Parts, Role};
+use super::{pose_check, poses};
+use crate::app::commands::claims::Claims;
+use crate::app::commands::trajectory::{self, TrajectorySummary, file_beside};
+use crate::app::commands::{Context, input, version};
+use crate::app::config::{self, BuildMapConfig, PoseSource};
+use crate::geometry::Pose3;
+use crate::map::plan::key_scans;
+use crate::recording::{Frame, Recording};
+use crate::sensor::SensorDescription;
+
+/// The recording of a map.
+pub struct Opened {
+    /// The configuration, with what the scans show about the sensor.
+    pub config: BuildMapConfig,
+    /// The recording with its poses.
+    pub sequence: Recording,
+    /// What was inferred about the sensor.
+    pub sensor: Option<SensorDescription>,
+    /// What the poses show about themselves, where they were found in this run.
+    pub trajectory: Option<TrajectorySummary>,
+    /// The map to which the recording is added.
+    pub older: Option<OlderMap>,
+    /// The key scans that build the map.
+    pub mapped: Vec<Frame>,
+    /// The key scans that are held out to evaluate it.
+    pub held_out: Vec<Frame>,
+    /// The local maps that are finished.
+    pub parts: Parts,
+}
+
+/// Opens the recording with its poses, or finds them, which only a build does, and completes the configuration by what the
+/// scans show about the sensor. The parts are locked before anything changes.
+pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(Opened, Claims)> {
+    if role != Role::Build {
+        // Where no jobs are listed, nothing is left behind.
+        Parts::lock(&config.mesh_file, role)?;
+    }
+    let mut claims = prepare(config, context)?;
+    let parts = Parts::lock(&config.mesh_file, role)?;
+    let mut config = config.clone();
+    let inputs = config.recording_inputs();
+    inputs.require()?;
+    if let Some(path) = &config.truth_mesh {
+        input::require_file("truth_mesh", path)?;
+    }
+    let (older, older_map) = OlderMap::open(&config, context)?.unzip();
+    let mut recording = inputs.open(&config.selection())?;
+    let given = poses::given(&config, &recording)?.map(|track| match &older {
+        Some(older) => track.in_map(&older.path.world_from_map),
+        None => track,
+    });
+    let pose_file = given.as_ref().map(|track| track.path.clone());
+    if let (Some(track), Some(pose_file)) = (given, &pose_file) {
+        recording = recording.with_poses(track)?;
+        let origin = format!("pose_file is {}", pose_file.display());
+        trajectory::check(&recording, config.max_step_m, &origin)?;
+    }
+    let (mut sequence, sensor) = config.sensor_keys().resolve(recording)?;
+    if let Some(pose_file) = pose_file.filter(|_| config.check_poses) {
+        pose_check::check(&sequence)
+            .with_context(|| format!("pose_file is {}", pose_file.display()))?;
+    }
+    let mut trajectory = None;
+    if sequence.track.is_none() || config.poses == PoseSource::Polished {
+        (sequence, trajectory) = poses::find(
+            sequence,
+            &config,
+            older.as_ref().zip(older_map.as_ref()),
+            role,
+            context,
+        )?;
+        let found = file_beside(&config.mesh_file);
+        let origin = format!("the poses from the scans are in {}", found.display());
+        trajectory::check(&sequence, config.max_step_m, &origin)?;
+    } else if let Some(name) = file_beside(&config.mesh_file).file_name()
+        && role == Role::Build
+    {
+        claims.remove(&[&name.to_string_lossy()])?;
+    }
+    let sequence = sequence.compensated_by_poses();
+    let (mapped, held_out) = hold_out(&sequence.frames, &config);
+    parts.keep_those_of(&inputs_of(&config, &mapped, older.as_ref())?)?;
+    let opened = Opened {
+        config,
+        sequence,
+        mapped,
+        held_out,
+        sensor,
+        trajectory,
+        older,
+        parts,
+    };
+    Ok((opened, claims))
+}
+
+/// The key scans that build the map, and those that are held out to evaluate it.
+fn hold_out(frames: &[Frame], config: &BuildMapConfig) -> (Vec<Frame>, Vec<Frame>) {
+    let keys = key_scans(&poses_of(frames), config.displacement_threshold_m);
+    let step = config.holdout_step;
+    let is_held_out = |row: usize| step > 0 && row % step == step - 1;
+    let frames_where = |held_out: bool| {
+        let rows = keys.iter().enumerate();
+        let rows = rows.filter(|&(row, _)| is_held_out(row) == held_out);
+        rows.map(|(_, &key)| frames[key].clone()).collect()
+    };
+    (frames_where(false), frames_where(true))
+}
+
+/// The poses of frames that have poses.
+pub fn poses_of(frames: &[Frame]) -> Vec<Pose3> {
+    let poses = frames.iter().map(|frame| frame.map_from_lidar);
+    poses.map(Option::unwrap_or_default).collect()
+}
+
+/// Inputs on which all local maps depend: the program, the configuration without the paths of outputs,
+/// the older map, and the poses. The content of the scans is recorded with each local map.
+fn inputs_of(
+    config: &BuildMapConfig,
+    frames: &[Frame],
+    older: Option<&OlderMap>,
+) -> Result<String> {
+    let relevant = BuildMapConfig {
+        mesh_file: PathBuf::new(),
+        truth_mesh: None,
+        visualize: false,
+        force: false,
+        ..config.clone()
+    };
+    let mut text = format!("# {}\n", version::program()?);
+    text += &config::to_yaml(&relevant)?;
+    if let Some(older) = older {
+        writeln!(text, "onto {}", older.hash)?;
+    }
+    for frame in frames {
+        let path = &frame.source;
+        let pose = frame.map_from_lidar.unwrap_or_default();
+        let (t, q) = (pose.translation.vector, pose.rotation.coords);
+        writeln!(text, "{path} {t:?} {q:?} {:?}", frame.motion)?;
+    }
+    Ok(text)
+}
