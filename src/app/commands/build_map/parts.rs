@@ -10,13 +10,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail, ensure};
 use blake3::Hash;
+use glam::DVec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::app::commands::output;
 use crate::files::remove_abandoned;
-use crate::geometry::TriangleMesh;
 use crate::lidar::Scan;
+use crate::map::mapped_ply::MappedPly;
 use crate::map::{LocalMap, LocalMapCounts, ply};
 use crate::recording::{Frame, RecordingError};
 
@@ -36,21 +37,49 @@ struct Part {
     /// Triangles of the older map that are gone.
     #[serde(default)]
     gone: Vec<u32>,
+    /// Origin of the coordinates of its mesh in the map frame [m].
+    #[serde(default)]
+    origin: [f64; 3],
 }
 
 /// What local maps add to a map, and what is gone from it.
-#[derive(Debug, Default)]
 pub struct Joined {
-    /// The mesh of all local maps.
-    pub mesh: TriangleMesh,
+    /// The meshes of the local maps, in order.
+    pub meshes: Vec<MappedPly>,
     /// Triangles of the older map that are gone, ascending.
     pub gone: Vec<u32>,
 }
 
-/// The folder of finished local maps of one build, locked.
+/// What a process does of a build.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Role {
+    /// All of it, or what comes before the local maps; alone. Parts of other inputs are deleted.
+    Build,
+    /// What comes after the local maps, which jobs have built; alone.
+    Collect,
+    /// One local map, beside other jobs.
+    Job,
+}
+
+/// The folder of finished local maps of one build, locked. Dropping it removes the folder unless jobs were listed in it.
 pub struct Parts {
+    mesh_file: PathBuf,
+    role: Role,
     folder: PathBuf,
-    _lock: Lock,
+    lock: Lock,
+}
+
+impl Drop for Parts {
+    fn drop(&mut self) {
+        let (inputs, lock) = (self.folder.join(INPUTS_FILE), self.folder.join(LOCK_FILE));
+        // Another build may have locked the folder since the parts were removed.
+        if inputs.exists() || !is_at(&self.lock.0, &lock) {
+            return;
+        }
+        if fs::remove_file(lock).is_ok() && fs::remove_dir(&self.folder).is_err() {
+            tracing::warn!("{} is kept: it has other files", self.folder.display());
+        }
+    }
 }
 
 /// A locked file; the operating system releases it after a crash.
@@ -64,39 +93,54 @@ impl Drop for Lock {
 }
 
 impl Parts {
-    /// Opens and locks the folder beside `mesh_file`; deletes its parts if they were made from other
-    /// inputs.
-    pub fn open(mesh_file: &Path, inputs: &str) -> Result<Self> {
+    /// Locks the folder beside `mesh_file`. A build makes it where it does not exist.
+    pub fn lock(mesh_file: &Path, role: Role) -> Result<Self> {
         let mut name = mesh_file.file_name().unwrap_or_default().to_owned();
         name.push(".parts");
         let folder = mesh_file.with_file_name(name);
         let context = || format!("cannot use {} for unfinished maps", folder.display());
-        output::create_subfolder(&folder)?;
-        remove_abandoned(&folder).with_context(context)?;
-        let found = fs::read_to_string(folder.join(INPUTS_FILE)).unwrap_or_default();
+        match role {
+            Role::Build => output::create_subfolder(&folder)?,
+            _ => ensure!(folder.join(INPUTS_FILE).exists(), not_listed(mesh_file)),
+        }
         let is_early = |entry: &fs::DirEntry| {
             let name = entry.file_name();
             name == LOCK_FILE || name.to_string_lossy().starts_with(".fpmcl-")
         };
         ensure!(
-            found.starts_with(INPUTS_START) || entries(&folder)?.iter().all(is_early),
+            inputs_in(&folder).starts_with(INPUTS_START) || entries(&folder)?.iter().all(is_early),
             "{} is needed for unfinished maps, but has files that fpmcl did not write; move it, or choose another mesh_file",
             folder.display()
         );
-        let parts = Self {
-            _lock: lock(&folder, mesh_file)?,
+        let lock = lock(&folder, mesh_file, role)?;
+        remove_abandoned(&folder).with_context(context)?;
+        Ok(Self {
+            mesh_file: mesh_file.to_owned(),
+            role,
             folder,
-        };
-        if found != inputs {
-            parts.remove_files(|name| name != LOCK_FILE)?;
-            output::write_text(&parts.folder.join(INPUTS_FILE), inputs)?;
+            lock,
+        })
+    }
+
+    /// Requires that the parts were made from `inputs`; a build deletes others.
+    pub fn keep_those_of(&self, inputs: &str) -> Result<()> {
+        if inputs_in(&self.folder) == inputs {
+            return Ok(());
         }
-        Ok(parts)
+        ensure!(self.role == Role::Build, not_listed(&self.mesh_file));
+        self.remove_parts()?;
+        output::write_text(&self.folder.join(INPUTS_FILE), inputs)
     }
 
     /// The folder of the parts.
     pub fn folder(&self) -> &Path {
         &self.folder
+    }
+
+    /// Whether a local map is finished and its mesh is there; its content is checked when the meshes are joined.
+    pub fn has(&self, number: usize) -> bool {
+        let part = self.read_counts(number);
+        part.is_ok_and(|part| part.mesh_hash.is_none() || self.mesh_file(number).exists())
     }
 
     /// The counts of a local map if it is finished, with its mesh, and made of these scans.
@@ -111,11 +155,16 @@ impl Parts {
         is_same().then_some(part.counts)
     }
 
-    /// Keeps a finished local map, after deleting one that was made of other scans, its counts first.
+    /// Deletes a local map, its counts first.
+    pub fn discard(&self, number: usize) -> Result<()> {
+        output::remove_if_exists(&self.counts_file(number))?;
+        output::remove_if_exists(&self.mesh_file(number))
+    }
+
+    /// Keeps a finished local map, after deleting one that was made of other scans.
     pub fn save(&self, number: usize, local_map: &LocalMap, scans_hash: &str) -> Result<()> {
+        self.discard(number)?;
         let (counts, mesh) = (self.counts_file(number), self.mesh_file(number));
-        output::remove_if_exists(&counts)?;
-        output::remove_if_exists(&mesh)?;
         let mut mesh_hash = None;
         if !local_map.mesh.triangles.is_empty() {
             ply::write(&mesh, &local_map.mesh, None)?;
@@ -126,43 +175,40 @@ impl Parts {
             mesh_hash,
             counts: local_map.counts.clone(),
             gone: local_map.gone.clone(),
+            origin: local_map.origin.to_array(),
         };
         output::write_json(&counts, &part)
     }
 
-    /// Joins the meshes of the local maps 0..count; an error if one is missing or damaged.
-    pub fn join(&self, count: usize) -> Result<Joined> {
-        let mut whole = Joined::default();
+    /// The meshes of the local maps 0..count, mapped into memory; an error if one is missing or damaged.
+    pub fn joined(&self, count: usize) -> Result<Joined> {
+        let (mut meshes, mut gone) = (Vec::with_capacity(count), Vec::new());
         for number in 0..count {
             let part = self.read(number).with_context(|| {
                 let folder = self.folder.display();
                 format!("{folder} has lost local map {number}; run the same command again")
             })?;
             if part.mesh_hash.is_some() {
-                whole.mesh.append(&ply::read(&self.mesh_file(number))?);
+                let path = self.mesh_file(number);
+                let mut mesh = MappedPly::open(&path)
+                    .with_context(|| format!("{} is damaged", path.display()))?;
+                mesh.origin = DVec3::from_array(part.origin);
+                meshes.push(mesh);
             }
-            whole.gone.extend(part.gone);
+            gone.extend(part.gone);
         }
-        whole.gone.sort_unstable();
-        Ok(whole)
+        gone.sort_unstable();
+        Ok(Joined { meshes, gone })
     }
 
     /// Removes the parts, and the folder unless others have files in it.
     pub fn remove(self) -> Result<()> {
-        self.remove_files(|_| true)?;
-        if fs::remove_dir(&self.folder).is_err() {
-            tracing::warn!("{} is kept: it has other files", self.folder.display());
-        }
-        Ok(())
+        self.remove_parts()
     }
 
     /// Reads a part; an error if it is missing, or its mesh is not the one that was written.
     fn read(&self, number: usize) -> Result<Part> {
-        let counts = self.counts_file(number);
-        let text =
-            fs::read(&counts).with_context(|| format!("cannot read {}", counts.display()))?;
-        let part: Part = serde_json::from_slice(&text)
-            .with_context(|| format!("{} is damaged", counts.display()))?;
+        let part = self.read_counts(number)?;
         if let Some(hash) = &part.mesh_hash {
             let mesh = self.mesh_file(number);
             ensure!(
@@ -174,13 +220,19 @@ impl Parts {
         Ok(part)
     }
 
-    /// Removes those files of this program whose names match; the inputs, which make the folder ours,
-    /// after the parts.
-    fn remove_files(&self, matches: impl Fn(&str) -> bool) -> Result<()> {
+    fn read_counts(&self, number: usize) -> Result<Part> {
+        let counts = self.counts_file(number);
+        let text =
+            fs::read(&counts).with_context(|| format!("cannot read {}", counts.display()))?;
+        serde_json::from_slice(&text).with_context(|| format!("{} is damaged", counts.display()))
+    }
+
+    /// Removes the parts, and after them the inputs, which make the folder ours.
+    fn remove_parts(&self) -> Result<()> {
         let names = entries(&self.folder)?.into_iter();
         let mut names: Vec<String> = names
             .map(|entry| entry.file_name().to_string_lossy().into_owned())
-            .filter(|name| is_ours(name) && matches(name))
+            .filter(|name| is_part(name) || name == INPUTS_FILE)
             .collect();
         names.sort();
         (names.iter()).try_for_each(|name| output::remove_if_exists(&self.folder.join(name)))
@@ -195,11 +247,16 @@ impl Parts {
     }
 }
 
-/// Whether a name is one of those in a folder of parts.
-fn is_ours(name: &str) -> bool {
+/// Whether a name is that of a file of a local map.
+fn is_part(name: &str) -> bool {
     let is_number = |stem: &str| stem.len() >= 4 && stem.bytes().all(|b| b.is_ascii_digit());
-    let is_part = |(stem, extension)| is_number(stem) && ["ply", "json"].contains(&extension);
-    [INPUTS_FILE, LOCK_FILE].contains(&name) || name.split_once('.').is_some_and(is_part)
+    (name.split_once('.'))
+        .is_some_and(|(stem, extension)| is_number(stem) && ["ply", "json"].contains(&extension))
+}
+
+/// The inputs of the parts that are in a folder.
+fn inputs_in(folder: &Path) -> String {
+    fs::read_to_string(folder.join(INPUTS_FILE)).unwrap_or_default()
 }
 
 fn entries(folder: &Path) -> Result<Vec<fs::DirEntry>> {
@@ -208,13 +265,17 @@ fn entries(folder: &Path) -> Result<Vec<fs::DirEntry>> {
 }
 
 /// Locks a folder of parts; an error if another build has locked it.
-fn lock(folder: &Path, mesh_file: &Path) -> Result<Lock> {
+fn lock(folder: &Path, mesh_file: &Path, role: Role) -> Result<Lock> {
     let path = folder.join(LOCK_FILE);
     let context = || format!("cannot lock {}", path.display());
     let file = File::create(&path).with_context(context)?;
-    match file.try_lock() {
-        // A build that has just ended removes its lock.
-        Ok(()) if path.exists() => Ok(Lock(file)),
+    let locked = match role {
+        Role::Build | Role::Collect => file.try_lock(),
+        Role::Job => file.try_lock_shared(),
+    };
+    match locked {
+        // A build that has just ended removes its lock, and another one may have made its own.
+        Ok(()) if is_at(&file, &path) => Ok(Lock(file)),
         Ok(()) | Err(TryLockError::WouldBlock) => bail!(
             "{} is being built by another build-map, which has locked {}; wait for it, or choose another mesh_file",
             mesh_file.display(),
@@ -222,6 +283,30 @@ fn lock(folder: &Path, mesh_file: &Path) -> Result<Lock> {
         ),
         Err(TryLockError::Error(error)) => Err(error).with_context(context),
     }
+}
+
+/// Whether an open file is the one of a path.
+fn is_at(file: &File, path: &Path) -> bool {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::MetadataExt as _;
+        let place = |metadata: fs::Metadata| (metadata.dev(), metadata.ino());
+        let (of_file, of_path) = (file.metadata().map(place), fs::metadata(path).map(place));
+        matches!((of_file, of_path), (Ok(a), Ok(b)) if a == b)
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = file;
+        path.exists()
+    }
+}
+
+/// Why jobs cannot be done or collected.
+pub fn not_listed(mesh_file: &Path) -> String {
+    format!(
+        "the jobs of {} were not listed with this configuration, recording and program; list them again with --list-jobs",
+        mesh_file.display()
+    )
 }
 
 /// BLAKE3 hash of a file.
@@ -265,7 +350,20 @@ mod tests {
 
     use super::*;
 
+    use crate::geometry::TriangleMesh;
+    use crate::map::mesh_view::MeshView as _;
+
     const INPUTS: &str = "# fpmcl inputs";
+
+    fn open(map: &Path, inputs: &str) -> Result<Parts> {
+        open_as(map, inputs, Role::Build)
+    }
+
+    fn open_as(map: &Path, inputs: &str, role: Role) -> Result<Parts> {
+        let parts = Parts::lock(map, role)?;
+        parts.keep_those_of(inputs)?;
+        Ok(parts)
+    }
 
     fn local_map(x: f32) -> LocalMap {
         LocalMap {
@@ -288,29 +386,29 @@ mod tests {
     fn finished_parts_are_found_again_and_joined_in_order() {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
-        let parts = Parts::open(&map, INPUTS).unwrap();
+        let parts = open(&map, INPUTS).unwrap();
         parts.save(1, &local_map(1.5), "0123").unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
 
         drop(parts);
-        let again = Parts::open(&map, INPUTS).unwrap();
+        let again = open(&map, INPUTS).unwrap();
         assert_eq!(again.finished(1, || Ok("0123".into())).unwrap().scans, 7);
         assert_eq!(again.finished(1, || Ok("4567".into())), None);
         assert_eq!(again.finished(2, || Ok("0123".into())), None);
-        let whole = again.join(2).unwrap().mesh;
-        assert_eq!(whole.vertices[0].x, 0.5);
-        assert_eq!(whole.vertices[3].x, 1.5);
+        let meshes = again.joined(2).unwrap().meshes;
+        assert_eq!(meshes[0].position(0).x, 0.5);
+        assert_eq!(meshes[1].position(0).x, 1.5);
     }
 
     #[test]
     fn parts_of_other_inputs_are_deleted() {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
-        let parts = Parts::open(&map, INPUTS).unwrap();
+        let parts = open(&map, INPUTS).unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
         drop(parts);
         assert_eq!(
-            Parts::open(&map, "# fpmcl others")
+            open(&map, "# fpmcl others")
                 .unwrap()
                 .finished(0, || Ok("0123".into())),
             None
@@ -321,12 +419,12 @@ mod tests {
     fn a_build_that_ended_is_not_locked_by_copies_of_its_lock() {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
-        let parts = Parts::open(&map, INPUTS).unwrap();
-        assert!(Parts::open(&map, INPUTS).is_err());
+        let parts = open(&map, INPUTS).unwrap();
+        assert!(open(&map, INPUTS).is_err());
         // As of a process that another thread is just starting.
-        let copy = parts._lock.0.try_clone().unwrap();
+        let copy = parts.lock.0.try_clone().unwrap();
         drop(parts);
-        assert!(Parts::open(&map, INPUTS).is_ok());
+        assert!(open(&map, INPUTS).is_ok());
         drop(copy);
     }
 
@@ -334,7 +432,7 @@ mod tests {
     fn a_mesh_without_its_counts_is_not_finished() {
         let folder = tempfile::tempdir().unwrap();
         let map = folder.path().join("map.ply");
-        let parts = Parts::open(&map, INPUTS).unwrap();
+        let parts = open(&map, INPUTS).unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
         fs::remove_file(parts.counts_file(0)).unwrap();
         assert_eq!(parts.finished(0, || Ok("0123".into())), None);
@@ -343,21 +441,23 @@ mod tests {
     #[test]
     fn counts_without_their_mesh_are_not_finished() {
         let folder = tempfile::tempdir().unwrap();
-        let parts = Parts::open(&folder.path().join("map.ply"), INPUTS).unwrap();
+        let parts = open(&folder.path().join("map.ply"), INPUTS).unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
+        assert!(parts.has(0));
         fs::remove_file(parts.mesh_file(0)).unwrap();
+        assert!(!parts.has(0));
         assert_eq!(parts.finished(0, || Ok("0123".into())), None);
     }
 
     #[test]
     fn a_truncated_mesh_is_not_finished_and_not_joined() {
         let folder = tempfile::tempdir().unwrap();
-        let parts = Parts::open(&folder.path().join("map.ply"), INPUTS).unwrap();
+        let parts = open(&folder.path().join("map.ply"), INPUTS).unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
         let bytes = fs::read(parts.mesh_file(0)).unwrap();
         fs::write(parts.mesh_file(0), &bytes[..bytes.len() - 1]).unwrap();
         assert_eq!(parts.finished(0, || Ok("0123".into())), None);
-        let message = format!("{:#}", parts.join(1).unwrap_err());
+        let message = format!("{:#}", parts.joined(1).err().unwrap());
         assert!(message.contains("has lost local map 0"), "{message}");
         assert!(message.contains("0000.ply is damaged"), "{message}");
     }
@@ -365,10 +465,46 @@ mod tests {
     #[test]
     fn an_empty_part_replaces_the_mesh_of_an_earlier_one() {
         let folder = tempfile::tempdir().unwrap();
-        let parts = Parts::open(&folder.path().join("map.ply"), INPUTS).unwrap();
+        let parts = open(&folder.path().join("map.ply"), INPUTS).unwrap();
         parts.save(0, &local_map(0.5), "0123").unwrap();
         parts.save(0, &LocalMap::default(), "").unwrap();
         assert!(parts.finished(0, || Ok("".into())).is_some());
-        assert!(parts.join(1).unwrap().mesh.triangles.is_empty());
+        assert!(parts.joined(1).unwrap().meshes.is_empty());
+    }
+
+    #[test]
+    fn jobs_share_the_parts_of_the_inputs_that_were_listed_and_of_no_others() {
+        let folder = tempfile::tempdir().unwrap();
+        let map = folder.path().join("map.ply");
+        let job = |inputs: &str| open_as(&map, inputs, Role::Job);
+        for role in [Role::Job, Role::Collect] {
+            let message = format!("{:#}", open_as(&map, INPUTS, role).err().unwrap());
+            assert!(message.contains("--list-jobs"), "{message}");
+            assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+        }
+        let parts = open(&map, INPUTS).unwrap();
+        parts.save(0, &local_map(0.5), "").unwrap();
+        drop(parts);
+        assert!(open_as(&map, "# fpmcl others", Role::Collect).is_err());
+        assert!(open_as(&map, INPUTS, Role::Collect).unwrap().has(0));
+        let jobs = [job(INPUTS).unwrap(), job(INPUTS).unwrap()];
+        assert!(job("# fpmcl others").is_err());
+        assert!(open(&map, INPUTS).is_err());
+        drop(jobs);
+        assert!(open(&map, INPUTS).is_ok());
+    }
+
+    #[test]
+    fn a_local_map_far_from_the_origin_is_joined_where_it_is() {
+        let folder = tempfile::tempdir().unwrap();
+        let parts = open(&folder.path().join("map.ply"), INPUTS).unwrap();
+        let origin = DVec3::new(1_003_520.0, -4096.0, 0.0);
+        let far = LocalMap {
+            origin,
+            ..local_map(0.25)
+        };
+        parts.save(0, &far, "").unwrap();
+        let joined = parts.joined(1).unwrap();
+        assert_eq!(joined.meshes[0].position(0), origin + DVec3::X * 0.25);
     }
 }
