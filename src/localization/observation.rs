@@ -62,9 +62,11 @@ pub struct ObservationConfig {
     #[default(3600)]
     pub beams: usize,
     /// Beams per particle, at least.
-    #[default(300)]
+    #[default(20)]
     pub min_beams: usize,
-    /// Rays per update over all particles, which limits the beams per particle.
+    /// Rays per update over all particles and rounds, which limits the beams per particle. Of the default number of
+    /// particles, places are found by 100 beams each, and the first round of a start near a known pose, whose power is
+    /// small, compares 25.
     #[default(1_000_000)]
     pub ray_budget: usize,
     /// Largest share of beams that end on the road, which looks alike everywhere (unitless).

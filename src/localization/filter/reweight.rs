@@ -55,7 +55,8 @@ impl ParticleFilter {
         let (mut power, mut round) = (0.0, 1);
         loop {
             let observation = &self.config.observation;
-            let count = observation.beams_for(self.particles.len());
+            // The rounds share the rays of the update.
+            let count = observation.beams_for(self.particles.len() * rounds);
             let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
             let refined = self.refined_attitude(scan, attitude);
             let (logs, costs_m) = self.log_likelihoods((scan, &beams), &refined)?;
