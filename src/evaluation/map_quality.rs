@@ -12,8 +12,9 @@
 //! the scan, or a hole); miss: no surface. The distance of the returns to the nearest surface shows
 //! how much of the world is in the map.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 
+use foldhash::HashMap;
 use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
 use serde::Serialize;

@@ -1,7 +1,6 @@
 //! Point clouds with normals and ground confidences.
 
-use std::collections::HashMap;
-
+use foldhash::{HashMap, HashMapExt as _};
 use glam::{IVec3, Vec3};
 
 use super::Rigid3f;

@@ -17,7 +17,7 @@ pub mod pose;
 pub mod surface_samples;
 pub mod trajectory;
 
-pub use angle::{circular_mean, wrap_angle};
+pub use angle::{circular_mean, fast_atan2, wrap_angle};
 pub use cloud::PointCloud;
 pub use degeneracy::Degeneracy;
 pub use grid::Grid2;

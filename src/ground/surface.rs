@@ -5,13 +5,14 @@
 //! least `spacing_m` away, so that noise does not tilt it; where it is missing, or so far away that
 //! it lies on another surface, the point itself takes its place.
 
-use std::f32::consts::{FRAC_PI_2, PI};
+use std::f32::consts::FRAC_PI_2;
 
 use glam::Vec3;
 use rayon::prelude::*;
 
 use super::direction_image::{Cell, DirectionImage, Return};
 use super::polar_grid::{PolarGrid, PolarPosition};
+use crate::geometry::fast_atan2;
 use crate::simd::{Simd, SimdTask, dispatch};
 
 /// Points that are processed together in vectorized loops.
@@ -188,7 +189,7 @@ impl SimdTask for LocationTask<'_> {
             let directions = distances_m.iter_mut().zip(&mut azimuths_rad);
             for ((distance_m, azimuth_rad), point) in directions.zip(points) {
                 *distance_m = point.truncate().length();
-                *azimuth_rad = coarse_atan2(point.y, point.x);
+                *azimuth_rad = fast_atan2(point.y, point.x);
             }
             for (i, point) in points.iter().enumerate() {
                 let (distance_m, azimuth_rad) = (distances_m[i], azimuths_rad[i]);
@@ -320,13 +321,13 @@ impl<const N: usize> Surfaces<N> {
             let x = a[1][i] * b[2][i] - a[2][i] * b[1][i];
             let y = a[2][i] * b[0][i] - a[0][i] * b[2][i];
             let z = a[0][i] * b[1][i] - a[1][i] * b[0][i];
-            slopes[i] = coarse_atan2((x * x + y * y).sqrt(), z.abs());
+            slopes[i] = fast_atan2((x * x + y * y).sqrt(), z.abs());
         }
         let (a, b) = (&self.before, &self.after);
         for i in 0..N {
             let (run, next_run) = (a[0][i].sqrt(), b[0][i].sqrt());
             let (rise, next_rise) = (a[1][i], b[1][i]);
-            bends[i] = coarse_atan2(
+            bends[i] = fast_atan2(
                 run * next_rise - rise * next_run,
                 run * next_run + rise * next_rise,
             );
@@ -336,23 +337,4 @@ impl<const N: usize> Surfaces<N> {
             curvature_rad: bends[i],
         })
     }
-}
-
-/// `atan2` to 2e-4 rad, which suffices to choose a cell; several times faster than the exact one.
-#[inline(always)]
-fn coarse_atan2(y: f32, x: f32) -> f32 {
-    let (ax, ay) = (x.abs(), y.abs());
-    // Selections instead of branches, so that loops over it are vectorized.
-    let (small, large) = if ay < ax { (ay, ax) } else { (ax, ay) };
-    let large = if large > f32::MIN_POSITIVE {
-        large
-    } else {
-        f32::MIN_POSITIVE
-    };
-    let t = small / large;
-    let s = t * t;
-    let octant = t * (0.999_787_8 + s * (-0.325_808_4 + s * (0.155_557_6 - s * 0.044_326_12)));
-    let quadrant = if ay < ax { octant } else { FRAC_PI_2 - octant };
-    let half = if x < 0.0 { PI - quadrant } else { quadrant };
-    half.copysign(y)
 }

@@ -1,6 +1,7 @@
 //! The sensor: projection model, scans, motion compensation, range images and their normals.
 
 pub mod deskewing;
+mod lanes;
 pub mod model;
 pub mod normals;
 pub mod projection;

@@ -18,8 +18,9 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
+use super::lanes::{LANES, Lanes, PlaneSumsOfLanes, dot, lanes, unit_cross};
 use super::range_image::RangeImage;
-use crate::geometry::PlaneSums;
+use crate::simd::{Simd, SimdTask, dispatch};
 use crate::validation::{
     InvalidValue, Validate, fraction, in_range, not_negative, positive, require,
 };
@@ -71,176 +72,314 @@ impl Validate for NormalConfig {
     }
 }
 
-/// Largest stride between the pixels of a neighborhood.
-const MAX_STRIDE: isize = 4;
-/// Column and row offsets of the eight outer neighbors, clockwise.
-const OUTER: [(isize, isize); 8] = [
-    (0, -1),
-    (1, -1),
-    (1, 0),
-    (1, 1),
-    (0, 1),
-    (-1, 1),
-    (-1, 0),
-    (-1, -1),
-];
-
 /// Unit normals in the lidar frame, towards the sensor, one per pixel, row-major; `None` where
 /// there is no return or no plane with enough inliers.
 pub fn estimate_normals(image: &RangeImage, config: &NormalConfig) -> Vec<Option<Vec3>> {
-    (0..image.model.height)
-        .into_par_iter()
-        .flat_map_iter(|row| {
-            let spacing_rad = image.model.row_spacing_rad(row);
-            (0..image.model.width)
-                .map(move |column| normal_at(image, config, [row, column], spacing_rad))
+    let returns = Returns::of(image);
+    let mut normals = vec![None; image.ranges.len()];
+    let rows = normals.par_chunks_mut(image.model.width);
+    rows.enumerate().for_each(|(row, normals)| {
+        let spacing_rad = [
+            image.model.row_spacing_rad(row),
+            std::f32::consts::TAU / image.model.width as f32,
+        ];
+        dispatch(RowTask {
+            returns: &returns,
+            config,
+            row,
+            spacing_rad,
+            normals,
+        });
+    });
+    normals
+}
+
+/// The normals of a row of pixels.
+struct RowTask<'a> {
+    returns: &'a Returns,
+    config: &'a NormalConfig,
+    row: usize,
+    /// Between rows and columns.
+    spacing_rad: [f32; 2],
+    normals: &'a mut [Option<Vec3>],
+}
+
+impl SimdTask for RowTask<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        for (group, normals) in self.normals.chunks_mut(LANES).enumerate() {
+            let first = self.returns.index_of(self.row, group * LANES);
+            let point = self.returns.points_from(first);
+            let found = normals_of(self.returns, self.config, first, &point, self.spacing_rad);
+            for (lane, normal) in normals.iter_mut().enumerate() {
+                let found = Vec3::new(found[0][lane], found[1][lane], found[2][lane]);
+                *normal = Some(found).filter(|normal| !normal.is_nan());
+            }
+        }
+    }
+}
+
+/// Normals of the pixels from `first` on; NaN where there is none.
+#[inline(always)]
+fn normals_of(
+    returns: &Returns,
+    config: &NormalConfig,
+    first: usize,
+    point: &[Lanes; 3],
+    spacing_rad: [f32; 2],
+) -> [Lanes; 3] {
+    let range_m = lanes(|lane| {
+        let [x, y, z] = [point[0][lane], point[1][lane], point[2][lane]];
+        (x * x + y * y + z * z).sqrt()
+    });
+    // Where there is no return, NaN becomes 1.
+    let strides = spacing_rad.map(|angle_rad| {
+        range_m.map(|range_m| {
+            ((config.spacing_m / (range_m * angle_rad)).round() as usize).clamp(1, MAX_STRIDE)
         })
-        .collect()
+    });
+    let neighborhood = Neighborhood::gather(returns, first, point, &strides);
+    let tolerance_m = |normal: &[Lanes; 3]| {
+        lanes(|lane| {
+            let cosine = dot(normal, point, lane).abs() / range_m[lane];
+            let across_m = config.tolerance_m + config.relative_tolerance * range_m[lane];
+            across_m.min(config.beam_tolerance_m * cosine)
+        })
+    };
+    let hypothesis = neighborhood.best_plane(tolerance_m);
+    let inliers = neighborhood.inliers(&hypothesis, &tolerance_m(&hypothesis));
+    let planes = inliers.fit();
+    let mut normals = planes.normals;
+    for lane in 0..LANES {
+        let cosine = -dot(&normals, point, lane) / range_m[lane];
+        let least = (config.min_share * neighborhood.count[lane]).floor();
+        let is_found = inliers.count[lane] - 1.0 >= least.max(config.min_support as f32)
+            // The tilt of a strip hardly wider than the noise is undetermined.
+            && planes.middle[lane] >= 4.0 * planes.smallest[lane]
+            && cosine.abs() >= config.min_incidence;
+        let sign = if is_found { cosine.signum() } else { f32::NAN };
+        for axis in &mut normals {
+            axis[lane] *= sign;
+        }
+    }
+    normals
 }
 
 /// Most returns around a pixel.
 const NEIGHBORS: usize = 24;
+/// Rows down and columns to the right of a pixel, in strides.
+const OFFSETS: [[isize; 2]; NEIGHBORS] = {
+    let mut offsets = [[0; 2]; NEIGHBORS];
+    let mut number = 0;
+    while number < NEIGHBORS {
+        let cell = if number < NEIGHBORS / 2 {
+            number
+        } else {
+            number + 1
+        };
+        offsets[number] = [(cell / 5) as isize - 2, (cell % 5) as isize - 2];
+        number += 1;
+    }
+    offsets
+};
+/// The eight directions around a pixel, clockwise: number of the outer neighbor and of the one before it.
+const AROUND: [[usize; 2]; 8] = [
+    [2, 7],
+    [4, 8],
+    [13, 12],
+    [23, 17],
+    [21, 16],
+    [19, 15],
+    [10, 11],
+    [0, 6],
+];
 
-/// The returns around a pixel, relative to its own.
+/// The returns around some pixels, relative to theirs.
 struct Neighborhood {
-    /// x, y and z; far away where there is no return.
-    offsets: [[f32; NEIGHBORS]; 3],
-    count: usize,
-    outer: [Option<Vec3>; 8],
-}
-
-fn normal_at(
-    image: &RangeImage,
-    config: &NormalConfig,
-    [row, column]: [usize; 2],
-    row_spacing_rad: f32,
-) -> Option<Vec3> {
-    let index = row * image.model.width + column;
-    if !image.has_return(index) {
-        return None;
-    }
-    let (point, range_m) = (image.points[index], image.ranges[index]);
-    let stride = |angle_rad: f32| {
-        ((config.spacing_m / (range_m * angle_rad)).round() as isize).clamp(1, MAX_STRIDE)
-    };
-    let column_spacing_rad = std::f32::consts::TAU / image.model.width as f32;
-    let strides = [stride(row_spacing_rad), stride(column_spacing_rad)];
-    let neighborhood = Neighborhood::gather(image, [row as isize, column as isize], strides);
-    let tolerance_m = |normal: Vec3| {
-        let cosine = normal.dot(point).abs() / range_m;
-        let across_m = config.tolerance_m + config.relative_tolerance * range_m;
-        across_m.min(config.beam_tolerance_m * cosine)
-    };
-    let hypothesis = neighborhood.best_plane(tolerance_m)?;
-    let tolerance_m = tolerance_m(hypothesis);
-    let min_inliers = config
-        .min_support
-        .max((config.min_share * neighborhood.count as f32) as usize);
-
-    let mut sums = PlaneSums::about(point);
-    sums.add(point);
-    let mut inliers = 0;
-    let distances_m = neighborhood.distances_m(hypothesis);
-    for (number, distance_m) in distances_m[..neighborhood.count].iter().enumerate() {
-        if *distance_m < tolerance_m {
-            let [x, y, z] = neighborhood.offsets.map(|axis| axis[number]);
-            sums.add(point + Vec3::new(x, y, z));
-            inliers += 1;
-        }
-    }
-    let plane = sums.fit().filter(|_| inliers >= min_inliers)?;
-    // The tilt of a strip hardly wider than the noise is undetermined.
-    if plane.variances[1] < 4.0 * plane.variances[0] {
-        return None;
-    }
-    let cosine = -plane.normal.dot(point) / range_m;
-    (cosine.abs() >= config.min_incidence).then_some(plane.normal * cosine.signum())
+    /// x, y and z; NaN where there is no return.
+    offsets: [[Lanes; NEIGHBORS]; 3],
+    count: Lanes,
 }
 
 impl Neighborhood {
-    /// The returns of every `strides`-th row and column around one.
-    fn gather(image: &RangeImage, [row, column]: [isize; 2], strides: [isize; 2]) -> Self {
-        /// So far away that it supports no plane [m].
-        const NOWHERE_M: f32 = 1e9;
-        let (height, width) = (image.model.height as isize, image.model.width as isize);
-        let point = image.points[(row * width + column) as usize];
-        let offsets = [-2, -1, 0, 1, 2_isize];
-        let columns = offsets.map(|right| (column + right * strides[1]).rem_euclid(width));
-        let mut found = Self {
-            offsets: [[NOWHERE_M; NEIGHBORS]; 3],
-            count: 0,
-            outer: [None; 8],
-        };
-        let mut grid = [[None; 5]; 5];
-        for (down, line) in grid.iter_mut().enumerate() {
-            let row = row + offsets[down] * strides[0];
-            if !(0..height).contains(&row) {
-                continue;
+    /// The returns of every `strides`-th row and column around the pixels from `first` on.
+    #[inline(always)]
+    fn gather(
+        returns: &Returns,
+        first: usize,
+        point: &[Lanes; 3],
+        [rows, columns]: &[[usize; LANES]; 2],
+    ) -> Self {
+        let mut offsets = [[[0.0; LANES]; NEIGHBORS]; 3];
+        let are_alike = rows.iter().all(|row| row == &rows[0])
+            && columns.iter().all(|column| column == &columns[0]);
+        for (number, &[down, right]) in OFFSETS.iter().enumerate() {
+            let index = |lane: usize| {
+                let [row, column] = [rows[lane] as isize, columns[lane] as isize];
+                let offset = down * row * returns.width as isize + right * column;
+                (first + lane).wrapping_add_signed(offset)
+            };
+            for axis in 0..3 {
+                let returns = &returns.axes[axis];
+                let neighbors = if are_alike {
+                    let mut neighbors = [0.0; LANES];
+                    neighbors.copy_from_slice(&returns[index(0)..][..LANES]);
+                    neighbors
+                } else {
+                    lanes(|lane| returns[index(lane)])
+                };
+                offsets[axis][number] = lanes(|lane| neighbors[lane] - point[axis][lane]);
             }
-            for (right, cell) in line.iter_mut().enumerate() {
-                let index = (row * width + columns[right]) as usize;
-                if [down, right] == [2, 2] || !image.has_return(index) {
-                    continue;
+        }
+        let mut count = [0.0; LANES];
+        for x in &offsets[0] {
+            for lane in 0..LANES {
+                count[lane] += if x[lane].is_nan() { 0.0 } else { 1.0 };
+            }
+        }
+        Self { offsets, count }
+    }
+
+    /// A neighbor in one of the directions around a pixel: the outer one, or else the inner one.
+    #[inline(always)]
+    fn around(&self, direction: usize) -> [Lanes; 3] {
+        let [outer, inner] = AROUND[direction % AROUND.len()];
+        let has_outer = &self.offsets[0][outer];
+        std::array::from_fn(|axis| {
+            let [outer, inner] = [&self.offsets[axis][outer], &self.offsets[axis][inner]];
+            lanes(|lane| {
+                if has_outer[lane].is_nan() {
+                    inner[lane]
+                } else {
+                    outer[lane]
                 }
-                let offset = image.points[index] - point;
-                *cell = Some(offset);
-                found.offsets[0][found.count] = offset.x;
-                found.offsets[1][found.count] = offset.y;
-                found.offsets[2][found.count] = offset.z;
-                found.count += 1;
-            }
-        }
-        for (outer, (right, down)) in found.outer.iter_mut().zip(OUTER) {
-            let at =
-                |radius: isize| grid[(2 + radius * down) as usize][(2 + radius * right) as usize];
-            *outer = at(2).or(at(1));
-        }
-        found
+            })
+        })
     }
 
-    /// Distances to the plane through the pixel's return with a unit normal [m].
-    fn distances_m(&self, normal: Vec3) -> [f32; NEIGHBORS] {
-        let [x, y, z] = &self.offsets;
-        let mut distances_m = [0.0; NEIGHBORS];
-        for number in 0..NEIGHBORS {
-            let along = normal.x * x[number] + normal.y * y[number] + normal.z * z[number];
-            distances_m[number] = along.abs();
-        }
-        distances_m
-    }
-
-    /// The unit normal of the plane through the pixel's return that has the largest support.
-    fn best_plane(&self, tolerance_m: impl Fn(Vec3) -> f32) -> Option<Vec3> {
-        /// Sums that are made side by side.
-        const LANES: usize = 8;
+    /// The unit normals of the planes through the returns of the pixels that have the largest support; NaN without any.
+    #[inline(always)]
+    fn best_plane(&self, tolerance_m: impl Fn(&[Lanes; 3]) -> Lanes) -> [Lanes; 3] {
         /// With this share of the largest possible support, others are not tried: they have about the same inliers.
         const ENOUGH: f32 = 0.8;
-        let mut best = (0.0, None);
-        for first in 0..8 {
-            let (Some(a), Some(b)) = (self.outer[first], self.outer[(first + 2) % 8]) else {
-                continue;
-            };
-            let Some(normal) = a.cross(b).try_normalize() else {
-                continue;
-            };
-            let per_tolerance = 1.0 / tolerance_m(normal);
-            let distances_m = self.distances_m(normal);
-            let mut sums = [0.0_f32; LANES];
-            for distances_m in distances_m.chunks_exact(LANES) {
+        // Infinite where no other plane is tried.
+        let mut most = self
+            .count
+            .map(|count| if count > 0.0 { 0.0 } else { f32::INFINITY });
+        let mut best = [[f32::NAN; LANES]; 3];
+        for direction in 0..AROUND.len() {
+            let normal = unit_cross(&self.around(direction), &self.around(direction + 2));
+            let tolerance_m = tolerance_m(&normal);
+            let mut support = [0.0; LANES];
+            for number in 0..NEIGHBORS {
                 for lane in 0..LANES {
-                    let support = 1.0 - distances_m[lane] * per_tolerance;
-                    sums[lane] += if support > 0.0 { support } else { 0.0 };
+                    let distance_m = self.along(&normal, number, lane).abs();
+                    let share = 1.0 - distance_m / tolerance_m[lane];
+                    support[lane] += if share > 0.0 { share } else { 0.0 };
                 }
             }
-            let support: f32 = sums.iter().sum();
-            if support > best.0 {
-                best = (support, Some(normal));
+            for lane in 0..LANES {
+                let is_better = support[lane] > most[lane];
+                for axis in 0..3 {
+                    best[axis][lane] = if is_better {
+                        normal[axis][lane]
+                    } else {
+                        best[axis][lane]
+                    };
+                }
+                let is_enough = support[lane] > ENOUGH * self.count[lane];
+                let support = if is_enough {
+                    f32::INFINITY
+                } else {
+                    support[lane]
+                };
+                most[lane] = if is_better { support } else { most[lane] };
             }
-            if support > ENOUGH * self.count as f32 {
+            if most.iter().all(|&most| most == f32::INFINITY) {
                 break;
             }
         }
-        best.1
+        best
+    }
+
+    /// Sums of the inliers of planes, and of the returns of the pixels themselves.
+    #[inline(always)]
+    fn inliers(&self, normal: &[Lanes; 3], tolerance_m: &Lanes) -> PlaneSumsOfLanes {
+        let mut sums = PlaneSumsOfLanes::of_origin();
+        for number in 0..NEIGHBORS {
+            let (mut weight, mut inlier) = ([0.0; LANES], [[0.0; LANES]; 3]);
+            for lane in 0..LANES {
+                let is_inlier = self.along(normal, number, lane).abs() < tolerance_m[lane];
+                weight[lane] = if is_inlier { 1.0 } else { 0.0 };
+                for (inlier, offsets) in inlier.iter_mut().zip(&self.offsets) {
+                    inlier[lane] = if is_inlier {
+                        offsets[number][lane]
+                    } else {
+                        0.0
+                    };
+                }
+            }
+            sums.add(&weight, &inlier);
+        }
+        sums
+    }
+
+    /// Signed distance of a neighbor to the plane through the pixel's return with a unit normal [m].
+    #[inline(always)]
+    fn along(&self, normal: &[Lanes; 3], number: usize, lane: usize) -> f32 {
+        let [x, y, z] = &self.offsets;
+        normal[0][lane] * x[number][lane]
+            + normal[1][lane] * y[number][lane]
+            + normal[2][lane] * z[number][lane]
+    }
+}
+
+/// Largest stride between the pixels of a neighborhood.
+const MAX_STRIDE: usize = 4;
+/// Rows and columns around an image that neighborhoods reach.
+const MARGIN: usize = 2 * MAX_STRIDE;
+
+/// The returns of an image, an axis after the other, with margins: the columns go on around the sensor, and above and below
+/// there are no returns.
+struct Returns {
+    /// Row-major; NaN where there is no return [m].
+    axes: [Vec<f32>; 3],
+    /// With margins.
+    width: usize,
+}
+
+impl Returns {
+    fn of(image: &RangeImage) -> Self {
+        let (height, own_width) = (image.model.height, image.model.width);
+        // The last group of a row may reach beyond it.
+        let width = own_width + 2 * MARGIN + LANES;
+        let mut axes: [Vec<f32>; 3] =
+            std::array::from_fn(|_| vec![f32::NAN; (height + 2 * MARGIN) * width]);
+        for row in 0..height {
+            let columns = (0..own_width).cycle();
+            let columns = columns.skip((own_width - MARGIN % own_width) % own_width);
+            for (column, own_column) in columns.take(width).enumerate() {
+                let own = row * own_width + own_column;
+                if image.has_return(own) {
+                    let index = (row + MARGIN) * width + column;
+                    for (axis, number) in axes.iter_mut().zip(image.points[own].to_array()) {
+                        axis[index] = number;
+                    }
+                }
+            }
+        }
+        Self { axes, width }
+    }
+
+    /// Index of a pixel of the image.
+    fn index_of(&self, row: usize, column: usize) -> usize {
+        (row + MARGIN) * self.width + MARGIN + column
+    }
+
+    /// The returns of the pixels from `first` on.
+    #[inline(always)]
+    fn points_from(&self, first: usize) -> [Lanes; 3] {
+        std::array::from_fn(|axis| lanes(|lane| self.axes[axis][first + lane]))
     }
 }
 
@@ -251,6 +390,7 @@ mod tests {
 
     use super::*;
     use crate::lidar::{LidarModel, NO_RETURN};
+    use crate::simd::Baseline;
 
     /// The image of a scene given as the range along a unit direction.
     fn image_of(range_along: impl Fn(Vec3) -> f32) -> RangeImage {
@@ -371,6 +511,45 @@ mod tests {
                 .iter()
                 .all(Option::is_none)
         );
+    }
+
+    #[test]
+    fn all_instruction_sets_give_the_same_normals() {
+        let image = image_of(ground_and_wall);
+        let config = NormalConfig::default();
+        let returns = Returns::of(&image);
+        let width = image.model.width;
+        for (row, best) in estimate_normals(&image, &config).chunks(width).enumerate() {
+            let mut normals = vec![None; width];
+            let spacing_rad = [
+                image.model.row_spacing_rad(row),
+                std::f32::consts::TAU / width as f32,
+            ];
+            let task = RowTask {
+                returns: &returns,
+                config: &config,
+                row,
+                spacing_rad,
+                normals: &mut normals,
+            };
+            task.run(Baseline);
+            assert_eq!(normals, best);
+        }
+    }
+
+    #[test]
+    fn narrow_images_have_the_normals_of_their_pixels() {
+        // Fewer columns than a neighborhood or a group has.
+        let model = LidarModel {
+            width: 5,
+            ..LidarModel::default()
+        };
+        let ranges = vec![9.0; model.len()];
+        let normals = estimate_normals(
+            &RangeImage::from_ranges(ranges, &model),
+            &NormalConfig::default(),
+        );
+        assert_eq!(normals.len(), model.len());
     }
 
     #[test]

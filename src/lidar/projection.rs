@@ -6,7 +6,7 @@
 use std::f32::consts::PI;
 
 use super::model::LidarModel;
-use crate::geometry::Vec3;
+use crate::geometry::{Vec3, fast_atan2};
 
 /// Entries of the table over the sines from 1 to −1.
 const CELLS: usize = 2048;
@@ -47,8 +47,14 @@ impl Projection {
     /// view.
     #[inline]
     pub fn pixel_of(&self, direction: Vec3) -> Option<usize> {
-        let row = self.row_of(direction.z / direction.length())?;
-        let azimuth_rad = direction.y.atan2(direction.x);
+        let azimuth_rad = fast_atan2(direction.y, direction.x);
+        self.pixel_at(direction.z / direction.length(), azimuth_rad)
+    }
+
+    /// The same of the sine of an elevation and an azimuth.
+    #[inline]
+    pub(crate) fn pixel_at(&self, sine: f32, azimuth_rad: f32) -> Option<usize> {
+        let row = self.row_of(sine)?;
         let column = 0.5 * (1.0 - azimuth_rad / PI) * self.width as f32;
         // An azimuth of exactly -π wraps to column 0.
         Some(row * self.width + column as usize % self.width)

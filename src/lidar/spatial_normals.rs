@@ -5,9 +5,9 @@
 //! components, and once more to the points that are within the tolerance of the first one. There is no normal where
 //! few points are, where they are not in a plane, or where they are in a line.
 
-use std::collections::HashMap;
 use std::ops::Range;
 
+use foldhash::HashMap;
 use glam::{IVec3, Vec3};
 use rayon::prelude::*;
 

@@ -1,8 +1,7 @@
 //! Agreement of neighbouring scans at their poses: wrong poses are found before a surface is made of
 //! them.
 
-use std::collections::HashMap;
-
+use foldhash::{HashMap, HashMapExt as _};
 use glam::{IVec3, Vec3};
 use rayon::prelude::*;
 

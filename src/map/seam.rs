@@ -10,9 +10,9 @@
 //! columns of the grid, then into rows. An edge is divided in the same order in both of its triangles,
 //! so that both get identical new vertices.
 
-use std::collections::HashMap;
 use std::ops::{Range, RangeInclusive};
 
+use foldhash::{HashMap, HashMapExt as _};
 use glam::{DVec3, Vec3};
 
 use super::plan::Region;

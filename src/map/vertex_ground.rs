@@ -4,8 +4,7 @@
 //! interpolated between the colours of rest and ground and changes sides at the threshold: the stronger
 //! of the two shows the classification.
 
-use std::collections::HashMap;
-
+use foldhash::{HashMap, HashMapExt as _};
 use glam::{IVec3, Vec3};
 use rayon::prelude::*;
 

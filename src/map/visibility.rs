@@ -25,9 +25,10 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::scan_cloud::ScanCloud;
-use crate::geometry::TriangleMesh;
+use crate::geometry::{TriangleMesh, fast_atan2};
 use crate::lidar::{LidarModel, Projection};
 use crate::raycasting::Scene;
+use crate::simd::{Simd, SimdTask, WIDE, dispatch};
 use crate::validation::{InvalidValue, Validate, at_least_one, in_range, not_negative};
 
 /// Parameters of free-space voting.
@@ -99,35 +100,124 @@ pub fn static_points(
 ) -> Vec<Vec<bool>> {
     let voters = spread(scans.len(), config.point_voters);
     let projection = Projection::of(model);
-    scans
-        .par_iter()
-        .enumerate()
-        .map(|(own, scan)| {
-            scan.cloud
-                .positions
+    let is_static = |(own, scan): (usize, &ScanCloud)| {
+        let points = &scan.cloud.positions;
+        let mut votes = vec![PointVotes::default(); points.len()];
+        for (number, &voter) in voters
+            .iter()
+            .enumerate()
+            .filter(|&(_, &voter)| voter != own)
+        {
+            dispatch(PointTask {
+                voter: Voter {
+                    scan: &scans[voter],
+                    projection: &projection,
+                    model,
+                    config,
+                },
+                left: (voters.len() - number) as u32,
+                points,
+                votes: &mut votes,
+            });
+        }
+        votes
+            .iter()
+            .map(|votes| votes.is_static(0, config))
+            .collect()
+    };
+    scans.par_iter().enumerate().map(is_static).collect()
+}
+
+/// Votes of scans on a point.
+#[derive(Clone, Copy, Default)]
+struct PointVotes {
+    through: u32,
+    seen: u32,
+}
+
+impl PointVotes {
+    /// Whether the point is static whatever `left` more scans vote.
+    #[inline(always)]
+    fn is_static(&self, left: u32, config: &VisibilityConfig) -> bool {
+        let most = self.through + left;
+        most < config.point_votes || 2 * most <= self.seen
+    }
+}
+
+/// The votes of a scan on the points of another one.
+struct PointTask<'a> {
+    voter: Voter<'a>,
+    /// Number of scans that have not voted.
+    left: u32,
+    points: &'a [Vec3],
+    votes: &'a mut [PointVotes],
+}
+
+impl SimdTask for PointTask<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let map_from_lidar = &self.voter.scan.map_from_lidar;
+        let lidar_from_map = map_from_lidar.rotation.transpose();
+        let groups = self.points.chunks(WIDE).zip(self.votes.chunks_mut(WIDE));
+        for (points, votes) in groups {
+            if votes
                 .iter()
-                .map(|&point| {
-                    let (mut through, mut seen) = (0_u32, 0_u32);
-                    for (number, &voter) in voters.iter().enumerate() {
-                        // Whatever the others vote, the point is static.
-                        let most = through + (voters.len() - number) as u32;
-                        if most < config.point_votes || 2 * most <= seen {
-                            break;
-                        }
-                        if voter == own {
-                            continue;
-                        }
-                        match vote(&scans[voter], point, model, &projection, config) {
-                            Vote::Through => through += 1,
-                            Vote::Seen => seen += 1,
-                            Vote::Unknown => {}
-                        }
-                    }
-                    through < config.point_votes || 2 * through <= seen
-                })
-                .collect()
-        })
-        .collect()
+                .all(|votes| votes.is_static(self.left, self.voter.config))
+            {
+                continue;
+            }
+            let mut of_points = [Vec3::ZERO; WIDE];
+            of_points[..points.len()].copy_from_slice(points);
+            let (mut range_m, mut sine, mut azimuth_rad) = ([0.0; WIDE], [0.0; WIDE], [0.0; WIDE]);
+            for lane in 0..WIDE {
+                let point = lidar_from_map * (of_points[lane] - map_from_lidar.translation);
+                range_m[lane] = point.length();
+                sine[lane] = point.z / range_m[lane];
+                azimuth_rad[lane] = fast_atan2(point.y, point.x);
+            }
+            for (lane, votes) in votes.iter_mut().enumerate() {
+                match self
+                    .voter
+                    .vote(range_m[lane], sine[lane], azimuth_rad[lane])
+                {
+                    Vote::Through => votes.through += 1,
+                    Vote::Seen => votes.seen += 1,
+                    Vote::Unknown => {}
+                }
+            }
+        }
+    }
+}
+
+/// A scan that votes on points.
+struct Voter<'a> {
+    scan: &'a ScanCloud,
+    projection: &'a Projection,
+    model: &'a LidarModel,
+    config: &'a VisibilityConfig,
+}
+
+impl Voter<'_> {
+    /// Vote on a point by where it is in the frame of the lidar.
+    #[inline(always)]
+    fn vote(&self, range_m: f32, sine: f32, azimuth_rad: f32) -> Vote {
+        const SEEN_WITHIN_M: f32 = 0.3;
+        if !self.model.accepts_range(range_m) {
+            return Vote::Unknown;
+        }
+        let Some(pixel) = self.projection.pixel_at(sine, azimuth_rad) else {
+            return Vote::Unknown;
+        };
+        let free_m = self.scan.free_range_m[pixel];
+        let margin_m = self.config.point_margin_m + self.config.point_margin_per_range * range_m;
+        if free_m > range_m + margin_m {
+            Vote::Through
+        } else if (free_m - range_m).abs() < SEEN_WITHIN_M {
+            Vote::Seen
+        } else {
+            Vote::Unknown
+        }
+    }
 }
 
 /// Returns at most `most` of `count` indices, evenly spread.
@@ -143,34 +233,6 @@ enum Vote {
     Through,
     Seen,
     Unknown,
-}
-
-/// Vote of a scan on a point of the map.
-fn vote(
-    scan: &ScanCloud,
-    point: Vec3,
-    model: &LidarModel,
-    projection: &Projection,
-    config: &VisibilityConfig,
-) -> Vote {
-    const SEEN_WITHIN_M: f32 = 0.3;
-    let point_in_lidar =
-        scan.map_from_lidar.rotation.transpose() * (point - scan.map_from_lidar.translation);
-    let range_m = point_in_lidar.length();
-    if !model.accepts_range(range_m) {
-        return Vote::Unknown;
-    }
-    let Some(pixel) = projection.pixel_of(point_in_lidar) else {
-        return Vote::Unknown;
-    };
-    let free_m = scan.free_range_m[pixel];
-    if free_m > range_m + config.point_margin_m + config.point_margin_per_range * range_m {
-        Vote::Through
-    } else if (free_m - range_m).abs() < SEEN_WITHIN_M {
-        Vote::Seen
-    } else {
-        Vote::Unknown
-    }
 }
 
 /// Removes the triangles that beams pass through; returns their number.

@@ -4,8 +4,7 @@
 //! then bent: a pose graph over its local maps, the motions between them, its loops and the map, with a robust kernel for
 //! loops and for poses in the map. A pose in the map counts if the map has the surfaces around it, as those of a loop.
 
-use std::collections::HashSet;
-
+use foldhash::HashSet;
 use glam::{DVec3, IVec3};
 
 use super::drive::{Drive, LocalMap, POINT_BYTES, SHORTER};
@@ -13,7 +12,7 @@ use super::loops::{Loop, LoopVerdict, MIN_COMMON, common_share};
 use super::odometer::OdometryEstimate;
 use super::path_graph::{LOCAL_MAP, move_along, odometry_edges};
 use super::pose_graph::{Edge, information, optimize};
-use super::voxel_map::{CellHasher, VoxelMap, pack};
+use super::voxel_map::{VoxelMap, pack};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::memory::{self, MemoryError};
 
@@ -183,7 +182,7 @@ fn surface_points(
     spacing_m: f64,
 ) -> Result<Vec<DVec3>, MemoryError> {
     let cell_of = |point: DVec3| (point / drive.range_m).floor().as_ivec3();
-    let mut near = HashSet::<u64, CellHasher>::default();
+    let mut near = HashSet::<u64>::default();
     for pose in &drive.poses {
         let center = cell_of(pose.translation.vector.into());
         for index in 0..27 {
@@ -196,7 +195,7 @@ fn surface_points(
     let positions = || (drive.poses.iter()).map(|pose| DVec3::from(pose.translation.vector));
     let low = positions().fold(DVec3::INFINITY, DVec3::min) - 2.0 * drive.range_m;
     let high = positions().fold(DVec3::NEG_INFINITY, DVec3::max) + 2.0 * drive.range_m;
-    let mut occupied = HashSet::<u64, CellHasher>::default();
+    let mut occupied = HashSet::<u64>::default();
     let mut points = vec![];
     for triangle in 0..mesh.triangles.len() {
         let [a, b, c] = mesh.corners(triangle).map(glam::Vec3::as_dvec3);

@@ -1,11 +1,10 @@
 //! Points of a scan for the odometry: valid ones, thinned to one per voxel.
 
-use std::collections::HashSet;
-
+use foldhash::HashSet;
 use glam::{DMat3, DQuat, DVec3, Vec3};
 
 use super::config::OdometryConfig;
-use super::voxel_map::{CellHasher, pack};
+use super::voxel_map::pack;
 use crate::geometry::Pose3;
 use crate::lidar::{Motion, Scan, Sweep};
 
@@ -87,7 +86,7 @@ impl Sample {
 /// The first point in each voxel.
 pub fn first_per_voxel(points: impl Iterator<Item = TimedPoint>, voxel_m: f64) -> Vec<TimedPoint> {
     let per_m = (1.0 / voxel_m) as f32;
-    let mut occupied = HashSet::<u64, CellHasher>::default();
+    let mut occupied = HashSet::<u64>::default();
     points
         .filter(|point| occupied.insert(pack((point.position * per_m).floor().as_ivec3())))
         .collect()

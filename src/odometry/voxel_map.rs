@@ -8,36 +8,10 @@
 //! voxel from the middle of its block. The finest block whose points form a plane is the surface near the
 //! point: variances λ₀ ≪ λ₁, and λ₁ not ≪ λ₂, as it would be on a single ring.
 
-use std::collections::HashMap;
-use std::hash::{BuildHasherDefault, Hasher};
-
+use foldhash::HashMap;
 use glam::{DMat3, DVec3, IVec3, Vec3};
 
 use crate::geometry::PlaneSums;
-
-/// Hasher of packed voxel coordinates.
-#[derive(Clone, Default)]
-pub struct PackedHasher(u64);
-
-/// Builds a [`PackedHasher`].
-pub type CellHasher = BuildHasherDefault<PackedHasher>;
-
-impl Hasher for PackedHasher {
-    fn finish(&self) -> u64 {
-        self.0
-    }
-
-    fn write(&mut self, bytes: &[u8]) {
-        for &byte in bytes {
-            self.write_u64(self.0 ^ u64::from(byte));
-        }
-    }
-
-    fn write_u64(&mut self, key: u64) {
-        let product = key.wrapping_mul(0x9E37_79B9_7F4A_7C15);
-        self.0 = product ^ (product >> 32);
-    }
-}
 
 /// Voxel coordinates as one number; they wrap after two million voxels.
 pub fn pack(cell: IVec3) -> u64 {
@@ -90,7 +64,7 @@ impl Cell {
 #[derive(Clone, Debug)]
 struct Level {
     edge_m: f64,
-    cells: HashMap<u64, Cell, CellHasher>,
+    cells: HashMap<u64, Cell>,
 }
 
 /// The surface near a point.

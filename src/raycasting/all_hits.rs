@@ -10,7 +10,7 @@ use super::single::SingleRay;
 use super::traversal::Traverse;
 use super::triangle::TriangleBlock;
 use super::wide::{BoxGrid, CHILDREN, WideNode};
-use crate::simd::Baseline;
+use crate::simd::Simd;
 
 /// A ray that visits all its hits: their ranges and places.
 pub(super) struct AllHits<F> {
@@ -18,27 +18,26 @@ pub(super) struct AllHits<F> {
     pub visit: F,
 }
 
-impl<F: FnMut(f32, Place)> Traverse<Baseline> for AllHits<F> {
-    type Relative = <SingleRay as Traverse<Baseline>>::Relative;
+impl<S: Simd, F: FnMut(f32, Place)> Traverse<S> for AllHits<F> {
+    type Relative = <SingleRay as Traverse<S>>::Relative;
 
-    fn relative_to(&self, simd: Baseline, middle: DVec3, grid: &BoxGrid) -> Self::Relative {
+    #[inline(always)]
+    fn relative_to(&self, simd: S, middle: DVec3, grid: &BoxGrid) -> Self::Relative {
         self.ray.relative_to(simd, middle, grid)
     }
 
-    fn enter(
-        &self,
-        simd: Baseline,
-        ray: &Self::Relative,
-        node: &WideNode,
-    ) -> (u32, [f32; CHILDREN]) {
+    #[inline(always)]
+    fn enter(&self, simd: S, ray: &Self::Relative, node: &WideNode) -> (u32, [f32; CHILDREN]) {
         self.ray.enter(simd, ray, node)
     }
 
+    #[inline(always)]
     fn until_m(&self) -> f32 {
-        Traverse::<Baseline>::until_m(&self.ray)
+        Traverse::<S>::until_m(&self.ray)
     }
 
-    fn intersect(&mut self, _: Baseline, ray: &Self::Relative, block: &TriangleBlock, leaf: Leaf) {
+    #[inline(always)]
+    fn intersect(&mut self, _: S, ray: &Self::Relative, block: &TriangleBlock, leaf: Leaf) {
         let (hits, range_m) = self.ray.hits(ray.origin, block);
         for lane in (0..block.count).filter(|lane| hits >> lane & 1 == 1) {
             (self.visit)(range_m[lane], Place::new(leaf, lane));

@@ -9,7 +9,7 @@ use crate::raycasting::place::{Leaf, Place};
 use crate::raycasting::single::SingleRay;
 use crate::raycasting::traversal::{Stack, Traversal, Traverse};
 use crate::raycasting::{Hit, RAYS, Reach};
-use crate::simd::{Baseline, Simd, SimdTask, dispatch};
+use crate::simd::{Simd, SimdTask, dispatch};
 
 impl Scene {
     /// Casts rays from one origin along unit directions, all in the frame of the mesh, and writes
@@ -102,7 +102,10 @@ impl Scene {
     ) {
         let ray = SingleRay::new(origin.as_dvec3(), direction, Reach::until(until_m));
         let visit = |range_m, place| visit(self.hit(range_m, place));
-        self.traverse(Baseline, &mut AllHits { ray, visit }, &mut stacks());
+        dispatch(AllHitsTask {
+            scene: self,
+            hits: AllHits { ray, visit },
+        });
     }
 
     pub(in crate::raycasting) fn task<'a, O, D, R>(
@@ -193,6 +196,19 @@ impl Scene {
 /// Memory of the traversals of the hierarchy over the tiles and of that of a tile.
 fn stacks() -> [Stack; 2] {
     [Stack::new(), Stack::new()]
+}
+
+/// A ray whose hits are all visited.
+struct AllHitsTask<'a, F> {
+    scene: &'a Scene,
+    hits: AllHits<F>,
+}
+
+impl<F: FnMut(f32, Place)> SimdTask for AllHitsTask<'_, F> {
+    #[inline(always)]
+    fn run<S: Simd>(mut self, simd: S) {
+        self.scene.traverse(simd, &mut self.hits, &mut stacks());
+    }
 }
 
 /// Rays to cast, and where their results go.
