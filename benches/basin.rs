@@ -19,7 +19,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use fpmcl::app::plotting::{LineChart, Panel, Series};
+use fpmcl::app::report::plotting::{LineChart, Panel, Series};
 use fpmcl::geometry::{Pose2, Pose3, Vec3, pose2_from_pose3};
 use fpmcl::lidar::{Beam, LidarModel, PERIOD_S, Rotation, Scan};
 use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, SensorConfig, Start, StartSpread};

@@ -24,7 +24,7 @@ use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
 use fpmcl::geometry::{Pose3, Rigid3f, Vec3};
 use fpmcl::lidar::{Beam, LidarModel};
-use fpmcl::map::ply;
+use fpmcl::map::files::ply;
 use fpmcl::raycasting::Scene;
 use fpmcl::rendering::{CpuRenderer, RangeDifference, RangeRenderer as _};
 use npyz::WriterBuilder as _;

@@ -8,7 +8,7 @@ use std::fmt::Debug;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use fpmcl::app::config::{
+use fpmcl::app::settings::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
     Initialization, LocalizationConfig, OdometryCommandConfig, RangeImageConfig, RefinementConfig,
 };
@@ -20,7 +20,7 @@ fn root() -> &'static Path {
 }
 
 fn load<T: CommandConfig>(path: &Path) -> T {
-    config::load(Some(path), &[]).unwrap_or_else(|error| panic!("{error}"))
+    settings::load(Some(path), &[]).unwrap_or_else(|error| panic!("{error}"))
 }
 
 /// Loads a configuration from a text.
@@ -72,7 +72,7 @@ fn round_trip<T: CommandConfig + PartialEq + Debug>(path: &Path) {
     let config: T = load(path);
     let folder = tempfile::tempdir().unwrap();
     let effective = folder.path().join("effective.yml");
-    std::fs::write(&effective, config::to_yaml(&config).unwrap()).unwrap();
+    std::fs::write(&effective, settings::to_yaml(&config).unwrap()).unwrap();
     assert_eq!(load::<T>(&effective), config, "{}", path.display());
 }
 
@@ -102,7 +102,7 @@ fn explained_keys(name: &str, text: &str) -> BTreeSet<String> {
 fn check_texts<T: CommandConfig + PartialEq + Debug>() {
     assert_eq!(parse::<T>(T::FULL), T::default(), "{}", T::PATH);
     assert_eq!(parse::<T>(T::SHORT), T::default(), "{}", T::PATH);
-    let effective = config::to_yaml(&T::default()).unwrap();
+    let effective = settings::to_yaml(&T::default()).unwrap();
     let every_key: BTreeSet<String> = effective
         .lines()
         .map(|line| line.replace("- ", "  "))

@@ -10,7 +10,7 @@ use std::path::Path;
 
 use common::{Fpmcl, Recording, fpmcl};
 use fpmcl::geometry::{Vec3, surface_area_m2};
-use fpmcl::map::mesh_file;
+use fpmcl::map::files::mesh_file;
 use fpmcl::recording::scan_files;
 use serde_json::Value;
 

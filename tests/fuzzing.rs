@@ -20,14 +20,14 @@ use std::path::Path;
 
 use clap::Parser as _;
 use fpmcl::app::cli::{Cli, Command};
-use fpmcl::app::config::{
+use fpmcl::app::report::results::LocalizationResults;
+use fpmcl::app::settings::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
     LocalizationConfig, RefinementConfig,
 };
-use fpmcl::app::results::LocalizationResults;
 use fpmcl::geometry::{FARTHEST_M, Pose2, Pose3, TriangleMesh};
 use fpmcl::lidar::{Rotation, RotationDirection, Scan};
-use fpmcl::map::ply;
+use fpmcl::map::files::ply;
 use fpmcl::recording::poses::{
     CameraPoses, read_times, read_tum, write_kitti, write_times, write_tum,
 };
@@ -464,16 +464,16 @@ fn configurations() {
 }
 
 fn read_config<T: CommandConfig + PartialEq>(file: &Input) -> Result<(), String> {
-    let config: T = config::load(Some(file.path), &[]).map_err(text)?;
+    let config: T = settings::load(Some(file.path), &[]).map_err(text)?;
     check_config(&config, file);
     Ok(())
 }
 
 /// Checks that a configuration reads back as it is written; no number equals itself that is none.
 fn check_config<T: CommandConfig + PartialEq>(config: &T, file: &Input) {
-    let written = config::to_yaml(config).unwrap();
+    let written = settings::to_yaml(config).unwrap();
     let path = file.write_beside(written.as_bytes());
-    let again: T = config::load(Some(&path), &[]).unwrap_or_else(|e| panic!("{e}: {written}"));
+    let again: T = settings::load(Some(&path), &[]).unwrap_or_else(|e| panic!("{e}: {written}"));
     assert!(*config == again, "{written}");
 }
 
@@ -528,7 +528,7 @@ fn set<'a, T: CommandConfig + PartialEq>(
         Command::Ground(args) => args.settings,
         other => panic!("{other:?} has no settings"),
     };
-    let config = config::with_settings(T::default(), &settings).map_err(text)?;
+    let config = settings::with_settings(T::default(), &settings).map_err(text)?;
     check_config(&config, file);
     Ok(())
 }

@@ -9,8 +9,8 @@ use std::path::Path;
 
 use common::{fpmcl, json, real_recording, run, simulate_two_drives};
 use fpmcl::geometry::Pose3;
-use fpmcl::map::mapped_ply::MappedPly;
-use fpmcl::map::ply;
+use fpmcl::map::files::mapped_ply::MappedPly;
+use fpmcl::map::files::ply;
 use fpmcl::recording::PoseTrack;
 use fpmcl::recording::poses::read_tum;
 use glam::DVec3;

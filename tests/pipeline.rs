@@ -10,8 +10,8 @@ use std::path::Path;
 
 use common::picture::Picture;
 use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, Recording, SENSOR, json, run, simulate_two_drives};
-use fpmcl::app::plotting::color::{MCL, REFINED, TRUTH};
-use fpmcl::app::results::LocalizationResults;
+use fpmcl::app::report::plotting::color::{MCL, REFINED, TRUTH};
+use fpmcl::app::report::results::LocalizationResults;
 use fpmcl::recording::Calibration;
 use fpmcl::recording::poses::{CameraPoses, read_tum};
 use serde_json::Value;

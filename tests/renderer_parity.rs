@@ -336,7 +336,7 @@ fn drive_0005() -> Option<TriangleMesh> {
         .set("n_scans", "6")
         .set("visualize", "False")
         .succeeds();
-    Some(fpmcl::map::ply::read(&map).unwrap())
+    Some(fpmcl::map::files::ply::read(&map).unwrap())
 }
 
 #[test]

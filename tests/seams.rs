@@ -5,7 +5,7 @@
 mod common;
 
 use common::Recording;
-use fpmcl::map::ply;
+use fpmcl::map::files::ply;
 use fpmcl::raycasting::Scene;
 use glam::Vec3;
 

@@ -16,7 +16,7 @@ use std::ffi::OsString;
 use std::path::PathBuf;
 
 use fpmcl::app;
-use fpmcl::app::commands::version;
+use fpmcl::app::run::version;
 use pyo3::prelude::*;
 
 #[pymodule]
@@ -37,7 +37,7 @@ mod _fpmcl {
     #[pymodule_init]
     fn init(module: &pyo3::Bound<'_, pyo3::types::PyModule>) -> pyo3::PyResult<()> {
         use pyo3::types::PyModuleMethods as _;
-        module.add("__version__", fpmcl::app::commands::version::VERSION)
+        module.add("__version__", fpmcl::app::run::version::VERSION)
     }
 }
 

@@ -1,6 +1,6 @@
 //! Localization, scan by scan.
 
-use fpmcl::app::config::{LocalizationConfig, OdometrySource};
+use fpmcl::app::settings::{LocalizationConfig, OdometrySource};
 use fpmcl::geometry::Pose3;
 use fpmcl::localization::{self, LocalizerError, Odometry, Start};
 use fpmcl::odometry::{Odometer, OdometryConfig};

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use anyhow::anyhow;
-use fpmcl::app::config::{BuildMapConfig, LocalizationConfig};
+use fpmcl::app::settings::{BuildMapConfig, LocalizationConfig};
 use fpmcl::geometry::{Pose3, TriangleMesh};
 use fpmcl::lidar::Motion;
 use fpmcl::map::{self, BuildError, MapBuilder, MapOptions, MappingPath};

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use anyhow::anyhow;
 use fpmcl::app::commands::stages;
-use fpmcl::app::config::{LocalizationConfig, RangeImageConfig};
+use fpmcl::app::settings::{LocalizationConfig, RangeImageConfig};
 use fpmcl::geometry::Pose3;
 use fpmcl::lidar;
 use fpmcl::recording::{self, Frame};

@@ -1,7 +1,7 @@
 //! Keyword arguments as settings of the program's configurations.
 
 use anyhow::anyhow;
-use fpmcl::app::config::{CommandConfig, with_settings};
+use fpmcl::app::settings::{CommandConfig, with_settings};
 use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict as _, PyDict};
 

@@ -1,7 +1,7 @@
 //! Trajectories of whole drives: odometry and refinement.
 
 use anyhow::anyhow;
-use fpmcl::app::config::{OdometryCommandConfig, RefinementConfig};
+use fpmcl::app::settings::{OdometryCommandConfig, RefinementConfig};
 use fpmcl::geometry::{Pose2, Pose3};
 use fpmcl::odometry::{OdometryEstimate, TrajectoryBuilder};
 use fpmcl::refinement::{InitialEstimate, TrajectoryRefiner};

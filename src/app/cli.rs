@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use clap::{ArgAction, Args, CommandFactory as _, Parser, Subcommand, ValueEnum};
 use tracing::level_filters::LevelFilter;
 
-use crate::app::commands::output::Form;
 use crate::app::comparison::RunId;
+use crate::app::run::output::Form;
 use crate::recording::scan_files;
 use crate::rendering::Backend;
 

@@ -3,18 +3,16 @@
 pub mod cli;
 pub mod commands;
 pub mod comparison;
-pub mod config;
-pub mod export;
-pub mod plotting;
-pub mod reporting;
-pub mod results;
+pub mod report;
+pub mod run;
+pub mod settings;
 
 use std::ffi::OsString;
 
 use clap::Parser as _;
 
 use cli::Cli;
-use commands::Context;
+use run::Context;
 
 /// The program: parses a command line, whose first argument is the name of the program, starts logging, runs the
 /// command, and reports its error; returns the exit code. Wrong usage and requests for help end the process.

@@ -22,7 +22,7 @@ use serde::Serialize;
 use super::surface_distance::distances_m;
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
 use crate::lidar::Scan;
-use crate::map::scan_cloud::ScanConfig;
+use crate::map::build::scan_cloud::ScanConfig;
 use crate::raycasting::{Hit, Scene};
 
 /// A residual beyond this is early or late [m].

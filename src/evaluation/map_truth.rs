@@ -17,7 +17,7 @@ use serde::Serialize;
 use super::map_quality::NEAR_M;
 use super::surface_distance::distances_m;
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
-use crate::map::scan_cloud::ScanConfig;
+use crate::map::build::scan_cloud::ScanConfig;
 use crate::raycasting::{Hit, Scene};
 
 /// Voxel size of the sampling of the truth [m].

@@ -11,7 +11,7 @@ use super::odometry::Odometry;
 use super::tracking_loss::State;
 use crate::geometry::Pose3;
 use crate::lidar::Scan;
-use crate::map::plan::origin_near;
+use crate::map::build::plan::origin_near;
 use crate::map::{Map, MapError};
 use crate::odometry::{
     OdometryError, PlacementError, Trajectory, TrajectoryBuilder, TrajectoryConfig,

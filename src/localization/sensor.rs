@@ -14,7 +14,7 @@ pub struct SensorConfig {
     /// Projection and range limits.
     pub lidar: LidarModel,
     /// Rectangle of the own car in the lidar frame, whose points are dropped: x_min, x_max, y_min, y_max [m].
-    #[default(crate::map::scan_cloud::ScanConfig::default().own_car_m)]
+    #[default(crate::map::build::scan_cloud::ScanConfig::default().own_car_m)]
     pub own_car_m: [f32; 4],
     /// Ground segmentation of the scans.
     pub ground: GroundConfig,

@@ -5,7 +5,7 @@ use std::collections::{HashMap, HashSet};
 
 use glam::{DVec3, IVec3, Vec3};
 
-use super::vertex_ground::is_ground_color;
+use super::build::vertex_ground::is_ground_color;
 use crate::geometry::{TriangleMesh, mesh::on_lattice};
 
 /// A vertex of a map.

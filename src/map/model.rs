@@ -8,21 +8,21 @@ use std::sync::{Arc, Mutex};
 use glam::{DVec3, Vec3};
 use nalgebra::Point2;
 
-use super::config::MapOptions;
-use super::elevation::GroundMap;
-use super::ground_surface::GroundSurface;
-use super::heights::{Chunks, GROUND_CELL_M, chunks_of_triangles};
-use super::mapped_ply::MappedPly;
-use super::mapping_path::MappingPath;
-use super::mesh_error::MeshFileError;
-use super::mesh_file;
+use super::build::config::MapOptions;
+use super::build::vertex_ground::{GROUND, REST};
+use super::files::mapped_ply::MappedPly;
+use super::files::mapping_path::MappingPath;
+use super::files::mesh_error::MeshFileError;
+use super::files::mesh_file;
+use super::files::ply;
+use super::ground::elevation::GroundMap;
+use super::ground::heights::{Chunks, GROUND_CELL_M, chunks_of_triangles};
+use super::ground::surface::GroundSurface;
 use super::mesh_view::MeshView;
-use super::panorama::{PanoramaIndex, PanoramaRequest};
-use super::panorama_file::Panoramas;
-use super::ply;
-use super::tile_store::TileStore;
-use super::tiles::{self, TileConfig, TileGrid, TileIndex};
-use super::vertex_ground::{GROUND, REST};
+use super::places::panorama::{PanoramaIndex, PanoramaRequest};
+use super::places::panorama_file::Panoramas;
+use super::tiles::grid::{self, TileConfig, TileGrid, TileIndex};
+use super::tiles::store::TileStore;
 use crate::geometry::mesh::on_lattice;
 use crate::geometry::{Aabb, TriangleMesh};
 use crate::memory::{self, MemoryError};
@@ -116,7 +116,7 @@ impl Map {
         choice: &BackendChoice,
     ) -> Result<Self, MapError> {
         let (indices, parts): (Vec<TileIndex>, Vec<TriangleMesh>) =
-            tiles::cut(&mesh, options.tiles.side_m).into_iter().unzip();
+            grid::cut(&mesh, options.tiles.side_m).into_iter().unzip();
         let boxes = std::iter::zip(indices, parts.iter().map(TriangleMesh::bounds));
         let tiles = grid_of(&path, boxes, &options.tiles);
         let renderer = choice.renderer(&parts, options.max_poses)?;

@@ -3,16 +3,16 @@
 
 use anyhow::{Context as _, Result, bail};
 
-use super::{Context, output};
 use crate::app::cli::CompareArgs;
 use crate::app::comparison::{Executor, Layout, Outcome, PlannedRun, RunId, collect, planned_runs};
-use crate::app::config::{self, CommandConfig as _, ComparisonConfig};
+use crate::app::run::{Context, output};
+use crate::app::settings::{self, CommandConfig as _, ComparisonConfig};
 
 /// Executes the missing runs, or the requested part of the work; returns the text for standard
 /// output.
 pub fn run(args: &CompareArgs, context: &Context) -> Result<String> {
     let path = args.source.config.as_deref();
-    let config: ComparisonConfig = config::load(path, &args.source.settings)?;
+    let config: ComparisonConfig = settings::load(path, &args.source.settings)?;
     let context = &context.with_config_file(path, ComparisonConfig::PATH);
     let runs = planned_runs(&config)?;
     let layout = Layout {

@@ -5,11 +5,12 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 
-use super::output::{Form, Printed};
 use super::simulate::{self, Existing};
-use super::{Context, build_map, localize, refine};
+use super::{build_map, localize, refine};
 use crate::app::cli::DemoArgs;
-use crate::app::config::{BuildMapConfig, LocalizationConfig, OdometrySource, RefinementConfig};
+use crate::app::run::Context;
+use crate::app::run::output::{Form, Printed};
+use crate::app::settings::{BuildMapConfig, LocalizationConfig, OdometrySource, RefinementConfig};
 use crate::simulation::SimulationConfig;
 
 /// Default number of frames per drive.

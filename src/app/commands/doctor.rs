@@ -9,13 +9,14 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use nalgebra::Vector3;
 
-use super::output::Printed;
-use super::{Context, version};
 use crate::app::cli::DoctorArgs;
+use crate::app::run::output::Printed;
+use crate::app::run::{Context, version};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::lidar::{Beam, LidarModel, RangeImage};
 use crate::localization::observation::ObservationConfig;
-use crate::map::{TileConfig, tiles};
+use crate::map::TileConfig;
+use crate::map::tiles::grid;
 use crate::rendering::backend::{AdapterReport, best_adapter};
 use crate::rendering::{
     Backend, CpuRenderer, RangeDifference, RangeRenderer, RenderError, RenderingMethod, selection,
@@ -125,7 +126,7 @@ impl Workload {
         let simulation = Simulation::new(&SimulationConfig::default(), None)?;
         let mut street = simulation.street.surface.mesh.clone();
         street.snap();
-        let tiles = tiles::cut(&street, TileConfig::default().side_m);
+        let tiles = grid::cut(&street, TileConfig::default().side_m);
         let tiles: Vec<TriangleMesh> = tiles.into_iter().map(|(_, tile)| tile).collect();
         let (poses, model) = (simulation.poses(), LidarModel::default());
         let pose = poses[poses.len() / 2];

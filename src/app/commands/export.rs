@@ -6,19 +6,21 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
 
-use super::claims::{Claims, Outputs};
-use super::interrupt::Interrupted;
-use super::output::Printed;
-use super::{Context, input, output, refine, run_output};
+use super::refine;
 use crate::app::cli::ExportArgs;
-use crate::app::config::RefinementConfig;
-use crate::app::export::tiles::TILES_FOLDER;
-use crate::app::export::{Model, Ribbon, RunLog, write_mcap};
-use crate::app::plotting::color::{Colormap, TRUTH};
-use crate::app::results::LocalizationResults;
+use crate::app::report::export::tiles::TILES_FOLDER;
+use crate::app::report::export::{Model, Ribbon, RunLog, write_mcap};
+use crate::app::report::plotting::color::{Colormap, TRUTH};
+use crate::app::report::results::LocalizationResults;
+use crate::app::report::run_output;
+use crate::app::run::claims::{Claims, Outputs};
+use crate::app::run::interrupt::Interrupted;
+use crate::app::run::output::Printed;
+use crate::app::run::{Context, input, output};
+use crate::app::settings::RefinementConfig;
 use crate::evaluation::planar_errors;
 use crate::geometry::{Pose3, TriangleMesh, pose2_from_pose3};
-use crate::map::mesh_file;
+use crate::map::files::mesh_file;
 use crate::recording::{Frame, scan_files};
 
 /// First bytes of the files.

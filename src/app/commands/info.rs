@@ -6,15 +6,15 @@ use std::path::Path;
 use anyhow::{Result, bail, ensure};
 use serde::{Deserialize, Serialize};
 
-use super::output::Printed;
 use super::stages::{self, is_bag, sample};
 use crate::app::cli::InfoArgs;
-use crate::app::config;
-use crate::app::results::{LocalizationResults, RunSummary};
+use crate::app::report::results::{LocalizationResults, RunSummary};
+use crate::app::run::output::Printed;
+use crate::app::settings;
 use crate::evaluation::RangeMclRules;
 use crate::geometry::Aabb;
 use crate::lidar::Scan;
-use crate::map::ply;
+use crate::map::files::ply;
 use crate::recording::{PoseTrack, Recording, Selection, scan_files};
 use crate::sensor::{self, BeamSource, SensorDescription};
 use crate::validation::{InvalidValue, Validate};
@@ -36,7 +36,7 @@ impl Validate for InfoConfig {
 /// Describes what is at a path.
 pub fn run(args: &InfoArgs) -> Result<Printed> {
     let path = args.path.as_path();
-    let config = config::with_settings(InfoConfig::default(), &args.settings)?;
+    let config = settings::with_settings(InfoConfig::default(), &args.settings)?;
     ensure!(
         path.exists(),
         "{} does not exist; give a recording (a folder or a bag), a scan or point cloud, a map (.ply) or a result (.npz)",

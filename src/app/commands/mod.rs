@@ -14,19 +14,9 @@ mod odometry;
 pub mod refine;
 pub mod simulate;
 // Shared by them.
-pub mod claims;
-mod context;
-mod input;
-pub mod interrupt;
-mod logging;
-mod motion_source;
-pub mod output;
-pub mod progress;
-pub mod run_output;
-pub mod run_page;
+pub mod motion_source;
 pub mod stages;
-mod trajectory;
-pub mod version;
+pub mod trajectory;
 
 use std::io::Write as _;
 
@@ -34,15 +24,16 @@ use anyhow::anyhow;
 use serde::Serialize;
 
 use crate::app::cli::{Cli, Command, ConfigurationArgs, ConfiguredCommand, ExportArgs, RunArgs};
-use crate::app::config::{
+use crate::app::report::results::Report;
+use crate::app::settings::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, ConfigError, EvaluationConfig,
     GroundCommandConfig, LocalizationConfig, OdometryCommandConfig, RefinementConfig,
 };
-use crate::app::results::Report;
 use crate::simulation::SimulationConfig;
-pub use context::Context;
-use interrupt::Interrupted;
-use output::{Form, Printed};
+
+use crate::app::run::Context;
+use crate::app::run::interrupt::Interrupted;
+use crate::app::run::output::{self, Form, Printed};
 
 /// Runs a command, and prints its output in a form.
 pub fn run(command: &Command, form: Form, context: &Context) -> anyhow::Result<()> {
@@ -95,7 +86,7 @@ fn printed(command: &Command, context: &Context) -> anyhow::Result<Printed> {
         Command::Simulate(args) => {
             let settings = with_flags::<SimulationConfig>(args, args.flags())?;
             let path = args.source.config.as_deref();
-            let config: SimulationConfig = config::load(path, &settings)?;
+            let config: SimulationConfig = settings::load(path, &settings)?;
             let context = context.with_config_file(path, SimulationConfig::PATH);
             let existing = match args.force {
                 true => simulate::Existing::Replace,
@@ -169,9 +160,9 @@ fn configured<T: CommandConfig>(
     let path = args.source.config_file();
     let settings = with_flags::<T>(args, flags)?;
     if args.source.input().is_some() {
-        return Ok((config::with_settings(base(), &settings)?, context.clone()));
+        return Ok((settings::with_settings(base(), &settings)?, context.clone()));
     }
-    let config = config::load(path, &settings)?;
+    let config = settings::load(path, &settings)?;
     Ok((config, context.with_config_file(path, T::PATH)))
 }
 
@@ -182,7 +173,7 @@ fn with_flags<T: CommandConfig>(
 ) -> Result<Vec<(String, String)>, ConfigError> {
     let mut settings = args.source.settings.clone();
     for (key, value) in flags {
-        if config::has_key::<T>(&key)? {
+        if settings::has_key::<T>(&key)? {
             settings.push((key, value));
         }
     }
@@ -224,7 +215,7 @@ mod tests {
             unreachable!("the command is localize")
         };
         let settings = with_flags::<T>(&args.run, args.flags()).unwrap();
-        config::load(args.run.source.config_file(), &settings).unwrap()
+        settings::load(args.run.source.config_file(), &settings).unwrap()
     }
 
     #[test]

@@ -7,7 +7,7 @@ use anyhow::Result;
 use rand::Rng;
 
 use super::stages::RecordingInputs;
-use crate::app::config::OdometrySource;
+use crate::app::settings::OdometrySource;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
 use crate::lidar::Scan;
 use crate::localization::odometry::{are_in_space, demonstration_noise, motions, with_noise};

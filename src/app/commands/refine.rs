@@ -6,13 +6,15 @@ use std::time::Instant;
 
 use anyhow::{Result, ensure};
 
-use super::claims::{Claims, NPZ, Outputs};
-use super::interrupt::Interrupted;
+use super::motion_source;
 use super::motion_source::MotionSource;
-use super::run_output::{self, REFINEMENT_FILES, REPORT_FILES, RunFiles};
-use super::{Context, input, motion_source, output, run_page};
-use crate::app::config::{self, LocalizationConfig, OdometrySource, RefinementConfig};
-use crate::app::results::{LocalizationResults, Report};
+use crate::app::report::results::{LocalizationResults, Report};
+use crate::app::report::run_output::{self, REFINEMENT_FILES, REPORT_FILES, RunFiles};
+use crate::app::report::run_page;
+use crate::app::run::claims::{Claims, NPZ, Outputs};
+use crate::app::run::interrupt::Interrupted;
+use crate::app::run::{Context, input, output};
+use crate::app::settings::{self, LocalizationConfig, OdometrySource, RefinementConfig};
 use crate::evaluation::RangeMclRules;
 use crate::files::remove_abandoned;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
@@ -97,7 +99,7 @@ pub fn base_config(result: Option<&Path>) -> RefinementConfig {
         return RefinementConfig::default();
     };
     let path = RunFiles::beside(result).file("effective_localization.yml");
-    let found = config::load::<LocalizationConfig>(Some(&path), &[]);
+    let found = settings::load::<LocalizationConfig>(Some(&path), &[]);
     found.map_or_else(
         |_missing| RefinementConfig::default(),
         |found| RefinementConfig {

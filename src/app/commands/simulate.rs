@@ -23,13 +23,13 @@ use std::sync::{Arc, OnceLock};
 use anyhow::{Context as _, Result, bail, ensure};
 use rayon::prelude::*;
 
-use super::interrupt::{Interrupt, Interrupted};
-use super::output::{self, Printed, write_file};
-use super::progress::Task;
-use super::{Context, version};
+use crate::app::run::interrupt::{Interrupt, Interrupted};
+use crate::app::run::output::{self, Printed, write_file};
+use crate::app::run::progress::Task;
+use crate::app::run::{Context, version};
 use crate::files::remove_abandoned;
 use crate::geometry::Pose3;
-use crate::map::ply;
+use crate::map::files::ply;
 use crate::recording::poses::{CameraPoses, write_kitti, write_times};
 use crate::recording::velodyne::{write_labels, write_scan};
 use crate::recording::{Calibration, MapFrame};

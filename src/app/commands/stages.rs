@@ -4,14 +4,14 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result};
 
-use super::{Context, input};
-use crate::app::config::{
+use crate::app::run::{Context, input};
+use crate::app::settings::{
     BuildMapConfig, LocalizationConfig, MotionCompensation, OdometryCommandConfig,
     RangeImageConfig, RefinementConfig, body_from_lidar,
 };
 use crate::geometry::wrap_angle;
 use crate::lidar::{LidarModel, PERIOD_S, Rotation, Scan};
-use crate::map::scan_cloud::ScanConfig;
+use crate::map::build::scan_cloud::ScanConfig;
 use crate::map::{Map, MapOptions, MappingPath};
 use crate::odometry::{OdometryConfig, TimingComparison, compare_timings};
 use crate::recording::{PoseTrack, Recording, Selection};

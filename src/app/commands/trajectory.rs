@@ -6,12 +6,12 @@ use std::sync::Arc;
 use anyhow::{Context as _, Result};
 use serde::{Deserialize, Serialize};
 
-use super::Context;
-use super::interrupt::Interrupted;
-use super::progress::Task;
+use crate::app::run::Context;
+use crate::app::run::interrupt::Interrupted;
+use crate::app::run::progress::Task;
 use crate::geometry::{Pose3, StampedPose};
 use crate::lidar::Scan;
-use crate::map::path_check;
+use crate::map::build::path_check;
 use crate::odometry::{
     ElevationBias, LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig,
 };

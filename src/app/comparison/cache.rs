@@ -13,7 +13,7 @@ use std::time::Instant;
 use anyhow::{Context as _, Result};
 use serde::{Deserialize, Serialize};
 
-use crate::app::commands::output;
+use crate::app::run::output;
 
 /// A complete shared result.
 #[derive(Clone, Debug, PartialEq)]

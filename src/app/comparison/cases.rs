@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::record::RunRecord;
 use super::results::ComparisonResults;
-use crate::app::reporting::{Cell, Column, Table, markdown};
+use crate::app::report::format::{Cell, Column, Table, markdown};
 use crate::evaluation::trust::Trust;
 use crate::statistics::median;
 

@@ -11,10 +11,10 @@ use super::plan::PlannedRun;
 use super::record::RunRecord;
 use super::results::ComparisonResults;
 use super::{cases, keys, page, tables};
-use crate::app::commands::claims::Outputs;
-use crate::app::commands::{Context, output, version};
-use crate::app::config::ComparisonConfig;
-use crate::app::reporting::{Table, csv, markdown, text};
+use crate::app::report::format::{Table, csv, markdown, text};
+use crate::app::run::claims::Outputs;
+use crate::app::run::{Context, output, version};
+use crate::app::settings::ComparisonConfig;
 
 /// Page of the sequences that are described as hard cases.
 const CASES_FILE: &str = "cases.md";

@@ -22,7 +22,7 @@ use serde::Serialize;
 use super::plan::PlannedRun;
 use crate::app::commands::build_map::hash_of_scan;
 use crate::app::commands::stages::{is_bag, is_topic};
-use crate::app::commands::version;
+use crate::app::run::version;
 use crate::recording::{Recording, Selection};
 use crate::simulation::SimulationConfig;
 
@@ -268,7 +268,7 @@ fn hash(parts: &[impl AsRef<str>]) -> String {
 mod tests {
     use super::*;
     use crate::app::comparison::record::RunId;
-    use crate::app::config::{BuildMapConfig, LocalizationConfig, RefinementConfig};
+    use crate::app::settings::{BuildMapConfig, LocalizationConfig, RefinementConfig};
 
     fn planned_run() -> PlannedRun {
         planned_run_in("here")

@@ -7,11 +7,11 @@ use super::pictures;
 use super::plan::PlannedRun;
 use super::record::{Outcome, RunRecord};
 use super::results::ComparisonResults;
-use crate::app::commands::run_page::{PICTURES, TEXTS, VIEW, collapsed, picture};
-use crate::app::commands::version;
-use crate::app::config::{self, ComparisonConfig, Overrides, settings};
-use crate::app::reporting::{Cell, Column, Page, PageElement, Section, Table};
-use crate::app::results::length;
+use crate::app::report::format::{Cell, Column, Page, PageElement, Section, Table};
+use crate::app::report::results::length;
+use crate::app::report::run_page::{PICTURES, TEXTS, VIEW, collapsed, picture};
+use crate::app::run::version;
+use crate::app::settings::{self, ComparisonConfig, Overrides, settings};
 use crate::evaluation::Summary;
 
 /// Picture of a run that the comparison has for all configurations together.
@@ -211,7 +211,7 @@ fn configuration(results: &ComparisonResults, layout: &Layout) -> Result<Vec<Pag
         PageElement::Table(overrides_table(results.config)),
         PageElement::Collapsed {
             name: "comparison.yml".to_owned(),
-            text: config::to_yaml(results.config)?,
+            text: settings::to_yaml(results.config)?,
         },
     ];
     let mut examples = results.sequences.iter();

@@ -5,11 +5,13 @@ use anyhow::Result;
 use super::layout::Layout;
 use super::record::RunRecord;
 use super::results::{ComparisonResults, success_rate};
-use crate::app::commands::{output, run_output::time_axis, run_page::picture};
-use crate::app::plotting::color::{Rgb, SERIES};
-use crate::app::plotting::{LineChart, Mark, Panel, PathPlot, Series, error_chart};
-use crate::app::reporting::{PageElement, SuccessRate};
-use crate::app::results::LocalizationResults;
+use crate::app::report::format::{PageElement, SuccessRate};
+use crate::app::report::plotting::color::{Rgb, SERIES};
+use crate::app::report::plotting::{LineChart, Mark, Panel, PathPlot, Series, error_chart};
+use crate::app::report::results::LocalizationResults;
+use crate::app::report::run_output::time_axis;
+use crate::app::report::run_page::picture;
+use crate::app::run::output;
 use crate::evaluation::planar_errors;
 use crate::geometry::Pose2;
 

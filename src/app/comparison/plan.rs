@@ -6,7 +6,7 @@ use serde::de::DeserializeOwned;
 
 use super::record::RunId;
 use crate::app::commands::simulate::{GIVEN_POSES_FILE, POSES_IN_MAP_FILE};
-use crate::app::config::{
+use crate::app::settings::{
     self, BuildMapConfig, ComparisonConfig, LocalizationConfig, OdometrySource, Overrides,
     RefinementConfig, SequenceConfig, VariantConfig, settings,
 };
@@ -193,7 +193,7 @@ where
     T: Validate + Serialize + DeserializeOwned,
 {
     let all: Vec<(String, String)> = overrides.iter().flat_map(|keys| settings(keys)).collect();
-    config::with_settings(config, &all).with_context(|| format!("in the block {block}"))
+    settings::with_settings(config, &all).with_context(|| format!("in the block {block}"))
 }
 
 #[cfg(test)]
@@ -227,7 +227,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
         let folder = tempfile::tempdir()?;
         let path = folder.path().join("comparison.yml");
         std::fs::write(&path, text)?;
-        planned_runs(&config::load(Some(&path), &[])?)
+        planned_runs(&settings::load(Some(&path), &[])?)
     }
 
     fn find<'a>(runs: &'a [PlannedRun], id: &str) -> &'a PlannedRun {

@@ -2,11 +2,12 @@
 
 use anyhow::Result;
 
-use crate::app::commands::Context;
-use crate::app::commands::claims::{Claims, Outputs, PLY};
-use crate::app::config::BuildMapConfig;
+use crate::app::run::Context;
+use crate::app::run::claims::{Claims, Outputs, PLY};
+use crate::app::settings::BuildMapConfig;
+use crate::map::MappingPath;
+use crate::map::files::ply;
 use crate::map::mesh_view::MeshView;
-use crate::map::{MappingPath, ply};
 
 /// Prepares the outputs.
 pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {

@@ -7,10 +7,10 @@ use anyhow::{Result, bail};
 use super::local_maps;
 use super::opened::{Opened, open, poses_of};
 use super::parts::Role;
-use crate::app::commands::Context;
-use crate::app::commands::output::Printed;
-use crate::app::config::BuildMapConfig;
-use crate::map::plan;
+use crate::app::run::Context;
+use crate::app::run::output::Printed;
+use crate::app::settings::BuildMapConfig;
+use crate::map::build::plan;
 
 /// One shell command per local map that is not finished, for the current folder: the command line of this process with
 /// `--job` instead of `--list-jobs`. The poses are found first.

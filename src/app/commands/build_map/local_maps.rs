@@ -9,14 +9,13 @@ use anyhow::{Context as _, Result, bail};
 use super::clock::StageClock;
 use super::opened::{Opened, poses_of};
 use super::parts::{Parts, Role, hash_of_scan, hash_of_scans, joint_hash};
-use crate::app::commands::Context;
-use crate::app::commands::interrupt::Interrupted;
-use crate::app::commands::progress::Task;
-use crate::app::config::BuildMapConfig;
-use crate::map::plan::{LocalMapPlan, local_maps};
-use crate::map::{
-    BuildError, BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan, scan_agreement,
-};
+use crate::app::run::Context;
+use crate::app::run::interrupt::Interrupted;
+use crate::app::run::progress::Task;
+use crate::app::settings::BuildMapConfig;
+use crate::map::build::plan::{LocalMapPlan, local_maps};
+use crate::map::build::scan_agreement;
+use crate::map::{BuildError, BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan};
 use crate::recording::Frame;
 
 /// Stages of a local map, and about the share of its time before each.

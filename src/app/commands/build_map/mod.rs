@@ -27,10 +27,10 @@ use self::opened::{open, poses_of};
 pub use self::parts::hash_of_scan;
 use self::parts::{Joined, Role};
 pub use self::report::BuildReport;
-use super::output::Printed;
-use super::{Context, output};
 use crate::app::cli::BuildPart;
-use crate::app::config::BuildMapConfig;
+use crate::app::run::output::Printed;
+use crate::app::run::{Context, output};
+use crate::app::settings::BuildMapConfig;
 use crate::map::MappingPath;
 use crate::map::mesh_view::{MeshView, Without};
 

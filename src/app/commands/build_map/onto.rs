@@ -7,11 +7,12 @@ use anyhow::Result;
 use serde::Serialize;
 
 use super::parts::hash_of_file;
-use crate::app::commands::run_output::MOST_TRIANGLES;
 use crate::app::commands::stages::MapInputs;
-use crate::app::commands::{Context, input, trajectory};
-use crate::app::config::{BuildMapConfig, LocalizationConfig};
-use crate::app::plotting::MapPlot;
+use crate::app::commands::trajectory;
+use crate::app::report::plotting::MapPlot;
+use crate::app::report::run_output::MOST_TRIANGLES;
+use crate::app::run::{Context, input};
+use crate::app::settings::{BuildMapConfig, LocalizationConfig};
 use crate::geometry::pose2_from_pose3;
 use crate::localization::SecondDrive;
 use crate::map::mesh_view::{MeshView, Without, reduced};

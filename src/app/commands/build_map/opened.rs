@@ -9,12 +9,12 @@ use super::files::prepare;
 use super::onto::OlderMap;
 use super::parts::{Parts, Role};
 use super::{pose_check, poses};
-use crate::app::commands::claims::Claims;
 use crate::app::commands::trajectory::{self, TrajectorySummary, file_beside};
-use crate::app::commands::{Context, input, version};
-use crate::app::config::{self, BuildMapConfig, PoseSource};
+use crate::app::run::claims::Claims;
+use crate::app::run::{Context, input, version};
+use crate::app::settings::{self, BuildMapConfig, PoseSource};
 use crate::geometry::Pose3;
-use crate::map::plan::key_scans;
+use crate::map::build::plan::key_scans;
 use crate::recording::{Frame, Recording};
 use crate::sensor::SensorDescription;
 
@@ -137,7 +137,7 @@ fn inputs_of(
         ..config.clone()
     };
     let mut text = format!("# {}\n", version::program()?);
-    text += &config::to_yaml(&relevant)?;
+    text += &settings::to_yaml(&relevant)?;
     if let Some(older) = older {
         writeln!(text, "onto {}", older.hash)?;
     }

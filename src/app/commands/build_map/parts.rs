@@ -14,11 +14,12 @@ use glam::DVec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::app::commands::output;
+use crate::app::run::output;
 use crate::files::remove_abandoned;
 use crate::lidar::Scan;
-use crate::map::mapped_ply::MappedPly;
-use crate::map::{LocalMap, LocalMapCounts, ply};
+use crate::map::files::mapped_ply::MappedPly;
+use crate::map::files::ply;
+use crate::map::{LocalMap, LocalMapCounts};
 use crate::recording::{Frame, RecordingError};
 
 const INPUTS_FILE: &str = "inputs.txt";

@@ -2,10 +2,10 @@
 
 use anyhow::Result;
 
-use crate::app::commands::run_output::MOST_TRIANGLES;
-use crate::app::config::BuildMapConfig;
-use crate::app::plotting::color::{Colormap, TRUTH};
-use crate::app::plotting::{MapPlot, ObliqueView, ScalarMapPlot, relief};
+use crate::app::report::plotting::color::{Colormap, TRUTH};
+use crate::app::report::plotting::{MapPlot, ObliqueView, ScalarMapPlot, relief};
+use crate::app::report::run_output::MOST_TRIANGLES;
+use crate::app::settings::BuildMapConfig;
 use crate::evaluation::map_quality::ResidualSums;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::map::mesh_view::{MeshView, reduced};

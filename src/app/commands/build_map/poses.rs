@@ -9,8 +9,8 @@ use anyhow::{Result, ensure};
 use super::onto::{self, OlderMap};
 use super::parts::{Role, not_listed};
 use crate::app::commands::trajectory::{self, TrajectorySummary};
-use crate::app::commands::{Context, output, version};
-use crate::app::config::{self, BuildMapConfig, PoseSource};
+use crate::app::run::{Context, output, version};
+use crate::app::settings::{self, BuildMapConfig, PoseSource};
 use crate::geometry::Pose3;
 use crate::map::Map;
 use crate::odometry::TrajectoryConfig;
@@ -68,7 +68,7 @@ pub fn find(
         false => recording.dense_frames(),
     };
     let localized_by = match older {
-        Some((older, _)) => older.hash.clone() + &config::to_yaml(&onto::localization(config))?,
+        Some((older, _)) => older.hash.clone() + &settings::to_yaml(&onto::localization(config))?,
         None => String::new(),
     };
     let hash = inputs(&frames, is_given, &localized_by)?;

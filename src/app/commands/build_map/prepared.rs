@@ -3,7 +3,7 @@
 use anyhow::Result;
 
 use super::onto;
-use crate::app::config::BuildMapConfig;
+use crate::app::settings::BuildMapConfig;
 use crate::localization::{Localizer, Odometry, Start};
 use crate::map::{Map, MapError, MapOptions};
 use crate::recording::Frame;

@@ -8,8 +8,8 @@ use anyhow::Result;
 use serde::Serialize;
 
 use super::onto::ChangesReport;
-use crate::app::commands::output::Printed;
 use crate::app::commands::trajectory::TrajectorySummary;
+use crate::app::run::output::Printed;
 use crate::evaluation::{MapQuality, TruthAgreement};
 use crate::map::{LocalMapCounts, MappingPath};
 use crate::sensor::SensorDescription;

@@ -10,17 +10,19 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 
-use super::claims::{Claims, NPZ, Outputs};
-use super::run_output::{self, REPORT_FILES, RunFiles};
-use super::{Context, input, output, run_page};
-use crate::app::config::{self, EvaluationConfig, LocalizationConfig};
-use crate::app::results::{LocalizationResults, Report};
+use crate::app::report::results::{LocalizationResults, Report};
+use crate::app::report::run_output::{self, REPORT_FILES, RunFiles};
+use crate::app::report::run_page;
+use crate::app::run::claims::{Claims, NPZ, Outputs};
+use crate::app::run::{Context, input, output};
+use crate::app::settings::{self, EvaluationConfig, LocalizationConfig};
 use crate::evaluation::{Alignment, RangeMclRules};
 use crate::files::folder_of;
 use crate::geometry::TriangleMesh;
-use crate::map::mapped_ply::MappedPly;
+use crate::map::MappingPath;
+use crate::map::files::mapped_ply::MappedPly;
+use crate::map::files::mesh_file;
 use crate::map::mesh_view::reduced;
-use crate::map::{MappingPath, mesh_file};
 
 /// Compares a result of `localize`, `refine` or range-mcl, or any trajectory, with the ground truth.
 pub fn run(config: &EvaluationConfig, context: &Context) -> Result<Report> {
@@ -217,7 +219,7 @@ fn about(config: &EvaluationConfig) -> Result<BTreeMap<String, String>> {
 fn localization_of(result: &Path) -> Result<Option<LocalizationConfig>> {
     let effective = RunFiles::beside(result).file("effective_localization.yml");
     match effective.exists() {
-        true => Ok(Some(config::load(Some(&effective), &[])?)),
+        true => Ok(Some(settings::load(Some(&effective), &[])?)),
         false => Ok(None),
     }
 }

@@ -4,10 +4,10 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 
-use crate::app::commands::input;
 use crate::app::commands::stages::{RecordingInputs, is_topic};
-use crate::app::config::{EvaluationConfig, LocalizationConfig};
-use crate::app::results::LocalizationResults;
+use crate::app::report::results::LocalizationResults;
+use crate::app::run::input;
+use crate::app::settings::{EvaluationConfig, LocalizationConfig};
 use crate::evaluation::{Alignment, aligned};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
 use crate::recording::{Frame, PoseTrack, ScanSource, Selection};

@@ -8,10 +8,12 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result, ensure};
 
 use crate::app::cli::ExportArgs;
-use crate::app::commands::claims::Claims;
-use crate::app::commands::interrupt::Interrupted;
-use crate::app::commands::{Context, output};
-use crate::app::export::tiles::{METADATA_FILE, TILES_FOLDER, Tile, is_tile, metadata, split};
+use crate::app::report::export::tiles::{
+    METADATA_FILE, TILES_FOLDER, Tile, is_tile, metadata, split,
+};
+use crate::app::run::claims::Claims;
+use crate::app::run::interrupt::Interrupted;
+use crate::app::run::{Context, output};
 use crate::geometry::{TriangleMesh, Vec3, sample_surface, surface_area_m2, surface_samples};
 use crate::map::MappingPath;
 use crate::memory::{self, MemoryError};

@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail, ensure};
 
 use crate::app::cli::GroundArgs;
-use crate::app::commands::input::require_folder;
 use crate::app::commands::stages::is_bag;
-use crate::app::config::{self, GroundCommandConfig};
+use crate::app::run::input::require_folder;
+use crate::app::settings::{self, GroundCommandConfig};
 use crate::evaluation::LabelledPoints;
 use crate::recording::{Frame, Recording, ScanSource, scan_files, velodyne};
 
@@ -37,7 +37,7 @@ pub fn load(args: &GroundArgs) -> Result<(GroundCommandConfig, PathBuf)> {
         Some(path) => (Some(path), None),
         None => (args.config.as_deref(), argument),
     };
-    let mut config: GroundCommandConfig = config::load(config_path, &settings)?;
+    let mut config: GroundCommandConfig = settings::load(config_path, &settings)?;
     let Some(path) = input else {
         let folder = config.scan_folder.clone();
         return Ok((config, folder));

@@ -23,18 +23,18 @@ use anyhow::{Context as _, Result, bail, ensure};
 
 use self::input::LabelledScan;
 use self::report::GroundReport;
-use super::Context;
-use super::claims::{Claims, Outputs};
-use super::interrupt::Interrupted;
-use super::output::{self, Printed};
 use crate::app::cli::GroundArgs;
-use crate::app::config::{CommandConfig as _, GroundCommandConfig};
-use crate::app::plotting::color::Colormap;
+use crate::app::report::plotting::color::Colormap;
+use crate::app::run::Context;
+use crate::app::run::claims::{Claims, Outputs};
+use crate::app::run::interrupt::Interrupted;
+use crate::app::run::output::{self, Printed};
+use crate::app::settings::{CommandConfig as _, GroundCommandConfig};
 use crate::evaluation::{GroundTally, LabelledPoints};
 use crate::files::folder_of;
 use crate::geometry::Vec3;
 use crate::ground::{FuzzyGround, GroundMethod};
-use crate::map::ply;
+use crate::map::files::ply;
 use crate::recording::velodyne;
 
 /// SemanticKITTI class of ground in written labels.

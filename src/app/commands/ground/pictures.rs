@@ -4,9 +4,9 @@ use std::path::Path;
 
 use anyhow::Result;
 
-use crate::app::config::GroundCommandConfig;
-use crate::app::plotting::color::SERIES;
-use crate::app::plotting::{GroundPlot, LineChart, Panel, Series};
+use crate::app::report::plotting::color::SERIES;
+use crate::app::report::plotting::{GroundPlot, LineChart, Panel, Series};
+use crate::app::settings::GroundCommandConfig;
 use crate::evaluation::{GroundProtocol, LabelledPoints};
 use crate::ground::{Features, FuzzyConfig};
 

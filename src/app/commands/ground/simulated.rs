@@ -3,9 +3,9 @@
 use anyhow::Result;
 use rayon::prelude::*;
 
-use crate::app::commands::Context;
-use crate::app::commands::interrupt::Interrupted;
-use crate::app::config::GroundCommandConfig;
+use crate::app::run::Context;
+use crate::app::run::interrupt::Interrupted;
+use crate::app::settings::GroundCommandConfig;
 use crate::evaluation::{GroundProtocol, GroundScore, LabelledPoints};
 use crate::simulation::{
     LabelledScan, ScannerConfig, Simulation, SimulationConfig, crest_scene, kerb_scene, slope_scene,

@@ -12,13 +12,17 @@ use nalgebra::Vector2;
 
 use self::pictures::draw_example;
 use self::recorder::Run;
-use super::claims::{Claims, NPZ, Outputs};
-use super::interrupt::Interrupted;
+use super::motion_source;
 use super::motion_source::{FrameMotion, MotionSource};
-use super::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES, RunFiles};
-use super::{Context, input, motion_source, output, run_page};
-use crate::app::config::{Initialization, LocalizationConfig, MotionModel};
-use crate::app::results::{LocalizationResults, Report};
+use crate::app::report::results::{LocalizationResults, Report};
+use crate::app::report::run_output::{
+    self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES, RunFiles,
+};
+use crate::app::report::run_page;
+use crate::app::run::claims::{Claims, NPZ, Outputs};
+use crate::app::run::interrupt::Interrupted;
+use crate::app::run::{Context, input, output};
+use crate::app::settings::{Initialization, LocalizationConfig, MotionModel};
 use crate::evaluation::RangeMclRules;
 use crate::geometry::Pose2;
 use crate::localization::motion::VelocityCommand;

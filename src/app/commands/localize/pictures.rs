@@ -2,10 +2,10 @@
 
 use anyhow::{Context as _, Result};
 
-use crate::app::commands::run_output::RunFiles;
-use crate::app::config::LocalizationConfig;
-use crate::app::plotting::color::{MCL, REFINED, Rgb};
-use crate::app::plotting::{LineChart, Panel, RangeImageStrip, Series};
+use crate::app::report::plotting::color::{MCL, REFINED, Rgb};
+use crate::app::report::plotting::{LineChart, Panel, RangeImageStrip, Series};
+use crate::app::report::run_output::RunFiles;
+use crate::app::settings::LocalizationConfig;
 use crate::geometry::{Pose3, pose2_from_pose3};
 use crate::lidar::RangeImage;
 use crate::localization::likelihood::{Direction, View, profile, width_at_half};

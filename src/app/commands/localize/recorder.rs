@@ -4,11 +4,11 @@ use std::time::Duration;
 
 use anyhow::Result;
 
-use crate::app::commands::claims::Claims;
-use crate::app::commands::interrupt::Interrupted;
-use crate::app::commands::run_output::{self, Movie, RunFiles};
-use crate::app::config::LocalizationConfig;
-use crate::app::results::{LocalizationResults, ParticleLog, ScanOutline};
+use crate::app::report::results::{LocalizationResults, ParticleLog, ScanOutline};
+use crate::app::report::run_output::{self, Movie, RunFiles};
+use crate::app::run::claims::Claims;
+use crate::app::run::interrupt::Interrupted;
+use crate::app::settings::LocalizationConfig;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
 use crate::localization::Estimate;

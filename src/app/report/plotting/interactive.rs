@@ -1,0 +1,188 @@
+//! Content of the interactive path of a page: the map from above and, for each frame, its pose, state, numbers
+//! and the outline of its scan. `interactive.js` of the page draws it.
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result};
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+use serde_json::{Value, json};
+
+use super::color::{Colormap, MCL, REFINED, Rgb, STATES, TRUTH};
+use super::map_image::MapImage;
+use super::palette;
+use crate::app::report::results::{LocalizationResults, ScanOutline};
+use crate::evaluation::planar_errors;
+use crate::evaluation::trust::Axes;
+use crate::files::write_atomically;
+use crate::geometry::Pose2;
+use crate::localization::State;
+
+/// A path of estimates with what is known about each frame.
+pub struct InteractivePath<'a> {
+    /// Results of the run.
+    pub results: &'a LocalizationResults,
+    /// Estimates, one per frame.
+    pub estimates: &'a [Pose2],
+    /// Map below the path.
+    pub map: Option<&'a MapImage>,
+}
+
+impl InteractivePath<'_> {
+    /// Writes the content as JSON.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        let content = self.content();
+        let content = content.with_context(|| format!("cannot draw {}", path.display()))?;
+        write_atomically(path, |file| -> Result<()> {
+            Ok(serde_json::to_writer(file, &content)?)
+        })
+        .with_context(|| format!("cannot write {}", path.display()))
+    }
+
+    fn content(&self) -> Result<Value> {
+        let results = self.results;
+        let best = results.refined.as_deref().unwrap_or(self.estimates);
+        let covariances = results
+            .refined_covariances
+            .as_ref()
+            .or(results.covariances.as_ref());
+        let sigmas_m = covariances.map(|all| -> Vec<f64> {
+            let axes = all
+                .iter()
+                .zip(best)
+                .map(|(covariance, pose)| Axes::of(covariance, pose));
+            axes.map(|axes| rounded(100.0 * axes.long_m, 100.0))
+                .collect()
+        });
+        let errors = results
+            .ground_truth
+            .as_ref()
+            .map(|truth| planar_errors(best, truth));
+        let errors_cm = errors.as_ref().map(|errors| -> Vec<f64> {
+            errors
+                .iter()
+                .map(|it| rounded(100.0 * it.distance_m(), 100.0))
+                .collect()
+        });
+        let heading_errors_deg = errors.as_ref().map(|errors| -> Vec<f64> {
+            errors
+                .iter()
+                .map(|it| rounded(it.turn_rad.abs().to_degrees(), 1e4))
+                .collect()
+        });
+        let states = results.states.as_ref().map(|states| -> Vec<Option<&str>> {
+            states
+                .iter()
+                .map(|&number| Some(State::of_number(number)?.word()))
+                .collect()
+        });
+        let colors = STATES.map(|(state, color)| (state.word().to_owned(), css(color).into()));
+        Ok(json!({
+            "map": self.map.map(map_layer).transpose()?,
+            "frames": results.frames,
+            "times_s": results.recorded_times(),
+            "name": if results.refined.is_some() { "refined" } else { "MCL" },
+            "color": css(if results.refined.is_some() { REFINED } else { MCL }),
+            "poses": flat(best),
+            "truth": results.ground_truth.as_deref().map(flat),
+            "truth_color": css(TRUTH),
+            "errors_cm": errors_cm,
+            "heading_errors_deg": heading_errors_deg,
+            "sigmas_cm": sigmas_m,
+            "agreements": results.agreements,
+            "places": results.places,
+            "states": states,
+            "state_colors": Value::Object(colors.into_iter().collect()),
+            "colormap": (0..10).map(|k| css(Colormap::Viridis.at(f64::from(k) / 9.0))).collect::<Vec<_>>(),
+            "scans": results.scan_outlines.as_deref().map(encoded),
+        }))
+    }
+}
+
+/// The map as a PNG with its upper left corner and the edge of a pixel [m].
+fn map_layer(map: &MapImage) -> Result<Value> {
+    let (bitmap, [x_min, y_max, cell_m]) = map.bitmap();
+    let png = palette::encoded(&bitmap)?;
+    Ok(json!({
+        "png": format!("data:image/png;base64,{}", STANDARD.encode(png)),
+        "x_min": x_min, "y_max": y_max, "cell_m": cell_m,
+    }))
+}
+
+/// x, y [m], heading [rad] of all poses.
+fn flat(poses: &[Pose2]) -> Vec<f64> {
+    let numbers = poses.iter().flat_map(|pose| {
+        let t = pose.translation;
+        [
+            rounded(t.x, 1e4),
+            rounded(t.y, 1e4),
+            rounded(pose.rotation.angle(), 1e5),
+        ]
+    });
+    numbers.collect()
+}
+
+/// Number of points of each outline, and all of them as 16-bit integers, little-endian.
+fn encoded(outlines: &[ScanOutline]) -> Value {
+    let bytes: Vec<u8> = outlines
+        .iter()
+        .flat_map(|outline| outline.0.as_flattened())
+        .flat_map(|number| number.to_le_bytes())
+        .collect();
+    let counts: Vec<usize> = outlines.iter().map(|outline| outline.0.len()).collect();
+    json!({ "counts": counts, "points": STANDARD.encode(bytes) })
+}
+
+fn rounded(number: f64, per_unit: f64) -> f64 {
+    (number * per_unit).round() / per_unit
+}
+
+fn css([red, green, blue]: Rgb) -> String {
+    format!("#{red:02x}{green:02x}{blue:02x}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_frame_has_its_pose_error_state_and_outline() {
+        let estimates: Vec<Pose2> = (0..3)
+            .map(|k| Pose2::new([f64::from(k), 0.02].into(), 0.1))
+            .collect();
+        let truth = estimates
+            .iter()
+            .map(|pose| Pose2::translation(0.0, -0.02) * pose)
+            .collect();
+        let results = LocalizationResults {
+            frames: vec![4, 5, 6],
+            ground_truth: Some(truth),
+            states: Some(vec![
+                State::Searching as u8,
+                State::Tracking as u8,
+                State::Lost as u8,
+            ]),
+            scan_outlines: Some(vec![
+                ScanOutline(vec![[100, -200]]),
+                ScanOutline(vec![]),
+                ScanOutline(vec![[1, 2], [3, 4]]),
+            ]),
+            ..LocalizationResults::default()
+        };
+        let content = InteractivePath {
+            results: &results,
+            estimates: &estimates,
+            map: None,
+        };
+        let content = content.content().unwrap();
+        assert_eq!(content["poses"].as_array().unwrap().len(), 9);
+        assert_eq!(content["errors_cm"], json!([2.0, 2.0, 2.0]));
+        assert_eq!(content["states"], json!(["searching", "tracking", "lost"]));
+        assert_eq!(content["scans"]["counts"], json!([1, 0, 2]));
+        let points = STANDARD
+            .decode(content["scans"]["points"].as_str().unwrap())
+            .unwrap();
+        assert_eq!(points.len(), 12);
+        assert_eq!(i16::from_le_bytes([points[2], points[3]]), -200);
+    }
+}

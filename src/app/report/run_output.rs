@@ -1,0 +1,238 @@
+//! Output files of a run: results, trajectories, reports and plots.
+
+mod pictures;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Result, bail};
+
+use crate::app::commands::trajectory::stamped;
+use crate::app::report::results::{
+    LocalizationResults, Report, RunSummary, TrajectoryReport, write_frames_csv, write_poses_npy,
+};
+use crate::app::run::claims::{Claims, Outputs};
+use crate::app::run::output;
+use crate::evaluation::{
+    EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, SpatialMetrics,
+    TrajectoryMetrics,
+};
+use crate::files::folder_of;
+use crate::geometry::{Pose2, Pose3};
+use crate::localization::ParticleSet;
+use crate::recording::Recording;
+use crate::recording::poses::{write_kitti, write_tum};
+
+pub use pictures::{MOST_TRIANGLES, Movie, draw_run, map_around, time_axis};
+
+/// Content of the interactive path, beside the pictures.
+pub const INTERACTIVE: &str = "path.json";
+
+/// Paths of the output files of a run, all in the folder of its result.
+#[derive(Clone, Debug)]
+pub struct RunFiles {
+    /// The `.npz` file.
+    pub result: PathBuf,
+    folder: PathBuf,
+}
+
+impl RunFiles {
+    /// The files beside a result.
+    pub fn beside(result: &Path) -> Self {
+        Self {
+            result: result.to_owned(),
+            folder: folder_of(result).to_owned(),
+        }
+    }
+
+    /// The folder of the result.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// The files of a result in another folder.
+    pub fn in_folder(result: &Path, folder: &Path) -> Self {
+        Self {
+            result: result.to_owned(),
+            folder: folder.to_owned(),
+        }
+    }
+
+    /// The path of a file beside the result.
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.folder.join(name)
+    }
+
+    /// The path of a plot in `plots/`, which is created if necessary, but not the folder above it.
+    pub fn plot(&self, name: &str) -> Result<PathBuf> {
+        self.in_subfolder("plots", name)
+    }
+
+    fn in_subfolder(&self, folder: &str, name: &str) -> Result<PathBuf> {
+        let folder = self.folder.join(folder);
+        output::create_subfolder(&folder)?;
+        Ok(folder.join(name))
+    }
+}
+
+/// Report files of a result.
+pub const REPORT_FILES: [&str; 4] = ["report.json", "report.md", "report.html", "frames.csv"];
+
+/// Further files that localization writes beside its result.
+pub const LOCALIZATION_FILES: [&str; 4] = [
+    "mcl_tum.txt",
+    "mcl_kitti.txt",
+    "ground_truth_poses.npy",
+    "effective_localization.yml",
+];
+
+/// Files that refinement adds to a result.
+pub const REFINEMENT_FILES: [&str; 4] = [
+    "refined_tum.txt",
+    "refined_kitti.txt",
+    "refined_poses.npy",
+    "effective_refinement.yml",
+];
+
+/// Prepares the outputs of a new result; an error if there is another one, also one with a
+/// different name in the same folder.
+pub fn prepare(files: &RunFiles, outputs: &Outputs) -> Result<Claims> {
+    let claims = outputs.prepare()?;
+    let names = ["report.json", "mcl_tum.txt", "frames.csv"];
+    let other = names.map(|name| files.file(name));
+    match other.iter().find(|path| path.exists()) {
+        Some(path) if !outputs.force && !files.result.exists() => bail!(
+            "{} exists and belongs to another result; set {} to a path in a folder of its own, or add --force to overwrite it",
+            path.display(),
+            outputs.key
+        ),
+        _ => Ok(claims),
+    }
+}
+
+/// Particles in the layout of the results.
+pub fn particle_rows(particles: &ParticleSet) -> Vec<ParticleRow> {
+    let row = |pose: &Pose2, weight: f64| {
+        let t = pose.translation;
+        [t.x, t.y, pose.rotation.angle(), weight].map(|number| number as f32)
+    };
+    (particles.particles().iter())
+        .map(|particle| row(&particle.map_from_lidar, particle.weight))
+        .collect()
+}
+
+/// Writes `<name>_tum.txt` (map frame, seconds) and `<name>_kitti.txt` (the convention of the
+/// recording's poses; without any, lidar poses in the map frame); the poses are those of the first frames.
+pub fn write_trajectory(
+    files: &RunFiles,
+    name: &str,
+    recording: &Recording,
+    map_from_lidar: &[Pose3],
+) -> Result<()> {
+    let trajectory = stamped(&recording.frames, map_from_lidar);
+    let (world_from_map, calibration) = recording.world();
+    output::write_file(&files.file(&format!("{name}_tum.txt")), |file| {
+        write_tum(file, &trajectory)
+    })?;
+    output::write_file(&files.file(&format!("{name}_kitti.txt")), |file| {
+        write_kitti(file, map_from_lidar, &world_from_map, &calibration)
+    })
+}
+
+/// Writes the `.npz` file, and poses as `.npy` files for other programs.
+pub fn write_results(files: &RunFiles, results: &LocalizationResults) -> Result<()> {
+    results.write(&files.result)?;
+    if let Some(truth) = &results.ground_truth {
+        write_poses_npy(&files.file("ground_truth_poses.npy"), truth)?;
+    }
+    if let Some(refined) = &results.refined {
+        write_poses_npy(&files.file("refined_poses.npy"), refined)?;
+    }
+    Ok(())
+}
+
+/// Writes `report.json`, `report.md` and `frames.csv`.
+pub fn write_report(
+    files: &RunFiles,
+    results: &LocalizationResults,
+    report: &Report,
+) -> Result<()> {
+    output::write_json(&files.file("report.json"), report)?;
+    output::write_text(&files.file("report.md"), &report.to_markdown())?;
+    write_frames_csv(&files.file("frames.csv"), results)
+}
+
+/// The entry of a report about a result that is not complete.
+pub fn shortfall(results: &LocalizationResults) -> Option<(String, String)> {
+    Some(("frames".to_owned(), results.shortfall()?))
+}
+
+/// Warns of a result that is not complete.
+pub fn warn_of_shortfall(results: &LocalizationResults, path: &Path) {
+    if let Some(shortfall) = results.shortfall() {
+        tracing::warn!(
+            "{} is incomplete: {shortfall}; run localize again for all of them",
+            path.display()
+        );
+    }
+}
+
+/// Summarizes a run, and compares the estimates and the refined trajectory with the ground truth, if there is one.
+pub fn evaluate(
+    results: &LocalizationResults,
+    rules: &RangeMclRules,
+    about: BTreeMap<String, String>,
+) -> Result<Report> {
+    let report =
+        |estimates: &[Pose2], in_space: &Option<Vec<Pose3>>, runtimes_s: &Option<Vec<f64>>| {
+            let Some(ground_truth) = results.ground_truth.as_deref() else {
+                return Ok(None);
+            };
+            let trajectory = EvaluatedTrajectory {
+                estimates,
+                ground_truth,
+                times_s: results.times_s.as_deref(),
+                runtimes_s: runtimes_s.as_deref(),
+            };
+            let in_space = in_space
+                .as_deref()
+                .zip(results.ground_truth_in_space.as_deref());
+            evaluate_trajectory(&trajectory, in_space, rules).map(Some)
+        };
+    let estimates = results.estimates_or_particle_means(rules)?;
+    Ok(Report {
+        about,
+        summary: RunSummary::of(results, &estimates),
+        mcl: report(&estimates, &results.estimates_in_space, &results.runtimes_s)?,
+        refined: match &results.refined {
+            Some(refined) => report(
+                refined,
+                &results.refined_in_space,
+                &results.refine_runtimes_s,
+            )?,
+            None => None,
+        },
+        trajectory: None,
+    })
+}
+
+/// Computes the errors of one trajectory.
+pub fn evaluate_trajectory(
+    trajectory: &EvaluatedTrajectory,
+    in_space: Option<(&[Pose3], &[Pose3])>,
+    rules: &RangeMclRules,
+) -> Result<TrajectoryReport> {
+    let defaults = MetricsConfig::default();
+    let config = MetricsConfig {
+        // At least half of a short run is evaluated.
+        skip_frames: (defaults.skip_frames).min(trajectory.ground_truth.len() / 2),
+        ..defaults
+    };
+    Ok(TrajectoryReport {
+        range_mcl: rules.evaluate(trajectory.estimates, trajectory.ground_truth),
+        metrics: TrajectoryMetrics::of(trajectory, &config)?,
+        in_space: in_space.and_then(|(estimates, truth)| {
+            SpatialMetrics::of(estimates, truth, config.skip_frames)
+        }),
+    })
+}

@@ -1,0 +1,524 @@
+//! Pictures of a run.
+
+use std::cmp::Reverse;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use anyhow::Result;
+use glam::DVec3;
+
+use super::{INTERACTIVE, RunFiles};
+use crate::app::report::plotting::color::{MCL, REFINED, Rgb, STATES};
+use crate::app::report::plotting::{
+    Animation, FRAME, InteractivePath, LineChart, LocalizationPicture, MapImage, MapPlot, Mark,
+    ObliqueView, Panel, ParticlePanels, PathPlot, Series, drift_chart, error_chart, relief,
+};
+use crate::app::report::results::{LocalizationResults, length};
+use crate::evaluation::trust::Axes;
+use crate::evaluation::{ParticleRow, planar_errors};
+use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
+use crate::localization::{Estimate, State};
+use crate::map::Map;
+
+/// Cells along the longer side of the map image in plots.
+const MAP_CELLS: usize = 1400;
+
+/// Triangles of a map in pictures; larger maps are drawn coarser.
+pub const MOST_TRIANGLES: usize = 2_000_000;
+
+/// Number of frames whose particles are drawn.
+const MOMENTS: usize = 4;
+
+/// Draws the plots of a run in `plots/`.
+pub fn draw_run(
+    files: &RunFiles,
+    mesh: Option<&TriangleMesh>,
+    results: &LocalizationResults,
+) -> Result<()> {
+    let path = mesh.map_or_else(Vec::new, |mesh| sensor_path(mesh, results));
+    let relief = mesh.map(|mesh| relief(mesh, &path));
+    let image = relief.as_ref();
+    let image = image.map(|relief| MapImage::of_colors(relief, MAP_CELLS));
+    let trajectories = Trajectories::of(results);
+    draw_path(files, image.as_ref(), results, &trajectories)?;
+    InteractivePath {
+        results,
+        estimates: &trajectories.estimates,
+        map: image.as_ref(),
+    }
+    .save(&files.plot(INTERACTIVE)?)?;
+    draw_errors(files, results, &trajectories)?;
+    draw_states(files, results, &trajectories)?;
+    draw_drift(files, trajectories.estimate_name(), results)?;
+    draw_runtimes(files, results)?;
+    draw_particles(files, image.as_ref(), results)?;
+    match &relief {
+        Some(relief) => draw_map(files, relief, &path, &trajectories),
+        None => Ok(()),
+    }
+}
+
+/// The map around some poses, for pictures: of large maps coarser.
+pub fn map_around<'a>(
+    map: &Map,
+    poses: impl IntoIterator<Item = &'a Pose2>,
+) -> Result<Arc<TriangleMesh>> {
+    /// What is shown beside the poses [m].
+    const RADIUS_M: f64 = 100.0;
+    let most_triangles = MOST_TRIANGLES as u64;
+    if map.triangle_count() <= most_triangles {
+        return Ok(map.mesh()?);
+    }
+    let places = poses.into_iter().map(|pose| pose.translation.vector.into());
+    let places: Vec<_> = places.collect();
+    Ok(map.mesh_near(&places, RADIUS_M, DVec3::ZERO, most_triangles)?)
+}
+
+/// Name and values of the horizontal axis of charts over the frames of a run.
+pub fn time_axis(results: &LocalizationResults) -> (&'static str, Vec<f64>) {
+    match results.times_s.as_deref() {
+        Some(times_s @ [start_s, ..]) => {
+            let from_start = times_s.iter().map(|time_s| time_s - start_s);
+            ("time from the start [s]", from_start.collect())
+        }
+        _ => {
+            let frames = results.frames.iter().map(|&frame| frame as f64);
+            (FRAME, frames.collect())
+        }
+    }
+}
+
+/// The trajectories of a run in the plane.
+struct Trajectories<'a> {
+    /// Whether there is no filter: the estimates come from elsewhere.
+    is_given: bool,
+    estimates: Vec<Pose2>,
+    refined: Option<&'a [Pose2]>,
+    truth: Option<&'a [Pose2]>,
+}
+
+impl<'a> Trajectories<'a> {
+    fn of(results: &'a LocalizationResults) -> Self {
+        Self {
+            is_given: results.particles.is_empty(),
+            estimates: match (&results.estimates, &results.estimates_in_space) {
+                (Some(estimates), _) => estimates.clone(),
+                (None, Some(estimates)) => estimates.iter().map(pose2_from_pose3).collect(),
+                (None, None) => Vec::new(),
+            },
+            refined: results.refined.as_deref(),
+            truth: results.ground_truth.as_deref(),
+        }
+    }
+
+    fn estimate_name(&self) -> &'static str {
+        if self.is_given { "estimate" } else { "MCL" }
+    }
+
+    /// Name, color and poses of what was found, the best last.
+    fn found(&self) -> Vec<(&'static str, Rgb, &[Pose2])> {
+        let refined = self.refined.map(|poses| ("refined", REFINED, poses));
+        std::iter::once((self.estimate_name(), MCL, self.estimates.as_slice()))
+            .chain(refined)
+            .collect()
+    }
+}
+
+/// The best path that was found, in space.
+fn sensor_path(mesh: &TriangleMesh, results: &LocalizationResults) -> Vec<Pose3> {
+    let in_space = [&results.refined_in_space, &results.estimates_in_space];
+    if let Some(path) = in_space.into_iter().flatten().next() {
+        return path.clone();
+    }
+    let planar = [&results.refined, &results.estimates];
+    let planar = planar.into_iter().flatten().next();
+    relief::lifted(mesh, planar.map_or(&[], Vec::as_slice))
+}
+
+/// Draws the best trajectory colored by its error, or without a truth by its standard deviation.
+fn draw_path(
+    files: &RunFiles,
+    map: Option<&MapImage>,
+    results: &LocalizationResults,
+    trajectories: &Trajectories,
+) -> Result<()> {
+    let paths = trajectories.found();
+    let numbers = paths
+        .last()
+        .and_then(|&(name, _, poses)| match trajectories.truth {
+            Some(truth) => {
+                let errors = planar_errors(poses, truth);
+                let errors_cm = errors.iter().map(|error| 100.0 * error.distance_m());
+                Some((format!("position error, {name} [cm]"), errors_cm.collect()))
+            }
+            None => {
+                let sigmas_cm = position_sigmas_cm(results)?;
+                Some((
+                    format!("standard deviation of the position, {name} [cm]"),
+                    sigmas_cm,
+                ))
+            }
+        });
+    PathPlot {
+        title: match trajectories.truth {
+            Some(_) => "Path against ground truth",
+            None => "Path",
+        },
+        ground_truth: trajectories.truth,
+        paths: &paths,
+        numbers: (numbers.as_ref())
+            .map(|(name, numbers): &(String, Vec<f64>)| (name.as_str(), numbers.as_slice())),
+        map,
+    }
+    .save(&files.plot("path.png")?)
+}
+
+/// Standard deviation of each position of the best trajectory [cm]; `None` if it is not known.
+fn position_sigmas_cm(results: &LocalizationResults) -> Option<Vec<f64>> {
+    let covariances = match results.refined {
+        Some(_) => results.refined_covariances.as_ref(),
+        None => results.covariances.as_ref(),
+    };
+    let sigma_cm =
+        |covariance: &nalgebra::Matrix3<f64>| 100.0 * (covariance.m11 + covariance.m22).sqrt();
+    Some(covariances?.iter().map(sigma_cm).collect())
+}
+
+fn draw_errors(
+    files: &RunFiles,
+    results: &LocalizationResults,
+    trajectories: &Trajectories,
+) -> Result<()> {
+    let Some(truth) = trajectories.truth.filter(|_| !trajectories.is_given) else {
+        return Ok(());
+    };
+    let (x_name, x) = time_axis(results);
+    let found = trajectories.found();
+    let errors = found.into_iter().map(|(name, color, poses)| {
+        let errors = x.iter().copied().zip(planar_errors(poses, truth));
+        (name, color, errors.collect())
+    });
+    let chart = error_chart("Errors over time", x_name, &errors.collect::<Vec<_>>());
+    chart.save(&files.plot("errors.png")?)
+}
+
+/// Draws how sure the run was of each frame: the standard deviation, and the agreement by state.
+fn draw_states(
+    files: &RunFiles,
+    results: &LocalizationResults,
+    trajectories: &Trajectories,
+) -> Result<()> {
+    let (Some(states), Some(covariances)) = (&results.states, &results.covariances) else {
+        return Ok(());
+    };
+    let (x_name, x) = time_axis(results);
+    let axes = covariances.iter().zip(&trajectories.estimates);
+    let sigmas_cm = axes.map(|(covariance, pose)| 100.0 * Axes::of(covariance, pose).long_m);
+    let agreements = results.agreements.as_deref().unwrap_or_default();
+    let in_state = |(state, color): (State, Rgb)| Series {
+        mark: Mark::Dots,
+        ..Series::line(
+            state.word(),
+            color,
+            (0..agreements.len())
+                .filter(|&row| states[row] == state as u8 && agreements[row] >= 0.0)
+                .map(|row| (x[row], 100.0 * agreements[row])),
+        )
+    };
+    let by_state = STATES.into_iter().map(in_state);
+    let panel = |y_name: &str, series: Vec<Series>| Panel {
+        y_name: y_name.to_owned(),
+        series,
+        clip_outliers: true,
+        ..Panel::default()
+    };
+    let sigma = Series::line(
+        "of the position, MCL",
+        MCL,
+        x.iter().copied().zip(sigmas_cm),
+    );
+    let panels = [
+        panel("standard deviation [cm]", vec![sigma]),
+        panel(
+            "beams on the map [%]",
+            by_state.filter(|it| !it.points.is_empty()).collect(),
+        ),
+    ];
+    LineChart {
+        title: "States over time".to_owned(),
+        x_name: x_name.to_owned(),
+        panels: (panels.into_iter())
+            .filter(|panel| !panel.series.is_empty())
+            .collect(),
+        ..LineChart::default()
+    }
+    .save(&files.plot("states.png")?)
+}
+
+/// Draws the errors in space against the distance driven.
+fn draw_drift(files: &RunFiles, name: &str, results: &LocalizationResults) -> Result<()> {
+    let Some(truth) = results.ground_truth_in_space.as_deref() else {
+        return Ok(());
+    };
+    let trajectories: Vec<_> = [
+        (name, MCL, &results.estimates_in_space),
+        ("refined", REFINED, &results.refined_in_space),
+    ]
+    .into_iter()
+    .filter_map(|(name, color, poses)| Some((name, color, poses.as_deref()?)))
+    .collect();
+    if trajectories.is_empty() {
+        return Ok(());
+    }
+    drift_chart(truth, &trajectories).save(&files.plot("drift.png")?)
+}
+
+fn draw_runtimes(files: &RunFiles, results: &LocalizationResults) -> Result<()> {
+    let stages = [
+        ("localize", MCL, &results.runtimes_s),
+        ("refine", REFINED, &results.refine_runtimes_s),
+    ];
+    let series = stages.into_iter().filter_map(|(stage, color, times_s)| {
+        let points = results.frames.iter().zip(times_s.as_ref()?);
+        let points = points.map(|(&frame, time_s)| (frame as f64, 1e3 * time_s));
+        Some(Series::line(stage, color, points))
+    });
+    let series: Vec<Series> = series.collect();
+    if series.is_empty() {
+        return Ok(());
+    }
+    LineChart {
+        title: "Runtime per frame".to_owned(),
+        x_name: FRAME.to_owned(),
+        is_x_whole: true,
+        panels: vec![Panel {
+            y_name: "time per frame [ms]".to_owned(),
+            series,
+            clip_outliers: true,
+            ..Panel::default()
+        }],
+        ..LineChart::default()
+    }
+    .save(&files.plot("runtime.png")?)
+}
+
+/// Draws the particles at several moments, from the first on.
+fn draw_particles(
+    files: &RunFiles,
+    map: Option<&MapImage>,
+    results: &LocalizationResults,
+) -> Result<()> {
+    let pose = |poses: &Option<Vec<Pose2>>, row: usize| poses.as_ref()?.get(row).copied();
+    let moments = moments(results);
+    let titles = moments.iter().map(|&row| {
+        let spread_m = spread_m(results.particles.frame(row)).unwrap_or(0.0);
+        let spread = length(spread_m);
+        format!("Frame {}: spread {spread}", results.frames[row])
+    });
+    let titles: Vec<String> = titles.collect();
+    let frames = moments
+        .iter()
+        .zip(&titles)
+        .map(|(&row, title)| LocalizationPicture {
+            title,
+            map,
+            particles: results.particles.frame(row),
+            estimate: pose(&results.estimates, row),
+            ground_truth: pose(&results.ground_truth, row),
+            ..LocalizationPicture::default()
+        });
+    let frames: Vec<LocalizationPicture> = frames.collect();
+    if frames.is_empty() {
+        return Ok(());
+    }
+    ParticlePanels {
+        title: "Particles",
+        frames: &frames,
+    }
+    .save(&files.plot("particles.png")?)
+}
+
+/// Rows of the first frame, of those in which the spread has shrunk to a third and the filter tracks,
+/// and of the last; and if they are too few, of frames between them.
+fn moments(results: &LocalizationResults) -> Vec<usize> {
+    let spreads_m: Vec<(usize, f64)> = (0..results.particles.len())
+        .filter_map(|row| Some((row, spread_m(results.particles.frame(row))?)))
+        .collect();
+    let (Some(&(first, widest_m)), Some(&(last, _))) = (spreads_m.first(), spreads_m.last()) else {
+        return Vec::new();
+    };
+    let shrunk = spreads_m
+        .iter()
+        .find(|(_, spread_m)| 3.0 * spread_m <= widest_m);
+    let states = results.states.as_deref().unwrap_or_default();
+    let tracks = states
+        .iter()
+        .position(|&state| state == State::Tracking as u8);
+    let found = [Some(first), shrunk.map(|(row, _)| *row), tracks, Some(last)];
+    let mut rows: Vec<usize> = found.into_iter().flatten().collect();
+    rows.sort_unstable();
+    rows.dedup();
+    while rows.len() < MOMENTS {
+        let gaps = rows
+            .windows(2)
+            .map(|pair| (pair[1] - pair[0], Reverse(pair[0])));
+        let Some((gap, Reverse(before))) = gaps.max().filter(|(gap, _)| *gap > 1) else {
+            break;
+        };
+        rows.push(before + gap / 2);
+        rows.sort_unstable();
+    }
+    rows
+}
+
+/// Standard deviation of the positions of particles [m]; `None` if they have no weight.
+fn spread_m(particles: &[ParticleRow]) -> Option<f64> {
+    let weighted = |value: fn(&[f64; 4]) -> f64| -> f64 {
+        let rows = particles.iter().map(|row| row.map(f64::from));
+        rows.map(|row| row[3] * value(&row)).sum()
+    };
+    let sum = weighted(|_| 1.0);
+    let variance = |value: fn(&[f64; 4]) -> f64, square: fn(&[f64; 4]) -> f64| {
+        weighted(square) / sum - (weighted(value) / sum).powi(2)
+    };
+    let x = variance(|row| row[0], |row| row[0] * row[0]);
+    let y = variance(|row| row[1], |row| row[1] * row[1]);
+    (sum > 0.0).then(|| (x + y).max(0.0).sqrt())
+}
+
+/// Draws the map from above and obliquely, with the path.
+fn draw_map(
+    files: &RunFiles,
+    relief: &TriangleMesh,
+    path: &[Pose3],
+    trajectories: &Trajectories,
+) -> Result<()> {
+    MapPlot {
+        title: "Map from above",
+        mesh: relief,
+        path: match trajectories.truth {
+            Some(truth) => Some(("true path", truth)),
+            None => Some(("found path", &trajectories.estimates)),
+        },
+        keys: &relief::KEYS,
+    }
+    .save(&files.plot("map.png")?)?;
+    let (name, color) = match (trajectories.refined, trajectories.is_given) {
+        (Some(_), _) => ("refined path", REFINED),
+        (None, true) => ("path", MCL),
+        (None, false) => ("MCL path", MCL),
+    };
+    ObliqueView {
+        mesh: relief,
+        name,
+        color,
+        path,
+    }
+    .save(&files.plot("view.png")?)
+}
+
+/// A picture per frame, and an animation of them.
+pub struct Movie {
+    files: RunFiles,
+    map: MapImage,
+    pictures: Vec<PathBuf>,
+}
+
+impl Movie {
+    /// Prepares the map image of the pictures.
+    pub fn begin(files: &RunFiles, map: &Map) -> Result<Self> {
+        let path = &map.path.map_from_lidar;
+        let places: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
+        let mesh = map_around(map, &places)?;
+        let relief = relief(&mesh, path);
+        Ok(Self {
+            files: files.clone(),
+            map: MapImage::of_colors(&relief, MAP_CELLS),
+            pictures: Vec::new(),
+        })
+    }
+
+    /// Draws the last frame of the results.
+    pub fn add(&mut self, results: &LocalizationResults, estimate: &Estimate) -> Result<()> {
+        /// Width of what is shown around the estimate [m].
+        const WINDOW_M: f64 = 80.0;
+        let Some(&number) = results.frames.last() else {
+            return Ok(());
+        };
+        let truth = results.ground_truth.as_deref().unwrap_or_default();
+        let driven = match truth {
+            [] => results.estimates.as_deref().unwrap_or_default(),
+            truth => truth,
+        };
+        let t = estimate.pose.translation;
+        let path = self
+            .files
+            .in_subfolder("loc_plots", &format!("{number:06}.png"))?;
+        LocalizationPicture {
+            title: &format!("Frame {number}: {}", estimate.state.word()),
+            map: Some(&self.map),
+            particles: results.particles.frame(results.len() - 1),
+            estimate: Some(estimate.pose),
+            ground_truth: truth.last().copied(),
+            driven,
+            window: Some(([t.x, t.y], WINDOW_M)),
+        }
+        .save(&path)?;
+        self.pictures.push(path);
+        Ok(())
+    }
+
+    /// Writes the animation.
+    pub fn finish(self) -> Result<()> {
+        Animation::default().save(&self.files.file("localization.gif"), &self.pictures)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::app::report::results::ParticleLog;
+
+    /// Two particles at a distance in each frame.
+    fn results(distances_m: &[f32], states: &[State]) -> LocalizationResults {
+        let mut particles = ParticleLog::new(2);
+        for &distance_m in distances_m {
+            particles.push_frame([[5.0, 0.0, 0.0, 0.5], [5.0 + distance_m, 0.0, 0.0, 0.5]]);
+        }
+        LocalizationResults {
+            frames: (0..distances_m.len()).collect(),
+            particles,
+            states: Some(states.iter().map(|&state| state as u8).collect()),
+            ..LocalizationResults::default()
+        }
+    }
+
+    #[test]
+    fn the_spread_is_the_standard_deviation_of_the_weighted_positions() {
+        let spread = spread_m(&[[1.0, 0.0, 0.0, 0.3], [1.0, 8.0, 0.0, 0.3]]);
+        assert!((spread.unwrap() - 4.0).abs() < 1e-6);
+        assert_eq!(spread_m(&[[0.0; 4]; 3]), None);
+    }
+
+    #[test]
+    fn the_moments_are_the_start_the_convergence_and_the_end() {
+        let mut distances_m = vec![30.0, 20.0, 9.0, 3.0, 0.5];
+        distances_m.resize(40, 0.2);
+        let mut states = vec![State::Searching; 7];
+        states.resize(40, State::Tracking);
+        assert_eq!(moments(&results(&distances_m, &states)), [0, 2, 7, 39]);
+        // Tracking from the start: frames between the first and the last.
+        let tracking = [State::Tracking; 9];
+        assert_eq!(moments(&results(&[1.0; 9], &tracking)), [0, 2, 4, 8]);
+        assert_eq!(moments(&results(&[1.0; 2], &tracking[..2])), [0, 1]);
+        assert!(moments(&results(&[], &[])).is_empty());
+    }
+
+    #[test]
+    fn time_starts_at_zero_and_without_times_frames_are_counted() {
+        let mut results = results(&[1.0; 3], &[]);
+        assert_eq!(time_axis(&results), (FRAME, vec![0.0, 1.0, 2.0]));
+        results.times_s = Some(vec![1e9, 1e9 + 0.5, 1e9 + 1.0]);
+        assert_eq!(time_axis(&results).1, [0.0, 0.5, 1.0]);
+    }
+}

@@ -1,0 +1,90 @@
+//! What every command gets beside its configuration.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use tracing::level_filters::LevelFilter;
+
+use crate::app::cli::MachineArgs;
+use crate::app::run::claims::CONFIGURATION_FILE;
+use crate::app::run::interrupt::Interrupt;
+use crate::app::run::logging::{self, RunLog};
+use crate::app::run::progress::Progress;
+use crate::memory;
+use crate::rendering::Backend;
+
+const GIB: f64 = (1_u64 << 30) as f64;
+
+/// Machine and user interface of a command.
+#[derive(Clone, Debug)]
+pub struct Context {
+    /// Number of threads.
+    pub threads: usize,
+    /// Processor that renders the map.
+    pub backend: Backend,
+    /// Interruption by the user.
+    pub interrupt: Interrupt,
+    /// Progress display.
+    pub progress: Progress,
+    /// Copy of the log for the results of a run.
+    pub log: RunLog,
+    /// The configuration file, which no output may replace.
+    pub config_file: Option<PathBuf>,
+}
+
+impl Context {
+    /// Starts logging, the thread pool and the handling of Ctrl-C, once per process.
+    pub fn new(level: LevelFilter, machine: MachineArgs) -> anyhow::Result<Self> {
+        let progress = Progress::new(level);
+        let log = RunLog::default();
+        logging::start(level, &progress, &log);
+        let half_gib = 0.5 * machine_bytes() / GIB;
+        memory::set_budget((machine.memory.unwrap_or(half_gib) * GIB) as u64);
+        let threads = machine.threads.map_or(0, usize::from);
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .build_global()
+            .context("starting the threads; choose fewer with --threads")?;
+        Ok(Self {
+            threads: rayon::current_num_threads(),
+            backend: machine.backend.into(),
+            interrupt: Interrupt::install().context("listening for Ctrl-C")?,
+            progress,
+            log,
+            config_file: None,
+        })
+    }
+
+    /// The context of a command with a configuration file: the given one, else the default.
+    pub fn with_config_file(&self, given: Option<&Path>, default: &str) -> Self {
+        Self {
+            config_file: Some(given.unwrap_or(Path::new(default)).to_owned()),
+            ..self.clone()
+        }
+    }
+
+    /// The configuration file as an input.
+    pub fn input(&self) -> Option<(&'static str, &Path)> {
+        Some((CONFIGURATION_FILE, self.config_file.as_deref()?))
+    }
+}
+
+/// The memory that this process can have: that of the machine or, if less, of its container or the limit
+/// of its address space; 8 GiB where the system does not report them [bytes].
+fn machine_bytes() -> f64 {
+    let number_in = |path: &str, name: &str, unit: f64| -> Option<f64> {
+        let text = std::fs::read_to_string(path).ok()?;
+        let line = text.lines().find(|line| line.starts_with(name))?;
+        let number = line[name.len()..].split_whitespace().next()?;
+        Some(unit * number.parse::<f64>().ok()?)
+    };
+    [
+        number_in("/proc/meminfo", "MemTotal:", 1024.0),
+        number_in("/sys/fs/cgroup/memory.max", "", 1.0),
+        number_in("/proc/self/limits", "Max address space", 1.0),
+    ]
+    .into_iter()
+    .flatten()
+    .reduce(f64::min)
+    .unwrap_or(8.0 * GIB)
+}

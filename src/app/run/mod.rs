@@ -1,0 +1,12 @@
+//! A run of a command: what it was called with, its progress, log, interruption and outputs.
+
+pub mod claims;
+mod context;
+pub mod input;
+pub mod interrupt;
+pub mod logging;
+pub mod output;
+pub mod progress;
+pub mod version;
+
+pub use context::Context;

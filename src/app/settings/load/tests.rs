@@ -1,0 +1,347 @@
+use std::fs;
+use std::path::PathBuf;
+
+use super::*;
+use crate::app::settings::{
+    BuildMapConfig, EvaluationConfig, GroundCommandConfig, Initialization, LocalizationConfig,
+    OdometrySource, RangeImageConfig, RefinementConfig,
+};
+use crate::rendering::RenderingMethod;
+
+/// Loads a configuration from a text.
+fn load_text<T: CommandConfig>(text: &str, settings: &[(&str, &str)]) -> Result<T, ConfigError> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("own.yml");
+    fs::write(&path, text).unwrap();
+    let settings: Vec<(String, String)> = settings
+        .iter()
+        .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()))
+        .collect();
+    load(Some(&path), &settings)
+}
+
+fn message_of(text: &str, settings: &[(&str, &str)]) -> String {
+    load_text::<LocalizationConfig>(text, settings)
+        .unwrap_err()
+        .to_string()
+}
+
+#[track_caller]
+fn assert_contains(message: &str, parts: &[&str]) {
+    for part in parts {
+        assert!(message.contains(part), "`{part}` is not in: {message}");
+    }
+}
+
+#[test]
+fn an_empty_file_is_the_default_configuration() {
+    assert_eq!(
+        load_text::<BuildMapConfig>("", &[]).unwrap(),
+        BuildMapConfig::default()
+    );
+    assert_eq!(
+        load_text::<EvaluationConfig>("# nothing but a comment\n", &[]).unwrap(),
+        EvaluationConfig::default()
+    );
+}
+
+#[test]
+fn every_default_configuration_is_valid() {
+    BuildMapConfig::default().validate().unwrap();
+    LocalizationConfig::default().validate().unwrap();
+    RefinementConfig::default().validate().unwrap();
+    EvaluationConfig::default().validate().unwrap();
+    GroundCommandConfig::default().validate().unwrap();
+}
+
+#[test]
+fn a_written_configuration_loads_to_an_equal_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("effective.yml");
+    for name in [
+        "map.ply",
+        "007",
+        "no",
+        "~",
+        "- a: b # c",
+        "it's \"q\"",
+        "a\nb",
+    ] {
+        let config = LocalizationConfig {
+            map_file: PathBuf::from(name),
+            odometry_file: Some(PathBuf::from(name)),
+            odometry: OdometrySource::File,
+            initialization: Some(Initialization::Extent),
+            move_thres: 0.1 + 0.2,
+            seed: u64::MAX,
+            range_image: RangeImageConfig {
+                fov_up: Some(0.1),
+                max_range: Some(1.0e6),
+                ..RangeImageConfig::default()
+            },
+            ..LocalizationConfig::default()
+        };
+        fs::write(&path, to_yaml(&config).unwrap()).unwrap();
+        let loaded: LocalizationConfig = load(Some(&path), &[]).unwrap();
+        assert_eq!(loaded, config);
+    }
+}
+
+#[test]
+fn an_unknown_key_is_reported_with_its_line_and_the_nearest_key() {
+    let message = message_of("seed: 1\nnumparticles: 100\n", &[]);
+    assert_contains(
+        &message,
+        &["own.yml, line 2", "`numparticles`", "`numParticles`"],
+    );
+    let message = message_of("range_image:\n  height: 64\n  widht: 900\n", &[]);
+    assert_contains(&message, &["line 3", "`widht`", "did you mean `width`?"]);
+}
+
+#[test]
+fn a_value_of_the_wrong_type_is_reported_with_line_key_and_value() {
+    let message = message_of("seed: 1\n\nmove_thres: far\n", &[]);
+    assert_contains(
+        &message,
+        &["own.yml, line 3", "move_thres", "`far`", "a number"],
+    );
+    let message = message_of("range_image:\n  # rows\n  height: tall # so\n", &[]);
+    assert_contains(
+        &message,
+        &["line 3", "range_image.height", "`tall`", "a whole number"],
+    );
+    let message = message_of("pose_tracking: perhaps\n", &[]);
+    assert_contains(&message, &["line 1", "pose_tracking", "True or False"]);
+    let message = message_of("odometry: guess\n", &[]);
+    assert_contains(
+        &message,
+        &["line 1", "`guess`", "auto, scans, file, ground_truth, none"],
+    );
+}
+
+#[test]
+fn a_value_of_the_wrong_shape_is_quoted() {
+    let message = message_of("range_image: [1]  # rows\n", &[]);
+    assert_contains(&message, &["line 1", "`[1]`", "a block of keys"]);
+    let message = message_of("seed: 1\nscan_folder: {a: b}\n", &[]);
+    assert_contains(&message, &["line 2", "`{a: b}`", "a text"]);
+    let message = message_of("start_idx:\n", &[]);
+    assert_contains(
+        &message,
+        &["line 1", "`null`", "start_idx", "a whole number"],
+    );
+    for text in [
+        "ground_color: [1, 2]\n",
+        "seed: 0\nground_color: [1, 2, 3, 4]\n",
+    ] {
+        let message = load_text::<BuildMapConfig>(text, &[])
+            .unwrap_err()
+            .to_string();
+        assert_contains(&message, &["`[1, 2", "ground_color", "a list of length 3"]);
+    }
+}
+
+#[test]
+fn a_syntax_error_is_reported_with_its_line() {
+    let message = message_of("seed: 1\nmap_file: [\n", &[]);
+    assert_contains(&message, &["own.yml", "line 2"]);
+    assert_contains(&message_of("just words\n", &[]), &["own.yml, line 1"]);
+}
+
+#[test]
+fn a_duplicate_key_is_reported() {
+    let message = message_of("seed: 1\nseed: 2\n", &[]);
+    assert_contains(&message, &["own.yml, line 2", "`seed` is given twice"]);
+}
+
+#[test]
+fn a_setting_replaces_one_key_and_the_last_one_wins() {
+    let config: LocalizationConfig = load_text(
+        "numParticles: 50\nrange_image:\n  height: 32\n",
+        &[
+            ("range_image.width", "512"),
+            ("range_image.width", "1024"),
+            ("scan_folder", "07"),
+            ("odometry_file", "odometry.txt"),
+            ("odometry", "file"),
+        ],
+    )
+    .unwrap();
+    let expected = LocalizationConfig {
+        num_particles: 50,
+        scan_folder: "07".into(),
+        odometry_file: Some("odometry.txt".into()),
+        odometry: OdometrySource::File,
+        range_image: RangeImageConfig {
+            height: Some(32),
+            width: Some(1024),
+            ..RangeImageConfig::default()
+        },
+        ..LocalizationConfig::default()
+    };
+    assert_eq!(config, expected);
+}
+
+#[test]
+fn a_setting_may_be_a_list_or_reset_a_key() {
+    let config: BuildMapConfig =
+        load_text("", &[("ground_color", "[0, 1, 0.5]"), ("seed", "3")]).unwrap();
+    assert_eq!(config.ground_color, [0.0, 1.0, 0.5]);
+    assert_eq!(config.rest_color, [0.0, 0.0, 1.0]);
+    assert_eq!(config.seed, 3);
+    let config: LocalizationConfig =
+        load_text("initialization: extent\n", &[("initialization", "null")]).unwrap();
+    assert_eq!(config.initialization, None);
+}
+
+#[test]
+fn an_invalid_setting_is_quoted() {
+    let message = message_of("", &[("range_image.widht", "3")]);
+    assert_contains(
+        &message,
+        &["--set range_image.widht=3", "`range_image.width`"],
+    );
+    let message = message_of("", &[("width", "3")]);
+    assert_contains(&message, &["did you mean `range_image.width`?"]);
+    let message = message_of("", &[("seed", "many")]);
+    assert_contains(&message, &["--set seed=many", "whole number"]);
+    let message = message_of("", &[("range_image", "[1")]);
+    assert_contains(&message, &["--set range_image=[1"]);
+    let message = message_of("", &[("seed", "-1")]);
+    assert_contains(&message, &["--set seed=-1", "not negative"]);
+    // The error is of the block of the key.
+    let (key, value) = ("fuzzy.variables.height.level", "{triangle: [3, 2, 1]}");
+    let message = message_of("", &[(key, value)]);
+    assert_contains(&message, &["--set fuzzy.variables.height.level"]);
+    let message = message_of("", &[(&"k".repeat(100_000), "1")]);
+    assert_contains(&message, &["prints every key"]);
+}
+
+#[test]
+fn an_invalid_value_is_reported_with_key_value_and_remedy() {
+    let message = message_of("range_image:\n  min_range: 60\n", &[]);
+    assert_contains(
+        &message,
+        &[
+            "line 2",
+            "range_image.min_range is 60",
+            "max_range, which is 50",
+        ],
+    );
+    for (key, value) in [
+        ("range_image.width", "0"),
+        ("range_image.fov_up", "-30"),
+        ("range_image.max_range", ".nan"),
+        ("range_image.max_instance", "0"),
+        ("numParticles", "0"),
+        ("num_reduced", "0"),
+        ("frame_step", "0"),
+        ("n_scans", "0"),
+        ("n_scans", "-2"),
+        ("grid_res", "-1"),
+        ("move_thres", ".inf"),
+        ("odometry", "file"),
+        ("map_file", "''"),
+        ("rendering.method", "raster"),
+    ] {
+        let message = message_of("", &[(key, value)]);
+        assert_contains(&message, &[&format!("--set {key}={value}: {key} is ")]);
+    }
+    for (key, value) in [
+        ("depth", "2"),
+        ("depth", "13"),
+        ("voxel_size", "-0.1"),
+        ("min_density", "1"),
+        ("crop_x", "0"),
+        ("ransac_n", "2"),
+        ("ground_color", "[2, 0, 0]"),
+    ] {
+        let message = load_text::<BuildMapConfig>("", &[(key, value)])
+            .unwrap_err()
+            .to_string();
+        assert_contains(&message, &[&format!("--set {key}={value}: {key} is ")]);
+    }
+    let message = load_text::<EvaluationConfig>("particle_select_ratio: 0\n", &[])
+        .unwrap_err()
+        .to_string();
+    assert_contains(&message, &["line 1", "particle_select_ratio is 0"]);
+}
+
+#[test]
+fn a_missing_file_is_named() {
+    let missing: Result<EvaluationConfig, _> = load(Some(Path::new("nowhere/own.yml")), &[]);
+    assert_contains(&missing.unwrap_err().to_string(), &["nowhere/own.yml"]);
+}
+
+#[test]
+fn the_numbers_of_items_are_not_part_of_the_keys_of_settings() {
+    let message = load_text::<BuildMapConfig>("", &[("fuzzy.rules[1]", "x")])
+        .unwrap_err()
+        .to_string();
+    assert_contains(&message, &["unknown key `fuzzy.rules[1]`", "`fuzzy.rules`"]);
+}
+
+#[test]
+fn the_initialization_follows_from_pose_tracking_unless_it_is_given() {
+    let start = |text: &str| {
+        let text = format!("pose_file: poses.txt\n{text}");
+        load_text::<LocalizationConfig>(&text, &[])
+            .unwrap()
+            .initialization()
+    };
+    assert_eq!(start(""), Initialization::Extent);
+    assert_eq!(
+        start("initial_pose: [1, 2, 90]\n"),
+        Initialization::Tracking
+    );
+    assert_eq!(start("pose_tracking: True\n"), Initialization::Tracking);
+    assert_eq!(start("pose_tracking: False\n"), Initialization::Corridor);
+    assert_eq!(
+        start("pose_tracking: True\ninitialization: extent\n"),
+        Initialization::Extent
+    );
+}
+
+#[test]
+fn a_known_start_and_the_true_odometry_need_their_poses() {
+    for text in [
+        "pose_tracking: True\n",
+        "initialization: tracking\n",
+        "odometry: ground_truth\n",
+    ] {
+        assert_contains(&message_of(text, &[]), &["pose_file"]);
+    }
+    let text = "initial_pose: [1e9, 0, 0]\n";
+    assert_contains(&message_of(text, &[]), &["initial_pose", "metres"]);
+    let text = "calib_file: calib.txt\nbody_from_lidar: [0, 0, 1.7, 0, 0, 0]\n";
+    assert_contains(&message_of(text, &[]), &["calib_file or body_from_lidar"]);
+}
+
+#[test]
+fn only_whole_range_images_are_rasterized() {
+    let text = "rendering: {method: raster}\n";
+    assert_contains(
+        &message_of(text, &[]),
+        &["rendering.method is raster", "reference"],
+    );
+    let reference = ("observation.likelihood", "reference");
+    let config: LocalizationConfig = load_text(text, &[reference]).unwrap();
+    assert_eq!(config.map_options().method, RenderingMethod::Raster);
+}
+
+#[test]
+fn keys_of_batches_are_those_of_localize_alone() {
+    for (key, value) in [("max_instance", "50"), ("render_instanced", "True")] {
+        let text = format!("range_image: {{{key}: {value}}}\n");
+        load_text::<LocalizationConfig>(&text, &[]).unwrap();
+        let errors = [
+            load_text::<BuildMapConfig>(&text, &[]).unwrap_err(),
+            load_text::<RefinementConfig>(&text, &[]).unwrap_err(),
+        ];
+        for error in errors {
+            assert_contains(&error.to_string(), &["range_image", key, "only localize"]);
+        }
+    }
+    let localization = load_text("range_image: {max_instance: 50}\n", &[]).unwrap();
+    RefinementConfig::of(localization).validate().unwrap();
+}

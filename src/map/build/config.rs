@@ -1,0 +1,57 @@
+//! Configuration of a map build.
+
+use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
+
+use super::local_map::LocalMapConfig;
+use crate::ground::GroundConfig;
+use crate::map::tiles::grid::TileConfig;
+use crate::rendering::{Backend, RenderingMethod};
+use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
+
+/// Everything that can be configured about building a map.
+///
+/// Defaults: the values of range-mcl where it has them.
+#[derive(Clone, Debug, PartialEq, SmartDefault)]
+pub struct MapConfig {
+    /// Distance from the previous key scan after which a scan is a key scan [m].
+    #[default(0.2)]
+    pub displacement_threshold_m: f64,
+    /// Key scans per local map.
+    #[default(100)]
+    pub local_map_size: usize,
+    /// Length of path of the neighbours with which a local map is meshed [m].
+    #[default(5.0)]
+    pub overlap_m: f64,
+    /// Largest distance between successive scans [m]; a larger one is an error of the poses.
+    #[default(50.0)]
+    pub max_step_m: f64,
+    /// Ground segmentation of the scans.
+    pub ground: GroundConfig,
+    /// From the scans of a local map to its mesh.
+    pub local_map: LocalMapConfig,
+}
+
+impl Validate for MapConfig {
+    /// With the keys of `build_map.yml`.
+    fn validate(&self) -> Result<(), InvalidValue> {
+        not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
+        in_range("local_map_size", self.local_map_size, 1..=10_000)?;
+        not_negative("overlap_m", self.overlap_m)?;
+        positive("max_step_m", self.max_step_m)?;
+        self.local_map.validate()
+    }
+}
+
+/// How a map is prepared for localization.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct MapOptions {
+    /// Processor that renders the map.
+    pub backend: Backend,
+    /// Method to render whole range images.
+    pub method: RenderingMethod,
+    /// Largest number of poses rendered at once; `None` for no limit.
+    pub max_poses: Option<usize>,
+    /// Division into tiles.
+    pub tiles: TileConfig,
+}

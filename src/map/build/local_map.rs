@@ -1,0 +1,433 @@
+//! A local map: the mesh of the scans of a stretch of road.
+
+use glam::{DVec3, Vec3};
+use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
+
+use super::changes::{self, Changes};
+use super::confidence::{self, ConfidenceConfig};
+use super::plan::Domain;
+use super::scan_cloud::{PointCounts, ScanCloud, ScanConfig};
+use super::seam;
+use super::vertex_ground;
+use super::visibility::{self, VisibilityConfig};
+use crate::geometry::{PointCloud, TriangleMesh};
+use crate::map::mesh_view::MeshView;
+use crate::meshing::{self, MeshingError, PoissonConfig, Reconstruction};
+use crate::validation::{InvalidValue, Validate, fraction, in_range, nested, require};
+
+/// Longest edge of the simplified ground in cells: vertices of neighbouring cells are less than two
+/// cells apart along an axis.
+const CELLS_PER_EDGE: f32 = 2.0;
+
+/// Processing of scans into a mesh.
+///
+/// Defaults: range-mcl's values where it has them.
+#[derive(Clone, Debug, PartialEq, SmartDefault)]
+pub struct LocalMapConfig {
+    /// Selection and preparation of points.
+    pub scan: ScanConfig,
+    /// Confidence weights of points.
+    pub confidence: ConfidenceConfig,
+    /// Surface reconstruction.
+    pub poisson: PoissonConfig,
+    /// Vertices below this quantile of density are removed (unitless).
+    #[default(0.1)]
+    pub min_density: f64,
+    /// Surface farther than this from every point is extrapolated and removed [m].
+    #[default(0.25)]
+    pub max_distance_m: f32,
+    /// Free-space votes.
+    pub visibility: VisibilityConfig,
+    /// A vertex with at least this ground confidence is ground (unitless).
+    #[default(0.5)]
+    pub ground_threshold: f32,
+    /// Cell size of the simplification of the ground [m]: no new edge is longer than two cells; 0
+    /// disables it.
+    #[default(1.0)]
+    pub simplify_resolution_m: f32,
+    /// Smoothing iterations of the simplified ground.
+    #[default(1)]
+    pub smoothing_iterations: usize,
+    /// Colour of confidence 1; lower confidences are interpolated towards `rest_color`.
+    #[default([255, 0, 0])]
+    pub ground_color: [u8; 3],
+    /// Colour of confidence 0.
+    #[default([0, 0, 255])]
+    pub rest_color: [u8; 3],
+}
+
+impl Validate for LocalMapConfig {
+    /// With the keys of `build_map.yml`.
+    fn validate(&self) -> Result<(), InvalidValue> {
+        self.scan.validate()?;
+        nested("confidence", &self.confidence)?;
+        nested("poisson", &self.poisson)?;
+        require(
+            (0.0..1.0).contains(&self.min_density),
+            "min_density",
+            self.min_density,
+            "it is the fraction of the vertices to remove, 0 or greater and less than 1",
+        )?;
+        in_range("max_distance_m", self.max_distance_m, 0.001..=1000.0)?;
+        nested("visibility", &self.visibility)?;
+        fraction("ground_threshold", self.ground_threshold)?;
+        let resolution_m = self.simplify_resolution_m;
+        require(
+            resolution_m == 0.0 || (0.01..=100.0).contains(&resolution_m),
+            "simplify_resolution",
+            resolution_m,
+            "it must lie between 0.01 and 100; 0 disables the simplification",
+        )?;
+        in_range("number_of_iterations", self.smoothing_iterations, 0..=1000)
+    }
+}
+
+/// Numbers of points and triangles at each step of a local map.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct LocalMapCounts {
+    /// Scans meshed.
+    pub scans: usize,
+    /// Points, summed over the scans.
+    pub points: PointCounts,
+    /// Points removed as dynamic.
+    pub dynamic_points: usize,
+    /// Points without a normal, merged from opposite ones, which the reconstruction cannot use.
+    pub unusable_points: usize,
+    /// Edge of the finest octree cells [m].
+    #[serde(default)]
+    pub cell_m: f32,
+    /// Triangles as reconstructed.
+    pub reconstructed_triangles: usize,
+    /// Triangles removed for low point density.
+    pub sparse_triangles: usize,
+    /// Triangles removed for their distance to all points.
+    pub distant_triangles: usize,
+    /// Triangles removed because beams pass through them.
+    pub crossed_triangles: usize,
+    /// Triangles saved by simplifying the ground.
+    pub simplified_triangles: usize,
+    /// Triangles in regions of neighbouring local maps.
+    pub foreign_triangles: usize,
+    /// Triangles that the older map has already, where there is one.
+    #[serde(default)]
+    pub known_triangles: usize,
+    /// Triangles of the finished local map.
+    pub triangles: usize,
+    /// Triangles of the older map that are gone.
+    #[serde(default)]
+    pub gone_triangles: usize,
+    /// Whether it had too few points to mesh.
+    #[serde(default)]
+    pub is_empty: bool,
+}
+
+/// A finished local map.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct LocalMap {
+    /// The part of the surface that it owns; empty where there were too few points.
+    pub mesh: TriangleMesh,
+    /// Origin of the coordinates of its mesh in the map frame [m], not zero far away from that of the map.
+    pub origin: DVec3,
+    /// Triangles of the older map that are gone, ascending.
+    pub gone: Vec<u32>,
+    /// Numbers of points and triangles at each step.
+    pub counts: LocalMapCounts,
+    /// Median share of the points of a scan that are on surfaces of the next one, from 0 to 1; below
+    /// 0.8 the poses are doubtful. `None` if no scans could be compared.
+    pub agreement: Option<f32>,
+    /// Key scans that agree with neither neighbour as well as the others do: their poses are doubtful.
+    pub doubtful_scans: Vec<usize>,
+}
+
+impl LocalMap {
+    /// Its mesh in the map frame, rounded to single precision.
+    pub fn in_map(&self) -> TriangleMesh {
+        let position = |vertex: &Vec3| (self.origin + vertex.as_dvec3()).as_vec3();
+        TriangleMesh {
+            vertices: self.mesh.vertices.iter().map(position).collect(),
+            ..self.mesh.clone()
+        }
+    }
+}
+
+/// Meshes the prepared scans of a local map and colours the mesh by ground confidence; of an older map, it finds what
+/// is gone, and keeps what is not in it. `begin_stage` is called at the start of each stage and may end the work with an
+/// error.
+pub(crate) fn build<E: From<MeshingError>>(
+    scans: Vec<ScanCloud>,
+    domain: Domain,
+    older: Option<&dyn MeshView>,
+    config: &LocalMapConfig,
+    begin_stage: impl Fn(&'static str) -> Result<(), E>,
+) -> Result<LocalMap, E> {
+    let mut counts = LocalMapCounts {
+        scans: scans.len(),
+        ..LocalMapCounts::default()
+    };
+    for scan in &scans {
+        counts.points.add(&scan.counts);
+    }
+    begin_stage("moving points")?;
+    let (cloud, weights) = static_cloud(&scans, config, &mut counts);
+
+    begin_stage("surface")?;
+    let Some(mut mesh) = surface(&cloud, weights.as_deref(), config, &mut counts)? else {
+        return Ok(LocalMap {
+            counts,
+            ..LocalMap::default()
+        });
+    };
+
+    begin_stage("false surfaces")?;
+    if config.visibility.enabled {
+        counts.crossed_triangles =
+            visibility::remove_crossed_triangles(&mut mesh, &scans, &config.visibility);
+    }
+    let mut changes = Changes::default();
+    if let Some(older) = older {
+        begin_stage("changes")?;
+        changes = changes::compare(older, &mut mesh, &scans, domain, &config.visibility);
+        counts.known_triangles = changes.known;
+        counts.gone_triangles = changes.gone.len();
+    }
+    drop(scans);
+
+    begin_stage("ground")?;
+    Ok(LocalMap {
+        gone: changes.gone,
+        ..finish(mesh, &cloud, domain, config, counts)
+    })
+}
+
+/// Meshes oriented points with ground confidences, as [`build`] does after the preparation of the scans.
+pub(crate) fn build_of_cloud<E: From<MeshingError>>(
+    cloud: &PointCloud,
+    domain: Domain,
+    config: &LocalMapConfig,
+    begin_stage: impl Fn(&'static str) -> Result<(), E>,
+) -> Result<LocalMap, E> {
+    let mut counts = LocalMapCounts::default();
+    begin_stage("surface")?;
+    let Some(mesh) = surface(cloud, None, config, &mut counts)? else {
+        return Ok(LocalMap {
+            counts,
+            ..LocalMap::default()
+        });
+    };
+    begin_stage("ground")?;
+    Ok(finish(mesh, cloud, domain, config, counts))
+}
+
+/// Reconstructs and trims the surface; `None` where there are too few points.
+fn surface(
+    cloud: &PointCloud,
+    weights: Option<&[f32]>,
+    config: &LocalMapConfig,
+    counts: &mut LocalMapCounts,
+) -> Result<Option<TriangleMesh>, MeshingError> {
+    let Some(Reconstruction {
+        mut mesh,
+        densities,
+        ..
+    }) = reconstruct(cloud, weights, config, counts)?
+    else {
+        return Ok(None);
+    };
+    counts.reconstructed_triangles = mesh.triangles.len();
+    counts.sparse_triangles = meshing::trim_by_density(&mut mesh, &densities, config.min_density);
+    counts.distant_triangles =
+        meshing::trim_by_distance(&mut mesh, &cloud.positions, config.max_distance_m);
+    Ok(Some(mesh))
+}
+
+/// Clips a mesh to what a local map owns, and colours and simplifies its ground.
+fn finish(
+    mut mesh: TriangleMesh,
+    cloud: &PointCloud,
+    domain: Domain,
+    config: &LocalMapConfig,
+    mut counts: LocalMapCounts,
+) -> LocalMap {
+    let region = domain.region(&mesh.bounds());
+    counts.foreign_triangles = seam::keep_own(&mut mesh, &region, domain.origin);
+    meshing::split_fans(&mut mesh);
+    let is_held = seam::on_border(&mesh.vertices, &region, domain.origin);
+    finish_ground(&mut mesh, cloud, &is_held, config, &mut counts);
+    mesh.snap();
+    counts.triangles = mesh.triangles.len();
+    LocalMap {
+        mesh,
+        origin: domain.origin,
+        counts,
+        ..LocalMap::default()
+    }
+}
+
+/// Returns the static points of all scans with their weights.
+fn static_cloud(
+    scans: &[ScanCloud],
+    config: &LocalMapConfig,
+    counts: &mut LocalMapCounts,
+) -> (PointCloud, Option<Vec<f32>>) {
+    let model = &config.scan.range_image;
+    let is_static = config
+        .visibility
+        .enabled
+        .then(|| visibility::static_points(scans, model, &config.visibility));
+    let mut all = PointCloud::default();
+    let mut weights: Option<Vec<f32>> = None;
+    for (number, scan) in scans.iter().enumerate() {
+        let mut cloud = scan.cloud.clone();
+        let is_kept = |index: usize| is_static.as_ref().is_none_or(|all| all[number][index]);
+        if let Some(confidences) = config.confidence.of(scan) {
+            let kept = confidences
+                .into_iter()
+                .enumerate()
+                .filter(|(index, _)| is_kept(*index));
+            weights
+                .get_or_insert_default()
+                .extend(kept.map(|(_, confidence)| confidence));
+        }
+        if is_static.is_some() {
+            cloud.retain(is_kept);
+            counts.dynamic_points += scan.cloud.len() - cloud.len();
+        }
+        all.append(cloud);
+    }
+    if let Some(weights) = &mut weights {
+        confidence::normalize(weights);
+    }
+    (all, weights)
+}
+
+/// Reconstructs the surface; `None` where there are too few points, which leaves a hole in the map.
+fn reconstruct(
+    cloud: &PointCloud,
+    weights: Option<&[f32]>,
+    config: &LocalMapConfig,
+    counts: &mut LocalMapCounts,
+) -> Result<Option<Reconstruction>, MeshingError> {
+    match meshing::reconstruct(cloud, weights, &config.poisson) {
+        Ok(surface) => {
+            counts.unusable_points = surface.dropped_points;
+            counts.cell_m = surface.cell_m;
+            Ok(Some(surface))
+        }
+        Err(MeshingError::TooFewPoints { usable, given, .. }) => {
+            counts.unusable_points = given - usable;
+            counts.is_empty = true;
+            Ok(None)
+        }
+        Err(other) => Err(other),
+    }
+}
+
+/// Colours the mesh by ground confidence and simplifies its ground, apart from the held vertices.
+fn finish_ground(
+    mesh: &mut TriangleMesh,
+    cloud: &PointCloud,
+    is_held: &[bool],
+    config: &LocalMapConfig,
+    counts: &mut LocalMapCounts,
+) {
+    let cell_m = config.max_distance_m.max(2.0 * config.scan.voxel_size_m);
+    let confidences = vertex_ground::mean_confidences(&mesh.vertices, cloud, cell_m);
+    let threshold = config.ground_threshold;
+    let (rest, ground) = (config.rest_color, config.ground_color);
+    mesh.colors = confidences
+        .iter()
+        .map(|&confidence| vertex_ground::color(confidence, threshold, rest, ground))
+        .collect();
+    if config.simplify_resolution_m <= 0.0 {
+        return;
+    }
+    let before = mesh.triangles.len();
+    *mesh = meshing::simplify_ground(
+        mesh,
+        &vertex_ground::ground_triangles(mesh, &confidences, threshold),
+        is_held,
+        CELLS_PER_EDGE * config.simplify_resolution_m,
+        config.smoothing_iterations,
+    );
+    counts.simplified_triangles = before.saturating_sub(mesh.triangles.len());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Pose3, Rigid3f};
+
+    /// A floor of 4 m x 4 m, of which some points have no normal.
+    fn floor(without_normal: usize) -> PointCloud {
+        let mut cloud = PointCloud::default();
+        for i in 0..1600 {
+            let normal = if i < without_normal {
+                Vec3::ZERO
+            } else {
+                Vec3::Z
+            };
+            let corner = Vec3::new((i % 40) as f32, (i / 40) as f32, 0.0);
+            cloud.push(0.1 * corner, normal, 1.0);
+        }
+        cloud
+    }
+
+    fn unusable(cloud: &PointCloud) -> (bool, usize) {
+        let mut counts = LocalMapCounts::default();
+        let settings = LocalMapConfig {
+            poisson: PoissonConfig {
+                depth: 5,
+                ..PoissonConfig::default()
+            },
+            ..LocalMapConfig::default()
+        };
+        let surface = reconstruct(cloud, None, &settings, &mut counts).unwrap();
+        assert_eq!(surface.is_none(), counts.is_empty);
+        (counts.is_empty, counts.unusable_points)
+    }
+
+    /// A scan with a point at 5 m in its own free space, and two points behind that.
+    fn scan() -> ScanCloud {
+        let mut cloud = PointCloud::default();
+        for range_m in [5.0, 10.0, 20.0] {
+            cloud.push(range_m * Vec3::X, Vec3::NEG_X, 0.0);
+        }
+        ScanCloud {
+            map_from_lidar: Rigid3f::from(&Pose3::identity()),
+            cloud,
+            returns: Vec::new(),
+            free_range_m: vec![7.0; ScanConfig::default().range_image.len()],
+            counts: PointCounts::default(),
+        }
+    }
+
+    #[test]
+    fn weights_are_those_of_the_static_points() {
+        let scans = [scan(), scan(), scan()];
+        let mut settings = LocalMapConfig::default();
+        let mut counts = LocalMapCounts::default();
+        let (_, weights) = static_cloud(&scans, &settings, &mut counts);
+        assert_eq!(weights, None);
+
+        settings.confidence.half_range_m = Some(10.0);
+        counts.dynamic_points = 0;
+        let (cloud, weights) = static_cloud(&scans, &settings, &mut counts);
+        assert_eq!((cloud.len(), counts.dynamic_points), (6, 3));
+        // 1/2 and 1/5 with a mean of 1.
+        let expected = [10.0 / 7.0, 4.0 / 7.0].repeat(3);
+        for (weight, expected) in weights.unwrap().into_iter().zip(&expected) {
+            assert!(
+                (weight - expected).abs() < 1e-5_f32,
+                "{weight} for {expected}"
+            );
+        }
+    }
+
+    #[test]
+    fn points_without_normals_are_counted_also_where_too_few_points_remain() {
+        assert_eq!(unusable(&floor(0)), (false, 0));
+        assert_eq!(unusable(&floor(7)), (false, 7));
+        assert_eq!(unusable(&floor(1597)), (true, 1597));
+    }
+}

@@ -1,0 +1,164 @@
+//! The path of the mapping drive and the frame of the map, stored with the map.
+//!
+//! In the PLY file they are comments, which all mesh readers skip: one for the frame, one per pose,
+//! each a translation [m] and a unit quaternion with all digits, so that reading gives the same bits.
+//!
+//! ```text
+//! comment fpmcl world_from_map   tx ty tz qx qy qz qw
+//! comment fpmcl map_from_lidar   tx ty tz qx qy qz qw
+//! ```
+
+use glam::DVec3;
+use nalgebra::{Quaternion, Translation3, UnitQuaternion};
+
+use crate::geometry::{FARTHEST_M, Pose3};
+
+const WORLD: &str = "fpmcl world_from_map";
+const POSE: &str = "fpmcl map_from_lidar";
+
+/// Poses of the scans that a map was built from, and the pose of the map in the world.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct MappingPath {
+    /// `p_world = world_from_map * p_map`, where the world is the frame in which the poses of the
+    /// mapping drive were given; the identity where they were given in the map frame.
+    pub world_from_map: Pose3,
+    /// Poses of the key scans, `p_map = map_from_lidar * p_lidar`; empty for a mesh from elsewhere.
+    pub map_from_lidar: Vec<Pose3>,
+}
+
+/// A comment of a map that cannot be read.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the comment `{0}` is not a pose of 7 finite numbers on Earth; build the map again")]
+pub struct BadPathComment(String);
+
+impl MappingPath {
+    /// Returns the comments of the PLY file.
+    pub fn to_comments(&self) -> Vec<String> {
+        let line = |key: &str, pose: &Pose3| {
+            let [x, y, z, i, j, k, w] = numbers_of_pose(pose);
+            format!("{key} {x} {y} {z} {i} {j} {k} {w}")
+        };
+        let poses = self.map_from_lidar.iter().map(|pose| line(POSE, pose));
+        std::iter::once(line(WORLD, &self.world_from_map))
+            .chain(poses)
+            .collect()
+    }
+
+    /// The path of a map to which a newer drive is added.
+    #[must_use]
+    pub fn extended_by(&self, map_from_lidar: &[Pose3]) -> Self {
+        let mut path = self.clone();
+        path.map_from_lidar.extend(map_from_lidar);
+        path
+    }
+
+    /// Frame of a mesh without a mapping drive that was moved by an origin [m]; `None` if it was not moved.
+    pub(crate) fn at_origin(origin: DVec3) -> Option<Self> {
+        (origin != DVec3::ZERO).then(|| Self {
+            world_from_map: Pose3::translation(origin.x, origin.y, origin.z),
+            ..Self::default()
+        })
+    }
+
+    /// Reads the comments of a PLY file; `None` where they hold neither path nor frame.
+    pub fn from_comments<'a>(
+        comments: impl IntoIterator<Item = &'a str>,
+    ) -> Result<Option<Self>, BadPathComment> {
+        let mut path: Option<Self> = None;
+        for comment in comments {
+            if let Some(numbers) = comment.strip_prefix(WORLD) {
+                path.get_or_insert_default().world_from_map = pose(numbers, comment)?;
+            } else if let Some(numbers) = comment.strip_prefix(POSE) {
+                let path = path.get_or_insert_default();
+                path.map_from_lidar.push(pose(numbers, comment)?);
+            }
+        }
+        Ok(path)
+    }
+}
+
+fn pose(numbers: &str, comment: &str) -> Result<Pose3, BadPathComment> {
+    let bad = || BadPathComment(comment.to_owned());
+    let numbers: Vec<f64> = numbers
+        .split_whitespace()
+        .map(|number| {
+            number
+                .parse()
+                .ok()
+                .filter(|number: &f64| number.is_finite())
+        })
+        .collect::<Option<_>>()
+        .ok_or_else(bad)?;
+    let &[x, y, z, i, j, k, w] = numbers.as_slice() else {
+        return Err(bad());
+    };
+    let quaternion = Quaternion::new(w, i, j, k);
+    let is_on_earth = [x, y, z].iter().all(|m| m.abs() <= FARTHEST_M);
+    if !is_on_earth || (quaternion.norm() - 1.0).abs() > 1e-6 {
+        return Err(bad());
+    }
+    Ok(pose_of_numbers(&[x, y, z, i, j, k, w]))
+}
+
+/// A pose as numbers: translation [m], then the quaternion i, j, k, w.
+pub(crate) type PoseNumbers = [f64; 7];
+
+pub(crate) fn numbers_of_pose(pose: &Pose3) -> PoseNumbers {
+    let (t, q) = (pose.translation, pose.rotation);
+    [t.x, t.y, t.z, q.i, q.j, q.k, q.w]
+}
+
+/// The same bits again: the quaternion is not normalized.
+pub(crate) fn pose_of_numbers(&[x, y, z, i, j, k, w]: &PoseNumbers) -> Pose3 {
+    let rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k));
+    Pose3::from_parts(Translation3::new(x, y, z), rotation)
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+
+    fn path() -> MappingPath {
+        let pose = |i: i32| {
+            let s = f64::from(i);
+            Pose3::new(
+                Vector3::new(s / 3.0, 1e6 * s, -s),
+                Vector3::new(0.1 * s, 0.2, -s),
+            )
+        };
+        MappingPath {
+            world_from_map: pose(7),
+            map_from_lidar: (0..5).map(pose).collect(),
+        }
+    }
+
+    #[test]
+    fn reading_what_was_written_gives_the_same_bits() {
+        let comments = path().to_comments();
+        let others = ["made by hand", "fpmcl"];
+        let lines = comments.iter().map(String::as_str).chain(others);
+        assert_eq!(MappingPath::from_comments(lines).unwrap(), Some(path()));
+    }
+
+    #[test]
+    fn a_file_without_poses_has_no_path() {
+        assert_eq!(MappingPath::from_comments(["a comment"]), Ok(None));
+    }
+
+    #[test]
+    fn a_damaged_comment_is_an_error_that_quotes_it() {
+        for numbers in [
+            "1 2 3",
+            "1 2 3 0 0 0 x",
+            "1 2 3 0 0 0 nan",
+            "1 2 3 0 0 0 2",
+            "1e9 2 3 0 0 0 1",
+        ] {
+            let line = format!("{POSE} {numbers}");
+            let error = MappingPath::from_comments([line.as_str()]).unwrap_err();
+            assert!(error.to_string().contains(&line), "{error}");
+        }
+    }
+}

@@ -1,0 +1,332 @@
+//! Multi-level surface map: heights on a regular grid over the whole x-y plane, sparse.
+//!
+//! ```text
+//! cell (i, j) covers [i c, (i + 1) c) × [j c, (j + 1) c)      c = edge of a cell
+//! ```
+//!
+//! Cells are stored in square chunks, which are allocated with their first height: the memory is
+//! proportional to the mapped area, not to its bounding box, which one outlier could make as large
+//! as the Earth.
+//!
+//! A cell may have several levels, as where a bridge crosses a road (Triebel, Pfaff and Burgard,
+//! *Multi-Level Surface Maps for Outdoor Terrain Mapping and Loop Closing*, IROS 2006): the heights of
+//! a cell are clustered by single linkage, and each level is the mean of a cluster.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fmt::Debug;
+use std::sync::Arc;
+
+use glam::DVec3;
+use nalgebra::{Point2, Vector3};
+
+use crate::shared_bytes::SharedBytes;
+
+/// Cells along the edge of a chunk.
+const CHUNK_CELLS: i64 = 64;
+
+/// Triangles with longer edges are artefacts, not the surface of a road [m].
+const MAX_EDGE_M: f64 = 500.0;
+
+/// Smallest distance of two levels, less than the clearance that any vehicle needs [m].
+pub(crate) const LEVEL_GAP_M: f64 = 2.0;
+
+/// Edge of a cell of the ground of a map [m].
+pub(crate) const GROUND_CELL_M: f64 = 0.5;
+
+/// Cells of a chunk.
+const CELLS: usize = (CHUNK_CELLS * CHUNK_CELLS) as usize;
+
+/// Column and row of a cell, or of a chunk.
+pub(crate) type Cell = (i64, i64);
+
+/// Heights of the levels of all cells. Clones share them.
+#[derive(Clone, Debug)]
+pub(crate) struct Heights {
+    /// Edge of a cell [m].
+    pub cell_m: f64,
+    chunks: Arc<dyn ChunkSource>,
+}
+
+/// Supplies chunks: level by level the heights of their cells [m], the lowest level of each cell first; NaN where a
+/// cell has no such level.
+pub(crate) trait ChunkSource: Debug + Send + Sync {
+    /// The numbers of a chunk, `f32`; `None` where there is no ground.
+    fn chunk(&self, chunk: Cell) -> Option<SharedBytes>;
+}
+
+/// Chunks in memory.
+pub(crate) type Chunks = BTreeMap<Cell, SharedBytes>;
+
+impl ChunkSource for Chunks {
+    fn chunk(&self, chunk: Cell) -> Option<SharedBytes> {
+        self.get(&chunk).cloned()
+    }
+}
+
+impl Heights {
+    /// Averages the heights of triangles per cell and level: one sample in each cell whose centre a
+    /// triangle covers, and one at each of its corners.
+    pub fn of_triangles(corners: impl Iterator<Item = [DVec3; 3]>, cell_m: f64) -> Self {
+        Self::over(Arc::new(chunks_of_triangles(corners, cell_m)), cell_m)
+    }
+
+    /// Heights that a source supplies.
+    pub fn over(chunks: Arc<dyn ChunkSource>, cell_m: f64) -> Self {
+        Self { cell_m, chunks }
+    }
+
+    /// One height for every cell of a rectangle.
+    pub fn flat(min: Point2<f64>, max: Point2<f64>, height_m: f64, cell_m: f64) -> Self {
+        let mut samples = HeightSamples::default();
+        let (first, last) = (cell_of(min, cell_m), cell_of(max, cell_m));
+        for row in first.1..=last.1 {
+            for column in first.0..=last.0 {
+                samples.add((column, row), height_m);
+            }
+        }
+        Self::over(Arc::new(samples.into_chunks()), cell_m)
+    }
+
+    /// Returns the cell of a position; `None` if a coordinate is not finite.
+    pub fn cell_at(&self, x: f64, y: f64) -> Option<Cell> {
+        (x.is_finite() && y.is_finite()).then(|| cell_of(Point2::new(x, y), self.cell_m))
+    }
+
+    /// Returns the centre of a cell.
+    pub fn center(&self, cell: Cell) -> Point2<f64> {
+        center_of(cell, self.cell_m)
+    }
+
+    /// Returns a reader that is fast for neighbouring cells.
+    pub fn reader(&self) -> HeightReader<'_> {
+        HeightReader {
+            heights: self,
+            last: None,
+        }
+    }
+}
+
+/// The chunks of triangles, in any order.
+pub(crate) fn chunks_of_triangles(
+    corners: impl Iterator<Item = [DVec3; 3]>,
+    cell_m: f64,
+) -> Chunks {
+    let mut samples = HeightSamples::default();
+    for corners in corners {
+        rasterize(corners, cell_m, &mut |cell, height_m| {
+            samples.add(cell, height_m)
+        });
+    }
+    samples.into_chunks()
+}
+
+/// Reads heights and keeps the last chunk: neighbouring cells mostly share one.
+pub(crate) struct HeightReader<'a> {
+    heights: &'a Heights,
+    last: Option<(Cell, Option<SharedBytes>)>,
+}
+
+impl HeightReader<'_> {
+    /// Returns the levels of a cell, the lowest first [m].
+    pub fn levels_m(&mut self, cell: Cell) -> impl Iterator<Item = f64> {
+        let (chunk, offset) = chunk_of(cell);
+        if !matches!(&self.last, Some((last, _)) if *last == chunk) {
+            self.last = Some((chunk, self.heights.chunks.chunk(chunk)));
+        }
+        let bytes = self.last.as_ref().and_then(|(_, bytes)| bytes.as_deref());
+        let heights_m: &[f32] = bytes.map_or(&[], bytemuck::cast_slice);
+        heights_m
+            .chunks_exact(CELLS)
+            .map(move |cells| f64::from(cells[offset]))
+            .take_while(|height_m| !height_m.is_nan())
+    }
+
+    /// Returns the level of a cell nearest to a height [m]; `None` in a cell without ground.
+    pub fn nearest_m(&mut self, cell: Cell, height_m: f64) -> Option<f64> {
+        self.levels_m(cell)
+            .min_by(|a, b| (a - height_m).abs().total_cmp(&(b - height_m).abs()))
+    }
+}
+
+/// Clusters of heights per cell, in chunks.
+#[derive(Default)]
+struct HeightSamples {
+    chunks: HashMap<Cell, Box<[Vec<HeightCluster>]>>,
+}
+
+/// A cluster of the heights of a cell.
+#[derive(Clone)]
+struct HeightCluster {
+    low_m: f64,
+    high_m: f64,
+    sum_m: f64,
+    count: f64,
+}
+
+impl HeightSamples {
+    /// Adds a height to the cell's cluster within [`LEVEL_GAP_M`], or as a new cluster. Clusters that
+    /// it connects are merged.
+    fn add(&mut self, cell: Cell, height_m: f64) {
+        let (chunk, offset) = chunk_of(cell);
+        let empty = || vec![Vec::new(); CELLS].into();
+        let clusters = &mut self.chunks.entry(chunk).or_insert_with(empty)[offset];
+        let mut added = HeightCluster {
+            low_m: height_m,
+            high_m: height_m,
+            sum_m: height_m,
+            count: 1.0,
+        };
+        clusters.retain(|cluster| {
+            let is_near =
+                cluster.low_m - LEVEL_GAP_M < height_m && height_m < cluster.high_m + LEVEL_GAP_M;
+            if is_near {
+                added.low_m = added.low_m.min(cluster.low_m);
+                added.high_m = added.high_m.max(cluster.high_m);
+                added.sum_m += cluster.sum_m;
+                added.count += cluster.count;
+            }
+            !is_near
+        });
+        let index = clusters.partition_point(|cluster| cluster.high_m < added.low_m);
+        clusters.insert(index, added);
+    }
+
+    fn into_chunks(self) -> Chunks {
+        let mean_m = |cluster: &HeightCluster| (cluster.sum_m / cluster.count) as f32;
+        let levels = |cells: &[Vec<HeightCluster>]| {
+            let most = cells.iter().map(Vec::len).max().unwrap_or(0);
+            let level_m = |clusters: &Vec<_>, level| clusters.get(level).map_or(f32::NAN, mean_m);
+            let heights_m: Vec<f32> = (0..most)
+                .flat_map(|level| cells.iter().map(move |cell| level_m(cell, level)))
+                .collect();
+            SharedBytes::from(bytemuck::cast_slice(&heights_m))
+        };
+        (self.chunks.into_iter())
+            .map(|(chunk, cells)| (chunk, levels(&cells)))
+            .collect()
+    }
+}
+
+/// Returns the chunk of a cell and the cell's index in it.
+fn chunk_of((column, row): Cell) -> (Cell, usize) {
+    let chunk = (column.div_euclid(CHUNK_CELLS), row.div_euclid(CHUNK_CELLS));
+    let offset = row.rem_euclid(CHUNK_CELLS) * CHUNK_CELLS + column.rem_euclid(CHUNK_CELLS);
+    (chunk, offset as usize)
+}
+
+/// The chunks that a triangle may have heights in; none for an artefact.
+pub(crate) fn chunks_reached([a, b, c]: [DVec3; 3], cell_m: f64) -> impl Iterator<Item = Cell> {
+    let (min, max) = (a.min(b).min(c), a.max(b).max(c));
+    let chunk_at = |corner: DVec3| {
+        let (column, row) = cell_of(Point2::new(corner.x, corner.y), cell_m);
+        (column.div_euclid(CHUNK_CELLS), row.div_euclid(CHUNK_CELLS))
+    };
+    let is_small =
+        (b - a).truncate().length() <= MAX_EDGE_M && (c - a).truncate().length() <= MAX_EDGE_M;
+    let (first, last) = (chunk_at(min), chunk_at(max));
+    let last_row = if is_small { last.1 } else { first.1 - 1 };
+    (first.1..=last_row).flat_map(move |row| (first.0..=last.0).map(move |column| (column, row)))
+}
+
+/// Middle of a chunk of cells of an edge.
+pub(crate) fn middle_of_chunk((column, row): Cell, cell_m: f64) -> Point2<f64> {
+    let edge_m = CHUNK_CELLS as f64 * cell_m;
+    Point2::new((column as f64 + 0.5) * edge_m, (row as f64 + 0.5) * edge_m)
+}
+
+/// Cell of a position.
+pub(crate) fn cell_of(position: Point2<f64>, cell_m: f64) -> Cell {
+    let cell = |along: f64| (along / cell_m).floor() as i64;
+    (cell(position.x), cell(position.y))
+}
+
+fn center_of((column, row): Cell, cell_m: f64) -> Point2<f64> {
+    Point2::new((column as f64 + 0.5) * cell_m, (row as f64 + 0.5) * cell_m)
+}
+
+/// Adds the heights of a triangle at the centres of cells that it covers, and those of its corners.
+pub(crate) fn rasterize(corners: [DVec3; 3], cell_m: f64, add: &mut impl FnMut(Cell, f64)) {
+    let [a, b, c] = corners.map(|corner| Vector3::from(corner.to_array()));
+    let (ab, ac) = (b - a, c - a);
+    if ab.xy().norm().max(ac.xy().norm()) > MAX_EDGE_M {
+        return;
+    }
+    for corner in [a, b, c] {
+        add(cell_of(corner.xy().into(), cell_m), corner.z);
+    }
+    let area = ab.x * ac.y - ab.y * ac.x;
+    if area.abs() <= 1e-12 {
+        return;
+    }
+    let first = cell_of(a.inf(&b).inf(&c).xy().into(), cell_m);
+    let last = cell_of(a.sup(&b).sup(&c).xy().into(), cell_m);
+    for row in first.1..=last.1 {
+        for column in first.0..=last.0 {
+            let center = center_of((column, row), cell_m);
+            let (x, y) = (center.x - a.x, center.y - a.y);
+            let u = (x * ac.y - y * ac.x) / area;
+            let v = (ab.x * y - ab.y * x) / area;
+            if u >= 0.0 && v >= 0.0 && u + v <= 1.0 {
+                add((column, row), a.z + u * ab.z + v * ac.z);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_center_of_a_cell_is_in_the_cell_on_both_sides_of_the_origin() {
+        let heights = Heights::flat(Point2::origin(), Point2::origin(), 0.0, 0.5);
+        for cell in [(0, 0), (-1, 63), (64, -64), (-65, 1_000_000)] {
+            let center = heights.center(cell);
+            assert_eq!(heights.cell_at(center.x, center.y), Some(cell));
+        }
+    }
+
+    #[test]
+    fn an_outlier_triangle_allocates_only_its_own_chunks() {
+        let near = [DVec3::ZERO, DVec3::X, DVec3::Y];
+        let far = near.map(|corner| corner + DVec3::new(1.0e9, -1.0e9, 0.0));
+        let degenerate = [DVec3::ZERO, DVec3::X, DVec3::new(0.0, 1.0e30, 0.0)];
+        let heights = Heights::of_triangles([near, far, degenerate].into_iter(), 0.25);
+        let chunks = chunks_of_triangles([near, far, degenerate].into_iter(), 0.25);
+        assert_eq!(chunks.len(), 2);
+        assert_eq!(heights.reader().nearest_m((1, 1), 5.0), Some(0.0));
+        assert_eq!(heights.reader().nearest_m((1000, 1), 0.0), None);
+    }
+
+    #[test]
+    fn heights_farther_apart_than_the_gap_are_levels_and_a_height_between_merges_them() {
+        let slab = |height: f64| {
+            [DVec3::ZERO, DVec3::X, DVec3::Y].map(|corner| corner + DVec3::Z * height)
+        };
+        let levels = |heights_m: &[f64]| {
+            let heights = Heights::of_triangles(heights_m.iter().map(|&height| slab(height)), 0.25);
+            heights.reader().levels_m((0, 0)).collect::<Vec<_>>()
+        };
+        assert_eq!(levels(&[6.0, 0.0, 6.5, 0.5]), [0.25, 6.25]);
+        assert_eq!(levels(&[12.0, 6.0, 0.0]), [0.0, 6.0, 12.0]);
+        assert_eq!(levels(&[0.0, 3.0, 1.5]), [1.5]);
+        assert_eq!(levels(&[1.5, 3.0, 0.0]), [1.5]);
+    }
+
+    #[test]
+    fn a_reader_returns_the_same_heights_in_any_order() {
+        let climbing = [
+            DVec3::new(-40.0, -40.0, -4.0),
+            DVec3::new(40.0, -40.0, 4.0),
+            DVec3::new(-40.0, 40.0, -4.0),
+        ];
+        let heights = Heights::of_triangles([climbing].into_iter(), 0.5);
+        let mut reader = heights.reader();
+        for cell in [(-1, -1), (63, -70), (-70, 63), (-1, -1), (900, 900)] {
+            let fresh = heights.reader().nearest_m(cell, 0.0);
+            assert_eq!(reader.nearest_m(cell, 0.0), fresh);
+        }
+        let expected_m = 0.1 * heights.center((63, -70)).x;
+        assert!((reader.nearest_m((63, -70), 0.0).unwrap() - expected_m).abs() < 1e-6);
+    }
+}

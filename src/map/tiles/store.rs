@@ -1,0 +1,897 @@
+//! The tiles of a map on disk: made beside its mesh on first use, read where rays and cars go, dropped behind them.
+//!
+//! What a ray hits and what ground is known never depends on which tiles are in memory: one that is missing is
+//! read when it is needed. Tiles ahead are read in the background, and those far away are dropped once all take more
+//! than [`KEPT_BYTES`].
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs::{self, File, TryLockError};
+use std::io::{self, BufRead as _, BufReader, Write as _};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
+use std::time::UNIX_EPOCH;
+
+use glam::{DVec3, Vec3};
+
+use super::file::{self, ENDING, INDEX, Source, TileEntry, TileFile, TileFileIndex, TileScene};
+use super::grid::{TileIndex, triangles_of_tiles};
+use crate::files::{remove_abandoned, write_atomically};
+use crate::geometry::mesh::on_lattice;
+use crate::geometry::{Aabb, TriangleMesh};
+use crate::map::build::plan::origin_near;
+use crate::map::build::vertex_ground::{GROUND, REST};
+use crate::map::files::mapping_path::MappingPath;
+use crate::map::ground::heights::{
+    Cell, ChunkSource, GROUND_CELL_M, chunks_of_triangles, chunks_reached, middle_of_chunk,
+};
+use crate::map::mesh_view::{MeshView, part_on_lattice};
+use crate::raycasting::{
+    Scene, SceneSource, Tile, TileError, TileProblem, TileSource, TriangleSource,
+};
+use crate::shared_bytes::SharedBytes;
+
+/// Memory of tiles above which those far from the rays are dropped [bytes].
+const KEPT_BYTES: u64 = 96 << 20;
+/// Ending of the names of files of panoramas.
+const PANORAMAS: &str = ".panoramas";
+/// Tiles nearer to the origins of rays are not dropped [m].
+const KEPT_M: f64 = 120.0;
+/// Tiles nearer to the origins of rays are read ahead [m].
+const AHEAD_M: f64 = 70.0;
+
+/// The tiles of a map on disk.
+#[derive(Debug)]
+pub(crate) struct TileStore {
+    files: Arc<Files>,
+    /// Path of the mapping drive, if it is in the mesh file.
+    pub path: Option<MappingPath>,
+    /// The boxes of all tiles, without the tiles.
+    scene: Scene,
+    resident: RwLock<Arc<Resident>>,
+    is_reading_ahead: Arc<AtomicBool>,
+}
+
+/// Where the tiles are, and how much of them is in memory.
+#[derive(Debug)]
+struct Files {
+    folder: PathBuf,
+    stamp: u32,
+    side_m: f64,
+    tiles: Vec<TileEntry>,
+    numbers: HashMap<TileIndex, usize>,
+    /// In memory [bytes].
+    bytes: Arc<AtomicU64>,
+    /// Memory above which tiles are dropped [bytes].
+    kept_bytes: u64,
+    /// The first tile that could not be read since the last check.
+    failure: Mutex<Option<Arc<TileError>>>,
+    /// The folder, locked so that no other process removes files from it.
+    _in_use: Option<File>,
+}
+
+/// The tiles that are in memory, and those that were not needed yet.
+#[derive(Debug)]
+struct Resident {
+    files: Arc<Files>,
+    slots: Vec<OnceLock<Option<Arc<LoadedTile>>>>,
+}
+
+/// A tile in memory; its bytes are counted as long as it is.
+#[derive(Debug)]
+struct LoadedTile {
+    number: usize,
+    file: TileFile,
+    scene: OnceLock<Option<TileScene>>,
+    /// Those of all tiles.
+    bytes: Arc<AtomicU64>,
+}
+
+impl Drop for LoadedTile {
+    fn drop(&mut self) {
+        let scene = self.scene.get().and_then(Option::as_ref);
+        let bytes = self.file.ground_bytes() + scene.map_or(0, TileScene::bytes);
+        self.bytes.fetch_sub(bytes as u64, Ordering::Relaxed);
+    }
+}
+
+impl Resident {
+    fn get(&self, number: usize) -> Option<&Arc<LoadedTile>> {
+        let slot = self.slots.get(number)?;
+        slot.get_or_init(|| self.files.read(number)).as_ref()
+    }
+
+    fn scene(&self, number: usize) -> Option<&TileScene> {
+        let tile = self.get(number)?;
+        tile.scene
+            .get_or_init(|| self.files.scene_of(tile))
+            .as_ref()
+    }
+}
+
+impl TileSource for Resident {
+    #[inline]
+    fn tile(&self, number: usize) -> Option<&Tile> {
+        self.scene(number)?.tile.as_ref()
+    }
+}
+
+impl Files {
+    fn read(&self, number: usize) -> Option<Arc<LoadedTile>> {
+        let path = self.tiles[number].file(&self.folder, self.stamp);
+        let file = self.or_failure(number, TileFile::open(&path))?;
+        self.bytes
+            .fetch_add(file.ground_bytes() as u64, Ordering::Relaxed);
+        Some(Arc::new(LoadedTile {
+            number,
+            file,
+            scene: OnceLock::new(),
+            bytes: self.bytes.clone(),
+        }))
+    }
+
+    fn scene_of(&self, tile: &LoadedTile) -> Option<TileScene> {
+        let scene = self.or_failure(tile.number, tile.file.scene())?;
+        self.bytes
+            .fetch_add(scene.bytes() as u64, Ordering::Relaxed);
+        Some(scene)
+    }
+
+    /// Keeps the first problem for the next check.
+    fn or_failure<T>(&self, number: usize, read: Result<T, TileProblem>) -> Option<T> {
+        read.map_err(|problem| {
+            let file = self.tiles[number].file(&self.folder, self.stamp);
+            let mut failure = self.failure.lock().unwrap_or_else(PoisonError::into_inner);
+            failure.get_or_insert(Arc::new(TileError { file, problem }));
+        })
+        .ok()
+    }
+}
+
+impl TileStore {
+    /// The folder of the tiles of a mesh file: beside it, its name with `.tiles`.
+    pub fn folder_of(mesh_file: &Path) -> PathBuf {
+        let mut name = mesh_file.as_os_str().to_owned();
+        name.push(".tiles");
+        name.into()
+    }
+
+    /// The tiles of a mesh file, if they are those of what it contains now.
+    pub fn open(mesh_file: &Path, has_given_path: bool, side_m: f64) -> io::Result<Option<Self>> {
+        let folder = Self::folder_of(mesh_file);
+        let in_use = in_use(&folder);
+        let bytes = match fs::read(folder.join(INDEX)) {
+            Ok(bytes) => bytes,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(error),
+        };
+        let Ok(index) = TileFileIndex::decode(&bytes) else {
+            return Ok(None);
+        };
+        let mut now = source_of(mesh_file, index.source.checksum, has_given_path, side_m)?;
+        if now.stamp() != index.source.stamp() {
+            return Ok(None);
+        }
+        if now != index.source {
+            // A copy has another time, and so has a mesh that was changed.
+            now.checksum = checksum_of(mesh_file)?;
+            if now.stamp() != index.source.stamp() {
+                return Ok(None);
+            }
+        }
+        let stamp = now.stamp();
+        let is_there = |tile: &TileEntry| tile.file(&folder, stamp).is_file();
+        match index.tiles.iter().all(is_there) {
+            true => Ok(Some(Self::over(folder.clone(), in_use, index, KEPT_BYTES))),
+            false => Ok(None),
+        }
+    }
+
+    /// A mesh file as it is now, and how it is to be divided.
+    pub fn source(mesh_file: &Path, has_given_path: bool, side_m: f64) -> io::Result<Source> {
+        source_of(mesh_file, checksum_of(mesh_file)?, has_given_path, side_m)
+    }
+
+    /// Writes the tiles of a mesh beside its file, on the lattice of maps, and opens them. Files of older tiles that no
+    /// process uses are removed. In memory are the indices of the triangles, and one tile.
+    ///
+    /// The source is that of the file before the mesh was opened: it is an error if the file has changed since.
+    pub fn make(
+        mesh_file: &Path,
+        source: Source,
+        mesh: &dyn MeshView,
+        is_ground: &dyn Fn(usize) -> bool,
+        own_path: Option<MappingPath>,
+    ) -> io::Result<Self> {
+        let folder = Self::folder_of(mesh_file);
+        let side_m = source.side_m;
+        let stamp = source.stamp();
+        fs::create_dir_all(&folder)?;
+        remove_abandoned(&folder)?;
+        let mut triangles_of = triangles_of_tiles(mesh, side_m);
+        let ground_of = ground_of_tiles(mesh, is_ground, side_m);
+        for tile in ground_of.keys() {
+            triangles_of.entry(*tile).or_default();
+        }
+        let mut tiles = Vec::with_capacity(triangles_of.len());
+        for (tile, triangles) in &triangles_of {
+            let middle = DVec3::new(tile.column as f64, tile.row as f64, 0.0) * side_m;
+            let origin = origin_near(middle);
+            let part = part_on_lattice(mesh, triangles, origin);
+            let ground = ground_of.get(tile).map_or(&[][..], Vec::as_slice).iter();
+            let corners = ground.map(|&triangle| mesh.corners(triangle as usize).map(on_lattice));
+            let chunks: Vec<(Cell, SharedBytes)> = chunks_of_triangles(corners, GROUND_CELL_M)
+                .into_iter()
+                .filter(|(chunk, _)| tile_of_chunk(*chunk, side_m) == *tile)
+                .collect();
+            let of_part = |triangle: usize| is_ground(triangles[triangle] as usize);
+            let (bytes, bounds) = file::encode(&part, origin, &chunks, of_part);
+            if triangles.is_empty() && chunks.is_empty() {
+                continue;
+            }
+            let entry = TileEntry::new(*tile, bounds, triangles.len());
+            write_atomically(&entry.file(&folder, stamp), |out| out.write_all(&bytes))?;
+            tiles.push(entry);
+        }
+        let has_given_path = source.has_given_path != 0;
+        if Self::source(mesh_file, has_given_path, side_m)? != source {
+            return Err(io::Error::other("the map has changed meanwhile"));
+        }
+        let index = TileFileIndex {
+            source,
+            path: own_path,
+            tiles,
+        };
+        write_atomically(&folder.join(INDEX), |out| out.write_all(&index.encode()))?;
+        remove_others(&folder, stamp)?;
+        Ok(Self::over(
+            folder.clone(),
+            in_use(&folder),
+            index,
+            KEPT_BYTES,
+        ))
+    }
+
+    /// The tiles of an index, none of them in memory.
+    fn over(folder: PathBuf, in_use: Option<File>, index: TileFileIndex, kept_bytes: u64) -> Self {
+        let numbers = index.tiles.iter().map(TileEntry::index).zip(0..).collect();
+        let bounds: Vec<Aabb> = index.tiles.iter().map(TileEntry::bounds).collect();
+        let mut triangles = 0_u32;
+        let first_triangles = (index.tiles.iter())
+            .map(|tile| {
+                let first = triangles;
+                triangles = triangles.wrapping_add(tile.triangles as u32);
+                first
+            })
+            .collect();
+        let files = Arc::new(Files {
+            folder,
+            stamp: index.source.stamp(),
+            side_m: index.source.side_m,
+            numbers,
+            bytes: Arc::default(),
+            kept_bytes,
+            failure: Mutex::default(),
+            _in_use: in_use,
+            tiles: index.tiles,
+        });
+        let resident = Arc::new(Resident {
+            slots: files.tiles.iter().map(|_| OnceLock::new()).collect(),
+            files: files.clone(),
+        });
+        Self {
+            files,
+            path: index.path,
+            scene: Scene::over(&bounds, first_triangles, Arc::new(Vec::new())),
+            resident: RwLock::new(resident),
+            is_reading_ahead: Arc::default(),
+        }
+    }
+
+    /// The file of the panoramas of a request, given in words.
+    pub fn file_of_panoramas(&self, request: &str) -> PathBuf {
+        let (stamp, request) = (self.files.stamp, crc32fast::hash(request.as_bytes()));
+        (self.files.folder).join(format!("panoramas-{request:08x}.{stamp:08x}{PANORAMAS}"))
+    }
+
+    /// Number of triangles of the map.
+    pub fn triangles(&self) -> u64 {
+        self.files.tiles.iter().map(|tile| tile.triangles).sum()
+    }
+
+    /// All tiles, and the boxes around their triangles.
+    pub fn boxes(&self) -> impl Iterator<Item = (TileIndex, Aabb)> {
+        let tiles = self.files.tiles.iter();
+        tiles
+            .map(|tile| (tile.index(), tile.bounds()))
+            .filter(|(_, bounds)| !bounds.is_empty())
+    }
+
+    /// The triangles of the tiles whose boxes are wanted, relative to `origin` [m], red where they are ground and blue
+    /// elsewhere; if there are more than `most_triangles`, about as many, of vertices merged in cells.
+    pub fn mesh_of(
+        &self,
+        origin: DVec3,
+        most_triangles: u64,
+        is_wanted: impl Fn(&Aabb) -> bool,
+    ) -> Result<TriangleMesh, Arc<TileError>> {
+        let wanted = self.files.tiles.iter().enumerate();
+        let wanted: Vec<_> = wanted
+            .filter(|(_, entry)| is_wanted(&entry.bounds()))
+            .collect();
+        let triangles: u64 = wanted.iter().map(|(_, entry)| entry.triangles).sum();
+        // The surface of a tile is about twice its square, and a cell that it passes through has about four triangles.
+        let cell_m = (triangles > most_triangles).then(|| {
+            let area_m2 = 2.0 * wanted.len() as f64 * self.files.side_m.powi(2);
+            (4.0 * area_m2 / most_triangles.max(1) as f64).sqrt()
+        });
+        let mut mesh = TriangleMesh::default();
+        for (number, entry) in wanted {
+            let resident = self.resident();
+            let Some(scene) = resident.scene(number) else {
+                continue;
+            };
+            let Some(tile) = &scene.tile else {
+                continue;
+            };
+            let mut vertices: HashMap<([u64; 3], bool), u32> = HashMap::new();
+            tile.for_each_triangle(|corners, triangle| {
+                let is_ground = scene.is_ground(triangle);
+                let indices = corners.map(|corner| {
+                    let place = cell_m.map_or(corner, |cell_m| (corner / cell_m).floor());
+                    let bits = place.to_array().map(f64::to_bits);
+                    *vertices.entry((bits, is_ground)).or_insert_with(|| {
+                        mesh.vertices.push((corner - origin).as_vec3());
+                        mesh.colors.push(if is_ground { GROUND } else { REST });
+                        mesh.vertices.len() as u32 - 1
+                    })
+                });
+                let [a, b, c] = indices;
+                if cell_m.is_none() || (a != b && b != c && c != a) {
+                    mesh.triangles.push(indices);
+                }
+            });
+            self.drop_beyond(entry.bounds());
+        }
+        self.check()?;
+        Ok(mesh)
+    }
+
+    fn resident(&self) -> Arc<Resident> {
+        self.resident
+            .read()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
+    }
+
+    /// Drops the tiles that are far from a box, if all together take much memory.
+    fn drop_beyond(&self, bounds: Aabb) {
+        if self.files.bytes.load(Ordering::Relaxed) <= self.files.kept_bytes {
+            return;
+        }
+        let mut resident = self
+            .resident
+            .write()
+            .unwrap_or_else(PoisonError::into_inner);
+        let slots = resident.slots.iter().zip(&self.files.tiles);
+        let kept = slots.map(
+            |(slot, tile)| match is_near(&tile.bounds(), &bounds, KEPT_M) {
+                true => slot.clone(),
+                false => OnceLock::new(),
+            },
+        );
+        *resident = Arc::new(Resident {
+            slots: kept.collect(),
+            files: self.files.clone(),
+        });
+    }
+
+    /// Reads the tiles around a box that are not in memory, in the background.
+    fn read_ahead(&self, resident: &Arc<Resident>, bounds: &Aabb) {
+        let at = |corner: Vec3, offset_m: f64| {
+            let [x, y] = [corner.x, corner.y].map(|along| f64::from(along) + offset_m);
+            TileIndex::of(x, y, self.files.side_m)
+        };
+        let is_missing = |number: &usize| {
+            let tile = resident.slots[*number].get().and_then(Option::as_ref);
+            tile.is_none_or(|tile| tile.scene.get().is_none())
+        };
+        let missing: Vec<usize> =
+            TileIndex::range(at(bounds.min, -AHEAD_M), at(bounds.max, AHEAD_M))
+                .filter_map(|tile| self.files.numbers.get(&tile).copied())
+                .filter(is_missing)
+                .collect();
+        if missing.is_empty() || self.is_reading_ahead.swap(true, Ordering::Acquire) {
+            return;
+        }
+        let (resident, reading) = (resident.clone(), Reading(self.is_reading_ahead.clone()));
+        std::thread::spawn(move || {
+            for number in missing {
+                resident.scene(number);
+            }
+            // Dropped first: who sees that the reading has ended sees what is kept.
+            drop(resident);
+            drop(reading);
+        });
+    }
+}
+
+/// Tiles are being read ahead, until it is dropped, also where the thread does not come to its end.
+struct Reading(Arc<AtomicBool>);
+
+impl Drop for Reading {
+    fn drop(&mut self) {
+        self.0.store(false, Ordering::Release);
+    }
+}
+
+impl SceneSource for TileStore {
+    fn scene(&self, origins: &[DVec3]) -> Scene {
+        let finite = origins.iter().filter(|origin| origin.is_finite());
+        let bounds = Aabb::of(finite.map(|origin| origin.as_vec3()));
+        if !bounds.is_empty() {
+            self.drop_beyond(bounds);
+        }
+        let resident = self.resident();
+        if !bounds.is_empty() && f64::from(bounds.size().truncate().max_element()) < KEPT_M {
+            self.read_ahead(&resident, &bounds);
+        }
+        self.scene.with_tiles(resident)
+    }
+
+    fn check(&self) -> Result<(), Arc<TileError>> {
+        let mut failure = self
+            .files
+            .failure
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        failure.take().map_or(Ok(()), Err)
+    }
+}
+
+impl TriangleSource for TileStore {
+    fn tiles(&self) -> Vec<(Aabb, u64)> {
+        let tiles = self.files.tiles.iter();
+        tiles.map(|tile| (tile.bounds(), tile.triangles)).collect()
+    }
+
+    /// The tile is not kept in memory.
+    fn triangles(&self, tile: usize) -> Result<Vec<[DVec3; 3]>, Arc<TileError>> {
+        let mut triangles = Vec::new();
+        if let Some(loaded) = self.files.read(tile) {
+            let scene = (loaded.scene.get_or_init(|| self.files.scene_of(&loaded))).as_ref();
+            if let Some(tile) = scene.and_then(|scene| scene.tile.as_ref()) {
+                tile.for_each_triangle(|corners, _| triangles.push(corners));
+            }
+        }
+        self.check()?;
+        Ok(triangles)
+    }
+}
+
+impl ChunkSource for TileStore {
+    fn chunk(&self, chunk: Cell) -> Option<SharedBytes> {
+        let tile = tile_of_chunk(chunk, self.files.side_m);
+        let number = *self.files.numbers.get(&tile)?;
+        let heights = self.resident().get(number)?.file.chunk(chunk);
+        if self.files.bytes.load(Ordering::Relaxed) > self.files.kept_bytes * 3 / 2 {
+            self.drop_beyond(self.files.tiles[number].bounds());
+        }
+        heights
+    }
+}
+
+/// The triangles of the ground that reach chunks of each tile.
+fn ground_of_tiles(
+    mesh: &dyn MeshView,
+    is_ground: &dyn Fn(usize) -> bool,
+    side_m: f64,
+) -> BTreeMap<TileIndex, Vec<u32>> {
+    let mut ground_of: BTreeMap<TileIndex, Vec<u32>> = BTreeMap::new();
+    for triangle in (0..mesh.triangles()).filter(|&triangle| is_ground(triangle)) {
+        let mut tiles: Vec<TileIndex> = chunks_reached(mesh.corners(triangle), GROUND_CELL_M)
+            .map(|chunk| tile_of_chunk(chunk, side_m))
+            .collect();
+        tiles.sort_unstable();
+        tiles.dedup();
+        for tile in tiles {
+            ground_of.entry(tile).or_default().push(triangle as u32);
+        }
+    }
+    ground_of
+}
+
+/// The tile whose file a chunk of the ground is in: that of its middle.
+fn tile_of_chunk(chunk: Cell, side_m: f64) -> TileIndex {
+    let middle = middle_of_chunk(chunk, GROUND_CELL_M);
+    TileIndex::of(middle.x, middle.y, side_m)
+}
+
+/// Whether boxes are within a distance of each other along x and y.
+fn is_near(a: &Aabb, b: &Aabb, distance_m: f64) -> bool {
+    let distance = Vec3::splat(distance_m as f32);
+    let overlap = (a.min - distance).cmple(b.max) & (b.min - distance).cmple(a.max);
+    overlap.x && overlap.y
+}
+
+/// A mesh file as it is now, with the checksum of its bytes.
+fn source_of(
+    mesh_file: &Path,
+    checksum: u32,
+    has_given_path: bool,
+    side_m: f64,
+) -> io::Result<Source> {
+    let metadata = fs::metadata(mesh_file)?;
+    let modified = metadata.modified().ok();
+    let since = modified.and_then(|time| time.duration_since(UNIX_EPOCH).ok());
+    Ok(Source {
+        bytes: metadata.len(),
+        modified_ns: since.map_or(0, |since| since.as_nanos() as u64),
+        checksum,
+        has_given_path: has_given_path.into(),
+        side_m,
+        ground_cell_m: GROUND_CELL_M,
+    })
+}
+
+/// Checksum of a file.
+fn checksum_of(path: &Path) -> io::Result<u32> {
+    let mut file = BufReader::with_capacity(1 << 20, File::open(path)?);
+    let mut hasher = crc32fast::Hasher::new();
+    loop {
+        let bytes = file.fill_buf()?;
+        if bytes.is_empty() {
+            return Ok(hasher.finalize());
+        }
+        hasher.update(bytes);
+        let count = bytes.len();
+        file.consume(count);
+    }
+}
+
+/// A folder of tiles, locked as one that is in use; `None` where there are no such locks.
+fn in_use(folder: &Path) -> Option<File> {
+    let opened = File::open(folder).ok()?;
+    opened.lock_shared().is_ok().then_some(opened)
+}
+
+/// Removes the tiles and panoramas with another stamp, unless a process may use them.
+fn remove_others(folder: &Path, stamp: u32) -> io::Result<()> {
+    let opened = File::open(folder);
+    if (opened.as_ref()).is_ok_and(|it| matches!(it.try_lock(), Err(TryLockError::WouldBlock))) {
+        return Ok(());
+    }
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let is_other = |ending: &str| {
+            name.ends_with(ending) && !name.ends_with(&format!(".{stamp:08x}{ending}"))
+        };
+        if is_other(ENDING) || is_other(PANORAMAS) {
+            fs::remove_file(entry.path())?;
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
+
+    use super::*;
+    use crate::geometry::Pose3;
+    use crate::map::ground::elevation::GroundMap;
+    use crate::map::{Map, MapOptions};
+    use crate::rendering::Backend;
+
+    /// A road of 1.2 km along x, walls beside it, and a ramp.
+    fn street() -> TriangleMesh {
+        let mut mesh = TriangleMesh::default();
+        let mut quad = |corners: [Vec3; 4], color: [u8; 3]| {
+            let first = mesh.vertices.len() as u32;
+            mesh.vertices.extend(corners);
+            mesh.colors.extend([color; 4]);
+            mesh.triangles.push([first, first + 1, first + 2]);
+            mesh.triangles.push([first, first + 2, first + 3]);
+        };
+        for number in 0..240_u16 {
+            let x = 5.0 * f32::from(number);
+            let z = 0.004 * x;
+            let at = |dx: f32, y: f32, up: f32| Vec3::new(x + dx, y, z + 0.004 * dx + up);
+            quad(
+                [
+                    at(0.0, -9.0, 0.0),
+                    at(5.0, -9.0, 0.0),
+                    at(5.0, 9.0, 0.0),
+                    at(0.0, 9.0, 0.0),
+                ],
+                [255, 0, 0],
+            );
+            let set_back = f32::from(number % 7);
+            quad(
+                [
+                    at(0.0, 9.0 + set_back, 0.0),
+                    at(5.0, 9.0 + set_back, 0.0),
+                    at(5.0, 9.0 + set_back, 6.0),
+                    at(0.0, 9.0 + set_back, 6.0),
+                ],
+                [0, 0, 255],
+            );
+        }
+        mesh
+    }
+
+    fn options() -> MapOptions {
+        MapOptions {
+            backend: Backend::Cpu,
+            ..MapOptions::default()
+        }
+    }
+
+    /// A folder with the street as `map.ply`.
+    fn saved() -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("map.ply");
+        crate::map::files::ply::write(&file, &street(), Some(&path())).unwrap();
+        (folder, file)
+    }
+
+    fn path() -> MappingPath {
+        MappingPath {
+            map_from_lidar: (0..1200)
+                .map(|x| Pose3::translation(f64::from(x), 0.0, 2.0))
+                .collect(),
+            ..MappingPath::default()
+        }
+    }
+
+    /// Ranges from many poses along the street, and the ground there.
+    fn seen(map: &Map) -> (Vec<Vec<f32>>, Vec<Option<f64>>) {
+        let mut rng = StdRng::seed_from_u64(1);
+        let directions: Vec<Vec3> = (0..200)
+            .map(|_| {
+                let mut along = || rng.random_range(-1.0_f32..1.0);
+                Vec3::new(along(), along(), 0.3 * along()).normalize()
+            })
+            .collect();
+        let xs: Vec<f64> = (0..60).map(|_| rng.random_range(5.0..1190.0)).collect();
+        let poses = xs
+            .iter()
+            .map(|&x| Pose3::translation(x, 1.0, 2.0 + 0.004 * x));
+        let ranges = poses.map(|pose| {
+            map.renderer
+                .cast(&[pose], &directions, 150.0)
+                .unwrap()
+                .remove(0)
+        });
+        let ranges = ranges.collect();
+        let heights = xs
+            .iter()
+            .map(|&x| Some(map.ground.patch_at(x, 0.0, 2.0, None)?.height_m));
+        (ranges, heights.collect())
+    }
+
+    #[test]
+    fn a_map_on_disk_is_seen_as_in_memory_also_when_tiles_are_dropped_and_read_again() {
+        let (_folder, file) = saved();
+        let expected = seen(&Map::new(street(), path(), &options()).unwrap());
+        assert!(
+            expected
+                .0
+                .iter()
+                .flatten()
+                .any(|range_m| range_m.is_finite())
+        );
+        assert!(expected.1.iter().all(Option::is_some));
+        for _ in ["the tiles are made", "the tiles are read"] {
+            let map = Map::load(&file, &options()).unwrap();
+            assert!(seen(&map) == expected);
+        }
+        let folder = TileStore::folder_of(&file);
+        let index = TileFileIndex::decode(&fs::read(folder.join(INDEX)).unwrap()).unwrap();
+        let length = |tile: &TileEntry| {
+            let file = tile.file(&folder, index.source.stamp());
+            fs::metadata(file).unwrap().len()
+        };
+        let all: u64 = index.tiles.iter().map(length).sum();
+        let store = Arc::new(TileStore::over(folder.clone(), None, index, all / 4));
+        let mut map = Map::load(&file, &options()).unwrap();
+        map.renderer = Arc::new(crate::rendering::CpuRenderer::over(store.clone()));
+        map.ground = Arc::new(GroundMap::over(store.clone(), GROUND_CELL_M));
+        assert!(seen(&map) == expected);
+        let origin = DVec3::new(600.0, 0.0, 2.0);
+        // Tiles that are being read in the background may come after the others are dropped. The three around the
+        // origin stay, of thirteen, and a tile in memory counts for about twice its file.
+        let kept = || store.files.bytes.load(Ordering::Relaxed);
+        let is_settled = || {
+            let is_reading = store.is_reading_ahead.load(Ordering::Acquire);
+            !is_reading && (1..=all).contains(&kept())
+        };
+        for _ in 0..60_000 {
+            if is_settled() {
+                break;
+            }
+            drop(store.scene(&[origin]));
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        assert!(is_settled(), "{} of {all}", kept());
+    }
+
+    #[test]
+    #[cfg(feature = "gpu")]
+    fn a_map_on_disk_is_seen_as_in_memory_on_a_graphics_adapter_too() {
+        let options = MapOptions {
+            backend: Backend::Gpu,
+            ..options()
+        };
+        let (_folder, file) = saved();
+        let expected = match Map::new(street(), path(), &options) {
+            Ok(map) => seen(&map),
+            Err(error) => {
+                let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|it| it == "1");
+                assert!(!required, "FPMCL_REQUIRE_GPU=1, and {error}");
+                eprintln!("not run: {error}");
+                return;
+            }
+        };
+        for _ in ["the tiles are made", "the tiles are read"] {
+            let map = Map::load(&file, &options).unwrap();
+            assert!(
+                map.renderer.name().starts_with("gpu"),
+                "{}",
+                map.renderer.name()
+            );
+            assert!(seen(&map) == expected);
+        }
+    }
+
+    #[test]
+    fn tiles_serve_a_copy_and_are_made_again_for_a_mesh_that_changed() {
+        let (_folder, file) = saved();
+        let map = Map::load(&file, &options()).unwrap();
+        let tiles = TileStore::folder_of(&file);
+        let names = || -> Vec<_> {
+            let entries = fs::read_dir(&tiles).unwrap();
+            entries.map(|entry| entry.unwrap().file_name()).collect()
+        };
+        let (first, triangles) = (names(), map.triangle_count());
+        // The same bytes at another time.
+        fs::write(&file, fs::read(&file).unwrap()).unwrap();
+        assert!(TileStore::open(&file, false, 100.0).unwrap().is_some());
+        let mut less = street();
+        less.triangles.truncate(100);
+        crate::map::files::ply::write(&file, &less, Some(&path())).unwrap();
+        assert!(TileStore::open(&file, false, 100.0).unwrap().is_none());
+        let abandoned = tiles.join(".fpmcl-6_0.tile-123456.part");
+        fs::write(&abandoned, "of a killed process").unwrap();
+        drop(map);
+        let changed = Map::load(&file, &options()).unwrap();
+        assert_eq!((triangles, changed.triangle_count()), (960, 100));
+        let second = names();
+        let is_tile = |name: &&std::ffi::OsString| *name != INDEX;
+        assert!(
+            second
+                .iter()
+                .filter(is_tile)
+                .all(|name| !first.contains(name))
+        );
+        assert!(!abandoned.exists());
+    }
+
+    #[test]
+    fn tiles_that_are_in_use_stay_when_others_are_made() {
+        let (_folder, file) = saved();
+        let map = Map::load(&file, &options()).unwrap();
+        let expected = seen(&map);
+        let tiles = TileStore::folder_of(&file);
+        let count = || fs::read_dir(&tiles).unwrap().count();
+        let first = count();
+        drop(map);
+        // No tile of it was read yet.
+        let old = Map::load(&file, &options()).unwrap();
+        let mut less = street();
+        less.triangles.truncate(100);
+        crate::map::files::ply::write(&file, &less, Some(&path())).unwrap();
+        drop(Map::load(&file, &options()).unwrap());
+        let both = count();
+        assert!(both > first);
+        assert_eq!(seen(&old), expected);
+        drop(old);
+        less.triangles.truncate(99);
+        crate::map::files::ply::write(&file, &less, Some(&path())).unwrap();
+        drop(Map::load(&file, &options()).unwrap());
+        assert!(count() < first);
+    }
+
+    #[test]
+    fn a_mesh_that_is_replaced_while_it_is_divided_has_no_tiles() {
+        let (_folder, file) = saved();
+        let source = TileStore::source(&file, false, 100.0).unwrap();
+        let make = || {
+            let is_ground = |triangle| MeshView::is_red(&street(), triangle);
+            TileStore::make(&file, source, &street(), &is_ground, Some(path()))
+        };
+        let mut moved = street();
+        moved.vertices.iter_mut().for_each(|vertex| vertex.z += 5.0);
+        crate::map::files::ply::write(&file, &moved, Some(&path())).unwrap();
+        assert!(make().err().unwrap().to_string().contains("changed"));
+        assert!(TileStore::open(&file, false, 100.0).unwrap().is_none());
+    }
+
+    #[test]
+    fn a_damaged_tile_is_an_error_that_names_it_and_a_damaged_index_is_made_again() {
+        let (_folder, file) = saved();
+        drop(Map::load(&file, &options()).unwrap());
+        let store = TileStore::open(&file, false, 100.0).unwrap().unwrap();
+        let (folder, stamp) = (store.files.folder.clone(), store.files.stamp);
+        let tile = TileEntry::new(TileIndex::of(600.0, 0.0, 100.0), None, 0).file(&folder, stamp);
+        let whole = fs::read(&tile).unwrap();
+        let mut bad = whole.clone();
+        bad[whole.len() / 2] ^= 1;
+        for (bytes, problem) in [
+            (&bad[..], "checksum"),
+            (&whole[..300], "incomplete"),
+            (&[], "tile"),
+        ] {
+            // Replaced as a whole, as files that may be mapped have to be.
+            fs::remove_file(&tile).unwrap();
+            fs::write(&tile, bytes).unwrap();
+            let map = Map::load(&file, &options()).unwrap();
+            let cast = map
+                .renderer
+                .cast(&[Pose3::translation(600.0, 0.0, 4.4)], &[Vec3::Y], 50.0);
+            let message = cast.unwrap_err().to_string();
+            assert!(
+                message.contains("6_0.") && message.contains(problem),
+                "{message}"
+            );
+        }
+        fs::write(folder.join(INDEX), b"nothing").unwrap();
+        let map = Map::load(&file, &options()).unwrap();
+        assert!(
+            map.renderer
+                .cast(&[Pose3::translation(600.0, 0.0, 4.4)], &[Vec3::Y], 50.0)
+                .is_ok()
+        );
+    }
+
+    #[test]
+    fn where_no_tiles_can_be_written_all_is_in_memory() {
+        let (_folder, file) = saved();
+        fs::write(TileStore::folder_of(&file), "in the way").unwrap();
+        let map = Map::load(&file, &options()).unwrap();
+        assert!(seen(&map) == seen(&Map::new(street(), path(), &options()).unwrap()));
+    }
+
+    #[test]
+    fn the_surface_around_a_place_is_that_of_the_mesh_with_its_ground() {
+        let (_folder, file) = saved();
+        let map = Map::load(&file, &options()).unwrap();
+        let near = map
+            .mesh_near(&[[600.0, 0.0].into()], 10.0, DVec3::ZERO, u64::MAX)
+            .unwrap();
+        let area_m2 = |mesh: &TriangleMesh, is_ground: bool| -> f32 {
+            let of_kind = |&triangle: &usize| {
+                let red = mesh.colors[mesh.triangles[triangle][0] as usize][0] > 0;
+                let middle: Vec3 = mesh.corners(triangle).into_iter().sum::<Vec3>() / 3.0;
+                red == is_ground && (550.0..650.0).contains(&middle.x)
+            };
+            let triangles = (0..mesh.triangles.len()).filter(of_kind);
+            triangles
+                .map(|triangle| mesh.scaled_normal(triangle).length() / 2.0)
+                .sum()
+        };
+        for is_ground in [true, false] {
+            let (found, expected) = (area_m2(&near, is_ground), area_m2(&street(), is_ground));
+            assert!((found / expected - 1.0).abs() < 1e-3, "{found} {expected}");
+        }
+        let fewer = near.triangles.len() as u64 / 2;
+        let coarse = map
+            .mesh_near(&[[600.0, 0.0].into()], 10.0, DVec3::ZERO, fewer)
+            .unwrap();
+        assert!((1..=fewer).contains(&(coarse.triangles.len() as u64)));
+        assert!((coarse.vertices.iter()).all(|vertex| near.vertices.contains(vertex)));
+    }
+}
