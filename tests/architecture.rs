@@ -79,7 +79,8 @@ const RESTRICTIONS: [Restriction; 11] = [
     Restriction {
         words: &["SeedableRng", "seed_from_u64", "from_seed("],
         allowed: &[
-            "app/commands", "app/run",
+            "app/commands",
+            "app/run",
             "random.rs",
             // Threads that share the work draw from independent streams of the seed.
             "simulation/random.rs",
