@@ -25,7 +25,7 @@ use fpmcl::lidar::{Beam, LidarModel, PERIOD_S, Rotation, Scan};
 use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, SensorConfig, Start, StartSpread};
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::odometry::{OdometryConfig, compare_timings};
-use fpmcl::recording::{Recording, Selection};
+use fpmcl::recording::Recording;
 use fpmcl::refinement::{
     InitialEstimate, Method, RefinementConfig, RefinerConfig, TrajectoryRefiner,
 };
@@ -136,7 +136,7 @@ fn main() -> Result<(), Failure> {
 /// The odd frames, compensated by the poses, with their poses in the map.
 fn frames(recording: &Path, map: &Map) -> Result<Vec<(Scan, Pose3)>, Failure> {
     const SCANS: usize = 11;
-    let recording = Recording::open(recording, None, &Selection::default())?;
+    let recording = Recording::open(recording)?;
     let first: Vec<Scan> = (recording.frames.iter().take(SCANS))
         .map(|frame| frame.read())
         .collect::<Result<_, _>>()?;
@@ -144,7 +144,7 @@ fn frames(recording: &Path, map: &Map) -> Result<Vec<(Scan, Pose3)>, Failure> {
     let timing = compare_timings(&first, PERIOD_S, &OdometryConfig::default())?;
     let best = timing.best.filter(|_| !has_times);
     let rotation: Option<Rotation> = best.and_then(|best| timing.residuals_m[best].0);
-    let track = recording.own_track(None)?.in_map(&map.path.world_from_map);
+    let track = recording.own_track()?.in_map(&map.path.world_from_map);
     let recording = recording.rotating(rotation).with_poses(track)?;
     let odd = recording.compensated_by_poses().frames.into_iter();
     odd.filter(|frame| frame.number % 2 == 1)

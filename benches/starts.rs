@@ -18,7 +18,7 @@ use std::time::Instant;
 use fpmcl::geometry::pose2_from_pose3;
 use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, SensorConfig, Start};
 use fpmcl::map::{Map, MapOptions};
-use fpmcl::recording::{Recording, Selection};
+use fpmcl::recording::Recording;
 use fpmcl::sensor;
 
 type Failure = Box<dyn std::error::Error>;
@@ -41,8 +41,8 @@ fn main() -> Result<(), Failure> {
     );
     let mut scans = vec![];
     for recording in recordings {
-        let recording = Recording::open(recording, None, &Selection::default())?;
-        let track = recording.own_track(None)?.in_map(&map.path.world_from_map);
+        let recording = Recording::open(recording)?;
+        let track = recording.own_track()?.in_map(&map.path.world_from_map);
         for frame in recording.with_poses(track)?.frames {
             let pose = frame.map_from_lidar.ok_or("a frame without a pose")?;
             scans.push((frame, pose));

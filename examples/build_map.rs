@@ -13,8 +13,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let [recording, map_file] = arguments.as_slice() else {
         return Err("usage: build_map RECORDING MAP.ply".into());
     };
-    let drive = Recording::open_with_poses(recording)?;
-    let map = MapBuilder::new(MapConfig::default()).build(drive.scans())?;
+    let drive = Recording::open(recording)?.with_own_poses()?;
+    let map = MapBuilder::new(MapConfig::default()).build(drive.scans_with_poses())?;
     map.save(map_file)?;
     println!(
         "{} triangles, {} key scans",

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
 use fpmcl::map::{Map, MapOptions};
-use fpmcl::recording::{Recording, Selection, poses::write_tum};
+use fpmcl::recording::{Recording, poses::write_tum};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<PathBuf> = std::env::args_os().skip(1).map(PathBuf::from).collect();
@@ -17,7 +17,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let map = Map::load(map_file, &MapOptions::default())?;
     let mut localizer = Localizer::new(&map, LocalizerConfig::default(), Start::Anywhere, 0)?;
     let mut trajectory = Vec::new();
-    for frame in &Recording::open(recording, None, &Selection::default())?.frames {
+    for frame in &Recording::open(recording)?.frames {
         let estimate = localizer.step(&frame.read()?, Odometry::Unknown)?;
         let (t, deviations) = (estimate.pose.translation, estimate.standard_deviations());
         let state = estimate.state.word();

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use fpmcl::geometry::pose2_from_pose3;
 use fpmcl::map::{Map, MapOptions};
-use fpmcl::recording::{Recording, Selection, poses::read_tum};
+use fpmcl::recording::{Recording, poses::read_tum};
 use fpmcl::refinement::{InitialEstimate, RefinerConfig, TrajectoryRefiner};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -18,7 +18,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let map = Map::load(map_file, &MapOptions::default())?;
     let trajectory = read_tum(trajectory_file)?;
     let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), 0)?;
-    let recording = Recording::open(recording, None, &Selection::default())?;
+    let recording = Recording::open(recording)?;
     for (frame, row) in recording.frames.iter().zip(&trajectory) {
         let estimate = InitialEstimate::tracked(pose2_from_pose3(&row.map_from_lidar));
         refiner.add(&frame.read()?, &estimate)?;

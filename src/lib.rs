@@ -15,19 +15,19 @@
 //!
 //! use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
 //! use fpmcl::map::{Map, MapBuilder, MapConfig, MapOptions};
-//! use fpmcl::recording::{Recording, Selection};
+//! use fpmcl::recording::Recording;
 //! use fpmcl::refinement::{InitialEstimate, RefinerConfig, TrajectoryRefiner};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! let first_drive = Recording::open_with_poses(Path::new("data/street/drive_1"))?;
-//! let map = MapBuilder::new(MapConfig::default()).build(first_drive.scans())?;
+//! let first_drive = Recording::open("data/street/drive_1")?.with_own_poses()?;
+//! let map = MapBuilder::new(MapConfig::default()).build(first_drive.scans_with_poses())?;
 //! map.save(Path::new("results/map.ply"))?;
 //!
 //! let map = Map::load(Path::new("results/map.ply"), &MapOptions::default())?;
 //! let seed = 0;
 //! let mut localizer = Localizer::new(&map, LocalizerConfig::default(), Start::Anywhere, seed)?;
 //! let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), seed)?;
-//! let second_drive = Recording::open(Path::new("data/street/drive_2"), None, &Selection::default())?;
+//! let second_drive = Recording::open("data/street/drive_2")?;
 //! for frame in &second_drive.frames {
 //!     let scan = frame.read()?;
 //!     let estimate = localizer.step(&scan, Odometry::Unknown)?;

@@ -54,9 +54,13 @@ fn a_second_drive_is_localized_and_refined_in_the_map_of_the_first() {
     );
 
     // The map frame is the lidar frame of the first pose of drive 1.
-    let map = Recording::open_with_poses(&folder.join("street/drive_1")).unwrap();
-    let query = Recording::open_with_poses(&folder.join("street/drive_2")).unwrap();
-    let truth = query.own_track(None).unwrap().in_map(&map.world().0);
+    let map = Recording::open(folder.join("street/drive_1"))
+        .and_then(Recording::with_own_poses)
+        .unwrap();
+    let query = Recording::open(folder.join("street/drive_2"))
+        .and_then(Recording::with_own_poses)
+        .unwrap();
+    let truth = query.own_track().unwrap().in_map(&map.world().0);
     let found = read_tum(&folder.join("trajectory.txt")).unwrap();
     let refined = example("refine", folder, &arguments);
     let rows = truth.map_from_lidar.iter().zip(refined.lines());

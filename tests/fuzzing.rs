@@ -249,7 +249,7 @@ fn recordings() {
         |file| {
             let folder = file.path.with_file_name("recording");
             write_recording(&folder, file.bytes);
-            let opened = Recording::open_with_poses(&folder);
+            let opened = Recording::open(&folder).and_then(Recording::with_own_poses);
             let sequence = opened.map_err(|error| format!("recording.txt: {error}"))?;
             let frames = &sequence.frames;
             assert!(!frames.is_empty());

@@ -11,7 +11,7 @@ use std::path::Path;
 use bag_writers::{Cloud, Kind, Recorded, mcap, point_cloud2};
 use fpmcl::geometry::Vec3;
 use fpmcl::lidar::Scan;
-use fpmcl::recording::{Bag, PoseTrack, Recording, Selection, scan_files};
+use fpmcl::recording::{Bag, PoseTrack, Recording, scan_files};
 
 const START_NS: u64 = 1_700_000_000_250_000_000;
 
@@ -192,7 +192,7 @@ fn files_with_times_as_names_are_compensated_as_a_bag_is() {
     fs::write(folder.join("poses.tum"), poses).unwrap();
     let compensated = |path: &Path| {
         let track = PoseTrack::read(&folder.join("poses.tum"), None).unwrap();
-        let recording = Recording::open(path, None, &Selection::default()).unwrap();
+        let recording = Recording::open(path).unwrap();
         recording.with_poses(track).unwrap().compensated_by_poses()
     };
     bag(&folder.join("drive.mcap"), 3);

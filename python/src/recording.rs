@@ -292,8 +292,8 @@ pub fn read_recording(
         let mut recording = inputs.open(&selection)?;
         let track = match &config.pose_file {
             Some(path) => Some(inputs.track(path, &recording)?),
-            None if recording.files.poses.is_some() => Some(inputs.own_track(&recording)?),
-            None => inputs.own_track(&recording).ok(),
+            None if recording.files.poses.is_some() => Some(recording.own_track()?),
+            None => recording.own_track().ok(),
         };
         if let Some(track) = track {
             recording = recording.with_poses(track)?;

@@ -2,7 +2,6 @@
 
 use std::fmt;
 use std::path::PathBuf;
-#[cfg(feature = "bags")]
 use std::sync::Arc;
 
 #[cfg(feature = "bags")]
@@ -22,6 +21,8 @@ pub enum ScanSource {
         /// The stamp of its scan, to which times of points are relative [s]; `None` if unknown.
         stamp_s: Option<f64>,
     },
+    /// In memory; times of its points are those after the moment of the pose.
+    Memory(Arc<Scan>),
     /// A message of a bag.
     #[cfg(feature = "bags")]
     Message {
@@ -38,6 +39,7 @@ impl ScanSource {
     fn read(&self) -> Result<Scan, RecordingError> {
         match self {
             Self::File { path, stamp_s } => Ok(scan_files::read_stamped(path, *stamp_s)?.scan),
+            Self::Memory(scan) => Ok(Scan::clone(scan)),
             #[cfg(feature = "bags")]
             Self::Message { bag, topic, index } => bag.read_scan(topic, *index),
         }
@@ -48,6 +50,7 @@ impl fmt::Display for ScanSource {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::File { path, .. } => write!(formatter, "{}", path.display()),
+            Self::Memory(_) => formatter.write_str("a scan in memory"),
             #[cfg(feature = "bags")]
             Self::Message { topic, index, .. } => write!(formatter, "message {index} of {topic}"),
         }
@@ -98,7 +101,9 @@ impl Frame {
         if let (true, Some(rotation)) = (scan.times_s.is_empty(), &self.rotation) {
             scan.times_s = rotation.point_times(&scan.points);
         }
-        scan.center_times();
+        if !matches!(self.source, ScanSource::Memory(_)) || self.rotation.is_some() {
+            scan.center_times();
+        }
         if !self.is_timed {
             scan.times_s.clear();
         }

@@ -13,6 +13,8 @@ pub enum Layout {
     Folder,
     /// MCAP, rosbag2 or a bag of ROS 1.
     Bag,
+    /// Scans in memory.
+    Memory,
 }
 
 impl Layout {
@@ -23,6 +25,7 @@ impl Layout {
             Self::KittiRaw => "KITTI raw",
             Self::Folder => "folder of scans",
             Self::Bag => "bag",
+            Self::Memory => "scans in memory",
         }
     }
 }
@@ -48,6 +51,15 @@ impl RecordingFiles {
         Self {
             layout: Layout::Bag,
             scans: path.to_owned(),
+            ..Self::memory()
+        }
+    }
+
+    /// No files.
+    pub(super) fn memory() -> Self {
+        Self {
+            layout: Layout::Memory,
+            scans: PathBuf::new(),
             times: None,
             poses: None,
             calibration: None,

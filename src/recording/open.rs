@@ -1,7 +1,6 @@
 //! A recording: its selected scans with their times.
 
 use std::path::{Path, PathBuf};
-#[cfg(feature = "bags")]
 use std::sync::Arc;
 
 #[cfg(feature = "bags")]
@@ -38,6 +37,8 @@ pub struct Recording {
     pub skipped: Vec<Frame>,
     /// The given poses, of which the frames have theirs.
     pub track: Option<PoseTrack>,
+    /// Pose of the lidar on the body whose poses a bag has; `None`: that of its static transforms.
+    pub body_from_lidar: Option<Pose3>,
     /// The bag and the topic of its scans.
     #[cfg(feature = "bags")]
     pub bag: Option<(Arc<Bag>, Arc<str>)>,
@@ -46,10 +47,15 @@ pub struct Recording {
 impl Recording {
     /// Opens a recording; of its scans, only the first one is read, if its points can have times.
     ///
-    /// `path` is the folder of a recording in one of the layouts of [`Layout`], the folder of its scans, or a bag, of
-    /// which `topic` is taken, or the only one with scans. Times are those of a bag, those in the names of the scans,
-    /// else those of `times.txt` (`timestamps.txt` of KITTI raw), which must ascend.
-    pub fn open(
+    /// `path` is the folder of a recording in one of the layouts of [`Layout`], the folder of its scans, or a bag. Times
+    /// are those of a bag, those in the names of the scans, else those of `times.txt` (`timestamps.txt` of KITTI raw),
+    /// which must ascend.
+    pub fn open(path: impl AsRef<Path>) -> Result<Self, RecordingError> {
+        Self::open_with(path.as_ref(), None, &Selection::default())
+    }
+
+    /// Opens the selected frames of a recording; of a bag those of `topic`, or of the only one with scans.
+    pub fn open_with(
         path: &Path,
         topic: Option<&str>,
         selection: &Selection,
@@ -93,6 +99,7 @@ impl Recording {
             frames,
             skipped,
             track: None,
+            body_from_lidar: None,
             #[cfg(feature = "bags")]
             bag: None,
         })
@@ -129,25 +136,41 @@ impl Recording {
             frames,
             skipped,
             track: None,
+            body_from_lidar: None,
             bag: Some((bag, topic)),
         })
     }
 
-    /// Opens a recording with the poses that it contains.
-    pub fn open_with_poses(folder: &Path) -> Result<Self, RecordingError> {
-        let recording = Self::open(folder, None, &Selection::default())?;
-        let track = recording.own_track(None)?;
-        recording.with_poses(track)
+    /// A recording of scans in memory, without poses. Times of points are those after the moment of the pose; scans of
+    /// which one has no time are taken as ten per second.
+    pub fn from_scans(scans: impl IntoIterator<Item = impl Into<Arc<Scan>>>) -> Self {
+        let scans: Vec<Arc<Scan>> = scans.into_iter().map(Into::into).collect();
+        let has_times = scans.iter().all(|scan| scan.time_s.is_some());
+        let frame = |(number, scan): (usize, Arc<Scan>)| {
+            let assumed_s = number as f64 / SCANS_PER_SECOND;
+            let time_s = scan.time_s.filter(|_| has_times).unwrap_or(assumed_s);
+            Frame::new(number, ScanSource::Memory(scan), time_s)
+        };
+        Self {
+            path: PathBuf::new(),
+            files: RecordingFiles::memory(),
+            scans: scans.len(),
+            has_times,
+            frames: scans.into_iter().enumerate().map(frame).collect(),
+            skipped: vec![],
+            track: None,
+            body_from_lidar: None,
+            #[cfg(feature = "bags")]
+            bag: None,
+        }
     }
 
     /// The poses that belong to the recording by their names and places; in a bag, of a body on which the lidar is
-    /// mounted as given, else by the static transforms.
-    pub fn own_track(&self, body_from_lidar: Option<Pose3>) -> Result<PoseTrack, RecordingError> {
-        #[cfg(not(feature = "bags"))]
-        let _ = body_from_lidar;
+    /// mounted by `body_from_lidar`, else by the static transforms.
+    pub fn own_track(&self) -> Result<PoseTrack, RecordingError> {
         #[cfg(feature = "bags")]
         if let Some((bag, topic)) = &self.bag {
-            return PoseTrack::read_topic(bag, None, topic, body_from_lidar);
+            return PoseTrack::read_topic(bag, None, topic, self.body_from_lidar);
         }
         let Some(path) = &self.files.poses else {
             return Err(RecordingError::NoPoseFile {
@@ -155,6 +178,12 @@ impl Recording {
             });
         };
         PoseTrack::read(path, self.files.calibration.as_deref())
+    }
+
+    /// The same recording with the poses that it contains.
+    pub fn with_own_poses(self) -> Result<Self, RecordingError> {
+        let track = self.own_track()?;
+        self.with_poses(track)
     }
 
     /// The same recording, whose frames have poses; see [`PoseTrack::matched`].
@@ -175,8 +204,13 @@ impl Recording {
         Ok(self)
     }
 
+    /// Reads the scans of the selected frames, one after the other.
+    pub fn scans(&self) -> impl Iterator<Item = Result<Scan, RecordingError>> {
+        self.frames.iter().map(Frame::read)
+    }
+
     /// Reads the scans, one after the other, with their poses `map_from_lidar`.
-    pub fn scans(&self) -> impl Iterator<Item = Result<(Scan, Pose3), RecordingError>> {
+    pub fn scans_with_poses(&self) -> impl Iterator<Item = Result<(Scan, Pose3), RecordingError>> {
         let read = |frame: &Frame| Ok((frame.read()?, frame.map_from_lidar.unwrap_or_default()));
         self.frames.iter().map(read)
     }
@@ -238,10 +272,8 @@ impl Recording {
 
 /// Time from the stamp of a scan of a file to its moment, the middle of its sweep [s]; 0 without times of points.
 fn moment_after_stamp_s(source: &ScanSource) -> Result<f64, RecordingError> {
-    let (path, stamp_s) = match source {
-        ScanSource::File { path, stamp_s } => (path, stamp_s),
-        #[cfg(feature = "bags")]
-        ScanSource::Message { .. } => return Ok(0.0),
+    let ScanSource::File { path, stamp_s } = source else {
+        return Ok(0.0);
     };
     if !scan_files::has_named_columns(path) {
         return Ok(0.0);
@@ -290,9 +322,7 @@ mod tests {
     }
 
     fn open(folder: &Path, selection: &Selection) -> Result<Recording, RecordingError> {
-        let recording = Recording::open(folder, None, selection)?;
-        let track = recording.own_track(None)?;
-        recording.with_poses(track)
+        Recording::open_with(folder, None, selection)?.with_own_poses()
     }
 
     fn numbers(recording: &Recording) -> Vec<usize> {

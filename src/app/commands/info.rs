@@ -56,7 +56,7 @@ pub fn run(args: &InfoArgs) -> Result<Printed> {
 }
 
 fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
-    let recording = Recording::open(path, topic, &Selection::default())?;
+    let recording = Recording::open_with(path, topic, &Selection::default())?;
     let frames = &recording.frames;
     let (first, last) = (&frames[0], &frames[frames.len() - 1]);
     let scans = sample(&recording)?;
@@ -79,7 +79,7 @@ fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
         ),
     ];
     rows.extend(sensor_rows(&sensor));
-    let track = recording.own_track(None);
+    let track = recording.own_track();
     let poses = match &track {
         Ok(track) => track_in_words(track, &recording),
         Err(error) => error.to_string(),

@@ -43,7 +43,7 @@ impl MotionSource {
             }
             // A bag may have a topic of odometry.
             (OdometrySource::Auto, None) if recording.files.layout == Layout::Bag => {
-                match inputs.own_track(recording) {
+                match recording.own_track() {
                     Ok(track) => {
                         return Ok((Self::of_track(&track, recording)?, Some(track.path)));
                     }

@@ -211,7 +211,7 @@ fn drives_are_read_back_in_the_documented_frames() {
     let [map, query] = [mapping, query].map(|config| {
         simulate(&config, Existing::Keep).unwrap();
         let drive = config.drive_folder();
-        let sequence = Recording::open_with_poses(&drive).unwrap();
+        let sequence = Recording::open(&drive).unwrap().with_own_poses().unwrap();
         let poses = CameraPoses::read(&drive.join("poses.txt")).unwrap();
         (prepare(&config).unwrap().poses(), sequence, poses, drive)
     });

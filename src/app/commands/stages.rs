@@ -70,13 +70,9 @@ impl<'a> RecordingInputs<'a> {
 
     /// Opens the selected frames of the recording.
     pub fn open(&self, selection: &Selection) -> Result<Recording> {
-        let recording = Recording::open(self.scan_folder, self.topic, selection)?;
+        let mut recording = Recording::open_with(self.scan_folder, self.topic, selection)?;
+        recording.body_from_lidar = self.body_from_lidar.map(body_from_lidar);
         Ok(recording.with_elevation_bias(self.elevation_bias_deg.to_radians()))
-    }
-
-    /// The poses that the recording contains.
-    pub fn own_track(&self, recording: &Recording) -> Result<PoseTrack> {
-        Ok(recording.own_track(self.body_from_lidar.map(body_from_lidar))?)
     }
 
     /// Reads poses of the recording from a file, or from a topic of its bag.
@@ -87,7 +83,7 @@ impl<'a> RecordingInputs<'a> {
                 bag,
                 path.to_str(),
                 scan_topic,
-                self.body_from_lidar.map(body_from_lidar),
+                recording.body_from_lidar,
             )?);
         }
         #[cfg(not(feature = "bags"))]

@@ -42,12 +42,12 @@ pub fn given(config: &BuildMapConfig, recording: &Recording) -> Result<Option<Po
     if let Some(path) = &config.pose_file {
         return inputs.track(path, recording).map(Some);
     }
-    match inputs.own_track(recording) {
+    match recording.own_track() {
         Err(error) if config.poses == PoseSource::Auto && recording.files.poses.is_none() => {
             tracing::info!("poses from the scans: {error}");
             Ok(None)
         }
-        track => track.map(Some),
+        track => Ok(track.map(Some)?),
     }
 }
 

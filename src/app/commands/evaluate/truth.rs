@@ -42,7 +42,7 @@ pub fn read_track(
             }
             inputs.file_track(path).map(Some)
         }
-        None if scan_folder.is_some() => inputs.own_track(&recording()?).map(Some),
+        None if scan_folder.is_some() => Ok(Some(recording()?.own_track()?)),
         None => Ok(None),
     }
 }

@@ -69,7 +69,7 @@ pub fn scans(path: &Path, config: &GroundCommandConfig) -> Result<Vec<LabelledSc
     if !is_bag(path) {
         require_folder("scan_folder", path)?;
     }
-    let recording = Recording::open(path, config.topic.as_deref(), &config.selection())?;
+    let recording = Recording::open_with(path, config.topic.as_deref(), &config.selection())?;
     let folder = &recording.files.scans;
     let frames = recording.frames.into_iter();
     Ok(frames
@@ -109,9 +109,8 @@ impl LabelledScan {
                 let name = path.strip_prefix(folder).unwrap_or(path);
                 (name.with_extension(""), label_path(path, name, labels))
             }
-            #[cfg(feature = "bags")]
-            ScanSource::Message { index, .. } => {
-                let name = PathBuf::from(format!("{index:06}"));
+            _ => {
+                let name = PathBuf::from(format!("{:06}", frame.number));
                 let path = labels.map(|folder| folder.join(&name).with_extension("label"));
                 (name, path.filter(|path| path.is_file()))
             }
