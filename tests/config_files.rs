@@ -10,9 +10,10 @@ use std::path::{Path, PathBuf};
 
 use fpmcl::app::settings::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
-    Initialization, LocalizationConfig, OdometryCommandConfig, RangeImageConfig, RefinementConfig,
+    Initialization, LocalizationConfig, OdometryCommandConfig, RefinementConfig,
 };
 use fpmcl::lidar::LidarModel;
+use fpmcl::sensor::RangeImageConfig;
 use fpmcl::simulation::SimulationConfig;
 
 fn root() -> &'static Path {

@@ -5,11 +5,11 @@ use std::path::PathBuf;
 
 use anyhow::anyhow;
 use fpmcl::app::commands::stages;
-use fpmcl::app::settings::{LocalizationConfig, RangeImageConfig};
+use fpmcl::app::settings::LocalizationConfig;
 use fpmcl::geometry::Pose3;
 use fpmcl::lidar;
 use fpmcl::recording::{self, Frame};
-use fpmcl::sensor::{self, SensorDescription};
+use fpmcl::sensor::{self, RangeImageConfig, SensorDescription};
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayDyn};
 use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;

@@ -15,6 +15,7 @@
 mod beam;
 pub mod beams;
 pub mod columns;
+mod config;
 pub mod dropped;
 mod elevations;
 pub mod mounting;
@@ -26,6 +27,7 @@ use serde::{Deserialize, Serialize};
 
 pub use beam::BeamReturns;
 pub use beams::BeamSource;
+pub use config::{MotionCompensation, RangeImageConfig, SensorConfig};
 pub use dropped::{DropReason, DroppedPoints};
 pub use mounting::Mounting;
 

@@ -14,11 +14,12 @@ use crate::app::report::run_output::{self, RunFiles};
 use crate::app::run::claims::{Claims, Outputs};
 use crate::app::run::output::Printed;
 use crate::app::run::{Context, output};
-use crate::app::settings::{OdometryCommandConfig, RangeImageConfig};
+use crate::app::settings::OdometryCommandConfig;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::odometry::{Loop, OdometryEstimate, StepState, Trajectory};
 use crate::recording::poses::write_tum;
 use crate::recording::{Frame, Recording};
+use crate::sensor::RangeImageConfig;
 use crate::sensor::SensorDescription;
 
 /// Report of a run.

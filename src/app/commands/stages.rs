@@ -6,8 +6,7 @@ use anyhow::{Context as _, Result};
 
 use crate::app::run::{Context, input};
 use crate::app::settings::{
-    BuildMapConfig, LocalizationConfig, MotionCompensation, OdometryCommandConfig,
-    RangeImageConfig, RefinementConfig, body_from_lidar,
+    BuildMapConfig, LocalizationConfig, OdometryCommandConfig, RefinementConfig, body_from_lidar,
 };
 use crate::geometry::wrap_angle;
 use crate::lidar::{LidarModel, PERIOD_S, Rotation, Scan};
@@ -15,7 +14,7 @@ use crate::map::build::scan_cloud::ScanConfig;
 use crate::map::{Map, MapOptions, MappingPath};
 use crate::odometry::{OdometryConfig, TimingComparison, compare_timings};
 use crate::recording::{PoseTrack, Recording, Selection};
-use crate::sensor::{self, DroppedPoints, SensorDescription};
+use crate::sensor::{self, DroppedPoints, MotionCompensation, RangeImageConfig, SensorDescription};
 
 /// Number of scans from which a sensor is inferred.
 const SENSOR_SCANS: usize = 10;

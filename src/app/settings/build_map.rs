@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::check::{optional_path, path};
-use super::recording::{MotionCompensation, RangeImageConfig, mounting};
+use super::recording::mounting;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::lidar::NormalConfig;
 use crate::map::build::confidence::ConfidenceConfig;
@@ -15,6 +15,7 @@ use crate::map::build::scan_cloud::ScanConfig;
 use crate::map::build::visibility::VisibilityConfig;
 use crate::map::{LocalMapConfig, MapConfig};
 use crate::meshing::PoissonConfig;
+use crate::sensor::{MotionCompensation, RangeImageConfig};
 use crate::validation::{InvalidValue, Validate, in_range, require};
 
 /// Where the poses of the scans come from.

@@ -7,7 +7,7 @@ use smart_default::SmartDefault;
 
 use super::check::{optional_path, path};
 use super::odometry::OdometrySource;
-use super::recording::{MotionCompensation, RangeImageConfig, mounting};
+use super::recording::mounting;
 use crate::geometry::FARTHEST_M;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::localization::convergence::ConvergenceConfig;
@@ -24,6 +24,7 @@ use crate::map::build::scan_cloud::ScanConfig;
 use crate::map::{MapOptions, PanoramaConfig};
 use crate::refinement::{RefinementConfig, RefinerConfig};
 use crate::rendering::RenderingMethod;
+use crate::sensor::{MotionCompensation, RangeImageConfig};
 use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative, require};
 
 /// Configuration of `localize`: the keys of range-mcl's `localization.yml`, then new ones.

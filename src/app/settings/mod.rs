@@ -38,7 +38,7 @@ pub use load::{has_key, load, with_settings};
 pub use localization::{Initialization, LocalizationConfig, MotionModel};
 pub use odometry::OdometrySource;
 pub use odometry_command::OdometryCommandConfig;
-pub use recording::{MotionCompensation, RangeImageConfig, body_from_lidar};
+pub use recording::body_from_lidar;
 pub use refinement::RefinementConfig;
 pub use template::CommandConfig;
 pub use yaml::to_yaml;

@@ -6,8 +6,9 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::check::{optional_path, path};
-use super::recording::{MotionCompensation, mounting};
+use super::recording::mounting;
 use crate::odometry::TrajectoryConfig;
+use crate::sensor::MotionCompensation;
 use crate::validation::{InvalidValue, Validate, in_range, positive};
 
 /// Configuration of `odometry`.

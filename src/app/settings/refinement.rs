@@ -7,12 +7,13 @@ use serde::{Deserialize, Serialize};
 use super::check::{optional_path, path};
 use super::localization::LocalizationConfig;
 use super::odometry::OdometrySource;
-use super::recording::{MotionCompensation, RangeImageConfig, mounting};
+use super::recording::mounting;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
 use crate::localization::SensorConfig;
 use crate::localization::observation::ObservationConfig;
 use crate::map::build::scan_cloud::ScanConfig;
 use crate::refinement::{self, RefinerConfig};
+use crate::sensor::{MotionCompensation, RangeImageConfig};
 use crate::validation::{InvalidValue, Validate, in_range, nested, require};
 
 /// Configuration of `refine`.

@@ -4,9 +4,10 @@ use std::path::PathBuf;
 use super::*;
 use crate::app::settings::{
     BuildMapConfig, EvaluationConfig, GroundCommandConfig, Initialization, LocalizationConfig,
-    OdometrySource, RangeImageConfig, RefinementConfig,
+    OdometrySource, RefinementConfig,
 };
 use crate::rendering::RenderingMethod;
+use crate::sensor::RangeImageConfig;
 
 /// Loads a configuration from a text.
 fn load_text<T: CommandConfig>(text: &str, settings: &[(&str, &str)]) -> Result<T, ConfigError> {

@@ -1,0 +1,249 @@
+//! What a user knows about a sensor; the rest is inferred from the scans.
+
+use std::fmt;
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
+
+use crate::lidar::{LidarModel, Rotation, RotationDirection};
+use crate::validation::{InvalidValue, Validate, in_range, nested, positive, rectangle};
+
+/// What is known about a sensor, with the names of the configuration; what is `None` is inferred from the scans.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[serde(default, deny_unknown_fields)]
+pub struct SensorConfig {
+    /// Size and limits of the range images.
+    pub range_image: RangeImageConfig,
+    /// Rectangle of the own car in the lidar frame, whose points are dropped: x_min, x_max, y_min, y_max [m].
+    pub own_car_m: Option<[f32; 4]>,
+    /// Height of the sensor above the ground [m].
+    pub sensor_height_m: Option<f64>,
+    /// Times of the points for motion compensation; `None` for scans that are compensated already.
+    #[default(Some(MotionCompensation::Auto))]
+    pub motion_compensation: Option<MotionCompensation>,
+}
+
+impl Validate for SensorConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        nested("range_image", &self.range_image)?;
+        if let Some(own_car_m) = self.own_car_m {
+            rectangle("own_car_m", own_car_m)?;
+        }
+        match self.sensor_height_m {
+            Some(height_m) => positive("sensor_height_m", height_m),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Times of points that the data do not have, for motion compensation.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum MotionCompensation {
+    /// Times of the data, else the rotation that fits consecutive scans best.
+    Auto,
+    /// Times from a rotation, written as `clockwise`, seen from above, or `counter_clockwise from 90`.
+    Rotation {
+        /// Sense of rotation.
+        direction: RotationDirection,
+        /// Azimuth at which a revolution starts, counter-clockwise from the x axis [deg].
+        start_deg: f64,
+    },
+}
+
+/// Azimuth at which a revolution starts that is not given: behind, as of KITTI [deg].
+const BEHIND_DEG: f64 = 180.0;
+
+impl MotionCompensation {
+    /// Times from a rotation, whose start is rounded to a degree.
+    pub fn of(rotation: &Rotation) -> Self {
+        Self::Rotation {
+            direction: rotation.direction,
+            // No negative zero.
+            start_deg: rotation
+                .start_rad
+                .to_degrees()
+                .round()
+                .rem_euclid(360.0)
+                .abs(),
+        }
+    }
+
+    /// The configured rotation; `None` if it has to be inferred.
+    pub fn rotation(self, period_s: f64) -> Option<Rotation> {
+        match self {
+            Self::Auto => None,
+            Self::Rotation {
+                direction,
+                start_deg,
+            } => Some(Rotation {
+                direction,
+                period_s,
+                start_rad: start_deg.to_radians(),
+            }),
+        }
+    }
+}
+
+impl fmt::Display for MotionCompensation {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self::Rotation {
+            direction,
+            start_deg,
+        } = *self
+        else {
+            return formatter.write_str("auto");
+        };
+        formatter.write_str(match direction {
+            RotationDirection::Clockwise => "clockwise",
+            RotationDirection::CounterClockwise => "counter_clockwise",
+        })?;
+        match start_deg == BEHIND_DEG {
+            true => Ok(()),
+            false => write!(formatter, " from {start_deg}"),
+        }
+    }
+}
+
+impl From<MotionCompensation> for String {
+    fn from(compensation: MotionCompensation) -> Self {
+        compensation.to_string()
+    }
+}
+
+impl TryFrom<String> for MotionCompensation {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        let (direction, start) = match text.split_once(" from ") {
+            Some((direction, start)) => (direction.trim(), start.trim().parse().ok()),
+            None => (text.as_str(), Some(BEHIND_DEG)),
+        };
+        let start_deg = start.filter(|deg: &f64| (-360.0..=360.0).contains(deg));
+        let direction = match direction {
+            "auto" if direction == text => return Ok(Self::Auto),
+            "clockwise" => Some(RotationDirection::Clockwise),
+            "counter_clockwise" => Some(RotationDirection::CounterClockwise),
+            _ => None,
+        };
+        match (direction, start_deg) {
+            (Some(direction), Some(start_deg)) => Ok(Self::Rotation {
+                direction,
+                start_deg,
+            }),
+            _ => Err(format!(
+                "`{text}` is not one of auto, clockwise, counter_clockwise, or with the azimuth at which a revolution starts [deg] `clockwise from 90`"
+            )),
+        }
+    }
+}
+
+/// Size and limits of the range images; `None` is inferred from the scans.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RangeImageConfig {
+    /// Rows.
+    pub height: Option<usize>,
+    /// Columns over 360 degrees.
+    pub width: Option<usize>,
+    /// Upper edge of the vertical field of view over the horizon [deg].
+    pub fov_up: Option<f32>,
+    /// Lower edge of the vertical field of view; below the horizon whatever its sign [deg].
+    pub fov_down: Option<f32>,
+    /// Range from which on returns are dropped [m].
+    pub max_range: Option<f32>,
+    /// Range up to which returns are dropped [m].
+    pub min_range: Option<f32>,
+    /// Elevations of the rows, from the top [deg]; without them, rows of a given `height`, `fov_up` or
+    /// `fov_down` are evenly spaced.
+    pub elevations: Option<Arc<[f32]>>,
+    /// Whether each beam keeps its elevation, as those of spinning sensors do; otherwise `build-map` takes normals
+    /// from neighbours in space.
+    pub has_rows: Option<bool>,
+    /// Number of particles that `localize` renders at once.
+    pub max_instance: Option<usize>,
+    /// Whether `localize` renders the particles in batches instead of one by one.
+    pub render_instanced: Option<bool>,
+}
+
+impl RangeImageConfig {
+    /// The range images of a model.
+    pub fn of(model: &LidarModel) -> Self {
+        Self {
+            height: Some(model.height),
+            width: Some(model.width),
+            fov_up: Some(model.fov_up),
+            fov_down: Some(model.fov_down),
+            max_range: Some(model.max_range),
+            min_range: Some(model.min_range),
+            elevations: model.elevations.clone(),
+            ..Self::default()
+        }
+    }
+
+    /// The sensor model, with the values of another where none is given.
+    pub fn model_over(&self, inferred: &LidarModel) -> LidarModel {
+        let has_rows = self.height.is_some() || self.fov_up.is_some() || self.fov_down.is_some();
+        LidarModel {
+            height: (self.height)
+                .or(self.elevations.as_ref().map(|elevations| elevations.len()))
+                .unwrap_or(inferred.height),
+            width: self.width.unwrap_or(inferred.width),
+            fov_up: self.fov_up.unwrap_or(inferred.fov_up),
+            fov_down: self.fov_down.unwrap_or(inferred.fov_down),
+            max_range: self.max_range.unwrap_or(inferred.max_range),
+            min_range: self.min_range.unwrap_or(inferred.min_range),
+            elevations: match has_rows {
+                true => self.elevations.clone(),
+                false => self.elevations.clone().or(inferred.elevations.clone()),
+            },
+        }
+    }
+
+    /// The sensor model, with the values of an HDL-64E where none is given.
+    pub fn model(&self) -> LidarModel {
+        self.model_over(&LidarModel::default())
+    }
+
+    /// Sets what is not given.
+    pub fn resolve(&mut self, inferred: &LidarModel, has_rows: bool) {
+        let (max_instance, render_instanced) = (self.max_instance, self.render_instanced);
+        *self = Self {
+            has_rows: self.has_rows.or(Some(has_rows)),
+            max_instance,
+            render_instanced,
+            ..Self::of(&self.model_over(inferred))
+        };
+    }
+
+    /// Requires that the keys of the batches, which only `localize` renders, are not given.
+    pub fn without_batches(&self) -> Result<(), InvalidValue> {
+        const REMEDY: &str = "only localize renders in batches; remove the key";
+        if let Some(value) = self.max_instance {
+            return Err(InvalidValue::new("range_image.max_instance", value, REMEDY));
+        }
+        let Some(value) = self.render_instanced else {
+            return Ok(());
+        };
+        let key = "range_image.render_instanced";
+        Err(InvalidValue::new(key, value, REMEDY))
+    }
+
+    /// Number of particles that are rendered at once.
+    pub fn batch_size(&self) -> usize {
+        match self.render_instanced {
+            Some(false) => 1,
+            _ => self.max_instance.unwrap_or(1024),
+        }
+    }
+}
+
+impl Validate for RangeImageConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        if let Some(max_instance) = self.max_instance {
+            in_range("max_instance", max_instance, 1..=1_000_000)?;
+        }
+        self.model().validate()
+    }
+}
