@@ -1,11 +1,12 @@
-//! Builds a map from a recording in KITTI layout:
+//! Builds a map from a recording, with or without poses, of any sensor:
 //! `cargo run --release --example build_map -- RECORDING MAP.ply`.
 
 #![allow(clippy::print_stdout, reason = "examples print their result")]
 
 use std::path::PathBuf;
 
-use fpmcl::map::{MapBuilder, MapConfig};
+use fpmcl::map::MapConfig;
+use fpmcl::mapping::build_map;
 use fpmcl::recording::Recording;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -13,8 +14,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let [recording, map_file] = arguments.as_slice() else {
         return Err("usage: build_map RECORDING MAP.ply".into());
     };
-    let drive = Recording::open(recording)?.with_own_poses()?;
-    let map = MapBuilder::new(MapConfig::default()).build(drive.scans_with_poses())?;
+    let map = build_map(&Recording::open(recording)?, &MapConfig::default())?;
     map.save(map_file)?;
     println!(
         "{} triangles, {} key scans",

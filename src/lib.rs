@@ -4,8 +4,9 @@
 //!
 //! | type | from | to |
 //! |---|---|---|
+//! | [`mapping::build_map`] | a recording, or scans in memory, with or without poses | a [`map::Map`] |
 //! | [`odometry::TrajectoryBuilder`] | scans of a drive | their poses: odometry, loops, adjustment |
-//! | [`map::MapBuilder`] | scans with their poses | a [`map::Map`] |
+//! | [`map::MapBuilder`] | deskewed scans with their poses | a [`map::Map`] |
 //! | [`map::Map`] | a PLY file | mesh, ground, tiles and renderer; [`save`](map::Map::save) writes it |
 //! | [`localization::Localizer`] | a map, then scan by scan | an [`Estimate`](localization::Estimate): pose, covariance, state |
 //! | [`refinement::TrajectoryRefiner`] | a map, scans, estimates | a refined, smoothed trajectory |
@@ -14,13 +15,13 @@
 //! use std::path::Path;
 //!
 //! use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
-//! use fpmcl::map::{Map, MapBuilder, MapConfig, MapOptions};
+//! use fpmcl::map::{Map, MapConfig, MapOptions};
+//! use fpmcl::mapping::build_map;
 //! use fpmcl::recording::Recording;
 //! use fpmcl::refinement::{InitialEstimate, RefinerConfig, TrajectoryRefiner};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! let first_drive = Recording::open("data/street/drive_1")?.with_own_poses()?;
-//! let map = MapBuilder::new(MapConfig::default()).build(first_drive.scans_with_poses())?;
+//! let map = build_map(&Recording::open("data/street/drive_1")?, &MapConfig::default())?;
 //! map.save(Path::new("results/map.ply"))?;
 //!
 //! let map = Map::load(Path::new("results/map.ply"), &MapOptions::default())?;
@@ -48,7 +49,7 @@
 //! | frame | origin and axes | appears in |
 //! |---|---|---|
 //! | `lidar` | the sensor; z up, and x forward, y left in KITTI's scans | scans, range images |
-//! | `map` | that of the poses given to [`map::MapBuilder`]; for a recording, the `lidar` frame of its first pose | map, particles, trajectories |
+//! | `map` | the `lidar` frame of the first pose of the recording, or that of the poses given to [`map::MapBuilder`] | map, particles, trajectories |
 //! | `cam0` | left grey camera; x right, y down, z forward | KITTI's pose files, nowhere else |
 //! | `body` | what the poses of a recording are poses of, if not the lidar or a camera | [`recording`] |
 //! | `world` | that of the poses of a recording | [`recording`], to compare drives of one place |
@@ -73,7 +74,7 @@
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
 //! | map | [`map`], [`odometry`], [`registration`], [`sensor`], [`simulation`] |
 //! | poses | [`evaluation`], [`localization`] |
-//! | trajectories | [`refinement`] |
+//! | trajectories | [`mapping`], [`refinement`] |
 //! | program, feature `cli` | `app` |
 //!
 //! `docs/architecture.md` describes how a scan and a configuration key pass through them.
@@ -110,6 +111,7 @@ pub mod simulation;
 pub mod evaluation;
 pub mod localization;
 // Trajectories.
+pub mod mapping;
 pub mod refinement;
 // Program.
 #[cfg(feature = "cli")]

@@ -4,11 +4,13 @@
 
 mod common;
 
+use std::fs;
 use std::path::Path;
 use std::process::Command;
 
 use common::simulate_two_drives;
 use fpmcl::geometry::Pose3;
+use fpmcl::map::{Map, MapOptions};
 use fpmcl::recording::{Recording, poses::read_tum};
 
 const SIMULATION: &str = "\
@@ -17,6 +19,24 @@ n_scans: 16
 path:
 - {length_m: 40, turn_deg: 30, grade_percent: 3}
 ";
+
+#[test]
+fn a_drive_without_poses_is_mapped_along_the_path_that_it_has_driven() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, SIMULATION);
+    let drive = folder.join("street/drive_1");
+    let truth = Recording::open(&drive).and_then(Recording::with_own_poses);
+    let truth = truth.unwrap();
+    fs::remove_file(drive.join("poses.txt")).unwrap();
+    let built = example("build_map", folder, &["street/drive_1", "map.ply"]);
+    assert!(built.contains("16 key scans"), "{built}");
+    let map = Map::load(&folder.join("map.ply"), &MapOptions::default()).unwrap();
+    for (frame, pose) in truth.frames.iter().zip(&map.path.map_from_lidar) {
+        let error_m = distance_m(&frame.map_from_lidar.unwrap(), pose);
+        assert!(error_m < 0.1, "frame {}: {error_m} m", frame.number);
+    }
+}
 
 /// Runs an example in a folder and returns its output.
 #[track_caller]

@@ -15,9 +15,9 @@ pub mod tiles;
 #[cfg(test)]
 pub(crate) mod test_world;
 
-pub use build::builder::{BuildError, BuildEvent, MapBuilder, MapPlan, ScanError};
+pub use build::builder::{BuildError, BuildEvent, MapBuilder, MapPlan, ReadScan, ScanError};
 pub use build::cloud::CloudPlan;
-pub use build::config::{MapConfig, MapOptions};
+pub use build::config::{MapConfig, MapOptions, PoseSource};
 pub use build::local_map::{LocalMap, LocalMapConfig, LocalMapCounts};
 pub use files::mapping_path::MappingPath;
 pub use files::mesh_error::{MeshFileError, MeshFileProblem};

@@ -204,15 +204,19 @@ impl Recording {
         Ok(self)
     }
 
+    /// The same recording, whose frames have no poses.
+    #[must_use]
+    pub fn without_poses(mut self) -> Self {
+        for frame in &mut self.frames {
+            frame.map_from_lidar = None;
+        }
+        self.track = None;
+        self
+    }
+
     /// Reads the scans of the selected frames, one after the other.
     pub fn scans(&self) -> impl Iterator<Item = Result<Scan, RecordingError>> {
         self.frames.iter().map(Frame::read)
-    }
-
-    /// Reads the scans, one after the other, with their poses `map_from_lidar`.
-    pub fn scans_with_poses(&self) -> impl Iterator<Item = Result<(Scan, Pose3), RecordingError>> {
-        let read = |frame: &Frame| Ok((frame.read()?, frame.map_from_lidar.unwrap_or_default()));
-        self.frames.iter().map(read)
     }
 
     /// All frames from the first selected one to the last, also those between, ascending.

@@ -102,6 +102,17 @@ impl PoseTrack {
         Self::of(Path::new(topic), body, calibration, Some(times_s))
     }
 
+    /// Poses of the lidar by frame number, in the frame of the map.
+    pub fn from_poses(map_from_lidar: Vec<Pose3>) -> Self {
+        Self {
+            path: PathBuf::from("the given poses"),
+            map_from_lidar,
+            times_s: None,
+            calibration: Calibration::identity(),
+            world_from_map: Pose3::identity(),
+        }
+    }
+
     fn of(
         path: &Path,
         camera: CameraPoses,

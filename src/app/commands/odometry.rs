@@ -6,7 +6,7 @@ use anyhow::Result;
 use serde::Serialize;
 
 use super::stages::SensorKeys;
-use super::trajectory::{self, TrajectorySummary};
+use super::trajectory;
 use crate::app::report::plotting::PathPlot;
 use crate::app::report::plotting::color::{ODOMETRY, REFINED};
 use crate::app::report::results::write_trajectory_npz;
@@ -16,6 +16,7 @@ use crate::app::run::output::Printed;
 use crate::app::run::{Context, output};
 use crate::app::settings::OdometryCommandConfig;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
+use crate::mapping::{TrajectorySummary, find_poses};
 use crate::odometry::{Loop, OdometryEstimate, StepState, Trajectory};
 use crate::recording::poses::write_tum;
 use crate::recording::{Frame, Recording};
@@ -57,7 +58,10 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
     let (recording, sensor) = open(&mut resolved)?;
     let frames = recording.dense_frames();
     let is_given = recording.track.is_some();
-    let found = trajectory::estimate(&frames, is_given, &config.trajectory, context)?;
+    let name = if is_given { "polish" } else { "odometry" };
+    let found = trajectory::find(name, frames.len(), context, |on_event| {
+        find_poses(&frames, is_given, &config.trajectory, on_event)
+    })?;
     let numbers: Vec<usize> = recording.frames.iter().map(|it| it.number).collect();
     let rows: Vec<usize> = (0..frames.len())
         .filter(|&row| numbers.binary_search(&frames[row].number).is_ok())
@@ -74,7 +78,7 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
     if config.visualize {
         draw(&folder.join("path.png"), &found, is_given)?;
     }
-    let summary = TrajectorySummary::of(&found, recording.has_times);
+    let summary = TrajectorySummary::new(&found, recording.has_times);
     let report = OdometryReport {
         found_loops: found
             .loops
@@ -87,8 +91,8 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
     output::write_yaml(&folder.join("effective_odometry.yml"), &resolved)?;
     output::write_json(&main, &report)?;
     claims.finish(&main)?;
-    report.summary.warn();
-    Printed::rows(&report.summary.rows()).with_json(&report)
+    trajectory::warn(&report.summary);
+    Printed::rows(&trajectory::rows(&report.summary)).with_json(&report)
 }
 
 fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> {

@@ -5,6 +5,7 @@
 //! are written atomically, so what is finished stays. A command whose finished work is still in memory
 //! saves it by [`Interrupt::supervise`].
 
+use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -68,6 +69,15 @@ impl Interrupt {
     /// Whether Ctrl-C was pressed.
     pub fn requested(&self) -> bool {
         self.shared.requested.load(Ordering::Relaxed)
+    }
+
+    /// The answer to events of the library: `Break` once Ctrl-C was pressed.
+    pub fn flow(&self) -> ControlFlow<()> {
+        if self.requested() {
+            ControlFlow::Break(())
+        } else {
+            ControlFlow::Continue(())
+        }
     }
 
     /// Requests to stop, as Ctrl-C does.

@@ -13,25 +13,10 @@ use crate::lidar::NormalConfig;
 use crate::map::build::confidence::ConfidenceConfig;
 use crate::map::build::scan_cloud::ScanConfig;
 use crate::map::build::visibility::VisibilityConfig;
-use crate::map::{LocalMapConfig, MapConfig};
+use crate::map::{LocalMapConfig, MapConfig, PoseSource};
 use crate::meshing::PoissonConfig;
 use crate::sensor::{MotionCompensation, RangeImageConfig};
 use crate::validation::{InvalidValue, Validate, in_range, require};
-
-/// Where the poses of the scans come from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum PoseSource {
-    /// Given, where there are any, otherwise as [`PoseSource::Odometry`].
-    #[default]
-    Auto,
-    /// Given.
-    Given,
-    /// Given, and adjusted so that the scans show the same surfaces.
-    Polished,
-    /// From the scans themselves: odometry, loops and adjustment.
-    Odometry,
-}
 
 /// Configuration of `build-map`: the keys of range-mcl's `build_map.yml`, then new ones.
 ///
@@ -172,6 +157,9 @@ impl BuildMapConfig {
     /// The build of the map.
     pub fn map(&self) -> MapConfig {
         MapConfig {
+            poses: self.poses,
+            check_poses: self.check_poses,
+            seed: self.seed,
             displacement_threshold_m: self.displacement_threshold_m,
             local_map_size: self.local_map_size,
             overlap_m: self.overlap_m,

@@ -26,7 +26,7 @@ mod load;
 mod template;
 mod yaml;
 
-pub use build_map::{BuildMapConfig, PoseSource};
+pub use build_map::BuildMapConfig;
 pub use comparison::{
     ComparisonConfig, Contrast, Overrides, ParticleSweep, SequenceConfig, StageOverrides,
     VariantConfig, settings,

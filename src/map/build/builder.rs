@@ -37,12 +37,15 @@ use crate::validation::{InvalidValue, Validate as _};
 /// An error of the source of the scans.
 pub type ScanError = Box<dyn Error + Send + Sync>;
 
+/// Reads a key scan by its index, from any thread.
+pub type ReadScan<'a> = dyn Fn(usize) -> Result<Scan, ScanError> + Sync + 'a;
+
 /// Progress of a build.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BuildEvent {
     /// A stage of a local map begins.
     Stage(&'static str),
-    /// A scan was read and prepared.
+    /// A scan was read, and prepared or registered.
     ScanPrepared,
 }
 
@@ -54,14 +57,12 @@ pub enum BuildError {
     Interrupted,
     #[error(transparent)]
     Scan(ScanError),
-    #[error(
-        "there are no scans to build a map from; check the recording and its selection of frames"
-    )]
+    #[error("there are no scans to build a map from; select at least one frame")]
     NoScans,
     #[error(transparent)]
     Path(#[from] ImplausiblePath),
     #[error(
-        "the poses of scans {first} to {last} do not fit: only {percent:.0} % of a scan's points are on the surfaces of the next one; check that the poses are of this recording and that calib_file has the line Tr that belongs to them"
+        "the poses of scans {first} to {last} do not fit: only {percent:.0} % of a scan's points are on the surfaces of the next one; check that they are poses of the lidar, and of these scans"
     )]
     PosesDoNotFit {
         first: usize,
@@ -80,7 +81,7 @@ pub enum BuildError {
     #[error(transparent)]
     Invalid(#[from] InvalidValue),
     #[error(
-        "the map has no triangles: none of the {scans} key scans has points left to mesh; check range_image, crop_x, crop_y and crop_z"
+        "the map has no triangles: none of the {scans} key scans has points left to mesh; check the ranges of local_map.scan.range_image, and local_map.scan.crop_m"
     )]
     Empty { scans: usize },
     #[error(
@@ -101,7 +102,26 @@ pub enum BuildError {
     Map(#[from] MapError),
 }
 
-/// Builds maps.
+impl BuildError {
+    /// The error with numbers of frames instead of those of key scans.
+    #[must_use]
+    pub fn with_frames(self, number_of: impl Fn(usize) -> usize) -> Self {
+        match self {
+            Self::PosesDoNotFit {
+                first,
+                last,
+                percent,
+            } => Self::PosesDoNotFit {
+                first: number_of(first),
+                last: number_of(last),
+                percent,
+            },
+            other => other,
+        }
+    }
+}
+
+/// Builds maps of deskewed scans with poses, with the sensor of its configuration.
 pub struct MapBuilder {
     /// Configuration of the build.
     pub config: MapConfig,
@@ -131,9 +151,29 @@ impl MapBuilder {
         scans: impl IntoIterator<Item = Result<(Scan, Pose3), E>>,
     ) -> Result<Map, BuildError> {
         let (keys, poses) = self.key_scans(scans)?;
-        let plan = self.plan(poses)?;
-        let (mesh, _) = plan.build_all(&keys)?;
-        plan.finish(mesh)
+        self.build_keys(poses, None, &|key| Ok(keys[key].clone()))
+    }
+
+    /// Builds a map of key scans by their poses, or adds them to an older map in whose frame their poses are: what their
+    /// beams pass through is removed, and what that map does not have is added. `read_scan` returns a key scan by its
+    /// index and is called from any thread.
+    pub fn build_keys(
+        &self,
+        map_from_lidar: Vec<Pose3>,
+        older: Option<&Map>,
+        read_scan: &ReadScan,
+    ) -> Result<Map, BuildError> {
+        let mut plan = self.plan(map_from_lidar)?;
+        let Some(map) = older else {
+            let (mesh, _) = plan.build_all(read_scan)?;
+            return plan.finish(mesh);
+        };
+        let mesh = map.mesh()?;
+        plan.older = Some(&*mesh);
+        let (added, gone) = plan.build_all(read_scan)?;
+        let path = map.path.extended_by(&plan.map_from_lidar);
+        let mesh = changes::joined(&mesh, &gone, &added);
+        Ok(Map::new(mesh, path, &self.options)?)
     }
 
     /// Adds a newer drive to a map, in whose frame its poses are: what its beams pass through is removed, and what
@@ -144,15 +184,7 @@ impl MapBuilder {
         scans: impl IntoIterator<Item = Result<(Scan, Pose3), E>>,
     ) -> Result<Map, BuildError> {
         let (keys, poses) = self.key_scans(scans)?;
-        let older = map.mesh()?;
-        let plan = MapPlan {
-            older: Some(&*older),
-            ..self.plan(poses)?
-        };
-        let (added, gone) = plan.build_all(&keys)?;
-        let path = map.path.extended_by(&plan.map_from_lidar);
-        let mesh = changes::joined(&older, &gone, &added);
-        Ok(Map::new(mesh, path, &self.options)?)
+        self.build_keys(poses, Some(map), &|key| Ok(keys[key].clone()))
     }
 
     /// The key scans and their poses.
@@ -201,7 +233,7 @@ fn require_memory_of_images(model: &LidarModel) -> Result<(), MemoryError> {
     memory::require(
         "the range images of the scans",
         (model.len() * rayon::current_num_threads() * PIXEL_BYTES) as f64,
-        "lower range_image.height or range_image.width, or give fewer --threads",
+        "lower the height or width of local_map.scan.range_image, or the number of threads",
     )
 }
 
@@ -221,10 +253,10 @@ pub struct MapPlan<'a> {
 
 impl MapPlan<'_> {
     /// Builds all local maps; returns what they add, and the triangles of the older map that are gone, ascending.
-    fn build_all(&self, keys: &[Scan]) -> Result<(TriangleMesh, Vec<u32>), BuildError> {
+    fn build_all(&self, read_scan: &ReadScan) -> Result<(TriangleMesh, Vec<u32>), BuildError> {
         let (mut mesh, mut gone) = (TriangleMesh::default(), vec![]);
         for local_map in &self.local_maps {
-            let built = self.build_local_map(local_map, &|key| Ok(keys[key].clone()))?;
+            let built = self.build_local_map(local_map, read_scan)?;
             mesh.append(&built.in_map());
             gone.extend(built.gone);
         }
@@ -236,7 +268,7 @@ impl MapPlan<'_> {
     pub fn build_local_map(
         &self,
         plan: &LocalMapPlan,
-        read_scan: &(dyn Fn(usize) -> Result<Scan, ScanError> + Sync),
+        read_scan: &ReadScan,
     ) -> Result<LocalMap, BuildError> {
         let config = &self.builder.config.local_map;
         let notify = |event| match (self.builder.on_event)(event) {
@@ -256,7 +288,7 @@ impl MapPlan<'_> {
             memory::require(
                 "the scans of a local map",
                 bytes as f64,
-                "lower local_map_size or overlap_m, or raise voxel_size",
+                "lower local_map_size or overlap_m, or raise local_map.scan.voxel_size_m",
             )?;
             notify(BuildEvent::ScanPrepared)?;
             Ok(prepared)

@@ -9,11 +9,33 @@ use crate::map::tiles::grid::TileConfig;
 use crate::rendering::{Backend, RenderingMethod};
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
+/// Where the poses of the scans come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PoseSource {
+    /// Given, where there are any, otherwise as [`PoseSource::Odometry`]; with an older map found in that map.
+    #[default]
+    Auto,
+    /// Given.
+    Given,
+    /// Given, and adjusted so that the scans show the same surfaces.
+    Polished,
+    /// From the scans themselves: odometry, loops and adjustment.
+    Odometry,
+}
+
 /// Everything that can be configured about building a map.
 ///
 /// Defaults: the values of range-mcl where it has them.
 #[derive(Clone, Debug, PartialEq, SmartDefault)]
 pub struct MapConfig {
+    /// Where the poses of a recording come from.
+    pub poses: PoseSource,
+    /// Whether to compare given poses with the motion of some scans before anything is built.
+    #[default(true)]
+    pub check_poses: bool,
+    /// Seed of the search for the start in an older map.
+    pub seed: u64,
     /// Distance from the previous key scan after which a scan is a key scan [m].
     #[default(0.2)]
     pub displacement_threshold_m: f64,
@@ -33,7 +55,6 @@ pub struct MapConfig {
 }
 
 impl Validate for MapConfig {
-    /// With the keys of `build_map.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
         not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
         in_range("local_map_size", self.local_map_size, 1..=10_000)?;

@@ -122,10 +122,7 @@ fn on_stage(event: BuildEvent, context: &Context, clock: &StageClock) -> Control
     if let BuildEvent::Stage(name) = event {
         clock.begin(name);
     }
-    match context.interrupt.requested() {
-        true => ControlFlow::Break(()),
-        false => ControlFlow::Continue(()),
-    }
+    context.interrupt.flow()
 }
 
 fn interrupted(error: BuildError, kept: &str) -> anyhow::Error {

@@ -5,12 +5,13 @@ use std::fmt::Write as _;
 use anyhow::{Result, bail};
 
 use super::local_maps;
-use super::opened::{Opened, open, poses_of};
+use super::opened::{Opened, open};
 use super::parts::Role;
 use crate::app::run::Context;
 use crate::app::run::output::Printed;
 use crate::app::settings::BuildMapConfig;
 use crate::map::build::plan;
+use crate::mapping::poses_of;
 
 /// One shell command per local map that is not finished, for the current folder: the command line of this process with
 /// `--job` instead of `--list-jobs`. The poses are found first.

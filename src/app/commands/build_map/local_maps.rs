@@ -1,13 +1,12 @@
 //! The local maps of a build: those that are not finished yet are built, and all are kept on disk.
 
 use std::collections::BTreeMap;
-use std::ops::ControlFlow;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use anyhow::{Context as _, Result, bail};
 
 use super::clock::StageClock;
-use super::opened::{Opened, poses_of};
+use super::opened::Opened;
 use super::parts::{Parts, Role, hash_of_scan, hash_of_scans, joint_hash};
 use crate::app::run::Context;
 use crate::app::run::interrupt::Interrupted;
@@ -16,6 +15,7 @@ use crate::app::settings::BuildMapConfig;
 use crate::map::build::plan::{LocalMapPlan, local_maps};
 use crate::map::build::scan_agreement;
 use crate::map::{BuildError, BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan};
+use crate::mapping::poses_of;
 use crate::recording::Frame;
 
 /// Stages of a local map, and about the share of its time before each.
@@ -181,10 +181,7 @@ fn builder(
                 }
                 BuildEvent::ScanPrepared => progress.end_scan(),
             }
-            match interrupt.requested() {
-                true => ControlFlow::Break(()),
-                false => ControlFlow::Continue(()),
-            }
+            interrupt.flow()
         }),
         ..MapBuilder::new(config.map())
     }
@@ -211,18 +208,7 @@ fn build_part(
     };
     let number_of = |key: usize| frames[key].number;
     let built = plan.build_local_map(local_map, &read);
-    let built = built.map_err(|error| match error {
-        BuildError::PosesDoNotFit {
-            first,
-            last,
-            percent,
-        } => BuildError::PosesDoNotFit {
-            first: number_of(first),
-            last: number_of(last),
-            percent,
-        },
-        other => other,
-    })?;
+    let built = built.map_err(|error| error.with_frames(number_of))?;
     warn_of_doubtful_poses(&built, frames);
     let hashes = hashes.into_inner().unwrap_or_else(|e| e.into_inner());
     if built.counts.is_empty {

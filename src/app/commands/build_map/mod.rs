@@ -23,7 +23,7 @@ use anyhow::{Result, ensure};
 use self::clock::StageClock;
 use self::files::write_map;
 use self::onto::ChangesReport;
-use self::opened::{open, poses_of};
+use self::opened::open;
 pub use self::parts::hash_of_scan;
 use self::parts::{Joined, Role};
 pub use self::report::BuildReport;
@@ -33,6 +33,7 @@ use crate::app::run::{Context, output};
 use crate::app::settings::BuildMapConfig;
 use crate::map::MappingPath;
 use crate::map::mesh_view::{MeshView, Without};
+use crate::mapping::poses_of;
 
 /// Builds the map that a configuration describes.
 pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {

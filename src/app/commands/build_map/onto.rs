@@ -8,17 +8,13 @@ use serde::Serialize;
 
 use super::parts::hash_of_file;
 use crate::app::commands::stages::MapInputs;
-use crate::app::commands::trajectory;
 use crate::app::report::plotting::MapPlot;
 use crate::app::report::run_output::MOST_TRIANGLES;
 use crate::app::run::{Context, input};
-use crate::app::settings::{BuildMapConfig, LocalizationConfig};
+use crate::app::settings::BuildMapConfig;
 use crate::geometry::pose2_from_pose3;
-use crate::localization::SecondDrive;
 use crate::map::mesh_view::{MeshView, Without, reduced};
 use crate::map::{Map, MapOptions, MappingPath, surface_of};
-use crate::odometry::{Trajectory, TrajectoryConfig};
-use crate::recording::Frame;
 
 /// A map that is extended.
 pub struct OlderMap {
@@ -57,42 +53,6 @@ impl OlderMap {
         };
         Ok(Some((older, map)))
     }
-}
-
-/// How the scans are localized in the older map.
-pub fn localization(config: &BuildMapConfig) -> LocalizationConfig {
-    LocalizationConfig {
-        range_image: config.range_image.clone(),
-        own_car_m: config.own_car_m,
-        ground_method: config.ground_method,
-        fuzzy: config.fuzzy.clone(),
-        pca: config.pca,
-        seed: config.seed,
-        ..LocalizationConfig::default()
-    }
-}
-
-/// Finds the trajectory of scans in a map.
-pub fn find(
-    frames: &[Frame],
-    map: &Map,
-    config: &BuildMapConfig,
-    context: &Context,
-) -> Result<Trajectory> {
-    let (localizer, settings) = (
-        localization(config).localizer(),
-        TrajectoryConfig::default(),
-    );
-    let mut drive = SecondDrive::new(map, localizer, settings, config.seed)?;
-    let task = trajectory::each_scan("localize", frames, context, |_, scan| {
-        drive.add(scan)?;
-        Ok(())
-    })?;
-    let (found, all) = (drive.found(), frames.len());
-    tracing::info!("{found} of {all} scans are found in the older map");
-    let trajectory = drive.finish()?;
-    task.set_share(1.0);
-    Ok(trajectory)
 }
 
 /// What a drive changed in an older map.

@@ -9,12 +9,12 @@ use super::files::prepare;
 use super::onto::OlderMap;
 use super::parts::{Parts, Role};
 use super::{pose_check, poses};
-use crate::app::commands::trajectory::{self, TrajectorySummary, file_beside};
+use crate::app::commands::trajectory::{self, file_beside};
 use crate::app::run::claims::Claims;
 use crate::app::run::{Context, input, version};
-use crate::app::settings::{self, BuildMapConfig, PoseSource};
-use crate::geometry::Pose3;
-use crate::map::build::plan::key_scans;
+use crate::app::settings::{self, BuildMapConfig};
+use crate::map::PoseSource;
+use crate::mapping::{TrajectorySummary, key_frames};
 use crate::recording::{Frame, Recording};
 use crate::sensor::SensorDescription;
 
@@ -54,22 +54,10 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
         input::require_file("truth_mesh", path)?;
     }
     let (older, older_map) = OlderMap::open(&config, context)?.unzip();
-    let mut recording = inputs.open(&config.selection())?;
-    let given = poses::given(&config, &recording)?.map(|track| match &older {
-        Some(older) => track.in_map(&older.path.world_from_map),
-        None => track,
-    });
-    let pose_file = given.as_ref().map(|track| track.path.clone());
-    if let (Some(track), Some(pose_file)) = (given, &pose_file) {
-        recording = recording.with_poses(track)?;
-        let origin = format!("pose_file is {}", pose_file.display());
-        trajectory::check(&recording, config.max_step_m, &origin)?;
-    }
+    let recording = poses::open(&config, older.as_ref())?;
     let (mut sequence, sensor) = config.sensor_keys().resolve(recording)?;
-    if let Some(pose_file) = pose_file.filter(|_| config.check_poses) {
-        pose_check::check(&sequence)
-            .with_context(|| format!("pose_file is {}", pose_file.display()))?;
-    }
+    pose_check::check(&sequence, &config)
+        .with_context(|| poses::origin(&sequence).unwrap_or_default())?;
     let mut trajectory = None;
     if sequence.track.is_none() || config.poses == PoseSource::Polished {
         (sequence, trajectory) = poses::find(
@@ -105,21 +93,15 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
 
 /// The key scans that build the map, and those that are held out to evaluate it.
 fn hold_out(frames: &[Frame], config: &BuildMapConfig) -> (Vec<Frame>, Vec<Frame>) {
-    let keys = key_scans(&poses_of(frames), config.displacement_threshold_m);
+    let keys = key_frames(frames, config.displacement_threshold_m);
     let step = config.holdout_step;
     let is_held_out = |row: usize| step > 0 && row % step == step - 1;
     let frames_where = |held_out: bool| {
         let rows = keys.iter().enumerate();
         let rows = rows.filter(|&(row, _)| is_held_out(row) == held_out);
-        rows.map(|(_, &key)| frames[key].clone()).collect()
+        rows.map(|(_, key)| key.clone()).collect()
     };
     (frames_where(false), frames_where(true))
-}
-
-/// The poses of frames that have poses.
-pub fn poses_of(frames: &[Frame]) -> Vec<Pose3> {
-    let poses = frames.iter().map(|frame| frame.map_from_lidar);
-    poses.map(Option::unwrap_or_default).collect()
 }
 
 /// Inputs on which all local maps depend: the program, the configuration without the paths of outputs,

@@ -6,13 +6,14 @@ use std::path::Path;
 
 use anyhow::{Result, ensure};
 
-use super::onto::{self, OlderMap};
+use super::onto::OlderMap;
 use super::parts::{Role, not_listed};
-use crate::app::commands::trajectory::{self, TrajectorySummary};
+use crate::app::commands::trajectory;
 use crate::app::run::{Context, output, version};
-use crate::app::settings::{self, BuildMapConfig, PoseSource};
+use crate::app::settings::BuildMapConfig;
 use crate::geometry::Pose3;
-use crate::map::Map;
+use crate::map::{Map, PoseSource};
+use crate::mapping::{self, TrajectorySummary, find_poses, find_poses_in};
 use crate::odometry::TrajectoryConfig;
 use crate::recording::poses::write_tum;
 use crate::recording::{Frame, PoseTrack, Recording};
@@ -20,14 +21,13 @@ use crate::recording::{Frame, PoseTrack, Recording};
 /// Start of the line of a file of poses with their summary.
 const SUMMARY: &str = "# ";
 
-/// The given poses of a recording; `None` if they are to be found from the scans.
-pub fn given(config: &BuildMapConfig, recording: &Recording) -> Result<Option<PoseTrack>> {
+/// Opens the recording with the poses that are given, if they are used.
+pub fn open(config: &BuildMapConfig, older: Option<&OlderMap>) -> Result<Recording> {
     let inputs = config.recording_inputs();
-    if config.poses == PoseSource::Odometry {
-        return Ok(None);
-    }
-    if let (Some(map), PoseSource::Auto) = (&config.onto, config.poses) {
-        let map = map.display();
+    let mut recording = inputs.open(&config.selection())?;
+    let is_found = config.poses == PoseSource::Auto && older.is_some();
+    if let Some(older) = older.filter(|_| is_found) {
+        let map = older.file.display();
         match &config.pose_file {
             Some(path) => tracing::warn!(
                 "pose_file {} is not used: the poses are found from the scans in {map}; set poses to given if they are in the world of that map",
@@ -37,18 +37,23 @@ pub fn given(config: &BuildMapConfig, recording: &Recording) -> Result<Option<Po
                 "the poses are found from the scans in {map}; set poses to given to use those of the recording"
             ),
         }
-        return Ok(None);
+    } else if let Some(path) = &config.pose_file
+        && config.poses != PoseSource::Odometry
+    {
+        recording.track = Some(inputs.track(path, &recording)?);
     }
-    if let Some(path) = &config.pose_file {
-        return inputs.track(path, recording).map(Some);
+    let world = older.map(|older| older.path.world_from_map);
+    let recording = mapping::with_given_poses(recording, config.poses, world.as_ref())?;
+    if let Some(origin) = origin(&recording) {
+        trajectory::check(&recording, config.max_step_m, &origin)?;
     }
-    match recording.own_track() {
-        Err(error) if config.poses == PoseSource::Auto && recording.files.poses.is_none() => {
-            tracing::info!("poses from the scans: {error}");
-            Ok(None)
-        }
-        track => Ok(track.map(Some)?),
-    }
+    Ok(recording)
+}
+
+/// Where the poses of a recording are from.
+pub fn origin(recording: &Recording) -> Option<String> {
+    let track = recording.track.as_ref()?;
+    Some(format!("pose_file is {}", track.path.display()))
 }
 
 /// The recording with poses from its scans, in an older map where there is one, or with its own ones polished, and what
@@ -68,7 +73,7 @@ pub fn find(
         false => recording.dense_frames(),
     };
     let localized_by = match older {
-        Some((older, _)) => older.hash.clone() + &settings::to_yaml(&onto::localization(config))?,
+        Some((older, _)) => format!("{}{:?}", older.hash, mapping::localizer(&config.map())),
         None => String::new(),
     };
     let hash = inputs(&frames, is_given, &localized_by)?;
@@ -82,12 +87,17 @@ pub fn find(
     } else {
         ensure!(role == Role::Build, not_listed(&config.mesh_file));
         let settings = TrajectoryConfig::default();
-        let found = match older {
-            Some((_, map)) => onto::find(&frames, map, config, context)?,
-            None => trajectory::estimate(&frames, is_given, &settings, context)?,
+        let name = match (older, is_given) {
+            (Some(_), _) => "localize",
+            (None, true) => "polish",
+            (None, false) => "odometry",
         };
-        let found_now = TrajectorySummary::of(&found, recording.has_times);
-        found_now.warn();
+        let found = trajectory::find(name, frames.len(), context, |on_event| match older {
+            Some((_, map)) => find_poses_in(map, &frames, &config.map(), on_event),
+            None => find_poses(&frames, is_given, &settings, on_event),
+        })?;
+        let found_now = TrajectorySummary::new(&found, recording.has_times);
+        trajectory::warn(&found_now);
         let kept = serde_json::to_string(&found_now.without_times())?;
         summary = Some(found_now);
         // Rows of the lidar in the world of the given poses, or of the older map.

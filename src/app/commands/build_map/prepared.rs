@@ -2,10 +2,10 @@
 
 use anyhow::Result;
 
-use super::onto;
 use crate::app::settings::BuildMapConfig;
 use crate::localization::{Localizer, Odometry, Start};
 use crate::map::{Map, MapError, MapOptions};
+use crate::mapping;
 use crate::recording::Frame;
 use crate::rendering::Backend;
 
@@ -26,7 +26,7 @@ pub fn open_map(config: &BuildMapConfig, frame: Option<&Frame>) -> Result<Option
     };
     if let Some(frame) = frame {
         let scan = frame.read()?;
-        let localizer = onto::localization(config).localizer();
+        let localizer = mapping::localizer(&config.map());
         let found = Localizer::new(&map, localizer, Start::unknown(&map), config.seed)
             .and_then(|mut localizer| localizer.step(&scan, Odometry::Unknown));
         if let Err(error) = found {

@@ -4,7 +4,6 @@ use anyhow::Result;
 use glam::DVec3;
 use nalgebra::{Point2, Translation3, Vector3};
 
-use super::opened::poses_of;
 use crate::app::settings::BuildMapConfig;
 use crate::evaluation::TruthAgreement;
 use crate::evaluation::map_quality::{self, ResidualSums};
@@ -12,6 +11,7 @@ use crate::geometry::Pose3;
 use crate::map::build::plan::origin_near;
 use crate::map::files::ply;
 use crate::map::{Map, MappingPath};
+use crate::mapping::poses_of;
 use crate::recording::Frame;
 
 /// Residuals of the map along the beams of the held-out scans.

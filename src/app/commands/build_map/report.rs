@@ -8,10 +8,11 @@ use anyhow::Result;
 use serde::Serialize;
 
 use super::onto::ChangesReport;
-use crate::app::commands::trajectory::TrajectorySummary;
+use crate::app::commands::trajectory;
 use crate::app::run::output::Printed;
 use crate::evaluation::{MapQuality, TruthAgreement};
 use crate::map::{LocalMapCounts, MappingPath};
+use crate::mapping::TrajectorySummary;
 use crate::sensor::SensorDescription;
 
 /// Report of a map build.
@@ -102,8 +103,8 @@ impl BuildReport {
         }
         rows.extend(self.changes.iter().flat_map(ChangesReport::rows));
         rows.extend(self.quality_rows());
-        if let Some(trajectory) = &self.trajectory {
-            let found = trajectory.rows().into_iter();
+        if let Some(summary) = &self.trajectory {
+            let found = trajectory::rows(summary).into_iter();
             rows.extend(found.filter(|(name, _)| !matches!(*name, "scans" | "path")));
         }
         let [thousands, megabytes] = [self.triangles_per_100m / 1e3, self.mb_per_100m];

@@ -1,0 +1,70 @@
+//! Poses of a recording on its way into a map.
+
+use crate::geometry::Pose3;
+use crate::localization::LocalizerConfig;
+use crate::localization::sensor::SensorConfig;
+use crate::map::build::path_check::{self, ImplausiblePath};
+use crate::map::build::plan::key_scans;
+use crate::map::{MapConfig, PoseSource};
+use crate::recording::{Frame, Recording, RecordingError};
+
+/// The recording with the poses that were given to it, else its own ones; without poses where these are to be found from
+/// the scans. `older` is the pose `world_from_map` of the map to which the recording is added, in whose world its poses
+/// are only if that is said by [`PoseSource::Given`].
+pub fn with_given_poses(
+    mut recording: Recording,
+    source: PoseSource,
+    older: Option<&Pose3>,
+) -> Result<Recording, RecordingError> {
+    let is_auto = source == PoseSource::Auto;
+    if source == PoseSource::Odometry || (is_auto && older.is_some()) {
+        return Ok(recording.without_poses());
+    }
+    let track = match recording.track.take() {
+        Some(track) => track,
+        None => match recording.own_track() {
+            Err(error) if is_auto && recording.files.poses.is_none() => {
+                tracing::info!("poses from the scans: {error}");
+                return Ok(recording);
+            }
+            track => track?,
+        },
+    };
+    recording.with_poses(match older {
+        Some(world_from_map) => track.in_map(world_from_map),
+        None => track,
+    })
+}
+
+/// Checks the poses of a recording against each other; see [`path_check`].
+pub fn check_path(recording: &Recording, max_step_m: f64) -> Result<(), ImplausiblePath> {
+    let poses = recording.frames.iter();
+    let poses = poses.filter_map(|frame| Some((frame.number, frame.map_from_lidar.as_ref()?)));
+    path_check::check(poses, max_step_m)
+}
+
+/// The frames that are far enough from each other [m] to be mapped.
+pub fn key_frames(frames: &[Frame], displacement_m: f64) -> Vec<Frame> {
+    let keys = key_scans(&poses_of(frames), displacement_m).into_iter();
+    keys.map(|key| frames[key].clone()).collect()
+}
+
+/// The poses of frames that have poses.
+pub fn poses_of(frames: &[Frame]) -> Vec<Pose3> {
+    let poses = frames.iter().map(|frame| frame.map_from_lidar);
+    poses.map(Option::unwrap_or_default).collect()
+}
+
+/// How scans are localized in a map to which they are added.
+pub fn localizer(config: &MapConfig) -> LocalizerConfig {
+    let scan = &config.local_map.scan;
+    LocalizerConfig {
+        sensor: SensorConfig {
+            lidar: scan.range_image.clone(),
+            own_car_m: scan.own_car_m,
+            ground: config.ground.clone(),
+            ..SensorConfig::default()
+        },
+        ..LocalizerConfig::default()
+    }
+}

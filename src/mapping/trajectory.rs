@@ -1,0 +1,173 @@
+//! Poses of scans, found from the scans themselves.
+
+use std::ops::ControlFlow;
+
+use serde::{Deserialize, Serialize};
+
+use super::error::MappingError;
+use super::poses::localizer;
+use crate::lidar::Scan;
+use crate::localization::{SecondDrive, SecondDriveError};
+use crate::map::{BuildEvent, Map, MapConfig};
+use crate::odometry::{
+    ElevationBias, LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig,
+};
+use crate::recording::Frame;
+
+/// The stage after the last scan.
+pub const ADJUSTMENT: &str = "loops and adjustment";
+
+/// Called for every event; the work ends soon after it returns `Break`.
+type OnEvent<'a> = &'a dyn Fn(BuildEvent) -> ControlFlow<()>;
+
+/// Finds the poses of frames from their scans, or polishes those that are given.
+///
+/// Its events are the stage `"odometry"` or `"polish"`, every scan, and the stage [`ADJUSTMENT`].
+pub fn find_poses(
+    frames: &[Frame],
+    are_given: bool,
+    config: &TrajectoryConfig,
+    on_event: OnEvent,
+) -> Result<Trajectory, MappingError> {
+    let mut builder = TrajectoryBuilder::new(config.clone())?;
+    let name = if are_given { "polish" } else { "odometry" };
+    each_scan(name, frames, on_event, |frame, scan| {
+        match frame.map_from_lidar {
+            Some(pose) if are_given => builder.add_given(scan, pose)?,
+            _ => drop(builder.add(scan)?),
+        }
+        Ok(())
+    })?;
+    Ok(builder.finish()?)
+}
+
+/// Finds the poses of frames in a map.
+///
+/// Its events are the stage `"localize"`, every scan, and the stage [`ADJUSTMENT`].
+pub fn find_poses_in(
+    map: &Map,
+    frames: &[Frame],
+    config: &MapConfig,
+    on_event: OnEvent,
+) -> Result<Trajectory, MappingError> {
+    let settings = TrajectoryConfig::default();
+    let drive = SecondDrive::new(map, localizer(config), settings, config.seed);
+    let mut drive = drive.map_err(SecondDriveError::from)?;
+    each_scan("localize", frames, on_event, |_, scan| {
+        drive.add(scan)?;
+        Ok(())
+    })?;
+    tracing::info!(
+        "{} of {} scans are found in the older map",
+        drive.found(),
+        frames.len()
+    );
+    Ok(drive.finish()?)
+}
+
+/// Reads the scans in order and passes each to `step`, until an event is answered with `Break`.
+fn each_scan(
+    name: &'static str,
+    frames: &[Frame],
+    on_event: OnEvent,
+    mut step: impl FnMut(&Frame, &Scan) -> Result<(), MappingError>,
+) -> Result<(), MappingError> {
+    let notify = |event| match on_event(event) {
+        ControlFlow::Continue(()) => Ok(()),
+        ControlFlow::Break(()) => Err(MappingError::Interrupted),
+    };
+    notify(BuildEvent::Stage(name))?;
+    for frame in frames {
+        step(frame, &frame.read()?)?;
+        notify(BuildEvent::ScanPrepared)?;
+    }
+    notify(BuildEvent::Stage(ADJUSTMENT))
+}
+
+/// What a trajectory shows about itself.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct TrajectorySummary {
+    /// Number of scans.
+    pub scans: usize,
+    /// Scans whose pose was predicted, because they did not fit.
+    pub predicted: usize,
+    /// Scans that do not determine all of their motion.
+    pub degenerate: usize,
+    /// Length of the path [m].
+    pub path_m: f64,
+    /// Mean speed [m/s]; `None` where the times are assumed.
+    pub speed_m_per_s: Option<f64>,
+    /// Median and 95 % quantile of the time per scan, without loops and adjustment [s].
+    pub seconds_per_scan: Option<[f64; 2]>,
+    /// Loops that were found and accepted, are not confirmed, and contradict others.
+    pub loops: LoopCounts,
+    /// Root mean square of the distances between points and common planes, before and after the adjustment [m].
+    pub residuals_m: Option<[f64; 2]>,
+    /// Angle to add to the elevations of all points so that surfaces fit themselves best.
+    pub elevation_bias: Option<ElevationBias>,
+    /// Largest change of a position by loops and adjustment [m].
+    pub largest_change_m: f64,
+}
+
+/// Numbers of loops.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
+pub struct LoopCounts {
+    /// The poses follow them.
+    pub accepted: usize,
+    /// No second loop confirms them.
+    pub unconfirmed: usize,
+    /// They contradict others.
+    pub contradicted: usize,
+}
+
+impl TrajectorySummary {
+    /// The same for every run.
+    pub fn without_times(&self) -> Self {
+        Self {
+            seconds_per_scan: None,
+            ..self.clone()
+        }
+    }
+
+    /// The summary of a trajectory, whose speed is known where its scans have times.
+    pub fn new(trajectory: &Trajectory, has_times: bool) -> Self {
+        let steps = &trajectory.odometry;
+        let positions = || trajectory.poses.iter().map(|pose| pose.translation.vector);
+        let path_m: f64 = (positions().zip(positions().skip(1)))
+            .map(|(a, b)| (b - a).norm())
+            .sum();
+        let duration_s: f64 = steps.iter().skip(1).map(|step| step.duration_s).sum();
+        let mut times_s: Vec<f64> = (steps.iter())
+            .map(|step| step.elapsed.as_secs_f64())
+            .filter(|&time_s| time_s > 0.0)
+            .collect();
+        times_s.sort_by(f64::total_cmp);
+        let quantile = |share: f64| Some(*times_s.get((share * times_s.len() as f64) as usize)?);
+        let counted = |verdict| {
+            let loops = trajectory.loops.iter();
+            loops.filter(|found| found.verdict == verdict).count()
+        };
+        Self {
+            scans: steps.len(),
+            predicted: (steps.iter())
+                .filter(|step| step.state == StepState::Predicted)
+                .count(),
+            degenerate: (steps.iter())
+                .filter(|step| !step.degenerate_directions.is_empty())
+                .count(),
+            path_m,
+            speed_m_per_s: (has_times && duration_s > 0.0).then(|| path_m / duration_s),
+            seconds_per_scan: quantile(0.5).zip(quantile(0.95)).map(|(a, b)| [a, b]),
+            loops: LoopCounts {
+                accepted: counted(LoopVerdict::Accepted),
+                unconfirmed: counted(LoopVerdict::Unconfirmed),
+                contradicted: counted(LoopVerdict::Contradicted),
+            },
+            residuals_m: trajectory.adjusted.map(|adjusted| adjusted.residuals_m),
+            elevation_bias: (trajectory.adjusted).and_then(|adjusted| adjusted.elevation_bias),
+            largest_change_m: (positions().zip(steps))
+                .map(|(found, step)| (found - step.odom_from_lidar.translation.vector).norm())
+                .fold(0.0, f64::max),
+        }
+    }
+}
