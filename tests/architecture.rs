@@ -1,6 +1,7 @@
 //! The structure of the source tree, checked over the source text.
 //!
-//! A module imports only modules of the layers above its own in `src/lib.rs`, no two files import each
+//! A module imports only modules of the layers above its own in `src/lib.rs`, and in `src/app/mod.rs` for the
+//! rooms of the program, no two files import each
 //! other, directly or through others, and some crates and operations (random generators, printing,
 //! opening files) are confined to one place each.
 
@@ -50,8 +51,8 @@ const RESTRICTIONS: [Restriction; 11] = [
     },
     Restriction {
         words: &["clap::", "use clap"],
-        allowed: &["app/cli.rs", "app/mod.rs"],
-        reason: "the command line is confined to app/cli.rs and app/mod.rs",
+        allowed: &["app"],
+        reason: "the command line is confined to app",
     },
     Restriction {
         words: &["anyhow::", "use anyhow", "anyhow!"],
@@ -414,18 +415,22 @@ impl Crate {
         cyclic.into_iter().map(|(_, text)| text).collect()
     }
 
-    /// The imports between modules of one layer, or from a layer below.
-    fn layer_violations(&self, layers: &[Vec<String>]) -> Vec<String> {
-        let layer = |module: &Module| match module.first() {
-            Some(name) => layers.iter().position(|layer| layer.contains(name)),
-            None => None,
+    /// The imports between the modules of one layer, or from a layer below, inside a room: the crate, or a module.
+    fn layer_violations(&self, room: &[String], layers: &[Vec<String>]) -> Vec<String> {
+        let name = |module: &Module| module.strip_prefix(room)?.first().cloned();
+        let layer = |name: &String| layers.iter().position(|layer| layer.contains(name));
+        let is_wrong = |import: &&Import| match name(&import.from) {
+            Some(from) if import.to.starts_with(room) => {
+                let to = name(&import.to);
+                let to_layer = to.as_ref().and_then(layer);
+                let is_below = || to_layer.is_some_and(|to| Some(to) < layer(&from));
+                layer(&from).is_some() && to.as_ref() != Some(&from) && !is_below()
+            }
+            // The root of a room may import everything, and the room around it has a law of its own.
+            _ => false,
         };
         let imports = self.imports();
-        let wrong = imports.iter().filter(|it| match layer(&it.from) {
-            Some(from) => it.from[0] != it.to[0] && layer(&it.to).is_none_or(|to| to >= from),
-            // `main.rs` may import everything.
-            None => false,
-        });
+        let wrong = imports.iter().filter(is_wrong);
         let mut texts: Vec<String> = wrong.map(|it| self.describe(it)).collect();
         texts.dedup();
         texts
@@ -560,19 +565,27 @@ fn violations(sources: &[Source]) -> Vec<String> {
     violations
 }
 
-fn lib_text() -> String {
-    fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("src/lib.rs")).unwrap()
+fn text_of(file: &str) -> String {
+    fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("src").join(file)).unwrap()
 }
 
 #[test]
 fn modules_import_only_those_of_the_layers_above() {
-    let violations = Crate::new(&sources()).layer_violations(&layers(&lib_text()));
+    let violations = Crate::new(&sources()).layer_violations(&[], &layers(&text_of("lib.rs")));
+    assert!(violations.is_empty(), "{}", violations.join("\n"));
+}
+
+#[test]
+fn the_rooms_of_the_program_import_only_those_of_the_layers_above() {
+    let layers = layers(&text_of("app/mod.rs"));
+    assert_eq!(layers.len(), 6);
+    let violations = Crate::new(&sources()).layer_violations(&["app".to_owned()], &layers);
     assert!(violations.is_empty(), "{}", violations.join("\n"));
 }
 
 #[test]
 fn the_table_of_the_front_page_lists_the_layers() {
-    let lib = lib_text();
+    let lib = text_of("lib.rs");
     let table = lib
         .lines()
         .skip_while(|line| *line != "//! | layer | modules |");
@@ -621,11 +634,33 @@ fn a_wrong_import_is_reported_with_file_and_line() {
         ("main.rs", "use fpmcl::app::X;"),
     ];
     assert_eq!(
-        crate_of(&files).layer_violations(&layers),
+        crate_of(&files).layer_violations(&[], &layers),
         [
             "src/lidar.rs:2 imports src/map/mod.rs",
             "src/lidar.rs:3 imports src/poses.rs",
             "src/poses.rs:1 imports src/app.rs"
+        ]
+    );
+    let files = [
+        (
+            "app/mod.rs",
+            "pub mod run;\npub mod cli;\nuse self::cli::C;",
+        ),
+        (
+            "app/run/mod.rs",
+            "use crate::lidar::X;\nuse crate::app::cli::C;",
+        ),
+        ("app/run/log.rs", "use super::super::A;"),
+        ("app/cli.rs", "use crate::app::run::{R, log};"),
+        ("lidar.rs", ""),
+    ];
+    let room = ["app".to_owned()];
+    let rooms = [["run".to_owned()].into(), ["cli".to_owned()].into()];
+    assert_eq!(
+        crate_of(&files).layer_violations(&room, &rooms),
+        [
+            "src/app/run/mod.rs:2 imports src/app/cli.rs",
+            "src/app/run/log.rs:1 imports src/app/mod.rs"
         ]
     );
 }

@@ -1,7 +1,7 @@
 //! Errors of the library as exceptions.
 
 use anyhow::anyhow;
-use fpmcl::app::commands::format_error_chain;
+use fpmcl::app::run::failure::format_error_chain;
 use pyo3::exceptions::PyException;
 use pyo3::prelude::*;
 

@@ -1,15 +1,32 @@
-//! The command line as types; nothing else.
+//! The command line: its types, and which command does what.
 
-use std::num::NonZeroUsize;
-use std::path::{Path, PathBuf};
-
+use anyhow::Context as _;
 use clap::{ArgAction, Args, CommandFactory as _, Parser, Subcommand, ValueEnum};
+use serde::Serialize;
 use tracing::level_filters::LevelFilter;
 
-use crate::app::comparison::RunId;
-use crate::app::run::output::Form;
-use crate::recording::scan_files;
-use crate::rendering::Backend;
+use crate::app::commands::build_map::{self, BuildMapArgs};
+use crate::app::commands::demo::{self, DemoArgs};
+use crate::app::commands::doctor::{self, DoctorArgs};
+use crate::app::commands::evaluate::{self, EvaluateArgs};
+use crate::app::commands::export::{self, ExportArgs};
+use crate::app::commands::ground::{self, GroundArgs};
+use crate::app::commands::info::{self, InfoArgs};
+use crate::app::commands::localize::{self, LocalizeArgs};
+use crate::app::commands::odometry::{self, OdometryArgs};
+use crate::app::commands::refine::{self, RefineArgs};
+use crate::app::commands::simulate;
+use crate::app::comparison::compare::{self, CompareArgs};
+use crate::app::report::results::Report;
+use crate::app::run::Context;
+use crate::app::run::arguments::{RunArgs, configured, with_flags};
+use crate::app::run::machine::MachineArgs;
+use crate::app::run::output::{Form, Printed};
+use crate::app::settings::{
+    self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
+    LocalizationConfig, OdometryCommandConfig, RefinementConfig,
+};
+use crate::simulation::SimulationConfig;
 
 /// Finds a car's pose to the centimetre from one LiDAR and a mesh map that it builds itself.
 #[derive(Clone, Debug, Parser)]
@@ -205,426 +222,25 @@ pub enum ConfiguredCommand {
     Ground,
 }
 
-/// Arguments of `doctor`.
-#[derive(Clone, Debug, Args)]
-pub struct DoctorArgs {
-    /// Duration of the ray-casting measurement; 0 for none
-    #[arg(long, value_name = "SECONDS", default_value_t = 10)]
-    pub measure: u64,
-}
-
-/// Configuration and machine.
-#[derive(Clone, Debug, Args)]
-pub struct ConfigArgs {
-    /// Configuration (.yml), or the input: a recording (odometry, build-map, localize), a point cloud (build-map), a result (refine, evaluate) or a trajectory (evaluate). Without it, the command's file under config/ or, if there is none, built-in values.
-    #[arg(value_name = "CONFIG | INPUT")]
-    pub config: Option<PathBuf>,
-
-    /// Override a key, such as range_image.width=1024; repeatable.
-    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
-    pub settings: Vec<(String, String)>,
-
-    /// Renderer and threads.
-    #[command(flatten)]
-    pub machine: MachineArgs,
-}
-
-/// Arguments of a stage.
-#[derive(Clone, Debug, Args)]
-pub struct RunArgs {
-    /// Configuration and machine.
-    #[command(flatten)]
-    pub source: ConfigArgs,
-
-    /// Seed of all random choices; overrides the key `seed` where it exists.
-    #[arg(long, value_name = "N")]
-    pub seed: Option<u64>,
-
-    /// Replace existing output; sets the key `force` where it exists.
-    #[arg(long)]
-    pub force: bool,
-}
-
-/// Arguments of `info`.
-#[derive(Clone, Debug, Args)]
-pub struct InfoArgs {
-    /// Recording (its folder, the folder of its scans, or a bag), scan or point cloud (.bin, .pcd, .ply, .npy), map (.ply), or result (.npz).
-    pub path: PathBuf,
-
-    /// Set the key topic, the topic of the scans in a bag with several: topic=/NAME.
-    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
-    pub settings: Vec<(String, String)>,
-}
-
-/// Arguments of `odometry`.
-#[derive(Clone, Debug, Args)]
-pub struct OdometryArgs {
-    /// Configuration and machine.
-    #[command(flatten)]
-    pub run: RunArgs,
-
-    /// Folder to write; sets the key `output_folder`.
-    #[arg(long, value_name = "FOLDER")]
-    pub output: Option<PathBuf>,
-
-    /// Poses to polish, rows of KITTI or TUM, or a topic of the bag; sets the key `pose_file`.
-    #[arg(long, value_name = "FILE")]
-    pub poses: Option<PathBuf>,
-
-    /// Calibration of the camera whose poses these are; sets the key `calib_file`.
-    #[arg(long, value_name = "FILE")]
-    pub calib: Option<PathBuf>,
-}
-
-/// Arguments of `build-map`.
-#[derive(Clone, Debug, Args)]
-pub struct BuildMapArgs {
-    /// Configuration and machine.
-    #[command(flatten)]
-    pub run: RunArgs,
-
-    /// Map to write; sets the key `mesh_file`.
-    #[arg(long, value_name = "MAP")]
-    pub output: Option<PathBuf>,
-
-    /// Poses of the recording, rows of KITTI or TUM, or a topic of the bag; by default those that it contains, else from the scans. Sets the key `pose_file`.
-    #[arg(long, value_name = "FILE")]
-    pub poses: Option<PathBuf>,
-
-    /// Calibration of the camera whose poses these are; sets the key `calib_file`.
-    #[arg(long, value_name = "FILE")]
-    pub calib: Option<PathBuf>,
-
-    /// Map to which the recording is added: it is localized there, and what has changed is replaced. Sets the key `onto`.
-    #[arg(long, value_name = "MAP")]
-    pub onto: Option<PathBuf>,
-
-    /// Find the poses, print one independent command per local map that is not finished, and exit.
-    #[arg(long, group = "part")]
-    pub list_jobs: bool,
-
-    /// Build one local map only, by its number.
-    #[arg(long, value_name = "NUMBER", group = "part")]
-    pub job: Option<usize>,
-
-    /// Join the local maps that jobs have built.
-    #[arg(long, group = "part")]
-    pub collect: bool,
-}
-
-/// A part of the work of `build-map`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum BuildPart {
-    /// Find the poses, and print a command per local map that is not finished.
-    List,
-    /// Build a local map by its number.
-    LocalMap(usize),
-    /// Join the finished local maps.
-    Collect,
-}
-
-/// Arguments of `localize`.
-#[derive(Clone, Debug, Args)]
-pub struct LocalizeArgs {
-    /// Configuration and machine.
-    #[command(flatten)]
-    pub run: RunArgs,
-
-    /// Map of `build-map` or range-mcl, or a mesh (.ply, .obj, .stl); sets the key `map_file`.
-    #[arg(long, value_name = "MAP")]
-    pub map: Option<PathBuf>,
-
-    /// Start in the map [m, deg], if it is known; sets the key `initial_pose`.
-    #[arg(long, value_name = "X,Y,HEADING", value_parser = start, allow_hyphen_values = true)]
-    pub start: Option<[f64; 3]>,
-
-    /// Odometry, rows of KITTI or TUM, or a topic of the bag; by default the topic of odometry that a bag has, else the scans. Sets the key `odometry_file`.
-    #[arg(long, value_name = "FILE")]
-    pub odometry: Option<PathBuf>,
-
-    /// True poses of the recording for the report; sets the key `pose_file`.
-    #[arg(long, value_name = "FILE")]
-    pub truth: Option<PathBuf>,
-
-    /// Calibration of the camera whose poses these are; sets the key `calib_file`.
-    #[arg(long, value_name = "FILE")]
-    pub calib: Option<PathBuf>,
-
-    /// Result to write (.npz); sets the key `result_path`.
-    #[arg(long, value_name = "RESULT")]
-    pub output: Option<PathBuf>,
-
-    /// Log to write afterwards, for Foxglove and rerun (.mcap), as `export` does.
-    #[arg(long, value_name = "FILE")]
-    pub mcap: Option<PathBuf>,
-}
-
-/// Arguments of `refine`.
-#[derive(Clone, Debug, Args)]
-pub struct RefineArgs {
-    /// Configuration and machine.
-    #[command(flatten)]
-    pub run: RunArgs,
-
-    /// Recording; by default that of the localization. Sets the key `scan_folder`.
-    #[arg(long, value_name = "RECORDING")]
-    pub recording: Option<PathBuf>,
-
-    /// Map; by default that of the localization. Sets the key `map_file`.
-    #[arg(long, value_name = "MAP")]
-    pub map: Option<PathBuf>,
-
-    /// Standard deviations of the poses of a trajectory [m, deg]; sets the key `uncertainty`.
-    #[arg(long, value_name = "POSITION,HEADING")]
-    pub uncertainty: Option<String>,
-
-    /// True poses of the recording for the report; sets the key `pose_file`.
-    #[arg(long, value_name = "FILE")]
-    pub truth: Option<PathBuf>,
-
-    /// Calibration of the camera whose poses these, and those of a trajectory, are; sets the key `calib_file`.
-    #[arg(long, value_name = "FILE")]
-    pub calib: Option<PathBuf>,
-
-    /// Result to write of a trajectory (.npz); sets the key `output_file`.
-    #[arg(long, value_name = "RESULT")]
-    pub output: Option<PathBuf>,
-}
-
-/// Arguments of `evaluate`.
-#[derive(Clone, Debug, Args)]
-pub struct EvaluateArgs {
-    /// Configuration and machine.
-    #[command(flatten)]
-    pub run: RunArgs,
-
-    /// True poses: rows of KITTI or TUM, a folder oxts, or a topic of the recording; by default those in the result. Sets the key `pose_file`.
-    #[arg(long, value_name = "FILE")]
-    pub truth: Option<PathBuf>,
-
-    /// Calibration of the camera whose poses the truth has; sets the key `calib_file`.
-    #[arg(long, value_name = "FILE")]
-    pub calib: Option<PathBuf>,
-
-    /// Recording whose poses are the truth; sets the key `scan_folder`.
-    #[arg(long, value_name = "RECORDING")]
-    pub recording: Option<PathBuf>,
-
-    /// Alignment with the truth; by default none for a result in a map, and first for a trajectory. Sets the key `alignment`.
-    #[arg(long, value_name = "ALIGNMENT", value_parser = ["none", "first", "rigid"])]
-    pub align: Option<String>,
-
-    /// Folder of the report; sets the key `output_folder`.
-    #[arg(long, value_name = "FOLDER")]
-    pub output: Option<PathBuf>,
-}
-
-/// Arguments of `export`.
-#[derive(Clone, Debug, Args)]
-#[command(group = clap::ArgGroup::new("format").required(true).multiple(true))]
-pub struct ExportArgs {
-    /// Result of `localize` or `refine` (.npz), or a map (.ply, .obj, .stl).
-    pub input: PathBuf,
-
-    /// Log to write: poses with covariances, states, particles, scans in the map frame, the map (.mcap).
-    #[arg(long, value_name = "FILE", group = "format")]
-    pub mcap: Option<PathBuf>,
-
-    /// Model to write: the map, and the path of a result colored by its error (.glb).
-    #[arg(long, value_name = "FILE", group = "format")]
-    pub glb: Option<PathBuf>,
-
-    /// Folder to write the map to as point cloud tiles, for Autoware: `pointcloud_map.pcd/` and
-    /// `pointcloud_map_metadata.yaml`.
-    #[arg(long, value_name = "FOLDER", group = "format")]
-    pub pcd: Option<PathBuf>,
-
-    /// Spacing of the points of tiles: one point per square of the surface [m].
-    #[arg(long, value_name = "M", requires = "pcd", value_parser = spacing, default_value_t = Self::SPACING_M)]
-    pub spacing: f64,
-
-    /// Side of tiles [m].
-    #[arg(long, value_name = "M", requires = "pcd", value_parser = clap::value_parser!(u16).range(1..=1000), default_value_t = Self::TILE_SIZE_M)]
-    pub tile_size: u16,
-
-    /// Recording of the result; by default that of its localization.
-    #[arg(long, value_name = "RECORDING")]
-    pub recording: Option<PathBuf>,
-
-    /// Map of the result; by default that of its localization.
-    #[arg(long, value_name = "MAP")]
-    pub map: Option<PathBuf>,
-
-    /// Largest number of points per scan in a log; 0 for a log without scans.
-    #[arg(long, value_name = "N", default_value_t = Self::POINTS)]
-    pub points: usize,
-
-    /// Largest memory that a stage may plan for; by default half of the machine's.
-    #[arg(long, value_name = "GIB", value_parser = gibibytes)]
-    pub memory: Option<f64>,
-
-    /// Replace existing files.
-    #[arg(long)]
-    pub force: bool,
-}
-
-/// Arguments of `demo`.
-#[derive(Clone, Debug, Args)]
-pub struct DemoArgs {
-    /// Output folder.
-    #[arg(long, value_name = "FOLDER", default_value = "results/demo")]
-    pub output: PathBuf,
-
-    /// Scans per drive; 160 by default.
-    #[arg(long, value_name = "N")]
-    pub frames: Option<NonZeroUsize>,
-
-    /// Seed of all random choices.
-    #[arg(long, value_name = "N")]
-    pub seed: Option<u64>,
-
-    /// Renderer and threads.
-    #[command(flatten)]
-    pub machine: MachineArgs,
-}
-
-/// Arguments of `compare`.
-#[derive(Clone, Debug, Args)]
-pub struct CompareArgs {
-    /// Configuration and machine.
-    #[command(flatten)]
-    pub source: ConfigArgs,
-
-    /// Print one independent command per run and exit.
-    #[arg(long, group = "part")]
-    pub list_jobs: bool,
-
-    /// Build sequences and maps only, before runs are distributed.
-    #[arg(long, group = "part")]
-    pub prepare: bool,
-
-    /// Execute one run only: SEQUENCE/CONFIGURATION/SEED.
-    #[arg(long, value_name = "RUN", group = "part")]
-    pub job: Option<RunId>,
-
-    /// Write tables and pages of the finished runs only.
-    #[arg(long, group = "part")]
-    pub collect: bool,
-}
-
-/// Arguments of `ground`.
-#[derive(Clone, Debug, Args)]
-pub struct GroundArgs {
-    /// Scan (.bin, .pcd, .ply, .npy), recording (its folder, the folder of its scans, or a bag), or configuration
-    /// (.yml); by default the configuration's scan_folder.
-    pub input: Option<PathBuf>,
-
-    /// Explain the decision at the point nearest to X Y Z in the lidar frame [m]; needs one scan.
-    #[arg(
-        long,
-        value_names = ["X", "Y", "Z"],
-        num_args = 3,
-        allow_negative_numbers = true,
-        requires = "input"
-    )]
-    pub explain: Option<Vec<f32>>,
-
-    /// Compare the methods on simulated slopes, crests, kerbs and drives with exact labels.
-    #[arg(long, conflicts_with = "explain")]
-    pub simulated: bool,
-
-    /// YAML file; by default config/ground.yml or, without one, built-in values.
-    #[arg(long, value_name = "FILE")]
-    pub config: Option<PathBuf>,
-
-    /// Override a key, such as ground_method=pca; repeatable.
-    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
-    pub settings: Vec<(String, String)>,
-
-    /// Replace existing output; sets the key `force`.
-    #[arg(long)]
-    pub force: bool,
-
-    /// Renderer and threads.
-    #[command(flatten)]
-    pub machine: MachineArgs,
-}
-
-/// Renderer and threads; results do not depend on the number of threads.
-#[derive(Clone, Copy, Debug, Default, Args)]
-pub struct MachineArgs {
-    /// Renderer of the map.
-    #[arg(long, value_enum, default_value_t)]
-    pub backend: BackendArg,
-
-    /// Number of threads; by default one per processor.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
-    pub threads: Option<u16>,
-
-    /// Largest memory that a stage may plan for; by default half of the machine's.
-    #[arg(long, value_name = "GIB", value_parser = gibibytes)]
-    pub memory: Option<f64>,
-}
-
-/// Renderer of the map.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub enum BackendArg {
-    /// The graphics adapter if available, else the processor.
-    #[default]
-    Auto,
-    /// The processor.
-    Cpu,
-    /// The graphics adapter; an error without one.
-    Gpu,
-}
-
-impl From<BackendArg> for Backend {
-    fn from(argument: BackendArg) -> Self {
-        match argument {
-            BackendArg::Auto => Self::Auto,
-            BackendArg::Cpu => Self::Cpu,
-            BackendArg::Gpu => Self::Gpu,
-        }
-    }
-}
-
 impl Cli {
     /// Form of what is printed on standard output.
     pub fn form(&self) -> Form {
-        match (self.json, self.all) {
-            (true, _) => Form::Json,
-            (false, true) => Form::All,
-            (false, false) => Form::Main,
+        if self.json {
+            Form::Json
+        } else if self.all {
+            Form::All
+        } else {
+            Form::Main
         }
-    }
-
-    /// The completions of a shell.
-    pub fn completions(shell: clap_complete::Shell) -> Vec<u8> {
-        let mut text = Vec::new();
-        clap_complete::generate(shell, &mut Self::command(), "fpmcl", &mut text);
-        text
-    }
-
-    /// The manual page of the program or of one of its commands, in roff; `None` if there is no such command.
-    pub fn manual(command: Option<&str>) -> Option<std::io::Result<Vec<u8>>> {
-        let mut program = Self::command();
-        program.build();
-        let page = match command {
-            None => program,
-            Some(name) => program.find_subcommand(name)?.clone(),
-        };
-        let mut text = Vec::new();
-        let rendered = clap_mangen::Man::new(page).render(&mut text);
-        Some(rendered.map(|()| text))
     }
 
     /// Least important messages on standard error.
     pub fn level(&self) -> LevelFilter {
-        match (self.quiet, self.verbose) {
-            (true, _) => LevelFilter::WARN,
-            (false, 0) => LevelFilter::INFO,
-            (false, 1) => LevelFilter::DEBUG,
-            (false, _) => LevelFilter::TRACE,
+        match self.verbose {
+            _ if self.quiet => LevelFilter::WARN,
+            0 => LevelFilter::INFO,
+            1 => LevelFilter::DEBUG,
+            _ => LevelFilter::TRACE,
         }
     }
 }
@@ -633,228 +249,143 @@ impl Command {
     /// Renderer and threads of this command.
     pub fn machine(&self) -> MachineArgs {
         match self {
-            Self::Odometry(args) => args.run.source.machine,
-            Self::BuildMap(args) => args.run.source.machine,
-            Self::Localize(args) => args.run.source.machine,
-            Self::Refine(args) => args.run.source.machine,
-            Self::Evaluate(args) => args.run.source.machine,
-            Self::Simulate(args) => args.source.machine,
+            Self::Odometry(OdometryArgs { run, .. })
+            | Self::BuildMap(BuildMapArgs { run, .. })
+            | Self::Localize(LocalizeArgs { run, .. })
+            | Self::Refine(RefineArgs { run, .. })
+            | Self::Evaluate(EvaluateArgs { run, .. })
+            | Self::Simulate(run) => run.source.machine,
             Self::Compare(args) => args.source.machine,
             Self::Demo(args) => args.machine,
             Self::Ground(args) => args.machine,
-            Self::Export(args) => MachineArgs {
-                memory: args.memory,
-                ..MachineArgs::default()
-            },
-            Self::Completions(_)
-            | Self::Config(_)
-            | Self::Doctor(_)
-            | Self::Info(_)
-            | Self::Man(_) => MachineArgs::default(),
+            Self::Export(args) => args.machine(),
+            _ => MachineArgs::default(),
+        }
+    }
+
+    /// Runs the command; returns what to print.
+    pub fn run(&self, context: &Context) -> anyhow::Result<Printed> {
+        match self {
+            Self::Info(args) => info::run(args),
+            Self::BuildMap(args) => {
+                let (source, base) = (&args.run.source, BuildMapConfig::default);
+                let (config, context) = configured(args, source, args.input_key(), base, context)?;
+                match args.part() {
+                    Some(part) => build_map::run_part(&config, part, &context),
+                    None => build_map::run(&config, &context)?.printed(),
+                }
+            }
+            Self::Odometry(args) => {
+                let (source, base) = (&args.run.source, OdometryCommandConfig::default);
+                let (config, context) = configured(args, source, "scan_folder", base, context)?;
+                odometry::run(&config, &context)
+            }
+            Self::Localize(args) => {
+                let (source, base) = (&args.run.source, LocalizationConfig::default);
+                let (config, context) = configured(args, source, "scan_folder", base, context)?;
+                let (result, map) = (&config.result_path, &config.map_file);
+                let log = args.mcap.as_ref();
+                let log = log.map(|path| ExportArgs::log_of(result, map, path, config.force));
+                if let Some(log) = &log {
+                    export::check(log, &context)?;
+                }
+                let report = localize::run(&config, &context)?;
+                if let Some(log) = &log {
+                    export::run(log, &context)?;
+                }
+                printed(&report)
+            }
+            Self::Refine(args) => {
+                let base = || refine::base_config(args.run.source.input());
+                let source = &args.run.source;
+                let (config, context) = configured(args, source, "result_file", base, context)?;
+                printed(&refine::run(&config, &context)?)
+            }
+            Self::Evaluate(args) => {
+                let (source, base) = (&args.run.source, EvaluationConfig::default);
+                let (config, context) = configured(args, source, "result_file", base, context)?;
+                printed(&evaluate::run(&config, &context)?)
+            }
+            Self::Export(args) => export::run(args, context),
+            Self::Simulate(args) => {
+                let settings = with_flags::<SimulationConfig>(args, &args.source, "")?;
+                let path = args.source.config.as_deref();
+                let config: SimulationConfig = settings::load(path, &settings)?;
+                let context = context.with_config_file(path, SimulationConfig::PATH);
+                let existing = if args.force {
+                    simulate::Existing::Replace
+                } else {
+                    simulate::Existing::Keep
+                };
+                simulate::run(&config, existing, &context)
+            }
+            Self::Compare(args) => Ok(Printed::text(compare::run(args, context)?)),
+            Self::Demo(args) => demo::run(args, context),
+            Self::Ground(args) => ground::run(args, context),
+            Self::Config(args) => args.run(),
+            Self::Doctor(args) => doctor::run(args, context),
+            Self::Completions(args) => {
+                let mut text = Vec::new();
+                clap_complete::generate(args.shell, &mut Cli::command(), "fpmcl", &mut text);
+                Ok(Printed::text(String::from_utf8(text)?))
+            }
+            Self::Man(args) => args.run(),
         }
     }
 }
 
-impl ConfigArgs {
-    /// The configuration file.
-    pub fn config_file(&self) -> Option<&Path> {
-        self.config.as_deref().filter(|path| is_config(path))
-    }
-
-    /// What the command works on, where the argument is no configuration.
-    pub fn input(&self) -> Option<&Path> {
-        self.config.as_deref().filter(|path| !is_config(path))
-    }
-}
-
-/// Whether a path is that of a configuration.
-fn is_config(path: &Path) -> bool {
-    let extension = path.extension();
-    extension.is_some_and(|it| it.eq_ignore_ascii_case("yml") || it.eq_ignore_ascii_case("yaml"))
-}
-
-impl RunArgs {
-    /// Settings of the flags that stand for a key.
-    pub fn flags(&self) -> Vec<(String, String)> {
-        let seed = self.seed.map(|seed| ("seed".to_owned(), seed.to_string()));
-        let force = self.force.then(|| ("force".to_owned(), "true".to_owned()));
-        seed.into_iter().chain(force).collect()
-    }
-}
-
-impl OdometryArgs {
-    /// Settings of the flags that stand for a key.
-    pub fn flags(&self) -> Vec<(String, String)> {
-        let paths = [
-            ("scan_folder", self.run.source.input()),
-            ("output_folder", self.output.as_deref()),
-            ("pose_file", self.poses.as_deref()),
-            ("calib_file", self.calib.as_deref()),
-        ];
-        [path_settings(&paths), self.run.flags()].concat()
-    }
-}
-
-impl BuildMapArgs {
-    /// The part of the work that is asked for; `None` for all of it.
-    pub fn part(&self) -> Option<BuildPart> {
-        match self.job {
-            Some(number) => Some(BuildPart::LocalMap(number)),
-            None if self.list_jobs => Some(BuildPart::List),
-            None => self.collect.then_some(BuildPart::Collect),
+impl ManArgs {
+    /// The manual page of the program or of one of its commands, in roff.
+    fn run(&self) -> anyhow::Result<Printed> {
+        let mut page = Cli::command();
+        page.build();
+        if let Some(name) = &self.command {
+            let command = page.find_subcommand(name).cloned();
+            page = command
+                .with_context(|| format!("there is no command {name}; fpmcl --help lists all"))?;
         }
-    }
-
-    /// Settings of the flags that stand for a key.
-    pub fn flags(&self) -> Vec<(String, String)> {
-        let input = self.run.source.input();
-        let is_cloud = input.is_some_and(|path| path.is_file() && scan_files::is_scan(path));
-        let input_key = if is_cloud {
-            "cloud_file"
-        } else {
-            "scan_folder"
-        };
-        let paths = [
-            (input_key, input),
-            ("mesh_file", self.output.as_deref()),
-            ("pose_file", self.poses.as_deref()),
-            ("calib_file", self.calib.as_deref()),
-            ("onto", self.onto.as_deref()),
-        ];
-        [path_settings(&paths), self.run.flags()].concat()
+        let mut text = Vec::new();
+        clap_mangen::Man::new(page).render(&mut text)?;
+        Ok(Printed::text(String::from_utf8(text)?))
     }
 }
 
-impl LocalizeArgs {
-    /// Settings of the flags that stand for a key.
-    pub fn flags(&self) -> Vec<(String, String)> {
-        let paths = [
-            ("scan_folder", self.run.source.input()),
-            ("map_file", self.map.as_deref()),
-            ("odometry_file", self.odometry.as_deref()),
-            ("pose_file", self.truth.as_deref()),
-            ("calib_file", self.calib.as_deref()),
-            ("result_path", self.output.as_deref()),
-        ];
-        let start = (self.start).map(|start| ("initial_pose".to_owned(), format!("{start:?}")));
-        let mut settings = path_settings(&paths);
-        settings.extend(start);
-        [settings, self.run.flags()].concat()
-    }
-}
-
-impl RefineArgs {
-    /// Settings of the flags that stand for a key.
-    pub fn flags(&self) -> Vec<(String, String)> {
-        let paths = [
-            ("result_file", self.run.source.input()),
-            ("scan_folder", self.recording.as_deref()),
-            ("map_file", self.map.as_deref()),
-            ("pose_file", self.truth.as_deref()),
-            ("calib_file", self.calib.as_deref()),
-            ("output_file", self.output.as_deref()),
-        ];
-        let mut settings = path_settings(&paths);
-        let uncertainty = self.uncertainty.as_ref();
-        settings.extend(uncertainty.map(|given| ("uncertainty".to_owned(), format!("[{given}]"))));
-        [settings, self.run.flags()].concat()
-    }
-}
-
-impl ExportArgs {
-    /// Default of `points`.
-    const POINTS: usize = 30_000;
-    /// Default of `spacing` [m].
-    const SPACING_M: f64 = 0.2;
-    /// Default of `tile_size` [m]: that of Autoware.
-    const TILE_SIZE_M: u16 = 20;
-
-    /// A log of a result in a map.
-    pub fn log_of(result: &Path, map: &Path, log: &Path, force: bool) -> Self {
-        Self {
-            input: result.to_owned(),
-            mcap: Some(log.to_owned()),
-            glb: None,
-            pcd: None,
-            spacing: Self::SPACING_M,
-            tile_size: Self::TILE_SIZE_M,
-            recording: None,
-            map: Some(map.to_owned()),
-            points: Self::POINTS,
-            memory: None,
-            force,
+impl ConfigurationArgs {
+    /// The configuration file of a command: the keys that people change, or all of them; in JSON, the defaults.
+    fn run(&self) -> anyhow::Result<Printed> {
+        fn text<T: CommandConfig + Default + Serialize>(full: bool) -> anyhow::Result<Printed> {
+            Printed::text(if full { T::FULL } else { T::SHORT }).with_json(&T::default())
+        }
+        match self.command {
+            ConfiguredCommand::BuildMap => text::<BuildMapConfig>(self.full),
+            ConfiguredCommand::Odometry => text::<OdometryCommandConfig>(self.full),
+            ConfiguredCommand::Localize => text::<LocalizationConfig>(self.full),
+            ConfiguredCommand::Refine => text::<RefinementConfig>(self.full),
+            ConfiguredCommand::Evaluate => text::<EvaluationConfig>(self.full),
+            ConfiguredCommand::Compare => text::<ComparisonConfig>(self.full),
+            ConfiguredCommand::Simulate => text::<SimulationConfig>(self.full),
+            ConfiguredCommand::Ground => text::<GroundCommandConfig>(self.full),
         }
     }
 }
 
-impl EvaluateArgs {
-    /// Settings of the flags that stand for a key.
-    pub fn flags(&self) -> Vec<(String, String)> {
-        let paths = [
-            ("result_file", self.run.source.input()),
-            ("pose_file", self.truth.as_deref()),
-            ("calib_file", self.calib.as_deref()),
-            ("scan_folder", self.recording.as_deref()),
-            ("output_folder", self.output.as_deref()),
-        ];
-        let mut settings = path_settings(&paths);
-        settings.extend((self.align.clone()).map(|align| ("alignment".to_owned(), align)));
-        [settings, self.run.flags()].concat()
-    }
-}
-
-/// Settings of keys whose values are paths, as YAML strings in single quotes.
-fn path_settings(paths: &[(&str, Option<&Path>)]) -> Vec<(String, String)> {
-    let quoted = |path: &Path| format!("'{}'", path.display().to_string().replace('\'', "''"));
-    let given = paths
-        .iter()
-        .filter_map(|(key, path)| Some((*key, (*path)?)));
-    given
-        .map(|(key, path)| (key.to_owned(), quoted(path)))
-        .collect()
-}
-
-/// Parses a start: x, y [m], heading [deg].
-fn start(text: &str) -> Result<[f64; 3], &'static str> {
-    let numbers = text.split(',').map(|number| number.trim().parse::<f64>());
-    let numbers: Result<Vec<f64>, _> = numbers.collect();
-    let finite = numbers
-        .ok()
-        .filter(|n| n.iter().all(|number| number.is_finite()));
-    finite
-        .and_then(|numbers| numbers.try_into().ok())
-        .ok_or("give x and y in the map in metres and the heading in degrees, such as 12.5,-3,90")
-}
-
-/// Parses a positive number of gibibytes.
-fn gibibytes(text: &str) -> Result<f64, &'static str> {
-    match text.parse::<f64>() {
-        Ok(number) if (0.01..=1e6).contains(&number) => Ok(number),
-        _ => Err("give a number from 0.01 to 1000000, such as 8"),
-    }
-}
-
-/// Parses a spacing of points [m].
-fn spacing(text: &str) -> Result<f64, &'static str> {
-    match text.parse::<f64>() {
-        Ok(number) if (0.001..=100.0).contains(&number) => Ok(number),
-        _ => Err("give a number from 0.001 to 100, such as 0.2"),
-    }
-}
-
-/// Splits `key=value` at the first `=`.
-fn setting(text: &str) -> Result<(String, String), &'static str> {
-    match text.split_once('=') {
-        Some((key, value)) if !key.trim().is_empty() => {
-            Ok((key.trim().to_owned(), value.to_owned()))
-        }
-        _ => Err("write it as key=value, such as range_image.width=1024"),
-    }
+fn printed(report: &Report) -> anyhow::Result<Printed> {
+    Printed::parts(report.to_text(false), report.to_text(true)).with_json(report)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// The settings of a command line of `localize`.
+    fn settings<T: CommandConfig>(arguments: &[&str]) -> Vec<(String, String)> {
+        let Command::Localize(args) =
+            Cli::parse_from(["fpmcl", "localize"].iter().chain(arguments)).command
+        else {
+            unreachable!("the command is localize")
+        };
+        with_flags::<T>(&args, &args.run.source, "scan_folder").unwrap()
+    }
 
     #[test]
     fn the_definition_is_consistent() {
@@ -862,44 +393,35 @@ mod tests {
     }
 
     #[test]
-    fn flags_are_settings_of_their_keys() {
-        let arguments = ["fpmcl", "localize", "--seed", "7", "--force"];
-        let Command::Localize(args) = Cli::parse_from(arguments).command else {
-            unreachable!("the command is localize")
-        };
-        let expected = [("seed", "7"), ("force", "true")];
-        assert_eq!(
-            args.flags(),
-            expected.map(|(key, value)| (key.to_owned(), value.to_owned()))
-        );
-    }
-
-    #[test]
-    fn a_recording_and_a_start_are_settings_of_their_keys() {
+    fn a_recording_and_flags_are_settings_of_their_keys() {
         let arguments = [
-            "fpmcl", "localize", "it's/", "--map", "m.ply", "--start", "-1,2,90",
+            "it's/", "--map", "m.ply", "--start", "-1,2,90", "--seed", "7",
         ];
-        let Command::Localize(args) = Cli::parse_from(arguments).command else {
-            unreachable!("the command is localize")
-        };
         let expected = [
-            ("scan_folder", "'it''s/'"),
-            ("map_file", "'m.ply'"),
-            ("initial_pose", "[-1.0, 2.0, 90.0]"),
+            ("initial_pose", "[-1.0,2.0,90.0]"),
+            ("map_file", "\"m.ply\""),
+            ("scan_folder", "\"it's/\""),
+            ("seed", "7"),
         ];
         assert_eq!(
-            args.flags(),
+            settings::<LocalizationConfig>(&arguments),
             expected.map(|(key, value)| (key.to_owned(), value.to_owned()))
         );
-        assert_eq!(args.run.source.config_file(), None);
-        assert!(start("1,2").is_err() && start("1,2,inf").is_err());
+        let wrong = |start: &str| Cli::try_parse_from(["fpmcl", "localize", "--start", start]);
+        assert!(wrong("1,2").is_err() && wrong("1,2,inf").is_err());
     }
 
     #[test]
-    fn a_setting_is_split_at_its_first_equals_sign() {
-        assert_eq!(setting("a.b=c=d"), Ok(("a.b".into(), "c=d".into())));
-        assert_eq!(setting("a="), Ok(("a".into(), String::new())));
-        assert!(setting("a").is_err());
-        assert!(setting("=a").is_err());
+    fn flags_override_settings_and_are_ignored_by_a_configuration_without_their_keys() {
+        let loaded = |arguments: &[&str]| -> LocalizationConfig {
+            let settings = settings::<LocalizationConfig>(arguments);
+            settings::with_settings(LocalizationConfig::default(), &settings).unwrap()
+        };
+        let arguments = ["own.yml", "--seed", "7", "--set", "n_scans=5", "--force"];
+        let config = loaded(&arguments);
+        assert_eq!((config.seed, config.n_scans, config.force), (7, 5, true));
+        assert_eq!(loaded(&["--seed", "7", "--set", "seed=3"]).seed, 7);
+        let evaluation = settings::<EvaluationConfig>(&arguments);
+        assert!(!evaluation.iter().any(|(key, _)| key == "seed"));
     }
 }

@@ -1,18 +1,24 @@
 //! The program around the library: command line, configuration files, comparison, plots, reports.
 
-pub mod cli;
-pub mod commands;
-pub mod comparison;
-pub mod report;
-pub mod run;
+// Configuration.
 pub mod settings;
+// A run and its surroundings.
+pub mod run;
+// What a run leaves behind.
+pub mod report;
+// The commands.
+pub mod commands;
+// Many runs.
+pub mod comparison;
+// The command line.
+pub mod cli;
 
 use std::ffi::OsString;
 
 use clap::Parser as _;
 
 use cli::Cli;
-use run::Context;
+use run::{Context, failure, output};
 
 /// The program: parses a command line, whose first argument is the name of the program, starts logging, runs the
 /// command, and reports its error; returns the exit code. Wrong usage and requests for help end the process.
@@ -20,13 +26,13 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     let cli = Cli::parse_from(arguments);
     let run = || {
         let context = Context::new(cli.level(), cli.command.machine())?;
-        commands::run(&cli.command, cli.form(), &context)
+        output::print(&cli.command.run(&context)?.in_form(cli.form()))
     };
     match run() {
         Ok(()) => 0,
         Err(error) => {
-            commands::report(&error);
-            commands::exit_code(&error)
+            failure::report(&error);
+            failure::exit_code(&error)
         }
     }
 }

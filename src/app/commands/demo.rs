@@ -1,17 +1,39 @@
 //! `demo`: simulation, map, localization and refinement in one command.
 
-use std::path::Path;
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context as _, Result};
+use clap::Args;
 
 use super::simulate::{self, Existing};
 use super::{build_map, localize, refine};
-use crate::app::cli::DemoArgs;
 use crate::app::run::Context;
+use crate::app::run::machine::MachineArgs;
 use crate::app::run::output::{Form, Printed};
 use crate::app::settings::{BuildMapConfig, LocalizationConfig, OdometrySource, RefinementConfig};
 use crate::simulation::SimulationConfig;
+
+/// Arguments of `demo`.
+#[derive(Clone, Debug, Args)]
+pub struct DemoArgs {
+    /// Output folder.
+    #[arg(long, value_name = "FOLDER", default_value = "results/demo")]
+    pub output: PathBuf,
+
+    /// Scans per drive; 160 by default.
+    #[arg(long, value_name = "N")]
+    pub frames: Option<NonZeroUsize>,
+
+    /// Seed of all random choices.
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+
+    /// Renderer and threads.
+    #[command(flatten)]
+    pub machine: MachineArgs,
+}
 
 /// Default number of frames per drive.
 const FRAMES: usize = 160;

@@ -7,9 +7,9 @@ use std::thread::available_parallelism;
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
+use clap::Args;
 use nalgebra::Vector3;
 
-use crate::app::cli::DoctorArgs;
 use crate::app::run::output::Printed;
 use crate::app::run::{Context, version};
 use crate::geometry::{Pose3, TriangleMesh};
@@ -23,6 +23,14 @@ use crate::rendering::{
 };
 use crate::simulation::{Simulation, SimulationConfig};
 
+/// Arguments of `doctor`.
+#[derive(Clone, Debug, Args)]
+pub struct DoctorArgs {
+    /// Duration of the ray-casting measurement; 0 for none
+    #[arg(long, value_name = "SECONDS", default_value_t = 10)]
+    pub measure: u64,
+}
+
 /// Number of images that are compared at once.
 const IMAGES: usize = 8;
 /// Number of particles that are compared at once, and of beams of each, as while a search converges.
@@ -33,7 +41,7 @@ const BEAMS: usize = 600;
 type Row = (&'static str, String);
 
 /// The properties of this machine, one per line.
-pub(super) fn run(args: &DoctorArgs, context: &Context) -> Result<Printed> {
+pub fn run(args: &DoctorArgs, context: &Context) -> Result<Printed> {
     let choice = selection::choose(Backend::Auto, RenderingMethod::Auto)?;
     let processors = available_parallelism().map_or("unknown".to_owned(), |n| n.to_string());
     let graphics = if cfg!(feature = "gpu") {

@@ -1,13 +1,14 @@
 //! `export`: a result or a map in the formats of other programs.
 
+mod arguments;
 mod tiles;
 
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
 
+pub use self::arguments::ExportArgs;
 use super::refine;
-use crate::app::cli::ExportArgs;
 use crate::app::report::export::tiles::TILES_FOLDER;
 use crate::app::report::export::{Model, Ribbon, RunLog, write_mcap};
 use crate::app::report::plotting::color::{Colormap, TRUTH};

@@ -1,14 +1,15 @@
 //! `info`: what a recording, a scan, a map or a result contains, and what is missing for which command.
 
 use std::fmt::Write as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail, ensure};
+use clap::Args;
 use serde::{Deserialize, Serialize};
 
 use super::stages::{self, is_bag, sample};
-use crate::app::cli::InfoArgs;
 use crate::app::report::results::{LocalizationResults, RunSummary};
+use crate::app::run::arguments::setting;
 use crate::app::run::output::Printed;
 use crate::app::settings;
 use crate::evaluation::RangeMclRules;
@@ -18,6 +19,17 @@ use crate::map::files::ply;
 use crate::recording::{PoseTrack, Recording, Selection, scan_files};
 use crate::sensor::{self, BeamSource, SensorDescription};
 use crate::validation::{InvalidValue, Validate};
+
+/// Arguments of `info`.
+#[derive(Clone, Debug, Args)]
+pub struct InfoArgs {
+    /// Recording (its folder, the folder of its scans, or a bag), scan or point cloud (.bin, .pcd, .ply, .npy), map (.ply), or result (.npz).
+    pub path: PathBuf,
+
+    /// Set the key topic, the topic of the scans in a bag with several: topic=/NAME.
+    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
+    pub settings: Vec<(String, String)>,
+}
 
 /// Keys of `info`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]

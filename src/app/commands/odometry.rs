@@ -1,8 +1,9 @@
 //! `odometry`: poses of a recording from its scans, with loops closed and all poses adjusted.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use clap::Args;
 use serde::Serialize;
 
 use super::stages::SensorKeys;
@@ -11,6 +12,7 @@ use crate::app::report::plotting::PathPlot;
 use crate::app::report::plotting::color::{ODOMETRY, REFINED};
 use crate::app::report::results::write_trajectory_npz;
 use crate::app::report::run_output::{self, RunFiles};
+use crate::app::run::arguments::RunArgs;
 use crate::app::run::claims::{Claims, Outputs};
 use crate::app::run::output::Printed;
 use crate::app::run::{Context, output};
@@ -22,6 +24,30 @@ use crate::recording::poses::write_tum;
 use crate::recording::{Frame, Recording};
 use crate::sensor::RangeImageConfig;
 use crate::sensor::SensorDescription;
+
+/// Arguments of `odometry`.
+#[derive(Clone, Debug, Args, Serialize)]
+pub struct OdometryArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub run: RunArgs,
+
+    /// Folder to write; sets the key `output_folder`.
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(rename = "output_folder")]
+    pub output: Option<PathBuf>,
+
+    /// Poses to polish, rows of KITTI or TUM, or a topic of the bag; sets the key `pose_file`.
+    #[arg(long, value_name = "FILE")]
+    #[serde(rename = "pose_file")]
+    pub poses: Option<PathBuf>,
+
+    /// Calibration of the camera whose poses these are; sets the key `calib_file`.
+    #[arg(long, value_name = "FILE")]
+    #[serde(rename = "calib_file")]
+    pub calib: Option<PathBuf>,
+}
 
 /// Report of a run.
 #[derive(Debug, Serialize)]

@@ -5,12 +5,15 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Result, ensure};
+use clap::Args;
+use serde::Serialize;
 
 use super::motion_source;
 use super::motion_source::MotionSource;
 use crate::app::report::results::{LocalizationResults, Report};
 use crate::app::report::run_output::{self, REFINEMENT_FILES, REPORT_FILES, RunFiles};
 use crate::app::report::run_page;
+use crate::app::run::arguments::{RunArgs, numbers};
 use crate::app::run::claims::{Claims, NPZ, Outputs};
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::{Context, input, output};
@@ -29,6 +32,52 @@ use crate::refinement::{
     InitialEstimate, RefinedTrajectory, RefinerConfig, SmoothingConfig, TrajectoryRefiner,
 };
 use crate::statistics::median;
+
+/// Arguments of `refine`.
+#[derive(Clone, Debug, Args, Serialize)]
+pub struct RefineArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub run: RunArgs,
+
+    /// Recording; by default that of the localization. Sets the key `scan_folder`.
+    #[arg(long, value_name = "RECORDING")]
+    #[serde(rename = "scan_folder")]
+    pub recording: Option<PathBuf>,
+
+    /// Map; by default that of the localization. Sets the key `map_file`.
+    #[arg(long, value_name = "MAP")]
+    #[serde(rename = "map_file")]
+    pub map: Option<PathBuf>,
+
+    /// Standard deviations of the poses of a trajectory [m, deg]; sets the key `uncertainty`.
+    #[arg(long, value_name = "POSITION,HEADING", value_parser = uncertainty)]
+    pub uncertainty: Option<[f64; 2]>,
+
+    /// True poses of the recording for the report; sets the key `pose_file`.
+    #[arg(long, value_name = "FILE")]
+    #[serde(rename = "pose_file")]
+    pub truth: Option<PathBuf>,
+
+    /// Calibration of the camera whose poses these, and those of a trajectory, are; sets the key `calib_file`.
+    #[arg(long, value_name = "FILE")]
+    #[serde(rename = "calib_file")]
+    pub calib: Option<PathBuf>,
+
+    /// Result to write of a trajectory (.npz); sets the key `output_file`.
+    #[arg(long, value_name = "RESULT")]
+    #[serde(rename = "output_file")]
+    pub output: Option<PathBuf>,
+}
+
+/// Parses the standard deviations of a position [m] and a heading [deg].
+fn uncertainty(text: &str) -> Result<[f64; 2], &'static str> {
+    numbers(
+        text,
+        "give those of the position in metres and of the heading in degrees, such as 2,15",
+    )
+}
 
 /// Random stream of the noise on the odometry; the refiner has its own streams.
 const ODOMETRY_STREAM: u64 = u64::MAX;

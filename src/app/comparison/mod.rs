@@ -45,6 +45,8 @@
 //!
 //! Relative pose errors and KITTI's segment errors: [`pose_error`](crate::evaluation::pose_error).
 
+// The command.
+pub mod compare;
 // Runs and their execution.
 mod cache;
 mod execute;

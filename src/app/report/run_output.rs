@@ -7,7 +7,6 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail};
 
-use crate::app::commands::trajectory::stamped;
 use crate::app::report::results::{
     LocalizationResults, Report, RunSummary, TrajectoryReport, write_frames_csv, write_poses_npy,
 };
@@ -129,7 +128,8 @@ pub fn write_trajectory(
     recording: &Recording,
     map_from_lidar: &[Pose3],
 ) -> Result<()> {
-    let trajectory = stamped(&recording.frames, map_from_lidar);
+    let frames = recording.frames.iter().zip(map_from_lidar);
+    let trajectory: Vec<_> = frames.map(|(frame, &pose)| frame.stamped(pose)).collect();
     let (world_from_map, calibration) = recording.world();
     output::write_file(&files.file(&format!("{name}_tum.txt")), |file| {
         write_tum(file, &trajectory)

@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use tracing::level_filters::LevelFilter;
 
-use crate::app::cli::MachineArgs;
 use crate::app::run::claims::CONFIGURATION_FILE;
 use crate::app::run::interrupt::Interrupt;
 use crate::app::run::logging::{self, RunLog};
+use crate::app::run::machine::MachineArgs;
 use crate::app::run::progress::Progress;
 use crate::memory;
 use crate::rendering::Backend;

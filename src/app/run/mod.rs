@@ -1,10 +1,13 @@
 //! A run of a command: what it was called with, its progress, log, interruption and outputs.
 
+pub mod arguments;
 pub mod claims;
 mod context;
+pub mod failure;
 pub mod input;
 pub mod interrupt;
 pub mod logging;
+pub mod machine;
 pub mod output;
 pub mod progress;
 pub mod version;

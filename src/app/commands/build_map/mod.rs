@@ -1,5 +1,6 @@
 //! `build-map`: builds a triangle-mesh map from scans, whose poses are given or found first.
 
+mod arguments;
 mod clock;
 mod cloud;
 mod files;
@@ -20,6 +21,7 @@ use std::time::Instant;
 
 use anyhow::{Result, ensure};
 
+pub use self::arguments::{BuildMapArgs, BuildPart};
 use self::clock::StageClock;
 use self::files::write_map;
 use self::onto::ChangesReport;
@@ -27,7 +29,6 @@ use self::opened::open;
 pub use self::parts::hash_of_scan;
 use self::parts::{Joined, Role};
 pub use self::report::BuildReport;
-use crate::app::cli::BuildPart;
 use crate::app::run::output::Printed;
 use crate::app::run::{Context, output};
 use crate::app::settings::BuildMapConfig;

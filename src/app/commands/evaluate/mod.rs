@@ -6,13 +6,16 @@ mod truth;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
+use clap::Args;
+use serde::Serialize;
 
 use crate::app::report::results::{LocalizationResults, Report};
 use crate::app::report::run_output::{self, REPORT_FILES, RunFiles};
 use crate::app::report::run_page;
+use crate::app::run::arguments::RunArgs;
 use crate::app::run::claims::{Claims, NPZ, Outputs};
 use crate::app::run::{Context, input, output};
 use crate::app::settings::{self, EvaluationConfig, LocalizationConfig};
@@ -23,6 +26,40 @@ use crate::map::MappingPath;
 use crate::map::files::mapped_ply::MappedPly;
 use crate::map::files::mesh_file;
 use crate::map::mesh_view::reduced;
+
+/// Arguments of `evaluate`.
+#[derive(Clone, Debug, Args, Serialize)]
+pub struct EvaluateArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub run: RunArgs,
+
+    /// True poses: rows of KITTI or TUM, a folder oxts, or a topic of the recording; by default those in the result. Sets the key `pose_file`.
+    #[arg(long, value_name = "FILE")]
+    #[serde(rename = "pose_file")]
+    pub truth: Option<PathBuf>,
+
+    /// Calibration of the camera whose poses the truth has; sets the key `calib_file`.
+    #[arg(long, value_name = "FILE")]
+    #[serde(rename = "calib_file")]
+    pub calib: Option<PathBuf>,
+
+    /// Recording whose poses are the truth; sets the key `scan_folder`.
+    #[arg(long, value_name = "RECORDING")]
+    #[serde(rename = "scan_folder")]
+    pub recording: Option<PathBuf>,
+
+    /// Alignment with the truth; by default none for a result in a map, and first for a trajectory. Sets the key `alignment`.
+    #[arg(long, value_name = "ALIGNMENT", value_parser = ["none", "first", "rigid"])]
+    #[serde(rename = "alignment")]
+    pub align: Option<String>,
+
+    /// Folder of the report; sets the key `output_folder`.
+    #[arg(long, value_name = "FOLDER")]
+    #[serde(rename = "output_folder")]
+    pub output: Option<PathBuf>,
+}
 
 /// Compares a result of `localize`, `refine` or range-mcl, or any trajectory, with the ground truth.
 pub fn run(config: &EvaluationConfig, context: &Context) -> Result<Report> {

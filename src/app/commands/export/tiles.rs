@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
 
-use crate::app::cli::ExportArgs;
+use super::arguments::ExportArgs;
 use crate::app::report::export::tiles::{
     METADATA_FILE, TILES_FOLDER, Tile, is_tile, metadata, split,
 };

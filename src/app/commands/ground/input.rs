@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail, ensure};
 
-use crate::app::cli::GroundArgs;
+use super::arguments::GroundArgs;
 use crate::app::commands::stages::is_bag;
 use crate::app::run::input::require_folder;
 use crate::app::settings::{self, GroundCommandConfig};

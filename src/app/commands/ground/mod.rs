@@ -11,6 +11,7 @@
 //! ground.json            the table on standard output; written last
 //! ```
 
+mod arguments;
 mod input;
 mod pictures;
 mod report;
@@ -21,9 +22,9 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result, bail, ensure};
 
+pub use self::arguments::GroundArgs;
 use self::input::LabelledScan;
 use self::report::GroundReport;
-use crate::app::cli::GroundArgs;
 use crate::app::report::plotting::color::Colormap;
 use crate::app::run::Context;
 use crate::app::run::claims::{Claims, Outputs};

@@ -1,5 +1,6 @@
 //! `localize`: localizes a recording in a map, scan by scan.
 
+mod arguments;
 mod pictures;
 mod recorder;
 
@@ -10,6 +11,7 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use nalgebra::Vector2;
 
+pub use self::arguments::LocalizeArgs;
 use self::pictures::draw_example;
 use self::recorder::Run;
 use super::motion_source;

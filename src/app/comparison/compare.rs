@@ -2,11 +2,36 @@
 //! [`comparison`](crate::app::comparison).
 
 use anyhow::{Context as _, Result, bail};
+use clap::Args;
 
-use crate::app::cli::CompareArgs;
-use crate::app::comparison::{Executor, Layout, Outcome, PlannedRun, RunId, collect, planned_runs};
+use super::{Executor, Layout, Outcome, PlannedRun, RunId, collect, planned_runs};
+use crate::app::run::arguments::ConfigArgs;
 use crate::app::run::{Context, output};
 use crate::app::settings::{self, CommandConfig as _, ComparisonConfig};
+
+/// Arguments of `compare`.
+#[derive(Clone, Debug, Args)]
+pub struct CompareArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    pub source: ConfigArgs,
+
+    /// Print one independent command per run and exit.
+    #[arg(long, group = "part")]
+    pub list_jobs: bool,
+
+    /// Build sequences and maps only, before runs are distributed.
+    #[arg(long, group = "part")]
+    pub prepare: bool,
+
+    /// Execute one run only: SEQUENCE/CONFIGURATION/SEED.
+    #[arg(long, value_name = "RUN", group = "part")]
+    pub job: Option<RunId>,
+
+    /// Write tables and pages of the finished runs only.
+    #[arg(long, group = "part")]
+    pub collect: bool,
+}
 
 /// Executes the missing runs, or the requested part of the work; returns the text for standard
 /// output.

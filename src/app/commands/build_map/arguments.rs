@@ -1,0 +1,84 @@
+//! Arguments of `build-map`.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use serde::Serialize;
+
+use crate::app::run::arguments::RunArgs;
+use crate::recording::scan_files;
+
+/// Arguments of `build-map`.
+#[derive(Clone, Debug, Args, Serialize)]
+pub struct BuildMapArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub run: RunArgs,
+
+    /// Map to write; sets the key `mesh_file`.
+    #[arg(long, value_name = "MAP")]
+    #[serde(rename = "mesh_file")]
+    pub output: Option<PathBuf>,
+
+    /// Poses of the recording, rows of KITTI or TUM, or a topic of the bag; by default those that it contains, else from the scans. Sets the key `pose_file`.
+    #[arg(long, value_name = "FILE")]
+    #[serde(rename = "pose_file")]
+    pub poses: Option<PathBuf>,
+
+    /// Calibration of the camera whose poses these are; sets the key `calib_file`.
+    #[arg(long, value_name = "FILE")]
+    #[serde(rename = "calib_file")]
+    pub calib: Option<PathBuf>,
+
+    /// Map to which the recording is added: it is localized there, and what has changed is replaced. Sets the key `onto`.
+    #[arg(long, value_name = "MAP")]
+    pub onto: Option<PathBuf>,
+
+    /// Find the poses, print one independent command per local map that is not finished, and exit.
+    #[arg(long, group = "part")]
+    #[serde(skip)]
+    pub list_jobs: bool,
+
+    /// Build one local map only, by its number.
+    #[arg(long, value_name = "NUMBER", group = "part")]
+    #[serde(skip)]
+    pub job: Option<usize>,
+
+    /// Join the local maps that jobs have built.
+    #[arg(long, group = "part")]
+    #[serde(skip)]
+    pub collect: bool,
+}
+
+/// A part of the work of `build-map`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BuildPart {
+    /// Find the poses, and print a command per local map that is not finished.
+    List,
+    /// Build a local map by its number.
+    LocalMap(usize),
+    /// Join the finished local maps.
+    Collect,
+}
+
+impl BuildMapArgs {
+    /// The key whose value is the input.
+    pub fn input_key(&self) -> &'static str {
+        let is_cloud = |path: &Path| path.is_file() && scan_files::is_scan(path);
+        if self.run.source.input().is_some_and(is_cloud) {
+            "cloud_file"
+        } else {
+            "scan_folder"
+        }
+    }
+
+    /// The part of the work that is asked for; `None` for all of it.
+    pub fn part(&self) -> Option<BuildPart> {
+        if self.list_jobs {
+            return Some(BuildPart::List);
+        }
+        let collect = self.collect.then_some(BuildPart::Collect);
+        self.job.map(BuildPart::LocalMap).or(collect)
+    }
+}

@@ -1,0 +1,132 @@
+//! Arguments that commands share, and the way from them to a configuration: a flag that stands for a key is a
+//! field that serializes under the name of that key.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use super::Context;
+use super::machine::MachineArgs;
+use crate::app::settings::{self, CommandConfig};
+
+/// Configuration and machine.
+#[derive(Clone, Debug, Args)]
+pub struct ConfigArgs {
+    /// Configuration (.yml), or the input: a recording (odometry, build-map, localize), a point cloud (build-map), a result (refine, evaluate) or a trajectory (evaluate). Without it, the command's file under config/ or, if there is none, built-in values.
+    #[arg(value_name = "CONFIG | INPUT")]
+    pub config: Option<PathBuf>,
+
+    /// Override a key, such as range_image.width=1024; repeatable.
+    #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
+    pub settings: Vec<(String, String)>,
+
+    /// Renderer and threads.
+    #[command(flatten)]
+    pub machine: MachineArgs,
+}
+
+impl ConfigArgs {
+    /// The configuration file.
+    pub fn config_file(&self) -> Option<&Path> {
+        self.config.as_deref().filter(|path| is_config(path))
+    }
+
+    /// What the command works on, where the argument is no configuration.
+    pub fn input(&self) -> Option<&Path> {
+        self.config.as_deref().filter(|path| !is_config(path))
+    }
+}
+
+/// Whether a path is that of a configuration.
+fn is_config(path: &Path) -> bool {
+    let extension = path.extension();
+    extension.is_some_and(|it| it.eq_ignore_ascii_case("yml") || it.eq_ignore_ascii_case("yaml"))
+}
+
+/// Arguments of a stage.
+#[derive(Clone, Debug, Args, Serialize)]
+pub struct RunArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    #[serde(skip)]
+    pub source: ConfigArgs,
+
+    /// Seed of all random choices; overrides the key `seed` where it exists.
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+
+    /// Replace existing output; sets the key `force` where it exists.
+    #[arg(long)]
+    pub force: bool,
+}
+
+/// Loads the configuration of a command, and notes its file. Where the argument of the command is no
+/// configuration but an input, flags and settings change `base`, and the input is the value of `input_key`.
+pub fn configured<T: CommandConfig>(
+    args: &impl Serialize,
+    source: &ConfigArgs,
+    input_key: &str,
+    base: impl FnOnce() -> T,
+    context: &Context,
+) -> anyhow::Result<(T, Context)> {
+    let path = source.config_file();
+    let settings = with_flags::<T>(args, source, input_key)?;
+    if source.input().is_some() {
+        return Ok((settings::with_settings(base(), &settings)?, context.clone()));
+    }
+    let config = settings::load(path, &settings)?;
+    Ok((config, context.with_config_file(path, T::PATH)))
+}
+
+/// The settings of a command; those of flags are the last, where the configuration has their keys.
+pub fn with_flags<T: CommandConfig>(
+    args: &impl Serialize,
+    source: &ConfigArgs,
+    input_key: &str,
+) -> anyhow::Result<Vec<(String, String)>> {
+    let mut flags: BTreeMap<String, Value> = serde_json::from_value(serde_json::to_value(args)?)?;
+    flags.insert(input_key.to_owned(), json!(source.input()));
+    flags.retain(|_, value| !matches!(value, Value::Null | Value::Bool(false)));
+    let mut settings = source.settings.clone();
+    for (key, value) in flags {
+        if settings::has_key::<T>(&key)? {
+            // JSON is YAML.
+            settings.push((key, value.to_string()));
+        }
+    }
+    Ok(settings)
+}
+
+/// Parses finite numbers that are separated by commas.
+pub fn numbers<const N: usize>(text: &str, help: &'static str) -> Result<[f64; N], &'static str> {
+    let numbers = text.split(',').map(|number| number.trim().parse::<f64>());
+    let numbers: Vec<f64> = numbers.collect::<Result<_, _>>().map_err(|_| help)?;
+    let is_finite = numbers.iter().all(|number| number.is_finite());
+    numbers.try_into().ok().filter(|_| is_finite).ok_or(help)
+}
+
+/// Splits `key=value` at the first `=`.
+pub fn setting(text: &str) -> Result<(String, String), &'static str> {
+    match text.split_once('=') {
+        Some((key, value)) if !key.trim().is_empty() => {
+            Ok((key.trim().to_owned(), value.to_owned()))
+        }
+        _ => Err("write it as key=value, such as range_image.width=1024"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_setting_is_split_at_its_first_equals_sign() {
+        assert_eq!(setting("a.b=c=d"), Ok(("a.b".into(), "c=d".into())));
+        assert_eq!(setting("a="), Ok(("a".into(), String::new())));
+        assert!(setting("a").is_err());
+        assert!(setting("=a").is_err());
+    }
+}
