@@ -7,7 +7,6 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 
-use super::cache::{self, SharedResult};
 use super::keys::{self, KeyCache, Keys};
 use super::layout::Layout;
 use super::plan::PlannedRun;
@@ -17,6 +16,7 @@ use crate::app::commands::{build_map, localize, refine};
 use crate::app::report::results::{LocalizationResults, Report, TrajectoryReport};
 use crate::app::report::run_output::{self, REFINEMENT_FILES, RunFiles};
 use crate::app::report::run_page::RunPage;
+use crate::app::run::artefact::{self, FINISHED_FILE, Lock, SharedResult};
 use crate::app::run::claims::{CLAIMS_FILE, Claims, Outputs};
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::{Context, output, version};
@@ -177,7 +177,9 @@ impl<'a> Executor<'a> {
         if run.drives.is_empty() {
             return Ok(());
         }
-        let _lock = cache::lock(&self.layout.root.join("sequences"), &run.id.sequence)?;
+        let folder = self.layout.root.join("sequences");
+        output::create_folder(&folder)?;
+        let _lock = Lock::wait(&folder.join(format!("{}.lock", run.id.sequence)))?;
         for drive in &run.drives {
             simulate::run(drive, Existing::Renew, self.context)?;
         }
@@ -185,7 +187,7 @@ impl<'a> Executor<'a> {
     }
 
     fn map(&self, run: &PlannedRun, keys: &Keys) -> Result<SharedResult> {
-        cache::get_or_create(&self.layout.shared("maps"), &keys.map, |folder| {
+        artefact::get_or_create(&self.layout.shared("maps"), &keys.map, |folder| {
             let _log = self.context.log.write_to(&folder.join(LOG_FILE))?;
             let config = BuildMapConfig {
                 mesh_file: folder.join(MAP_FILE),
@@ -204,7 +206,7 @@ impl<'a> Executor<'a> {
         map: &SharedResult,
     ) -> Result<SharedResult> {
         let shared = self.layout.shared("localizations");
-        cache::get_or_create(&shared, &keys.localization, |folder| {
+        artefact::get_or_create(&shared, &keys.localization, |folder| {
             let _log = self.context.log.write_to(&folder.join(LOG_FILE))?;
             let config = LocalizationConfig {
                 map_file: map.folder.join(MAP_FILE),
@@ -341,7 +343,7 @@ fn prepare(folder: &Path, names: Vec<String>) -> Result<Claims> {
     outputs.prepare()
 }
 
-/// Copies the content of a folder, except for [`cache::FINISHED_FILE`], the log and the claims.
+/// Copies the content of a folder, except for [`FINISHED_FILE`], the log and the claims.
 fn copy_folder(from: &Path, to: &Path) -> Result<()> {
     output::create_folder(to)?;
     for name in names_to_copy(from)? {
@@ -361,7 +363,7 @@ fn names_to_copy(folder: &Path) -> Result<Vec<String>> {
         fs::read_dir(folder).with_context(|| format!("cannot read {}", folder.display()))?
     {
         let name = entry?.file_name().to_string_lossy().into_owned();
-        if ![cache::FINISHED_FILE, LOG_FILE, CLAIMS_FILE].contains(&&*name) {
+        if ![FINISHED_FILE, LOG_FILE, CLAIMS_FILE].contains(&&*name) {
             names.push(name);
         }
     }

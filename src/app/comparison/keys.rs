@@ -12,16 +12,15 @@
 //! ([`Existing::Renew`](crate::app::commands::simulate::Existing::Renew)).
 
 use std::collections::BTreeMap;
-use std::fs::{self, File};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context as _, Result};
 use rayon::prelude::*;
 use serde::Serialize;
 
 use super::plan::PlannedRun;
-use crate::app::commands::build_map::hash_of_scan;
 use crate::app::commands::stages::{is_bag, is_topic};
+use crate::app::run::artefact::{hash_of_file, hash_of_scan, hash_of_texts};
 use crate::app::run::version;
 use crate::recording::{Recording, Selection};
 use crate::simulation::SimulationConfig;
@@ -81,7 +80,7 @@ impl KeyCache {
         for input in &stage.inputs {
             parts.push(self.input(input)?);
         }
-        Ok(hash(&parts))
+        Ok(hash_of_texts(&parts))
     }
 
     fn input(&mut self, input: &Input) -> Result<String> {
@@ -93,7 +92,7 @@ impl KeyCache {
                     parts.push(self.file(poses)?);
                     parts.push(self.file(drive.path_calib_file.as_ref().unwrap_or(&beside))?);
                 }
-                Ok(hash(&parts))
+                Ok(hash_of_texts(&parts))
             }
             Input::Scans(bag, _) if is_bag(bag) => self.file(bag),
             Input::Scans(folder, selection) => {
@@ -107,9 +106,9 @@ impl KeyCache {
                         .collect::<Result<Vec<String>>>()?;
                     let files = recording.files;
                     for path in files.poses.iter().chain(&files.calibration) {
-                        hashes.push(content(path)?);
+                        hashes.push(hash_of_file(path)?);
                     }
-                    Ok(hash(&hashes))
+                    Ok(hash_of_texts(&hashes))
                 })
             }
             Input::Topic(name) => Ok(format!("{name:?}")),
@@ -121,8 +120,11 @@ impl KeyCache {
     fn file(&mut self, path: &Path) -> Result<String> {
         self.once(format!("{path:?}"), || {
             let times = path.with_file_name("times.txt");
-            let times = times.exists().then(|| content(&times)).transpose()?;
-            Ok(hash(&[content(path)?, times.unwrap_or_default()]))
+            let times = times.exists().then(|| hash_of_file(&times)).transpose()?;
+            Ok(hash_of_texts(&[
+                hash_of_file(path)?,
+                times.unwrap_or_default(),
+            ]))
         })
     }
 
@@ -146,7 +148,7 @@ pub fn settings_hash(run: &PlannedRun) -> Result<String> {
             parts.push(input.name()?);
         }
     }
-    Ok(hash(&parts))
+    Ok(hash_of_texts(&parts))
 }
 
 /// What a stage depends on besides the previous stage.
@@ -233,35 +235,6 @@ fn settings(config: &impl Serialize) -> Result<String> {
         settings.retain(|key, _| !IGNORED_KEYS.contains(&key.as_str()));
     }
     Ok(settings.to_string())
-}
-
-/// Hash of a file, or of those in a folder.
-fn content(path: &Path) -> Result<String> {
-    let context = || format!("cannot read {}", path.display());
-    if path.is_dir() {
-        let entries = fs::read_dir(path).with_context(context)?;
-        let mut paths: Vec<PathBuf> = entries
-            .map(|entry| Ok(entry.with_context(context)?.path()))
-            .collect::<Result<_>>()?;
-        paths.sort();
-        let hashes: Result<Vec<String>> = paths.iter().map(|path| content(path)).collect();
-        return Ok(hash(&hashes?));
-    }
-    let mut hasher = blake3::Hasher::new();
-    let file = File::open(path).with_context(context)?;
-    hasher.update_reader(file).with_context(context)?;
-    Ok(hasher.finalize().to_hex().to_string())
-}
-
-/// Hash of a list of texts, 32 hexadecimal digits.
-fn hash(parts: &[impl AsRef<str>]) -> String {
-    let mut hasher = blake3::Hasher::new();
-    for part in parts {
-        let part = part.as_ref();
-        hasher.update(&(part.len() as u64).to_le_bytes());
-        hasher.update(part.as_bytes());
-    }
-    hasher.finalize().to_hex()[..32].to_owned()
 }
 
 #[cfg(test)]
@@ -452,6 +425,6 @@ mod tests {
 
     #[test]
     fn boundaries_between_parts_change_the_hash() {
-        assert_ne!(hash(&["ab", "c"]), hash(&["a", "bc"]));
+        assert_ne!(hash_of_texts(&["ab", "c"]), hash_of_texts(&["a", "bc"]));
     }
 }

@@ -48,7 +48,6 @@
 // The command.
 pub mod compare;
 // Runs and their execution.
-mod cache;
 mod execute;
 mod keys;
 mod layout;

@@ -1,6 +1,7 @@
 //! A run of a command: what it was called with, its progress, log, interruption and outputs.
 
 pub mod arguments;
+pub mod artefact;
 pub mod claims;
 mod context;
 pub mod failure;

@@ -7,8 +7,9 @@ use anyhow::{Context as _, Result, bail};
 
 use super::clock::StageClock;
 use super::opened::Opened;
-use super::parts::{Parts, Role, hash_of_scan, hash_of_scans, joint_hash};
+use super::parts::{Parts, Role};
 use crate::app::run::Context;
+use crate::app::run::artefact::{hash_of_scan, hash_of_scans, joint_hash};
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::progress::Task;
 use crate::app::settings::BuildMapConfig;

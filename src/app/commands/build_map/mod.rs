@@ -26,7 +26,6 @@ use self::clock::StageClock;
 use self::files::write_map;
 use self::onto::ChangesReport;
 use self::opened::open;
-pub use self::parts::hash_of_scan;
 use self::parts::{Joined, Role};
 pub use self::report::BuildReport;
 use crate::app::run::output::Printed;

@@ -6,10 +6,10 @@ use std::sync::Arc;
 use anyhow::Result;
 use serde::Serialize;
 
-use super::parts::hash_of_file;
 use crate::app::commands::stages::MapInputs;
 use crate::app::report::plotting::MapPlot;
 use crate::app::report::run_output::MOST_TRIANGLES;
+use crate::app::run::artefact::hash_of_file;
 use crate::app::run::{Context, input};
 use crate::app::settings::BuildMapConfig;
 use crate::geometry::pose2_from_pose3;

@@ -5,22 +5,20 @@
 //! that the build locks. Parts of other inputs are deleted, files of others never. A part is finished
 //! once its counts exist, which are written last.
 
-use std::fs::{self, File, TryLockError};
+use std::fs;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Result, bail, ensure};
-use blake3::Hash;
+use anyhow::{Context as _, Result, ensure};
 use glam::DVec3;
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::app::run::artefact::{Lock, hash_of_file};
 use crate::app::run::output;
 use crate::files::remove_abandoned;
-use crate::lidar::Scan;
 use crate::map::files::mapped_ply::MappedPly;
 use crate::map::files::ply;
 use crate::map::{LocalMap, LocalMapCounts};
-use crate::recording::{Frame, RecordingError};
+use crate::recording::RecordingError;
 
 const INPUTS_FILE: &str = "inputs.txt";
 const LOCK_FILE: &str = "lock";
@@ -74,22 +72,12 @@ impl Drop for Parts {
     fn drop(&mut self) {
         let (inputs, lock) = (self.folder.join(INPUTS_FILE), self.folder.join(LOCK_FILE));
         // Another build may have locked the folder since the parts were removed.
-        if inputs.exists() || !is_at(&self.lock.0, &lock) {
+        if inputs.exists() || !self.lock.is_in_place() {
             return;
         }
         if fs::remove_file(lock).is_ok() && fs::remove_dir(&self.folder).is_err() {
             tracing::warn!("{} is kept: it has other files", self.folder.display());
         }
-    }
-}
-
-/// A locked file; the operating system releases it after a crash.
-struct Lock(File);
-
-impl Drop for Lock {
-    fn drop(&mut self) {
-        // Closing the file is not enough: a process that is being started holds a copy of it for a moment.
-        let _ = self.0.unlock();
     }
 }
 
@@ -268,38 +256,13 @@ fn entries(folder: &Path) -> Result<Vec<fs::DirEntry>> {
 /// Locks a folder of parts; an error if another build has locked it.
 fn lock(folder: &Path, mesh_file: &Path, role: Role) -> Result<Lock> {
     let path = folder.join(LOCK_FILE);
-    let context = || format!("cannot lock {}", path.display());
-    let file = File::create(&path).with_context(context)?;
-    let locked = match role {
-        Role::Build | Role::Collect => file.try_lock(),
-        Role::Job => file.try_lock_shared(),
-    };
-    match locked {
-        // A build that has just ended removes its lock, and another one may have made its own.
-        Ok(()) if is_at(&file, &path) => Ok(Lock(file)),
-        Ok(()) | Err(TryLockError::WouldBlock) => bail!(
+    Lock::now(&path, role == Role::Job)?.with_context(|| {
+        format!(
             "{} is being built by another build-map, which has locked {}; wait for it, or choose another mesh_file",
             mesh_file.display(),
             path.display()
-        ),
-        Err(TryLockError::Error(error)) => Err(error).with_context(context),
-    }
-}
-
-/// Whether an open file is the one of a path.
-fn is_at(file: &File, path: &Path) -> bool {
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::MetadataExt as _;
-        let place = |metadata: fs::Metadata| (metadata.dev(), metadata.ino());
-        let (of_file, of_path) = (file.metadata().map(place), fs::metadata(path).map(place));
-        matches!((of_file, of_path), (Ok(a), Ok(b)) if a == b)
-    }
-    #[cfg(not(unix))]
-    {
-        let _ = file;
-        path.exists()
-    }
+        )
+    })
 }
 
 /// Why jobs cannot be done or collected.
@@ -308,41 +271,6 @@ pub fn not_listed(mesh_file: &Path) -> String {
         "the jobs of {} were not listed with this configuration, recording and program; list them again with --list-jobs",
         mesh_file.display()
     )
-}
-
-/// BLAKE3 hash of a file.
-pub fn hash_of_file(path: &Path) -> Result<String> {
-    let mut hasher = blake3::Hasher::new();
-    (File::open(path).and_then(|file| hasher.update_reader(file).map(drop)))
-        .with_context(|| format!("cannot read {}", path.display()))?;
-    Ok(hasher.finalize().to_hex().to_string())
-}
-
-/// BLAKE3 hash of the files of scans, in order.
-pub fn hash_of_scans(frames: &[Frame]) -> Result<String, RecordingError> {
-    let hash = |frame: &Frame| Ok(hash_of_scan(&frame.read()?));
-    let hashes: Vec<Hash> = frames
-        .par_iter()
-        .map(hash)
-        .collect::<Result<_, RecordingError>>()?;
-    Ok(joint_hash(hashes))
-}
-
-/// Hash of the hashes of scans, in order.
-pub fn joint_hash(hashes: impl IntoIterator<Item = Hash>) -> String {
-    let mut joint = blake3::Hasher::new();
-    for hash in hashes {
-        joint.update(hash.as_bytes());
-    }
-    joint.finalize().to_hex().to_string()
-}
-
-/// Hash of the points of a scan with their times.
-pub fn hash_of_scan(scan: &Scan) -> Hash {
-    let numbers = scan.points.iter().flat_map(|point| point.to_array());
-    let numbers = numbers.chain(scan.times_s.iter().copied());
-    let bytes: Vec<u8> = numbers.flat_map(f32::to_le_bytes).collect();
-    blake3::hash(&bytes)
 }
 
 #[cfg(test)]
@@ -414,19 +342,6 @@ mod tests {
                 .finished(0, || Ok("0123".into())),
             None
         );
-    }
-
-    #[test]
-    fn a_build_that_ended_is_not_locked_by_copies_of_its_lock() {
-        let folder = tempfile::tempdir().unwrap();
-        let map = folder.path().join("map.ply");
-        let parts = open(&map, INPUTS).unwrap();
-        assert!(open(&map, INPUTS).is_err());
-        // As of a process that another thread is just starting.
-        let copy = parts.lock.0.try_clone().unwrap();
-        drop(parts);
-        assert!(open(&map, INPUTS).is_ok());
-        drop(copy);
     }
 
     #[test]

@@ -9,6 +9,7 @@ use anyhow::{Result, ensure};
 use super::onto::OlderMap;
 use super::parts::{Role, not_listed};
 use crate::app::commands::trajectory;
+use crate::app::run::artefact::hash_of_texts;
 use crate::app::run::{Context, output, version};
 use crate::app::settings::BuildMapConfig;
 use crate::geometry::Pose3;
@@ -133,18 +134,15 @@ fn summary_in(text: &str) -> Option<TrajectorySummary> {
 
 /// Hash of what the poses depend on, also the older map and how scans are localized there; of a scan its place and size.
 fn inputs(frames: &[Frame], is_given: bool, localized_by: &str) -> Result<String> {
-    let mut hasher = blake3::Hasher::new();
-    hasher.update(localized_by.as_bytes());
-    hasher.update(version::program()?.as_bytes());
+    let mut parts = vec![version::program()?, localized_by.to_owned()];
     for frame in frames {
         let source = frame.source.to_string();
         let bytes = fs::metadata(Path::new(&source)).map_or(0, |file| file.len());
         let given = frame.map_from_lidar.filter(|_| is_given);
-        let what = format!(
-            "{source} {bytes} {} {:?} {} {given:?}\n",
+        parts.push(format!(
+            "{source} {bytes} {} {:?} {} {given:?}",
             frame.time_s, frame.rotation, frame.is_timed
-        );
-        hasher.update(what.as_bytes());
+        ));
     }
-    Ok(hasher.finalize().to_hex().to_string())
+    Ok(hash_of_texts(&parts))
 }
