@@ -23,7 +23,7 @@ pub use trajectory::{ADJUSTMENT, LoopCounts, TrajectorySummary, find_poses, find
 
 use crate::map::{BuildError, Map, MapBuilder, MapConfig, MappingPath, PoseSource};
 use crate::odometry::{Trajectory, TrajectoryConfig};
-use crate::recording::{Frame, PoseTrack, Recording};
+use crate::recording::{Frame, Recording};
 use crate::sensor::SensorDescription;
 
 /// A map, and what its recording has shown.
@@ -78,13 +78,8 @@ pub fn map_recording(
     let mut trajectory = None;
     if recording.track.is_none() || builder.config.poses == PoseSource::Polished {
         let (frames, found) = found_poses(&recording, older, &builder)?;
-        let track = PoseTrack {
-            times_s: Some(frames.iter().map(|frame| frame.time_s).collect()),
-            world_from_map: world.unwrap_or(recording.world().0),
-            ..PoseTrack::from_poses(found.poses.clone())
-        };
-        recording.has_times = true;
-        recording = recording.with_poses(track)?;
+        let world_from_map = world.unwrap_or(recording.world().0);
+        recording = recording.with_poses_of(&frames, found.poses.clone(), world_from_map)?;
         check_path(&recording, builder.config.max_step_m)?;
         trajectory = Some(found);
     }

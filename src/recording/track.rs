@@ -102,14 +102,18 @@ impl PoseTrack {
         Self::of(Path::new(topic), body, calibration, Some(times_s))
     }
 
-    /// Poses of the lidar by frame number, in the frame of the map.
-    pub fn from_poses(map_from_lidar: Vec<Pose3>) -> Self {
+    /// Poses of the lidar in the frame of a map by their times, which ascend [s].
+    pub fn from_poses(
+        map_from_lidar: Vec<Pose3>,
+        times_s: Vec<f64>,
+        world_from_map: Pose3,
+    ) -> Self {
         Self {
             path: PathBuf::from("the given poses"),
             map_from_lidar,
-            times_s: None,
+            times_s: Some(times_s),
             calibration: Calibration::identity(),
-            world_from_map: Pose3::identity(),
+            world_from_map,
         }
     }
 

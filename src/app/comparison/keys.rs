@@ -239,6 +239,8 @@ fn settings(config: &impl Serialize) -> Result<String> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
     use crate::app::comparison::record::RunId;
     use crate::app::settings::{BuildMapConfig, LocalizationConfig, RefinementConfig};

@@ -10,8 +10,6 @@ use super::parts::Role;
 use crate::app::run::Context;
 use crate::app::run::output::Printed;
 use crate::app::settings::BuildMapConfig;
-use crate::map::build::plan;
-use crate::mapping::poses_of;
 
 /// One shell command per local map that is not finished, for the current folder: the command line of this process with
 /// `--job` instead of `--list-jobs`. The poses are found first.
@@ -52,8 +50,7 @@ pub fn require_all(opened: &Opened) -> Result<()> {
 
 /// Numbers of the local maps that are not finished.
 fn missing(opened: &Opened) -> Vec<usize> {
-    let (poses, config) = (poses_of(&opened.mapped), &opened.config);
-    let planned = plan::local_maps(&poses, config.local_map_size, config.overlap_m);
+    let planned = opened.local_maps();
     let numbers = planned.iter().map(|local_map| local_map.number);
     numbers
         .filter(|&number| !opened.parts.has(number))

@@ -12,11 +12,9 @@ use crate::app::run::Context;
 use crate::app::run::artefact::{hash_of_scan, hash_of_scans, joint_hash};
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::progress::Task;
-use crate::app::settings::BuildMapConfig;
-use crate::map::build::plan::{LocalMapPlan, local_maps};
+use crate::map::build::plan::LocalMapPlan;
 use crate::map::build::scan_agreement;
 use crate::map::{BuildError, BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan};
-use crate::mapping::poses_of;
 use crate::recording::Frame;
 
 /// Stages of a local map, and about the share of its time before each.
@@ -80,9 +78,8 @@ pub fn build(
     clock: &Arc<StageClock>,
     context: &Context,
 ) -> Result<(Vec<LocalMapCounts>, Arc<Task>)> {
-    let (config, frames, parts) = (&opened.config, &opened.mapped, &opened.parts);
-    let poses = poses_of(frames);
-    let planned = local_maps(&poses, config.local_map_size, config.overlap_m);
+    let (frames, parts) = (&opened.mapped, &opened.parts);
+    let planned = opened.local_maps();
     // Scans in two local maps count once, in the one that owns them.
     let task = context.progress.task("build-map", frames.len());
     let progress = Arc::new(MapProgress {
@@ -90,9 +87,8 @@ pub fn build(
         scans: planned.iter().map(|local_map| local_map.used.len()).sum(),
         state: Mutex::default(),
     });
-    let builder = builder(config, context, &progress, clock);
-    let mut plan = builder.plan(poses)?;
-    plan.older = opened.older.as_ref().map(|older| &*older.mesh);
+    let builder = builder(opened, context, &progress, clock);
+    let plan = opened.plan(&builder)?;
     let mut all = Vec::with_capacity(plan.local_maps.len());
     context.interrupt.keeps(kept(0, &plan, parts));
     for local_map in &plan.local_maps {
@@ -130,9 +126,8 @@ pub fn build_one(
     number: usize,
     context: &Context,
 ) -> Result<(LocalMapCounts, usize)> {
-    let (config, frames, parts) = (&opened.config, &opened.mapped, &opened.parts);
-    let poses = poses_of(frames);
-    let planned = local_maps(&poses, config.local_map_size, config.overlap_m);
+    let (frames, parts) = (&opened.mapped, &opened.parts);
+    let planned = opened.local_maps();
     let count = planned.len();
     let local_map = planned.get(number).with_context(|| {
         format!(
@@ -148,9 +143,8 @@ pub fn build_one(
         scans: used.len(),
         state: Mutex::default(),
     });
-    let builder = builder(config, context, &progress, &Arc::default());
-    let mut plan = builder.plan(poses)?;
-    plan.older = opened.older.as_ref().map(|older| &*older.mesh);
+    let builder = builder(opened, context, &progress, &Arc::default());
+    let plan = opened.plan(&builder)?;
     let nothing = "nothing is kept of an unfinished local map".to_owned();
     context.interrupt.keeps(nothing.clone());
     progress.begin(used.len());
@@ -166,7 +160,7 @@ pub fn build_one(
 
 /// A builder that reports its progress, and stops when it is interrupted.
 fn builder(
-    config: &BuildMapConfig,
+    opened: &Opened,
     context: &Context,
     progress: &Arc<MapProgress>,
     clock: &Arc<StageClock>,
@@ -184,7 +178,7 @@ fn builder(
             }
             interrupt.flow()
         }),
-        ..MapBuilder::new(config.map())
+        ..MapBuilder::new(opened.map.clone())
     }
 }
 

@@ -13,8 +13,9 @@ use crate::app::commands::trajectory::{self, file_beside};
 use crate::app::run::claims::Claims;
 use crate::app::run::{Context, input, version};
 use crate::app::settings::{self, BuildMapConfig};
-use crate::map::PoseSource;
-use crate::mapping::{TrajectorySummary, key_frames};
+use crate::map::build::plan::{self, LocalMapPlan};
+use crate::map::{MapBuilder, MapConfig, MapPlan, PoseSource};
+use crate::mapping::{TrajectorySummary, key_frames, poses_of};
 use crate::recording::{Frame, Recording};
 use crate::sensor::SensorDescription;
 
@@ -22,6 +23,8 @@ use crate::sensor::SensorDescription;
 pub struct Opened {
     /// The configuration, with what the scans show about the sensor.
     pub config: BuildMapConfig,
+    /// How the scans become a map.
+    pub map: MapConfig,
     /// The recording with its poses.
     pub sequence: Recording,
     /// What was inferred about the sensor.
@@ -79,6 +82,7 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
     let (mapped, held_out) = hold_out(&sequence.frames, &config);
     parts.keep_those_of(&inputs_of(&config, &mapped, older.as_ref())?)?;
     let opened = Opened {
+        map: config.map(),
         config,
         sequence,
         mapped,
@@ -89,6 +93,21 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
         parts,
     };
     Ok((opened, claims))
+}
+
+impl Opened {
+    /// The local maps of the key scans.
+    pub fn local_maps(&self) -> Vec<LocalMapPlan> {
+        let poses = poses_of(&self.mapped);
+        plan::local_maps(&poses, self.map.local_map_size, self.map.overlap_m)
+    }
+
+    /// The plan of a builder for the key scans, which are added to the older map where there is one.
+    pub fn plan<'a>(&'a self, builder: &'a MapBuilder) -> Result<MapPlan<'a>> {
+        let mut plan = builder.plan(poses_of(&self.mapped))?;
+        plan.older = self.older.as_ref().map(|older| &*older.mesh);
+        Ok(plan)
+    }
 }
 
 /// The key scans that build the map, and those that are held out to evaluate it.
