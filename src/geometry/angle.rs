@@ -3,6 +3,8 @@
 use std::f32;
 use std::f64::consts::{PI, TAU};
 
+use glam::Vec3;
+
 /// Wraps an angle to [-π, π) [rad].
 pub fn wrap_angle(angle_rad: f64) -> f64 {
     let wrapped = (angle_rad + PI).rem_euclid(TAU) - PI;
@@ -10,10 +12,16 @@ pub fn wrap_angle(angle_rad: f64) -> f64 {
     if wrapped >= PI { -PI } else { wrapped }
 }
 
+/// Index of the sector of azimuth that contains a direction; `count` sectors begin at −π.
+pub fn azimuth_sector(direction: Vec3, count: usize) -> usize {
+    let turns = 0.5 + direction.y.atan2(direction.x) / std::f32::consts::TAU;
+    ((turns * count as f32) as usize).min(count - 1)
+}
+
 /// `atan2` to 5e-7 rad, π/2 of two zeros, with the same bits on every platform; loops over it are vectorized.
 #[inline(always)]
 pub fn fast_atan2(y: f32, x: f32) -> f32 {
-    /// Of the odd polynomial that is nearest to the arcus tangent on [0, 1].
+    /// Coefficients of the odd polynomial that is nearest to the arctangent on [0, 1].
     const COEFFICIENTS: [f32; 7] = [
         0.999_996_1,
         -0.333_173_7,

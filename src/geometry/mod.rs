@@ -14,10 +14,11 @@ pub mod morton;
 pub mod plane;
 pub mod ply_vertex;
 pub mod pose;
+pub mod robust_kernel;
 pub mod surface_samples;
 pub mod trajectory;
 
-pub use angle::{circular_mean, fast_atan2, wrap_angle};
+pub use angle::{azimuth_sector, circular_mean, fast_atan2, wrap_angle};
 pub use cloud::PointCloud;
 pub use degeneracy::Degeneracy;
 pub use grid::Grid2;
@@ -26,6 +27,7 @@ pub use mesh::{Aabb, TriangleMesh};
 pub use plane::{PlaneFit, PlaneSums};
 pub use ply_vertex::PlyVertex;
 pub use pose::{FARTHEST_M, Pose2, Pose3, Rigid3f, pose2_from_pose3, pose3_from_pose2, yaw};
+pub use robust_kernel::RobustKernel;
 pub use surface_samples::{sample_surface, surface_area_m2};
 pub use trajectory::StampedPose;
 

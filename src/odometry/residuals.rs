@@ -16,13 +16,13 @@ use rayon::prelude::*;
 
 use super::sampling::TimedPoint;
 use super::voxel_map::{Shape, Surface, VoxelMap};
-use crate::geometry::{Pose3, Rigid3f};
+use crate::geometry::{Pose3, Rigid3f, RobustKernel, azimuth_sector};
 use crate::lidar::{Motion, Sweep};
 
 /// Azimuth sectors, the clusters of correlated residuals in the covariance.
 const SECTORS: usize = 24;
 
-/// A scan beside the local map.
+/// A scan and the local map.
 #[derive(Clone, Copy)]
 pub struct Observation<'a> {
     /// The local map.
@@ -64,9 +64,9 @@ pub struct Sums {
 /// Residuals of all points.
 #[derive(Clone)]
 pub struct Equations {
-    /// Of points on planes.
+    /// Sums of points on planes.
     pub planar: Sums,
-    /// Of other points.
+    /// Sums of other points.
     pub other: Sums,
     /// Σ w Jᵀ r of points on planes, per sector of the azimuth.
     pub gradients: [Vector6<f64>; SECTORS],
@@ -83,7 +83,7 @@ struct Linearization {
     translation: DVec3,
     /// Motion compensation per interval of the sweep.
     compensation: Vec<Rigid3f>,
-    kernel_m: f64,
+    kernel: RobustKernel,
 }
 
 impl Observation<'_> {
@@ -106,7 +106,7 @@ impl Observation<'_> {
             lidar_from_odom: rotation.transpose(),
             translation: pose.translation.vector.into(),
             compensation: self.sweep.transforms(&motion),
-            kernel_m,
+            kernel: RobustKernel { scale_m: kernel_m },
         };
         let parts: Vec<Equations> = (self.points.par_chunks(CHUNK))
             .zip(matches.par_chunks_mut(CHUNK))
@@ -158,20 +158,20 @@ impl Observation<'_> {
             Shape::Plane(normal) => normal.dot(offset),
             Shape::Other(_) => offset.dot(information * offset).sqrt(),
         };
-        if distance_m.abs() > GATE * at.kernel_m {
+        if distance_m.abs() > GATE * at.kernel.scale_m {
             equations.cost += 1.0;
             return;
         }
-        let ratio = (distance_m / at.kernel_m).powi(2);
-        let weight = (1.0 + ratio).powi(-2);
-        equations.cost += ratio / (1.0 + ratio);
+        let weight = at.kernel.weight(distance_m);
+        equations.cost += at.kernel.cost(distance_m);
         let factor = 1.0 + f64::from(point.time_s) / self.duration_s;
         if let Shape::Plane(normal) = surface.shape {
             equations.distances_m.push(distance_m.abs() as f32);
             let jacobian = factor * jacobian(at.lidar_from_odom * normal, in_lidar);
             equations.planar.add(&jacobian, distance_m, weight);
             equations.planar.count(distance_m, weight);
-            equations.gradients[sector(point)] += weight * distance_m * jacobian;
+            let sector = azimuth_sector(point.position, SECTORS);
+            equations.gradients[sector] += weight * distance_m * jacobian;
         } else {
             let information = at.lidar_from_odom * information * at.rotation;
             let pull = information * (at.lidar_from_odom * offset);
@@ -193,11 +193,6 @@ impl Observation<'_> {
 fn jacobian(normal: DVec3, point: DVec3) -> Vector6<f64> {
     let turn = point.cross(normal);
     Vector6::new(normal.x, normal.y, normal.z, turn.x, turn.y, turn.z)
-}
-
-fn sector(point: &TimedPoint) -> usize {
-    let turns = 0.5 + point.position.y.atan2(point.position.x) / std::f32::consts::TAU;
-    ((turns * SECTORS as f32) as usize).min(SECTORS - 1)
 }
 
 impl Sums {

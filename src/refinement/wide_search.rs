@@ -22,7 +22,7 @@ use super::upright::{UprightSurfaces, is_upright_height};
 use crate::geometry::{Pose2, Pose3, Rigid3f, pose2_from_pose3};
 use crate::lidar::Beam;
 use crate::random::stream;
-use crate::registration::{RegistrationConfig, register};
+use crate::registration::{RegistrationConfig, register_coarse_to_fine};
 use crate::rendering::RenderError;
 use crate::validation::{InvalidValue, Validate, in_range, nested, positive};
 
@@ -167,20 +167,17 @@ pub(super) fn finish(
     let Some(patch) = objective.patch_within(pose, reach_m) else {
         return Ok(None);
     };
-    let wide = RegistrationConfig {
-        kernel_m: config.kernel_m.max(gauss_newton.kernel_m),
-        tolerance_m: 0.01,
-        ..gauss_newton.clone()
-    };
     let some: Vec<Beam> = objective.beams.iter().step_by(STEP).copied().collect();
     let lifted = patch.lift(pose, &objective.attitude);
-    let mut found = lifted;
-    for (beams, config) in [(some.as_slice(), &wide), (objective.beams, gauss_newton)] {
-        match register(objective.renderer, beams, &found, config)? {
-            Some(registered) => found = registered.map_from_lidar,
-            None => break,
-        }
-    }
+    let registered = register_coarse_to_fine(
+        objective.renderer,
+        [&some, objective.beams],
+        &lifted,
+        config.kernel_m,
+        gauss_newton,
+        |_| true,
+    )?;
+    let found = registered.map_or(lifted, |registered| registered.map_from_lidar);
     let is_near = (pose2_from_pose3(&found).translation.vector - pose.translation.vector).norm()
         < reach_m.max(1.0);
     let found = if is_near { found } else { lifted };

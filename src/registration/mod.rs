@@ -4,7 +4,7 @@
 //! ```text
 //! rᵢ = nᵢ · (map_from_lidar qᵢ − sᵢ)                      return q, surface s with normal n [m]
 //! ∂rᵢ / ∂(translation, rotation) = (nᵢ, qᵢ × nᵢ)          n in the lidar frame
-//! Σ wᵢ Jᵢᵀ Jᵢ δ = − Σ wᵢ Jᵢᵀ rᵢ        wᵢ = (1 + rᵢ²/c²)⁻²       Geman-McClure kernel
+//! Σ wᵢ Jᵢᵀ Jᵢ δ = − Σ wᵢ Jᵢᵀ rᵢ        wᵢ: robust kernel
 //! ```
 //!
 //! Each iteration casts one ray per beam; the hit is the correspondence of the return (projective
@@ -33,7 +33,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use crate::geometry::pose::exponential;
-use crate::geometry::{Pose3, Rigid3f, Vec3};
+use crate::geometry::{Pose3, Rigid3f, RobustKernel, Vec3, azimuth_sector};
 use crate::lidar::Beam;
 use crate::rendering::{RangeRenderer, RenderError, SurfaceHit};
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
@@ -156,6 +156,33 @@ pub fn register(
     Ok(result)
 }
 
+/// Registers beams from farther away in two stages: the first of `beams` with a kernel of `wide_kernel_m`, then the second
+/// as configured. A pose that is not accepted ends it; the last accepted one is returned, if any.
+pub fn register_coarse_to_fine(
+    renderer: &dyn RangeRenderer,
+    beams: [&[Beam]; 2],
+    initial: &Pose3,
+    wide_kernel_m: f64,
+    config: &RegistrationConfig,
+    is_accepted: impl Fn(&Pose3) -> bool,
+) -> Result<Option<RegistrationResult>, RenderError> {
+    let wide = RegistrationConfig {
+        kernel_m: config.kernel_m.max(wide_kernel_m),
+        tolerance_m: 0.01,
+        ..config.clone()
+    };
+    let (mut pose, mut result) = (*initial, None);
+    for (beams, config) in beams.into_iter().zip([&wide, config]) {
+        let found = register(renderer, beams, &pose, config)?;
+        let Some(found) = found.filter(|found| is_accepted(&found.map_from_lidar)) else {
+            break;
+        };
+        pose = found.map_from_lidar;
+        result = Some(found);
+    }
+    Ok(result)
+}
+
 /// Gate on the distance along the beam, in kernel widths, for grazing incidence.
 const GATE_ALONG: f64 = 20.0;
 
@@ -197,11 +224,10 @@ fn residual(
     }
     let lever = beam.point().cross(normal);
     let jacobian = [normal.x, normal.y, normal.z, lever.x, lever.y, lever.z];
-    let turns = 0.5 + beam.direction.y.atan2(beam.direction.x) / std::f32::consts::TAU;
     Some(Residual {
         value_m,
         jacobian: Vector6::from(jacobian.map(f64::from)),
-        sector: ((turns * config.sectors as f32) as usize).min(config.sectors - 1),
+        sector: azimuth_sector(beam.direction, config.sectors),
     })
 }
 
@@ -223,9 +249,12 @@ fn solve(
     let mut right_side = Vector6::zeros();
     let mut sector_gradients = vec![Vector6::zeros(); config.sectors];
     let (mut squares, mut weights) = (0.0, 0.0);
+    let kernel = RobustKernel {
+        scale_m: config.kernel_m,
+    };
     for residual in residuals {
         let jacobian = residual.jacobian.component_mul(&estimated);
-        let weight = (1.0 + (residual.value_m / config.kernel_m).powi(2)).powi(-2);
+        let weight = kernel.weight(residual.value_m);
         information += weight * jacobian * jacobian.transpose();
         let gradient = weight * residual.value_m * jacobian;
         right_side -= gradient;
@@ -237,7 +266,7 @@ fn solve(
     let cholesky = information.cholesky()?;
     let step = cholesky.solve(&right_side);
     let outer_products: Matrix6<f64> = sector_gradients.iter().map(|g| g * g.transpose()).sum();
-    let horizontal = Horizontal::of(&information, weights)?;
+    let horizontal = Horizontal::new(&information, weights)?;
     let inverse = horizontal.corrected(&information).try_inverse()?;
     let step = horizontal.determined(step);
     let mut covariance = inverse * (squares / weights) + inverse * outer_products * inverse;
@@ -263,8 +292,8 @@ struct Horizontal {
 }
 
 impl Horizontal {
-    /// Of an information matrix with a sum of weights; `None` if it is singular.
-    fn of(information: &Matrix6<f64>, weights: f64) -> Option<Self> {
+    /// Splits the information of residuals with a sum of weights; `None` if it is singular.
+    fn new(information: &Matrix6<f64>, weights: f64) -> Option<Self> {
         /// Standard deviation of a normal: 3 mm over the 9 cm of a cell [rad].
         const NORMAL_RAD: f64 = 0.03;
         /// Share of its information that a direction keeps at least, so that the matrix stays positive definite.
@@ -375,7 +404,7 @@ mod tests {
             } + noise;
             information += jacobian * jacobian.transpose();
         }
-        let horizontal = Horizontal::of(&information, 1200.0).unwrap();
+        let horizontal = Horizontal::new(&information, 1200.0).unwrap();
         let sigma = |information: &Matrix6<f64>, axis: usize| {
             information.try_inverse().unwrap()[(axis, axis)].sqrt()
         };
