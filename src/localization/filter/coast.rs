@@ -2,7 +2,7 @@
 
 use nalgebra::Matrix3;
 
-use super::state::ParticleFilter;
+use super::state::{ParticleFilter, Pending};
 use crate::localization::estimate::Estimate;
 use crate::localization::motion::{TurnDriveTurn, VelocityCommand};
 use crate::localization::odometry::Odometry;
@@ -12,11 +12,13 @@ impl ParticleFilter {
     /// Moves the last estimate by the motion since the last update.
     pub(super) fn coast(&mut self, odometry: Odometry, attitude: &SensorAttitude) -> Estimate {
         let mut particles = self.particles.clone();
-        particles.propagate(|pose| pose * self.pending);
-        let covariance = self.covariance_after_pending(odometry);
-        let pose = match self.compares_places() {
-            true => self.estimate * self.pending,
-            false => particles.mean(),
+        let pending = self.pending.unwrap_or_default();
+        particles.propagate(|pose| pose * pending.motion);
+        let covariance = self.covariance_after(&pending, odometry);
+        let pose = if self.compares_places() {
+            self.updated.pose * pending.motion
+        } else {
+            particles.mean()
         };
         self.estimate_of(pose, particles, covariance, attitude)
     }
@@ -29,28 +31,29 @@ impl ParticleFilter {
     ///
     /// N is the noise of one update, in the axes of the car, and s the share of the motion that triggers an
     /// update: a standing car does not lose certainty.
-    fn covariance_after_pending(&self, odometry: Odometry) -> Matrix3<f64> {
+    fn covariance_after(&self, pending: &Pending, odometry: Odometry) -> Matrix3<f64> {
         let config = &self.config;
-        let moved_m = self.pending.translation.vector.norm();
-        let turned_rad = self.pending.rotation.angle().abs();
+        let motion = &pending.motion;
+        let moved_m = motion.translation.vector.norm();
+        let turned_rad = motion.rotation.angle().abs();
         let share = (moved_m / config.move_thres_m).max(turned_rad / config.turn_thres_rad);
         let noise = if let Odometry::Velocity(_) = odometry {
-            let command = VelocityCommand::driving(&self.pending, self.pending_duration);
+            let command = VelocityCommand::driving(motion, pending.duration);
             config.velocity.covariance(&command)
         } else {
-            config
-                .motion
-                .covariance(&TurnDriveTurn::decompose(&self.pending))
+            config.motion.covariance(&TurnDriveTurn::decompose(motion))
         };
-        let step = self.estimate.rotation * self.pending.translation.vector;
+        let updated = &self.updated;
+        let step = updated.pose.rotation * motion.translation.vector;
         let jacobian = Matrix3::new(1.0, 0.0, -step.y, 0.0, 1.0, step.x, 0.0, 0.0, 1.0);
-        let rotation = self.estimate.rotation.to_rotation_matrix().to_homogeneous();
+        let rotation = updated.pose.rotation.to_rotation_matrix().to_homogeneous();
         // With thresholds of zero every motion triggers an update, and none is ever pending.
-        let share = match share.is_finite() {
-            true => share.min(1.0),
-            false => 0.0,
+        let share = if share.is_finite() {
+            share.min(1.0)
+        } else {
+            0.0
         };
-        jacobian * self.covariance * jacobian.transpose()
+        jacobian * updated.covariance * jacobian.transpose()
             + share * rotation * noise * rotation.transpose()
     }
 }

@@ -3,7 +3,8 @@
 //! ```text
 //! propagate      x ~ p(x | x_before, odometry)           motion
 //! reweight       w ∝ w · p(scan | x, map)ᵝ               observation, tempering
-//! estimate       weighted mean, covariance, state        particles, tracking_loss
+//! estimate       weighted mean, covariance              particles
+//! phase          searching, tracking, lost              phase, tracking_loss
 //! resample       when few particles carry the weight     resampling
 //! ```
 //!
@@ -13,6 +14,7 @@
 //! particles are enough; they are sampled where odometry and scan agree
 //! ([`proposal`](super::proposal)).
 
+mod phase;
 mod state;
 
 mod coast;

@@ -11,7 +11,6 @@ use crate::localization::observation::choose_beams;
 use crate::localization::odometry::Odometry;
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::proposal::{Gaussian, regular};
-use crate::localization::tracking_loss::State;
 use crate::map::SensorAttitude;
 use crate::registration::register;
 use crate::rendering::RenderError;
@@ -40,9 +39,10 @@ impl ParticleFilter {
         rng: &mut impl Rng,
     ) -> Result<Option<Pose3>, RenderError> {
         let config = &self.config.proposal;
-        let predicted = self.particles.mean() * self.pending * self.increment(odometry);
+        let pending = self.pending.unwrap_or_default().motion;
+        let predicted = self.particles.mean() * pending * self.increment(odometry);
         let patch = self.patch_at(&predicted).or(self.patch);
-        let Some(patch) = patch.filter(|_| self.state == State::Tracking) else {
+        let Some(patch) = patch.filter(|_| self.phase.is_tracking()) else {
             return Ok(None);
         };
         let beams = choose_beams(scan, config.beams, config.road_share, attitude, rng);
@@ -60,7 +60,7 @@ impl ParticleFilter {
         rng: &mut impl Rng,
     ) -> Result<Option<Proposal>, RenderError> {
         let config = &self.config.proposal;
-        if !config.scan || self.state != State::Tracking {
+        if !config.scan || !self.phase.is_tracking() {
             return Ok(None);
         }
         let mean = self.particles.mean();

@@ -2,12 +2,13 @@
 
 use rand::Rng;
 
-use super::state::{ParticleFilter, Search};
+use super::phase::Phase;
+use super::state::{ParticleFilter, Updated};
 use crate::lidar::RangeImage;
 use crate::localization::initialization::from_panoramas;
 use crate::localization::particles::ParticleSet;
 use crate::localization::resampling::{jitter, kld_sample_size, occupied_bins, systematic};
-use crate::localization::tracking_loss::{AgreementMonitor, State};
+use crate::localization::tracking_loss::AgreementMonitor;
 use crate::map::SensorAttitude;
 use crate::rendering::RenderError;
 
@@ -19,12 +20,13 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<(), RenderError> {
-        if self.state == State::Lost && self.restart_search(scan, attitude, rng)? {
+        let is_lost = matches!(self.phase, Phase::Lost { .. });
+        if is_lost && self.restart_search(scan, attitude, rng)? {
             return Ok(());
         }
         let size = self.particles.len();
         let threshold = self.config.resampling.min_effective_fraction * size as f64;
-        let shrinks = self.state == State::Tracking && size != self.config.num_reduced;
+        let shrinks = self.phase.is_tracking() && size != self.config.num_reduced;
         let is_depleted =
             !self.compares_places() && self.particles.effective_sample_size() < threshold;
         if shrinks || is_depleted {
@@ -55,23 +57,20 @@ impl ParticleFilter {
         let before = self.particles.particles();
         particles.extend(kept.into_iter().map(|index| before[index]));
         self.particles = ParticleSet::uniform(particles);
-        self.search = Search::of(&self.particles);
+        self.phase = Phase::from_particles(&self.particles);
         // Valid until the next update.
-        self.estimate = self.particles.mean();
-        self.covariance = self.particles.covariance_about(&self.estimate);
-        self.is_narrow = false;
-        self.last_increment = None;
+        self.updated = Updated::from_particles(&self.particles);
+        self.last_motion = None;
         self.agreement = AgreementMonitor::default();
-        self.updates_in_state = 0;
-        self.state = State::Searching;
         Ok(true)
     }
 
     /// Resamples as many particles as the distribution needs, with jitter.
     pub(super) fn resample(&mut self, rng: &mut impl Rng) {
-        let count = match self.state {
-            State::Tracking => self.config.num_reduced,
-            State::Searching | State::Lost => self.searching_size(),
+        let count = if self.phase.is_tracking() {
+            self.config.num_reduced
+        } else {
+            self.searching_size()
         };
         let covariance = self.particles.covariance_about(&self.particles.mean());
         let indices = systematic(&self.particles.weights(), count, rng);

@@ -2,14 +2,13 @@
 
 use rand::Rng;
 
-use super::state::ParticleFilter;
+use super::state::{LastMotion, ParticleFilter, Updated};
 use crate::geometry::{Pose2, Pose3};
 use crate::lidar::{Beam, RangeImage};
 use crate::localization::estimate::Estimate;
 use crate::localization::observation::{choose_beams, costs_of_scan, ground_patch_of, near_points};
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::tempering::exponent;
-use crate::localization::tracking_loss::State;
 use crate::map::{GroundPatch, SensorAttitude};
 use crate::rendering::RenderError;
 
@@ -48,9 +47,11 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Update, RenderError> {
-        let rounds = match self.state {
-            State::Tracking => self.config.tempering.tracking_rounds,
-            State::Searching | State::Lost => self.config.tempering.searching_rounds,
+        let tempering = &self.config.tempering;
+        let rounds = if self.phase.is_tracking() {
+            tempering.tracking_rounds
+        } else {
+            tempering.searching_rounds
         };
         let (mut power, mut round) = (0.0, 1);
         loop {
@@ -105,22 +106,27 @@ impl ParticleFilter {
     /// Estimate of an updated frame, which is kept for the next frames.
     pub(super) fn updated_estimate(&mut self, update: &Update) -> Estimate {
         let pose = update.place.unwrap_or_else(|| self.particles.mean());
-        self.covariance = match update.place {
+        let covariance = match update.place {
             Some(_) => self.particles.covariance_about(&pose),
             None => self.particles.covariance_of_estimate(),
         };
         let particles = self.particles.clone();
-        let mut estimate = self.estimate_of(pose, particles, self.covariance, &update.attitude);
+        let mut estimate = self.estimate_of(pose, particles, covariance, &update.attitude);
         estimate.updated = true;
         estimate.mean_cost_m = weighted_mean(&self.particles, &update.costs_m);
         let is_narrow = self.is_narrow();
         // A jump of a wide distribution is not a motion of the car.
-        if self.is_narrow && is_narrow {
-            self.last_increment = Some(self.estimate.inverse() * estimate.pose);
-            self.last_duration_s = self.duration_s;
+        if self.updated.is_narrow && is_narrow {
+            self.last_motion = Some(LastMotion {
+                increment: self.updated.pose.inverse() * pose,
+                duration_s: self.duration_s,
+            });
         }
-        self.is_narrow = is_narrow;
-        self.estimate = estimate.pose;
+        self.updated = Updated {
+            pose,
+            covariance,
+            is_narrow,
+        };
         estimate
     }
 
@@ -139,7 +145,7 @@ impl ParticleFilter {
 
     /// Aligns the particles to the ground of the map and returns their poses in space.
     fn align_to_ground(&mut self, attitude: &SensorAttitude) -> Vec<Option<Pose3>> {
-        let remembered = self.patch.filter(|_| self.state == State::Tracking);
+        let remembered = self.patch.filter(|_| self.phase.is_tracking());
         let particles = self.particles.particles();
         let patches: Vec<Option<GroundPatch>> = particles
             .iter()

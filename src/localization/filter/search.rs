@@ -7,28 +7,28 @@ use nalgebra::{Matrix3, Vector3};
 use rand::Rng;
 use rayon::prelude::*;
 
+use super::phase::Search;
 use super::reweight::Update;
-use super::state::{ParticleFilter, Search};
+use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
 use crate::localization::observation::{choose_beams, costs_of_scan, ground_patch_of};
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::places::{best_of_each, is_same, weights_after, weights_in};
 use crate::localization::proposal::{Gaussian, regular};
-use crate::localization::tracking_loss::State;
 use crate::map::{GroundPatch, SensorAttitude};
-use crate::registration::{RegistrationConfig, register};
+use crate::registration::{RegistrationResult, register_coarse_to_fine};
 use crate::rendering::RenderError;
 
 /// A place where the car may be.
-struct Place {
+struct PlaceHypothesis {
     /// Registered pose where registration succeeded, else that of a particle.
     map_from_lidar: Pose3,
     distribution: Gaussian,
     patch: GroundPatch,
 }
 
-impl Place {
+impl PlaceHypothesis {
     fn pose(&self) -> &Pose2 {
         &self.distribution.mean
     }
@@ -37,14 +37,15 @@ impl Place {
 impl ParticleFilter {
     /// Whether places are compared instead of particles.
     pub(super) fn compares_places(&self) -> bool {
-        let is_far_apart = self.search != Search::Around && !self.is_narrow();
-        self.config.proposal.scan && self.state != State::Tracking && is_far_apart
+        let search = self.phase.search();
+        let are_several = search.is_some_and(|search| search != Search::Around);
+        self.config.proposal.scan && are_several && !self.is_narrow()
     }
 
     /// Number of places where the car may be.
     pub(super) fn likely_places(&self) -> usize {
-        match self.search {
-            Search::Places { likely } if self.compares_places() => likely,
+        match self.phase.search() {
+            Some(Search::Places { likely }) if self.compares_places() => likely,
             _ => 1,
         }
     }
@@ -68,8 +69,8 @@ impl ParticleFilter {
         );
         let beams = choose_beams(scan, count, road_share, attitude, rng);
         let costs_m = self.costs_of_places(&registered, (scan, &beams))?;
-        let poses = registered.iter().map(Place::pose);
-        let (places, costs_m): (Vec<&Place>, Vec<f64>) =
+        let poses = registered.iter().map(PlaceHypothesis::pose);
+        let (places, costs_m): (Vec<&PlaceHypothesis>, Vec<f64>) =
             (best_of_each(poses, &costs_m, config.most, config.radius_m).into_iter())
                 .filter_map(|index| Some((&registered[index], costs_m[index]?)))
                 .unzip();
@@ -82,7 +83,7 @@ impl ParticleFilter {
         let attitude = places[best].patch.attitude_of(&places[best].map_from_lidar);
         let costs_m = self.sample_places(&places, &weights, &costs_m, rng);
         let likely = weights.iter().filter(|&&weight| weight >= LIKELY).count();
-        self.search = Search::Places { likely };
+        self.phase.set_search(Search::Places { likely });
         Ok(Some(Update {
             costs_m,
             beams,
@@ -118,19 +119,13 @@ impl ParticleFilter {
         scan: &RangeImage,
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
-    ) -> Result<Vec<Place>, RenderError> {
+    ) -> Result<Vec<PlaceHypothesis>, RenderError> {
         /// Number of registered beams.
         const BEAMS: usize = 800;
         /// Scale of the robust kernel for particles that are a metre off [m].
         const WIDE_KERNEL_M: f64 = 0.4;
         let config = &self.config.proposal;
         let beams = choose_beams(scan, BEAMS, config.road_share, attitude, rng);
-        let exact = &config.registration;
-        let wide = RegistrationConfig {
-            kernel_m: exact.kernel_m.max(WIDE_KERNEL_M),
-            tolerance_m: 0.01,
-            ..exact.clone()
-        };
         let radius_m = self.config.places.radius_m;
         let place = |&seed: &usize| {
             let particle = &self.particles.particles()[seed];
@@ -138,21 +133,21 @@ impl ParticleFilter {
                 return Ok(None);
             };
             let start = particle.map_from_lidar;
-            let mut pose = patch.lift(&start, attitude);
-            let mut covariance = None;
-            for config in [&wide, exact] {
-                let found = register(&*self.map.renderer, &beams, &pose, config)?;
-                let is_here = |pose: &Pose3| is_same(&start, &pose2_from_pose3(pose), radius_m);
-                let Some(found) = found.filter(|found| is_here(&found.map_from_lidar)) else {
-                    break;
-                };
-                pose = found.map_from_lidar;
-                covariance = Some(found.planar_covariance());
-            }
+            let lifted = patch.lift(&start, attitude);
+            let found = register_coarse_to_fine(
+                &*self.map.renderer,
+                [&beams, &beams],
+                &lifted,
+                WIDE_KERNEL_M,
+                &config.registration,
+                |pose| is_same(&start, &pose2_from_pose3(pose), radius_m),
+            )?;
+            let covariance = (found.as_ref()).map(RegistrationResult::planar_covariance);
+            let pose = found.map_or(lifted, |found| found.map_from_lidar);
             let mean = pose2_from_pose3(&pose);
             Ok(within_place(covariance, radius_m)
                 .and_then(|covariance| Gaussian::new(mean, covariance))
-                .map(|distribution| Place {
+                .map(|distribution| PlaceHypothesis {
                     map_from_lidar: pose,
                     distribution,
                     patch,
@@ -164,7 +159,7 @@ impl ParticleFilter {
 
     fn costs_of_places(
         &self,
-        places: &[Place],
+        places: &[PlaceHypothesis],
         scan_and_beams: (&RangeImage, &[Beam]),
     ) -> Result<Vec<Option<f64>>, RenderError> {
         let poses: Vec<_> = places
@@ -177,20 +172,21 @@ impl ParticleFilter {
 
     /// Weights of the places in the prediction. Those of the first scan are equal: the panoramas from which the
     /// particles were sampled have compared the same scan.
-    fn weights_before(&self, places: &[&Place], radius_m: f64) -> Vec<f64> {
+    fn weights_before(&self, places: &[&PlaceHypothesis], radius_m: f64) -> Vec<f64> {
         let poses: Vec<Pose2> = places.iter().map(|place| *place.pose()).collect();
         let weights = weights_in(&poses, self.particles.particles(), radius_m);
-        match matches!(self.search, Search::Places { .. }) && weights.iter().sum::<f64>() > 0.0 {
-            true => weights,
-            false => vec![1.0; places.len()],
+        let is_first = !matches!(self.phase.search(), Some(Search::Places { .. }));
+        if is_first || weights.iter().sum::<f64>() <= 0.0 {
+            return vec![1.0; places.len()];
         }
+        weights
     }
 
     /// Samples the particles of the places, in proportion to their weights and at least a few for each; returns
     /// the costs of the particles [m].
     fn sample_places(
         &mut self,
-        places: &[&Place],
+        places: &[&PlaceHypothesis],
         weights: &[f64],
         costs_m: &[f64],
         rng: &mut impl Rng,

@@ -4,13 +4,14 @@ use std::time::Duration;
 
 use nalgebra::{Matrix3, Vector3};
 
+use super::phase::Phase;
 use crate::geometry::Pose2;
 use crate::lidar::PERIOD_S;
 use crate::localization::config::LocalizerConfig;
 use crate::localization::convergence::is_narrow;
 use crate::localization::estimate::Estimate;
-use crate::localization::particles::{ParticleSet, long_axis_m, spread};
-use crate::localization::tracking_loss::{AgreementMonitor, State};
+use crate::localization::particles::{ParticleSet, long_axis_m};
+use crate::localization::tracking_loss::AgreementMonitor;
 use crate::map::{GroundPatch, Map, PanoramaRequest, SensorAttitude};
 
 /// A distribution over planar poses, `map_from_lidar`, updated frame by frame.
@@ -21,56 +22,55 @@ pub struct ParticleFilter {
     /// filter reports the loss and stays lost.
     pub(super) restart: Option<PanoramaRequest>,
     pub(super) particles: ParticleSet,
-    /// Motion since the last update, `updated_from_current`.
-    pub(super) pending: Pose2,
-    /// Duration of the velocity commands since the last update.
-    pub(super) pending_duration: Duration,
-    /// Last estimate of an updated frame.
-    pub(super) estimate: Pose2,
-    /// Its covariance [m², m·rad, rad²].
-    pub(super) covariance: Matrix3<f64>,
-    /// Whether the distribution around it was narrow.
-    pub(super) is_narrow: bool,
-    /// Motion into it, for frames without odometry; `None` while unknown.
-    pub(super) last_increment: Option<Pose2>,
-    /// Duration of that motion [s].
-    pub(super) last_duration_s: f64,
+    pub(super) phase: Phase,
+    pub(super) agreement: AgreementMonitor,
+    /// The last update, or what is known before the first.
+    pub(super) updated: Updated,
+    /// Motion since then; `None` before the first update.
+    pub(super) pending: Option<Pending>,
+    /// Motion between the last updates, for frames without odometry; `None` while unknown.
+    pub(super) last_motion: Option<LastMotion>,
     /// Time since the previous frame [s].
     pub(super) duration_s: f64,
     /// Last known ground below the estimate.
     pub(super) patch: Option<GroundPatch>,
+    /// Attitude of the sensor in the last update.
     pub(super) attitude: Option<SensorAttitude>,
-    pub(super) state: State,
-    pub(super) agreement: AgreementMonitor,
-    pub(super) updates_in_state: usize,
-    /// Whether the pose was confirmed since the distribution was last too wide for it to be called tracked.
-    pub(super) is_sure: bool,
-    pub(super) search: Search,
-    pub(super) is_first: bool,
 }
 
-/// What the particles represent until the filter tracks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Search {
-    /// The surroundings of a known start.
-    Around,
-    /// Many places, none of them registered yet.
-    Anywhere,
-    /// Places with their weights.
-    Places {
-        /// Number of places that are likely.
-        likely: usize,
-    },
+/// Estimate of an update.
+pub(super) struct Updated {
+    pub pose: Pose2,
+    /// Its covariance [m², m·rad, rad²].
+    pub covariance: Matrix3<f64>,
+    /// Whether the distribution around it was narrow.
+    pub is_narrow: bool,
 }
 
-impl Search {
-    /// Of particles with which a search starts.
-    pub fn of(particles: &ParticleSet) -> Self {
-        /// Standard deviation of the position around a known start, at most [m].
-        const AROUND_M: f64 = 10.0;
-        match spread(&particles.covariance_about(&particles.mean())).0 > AROUND_M {
-            true => Self::Anywhere,
-            false => Self::Around,
+/// Motion since the last update.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Pending {
+    /// `updated_from_current`.
+    pub motion: Pose2,
+    /// Duration of the velocity commands in it.
+    pub duration: Duration,
+}
+
+/// Motion between two updates.
+pub(super) struct LastMotion {
+    /// `previous_from_updated`.
+    pub increment: Pose2,
+    pub duration_s: f64,
+}
+
+impl Updated {
+    /// The estimate that particles give by themselves.
+    pub fn from_particles(particles: &ParticleSet) -> Self {
+        let pose = particles.mean();
+        Self {
+            pose,
+            covariance: particles.covariance_about(&pose),
+            is_narrow: false,
         }
     }
 }
@@ -83,28 +83,21 @@ impl ParticleFilter {
         restart: Option<PanoramaRequest>,
         particles: ParticleSet,
     ) -> Self {
-        let estimate = particles.mean();
+        let updated = Updated::from_particles(&particles);
+        let level_m = particles.best().level_m;
         Self {
-            patch: map.ground.patch_under(&estimate, particles.best().level_m),
+            patch: map.ground.patch_under(&updated.pose, level_m),
             config,
             map,
             restart,
-            covariance: particles.covariance_about(&estimate),
-            search: Search::of(&particles),
+            phase: Phase::from_particles(&particles),
             particles,
-            pending: Pose2::identity(),
-            pending_duration: Duration::ZERO,
-            estimate,
-            is_narrow: false,
-            last_increment: None,
-            last_duration_s: PERIOD_S,
+            agreement: AgreementMonitor::default(),
+            updated,
+            pending: None,
+            last_motion: None,
             duration_s: PERIOD_S,
             attitude: None,
-            state: State::Searching,
-            agreement: AgreementMonitor::default(),
-            updates_in_state: 0,
-            is_sure: true,
-            is_first: true,
         }
     }
 
@@ -113,20 +106,10 @@ impl ParticleFilter {
         self.duration_s = duration_s;
     }
 
-    /// Searching, tracking or lost.
-    pub fn state(&self) -> State {
-        self.state
-    }
-
-    /// The particles with which the next frame starts.
-    pub fn particles(&self) -> &ParticleSet {
-        &self.particles
-    }
-
     /// Attitude of the sensor in the last frame if it is a good start for the next: while tracking it
     /// comes from the map, which is more accurate than the ground plane of a single scan.
     pub fn attitude(&self) -> Option<SensorAttitude> {
-        let proposes = self.config.proposal.scan && self.state == State::Tracking;
+        let proposes = self.config.proposal.scan && self.phase.is_tracking();
         self.attitude.filter(|_| proposes)
     }
 
@@ -155,7 +138,7 @@ impl ParticleFilter {
             mean_cost_m: None,
             agreement: None,
             places: self.likely_places(),
-            state: self.reported_state(&covariance),
+            state: self.phase.reported(self.is_precise(&covariance)),
             updated: false,
             on_mapped_ground: found.is_some(),
             motion: None,
@@ -163,17 +146,9 @@ impl ParticleFilter {
         }
     }
 
-    /// The state, of a frame whose estimate has a covariance: tracking only if that is small.
-    pub(super) fn reported_state(&self, covariance: &Matrix3<f64>) -> State {
-        match self.state {
-            State::Tracking if !self.is_sure || self.is_too_wide(covariance) => State::Searching,
-            state => state,
-        }
-    }
-
-    /// Whether a position with a covariance is too uncertain to be called tracked.
-    pub(super) fn is_too_wide(&self, covariance: &Matrix3<f64>) -> bool {
-        long_axis_m(covariance) > self.config.tracking_loss.sure_spread_m
+    /// Whether a position with a covariance is certain enough to be reported as tracked.
+    pub(super) fn is_precise(&self, covariance: &Matrix3<f64>) -> bool {
+        long_axis_m(covariance) <= self.config.tracking_loss.sure_spread_m
     }
 
     /// Ground patch under a pose near the particles.

@@ -1,10 +1,9 @@
-//! One step of the filter: propagation, measurement update, change of the state, resampling.
-
-use std::time::Duration;
+//! One step of the filter: propagation, measurement update, change of the phase, resampling.
 
 use rand::Rng;
 
-use super::state::ParticleFilter;
+use super::phase::Evidence;
+use super::state::{ParticleFilter, Pending};
 use crate::geometry::{Pose2, Pose3};
 use crate::lidar::{Beam, PERIOD_S, RangeImage};
 use crate::localization::convergence::is_converged;
@@ -14,7 +13,6 @@ use crate::localization::observation::{above_road, agreement, ranges_along};
 use crate::localization::odometry::Odometry;
 use crate::localization::particles::spread;
 use crate::localization::resampling::systematic;
-use crate::localization::tracking_loss::State;
 use crate::map::SensorAttitude;
 use crate::rendering::RenderError;
 
@@ -28,9 +26,7 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Estimate, RenderError> {
-        if !self.is_first {
-            self.accumulate(odometry);
-        }
+        self.accumulate(odometry);
         if !self.is_update_due(odometry) {
             return Ok(self.coast(odometry, attitude));
         }
@@ -43,72 +39,74 @@ impl ParticleFilter {
         estimate.agreement =
             self.agreement_at(&estimate.map_from_lidar, &update.beams, &update.attitude)?;
         self.attitude = Some(update.attitude);
-        self.change_state(estimate.agreement, odometry);
-        self.is_sure = self.state != State::Tracking
-            || !self.is_too_wide(&estimate.covariance)
-                && (self.is_sure
-                    || (self.agreement).is_usual(estimate.agreement, &self.config.tracking_loss));
+        let evidence = self.evidence(&estimate, odometry);
+        self.phase = (self.phase).after(&evidence, self.config.tracking_loss.patience);
         estimate.places = self.likely_places();
-        estimate.state = self.reported_state(&estimate.covariance);
+        estimate.state = self.phase.reported(evidence.is_precise);
         self.prepare_next(scan, attitude, rng)?;
         Ok(estimate)
     }
 
     /// Adds the motion into a frame to the motion since the last update.
     fn accumulate(&mut self, odometry: Odometry) {
-        self.pending *= self.increment(odometry);
+        let increment = self.increment(odometry);
+        let Some(pending) = &mut self.pending else {
+            return;
+        };
+        pending.motion *= increment;
         if let Odometry::Velocity(command) = odometry {
-            self.pending_duration += command.duration;
+            pending.duration += command.duration;
         }
     }
 
     /// Motion into a frame.
     pub(super) fn increment(&self, odometry: Odometry) -> Pose2 {
         odometry.in_plane().unwrap_or_else(|| {
-            let last = self.last_increment.unwrap_or_else(Pose2::identity);
-            let share = self.duration_s / self.last_duration_s;
-            let translation = last.translation.vector * share;
-            Pose2::new(translation, last.rotation.angle() * share)
+            let Some(last) = &self.last_motion else {
+                return Pose2::identity();
+            };
+            let share = self.duration_s / last.duration_s;
+            let translation = last.increment.translation.vector * share;
+            Pose2::new(translation, last.increment.rotation.angle() * share)
         })
     }
 
     /// Without odometry every scan is used: nothing else shows whether the car moves.
     fn is_update_due(&self, odometry: Odometry) -> bool {
-        self.is_first
-            || odometry == Odometry::Unknown
-            || self.pending.translation.vector.norm() > self.config.move_thres_m
-            || self.pending.rotation.angle().abs() > self.config.turn_thres_rad
+        let moved_far = |pending: &Pending| {
+            pending.motion.translation.vector.norm() > self.config.move_thres_m
+                || pending.motion.rotation.angle().abs() > self.config.turn_thres_rad
+        };
+        odometry == Odometry::Unknown || self.pending.as_ref().is_none_or(moved_far)
     }
 
     /// Moves the particles by noisy copies of the motion since the last update.
     fn propagate(&mut self, odometry: Odometry, rng: &mut impl Rng) {
-        if !self.is_first {
-            if odometry == Odometry::Unknown && self.last_increment.is_none() {
-                // The distribution becomes as wide as at the start and needs as many particles.
-                let weights = self.particles.weights();
-                let indices = systematic(&weights, self.config.num_particles, rng);
-                self.particles = self.particles.selected(&indices);
-            }
-            let config = &self.config;
-            if let Odometry::Velocity(_) = odometry {
-                let command = VelocityCommand::driving(&self.pending, self.pending_duration);
-                self.particles
-                    .propagate(|pose| pose * command.sample(&config.velocity, rng));
-            } else {
-                let motion = TurnDriveTurn::decompose(&self.pending);
-                let periods = self.duration_s / PERIOD_S;
-                let noise = match (odometry, self.last_increment) {
-                    (Odometry::Unknown, None) => config.unknown_velocity.scaled(periods),
-                    (Odometry::Unknown, Some(_)) => config.constant_velocity.scaled(periods),
-                    _ => config.motion.clone(),
-                };
-                self.particles
-                    .propagate(|pose| pose * motion.sample(&noise, rng));
-            }
+        let Some(pending) = self.pending.replace(Pending::default()) else {
+            return;
+        };
+        if odometry == Odometry::Unknown && self.last_motion.is_none() {
+            // The distribution becomes as wide as at the start and needs as many particles.
+            let weights = self.particles.weights();
+            let indices = systematic(&weights, self.config.num_particles, rng);
+            self.particles = self.particles.selected(&indices);
         }
-        self.is_first = false;
-        self.pending = Pose2::identity();
-        self.pending_duration = Duration::ZERO;
+        let config = &self.config;
+        if let Odometry::Velocity(_) = odometry {
+            let command = VelocityCommand::driving(&pending.motion, pending.duration);
+            self.particles
+                .propagate(|pose| pose * command.sample(&config.velocity, rng));
+        } else {
+            let motion = TurnDriveTurn::decompose(&pending.motion);
+            let periods = self.duration_s / PERIOD_S;
+            let noise = match (odometry, &self.last_motion) {
+                (Odometry::Unknown, None) => config.unknown_velocity.scaled(periods),
+                (Odometry::Unknown, Some(_)) => config.constant_velocity.scaled(periods),
+                _ => config.motion.clone(),
+            };
+            self.particles
+                .propagate(|pose| pose * motion.sample(&noise, rng));
+        }
     }
 
     /// Share of the beams above the road that agree with the map at a pose.
@@ -126,33 +124,25 @@ impl ParticleFilter {
         Ok(agreement(&beams, &rendered_m, tolerance_m))
     }
 
-    fn change_state(&mut self, agreement: Option<f64>, odometry: Odometry) {
+    /// What an update shows, of which the averages of the agreement are kept.
+    fn evidence(&mut self, estimate: &Estimate, odometry: Odometry) -> Evidence {
         let config = &self.config.tracking_loss;
+        let agreement = estimate.agreement;
         // Without a known motion the next frame cannot be predicted.
-        let knows_motion = odometry != Odometry::Unknown || self.last_increment.is_some();
+        let knows_motion = odometry != Odometry::Unknown || self.last_motion.is_some();
         let is_converged = knows_motion
             && is_converged(&self.particles, &self.map.tiles, &self.config.convergence);
-        if is_converged || self.state == State::Tracking {
+        if is_converged || self.phase.is_tracking() {
             self.agreement.observe(agreement, config);
         }
         let covariance = self.particles.covariance_about(&self.particles.mean());
-        let is_wide = self.state == State::Tracking && spread(&covariance).0 > config.max_spread_m;
-        let is_lost = is_wide || self.agreement.is_lost(config);
-        let is_found = self.agreement.confirm(is_converged, agreement, config);
-        // Places that look alike and agree with the scan are told apart by driving.
-        let are_alike = self.compares_places() && agreement >= Some(config.min_agreement);
-        let is_stuck = self.updates_in_state >= config.patience;
-        let next = match self.state {
-            _ if is_lost => State::Lost,
-            State::Searching if is_found => State::Tracking,
-            State::Searching if is_stuck => State::Lost,
-            State::Lost if is_found => State::Tracking,
-            state => state,
-        };
-        self.updates_in_state = match next == self.state && !are_alike {
-            true => self.updates_in_state + 1,
-            false => 0,
-        };
-        self.state = next;
+        Evidence {
+            disagrees: self.agreement.is_lost(config),
+            is_scattered: spread(&covariance).0 > config.max_spread_m,
+            is_confirmed: self.agreement.confirm(is_converged, agreement, config),
+            are_alike: agreement >= Some(config.min_agreement) && self.compares_places(),
+            is_precise: self.is_precise(&estimate.covariance),
+            is_usual: self.agreement.is_usual(agreement, config),
+        }
     }
 }
