@@ -149,7 +149,7 @@ fn starts(
     let [position_m, heading_deg] = config.uncertainty;
     let deviations = [position_m, heading_deg.to_radians()];
     let times_s = scans.times_s();
-    Ok(InitialEstimate::of_rough(
+    Ok(InitialEstimate::from_rough(
         &poses,
         deviations,
         &increments,

@@ -41,7 +41,7 @@ pub struct TruthAgreement {
 impl TruthAgreement {
     /// Compares a map with the truth that is visible from `map_from_lidar` inside the crop box, both in
     /// the map frame; `None` where either is empty.
-    pub fn of(
+    pub fn new(
         mesh: &TriangleMesh,
         truth: &TriangleMesh,
         map_from_lidar: &[Pose3],
@@ -162,7 +162,7 @@ mod tests {
 
     fn agreement(mesh: &TriangleMesh) -> TruthAgreement {
         let truth = floor(10.0, -1.7);
-        TruthAgreement::of(mesh, &truth, &[Pose3::identity()], &ScanConfig::default()).unwrap()
+        TruthAgreement::new(mesh, &truth, &[Pose3::identity()], &ScanConfig::default()).unwrap()
     }
 
     #[test]

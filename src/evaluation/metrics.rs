@@ -125,7 +125,7 @@ pub enum MetricsError {
 
 impl TrajectoryMetrics {
     /// Computes the metrics of a trajectory.
-    pub fn of(
+    pub fn new(
         trajectory: &EvaluatedTrajectory,
         config: &MetricsConfig,
     ) -> Result<Self, MetricsError> {
@@ -154,12 +154,12 @@ impl TrajectoryMetrics {
         Some(Self {
             frames: errors.len(),
             distance_m: *driven_m.last()?,
-            position_m: Summary::of(&distance)?,
+            position_m: Summary::new(&distance)?,
             x_rmse_m: rms(&column(|error| error.offset_in_map.x))?,
             y_rmse_m: rms(&column(|error| error.offset_in_map.y))?,
             along: AxisError::of(&column(|error| error.along_m))?,
             across: AxisError::of(&column(|error| error.across_m))?,
-            heading_rad: Summary::of(&column(|error| error.turn_rad))?,
+            heading_rad: Summary::new(&column(|error| error.turn_rad))?,
             convergence: (config.success).convergence(&all_errors, &all_distances_m, whole.times_s),
             smoothness: Smoothness::of(&counted, errors),
             drift: slope(&driven_m, &distance),
@@ -167,7 +167,7 @@ impl TrajectoryMetrics {
             rpe_translation_m: relative.translation(),
             rpe_rotation_rad: relative.rotation(),
             segments: kitti_segment_errors(&estimates, &truth),
-            runtime_s: counted.runtimes_s.and_then(Summary::of),
+            runtime_s: counted.runtimes_s.and_then(Summary::new),
             first_runtime_s: whole.runtimes_s.and_then(|all| all.first().copied()),
         })
     }
@@ -264,7 +264,7 @@ mod tests {
             times_s: None,
             runtimes_s: None,
         };
-        TrajectoryMetrics::of(&trajectory, &MetricsConfig::default()).unwrap()
+        TrajectoryMetrics::new(&trajectory, &MetricsConfig::default()).unwrap()
     }
 
     #[test]
@@ -336,12 +336,12 @@ mod tests {
             runtimes_s: None,
         };
         let config = MetricsConfig::default();
-        let message = TrajectoryMetrics::of(&trajectory, &config)
+        let message = TrajectoryMetrics::new(&trajectory, &config)
             .unwrap_err()
             .to_string();
         assert!(message.contains("10 frames are too few"), "{message}");
         trajectory.ground_truth = &truth[1..];
-        let message = TrajectoryMetrics::of(&trajectory, &config)
+        let message = TrajectoryMetrics::new(&trajectory, &config)
             .unwrap_err()
             .to_string();
         assert!(message.contains("9 true poses for 10 frames"), "{message}");

@@ -41,12 +41,12 @@ impl PoseErrors {
 
     /// Summary of the translations [m]; `None` without errors.
     pub fn translation(&self) -> Option<Summary> {
-        Summary::of(&self.translations_m)
+        Summary::new(&self.translations_m)
     }
 
     /// Summary of the rotations [rad]; `None` without errors.
     pub fn rotation(&self) -> Option<Summary> {
-        Summary::of(&self.rotations_rad)
+        Summary::new(&self.rotations_rad)
     }
 }
 

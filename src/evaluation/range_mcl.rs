@@ -109,7 +109,7 @@ mod tests {
             .collect()
     }
 
-    fn beside(poses: &[Pose2], left_m: f64, turn_rad: f64) -> Vec<Pose2> {
+    fn shifted(poses: &[Pose2], left_m: f64, turn_rad: f64) -> Vec<Pose2> {
         poses
             .iter()
             .map(|pose| pose * Pose2::new(Vector2::new(0.0, left_m), turn_rad))
@@ -119,7 +119,7 @@ mod tests {
     #[test]
     fn a_constant_offset_is_the_rmse() {
         let truth = straight(301);
-        let errors = RangeMclRules::default().evaluate(&beside(&truth, 0.3, 0.02), &truth);
+        let errors = RangeMclRules::default().evaluate(&shifted(&truth, 0.3, 0.02), &truth);
         assert_eq!(errors.success, Some(true));
         assert_relative_eq!(errors.rmse_location_m.unwrap(), 0.3, epsilon = 1e-12);
         let expected_deg = 0.02_f64.to_degrees();

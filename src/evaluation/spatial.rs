@@ -5,7 +5,7 @@
 //! ```
 //!
 //! The height error is z_P − z_Q in the frame of the truth. Absolute errors are those of the poses as they are
-//! given and, beside them, after a rigid [`alignment`](super::alignment); relative errors are those of
+//! given and after a rigid [`alignment`](super::alignment); relative errors are those of
 //! [segments](super::pose_error::segments) and need none.
 
 use serde::{Deserialize, Serialize};
@@ -19,7 +19,7 @@ use super::pose_error::{
 use super::statistics::{Summary, mean};
 use crate::geometry::Pose3;
 
-/// Errors in space, beside those in the plane.
+/// Errors in space, in addition to those in the plane.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SpatialMetrics {
     /// Distance to the true position [m].
@@ -69,7 +69,7 @@ pub struct LengthErrors {
 impl SpatialMetrics {
     /// Computes the metrics of the frames after the skipped ones; `None` if there are none or the
     /// trajectories differ in length.
-    pub fn of(estimates: &[Pose3], ground_truth: &[Pose3], skip_frames: usize) -> Option<Self> {
+    pub fn new(estimates: &[Pose3], ground_truth: &[Pose3], skip_frames: usize) -> Option<Self> {
         if estimates.len() != ground_truth.len() {
             return None;
         }
@@ -94,7 +94,7 @@ impl SpatialMetrics {
         });
         Some(Self {
             position_m: errors.translation()?,
-            height_m: Summary::of(&heights_m)?,
+            height_m: Summary::new(&heights_m)?,
             height_bias_m: mean(&heights_m)?,
             rotation_rad: errors.rotation()?,
             aligned_position_m: aligned_errors.as_ref().and_then(|it| it.translation()),
@@ -135,13 +135,13 @@ mod tests {
             .collect();
         let mut estimates: Vec<Pose3> = truth.iter().map(|pose| pose * error).collect();
         estimates[0].translation.z = 100.0;
-        let metrics = SpatialMetrics::of(&estimates, &truth, 1).unwrap();
+        let metrics = SpatialMetrics::new(&estimates, &truth, 1).unwrap();
         assert_relative_eq!(metrics.position_m.max, 0.5, epsilon = 1e-9);
         assert_relative_eq!(metrics.height_m.rmse, 0.4, epsilon = 1e-9);
         assert_relative_eq!(metrics.height_bias_m, -0.4, epsilon = 1e-9);
         assert_relative_eq!(metrics.rotation_rad.mean, 0.02, epsilon = 1e-9);
-        assert_eq!(SpatialMetrics::of(&estimates, &truth, 20), None);
-        assert_eq!(SpatialMetrics::of(&estimates[1..], &truth, 0), None);
+        assert_eq!(SpatialMetrics::new(&estimates, &truth, 20), None);
+        assert_eq!(SpatialMetrics::new(&estimates[1..], &truth, 0), None);
     }
     /// A path with curves of steps of 1 m and a little, so that n steps are not below n metres, `scale` times as long.
     fn curve(scale: f64) -> Vec<Pose3> {
@@ -162,7 +162,7 @@ mod tests {
     fn a_rigid_transform_of_the_truth_has_no_error_after_alignment() {
         let truth = curve(1.0);
         let elsewhere = Pose3::new(Vector3::new(70.0, 3.0, 2.0), Vector3::new(0.2, 0.1, 2.0));
-        let metrics = SpatialMetrics::of(&aligned(&elsewhere, &truth), &truth, 0).unwrap();
+        let metrics = SpatialMetrics::new(&aligned(&elsewhere, &truth), &truth, 0).unwrap();
         assert!(metrics.position_m.rmse > 50.0);
         assert!(metrics.aligned_position_m.unwrap().max < 1e-9);
         assert!(metrics.aligned_rotation_rad.unwrap().max < 1e-7);
@@ -174,7 +174,7 @@ mod tests {
     #[test]
     fn a_scale_error_is_the_translation_error_of_every_length_and_of_the_end() {
         let (truth, estimates) = (curve(1.0), curve(1.03));
-        let metrics = SpatialMetrics::of(&estimates, &truth, 0).unwrap();
+        let metrics = SpatialMetrics::new(&estimates, &truth, 0).unwrap();
         assert_relative_eq!(metrics.distance_m, 399.0, epsilon = 1e-5);
         let lengths_m = [5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 300.0];
         assert_eq!(metrics.by_length.len(), lengths_m.len());

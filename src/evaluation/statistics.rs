@@ -19,7 +19,7 @@ pub struct Summary {
 
 impl Summary {
     /// The statistics of the magnitudes of numbers; `None` without numbers.
-    pub fn of(numbers: &[f64]) -> Option<Self> {
+    pub fn new(numbers: &[f64]) -> Option<Self> {
         let mut magnitudes: Vec<f64> = numbers.iter().map(|number| number.abs()).collect();
         magnitudes.sort_by(f64::total_cmp);
         Some(Self {
@@ -71,11 +71,11 @@ mod tests {
 
     #[test]
     fn a_summary_does_not_depend_on_signs_or_order() {
-        let summary = Summary::of(&[3.0, -4.0, 0.0]).unwrap();
-        assert_eq!(summary, Summary::of(&[0.0, 4.0, -3.0]).unwrap());
+        let summary = Summary::new(&[3.0, -4.0, 0.0]).unwrap();
+        assert_eq!(summary, Summary::new(&[0.0, 4.0, -3.0]).unwrap());
         assert_relative_eq!(summary.rmse, (25.0_f64 / 3.0).sqrt(), epsilon = 1e-15);
         assert_eq!((summary.median, summary.max), (3.0, 4.0));
-        assert_eq!(Summary::of(&[]), None);
+        assert_eq!(Summary::new(&[]), None);
     }
 
     #[test]

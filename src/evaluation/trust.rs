@@ -69,8 +69,8 @@ pub struct Trust {
 }
 
 impl Trust {
-    /// Of a run whose columns have the same length.
-    pub fn of(run: &TrustedRun) -> Self {
+    /// The trust of a run whose columns have the same length.
+    pub fn new(run: &TrustedRun) -> Self {
         let errors = planar_errors(run.estimates, run.ground_truth);
         let tracked: Vec<usize> = (0..errors.len()).filter(|&k| run.is_tracking[k]).collect();
         let is_wrong = |k: usize| errors[k].distance_m() > WRONG_M;
@@ -79,7 +79,7 @@ impl Trust {
         let inside = tracked.iter().filter(|&&k| is_inside(k)).count();
         let widest = (tracked
             .iter()
-            .map(|&k| Axes::of(&run.covariances[k], &run.estimates[k])))
+            .map(|&k| Axes::new(&run.covariances[k], &run.estimates[k])))
         .max_by(|a, b| a.long_m.total_cmp(&b.long_m));
         Self {
             frames: errors.len(),
@@ -117,8 +117,8 @@ pub struct Axes {
 }
 
 impl Axes {
-    /// Of the covariance of (x, y, heading) in the axes of the map, around a pose.
-    pub fn of(covariance: &Matrix3<f64>, pose: &Pose2) -> Self {
+    /// The axes of the covariance of (x, y, heading) in the axes of the map, around a pose.
+    pub fn new(covariance: &Matrix3<f64>, pose: &Pose2) -> Self {
         let position: Matrix2<f64> = covariance.fixed_view::<2, 2>(0, 0).into_owned();
         let eigen = position.symmetric_eigen();
         let long = eigen.eigenvalues.imax();
@@ -167,7 +167,7 @@ mod tests {
         let truth = [Pose2::identity(); 10];
         let estimates = errors_m.map(|x| Pose2::translation(x, 0.0));
         let covariance = Matrix3::from_diagonal(&Vector3::new(0.04, 0.01, 1e-4));
-        Trust::of(&TrustedRun {
+        Trust::new(&TrustedRun {
             estimates: &estimates,
             ground_truth: &truth,
             covariances: &[covariance; 10],
@@ -208,7 +208,7 @@ mod tests {
         let turn = Pose2::rotation(0.7);
         let rotation = turn.rotation.to_rotation_matrix().to_homogeneous();
         let along = Matrix3::from_diagonal(&Vector3::new(1.0, 0.01, 1e-4));
-        let axes = Axes::of(&(rotation * along * rotation.transpose()), &turn);
+        let axes = Axes::new(&(rotation * along * rotation.transpose()), &turn);
         assert_relative_eq!(axes.long_m, 1.0, epsilon = 1e-9);
         assert_relative_eq!(axes.short_m, 0.1, epsilon = 1e-9);
         assert_relative_eq!(axes.long_from_forward_rad, 0.0, epsilon = 1e-6);

@@ -20,7 +20,7 @@ pub struct Degeneracy {
 
 impl Degeneracy {
     /// The degenerate directions of an information matrix per unit of weight.
-    pub fn of(information: &Matrix6<f64>, lever_m: f64) -> Self {
+    pub fn new(information: &Matrix6<f64>, lever_m: f64) -> Self {
         /// Largest eigenvalue that noise of the surfaces explains (unitless).
         const NOISE: f64 = 0.004;
         let turn = 1.0 / lever_m.max(f64::MIN_POSITIVE);

@@ -53,9 +53,10 @@ impl KdTree {
         let axis = usize::from(self.axes[middle]);
         let beyond_m = position[axis] - self.points[middle].0[axis];
         let (before, behind) = (range.start..middle, middle + 1..range.end);
-        let (near, far) = match beyond_m < 0.0 {
-            true => (before, behind),
-            false => (behind, before),
+        let (near, far) = if beyond_m < 0.0 {
+            (before, behind)
+        } else {
+            (behind, before)
         };
         self.visit(near, position, count, found);
         self.offer(middle, position, count, found);

@@ -124,7 +124,7 @@ impl TriangleMesh {
 
     /// Bounding box of all vertices.
     pub fn bounds(&self) -> Aabb {
-        Aabb::of(self.vertices.iter().copied())
+        Aabb::from_points(self.vertices.iter().copied())
     }
 }
 
@@ -145,7 +145,7 @@ impl Aabb {
     };
 
     /// Bounding box of points.
-    pub fn of(points: impl IntoIterator<Item = Vec3>) -> Self {
+    pub fn from_points(points: impl IntoIterator<Item = Vec3>) -> Self {
         let grown = |bounds: Self, point| Self {
             min: bounds.min.min(point),
             max: bounds.max.max(point),
@@ -217,7 +217,7 @@ mod tests {
     #[test]
     fn the_box_of_no_points_is_empty() {
         assert!(Aabb::EMPTY.is_empty());
-        assert!(Aabb::of([]).is_empty());
-        assert_eq!(Aabb::of([Vec3::X]).center(), Vec3::X);
+        assert!(Aabb::from_points([]).is_empty());
+        assert_eq!(Aabb::from_points([Vec3::X]).center(), Vec3::X);
     }
 }

@@ -31,12 +31,12 @@ pub(super) struct Return {
 
 /// A cell of a [`DirectionImage`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Cell(NonZeroU32);
+pub(super) struct DirectionCell(NonZeroU32);
 
-impl Cell {
+impl DirectionCell {
     /// Returns the cell of a direction; `None` outside the elevations at which ground is visible.
     #[inline(always)]
-    pub(super) fn of(z: f32, distance_m: f32, azimuth_rad: f32) -> Option<Self> {
+    pub(super) fn new(z: f32, distance_m: f32, azimuth_rad: f32) -> Option<Self> {
         type Image = DirectionImage;
         let row = (z / distance_m - Image::TAN_BOTTOM) * Image::ROWS_PER_TAN;
         if !(row >= 0.0 && row < Image::ROWS as f32) {
@@ -68,7 +68,7 @@ impl DirectionImage {
     const ROWS_PER_TAN: f32 = 1.0 / 0.007;
 
     /// Builds the image of points with their cells, if they have one.
-    pub(super) fn new(points: &[Vec3], cells: &[Option<Cell>]) -> Self {
+    pub(super) fn new(points: &[Vec3], cells: &[Option<DirectionCell>]) -> Self {
         let mut ranks = vec![0; Self::COLUMNS * Self::STRIDE + 1];
         for cell in cells.iter().flatten() {
             ranks[cell.index()] = 1;
@@ -124,7 +124,7 @@ impl DirectionImage {
 
     /// Index of the return of a cell.
     #[inline]
-    pub(super) fn return_of(&self, cell: Cell) -> Option<usize> {
+    pub(super) fn return_of(&self, cell: DirectionCell) -> Option<usize> {
         self.index_at(cell.index())
     }
 
@@ -150,9 +150,9 @@ impl DirectionImage {
         below.take_while(move |other| other.cell >= end)
     }
 
-    /// The returns `left` columns beside a return, in its row, the next above and the next below.
+    /// The returns `left` columns next to a return, in its row, the next above and the next below.
     #[inline]
-    pub(super) fn beside(&self, index: usize, left: isize) -> impl Iterator<Item = &Return> {
+    pub(super) fn neighbours(&self, index: usize, left: isize) -> impl Iterator<Item = &Return> {
         let cell = self.returns[index].cell as usize;
         let (column, row) = (cell / Self::STRIDE, cell % Self::STRIDE);
         let column = (column as isize + left) as usize % Self::COLUMNS;
@@ -176,9 +176,10 @@ mod tests {
         let points: Vec<Vec3> = (0..50_000)
             .map(|_| Vec3::from_array([15.0, 15.0, 3.0].map(|far| rng.random_range(-far..far))))
             .collect();
-        let cell =
-            |point: &Vec3| Cell::of(point.z, point.truncate().length(), point.y.atan2(point.x));
-        let cells: Vec<Option<Cell>> = points.iter().map(cell).collect();
+        let cell = |point: &Vec3| {
+            DirectionCell::new(point.z, point.truncate().length(), point.y.atan2(point.x))
+        };
+        let cells: Vec<Option<DirectionCell>> = points.iter().map(cell).collect();
         let image = DirectionImage::new(&points, &cells);
         assert!(image.returns.is_sorted_by_key(|seen| seen.cell));
         let mut is_reached = vec![false; image.returns.len()];

@@ -15,7 +15,7 @@ pub struct RoadPlane {
 /// Radius around the sensor within which the road is taken as plane [m].
 const RADIUS_M: f32 = 12.0;
 /// Standard deviation of the weight over the distance, so that the road outweighs what lies
-/// beside it [m].
+/// next to it [m].
 const NEARNESS_M: f64 = 5.0;
 /// Scales of Tukey's weights, from where the tilt is unknown down to where a kerb is an outlier [m].
 const SCALES_M: [f64; 12] = [
@@ -52,13 +52,13 @@ pub fn road_plane(points: &[Vec3], confidences: &[f32]) -> Option<RoadPlane> {
     })
 }
 
-struct Cell {
+struct GroundCell {
     point: DVec3,
     weight: f64,
 }
 
 /// Computes mean position and weight of the ground per cell, in the order of the cells.
-fn ground_cells(points: &[Vec3], confidences: &[f32]) -> Vec<Cell> {
+fn ground_cells(points: &[Vec3], confidences: &[f32]) -> Vec<GroundCell> {
     let across = (2.0 * RADIUS_M / CELL_M) as usize;
     let mut sums = vec![(DVec3::ZERO, 0.0, 0.0); across * across];
     for (&point, &confidence) in points.iter().zip(confidences) {
@@ -76,7 +76,7 @@ fn ground_cells(points: &[Vec3], confidences: &[f32]) -> Vec<Cell> {
     }
     sums.into_iter()
         .filter(|&(_, _, count)| count > 0.0)
-        .map(|(sum, weight, count): (DVec3, f64, f64)| Cell {
+        .map(|(sum, weight, count): (DVec3, f64, f64)| GroundCell {
             point: sum / weight,
             // A cell of many points is more certain, but not in proportion to their number.
             weight: weight / count * count.min(8.0) * nearness(sum / weight),
@@ -89,11 +89,11 @@ fn nearness(point: DVec3) -> f64 {
 }
 
 /// One step of iteratively reweighted least squares with Tukey's biweight.
-fn weighted_fit(cells: &[Cell], plane: DVec3, scale_m: f64) -> Option<DVec3> {
+fn weighted_fit(cells: &[GroundCell], plane: DVec3, scale_m: f64) -> Option<DVec3> {
     const TUKEY: f64 = 4.685;
     let mut matrix = DMat3::ZERO;
     let mut right = DVec3::ZERO;
-    for Cell { point, weight } in cells {
+    for GroundCell { point, weight } in cells {
         let residual = point.z - plane.x - plane.y * point.x - plane.z * point.y;
         let u = residual / (TUKEY * scale_m);
         if u.abs() < 1.0 {

@@ -10,7 +10,7 @@ use std::f32::consts::FRAC_PI_2;
 use glam::Vec3;
 use rayon::prelude::*;
 
-use super::direction_image::{Cell, DirectionImage, Return};
+use super::direction_image::{DirectionCell, DirectionImage, Return};
 use super::polar_grid::{PolarGrid, PolarPosition};
 use crate::geometry::fast_atan2;
 use crate::simd::{Simd, SimdTask, dispatch};
@@ -49,7 +49,7 @@ pub(super) struct ScanIndex<'a> {
     pub(super) positions: Vec<Option<PolarPosition>>,
     image: DirectionImage,
     /// Cells of the points in the image.
-    cells: Vec<Option<Cell>>,
+    cells: Vec<Option<DirectionCell>>,
 }
 
 impl<'a> ScanIndex<'a> {
@@ -158,12 +158,13 @@ impl<'a> ScanIndex<'a> {
     fn neighbours(&self, index: usize, point: Vec3, distance_m: f32) -> Neighbours {
         let columns = self.spacing_m / (distance_m * DirectionImage::COLUMN_RAD);
         let columns = columns.clamp(1.0, MAX_COLUMNS) as isize;
-        let beside = |left| first_beside(self.image.beside(index, left), point, distance_m);
+        let neighbour =
+            |left| first_neighbour(self.image.neighbours(index, left), point, distance_m);
         Neighbours {
             up: first_spaced(self.image.above(index), point, self.spacing_m),
             down: first_spaced(self.image.below(index), point, self.spacing_m),
-            left: beside(columns),
-            right: beside(-columns),
+            left: neighbour(columns),
+            right: neighbour(-columns),
         }
     }
 }
@@ -174,7 +175,7 @@ struct LocationTask<'a> {
     min_distance_m: f32,
     grid: &'a PolarGrid,
     positions: &'a mut [Option<PolarPosition>],
-    cells: &'a mut [Option<Cell>],
+    cells: &'a mut [Option<DirectionCell>],
 }
 
 impl SimdTask for LocationTask<'_> {
@@ -195,7 +196,7 @@ impl SimdTask for LocationTask<'_> {
                 let (distance_m, azimuth_rad) = (distances_m[i], azimuths_rad[i]);
                 if distance_m >= self.min_distance_m && point.z.is_finite() {
                     positions[i] = self.grid.locate(point.z, distance_m, azimuth_rad);
-                    let cell = || Cell::of(point.z, distance_m, azimuth_rad);
+                    let cell = || DirectionCell::new(point.z, distance_m, azimuth_rad);
                     cells[i] = positions[i].and_then(|_| cell());
                 }
             }
@@ -257,7 +258,7 @@ fn first_spaced<'a>(
 
 /// Returns the vector to the first return about as far away as the point.
 #[inline]
-fn first_beside<'a>(
+fn first_neighbour<'a>(
     mut returns: impl Iterator<Item = &'a Return>,
     point: Vec3,
     distance_m: f32,

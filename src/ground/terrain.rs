@@ -34,10 +34,10 @@ pub struct TerrainConfig {
     /// Maximum change that is accepted across a gap [m].
     #[default(0.6)]
     pub max_jump_m: f32,
-    /// As `max_slope`, of ground below the prediction, unitless.
+    /// Like `max_slope`, for ground below the prediction, unitless.
     #[default(0.3)]
     pub max_fall_slope: f32,
-    /// As `max_jump_m`, of ground below the prediction [m].
+    /// Like `max_jump_m`, for ground below the prediction [m].
     #[default(1.0)]
     pub max_fall_m: f32,
     /// Radius within which the ground is initialized as a plane [m].
@@ -191,7 +191,7 @@ impl Terrain {
             let mut new_slope = slope;
             for sector in 0..SECTORS {
                 let cell = ring * SECTORS + sector;
-                let [before, after] = beside(sector);
+                let [before, after] = neighbours(sector);
                 let predicted = if ring == 0 || near {
                     a + middle_m * start_slope[sector]
                 } else {
@@ -228,7 +228,7 @@ impl Terrain {
                 }
             }
             for (sector, slope) in slope.iter_mut().enumerate() {
-                let [before, after] = beside(sector);
+                let [before, after] = neighbours(sector);
                 *slope = 0.25 * (new_slope[before] + 2.0 * new_slope[sector] + new_slope[after]);
             }
             self.slopes[ring * SECTORS..][..SECTORS].copy_from_slice(&slope);
@@ -289,7 +289,7 @@ impl Terrain {
 /// Replaces a height by the weighted mean of itself and its four neighbours.
 #[inline]
 fn smooth(heights: &mut [f32], weights: &[f32], cell: usize) {
-    let [before, after] = beside(cell % SECTORS);
+    let [before, after] = neighbours(cell % SECTORS);
     let row = cell - cell % SECTORS;
     let (mut sum, mut total) = (heights[cell], 1.0);
     for neighbour in [cell - SECTORS, cell + SECTORS, row + before, row + after] {
@@ -343,7 +343,7 @@ fn surroundings(lows: &[f32]) -> Vec<(f32, f32)> {
         let (ring, sector) = (cell / SECTORS, cell % SECTORS);
         let (mut sum, mut squares, mut count) = (0.0, 0.0, 0.0);
         for ring in ring.saturating_sub(1)..=(ring + 1).min(last_ring) {
-            let [before, after] = beside(sector);
+            let [before, after] = neighbours(sector);
             for sector in [before, sector, after] {
                 // Relative to the central cell, against cancellation of squared heights.
                 let low = lows[ring * SECTORS + sector] - center;
@@ -362,7 +362,7 @@ fn surroundings(lows: &[f32]) -> Vec<(f32, f32)> {
 
 /// The neighbouring sectors.
 #[inline]
-fn beside(sector: usize) -> [usize; 2] {
+fn neighbours(sector: usize) -> [usize; 2] {
     [(sector + SECTORS - 1) % SECTORS, (sector + 1) % SECTORS]
 }
 

@@ -147,9 +147,12 @@ impl ParticleSet {
 
     /// The particle with the largest weight, the first among equals.
     pub fn best(&self) -> Particle {
-        let heavier = |best: Particle, next: &Particle| match next.weight > best.weight {
-            true => *next,
-            false => best,
+        let heavier = |best: Particle, next: &Particle| {
+            if next.weight > best.weight {
+                *next
+            } else {
+                best
+            }
         };
         self.particles.iter().fold(self.particles[0], heavier)
     }

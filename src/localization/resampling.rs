@@ -159,9 +159,12 @@ fn limited_root(
     config: &ResamplingConfig,
 ) -> Option<Matrix3<f64>> {
     let (position_m, heading_rad) = spread(covariance);
-    let scale = |sigma: f64, largest: f64| match sigma * kernel > largest {
-        true => largest / sigma,
-        false => kernel,
+    let scale = |sigma: f64, largest: f64| {
+        if sigma * kernel > largest {
+            largest / sigma
+        } else {
+            kernel
+        }
     };
     let scale_m = scale(position_m, config.max_jitter_m);
     let scale_rad = scale(heading_rad, config.max_jitter_rad);

@@ -229,10 +229,10 @@ impl Extraction<'_> {
         (axis, side): (usize, usize),
         segments: &mut Vec<(Vertex, Vertex)>,
     ) {
-        let mut beside = self.global_corner(self.level, node, cell);
-        beside[axis] += 2 * side as i32 - 1;
-        let local = beside.map(|x| (x & 3) as usize);
-        match self.function.tree.node_at(self.level, beside) {
+        let mut neighbour = self.global_corner(self.level, node, cell);
+        neighbour[axis] += 2 * side as i32 - 1;
+        let local = neighbour.map(|x| (x & 3) as usize);
+        match self.function.tree.node_at(self.level, neighbour) {
             Some(other) if self.child(self.level, other, local).is_some() => {
                 self.add_leaf_segments(self.level, other, local, (axis, 1 - side), segments);
             }

@@ -35,7 +35,7 @@ fn fans(triangles: &[[u32; 3]], corners: &[u32]) -> Vec<usize> {
     let edges: Vec<(u32, u32)> = (corners.iter())
         .map(|&corner| opposite_edge(triangles, corner))
         .collect();
-    let is_beside = |a: usize, b: usize| {
+    let is_adjacent = |a: usize, b: usize| {
         let ((a0, a1), (b0, b1)) = (edges[a], edges[b]);
         a0 == b0 || a0 == b1 || a1 == b0 || a1 == b1
     };
@@ -50,7 +50,7 @@ fn fans(triangles: &[[u32; 3]], corners: &[u32]) -> Vec<usize> {
         open.push(start);
         while let Some(here) = open.pop() {
             for (next, of) in fans.iter_mut().enumerate() {
-                if *of == usize::MAX && is_beside(here, next) {
+                if *of == usize::MAX && is_adjacent(here, next) {
                     *of = fan;
                     open.push(next);
                 }

@@ -273,8 +273,8 @@ fn link(above: &mut Level, level: &mut Level) {
         for (neighbor, offset) in neighbors.iter_mut().zip(offsets()) {
             let position = [0, 1, 2].map(|axis| octant[axis] + offset[axis]);
             let octant = morton::encode(position.map(|x| x.rem_euclid(2) as u32)) as usize;
-            let beside = above.neighbor(parent, position.map(|x| x.div_euclid(2)));
-            if let Some(node) = beside.and_then(|beside| above.child(beside, octant)) {
+            let uncle = above.neighbor(parent, position.map(|x| x.div_euclid(2)));
+            if let Some(node) = uncle.and_then(|uncle| above.child(uncle, octant)) {
                 *neighbor = node as u32;
             }
         }

@@ -53,7 +53,7 @@ impl Samples {
             .map(|index| index as u32)
             .collect();
         let at = |index: u32| cloud.positions[index as usize];
-        let bounds = Aabb::of(usable.iter().map(|&index| at(index)));
+        let bounds = Aabb::from_points(usable.iter().map(|&index| at(index)));
         let extent_m = bounds.size().max_element();
         if usable.len() < Self::MIN_POINTS || extent_m <= 0.0 {
             return Err(MeshingError::TooFewPoints {

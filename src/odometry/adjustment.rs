@@ -24,7 +24,7 @@ use super::alignment::median;
 use super::block_system::{BlockRow, BlockSystem};
 use super::drive::{Drive, SHORTER};
 use super::elevation_bias::{ElevationBias, elevation_bias};
-use super::planes::{LidarFrame, Plane, Row, associate};
+use super::planes::{LidarFrame, Plane, ScanPoints, associate};
 use super::pose_graph::{Edge, information};
 use crate::geometry::Pose3;
 use crate::geometry::pose::{exponential, logarithm};
@@ -118,7 +118,7 @@ pub fn adjust(
         let factor = coarse.get(iteration).copied().unwrap_or(1.0);
         let edge_m = factor * config.voxels * drive.voxel_m;
         let (rows, planes) = associate(drive, surfaces, edge_m, &kernels_m);
-        let Some(residuals) = Residuals::of(&rows, &planes) else {
+        let Some(residuals) = Residuals::new(&rows, &planes) else {
             break;
         };
         require_memory(&rows, &planes)?;
@@ -173,10 +173,10 @@ pub fn adjust(
 }
 
 /// Requires the memory of the equations: all scans of a car that stands see the same planes.
-fn require_memory(rows: &[Row], planes: &[Plane]) -> Result<(), MemoryError> {
+fn require_memory(rows: &[ScanPoints], planes: &[Plane]) -> Result<(), MemoryError> {
     /// Memory of the blocks of two scans that see a plane in common [bytes].
     const PAIR_BYTES: f64 = 2400.0;
-    let later_scans = |(number, row): (usize, &Row)| {
+    let later_scans = |(number, row): (usize, &ScanPoints)| {
         let mut is_seen = vec![false; rows.len() - number];
         for plane in row.planes_once() {
             let couplings = &planes[plane as usize].couplings;
@@ -238,7 +238,7 @@ struct Residuals {
 }
 
 impl Residuals {
-    fn of(rows: &[Row], planes: &[Plane]) -> Option<Self> {
+    fn new(rows: &[ScanPoints], planes: &[Plane]) -> Option<Self> {
         /// Kernel in robust standard deviations.
         const KERNEL_SIGMAS: f64 = 3.0;
         let mut of_rows: Vec<Vec<f32>> = (rows.par_iter())
@@ -281,7 +281,7 @@ fn information_of_point(sigma_m: f64) -> f64 {
 }
 
 /// The equations of all poses.
-fn system(rows: &[Row], planes: &[Plane], scale: f64) -> BlockSystem {
+fn system(rows: &[ScanPoints], planes: &[Plane], scale: f64) -> BlockSystem {
     let sums: Vec<BlockRow> = (rows.par_iter().enumerate())
         .map(|(number, row)| block_row(number, row, planes, scale))
         .collect();
@@ -290,8 +290,8 @@ fn system(rows: &[Row], planes: &[Plane], scale: f64) -> BlockSystem {
     system
 }
 
-fn block_row(number: usize, row: &Row, planes: &[Plane], scale: f64) -> BlockRow {
-    let lidar = LidarFrame::of(&row.pose);
+fn block_row(number: usize, row: &ScanPoints, planes: &[Plane], scale: f64) -> BlockRow {
+    let lidar = LidarFrame::new(&row.pose);
     let mut sums = BlockRow::default();
     for (&position, &plane) in row.in_map.iter().zip(&row.planes) {
         let Some(plane) = planes.get(plane as usize) else {
@@ -302,7 +302,7 @@ fn block_row(number: usize, row: &Row, planes: &[Plane], scale: f64) -> BlockRow
         sums.diagonal += at.weight * jacobian * jacobian.transpose();
         sums.right_side -= at.weight * at.distance_m * jacobian;
     }
-    let mut beside: Vec<Option<Matrix6<f64>>> = vec![];
+    let mut off_diagonal: Vec<Option<Matrix6<f64>>> = vec![];
     for plane in row.planes_once() {
         let plane = &planes[plane as usize];
         let Ok(own) = plane
@@ -317,18 +317,18 @@ fn block_row(number: usize, row: &Row, planes: &[Plane], scale: f64) -> BlockRow
         // The other half of the matrix is its mirror image.
         for (other, coupling) in &plane.couplings[own + 1..] {
             let index = *other - number;
-            if beside.len() <= index {
-                beside.resize(index + 1, None);
+            if off_diagonal.len() <= index {
+                off_diagonal.resize(index + 1, None);
             }
-            let block = beside[index].get_or_insert_with(Matrix6::zeros);
+            let block = off_diagonal[index].get_or_insert_with(Matrix6::zeros);
             block.gemm(-1.0, &eliminated, &coupling.transpose(), 1.0);
         }
     }
-    let blocks = beside.into_iter().enumerate();
+    let blocks = off_diagonal.into_iter().enumerate();
     BlockRow {
         diagonal: sums.diagonal * scale,
         right_side: sums.right_side * scale,
-        beside: blocks
+        off_diagonal: blocks
             .filter_map(|(index, block)| Some((number + index, block? * scale)))
             .collect(),
     }

@@ -128,7 +128,7 @@ impl Problem<'_> {
         let information = planar.information.zip_map(&other.information, blend);
         let mut right_side = planar.right_side.zip_map(&other.right_side, blend);
         let weight = blend(planar.weight, other.weight);
-        let degeneracy = Degeneracy::of(&(information / weight), lever_m);
+        let degeneracy = Degeneracy::new(&(information / weight), lever_m);
         let kept = degeneracy.projection;
         let information = kept * information * kept.transpose();
         right_side = kept * kept * right_side;

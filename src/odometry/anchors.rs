@@ -1,16 +1,16 @@
 //! A drive in an older map: poses of scans that were found in it hold the drive.
 //!
 //! The drive is first moved as a whole, by the scan whose pose in the map agrees with the positions of the most others, and
-//! then bent: a pose graph over its local maps, the motions between them, its loops and the map, with a robust kernel for
+//! then bent: a pose graph over its submaps, the motions between them, its loops and the map, with a robust kernel for
 //! loops and for poses in the map. A pose in the map counts if the map has the surfaces around it, as those of a loop.
 
 use foldhash::HashSet;
 use glam::{DVec3, IVec3};
 
-use super::drive::{Drive, LocalMap, POINT_BYTES, SHORTER};
+use super::drive::{Drive, POINT_BYTES, SHORTER, Submap};
 use super::loops::{Loop, LoopVerdict, MIN_COMMON, common_share};
 use super::odometer::OdometryEstimate;
-use super::path_graph::{LOCAL_MAP, move_along, odometry_edges};
+use super::path_graph::{SUBMAP_LENGTH, move_along, odometry_edges};
 use super::pose_graph::{Edge, information, optimize};
 use super::voxel_map::{VoxelMap, pack};
 use crate::geometry::{Pose3, TriangleMesh};
@@ -60,14 +60,14 @@ pub fn place(
     for pose in &mut drive.poses {
         *pose = map_from_odom * *pose;
     }
-    let maps = drive.local_maps(LOCAL_MAP * drive.range_m);
+    let maps = drive.submaps(SUBMAP_LENGTH * drive.range_m);
     let surfaces = surface_points(mesh, drive, SPACING * drive.voxel_m)?;
     let mut voxels = VoxelMap::new(drive.voxel_m, f32::MAX);
     voxels.insert(&surfaces);
     let in_map: Vec<Edge> = map_edges(drive, &maps, &found)
         .into_iter()
         .filter(|edge| {
-            let points = drive.local_points(&maps[edge.second - 1], 2.0 * drive.voxel_m);
+            let points = drive.submap_points(&maps[edge.second - 1], 2.0 * drive.voxel_m);
             common_share(&voxels, &points, &edge.first_from_second, drive) > MIN_COMMON
         })
         .collect();
@@ -126,8 +126,8 @@ fn common_transform(drive: &Drive, found: &[(usize, Pose3)]) -> Option<Pose3> {
         .map(|(_, map_from_odom)| map_from_odom)
 }
 
-/// The loops that the poses follow, between the centers of their local maps.
-fn loop_edges(drive: &Drive, maps: &[LocalMap], loops: &[Loop]) -> Vec<Edge> {
+/// The loops that the poses follow, between the centers of their submaps.
+fn loop_edges(drive: &Drive, maps: &[Submap], loops: &[Loop]) -> Vec<Edge> {
     /// Standard deviations [m], [rad].
     const SHIFT_M: f64 = 0.05;
     const TURN_RAD: f64 = 0.005;
@@ -150,8 +150,8 @@ fn loop_edges(drive: &Drive, maps: &[LocalMap], loops: &[Loop]) -> Vec<Edge> {
         .collect()
 }
 
-/// For each local map, the scan nearest to its center that was found in the map.
-fn map_edges(drive: &Drive, maps: &[LocalMap], found: &[(usize, Pose3)]) -> Vec<Edge> {
+/// For each submap, the scan nearest to its center that was found in the map.
+fn map_edges(drive: &Drive, maps: &[Submap], found: &[(usize, Pose3)]) -> Vec<Edge> {
     /// Standard deviations of a pose in the map [m], [rad]: the tilt is that of the ground.
     const SHIFT_M: f64 = 0.1;
     const TURN_RAD: f64 = 0.01;

@@ -1,6 +1,6 @@
 //! Symmetric linear systems of 6 x 6 blocks, one row per pose.
 //!
-//! Conjugate gradients, preconditioned by the factorization of the blocks on the diagonal and beside it: the
+//! Conjugate gradients, preconditioned by the factorization of the blocks on the diagonal and next to it: the
 //! system of a drive without loops is solved in one iteration, each loop adds a few.
 //!
 //! Nocedal and Wright, *Numerical Optimization* (2006), algorithm 5.3.
@@ -13,8 +13,8 @@ use rayon::prelude::*;
 pub struct BlockSystem {
     /// Blocks on the diagonal.
     diagonal: Vec<Matrix6<f64>>,
-    /// Blocks beside it by row: column and block, in the order of the columns; both halves are stored.
-    beside: Vec<Vec<(usize, Matrix6<f64>)>>,
+    /// Off-diagonal blocks by row: column and block, in the order of the columns; both halves are stored.
+    off_diagonal: Vec<Vec<(usize, Matrix6<f64>)>>,
     /// Right side.
     right_side: Vec<Vector6<f64>>,
 }
@@ -24,7 +24,7 @@ impl BlockSystem {
     pub fn new(rows: usize) -> Self {
         Self {
             diagonal: vec![Matrix6::zeros(); rows],
-            beside: vec![Vec::new(); rows],
+            off_diagonal: vec![Vec::new(); rows],
             right_side: vec![Vector6::zeros(); rows],
         }
     }
@@ -35,14 +35,14 @@ impl BlockSystem {
         self.right_side[row] += right_side;
     }
 
-    /// Adds to the block beside the diagonal and to its mirror image.
-    pub fn add_beside(&mut self, row: usize, column: usize, block: &Matrix6<f64>) {
+    /// Adds to an off-diagonal block and to its mirror image.
+    pub fn add_off_diagonal(&mut self, row: usize, column: usize, block: &Matrix6<f64>) {
         self.add_half(row, column, block);
         self.add_half(column, row, &block.transpose());
     }
 
     fn add_half(&mut self, row: usize, column: usize, block: &Matrix6<f64>) {
-        let blocks = &mut self.beside[row];
+        let blocks = &mut self.off_diagonal[row];
         match blocks.binary_search_by_key(&column, |entry| entry.0) {
             Ok(found) => blocks[found].1 += block,
             Err(place) => blocks.insert(place, (column, *block)),
@@ -53,8 +53,8 @@ impl BlockSystem {
     pub fn add_rows(&mut self, rows: Vec<BlockRow>) {
         for (row, sums) in rows.into_iter().enumerate() {
             self.add(row, &sums.diagonal, &sums.right_side);
-            for (column, block) in &sums.beside {
-                self.add_beside(row, *column, block);
+            for (column, block) in &sums.off_diagonal {
+                self.add_off_diagonal(row, *column, block);
             }
         }
     }
@@ -107,7 +107,7 @@ impl BlockSystem {
             .into_par_iter()
             .map(|row| {
                 let mut sum = self.diagonal[row] * vector[row];
-                for (column, block) in &self.beside[row] {
+                for (column, block) in &self.off_diagonal[row] {
                     sum += block * vector[*column];
                 }
                 sum
@@ -115,8 +115,8 @@ impl BlockSystem {
             .collect()
     }
 
-    fn beside_next(&self, row: usize) -> Option<&Matrix6<f64>> {
-        let blocks = &self.beside[row];
+    fn next_to_diagonal(&self, row: usize) -> Option<&Matrix6<f64>> {
+        let blocks = &self.off_diagonal[row];
         let found = blocks.binary_search_by_key(&(row + 1), |entry| entry.0);
         found.ok().map(|index| &blocks[index].1)
     }
@@ -127,9 +127,9 @@ impl BlockSystem {
         for row in 0..self.diagonal.len() {
             let alone = self.diagonal[row];
             let joined = row.checked_sub(1).and_then(|before| {
-                let beside = *self.beside_next(before)?;
-                let below = factors[before].own.solve(&beside).transpose();
-                let own = (alone - below * beside).cholesky()?;
+                let next = *self.next_to_diagonal(before)?;
+                let below = factors[before].own.solve(&next).transpose();
+                let own = (alone - below * next).cholesky()?;
                 Some(Factor { own, below })
             });
             factors.push(match joined {
@@ -150,7 +150,7 @@ pub struct BlockRow {
     /// Block on the diagonal.
     pub diagonal: Matrix6<f64>,
     /// Columns right of it, and their blocks.
-    pub beside: Vec<(usize, Matrix6<f64>)>,
+    pub off_diagonal: Vec<(usize, Matrix6<f64>)>,
     /// Right side.
     pub right_side: Vector6<f64>,
 }
@@ -220,7 +220,7 @@ mod tests {
                 &(of_b.transpose() * of_b),
                 &(of_b.transpose() * residual),
             );
-            system.add_beside(a, b, &(of_a.transpose() * of_b));
+            system.add_off_diagonal(a, b, &(of_a.transpose() * of_b));
         }
         for row in 0..ROWS {
             system.add(row, &(Matrix6::identity() * 0.1), &Vector6::zeros());

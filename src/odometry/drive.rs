@@ -1,4 +1,4 @@
-//! A drive as it is kept for loops and adjustment: a sample of the points of every scan, and local maps of them.
+//! A drive as it is kept for loops and adjustment: a sample of the points of every scan, and submaps of them.
 
 use std::ops::Range;
 
@@ -32,10 +32,10 @@ pub struct Drive {
 
 /// Scans in succession, whose poses relative to each other are taken as known.
 #[derive(Clone, Debug, PartialEq)]
-pub struct LocalMap {
+pub struct Submap {
     /// Rows of the scans.
     pub rows: Range<usize>,
-    /// The row whose lidar frame is that of the local map.
+    /// The row whose lidar frame is that of the submap.
     pub center: usize,
     /// Length of the path up to the center [m].
     pub travelled_m: f64,
@@ -63,8 +63,8 @@ impl Drive {
         std::iter::once(0.0).chain(steps).collect()
     }
 
-    /// Local maps of about `length_m` of the path each.
-    pub fn local_maps(&self, length_m: f64) -> Vec<LocalMap> {
+    /// Submaps of about `length_m` of the path each.
+    pub fn submaps(&self, length_m: f64) -> Vec<Submap> {
         let travelled_m = self.travelled_m();
         let mut maps = vec![];
         let mut first = 0;
@@ -75,7 +75,7 @@ impl Drive {
             let middle_m = 0.5 * (travelled_m[first] + travelled_m[end - 1]);
             let center = travelled_m.partition_point(|&path_m| path_m < middle_m);
             let center = center.clamp(first, end - 1);
-            maps.push(LocalMap {
+            maps.push(Submap {
                 rows: first..end,
                 center,
                 travelled_m: travelled_m[center],
@@ -85,8 +85,8 @@ impl Drive {
         maps
     }
 
-    /// Points of a local map in the frame of its center, at least about `spacing_m` from each other.
-    pub fn local_points(&self, map: &LocalMap, spacing_m: f64) -> Vec<TimedPoint> {
+    /// Points of a submap in the frame of its center, at least about `spacing_m` from each other.
+    pub fn submap_points(&self, map: &Submap, spacing_m: f64) -> Vec<TimedPoint> {
         let lidar_from_map = self.poses[map.center].inverse();
         let points = evenly_spaced(&map.rows)
             .flat_map(|row| self.points_at(row, &(lidar_from_map * self.poses[row])));
@@ -97,12 +97,8 @@ impl Drive {
         first_per_voxel(still, spacing_m)
     }
 
-    /// The surfaces of some local maps in the frame of a center.
-    pub fn surfaces<'a>(
-        &self,
-        center: usize,
-        maps: impl Iterator<Item = &'a LocalMap>,
-    ) -> VoxelMap {
+    /// The surfaces of some submaps in the frame of a center.
+    pub fn surfaces<'a>(&self, center: usize, maps: impl Iterator<Item = &'a Submap>) -> VoxelMap {
         const VOXEL_POINTS: f32 = 1000.0;
         let lidar_from_map = self.poses[center].inverse();
         let mut surfaces = VoxelMap::new(self.voxel_m, VOXEL_POINTS);

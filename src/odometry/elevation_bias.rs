@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::block_system::BlockSystem;
-use super::planes::{LidarFrame, Plane, Row};
+use super::planes::{LidarFrame, Plane, ScanPoints};
 
 /// Angle to add to the elevations of all beams, so that surfaces fit themselves best.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -39,14 +39,14 @@ impl ElevationBias {
 /// Finds the bias at poses for which the system of equations was set up, with the information `scale` of a residual
 /// [1/m²]; `None` if it does not follow from the scans.
 pub fn elevation_bias(
-    rows: &[Row],
+    rows: &[ScanPoints],
     planes: &[Plane],
     system: &BlockSystem,
     scale: f64,
 ) -> Option<ElevationBias> {
     let of_planes = couplings_of_planes(rows, planes);
     let sums: Vec<Sums> = (rows.par_iter().enumerate())
-        .map(|(number, row)| Sums::of(number, row, planes, &of_planes))
+        .map(|(number, row)| Sums::new(number, row, planes, &of_planes))
         .collect();
     let eliminated = (planes.iter().zip(&of_planes)).map(|(plane, coupling)| {
         let by_plane = plane.inverse * coupling;
@@ -78,10 +78,10 @@ pub fn elevation_bias(
 }
 
 /// Σ w g ∂r/∂δ of each plane.
-fn couplings_of_planes(rows: &[Row], planes: &[Plane]) -> Vec<Vector3<f64>> {
+fn couplings_of_planes(rows: &[ScanPoints], planes: &[Plane]) -> Vec<Vector3<f64>> {
     let mut couplings = vec![Vector3::zeros(); planes.len()];
     for row in rows {
-        let lidar = LidarFrame::of(&row.pose);
+        let lidar = LidarFrame::new(&row.pose);
         for (&position, &number) in row.in_map.iter().zip(&row.planes) {
             let Some(plane) = planes.get(number as usize) else {
                 continue;
@@ -105,8 +105,8 @@ struct Sums {
 }
 
 impl Sums {
-    fn of(number: usize, row: &Row, planes: &[Plane], of_planes: &[Vector3<f64>]) -> Self {
-        let lidar = LidarFrame::of(&row.pose);
+    fn new(number: usize, row: &ScanPoints, planes: &[Plane], of_planes: &[Vector3<f64>]) -> Self {
+        let lidar = LidarFrame::new(&row.pose);
         let mut sums = Self {
             information: 0.0,
             right_side: 0.0,

@@ -1,7 +1,7 @@
 //! Loops: places where a drive comes back to, and the transforms between its visits.
 //!
-//! Candidates are the local maps that are nearest by the poses known so far, within their uncertainty, and those that
-//! look most similar ([`Place`]). A candidate is registered to the surfaces around the earlier visit and has to
+//! Candidates are the submaps that are nearest by the poses known so far, within their uncertainty, and those that
+//! look most similar ([`ScanContext`]). A candidate is registered to the surfaces around the earlier visit and has to
 //! share them: not the ground, which looks the same everywhere. It counts if a second loop of other local
 //! maps confirms it: the drive from one visit to the other closes by both.
 
@@ -9,11 +9,11 @@ use nalgebra::{Matrix6, UnitQuaternion, Vector3, Vector6};
 use rayon::prelude::*;
 
 use super::alignment::Problem;
-use super::drive::{Drive, LocalMap};
-use super::places::Place;
+use super::drive::{Drive, Submap};
 use super::pose_graph::Edge;
 use super::residuals::Observation;
 use super::sampling::TimedPoint;
+use super::scan_context::ScanContext;
 use super::search::search;
 use super::voxel_map::{Shape, VoxelMap};
 use crate::geometry::Pose3;
@@ -46,10 +46,10 @@ pub enum LoopVerdict {
     Contradicted,
 }
 
-/// A loop between local maps.
+/// A loop between submaps.
 #[derive(Clone, Debug)]
 pub struct FoundLoop {
-    /// Indices of the local maps, the earlier first.
+    /// Indices of the submaps, the earlier first.
     pub maps: [usize; 2],
     /// `p_first = first_from_second * p_second` between their centers.
     pub first_from_second: Pose3,
@@ -69,28 +69,28 @@ pub struct Drift {
 }
 
 impl Drift {
-    /// Of a path.
+    /// Standard deviation after a path [m].
     pub fn after_m(&self, path_m: f64) -> f64 {
         self.least_m + self.share * path_m
     }
 }
 
-/// Finds loops between local maps.
-pub fn find(drive: &Drive, maps: &[LocalMap], drift: Drift) -> Vec<FoundLoop> {
+/// Finds loops between submaps.
+pub fn find(drive: &Drive, maps: &[Submap], drift: Drift) -> Vec<FoundLoop> {
     /// Radius of the described surroundings, in ranges of the sensor.
-    const PLACE_RADIUS: f64 = 0.6;
+    const CONTEXT_RADIUS: f64 = 0.6;
     let spacing_m = 2.0 * drive.voxel_m;
     let points: Vec<Vec<TimedPoint>> = (maps.par_iter())
-        .map(|map| drive.local_points(map, spacing_m))
+        .map(|map| drive.submap_points(map, spacing_m))
         .collect();
-    let places: Vec<Place> = (points.par_iter())
-        .map(|points| Place::of(points, PLACE_RADIUS * drive.range_m))
+    let contexts: Vec<ScanContext> = (points.par_iter())
+        .map(|points| ScanContext::new(points, CONTEXT_RADIUS * drive.range_m))
         .collect();
     let search = LoopSearch {
         drive,
         maps,
         points: &points,
-        places: &places,
+        contexts: &contexts,
         drift,
     };
     (0..maps.len())
@@ -101,21 +101,21 @@ pub fn find(drive: &Drive, maps: &[LocalMap], drift: Drift) -> Vec<FoundLoop> {
 
 struct LoopSearch<'a> {
     drive: &'a Drive,
-    maps: &'a [LocalMap],
+    maps: &'a [Submap],
     points: &'a [Vec<TimedPoint>],
-    places: &'a [Place],
+    contexts: &'a [ScanContext],
     drift: Drift,
 }
 
 impl LoopSearch<'_> {
-    /// The best loop from a local map to an earlier one.
+    /// The best loop from a submap to an earlier one.
     fn loop_to(&self, second: usize) -> Option<FoundLoop> {
         (self.candidates(second).into_iter())
             .filter_map(|(first, guess)| self.register(first, second, &guess))
             .find(|found| found.common_share > MIN_COMMON)
     }
 
-    /// Earlier local maps and the pose of the later one in them: the nearest, then those that look most similar.
+    /// Earlier submaps and the pose of the later one in them: the nearest, then those that look most similar.
     fn candidates(&self, second: usize) -> Vec<(usize, Pose3)> {
         /// Least path between the visits, in ranges: the local map of the odometry reaches so far.
         const MIN_PATH: f64 = 1.5;
@@ -138,7 +138,7 @@ impl LoopSearch<'_> {
             .map(|&(first, _)| (first, by_poses(first)));
         let mut similar: Vec<(f64, usize, f64)> = (reachable.iter())
             .map(|&(first, _)| {
-                let (similarity, heading) = self.places[first].similarity(&self.places[second]);
+                let (similarity, heading) = self.contexts[first].similarity(&self.contexts[second]);
                 (similarity, first, heading)
             })
             .filter(|candidate| candidate.0 > MIN_SIMILARITY)
@@ -153,9 +153,9 @@ impl LoopSearch<'_> {
         nearest.into_iter().chain(similar).collect()
     }
 
-    /// Registers the later local map to the surfaces around the earlier one.
+    /// Registers the later submap to the surfaces around the earlier one.
     fn register(&self, first: usize, second: usize, guess: &Pose3) -> Option<FoundLoop> {
-        /// Local maps on each side of the earlier one.
+        /// Submaps on each side of the earlier one.
         const AROUND: usize = 2;
         /// Reach of the search, in ranges, and its step in voxels.
         const REACH: f64 = 0.2;
@@ -242,9 +242,9 @@ pub fn common_share(
     common as f64 / compared.max(1) as f64
 }
 
-/// Which loops another one confirms: its local maps are not the same nor next to them, and the ways from one loop to the other over the
+/// Which loops another one confirms: its submaps are not the same nor next to them, and the ways from one loop to the other over the
 /// first visit and over the second end at the same place.
-pub fn confirmed(drive: &Drive, maps: &[LocalMap], loops: &[FoundLoop], drift: Drift) -> Vec<bool> {
+pub fn confirmed(drive: &Drive, maps: &[Submap], loops: &[FoundLoop], drift: Drift) -> Vec<bool> {
     /// Longest path from one loop to the other, in ranges.
     const NEAR: f64 = 3.0;
     /// Angle per distance of the drift [rad/m], of points at the range.
@@ -273,7 +273,7 @@ pub fn confirmed(drive: &Drive, maps: &[LocalMap], loops: &[FoundLoop], drift: D
 impl FoundLoop {
     /// The edge of the pose graph.
     pub fn edge(&self, voxel_m: f64) -> Option<Edge> {
-        /// Standard deviations that local maps have within themselves: voxels, and [rad].
+        /// Standard deviations that submaps have within themselves: voxels, and [rad].
         const FLOOR: f64 = 0.05;
         const FLOOR_RAD: f64 = 0.002;
         let [shift, turn] = [(FLOOR * voxel_m).powi(2), FLOOR_RAD.powi(2)];

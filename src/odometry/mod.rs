@@ -16,8 +16,8 @@
 //!
 //! ```text
 //! Odometer      pose of each scan, scan by scan
-//! loops         local maps of the path, recognized by position and appearance, registered, confirmed by a second loop
-//! pose_graph    poses of the local maps, with a robust kernel for loops; the scans between move along
+//! loops         submaps of the path, recognized by position and appearance, registered, confirmed by a second loop
+//! pose_graph    poses of the submaps, with a robust kernel for loops; the scans between move along
 //! adjustment    all poses and the planes that the scans have in common
 //! ```
 //!
@@ -36,12 +36,12 @@ mod elevation_bias;
 mod loops;
 mod odometer;
 mod path_graph;
-mod places;
 mod planes;
 mod pose_check;
 mod pose_graph;
 mod residuals;
 mod sampling;
+mod scan_context;
 mod search;
 mod state;
 mod timing;

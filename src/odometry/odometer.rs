@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use nalgebra::{Matrix6, Vector6};
 
 use super::config::OdometryConfig;
-use super::state::State;
+use super::state::OdometerState;
 use crate::geometry::Pose3;
 use crate::lidar::{Scan, interval_s};
 use crate::memory::MemoryError;
@@ -71,7 +71,7 @@ pub struct OdometryEstimate {
 #[derive(Clone, Debug)]
 pub struct Odometer {
     config: OdometryConfig,
-    state: Option<State>,
+    state: Option<OdometerState>,
     /// Time of the last scan [s].
     time_s: Option<f64>,
 }
@@ -96,7 +96,7 @@ impl Odometer {
         let mut estimate = match &mut self.state {
             Some(state) => advance(state, scan, duration_s, &self.config),
             None => {
-                self.state = State::begin(scan, &self.config);
+                self.state = OdometerState::begin(scan, &self.config);
                 OdometryEstimate::first(duration_s)
             }
         };
@@ -110,16 +110,17 @@ impl Odometer {
             return Ok(self.config.period_s);
         };
         let duration_s = interval_s(previous_s, time_s);
-        match duration_s > 0.0 && duration_s.is_finite() {
-            true => Ok(duration_s),
-            false => Err(OdometryError::TimeNotAscending { previous_s, time_s }),
+        if duration_s > 0.0 && duration_s.is_finite() {
+            Ok(duration_s)
+        } else {
+            Err(OdometryError::TimeNotAscending { previous_s, time_s })
         }
     }
 }
 
 /// Registers a scan, or predicts its pose.
 fn advance(
-    state: &mut State,
+    state: &mut OdometerState,
     scan: &Scan,
     duration_s: f64,
     config: &OdometryConfig,

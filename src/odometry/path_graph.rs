@@ -1,24 +1,20 @@
-//! The pose graph of a drive: its local maps, the motions between them, and the scans that move with them.
+//! The pose graph of a drive: its submaps, the motions between them, and the scans that move with them.
 
-use super::drive::{Drive, LocalMap};
+use super::drive::{Drive, Submap};
 use super::odometer::{OdometryEstimate, StepState};
 use super::pose_graph::{Edge, information};
 use crate::geometry::Pose3;
 use crate::lidar::interpolate_motion;
 
-/// Path of a local map, in ranges.
-pub const LOCAL_MAP: f64 = 0.12;
+/// Path of a submap, in ranges.
+pub const SUBMAP_LENGTH: f64 = 0.12;
 
-/// Edges of the pose graph between local maps in succession.
-pub fn odometry_edges(
-    drive: &Drive,
-    maps: &[LocalMap],
-    odometry: &[OdometryEstimate],
-) -> Vec<Edge> {
+/// Edges of the pose graph between submaps in succession.
+pub fn odometry_edges(drive: &Drive, maps: &[Submap], odometry: &[OdometryEstimate]) -> Vec<Edge> {
     /// Standard deviation of the motion: share of the path, and at least in voxels.
     const SHARE: f64 = 0.003;
     const FLOOR: f64 = 0.01;
-    /// Of the rotation [rad/m], and at least [rad].
+    /// Standard deviation of the rotation [rad/m], and at least [rad].
     const TURN_RAD_PER_M: f64 = 2e-4;
     const TURN_FLOOR_RAD: f64 = 2e-4;
     /// Factor where scans could not be registered.
@@ -44,8 +40,8 @@ pub fn odometry_edges(
         .collect()
 }
 
-/// Moves all poses with the centers of their local maps; the correction changes evenly from one to the next.
-pub fn move_along(poses: &mut [Pose3], maps: &[LocalMap], before: &[Pose3], after: &[Pose3]) {
+/// Moves all poses with the centers of their submaps; the correction changes evenly from one to the next.
+pub fn move_along(poses: &mut [Pose3], maps: &[Submap], before: &[Pose3], after: &[Pose3]) {
     let correction = |map: usize| after[map] * before[map].inverse();
     for (row, pose) in poses.iter_mut().enumerate() {
         let next = maps.partition_point(|map| map.center <= row);

@@ -13,7 +13,7 @@ use rayon::prelude::*;
 
 use super::drive::Drive;
 use super::voxel_map::pack;
-use crate::geometry::{PlaneSums, Pose3};
+use crate::geometry::{PlaneSums, Pose3, RobustKernel};
 
 /// A plane through the points of several scans.
 pub struct Plane {
@@ -30,7 +30,7 @@ pub struct Plane {
 }
 
 /// Points of a scan, or of the map as the last row: in the map frame, and the plane of each.
-pub struct Row {
+pub struct ScanPoints {
     pub pose: Pose3,
     /// Scale of the robust kernel: a scan that is far from its place has a wider one.
     pub kernel_m: f64,
@@ -41,7 +41,7 @@ pub struct Row {
 
 const NONE: u32 = u32::MAX;
 
-impl Row {
+impl ScanPoints {
     /// The planes of the scan, each once.
     pub fn planes_once(&self) -> Vec<u32> {
         let mut seen: Vec<u32> = (self.planes.iter().copied())
@@ -67,10 +67,10 @@ pub fn associate(
     surfaces: &[DVec3],
     edge_m: f64,
     kernels_m: &[f64],
-) -> (Vec<Row>, Vec<Plane>) {
-    let mut rows: Vec<Row> = (0..drive.poses.len())
+) -> (Vec<ScanPoints>, Vec<Plane>) {
+    let mut rows: Vec<ScanPoints> = (0..drive.poses.len())
         .into_par_iter()
-        .map(|row| Row {
+        .map(|row| ScanPoints {
             pose: drive.poses[row],
             kernel_m: kernels_m[row],
             in_map: drive.points(row),
@@ -78,7 +78,7 @@ pub fn associate(
         })
         .collect();
     if !surfaces.is_empty() {
-        rows.push(Row {
+        rows.push(ScanPoints {
             pose: Pose3::identity(),
             kernel_m: drive.voxel_m,
             in_map: surfaces.to_vec(),
@@ -116,7 +116,7 @@ pub fn associate(
 }
 
 /// The plane through the points of a voxel, if several scans see one; the rows after those of the scans do not move.
-fn plane(rows: &[Row], scans: usize, voxel: &[Entry], edge_m: f64) -> Option<Plane> {
+fn plane(rows: &[ScanPoints], scans: usize, voxel: &[Entry], edge_m: f64) -> Option<Plane> {
     const MIN_POINTS: usize = 8;
     /// Largest share of the smallest variance in the second one, and smallest one of the second in the largest.
     const FLAT: f64 = 0.05;
@@ -153,7 +153,7 @@ fn plane(rows: &[Row], scans: usize, voxel: &[Entry], edge_m: f64) -> Option<Pla
     let mut sums = Matrix3::identity() * (RIDGE * count);
     for of_row in voxel.chunk_by(|a, b| a.row == b.row) {
         let row = &rows[of_row[0].row as usize];
-        let lidar = LidarFrame::of(&row.pose);
+        let lidar = LidarFrame::new(&row.pose);
         let mut coupling = Matrix6x3::zeros();
         for entry in of_row {
             let at = plane.residual(position(entry), row.kernel_m);
@@ -184,10 +184,9 @@ impl Plane {
     pub fn residual(&self, position: DVec3, kernel_m: f64) -> Residual {
         let offset = position - self.center;
         let distance_m = self.normal.dot(offset);
-        let ratio = (distance_m / kernel_m).powi(2);
         Residual {
             distance_m,
-            weight: (1.0 + ratio).powi(-2),
+            weight: RobustKernel { scale_m: kernel_m }.weight(distance_m),
             by_plane: Vector3::new(
                 1.0,
                 self.tangents[0].dot(offset),
@@ -204,8 +203,8 @@ pub struct LidarFrame {
 }
 
 impl LidarFrame {
-    /// Of a pose.
-    pub fn of(map_from_lidar: &Pose3) -> Self {
+    /// The frame at a pose.
+    pub fn new(map_from_lidar: &Pose3) -> Self {
         let rotation = DMat3::from_quat(DQuat::from(map_from_lidar.rotation));
         Self {
             lidar_from_map: rotation.transpose(),

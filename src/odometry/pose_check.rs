@@ -35,7 +35,7 @@ pub struct GivenPoses<'a> {
 /// What the rows of a pose file are.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum PoseMeaning {
-    /// As given: poses of the body of the calibration.
+    /// The given poses: poses of the body of the calibration.
     Given,
     /// Poses of a camera: x right, y down, z forward.
     Camera,
@@ -43,7 +43,7 @@ pub enum PoseMeaning {
     Lidar,
     /// Inverse poses, `body_from_world`.
     Inverse,
-    /// Poses of a body about whose z axis the lidar is turned, beside the calibration [rad].
+    /// Poses of a body about whose z axis the lidar is turned, in addition to the calibration [rad].
     Turned(f64),
 }
 

@@ -97,7 +97,7 @@ impl Edge {
             &(second * at.by_second),
             &-(second * at.residual),
         );
-        system.add_beside(self.first, self.second, &(first * at.by_second));
+        system.add_off_diagonal(self.first, self.second, &(first * at.by_second));
     }
 }
 

@@ -27,7 +27,7 @@ pub struct Sample {
 }
 
 impl Sample {
-    /// Of a scan without enough points.
+    /// The sample of a scan without enough points.
     pub fn empty() -> Self {
         Self {
             points: vec![],
@@ -36,7 +36,7 @@ impl Sample {
     }
 
     /// Samples a scan for a sensor of range `range_m`.
-    pub fn of(scan: &Scan, range_m: f64, config: &OdometryConfig) -> Self {
+    pub fn new(scan: &Scan, range_m: f64, config: &OdometryConfig) -> Self {
         /// Larger times before or after the moment of the pose are errors [s].
         const MAX_TIME_S: f32 = 1.0;
         /// Largest range of a point, in ranges of the sensor.

@@ -1,4 +1,4 @@
-//! State between scans: the local map, the pose, the motion, and how well it predicts.
+//! OdometerState between scans: the local map, the pose, the motion, and how well it predicts.
 
 use nalgebra::Vector6;
 
@@ -11,9 +11,9 @@ use super::voxel_map::VoxelMap;
 use crate::geometry::Pose3;
 use crate::lidar::{Motion, Scan};
 
-/// State after a scan.
+/// OdometerState after a scan.
 #[derive(Clone, Debug)]
-pub struct State {
+pub struct OdometerState {
     map: VoxelMap,
     /// Range of the sensor, for all lengths [m].
     range_m: f64,
@@ -33,7 +33,7 @@ pub struct State {
     missed: usize,
 }
 
-impl State {
+impl OdometerState {
     /// The state after the first scan; `None` if it has too few points.
     pub fn begin(scan: &Scan, config: &OdometryConfig) -> Option<Self> {
         let range_m = sensor_range(scan)?;
@@ -299,6 +299,6 @@ impl State {
     }
 
     fn sample(&self, scan: &Scan, config: &OdometryConfig) -> Sample {
-        Sample::of(scan, self.range_m, config)
+        Sample::new(scan, self.range_m, config)
     }
 }

@@ -100,9 +100,10 @@ pub fn order_of_firing(scan: &Scan) -> Option<(RotationDirection, f64)> {
         farthest = farthest.max(along);
         along >= farthest - ASIDE_RAD
     });
-    let direction = match last > 0.0 {
-        true => RotationDirection::CounterClockwise,
-        false => RotationDirection::Clockwise,
+    let direction = if last > 0.0 {
+        RotationDirection::CounterClockwise
+    } else {
+        RotationDirection::Clockwise
     };
     (is_steady && TURNS.contains(&(last.abs() / (2.0 * PI)))).then_some((direction, start_rad))
 }

@@ -7,10 +7,10 @@ use super::adjustment::{Adjusted, AdjustmentConfig, Held, adjust};
 use super::alignment::median;
 use super::anchors::{self, NotInMap, Placed, PlacementError};
 use super::config::OdometryConfig;
-use super::drive::{Drive, LocalMap, POINT_BYTES, SHORTER};
+use super::drive::{Drive, POINT_BYTES, SHORTER, Submap};
 use super::loops::{self, Drift, FoundLoop, Loop, LoopVerdict};
 use super::odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
-use super::path_graph::{LOCAL_MAP, move_along, odometry_edges};
+use super::path_graph::{SUBMAP_LENGTH, move_along, odometry_edges};
 use super::pose_graph::{Edge, optimize};
 use super::sampling::{Sample, sensor_range};
 use crate::geometry::{Pose3, TriangleMesh};
@@ -122,7 +122,7 @@ impl TrajectoryBuilder {
         let range_m = sensor_range(scan);
         let sample = range_m.map_or_else(Sample::empty, |range_m| {
             let spacing_m = self.config.sample_spacing * config.voxel_share * range_m;
-            let sample = Sample::of(scan, range_m, config);
+            let sample = Sample::new(scan, range_m, config);
             Sample {
                 points: sample.thinned(spacing_m),
                 ..sample
@@ -229,7 +229,7 @@ fn times_s(estimates: &[OdometryEstimate]) -> Vec<f64> {
 fn close_loops(drive: &mut Drive, odometry: &[OdometryEstimate]) -> Vec<Loop> {
     /// Drift of the odometry, as a share of the path, and what is left of it after the first round.
     const DRIFT: [f64; 2] = [0.02, 0.005];
-    let maps = drive.local_maps(LOCAL_MAP * drive.range_m);
+    let maps = drive.submaps(SUBMAP_LENGTH * drive.range_m);
     let along_path = odometry_edges(drive, &maps, odometry);
     let odometry = drive.poses.clone();
     let mut result = vec![];
@@ -258,7 +258,7 @@ fn close_loops(drive: &mut Drive, odometry: &[OdometryEstimate]) -> Vec<Loop> {
 /// Moves the poses by the loops that are confirmed.
 fn close(
     drive: &mut Drive,
-    maps: &[LocalMap],
+    maps: &[Submap],
     along_path: &[Edge],
     found: &[FoundLoop],
     drift: Drift,

@@ -23,7 +23,7 @@ pub fn pack(cell: IVec3) -> u64 {
 
 /// Moments of the points in a voxel, relative to its lower corner.
 #[derive(Clone, Copy, Debug, Default)]
-struct Cell {
+struct Moments {
     count: f32,
     first: Vec3,
     /// xx, yy, zz
@@ -32,7 +32,7 @@ struct Cell {
     products: Vec3,
 }
 
-impl Cell {
+impl Moments {
     /// Adds a point; beyond `limit` points older ones are forgotten.
     fn add(&mut self, p: Vec3, limit: f32) {
         if self.count >= limit {
@@ -62,9 +62,9 @@ impl Cell {
 
 /// Voxels of one scale.
 #[derive(Clone, Debug)]
-struct Level {
+struct VoxelGrid {
     edge_m: f64,
-    cells: HashMap<u64, Cell>,
+    cells: HashMap<u64, Moments>,
 }
 
 /// The surface near a point.
@@ -88,14 +88,14 @@ pub enum Shape {
 /// The local map.
 #[derive(Clone, Debug)]
 pub struct VoxelMap {
-    levels: [Level; 3],
+    levels: [VoxelGrid; 3],
     point_limit: f32,
 }
 
 impl VoxelMap {
     /// An empty map whose finest voxels have an edge `edge_m`.
     pub fn new(edge_m: f64, point_limit: f32) -> Self {
-        let level = |scale: f64| Level {
+        let level = |scale: f64| VoxelGrid {
             edge_m: edge_m * scale,
             cells: HashMap::default(),
         };
@@ -167,7 +167,7 @@ fn unpack(key: u64) -> IVec3 {
     IVec3::new(field(0), field(21), field(42))
 }
 
-impl Level {
+impl VoxelGrid {
     fn block(&self, point: DVec3) -> IVec3 {
         (point / self.edge_m - 0.5).floor().as_ivec3()
     }
@@ -181,7 +181,7 @@ impl Level {
         const WIDE: f64 = 0.05;
         let block = self.block(point);
         let edge_m = self.edge_m as f32;
-        let mut sums = Cell::default();
+        let mut sums = Moments::default();
         for corner in 0..8 {
             let step = IVec3::new(corner & 1, (corner >> 1) & 1, corner >> 2);
             if let Some(cell) = self.cells.get(&pack(block + step)) {
@@ -210,9 +210,10 @@ impl Level {
         let outer = DMat3::from_cols(mean * mean.x, mean * mean.y, mean * mean.z);
         Some(Surface {
             center: middle + mean,
-            shape: match smallest < FLAT * middle_one {
-                true => Shape::Plane(plane.normal.as_dvec3()),
-                false => Shape::Other(second * (1.0 / count) - outer),
+            shape: if smallest < FLAT * middle_one {
+                Shape::Plane(plane.normal.as_dvec3())
+            } else {
+                Shape::Other(second * (1.0 / count) - outer)
             },
         })
     }
@@ -262,7 +263,7 @@ mod tests {
 
     #[test]
     fn a_full_voxel_forgets_and_keeps_its_mean() {
-        let mut cell = Cell::default();
+        let mut cell = Moments::default();
         for _ in 0..100 {
             cell.add(Vec3::splat(0.1), 10.0);
         }

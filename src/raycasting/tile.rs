@@ -71,7 +71,7 @@ impl Tile {
             .map(|triangle| triangle as u32)
             .collect();
         let corners = |triangle: u32| mesh.corners(triangle as usize);
-        let bounds = Aabb::of(usable.iter().flat_map(|&triangle| corners(triangle)));
+        let bounds = Aabb::from_points(usable.iter().flat_map(|&triangle| corners(triangle)));
         if bounds.is_empty() {
             return None;
         }
@@ -79,7 +79,7 @@ impl Tile {
         let local = |triangle: u32| corners(triangle).map(|corner| (corner - middle) / STEP_M);
         let prims = usable
             .into_par_iter()
-            .map(|triangle| padded_prim(Aabb::of(local(triangle)), &bounds, triangle));
+            .map(|triangle| padded_prim(Aabb::from_points(local(triangle)), &bounds, triangle));
         let (bvh, of_leaves) = Bvh::build(prims.collect(), TRIANGLES);
         let (bvh, order) = WideBvh::of(&bvh);
         let mut leaves = LeafList::default();

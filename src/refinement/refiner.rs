@@ -167,7 +167,7 @@ pub enum Distance<'a> {
     InBasin,
     /// About half a metre: Gauss-Newton begins with a wide kernel.
     Near,
-    /// As far as its covariance says: the swarm searches among these surfaces of the map.
+    /// Up to its covariance: the swarm searches among these surfaces of the map.
     Far(&'a UprightSurfaces),
 }
 

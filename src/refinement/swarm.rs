@@ -131,9 +131,10 @@ pub fn minimize<const N: usize, E>(
         }
         let before = best.1;
         evaluate(&mut swarm, &mut best, &mut objective)?;
-        idle = match before - best.1 > config.tolerance {
-            true => 0,
-            false => idle + 1,
+        idle = if before - best.1 > config.tolerance {
+            0
+        } else {
+            idle + 1
         };
         if config.patience > 0 && idle >= config.patience {
             break;

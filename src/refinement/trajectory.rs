@@ -82,7 +82,7 @@ impl InitialEstimate {
     /// The poses of a rough trajectory with standard deviations of position [m] and heading [rad], and the increments
     /// of its odometry `previous_from_current`, of which the first is ignored. Scans are deskewed by the odometry, if all
     /// of it and the times of the poses [s] are known.
-    pub fn of_rough(
+    pub fn from_rough(
         poses: &[Pose2],
         [position_m, heading_rad]: [f64; 2],
         increments: &[Option<Pose2>],
@@ -101,7 +101,7 @@ impl InitialEstimate {
         poses.iter().enumerate().map(rough).collect()
     }
 
-    /// Where increments `previous_from_current`, of which the first is ignored, lead from the first pose; `None` if one is
+    /// Poses to which increments `previous_from_current` lead from the first one; the first increment is ignored. `None` if one is
     /// missing.
     pub fn driven(increments: &[Option<Pose2>]) -> Option<Vec<Pose3>> {
         let mut pose = Pose2::identity();
@@ -189,7 +189,7 @@ pub enum RefinerError {
 /// Upright surfaces around a square.
 struct NearbySurfaces {
     square: Vector2<i64>,
-    /// Where they come from.
+    /// The mesh from which they come.
     mesh: Weak<TriangleMesh>,
     surfaces: Arc<UprightSurfaces>,
 }
@@ -267,9 +267,10 @@ impl TrajectoryRefiner {
                 self.correction = Some(placed.pose * estimate.pose.inverse());
             }
             let unplaced = FrameResult {
-                state: match is_tracked {
-                    true => State::Searching,
-                    false => frame.state,
+                state: if is_tracked {
+                    State::Searching
+                } else {
+                    frame.state
                 },
                 ..frame
             };
@@ -378,9 +379,10 @@ impl TrajectoryRefiner {
         }
         let config = &self.config.refinement;
         let (pose, covariance) = (&frame.pose, &frame.covariance);
-        let surfaces = match config.is_wide(covariance) {
-            true => Some(self.surfaces_near(pose)?),
-            false => None,
+        let surfaces = if config.is_wide(covariance) {
+            Some(self.surfaces_near(pose)?)
+        } else {
+            None
         };
         let distance = surfaces.as_deref().map_or(distance, Distance::Far);
         let Some(refined) = refine_frame(&objective, pose, covariance, distance, config, rng)?
@@ -415,7 +417,7 @@ impl TrajectoryRefiner {
         let surfaces = match &*last {
             // Of a map in memory there is one mesh only.
             Some(last) if last.mesh.upgrade().is_some() => last.surfaces.clone(),
-            _ => Arc::new(UprightSurfaces::of(&mesh)),
+            _ => Arc::new(UprightSurfaces::new(&mesh)),
         };
         *last = Some(NearbySurfaces {
             square,

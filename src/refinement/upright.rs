@@ -27,8 +27,8 @@ pub struct UprightSurfaces {
 }
 
 impl UprightSurfaces {
-    /// Of a mesh in the map frame.
-    pub fn of(mesh: &TriangleMesh) -> Self {
+    /// Collects the surfaces of a mesh in the map frame.
+    pub fn new(mesh: &TriangleMesh) -> Self {
         /// Vertical component of the normal of an upright surface, at most.
         const UPRIGHT: f32 = 0.5;
         /// Largest number of points along an edge, for meshes with triangles of any size.
@@ -201,7 +201,7 @@ mod tests {
 
     #[test]
     fn distances_are_those_to_the_nearest_upright_surface_up_to_the_limit() {
-        let surfaces = UprightSurfaces::of(&wall());
+        let surfaces = UprightSurfaces::new(&wall());
         let field = surfaces.distances(Vector2::new(1.0, 2.0), &level(), 10.0, 3.0);
         for y in [-4.0, 0.0, 3.3, 9.0] {
             for x in [2.5, 3.4, 4.6, 5.1, 6.0] {
@@ -216,7 +216,7 @@ mod tests {
 
     #[test]
     fn surfaces_below_the_plane_of_the_ground_do_not_count() {
-        let surfaces = UprightSurfaces::of(&wall());
+        let surfaces = UprightSurfaces::new(&wall());
         let above = GroundPatch {
             height_m: 10.0,
             ..level()

@@ -209,7 +209,7 @@ mod tests {
     fn a_pose_metres_and_tens_of_degrees_off_is_found() {
         let world = TestWorld::street();
         let map = world.map();
-        let surfaces = UprightSurfaces::of(&map.mesh().unwrap());
+        let surfaces = UprightSurfaces::new(&map.mesh().unwrap());
         let truth = world.pose_at(18.0, 0.2, 0.05);
         let beams: Vec<Beam> = world.scan(&truth).beams().step_by(5).collect();
         let objective = world.objective(&beams);

@@ -180,7 +180,7 @@ fn cloud(path: &Path) -> Result<Printed> {
     let mut rows = vec![
         ("layout", "a scan, or a point cloud".to_owned()),
         ("points", format!("{} ({})", scan.len(), fields(&scan))),
-        ("extent", extent(Aabb::of(finite.copied()))),
+        ("extent", extent(Aabb::from_points(finite.copied()))),
         ("normals", normals.to_owned()),
     ];
     if scan.len() <= MAX_SCAN {
@@ -215,7 +215,10 @@ fn map(path: &Path) -> Result<Printed> {
     };
     Ok(Printed::rows(&[
         ("triangles", mesh.triangles.len().to_string()),
-        ("extent", extent(Aabb::of(mesh.vertices.iter().copied()))),
+        (
+            "extent",
+            extent(Aabb::from_points(mesh.vertices.iter().copied())),
+        ),
         ("path", path),
     ]))
 }

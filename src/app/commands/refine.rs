@@ -116,7 +116,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
             let [position_m, heading_deg] = config.uncertainty;
             let deviations = [position_m, heading_deg.to_radians()];
             let times_s = results.times_s.as_deref();
-            InitialEstimate::of_rough(&estimates, deviations, &increments, times_s)
+            InitialEstimate::from_rough(&estimates, deviations, &increments, times_s)
         }
         false => initial_estimates(&results, &estimates, &increments),
     };
@@ -261,7 +261,9 @@ fn initial_estimates(
 ) -> Vec<InitialEstimate> {
     let state = |row: usize| {
         let number = results.states.as_ref().map(|states| states[row]);
-        number.and_then(State::of_number).unwrap_or(State::Tracking)
+        number
+            .and_then(State::from_number)
+            .unwrap_or(State::Tracking)
     };
     let in_space: Vec<Pose3> = (estimates.iter())
         .map(|pose| pose3_from_pose2(pose, 0.0))

@@ -306,7 +306,7 @@ fn trust(result: &Path) -> Result<Option<Trust>> {
         .collect();
     // Frames without times are a tenth of a second apart.
     let by_number = || (0..states.len()).map(|row| 0.1 * row as f64).collect();
-    let mut trust = Trust::of(&TrustedRun {
+    let mut trust = Trust::new(&TrustedRun {
         estimates,
         ground_truth,
         covariances,

@@ -75,7 +75,7 @@ fn verdict(results: &ComparisonResults) -> String {
     for variant in &results.config.configurations {
         let runs: Vec<&RunRecord> = results.runs_by_sequence(&variant.name).concat();
         let errors: Vec<_> = runs.iter().filter_map(|run| run.metrics()).collect();
-        let Some(position) = Summary::of(
+        let Some(position) = Summary::new(
             &errors
                 .iter()
                 .map(|it| it.position_m.rmse)

@@ -28,7 +28,7 @@ fn run(sequence: &str, configuration: &str, seed: u64, error_m: f64) -> RunRecor
     };
     let report = TrajectoryReport {
         range_mcl: RangeMclRules::default().evaluate(&estimates, &truth),
-        metrics: TrajectoryMetrics::of(&trajectory, &MetricsConfig::default()).unwrap(),
+        metrics: TrajectoryMetrics::new(&trajectory, &MetricsConfig::default()).unwrap(),
         in_space: None,
     };
     RunRecord {

@@ -230,9 +230,9 @@ pub fn evaluate_trajectory(
     };
     Ok(TrajectoryReport {
         range_mcl: rules.evaluate(trajectory.estimates, trajectory.ground_truth),
-        metrics: TrajectoryMetrics::of(trajectory, &config)?,
+        metrics: TrajectoryMetrics::new(trajectory, &config)?,
         in_space: in_space.and_then(|(estimates, truth)| {
-            SpatialMetrics::of(estimates, truth, config.skip_frames)
+            SpatialMetrics::new(estimates, truth, config.skip_frames)
         }),
     })
 }

@@ -202,7 +202,7 @@ fn voxels(
 
 /// Centres of the blocks with points, by row and column.
 fn blocks(points: &[Vec3]) -> Vec<Point2<f32>> {
-    let bounds = Aabb::of(points.iter().copied());
+    let bounds = Aabb::from_points(points.iter().copied());
     let cell = |point: &Vec3| {
         ((*point - bounds.min) / BLOCK_M)
             .floor()

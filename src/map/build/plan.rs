@@ -220,7 +220,7 @@ impl Domain<'_> {
     /// The cells that it owns within and beside a box in its coordinates.
     pub fn region(&self, bounds: &Aabb) -> Region {
         let bounds = if bounds.is_empty() {
-            Aabb::of([Vec3::ZERO])
+            Aabb::from_points([Vec3::ZERO])
         } else {
             *bounds
         };

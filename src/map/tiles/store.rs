@@ -428,7 +428,7 @@ impl Drop for Reading {
 impl SceneSource for TileStore {
     fn scene(&self, origins: &[DVec3]) -> Scene {
         let finite = origins.iter().filter(|origin| origin.is_finite());
-        let bounds = Aabb::of(finite.map(|origin| origin.as_vec3()));
+        let bounds = Aabb::from_points(finite.map(|origin| origin.as_vec3()));
         if !bounds.is_empty() {
             self.drop_beyond(bounds);
         }

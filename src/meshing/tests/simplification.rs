@@ -284,7 +284,7 @@ impl<'a> SurfaceIndex<'a> {
             columns,
         };
         for triangle in 0..mesh.triangles.len() {
-            let extent = Aabb::of(mesh.corners(triangle));
+            let extent = Aabb::from_points(mesh.corners(triangle));
             let [low, high] = [extent.min, extent.max].map(|corner| surface.cell(corner));
             for row in low.1..=high.1 {
                 for column in low.0..=high.0 {

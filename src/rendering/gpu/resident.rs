@@ -238,5 +238,5 @@ impl Tiles {
 fn bounds_of<'a>(poses: impl Iterator<Item = &'a Pose3>) -> Aabb {
     let origins = poses.map(|pose| pose.translation.vector.cast::<f32>());
     let origins = origins.map(|origin| Vec3::new(origin.x, origin.y, origin.z));
-    Aabb::of(origins.filter(|origin| origin.is_finite()))
+    Aabb::from_points(origins.filter(|origin| origin.is_finite()))
 }

@@ -99,7 +99,7 @@ impl TwoLevelBvh {
         self.triangles
             .extend(order.map(|&index| Triangle::new(bottom.corners[index as usize])));
         self.tiles.push(DeviceTile {
-            bounds: Aabb::of(bottom.corners.iter().flatten().copied()),
+            bounds: Aabb::from_points(bottom.corners.iter().flatten().copied()),
             triangles: first as u32..self.triangles.len() as u32,
         });
         Some(refer(root))
@@ -159,7 +159,8 @@ impl BottomLevel {
             .filter(|corners| is_proper(*corners))
             .collect();
         let triangles = corners.iter().zip(0..);
-        let prims = triangles.map(|(corners, index)| PrimRef::new(Aabb::of(*corners), index));
+        let prims =
+            triangles.map(|(corners, index)| PrimRef::new(Aabb::from_points(*corners), index));
         let (bvh, leaves) = Bvh::build(prims.collect(), LEAF_SIZE);
         Self {
             bvh,

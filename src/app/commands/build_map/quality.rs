@@ -51,7 +51,7 @@ pub fn agreement(config: &BuildMapConfig, path: &MappingPath) -> Result<Option<T
     };
     let (mesh, surface) = (ply::read(&config.mesh_file)?, ply::read(truth)?);
     let scan = config.map().local_map.scan;
-    Ok(TruthAgreement::of(
+    Ok(TruthAgreement::new(
         &mesh,
         &surface,
         &path.map_from_lidar,

@@ -74,7 +74,7 @@ fn moves_along_z(poses: &[Pose3]) -> bool {
 pub fn evaluate(results: &LocalizationResults, about: BTreeMap<String, String>) -> Result<Report> {
     let estimates = results.estimates_in_space.as_deref().unwrap_or_default();
     let truth = results.ground_truth_in_space.as_deref().unwrap_or_default();
-    let metrics = SpatialMetrics::of(estimates, truth, 0)
+    let metrics = SpatialMetrics::new(estimates, truth, 0)
         .context("there are no poses with true poses to evaluate")?;
     let error = metrics.short_segments.map(|it| it.translation_percent);
     if let Some(percent) = error.filter(|&percent| percent > OTHER_AXES_PERCENT) {

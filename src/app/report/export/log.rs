@@ -178,7 +178,7 @@ impl Trajectories {
                 rotation: orientation,
             },
         )?;
-        let state = |row: usize| Some(State::of_number(results.states.as_ref()?[row])?.word());
+        let state = |row: usize| Some(State::from_number(results.states.as_ref()?[row])?.word());
         let covariance = |all: &Option<Vec<Matrix3<f64>>>| Some(all.as_ref()?[row]);
         let odometry = |pose3: &Pose3, covariance: Option<Matrix3<f64>>| Odometry {
             timestamp: timestamp(stamp),
@@ -252,7 +252,7 @@ impl Trajectories {
             .as_ref()
             .or(results.covariances.as_ref());
         let covariance = covariances.map(|all| all[row]);
-        let axes = covariance.map(|covariance| Axes::of(&covariance, &best));
+        let axes = covariance.map(|covariance| Axes::new(&covariance, &best));
         let [error, refined_error] = [Some(&self.estimates), self.refined.as_ref()]
             .map(|poses| poses.and_then(|poses| errors(poses)));
         let agreement = results.agreements.as_ref().map(|all| all[row]);

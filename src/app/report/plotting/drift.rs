@@ -46,7 +46,7 @@ pub fn drift_chart(truth: &[Pose3], trajectories: &[(&str, Rgb, &[Pose3])]) -> L
                     .push(series(|it| it.heading_rad.to_degrees()));
             }
         }
-        let by_length = SpatialMetrics::of(estimates, truth, 0).map(|it| it.by_length);
+        let by_length = SpatialMetrics::new(estimates, truth, 0).map(|it| it.by_length);
         let by_length = by_length.unwrap_or_default();
         let series = |value: fn(&LengthErrors) -> f64| {
             let points = by_length.iter().map(|it| (it.length_m, value(it)));

@@ -50,7 +50,7 @@ impl InteractivePath<'_> {
             let axes = all
                 .iter()
                 .zip(best)
-                .map(|(covariance, pose)| Axes::of(covariance, pose));
+                .map(|(covariance, pose)| Axes::new(covariance, pose));
             axes.map(|axes| rounded(100.0 * axes.long_m, 100.0))
                 .collect()
         });
@@ -73,7 +73,7 @@ impl InteractivePath<'_> {
         let states = results.states.as_ref().map(|states| -> Vec<Option<&str>> {
             states
                 .iter()
-                .map(|&number| Some(State::of_number(number)?.word()))
+                .map(|&number| Some(State::from_number(number)?.word()))
                 .collect()
         });
         let colors = STATES.map(|(state, color)| (state.word().to_owned(), css(color).into()));

@@ -459,7 +459,7 @@ fn on_ground(scene: &Scene, map_from_lidar: &Pose3) -> Vec3 {
 
 /// Points that the camera must see: around each pose and around the middle of the path, inside the map.
 fn surroundings(path: &[Vec3], map: &Aabb) -> Vec<Vec3> {
-    let bounds = Aabb::of(path.iter().copied());
+    let bounds = Aabb::from_points(path.iter().copied());
     let circle = |center: Vec3, radius_m: f32| {
         (0..8).map(move |k| {
             let (sin, cos) = (TAU * k as f32 / 8.0).sin_cos();

@@ -152,7 +152,7 @@ impl FrameTable {
         let axes: Option<Vec<Axes>> = covariances.map(|covariances| {
             let pairs = covariances.iter().zip(estimates);
             pairs
-                .map(|(covariance, pose)| Axes::of(covariance, pose))
+                .map(|(covariance, pose)| Axes::new(covariance, pose))
                 .collect()
         });
         let axes = axes.as_deref();

@@ -69,7 +69,7 @@ fn metrics_on_kitti_07_equal_those_of_an_independent_script() {
         skip_frames: 20,
         ..MetricsConfig::default()
     };
-    let metrics = TrajectoryMetrics::of(&trajectory, &config).unwrap();
+    let metrics = TrajectoryMetrics::new(&trajectory, &config).unwrap();
     let position = metrics.position_m;
     let heading = metrics.heading_rad;
     for (ours, theirs, half_digit) in [

@@ -297,7 +297,7 @@ mod tests {
         };
         TrajectoryReport {
             range_mcl: RangeMclRules::default().evaluate(&estimates, &truth),
-            metrics: TrajectoryMetrics::of(&trajectory, &MetricsConfig::default()).unwrap(),
+            metrics: TrajectoryMetrics::new(&trajectory, &MetricsConfig::default()).unwrap(),
             in_space: None,
         }
     }

@@ -42,7 +42,7 @@ impl RunSummary {
         let tracked: Vec<usize> = (0..results.len()).filter(|&row| is_tracked(row)).collect();
         let over_tracked = |value: &dyn Fn(usize) -> Option<f64>| {
             let values: Vec<f64> = tracked.iter().filter_map(|&row| value(row)).collect();
-            Summary::of(&values)
+            Summary::new(&values)
         };
         let covariance = |row: usize| Some(results.covariances.as_ref()?[row]);
         let steps = estimates.iter().zip(estimates.iter().skip(1));

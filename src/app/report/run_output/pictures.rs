@@ -213,7 +213,7 @@ fn draw_states(
     };
     let (x_name, x) = time_axis(results);
     let axes = covariances.iter().zip(&trajectories.estimates);
-    let sigmas_cm = axes.map(|(covariance, pose)| 100.0 * Axes::of(covariance, pose).long_m);
+    let sigmas_cm = axes.map(|(covariance, pose)| 100.0 * Axes::new(covariance, pose).long_m);
     let agreements = results.agreements.as_deref().unwrap_or_default();
     let in_state = |(state, color): (State, Rgb)| Series {
         mark: Mark::Dots,

@@ -4,7 +4,7 @@
 //! turn of the sensor shifts the sectors, so two places are compared at the shift at which the columns of
 //! their images are most similar.
 //!
-//! Kim and Kim, *Scan Context: Egocentric Spatial Descriptor for Place Recognition within 3D Point Cloud Map*
+//! Kim and Kim, *Scan Context: Egocentric Spatial Descriptor for ScanContext Recognition within 3D Point Cloud Map*
 //! (IROS 2018), eq. 3 to 8.
 
 use std::f64::consts::TAU;
@@ -14,16 +14,16 @@ use super::sampling::TimedPoint;
 const RINGS: usize = 20;
 const SECTORS: usize = 60;
 
-/// Descriptor of a place.
+/// Descriptor of the surroundings of a sensor.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Place {
+pub struct ScanContext {
     /// Per sector the heights of its rings, as a vector of length one; zeros where nothing is.
     columns: Vec<[f32; RINGS]>,
 }
 
-impl Place {
+impl ScanContext {
     /// Describes the points around a sensor, up to a distance.
-    pub fn of(points: &[TimedPoint], radius_m: f64) -> Self {
+    pub fn new(points: &[TimedPoint], radius_m: f64) -> Self {
         /// Share of the points that are lower than the zero of the heights: the ground.
         const LOW: f64 = 0.05;
         let radius_m = radius_m as f32;
@@ -113,7 +113,7 @@ mod tests {
     #[test]
     fn a_place_is_recognized_from_any_heading() {
         let there = surroundings(1);
-        let place = Place::of(&there, 50.0);
+        let place = ScanContext::new(&there, 50.0);
         for turn in [0.0_f32, 0.7, 2.0, 3.2, 5.5] {
             let turned: Vec<TimedPoint> = (there.iter())
                 .map(|point| TimedPoint {
@@ -121,9 +121,9 @@ mod tests {
                     ..*point
                 })
                 .collect();
-            let (similarity, found) = place.similarity(&Place::of(&turned, 50.0));
+            let (similarity, found) = place.similarity(&ScanContext::new(&turned, 50.0));
             let error = (found - f64::from(turn) + 0.5 * TAU).rem_euclid(TAU) - 0.5 * TAU;
-            let (of_other, _) = place.similarity(&Place::of(&surroundings(2), 50.0));
+            let (of_other, _) = place.similarity(&ScanContext::new(&surroundings(2), 50.0));
             assert!(
                 error.abs() < 0.11 && similarity > of_other + 0.05,
                 "{turn} {found} {similarity} {of_other}"
@@ -133,7 +133,7 @@ mod tests {
 
     #[test]
     fn nothing_is_similar_to_nothing() {
-        let empty = Place::of(&[], 50.0);
+        let empty = ScanContext::new(&[], 50.0);
         assert_eq!(empty.similarity(&empty).0, 0.0);
     }
 }
