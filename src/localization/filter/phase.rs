@@ -282,6 +282,16 @@ mod tests {
     }
 
     #[test]
+    fn an_uncertain_pose_is_tracked_again_only_if_it_is_precise_and_as_many_beams_agree_as_usual() {
+        for update in evidence() {
+            let after = Phase::Uncertain.after(&update, PATIENCE);
+            let is_lost = update.disagrees || update.is_scattered;
+            let is_tracked = !is_lost && update.is_precise && update.is_usual;
+            assert_eq!(after == Phase::Tracking, is_tracked);
+        }
+    }
+
+    #[test]
     fn only_a_pose_that_is_tracked_and_precise_is_reported_as_tracking() {
         for phase in phases() {
             for is_precise in [false, true] {
