@@ -22,7 +22,7 @@ use std::time::{Duration, Instant};
 use fpmcl::app::report::plotting::{LineChart, Panel, Series};
 use fpmcl::geometry::{Pose2, Pose3, Vec3, pose2_from_pose3};
 use fpmcl::lidar::{Beam, LidarModel, PERIOD_S, Rotation, Scan};
-use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, SensorConfig, Start, StartSpread};
+use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start, StartSpread};
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::odometry::{OdometryConfig, compare_timings};
 use fpmcl::recording::Recording;
@@ -30,7 +30,7 @@ use fpmcl::refinement::{
     InitialEstimate, Method, RefinementConfig, RefinerConfig, TrajectoryRefiner,
 };
 use fpmcl::rendering::{RangeDifference, RangeRenderer, RenderError, SurfaceHit};
-use fpmcl::sensor;
+use fpmcl::sensor::{Sensor, SensorConfig};
 use nalgebra::{Matrix3, Vector2};
 use rand::{RngExt as _, SeedableRng as _, rngs::StdRng};
 
@@ -79,10 +79,7 @@ fn main() -> Result<(), Failure> {
         .take(10)
         .map(|(scan, _)| scan.clone())
         .collect();
-    let sensor_config = SensorConfig {
-        lidar: sensor::infer(&scans).lidar,
-        ..SensorConfig::default()
-    };
+    let sensor = Sensor::infer(&scans, &SensorConfig::default());
     println!("| method | start | back | time per frame | rays per frame |\n|---|---|---|---|---|");
     let mut curves = vec![];
     for (name, placer) in PLACERS {
@@ -105,7 +102,7 @@ fn main() -> Result<(), Failure> {
                 );
                 let trial = Trial {
                     map: &map,
-                    sensor: &sensor_config,
+                    sensor: &sensor,
                     scan,
                     other: &frames[(number + 1) % frames.len()],
                     start,
@@ -158,7 +155,7 @@ fn frames(recording: &Path, map: &Map) -> Result<Vec<(Scan, Pose3)>, Failure> {
 /// A frame to place.
 struct Trial<'a> {
     map: &'a Map,
-    sensor: &'a SensorConfig,
+    sensor: &'a Sensor,
     scan: &'a Scan,
     other: &'a (Scan, Pose3),
     start: Pose2,
@@ -180,7 +177,6 @@ impl Trial<'_> {
         match placer {
             Placer::Refiner(method) => {
                 let config = RefinerConfig {
-                    sensor: self.sensor.clone(),
                     refinement: RefinementConfig {
                         method,
                         ..RefinementConfig::default()
@@ -194,7 +190,7 @@ impl Trial<'_> {
                     covariance: Some(Matrix3::from_diagonal(&variances.into())),
                     ..InitialEstimate::tracked(pose)
                 };
-                let mut refiner = TrajectoryRefiner::new(self.map, config, self.seed)?;
+                let mut refiner = TrajectoryRefiner::new(self.map, self.sensor, config, self.seed)?;
                 let counted = rays.load(Ordering::Relaxed);
                 let (other, pose) = self.other;
                 refiner.add(&compensated(other), &uncertain(pose2_from_pose3(pose)))?;
@@ -217,11 +213,11 @@ impl Trial<'_> {
                     spread,
                 };
                 let config = LocalizerConfig {
-                    sensor: self.sensor.clone(),
                     num_particles,
                     ..LocalizerConfig::default()
                 };
-                let mut localizer = Localizer::new(self.map, config, start, self.seed)?;
+                let mut localizer =
+                    Localizer::new(self.map, self.sensor, config, start, self.seed)?;
                 let begin = Instant::now();
                 let pose = localizer.step(&scan, Odometry::Unknown)?.pose;
                 Ok((pose, begin.elapsed()))

@@ -16,10 +16,10 @@ mod process;
 use std::time::Instant;
 
 use fpmcl::geometry::pose2_from_pose3;
-use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, SensorConfig, Start};
+use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::recording::Recording;
-use fpmcl::sensor;
+use fpmcl::sensor::{Sensor, SensorConfig};
 
 type Failure = Box<dyn std::error::Error>;
 
@@ -54,18 +54,16 @@ fn main() -> Result<(), Failure> {
     let some = some
         .map(|(frame, _)| frame.read())
         .collect::<Result<Vec<_>, _>>()?;
+    let sensor = Sensor::infer(&some, &SensorConfig::default());
     let config = LocalizerConfig {
-        sensor: SensorConfig {
-            lidar: sensor::infer(&some).lidar,
-            ..SensorConfig::default()
-        },
         num_particles: 10_000,
         ..LocalizerConfig::default()
     };
     for (number, (frame, truth)) in scans.iter().step_by(step).enumerate() {
         let scan = frame.read()?;
         let begin = Instant::now();
-        let mut localizer = Localizer::new(&map, config.clone(), Start::Road, number as u64)?;
+        let mut localizer =
+            Localizer::new(&map, &sensor, config.clone(), Start::Road, number as u64)?;
         let pose = localizer.step(&scan, Odometry::Unknown)?.pose;
         let time_s = begin.elapsed().as_secs_f64();
         let error = pose2_from_pose3(truth).inverse() * pose;

@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::recording::{Recording, poses::write_tum};
+use fpmcl::sensor::{Sensor, SensorConfig};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<PathBuf> = std::env::args_os().skip(1).map(PathBuf::from).collect();
@@ -15,9 +16,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         return Err("usage: localize RECORDING MAP.ply TRAJECTORY.txt".into());
     };
     let map = Map::load(map_file, &MapOptions::default())?;
-    let mut localizer = Localizer::new(&map, LocalizerConfig::default(), Start::Anywhere, 0)?;
+    let recording = Recording::open(recording)?;
+    let sensor = Sensor::infer_recording(&recording, &SensorConfig::default())?;
+    let config = LocalizerConfig::default();
+    let mut localizer = Localizer::new(&map, &sensor, config, Start::Anywhere, 0)?;
     let mut trajectory = Vec::new();
-    for frame in &Recording::open(recording)?.frames {
+    for frame in &sensor.applied_to(recording).frames {
         let estimate = localizer.step(&frame.read()?, Odometry::Unknown)?;
         let (t, deviations) = (estimate.pose.translation, estimate.standard_deviations());
         let state = estimate.state.word();

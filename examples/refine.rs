@@ -9,6 +9,7 @@ use fpmcl::geometry::pose2_from_pose3;
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::recording::{Recording, poses::read_tum};
 use fpmcl::refinement::{InitialEstimate, RefinerConfig, TrajectoryRefiner};
+use fpmcl::sensor::{Sensor, SensorConfig};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<PathBuf> = std::env::args_os().skip(1).map(PathBuf::from).collect();
@@ -17,8 +18,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     };
     let map = Map::load(map_file, &MapOptions::default())?;
     let trajectory = read_tum(trajectory_file)?;
-    let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), 0)?;
     let recording = Recording::open(recording)?;
+    let sensor = Sensor::infer_recording(&recording, &SensorConfig::default())?;
+    let mut refiner = TrajectoryRefiner::new(&map, &sensor, RefinerConfig::default(), 0)?;
+    let recording = sensor.applied_to(recording);
     for (frame, row) in recording.frames.iter().zip(&trajectory) {
         let estimate = InitialEstimate::tracked(pose2_from_pose3(&row.map_from_lidar));
         refiner.add(&frame.read()?, &estimate)?;

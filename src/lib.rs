@@ -19,6 +19,7 @@
 //! use fpmcl::mapping::build_map;
 //! use fpmcl::recording::Recording;
 //! use fpmcl::refinement::{InitialEstimate, RefinerConfig, TrajectoryRefiner};
+//! use fpmcl::sensor::{Sensor, SensorConfig};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let map = build_map(&Recording::open("data/street/drive_1")?, &MapConfig::default())?;
@@ -26,9 +27,11 @@
 //!
 //! let map = Map::load(Path::new("results/map.ply"), &MapOptions::default())?;
 //! let seed = 0;
-//! let mut localizer = Localizer::new(&map, LocalizerConfig::default(), Start::Anywhere, seed)?;
-//! let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), seed)?;
 //! let second_drive = Recording::open("data/street/drive_2")?;
+//! let sensor = Sensor::infer_recording(&second_drive, &SensorConfig::default())?;
+//! let config = LocalizerConfig::default();
+//! let mut localizer = Localizer::new(&map, &sensor, config, Start::Anywhere, seed)?;
+//! let mut refiner = TrajectoryRefiner::new(&map, &sensor, RefinerConfig::default(), seed)?;
 //! for frame in &second_drive.frames {
 //!     let scan = frame.read()?;
 //!     let estimate = localizer.step(&scan, Odometry::Unknown)?;
@@ -72,7 +75,9 @@
 //! | foundations | [`files`], [`geometry`], [`memory`], [`random`], [`shared_bytes`], `simd`, [`statistics`], [`validation`] |
 //! | sensor and rays | [`lidar`], [`raycasting`] |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
-//! | map | [`map`], [`odometry`], [`registration`], [`sensor`], [`simulation`] |
+//! | motion | [`odometry`] |
+//! | inferred sensor | [`sensor`] |
+//! | map | [`map`], [`registration`], [`simulation`] |
 //! | poses | [`evaluation`], [`localization`] |
 //! | trajectories | [`mapping`], [`refinement`] |
 //! | program, feature `cli` | `app` |
@@ -101,11 +106,13 @@ pub mod ground;
 pub mod meshing;
 pub mod recording;
 pub mod rendering;
+// Motion.
+pub mod odometry;
+// Inferred sensor.
+pub mod sensor;
 // Map.
 pub mod map;
-pub mod odometry;
 pub mod registration;
-pub mod sensor;
 pub mod simulation;
 // Poses.
 pub mod evaluation;

@@ -10,7 +10,11 @@ use std::path::Path;
 
 use fpmcl::lidar::{NormalConfig, RangeImage, Scan, estimate_spatial_normals};
 use fpmcl::recording::scan_files;
-use fpmcl::sensor::{BeamSource, DroppedPoints, SensorDescription, infer};
+use fpmcl::sensor::{BeamSource, DroppedPoints, Sensor, SensorConfig};
+
+fn infer(scans: &[Scan]) -> Sensor {
+    Sensor::infer(scans, &SensorConfig::default())
+}
 
 #[test]
 fn every_sample_has_the_points_of_its_header_and_they_surround_the_sensor() {
@@ -50,7 +54,7 @@ fn scans_of_nuscenes_have_five_numbers_per_point() {
 }
 
 /// The sensor of `count` scans of a folder, each `step` after the last.
-fn sensor_of(folder: &Path, step: usize, count: usize) -> (Vec<Scan>, SensorDescription) {
+fn sensor_of(folder: &Path, step: usize, count: usize) -> (Vec<Scan>, Sensor) {
     let mut paths: Vec<_> = (fs::read_dir(folder).unwrap())
         .map(|entry| entry.unwrap().path())
         .filter(|path| scan_files::is_scan(path))
@@ -107,7 +111,7 @@ fn the_sensor_of_kitti_is_recognized_by_a_drive() {
         return;
     };
     let (mut scans, sensor) = sensor_of(&folder.join("velodyne"), 8, 10);
-    assert_eq!((sensor.beams, sensor.lidar.height), (Some(64), 64));
+    assert_eq!((sensor.beams, sensor.range_image.height), (Some(64), 64));
     let height_m = sensor.mounting.unwrap().height_m;
     assert!((height_m - 1.73).abs() < 0.05, "{height_m}");
     assert!(sensor.is_moving);
@@ -115,7 +119,11 @@ fn the_sensor_of_kitti_is_recognized_by_a_drive() {
     assert!(x_min > -2.8 && x_max < 3.0 && y_min > -2.0 && y_max < 2.0);
     let mut lost = DroppedPoints::default();
     for scan in &scans {
-        lost.add(&DroppedPoints::count(scan, &sensor.lidar, sensor.own_car_m));
+        lost.add(&DroppedPoints::count(
+            scan,
+            &sensor.range_image,
+            sensor.own_car_m,
+        ));
     }
     assert_eq!(lost.above(0.2), [], "{lost:?}");
 
@@ -134,10 +142,10 @@ fn the_sensor_of_nuscenes_is_recognized_by_a_drive() {
     };
     let (_, sensor) = sensor_of(&folder.join("lidar"), 3, 10);
     assert_eq!(sensor.beams, Some(32));
-    let top_deg = sensor.lidar.elevation_rad(0).to_degrees();
+    let top_deg = sensor.range_image.elevation_rad(0).to_degrees();
     let bottom_deg = sensor
-        .lidar
-        .elevation_rad(sensor.lidar.height - 1)
+        .range_image
+        .elevation_rad(sensor.range_image.height - 1)
         .to_degrees();
     assert!((top_deg - 10.7).abs() < 0.3, "{top_deg}");
     assert!((bottom_deg + 30.7).abs() < 1.0, "{bottom_deg}");
@@ -163,9 +171,9 @@ fn a_livox_has_no_rows_and_normals_from_neighbours_in_space() {
     assert!((60.0..90.0).contains(&sensor.horizontal_fov_deg));
     let (mut all_found, mut all_pixels) = (0, 0);
     for scan in &scans {
-        let lost = DroppedPoints::count(scan, &sensor.lidar, sensor.own_car_m);
+        let lost = DroppedPoints::count(scan, &sensor.range_image, sensor.own_car_m);
         assert_eq!(lost.above(0.25), [], "{lost:?}");
-        let points = RangeImage::project(&scan.points, &sensor.lidar).points;
+        let points = RangeImage::project(&scan.points, &sensor.range_image).points;
         let normals = estimate_spatial_normals(&points, &NormalConfig::default());
         let pixels = points.iter().filter(|point| point.length() > 0.0).count();
         let found = normals.iter().flatten().count();

@@ -99,10 +99,11 @@ impl Localizer {
 
 impl Localizer {
     fn begin(&mut self, sensor: &Sensor) -> Result<(), LocalizerError> {
-        let config = &mut self.config;
-        sensor.apply(&mut config.range_image, &mut config.own_car_m);
+        let config = &self.config;
+        let sensor = sensor.0.clone().with_known(&config.known_sensor());
         let (start, seed) = (self.start.clone(), config.seed);
-        let localizer = localization::Localizer::new(&self.map, config.localizer(), start, seed)?;
+        let localizer =
+            localization::Localizer::new(&self.map, &sensor, config.localizer(), start, seed)?;
         self.localizer = Some(localizer);
         Ok(())
     }
@@ -114,7 +115,10 @@ impl Localizer {
         given: Option<Given>,
     ) -> anyhow::Result<(localization::Estimate, Option<Pose3>)> {
         if self.localizer.is_none() {
-            let sensor = Sensor(sensor::infer(std::slice::from_ref(scan)));
+            let sensor = Sensor(sensor::Sensor::infer(
+                std::slice::from_ref(scan),
+                &self.config.known_sensor(),
+            ));
             self.begin(&sensor)?;
         }
         let odometry = match (given, &mut self.odometer) {

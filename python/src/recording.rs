@@ -4,12 +4,11 @@ use std::borrow::Cow;
 use std::path::PathBuf;
 
 use anyhow::anyhow;
-use fpmcl::app::commands::stages;
 use fpmcl::app::settings::LocalizationConfig;
 use fpmcl::geometry::Pose3;
 use fpmcl::lidar;
 use fpmcl::recording::{self, Frame};
-use fpmcl::sensor::{self, RangeImageConfig, SensorDescription};
+use fpmcl::sensor::{self, RangeImageConfig, SensorConfig};
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayDyn};
 use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;
@@ -142,7 +141,7 @@ fn column_view<'py, T: numpy::Element>(
 /// What a sensor is: its beams, limits of range, own car and height, inferred from scans.
 #[pyclass(frozen, from_py_object, module = "fpmcl")]
 #[derive(Clone)]
-pub struct Sensor(pub SensorDescription);
+pub struct Sensor(pub sensor::Sensor);
 
 #[pymethods]
 impl Sensor {
@@ -165,14 +164,15 @@ impl Sensor {
     }
 
     fn __repr__(&self) -> String {
-        format!("<fpmcl.Sensor: {}>", stages::description(&self.0))
+        format!("<fpmcl.Sensor: {}>", self.0)
     }
 }
 
 impl Sensor {
     /// Sets the keys of the sensor that are not given.
     pub fn apply(&self, range_image: &mut RangeImageConfig, own_car_m: &mut Option<[f32; 4]>) {
-        stages::apply(&self.0, range_image, own_car_m);
+        range_image.resolve(&self.0.range_image, self.0.has_rows);
+        own_car_m.get_or_insert(self.0.own_car_m);
     }
 }
 
@@ -299,8 +299,6 @@ pub fn read_recording(
             recording = recording.with_poses(track)?;
         }
         let (recording, sensor) = config.sensor_keys().resolve(recording)?;
-        let inferred = || anyhow::Ok(sensor::infer(&stages::sample(&recording)?));
-        let sensor = sensor.map_or_else(inferred, Ok)?;
         anyhow::Ok((recording, Sensor(sensor)))
     })?;
     Ok(Recording { recording, sensor })
@@ -389,7 +387,10 @@ impl Scans {
                 let scans: Vec<lidar::Scan> = scans
                     .map(|row| Ok(self.read(row)?.into_owned()))
                     .collect::<anyhow::Result<_>>()?;
-                anyhow::Ok(Sensor(sensor::infer(&scans)))
+                anyhow::Ok(Sensor(sensor::Sensor::infer(
+                    &scans,
+                    &SensorConfig::default(),
+                )))
             }),
         }
     }

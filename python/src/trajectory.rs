@@ -88,10 +88,10 @@ pub fn refine(
     sensor: Option<Sensor>,
     settings: Option<&Bound<'_, PyDict>>,
 ) -> PyResult<RefinedTrajectory> {
-    let mut config = settings::of_stage(RefinementConfig::default(), settings)?;
+    let config = settings::of_stage(RefinementConfig::default(), settings)?;
     let scans = Scans::of(scans)?;
     let sensor = scans.sensor(py, sensor)?;
-    sensor.apply(&mut config.range_image, &mut config.own_car_m);
+    let sensor = Sensor(sensor.0.with_known(&config.known_sensor()));
     let increments = motions.map(|motions| arrays::all_planar("motions", &motions));
     let increments = increments.transpose()?;
     let starts = starts(estimates, increments.as_deref(), &scans, &config)?;
@@ -107,7 +107,8 @@ pub fn refine(
         }
     }
     let refined = released(py, || {
-        let mut refiner = TrajectoryRefiner::new(&map.map, config.refiner(), config.seed)?;
+        let mut refiner =
+            TrajectoryRefiner::new(&map.map, &sensor.0, config.refiner(), config.seed)?;
         for (row, start) in starts.iter().enumerate() {
             refiner.add(&*scans.read(row)?, start)?;
             Python::attach(|py| py.check_signals())?;

@@ -6,9 +6,9 @@ use super::observation::ObservationConfig;
 use super::places::PlacesConfig;
 use super::proposal::ProposalConfig;
 use super::resampling::{KldConfig, ResamplingConfig};
-use super::sensor::SensorConfig;
 use super::tempering::TemperingConfig;
 use super::tracking_loss::TrackingLossConfig;
+use crate::ground::GroundConfig;
 use crate::map::PanoramaConfig;
 use crate::validation::{InvalidValue, Validate, at_least_one, in_range, nested, not_negative};
 use smart_default::SmartDefault;
@@ -18,8 +18,8 @@ use smart_default::SmartDefault;
 /// Defaults: numbers of particles and motion threshold of range-mcl.
 #[derive(Clone, Debug, PartialEq, SmartDefault)]
 pub struct LocalizerConfig {
-    /// The sensor and the preparation of its scans.
-    pub sensor: SensorConfig,
+    /// Ground segmentation of the scans.
+    pub ground: GroundConfig,
     /// Largest number of particles while searching.
     #[default(10_000)]
     pub num_particles: usize,
@@ -85,7 +85,7 @@ const MAX_PARTICLES: usize = 1_000_000;
 impl Validate for LocalizerConfig {
     /// Errors have the keys of `localization.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
-        self.sensor.validate()?;
+        self.ground.validate_with_flat_ransac()?;
         in_range("numParticles", self.num_particles, 1..=MAX_PARTICLES)?;
         in_range("num_reduced", self.num_reduced, 1..=MAX_PARTICLES)?;
         not_negative("move_thres", self.move_thres_m)?;

@@ -6,7 +6,7 @@ use super::filter::ParticleFilter;
 use super::initialization::{StartSpread, around, from_panoramas};
 use super::odometry::Odometry;
 use super::particles::{Particle, ParticleSet};
-use super::sensor::Sensor;
+use super::preparation::ScanPreparation;
 use super::sweep::SweepMotion;
 use super::tracking_loss::State;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
@@ -14,6 +14,7 @@ use crate::lidar::{Motion, RangeImage, Scan};
 use crate::map::{Map, PanoramaRequest, SearchRegion, SensorAttitude};
 use crate::random::{Generator, stream};
 use crate::rendering::RenderError;
+use crate::sensor::{Sensor, SensorError};
 use crate::validation::{InvalidValue, Validate as _, nested};
 
 /// Random streams: of the initial particles, and of the first frame; those of the other frames follow.
@@ -69,6 +70,8 @@ pub enum LocalizerError {
     Invalid(#[from] InvalidValue),
     #[error(transparent)]
     Render(#[from] RenderError),
+    #[error(transparent)]
+    Sensor(#[from] SensorError),
     #[error(
         "the odometry {0:?} is not finite or farther than any place on Earth; correct the odometry of this frame"
     )]
@@ -87,7 +90,7 @@ pub struct Localizer {
     config: LocalizerConfig,
     start: Start,
     seed: u64,
-    sensor: Sensor,
+    preparation: ScanPreparation,
     /// Attitude of the sensor in the last frame.
     attitude: SensorAttitude,
     sweep: SweepMotion,
@@ -97,9 +100,10 @@ pub struct Localizer {
 }
 
 impl Localizer {
-    /// Prepares the localization of a drive. The same seed gives the same estimates.
+    /// Prepares the localization of a drive with a sensor. The same seed gives the same estimates.
     pub fn new(
         map: &Map,
+        sensor: &Sensor,
         config: LocalizerConfig,
         start: Start,
         seed: u64,
@@ -108,10 +112,11 @@ impl Localizer {
         if let Start::Pose { spread, .. } = &start {
             nested("start", spread)?;
         }
+        let preparation = ScanPreparation::new(sensor, &config.ground)?;
         Ok(Self {
             map: map.clone(),
-            sensor: Sensor::new(&config.sensor)?,
-            attitude: config.sensor.assumed_attitude(),
+            attitude: preparation.assumed_attitude(),
+            preparation,
             sweep: SweepMotion::default(),
             config,
             start,
@@ -135,13 +140,16 @@ impl Localizer {
             _ => before,
         };
         let motion = self.motion_during(scan, odometry, known, duration_s, &mut rng)?;
-        let image = self.sensor.range_image(scan, motion.as_ref());
-        if let Some(attitude) = known.or_else(|| self.sensor.attitude(&image)) {
+        let image = self.preparation.range_image(scan, motion.as_ref());
+        if let Some(attitude) = known.or_else(|| self.preparation.attitude(&image)) {
             self.attitude = attitude;
         }
         let filter = match self.filter.take() {
             Some(filter) => filter,
-            None => self.initialize(&image)?,
+            None => {
+                self.preparation.sensor.require_fit(scan)?;
+                self.initialize(&image)?
+            }
         };
         let filter = self.filter.insert(filter);
         filter.set_duration_s(duration_s);
@@ -176,7 +184,7 @@ impl Localizer {
             return Ok(predicted);
         };
         let some = scan.every(STEP);
-        let image = self.sensor.range_image(&some, predicted.as_ref());
+        let image = self.preparation.range_image(&some, predicted.as_ref());
         let pose = filter.registered(odometry, &image, &attitude, rng)?;
         let found = pose.and_then(|pose| self.sweep.around(&pose, duration_s));
         Ok(found.or(predicted))
@@ -233,8 +241,8 @@ impl Localizer {
         let rounded_m = (self.attitude.height_m / HEIGHT_STEP_M).round() * HEIGHT_STEP_M;
         PanoramaRequest {
             region,
-            lidar: self.config.sensor.lidar.clone(),
-            sensor_height_m: self.config.sensor.height_m.unwrap_or(rounded_m),
+            lidar: self.preparation.sensor.range_image.clone(),
+            sensor_height_m: (self.preparation.sensor.sensor_height_m).unwrap_or(rounded_m),
             config: self.config.panorama.clone(),
         }
     }

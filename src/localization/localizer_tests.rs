@@ -6,7 +6,6 @@ use nalgebra::Vector2;
 use super::*;
 use crate::lidar::LidarModel;
 use crate::localization::State;
-use crate::localization::sensor::SensorConfig;
 use crate::map::test_world::TestWorld;
 use crate::map::{MappingPath, TileConfig, TileGrid};
 
@@ -18,19 +17,17 @@ const _: () = {
     is_shared::<Map>();
 };
 
-/// A test's, with small range images.
+/// A sensor with small range images.
+fn sensor() -> Sensor {
+    Sensor::new(LidarModel {
+        height: 32,
+        width: 360,
+        ..LidarModel::default()
+    })
+}
+
 fn config() -> LocalizerConfig {
-    LocalizerConfig {
-        sensor: SensorConfig {
-            lidar: LidarModel {
-                height: 32,
-                width: 360,
-                ..LidarModel::default()
-            },
-            ..SensorConfig::default()
-        },
-        ..LocalizerConfig::of_test(500)
-    }
+    LocalizerConfig::of_test(500)
 }
 
 /// A drive along the street, 0.8 m per frame.
@@ -57,7 +54,7 @@ fn near(pose: &Pose2) -> Start {
 
 /// Localizes a drive with exact odometry.
 fn localize(world: &TestWorld, start: Start, truth: &[Pose2], seed: u64) -> Vec<Estimate> {
-    let mut localizer = Localizer::new(&world.map(), config(), start, seed).unwrap();
+    let mut localizer = Localizer::new(&world.map(), &sensor(), config(), start, seed).unwrap();
     let mut previous = truth[0];
     truth
         .iter()
@@ -94,7 +91,7 @@ fn a_change_of_the_scans_by_a_millimetre_changes_the_estimates_by_less() {
     let truth = drive(&world, 10.0, 10);
     let run = |changed_m: f32| {
         let start = near(&truth[0]);
-        let mut localizer = Localizer::new(&world.map(), config(), start, 3).unwrap();
+        let mut localizer = Localizer::new(&world.map(), &sensor(), config(), start, 3).unwrap();
         let step = |pair: &[Pose2]| {
             let mut scan = scan(&world, &pair[1]);
             // One of eleven thousand points is farther away, and one is missing.
@@ -149,7 +146,7 @@ fn an_unknown_start_is_on_the_road_of_a_large_map_and_anywhere_in_others() {
 fn a_start_outside_the_map_is_an_error_that_gives_the_place() {
     let world = TestWorld::street();
     let start = near(&Pose2::new(Vector2::new(9000.0, -50.0), 0.0));
-    let mut localizer = Localizer::new(&world.map(), config(), start, 0).unwrap();
+    let mut localizer = Localizer::new(&world.map(), &sensor(), config(), start, 0).unwrap();
     let scan = scan(&world, &world.pose_at(0.0, 0.0, 0.0));
     let error = localizer.step(&scan, Odometry::Unknown).unwrap_err();
     let LocalizerError::StartOutside { x, y } = error else {
@@ -161,10 +158,12 @@ fn a_start_outside_the_map_is_an_error_that_gives_the_place() {
 #[test]
 fn a_configured_height_of_the_sensor_is_used_where_no_ground_is_visible() {
     let world = TestWorld::street();
-    let mut config = config();
-    config.sensor.height_m = Some(2.1);
+    let sensor = Sensor {
+        sensor_height_m: Some(2.1),
+        ..sensor()
+    };
     let start = near(&world.pose_at(0.0, 0.0, 0.0));
-    let mut localizer = Localizer::new(&world.map(), config, start, 0).unwrap();
+    let mut localizer = Localizer::new(&world.map(), &sensor, config(), start, 0).unwrap();
     let estimate = localizer.step(&Scan::default(), Odometry::Unknown).unwrap();
     assert_eq!(estimate.attitude.height_m, 2.1);
     let request = localizer.panorama_request();
@@ -177,7 +176,7 @@ fn an_invalid_configuration_is_an_error_that_names_its_key() {
     let message = |change: fn(&mut LocalizerConfig)| {
         let mut config = config();
         change(&mut config);
-        let result = Localizer::new(&map, config, Start::Road, 0);
+        let result = Localizer::new(&map, &sensor(), config, Start::Road, 0);
         result.err().unwrap().to_string()
     };
     let no_particles = message(|config| config.num_particles = 0);
@@ -188,14 +187,30 @@ fn an_invalid_configuration_is_an_error_that_names_its_key() {
 
 #[test]
 fn library_and_program_refuse_the_same_values() {
-    let refused = |change: fn(&mut LocalizerConfig)| {
-        let mut config = LocalizerConfig::default();
-        change(&mut config);
-        config.validate().unwrap_err().to_string()
+    let refused = |change: fn(&mut Sensor)| {
+        let mut sensor = sensor();
+        change(&mut sensor);
+        sensor.validate().unwrap_err().to_string()
     };
-    assert!(refused(|config| config.sensor.lidar.width = 0).contains("range_image"));
-    assert!(refused(|config| config.sensor.height_m = Some(-1.0)).contains("sensor_height_m"));
-    assert!(refused(|config| config.sensor.height_m = Some(f64::NAN)).contains("sensor_height_m"));
-    assert!(refused(|config| config.sensor.own_car_m = [1.0, -1.0, 0.0, 1.0]).contains("own_car"));
-    assert!(refused(|config| config.panorama.yaw_sigma_rad = -1.0).contains("yaw_sigma"));
+    assert!(refused(|sensor| sensor.range_image.width = 0).contains("range_image"));
+    assert!(refused(|sensor| sensor.sensor_height_m = Some(-1.0)).contains("sensor_height_m"));
+    assert!(refused(|sensor| sensor.sensor_height_m = Some(f64::NAN)).contains("sensor_height_m"));
+    assert!(refused(|sensor| sensor.own_car_m = [1.0, -1.0, 0.0, 1.0]).contains("own_car"));
+    let mut config = LocalizerConfig::default();
+    config.panorama.yaw_sigma_rad = -1.0;
+    let error = config.validate().unwrap_err().to_string();
+    assert!(error.contains("yaw_sigma"));
+}
+
+#[test]
+fn scans_of_another_sensor_are_refused() {
+    let world = TestWorld::street();
+    let pose = world.pose_at(20.0, 0.3, 0.02);
+    let mut localizer =
+        Localizer::new(&world.map(), &Sensor::vlp16(), config(), near(&pose), 0).unwrap();
+    let result = localizer.step(&scan(&world, &pose), Odometry::Unknown);
+    let Err(LocalizerError::Sensor(SensorError::OtherSensor { share, .. })) = result else {
+        panic!("an answer for beams that a VLP-16 does not have");
+    };
+    assert!(share > 0.2, "{share}");
 }

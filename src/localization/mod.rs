@@ -1,6 +1,6 @@
 //! Monte Carlo localization of a car in a mesh map.
 //!
-//! > [`Localizer`] turns scans into range images with the attitude of the sensor ([`sensor`]) and feeds the
+//! > [`Localizer`] turns scans into range images with the attitude of the sensor and feeds the
 //! > particle [`filter`]: [`initialization`] samples the first particles, [`motion`] moves them by the
 //! > [`odometry`], [`observation`] weights them, [`resampling`] keeps the likely ones, [`places`]
 //! > compares those that are far apart, [`convergence`]
@@ -17,7 +17,7 @@ pub mod config;
 pub mod estimate;
 pub mod odometry;
 pub mod particles;
-pub mod sensor;
+mod preparation;
 mod sweep;
 // One step of the filter.
 pub mod initialization;
@@ -43,6 +43,6 @@ pub use initialization::StartSpread;
 pub use localizer::{Localizer, LocalizerError, Start};
 pub use odometry::Odometry;
 pub use particles::{Particle, ParticleSet};
+pub(crate) use preparation::ScanPreparation;
 pub use second_drive::{SecondDrive, SecondDriveError};
-pub use sensor::{Sensor, SensorConfig};
 pub use tracking_loss::{State, TrackingLossConfig};

@@ -16,6 +16,7 @@ use crate::map::{Map, MapError};
 use crate::odometry::{
     OdometryError, PlacementError, Trajectory, TrajectoryBuilder, TrajectoryConfig,
 };
+use crate::sensor::Sensor;
 
 /// Why a second drive, or a scan of it, cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -43,13 +44,14 @@ impl SecondDrive {
     /// A drive before its first scan.
     pub fn new(
         map: &Map,
+        sensor: &Sensor,
         localizer: LocalizerConfig,
         trajectory: TrajectoryConfig,
         seed: u64,
     ) -> Result<Self, LocalizerError> {
         Ok(Self {
             map: map.clone(),
-            localizer: Localizer::new(map, localizer, Start::unknown(map), seed)?,
+            localizer: Localizer::new(map, sensor, localizer, Start::unknown(map), seed)?,
             builder: TrajectoryBuilder::new(trajectory)?,
             found: vec![],
         })

@@ -7,6 +7,7 @@ use crate::map::build::path_check::ImplausiblePath;
 use crate::memory::MemoryError;
 use crate::odometry::{OdometryError, TimingError};
 use crate::recording::RecordingError;
+use crate::sensor::SensorError;
 use crate::validation::InvalidValue;
 
 /// Why a recording cannot be mapped.
@@ -25,6 +26,8 @@ pub enum MappingError {
     Odometry(#[from] OdometryError),
     #[error(transparent)]
     Timing(#[from] TimingError),
+    #[error(transparent)]
+    Sensor(#[from] SensorError),
     #[error(transparent)]
     InvalidValue(#[from] InvalidValue),
     #[error(transparent)]

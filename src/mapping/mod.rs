@@ -24,14 +24,14 @@ pub use trajectory::{ADJUSTMENT, LoopCounts, TrajectorySummary, find_poses, find
 use crate::map::{BuildError, Map, MapBuilder, MapConfig, MappingPath, PoseSource};
 use crate::odometry::{Trajectory, TrajectoryConfig};
 use crate::recording::{Frame, Recording};
-use crate::sensor::SensorDescription;
+use crate::sensor::Sensor;
 
 /// A map, and what its recording has shown.
 pub struct MappedRecording {
     /// The map.
     pub map: Map,
     /// The sensor.
-    pub sensor: SensorDescription,
+    pub sensor: Sensor,
     /// Checks of the poses that the recording has; `None` without them, or where they are not to be checked.
     pub poses: Option<PoseReport>,
     /// Poses that were found from the scans; `None` where those of the recording were used.

@@ -2,11 +2,11 @@
 
 use crate::geometry::Pose3;
 use crate::localization::LocalizerConfig;
-use crate::localization::sensor::SensorConfig;
 use crate::map::build::path_check::{self, ImplausiblePath};
 use crate::map::build::plan::key_scans;
 use crate::map::{MapConfig, PoseSource};
 use crate::recording::{Frame, Recording, RecordingError};
+use crate::sensor::Sensor;
 
 /// The recording with the poses that were given to it, else its own ones; without poses where these are to be found from
 /// the scans. `older` is the pose `world_from_map` of the map to which the recording is added, in whose world its poses
@@ -55,16 +55,17 @@ pub fn poses_of(frames: &[Frame]) -> Vec<Pose3> {
     poses.map(Option::unwrap_or_default).collect()
 }
 
-/// How scans are localized in a map to which they are added.
-pub fn localizer(config: &MapConfig) -> LocalizerConfig {
+/// How scans are localized in a map to which they are added, and their sensor.
+pub fn localizer(config: &MapConfig) -> (Sensor, LocalizerConfig) {
     let scan = &config.local_map.scan;
-    LocalizerConfig {
-        sensor: SensorConfig {
-            lidar: scan.range_image.clone(),
-            own_car_m: scan.own_car_m,
-            ground: config.ground.clone(),
-            ..SensorConfig::default()
-        },
+    let sensor = Sensor {
+        has_rows: scan.has_rows,
+        own_car_m: scan.own_car_m,
+        ..Sensor::new(scan.range_image.clone())
+    };
+    let localizer = LocalizerConfig {
+        ground: config.ground.clone(),
         ..LocalizerConfig::default()
-    }
+    };
+    (sensor, localizer)
 }

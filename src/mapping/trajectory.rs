@@ -51,7 +51,8 @@ pub fn find_poses_in(
     on_event: OnEvent,
 ) -> Result<Trajectory, MappingError> {
     let settings = TrajectoryConfig::default();
-    let drive = SecondDrive::new(map, localizer(config), settings, config.seed);
+    let (sensor, localizer) = localizer(config);
+    let drive = SecondDrive::new(map, &sensor, localizer, settings, config.seed);
     let mut drive = drive.map_err(SecondDriveError::from)?;
     each_scan("localize", frames, on_event, |_, scan| {
         drive.add(scan)?;

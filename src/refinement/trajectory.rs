@@ -22,19 +22,21 @@ use super::refiner::{Distance, RefinementConfig, refine_frame};
 use super::smoothing::{self, FramePrior, smooth};
 use super::upright::UprightSurfaces;
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose3_from_pose2};
+use crate::ground::GroundConfig;
 use crate::lidar::{Beam, Motion, RangeImage, Scan};
 use crate::localization::observation::{ObservationConfig, agreement, choose_beams, ranges_along};
-use crate::localization::{Estimate, Sensor, SensorConfig, State, TrackingLossConfig};
+use crate::localization::{Estimate, ScanPreparation, State, TrackingLossConfig};
 use crate::map::{Map, MapError, SensorAttitude};
 use crate::random::{Generator, stream};
 use crate::rendering::RenderError;
+use crate::sensor::{Sensor, SensorError};
 use crate::validation::{InvalidValue, Validate, nested};
 
 /// Configuration of the refinement of a trajectory.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RefinerConfig {
-    /// The sensor and the preparation of its scans.
-    pub sensor: SensorConfig,
+    /// Ground segmentation of the scans.
+    pub ground: GroundConfig,
     /// Selection of beams and cost of differences.
     pub observation: ObservationConfig,
     /// Swarm, Gauss-Newton and smoothing.
@@ -44,7 +46,7 @@ pub struct RefinerConfig {
 impl Validate for RefinerConfig {
     /// Errors have the keys of `refinement.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
-        self.sensor.validate()?;
+        self.ground.validate_with_flat_ransac()?;
         nested("observation", &self.observation)?;
         nested("refinement", &self.refinement)
     }
@@ -180,6 +182,8 @@ pub enum RefinerError {
     Render(#[from] RenderError),
     #[error(transparent)]
     Map(#[from] MapError),
+    #[error(transparent)]
+    Sensor(#[from] SensorError),
     #[error(
         "there are {increments} odometry increments for {frames} frames; give one per frame, the first of which is ignored"
     )]
@@ -199,7 +203,7 @@ pub struct TrajectoryRefiner {
     map: Map,
     config: RefinerConfig,
     seed: u64,
-    sensor: Sensor,
+    preparation: ScanPreparation,
     frames: Vec<FrameResult>,
     /// Upright surfaces of the map around the last wide search.
     surfaces: RefCell<Option<NearbySurfaces>>,
@@ -208,12 +212,17 @@ pub struct TrajectoryRefiner {
 }
 
 impl TrajectoryRefiner {
-    /// Prepares the refinement in a map. The same seed gives the same trajectory.
-    pub fn new(map: &Map, config: RefinerConfig, seed: u64) -> Result<Self, RefinerError> {
+    /// Prepares the refinement of the scans of a sensor in a map. The same seed gives the same trajectory.
+    pub fn new(
+        map: &Map,
+        sensor: &Sensor,
+        config: RefinerConfig,
+        seed: u64,
+    ) -> Result<Self, RefinerError> {
         config.validate()?;
         Ok(Self {
             map: map.clone(),
-            sensor: Sensor::new(&config.sensor)?,
+            preparation: ScanPreparation::new(sensor, &config.ground)?,
             config,
             seed,
             frames: Vec::new(),
@@ -230,8 +239,11 @@ impl TrajectoryRefiner {
         scan: &Scan,
         estimate: &InitialEstimate,
     ) -> Result<&FrameResult, RefinerError> {
+        if self.frames.is_empty() {
+            self.preparation.sensor.require_fit(scan)?;
+        }
         let mut rng = stream(self.seed, self.frames.len() as u64);
-        let image = self.sensor.range_image(scan, estimate.motion.as_ref());
+        let image = self.preparation.range_image(scan, estimate.motion.as_ref());
         let previous = self.frames.last();
         let mut frame = FrameResult {
             pose: estimate.pose,
@@ -315,7 +327,7 @@ impl TrajectoryRefiner {
         row_from_next: &Pose2,
     ) -> Result<(), RefinerError> {
         let mut rng = stream(self.seed, row as u64);
-        let image = self.sensor.range_image(scan, motion);
+        let image = self.preparation.range_image(scan, motion);
         let next = &self.frames[row + 1];
         let start = next.near(next.pose * row_from_next.inverse());
         if let Some(placed) = self.place(&image, [start], &mut rng)? {
@@ -331,9 +343,9 @@ impl TrajectoryRefiner {
         previous
             .filter(|previous| previous.is_refined())
             .map(|previous| previous.attitude)
-            .or_else(|| self.sensor.attitude(image))
+            .or_else(|| self.preparation.attitude(image))
             .or(previous.map(|previous| previous.attitude))
-            .unwrap_or_else(|| self.config.sensor.assumed_attitude())
+            .unwrap_or_else(|| self.preparation.assumed_attitude())
     }
 
     /// Refines a frame from each start until it agrees with the map.
@@ -570,12 +582,18 @@ impl FrameResult {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::lidar::LidarModel;
     use crate::map::test_world::TestWorld;
+
+    fn sensor() -> Sensor {
+        Sensor::new(LidarModel::default())
+    }
 
     #[test]
     fn a_jump_where_tracking_was_lost_does_not_affect_its_neighbors() {
         let map = TestWorld::street().map();
-        let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), 0).unwrap();
+        let mut refiner =
+            TrajectoryRefiner::new(&map, &sensor(), RefinerConfig::default(), 0).unwrap();
         for row in 0..20 {
             let is_lost = row == 10;
             let jump_m = if row > 10 { 50.0 } else { 0.0 };
@@ -623,7 +641,8 @@ mod tests {
         let wrong = Pose2::translation(8.0, 0.5);
         let places = |elsewhere: Option<usize>| {
             let mut refiner =
-                TrajectoryRefiner::new(&world.map(), RefinerConfig::default(), 0).unwrap();
+                TrajectoryRefiner::new(&world.map(), &sensor(), RefinerConfig::default(), 0)
+                    .unwrap();
             let mut starts = Vec::new();
             // The filter knows its pose in frames 2 and 3 only.
             for row in 0..6 {
@@ -668,7 +687,8 @@ mod tests {
     #[test]
     fn an_odometry_that_contradicts_the_frames_does_not_bend_them() {
         let map = TestWorld::street().map();
-        let mut refiner = TrajectoryRefiner::new(&map, RefinerConfig::default(), 0).unwrap();
+        let mut refiner =
+            TrajectoryRefiner::new(&map, &sensor(), RefinerConfig::default(), 0).unwrap();
         for row in 0..20 {
             let jump_m = if row > 10 { 50.0 } else { 0.0 };
             let pose = Pose2::translation(f64::from(row) + jump_m, 0.0);
@@ -694,7 +714,7 @@ mod tests {
     fn a_wrong_number_of_increments_is_an_error() {
         let world = TestWorld::street();
         let mut refiner =
-            TrajectoryRefiner::new(&world.map(), RefinerConfig::default(), 0).unwrap();
+            TrajectoryRefiner::new(&world.map(), &sensor(), RefinerConfig::default(), 0).unwrap();
         let truth = world.pose_at(10.0, 0.0, 0.0);
         let points = world.scan(&truth).points;
         let scan = Scan {

@@ -69,6 +69,9 @@ impl DropReason {
 }
 
 impl DroppedPoints {
+    /// Share of the returns that is too many to lose for one reason (unitless).
+    pub const TOO_MANY: f64 = 0.2;
+
     /// Counts the points of a scan that are not in its range image.
     pub fn count(scan: &Scan, lidar: &LidarModel, own_car_m: [f32; 4]) -> Self {
         /// Greatest angle between two returns of one pulse [rad].
@@ -123,9 +126,19 @@ impl DroppedPoints {
         self.same_pixel += other.same_pixel;
     }
 
+    /// Share of the returns that are above or below the field of view, or between rows (unitless).
+    pub fn share_outside(&self) -> f64 {
+        self.outside_image as f64 / self.returns()
+    }
+
+    /// Number of returns, at least one.
+    fn returns(&self) -> f64 {
+        (self.points - self.without_return - self.second_return).max(1) as f64
+    }
+
     /// The reasons for which more than a share of the returns are lost, with their shares, the most frequent first.
     pub fn above(&self, share: f64) -> Vec<(DropReason, f64)> {
-        let returns = (self.points - self.without_return - self.second_return).max(1) as f64;
+        let returns = self.returns();
         let mut reasons: Vec<(DropReason, f64)> = [
             (DropReason::OwnCar, self.own_car),
             (DropReason::TooNear, self.too_near),

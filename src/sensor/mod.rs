@@ -1,4 +1,4 @@
-//! What a sensor is, inferred from a few of its scans.
+//! What a sensor is: given, or inferred from a few of its scans.
 //!
 //! | question | answer from |
 //! |---|---|
@@ -18,10 +18,14 @@ pub mod columns;
 mod config;
 pub mod dropped;
 mod elevations;
+pub mod inference;
 pub mod mounting;
+mod named;
 pub mod own_car;
 pub mod projection;
 pub mod rotation;
+
+use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
@@ -29,17 +33,23 @@ pub use beam::BeamReturns;
 pub use beams::BeamSource;
 pub use config::{MotionCompensation, RangeImageConfig, SensorConfig};
 pub use dropped::{DropReason, DroppedPoints};
+pub use inference::{SensorError, spread_scans};
 pub use mounting::Mounting;
 
-use crate::lidar::{LidarModel, RotationDirection, Scan};
+use crate::lidar::{LidarModel, RotationDirection};
+use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 
-/// What is known about a sensor, and how surely.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct SensorDescription {
+/// Rectangle of a car of common size around its lidar, assumed until the scans show the own car: that of range-mcl's
+/// configuration, x_min, x_max, y_min, y_max [m].
+pub const ASSUMED_OWN_CAR_M: [f32; 4] = [-2.5, 2.7, -1.2, 1.2];
+
+/// What a sensor is, and how its scans are used.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Sensor {
     /// Projection: rows are the beams that returned, or pixels of about the spacing of the points if there
     /// are no rows.
-    pub lidar: LidarModel,
+    pub range_image: LidarModel,
     /// Whether each beam keeps its elevation, as those of spinning sensors do.
     pub has_rows: bool,
     /// Number of beams of the device, which may have more than returned; `None` without rows.
@@ -52,58 +62,78 @@ pub struct SensorDescription {
     pub horizontal_fov_deg: f32,
     /// Height over ground and tilt; `None` where too little ground is visible.
     pub mounting: Option<Mounting>,
-    /// Rectangle of the lidar frame with returns of the own car: x_min, x_max, y_min, y_max [m]; all 0 if there
-    /// are none.
+    /// Given height above the ground [m]; `None`: measured in each scan.
+    pub sensor_height_m: Option<f64>,
+    /// Rectangle of the lidar frame with returns of the own car, which are dropped: x_min, x_max, y_min, y_max [m];
+    /// all 0 if there are none.
     pub own_car_m: [f32; 4],
-    /// Whether the scans show that the sensor moves, without which the own car is unknown.
+    /// Whether the scans show that the sensor moves, without which the own car is unknown and assumed.
     pub is_moving: bool,
-    /// Duration of a revolution or frame [s]; `None` if no times tell.
+    /// Duration of a revolution or frame [s]; `None` if no times show it.
     pub period_s: Option<f64>,
     /// Sense of rotation by the times of the points; `None` without times or revolutions.
     pub rotation: Option<RotationDirection>,
-    /// Number of scans that it follows from.
+    /// Times of the points: `auto` are those of the data; `None` for scans that are compensated already.
+    pub motion_compensation: Option<MotionCompensation>,
+    /// Number of scans that it was inferred from.
     pub scans: usize,
 }
 
-/// Infers the sensor of some scans: one suffices for the beams, ten of a drive for the rest, better spread
-/// over some seconds than neighbours.
-pub fn infer(scans: &[Scan]) -> SensorDescription {
-    let scans: Vec<Scan> = scans.iter().map(valid_points).collect();
-    let scans: &[Scan] = &scans;
-    let beams = beams::find(scans);
-    let horizontal_fov_deg = columns::horizontal_fov_deg(scans);
-    let columns = columns::count(&beams);
-    let surroundings = mounting::Surroundings::of(scans);
-    let own_car = own_car::find(&surroundings);
-    let mounting = mounting::find(&surroundings);
-    SensorDescription {
-        lidar: projection::model(scans, &beams, columns, own_car.rectangle_m),
-        has_rows: beams.source != BeamSource::None,
-        beams: beams.nominal,
-        beam_source: beams.source,
-        columns,
-        horizontal_fov_deg,
-        mounting,
-        own_car_m: own_car.rectangle_m,
-        is_moving: own_car.is_moving,
-        period_s: rotation::period_s(scans, horizontal_fov_deg),
-        rotation: rotation::direction(scans, horizontal_fov_deg),
-        scans: scans.len(),
+impl Sensor {
+    /// A sensor of beams all around, with the own car assumed and the times of the data.
+    pub fn new(range_image: LidarModel) -> Self {
+        Self {
+            has_rows: true,
+            beams: Some(range_image.height),
+            beam_source: BeamSource::None,
+            columns: range_image.width,
+            horizontal_fov_deg: 360.0,
+            range_image,
+            mounting: None,
+            sensor_height_m: None,
+            own_car_m: ASSUMED_OWN_CAR_M,
+            is_moving: false,
+            period_s: None,
+            rotation: None,
+            motion_compensation: Some(MotionCompensation::Auto),
+            scans: 0,
+        }
     }
 }
 
-/// The points with a direction.
-fn valid_points(scan: &Scan) -> Scan {
-    /// Nearer points are marks of missing returns, and have no accurate direction [m].
-    const NEAREST_M: f32 = 0.1;
-    let any_range = LidarModel {
-        min_range: NEAREST_M,
-        max_range: f32::MAX,
-        ..LidarModel::default()
-    };
-    let mut scan = scan.clone();
-    scan.drop_invalid(&any_range);
-    scan
+impl Validate for Sensor {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        nested("range_image", &self.range_image)?;
+        rectangle("own_car_m", self.own_car_m)?;
+        match self.sensor_height_m {
+            Some(height_m) => positive("sensor_height_m", height_m),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Beams, field of view, image, ranges and height.
+impl fmt::Display for Sensor {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let image = &self.range_image;
+        match self.beams {
+            Some(beams) => write!(formatter, "{beams} beams")?,
+            None => formatter.write_str("points without rows")?,
+        }
+        let [highest, lowest] = match image.elevations.as_deref() {
+            Some([highest, .., lowest]) => [*highest, *lowest],
+            _ => [image.fov_up, -image.fov_down.abs()],
+        };
+        write!(
+            formatter,
+            " from {highest:+.1} to {lowest:+.1} degrees, image {} x {}, ranges {:.1} to {:.0} m",
+            image.height, image.width, image.min_range, image.max_range
+        )?;
+        match &self.mounting {
+            Some(mounting) => write!(formatter, ", {:.2} m above the ground", mounting.height_m),
+            None => Ok(()),
+        }
+    }
 }
 
 #[cfg(test)]

@@ -9,6 +9,11 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
+use crate::lidar::Scan;
+
+fn infer(scans: &[Scan]) -> Sensor {
+    Sensor::infer(scans, &SensorConfig::default())
+}
 
 /// A drawn spinning sensor at the origin in a yard: ground 1.8 m below, walls around at 8 to 30 m.
 struct Spinner {
@@ -64,9 +69,9 @@ impl Spinner {
 fn assert_finds(sensor: &Spinner, scan: &Scan) {
     let found = infer(std::slice::from_ref(scan));
     assert!(found.has_rows);
-    assert_eq!(found.lidar.height, sensor.elevations_deg.len());
+    assert_eq!(found.range_image.height, sensor.elevations_deg.len());
     for (row, expected) in sensor.elevations_deg.iter().enumerate() {
-        let error = found.lidar.elevation_rad(row).to_degrees() - expected;
+        let error = found.range_image.elevation_rad(row).to_degrees() - expected;
         assert!(error.abs() < 0.15, "row {row}: {error}");
     }
 }
@@ -157,7 +162,7 @@ fn lasers_above_the_origin_are_found_in_any_order() {
     scan.points.shuffle(&mut rng);
     let found = infer(&[scan]);
     // The offset is found to a centimetre, so two beams close together may be one.
-    assert!((49..=51).contains(&found.lidar.height));
+    assert!((49..=51).contains(&found.range_image.height));
 }
 
 #[test]
@@ -174,11 +179,11 @@ fn rings_are_trusted_only_if_they_are_beams() {
         (found.beam_source, found.beams),
         (BeamSource::Rings, Some(15))
     );
-    assert_eq!(found.lidar.height, 14);
+    assert_eq!(found.range_image.height, 14);
     scan.rings = (0..scan.len()).map(|_| rng.random_range(0..6)).collect();
     let found = infer(&[scan]);
     assert_eq!(
-        (found.beam_source, found.lidar.height),
+        (found.beam_source, found.range_image.height),
         (BeamSource::Elevations, 14)
     );
 }
@@ -269,7 +274,7 @@ fn nothing_follows_from_no_points_and_damaged_ones() {
         assert!(!found.has_rows);
         assert_eq!(found.mounting, None);
     }
-    assert_eq!(infer(&[]).lidar, LidarModel::default());
+    assert_eq!(infer(&[]).range_image, LidarModel::default());
 }
 
 #[test]

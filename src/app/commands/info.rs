@@ -7,7 +7,7 @@ use anyhow::{Result, bail, ensure};
 use clap::Args;
 use serde::{Deserialize, Serialize};
 
-use super::stages::{self, is_bag, sample};
+use super::stages::is_bag;
 use crate::app::report::results::{LocalizationResults, RunSummary};
 use crate::app::run::arguments::setting;
 use crate::app::run::output::Printed;
@@ -17,7 +17,7 @@ use crate::geometry::Aabb;
 use crate::lidar::Scan;
 use crate::map::files::ply;
 use crate::recording::{PoseTrack, Recording, Selection, scan_files};
-use crate::sensor::{self, BeamSource, SensorDescription};
+use crate::sensor::{BeamSource, Sensor, SensorConfig, spread_scans};
 use crate::validation::{InvalidValue, Validate};
 
 /// Arguments of `info`.
@@ -71,9 +71,9 @@ fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
     let recording = Recording::open_with(path, topic, &Selection::default())?;
     let frames = &recording.frames;
     let (first, last) = (&frames[0], &frames[frames.len() - 1]);
-    let scans = sample(&recording)?;
+    let scans = spread_scans(&recording)?;
     let points = scans.iter().map(Scan::len).sum::<usize>() / scans.len();
-    let sensor = sensor::infer(&scans);
+    let sensor = Sensor::infer(&scans, &SensorConfig::default());
     let duration = match recording.has_times {
         true => format!("{:.1} s", last.time_s - first.time_s),
         false => "unknown: there are no times, 10 scans per second are assumed".to_owned(),
@@ -119,7 +119,7 @@ fn fields(scan: &Scan) -> String {
     fields.join(", ")
 }
 
-fn sensor_rows(sensor: &SensorDescription) -> Vec<(&'static str, String)> {
+fn sensor_rows(sensor: &Sensor) -> Vec<(&'static str, String)> {
     let source = match sensor.beam_source {
         BeamSource::Rings => "from the rings of the points",
         BeamSource::Order => "from the order of the points",
@@ -145,7 +145,7 @@ fn sensor_rows(sensor: &SensorDescription) -> Vec<(&'static str, String)> {
         },
     );
     vec![
-        ("sensor", stages::description(sensor)),
+        ("sensor", sensor.to_string()),
         ("beams", source.to_owned()),
         (
             "field of view",
@@ -184,7 +184,7 @@ fn cloud(path: &Path) -> Result<Printed> {
         ("normals", normals.to_owned()),
     ];
     if scan.len() <= MAX_SCAN {
-        let sensor = sensor::infer(std::slice::from_ref(&scan));
+        let sensor = Sensor::infer(std::slice::from_ref(&scan), &SensorConfig::default());
         if sensor.has_rows {
             rows.extend(sensor_rows(&sensor));
         }

@@ -22,8 +22,7 @@ use crate::mapping::{TrajectorySummary, find_poses};
 use crate::odometry::{Loop, OdometryEstimate, StepState, Trajectory};
 use crate::recording::poses::write_tum;
 use crate::recording::{Frame, Recording};
-use crate::sensor::RangeImageConfig;
-use crate::sensor::SensorDescription;
+use crate::sensor::{RangeImageConfig, Sensor};
 
 /// Arguments of `odometry`.
 #[derive(Clone, Debug, Args, Serialize)]
@@ -54,8 +53,8 @@ pub struct OdometryArgs {
 struct OdometryReport {
     #[serde(flatten)]
     summary: TrajectorySummary,
-    /// What was inferred about the sensor.
-    sensor: Option<SensorDescription>,
+    /// The sensor.
+    sensor: Sensor,
     /// Loops that were found.
     found_loops: Vec<LoopReport>,
 }
@@ -145,7 +144,7 @@ fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> 
 }
 
 /// Opens the recording, with the poses to polish if there are any.
-fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Option<SensorDescription>)> {
+fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Sensor)> {
     let inputs = config.recording_inputs();
     let mut recording = inputs.open(&config.selection())?;
     if let Some(path) = &config.pose_file {

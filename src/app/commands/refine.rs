@@ -31,6 +31,7 @@ use crate::recording::{Calibration, Frame, Recording};
 use crate::refinement::{
     InitialEstimate, RefinedTrajectory, RefinerConfig, SmoothingConfig, TrajectoryRefiner,
 };
+use crate::sensor::Sensor;
 use crate::statistics::median;
 
 /// Arguments of `refine`.
@@ -103,7 +104,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     run_output::warn_of_shortfall(&results, &config.result_file);
     let map = config.map_inputs().load(MapOptions::default(), context)?;
     let mut resolved = config.clone();
-    let sequence = resolved.open_in_map(&map)?;
+    let (sequence, sensor) = resolved.open_in_map(&map)?;
     let config = &resolved;
     if is_trajectory {
         results = follow(config, &map, &sequence)?;
@@ -120,7 +121,14 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
         }
         false => initial_estimates(&results, &estimates, &increments),
     };
-    let (refined, runtimes_s) = refine(config, context, &map, &sequence, &starts, &increments)?;
+    let (refined, runtimes_s) = refine(
+        config,
+        context,
+        (&map, &sensor),
+        &sequence,
+        &starts,
+        &increments,
+    )?;
     let truth = sequence.frames.iter().map(|frame| frame.map_from_lidar);
     let truth: Option<Vec<Pose3>> = truth.collect();
     let planar = |truth: &[Pose3]| truth.iter().map(pose2_from_pose3).collect();
@@ -293,7 +301,7 @@ fn initial_estimates(
 fn refine(
     config: &RefinementConfig,
     context: &Context,
-    map: &Map,
+    (map, sensor): (&Map, &Sensor),
     sequence: &Recording,
     starts: &[InitialEstimate],
     increments: &[Option<Pose2>],
@@ -301,7 +309,7 @@ fn refine(
     let path = config.result_file.display();
     let kept = format!("{path} is unchanged: a trajectory is refined as a whole");
     context.interrupt.keeps(kept.clone());
-    let mut refiner = TrajectoryRefiner::new(map, refiner_config(config), config.seed)?;
+    let mut refiner = TrajectoryRefiner::new(map, sensor, refiner_config(config), config.seed)?;
     let mut runtimes_s = Vec::with_capacity(starts.len());
     let task = context.progress.task("refine", starts.len());
     for (frame, start) in sequence.frames.iter().zip(starts) {

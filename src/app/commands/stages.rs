@@ -8,16 +8,9 @@ use crate::app::run::{Context, input};
 use crate::app::settings::{
     BuildMapConfig, LocalizationConfig, OdometryCommandConfig, RefinementConfig, body_from_lidar,
 };
-use crate::geometry::wrap_angle;
-use crate::lidar::{LidarModel, PERIOD_S, Rotation, Scan};
-use crate::map::build::scan_cloud::ScanConfig;
 use crate::map::{Map, MapOptions, MappingPath};
-use crate::odometry::{OdometryConfig, TimingComparison, compare_timings};
 use crate::recording::{PoseTrack, Recording, Selection};
-use crate::sensor::{self, DroppedPoints, MotionCompensation, RangeImageConfig, SensorDescription};
-
-/// Number of scans from which a sensor is inferred.
-const SENSOR_SCANS: usize = 10;
+use crate::sensor::{MotionCompensation, RangeImageConfig, Sensor, SensorConfig};
 
 /// Keys of a recording.
 #[derive(Clone, Copy)]
@@ -200,62 +193,20 @@ pub struct SensorKeys<'a> {
 
 impl SensorKeys<'_> {
     /// Sets what is not given from the scans; returns the recording, whose points have times if they are known.
-    pub fn resolve(
-        self,
-        mut recording: Recording,
-    ) -> Result<(Recording, Option<SensorDescription>)> {
-        if self.motion_compensation.is_none() {
-            recording = recording.compensated();
-        }
-        let is_given = RangeImageConfig::of(&self.range_image.model());
-        let is_complete = RangeImageConfig {
-            has_rows: None,
-            max_instance: None,
-            render_instanced: None,
-            ..self.range_image.clone()
-        } == is_given
-            && self.own_car_m.is_some();
-        let is_auto = *self.motion_compensation == Some(MotionCompensation::Auto);
-        if let (Some(configured), false) = (*self.motion_compensation, is_auto) {
-            warn_of_contradiction(&recording, configured)?;
-        }
-        if is_complete && !is_auto {
-            return Ok((rotating(recording, *self.motion_compensation), None));
-        }
-        let scans = sample(&recording)?;
-        let sensor = sensor::infer(&scans);
-        tracing::info!("sensor: {}", description(&sensor));
-        let own_car_m = apply(&sensor, self.range_image, self.own_car_m);
-        warn_of_dropped_points(&scans, &self.range_image.model(), own_car_m);
-        if is_auto && scans.iter().all(|scan| scan.times_s.is_empty()) {
-            let is_spinning = sensor.has_rows && sensor.horizontal_fov_deg > SPINNING_DEG;
-            *self.motion_compensation = match is_spinning {
-                true => fitting_rotation(&recording)?,
-                false => None,
-            };
-        }
-        Ok((rotating(recording, *self.motion_compensation), Some(sensor)))
+    pub fn resolve(self, recording: Recording) -> Result<(Recording, Sensor)> {
+        let known = SensorConfig {
+            range_image: self.range_image.clone(),
+            own_car_m: *self.own_car_m,
+            sensor_height_m: None,
+            motion_compensation: *self.motion_compensation,
+        };
+        let sensor = Sensor::infer_recording(&recording, &known)?;
+        self.range_image
+            .resolve(&sensor.range_image, sensor.has_rows);
+        *self.own_car_m = Some(sensor.own_car_m);
+        *self.motion_compensation = sensor.motion_compensation;
+        Ok((sensor.applied_to(recording), sensor))
     }
-}
-
-/// Sets the keys of a sensor that are not given; returns the box of the own car.
-pub fn apply(
-    sensor: &SensorDescription,
-    range_image: &mut RangeImageConfig,
-    own_car_m: &mut Option<[f32; 4]>,
-) -> [f32; 4] {
-    range_image.resolve(&sensor.lidar, sensor.has_rows);
-    *own_car_m.get_or_insert(match sensor.is_moving {
-        true => sensor.own_car_m,
-        false => ScanConfig::default().own_car_m,
-    })
-}
-
-/// The recording, whose points have times from the rotation of the sensor where the data have none.
-fn rotating(recording: Recording, compensation: Option<MotionCompensation>) -> Recording {
-    let period_s = period_s(&recording);
-    let rotation = compensation.and_then(|it| it.rotation(period_s));
-    recording.rotating(rotation)
 }
 
 /// Adds the inputs of a configuration that names a recording.
@@ -327,163 +278,18 @@ macro_rules! inputs_in_map {
 
             /// Opens the selected frames, with the true poses in the frame of the map, and completes the
             /// configuration by what the scans show about the sensor.
-            pub fn open_in_map(&mut self, map: &Map) -> Result<Recording> {
+            pub fn open_in_map(&mut self, map: &Map) -> Result<(Recording, Sensor)> {
                 let inputs = self.recording_inputs();
                 let mut recording = inputs.open(&self.selection())?;
                 if let Some(pose_file) = &self.pose_file {
                     let track = inputs.track(pose_file, &recording)?;
                     recording = recording.with_poses(track.in_map(&map.path.world_from_map))?;
                 }
-                Ok(self.sensor_keys().resolve(recording)?.0)
+                let (recording, sensor) = self.sensor_keys().resolve(recording)?;
+                Ok((recording, sensor.with_known(&self.known_sensor())))
             }
         })*
     };
 }
 
 inputs_in_map!(LocalizationConfig, RefinementConfig);
-
-/// Horizontal field of view from which on a sensor is taken for one that spins [deg].
-const SPINNING_DEG: f32 = 300.0;
-
-/// Duration of a revolution: the time between scans with consecutive numbers, if that is plausible [s].
-fn period_s(recording: &Recording) -> f64 {
-    let [first, .., last] = recording.frames.as_slice() else {
-        return PERIOD_S;
-    };
-    let period_s = (last.time_s - first.time_s) / (last.number - first.number) as f64;
-    match recording.has_times && (0.03..0.3).contains(&period_s) {
-        true => period_s,
-        false => PERIOD_S,
-    }
-}
-
-/// The rotation that makes consecutive scans fit best; `None` if they fit best as they are, or if nothing shows it.
-fn fitting_rotation(recording: &Recording) -> Result<Option<MotionCompensation>> {
-    let Some(compared) = compared_timings(recording)? else {
-        return Ok(None);
-    };
-    let best = compared.best.map(|best| compared.residuals_m[best].0);
-    let name = best.map_or("undecided, none".to_owned(), timing_in_words);
-    tracing::info!(
-        "motion compensation: {name}; distances between scans: {}",
-        residuals_in_words(&compared)
-    );
-    Ok(best.flatten().map(|best| MotionCompensation::of(&best)))
-}
-
-/// Warns if another rotation than the configured one makes consecutive scans fit best.
-fn warn_of_contradiction(recording: &Recording, configured: MotionCompensation) -> Result<()> {
-    /// Starts of the revolution that are nearer are the same [rad].
-    const SAME_START_RAD: f64 = 0.5;
-    let Some(compared) = compared_timings(recording)? else {
-        return Ok(());
-    };
-    let configured = configured.rotation(PERIOD_S);
-    let is_same = |found: Rotation, configured: Rotation| {
-        let apart_rad = wrap_angle(found.start_rad - configured.start_rad).abs();
-        found.direction == configured.direction && apart_rad < SAME_START_RAD
-    };
-    if let Some(best) = compared.best.map(|best| compared.residuals_m[best].0)
-        && !(best.zip(configured)).is_some_and(|(best, configured)| is_same(best, configured))
-    {
-        tracing::warn!(
-            "the scans fit best as {}, not as motion_compensation says; distances between scans: {}",
-            timing_in_words(best),
-            residuals_in_words(&compared)
-        );
-    }
-    Ok(())
-}
-
-/// Times of points in words, as the key has them.
-fn timing_in_words(timing: Option<Rotation>) -> String {
-    match timing {
-        None => "compensated already".to_owned(),
-        Some(rotation) => {
-            let text = MotionCompensation::of(&rotation).to_string();
-            text.replace("counter_clockwise", "counter-clockwise")
-        }
-    }
-}
-
-fn residuals_in_words(compared: &TimingComparison) -> String {
-    let residuals = compared.residuals_m.iter();
-    let words: Vec<String> = residuals
-        .map(|(timing, m)| format!("{} {:.1} mm", timing_in_words(*timing), 1e3 * m))
-        .collect();
-    words.join(", ")
-}
-
-/// Compares the times of points by the distances between consecutive scans; `None` if the data have times, or if
-/// the scans are too few or too far apart.
-fn compared_timings(recording: &Recording) -> Result<Option<TimingComparison>> {
-    /// Number of scans, from the middle of the recording.
-    const SCANS: usize = 16;
-    /// Longest time between scans in which a sensor moves evenly [s].
-    const MAX_STEP_S: f64 = 0.35;
-    let frames = &recording.frames;
-    let first = frames.len().saturating_sub(SCANS) / 2;
-    let run = &frames[first..(first + SCANS).min(frames.len())];
-    let is_dense = (run.windows(2)).all(|pair| pair[1].time_s - pair[0].time_s < MAX_STEP_S);
-    if run.len() < SCANS / 2 || !is_dense {
-        return Ok(None);
-    }
-    let scans: Vec<Scan> = run
-        .iter()
-        .map(|frame| frame.read())
-        .collect::<Result<_, _>>()?;
-    if scans.iter().any(|scan| !scan.times_s.is_empty()) {
-        return Ok(None);
-    }
-    let config = OdometryConfig::default();
-    Ok(Some(compare_timings(&scans, period_s(recording), &config)?))
-}
-
-/// Some scans, spread over the recording.
-pub fn sample(recording: &Recording) -> Result<Vec<Scan>> {
-    let count = recording.frames.len();
-    let step = count.div_ceil(SENSOR_SCANS).max(1);
-    let frames = recording.frames.iter().step_by(step);
-    Ok(frames.map(|frame| frame.read()).collect::<Result<_, _>>()?)
-}
-
-/// The sensor in words.
-pub fn description(sensor: &SensorDescription) -> String {
-    let model = &sensor.lidar;
-    let rows = match sensor.beams {
-        Some(beams) => format!("{beams} beams"),
-        None => "points without rows".to_owned(),
-    };
-    let elevations = model.elevations.as_deref();
-    let highest = elevations
-        .and_then(|rows| rows.first())
-        .unwrap_or(&model.fov_up);
-    let lowest = -model.fov_down.abs();
-    let lowest = elevations.and_then(|rows| rows.last()).unwrap_or(&lowest);
-    let mut text = format!(
-        "{rows} from {highest:+.1} to {lowest:+.1} degrees, image {} x {}, ranges {:.1} to {:.0} m",
-        model.height, model.width, model.min_range, model.max_range
-    );
-    if let Some(mounting) = &sensor.mounting {
-        text += &format!(", {:.2} m above the ground", mounting.height_m);
-    }
-    text
-}
-
-/// Warns if more than a fifth of the points are dropped, with the reason that drops most.
-fn warn_of_dropped_points(scans: &[Scan], model: &LidarModel, own_car_m: [f32; 4]) {
-    /// Share of the points.
-    const WARNED: f64 = 0.2;
-    let mut dropped = DroppedPoints::default();
-    for scan in scans {
-        dropped.add(&DroppedPoints::count(scan, model, own_car_m));
-    }
-    for (reason, share) in dropped.above(WARNED) {
-        tracing::warn!(
-            "{:.0} % of the points are not used: they {}; see {}",
-            100.0 * share,
-            reason.description(),
-            reason.keys()
-        );
-    }
-}

@@ -10,6 +10,7 @@ use super::odometry::OdometrySource;
 use super::recording::mounting;
 use crate::geometry::FARTHEST_M;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
+use crate::localization::LocalizerConfig;
 use crate::localization::convergence::ConvergenceConfig;
 use crate::localization::initialization::StartSpread;
 use crate::localization::motion::{OdometryNoise, VelocityNoise};
@@ -19,12 +20,10 @@ use crate::localization::proposal::ProposalConfig;
 use crate::localization::resampling::{KldConfig, ResamplingConfig};
 use crate::localization::tempering::TemperingConfig;
 use crate::localization::tracking_loss::TrackingLossConfig;
-use crate::localization::{LocalizerConfig, SensorConfig};
-use crate::map::build::scan_cloud::ScanConfig;
 use crate::map::{MapOptions, PanoramaConfig};
 use crate::refinement::{RefinementConfig, RefinerConfig};
 use crate::rendering::RenderingMethod;
-use crate::sensor::{MotionCompensation, RangeImageConfig};
+use crate::sensor::{MotionCompensation, RangeImageConfig, SensorConfig};
 use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative, require};
 
 /// Configuration of `localize`: the keys of range-mcl's `localization.yml`, then new ones.
@@ -230,7 +229,7 @@ impl LocalizationConfig {
                 ..self.convergence.clone()
             },
             tracking_loss: self.vigilance.clone(),
-            sensor: self.sensor(),
+            ground: self.ground(),
             panorama: self.panorama_config(),
         }
     }
@@ -244,20 +243,20 @@ impl LocalizationConfig {
         }
     }
 
-    /// The sensor and the preparation of its scans.
-    pub fn sensor(&self) -> SensorConfig {
+    /// What is known about the sensor.
+    pub fn known_sensor(&self) -> SensorConfig {
         SensorConfig {
-            lidar: self.range_image.model(),
-            own_car_m: self.own_car_m.unwrap_or(ScanConfig::default().own_car_m),
-            ground: self.ground(),
-            height_m: self.sensor_height_m,
+            range_image: self.range_image.clone(),
+            own_car_m: self.own_car_m,
+            sensor_height_m: self.sensor_height_m,
+            motion_compensation: self.motion_compensation,
         }
     }
 
     /// The refinement of every frame, where `refine` is set.
     pub fn refiner(&self) -> RefinerConfig {
         RefinerConfig {
-            sensor: self.sensor(),
+            ground: self.ground(),
             observation: self.observation.clone(),
             refinement: self.refinement.clone(),
         }
@@ -316,6 +315,7 @@ impl Validate for LocalizationConfig {
         in_range("grid_res", self.grid_res, PanoramaConfig::CELLS_M)?;
         not_negative("yaw_sigma", self.yaw_sigma)?;
         nested("start", &self.start)?;
+        self.known_sensor().validate()?;
         self.localizer().validate()?;
         require(
             self.rendering.method != RenderingMethod::Raster
@@ -324,8 +324,7 @@ impl Validate for LocalizationConfig {
             "raster",
             "observation.likelihood: robust compares along the measured beams, which are always cast; set it to reference, or rendering.method to auto or cast",
         )?;
-        nested("refinement", &self.refinement)?;
-        nested("range_image", &self.range_image)
+        nested("refinement", &self.refinement)
     }
 }
 

@@ -9,12 +9,10 @@ use super::localization::LocalizationConfig;
 use super::odometry::OdometrySource;
 use super::recording::mounting;
 use crate::ground::{FuzzyConfig, GroundConfig, GroundMethod, PcaGround, RansacGround};
-use crate::localization::SensorConfig;
 use crate::localization::observation::ObservationConfig;
-use crate::map::build::scan_cloud::ScanConfig;
 use crate::refinement::{self, RefinerConfig};
-use crate::sensor::{MotionCompensation, RangeImageConfig};
-use crate::validation::{InvalidValue, Validate, in_range, nested, require};
+use crate::sensor::{MotionCompensation, RangeImageConfig, SensorConfig};
+use crate::validation::{InvalidValue, Validate, in_range, require};
 
 /// Configuration of `refine`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -168,15 +166,20 @@ impl RefinementConfig {
         }
     }
 
+    /// What is known about the sensor.
+    pub fn known_sensor(&self) -> SensorConfig {
+        SensorConfig {
+            range_image: self.range_image.clone(),
+            own_car_m: self.own_car_m,
+            sensor_height_m: self.sensor_height_m,
+            motion_compensation: self.motion_compensation,
+        }
+    }
+
     /// The refiner.
     pub fn refiner(&self) -> RefinerConfig {
         RefinerConfig {
-            sensor: SensorConfig {
-                lidar: self.range_image.model(),
-                own_car_m: self.own_car_m.unwrap_or(ScanConfig::default().own_car_m),
-                ground: self.ground(),
-                height_m: self.sensor_height_m,
-            },
+            ground: self.ground(),
             observation: self.observation.clone(),
             refinement: self.refinement.clone(),
         }
@@ -213,7 +216,7 @@ impl Validate for RefinementConfig {
         )?;
         self.selection().validate()?;
         (self.odometry).validate(self.odometry_file.as_deref(), self.pose_file.as_deref())?;
-        nested("range_image", &self.range_image)?;
+        self.known_sensor().validate()?;
         self.range_image.without_batches()?;
         self.refiner().validate()
     }

@@ -32,7 +32,7 @@ pub struct ScanConfig {
     #[default(Vec3::new(30.0, 30.0, 5.0))]
     pub crop_m: Vec3,
     /// Rectangle of the own car in the lidar frame, whose points are dropped: x_min, x_max, y_min, y_max [m].
-    #[default([-2.5, 2.7, -1.2, 1.2])]
+    #[default(crate::sensor::ASSUMED_OWN_CAR_M)]
     pub own_car_m: [f32; 4],
 }
 

@@ -105,7 +105,7 @@ fn run_with_scans(config: &BuildMapConfig, role: Role, context: &Context) -> Res
         frames: opened.sequence.frames.len(),
         mapped_frames: mapped.len(),
         held_out_frames: opened.held_out.len(),
-        sensor: opened.sensor,
+        sensor: Some(opened.sensor),
         trajectory: opened.trajectory,
         changes: older.map(|older| ChangesReport::of(older, &gone, &added)),
         stage_seconds: clock.seconds(),

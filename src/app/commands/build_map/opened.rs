@@ -17,7 +17,7 @@ use crate::map::build::plan::{self, LocalMapPlan};
 use crate::map::{MapBuilder, MapConfig, MapPlan, PoseSource};
 use crate::mapping::{TrajectorySummary, key_frames, poses_of};
 use crate::recording::{Frame, Recording};
-use crate::sensor::SensorDescription;
+use crate::sensor::Sensor;
 
 /// The recording of a map.
 pub struct Opened {
@@ -27,8 +27,8 @@ pub struct Opened {
     pub map: MapConfig,
     /// The recording with its poses.
     pub sequence: Recording,
-    /// What was inferred about the sensor.
-    pub sensor: Option<SensorDescription>,
+    /// The sensor.
+    pub sensor: Sensor,
     /// What the poses show about themselves, where they were found in this run.
     pub trajectory: Option<TrajectorySummary>,
     /// The map to which the recording is added.

@@ -26,8 +26,8 @@ pub fn open_map(config: &BuildMapConfig, frame: Option<&Frame>) -> Result<Option
     };
     if let Some(frame) = frame {
         let scan = frame.read()?;
-        let localizer = mapping::localizer(&config.map());
-        let found = Localizer::new(&map, localizer, Start::unknown(&map), config.seed)
+        let (sensor, localizer) = mapping::localizer(&config.map());
+        let found = Localizer::new(&map, &sensor, localizer, Start::unknown(&map), config.seed)
             .and_then(|mut localizer| localizer.step(&scan, Odometry::Unknown));
         if let Err(error) = found {
             tracing::warn!("a start anywhere in this map was not prepared: {error}");

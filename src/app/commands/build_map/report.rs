@@ -13,7 +13,7 @@ use crate::app::run::output::Printed;
 use crate::evaluation::{MapQuality, TruthAgreement};
 use crate::map::{LocalMapCounts, MappingPath};
 use crate::mapping::TrajectorySummary;
-use crate::sensor::SensorDescription;
+use crate::sensor::Sensor;
 
 /// Report of a map build.
 #[derive(Debug, Default, Serialize)]
@@ -24,8 +24,8 @@ pub struct BuildReport {
     pub mapped_frames: usize,
     /// Key scans held out to evaluate the map.
     pub held_out_frames: usize,
-    /// What was inferred about the sensor; `None` if all of it was configured.
-    pub sensor: Option<SensorDescription>,
+    /// The sensor.
+    pub sensor: Option<Sensor>,
     /// What poses that were found in this run show about themselves.
     pub trajectory: Option<TrajectorySummary>,
     /// What changed in the older map, where there is one.

@@ -33,6 +33,7 @@ use crate::map::Map;
 use crate::random::stream;
 use crate::recording::Recording;
 use crate::refinement::{InitialEstimate, TrajectoryRefiner};
+use crate::sensor::Sensor;
 
 /// Random stream of the noise on the odometry; the localizer has its own streams.
 const ODOMETRY_STREAM: u64 = 1;
@@ -46,7 +47,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     let claims = prepare(config, context, &files)?;
     let map = config.map_inputs().load(config.map_options(), context)?;
     let mut resolved = config.clone();
-    let sequence = resolved.open_in_map(&map)?;
+    let (sequence, sensor) = resolved.open_in_map(&map)?;
     let (motion, odometry_file) = MotionSource::open(
         config.odometry,
         config.odometry_file.clone(),
@@ -68,7 +69,9 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     let kept = |run: &Run| run.kept(config, sequence.frames.len());
     context.interrupt.supervise(
         || {
-            localize(config, context, &map, &sequence, &motion, &recorded)?;
+            localize(
+                config, context, &map, &sensor, &sequence, &motion, &recorded,
+            )?;
             let mut run = recorded();
             run.complete()?;
             write_results(config, &files, &sequence, &mut run)?;
@@ -118,14 +121,15 @@ fn localize<'a>(
     config: &LocalizationConfig,
     context: &Context,
     map: &Map,
+    sensor: &Sensor,
     sequence: &Recording,
     motion: &Mutex<MotionSource>,
     recorded: &dyn Fn() -> MutexGuard<'a, Run>,
 ) -> Result<()> {
     let start = start(config, map, sequence);
     let mut motion = motion.lock().unwrap_or_else(PoisonError::into_inner);
-    let mut localizer = Localizer::new(map, config.localizer(), start, config.seed)?;
-    let refiner = || TrajectoryRefiner::new(map, config.refiner(), config.seed);
+    let mut localizer = Localizer::new(map, sensor, config.localizer(), start, config.seed)?;
+    let refiner = || TrajectoryRefiner::new(map, sensor, config.refiner(), config.seed);
     let mut refiner = config.refine.then(refiner).transpose()?;
     let task = context.progress.task("localize", sequence.frames.len());
     for (row, frame) in sequence.frames.iter().enumerate() {

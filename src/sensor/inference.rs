@@ -1,0 +1,323 @@
+//! The sensor of some scans, or of a recording: what is given, else what the scans show.
+
+use super::beams::{self, BeamSource};
+use super::config::{MotionCompensation, RangeImageConfig, SensorConfig};
+use super::dropped::DroppedPoints;
+use super::mounting::{self, Surroundings};
+use super::{ASSUMED_OWN_CAR_M, Sensor, columns, own_car, projection, rotation};
+use crate::geometry::wrap_angle;
+use crate::lidar::{LidarModel, PERIOD_S, Rotation, Scan};
+use crate::odometry::{OdometryConfig, TimingComparison, TimingError, compare_timings};
+use crate::recording::{Frame, Recording, RecordingError};
+
+/// Number of scans from which a sensor is inferred.
+const SENSOR_SCANS: usize = 10;
+
+/// Number of consecutive scans that show the times of points.
+pub const TIMING_SCANS: usize = 16;
+
+/// Why a sensor cannot be inferred, or a scan is not of it.
+#[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages are the documentation")]
+pub enum SensorError {
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    #[error(transparent)]
+    Timing(#[from] TimingError),
+    #[error(
+        "{:.0} % of the points of the scan are outside the field of view of the sensor ({sensor}); give the sensor of these scans, or none, so that it is inferred",
+        100.0 * share
+    )]
+    OtherSensor { sensor: Box<Sensor>, share: f64 },
+}
+
+impl Sensor {
+    /// The sensor of some scans: one suffices for the beams, ten of a drive for the rest, better spread over some
+    /// seconds than neighbours. What is known takes precedence.
+    pub fn infer(scans: &[Scan], known: &SensorConfig) -> Self {
+        let scans: Vec<Scan> = scans.iter().map(valid_points).collect();
+        let scans: &[Scan] = &scans;
+        let beams = beams::find(scans);
+        let horizontal_fov_deg = columns::horizontal_fov_deg(scans);
+        let columns = columns::count(&beams);
+        let surroundings = Surroundings::of(scans);
+        let own_car = own_car::find(&surroundings);
+        let sensor = Self {
+            range_image: projection::model(scans, &beams, columns, own_car.rectangle_m),
+            has_rows: beams.source != BeamSource::None,
+            beams: beams.nominal,
+            beam_source: beams.source,
+            columns,
+            horizontal_fov_deg,
+            mounting: mounting::find(&surroundings),
+            sensor_height_m: None,
+            own_car_m: if own_car.is_moving {
+                own_car.rectangle_m
+            } else {
+                ASSUMED_OWN_CAR_M
+            },
+            is_moving: own_car.is_moving,
+            period_s: rotation::period_s(scans, horizontal_fov_deg),
+            rotation: rotation::direction(scans, horizontal_fov_deg),
+            motion_compensation: Some(MotionCompensation::Auto),
+            scans: scans.len(),
+        };
+        sensor.with_known(known)
+    }
+
+    /// The sensor of a recording, from ten of its scans, and from consecutive ones of its middle for the times of the
+    /// points where the data have none. What is known takes precedence; a rotation that contradicts the scans is a
+    /// warning.
+    pub fn infer_recording(
+        recording: &Recording,
+        known: &SensorConfig,
+    ) -> Result<Self, SensorError> {
+        let is_auto = known.motion_compensation == Some(MotionCompensation::Auto);
+        if let (Some(configured), false) = (known.motion_compensation, is_auto) {
+            warn_of_contradiction(recording, configured)?;
+        }
+        if let (Some(sensor), false) = (Self::configured(known), is_auto) {
+            return Ok(sensor);
+        }
+        let mut scans = spread_scans(recording)?;
+        if known.motion_compensation.is_none() {
+            scans.iter_mut().for_each(|scan| scan.times_s.clear());
+        }
+        let mut sensor = Self::infer(&scans, known);
+        tracing::info!("sensor: {sensor}");
+        sensor.warn_of_dropped_points(&scans);
+        if is_auto && scans.iter().all(|scan| scan.times_s.is_empty()) {
+            let compared = if sensor.is_spinning() {
+                timings_of_recording(recording)?
+            } else {
+                None
+            };
+            sensor.motion_compensation = compared.as_ref().and_then(fitting_rotation);
+        }
+        Ok(sensor)
+    }
+
+    /// The sensor of a configuration from which nothing about range images and own car is missing.
+    pub fn configured(known: &SensorConfig) -> Option<Self> {
+        let range_image = known.range_image.model();
+        let given = RangeImageConfig {
+            has_rows: None,
+            max_instance: None,
+            render_instanced: None,
+            ..known.range_image.clone()
+        };
+        let own_car_m = known.own_car_m?;
+        let is_complete = given == RangeImageConfig::of(&range_image);
+        is_complete.then(|| Self {
+            own_car_m,
+            motion_compensation: known.motion_compensation,
+            ..Self::new(range_image).with_known(known)
+        })
+    }
+
+    /// The same sensor, with what is known.
+    #[must_use]
+    pub fn with_known(mut self, known: &SensorConfig) -> Self {
+        self.range_image = known.range_image.model_over(&self.range_image);
+        self.has_rows = known.range_image.has_rows.unwrap_or(self.has_rows);
+        self.own_car_m = known.own_car_m.unwrap_or(self.own_car_m);
+        self.sensor_height_m = known.sensor_height_m.or(self.sensor_height_m);
+        if known.motion_compensation != Some(MotionCompensation::Auto) {
+            self.motion_compensation = known.motion_compensation;
+        }
+        self
+    }
+
+    /// Completes a sensor that was inferred from its first scans by more of them, consecutive ones: the own car and the
+    /// times of the points, where they are not known. Returns whether the scans show them, which needs motion.
+    pub fn complete(&mut self, scans: &[Scan], known: &SensorConfig) -> Result<bool, SensorError> {
+        let valid: Vec<Scan> = scans.iter().map(valid_points).collect();
+        let own_car = own_car::find(&Surroundings::of(&valid));
+        if !own_car.is_moving {
+            return Ok(false);
+        }
+        self.is_moving = true;
+        self.own_car_m = known.own_car_m.unwrap_or(own_car.rectangle_m);
+        if self.motion_compensation == Some(MotionCompensation::Auto)
+            && scans.iter().all(|scan| scan.times_s.is_empty())
+        {
+            let compared = if self.is_spinning() {
+                timings_of(scans, self.period_s.unwrap_or(PERIOD_S))?
+            } else {
+                None
+            };
+            self.motion_compensation = compared.as_ref().and_then(fitting_rotation);
+        }
+        Ok(true)
+    }
+
+    /// The recording, whose points have times from the rotation of the sensor where the data have none; without motion
+    /// compensation, times of the data are ignored.
+    pub fn applied_to(&self, recording: Recording) -> Recording {
+        let Some(compensation) = self.motion_compensation else {
+            return recording.compensated();
+        };
+        let rotation = compensation.rotation(period_s(&recording));
+        recording.rotating(rotation)
+    }
+
+    /// Requires that the points of a scan are in the field of view.
+    pub fn require_fit(&self, scan: &Scan) -> Result<(), SensorError> {
+        let dropped = DroppedPoints::count(scan, &self.range_image, self.own_car_m);
+        let share = dropped.share_outside();
+        if share > DroppedPoints::TOO_MANY {
+            let sensor = Box::new(self.clone());
+            return Err(SensorError::OtherSensor { sensor, share });
+        }
+        Ok(())
+    }
+
+    /// Whether the sensor sees nearly all around, in rows.
+    fn is_spinning(&self) -> bool {
+        /// Horizontal field of view [deg].
+        const SPINNING_DEG: f32 = 300.0;
+        self.has_rows && self.horizontal_fov_deg > SPINNING_DEG
+    }
+
+    /// Warns of each reason that drops too many of the points.
+    fn warn_of_dropped_points(&self, scans: &[Scan]) {
+        let mut dropped = DroppedPoints::default();
+        for scan in scans {
+            dropped.add(&DroppedPoints::count(
+                scan,
+                &self.range_image,
+                self.own_car_m,
+            ));
+        }
+        for (reason, share) in dropped.above(DroppedPoints::TOO_MANY) {
+            tracing::warn!(
+                "{:.0} % of the points are not used: they {}; see {}",
+                100.0 * share,
+                reason.description(),
+                reason.keys()
+            );
+        }
+    }
+}
+
+/// The points with a direction.
+fn valid_points(scan: &Scan) -> Scan {
+    /// Nearer points are marks of missing returns, and have no accurate direction [m].
+    const NEAREST_M: f32 = 0.1;
+    let any_range = LidarModel {
+        min_range: NEAREST_M,
+        max_range: f32::MAX,
+        ..LidarModel::default()
+    };
+    let mut scan = scan.clone();
+    scan.drop_invalid(&any_range);
+    scan
+}
+
+/// Ten scans, spread over a recording.
+pub fn spread_scans(recording: &Recording) -> Result<Vec<Scan>, RecordingError> {
+    let step = recording.frames.len().div_ceil(SENSOR_SCANS).max(1);
+    let frames = recording.frames.iter().step_by(step);
+    frames.map(Frame::read).collect()
+}
+
+/// Duration of a revolution: the time between scans with consecutive numbers, if that is plausible [s].
+fn period_s(recording: &Recording) -> f64 {
+    let [first, .., last] = recording.frames.as_slice() else {
+        return PERIOD_S;
+    };
+    let period_s = (last.time_s - first.time_s) / (last.number - first.number) as f64;
+    if recording.has_times && (0.03..0.3).contains(&period_s) {
+        period_s
+    } else {
+        PERIOD_S
+    }
+}
+
+/// The rotation that makes consecutive scans fit best; `None` if they fit best as they are, or if nothing shows it.
+fn fitting_rotation(compared: &TimingComparison) -> Option<MotionCompensation> {
+    let best = compared.best.map(|best| compared.residuals_m[best].0);
+    let name = best.map_or("undecided, none".to_owned(), timing_in_words);
+    tracing::info!(
+        "motion compensation: {name}; distances between scans: {}",
+        residuals_in_words(compared)
+    );
+    best.flatten().map(|best| MotionCompensation::of(&best))
+}
+
+/// Warns if another rotation than the configured one makes consecutive scans fit best.
+fn warn_of_contradiction(
+    recording: &Recording,
+    configured: MotionCompensation,
+) -> Result<(), SensorError> {
+    /// Starts of the revolution that are nearer are the same [rad].
+    const SAME_START_RAD: f64 = 0.5;
+    let Some(compared) = timings_of_recording(recording)? else {
+        return Ok(());
+    };
+    let configured = configured.rotation(PERIOD_S);
+    let is_same = |found: Rotation, configured: Rotation| {
+        let apart_rad = wrap_angle(found.start_rad - configured.start_rad).abs();
+        found.direction == configured.direction && apart_rad < SAME_START_RAD
+    };
+    if let Some(best) = compared.best.map(|best| compared.residuals_m[best].0)
+        && !(best.zip(configured)).is_some_and(|(best, configured)| is_same(best, configured))
+    {
+        tracing::warn!(
+            "the scans fit best as {}, not as motion_compensation says; distances between scans: {}",
+            timing_in_words(best),
+            residuals_in_words(&compared)
+        );
+    }
+    Ok(())
+}
+
+/// Times of points in words, as the key has them.
+fn timing_in_words(timing: Option<Rotation>) -> String {
+    match timing {
+        None => "compensated already".to_owned(),
+        Some(rotation) => {
+            let text = MotionCompensation::of(&rotation).to_string();
+            text.replace("counter_clockwise", "counter-clockwise")
+        }
+    }
+}
+
+fn residuals_in_words(compared: &TimingComparison) -> String {
+    let residuals = compared.residuals_m.iter();
+    let words: Vec<String> = residuals
+        .map(|(timing, m)| format!("{} {:.1} mm", timing_in_words(*timing), 1e3 * m))
+        .collect();
+    words.join(", ")
+}
+
+/// Compares the times of points by the distances between scans of the middle of a recording.
+fn timings_of_recording(recording: &Recording) -> Result<Option<TimingComparison>, SensorError> {
+    let frames = &recording.frames;
+    let first = frames.len().saturating_sub(TIMING_SCANS) / 2;
+    let run = &frames[first..(first + TIMING_SCANS).min(frames.len())];
+    if !are_dense(&run.iter().map(|frame| frame.time_s).collect::<Vec<_>>()) {
+        return Ok(None);
+    }
+    let scans: Vec<Scan> = run.iter().map(Frame::read).collect::<Result<_, _>>()?;
+    timings_of(&scans, period_s(recording))
+}
+
+/// Compares the times of points by the distances between consecutive scans; `None` if the data have times, or if
+/// the scans are too few or too far apart.
+fn timings_of(scans: &[Scan], period_s: f64) -> Result<Option<TimingComparison>, SensorError> {
+    let times_s: Vec<f64> = scans.iter().filter_map(|scan| scan.time_s).collect();
+    let are_timed = scans.iter().any(|scan| !scan.times_s.is_empty());
+    if are_timed || scans.len() < TIMING_SCANS / 2 || !are_dense(&times_s) {
+        return Ok(None);
+    }
+    let config = OdometryConfig::default();
+    Ok(Some(compare_timings(scans, period_s, &config)?))
+}
+
+/// Whether a sensor moves evenly between scans.
+fn are_dense(times_s: &[f64]) -> bool {
+    /// Longest time between scans [s].
+    const MAX_STEP_S: f64 = 0.35;
+    (times_s.windows(2)).all(|pair| pair[1] - pair[0] < MAX_STEP_S)
+}
