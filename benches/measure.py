@@ -1,0 +1,254 @@
+"""Measures the tables of `docs/benchmarks.md` and prints their rows.
+
+    cargo build --release
+    python benches/measure.py [SUBJECT ...] [--seeds 1,2,3,4,5] [--work results/measure]
+
+Subjects: drive_0005, kitti_07, odometry, ground, demo, poisson, rays, basin, starts; all by default. A subject whose
+recording, package or program is absent is skipped with a line that names it. Recordings are below the folder in
+`FPMCL_DATA`, by default `../shared/data`; the simulated drives are made in the folder of the work, where finished
+maps are kept for the next call. The numbers of one call belong to one commit and one machine, which head the output.
+Times are those of an otherwise idle machine.
+"""
+
+import argparse
+import importlib.util
+import json
+import math
+import os
+import pathlib
+import platform
+import statistics
+import subprocess
+import sys
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+DATA = pathlib.Path(os.environ.get("FPMCL_DATA", ROOT / "../shared/data")).resolve()
+PROGRAM = ROOT / "target/release/fpmcl"
+DRIVE_0005 = DATA / "kitti-0926-drive-0005"
+TRUTH_0005 = ["--truth", DRIVE_0005 / "poses.txt", "--calib", DRIVE_0005 / "calib.txt"]
+
+
+class Absent(Exception):
+    """A file, package or program that a subject needs."""
+
+
+def require(path):
+    """Returns `path`, which must exist."""
+    if not path.exists():
+        raise Absent(path)
+    return path
+
+
+def run(*command, **environment):
+    """Runs a command in the root of the repository and returns its standard output."""
+    words = [str(word) for word in command]
+    print("$", *words, file=sys.stderr)
+    environment = {**os.environ, **environment}
+    return subprocess.run(
+        words, cwd=ROOT, env=environment, check=True, stdout=subprocess.PIPE, text=True
+    ).stdout
+
+
+def fpmcl(*arguments):
+    return run(require(PROGRAM), *arguments)
+
+
+def bench(name, *arguments, **environment):
+    return run("cargo", "bench", "--bench", name, "--", *arguments, **environment)
+
+
+def row(*cells):
+    print("|", " | ".join(str(cell) for cell in cells), "|")
+
+
+def table(*heads):
+    row(*heads)
+    row(*["---"] * len(heads))
+
+
+def block(text):
+    print("```text", text.rstrip(), "```", sep="\n")
+
+
+def errors(name, folders, run_of):
+    """Prints the errors of `run_of` (`mcl` or `refined`) over the reports of all seeds: mean (worst)."""
+    reports = [json.loads((folder / "report.json").read_text()) for folder in folders]
+    metrics = [report[run_of]["metrics"] for report in reports]
+    position_cm = [100 * it["position_m"]["rmse"] for it in metrics]
+    heading_deg = [math.degrees(it["heading_rad"]["rmse"]) for it in metrics]
+    median_ms = statistics.median(1e3 * it["runtime_s"]["median"] for it in metrics)
+    row(
+        name,
+        f"{statistics.mean(position_cm):.2f} ({max(position_cm):.2f}) cm",
+        f"{statistics.mean(heading_deg):.3f} ({max(heading_deg):.3f}) deg",
+        f"{median_ms:.0f} ms",
+    )
+
+
+def localized(work, seeds, name, localize, refine):
+    """Localizes and refines once per seed; `localize` and `refine` are the arguments before the seed and the output."""
+    folders = []
+    for seed in seeds:
+        folder = work / f"{name}_{seed}".replace(" ", "_")
+        result = folder / "localization.npz"
+        outputs = ["--output", result, "--seed", seed, "--force"]
+        fpmcl("localize", *localize, *outputs)
+        fpmcl("refine", result, *refine, "--seed", seed)
+        folders.append(folder)
+    errors(f"{name}: `localize`", folders, "mcl")
+    errors(f"{name}: `refine`", folders, "refined")
+
+
+def map_of(recording, file, *arguments):
+    """Builds a map, if there is none yet, and prints its rate."""
+    if not file.exists():
+        fpmcl("build-map", recording, "--output", file, *arguments)
+    report = json.loads(file.with_suffix(".report.json").read_text())
+    seconds = report["seconds"]
+    print(f"`build-map`: {report['mapped_frames']} key scans of {report['frames']} in {seconds:.1f} s\n")
+    return file
+
+
+def map_0005(work):
+    steps = ["--set", "frame_step=2", "--set", "depth=10"]
+    return map_of(require(DRIVE_0005), work / "drive_0005/map.ply", *steps)
+
+
+def drive_0005(work, seeds):
+    odd = [DRIVE_0005, "--map", map_0005(work), "--set", "start_idx=1", "--set", "frame_step=2", *TRUTH_0005]
+    stereo = ["--odometry", DRIVE_0005 / "odometry_stereo.txt"]
+    table("odometry", "position RMSE", "heading RMSE", "time per frame")
+    localized(work / "drive_0005", seeds, "scans", odd, [])
+    localized(work / "drive_0005", seeds, "stereo camera", odd + stereo, [])
+    localized(work / "drive_0005", seeds, "noisy truth", odd + ["--set", "odometry=ground_truth"], [])
+
+
+def kitti_07_drives(work):
+    """Simulates both drives along the path of KITTI 07 where the poses of the benchmark are."""
+    benchmark = DATA / "kitti-odometry-poses"
+    poses = require(benchmark / "poses/07.txt")
+    calib = require(benchmark / "sequences/07/calib.txt")
+    parent = work / "kitti_07"
+    for drive in (1, 2):
+        if not (parent / f"drive_{drive}").exists():
+            settings = [f"drive={drive}", f"output_folder={parent}", f"path_pose_file={poses}", f"path_calib_file={calib}"]
+            chosen = [word for setting in settings for word in ("--set", setting)]
+            fpmcl("simulate", "config/kitti_07/simulation.yml", *chosen)
+    return work / "kitti_07/drive_1", work / "kitti_07/drive_2"
+
+
+def given(drive):
+    return ["--poses", drive / "poses.txt", "--calib", drive / "calib.txt"]
+
+
+def kitti_07(work, seeds):
+    first, second = kitti_07_drives(work)
+    file = map_of(first, work / "kitti_07/map.ply", *given(first))
+    truth = ["--truth", second / "poses.txt", "--calib", second / "calib.txt"]
+    table("odometry", "position RMSE", "heading RMSE", "time per frame")
+    odometry = ["--odometry", second / "odometry.txt"]
+    localized(work / "kitti_07", seeds, "drifting", [second, "--map", file, *truth, *odometry], [])
+    localized(work / "kitti_07", seeds, "scans", [second, "--map", file, *truth], [])
+
+
+def odometry(work, _seeds):
+    table("recording", "scans", "path", "segments of 5 to 50 m", "time per scan (median)")
+    for name, truth in {
+        "kitti-0926-drive-0005": TRUTH_0005,
+        "vlp16-raw": [],
+        "os1-thinned": [],
+        "hdl32-gaps": [],
+        "livox-hku1": [],
+    }.items():
+        recording = DATA / name
+        if not recording.exists():
+            print(f"skipped: {recording} is absent", file=sys.stderr)
+            continue
+        folder = work / "odometry" / name
+        fpmcl("odometry", recording, "--output", folder, "--force")
+        report = json.loads((folder / "report.json").read_text())
+        segments = "-"
+        if truth:
+            evaluated = folder / "evaluation"
+            poses = folder / "odometry_tum.txt"
+            fpmcl("evaluate", poses, *truth, "--recording", recording, "--align", "first", "--output", evaluated)
+            found = json.loads((evaluated / "report.json").read_text())
+            segments = json.dumps(found["mcl"]["in_space"]["short_segments"])
+        median_s, _p95_s = report["seconds_per_scan"]
+        row(name, report["scans"], f"{report['path_m']:.0f} m", segments, f"{1e3 * median_s:.0f} ms")
+
+
+def ground(work, _seeds):
+    for name in ("semantickitti-00-labels", "semantickitti-08-labels", "nuscenes-hdl32"):
+        output = ["--set", f"output_folder={work / 'ground' / name}", "--set", "plot_step=0"]
+        block(fpmcl("ground", require(DATA / name), *output))
+        scans = DATA / name / "velodyne"
+        if importlib.util.find_spec("pypatchworkpp") and scans.exists():
+            block("Patchwork++: " + run(sys.executable, "benches/patchwork.py", scans))
+    block(fpmcl("ground", "--simulated"))
+
+
+def demo(work, _seeds):
+    block(fpmcl("demo", "--output", work / "demo", "--force"))
+
+
+def poisson(_work, _seeds):
+    for size in ("1000000,9", "1000000,8"):
+        block(bench("poisson", FPMCL_POISSON=size, RAYON_NUM_THREADS="2"))
+
+
+def rays(work, _seeds):
+    folder = work / "rays"
+    folder.mkdir(parents=True, exist_ok=True)
+    block(bench("rendering", FPMCL_BENCH_DIR=str(folder)))
+    if importlib.util.find_spec("open3d"):
+        block(run(sys.executable, "benches/embree.py", folder))
+
+
+def basin(work, _seeds):
+    block(bench("basin", map_0005(work), DRIVE_0005))
+
+
+def starts(work, _seeds):
+    first, second = kitti_07_drives(work)
+    file = map_of(first, work / "kitti_07/map.ply", *given(first))
+    block(bench("starts", file, second, FPMCL_STARTS="40"))
+
+
+SUBJECTS = [drive_0005, kitti_07, odometry, ground, demo, poisson, rays, basin, starts]
+
+
+def processor():
+    """The model of the processor, where the system names it."""
+    file = pathlib.Path("/proc/cpuinfo")
+    lines = file.read_text().splitlines() if file.exists() else []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or platform.machine()
+
+
+def main():
+    names = [subject.__name__ for subject in SUBJECTS]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("subjects", nargs="*", metavar="SUBJECT", help=", ".join(names))
+    parser.add_argument("--seeds", default="1,2,3,4,5")
+    parser.add_argument("--work", type=pathlib.Path, default=ROOT / "results/measure")
+    options = parser.parse_args()
+    unknown = set(options.subjects) - set(names)
+    if unknown:
+        parser.error(f"no such subject: {', '.join(sorted(unknown))}; there are {', '.join(names)}")
+    commit = run("git", "describe", "--always", "--dirty", "--abbrev=7").strip()
+    print(f"{os.cpu_count()} cores, {processor()}; commit {commit}.")
+    for subject in SUBJECTS:
+        if options.subjects and subject.__name__ not in options.subjects:
+            continue
+        print(f"\n## {subject.__name__}\n", flush=True)
+        try:
+            subject(options.work.resolve(), options.seeds.split(","))
+        except Absent as absent:
+            print(f"skipped: {absent} is absent", file=sys.stderr)
+        except subprocess.CalledProcessError as error:
+            print(f"failed: {error}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()
