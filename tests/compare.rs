@@ -248,7 +248,7 @@ fn the_page_is_made_of_the_available_files(recording: &Recording) {
     let html = page();
     for text in [
         "Example run: street/Fuzzy-MCL/2",
-        "Missing or not readable: view.png, range_images.png, states.png, drift.png, particles.png, cannot read",
+        "Missing or not readable: range_images.png, states.png, drift.png, particles.png, cannot read",
         "(Fuzzy-MCL seed 2)",
     ] {
         assert!(html.contains(text), "{text}");

@@ -24,7 +24,6 @@ fn the_pictures_of_finished_runs_show_the_paths() {
         let plots = Path::new(run).join("plots");
         let picture = |name: &str| Picture::read(&plots.join(name));
         // The enlarged part has the colors of the trajectories.
-        picture("view.png").shows(&[REFINED]);
         picture("path.png").shows(&[REFINED]);
         picture("errors.png").shows_at_least(400, &[MCL, REFINED]);
         picture("runtime.png").shows(&[MCL, REFINED]);

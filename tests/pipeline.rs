@@ -83,7 +83,6 @@ fn a_drive_is_localized_and_refined_in_the_map_of_another_drive() {
         assert!(output.contains(row), "no `{row}` in: {output}");
     }
     let picture = |name: &str| Picture::read(&plots.join(name));
-    picture("view.png").shows(&[REFINED]);
     picture("path.png").shows(&[REFINED, TRUTH]);
     picture("errors.png").shows_at_least(400, &[MCL, REFINED]);
     picture("runtime.png").shows(&[MCL, REFINED]);

@@ -9,7 +9,7 @@ use super::record::{Outcome, RunRecord};
 use super::results::ComparisonResults;
 use crate::app::report::format::{Cell, Column, Page, PageElement, Section, Table};
 use crate::app::report::results::length;
-use crate::app::report::run_page::{PICTURES, TEXTS, VIEW, collapsed, picture};
+use crate::app::report::run_page::{PICTURES, TEXTS, collapsed, picture};
 use crate::app::run::version;
 use crate::app::settings::{self, ComparisonConfig, Overrides, settings};
 use crate::evaluation::Summary;
@@ -166,8 +166,7 @@ fn sequence_elements(
         run.id
     )));
     let mut omitted = Vec::new();
-    let pictures = PICTURES.map(|(_, name, caption)| (name, caption));
-    for (name, caption) in [VIEW].into_iter().chain(pictures) {
+    for (_, name, caption) in PICTURES {
         if name == COMBINED_PICTURE {
             continue;
         }

@@ -7,7 +7,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result};
 
 use crate::app::report::format::{Cell, Column, Page, PageElement, Section, Table};
-use crate::app::report::plotting::palette;
+use crate::app::report::plotting::Bitmap;
 use crate::app::report::results::{MetricRow, Report, Value};
 use crate::app::report::run_output::{INTERACTIVE, RunFiles};
 use crate::app::run::{output, version};
@@ -26,9 +26,6 @@ pub struct RunPage<'a> {
     /// Properties of the machine; may be empty.
     pub machine: &'a BTreeMap<String, String>,
 }
-
-/// File name and caption of the oblique view.
-pub const VIEW: (&str, &str) = ("view.png", "Map with the path");
 
 /// Pictures of a run after the path: section, file name and caption.
 pub const PICTURES: [(&str, &str, &str); 8] = [
@@ -153,7 +150,7 @@ impl RunPage<'_> {
         })
     }
 
-    /// The interactive path, and the view of the map.
+    /// The interactive path, and its picture.
     fn path(&self) -> Result<Vec<PageElement>> {
         let plots = self.files.file("plots");
         let content = plots.join(INTERACTIVE);
@@ -165,7 +162,6 @@ impl RunPage<'_> {
                 caption: "Path over the map, colored by error or state. Point at a frame: its scan is drawn where the estimate puts it. Wheel or pinch to zoom, drag to move, double click to see all.".to_owned(),
             });
         }
-        elements.extend(picture_or_error(&plots.join(VIEW.0), VIEW.1));
         elements.extend(picture_or_error(&plots.join("path.png"), "Path, colored by its position error, or without ground truth by its standard deviation"));
         Ok(elements)
     }
@@ -287,8 +283,9 @@ pub fn picture(path: &Path, caption: &str) -> Result<Option<PageElement>> {
     if !path.exists() {
         return Ok(None);
     }
+    let png = Bitmap::read_png(path).and_then(|it| it.to_png());
     Ok(Some(PageElement::Picture {
-        png: palette::with_palette(path)?,
+        png: png.with_context(|| format!("cannot read {}", path.display()))?,
         caption: caption.to_owned(),
     }))
 }
@@ -316,7 +313,6 @@ pub fn collapsed(path: &Path, name: &str) -> Result<Option<PageElement>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::app::report::plotting::Bitmap;
 
     #[test]
     fn a_damaged_picture_is_replaced_by_the_reason() {

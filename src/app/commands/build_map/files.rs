@@ -13,7 +13,7 @@ use crate::map::mesh_view::MeshView;
 pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
     let mut extensions = vec!["report.json", "effective.yml", "poses_tum.txt"];
     if config.visualize {
-        extensions.extend(["png", "view.png", "residuals.png"]);
+        extensions.extend(["png", "residuals.png"]);
         extensions.extend(config.onto.is_some().then_some("changes.png"));
     }
     let name = |extension| {

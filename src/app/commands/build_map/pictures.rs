@@ -2,8 +2,8 @@
 
 use anyhow::Result;
 
-use crate::app::report::plotting::color::{Colormap, TRUTH};
-use crate::app::report::plotting::{MapPlot, ObliqueView, ScalarMapPlot, relief};
+use crate::app::report::plotting::color::Colormap;
+use crate::app::report::plotting::{MapPlot, SURFACES, ScalarMapPlot, muted};
 use crate::app::report::run_output::MOST_TRIANGLES;
 use crate::app::settings::BuildMapConfig;
 use crate::evaluation::map_quality::ResidualSums;
@@ -23,27 +23,15 @@ pub fn draw(
     let in_own_colors: Vec<_> = meshes.iter().map(|mesh| (*mesh, None)).collect();
     let mesh = &reduced(&in_own_colors, MOST_TRIANGLES);
     let driven: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
-    let relief = relief(mesh, path);
     let picture = config.mesh_file.with_extension("png");
     MapPlot {
         title: "Map from above",
-        mesh: &relief,
+        mesh: &muted(mesh),
         path: Some(("mapping trajectory", &driven)),
-        keys: &relief::KEYS,
+        keys: &SURFACES,
     }
     .save(&picture)?;
     tracing::info!("drew {}", picture.display());
-    if !path.is_empty() {
-        let picture = config.mesh_file.with_extension("view.png");
-        ObliqueView {
-            mesh: &relief,
-            name: "mapping trajectory",
-            color: TRUTH,
-            path,
-        }
-        .save(&picture)?;
-        tracing::info!("drew {}", picture.display());
-    }
     if residuals.quality().is_none() {
         return Ok(());
     }

@@ -54,13 +54,24 @@ impl Bitmap {
 
     /// Writes a PNG of 8 bits per channel.
     pub fn write_png(&self, writer: impl Write) -> io::Result<()> {
+        self.encode(writer, png::Compression::Fast)
+    }
+
+    fn encode(&self, writer: impl Write, compression: png::Compression) -> io::Result<()> {
         let mut encoder = png::Encoder::new(writer, self.width, self.height);
         encoder.set_color(png::ColorType::Rgb);
-        encoder.set_compression(png::Compression::Fast);
+        encoder.set_compression(compression);
         encoder.set_filter(png::Filter::Adaptive);
         let mut writer = encoder.write_header()?;
         writer.write_image_data(self.pixels.as_flattened())?;
         Ok(writer.finish()?)
+    }
+
+    /// A PNG of few bytes in memory.
+    pub fn to_png(&self) -> io::Result<Vec<u8>> {
+        let mut bytes = Vec::new();
+        self.encode(&mut bytes, png::Compression::High)?;
+        Ok(bytes)
     }
 
     /// Color at (column, row).

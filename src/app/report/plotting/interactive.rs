@@ -10,7 +10,6 @@ use serde_json::{Value, json};
 
 use super::color::{Colormap, MCL, REFINED, Rgb, STATES, TRUTH};
 use super::map_image::MapImage;
-use super::palette;
 use crate::app::report::results::{LocalizationResults, ScanOutline};
 use crate::evaluation::planar_errors;
 use crate::evaluation::trust::Axes;
@@ -102,7 +101,7 @@ impl InteractivePath<'_> {
 /// The map as a PNG with its upper left corner and the edge of a pixel [m].
 fn map_layer(map: &MapImage) -> Result<Value> {
     let (bitmap, [x_min, y_max, cell_m]) = map.bitmap();
-    let png = palette::encoded(&bitmap)?;
+    let png = bitmap.to_png()?;
     Ok(json!({
         "png": format!("data:image/png;base64,{}", STANDARD.encode(png)),
         "x_min": x_min, "y_max": y_max, "cell_m": cell_m,

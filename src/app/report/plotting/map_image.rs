@@ -1,4 +1,7 @@
 //! The map from above as a raster: the highest triangle of each cell, shaded by its slope.
+//!
+//! Where a surface is more than 2 m below others, as the road below crowns, the floor below a ceiling and the road
+//! below a bridge, the others are left out.
 
 use anyhow::Result;
 use glam::Vec3;
@@ -11,6 +14,12 @@ use crate::geometry::TriangleMesh;
 
 /// Direction to the light: from the upper left, steep.
 const LIGHT: Vec3 = Vec3::new(-0.42, 0.42, 0.8);
+
+/// What is higher above the lowest surface of a cell is left out [m].
+const HEADROOM_M: f32 = 2.0;
+
+/// Names and colors of the ground and of what is above it, in [`muted`] maps.
+pub const SURFACES: [(&str, Rgb); 2] = [("ground", [224, 217, 206]), ("above it", [116, 151, 150])];
 
 /// Raster over the x-y plane, rows from the top (largest y) down.
 #[derive(Clone, Debug, PartialEq)]
@@ -84,22 +93,30 @@ impl MapImage {
         if bounds.is_empty() {
             return image;
         }
+        let mut bottoms = vec![f32::INFINITY; image.cells.len()];
         let mut tops = vec![f32::NEG_INFINITY; image.cells.len()];
-        for triangle in 0..mesh.triangles.len() {
-            image.draw_triangle(mesh, triangle, &color, &mut tops);
+        let triangles = 0..mesh.triangles.len();
+        for triangle in triangles.clone() {
+            image.for_each_cell(mesh.corners(triangle), |cell, height_m, _| {
+                bottoms[cell] = bottoms[cell].min(height_m);
+            });
         }
+        let mut cells = vec![None; tops.len()];
+        for triangle in triangles {
+            let shade = shade(mesh.scaled_normal(triangle));
+            image.for_each_cell(mesh.corners(triangle), |cell, height_m, weights| {
+                if height_m > tops[cell] && height_m <= bottoms[cell] + HEADROOM_M {
+                    tops[cell] = height_m;
+                    cells[cell] = Some(blend([0, 0, 0], color(triangle, weights), shade));
+                }
+            });
+        }
+        image.cells = cells;
         image
     }
 
-    fn draw_triangle(
-        &mut self,
-        mesh: &TriangleMesh,
-        triangle: usize,
-        color: &impl Fn(usize, [f32; 3]) -> Rgb,
-        tops: &mut [f32],
-    ) {
-        let corners = mesh.corners(triangle);
-        let shade = shade(mesh.scaled_normal(triangle));
+    /// Visits the cells whose center a triangle covers, with its height there and its barycentric weights.
+    fn for_each_cell(&self, corners: [Vec3; 3], mut visit: impl FnMut(usize, f32, [f32; 3])) {
         // In units of cells, so that the center of cell (column, row) is at + 0.5.
         let [a, b, c] = corners.map(|corner| {
             (
@@ -128,11 +145,7 @@ impl MapImage {
                     continue;
                 }
                 let height_m = interpolated(corners.map(|corner| corner.z), weights);
-                let cell = row * self.width + column;
-                if height_m > tops[cell] {
-                    tops[cell] = height_m;
-                    self.cells[cell] = Some(blend([0, 0, 0], color(triangle, weights), shade));
-                }
+                visit(row * self.width + column, height_m, weights);
             }
         }
     }
@@ -164,8 +177,17 @@ impl MapImage {
     }
 }
 
+/// A copy of a map in the colors of [`SURFACES`]: ground is what has more red than blue.
+pub fn muted(mesh: &TriangleMesh) -> TriangleMesh {
+    let muted = |[red, _, blue]: &Rgb| SURFACES[usize::from(red <= blue)].1;
+    TriangleMesh {
+        colors: mesh.colors.iter().map(muted).collect(),
+        ..mesh.clone()
+    }
+}
+
 /// Sum of the weighted values.
-pub(crate) fn interpolated(values: [f32; 3], weights: [f32; 3]) -> f32 {
+fn interpolated(values: [f32; 3], weights: [f32; 3]) -> f32 {
     let weighted = values.iter().zip(weights);
     weighted.map(|(value, weight)| value * weight).sum()
 }
@@ -200,13 +222,23 @@ mod tests {
     }
 
     #[test]
-    fn higher_surfaces_hide_lower_ones_in_any_order() {
-        let image = MapImage::of_colors(&floor_and_box(), 100);
+    fn higher_surfaces_hide_lower_ones_in_any_order_unless_there_is_headroom_below_them() {
+        let mut mesh = floor_and_box();
+        let image = MapImage::of_colors(&mesh, 100);
         let [red, _, blue] = image.at(0.0, 0.0).unwrap();
         assert!(blue > 150 && red == 0);
         let [red, _, blue] = image.at(3.0, -3.0).unwrap();
         assert!(red > 150 && blue == 0);
         assert_eq!(image.at(5.1, 0.0), None);
+        mesh.vertices.iter_mut().for_each(|vertex| vertex.z *= 1.1);
+        let [red, _, blue] = MapImage::of_colors(&mesh, 100).at(0.0, 0.0).unwrap();
+        assert!(red > 150 && blue == 0);
+    }
+
+    #[test]
+    fn ground_and_the_rest_of_a_muted_map_have_their_colors() {
+        let colors = muted(&floor_and_box()).colors;
+        assert_eq!((colors[0], colors[7]), (SURFACES[1].1, SURFACES[0].1));
     }
 
     #[test]

@@ -6,7 +6,6 @@
 // Drawing.
 mod bitmap;
 pub mod color;
-pub mod palette;
 mod sheet;
 mod view;
 // The pictures.
@@ -17,10 +16,8 @@ mod ground_plot;
 mod interactive;
 mod map_image;
 mod map_plot;
-mod oblique;
 mod particles;
 mod range_images;
-pub mod relief;
 mod top_view;
 mod trajectory;
 
@@ -33,11 +30,9 @@ pub use chart::{LineChart, Panel, Series};
 pub use drift::drift_chart;
 pub use ground_plot::GroundPlot;
 pub use interactive::InteractivePath;
-pub use map_image::MapImage;
+pub use map_image::{MapImage, SURFACES, muted};
 pub use map_plot::{MapPlot, ScalarMapPlot};
-pub use oblique::ObliqueView;
 pub use particles::{LocalizationPicture, ParticlePanels};
 pub use range_images::RangeImageStrip;
-pub use relief::relief;
 pub use trajectory::{FRAME, PathPlot, error_chart};
 pub use view::Mark;

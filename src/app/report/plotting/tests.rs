@@ -299,7 +299,7 @@ fn particles_are_drawn_on_the_map_spread_and_concentrated() {
 fn particles_of_several_frames_are_drawn_beside_each_other() {
     let gallery = Gallery::open();
     let truth = street(300);
-    let map = MapImage::of_colors(&relief(&town(&truth), &[]), 2500);
+    let map = MapImage::of_colors(&town(&truth), 2500);
     let clouds = [(0, 15.0), (3, 4.0), (10, 0.5), (250, 0.1)];
     let clouds = clouds.map(|(row, spread_m)| (row, cloud(&truth[row], spread_m, 500)));
     let frames = clouds
@@ -342,49 +342,6 @@ fn particles_of_several_frames_are_drawn_beside_each_other() {
     assert!(format!("{error:#}").contains("no frames"), "{error:#}");
 }
 
-#[test]
-fn the_map_is_drawn_obliquely_with_the_path() {
-    let gallery = Gallery::open();
-    let truth = street(300);
-    let path: Vec<Pose3> = (truth.iter())
-        .map(|pose| pose3_from_pose2(pose, 0.0))
-        .collect();
-    let town = town(&truth);
-    let picture = gallery.path("view.png");
-    ObliqueView {
-        mesh: &relief(&town, &path),
-        name: "path",
-        color: REFINED,
-        path: &path,
-    }
-    .save(&picture)
-    .unwrap();
-    let image = assert_picture(&picture, &[(REFINED, 1000)]);
-    // Ground in the light, a little darker on slopes, and not red.
-    let ground = image.pixels.iter().filter(|[red, green, blue]| {
-        *red > 190 && red > blue && red - blue < 25 && green.abs_diff(*red) < 15
-    });
-    assert!(ground.count() > 50_000);
-    assert!(
-        image
-            .pixels
-            .iter()
-            .all(|[red, _, blue]| red.abs_diff(*blue) < 190)
-    );
-
-    let empty = ObliqueView {
-        mesh: &town,
-        name: "path",
-        color: REFINED,
-        path: &[],
-    };
-    let error = empty.save(&picture).unwrap_err();
-    assert!(
-        format!("{error:#}").contains("the path is empty"),
-        "{error:#}"
-    );
-}
-
 /// Three rooms in a row with doors between them, 1.3 m below the sensor, in one color; all surfaces have
 /// two sides.
 fn rooms() -> (TriangleMesh, Vec<Pose3>) {
@@ -425,33 +382,21 @@ fn rooms() -> (TriangleMesh, Vec<Pose3>) {
 }
 
 #[test]
-fn indoors_the_path_is_visible_from_above() {
+fn indoors_the_floor_is_visible_from_above() {
     let gallery = Gallery::open();
     let (rooms, path) = rooms();
-    let relief = relief(&rooms, &path);
-    let is_above = |triangle| relief.corners(triangle).iter().all(|corner| corner.z > 0.7);
-    assert!(!(0..relief.triangles.len()).any(is_above));
     let planar: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
     let map = gallery.path("rooms_map.png");
     MapPlot {
         title: "Rooms",
-        mesh: &relief,
+        mesh: &rooms,
         path: Some(("path", &planar)),
-        keys: &relief::KEYS,
+        keys: &[],
     }
     .save(&map)
     .unwrap();
-    assert_picture(&map, &[(TRUTH, 300)]);
-    let view = gallery.path("rooms_view.png");
-    ObliqueView {
-        mesh: &relief,
-        name: "path",
-        color: REFINED,
-        path: &path,
-    }
-    .save(&view)
-    .unwrap();
-    assert_picture(&view, &[(REFINED, 2000), (relief::GROUND, 0)]);
+    // Level surfaces are in the color of what has none, walls are darker.
+    assert_picture(&map, &[(TRUTH, 300), (MISSING, 100_000)]);
 }
 
 #[test]

@@ -11,7 +11,7 @@ use super::{INTERACTIVE, RunFiles};
 use crate::app::report::plotting::color::{MCL, REFINED, Rgb, STATES};
 use crate::app::report::plotting::{
     Animation, FRAME, InteractivePath, LineChart, LocalizationPicture, MapImage, MapPlot, Mark,
-    ObliqueView, Panel, ParticlePanels, PathPlot, Series, drift_chart, error_chart, relief,
+    Panel, ParticlePanels, PathPlot, SURFACES, Series, drift_chart, error_chart, muted,
 };
 use crate::app::report::results::{LocalizationResults, length};
 use crate::evaluation::trust::Axes;
@@ -35,10 +35,8 @@ pub fn draw_run(
     mesh: Option<&TriangleMesh>,
     results: &LocalizationResults,
 ) -> Result<()> {
-    let path = mesh.map_or_else(Vec::new, |mesh| sensor_path(mesh, results));
-    let relief = mesh.map(|mesh| relief(mesh, &path));
-    let image = relief.as_ref();
-    let image = image.map(|relief| MapImage::of_colors(relief, MAP_CELLS));
+    let mesh = mesh.map(muted);
+    let image = (mesh.as_ref()).map(|mesh| MapImage::of_colors(mesh, MAP_CELLS));
     let trajectories = Trajectories::of(results);
     draw_path(files, image.as_ref(), results, &trajectories)?;
     InteractivePath {
@@ -52,10 +50,19 @@ pub fn draw_run(
     draw_drift(files, trajectories.estimate_name(), results)?;
     draw_runtimes(files, results)?;
     draw_particles(files, image.as_ref(), results)?;
-    match &relief {
-        Some(relief) => draw_map(files, relief, &path, &trajectories),
-        None => Ok(()),
+    let Some(mesh) = &mesh else {
+        return Ok(());
+    };
+    MapPlot {
+        title: "Map from above",
+        mesh,
+        path: Some(match trajectories.truth {
+            Some(truth) => ("true path", truth),
+            None => ("found path", &trajectories.estimates),
+        }),
+        keys: &SURFACES,
     }
+    .save(&files.plot("map.png")?)
 }
 
 /// The map around some poses, for pictures: of large maps coarser.
@@ -122,17 +129,6 @@ impl<'a> Trajectories<'a> {
             .chain(refined)
             .collect()
     }
-}
-
-/// The best path that was found, in space.
-fn sensor_path(mesh: &TriangleMesh, results: &LocalizationResults) -> Vec<Pose3> {
-    let in_space = [&results.refined_in_space, &results.estimates_in_space];
-    if let Some(path) = in_space.into_iter().flatten().next() {
-        return path.clone();
-    }
-    let planar = [&results.refined, &results.estimates];
-    let planar = planar.into_iter().flatten().next();
-    relief::lifted(mesh, planar.map_or(&[], Vec::as_slice))
 }
 
 /// Draws the best trajectory colored by its error, or without a truth by its standard deviation.
@@ -386,37 +382,6 @@ fn spread_m(particles: &[ParticleRow]) -> Option<f64> {
     (sum > 0.0).then(|| (x + y).max(0.0).sqrt())
 }
 
-/// Draws the map from above and obliquely, with the path.
-fn draw_map(
-    files: &RunFiles,
-    relief: &TriangleMesh,
-    path: &[Pose3],
-    trajectories: &Trajectories,
-) -> Result<()> {
-    MapPlot {
-        title: "Map from above",
-        mesh: relief,
-        path: match trajectories.truth {
-            Some(truth) => Some(("true path", truth)),
-            None => Some(("found path", &trajectories.estimates)),
-        },
-        keys: &relief::KEYS,
-    }
-    .save(&files.plot("map.png")?)?;
-    let (name, color) = match (trajectories.refined, trajectories.is_given) {
-        (Some(_), _) => ("refined path", REFINED),
-        (None, true) => ("path", MCL),
-        (None, false) => ("MCL path", MCL),
-    };
-    ObliqueView {
-        mesh: relief,
-        name,
-        color,
-        path,
-    }
-    .save(&files.plot("view.png")?)
-}
-
 /// A picture per frame, and an animation of them.
 pub struct Movie {
     files: RunFiles,
@@ -430,10 +395,9 @@ impl Movie {
         let path = &map.path.map_from_lidar;
         let places: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
         let mesh = map_around(map, &places)?;
-        let relief = relief(&mesh, path);
         Ok(Self {
             files: files.clone(),
-            map: MapImage::of_colors(&relief, MAP_CELLS),
+            map: MapImage::of_colors(&muted(&mesh), MAP_CELLS),
             pictures: Vec::new(),
         })
     }
