@@ -8,7 +8,7 @@ use clap::Args;
 use serde::{Deserialize, Serialize};
 
 use super::stages::is_bag;
-use crate::app::report::results::{LocalizationResults, RunSummary};
+use crate::app::report::results::{LocalizationResults, RunSummary, Value};
 use crate::app::run::arguments::setting;
 use crate::app::run::output::Printed;
 use crate::app::settings;
@@ -229,6 +229,7 @@ fn result(path: &Path) -> Result<Printed> {
     let summary = RunSummary::of(&results, &estimates);
     let yes = |is: bool| if is { "yes" } else { "no" }.to_owned();
     let mut rows: Vec<(&str, String)> = (summary.rows().into_iter())
+        .filter(|row| row.value != Value::Absent)
         .map(|row| (row.name, format!("{} {}", row.value, row.unit)))
         .collect();
     rows.push(("refined", yes(results.refined.is_some())));

@@ -7,7 +7,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result, anyhow};
 use serde::{Deserialize, Serialize};
 
-use super::rows::{MetricRow, Value, length, metric_rows, spatial_rows};
+use super::rows::{MetricRow, Value, length, metric_rows, metrics, spatial_rows};
 use super::run_summary::RunSummary;
 use crate::evaluation::{RangeMclErrors, SpatialMetrics, TrajectoryMetrics};
 
@@ -56,22 +56,12 @@ pub struct TrajectoryReport {
 impl TrajectoryReport {
     /// All rows: those of range-mcl first.
     pub fn rows(&self) -> Vec<MetricRow> {
-        let range_mcl = vec![
-            MetricRow::new(
-                "range-mcl success: position error under converge_thres at every convergence_interval-th row",
-                self.range_mcl
-                    .success
-                    .map_or(Value::NotChecked, Value::Flag),
-            ),
-            MetricRow::new(
-                "range-mcl RMSE location [m]: position RMSE from row convergence_interval on, as range-mcl computes it",
-                self.range_mcl.rmse_location_m,
-            ),
-            MetricRow::new(
-                "range-mcl RMSE yaw [deg]: heading RMSE from row convergence_interval on, as range-mcl computes it",
-                self.range_mcl.rmse_yaw_deg,
-            ),
-        ];
+        let errors = &self.range_mcl;
+        let range_mcl = metrics! {
+            "range-mcl success" [""] errors.success.map_or(Value::NotChecked, Value::Flag), "position error under converge_thres at every convergence_interval-th row";
+            "range-mcl RMSE location" ["m"] errors.rmse_location_m, "position RMSE from row convergence_interval on, as range-mcl computes it";
+            "range-mcl RMSE yaw" ["deg"] errors.rmse_yaw_deg, "heading RMSE from row convergence_interval on, as range-mcl computes it";
+        };
         let in_space = self.in_space.as_ref().map_or_else(Vec::new, spatial_rows);
         [range_mcl, metric_rows(&self.metrics), in_space].concat()
     }

@@ -63,9 +63,10 @@ impl<T: Into<Value>> From<Option<T>> for Value {
 
 /// A length in centimetres, from a metre on in metres.
 pub fn length(length_m: f64) -> String {
-    match length_m < 1.0 {
-        true => format!("{:.1} cm", 100.0 * length_m),
-        false => format!("{length_m:.1} m"),
+    if length_m < 1.0 {
+        format!("{:.1} cm", 100.0 * length_m)
+    } else {
+        format!("{length_m:.1} m")
     }
 }
 
@@ -82,19 +83,13 @@ pub struct MetricRow {
     pub definition: &'static str,
 }
 
-impl MetricRow {
-    /// A row described by `name [unit]: definition`; the unit may be left out.
-    pub fn new(description: &'static str, value: impl Into<Value>) -> Self {
-        let (head, definition) = description.split_once(": ").unwrap_or((description, ""));
-        let (name, unit) = head.split_once(" [").unwrap_or((head, ""));
-        Self {
-            name,
-            value: value.into(),
-            unit: unit.trim_end_matches(']'),
-            definition,
-        }
-    }
+/// A row per metric: name, unit, value and definition.
+macro_rules! metrics {
+    ($($name:literal [$unit:literal] $value:expr, $definition:literal;)*) => {
+        vec![$(MetricRow { name: $name, value: $value.into(), unit: $unit, definition: $definition }),*]
+    };
 }
+pub(super) use metrics;
 
 /// The rows, most important first; the same rows in the same order for every trajectory.
 pub fn metric_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
@@ -121,292 +116,121 @@ pub fn spatial_rows(metrics: &SpatialMetrics) -> Vec<MetricRow> {
 
 fn absolute_rows(metrics: &SpatialMetrics) -> Vec<MetricRow> {
     let (position, rotation) = (&metrics.position_m, &metrics.rotation_rad);
-    vec![
-        MetricRow::new(
-            "position in space RMSE [m]: root mean square of the distance to the true position (APE, Sturm et al. 2012, as evo)",
-            position.rmse,
-        ),
-        MetricRow::new(
-            "position in space mean [m]: mean of the distance",
-            position.mean,
-        ),
-        MetricRow::new(
-            "position in space median [m]: half of the frames are nearer",
-            position.median,
-        ),
-        MetricRow::new("position in space max [m]: the worst frame", position.max),
-        MetricRow::new(
-            "height RMSE [m]: root mean square of the height difference",
-            metrics.height_m.rmse,
-        ),
-        MetricRow::new(
-            "height bias [m]: mean of the height difference; positive is above the truth",
-            metrics.height_bias_m,
-        ),
-        MetricRow::new(
-            "rotation RMSE [deg]: root mean square of the angle between the orientations",
-            rotation.rmse.to_degrees(),
-        ),
-        MetricRow::new(
-            "rotation max [deg]: the worst frame",
-            rotation.max.to_degrees(),
-        ),
-        MetricRow::new(
-            "position at the end [m]: distance of the last position to the true one",
-            metrics.end_position_m,
-        ),
-        MetricRow::new(
-            "rotation at the end [deg]: angle between the last orientations",
-            metrics.end_rotation_rad.to_degrees(),
-        ),
-        MetricRow::new(
-            "distance in space [m]: distance driven by the truth, with heights",
-            metrics.distance_m,
-        ),
-    ]
+    metrics! {
+        "position in space RMSE" ["m"] position.rmse, "root mean square of the distance to the true position (APE, Sturm et al. 2012, as evo)";
+        "position in space mean" ["m"] position.mean, "mean of the distance";
+        "position in space median" ["m"] position.median, "half of the frames are nearer";
+        "position in space max" ["m"] position.max, "the worst frame";
+        "height RMSE" ["m"] metrics.height_m.rmse, "root mean square of the height difference";
+        "height bias" ["m"] metrics.height_bias_m, "mean of the height difference; positive is above the truth";
+        "rotation RMSE" ["deg"] rotation.rmse.to_degrees(), "root mean square of the angle between the orientations";
+        "rotation max" ["deg"] rotation.max.to_degrees(), "the worst frame";
+        "position at the end" ["m"] metrics.end_position_m, "distance of the last position to the true one";
+        "rotation at the end" ["deg"] metrics.end_rotation_rad.to_degrees(), "angle between the last orientations";
+        "distance in space" ["m"] metrics.distance_m, "distance driven by the truth, with heights";
+    }
 }
 
 fn aligned_rows(metrics: &SpatialMetrics) -> Vec<MetricRow> {
     let position = |number: fn(&Summary) -> f64| metrics.aligned_position_m.as_ref().map(number);
     let rotation = metrics.aligned_rotation_rad.as_ref();
-    vec![
-        MetricRow::new(
-            "aligned position RMSE [m]: root mean square of the distance after rigid alignment, no scale (Umeyama 1991)",
-            position(|it| it.rmse),
-        ),
-        MetricRow::new(
-            "aligned position mean [m]: mean of this distance",
-            position(|it| it.mean),
-        ),
-        MetricRow::new(
-            "aligned position median [m]: half of the frames are nearer",
-            position(|it| it.median),
-        ),
-        MetricRow::new(
-            "aligned position max [m]: the worst frame",
-            position(|it| it.max),
-        ),
-        MetricRow::new(
-            "aligned rotation RMSE [deg]: root mean square of the angle after this alignment",
-            rotation.map(|it| it.rmse.to_degrees()),
-        ),
-    ]
+    metrics! {
+        "aligned position RMSE" ["m"] position(|it| it.rmse), "root mean square of the distance after rigid alignment, no scale (Umeyama 1991)";
+        "aligned position mean" ["m"] position(|it| it.mean), "mean of this distance";
+        "aligned position median" ["m"] position(|it| it.median), "half of the frames are nearer";
+        "aligned position max" ["m"] position(|it| it.max), "the worst frame";
+        "aligned rotation RMSE" ["deg"] rotation.map(|it| it.rmse.to_degrees()), "root mean square of the angle after this alignment";
+    }
 }
 
 fn segment_rows(metrics: &SpatialMetrics) -> Vec<MetricRow> {
-    let of_length = |description, length_m| {
-        let errors = metrics.of_length(length_m);
-        MetricRow::new(description, errors.map(|it| it.translation_percent))
-    };
+    let of_length = |length_m| metrics.of_length(length_m).map(|it| it.translation_percent);
     let (kitti, short) = (metrics.kitti_segments, metrics.short_segments);
-    vec![
-        MetricRow::new(
-            "segments 100-800 m, translation [%]: mean error over segments of 100, 200, ..., 800 m from every tenth frame, per length, in space (Geiger et al. 2012)",
-            kitti.map(|it| it.translation_percent),
-        ),
-        MetricRow::new(
-            "segments 100-800 m, rotation [deg/100 m]: the same for rotation",
-            kitti.map(|it| it.rotation_deg_per_100_m()),
-        ),
-        MetricRow::new(
-            "segments 100-800 m: their number",
-            kitti.map(|it| it.segments),
-        ),
-        MetricRow::new(
-            "segments 5-50 m, translation [%]: mean error over segments of 5, 10, 20 and 50 m from every frame, per length, in space",
-            short.map(|it| it.translation_percent),
-        ),
-        MetricRow::new(
-            "segments 5-50 m, rotation [deg/100 m]: the same for rotation",
-            short.map(|it| it.rotation_deg_per_100_m()),
-        ),
-        MetricRow::new("segments 5-50 m: their number", short.map(|it| it.segments)),
-        of_length("segments 5 m, translation [%]: those of 5 m alone", 5.0),
-        of_length("segments 10 m, translation [%]: those of 10 m alone", 10.0),
-        of_length("segments 20 m, translation [%]: those of 20 m alone", 20.0),
-        of_length("segments 50 m, translation [%]: those of 50 m alone", 50.0),
-    ]
+    metrics! {
+        "segments 100-800 m, translation" ["%"] kitti.map(|it| it.translation_percent), "mean error over segments of 100, 200, ..., 800 m from every tenth frame, per length, in space (Geiger et al. 2012)";
+        "segments 100-800 m, rotation" ["deg/100 m"] kitti.map(|it| it.rotation_deg_per_100_m()), "the same for rotation";
+        "segments 100-800 m" [""] kitti.map(|it| it.segments), "their number";
+        "segments 5-50 m, translation" ["%"] short.map(|it| it.translation_percent), "mean error over segments of 5, 10, 20 and 50 m from every frame, per length, in space";
+        "segments 5-50 m, rotation" ["deg/100 m"] short.map(|it| it.rotation_deg_per_100_m()), "the same for rotation";
+        "segments 5-50 m" [""] short.map(|it| it.segments), "their number";
+        "segments 5 m, translation" ["%"] of_length(5.0), "those of 5 m alone";
+        "segments 10 m, translation" ["%"] of_length(10.0), "those of 10 m alone";
+        "segments 20 m, translation" ["%"] of_length(20.0), "those of 20 m alone";
+        "segments 50 m, translation" ["%"] of_length(50.0), "those of 50 m alone";
+    }
 }
 
 fn position_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
     let position = &metrics.position_m;
     let (along, across) = (&metrics.along, &metrics.across);
-    vec![
-        MetricRow::new(
-            "position RMSE [m]: root mean square of the planar distance to the true position",
-            position.rmse,
-        ),
-        MetricRow::new(
-            "position mean [m]: mean of the planar distance (average positional error)",
-            position.mean,
-        ),
-        MetricRow::new(
-            "position median [m]: half of the frames are nearer",
-            position.median,
-        ),
-        MetricRow::new(
-            "position p95 [m]: 95 % of the frames are nearer",
-            position.p95,
-        ),
-        MetricRow::new("position max [m]: the worst frame", position.max),
-        MetricRow::new(
-            "x RMSE [m]: root mean square of the x difference in the map frame",
-            metrics.x_rmse_m,
-        ),
-        MetricRow::new(
-            "y RMSE [m]: root mean square of the y difference in the map frame",
-            metrics.y_rmse_m,
-        ),
-        MetricRow::new(
-            "along RMSE [m]: root mean square of the error along the true heading",
-            along.rmse_m,
-        ),
-        MetricRow::new(
-            "along bias [m]: mean error along the true heading; positive is ahead",
-            along.bias_m,
-        ),
-        MetricRow::new(
-            "across RMSE [m]: root mean square of the error across the true heading",
-            across.rmse_m,
-        ),
-        MetricRow::new(
-            "across bias [m]: mean error across the true heading; positive is left",
-            across.bias_m,
-        ),
-    ]
+    metrics! {
+        "position RMSE" ["m"] position.rmse, "root mean square of the planar distance to the true position";
+        "position mean" ["m"] position.mean, "mean of the planar distance (average positional error)";
+        "position median" ["m"] position.median, "half of the frames are nearer";
+        "position p95" ["m"] position.p95, "95 % of the frames are nearer";
+        "position max" ["m"] position.max, "the worst frame";
+        "x RMSE" ["m"] metrics.x_rmse_m, "root mean square of the x difference in the map frame";
+        "y RMSE" ["m"] metrics.y_rmse_m, "root mean square of the y difference in the map frame";
+        "along RMSE" ["m"] along.rmse_m, "root mean square of the error along the true heading";
+        "along bias" ["m"] along.bias_m, "mean error along the true heading; positive is ahead";
+        "across RMSE" ["m"] across.rmse_m, "root mean square of the error across the true heading";
+        "across bias" ["m"] across.bias_m, "mean error across the true heading; positive is left";
+    }
 }
 
 fn heading_rows(heading: &Summary) -> Vec<MetricRow> {
-    vec![
-        MetricRow::new(
-            "heading RMSE [deg]: root mean square of the wrapped heading difference",
-            heading.rmse.to_degrees(),
-        ),
-        MetricRow::new(
-            "heading mean [deg]: mean magnitude of the wrapped heading difference",
-            heading.mean.to_degrees(),
-        ),
-        MetricRow::new(
-            "heading median [deg]: half of the frames are nearer",
-            heading.median.to_degrees(),
-        ),
-        MetricRow::new(
-            "heading p95 [deg]: 95 % of the frames are nearer",
-            heading.p95.to_degrees(),
-        ),
-        MetricRow::new(
-            "heading max [deg]: the worst frame",
-            heading.max.to_degrees(),
-        ),
-    ]
+    metrics! {
+        "heading RMSE" ["deg"] heading.rmse.to_degrees(), "root mean square of the wrapped heading difference";
+        "heading mean" ["deg"] heading.mean.to_degrees(), "mean magnitude of the wrapped heading difference";
+        "heading median" ["deg"] heading.median.to_degrees(), "half of the frames are nearer";
+        "heading p95" ["deg"] heading.p95.to_degrees(), "95 % of the frames are nearer";
+        "heading max" ["deg"] heading.max.to_degrees(), "the worst frame";
+    }
 }
 
 fn success_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
     let found = metrics.convergence;
-    vec![
-        MetricRow::new(
-            "strict success: converged, and every frame from there to the end is within the limits (default 0.5 m and 2 deg)",
-            found.is_some_and(|found| found.kept),
-        ),
-        MetricRow::new(
-            "time to convergence [frames]: frames before the first of ten good frames in a row",
-            found.map(|found| found.row),
-        ),
-        MetricRow::new(
-            "time to convergence [m]: distance driven until then",
-            found.map(|found| found.distance_m),
-        ),
-        MetricRow::new(
-            "time to convergence [s]: time passed until then",
-            found.and_then(|found| found.time_s),
-        ),
-    ]
+    metrics! {
+        "strict success" [""] found.is_some_and(|found| found.kept), "converged, and every frame from there to the end is within the limits (default 0.5 m and 2 deg)";
+        "time to convergence" ["frames"] found.map(|found| found.row), "frames before the first of ten good frames in a row";
+        "time to convergence" ["m"] found.map(|found| found.distance_m), "distance driven until then";
+        "time to convergence" ["s"] found.and_then(|found| found.time_s), "time passed until then";
+    }
 }
 
 fn smoothness_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
     let smoothness = &metrics.smoothness;
-    vec![
-        MetricRow::new(
-            "jitter [m]: root mean square difference of consecutive planar error vectors",
-            smoothness.jitter_m,
-        ),
-        MetricRow::new(
-            "log dimensionless jerk: -ln(T³ / v²peak · ∫|jerk|² dt); nearer to zero is smoother (Hogan and Sternad 2009)",
-            smoothness.log_jerk,
-        ),
-        MetricRow::new(
-            "log dimensionless jerk of truth: the same of the ground truth",
-            smoothness.log_jerk_of_truth,
-        ),
-        MetricRow::new(
-            "drift [mm/m]: slope of the position error against the distance driven (least squares)",
-            metrics.drift.map(|drift| 1e3 * drift),
-        ),
-        MetricRow::new(
-            "drift over time [mm/s]: slope of the position error against time (least squares)",
-            metrics.drift_m_per_s.map(|drift| 1e3 * drift),
-        ),
-        MetricRow::new(
-            "mean pose change [m]: mean length of a step from frame to frame",
-            smoothness.mean_step_m,
-        ),
-        MetricRow::new(
-            "mean pose change of truth [m]: the same of the ground truth",
-            smoothness.mean_step_of_truth_m,
-        ),
-        MetricRow::new(
-            "mean heading change [deg]: mean magnitude of the turn from frame to frame",
-            smoothness.mean_turn_rad.map(f64::to_degrees),
-        ),
-    ]
+    metrics! {
+        "jitter" ["m"] smoothness.jitter_m, "root mean square difference of consecutive planar error vectors";
+        "log dimensionless jerk" [""] smoothness.log_jerk, "-ln(T³ / v²peak · ∫|jerk|² dt); nearer to zero is smoother (Hogan and Sternad 2009)";
+        "log dimensionless jerk of truth" [""] smoothness.log_jerk_of_truth, "the same of the ground truth";
+        "drift" ["mm/m"] metrics.drift.map(|drift| 1e3 * drift), "slope of the position error against the distance driven (least squares)";
+        "drift over time" ["mm/s"] metrics.drift_m_per_s.map(|drift| 1e3 * drift), "slope of the position error against time (least squares)";
+        "mean pose change" ["m"] smoothness.mean_step_m, "mean length of a step from frame to frame";
+        "mean pose change of truth" ["m"] smoothness.mean_step_of_truth_m, "the same of the ground truth";
+        "mean heading change" ["deg"] smoothness.mean_turn_rad.map(f64::to_degrees), "mean magnitude of the turn from frame to frame";
+    }
 }
 
 fn relative_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
     let segments = metrics.segments;
-    vec![
-        MetricRow::new(
-            "RPE translation RMSE [m]: relative pose error from frame to frame, translation (Sturm et al. 2012, as evo)",
-            metrics.rpe_translation_m.map(|rpe| rpe.rmse),
-        ),
-        MetricRow::new(
-            "RPE rotation RMSE [deg]: relative pose error from frame to frame, rotation",
-            metrics.rpe_rotation_rad.map(|rpe| rpe.rmse.to_degrees()),
-        ),
-        MetricRow::new(
-            "KITTI segments, translation [%]: mean error over segments of 100 to 800 m per distance, in the plane (Geiger et al. 2012)",
-            segments.map(|segments| segments.translation_percent),
-        ),
-        MetricRow::new(
-            "KITTI segments, rotation [deg/100 m]: the same for rotation",
-            segments.map(|segments| segments.rotation_deg_per_100_m()),
-        ),
-    ]
+    metrics! {
+        "RPE translation RMSE" ["m"] metrics.rpe_translation_m.map(|rpe| rpe.rmse), "relative pose error from frame to frame, translation (Sturm et al. 2012, as evo)";
+        "RPE rotation RMSE" ["deg"] metrics.rpe_rotation_rad.map(|rpe| rpe.rmse.to_degrees()), "relative pose error from frame to frame, rotation";
+        "KITTI segments, translation" ["%"] segments.map(|segments| segments.translation_percent), "mean error over segments of 100 to 800 m per distance, in the plane (Geiger et al. 2012)";
+        "KITTI segments, rotation" ["deg/100 m"] segments.map(|segments| segments.rotation_deg_per_100_m()), "the same for rotation";
+    }
 }
 
 fn runtime_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
     let runtime_ms =
         |number: fn(&Summary) -> f64| metrics.runtime_s.as_ref().map(|time| 1e3 * number(time));
-    vec![
-        MetricRow::new(
-            "runtime p50 [ms]: time per counted frame: half are faster",
-            runtime_ms(|time| time.median),
-        ),
-        MetricRow::new(
-            "runtime p95 [ms]: time per counted frame: 95 % are faster",
-            runtime_ms(|time| time.p95),
-        ),
-        MetricRow::new(
-            "runtime max [ms]: the slowest counted frame",
-            runtime_ms(|time| time.max),
-        ),
-        MetricRow::new(
-            "runtime of first frame [ms]: the first frame of the run, with the start in it",
-            metrics.first_runtime_s.map(|time_s| 1e3 * time_s),
-        ),
-        MetricRow::new("evaluated frames: frames that count", metrics.frames),
-        MetricRow::new(
-            "distance [m]: distance driven in them, by the truth",
-            metrics.distance_m,
-        ),
-    ]
+    metrics! {
+        "runtime p50" ["ms"] runtime_ms(|time| time.median), "time per counted frame: half are faster";
+        "runtime p95" ["ms"] runtime_ms(|time| time.p95), "time per counted frame: 95 % are faster";
+        "runtime max" ["ms"] runtime_ms(|time| time.max), "the slowest counted frame";
+        "runtime of first frame" ["ms"] metrics.first_runtime_s.map(|time_s| 1e3 * time_s), "the first frame of the run, with the start in it";
+        "evaluated frames" [""] metrics.frames, "frames that count";
+        "distance" ["m"] metrics.distance_m, "distance driven in them, by the truth";
+    }
 }

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::localization_results::LocalizationResults;
-use super::rows::{MetricRow, length};
+use super::rows::{MetricRow, length, metrics};
 use crate::evaluation::Summary;
 use crate::geometry::Pose2;
 use crate::localization::State;
@@ -99,48 +99,20 @@ impl RunSummary {
 
     /// Rows of the report.
     pub fn rows(&self) -> Vec<MetricRow> {
-        let mut rows = vec![MetricRow::new(
-            "frames: number of localized frames",
-            self.frames,
-        )];
-        if let Some(tracking) = self.tracking {
-            rows.extend([
-                MetricRow::new("tracking: number of frames in which the filter was tracking", tracking),
-                MetricRow::new("first tracked frame: number of the first frame in which the filter was tracking", self.first_tracked),
-            ]);
+        let position = self.position_sigma_m.as_ref();
+        let heading = self.heading_sigma_rad.as_ref();
+        metrics! {
+            "frames" [""] self.frames, "number of localized frames";
+            "tracking" [""] self.tracking, "number of frames in which the filter was tracking";
+            "first tracked frame" [""] self.first_tracked, "number of the first frame in which the filter was tracking";
+            "ambiguous" [""] self.ambiguous.filter(|&count| count > 0), "number of frames in which the car may have been in several places";
+            "path" ["m"] self.path_m, "length of the found path";
+            "speed" ["m/s"] self.speed_m_per_s, "length of the path over its duration";
+            "position sigma median" ["m"] position.map(|it| it.median), "estimated standard deviation along its larger axis, tracked frames";
+            "position sigma p95" ["m"] position.map(|it| it.p95), "its 95th percentile";
+            "heading sigma median" ["deg"] heading.map(|it| it.median.to_degrees()), "estimated standard deviation, tracked frames";
+            "agreement median" [""] self.agreement.as_ref().map(|it| it.median), "share of the beams above the road that end on a surface of the map, tracked frames";
         }
-        if let Some(count @ 1..) = self.ambiguous {
-            rows.push(MetricRow::new(
-                "ambiguous: number of frames in which the car may have been in several places",
-                count,
-            ));
-        }
-        rows.push(MetricRow::new(
-            "path [m]: length of the found path",
-            self.path_m,
-        ));
-        if let Some(speed) = self.speed_m_per_s {
-            rows.push(MetricRow::new(
-                "speed [m/s]: length of the path over its duration",
-                speed,
-            ));
-        }
-        if let Some(sigma) = &self.position_sigma_m {
-            rows.extend([
-                MetricRow::new("position sigma median [m]: estimated standard deviation along its larger axis, tracked frames", sigma.median),
-                MetricRow::new("position sigma p95 [m]: its 95th percentile", sigma.p95),
-            ]);
-        }
-        if let Some(sigma) = &self.heading_sigma_rad {
-            rows.push(MetricRow::new(
-                "heading sigma median [deg]: estimated standard deviation, tracked frames",
-                sigma.median.to_degrees(),
-            ));
-        }
-        if let Some(agreement) = &self.agreement {
-            rows.push(MetricRow::new("agreement median: share of the beams above the road that end on a surface of the map, tracked frames", agreement.median));
-        }
-        rows
     }
 }
 
