@@ -2,9 +2,10 @@
 
 use std::fmt::Write as _;
 
+use super::formats::markdown;
 use super::record::RunRecord;
 use super::results::ComparisonResults;
-use crate::app::report::format::{Cell, Column, Table, markdown};
+use crate::app::report::format::{Cell, Column, Table};
 use crate::evaluation::trust::Trust;
 use crate::statistics::median;
 

@@ -6,12 +6,13 @@ use std::path::Path;
 use anyhow::{Result, ensure};
 use serde::Serialize;
 
+use super::formats::{csv, markdown, text};
 use super::layout::Layout;
 use super::plan::PlannedRun;
 use super::record::RunRecord;
 use super::results::ComparisonResults;
 use super::{cases, keys, page, tables};
-use crate::app::report::format::{Table, csv, markdown, text};
+use crate::app::report::format::Table;
 use crate::app::run::claims::Outputs;
 use crate::app::run::{Context, output, version};
 use crate::app::settings::ComparisonConfig;

@@ -56,6 +56,7 @@ mod record;
 // Evaluation of the records.
 mod cases;
 mod collect;
+mod formats;
 mod measures;
 mod page;
 mod pictures;

@@ -2,8 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::format::value_and_uncertainty;
-use super::{Cell, Table};
+use crate::app::report::format::{Cell, Table, value_and_uncertainty};
 
 /// Formats the table under a heading.
 pub fn table(table: &Table) -> String {
@@ -53,8 +52,8 @@ fn escape(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::example;
     use super::*;
+    use crate::app::report::format::tests::example;
 
     #[test]
     fn every_line_has_as_many_cells_and_every_column_its_definition() {
