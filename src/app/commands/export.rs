@@ -36,9 +36,10 @@ pub fn run(args: &ExportArgs, context: &Context) -> Result<Printed> {
         .input
         .extension()
         .is_some_and(|it| it.eq_ignore_ascii_case("npz"));
-    let tiles = match is_map {
-        true => export_map(args, context)?,
-        false => export_result(args, context)?,
+    let tiles = if is_map {
+        export_map(args, context)?
+    } else {
+        export_result(args, context)?
     };
     let mut written = Vec::new();
     for (mut claims, path) in claims {
@@ -142,12 +143,13 @@ fn write_log(path: &Path, run: &RunLog, context: &Context) -> Result<()> {
     output::write_file(path, |file| {
         write_mcap(run, file, || {
             task.advance(1);
-            match context.interrupt.requested() {
-                true => Err(Interrupted {
+            if context.interrupt.requested() {
+                Err(Interrupted {
                     kept: "nothing was written".to_owned(),
                 }
-                .into()),
-                false => Ok(()),
+                .into())
+            } else {
+                Ok(())
             }
         })
     })

@@ -74,9 +74,10 @@ fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
     let scans = spread_scans(&recording)?;
     let points = scans.iter().map(Scan::len).sum::<usize>() / scans.len();
     let sensor = Sensor::infer(&scans, &SensorConfig::default());
-    let duration = match recording.has_times {
-        true => format!("{:.1} s", last.time_s - first.time_s),
-        false => "unknown: there are no times, 10 scans per second are assumed".to_owned(),
+    let duration = if recording.has_times {
+        format!("{:.1} s", last.time_s - first.time_s)
+    } else {
+        "unknown: there are no times, 10 scans per second are assumed".to_owned()
     };
     let mut rows = vec![
         ("layout", recording.files.layout.name().to_owned()),
@@ -97,9 +98,10 @@ fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
         Err(error) => error.to_string(),
     };
     let has_poses = track.is_ok_and(|track| track.matched(frames, recording.has_times).is_ok());
-    let build_map = match has_poses {
-        true => "ready".to_owned(),
-        false => "ready; poses from the scans, or --poses FILE".to_owned(),
+    let build_map = if has_poses {
+        "ready".to_owned()
+    } else {
+        "ready; poses from the scans, or --poses FILE".to_owned()
     };
     rows.extend([
         ("poses", poses),

@@ -67,10 +67,12 @@ impl Printed {
     pub fn rows(rows: &[(&str, String)]) -> Self {
         const MAIN: usize = 12;
         let lines = |rows: &[(&str, String)]| -> String {
-            let line = |(name, value): &(&str, String)| match value.starts_with(char::is_alphabetic)
-            {
-                true => format!("{name:<24} {value}\n"),
-                false => format!("{name:<24} {value:>14}\n"),
+            let line = |(name, value): &(&str, String)| {
+                if value.starts_with(char::is_alphabetic) {
+                    format!("{name:<24} {value}\n")
+                } else {
+                    format!("{name:<24} {value:>14}\n")
+                }
             };
             rows.iter().map(line).collect()
         };

@@ -73,9 +73,10 @@ pub fn run(config: &EvaluationConfig, context: &Context) -> Result<Report> {
     about.extend(run_output::shortfall(&results));
     let results = selected(results, config)?;
     let is_trajectory = results.particles.is_empty();
-    let (report, results, mesh) = match is_trajectory {
-        true => of_trajectory(config, results, about)?,
-        false => in_map(config, results, about)?,
+    let (report, results, mesh) = if is_trajectory {
+        of_trajectory(config, results, about)?
+    } else {
+        in_map(config, results, about)?
     };
     if config.save_evaluation_results {
         claims.begin(&main)?;
@@ -103,9 +104,10 @@ fn in_map(
 ) -> Result<Evaluated> {
     let localized = localization_of(&config.result_file)?;
     let track = truth::read_track(config, localized.as_ref())?;
-    let map = match track.is_some() || config.plot_loc_traj {
-        true => localized.as_ref().map_or(Ok(None), map_of)?,
-        false => None,
+    let map = if track.is_some() || config.plot_loc_traj {
+        localized.as_ref().map_or(Ok(None), map_of)?
+    } else {
+        None
     };
     if let Some(mut track) = track {
         if let Some((_, Some(path))) = &map {
@@ -197,9 +199,10 @@ fn output_files(config: &EvaluationConfig) -> Result<RunFiles> {
 fn read(config: &EvaluationConfig) -> Result<LocalizationResults> {
     let path = &config.result_file;
     input::require_optional_file("result_calib_file", config.result_calib_file.as_deref())?;
-    let mut results = match is_archive(path)? {
-        true => LocalizationResults::read(path)?,
-        false => trajectory::read(path, config.result_calib_file.as_deref())?,
+    let mut results = if is_archive(path)? {
+        LocalizationResults::read(path)?
+    } else {
+        trajectory::read(path, config.result_calib_file.as_deref())?
     };
     scale(&mut results, config.grid_resolution);
     Ok(results)
@@ -255,9 +258,10 @@ fn about(config: &EvaluationConfig) -> Result<BTreeMap<String, String>> {
 /// The configuration of the localization beside a result, if there is one.
 fn localization_of(result: &Path) -> Result<Option<LocalizationConfig>> {
     let effective = RunFiles::beside(result).file("effective_localization.yml");
-    match effective.exists() {
-        true => Ok(Some(settings::load(Some(&effective), &[])?)),
-        false => Ok(None),
+    if effective.exists() {
+        Ok(Some(settings::load(Some(&effective), &[])?))
+    } else {
+        Ok(None)
     }
 }
 
@@ -314,8 +318,9 @@ fn selected(
         "no frame of {} is selected; check start_idx, n_scans and frame_step",
         config.result_file.display()
     );
-    Ok(match rows.len() == results.len() {
-        true => results,
-        false => results.select(&rows),
+    Ok(if rows.len() == results.len() {
+        results
+    } else {
+        results.select(&rows)
     })
 }

@@ -30,9 +30,10 @@ pub fn read(path: &Path, calib_file: Option<&Path>) -> Result<LocalizationResult
 pub fn in_world(track: &PoseTrack) -> Vec<Pose3> {
     let camera_from_lidar = track.calibration.cam0_from_lidar;
     let is_camera = (camera_from_lidar * Vector3::x()).z > 0.7;
-    let world_from_map = match is_camera {
-        true => camera_from_lidar.inverse() * track.world_from_map,
-        false => track.world_from_map,
+    let world_from_map = if is_camera {
+        camera_from_lidar.inverse() * track.world_from_map
+    } else {
+        track.world_from_map
     };
     aligned(&world_from_map, &track.map_from_lidar)
 }

@@ -166,9 +166,10 @@ impl Model {
 fn linear(color: Rgb) -> [u8; 4] {
     let channel = |value: u8| {
         let share = f64::from(value) / 255.0;
-        let linear = match share <= 0.04045 {
-            true => share / 12.92,
-            false => ((share + 0.055) / 1.055).powf(2.4),
+        let linear = if share <= 0.04045 {
+            share / 12.92
+        } else {
+            ((share + 0.055) / 1.055).powf(2.4)
         };
         (255.0 * linear).round() as u8
     };

@@ -222,9 +222,10 @@ impl Trajectories {
                 stamp,
                 &Log {
                     timestamp: timestamp(stamp),
-                    level: match now == State::Tracking.word() {
-                        true => log::Level::Info,
-                        false => log::Level::Warning,
+                    level: if now == State::Tracking.word() {
+                        log::Level::Info
+                    } else {
+                        log::Level::Warning
                     }
                     .into(),
                     message: format!("frame {}: {now}", results.frames[row]),

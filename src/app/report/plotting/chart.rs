@@ -132,9 +132,10 @@ impl LineChart {
         };
         let (y, cut_off) = panel.y_range();
         let view = View { rect, x, y };
-        let x_ticks = match self.is_x_whole && panel.own_x_name.is_none() {
-            true => view.whole_x_ticks(),
-            false => view.x_ticks(),
+        let x_ticks = if self.is_x_whole && panel.own_x_name.is_none() {
+            view.whole_x_ticks()
+        } else {
+            view.x_ticks()
         };
         view.grid(sheet, &x_ticks)?;
         self.draw_marks(sheet, &view)?;

@@ -12,7 +12,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 use super::color::{Colormap, MCL, MISSING, REFINED, Rgb, TRUTH};
 use super::*;
 use crate::evaluation::{RangeMclRules, planar_errors};
-use crate::geometry::{Pose2, Pose3, TriangleMesh, Vec3, pose2_from_pose3, pose3_from_pose2};
+use crate::geometry::{Pose2, Pose3, TriangleMesh, Vec3, pose2_from_pose3};
 use crate::lidar::{LidarModel, RangeImage};
 
 /// Folder of the pictures: the one requested, or a temporary one.

@@ -1,6 +1,5 @@
 //! Pictures of a run.
 
-use std::cmp::Reverse;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -13,10 +12,10 @@ use crate::app::report::plotting::{
     Animation, FRAME, InteractivePath, LineChart, LocalizationPicture, MapImage, MapPlot, Mark,
     Panel, ParticlePanels, PathPlot, SURFACES, Series, drift_chart, error_chart, muted,
 };
-use crate::app::report::results::{LocalizationResults, length};
+use crate::app::report::results::LocalizationResults;
+use crate::evaluation::planar_errors;
 use crate::evaluation::trust::Axes;
-use crate::evaluation::{ParticleRow, planar_errors};
-use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
+use crate::geometry::{Pose2, TriangleMesh, pose2_from_pose3};
 use crate::localization::{Estimate, State};
 use crate::map::Map;
 
@@ -306,11 +305,7 @@ fn draw_particles(
 ) -> Result<()> {
     let pose = |poses: &Option<Vec<Pose2>>, row: usize| poses.as_ref()?.get(row).copied();
     let moments = moments(results);
-    let titles = moments.iter().map(|&row| {
-        let spread_m = spread_m(results.particles.frame(row)).unwrap_or(0.0);
-        let spread = length(spread_m);
-        format!("Frame {}: spread {spread}", results.frames[row])
-    });
+    let titles = (moments.iter()).map(|&row| format!("Frame {}", results.frames[row]));
     let titles: Vec<String> = titles.collect();
     let frames = moments
         .iter()
@@ -334,52 +329,16 @@ fn draw_particles(
     .save(&files.plot("particles.png")?)
 }
 
-/// Rows of the first frame, of those in which the spread has shrunk to a third and the filter tracks,
-/// and of the last; and if they are too few, of frames between them.
+/// Rows of the first frame, of the last, and of two between them at even ratios: a search is over early.
 fn moments(results: &LocalizationResults) -> Vec<usize> {
-    let spreads_m: Vec<(usize, f64)> = (0..results.particles.len())
-        .filter_map(|row| Some((row, spread_m(results.particles.frame(row))?)))
+    let frames = results.particles.len() as f64;
+    let rows = (0..=MOMENTS - 1).map(|k| frames.powf(k as f64 / (MOMENTS - 1) as f64) as usize);
+    let mut rows: Vec<usize> = rows
+        .filter(|row| (1..=results.particles.len()).contains(row))
+        .map(|row| row - 1)
         .collect();
-    let (Some(&(first, widest_m)), Some(&(last, _))) = (spreads_m.first(), spreads_m.last()) else {
-        return Vec::new();
-    };
-    let shrunk = spreads_m
-        .iter()
-        .find(|(_, spread_m)| 3.0 * spread_m <= widest_m);
-    let states = results.states.as_deref().unwrap_or_default();
-    let tracks = states
-        .iter()
-        .position(|&state| state == State::Tracking as u8);
-    let found = [Some(first), shrunk.map(|(row, _)| *row), tracks, Some(last)];
-    let mut rows: Vec<usize> = found.into_iter().flatten().collect();
-    rows.sort_unstable();
     rows.dedup();
-    while rows.len() < MOMENTS {
-        let gaps = rows
-            .windows(2)
-            .map(|pair| (pair[1] - pair[0], Reverse(pair[0])));
-        let Some((gap, Reverse(before))) = gaps.max().filter(|(gap, _)| *gap > 1) else {
-            break;
-        };
-        rows.push(before + gap / 2);
-        rows.sort_unstable();
-    }
     rows
-}
-
-/// Standard deviation of the positions of particles [m]; `None` if they have no weight.
-fn spread_m(particles: &[ParticleRow]) -> Option<f64> {
-    let weighted = |value: fn(&[f64; 4]) -> f64| -> f64 {
-        let rows = particles.iter().map(|row| row.map(f64::from));
-        rows.map(|row| row[3] * value(&row)).sum()
-    };
-    let sum = weighted(|_| 1.0);
-    let variance = |value: fn(&[f64; 4]) -> f64, square: fn(&[f64; 4]) -> f64| {
-        weighted(square) / sum - (weighted(value) / sum).powi(2)
-    };
-    let x = variance(|row| row[0], |row| row[0] * row[0]);
-    let y = variance(|row| row[1], |row| row[1] * row[1]);
-    (sum > 0.0).then(|| (x + y).max(0.0).sqrt())
 }
 
 /// A picture per frame, and an animation of them.
@@ -443,44 +402,28 @@ mod tests {
     use super::*;
     use crate::app::report::results::ParticleLog;
 
-    /// Two particles at a distance in each frame.
-    fn results(distances_m: &[f32], states: &[State]) -> LocalizationResults {
+    /// Two particles in each frame.
+    fn results(frames: usize) -> LocalizationResults {
         let mut particles = ParticleLog::new(2);
-        for &distance_m in distances_m {
-            particles.push_frame([[5.0, 0.0, 0.0, 0.5], [5.0 + distance_m, 0.0, 0.0, 0.5]]);
-        }
+        (0..frames).for_each(|_| particles.push_frame([[5.0, 0.0, 0.0, 0.5]; 2]));
         LocalizationResults {
-            frames: (0..distances_m.len()).collect(),
+            frames: (0..frames).collect(),
             particles,
-            states: Some(states.iter().map(|&state| state as u8).collect()),
             ..LocalizationResults::default()
         }
     }
 
     #[test]
-    fn the_spread_is_the_standard_deviation_of_the_weighted_positions() {
-        let spread = spread_m(&[[1.0, 0.0, 0.0, 0.3], [1.0, 8.0, 0.0, 0.3]]);
-        assert!((spread.unwrap() - 4.0).abs() < 1e-6);
-        assert_eq!(spread_m(&[[0.0; 4]; 3]), None);
-    }
-
-    #[test]
-    fn the_moments_are_the_start_the_convergence_and_the_end() {
-        let mut distances_m = vec![30.0, 20.0, 9.0, 3.0, 0.5];
-        distances_m.resize(40, 0.2);
-        let mut states = vec![State::Searching; 7];
-        states.resize(40, State::Tracking);
-        assert_eq!(moments(&results(&distances_m, &states)), [0, 2, 7, 39]);
-        // Tracking from the start: frames between the first and the last.
-        let tracking = [State::Tracking; 9];
-        assert_eq!(moments(&results(&[1.0; 9], &tracking)), [0, 2, 4, 8]);
-        assert_eq!(moments(&results(&[1.0; 2], &tracking[..2])), [0, 1]);
-        assert!(moments(&results(&[], &[])).is_empty());
+    fn the_moments_are_the_start_two_early_frames_and_the_end() {
+        assert_eq!(moments(&results(1000)), [0, 8, 98, 999]);
+        assert_eq!(moments(&results(40)), [0, 2, 10, 39]);
+        assert_eq!(moments(&results(2)), [0, 1]);
+        assert!(moments(&results(0)).is_empty());
     }
 
     #[test]
     fn time_starts_at_zero_and_without_times_frames_are_counted() {
-        let mut results = results(&[1.0; 3], &[]);
+        let mut results = results(3);
         assert_eq!(time_axis(&results), (FRAME, vec![0.0, 1.0, 2.0]));
         results.times_s = Some(vec![1e9, 1e9 + 0.5, 1e9 + 1.0]);
         assert_eq!(time_axis(&results).1, [0.0, 0.5, 1.0]);
