@@ -88,7 +88,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
     input::require_file("map_file", &config.map_file)?;
     config.recording_inputs().require()?;
-    let files = RunFiles::beside(&config.output());
+    let files = RunFiles::new(&config.output());
     let (mut claims, main) = prepare(config, context, &files)?;
     let is_trajectory = config.is_trajectory();
     let mut results = match is_trajectory {
@@ -155,7 +155,7 @@ pub fn base_config(result: Option<&Path>) -> RefinementConfig {
     let Some(result) = result else {
         return RefinementConfig::default();
     };
-    let path = RunFiles::beside(result).file("effective_localization.yml");
+    let path = RunFiles::new(result).file("effective_localization.yml");
     let found = settings::load::<LocalizationConfig>(Some(&path), &[]);
     found.map_or_else(
         |_missing| RefinementConfig::default(),

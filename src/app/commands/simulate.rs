@@ -133,8 +133,8 @@ fn prepare(config: &SimulationConfig) -> Result<Simulation> {
 }
 
 fn recorded_path(pose_file: &Path, calib_file: Option<&Path>) -> Result<Vec<Pose3>> {
-    let beside = pose_file.with_file_name("calib.txt");
-    let calibration = Calibration::read(calib_file.unwrap_or(&beside))
+    let neighbour = pose_file.with_file_name("calib.txt");
+    let calibration = Calibration::read(calib_file.unwrap_or(&neighbour))
         .context("path_pose_file needs its calibration; name it with path_calib_file")?;
     Ok(CameraPoses::read(pose_file)?.map_from_lidar(&calibration))
 }

@@ -119,7 +119,7 @@ impl<'a> Executor<'a> {
         };
         if let Some(report) = &stages.report {
             RunPage {
-                files: &RunFiles::beside(&folder.join(RESULT_FILE)),
+                files: &RunFiles::new(&folder.join(RESULT_FILE)),
                 title: &format!("Run {}", run.id),
                 report,
                 stage_seconds: &record.stage_seconds,

@@ -6,7 +6,7 @@
 //! run          = H(localization, refinement settings, odometry)
 //! ```
 //!
-//! Scans are those that are selected, with the poses beside them, or a whole bag. H is BLAKE3. Settings are the effective configuration without paths, so that a copied or renamed
+//! Scans are those that are selected, with the poses next to them, or a whole bag. H is BLAKE3. Settings are the effective configuration without paths, so that a copied or renamed
 //! folder keeps its results. A simulated drive is represented by its configuration instead of its
 //! files, which need not exist yet; drives of another executable are simulated again before use
 //! ([`Existing::Renew`](crate::app::commands::simulate::Existing::Renew)).
@@ -88,9 +88,9 @@ impl KeyCache {
             Input::Simulated(drive, _) => {
                 let mut parts = vec![input.name()?];
                 if let Some(poses) = &drive.path_pose_file {
-                    let beside = poses.with_file_name("calib.txt");
+                    let neighbour = poses.with_file_name("calib.txt");
                     parts.push(self.file(poses)?);
-                    parts.push(self.file(drive.path_calib_file.as_ref().unwrap_or(&beside))?);
+                    parts.push(self.file(drive.path_calib_file.as_ref().unwrap_or(&neighbour))?);
                 }
                 Ok(hash_of_texts(&parts))
             }
@@ -116,7 +116,7 @@ impl KeyCache {
         }
     }
 
-    /// Hash of a file and of the `times.txt` beside it, which is part of a file of poses.
+    /// Hash of a file and of the `times.txt` next to it, which is part of a file of poses.
     fn file(&mut self, path: &Path) -> Result<String> {
         self.once(format!("{path:?}"), || {
             let times = path.with_file_name("times.txt");

@@ -24,7 +24,7 @@ use crate::recording::poses::{write_kitti, write_tum};
 
 pub use pictures::{MOST_TRIANGLES, Movie, draw_run, map_around, time_axis};
 
-/// Content of the interactive path, beside the pictures.
+/// Content of the interactive path, next to the pictures.
 pub const INTERACTIVE: &str = "path.json";
 
 /// Paths of the output files of a run, all in the folder of its result.
@@ -36,8 +36,8 @@ pub struct RunFiles {
 }
 
 impl RunFiles {
-    /// The files beside a result.
-    pub fn beside(result: &Path) -> Self {
+    /// The files in the folder of a result.
+    pub fn new(result: &Path) -> Self {
         Self {
             result: result.to_owned(),
             folder: folder_of(result).to_owned(),
@@ -57,7 +57,7 @@ impl RunFiles {
         }
     }
 
-    /// The path of a file beside the result.
+    /// The path of a file next to the result.
     pub fn file(&self, name: &str) -> PathBuf {
         self.folder.join(name)
     }
@@ -77,7 +77,7 @@ impl RunFiles {
 /// Report files of a result.
 pub const REPORT_FILES: [&str; 4] = ["report.json", "report.md", "report.html", "frames.csv"];
 
-/// Further files that localization writes beside its result.
+/// Further files that localization writes next to its result.
 pub const LOCALIZATION_FILES: [&str; 4] = [
     "mcl_tum.txt",
     "mcl_kitti.txt",

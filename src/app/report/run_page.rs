@@ -104,7 +104,7 @@ fn short_name(path: &str) -> String {
 }
 
 impl RunPage<'_> {
-    /// Writes `report.html` beside the result.
+    /// Writes `report.html` next to the result.
     pub fn write(&self) -> Result<()> {
         output::write_text(&self.files.file("report.html"), &self.page()?.to_html())
     }

@@ -1,4 +1,4 @@
-//! What every command gets beside its configuration.
+//! What every command gets in addition to its configuration.
 
 use std::path::{Path, PathBuf};
 

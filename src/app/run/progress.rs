@@ -111,7 +111,7 @@ impl Task {
         (share * self.bar.length().unwrap_or(0) as f64).round() as u64
     }
 
-    /// Shows a short text beside the bar, such as the current error.
+    /// Shows a short text next to the bar, such as the current error.
     pub fn note(&self, text: &str) {
         self.bar.set_message(text.to_owned());
     }

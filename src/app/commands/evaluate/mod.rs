@@ -181,12 +181,12 @@ fn is_archive(path: &Path) -> Result<bool> {
     Ok(is_named || start == NPZ)
 }
 
-/// The outputs: by default beside a result, and in a folder of its own beside a trajectory.
+/// The outputs: by default next to a result, and in a folder of its own next to a trajectory.
 fn output_files(config: &EvaluationConfig) -> Result<RunFiles> {
     let result = &config.result_file;
     Ok(match &config.output_folder {
         Some(folder) => RunFiles::in_folder(result, folder),
-        None if is_archive(result)? => RunFiles::beside(result),
+        None if is_archive(result)? => RunFiles::new(result),
         None => {
             let stem = result.file_stem().unwrap_or_default().to_string_lossy();
             let folder = folder_of(result).join(format!("{stem}_evaluation"));
@@ -241,7 +241,7 @@ fn prepare(config: &EvaluationConfig, context: &Context, main: &Path) -> Result<
 
 /// The inputs and settings of the run from its report, and the evaluated files.
 fn about(config: &EvaluationConfig) -> Result<BTreeMap<String, String>> {
-    let report = RunFiles::beside(&config.result_file).file("report.json");
+    let report = RunFiles::new(&config.result_file).file("report.json");
     let mut about = if is_archive(&config.result_file)? && report.exists() {
         Report::read_json(&report)?.about
     } else {
@@ -255,9 +255,9 @@ fn about(config: &EvaluationConfig) -> Result<BTreeMap<String, String>> {
     Ok(about)
 }
 
-/// The configuration of the localization beside a result, if there is one.
+/// The configuration of the localization next to a result, if there is one.
 fn localization_of(result: &Path) -> Result<Option<LocalizationConfig>> {
-    let effective = RunFiles::beside(result).file("effective_localization.yml");
+    let effective = RunFiles::new(result).file("effective_localization.yml");
     if effective.exists() {
         Ok(Some(settings::load(Some(&effective), &[])?))
     } else {

@@ -87,14 +87,14 @@ fn has_extension(path: &Path, extension: &str) -> bool {
 }
 
 /// The existing label file of a scan: of the same name in `label_folder`, by default in `labels`
-/// beside the folder of the scans. That of nuScenes' `000000.pcd.bin` is `000000.label`.
+/// next to the folder of the scans. That of nuScenes' `000000.pcd.bin` is `000000.label`.
 fn label_path(scan_path: &Path, name: &Path, label_folder: Option<&Path>) -> Option<PathBuf> {
     let depth = name.components().count();
-    let beside = |depth| Some(scan_path.ancestors().nth(depth + 1)?.join("labels"));
+    let above = |depth| Some(scan_path.ancestors().nth(depth + 1)?.join("labels"));
     let stem = name.file_stem()?;
     let candidates = match label_folder {
         Some(folder) => [folder.join(name), folder.join(stem)],
-        None => [beside(depth)?.join(name), beside(1)?.join(stem)],
+        None => [above(depth)?.join(name), above(1)?.join(stem)],
     };
     candidates
         .map(|path| path.with_extension("label"))
@@ -163,7 +163,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn labels_are_found_beside_the_folder_of_the_scans_with_one_or_two_extensions() {
+    fn labels_are_found_next_to_the_folder_of_the_scans_with_one_or_two_extensions() {
         let folder = tempfile::tempdir().unwrap();
         let labels = folder.path().join("labels");
         std::fs::create_dir(&labels).unwrap();

@@ -42,7 +42,7 @@ const ODOMETRY_STREAM: u64 = 1;
 pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     input::require_file("map_file", &config.map_file)?;
     config.recording_inputs().require()?;
-    let files = RunFiles::beside(&config.result_path);
+    let files = RunFiles::new(&config.result_path);
     context.interrupt.keeps("no frame was finished");
     let claims = prepare(config, context, &files)?;
     let map = config.map_inputs().load(config.map_options(), context)?;

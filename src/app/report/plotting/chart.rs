@@ -66,7 +66,7 @@ pub struct LineChart {
     pub is_x_whole: bool,
     /// Panels from the top.
     pub panels: Vec<Panel>,
-    /// Number of panels beside each other, at least one.
+    /// Number of panels next to each other, at least one.
     pub columns: usize,
     /// Vertical lines: x and label.
     pub marks: Vec<(f64, String)>,

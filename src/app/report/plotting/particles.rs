@@ -166,7 +166,7 @@ impl LocalizationPicture<'_> {
     }
 }
 
-/// Frames beside and below each other, two in a row.
+/// Frames next to and below each other, two in a row.
 #[derive(Clone, Copy, Debug)]
 pub struct ParticlePanels<'a> {
     /// Title.

@@ -316,7 +316,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_beside_the_clip_is_not_drawn() {
+    fn a_line_outside_the_clip_is_not_drawn() {
         assert_eq!(clipped((0.0, 0.0), (5.0, 100.0), &SQUARE), None);
         assert_eq!(clipped((0.0, 15.0), (15.0, 0.0), &SQUARE), None);
         assert!(clipped((0.0, 25.0), (25.0, 0.0), &SQUARE).is_some());

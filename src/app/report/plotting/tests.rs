@@ -296,7 +296,7 @@ fn particles_are_drawn_on_the_map_spread_and_concentrated() {
 }
 
 #[test]
-fn particles_of_several_frames_are_drawn_beside_each_other() {
+fn particles_of_several_frames_are_drawn_next_to_each_other() {
     let gallery = Gallery::open();
     let truth = street(300);
     let map = MapImage::of_colors(&town(&truth), 2500);

@@ -103,11 +103,11 @@ impl View {
             sheet.line((column, bottom), (column, bottom + 5.0), line)?;
             sheet.text(&text, (column, bottom + 9.0), &below)?;
         }
-        let beside = text_style(TICK, HPos::Right, VPos::Center);
+        let style = text_style(TICK, HPos::Right, VPos::Center);
         for (y, text) in self.y_ticks().labelled() {
             let (_, row) = self.at(self.x.min, y);
             sheet.line((left - 5.0, row), (left, row), line)?;
-            sheet.text(&text, (left - 9.0, row), &beside)?;
+            sheet.text(&text, (left - 9.0, row), &style)?;
         }
         let style = text_style(LABEL, HPos::Center, VPos::Center);
         let center = (0.5 * (left + rect.right), bottom + 46.0);
@@ -157,8 +157,8 @@ impl View {
         for end in [left, right] {
             sheet.line((end, row - 6.0), (end, row + 6.0), stroke(INK, 2.0))?;
         }
-        let beside = text_style(TICK, HPos::Right, VPos::Center);
-        sheet.text(&in_metres(length), (left - 10.0, row), &beside)
+        let style = text_style(TICK, HPos::Right, VPos::Center);
+        sheet.text(&in_metres(length), (left - 10.0, row), &style)
     }
 }
 
@@ -313,13 +313,13 @@ impl ColorBar<'_> {
         self.colormap.at(share)
     }
 
-    /// Draws the bar between two columns at the height of `beside`, with its numbers and its name
+    /// Draws the bar between two columns at the height of `neighbour`, with its numbers and its name
     /// to the right.
-    pub fn draw(&self, sheet: &Sheet, beside: &Rect, [left, right]: [f64; 2]) -> Result<()> {
+    pub fn draw(&self, sheet: &Sheet, neighbour: &Rect, [left, right]: [f64; 2]) -> Result<()> {
         let rect = Rect {
             left,
             right,
-            ..*beside
+            ..*neighbour
         };
         sheet.pixels(&rect, |_, y| Some(self.colormap.at(1.0 - y)))?;
         let line = stroke(FRAME, 1.0);

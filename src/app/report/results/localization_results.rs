@@ -20,7 +20,7 @@
 //! | `selected_frames` | () | int64 | number of frames to localize; only where not all were |
 //!
 //! All but the first three are optional, and so are `particles` where there are `frames`: a trajectory without a map.
-//! In rows before `start_idx` they are NaN.
+//! They are NaN in rows before `start_idx`.
 
 use std::ops::RangeInclusive;
 

@@ -315,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn columns_are_aligned_and_units_stand_beside_the_numbers() {
+    fn columns_are_aligned_and_units_stand_next_to_the_numbers() {
         let text = report().to_text(true);
         let line = |name: &str| text.lines().find(|line| line.starts_with(name)).unwrap();
         let words: Vec<&str> = line("position RMSE").split_whitespace().collect();

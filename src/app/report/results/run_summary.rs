@@ -68,7 +68,7 @@ impl RunSummary {
         }
     }
 
-    /// Where and how long the run was tracking, and how sure it is of itself, in a sentence.
+    /// Place and duration of the tracking, and how sure it is of itself, in a sentence.
     pub fn verdict(&self) -> String {
         let sure = match (&self.position_sigma_m, &self.agreement) {
             (Some(sigma), Some(agreement)) => format!(

@@ -69,7 +69,7 @@ pub fn map_around<'a>(
     map: &Map,
     poses: impl IntoIterator<Item = &'a Pose2>,
 ) -> Result<Arc<TriangleMesh>> {
-    /// What is shown beside the poses [m].
+    /// What is shown around the poses [m].
     const RADIUS_M: f64 = 100.0;
     let most_triangles = MOST_TRIANGLES as u64;
     if map.triangle_count() <= most_triangles {
