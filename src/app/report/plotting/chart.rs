@@ -72,7 +72,22 @@ pub struct LineChart {
     pub marks: Vec<(f64, String)>,
 }
 
+/// Name of an x axis of frame numbers, which are whole.
+pub const FRAME: &str = "frame";
+
 impl LineChart {
+    /// Panels one above the other, without those that show nothing.
+    pub fn new(title: &str, x_name: &str, panels: impl IntoIterator<Item = Panel>) -> Self {
+        let has_points = |panel: &Panel| panel.series.iter().any(|it| !it.points.is_empty());
+        Self {
+            title: title.to_owned(),
+            x_name: x_name.to_owned(),
+            is_x_whole: x_name == FRAME,
+            panels: panels.into_iter().filter(has_points).collect(),
+            ..Self::default()
+        }
+    }
+
     /// Writes the picture.
     pub fn save(&self, path: &Path) -> Result<()> {
         save_png(path, self.draw())
@@ -174,6 +189,16 @@ fn x_range<'a>(panels: impl IntoIterator<Item = &'a Panel>) -> Option<AxisRange>
 }
 
 impl Panel {
+    /// A panel over the common x axis, whose rare high values are cut off.
+    pub fn new(y_name: &str, series: impl IntoIterator<Item = Series>) -> Self {
+        Self {
+            y_name: y_name.to_owned(),
+            series: series.into_iter().collect(),
+            clip_outliers: true,
+            ..Self::default()
+        }
+    }
+
     /// Unit in the name of the y axis, empty without.
     fn unit(&self) -> &str {
         let in_brackets = self.y_name.split_once('[').map_or("", |(_, unit)| unit);

@@ -62,11 +62,6 @@ pub fn drift_chart(truth: &[Pose3], trajectories: &[(&str, Rgb, &[Pose3])]) -> L
     for panel in &mut panels[2..] {
         panel.own_x_name = Some("length of the segments [m]".to_owned());
     }
-    let has_points = |panel: &Panel| panel.series.iter().any(|series| !series.points.is_empty());
-    LineChart {
-        title: "Error against the distance driven, and over segments".to_owned(),
-        x_name: "distance [m]".to_owned(),
-        panels: panels.into_iter().filter(has_points).collect(),
-        ..LineChart::default()
-    }
+    let title = "Error against the distance driven, and over segments";
+    LineChart::new(title, "distance [m]", panels)
 }

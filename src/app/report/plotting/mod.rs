@@ -26,7 +26,7 @@ mod tests;
 
 pub use animation::Animation;
 pub use bitmap::Bitmap;
-pub use chart::{LineChart, Panel, Series};
+pub use chart::{FRAME, LineChart, Panel, Series};
 pub use drift::drift_chart;
 pub use ground_plot::GroundPlot;
 pub use interactive::InteractivePath;
@@ -34,5 +34,5 @@ pub use map_image::{MapImage, SURFACES, muted};
 pub use map_plot::{MapPlot, ScalarMapPlot};
 pub use particles::{LocalizationPicture, ParticlePanels};
 pub use range_images::RangeImageStrip;
-pub use trajectory::{FRAME, PathPlot, error_chart};
+pub use trajectory::{PathPlot, error_chart};
 pub use view::Mark;

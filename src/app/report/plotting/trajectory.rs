@@ -217,10 +217,7 @@ impl PathPlot<'_> {
     }
 }
 
-/// Name of an x axis of frame numbers, which are whole.
-pub const FRAME: &str = "frame";
-
-/// Name and color of a trajectory, and its errors over time or [`FRAME`] number.
+/// Name and color of a trajectory, and its errors over time or frame number.
 pub type NamedErrors<'a> = (&'a str, Rgb, Vec<(f64, PlanarError)>);
 
 /// Position and heading error of trajectories.
@@ -230,23 +227,13 @@ pub fn error_chart(title: &str, x_name: &str, trajectories: &[NamedErrors]) -> L
             let points = errors.iter().map(|(x, error)| (*x, value(error)));
             Series::line(name, *color, points)
         });
-        Panel {
-            y_name: y_name.to_owned(),
-            series: series.collect(),
-            clip_outliers: true,
-            ..Panel::default()
-        }
+        Panel::new(y_name, series)
     };
-    LineChart {
-        title: title.to_owned(),
-        x_name: x_name.to_owned(),
-        is_x_whole: x_name == FRAME,
-        panels: vec![
-            panel("position error [cm]", |error| 100.0 * error.distance_m()),
-            panel("heading error [deg]", |error| {
-                error.turn_rad.abs().to_degrees()
-            }),
-        ],
-        ..LineChart::default()
-    }
+    let panels = [
+        panel("position error [cm]", |error| 100.0 * error.distance_m()),
+        panel("heading error [deg]", |error| {
+            error.turn_rad.abs().to_degrees()
+        }),
+    ];
+    LineChart::new(title, x_name, panels)
 }

@@ -221,33 +221,15 @@ fn draw_states(
         )
     };
     let by_state = STATES.into_iter().map(in_state);
-    let panel = |y_name: &str, series: Vec<Series>| Panel {
-        y_name: y_name.to_owned(),
-        series,
-        clip_outliers: true,
-        ..Panel::default()
-    };
-    let sigma = Series::line(
-        "of the position, MCL",
-        MCL,
-        x.iter().copied().zip(sigmas_cm),
-    );
+    let sigmas_cm = x.iter().copied().zip(sigmas_cm);
+    let sigma = Series::line("of the position, MCL", MCL, sigmas_cm);
+    let by_state = by_state.filter(|it| !it.points.is_empty());
     let panels = [
-        panel("standard deviation [cm]", vec![sigma]),
-        panel(
-            "beams on the map [%]",
-            by_state.filter(|it| !it.points.is_empty()).collect(),
-        ),
+        Panel::new("standard deviation [cm]", [sigma]),
+        Panel::new("beams on the map [%]", by_state),
     ];
-    LineChart {
-        title: "States over time".to_owned(),
-        x_name: x_name.to_owned(),
-        panels: (panels.into_iter())
-            .filter(|panel| !panel.series.is_empty())
-            .collect(),
-        ..LineChart::default()
-    }
-    .save(&files.plot("states.png")?)
+    let chart = LineChart::new("States over time", x_name, panels);
+    chart.save(&files.plot("states.png")?)
 }
 
 /// Draws the errors in space against the distance driven.
@@ -282,19 +264,9 @@ fn draw_runtimes(files: &RunFiles, results: &LocalizationResults) -> Result<()> 
     if series.is_empty() {
         return Ok(());
     }
-    LineChart {
-        title: "Runtime per frame".to_owned(),
-        x_name: FRAME.to_owned(),
-        is_x_whole: true,
-        panels: vec![Panel {
-            y_name: "time per frame [ms]".to_owned(),
-            series,
-            clip_outliers: true,
-            ..Panel::default()
-        }],
-        ..LineChart::default()
-    }
-    .save(&files.plot("runtime.png")?)
+    let panel = Panel::new("time per frame [ms]", series);
+    let chart = LineChart::new("Runtime per frame", FRAME, [panel]);
+    chart.save(&files.plot("runtime.png")?)
 }
 
 /// Draws the particles at several moments, from the first on.
