@@ -11,7 +11,6 @@ mod error;
 mod pose_check;
 mod pose_report;
 mod poses;
-mod sensor;
 mod trajectory;
 
 use std::sync::Arc;
@@ -68,7 +67,9 @@ pub fn map_recording(
     let world = older.map(|map| map.path.world_from_map);
     let given = with_given_poses(recording.clone(), builder.config.poses, world.as_ref())?;
     check_path(&given, builder.config.max_step_m)?;
-    let (mut recording, sensor) = sensor::resolve(given, &mut builder.config)?;
+    let sensor = Sensor::infer_recording(&given, &builder.config.sensor)?;
+    builder.config.set_sensor(&sensor);
+    let mut recording = sensor.applied_to(given);
     let mut poses = None;
     if recording.track.is_some() && builder.config.check_poses {
         let report = PoseReport::new(&recording)?;

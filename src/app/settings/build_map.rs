@@ -15,7 +15,7 @@ use crate::map::build::scan_cloud::ScanConfig;
 use crate::map::build::visibility::VisibilityConfig;
 use crate::map::{LocalMapConfig, MapConfig, PoseSource};
 use crate::meshing::PoissonConfig;
-use crate::sensor::{MotionCompensation, RangeImageConfig};
+use crate::sensor::{MotionCompensation, RangeImageConfig, SensorConfig};
 use crate::validation::{InvalidValue, Validate, in_range, require};
 
 /// Configuration of `build-map`: the keys of range-mcl's `build_map.yml`, then new ones.
@@ -157,6 +157,12 @@ impl BuildMapConfig {
     /// The build of the map.
     pub fn map(&self) -> MapConfig {
         MapConfig {
+            sensor: SensorConfig {
+                range_image: self.range_image.clone(),
+                own_car_m: self.own_car_m,
+                sensor_height_m: None,
+                motion_compensation: self.motion_compensation,
+            },
             poses: self.poses,
             check_poses: self.check_poses,
             seed: self.seed,

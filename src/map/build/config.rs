@@ -7,6 +7,7 @@ use super::local_map::LocalMapConfig;
 use crate::ground::GroundConfig;
 use crate::map::tiles::grid::TileConfig;
 use crate::rendering::{Backend, RenderingMethod};
+use crate::sensor::{Sensor, SensorConfig};
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Where the poses of the scans come from.
@@ -29,6 +30,8 @@ pub enum PoseSource {
 /// Defaults: the values of range-mcl where it has them.
 #[derive(Clone, Debug, PartialEq, SmartDefault)]
 pub struct MapConfig {
+    /// What is known about the sensor of a recording; the rest is inferred from its scans, and set in `local_map.scan`.
+    pub sensor: SensorConfig,
     /// Where the poses of a recording come from.
     pub poses: PoseSource,
     /// Whether to compare given poses with the motion of some scans before anything is built.
@@ -54,12 +57,23 @@ pub struct MapConfig {
     pub local_map: LocalMapConfig,
 }
 
+impl MapConfig {
+    /// Sets the sensor of the scans.
+    pub fn set_sensor(&mut self, sensor: &Sensor) {
+        let scan = &mut self.local_map.scan;
+        scan.range_image = sensor.range_image.clone();
+        scan.has_rows = sensor.has_rows;
+        scan.own_car_m = sensor.own_car_m;
+    }
+}
+
 impl Validate for MapConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
         in_range("local_map_size", self.local_map_size, 1..=10_000)?;
         not_negative("overlap_m", self.overlap_m)?;
         positive("max_step_m", self.max_step_m)?;
+        self.sensor.validate()?;
         self.local_map.validate()
     }
 }
