@@ -1,14 +1,13 @@
-//! Localizes a recording in a map without an initial pose and without odometry:
+//! Localizes a recording in a map without an initial pose, odometry or a known sensor:
 //! `cargo run --release --example localize -- RECORDING MAP.ply TRAJECTORY.txt`.
 
 #![allow(clippy::print_stdout, reason = "examples print their result")]
 
 use std::path::PathBuf;
 
-use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
+use fpmcl::localization::{Tracker, TrackerConfig};
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::recording::{Recording, poses::write_tum};
-use fpmcl::sensor::{Sensor, SensorConfig};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<PathBuf> = std::env::args_os().skip(1).map(PathBuf::from).collect();
@@ -16,13 +15,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         return Err("usage: localize RECORDING MAP.ply TRAJECTORY.txt".into());
     };
     let map = Map::load(map_file, &MapOptions::default())?;
-    let recording = Recording::open(recording)?;
-    let sensor = Sensor::infer_recording(&recording, &SensorConfig::default())?;
-    let config = LocalizerConfig::default();
-    let mut localizer = Localizer::new(&map, &sensor, config, Start::Anywhere, 0)?;
+    let mut tracker = Tracker::new(&map, TrackerConfig::default())?;
     let mut trajectory = Vec::new();
-    for frame in &sensor.applied_to(recording).frames {
-        let estimate = localizer.step(&frame.read()?, Odometry::Unknown)?;
+    for frame in &Recording::open(recording)?.frames {
+        let estimate = tracker.step(&frame.read()?)?;
         let (t, deviations) = (estimate.pose.translation, estimate.standard_deviations());
         let state = estimate.state.word();
         println!(

@@ -8,13 +8,13 @@
 //! | [`odometry::TrajectoryBuilder`] | scans of a drive | their poses: odometry, loops, adjustment |
 //! | [`map::MapBuilder`] | deskewed scans with their poses | a [`map::Map`] |
 //! | [`map::Map`] | a PLY file | mesh, ground, tiles and renderer; [`save`](map::Map::save) writes it |
-//! | [`localization::Localizer`] | a map, then scan by scan | an [`Estimate`](localization::Estimate): pose, covariance, state |
+//! | [`localization::Tracker`] | a map, then scan by scan, of any sensor | an [`Estimate`](localization::Estimate): pose, covariance, state |
 //! | [`refinement::TrajectoryRefiner`] | a map, scans, estimates | a refined, smoothed trajectory |
 //!
 //! ```no_run
 //! use std::path::Path;
 //!
-//! use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
+//! use fpmcl::localization::{Tracker, TrackerConfig};
 //! use fpmcl::map::{Map, MapConfig, MapOptions};
 //! use fpmcl::mapping::build_map;
 //! use fpmcl::recording::Recording;
@@ -26,15 +26,15 @@
 //! map.save(Path::new("results/map.ply"))?;
 //!
 //! let map = Map::load(Path::new("results/map.ply"), &MapOptions::default())?;
-//! let seed = 0;
 //! let second_drive = Recording::open("data/street/drive_2")?;
 //! let sensor = Sensor::infer_recording(&second_drive, &SensorConfig::default())?;
-//! let config = LocalizerConfig::default();
-//! let mut localizer = Localizer::new(&map, &sensor, config, Start::Anywhere, seed)?;
-//! let mut refiner = TrajectoryRefiner::new(&map, &sensor, RefinerConfig::default(), seed)?;
-//! for frame in &second_drive.frames {
-//!     let scan = frame.read()?;
-//!     let estimate = localizer.step(&scan, Odometry::Unknown)?;
+//! let second_drive = sensor.applied_to(second_drive);
+//! let mut refiner = TrajectoryRefiner::new(&map, &sensor, RefinerConfig::default(), 0)?;
+//! // A robot gives its scans as they come, without `with_sensor`: the sensor is inferred from the first ones.
+//! let mut tracker = Tracker::new(&map, TrackerConfig::default())?.with_sensor(sensor);
+//! for scan in second_drive.scans() {
+//!     let scan = scan?;
+//!     let estimate = tracker.step(&scan)?;
 //!     println!("{} ± {:?}", estimate.pose, estimate.standard_deviations());
 //!     refiner.add(&scan, &InitialEstimate::from(&estimate))?;
 //! }

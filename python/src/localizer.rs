@@ -2,9 +2,9 @@
 
 use fpmcl::app::settings::{LocalizationConfig, OdometrySource};
 use fpmcl::geometry::Pose3;
-use fpmcl::localization::{self, LocalizerError, Odometry, Start};
-use fpmcl::odometry::{Odometer, OdometryConfig};
-use fpmcl::{lidar, sensor};
+use fpmcl::lidar;
+use fpmcl::localization::{self, Odometry, Start, Tracker, TrackerConfig, TrackerError};
+use fpmcl::odometry::OdometryConfig;
 use numpy::ndarray::Array2;
 use numpy::{IntoPyArray as _, PyArray1, PyArray2, PyUntypedArrayMethods as _};
 use pyo3::exceptions::PyValueError;
@@ -20,18 +20,12 @@ use crate::settings;
 /// Estimates the pose of a car in a map from its scans. The same seed gives the same estimates.
 ///
 /// ``start``: ``"anywhere"`` (the default in maps of up to 1 km²), ``"road"`` (anywhere along the mapping drive), or a pose nearby: (3,), x, y
-/// [m] and heading [rad], or (4, 4). ``sensor``: by default inferred from the first scan, which does not show the own car;
-/// better that of a Recording. Settings: ``fpmcl config localize --full``, such as ``seed``, ``numParticles``, and
+/// [m] and heading [rad], or (4, 4). ``sensor``: by default inferred from the first scan,
+/// own car and times of points from the first that show motion; better that of a Recording. Settings: ``fpmcl config localize --full``, such as ``seed``, ``numParticles``, and
 /// ``odometry="none"`` for constant velocity where no motion is given.
 #[pyclass(module = "fpmcl")]
 pub struct Localizer {
-    map: fpmcl::map::Map,
-    config: LocalizationConfig,
-    start: Start,
-    /// `None` until the sensor is known.
-    localizer: Option<localization::Localizer>,
-    /// Motion from the scans; `None` if it is given or not to be used.
-    odometer: Option<Odometer>,
+    tracker: Tracker,
 }
 
 #[pymethods]
@@ -45,21 +39,20 @@ impl Localizer {
         settings: Option<&Bound<'_, PyDict>>,
     ) -> PyResult<Self> {
         let config = settings::of_stage(LocalizationConfig::default(), settings)?;
-        let odometer = match config.odometry {
-            OdometrySource::None => None,
-            _ => Some(Odometer::new(OdometryConfig::default()).map_err(raised)?),
+        let tracker = TrackerConfig {
+            sensor: config.known_sensor(),
+            localizer: config.localizer(),
+            odometry: (config.odometry != OdometrySource::None).then(OdometryConfig::default),
+            seed: config.seed,
         };
-        let mut new = Self {
-            map: map.map.clone(),
-            start: start_of(start, &config, &map.map)?,
-            config,
-            localizer: None,
-            odometer,
-        };
-        if let Some(sensor) = sensor {
-            new.begin(&sensor).map_err(raised)?;
-        }
-        Ok(new)
+        let tracker = Tracker::new(&map.map, tracker).map_err(raised)?;
+        let tracker = tracker.with_start(start_of(start, &config, &map.map)?);
+        Ok(Self {
+            tracker: match sensor {
+                Some(sensor) => tracker.with_sensor(sensor.0),
+                None => tracker,
+            },
+        })
     }
 
     /// Estimates the pose of the next scan.
@@ -98,46 +91,22 @@ impl Localizer {
 }
 
 impl Localizer {
-    fn begin(&mut self, sensor: &Sensor) -> Result<(), LocalizerError> {
-        let config = &self.config;
-        let sensor = sensor.0.clone().with_known(&config.known_sensor());
-        let (start, seed) = (self.start.clone(), config.seed);
-        let localizer =
-            localization::Localizer::new(&self.map, &sensor, config.localizer(), start, seed)?;
-        self.localizer = Some(localizer);
-        Ok(())
-    }
-
     /// Localizes the next scan; returns also the motion that was used.
     fn advance(
         &mut self,
         scan: &lidar::Scan,
         given: Option<Given>,
-    ) -> anyhow::Result<(localization::Estimate, Option<Pose3>)> {
-        if self.localizer.is_none() {
-            let sensor = Sensor(sensor::Sensor::infer(
-                std::slice::from_ref(scan),
-                &self.config.known_sensor(),
-            ));
-            self.begin(&sensor)?;
-        }
-        let odometry = match (given, &mut self.odometer) {
-            (Some(given), odometer) => {
-                // It has not seen all scans from here on.
-                *odometer = None;
-                given.0
-            }
-            (None, Some(odometer)) => Odometry::Motion(odometer.step(scan)?.previous_from_current),
-            (None, None) => Odometry::Unknown,
+    ) -> Result<(localization::Estimate, Option<Pose3>), TrackerError> {
+        let odometry = match given {
+            Some(given) => given.0,
+            None => self.tracker.measure(scan)?,
         };
         let motion = match odometry {
             Odometry::Motion(motion) => Some(motion),
             Odometry::Increment(increment) => Some(arrays::in_space(&increment)),
             _ => None,
         };
-        let localizer = self.localizer.as_mut();
-        let localizer = localizer.ok_or_else(|| anyhow::anyhow!("the sensor is not known"))?;
-        Ok((localizer.step(scan, odometry)?, motion))
+        Ok((self.tracker.step_with_motion(scan, odometry)?, motion))
     }
 }
 

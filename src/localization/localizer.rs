@@ -126,6 +126,11 @@ impl Localizer {
         })
     }
 
+    /// Sets the rectangle of the own car, x_min, x_max, y_min, y_max [m], once the scans show it.
+    pub(super) fn set_own_car(&mut self, own_car_m: [f32; 4]) {
+        self.preparation.sensor.own_car_m = own_car_m;
+    }
+
     /// Estimates the pose of the next scan, given the motion since the previous one.
     pub fn step(&mut self, scan: &Scan, odometry: Odometry) -> Result<Estimate, LocalizerError> {
         if !odometry.is_possible() {

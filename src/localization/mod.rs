@@ -1,6 +1,6 @@
 //! Monte Carlo localization of a car in a mesh map.
 //!
-//! > [`Localizer`] turns scans into range images with the attitude of the sensor and feeds the
+//! > [`Tracker`] finds out what the sensor is, measures its motion, and passes both to a [`Localizer`], which turns scans into range images with the attitude of the sensor and feeds the
 //! > particle [`filter`]: [`initialization`] samples the first particles, [`motion`] moves them by the
 //! > [`odometry`], [`observation`] weights them, [`resampling`] keeps the likely ones, [`places`]
 //! > compares those that are far apart, [`convergence`]
@@ -35,6 +35,7 @@ pub mod tracking_loss;
 pub mod filter;
 pub mod localizer;
 mod second_drive;
+pub mod tracker;
 
 pub use config::LocalizerConfig;
 pub use estimate::Estimate;
@@ -45,4 +46,5 @@ pub use odometry::Odometry;
 pub use particles::{Particle, ParticleSet};
 pub(crate) use preparation::ScanPreparation;
 pub use second_drive::{SecondDrive, SecondDriveError};
+pub use tracker::{Tracker, TrackerConfig, TrackerError};
 pub use tracking_loss::{State, TrackingLossConfig};

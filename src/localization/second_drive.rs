@@ -5,18 +5,17 @@ use std::sync::Arc;
 use glam::DVec3;
 use nalgebra::Point2;
 
-use super::config::LocalizerConfig;
-use super::localizer::{Localizer, LocalizerError, Start};
 use super::odometry::Odometry;
+use super::tracker::{Tracker, TrackerError};
 use super::tracking_loss::State;
 use crate::geometry::Pose3;
 use crate::lidar::Scan;
+use crate::map::MapError;
 use crate::map::build::plan::origin_near;
-use crate::map::{Map, MapError};
 use crate::odometry::{
     OdometryError, PlacementError, Trajectory, TrajectoryBuilder, TrajectoryConfig,
 };
-use crate::sensor::Sensor;
+use crate::validation::InvalidValue;
 
 /// Why a second drive, or a scan of it, cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -25,7 +24,9 @@ pub enum SecondDriveError {
     #[error(transparent)]
     Odometry(#[from] OdometryError),
     #[error(transparent)]
-    Localizer(#[from] LocalizerError),
+    Tracker(#[from] TrackerError),
+    #[error(transparent)]
+    Invalid(#[from] InvalidValue),
     #[error(transparent)]
     Map(#[from] MapError),
     #[error(transparent)]
@@ -34,24 +35,16 @@ pub enum SecondDriveError {
 
 /// Finds the trajectory of a drive in a map, scan by scan; the drive may begin anywhere, and leave the map.
 pub struct SecondDrive {
-    map: Map,
-    localizer: Localizer,
+    tracker: Tracker,
     builder: TrajectoryBuilder,
     found: Vec<Option<Pose3>>,
 }
 
 impl SecondDrive {
-    /// A drive before its first scan.
-    pub fn new(
-        map: &Map,
-        sensor: &Sensor,
-        localizer: LocalizerConfig,
-        trajectory: TrajectoryConfig,
-        seed: u64,
-    ) -> Result<Self, LocalizerError> {
+    /// A drive before its first scan, with a tracker in the map.
+    pub fn new(tracker: Tracker, trajectory: TrajectoryConfig) -> Result<Self, InvalidValue> {
         Ok(Self {
-            map: map.clone(),
-            localizer: Localizer::new(map, sensor, localizer, Start::unknown(map), seed)?,
+            tracker,
             builder: TrajectoryBuilder::new(trajectory)?,
             found: vec![],
         })
@@ -61,7 +54,8 @@ impl SecondDrive {
     pub fn add(&mut self, scan: &Scan) -> Result<State, SecondDriveError> {
         self.found.push(None);
         let motion = self.builder.add(scan)?.previous_from_current;
-        let estimate = self.localizer.step(scan, Odometry::Motion(motion))?;
+        let odometry = Odometry::Motion(motion);
+        let estimate = self.tracker.step_with_motion(scan, odometry)?;
         let is_found = estimate.state == State::Tracking && estimate.on_mapped_ground;
         if let Some(last) = self.found.last_mut() {
             *last = is_found.then_some(estimate.map_from_lidar);
@@ -88,7 +82,7 @@ impl SecondDrive {
         let map_from_local = Pose3::translation(origin.x, origin.y, origin.z);
         let mesh = match positions.is_empty() {
             true => Arc::default(),
-            false => (self.map).mesh_near(&positions, RADIUS_M, origin, u64::MAX)?,
+            false => (self.tracker.map()).mesh_near(&positions, RADIUS_M, origin, u64::MAX)?,
         };
         let found: Vec<Option<Pose3>> = (self.found.iter())
             .map(|pose| pose.map(|pose| map_from_local.inverse() * pose))

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::error::MappingError;
 use super::poses::localizer;
 use crate::lidar::Scan;
-use crate::localization::{SecondDrive, SecondDriveError};
+use crate::localization::{SecondDrive, SecondDriveError, Tracker, TrackerConfig};
 use crate::map::{BuildEvent, Map, MapConfig};
 use crate::odometry::{
     ElevationBias, LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig,
@@ -52,7 +52,14 @@ pub fn find_poses_in(
 ) -> Result<Trajectory, MappingError> {
     let settings = TrajectoryConfig::default();
     let (sensor, localizer) = localizer(config);
-    let drive = SecondDrive::new(map, &sensor, localizer, settings, config.seed);
+    let tracker = TrackerConfig {
+        localizer,
+        odometry: None,
+        seed: config.seed,
+        ..TrackerConfig::default()
+    };
+    let tracker = Tracker::new(map, tracker).map_err(SecondDriveError::from)?;
+    let drive = SecondDrive::new(tracker.with_sensor(sensor), settings);
     let mut drive = drive.map_err(SecondDriveError::from)?;
     each_scan("localize", frames, on_event, |_, scan| {
         drive.add(scan)?;

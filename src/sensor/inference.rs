@@ -1,5 +1,7 @@
 //! The sensor of some scans, or of a recording: what is given, else what the scans show.
 
+use std::borrow::Cow;
+
 use super::beams::{self, BeamSource};
 use super::config::{MotionCompensation, RangeImageConfig, SensorConfig};
 use super::dropped::DroppedPoints;
@@ -159,6 +161,24 @@ impl Sensor {
         };
         let rotation = compensation.rotation(period_s(&recording));
         recording.rotating(rotation)
+    }
+
+    /// A scan whose points have times from the rotation of the sensor where the data have none; without motion
+    /// compensation, times of the data are ignored.
+    pub fn timed<'a>(&self, scan: &'a Scan) -> Cow<'a, Scan> {
+        let rotation = (self.motion_compensation)
+            .and_then(|it| it.rotation(self.period_s.unwrap_or(PERIOD_S)));
+        let mut timed = match (self.motion_compensation, rotation) {
+            (None, _) if !scan.times_s.is_empty() => scan.clone(),
+            (Some(_), Some(_)) if scan.times_s.is_empty() => scan.clone(),
+            _ => return Cow::Borrowed(scan),
+        };
+        timed.times_s.clear();
+        if let Some(rotation) = rotation {
+            timed.times_s = rotation.point_times(&timed.points);
+            timed.center_times();
+        }
+        Cow::Owned(timed)
     }
 
     /// Requires that the points of a scan are in the field of view.

@@ -33,7 +33,7 @@ pub use beam::BeamReturns;
 pub use beams::BeamSource;
 pub use config::{MotionCompensation, RangeImageConfig, SensorConfig};
 pub use dropped::{DropReason, DroppedPoints};
-pub use inference::{SensorError, spread_scans};
+pub use inference::{SensorError, TIMING_SCANS, spread_scans};
 pub use mounting::Mounting;
 
 use crate::lidar::{LidarModel, RotationDirection};

@@ -254,6 +254,14 @@ fn a_moving_sensor_sees_its_own_car_and_the_ground_below() {
 
     let standing: Vec<Scan> = (0..10).map(|_| sensor.scan(0.0, &mut rng)).collect();
     assert!(!infer(&standing).is_moving);
+
+    // As from the first scan on, one after the other.
+    let mut first = infer(&scans[..1]);
+    assert_eq!(first.own_car_m, ASSUMED_OWN_CAR_M);
+    let known = SensorConfig::default();
+    assert!(!first.complete(&standing, &known).unwrap());
+    assert!(first.complete(&scans, &known).unwrap());
+    assert_eq!(first.own_car_m, found.own_car_m);
 }
 
 #[test]

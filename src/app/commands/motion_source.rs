@@ -9,9 +9,7 @@ use rand::Rng;
 use super::stages::RecordingInputs;
 use crate::app::settings::OdometrySource;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
-use crate::lidar::Scan;
 use crate::localization::odometry::{are_in_space, demonstration_noise, motions, with_noise};
-use crate::odometry::{Odometer, OdometryConfig};
 use crate::recording::layout::Layout;
 use crate::recording::{Frame, PoseTrack, Recording};
 
@@ -19,8 +17,8 @@ use crate::recording::{Frame, PoseTrack, Recording};
 pub enum MotionSource {
     /// Known for all frames.
     Given(Vec<FrameMotion>),
-    /// From the scans themselves, also from those between the selected ones.
-    Scans(Box<ScanOdometry>),
+    /// From the scans themselves, also from those between the selected ones, which are listed until they are taken.
+    Scans(VecDeque<Frame>),
     /// Not known.
     Unknown,
 }
@@ -51,7 +49,7 @@ impl MotionSource {
                         tracing::info!(
                             "odometry from the scans, because the bag has none to use: {error}"
                         );
-                        Self::of_scans(recording)?
+                        Self::of_scans(recording)
                     }
                 }
             }
@@ -69,24 +67,19 @@ impl MotionSource {
                 });
                 Self::given(with_noise.collect(), &noisy)
             }
-            _ => Self::of_scans(recording)?,
+            _ => Self::of_scans(recording),
         };
         Ok((motion, file))
     }
 
-    fn of_scans(recording: &Recording) -> Result<Self> {
+    fn of_scans(recording: &Recording) -> Self {
         /// Larger steps are not bridged by the scans between.
         const MAX_STEP: usize = 10;
         let steps = recording.frames.windows(2);
         let largest = steps.map(|pair| pair[1].number - pair[0].number).max();
-        let skipped = match largest.is_some_and(|step| step <= MAX_STEP) {
-            true => recording.skipped.clone(),
-            false => Vec::new(),
-        };
-        Ok(Self::Scans(Box::new(ScanOdometry {
-            odometer: Odometer::new(OdometryConfig::default())?,
-            skipped: skipped.into(),
-        })))
+        let is_bridged = largest.is_some_and(|step| step <= MAX_STEP);
+        let skipped = is_bridged.then(|| recording.skipped.clone());
+        Self::Scans(skipped.unwrap_or_default().into())
     }
 
     fn of_track(track: &PoseTrack, recording: &Recording) -> Result<Self> {
@@ -114,18 +107,21 @@ impl MotionSource {
         )
     }
 
-    /// The motion into a frame by its row and scan; every scan has to be given, in order.
-    pub fn motion_to(
-        &mut self,
-        row: usize,
-        frame: &Frame,
-        scan: &Scan,
-    ) -> Result<Option<FrameMotion>> {
-        Ok(match self {
+    /// The known motion into the frame of a row.
+    pub fn given_to(&self, row: usize) -> Option<FrameMotion> {
+        match self {
             Self::Given(motions) => motions.get(row).copied(),
-            Self::Scans(odometry) => Some(odometry.motion_to(frame, scan)?),
-            Self::Unknown => None,
-        })
+            Self::Scans(_) | Self::Unknown => None,
+        }
+    }
+
+    /// Takes the frames before one that only the odometry of the scans needs, in order.
+    pub fn frames_before(&mut self, frame: &Frame) -> Vec<Frame> {
+        let Self::Scans(skipped) = self else {
+            return vec![];
+        };
+        let count = skipped.partition_point(|between| between.number < frame.number);
+        skipped.drain(..count).collect()
     }
 }
 
@@ -138,26 +134,13 @@ pub struct FrameMotion {
     pub in_space: Option<Pose3>,
 }
 
-/// Odometry of the scans.
-pub struct ScanOdometry {
-    odometer: Odometer,
-    /// The scans between the selected ones that were not registered yet.
-    skipped: VecDeque<Frame>,
-}
-
-impl ScanOdometry {
-    fn motion_to(&mut self, frame: &Frame, scan: &Scan) -> Result<FrameMotion> {
-        let mut motion = Pose3::identity();
-        while (self.skipped.front()).is_some_and(|between| between.number < frame.number) {
-            if let Some(between) = self.skipped.pop_front() {
-                motion *= self.odometer.step(&between.read()?)?.previous_from_current;
-            }
-        }
-        motion *= self.odometer.step(scan)?.previous_from_current;
-        Ok(FrameMotion {
+impl FrameMotion {
+    /// A motion that was measured in space.
+    pub fn from_motion(motion: Pose3) -> Self {
+        Self {
             increment: pose2_from_pose3(&motion),
             in_space: Some(motion),
-        })
+        }
     }
 }
 

@@ -21,10 +21,11 @@ use crate::app::settings::{self, LocalizationConfig, OdometrySource, RefinementC
 use crate::evaluation::RangeMclRules;
 use crate::files::remove_abandoned;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
-use crate::lidar::{Motion, Scan};
+use crate::lidar::Motion;
 use crate::localization::State;
 use crate::localization::odometry::demonstration_noise;
 use crate::map::{Map, MapOptions};
+use crate::odometry::{Odometer, OdometryConfig};
 use crate::random::stream;
 use crate::recording::layout::Layout;
 use crate::recording::{Calibration, Frame, Recording};
@@ -401,16 +402,18 @@ fn increments(
         sequence,
         &mut stream(config.seed, ODOMETRY_STREAM),
     )?;
-    let frames = sequence.frames.iter().enumerate();
+    let mut odometer = Odometer::new(OdometryConfig::default())?;
     let into_frame = |(row, frame): (usize, &Frame)| {
-        let scan = match &motion {
-            MotionSource::Scans(_) => frame.read()?,
-            _ => Scan::default(),
-        };
-        let found = motion.motion_to(row, frame, &scan)?;
-        Ok(found.map(|motion| motion.increment))
+        if !matches!(motion, MotionSource::Scans(_)) {
+            return Ok(motion.given_to(row).map(|motion| motion.increment));
+        }
+        let mut increment = Pose3::identity();
+        for scan in motion.frames_before(frame).iter().chain([frame]) {
+            increment *= odometer.step(&scan.read()?)?.previous_from_current;
+        }
+        Ok(Some(pose2_from_pose3(&increment)))
     };
-    frames.map(into_frame).collect()
+    sequence.frames.iter().enumerate().map(into_frame).collect()
 }
 
 /// The configuration of the refiner; the noise that the demonstration adds to the true odometry is

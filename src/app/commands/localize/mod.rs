@@ -28,8 +28,9 @@ use crate::app::settings::{Initialization, LocalizationConfig, MotionModel};
 use crate::evaluation::RangeMclRules;
 use crate::geometry::Pose2;
 use crate::localization::motion::VelocityCommand;
-use crate::localization::{Localizer, Odometry, Start, State};
+use crate::localization::{Odometry, Start, State, Tracker, TrackerConfig};
 use crate::map::Map;
+use crate::odometry::OdometryConfig;
 use crate::random::stream;
 use crate::recording::Recording;
 use crate::refinement::{InitialEstimate, TrajectoryRefiner};
@@ -128,7 +129,14 @@ fn localize<'a>(
 ) -> Result<()> {
     let start = start(config, map, sequence);
     let mut motion = motion.lock().unwrap_or_else(PoisonError::into_inner);
-    let mut localizer = Localizer::new(map, sensor, config.localizer(), start, config.seed)?;
+    let tracker = TrackerConfig {
+        sensor: config.known_sensor(),
+        localizer: config.localizer(),
+        odometry: matches!(*motion, MotionSource::Scans(_)).then(OdometryConfig::default),
+        seed: config.seed,
+    };
+    let tracker = Tracker::new(map, tracker)?.with_sensor(sensor.clone());
+    let mut tracker = tracker.with_start(start);
     let refiner = || TrajectoryRefiner::new(map, sensor, config.refiner(), config.seed);
     let mut refiner = config.refine.then(refiner).transpose()?;
     let task = context.progress.task("localize", sequence.frames.len());
@@ -139,10 +147,16 @@ fn localize<'a>(
         let mut process = || {
             let scan = frame.read()?;
             let started = Instant::now();
-            let known = motion.motion_to(row, frame, &scan)?;
+            for between in motion.frames_before(frame) {
+                tracker.pass(&between.read()?)?;
+            }
+            let known = match tracker.measure(&scan)? {
+                Odometry::Motion(motion) => Some(FrameMotion::from_motion(motion)),
+                _ => motion.given_to(row),
+            };
             let increment = known.map(|motion| motion.increment);
             let odometry = odometry_into(config.motion_model, known, sequence, row);
-            let estimate = localizer.step(&scan, odometry)?;
+            let estimate = tracker.step_with_motion(&scan, odometry)?;
             let runtime = started.elapsed();
             let refined = match &mut refiner {
                 Some(refiner) => Some(refiner.add(&scan, &InitialEstimate::from(&estimate))?),

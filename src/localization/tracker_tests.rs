@@ -1,0 +1,85 @@
+//! The tracker on scans of a street.
+
+use super::*;
+use crate::geometry::Pose2;
+use crate::localization::{StartSpread, State};
+use crate::map::test_world::TestWorld;
+
+fn config() -> TrackerConfig {
+    TrackerConfig {
+        localizer: LocalizerConfig::of_test(500),
+        ..TrackerConfig::default()
+    }
+}
+
+/// A drive along the street, 0.8 m per scan: poses and scans.
+fn drive(world: &TestWorld) -> Vec<(Pose2, Scan)> {
+    (0..12)
+        .map(|number| {
+            let pose = world.pose_at(10.0 + 0.8 * f64::from(number), 0.3, 0.02);
+            let scan = Scan {
+                points: world.scan(&pose).points,
+                time_s: Some(0.1 * f64::from(number)),
+                ..Scan::default()
+            };
+            (pose, scan)
+        })
+        .collect()
+}
+
+fn near(pose: &Pose2) -> Start {
+    Start::Pose {
+        map_from_lidar: *pose,
+        height_m: None,
+        spread: StartSpread::default(),
+    }
+}
+
+#[test]
+fn scans_of_an_unknown_sensor_are_tracked() {
+    let world = TestWorld::street();
+    let drive = drive(&world);
+    let tracker = Tracker::new(&world.map(), config()).unwrap();
+    let mut tracker = tracker.with_start(near(&drive[0].0));
+    assert!(tracker.sensor().is_none());
+    for (row, (truth, scan)) in drive.iter().enumerate() {
+        let estimate = tracker.step(scan).unwrap();
+        let error = truth.inverse() * estimate.pose;
+        let error_m = error.translation.vector.norm();
+        assert!(row < 2 || error_m < 0.1, "scan {row}: {error_m} m");
+        assert!(row < 11 || estimate.state == State::Tracking);
+    }
+    assert_eq!(tracker.sensor().unwrap().range_image.height, 32);
+}
+
+#[test]
+fn a_tracker_is_the_odometer_and_the_localizer() {
+    let world = TestWorld::street();
+    let drive = drive(&world);
+    let start = near(&drive[0].0);
+    let sensor = Sensor::infer(&[drive[0].1.clone()], &SensorConfig::default());
+    let tracker = Tracker::new(&world.map(), config()).unwrap();
+    let mut tracker = (tracker.with_sensor(sensor.clone())).with_start(start.clone());
+    let mut odometer = Odometer::new(OdometryConfig::default()).unwrap();
+    let mut localizer =
+        Localizer::new(&world.map(), &sensor, config().localizer, start, 0).unwrap();
+    let mut motion = Pose3::identity();
+    for (row, (_, scan)) in drive.iter().enumerate() {
+        motion *= odometer.step(scan).unwrap().previous_from_current;
+        if row % 2 == 1 {
+            tracker.pass(scan).unwrap();
+            continue;
+        }
+        let expected = localizer.step(scan, Odometry::Motion(motion)).unwrap();
+        let found = tracker.step(scan).unwrap();
+        assert_eq!(found.particles, expected.particles, "scan {row}");
+        motion = Pose3::identity();
+    }
+}
+
+#[test]
+fn a_first_scan_without_points_is_an_error() {
+    let mut tracker = Tracker::new(&TestWorld::street().map(), config()).unwrap();
+    let result = tracker.step(&Scan::default());
+    assert!(matches!(result, Err(TrackerError::NoPoints)));
+}
