@@ -27,7 +27,7 @@ use fpmcl::map::{Map, MapOptions};
 use fpmcl::odometry::{OdometryConfig, compare_timings};
 use fpmcl::recording::Recording;
 use fpmcl::refinement::{
-    InitialEstimate, Method, RefinementConfig, RefinerConfig, TrajectoryRefiner,
+    FrameRefinementConfig, InitialEstimate, Method, RefinerConfig, TrajectoryRefiner,
 };
 use fpmcl::rendering::{RangeDifference, RangeRenderer, RenderError, SurfaceHit};
 use fpmcl::sensor::{Sensor, SensorConfig};
@@ -177,9 +177,9 @@ impl Trial<'_> {
         match placer {
             Placer::Refiner(method) => {
                 let config = RefinerConfig {
-                    refinement: RefinementConfig {
+                    refinement: FrameRefinementConfig {
                         method,
-                        ..RefinementConfig::default()
+                        ..FrameRefinementConfig::default()
                     },
                     ..RefinerConfig::default()
                 };

@@ -1,4 +1,4 @@
-//! Detection of tracking loss.
+//! Detection of tracking loss: the evidence by which the filter changes its phase.
 //!
 //! The share a of beams that agree with the map at the estimate, among those that reach it, is followed
 //! by a fast and a slow average,
@@ -75,7 +75,7 @@ pub struct TrackingLossConfig {
     /// A place that was found is the right one from this share of agreeing beams on (unitless).
     #[default(0.85)]
     pub sure_agreement: f64,
-    /// Least share of updates that confirm it in turn (unitless).
+    /// Least share of updates that confirm it in turn: at places 3 m from the right one half of the beams agree (unitless).
     #[default(0.7)]
     pub confirming_agreement: f64,
     /// Number of these updates.
@@ -150,10 +150,14 @@ impl AgreementMonitor {
         config: &TrackingLossConfig,
     ) -> bool {
         let agreement = agreement.unwrap_or(config.confirming_agreement);
-        self.confirming = match is_converged {
-            true if agreement >= config.sure_agreement => config.confirming_updates,
-            true if agreement >= config.confirming_agreement => self.confirming + 1,
-            _ => 0,
+        self.confirming = if !is_converged {
+            0
+        } else if agreement >= config.sure_agreement {
+            config.confirming_updates
+        } else if agreement >= config.confirming_agreement {
+            self.confirming + 1
+        } else {
+            0
         };
         self.confirming >= config.confirming_updates
     }

@@ -16,7 +16,7 @@ pub mod upright;
 pub mod wide_search;
 
 pub use objective::FrameObjective;
-pub use refiner::{Distance, Method, RefinedFrame, RefinementConfig, refine_frame};
+pub use refiner::{Distance, FrameRefinementConfig, Method, RefinedFrame, refine_frame};
 pub use smoothing::{FramePrior, SmoothingConfig, smooth};
 pub use trajectory::{
     FrameResult, InitialEstimate, RefinedTrajectory, RefinerConfig, RefinerError, TrajectoryRefiner,

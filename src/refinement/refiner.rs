@@ -41,7 +41,7 @@ pub enum Method {
 /// Defaults: both steps; the bounds are of this project.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
-pub struct RefinementConfig {
+pub struct FrameRefinementConfig {
     /// Steps of the refinement of a frame.
     #[default(Method::Both)]
     pub method: Method,
@@ -83,7 +83,7 @@ pub struct RefinementConfig {
     pub scale_m: f64,
 }
 
-impl Validate for RefinementConfig {
+impl Validate for FrameRefinementConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         nested("swarm", &self.swarm)?;
         in_range("swarm_beams", self.swarm_beams, 1..=1_000_000)?;
@@ -107,7 +107,7 @@ impl Validate for RefinementConfig {
     }
 }
 
-impl RefinementConfig {
+impl FrameRefinementConfig {
     /// Reach of the search for an estimate with a covariance: x, y [m], heading [rad].
     pub fn reach(&self, covariance: &Matrix3<f64>) -> [f64; 3] {
         let reach = |axis: usize, least: f64, most: f64| {
@@ -179,7 +179,7 @@ pub fn refine_frame(
     estimate: &Pose2,
     covariance: &Matrix3<f64>,
     distance: Distance<'_>,
-    config: &RefinementConfig,
+    config: &FrameRefinementConfig,
     rng: &mut impl Rng,
 ) -> Result<Option<RefinedFrame>, RenderError> {
     let reach = config.reach(covariance);
@@ -243,7 +243,7 @@ fn search_widely(
     objective: &FrameObjective<'_>,
     frame: &mut RefinedFrame,
     surfaces: &UprightSurfaces,
-    config: &RefinementConfig,
+    config: &FrameRefinementConfig,
     rng: &mut impl Rng,
 ) -> Result<(), RenderError> {
     let found = wide_search::search(
@@ -263,7 +263,7 @@ fn search_widely(
 fn search(
     objective: &FrameObjective<'_>,
     frame: &mut RefinedFrame,
-    config: &RefinementConfig,
+    config: &FrameRefinementConfig,
     rng: &mut impl Rng,
 ) -> Result<(), RenderError> {
     let dimensions = search_space(&frame.pose, &frame.covariance, config);
@@ -296,7 +296,7 @@ fn search(
 fn search_space(
     pose: &Pose2,
     covariance: &Matrix3<f64>,
-    config: &RefinementConfig,
+    config: &FrameRefinementConfig,
 ) -> [Dimension; 3] {
     let reach = config.reach(covariance);
     let t = pose.translation;
@@ -317,7 +317,7 @@ fn pose_of(&[x, y, heading_rad]: &[f64; 3]) -> Pose2 {
 fn finish(
     objective: &FrameObjective<'_>,
     frame: &mut RefinedFrame,
-    config: &RefinementConfig,
+    config: &FrameRefinementConfig,
 ) -> Result<Option<RegistrationResult>, RenderError> {
     let (renderer, beams) = (objective.renderer, objective.beams);
     let start = &frame.map_from_lidar;
@@ -348,9 +348,9 @@ mod tests {
         let beams: Vec<Beam> = world.scan(&truth).beams().step_by(7).collect();
         let objective = world.objective(&beams);
         let covariance = Matrix3::from_diagonal(&Vector3::new(0.0025, 0.0025, 1e-4));
-        let config = RefinementConfig {
+        let config = FrameRefinementConfig {
             method,
-            ..RefinementConfig::default()
+            ..FrameRefinementConfig::default()
         };
         let mut rng = StdRng::seed_from_u64(seed);
         let frame = refine_frame(
@@ -406,7 +406,7 @@ mod tests {
         let world = TestWorld::street();
         let truth = world.pose_at(0.0, 0.0, 0.0);
         let beams: Vec<Beam> = world.scan(&truth).beams().collect();
-        let config = RefinementConfig::default();
+        let config = FrameRefinementConfig::default();
         let mut rng = StdRng::seed_from_u64(1);
         let covariance = Matrix3::identity();
         let empty = world.objective(&[]);

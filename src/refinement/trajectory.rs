@@ -18,7 +18,7 @@ use glam::DVec3;
 use nalgebra::{Matrix3, Vector2, Vector3};
 
 use super::objective::FrameObjective;
-use super::refiner::{Distance, RefinementConfig, refine_frame};
+use super::refiner::{Distance, FrameRefinementConfig, refine_frame};
 use super::smoothing::{self, FramePrior, smooth};
 use super::upright::UprightSurfaces;
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose3_from_pose2};
@@ -40,7 +40,7 @@ pub struct RefinerConfig {
     /// Selection of beams and cost of differences.
     pub observation: ObservationConfig,
     /// Swarm, Gauss-Newton and smoothing.
-    pub refinement: RefinementConfig,
+    pub refinement: FrameRefinementConfig,
 }
 
 impl Validate for RefinerConfig {

@@ -8,7 +8,7 @@ use smart_default::SmartDefault;
 use super::centreline::PathSegment;
 use super::ego_motion::MotionConfig;
 use super::given_poses::GivenPosesConfig;
-use super::odometry::OdometryConfig;
+use super::odometry::SimulatedOdometryConfig;
 use super::scanner::ScannerConfig;
 use super::street_config::StreetConfig;
 use super::traffic::TrafficConfig;
@@ -49,7 +49,7 @@ pub struct SimulationConfig {
     /// The sensor.
     pub scanner: ScannerConfig,
     /// The odometry written beside the true poses.
-    pub odometry: OdometryConfig,
+    pub odometry: SimulatedOdometryConfig,
     /// Errors of the poses that the drive comes with, to build a map with; without errors they are the true ones.
     pub given_poses: GivenPosesConfig,
 }

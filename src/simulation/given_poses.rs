@@ -16,7 +16,7 @@ use rand::Rng;
 use rand_distr::{Distribution as _, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::odometry::{OdometryConfig, drifting_odometry};
+use super::odometry::{SimulatedOdometryConfig, drifting_odometry};
 use crate::geometry::Pose3;
 use crate::validation::{InvalidValue, Validate, in_range};
 
@@ -71,8 +71,8 @@ impl GivenPosesConfig {
         noisy.collect()
     }
 
-    fn drift(&self) -> OdometryConfig {
-        OdometryConfig {
+    fn drift(&self) -> SimulatedOdometryConfig {
+        SimulatedOdometryConfig {
             scale_error: self.scale_error,
             heading_drift_deg_per_m: self.heading_drift_deg_per_m,
             step_noise_m: 0.0,

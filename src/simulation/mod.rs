@@ -49,7 +49,7 @@ pub use config::{SimulationConfig, SimulationError};
 pub use ego_motion::{EgoMotion, MotionConfig, SCAN_PERIOD_S};
 pub use given_poses::GivenPosesConfig;
 pub use ground::{GroundField, GroundSample, GroundZone};
-pub use odometry::OdometryConfig;
+pub use odometry::SimulatedOdometryConfig;
 pub use scanner::{LabelledScan, ScannerConfig};
 pub use scenes::{crest_scene, kerb_scene, slope_scene};
 pub use street::Street;

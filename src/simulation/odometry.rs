@@ -21,7 +21,7 @@ use crate::validation::{InvalidValue, Validate, in_range};
 /// Defaults: a good wheel odometry: 1 % too long, one degree in 100 m.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
-pub struct OdometryConfig {
+pub struct SimulatedOdometryConfig {
     /// Relative error of distances (s), positive if they are too long.
     #[default(0.01)]
     pub scale_error: f64,
@@ -36,7 +36,7 @@ pub struct OdometryConfig {
     pub turn_noise_deg: f64,
 }
 
-impl Validate for OdometryConfig {
+impl Validate for SimulatedOdometryConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         in_range("scale_error", self.scale_error, -0.9..=10.0)?;
         let drift = self.heading_drift_deg_per_m;
@@ -49,7 +49,7 @@ impl Validate for OdometryConfig {
 /// The poses that odometry reports for true poses, starting at the first of them.
 pub fn drifting_odometry(
     true_poses: &[Pose3],
-    config: &OdometryConfig,
+    config: &SimulatedOdometryConfig,
     rng: &mut impl Rng,
 ) -> Vec<Pose3> {
     let mut noise = |sigma: f64| {
@@ -86,11 +86,11 @@ mod tests {
             .collect()
     }
 
-    fn odometry(true_poses: &[Pose3], config: &OdometryConfig) -> Vec<Pose3> {
+    fn odometry(true_poses: &[Pose3], config: &SimulatedOdometryConfig) -> Vec<Pose3> {
         drifting_odometry(true_poses, config, &mut stream(1, Purpose::Odometry, 1))
     }
 
-    const EXACT: OdometryConfig = OdometryConfig {
+    const EXACT: SimulatedOdometryConfig = SimulatedOdometryConfig {
         scale_error: 0.0,
         heading_drift_deg_per_m: 0.0,
         step_noise_m: 0.0,
@@ -115,7 +115,7 @@ mod tests {
 
     #[test]
     fn scale_and_heading_drift_add_up() {
-        let config = OdometryConfig {
+        let config = SimulatedOdometryConfig {
             scale_error: 0.02,
             heading_drift_deg_per_m: 0.05,
             ..EXACT
@@ -132,7 +132,7 @@ mod tests {
 
     #[test]
     fn steps_have_the_configured_noise() {
-        let config = OdometryConfig {
+        let config = SimulatedOdometryConfig {
             step_noise_m: 0.03,
             ..EXACT
         };
@@ -149,7 +149,7 @@ mod tests {
     #[test]
     fn a_stationary_vehicle_does_not_drift() {
         let stationary = vec![straight(1)[0]; 100];
-        let reported = odometry(&stationary, &OdometryConfig::default());
+        let reported = odometry(&stationary, &SimulatedOdometryConfig::default());
         assert_relative_eq!(reported[99], stationary[0], epsilon = 1e-12);
     }
 }

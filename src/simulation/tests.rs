@@ -219,7 +219,7 @@ fn a_kidnapped_vehicle_is_displaced_without_its_odometry_noticing() {
             kidnapped_by_m: 20.0,
             ..MotionConfig::default()
         },
-        odometry: OdometryConfig {
+        odometry: SimulatedOdometryConfig {
             scale_error: 0.0,
             heading_drift_deg_per_m: 0.0,
             step_noise_m: 0.0,

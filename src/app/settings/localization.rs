@@ -21,7 +21,7 @@ use crate::localization::resampling::{KldConfig, ResamplingConfig};
 use crate::localization::tempering::TemperingConfig;
 use crate::localization::tracking_loss::TrackingLossConfig;
 use crate::map::{MapOptions, PanoramaConfig};
-use crate::refinement::{RefinementConfig, RefinerConfig};
+use crate::refinement::{FrameRefinementConfig, RefinerConfig};
 use crate::rendering::RenderingMethod;
 use crate::sensor::{MotionCompensation, RangeImageConfig, SensorConfig};
 use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative, require};
@@ -168,7 +168,7 @@ pub struct LocalizationConfig {
     /// Whether to refine every frame while tracking.
     pub refine: bool,
     /// Parameters of the refinement.
-    pub refinement: RefinementConfig,
+    pub refinement: FrameRefinementConfig,
     /// Seed of all random choices.
     pub seed: u64,
     /// Whether to replace an existing result.

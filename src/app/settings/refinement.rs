@@ -75,7 +75,7 @@ pub struct RefinementConfig {
     /// Observation model.
     pub observation: ObservationConfig,
     /// Swarm, Gauss-Newton and smoothing.
-    pub refinement: refinement::RefinementConfig,
+    pub refinement: refinement::FrameRefinementConfig,
     /// Times of the points for motion compensation; `None` for scans that are compensated already, such as
     /// those of KITTI odometry.
     pub motion_compensation: Option<MotionCompensation>,
@@ -123,7 +123,7 @@ impl RefinementConfig {
             pca: localization.pca,
             fuzzy: localization.fuzzy,
             observation: localization.observation,
-            refinement: refinement::RefinementConfig::default(),
+            refinement: refinement::FrameRefinementConfig::default(),
             motion_compensation: localization.motion_compensation,
             elevation_bias_deg: localization.elevation_bias_deg,
             seed: localization.seed,
