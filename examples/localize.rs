@@ -1,4 +1,6 @@
-//! Localizes a recording in a map without an initial pose, odometry or a known sensor:
+//! Localizes a recording in a map without an initial pose, odometry or a known sensor. A robot has no recording yet: the
+//! tracker then infers the sensor from the first scans.
+//!
 //! `cargo run --release --example localize -- RECORDING MAP.ply TRAJECTORY.txt`.
 
 #![allow(clippy::print_stdout, reason = "examples print their result")]
@@ -8,6 +10,7 @@ use std::path::PathBuf;
 use fpmcl::localization::{Tracker, TrackerConfig};
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::recording::{Recording, poses::write_tum};
+use fpmcl::sensor::{Sensor, SensorConfig};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<PathBuf> = std::env::args_os().skip(1).map(PathBuf::from).collect();
@@ -15,9 +18,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         return Err("usage: localize RECORDING MAP.ply TRAJECTORY.txt".into());
     };
     let map = Map::load(map_file, &MapOptions::default())?;
-    let mut tracker = Tracker::new(&map, TrackerConfig::default())?;
+    let recording = Recording::open(recording)?;
+    let sensor = Sensor::infer_recording(&recording, &SensorConfig::default())?;
+    let mut tracker = Tracker::new(&map, TrackerConfig::default())?.with_sensor(sensor);
     let mut trajectory = Vec::new();
-    for frame in &Recording::open(recording)?.frames {
+    for frame in &recording.frames {
         let estimate = tracker.step(&frame.read()?)?;
         let (t, deviations) = (estimate.pose.translation, estimate.standard_deviations());
         let state = estimate.state.word();
