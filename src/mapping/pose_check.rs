@@ -17,9 +17,9 @@ impl PoseReport {
     /// Checks the poses of a recording whose scans are not yet deskewed by them.
     pub fn new(recording: &Recording) -> Result<Self, MappingError> {
         let run = moving_run(recording);
-        let numbers = run.iter().map(|(frame, _)| frame.number);
+        let ends = [run.first(), run.last()];
         Ok(Self {
-            frames: [numbers.clone().next(), numbers.last()].map(Option::unwrap_or_default),
+            frames: ends.map(|end| end.map_or(0, |(frame, _)| frame.number)),
             motion: check_motion(recording, &run)?,
             tilt: tilt(recording)?,
         })

@@ -7,7 +7,7 @@ use super::pictures;
 use super::plan::PlannedRun;
 use super::record::{Outcome, RunRecord};
 use super::results::ComparisonResults;
-use crate::app::report::format::{Cell, Column, Page, PageElement, Section, Table};
+use crate::app::report::pages::{Cell, Column, Page, PageElement, Section, Table};
 use crate::app::report::results::length;
 use crate::app::report::run_page::{PICTURES, TEXTS, collapsed, picture};
 use crate::app::run::version;

@@ -5,7 +5,7 @@ use anyhow::Result;
 use super::layout::Layout;
 use super::record::RunRecord;
 use super::results::{ComparisonResults, success_rate};
-use crate::app::report::format::{PageElement, SuccessRate};
+use crate::app::report::pages::{PageElement, SuccessRate};
 use crate::app::report::plotting::color::{Rgb, SERIES};
 use crate::app::report::plotting::{LineChart, Mark, Panel, PathPlot, Series, error_chart};
 use crate::app::report::results::LocalizationResults;

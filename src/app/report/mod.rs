@@ -1,7 +1,7 @@
 //! What a run leaves behind: results, tables, pages, pictures and exports.
 
 pub mod export;
-pub mod format;
+pub mod pages;
 pub mod plotting;
 pub mod results;
 pub mod run_output;

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result};
 
-use crate::app::report::format::{Cell, Column, Page, PageElement, Section, Table};
+use crate::app::report::pages::{Cell, Column, Page, PageElement, Section, Table};
 use crate::app::report::plotting::Bitmap;
 use crate::app::report::results::{MetricRow, Report, Value};
 use crate::app::report::run_output::{INTERACTIVE, RunFiles};

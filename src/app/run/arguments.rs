@@ -103,9 +103,11 @@ pub fn with_flags<T: CommandConfig>(
 /// Parses finite numbers that are separated by commas.
 pub fn numbers<const N: usize>(text: &str, help: &'static str) -> Result<[f64; N], &'static str> {
     let numbers = text.split(',').map(|number| number.trim().parse::<f64>());
-    let numbers: Vec<f64> = numbers.collect::<Result<_, _>>().map_err(|_| help)?;
-    let is_finite = numbers.iter().all(|number| number.is_finite());
-    numbers.try_into().ok().filter(|_| is_finite).ok_or(help)
+    let numbers: Option<Vec<f64>> = numbers.map(Result::ok).collect();
+    let finite = numbers.filter(|numbers| numbers.iter().all(|number| number.is_finite()));
+    finite
+        .and_then(|numbers| numbers.try_into().ok())
+        .ok_or(help)
 }
 
 /// Splits `key=value` at the first `=`.
