@@ -25,6 +25,8 @@ mod ransac;
 // The ground plane below the sensor.
 mod road;
 #[cfg(test)]
+mod scenes_for_tests;
+#[cfg(test)]
 mod tests;
 
 pub use classifier::GroundClassifier;

@@ -1,10 +1,8 @@
 //! Laws of the classifiers in synthetic worlds.
 
-mod scenes;
-
 use glam::Vec3;
 
-use self::scenes::{Sensor, Surface, cuboid};
+use super::scenes_for_tests::{Sensor, Surface, cuboid};
 use super::*;
 
 const SENSORS: [Sensor; 2] = [Sensor::SIXTY_FOUR, Sensor::THIRTY_TWO];

@@ -146,7 +146,7 @@ mod tests {
     use super::*;
     use crate::geometry::wrap_angle;
     use crate::lidar::LidarModel;
-    use crate::map::test_world::TestWorld;
+    use crate::map::world_for_tests::TestWorld;
     use crate::map::{PanoramaConfig, PanoramaRequest, SearchRegion};
 
     #[test]

@@ -114,7 +114,7 @@ mod tests {
     use approx::assert_relative_eq;
 
     use super::*;
-    use crate::map::test_world::TestWorld;
+    use crate::map::world_for_tests::TestWorld;
 
     #[test]
     fn the_width_of_a_triangle_is_half_its_base_and_a_plateau_has_none() {

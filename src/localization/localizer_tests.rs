@@ -6,7 +6,7 @@ use nalgebra::Vector2;
 use super::*;
 use crate::lidar::LidarModel;
 use crate::localization::State;
-use crate::map::test_world::TestWorld;
+use crate::map::world_for_tests::TestWorld;
 use crate::map::{MappingPath, TileConfig, TileGrid};
 
 /// A localizer runs on one thread at a time, a map is shared by several.

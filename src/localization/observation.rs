@@ -303,7 +303,7 @@ mod tests {
 
     use super::*;
     use crate::geometry::Pose2;
-    use crate::map::test_world::TestWorld;
+    use crate::map::world_for_tests::TestWorld;
 
     #[test]
     fn the_reference_likelihood_is_the_published_one() {

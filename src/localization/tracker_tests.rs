@@ -3,7 +3,7 @@
 use super::*;
 use crate::geometry::Pose2;
 use crate::localization::{StartSpread, State};
-use crate::map::test_world::TestWorld;
+use crate::map::world_for_tests::TestWorld;
 
 fn config() -> TrackerConfig {
     TrackerConfig {

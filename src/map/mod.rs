@@ -13,7 +13,7 @@ pub mod places;
 pub mod tiles;
 
 #[cfg(test)]
-pub(crate) mod test_world;
+pub(crate) mod world_for_tests;
 
 pub use build::builder::{BuildError, BuildEvent, MapBuilder, MapPlan, ReadScan, ScanError};
 pub use build::cloud::CloudPlan;

@@ -65,7 +65,7 @@ fn fans(triangles: &[[u32; 3]], corners: &[u32]) -> Vec<usize> {
 mod tests {
     use glam::Vec3;
 
-    use super::super::tests::shapes::Topology;
+    use super::super::shapes_for_tests::Topology;
     use super::*;
 
     /// A disk of six triangles around vertex 0, without some of them.

@@ -29,4 +29,8 @@ pub use simplify::simplify_ground;
 pub use trimming::{trim_by_density, trim_by_distance};
 
 #[cfg(test)]
-mod tests;
+mod reconstruction_tests;
+#[cfg(test)]
+mod shapes_for_tests;
+#[cfg(test)]
+mod simplification_tests;

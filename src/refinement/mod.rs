@@ -24,7 +24,7 @@ pub use trajectory::{
 pub use wide_search::WideSearchConfig;
 
 #[cfg(test)]
-impl crate::map::test_world::TestWorld {
+impl crate::map::world_for_tests::TestWorld {
     /// The objective of a scan from the street.
     fn objective<'a>(&'a self, beams: &'a [crate::lidar::Beam]) -> FrameObjective<'a> {
         FrameObjective {

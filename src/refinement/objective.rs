@@ -191,7 +191,7 @@ mod tests {
     use approx::assert_relative_eq;
 
     use super::*;
-    use crate::map::test_world::TestWorld;
+    use crate::map::world_for_tests::TestWorld;
 
     #[test]
     fn second_differences_of_a_quadratic_are_its_matrix() {

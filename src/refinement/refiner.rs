@@ -340,7 +340,7 @@ mod tests {
     use rand::{SeedableRng, rngs::StdRng};
 
     use super::*;
-    use crate::map::test_world::TestWorld;
+    use crate::map::world_for_tests::TestWorld;
 
     fn refine(method: Method, off: &Pose2, seed: u64) -> (RefinedFrame, Pose2) {
         let world = TestWorld::street();

@@ -583,7 +583,7 @@ impl FrameResult {
 mod tests {
     use super::*;
     use crate::lidar::LidarModel;
-    use crate::map::test_world::TestWorld;
+    use crate::map::world_for_tests::TestWorld;
 
     fn sensor() -> Sensor {
         Sensor::new(LidarModel::default())

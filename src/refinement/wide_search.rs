@@ -203,7 +203,7 @@ mod tests {
     use rand::{SeedableRng as _, rngs::StdRng};
 
     use super::*;
-    use crate::map::test_world::TestWorld;
+    use crate::map::world_for_tests::TestWorld;
 
     #[test]
     fn a_pose_metres_and_tens_of_degrees_off_is_found() {

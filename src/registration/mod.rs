@@ -337,7 +337,7 @@ mod tests {
     use super::*;
     use crate::geometry::Pose2;
     use crate::map::SensorAttitude;
-    use crate::map::test_world::TestWorld;
+    use crate::map::world_for_tests::TestWorld;
 
     fn beams(world: &TestWorld, truth: &Pose2) -> Vec<Beam> {
         world.scan(truth).beams().step_by(3).collect()

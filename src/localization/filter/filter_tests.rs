@@ -14,7 +14,7 @@ use crate::localization::motion::{OdometryNoise, TurnDriveTurn, VelocityCommand}
 use crate::localization::odometry::{increments, with_noise};
 use crate::localization::places::PlacesConfig;
 use crate::localization::{Estimate, LocalizerConfig, Odometry, ParticleSet, State};
-use crate::map::test_world::TestWorld;
+use crate::map::world_for_tests::TestWorld;
 use crate::map::{PanoramaConfig, PanoramaRequest, SearchRegion, SensorAttitude};
 
 /// A slightly winding drive along the street, 0.8 m per frame, map frame.

@@ -378,7 +378,7 @@ fn panorama_model(lidar: &LidarModel, config: &PanoramaConfig) -> LidarModel {
 mod tests {
     use super::*;
     use crate::map::places::scan_panorama::{NOTHING, steps_of};
-    use crate::map::test_world::TestWorld;
+    use crate::map::world_for_tests::TestWorld;
 
     fn request() -> PanoramaRequest {
         PanoramaRequest {

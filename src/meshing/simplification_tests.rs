@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 
 use glam::Vec3;
 
-use super::super::{PoissonConfig, reconstruct, simplify_ground};
-use super::shapes::{Topology, street};
+use super::shapes_for_tests::{Topology, street};
+use super::{PoissonConfig, reconstruct, simplify_ground};
 use crate::geometry::{Aabb, TriangleMesh};
 
 /// A square of 20 m with heights `height` and a number of cells per side.

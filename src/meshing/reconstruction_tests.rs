@@ -3,8 +3,8 @@
 use approx::assert_relative_eq;
 use glam::{Quat, Vec3};
 
-use super::super::*;
-use super::shapes::{Topology, sphere, street};
+use super::shapes_for_tests::{Topology, sphere, street};
+use super::*;
 use crate::geometry::PointCloud;
 
 fn at_depth(depth: u32) -> PoissonConfig {

@@ -6,7 +6,7 @@ use glam::Vec3;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
 use rand_distr::{Distribution, StandardNormal};
 
-use super::super::adjacency::chain_start;
+use super::adjacency::chain_start;
 use crate::geometry::{PointCloud, TriangleMesh};
 
 /// Points all over a sphere around the origin, normals outwards.

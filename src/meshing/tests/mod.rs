@@ -1,5 +1,0 @@
-//! Laws of the reconstruction and of the simplification.
-
-mod reconstruction;
-pub mod shapes;
-mod simplification;
