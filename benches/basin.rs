@@ -21,10 +21,11 @@ use std::time::{Duration, Instant};
 
 use fpmcl::app::report::plotting::{LineChart, Panel, Series};
 use fpmcl::geometry::{Pose2, Pose3, Vec3, pose2_from_pose3};
-use fpmcl::lidar::{Beam, LidarModel, PERIOD_S, Rotation, Scan};
+use fpmcl::internals::{PERIOD_S, compare_timings};
+use fpmcl::lidar::{Beam, LidarModel, Rotation, Scan};
 use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start, StartSpread};
 use fpmcl::map::{Map, MapOptions};
-use fpmcl::odometry::{OdometryConfig, compare_timings};
+use fpmcl::odometry::OdometryConfig;
 use fpmcl::recording::Recording;
 use fpmcl::refinement::{
     FrameRefinementConfig, InitialEstimate, Method, RefinerConfig, TrajectoryRefiner,

@@ -32,7 +32,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use fpmcl::geometry::{PointCloud, TriangleMesh};
-use fpmcl::map::files::ply;
+use fpmcl::internals::ply;
 use fpmcl::meshing::{PoissonConfig, reconstruct};
 use glam::Vec3;
 use rand::{RngExt, SeedableRng, rngs::StdRng};

@@ -22,11 +22,13 @@ use std::path::Path;
 
 use divan::counter::ItemsCount;
 use divan::{Bencher, black_box};
-use fpmcl::geometry::{Pose3, Rigid3f, Vec3};
+use fpmcl::geometry::{Pose3, Vec3};
+use fpmcl::internals::Rigid3f;
 use fpmcl::lidar::{Beam, LidarModel};
-use fpmcl::map::files::ply;
-use fpmcl::raycasting::Scene;
-use fpmcl::rendering::{CpuRenderer, RangeDifference, RangeRenderer as _};
+use fpmcl::internals::ply;
+use fpmcl::internals::Scene;
+use fpmcl::internals::CpuRenderer;
+use fpmcl::rendering::{RangeDifference, RangeRenderer as _};
 use npyz::WriterBuilder as _;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 

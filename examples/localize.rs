@@ -9,7 +9,7 @@ use std::path::PathBuf;
 
 use fpmcl::localization::{Tracker, TrackerConfig};
 use fpmcl::map::{Map, MapOptions};
-use fpmcl::recording::{Recording, poses::write_tum};
+use fpmcl::recording::{Recording, write_tum};
 use fpmcl::sensor::{Sensor, SensorConfig};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {

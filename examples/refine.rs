@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use fpmcl::geometry::pose2_from_pose3;
 use fpmcl::map::{Map, MapOptions};
-use fpmcl::recording::{Recording, poses::read_tum};
+use fpmcl::recording::{Recording, read_tum};
 use fpmcl::refinement::{InitialEstimate, RefinerConfig, TrajectoryRefiner};
 use fpmcl::sensor::{Sensor, SensorConfig};
 

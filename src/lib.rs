@@ -72,12 +72,12 @@
 //!
 //! | layer | modules |
 //! |---|---|
-//! | foundations | [`files`], [`geometry`], [`memory`], [`random`], [`shared_bytes`], `simd`, [`statistics`], [`validation`] |
-//! | sensor and rays | [`lidar`], [`raycasting`] |
+//! | foundations | `files`, [`geometry`], [`memory`], `random`, `shared_bytes`, `simd`, `statistics`, [`validation`] |
+//! | sensor and rays | [`lidar`], `raycasting` |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
 //! | motion | [`odometry`] |
 //! | inferred sensor | [`sensor`] |
-//! | map | [`map`], [`registration`], [`simulation`] |
+//! | map | [`map`], [`registration`], `simulation` (with its feature) |
 //! | poses | [`evaluation`], [`localization`] |
 //! | trajectories | [`mapping`], [`refinement`] |
 //! | program, feature `cli` | `app` |
@@ -90,17 +90,17 @@
 )]
 
 // Foundations.
-pub mod files;
+mod files;
 pub mod geometry;
 pub mod memory;
-pub mod random;
-pub mod shared_bytes;
+mod random;
+mod shared_bytes;
 mod simd;
-pub mod statistics;
+mod statistics;
 pub mod validation;
 // Sensor and rays.
 pub mod lidar;
-pub mod raycasting;
+mod raycasting;
 // Scans, points and meshes.
 pub mod ground;
 pub mod meshing;
@@ -113,6 +113,7 @@ pub mod sensor;
 // Map.
 pub mod map;
 pub mod registration;
+#[cfg(feature = "simulation")]
 pub mod simulation;
 // Poses.
 pub mod evaluation;
@@ -123,3 +124,34 @@ pub mod refinement;
 // Program.
 #[cfg(feature = "cli")]
 pub mod app;
+
+/// What the tests and benches of this repository use beyond the library's interface; it changes without notice.
+#[doc(hidden)]
+pub mod internals {
+    pub use crate::geometry::pose::{FARTHEST_M, Rigid3f};
+    pub use crate::geometry::surface_samples::surface_area_m2;
+    pub use crate::lidar::deskewing::PERIOD_S;
+    pub use crate::lidar::spatial_normals::estimate_spatial_normals;
+    pub use crate::map::files::mapped_ply::MappedPly;
+    pub use crate::odometry::timing::compare_timings;
+    pub use crate::random::stream;
+    pub use crate::raycasting::Scene;
+    #[cfg(feature = "bags")]
+    pub use crate::recording::bags::FramePose;
+    pub use crate::recording::poses::CameraPoses;
+    pub use crate::rendering::cpu::CpuRenderer;
+    #[cfg(feature = "gpu")]
+    pub use crate::rendering::gpu::{GpuRenderer, ImageMethod};
+
+    pub mod mesh_file {
+        pub use crate::map::files::mesh_file::read;
+    }
+
+    pub mod ply {
+        pub use crate::map::files::ply::{read, read_map, write, write_joined};
+    }
+
+    pub mod scan_files {
+        pub use crate::recording::scan_files::{is_scan, read, read_stamped};
+    }
+}

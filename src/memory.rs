@@ -43,7 +43,7 @@ pub fn set_budget(bytes: u64) {
 }
 
 /// Requires that an estimate [bytes] is within the budget.
-pub fn require(what: &'static str, bytes: f64, remedy: &'static str) -> Result<(), MemoryError> {
+pub(crate) fn require(what: &'static str, bytes: f64, remedy: &'static str) -> Result<(), MemoryError> {
     let budget = BUDGET.load(Ordering::Relaxed) as f64;
     if bytes <= budget {
         return Ok(());
@@ -57,7 +57,7 @@ pub fn require(what: &'static str, bytes: f64, remedy: &'static str) -> Result<(
 }
 
 /// Reads a whole file within the budget, also one whose size is not known before, such as a pipe.
-pub fn read_file(path: &Path) -> io::Result<Vec<u8>> {
+pub(crate) fn read_file(path: &Path) -> io::Result<Vec<u8>> {
     /// Memory for the content and what is made of it, in sizes of the file.
     const COPIES: u64 = 2;
     let file = File::open(path)?;
@@ -77,7 +77,7 @@ pub fn read_file(path: &Path) -> io::Result<Vec<u8>> {
 }
 
 /// Reads a whole text file within the budget.
-pub fn read_text(path: &Path) -> io::Result<String> {
+pub(crate) fn read_text(path: &Path) -> io::Result<String> {
     String::from_utf8(read_file(path)?)
         .map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error.utf8_error()))
 }

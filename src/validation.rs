@@ -26,7 +26,7 @@ pub struct InvalidValue {
 
 impl InvalidValue {
     /// An invalid value of `key`.
-    pub fn new(key: &str, value: impl Display, remedy: impl Into<String>) -> Self {
+    pub(crate) fn new(key: &str, value: impl Display, remedy: impl Into<String>) -> Self {
         Self {
             key: key.to_owned(),
             value: value.to_string(),
@@ -36,7 +36,7 @@ impl InvalidValue {
 }
 
 /// Validates a nested configuration; its keys get the prefix `block.`.
-pub fn nested(block: &str, config: &impl Validate) -> Result<(), InvalidValue> {
+pub(crate) fn nested(block: &str, config: &impl Validate) -> Result<(), InvalidValue> {
     config.validate().map_err(|invalid| InvalidValue {
         key: format!("{block}.{}", invalid.key),
         ..invalid
@@ -44,7 +44,7 @@ pub fn nested(block: &str, config: &impl Validate) -> Result<(), InvalidValue> {
 }
 
 /// Requires a condition.
-pub fn require(
+pub(crate) fn require(
     condition: bool,
     key: &str,
     value: impl Display,
@@ -62,7 +62,7 @@ const SMALLEST: f64 = 1e-9;
 const LARGEST: f64 = 1e6;
 
 /// Requires a value greater than 0, from 1e-9 to a million.
-pub fn positive<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), InvalidValue> {
+pub(crate) fn positive<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), InvalidValue> {
     let number: f64 = value.into();
     require(number > 0.0, key, value, "it must be greater than 0")?;
     // Values of single precision are rounded.
@@ -76,7 +76,7 @@ pub fn positive<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<()
 }
 
 /// Requires a value greater than 0, which may be infinite: no limit.
-pub fn positive_or_infinite<N: Into<f64> + Copy + Display>(
+pub(crate) fn positive_or_infinite<N: Into<f64> + Copy + Display>(
     key: &str,
     value: N,
 ) -> Result<(), InvalidValue> {
@@ -84,7 +84,7 @@ pub fn positive_or_infinite<N: Into<f64> + Copy + Display>(
 }
 
 /// Requires a value of 0 or greater, at most a million.
-pub fn not_negative<N: Into<f64> + Copy + Display>(
+pub(crate) fn not_negative<N: Into<f64> + Copy + Display>(
     key: &str,
     value: N,
 ) -> Result<(), InvalidValue> {
@@ -94,13 +94,13 @@ pub fn not_negative<N: Into<f64> + Copy + Display>(
 }
 
 /// Requires a value between minus and plus a million.
-pub fn bounded<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), InvalidValue> {
+pub(crate) fn bounded<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), InvalidValue> {
     let remedy = format!("it must lie between -{LARGEST} and {LARGEST}");
     require(value.into().abs() <= LARGEST, key, value, remedy)
 }
 
 /// Requires a value within both limits.
-pub fn in_range<N: PartialOrd + Display>(
+pub(crate) fn in_range<N: PartialOrd + Display>(
     key: &str,
     value: N,
     range: RangeInclusive<N>,
@@ -110,18 +110,18 @@ pub fn in_range<N: PartialOrd + Display>(
 }
 
 /// Requires a value from 0 to 1.
-pub fn fraction<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), InvalidValue> {
+pub(crate) fn fraction<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), InvalidValue> {
     let holds = (0.0..=1.0).contains(&value.into());
     require(holds, key, value, "it must lie between 0 and 1")
 }
 
 /// Requires a count of 1 or greater.
-pub fn at_least_one(key: &str, count: usize) -> Result<(), InvalidValue> {
+pub(crate) fn at_least_one(key: &str, count: usize) -> Result<(), InvalidValue> {
     require(count >= 1, key, count, "it must be 1 or greater")
 }
 
 /// Requires a rectangle `[x_min, x_max, y_min, y_max]`.
-pub fn rectangle(key: &str, limits_m: [f32; 4]) -> Result<(), InvalidValue> {
+pub(crate) fn rectangle(key: &str, limits_m: [f32; 4]) -> Result<(), InvalidValue> {
     let [x_min, x_max, y_min, y_max] = limits_m;
     require(
         limits_m

@@ -10,9 +10,9 @@ use std::path::Path;
 use common::{Fpmcl, Output, fpmcl, json, real_recording, run, simulate_two_drives};
 use fpmcl::app::report::results::LocalizationResults;
 use fpmcl::geometry::{Pose3, StampedPose};
-use fpmcl::map::files::ply;
+use fpmcl::internals::ply;
 use fpmcl::recording::PoseTrack;
-use fpmcl::recording::poses::{read_tum, write_tum};
+use fpmcl::recording::{read_tum, write_tum};
 use nalgebra::{UnitQuaternion, Vector3};
 use serde_json::Value;
 

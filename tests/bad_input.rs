@@ -348,11 +348,11 @@ fn frames_without_ground_keep_the_estimates_of_the_filter() {
     // With few particles the covariances are wide, and the frames are searched for.
     let call = recording.fpmcl("localize").set("numParticles", "2000");
     call.set("num_reduced", "200").succeeds();
-    let mut map = ::fpmcl::map::files::ply::read(&recording.path("map.ply")).unwrap();
+    let mut map = ::fpmcl::internals::ply::read(&recording.path("map.ply")).unwrap();
     for vertex in &mut map.vertices {
         vertex.y += 500.0;
     }
-    ::fpmcl::map::files::ply::write(&recording.path("elsewhere.ply"), &map, None).unwrap();
+    ::fpmcl::internals::ply::write(&recording.path("elsewhere.ply"), &map, None).unwrap();
     // Without odometry, the trajectory is not smoothed either.
     let stderr = recording
         .fpmcl("refine")

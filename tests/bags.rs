@@ -11,8 +11,8 @@ use std::path::Path;
 
 use fpmcl::geometry::{Pose3, Vec3};
 use fpmcl::lidar::Scan;
-use fpmcl::recording::bags::{FramePose, TopicKind};
-use fpmcl::recording::{Bag, PoseTrack, RecordingError, scan_files};
+use fpmcl::internals::{FramePose, scan_files};
+use fpmcl::recording::{Bag, PoseTrack, RecordingError, TopicKind};
 use rayon::prelude::*;
 
 use bag_writers::{

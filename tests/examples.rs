@@ -11,7 +11,7 @@ use std::process::Command;
 use common::simulate_two_drives;
 use fpmcl::geometry::Pose3;
 use fpmcl::map::{Map, MapOptions};
-use fpmcl::recording::{Recording, poses::read_tum};
+use fpmcl::recording::{Recording, read_tum};
 
 const SIMULATION: &str = "\
 output_folder: street

@@ -9,9 +9,10 @@ use std::fs;
 use std::path::Path;
 
 use common::{Fpmcl, Recording, fpmcl};
-use fpmcl::geometry::{Vec3, surface_area_m2};
-use fpmcl::map::files::mesh_file;
-use fpmcl::recording::scan_files;
+use fpmcl::geometry::Vec3;
+use fpmcl::internals::surface_area_m2;
+use fpmcl::internals::mesh_file;
+use fpmcl::internals::scan_files;
 use serde_json::Value;
 
 const RESULT: &str = "results/localization.npz";

@@ -417,7 +417,7 @@ fn stable_bytes(path: &Path) -> Option<Vec<u8>> {
 
 /// Stops a command by signals at random moments and runs it again.
 fn stop_at_random_moments(reference: &Reference, tries: usize) -> Vec<Row> {
-    let mut rng = fpmcl::random::stream(14, 0);
+    let mut rng = fpmcl::internals::stream(14, 0);
     let mut rows: Vec<Row> = (SIGNALS.iter())
         .map(|(name, _)| Row::new(name, reference.stage))
         .collect();

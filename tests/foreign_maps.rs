@@ -10,10 +10,10 @@ use std::path::Path;
 
 use common::{SENSOR, fpmcl, json, run, simulate_two_drives};
 use fpmcl::geometry::{StampedPose, TriangleMesh, pose2_from_pose3};
-use fpmcl::map::files::ply;
+use fpmcl::internals::ply;
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::recording::PoseTrack;
-use fpmcl::recording::poses::write_tum;
+use fpmcl::recording::write_tum;
 use fpmcl::rendering::Backend;
 
 const SIMULATION: &str = "\

@@ -25,14 +25,15 @@ use fpmcl::app::settings::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
     LocalizationConfig, RefinementConfig,
 };
-use fpmcl::geometry::{FARTHEST_M, Pose2, Pose3, TriangleMesh};
+use fpmcl::geometry::{Pose2, Pose3, TriangleMesh};
+use fpmcl::internals::FARTHEST_M;
 use fpmcl::lidar::{Rotation, RotationDirection, Scan};
-use fpmcl::map::files::ply;
-use fpmcl::recording::poses::{
-    CameraPoses, read_times, read_tum, write_kitti, write_times, write_tum,
-};
-use fpmcl::recording::velodyne::{read_labels, write_labels, write_scan};
-use fpmcl::recording::{Calibration, Recording, scan_files};
+use fpmcl::internals::ply;
+use fpmcl::internals::CameraPoses;
+use fpmcl::recording::{read_times, read_tum, write_kitti, write_times, write_tum};
+use fpmcl::recording::{read_labels, write_labels, write_scan};
+use fpmcl::internals::scan_files;
+use fpmcl::recording::{Calibration, Recording};
 use fpmcl::simulation::SimulationConfig;
 
 use fuzzed::files;
@@ -134,7 +135,7 @@ fn bags_database() {
 /// Reads all scans, poses and transforms of a bag.
 #[cfg(feature = "bags")]
 fn read_bag(file: &Input) -> Result<(), String> {
-    use fpmcl::recording::bags::{Bag, TopicKind};
+    use fpmcl::recording::{Bag, TopicKind};
 
     let bag = Bag::open(file.path).map_err(text)?;
     for topic in bag.topics_of(TopicKind::Scans) {

@@ -10,7 +10,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use common::fpmcl;
-use fpmcl::recording::velodyne::{read_labels, write_labels, write_scan};
+use fpmcl::recording::{read_labels, write_labels, write_scan};
 use fpmcl::simulation::{LabelledScan, ScannerConfig, slope_scene};
 use tempfile::TempDir;
 

@@ -9,8 +9,8 @@ use fpmcl::evaluation::{GroundProtocol, GroundScore};
 use fpmcl::ground::{
     FuzzyConfig, FuzzyGround, GroundClassifier, PcaGround, RansacGround, ReportRule,
 };
-use fpmcl::recording::scan_files;
-use fpmcl::recording::velodyne::read_labels;
+use fpmcl::internals::scan_files;
+use fpmcl::recording::read_labels;
 
 /// A labelled recording: its folder, the path of a scan in it, and the number of scans.
 struct Labelled {

@@ -9,10 +9,10 @@ use std::path::Path;
 
 use common::{fpmcl, json, real_recording, run, simulate_two_drives};
 use fpmcl::geometry::Pose3;
-use fpmcl::map::files::mapped_ply::MappedPly;
-use fpmcl::map::files::ply;
+use fpmcl::internals::MappedPly;
+use fpmcl::internals::ply;
 use fpmcl::recording::PoseTrack;
-use fpmcl::recording::poses::read_tum;
+use fpmcl::recording::read_tum;
 use glam::DVec3;
 
 /// A street with a bend and traffic.

@@ -13,7 +13,8 @@ use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, Recording, SENSOR, json, run, simul
 use fpmcl::app::report::plotting::color::{MCL, REFINED, TRUTH};
 use fpmcl::app::report::results::LocalizationResults;
 use fpmcl::recording::Calibration;
-use fpmcl::recording::poses::{CameraPoses, read_tum};
+use fpmcl::internals::CameraPoses;
+use fpmcl::recording::read_tum;
 use serde_json::Value;
 use tempfile::TempDir;
 

@@ -12,10 +12,10 @@ use std::path::Path;
 
 use fpmcl::geometry::{Pose2, Pose3, TriangleMesh, Vec3};
 use fpmcl::lidar::{Beam, LidarModel, RangeImage};
-use fpmcl::localization::observation::ObservationConfig;
-use fpmcl::localization::particles::ParticleSet;
-use fpmcl::rendering::cpu::CpuRenderer;
-use fpmcl::rendering::gpu::{GpuRenderer, ImageMethod};
+use fpmcl::localization::ObservationConfig;
+use fpmcl::localization::ParticleSet;
+use fpmcl::internals::CpuRenderer;
+use fpmcl::internals::{GpuRenderer, ImageMethod};
 use fpmcl::rendering::{Backend, RangeDifference, RangeRenderer, RenderError, RenderingMethod};
 
 use brute_force::{BruteForce, room, street};
@@ -336,7 +336,7 @@ fn drive_0005() -> Option<TriangleMesh> {
         .set("n_scans", "6")
         .set("visualize", "False")
         .succeeds();
-    Some(fpmcl::map::files::ply::read(&map).unwrap())
+    Some(fpmcl::internals::ply::read(&map).unwrap())
 }
 
 #[test]

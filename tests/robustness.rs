@@ -10,7 +10,7 @@ use std::path::Path;
 use std::sync::LazyLock;
 
 use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, SENSOR, fpmcl, json, run, simulate_two_drives};
-use fpmcl::map::files::ply;
+use fpmcl::internals::ply;
 use tempfile::TempDir;
 
 /// Frames of a drive; 0.8 m apart.

@@ -8,8 +8,9 @@ use std::fs;
 
 use std::path::Path;
 
-use fpmcl::lidar::{NormalConfig, RangeImage, Scan, estimate_spatial_normals};
-use fpmcl::recording::scan_files;
+use fpmcl::internals::estimate_spatial_normals;
+use fpmcl::lidar::{NormalConfig, RangeImage, Scan};
+use fpmcl::internals::scan_files;
 use fpmcl::sensor::{BeamSource, DroppedPoints, Sensor, SensorConfig};
 
 fn infer(scans: &[Scan]) -> Sensor {

@@ -13,7 +13,7 @@ use std::process::Command;
 
 use approx::assert_relative_eq;
 use fpmcl::geometry::{Pose3, StampedPose};
-use fpmcl::recording::poses::write_tum;
+use fpmcl::recording::write_tum;
 use nalgebra::Vector3;
 use serde_json::Value;
 use tempfile::TempDir;
@@ -295,7 +295,7 @@ fn poses_of_a_camera_against_those_of_the_lidar_need_its_calibration() {
     let calibration = fpmcl::recording::Calibration::read(&folder.path("calib.txt")).unwrap();
     let poses: Vec<Pose3> = times(300, 0.0, 10.0).map(truth_at).collect();
     let world = calibration.cam0_from_lidar;
-    fpmcl::recording::poses::write_kitti(
+    fpmcl::recording::write_kitti(
         fs::File::create(folder.path("camera.txt")).unwrap(),
         &poses,
         &world,

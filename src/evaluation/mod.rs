@@ -3,23 +3,23 @@
 //! [`metrics`] computes the errors of the literature, [`range_mcl`] those of range-mcl's
 //! evaluation script. Everything here works on values; files are read and written elsewhere.
 
-pub mod alignment;
-pub mod convergence;
-pub mod drift;
+pub(crate) mod alignment;
+pub(crate) mod convergence;
+pub(crate) mod drift;
 mod ground_score;
-pub mod map_quality;
-pub mod map_truth;
-pub mod metrics;
-pub mod planar;
-pub mod pose_error;
-pub mod range_mcl;
-pub mod smoothness;
-pub mod spatial;
-pub mod statistics;
+pub(crate) mod map_quality;
+pub(crate) mod map_truth;
+pub(crate) mod metrics;
+pub(crate) mod planar;
+pub(crate) mod pose_error;
+pub(crate) mod range_mcl;
+pub(crate) mod smoothness;
+pub(crate) mod spatial;
+pub(crate) mod statistics;
 mod surface_distance;
-pub mod trust;
+pub(crate) mod trust;
 
-pub use alignment::{Alignment, aligned, rigid_alignment};
+pub use alignment::{Alignment, aligned};
 pub use convergence::{Convergence, StrictSuccess};
 pub use drift::{DriftPoint, drift};
 pub use ground_score::{
@@ -27,12 +27,21 @@ pub use ground_score::{
 };
 pub use map_quality::MapQuality;
 pub use map_truth::TruthAgreement;
-pub use metrics::{EvaluatedTrajectory, MetricsConfig, MetricsError, TrajectoryMetrics};
-pub use planar::{PlanarError, distances_m, planar_errors};
+pub use metrics::{
+    AxisError, EvaluatedTrajectory, MetricsConfig, MetricsError, Smoothness, TrajectoryMetrics,
+};
+pub use planar::PlanarError;
 pub use pose_error::{
-    KITTI_FRAME_STEP, KITTI_LENGTHS_M, Pairs, SHORT_LENGTHS_M, Segment, SegmentErrors,
-    absolute_pose_error, kitti_segment_errors, relative_pose_error, segments,
+    Pairs, PoseErrors, SegmentErrors, absolute_pose_error, kitti_segment_errors,
+    relative_pose_error,
 };
 pub use range_mcl::{ParticleRow, RangeMclErrors, RangeMclRules};
 pub use spatial::{LengthErrors, SpatialMetrics};
 pub use statistics::Summary;
+pub use trust::{Trust, TrustedRun};
+
+pub(crate) use alignment::rigid_alignment;
+pub(crate) use planar::{distances_m, planar_errors};
+pub(crate) use pose_error::{
+    KITTI_FRAME_STEP, KITTI_LENGTHS_M, SHORT_LENGTHS_M, Segment, segments,
+};

@@ -30,13 +30,15 @@ mod scenes_for_tests;
 mod tests;
 
 pub use classifier::GroundClassifier;
-pub use config::{GroundConfig, GroundMethod, NamedClassifier};
+pub use config::{GroundConfig, GroundMethod};
 pub use features::{FeatureConfig, Features};
 pub use fuzzy::{Explanation, FuzzyConfig, FuzzyGround};
-pub use inference::{FuzzySystem, Inference};
+pub use inference::Inference;
 pub use membership::{MembershipFunction, Operators};
 pub use pca::{PcaGround, ReportRule};
 pub use ransac::RansacGround;
 pub use road::{RoadPlane, road_plane};
 pub use rules::Vocabulary;
 pub use terrain::TerrainConfig;
+
+pub(crate) use config::NamedClassifier;

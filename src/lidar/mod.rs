@@ -1,18 +1,23 @@
 //! The sensor: projection model, scans, motion compensation, range images and their normals.
 
-pub mod deskewing;
+pub(crate) mod deskewing;
 mod lanes;
-pub mod model;
-pub mod normals;
-pub mod projection;
-pub mod range_image;
-pub mod scan;
-pub mod spatial_normals;
+pub(crate) mod model;
+pub(crate) mod normals;
+pub(crate) mod projection;
+pub(crate) mod range_image;
+pub(crate) mod scan;
+pub(crate) mod spatial_normals;
 
-pub use deskewing::{Motion, PERIOD_S, Rotation, RotationDirection, Sweep, interpolate_motion};
+pub use deskewing::{Motion, Rotation, RotationDirection};
 pub use model::LidarModel;
-pub use normals::{NormalConfig, estimate_normals};
-pub use projection::Projection;
-pub use range_image::{NO_RETURN, RangeImage};
-pub use scan::{Beam, Scan, interval_s};
-pub use spatial_normals::estimate_spatial_normals;
+pub use normals::NormalConfig;
+pub use range_image::RangeImage;
+pub use scan::{Beam, Scan};
+
+pub(crate) use deskewing::{PERIOD_S, Sweep, interpolate_motion};
+pub(crate) use normals::estimate_normals;
+pub(crate) use projection::Projection;
+pub(crate) use range_image::NO_RETURN;
+pub(crate) use scan::interval_s;
+pub(crate) use spatial_normals::estimate_spatial_normals;

@@ -13,38 +13,46 @@
 //! *Range Image-based LiDAR Localization for Autonomous Vehicles*, ICRA 2021.
 
 // State, input and output.
-pub mod config;
-pub mod estimate;
-pub mod odometry;
-pub mod particles;
+pub(crate) mod config;
+pub(crate) mod estimate;
+pub(crate) mod odometry;
+pub(crate) mod particles;
 mod preparation;
 mod sweep;
 // One step of the filter.
-pub mod initialization;
-pub mod motion;
-pub mod observation;
-pub mod places;
-pub mod proposal;
-pub mod resampling;
-pub mod tempering;
+pub(crate) mod initialization;
+pub(crate) mod motion;
+pub(crate) mod observation;
+pub(crate) mod places;
+pub(crate) mod proposal;
+pub(crate) mod resampling;
+pub(crate) mod tempering;
 // Confidence.
-pub mod convergence;
-pub mod likelihood;
-pub mod tracking_loss;
+pub(crate) mod convergence;
+pub(crate) mod likelihood;
+pub(crate) mod tracking_loss;
 // The loop.
-pub mod filter;
-pub mod localizer;
+pub(crate) mod filter;
+pub(crate) mod localizer;
 mod second_drive;
-pub mod tracker;
+pub(crate) mod tracker;
 
 pub use config::LocalizerConfig;
+pub use convergence::ConvergenceConfig;
 pub use estimate::Estimate;
-pub use filter::ParticleFilter;
-pub use initialization::StartSpread;
+pub use initialization::{StartDistribution, StartSpread};
 pub use localizer::{Localizer, LocalizerError, Start};
+pub use motion::{OdometryNoise, VelocityNoise};
+pub use observation::{Likelihood, ObservationConfig};
 pub use odometry::Odometry;
 pub use particles::{Particle, ParticleSet};
-pub(crate) use preparation::ScanPreparation;
+pub use places::PlacesConfig;
+pub use proposal::ProposalConfig;
+pub use resampling::{KldConfig, ResamplingConfig};
 pub use second_drive::{SecondDrive, SecondDriveError};
+pub use tempering::TemperingConfig;
 pub use tracker::{Tracker, TrackerConfig, TrackerError};
 pub use tracking_loss::{State, TrackingLossConfig};
+
+pub(crate) use filter::ParticleFilter;
+pub(crate) use preparation::ScanPreparation;

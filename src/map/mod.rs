@@ -4,26 +4,31 @@
 //! > into [`tiles`] that are loaded where the car is; it knows its [`ground`], the [`places`] where a car may be, and
 //! > what renders it.
 
-pub mod build;
-pub mod files;
-pub mod ground;
-pub mod mesh_view;
-pub mod model;
-pub mod places;
-pub mod tiles;
+pub(crate) mod build;
+pub(crate) mod files;
+pub(crate) mod ground;
+pub(crate) mod mesh_view;
+pub(crate) mod model;
+pub(crate) mod places;
+pub(crate) mod tiles;
 
 #[cfg(test)]
 pub(crate) mod world_for_tests;
 
 pub use build::builder::{BuildError, BuildEvent, MapBuilder, MapPlan, ReadScan, ScanError};
 pub use build::cloud::CloudPlan;
+pub use build::confidence::ConfidenceConfig;
 pub use build::config::{MapConfig, MapOptions, PoseSource};
 pub use build::local_map::{LocalMap, LocalMapConfig, LocalMapCounts};
+pub use build::path_check::ImplausiblePath;
+pub use build::scan_cloud::{PointCounts, ScanConfig};
+pub use build::visibility::VisibilityConfig;
 pub use files::mapping_path::MappingPath;
 pub use files::mesh_error::{MeshFileError, MeshFileProblem};
 pub use ground::elevation::{GroundMap, GroundPatch, SensorAttitude};
-pub use model::{Map, MapError, surface_of};
-pub use places::panorama::{
-    PanoramaConfig, PanoramaIndex, PanoramaRequest, PanoramaSeed, SearchRegion,
-};
+pub use model::{Map, MapError};
+pub use places::panorama::{PanoramaConfig, SearchRegion};
 pub use tiles::grid::{TileConfig, TileGrid, TileIndex};
+
+pub(crate) use model::surface_of;
+pub(crate) use places::panorama::{PanoramaIndex, PanoramaRequest, PanoramaSeed};

@@ -17,8 +17,10 @@ use std::sync::Arc;
 
 pub use error::MappingError;
 pub use pose_report::{PoseReport, Tilt};
-pub use poses::{check_path, key_frames, localizer, poses_of, with_given_poses};
-pub use trajectory::{ADJUSTMENT, LoopCounts, TrajectorySummary, find_poses, find_poses_in};
+pub use trajectory::{LoopCounts, TrajectorySummary};
+
+pub(crate) use poses::{check_path, key_frames, localizer, poses_of, with_given_poses};
+pub(crate) use trajectory::{ADJUSTMENT, find_poses, find_poses_in};
 
 use crate::map::{BuildError, Map, MapBuilder, MapConfig, MappingPath, PoseSource};
 use crate::odometry::{Trajectory, TrajectoryConfig};

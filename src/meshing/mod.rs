@@ -2,9 +2,9 @@
 //! surface, simplification of the ground.
 
 // The pipeline.
-pub mod poisson;
-pub mod simplify;
-pub mod trimming;
+pub(crate) mod poisson;
+pub(crate) mod simplify;
+pub(crate) mod trimming;
 // Its parts, in the order of their use.
 mod adjacency;
 mod base_grid;
@@ -23,10 +23,11 @@ mod stencil;
 mod weights;
 
 pub use error::MeshingError;
-pub use manifold::split_fans;
 pub use poisson::{PoissonConfig, Reconstruction, reconstruct};
-pub use simplify::simplify_ground;
-pub use trimming::{trim_by_density, trim_by_distance};
+
+pub(crate) use manifold::split_fans;
+pub(crate) use simplify::simplify_ground;
+pub(crate) use trimming::{trim_by_density, trim_by_distance};
 
 #[cfg(test)]
 mod reconstruction_tests;

@@ -44,19 +44,21 @@ mod sampling;
 mod scan_context;
 mod search;
 mod state;
-mod timing;
+pub(crate) mod timing;
 mod trajectory;
 mod voxel_map;
 
 pub use adjustment::{Adjusted, AdjustmentConfig};
-pub use anchors::{NotInMap, PlacementError};
 pub use config::OdometryConfig;
 pub use elevation_bias::ElevationBias;
 pub use loops::{Loop, LoopVerdict};
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
-pub use pose_check::{GivenPoses, MotionDifference, PoseCheck, PoseFit, PoseMeaning, check_poses};
-pub use timing::{TimingComparison, TimingError, compare_timings, order_of_firing};
+pub use pose_check::{MotionDifference, PoseCheck, PoseFit, PoseMeaning};
 pub use trajectory::{Trajectory, TrajectoryBuilder, TrajectoryConfig};
+
+pub(crate) use anchors::{NotInMap, PlacementError};
+pub(crate) use pose_check::{GivenPoses, check_poses};
+pub(crate) use timing::{TimingComparison, TimingError, compare_timings, order_of_firing};
 
 #[cfg(test)]
 mod tests;

@@ -10,28 +10,33 @@
 
 // Scans.
 #[cfg(feature = "bags")]
-pub mod bags;
-pub mod frame;
-pub mod layout;
-pub mod open;
-pub mod scan_files;
-pub mod scan_list;
-pub mod velodyne;
+pub(crate) mod bags;
+pub(crate) mod frame;
+pub(crate) mod layout;
+pub(crate) mod open;
+pub(crate) mod scan_files;
+pub(crate) mod scan_list;
+pub(crate) mod velodyne;
 // Poses.
-pub mod calibration;
+pub(crate) mod calibration;
 mod oxts;
-pub mod poses;
-pub mod track;
+pub(crate) mod poses;
+pub(crate) mod track;
 // Text files and errors.
 mod error;
 mod table;
 
 #[cfg(feature = "bags")]
-pub use bags::Bag;
+pub use bags::{Bag, Topic, TopicKind};
 pub use calibration::Calibration;
 pub use error::RecordingError;
 pub use frame::{Frame, ScanSource};
+pub use layout::{Layout, RecordingFiles};
 pub use open::Recording;
-pub use poses::MapFrame;
+pub use poses::{read_times, read_tum, write_kitti, write_times, write_tum};
+pub use scan_files::read as read_scan;
 pub use scan_list::Selection;
 pub use track::PoseTrack;
+pub use velodyne::{read_labels, write_labels, write_scan};
+
+pub(crate) use poses::MapFrame;

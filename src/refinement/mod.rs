@@ -7,21 +7,25 @@
 //!
 //! No step makes an estimate worse by its own measure: what does not lower the cost is rejected.
 
-pub mod objective;
-pub mod refiner;
-pub mod smoothing;
-pub mod swarm;
-pub mod trajectory;
-pub mod upright;
-pub mod wide_search;
+pub(crate) mod objective;
+pub(crate) mod refiner;
+pub(crate) mod smoothing;
+pub(crate) mod swarm;
+pub(crate) mod trajectory;
+pub(crate) mod upright;
+pub(crate) mod wide_search;
 
-pub use objective::FrameObjective;
-pub use refiner::{Distance, FrameRefinementConfig, Method, RefinedFrame, refine_frame};
-pub use smoothing::{FramePrior, SmoothingConfig, smooth};
+pub use refiner::{FrameRefinementConfig, Method};
+pub use smoothing::SmoothingConfig;
+pub use swarm::SwarmConfig;
 pub use trajectory::{
     FrameResult, InitialEstimate, RefinedTrajectory, RefinerConfig, RefinerError, TrajectoryRefiner,
 };
 pub use wide_search::WideSearchConfig;
+
+pub(crate) use objective::FrameObjective;
+pub(crate) use refiner::{Distance, RefinedFrame, refine_frame};
+pub(crate) use smoothing::{FramePrior, smooth};
 
 #[cfg(test)]
 impl crate::map::world_for_tests::TestWorld {

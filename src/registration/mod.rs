@@ -90,7 +90,7 @@ impl Validate for RegistrationConfig {
 
 /// A registered pose with its covariance.
 #[derive(Clone, Debug, PartialEq)]
-pub struct RegistrationResult {
+pub(crate) struct RegistrationResult {
     /// `p_map = map_from_lidar * p_lidar`.
     pub map_from_lidar: Pose3,
     /// Covariance of (x, y, z, roll, pitch, yaw) in the lidar frame [m, rad]; zero for components
@@ -102,7 +102,7 @@ pub struct RegistrationResult {
 
 impl RegistrationResult {
     /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
-    pub fn planar_covariance(&self) -> Matrix3<f64> {
+    pub(crate) fn planar_covariance(&self) -> Matrix3<f64> {
         let rotation = self.map_from_lidar.rotation.to_rotation_matrix();
         let mut map_from_lidar = Matrix6::zeros();
         for corner in [0, 3] {
@@ -125,7 +125,7 @@ struct Residual {
 
 /// Registers beams to the map, starting at `initial`; `None` if the beams do not determine the pose.
 /// The caller has to check whether the result is an improvement.
-pub fn register(
+pub(crate) fn register(
     renderer: &dyn RangeRenderer,
     beams: &[Beam],
     initial: &Pose3,
@@ -158,7 +158,7 @@ pub fn register(
 
 /// Registers beams from farther away in two stages: the first of `beams` with a kernel of `wide_kernel_m`, then the second
 /// as configured. A pose that is not accepted ends it; the last accepted one is returned, if any.
-pub fn register_coarse_to_fine(
+pub(crate) fn register_coarse_to_fine(
     renderer: &dyn RangeRenderer,
     beams: [&[Beam]; 2],
     initial: &Pose3,

@@ -3,15 +3,16 @@
 //! The product's own likelihood compares beams along the very directions that were measured; that of range-mcl compares
 //! whole range images, rendered at pixel centres.
 
-pub mod backend;
-pub mod cpu;
+pub(crate) mod backend;
+pub(crate) mod cpu;
 #[cfg(feature = "gpu")]
-pub mod gpu;
+pub(crate) mod gpu;
 mod order;
-pub mod selection;
+pub(crate) mod selection;
 
 pub use backend::{Backend, RenderingMethod};
-pub use cpu::CpuRenderer;
+
+pub(crate) use cpu::CpuRenderer;
 
 use std::sync::Arc;
 

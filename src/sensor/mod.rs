@@ -13,28 +13,30 @@
 //! one direction: they count once for beams and columns, and a range image keeps the nearer one.
 
 mod beam;
-pub mod beams;
-pub mod columns;
+pub(crate) mod beams;
+pub(crate) mod columns;
 mod config;
-pub mod dropped;
+pub(crate) mod dropped;
 mod elevations;
-pub mod inference;
-pub mod mounting;
+pub(crate) mod inference;
+pub(crate) mod mounting;
 mod named;
-pub mod own_car;
-pub mod projection;
-pub mod rotation;
+pub(crate) mod own_car;
+pub(crate) mod projection;
+pub(crate) mod rotation;
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-pub use beam::BeamReturns;
+pub(crate) use beam::BeamReturns;
 pub use beams::BeamSource;
 pub use config::{MotionCompensation, RangeImageConfig, SensorConfig};
 pub use dropped::{DropReason, DroppedPoints};
-pub use inference::{SensorError, TIMING_SCANS, spread_scans};
+pub use inference::SensorError;
 pub use mounting::Mounting;
+
+pub(crate) use inference::{TIMING_SCANS, spread_scans};
 
 use crate::lidar::{LidarModel, RotationDirection};
 use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};

@@ -5,20 +5,20 @@
 //! > [`local_map`] meshes and cuts what belongs to it, [`changes`] compares with an older map. [`builder`] does all
 //! > of it.
 
-pub mod builder;
-pub mod changes;
-pub mod confidence;
-pub mod config;
-pub mod local_map;
-pub mod path_check;
-pub mod plan;
-pub mod scan_agreement;
-pub mod scan_cloud;
+pub(crate) mod builder;
+pub(crate) mod changes;
+pub(crate) mod confidence;
+pub(crate) mod config;
+pub(crate) mod local_map;
+pub(crate) mod path_check;
+pub(crate) mod plan;
+pub(crate) mod scan_agreement;
+pub(crate) mod scan_cloud;
 mod seam;
 pub(crate) mod vertex_ground;
-pub mod visibility;
+pub(crate) mod visibility;
 // Point clouds from elsewhere.
-pub mod cloud;
+pub(crate) mod cloud;
 mod cloud_normals;
 
 #[cfg(test)]

@@ -1,5 +1,5 @@
 //! Tiles of a map: squares that are made once, kept on disk, and loaded where the car is.
 
 mod file;
-pub mod grid;
+pub(crate) mod grid;
 pub(crate) mod store;

@@ -1,7 +1,7 @@
 //! Files of one scan: `.bin` of KITTI, SemanticKITTI and nuScenes, `.pcd`, `.ply` and `.npy`.
 
 mod bin;
-pub mod npy;
+pub(crate) mod npy;
 mod pcd;
 mod ply;
 pub(super) mod point_table;
