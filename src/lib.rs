@@ -88,6 +88,14 @@
     rustdoc::broken_intra_doc_links,
     reason = "units in brackets, such as [m], are no links"
 )]
+#![cfg_attr(
+    not(all(feature = "cli", feature = "gpu", feature = "bags")),
+    allow(
+        dead_code,
+        unused_imports,
+        reason = "what only the program, the graphics card or bags use is dead without them"
+    )
+)]
 
 // Foundations.
 mod files;

@@ -43,7 +43,11 @@ pub fn set_budget(bytes: u64) {
 }
 
 /// Requires that an estimate [bytes] is within the budget.
-pub(crate) fn require(what: &'static str, bytes: f64, remedy: &'static str) -> Result<(), MemoryError> {
+pub(crate) fn require(
+    what: &'static str,
+    bytes: f64,
+    remedy: &'static str,
+) -> Result<(), MemoryError> {
     let budget = BUDGET.load(Ordering::Relaxed) as f64;
     if bytes <= budget {
         return Ok(());

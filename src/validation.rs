@@ -62,7 +62,10 @@ const SMALLEST: f64 = 1e-9;
 const LARGEST: f64 = 1e6;
 
 /// Requires a value greater than 0, from 1e-9 to a million.
-pub(crate) fn positive<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), InvalidValue> {
+pub(crate) fn positive<N: Into<f64> + Copy + Display>(
+    key: &str,
+    value: N,
+) -> Result<(), InvalidValue> {
     let number: f64 = value.into();
     require(number > 0.0, key, value, "it must be greater than 0")?;
     // Values of single precision are rounded.
@@ -94,7 +97,10 @@ pub(crate) fn not_negative<N: Into<f64> + Copy + Display>(
 }
 
 /// Requires a value between minus and plus a million.
-pub(crate) fn bounded<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), InvalidValue> {
+pub(crate) fn bounded<N: Into<f64> + Copy + Display>(
+    key: &str,
+    value: N,
+) -> Result<(), InvalidValue> {
     let remedy = format!("it must lie between -{LARGEST} and {LARGEST}");
     require(value.into().abs() <= LARGEST, key, value, remedy)
 }
@@ -110,7 +116,10 @@ pub(crate) fn in_range<N: PartialOrd + Display>(
 }
 
 /// Requires a value from 0 to 1.
-pub(crate) fn fraction<N: Into<f64> + Copy + Display>(key: &str, value: N) -> Result<(), InvalidValue> {
+pub(crate) fn fraction<N: Into<f64> + Copy + Display>(
+    key: &str,
+    value: N,
+) -> Result<(), InvalidValue> {
     let holds = (0.0..=1.0).contains(&value.into());
     require(holds, key, value, "it must lie between 0 and 1")
 }

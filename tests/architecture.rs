@@ -448,8 +448,10 @@ fn layers(lib: &str) -> Vec<Vec<String>> {
         if line.starts_with("// ") {
             layers.push(Vec::new());
         } else if let Some(module) = line.trim_start_matches("pub ").strip_prefix("mod ") {
-            let module = module.trim_end_matches(';').to_owned();
-            layers.last_mut().unwrap().push(module);
+            // A body in place of the semicolon makes no layer.
+            if let Some(module) = module.strip_suffix(';') {
+                layers.last_mut().unwrap().push(module.to_owned());
+            }
         }
     }
     layers
@@ -598,6 +600,23 @@ fn the_table_of_the_front_page_lists_the_layers() {
             .collect()
     };
     assert_eq!(rows.map(names_of).collect::<Vec<_>>(), layers(&lib));
+}
+
+#[test]
+fn users_of_the_library_do_not_compile_the_simulation() {
+    let declaration = "#[cfg(feature = \"simulation\")]\npub mod simulation;";
+    assert!(text_of("lib.rs").contains(declaration));
+    let users: Vec<PathBuf> = sources()
+        .into_iter()
+        .filter(|it| !it.is_below(&["app", "simulation"]))
+        .filter(|it| {
+            it.lines
+                .iter()
+                .any(|(_, line)| line.contains("simulation::"))
+        })
+        .map(|it| it.path)
+        .collect();
+    assert!(users.is_empty(), "{users:?}");
 }
 
 #[test]

@@ -10,8 +10,8 @@ use std::fs;
 use std::path::Path;
 
 use fpmcl::geometry::{Pose3, Vec3};
-use fpmcl::lidar::Scan;
 use fpmcl::internals::{FramePose, scan_files};
+use fpmcl::lidar::Scan;
 use fpmcl::recording::{Bag, PoseTrack, RecordingError, TopicKind};
 use rayon::prelude::*;
 

@@ -10,9 +10,9 @@ use std::path::Path;
 
 use common::{Fpmcl, Recording, fpmcl};
 use fpmcl::geometry::Vec3;
-use fpmcl::internals::surface_area_m2;
 use fpmcl::internals::mesh_file;
 use fpmcl::internals::scan_files;
+use fpmcl::internals::surface_area_m2;
 use serde_json::Value;
 
 const RESULT: &str = "results/localization.npz";

@@ -26,14 +26,14 @@ use fpmcl::app::settings::{
     LocalizationConfig, RefinementConfig,
 };
 use fpmcl::geometry::{Pose2, Pose3, TriangleMesh};
-use fpmcl::internals::FARTHEST_M;
-use fpmcl::lidar::{Rotation, RotationDirection, Scan};
-use fpmcl::internals::ply;
 use fpmcl::internals::CameraPoses;
-use fpmcl::recording::{read_times, read_tum, write_kitti, write_times, write_tum};
-use fpmcl::recording::{read_labels, write_labels, write_scan};
+use fpmcl::internals::FARTHEST_M;
+use fpmcl::internals::ply;
 use fpmcl::internals::scan_files;
+use fpmcl::lidar::{Rotation, RotationDirection, Scan};
 use fpmcl::recording::{Calibration, Recording};
+use fpmcl::recording::{read_labels, write_labels, write_scan};
+use fpmcl::recording::{read_times, read_tum, write_kitti, write_times, write_tum};
 use fpmcl::simulation::SimulationConfig;
 
 use fuzzed::files;

@@ -10,8 +10,8 @@ use std::path::Path;
 
 use bag_writers::{Cloud, Kind, Recorded, mcap, point_cloud2};
 use fpmcl::geometry::Vec3;
-use fpmcl::lidar::Scan;
 use fpmcl::internals::scan_files;
+use fpmcl::lidar::Scan;
 use fpmcl::recording::{Bag, PoseTrack, Recording};
 
 const START_NS: u64 = 1_700_000_000_250_000_000;

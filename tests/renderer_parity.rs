@@ -11,11 +11,11 @@ mod common;
 use std::path::Path;
 
 use fpmcl::geometry::{Pose2, Pose3, TriangleMesh, Vec3};
+use fpmcl::internals::CpuRenderer;
+use fpmcl::internals::{GpuRenderer, ImageMethod};
 use fpmcl::lidar::{Beam, LidarModel, RangeImage};
 use fpmcl::localization::ObservationConfig;
 use fpmcl::localization::ParticleSet;
-use fpmcl::internals::CpuRenderer;
-use fpmcl::internals::{GpuRenderer, ImageMethod};
 use fpmcl::rendering::{Backend, RangeDifference, RangeRenderer, RenderError, RenderingMethod};
 
 use brute_force::{BruteForce, room, street};

@@ -5,8 +5,8 @@
 mod common;
 
 use common::Recording;
-use fpmcl::internals::ply;
 use fpmcl::internals::Scene;
+use fpmcl::internals::ply;
 use glam::Vec3;
 
 /// Height of the road in the frame of the first scan [m].

@@ -9,8 +9,8 @@ use std::fs;
 use std::path::Path;
 
 use fpmcl::internals::estimate_spatial_normals;
-use fpmcl::lidar::{NormalConfig, RangeImage, Scan};
 use fpmcl::internals::scan_files;
+use fpmcl::lidar::{NormalConfig, RangeImage, Scan};
 use fpmcl::sensor::{BeamSource, DroppedPoints, Sensor, SensorConfig};
 
 fn infer(scans: &[Scan]) -> Sensor {

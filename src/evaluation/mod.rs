@@ -42,6 +42,3 @@ pub use trust::{Trust, TrustedRun};
 
 pub(crate) use alignment::rigid_alignment;
 pub(crate) use planar::{distances_m, planar_errors};
-pub(crate) use pose_error::{
-    KITTI_FRAME_STEP, KITTI_LENGTHS_M, SHORT_LENGTHS_M, Segment, segments,
-};

@@ -40,5 +40,3 @@ pub use ransac::RansacGround;
 pub use road::{RoadPlane, road_plane};
 pub use rules::Vocabulary;
 pub use terrain::TerrainConfig;
-
-pub(crate) use config::NamedClassifier;

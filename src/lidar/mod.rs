@@ -18,6 +18,5 @@ pub use scan::{Beam, Scan};
 pub(crate) use deskewing::{PERIOD_S, Sweep, interpolate_motion};
 pub(crate) use normals::estimate_normals;
 pub(crate) use projection::Projection;
-pub(crate) use range_image::NO_RETURN;
 pub(crate) use scan::interval_s;
 pub(crate) use spatial_normals::estimate_spatial_normals;

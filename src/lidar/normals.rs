@@ -389,7 +389,8 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
-    use crate::lidar::{LidarModel, NO_RETURN};
+    use crate::lidar::LidarModel;
+    use crate::lidar::range_image::NO_RETURN;
     use crate::simd::Baseline;
 
     /// The image of a scene given as the range along a unit direction.

@@ -54,5 +54,4 @@ pub use tempering::TemperingConfig;
 pub use tracker::{Tracker, TrackerConfig, TrackerError};
 pub use tracking_loss::{State, TrackingLossConfig};
 
-pub(crate) use filter::ParticleFilter;
 pub(crate) use preparation::ScanPreparation;

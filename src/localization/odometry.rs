@@ -55,7 +55,8 @@ pub fn motions(world_from_lidar: &[Pose3]) -> Vec<Pose3> {
 }
 
 /// The same motions in the plane of the car.
-pub fn increments(world_from_lidar: &[Pose3]) -> Vec<Pose2> {
+#[cfg(test)]
+pub(crate) fn increments(world_from_lidar: &[Pose3]) -> Vec<Pose2> {
     let motions = motions(world_from_lidar);
     motions.iter().map(pose2_from_pose3).collect()
 }

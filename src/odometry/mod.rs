@@ -56,9 +56,9 @@ pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 pub use pose_check::{MotionDifference, PoseCheck, PoseFit, PoseMeaning};
 pub use trajectory::{Trajectory, TrajectoryBuilder, TrajectoryConfig};
 
-pub(crate) use anchors::{NotInMap, PlacementError};
+pub(crate) use anchors::PlacementError;
 pub(crate) use pose_check::{GivenPoses, check_poses};
-pub(crate) use timing::{TimingComparison, TimingError, compare_timings, order_of_firing};
+pub(crate) use timing::{TimingComparison, TimingError, compare_timings};
 
 #[cfg(test)]
 mod tests;

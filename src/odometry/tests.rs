@@ -5,6 +5,7 @@ use nalgebra::{Point3, Vector3};
 use rand::{SeedableRng as _, rngs::StdRng};
 use rand_distr::{Distribution as _, StandardNormal};
 
+use super::timing::order_of_firing;
 use super::*;
 use crate::geometry::{Pose3, wrap_angle};
 use crate::lidar::{Rotation, RotationDirection, Scan};

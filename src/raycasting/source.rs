@@ -53,7 +53,6 @@ pub struct TileError {
 
 /// What is wrong with a tile.
 #[derive(Debug, thiserror::Error)]
-#[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum TileProblem {
     #[error("{0}")]
     Read(#[from] std::io::Error),

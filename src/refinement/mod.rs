@@ -23,15 +23,11 @@ pub use trajectory::{
 };
 pub use wide_search::WideSearchConfig;
 
-pub(crate) use objective::FrameObjective;
-pub(crate) use refiner::{Distance, RefinedFrame, refine_frame};
-pub(crate) use smoothing::{FramePrior, smooth};
-
 #[cfg(test)]
 impl crate::map::world_for_tests::TestWorld {
     /// The objective of a scan from the street.
-    fn objective<'a>(&'a self, beams: &'a [crate::lidar::Beam]) -> FrameObjective<'a> {
-        FrameObjective {
+    fn objective<'a>(&'a self, beams: &'a [crate::lidar::Beam]) -> objective::FrameObjective<'a> {
+        objective::FrameObjective {
             renderer: self,
             ground: &self.ground,
             beams,

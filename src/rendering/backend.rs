@@ -32,7 +32,6 @@ pub enum RenderingMethod {
 
 /// Type of a graphics adapter, best first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-#[expect(missing_docs, reason = "the names are the documentation")]
 pub enum AdapterKind {
     Discrete,
     Integrated,

@@ -29,7 +29,6 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-pub(crate) use beam::BeamReturns;
 pub use beams::BeamSource;
 pub use config::{MotionCompensation, RangeImageConfig, SensorConfig};
 pub use dropped::{DropReason, DroppedPoints};

@@ -212,7 +212,7 @@ mod tests {
         };
         let mut ranges = vec![20.0; model.len()];
         ranges[8 + 7] = 5.0;
-        ranges[2] = crate::lidar::NO_RETURN;
+        ranges[2] = crate::lidar::range_image::NO_RETURN;
         let free = free_ranges(&RangeImage::from_ranges(ranges, &model));
         assert_eq!(free[2], 0.0);
         assert_eq!(free[3], 20.0);
