@@ -29,7 +29,7 @@ pub enum Alignment {
 impl Alignment {
     /// The transform `truth_from_estimate`; `None` without poses, and for `Rigid` on a straight line or a point,
     /// which does not determine it.
-    pub fn transform(self, estimates: &[Pose3], truth: &[Pose3]) -> Option<Pose3> {
+    pub(crate) fn transform(self, estimates: &[Pose3], truth: &[Pose3]) -> Option<Pose3> {
         match self {
             Self::None => Some(Pose3::identity()),
             Self::First => Some(truth.first()? * estimates.first()?.inverse()),

@@ -44,7 +44,7 @@ impl StrictSuccess {
     }
 
     /// The convergence of a run; `None` if it never converged.
-    pub fn convergence(
+    pub(crate) fn convergence(
         &self,
         errors: &[PlanarError],
         distances_m: &[f64],

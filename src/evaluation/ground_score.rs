@@ -115,7 +115,7 @@ pub struct LabelledPoints {
 
 impl LabelledPoints {
     /// Returns whether each point is ground; `None` for excluded points. Empty without classes.
-    pub fn truth(&self, protocol: GroundProtocol) -> Vec<Option<bool>> {
+    pub(crate) fn truth(&self, protocol: GroundProtocol) -> Vec<Option<bool>> {
         let classes = self.classes.iter().flatten();
         let points = self.points.iter().zip(classes);
         points
@@ -170,7 +170,6 @@ pub struct GroundMethodReport {
 
 /// The scores of a confusion matrix, 0 to 1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-#[expect(missing_docs, reason = "the methods of `GroundScore` define them")]
 pub struct GroundScores {
     pub precision: f64,
     pub recall: f64,

@@ -21,12 +21,7 @@ pub(crate) mod trust;
 
 pub use alignment::{Alignment, aligned};
 pub use convergence::{Convergence, StrictSuccess};
-pub use drift::{DriftPoint, drift};
-pub use ground_score::{
-    GroundMethodReport, GroundProtocol, GroundScore, GroundScores, GroundTally, LabelledPoints,
-};
-pub use map_quality::MapQuality;
-pub use map_truth::TruthAgreement;
+pub use ground_score::{GroundProtocol, GroundScore, LabelledPoints};
 pub use metrics::{
     AxisError, EvaluatedTrajectory, MetricsConfig, MetricsError, Smoothness, TrajectoryMetrics,
 };
@@ -35,10 +30,13 @@ pub use pose_error::{
     Pairs, PoseErrors, SegmentErrors, absolute_pose_error, kitti_segment_errors,
     relative_pose_error,
 };
-pub use range_mcl::{ParticleRow, RangeMclErrors, RangeMclRules};
 pub use spatial::{LengthErrors, SpatialMetrics};
 pub use statistics::Summary;
-pub use trust::{Trust, TrustedRun};
 
 pub(crate) use alignment::rigid_alignment;
+pub(crate) use drift::{DriftPoint, drift};
+pub(crate) use ground_score::{GroundMethodReport, GroundTally};
+pub(crate) use map_quality::MapQuality;
+pub(crate) use map_truth::TruthAgreement;
 pub(crate) use planar::{distances_m, planar_errors};
+pub(crate) use range_mcl::{ParticleRow, RangeMclErrors, RangeMclRules};

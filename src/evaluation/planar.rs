@@ -26,7 +26,7 @@ pub struct PlanarError {
 
 impl PlanarError {
     /// The error of an estimate.
-    pub fn between(estimate: &Pose2, truth: &Pose2) -> Self {
+    pub(crate) fn between(estimate: &Pose2, truth: &Pose2) -> Self {
         let offset_in_map = estimate.translation.vector - truth.translation.vector;
         let offset_in_car = truth.rotation.inverse() * offset_in_map;
         Self {
@@ -38,7 +38,7 @@ impl PlanarError {
     }
 
     /// Distance from the true position [m].
-    pub fn distance_m(&self) -> f64 {
+    pub(crate) fn distance_m(&self) -> f64 {
         self.offset_in_map.norm()
     }
 }

@@ -40,12 +40,12 @@ impl PoseErrors {
     }
 
     /// Summary of the translations [m]; `None` without errors.
-    pub fn translation(&self) -> Option<Summary> {
+    pub(crate) fn translation(&self) -> Option<Summary> {
         Summary::new(&self.translations_m)
     }
 
     /// Summary of the rotations [rad]; `None` without errors.
-    pub fn rotation(&self) -> Option<Summary> {
+    pub(crate) fn rotation(&self) -> Option<Summary> {
         Summary::new(&self.rotations_rad)
     }
 }
@@ -64,7 +64,7 @@ pub enum Pairs {
 
 impl Pairs {
     /// First and second pose of each pair.
-    pub fn of(self, estimates: &[Pose3]) -> Vec<(usize, usize)> {
+    pub(crate) fn of(self, estimates: &[Pose3]) -> Vec<(usize, usize)> {
         let chain = |ids: Vec<usize>| ids.windows(2).map(|pair| (pair[0], pair[1])).collect();
         match self {
             Self::Frames(delta) => chain((0..estimates.len()).step_by(delta.max(1)).collect()),
@@ -135,7 +135,7 @@ pub struct SegmentErrors {
 
 impl SegmentErrors {
     /// The mean over all segments, as the KITTI benchmark averages; `None` without segments.
-    pub fn mean_of<'a>(segments: impl IntoIterator<Item = &'a Segment>) -> Option<Self> {
+    pub(crate) fn mean_of<'a>(segments: impl IntoIterator<Item = &'a Segment>) -> Option<Self> {
         let (translations, rotations): (Vec<f64>, Vec<f64>) = (segments.into_iter())
             .map(|segment| (segment.translation, segment.rotation_rad_per_m))
             .unzip();

@@ -109,7 +109,7 @@ impl SpatialMetrics {
     }
 
     /// Mean errors of the segments of one length [m]; `None` if the path has none.
-    pub fn of_length(&self, length_m: f64) -> Option<SegmentErrors> {
+    pub(crate) fn of_length(&self, length_m: f64) -> Option<SegmentErrors> {
         let found = self.by_length.iter().find(|it| it.length_m == length_m);
         found.map(|it| it.errors)
     }

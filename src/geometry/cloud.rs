@@ -44,14 +44,14 @@ impl PointCloud {
     }
 
     /// Appends all points of `other`.
-    pub fn append(&mut self, mut other: Self) {
+    pub(crate) fn append(&mut self, mut other: Self) {
         self.positions.append(&mut other.positions);
         self.normals.append(&mut other.normals);
         self.ground.append(&mut other.ground);
     }
 
     /// Keeps the points whose index satisfies `keep`, in order.
-    pub fn retain(&mut self, keep: impl Fn(usize) -> bool) {
+    pub(crate) fn retain(&mut self, keep: impl Fn(usize) -> bool) {
         let mut kept = 0;
         for index in 0..self.len() {
             if keep(index) {
@@ -67,7 +67,7 @@ impl PointCloud {
     }
 
     /// Transforms all points from frame b to frame a.
-    pub fn transform(&mut self, a_from_b: &Rigid3f) {
+    pub(crate) fn transform(&mut self, a_from_b: &Rigid3f) {
         for position in &mut self.positions {
             *position = a_from_b.apply(*position);
         }
@@ -80,7 +80,7 @@ impl PointCloud {
     ///
     /// Voxels are in the order of their first points. A voxel whose normals cancel out (two sides
     /// of a sheet) has the normal of its first point.
-    pub fn downsample(&self, voxel_m: f32) -> Self {
+    pub(crate) fn downsample(&self, voxel_m: f32) -> Self {
         let mut voxel_of: HashMap<IVec3, usize> = HashMap::with_capacity(self.len());
         let mut sums = Self::with_capacity(self.len());
         let mut first = Vec::with_capacity(self.len());

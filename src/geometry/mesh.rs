@@ -34,7 +34,7 @@ impl TriangleMesh {
 
     /// Normal of a triangle by the right-hand rule; its length is twice the area.
     #[inline]
-    pub fn scaled_normal(&self, triangle: usize) -> Vec3 {
+    pub(crate) fn scaled_normal(&self, triangle: usize) -> Vec3 {
         let [a, b, c] = self.corners(triangle);
         (b - a).cross(c - a)
     }
@@ -78,7 +78,7 @@ impl TriangleMesh {
     }
 
     /// Removes the vertices without a triangle and keeps the order of the others.
-    pub fn drop_unreferenced_vertices(&mut self) {
+    pub(crate) fn drop_unreferenced_vertices(&mut self) {
         const UNUSED: u32 = u32::MAX;
         let mut new_index = vec![UNUSED; self.vertices.len()];
         for vertex in self.triangles.iter().flatten() {
@@ -108,7 +108,7 @@ impl TriangleMesh {
     }
 
     /// Computes area-weighted unit vertex normals.
-    pub fn compute_normals(&mut self) {
+    pub(crate) fn compute_normals(&mut self) {
         let mut normals = vec![Vec3::ZERO; self.vertices.len()];
         for triangle in 0..self.triangles.len() {
             let normal = self.scaled_normal(triangle);
@@ -155,7 +155,7 @@ impl Aabb {
 
     /// Bounding box of two boxes.
     #[must_use]
-    pub fn union(self, other: Self) -> Self {
+    pub(crate) fn union(self, other: Self) -> Self {
         Self {
             min: self.min.min(other.min),
             max: self.max.max(other.max),
@@ -173,7 +173,7 @@ impl Aabb {
     }
 
     /// Center [m].
-    pub fn center(&self) -> Vec3 {
+    pub(crate) fn center(&self) -> Vec3 {
         0.5 * (self.min + self.max)
     }
 }

@@ -19,7 +19,7 @@ pub(crate) mod surface_samples;
 pub(crate) mod trajectory;
 
 pub use cloud::PointCloud;
-pub use mesh::TriangleMesh;
+pub use mesh::{Aabb, TriangleMesh};
 pub use pose::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
 pub use trajectory::StampedPose;
 
@@ -27,7 +27,6 @@ pub(crate) use angle::{azimuth_sector, circular_mean, fast_atan2, wrap_angle};
 pub(crate) use degeneracy::Degeneracy;
 pub(crate) use grid::Grid2;
 pub(crate) use kd_tree::KdTree;
-pub(crate) use mesh::Aabb;
 pub(crate) use plane::{PlaneFit, PlaneSums};
 pub(crate) use ply_vertex::PlyVertex;
 pub(crate) use pose::{FARTHEST_M, Rigid3f, yaw};

@@ -50,7 +50,7 @@ impl GroundConfig {
     }
 
     /// Builds the classifiers of all methods with their names for tables: the configured one first.
-    pub fn all_classifiers(&self) -> Result<Vec<NamedClassifier>, InvalidValue> {
+    pub(crate) fn all_classifiers(&self) -> Result<Vec<NamedClassifier>, InvalidValue> {
         let three_features = FuzzyConfig::three_features();
         let mut all: Vec<NamedClassifier> = vec![
             ("fuzzy", Box::new(FuzzyGround::new(self.fuzzy.clone())?)),
@@ -82,7 +82,7 @@ impl Validate for GroundConfig {
 
 impl GroundConfig {
     /// Validates a configuration whose RANSAC keys are at the top level, as in range-mcl's files.
-    pub fn validate_with_flat_ransac(&self) -> Result<(), InvalidValue> {
+    pub(crate) fn validate_with_flat_ransac(&self) -> Result<(), InvalidValue> {
         nested("fuzzy", &self.fuzzy)?;
         nested("pca", &self.pca)?;
         self.ransac.validate()

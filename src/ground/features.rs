@@ -69,13 +69,14 @@ pub struct Features {
 
 impl Features {
     /// Names in rules, in the order of [`to_array`](Self::to_array).
-    pub const NAMES: [&str; 5] = ["slope", "height_variance", "curvature", "height", "relief"];
+    pub(crate) const NAMES: [&str; 5] =
+        ["slope", "height_variance", "curvature", "height", "relief"];
     /// Units, in the same order.
-    pub const UNITS: [&str; 5] = ["deg", "m", "deg", "m", "m"];
+    pub(crate) const UNITS: [&str; 5] = ["deg", "m", "deg", "m", "m"];
 
     /// Returns the inputs of a fuzzy system.
     #[inline]
-    pub fn to_array(&self) -> [f32; 5] {
+    pub(crate) fn to_array(&self) -> [f32; 5] {
         [
             self.slope_deg,
             self.height_variance_m,

@@ -125,7 +125,7 @@ impl FuzzyConfig {
     }
 
     /// The interval in which the sets of a variable differ, with a margin; for charts.
-    pub fn chart_range(&self, variable: &str) -> (f32, f32) {
+    pub(crate) fn chart_range(&self, variable: &str) -> (f32, f32) {
         let sets = self.variables.get(variable).into_iter().flatten();
         let (from, to) = sets
             .map(|(_, function)| function.span())
@@ -202,7 +202,7 @@ impl FuzzyGround {
     }
 
     /// Expresses a confidence in words.
-    pub fn verdict(&self, confidence: f32) -> &'static str {
+    pub(crate) fn verdict(&self, confidence: f32) -> &'static str {
         let (definitely, probably) = (self.config.definitely, self.config.probably);
         if confidence >= definitely {
             "definitely ground"

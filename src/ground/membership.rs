@@ -35,7 +35,7 @@ pub enum MembershipFunction {
 
 impl MembershipFunction {
     /// Returns the degree of membership of `x`; 0 for NaN.
-    pub fn degree(&self, x: f32) -> f32 {
+    pub(crate) fn degree(&self, x: f32) -> f32 {
         let mut degree = [0.0];
         self.degrees(&[x], &mut degree);
         degree[0]
@@ -64,7 +64,7 @@ impl MembershipFunction {
     }
 
     /// Whether the corners are finite and ascend, and a standard deviation is positive.
-    pub fn is_valid(&self) -> bool {
+    pub(crate) fn is_valid(&self) -> bool {
         let corners = self.corners();
         let is_ordered = match *self {
             Self::Gaussian([_, sigma]) => sigma > 0.0,
@@ -74,7 +74,7 @@ impl MembershipFunction {
     }
 
     /// The condition of [`is_valid`](Self::is_valid), for error messages.
-    pub fn requirement(&self) -> &'static str {
+    pub(crate) fn requirement(&self) -> &'static str {
         match self {
             Self::Gaussian(_) => "its mean must be finite and its sigma greater than 0",
             _ => "its corners must be finite and ascend",
@@ -82,7 +82,7 @@ impl MembershipFunction {
     }
 
     /// The interval in which the degree changes; three sigmas to both sides for a Gaussian.
-    pub fn span(&self) -> (f32, f32) {
+    pub(crate) fn span(&self) -> (f32, f32) {
         match *self {
             Self::Trapezoid([a, .., d]) => (a, d),
             Self::Triangle([a, _, c]) => (a, c),

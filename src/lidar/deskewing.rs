@@ -53,7 +53,7 @@ pub struct Rotation {
 
 impl Rotation {
     /// Time of each point from its azimuth, zero in the middle of the revolution [s].
-    pub fn point_times(&self, points: &[Vec3]) -> Vec<f32> {
+    pub(crate) fn point_times(&self, points: &[Vec3]) -> Vec<f32> {
         let sense = match self.direction {
             RotationDirection::Clockwise => -1.0,
             RotationDirection::CounterClockwise => 1.0,
@@ -113,7 +113,7 @@ impl Motion {
     }
 
     /// The motion in a time; backward if it is negative.
-    pub fn after(&self, time_s: f64) -> Pose3 {
+    pub(crate) fn after(&self, time_s: f64) -> Pose3 {
         interpolate_motion(&self.previous_from_current, time_s / self.duration_s)
     }
 

@@ -48,7 +48,7 @@ pub struct LidarModel {
 
 impl LidarModel {
     /// Largest number of pixels: ten times those of the largest sensors.
-    pub const MAX_PIXELS: usize = 1 << 22;
+    pub(crate) const MAX_PIXELS: usize = 1 << 22;
 }
 
 impl Validate for LidarModel {
@@ -116,7 +116,7 @@ impl LidarModel {
     }
 
     /// Whether a range is within the limits; false if it is not finite.
-    pub fn accepts_range(&self, range_m: f32) -> bool {
+    pub(crate) fn accepts_range(&self, range_m: f32) -> bool {
         self.min_range < range_m && range_m < self.max_range
     }
 
@@ -129,7 +129,7 @@ impl LidarModel {
     }
 
     /// Greatest angle between a row and its neighbours [rad].
-    pub fn row_spacing_rad(&self, row: usize) -> f32 {
+    pub(crate) fn row_spacing_rad(&self, row: usize) -> f32 {
         let Some(elevations) = &self.elevations else {
             return self.fov_rad() / self.height as f32;
         };
@@ -139,7 +139,7 @@ impl LidarModel {
     }
 
     /// The unit direction through the center of the pixel at a row-major index.
-    pub fn direction_of(&self, index: usize) -> Vec3 {
+    pub(crate) fn direction_of(&self, index: usize) -> Vec3 {
         let (row, column) = (index / self.width, index % self.width);
         let elevation_rad = self.elevation_rad(row);
         let azimuth_rad = PI * (1.0 - 2.0 * (column as f32 + 0.5) / self.width as f32);
@@ -158,17 +158,17 @@ impl LidarModel {
     }
 
     /// Upper limit of the field of view [rad].
-    pub fn fov_up_rad(&self) -> f32 {
+    pub(crate) fn fov_up_rad(&self) -> f32 {
         self.fov_up.to_radians()
     }
 
     /// Lower limit of the field of view, negative [rad].
-    pub fn fov_down_rad(&self) -> f32 {
+    pub(crate) fn fov_down_rad(&self) -> f32 {
         -self.fov_down.abs().to_radians()
     }
 
     /// Vertical field of view [rad].
-    pub fn fov_rad(&self) -> f32 {
+    pub(crate) fn fov_rad(&self) -> f32 {
         self.fov_up_rad() - self.fov_down_rad()
     }
 }

@@ -81,13 +81,13 @@ impl RangeImage {
     }
 
     /// Index of the projected point in the pixel at a row-major index.
-    pub fn point_index(&self, index: usize) -> Option<usize> {
+    pub(crate) fn point_index(&self, index: usize) -> Option<usize> {
         let point = self.point_indices[index];
         (point != NO_POINT).then_some(point as usize)
     }
 
     /// The beam of a pixel along its measured direction; `None` without a return.
-    pub fn beam(&self, index: usize) -> Option<Beam> {
+    pub(crate) fn beam(&self, index: usize) -> Option<Beam> {
         self.has_return(index).then(|| Beam {
             direction: self.points[index] / self.ranges[index],
             range_m: self.ranges[index],
@@ -95,7 +95,7 @@ impl RangeImage {
     }
 
     /// The measured ranges along the centre rays of their pixels, row-major.
-    pub fn center_beams(&self) -> impl Iterator<Item = Beam> {
+    pub(crate) fn center_beams(&self) -> impl Iterator<Item = Beam> {
         let returns = (0..self.ranges.len()).filter(|&index| self.has_return(index));
         returns.map(|index| Beam {
             direction: self.model.direction_of(index),

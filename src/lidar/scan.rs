@@ -49,7 +49,7 @@ impl Scan {
 
     /// Every n-th of its points.
     #[must_use]
-    pub fn every(&self, n: usize) -> Self {
+    pub(crate) fn every(&self, n: usize) -> Self {
         fn pick<T: Copy>(values: &[T], n: usize) -> Vec<T> {
             values.iter().step_by(n).copied().collect()
         }
@@ -63,7 +63,7 @@ impl Scan {
     }
 
     /// Adds an angle to the elevations of all points [rad]: corrects beams that are mounted higher than they say.
-    pub fn raise(&mut self, angle_rad: f64) {
+    pub(crate) fn raise(&mut self, angle_rad: f64) {
         if angle_rad == 0.0 {
             return;
         }
@@ -84,7 +84,7 @@ impl Scan {
 
     /// Removes points that are not finite or outside the range limits of the model; returns their
     /// number.
-    pub fn drop_invalid(&mut self, model: &LidarModel) -> usize {
+    pub(crate) fn drop_invalid(&mut self, model: &LidarModel) -> usize {
         self.retain(|point| point.is_finite() && model.accepts_range(point.length()))
     }
 
@@ -95,13 +95,13 @@ impl Scan {
 
     /// Drops the points inside a rectangle of the lidar frame, x_min, x_max, y_min, y_max [m], such as
     /// the own car. Returns how many.
-    pub fn drop_inside(&mut self, [x_min, x_max, y_min, y_max]: [f32; 4]) -> usize {
+    pub(crate) fn drop_inside(&mut self, [x_min, x_max, y_min, y_max]: [f32; 4]) -> usize {
         self.retain(|p| !(p.x > x_min && p.x < x_max && p.y > y_min && p.y < y_max))
     }
 
     /// Moves the moment of the scan to the middle of its sweep, and rounds times to microseconds, so that the same
     /// scan of different files has the same times.
-    pub fn center_times(&mut self) {
+    pub(crate) fn center_times(&mut self) {
         let finite = || self.times_s.iter().copied().filter(|time| time.is_finite());
         let first_s = finite().fold(f32::INFINITY, f32::min);
         let last_s = finite().fold(f32::NEG_INFINITY, f32::max);

@@ -85,7 +85,7 @@ impl OdometryNoise {
 
     /// The noise with all standard deviations multiplied.
     #[must_use]
-    pub fn scaled(&self, factor: f64) -> Self {
+    pub(crate) fn scaled(&self, factor: f64) -> Self {
         Self {
             turn_rad: factor * self.turn_rad,
             drive_m: factor * self.drive_m,
@@ -108,7 +108,7 @@ impl OdometryNoise {
 
     /// Covariance of (x, y, heading) of a motion in the axes of the car before it [m², m·rad, rad²],
     /// to first order in the turns.
-    pub fn covariance(&self, motion: &TurnDriveTurn) -> Matrix3<f64> {
+    pub(crate) fn covariance(&self, motion: &TurnDriveTurn) -> Matrix3<f64> {
         let (sin, cos) = motion.first_turn_rad.sin_cos();
         let jacobian = Matrix3x4::from_columns(&[
             Vector3::new(-motion.drive_m * sin, motion.drive_m * cos, 1.0),
@@ -195,7 +195,7 @@ impl Validate for VelocityNoise {
 impl VelocityNoise {
     /// Covariance of (x, y, heading) of the motion of a command in the axes of the car before it
     /// [m², m·rad, rad²], to first order in the noise, for arcs hardly longer than their chord.
-    pub fn covariance(&self, command: &VelocityCommand) -> Matrix3<f64> {
+    pub(crate) fn covariance(&self, command: &VelocityCommand) -> Matrix3<f64> {
         let seconds = command.duration.as_secs_f64();
         let turn_rad = command.turn_rate_rad_per_s * seconds;
         let (middle_sin, middle_cos) = (0.5 * turn_rad).sin_cos();

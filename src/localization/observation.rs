@@ -120,7 +120,7 @@ impl ObservationConfig {
 
     /// Logarithm of the likelihood of a pose that is not on the map: range-mcl's 1e-5, and never
     /// better than the worst that a pose on the map can get.
-    pub fn floor_log_likelihood(&self) -> f64 {
+    pub(crate) fn floor_log_likelihood(&self) -> f64 {
         let worst_m = f64::from(self.short_m.max(self.long_m).max(self.no_surface_m));
         match self.likelihood {
             Likelihood::Reference => 1e-5_f64.ln(),
@@ -129,7 +129,7 @@ impl ObservationConfig {
     }
 
     /// Number of beams per pose for `poses` poses.
-    pub fn beams_for(&self, poses: usize) -> usize {
+    pub(crate) fn beams_for(&self, poses: usize) -> usize {
         (self.ray_budget / poses.max(1))
             .max(self.min_beams)
             .min(self.beams)

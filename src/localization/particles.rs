@@ -25,7 +25,7 @@ pub struct Particle {
 
 impl Particle {
     /// A particle of weight 1.
-    pub fn new(map_from_lidar: Pose2, level_m: Option<f64>) -> Self {
+    pub(crate) fn new(map_from_lidar: Pose2, level_m: Option<f64>) -> Self {
         Self {
             map_from_lidar,
             level_m,
@@ -60,7 +60,7 @@ impl ParticleSet {
     }
 
     /// At least one particle of positive weight; the weights are normalized.
-    pub fn weighted(mut particles: Vec<Particle>) -> Self {
+    pub(crate) fn weighted(mut particles: Vec<Particle>) -> Self {
         let sum: f64 = particles.iter().map(|particle| particle.weight).sum();
         debug_assert!(sum > 0.0, "a distribution needs weight");
         for particle in &mut particles {
@@ -97,7 +97,7 @@ impl ParticleSet {
     }
 
     /// Moves every particle, in order.
-    pub fn propagate(&mut self, mut moved: impl FnMut(&Pose2) -> Pose2) {
+    pub(crate) fn propagate(&mut self, mut moved: impl FnMut(&Pose2) -> Pose2) {
         for particle in &mut self.particles {
             particle.map_from_lidar = moved(&particle.map_from_lidar);
         }
@@ -105,7 +105,7 @@ impl ParticleSet {
 
     /// Sets the heights of the ground below the particles [m], in order; particles without ground keep
     /// the last one.
-    pub fn set_levels(&mut self, levels_m: impl IntoIterator<Item = Option<f64>>) {
+    pub(crate) fn set_levels(&mut self, levels_m: impl IntoIterator<Item = Option<f64>>) {
         for (particle, level_m) in self.particles.iter_mut().zip(levels_m) {
             particle.level_m = level_m.or(particle.level_m);
         }
@@ -141,7 +141,7 @@ impl ParticleSet {
 
     /// Copies of the particles with these indices, equally weighted; an index may occur several times.
     #[must_use]
-    pub fn selected(&self, indices: &[usize]) -> Self {
+    pub(crate) fn selected(&self, indices: &[usize]) -> Self {
         Self::uniform(indices.iter().map(|&index| self.particles[index]))
     }
 
@@ -175,7 +175,7 @@ impl ParticleSet {
     }
 
     /// Weighted covariance of (x, y, heading) about a pose, in the axes of the map [m², m·rad, rad²].
-    pub fn covariance_about(&self, center: &Pose2) -> Matrix3<f64> {
+    pub(crate) fn covariance_about(&self, center: &Pose2) -> Matrix3<f64> {
         self.particles
             .iter()
             .map(|particle| {
@@ -191,7 +191,7 @@ impl ParticleSet {
     /// ```text
     /// Σ = Σ_weighted + Σ_samples / N_eff        Σ_samples: of the particles without their weights
     /// ```
-    pub fn covariance_of_estimate(&self) -> Matrix3<f64> {
+    pub(crate) fn covariance_of_estimate(&self) -> Matrix3<f64> {
         let samples = Self::uniform(self.poses().copied());
         let of_mean = samples.covariance_about(&samples.mean()) / self.effective_sample_size();
         self.covariance_about(&self.mean()) + of_mean

@@ -133,7 +133,7 @@ impl Tracker {
     }
 
     /// Takes a scan between those that are localized, which only the odometry needs.
-    pub fn pass(&mut self, scan: &Scan) -> Result<(), TrackerError> {
+    pub(crate) fn pass(&mut self, scan: &Scan) -> Result<(), TrackerError> {
         let scan = self.prepare(scan)?;
         if let Some(odometer) = &mut self.odometer {
             self.previous_from_current *= odometer.step(&scan)?.previous_from_current;

@@ -35,7 +35,7 @@ pub enum State {
 
 impl State {
     /// The state of a number in a result; `None` if it is of no state.
-    pub fn from_number(number: u8) -> Option<Self> {
+    pub(crate) fn from_number(number: u8) -> Option<Self> {
         [Self::Searching, Self::Tracking, Self::Lost]
             .into_iter()
             .find(|state| *state as u8 == number)

@@ -15,8 +15,7 @@ pub(crate) mod tiles;
 #[cfg(test)]
 pub(crate) mod world_for_tests;
 
-pub use build::builder::{BuildError, BuildEvent, MapBuilder, MapPlan, ReadScan, ScanError};
-pub use build::cloud::CloudPlan;
+pub use build::builder::{BuildError, BuildEvent, MapBuilder, MapPlan, ScanError};
 pub use build::confidence::ConfidenceConfig;
 pub use build::config::{MapConfig, MapOptions, PoseSource};
 pub use build::local_map::{LocalMap, LocalMapConfig, LocalMapCounts};
@@ -30,5 +29,6 @@ pub use model::{Map, MapError};
 pub use places::panorama::{PanoramaConfig, SearchRegion};
 pub use tiles::grid::{TileConfig, TileGrid, TileIndex};
 
+pub(crate) use build::cloud::CloudPlan;
 pub(crate) use model::surface_of;
 pub(crate) use places::panorama::{PanoramaIndex, PanoramaRequest, PanoramaSeed};

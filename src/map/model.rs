@@ -125,7 +125,7 @@ impl Map {
     }
 
     /// Assembles a map from its parts.
-    pub fn from_parts(
+    pub(crate) fn from_parts(
         mesh: TriangleMesh,
         path: MappingPath,
         tiles: TileGrid,
@@ -154,7 +154,7 @@ impl Map {
 
     /// Opens a map like [`load`](Self::load), with the path of its mapping drive if it is not in the file: maps of
     /// range-mcl do not contain theirs.
-    pub fn load_with_path(
+    pub(crate) fn load_with_path(
         mesh_file: &Path,
         given: Option<MappingPath>,
         options: &MapOptions,
@@ -246,7 +246,7 @@ impl Map {
     /// The surface around some positions [m] (without any, everywhere), at least as far as `radius_m`, relative to
     /// `origin` in the map frame: that of the tiles there, or, of a map in memory, all of it. Of tiles, ground is red and the rest blue, and there are no
     /// normals; if they have more than `most_triangles`, vertices are merged in cells, for pictures.
-    pub fn mesh_near(
+    pub(crate) fn mesh_near(
         &self,
         positions: &[Point2<f64>],
         radius_m: f64,
@@ -278,7 +278,10 @@ impl Map {
 
     /// Returns the panoramas of the cells in which place recognition searches. They are rendered if the
     /// last request was a different one.
-    pub fn panoramas(&self, request: &PanoramaRequest) -> Result<Arc<PanoramaIndex>, RenderError> {
+    pub(crate) fn panoramas(
+        &self,
+        request: &PanoramaRequest,
+    ) -> Result<Arc<PanoramaIndex>, RenderError> {
         let mut last = self.panoramas.lock().unwrap_or_else(|e| e.into_inner());
         match &*last {
             Some((made_for, index)) if made_for == request => Ok(index.clone()),

@@ -15,7 +15,7 @@ const SCANS: usize = 11;
 
 impl PoseReport {
     /// Checks the poses of a recording whose scans are not yet deskewed by them.
-    pub fn new(recording: &Recording) -> Result<Self, MappingError> {
+    pub(crate) fn new(recording: &Recording) -> Result<Self, MappingError> {
         let run = moving_run(recording);
         let ends = [run.first(), run.last()];
         Ok(Self {
@@ -26,7 +26,7 @@ impl PoseReport {
     }
 
     /// An error where the poses are of another motion than that of the scans.
-    pub fn require_fit(&self) -> Result<(), MappingError> {
+    pub(crate) fn require_fit(&self) -> Result<(), MappingError> {
         match self.fit() {
             PoseFit::Wrong => Err(MappingError::PosesDoNotFit(Box::new(self.clone()))),
             PoseFit::Fits | PoseFit::Doubtful => Ok(()),

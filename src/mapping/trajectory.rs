@@ -130,7 +130,7 @@ pub struct LoopCounts {
 
 impl TrajectorySummary {
     /// The same for every run.
-    pub fn without_times(&self) -> Self {
+    pub(crate) fn without_times(&self) -> Self {
         Self {
             seconds_per_scan: None,
             ..self.clone()
@@ -138,7 +138,7 @@ impl TrajectorySummary {
     }
 
     /// The summary of a trajectory, whose speed is known where its scans have times.
-    pub fn new(trajectory: &Trajectory, has_times: bool) -> Self {
+    pub(crate) fn new(trajectory: &Trajectory, has_times: bool) -> Self {
         let steps = &trajectory.odometry;
         let positions = || trajectory.poses.iter().map(|pose| pose.translation.vector);
         let path_m: f64 = (positions().zip(positions().skip(1)))

@@ -58,7 +58,7 @@ pub struct PoissonConfig {
 
 impl PoissonConfig {
     /// Allowed depths.
-    pub const DEPTHS: RangeInclusive<u32> = 3..=12;
+    pub(crate) const DEPTHS: RangeInclusive<u32> = 3..=12;
 }
 
 impl Validate for PoissonConfig {

@@ -164,7 +164,7 @@ impl TrajectoryBuilder {
 
     /// Closes loops, moves the drive into a map in which some of its scans were found, and adjusts all poses to its
     /// surfaces. `map_from_lidar` has the poses of the scans that were found.
-    pub fn finish_in_map(
+    pub(crate) fn finish_in_map(
         self,
         mesh: &TriangleMesh,
         map_from_lidar: &[Option<Pose3>],

@@ -46,7 +46,7 @@ impl Calibration {
     }
 
     /// Camera pose of a lidar pose given in a map: `world_from_cam0 = world_from_map * map_from_lidar * inv(Tr)`.
-    pub fn world_from_cam0(&self, world_from_map: &Pose3, map_from_lidar: &Pose3) -> Pose3 {
+    pub(crate) fn world_from_cam0(&self, world_from_map: &Pose3, map_from_lidar: &Pose3) -> Pose3 {
         world_from_map * map_from_lidar * self.cam0_from_lidar.inverse()
     }
 }

@@ -19,7 +19,7 @@ pub enum Layout {
 
 impl Layout {
     /// Name for reports.
-    pub fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Self::KittiOdometry => "KITTI odometry",
             Self::KittiRaw => "KITTI raw",
@@ -47,7 +47,7 @@ pub struct RecordingFiles {
 
 impl RecordingFiles {
     /// A bag, which has its times and poses in itself.
-    pub fn bag(path: &Path) -> Self {
+    pub(crate) fn bag(path: &Path) -> Self {
         Self {
             layout: Layout::Bag,
             scans: path.to_owned(),
@@ -67,7 +67,7 @@ impl RecordingFiles {
     }
 
     /// Finds the files of a recording: of its folder, or of the folder of its scans.
-    pub fn find(folder: &Path) -> Self {
+    pub(crate) fn find(folder: &Path) -> Self {
         let existing = |base: &Path, names: &[&str]| {
             let paths = names.iter().map(|name| base.join(name));
             paths.into_iter().find(|path| path.exists())

@@ -205,7 +205,7 @@ impl Recording {
     }
 
     /// The same recording with poses `map_from_lidar` of some frames, one per frame, of which its own are part.
-    pub fn with_poses_of(
+    pub(crate) fn with_poses_of(
         mut self,
         frames: &[Frame],
         map_from_lidar: Vec<Pose3>,
@@ -237,7 +237,7 @@ impl Recording {
     }
 
     /// All frames from the first selected one to the last, also those between, ascending.
-    pub fn dense_frames(&self) -> Vec<Frame> {
+    pub(crate) fn dense_frames(&self) -> Vec<Frame> {
         let mut frames: Vec<Frame> = (self.frames.iter().chain(&self.skipped)).cloned().collect();
         frames.sort_by_key(|frame| frame.number);
         frames
@@ -254,7 +254,7 @@ impl Recording {
 
     /// The same recording, with an angle added to the elevations of all points [rad].
     #[must_use]
-    pub fn with_elevation_bias(mut self, bias_rad: f64) -> Self {
+    pub(crate) fn with_elevation_bias(mut self, bias_rad: f64) -> Self {
         for frame in self.frames.iter_mut().chain(&mut self.skipped) {
             frame.elevation_bias_rad = bias_rad;
         }

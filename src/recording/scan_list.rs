@@ -57,7 +57,7 @@ pub struct ScanFile {
 
 impl Selection {
     /// The selected ones of all frames of a recording, and the others between them.
-    pub fn of<T>(
+    pub(crate) fn of<T>(
         &self,
         frames: Vec<T>,
         number: impl Fn(&T) -> usize,

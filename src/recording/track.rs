@@ -161,7 +161,7 @@ impl PoseTrack {
 
     /// The poses of frames. Frames after the last row or before the first are without one, with a
     /// warning; an error if these are more than one and a hundredth of the frames.
-    pub fn matched(
+    pub(crate) fn matched(
         &self,
         frames: &[Frame],
         have_times: bool,
@@ -214,12 +214,12 @@ impl PoseTrack {
     }
 
     /// Motion of the sensor around a frame; `None` if the frame has no pose, or the track only one.
-    pub fn motion_at(&self, frame: &Frame, have_times: bool) -> Option<Motion> {
+    pub(crate) fn motion_at(&self, frame: &Frame, have_times: bool) -> Option<Motion> {
         self.at(frame, have_times)?.1
     }
 
     /// Pose of a frame; `None` if the track has none.
-    pub fn pose_at(&self, frame: &Frame, have_times: bool) -> Option<Pose3> {
+    pub(crate) fn pose_at(&self, frame: &Frame, have_times: bool) -> Option<Pose3> {
         Some(self.at(frame, have_times)?.0)
     }
 

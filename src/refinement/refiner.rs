@@ -109,7 +109,7 @@ impl Validate for FrameRefinementConfig {
 
 impl FrameRefinementConfig {
     /// Reach of the search for an estimate with a covariance: x, y [m], heading [rad].
-    pub fn reach(&self, covariance: &Matrix3<f64>) -> [f64; 3] {
+    pub(crate) fn reach(&self, covariance: &Matrix3<f64>) -> [f64; 3] {
         let reach = |axis: usize, least: f64, most: f64| {
             let sigma = covariance[(axis, axis)].max(0.0).sqrt();
             (self.reach_sigmas * sigma).clamp(least, most)
@@ -122,7 +122,7 @@ impl FrameRefinementConfig {
     }
 
     /// Whether an estimate may be outside the basin of Gauss-Newton, so that both steps are needed.
-    pub fn is_wide(&self, covariance: &Matrix3<f64>) -> bool {
+    pub(crate) fn is_wide(&self, covariance: &Matrix3<f64>) -> bool {
         let [x, y, heading] = self.reach(covariance);
         self.method == Method::Both && (x.max(y) > self.basin_m || heading > self.basin_rad)
     }

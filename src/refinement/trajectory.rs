@@ -105,7 +105,7 @@ impl InitialEstimate {
 
     /// Poses to which increments `previous_from_current` lead from the first one; the first increment is ignored. `None` if one is
     /// missing.
-    pub fn driven(increments: &[Option<Pose2>]) -> Option<Vec<Pose3>> {
+    pub(crate) fn driven(increments: &[Option<Pose2>]) -> Option<Vec<Pose3>> {
         let mut pose = Pose2::identity();
         let after = |increment: &Option<Pose2>| {
             pose *= (*increment)?;

@@ -57,7 +57,7 @@ const BEHIND_DEG: f64 = 180.0;
 
 impl MotionCompensation {
     /// Times from a rotation, whose start is rounded to a degree.
-    pub fn of(rotation: &Rotation) -> Self {
+    pub(crate) fn of(rotation: &Rotation) -> Self {
         Self::Rotation {
             direction: rotation.direction,
             // No negative zero.
@@ -71,7 +71,7 @@ impl MotionCompensation {
     }
 
     /// The configured rotation; `None` if it has to be inferred.
-    pub fn rotation(self, period_s: f64) -> Option<Rotation> {
+    pub(crate) fn rotation(self, period_s: f64) -> Option<Rotation> {
         match self {
             Self::Auto => None,
             Self::Rotation {
@@ -183,7 +183,7 @@ impl RangeImageConfig {
     }
 
     /// The sensor model, with the values of another where none is given.
-    pub fn model_over(&self, inferred: &LidarModel) -> LidarModel {
+    pub(crate) fn model_over(&self, inferred: &LidarModel) -> LidarModel {
         let has_rows = self.height.is_some() || self.fov_up.is_some() || self.fov_down.is_some();
         LidarModel {
             height: (self.height)
@@ -202,7 +202,7 @@ impl RangeImageConfig {
     }
 
     /// The sensor model, with the values of an HDL-64E where none is given.
-    pub fn model(&self) -> LidarModel {
+    pub(crate) fn model(&self) -> LidarModel {
         self.model_over(&LidarModel::default())
     }
 
@@ -218,7 +218,7 @@ impl RangeImageConfig {
     }
 
     /// Requires that the keys of the batches, which only `localize` renders, are not given.
-    pub fn without_batches(&self) -> Result<(), InvalidValue> {
+    pub(crate) fn without_batches(&self) -> Result<(), InvalidValue> {
         const REMEDY: &str = "only localize renders in batches; remove the key";
         if let Some(value) = self.max_instance {
             return Err(InvalidValue::new("range_image.max_instance", value, REMEDY));
@@ -231,7 +231,7 @@ impl RangeImageConfig {
     }
 
     /// Number of particles that are rendered at once.
-    pub fn batch_size(&self) -> usize {
+    pub(crate) fn batch_size(&self) -> usize {
         match self.render_instanced {
             Some(false) => 1,
             _ => self.max_instance.unwrap_or(1024),

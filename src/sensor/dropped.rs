@@ -44,7 +44,7 @@ pub enum DropReason {
 
 impl DropReason {
     /// Keys of the configuration that keep more points.
-    pub fn keys(self) -> &'static str {
+    pub(crate) fn keys(self) -> &'static str {
         match self {
             Self::OwnCar => "own_car_m",
             Self::TooNear => "range_image.min_range",
@@ -57,7 +57,7 @@ impl DropReason {
     }
 
     /// What happened to the points.
-    pub fn description(self) -> &'static str {
+    pub(crate) fn description(self) -> &'static str {
         match self {
             Self::OwnCar => "are in the rectangle of the own car",
             Self::TooNear => "are nearer than the least range",
@@ -70,7 +70,7 @@ impl DropReason {
 
 impl DroppedPoints {
     /// Share of the returns that is too many to lose for one reason (unitless).
-    pub const TOO_MANY: f64 = 0.2;
+    pub(crate) const TOO_MANY: f64 = 0.2;
 
     /// Counts the points of a scan that are not in its range image.
     pub fn count(scan: &Scan, lidar: &LidarModel, own_car_m: [f32; 4]) -> Self {

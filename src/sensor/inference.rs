@@ -100,7 +100,7 @@ impl Sensor {
     }
 
     /// The sensor of a configuration from which nothing about range images and own car is missing.
-    pub fn configured(known: &SensorConfig) -> Option<Self> {
+    pub(crate) fn configured(known: &SensorConfig) -> Option<Self> {
         let range_image = known.range_image.model();
         let given = RangeImageConfig {
             has_rows: None,
@@ -132,7 +132,11 @@ impl Sensor {
 
     /// Completes a sensor that was inferred from its first scans by more of them, consecutive ones: the own car and the
     /// times of the points, where they are not known. Returns whether the scans show them, which needs motion.
-    pub fn complete(&mut self, scans: &[Scan], known: &SensorConfig) -> Result<bool, SensorError> {
+    pub(crate) fn complete(
+        &mut self,
+        scans: &[Scan],
+        known: &SensorConfig,
+    ) -> Result<bool, SensorError> {
         let valid: Vec<Scan> = scans.iter().map(valid_points).collect();
         let own_car = own_car::find(&Surroundings::of(&valid));
         if !own_car.is_moving {
@@ -165,7 +169,7 @@ impl Sensor {
 
     /// A scan whose points have times from the rotation of the sensor where the data have none; without motion
     /// compensation, times of the data are ignored.
-    pub fn timed<'a>(&self, scan: &'a Scan) -> Cow<'a, Scan> {
+    pub(crate) fn timed<'a>(&self, scan: &'a Scan) -> Cow<'a, Scan> {
         let rotation = (self.motion_compensation)
             .and_then(|it| it.rotation(self.period_s.unwrap_or(PERIOD_S)));
         let mut timed = match (self.motion_compensation, rotation) {

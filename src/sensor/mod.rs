@@ -42,7 +42,7 @@ use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 
 /// Rectangle of a car of common size around its lidar, assumed until the scans show the own car: that of range-mcl's
 /// configuration, x_min, x_max, y_min, y_max [m].
-pub const ASSUMED_OWN_CAR_M: [f32; 4] = [-2.5, 2.7, -1.2, 1.2];
+pub(crate) const ASSUMED_OWN_CAR_M: [f32; 4] = [-2.5, 2.7, -1.2, 1.2];
 
 /// What a sensor is, and how its scans are used.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -105,7 +105,7 @@ pub enum BuildError {
 impl BuildError {
     /// The error with numbers of frames instead of those of key scans.
     #[must_use]
-    pub fn with_frames(self, number_of: impl Fn(usize) -> usize) -> Self {
+    pub(crate) fn with_frames(self, number_of: impl Fn(usize) -> usize) -> Self {
         match self {
             Self::PosesDoNotFit {
                 first,
@@ -157,7 +157,7 @@ impl MapBuilder {
     /// Builds a map of key scans by their poses, or adds them to an older map in whose frame their poses are: what their
     /// beams pass through is removed, and what that map does not have is added. `read_scan` returns a key scan by its
     /// index and is called from any thread.
-    pub fn build_keys(
+    pub(crate) fn build_keys(
         &self,
         map_from_lidar: Vec<Pose3>,
         older: Option<&Map>,

@@ -59,7 +59,7 @@ pub struct MapConfig {
 
 impl MapConfig {
     /// Sets the sensor of the scans.
-    pub fn set_sensor(&mut self, sensor: &Sensor) {
+    pub(crate) fn set_sensor(&mut self, sensor: &Sensor) {
         let scan = &mut self.local_map.scan;
         scan.range_image = sensor.range_image.clone();
         scan.has_rows = sensor.has_rows;

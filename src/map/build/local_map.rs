@@ -142,7 +142,7 @@ pub struct LocalMap {
 
 impl LocalMap {
     /// Its mesh in the map frame, rounded to single precision.
-    pub fn in_map(&self) -> TriangleMesh {
+    pub(crate) fn in_map(&self) -> TriangleMesh {
         let position = |vertex: &Vec3| (self.origin + vertex.as_dvec3()).as_vec3();
         TriangleMesh {
             vertices: self.mesh.vertices.iter().map(position).collect(),

@@ -73,7 +73,7 @@ pub struct PointCounts {
 
 impl PointCounts {
     /// Adds the counts of another scan.
-    pub fn add(&mut self, other: &Self) {
+    pub(crate) fn add(&mut self, other: &Self) {
         self.read += other.read;
         self.invalid += other.invalid;
         self.not_in_image += other.not_in_image;

@@ -33,7 +33,7 @@ pub struct BadPathComment(String);
 
 impl MappingPath {
     /// Returns the comments of the PLY file.
-    pub fn to_comments(&self) -> Vec<String> {
+    pub(crate) fn to_comments(&self) -> Vec<String> {
         let line = |key: &str, pose: &Pose3| {
             let [x, y, z, i, j, k, w] = numbers_of_pose(pose);
             format!("{key} {x} {y} {z} {i} {j} {k} {w}")
@@ -46,7 +46,7 @@ impl MappingPath {
 
     /// The path of a map to which a newer drive is added.
     #[must_use]
-    pub fn extended_by(&self, map_from_lidar: &[Pose3]) -> Self {
+    pub(crate) fn extended_by(&self, map_from_lidar: &[Pose3]) -> Self {
         let mut path = self.clone();
         path.map_from_lidar.extend(map_from_lidar);
         path
@@ -61,7 +61,7 @@ impl MappingPath {
     }
 
     /// Reads the comments of a PLY file; `None` where they hold neither path nor frame.
-    pub fn from_comments<'a>(
+    pub(crate) fn from_comments<'a>(
         comments: impl IntoIterator<Item = &'a str>,
     ) -> Result<Option<Self>, BadPathComment> {
         let mut path: Option<Self> = None;

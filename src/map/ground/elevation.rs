@@ -22,7 +22,7 @@ use nalgebra::{
 use smart_default::SmartDefault;
 
 use super::heights::{ChunkSource, HeightReader, Heights, LEVEL_GAP_M};
-use crate::geometry::{Pose2, Pose3, TriangleMesh};
+use crate::geometry::{Pose2, Pose3};
 
 /// Radius of the ground that carries a car, about its wheelbase [m].
 const RADIUS_M: f64 = 2.0;
@@ -51,7 +51,7 @@ impl SensorAttitude {
     }
 
     /// The attitude after a motion in space, on a road that stays even.
-    pub fn after(&self, previous_from_current: &Pose3) -> Self {
+    pub(crate) fn after(&self, previous_from_current: &Pose3) -> Self {
         let road_from_lidar = self.road_from_lidar() * previous_from_current;
         let up = road_from_lidar.rotation.inverse() * Vector3::z();
         let up = up.cast::<f32>();
@@ -60,7 +60,7 @@ impl SensorAttitude {
 
     /// Computes the attitude from the plane of the road in the lidar frame: its unit normal (up) and
     /// the distance of the sensor from it [m].
-    pub fn from_plane(up_in_lidar: Vec3, height_m: f64) -> Self {
+    pub(crate) fn from_plane(up_in_lidar: Vec3, height_m: f64) -> Self {
         let up: Vector3<f64> = Vector3::new(up_in_lidar.x, up_in_lidar.y, up_in_lidar.z).cast();
         // up = Rx(roll)ᵀ Ry(pitch)ᵀ z  (no yaw)  =  (-sin p, cos p sin r, cos p cos r)
         Self {
@@ -125,7 +125,12 @@ pub struct GroundMap {
 
 impl GroundMap {
     /// Builds the elevation map of the triangles for which `is_ground` holds, in cells of `cell_m`.
-    pub fn from_mesh(mesh: &TriangleMesh, is_ground: impl Fn(usize) -> bool, cell_m: f64) -> Self {
+    #[cfg(test)]
+    pub(crate) fn from_mesh(
+        mesh: &crate::geometry::TriangleMesh,
+        is_ground: impl Fn(usize) -> bool,
+        cell_m: f64,
+    ) -> Self {
         let ground = (0..mesh.triangles.len()).filter(|&triangle| is_ground(triangle));
         Self {
             heights: Heights::of_triangles(
@@ -142,8 +147,9 @@ impl GroundMap {
         }
     }
 
-    /// Flat ground in a rectangle, for tests and for maps whose ground is not marked.
-    pub fn flat(min: Point2<f64>, max: Point2<f64>, height_m: f64) -> Self {
+    /// Flat ground in a rectangle.
+    #[cfg(test)]
+    pub(crate) fn flat(min: Point2<f64>, max: Point2<f64>, height_m: f64) -> Self {
         Self {
             heights: Heights::flat(min, max, height_m, 1.0),
         }
@@ -155,7 +161,7 @@ impl GroundMap {
     /// third of the cells have; the lowest such without `level_m`. `None` where no level has that
     /// many, and where the one at `level_m` has fewer: a gap in a bridge does not drop the car
     /// onto the road below.
-    pub fn patch_at(
+    pub(crate) fn patch_at(
         &self,
         x: f64,
         y: f64,
@@ -198,7 +204,7 @@ impl GroundMap {
 
     /// Returns the patches of all levels at a position, the lowest first. If no level of its own cell
     /// has enough cells around it, returns the lowest patch of the surroundings.
-    pub fn levels_at(&self, x: f64, y: f64) -> Vec<GroundPatch> {
+    pub(crate) fn levels_at(&self, x: f64, y: f64) -> Vec<GroundPatch> {
         let Some(cell) = self.heights.cell_at(x, y) else {
             return Vec::new();
         };

@@ -3,6 +3,7 @@
 use approx::assert_relative_eq;
 
 use super::*;
+use crate::geometry::TriangleMesh;
 use crate::geometry::pose2_from_pose3;
 
 /// A square of 40 m with a slope along x.

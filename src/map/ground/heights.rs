@@ -66,6 +66,7 @@ impl ChunkSource for Chunks {
 impl Heights {
     /// Averages the heights of triangles per cell and level: one sample in each cell whose centre a
     /// triangle covers, and one at each of its corners.
+    #[cfg(test)]
     pub fn of_triangles(corners: impl Iterator<Item = [DVec3; 3]>, cell_m: f64) -> Self {
         Self::over(Arc::new(chunks_of_triangles(corners, cell_m)), cell_m)
     }
@@ -76,6 +77,7 @@ impl Heights {
     }
 
     /// One height for every cell of a rectangle.
+    #[cfg(test)]
     pub fn flat(min: Point2<f64>, max: Point2<f64>, height_m: f64, cell_m: f64) -> Self {
         let mut samples = HeightSamples::default();
         let (first, last) = (cell_of(min, cell_m), cell_of(max, cell_m));

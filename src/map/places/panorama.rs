@@ -79,7 +79,7 @@ pub struct PanoramaConfig {
 
 impl PanoramaConfig {
     /// Allowed sides of a cell [m].
-    pub const CELLS_M: RangeInclusive<f64> = 0.05..=1000.0;
+    pub(crate) const CELLS_M: RangeInclusive<f64> = 0.05..=1000.0;
 }
 
 impl Validate for PanoramaConfig {
@@ -243,11 +243,6 @@ impl PanoramaIndex {
             model: panorama_model(&request.lidar, &request.config),
             panoramas,
         }
-    }
-
-    /// Whether no cell has ground.
-    pub fn is_empty(&self) -> bool {
-        self.panoramas.places().is_empty()
     }
 
     /// Returns the best heading of each cell of the last pass, the lowest cost first.
@@ -457,7 +452,7 @@ mod tests {
             ..request()
         };
         let index = world.map().panoramas(&anywhere).unwrap();
-        assert!(!index.is_empty());
+        assert!(!index.panoramas.places().is_empty());
         for place in index.panoramas.places() {
             let pose = Pose2::translation(place.x, place.y);
             assert!(world.ground.patch_under(&pose, None).is_some());
@@ -479,7 +474,7 @@ mod tests {
         )
         .unwrap();
         let scan = world.scan(&world.pose_at(0.0, 0.0, 0.0));
-        assert!(index.is_empty());
+        assert!(index.panoramas.places().is_empty());
         assert!(
             index
                 .search(&scan, &SensorAttitude::default())

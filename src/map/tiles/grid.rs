@@ -42,7 +42,7 @@ pub struct TileIndex {
 
 impl TileIndex {
     /// The tile of a position, for tiles of a side.
-    pub fn of(x: f64, y: f64, side_m: f64) -> Self {
+    pub(crate) fn of(x: f64, y: f64, side_m: f64) -> Self {
         let [column, row] = [x, y].map(|along| (along / side_m + 0.5).floor() as i64);
         Self { column, row }
     }
@@ -90,7 +90,10 @@ pub struct TileGrid {
 impl TileGrid {
     /// Covers mapping poses (`map_from_lidar`) and a margin around them. Without poses, one invalid tile
     /// around the origin.
-    pub fn around<'a>(poses: impl IntoIterator<Item = &'a Pose3>, config: &TileConfig) -> Self {
+    pub(crate) fn around<'a>(
+        poses: impl IntoIterator<Item = &'a Pose3>,
+        config: &TileConfig,
+    ) -> Self {
         let side_m = config.side_m;
         // Radius around the centre of a tile in which mapping poses are counted.
         let reach_m = config.margin_m + 0.25 * side_m;
@@ -134,7 +137,10 @@ impl TileGrid {
 
     /// Covers a mesh without a mapping drive, given by the boxes of the triangles of its tiles; the tiles that
     /// these reach are valid.
-    pub fn of_boxes(boxes: impl IntoIterator<Item = (TileIndex, Aabb)>, side_m: f64) -> Self {
+    pub(crate) fn of_boxes(
+        boxes: impl IntoIterator<Item = (TileIndex, Aabb)>,
+        side_m: f64,
+    ) -> Self {
         /// A triangle that reaches farther is an artefact [tiles].
         const REACH: i64 = 50;
         let mut valid = HashSet::new();
@@ -165,7 +171,7 @@ impl TileGrid {
     }
 
     /// Returns the tile of a position; `None` outside the grid.
-    pub fn tile_at(&self, x: f64, y: f64) -> Option<TileIndex> {
+    pub(crate) fn tile_at(&self, x: f64, y: f64) -> Option<TileIndex> {
         let tile = TileIndex::of(x, y, self.side_m);
         let [first, last] = self.range;
         let is_inside = (first.column..=last.column).contains(&tile.column)
@@ -175,19 +181,19 @@ impl TileGrid {
 
     /// Returns the valid tile of a pose; `None` outside the grid and in tiles that the mapping drive did
     /// not visit.
-    pub fn valid_tile_of(&self, pose: &Pose2) -> Option<TileIndex> {
+    pub(crate) fn valid_tile_of(&self, pose: &Pose2) -> Option<TileIndex> {
         let position = pose.translation.vector;
         self.tile_at(position.x, position.y)
             .filter(|tile| self.is_valid(*tile))
     }
 
     /// Whether the mapping drive visited a tile.
-    pub fn is_valid(&self, tile: TileIndex) -> bool {
+    pub(crate) fn is_valid(&self, tile: TileIndex) -> bool {
         self.valid.contains(&tile)
     }
 
     /// Returns the centre of a tile [m].
-    pub fn center(&self, tile: TileIndex) -> Point2<f64> {
+    pub(crate) fn center(&self, tile: TileIndex) -> Point2<f64> {
         center(tile, self.side_m)
     }
 
