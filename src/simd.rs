@@ -54,11 +54,13 @@ pub(crate) trait Simd: Copy {
 
 /// Work that is compiled for each instruction set. All that it calls must be `inline(always)`.
 pub(crate) trait SimdTask {
-    fn run<S: Simd>(self, simd: S);
+    type Output;
+
+    fn run<S: Simd>(self, simd: S) -> Self::Output;
 }
 
 /// Runs a task with the best instruction set of this CPU.
-pub(crate) fn dispatch(task: impl SimdTask) {
+pub(crate) fn dispatch<T: SimdTask>(task: T) -> T::Output {
     #[cfg(target_arch = "x86_64")]
     {
         if let Some(avx512) = avx512::Avx512::detect() {
@@ -68,7 +70,7 @@ pub(crate) fn dispatch(task: impl SimdTask) {
             return avx2.run(task);
         }
     }
-    task.run(Baseline);
+    task.run(Baseline)
 }
 
 impl Lanes for Vec4 {
@@ -298,10 +300,10 @@ pub(crate) mod avx2 {
         }
 
         /// Runs a task compiled for AVX2.
-        pub fn run(self, task: impl SimdTask) {
+        pub fn run<T: SimdTask>(self, task: T) -> T::Output {
             #[target_feature(enable = "avx2")]
-            fn run_compiled(task: impl SimdTask, avx2: Avx2) {
-                task.run(avx2);
+            fn run_compiled<T: SimdTask>(task: T, avx2: Avx2) -> T::Output {
+                task.run(avx2)
             }
             // SAFETY: `self` proves that the CPU has AVX2.
             unsafe { run_compiled(task, self) }
@@ -398,10 +400,10 @@ pub(crate) mod avx512 {
         }
 
         /// Runs a task compiled for AVX-512.
-        pub fn run(self, task: impl SimdTask) {
+        pub fn run<T: SimdTask>(self, task: T) -> T::Output {
             #[target_feature(enable = "avx2,avx512f,avx512bw,avx512dq,avx512vl")]
-            fn run_compiled(task: impl SimdTask, avx512: Avx512) {
-                task.run(avx512);
+            fn run_compiled<T: SimdTask>(task: T, avx512: Avx512) -> T::Output {
+                task.run(avx512)
             }
             // SAFETY: `self` proves that the CPU has them.
             unsafe { run_compiled(task, self) }

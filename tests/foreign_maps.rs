@@ -114,8 +114,8 @@ fn a_drive_is_localized_in_a_mesh_of_any_format_without_colors_and_path() {
         assert_eq!(map.tiles, maps[0].tiles);
         for pose in &truth {
             let planar = pose2_from_pose3(&pose.map_from_lidar);
-            let patch = map.ground.patch_under(&planar, None).unwrap();
-            let of_ply = maps[0].ground.patch_under(&planar, None).unwrap();
+            let patch = map.ground.patch_under(&planar, None).unwrap().unwrap();
+            let of_ply = maps[0].ground.patch_under(&planar, None).unwrap().unwrap();
             assert!((patch.height_m - of_ply.height_m).abs() < 1e-4);
             let height_m = patch.attitude_of(&pose.map_from_lidar).height_m;
             assert!((height_m - 1.73).abs() < 0.06, "{height_m}");

@@ -161,6 +161,8 @@ struct InferenceTask<'a> {
 }
 
 impl SimdTask for InferenceTask<'_> {
+    type Output = ();
+
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
         let blocks = (self.results.chunks_mut(BLOCK))

@@ -179,6 +179,8 @@ struct LocationTask<'a> {
 }
 
 impl SimdTask for LocationTask<'_> {
+    type Output = ();
+
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
         let blocks = (self.points.chunks(BLOCK))

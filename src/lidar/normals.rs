@@ -105,6 +105,8 @@ struct RowTask<'a> {
 }
 
 impl SimdTask for RowTask<'_> {
+    type Output = ();
+
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
         for (group, normals) in self.normals.chunks_mut(LANES).enumerate() {

@@ -77,9 +77,9 @@ pub fn profile(
         .map(|&offset| {
             let moved = direction.moved(pose, offset);
             let patch = view.ground.patch_under(&moved, view.level_m)?;
-            Some(patch.lift(&moved, &view.attitude))
+            Ok(patch.map(|patch| patch.lift(&moved, &view.attitude)))
         })
-        .collect();
+        .collect::<Result<_, RenderError>>()?;
     let costs_m = costs(view.renderer, &lifted, view.beams, &config.difference())?;
     let logs: Vec<(f64, f64)> = offsets
         .into_iter()

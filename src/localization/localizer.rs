@@ -232,7 +232,7 @@ impl Localizer {
         }
         let particles = ParticleSet::uniform(particles);
         let (config, map) = (self.config.clone(), self.map.clone());
-        Ok(ParticleFilter::new(config, map, Some(request), particles))
+        Ok(ParticleFilter::new(config, map, Some(request), particles)?)
     }
 
     /// The panoramas for a start without a pose and for a restart after a loss.

@@ -1,13 +1,18 @@
 //! The localizer on scans as values.
 
+use std::fs;
+use std::path::Path;
+
 use glam::Vec3;
 use nalgebra::Vector2;
 
 use super::*;
+use crate::geometry::TriangleMesh;
 use crate::lidar::LidarModel;
 use crate::localization::State;
 use crate::map::world_for_tests::TestWorld;
-use crate::map::{MappingPath, TileConfig, TileGrid};
+use crate::map::{MapOptions, MappingPath, TileConfig, TileGrid};
+use crate::rendering::Backend;
 
 /// A localizer runs on one thread at a time, a map is shared by several.
 const _: () = {
@@ -65,6 +70,75 @@ fn localize(world: &TestWorld, start: Start, truth: &[Pose2], seed: u64) -> Vec<
             localizer.step(&scan(world, pose), odometry).unwrap()
         })
         .collect()
+}
+
+/// The street as a map on disk, in a folder: its walls and, red, its ground.
+fn on_disk(world: &TestWorld) -> (tempfile::TempDir, Map) {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("street.ply");
+    let map = world.map();
+    let mut mesh = TriangleMesh::clone(&map.mesh().unwrap());
+    mesh.colors = vec![[0, 0, 255]; mesh.vertices.len()];
+    let first = mesh.vertices.len() as u32;
+    for (x, y) in [(-90.0, -90.0), (180.0, -90.0), (180.0, 90.0), (-90.0, 90.0)] {
+        let corner = world.pose_at(x, y, 0.0).translation.vector;
+        let height_m = map
+            .ground
+            .patch_at(0.0, 0.0, 2.0, None)
+            .unwrap()
+            .unwrap()
+            .height_m;
+        (mesh.vertices).push(Vec3::new(corner.x as f32, corner.y as f32, height_m as f32));
+        mesh.colors.push([255, 0, 0]);
+    }
+    mesh.triangles
+        .extend([[0, 1, 2], [0, 2, 3]].map(|corners| corners.map(|it| first + it)));
+    let options = MapOptions {
+        backend: Backend::Cpu,
+        ..MapOptions::default()
+    };
+    let saved = Map::new(mesh, MappingPath::clone(&map.path), &options).unwrap();
+    saved.save(&file).unwrap();
+    let map = Map::load(&file, &options).unwrap();
+    (folder, map)
+}
+
+/// Changes a byte of all tiles of the map in a folder: the number of the byte follows from the length of the file.
+fn damage_tiles(folder: &Path, byte: fn(usize) -> usize) {
+    for entry in fs::read_dir(folder.join("street.ply.tiles")).unwrap() {
+        let file = entry.unwrap().path();
+        if file.extension().is_some_and(|ending| ending == "tile") {
+            let mut bytes = fs::read(&file).unwrap();
+            let byte = byte(bytes.len());
+            bytes[byte] ^= 1;
+            // Replaced as a whole, as files that may be mapped have to be.
+            fs::remove_file(&file).unwrap();
+            fs::write(&file, bytes).unwrap();
+        }
+    }
+}
+
+#[test]
+fn a_tile_that_cannot_be_read_is_an_error_of_each_step_that_needs_it() {
+    let world = TestWorld::street();
+    let truth = drive(&world, 10.0, 6);
+    let is_of_tile = |error: LocalizerError| {
+        let message = error.to_string();
+        assert!(
+            message.contains(".tile") && message.contains("checksum"),
+            "{message}"
+        );
+    };
+    // A byte of the surfaces, and one of the ground.
+    for byte in [|_| 300, |bytes| bytes - 1] as [fn(usize) -> usize; 2] {
+        let (folder, map) = on_disk(&world);
+        damage_tiles(folder.path(), byte);
+        let mut localizer = Localizer::new(&map, &sensor(), config(), near(&truth[0]), 1).unwrap();
+        for pose in &truth {
+            let odometry = Odometry::Increment(Pose2::translation(0.8, 0.0));
+            is_of_tile(localizer.step(&scan(&world, pose), odometry).unwrap_err());
+        }
+    }
 }
 
 /// Distance between an estimate and the truth [m].

@@ -247,11 +247,13 @@ pub fn ground_patch_of(
     particle: &Particle,
     map: &Map,
     remembered: Option<&GroundPatch>,
-) -> Option<GroundPatch> {
+) -> Result<Option<GroundPatch>, RenderError> {
     let pose = &particle.map_from_lidar;
-    map.tiles.valid_tile_of(pose)?;
-    let patch = map.ground.patch_under(pose, particle.level_m);
-    patch.or(remembered.copied())
+    if map.tiles.valid_tile_of(pose).is_none() {
+        return Ok(None);
+    }
+    let patch = map.ground.patch_under(pose, particle.level_m)?;
+    Ok(patch.or(remembered.copied()))
 }
 
 /// Ranges of the map along beams from a pose, as far as their [`agreement`] depends on them [m].
@@ -366,7 +368,7 @@ mod tests {
         let beams = choose_beams(&image, 2000, 0.2, &SensorAttitude::default(), &mut rng);
         let lifted = |x: f64, y: f64, heading: f64| {
             let pose = Pose2::new(nalgebra::Vector2::new(x, y), heading);
-            let patch = ground_patch_of(&pose.into(), &world.map(), None);
+            let patch = ground_patch_of(&pose.into(), &world.map(), None).unwrap();
             patch.map(|patch| patch.lift(&pose, &SensorAttitude::default()))
         };
         let poses = [

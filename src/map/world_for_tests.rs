@@ -143,7 +143,8 @@ impl TestWorld {
 
     /// The range image at a pose.
     pub fn scan(&self, pose: &Pose2) -> RangeImage {
-        let map_from_lidar = self.ground.lift(pose, &SensorAttitude::default()).unwrap();
+        let lifted = self.ground.lift(pose, &SensorAttitude::default());
+        let map_from_lidar = lifted.unwrap().unwrap();
         let ranges = self.ranges(&map_from_lidar, &self.model.directions());
         let limited = ranges
             .into_iter()

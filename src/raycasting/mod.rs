@@ -9,6 +9,7 @@
 
 mod all_hits;
 pub(crate) mod bvh;
+mod error;
 mod leaves;
 mod packet;
 mod place;
@@ -21,9 +22,10 @@ mod triangle;
 mod wide;
 
 use crate::simd::WIDE;
+pub use error::{TileError, TileProblem};
 use place::Place;
 pub use scene::{Scene, TileSource};
-pub use source::{SceneSource, TileError, TileProblem, TriangleSource};
+pub use source::{SceneSource, TriangleSource};
 pub use tile::Tile;
 #[cfg(feature = "gpu")]
 pub(crate) use triangle::is_proper;

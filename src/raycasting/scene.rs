@@ -2,6 +2,7 @@
 
 mod cast;
 
+use std::convert::Infallible;
 use std::fmt::Debug;
 use std::sync::Arc;
 
@@ -17,22 +18,26 @@ use crate::geometry::{Aabb, TriangleMesh};
 
 /// Triangles that rays can be cast at, from both sides. Clones share them.
 ///
-/// Triangles that are degenerate or not finite are never hit.
+/// Triangles that are degenerate or not finite are never hit. `E` is the error of a tile that cannot be read; all tiles
+/// of a [`Scene`] without it are in memory.
 #[derive(Clone, Debug)]
-pub struct Scene {
+pub struct Scene<E = Infallible> {
     top: Arc<Top>,
-    tiles: Arc<dyn TileSource>,
+    tiles: Arc<dyn TileSource<E>>,
 }
 
 /// Supplies the tiles of a scene when rays enter their boxes.
-pub trait TileSource: Debug + Send + Sync {
-    /// A tile by its number; `None` where it cannot be had, which is as if it were empty.
-    fn tile(&self, number: usize) -> Option<&Tile>;
+pub trait TileSource<E>: Debug + Send + Sync {
+    /// A tile by its number; `None` if it has no triangles.
+    ///
+    /// # Errors
+    /// Why the tile cannot be read, each time it is requested.
+    fn tile(&self, number: usize) -> Result<Option<&Tile>, &E>;
 }
 
-impl TileSource for Vec<Tile> {
-    fn tile(&self, number: usize) -> Option<&Tile> {
-        self.get(number)
+impl<E> TileSource<E> for Vec<Tile> {
+    fn tile(&self, number: usize) -> Result<Option<&Tile>, &E> {
+        Ok(self.get(number))
     }
 }
 
@@ -54,6 +59,19 @@ impl Scene {
         Self::of_tiles(std::slice::from_ref(mesh))
     }
 
+    /// Memory of the hierarchies and the triangles [bytes].
+    pub fn bytes(&self) -> usize {
+        let top = size_of_val(&*self.top.bvh.nodes);
+        let numbers = 0..self.top.numbers.len();
+        let tiles = numbers.filter_map(|number| {
+            let tile = self.tiles.tile(number);
+            tile.unwrap_or_else(|never| match *never {})
+        });
+        top + tiles.map(|tile| tile.as_bytes().len()).sum::<usize>()
+    }
+}
+
+impl<E> Scene<E> {
     /// Builds a hierarchy per mesh and one over all, on all threads of the current pool.
     /// [`Hit::triangle`](super::Hit::triangle) counts the triangles of all meshes one after the
     /// other.
@@ -77,7 +95,7 @@ impl Scene {
 
     /// Builds a hierarchy over tiles, of which only the boxes are known yet. `first_triangles` is added to the indices
     /// of the triangles of each.
-    pub fn over(bounds: &[Aabb], first_triangles: Vec<u32>, tiles: Arc<dyn TileSource>) -> Self {
+    pub fn over(bounds: &[Aabb], first_triangles: Vec<u32>, tiles: Arc<dyn TileSource<E>>) -> Self {
         let whole = bounds
             .iter()
             .fold(Aabb::EMPTY, |whole, bounds| whole.union(*bounds));
@@ -114,7 +132,7 @@ impl Scene {
 
     /// The same scene with tiles from another source.
     #[must_use]
-    pub fn with_tiles(&self, tiles: Arc<dyn TileSource>) -> Self {
+    pub fn with_tiles(&self, tiles: Arc<dyn TileSource<E>>) -> Self {
         Self {
             top: self.top.clone(),
             tiles,
@@ -122,18 +140,18 @@ impl Scene {
     }
 
     /// The unit normal of the triangle of a hit of this scene by the right-hand rule; `None` if there is none.
-    pub fn normal(&self, hit: &Hit) -> Option<Vec3> {
+    ///
+    /// # Errors
+    /// That of the tile of the hit.
+    pub fn normal(&self, hit: &Hit) -> Result<Option<Vec3>, E>
+    where
+        E: Clone,
+    {
         let leaf = hit.place.leaf;
-        let tile = self.tiles.tile(leaf.tile as usize)?;
-        let block = tile.parts().leaves.block(leaf.index as usize);
-        Some(block.normal(hit.place.lane as usize))
-    }
-
-    /// Memory of the hierarchies and the triangles [bytes].
-    pub fn bytes(&self) -> usize {
-        let top = size_of_val(&*self.top.bvh.nodes);
-        let numbers = 0..self.top.numbers.len();
-        let tiles = numbers.filter_map(|number| self.tiles.tile(number));
-        top + tiles.map(|tile| tile.as_bytes().len()).sum::<usize>()
+        let tile = self.tiles.tile(leaf.tile as usize).map_err(E::clone)?;
+        Ok(tile.map(|tile| {
+            let block = tile.parts().leaves.block(leaf.index as usize);
+            block.normal(hit.place.lane as usize)
+        }))
     }
 }

@@ -35,41 +35,50 @@ pub struct FrameObjective<'a> {
 
 impl FrameObjective<'_> {
     /// Aligns a pose to the ground; `remembered` replaces it where the map has none.
-    pub fn lift(&self, pose: &Pose2, remembered: Option<&GroundPatch>) -> Option<Pose3> {
-        let patch = self.ground.patch_under(pose, self.level_m);
-        Some(patch.as_ref().or(remembered)?.lift(pose, &self.attitude))
+    pub fn lift(
+        &self,
+        pose: &Pose2,
+        remembered: Option<&GroundPatch>,
+    ) -> Result<Option<Pose3>, RenderError> {
+        let patch = self.ground.patch_under(pose, self.level_m)?;
+        let patch = patch.as_ref().or(remembered);
+        Ok(patch.map(|patch| patch.lift(pose, &self.attitude)))
     }
 
     /// The ground under a pose, or the nearest part of it within a distance [m].
-    pub fn patch_within(&self, pose: &Pose2, distance_m: f64) -> Option<GroundPatch> {
+    pub fn patch_within(
+        &self,
+        pose: &Pose2,
+        distance_m: f64,
+    ) -> Result<Option<GroundPatch>, RenderError> {
+        let mut patch = self.ground.patch_under(pose, self.level_m)?;
         let t = pose.translation.vector;
-        let nearest = || {
-            let radii_m = [4.0, 8.0].into_iter();
-            (radii_m.filter(|&radius_m| radius_m <= distance_m + 2.0))
-                .find_map(|radius_m| self.ground.patch_at(t.x, t.y, radius_m, self.level_m))
-        };
-        self.ground.patch_under(pose, self.level_m).or_else(nearest)
+        for radius_m in [4.0, 8.0] {
+            if patch.is_none() && radius_m <= distance_m + 2.0 {
+                patch = self.ground.patch_at(t.x, t.y, radius_m, self.level_m)?;
+            }
+        }
+        Ok(patch)
     }
 
     /// Returns the objective with the attitude fitted at a pose, so that the beams on the road end on the
     /// mapped ground; unchanged where too few of them do.
-    #[must_use]
-    pub fn with_fitted_attitude(&self, pose: &Pose2) -> Self {
+    pub fn with_fitted_attitude(&self, pose: &Pose2) -> Result<Self, RenderError> {
         let points: Vec<Vec3> = self.beams.iter().map(Beam::point).collect();
         let attitude = self
             .ground
-            .attitude_at(pose, self.level_m, &self.attitude, &points);
-        Self {
+            .attitude_at(pose, self.level_m, &self.attitude, &points)?;
+        Ok(Self {
             attitude: attitude.unwrap_or(self.attitude),
             ..*self
-        }
+        })
     }
 
     /// Returns the objective on the level of the ground where it is smallest at a pose, for an unknown
     /// level.
     pub fn on_best_level(&self, pose: &Pose2) -> Result<Self, RenderError> {
         let place = pose.translation.vector;
-        let levels = self.ground.levels_at(place.x, place.y);
+        let levels = self.ground.levels_at(place.x, place.y)?;
         let mut best = (f64::INFINITY, *self);
         for patch in &levels {
             let level_m = Some(patch.height_m);
@@ -77,7 +86,8 @@ impl FrameObjective<'_> {
             if levels.len() == 1 {
                 return Ok(on_level);
             }
-            let lifted = patch.lift(pose, &on_level.with_fitted_attitude(pose).attitude);
+            let fitted = on_level.with_fitted_attitude(pose)?;
+            let lifted = patch.lift(pose, &fitted.attitude);
             let cost_m = self.costs_in_space(&[lifted])?[0];
             if cost_m < best.0 {
                 best = (cost_m, on_level);
@@ -95,7 +105,7 @@ impl FrameObjective<'_> {
         let lifted: Vec<Option<Pose3>> = poses
             .iter()
             .map(|pose| self.lift(pose, remembered))
-            .collect();
+            .collect::<Result<_, _>>()?;
         let costs = costs(self.renderer, &lifted, self.beams, &self.difference)?;
         Ok(costs
             .into_iter()
@@ -234,7 +244,7 @@ mod tests {
         // The covariance is large where the costs of the poses around it are unknown.
         let unknown = objective.covariance(&off[0], None, 0.002).unwrap();
         assert!(unknown.iter().all(|entry| entry.is_finite()) && unknown[(0, 0)] > 0.1);
-        let patch = world.ground.patch_under(&off[1], None);
+        let patch = world.ground.patch_under(&off[1], None).unwrap();
         assert!(objective.costs(&off, patch.as_ref()).unwrap()[0].is_finite());
     }
 }

@@ -185,11 +185,11 @@ pub fn refine_frame(
     let reach = config.reach(covariance);
     let (objective, reach_m) = match distance {
         Distance::Far(_) => (*objective, reach[0].max(reach[1])),
-        Distance::InBasin | Distance::Near => (objective.with_fitted_attitude(estimate), 0.0),
+        Distance::InBasin | Distance::Near => (objective.with_fitted_attitude(estimate)?, 0.0),
     };
     let objective = &objective;
     let Some(lifted) = objective
-        .patch_within(estimate, reach_m)
+        .patch_within(estimate, reach_m)?
         .filter(|_| !objective.beams.is_empty())
         .map(|patch| patch.lift(estimate, &objective.attitude))
     else {
@@ -224,7 +224,9 @@ pub fn refine_frame(
         Method::GaussNewton | Method::Both => finish(objective, &mut frame, config)?,
         Method::None | Method::Swarm => None,
     };
-    let patch = objective.ground.patch_under(&frame.pose, objective.level_m);
+    let patch = objective
+        .ground
+        .patch_under(&frame.pose, objective.level_m)?;
     if let Some(patch) = &patch {
         frame.attitude = patch.attitude_of(&frame.map_from_lidar);
         frame.level_m = Some(patch.height_m);
@@ -267,7 +269,9 @@ fn search(
     rng: &mut impl Rng,
 ) -> Result<(), RenderError> {
     let dimensions = search_space(&frame.pose, &frame.covariance, config);
-    let patch = objective.ground.patch_under(&frame.pose, objective.level_m);
+    let patch = objective
+        .ground
+        .patch_under(&frame.pose, objective.level_m)?;
     let step = objective.beams.len().div_ceil(config.swarm_beams).max(1);
     let beams: Vec<Beam> = objective.beams.iter().step_by(step).copied().collect();
     let coarse = FrameObjective {
@@ -280,7 +284,7 @@ fn search(
     };
     let (position, _) = minimize(&dimensions, &config.swarm, batch, rng)?;
     let pose = pose_of(&position);
-    let Some(lifted) = objective.lift(&pose, patch.as_ref()) else {
+    let Some(lifted) = objective.lift(&pose, patch.as_ref())? else {
         return Ok(());
     };
     let cost_m = objective.costs_in_space(&[lifted])?[0];

@@ -475,7 +475,7 @@ impl TrajectoryRefiner {
         let untracked = frames.iter().filter(|frame| !frame.is_tracked()).count();
         let refined = frames.iter().filter(|frame| frame.is_refined()).count();
         Ok(RefinedTrajectory {
-            map_from_lidar: self.lift(&poses),
+            map_from_lidar: self.lift(&poses)?,
             poses,
             covariances,
             untracked,
@@ -538,14 +538,14 @@ impl TrajectoryRefiner {
     }
 
     /// The poses in space, aligned to the ground of the map, or to the last known ground.
-    fn lift(&self, poses: &[Pose2]) -> Vec<Pose3> {
+    fn lift(&self, poses: &[Pose2]) -> Result<Vec<Pose3>, RenderError> {
         let mut patch = None;
         let lift = |(pose, frame): (&Pose2, &FrameResult)| {
-            patch = self.map.ground.patch_under(pose, frame.level_m).or(patch);
-            match &patch {
+            patch = (self.map.ground.patch_under(pose, frame.level_m)?).or(patch);
+            Ok(match &patch {
                 Some(patch) => patch.lift(pose, &frame.attitude),
                 None => pose3_from_pose2(pose, 0.0),
-            }
+            })
         };
         poses.iter().zip(&self.frames).map(lift).collect()
     }

@@ -86,7 +86,7 @@ pub fn search(
 ) -> Result<Option<(Pose3, f64)>, RenderError> {
     let center = estimate.translation.vector;
     let reach_m = reach[0].max(reach[1]);
-    let Some(patch) = objective.patch_within(estimate, reach_m) else {
+    let Some(patch) = objective.patch_within(estimate, reach_m)? else {
         return Ok(None);
     };
     let returns = upright_returns(objective, config);
@@ -164,7 +164,7 @@ pub(super) fn finish(
 ) -> Result<Option<(Pose3, f64)>, RenderError> {
     /// Every n-th beam suffices for the wide kernel.
     const STEP: usize = 3;
-    let Some(patch) = objective.patch_within(pose, reach_m) else {
+    let Some(patch) = objective.patch_within(pose, reach_m)? else {
         return Ok(None);
     };
     let some: Vec<Beam> = objective.beams.iter().step_by(STEP).copied().collect();

@@ -344,7 +344,11 @@ mod tests {
     }
 
     fn lift(world: &TestWorld, pose: &Pose2) -> Pose3 {
-        world.ground.lift(pose, &SensorAttitude::default()).unwrap()
+        world
+            .ground
+            .lift(pose, &SensorAttitude::default())
+            .unwrap()
+            .unwrap()
     }
 
     fn perfect_map_config() -> RegistrationConfig {

@@ -23,7 +23,7 @@ use super::order::{
 use super::{RangeDifference, RangeRenderer, RenderError, SurfaceHit, facing};
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh, Vec3};
 use crate::lidar::{Beam, LidarModel, RangeImage};
-use crate::raycasting::{Hit, RAYS, Reach, Scene, SceneSource};
+use crate::raycasting::{Hit, RAYS, Reach, Scene, SceneSource, TileError};
 
 /// Beams that one thread casts at a time.
 const RAYS_PER_PIECE: usize = 64;
@@ -78,13 +78,12 @@ impl CpuRenderer {
                 let poses: Vec<Pose3> = (numbers.iter())
                     .map(|&number| map_from_lidar[number])
                     .collect();
-                let of_poses = self.map_batch(&poses, beams, &summarize);
+                let of_poses = self.map_batch(&poses, beams, &summarize)?;
                 for (&number, of_pose) in numbers.iter().zip(of_poses) {
                     pieces[number] = of_pose;
                 }
             }
         }
-        self.scenes.check()?;
         Ok(pieces)
     }
 
@@ -93,7 +92,7 @@ impl CpuRenderer {
         map_from_lidar: &[Pose3],
         beams: &CastBeams,
         summarize: impl Fn(&[u32], &[f32]) -> T + Sync,
-    ) -> Vec<Vec<T>> {
+    ) -> Result<Vec<Vec<T>>, TileError> {
         let order = pose_order(map_from_lidar);
         let poses: Vec<Pose3> = order
             .iter()
@@ -111,16 +110,14 @@ impl CpuRenderer {
                 let rays = pieces[number / groups.len()];
                 let group = groups[number % groups.len()];
                 let ranges = match grouping {
-                    Grouping::Packets => vec![cast_packets(scene, &group[0], rays, beams)],
-                    Grouping::Bundles => cast_bundles(scene, group, rays, beams),
-                    Grouping::Single => vec![cast_single(scene, &group[0], rays, beams)],
+                    Grouping::Packets => vec![cast_packets(scene, &group[0], rays, beams)?],
+                    Grouping::Bundles => cast_bundles(scene, group, rays, beams)?,
+                    Grouping::Single => vec![cast_single(scene, &group[0], rays, beams)?],
                 };
-                ranges
-                    .iter()
-                    .map(|ranges| summarize(rays, ranges))
-                    .collect()
+                let summaries = ranges.iter().map(|ranges| summarize(rays, ranges));
+                Ok(summaries.collect())
             })
-            .collect();
+            .collect::<Result<_, TileError>>()?;
         let mut per_pose: Vec<Vec<T>> = map_from_lidar.iter().map(|_| Vec::new()).collect();
         for (number, summaries) in summaries.into_iter().enumerate() {
             let first = number % groups.len() * grouping.poses_at_once();
@@ -128,7 +125,7 @@ impl CpuRenderer {
                 per_pose[pose as usize].push(summary);
             }
         }
-        per_pose
+        Ok(per_pose)
     }
 
     /// Mean over the beams of the cost of the range along each, one number per pose; 0 without beams.
@@ -180,41 +177,51 @@ impl CpuRenderer {
 }
 
 /// Nearest hits of some beams of one pose.
-fn hits(scene: &Scene, map_from_lidar: &Pose3, rays: &[u32], beams: &CastBeams) -> Vec<Hit> {
+fn hits(
+    scene: &Scene<TileError>,
+    map_from_lidar: &Pose3,
+    rays: &[u32],
+    beams: &CastBeams,
+) -> Result<Vec<Hit>, TileError> {
     let (directions, reaches) = beams.in_map(map_from_lidar, rays);
     let mut hits = vec![Hit::MISS; rays.len()];
     let origin = origin_of(map_from_lidar);
-    scene.cast_packets(origin, &directions, &reaches, &mut hits);
-    hits
+    scene.cast_packets(origin, &directions, &reaches, &mut hits)?;
+    Ok(hits)
 }
 
 /// Ranges of some beams of one pose.
 fn cast_packets(
-    scene: &Scene,
+    scene: &Scene<TileError>,
     map_from_lidar: &Pose3,
     rays: &[u32],
     beams: &CastBeams,
-) -> Vec<f32> {
-    let hits = hits(scene, map_from_lidar, rays, beams);
-    hits.iter().map(|hit| hit.range_m).collect()
+) -> Result<Vec<f32>, TileError> {
+    let hits = hits(scene, map_from_lidar, rays, beams)?;
+    Ok(hits.iter().map(|hit| hit.range_m).collect())
 }
 
 /// Ranges of some beams of one pose.
-fn cast_single(scene: &Scene, map_from_lidar: &Pose3, rays: &[u32], beams: &CastBeams) -> Vec<f32> {
+fn cast_single(
+    scene: &Scene<TileError>,
+    map_from_lidar: &Pose3,
+    rays: &[u32],
+    beams: &CastBeams,
+) -> Result<Vec<f32>, TileError> {
     let (directions, reaches) = beams.in_map(map_from_lidar, rays);
     let mut ranges = vec![f32::INFINITY; rays.len()];
     let origin = origin_of(map_from_lidar);
-    scene.cast_single(origin, &directions, &reaches, &mut ranges);
-    ranges
+    scene.cast_single(origin, &directions, &reaches, &mut ranges)?;
+    Ok(ranges)
 }
 
 /// Ranges of some beams of up to [`RAYS`] poses, pose by pose.
 fn cast_bundles(
-    scene: &Scene,
+    scene: &Scene<TileError>,
     map_from_lidar: &[Pose3],
     rays: &[u32],
     beams: &CastBeams,
-) -> Vec<Vec<f32>> {
+) -> Result<Vec<Vec<f32>>, TileError> {
     // The last pose fills the empty places.
     let last = map_from_lidar.len() - 1;
     let poses: [&Pose3; RAYS] = std::array::from_fn(|place| &map_from_lidar[place.min(last)]);
@@ -223,10 +230,10 @@ fn cast_bundles(
         beams.rotated(rays, |direction| rotations.map(|r| r * direction));
     let mut ranges = vec![[f32::INFINITY; RAYS]; rays.len()];
     let origins = poses.map(origin_of);
-    scene.cast_bundles(&origins, &directions, &reaches, &mut ranges);
-    (0..map_from_lidar.len())
+    scene.cast_bundles(&origins, &directions, &reaches, &mut ranges)?;
+    Ok((0..map_from_lidar.len())
         .map(|place| ranges.iter().map(|ranges| ranges[place]).collect())
-        .collect()
+        .collect())
 }
 
 /// Which rays traverse the scene together.
@@ -350,12 +357,11 @@ impl RangeRenderer for CpuRenderer {
             .order
             .par_chunks(RAYS_PER_PIECE)
             .map(|rays| hits(&scene, map_from_lidar, rays, &beams))
-            .collect();
-        self.scenes.check()?;
+            .collect::<Result<_, TileError>>()?;
         let rotation = rotation_of(map_from_lidar);
         let mut surfaces = vec![None; directions.len()];
         for (&ray, hit) in beams.order.iter().zip(pieces.into_iter().flatten()) {
-            surfaces[ray as usize] = scene.normal(&hit).map(|normal| SurfaceHit {
+            surfaces[ray as usize] = scene.normal(&hit)?.map(|normal| SurfaceHit {
                 range_m: hit.range_m,
                 normal_in_map: facing(normal, rotation * directions[ray as usize]),
             });

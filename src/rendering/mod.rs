@@ -14,8 +14,6 @@ pub use backend::{Backend, RenderingMethod};
 
 pub(crate) use cpu::CpuRenderer;
 
-use std::sync::Arc;
-
 use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::{Beam, LidarModel, RangeImage};
 use crate::memory::MemoryError;
@@ -205,7 +203,7 @@ pub enum RenderError {
     #[error(transparent)]
     Memory(#[from] MemoryError),
     #[error(transparent)]
-    Tile(#[from] Arc<TileError>),
+    Tile(#[from] TileError),
 }
 
 #[cfg(test)]

@@ -7,10 +7,15 @@ use crate::localization::estimate::Estimate;
 use crate::localization::motion::{TurnDriveTurn, VelocityCommand};
 use crate::localization::odometry::Odometry;
 use crate::map::SensorAttitude;
+use crate::rendering::RenderError;
 
 impl ParticleFilter {
     /// Moves the last estimate by the motion since the last update.
-    pub(super) fn coast(&mut self, odometry: Odometry, attitude: &SensorAttitude) -> Estimate {
+    pub(super) fn coast(
+        &mut self,
+        odometry: Odometry,
+        attitude: &SensorAttitude,
+    ) -> Result<Estimate, RenderError> {
         let mut particles = self.particles.clone();
         let pending = self.pending.unwrap_or_default();
         particles.propagate(|pose| pose * pending.motion);

@@ -84,7 +84,8 @@ fn track(world: &TestWorld, truth: &[Pose2], seed: u64) -> Vec<Estimate> {
         world.map(),
         None,
         ParticleSet::uniform(start),
-    );
+    )
+    .unwrap();
     run(
         &mut filter,
         world,
@@ -199,7 +200,7 @@ fn without_odometry_the_velocity_is_estimated_and_tracking_is_not_lost() {
         let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
         let start = ParticleSet::uniform(start);
         let mut filter =
-            ParticleFilter::new(LocalizerConfig::of_test(500), world.map(), None, start);
+            ParticleFilter::new(LocalizerConfig::of_test(500), world.map(), None, start).unwrap();
         let frames = run(&mut filter, &world, &truth, OdometrySource::None, &mut rng);
         let (position_m, heading_rad) = rmse(&frames[10..], &truth[10..]);
         assert!(
@@ -227,7 +228,7 @@ fn velocity_commands_of_a_car_that_drifts_sideways_add_no_bias() {
         let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
         let start = ParticleSet::uniform(start);
         let mut filter =
-            ParticleFilter::new(LocalizerConfig::of_test(500), world.map(), None, start);
+            ParticleFilter::new(LocalizerConfig::of_test(500), world.map(), None, start).unwrap();
         run(
             &mut filter,
             &world,
@@ -255,7 +256,8 @@ fn a_standing_car_is_not_updated_and_its_covariance_does_not_grow() {
         world.map(),
         None,
         ParticleSet::uniform(start),
-    );
+    )
+    .unwrap();
     let last = run(
         &mut filter,
         &world,
@@ -303,7 +305,7 @@ fn the_covariance_of_a_creeping_car_grows_by_the_noise_of_its_motion() {
     ] {
         // Identical particles: all of the covariance comes from the motion.
         let start = ParticleSet::uniform([truth; 3]);
-        let mut filter = ParticleFilter::new(config.clone(), world.map(), None, start);
+        let mut filter = ParticleFilter::new(config.clone(), world.map(), None, start).unwrap();
         let (scan, attitude) = (world.scan(&truth), SensorAttitude::default());
         let mut rng = StdRng::seed_from_u64(1);
         filter.step(odometry, &scan, &attitude, &mut rng).unwrap();
@@ -331,7 +333,7 @@ fn the_velocity_is_known_across_a_border_of_tiles() {
     let mut rng = StdRng::seed_from_u64(3);
     let start = around(&truth[0], None, 500, &StartSpread::default(), &mut rng);
     let start = ParticleSet::uniform(start);
-    let mut filter = ParticleFilter::new(config, world.map(), None, start);
+    let mut filter = ParticleFilter::new(config, world.map(), None, start).unwrap();
     run(
         &mut filter,
         &world,
@@ -376,7 +378,8 @@ fn a_kidnapped_car_is_detected_within_five_frames_and_localized_again() {
         world.map(),
         Some(panoramas()),
         ParticleSet::uniform(start),
-    );
+    )
+    .unwrap();
     let frames = run(
         &mut filter,
         &world,
@@ -413,7 +416,8 @@ fn after_a_restart_the_covariance_of_a_standing_car_is_that_of_the_particles() {
         world.map(),
         Some(panoramas()),
         ParticleSet::uniform(start),
-    );
+    )
+    .unwrap();
     run(
         &mut filter,
         &world,
@@ -471,7 +475,8 @@ fn a_start_anywhere_converges() {
             world.map(),
             Some(panoramas()),
             ParticleSet::uniform(start),
-        );
+        )
+        .unwrap();
         let frames = run(
             &mut filter,
             &world,
@@ -501,7 +506,8 @@ fn tracking_is_not_lost_next_to_a_lorry() {
         ..StartSpread::default()
     };
     let start = ParticleSet::uniform(around(&truth[0], None, 500, &start, &mut rng));
-    let mut filter = ParticleFilter::new(LocalizerConfig::of_test(500), map.map(), None, start);
+    let mut filter =
+        ParticleFilter::new(LocalizerConfig::of_test(500), map.map(), None, start).unwrap();
     let frames = run(
         &mut filter,
         &seen,
@@ -520,7 +526,8 @@ fn particles_off_the_map_have_no_cost() {
     let truth = world.pose_at(0.0, 0.0, 0.0);
     let nowhere = Pose2::translation(1e6, f64::MAX.sqrt());
     let start = ParticleSet::uniform([nowhere, truth, nowhere]);
-    let mut filter = ParticleFilter::new(LocalizerConfig::of_test(3), world.map(), None, start);
+    let mut filter =
+        ParticleFilter::new(LocalizerConfig::of_test(3), world.map(), None, start).unwrap();
     let mut rng = StdRng::seed_from_u64(1);
     let scan = world.scan(&truth);
     let odometry = Odometry::Increment(Pose2::identity());
@@ -529,7 +536,8 @@ fn particles_off_the_map_have_no_cost() {
         .unwrap();
     assert!(frame.mean_cost_m.is_some());
     let start = ParticleSet::uniform([nowhere; 3]);
-    let mut filter = ParticleFilter::new(LocalizerConfig::of_test(3), world.map(), None, start);
+    let mut filter =
+        ParticleFilter::new(LocalizerConfig::of_test(3), world.map(), None, start).unwrap();
     let frame = filter
         .step(odometry, &scan, &SensorAttitude::default(), &mut rng)
         .unwrap();
@@ -548,7 +556,8 @@ fn a_scan_without_returns_leaves_the_prediction() {
         world.map(),
         None,
         ParticleSet::uniform(start),
-    );
+    )
+    .unwrap();
     run(
         &mut filter,
         &world,
@@ -577,7 +586,8 @@ fn without_returns_tracking_is_lost_after_some_distance() {
         world.map(),
         None,
         ParticleSet::uniform(start),
-    );
+    )
+    .unwrap();
     let frames = run(
         &mut filter,
         &world,

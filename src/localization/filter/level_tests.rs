@@ -214,7 +214,8 @@ fn cars_on_both_levels_and_on_the_ramp_keep_their_level() {
             crossing.map.clone(),
             None,
             start,
-        );
+        )
+        .unwrap();
         follow(&crossing, filter, &truth, &mut rng);
     }
 }
@@ -247,7 +248,8 @@ fn a_start_anywhere_finds_its_level() {
             crossing.map.clone(),
             None,
             ParticleSet::uniform(start),
-        );
+        )
+        .unwrap();
         follow(&crossing, filter, truth, &mut rng);
     }
 }

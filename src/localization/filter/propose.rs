@@ -41,7 +41,7 @@ impl ParticleFilter {
         let config = &self.config.proposal;
         let pending = self.pending.unwrap_or_default().motion;
         let predicted = self.particles.mean() * pending * self.increment(odometry);
-        let patch = self.patch_at(&predicted).or(self.patch);
+        let patch = self.patch_at(&predicted)?.or(self.patch);
         let Some(patch) = patch.filter(|_| self.phase.is_tracking()) else {
             return Ok(None);
         };
@@ -64,7 +64,7 @@ impl ParticleFilter {
             return Ok(None);
         }
         let mean = self.particles.mean();
-        let Some(patch) = self.patch_at(&mean).or(self.patch) else {
+        let Some(patch) = self.patch_at(&mean)?.or(self.patch) else {
             return Ok(None);
         };
         let mut choose = |count| choose_beams(scan, count, config.road_share, attitude, rng);

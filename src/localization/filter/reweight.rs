@@ -59,7 +59,7 @@ impl ParticleFilter {
             // The rounds share the rays of the update.
             let count = observation.beams_for(self.particles.len() * rounds);
             let beams = choose_beams(scan, count, observation.road_share, attitude, rng);
-            let refined = self.refined_attitude(scan, attitude);
+            let refined = self.refined_attitude(scan, attitude)?;
             let (logs, costs_m) = self.log_likelihoods((scan, &beams), &refined)?;
             let used = self.reweight(&logs, 1.0 - power);
             power += used;
@@ -67,7 +67,7 @@ impl ParticleFilter {
                 return Ok(Update {
                     costs_m,
                     beams,
-                    attitude: self.refined_attitude(scan, attitude),
+                    attitude: self.refined_attitude(scan, attitude)?,
                     place: None,
                 });
             }
@@ -82,7 +82,7 @@ impl ParticleFilter {
         scan_and_beams: (&RangeImage, &[Beam]),
         attitude: &SensorAttitude,
     ) -> Result<(Vec<f64>, Vec<Option<f64>>), RenderError> {
-        let poses = self.align_to_ground(attitude);
+        let poses = self.align_to_ground(attitude)?;
         let observation = &self.config.observation;
         let costs = costs_of_scan(&*self.map.renderer, &poses, scan_and_beams, observation)?;
         let log = |cost: &Option<f64>| {
@@ -104,14 +104,14 @@ impl ParticleFilter {
     }
 
     /// Estimate of an updated frame, which is kept for the next frames.
-    pub(super) fn updated_estimate(&mut self, update: &Update) -> Estimate {
+    pub(super) fn updated_estimate(&mut self, update: &Update) -> Result<Estimate, RenderError> {
         let pose = update.place.unwrap_or_else(|| self.particles.mean());
         let covariance = match update.place {
             Some(_) => self.particles.covariance_about(&pose),
             None => self.particles.covariance_of_estimate(),
         };
         let particles = self.particles.clone();
-        let mut estimate = self.estimate_of(pose, particles, covariance, &update.attitude);
+        let mut estimate = self.estimate_of(pose, particles, covariance, &update.attitude)?;
         estimate.updated = true;
         estimate.mean_cost_m = weighted_mean(&self.particles, &update.costs_m);
         let is_narrow = self.is_narrow();
@@ -127,30 +127,36 @@ impl ParticleFilter {
             covariance,
             is_narrow,
         };
-        estimate
+        Ok(estimate)
     }
 
     /// Attitude of the sensor: where the distribution is narrow, from the distances of ground returns
     /// to the mapped ground; otherwise from the scan alone.
-    fn refined_attitude(&self, scan: &RangeImage, attitude: &SensorAttitude) -> SensorAttitude {
+    fn refined_attitude(
+        &self,
+        scan: &RangeImage,
+        attitude: &SensorAttitude,
+    ) -> Result<SensorAttitude, RenderError> {
         if !self.is_narrow() {
-            return *attitude;
+            return Ok(*attitude);
         }
         let (mean, points) = (self.particles.mean(), near_points(scan));
-        self.map
-            .ground
-            .attitude_at(&mean, self.level_m(), attitude, &points)
-            .unwrap_or(*attitude)
+        let ground = &self.map.ground;
+        let refined = ground.attitude_at(&mean, self.level_m(), attitude, &points)?;
+        Ok(refined.unwrap_or(*attitude))
     }
 
     /// Aligns the particles to the ground of the map and returns their poses in space.
-    fn align_to_ground(&mut self, attitude: &SensorAttitude) -> Vec<Option<Pose3>> {
+    fn align_to_ground(
+        &mut self,
+        attitude: &SensorAttitude,
+    ) -> Result<Vec<Option<Pose3>>, RenderError> {
         let remembered = self.patch.filter(|_| self.phase.is_tracking());
         let particles = self.particles.particles();
         let patches: Vec<Option<GroundPatch>> = particles
             .iter()
             .map(|particle| ground_patch_of(particle, &self.map, remembered.as_ref()))
-            .collect();
+            .collect::<Result<_, _>>()?;
         let lift = |(particle, patch): (&Particle, &Option<GroundPatch>)| {
             Some(patch.as_ref()?.lift(&particle.map_from_lidar, attitude))
         };
@@ -159,7 +165,7 @@ impl ParticleFilter {
             .iter()
             .map(|patch| patch.map(|patch| patch.height_m));
         self.particles.set_levels(levels_m);
-        poses
+        Ok(poses)
     }
 }
 

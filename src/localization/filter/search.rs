@@ -129,7 +129,7 @@ impl ParticleFilter {
         let radius_m = self.config.places.radius_m;
         let place = |&seed: &usize| {
             let particle = &self.particles.particles()[seed];
-            let Some(patch) = ground_patch_of(particle, &self.map, None) else {
+            let Some(patch) = ground_patch_of(particle, &self.map, None)? else {
                 return Ok(None);
             };
             let start = particle.map_from_lidar;

@@ -13,6 +13,7 @@ use crate::localization::estimate::Estimate;
 use crate::localization::particles::{ParticleSet, long_axis_m};
 use crate::localization::tracking_loss::AgreementMonitor;
 use crate::map::{GroundPatch, Map, PanoramaRequest, SensorAttitude};
+use crate::rendering::RenderError;
 
 /// A distribution over planar poses, `map_from_lidar`, updated frame by frame.
 pub struct ParticleFilter {
@@ -77,16 +78,19 @@ impl Updated {
 
 impl ParticleFilter {
     /// Starts with a distribution; see [`initialization`](crate::localization::initialization).
+    ///
+    /// # Errors
+    /// That of the tile of the map under the distribution.
     pub fn new(
         config: LocalizerConfig,
         map: Map,
         restart: Option<PanoramaRequest>,
         particles: ParticleSet,
-    ) -> Self {
+    ) -> Result<Self, RenderError> {
         let updated = Updated::from_particles(&particles);
         let level_m = particles.best().level_m;
-        Self {
-            patch: map.ground.patch_under(&updated.pose, level_m),
+        Ok(Self {
+            patch: map.ground.patch_under(&updated.pose, level_m)?,
             config,
             map,
             restart,
@@ -98,7 +102,7 @@ impl ParticleFilter {
             last_motion: None,
             duration_s: PERIOD_S,
             attitude: None,
-        }
+        })
     }
 
     /// Sets the time between the previous frame and the next [s].
@@ -121,14 +125,14 @@ impl ParticleFilter {
         particles: ParticleSet,
         covariance: Matrix3<f64>,
         attitude: &SensorAttitude,
-    ) -> Estimate {
-        let found = self.patch_at(&pose);
+    ) -> Result<Estimate, RenderError> {
+        let found = self.patch_at(&pose)?;
         self.patch = found.or(self.patch);
         let level = GroundPatch {
             height_m: 0.0,
             normal: Vector3::z(),
         };
-        Estimate {
+        Ok(Estimate {
             pose,
             map_from_lidar: self.patch.unwrap_or(level).lift(&pose, attitude),
             attitude: *attitude,
@@ -143,7 +147,7 @@ impl ParticleFilter {
             on_mapped_ground: found.is_some(),
             motion: None,
             particles,
-        }
+        })
     }
 
     /// Whether a position with a covariance is certain enough to be reported as tracked.
@@ -152,8 +156,8 @@ impl ParticleFilter {
     }
 
     /// Ground patch under a pose near the particles.
-    pub(super) fn patch_at(&self, pose: &Pose2) -> Option<GroundPatch> {
-        self.map.ground.patch_under(pose, self.level_m())
+    pub(super) fn patch_at(&self, pose: &Pose2) -> Result<Option<GroundPatch>, RenderError> {
+        Ok(self.map.ground.patch_under(pose, self.level_m())?)
     }
 
     /// Height of the ground below the best particle [m].

@@ -28,14 +28,14 @@ impl ParticleFilter {
     ) -> Result<Estimate, RenderError> {
         self.accumulate(odometry);
         if !self.is_update_due(odometry) {
-            return Ok(self.coast(odometry, attitude));
+            return self.coast(odometry, attitude);
         }
         self.propagate(odometry, rng);
         let update = match self.propose(scan, attitude, rng)? {
             Some(proposal) => self.sample_and_weight(proposal, scan, rng)?,
             None => self.reweight_widely(scan, attitude, rng)?,
         };
-        let mut estimate = self.updated_estimate(&update);
+        let mut estimate = self.updated_estimate(&update)?;
         estimate.agreement =
             self.agreement_at(&estimate.map_from_lidar, &update.beams, &update.attitude)?;
         self.attitude = Some(update.attitude);

@@ -154,6 +154,8 @@ struct PointTask<'a> {
 }
 
 impl SimdTask for PointTask<'_> {
+    type Output = ();
+
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
         let map_from_lidar = &self.voter.scan.map_from_lidar;

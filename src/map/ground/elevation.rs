@@ -23,6 +23,7 @@ use smart_default::SmartDefault;
 
 use super::heights::{ChunkSource, HeightReader, Heights, LEVEL_GAP_M};
 use crate::geometry::{Pose2, Pose3};
+use crate::raycasting::TileError;
 
 /// Radius of the ground that carries a car, about its wheelbase [m].
 const RADIUS_M: f64 = 2.0;
@@ -118,6 +119,9 @@ impl GroundPatch {
 }
 
 /// Elevation map: heights of the ground on a grid, with several levels under bridges.
+///
+/// The ground of a map on disk is read when it is needed: its methods fail with the [`TileError`] of a tile that cannot
+/// be read, and never treat it as one without ground.
 #[derive(Clone, Debug)]
 pub struct GroundMap {
     heights: Heights,
@@ -167,9 +171,13 @@ impl GroundMap {
         y: f64,
         radius_m: f64,
         level_m: Option<f64>,
-    ) -> Option<GroundPatch> {
-        let on_level = level_m.and_then(|level_m| self.patch_on_level(x, y, radius_m, level_m));
-        on_level.or_else(|| self.patch_on_nearest_level(x, y, radius_m, level_m))
+    ) -> Result<Option<GroundPatch>, TileError> {
+        if let Some(level_m) = level_m
+            && let Some(patch) = self.patch_on_level(x, y, radius_m, level_m)?
+        {
+            return Ok(Some(patch));
+        }
+        self.patch_on_nearest_level(x, y, radius_m, level_m)
     }
 
     /// Fits a plane to the level nearest to a height, or to the lowest, among those of enough cells.
@@ -180,13 +188,13 @@ impl GroundMap {
         y: f64,
         radius_m: f64,
         level_m: Option<f64>,
-    ) -> Option<GroundPatch> {
+    ) -> Result<Option<GroundPatch>, TileError> {
         let mut heights = self.heights.reader();
         let mut known_m = Vec::new();
         let mut all = 0;
-        for (cell, _) in self.cells_around(x, y, radius_m)? {
+        for (cell, _) in self.cells_around(x, y, radius_m) {
             all += 1;
-            known_m.extend(heights.levels_m(cell));
+            known_m.extend(heights.levels_m(cell)?);
         }
         let near = |height_m: f64| known_m.iter().filter(move |&&m| is_near(m, height_m));
         let distance_m =
@@ -199,54 +207,65 @@ impl GroundMap {
         levels_m.dedup();
         (levels_m.into_iter())
             .filter(|&level_m| is_enough(near(level_m).count(), all))
-            .find_map(|level_m| self.patch_on_level(x, y, radius_m, level_m))
+            .find_map(|level_m| self.patch_on_level(x, y, radius_m, level_m).transpose())
+            .transpose()
     }
 
     /// Returns the patches of all levels at a position, the lowest first. If no level of its own cell
     /// has enough cells around it, returns the lowest patch of the surroundings.
-    pub(crate) fn levels_at(&self, x: f64, y: f64) -> Vec<GroundPatch> {
+    pub(crate) fn levels_at(&self, x: f64, y: f64) -> Result<Vec<GroundPatch>, TileError> {
         let Some(cell) = self.heights.cell_at(x, y) else {
-            return Vec::new();
+            return Ok(Vec::new());
         };
         let mut heights = self.heights.reader();
-        let own: Vec<GroundPatch> = (heights.levels_m(cell))
-            .filter_map(|level_m| self.patch_on_level(x, y, RADIUS_M, level_m))
-            .collect();
+        let own: Vec<GroundPatch> = (heights.levels_m(cell)?)
+            .filter_map(|level_m| self.patch_on_level(x, y, RADIUS_M, level_m).transpose())
+            .collect::<Result<_, _>>()?;
         if own.is_empty() {
-            return self.patch_at(x, y, RADIUS_M, None).into_iter().collect();
+            let around = self.patch_at(x, y, RADIUS_M, None)?;
+            return Ok(around.into_iter().collect());
         }
-        own
+        Ok(own)
     }
 
-    /// Returns the cells within a radius of a position, with the offsets of their centres.
+    /// Returns the cells within a radius of a position, with the offsets of their centres; none if a coordinate is not
+    /// finite.
     fn cells_around(
         &self,
         x: f64,
         y: f64,
         radius_m: f64,
-    ) -> Option<impl Iterator<Item = ((i64, i64), Vector2<f64>)>> {
-        let (column, row) = self.heights.cell_at(x, y)?;
+    ) -> impl Iterator<Item = ((i64, i64), Vector2<f64>)> {
+        let middle = self.heights.cell_at(x, y);
         let reach = (radius_m / self.heights.cell_m).ceil() as i64;
-        let rows = row.saturating_sub(reach)..=row.saturating_add(reach);
-        let cells = rows.flat_map(move |row| {
-            let columns = column.saturating_sub(reach)..=column.saturating_add(reach);
-            columns.map(move |column| (column, row))
+        let cells = middle.into_iter().flat_map(move |(column, row)| {
+            let rows = row.saturating_sub(reach)..=row.saturating_add(reach);
+            rows.flat_map(move |row| {
+                let columns = column.saturating_sub(reach)..=column.saturating_add(reach);
+                columns.map(move |column| (column, row))
+            })
         });
-        Some(cells.filter_map(move |cell| {
+        cells.filter_map(move |cell| {
             let offset = self.heights.center(cell) - Point2::new(x, y);
             (offset.norm() <= radius_m).then_some((cell, offset))
-        }))
+        })
     }
 
     /// Fits a plane to the cells whose ground is at about a height.
-    fn patch_on_level(&self, x: f64, y: f64, radius_m: f64, level_m: f64) -> Option<GroundPatch> {
+    fn patch_on_level(
+        &self,
+        x: f64,
+        y: f64,
+        radius_m: f64,
+        level_m: f64,
+    ) -> Result<Option<GroundPatch>, TileError> {
         let mut heights = self.heights.reader();
         let mut normal_matrix = Matrix3::zeros();
         let mut right_side = Vector3::zeros();
         let (mut known, mut all) = (0, 0);
-        for (cell, offset) in self.cells_around(x, y, radius_m)? {
+        for (cell, offset) in self.cells_around(x, y, radius_m) {
             all += 1;
-            let height_m = heights.nearest_m(cell, level_m);
+            let height_m = heights.nearest_m(cell, level_m)?;
             if let Some(height_m) = height_m.filter(|&height_m| is_near(height_m, level_m)) {
                 known += 1;
                 let offset = offset.push(1.0);
@@ -255,34 +274,51 @@ impl GroundMap {
             }
         }
         if !is_enough(known, all) {
-            return None;
+            return Ok(None);
         }
-        let plane = normal_matrix.cholesky()?.solve(&right_side);
-        Some(GroundPatch {
+        let plane = (normal_matrix.cholesky()).map(|factors| factors.solve(&right_side));
+        Ok(plane.map(|plane| GroundPatch {
             height_m: plane.z,
             normal: Vector3::new(-plane.x, -plane.y, 1.0).normalize(),
-        })
+        }))
     }
 
     /// Lifts a planar pose onto the (lowest) ground, `map_from_lidar = map_from_road ·
     /// road_from_lidar`, at the x and y of the planar pose; `None` where there is no ground.
-    pub fn lift(&self, planar: &Pose2, attitude: &SensorAttitude) -> Option<Pose3> {
-        Some(self.patch_under(planar, None)?.lift(planar, attitude))
+    pub fn lift(
+        &self,
+        planar: &Pose2,
+        attitude: &SensorAttitude,
+    ) -> Result<Option<Pose3>, TileError> {
+        let patch = self.patch_under(planar, None)?;
+        Ok(patch.map(|patch| patch.lift(planar, attitude)))
     }
 
     /// Interpolates the height of the ground bilinearly on the level nearest to `level_m` [m]; `None`
     /// if it is unknown in one of the four cells.
-    fn height_at(&self, heights: &mut HeightReader, x: f64, y: f64, level_m: f64) -> Option<f64> {
+    fn height_at(
+        &self,
+        heights: &mut HeightReader,
+        x: f64,
+        y: f64,
+        level_m: f64,
+    ) -> Result<Option<f64>, TileError> {
         let cell_m = self.heights.cell_m;
-        let (column, row) = self.heights.cell_at(x - 0.5 * cell_m, y - 0.5 * cell_m)?;
+        let Some((column, row)) = self.heights.cell_at(x - 0.5 * cell_m, y - 0.5 * cell_m) else {
+            return Ok(None);
+        };
         let center = self.heights.center((column, row));
         let (right, up) = ((x - center.x) / cell_m, (y - center.y) / cell_m);
-        let mut between = |row: i64| {
+        let mut rows_m = [0.0; 2];
+        for (row, between_m) in (row..).zip(&mut rows_m) {
             let near = heights.nearest_m((column, row), level_m)?;
             let far = heights.nearest_m((column + 1, row), level_m)?;
-            Some((1.0 - right) * near + right * far)
-        };
-        Some((1.0 - up) * between(row)? + up * between(row + 1)?)
+            let (Some(near), Some(far)) = (near, far) else {
+                return Ok(None);
+            };
+            *between_m = (1.0 - right) * near + right * far;
+        }
+        Ok(Some((1.0 - up) * rows_m[0] + up * rows_m[1]))
     }
 
     /// Estimates the sensor attitude at a planar pose: minimizes the distances of the returns from
@@ -297,12 +333,14 @@ impl GroundMap {
         level_m: Option<f64>,
         start: &SensorAttitude,
         points: &[Vec3],
-    ) -> Option<SensorAttitude> {
+    ) -> Result<Option<SensorAttitude>, TileError> {
         /// Returns farther from the ground are outliers, per iteration [m].
         const GATES_M: [f64; 4] = [0.4, 0.2, 0.1, 0.1];
         /// Least number of returns on the ground.
         const MIN_RETURNS: usize = 50;
-        let patch = self.patch_under(planar, level_m)?;
+        let Some(patch) = self.patch_under(planar, level_m)? else {
+            return Ok(None);
+        };
         let mut heights = self.heights.reader();
         let mut attitude = *start;
         for gate_m in GATES_M {
@@ -313,7 +351,7 @@ impl GroundMap {
             for point in points {
                 let in_lidar = Point3::new(point.x, point.y, point.z).cast::<f64>();
                 let in_map = map_from_lidar * in_lidar;
-                let ground_m = self.height_at(&mut heights, in_map.x, in_map.y, in_map.z);
+                let ground_m = self.height_at(&mut heights, in_map.x, in_map.y, in_map.z)?;
                 let Some(above_m) = (ground_m.map(|ground_m| in_map.z - ground_m))
                     .filter(|above_m| above_m.abs() <= gate_m)
                 else {
@@ -326,20 +364,25 @@ impl GroundMap {
                 right_side -= weight * above_m * slopes;
                 used += 1;
             }
-            if used < MIN_RETURNS {
-                return None;
-            }
-            let step = normal_matrix.cholesky()?.solve(&right_side);
+            let factors = normal_matrix.cholesky().filter(|_| used >= MIN_RETURNS);
+            let Some(factors) = factors else {
+                return Ok(None);
+            };
+            let step = factors.solve(&right_side);
             attitude.height_m += step.x;
             attitude.roll_rad += step.y;
             attitude.pitch_rad += step.z;
         }
-        Some(attitude)
+        Ok(Some(attitude))
     }
 
     /// Returns the ground under a car at a planar pose; `None` where there is none. The level is
     /// chosen as in [`patch_at`](Self::patch_at).
-    pub fn patch_under(&self, planar: &Pose2, level_m: Option<f64>) -> Option<GroundPatch> {
+    pub fn patch_under(
+        &self,
+        planar: &Pose2,
+        level_m: Option<f64>,
+    ) -> Result<Option<GroundPatch>, TileError> {
         let t = planar.translation.vector;
         self.patch_at(t.x, t.y, RADIUS_M, level_m)
     }

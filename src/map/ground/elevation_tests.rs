@@ -24,14 +24,16 @@ fn slope(grade: f32) -> TriangleMesh {
 #[test]
 fn a_patch_of_a_slope_has_the_height_and_normal_of_the_slope() {
     let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
-    let patch = ground.patch_at(3.0, -2.0, 2.0, None).unwrap();
+    let patch = ground.patch_at(3.0, -2.0, 2.0, None).unwrap().unwrap();
     assert_relative_eq!(patch.height_m, 0.3, epsilon = 1e-3);
     let expected = Vector3::new(-0.1, 0.0, 1.0).normalize();
     assert_relative_eq!(patch.normal, expected, epsilon = 1e-3);
 }
 
 fn height_at(ground: &GroundMap, x: f64, y: f64) -> Option<f64> {
-    ground.height_at(&mut ground.heights.reader(), x, y, 0.0)
+    ground
+        .height_at(&mut ground.heights.reader(), x, y, 0.0)
+        .unwrap()
 }
 
 #[test]
@@ -48,10 +50,10 @@ fn heights_are_interpolated_between_cells() {
 #[test]
 fn outside_the_map_there_is_no_ground() {
     let ground = GroundMap::from_mesh(&slope(0.0), |_| true, 0.5);
-    assert_eq!(ground.patch_at(25.0, 0.0, 2.0, None), None);
+    assert_eq!(ground.patch_at(25.0, 0.0, 2.0, None).unwrap(), None);
     let nothing = GroundMap::from_mesh(&TriangleMesh::default(), |_| true, 0.5);
-    assert_eq!(nothing.patch_at(0.0, 0.0, 2.0, None), None);
-    assert_eq!(nothing.levels_at(0.0, 0.0), []);
+    assert_eq!(nothing.patch_at(0.0, 0.0, 2.0, None).unwrap(), None);
+    assert_eq!(nothing.levels_at(0.0, 0.0).unwrap(), []);
 }
 
 /// A square with a deck above it, connected by a ramp.
@@ -80,27 +82,35 @@ fn a_car_stays_on_its_level_up_a_ramp_and_under_a_bridge() {
         let x = -70.0 + 0.5 * f64::from(step);
         let expected_m = (0.1 * (x + 70.0)).min(6.0);
         let pose = Pose2::translation(x, 0.3);
-        above_m = ground.patch_under(&pose, Some(above_m)).unwrap().height_m;
+        above_m = ground
+            .patch_under(&pose, Some(above_m))
+            .unwrap()
+            .unwrap()
+            .height_m;
         // Where the ramp ends, the patch rounds the edge.
         assert_relative_eq!(above_m, expected_m, epsilon = 0.1);
     }
     let mut below_m = 0.0;
     for step in 0..70 {
         let pose = Pose2::translation(0.0, -17.0 + 0.5 * f64::from(step));
-        below_m = ground.patch_under(&pose, Some(below_m)).unwrap().height_m;
+        below_m = ground
+            .patch_under(&pose, Some(below_m))
+            .unwrap()
+            .unwrap()
+            .height_m;
         assert_relative_eq!(below_m, 0.0, epsilon = 1e-6);
     }
-    let levels = ground.levels_at(0.0, 0.0);
+    let levels = ground.levels_at(0.0, 0.0).unwrap();
     let heights: Vec<f64> = levels.iter().map(|patch| patch.height_m).collect();
     assert_relative_eq!(heights[..], [0.0, 6.0][..], epsilon = 1e-6);
-    assert_eq!(ground.levels_at(0.0, 12.0).len(), 1);
+    assert_eq!(ground.levels_at(0.0, 12.0).unwrap().len(), 1);
 }
 
 #[test]
 fn a_wrong_level_height_selects_the_nearest_level() {
     let ground = GroundMap::from_mesh(&bridge(), |_| true, 0.5);
     let height_m = |level_m: Option<f64>| {
-        let patch = ground.patch_under(&Pose2::identity(), level_m);
+        let patch = ground.patch_under(&Pose2::identity(), level_m).unwrap();
         patch.unwrap().height_m
     };
     assert_relative_eq!(height_m(Some(30.0)), 6.0, epsilon = 1e-6);
@@ -138,10 +148,10 @@ fn an_outlier_cell_above_or_below_the_ground_does_not_change_the_patch() {
         let ground = GroundMap::from_mesh(&mesh, |_| true, 0.5);
         for (x, y) in [(0.25, 0.25), (0.8, 0.25), (-1.0, 0.5)] {
             for level_m in [None, Some(0.0), Some(3.0 * f64::from(outlier_m))] {
-                let patch = ground.patch_at(x, y, RADIUS_M, level_m).unwrap();
+                let patch = ground.patch_at(x, y, RADIUS_M, level_m).unwrap().unwrap();
                 assert_relative_eq!(patch.height_m, 0.0, epsilon = 1e-6);
             }
-            let levels = ground.levels_at(x, y);
+            let levels = ground.levels_at(x, y).unwrap();
             assert_eq!(levels.len(), 1);
             assert_relative_eq!(levels[0].height_m, 0.0, epsilon = 1e-6);
         }
@@ -159,7 +169,7 @@ fn deck_over_road(mapped_from_m: f32) -> GroundMap {
 fn at_the_edge_of_a_bridge_a_strip_of_the_road_below_does_not_hide_the_deck() {
     let ground = deck_over_road(2.0);
     let height_m = |y: f64, level_m: Option<f64>| {
-        let patch = ground.patch_at(0.0, y, RADIUS_M, level_m);
+        let patch = ground.patch_at(0.0, y, RADIUS_M, level_m).unwrap();
         patch.map(|patch| patch.height_m)
     };
     // A fifth of the cells around contain the road, all of them the deck.
@@ -175,7 +185,7 @@ fn at_the_edge_of_a_bridge_a_strip_of_the_road_below_does_not_hide_the_deck() {
 fn at_the_edge_of_a_bridge_a_position_has_the_levels_of_its_own_cell() {
     let ground = deck_over_road(4.0);
     let levels_m = |y: f64| {
-        let levels = ground.levels_at(0.0, y);
+        let levels = ground.levels_at(0.0, y).unwrap();
         levels
             .iter()
             .map(|patch| patch.height_m)
@@ -190,7 +200,10 @@ fn at_the_edge_of_a_bridge_a_position_has_the_levels_of_its_own_cell() {
 fn on_level_ground_a_lifted_pose_has_the_sensor_height_at_the_planar_pose() {
     let ground = GroundMap::flat(Point2::new(-10.0, -10.0), Point2::new(10.0, 10.0), -1.73);
     let pose = Pose2::new(Vector2::new(1.0, 2.0), 2.5);
-    let lifted = ground.lift(&pose, &SensorAttitude::default()).unwrap();
+    let lifted = ground
+        .lift(&pose, &SensorAttitude::default())
+        .unwrap()
+        .unwrap();
     assert_relative_eq!(pose2_from_pose3(&lifted), pose, epsilon = 1e-9);
     assert_relative_eq!(lifted.translation.z, 0.0, epsilon = 1e-6);
 }
@@ -222,7 +235,7 @@ fn the_attitude_is_estimated_from_returns_of_a_slope_with_outliers() {
         roll_rad: 0.015,
         pitch_rad: -0.02,
     };
-    let lidar_from_map = ground.lift(&pose, &truth).unwrap().inverse();
+    let lidar_from_map = ground.lift(&pose, &truth).unwrap().unwrap().inverse();
     let points: Vec<Vec3> = (0..900)
         .map(|i| {
             let (x, y) = (f64::from(i % 30) - 14.0, f64::from(i / 30) - 14.0);
@@ -232,11 +245,19 @@ fn the_attitude_is_estimated_from_returns_of_a_slope_with_outliers() {
         })
         .collect();
     let start = SensorAttitude::default();
-    let found = ground.attitude_at(&pose, None, &start, &points).unwrap();
+    let found = ground
+        .attitude_at(&pose, None, &start, &points)
+        .unwrap()
+        .unwrap();
     assert_relative_eq!(found.height_m, truth.height_m, epsilon = 5e-3);
     assert_relative_eq!(found.roll_rad, truth.roll_rad, epsilon = 5e-4);
     assert_relative_eq!(found.pitch_rad, truth.pitch_rad, epsilon = 5e-4);
-    assert_eq!(ground.attitude_at(&pose, None, &start, &points[..40]), None);
+    assert_eq!(
+        ground
+            .attitude_at(&pose, None, &start, &points[..40])
+            .unwrap(),
+        None
+    );
 }
 
 #[test]
@@ -244,7 +265,10 @@ fn the_pitch_follows_the_slope_uphill_and_downhill() {
     let ground = GroundMap::from_mesh(&slope(0.1), |_| true, 0.5);
     for (heading, sign) in [(0.0, 1.0), (std::f64::consts::PI, -1.0)] {
         let pose = Pose2::new(Vector2::new(0.0, 0.0), heading);
-        let lifted = ground.lift(&pose, &SensorAttitude::default()).unwrap();
+        let lifted = ground
+            .lift(&pose, &SensorAttitude::default())
+            .unwrap()
+            .unwrap();
         let forward = lifted.rotation * Vector3::x();
         assert_relative_eq!(forward.z, sign * 0.1_f64.atan().sin(), epsilon = 1e-3);
     }

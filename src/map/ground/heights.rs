@@ -19,6 +19,7 @@ use std::sync::Arc;
 use glam::DVec3;
 use nalgebra::{Point2, Vector3};
 
+use crate::raycasting::TileError;
 use crate::shared_bytes::SharedBytes;
 
 /// Cells along the edge of a chunk.
@@ -51,15 +52,18 @@ pub(crate) struct Heights {
 /// cell has no such level.
 pub(crate) trait ChunkSource: Debug + Send + Sync {
     /// The numbers of a chunk, `f32`; `None` where there is no ground.
-    fn chunk(&self, chunk: Cell) -> Option<SharedBytes>;
+    ///
+    /// # Errors
+    /// That of the tile of the chunk, each time it is requested.
+    fn chunk(&self, chunk: Cell) -> Result<Option<SharedBytes>, TileError>;
 }
 
 /// Chunks in memory.
 pub(crate) type Chunks = BTreeMap<Cell, SharedBytes>;
 
 impl ChunkSource for Chunks {
-    fn chunk(&self, chunk: Cell) -> Option<SharedBytes> {
-        self.get(&chunk).cloned()
+    fn chunk(&self, chunk: Cell) -> Result<Option<SharedBytes>, TileError> {
+        Ok(self.get(&chunk).cloned())
     }
 }
 
@@ -130,23 +134,23 @@ pub(crate) struct HeightReader<'a> {
 
 impl HeightReader<'_> {
     /// Returns the levels of a cell, the lowest first [m].
-    pub fn levels_m(&mut self, cell: Cell) -> impl Iterator<Item = f64> {
+    pub fn levels_m(&mut self, cell: Cell) -> Result<impl Iterator<Item = f64>, TileError> {
         let (chunk, offset) = chunk_of(cell);
         if !matches!(&self.last, Some((last, _)) if *last == chunk) {
-            self.last = Some((chunk, self.heights.chunks.chunk(chunk)));
+            self.last = Some((chunk, self.heights.chunks.chunk(chunk)?));
         }
         let bytes = self.last.as_ref().and_then(|(_, bytes)| bytes.as_deref());
         let heights_m: &[f32] = bytes.map_or(&[], bytemuck::cast_slice);
-        heights_m
+        Ok(heights_m
             .chunks_exact(CELLS)
             .map(move |cells| f64::from(cells[offset]))
-            .take_while(|height_m| !height_m.is_nan())
+            .take_while(|height_m| !height_m.is_nan()))
     }
 
     /// Returns the level of a cell nearest to a height [m]; `None` in a cell without ground.
-    pub fn nearest_m(&mut self, cell: Cell, height_m: f64) -> Option<f64> {
-        self.levels_m(cell)
-            .min_by(|a, b| (a - height_m).abs().total_cmp(&(b - height_m).abs()))
+    pub fn nearest_m(&mut self, cell: Cell, height_m: f64) -> Result<Option<f64>, TileError> {
+        let levels_m = self.levels_m(cell)?;
+        Ok(levels_m.min_by(|a, b| (a - height_m).abs().total_cmp(&(b - height_m).abs())))
     }
 }
 
@@ -296,8 +300,8 @@ mod tests {
         let heights = Heights::of_triangles([near, far, degenerate].into_iter(), 0.25);
         let chunks = chunks_of_triangles([near, far, degenerate].into_iter(), 0.25);
         assert_eq!(chunks.len(), 2);
-        assert_eq!(heights.reader().nearest_m((1, 1), 5.0), Some(0.0));
-        assert_eq!(heights.reader().nearest_m((1000, 1), 0.0), None);
+        assert_eq!(heights.reader().nearest_m((1, 1), 5.0).unwrap(), Some(0.0));
+        assert_eq!(heights.reader().nearest_m((1000, 1), 0.0).unwrap(), None);
     }
 
     #[test]
@@ -307,7 +311,11 @@ mod tests {
         };
         let levels = |heights_m: &[f64]| {
             let heights = Heights::of_triangles(heights_m.iter().map(|&height| slab(height)), 0.25);
-            heights.reader().levels_m((0, 0)).collect::<Vec<_>>()
+            heights
+                .reader()
+                .levels_m((0, 0))
+                .unwrap()
+                .collect::<Vec<_>>()
         };
         assert_eq!(levels(&[6.0, 0.0, 6.5, 0.5]), [0.25, 6.25]);
         assert_eq!(levels(&[12.0, 6.0, 0.0]), [0.0, 6.0, 12.0]);
@@ -325,10 +333,10 @@ mod tests {
         let heights = Heights::of_triangles([climbing].into_iter(), 0.5);
         let mut reader = heights.reader();
         for cell in [(-1, -1), (63, -70), (-70, 63), (-1, -1), (900, 900)] {
-            let fresh = heights.reader().nearest_m(cell, 0.0);
-            assert_eq!(reader.nearest_m(cell, 0.0), fresh);
+            let fresh = heights.reader().nearest_m(cell, 0.0).unwrap();
+            assert_eq!(reader.nearest_m(cell, 0.0).unwrap(), fresh);
         }
         let expected_m = 0.1 * heights.center((63, -70)).x;
-        assert!((reader.nearest_m((63, -70), 0.0).unwrap() - expected_m).abs() < 1e-6);
+        assert!((reader.nearest_m((63, -70), 0.0).unwrap().unwrap() - expected_m).abs() < 1e-6);
     }
 }

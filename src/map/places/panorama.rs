@@ -19,7 +19,6 @@ use std::collections::BTreeSet;
 use std::f32::consts::TAU;
 use std::ops::{Range, RangeInclusive};
 use std::path::Path;
-use std::sync::Arc;
 
 use nalgebra::Point2;
 use rayon::prelude::*;
@@ -201,20 +200,18 @@ impl PanoramaIndex {
             let pose = Pose2::from(center.coords);
             tiles.valid_tile_of(&pose).is_some()
         };
-        let levels = |center: &Point2<f64>| {
-            let (center, pose) = (*center, Pose2::from(center.coords));
-            let patches = ground.levels_at(center.x, center.y);
-            patches.into_iter().map(move |patch| {
-                let place = Place {
+        let (mut places, mut poses) = (Vec::new(), Vec::new());
+        for center in cells.iter().filter(on_map) {
+            let pose = Pose2::from(center.coords);
+            for patch in ground.levels_at(center.x, center.y)? {
+                places.push(Place {
                     x: center.x,
                     y: center.y,
                     level_m: patch.height_m,
-                };
-                (place, patch.lift(&pose, &upright))
-            })
-        };
-        let (places, poses): (Vec<Place>, Vec<Pose3>) =
-            cells.iter().filter(on_map).flat_map(levels).unzip();
+                });
+                poses.push(patch.lift(&pose, &upright));
+            }
+        }
         let model = panorama_model(&request.lidar, &request.config);
         let render = |places: Range<usize>| renderer.render(&poses[places], &model);
         // Also of those in a file, so that a fine grid does not fill the disk.
@@ -223,8 +220,6 @@ impl PanoramaIndex {
             2.0 * model.len() as f64 * (places.len() + 3 * places.len().min(BATCH)) as f64,
             "raise grid_res, or lower panorama.rows or panorama.columns",
         )?;
-        // Where there is no ground because it cannot be read, this fails.
-        render(0..0)?;
         let on_disk = match file {
             Some((path, request)) => Panoramas::write(path, request, &places, &model, render),
             None => Ok(None),
@@ -265,8 +260,7 @@ impl PanoramaIndex {
                 let coarse_image = thinned(&reader.read(cell)?, self.model.width, step);
                 Ok((best_shift(&coarse_image, &coarse_scan, limit).0, cell))
             })
-            .collect::<Result<_, TileError>>()
-            .map_err(Arc::new)?;
+            .collect::<Result<_, TileError>>()?;
         coarse.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         let kept = (self.config.refined_share * coarse.len() as f64).ceil() as usize;
         self.keep_best_and_one_per_square(&mut coarse, kept.max(1));
@@ -284,8 +278,7 @@ impl PanoramaIndex {
                     cost_m: f64::from(cost_m),
                 })
             })
-            .collect::<Result<_, TileError>>()
-            .map_err(Arc::new)?;
+            .collect::<Result<_, TileError>>()?;
         // Stable: cells of equal cost keep their order.
         seeds.sort_by(|a, b| a.cost_m.total_cmp(&b.cost_m));
         Ok(seeds)
@@ -455,7 +448,7 @@ mod tests {
         assert!(!index.panoramas.places().is_empty());
         for place in index.panoramas.places() {
             let pose = Pose2::translation(place.x, place.y);
-            assert!(world.ground.patch_under(&pose, None).is_some());
+            assert!(world.ground.patch_under(&pose, None).unwrap().is_some());
             assert!(world.tiles.valid_tile_of(&pose).is_some());
         }
     }

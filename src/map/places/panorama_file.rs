@@ -234,10 +234,7 @@ impl PanoramaReader<'_> {
                             false => Err(TileProblem::Checksum),
                         }
                     })
-                    .map_err(|problem| TileError {
-                        file: path.clone(),
-                        problem,
-                    })
+                    .map_err(|problem| TileError::new(path.clone(), problem))
             }
         }
     }

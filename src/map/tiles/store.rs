@@ -9,7 +9,7 @@ use std::fs::{self, File, TryLockError};
 use std::io::{self, BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, OnceLock, PoisonError, RwLock};
+use std::sync::{Arc, OnceLock, PoisonError, RwLock};
 use std::time::UNIX_EPOCH;
 
 use glam::{DVec3, Vec3};
@@ -26,9 +26,7 @@ use crate::map::ground::heights::{
     Cell, ChunkSource, GROUND_CELL_M, chunks_of_triangles, chunks_reached, middle_of_chunk,
 };
 use crate::map::mesh_view::{MeshView, part_on_lattice};
-use crate::raycasting::{
-    Scene, SceneSource, Tile, TileError, TileProblem, TileSource, TriangleSource,
-};
+use crate::raycasting::{Scene, SceneSource, Tile, TileError, TileSource, TriangleSource};
 use crate::shared_bytes::SharedBytes;
 
 /// Memory of tiles above which those far from the rays are dropped [bytes].
@@ -47,7 +45,7 @@ pub(crate) struct TileStore {
     /// Path of the mapping drive, if it is in the mesh file.
     pub path: Option<MappingPath>,
     /// The boxes of all tiles, without the tiles.
-    scene: Scene,
+    scene: Scene<TileError>,
     resident: RwLock<Arc<Resident>>,
     is_reading_ahead: Arc<AtomicBool>,
 }
@@ -64,17 +62,15 @@ struct Files {
     bytes: Arc<AtomicU64>,
     /// Memory above which tiles are dropped [bytes].
     kept_bytes: u64,
-    /// The first tile that could not be read since the last check.
-    failure: Mutex<Option<Arc<TileError>>>,
     /// The folder, locked so that no other process removes files from it.
     _in_use: Option<File>,
 }
 
-/// The tiles that are in memory, and those that were not needed yet.
+/// The tiles that are in memory or cannot be read, and those that were not needed yet.
 #[derive(Debug)]
 struct Resident {
     files: Arc<Files>,
-    slots: Vec<OnceLock<Option<Arc<LoadedTile>>>>,
+    slots: Vec<OnceLock<Result<Arc<LoadedTile>, TileError>>>,
 }
 
 /// A tile in memory; its bytes are counted as long as it is.
@@ -82,47 +78,50 @@ struct Resident {
 struct LoadedTile {
     number: usize,
     file: TileFile,
-    scene: OnceLock<Option<TileScene>>,
+    scene: OnceLock<Result<TileScene, TileError>>,
     /// Those of all tiles.
     bytes: Arc<AtomicU64>,
 }
 
 impl Drop for LoadedTile {
     fn drop(&mut self) {
-        let scene = self.scene.get().and_then(Option::as_ref);
+        let scene = self.scene.get().and_then(|scene| scene.as_ref().ok());
         let bytes = self.file.ground_bytes() + scene.map_or(0, TileScene::bytes);
         self.bytes.fetch_sub(bytes as u64, Ordering::Relaxed);
     }
 }
 
 impl Resident {
-    fn get(&self, number: usize) -> Option<&Arc<LoadedTile>> {
-        let slot = self.slots.get(number)?;
-        slot.get_or_init(|| self.files.read(number)).as_ref()
+    fn get(&self, number: usize) -> Result<&Arc<LoadedTile>, &TileError> {
+        let tile = self.slots[number].get_or_init(|| self.files.read(number));
+        tile.as_ref()
     }
 
-    fn scene(&self, number: usize) -> Option<&TileScene> {
+    fn scene(&self, number: usize) -> Result<&TileScene, &TileError> {
         let tile = self.get(number)?;
-        tile.scene
-            .get_or_init(|| self.files.scene_of(tile))
-            .as_ref()
+        let scene = tile.scene.get_or_init(|| self.files.scene_of(tile));
+        scene.as_ref()
     }
 }
 
-impl TileSource for Resident {
+impl TileSource<TileError> for Resident {
     #[inline]
-    fn tile(&self, number: usize) -> Option<&Tile> {
-        self.scene(number)?.tile.as_ref()
+    fn tile(&self, number: usize) -> Result<Option<&Tile>, &TileError> {
+        // The tile of a ray without a hit has a number that no tile has.
+        if number >= self.slots.len() {
+            return Ok(None);
+        }
+        Ok(self.scene(number)?.tile.as_ref())
     }
 }
 
 impl Files {
-    fn read(&self, number: usize) -> Option<Arc<LoadedTile>> {
-        let path = self.tiles[number].file(&self.folder, self.stamp);
-        let file = self.or_failure(number, TileFile::open(&path))?;
+    fn read(&self, number: usize) -> Result<Arc<LoadedTile>, TileError> {
+        let path = self.path(number);
+        let file = TileFile::open(&path).map_err(|problem| TileError::new(path, problem))?;
         self.bytes
             .fetch_add(file.ground_bytes() as u64, Ordering::Relaxed);
-        Some(Arc::new(LoadedTile {
+        Ok(Arc::new(LoadedTile {
             number,
             file,
             scene: OnceLock::new(),
@@ -130,21 +129,16 @@ impl Files {
         }))
     }
 
-    fn scene_of(&self, tile: &LoadedTile) -> Option<TileScene> {
-        let scene = self.or_failure(tile.number, tile.file.scene())?;
+    fn scene_of(&self, tile: &LoadedTile) -> Result<TileScene, TileError> {
+        let scene = tile.file.scene();
+        let scene = scene.map_err(|problem| TileError::new(self.path(tile.number), problem))?;
         self.bytes
             .fetch_add(scene.bytes() as u64, Ordering::Relaxed);
-        Some(scene)
+        Ok(scene)
     }
 
-    /// Keeps the first problem for the next check.
-    fn or_failure<T>(&self, number: usize, read: Result<T, TileProblem>) -> Option<T> {
-        read.map_err(|problem| {
-            let file = self.tiles[number].file(&self.folder, self.stamp);
-            let mut failure = self.failure.lock().unwrap_or_else(PoisonError::into_inner);
-            failure.get_or_insert(Arc::new(TileError { file, problem }));
-        })
-        .ok()
+    fn path(&self, number: usize) -> PathBuf {
+        self.tiles[number].file(&self.folder, self.stamp)
     }
 }
 
@@ -271,7 +265,6 @@ impl TileStore {
             numbers,
             bytes: Arc::default(),
             kept_bytes,
-            failure: Mutex::default(),
             _in_use: in_use,
             tiles: index.tiles,
         });
@@ -314,7 +307,7 @@ impl TileStore {
         origin: DVec3,
         most_triangles: u64,
         is_wanted: impl Fn(&Aabb) -> bool,
-    ) -> Result<TriangleMesh, Arc<TileError>> {
+    ) -> Result<TriangleMesh, TileError> {
         let wanted = self.files.tiles.iter().enumerate();
         let wanted: Vec<_> = wanted
             .filter(|(_, entry)| is_wanted(&entry.bounds()))
@@ -328,9 +321,7 @@ impl TileStore {
         let mut mesh = TriangleMesh::default();
         for (number, entry) in wanted {
             let resident = self.resident();
-            let Some(scene) = resident.scene(number) else {
-                continue;
-            };
+            let scene = resident.scene(number).map_err(TileError::clone)?;
             let Some(tile) = &scene.tile else {
                 continue;
             };
@@ -353,7 +344,6 @@ impl TileStore {
             });
             self.drop_beyond(entry.bounds());
         }
-        self.check()?;
         Ok(mesh)
     }
 
@@ -393,8 +383,8 @@ impl TileStore {
             TileIndex::of(x, y, self.files.side_m)
         };
         let is_missing = |number: &usize| {
-            let tile = resident.slots[*number].get().and_then(Option::as_ref);
-            tile.is_none_or(|tile| tile.scene.get().is_none())
+            let tile = resident.slots[*number].get();
+            tile.is_none_or(|tile| tile.as_ref().is_ok_and(|tile| tile.scene.get().is_none()))
         };
         let missing: Vec<usize> =
             TileIndex::range(at(bounds.min, -AHEAD_M), at(bounds.max, AHEAD_M))
@@ -407,7 +397,8 @@ impl TileStore {
         let (resident, reading) = (resident.clone(), Reading(self.is_reading_ahead.clone()));
         std::thread::spawn(move || {
             for number in missing {
-                resident.scene(number);
+                // An error is kept for the call that needs the tile.
+                let _ = resident.scene(number);
             }
             // Dropped first: who sees that the reading has ended sees what is kept.
             drop(resident);
@@ -426,7 +417,7 @@ impl Drop for Reading {
 }
 
 impl SceneSource for TileStore {
-    fn scene(&self, origins: &[DVec3]) -> Scene {
+    fn scene(&self, origins: &[DVec3]) -> Scene<TileError> {
         let finite = origins.iter().filter(|origin| origin.is_finite());
         let bounds = Aabb::from_points(finite.map(|origin| origin.as_vec3()));
         if !bounds.is_empty() {
@@ -438,15 +429,6 @@ impl SceneSource for TileStore {
         }
         self.scene.with_tiles(resident)
     }
-
-    fn check(&self) -> Result<(), Arc<TileError>> {
-        let mut failure = self
-            .files
-            .failure
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
-        failure.take().map_or(Ok(()), Err)
-    }
 }
 
 impl TriangleSource for TileStore {
@@ -456,28 +438,30 @@ impl TriangleSource for TileStore {
     }
 
     /// The tile is not kept in memory.
-    fn triangles(&self, tile: usize) -> Result<Vec<[DVec3; 3]>, Arc<TileError>> {
+    fn triangles(&self, tile: usize) -> Result<Vec<[DVec3; 3]>, TileError> {
         let mut triangles = Vec::new();
-        if let Some(loaded) = self.files.read(tile) {
-            let scene = (loaded.scene.get_or_init(|| self.files.scene_of(&loaded))).as_ref();
-            if let Some(tile) = scene.and_then(|scene| scene.tile.as_ref()) {
-                tile.for_each_triangle(|corners, _| triangles.push(corners));
-            }
+        let loaded = self.files.read(tile)?;
+        let scene = loaded.scene.get_or_init(|| self.files.scene_of(&loaded));
+        if let Some(tile) = &scene.as_ref().map_err(TileError::clone)?.tile {
+            tile.for_each_triangle(|corners, _| triangles.push(corners));
         }
-        self.check()?;
         Ok(triangles)
     }
 }
 
 impl ChunkSource for TileStore {
-    fn chunk(&self, chunk: Cell) -> Option<SharedBytes> {
+    fn chunk(&self, chunk: Cell) -> Result<Option<SharedBytes>, TileError> {
         let tile = tile_of_chunk(chunk, self.files.side_m);
-        let number = *self.files.numbers.get(&tile)?;
-        let heights = self.resident().get(number)?.file.chunk(chunk);
+        let Some(&number) = self.files.numbers.get(&tile) else {
+            return Ok(None);
+        };
+        let resident = self.resident();
+        let loaded = resident.get(number).map_err(TileError::clone)?;
+        let heights = loaded.file.chunk(chunk);
         if self.files.bytes.load(Ordering::Relaxed) > self.files.kept_bytes * 3 / 2 {
             self.drop_beyond(self.files.tiles[number].bounds());
         }
-        heights
+        Ok(heights)
     }
 }
 
@@ -582,9 +566,10 @@ mod tests {
 
     use super::*;
     use crate::geometry::Pose3;
+    use crate::lidar::LidarModel;
     use crate::map::ground::elevation::GroundMap;
-    use crate::map::{Map, MapOptions};
-    use crate::rendering::Backend;
+    use crate::map::{Map, MapError, MapOptions};
+    use crate::rendering::{Backend, RenderError};
 
     /// A road of 1.2 km along x, walls beside it, and a ramp.
     fn street() -> TriangleMesh {
@@ -669,7 +654,7 @@ mod tests {
         let ranges = ranges.collect();
         let heights = xs
             .iter()
-            .map(|&x| Some(map.ground.patch_at(x, 0.0, 2.0, None)?.height_m));
+            .map(|&x| Some(map.ground.patch_at(x, 0.0, 2.0, None).unwrap()?.height_m));
         (ranges, heights.collect())
     }
 
@@ -821,32 +806,62 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_tile_is_an_error_that_names_it_and_a_damaged_index_is_made_again() {
+    fn a_damaged_tile_is_an_error_of_each_call_that_needs_it_and_a_damaged_index_is_made_again() {
         let (_folder, file) = saved();
         drop(Map::load(&file, &options()).unwrap());
         let store = TileStore::open(&file, false, 100.0).unwrap().unwrap();
         let (folder, stamp) = (store.files.folder.clone(), store.files.stamp);
         let tile = TileEntry::new(TileIndex::of(600.0, 0.0, 100.0), None, 0).file(&folder, stamp);
         let whole = fs::read(&tile).unwrap();
-        let mut bad = whole.clone();
-        bad[whole.len() / 2] ^= 1;
-        for (bytes, problem) in [
-            (&bad[..], "checksum"),
-            (&whole[..300], "incomplete"),
-            (&[], "tile"),
+        let damaged = |byte: usize| {
+            let mut bad = whole.clone();
+            bad[byte] ^= 1;
+            bad
+        };
+        let pose = Pose3::translation(600.0, 0.0, 4.4);
+        for (bytes, problem, has_ground) in [
+            (&damaged(300)[..], "checksum", true),
+            (&damaged(whole.len() - 1), "checksum", false),
+            (&whole[..300], "incomplete", false),
+            (&[], "tile", false),
         ] {
             // Replaced as a whole, as files that may be mapped have to be.
             fs::remove_file(&tile).unwrap();
             fs::write(&tile, bytes).unwrap();
             let map = Map::load(&file, &options()).unwrap();
-            let cast = map
-                .renderer
-                .cast(&[Pose3::translation(600.0, 0.0, 4.4)], &[Vec3::Y], 50.0);
-            let message = cast.unwrap_err().to_string();
-            assert!(
-                message.contains("6_0.") && message.contains(problem),
-                "{message}"
-            );
+            let (renderer, ground) = (&*map.renderer, &map.ground);
+            let failing = |call: &str| -> Option<RenderError> {
+                match call {
+                    "cast" => renderer.cast(&[pose], &[Vec3::Y], 50.0).err(),
+                    "surfaces" => renderer.surfaces(&pose, &[Vec3::Y], 50.0).err(),
+                    "render" => renderer.render(&[pose], &LidarModel::default()).err(),
+                    "mesh" => map
+                        .mesh_near(&[[600.0, 0.0].into()], 10.0, DVec3::ZERO, u64::MAX)
+                        .err()
+                        .map(|error| match error {
+                            MapError::Render(error) => error,
+                            other => panic!("{other}"),
+                        }),
+                    "patch" => ground.patch_at(600.0, 0.0, 2.0, None).err().map(Into::into),
+                    _ => ground.levels_at(600.0, 0.0).err().map(Into::into),
+                }
+            };
+            let calls = ["cast", "surfaces", "render", "mesh", "patch", "levels"];
+            for call in [calls, calls].into_iter().flatten() {
+                if has_ground && matches!(call, "patch" | "levels") {
+                    assert!(failing(call).is_none(), "{call}");
+                    continue;
+                }
+                let message = failing(call).unwrap().to_string();
+                assert!(
+                    message.contains("6_0.") && message.contains(problem),
+                    "{call}: {message}"
+                );
+            }
+            // Rays and ground elsewhere do not need the tile.
+            let elsewhere = Pose3::translation(300.0, 0.0, 3.2);
+            assert!(renderer.cast(&[elsewhere], &[Vec3::Y], 50.0).is_ok());
+            assert!(ground.patch_at(300.0, 0.0, 2.0, None).unwrap().is_some());
         }
         fs::write(folder.join(INDEX), b"nothing").unwrap();
         let map = Map::load(&file, &options()).unwrap();

@@ -36,57 +36,8 @@ impl Scene {
         let chunks = directions.chunks(AT_ONCE).zip(hits.chunks_mut(AT_ONCE));
         for (directions, hits) in chunks {
             let reaches = &reaches[..directions.len()];
-            self.cast_packets(origin.as_dvec3(), directions, reaches, hits);
+            let Ok(()) = self.cast_packets(origin.as_dvec3(), directions, reaches, hits);
         }
-    }
-
-    /// Like [`Scene::cast`], but each ray has its own reach, and the origin keeps its precision
-    /// far from the origin of the frame.
-    ///
-    /// # Panics
-    /// If there are not as many reaches or hits as directions.
-    pub fn cast_packets(
-        &self,
-        origin: DVec3,
-        directions: &[Vec3],
-        reaches: &[Reach],
-        hits: &mut [Hit],
-    ) {
-        dispatch(self.task(origin, directions, reaches, hits));
-    }
-
-    /// Casts bundles of rays from the same origins, which is faster than [`Scene::cast_single`] if
-    /// the rays of a bundle stay close to each other, and writes the ranges of their nearest hits:
-    /// the same, bit by bit, with the exceptions that are named there. All rays of a bundle have
-    /// one reach. Runs on the calling thread.
-    ///
-    /// # Panics
-    /// If there are not as many reaches or ranges as bundles.
-    pub fn cast_bundles(
-        &self,
-        origins: &[DVec3; RAYS],
-        directions: &[[Vec3; RAYS]],
-        reaches: &[Reach],
-        ranges_m: &mut [[f32; RAYS]],
-    ) {
-        dispatch(self.task(*origins, directions, reaches, ranges_m));
-    }
-
-    /// Casts single rays from one origin, which is faster than [`Scene::cast_packets`] if they
-    /// diverge, and writes the range of the nearest hit of each: the same, bit by bit, with two
-    /// exceptions: of surfaces nearer than [`Reach::enough_m`] it may be another, and so it may be
-    /// of the triangles at an edge that the ray passes within rounding. Runs on the calling thread.
-    ///
-    /// # Panics
-    /// If there are not as many reaches or ranges as directions.
-    pub fn cast_single(
-        &self,
-        origin: DVec3,
-        directions: &[Vec3],
-        reaches: &[Reach],
-        ranges_m: &mut [f32],
-    ) {
-        dispatch(self.task(origin, directions, reaches, ranges_m));
     }
 
     /// Visits every triangle that a ray hits nearer than `until_m`, in no particular order but
@@ -101,11 +52,74 @@ impl Scene {
         mut visit: impl FnMut(Hit),
     ) {
         let ray = SingleRay::new(origin.as_dvec3(), direction, Reach::until(until_m));
-        let visit = |range_m, place| visit(self.hit(range_m, place));
-        dispatch(AllHitsTask {
+        let visit = |range_m, place| {
+            let Ok(hit) = self.hit(range_m, place);
+            visit(hit);
+        };
+        let Ok(()) = dispatch(AllHitsTask {
             scene: self,
             hits: AllHits { ray, visit },
         });
+    }
+}
+
+impl<E: Clone> Scene<E> {
+    /// Like [`Scene::cast`], but each ray has its own reach, and the origin keeps its precision
+    /// far from the origin of the frame.
+    ///
+    /// # Errors
+    /// That of a tile that a ray enters; the hits are incomplete then.
+    ///
+    /// # Panics
+    /// If there are not as many reaches or hits as directions.
+    pub fn cast_packets(
+        &self,
+        origin: DVec3,
+        directions: &[Vec3],
+        reaches: &[Reach],
+        hits: &mut [Hit],
+    ) -> Result<(), E> {
+        dispatch(self.task(origin, directions, reaches, hits))
+    }
+
+    /// Casts bundles of rays from the same origins, which is faster than [`Scene::cast_single`] if
+    /// the rays of a bundle stay close to each other, and writes the ranges of their nearest hits:
+    /// the same, bit by bit, with the exceptions that are named there. All rays of a bundle have
+    /// one reach. Runs on the calling thread.
+    ///
+    /// # Errors
+    /// That of a tile that a ray enters.
+    ///
+    /// # Panics
+    /// If there are not as many reaches or ranges as bundles.
+    pub fn cast_bundles(
+        &self,
+        origins: &[DVec3; RAYS],
+        directions: &[[Vec3; RAYS]],
+        reaches: &[Reach],
+        ranges_m: &mut [[f32; RAYS]],
+    ) -> Result<(), E> {
+        dispatch(self.task(*origins, directions, reaches, ranges_m))
+    }
+
+    /// Casts single rays from one origin, which is faster than [`Scene::cast_packets`] if they
+    /// diverge, and writes the range of the nearest hit of each: the same, bit by bit, with two
+    /// exceptions: of surfaces nearer than [`Reach::enough_m`] it may be another, and so it may be
+    /// of the triangles at an edge that the ray passes within rounding. Runs on the calling thread.
+    ///
+    /// # Errors
+    /// That of a tile that a ray enters.
+    ///
+    /// # Panics
+    /// If there are not as many reaches or ranges as directions.
+    pub fn cast_single(
+        &self,
+        origin: DVec3,
+        directions: &[Vec3],
+        reaches: &[Reach],
+        ranges_m: &mut [f32],
+    ) -> Result<(), E> {
+        dispatch(self.task(origin, directions, reaches, ranges_m))
     }
 
     pub(in crate::raycasting) fn task<'a, O, D, R>(
@@ -114,7 +128,7 @@ impl Scene {
         directions: &'a [D],
         reaches: &'a [Reach],
         results: &'a mut [R],
-    ) -> CastTask<'a, O, D, R> {
+    ) -> CastTask<'a, E, O, D, R> {
         assert_eq!(directions.len(), results.len(), "one result per direction");
         assert_eq!(directions.len(), reaches.len(), "one reach per direction");
         CastTask {
@@ -132,13 +146,13 @@ impl Scene {
         simd: S,
         rays: &mut R,
         [top_stack, tile_stack]: &mut [Stack; 2],
-    ) {
+    ) -> Result<(), E> {
         let top = &*self.top;
         let relative = rays.relative_to(simd, top.middle, &top.bvh.grid);
         let mut tiles = Traversal::new(simd, &top.bvh.nodes, &relative, top_stack);
         while let Some(leaf) = tiles.next_leaf(rays) {
             let number = top.numbers[leaf];
-            let Some(tile) = self.tiles.tile(number as usize) else {
+            let Some(tile) = self.tiles.tile(number as usize).map_err(E::clone)? else {
                 continue;
             };
             let parts = tile.parts();
@@ -152,6 +166,7 @@ impl Scene {
                 rays.intersect(simd, &relative, &parts.leaves.block(index), leaf);
             }
         }
+        Ok(())
     }
 
     /// Nearest hits of rays that are neighbours: together if their directions have the same signs.
@@ -163,33 +178,33 @@ impl Scene {
         directions: &[Vec3; RAYS],
         reaches: &[Reach; RAYS],
         stacks: &mut [Stack; 2],
-    ) -> ([f32; RAYS], [Place; RAYS]) {
+    ) -> Result<([f32; RAYS], [Place; RAYS]), E> {
         if let Some(mut packet) = Packet::new(simd, origin, directions, reaches) {
-            self.traverse(simd, &mut packet, stacks);
-            return (packet.range_m, packet.place);
+            self.traverse(simd, &mut packet, stacks)?;
+            return Ok((packet.range_m, packet.place));
         }
         let (mut range_m, mut place) = ([f32::INFINITY; RAYS], [Place::NONE; RAYS]);
         for ray in 0..RAYS {
             let mut single = SingleRay::new(origin.of_ray(ray), directions[ray], reaches[ray]);
-            self.traverse(simd, &mut single, stacks);
+            self.traverse(simd, &mut single, stacks)?;
             (range_m[ray], place[ray]) = (single.range_m, single.place);
         }
-        (range_m, place)
+        Ok((range_m, place))
     }
 
     #[inline(always)]
-    fn hit(&self, range_m: f32, place: Place) -> Hit {
+    fn hit(&self, range_m: f32, place: Place) -> Result<Hit, E> {
         let number = place.leaf.tile as usize;
-        let Some(tile) = self.tiles.tile(number) else {
-            return Hit::MISS;
+        let Some(tile) = self.tiles.tile(number).map_err(E::clone)? else {
+            return Ok(Hit::MISS);
         };
         let leaves = tile.parts().leaves;
         let index = leaves.index(place.leaf.index as usize, place.lane as usize);
-        Hit {
+        Ok(Hit {
             range_m,
             triangle: self.top.first_triangles[number] + index,
             place,
-        }
+        })
     }
 }
 
@@ -199,21 +214,23 @@ fn stacks() -> [Stack; 2] {
 }
 
 /// A ray whose hits are all visited.
-struct AllHitsTask<'a, F> {
-    scene: &'a Scene,
+struct AllHitsTask<'a, E, F> {
+    scene: &'a Scene<E>,
     hits: AllHits<F>,
 }
 
-impl<F: FnMut(f32, Place)> SimdTask for AllHitsTask<'_, F> {
+impl<E: Clone, F: FnMut(f32, Place)> SimdTask for AllHitsTask<'_, E, F> {
+    type Output = Result<(), E>;
+
     #[inline(always)]
-    fn run<S: Simd>(mut self, simd: S) {
-        self.scene.traverse(simd, &mut self.hits, &mut stacks());
+    fn run<S: Simd>(mut self, simd: S) -> Result<(), E> {
+        self.scene.traverse(simd, &mut self.hits, &mut stacks())
     }
 }
 
 /// Rays to cast, and where their results go.
-pub(in crate::raycasting) struct CastTask<'a, O, D, R> {
-    scene: &'a Scene,
+pub(in crate::raycasting) struct CastTask<'a, E, O, D, R> {
+    scene: &'a Scene<E>,
     origin: O,
     directions: &'a [D],
     reaches: &'a [Reach],
@@ -221,9 +238,11 @@ pub(in crate::raycasting) struct CastTask<'a, O, D, R> {
 }
 
 /// Packets of neighbouring directions.
-impl SimdTask for CastTask<'_, DVec3, Vec3, Hit> {
+impl<E: Clone> SimdTask for CastTask<'_, E, DVec3, Vec3, Hit> {
+    type Output = Result<(), E>;
+
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd>(self, simd: S) -> Result<(), E> {
         let mut stacks = stacks();
         let chunks = self.directions.chunks(RAYS).zip(self.reaches.chunks(RAYS));
         for ((directions, reaches), hits) in chunks.zip(self.results.chunks_mut(RAYS)) {
@@ -235,32 +254,38 @@ impl SimdTask for CastTask<'_, DVec3, Vec3, Hit> {
                 &std::array::from_fn(|ray| directions[ray.min(last)]),
                 &std::array::from_fn(|ray| reaches[ray.min(last)]),
                 &mut stacks,
-            );
+            )?;
             for (ray, hit) in hits.iter_mut().enumerate() {
-                *hit = self.scene.hit(range_m[ray], place[ray]);
+                *hit = self.scene.hit(range_m[ray], place[ray])?;
             }
         }
+        Ok(())
     }
 }
 
 /// Bundles.
-impl SimdTask for CastTask<'_, [DVec3; RAYS], [Vec3; RAYS], [f32; RAYS]> {
+impl<E: Clone> SimdTask for CastTask<'_, E, [DVec3; RAYS], [Vec3; RAYS], [f32; RAYS]> {
+    type Output = Result<(), E>;
+
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd>(self, simd: S) -> Result<(), E> {
         let mut stacks = stacks();
         let bundles = self.directions.iter().zip(self.reaches);
         for ((directions, &reach), ranges_m) in bundles.zip(self.results) {
             let reaches = [reach; RAYS];
             (*ranges_m, _) =
-                (self.scene).cast_packet(simd, &self.origin, directions, &reaches, &mut stacks);
+                (self.scene).cast_packet(simd, &self.origin, directions, &reaches, &mut stacks)?;
         }
+        Ok(())
     }
 }
 
 /// Single rays.
-impl SimdTask for CastTask<'_, DVec3, Vec3, f32> {
+impl<E: Clone> SimdTask for CastTask<'_, E, DVec3, Vec3, f32> {
+    type Output = Result<(), E>;
+
     #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
+    fn run<S: Simd>(self, simd: S) -> Result<(), E> {
         let mut stacks = stacks();
         let rays = self.directions.iter().zip(self.reaches);
         for ((&direction, &reach), range_m) in rays.zip(self.results) {
@@ -270,7 +295,7 @@ impl SimdTask for CastTask<'_, DVec3, Vec3, f32> {
             }
             let mut is_last = !reach.is_window;
             loop {
-                (self.scene).traverse(simd, &mut ray, &mut stacks);
+                (self.scene).traverse(simd, &mut ray, &mut stacks)?;
                 if is_last || ray.range_m == f32::INFINITY {
                     break;
                 }
@@ -280,5 +305,6 @@ impl SimdTask for CastTask<'_, DVec3, Vec3, f32> {
             }
             *range_m = ray.range_m;
         }
+        Ok(())
     }
 }

@@ -262,7 +262,7 @@ fn images_are_compared_by_the_faster_method_also_where_they_fit_no_texture() {
 #[derive(Debug)]
 struct Street {
     tiles: Vec<TriangleMesh>,
-    scene: Scene,
+    scene: Scene<TileError>,
 }
 
 impl Street {
@@ -288,7 +288,7 @@ impl TriangleSource for Street {
         self.tiles.iter().map(of).collect()
     }
 
-    fn triangles(&self, tile: usize) -> Result<Vec<[DVec3; 3]>, Arc<TileError>> {
+    fn triangles(&self, tile: usize) -> Result<Vec<[DVec3; 3]>, TileError> {
         let mesh = &self.tiles[tile];
         let corners = |triangle| mesh.corners(triangle).map(|corner| corner.as_dvec3());
         Ok((0..mesh.triangles.len()).map(corners).collect())
@@ -296,12 +296,8 @@ impl TriangleSource for Street {
 }
 
 impl SceneSource for Street {
-    fn scene(&self, _: &[DVec3]) -> Scene {
+    fn scene(&self, _: &[DVec3]) -> Scene<TileError> {
         self.scene.clone()
-    }
-
-    fn check(&self) -> Result<(), Arc<TileError>> {
-        Ok(())
     }
 }
 

@@ -56,7 +56,7 @@ fn draw_likelihood(
 ) -> Result<()> {
     let center = pose2_from_pose3(map_from_lidar);
     let below_m = map_from_lidar.translation.z - SensorAttitude::default().height_m;
-    let Some(patch) = map.ground.patch_under(&center, Some(below_m)) else {
+    let Some(patch) = map.ground.patch_under(&center, Some(below_m))? else {
         tracing::info!(
             "frame {}: the likelihood is not drawn because there is no ground below the {name}",
             frame.number
