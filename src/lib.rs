@@ -144,8 +144,6 @@ pub mod internals {
     pub use crate::odometry::timing::compare_timings;
     pub use crate::random::stream;
     pub use crate::raycasting::Scene;
-    #[cfg(feature = "bags")]
-    pub use crate::recording::bags::FramePose;
     pub use crate::recording::poses::CameraPoses;
     pub use crate::rendering::cpu::CpuRenderer;
     #[cfg(feature = "gpu")]

@@ -10,9 +10,9 @@ use std::fs;
 use std::path::Path;
 
 use fpmcl::geometry::{Pose3, Vec3};
-use fpmcl::internals::{FramePose, scan_files};
+use fpmcl::internals::scan_files;
 use fpmcl::lidar::Scan;
-use fpmcl::recording::{Bag, PoseTrack, RecordingError, TopicKind};
+use fpmcl::recording::{Bag, FramePose, PoseTrack, RecordingError, TopicKind};
 use rayon::prelude::*;
 
 use bag_writers::{

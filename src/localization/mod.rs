@@ -42,7 +42,7 @@ pub use convergence::ConvergenceConfig;
 pub use estimate::Estimate;
 pub use initialization::{StartDistribution, StartSpread};
 pub use localizer::{Localizer, LocalizerError, Start};
-pub use motion::{OdometryNoise, VelocityNoise};
+pub use motion::{OdometryNoise, VelocityCommand, VelocityNoise};
 pub use observation::{Likelihood, ObservationConfig};
 pub use odometry::Odometry;
 pub use particles::{Particle, ParticleSet};

@@ -259,7 +259,7 @@ impl VelocityCommand {
     }
 
     /// `previous_from_current` along the arc; a straight line for ω = 0.
-    pub fn compose(&self) -> Pose2 {
+    pub(crate) fn compose(&self) -> Pose2 {
         let seconds = self.duration.as_secs_f64();
         let turn_rad = self.turn_rate_rad_per_s * seconds;
         let drive_m = self.speed_m_per_s * seconds;
@@ -273,7 +273,7 @@ impl VelocityCommand {
     }
 
     /// Samples `previous_from_current` with noise.
-    pub fn sample(&self, noise: &VelocityNoise, rng: &mut impl Rng) -> Pose2 {
+    pub(crate) fn sample(&self, noise: &VelocityNoise, rng: &mut impl Rng) -> Pose2 {
         let mut normal = |sigma: f64| sigma * rng.sample::<f64, _>(StandardNormal);
         let noisy = Self {
             speed_m_per_s: self.speed_m_per_s + normal(noise.speed_m_per_s),

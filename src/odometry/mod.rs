@@ -49,16 +49,17 @@ mod trajectory;
 mod voxel_map;
 
 pub use adjustment::{Adjusted, AdjustmentConfig};
+pub use anchors::{NotInMap, PlacementError};
 pub use config::OdometryConfig;
 pub use elevation_bias::ElevationBias;
 pub use loops::{Loop, LoopVerdict};
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
 pub use pose_check::{MotionDifference, PoseCheck, PoseFit, PoseMeaning};
+pub use timing::TimingError;
 pub use trajectory::{Trajectory, TrajectoryBuilder, TrajectoryConfig};
 
-pub(crate) use anchors::PlacementError;
 pub(crate) use pose_check::{GivenPoses, check_poses};
-pub(crate) use timing::{TimingComparison, TimingError, compare_timings};
+pub(crate) use timing::{TimingComparison, compare_timings};
 
 #[cfg(test)]
 mod tests;

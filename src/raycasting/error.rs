@@ -15,7 +15,7 @@ pub struct TileError {
 
 impl TileError {
     /// A file and what is wrong with it.
-    pub fn new(file: PathBuf, problem: TileProblem) -> Self {
+    pub(crate) fn new(file: PathBuf, problem: TileProblem) -> Self {
         Self {
             file,
             problem: Arc::new(problem),
@@ -25,6 +25,7 @@ impl TileError {
 
 /// What is wrong with a tile.
 #[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum TileProblem {
     #[error("{0}")]
     Read(#[from] std::io::Error),

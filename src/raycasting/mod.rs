@@ -72,6 +72,7 @@ pub struct Reach {
 
 impl Reach {
     /// The nearest surface at any range.
+    #[cfg(test)]
     pub const UNLIMITED: Self = Self::until(f32::INFINITY);
 
     /// The nearest surface that is nearer than a range [m].

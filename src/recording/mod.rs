@@ -27,7 +27,7 @@ mod error;
 mod table;
 
 #[cfg(feature = "bags")]
-pub use bags::{Bag, Topic, TopicKind};
+pub use bags::{Bag, FramePose, Topic, TopicKind};
 pub use calibration::Calibration;
 pub use error::RecordingError;
 pub use frame::{Frame, ScanSource};

@@ -246,7 +246,7 @@ pub struct MapPlan<'a> {
     /// Ground classifier; by default that of the configuration.
     pub classifier: Box<dyn GroundClassifier>,
     /// A map that the drive is added to, in the same frame.
-    pub older: Option<&'a dyn MeshView>,
+    pub(crate) older: Option<&'a dyn MeshView>,
     builder: &'a MapBuilder,
     ownership: Ownership,
 }
