@@ -23,8 +23,8 @@ fn the_pictures_of_finished_runs_show_the_paths() {
         // Relative to the folder of the package.
         let plots = Path::new(run).join("plots");
         let picture = |name: &str| Picture::read(&plots.join(name));
-        // The enlarged part has the colors of the trajectories.
-        picture("path.png").shows(&[REFINED]);
+        // The refined path has the colors of its errors.
+        picture("path.png").shows(&[MCL]);
         picture("errors.png").shows_at_least(400, &[MCL, REFINED]);
         picture("runtime.png").shows(&[MCL, REFINED]);
         picture("particles.png").shows(&[MCL]);

@@ -187,7 +187,7 @@ fn the_path_is_drawn_over_the_truth_and_over_the_map() {
     let colors = [(REFINED, 300), (TRUTH, 300), (MCL, 50)];
     assert_picture(&gallery.path("path_on_map.png"), &colors);
 
-    // Colored by its error; the trajectories apart are in the corner.
+    // The last one is colored by its error.
     let path = gallery.path("path_colored.png");
     let errors = planar_errors(&refined, &truth);
     let errors_cm: Vec<f64> = errors.iter().map(|it| 100.0 * it.distance_m()).collect();
@@ -197,11 +197,7 @@ fn the_path_is_drawn_over_the_truth_and_over_the_map() {
     }
     .save(&path)
     .unwrap();
-    let colors = [
-        (REFINED, 200),
-        (TRUTH, 300),
-        (Colormap::Viridis.at(1.0), 10),
-    ];
+    let colors = [(MCL, 50), (TRUTH, 300), (Colormap::Viridis.at(1.0), 10)];
     assert_picture(&path, &colors);
 
     // A short straight drive: thirty metres by two.

@@ -137,21 +137,8 @@ impl View {
 
     /// Draws a bar of a round length above the upper right corner, for maps.
     pub fn scale_bar(&self, sheet: &Sheet) -> Result<()> {
-        self.bar_at(sheet, (self.rect.right, self.rect.top - 26.0), 0.12)
-    }
-
-    /// Draws the bar inside, in the lower right corner.
-    pub fn scale_bar_inside(&self, sheet: &Sheet) -> Result<()> {
-        self.bar_at(
-            sheet,
-            (self.rect.right - 14.0, self.rect.bottom - 18.0),
-            0.3,
-        )
-    }
-
-    /// Draws a bar of about a share of the width that ends at a point.
-    fn bar_at(&self, sheet: &Sheet, (right, row): Point, share: f64) -> Result<()> {
-        let length = round_step(share * self.x.length());
+        let (right, row) = (self.rect.right, self.rect.top - 26.0);
+        let length = round_step(0.12 * self.x.length());
         let left = right - length * self.scale();
         sheet.line((left, row), (right, row), stroke(INK, 3.0))?;
         for end in [left, right] {
