@@ -211,7 +211,7 @@ fn the_page_is_made_of_the_available_files(recording: &Recording) {
     assert!(!whole.contains("Missing"));
     for text in [
         "Example run: street/Fuzzy-PSO-MCL/1",
-        "street/Fuzzy-PSO-MCL/1: Likelihood around the true pose",
+        "street/Fuzzy-PSO-MCL/1: Particles from the first frame to the last",
         "numbers of particles, Fuzzy-MCL",
         "build_map.ground_method: &quot;pca&quot;",
         "effective_localization.yml of street/Fuzzy-PSO-MCL/1",
@@ -243,12 +243,12 @@ fn the_page_is_made_of_the_available_files(recording: &Recording) {
         "Fuzzy-MCL/2",
         &["run.json", "localization.npz", "plots/map.png"],
     );
-    fs::write(runs.join("Fuzzy-MCL/2/plots/likelihood.png"), "half a").unwrap();
+    fs::write(runs.join("Fuzzy-MCL/2/plots/states.png"), "half a").unwrap();
     compare(recording).with("--collect").succeeds();
     let html = page();
     for text in [
         "Example run: street/Fuzzy-MCL/2",
-        "Missing or not readable: range_images.png, states.png, drift.png, particles.png, cannot read",
+        "Missing or not readable: range_images.png, cannot read",
         "(Fuzzy-MCL seed 2)",
     ] {
         assert!(html.contains(text), "{text}");

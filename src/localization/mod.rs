@@ -4,8 +4,7 @@
 //! > particle [`filter`]: [`initialization`] samples the first particles, [`motion`] moves them by the
 //! > [`odometry`], [`observation`] weights them, [`resampling`] keeps the likely ones, [`places`]
 //! > compares those that are far apart, [`convergence`]
-//! > decides when few are enough and [`tracking_loss`] when none is right. [`likelihood`] shows how
-//! > peaked the likelihood is.
+//! > decides when few are enough and [`tracking_loss`] when none is right.
 //!
 //! Particles are planar poses `map_from_lidar`; the ground of the map gives height, roll and pitch.
 //!
@@ -29,7 +28,6 @@ pub(crate) mod resampling;
 pub(crate) mod tempering;
 // Confidence.
 pub(crate) mod convergence;
-pub(crate) mod likelihood;
 pub(crate) mod tracking_loss;
 // The loop.
 pub(crate) mod filter;

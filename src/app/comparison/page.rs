@@ -156,7 +156,7 @@ fn sequence_elements(
     }
     let Some(run) = example_run(results, sequence, layout) else {
         elements.push(PageElement::Paragraph(
-            "No particles, range images, map, likelihood and time per frame: the pictures of the runs are missing."
+            "No particles, range images, map and time per frame: the pictures of the runs are missing."
                 .to_owned(),
         ));
         return Ok(elements);

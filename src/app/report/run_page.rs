@@ -28,7 +28,7 @@ pub struct RunPage<'a> {
 }
 
 /// Pictures of a run after the path: section, file name and caption.
-pub const PICTURES: [(&str, &str, &str); 8] = [
+pub const PICTURES: [(&str, &str, &str); 7] = [
     (
         "Errors",
         "errors.png",
@@ -55,11 +55,6 @@ pub const PICTURES: [(&str, &str, &str); 8] = [
         "Particles from the first frame to the last",
     ),
     ("Map", "map.png", "Map from above with the path of the car"),
-    (
-        "Likelihood",
-        "likelihood.png",
-        "Likelihood around the true pose, or the estimate",
-    ),
     ("Timing", "runtime.png", "Time per frame"),
 ];
 

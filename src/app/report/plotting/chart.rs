@@ -7,7 +7,7 @@ use anyhow::{Context as _, Result};
 use super::bitmap::Bitmap;
 use super::color::{INK, Rgb, WHITE};
 use super::sheet::{self, HPos, Point, Rect, Sheet, TICK, VPos, save_png, stroke, text_style};
-use super::view::{AxisRange, LINE, LegendEntry, Mark, View, legend};
+use super::view::{AxisRange, LegendEntry, Mark, View, legend};
 
 const WIDTH: f64 = 1400.0;
 const LEFT: f64 = 118.0;
@@ -55,7 +55,7 @@ pub struct Panel {
     pub clip_outliers: bool,
 }
 
-/// Panels over a common x axis, except those that have a separate one, row by row.
+/// Panels over a common x axis, except those that have a separate one.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LineChart {
     /// Title.
@@ -66,8 +66,6 @@ pub struct LineChart {
     pub is_x_whole: bool,
     /// Panels from the top.
     pub panels: Vec<Panel>,
-    /// Number of panels next to each other, at least one.
-    pub columns: usize,
     /// Vertical lines: x and label.
     pub marks: Vec<(f64, String)>,
 }
@@ -97,46 +95,27 @@ impl LineChart {
         let x = x_range(&self.panels).context("there is nothing to draw: all series are empty")?;
         // Whole numbers at the ends are not on the frame.
         let x = if self.is_x_whole { x.padded(0.5) } else { x };
-        let columns = self.columns.max(1);
-        let panel_height = self.legend_height() + PANEL + BELOW_PANEL;
-        let height = HEADER + self.panels.len().div_ceil(columns) as f64 * panel_height;
+        let panel_height = LEGEND + PANEL + BELOW_PANEL;
+        let height = HEADER + self.panels.len() as f64 * panel_height;
         sheet::draw((WIDTH as u32, height as u32), |sheet| {
             sheet.title(&self.title, LEFT)?;
             for (number, panel) in self.panels.iter().enumerate() {
-                let left = (number % columns) as f64 * WIDTH / columns as f64;
-                let top = HEADER + (number / columns) as f64 * panel_height;
-                self.draw_panel(sheet, panel, x, (left, top))?;
+                self.draw_panel(sheet, panel, x, HEADER + number as f64 * panel_height)?;
             }
             Ok(())
         })
     }
 
-    /// Height of the legend of a panel: narrow panels have a line per entry.
-    fn legend_height(&self) -> f64 {
-        if self.columns > 1 {
-            LEGEND + LINE
-        } else {
-            LEGEND
-        }
-    }
-
-    fn draw_panel(
-        &self,
-        sheet: &Sheet,
-        panel: &Panel,
-        x: AxisRange,
-        (left, top): Point,
-    ) -> Result<()> {
-        let right = left + WIDTH / self.columns.max(1) as f64 - RIGHT;
+    fn draw_panel(&self, sheet: &Sheet, panel: &Panel, x: AxisRange, top: f64) -> Result<()> {
+        let right = WIDTH - RIGHT;
         let named = panel.series.iter().filter(|series| !series.name.is_empty());
         let entries: Vec<LegendEntry> = named
             .map(|series| LegendEntry::new(&series.name, series.color, series.mark))
             .collect();
-        let left = left + LEFT;
-        legend(sheet, &entries, (left, top + 12.0), right)?;
-        let top = top + self.legend_height();
+        legend(sheet, &entries, (LEFT, top + 12.0), right)?;
+        let top = top + LEGEND;
         let rect = Rect {
-            left,
+            left: LEFT,
             top,
             right,
             bottom: top + PANEL,

@@ -265,9 +265,6 @@ impl LegendEntry {
     }
 }
 
-/// Height of a line of a legend [px].
-pub const LINE: f64 = 28.0;
-
 /// Draws a legend from a point to the right; entries beyond `right` wrap to the next line.
 pub fn legend(sheet: &Sheet, entries: &[LegendEntry], at: Point, right: f64) -> Result<()> {
     let style = text_style(TICK + 1.0, HPos::Left, VPos::Center);
@@ -275,7 +272,7 @@ pub fn legend(sheet: &Sheet, entries: &[LegendEntry], at: Point, right: f64) -> 
     for entry in entries {
         let width = 46.0 + text_width(&entry.name, &style);
         if x + width > right && x > at.0 {
-            (x, y) = (at.0, y + LINE);
+            (x, y) = (at.0, y + 28.0);
         }
         entry.draw_key(sheet, (x, y))?;
         sheet.text(&entry.name, (x + 42.0, y), &style)?;
