@@ -28,6 +28,7 @@ use anyhow::{Context as _, Result, ensure};
 use glam::Vec3;
 use nalgebra::Matrix3;
 
+use super::columns::columns;
 use crate::evaluation::{ParticleRow, RangeMclRules};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
@@ -214,27 +215,13 @@ impl LocalizationResults {
                 particles.push_frame(self.particles.frame(row).iter().copied());
             }
         }
-        Self {
-            frames: rows.iter().map(|&row| self.frames[row]).collect(),
-            particles,
-            estimates: pick(&self.estimates, rows),
-            refined: pick(&self.refined, rows),
-            ground_truth: pick(&self.ground_truth, rows),
-            estimates_in_space: pick(&self.estimates_in_space, rows),
-            refined_in_space: pick(&self.refined_in_space, rows),
-            ground_truth_in_space: pick(&self.ground_truth_in_space, rows),
-            odometry: pick(&self.odometry, rows),
-            covariances: pick(&self.covariances, rows),
-            refined_covariances: pick(&self.refined_covariances, rows),
-            times_s: pick(&self.times_s, rows),
-            runtimes_s: pick(&self.runtimes_s, rows),
-            refine_runtimes_s: pick(&self.refine_runtimes_s, rows),
-            agreements: pick(&self.agreements, rows),
-            places: pick(&self.places, rows),
-            states: pick(&self.states, rows),
-            scan_outlines: pick(&self.scan_outlines, rows),
-            selected: None,
+        let frames = rows.iter().map(|&row| self.frames[row]).collect();
+        macro_rules! select {
+            ($($name:ident),*) => {
+                Self { frames, particles, selected: None, $($name: pick(&self.$name, rows)),* }
+            };
         }
+        columns!(select)
     }
 
     /// The stored estimates, or if there are none, weighted means of the particles; those in space, projected,

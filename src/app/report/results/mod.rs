@@ -1,6 +1,7 @@
 //! Result files of a run: `localization.npz`, `frames.csv`, `report.json` and `report.md`.
 
 // The results of a run and their `.npz` file.
+mod columns;
 mod localization_results;
 mod npz;
 mod results_file;

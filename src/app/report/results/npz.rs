@@ -8,7 +8,7 @@ use std::io::{self, BufReader, BufWriter, Read, Seek, Write};
 use std::mem::ManuallyDrop;
 use std::path::Path;
 
-use anyhow::{Context as _, Result, anyhow, bail, ensure};
+use anyhow::{Context as _, Result, anyhow, ensure};
 use npyz::{AutoSerialize, DType, Deserialize, NpyFile, Order, TypeChar, WriterBuilder};
 use zip::result::ZipError;
 use zip::write::SimpleFileOptions;
@@ -124,18 +124,18 @@ impl Array<'_> {
     /// for the message.
     pub fn next_finite_row<const N: usize>(&mut self, row: usize) -> Result<[f64; N]> {
         let numbers = self.next_row()?;
-        match numbers
-            .iter()
-            .find(|number| !number.is_finite() || number.abs() > LARGEST)
-        {
-            Some(value) => bail!(
-                "{}, array `{}`, row {row}: {value} is not a valid value",
-                self.path.display(),
-                self.name
-            ),
+        let is_invalid = |number: &&f64| !number.is_finite() || number.abs() > LARGEST;
+        match numbers.iter().find(is_invalid) {
+            Some(&value) => Err(not_valid(self.path, self.name, row, value)),
             None => Ok(numbers),
         }
     }
+}
+
+/// The error of a number that a result cannot have.
+pub fn not_valid(path: &Path, name: &str, row: usize, value: f64) -> anyhow::Error {
+    let path = path.display();
+    anyhow!("{path}, array `{name}`, row {row}: {value} is not a valid value")
 }
 
 fn unreadable(error: &io::Error) -> String {

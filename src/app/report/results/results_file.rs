@@ -4,20 +4,17 @@ use std::io::{self, Seek, Write};
 use std::iter::repeat_n;
 use std::path::Path;
 
-use anyhow::{Context as _, Result, anyhow, ensure};
-use nalgebra::{Matrix3, Quaternion, Translation3, UnitQuaternion, Vector2};
+use anyhow::{Context as _, Result, ensure};
 
-use super::localization_results::{LocalizationResults, ParticleLog, ScanOutline};
-use super::npz::{Array, NpzReader, NpzWriter, write_npy};
+use super::columns::{Row, columns};
+use super::localization_results::{LocalizationResults, ParticleLog};
+use super::npz::{Array, NpzReader, NpzWriter, not_valid, write_npy};
 use crate::evaluation::ParticleRow;
 use crate::files::write_atomically;
-use crate::geometry::{Pose2, Pose3};
+use crate::geometry::Pose2;
 
 /// Largest number of particles in empty rows, 4 GiB of zeros.
 const MOST_EMPTY_PARTICLES: usize = 1 << 28;
-
-/// Numbers in a row of an outline.
-const OUTLINE_NUMBERS: usize = 2 * ScanOutline::MAX;
 
 impl LocalizationResults {
     /// Reads a file of fpmcl or of range-mcl.
@@ -32,37 +29,12 @@ impl LocalizationResults {
             first,
         };
         let frames = file.frames()?;
-        let mut poses = |name| file.rows(name, pose_from_row);
-        let (estimates, refined) = (poses("estimates")?, poses("refined")?);
-        let (ground_truth, odometry) = (poses("ground_truth")?, poses("odometry")?);
-        let mut spatial = |name| file.rows(name, pose_in_space_from_row);
-        let (estimates_in_space, refined_in_space) =
-            (spatial("estimates_in_space")?, spatial("refined_in_space")?);
-        let ground_truth_in_space = spatial("ground_truth_in_space")?;
-        let mut matrices = |name| file.rows(name, |row: [f64; 9]| Matrix3::from_row_slice(&row));
-        let (covariances, refined_covariances) =
-            (matrices("covariances")?, matrices("refined_covariances")?);
-        Ok(Self {
-            frames,
-            particles,
-            estimates,
-            refined,
-            ground_truth,
-            estimates_in_space,
-            refined_in_space,
-            ground_truth_in_space,
-            odometry,
-            covariances,
-            refined_covariances,
-            times_s: file.rows("times_s", |[time_s]| time_s)?,
-            runtimes_s: file.rows("runtimes_s", |[time_s]| time_s)?,
-            refine_runtimes_s: file.rows("refine_runtimes_s", |[time_s]| time_s)?,
-            agreements: file.rows("agreements", |[share]| share)?,
-            places: file.rows("places", |[places]| places)?,
-            states: file.states()?,
-            scan_outlines: file.rows("scan_outlines", outline_from_row)?,
-            selected,
-        })
+        macro_rules! read {
+            ($($name:ident),*) => {
+                Self { frames, particles, selected, $($name: file.column(stringify!($name))?),* }
+            };
+        }
+        Ok(columns!(read))
     }
 
     /// Writes the file, replacing an existing one only when the new one is complete.
@@ -98,30 +70,10 @@ impl LocalizationResults {
             npz.add("selected_frames", &[], [selected as i64])?;
         }
         let mut file = RowWriter { npz, leading };
-        file.rows("estimates", &self.estimates, row_from_pose)?;
-        file.rows("refined", &self.refined, row_from_pose)?;
-        file.rows("ground_truth", &self.ground_truth, row_from_pose)?;
-        for (name, poses) in [
-            ("estimates_in_space", &self.estimates_in_space),
-            ("refined_in_space", &self.refined_in_space),
-            ("ground_truth_in_space", &self.ground_truth_in_space),
-        ] {
-            file.rows(name, poses, row_from_pose_in_space)?;
+        macro_rules! write {
+            ($($name:ident),*) => { $(file.column(stringify!($name), self.$name.as_deref())?;)* };
         }
-        file.rows("odometry", &self.odometry, row_from_pose)?;
-        file.rows("covariances", &self.covariances, row_from_matrix)?;
-        file.rows(
-            "refined_covariances",
-            &self.refined_covariances,
-            row_from_matrix,
-        )?;
-        file.numbers("times_s", &self.times_s, f64::NAN)?;
-        file.numbers("runtimes_s", &self.runtimes_s, f64::NAN)?;
-        file.numbers("refine_runtimes_s", &self.refine_runtimes_s, f64::NAN)?;
-        file.numbers("agreements", &self.agreements, f64::NAN)?;
-        file.numbers("places", &self.places, f64::NAN)?;
-        file.numbers("states", &self.states, 0)?;
-        file.outlines(&self.scan_outlines)?;
+        columns!(write);
         file.npz.finish()
     }
 
@@ -151,47 +103,9 @@ impl LocalizationResults {
 
 /// Writes poses as a NumPy array (rows, 3) of x, y [m] and heading [rad].
 pub fn write_poses_npy(path: &Path, poses: &[Pose2]) -> Result<()> {
-    let numbers = poses.iter().flat_map(row_from_pose);
+    let numbers = poses.iter().flat_map(Row::to_row);
     write_atomically(path, |file| write_npy(file, &[poses.len(), 3], numbers))
         .with_context(|| format!("cannot write {}", path.display()))
-}
-
-fn pose_from_row([x, y, heading]: [f64; 3]) -> Pose2 {
-    Pose2::new(Vector2::new(x, y), heading)
-}
-
-fn row_from_pose(pose: &Pose2) -> [f64; 3] {
-    let t = pose.translation;
-    [t.x, t.y, pose.rotation.angle()]
-}
-
-/// The rotation of a row of zeros is the identity.
-fn pose_in_space_from_row([x, y, z, i, j, k, w]: [f64; 7]) -> Pose3 {
-    let rotation = UnitQuaternion::try_new(Quaternion::new(w, i, j, k), f64::MIN_POSITIVE);
-    Pose3::from_parts(Translation3::new(x, y, z), rotation.unwrap_or_default())
-}
-
-fn row_from_pose_in_space(pose: &Pose3) -> [f64; 7] {
-    let (t, q) = (pose.translation, pose.rotation);
-    [t.x, t.y, t.z, q.i, q.j, q.k, q.w]
-}
-
-fn row_from_matrix(matrix: &Matrix3<f64>) -> [f64; 9] {
-    std::array::from_fn(|index| matrix[(index / 3, index % 3)])
-}
-
-/// The points of a row up to the last that is not zero.
-fn outline_from_row(row: [f64; OUTLINE_NUMBERS]) -> ScanOutline {
-    let mut points: Vec<[i16; 2]> = row
-        .as_chunks()
-        .0
-        .iter()
-        .map(|point: &[f64; 2]| point.map(|it| it as i16))
-        .collect();
-    while points.last() == Some(&[0, 0]) {
-        points.pop();
-    }
-    ScanOutline(points)
 }
 
 /// Writes arrays of one row per frame after `leading` empty rows.
@@ -201,40 +115,16 @@ struct RowWriter<W: Write + Seek> {
 }
 
 impl<W: Write + Seek> RowWriter<W> {
-    fn rows<T, const N: usize>(
+    fn column<T: Row<N>, const N: usize>(
         &mut self,
         name: &str,
-        items: &Option<Vec<T>>,
-        row: impl Fn(&T) -> [f64; N],
+        items: Option<&[T]>,
     ) -> io::Result<()> {
         let Some(items) = items else { return Ok(()) };
-        let numbers = repeat_n([f64::NAN; N], self.leading).chain(items.iter().map(row));
+        let rows = repeat_n([T::EMPTY; N], self.leading).chain(items.iter().map(T::to_row));
         let shape = [self.leading + items.len(), N];
-        self.npz.add(name, &shape, numbers.flatten())
-    }
-
-    fn outlines(&mut self, items: &Option<Vec<ScanOutline>>) -> io::Result<()> {
-        let Some(items) = items else { return Ok(()) };
-        let shape = [self.leading + items.len(), OUTLINE_NUMBERS];
-        let row = |outline: &ScanOutline| -> Vec<i16> {
-            let mut row = outline.0.concat();
-            row.resize(OUTLINE_NUMBERS, 0);
-            row
-        };
-        let numbers = repeat_n(0, self.leading * OUTLINE_NUMBERS);
-        let numbers = numbers.chain(items.iter().flat_map(row));
-        self.npz.add("scan_outlines", &shape, numbers)
-    }
-
-    fn numbers<T: npyz::AutoSerialize + Copy>(
-        &mut self,
-        name: &str,
-        items: &Option<Vec<T>>,
-        empty: T,
-    ) -> io::Result<()> {
-        let Some(items) = items else { return Ok(()) };
-        let numbers = repeat_n(empty, self.leading).chain(items.iter().copied());
-        self.npz.add(name, &[self.leading + items.len()], numbers)
+        let axes = if N == 1 { 1 } else { 2 };
+        self.npz.add(name, &shape[..axes], rows.flatten())
     }
 }
 
@@ -316,13 +206,9 @@ struct RowReader<'a> {
 }
 
 impl RowReader<'_> {
-    /// Reads an array of `N` finite numbers per row. `None` if it is missing, or empty, which
-    /// means the same in range-mcl.
-    fn rows<const N: usize, T>(
-        &mut self,
-        name: &'static str,
-        item: impl Fn([f64; N]) -> T,
-    ) -> Result<Option<Vec<T>>> {
+    /// Reads an array of finite numbers, a row per item. `None` if it is missing, or empty, which means the
+    /// same in range-mcl.
+    fn column<T: Row<N>, const N: usize>(&mut self, name: &'static str) -> Result<Option<Vec<T>>> {
         let Some(mut array) = self.npz.array(name)? else {
             return Ok(None);
         };
@@ -337,42 +223,26 @@ impl RowReader<'_> {
         for _ in 0..self.first {
             array.next_row::<N>()?;
         }
-        (self.first..self.rows)
-            .map(|row| Ok(item(array.next_finite_row(row)?)))
-            .collect::<Result<_, _>>()
-            .map(Some)
+        let item = |row| {
+            let numbers = array.next_finite_row(row)?;
+            T::from_row(numbers).ok_or_else(|| not_valid(self.path, name, row, numbers[0]))
+        };
+        let items: Result<_> = (self.first..self.rows).map(item).collect();
+        items.map(Some)
     }
 
     /// Reads the frame of each row: the row itself if the file does not contain `frames`.
     fn frames(&mut self) -> Result<Vec<usize>> {
-        let Some(frames) = self.rows("frames", |[frame]| frame)? else {
+        let Some(frames) = self.column::<f64, 1>("frames")? else {
             return Ok((self.first..self.rows).collect());
         };
         let mut previous = -1.0;
         for (row, &frame) in (self.first..).zip(&frames) {
             if frame <= previous || frame.fract() != 0.0 {
-                return Err(self.invalid("frames", row, frame));
+                return Err(not_valid(self.path, "frames", row, frame));
             }
             previous = frame;
         }
         Ok(frames.iter().map(|&frame| frame as usize).collect())
-    }
-
-    /// Reads the states of the filter.
-    fn states(&mut self) -> Result<Option<Vec<u8>>> {
-        let Some(states) = self.rows("states", |[state]| state)? else {
-            return Ok(None);
-        };
-        let state_in = |(row, &state): (usize, &f64)| match state as u8 {
-            number if f64::from(number) == state => Ok(number),
-            _ => Err(self.invalid("states", row, state)),
-        };
-        let states = (self.first..).zip(&states).map(state_in);
-        states.collect::<Result<_>>().map(Some)
-    }
-
-    fn invalid(&self, name: &str, row: usize, value: f64) -> anyhow::Error {
-        let path = self.path.display();
-        anyhow!("{path}, array `{name}`, row {row}: {value} is not a valid value")
     }
 }

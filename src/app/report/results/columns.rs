@@ -1,0 +1,144 @@
+//! Columns of [`LocalizationResults`](super::LocalizationResults): their names, and the rows of their arrays.
+
+use nalgebra::{Matrix3, Quaternion, Translation3, UnitQuaternion, Vector2};
+use npyz::AutoSerialize;
+
+use super::localization_results::ScanOutline;
+use crate::geometry::{Pose2, Pose3};
+
+/// Applies a macro to the names of all columns that may be missing, in the order of the file.
+macro_rules! columns {
+    ($apply:ident) => {
+        $apply!(
+            estimates,
+            refined,
+            ground_truth,
+            estimates_in_space,
+            refined_in_space,
+            ground_truth_in_space,
+            odometry,
+            covariances,
+            refined_covariances,
+            times_s,
+            runtimes_s,
+            refine_runtimes_s,
+            agreements,
+            places,
+            states,
+            scan_outlines
+        )
+    };
+}
+pub(super) use columns;
+
+/// An item of a column, as a row of `N` numbers.
+pub trait Row<const N: usize>: Sized {
+    /// Type of the numbers in the file.
+    type Number: AutoSerialize + Copy;
+    /// Number in the rows before the first localized frame.
+    const EMPTY: Self::Number;
+
+    /// The row of the item.
+    fn to_row(&self) -> [Self::Number; N];
+
+    /// The item of a row; `None` if no item has it.
+    fn from_row(row: [f64; N]) -> Option<Self>;
+}
+
+impl Row<1> for f64 {
+    type Number = Self;
+    const EMPTY: Self = Self::NAN;
+
+    fn to_row(&self) -> [Self; 1] {
+        [*self]
+    }
+
+    fn from_row([number]: [Self; 1]) -> Option<Self> {
+        Some(number)
+    }
+}
+
+impl Row<1> for u8 {
+    type Number = Self;
+    const EMPTY: Self = 0;
+
+    fn to_row(&self) -> [Self; 1] {
+        [*self]
+    }
+
+    fn from_row([number]: [f64; 1]) -> Option<Self> {
+        Some(number as Self).filter(|&it| f64::from(it) == number)
+    }
+}
+
+/// x, y [m], heading [rad].
+impl Row<3> for Pose2 {
+    type Number = f64;
+    const EMPTY: f64 = f64::NAN;
+
+    fn to_row(&self) -> [f64; 3] {
+        let t = self.translation;
+        [t.x, t.y, self.rotation.angle()]
+    }
+
+    fn from_row([x, y, heading]: [f64; 3]) -> Option<Self> {
+        Some(Self::new(Vector2::new(x, y), heading))
+    }
+}
+
+/// x, y, z [m], quaternion x, y, z, w.
+impl Row<7> for Pose3 {
+    type Number = f64;
+    const EMPTY: f64 = f64::NAN;
+
+    fn to_row(&self) -> [f64; 7] {
+        let (t, q) = (self.translation, self.rotation);
+        [t.x, t.y, t.z, q.i, q.j, q.k, q.w]
+    }
+
+    /// The rotation of a row of zeros is the identity.
+    fn from_row([x, y, z, i, j, k, w]: [f64; 7]) -> Option<Self> {
+        let rotation = UnitQuaternion::try_new(Quaternion::new(w, i, j, k), f64::MIN_POSITIVE);
+        let translation = Translation3::new(x, y, z);
+        Some(Self::from_parts(translation, rotation.unwrap_or_default()))
+    }
+}
+
+/// Row-major.
+impl Row<9> for Matrix3<f64> {
+    type Number = f64;
+    const EMPTY: f64 = f64::NAN;
+
+    fn to_row(&self) -> [f64; 9] {
+        std::array::from_fn(|index| self[(index / 3, index % 3)])
+    }
+
+    fn from_row(row: [f64; 9]) -> Option<Self> {
+        Some(Self::from_row_slice(&row))
+    }
+}
+
+/// x, y of each point; zeros after the last that is not zero.
+impl Row<{ 2 * ScanOutline::MAX }> for ScanOutline {
+    type Number = i16;
+    const EMPTY: i16 = 0;
+
+    fn to_row(&self) -> [i16; 2 * Self::MAX] {
+        let mut row = [0; 2 * Self::MAX];
+        let numbers = self.0.as_flattened();
+        row[..numbers.len()].copy_from_slice(numbers);
+        row
+    }
+
+    fn from_row(row: [f64; 2 * Self::MAX]) -> Option<Self> {
+        let points = row.as_chunks().0.iter();
+        let mut points: Vec<_> = points.map(|it: &[f64; 2]| it.map(|it| it as i16)).collect();
+        points.truncate(
+            points
+                .iter()
+                .rposition(|it| *it != [0, 0])
+                .map_or(0, |last| last + 1),
+        );
+        Some(Self(points))
+    }
+}
