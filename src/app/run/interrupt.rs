@@ -154,35 +154,7 @@ fn exit() -> ! {
     std::process::exit(130)
 }
 
-#[cfg(all(test, unix))]
-mod tests {
-    use std::process::Command;
-    use std::time::Instant;
-
-    use super::*;
-
-    #[test]
-    fn ctrl_c_is_seen_by_every_copy() {
-        let interrupt = Interrupt::install().unwrap();
-        // The process of the tests must not end.
-        std::mem::forget(interrupt.saving());
-        let copy = interrupt.clone();
-        assert!(!copy.requested());
-        let pid = std::process::id().to_string();
-        let sent = Command::new("kill").args(["-INT", &pid]).status().unwrap();
-        assert!(sent.success());
-        let start = Instant::now();
-        while !copy.requested() && start.elapsed() < Duration::from_secs(20) {
-            thread::sleep(Duration::from_millis(5));
-        }
-        assert!(copy.requested() && interrupt.requested());
-    }
-
-    #[test]
-    fn supervised_work_returns_its_value_and_nothing_is_saved() {
-        let interrupt = Interrupt::default();
-        interrupt.request();
-        let value = interrupt.supervise(|| 7, || unreachable!("the work is in time"));
-        assert_eq!(value, 7);
-    }
-}
+#[cfg(test)]
+#[cfg(unix)]
+#[path = "interrupt_tests.rs"]
+mod tests;
