@@ -9,7 +9,7 @@ use serde::Serialize;
 use crate::app::commands::stages::MapInputs;
 use crate::app::report::plotting::MapPlot;
 use crate::app::report::run_output::MOST_TRIANGLES;
-use crate::app::run::artefact::hash_of_file;
+use crate::app::run::artefact::hash::hash_of_file;
 use crate::app::run::{Context, input};
 use crate::app::settings::BuildMapConfig;
 use crate::geometry::pose2_from_pose3;
@@ -123,6 +123,7 @@ pub fn draw(
         mesh: &mesh,
         path: Some(("older mapping trajectory", &path)),
         keys: &[("kept", KEPT), ("gone", GONE), ("added", ADDED)],
+        numbers: None,
     }
     .save(picture)?;
     tracing::info!("drew {}", picture.display());

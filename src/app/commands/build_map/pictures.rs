@@ -2,8 +2,7 @@
 
 use anyhow::Result;
 
-use crate::app::report::plotting::color::Colormap;
-use crate::app::report::plotting::{MapPlot, SURFACES, ScalarMapPlot, muted};
+use crate::app::report::plotting::{MapPlot, SURFACES, VertexNumbers, muted};
 use crate::app::report::run_output::MOST_TRIANGLES;
 use crate::app::settings::BuildMapConfig;
 use crate::evaluation::map_quality::ResidualSums;
@@ -29,6 +28,7 @@ pub fn draw(
         mesh: &muted(mesh),
         path: Some(("mapping trajectory", &driven)),
         keys: &SURFACES,
+        numbers: None,
     }
     .save(&picture)?;
     tracing::info!("drew {}", picture.display());
@@ -36,14 +36,16 @@ pub fn draw(
         return Ok(());
     }
     let picture = config.mesh_file.with_extension("residuals.png");
-    ScalarMapPlot {
+    MapPlot {
         title: "Distance of held-out beams to the surface that they hit",
         mesh,
-        values: &residuals.at_vertices(mesh),
-        value_name: "mean beam-plane distance [m]",
-        limits: (0.0, PICTURE_LIMIT_M),
-        colormap: Colormap::Viridis,
-        trajectory: Some(&driven),
+        path: Some(("mapping trajectory", &driven)),
+        keys: &[],
+        numbers: Some(VertexNumbers {
+            values: &residuals.at_vertices(mesh),
+            name: "mean beam-plane distance [m]",
+            limit: PICTURE_LIMIT_M,
+        }),
     }
     .save(&picture)?;
     tracing::info!("drew {}", picture.display());

@@ -15,7 +15,7 @@ use crate::geometry::{Pose2, TriangleMesh};
 /// Maximum number of columns and rows of the raster: the resolution of drawing.
 const RASTER: usize = 2500;
 
-/// The map from above in the colors of its vertices.
+/// The map from above, in the colors of its vertices or of numbers.
 #[derive(Clone, Copy, Debug)]
 pub struct MapPlot<'a> {
     /// Title.
@@ -26,106 +26,66 @@ pub struct MapPlot<'a> {
     pub path: Option<(&'a str, &'a [Pose2])>,
     /// Names of colors of the map.
     pub keys: &'a [(&'a str, Rgb)],
+    /// Numbers that color the map instead.
+    pub numbers: Option<VertexNumbers<'a>>,
+}
+
+/// A number per vertex of a map, such as a residual, whose colors are those of viridis.
+#[derive(Clone, Copy, Debug)]
+pub struct VertexNumbers<'a> {
+    /// The numbers; not finite where unknown.
+    pub values: &'a [f32],
+    /// Name of the numbers with their unit.
+    pub name: &'a str,
+    /// Number at the end of the color bar, which starts at zero; larger ones have its color.
+    pub limit: f64,
 }
 
 impl MapPlot<'_> {
-    /// Writes the picture.
-    pub fn save(&self, path: &Path) -> Result<()> {
-        let colors = self.keys.iter();
-        let colors = colors.map(|&(name, color)| LegendEntry::new(name, color, Mark::Area));
-        let driven = self
-            .path
-            .map(|(name, _)| LegendEntry::new(name, TRUTH, Mark::Line));
-        let legend = colors.chain(driven).collect();
-        let image = || MapImage::of_colors(self.mesh, RASTER);
-        let poses = self.path.map(|(_, poses)| poses);
-        save_png(
-            path,
-            draw(self.title, self.mesh, legend, None, image, poses),
-        )
-    }
-}
-
-/// The map from above, colored by a number per vertex, such as a residual.
-#[derive(Clone, Copy, Debug)]
-pub struct ScalarMapPlot<'a> {
-    /// Title.
-    pub title: &'a str,
-    /// Map.
-    pub mesh: &'a TriangleMesh,
-    /// One number per vertex; not finite where unknown.
-    pub values: &'a [f32],
-    /// Name of the numbers with their unit.
-    pub value_name: &'a str,
-    /// Numbers at the ends of the color bar; numbers beyond have the color of the end.
-    pub limits: (f64, f64),
-    /// Colors.
-    pub colormap: Colormap,
-    /// Mapping trajectory to draw.
-    pub trajectory: Option<&'a [Pose2]>,
-}
-
-impl ScalarMapPlot<'_> {
     /// Writes the picture.
     pub fn save(&self, path: &Path) -> Result<()> {
         save_png(path, self.draw())
     }
 
     fn draw(&self) -> Result<Bitmap> {
-        debug_assert_eq!(self.values.len(), self.mesh.vertices.len());
-        let bar = ColorBar {
-            range: AxisRange::new(self.limits.0, self.limits.1).at_least(1e-9),
-            colormap: self.colormap,
-            name: self.value_name,
+        let bounds = self.mesh.bounds();
+        ensure!(
+            !bounds.is_empty() && !self.mesh.triangles.is_empty(),
+            "there is nothing to draw: the mesh has no triangles"
+        );
+        let range = |min: f32, max: f32| {
+            let range = AxisRange::new(f64::from(min), f64::from(max)).at_least(1.0);
+            range.padded(0.02 * range.length())
         };
-        let unknown = LegendEntry::new("not known", MISSING, Mark::Area);
-        let image = || {
-            let color = |value| bar.color(f64::from(value));
-            MapImage::of_scalar(self.mesh, self.values, RASTER, color)
+        let color_bar = self.numbers.map(|numbers| ColorBar {
+            range: AxisRange::new(0.0, numbers.limit),
+            colormap: Colormap::Viridis,
+            name: numbers.name,
+        });
+        let unknown = self.numbers.map(|_| ("not known", MISSING));
+        let colors = self.keys.iter().copied().chain(unknown);
+        let colors = colors.map(|(name, color)| LegendEntry::new(name, color, Mark::Area));
+        let driven = (self.path).map(|(name, _)| LegendEntry::new(name, TRUTH, Mark::Line));
+        let view = TopView {
+            title: self.title,
+            width: WIDTH,
+            legend: colors.chain(driven).collect(),
+            x: range(bounds.min.x, bounds.max.x),
+            y: range(bounds.min.y, bounds.max.y),
+            color_bar,
         };
-        let legend = vec![unknown];
-        draw(
-            self.title,
-            self.mesh,
-            legend,
-            Some(bar),
-            image,
-            self.trajectory,
-        )
+        let image = match (self.numbers, color_bar) {
+            (Some(numbers), Some(bar)) => {
+                let color = |value| bar.color(f64::from(value));
+                MapImage::of_scalar(self.mesh, numbers.values, RASTER, color)
+            }
+            _ => MapImage::of_colors(self.mesh, RASTER),
+        };
+        view.draw(|sheet, view| {
+            image.draw(sheet, view, 0.0)?;
+            let path = positions(self.path.map_or(&[], |(_, poses)| poses), view);
+            sheet.polyline(&path, &view.rect, stroke(WHITE, 5.0))?;
+            sheet.polyline(&path, &view.rect, stroke(TRUTH, 2.5))
+        })
     }
-}
-
-/// Draws a raster of the map and a path over it.
-fn draw(
-    title: &str,
-    mesh: &TriangleMesh,
-    legend: Vec<LegendEntry>,
-    color_bar: Option<ColorBar>,
-    image: impl FnOnce() -> MapImage,
-    path: Option<&[Pose2]>,
-) -> Result<Bitmap> {
-    let bounds = mesh.bounds();
-    ensure!(
-        !bounds.is_empty() && !mesh.triangles.is_empty(),
-        "there is nothing to draw: the mesh has no triangles"
-    );
-    let range = |min: f32, max: f32| {
-        let range = AxisRange::new(f64::from(min), f64::from(max)).at_least(1.0);
-        range.padded(0.02 * range.length())
-    };
-    let view = TopView {
-        title,
-        width: WIDTH,
-        legend,
-        x: range(bounds.min.x, bounds.max.x),
-        y: range(bounds.min.y, bounds.max.y),
-        color_bar,
-    };
-    let image = image();
-    view.draw(|sheet, view| {
-        image.draw(sheet, view, 0.0)?;
-        let path = positions(path.unwrap_or_default(), view);
-        sheet.polyline(&path, &view.rect, stroke(WHITE, 5.0))?;
-        sheet.polyline(&path, &view.rect, stroke(TRUTH, 2.5))
-    })
 }

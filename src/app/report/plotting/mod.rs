@@ -24,14 +24,14 @@ mod trajectory;
 #[cfg(test)]
 mod tests;
 
-pub use animation::Animation;
+pub use animation::save_animation;
 pub use bitmap::Bitmap;
 pub use chart::{FRAME, LineChart, Panel, Series};
 pub use drift::drift_chart;
 pub use ground_plot::GroundPlot;
 pub use interactive::InteractivePath;
 pub use map_image::{MapImage, SURFACES, muted};
-pub use map_plot::{MapPlot, ScalarMapPlot};
+pub use map_plot::{MapPlot, VertexNumbers};
 pub use particles::{LocalizationPicture, ParticlePanels};
 pub use range_images::RangeImageStrip;
 pub use trajectory::{PathPlot, error_chart};

@@ -388,6 +388,7 @@ fn indoors_the_floor_is_visible_from_above() {
         mesh: &rooms,
         path: Some(("path", &planar)),
         keys: &[],
+        numbers: None,
     }
     .save(&map)
     .unwrap();
@@ -420,7 +421,7 @@ fn frames_become_an_animation_of_one_size() {
         })
         .collect();
     let path = gallery.path("localization.gif");
-    Animation::default().save(&path, &pictures).unwrap();
+    save_animation(&path, &pictures).unwrap();
     let mut options = gif::DecodeOptions::new();
     options.set_color_output(gif::ColorOutput::RGBA);
     let decoder = options.read_info(std::fs::File::open(&path).unwrap());
@@ -430,7 +431,7 @@ fn frames_become_an_animation_of_one_size() {
     assert_ne!(frames[0].buffer, frames[3].buffer);
 
     let missing = [gallery.path("no_such.png")];
-    let error = Animation::default().save(&path, &missing).unwrap_err();
+    let error = save_animation(&path, &missing).unwrap_err();
     assert!(format!("{error:#}").contains("no_such.png"), "{error:#}");
 }
 
@@ -494,6 +495,7 @@ fn the_map_is_drawn_in_its_colors_and_by_a_number() {
         mesh: &mesh,
         path: Some(("mapping trajectory", &truth)),
         keys: &[("ground", [255, 0, 0]), ("rest", [0, 0, 255])],
+        numbers: None,
     }
     .save(&path)
     .unwrap();
@@ -519,14 +521,16 @@ fn the_map_is_drawn_in_its_colors_and_by_a_number() {
     };
     let values: Vec<f32> = mesh.vertices.iter().map(residual).collect();
     let path = gallery.path("map_residual.png");
-    ScalarMapPlot {
+    MapPlot {
         title: "Residual of the map",
         mesh: &mesh,
-        values: &values,
-        value_name: "residual [m]",
-        limits: (-0.05, 0.05),
-        colormap: Colormap::Diverging,
-        trajectory: None,
+        path: None,
+        keys: &[],
+        numbers: Some(VertexNumbers {
+            values: &values,
+            name: "residual [m]",
+            limit: 0.05,
+        }),
     }
     .save(&path)
     .unwrap();
@@ -537,6 +541,7 @@ fn the_map_is_drawn_in_its_colors_and_by_a_number() {
         mesh: &TriangleMesh::default(),
         path: None,
         keys: &[],
+        numbers: None,
     };
     let error = nothing.save(&path).unwrap_err();
     assert!(

@@ -9,8 +9,8 @@ use glam::DVec3;
 use super::{INTERACTIVE, RunFiles};
 use crate::app::report::plotting::color::{MCL, REFINED, Rgb, STATES};
 use crate::app::report::plotting::{
-    Animation, FRAME, InteractivePath, LineChart, LocalizationPicture, MapImage, MapPlot, Mark,
-    Panel, ParticlePanels, PathPlot, SURFACES, Series, drift_chart, error_chart, muted,
+    FRAME, InteractivePath, LineChart, LocalizationPicture, MapImage, MapPlot, Mark, Panel,
+    ParticlePanels, PathPlot, SURFACES, Series, drift_chart, error_chart, muted, save_animation,
 };
 use crate::app::report::results::LocalizationResults;
 use crate::evaluation::planar_errors;
@@ -60,6 +60,7 @@ pub fn draw_run(
             None => ("found path", &trajectories.estimates),
         }),
         keys: &SURFACES,
+        numbers: None,
     }
     .save(&files.plot("map.png")?)
 }
@@ -365,7 +366,7 @@ impl Movie {
 
     /// Writes the animation.
     pub fn finish(self) -> Result<()> {
-        Animation::default().save(&self.files.file("localization.gif"), &self.pictures)
+        save_animation(&self.files.file("localization.gif"), &self.pictures)
     }
 }
 
