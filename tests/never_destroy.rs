@@ -337,7 +337,7 @@ fn files_of_others_in_the_folder_of_the_parts_are_kept() {
         ]);
     }
     // Beside parts of an interrupted build of other inputs.
-    recording.write("map.ply.parts/inputs.txt", "# fpmcl 0.0.1\n");
+    recording.write("map.ply.parts/.fpmcl", "unfinished:0123 map.ply\n");
     recording.write("map.ply.parts/0000.ply", "a part");
     recording.fpmcl("build-map").succeeds();
     assert_eq!(recording.bytes("map.ply.parts/thesis.tex"), b"of the user");

@@ -14,7 +14,7 @@ use crate::app::report::export::{Model, Ribbon, RunLog, write_mcap};
 use crate::app::report::plotting::color::{Colormap, TRUTH};
 use crate::app::report::results::LocalizationResults;
 use crate::app::report::run_output;
-use crate::app::run::claims::{Claims, Outputs};
+use crate::app::run::artefact::{Claims, Outputs};
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::output::Printed;
 use crate::app::run::{Context, input, output};

@@ -13,7 +13,7 @@ use crate::app::report::plotting::color::{ODOMETRY, REFINED};
 use crate::app::report::results::write_trajectory_npz;
 use crate::app::report::run_output::{self, RunFiles};
 use crate::app::run::arguments::RunArgs;
-use crate::app::run::claims::{Claims, Outputs};
+use crate::app::run::artefact::{Claims, Outputs};
 use crate::app::run::output::Printed;
 use crate::app::run::{Context, output};
 use crate::app::settings::OdometryCommandConfig;

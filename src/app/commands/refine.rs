@@ -14,7 +14,7 @@ use crate::app::report::results::{LocalizationResults, Report};
 use crate::app::report::run_output::{self, REFINEMENT_FILES, REPORT_FILES, RunFiles};
 use crate::app::report::run_page;
 use crate::app::run::arguments::{RunArgs, numbers};
-use crate::app::run::claims::{Claims, NPZ, Outputs};
+use crate::app::run::artefact::{Claims, NPZ, Outputs};
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::{Context, input, output};
 use crate::app::settings::{self, LocalizationConfig, OdometrySource, RefinementConfig};

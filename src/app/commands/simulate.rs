@@ -5,7 +5,7 @@
 //! drive_1/labels/000000.label ...   SemanticKITTI class of each point
 //! drive_1/calib.txt times.txt odometry.txt
 //! drive_1/street.ply                the static world in the map frame: ground truth of a map
-//! drive_1/executable.txt            hash of the executable that wrote the drive, written first
+//! drive_1/.fpmcl                      claim of poses.txt, with the key of configuration and executable
 //! drive_1/simulation.yml            the configuration
 //! drive_1/given_poses.txt poses_in_map.txt    only where the configuration gives poses with errors
 //! drive_1/poses.txt                 written last
@@ -20,13 +20,16 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
 
-use anyhow::{Context as _, Result, bail, ensure};
+use anyhow::{Context as _, Result, bail};
 use rayon::prelude::*;
 
+use crate::app::run::artefact::Claims;
+use crate::app::run::artefact::hash::hash_of_texts;
 use crate::app::run::interrupt::{Interrupt, Interrupted};
 use crate::app::run::output::{self, Printed, write_file};
 use crate::app::run::progress::Task;
 use crate::app::run::{Context, version};
+use crate::app::settings::to_yaml;
 use crate::files::remove_abandoned;
 use crate::geometry::Pose3;
 use crate::map::files::ply;
@@ -51,7 +54,7 @@ pub const GIVEN_POSES_FILE: &str = "given_poses.txt";
 /// True poses in the map that is built with the given poses of drive 1; only where these have errors.
 pub const POSES_IN_MAP_FILE: &str = "poses_in_map.txt";
 
-const EXECUTABLE_FILE: &str = "executable.txt";
+const POSES_FILE: &str = "poses.txt";
 
 /// Remedy for a folder that cannot be used.
 const REMEDY: &str =
@@ -106,12 +109,19 @@ fn write_drive(
         "finished scans are kept in {}; the same command continues from there",
         folder.display()
     ));
-    let kept = if resolve_existing(config, &simulation, existing)? {
+    let main = folder.join(POSES_FILE);
+    let key = key(config)?;
+    let mut claims = Claims::read(&folder)?;
+    let kept = if resolve_existing(config, &claims, &key, simulation.frames(), existing)? {
         simulation.frames()
     } else {
+        output::create_folder(&folder)?;
+        remove_abandoned(&folder)?;
+        claims.begin_with_key(&main, &key)?;
         write_constants(config, &simulation)?;
         let kept = write_scans(&simulation, &folder, progress, interrupt)?;
         write_tables(config, &simulation)?;
+        claims.finish(&main)?;
         kept
     };
     Ok(SimulationReport {
@@ -139,112 +149,52 @@ fn recorded_path(pose_file: &Path, calib_file: Option<&Path>) -> Result<Vec<Pose
     Ok(CameraPoses::read(pose_file)?.map_from_lidar(&calibration))
 }
 
-/// Applies `existing` to the folder of the drive; returns whether a complete drive is kept.
+/// Key of a drive: the hash of its configuration, wherever it and its recorded path are, and that of the executable.
+fn key(config: &SimulationConfig) -> Result<String> {
+    let path = config.path_pose_file.as_deref();
+    let path = path.map(|pose_file| recorded_path(pose_file, config.path_calib_file.as_deref()));
+    let anywhere = SimulationConfig {
+        output_folder: PathBuf::new(),
+        path_pose_file: None,
+        path_calib_file: None,
+        ..config.clone()
+    };
+    let inputs = hash_of_texts(&[to_yaml(&anywhere)?, format!("{:?}", path.transpose()?)]);
+    Ok(format!("{inputs}:{}", version::executable_hash()?))
+}
+
+/// Applies `existing` to the folder of the drive with a key; returns whether a complete drive is kept.
 fn resolve_existing(
     config: &SimulationConfig,
-    simulation: &Simulation,
+    claims: &Claims,
+    key: &str,
+    frames: usize,
     existing: Existing,
 ) -> Result<bool> {
     let folder = config.drive_folder();
     let name = folder.display();
-    match (folder_state(config, simulation)?, existing) {
-        (state, Existing::Replace) => {
-            ensure!(
-                matches!(state, FolderState::Empty) || is_drive(&folder),
-                "{name} contains files that were not written by fpmcl simulate; choose another output_folder, or move that folder"
-            );
-            remove_drive(&folder)?;
-        }
-        (FolderState::Empty | FolderState::Incomplete, _) => {}
-        (FolderState::Complete, _) => return Ok(true),
-        (FolderState::Foreign, _) => {
-            bail!("{name} contains other files or a drive of another configuration; {REMEDY}")
-        }
-        (FolderState::Outdated, Existing::Keep) => {
+    // What a run leaves that was killed before it claimed the drive is nothing.
+    let is_early = |entry: &fs::DirEntry| entry.file_name().to_string_lossy().starts_with(".fpmcl");
+    let mut entries = fs::read_dir(&folder).into_iter().flatten().flatten();
+    let is_empty = entries.all(|entry| is_early(&entry));
+    let is_same_drive = |found: &str| found.split(':').next() == key.split(':').next();
+    match (claims.key(&folder.join(POSES_FILE)), existing) {
+        _ if is_empty => return Ok(false),
+        (None, Existing::Replace) => bail!(
+            "{name} contains files that were not written by fpmcl simulate; choose another output_folder, or move that folder"
+        ),
+        (Some(_), Existing::Replace) => {}
+        (Some(found), _) if found == key => return Ok(is_complete(config, claims, frames)),
+        (Some(found), Existing::Keep) if is_same_drive(found) => {
             bail!("{name} was written by another build of the program and may differ; {REMEDY}")
         }
-        (FolderState::Outdated, Existing::Renew) => {
+        (Some(found), Existing::Renew) if is_same_drive(found) => {
             tracing::info!("{name} was written by another build of the program and is replaced");
-            remove_drive(&folder)?;
         }
+        _ => bail!("{name} contains other files or a drive of another configuration; {REMEDY}"),
     }
+    remove_drive(&folder)?;
     Ok(false)
-}
-
-/// Whether this program wrote the drive in a folder.
-fn is_drive(folder: &Path) -> bool {
-    let text = fs::read_to_string(folder.join("simulation.yml")).unwrap_or_default();
-    serde_yaml::from_str::<SimulationConfig>(&text).is_ok() && folder.join(EXECUTABLE_FILE).exists()
-}
-
-/// Contents of the folder of a drive.
-enum FolderState {
-    Empty,
-    /// A part of this drive.
-    Incomplete,
-    /// All of this drive.
-    Complete,
-    /// All or a part of this drive, written by another executable.
-    Outdated,
-    /// Anything else.
-    Foreign,
-}
-
-fn folder_state(config: &SimulationConfig, simulation: &Simulation) -> Result<FolderState> {
-    let folder = config.drive_folder();
-    // What a run leaves that was killed before it wrote the configuration is empty, too.
-    let is_early = |name: &str| name == EXECUTABLE_FILE || name.starts_with(".fpmcl-");
-    let names = fs::read_dir(&folder).into_iter().flatten().flatten();
-    if names
-        .map(|entry| entry.file_name())
-        .all(|name| is_early(&name.to_string_lossy()))
-    {
-        return Ok(FolderState::Empty);
-    }
-    let text = fs::read_to_string(folder.join("simulation.yml")).ok();
-    let found = text.and_then(|text| serde_yaml::from_str::<SimulationConfig>(&text).ok());
-    let Some(found) = found else {
-        return Ok(FolderState::Foreign);
-    };
-    let is_same_path = found.path_pose_file == config.path_pose_file
-        && found.path_calib_file == config.path_calib_file;
-    // The drive and its recorded path may have been moved.
-    let moved = SimulationConfig {
-        output_folder: config.output_folder.clone(),
-        path_pose_file: config.path_pose_file.clone(),
-        path_calib_file: config.path_calib_file.clone(),
-        ..found
-    };
-    if moved != *config {
-        return Ok(FolderState::Foreign);
-    }
-    let executable = version::executable_hash()?;
-    let is_same_executable =
-        fs::read(folder.join(EXECUTABLE_FILE)).is_ok_and(|by| by == executable.as_bytes());
-    Ok(match fs::read(folder.join("poses.txt")) {
-        // Another executable may follow another path.
-        _ if !is_same_executable && is_same_path => FolderState::Outdated,
-        // A recorded path is the same if its poses are, wherever its file is.
-        Ok(poses) if poses != poses_text(simulation)? => FolderState::Foreign,
-        Ok(_) if !is_same_executable => FolderState::Outdated,
-        Ok(_) if has_all_files(config, simulation.frames()) => FolderState::Complete,
-        Ok(_) => FolderState::Incomplete,
-        Err(_) if is_same_path => FolderState::Incomplete,
-        Err(_) => FolderState::Foreign,
-    })
-}
-
-/// Contents of `poses.txt`.
-fn poses_text(simulation: &Simulation) -> Result<Vec<u8>> {
-    let mut text = Vec::new();
-    let frame = map_frame();
-    write_kitti(
-        &mut text,
-        &simulation.poses(),
-        &frame.world_from_map(),
-        &frame.calibration,
-    )?;
-    Ok(text)
 }
 
 /// The frame of the written poses: the world frame of the street.
@@ -255,8 +205,13 @@ fn map_frame() -> MapFrame {
     }
 }
 
-fn has_all_files(config: &SimulationConfig, frames: usize) -> bool {
+/// Whether a drive is finished and has lost no file since.
+fn is_complete(config: &SimulationConfig, claims: &Claims, frames: usize) -> bool {
     let folder = config.drive_folder();
+    let poses = folder.join(POSES_FILE);
+    if claims.state(&poses) != Some("finished") || !poses.exists() {
+        return false;
+    }
     let mut tables = vec!["street.ply", "calib.txt", "times.txt", "odometry.txt"];
     if config.given_poses.has_errors() {
         tables.extend([GIVEN_POSES_FILE, POSES_IN_MAP_FILE]);
@@ -273,11 +228,10 @@ fn scan_files(folder: &Path, frame: usize) -> [PathBuf; 2] {
     ]
 }
 
-/// Removes the files of a drive and nothing else, `poses.txt` first. The configuration and the
-/// executable's hash are kept and overwritten later, so that a folder that is half removed is
-/// still recognized.
+/// Removes the files of a drive and nothing else, `poses.txt` first. The claim is kept until the next one, so that a
+/// folder that is half removed is still recognized.
 fn remove_drive(folder: &Path) -> Result<()> {
-    let mut paths = ["poses.txt", "street.ply"]
+    let mut paths = [POSES_FILE, "street.ply"]
         .map(|name| folder.join(name))
         .to_vec();
     for (name, extension) in [("velodyne", "bin"), ("labels", "label")] {
@@ -293,14 +247,10 @@ fn remove_drive(folder: &Path) -> Result<()> {
         .try_for_each(|path| output::remove_if_exists(path))
 }
 
-/// Writes what does not depend on the scans: configuration, executable's hash and street.
+/// Writes what does not depend on the scans: configuration and street.
 fn write_constants(config: &SimulationConfig, simulation: &Simulation) -> Result<()> {
     let folder = config.drive_folder();
-    output::create_folder(&folder)?;
-    remove_abandoned(&folder)?;
-    output::write_text(&folder.join(EXECUTABLE_FILE), version::executable_hash()?)?;
-    let yaml = serde_yaml::to_string(config).context("cannot write the configuration as YAML")?;
-    output::write_text(&folder.join("simulation.yml"), &yaml)?;
+    output::write_yaml(&folder.join("simulation.yml"), config)?;
     for name in ["velodyne", "labels"] {
         output::create_subfolder(&folder.join(name))?;
     }
@@ -361,7 +311,7 @@ fn write_tables(config: &SimulationConfig, simulation: &Simulation) -> Result<()
         tables.push((GIVEN_POSES_FILE, simulation.given_poses()));
         tables.push((POSES_IN_MAP_FILE, simulation.poses_in_map()));
     }
-    tables.push(("poses.txt", simulation.poses()));
+    tables.push((POSES_FILE, simulation.poses()));
     for (name, poses) in tables {
         write_file(&folder.join(name), |file| {
             write_kitti(file, &poses, &frame.world_from_map(), &frame.calibration)

@@ -3,6 +3,7 @@
 use approx::assert_relative_eq;
 
 use super::*;
+use crate::app::run::artefact::CLAIMS_FILE;
 use crate::recording::{Recording, velodyne};
 use crate::simulation::{PathSegment, ScannerConfig};
 
@@ -24,13 +25,14 @@ fn simulate(config: &SimulationConfig, existing: Existing) -> Result<SimulationR
     write_drive(config, existing, &|_, _| {}, &Interrupt::default())
 }
 
-/// Every file of a drive with its bytes, except the configuration, which names the folder.
+/// Every file of a drive with its bytes, except the configuration, which names the folder, and the claims.
 fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let mut files = Vec::new();
     for part in ["", "velodyne", "labels"] {
         for entry in fs::read_dir(folder.join(part)).unwrap() {
             let path = entry.unwrap().path();
-            if path.is_file() && !path.ends_with("simulation.yml") {
+            let is_named = ["simulation.yml", CLAIMS_FILE].map(|name| path.ends_with(name));
+            if path.is_file() && is_named == [false; 2] {
                 let name = path.strip_prefix(folder).unwrap().to_owned();
                 files.push((name, fs::read(&path).unwrap()));
             }
@@ -52,7 +54,7 @@ fn the_same_seed_gives_the_same_bytes_at_any_number_of_threads() {
             .unwrap();
         contents(&folder.path().join("drive_1"))
     });
-    assert_eq!(written[0].len(), 6 + 2 * 6);
+    assert_eq!(written[0].len(), 5 + 2 * 6);
     assert_eq!(written[0], written[1]);
     assert_eq!(written[0], written[2]);
 }
@@ -112,7 +114,7 @@ fn what_exists_is_kept_without_force_and_replaced_with_it() {
 
     simulate(&other, Existing::Replace).unwrap();
     let after = contents(&config.drive_folder());
-    assert_eq!(after.len(), 6 + 2 * 3, "scans of the old drive are gone");
+    assert_eq!(after.len(), 5 + 2 * 3, "scans of the old drive are gone");
 }
 
 #[test]
@@ -122,7 +124,11 @@ fn a_drive_of_another_executable_is_reported_or_replaced() {
     let drive = config.drive_folder();
     simulate(&config, Existing::Keep).unwrap();
     let whole = contents(&drive);
-    let age = || fs::write(drive.join("executable.txt"), "another").unwrap();
+    let age = || {
+        let claims = fs::read_to_string(drive.join(CLAIMS_FILE)).unwrap();
+        let aged = claims.replace(version::executable_hash().unwrap(), "another");
+        fs::write(drive.join(CLAIMS_FILE), aged).unwrap();
+    };
     let make_old_scan = || fs::write(drive.join("velodyne/000002.bin"), [0; 16]).unwrap();
     assert_eq!(simulate(&config, Existing::Renew).unwrap().kept, 6);
 
@@ -139,16 +145,16 @@ fn a_drive_of_another_executable_is_reported_or_replaced() {
         assert_eq!(simulate(&config, Existing::Renew).unwrap().kept, 0);
         assert_eq!(contents(&drive), whole);
     }
-    // A drive without the hash of its executable.
-    fs::remove_file(drive.join("executable.txt")).unwrap();
-    assert_eq!(simulate(&config, Existing::Renew).unwrap().kept, 0);
-
     // A comparison does not replace a drive of another configuration.
     age();
     let other = SimulationConfig { seed: 2, ..config };
     let message = simulate(&other, Existing::Renew).unwrap_err().to_string();
     assert!(message.contains("another configuration"), "{message}");
     assert!(message.contains("remove that folder"), "{message}");
+    // Nor one that is not claimed.
+    fs::remove_file(drive.join(CLAIMS_FILE)).unwrap();
+    let message = simulate(&other, Existing::Renew).unwrap_err().to_string();
+    assert!(message.contains("other files"), "{message}");
 }
 
 #[test]

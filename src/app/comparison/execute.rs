@@ -16,8 +16,9 @@ use crate::app::commands::{build_map, localize, refine};
 use crate::app::report::results::{LocalizationResults, Report, TrajectoryReport};
 use crate::app::report::run_output::{self, REFINEMENT_FILES, RunFiles};
 use crate::app::report::run_page::RunPage;
-use crate::app::run::artefact::{self, FINISHED_FILE, Lock, SharedResult};
-use crate::app::run::claims::{CLAIMS_FILE, Claims, Outputs};
+use crate::app::run::artefact::{
+    self, CLAIMS_FILE, Claims, FINISHED_FILE, Lock, Outputs, SharedResult,
+};
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::{Context, output, version};
 use crate::app::settings::{BuildMapConfig, LocalizationConfig, RefinementConfig};

@@ -20,7 +20,7 @@ use serde::Serialize;
 
 use super::plan::PlannedRun;
 use crate::app::commands::stages::{is_bag, is_topic};
-use crate::app::run::artefact::{hash_of_file, hash_of_scan, hash_of_texts};
+use crate::app::run::artefact::hash::{hash_of_file, hash_of_scan, hash_of_texts};
 use crate::app::run::version;
 use crate::recording::{Recording, Selection};
 use crate::simulation::SimulationConfig;

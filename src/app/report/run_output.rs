@@ -10,7 +10,7 @@ use anyhow::{Result, bail};
 use crate::app::report::results::{
     LocalizationResults, Report, RunSummary, TrajectoryReport, write_frames_csv, write_poses_npy,
 };
-use crate::app::run::claims::{Claims, Outputs};
+use crate::app::run::artefact::{Claims, Outputs};
 use crate::app::run::output;
 use crate::evaluation::{
     EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, SpatialMetrics,

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use tracing::level_filters::LevelFilter;
 
-use crate::app::run::claims::CONFIGURATION_FILE;
+use crate::app::run::artefact::CONFIGURATION_FILE;
 use crate::app::run::interrupt::Interrupt;
 use crate::app::run::logging::{self, RunLog};
 use crate::app::run::machine::MachineArgs;

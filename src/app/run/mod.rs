@@ -2,7 +2,6 @@
 
 pub mod arguments;
 pub mod artefact;
-pub mod claims;
 mod context;
 pub mod failure;
 pub mod input;

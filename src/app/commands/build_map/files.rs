@@ -3,7 +3,7 @@
 use anyhow::Result;
 
 use crate::app::run::Context;
-use crate::app::run::claims::{Claims, Outputs, PLY};
+use crate::app::run::artefact::{Claims, Outputs, PLY};
 use crate::app::settings::BuildMapConfig;
 use crate::map::MappingPath;
 use crate::map::files::ply;

@@ -9,7 +9,7 @@ use super::clock::StageClock;
 use super::opened::Opened;
 use super::parts::{Parts, Role};
 use crate::app::run::Context;
-use crate::app::run::artefact::{hash_of_scan, hash_of_scans, joint_hash};
+use crate::app::run::artefact::hash::{hash_of_scan, hash_of_scans, joint_hash};
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::progress::Task;
 use crate::map::build::plan::LocalMapPlan;

@@ -10,7 +10,7 @@ use super::onto::OlderMap;
 use super::parts::{Parts, Role};
 use super::{pose_check, poses};
 use crate::app::commands::trajectory::{self, file_beside};
-use crate::app::run::claims::Claims;
+use crate::app::run::artefact::Claims;
 use crate::app::run::{Context, input, version};
 use crate::app::settings::{self, BuildMapConfig};
 use crate::map::build::plan::{self, LocalMapPlan};

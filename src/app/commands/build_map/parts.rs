@@ -1,9 +1,9 @@
 //! Finished local maps on disk, from which an interrupted build resumes.
 //!
 //! While a map is being built, the folder `<map>.parts` beside it holds per local map a mesh, and its
-//! counts with the hashes of its scans and of the mesh; `inputs.txt` with all other inputs; and a file
-//! that the build locks. Parts of other inputs are deleted, files of others never. A part is finished
-//! once its counts exist, which are written last.
+//! counts with the hashes of its scans and of the mesh; the claim of the map with the key of all other inputs; and a
+//! file that the build locks. Parts of other inputs are deleted, files of others never. A part is finished once its
+//! counts exist, which are written last.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,8 @@ use anyhow::{Context as _, Result, ensure};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use crate::app::run::artefact::{Lock, hash_of_file};
+use crate::app::run::artefact::hash::{hash_of_file, hash_of_texts};
+use crate::app::run::artefact::{CLAIMS_FILE, Claims, Lock};
 use crate::app::run::output;
 use crate::files::remove_abandoned;
 use crate::map::files::mapped_ply::MappedPly;
@@ -20,10 +21,7 @@ use crate::map::files::ply;
 use crate::map::{LocalMap, LocalMapCounts};
 use crate::recording::RecordingError;
 
-const INPUTS_FILE: &str = "inputs.txt";
 const LOCK_FILE: &str = "lock";
-/// Start of the inputs, by which a folder is recognized as ours.
-const INPUTS_START: &str = "# fpmcl ";
 
 /// A finished local map beside its mesh.
 #[derive(Serialize, Deserialize)]
@@ -70,9 +68,9 @@ pub struct Parts {
 
 impl Drop for Parts {
     fn drop(&mut self) {
-        let (inputs, lock) = (self.folder.join(INPUTS_FILE), self.folder.join(LOCK_FILE));
+        let [claims, lock] = [CLAIMS_FILE, LOCK_FILE].map(|name| self.folder.join(name));
         // Another build may have locked the folder since the parts were removed.
-        if inputs.exists() || !self.lock.is_in_place() {
+        if claims.exists() || !self.lock.is_in_place() {
             return;
         }
         if fs::remove_file(lock).is_ok() && fs::remove_dir(&self.folder).is_err() {
@@ -90,14 +88,15 @@ impl Parts {
         let context = || format!("cannot use {} for unfinished maps", folder.display());
         match role {
             Role::Build => output::create_subfolder(&folder)?,
-            _ => ensure!(folder.join(INPUTS_FILE).exists(), not_listed(mesh_file)),
+            _ => ensure!(folder.join(CLAIMS_FILE).exists(), not_listed(mesh_file)),
         }
         let is_early = |entry: &fs::DirEntry| {
             let name = entry.file_name();
             name == LOCK_FILE || name.to_string_lossy().starts_with(".fpmcl-")
         };
         ensure!(
-            inputs_in(&folder).starts_with(INPUTS_START) || entries(&folder)?.iter().all(is_early),
+            Claims::read(&folder)?.key(mesh_file).is_some()
+                || entries(&folder)?.iter().all(is_early),
             "{} is needed for unfinished maps, but has files that fpmcl did not write; move it, or choose another mesh_file",
             folder.display()
         );
@@ -113,12 +112,13 @@ impl Parts {
 
     /// Requires that the parts were made from `inputs`; a build deletes others.
     pub fn keep_those_of(&self, inputs: &str) -> Result<()> {
-        if inputs_in(&self.folder) == inputs {
+        let key = hash_of_texts(&[inputs]);
+        if Claims::read(&self.folder)?.key(&self.mesh_file) == Some(key.as_str()) {
             return Ok(());
         }
         ensure!(self.role == Role::Build, not_listed(&self.mesh_file));
         self.remove_parts()?;
-        output::write_text(&self.folder.join(INPUTS_FILE), inputs)
+        Claims::read(&self.folder)?.begin_with_key(&self.mesh_file, &key)
     }
 
     /// The folder of the parts.
@@ -216,15 +216,15 @@ impl Parts {
         serde_json::from_slice(&text).with_context(|| format!("{} is damaged", counts.display()))
     }
 
-    /// Removes the parts, and after them the inputs, which make the folder ours.
+    /// Removes the parts, and after them the claim, which makes the folder ours.
     fn remove_parts(&self) -> Result<()> {
         let names = entries(&self.folder)?.into_iter();
-        let mut names: Vec<String> = names
-            .map(|entry| entry.file_name().to_string_lossy().into_owned())
-            .filter(|name| is_part(name) || name == INPUTS_FILE)
-            .collect();
+        let names = names.map(|entry| entry.file_name().to_string_lossy().into_owned());
+        let mut names: Vec<String> = names.filter(|name| is_part(name)).collect();
         names.sort();
-        (names.iter()).try_for_each(|name| output::remove_if_exists(&self.folder.join(name)))
+        (names.iter().map(String::as_str))
+            .chain([CLAIMS_FILE])
+            .try_for_each(|name| output::remove_if_exists(&self.folder.join(name)))
     }
 
     fn mesh_file(&self, number: usize) -> PathBuf {
@@ -241,11 +241,6 @@ fn is_part(name: &str) -> bool {
     let is_number = |stem: &str| stem.len() >= 4 && stem.bytes().all(|b| b.is_ascii_digit());
     (name.split_once('.'))
         .is_some_and(|(stem, extension)| is_number(stem) && ["ply", "json"].contains(&extension))
-}
-
-/// The inputs of the parts that are in a folder.
-fn inputs_in(folder: &Path) -> String {
-    fs::read_to_string(folder.join(INPUTS_FILE)).unwrap_or_default()
 }
 
 fn entries(folder: &Path) -> Result<Vec<fs::DirEntry>> {

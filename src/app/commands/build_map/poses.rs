@@ -9,7 +9,7 @@ use anyhow::{Result, ensure};
 use super::onto::OlderMap;
 use super::parts::{Role, not_listed};
 use crate::app::commands::trajectory;
-use crate::app::run::artefact::hash_of_texts;
+use crate::app::run::artefact::hash::hash_of_texts;
 use crate::app::run::{Context, output, version};
 use crate::app::settings::BuildMapConfig;
 use crate::geometry::Pose3;

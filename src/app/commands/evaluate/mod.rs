@@ -16,7 +16,7 @@ use crate::app::report::results::{LocalizationResults, Report};
 use crate::app::report::run_output::{self, REPORT_FILES, RunFiles};
 use crate::app::report::run_page;
 use crate::app::run::arguments::RunArgs;
-use crate::app::run::claims::{Claims, NPZ, Outputs};
+use crate::app::run::artefact::{Claims, NPZ, Outputs};
 use crate::app::run::{Context, input, output};
 use crate::app::settings::{self, EvaluationConfig, LocalizationConfig};
 use crate::evaluation::{Alignment, RangeMclRules};

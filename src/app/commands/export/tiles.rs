@@ -11,7 +11,7 @@ use super::arguments::ExportArgs;
 use crate::app::report::export::tiles::{
     METADATA_FILE, TILES_FOLDER, Tile, is_tile, metadata, split,
 };
-use crate::app::run::claims::Claims;
+use crate::app::run::artefact::Claims;
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::{Context, output};
 use crate::geometry::{TriangleMesh, Vec3, sample_surface, surface_area_m2, surface_samples};

@@ -27,7 +27,7 @@ use self::input::LabelledScan;
 use self::report::GroundReport;
 use crate::app::report::plotting::color::Colormap;
 use crate::app::run::Context;
-use crate::app::run::claims::{Claims, Outputs};
+use crate::app::run::artefact::{Claims, Outputs};
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::output::{self, Printed};
 use crate::app::settings::{CommandConfig as _, GroundCommandConfig};

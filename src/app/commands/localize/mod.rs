@@ -21,7 +21,7 @@ use crate::app::report::run_output::{
     self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES, RunFiles,
 };
 use crate::app::report::run_page;
-use crate::app::run::claims::{Claims, NPZ, Outputs};
+use crate::app::run::artefact::{Claims, NPZ, Outputs};
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::{Context, input, output};
 use crate::app::settings::{Initialization, LocalizationConfig, MotionModel};

@@ -6,7 +6,7 @@ use anyhow::Result;
 
 use crate::app::report::results::{LocalizationResults, ParticleLog, ScanOutline};
 use crate::app::report::run_output::{self, Movie, RunFiles};
-use crate::app::run::claims::Claims;
+use crate::app::run::artefact::Claims;
 use crate::app::run::interrupt::Interrupted;
 use crate::app::settings::LocalizationConfig;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};

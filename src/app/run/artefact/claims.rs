@@ -189,7 +189,14 @@ impl Claims {
 
     /// The state of an output of the folder; `None` if it is not claimed.
     pub fn state(&self, path: &Path) -> Option<&str> {
-        self.states.get(&*name_of(path)).map(String::as_str)
+        let state = self.states.get(&*name_of(path))?;
+        state.split(':').next()
+    }
+
+    /// The key of the inputs of an output; `None` if it has none.
+    pub fn key(&self, path: &Path) -> Option<&str> {
+        let state = self.states.get(&*name_of(path))?;
+        Some(state.split_once(':')?.1)
     }
 
     /// Marks a main output as being written.
@@ -197,9 +204,15 @@ impl Claims {
         self.set(&[name_of(main)], "unfinished")
     }
 
+    /// Marks a main output as being written from the inputs of a key.
+    pub fn begin_with_key(&mut self, main: &Path, key: &str) -> Result<()> {
+        self.set(&[name_of(main)], &format!("unfinished:{key}"))
+    }
+
     /// Marks a main output as complete.
     pub fn finish(&mut self, main: &Path) -> Result<()> {
-        self.set(&[name_of(main)], "finished")
+        let key = self.key(main).map(|key| format!("finished:{key}"));
+        self.set(&[name_of(main)], key.as_deref().unwrap_or("finished"))
     }
 
     /// Removes the claimed ones of some files.
