@@ -31,6 +31,7 @@ mod street_config;
 mod structure;
 // Drives and measurements.
 mod config;
+pub mod drive_files;
 mod ego_motion;
 mod given_poses;
 mod odometry;
@@ -51,7 +52,7 @@ pub use given_poses::GivenPosesConfig;
 pub use ground::{GroundField, GroundSample, GroundZone};
 pub use odometry::SimulatedOdometryConfig;
 pub use scanner::{LabelledScan, ScannerConfig};
-pub use scenes::{crest_scene, kerb_scene, slope_scene};
+pub use scenes::{crest_scene, ground_scenes, kerb_scene, slope_scene};
 pub use street::Street;
 pub use street_config::{ChangesConfig, CrossSectionConfig, StreetConfig};
 pub use structure::Structure;

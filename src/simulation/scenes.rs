@@ -1,12 +1,74 @@
 //! Scenes with exact labels for the evaluation of ground segmentation: one scan each, from a
 //! vehicle on a straight street with a slope, a crest or kerbs.
 
+use rayon::prelude::*;
+
 use super::centreline::{Centreline, PathSegment};
 use super::ego_motion::{EgoMotion, MotionConfig};
 use super::random::{Purpose, stream};
 use super::scanner::{LabelledScan, ScanTarget, ScannerConfig, simulate_scan};
 use super::street::Street;
 use super::street_config::StreetConfig;
+use super::{Simulation, SimulationConfig, SimulationError};
+
+/// A named scene: its scans with a seed.
+pub type GroundScene = (
+    String,
+    Box<dyn Fn(u64) -> Result<Vec<LabelledScan>, SimulationError> + Sync>,
+);
+
+/// Slopes, crests, kerbs and drives on which methods of ground segmentation are compared.
+pub fn ground_scenes() -> Vec<GroundScene> {
+    let percent = |grade: f64| (100.0 * grade).round();
+    let mut scenes: Vec<GroundScene> = Vec::new();
+    for grade in [0.0, 0.05, 0.10, 0.15, -0.10] {
+        let name = format!("slope {} %", percent(grade));
+        scenes.push(one_scan(name, move |scanner, seed| {
+            slope_scene(grade, scanner, seed)
+        }));
+    }
+    for grade in [0.05, 0.10, 0.15] {
+        let name = format!("crest {} %", percent(grade));
+        scenes.push(one_scan(name, move |scanner, seed| {
+            crest_scene(grade, scanner, seed)
+        }));
+    }
+    for height_m in [0.05, 0.12, 0.20] {
+        let name = format!("kerb {height_m:.2} m");
+        scenes.push(one_scan(name, move |scanner, seed| {
+            kerb_scene(height_m, scanner, seed)
+        }));
+    }
+    for beams in [64, 32] {
+        let scans = move |seed| drive(seed, beams);
+        scenes.push((format!("drive, {beams} beams"), Box::new(scans)));
+    }
+    scenes
+}
+
+fn one_scan(
+    name: String,
+    scan: impl Fn(&ScannerConfig, u64) -> LabelledScan + Sync + 'static,
+) -> GroundScene {
+    let scans = move |seed| Ok(vec![scan(&ScannerConfig::default(), seed)]);
+    (name, Box::new(scans))
+}
+
+/// Every twentieth scan of a drive through the whole simulated street, with its slope, crest, square and traffic.
+fn drive(seed: u64, beams: usize) -> Result<Vec<LabelledScan>, SimulationError> {
+    const STEP: usize = 20;
+    let config = SimulationConfig {
+        seed,
+        scanner: ScannerConfig {
+            beams,
+            ..ScannerConfig::default()
+        },
+        ..SimulationConfig::default()
+    };
+    let simulation = Simulation::new(&config, None)?;
+    let frames = (0..simulation.frames()).into_par_iter().step_by(STEP);
+    Ok(frames.map(|frame| simulation.scan(frame)).collect())
+}
 
 /// Level ground from behind the vehicle to 6 m ahead of it, then a slope of `grade` (0.1 for
 /// 10 %; negative downhill).

@@ -1,14 +1,10 @@
 //! `simulate`: a drive through a procedural street, written in the layout of KITTI.
 //!
 //! ```text
-//! drive_1/velodyne/000000.bin ...   points
-//! drive_1/labels/000000.label ...   SemanticKITTI class of each point
-//! drive_1/calib.txt times.txt odometry.txt
-//! drive_1/street.ply                the static world in the map frame: ground truth of a map
-//! drive_1/.fpmcl                      claim of poses.txt, with the key of configuration and executable
-//! drive_1/simulation.yml            the configuration
-//! drive_1/given_poses.txt poses_in_map.txt    only where the configuration gives poses with errors
-//! drive_1/poses.txt                 written last
+//! drive_1/...               the drive, as of [`drive_files`](crate::simulation::drive_files)
+//! drive_1/street.ply        the static world in the map frame: ground truth of a map
+//! drive_1/.fpmcl            claim of poses.txt, with the key of configuration and executable
+//! drive_1/simulation.yml    the configuration
 //! ```
 //!
 //! Every file is written atomically. A drive is complete if all of them exist. One that was
@@ -26,17 +22,17 @@ use rayon::prelude::*;
 use crate::app::run::artefact::Claims;
 use crate::app::run::artefact::hash::hash_of_texts;
 use crate::app::run::interrupt::{Interrupt, Interrupted};
-use crate::app::run::output::{self, Printed, write_file};
+use crate::app::run::output::{self, Printed};
 use crate::app::run::progress::Task;
 use crate::app::run::{Context, version};
 use crate::app::settings::to_yaml;
 use crate::files::remove_abandoned;
 use crate::geometry::Pose3;
 use crate::map::files::ply;
-use crate::recording::poses::{CameraPoses, write_kitti, write_times};
-use crate::recording::velodyne::{write_labels, write_scan};
-use crate::recording::{Calibration, MapFrame};
-use crate::simulation::{Simulation, SimulationConfig, calibration};
+use crate::recording::Calibration;
+use crate::recording::poses::CameraPoses;
+use crate::simulation::drive_files::{POSES_FILE, scan_files};
+use crate::simulation::{Simulation, SimulationConfig};
 
 /// Treatment of an existing drive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -49,12 +45,8 @@ pub enum Existing {
     Replace,
 }
 
-/// Poses with the errors of the configuration; only where it has some.
-pub const GIVEN_POSES_FILE: &str = "given_poses.txt";
-/// True poses in the map that is built with the given poses of drive 1; only where these have errors.
-pub const POSES_IN_MAP_FILE: &str = "poses_in_map.txt";
-
-const POSES_FILE: &str = "poses.txt";
+/// The static world in the map frame: ground truth of a map.
+const STREET_FILE: &str = "street.ply";
 
 /// Remedy for a folder that cannot be used.
 const REMEDY: &str =
@@ -112,7 +104,7 @@ fn write_drive(
     let main = folder.join(POSES_FILE);
     let key = key(config)?;
     let mut claims = Claims::read(&folder)?;
-    let kept = if resolve_existing(config, &claims, &key, simulation.frames(), existing)? {
+    let kept = if resolve_existing(config, &claims, &key, &simulation, existing)? {
         simulation.frames()
     } else {
         output::create_folder(&folder)?;
@@ -120,7 +112,7 @@ fn write_drive(
         claims.begin_with_key(&main, &key)?;
         write_constants(config, &simulation)?;
         let kept = write_scans(&simulation, &folder, progress, interrupt)?;
-        write_tables(config, &simulation)?;
+        simulation.write_tables(&folder)?;
         claims.finish(&main)?;
         kept
     };
@@ -168,7 +160,7 @@ fn resolve_existing(
     config: &SimulationConfig,
     claims: &Claims,
     key: &str,
-    frames: usize,
+    simulation: &Simulation,
     existing: Existing,
 ) -> Result<bool> {
     let folder = config.drive_folder();
@@ -184,7 +176,7 @@ fn resolve_existing(
             "{name} contains files that were not written by fpmcl simulate; choose another output_folder, or move that folder"
         ),
         (Some(_), Existing::Replace) => {}
-        (Some(found), _) if found == key => return Ok(is_complete(config, claims, frames)),
+        (Some(found), _) if found == key => return Ok(is_complete(&folder, claims, simulation)),
         (Some(found), Existing::Keep) if is_same_drive(found) => {
             bail!("{name} was written by another build of the program and may differ; {REMEDY}")
         }
@@ -197,41 +189,17 @@ fn resolve_existing(
     Ok(false)
 }
 
-/// The frame of the written poses: the world frame of the street.
-fn map_frame() -> MapFrame {
-    MapFrame {
-        calibration: calibration(),
-        world_from_first_cam0: Pose3::identity(),
-    }
-}
-
 /// Whether a drive is finished and has lost no file since.
-fn is_complete(config: &SimulationConfig, claims: &Claims, frames: usize) -> bool {
-    let folder = config.drive_folder();
-    let poses = folder.join(POSES_FILE);
-    if claims.state(&poses) != Some("finished") || !poses.exists() {
-        return false;
-    }
-    let mut tables = vec!["street.ply", "calib.txt", "times.txt", "odometry.txt"];
-    if config.given_poses.has_errors() {
-        tables.extend([GIVEN_POSES_FILE, POSES_IN_MAP_FILE]);
-    }
-    let mut scans = (0..frames).flat_map(|frame| scan_files(&folder, frame));
-    tables.iter().all(|name| folder.join(name).exists()) && scans.all(|path| path.exists())
-}
-
-/// Paths of the points and of the labels of a scan.
-fn scan_files(folder: &Path, frame: usize) -> [PathBuf; 2] {
-    [
-        folder.join(format!("velodyne/{frame:06}.bin")),
-        folder.join(format!("labels/{frame:06}.label")),
-    ]
+fn is_complete(folder: &Path, claims: &Claims, simulation: &Simulation) -> bool {
+    let mut files = simulation.files_in(folder);
+    files.push(folder.join(STREET_FILE));
+    claims.state(&folder.join(POSES_FILE)) == Some("finished") && files.iter().all(|it| it.exists())
 }
 
 /// Removes the files of a drive and nothing else, `poses.txt` first. The claim is kept until the next one, so that a
 /// folder that is half removed is still recognized.
 fn remove_drive(folder: &Path) -> Result<()> {
-    let mut paths = [POSES_FILE, "street.ply"]
+    let mut paths = [POSES_FILE, STREET_FILE]
         .map(|name| folder.join(name))
         .to_vec();
     for (name, extension) in [("velodyne", "bin"), ("labels", "label")] {
@@ -255,7 +223,7 @@ fn write_constants(config: &SimulationConfig, simulation: &Simulation) -> Result
         output::create_subfolder(&folder.join(name))?;
     }
     Ok(ply::write(
-        &folder.join("street.ply"),
+        &folder.join(STREET_FILE),
         &simulation.street_in_map(),
         None,
     )?)
@@ -275,13 +243,10 @@ fn write_scans(
         if interrupt.requested() {
             return Ok(());
         }
-        let [scan_path, label_path] = scan_files(folder, frame);
-        if scan_path.exists() && label_path.exists() {
+        if scan_files(folder, frame).iter().all(|path| path.exists()) {
             kept.fetch_add(1, Ordering::Relaxed);
         } else {
-            let labelled = simulation.scan(frame);
-            write_file(&label_path, |file| write_labels(file, &labelled.classes))?;
-            write_file(&scan_path, |file| write_scan(file, &labelled.scan))?;
+            simulation.write_scan(folder, frame)?;
         }
         progress(done.fetch_add(1, Ordering::Relaxed) + 1, frames);
         anyhow::Ok(())
@@ -295,29 +260,6 @@ fn write_scans(
         return Err(Interrupted { kept }.into());
     }
     Ok(kept.into_inner())
-}
-
-/// Writes calibration, times, odometry and, last, the poses.
-fn write_tables(config: &SimulationConfig, simulation: &Simulation) -> Result<()> {
-    let folder = config.drive_folder();
-    write_file(&folder.join("calib.txt"), |file| calibration().write(file))?;
-    let times_s = simulation.times_s();
-    write_file(&folder.join("times.txt"), |file| {
-        write_times(file, &times_s)
-    })?;
-    let frame = map_frame();
-    let mut tables = vec![("odometry.txt", simulation.odometry())];
-    if config.given_poses.has_errors() {
-        tables.push((GIVEN_POSES_FILE, simulation.given_poses()));
-        tables.push((POSES_IN_MAP_FILE, simulation.poses_in_map()));
-    }
-    tables.push((POSES_FILE, simulation.poses()));
-    for (name, poses) in tables {
-        write_file(&folder.join(name), |file| {
-            write_kitti(file, &poses, &frame.world_from_map(), &frame.calibration)
-        })?;
-    }
-    Ok(())
 }
 
 fn length_m(poses: &[Pose3]) -> f64 {

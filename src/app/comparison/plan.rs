@@ -5,12 +5,12 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::record::RunId;
-use crate::app::commands::simulate::{GIVEN_POSES_FILE, POSES_IN_MAP_FILE};
 use crate::app::settings::{
     self, BuildMapConfig, ComparisonConfig, LocalizationConfig, OdometrySource, Overrides,
     RefinementConfig, SequenceConfig, VariantConfig, settings,
 };
 use crate::simulation::SimulationConfig;
+use crate::simulation::drive_files::{GIVEN_POSES_FILE, POSES_IN_MAP_FILE};
 use crate::validation::Validate;
 
 /// A run to execute. Paths of its results are set on execution.

@@ -1,0 +1,111 @@
+//! A drive on disk, in the layout of KITTI.
+//!
+//! ```text
+//! velodyne/000000.bin ...         points
+//! labels/000000.label ...         SemanticKITTI class of each point
+//! calib.txt times.txt odometry.txt
+//! given_poses.txt poses_in_map.txt    only where the configuration gives poses with errors
+//! poses.txt                       written last
+//! ```
+
+use std::fs::File;
+use std::io::{self, BufWriter};
+use std::path::{Path, PathBuf};
+
+use super::{Simulation, calibration};
+use crate::files::write_atomically;
+use crate::geometry::Pose3;
+use crate::recording::MapFrame;
+use crate::recording::poses::{write_kitti, write_times};
+use crate::recording::velodyne;
+
+/// True poses, written last.
+pub const POSES_FILE: &str = "poses.txt";
+/// Poses with the errors of the configuration; only where it has some.
+pub const GIVEN_POSES_FILE: &str = "given_poses.txt";
+/// True poses in the map that is built with the given poses of drive 1; only where these have errors.
+pub const POSES_IN_MAP_FILE: &str = "poses_in_map.txt";
+
+const CALIBRATION_FILE: &str = "calib.txt";
+const TIMES_FILE: &str = "times.txt";
+
+/// A file of a drive that cannot be written.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot write {}", path.display())]
+pub struct DriveFileError {
+    path: PathBuf,
+    source: io::Error,
+}
+
+/// Paths of the points and of the labels of a scan.
+pub fn scan_files(folder: &Path, frame: usize) -> [PathBuf; 2] {
+    [
+        folder.join(format!("velodyne/{frame:06}.bin")),
+        folder.join(format!("labels/{frame:06}.label")),
+    ]
+}
+
+impl Simulation {
+    /// Paths of all files of the drive in a folder.
+    pub fn files_in(&self, folder: &Path) -> Vec<PathBuf> {
+        let poses = self.tables().into_iter().map(|(name, _)| name);
+        let tables = [CALIBRATION_FILE, TIMES_FILE].into_iter().chain(poses);
+        let scans = (0..self.frames()).flat_map(|frame| scan_files(folder, frame));
+        tables.map(|name| folder.join(name)).chain(scans).collect()
+    }
+
+    /// Writes a scan into the folders `velodyne` and `labels`, which must exist.
+    pub fn write_scan(&self, folder: &Path, frame: usize) -> Result<(), DriveFileError> {
+        let [scan_path, label_path] = scan_files(folder, frame);
+        let labelled = self.scan(frame);
+        write(&label_path, |file| {
+            velodyne::write_labels(file, &labelled.classes)
+        })?;
+        write(&scan_path, |file| {
+            velodyne::write_scan(file, &labelled.scan)
+        })
+    }
+
+    /// Writes calibration, times, odometry and, last, the poses.
+    pub fn write_tables(&self, folder: &Path) -> Result<(), DriveFileError> {
+        // The frame of the poses is the world frame of the street.
+        let frame = MapFrame {
+            calibration: calibration(),
+            world_from_first_cam0: Pose3::identity(),
+        };
+        let world_from_map = frame.world_from_map();
+        let times_s = self.times_s();
+        write(&folder.join(CALIBRATION_FILE), |file| {
+            frame.calibration.write(file)
+        })?;
+        write(&folder.join(TIMES_FILE), |file| write_times(file, &times_s))?;
+        for (name, poses) in self.tables() {
+            let poses = poses(self);
+            write(&folder.join(name), |file| {
+                write_kitti(file, &poses, &world_from_map, &frame.calibration)
+            })?;
+        }
+        Ok(())
+    }
+
+    /// Names and poses of the files of poses, in the order in which they are written.
+    fn tables(&self) -> Vec<(&'static str, fn(&Self) -> Vec<Pose3>)> {
+        let mut tables: Vec<(_, fn(&Self) -> _)> = vec![("odometry.txt", Self::odometry)];
+        if self.config.given_poses.has_errors() {
+            tables.push((GIVEN_POSES_FILE, Self::given_poses));
+            tables.push((POSES_IN_MAP_FILE, Self::poses_in_map));
+        }
+        tables.push((POSES_FILE, Self::poses));
+        tables
+    }
+}
+
+fn write(
+    path: &Path,
+    write: impl FnOnce(&mut BufWriter<&mut File>) -> io::Result<()>,
+) -> Result<(), DriveFileError> {
+    write_atomically(path, write).map_err(|source| DriveFileError {
+        path: path.to_owned(),
+        source,
+    })
+}
