@@ -65,14 +65,14 @@ pub fn write_mcap(
     let results = run.results;
     let poses = Trajectories::of(results)?;
     let mut log = LogWriter::new(writer)?;
-    let times_s = match &results.times_s {
-        Some(times_s) => times_s.clone(),
-        None => results
+    let assumed = || {
+        results
             .frames
             .iter()
             .map(|&frame| frame as f64 / 10.0)
-            .collect(),
+            .collect()
     };
+    let times_s: Vec<f64> = results.times_s.clone().unwrap_or_else(assumed);
     let first_s = times_s.iter().copied().reduce(f64::min).unwrap_or(0.0);
     let shift_s = (-first_s).max(0.0);
     let nanoseconds = |time_s: &f64| ((time_s + shift_s) * 1e9).round() as u64;
@@ -87,11 +87,8 @@ pub fn write_mcap(
         poses.send(&mut log, results, row, stamp)?;
         if !results.particles.is_empty() {
             let height_m = poses.best()[row].translation.z;
-            log.send(
-                "/particles",
-                stamp,
-                &particles(results, row, height_m, stamp),
-            )?;
+            let particles = particles(results, row, height_m, stamp);
+            log.send("/particles", stamp, &particles)?;
         }
         if let Some(frames) = run.frames {
             let motion = Motion::along(poses.best(), &times_s, row);
@@ -133,13 +130,9 @@ struct Trajectories {
 impl Trajectories {
     fn of(results: &LocalizationResults) -> Result<Self> {
         let raised = |in_space: &Option<Vec<Pose3>>, planar: &Option<Vec<Pose2>>| {
-            let lifted = |poses: &Vec<Pose2>| -> Vec<Pose3> {
-                poses
-                    .iter()
-                    .map(|pose| pose3_from_pose2(pose, 0.0))
-                    .collect()
-            };
-            in_space.clone().or(planar.as_ref().map(lifted))
+            let planar = planar.as_ref().map(|poses| poses.iter());
+            let raised = planar.map(|poses| poses.map(|pose| pose3_from_pose2(pose, 0.0)));
+            in_space.clone().or(raised.map(Iterator::collect))
         };
         let estimates = raised(&results.estimates_in_space, &results.estimates);
         Ok(Self {
@@ -162,77 +155,57 @@ impl Trajectories {
         row: usize,
         stamp: u64,
     ) -> Result<()> {
-        let best = &self.best()[row];
-        let Pose {
-            position,
-            orientation,
-        } = pose(best);
-        log.send(
-            "/tf",
-            stamp,
-            &FrameTransform {
-                timestamp: timestamp(stamp),
-                parent_frame_id: MAP.to_owned(),
-                child_frame_id: LIDAR.to_owned(),
-                translation: position,
-                rotation: orientation,
-            },
-        )?;
+        let best = pose(&self.best()[row]);
+        let transform = FrameTransform {
+            timestamp: timestamp(stamp),
+            parent_frame_id: MAP.to_owned(),
+            child_frame_id: LIDAR.to_owned(),
+            translation: best.position,
+            rotation: best.orientation,
+        };
+        log.send("/tf", stamp, &transform)?;
         let state = |row: usize| Some(State::from_number(results.states.as_ref()?[row])?.word());
-        let covariance = |all: &Option<Vec<Matrix3<f64>>>| Some(all.as_ref()?[row]);
-        let odometry = |pose3: &Pose3, covariance: Option<Matrix3<f64>>| Odometry {
+        let metadata = state(row).map(|state| KeyValuePair {
+            key: "state".to_owned(),
+            value: state.to_owned(),
+        });
+        let odometry = |poses: &[Pose3], covariances: &Option<Vec<Matrix3<f64>>>| Odometry {
             timestamp: timestamp(stamp),
             frame_id: MAP.to_owned(),
             body_frame_id: LIDAR.to_owned(),
-            pose: Some(pose(pose3)),
-            pose_covariance: in_space(covariance),
+            pose: Some(pose(&poses[row])),
+            pose_covariance: in_space(covariances.as_ref().map(|all| all[row])),
             velocity_covariance: vec![0.0; 36],
-            metadata: state(row)
-                .map(|state| pair("state", state))
-                .into_iter()
-                .collect(),
+            metadata: metadata.iter().cloned().collect(),
             ..Odometry::default()
         };
-        let estimate = &self.estimates[row];
-        log.send(
-            "/estimate",
-            stamp,
-            &odometry(estimate, covariance(&results.covariances)),
-        )?;
+        let estimate = odometry(&self.estimates, &results.covariances);
+        log.send("/estimate", stamp, &estimate)?;
         if let Some(refined) = &self.refined {
-            let covariance = covariance(&results.refined_covariances);
-            log.send("/refined", stamp, &odometry(&refined[row], covariance))?;
+            let refined = odometry(refined, &results.refined_covariances);
+            log.send("/refined", stamp, &refined)?;
         }
         if let Some(truth) = &self.truth {
-            log.send(
-                "/truth",
-                stamp,
-                &PoseInFrame {
-                    timestamp: timestamp(stamp),
-                    frame_id: MAP.to_owned(),
-                    pose: Some(pose(&truth[row])),
-                },
-            )?;
+            let truth = PoseInFrame {
+                timestamp: timestamp(stamp),
+                frame_id: MAP.to_owned(),
+                pose: Some(pose(&truth[row])),
+            };
+            log.send("/truth", stamp, &truth)?;
         }
         if let Some(now) = state(row)
             && (row == 0 || state(row - 1) != Some(now))
         {
-            log.send(
-                "/state",
-                stamp,
-                &Log {
-                    timestamp: timestamp(stamp),
-                    level: if now == State::Tracking.word() {
-                        log::Level::Info
-                    } else {
-                        log::Level::Warning
-                    }
-                    .into(),
-                    message: format!("frame {}: {now}", results.frames[row]),
-                    name: "fpmcl".to_owned(),
-                    ..Log::default()
-                },
-            )?;
+            let is_tracking = now == State::Tracking.word();
+            let levels = [log::Level::Warning, log::Level::Info];
+            let change = Log {
+                timestamp: timestamp(stamp),
+                level: levels[usize::from(is_tracking)].into(),
+                message: format!("frame {}: {now}", results.frames[row]),
+                name: "fpmcl".to_owned(),
+                ..Log::default()
+            };
+            log.send("/state", stamp, &change)?;
         }
         log.send_json("/numbers", stamp, &self.numbers(results, row, state(row)))
     }
@@ -248,11 +221,7 @@ impl Trajectories {
             planar_errors(&[pose], &[truth]).first().copied()
         };
         let best = pose2_from_pose3(&self.best()[row]);
-        let covariances = results
-            .refined_covariances
-            .as_ref()
-            .or(results.covariances.as_ref());
-        let covariance = covariances.map(|all| all[row]);
+        let covariance = results.best_covariances().map(|all| all[row]);
         let axes = covariance.map(|covariance| Axes::new(&covariance, &best));
         let [error, refined_error] = [Some(&self.estimates), self.refined.as_ref()]
             .map(|poses| poses.and_then(|poses| errors(poses)));
@@ -281,10 +250,7 @@ impl Trajectories {
                 r#type: line_primitive::Type::LineStrip.into(),
                 thickness: 3.0,
                 scale_invariant: true,
-                points: poses
-                    .iter()
-                    .map(|it| point(it.translation.vector))
-                    .collect(),
+                points: poses.iter().map(point).collect(),
                 color: Some(opaque(color)),
                 ..LinePrimitive::default()
             }],
@@ -399,17 +365,12 @@ fn map_scene(mesh: &TriangleMesh, stamp: u64) -> Result<SceneUpdate> {
 }
 
 fn particles(results: &LocalizationResults, row: usize, height_m: f64, stamp: u64) -> PosesInFrame {
-    let poses = results
-        .particles
-        .frame(row)
-        .iter()
-        .map(|&[x, y, heading, _]| {
-            let [x, y, heading] = [x, y, heading].map(f64::from);
-            pose(&pose3_from_pose2(
-                &Pose2::new([x, y].into(), heading),
-                height_m,
-            ))
-        });
+    let poses = results.particles.frame(row).iter();
+    let poses = poses.map(|&[x, y, heading, _]| {
+        let [x, y, heading] = [x, y, heading].map(f64::from);
+        let planar = Pose2::new([x, y].into(), heading);
+        pose(&pose3_from_pose2(&planar, height_m))
+    });
     PosesInFrame {
         timestamp: timestamp(stamp),
         frame_id: MAP.to_owned(),
@@ -425,15 +386,12 @@ fn cloud(scan: &Scan, map_from_lidar: &Pose3, stamp: u64) -> PointCloud {
         data.extend(point.coords.iter().map(|&coordinate| coordinate as f32));
         data.push(scan.intensities.get(k).copied().unwrap_or(0.0));
     }
-    let names = ["x", "y", "z", "intensity"];
-    let fields = names
-        .into_iter()
-        .zip(0..)
-        .map(|(name, k)| PackedElementField {
-            name: name.to_owned(),
-            offset: 4 * k,
-            r#type: packed_element_field::NumericType::Float32.into(),
-        });
+    let names = ["x", "y", "z", "intensity"].into_iter().zip(0..);
+    let fields = names.map(|(name, k)| PackedElementField {
+        name: name.to_owned(),
+        offset: 4 * k,
+        r#type: packed_element_field::NumericType::Float32.into(),
+    });
     PointCloud {
         timestamp: timestamp(stamp),
         frame_id: MAP.to_owned(),
@@ -468,33 +426,23 @@ fn entity(name: &str, stamp: u64) -> SceneEntity {
 
 fn pose(pose: &Pose3) -> Pose {
     let [x, y, z] = pose.translation.vector.into();
-    let [qx, qy, qz, qw] = pose.rotation.coords.into();
+    let position = Some(Vector3 { x, y, z });
+    let [x, y, z, w] = pose.rotation.coords.into();
+    let orientation = Some(Quaternion { x, y, z, w });
     Pose {
-        position: Some(Vector3 { x, y, z }),
-        orientation: Some(Quaternion {
-            x: qx,
-            y: qy,
-            z: qz,
-            w: qw,
-        }),
+        position,
+        orientation,
     }
 }
 
-fn point(vector: nalgebra::Vector3<f64>) -> Point3 {
-    let [x, y, z] = vector.into();
+fn point(pose: &Pose3) -> Point3 {
+    let [x, y, z] = pose.translation.vector.into();
     Point3 { x, y, z }
 }
 
 fn opaque(color: Rgb) -> Color {
     let [r, g, b] = color.map(|channel| f64::from(channel) / 255.0);
     Color { r, g, b, a: 1.0 }
-}
-
-fn pair(key: &str, value: &str) -> KeyValuePair {
-    KeyValuePair {
-        key: key.to_owned(),
-        value: value.to_owned(),
-    }
 }
 
 fn timestamp(nanoseconds: u64) -> Option<Timestamp> {

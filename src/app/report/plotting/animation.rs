@@ -6,7 +6,7 @@ use anyhow::{Context as _, Result, ensure};
 use rayon::prelude::*;
 
 use super::bitmap::Bitmap;
-use crate::files::write_atomically;
+use crate::app::run::output;
 
 /// Largest width [px]; wider pictures are scaled down.
 const WIDTH: u32 = 1200;
@@ -28,7 +28,7 @@ pub fn save_animation(path: &Path, pictures: &[PathBuf]) -> Result<()> {
     let frames = (chosen.par_iter())
         .map(|picture| frame(picture, chosen.len()))
         .collect::<Result<Vec<gif::Frame>>>()?;
-    write_atomically(path, |file| -> Result<()> {
+    output::write_file(path, |file| -> Result<()> {
         let mut encoder = gif::Encoder::new(file, frames[0].width, frames[0].height, &[])?;
         encoder.set_repeat(gif::Repeat::Infinite)?;
         for frame in &frames {
@@ -36,7 +36,6 @@ pub fn save_animation(path: &Path, pictures: &[PathBuf]) -> Result<()> {
         }
         Ok(())
     })
-    .with_context(|| format!("cannot write {}", path.display()))
 }
 
 fn choose(pictures: &[PathBuf], most: usize) -> Vec<&PathBuf> {

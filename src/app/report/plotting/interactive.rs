@@ -6,14 +6,15 @@ use std::path::Path;
 use anyhow::{Context as _, Result};
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
+use nalgebra::Matrix3;
 use serde_json::{Value, json};
 
 use super::color::{Colormap, MCL, REFINED, Rgb, STATES, TRUTH};
 use super::map_image::MapImage;
 use crate::app::report::results::{LocalizationResults, ScanOutline};
-use crate::evaluation::planar_errors;
+use crate::app::run::output;
 use crate::evaluation::trust::Axes;
-use crate::files::write_atomically;
+use crate::evaluation::{PlanarError, planar_errors};
 use crate::geometry::Pose2;
 use crate::localization::State;
 
@@ -32,49 +33,31 @@ impl InteractivePath<'_> {
     pub fn save(&self, path: &Path) -> Result<()> {
         let content = self.content();
         let content = content.with_context(|| format!("cannot draw {}", path.display()))?;
-        write_atomically(path, |file| -> Result<()> {
-            Ok(serde_json::to_writer(file, &content)?)
-        })
-        .with_context(|| format!("cannot write {}", path.display()))
+        output::write_file(path, |file| serde_json::to_writer(file, &content))
     }
 
     fn content(&self) -> Result<Value> {
         let results = self.results;
         let best = results.refined.as_deref().unwrap_or(self.estimates);
-        let covariances = results
-            .refined_covariances
-            .as_ref()
-            .or(results.covariances.as_ref());
-        let sigmas_m = covariances.map(|all| -> Vec<f64> {
-            let axes = all
-                .iter()
-                .zip(best)
-                .map(|(covariance, pose)| Axes::new(covariance, pose));
-            axes.map(|axes| rounded(100.0 * axes.long_m, 100.0))
+        let axes = |all: &[Matrix3<f64>]| -> Vec<f64> {
+            let pairs = all.iter().zip(best);
+            pairs
+                .map(|(covariance, pose)| {
+                    rounded(100.0 * Axes::new(covariance, pose).long_m, 100.0)
+                })
                 .collect()
-        });
-        let errors = results
-            .ground_truth
-            .as_ref()
-            .map(|truth| planar_errors(best, truth));
-        let errors_cm = errors.as_ref().map(|errors| -> Vec<f64> {
-            errors
-                .iter()
-                .map(|it| rounded(100.0 * it.distance_m(), 100.0))
-                .collect()
-        });
-        let heading_errors_deg = errors.as_ref().map(|errors| -> Vec<f64> {
-            errors
-                .iter()
-                .map(|it| rounded(it.turn_rad.abs().to_degrees(), 1e4))
-                .collect()
-        });
-        let states = results.states.as_ref().map(|states| -> Vec<Option<&str>> {
-            states
-                .iter()
-                .map(|&number| Some(State::from_number(number)?.word()))
-                .collect()
-        });
+        };
+        let errors = (results.ground_truth.as_ref()).map(|truth| planar_errors(best, truth));
+        let numbers = |value: fn(&PlanarError) -> f64, per_unit: f64| -> Option<Vec<f64>> {
+            let errors = errors.as_ref()?.iter();
+            Some(
+                errors
+                    .map(|error| rounded(value(error), per_unit))
+                    .collect(),
+            )
+        };
+        let word = |&number: &u8| Some(State::from_number(number)?.word());
+        let states = results.states.as_ref();
         let colors = STATES.map(|(state, color)| (state.word().to_owned(), css(color).into()));
         Ok(json!({
             "map": self.map.map(map_layer).transpose()?,
@@ -85,12 +68,12 @@ impl InteractivePath<'_> {
             "poses": flat(best),
             "truth": results.ground_truth.as_deref().map(flat),
             "truth_color": css(TRUTH),
-            "errors_cm": errors_cm,
-            "heading_errors_deg": heading_errors_deg,
-            "sigmas_cm": sigmas_m,
+            "errors_cm": numbers(|error| 100.0 * error.distance_m(), 100.0),
+            "heading_errors_deg": numbers(|error| error.turn_rad.abs().to_degrees(), 1e4),
+            "sigmas_cm": results.best_covariances().map(axes),
             "agreements": results.agreements,
             "places": results.places,
-            "states": states,
+            "states": states.map(|all| all.iter().map(word).collect::<Vec<_>>()),
             "state_colors": Value::Object(colors.into_iter().collect()),
             "colormap": (0..10).map(|k| css(Colormap::Viridis.at(f64::from(k) / 9.0))).collect::<Vec<_>>(),
             "scans": results.scan_outlines.as_deref().map(encoded),
@@ -110,15 +93,12 @@ fn map_layer(map: &MapImage) -> Result<Value> {
 
 /// x, y [m], heading [rad] of all poses.
 fn flat(poses: &[Pose2]) -> Vec<f64> {
-    let numbers = poses.iter().flat_map(|pose| {
+    let row = |pose: &Pose2| {
         let t = pose.translation;
-        [
-            rounded(t.x, 1e4),
-            rounded(t.y, 1e4),
-            rounded(pose.rotation.angle(), 1e5),
-        ]
-    });
-    numbers.collect()
+        let heading_rad = rounded(pose.rotation.angle(), 1e5);
+        [rounded(t.x, 1e4), rounded(t.y, 1e4), heading_rad]
+    };
+    poses.iter().flat_map(row).collect()
 }
 
 /// Number of points of each outline, and all of them as 16-bit integers, little-endian.

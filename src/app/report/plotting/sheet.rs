@@ -19,7 +19,7 @@ pub use plotters::style::text_anchor::{HPos, VPos};
 
 use super::bitmap::Bitmap;
 use super::color::{INK, Rgb, WHITE};
-use crate::files::write_atomically;
+use crate::app::run::output;
 
 /// Ratio of the size of the bitmap while drawing to its final size.
 const SCALE: u32 = 2;
@@ -80,8 +80,7 @@ pub fn draw(
 /// Writes a picture as PNG; errors of drawing and of writing name the file.
 pub fn save_png(path: &Path, picture: Result<Bitmap>) -> Result<()> {
     let picture = picture.with_context(|| format!("cannot draw {}", path.display()))?;
-    write_atomically(path, |file| picture.write_png(file))
-        .with_context(|| format!("cannot write {}", path.display()))
+    output::write_file(path, |file| picture.write_png(file))
 }
 
 impl Sheet<'_> {

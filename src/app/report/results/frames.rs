@@ -3,13 +3,13 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use anyhow::{Context as _, Result};
+use anyhow::Result;
 use nalgebra::Matrix3;
 
 use super::localization_results::LocalizationResults;
+use crate::app::run::output;
 use crate::evaluation::trust::Axes;
 use crate::evaluation::{PlanarError, distances_m, drift, planar_errors};
-use crate::files::write_atomically;
 use crate::geometry::{Pose2, Pose3};
 
 /// Writes the table; of a trajectory without particles, that of its errors in space. Nothing without estimates.
@@ -21,8 +21,7 @@ pub fn write_frames_csv(path: &Path, results: &LocalizationResults) -> Result<()
         (Some(estimates), _) => FrameTable::new(results, estimates),
         _ => return Ok(()),
     };
-    write_atomically(path, |file| table.write(file))
-        .with_context(|| format!("cannot write {}", path.display()))
+    output::write_file(path, |file| table.write(file))
 }
 
 /// Columns with a title and one cell per frame.

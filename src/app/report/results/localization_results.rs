@@ -195,6 +195,12 @@ impl LocalizationResults {
         (!are_assumed).then_some(times_s)
     }
 
+    /// Covariances of the refined poses, else of the estimates, in x, y [m], heading [rad].
+    pub fn best_covariances(&self) -> Option<&[Matrix3<f64>]> {
+        let refined = self.refined_covariances.as_deref();
+        refined.or(self.covariances.as_deref())
+    }
+
     /// How many of the frames were localized, if not all.
     pub fn shortfall(&self) -> Option<String> {
         let found = self.len();

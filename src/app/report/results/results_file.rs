@@ -4,13 +4,13 @@ use std::io::{self, Seek, Write};
 use std::iter::repeat_n;
 use std::path::Path;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Result, ensure};
 
 use super::columns::{Row, columns};
 use super::localization_results::{LocalizationResults, ParticleLog};
 use super::npz::{Array, NpzReader, NpzWriter, not_valid, write_npy};
+use crate::app::run::output;
 use crate::evaluation::ParticleRow;
-use crate::files::write_atomically;
 use crate::geometry::Pose2;
 
 /// Largest number of particles in empty rows, 4 GiB of zeros.
@@ -42,8 +42,7 @@ impl LocalizationResults {
     /// Row k is frame k, as in range-mcl, if the frames are consecutive and the rows before the first
     /// are not too many; otherwise there is one row per localized frame.
     pub fn write(&self, path: &Path) -> Result<()> {
-        write_atomically(path, |file| self.write_to(file))
-            .with_context(|| format!("cannot write {}", path.display()))
+        output::write_file(path, |file| self.write_to(file))
     }
 
     fn write_to(&self, file: impl Write + Seek) -> io::Result<()> {
@@ -104,8 +103,7 @@ impl LocalizationResults {
 /// Writes poses as a NumPy array (rows, 3) of x, y [m] and heading [rad].
 pub fn write_poses_npy(path: &Path, poses: &[Pose2]) -> Result<()> {
     let numbers = poses.iter().flat_map(Row::to_row);
-    write_atomically(path, |file| write_npy(file, &[poses.len(), 3], numbers))
-        .with_context(|| format!("cannot write {}", path.display()))
+    output::write_file(path, |file| write_npy(file, &[poses.len(), 3], numbers))
 }
 
 /// Writes arrays of one row per frame after `leading` empty rows.

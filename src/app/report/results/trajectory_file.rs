@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use anyhow::{Context as _, Result};
+use anyhow::Result;
 
 use super::npz::NpzWriter;
-use crate::files::write_atomically;
+use crate::app::run::output;
 use crate::geometry::Pose3;
 use crate::odometry::{OdometryEstimate, StepState};
 use crate::recording::Frame;
@@ -36,7 +36,7 @@ pub fn write_trajectory_npz(
         StepState::Predicted => 2,
         StepState::Given => 3,
     };
-    write_atomically(path, |file| {
+    output::write_file(path, |file| {
         let mut npz = NpzWriter::new(file);
         npz.add(
             "frames",
@@ -54,5 +54,4 @@ pub fn write_trajectory_npz(
         npz.add("states", &[count], steps.iter().map(state))?;
         npz.finish()
     })
-    .with_context(|| format!("cannot write {}", path.display()))
 }

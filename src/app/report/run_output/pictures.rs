@@ -16,7 +16,7 @@ use crate::app::report::results::LocalizationResults;
 use crate::evaluation::planar_errors;
 use crate::evaluation::trust::Axes;
 use crate::geometry::{Pose2, TriangleMesh, pose2_from_pose3};
-use crate::localization::{Estimate, State};
+use crate::localization::Estimate;
 use crate::map::Map;
 
 /// Cells along the longer side of the map image in plots.
@@ -36,33 +36,15 @@ pub fn draw_run(
 ) -> Result<()> {
     let mesh = mesh.map(muted);
     let image = (mesh.as_ref()).map(|mesh| MapImage::of_colors(mesh, MAP_CELLS));
-    let trajectories = Trajectories::of(results);
-    draw_path(files, image.as_ref(), results, &trajectories)?;
-    InteractivePath {
-        results,
-        estimates: &trajectories.estimates,
-        map: image.as_ref(),
-    }
-    .save(&files.plot(INTERACTIVE)?)?;
-    draw_errors(files, results, &trajectories)?;
-    draw_states(files, results, &trajectories)?;
-    draw_drift(files, trajectories.estimate_name(), results)?;
-    draw_runtimes(files, results)?;
-    draw_particles(files, image.as_ref(), results)?;
-    let Some(mesh) = &mesh else {
-        return Ok(());
-    };
-    MapPlot {
-        title: "Map from above",
-        mesh,
-        path: Some(match trajectories.truth {
-            Some(truth) => ("true path", truth),
-            None => ("found path", &trajectories.estimates),
-        }),
-        keys: &SURFACES,
-        numbers: None,
-    }
-    .save(&files.plot("map.png")?)
+    let drawing = Drawing::new(files, image.as_ref(), results);
+    drawing.path()?;
+    drawing.interactive_path()?;
+    drawing.errors()?;
+    drawing.states()?;
+    drawing.drift()?;
+    drawing.runtimes()?;
+    drawing.particles()?;
+    mesh.map_or(Ok(()), |mesh| drawing.map_with_path(&mesh))
 }
 
 /// The map around some poses, for pictures: of large maps coarser.
@@ -95,211 +77,210 @@ pub fn time_axis(results: &LocalizationResults) -> (&'static str, Vec<f64>) {
     }
 }
 
-/// The trajectories of a run in the plane.
-struct Trajectories<'a> {
-    /// Whether there is no filter: the estimates come from elsewhere.
-    is_given: bool,
+/// A run with its trajectories in the plane.
+struct Drawing<'a> {
+    files: &'a RunFiles,
+    map: Option<&'a MapImage>,
+    results: &'a LocalizationResults,
+    /// Name of the estimates: those of the filter, or of a trajectory from elsewhere.
+    name: &'static str,
     estimates: Vec<Pose2>,
-    refined: Option<&'a [Pose2]>,
     truth: Option<&'a [Pose2]>,
 }
 
-impl<'a> Trajectories<'a> {
-    fn of(results: &'a LocalizationResults) -> Self {
+impl<'a> Drawing<'a> {
+    fn new(
+        files: &'a RunFiles,
+        map: Option<&'a MapImage>,
+        results: &'a LocalizationResults,
+    ) -> Self {
+        let is_given = results.particles.is_empty();
+        let in_space = results.estimates_in_space.iter().flatten();
+        let estimates = results.estimates.clone();
         Self {
-            is_given: results.particles.is_empty(),
-            estimates: match (&results.estimates, &results.estimates_in_space) {
-                (Some(estimates), _) => estimates.clone(),
-                (None, Some(estimates)) => estimates.iter().map(pose2_from_pose3).collect(),
-                (None, None) => Vec::new(),
-            },
-            refined: results.refined.as_deref(),
+            files,
+            map,
+            results,
+            name: if is_given { "estimate" } else { "MCL" },
+            estimates: estimates.unwrap_or_else(|| in_space.map(pose2_from_pose3).collect()),
             truth: results.ground_truth.as_deref(),
         }
     }
 
-    fn estimate_name(&self) -> &'static str {
-        if self.is_given { "estimate" } else { "MCL" }
-    }
-
     /// Name, color and poses of what was found, the best last.
     fn found(&self) -> Vec<(&'static str, Rgb, &[Pose2])> {
-        let refined = self.refined.map(|poses| ("refined", REFINED, poses));
-        std::iter::once((self.estimate_name(), MCL, self.estimates.as_slice()))
+        let refined = self.results.refined.as_deref();
+        let refined = refined.map(|poses| ("refined", REFINED, poses));
+        std::iter::once((self.name, MCL, self.estimates.as_slice()))
             .chain(refined)
             .collect()
     }
-}
 
-/// Draws the best trajectory colored by its error, or without a truth by its standard deviation.
-fn draw_path(
-    files: &RunFiles,
-    map: Option<&MapImage>,
-    results: &LocalizationResults,
-    trajectories: &Trajectories,
-) -> Result<()> {
-    let paths = trajectories.found();
-    let numbers = paths
-        .last()
-        .and_then(|&(name, _, poses)| match trajectories.truth {
-            Some(truth) => {
-                let errors = planar_errors(poses, truth);
-                let errors_cm = errors.iter().map(|error| 100.0 * error.distance_m());
-                Some((format!("position error, {name} [cm]"), errors_cm.collect()))
+    /// Saves a chart in `plots/`, if it shows anything.
+    fn save(&self, chart: &LineChart, name: &str) -> Result<()> {
+        if chart.panels.is_empty() {
+            return Ok(());
+        }
+        chart.save(&self.files.plot(name)?)
+    }
+
+    /// Draws the best trajectory colored by its error, or without a truth by its standard deviation.
+    fn path(&self) -> Result<()> {
+        let paths = self.found();
+        let numbers = paths.last().and_then(|&(name, _, poses)| {
+            if let Some(truth) = self.truth {
+                let errors = planar_errors(poses, truth).into_iter();
+                let errors_cm = errors.map(|error| 100.0 * error.distance_m());
+                return Some((format!("position error, {name} [cm]"), errors_cm.collect()));
             }
-            None => {
-                let sigmas_cm = position_sigmas_cm(results)?;
-                Some((
-                    format!("standard deviation of the position, {name} [cm]"),
-                    sigmas_cm,
-                ))
+            let covariances = self.results.best_covariances()?.iter();
+            let sigmas_cm = covariances.map(|it| 100.0 * (it.m11 + it.m22).sqrt());
+            let name = format!("standard deviation of the position, {name} [cm]");
+            Some((name, sigmas_cm.collect()))
+        });
+        PathPlot {
+            title: match self.truth {
+                Some(_) => "Path against ground truth",
+                None => "Path",
+            },
+            ground_truth: self.truth,
+            paths: &paths,
+            numbers: (numbers.as_ref())
+                .map(|(name, numbers): &(String, Vec<f64>)| (name.as_str(), numbers.as_slice())),
+            map: self.map,
+        }
+        .save(&self.files.plot("path.png")?)
+    }
+
+    fn interactive_path(&self) -> Result<()> {
+        InteractivePath {
+            results: self.results,
+            estimates: &self.estimates,
+            map: self.map,
+        }
+        .save(&self.files.plot(INTERACTIVE)?)
+    }
+
+    fn errors(&self) -> Result<()> {
+        let Some(truth) = self.truth.filter(|_| !self.results.particles.is_empty()) else {
+            return Ok(());
+        };
+        let (x_name, x) = time_axis(self.results);
+        let errors = self.found().into_iter().map(|(name, color, poses)| {
+            let errors = x.iter().copied().zip(planar_errors(poses, truth));
+            (name, color, errors.collect())
+        });
+        let errors: Vec<_> = errors.collect();
+        self.save(
+            &error_chart("Errors over time", x_name, &errors),
+            "errors.png",
+        )
+    }
+
+    /// Draws how sure the run was of each frame: the standard deviation, and the agreement by state.
+    fn states(&self) -> Result<()> {
+        let (Some(states), Some(covariances)) = (&self.results.states, &self.results.covariances)
+        else {
+            return Ok(());
+        };
+        let (x_name, x) = time_axis(self.results);
+        let axes = covariances.iter().zip(&self.estimates);
+        let sigmas_cm = axes.map(|(covariance, pose)| 100.0 * Axes::new(covariance, pose).long_m);
+        let sigma = Series::line(
+            "of the position, MCL",
+            MCL,
+            x.iter().copied().zip(sigmas_cm),
+        );
+        let agreements = self.results.agreements.as_deref().unwrap_or_default();
+        let by_state = STATES.into_iter().map(|(state, color)| {
+            let rows = (0..agreements.len())
+                .filter(|&row| states[row] == state as u8 && agreements[row] >= 0.0);
+            let points = rows.map(|row| (x[row], 100.0 * agreements[row]));
+            Series {
+                mark: Mark::Dots,
+                ..Series::line(state.word(), color, points)
             }
         });
-    PathPlot {
-        title: match trajectories.truth {
-            Some(_) => "Path against ground truth",
-            None => "Path",
-        },
-        ground_truth: trajectories.truth,
-        paths: &paths,
-        numbers: (numbers.as_ref())
-            .map(|(name, numbers): &(String, Vec<f64>)| (name.as_str(), numbers.as_slice())),
-        map,
-    }
-    .save(&files.plot("path.png")?)
-}
-
-/// Standard deviation of each position of the best trajectory [cm]; `None` if it is not known.
-fn position_sigmas_cm(results: &LocalizationResults) -> Option<Vec<f64>> {
-    let covariances = match results.refined {
-        Some(_) => results.refined_covariances.as_ref(),
-        None => results.covariances.as_ref(),
-    };
-    let sigma_cm =
-        |covariance: &nalgebra::Matrix3<f64>| 100.0 * (covariance.m11 + covariance.m22).sqrt();
-    Some(covariances?.iter().map(sigma_cm).collect())
-}
-
-fn draw_errors(
-    files: &RunFiles,
-    results: &LocalizationResults,
-    trajectories: &Trajectories,
-) -> Result<()> {
-    let Some(truth) = trajectories.truth.filter(|_| !trajectories.is_given) else {
-        return Ok(());
-    };
-    let (x_name, x) = time_axis(results);
-    let found = trajectories.found();
-    let errors = found.into_iter().map(|(name, color, poses)| {
-        let errors = x.iter().copied().zip(planar_errors(poses, truth));
-        (name, color, errors.collect())
-    });
-    let chart = error_chart("Errors over time", x_name, &errors.collect::<Vec<_>>());
-    chart.save(&files.plot("errors.png")?)
-}
-
-/// Draws how sure the run was of each frame: the standard deviation, and the agreement by state.
-fn draw_states(
-    files: &RunFiles,
-    results: &LocalizationResults,
-    trajectories: &Trajectories,
-) -> Result<()> {
-    let (Some(states), Some(covariances)) = (&results.states, &results.covariances) else {
-        return Ok(());
-    };
-    let (x_name, x) = time_axis(results);
-    let axes = covariances.iter().zip(&trajectories.estimates);
-    let sigmas_cm = axes.map(|(covariance, pose)| 100.0 * Axes::new(covariance, pose).long_m);
-    let agreements = results.agreements.as_deref().unwrap_or_default();
-    let in_state = |(state, color): (State, Rgb)| Series {
-        mark: Mark::Dots,
-        ..Series::line(
-            state.word(),
-            color,
-            (0..agreements.len())
-                .filter(|&row| states[row] == state as u8 && agreements[row] >= 0.0)
-                .map(|row| (x[row], 100.0 * agreements[row])),
+        let panels = [
+            Panel::new("standard deviation [cm]", [sigma]),
+            Panel::new(
+                "beams on the map [%]",
+                by_state.filter(|it| !it.points.is_empty()),
+            ),
+        ];
+        self.save(
+            &LineChart::new("States over time", x_name, panels),
+            "states.png",
         )
-    };
-    let by_state = STATES.into_iter().map(in_state);
-    let sigmas_cm = x.iter().copied().zip(sigmas_cm);
-    let sigma = Series::line("of the position, MCL", MCL, sigmas_cm);
-    let by_state = by_state.filter(|it| !it.points.is_empty());
-    let panels = [
-        Panel::new("standard deviation [cm]", [sigma]),
-        Panel::new("beams on the map [%]", by_state),
-    ];
-    let chart = LineChart::new("States over time", x_name, panels);
-    chart.save(&files.plot("states.png")?)
-}
-
-/// Draws the errors in space against the distance driven.
-fn draw_drift(files: &RunFiles, name: &str, results: &LocalizationResults) -> Result<()> {
-    let Some(truth) = results.ground_truth_in_space.as_deref() else {
-        return Ok(());
-    };
-    let trajectories: Vec<_> = [
-        (name, MCL, &results.estimates_in_space),
-        ("refined", REFINED, &results.refined_in_space),
-    ]
-    .into_iter()
-    .filter_map(|(name, color, poses)| Some((name, color, poses.as_deref()?)))
-    .collect();
-    if trajectories.is_empty() {
-        return Ok(());
     }
-    drift_chart(truth, &trajectories).save(&files.plot("drift.png")?)
-}
 
-fn draw_runtimes(files: &RunFiles, results: &LocalizationResults) -> Result<()> {
-    let stages = [
-        ("localize", MCL, &results.runtimes_s),
-        ("refine", REFINED, &results.refine_runtimes_s),
-    ];
-    let series = stages.into_iter().filter_map(|(stage, color, times_s)| {
-        let points = results.frames.iter().zip(times_s.as_ref()?);
-        let points = points.map(|(&frame, time_s)| (frame as f64, 1e3 * time_s));
-        Some(Series::line(stage, color, points))
-    });
-    let series: Vec<Series> = series.collect();
-    if series.is_empty() {
-        return Ok(());
+    /// Draws the errors in space against the distance driven.
+    fn drift(&self) -> Result<()> {
+        let truth = self.results.ground_truth_in_space.as_deref();
+        let trajectories = [
+            (self.name, MCL, self.results.estimates_in_space.as_deref()),
+            ("refined", REFINED, self.results.refined_in_space.as_deref()),
+        ];
+        let chart = drift_chart(truth.unwrap_or_default(), &trajectories);
+        self.save(&chart, "drift.png")
     }
-    let panel = Panel::new("time per frame [ms]", series);
-    let chart = LineChart::new("Runtime per frame", FRAME, [panel]);
-    chart.save(&files.plot("runtime.png")?)
-}
 
-/// Draws the particles at several moments, from the first on.
-fn draw_particles(
-    files: &RunFiles,
-    map: Option<&MapImage>,
-    results: &LocalizationResults,
-) -> Result<()> {
-    let pose = |poses: &Option<Vec<Pose2>>, row: usize| poses.as_ref()?.get(row).copied();
-    let moments = moments(results);
-    let titles = (moments.iter()).map(|&row| format!("Frame {}", results.frames[row]));
-    let titles: Vec<String> = titles.collect();
-    let frames = moments
-        .iter()
-        .zip(&titles)
-        .map(|(&row, title)| LocalizationPicture {
+    fn runtimes(&self) -> Result<()> {
+        let stages = [
+            ("localize", MCL, &self.results.runtimes_s),
+            ("refine", REFINED, &self.results.refine_runtimes_s),
+        ];
+        let series = stages.into_iter().filter_map(|(stage, color, times_s)| {
+            let points = self.results.frames.iter().zip(times_s.as_ref()?);
+            let points = points.map(|(&frame, time_s)| (frame as f64, 1e3 * time_s));
+            Some(Series::line(stage, color, points))
+        });
+        let panel = Panel::new("time per frame [ms]", series);
+        self.save(
+            &LineChart::new("Runtime per frame", FRAME, [panel]),
+            "runtime.png",
+        )
+    }
+
+    /// Draws the particles at several moments, from the first on.
+    fn particles(&self) -> Result<()> {
+        let pose = |poses: &Option<Vec<Pose2>>, row: usize| poses.as_ref()?.get(row).copied();
+        let moments = moments(self.results);
+        let title = |&row: &usize| format!("Frame {}", self.results.frames[row]);
+        let titles: Vec<String> = moments.iter().map(title).collect();
+        let frames = moments.iter().zip(&titles);
+        let frames = frames.map(|(&row, title)| LocalizationPicture {
             title,
-            map,
-            particles: results.particles.frame(row),
-            estimate: pose(&results.estimates, row),
-            ground_truth: pose(&results.ground_truth, row),
+            map: self.map,
+            particles: self.results.particles.frame(row),
+            estimate: pose(&self.results.estimates, row),
+            ground_truth: pose(&self.results.ground_truth, row),
             ..LocalizationPicture::default()
         });
-    let frames: Vec<LocalizationPicture> = frames.collect();
-    if frames.is_empty() {
-        return Ok(());
+        let frames: Vec<LocalizationPicture> = frames.collect();
+        if frames.is_empty() {
+            return Ok(());
+        }
+        ParticlePanels {
+            title: "Particles",
+            frames: &frames,
+        }
+        .save(&self.files.plot("particles.png")?)
     }
-    ParticlePanels {
-        title: "Particles",
-        frames: &frames,
+
+    fn map_with_path(&self, mesh: &TriangleMesh) -> Result<()> {
+        MapPlot {
+            title: "Map from above",
+            mesh,
+            path: Some(match self.truth {
+                Some(truth) => ("true path", truth),
+                None => ("found path", &self.estimates),
+            }),
+            keys: &SURFACES,
+            numbers: None,
+        }
+        .save(&self.files.plot("map.png")?)
     }
-    .save(&files.plot("particles.png")?)
 }
 
 /// Rows of the first frame, of the last, and of two between them at even ratios: a search is over early.
@@ -347,9 +328,8 @@ impl Movie {
             truth => truth,
         };
         let t = estimate.pose.translation;
-        let path = self
-            .files
-            .in_subfolder("loc_plots", &format!("{number:06}.png"))?;
+        let name = format!("{number:06}.png");
+        let path = self.files.in_subfolder("loc_plots", &name)?;
         LocalizationPicture {
             title: &format!("Frame {number}: {}", estimate.state.word()),
             map: Some(&self.map),
