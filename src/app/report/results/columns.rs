@@ -1,35 +1,10 @@
-//! Columns of [`LocalizationResults`](super::LocalizationResults): their names, and the rows of their arrays.
+//! Items of the columns of a result, as rows of numbers.
 
 use nalgebra::{Matrix3, Quaternion, Translation3, UnitQuaternion, Vector2};
 use npyz::AutoSerialize;
 
 use super::localization_results::ScanOutline;
 use crate::geometry::{Pose2, Pose3};
-
-/// Applies a macro to the names of all columns that may be missing, in the order of the file.
-macro_rules! columns {
-    ($apply:ident) => {
-        $apply!(
-            estimates,
-            refined,
-            ground_truth,
-            estimates_in_space,
-            refined_in_space,
-            ground_truth_in_space,
-            odometry,
-            covariances,
-            refined_covariances,
-            times_s,
-            runtimes_s,
-            refine_runtimes_s,
-            agreements,
-            places,
-            states,
-            scan_outlines
-        )
-    };
-}
-pub(super) use columns;
 
 /// An item of a column, as a row of `N` numbers.
 pub trait Row<const N: usize>: Sized {

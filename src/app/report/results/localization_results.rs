@@ -28,7 +28,6 @@ use anyhow::{Context as _, Result, ensure};
 use glam::Vec3;
 use nalgebra::Matrix3;
 
-use super::columns::columns;
 use crate::evaluation::{ParticleRow, RangeMclRules};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
@@ -174,6 +173,31 @@ pub struct LocalizationResults {
     /// Number of frames to localize; a file has it only if the run ended before the last of them.
     pub selected: Option<usize>,
 }
+
+/// Applies a macro to the names of all columns that may be missing, in the order of the file.
+macro_rules! columns {
+    ($apply:ident) => {
+        $apply!(
+            estimates,
+            refined,
+            ground_truth,
+            estimates_in_space,
+            refined_in_space,
+            ground_truth_in_space,
+            odometry,
+            covariances,
+            refined_covariances,
+            times_s,
+            runtimes_s,
+            refine_runtimes_s,
+            agreements,
+            places,
+            states,
+            scan_outlines
+        )
+    };
+}
+pub(super) use columns;
 
 impl LocalizationResults {
     /// Number of frames.

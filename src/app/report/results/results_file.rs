@@ -6,8 +6,8 @@ use std::path::Path;
 
 use anyhow::{Result, ensure};
 
-use super::columns::{Row, columns};
-use super::localization_results::{LocalizationResults, ParticleLog};
+use super::columns::Row;
+use super::localization_results::{LocalizationResults, ParticleLog, columns};
 use super::npz::{Array, NpzReader, NpzWriter, not_valid, write_npy};
 use crate::app::run::output;
 use crate::evaluation::ParticleRow;
