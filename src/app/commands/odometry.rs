@@ -1,6 +1,6 @@
 //! `odometry`: poses of a recording from its scans, with loops closed and all poses adjusted.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::Args;
@@ -8,20 +8,15 @@ use serde::Serialize;
 
 use super::stages::SensorKeys;
 use super::trajectory;
-use crate::app::report::plotting::PathPlot;
-use crate::app::report::plotting::color::{ODOMETRY, REFINED};
-use crate::app::report::results::write_trajectory_npz;
-use crate::app::report::run_output::{self, RunFiles};
+use crate::app::report::odometry::{self, OdometryReport};
+use crate::app::report::run_output::RunFiles;
 use crate::app::run::arguments::RunArgs;
 use crate::app::run::artefact::{Claims, Outputs};
 use crate::app::run::output::Printed;
 use crate::app::run::{Context, output};
 use crate::app::settings::OdometryCommandConfig;
-use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
-use crate::mapping::{TrajectorySummary, find_poses};
-use crate::odometry::{Loop, OdometryEstimate, StepState, Trajectory};
-use crate::recording::poses::write_tum;
-use crate::recording::{Frame, Recording};
+use crate::mapping::find_poses;
+use crate::recording::Recording;
 use crate::sensor::{RangeImageConfig, Sensor};
 
 /// Arguments of `odometry`.
@@ -48,32 +43,6 @@ pub struct OdometryArgs {
     pub calib: Option<PathBuf>,
 }
 
-/// Report of a run.
-#[derive(Debug, Serialize)]
-struct OdometryReport {
-    #[serde(flatten)]
-    summary: TrajectorySummary,
-    /// The sensor.
-    sensor: Sensor,
-    /// Loops that were found.
-    found_loops: Vec<LoopReport>,
-}
-
-/// A loop in the report.
-#[derive(Debug, Serialize)]
-struct LoopReport {
-    /// Frame of the earlier visit.
-    first: usize,
-    /// Frame of the later visit.
-    second: usize,
-    /// Distance between the visits [m].
-    distance_m: f64,
-    /// Share of the surfaces in common, without the ground.
-    common_share: f64,
-    /// What became of it.
-    verdict: String,
-}
-
 /// Finds the poses of the recording that a configuration names; returns what to print.
 pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed> {
     config.recording_inputs().require()?;
@@ -94,30 +63,21 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
     let main = folder.join("report.json");
     output::create_folder(folder)?;
     claims.begin(&main)?;
-    write(
+    odometry::write(
         &RunFiles::in_folder(&main, folder),
         &recording,
         &rows,
         &found,
     )?;
     if config.visualize {
-        draw(&folder.join("path.png"), &found, is_given)?;
+        odometry::draw(&folder.join("path.png"), &found, is_given)?;
     }
-    let summary = TrajectorySummary::new(&found, recording.has_times);
-    let report = OdometryReport {
-        found_loops: found
-            .loops
-            .iter()
-            .map(|it| LoopReport::of(it, &frames))
-            .collect(),
-        summary,
-        sensor,
-    };
+    let report = OdometryReport::new(&found, &frames, recording.has_times, sensor);
     output::write_yaml(&folder.join("effective_odometry.yml"), &resolved)?;
     output::write_json(&main, &report)?;
     claims.finish(&main)?;
-    trajectory::warn(&report.summary);
-    Printed::rows(&trajectory::rows(&report.summary)).with_json(&report)
+    odometry::warn(&report.summary);
+    Printed::rows(&odometry::rows(&report.summary)).with_json(&report)
 }
 
 fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> {
@@ -160,87 +120,4 @@ fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Sensor)> {
         motion_compensation: &mut config.motion_compensation,
     };
     keys.resolve(recording)
-}
-
-/// Writes the poses of the selected frames.
-fn write(
-    files: &RunFiles,
-    recording: &Recording,
-    rows: &[usize],
-    found: &Trajectory,
-) -> Result<()> {
-    let frames = &recording.frames;
-    let poses: Vec<Pose3> = rows.iter().map(|&row| found.poses[row]).collect();
-    let steps: Vec<&OdometryEstimate> = rows.iter().map(|&row| &found.odometry[row]).collect();
-    let odometry: Vec<Pose3> = steps.iter().map(|step| step.odom_from_lidar).collect();
-    run_output::write_trajectory(files, "poses", recording, &poses)?;
-    output::write_file(&files.file("odometry_tum.txt"), |file| {
-        write_tum(file, &trajectory::stamped(frames, &odometry))
-    })?;
-    write_trajectory_npz(&files.file("trajectory.npz"), frames, &poses, &steps)?;
-    output::write_text(&files.file("frames.csv"), &csv(frames, &poses, &steps))
-}
-
-/// One row per frame.
-fn csv(frames: &[Frame], poses: &[Pose3], steps: &[&OdometryEstimate]) -> String {
-    let mut text = "frame,time_s,x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad,state,matched_share,residual_m,degenerate_directions,time_ms\n".to_owned();
-    for ((frame, pose), step) in frames.iter().zip(poses).zip(steps) {
-        let (t, angles) = (pose.translation.vector, pose.rotation.euler_angles());
-        let residual = step.residual_m.map_or(String::new(), |m| format!("{m:.5}"));
-        text += &format!(
-            "{},{:.6},{:.6},{:.6},{:.6},{:.8},{:.8},{:.8},{},{:.4},{residual},{},{:.3}\n",
-            frame.number,
-            frame.time_s,
-            t.x,
-            t.y,
-            t.z,
-            angles.0,
-            angles.1,
-            angles.2,
-            in_words(step.state),
-            step.matched_share,
-            step.degenerate_directions.len(),
-            1e3 * step.elapsed.as_secs_f64()
-        );
-    }
-    text
-}
-
-fn in_words(state: StepState) -> &'static str {
-    match state {
-        StepState::First => "first",
-        StepState::Registered => "registered",
-        StepState::Predicted => "predicted",
-        StepState::Given => "given",
-    }
-}
-
-/// Draws the path before and after loops and adjustment.
-fn draw(path: &Path, found: &Trajectory, is_given: bool) -> Result<()> {
-    let planar = |poses: &mut dyn Iterator<Item = Pose3>| -> Vec<Pose2> {
-        poses.map(|pose| pose2_from_pose3(&pose)).collect()
-    };
-    let before = planar(&mut found.odometry.iter().map(|step| step.odom_from_lidar));
-    let after = planar(&mut found.poses.iter().copied());
-    let name = if is_given { "given" } else { "odometry" };
-    PathPlot {
-        title: "Path",
-        ground_truth: None,
-        paths: &[(name, ODOMETRY, &before), ("adjusted", REFINED, &after)],
-        numbers: None,
-        map: None,
-    }
-    .save(path)
-}
-
-impl LoopReport {
-    fn of(found: &Loop, frames: &[Frame]) -> Self {
-        Self {
-            first: frames[found.first].number,
-            second: frames[found.second].number,
-            distance_m: found.first_from_second.translation.vector.norm(),
-            common_share: found.common_share,
-            verdict: format!("{:?}", found.verdict).to_lowercase(),
-        }
-    }
 }

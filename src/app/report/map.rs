@@ -1,16 +1,16 @@
 //! Report of a map build.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Result;
 use serde::Serialize;
 
-use super::onto::ChangesReport;
-use crate::app::commands::trajectory;
+use super::odometry;
 use crate::app::run::output::Printed;
 use crate::evaluation::{MapQuality, TruthAgreement};
+use crate::map::mesh_view::MeshView;
 use crate::map::{LocalMapCounts, MappingPath};
 use crate::mapping::TrajectorySummary;
 use crate::sensor::Sensor;
@@ -104,7 +104,7 @@ impl BuildReport {
         rows.extend(self.changes.iter().flat_map(ChangesReport::rows));
         rows.extend(self.quality_rows());
         if let Some(summary) = &self.trajectory {
-            let found = trajectory::rows(summary).into_iter();
+            let found = odometry::rows(summary).into_iter();
             rows.extend(found.filter(|(name, _)| !matches!(*name, "scans" | "path")));
         }
         let [thousands, megabytes] = [self.triangles_per_100m / 1e3, self.mb_per_100m];
@@ -147,5 +147,47 @@ impl BuildReport {
             ]);
         }
         rows
+    }
+}
+
+/// What a drive changed in an older map.
+#[derive(Clone, Debug, Serialize)]
+pub struct ChangesReport {
+    /// The older map.
+    pub onto: PathBuf,
+    /// Triangles of the older map that are gone.
+    pub gone_triangles: usize,
+    /// Their area [m²].
+    pub gone_m2: f64,
+    /// Triangles that were added.
+    pub added_triangles: usize,
+    /// Their area [m²].
+    pub added_m2: f64,
+}
+
+impl ChangesReport {
+    /// The triangles that are gone from a map, and meshes that were added.
+    pub fn new(onto: &Path, older: &dyn MeshView, gone: &[u32], added: &[&dyn MeshView]) -> Self {
+        let of_mesh = |mesh: &dyn MeshView| -> f64 {
+            let triangles = 0..mesh.triangles();
+            triangles.map(|triangle| mesh.area_m2(triangle)).sum()
+        };
+        let gone_m2 = gone.iter().map(|&it| older.area_m2(it as usize));
+        Self {
+            onto: onto.to_owned(),
+            gone_triangles: gone.len(),
+            gone_m2: gone_m2.sum(),
+            added_triangles: added.iter().map(|mesh| mesh.triangles()).sum(),
+            added_m2: added.iter().map(|mesh| of_mesh(*mesh)).sum(),
+        }
+    }
+
+    /// Rows of the table on standard output.
+    pub fn rows(&self) -> Vec<(&'static str, String)> {
+        let area = |m2: f64, triangles: usize| format!("{m2:.0} m², {triangles} triangles");
+        vec![
+            ("gone", area(self.gone_m2, self.gone_triangles)),
+            ("added", area(self.added_m2, self.added_triangles)),
+        ]
     }
 }

@@ -1,8 +1,14 @@
-//! What a run leaves behind: results, tables, pages, pictures and exports.
+//! What a command leaves behind: reports, results, tables, pages, pictures and exports.
 
-pub mod export;
-pub mod pages;
-pub mod plotting;
+// Of a run: localization, refinement, evaluation.
 pub mod results;
 pub mod run_output;
 pub mod run_page;
+// Of the other commands.
+pub mod ground;
+pub mod map;
+pub mod odometry;
+// Forms.
+pub mod export;
+pub mod pages;
+pub mod plotting;

@@ -17,10 +17,10 @@ use crate::evaluation::{
     TrajectoryMetrics,
 };
 use crate::files::folder_of;
-use crate::geometry::{Pose2, Pose3};
+use crate::geometry::{Pose2, Pose3, StampedPose};
 use crate::localization::ParticleSet;
-use crate::recording::Recording;
 use crate::recording::poses::{write_kitti, write_tum};
+use crate::recording::{Frame, Recording};
 
 pub use pictures::{MOST_TRIANGLES, Movie, draw_run, map_around, time_axis};
 
@@ -120,6 +120,13 @@ pub fn particle_rows(particles: &ParticleSet) -> Vec<ParticleRow> {
         .collect()
 }
 
+/// Poses with the numbers and times of frames.
+pub fn stamped(frames: &[Frame], poses: &[Pose3]) -> Vec<StampedPose> {
+    (frames.iter().zip(poses))
+        .map(|(frame, &pose)| frame.stamped(pose))
+        .collect()
+}
+
 /// Writes `<name>_tum.txt` (map frame, seconds) and `<name>_kitti.txt` (the convention of the
 /// recording's poses; without any, lidar poses in the map frame); the poses are those of the first frames.
 pub fn write_trajectory(
@@ -128,8 +135,7 @@ pub fn write_trajectory(
     recording: &Recording,
     map_from_lidar: &[Pose3],
 ) -> Result<()> {
-    let frames = recording.frames.iter().zip(map_from_lidar);
-    let trajectory: Vec<_> = frames.map(|(frame, &pose)| frame.stamped(pose)).collect();
+    let trajectory = stamped(&recording.frames, map_from_lidar);
     let (world_from_map, calibration) = recording.world();
     output::write_file(&files.file(&format!("{name}_tum.txt")), |file| {
         write_tum(file, &trajectory)

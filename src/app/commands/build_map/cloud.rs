@@ -9,7 +9,7 @@ use anyhow::{Result, ensure};
 use super::clock::StageClock;
 use super::files::{prepare, write_map};
 use super::pictures;
-use super::report::BuildReport;
+use crate::app::report::map::BuildReport;
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::{Context, input, output};
 use crate::app::settings::BuildMapConfig;

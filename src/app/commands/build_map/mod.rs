@@ -14,7 +14,6 @@ mod pose_check;
 mod poses;
 mod prepared;
 mod quality;
-mod report;
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -24,10 +23,9 @@ use anyhow::{Result, ensure};
 pub use self::arguments::{BuildMapArgs, BuildPart};
 use self::clock::StageClock;
 use self::files::write_map;
-use self::onto::ChangesReport;
 use self::opened::open;
 use self::parts::{Joined, Role};
-pub use self::report::BuildReport;
+use crate::app::report::map::{BuildReport, ChangesReport};
 use crate::app::run::output::Printed;
 use crate::app::run::{Context, output};
 use crate::app::settings::BuildMapConfig;
@@ -107,7 +105,7 @@ fn run_with_scans(config: &BuildMapConfig, role: Role, context: &Context) -> Res
         held_out_frames: opened.held_out.len(),
         sensor: Some(opened.sensor),
         trajectory: opened.trajectory,
-        changes: older.map(|older| ChangesReport::of(older, &gone, &added)),
+        changes: older.map(|it| ChangesReport::new(&it.file, &*it.mesh, &gone, &added)),
         stage_seconds: clock.seconds(),
         quality: residuals.quality(),
         truth,

@@ -4,7 +4,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Result;
-use serde::Serialize;
 
 use crate::app::commands::stages::MapInputs;
 use crate::app::report::plotting::MapPlot;
@@ -52,48 +51,6 @@ impl OlderMap {
             path: map.path.clone(),
         };
         Ok(Some((older, map)))
-    }
-}
-
-/// What a drive changed in an older map.
-#[derive(Clone, Debug, Serialize)]
-pub struct ChangesReport {
-    /// The older map.
-    pub onto: PathBuf,
-    /// Triangles of the older map that are gone.
-    pub gone_triangles: usize,
-    /// Their area [m²].
-    pub gone_m2: f64,
-    /// Triangles that were added.
-    pub added_triangles: usize,
-    /// Their area [m²].
-    pub added_m2: f64,
-}
-
-impl ChangesReport {
-    /// Of triangles that are gone, and meshes that were added.
-    pub fn of(older: &OlderMap, gone: &[u32], added: &[&dyn MeshView]) -> Self {
-        let of_mesh = |mesh: &dyn MeshView| -> f64 {
-            let triangles = 0..mesh.triangles();
-            triangles.map(|triangle| mesh.area_m2(triangle)).sum()
-        };
-        let gone_m2 = gone.iter().map(|&it| older.mesh.area_m2(it as usize));
-        Self {
-            onto: older.file.clone(),
-            gone_triangles: gone.len(),
-            gone_m2: gone_m2.sum(),
-            added_triangles: added.iter().map(|mesh| mesh.triangles()).sum(),
-            added_m2: added.iter().map(|mesh| of_mesh(*mesh)).sum(),
-        }
-    }
-
-    /// Rows of the table on standard output.
-    pub fn rows(&self) -> Vec<(&'static str, String)> {
-        let area = |m2: f64, triangles: usize| format!("{m2:.0} m², {triangles} triangles");
-        vec![
-            ("gone", area(self.gone_m2, self.gone_triangles)),
-            ("added", area(self.added_m2, self.added_triangles)),
-        ]
     }
 }
 

@@ -9,6 +9,8 @@ use anyhow::{Result, ensure};
 use super::onto::OlderMap;
 use super::parts::{Role, not_listed};
 use crate::app::commands::trajectory;
+use crate::app::report::odometry;
+use crate::app::report::run_output::stamped;
 use crate::app::run::artefact::hash::hash_of_texts;
 use crate::app::run::{Context, output, version};
 use crate::app::settings::BuildMapConfig;
@@ -98,7 +100,7 @@ pub fn find(
             None => find_poses(&frames, is_given, &settings, on_event),
         })?;
         let found_now = TrajectorySummary::new(&found, recording.has_times);
-        trajectory::warn(&found_now);
+        odometry::warn(&found_now);
         let kept = serde_json::to_string(&found_now.without_times())?;
         summary = Some(found_now);
         // Rows of the lidar in the world of the given poses, or of the older map.
@@ -108,7 +110,7 @@ pub fn find(
             .iter()
             .map(|pose| world_from_map * pose)
             .collect();
-        let stamped = trajectory::stamped(&frames, &poses);
+        let stamped = stamped(&frames, &poses);
         output::write_file(&path, |file| {
             writeln!(file, "{heading}{SUMMARY}{kept}")?;
             write_tum(file, &stamped)

@@ -14,7 +14,6 @@
 mod arguments;
 mod input;
 mod pictures;
-mod report;
 mod simulated;
 
 use std::fmt::Write as _;
@@ -24,7 +23,7 @@ use anyhow::{Context as _, Result, bail, ensure};
 
 pub use self::arguments::GroundArgs;
 use self::input::LabelledScan;
-use self::report::GroundReport;
+use crate::app::report::ground::GroundReport;
 use crate::app::report::plotting::color::Colormap;
 use crate::app::run::Context;
 use crate::app::run::artefact::{Claims, Outputs};

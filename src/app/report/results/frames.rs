@@ -1,6 +1,5 @@
 //! `frames.csv`: one row per frame, units in the header, empty cells where nothing is known.
 
-use std::io::{self, Write};
 use std::path::Path;
 
 use anyhow::Result;
@@ -21,16 +20,24 @@ pub fn write_frames_csv(path: &Path, results: &LocalizationResults) -> Result<()
         (Some(estimates), _) => FrameTable::new(results, estimates),
         _ => return Ok(()),
     };
-    output::write_file(path, |file| table.write(file))
+    table.save(path)
 }
 
 /// Columns with a title and one cell per frame.
-struct FrameTable {
+pub struct FrameTable {
     rows: usize,
     columns: Vec<(String, Vec<String>)>,
 }
 
 impl FrameTable {
+    /// A table of a number of rows without columns.
+    pub fn empty(rows: usize) -> Self {
+        Self {
+            rows,
+            columns: Vec::new(),
+        }
+    }
+
     fn new(results: &LocalizationResults, estimates: &[Pose2]) -> Self {
         let truth = results.ground_truth.as_deref();
         let refined = results.refined.as_deref();
@@ -39,10 +46,7 @@ impl FrameTable {
             .map(|row| results.particles.frame(row).len())
             .collect();
         let particles = (!particles.is_empty()).then_some(particles);
-        let mut table = Self {
-            rows: results.len(),
-            columns: Vec::new(),
-        };
+        let mut table = Self::empty(results.len());
         table.add("frame", Some(&results.frames), usize::to_string);
         table.add_numbers("time_s", results.times_s.as_deref(), |time_s| *time_s);
         table.add_numbers("distance_m", Some(&driven_m), |distance_m| *distance_m);
@@ -74,10 +78,7 @@ impl FrameTable {
         let truth = results.ground_truth_in_space.as_deref();
         let errors = truth.map(|truth| drift(estimates, truth));
         let errors = errors.as_deref();
-        let mut table = Self {
-            rows: results.len(),
-            columns: Vec::new(),
-        };
+        let mut table = Self::empty(results.len());
         table.add("frame", Some(&results.frames), usize::to_string);
         table.add_numbers("time_s", results.times_s.as_deref(), |time_s| *time_s);
         table.add_numbers("distance_m", errors, |error| error.distance_m);
@@ -99,7 +100,7 @@ impl FrameTable {
     }
 
     /// Adds a column with a cell per item, or with empty cells.
-    fn add<T>(
+    pub fn add<T>(
         &mut self,
         title: impl Into<String>,
         items: Option<&[T]>,
@@ -165,13 +166,16 @@ impl FrameTable {
         });
     }
 
-    fn write(&self, file: &mut impl Write) -> io::Result<()> {
-        let mut writer = csv::Writer::from_writer(file);
-        writer.write_record(self.columns.iter().map(|(title, _)| title))?;
-        for row in 0..self.rows {
-            writer.write_record(self.columns.iter().map(|(_, cells)| &cells[row]))?;
-        }
-        writer.flush()
+    /// Writes the table as CSV.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        output::write_file(path, |file| {
+            let mut writer = csv::Writer::from_writer(file);
+            writer.write_record(self.columns.iter().map(|(title, _)| title))?;
+            for row in 0..self.rows {
+                writer.write_record(self.columns.iter().map(|(_, cells)| &cells[row]))?;
+            }
+            writer.flush()
+        })
     }
 }
 

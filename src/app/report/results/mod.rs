@@ -17,7 +17,7 @@ mod run_summary;
 #[cfg(test)]
 pub(crate) mod kitti_07_tests;
 
-pub use frames::write_frames_csv;
+pub use frames::{FrameTable, write_frames_csv};
 pub use localization_results::{LocalizationResults, ParticleLog, ScanOutline};
 pub use report::{Report, TrajectoryReport};
 pub use results_file::write_poses_npy;
