@@ -17,7 +17,7 @@ use std::time::Instant;
 
 use fpmcl::geometry::pose2_from_pose3;
 use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start};
-use fpmcl::map::{Map, MapOptions};
+use fpmcl::map::{Map, MapCache, MapOptions};
 use fpmcl::recording::Recording;
 use fpmcl::sensor::{Sensor, SensorConfig};
 
@@ -30,7 +30,11 @@ fn main() -> Result<(), Failure> {
     };
     let most: usize = std::env::var("FPMCL_STARTS").map_or(Ok(50), |text| text.parse())?;
     let begin = Instant::now();
-    let map = Map::load(map_file, &MapOptions::default())?;
+    let options = MapOptions {
+        cache: MapCache::NextToMap,
+        ..MapOptions::default()
+    };
+    let map = Map::load(map_file, &options)?;
     println!(
         "{} triangles in {} tiles, {:.1} km of road; opened in {:.2} s, {}",
         map.triangle_count(),

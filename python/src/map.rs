@@ -8,7 +8,7 @@ use anyhow::anyhow;
 use fpmcl::app::settings::{BuildMapConfig, LocalizationConfig};
 use fpmcl::geometry::{Pose3, TriangleMesh};
 use fpmcl::lidar::Motion;
-use fpmcl::map::{self, BuildError, MapBuilder, MapOptions, MappingPath};
+use fpmcl::map::{self, BuildError, MapBuilder, MapCache, MapOptions, MappingPath};
 use fpmcl::rendering::Backend;
 use numpy::ndarray::Array2;
 use numpy::{
@@ -54,11 +54,20 @@ impl Map {
 impl Map {
     /// Reads a map, or a mesh from elsewhere (PLY, OBJ, STL).
     ///
-    /// ``backend``: what renders it, ``"auto"``, ``"cpu"`` or ``"gpu"``.
+    /// ``backend``: what renders it, ``"auto"``, ``"cpu"`` or ``"gpu"``. ``cache``: where its tiles are kept between
+    /// runs, of which only those around the car are then in memory: ``True`` for a folder next to the map, or a folder;
+    /// by default nothing is written.
     #[staticmethod]
-    #[pyo3(signature = (path, *, backend="auto"))]
-    fn load(py: Python<'_>, path: PathBuf, backend: &str) -> PyResult<Self> {
-        let options = options(backend)?;
+    #[pyo3(signature = (path, *, backend="auto", cache=None))]
+    fn load(py: Python<'_>, path: PathBuf, backend: &str, cache: Option<Cache>) -> PyResult<Self> {
+        let options = MapOptions {
+            cache: match cache {
+                None | Some(Cache::NextToMap(false)) => MapCache::None,
+                Some(Cache::NextToMap(true)) => MapCache::NextToMap,
+                Some(Cache::Folder(folder)) => MapCache::Folder(folder),
+            },
+            ..options(backend)?
+        };
         let map = released(py, || map::Map::load(&path, &options))?;
         Ok(Self::from(map))
     }
@@ -160,6 +169,13 @@ impl Map {
     fn __repr__(&self) -> String {
         format!("<fpmcl.Map: {} triangles>", self.map.triangle_count())
     }
+}
+
+/// Where the tiles of a map are kept.
+#[derive(FromPyObject)]
+enum Cache {
+    NextToMap(bool),
+    Folder(PathBuf),
 }
 
 fn options(backend: &str) -> PyResult<MapOptions> {

@@ -11,7 +11,7 @@ use crate::geometry::TriangleMesh;
 use crate::lidar::LidarModel;
 use crate::localization::State;
 use crate::map::world_for_tests::TestWorld;
-use crate::map::{MapOptions, MappingPath, TileConfig, TileGrid};
+use crate::map::{MapCache, MapOptions, MappingPath, TileConfig, TileGrid};
 use crate::rendering::Backend;
 
 /// A localizer runs on one thread at a time, a map is shared by several.
@@ -95,6 +95,7 @@ fn on_disk(world: &TestWorld) -> (tempfile::TempDir, Map) {
         .extend([[0, 1, 2], [0, 2, 3]].map(|corners| corners.map(|it| first + it)));
     let options = MapOptions {
         backend: Backend::Cpu,
+        cache: MapCache::NextToMap,
         ..MapOptions::default()
     };
     let saved = Map::new(mesh, MappingPath::clone(&map.path), &options).unwrap();

@@ -15,6 +15,7 @@ pub(crate) mod tiles;
 #[cfg(test)]
 pub(crate) mod world_for_tests;
 
+pub use crate::raycasting::{TileError, TileProblem};
 pub use build::builder::{BuildError, BuildEvent, MapBuilder, MapPlan, ScanError};
 pub use build::confidence::ConfidenceConfig;
 pub use build::config::{MapConfig, MapOptions, PoseSource};
@@ -28,6 +29,7 @@ pub use files::mesh_error::{MeshFileError, MeshFileProblem};
 pub use ground::elevation::{GroundMap, GroundPatch, SensorAttitude};
 pub use model::{Map, MapError};
 pub use places::panorama::{PanoramaConfig, SearchRegion};
+pub use tiles::cache::MapCache;
 pub use tiles::grid::{TileConfig, TileGrid, TileIndex};
 
 pub(crate) use build::cloud::CloudPlan;

@@ -1,6 +1,5 @@
 //! The map that a car is localized in.
 
-use std::io;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
@@ -12,7 +11,7 @@ use super::build::config::MapOptions;
 use super::build::vertex_ground::{GROUND, REST};
 use super::files::mapped_ply::MappedPly;
 use super::files::mapping_path::MappingPath;
-use super::files::mesh_error::MeshFileError;
+use super::files::mesh_error::{MeshFileError, MeshFileProblem};
 use super::files::mesh_file;
 use super::files::ply;
 use super::ground::elevation::GroundMap;
@@ -21,6 +20,7 @@ use super::ground::surface::GroundSurface;
 use super::mesh_view::MeshView;
 use super::places::panorama::{PanoramaIndex, PanoramaRequest};
 use super::places::panorama_file::Panoramas;
+use super::tiles::file::Source;
 use super::tiles::grid::{self, TileConfig, TileGrid, TileIndex};
 use super::tiles::store::TileStore;
 use crate::geometry::mesh::on_lattice;
@@ -87,6 +87,8 @@ pub enum MapError {
         "the map has no ground: no near-horizontal surface of 4 m² or more lies below the others{}", hint(*.is_y_up)
     )]
     NoGround { is_y_up: bool },
+    #[error("the map {} has changed while it was read; load it again", file.display())]
+    Changed { file: PathBuf },
     #[error(transparent)]
     Memory(#[from] MemoryError),
     #[error(transparent)]
@@ -145,9 +147,9 @@ impl Map {
     /// Opens a map that [`save`](Self::save) or `build-map` wrote, or a mesh from elsewhere (PLY, OBJ or
     /// STL).
     ///
-    /// On first use, and when the mesh has changed, it is divided into tiles, in a folder beside it whose name is that
-    /// of the file with `.tiles`; of these, those around the car are kept in memory, and on a graphics card. Where that folder
-    /// cannot be written, all of the map is.
+    /// With a [cache](MapOptions::cache), the mesh is divided into tiles on first use, and when it has changed; of
+    /// these, those around the car are kept in memory, and on a graphics card. Without one, and where it cannot be
+    /// written, all of the map is, and nothing is written.
     pub fn load(mesh_file: &Path, options: &MapOptions) -> Result<Self, MapError> {
         Self::load_with_path(mesh_file, None, options)
     }
@@ -159,38 +161,48 @@ impl Map {
         given: Option<MappingPath>,
         options: &MapOptions,
     ) -> Result<Self, MapError> {
-        let side_m = options.tiles.side_m;
         let choice = selection::choose(options.backend, options.method)?;
-        let on_disk = |store, given| Self::on_disk((mesh_file, store), given, options, &choice);
-        if let Ok(Some(store)) = TileStore::open(mesh_file, given.is_some(), side_m) {
-            return on_disk(store, given);
-        }
-        let has_given = given.is_some();
-        // Of the file before it is opened: what is opened is not of an earlier file.
-        let source = TileStore::source(mesh_file, has_given, side_m).ok();
-        let divide =
-            |mesh: &dyn MeshView, own: Option<MappingPath>, is_ground: &dyn Fn(usize) -> bool| {
-                let source = source.ok_or(io::ErrorKind::NotFound)?;
-                TileStore::make(mesh_file, source, mesh, is_ground, own)
-            };
-        if let Some(mesh) = MappedPly::open(mesh_file)
-            && has_red_ground(&mesh, mesh.has_path() || has_given)
+        let cache = options.cache.folder_of(mesh_file);
+        let mut cache = match &cache {
+            Some(folder) => {
+                let side_m = options.tiles.side_m;
+                let of_file = |error| MeshFileProblem::Read(error).of(mesh_file);
+                let opened = TileStore::open(mesh_file, folder, given.is_some(), side_m);
+                if let Some(store) = opened.map_err(of_file)? {
+                    return Self::on_disk((mesh_file, store), given, options, &choice);
+                }
+                // Of the file before it is read: what is read is not of an earlier file.
+                let source = TileStore::source(mesh_file, given.is_some(), side_m);
+                Some((folder, source.map_err(of_file)?))
+            }
+            None => None,
+        };
+        if let Some((folder, source)) = cache
+            && let Some(mesh) = MappedPly::open(mesh_file)
+            && has_red_ground(&mesh, mesh.has_path() || given.is_some())
         {
             let bytes = mesh.triangles() as f64 * DIVIDED_BYTES;
             memory::require("the tiles of the map", bytes, SMALLER_MAP)?;
-            if let Ok(store) = divide(&mesh, mesh.path.clone(), &|triangle| mesh.is_red(triangle)) {
-                return on_disk(store, given);
+            let is_ground = |triangle| mesh.is_red(triangle);
+            let path = mesh.path.clone();
+            match divided((mesh_file, folder), source, &mesh, &is_ground, path)? {
+                Some(store) => return Self::on_disk((mesh_file, store), given, options, &choice),
+                None => cache = None,
             }
         }
         let (mut mesh, own) = mesh_file::read(mesh_file)?;
         let path = own.clone().or_else(|| given.clone()).unwrap_or_default();
         let (chunks, is_ground) = prepare(&mut mesh, &path)?;
-        match divide(&mesh, own, &|triangle| is_ground[triangle]) {
-            Ok(store) => return on_disk(store, given),
-            Err(error) => tracing::info!(
-                "the tiles of {} cannot be written beside it ({error}): all of it is kept in memory",
-                mesh_file.display()
-            ),
+        if let Some((folder, source)) = cache
+            && let Some(store) = divided(
+                (mesh_file, folder),
+                source,
+                &mesh,
+                &|triangle| is_ground[triangle],
+                own,
+            )?
+        {
+            return Self::on_disk((mesh_file, store), given, options, &choice);
         }
         Self::in_memory(mesh, path, chunks, options, &choice)
     }
@@ -316,6 +328,30 @@ impl Map {
         let file = file.as_ref().map(|file| (&**file, &*words));
         let (renderer, ground) = (&*self.renderer, &self.ground);
         PanoramaIndex::build(&cells, renderer, ground, &self.tiles, request, file)
+    }
+}
+
+/// Divides the mesh of a file into tiles in a folder; `None` if they cannot be written, after a warning.
+fn divided(
+    (mesh_file, folder): (&Path, &Path),
+    source: Source,
+    mesh: &dyn MeshView,
+    is_ground: &dyn Fn(usize) -> bool,
+    own_path: Option<MappingPath>,
+) -> Result<Option<TileStore>, MapError> {
+    match TileStore::make(mesh_file, folder, source, mesh, is_ground, own_path) {
+        Ok(Some(store)) => Ok(Some(store)),
+        Ok(None) => Err(MapError::Changed {
+            file: mesh_file.to_owned(),
+        }),
+        Err(error) => {
+            tracing::warn!(
+                "the tiles of {} cannot be written to {} ({error}): all of the map is kept in memory",
+                mesh_file.display(),
+                folder.display()
+            );
+            Ok(None)
+        }
     }
 }
 

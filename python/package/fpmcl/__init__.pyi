@@ -65,7 +65,9 @@ class Recording:
 
 class Map:
     @staticmethod
-    def load(path: _Path, *, backend: _Backend = "auto") -> Map: ...
+    def load(
+        path: _Path, *, backend: _Backend = "auto", cache: Union[bool, _Path, None] = None
+    ) -> Map: ...
     def save(self, path: _Path) -> None: ...
     @staticmethod
     def build(

@@ -8,7 +8,7 @@ use crate::app::run::{Context, input};
 use crate::app::settings::{
     BuildMapConfig, LocalizationConfig, OdometryCommandConfig, RefinementConfig, body_from_lidar,
 };
-use crate::map::{Map, MapOptions, MappingPath};
+use crate::map::{Map, MapCache, MapOptions, MappingPath};
 use crate::recording::{PoseTrack, Recording, Selection};
 use crate::sensor::{MotionCompensation, RangeImageConfig, Sensor, SensorConfig};
 
@@ -127,10 +127,12 @@ impl<'a> MapInputs<'a> {
         files
     }
 
-    /// Reads the map and prepares it for rendering on the backend of the context, with the other options given.
+    /// Reads the map and prepares it for rendering on the backend of the context, with its tiles next to it and the
+    /// other options given.
     pub fn load(&self, options: MapOptions, context: &Context) -> Result<Map> {
         let options = MapOptions {
             backend: context.backend,
+            cache: MapCache::NextToMap,
             ..options
         };
         let map = Map::load_with_path(self.map_file, self.given_path()?, &options)

@@ -5,6 +5,7 @@ use smart_default::SmartDefault;
 
 use super::local_map::LocalMapConfig;
 use crate::ground::GroundConfig;
+use crate::map::tiles::cache::MapCache;
 use crate::map::tiles::grid::TileConfig;
 use crate::rendering::{Backend, RenderingMethod};
 use crate::sensor::{Sensor, SensorConfig};
@@ -89,4 +90,6 @@ pub struct MapOptions {
     pub max_poses: Option<usize>,
     /// Division into tiles.
     pub tiles: TileConfig,
+    /// Where the tiles of a map file are kept.
+    pub cache: MapCache,
 }

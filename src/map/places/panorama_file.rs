@@ -171,7 +171,7 @@ impl Panoramas {
             Err(Failure::Render(error)) => Err(error),
             Err(Failure::Write(error)) => {
                 let path = path.display();
-                tracing::info!(
+                tracing::warn!(
                     "{path} cannot be written ({error}): the panoramas are kept in memory"
                 );
                 Ok(None)

@@ -1,4 +1,4 @@
-//! The tiles of a map on disk: made beside its mesh on first use, read where rays and cars go, dropped behind them.
+//! The tiles of a map on disk: made on first use, read where rays and cars go, dropped behind them.
 //!
 //! What a ray hits and what ground is known never depends on which tiles are in memory: one that is missing is
 //! read when it is needed. Tiles ahead are read in the background, and those far away are dropped once all take more
@@ -143,21 +143,26 @@ impl Files {
 }
 
 impl TileStore {
-    /// The folder of the tiles of a mesh file: beside it, its name with `.tiles`.
-    pub fn folder_of(mesh_file: &Path) -> PathBuf {
-        let mut name = mesh_file.as_os_str().to_owned();
-        name.push(".tiles");
-        name.into()
-    }
-
-    /// The tiles of a mesh file, if they are those of what it contains now.
-    pub fn open(mesh_file: &Path, has_given_path: bool, side_m: f64) -> io::Result<Option<Self>> {
-        let folder = Self::folder_of(mesh_file);
-        let in_use = in_use(&folder);
+    /// The tiles of a mesh file in a folder, if they are those of what the file contains now.
+    ///
+    /// # Errors
+    /// Those of the mesh file. Tiles whose index cannot be read are made again, after a warning.
+    pub fn open(
+        mesh_file: &Path,
+        folder: &Path,
+        has_given_path: bool,
+        side_m: f64,
+    ) -> io::Result<Option<Self>> {
+        let in_use = in_use(folder);
         let bytes = match fs::read(folder.join(INDEX)) {
             Ok(bytes) => bytes,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-            Err(error) => return Err(error),
+            Err(error) => {
+                if error.kind() != io::ErrorKind::NotFound {
+                    let folder = folder.display();
+                    tracing::warn!("the tiles in {folder} are made again: {error}");
+                }
+                return Ok(None);
+            }
         };
         let Ok(index) = TileFileIndex::decode(&bytes) else {
             return Ok(None);
@@ -174,11 +179,9 @@ impl TileStore {
             }
         }
         let stamp = now.stamp();
-        let is_there = |tile: &TileEntry| tile.file(&folder, stamp).is_file();
-        match index.tiles.iter().all(is_there) {
-            true => Ok(Some(Self::over(folder.clone(), in_use, index, KEPT_BYTES))),
-            false => Ok(None),
-        }
+        let is_there = |tile: &TileEntry| tile.file(folder, stamp).is_file();
+        let are_all_there = index.tiles.iter().all(is_there);
+        Ok(are_all_there.then(|| Self::over(folder.to_owned(), in_use, index, KEPT_BYTES)))
     }
 
     /// A mesh file as it is now, and how it is to be divided.
@@ -186,22 +189,22 @@ impl TileStore {
         source_of(mesh_file, checksum_of(mesh_file)?, has_given_path, side_m)
     }
 
-    /// Writes the tiles of a mesh beside its file, on the lattice of maps, and opens them. Files of older tiles that no
+    /// Writes the tiles of a mesh into a folder, on the lattice of maps, and opens them. Files of older tiles that no
     /// process uses are removed. In memory are the indices of the triangles, and one tile.
     ///
-    /// The source is that of the file before the mesh was opened: it is an error if the file has changed since.
+    /// The source is that of the file before the mesh was opened; `None` if the file has changed since.
     pub fn make(
         mesh_file: &Path,
+        folder: &Path,
         source: Source,
         mesh: &dyn MeshView,
         is_ground: &dyn Fn(usize) -> bool,
         own_path: Option<MappingPath>,
-    ) -> io::Result<Self> {
-        let folder = Self::folder_of(mesh_file);
+    ) -> io::Result<Option<Self>> {
         let side_m = source.side_m;
         let stamp = source.stamp();
-        fs::create_dir_all(&folder)?;
-        remove_abandoned(&folder)?;
+        fs::create_dir_all(folder)?;
+        remove_abandoned(folder)?;
         let mut triangles_of = triangles_of_tiles(mesh, side_m);
         let ground_of = ground_of_tiles(mesh, is_ground, side_m);
         for tile in ground_of.keys() {
@@ -224,12 +227,12 @@ impl TileStore {
                 continue;
             }
             let entry = TileEntry::new(*tile, bounds, triangles.len());
-            write_atomically(&entry.file(&folder, stamp), |out| out.write_all(&bytes))?;
+            write_atomically(&entry.file(folder, stamp), |out| out.write_all(&bytes))?;
             tiles.push(entry);
         }
         let has_given_path = source.has_given_path != 0;
-        if Self::source(mesh_file, has_given_path, side_m)? != source {
-            return Err(io::Error::other("the map has changed meanwhile"));
+        if Self::source(mesh_file, has_given_path, side_m).ok() != Some(source) {
+            return Ok(None);
         }
         let index = TileFileIndex {
             source,
@@ -237,13 +240,9 @@ impl TileStore {
             tiles,
         };
         write_atomically(&folder.join(INDEX), |out| out.write_all(&index.encode()))?;
-        remove_others(&folder, stamp)?;
-        Ok(Self::over(
-            folder.clone(),
-            in_use(&folder),
-            index,
-            KEPT_BYTES,
-        ))
+        remove_others(folder, stamp)?;
+        let (folder, in_use) = (folder.to_owned(), in_use(folder));
+        Ok(Some(Self::over(folder, in_use, index, KEPT_BYTES)))
     }
 
     /// The tiles of an index, none of them in memory.
@@ -568,7 +567,7 @@ mod tests {
     use crate::geometry::Pose3;
     use crate::lidar::LidarModel;
     use crate::map::ground::elevation::GroundMap;
-    use crate::map::{Map, MapError, MapOptions};
+    use crate::map::{Map, MapCache, MapError, MapOptions};
     use crate::rendering::{Backend, RenderError};
 
     /// A road of 1.2 km along x, walls beside it, and a ramp.
@@ -611,8 +610,18 @@ mod tests {
     fn options() -> MapOptions {
         MapOptions {
             backend: Backend::Cpu,
+            cache: MapCache::NextToMap,
             ..MapOptions::default()
         }
+    }
+
+    /// The folder of the tiles of a file.
+    fn folder_of(file: &Path) -> PathBuf {
+        MapCache::NextToMap.folder_of(file).unwrap()
+    }
+
+    fn open(file: &Path) -> Option<TileStore> {
+        TileStore::open(file, &folder_of(file), false, 100.0).unwrap()
     }
 
     /// A folder with the street as `map.ply`.
@@ -674,7 +683,7 @@ mod tests {
             let map = Map::load(&file, &options()).unwrap();
             assert!(seen(&map) == expected);
         }
-        let folder = TileStore::folder_of(&file);
+        let folder = folder_of(&file);
         let index = TileFileIndex::decode(&fs::read(folder.join(INDEX)).unwrap()).unwrap();
         let length = |tile: &TileEntry| {
             let file = tile.file(&folder, index.source.stamp());
@@ -736,7 +745,7 @@ mod tests {
     fn tiles_serve_a_copy_and_are_made_again_for_a_mesh_that_changed() {
         let (_folder, file) = saved();
         let map = Map::load(&file, &options()).unwrap();
-        let tiles = TileStore::folder_of(&file);
+        let tiles = folder_of(&file);
         let names = || -> Vec<_> {
             let entries = fs::read_dir(&tiles).unwrap();
             entries.map(|entry| entry.unwrap().file_name()).collect()
@@ -744,11 +753,11 @@ mod tests {
         let (first, triangles) = (names(), map.triangle_count());
         // The same bytes at another time.
         fs::write(&file, fs::read(&file).unwrap()).unwrap();
-        assert!(TileStore::open(&file, false, 100.0).unwrap().is_some());
+        assert!(open(&file).is_some());
         let mut less = street();
         less.triangles.truncate(100);
         crate::map::files::ply::write(&file, &less, Some(&path())).unwrap();
-        assert!(TileStore::open(&file, false, 100.0).unwrap().is_none());
+        assert!(open(&file).is_none());
         let abandoned = tiles.join(".fpmcl-6_0.tile-123456.part");
         fs::write(&abandoned, "of a killed process").unwrap();
         drop(map);
@@ -770,7 +779,7 @@ mod tests {
         let (_folder, file) = saved();
         let map = Map::load(&file, &options()).unwrap();
         let expected = seen(&map);
-        let tiles = TileStore::folder_of(&file);
+        let tiles = folder_of(&file);
         let count = || fs::read_dir(&tiles).unwrap().count();
         let first = count();
         drop(map);
@@ -796,20 +805,27 @@ mod tests {
         let source = TileStore::source(&file, false, 100.0).unwrap();
         let make = || {
             let is_ground = |triangle| MeshView::is_red(&street(), triangle);
-            TileStore::make(&file, source, &street(), &is_ground, Some(path()))
+            TileStore::make(
+                &file,
+                &folder_of(&file),
+                source,
+                &street(),
+                &is_ground,
+                Some(path()),
+            )
         };
         let mut moved = street();
         moved.vertices.iter_mut().for_each(|vertex| vertex.z += 5.0);
         crate::map::files::ply::write(&file, &moved, Some(&path())).unwrap();
-        assert!(make().err().unwrap().to_string().contains("changed"));
-        assert!(TileStore::open(&file, false, 100.0).unwrap().is_none());
+        assert!(make().unwrap().is_none());
+        assert!(open(&file).is_none());
     }
 
     #[test]
     fn a_damaged_tile_is_an_error_of_each_call_that_needs_it_and_a_damaged_index_is_made_again() {
         let (_folder, file) = saved();
         drop(Map::load(&file, &options()).unwrap());
-        let store = TileStore::open(&file, false, 100.0).unwrap().unwrap();
+        let store = open(&file).unwrap();
         let (folder, stamp) = (store.files.folder.clone(), store.files.stamp);
         let tile = TileEntry::new(TileIndex::of(600.0, 0.0, 100.0), None, 0).file(&folder, stamp);
         let whole = fs::read(&tile).unwrap();
@@ -873,9 +889,40 @@ mod tests {
     }
 
     #[test]
+    fn without_a_cache_nothing_is_written_and_a_folder_has_the_tiles_of_several_maps() {
+        let ((one, file), (other, other_file)) = (saved(), saved());
+        let names = |folder: &Path| -> Vec<_> {
+            let entries = fs::read_dir(folder).unwrap();
+            entries.map(|entry| entry.unwrap().file_name()).collect()
+        };
+        let load = |file: &Path, cache: MapCache| {
+            let options = MapOptions { cache, ..options() };
+            Map::load(file, &options).unwrap()
+        };
+        let in_memory = load(&file, MapCache::None);
+        assert_eq!(names(one.path()), ["map.ply"]);
+        let folder = tempfile::tempdir().unwrap();
+        let cache = || MapCache::Folder(folder.path().to_owned());
+        let on_disk = load(&file, cache());
+        load(&other_file, cache());
+        assert!(seen(&on_disk) == seen(&in_memory));
+        assert_eq!(names(folder.path()).len(), 2);
+        assert_eq!(
+            (names(one.path()), names(other.path())),
+            (vec!["map.ply".into()], vec!["map.ply".into()])
+        );
+        // The tiles of the one stay when those of the other are made.
+        assert!(
+            TileStore::open(&file, &cache().folder_of(&file).unwrap(), false, 100.0)
+                .unwrap()
+                .is_some()
+        );
+    }
+
+    #[test]
     fn where_no_tiles_can_be_written_all_is_in_memory() {
         let (_folder, file) = saved();
-        fs::write(TileStore::folder_of(&file), "in the way").unwrap();
+        fs::write(folder_of(&file), "in the way").unwrap();
         let map = Map::load(&file, &options()).unwrap();
         assert!(seen(&map) == seen(&Map::new(street(), path(), &options()).unwrap()));
     }

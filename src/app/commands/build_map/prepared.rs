@@ -4,7 +4,7 @@ use anyhow::Result;
 
 use crate::app::settings::BuildMapConfig;
 use crate::localization::{Localizer, Odometry, Start};
-use crate::map::{Map, MapError, MapOptions};
+use crate::map::{Map, MapCache, MapError, MapOptions};
 use crate::mapping;
 use crate::recording::Frame;
 use crate::rendering::Backend;
@@ -14,6 +14,7 @@ use crate::rendering::Backend;
 pub fn open_map(config: &BuildMapConfig, frame: Option<&Frame>) -> Result<Option<Map>> {
     let options = MapOptions {
         backend: Backend::Cpu,
+        cache: MapCache::NextToMap,
         ..MapOptions::default()
     };
     let map = match Map::load(&config.mesh_file, &options) {
