@@ -1,6 +1,6 @@
 //! The memory that the process may use: stages check an estimate before they allocate.
 //!
-//! Without [`set_budget`] there is no limit. Estimates are beside the calls of [`require`]; they are
+//! Without [`set_budget`] there is no limit. Estimates stand at the calls of `require`; they are
 //! upper bounds of what grows with a configuration or an input, not of everything.
 
 use std::fs::File;

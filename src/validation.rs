@@ -9,6 +9,9 @@ use std::ops::RangeInclusive;
 /// A configuration that knows the limits of its values.
 pub trait Validate {
     /// Returns the first value that cannot be used.
+    ///
+    /// # Errors
+    /// The first field that is out of its range, by its path in the configuration.
     fn validate(&self) -> Result<(), InvalidValue>;
 }
 

@@ -58,7 +58,7 @@ pub fn rigid_alignment(estimates: &[Pose3], truth: &[Pose3]) -> Option<Pose3> {
     is_determined.then(|| Pose3::from_parts(translation, rotation))
 }
 
-/// Applies `truth_from_estimate` to estimates.
+/// Transforms estimates into the frame of the truth by `truth_from_estimate`.
 pub fn aligned(truth_from_estimate: &Pose3, estimates: &[Pose3]) -> Vec<Pose3> {
     (estimates.iter())
         .map(|pose| truth_from_estimate * pose)

@@ -125,6 +125,9 @@ pub enum MetricsError {
 
 impl TrajectoryMetrics {
     /// Computes the metrics of a trajectory.
+    ///
+    /// # Errors
+    /// The trajectories differ in length, or are empty.
     pub fn new(
         trajectory: &EvaluatedTrajectory,
         config: &MetricsConfig,

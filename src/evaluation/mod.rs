@@ -1,6 +1,6 @@
 //! Accuracy of estimated trajectories and of maps.
 //!
-//! [`metrics`] computes the errors of the literature, [`range_mcl`] those of range-mcl's
+//! `metrics` computes the errors of the literature, `range_mcl` those of range-mcl's
 //! evaluation script. Everything here works on values; files are read and written elsewhere.
 
 pub(crate) mod alignment;

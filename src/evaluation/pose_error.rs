@@ -85,13 +85,13 @@ impl Pairs {
     }
 }
 
-/// APE of every pose.
+/// Absolute errors of poses that correspond one to one, both in the frame of the truth: `truth⁻¹ · estimate` [m, rad].
 pub fn absolute_pose_error(estimates: &[Pose3], ground_truth: &[Pose3]) -> PoseErrors {
     let pairs = estimates.iter().zip(ground_truth);
     PoseErrors::of(pairs.map(|(estimate, truth)| truth.inverse() * estimate))
 }
 
-/// RPE of every pair.
+/// Relative errors of pairs of poses that correspond one to one: of the motions between the two [m, rad].
 pub fn relative_pose_error(
     estimates: &[Pose3],
     ground_truth: &[Pose3],

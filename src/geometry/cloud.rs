@@ -36,7 +36,7 @@ impl PointCloud {
         self.positions.is_empty()
     }
 
-    /// Appends a point.
+    /// Appends a point: its position [m], its unit normal, and the confidence that it is ground, 0 to 1.
     pub fn push(&mut self, position: Vec3, normal: Vec3, ground: f32) {
         self.positions.push(position);
         self.normals.push(normal);

@@ -26,7 +26,7 @@ pub struct TriangleMesh {
 }
 
 impl TriangleMesh {
-    /// The three corners of a triangle.
+    /// The three corners of a triangle [m], in the frame of the mesh.
     #[inline]
     pub fn corners(&self, triangle: usize) -> [Vec3; 3] {
         self.triangles[triangle].map(|vertex| self.vertices[vertex as usize])
@@ -39,7 +39,7 @@ impl TriangleMesh {
         (b - a).cross(c - a)
     }
 
-    /// Moves each vertex to the nearest point of a lattice of [`STEP_M`], by at most 0.43 mm: ray casting keeps such
+    /// Moves each vertex to the nearest point of a lattice of 1/2048 m, by at most 0.43 mm: ray casting keeps such
     /// triangles in less than half of the memory.
     pub fn snap(&mut self) {
         for vertex in &mut self.vertices {

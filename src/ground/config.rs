@@ -40,6 +40,9 @@ pub type NamedClassifier = (&'static str, Box<dyn GroundClassifier>);
 
 impl GroundConfig {
     /// Builds the configured classifier.
+    ///
+    /// # Errors
+    /// A field of the configured method is out of its range.
     pub fn classifier(&self) -> Result<Box<dyn GroundClassifier>, InvalidValue> {
         self.validate()?;
         Ok(match self.method {

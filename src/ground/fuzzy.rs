@@ -161,6 +161,9 @@ pub struct Explanation {
 
 impl FuzzyGround {
     /// Parses the rule base of the configuration.
+    ///
+    /// # Errors
+    /// A rule or a membership function cannot be used.
     pub fn new(config: FuzzyConfig) -> Result<Self, InvalidValue> {
         let system = FuzzySystem::new(
             &config.variables,

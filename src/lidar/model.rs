@@ -150,7 +150,7 @@ impl LidarModel {
         )
     }
 
-    /// The directions of all pixels, row-major.
+    /// The unit directions of the centres of all pixels in the lidar frame, row-major.
     pub fn directions(&self) -> Vec<Vec3> {
         (0..self.len())
             .map(|index| self.direction_of(index))

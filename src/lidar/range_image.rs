@@ -17,7 +17,7 @@ const NO_POINT: u32 = u32::MAX;
 pub struct RangeImage {
     /// Projection of the image.
     pub model: LidarModel,
-    /// Range of the nearest return [m], or [`NO_RETURN`].
+    /// Range of the nearest return [m]; infinite without a return.
     pub ranges: Vec<f32>,
     /// Nearest return in the lidar frame [m]; zero without one.
     pub points: Vec<Vec3>,
@@ -52,7 +52,7 @@ impl RangeImage {
         image
     }
 
-    /// An image of rendered ranges, with points on the rays through the pixel centers.
+    /// An image of ranges [m], row-major, infinite without a return, with points on the rays through the pixel centres.
     pub fn from_ranges(ranges: Vec<f32>, model: &LidarModel) -> Self {
         debug_assert_eq!(ranges.len(), model.len());
         let points = ranges

@@ -101,6 +101,9 @@ pub struct Localizer {
 
 impl Localizer {
     /// Prepares the localization of a drive with a sensor. The same seed gives the same estimates.
+    ///
+    /// # Errors
+    /// The configuration, or the spread of the start, is out of its range.
     pub fn new(
         map: &Map,
         sensor: &Sensor,
@@ -131,7 +134,11 @@ impl Localizer {
         self.preparation.sensor.own_car_m = own_car_m;
     }
 
-    /// Estimates the pose of the next scan, given the motion since the previous one.
+    /// Estimates `map_from_lidar` at the moment of the next scan, given the motion since the previous one.
+    ///
+    /// # Errors
+    /// The motion is impossible, the points do not fit the sensor, the start is outside of the map, or the map cannot be
+    /// rendered.
     pub fn step(&mut self, scan: &Scan, odometry: Odometry) -> Result<Estimate, LocalizerError> {
         if !odometry.is_possible() {
             return Err(LocalizerError::ImpossibleOdometry(odometry));

@@ -1,10 +1,10 @@
 //! Monte Carlo localization of a car in a mesh map.
 //!
-//! > [`Tracker`] finds out what the sensor is, measures its motion, and passes both to a [`Localizer`], which turns scans into range images with the attitude of the sensor and feeds the
-//! > particle [`filter`]: [`initialization`] samples the first particles, [`motion`] moves them by the
-//! > [`odometry`], [`observation`] weights them, [`resampling`] keeps the likely ones, [`places`]
-//! > compares those that are far apart, [`convergence`]
-//! > decides when few are enough and [`tracking_loss`] when none is right.
+//! > [`Tracker`] infers the sensor, measures its motion, and passes both to a [`Localizer`], which turns scans into
+//! > range images with the attitude of the sensor and feeds the particle `filter`: `initialization` samples the first
+//! > particles, `motion` moves them by the `odometry`, `observation` weights them, `resampling` keeps the likely ones,
+//! > `places` compares those that are far apart, `convergence` decides when few are enough and `tracking_loss` when
+//! > none is right.
 //!
 //! Particles are planar poses `map_from_lidar`; the ground of the map gives height, roll and pitch.
 //!

@@ -98,7 +98,7 @@ impl ObservationConfig {
         }
     }
 
-    /// Cost of a difference of ranges.
+    /// Cost of the difference of a measured and a rendered range [m].
     pub fn difference(&self) -> RangeDifference {
         match self.likelihood {
             Likelihood::Reference => RangeDifference::UNLIMITED,

@@ -84,14 +84,14 @@ impl ParticleSet {
         &self.particles
     }
 
-    /// The poses, in the order of the particles.
+    /// The poses `map_from_lidar` in the plane, in the order of the particles.
     pub fn poses(&self) -> impl ExactSizeIterator<Item = &Pose2> {
         self.particles
             .iter()
             .map(|particle| &particle.map_from_lidar)
     }
 
-    /// The weights, in the order of the particles.
+    /// The weights, whose sum is one, in the order of the particles.
     pub fn weights(&self) -> Vec<f64> {
         self.particles.iter().map(|p| p.weight).collect()
     }

@@ -42,6 +42,9 @@ pub struct SecondDrive {
 
 impl SecondDrive {
     /// A drive before its first scan, with a tracker in the map.
+    ///
+    /// # Errors
+    /// A field of the configuration is out of its range.
     pub fn new(tracker: Tracker, trajectory: TrajectoryConfig) -> Result<Self, InvalidValue> {
         Ok(Self {
             tracker,
@@ -51,6 +54,9 @@ impl SecondDrive {
     }
 
     /// Registers the next scan to those before it, and localizes it in the map.
+    ///
+    /// # Errors
+    /// Times of scans do not ascend, the points do not fit the sensor, or the map cannot be rendered.
     pub fn add(&mut self, scan: &Scan) -> Result<State, SecondDriveError> {
         self.found.push(None);
         let motion = self.builder.add(scan)?.previous_from_current;
@@ -69,6 +75,9 @@ impl SecondDrive {
     }
 
     /// Closes loops and adjusts all poses to the surfaces of the map.
+    ///
+    /// # Errors
+    /// The drive was not found in the map, the surfaces of the map cannot be read, or memory does not suffice.
     pub fn finish(self) -> Result<Trajectory, SecondDriveError> {
         /// The map is needed around the scans that were found, as far as a sensor sees [m].
         const RADIUS_M: f64 = 150.0;

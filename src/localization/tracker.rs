@@ -85,6 +85,9 @@ pub struct Tracker {
 impl Tracker {
     /// A tracker in a map, with a start that is unknown and a sensor that is inferred from the first scan if the
     /// configuration does not contain it.
+    ///
+    /// # Errors
+    /// A field of the configuration is out of its range.
     pub fn new(map: &Map, config: TrackerConfig) -> Result<Self, TrackerError> {
         config.validate()?;
         let sensor = Sensor::configured(&config.sensor);
@@ -126,7 +129,11 @@ impl Tracker {
         self.sensor.as_ref()
     }
 
-    /// Estimates the pose of the next scan; the motion is that of the scans.
+    /// Estimates `map_from_lidar` at the moment of the next scan; the motion is that of the scans.
+    ///
+    /// # Errors
+    /// The points do not fit the sensor, times of scans do not ascend, the start is outside of the map, or the map cannot be
+    /// rendered.
     pub fn step(&mut self, scan: &Scan) -> Result<Estimate, TrackerError> {
         let odometry = self.measure(scan)?;
         self.step_with_motion(scan, odometry)
@@ -143,6 +150,9 @@ impl Tracker {
 
     /// Measures the motion into the next scan since the last one that was localized; it is localized by
     /// [`step_with_motion`](Self::step_with_motion) afterwards. `Unknown` without odometry.
+    ///
+    /// # Errors
+    /// The first scan has no points, from which the sensor is inferred, or times of scans do not ascend.
     pub fn measure(&mut self, scan: &Scan) -> Result<Odometry, TrackerError> {
         self.pass(scan)?;
         self.is_measured = true;
@@ -154,8 +164,11 @@ impl Tracker {
         })
     }
 
-    /// Estimates the pose of the next scan, given the motion since the last one that was localized. The odometry of the
+    /// Estimates `map_from_lidar` at the moment of the next scan, given the motion since the last one that was localized. The odometry of the
     /// scans ends with a scan that was not [measured](Self::measure).
+    ///
+    /// # Errors
+    /// The motion is impossible; else as [`step`](Self::step).
     pub fn step_with_motion(
         &mut self,
         scan: &Scan,

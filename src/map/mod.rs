@@ -1,7 +1,7 @@
 //! The map: built from scans, a mesh with its ground and tiles, saved and loaded.
 //!
-//! > [`MapBuilder`] makes a [`Map`] of scans with poses. A [`Map`] is a mesh, read and written by [`files`], divided
-//! > into [`tiles`] that are loaded where the car is; it knows its [`ground`], the [`places`] where a car may be, and
+//! > [`MapBuilder`] makes a [`Map`] of scans with poses. A [`Map`] is a mesh, read and written by `files`, divided
+//! > into `tiles` that are loaded where the car is; it knows its `ground`, the `places` where a car may be, and
 //! > what renders it.
 
 pub(crate) mod build;

@@ -100,6 +100,9 @@ impl Map {
     ///
     /// The ground consists of the triangles with more red than blue, as `build-map` and range-mcl
     /// colour them; in a mesh without such colours, it is found by its shape (see `ground_surface`).
+    ///
+    /// # Errors
+    /// No triangle has an area, there is no ground, memory does not suffice, or the graphics card cannot be used.
     pub fn new(
         mut mesh: TriangleMesh,
         path: MappingPath,
@@ -150,6 +153,9 @@ impl Map {
     /// With a [cache](MapOptions::cache), the mesh is divided into tiles on first use, and when it has changed; of
     /// these, those around the car are kept in memory, and on a graphics card. Without one, and where it cannot be
     /// written, all of the map is, and nothing is written.
+    ///
+    /// # Errors
+    /// The file cannot be read; else as [`new`](Self::new).
     pub fn load(mesh_file: &Path, options: &MapOptions) -> Result<Self, MapError> {
         Self::load_with_path(mesh_file, None, options)
     }
@@ -230,7 +236,10 @@ impl Map {
         })
     }
 
-    /// Writes the map as a PLY file that is complete by itself; see [`ply::write`].
+    /// Writes the map as a binary PLY file that is complete by itself: mesh, colours of the ground, path of the mapping drive.
+    ///
+    /// # Errors
+    /// The file cannot be written, or that of the map cannot be read.
     pub fn save(&self, path: &Path) -> Result<(), MapError> {
         Ok(ply::write(path, &*self.mesh()?, Some(&self.path))?)
     }
@@ -244,6 +253,9 @@ impl Map {
     }
 
     /// The whole surface, map frame. That of a map on disk is read from its file again, on the lattice of maps.
+    ///
+    /// # Errors
+    /// The file of the map cannot be read again.
     pub fn mesh(&self) -> Result<Arc<TriangleMesh>, MapError> {
         match &self.surface {
             Surface::Memory(mesh) => Ok(mesh.clone()),

@@ -4,8 +4,8 @@
 //! > are found from the scans ([`TrajectorySummary`]); the sensor is inferred from some scans; key scans, deskewed by
 //! > the poses, become a mesh by [`MapBuilder`].
 //!
-//! [`build_map`] does all of it. A caller that keeps results between the steps, such as a program that resumes, takes
-//! them one by one: [`with_given_poses`], [`PoseReport::new`], [`find_poses`], [`key_frames`].
+//! [`build_map`] does all of it, [`map_recording`] also returns what the recording has shown. The program, which keeps
+//! results between the steps, takes them one by one: `with_given_poses`, `PoseReport::new`, `find_poses`, `key_frames`.
 
 mod error;
 mod pose_check;
@@ -44,6 +44,9 @@ pub struct MappedRecording {
 ///
 /// Scans are read when they are needed, more than once: memory is that of the scans of a local map, about 1.5 MB for each
 /// of 120,000 points, and the map.
+///
+/// # Errors
+/// The scans cannot be read, no poses can be found or they contradict the scans, or the map cannot be built.
 pub fn build_map(recording: &Recording, config: &MapConfig) -> Result<Map, MappingError> {
     let builder = MapBuilder::new(config.clone());
     Ok(map_recording(recording, None, builder)?.map)
@@ -51,6 +54,9 @@ pub fn build_map(recording: &Recording, config: &MapConfig) -> Result<Map, Mappi
 
 /// Adds a recording to a map of the same place: it is localized in that map, or has poses in its world; what its beams
 /// pass through is removed, and what the map does not have is added.
+///
+/// # Errors
+/// As [`build_map`]; the recording is not found in the map.
 pub fn extend_map(
     map: &Map,
     recording: &Recording,
@@ -61,6 +67,9 @@ pub fn extend_map(
 }
 
 /// Builds a map of a recording, or adds it to an older one, with the events and options of a builder.
+///
+/// # Errors
+/// As [`build_map`] and [`extend_map`].
 pub fn map_recording(
     recording: &Recording,
     older: Option<&Map>,

@@ -78,6 +78,9 @@ pub struct Odometer {
 
 impl Odometer {
     /// An odometry before its first scan.
+    ///
+    /// # Errors
+    /// A field of the configuration is out of its range.
     pub fn new(config: OdometryConfig) -> Result<Self, InvalidValue> {
         config.validate()?;
         Ok(Self {
@@ -89,6 +92,9 @@ impl Odometer {
 
     /// Registers the next scan. Points with times are compensated by the estimated motion; points without are taken as
     /// compensated.
+    ///
+    /// # Errors
+    /// Times of scans do not ascend, or memory does not suffice.
     pub fn step(&mut self, scan: &Scan) -> Result<OdometryEstimate, OdometryError> {
         let start = Instant::now();
         let duration_s = self.duration_until(scan)?;

@@ -77,6 +77,9 @@ pub struct TrajectoryBuilder {
 
 impl TrajectoryBuilder {
     /// A trajectory without scans.
+    ///
+    /// # Errors
+    /// A field of the configuration is out of its range.
     pub fn new(config: TrajectoryConfig) -> Result<Self, InvalidValue> {
         config.validate()?;
         Ok(Self {
@@ -92,6 +95,9 @@ impl TrajectoryBuilder {
     }
 
     /// Registers the next scan, and keeps a sample of its points.
+    ///
+    /// # Errors
+    /// Times of scans do not ascend, or memory does not suffice.
     pub fn add(&mut self, scan: &Scan) -> Result<&OdometryEstimate, OdometryError> {
         let estimate = self.odometer.step(scan)?;
         self.estimates.push(estimate);
@@ -101,6 +107,9 @@ impl TrajectoryBuilder {
     }
 
     /// Keeps a sample of the next scan, whose pose is given; all or none of the poses of a drive are.
+    ///
+    /// # Errors
+    /// Memory does not suffice.
     pub fn add_given(&mut self, scan: &Scan, map_from_lidar: Pose3) -> Result<(), MemoryError> {
         let last = self.given.last().unwrap_or(&map_from_lidar);
         let times_s = self.time_s.zip(scan.time_s);
@@ -140,6 +149,9 @@ impl TrajectoryBuilder {
     }
 
     /// Closes loops, unless the poses are given, and adjusts the poses.
+    ///
+    /// # Errors
+    /// Memory does not suffice.
     pub fn finish(self) -> Result<Trajectory, MemoryError> {
         let given = self.given.clone();
         let is_given = !given.is_empty();

@@ -23,6 +23,9 @@ impl Calibration {
     }
 
     /// Reads the line that starts with `Tr:` (or `Tr_velo_to_cam:`); other lines are ignored.
+    ///
+    /// # Errors
+    /// The file cannot be read, or has no such line of 12 numbers.
     pub fn read(path: &Path) -> Result<Self, RecordingError> {
         for (line, text) in (1..).zip(read_text(path)?.lines()) {
             let Some((key, numbers)) = text.split_once(':') else {
@@ -41,6 +44,9 @@ impl Calibration {
     }
 
     /// Writes a `calib.txt` that contains only the line `Tr`.
+    ///
+    /// # Errors
+    /// Those of the writer.
     pub fn write(&self, mut writer: impl Write) -> io::Result<()> {
         writeln!(writer, "Tr: {}", row_from_pose(&self.cam0_from_lidar))
     }

@@ -94,6 +94,9 @@ impl Frame {
     }
 
     /// Reads the scan and deskews it by the motion, if that is known.
+    ///
+    /// # Errors
+    /// The file or message of the scan cannot be read.
     pub fn read(&self) -> Result<Scan, RecordingError> {
         let mut scan = self.source.read()?;
         scan.time_s = scan.time_s.or(Some(self.time_s));

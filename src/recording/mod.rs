@@ -1,7 +1,7 @@
 //! Recordings: scans with their times, and the poses that belong to them.
 //!
-//! [`Recording::open`] recognizes the [`layout`]; [`PoseTrack`] reads poses and matches them to the scans. Poses on disk
-//! are poses of a camera or of another body on which the lidar is mounted; [`MapFrame`] converts between
+//! [`Recording::open`] recognizes the [`Layout`]; [`PoseTrack`] reads poses and matches them to the scans. Poses on disk
+//! are poses of a camera or of another body on which the lidar is mounted; `MapFrame` converts between
 //! them and the lidar poses that everything else uses:
 //!
 //! ```text

@@ -50,11 +50,17 @@ impl Recording {
     /// `path` is the folder of a recording in one of the layouts of [`Layout`], the folder of its scans, or a bag. Times
     /// are those of a bag, those in the names of the scans, else those of `times.txt` (`timestamps.txt` of KITTI raw),
     /// which must ascend.
+    ///
+    /// # Errors
+    /// There are no scans, or their times do not ascend or cannot be read.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, RecordingError> {
         Self::open_with(path.as_ref(), None, &Selection::default())
     }
 
     /// Opens the selected frames of a recording; of a bag those of `topic`, or of the only one with scans.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open); the selection is empty, or the topic does not exist.
     pub fn open_with(
         path: &Path,
         topic: Option<&str>,
@@ -167,6 +173,9 @@ impl Recording {
 
     /// The poses that belong to the recording by their names and places; in a bag, of a body on which the lidar is
     /// mounted by `body_from_lidar`, else by the static transforms.
+    ///
+    /// # Errors
+    /// The recording has no poses, or they cannot be read.
     pub fn own_track(&self) -> Result<PoseTrack, RecordingError> {
         #[cfg(feature = "bags")]
         if let Some((bag, topic)) = &self.bag {
@@ -180,13 +189,19 @@ impl Recording {
         PoseTrack::read(path, self.files.calibration.as_deref())
     }
 
-    /// The same recording with the poses that it contains.
+    /// The same recording with the poses that it contains, `map_from_lidar` in the frame of the first of them.
+    ///
+    /// # Errors
+    /// The recording has no poses, they cannot be read, or do not belong to its frames.
     pub fn with_own_poses(self) -> Result<Self, RecordingError> {
         let track = self.own_track()?;
         self.with_poses(track)
     }
 
-    /// The same recording, whose frames have poses; see [`PoseTrack::matched`].
+    /// The same recording, whose frames have the poses of a track; frames without one are dropped.
+    ///
+    /// # Errors
+    /// The track does not belong to these frames.
     pub fn with_poses(mut self, track: PoseTrack) -> Result<Self, RecordingError> {
         if !self.has_times
             && let Some(times_s) = &track.times_s
@@ -232,6 +247,9 @@ impl Recording {
     }
 
     /// Reads the scans of the selected frames, one after the other.
+    ///
+    /// # Errors
+    /// An item is the error of its scan; those after it can be read.
     pub fn scans(&self) -> impl Iterator<Item = Result<Scan, RecordingError>> {
         self.frames.iter().map(Frame::read)
     }

@@ -90,7 +90,11 @@ impl MapFrame {
     }
 }
 
-/// Writes lidar poses as camera poses, as in `poses.txt`, in the world of `world_from_map`.
+/// Writes lidar poses as camera poses in the world of `world_from_map`, as in `poses.txt`: the upper 3 × 4 of each matrix,
+/// row-major.
+///
+/// # Errors
+/// Those of the writer.
 pub fn write_kitti(
     mut writer: impl Write,
     map_from_lidar: &[Pose3],
@@ -106,7 +110,10 @@ pub fn write_kitti(
     })
 }
 
-/// Writes `time x y z qx qy qz qw` rows of lidar poses in the map frame.
+/// Writes `time x y z qx qy qz qw` rows [s, m] of lidar poses in the map frame.
+///
+/// # Errors
+/// Those of the writer.
 pub fn write_tum(mut writer: impl Write, trajectory: &[StampedPose]) -> io::Result<()> {
     trajectory.iter().try_for_each(|pose| {
         let t = pose.map_from_lidar.translation.vector;
@@ -119,7 +126,10 @@ pub fn write_tum(mut writer: impl Write, trajectory: &[StampedPose]) -> io::Resu
     })
 }
 
-/// Reads a TUM trajectory; frames are numbered by row.
+/// Reads `time x y z qx qy qz qw` rows [s, m] of lidar poses (TUM); frames are numbered by row.
+///
+/// # Errors
+/// The file cannot be read, or a row does not have eight numbers of a pose.
 pub fn read_tum(path: &Path) -> Result<Vec<StampedPose>, RecordingError> {
     read_rows(path)?
         .iter()
@@ -148,6 +158,9 @@ pub fn read_tum(path: &Path) -> Result<Vec<StampedPose>, RecordingError> {
 }
 
 /// Reads `times.txt`, one number per row [s].
+///
+/// # Errors
+/// The file cannot be read, or its numbers do not ascend.
 pub fn read_times(path: &Path) -> Result<Vec<f64>, RecordingError> {
     read_rows(path)?
         .iter()
@@ -185,7 +198,10 @@ pub(super) fn ascending(path: &Path, times_s: Vec<f64>) -> Result<Vec<f64>, Reco
     }
 }
 
-/// Writes `times.txt` [s].
+/// Writes `times.txt`, one number per row [s].
+///
+/// # Errors
+/// Those of the writer.
 pub fn write_times(mut writer: impl Write, times_s: &[f64]) -> io::Result<()> {
     (times_s.iter()).try_for_each(|time_s| writeln!(writer, "{time_s:.6e}"))
 }

@@ -37,6 +37,9 @@ impl PoseTrack {
     /// Reads rows of KITTI (12 numbers: poses of the camera if there is a calibration, else of the lidar), rows of
     /// TUM (8 numbers: poses of the lidar), or a folder `oxts` of KITTI raw. Times are those of the rows, or
     /// of `times.txt` beside the file.
+    ///
+    /// # Errors
+    /// The file cannot be read, or a row is no pose.
     pub fn read(path: &Path, calib_file: Option<&Path>) -> Result<Self, RecordingError> {
         if path.is_dir() {
             let (world_from_imu, calibration) = oxts::read(path)?;
@@ -54,6 +57,9 @@ impl PoseTrack {
     }
 
     /// Reads poses of a body on which the lidar is mounted, rows of KITTI or TUM.
+    ///
+    /// # Errors
+    /// The file cannot be read, or a row is no pose.
     pub fn read_of_body(path: &Path, body_from_lidar: Pose3) -> Result<Self, RecordingError> {
         let (body, times_s) = read_rows_of_poses(path)?;
         let calibration = Calibration {
@@ -64,6 +70,9 @@ impl PoseTrack {
 
     /// Reads the poses of a topic of a bag, of the lidar or of a body on which it is mounted as given, else by the
     /// static transforms.
+    ///
+    /// # Errors
+    /// There is no such topic, a message cannot be decoded, or the transforms do not join the frames.
     #[cfg(feature = "bags")]
     pub fn read_topic(
         bag: &Bag,

@@ -7,7 +7,10 @@ use super::error::RecordingError;
 use crate::lidar::Scan;
 use crate::memory;
 
-/// Writes a scan.
+/// Writes a scan in the format of KITTI's `.bin`: x, y, z [m] and intensity of each point, as little-endian `f32`.
+///
+/// # Errors
+/// Those of the writer.
 pub fn write_scan(mut writer: impl Write, scan: &Scan) -> io::Result<()> {
     let bytes: Vec<u8> = scan
         .points
@@ -20,6 +23,9 @@ pub fn write_scan(mut writer: impl Write, scan: &Scan) -> io::Result<()> {
 }
 
 /// Reads the semantic class of each point: the low 16 bits, without the instance.
+///
+/// # Errors
+/// The file cannot be read, or its size is not a multiple of four bytes.
 pub fn read_labels(path: &Path) -> Result<Vec<u16>, RecordingError> {
     let bytes = read_bytes(path)?;
     Ok(records::<4>(path, &bytes)?
@@ -28,7 +34,10 @@ pub fn read_labels(path: &Path) -> Result<Vec<u16>, RecordingError> {
         .collect())
 }
 
-/// Writes semantic classes, with instance 0.
+/// Writes the semantic class of each point as a little-endian `u32`, with instance 0.
+///
+/// # Errors
+/// Those of the writer.
 pub fn write_labels(mut writer: impl Write, classes: &[u16]) -> io::Result<()> {
     let bytes: Vec<u8> = classes
         .iter()

@@ -1,9 +1,9 @@
 //! Refinement of a trajectory: a particle swarm and Gauss-Newton per frame, then smoothing.
 //!
-//! > [`TrajectoryRefiner`] takes the frames of a [`trajectory`]; [`refiner`] searches a better pose of
-//! > each with a [`swarm`] that minimizes the [`objective`], and finishes with Gauss-Newton
-//! > ([`registration`](crate::registration)); from metres away a [`wide_search`] over [`upright`] surfaces comes
-//! > first; [`smoothing`] combines all frames with the odometry.
+//! > [`TrajectoryRefiner`] takes the frames of a `trajectory`; `refiner` searches a better pose of
+//! > each with a `swarm` that minimizes the `objective`, and finishes with Gauss-Newton
+//! > ([`registration`](crate::registration)); from metres away a `wide_search` over `upright` surfaces comes
+//! > first; `smoothing` combines all frames with the odometry.
 //!
 //! No step makes an estimate worse by its own measure: what does not lower the cost is rejected.
 

@@ -213,6 +213,9 @@ pub struct TrajectoryRefiner {
 
 impl TrajectoryRefiner {
     /// Prepares the refinement of the scans of a sensor in a map. The same seed gives the same trajectory.
+    ///
+    /// # Errors
+    /// The configuration is out of its range.
     pub fn new(
         map: &Map,
         sensor: &Sensor,
@@ -234,6 +237,9 @@ impl TrajectoryRefiner {
     /// Refines the next frame. One whose estimate is uncertain, or whose state is not `Tracking`, is placed from the
     /// frame before by the odometry; where the scan does not agree with the map there, it keeps its estimate, and a
     /// tracked one gets the state `Searching`.
+    ///
+    /// # Errors
+    /// The points do not fit the sensor, or the map cannot be rendered.
     pub fn add(
         &mut self,
         scan: &Scan,
@@ -294,6 +300,9 @@ impl TrajectoryRefiner {
 
     /// Places frames before those that have poses in the map, from the last to the first, by the odometry into each
     /// frame, whose first entry is ignored; `read` reads the scan of a row.
+    ///
+    /// # Errors
+    /// That of `read`, or as [`add`](Self::add).
     pub fn place_backwards<E: From<RefinerError>>(
         &mut self,
         starts: &[InitialEstimate],
@@ -456,6 +465,9 @@ impl TrajectoryRefiner {
 
     /// Smooths the trajectory with the odometry `previous_from_current` into each frame (the first is
     /// ignored), or leaves every frame as its scan determines it where there is none.
+    ///
+    /// # Errors
+    /// There are increments, but not one per frame, or the ground of the map cannot be read.
     pub fn finish(self, increments: Option<&[Pose2]>) -> Result<RefinedTrajectory, RefinerError> {
         let frames = &self.frames;
         let mut poses: Vec<Pose2> = frames.iter().map(|frame| frame.pose).collect();

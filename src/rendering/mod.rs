@@ -26,6 +26,9 @@ pub trait RangeRenderer: Send + Sync {
 
     /// Ranges along the centre rays of all pixels, row-major, one image per pose [m].
     /// Ranges outside the limits of the model are infinite.
+    ///
+    /// # Errors
+    /// A tile of the map cannot be read, memory does not suffice, or the graphics card fails.
     fn render(
         &self,
         map_from_lidar: &[Pose3],
@@ -34,6 +37,9 @@ pub trait RangeRenderer: Send + Sync {
 
     /// Ranges along unit directions of the lidar frame, one row per pose [m]. Surfaces at `until_m` or farther do not
     /// count.
+    ///
+    /// # Errors
+    /// As [`render`](Self::render).
     fn cast(
         &self,
         map_from_lidar: &[Pose3],
@@ -46,6 +52,9 @@ pub trait RangeRenderer: Send + Sync {
     ///
     /// By default those of the plane through the ends of three rays that are close together; rays
     /// whose neighbours hit nothing hit nothing here.
+    ///
+    /// # Errors
+    /// As [`render`](Self::render).
     fn surfaces(
         &self,
         map_from_lidar: &Pose3,
@@ -82,6 +91,9 @@ pub trait RangeRenderer: Send + Sync {
 
     /// Mean [`RangeDifference::cost`] of the beams, one number per pose [m]; nothing is kept
     /// per beam.
+    ///
+    /// # Errors
+    /// As [`render`](Self::render).
     fn compare(
         &self,
         map_from_lidar: &[Pose3],
@@ -91,6 +103,9 @@ pub trait RangeRenderer: Send + Sync {
 
     /// Mean [`RangeDifference::cost`] of the pixels with a return between a measured range image and those that
     /// [`render`](Self::render) renders, one number per pose [m]; 0 without returns.
+    ///
+    /// # Errors
+    /// As [`render`](Self::render).
     fn compare_images(
         &self,
         map_from_lidar: &[Pose3],

@@ -70,6 +70,9 @@ impl Sensor {
     /// The sensor of a recording, from ten of its scans, and from consecutive ones of its middle for the times of the
     /// points where the data have none. What is known takes precedence; a rotation that contradicts the scans is a
     /// warning.
+    ///
+    /// # Errors
+    /// A scan cannot be read, or memory does not suffice to compare the timings of points.
     pub fn infer_recording(
         recording: &Recording,
         known: &SensorConfig,
@@ -186,6 +189,9 @@ impl Sensor {
     }
 
     /// Requires that the points of a scan are in the field of view.
+    ///
+    /// # Errors
+    /// More than a fifth of the points are outside of the field of view of the sensor.
     pub fn require_fit(&self, scan: &Scan) -> Result<(), SensorError> {
         let dropped = DroppedPoints::count(scan, &self.range_image, self.own_car_m);
         let share = dropped.share_outside();

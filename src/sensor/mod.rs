@@ -2,14 +2,14 @@
 //!
 //! | question | answer from |
 //! |---|---|
-//! | [`beams`] and their elevations | the rings of the points, else revolutions in the order of the points, else peaks of the elevations |
-//! | [`columns`], field of view | differences of azimuth along a beam, empty azimuths |
-//! | [`rotation`] and period | azimuth against time; times of scans |
-//! | [`own_car`] | near returns above the ground that stay while everything else moves |
-//! | [`mounting`] | ground segmentation and ground plane, per scan |
-//! | [`projection`] | the above; limits of range from the ranges |
+//! | `beams` and their elevations | the rings of the points, else revolutions in the order of the points, else peaks of the elevations |
+//! | `columns`, field of view | differences of azimuth along a beam, empty azimuths |
+//! | `rotation` and period | azimuth against time; times of scans |
+//! | `own_car` | near returns above the ground that stay while everything else moves |
+//! | `mounting` | ground segmentation and ground plane, per scan |
+//! | `projection` | the above; limits of range from the ranges |
 //!
-//! [`dropped`] counts which points a projection loses, and why. Two returns of one pulse are two points of
+//! `dropped` counts which points a projection loses, and why. Two returns of one pulse are two points of
 //! one direction: they count once for beams and columns, and a range image keeps the nearer one.
 
 mod beam;

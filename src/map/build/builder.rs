@@ -146,6 +146,10 @@ impl MapBuilder {
     ///
     /// Keeps the key scans in memory, about 1.5 MB for each scan of 120,000 points, and the map: in single precision,
     /// which resolves millimetres up to 8 km from its origin.
+    ///
+    /// # Errors
+    /// The configuration is out of its range, a scan cannot be read or does not fit the sensor, the poses are implausible,
+    /// memory does not suffice, or there is no surface.
     pub fn build<E: Into<ScanError>>(
         &self,
         scans: impl IntoIterator<Item = Result<(Scan, Pose3), E>>,
@@ -178,6 +182,9 @@ impl MapBuilder {
 
     /// Adds a newer drive to a map, in whose frame its poses are: what its beams pass through is removed, and what
     /// the map does not have is added. See [`SecondDrive`](crate::localization::SecondDrive) for the poses.
+    ///
+    /// # Errors
+    /// As [`build`](Self::build).
     pub fn extend<E: Into<ScanError>>(
         &self,
         map: &Map,
@@ -205,6 +212,9 @@ impl MapBuilder {
     }
 
     /// Plans the local maps along the poses of the key scans.
+    ///
+    /// # Errors
+    /// The configuration is out of its range, there are no poses, or memory does not suffice.
     pub fn plan(&self, map_from_lidar: Vec<Pose3>) -> Result<MapPlan<'_>, BuildError> {
         let config = &self.config;
         config.validate()?;
@@ -265,6 +275,9 @@ impl MapPlan<'_> {
     }
 
     /// Builds a local map. `read_scan` returns a key scan by its index and is called from any thread.
+    ///
+    /// # Errors
+    /// A scan cannot be read, the poses do not fit the scans, there is no surface, or memory does not suffice.
     pub fn build_local_map(
         &self,
         plan: &LocalMapPlan,
@@ -331,6 +344,9 @@ impl MapPlan<'_> {
     }
 
     /// Prepares the joined mesh of all local maps as a map; `world_from_map` is the identity.
+    ///
+    /// # Errors
+    /// The mesh has no triangles; else as [`Map::new`].
     pub fn finish(self, mesh: TriangleMesh) -> Result<Map, BuildError> {
         if mesh.triangles.is_empty() {
             let scans = self.map_from_lidar.len();

@@ -2,7 +2,7 @@
 
 use crate::geometry::{FARTHEST_M, Pose3};
 
-/// Poses that no car has driven; frames are those given to [`check`].
+/// Poses that no car has driven, with the numbers of their frames.
 #[derive(Debug, thiserror::Error)]
 #[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum ImplausiblePath {

@@ -376,8 +376,8 @@ impl GroundMap {
         Ok(Some(attitude))
     }
 
-    /// Returns the ground under a car at a planar pose; `None` where there is none. The level is
-    /// chosen as in [`patch_at`](Self::patch_at).
+    /// Returns the ground under a car at a planar pose; `None` where there is none. Of several
+    /// levels it is the one at about `level_m` [m], else the lowest that most of the cells nearby have.
     pub fn patch_under(
         &self,
         planar: &Pose2,

@@ -86,6 +86,9 @@ impl fmt::Debug for Bag {
 
 impl Bag {
     /// Opens a bag by its index. An `.mcap` without one is read once, as a whole.
+    ///
+    /// # Errors
+    /// The file cannot be read, or is no bag.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         let bad = |path: &Path, problem| RecordingError::BadBag {
             path: path.to_owned(),
@@ -121,6 +124,9 @@ impl Bag {
     }
 
     /// The topic of a kind that is named, or the only one.
+    ///
+    /// # Errors
+    /// There is no such topic, or there are several and none is named.
     pub fn topic(&self, kind: TopicKind, name: Option<&str>) -> Result<&Topic, RecordingError> {
         let mut found = self.topics_of(kind);
         let (path, types) = (self.path.clone(), kind.types());
@@ -152,6 +158,9 @@ impl Bag {
 
     /// When the scans of a topic were logged [s], ascending. What [`read_scan`](Self::read_scan) returns
     /// has the time of its stamp and its points.
+    ///
+    /// # Errors
+    /// There is no such topic.
     pub fn scan_times(&self, topic: &str) -> Result<Vec<f64>, RecordingError> {
         let messages = &self.topic(TopicKind::Scans, Some(topic))?.messages;
         Ok(messages.iter().map(Message::time_s).collect())
@@ -161,6 +170,9 @@ impl Bag {
     ///
     /// If the points have times, the moment of the scan is the middle of its sweep, else its stamp.
     /// Intensities are as in the message, 0 where it has none.
+    ///
+    /// # Errors
+    /// There is no such topic or scan, or its message cannot be decoded.
     pub fn read_scan(&self, topic: &str, scan: usize) -> Result<Scan, RecordingError> {
         let topic = self.topic(TopicKind::Scans, Some(topic))?;
         let read = self.parse(topic, scan, |message, log_s| {
@@ -179,6 +191,9 @@ impl Bag {
     }
 
     /// Name of the frame of the scans of a topic, from the first of them.
+    ///
+    /// # Errors
+    /// There is no such topic, or its first message cannot be decoded.
     pub fn scan_frame(&self, topic: &str) -> Result<String, RecordingError> {
         let topic = self.topic(TopicKind::Scans, Some(topic))?;
         self.parse(topic, 0, |message, _log_s| {
@@ -188,6 +203,9 @@ impl Bag {
     }
 
     /// Reads the poses of a topic, by time.
+    ///
+    /// # Errors
+    /// There is no such topic, or a message cannot be decoded.
     pub fn poses(&self, topic: &str) -> Result<Vec<FramePose>, RecordingError> {
         let mut poses = self.poses_of(self.topic(TopicKind::Poses, Some(topic))?)?;
         poses.sort_by(|a, b| a.time_s.total_cmp(&b.time_s));
@@ -195,6 +213,9 @@ impl Bag {
     }
 
     /// Reads the transforms that do not change: those of topics `tf_static`, and of latched ones in ROS 1.
+    ///
+    /// # Errors
+    /// A message cannot be decoded.
     pub fn static_transforms(&self) -> Result<Vec<FramePose>, RecordingError> {
         let is_static =
             |topic: &&Topic| topic.is_latched && topic.content == Some(Content::TransformTree);
@@ -205,6 +226,9 @@ impl Bag {
 
     /// `p_body = body_from_lidar * p_lidar`, from the name of the body's frame and that of the scans of
     /// a topic, through the static transforms. `None` if they do not join the frames.
+    ///
+    /// # Errors
+    /// A message of a transform or of the scans cannot be decoded.
     pub fn body_from_lidar(
         &self,
         body: &str,

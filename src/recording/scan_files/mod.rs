@@ -50,6 +50,9 @@ pub struct ReadScan {
 /// Reads a scan with all its points, including invalid ones.
 ///
 /// Intensities are as in the file, 0 where it has none. Times of the points are those after the middle of the sweep.
+///
+/// # Errors
+/// The file cannot be read, or its format is not one of those of scans.
 pub fn read(path: &Path) -> Result<Scan, RecordingError> {
     Ok(read_stamped(path, None)?.scan)
 }
