@@ -73,6 +73,7 @@
 //! | layer | modules |
 //! |---|---|
 //! | foundations | `files`, [`geometry`], [`memory`], `random`, `shared_bytes`, `simd`, `statistics`, [`validation`] |
+//! | texts, feature `configuration` | `configuration` |
 //! | sensor and rays | [`lidar`], `raycasting` |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
 //! | motion | [`odometry`] |
@@ -106,6 +107,9 @@ mod shared_bytes;
 mod simd;
 mod statistics;
 pub mod validation;
+// Configurations as texts.
+#[cfg(feature = "configuration")]
+pub mod configuration;
 // Sensor and rays.
 pub mod lidar;
 mod raycasting;

@@ -3,14 +3,14 @@
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
-use std::collections::BTreeSet;
 use std::fmt::Debug;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use fpmcl::app::settings::{
-    self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
-    Initialization, LocalizationConfig, OdometryCommandConfig, RefinementConfig,
+    self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GivenPosesConfig,
+    GroundCommandConfig, Initialization, LocalizationConfig, MapInputConfig, OdometryCommandConfig,
+    RecordingConfig, RefinementConfig,
 };
 use fpmcl::lidar::LidarModel;
 use fpmcl::sensor::RangeImageConfig;
@@ -77,40 +77,32 @@ fn round_trip<T: CommandConfig + PartialEq + Debug>(path: &Path) {
     assert_eq!(load::<T>(&effective), config, "{}", path.display());
 }
 
-/// Checks that a text has a comment for each of its keys; returns the keys.
-fn explained_keys(name: &str, text: &str) -> BTreeSet<String> {
-    let mut keys = BTreeSet::new();
+/// Checks that a text has a comment for each of its keys: on its line, or above it or its block.
+fn require_comments(name: &str, text: &str) {
     let mut is_commented = false;
     for line in text.lines() {
         let Some(key) = key_of(line) else {
             let is_comment = line.trim_start().starts_with('#');
             is_commented = is_comment || is_commented && !line.is_empty();
-            if !is_comment {
-                keys.extend(keys_in_braces(line).map(str::to_owned));
-            }
             continue;
         };
-        // A comment above explains the block or the keys of the same indentation below it.
         assert!(line.contains(" # ") || is_commented, "{name}: {key}");
-        is_commented &= !line.contains(" # ") && !line.trim_end().ends_with(':');
-        keys.insert(key.to_owned());
-        keys.extend(keys_in_braces(line).map(str::to_owned));
     }
-    keys
 }
 
 /// Checks the texts of a command: both have the defaults, the full one every key, the short one few.
 fn check_texts<T: CommandConfig + PartialEq + Debug>() {
-    assert_eq!(parse::<T>(T::FULL), T::default(), "{}", T::PATH);
+    let full = settings::full_text::<T>().unwrap();
+    assert_eq!(parse::<T>(&full), T::default(), "{}", T::PATH);
     assert_eq!(parse::<T>(T::SHORT), T::default(), "{}", T::PATH);
+    let keys_of = |text: &str| -> Vec<String> {
+        let keys = text.lines().filter_map(key_of);
+        keys.map(str::to_owned).collect()
+    };
     let effective = settings::to_yaml(&T::default()).unwrap();
-    let every_key: BTreeSet<String> = effective
-        .lines()
-        .map(|line| line.replace("- ", "  "))
-        .filter_map(|line| key_of(&line).map(str::to_owned))
-        .collect();
-    assert_eq!(explained_keys(T::PATH, T::FULL), every_key, "{}", T::PATH);
-    explained_keys(T::PATH, T::SHORT);
+    assert_eq!(keys_of(&full), keys_of(&effective), "{}", T::PATH);
+    require_comments(T::PATH, &full);
+    require_comments(T::PATH, T::SHORT);
     let is_leaf = |line: &&str| {
         let code = line.split(" #").next().unwrap_or_default();
         key_of(code).is_some() && !code.trim_end().ends_with(':')
@@ -125,12 +117,6 @@ fn key_of(line: &str) -> Option<&str> {
     key.chars()
         .all(|c| c.is_alphanumeric() || c == '_')
         .then_some(key)
-}
-
-/// The keys in the braces of a line.
-fn keys_in_braces(line: &str) -> impl Iterator<Item = &str> {
-    let value = line.split(" # ").next().unwrap_or_default();
-    value.split(['{', ',']).skip(1).filter_map(key_of)
 }
 
 #[test]
@@ -153,39 +139,50 @@ fn the_built_in_texts_have_the_defaults_and_explain_every_key() {
     check_texts::<SimulationConfig>();
 }
 
+fn recording() -> RecordingConfig {
+    RecordingConfig {
+        scan_folder: "../data/07/velodyne".into(),
+        ..RecordingConfig::default()
+    }
+}
+
+fn poses() -> GivenPosesConfig {
+    GivenPosesConfig {
+        pose_file: Some("../data/07/poses.txt".into()),
+        calib_file: Some("../data/07/calib.txt".into()),
+        ..GivenPosesConfig::default()
+    }
+}
+
 #[test]
 fn the_build_map_file_of_range_mcl_loads_unchanged() {
     let config: BuildMapConfig = load(&root().join("tests/range_mcl/build_map.yml"));
-    let expected = BuildMapConfig {
-        scan_folder: "../data/07/velodyne".into(),
-        pose_file: Some("../data/07/poses.txt".into()),
-        calib_file: Some("../data/07/calib.txt".into()),
+    let mut expected = BuildMapConfig {
+        recording: recording(),
+        given_poses: poses(),
         mesh_file: "../data/mesh_kitti_07.ply".into(),
-        range_image: RangeImageConfig::of(&LidarModel::default()),
         ..BuildMapConfig::default()
     };
+    expected.map.sensor.range_image = RangeImageConfig::of(&LidarModel::default());
     assert_eq!(config, expected);
 }
 
 #[test]
 fn the_localization_file_of_range_mcl_loads_unchanged() {
     let config: LocalizationConfig = load(&root().join("tests/range_mcl/localization.yml"));
-    let expected = LocalizationConfig {
-        scan_folder: "../data/07/velodyne".into(),
-        map_file: "../data/mesh_kitti_07.ply".into(),
-        map_pose_file: Some("../data/07/poses.txt".into()),
-        map_calib_file: Some("../data/07/calib.txt".into()),
-        pose_file: Some("../data/07/poses.txt".into()),
-        calib_file: Some("../data/07/calib.txt".into()),
+    let mut expected = LocalizationConfig {
+        recording: recording(),
+        given_poses: poses(),
+        map_input: MapInputConfig {
+            map_file: "../data/mesh_kitti_07.ply".into(),
+            map_pose_file: Some("../data/07/poses.txt".into()),
+            map_calib_file: Some("../data/07/calib.txt".into()),
+        },
         result_path: "../results/demo_loc_results.npz".into(),
         pose_tracking: Some(false),
-        range_image: RangeImageConfig {
-            max_instance: Some(50),
-            render_instanced: Some(true),
-            ..RangeImageConfig::of(&LidarModel::default())
-        },
         ..LocalizationConfig::default()
     };
+    expected.tracker.sensor.range_image = RangeImageConfig::of(&LidarModel::default());
     assert_eq!(config, expected);
     assert_eq!(config.initialization(), Initialization::Corridor);
 }
@@ -195,8 +192,7 @@ fn the_evaluation_file_of_range_mcl_loads_unchanged() {
     let config: EvaluationConfig = load(&root().join("tests/range_mcl/evaluation.yml"));
     let expected = EvaluationConfig {
         result_file: "../results/demo_loc_results.npz".into(),
-        pose_file: Some("../data/07/poses.txt".into()),
-        calib_file: Some("../data/07/calib.txt".into()),
+        given_poses: poses(),
         ..EvaluationConfig::default()
     };
     assert_eq!(config, expected);

@@ -6,6 +6,7 @@ use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
 use fpmcl::ground::GroundClassifier;
 use fpmcl::lidar::Scan;
 use fpmcl::map::{LocalMapCounts, MapBuilder, MapConfig};
+use fpmcl::sensor::Sensor;
 use fpmcl::simulation::{ScannerConfig, kerb_scene};
 
 /// Classifier with one confidence per scan, which depends on its number of points.
@@ -41,10 +42,12 @@ fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMap
     let mut config = MapConfig::default();
     config.local_map.ground_threshold = ground_threshold;
     config.local_map.poisson.depth = 6;
-    config.local_map.scan.crop_m = Vec3::new(10.0, 10.0, 5.0);
+    (config.local_map.crop_x_m, config.local_map.crop_y_m) = (10.0, 10.0);
     config.local_map.visibility.enabled = false;
     let builder = MapBuilder::new(config);
-    let mut plan = builder.plan(vec![Pose3::identity(); 2]).unwrap();
+    let mut plan = builder
+        .plan(&Sensor::hdl64e(), vec![Pose3::identity(); 2])
+        .unwrap();
     plan.classifier = Box::new(ByScan {
         small,
         large,

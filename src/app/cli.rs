@@ -2,7 +2,6 @@
 
 use anyhow::Context as _;
 use clap::{ArgAction, Args, CommandFactory as _, Parser, Subcommand, ValueEnum};
-use serde::Serialize;
 use tracing::level_filters::LevelFilter;
 
 use crate::app::commands::build_map::{self, BuildMapArgs};
@@ -283,9 +282,10 @@ impl Command {
             Self::Localize(args) => {
                 let (source, base) = (&args.run.source, LocalizationConfig::default);
                 let (config, context) = configured(args, source, "scan_folder", base, context)?;
-                let (result, map) = (&config.result_path, &config.map_file);
+                let (result, map) = (&config.result_path, &config.map_input.map_file);
                 let log = args.mcap.as_ref();
-                let log = log.map(|path| ExportArgs::log_of(result, map, path, config.force));
+                let log =
+                    log.map(|path| ExportArgs::log_of(result, map, path, config.output.force));
                 if let Some(log) = &log {
                     export::check(log, &context)?;
                 }
@@ -353,8 +353,13 @@ impl ManArgs {
 impl ConfigurationArgs {
     /// The configuration file of a command: the keys that people change, or all of them; in JSON, the defaults.
     fn run(&self) -> anyhow::Result<Printed> {
-        fn text<T: CommandConfig + Default + Serialize>(full: bool) -> anyhow::Result<Printed> {
-            Printed::text(if full { T::FULL } else { T::SHORT }).with_json(&T::default())
+        fn text<T: CommandConfig>(full: bool) -> anyhow::Result<Printed> {
+            let text = if full {
+                settings::full_text::<T>()?
+            } else {
+                T::SHORT.to_owned()
+            };
+            Printed::text(text).with_json(&T::default())
         }
         match self.command {
             ConfiguredCommand::BuildMap => text::<BuildMapConfig>(self.full),
@@ -419,8 +424,15 @@ mod tests {
         };
         let arguments = ["own.yml", "--seed", "7", "--set", "n_scans=5", "--force"];
         let config = loaded(&arguments);
-        assert_eq!((config.seed, config.n_scans, config.force), (7, 5, true));
-        assert_eq!(loaded(&["--seed", "7", "--set", "seed=3"]).seed, 7);
+        assert_eq!(
+            (
+                config.tracker.seed,
+                config.recording.frames.n_scans,
+                config.output.force
+            ),
+            (7, 5, true)
+        );
+        assert_eq!(loaded(&["--seed", "7", "--set", "seed=3"]).tracker.seed, 7);
         let evaluation = settings::<EvaluationConfig>(&arguments);
         assert!(!evaluation.iter().any(|(key, _)| key == "seed"));
     }

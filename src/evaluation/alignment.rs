@@ -16,6 +16,7 @@ use crate::geometry::Pose3;
 
 /// Alignment of a trajectory with the truth before its errors are computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Alignment {
     /// None: both are in one frame.

@@ -12,6 +12,7 @@ use super::planar::PlanarError;
 ///
 /// Defaults: half a metre and two degrees, held for ten frames: a second of a 10 Hz sensor.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct StrictSuccess {
     /// Largest position error [m].

@@ -22,8 +22,8 @@ use serde::Serialize;
 use super::surface_distance::distances_m;
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
 use crate::lidar::Scan;
-use crate::map::build::scan_cloud::ScanConfig;
 use crate::raycasting::{Hit, Scene};
+use crate::sensor::Sensor;
 
 /// A residual beyond this is early or late [m].
 const GROSS_M: f32 = 0.5;
@@ -82,20 +82,21 @@ pub fn residuals<E: Send>(
     mesh: &TriangleMesh,
     count: usize,
     read: impl Fn(usize) -> Result<(Scan, Pose3), E> + Sync,
-    settings: &ScanConfig,
+    sensor: &Sensor,
+    crop_m: Vec3,
 ) -> Result<Vec<BeamResidual>, E> {
     let scene = Scene::new(mesh);
     let per_scan = (0..count)
         .into_par_iter()
         .map(|index| {
             let (mut scan, map_from_lidar) = read(index)?;
-            scan.drop_invalid(&settings.range_image);
+            scan.drop_invalid(&sensor.range_image);
             let points: Vec<Vec3> = scan
                 .points
                 .into_iter()
                 .filter(|point| point.length() > NEAREST_M)
                 .step_by(BEAM_STEP)
-                .filter(|point| point.abs().cmplt(settings.crop_m).all())
+                .filter(|point| point.abs().cmplt(crop_m).all())
                 .collect();
             Ok(compare(
                 mesh,

@@ -17,8 +17,8 @@ use serde::Serialize;
 use super::map_quality::NEAR_M;
 use super::surface_distance::distances_m;
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
-use crate::map::build::scan_cloud::ScanConfig;
 use crate::raycasting::{Hit, Scene};
+use crate::sensor::Sensor;
 
 /// Voxel size of the sampling of the truth [m].
 const VOXEL_M: f32 = 0.1;
@@ -45,9 +45,10 @@ impl TruthAgreement {
         mesh: &TriangleMesh,
         truth: &TriangleMesh,
         map_from_lidar: &[Pose3],
-        settings: &ScanConfig,
+        sensor: &Sensor,
+        crop_m: Vec3,
     ) -> Option<Self> {
-        let seen = visible_points(truth, map_from_lidar, settings);
+        let seen = visible_points(truth, map_from_lidar, sensor, crop_m);
         let samples = samples(mesh);
         if seen.is_empty() || samples.is_empty() {
             return None;
@@ -73,9 +74,14 @@ fn near_distances(points: &[Vec3], mesh: &TriangleMesh) -> Vec<f32> {
 }
 
 /// Returns the points where the beams of the pixels hit the truth, one per voxel.
-fn visible_points(truth: &TriangleMesh, poses: &[Pose3], settings: &ScanConfig) -> Vec<Vec3> {
+fn visible_points(
+    truth: &TriangleMesh,
+    poses: &[Pose3],
+    sensor: &Sensor,
+    crop_m: Vec3,
+) -> Vec<Vec3> {
     let scene = Scene::new(truth);
-    let model = &settings.range_image;
+    let model = &sensor.range_image;
     let in_lidar = model.directions();
     let mut taken = HashSet::new();
     let mut seen = Vec::new();
@@ -94,7 +100,7 @@ fn visible_points(truth: &TriangleMesh, poses: &[Pose3], settings: &ScanConfig) 
         );
         for ((hit, direction), in_lidar) in hits.iter().zip(&directions).zip(&in_lidar) {
             let is_inside = model.accepts_range(hit.range_m)
-                && (*in_lidar * hit.range_m).abs().cmple(settings.crop_m).all();
+                && (*in_lidar * hit.range_m).abs().cmple(crop_m).all();
             if !is_inside {
                 continue;
             }
@@ -162,7 +168,14 @@ mod tests {
 
     fn agreement(mesh: &TriangleMesh) -> TruthAgreement {
         let truth = floor(10.0, -1.7);
-        TruthAgreement::new(mesh, &truth, &[Pose3::identity()], &ScanConfig::default()).unwrap()
+        TruthAgreement::new(
+            mesh,
+            &truth,
+            &[Pose3::identity()],
+            &Sensor::hdl64e(),
+            Vec3::new(30.0, 30.0, 5.0),
+        )
+        .unwrap()
     }
 
     #[test]

@@ -23,6 +23,7 @@ pub type ParticleRow = [f32; 4];
 ///
 /// Defaults: the values of range-mcl's `evaluation.yml`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct RangeMclRules {
     /// Interval of the rows whose error decides on success, and number of rows before the first

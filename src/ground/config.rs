@@ -10,6 +10,7 @@ use crate::validation::{InvalidValue, Validate, nested};
 
 /// Method of ground segmentation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum GroundMethod {
     /// [`FuzzyGround`].
@@ -23,6 +24,7 @@ pub enum GroundMethod {
 
 /// The method of ground segmentation and the parameters of every method.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct GroundConfig {
     /// The method that [`classifier`](Self::classifier) builds.
@@ -80,15 +82,6 @@ impl Validate for GroundConfig {
         nested("fuzzy", &self.fuzzy)?;
         nested("pca", &self.pca)?;
         nested("ransac", &self.ransac)
-    }
-}
-
-impl GroundConfig {
-    /// Validates a configuration whose RANSAC keys are at the top level, as in range-mcl's files.
-    pub(crate) fn validate_with_flat_ransac(&self) -> Result<(), InvalidValue> {
-        nested("fuzzy", &self.fuzzy)?;
-        nested("pca", &self.pca)?;
-        self.ransac.validate()
     }
 }
 

@@ -23,6 +23,7 @@ use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive
 
 /// Parameters of the features.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct FeatureConfig {
     /// Minimum distance from a point to the neighbours that its surface is computed from [m].

@@ -20,6 +20,7 @@ const OUTPUT: &str = "ground";
 
 /// Features, linguistic variables and rule base of the fuzzy classifier.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct FuzzyConfig {
     /// Parameters of the features.

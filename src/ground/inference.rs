@@ -18,6 +18,7 @@ use crate::validation::InvalidValue;
 
 /// Method of inference and defuzzification.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Inference {
     /// Implied output sets, and the centroid of their union.

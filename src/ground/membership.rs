@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 /// Fuzzy operators for AND, OR and implication.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Operators {
     /// Minimum for AND and implication, maximum for OR.
@@ -19,6 +20,7 @@ pub enum Operators {
 
 /// The membership function of a fuzzy set, by its corners in ascending order.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum MembershipFunction {
     /// 0 up to the first corner, 1 between the second and the third, 0 from the fourth on.

@@ -16,6 +16,7 @@ use crate::validation::{InvalidValue, Validate, fraction, require};
 ///
 /// Defaults: the values of range-mcl, for a sensor 1.73 m above the road.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct PcaGround {
     /// Minimum |cosine| between the normal of a point and that of the cloud, unitless.

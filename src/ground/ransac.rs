@@ -18,6 +18,7 @@ use crate::validation::{InvalidValue, Validate, in_range, positive};
 ///
 /// Defaults: the values of range-mcl.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct RansacGround {
     /// Maximum distance of ground from the plane [m].

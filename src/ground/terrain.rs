@@ -23,6 +23,7 @@ use super::surface::Shape;
 /// Defaults: nearly as good on each of three labelled drives and on simulated streets as values
 /// that are chosen on the others.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct TerrainConfig {
     /// Change of height that is always accepted, such as a kerb [m].

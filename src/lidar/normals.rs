@@ -29,6 +29,7 @@ use crate::validation::{
 ///
 /// Defaults: values for sensors with about 2 cm of noise.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct NormalConfig {
     /// Desired distance between the pixels of a neighborhood near the sensor [m].

@@ -10,13 +10,16 @@ use super::tempering::TemperingConfig;
 use super::tracking_loss::TrackingLossConfig;
 use crate::ground::GroundConfig;
 use crate::map::PanoramaConfig;
-use crate::validation::{InvalidValue, Validate, at_least_one, in_range, nested, not_negative};
+use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative};
+use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 /// Configuration of the localizer.
 ///
 /// Defaults: numbers of particles and motion threshold of range-mcl.
-#[derive(Clone, Debug, PartialEq, SmartDefault)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
+#[serde(default, deny_unknown_fields)]
 pub struct LocalizerConfig {
     /// Ground segmentation of the scans.
     pub ground: GroundConfig,
@@ -83,26 +86,24 @@ impl LocalizerConfig {
 const MAX_PARTICLES: usize = 1_000_000;
 
 impl Validate for LocalizerConfig {
-    /// Errors have the keys of `localization.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
-        self.ground.validate_with_flat_ransac()?;
-        in_range("numParticles", self.num_particles, 1..=MAX_PARTICLES)?;
+        nested("ground", &self.ground)?;
+        in_range("num_particles", self.num_particles, 1..=MAX_PARTICLES)?;
         in_range("num_reduced", self.num_reduced, 1..=MAX_PARTICLES)?;
-        not_negative("move_thres", self.move_thres_m)?;
+        not_negative("move_thres_m", self.move_thres_m)?;
         not_negative("turn_thres_rad", self.turn_thres_rad)?;
-        nested("odometry_noise", &self.motion)?;
-        nested("velocity_noise", &self.velocity)?;
-        nested("constant_velocity_noise", &self.constant_velocity)?;
-        nested("unknown_velocity_noise", &self.unknown_velocity)?;
+        nested("motion", &self.motion)?;
+        nested("velocity", &self.velocity)?;
+        nested("constant_velocity", &self.constant_velocity)?;
+        nested("unknown_velocity", &self.unknown_velocity)?;
         nested("observation", &self.observation)?;
         nested("tempering", &self.tempering)?;
         nested("places", &self.places)?;
         nested("proposal", &self.proposal)?;
         nested("resampling", &self.resampling)?;
         nested("kld", &self.kld)?;
-        at_least_one("converge_thres", self.convergence.converge_thres)?;
         nested("convergence", &self.convergence)?;
-        nested("vigilance", &self.tracking_loss)?;
+        nested("tracking_loss", &self.tracking_loss)?;
         nested("panorama", &self.panorama)
     }
 }

@@ -14,17 +14,16 @@ use smart_default::SmartDefault;
 
 use super::particles::{ParticleSet, spread};
 use crate::map::TileGrid;
-use crate::validation::{InvalidValue, Validate, positive_or_infinite};
+use crate::validation::{InvalidValue, Validate, at_least_one, positive_or_infinite};
 
 /// Thresholds of convergence.
 ///
 /// Defaults: two tiles, as range-mcl; half a metre and five degrees.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct ConvergenceConfig {
-    /// Number of occupied valid tiles below which the particles have converged; `converge_thres` of
-    /// `localization.yml`.
-    #[serde(skip)]
+    /// Number of occupied valid tiles below which the particles have converged.
     #[default(2)]
     pub converge_thres: usize,
     /// Standard deviation of the position below which they have converged [m]; infinite for range-mcl's
@@ -38,6 +37,7 @@ pub struct ConvergenceConfig {
 
 impl Validate for ConvergenceConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
+        at_least_one("converge_thres", self.converge_thres)?;
         positive_or_infinite("max_spread_m", self.max_spread_m)?;
         positive_or_infinite("max_spread_rad", self.max_spread_rad)
     }

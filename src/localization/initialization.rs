@@ -26,6 +26,7 @@ use crate::validation::{InvalidValue, Validate, not_negative};
 
 /// Shape of the initial distribution.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum StartDistribution {
     /// Uniform within the bound on either side.
@@ -38,6 +39,7 @@ pub enum StartDistribution {
 ///
 /// Defaults: the values of range-mcl: uniform, ±5 m, ±30 degrees.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct StartSpread {
     /// Distribution of each coordinate.
@@ -114,7 +116,8 @@ pub fn from_panoramas(
     let sample = |number: usize| {
         let seed = &seeds[number];
         let position = uniform_in_cell(seed.center, index.config.cell_m, rng);
-        let turn_rad = index.config.yaw_sigma_rad * rng.sample::<f64, _>(StandardNormal)
+        let turn_rad = index.config.yaw_sigma_deg.to_radians()
+            * rng.sample::<f64, _>(StandardNormal)
             + rng.random_range(-half_column_rad..=half_column_rad);
         let map_from_lidar = Pose2::new(position, seed.heading_rad + turn_rad);
         Particle::new(map_from_lidar, Some(seed.level_m))

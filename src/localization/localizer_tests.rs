@@ -255,7 +255,10 @@ fn an_invalid_configuration_is_an_error_that_names_its_key() {
         result.err().unwrap().to_string()
     };
     let no_particles = message(|config| config.num_particles = 0);
-    assert!(no_particles.contains("numParticles is 0"), "{no_particles}");
+    assert!(
+        no_particles.contains("num_particles is 0"),
+        "{no_particles}"
+    );
     let no_scale = message(|config| config.observation.scale_m = -1.0);
     assert!(no_scale.contains("observation.scale_m is -1"), "{no_scale}");
 }
@@ -272,7 +275,7 @@ fn library_and_program_refuse_the_same_values() {
     assert!(refused(|sensor| sensor.sensor_height_m = Some(f64::NAN)).contains("sensor_height_m"));
     assert!(refused(|sensor| sensor.own_car_m = [1.0, -1.0, 0.0, 1.0]).contains("own_car"));
     let mut config = LocalizerConfig::default();
-    config.panorama.yaw_sigma_rad = -1.0;
+    config.panorama.yaw_sigma_deg = -1.0;
     let error = config.validate().unwrap_err().to_string();
     assert!(error.contains("yaw_sigma"));
 }

@@ -37,6 +37,7 @@ use crate::validation::{InvalidValue, Validate, not_negative};
 /// Defaults: the values of range-mcl, twice the lateral error of a good odometry, 1 cm, and per metre those
 /// of a poor one.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct OdometryNoise {
     /// Standard deviation of each of the two turns [rad].
@@ -165,6 +166,7 @@ impl TurnDriveTurn {
 ///
 /// Defaults: at ten commands per second, the forward and heading noise of [`OdometryNoise`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct VelocityNoise {
     /// Standard deviation of the forward speed [m/s].

@@ -26,6 +26,7 @@ use crate::validation::{
 
 /// Form of the likelihood.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Likelihood {
     /// Gaussian of the mean |difference| of whole range images without limits, as in range-mcl.
@@ -38,6 +39,7 @@ pub enum Likelihood {
 ///
 /// Defaults: robust; see [`reference`](Self::reference) for the published values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct ObservationConfig {
     /// Form of the likelihood.

@@ -23,6 +23,7 @@ use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive
 ///
 /// Defaults: values of this project.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct PlacesConfig {
     /// Largest number of places that are registered in a frame.

@@ -31,6 +31,7 @@ use crate::validation::{InvalidValue, Validate, fraction, in_range, nested, posi
 ///
 /// Defaults: values of this project.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct ProposalConfig {
     /// Whether the scan is part of the proposal; otherwise the prediction alone is, as in range-mcl.

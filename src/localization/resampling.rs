@@ -28,6 +28,7 @@ use crate::validation::{InvalidValue, Validate, fraction, not_negative, positive
 /// Defaults: range-mcl's 0.75; half the optimal kernel, since the distribution is narrower than the Gaussian
 /// with its covariance.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct ResamplingConfig {
     /// Share of the particles below which the effective sample size triggers resampling (unitless).
@@ -57,6 +58,7 @@ impl Validate for ResamplingConfig {
 ///
 /// Defaults: ε and z of Fox (2003), section 4: 0.05 with probability 0.99; bins of 0.5 m and 10 degrees.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct KldConfig {
     /// Bound on the Kullback-Leibler distance between particles and distribution, ε (unitless).

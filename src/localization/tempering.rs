@@ -21,6 +21,7 @@ use crate::validation::{InvalidValue, Validate, fraction, in_range};
 ///
 /// Defaults: values of this project.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct TemperingConfig {
     /// Smallest share of effective particles that a frame may leave (unitless); 0 uses the likelihood

@@ -9,6 +9,7 @@
 
 use std::borrow::Cow;
 
+use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::config::LocalizerConfig;
@@ -23,7 +24,9 @@ use crate::sensor::{Sensor, SensorConfig, SensorError, TIMING_SCANS};
 use crate::validation::{InvalidValue, Validate, nested};
 
 /// Configuration of a tracker.
-#[derive(Clone, Debug, PartialEq, SmartDefault)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
+#[serde(default, deny_unknown_fields)]
 pub struct TrackerConfig {
     /// What is known about the sensor; the rest is inferred from the scans.
     pub sensor: SensorConfig,
@@ -39,7 +42,7 @@ pub struct TrackerConfig {
 impl Validate for TrackerConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         nested("sensor", &self.sensor)?;
-        self.localizer.validate()?;
+        nested("localizer", &self.localizer)?;
         match &self.odometry {
             Some(odometry) => nested("odometry", odometry),
             None => Ok(()),

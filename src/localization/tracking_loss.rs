@@ -55,6 +55,7 @@ impl State {
 ///
 /// Defaults: values of this project.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct TrackingLossConfig {
     /// Largest difference of an agreeing beam [m].

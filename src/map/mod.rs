@@ -22,7 +22,7 @@ pub use build::config::{MapConfig, MapOptions, PoseSource};
 pub use build::local_map::{LocalMap, LocalMapConfig, LocalMapCounts};
 pub use build::path_check::ImplausiblePath;
 pub use build::plan::LocalMapPlan;
-pub use build::scan_cloud::{PointCounts, ScanConfig};
+pub use build::scan_cloud::PointCounts;
 pub use build::visibility::VisibilityConfig;
 pub use files::mapping_path::{BadPathComment, MappingPath};
 pub use files::mesh_error::{MeshFileError, MeshFileProblem};

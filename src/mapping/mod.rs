@@ -19,7 +19,7 @@ pub use error::MappingError;
 pub use pose_report::{PoseReport, Tilt};
 pub use trajectory::{LoopCounts, TrajectorySummary};
 
-pub(crate) use poses::{check_path, key_frames, localizer, poses_of, with_given_poses};
+pub(crate) use poses::{check_path, key_frames, poses_of, with_given_poses};
 pub(crate) use trajectory::{ADJUSTMENT, find_poses, find_poses_in};
 
 use crate::map::{BuildError, Map, MapBuilder, MapConfig, MappingPath, PoseSource};
@@ -79,7 +79,7 @@ pub fn map_recording(
     let given = with_given_poses(recording.clone(), builder.config.poses, world.as_ref())?;
     check_path(&given, builder.config.max_step_m)?;
     let sensor = Sensor::infer_recording(&given, &builder.config.sensor)?;
-    builder.config.set_sensor(&sensor);
+    builder.sensor = Some(sensor.clone());
     let mut recording = sensor.applied_to(given);
     let mut poses = None;
     if recording.track.is_some() && builder.config.check_poses {
@@ -89,7 +89,7 @@ pub fn map_recording(
     }
     let mut trajectory = None;
     if recording.track.is_none() || builder.config.poses == PoseSource::Polished {
-        let (frames, found) = found_poses(&recording, older, &builder)?;
+        let (frames, found) = found_poses(&recording, older, &sensor, &builder)?;
         let world_from_map = world.unwrap_or(recording.world().0);
         recording = recording.with_poses_of(&frames, found.poses.clone(), world_from_map)?;
         check_path(&recording, builder.config.max_step_m)?;
@@ -108,6 +108,7 @@ pub fn map_recording(
 fn found_poses(
     recording: &Recording,
     older: Option<&Map>,
+    sensor: &Sensor,
     builder: &MapBuilder,
 ) -> Result<(Vec<Frame>, Trajectory), MappingError> {
     let config = TrajectoryConfig::default();
@@ -117,7 +118,7 @@ fn found_poses(
         recording.dense_frames()
     };
     let found = match older {
-        Some(map) => find_poses_in(map, &frames, &builder.config, &builder.on_event)?,
+        Some(map) => find_poses_in(map, &frames, sensor, &builder.config, &builder.on_event)?,
         None => find_poses(
             &frames,
             recording.track.is_some(),

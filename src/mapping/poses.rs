@@ -1,12 +1,10 @@
 //! Poses of a recording on its way into a map.
 
 use crate::geometry::Pose3;
-use crate::localization::LocalizerConfig;
+use crate::map::PoseSource;
 use crate::map::build::path_check::{self, ImplausiblePath};
 use crate::map::build::plan::key_scans;
-use crate::map::{MapConfig, PoseSource};
 use crate::recording::{Frame, Recording, RecordingError};
-use crate::sensor::Sensor;
 
 /// The recording with the poses that were given to it, else its own ones; without poses where these are to be found from
 /// the scans. `older` is the pose `world_from_map` of the map to which the recording is added, in whose world its poses
@@ -53,19 +51,4 @@ pub fn key_frames(frames: &[Frame], displacement_m: f64) -> Vec<Frame> {
 pub fn poses_of(frames: &[Frame]) -> Vec<Pose3> {
     let poses = frames.iter().map(|frame| frame.map_from_lidar);
     poses.map(Option::unwrap_or_default).collect()
-}
-
-/// How scans are localized in a map to which they are added, and their sensor.
-pub fn localizer(config: &MapConfig) -> (Sensor, LocalizerConfig) {
-    let scan = &config.local_map.scan;
-    let sensor = Sensor {
-        has_rows: scan.has_rows,
-        own_car_m: scan.own_car_m,
-        ..Sensor::new(scan.range_image.clone())
-    };
-    let localizer = LocalizerConfig {
-        ground: config.ground.clone(),
-        ..LocalizerConfig::default()
-    };
-    (sensor, localizer)
 }

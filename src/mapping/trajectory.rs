@@ -5,14 +5,14 @@ use std::ops::ControlFlow;
 use serde::{Deserialize, Serialize};
 
 use super::error::MappingError;
-use super::poses::localizer;
 use crate::lidar::Scan;
-use crate::localization::{SecondDrive, SecondDriveError, Tracker, TrackerConfig};
+use crate::localization::{LocalizerConfig, SecondDrive, SecondDriveError, Tracker, TrackerConfig};
 use crate::map::{BuildEvent, Map, MapConfig};
 use crate::odometry::{
     ElevationBias, LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig,
 };
 use crate::recording::Frame;
+use crate::sensor::Sensor;
 
 /// The stage after the last scan.
 pub const ADJUSTMENT: &str = "loops and adjustment";
@@ -41,25 +41,28 @@ pub fn find_poses(
     Ok(builder.finish()?)
 }
 
-/// Finds the poses of frames in a map.
+/// Finds the poses of frames of a sensor in a map.
 ///
 /// Its events are the stage `"localize"`, every scan, and the stage [`ADJUSTMENT`].
 pub fn find_poses_in(
     map: &Map,
     frames: &[Frame],
+    sensor: &Sensor,
     config: &MapConfig,
     on_event: OnEvent,
 ) -> Result<Trajectory, MappingError> {
     let settings = TrajectoryConfig::default();
-    let (sensor, localizer) = localizer(config);
     let tracker = TrackerConfig {
-        localizer,
+        localizer: LocalizerConfig {
+            ground: config.ground.clone(),
+            ..LocalizerConfig::default()
+        },
         odometry: None,
         seed: config.seed,
         ..TrackerConfig::default()
     };
     let tracker = Tracker::new(map, tracker).map_err(SecondDriveError::from)?;
-    let drive = SecondDrive::new(tracker.with_sensor(sensor), settings);
+    let drive = SecondDrive::new(tracker.with_sensor(sensor.clone()), settings);
     let mut drive = drive.map_err(SecondDriveError::from)?;
     each_scan("localize", frames, on_event, |_, scan| {
         drive.add(scan)?;

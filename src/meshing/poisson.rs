@@ -35,11 +35,10 @@ use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive
 /// Defaults: `scale` and `samples_per_node` are Open3D's values, `depth` is range-mcl's. α is per area of a
 /// cell face here; in `benches/poisson.rs` 10 is the best compromise of error and coverage.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct PoissonConfig {
-    /// Depth of the finest cells, the number of bisections of the cube, 3 to 12; `depth` of
-    /// `build_map.yml`.
-    #[serde(skip)]
+    /// Depth of the finest cells, the number of bisections of the cube, 3 to 12.
     #[default(9)]
     pub depth: u32,
     /// Edge of the cube over the longest edge of the points' bounding box, 1.05 to 10 (unitless).

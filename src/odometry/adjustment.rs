@@ -35,6 +35,7 @@ use crate::validation::{InvalidValue, Validate, in_range, positive};
 ///
 /// Defaults: our own values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct AdjustmentConfig {
     /// Edge of a voxel, in voxels of the odometry.

@@ -9,6 +9,7 @@ use crate::validation::{InvalidValue, Validate, at_least_one, in_range, positive
 ///
 /// Defaults: our own values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct OdometryConfig {
     /// Edge of a voxel of the local map, as a share of the range (unitless).

@@ -22,6 +22,7 @@ use crate::validation::{InvalidValue, Validate, in_range, nested};
 ///
 /// Defaults: our own values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct TrajectoryConfig {
     /// The odometry.

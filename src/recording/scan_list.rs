@@ -15,6 +15,7 @@ use crate::validation::{InvalidValue, Validate, require};
 ///
 /// Defaults: every frame.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct Selection {
     /// First frame.

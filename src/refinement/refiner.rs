@@ -24,6 +24,7 @@ use crate::validation::{
 
 /// Steps of the refinement of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Method {
     /// No step; the estimate is kept.
@@ -40,6 +41,7 @@ pub enum Method {
 ///
 /// Defaults: both steps; the bounds are of this project.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct FrameRefinementConfig {
     /// Steps of the refinement of a frame.

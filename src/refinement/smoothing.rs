@@ -24,6 +24,7 @@ use crate::validation::{InvalidValue, Validate, in_range, positive};
 /// Defaults: an odometry of KITTI's quality: 2 cm and 0.06 degrees per frame. Where the measured poses of neighbours
 /// show that it is worse, it is taken as worse.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct SmoothingConfig {
     /// Least standard deviation of the odometry along the car, per frame [m].

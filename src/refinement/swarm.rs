@@ -22,6 +22,7 @@ use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive
 ///
 /// Defaults: ω, φ_p, φ_g and the number of iterations of Fuzzy-PSO-MCL, which gives no size and no bounds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct SwarmConfig {
     /// Number of candidates.

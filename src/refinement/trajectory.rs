@@ -16,6 +16,7 @@ use std::sync::{Arc, Weak};
 
 use glam::DVec3;
 use nalgebra::{Matrix3, Vector2, Vector3};
+use serde::{Deserialize, Serialize};
 
 use super::objective::FrameObjective;
 use super::refiner::{Distance, FrameRefinementConfig, refine_frame};
@@ -33,7 +34,9 @@ use crate::sensor::{Sensor, SensorError};
 use crate::validation::{InvalidValue, Validate, nested};
 
 /// Configuration of the refinement of a trajectory.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
+#[serde(default, deny_unknown_fields)]
 pub struct RefinerConfig {
     /// Ground segmentation of the scans.
     pub ground: GroundConfig,
@@ -44,9 +47,8 @@ pub struct RefinerConfig {
 }
 
 impl Validate for RefinerConfig {
-    /// Errors have the keys of `refinement.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
-        self.ground.validate_with_flat_ransac()?;
+        nested("ground", &self.ground)?;
         nested("observation", &self.observation)?;
         nested("refinement", &self.refinement)
     }

@@ -30,6 +30,7 @@ use crate::validation::{InvalidValue, Validate, in_range, nested, positive};
 ///
 /// Defaults: our own values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct WideSearchConfig {
     /// Swarms, each of which may end in another minimum.

@@ -40,6 +40,7 @@ use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive
 
 /// Components of the pose that registration estimates.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum DegreesOfFreedom {
     /// x, y and heading, in the plane of the road.
@@ -52,6 +53,7 @@ pub enum DegreesOfFreedom {
 ///
 /// Defaults: our own values; from 1.5 degrees away it takes up to ten iterations.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct RegistrationConfig {
     /// Estimated components of the pose.

@@ -19,6 +19,7 @@ pub enum Backend {
 
 /// Requested method to render whole range images on a graphics adapter, `rendering.method`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum RenderingMethod {
     /// The faster one, by a measurement; on the CPU rays.

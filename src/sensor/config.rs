@@ -7,10 +7,11 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use crate::lidar::{LidarModel, Rotation, RotationDirection};
-use crate::validation::{InvalidValue, Validate, in_range, nested, positive, rectangle};
+use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 
 /// What is known about a sensor, with the names of the configuration; what is `None` is inferred from the scans.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct SensorConfig {
     /// Size and limits of the range images.
@@ -39,6 +40,7 @@ impl Validate for SensorConfig {
 
 /// Times of points that the data do not have, for motion compensation.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(try_from = "String", into = "String")]
 pub enum MotionCompensation {
     /// Times of the data, else the rotation that fits consecutive scans best.
@@ -141,6 +143,7 @@ impl TryFrom<String> for MotionCompensation {
 
 /// Size and limits of the range images; `None` is inferred from the scans.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct RangeImageConfig {
     /// Rows.
@@ -161,10 +164,6 @@ pub struct RangeImageConfig {
     /// Whether each beam keeps its elevation, as those of spinning sensors do; otherwise `build-map` takes normals
     /// from neighbours in space.
     pub has_rows: Option<bool>,
-    /// Number of particles that `localize` renders at once.
-    pub max_instance: Option<usize>,
-    /// Whether `localize` renders the particles in batches instead of one by one.
-    pub render_instanced: Option<bool>,
 }
 
 impl RangeImageConfig {
@@ -205,45 +204,10 @@ impl RangeImageConfig {
     pub(crate) fn model(&self) -> LidarModel {
         self.model_over(&LidarModel::default())
     }
-
-    /// Sets what is not given.
-    pub fn resolve(&mut self, inferred: &LidarModel, has_rows: bool) {
-        let (max_instance, render_instanced) = (self.max_instance, self.render_instanced);
-        *self = Self {
-            has_rows: self.has_rows.or(Some(has_rows)),
-            max_instance,
-            render_instanced,
-            ..Self::of(&self.model_over(inferred))
-        };
-    }
-
-    /// Requires that the keys of the batches, which only `localize` renders, are not given.
-    pub(crate) fn without_batches(&self) -> Result<(), InvalidValue> {
-        const REMEDY: &str = "only localize renders in batches; remove the key";
-        if let Some(value) = self.max_instance {
-            return Err(InvalidValue::new("range_image.max_instance", value, REMEDY));
-        }
-        let Some(value) = self.render_instanced else {
-            return Ok(());
-        };
-        let key = "range_image.render_instanced";
-        Err(InvalidValue::new(key, value, REMEDY))
-    }
-
-    /// Number of particles that are rendered at once.
-    pub(crate) fn batch_size(&self) -> usize {
-        match self.render_instanced {
-            Some(false) => 1,
-            _ => self.max_instance.unwrap_or(1024),
-        }
-    }
 }
 
 impl Validate for RangeImageConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        if let Some(max_instance) = self.max_instance {
-            in_range("max_instance", max_instance, 1..=1_000_000)?;
-        }
         self.model().validate()
     }
 }

@@ -6,6 +6,7 @@ use crate::lidar::{LidarModel, Projection, RangeImage, Scan};
 
 /// Number of points of a scan that a range image loses, by reason; kept and lost ones are all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct DroppedPoints {
     /// Points of the scan.

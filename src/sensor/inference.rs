@@ -13,7 +13,7 @@ use crate::odometry::{OdometryConfig, TimingComparison, TimingError, compare_tim
 use crate::recording::{Frame, Recording, RecordingError};
 
 /// Number of scans from which a sensor is inferred.
-const SENSOR_SCANS: usize = 10;
+pub const SENSOR_SCANS: usize = 10;
 
 /// Number of consecutive scans that show the times of points.
 pub const TIMING_SCANS: usize = 16;
@@ -107,8 +107,6 @@ impl Sensor {
         let range_image = known.range_image.model();
         let given = RangeImageConfig {
             has_rows: None,
-            max_instance: None,
-            render_instanced: None,
             ..known.range_image.clone()
         };
         let own_car_m = known.own_car_m?;

@@ -35,7 +35,7 @@ pub use dropped::{DropReason, DroppedPoints};
 pub use inference::SensorError;
 pub use mounting::Mounting;
 
-pub(crate) use inference::{TIMING_SCANS, spread_scans};
+pub(crate) use inference::{SENSOR_SCANS, TIMING_SCANS, spread_scans};
 
 use crate::lidar::{LidarModel, RotationDirection};
 use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};

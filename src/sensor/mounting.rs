@@ -12,6 +12,7 @@ use crate::lidar::Scan;
 
 /// Height and tilt of a sensor: medians over the scans, and their spread.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Mounting {
     /// Height above the ground, along its normal [m].

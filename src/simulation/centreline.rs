@@ -21,6 +21,7 @@ pub(super) const SHORTEST_M: f64 = 10.0;
 
 /// A piece of the driven path: an arc (straight where `turn_deg` is 0) of constant grade.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct PathSegment {
     /// Length of the arc [m].

@@ -19,6 +19,7 @@ use crate::validation::{InvalidValue, Validate, in_range, nested, require};
 ///
 /// Defaults: 260 m through a small town, up a slope and over a crest, past a square.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct SimulationConfig {
     /// Folder of the drives: drive n is written to `drive_n` below it.

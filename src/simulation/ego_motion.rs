@@ -31,6 +31,7 @@ const LANE_OFFSETS_M: [f64; 5] = [0.0, 0.4, -0.4, 0.25, -0.25];
 ///
 /// Defaults: the vehicle of KITTI at a residential speed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct MotionConfig {
     /// Mean speed on a path of segments; a recorded path has its own [m/s].

@@ -24,6 +24,7 @@ use crate::validation::{InvalidValue, Validate, in_range};
 ///
 /// Defaults: none.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct GivenPosesConfig {
     /// Standard deviation of each component of a position [m].

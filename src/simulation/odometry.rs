@@ -20,6 +20,7 @@ use crate::validation::{InvalidValue, Validate, in_range};
 ///
 /// Defaults: a good wheel odometry: 1 % too long, one degree in 100 m.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct SimulatedOdometryConfig {
     /// Relative error of distances (s), positive if they are too long.

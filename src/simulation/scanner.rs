@@ -36,6 +36,7 @@ const STEPS_PER_POSE: usize = 8;
 ///
 /// Defaults: a Velodyne HDL-64E at 10 revolutions per second.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct ScannerConfig {
     /// Number of beams of the HDL-64E that are used, evenly chosen: 64, 32, 16, ...

@@ -10,6 +10,7 @@ use crate::validation::{InvalidValue, Validate, fraction, in_range, nested};
 ///
 /// Defaults: a residential street.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct StreetConfig {
     /// Width of each of the two lanes [m].
@@ -45,6 +46,7 @@ pub struct StreetConfig {
 ///
 /// Defaults: nothing.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct ChangesConfig {
     /// Whether other cars are parked in the bays.
@@ -106,6 +108,7 @@ impl Validate for StreetConfig {
 ///
 /// Defaults: a residential street.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct CrossSectionConfig {
     /// Edge of the square grid cells of the ground [m].

@@ -18,6 +18,7 @@ const REFLECTANCE: f32 = 0.5;
 ///
 /// Defaults: a wall of 20 m, 2 m high, 3.5 m to the right of the path.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct Structure {
     /// Station of its start on the path [m]; before the path if negative.

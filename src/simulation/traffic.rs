@@ -22,6 +22,7 @@ const VISIBLE_M: f64 = 90.0;
 ///
 /// Defaults: a town in the afternoon.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct TrafficConfig {
     /// Whether a vehicle drives ahead during the whole drive.

@@ -12,7 +12,12 @@ use super::{build_map, localize, refine};
 use crate::app::run::Context;
 use crate::app::run::machine::MachineArgs;
 use crate::app::run::output::{Form, Printed};
-use crate::app::settings::{BuildMapConfig, LocalizationConfig, OdometrySource, RefinementConfig};
+use crate::app::settings::{
+    BuildMapConfig, GivenPosesConfig, LocalizationConfig, MapInputConfig, MotionConfig,
+    OdometrySource, OutputConfig, RecordingConfig, RefinementConfig,
+};
+use crate::localization::TrackerConfig;
+use crate::map::MapConfig;
 use crate::simulation::SimulationConfig;
 
 /// Arguments of `demo`.
@@ -86,16 +91,35 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Printed> {
     }))
 }
 
-fn build_map_config(output: &Path, drive: &Path, seed: u64) -> BuildMapConfig {
-    BuildMapConfig {
+fn recording(drive: &Path) -> RecordingConfig {
+    RecordingConfig {
         scan_folder: drive.join("velodyne"),
+        ..RecordingConfig::default()
+    }
+}
+
+fn true_poses(drive: &Path) -> GivenPosesConfig {
+    GivenPosesConfig {
         pose_file: Some(drive.join("poses.txt")),
         calib_file: Some(drive.join("calib.txt")),
+        ..GivenPosesConfig::default()
+    }
+}
+
+fn build_map_config(output: &Path, drive: &Path, seed: u64) -> BuildMapConfig {
+    BuildMapConfig {
+        recording: recording(drive),
+        given_poses: true_poses(drive),
         mesh_file: output.join("map.ply"),
-        visualize: false,
         holdout_step: 10,
-        seed,
-        force: true,
+        map: MapConfig {
+            seed,
+            ..MapConfig::default()
+        },
+        output: OutputConfig {
+            plots: false,
+            force: true,
+        },
         ..BuildMapConfig::default()
     }
 }
@@ -106,18 +130,29 @@ fn localization_config(
     drive: &Path,
     seed: u64,
 ) -> LocalizationConfig {
+    let mut tracker = TrackerConfig {
+        seed,
+        ..TrackerConfig::default()
+    };
+    tracker.localizer.num_particles = 1000;
     LocalizationConfig {
-        scan_folder: drive.join("velodyne"),
-        pose_file: Some(drive.join("poses.txt")),
-        calib_file: Some(drive.join("calib.txt")),
-        map_file: map.mesh_file.clone(),
+        recording: recording(drive),
+        given_poses: true_poses(drive),
+        map_input: MapInputConfig {
+            map_file: map.mesh_file.clone(),
+            ..MapInputConfig::default()
+        },
         result_path: output.join("localization.npz"),
         pose_tracking: Some(true),
-        num_particles: 1000,
-        odometry: OdometrySource::File,
-        odometry_file: Some(drive.join("odometry.txt")),
-        seed,
-        force: true,
+        motion: MotionConfig {
+            odometry: OdometrySource::File,
+            odometry_file: Some(drive.join("odometry.txt")),
+        },
+        tracker,
+        output: OutputConfig {
+            force: true,
+            ..OutputConfig::default()
+        },
         ..LocalizationConfig::default()
     }
 }

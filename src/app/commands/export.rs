@@ -9,6 +9,7 @@ use anyhow::{Context as _, Result, ensure};
 
 pub use self::arguments::ExportArgs;
 use super::refine;
+use super::stages::{RecordingInputs, complete};
 use crate::app::report::export::tiles::TILES_FOLDER;
 use crate::app::report::export::{Model, Ribbon, RunLog, write_mcap};
 use crate::app::report::plotting::color::{Colormap, TRUTH};
@@ -60,8 +61,11 @@ pub fn check(args: &ExportArgs, context: &Context) -> Result<Vec<(Claims, PathBu
         ("--pcd", &metadata, None, &[TILES_FOLDER]),
     ];
     let base = refine::base_config(Some(&args.input));
-    let map = args.map.as_deref().unwrap_or(&base.map_file);
-    let recording = args.recording.as_deref().unwrap_or(&base.scan_folder);
+    let map = args.map.as_deref().unwrap_or(&base.map_input.map_file);
+    let recording = args
+        .recording
+        .as_deref()
+        .unwrap_or(&base.recording.scan_folder);
     let inputs = [
         ("the input", args.input.as_path()),
         ("the map", map),
@@ -112,13 +116,16 @@ fn export_result(args: &ExportArgs, context: &Context) -> Result<Vec<(&'static s
     run_output::warn_of_shortfall(&results, &args.input);
     let mut config = refine::base_config(Some(&args.input));
     if let Some(map) = &args.map {
-        config.map_file.clone_from(map);
+        config.map_input.map_file.clone_from(map);
     }
     if let Some(recording) = &args.recording {
-        config.scan_folder.clone_from(recording);
+        config.recording.scan_folder.clone_from(recording);
     }
-    input::require_file("the map of the result (--map MAP)", &config.map_file)?;
-    let (mesh, path) = mesh_file::read(&config.map_file)?;
+    input::require_file(
+        "the map of the result (--map MAP)",
+        &config.map_input.map_file,
+    )?;
+    let (mesh, path) = mesh_file::read(&config.map_input.map_file)?;
     if args.glb.is_some() {
         write_model(args, &model_of(&mesh, &results)?)?;
     }
@@ -157,15 +164,15 @@ fn write_log(path: &Path, run: &RunLog, context: &Context) -> Result<()> {
 
 /// The frames of a result in its recording.
 fn frames_of(config: &mut RefinementConfig, results: &LocalizationResults) -> Result<Vec<Frame>> {
-    let recording = config.recording_inputs().open(&config.selection());
+    let recording = RecordingInputs::new(&config.recording, &config.given_poses).open();
     let recording = recording.context("the scans of the result cannot be read; give --recording RECORDING, or --points 0 for a log without scans")?;
-    let (recording, _) = config.sensor_keys().resolve(recording)?;
+    let (recording, _) = complete(&mut config.sensor, recording)?;
     let mut frames = recording.frames;
     frames.retain(|frame| results.frames.binary_search(&frame.number).is_ok());
     ensure!(
         frames.len() == results.len(),
         "{} has {} of the {} frames of the result; give --recording RECORDING",
-        config.scan_folder.display(),
+        config.recording.scan_folder.display(),
         frames.len(),
         results.len()
     );

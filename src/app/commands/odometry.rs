@@ -6,7 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use serde::Serialize;
 
-use super::stages::SensorKeys;
+use super::stages::{RecordingInputs, complete};
 use super::trajectory;
 use crate::app::report::odometry::{self, OdometryReport};
 use crate::app::report::run_output::RunFiles;
@@ -17,7 +17,7 @@ use crate::app::run::{Context, output};
 use crate::app::settings::OdometryCommandConfig;
 use crate::mapping::find_poses;
 use crate::recording::Recording;
-use crate::sensor::{RangeImageConfig, Sensor};
+use crate::sensor::{Sensor, SensorConfig};
 
 /// Arguments of `odometry`.
 #[derive(Clone, Debug, Args, Serialize)]
@@ -45,7 +45,7 @@ pub struct OdometryArgs {
 
 /// Finds the poses of the recording that a configuration names; returns what to print.
 pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed> {
-    config.recording_inputs().require()?;
+    RecordingInputs::new(&config.recording, &config.given_poses).require()?;
     let folder = &config.output_folder;
     let mut claims = prepare(config, context)?;
     let mut resolved = config.clone();
@@ -69,7 +69,7 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
         &rows,
         &found,
     )?;
-    if config.visualize {
+    if config.output.plots {
         odometry::draw(&folder.join("path.png"), &found, is_given)?;
     }
     let report = OdometryReport::new(&found, &frames, recording.has_times, sensor);
@@ -89,8 +89,8 @@ fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> 
         "frames.csv",
         "effective_odometry.yml",
     ];
-    names.extend(config.visualize.then_some("path.png"));
-    let mut inputs = config.recording_inputs().files();
+    names.extend(config.output.plots.then_some("path.png"));
+    let mut inputs = RecordingInputs::new(&config.recording, &config.given_poses).files();
     inputs.extend(context.input());
     let outputs = Outputs {
         key: "output_folder",
@@ -98,26 +98,27 @@ fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> 
         magic: None,
         names: names.into_iter().map(str::to_owned).collect(),
         inputs,
-        force: config.force,
+        force: config.output.force,
     };
     outputs.prepare()
 }
 
 /// Opens the recording, with the poses to polish if there are any.
 fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Sensor)> {
-    let inputs = config.recording_inputs();
-    let mut recording = inputs.open(&config.selection())?;
-    if let Some(path) = &config.pose_file {
+    let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
+    let mut recording = inputs.open()?;
+    if let Some(path) = &config.given_poses.pose_file {
         let track = inputs.track(path, &recording)?;
         recording = recording.with_poses(track)?;
         let origin = format!("pose_file is {}", path.display());
         trajectory::check(&recording, config.max_step_m, &origin)?;
         recording.skipped.clear();
     }
-    let keys = SensorKeys {
-        range_image: &mut RangeImageConfig::default(),
-        own_car_m: &mut None,
-        motion_compensation: &mut config.motion_compensation,
+    let mut known = SensorConfig {
+        motion_compensation: config.motion_compensation,
+        ..SensorConfig::default()
     };
-    keys.resolve(recording)
+    let completed = complete(&mut known, recording)?;
+    config.motion_compensation = known.motion_compensation;
+    Ok(completed)
 }

@@ -10,6 +10,7 @@ use serde::Serialize;
 
 use super::motion_source;
 use super::motion_source::MotionSource;
+use super::stages::{RecordingInputs, input_files};
 use crate::app::report::results::{LocalizationResults, Report};
 use crate::app::report::run_output::{self, REFINEMENT_FILES, REPORT_FILES, RunFiles};
 use crate::app::report::run_page;
@@ -17,7 +18,9 @@ use crate::app::run::arguments::{RunArgs, numbers};
 use crate::app::run::artefact::{Claims, NPZ, Outputs};
 use crate::app::run::interrupt::Interrupted;
 use crate::app::run::{Context, input, output};
-use crate::app::settings::{self, LocalizationConfig, OdometrySource, RefinementConfig};
+use crate::app::settings::{
+    self, LocalizationConfig, OdometrySource, OutputConfig, RefinementConfig,
+};
 use crate::evaluation::RangeMclRules;
 use crate::files::remove_abandoned;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
@@ -87,8 +90,8 @@ const ODOMETRY_STREAM: u64 = u64::MAX;
 /// Refines the result that a configuration names, and adds the refined trajectory to it.
 pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
-    input::require_file("map_file", &config.map_file)?;
-    config.recording_inputs().require()?;
+    input::require_file("map_file", &config.map_input.map_file)?;
+    RecordingInputs::new(&config.recording, &config.given_poses).require()?;
     let files = RunFiles::new(&config.output());
     let (mut claims, main) = prepare(config, context, &files)?;
     let is_trajectory = config.is_trajectory();
@@ -98,14 +101,15 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     };
     let is_unfinished = claims.state(&main) == Some("unfinished");
     ensure!(
-        results.refined.is_none() || config.force || is_unfinished,
+        results.refined.is_none() || config.output.force || is_unfinished,
         "{} already has refined poses; add --force to replace them",
         config.result_file.display()
     );
     run_output::warn_of_shortfall(&results, &config.result_file);
-    let map = config.map_inputs().load(MapOptions::default(), context)?;
+    let map = config.map_input.load(MapOptions::default(), context)?;
     let mut resolved = config.clone();
-    let (sequence, sensor) = resolved.open_in_map(&map)?;
+    let (sequence, sensor) = RecordingInputs::new(&config.recording, &config.given_poses)
+        .open_in_map(&map, &mut resolved.sensor)?;
     let config = &resolved;
     if is_trajectory {
         results = follow(config, &map, &sequence)?;
@@ -151,7 +155,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     Ok(report)
 }
 
-/// The configuration for a result: that of its localization, which is beside it.
+/// The configuration for a result: that of its localization, which is next to it.
 pub fn base_config(result: Option<&Path>) -> RefinementConfig {
     let Some(result) = result else {
         return RefinementConfig::default();
@@ -161,7 +165,7 @@ pub fn base_config(result: Option<&Path>) -> RefinementConfig {
     found.map_or_else(
         |_missing| RefinementConfig::default(),
         |found| RefinementConfig {
-            force: false,
+            output: OutputConfig::default(),
             ..RefinementConfig::of(found)
         },
     )
@@ -176,7 +180,7 @@ fn prepare(
 ) -> Result<(Claims, PathBuf)> {
     let mut names: Vec<&str> = [REPORT_FILES, REFINEMENT_FILES].concat();
     names.push("ground_truth_poses.npy");
-    names.extend(config.plot_loc_results.then_some("plots"));
+    names.extend(config.output.plots.then_some("plots"));
     let is_trajectory = config.is_trajectory();
     let (key, main) = match is_trajectory {
         true => ("output_file", files.result.clone()),
@@ -187,7 +191,12 @@ fn prepare(
         "result_file is {}, which is not a regular file; refine replaces it: give the path of the file itself",
         config.result_file.display()
     );
-    let mut inputs = config.input_files(context);
+    let mut inputs = input_files(
+        RecordingInputs::new(&config.recording, &config.given_poses),
+        &config.map_input,
+        &config.motion,
+        context,
+    );
     inputs.extend(is_trajectory.then_some(("result_file", config.result_file.as_path())));
     let outputs = Outputs {
         key,
@@ -195,7 +204,7 @@ fn prepare(
         magic: is_trajectory.then_some(NPZ),
         names: names.into_iter().map(str::to_owned).collect(),
         inputs,
-        force: config.force || !is_trajectory,
+        force: config.output.force || !is_trajectory,
     };
     let claims = outputs.prepare()?;
     remove_abandoned(&files.result)?;
@@ -208,8 +217,7 @@ fn follow(
     map: &Map,
     sequence: &Recording,
 ) -> Result<LocalizationResults> {
-    let track = config
-        .recording_inputs()
+    let track = RecordingInputs::new(&config.recording, &config.given_poses)
         .track(&config.result_file, sequence)?;
     // Poses of a lidar are in the frame of the map, those of a camera in the world of its drive.
     let world_from_map = match track.calibration == Calibration::identity() {
@@ -331,7 +339,7 @@ fn refine(
         anyhow::Ok(sequence.frames[row].read()?)
     })?;
     let known: Option<Vec<Pose2>> = increments.iter().copied().collect();
-    let is_used = config.odometry != OdometrySource::None;
+    let is_used = config.motion.odometry != OdometrySource::None;
     ensure!(known.is_some() || !is_used, "the odometry has gaps");
     let refined = refiner.finish(known.as_deref().filter(|_| is_used))?;
     report_unrefined(&refined, config.is_trajectory());
@@ -391,14 +399,15 @@ fn increments(
     sequence: &Recording,
     results: &LocalizationResults,
 ) -> Result<Vec<Option<Pose2>>> {
-    let is_new = config.odometry == OdometrySource::None || config.odometry_file.is_some();
+    let is_new =
+        config.motion.odometry == OdometrySource::None || config.motion.odometry_file.is_some();
     if let (Some(recorded), false) = (&results.odometry, is_new) {
         return Ok(recorded.iter().copied().map(Some).collect());
     }
     let (mut motion, _file) = MotionSource::open(
-        config.odometry,
-        config.odometry_file.clone(),
-        &config.recording_inputs(),
+        config.motion.odometry,
+        config.motion.odometry_file.clone(),
+        &RecordingInputs::new(&config.recording, &config.given_poses),
         sequence,
         &mut stream(config.seed, ODOMETRY_STREAM),
     )?;
@@ -419,8 +428,8 @@ fn increments(
 /// The configuration of the refiner; the noise that the demonstration adds to the true odometry is
 /// never assumed smaller than it is.
 fn refiner_config(config: &RefinementConfig) -> RefinerConfig {
-    let mut refiner = config.refiner();
-    if config.odometry == OdometrySource::GroundTruth {
+    let mut refiner = config.refiner.clone();
+    if config.motion.odometry == OdometrySource::GroundTruth {
         let noise = demonstration_noise();
         let turn_rad = std::f64::consts::SQRT_2 * noise.turn_rad;
         let smoothing = refiner.refinement.smoothing.clone();
@@ -448,7 +457,7 @@ fn write_run(
     run_output::write_results(files, results)?;
     run_output::write_trajectory(files, "refined", sequence, &refined.map_from_lidar)?;
     output::write_yaml(&files.file("effective_refinement.yml"), config)?;
-    let odometry = match (config.odometry, &config.odometry_file) {
+    let odometry = match (config.motion.odometry, &config.motion.odometry_file) {
         // It may be that of a topic.
         (OdometrySource::Auto, None) if sequence.files.layout == Layout::Bag => {
             "that of the localization".to_owned()
@@ -456,8 +465,11 @@ fn write_run(
         (source, file) => motion_source::description(source, file.as_deref()),
     };
     let about = [
-        ("recording", config.scan_folder.display().to_string()),
-        ("map", config.map_file.display().to_string()),
+        (
+            "recording",
+            config.recording.scan_folder.display().to_string(),
+        ),
+        ("map", config.map_input.map_file.display().to_string()),
         ("odometry", odometry),
         ("renderer", map.renderer.name()),
         ("seed", config.seed.to_string()),
@@ -471,7 +483,7 @@ fn write_run(
         "the refined trajectory is kept in {path}; plots are missing"
     ));
     drop(saving);
-    if config.plot_loc_results {
+    if config.output.plots {
         let mesh = run_output::map_around(map, results.estimates.iter().flatten())?;
         run_output::draw_run(files, Some(&mesh), results)?;
     }

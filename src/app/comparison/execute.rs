@@ -161,12 +161,12 @@ impl<'a> Executor<'a> {
 
         if let Some(refinement) = &run.refinement {
             let start = Instant::now();
-            let config = RefinementConfig {
-                map_file: map.folder.join(MAP_FILE),
+            let mut config = RefinementConfig {
                 result_file: result.clone(),
-                force: true,
                 ..refinement.clone()
             };
+            config.map_input.map_file = map.folder.join(MAP_FILE);
+            config.output.force = true;
             let report = refine::run(&config, self.context).context("while refining")?;
             stages.report = Some(report);
             stages.add("3 refine", start.elapsed().as_secs_f64());
@@ -190,12 +190,15 @@ impl<'a> Executor<'a> {
     fn map(&self, run: &PlannedRun, keys: &Keys) -> Result<SharedResult> {
         artefact::get_or_create(&self.layout.shared("maps"), &keys.map, |folder| {
             let _log = self.context.log.write_to(&folder.join(LOG_FILE))?;
-            let config = BuildMapConfig {
+            let mut config = BuildMapConfig {
                 mesh_file: folder.join(MAP_FILE),
-                force: true,
                 ..run.build_map.clone()
             };
-            tracing::info!("building the map of {}", config.scan_folder.display());
+            config.output.force = true;
+            tracing::info!(
+                "building the map of {}",
+                config.recording.scan_folder.display()
+            );
             build_map::run(&config, self.context).map(drop)
         })
     }
@@ -209,13 +212,13 @@ impl<'a> Executor<'a> {
         let shared = self.layout.shared("localizations");
         artefact::get_or_create(&shared, &keys.localization, |folder| {
             let _log = self.context.log.write_to(&folder.join(LOG_FILE))?;
-            let config = LocalizationConfig {
-                map_file: map.folder.join(MAP_FILE),
+            let mut config = LocalizationConfig {
                 result_path: folder.join(RESULT_FILE),
                 save_result: true,
-                force: true,
                 ..run.localization.clone()
             };
+            config.map_input.map_file = map.folder.join(MAP_FILE);
+            config.output.force = true;
             localize::run(&config, self.context).map(drop)
         })
     }

@@ -17,6 +17,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result};
 use rayon::prelude::*;
 use serde::Serialize;
+use serde_json::Value;
 
 use super::plan::PlannedRun;
 use crate::app::commands::stages::{is_bag, is_topic};
@@ -26,7 +27,7 @@ use crate::recording::{Recording, Selection};
 use crate::simulation::SimulationConfig;
 
 /// Configuration keys without effect on the numbers: paths, plots, permission to replace files.
-const IGNORED_KEYS: [&str; 16] = [
+const IGNORED_KEYS: [&str; 15] = [
     "scan_folder",
     "pose_file",
     "calib_file",
@@ -40,9 +41,8 @@ const IGNORED_KEYS: [&str; 16] = [
     "output_folder",
     "path_pose_file",
     "path_calib_file",
-    "plot_loc_results",
     "visualize",
-    "force",
+    "output",
 ];
 
 /// Keys of the stages of a run.
@@ -166,26 +166,46 @@ fn stages(run: &PlannedRun) -> Result<[Stage<'_>; 3]> {
     };
     let mut mapping = Stage {
         settings: settings(map)?,
-        inputs: vec![Input::new(run, &map.scan_folder, Some(map.selection()))],
+        inputs: vec![Input::new(
+            run,
+            &map.recording.scan_folder,
+            Some(map.recording.frames),
+        )],
     };
-    let of_map = map.pose_file.iter().chain(&map.calib_file);
+    let of_map = map
+        .given_poses
+        .pose_file
+        .iter()
+        .chain(&map.given_poses.calib_file);
     mapping
         .inputs
-        .extend(of_map.map(|path| file(&map.scan_folder, path)));
+        .extend(of_map.map(|path| file(&map.recording.scan_folder, path)));
     let mut localization = Stage {
         settings: settings(query)?,
-        inputs: vec![Input::new(run, &query.scan_folder, Some(query.selection()))],
+        inputs: vec![Input::new(
+            run,
+            &query.recording.scan_folder,
+            Some(query.recording.frames),
+        )],
     };
-    let of_query = query.pose_file.iter().chain(&query.calib_file);
+    let of_query = query
+        .given_poses
+        .pose_file
+        .iter()
+        .chain(&query.given_poses.calib_file);
     localization
         .inputs
-        .extend(of_query.map(|path| file(&query.scan_folder, path)));
-    let odometry = query.odometry_file.iter();
+        .extend(of_query.map(|path| file(&query.recording.scan_folder, path)));
+    let odometry = query.motion.odometry_file.iter();
     localization
         .inputs
-        .extend(odometry.map(|path| file(&query.scan_folder, path)));
-    let odometry = (refinement.iter())
-        .filter_map(|refined| Some(file(&refined.scan_folder, refined.odometry_file.as_ref()?)));
+        .extend(odometry.map(|path| file(&query.recording.scan_folder, path)));
+    let odometry = (refinement.iter()).filter_map(|refined| {
+        Some(file(
+            &refined.recording.scan_folder,
+            refined.motion.odometry_file.as_ref()?,
+        ))
+    });
     let refinement = Stage {
         settings: settings(refinement)?,
         inputs: odometry.collect(),
@@ -231,19 +251,43 @@ impl<'a> Input<'a> {
 /// A configuration as text, without [`IGNORED_KEYS`].
 fn settings(config: &impl Serialize) -> Result<String> {
     let mut settings = serde_json::to_value(config).context("cannot serialize a configuration")?;
-    if let Some(settings) = settings.as_object_mut() {
-        settings.retain(|key, _| !IGNORED_KEYS.contains(&key.as_str()));
-    }
+    remove_ignored(&mut settings);
     Ok(settings.to_string())
+}
+
+fn remove_ignored(settings: &mut Value) {
+    if let Value::Object(block) = settings {
+        block.retain(|key, _| !IGNORED_KEYS.contains(&key.as_str()));
+        block.values_mut().for_each(remove_ignored);
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use std::fs;
+    use std::path::PathBuf;
 
     use super::*;
     use crate::app::comparison::record::RunId;
-    use crate::app::settings::{BuildMapConfig, LocalizationConfig, RefinementConfig};
+    use crate::app::settings::{
+        BuildMapConfig, GivenPosesConfig, LocalizationConfig, MotionConfig, RecordingConfig,
+        RefinementConfig,
+    };
+
+    fn recording(scan_folder: PathBuf) -> RecordingConfig {
+        RecordingConfig {
+            scan_folder,
+            ..RecordingConfig::default()
+        }
+    }
+
+    fn true_poses(drive: &Path) -> GivenPosesConfig {
+        GivenPosesConfig {
+            pose_file: Some(drive.join("poses.txt")),
+            calib_file: Some(drive.join("calib.txt")),
+            ..GivenPosesConfig::default()
+        }
+    }
 
     fn planned_run() -> PlannedRun {
         planned_run_in("here")
@@ -264,16 +308,17 @@ mod tests {
             },
             drives: drives.into(),
             build_map: BuildMapConfig {
-                scan_folder: first.join("velodyne"),
-                pose_file: Some(first.join("poses.txt")),
-                calib_file: Some(first.join("calib.txt")),
+                recording: recording(first.join("velodyne")),
+                given_poses: true_poses(&first),
                 ..BuildMapConfig::default()
             },
             localization: LocalizationConfig {
-                scan_folder: second.join("velodyne"),
-                pose_file: Some(second.join("poses.txt")),
-                calib_file: Some(second.join("calib.txt")),
-                odometry_file: Some(second.join("odometry.txt")),
+                recording: recording(second.join("velodyne")),
+                given_poses: true_poses(&second),
+                motion: MotionConfig {
+                    odometry_file: Some(second.join("odometry.txt")),
+                    ..MotionConfig::default()
+                },
                 ..LocalizationConfig::default()
             },
             refinement: Some(RefinementConfig::default()),
@@ -293,7 +338,7 @@ mod tests {
             run.id.configuration = "B".to_owned();
             run.build_map.mesh_file = "elsewhere.ply".into();
             run.localization.result_path = "elsewhere.npz".into();
-            run.localization.force = true;
+            run.localization.output.force = true;
         });
         assert_eq!(moved, keys(|_| ()));
         let elsewhere = KeyCache::default().keys(&planned_run_in("elsewhere"));
@@ -305,10 +350,10 @@ mod tests {
         let same = keys(|_| ());
         let other = keys(|run| run.refinement = None);
         assert!(other.run != same.run && other.localization == same.localization);
-        let other = keys(|run| run.localization.seed = 9);
+        let other = keys(|run| run.localization.tracker.seed = 9);
         assert!(other.run != same.run && other.localization != same.localization);
         assert_eq!(other.map, same.map);
-        let other = keys(|run| run.build_map.depth = 7);
+        let other = keys(|run| run.build_map.map.local_map.poisson.depth = 7);
         assert!(other.run != same.run && other.localization != same.localization);
         assert_ne!(other.map, same.map);
         let other = keys(|run| {
@@ -327,13 +372,13 @@ mod tests {
         fs::write(path("calib.txt"), "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n").unwrap();
         let mut run = planned_run();
         run.drives.clear();
-        run.build_map.scan_folder = path("velodyne");
-        run.build_map.pose_file = Some(path("poses.txt"));
-        run.build_map.calib_file = Some(path("calib.txt"));
-        run.localization.scan_folder = path("velodyne");
-        run.localization.pose_file = Some(path("poses.txt"));
-        run.localization.calib_file = Some(path("calib.txt"));
-        run.localization.odometry_file = None;
+        run.build_map.recording.scan_folder = path("velodyne");
+        run.build_map.given_poses.pose_file = Some(path("poses.txt"));
+        run.build_map.given_poses.calib_file = Some(path("calib.txt"));
+        run.localization.recording.scan_folder = path("velodyne");
+        run.localization.given_poses.pose_file = Some(path("poses.txt"));
+        run.localization.given_poses.calib_file = Some(path("calib.txt"));
+        run.localization.motion.odometry_file = None;
         let before = KeyCache::default().keys(&run).unwrap();
         assert_eq!(KeyCache::default().keys(&run).unwrap(), before);
         fs::write(path("velodyne/000000.bin"), [1; 16]).unwrap();
@@ -349,21 +394,22 @@ mod tests {
         fs::write(&bag, [0; 16]).unwrap();
         let mut run = planned_run();
         run.drives.clear();
-        run.build_map.scan_folder = bag.clone();
-        run.build_map.pose_file = Some("/slam/odometry".into());
-        run.build_map.calib_file = None;
-        run.localization.scan_folder = bag.clone();
-        run.localization.pose_file = None;
-        run.localization.calib_file = None;
-        run.localization.odometry_file = Some("/wheels/odometry".into());
+        run.build_map.recording.scan_folder = bag.clone();
+        run.build_map.given_poses.pose_file = Some("/slam/odometry".into());
+        run.build_map.given_poses.calib_file = None;
+        run.localization.recording.scan_folder = bag.clone();
+        run.localization.given_poses.pose_file = None;
+        run.localization.given_poses.calib_file = None;
+        run.localization.motion.odometry_file = Some("/wheels/odometry".into());
         run.refinement = None;
         let keys = |run: &PlannedRun| KeyCache::default().keys(run).unwrap();
         let before = keys(&run);
         assert_eq!(keys(&run), before);
         for (change, is_map) in [
-            (|run: &mut PlannedRun| run.build_map.topic = Some("/rear".to_owned())) as fn(&mut _),
-            |run| run.build_map.pose_file = Some("/other".into()),
-            |run| run.localization.odometry_file = Some("/other".into()),
+            (|run: &mut PlannedRun| run.build_map.recording.topic = Some("/rear".to_owned()))
+                as fn(&mut _),
+            |run| run.build_map.given_poses.pose_file = Some("/other".into()),
+            |run| run.localization.motion.odometry_file = Some("/other".into()),
         ]
         .into_iter()
         .zip([true, true, false])
@@ -386,11 +432,11 @@ mod tests {
         fs::write(path("velodyne/000000.bin"), [0; 16]).unwrap();
         let mut run = planned_run();
         run.drives.clear();
-        run.build_map.scan_folder = folder.path().to_owned();
-        run.build_map.pose_file = None;
-        run.build_map.calib_file = None;
+        run.build_map.recording.scan_folder = folder.path().to_owned();
+        run.build_map.given_poses.pose_file = None;
+        run.build_map.given_poses.calib_file = None;
         run.localization = LocalizationConfig {
-            scan_folder: path("velodyne"),
+            recording: recording(path("velodyne")),
             ..LocalizationConfig::default()
         };
         let map = |row: &str| {
@@ -407,16 +453,16 @@ mod tests {
         let path = folder.path().join("other.txt");
         fs::write(&path, "1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
         let (before, own) = (planned_run(), keys(|_| ()));
-        let other = keys(|run| run.localization.odometry_file = Some(path.clone()));
+        let other = keys(|run| run.localization.motion.odometry_file = Some(path.clone()));
         assert!(other.map == own.map && other.localization != own.localization);
         let refined = keys(|run| {
             if let Some(refinement) = &mut run.refinement {
-                refinement.odometry_file = Some(path.clone());
+                refinement.motion.odometry_file = Some(path.clone());
             }
         });
         assert!(refined.localization == own.localization && refined.run != own.run);
         let mut missing = planned_run();
-        missing.localization.odometry_file = Some("nowhere.txt".into());
+        missing.localization.motion.odometry_file = Some("nowhere.txt".into());
         assert!(KeyCache::default().keys(&missing).is_err());
         // The settings differ without access to the files, too.
         assert_ne!(

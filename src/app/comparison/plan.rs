@@ -1,17 +1,15 @@
 //! Plan of a comparison: all runs with their effective configurations.
 
 use anyhow::{Context as _, Result};
-use serde::Serialize;
-use serde::de::DeserializeOwned;
 
 use super::record::RunId;
 use crate::app::settings::{
     self, BuildMapConfig, ComparisonConfig, LocalizationConfig, OdometrySource, Overrides,
     RefinementConfig, SequenceConfig, VariantConfig, settings,
 };
+use crate::configuration::Configuration;
 use crate::simulation::SimulationConfig;
 use crate::simulation::drive_files::{GIVEN_POSES_FILE, POSES_IN_MAP_FILE};
-use crate::validation::Validate;
 
 /// A run to execute. Paths of its results are set on execution.
 #[derive(Clone, Debug, PartialEq)]
@@ -44,7 +42,7 @@ pub fn planned_runs(config: &ComparisonConfig) -> Result<Vec<PlannedRun>> {
                     sequence.name, variant.name
                 )
             })?;
-            let scan_folder = &run.build_map.scan_folder;
+            let scan_folder = &run.build_map.recording.scan_folder;
             if sequence.optional && drives.is_empty() && !scan_folder.exists() {
                 tracing::info!(
                     "sequence {} is skipped: there is no {}",
@@ -64,7 +62,7 @@ impl PlannedRun {
     fn with_seed(&self, seed: u64) -> Self {
         let mut run = self.clone();
         run.id.seed = seed;
-        run.localization.seed = seed;
+        run.localization.tracker.seed = seed;
         if let Some(refinement) = &mut run.refinement {
             refinement.seed = seed;
         }
@@ -97,25 +95,23 @@ fn planned_run(
     variant: &VariantConfig,
     drives: &[SimulationConfig],
 ) -> Result<PlannedRun> {
-    let mut build_map = BuildMapConfig {
-        visualize: false,
-        ..BuildMapConfig::default()
-    };
+    let mut build_map = BuildMapConfig::default();
+    build_map.output.plots = false;
     let mut localization = LocalizationConfig::default();
     if let [first, second] = drives {
         let has_errors = first.given_poses.has_errors();
         let [first, second] = [first, second].map(SimulationConfig::drive_folder);
-        build_map.scan_folder = first.join("velodyne");
-        build_map.pose_file = Some(first.join("poses.txt"));
-        build_map.calib_file = Some(first.join("calib.txt"));
-        localization.scan_folder = second.join("velodyne");
-        localization.pose_file = Some(second.join("poses.txt"));
-        localization.calib_file = Some(second.join("calib.txt"));
-        localization.odometry = OdometrySource::File;
-        localization.odometry_file = Some(second.join("odometry.txt"));
+        build_map.recording.scan_folder = first.join("velodyne");
+        build_map.given_poses.pose_file = Some(first.join("poses.txt"));
+        build_map.given_poses.calib_file = Some(first.join("calib.txt"));
+        localization.recording.scan_folder = second.join("velodyne");
+        localization.given_poses.pose_file = Some(second.join("poses.txt"));
+        localization.given_poses.calib_file = Some(second.join("calib.txt"));
+        localization.motion.odometry = OdometrySource::File;
+        localization.motion.odometry_file = Some(second.join("odometry.txt"));
         if has_errors {
-            build_map.pose_file = Some(first.join(GIVEN_POSES_FILE));
-            localization.pose_file = Some(second.join(POSES_IN_MAP_FILE));
+            build_map.given_poses.pose_file = Some(first.join(GIVEN_POSES_FILE));
+            localization.given_poses.pose_file = Some(second.join(POSES_IN_MAP_FILE));
         }
     }
     let base = &config.base;
@@ -169,17 +165,17 @@ fn particle_runs(config: &ComparisonConfig, run: &PlannedRun) -> Result<Vec<Plan
     )?;
     for &count in &sweep.counts {
         for &seed in &sweep.seeds {
+            let mut localization = localization.clone();
+            localization.tracker.seed = seed;
+            let filter = &mut localization.tracker.localizer;
+            filter.num_particles = count;
+            filter.num_reduced = filter.num_reduced.min(count);
             let mut run = PlannedRun {
-                localization: LocalizationConfig {
-                    num_particles: count,
-                    num_reduced: localization.num_reduced.min(count),
-                    ..localization.clone()
-                },
+                localization,
                 refinement: None,
                 particles: Some(count),
                 ..run.with_seed(seed)
             };
-            run.localization.seed = seed;
             run.id.configuration = format!("{}-{count}-particles", run.id.configuration);
             runs.push(run);
         }
@@ -188,10 +184,7 @@ fn particle_runs(config: &ComparisonConfig, run: &PlannedRun) -> Result<Vec<Plan
 }
 
 /// Applies overrides in order, the last with the highest precedence.
-fn with_overrides<T>(config: T, block: &str, overrides: &[&Overrides]) -> Result<T>
-where
-    T: Validate + Serialize + DeserializeOwned,
-{
+fn with_overrides<T: Configuration>(config: T, block: &str, overrides: &[&Overrides]) -> Result<T> {
     let all: Vec<(String, String)> = overrides.iter().flat_map(|keys| settings(keys)).collect();
     settings::with_settings(config, &all).with_context(|| format!("in the block {block}"))
 }
@@ -239,7 +232,10 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
         let runs = planned(TEXT).unwrap();
         assert_eq!(runs.len(), 2 * 2 * 2 + 2);
         let run = find(&runs, "town/Fuzzy-PSO-MCL/4");
-        assert_eq!((run.localization.seed, run.build_map.seed), (4, 0));
+        assert_eq!(
+            (run.localization.tracker.seed, run.build_map.map.seed),
+            (4, 0)
+        );
         assert_eq!(run.refinement.as_ref().unwrap().seed, 4);
         assert!(find(&runs, "town/PCA-MCL/3").refinement.is_none());
     }
@@ -247,18 +243,18 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
     #[test]
     fn the_configuration_overrides_the_sequence_and_the_sequence_overrides_the_base() {
         let runs = planned(TEXT).unwrap();
-        let particles = |id| find(&runs, id).localization.num_particles;
+        let particles = |id| find(&runs, id).localization.tracker.localizer.num_particles;
         assert_eq!(particles("town/PCA-MCL/3"), 500);
         assert_eq!(particles("drive/PCA-MCL/3"), 600);
         assert_eq!(particles("drive/Fuzzy-PSO-MCL/3"), 700);
         let run = find(&runs, "drive/Fuzzy-PSO-MCL/3");
         assert_eq!(
-            run.build_map.ground_method,
+            run.build_map.map.ground.method,
             crate::ground::GroundMethod::Fuzzy
         );
         let run = find(&runs, "drive/PCA-MCL/3");
         assert_eq!(
-            run.build_map.ground_method,
+            run.build_map.map.ground.method,
             crate::ground::GroundMethod::Pca
         );
     }
@@ -270,10 +266,13 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
             .refinement
             .clone()
             .unwrap();
-        assert_eq!(refinement.scan_folder, std::path::Path::new("b/velodyne"));
-        assert_eq!(refinement.start_idx, 1);
+        assert_eq!(
+            refinement.recording.scan_folder,
+            std::path::Path::new("b/velodyne")
+        );
+        assert_eq!(refinement.recording.frames.start_idx, 1);
         // The map contains the path of its drive.
-        assert_eq!(refinement.map_pose_file, None);
+        assert_eq!(refinement.map_input.map_pose_file, None);
     }
 
     #[test]
@@ -282,11 +281,11 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
         let run = find(&runs, "town/PCA-MCL/3");
         let ends = |path: &std::path::Path, end| assert!(path.ends_with(end), "{path:?}");
         ends(
-            &run.build_map.scan_folder,
+            &run.build_map.recording.scan_folder,
             "sequences/town/drive_1/velodyne",
         );
         ends(
-            &run.localization.scan_folder,
+            &run.localization.recording.scan_folder,
             "sequences/town/drive_2/velodyne",
         );
         let [first, second] = &run.drives[..] else {
@@ -307,17 +306,25 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
         assert_eq!(noises, [0.02, 0.07]);
         assert!(run.drives.iter().all(|drive| drive.n_scans == 9));
         let pose_file = |path: &Option<std::path::PathBuf>| path.clone().unwrap();
-        assert!(pose_file(&run.build_map.pose_file).ends_with("drive_1/given_poses.txt"));
-        assert!(pose_file(&run.localization.pose_file).ends_with("drive_2/poses_in_map.txt"));
+        assert!(
+            pose_file(&run.build_map.given_poses.pose_file).ends_with("drive_1/given_poses.txt")
+        );
+        assert!(
+            pose_file(&run.localization.given_poses.pose_file)
+                .ends_with("drive_2/poses_in_map.txt")
+        );
     }
 
     #[test]
     fn the_particle_sweep_varies_the_named_configuration() {
         let runs = planned(TEXT).unwrap();
         let few = find(&runs, "town/PCA-MCL-50-particles/1");
-        assert_eq!(few.localization.num_particles, 50);
+        assert_eq!(few.localization.tracker.localizer.num_particles, 50);
         assert_eq!(
-            (few.localization.num_reduced, few.particles),
+            (
+                few.localization.tracker.localizer.num_reduced,
+                few.particles
+            ),
             (50, Some(50))
         );
         assert_eq!(few.localization.pose_tracking, Some(false));
@@ -333,7 +340,7 @@ particles: {counts: [50, 2000], configuration: PCA-MCL, sequences: [town], seeds
             "town",
             "PCA-MCL",
             "build_map",
-            "did you mean `ground_method`",
+            "did you mean `ground.method`",
         ] {
             assert!(message.contains(part), "{message}");
         }

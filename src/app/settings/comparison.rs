@@ -3,10 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::check::path;
+use super::blocks::require_path;
 use crate::validation::{InvalidValue, Validate, at_least_one, require};
 
 /// Keys of the configuration of a stage with their values, dotted as in `--set`
@@ -16,7 +17,7 @@ pub type Overrides = BTreeMap<String, serde_json::Value>;
 /// Configuration of a comparison.
 ///
 /// Defaults: no sequences and configurations; five seeds.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct ComparisonConfig {
     /// Folder of all results.
@@ -38,21 +39,21 @@ pub struct ComparisonConfig {
 }
 
 /// Overrides of the defaults of the stages.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct StageOverrides {
-    /// Keys of `simulation.yml`, for simulated sequences.
+    /// Keys of `simulate`, for simulated sequences.
     pub simulation: Overrides,
-    /// Keys of `build_map.yml`.
+    /// Keys of `build-map`.
     pub build_map: Overrides,
-    /// Keys of `localization.yml`.
+    /// Keys of `localize`.
     pub localization: Overrides,
-    /// Keys of `refinement.yml`.
+    /// Keys of `refine`.
     pub refinement: Overrides,
 }
 
 /// A drive to map and a drive to localize.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct SequenceConfig {
     /// Name in tables and folders.
@@ -63,21 +64,21 @@ pub struct SequenceConfig {
     pub tried: String,
     /// Whether to skip the sequence, with a log message, if its files are missing.
     pub optional: bool,
-    /// Keys of `simulation.yml` for a simulated sequence, of which drive 1 is mapped and drive 2
+    /// Keys of `simulate` for a simulated sequence, of which drive 1 is mapped and drive 2
     /// localized; `None` for a recording.
     pub simulation: Option<Overrides>,
-    /// Keys of `simulation.yml` for drive 2 alone.
+    /// Keys of `simulate` for drive 2 alone.
     pub second_drive: Overrides,
-    /// Keys of `build_map.yml`, such as the files of a recording.
+    /// Keys of `build-map`, such as the files of a recording.
     pub build_map: Overrides,
-    /// Keys of `localization.yml`.
+    /// Keys of `localize`.
     pub localization: Overrides,
-    /// Keys of `refinement.yml`; files, frames and odometry default to those of the localization.
+    /// Keys of `refine`; files, frames and odometry default to those of the localization.
     pub refinement: Overrides,
 }
 
 /// A configuration to compare.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct VariantConfig {
     /// Name in tables and folders.
@@ -86,16 +87,16 @@ pub struct VariantConfig {
     pub refine: bool,
     /// Average positional error that the report claims for the configuration [m].
     pub claimed_m: Option<f64>,
-    /// Keys of `build_map.yml`.
+    /// Keys of `build-map`.
     pub build_map: Overrides,
-    /// Keys of `localization.yml`.
+    /// Keys of `localize`.
     pub localization: Overrides,
-    /// Keys of `refinement.yml`.
+    /// Keys of `refine`.
     pub refinement: Overrides,
 }
 
 /// Two configurations to compare.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Contrast {
     /// Name of the configuration.
@@ -105,7 +106,7 @@ pub struct Contrast {
 }
 
 /// Runs of one configuration with several numbers of particles.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct ParticleSweep {
     /// Initial numbers of particles.
@@ -116,7 +117,7 @@ pub struct ParticleSweep {
     pub sequences: Vec<String>,
     /// Seeds of the runs, one run per seed.
     pub seeds: Vec<u64>,
-    /// Keys of `localization.yml`, such as global initialization.
+    /// Keys of `localize`, such as global initialization.
     pub localization: Overrides,
 }
 
@@ -153,7 +154,7 @@ pub fn settings(overrides: &Overrides) -> Vec<(String, String)> {
 
 impl Validate for ComparisonConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        path("output_folder", &self.output_folder)?;
+        require_path("output_folder", &self.output_folder)?;
         at_least_one("seeds", self.seeds.len())?;
         let sequences: Vec<&str> = self.sequences.iter().map(|s| s.name.as_str()).collect();
         let configurations = self.configurations.iter();

@@ -2,18 +2,19 @@
 
 use std::path::PathBuf;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::check::{optional_path, path};
-use super::recording::mounting;
+use super::blocks::{GivenPosesConfig, OutputConfig, optional_path, require_path};
 use crate::evaluation::Alignment;
-use crate::validation::{InvalidValue, Validate, at_least_one, positive, require};
+use crate::recording::Selection;
+use crate::validation::{InvalidValue, Validate, at_least_one, nested, positive, require};
 
 /// Configuration of `evaluate`: the keys of range-mcl's `evaluation.yml`, then new ones.
 ///
 /// Defaults: the values of range-mcl.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct EvaluationConfig {
     /// Result of `localize`, `refine` or range-mcl, or a trajectory of any origin, rows of KITTI or TUM.
@@ -21,15 +22,8 @@ pub struct EvaluationConfig {
     pub result_file: PathBuf,
     /// Calibration of the camera whose poses a trajectory has as rows of KITTI; `None`: they are those of the lidar.
     pub result_calib_file: Option<PathBuf>,
-    /// The ground truth, rows of KITTI or TUM, a folder `oxts`, or a topic of a bag; `None`: the poses in
-    /// `scan_folder`, else those in the result.
-    pub pose_file: Option<PathBuf>,
-    /// Calibration of the recording, with its line `Tr`, for `pose_file`.
-    /// `None`: the poses are those of the lidar.
-    pub calib_file: Option<PathBuf>,
-    /// Pose x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose true poses are given; `None`: they
-    /// are those of the lidar.
-    pub body_from_lidar: Option<[f64; 6]>,
+    /// The ground truth; without any, the poses in `scan_folder`, else those in the result.
+    pub given_poses: GivenPosesConfig,
     /// The recording whose poses are the ground truth; `None`: for a topic, that of the localization.
     pub scan_folder: Option<PathBuf>,
     /// Topic of the point clouds in a bag with several.
@@ -37,12 +31,9 @@ pub struct EvaluationConfig {
     /// Alignment with the truth before errors are computed; `None`: none for a result in a map, and that of the
     /// first pose for a trajectory.
     pub alignment: Option<Alignment>,
-    /// Folder of the output; `None`: that of a result, and `NAME_evaluation` beside a trajectory `NAME.txt`.
+    /// Folder of the output; `None`: that of a result, and `NAME_evaluation` next to a trajectory `NAME.txt`.
     pub output_folder: Option<PathBuf>,
-    /// Whether to draw the trajectory.
-    #[default(true)]
-    pub plot_loc_traj: bool,
-    /// Whether to write the metrics beside the result.
+    /// Whether to write the metrics next to the result.
     #[default(true)]
     pub save_evaluation_results: bool,
     /// Metres per unit of the result's positions.
@@ -57,31 +48,24 @@ pub struct EvaluationConfig {
     /// Number of frames before the first check of convergence, and between checks.
     #[default(100)]
     pub convergence_interval: usize,
-
-    /// First frame of the result.
-    pub start_idx: usize,
-    /// Number of frames from `start_idx` on; -1 for all.
-    #[default(-1)]
-    pub n_scans: i64,
-    /// Step between frames: n uses every n-th frame.
-    #[default(1)]
-    pub frame_step: usize,
+    /// The frames of the result that are used.
+    pub frames: Selection,
+    /// Output; what is written replaces earlier evaluations.
+    pub output: OutputConfig,
 }
 
 impl Validate for EvaluationConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
-        path("result_file", &self.result_file)?;
-        optional_path("pose_file", self.pose_file.as_deref())?;
+        require_path("result_file", &self.result_file)?;
+        nested("given_poses", &self.given_poses)?;
         for (key, value) in [
             ("result_calib_file", &self.result_calib_file),
-            ("calib_file", &self.calib_file),
             ("scan_folder", &self.scan_folder),
             ("output_folder", &self.output_folder),
         ] {
             optional_path(key, value.as_deref())?;
         }
-        mounting(self.calib_file.as_deref(), self.body_from_lidar)?;
-        self.selection().validate()?;
+        nested("frames", &self.frames)?;
         positive("grid_resolution", self.grid_resolution)?;
         positive("converge_thres", self.converge_thres)?;
         require(

@@ -1,15 +1,54 @@
-//! Loading, overriding and writing of configurations.
+//! Configurations of commands from files and `--set`, and the texts that `fpmcl config` prints.
 
 use std::path::Path;
 
-use serde::Serialize;
-use serde::de::DeserializeOwned;
+use super::build_map::BuildMapConfig;
+use super::comparison::ComparisonConfig;
+use super::evaluation::EvaluationConfig;
+use super::ground::GroundCommandConfig;
+use super::localization::LocalizationConfig;
+use super::odometry::OdometryCommandConfig;
+use super::refinement::RefinementConfig;
+use crate::configuration::{self, ConfigError, Configuration, Settings, commented};
+use crate::simulation::SimulationConfig;
 
-use super::error::{self, ConfigError};
-use super::template::CommandConfig;
-use super::yaml::{self, keys, to_yaml};
-use crate::memory;
-use crate::validation::Validate;
+/// The configuration of a command.
+pub trait CommandConfig: Configuration {
+    /// Path of the file that is used if it exists and no other is given.
+    const PATH: &'static str;
+    /// The keys that people change; the configuration where there is no file.
+    const SHORT: &'static str;
+}
+
+/// Names the files of configurations, which are below `config/`.
+macro_rules! command_configs {
+    ($($config:ty: $name:literal),* $(,)?) => {
+        $(impl CommandConfig for $config {
+            const PATH: &'static str = concat!("config/", $name, ".yml");
+            const SHORT: &'static str = include_str!(concat!("../../../config/", $name, ".yml"));
+        })*
+    };
+}
+
+command_configs!(
+    BuildMapConfig: "build_map",
+    OdometryCommandConfig: "odometry",
+    LocalizationConfig: "localization",
+    RefinementConfig: "refinement",
+    EvaluationConfig: "evaluation",
+    GroundCommandConfig: "ground",
+    SimulationConfig: "simulation",
+    ComparisonConfig: "comparison",
+);
+
+/// Every key of a command with its default and its documentation, below the heading of the short text.
+pub fn full_text<T: CommandConfig>() -> Result<String, ConfigError> {
+    let heading = T::SHORT.lines().next().unwrap_or_default();
+    let keys = commented::<T>()?;
+    Ok(format!(
+        "{heading}\n# Every key with its default.\n# Relative paths are relative to the working directory.\n\n{keys}"
+    ))
+}
 
 /// Loads and validates the configuration of a command from `path`, else from its default path
 /// where that file exists, else from the built-in text, with settings (dotted key, YAML value)
@@ -18,64 +57,23 @@ pub fn load<T: CommandConfig>(
     path: Option<&Path>,
     settings: &[(String, String)],
 ) -> Result<T, ConfigError> {
+    let settings = from_options(settings);
     let default_path = Path::new(T::PATH);
-    let Some(path) = path.or(default_path.exists().then_some(default_path)) else {
-        return load_text("built-in configuration", T::SHORT, settings);
-    };
-    let text = memory::read_text(path).map_err(|source| ConfigError::Read {
-        path: path.to_owned(),
-        source,
-    })?;
-    load_text(&path.display().to_string(), &text, settings)
+    match path.or(default_path.exists().then_some(default_path)) {
+        Some(path) => configuration::read(path, settings),
+        None => configuration::parse("built-in configuration", T::SHORT, settings),
+    }
 }
 
 /// Applies settings to a configuration and validates it.
-pub fn with_settings<T>(config: T, settings: &[(String, String)]) -> Result<T, ConfigError>
-where
-    T: Validate + Serialize + DeserializeOwned,
-{
-    with_settings_over("defaults", "", config, settings)
-}
-
-/// Whether a configuration has a key.
-pub fn has_key<T: Default + Serialize>(key: &str) -> Result<bool, ConfigError> {
-    let text = to_yaml(&T::default())?;
-    Ok(keys(&text).iter().any(|it| it.name == key))
-}
-
-fn load_text<T>(name: &str, text: &str, settings: &[(String, String)]) -> Result<T, ConfigError>
-where
-    T: Validate + Serialize + DeserializeOwned,
-{
-    let config = yaml::parse(text).map_err(|source| error::in_file(name, text, source))?;
-    with_settings_over(name, text, config, settings)
-}
-
-/// Applies settings to the configuration of a text and validates it.
-fn with_settings_over<T>(
-    name: &str,
-    text: &str,
-    mut config: T,
+pub fn with_settings<T: Configuration>(
+    config: T,
     settings: &[(String, String)],
-) -> Result<T, ConfigError>
-where
-    T: Validate + Serialize + DeserializeOwned,
-{
-    for (key, value) in settings {
-        let current = to_yaml(&config)?;
-        let Some(replaced) = yaml::with_value(&current, key, value) else {
-            let keys = keys(&current);
-            let names = keys.iter().map(|key| key.name.as_str());
-            let known = names.filter(|name| !name.contains('['));
-            return Err(error::unknown_setting(key, value, known));
-        };
-        config = yaml::parse(&replaced).map_err(|source| error::in_setting(key, value, source))?;
-    }
-    config
-        .validate()
-        .map_err(|invalid| error::invalid(name, text, settings, invalid))?;
-    Ok(config)
+) -> Result<T, ConfigError> {
+    configuration::with_settings(config, from_options(settings))
 }
 
-#[cfg(test)]
-mod tests;
+fn from_options(pairs: &[(String, String)]) -> Settings<'_> {
+    let before = "--set ";
+    Settings { before, pairs }
+}

@@ -1,12 +1,11 @@
-//! Configuration of the commands: one struct per command, composed of the stages' own.
+//! Configuration of the commands: one struct per command, composed of those of the library and of blocks that commands
+//! share.
 //!
 //! ```text
 //! defaults  <-  YAML file  <-  --set key=value, in order  ->  validation  ->  effective configuration
 //! ```
 //!
-//! The keys are those of range-mcl's files, which load unchanged, and new ones. Nothing is ignored:
-//! an unknown key, a value of the wrong type and a contradiction are errors that name the file and
-//! the line, or the `--set`.
+//! [`configuration`](crate::configuration) reads and writes them, and knows range-mcl's names of the keys.
 
 // One file per command.
 mod build_map;
@@ -14,31 +13,28 @@ mod comparison;
 mod evaluation;
 mod ground;
 mod localization;
-mod odometry_command;
-mod refinement;
-// What they share.
-mod check;
 mod odometry;
-mod recording;
-// From text to configuration and back.
-mod error;
+mod refinement;
+// Blocks of several commands.
+mod blocks;
+// From files to configurations.
 mod load;
-mod template;
-mod yaml;
+#[cfg(test)]
+mod tests;
 
+pub use blocks::{
+    GivenPosesConfig, MapInputConfig, MotionConfig, OdometrySource, OutputConfig, RecordingConfig,
+};
 pub use build_map::BuildMapConfig;
 pub use comparison::{
     ComparisonConfig, Contrast, Overrides, ParticleSweep, SequenceConfig, StageOverrides,
     VariantConfig, settings,
 };
-pub use error::ConfigError;
 pub use evaluation::EvaluationConfig;
 pub use ground::GroundCommandConfig;
-pub use load::{has_key, load, with_settings};
+pub use load::{CommandConfig, full_text, load, with_settings};
 pub use localization::{Initialization, LocalizationConfig, MotionModel};
-pub use odometry::OdometrySource;
-pub use odometry_command::OdometryCommandConfig;
-pub use recording::body_from_lidar;
+pub use odometry::OdometryCommandConfig;
 pub use refinement::RefinementConfig;
-pub use template::CommandConfig;
-pub use yaml::to_yaml;
+
+pub use crate::configuration::{ConfigError, has_key, to_yaml};

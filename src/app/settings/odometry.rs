@@ -1,46 +1,45 @@
-//! Source of the motion between frames.
+//! Configuration of `odometry`: poses of a recording from its scans.
 
-use std::path::Path;
+use std::path::PathBuf;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
 
-use crate::validation::{InvalidValue, require};
+use super::blocks::{GivenPosesConfig, OutputConfig, RecordingConfig, require_path};
+use crate::odometry::TrajectoryConfig;
+use crate::sensor::MotionCompensation;
+use crate::validation::{InvalidValue, Validate, nested, positive};
 
-/// Source of the motion between frames.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum OdometrySource {
-    /// `odometry_file` or, in a bag, the topic of odometry, if there is one; else the scans.
-    #[default]
-    Auto,
-    /// The scans alone.
-    Scans,
-    /// `odometry_file`.
-    File,
-    /// The true poses of the recording with noise, as range-mcl does for demonstration.
-    GroundTruth,
-    /// None: constant velocity.
-    None,
+/// Configuration of `odometry`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema, SmartDefault)]
+#[serde(default, deny_unknown_fields)]
+pub struct OdometryCommandConfig {
+    /// The recording.
+    pub recording: RecordingConfig,
+    /// Poses to polish; without any, poses are found from the scans alone.
+    pub given_poses: GivenPosesConfig,
+    /// Folder of the poses, the report and the picture.
+    #[default("results/odometry".into())]
+    pub output_folder: PathBuf,
+    /// Largest distance between successive given poses [m]; a larger one is an error of the poses.
+    #[default(50.0)]
+    pub max_step_m: f64,
+    /// Times of the points for motion compensation; `None` for scans that are compensated already.
+    #[default(Some(MotionCompensation::Auto))]
+    pub motion_compensation: Option<MotionCompensation>,
+    /// Odometry, loops and adjustment.
+    pub trajectory: TrajectoryConfig,
+    /// Output.
+    pub output: OutputConfig,
 }
 
-impl OdometrySource {
-    /// Requires a file for [`OdometrySource::File`], and true poses for [`OdometrySource::GroundTruth`].
-    pub(super) fn validate(
-        self,
-        file: Option<&Path>,
-        truth: Option<&Path>,
-    ) -> Result<(), InvalidValue> {
-        require(
-            self != Self::GroundTruth || truth.is_some(),
-            "odometry",
-            "ground_truth",
-            "name the true poses in pose_file, or choose auto",
-        )?;
-        require(
-            self != Self::File || file.is_some(),
-            "odometry",
-            "file",
-            "name the file in odometry_file, or choose auto, scans or none",
-        )
+impl Validate for OdometryCommandConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        nested("recording", &self.recording)?;
+        nested("given_poses", &self.given_poses)?;
+        require_path("output_folder", &self.output_folder)?;
+        positive("max_step_m", self.max_step_m)?;
+        nested("trajectory", &self.trajectory)
     }
 }

@@ -23,7 +23,7 @@ use super::local_map::{self, LocalMap};
 use super::path_check::{self, ImplausiblePath};
 use super::plan::{self, Domain, LocalMapPlan, Ownership, origin_near};
 use super::scan_agreement;
-use super::scan_cloud::ScanCloud;
+use super::scan_cloud::{ScanCloud, ScanPreparation};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::ground::GroundClassifier;
 use crate::lidar::{LidarModel, Scan};
@@ -32,6 +32,7 @@ use crate::map::mesh_view::MeshView;
 use crate::map::model::{Map, MapError};
 use crate::memory::{self, MemoryError};
 use crate::meshing::MeshingError;
+use crate::sensor::{SENSOR_SCANS, Sensor, SensorError};
 use crate::validation::{InvalidValue, Validate as _};
 
 /// An error of the source of the scans.
@@ -81,7 +82,7 @@ pub enum BuildError {
     #[error(transparent)]
     Invalid(#[from] InvalidValue),
     #[error(
-        "the map has no triangles: none of the {scans} key scans has points left to mesh; check the ranges of local_map.scan.range_image, and local_map.scan.crop_m"
+        "the map has no triangles: none of the {scans} key scans has points left to mesh; check the ranges of the sensor, and local_map.crop_x_m, crop_y_m and crop_z_m"
     )]
     Empty { scans: usize },
     #[error(
@@ -96,6 +97,8 @@ pub enum BuildError {
         "the cloud has {points} points, more than the 4 billion that can be numbered; divide it"
     )]
     CloudTooLarge { points: usize },
+    #[error(transparent)]
+    Sensor(#[from] SensorError),
     #[error(transparent)]
     Memory(#[from] MemoryError),
     #[error(transparent)]
@@ -121,10 +124,12 @@ impl BuildError {
     }
 }
 
-/// Builds maps of deskewed scans with poses, with the sensor of its configuration.
+/// Builds maps of deskewed scans with poses.
 pub struct MapBuilder {
     /// Configuration of the build.
     pub config: MapConfig,
+    /// Sensor of the scans; `None`: what the configuration does not contain is inferred from them.
+    pub sensor: Option<Sensor>,
     /// Preparation of the finished map for localization.
     pub options: MapOptions,
     /// Called for every event, from any thread; the build stops with [`BuildError::Interrupted`] soon
@@ -137,6 +142,7 @@ impl MapBuilder {
     pub fn new(config: MapConfig) -> Self {
         Self {
             config,
+            sensor: None,
             options: MapOptions::default(),
             on_event: Box::new(|_| ControlFlow::Continue(())),
         }
@@ -167,7 +173,9 @@ impl MapBuilder {
         older: Option<&Map>,
         read_scan: &ReadScan,
     ) -> Result<Map, BuildError> {
-        let mut plan = self.plan(map_from_lidar)?;
+        self.config.validate()?;
+        let sensor = self.sensor_of(map_from_lidar.len(), read_scan)?;
+        let mut plan = self.plan(&sensor, map_from_lidar)?;
         let Some(map) = older else {
             let (mesh, _) = plan.build_all(read_scan)?;
             return plan.finish(mesh);
@@ -211,11 +219,29 @@ impl MapBuilder {
         Ok((keys, poses))
     }
 
-    /// Plans the local maps along the poses of the key scans.
+    /// The sensor of the key scans: given, else inferred from ten of them.
+    fn sensor_of(&self, count: usize, read_scan: &ReadScan) -> Result<Sensor, BuildError> {
+        let known = &self.config.sensor;
+        if let Some(sensor) = &self.sensor {
+            return Ok(sensor.clone().with_known(known));
+        }
+        if let Some(sensor) = Sensor::configured(known) {
+            return Ok(sensor);
+        }
+        let step = count.div_ceil(SENSOR_SCANS).max(1);
+        let scans: Result<Vec<Scan>, ScanError> = (0..count).step_by(step).map(read_scan).collect();
+        Ok(Sensor::infer(&scans.map_err(BuildError::Scan)?, known))
+    }
+
+    /// Plans the local maps along the poses of the key scans of a sensor.
     ///
     /// # Errors
     /// The configuration is out of its range, there are no poses, or memory does not suffice.
-    pub fn plan(&self, map_from_lidar: Vec<Pose3>) -> Result<MapPlan<'_>, BuildError> {
+    pub fn plan(
+        &self,
+        sensor: &Sensor,
+        map_from_lidar: Vec<Pose3>,
+    ) -> Result<MapPlan<'_>, BuildError> {
         let config = &self.config;
         config.validate()?;
         if map_from_lidar.is_empty() {
@@ -223,11 +249,12 @@ impl MapBuilder {
         }
         path_check::check(map_from_lidar.iter().enumerate(), config.max_step_m)?;
         let local_maps = plan::local_maps(&map_from_lidar, config.local_map_size, config.overlap_m);
-        let reach_m = f64::from(config.local_map.scan.crop_m.length());
+        let reach_m = f64::from(config.local_map.crop_m().length());
         Ownership::require_memory(&map_from_lidar, &local_maps, reach_m)?;
-        require_memory_of_images(&config.local_map.scan.range_image)?;
+        require_memory_of_images(&sensor.range_image)?;
         Ok(MapPlan {
             builder: self,
+            scan: ScanPreparation::new(sensor, &config.local_map),
             classifier: config.ground.classifier()?,
             older: None,
             ownership: Ownership::new(&map_from_lidar, &local_maps),
@@ -243,7 +270,7 @@ fn require_memory_of_images(model: &LidarModel) -> Result<(), MemoryError> {
     memory::require(
         "the range images of the scans",
         (model.len() * rayon::current_num_threads() * PIXEL_BYTES) as f64,
-        "lower the height or width of local_map.scan.range_image, or the number of threads",
+        "lower the height or width of the sensor's range_image, or the number of threads",
     )
 }
 
@@ -258,6 +285,7 @@ pub struct MapPlan<'a> {
     /// A map that the drive is added to, in the same frame.
     pub(crate) older: Option<&'a dyn MeshView>,
     builder: &'a MapBuilder,
+    scan: ScanPreparation,
     ownership: Ownership,
 }
 
@@ -295,13 +323,16 @@ impl MapPlan<'_> {
         let held_bytes = AtomicUsize::new(0);
         let prepare = |index: usize| {
             let scan = read_scan(index).map_err(BuildError::Scan)?;
+            if index == plan.used.start {
+                self.scan.sensor.require_fit(&scan)?;
+            }
             let pose = Translation3::from(-offset) * self.map_from_lidar[index];
-            let prepared = ScanCloud::prepare(scan, &pose, &config.scan, &*self.classifier);
+            let prepared = ScanCloud::prepare(scan, &pose, &self.scan, &*self.classifier);
             let bytes = held_bytes.fetch_add(prepared.bytes(), Ordering::Relaxed);
             memory::require(
                 "the scans of a local map",
                 bytes as f64,
-                "lower local_map_size or overlap_m, or raise local_map.scan.voxel_size_m",
+                "lower local_map_size or overlap_m, or raise local_map.voxel_size_m",
             )?;
             notify(BuildEvent::ScanPrepared)?;
             Ok(prepared)
@@ -326,7 +357,14 @@ impl MapPlan<'_> {
             origin,
             ownership: &self.ownership,
         };
-        let built = local_map::build(scans, domain, self.older, config, begin_stage);
+        let built = local_map::build(
+            scans,
+            domain,
+            self.older,
+            &self.scan.sensor.range_image,
+            config,
+            begin_stage,
+        );
         let mut local_map = built.map_err(|error| match error {
             BuildError::Meshing(source) => BuildError::LocalMap {
                 number: plan.number,
@@ -383,9 +421,9 @@ mod tests {
         };
         config.local_map.poisson.depth = 5;
         config.local_map.max_distance_m = 1.0;
-        config.local_map.scan.range_image = model();
-        config.local_map.scan.crop_m = Vec3::new(10.0, 10.0, 5.0);
+        (config.local_map.crop_x_m, config.local_map.crop_y_m) = (10.0, 10.0);
         MapBuilder {
+            sensor: Some(Sensor::new(model())),
             options: MapOptions {
                 backend: Backend::Cpu,
                 ..MapOptions::default()
@@ -493,7 +531,7 @@ mod tests {
         let map = builder.build(drive(&positions_m)).unwrap();
 
         let poses = positions_m.map(|x| Pose3::translation(x, 0.0, 0.0));
-        let plan = builder.plan(poses.to_vec()).unwrap();
+        let plan = builder.plan(&Sensor::new(model()), poses.to_vec()).unwrap();
         assert_eq!(plan.local_maps.len(), 2);
         let mut mesh = TriangleMesh::default();
         for local_map in &plan.local_maps {

@@ -62,13 +62,13 @@ impl CloudPlan {
         config.validate()?;
         let begin_stage = |name| notify(on_event, name);
         begin_stage("voxels")?;
-        let remedy = "raise voxel_size, or divide the cloud";
+        let remedy = "raise local_map.voxel_size_m, or divide the cloud";
         memory::require(
             "the points of the cloud",
             points.len() as f64 * 60.0,
             remedy,
         )?;
-        let mut cloud = voxels(points, normals, config.scan.voxel_size_m)?;
+        let mut cloud = voxels(points, normals, config.voxel_size_m)?;
         memory::require(
             "the neighbours in the cloud",
             cloud.len() as f64 * POINT_BYTES,
@@ -314,10 +314,7 @@ mod tests {
             .map(|(index, &normal)| if index % 2 == 0 { normal } else { -normal })
             .collect();
         let config = LocalMapConfig {
-            scan: crate::map::build::scan_cloud::ScanConfig {
-                voxel_size_m: 0.05,
-                ..config().scan
-            },
+            voxel_size_m: 0.05,
             ..config()
         };
         let go_on = |_| ControlFlow::Continue(());

@@ -17,6 +17,7 @@ use crate::validation::{InvalidValue, Validate, not_negative, positive};
 
 /// Decrease of confidence with range and incidence. By default all points have equal weight.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct ConfidenceConfig {
     /// r: range at which the confidence is one half [m]; none: independent of range.

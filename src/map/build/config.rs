@@ -8,11 +8,12 @@ use crate::ground::GroundConfig;
 use crate::map::tiles::cache::MapCache;
 use crate::map::tiles::grid::TileConfig;
 use crate::rendering::{Backend, RenderingMethod};
-use crate::sensor::{Sensor, SensorConfig};
-use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
+use crate::sensor::SensorConfig;
+use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative, positive};
 
 /// Where the poses of the scans come from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum PoseSource {
     /// Given, where there are any, otherwise as [`PoseSource::Odometry`]; with an older map found in that map.
@@ -29,9 +30,11 @@ pub enum PoseSource {
 /// Everything that can be configured about building a map.
 ///
 /// Defaults: the values of range-mcl where it has them.
-#[derive(Clone, Debug, PartialEq, SmartDefault)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
+#[serde(default, deny_unknown_fields)]
 pub struct MapConfig {
-    /// What is known about the sensor of a recording; the rest is inferred from its scans, and set in `local_map.scan`.
+    /// What is known about the sensor; the rest is inferred from the scans.
     pub sensor: SensorConfig,
     /// Where the poses of a recording come from.
     pub poses: PoseSource,
@@ -58,24 +61,15 @@ pub struct MapConfig {
     pub local_map: LocalMapConfig,
 }
 
-impl MapConfig {
-    /// Sets the sensor of the scans.
-    pub(crate) fn set_sensor(&mut self, sensor: &Sensor) {
-        let scan = &mut self.local_map.scan;
-        scan.range_image = sensor.range_image.clone();
-        scan.has_rows = sensor.has_rows;
-        scan.own_car_m = sensor.own_car_m;
-    }
-}
-
 impl Validate for MapConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         not_negative("displacement_threshold_m", self.displacement_threshold_m)?;
         in_range("local_map_size", self.local_map_size, 1..=10_000)?;
         not_negative("overlap_m", self.overlap_m)?;
         positive("max_step_m", self.max_step_m)?;
-        self.sensor.validate()?;
-        self.local_map.validate()
+        nested("sensor", &self.sensor)?;
+        nested("ground", &self.ground)?;
+        nested("local_map", &self.local_map)
     }
 }
 

@@ -7,11 +7,12 @@ use smart_default::SmartDefault;
 use super::changes::{self, Changes};
 use super::confidence::{self, ConfidenceConfig};
 use super::plan::Domain;
-use super::scan_cloud::{PointCounts, ScanCloud, ScanConfig};
+use super::scan_cloud::{PointCounts, ScanCloud};
 use super::seam;
 use super::vertex_ground;
 use super::visibility::{self, VisibilityConfig};
 use crate::geometry::{PointCloud, TriangleMesh};
+use crate::lidar::{LidarModel, NormalConfig};
 use crate::map::mesh_view::MeshView;
 use crate::meshing::{self, MeshingError, PoissonConfig, Reconstruction};
 use crate::validation::{InvalidValue, Validate, fraction, in_range, nested, require};
@@ -23,10 +24,24 @@ const CELLS_PER_EDGE: f32 = 2.0;
 /// Processing of scans into a mesh.
 ///
 /// Defaults: range-mcl's values where it has them.
-#[derive(Clone, Debug, PartialEq, SmartDefault)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
+#[serde(default, deny_unknown_fields)]
 pub struct LocalMapConfig {
-    /// Selection and preparation of points.
-    pub scan: ScanConfig,
+    /// Normals of the points.
+    pub normals: NormalConfig,
+    /// Edge of the voxels for downsampling, in the lidar frame [m].
+    #[default(0.1)]
+    pub voxel_size_m: f32,
+    /// Half length of the box around the sensor in which points are kept [m].
+    #[default(30.0)]
+    pub crop_x_m: f32,
+    /// Half width of that box [m].
+    #[default(30.0)]
+    pub crop_y_m: f32,
+    /// Half height of that box [m].
+    #[default(5.0)]
+    pub crop_z_m: f32,
     /// Confidence weights of points.
     pub confidence: ConfidenceConfig,
     /// Surface reconstruction.
@@ -49,18 +64,40 @@ pub struct LocalMapConfig {
     /// Smoothing iterations of the simplified ground.
     #[default(1)]
     pub smoothing_iterations: usize,
-    /// Colour of confidence 1; lower confidences are interpolated towards `rest_color`.
-    #[default([255, 0, 0])]
-    pub ground_color: [u8; 3],
-    /// Colour of confidence 0.
-    #[default([0, 0, 255])]
-    pub rest_color: [u8; 3],
+    /// Red, green and blue of confidence 1, each from 0 to 1; lower confidences are interpolated towards `rest_color`.
+    #[default([1.0, 0.0, 0.0])]
+    pub ground_color: [f64; 3],
+    /// Red, green and blue of confidence 0, each from 0 to 1.
+    #[default([0.0, 0.0, 1.0])]
+    pub rest_color: [f64; 3],
+}
+
+/// Largest half extent of the crop box [m]: beyond the range of any sensor.
+const MAX_CROP_M: f32 = 500.0;
+
+impl LocalMapConfig {
+    /// Half extent of the box around the sensor in which points are kept [m].
+    pub fn crop_m(&self) -> Vec3 {
+        Vec3::new(self.crop_x_m, self.crop_y_m, self.crop_z_m)
+    }
+}
+
+fn color(key: &str, rgb: [f64; 3]) -> Result<(), InvalidValue> {
+    require(
+        rgb.iter().all(|share| (0.0..=1.0).contains(share)),
+        key,
+        format_args!("{rgb:?}"),
+        "red, green and blue must lie between 0 and 1",
+    )
 }
 
 impl Validate for LocalMapConfig {
-    /// With the keys of `build_map.yml`.
     fn validate(&self) -> Result<(), InvalidValue> {
-        self.scan.validate()?;
+        nested("normals", &self.normals)?;
+        in_range("voxel_size_m", self.voxel_size_m, 0.001..=100.0)?;
+        in_range("crop_x_m", self.crop_x_m, 0.001..=MAX_CROP_M)?;
+        in_range("crop_y_m", self.crop_y_m, 0.001..=MAX_CROP_M)?;
+        in_range("crop_z_m", self.crop_z_m, 0.001..=MAX_CROP_M)?;
         nested("confidence", &self.confidence)?;
         nested("poisson", &self.poisson)?;
         require(
@@ -75,11 +112,13 @@ impl Validate for LocalMapConfig {
         let resolution_m = self.simplify_resolution_m;
         require(
             resolution_m == 0.0 || (0.01..=100.0).contains(&resolution_m),
-            "simplify_resolution",
+            "simplify_resolution_m",
             resolution_m,
             "it must lie between 0.01 and 100; 0 disables the simplification",
         )?;
-        in_range("number_of_iterations", self.smoothing_iterations, 0..=1000)
+        in_range("smoothing_iterations", self.smoothing_iterations, 0..=1000)?;
+        color("ground_color", self.ground_color)?;
+        color("rest_color", self.rest_color)
     }
 }
 
@@ -158,6 +197,7 @@ pub(crate) fn build<E: From<MeshingError>>(
     scans: Vec<ScanCloud>,
     domain: Domain,
     older: Option<&dyn MeshView>,
+    model: &LidarModel,
     config: &LocalMapConfig,
     begin_stage: impl Fn(&'static str) -> Result<(), E>,
 ) -> Result<LocalMap, E> {
@@ -169,7 +209,7 @@ pub(crate) fn build<E: From<MeshingError>>(
         counts.points.add(&scan.counts);
     }
     begin_stage("moving points")?;
-    let (cloud, weights) = static_cloud(&scans, config, &mut counts);
+    let (cloud, weights) = static_cloud(&scans, model, config, &mut counts);
 
     begin_stage("surface")?;
     let Some(mut mesh) = surface(&cloud, weights.as_deref(), config, &mut counts)? else {
@@ -267,10 +307,10 @@ fn finish(
 /// Returns the static points of all scans with their weights.
 fn static_cloud(
     scans: &[ScanCloud],
+    model: &LidarModel,
     config: &LocalMapConfig,
     counts: &mut LocalMapCounts,
 ) -> (PointCloud, Option<Vec<f32>>) {
-    let model = &config.scan.range_image;
     let is_static = config
         .visibility
         .enabled
@@ -331,10 +371,11 @@ fn finish_ground(
     config: &LocalMapConfig,
     counts: &mut LocalMapCounts,
 ) {
-    let cell_m = config.max_distance_m.max(2.0 * config.scan.voxel_size_m);
+    let cell_m = config.max_distance_m.max(2.0 * config.voxel_size_m);
     let confidences = vertex_ground::mean_confidences(&mesh.vertices, cloud, cell_m);
     let threshold = config.ground_threshold;
-    let (rest, ground) = (config.rest_color, config.ground_color);
+    let byte = |share: f64| (255.0 * share).round() as u8;
+    let (rest, ground) = (config.rest_color.map(byte), config.ground_color.map(byte));
     mesh.colors = confidences
         .iter()
         .map(|&confidence| vertex_ground::color(confidence, threshold, rest, ground))
@@ -397,7 +438,7 @@ mod tests {
             map_from_lidar: Rigid3f::from(&Pose3::identity()),
             cloud,
             returns: Vec::new(),
-            free_range_m: vec![7.0; ScanConfig::default().range_image.len()],
+            free_range_m: vec![7.0; LidarModel::default().len()],
             counts: PointCounts::default(),
         }
     }
@@ -407,12 +448,12 @@ mod tests {
         let scans = [scan(), scan(), scan()];
         let mut settings = LocalMapConfig::default();
         let mut counts = LocalMapCounts::default();
-        let (_, weights) = static_cloud(&scans, &settings, &mut counts);
+        let (_, weights) = static_cloud(&scans, &LidarModel::default(), &settings, &mut counts);
         assert_eq!(weights, None);
 
         settings.confidence.half_range_m = Some(10.0);
         counts.dynamic_points = 0;
-        let (cloud, weights) = static_cloud(&scans, &settings, &mut counts);
+        let (cloud, weights) = static_cloud(&scans, &LidarModel::default(), &settings, &mut counts);
         assert_eq!((cloud.len(), counts.dynamic_points), (6, 3));
         // 1/2 and 1/5 with a mean of 1.
         let expected = [10.0 / 7.0, 4.0 / 7.0].repeat(3);

@@ -3,52 +3,34 @@
 
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
-use smart_default::SmartDefault;
 
+use super::local_map::LocalMapConfig;
 use crate::geometry::{PointCloud, Pose3, Rigid3f};
 use crate::ground::GroundClassifier;
-use crate::lidar::{
-    LidarModel, NormalConfig, RangeImage, Scan, estimate_normals, estimate_spatial_normals,
-};
-use crate::validation::{InvalidValue, Validate, in_range, nested, rectangle};
+use crate::lidar::{NormalConfig, RangeImage, Scan, estimate_normals, estimate_spatial_normals};
+use crate::sensor::Sensor;
 
-/// Selection and preparation of the points of a scan.
-///
-/// Defaults: range-mcl's, with the outline of KITTI's car.
-#[derive(Clone, Debug, PartialEq, SmartDefault)]
-pub struct ScanConfig {
-    /// Projection and range limits.
-    pub range_image: LidarModel,
+/// How the points of a scan are selected and prepared: what its sensor and the configuration of the map say.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct ScanPreparation {
+    /// Sensor of the scans.
+    pub sensor: Sensor,
     /// Normal estimation.
     pub normals: NormalConfig,
-    /// Whether neighbouring pixels of the range image are neighbours on a surface; otherwise normals are
-    /// those of neighbours in space.
-    #[default(true)]
-    pub has_rows: bool,
     /// Edge of the voxels for downsampling, in the lidar frame [m].
-    #[default(0.1)]
     pub voxel_size_m: f32,
     /// Half extent of the crop box around the sensor along x, y and z [m].
-    #[default(Vec3::new(30.0, 30.0, 5.0))]
     pub crop_m: Vec3,
-    /// Rectangle of the own car in the lidar frame, whose points are dropped: x_min, x_max, y_min, y_max [m].
-    #[default(crate::sensor::ASSUMED_OWN_CAR_M)]
-    pub own_car_m: [f32; 4],
 }
 
-/// Largest half extent of the crop box [m]: beyond the range of any sensor.
-const MAX_CROP_M: f32 = 500.0;
-
-impl Validate for ScanConfig {
-    /// With the keys of `build_map.yml`.
-    fn validate(&self) -> Result<(), InvalidValue> {
-        nested("range_image", &self.range_image)?;
-        nested("normals", &self.normals)?;
-        in_range("voxel_size", self.voxel_size_m, 0.001..=100.0)?;
-        in_range("crop_x", self.crop_m.x, 0.001..=MAX_CROP_M)?;
-        in_range("crop_y", self.crop_m.y, 0.001..=MAX_CROP_M)?;
-        in_range("crop_z", self.crop_m.z, 0.001..=MAX_CROP_M)?;
-        rectangle("own_car_m", self.own_car_m)
+impl ScanPreparation {
+    pub fn new(sensor: &Sensor, config: &LocalMapConfig) -> Self {
+        Self {
+            sensor: sensor.clone(),
+            normals: config.normals,
+            voxel_size_m: config.voxel_size_m,
+            crop_m: config.crop_m(),
+        }
     }
 }
 
@@ -103,22 +85,22 @@ pub struct ScanCloud {
 
 impl ScanCloud {
     /// Prepares a scan taken at `map_from_lidar`.
-    pub fn prepare(
+    pub(crate) fn prepare(
         mut scan: Scan,
         map_from_lidar: &Pose3,
-        settings: &ScanConfig,
+        settings: &ScanPreparation,
         classifier: &dyn GroundClassifier,
     ) -> Self {
         let mut counts = PointCounts {
             read: scan.len(),
             ..PointCounts::default()
         };
-        counts.invalid = scan.drop_invalid(&settings.range_image);
-        counts.invalid += scan.drop_inside(settings.own_car_m);
+        counts.invalid = scan.drop_invalid(&settings.sensor.range_image);
+        counts.invalid += scan.drop_inside(settings.sensor.own_car_m);
 
-        let image = RangeImage::project(&scan.points, &settings.range_image);
+        let image = RangeImage::project(&scan.points, &settings.sensor.range_image);
         let ground = classifier.ground_confidence(&scan.points);
-        let normals = if settings.has_rows {
+        let normals = if settings.sensor.has_rows {
             estimate_normals(&image, &settings.normals)
         } else {
             estimate_spatial_normals(&image.points, &settings.normals)
@@ -202,6 +184,7 @@ pub(crate) fn free_ranges(image: &RangeImage) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::lidar::LidarModel;
 
     #[test]
     fn free_space_ends_at_the_nearest_of_nine_pixels_and_is_unknown_without_a_return() {

@@ -35,6 +35,7 @@ use crate::validation::{InvalidValue, Validate, at_least_one, in_range, not_nega
 ///
 /// Defaults: measured on a real drive and a simulated one.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct VisibilityConfig {
     /// If false, all points are meshed and no triangle is removed.

@@ -42,10 +42,10 @@ use crate::validation::{InvalidValue, Validate, fraction, in_range, not_negative
 ///
 /// Defaults: `yaw_sigma` of range-mcl, 2 degrees; the rest is ours.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct PanoramaConfig {
-    /// Side of a cell, which has one panorama per level [m]; `grid_res` of `localization.yml`.
-    #[serde(skip)]
+    /// Side of a cell of the search, which has one panorama per level [m].
     #[default(1.0)]
     pub cell_m: f64,
     /// Rows of a panorama.
@@ -69,11 +69,9 @@ pub struct PanoramaConfig {
     /// Increase of the mean cost for which a cell gets e times fewer particles [m].
     #[default(0.03)]
     pub scale_m: f64,
-    /// Standard deviation of the headings around the best heading of a cell [rad]; `yaw_sigma` of
-    /// `localization.yml`.
-    #[serde(skip)]
-    #[default(2.0_f64.to_radians())]
-    pub yaw_sigma_rad: f64,
+    /// Standard deviation of the headings around the best heading of a cell [deg].
+    #[default(2.0)]
+    pub yaw_sigma_deg: f64,
 }
 
 impl PanoramaConfig {
@@ -91,7 +89,7 @@ impl Validate for PanoramaConfig {
         in_range("coarse_step", self.coarse_step, 1..=self.columns)?;
         fraction("refined_share", self.refined_share)?;
         positive("scale_m", self.scale_m)?;
-        not_negative("yaw_sigma_rad", self.yaw_sigma_rad)
+        not_negative("yaw_sigma_deg", self.yaw_sigma_deg)
     }
 }
 

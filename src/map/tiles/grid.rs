@@ -21,6 +21,7 @@ use crate::map::mesh_view::MeshView;
 ///
 /// Defaults: the values of range-mcl.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct TileConfig {
     /// Side of a tile [m].

@@ -43,7 +43,7 @@ pub fn run(config: &BuildMapConfig, cloud_file: &Path, context: &Context) -> Res
     let path = MappingPath::default();
     write_map(config, &meshes, &path, &mut claims)?;
     let triangles = meshes.iter().map(|mesh| mesh.triangles()).sum();
-    if config.visualize {
+    if config.output.plots {
         pictures::draw(config, &meshes, &[], &ResidualSums::default())?;
     }
     let cells_m = blocks.iter().map(|block| block.counts.cell_m);
@@ -71,9 +71,9 @@ fn build_blocks(
     let read = clock.time("read", || scan_files::read_cloud(cloud_file))?;
     let normals = usable_normals(&read, cloud_file);
     let points = read.scan.points;
-    let local_map = config.map().local_map;
+    let local_map = &config.map.local_map;
     let prepare = || {
-        CloudPlan::new(&points, normals.as_deref(), &[], &local_map, &|event| {
+        CloudPlan::new(&points, normals.as_deref(), &[], local_map, &|event| {
             on_stage(event, context, clock)
         })
     };

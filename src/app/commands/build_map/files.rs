@@ -2,6 +2,7 @@
 
 use anyhow::Result;
 
+use crate::app::commands::stages::RecordingInputs;
 use crate::app::run::Context;
 use crate::app::run::artefact::{Claims, Outputs, PLY};
 use crate::app::settings::BuildMapConfig;
@@ -12,7 +13,7 @@ use crate::map::mesh_view::MeshView;
 /// Prepares the outputs.
 pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
     let mut extensions = vec!["report.json", "effective.yml", "poses_tum.txt"];
-    if config.visualize {
+    if config.output.plots {
         extensions.extend(["png", "residuals.png"]);
         extensions.extend(config.onto.is_some().then_some("changes.png"));
     }
@@ -21,7 +22,7 @@ pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
         path.file_name()
             .map(|name| name.to_string_lossy().into_owned())
     };
-    let mut inputs = config.recording_inputs().files();
+    let mut inputs = RecordingInputs::new(&config.recording, &config.given_poses).files();
     let optional = [
         ("cloud_file", &config.cloud_file),
         ("truth_mesh", &config.truth_mesh),
@@ -35,7 +36,7 @@ pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
         magic: Some(PLY),
         names: extensions.into_iter().filter_map(name).collect(),
         inputs,
-        force: config.force,
+        force: config.output.force,
     };
     outputs.prepare()
 }
@@ -53,7 +54,7 @@ pub fn write_map(
         config
             .cloud_file
             .as_ref()
-            .unwrap_or(&config.scan_folder)
+            .unwrap_or(&config.recording.scan_folder)
             .display()
     );
     claims.begin(&config.mesh_file)?;

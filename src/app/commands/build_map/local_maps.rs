@@ -178,7 +178,7 @@ fn builder(
             }
             interrupt.flow()
         }),
-        ..MapBuilder::new(opened.map.clone())
+        ..MapBuilder::new(opened.config.map.clone())
     }
 }
 

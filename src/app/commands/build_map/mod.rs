@@ -83,13 +83,17 @@ fn run_with_scans(config: &BuildMapConfig, role: Role, context: &Context) -> Res
     clock.time("join", || write_map(config, &all, &path, &mut claims))?;
 
     task.note("tiles");
-    let map = clock.time("tiles", || prepared::open_map(config, mapped.first()))?;
-    let residuals = clock.time("quality", || {
-        quality::residuals(config, map.as_ref(), &opened.held_out)
+    let map = clock.time("tiles", || {
+        prepared::open_map(config, &opened.sensor, mapped.first())
     })?;
-    let truth = clock.time("truth", || quality::agreement(config, &path))?;
+    let residuals = clock.time("quality", || {
+        quality::residuals(config, &opened.sensor, map.as_ref(), &opened.held_out)
+    })?;
+    let truth = clock.time("truth", || {
+        quality::agreement(config, &opened.sensor, &path)
+    })?;
     task.note("pictures");
-    if config.visualize {
+    if config.output.plots {
         clock.time("pictures", || {
             pictures::draw(config, &all, &path.map_from_lidar, &residuals)
         })?;

@@ -5,12 +5,11 @@ use std::sync::Arc;
 
 use anyhow::Result;
 
-use crate::app::commands::stages::MapInputs;
 use crate::app::report::plotting::MapPlot;
 use crate::app::report::run_output::MOST_TRIANGLES;
 use crate::app::run::artefact::hash::hash_of_file;
 use crate::app::run::{Context, input};
-use crate::app::settings::BuildMapConfig;
+use crate::app::settings::{BuildMapConfig, MapInputConfig};
 use crate::geometry::pose2_from_pose3;
 use crate::map::mesh_view::{MeshView, Without, reduced};
 use crate::map::{Map, MapOptions, MappingPath, surface_of};
@@ -34,16 +33,11 @@ impl OlderMap {
             return Ok(None);
         };
         input::require_file("onto", file)?;
-        let inputs = MapInputs {
-            map_file: file,
-            map_pose_file: None,
-            map_calib_file: None,
+        let input = MapInputConfig {
+            map_file: file.clone(),
+            ..MapInputConfig::default()
         };
-        let options = MapOptions {
-            max_poses: Some(config.range_image.batch_size()),
-            ..MapOptions::default()
-        };
-        let map = inputs.load(options, context)?;
+        let map = input.load(MapOptions::default(), context)?;
         let older = Self {
             file: file.clone(),
             hash: hash_of_file(file)?,

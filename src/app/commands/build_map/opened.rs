@@ -9,12 +9,13 @@ use super::files::prepare;
 use super::onto::OlderMap;
 use super::parts::{Parts, Role};
 use super::{pose_check, poses};
+use crate::app::commands::stages::{RecordingInputs, complete};
 use crate::app::commands::trajectory::{self, file_beside};
 use crate::app::run::artefact::Claims;
 use crate::app::run::{Context, input, version};
-use crate::app::settings::{self, BuildMapConfig};
+use crate::app::settings::{self, BuildMapConfig, OutputConfig};
 use crate::map::build::plan::{self, LocalMapPlan};
-use crate::map::{MapBuilder, MapConfig, MapPlan, PoseSource};
+use crate::map::{MapBuilder, MapPlan, PoseSource};
 use crate::mapping::{TrajectorySummary, key_frames, poses_of};
 use crate::recording::{Frame, Recording};
 use crate::sensor::Sensor;
@@ -23,8 +24,6 @@ use crate::sensor::Sensor;
 pub struct Opened {
     /// The configuration, with what the scans show about the sensor.
     pub config: BuildMapConfig,
-    /// How the scans become a map.
-    pub map: MapConfig,
     /// The recording with its poses.
     pub sequence: Recording,
     /// The sensor.
@@ -51,20 +50,21 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
     let mut claims = prepare(config, context)?;
     let parts = Parts::lock(&config.mesh_file, role)?;
     let mut config = config.clone();
-    let inputs = config.recording_inputs();
+    let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
     inputs.require()?;
     if let Some(path) = &config.truth_mesh {
         input::require_file("truth_mesh", path)?;
     }
     let (older, older_map) = OlderMap::open(&config, context)?.unzip();
     let recording = poses::open(&config, older.as_ref())?;
-    let (mut sequence, sensor) = config.sensor_keys().resolve(recording)?;
+    let (mut sequence, sensor) = complete(&mut config.map.sensor, recording)?;
     pose_check::check(&sequence, &config)
         .with_context(|| poses::origin(&sequence).unwrap_or_default())?;
     let mut trajectory = None;
-    if sequence.track.is_none() || config.poses == PoseSource::Polished {
+    if sequence.track.is_none() || config.map.poses == PoseSource::Polished {
         (sequence, trajectory) = poses::find(
             sequence,
+            &sensor,
             &config,
             older.as_ref().zip(older_map.as_ref()),
             role,
@@ -72,7 +72,7 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
         )?;
         let found = file_beside(&config.mesh_file);
         let origin = format!("the poses from the scans are in {}", found.display());
-        trajectory::check(&sequence, config.max_step_m, &origin)?;
+        trajectory::check(&sequence, config.map.max_step_m, &origin)?;
     } else if let Some(name) = file_beside(&config.mesh_file).file_name()
         && role == Role::Build
     {
@@ -82,7 +82,6 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
     let (mapped, held_out) = hold_out(&sequence.frames, &config);
     parts.keep_those_of(&inputs_of(&config, &mapped, older.as_ref())?)?;
     let opened = Opened {
-        map: config.map(),
         config,
         sequence,
         mapped,
@@ -99,12 +98,16 @@ impl Opened {
     /// The local maps of the key scans.
     pub fn local_maps(&self) -> Vec<LocalMapPlan> {
         let poses = poses_of(&self.mapped);
-        plan::local_maps(&poses, self.map.local_map_size, self.map.overlap_m)
+        plan::local_maps(
+            &poses,
+            self.config.map.local_map_size,
+            self.config.map.overlap_m,
+        )
     }
 
     /// The plan of a builder for the key scans, which are added to the older map where there is one.
     pub fn plan<'a>(&'a self, builder: &'a MapBuilder) -> Result<MapPlan<'a>> {
-        let mut plan = builder.plan(poses_of(&self.mapped))?;
+        let mut plan = builder.plan(&self.sensor, poses_of(&self.mapped))?;
         plan.older = self.older.as_ref().map(|older| &*older.mesh);
         Ok(plan)
     }
@@ -112,7 +115,7 @@ impl Opened {
 
 /// The key scans that build the map, and those that are held out to evaluate it.
 fn hold_out(frames: &[Frame], config: &BuildMapConfig) -> (Vec<Frame>, Vec<Frame>) {
-    let keys = key_frames(frames, config.displacement_threshold_m);
+    let keys = key_frames(frames, config.map.displacement_threshold_m);
     let step = config.holdout_step;
     let is_held_out = |row: usize| step > 0 && row % step == step - 1;
     let frames_where = |held_out: bool| {
@@ -133,8 +136,7 @@ fn inputs_of(
     let relevant = BuildMapConfig {
         mesh_file: PathBuf::new(),
         truth_mesh: None,
-        visualize: false,
-        force: false,
+        output: OutputConfig::default(),
         ..config.clone()
     };
     let mut text = format!("# {}\n", version::program()?);

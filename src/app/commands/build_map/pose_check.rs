@@ -10,7 +10,7 @@ use crate::recording::Recording;
 /// Checks the poses of a recording whose scans are not compensated by them: an error where they are of another
 /// motion, a warning where they are doubtful or the map is not level.
 pub fn check(recording: &Recording, config: &BuildMapConfig) -> Result<()> {
-    if !config.check_poses || recording.track.is_none() {
+    if !config.map.check_poses || recording.track.is_none() {
         return Ok(());
     }
     let report = PoseReport::new(recording)?;

@@ -8,6 +8,7 @@ use anyhow::{Result, ensure};
 
 use super::onto::OlderMap;
 use super::parts::{Role, not_listed};
+use crate::app::commands::stages::RecordingInputs;
 use crate::app::commands::trajectory;
 use crate::app::report::odometry;
 use crate::app::report::run_output::stamped;
@@ -20,18 +21,19 @@ use crate::mapping::{self, TrajectorySummary, find_poses, find_poses_in};
 use crate::odometry::TrajectoryConfig;
 use crate::recording::poses::write_tum;
 use crate::recording::{Frame, PoseTrack, Recording};
+use crate::sensor::Sensor;
 
 /// Start of the line of a file of poses with their summary.
 const SUMMARY: &str = "# ";
 
 /// Opens the recording with the poses that are given, if they are used.
 pub fn open(config: &BuildMapConfig, older: Option<&OlderMap>) -> Result<Recording> {
-    let inputs = config.recording_inputs();
-    let mut recording = inputs.open(&config.selection())?;
-    let is_found = config.poses == PoseSource::Auto && older.is_some();
+    let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
+    let mut recording = inputs.open()?;
+    let is_found = config.map.poses == PoseSource::Auto && older.is_some();
     if let Some(older) = older.filter(|_| is_found) {
         let map = older.file.display();
-        match &config.pose_file {
+        match &config.given_poses.pose_file {
             Some(path) => tracing::warn!(
                 "pose_file {} is not used: the poses are found from the scans in {map}; set poses to given if they are in the world of that map",
                 path.display()
@@ -40,15 +42,15 @@ pub fn open(config: &BuildMapConfig, older: Option<&OlderMap>) -> Result<Recordi
                 "the poses are found from the scans in {map}; set poses to given to use those of the recording"
             ),
         }
-    } else if let Some(path) = &config.pose_file
-        && config.poses != PoseSource::Odometry
+    } else if let Some(path) = &config.given_poses.pose_file
+        && config.map.poses != PoseSource::Odometry
     {
         recording.track = Some(inputs.track(path, &recording)?);
     }
     let world = older.map(|older| older.path.world_from_map);
-    let recording = mapping::with_given_poses(recording, config.poses, world.as_ref())?;
+    let recording = mapping::with_given_poses(recording, config.map.poses, world.as_ref())?;
     if let Some(origin) = origin(&recording) {
-        trajectory::check(&recording, config.max_step_m, &origin)?;
+        trajectory::check(&recording, config.map.max_step_m, &origin)?;
     }
     Ok(recording)
 }
@@ -64,6 +66,7 @@ pub fn origin(recording: &Recording) -> Option<String> {
 /// same scans; otherwise only a build finds them.
 pub fn find(
     mut recording: Recording,
+    sensor: &Sensor,
     config: &BuildMapConfig,
     older: Option<(&OlderMap, &Map)>,
     role: Role,
@@ -76,7 +79,7 @@ pub fn find(
         false => recording.dense_frames(),
     };
     let localized_by = match older {
-        Some((older, _)) => format!("{}{:?}", older.hash, mapping::localizer(&config.map())),
+        Some((older, _)) => format!("{}{sensor:?}{:?}", older.hash, config.map.ground),
         None => String::new(),
     };
     let hash = inputs(&frames, is_given, &localized_by)?;
@@ -96,7 +99,7 @@ pub fn find(
             (None, false) => "odometry",
         };
         let found = trajectory::find(name, frames.len(), context, |on_event| match older {
-            Some((_, map)) => find_poses_in(map, &frames, &config.map(), on_event),
+            Some((_, map)) => find_poses_in(map, &frames, sensor, &config.map, on_event),
             None => find_poses(&frames, is_given, &settings, on_event),
         })?;
         let found_now = TrajectorySummary::new(&found, recording.has_times);

@@ -3,15 +3,19 @@
 use anyhow::Result;
 
 use crate::app::settings::BuildMapConfig;
-use crate::localization::{Localizer, Odometry, Start};
+use crate::localization::{Localizer, LocalizerConfig, Odometry, Start};
 use crate::map::{Map, MapCache, MapError, MapOptions};
-use crate::mapping;
 use crate::recording::Frame;
 use crate::rendering::Backend;
+use crate::sensor::Sensor;
 
 /// Opens the map that was written, which makes its tiles, and localizes one of its scans, which makes its panoramas.
 /// `None` if no car can be localized in it, after a warning.
-pub fn open_map(config: &BuildMapConfig, frame: Option<&Frame>) -> Result<Option<Map>> {
+pub fn open_map(
+    config: &BuildMapConfig,
+    sensor: &Sensor,
+    frame: Option<&Frame>,
+) -> Result<Option<Map>> {
     let options = MapOptions {
         backend: Backend::Cpu,
         cache: MapCache::NextToMap,
@@ -27,9 +31,18 @@ pub fn open_map(config: &BuildMapConfig, frame: Option<&Frame>) -> Result<Option
     };
     if let Some(frame) = frame {
         let scan = frame.read()?;
-        let (sensor, localizer) = mapping::localizer(&config.map());
-        let found = Localizer::new(&map, &sensor, localizer, Start::unknown(&map), config.seed)
-            .and_then(|mut localizer| localizer.step(&scan, Odometry::Unknown));
+        let localizer = LocalizerConfig {
+            ground: config.map.ground.clone(),
+            ..LocalizerConfig::default()
+        };
+        let found = Localizer::new(
+            &map,
+            sensor,
+            localizer,
+            Start::unknown(&map),
+            config.map.seed,
+        )
+        .and_then(|mut localizer| localizer.step(&scan, Odometry::Unknown));
         if let Err(error) = found {
             tracing::warn!("a start anywhere in this map was not prepared: {error}");
         }

@@ -83,7 +83,7 @@ pub fn run(config: &EvaluationConfig, context: &Context) -> Result<Report> {
         run_output::write_report(&files, &results, &report)?;
         output::write_yaml(&main, config)?;
     }
-    if config.plot_loc_traj {
+    if config.output.plots {
         run_output::draw_run(&files, mesh.as_ref(), &results)?;
     }
     if config.save_evaluation_results {
@@ -104,7 +104,7 @@ fn in_map(
 ) -> Result<Evaluated> {
     let localized = localization_of(&config.result_file)?;
     let track = truth::read_track(config, localized.as_ref())?;
-    let map = if track.is_some() || config.plot_loc_traj {
+    let map = if track.is_some() || config.output.plots {
         localized.as_ref().map_or(Ok(None), map_of)?
     } else {
         None
@@ -215,13 +215,13 @@ fn prepare(config: &EvaluationConfig, context: &Context, main: &Path) -> Result<
         .copied()
         .filter(|_| config.save_evaluation_results)
         .collect();
-    names.extend(config.plot_loc_traj.then_some("plots"));
+    names.extend(config.output.plots.then_some("plots"));
     if names.is_empty() {
         return Claims::read(folder_of(main));
     }
     let optional = [
-        ("pose_file", &config.pose_file),
-        ("calib_file", &config.calib_file),
+        ("pose_file", &config.given_poses.pose_file),
+        ("calib_file", &config.given_poses.calib_file),
         ("result_calib_file", &config.result_calib_file),
     ];
     let inputs = (optional.iter()).filter_map(|(key, path)| Some((*key, path.as_deref()?)));
@@ -247,7 +247,11 @@ fn about(config: &EvaluationConfig) -> Result<BTreeMap<String, String>> {
     } else {
         BTreeMap::new()
     };
-    let truth = config.pose_file.as_ref().or(config.scan_folder.as_ref());
+    let truth = config
+        .given_poses
+        .pose_file
+        .as_ref()
+        .or(config.scan_folder.as_ref());
     for (name, path) in [("result", Some(&config.result_file)), ("truth", truth)] {
         about.remove(name);
         about.extend(path.map(|path| (name.to_owned(), path.display().to_string())));
@@ -267,16 +271,19 @@ fn localization_of(result: &Path) -> Result<Option<LocalizationConfig>> {
 
 /// The map of a run for pictures, a large one coarser, and its path; `None` if its file does not exist.
 fn map_of(localized: &LocalizationConfig) -> Result<Option<(TriangleMesh, Option<MappingPath>)>> {
-    if !localized.map_file.exists() {
-        tracing::info!("{} does not exist any more", localized.map_file.display());
+    if !localized.map_input.map_file.exists() {
+        tracing::info!(
+            "{} does not exist any more",
+            localized.map_input.map_file.display()
+        );
         return Ok(None);
     }
-    Ok(Some(match MappedPly::open(&localized.map_file) {
+    Ok(Some(match MappedPly::open(&localized.map_input.map_file) {
         Some(mesh) => {
             let drawn = reduced(&[(&mesh, None)], run_output::MOST_TRIANGLES);
             (drawn, mesh.path)
         }
-        None => mesh_file::read(&localized.map_file)?,
+        None => mesh_file::read(&localized.map_input.map_file)?,
     }))
 }
 
@@ -304,14 +311,14 @@ fn selected(
     results: LocalizationResults,
     config: &EvaluationConfig,
 ) -> Result<LocalizationResults> {
-    let window = usize::try_from(config.n_scans).unwrap_or(usize::MAX);
-    let end = config.start_idx.saturating_add(window);
+    let window = usize::try_from(config.frames.n_scans).unwrap_or(usize::MAX);
+    let end = config.frames.start_idx.saturating_add(window);
     let rows: Vec<usize> = (0..results.len())
         .filter(|&row| {
             let frame = results.frames[row];
-            (config.start_idx..end).contains(&frame)
+            (config.frames.start_idx..end).contains(&frame)
         })
-        .step_by(config.frame_step)
+        .step_by(config.frames.frame_step)
         .collect();
     ensure!(
         !rows.is_empty(),

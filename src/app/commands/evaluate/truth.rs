@@ -7,10 +7,10 @@ use anyhow::{Context as _, Result, ensure};
 use crate::app::commands::stages::{RecordingInputs, is_topic};
 use crate::app::report::results::LocalizationResults;
 use crate::app::run::input;
-use crate::app::settings::{EvaluationConfig, LocalizationConfig};
+use crate::app::settings::{EvaluationConfig, LocalizationConfig, RecordingConfig};
 use crate::evaluation::{Alignment, aligned};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
-use crate::recording::{Frame, PoseTrack, ScanSource, Selection};
+use crate::recording::{Frame, PoseTrack, ScanSource};
 
 /// Difference of times that are the same [s].
 const SAME_S: f64 = 1e-4;
@@ -22,25 +22,28 @@ pub fn read_track(
     localized: Option<&LocalizationConfig>,
 ) -> Result<Option<PoseTrack>> {
     let scan_folder = config.scan_folder.as_deref();
-    let of_localization = localized.map(|it| it.scan_folder.as_path());
-    let topic = config.topic.as_deref();
-    let inputs = RecordingInputs {
-        scan_folder: scan_folder.or(of_localization).unwrap_or(Path::new("")),
-        topic: topic.or(localized.and_then(|it| it.topic.as_deref())),
-        pose_file: config.pose_file.as_deref(),
-        calib_file: config.calib_file.as_deref(),
-        body_from_lidar: config.body_from_lidar,
-        elevation_bias_deg: 0.0,
+    let of_localization = localized.map(|it| it.recording.scan_folder.as_path());
+    let topic = config.topic.as_ref();
+    let recording = RecordingConfig {
+        scan_folder: scan_folder
+            .or(of_localization)
+            .unwrap_or(Path::new(""))
+            .to_owned(),
+        topic: topic
+            .or(localized.and_then(|it| it.recording.topic.as_ref()))
+            .cloned(),
+        ..RecordingConfig::default()
     };
-    input::require_optional_file("calib_file", inputs.calib_file)?;
-    let recording = || inputs.open(&Selection::default());
-    match inputs.pose_file {
+    let inputs = RecordingInputs::new(&recording, &config.given_poses);
+    input::require_optional_file("calib_file", config.given_poses.calib_file.as_deref())?;
+    let recording = || inputs.open();
+    match &config.given_poses.pose_file {
         Some(path) => {
             inputs.require_poses("pose_file", path)?;
             if is_topic(path) {
                 return inputs.track(path, &recording()?).map(Some);
             }
-            inputs.file_track(path).map(Some)
+            config.given_poses.track(path).map(Some)
         }
         None if scan_folder.is_some() => Ok(Some(recording()?.own_track()?)),
         None => Ok(None),

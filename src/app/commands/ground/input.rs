@@ -39,11 +39,11 @@ pub fn load(args: &GroundArgs) -> Result<(GroundCommandConfig, PathBuf)> {
     };
     let mut config: GroundCommandConfig = settings::load(config_path, &settings)?;
     let Some(path) = input else {
-        let folder = config.scan_folder.clone();
+        let folder = config.recording.scan_folder.clone();
         return Ok((config, folder));
     };
     if path.is_dir() || is_bag(path) {
-        config.scan_folder = path.to_owned();
+        config.recording.scan_folder = path.to_owned();
         return Ok((config, path.to_owned()));
     }
     ensure!(
@@ -69,7 +69,11 @@ pub fn scans(path: &Path, config: &GroundCommandConfig) -> Result<Vec<LabelledSc
     if !is_bag(path) {
         require_folder("scan_folder", path)?;
     }
-    let recording = Recording::open_with(path, config.topic.as_deref(), &config.selection())?;
+    let recording = Recording::open_with(
+        path,
+        config.recording.topic.as_deref(),
+        &config.recording.frames,
+    )?;
     let folder = &recording.files.scans;
     let frames = recording.frames.into_iter();
     Ok(frames

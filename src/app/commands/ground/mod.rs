@@ -63,7 +63,7 @@ pub fn run(args: &GroundArgs, context: &Context) -> Result<Printed> {
 /// Explains the confidence of the point nearest to a position.
 fn explain(config: &GroundCommandConfig, path: &Path, position: Vec3) -> Result<String> {
     ensure!(
-        config.ground_method == GroundMethod::Fuzzy,
+        config.ground.method == GroundMethod::Fuzzy,
         "--explain needs fuzzy rules; set ground_method to fuzzy"
     );
     let scans = input::scans(path, config)?;
@@ -87,13 +87,13 @@ fn explain(config: &GroundCommandConfig, path: &Path, position: Vec3) -> Result<
     if let Some(classes) = &scan.classes {
         writeln!(text, "its label is class {}", classes[index])?;
     }
-    let classifier = FuzzyGround::new(config.fuzzy.clone())?;
+    let classifier = FuzzyGround::new(config.ground.fuzzy.clone())?;
     match classifier.features(&scan.points)[index] {
         Some(features) => writeln!(text, "\n{}", classifier.explain(&features))?,
         None => writeln!(
             text,
             "its confidence is 0 because it is out of range, or on the own car: nearer than fuzzy.features.min_distance_m = {} m",
-            config.fuzzy.features.min_distance_m
+            config.ground.fuzzy.features.min_distance_m
         )?,
     }
     Ok(text)
@@ -105,9 +105,12 @@ fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Resu
     let report_file = config.output_folder.join("ground.json");
     input::check_overwrite(config, &scans)?;
     let mut claims = prepare(config, context, &scans, &report_file)?;
-    pictures::draw_memberships(&config.fuzzy, &config.output_folder.join("memberships.png"))?;
+    pictures::draw_memberships(
+        &config.ground.fuzzy,
+        &config.output_folder.join("memberships.png"),
+    )?;
 
-    let mut methods = config.ground().all_classifiers()?;
+    let mut methods = config.ground.all_classifiers()?;
     if !(config.compare && scans.iter().any(|scan| scan.label_path.is_some())) {
         methods.truncate(1);
     }
@@ -178,7 +181,7 @@ fn prepare(
         magic: None,
         names,
         inputs: context.input().into_iter().collect(),
-        force: config.force,
+        force: config.output.force,
     };
     let claims = outputs.prepare()?;
     for (folder, is_written) in [

@@ -17,7 +17,7 @@ const AHEAD_M: f32 = 8.0;
 
 /// Returns the table for standard output.
 pub fn run(config: &GroundCommandConfig, context: &Context) -> Result<String> {
-    let methods = config.ground().all_classifiers()?;
+    let methods = config.ground.all_classifiers()?;
     let scenes = ground_scenes();
     let task = context.progress.task("ground", scenes.len());
     let columns: String = methods

@@ -16,6 +16,7 @@ use self::pictures::draw_example;
 use self::recorder::Run;
 use super::motion_source;
 use super::motion_source::{FrameMotion, MotionSource};
+use super::stages::{RecordingInputs, input_files};
 use crate::app::report::results::{LocalizationResults, Report};
 use crate::app::report::run_output::{
     self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES, RunFiles,
@@ -30,7 +31,6 @@ use crate::geometry::Pose2;
 use crate::localization::motion::VelocityCommand;
 use crate::localization::{Odometry, Start, State, Tracker, TrackerConfig};
 use crate::map::Map;
-use crate::odometry::OdometryConfig;
 use crate::random::stream;
 use crate::recording::Recording;
 use crate::refinement::{InitialEstimate, TrajectoryRefiner};
@@ -41,22 +41,23 @@ const ODOMETRY_STREAM: u64 = 1;
 
 /// Localizes the selected frames of a recording.
 pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
-    input::require_file("map_file", &config.map_file)?;
-    config.recording_inputs().require()?;
+    input::require_file("map_file", &config.map_input.map_file)?;
+    RecordingInputs::new(&config.recording, &config.given_poses).require()?;
     let files = RunFiles::new(&config.result_path);
     context.interrupt.keeps("no frame was finished");
     let claims = prepare(config, context, &files)?;
-    let map = config.map_inputs().load(config.map_options(), context)?;
+    let map = config.map_input.load(config.map_options(), context)?;
     let mut resolved = config.clone();
-    let (sequence, sensor) = resolved.open_in_map(&map)?;
+    let (sequence, sensor) = RecordingInputs::new(&config.recording, &config.given_poses)
+        .open_in_map(&map, &mut resolved.tracker.sensor)?;
     let (motion, odometry_file) = MotionSource::open(
-        config.odometry,
-        config.odometry_file.clone(),
-        &config.recording_inputs(),
+        config.motion.odometry,
+        config.motion.odometry_file.clone(),
+        &RecordingInputs::new(&config.recording, &config.given_poses),
         &sequence,
-        &mut stream(config.seed, ODOMETRY_STREAM),
+        &mut stream(config.tracker.seed, ODOMETRY_STREAM),
     )?;
-    resolved.odometry_file = odometry_file;
+    resolved.motion.odometry_file = odometry_file;
     let config = &resolved;
     let motion = Mutex::new(motion);
     let run = Mutex::new(Run::new(
@@ -99,7 +100,7 @@ fn prepare(config: &LocalizationConfig, context: &Context, files: &RunFiles) -> 
         let is_refined = config.refine;
         names.extend(REFINEMENT_FILES.iter().filter(|_| is_refined));
     }
-    names.extend(config.plot_loc_results.then_some("plots"));
+    names.extend(config.output.plots.then_some("plots"));
     if config.visualize {
         names.extend(["loc_plots", "localization.gif"]);
     }
@@ -111,8 +112,13 @@ fn prepare(config: &LocalizationConfig, context: &Context, files: &RunFiles) -> 
         main: &config.result_path,
         magic: Some(NPZ),
         names: names.into_iter().map(str::to_owned).collect(),
-        inputs: config.input_files(context),
-        force: config.force,
+        inputs: input_files(
+            RecordingInputs::new(&config.recording, &config.given_poses),
+            &config.map_input,
+            &config.motion,
+            context,
+        ),
+        force: config.output.force,
     };
     run_output::prepare(files, &outputs)
 }
@@ -130,14 +136,13 @@ fn localize<'a>(
     let start = start(config, map, sequence);
     let mut motion = motion.lock().unwrap_or_else(PoisonError::into_inner);
     let tracker = TrackerConfig {
-        sensor: config.known_sensor(),
-        localizer: config.localizer(),
-        odometry: matches!(*motion, MotionSource::Scans(_)).then(OdometryConfig::default),
-        seed: config.seed,
+        odometry: (config.tracker.odometry.clone())
+            .filter(|_| matches!(*motion, MotionSource::Scans(_))),
+        ..config.tracker.clone()
     };
     let tracker = Tracker::new(map, tracker)?.with_sensor(sensor.clone());
     let mut tracker = tracker.with_start(start);
-    let refiner = || TrajectoryRefiner::new(map, sensor, config.refiner(), config.seed);
+    let refiner = || TrajectoryRefiner::new(map, sensor, config.refiner(), config.tracker.seed);
     let mut refiner = config.refine.then(refiner).transpose()?;
     let task = context.progress.task("localize", sequence.frames.len());
     for (row, frame) in sequence.frames.iter().enumerate() {
@@ -271,7 +276,7 @@ fn write_run(
     if config.save_result {
         run_output::write_report(files, results, &report)?;
     }
-    if config.plot_loc_results {
+    if config.output.plots {
         let mesh = run_output::map_around(map, results.estimates.iter().flatten())?;
         run_output::draw_run(files, Some(&mesh), results)?;
         draw_example(config, files, map, sequence, &run.map_from_lidar)?;
@@ -321,14 +326,23 @@ fn warn_of_untracked_frames(results: &LocalizationResults) {
 
 /// Description of the run for the report.
 fn about(config: &LocalizationConfig, context: &Context, map: &Map) -> BTreeMap<String, String> {
-    let odometry = motion_source::description(config.odometry, config.odometry_file.as_deref());
-    let particles = format!("{} reduced to {}", config.num_particles, config.num_reduced);
+    let odometry = motion_source::description(
+        config.motion.odometry,
+        config.motion.odometry_file.as_deref(),
+    );
+    let particles = format!(
+        "{} reduced to {}",
+        config.tracker.localizer.num_particles, config.tracker.localizer.num_reduced
+    );
     [
-        ("recording", config.scan_folder.display().to_string()),
-        ("map", config.map_file.display().to_string()),
+        (
+            "recording",
+            config.recording.scan_folder.display().to_string(),
+        ),
+        ("map", config.map_input.map_file.display().to_string()),
         ("odometry", odometry),
         ("renderer", map.renderer.name()),
-        ("seed", config.seed.to_string()),
+        ("seed", config.tracker.seed.to_string()),
         ("threads", context.threads.to_string()),
         ("particles", particles),
     ]

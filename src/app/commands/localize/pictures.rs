@@ -19,7 +19,7 @@ pub fn draw_example(
     map_from_lidar: &[Pose3],
 ) -> Result<()> {
     let row = map_from_lidar.len() / 2;
-    let model = config.range_image.model();
+    let model = config.tracker.sensor.range_image.model();
     let scan = recording.frames[row].read()?;
     let observed = RangeImage::project(&scan.points, &model);
     let rendered = map.renderer.render(&map_from_lidar[row..=row], &model)?;

@@ -45,12 +45,12 @@ impl Run {
         let empty = || Some(Vec::new());
         Ok(Self {
             results: LocalizationResults {
-                particles: ParticleLog::new(config.num_particles),
+                particles: ParticleLog::new(config.tracker.localizer.num_particles),
                 estimates: empty(),
-                ground_truth: config.pose_file.as_ref().map(|_| Vec::new()),
+                ground_truth: config.given_poses.pose_file.as_ref().map(|_| Vec::new()),
                 estimates_in_space: Some(Vec::new()),
                 refined_in_space: config.refine.then(Vec::new),
-                ground_truth_in_space: config.pose_file.as_ref().map(|_| Vec::new()),
+                ground_truth_in_space: config.given_poses.pose_file.as_ref().map(|_| Vec::new()),
                 odometry: empty(),
                 covariances: Some(Vec::new()),
                 times_s: Some(Vec::new()),

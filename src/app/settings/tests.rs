@@ -1,13 +1,9 @@
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::*;
-use crate::app::settings::{
-    BuildMapConfig, EvaluationConfig, GroundCommandConfig, Initialization, LocalizationConfig,
-    OdometrySource, RefinementConfig,
-};
 use crate::rendering::RenderingMethod;
-use crate::sensor::RangeImageConfig;
+use crate::validation::Validate;
 
 /// Loads a configuration from a text.
 fn load_text<T: CommandConfig>(text: &str, settings: &[(&str, &str)]) -> Result<T, ConfigError> {
@@ -68,20 +64,19 @@ fn a_written_configuration_loads_to_an_equal_one() {
         "it's \"q\"",
         "a\nb",
     ] {
-        let config = LocalizationConfig {
-            map_file: PathBuf::from(name),
-            odometry_file: Some(PathBuf::from(name)),
-            odometry: OdometrySource::File,
-            initialization: Some(Initialization::Extent),
-            move_thres: 0.1 + 0.2,
-            seed: u64::MAX,
-            range_image: RangeImageConfig {
-                fov_up: Some(0.1),
-                max_range: Some(1.0e6),
-                ..RangeImageConfig::default()
+        let mut config = LocalizationConfig {
+            motion: MotionConfig {
+                odometry: OdometrySource::File,
+                odometry_file: Some(PathBuf::from(name)),
             },
+            initialization: Some(Initialization::Extent),
             ..LocalizationConfig::default()
         };
+        config.map_input.map_file = PathBuf::from(name);
+        config.tracker.localizer.move_thres_m = 0.1 + 0.2;
+        config.tracker.seed = u64::MAX;
+        config.tracker.sensor.range_image.fov_up = Some(0.1);
+        config.tracker.sensor.range_image.max_range = Some(1.0e6);
         fs::write(&path, to_yaml(&config).unwrap()).unwrap();
         let loaded: LocalizationConfig = load(Some(&path), &[]).unwrap();
         assert_eq!(loaded, config);
@@ -93,7 +88,7 @@ fn an_unknown_key_is_reported_with_its_line_and_the_nearest_key() {
     let message = message_of("seed: 1\nnumparticles: 100\n", &[]);
     assert_contains(
         &message,
-        &["own.yml, line 2", "`numparticles`", "`numParticles`"],
+        &["own.yml, line 2", "`numparticles`", "`num_particles`"],
     );
     let message = message_of("range_image:\n  height: 64\n  widht: 900\n", &[]);
     assert_contains(&message, &["line 3", "`widht`", "did you mean `width`?"]);
@@ -152,7 +147,10 @@ fn a_syntax_error_is_reported_with_its_line() {
 #[test]
 fn a_duplicate_key_is_reported() {
     let message = message_of("seed: 1\nseed: 2\n", &[]);
-    assert_contains(&message, &["own.yml, line 2", "`seed` is given twice"]);
+    assert_contains(
+        &message,
+        &["own.yml, line 2", "`tracker.seed` is given twice"],
+    );
 }
 
 #[test]
@@ -168,18 +166,17 @@ fn a_setting_replaces_one_key_and_the_last_one_wins() {
         ],
     )
     .unwrap();
-    let expected = LocalizationConfig {
-        num_particles: 50,
-        scan_folder: "07".into(),
-        odometry_file: Some("odometry.txt".into()),
-        odometry: OdometrySource::File,
-        range_image: RangeImageConfig {
-            height: Some(32),
-            width: Some(1024),
-            ..RangeImageConfig::default()
+    let mut expected = LocalizationConfig {
+        motion: MotionConfig {
+            odometry: OdometrySource::File,
+            odometry_file: Some("odometry.txt".into()),
         },
         ..LocalizationConfig::default()
     };
+    expected.recording.scan_folder = "07".into();
+    expected.tracker.localizer.num_particles = 50;
+    expected.tracker.sensor.range_image.height = Some(32);
+    expected.tracker.sensor.range_image.width = Some(1024);
     assert_eq!(config, expected);
 }
 
@@ -187,9 +184,9 @@ fn a_setting_replaces_one_key_and_the_last_one_wins() {
 fn a_setting_may_be_a_list_or_reset_a_key() {
     let config: BuildMapConfig =
         load_text("", &[("ground_color", "[0, 1, 0.5]"), ("seed", "3")]).unwrap();
-    assert_eq!(config.ground_color, [0.0, 1.0, 0.5]);
-    assert_eq!(config.rest_color, [0.0, 0.0, 1.0]);
-    assert_eq!(config.seed, 3);
+    assert_eq!(config.map.local_map.ground_color, [0.0, 1.0, 0.5]);
+    assert_eq!(config.map.local_map.rest_color, [0.0, 0.0, 1.0]);
+    assert_eq!(config.map.seed, 3);
     let config: LocalizationConfig =
         load_text("initialization: extent\n", &[("initialization", "null")]).unwrap();
     assert_eq!(config.initialization, None);
@@ -202,8 +199,15 @@ fn an_invalid_setting_is_quoted() {
         &message,
         &["--set range_image.widht=3", "`range_image.width`"],
     );
-    let message = message_of("", &[("width", "3")]);
-    assert_contains(&message, &["did you mean `range_image.width`?"]);
+    let message = message_of("", &[("patience", "3")]);
+    assert_contains(
+        &message,
+        &[
+            "may be",
+            "tracking_loss.patience",
+            "refinement.swarm.patience",
+        ],
+    );
     let message = message_of("", &[("seed", "many")]);
     assert_contains(&message, &["--set seed=many", "whole number"]);
     let message = message_of("", &[("range_image", "[1")]);
@@ -215,7 +219,7 @@ fn an_invalid_setting_is_quoted() {
     let message = message_of("", &[(key, value)]);
     assert_contains(&message, &["--set fuzzy.variables.height.level"]);
     let message = message_of("", &[(&"k".repeat(100_000), "1")]);
-    assert_contains(&message, &["prints every key"]);
+    assert_contains(&message, &["no known key is similar"]);
 }
 
 #[test]
@@ -225,7 +229,7 @@ fn an_invalid_value_is_reported_with_key_value_and_remedy() {
         &message,
         &[
             "line 2",
-            "range_image.min_range is 60",
+            "tracker.sensor.range_image.min_range is 60",
             "max_range, which is 50",
         ],
     );
@@ -233,7 +237,6 @@ fn an_invalid_value_is_reported_with_key_value_and_remedy() {
         ("range_image.width", "0"),
         ("range_image.fov_up", "-30"),
         ("range_image.max_range", ".nan"),
-        ("range_image.max_instance", "0"),
         ("numParticles", "0"),
         ("num_reduced", "0"),
         ("frame_step", "0"),
@@ -246,7 +249,7 @@ fn an_invalid_value_is_reported_with_key_value_and_remedy() {
         ("rendering.method", "raster"),
     ] {
         let message = message_of("", &[(key, value)]);
-        assert_contains(&message, &[&format!("--set {key}={value}: {key} is ")]);
+        assert_contains(&message, &[&format!("--set {key}={value}: "), " is "]);
     }
     for (key, value) in [
         ("depth", "2"),
@@ -260,7 +263,7 @@ fn an_invalid_value_is_reported_with_key_value_and_remedy() {
         let message = load_text::<BuildMapConfig>("", &[(key, value)])
             .unwrap_err()
             .to_string();
-        assert_contains(&message, &[&format!("--set {key}={value}: {key} is ")]);
+        assert_contains(&message, &[&format!("--set {key}={value}: "), " is "]);
     }
     let message = load_text::<EvaluationConfig>("particle_select_ratio: 0\n", &[])
         .unwrap_err()
@@ -331,18 +334,47 @@ fn only_whole_range_images_are_rasterized() {
 }
 
 #[test]
-fn keys_of_batches_are_those_of_localize_alone() {
-    for (key, value) in [("max_instance", "50"), ("render_instanced", "True")] {
-        let text = format!("range_image: {{{key}: {value}}}\n");
-        load_text::<LocalizationConfig>(&text, &[]).unwrap();
-        let errors = [
-            load_text::<BuildMapConfig>(&text, &[]).unwrap_err(),
-            load_text::<RefinementConfig>(&text, &[]).unwrap_err(),
-        ];
-        for error in errors {
-            assert_contains(&error.to_string(), &["range_image", key, "only localize"]);
-        }
-    }
-    let localization = load_text("range_image: {max_instance: 50}\n", &[]).unwrap();
-    RefinementConfig::of(localization).validate().unwrap();
+fn keys_of_batches_have_no_effect() {
+    let text = "range_image:\n  max_instance: 50\n  height: 32\n  render_instanced: True\n";
+    let config: LocalizationConfig = load_text(text, &[("range_image.max_instance", "7")]).unwrap();
+    let mut expected = LocalizationConfig::default();
+    expected.tracker.sensor.range_image.height = Some(32);
+    assert_eq!(config, expected);
+}
+
+#[test]
+fn names_of_one_block_are_gathered_and_errors_keep_the_lines_of_the_file() {
+    let text = "\
+depth: 8
+map:
+  local_map:
+    # rows
+    voxel_size_m: 0.2
+
+ground_method: pca
+pca: {min_cosine: 0.9}
+crop_x: 20
+";
+    let config: BuildMapConfig = load_text(text, &[]).unwrap();
+    let mut expected = BuildMapConfig::default();
+    expected.map.local_map.poisson.depth = 8;
+    expected.map.local_map.voxel_size_m = 0.2;
+    expected.map.local_map.crop_x_m = 20.0;
+    expected.map.ground.method = crate::ground::GroundMethod::Pca;
+    expected.map.ground.pca.min_cosine = 0.9;
+    assert_eq!(config, expected);
+
+    let message = |text: &str| {
+        load_text::<BuildMapConfig>(text, &[])
+            .unwrap_err()
+            .to_string()
+    };
+    let wrong = message(&text.replace("crop_x: 20", "crop_x: wide"));
+    assert_contains(&wrong, &["line 9", "crop_x_m", "`wide`", "a number"]);
+    let impossible = message(&text.replace("depth: 8", "depth: 1"));
+    assert_contains(&impossible, &["line 1", "poisson.depth is 1"]);
+    let twice = message(&format!("{text}voxel_size: 0.1\n"));
+    assert_contains(&twice, &["line 10", "voxel_size_m", "twice"]);
+    let block_and_value = message(&format!("{text}ground: null\n"));
+    assert_contains(&block_and_value, &["line 10", "ground", "twice"]);
 }

@@ -1,8 +1,9 @@
-//! Errors of configurations, with the file and line or the `--set` that they are about.
+//! Errors of configurations, with the place that they are about: the line of a text, or a setting.
 
 use std::path::PathBuf;
 
-use super::yaml::{is_within, keys};
+use super::names::{Meaning, Names};
+use super::yaml::{FullText, is_within, keys};
 use crate::validation::InvalidValue;
 
 /// Longest key that is compared with the known ones [bytes].
@@ -13,7 +14,7 @@ const LONGEST_KEY: usize = 200;
 #[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum ConfigError {
     #[error(
-        "cannot read the configuration {}: {source}; give the path of a YAML file, such as one that `fpmcl config` prints",
+        "cannot read the configuration {}: {source}; give the path of a YAML file",
         path.display()
     )]
     Read {
@@ -25,6 +26,12 @@ pub enum ConfigError {
         place: String,
         key: String,
         nearest: Option<String>,
+    },
+    #[error("{place}: `{key}` may be {}; give more of its name", keys.join(" or "))]
+    AmbiguousKey {
+        place: String,
+        key: String,
+        keys: Vec<String>,
     },
     #[error("{place}: {invalid}")]
     InvalidValue {
@@ -42,46 +49,47 @@ pub enum ConfigError {
     Serialize(#[from] serde_yaml::SerializeError),
 }
 
-/// The error of a YAML file, with the key and the value of its line.
-pub(super) fn in_file(name: &str, text: &str, source: serde_yaml::Error) -> ConfigError {
+/// The error of a text, with the key and the value of its line.
+pub(super) fn in_text(name: &str, text: &FullText, source: serde_yaml::Error) -> ConfigError {
     let Some(line) = source
         .location()
         .map(|location| (location.line() as usize).saturating_sub(1))
     else {
         return describe(name.to_owned(), None, source);
     };
-    let key = keys(text).into_iter().rfind(|key| key.line <= line);
-    let value = text.lines().nth(line).map(value_of).unwrap_or_default();
-    let at_line = key.map(|key| (key.name, value));
+    let key = keys(&text.text).into_iter().rfind(|key| key.line <= line);
+    let line = text.original_line(line);
+    let at_line = key.map(|key| (key.name, text.value(line)));
     describe(place(name, Some(line)), at_line, source)
 }
 
-/// The error of a `--set`.
-pub(super) fn in_setting(key: &str, value: &str, source: serde_yaml::Error) -> ConfigError {
-    describe(
-        setting(key, value),
-        Some((key.to_owned(), value.to_owned())),
-        source,
-    )
-}
-
-/// The error of a `--set` of a key that does not exist.
-pub(super) fn unknown_setting<'a>(
+/// The error of a setting.
+pub(super) fn in_setting(
+    place: String,
     key: &str,
     value: &str,
-    known: impl Iterator<Item = &'a str>,
+    source: serde_yaml::Error,
 ) -> ConfigError {
-    ConfigError::UnknownKey {
-        place: setting(key, value),
-        nearest: nearest(key, known),
-        key: key.to_owned(),
+    describe(place, Some((key.to_owned(), value.to_owned())), source)
+}
+
+/// The error of a name that stands for no key, or for several.
+pub(super) fn unknown(place: String, key: &str, meaning: Meaning, names: &Names) -> ConfigError {
+    let key = key.to_owned();
+    match meaning {
+        Meaning::Ambiguous(keys) => ConfigError::AmbiguousKey { place, key, keys },
+        _ => ConfigError::UnknownKey {
+            nearest: nearest(&key, names.0.iter().map(String::as_str)),
+            place,
+            key,
+        },
     }
 }
 
-/// The error of an invalid value, at the place where it was given last.
+/// The error of an invalid value, at the place where it was given last; settings are keys with their places.
 pub(super) fn invalid(
     name: &str,
-    text: &str,
+    text: &FullText,
     settings: &[(String, String)],
     invalid: InvalidValue,
 ) -> ConfigError {
@@ -89,45 +97,44 @@ pub(super) fn invalid(
         .iter()
         .rfind(|(key, _)| is_within(&invalid.key, key) || is_within(key, &invalid.key));
     let place = match set {
-        Some((key, value)) => setting(key, value),
+        Some((_, place)) => place.clone(),
         None => {
-            let keys = keys(text);
+            let keys = keys(&text.text);
             let innermost = keys.iter().rfind(|key| is_within(&invalid.key, &key.name));
-            place(name, innermost.map(|key| key.line))
+            place(name, innermost.map(|key| text.original_line(key.line)))
         }
     };
     ConfigError::InvalidValue { place, invalid }
 }
 
 /// A file and a line of it, from 0.
-fn place(name: &str, line: Option<usize>) -> String {
+pub(super) fn place(name: &str, line: Option<usize>) -> String {
     match line {
         Some(line) => format!("{name}, line {}", line + 1),
         None => name.to_owned(),
     }
 }
 
-fn setting(key: &str, value: &str) -> String {
-    format!("--set {key}={value}")
-}
-
 fn suggestion(nearest: Option<&str>) -> String {
     match nearest {
         Some(key) => format!("; did you mean `{key}`?"),
-        None => "; `fpmcl config COMMAND --full` prints every key".to_owned(),
+        None => "; no known key is similar".to_owned(),
     }
 }
 
-/// The known key that is most similar, by itself or as the last part of a dotted key; `None` where
-/// none is similar. Keys too long for any configuration are compared with none.
+/// The last parts of a known key that are most similar; `None` where none are. Keys too long for any configuration are compared with none.
 fn nearest<'a>(key: &str, known: impl Iterator<Item = &'a str>) -> Option<String> {
-    let distance = |candidate: &str| {
-        let last = candidate.rsplit('.').next().unwrap_or(candidate);
-        strsim::damerau_levenshtein(key, candidate).min(strsim::damerau_levenshtein(key, last))
-    };
+    let distance = |candidate: &str| strsim::damerau_levenshtein(key, candidate);
     let limit = (key.chars().count() / 3).max(2);
     let known = known.filter(|_| key.len() <= LONGEST_KEY);
+    let endings = |candidate: &'a str| {
+        let dots = candidate.match_indices('.').map(|(dot, _)| dot + 1);
+        std::iter::once(0)
+            .chain(dots)
+            .map(move |start| &candidate[start..])
+    };
     known
+        .flat_map(endings)
         .map(|candidate| (distance(candidate), candidate))
         .min_by_key(|(distance, _)| *distance)
         .filter(|(distance, _)| *distance <= limit)
@@ -199,11 +206,4 @@ fn in_words(ty: &str) -> &str {
         "i8" | "i16" | "i32" | "i64" => "a whole number",
         _ => ty,
     }
-}
-
-/// The value on a line, without its key and its comment.
-fn value_of(line: &str) -> String {
-    let value = line.split_once(':').map_or(line, |(_, value)| value);
-    let value = value.split(" #").next().unwrap_or_default();
-    value.trim().to_owned()
 }

@@ -1,7 +1,12 @@
 //! YAML text of configurations, and the lines of its keys.
 
+use std::ops::Range;
+
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+
+use super::error::{self, ConfigError};
+use super::names::{Meaning, Names};
 
 /// Serializes a configuration in block style, each key on a line of its own.
 pub fn to_yaml<T: Serialize>(config: &T) -> Result<String, serde_yaml::SerializeError> {
@@ -57,6 +62,141 @@ pub(super) fn keys(text: &str) -> Vec<Key> {
         });
     }
     keys
+}
+
+/// A text whose keys have their full names, and the lines of the original text.
+#[derive(Debug, Default)]
+pub(super) struct FullText {
+    pub(super) text: String,
+    /// For each line, that of the original, from 0.
+    lines: Vec<usize>,
+    original: Vec<String>,
+}
+
+impl FullText {
+    /// Replaces the names of all keys by their full ones. A text without keys in block style stays as it is.
+    pub(super) fn new(name: &str, text: &str, names: &Names) -> Result<Self, ConfigError> {
+        let original: Vec<String> = text.lines().map(str::to_owned).collect();
+        let found = keys(text);
+        let first = found.first().map_or(original.len(), |key| key.line);
+        let is_code =
+            |line: &&String| !line.trim().is_empty() && !line.starts_with(['#', '-', '%']);
+        let mut full = Self {
+            text: text.to_owned(),
+            lines: (0..original.len()).collect(),
+            original,
+        };
+        if found.is_empty() || full.original[..first].iter().any(|line| is_code(&line)) {
+            return Ok(full);
+        }
+        let mut root = Node::default();
+        for (index, key) in found.iter().enumerate() {
+            let is_inner =
+                |it: &&Key| it.name.len() > key.name.len() && is_within(&it.name, &key.name);
+            let later = &found[index + 1..];
+            let mut inner = later.iter().take_while(is_inner);
+            if key.name.contains('[') || inner.any(|it| !it.name[key.name.len()..].starts_with('['))
+            {
+                continue;
+            }
+            let end = later.iter().find(|it| !is_inner(it));
+            let end = end.map_or(full.original.len(), |next| next.line);
+            let place = error::place(name, Some(key.line));
+            match names.meaning(&key.name) {
+                Meaning::Key(name) => root.insert(&name, key.line..end, place)?,
+                Meaning::Nothing => (),
+                meaning => return Err(error::unknown(place, &key.name, meaning, names)),
+            }
+        }
+        (full.text, full.lines) = (String::new(), Vec::new());
+        root.write(0, &full.original, &mut full.text, &mut full.lines);
+        Ok(full)
+    }
+
+    /// The line of the original text, from 0.
+    pub(super) fn original_line(&self, line: usize) -> usize {
+        let last = self.lines.last().copied().unwrap_or(line);
+        self.lines.get(line).copied().unwrap_or(last)
+    }
+
+    /// The value on a line of the original text, without its key and its comment.
+    pub(super) fn value(&self, line: usize) -> String {
+        let line = self.original.get(line).map_or("", String::as_str);
+        let value = line.split_once(':').map_or(line, |(_, value)| value);
+        let value = value.split(" #").next().unwrap_or_default();
+        value.trim().to_owned()
+    }
+}
+
+/// A key with its lines in the original text, or a block of keys.
+#[derive(Default)]
+struct Node {
+    name: String,
+    lines: Range<usize>,
+    inner: Vec<Node>,
+}
+
+impl Node {
+    fn insert(
+        &mut self,
+        name: &str,
+        lines: Range<usize>,
+        place: String,
+    ) -> Result<(), ConfigError> {
+        let mut node = self;
+        for part in name.split('.') {
+            let known = node.inner.iter().position(|it| it.name == part);
+            let index = known.unwrap_or(node.inner.len());
+            if known.is_none() {
+                node.inner.push(Self {
+                    name: part.to_owned(),
+                    ..Self::default()
+                });
+            }
+            node = &mut node.inner[index];
+            // A value where a block is wanted, or the other way round.
+            if !node.lines.is_empty() {
+                break;
+            }
+        }
+        if !node.lines.is_empty() || !node.inner.is_empty() {
+            let key = name.to_owned();
+            return Err(ConfigError::DuplicateKey { place, key });
+        }
+        node.lines = lines;
+        Ok(())
+    }
+
+    /// Writes what is within it with an indentation, and the original line of each line.
+    fn write(
+        &self,
+        indentation: usize,
+        original: &[String],
+        text: &mut String,
+        lines: &mut Vec<usize>,
+    ) {
+        for node in &self.inner {
+            let start = &original[node.lines.start];
+            let value = start.split_once(':').map_or("", |(_, value)| value);
+            let value = if node.inner.is_empty() { value } else { "" };
+            *text += &format!("{:indentation$}{}:{value}\n", "", node.name);
+            lines.push(node.first_line());
+            let old = start.len() - start.trim_start().len();
+            for row in node.lines.clone().skip(1) {
+                let line = &original[row];
+                let kept = old.min(line.len() - line.trim_start().len());
+                *text += &format!("{:indentation$}{}\n", "", &line[kept..]);
+                lines.push(row);
+            }
+            node.write(indentation + 2, original, text, lines);
+        }
+    }
+
+    fn first_line(&self) -> usize {
+        self.inner
+            .first()
+            .map_or(self.lines.start, Self::first_line)
+    }
 }
 
 /// Replaces the value of a key in a text of [`to_yaml`]; `None` where the key does not exist.

@@ -1,0 +1,173 @@
+//! Blocks of keys that several commands share.
+
+use std::path::{Path, PathBuf};
+
+use nalgebra::{UnitQuaternion, Vector3};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
+
+use crate::geometry::Pose3;
+use crate::recording::Selection;
+use crate::validation::{InvalidValue, Validate, in_range, nested, require};
+
+/// The recording that a command reads.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema, SmartDefault)]
+#[serde(default, deny_unknown_fields)]
+pub struct RecordingConfig {
+    /// The recording: its folder, the folder of its scans, or a bag.
+    #[default("data/kitti/velodyne".into())]
+    pub scan_folder: PathBuf,
+    /// Topic of the point clouds in a bag with several.
+    pub topic: Option<String>,
+    /// The frames that are used.
+    pub frames: Selection,
+    /// Angle to add to the elevations of all points [deg].
+    pub elevation_bias_deg: f64,
+}
+
+impl Validate for RecordingConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        require_path("scan_folder", &self.scan_folder)?;
+        nested("frames", &self.frames)?;
+        in_range("elevation_bias_deg", self.elevation_bias_deg, -5.0..=5.0)
+    }
+}
+
+/// Poses that are given: those of a map, or the true ones of a recording.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct GivenPosesConfig {
+    /// Rows of KITTI or TUM, a folder `oxts`, or a topic of a bag; `None`: those that the recording contains, if any.
+    pub pose_file: Option<PathBuf>,
+    /// Calibration of the recording, with its line `Tr`; `None`: the poses in `pose_file` are those of the lidar.
+    pub calib_file: Option<PathBuf>,
+    /// Pose x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose poses are given; `None`: they are
+    /// those of the lidar.
+    pub body_from_lidar: Option<[f64; 6]>,
+}
+
+impl GivenPosesConfig {
+    /// `body_from_lidar` as a pose.
+    pub fn body_from_lidar(&self) -> Option<Pose3> {
+        let [x, y, z, roll, pitch, yaw] = self.body_from_lidar?;
+        let [roll, pitch, yaw] = [roll, pitch, yaw].map(f64::to_radians);
+        Some(Pose3::from_parts(
+            Vector3::new(x, y, z).into(),
+            UnitQuaternion::from_euler_angles(roll, pitch, yaw),
+        ))
+    }
+}
+
+impl Validate for GivenPosesConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        optional_path("pose_file", self.pose_file.as_deref())?;
+        optional_path("calib_file", self.calib_file.as_deref())?;
+        let Some(numbers) = self.body_from_lidar else {
+            return Ok(());
+        };
+        let key = "body_from_lidar";
+        require(
+            self.calib_file.is_none(),
+            key,
+            format!("{numbers:?}"),
+            "give calib_file or body_from_lidar, not both",
+        )?;
+        let is_possible = numbers[..3].iter().all(|m| m.abs() <= 1000.0)
+            && numbers[3..].iter().all(|deg| deg.abs() <= 360.0);
+        require(
+            is_possible,
+            key,
+            format!("{numbers:?}"),
+            "x, y, z must be within 1000 m, and roll, pitch, yaw within 360 degrees",
+        )
+    }
+}
+
+/// The map in which a recording is localized.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema, SmartDefault)]
+#[serde(default, deny_unknown_fields)]
+pub struct MapInputConfig {
+    /// Map of `build-map` or range-mcl.
+    #[default("results/map.ply".into())]
+    pub map_file: PathBuf,
+    /// Camera poses of the mapping drive; `None`: the map carries its own frame.
+    pub map_pose_file: Option<PathBuf>,
+    /// Calibration of the mapping drive; `None`: the map carries its own frame.
+    pub map_calib_file: Option<PathBuf>,
+}
+
+impl Validate for MapInputConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        require_path("map_file", &self.map_file)?;
+        optional_path("map_pose_file", self.map_pose_file.as_deref())?;
+        optional_path("map_calib_file", self.map_calib_file.as_deref())
+    }
+}
+
+/// Where the motion between frames comes from.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct MotionConfig {
+    /// Source: auto, scans, file, ground_truth or none.
+    pub odometry: OdometrySource,
+    /// Odometry poses in KITTI or TUM format, for `odometry: file`.
+    pub odometry_file: Option<PathBuf>,
+}
+
+impl MotionConfig {
+    /// Requires a file for [`OdometrySource::File`], and true poses for [`OdometrySource::GroundTruth`].
+    pub(super) fn validate(&self, truth: &GivenPosesConfig) -> Result<(), InvalidValue> {
+        require(
+            self.odometry != OdometrySource::GroundTruth || truth.pose_file.is_some(),
+            "motion.odometry",
+            "ground_truth",
+            "name the true poses in pose_file, or choose auto",
+        )?;
+        require(
+            self.odometry != OdometrySource::File || self.odometry_file.is_some(),
+            "motion.odometry",
+            "file",
+            "name the file in odometry_file, or choose auto, scans or none",
+        )
+    }
+}
+
+/// Source of the motion between frames.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum OdometrySource {
+    /// `odometry_file` or, in a bag, the topic of odometry, if there is one; else the scans.
+    #[default]
+    Auto,
+    /// The scans alone.
+    Scans,
+    /// `odometry_file`.
+    File,
+    /// The true poses of the recording with noise, as range-mcl does for demonstration.
+    GroundTruth,
+    /// None: constant velocity.
+    None,
+}
+
+/// How a command writes its output.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema, SmartDefault)]
+#[serde(default, deny_unknown_fields)]
+pub struct OutputConfig {
+    /// Whether to draw the pictures of the result.
+    #[default(true)]
+    pub plots: bool,
+    /// Whether to replace existing output.
+    pub force: bool,
+}
+
+/// Requires a path that is not empty.
+pub(super) fn require_path(key: &str, value: &Path) -> Result<(), InvalidValue> {
+    let is_given = !value.as_os_str().is_empty();
+    require(is_given, key, "empty", "give a path")
+}
+
+/// Requires a path that is not empty, where one is given.
+pub(super) fn optional_path(key: &str, value: Option<&Path>) -> Result<(), InvalidValue> {
+    value.map_or(Ok(()), |value| require_path(key, value))
+}

@@ -1,0 +1,180 @@
+//! Names of keys: full ones, their last parts, and those of range-mcl.
+//!
+//! > A name is the key with that full name; else, with its first part replaced by [`ALIASES`], and else as it is, the
+//! > key whose full name ends with it. Of several, the one whose block contains the others.
+//!
+//! So `seed`, `range_image.width` and `numParticles` are names of keys wherever these are in a configuration.
+
+/// Other first parts of names: those of range-mcl, without units and blocks, and earlier ones of our own.
+const ALIASES: [(&str, &str); 20] = [
+    // range-mcl
+    ("crop_x", "crop_x_m"),
+    ("crop_y", "crop_y_m"),
+    ("crop_z", "crop_z_m"),
+    ("grid_res", "panorama.cell_m"),
+    ("move_thres", "move_thres_m"),
+    ("numParticles", "num_particles"),
+    ("number_of_iterations", "smoothing_iterations"),
+    ("plot_loc_results", "output.plots"),
+    ("plot_loc_traj", "output.plots"),
+    ("simplify_resolution", "simplify_resolution_m"),
+    ("visualize", "output.plots"),
+    ("voxel_size", "voxel_size_m"),
+    ("yaw_sigma", "panorama.yaw_sigma_deg"),
+    // Earlier names of our own.
+    ("constant_velocity_noise", "constant_velocity"),
+    ("ground_method", "ground.method"),
+    ("odometry", "motion.odometry"),
+    ("odometry_noise", "localizer.motion"),
+    ("unknown_velocity_noise", "unknown_velocity"),
+    ("velocity_noise", "localizer.velocity"),
+    ("vigilance", "tracking_loss"),
+];
+
+/// Keys of range-mcl that bound the memory of its graphics card.
+const WITHOUT_EFFECT: [&str; 2] = ["range_image.max_instance", "range_image.render_instanced"];
+
+/// What a name stands for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Meaning {
+    /// The full name of a key, or of one that would be in a known block.
+    Key(String),
+    /// A key that has no effect.
+    Nothing,
+    /// None of the keys.
+    Unknown,
+    /// Several keys equally well.
+    Ambiguous(Vec<String>),
+}
+
+/// The full names of the keys of a configuration.
+pub(super) struct Names(pub Vec<String>);
+
+impl Names {
+    /// What a dotted name stands for: that of a key, or of something within one.
+    pub(super) fn meaning(&self, name: &str) -> Meaning {
+        if WITHOUT_EFFECT.contains(&name) {
+            return Meaning::Nothing;
+        }
+        let mut end = name.len();
+        loop {
+            match self.key(&name[..end]) {
+                Meaning::Key(key) => return Meaning::Key(key + &name[end..]),
+                Meaning::Unknown => (),
+                other => return other,
+            }
+            match name[..end].rfind('.') {
+                Some(dot) => end = dot,
+                None => return Meaning::Unknown,
+            }
+        }
+    }
+
+    /// The key of a name.
+    fn key(&self, name: &str) -> Meaning {
+        if self.0.iter().any(|key| key == name) {
+            return Meaning::Key(name.to_owned());
+        }
+        let first = name.split('.').next().unwrap_or(name);
+        if let Some((_, other)) = ALIASES.iter().find(|(alias, _)| *alias == first) {
+            let replaced = format!("{other}{}", &name[first.len()..]);
+            match self.ending(&replaced) {
+                Meaning::Unknown => (),
+                found => return found,
+            }
+        }
+        self.ending(name)
+    }
+
+    /// The key whose name ends with these parts; of several, the one whose block contains the others.
+    fn ending(&self, parts: &str) -> Meaning {
+        let block = |key: &str| key.strip_suffix(parts).map(str::to_owned);
+        let is_block = |block: &str| block.is_empty() || block.ends_with('.');
+        let blocks = self.0.iter().filter_map(|key| block(key));
+        let blocks: Vec<String> = blocks.filter(|block| is_block(block)).collect();
+        let outermost = blocks
+            .iter()
+            .find(|outer| blocks.iter().all(|it| it.starts_with(*outer)));
+        match outermost {
+            Some(block) => Meaning::Key(format!("{block}{parts}")),
+            None if blocks.is_empty() => Meaning::Unknown,
+            None => {
+                let keys = blocks.iter().map(|block| format!("{block}{parts}"));
+                Meaning::Ambiguous(keys.collect())
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn meaning(name: &str) -> Meaning {
+        let keys = [
+            "seed",
+            "odometry",
+            "tracker.seed",
+            "tracker.localizer.num_particles",
+            "tracker.localizer.tracking_loss",
+            "tracker.localizer.tracking_loss.patience",
+            "refinement.swarm.patience",
+            "refinement.wide_search.swarm.patience",
+            "refinement.swarm",
+            "refinement.wide_search.swarm",
+            "tracker.sensor.range_image",
+        ];
+        Names(keys.map(str::to_owned).into()).meaning(name)
+    }
+
+    fn key(name: &str) -> Meaning {
+        Meaning::Key(name.to_owned())
+    }
+
+    #[test]
+    fn a_full_name_comes_before_a_longer_one() {
+        assert_eq!(meaning("seed"), key("seed"));
+        assert_eq!(meaning("tracker.seed"), key("tracker.seed"));
+        assert_eq!(meaning("odometry"), key("odometry"));
+    }
+
+    #[test]
+    fn the_last_parts_are_a_name_of_the_outermost_key() {
+        assert_eq!(
+            meaning("num_particles"),
+            key("tracker.localizer.num_particles")
+        );
+        assert_eq!(meaning("swarm.patience"), key("refinement.swarm.patience"));
+        assert_eq!(meaning("articles"), Meaning::Unknown);
+        let all = [
+            "tracker.localizer.tracking_loss.patience",
+            "refinement.swarm.patience",
+            "refinement.wide_search.swarm.patience",
+        ];
+        assert_eq!(
+            meaning("patience"),
+            Meaning::Ambiguous(all.map(str::to_owned).into())
+        );
+    }
+
+    #[test]
+    fn aliases_replace_the_first_part() {
+        assert_eq!(
+            meaning("numParticles"),
+            key("tracker.localizer.num_particles")
+        );
+        assert_eq!(
+            meaning("vigilance.patience"),
+            key("tracker.localizer.tracking_loss.patience")
+        );
+    }
+
+    #[test]
+    fn what_is_within_a_known_block_has_its_name() {
+        assert_eq!(
+            meaning("range_image.widht"),
+            key("tracker.sensor.range_image.widht")
+        );
+        assert_eq!(meaning("range_image.max_instance"), Meaning::Nothing);
+    }
+}
