@@ -165,3 +165,5 @@ pub mod internals {
         pub use crate::recording::scan_files::{is_scan, read, read_stamped};
     }
 }
+#[cfg(feature = "cli")]
+pub use app::main_of_library;

@@ -1,7 +1,6 @@
 //! Errors of the library as exceptions.
 
 use anyhow::anyhow;
-use fpmcl::app::run::failure::format_error_chain;
 use pyo3::exceptions::PyException;
 use pyo3::prelude::*;
 
@@ -18,8 +17,20 @@ pyo3::create_exception!(
 pub fn raised(error: impl Into<anyhow::Error>) -> PyErr {
     match error.into().downcast::<PyErr>() {
         Ok(exception) => exception,
-        Err(error) => Error::new_err(format_error_chain(&error)),
+        Err(error) => Error::new_err(chain(&error)),
     }
+}
+
+/// An error and its causes, without repetitions.
+fn chain(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if !text.contains(&cause) {
+            text += if text.is_empty() { "" } else { ": " };
+            text += &cause;
+        }
+    }
+    text
 }
 
 /// Calls the library without the interpreter lock.

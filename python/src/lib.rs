@@ -15,8 +15,6 @@ mod trajectory;
 use std::ffi::OsString;
 use std::path::PathBuf;
 
-use fpmcl::app;
-use fpmcl::app::run::version;
 use pyo3::prelude::*;
 
 #[pymodule]
@@ -37,7 +35,7 @@ mod _fpmcl {
     #[pymodule_init]
     fn init(module: &pyo3::Bound<'_, pyo3::types::PyModule>) -> pyo3::PyResult<()> {
         use pyo3::types::PyModuleMethods as _;
-        module.add("__version__", fpmcl::app::run::version::VERSION)
+        module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }
 
@@ -46,6 +44,5 @@ mod _fpmcl {
 fn main(py: Python<'_>) -> PyResult<u8> {
     let arguments: Vec<OsString> = py.import("sys")?.getattr("argv")?.extract()?;
     let library: PathBuf = py.import("fpmcl._fpmcl")?.getattr("__file__")?.extract()?;
-    version::set_library(library);
-    Ok(py.detach(|| app::main(arguments)))
+    Ok(py.detach(|| fpmcl::main_of_library(arguments, library)))
 }

@@ -1,10 +1,10 @@
 //! Localization, scan by scan.
 
-use fpmcl::app::settings::{LocalizationConfig, OdometrySource};
 use fpmcl::geometry::Pose3;
 use fpmcl::lidar;
-use fpmcl::localization::{self, Odometry, Start, Tracker, TrackerConfig, TrackerError};
-use fpmcl::odometry::OdometryConfig;
+use fpmcl::localization::{
+    self, Odometry, Start, StartSpread, Tracker, TrackerConfig, TrackerError,
+};
 use numpy::ndarray::Array2;
 use numpy::{IntoPyArray as _, PyArray1, PyArray2, PyUntypedArrayMethods as _};
 use pyo3::exceptions::PyValueError;
@@ -21,8 +21,9 @@ use crate::settings;
 ///
 /// ``start``: ``"anywhere"`` (the default in maps of up to 1 km²), ``"road"`` (anywhere along the mapping drive), or a pose nearby: (3,), x, y
 /// [m] and heading [rad], or (4, 4). ``sensor``: by default inferred from the first scan,
-/// own car and times of points from the first that show motion; better that of a Recording. Settings: ``fpmcl config localize --full``, such as ``seed``, ``numParticles``, and
-/// ``odometry="none"`` for constant velocity where no motion is given.
+/// own car and times of points from the first that show motion; better that of a Recording. Settings: fields of
+/// ``tracker`` in ``fpmcl config localize --full``, such as ``seed``, ``num_particles``, and ``odometry=None`` for
+/// constant velocity where no motion is given.
 #[pyclass(module = "fpmcl")]
 pub struct Localizer {
     tracker: Tracker,
@@ -38,15 +39,9 @@ impl Localizer {
         sensor: Option<Sensor>,
         settings: Option<&Bound<'_, PyDict>>,
     ) -> PyResult<Self> {
-        let config = settings::of_stage(LocalizationConfig::default(), settings)?;
-        let tracker = TrackerConfig {
-            sensor: config.known_sensor(),
-            localizer: config.localizer(),
-            odometry: (config.odometry != OdometrySource::None).then(OdometryConfig::default),
-            seed: config.seed,
-        };
-        let tracker = Tracker::new(&map.map, tracker).map_err(raised)?;
-        let tracker = tracker.with_start(start_of(start, &config, &map.map)?);
+        let config = settings::apply(TrackerConfig::default(), settings)?;
+        let tracker = Tracker::new(&map.map, config).map_err(raised)?;
+        let tracker = tracker.with_start(start_of(start, &map.map)?);
         Ok(Self {
             tracker: match sensor {
                 Some(sensor) => tracker.with_sensor(sensor.0),
@@ -123,11 +118,7 @@ impl Given {
 }
 
 /// Where the car starts: `"anywhere"`, `"road"`, or near a pose; `None` if that is unknown.
-fn start_of(
-    start: Option<&Bound<'_, PyAny>>,
-    config: &LocalizationConfig,
-    map: &fpmcl::map::Map,
-) -> PyResult<Start> {
+fn start_of(start: Option<&Bound<'_, PyAny>>, map: &fpmcl::map::Map) -> PyResult<Start> {
     let Some(start) = start else {
         return Ok(Start::unknown(map));
     };
@@ -141,7 +132,7 @@ fn start_of(
         };
     }
     let pose: Numbers<'_, f64> = start.extract()?;
-    let spread = config.start.clone();
+    let spread = StartSpread::default();
     Ok(match pose.ndim() {
         2 => Start::near(&arrays::pose("start", &pose)?, spread),
         _ => Start::Pose {

@@ -4,11 +4,12 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
-use anyhow::anyhow;
-use fpmcl::app::settings::{BuildMapConfig, LocalizationConfig};
+use anyhow::ensure;
 use fpmcl::geometry::{Pose3, TriangleMesh};
+use fpmcl::ground::GroundConfig;
 use fpmcl::lidar::Motion;
-use fpmcl::map::{self, BuildError, MapBuilder, MapCache, MapOptions, MappingPath};
+use fpmcl::map::{self, BuildError, MapBuilder, MapCache, MapConfig, MapOptions};
+use fpmcl::mapping::{MappingError, map_recording};
 use fpmcl::rendering::Backend;
 use numpy::ndarray::Array2;
 use numpy::{
@@ -20,7 +21,7 @@ use pyo3::types::PyDict;
 
 use crate::arrays::{self, Numbers, Numbers2};
 use crate::errors::{of_scan, raised, released};
-use crate::recording::{Recording, Scans, Sensor, without_poses};
+use crate::recording::{Scans, Sensor};
 use crate::settings;
 
 /// A triangle mesh with its ground and the path of its mapping drive; immutable.
@@ -80,10 +81,11 @@ impl Map {
     /// Builds a map.
     ///
     /// ``scans``: a Recording, or an iterable of Scans and of arrays (N, 3) [m], which are taken as deskewed.
-    /// ``poses``: (N, 4, 4), one per scan, into the frame of the map; by default those of the recording. Scans with times
-    /// are deskewed by them. ``sensor``: by default inferred from the scans. Settings: ``fpmcl config build-map --full``.
+    /// ``poses``: (N, 4, 4), one per scan, into the frame of the map; by default those of the recording, which are checked,
+    /// and without these found from the scans. Scans with times are deskewed by them. ``sensor``: by default inferred from
+    /// the scans. Settings: fields of ``map`` in ``fpmcl config build-map --full``, such as ``local_map_size``, ``depth``.
     ///
-    /// Raises Error if there are no poses, or if poses and scans do not fit each other.
+    /// Raises Error if poses and scans, or scans and sensor, do not fit each other.
     #[staticmethod]
     #[pyo3(signature = (scans, poses=None, *, sensor=None, backend="auto", **settings))]
     fn build(
@@ -94,10 +96,11 @@ impl Map {
         backend: &str,
         settings: Option<&Bound<'_, PyDict>>,
     ) -> PyResult<Self> {
-        let mut config = settings::of_stage(BuildMapConfig::default(), settings)?;
-        let drive = Drive::of(scans, poses)?;
-        let sensor = drive.scans.sensor(py, sensor)?;
-        sensor.apply(&mut config.range_image, &mut config.own_car_m);
+        let config = settings::apply(MapConfig::default(), settings)?;
+        let scans = Scans::of(scans)?;
+        let poses = poses.map(|poses| arrays::poses("poses", &poses));
+        let poses = poses.transpose()?;
+        let sensor = scans.sensor(py, sensor)?;
         let raised_signal = Arc::new(Mutex::new(None));
         let signal = raised_signal.clone();
         let builder = MapBuilder {
@@ -111,9 +114,13 @@ impl Map {
                     }
                 },
             ),
-            ..MapBuilder::new(config.map())
+            sensor: Some(sensor.0),
+            ..MapBuilder::new(config)
         };
-        let built = released(py, || drive.build(&builder));
+        let built = released(py, || match &poses {
+            Some(poses) => build_of_poses(&scans, poses, &builder),
+            None => build_of_recording(&scans, builder),
+        });
         let signal = raised_signal
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
@@ -195,69 +202,45 @@ fn options(backend: &str) -> PyResult<MapOptions> {
     })
 }
 
-/// Scans with their poses.
-struct Drive {
-    scans: Scans,
-    map_from_lidar: Vec<Pose3>,
-    /// Motion of the sensor around each scan, by which it is deskewed; `None` if it is unknown.
-    motions: Vec<Option<Motion>>,
-    world_from_map: Pose3,
+/// A map of scans with one pose each, by which they are deskewed.
+fn build_of_poses(
+    scans: &Scans,
+    map_from_lidar: &[Pose3],
+    builder: &MapBuilder,
+) -> anyhow::Result<map::Map> {
+    ensure!(
+        map_from_lidar.len() == scans.len(),
+        "there are {} poses for {} scans; give one per scan",
+        map_from_lidar.len(),
+        scans.len()
+    );
+    let times_s = scans.times_s();
+    let posed = (0..scans.len()).map(|row| {
+        let mut scan = scans.read(row)?.into_owned();
+        if let Some(times_s) = &times_s
+            && let Some(motion) = Motion::along(map_from_lidar, times_s, row)
+        {
+            motion.deskew(&mut scan);
+        }
+        anyhow::Ok((scan, map_from_lidar[row]))
+    });
+    builder.build(posed).map_err(of_build)
 }
 
-impl Drive {
-    /// The poses are the given ones, else those of the recording.
-    fn of(scans: &Bound<'_, PyAny>, poses: Option<Numbers<'_, f64>>) -> PyResult<Self> {
-        let recording = scans.cast::<Recording>().ok().map(Bound::get);
-        let scans = Scans::of(scans)?;
-        let Some(poses) = poses else {
-            let recording = recording.ok_or_else(without_poses)?;
-            let map_from_lidar = recording.given().ok_or_else(without_poses)?;
-            let compensated = recording.recording.clone().compensated_by_poses();
-            return Ok(Self {
-                motions: (compensated.frames.iter())
-                    .map(|frame| frame.motion)
-                    .collect(),
-                world_from_map: compensated.world().0,
-                scans,
-                map_from_lidar,
-            });
-        };
-        let map_from_lidar = arrays::poses("poses", &poses)?;
-        if map_from_lidar.len() != scans.len() {
-            return Err(raised(anyhow!(
-                "there are {} poses for {} scans; give one per scan",
-                map_from_lidar.len(),
-                scans.len()
-            )));
-        }
-        let times_s = scans.times_s();
-        let motion = |row| Motion::along(&map_from_lidar, times_s.as_ref()?, row);
-        Ok(Self {
-            motions: (0..scans.len()).map(motion).collect(),
-            world_from_map: Pose3::identity(),
-            scans,
-            map_from_lidar,
-        })
+/// A map of scans whose poses are those of their recording, or are found.
+fn build_of_recording(scans: &Scans, builder: MapBuilder) -> anyhow::Result<map::Map> {
+    let recording = scans.recording()?;
+    match map_recording(&recording, None, builder) {
+        Ok(mapped) => Ok(mapped.map),
+        Err(MappingError::Build(error)) => Err(of_build(error)),
+        Err(error) => Err(error.into()),
     }
+}
 
-    fn build(&self, builder: &MapBuilder) -> anyhow::Result<map::Map> {
-        let scans = self.map_from_lidar.iter().zip(&self.motions).enumerate();
-        let scans = scans.map(|(row, (pose, motion))| {
-            let mut scan = self.scans.read(row)?.into_owned();
-            if let Some(motion) = motion {
-                motion.deskew(&mut scan);
-            }
-            anyhow::Ok((scan, *pose))
-        });
-        let mut map = builder.build(scans).map_err(|error| match error {
-            BuildError::Scan(error) => of_scan(error),
-            error => error.into(),
-        })?;
-        map.path = Arc::new(MappingPath {
-            world_from_map: self.world_from_map,
-            map_from_lidar: map.path.map_from_lidar.clone(),
-        });
-        Ok(map)
+fn of_build(error: BuildError) -> anyhow::Error {
+    match error {
+        BuildError::Scan(error) => of_scan(error),
+        error => error.into(),
     }
 }
 
@@ -300,7 +283,7 @@ pub fn cast_rays<'py>(
 /// Returns the confidence that each point of a scan is ground, (N,) float32, 0 to 1.
 ///
 /// ``points``: (N, 3), one revolution in the frame of the lidar [m]; float32 without a copy if contiguous. Settings:
-/// ``ground_method`` (``"fuzzy"``, ``"pca"``, ``"ransac"``) and its keys, as in ``fpmcl config localize --full``.
+/// ``method`` (``"fuzzy"``, ``"pca"``, ``"ransac"``) and the other fields of ``ground`` in ``fpmcl config ground --full``.
 #[pyfunction]
 #[pyo3(signature = (points, **settings))]
 pub fn classify_ground<'py>(
@@ -308,10 +291,10 @@ pub fn classify_ground<'py>(
     points: Numbers2<'py, f32>,
     settings: Option<&Bound<'_, PyDict>>,
 ) -> PyResult<Bound<'py, PyArray1<f32>>> {
-    let config = settings::of_stage(LocalizationConfig::default(), settings)?;
+    let config = settings::apply(GroundConfig::default(), settings)?;
     let points = arrays::vectors("points", &points)?;
     let confidence = released(py, || {
-        let classifier = config.ground().classifier()?;
+        let classifier = config.classifier()?;
         anyhow::Ok(classifier.ground_confidence(&points))
     })?;
     Ok(confidence.into_pyarray(py))

@@ -4,20 +4,18 @@ use std::borrow::Cow;
 use std::path::PathBuf;
 
 use anyhow::anyhow;
-use fpmcl::app::settings::LocalizationConfig;
-use fpmcl::geometry::Pose3;
+use fpmcl::geometry::{Pose3, pose_from_degrees};
 use fpmcl::lidar;
-use fpmcl::recording::{self, Frame};
-use fpmcl::sensor::{self, RangeImageConfig, SensorConfig};
+use fpmcl::recording::{self, Selection};
+use fpmcl::sensor::{self, MotionCompensation, SensorConfig};
+use fpmcl::validation::Validate as _;
 use numpy::{PyArray1, PyArray2, PyArray3, PyArrayDyn};
 use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
 
 use crate::arrays::{self, Numbers1, Numbers2};
 use crate::errors::{raised, released};
 use crate::map::Map;
-use crate::settings;
 
 /// Number of scans from which a sensor is inferred.
 const SENSOR_SCANS: usize = 10;
@@ -168,14 +166,6 @@ impl Sensor {
     }
 }
 
-impl Sensor {
-    /// Sets the keys of the sensor that are not given.
-    pub fn apply(&self, range_image: &mut RangeImageConfig, own_car_m: &mut Option<[f32; 4]>) {
-        range_image.resolve(&self.0.range_image, self.0.has_rows);
-        own_car_m.get_or_insert(self.0.own_car_m);
-    }
-}
-
 /// A sequence of scans, each of which is read when it is indexed.
 #[pyclass(frozen, module = "fpmcl")]
 pub struct Recording {
@@ -267,39 +257,60 @@ pub fn without_poses() -> PyErr {
 /// Opens a recording: a folder of scans (KITTI odometry, KITTI raw, .bin, .pcd, .ply, .npy) or a bag (MCAP, rosbag2, ROS 1).
 ///
 /// ``poses``: file of its poses (KITTI, TUM, a folder ``oxts``) or topic of its bag; by default those that the
-/// recording contains, if there are any. Settings: ``start_idx``, ``n_scans``, ``frame_step``, ``topic``, ``calib_file``,
-/// ``body_from_lidar``, ``motion_compensation``, ``elevation_bias_deg``, as in ``fpmcl config localize --full``.
+/// recording contains, if there are any. ``calib_file``: calibration of the camera whose poses these are.
+/// ``body_from_lidar``: x, y, z [m], roll, pitch, yaw [deg] of the lidar on the body whose poses these are. ``topic``: of the
+/// point clouds in a bag with several. ``start_idx``, ``n_scans`` (-1: all), ``frame_step``: the frames that are used.
+/// ``motion_compensation``: ``"auto"``, a rotation such as ``"clockwise"``, or None for compensated scans.
+/// ``elevation_bias_deg``: angle to add to the elevations of all points [deg].
 ///
 /// Raises Error if something cannot be read, with the file, and what to do.
 #[pyfunction]
-#[pyo3(signature = (path, poses=None, **settings))]
+#[expect(clippy::too_many_arguments, reason = "they have names in Python")]
+#[pyo3(signature = (
+    path, poses=None, *, topic=None, calib_file=None, body_from_lidar=None, start_idx=0, n_scans=-1, frame_step=1,
+    motion_compensation=Some("auto".to_owned()), elevation_bias_deg=0.0
+))]
 pub fn read_recording(
     py: Python<'_>,
     path: PathBuf,
     poses: Option<PathBuf>,
-    settings: Option<&Bound<'_, PyDict>>,
+    topic: Option<String>,
+    calib_file: Option<PathBuf>,
+    body_from_lidar: Option<[f64; 6]>,
+    start_idx: usize,
+    n_scans: i64,
+    frame_step: usize,
+    motion_compensation: Option<String>,
+    elevation_bias_deg: f64,
 ) -> PyResult<Recording> {
-    let base = LocalizationConfig {
-        scan_folder: path,
-        pose_file: poses,
-        ..LocalizationConfig::default()
+    let selection = Selection {
+        start_idx,
+        n_scans,
+        frame_step,
     };
-    let mut config = settings::of_recording(base, settings)?;
+    selection.validate().map_err(raised)?;
+    let motion_compensation = motion_compensation.map(MotionCompensation::try_from);
+    let known = SensorConfig {
+        motion_compensation: motion_compensation
+            .transpose()
+            .map_err(PyValueError::new_err)?,
+        ..SensorConfig::default()
+    };
     let (recording, sensor) = released(py, || {
-        let inputs = config.recording_inputs();
-        inputs.require()?;
-        let selection = config.selection();
-        let mut recording = inputs.open(&selection)?;
-        let track = match &config.pose_file {
-            Some(path) => Some(inputs.track(path, &recording)?),
+        let mut recording = recording::Recording::open_with(&path, topic.as_deref(), &selection)?;
+        recording.body_from_lidar = body_from_lidar.map(pose_from_degrees);
+        let recording = recording.with_elevation_bias(elevation_bias_deg.to_radians());
+        let track = match &poses {
+            Some(path) => Some(recording.read_track(path, calib_file.as_deref())?),
             None if recording.files.poses.is_some() => Some(recording.own_track()?),
             None => recording.own_track().ok(),
         };
-        if let Some(track) = track {
-            recording = recording.with_poses(track)?;
-        }
-        let (recording, sensor) = config.sensor_keys().resolve(recording)?;
-        anyhow::Ok((recording, Sensor(sensor)))
+        let recording = match track {
+            Some(track) => recording.with_poses(track)?,
+            None => recording,
+        };
+        let sensor = sensor::Sensor::infer_recording(&recording, &known)?;
+        anyhow::Ok((sensor.applied_to(recording), Sensor(sensor)))
     })?;
     Ok(Recording { recording, sensor })
 }
@@ -312,7 +323,7 @@ pub fn infer_sensor(py: Python<'_>, scans: &Bound<'_, PyAny>) -> PyResult<Sensor
 
 /// Scans of an argument, which are read or converted when they are needed.
 pub enum Scans {
-    Recorded(Vec<Frame>, Sensor),
+    Recorded(recording::Recording, Sensor),
     Given(Vec<GivenScan>),
 }
 
@@ -327,8 +338,8 @@ impl Scans {
     pub fn of(scans: &Bound<'_, PyAny>) -> PyResult<Self> {
         if let Ok(recording) = scans.cast::<Recording>() {
             let recording = recording.get();
-            let frames = recording.recording.frames.clone();
-            return Ok(Self::Recorded(frames, recording.sensor.clone()));
+            let sensor = recording.sensor.clone();
+            return Ok(Self::Recorded(recording.recording.clone(), sensor));
         }
         let scans = scans.try_iter()?.map(|scan| {
             Ok(match scan?.cast_into::<Scan>() {
@@ -341,7 +352,7 @@ impl Scans {
 
     pub fn len(&self) -> usize {
         match self {
-            Self::Recorded(frames, _) => frames.len(),
+            Self::Recorded(recording, _) => recording.frames.len(),
             Self::Given(scans) => scans.len(),
         }
     }
@@ -349,7 +360,7 @@ impl Scans {
     /// Reads a scan, without the interpreter lock.
     pub fn read(&self, row: usize) -> anyhow::Result<Cow<'_, lidar::Scan>> {
         match self {
-            Self::Recorded(frames, _) => Ok(Cow::Owned(frames[row].read()?)),
+            Self::Recorded(recording, _) => Ok(Cow::Owned(recording.frames[row].read()?)),
             Self::Given(scans) => match &scans[row] {
                 GivenScan::Scan(scan) => Ok(Cow::Borrowed(&scan.get().scan)),
                 GivenScan::Points(points) => Python::attach(|py| {
@@ -366,7 +377,9 @@ impl Scans {
     /// Times of the scans [s]; `None` if one is not known.
     pub fn times_s(&self) -> Option<Vec<f64>> {
         match self {
-            Self::Recorded(frames, _) => Some(frames.iter().map(|frame| frame.time_s).collect()),
+            Self::Recorded(recording, _) => {
+                Some(recording.frames.iter().map(|frame| frame.time_s).collect())
+            }
             Self::Given(scans) => (scans.iter())
                 .map(|scan| match scan {
                     GivenScan::Scan(scan) => scan.get().scan.time_s,
@@ -374,6 +387,16 @@ impl Scans {
                 })
                 .collect(),
         }
+    }
+
+    /// The recording, which scans of an iterable make.
+    pub fn recording(&self) -> anyhow::Result<recording::Recording> {
+        if let Self::Recorded(recording, _) = self {
+            return Ok(recording.clone());
+        }
+        let scans = (0..self.len()).map(|row| Ok(self.read(row)?.into_owned()));
+        let scans = scans.collect::<anyhow::Result<Vec<lidar::Scan>>>()?;
+        Ok(recording::Recording::from_scans(scans))
     }
 
     /// The given sensor, else that of the recording, else the one that is inferred from some of the scans.

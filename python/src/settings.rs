@@ -1,90 +1,22 @@
-//! Keyword arguments as settings of the program's configurations.
+//! Keyword arguments as fields of the library's configurations.
 
-use anyhow::anyhow;
-use fpmcl::app::settings::{CommandConfig, with_settings};
+use fpmcl::configuration::{self, Configuration};
 use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict as _, PyDict};
 
 use crate::errors::raised;
 
-/// Keyword arguments of a call.
-pub type Settings<'a, 'py> = Option<&'a Bound<'py, PyDict>>;
-
-/// Keys of recordings, which only `read_recording` takes.
-const RECORDING: [&str; 8] = [
-    "body_from_lidar",
-    "calib_file",
-    "elevation_bias_deg",
-    "frame_step",
-    "motion_compensation",
-    "n_scans",
-    "start_idx",
-    "topic",
-];
-
-/// Keys of the program's files, outputs and modes, which have no effect here.
-const PROGRAM: [&str; 26] = [
-    "check_poses",
-    "cloud_file",
-    "force",
-    "holdout_step",
-    "initial_pose",
-    "initialization",
-    "map_calib_file",
-    "map_file",
-    "map_pose_file",
-    "mesh_file",
-    "motion_model",
-    "odometry_file",
-    "onto",
-    "output_file",
-    "output_folder",
-    "plot_loc_results",
-    "pose_file",
-    "pose_tracking",
-    "poses",
-    "refine",
-    "result_file",
-    "result_path",
-    "save_result",
-    "scan_folder",
-    "truth_mesh",
-    "visualize",
-];
-
-/// Applies the settings of a recording to a configuration.
-pub fn of_recording<T: CommandConfig>(config: T, settings: Settings) -> PyResult<T> {
-    apply(config, settings, |key| RECORDING.contains(&key))
-}
-
-/// Applies the settings of a stage to a configuration.
-pub fn of_stage<T: CommandConfig>(config: T, settings: Settings) -> PyResult<T> {
-    apply(config, settings, |key| {
-        !RECORDING.contains(&key) && !PROGRAM.contains(&key)
-    })
-}
-
-fn apply<T: CommandConfig>(
-    config: T,
-    settings: Settings,
-    is_taken: impl Fn(&str) -> bool,
-) -> PyResult<T> {
+/// Sets the fields of a configuration that keyword arguments name.
+pub fn apply<T: Configuration>(config: T, settings: Option<&Bound<'_, PyDict>>) -> PyResult<T> {
     let mut rows = Vec::new();
     if let Some(settings) = settings {
         flatten("", settings, &mut rows)?;
     }
-    if let Some((key, _)) = rows.iter().find(|(key, _)| !is_taken(first_word(key)))
-        && T::FULL.contains(&format!("{}:", first_word(key)))
-    {
-        return Err(raised(anyhow!(
-            "the key `{key}` has no effect here; remove it, or give it to read_recording or to the program"
-        )));
-    }
-    with_settings(config, &rows).map_err(raised)
-}
-
-fn first_word(key: &str) -> &str {
-    key.split('.').next().unwrap_or(key)
+    let settings = configuration::Settings {
+        before: "",
+        pairs: &rows,
+    };
+    configuration::with_settings(config, settings).map_err(raised)
 }
 
 /// Dotted keys and their values as JSON, which YAML contains.

@@ -1,10 +1,9 @@
 //! Trajectories of whole drives: odometry and refinement.
 
 use anyhow::anyhow;
-use fpmcl::app::settings::{OdometryCommandConfig, RefinementConfig};
 use fpmcl::geometry::{Pose2, Pose3};
-use fpmcl::odometry::{OdometryEstimate, TrajectoryBuilder};
-use fpmcl::refinement::{InitialEstimate, TrajectoryRefiner};
+use fpmcl::odometry::{OdometryEstimate, TrajectoryBuilder, TrajectoryConfig};
+use fpmcl::refinement::{InitialEstimate, RefinerConfig, TrajectoryRefiner};
 use numpy::{PyArray2, PyArray3};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -29,8 +28,8 @@ pub struct Trajectory {
 
 /// Finds the poses of scans from the scans themselves.
 ///
-/// ``scans``: a Recording, or an iterable of Scans and of arrays (N, 3) [m]. Settings: ``trajectory`` of
-/// ``fpmcl config odometry --full``, such as ``trajectory={"loops": False}``.
+/// ``scans``: a Recording, or an iterable of Scans and of arrays (N, 3) [m]. Settings: fields of ``trajectory`` in
+/// ``fpmcl config odometry --full``, such as ``loops=False``.
 #[pyfunction]
 #[pyo3(signature = (scans, **settings))]
 pub fn odometry(
@@ -38,10 +37,10 @@ pub fn odometry(
     scans: &Bound<'_, PyAny>,
     settings: Option<&Bound<'_, PyDict>>,
 ) -> PyResult<Trajectory> {
-    let config = settings::of_stage(OdometryCommandConfig::default(), settings)?;
+    let config = settings::apply(TrajectoryConfig::default(), settings)?;
     let scans = Scans::of(scans)?;
     let found = released(py, || {
-        let mut builder = TrajectoryBuilder::new(config.trajectory)?;
+        let mut builder = TrajectoryBuilder::new(config)?;
         for row in 0..scans.len() {
             builder.add(&*scans.read(row)?)?;
             Python::attach(|py| py.check_signals())?;
@@ -76,9 +75,10 @@ pub struct RefinedTrajectory {
 ///
 /// ``scans``: as of ``Map.build``. ``estimates``: those of a Localizer, or the poses of a rough trajectory, (N, 4, 4) or
 /// (N, 3), with the standard deviations ``uncertainty=[m, deg]``. ``motions``: into each scan, (N, 4, 4) or (N, 3);
-/// without, each scan by itself. Settings: ``fpmcl config refine --full``.
+/// without, each scan by itself. Settings: fields of ``refiner`` in ``fpmcl config refine --full``.
 #[pyfunction]
-#[pyo3(signature = (map, scans, estimates, motions=None, *, sensor=None, **settings))]
+#[expect(clippy::too_many_arguments, reason = "they have names in Python")]
+#[pyo3(signature = (map, scans, estimates, motions=None, *, sensor=None, uncertainty=[1.0, 10.0], seed=0, **settings))]
 pub fn refine(
     py: Python<'_>,
     map: &Map,
@@ -86,15 +86,16 @@ pub fn refine(
     estimates: &Bound<'_, PyAny>,
     motions: Option<Numbers<'_, f64>>,
     sensor: Option<Sensor>,
+    uncertainty: [f64; 2],
+    seed: u64,
     settings: Option<&Bound<'_, PyDict>>,
 ) -> PyResult<RefinedTrajectory> {
-    let config = settings::of_stage(RefinementConfig::default(), settings)?;
+    let config = settings::apply(RefinerConfig::default(), settings)?;
     let scans = Scans::of(scans)?;
     let sensor = scans.sensor(py, sensor)?;
-    let sensor = Sensor(sensor.0.with_known(&config.known_sensor()));
     let increments = motions.map(|motions| arrays::all_planar("motions", &motions));
     let increments = increments.transpose()?;
-    let starts = starts(estimates, increments.as_deref(), &scans, &config)?;
+    let starts = starts(estimates, increments.as_deref(), &scans, uncertainty)?;
     for (name, count) in [
         ("estimates", Some(starts.len())),
         ("motions", increments.as_ref().map(Vec::len)),
@@ -107,8 +108,7 @@ pub fn refine(
         }
     }
     let refined = released(py, || {
-        let mut refiner =
-            TrajectoryRefiner::new(&map.map, &sensor.0, config.refiner(), config.seed)?;
+        let mut refiner = TrajectoryRefiner::new(&map.map, &sensor.0, config, seed)?;
         for (row, start) in starts.iter().enumerate() {
             refiner.add(&*scans.read(row)?, start)?;
             Python::attach(|py| py.check_signals())?;
@@ -135,7 +135,7 @@ fn starts(
     estimates: &Bound<'_, PyAny>,
     increments: Option<&[Pose2]>,
     scans: &Scans,
-    config: &RefinementConfig,
+    [position_m, heading_deg]: [f64; 2],
 ) -> PyResult<Vec<InitialEstimate>> {
     if let Ok(estimates) = estimates.extract::<Vec<PyRef<'_, Estimate>>>() {
         let of_filter = |estimate: &PyRef<'_, Estimate>| InitialEstimate::from(&estimate.estimate);
@@ -147,7 +147,6 @@ fn starts(
         Some(increments) => increments.iter().copied().map(Some).collect(),
         None => vec![None; poses.len()],
     };
-    let [position_m, heading_deg] = config.uncertainty;
     let deviations = [position_m, heading_deg.to_radians()];
     let times_s = scans.times_s();
     Ok(InitialEstimate::from_rough(

@@ -14,6 +14,7 @@ pub mod comparison;
 pub mod cli;
 
 use std::ffi::OsString;
+use std::path::PathBuf;
 
 use clap::Parser as _;
 
@@ -35,4 +36,11 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
             failure::exit_code(&error)
         }
     }
+}
+
+/// The program in a library of another program, such as an interpreter, whose file is given: results are reused only by the
+/// code that made them.
+pub fn main_of_library(arguments: impl IntoIterator<Item = OsString>, library: PathBuf) -> u8 {
+    run::version::set_library(library);
+    main(arguments)
 }

@@ -20,7 +20,7 @@ pub(crate) mod trajectory;
 
 pub use cloud::PointCloud;
 pub use mesh::{Aabb, TriangleMesh};
-pub use pose::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
+pub use pose::{Pose2, Pose3, pose_from_degrees, pose2_from_pose3, pose3_from_pose2};
 pub use trajectory::StampedPose;
 
 pub(crate) use angle::{azimuth_sector, circular_mean, fast_atan2, wrap_angle};

@@ -17,6 +17,15 @@ pub fn yaw(pose: &Pose3) -> f64 {
     forward.y.atan2(forward.x)
 }
 
+/// Returns the pose of x, y, z [m], roll, pitch, yaw [deg]: rotations about the fixed axes x, y, z, in this order.
+pub fn pose_from_degrees([x, y, z, roll, pitch, yaw]: [f64; 6]) -> Pose3 {
+    let [roll, pitch, yaw] = [roll, pitch, yaw].map(f64::to_radians);
+    Pose3::from_parts(
+        nalgebra::Translation3::new(x, y, z),
+        nalgebra::UnitQuaternion::from_euler_angles(roll, pitch, yaw),
+    )
+}
+
 /// Projects a pose onto the x-y plane: x, y and heading.
 pub fn pose2_from_pose3(pose: &Pose3) -> Pose2 {
     Pose2::new(pose.translation.vector.xy(), yaw(pose))

@@ -78,7 +78,10 @@ pub fn map_recording(
     let world = older.map(|map| map.path.world_from_map);
     let given = with_given_poses(recording.clone(), builder.config.poses, world.as_ref())?;
     check_path(&given, builder.config.max_step_m)?;
-    let sensor = Sensor::infer_recording(&given, &builder.config.sensor)?;
+    let sensor = match &builder.sensor {
+        Some(sensor) => sensor.clone().with_known(&builder.config.sensor),
+        None => Sensor::infer_recording(&given, &builder.config.sensor)?,
+    };
     builder.sensor = Some(sensor.clone());
     let mut recording = sensor.applied_to(given);
     let mut poses = None;

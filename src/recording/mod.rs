@@ -39,4 +39,5 @@ pub use scan_list::Selection;
 pub use track::PoseTrack;
 pub use velodyne::{read_labels, write_labels, write_scan};
 
+pub(crate) use open::is_topic;
 pub(crate) use poses::MapFrame;

@@ -44,6 +44,11 @@ pub struct Recording {
     pub bag: Option<(Arc<Bag>, Arc<str>)>,
 }
 
+/// Whether a path can be the name of a topic.
+pub(crate) fn is_topic(path: &Path) -> bool {
+    path.starts_with("/") && !path.exists()
+}
+
 impl Recording {
     /// Opens a recording; of its scans, only the first one is read, if its points can have times.
     ///
@@ -189,6 +194,26 @@ impl Recording {
         PoseTrack::read(path, self.files.calibration.as_deref())
     }
 
+    /// Reads poses of this recording from a file, a folder `oxts`, or a topic of its bag; they are those of a body if its
+    /// mounting is known, else of the camera of a calibration, else of the lidar.
+    ///
+    /// # Errors
+    /// The poses cannot be read.
+    pub fn read_track(
+        &self,
+        path: &Path,
+        calib_file: Option<&Path>,
+    ) -> Result<PoseTrack, RecordingError> {
+        #[cfg(feature = "bags")]
+        if let (Some((bag, topic)), true) = (&self.bag, is_topic(path)) {
+            return PoseTrack::read_topic(bag, path.to_str(), topic, self.body_from_lidar);
+        }
+        match self.body_from_lidar {
+            Some(pose) => PoseTrack::read_of_body(path, pose),
+            None => PoseTrack::read(path, calib_file),
+        }
+    }
+
     /// The same recording with the poses that it contains, `map_from_lidar` in the frame of the first of them.
     ///
     /// # Errors
@@ -272,7 +297,7 @@ impl Recording {
 
     /// The same recording, with an angle added to the elevations of all points [rad].
     #[must_use]
-    pub(crate) fn with_elevation_bias(mut self, bias_rad: f64) -> Self {
+    pub fn with_elevation_bias(mut self, bias_rad: f64) -> Self {
         for frame in self.frames.iter_mut().chain(&mut self.skipped) {
             frame.elevation_bias_rad = bias_rad;
         }

@@ -7,7 +7,7 @@ use anyhow::{Context as _, Result};
 use crate::app::run::{Context, input};
 use crate::app::settings::{GivenPosesConfig, MapInputConfig, MotionConfig, RecordingConfig};
 use crate::map::{Map, MapCache, MapOptions, MappingPath};
-use crate::recording::{PoseTrack, Recording};
+use crate::recording::{PoseTrack, Recording, is_topic};
 use crate::sensor::{RangeImageConfig, Sensor, SensorConfig};
 
 /// A recording, and the poses that are given with it.
@@ -77,18 +77,7 @@ impl<'a> RecordingInputs<'a> {
 
     /// Reads poses of the recording from a file, or from a topic of its bag.
     pub fn track(&self, path: &Path, recording: &Recording) -> Result<PoseTrack> {
-        #[cfg(feature = "bags")]
-        if let (Some((bag, scan_topic)), true) = (&recording.bag, is_topic(path)) {
-            return Ok(PoseTrack::read_topic(
-                bag,
-                path.to_str(),
-                scan_topic,
-                recording.body_from_lidar,
-            )?);
-        }
-        #[cfg(not(feature = "bags"))]
-        let _ = recording;
-        self.poses.track(path)
+        Ok(recording.read_track(path, self.poses.calib_file.as_deref())?)
     }
 }
 
@@ -139,11 +128,6 @@ pub fn is_bag(path: &Path) -> bool {
         let _ = path;
         false
     };
-}
-
-/// Whether a path can be the name of a topic.
-pub fn is_topic(path: &Path) -> bool {
-    path.starts_with("/") && !path.exists()
 }
 
 impl MapInputConfig {

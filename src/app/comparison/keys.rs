@@ -20,9 +20,10 @@ use serde::Serialize;
 use serde_json::Value;
 
 use super::plan::PlannedRun;
-use crate::app::commands::stages::{is_bag, is_topic};
+use crate::app::commands::stages::is_bag;
 use crate::app::run::artefact::hash::{hash_of_file, hash_of_scan, hash_of_texts};
 use crate::app::run::version;
+use crate::recording::is_topic;
 use crate::recording::{Recording, Selection};
 use crate::simulation::SimulationConfig;
 

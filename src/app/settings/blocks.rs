@@ -2,12 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use nalgebra::{UnitQuaternion, Vector3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use crate::geometry::Pose3;
+use crate::geometry::{Pose3, pose_from_degrees};
 use crate::recording::Selection;
 use crate::validation::{InvalidValue, Validate, in_range, nested, require};
 
@@ -50,12 +49,7 @@ pub struct GivenPosesConfig {
 impl GivenPosesConfig {
     /// `body_from_lidar` as a pose.
     pub fn body_from_lidar(&self) -> Option<Pose3> {
-        let [x, y, z, roll, pitch, yaw] = self.body_from_lidar?;
-        let [roll, pitch, yaw] = [roll, pitch, yaw].map(f64::to_radians);
-        Some(Pose3::from_parts(
-            Vector3::new(x, y, z).into(),
-            UnitQuaternion::from_euler_angles(roll, pitch, yaw),
-        ))
+        self.body_from_lidar.map(pose_from_degrees)
     }
 }
 

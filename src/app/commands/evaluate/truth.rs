@@ -4,13 +4,13 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 
-use crate::app::commands::stages::{RecordingInputs, is_topic};
+use crate::app::commands::stages::RecordingInputs;
 use crate::app::report::results::LocalizationResults;
 use crate::app::run::input;
 use crate::app::settings::{EvaluationConfig, LocalizationConfig, RecordingConfig};
 use crate::evaluation::{Alignment, aligned};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
-use crate::recording::{Frame, PoseTrack, ScanSource};
+use crate::recording::{Frame, PoseTrack, ScanSource, is_topic};
 
 /// Difference of times that are the same [s].
 const SAME_S: f64 = 1e-4;
