@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use super::formats::markdown;
 use super::record::RunRecord;
 use super::results::ComparisonResults;
-use crate::app::report::pages::{Cell, Column, Table};
+use crate::app::comparison::table::{Cell, Column, Table};
 use crate::evaluation::trust::Trust;
 use crate::statistics::median;
 

@@ -12,7 +12,7 @@ use super::plan::PlannedRun;
 use super::record::RunRecord;
 use super::results::ComparisonResults;
 use super::{cases, keys, page, tables};
-use crate::app::report::pages::Table;
+use crate::app::comparison::table::Table;
 use crate::app::run::artefact::Outputs;
 use crate::app::run::{Context, output, version};
 use crate::app::settings::ComparisonConfig;

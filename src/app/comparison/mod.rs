@@ -62,7 +62,11 @@ mod page;
 mod pictures;
 mod results;
 mod statistics;
+mod table;
 mod tables;
+
+#[cfg(test)]
+mod table_tests;
 
 pub use collect::collect;
 pub use execute::Executor;

@@ -7,7 +7,8 @@ use super::pictures;
 use super::plan::PlannedRun;
 use super::record::{Outcome, RunRecord};
 use super::results::ComparisonResults;
-use crate::app::report::pages::{Cell, Column, Page, PageElement, Section, Table};
+use super::table::{Cell, Column, Table};
+use crate::app::report::pages::{Page, PageElement, Section};
 use crate::app::report::results::length;
 use crate::app::report::run_page::{PICTURES, TEXTS, collapsed, picture};
 use crate::app::run::version;
@@ -30,7 +31,7 @@ pub fn page(
     let elements = |names: &[&str]| -> Vec<PageElement> {
         let tables = tables.iter().filter(|t| names.contains(&t.name.as_str()));
         let tables = tables.cloned().map(Table::without_absent_columns);
-        tables.map(PageElement::Table).collect()
+        tables.map(|it| PageElement::Table(it.into())).collect()
     };
     let mut sequences = elements(&["by_sequence", "states"]);
     sequences.extend(pictures::errors_of_runs(results, layout)?);
@@ -207,7 +208,7 @@ fn example_run<'a>(
 fn configuration(results: &ComparisonResults, layout: &Layout) -> Result<Vec<PageElement>> {
     let mut elements = vec![
         PageElement::Facts(versions(results)?),
-        PageElement::Table(overrides_table(results.config)),
+        PageElement::Table(overrides_table(results.config).into()),
         PageElement::Collapsed {
             name: "comparison.yml".to_owned(),
             text: settings::to_yaml(results.config)?,

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::measures::Measure;
 use super::record::RunRecord;
 use super::statistics;
-use crate::app::report::pages::SuccessRate;
+use crate::app::comparison::table::SuccessRate;
 use crate::app::settings::{ComparisonConfig, Contrast};
 
 /// All available records of a comparison.

@@ -2,7 +2,7 @@
 
 use statrs::distribution::{ContinuousCDF as _, StudentsT};
 
-use crate::app::report::pages::{MeanWithSpread, PairedDifference, SuccessRate};
+use crate::app::comparison::table::{MeanWithSpread, PairedDifference, SuccessRate};
 use crate::evaluation::statistics::mean;
 
 /// Mean with standard deviations, from the values of each sequence, one per seed; `None` without

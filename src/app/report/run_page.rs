@@ -179,14 +179,14 @@ fn metrics(report: &Report, is_shown: impl Fn(&MetricRow) -> bool) -> Table {
     let has_refined = report.refined.is_some();
     let titles = ["metric", report.estimate_title(), "refined", "unit"];
     let cell = |value: Value| match value {
-        Value::Number(number) => Cell::Number(number),
-        Value::Count(count) => Cell::Number(count as f64),
-        Value::Flag(_) | Value::NotChecked | Value::Absent => Cell::Text(value.to_string()),
+        Value::Number(number) => Cell::from(number),
+        Value::Count(count) => Cell::from(count as f64),
+        Value::Flag(_) | Value::NotChecked | Value::Absent => value.to_string().as_str().into(),
     };
     let row = |(row, refined): (MetricRow, Option<Value>)| {
         let mut cells = vec![row.name.into(), cell(row.value)];
         if has_refined {
-            cells.push(refined.map_or(Cell::Text(String::new()), cell));
+            cells.push(refined.map_or(Cell::default(), cell));
         }
         cells.push(row.unit.into());
         cells
@@ -205,7 +205,7 @@ fn metrics(report: &Report, is_shown: impl Fn(&MetricRow) -> bool) -> Table {
         columns: titles
             .into_iter()
             .filter(|title| has_refined || *title != "refined")
-            .map(Column::named)
+            .map(Column::from)
             .collect(),
         rows: rows.filter(|(row, _)| is_shown(row)).map(row).collect(),
     }
@@ -226,10 +226,6 @@ fn definitions(report: &Report) -> PageElement {
 
 /// Relative errors of a trajectory by the length of the segments; `None` if it is shorter than all.
 fn segments(name: &str, metrics: &SpatialMetrics) -> Option<Table> {
-    let column = |name: &str, unit: &str| Column {
-        unit: unit.to_owned(),
-        ..Column::named(name)
-    };
     let row = |it: &LengthErrors| {
         vec![
             it.length_m.into(),
@@ -243,26 +239,26 @@ fn segments(name: &str, metrics: &SpatialMetrics) -> Option<Table> {
         title: format!("Mean errors over segments by their length: {name}"),
         note: "From every frame up to 50 m, from every tenth from 100 m on; divided by the length."
             .to_owned(),
-        columns: vec![
-            column("length", "m"),
-            column("translation error", "%"),
-            column("rotation error", "deg/100 m"),
-            Column::named("segments"),
-        ],
+        columns: [
+            "length [m]",
+            "translation error [%]",
+            "rotation error [deg/100 m]",
+            "segments",
+        ]
+        .map(Column::from)
+        .into(),
         rows: metrics.by_length.iter().map(row).collect(),
     })
 }
 
 fn stages(seconds: &BTreeMap<String, f64>) -> Table {
-    let mut time = Column::named("wall time");
-    time.unit = "s".to_owned();
     let rows = seconds.iter();
     Table {
         name: "stages".to_owned(),
         title: "Time per stage".to_owned(),
         note: "Stages shared by several runs are listed with the time of their single execution."
             .to_owned(),
-        columns: vec![Column::named("stage"), time],
+        columns: ["stage", "wall time [s]"].map(Column::from).into(),
         rows: rows
             .map(|(stage, &time_s)| vec![stage.as_str().into(), time_s.into()])
             .collect(),

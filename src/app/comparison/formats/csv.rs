@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use csv::Writer;
 
-use crate::app::report::pages::{Cell, Column, Table};
+use crate::app::comparison::table::{Cell, Column, Table};
 
 /// A column of the file: its title and the value that it takes from a cell.
 type CsvColumn = (String, fn(&Cell) -> String);
@@ -75,7 +75,7 @@ fn number(number: Option<f64>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::app::report::pages::tests::example;
+    use crate::app::comparison::table_tests::example;
 
     #[test]
     fn every_number_has_a_column_and_text_with_commas_is_quoted() {

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use crate::app::report::pages::{Cell, Table, value_and_uncertainty};
+use crate::app::comparison::table::{Cell, Table, value_and_uncertainty};
 
 /// Formats the table under a heading.
 pub fn table(table: &Table) -> String {
@@ -53,7 +53,7 @@ fn escape(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::app::report::pages::tests::example;
+    use crate::app::comparison::table_tests::example;
 
     #[test]
     fn every_line_has_as_many_cells_and_every_column_its_definition() {

@@ -1,6 +1,6 @@
 //! Tables for the terminal: the uncertainty is below its value, so that rows stay short.
 
-use crate::app::report::pages::{Table, value_and_uncertainty};
+use crate::app::comparison::table::{Table, value_and_uncertainty};
 
 /// Maximum width of a line of a column title [characters].
 const TITLE_WIDTH: usize = 16;
@@ -86,7 +86,7 @@ fn wrapped(text: &str, width: usize) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::app::report::pages::tests::example;
+    use crate::app::comparison::table_tests::example;
 
     #[test]
     fn numbers_are_aligned_and_their_spread_is_below_them() {

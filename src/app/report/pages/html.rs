@@ -2,19 +2,20 @@
 
 use maud::{Markup, html};
 
-use super::format::value_and_uncertainty;
 use super::{Cell, Table};
 
 /// Renders the table, its note and its definitions.
 pub fn table(table: &Table) -> Markup {
+    let is_numeric = |column: usize| table.rows.iter().any(|row| row[column].number.is_some());
+    let defined = || table.columns.iter().filter(|it| !it.definition.is_empty());
     html! {
         div.wide {
             table id=(table.name) {
                 thead {
                     tr {
                         @for (index, column) in table.columns.iter().enumerate() {
-                            th scope="col" class=[table.is_numeric(index).then_some("number")] title=(column.definition) {
-                                button type="button" { (column.title()) }
+                            th scope="col" class=[is_numeric(index).then_some("number")] title=(column.definition) {
+                                button type="button" { (column.title) }
                             }
                         }
                     }
@@ -29,12 +30,12 @@ pub fn table(table: &Table) -> Markup {
             }
         }
         @if !table.note.is_empty() { p.note { (table.note) } }
-        @if table.defined_columns().next().is_some() {
+        @if defined().next().is_some() {
             details {
                 summary { "Definitions" }
                 dl {
-                    @for column in table.defined_columns() {
-                        dt { (column.title()) }
+                    @for column in defined() {
+                        dt { (column.title) }
                         dd { (column.definition) }
                     }
                 }
@@ -44,24 +45,23 @@ pub fn table(table: &Table) -> Markup {
 }
 
 fn td(cell: &Cell) -> Markup {
-    let (value, uncertainty) = value_and_uncertainty(cell);
     html! {
-        @if let Some(number) = cell.number() {
+        @if let Some(number) = cell.number {
             td.number data-value=(number) {
-                (value)
-                @if !uncertainty.is_empty() { small { (uncertainty) } }
+                (cell.text)
+                @if !cell.uncertainty.is_empty() { small { (cell.uncertainty) } }
             }
-        } @else if let Cell::Link { text, to } = cell {
-            td { a href=(to) { (text) } }
+        } @else if let Some(link) = &cell.link {
+            td { a href=(link) { (cell.text) } }
         } @else {
-            td { (value) }
+            td { (cell.text) }
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::example;
+    use super::super::page::tests::example;
 
     #[test]
     fn a_table_has_its_numbers_to_sort_by_and_none_of_its_text_is_markup() {

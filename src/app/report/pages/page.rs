@@ -166,9 +166,39 @@ impl PageElement {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::super::tests::example;
+pub mod tests {
+    use super::super::{Cell, Column};
     use super::*;
+
+    /// Two rows with text, link, number, uncertainty and an absent cell.
+    pub fn example() -> Table {
+        let column = |title: &str| Column {
+            title: title.to_owned(),
+            definition: "a | b <c>".to_owned(),
+        };
+        let mean = Cell {
+            uncertainty: "±0.0020".to_owned(),
+            ..0.023.into()
+        };
+        let link = Cell {
+            link: Some("runs/b.html".to_owned()),
+            ..Cell::from("B|C")
+        };
+        Table {
+            name: "table_1".to_owned(),
+            title: "Table 1: errors".to_owned(),
+            note: "What <b> means.".to_owned(),
+            columns: vec![
+                Column::from("configuration"),
+                column("average positional error [m]"),
+                column("success [%]"),
+            ],
+            rows: vec![
+                vec!["A, \"first\"".into(), mean, 100.0.into()],
+                vec![link, 0.5.into(), "-".into()],
+            ],
+        }
+    }
 
     fn page() -> Page {
         Page {

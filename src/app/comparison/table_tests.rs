@@ -1,6 +1,6 @@
 //! A table for the tests of every format.
 
-use super::{Cell, Column, MeanWithSpread, SuccessRate, Table};
+use super::table::{Cell, Column, MeanWithSpread, SuccessRate, Table};
 
 /// Five successes in five runs.
 pub fn all_successful() -> SuccessRate {
