@@ -79,16 +79,6 @@ impl Bitmap {
         self.pixels[y as usize * self.width as usize + x as usize]
     }
 
-    /// Copies another image to (column, row); what is outside is cut off.
-    pub fn paste(&mut self, other: &Self, (left, top): (u32, u32)) {
-        let width = other.width.min(self.width.saturating_sub(left)) as usize;
-        for row in 0..other.height.min(self.height.saturating_sub(top)) {
-            let to = ((top + row) * self.width + left) as usize;
-            let from = (row * other.width) as usize;
-            self.pixels[to..to + width].copy_from_slice(&other.pixels[from..from + width]);
-        }
-    }
-
     /// Resamples to another size: each pixel is the mean of the area that it covers.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let columns = covered(self.width, width);
@@ -157,19 +147,6 @@ mod tests {
             let resized = bitmap.resized(width, height);
             assert!((mean(&resized) - mean(&bitmap)).abs() < 0.6, "{width}");
         }
-    }
-
-    #[test]
-    fn a_pasted_image_is_where_it_was_put_and_cut_off_at_the_edges() {
-        let mut sheet = Bitmap::from_fn(50, 40, |_, _| [0; 3]);
-        let image = Bitmap::from_fn(20, 10, |x, y| [1, x as u8, y as u8]);
-        sheet.paste(&image, (5, 7));
-        sheet.paste(&image, (40, 35));
-        assert_eq!(sheet.pixel(5, 7), [1, 0, 0]);
-        assert_eq!(sheet.pixel(24, 16), [1, 19, 9]);
-        assert_eq!(sheet.pixel(25, 16), [0; 3]);
-        assert_eq!(sheet.pixel(49, 39), [1, 9, 4]);
-        assert_eq!(sheet.pixel(0, 36), [0; 3]);
     }
 
     #[test]

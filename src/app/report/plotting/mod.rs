@@ -32,7 +32,7 @@ pub use ground_plot::GroundPlot;
 pub use interactive::InteractivePath;
 pub use map_image::{MapImage, SURFACES, muted};
 pub use map_plot::{MapPlot, VertexNumbers};
-pub use particles::{LocalizationPicture, ParticlePanels};
+pub use particles::LocalizationPicture;
 pub use range_images::RangeImageStrip;
 pub use trajectory::{PathPlot, error_chart};
 pub use view::Mark;

@@ -7,9 +7,9 @@ use anyhow::{Context as _, Result};
 use super::MapImage;
 use super::bitmap::Bitmap;
 use super::color::{Colormap, MCL, Rgb, TRUTH, WHITE};
-use super::sheet::{self, Point, Sheet, save_png, stroke};
+use super::sheet::{Point, Sheet, save_png, stroke};
 use super::top_view::{TopView, WIDTH, positions};
-use super::view::{AxisRange, ColorBar, LegendEntry, Mark, View, legend};
+use super::view::{AxisRange, ColorBar, LegendEntry, Mark, View};
 use crate::evaluation::ParticleRow;
 use crate::geometry::Pose2;
 
@@ -20,8 +20,10 @@ pub struct LocalizationPicture<'a> {
     pub title: &'a str,
     /// Map, drawn pale below everything.
     pub map: Option<&'a MapImage>,
-    /// Particles: x, y [m], heading [rad], weight.
+    /// Particles: x, y [m], heading [rad], and the weight, which colors them.
     pub particles: &'a [ParticleRow],
+    /// Name of the weight, relative to the largest.
+    pub color_name: &'a str,
     /// Estimate of the filter.
     pub estimate: Option<Pose2>,
     /// True pose.
@@ -39,27 +41,32 @@ impl LocalizationPicture<'_> {
     }
 
     fn draw(&self) -> Result<Bitmap> {
-        const NARROWEST_M: f64 = 24.0;
-        let (x, y) = self
-            .extent(NARROWEST_M)
-            .context("there is nothing to draw: there are no particles and no poses")?;
+        let (x, y) = self.extent()?;
+        let count = format!("{} particles", self.particles.len());
+        let particles = Some((count.as_str(), Colormap::Viridis.at(0.0), Mark::Dots));
+        let truth = (self.ground_truth).map(|_| ("ground truth", TRUTH, Mark::Line));
+        let estimate = self.estimate.map(|_| ("MCL", MCL, Mark::Line));
+        let driven = (self.driven.len() > 1).then_some(("driven", TRUTH, Mark::Dashes));
+        let entries = [particles, truth, estimate, driven].into_iter().flatten();
         let view = TopView {
             title: self.title,
             width: WIDTH,
-            legend: self.legend(),
+            legend: entries
+                .map(|(name, color, mark)| LegendEntry::new(name, color, mark))
+                .collect(),
             x,
             y,
             color_bar: Some(ColorBar {
                 range: AxisRange::new(0.0, 1.0),
                 colormap: Colormap::Viridis,
-                name: "weight / largest",
+                name: self.color_name,
             }),
         };
-        view.draw(|sheet, view| self.draw_content(sheet, view, 1.0))
+        view.draw(|sheet, view| self.draw_content(sheet, view))
     }
 
-    /// Draws map, particles and poses, these with arrows of a relative size.
-    fn draw_content(&self, sheet: &Sheet, view: &View, size: f64) -> Result<()> {
+    /// Draws map, particles and poses.
+    fn draw_content(&self, sheet: &Sheet, view: &View) -> Result<()> {
         if let Some(map) = self.map {
             map.draw(sheet, view, 0.5)?;
         }
@@ -72,40 +79,18 @@ impl LocalizationPicture<'_> {
             (self.estimate, MCL, 6.0, 52.0),
         ] {
             if let Some(pose) = pose {
-                draw_arrow(sheet, view, &pose, color, [width * size, length * size])?;
+                draw_arrow(sheet, view, &pose, color, [width, length])?;
             }
         }
         Ok(())
     }
 
-    /// Draws half as wide, without legend, in the same size for all frames.
-    fn draw_panel(&self) -> Result<Bitmap> {
-        const SHAPE: f64 = 0.7;
-        // Particles that have converged are apart.
-        const NARROWEST_M: f64 = 0.06;
-        let (x, y) = self
-            .extent(NARROWEST_M)
-            .context("there is nothing to draw: there are no particles and no poses")?;
-        let width_m = x.length().max(y.length() / SHAPE);
-        let view = TopView {
-            title: self.title,
-            width: 0.5 * WIDTH,
-            legend: Vec::new(),
-            x: x.at_least(width_m),
-            y: y.at_least(SHAPE * width_m),
-            color_bar: None,
-        };
-        view.draw(|sheet, view| self.draw_content(sheet, view, 0.6))
-    }
-
     /// Visible ranges of x and y: the window, or particles and poses with a margin.
-    fn extent(&self, narrowest_m: f64) -> Option<(AxisRange, AxisRange)> {
-        let around = |center: f64| AxisRange::new(center, center);
+    fn extent(&self) -> Result<(AxisRange, AxisRange)> {
+        const NARROWEST_M: f64 = 24.0;
         if let Some(([x, y], width_m)) = self.window {
-            return Some((
-                around(x).at_least(width_m),
-                around(y).at_least(0.6 * width_m),
-            ));
+            let [x, y] = [x, y].map(|center| AxisRange::new(center, center));
+            return Ok((x.at_least(width_m), y.at_least(0.6 * width_m)));
         }
         let poses = [self.estimate, self.ground_truth].into_iter().flatten();
         let poses = poses.map(|pose| [pose.translation.x, pose.translation.y]);
@@ -116,29 +101,8 @@ impl LocalizationPicture<'_> {
             let range = AxisRange::of(points.iter().map(|point| point[axis]))?;
             Some(range.padded(0.06 * range.length()).at_least(narrowest_m))
         };
-        Some((range(0, narrowest_m)?, range(1, 0.6 * narrowest_m)?))
-    }
-
-    fn legend(&self) -> Vec<LegendEntry> {
-        let count = format!("{} particles, colored by weight", self.particles.len());
-        let particles = LegendEntry::new(count, Colormap::Viridis.at(0.0), Mark::Dots);
-        [particles]
-            .into_iter()
-            .chain(self.legend_of_poses())
-            .collect()
-    }
-
-    fn legend_of_poses(&self) -> Vec<LegendEntry> {
-        let mut entries = Vec::new();
-        let truth = self
-            .ground_truth
-            .map(|_| ("ground truth", TRUTH, Mark::Line));
-        let estimate = self.estimate.map(|_| ("MCL", MCL, Mark::Line));
-        let driven = (self.driven.len() > 1).then_some(("driven", TRUTH, Mark::Dashes));
-        for (name, color, mark) in [truth, estimate, driven].into_iter().flatten() {
-            entries.push(LegendEntry::new(name, color, mark));
-        }
-        entries
+        (range(0, NARROWEST_M).zip(range(1, 0.6 * NARROWEST_M)))
+            .context("there is nothing to draw: there are no particles and no poses")
     }
 
     /// Draws particles with a line along their heading, in ascending order of weight.
@@ -163,56 +127,6 @@ impl LocalizationPicture<'_> {
             sheet.dot(place, radius, color, 1.0)?;
         }
         Ok(())
-    }
-}
-
-/// Frames next to and below each other, two in a row.
-#[derive(Clone, Copy, Debug)]
-pub struct ParticlePanels<'a> {
-    /// Title.
-    pub title: &'a str,
-    /// Frames; each is drawn around its particles and poses.
-    pub frames: &'a [LocalizationPicture<'a>],
-}
-
-impl ParticlePanels<'_> {
-    /// Writes the picture.
-    pub fn save(&self, path: &Path) -> Result<()> {
-        save_png(path, self.draw())
-    }
-
-    fn draw(&self) -> Result<Bitmap> {
-        const HEADER: f64 = 92.0;
-        let panels = self.frames.iter().map(LocalizationPicture::draw_panel);
-        let panels: Vec<Bitmap> = panels.collect::<Result<_>>()?;
-        let first = panels
-            .first()
-            .context("there is nothing to draw: there are no frames")?;
-        let height = HEADER as u32 + panels.len().div_ceil(2) as u32 * first.height;
-        let mut picture = sheet::draw((WIDTH as u32, height), |sheet| {
-            const LEFT: f64 = 118.0;
-            sheet.title(self.title, LEFT)?;
-            let [light, heavy] = [0.0, 1.0].map(|share| Colormap::Viridis.at(share));
-            let mut entries = vec![
-                LegendEntry::new("particle of small weight", light, Mark::Dots),
-                LegendEntry::new("largest weight", heavy, Mark::Dots),
-            ];
-            entries.extend(
-                self.frames
-                    .iter()
-                    .flat_map(LocalizationPicture::legend_of_poses)
-                    .take(2),
-            );
-            legend(sheet, &entries, (LEFT, 70.0), WIDTH)
-        })?;
-        for (number, panel) in (0..).zip(&panels) {
-            let place = (
-                number % 2 * panel.width,
-                HEADER as u32 + number / 2 * panel.height,
-            );
-            picture.paste(panel, place);
-        }
-        Ok(picture)
     }
 }
 

@@ -280,6 +280,7 @@ fn particles_are_drawn_on_the_map_spread_and_concentrated() {
             title: &format!("frame 150, {name}"),
             map: Some(&map),
             particles: &particles,
+            color_name: "weight / largest",
             estimate: Some(here * Pose2::new(Vector2::new(0.5, 0.3), 0.1)),
             ground_truth: Some(here),
             driven: &truth[..=150],
@@ -289,53 +290,6 @@ fn particles_are_drawn_on_the_map_spread_and_concentrated() {
         .unwrap();
         assert_picture(&path, &[(MCL, 100), (TRUTH, 100)]);
     }
-}
-
-#[test]
-fn particles_of_several_frames_are_drawn_next_to_each_other() {
-    let gallery = Gallery::open();
-    let truth = street(300);
-    let map = MapImage::of_colors(&town(&truth), 2500);
-    let clouds = [(0, 15.0), (3, 4.0), (10, 0.5), (250, 0.1)];
-    let clouds = clouds.map(|(row, spread_m)| (row, cloud(&truth[row], spread_m, 500)));
-    let frames = clouds
-        .each_ref()
-        .map(|(row, particles)| LocalizationPicture {
-            title: "Frame",
-            map: Some(&map),
-            particles,
-            estimate: Some(truth[*row]),
-            ground_truth: Some(truth[*row]),
-            ..LocalizationPicture::default()
-        });
-    let path = gallery.path("particles.png");
-    let panels = ParticlePanels {
-        title: "Particles",
-        frames: &frames,
-    };
-    panels.save(&path).unwrap();
-    let image = assert_picture(&path, &[(MCL, 400), (TRUTH, 400)]);
-    // Each quarter has its estimate.
-    for (left, top) in [
-        (0, 0),
-        (700, 0),
-        (0, image.height / 2),
-        (700, image.height / 2),
-    ] {
-        let quarter = (0..350_000).map(|k| image.pixel(left + k % 700, top + k / 700));
-        assert!(
-            quarter.filter(|color| *color == MCL).count() > 50,
-            "{left} {top}"
-        );
-    }
-
-    let error = ParticlePanels {
-        frames: &[],
-        ..panels
-    }
-    .save(&path)
-    .unwrap_err();
-    assert!(format!("{error:#}").contains("no frames"), "{error:#}");
 }
 
 /// Three rooms in a row with doors between them, 1.3 m below the sensor, in one color; all surfaces have
@@ -410,6 +364,7 @@ fn frames_become_an_animation_of_one_size() {
                 title: &format!("frame {k}"),
                 map: Some(&map),
                 particles: &cloud(&truth[k], 3.0 / (1.0 + k as f64 / 30.0), 300),
+                color_name: "weight / largest",
                 estimate: Some(truth[k] * Pose2::translation(0.3, 0.2)),
                 ground_truth: Some(truth[k]),
                 driven: &truth[..=k],

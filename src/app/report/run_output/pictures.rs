@@ -10,11 +10,11 @@ use super::{INTERACTIVE, RunFiles};
 use crate::app::report::plotting::color::{MCL, REFINED, Rgb, STATES};
 use crate::app::report::plotting::{
     FRAME, InteractivePath, LineChart, LocalizationPicture, MapImage, MapPlot, Mark, Panel,
-    ParticlePanels, PathPlot, SURFACES, Series, drift_chart, error_chart, muted, save_animation,
+    PathPlot, SURFACES, Series, drift_chart, error_chart, muted, save_animation,
 };
 use crate::app::report::results::LocalizationResults;
-use crate::evaluation::planar_errors;
 use crate::evaluation::trust::Axes;
+use crate::evaluation::{ParticleRow, planar_errors};
 use crate::geometry::{Pose2, TriangleMesh, pose2_from_pose3};
 use crate::localization::Estimate;
 use crate::map::Map;
@@ -242,28 +242,28 @@ impl<'a> Drawing<'a> {
         )
     }
 
-    /// Draws the particles at several moments, from the first on.
+    /// Draws the particles at several moments, colored by it: later ones are on top.
     fn particles(&self) -> Result<()> {
-        let pose = |poses: &Option<Vec<Pose2>>, row: usize| poses.as_ref()?.get(row).copied();
         let moments = moments(self.results);
-        let title = |&row: &usize| format!("Frame {}", self.results.frames[row]);
-        let titles: Vec<String> = moments.iter().map(title).collect();
-        let frames = moments.iter().zip(&titles);
-        let frames = frames.map(|(&row, title)| LocalizationPicture {
-            title,
-            map: self.map,
-            particles: self.results.particles.frame(row),
-            estimate: pose(&self.results.estimates, row),
-            ground_truth: pose(&self.results.ground_truth, row),
-            ..LocalizationPicture::default()
-        });
-        let frames: Vec<LocalizationPicture> = frames.collect();
-        if frames.is_empty() {
+        let Some(&last) = moments.last() else {
             return Ok(());
-        }
-        ParticlePanels {
-            title: "Particles",
-            frames: &frames,
+        };
+        let rows = (1_u8..).zip(&moments);
+        let particles: Vec<ParticleRow> = rows
+            .flat_map(|(moment, &row)| {
+                let particles = self.results.particles.frame(row).iter();
+                particles.map(move |&[x, y, heading, _]| [x, y, heading, moment.into()])
+            })
+            .collect();
+        LocalizationPicture {
+            title: "Particles from the first frame to the last",
+            map: self.map,
+            particles: &particles,
+            color_name: "from the first frame to the last",
+            estimate: self.estimates.get(last).copied(),
+            ground_truth: self.truth.and_then(|truth| truth.get(last).copied()),
+            driven: self.truth.unwrap_or(&self.estimates),
+            window: None,
         }
         .save(&self.files.plot("particles.png")?)
     }
@@ -334,6 +334,7 @@ impl Movie {
             title: &format!("Frame {number}: {}", estimate.state.word()),
             map: Some(&self.map),
             particles: results.particles.frame(results.len() - 1),
+            color_name: "weight / largest",
             estimate: Some(estimate.pose),
             ground_truth: truth.last().copied(),
             driven,
