@@ -189,35 +189,28 @@ pub fn evaluate(
     rules: &RangeMclRules,
     about: BTreeMap<String, String>,
 ) -> Result<Report> {
-    let report =
-        |estimates: &[Pose2], in_space: &Option<Vec<Pose3>>, runtimes_s: &Option<Vec<f64>>| {
-            let Some(ground_truth) = results.ground_truth.as_deref() else {
-                return Ok(None);
-            };
-            let trajectory = EvaluatedTrajectory {
-                estimates,
-                ground_truth,
-                times_s: results.times_s.as_deref(),
-                runtimes_s: runtimes_s.as_deref(),
-            };
-            let in_space = in_space
-                .as_deref()
-                .zip(results.ground_truth_in_space.as_deref());
-            evaluate_trajectory(&trajectory, in_space, rules).map(Some)
-        };
     let estimates = results.estimates_or_particle_means(rules)?;
+    let report = |estimates: &[Pose2], in_space: &Option<Vec<Pose3>>, times: &Option<Vec<f64>>| {
+        let Some(ground_truth) = results.ground_truth.as_deref() else {
+            return Ok(None);
+        };
+        let trajectory = EvaluatedTrajectory {
+            estimates,
+            ground_truth,
+            times_s: results.times_s.as_deref(),
+            runtimes_s: times.as_deref(),
+        };
+        let truth_in_space = results.ground_truth_in_space.as_deref();
+        let in_space = in_space.as_deref().zip(truth_in_space);
+        evaluate_trajectory(&trajectory, in_space, rules).map(Some)
+    };
+    let refined = (results.refined.as_ref())
+        .map(|it| report(it, &results.refined_in_space, &results.refine_runtimes_s));
     Ok(Report {
         about,
         summary: RunSummary::of(results, &estimates),
         mcl: report(&estimates, &results.estimates_in_space, &results.runtimes_s)?,
-        refined: match &results.refined {
-            Some(refined) => report(
-                refined,
-                &results.refined_in_space,
-                &results.refine_runtimes_s,
-            )?,
-            None => None,
-        },
+        refined: refined.transpose()?.flatten(),
         trajectory: None,
     })
 }

@@ -86,25 +86,19 @@ impl Task {
     /// Counts completed steps.
     pub fn advance(&self, steps: usize) {
         self.bar.inc(PARTS * steps as u64);
-        if self.line_is_due() {
-            self.write_line();
-        }
+        self.write_line_if_due();
     }
 
     /// Sets the completed share of all steps, 0 to 1.
     pub fn set_share(&self, share: f64) {
         self.bar.set_position(self.parts(share));
-        if self.line_is_due() {
-            self.write_line();
-        }
+        self.write_line_if_due();
     }
 
     /// Counts a share of all steps.
     pub fn advance_share(&self, share: f64) {
         self.bar.inc(self.parts(share));
-        if self.line_is_due() {
-            self.write_line();
-        }
+        self.write_line_if_due();
     }
 
     fn parts(&self, share: f64) -> u64 {
@@ -116,24 +110,23 @@ impl Task {
         self.bar.set_message(text.to_owned());
     }
 
-    /// Whether enough time has passed since the last line; true for only one of many threads.
-    fn line_is_due(&self) -> bool {
+    /// Writes a line if enough time has passed since the last one; only one of many threads does.
+    fn write_line_if_due(&self) {
         let Some(last_line_ms) = &self.last_line_ms else {
-            return false;
+            return;
         };
-        let now_ms = self.bar.elapsed().as_millis() as u64;
-        let last_ms = last_line_ms.load(Ordering::Relaxed);
-        now_ms >= last_ms + LINE_INTERVAL.as_millis() as u64
-            && last_line_ms
-                .compare_exchange(last_ms, now_ms, Ordering::Relaxed, Ordering::Relaxed)
-                .is_ok()
+        let (relaxed, now_ms) = (Ordering::Relaxed, self.bar.elapsed().as_millis() as u64);
+        let last_ms = last_line_ms.load(relaxed);
+        let is_due = now_ms >= last_ms + LINE_INTERVAL.as_millis() as u64;
+        let changed = || last_line_ms.compare_exchange(last_ms, now_ms, relaxed, relaxed);
+        if is_due && changed().is_ok() {
+            self.write_line();
+        }
     }
 
     fn write_line(&self) {
-        let (done, total) = (
-            self.bar.position() / PARTS,
-            self.bar.length().unwrap_or(0) / PARTS,
-        );
+        let [done, total] =
+            [self.bar.position(), self.bar.length().unwrap_or(0)].map(|it| it / PARTS);
         let line = line(&self.name, done, total, self.bar.elapsed());
         // A failure to show progress must not stop the task.
         let _ = writeln!(std::io::stderr(), "{line}");
@@ -184,20 +177,16 @@ fn rate(done: u64, elapsed: Duration) -> String {
 fn line(name: &str, done: u64, total: u64, elapsed: Duration) -> String {
     let percent = 100 * done / total.max(1);
     let seconds = elapsed.as_secs_f64();
-    let rest = if done >= total {
-        format!("{seconds:.1} s")
-    } else if done == 0 {
-        "time left unknown".to_owned()
-    } else {
-        format!(
+    let rest = match done {
+        _ if done >= total => format!("{seconds:.1} s"),
+        0 => "time left unknown".to_owned(),
+        _ => format!(
             "{:.0} s left",
             (total - done) as f64 * seconds / done as f64
-        )
+        ),
     };
-    format!(
-        "{name}: {done} of {total} ({percent} %), {}, {rest}",
-        rate(done, elapsed)
-    )
+    let rate = rate(done, elapsed);
+    format!("{name}: {done} of {total} ({percent} %), {rate}, {rest}")
 }
 
 #[cfg(test)]

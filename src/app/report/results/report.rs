@@ -1,7 +1,6 @@
 //! The report of a run: a JSON file for programs, a verdict and tables for people.
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::{Context as _, Result, anyhow};
@@ -103,29 +102,25 @@ impl Report {
     pub fn to_text(&self, all: bool) -> String {
         let mut rows = self.joined_rows();
         let count = rows.len();
-        if !all {
-            rows.retain(|(row, _)| self.is_main(row));
-        }
+        rows.retain(|(row, _)| all || self.is_main(row));
         let width = rows.iter().map(|(row, _)| row.name.len()).max();
         let width = width.unwrap_or(0);
         let mut text = format!("{}\n\n", self.verdict());
         if all && !self.about.is_empty() {
-            text += &self.about_lines("");
-            text.push('\n');
+            text += &(self.about_lines("") + "\n");
         }
-        let mut add_line = |name: &str, mcl: &str, refined: &str, unit: &str| {
+        let line = |name: &str, mcl: &str, refined: &str, unit: &str| {
             let line = format!("{name:width$}  {mcl:>10}  {refined:>10}  {unit}");
-            text.push_str(line.trim_end());
-            text.push('\n');
+            line.trim_end().to_owned() + "\n"
         };
         let refined_title = self.refined.as_ref().map_or("", |_| "refined");
-        add_line("", self.estimate_title(), refined_title, "unit");
+        text += &line("", self.estimate_title(), refined_title, "unit");
         for (row, refined) in &rows {
             let refined = refined.map_or(String::new(), |value| value.to_string());
-            add_line(row.name, &row.value.to_string(), &refined, row.unit);
+            text += &line(row.name, &row.value.to_string(), &refined, row.unit);
         }
         if rows.len() < count {
-            let _ = writeln!(text, "{} more rows: --all", count - rows.len());
+            text += &format!("{} more rows: --all\n", count - rows.len());
         }
         text
     }
@@ -140,10 +135,7 @@ impl Report {
 
     /// What the run found, in one or two sentences.
     pub fn verdict(&self) -> String {
-        let found = match self.trajectory {
-            Some(_) => None,
-            None => Some(self.summary.verdict()),
-        };
+        let found = self.trajectory.is_none().then(|| self.summary.verdict());
         let accuracy = match (&self.mcl, &self.trajectory) {
             (Some(mcl), _) => accuracy(&mcl.metrics, self.refined.as_ref().map(|it| &it.metrics)),
             (None, Some(trajectory)) => {
@@ -160,21 +152,19 @@ impl Report {
             }
             (None, None) => "No true poses were given.".to_owned(),
         };
-        found
-            .into_iter()
-            .chain([accuracy])
-            .collect::<Vec<_>>()
-            .join(" ")
+        let parts: Vec<String> = found.into_iter().chain([accuracy]).collect();
+        parts.join(" ")
     }
 
     /// The same table in Markdown, with definitions.
     pub fn to_markdown(&self) -> String {
         let mut text = self.about_lines("- ");
-        let refined_title = self.refined.as_ref().map_or("", |_| " refined |");
-        let refined_rule = self.refined.as_ref().map_or("", |_| "---:|");
-        let _ = writeln!(
-            text,
-            "\n| | {} |{refined_title} unit | definition |\n|---|---:|{refined_rule}---|---|",
+        let [title, rule] = match self.refined {
+            Some(_) => [" refined |", "---:|"],
+            None => ["", ""],
+        };
+        text += &format!(
+            "\n| | {} |{title} unit | definition |\n|---|---:|{rule}---|---|\n",
             self.estimate_title()
         );
         for (row, refined) in self.joined_rows() {
@@ -183,13 +173,12 @@ impl Report {
                 (Some(_), None) => " |".to_owned(),
                 (Some(_), Some(value)) => format!(" {value} |"),
             };
+            let MetricRow {
+                name, value, unit, ..
+            } = row;
             // A bar inside a cell would end the cell.
             let definition = row.definition.replace('|', "\\|");
-            let _ = writeln!(
-                text,
-                "| {} | {} |{refined} {} | {definition} |",
-                row.name, row.value, row.unit
-            );
+            text += &format!("| {name} | {value} |{refined} {unit} | {definition} |\n");
         }
         text
     }
@@ -218,16 +207,13 @@ impl Report {
 
     /// Errors in six degrees of freedom of each trajectory that has them, with its name.
     pub fn in_space(&self) -> Vec<(&'static str, &SpatialMetrics)> {
+        let [mcl, refined] = [&self.mcl, &self.refined]
+            .map(|report| report.as_ref().and_then(|it| it.in_space.as_ref()));
+        let title = self.estimate_title();
         [
-            (self.estimate_title(), self.trajectory.as_ref()),
-            (
-                self.estimate_title(),
-                self.mcl.as_ref().and_then(|it| it.in_space.as_ref()),
-            ),
-            (
-                "refined",
-                self.refined.as_ref().and_then(|it| it.in_space.as_ref()),
-            ),
+            (title, self.trajectory.as_ref()),
+            (title, mcl),
+            ("refined", refined),
         ]
         .into_iter()
         .filter_map(|(name, metrics)| Some((name, metrics?)))
@@ -243,28 +229,14 @@ impl Report {
 
 /// Errors against true poses in a sentence.
 fn accuracy(mcl: &TrajectoryMetrics, refined: Option<&TrajectoryMetrics>) -> String {
-    let errors = |it: &TrajectoryMetrics| {
+    let errors = |it: &TrajectoryMetrics, of: &str| {
+        let [rmse, worst] = [it.position_m.rmse, it.position_m.max].map(length);
         let heading_deg = it.heading_rad.rmse.to_degrees();
-        format!(
-            "{} and {heading_deg:.3} deg (RMS)",
-            length(it.position_m.rmse)
-        )
+        format!("{rmse} and {heading_deg:.3} deg (RMS){of}, at most {worst}")
     };
-    let worst = |it: &TrajectoryMetrics| length(it.position_m.max);
-    match refined {
-        None => format!(
-            "{} from the true poses, at most {}.",
-            errors(mcl),
-            worst(mcl)
-        ),
-        Some(refined) => format!(
-            "{} from the true poses, at most {}; refined {}, at most {}.",
-            errors(mcl),
-            worst(mcl),
-            errors(refined),
-            worst(refined)
-        ),
-    }
+    let refined = refined.map(|it| format!("; refined {}", errors(it, "")));
+    let mcl = errors(mcl, " from the true poses");
+    format!("{mcl}{}.", refined.unwrap_or_default())
 }
 
 #[cfg(test)]
