@@ -603,6 +603,22 @@ fn the_table_of_the_front_page_lists_the_layers() {
 }
 
 #[test]
+fn modules_inside_the_modules_of_the_library_are_private() {
+    let mut public = sources();
+    public.retain(|it| !it.is_below(&["app", "simulation", "lib.rs"]));
+    public.retain(|it| {
+        it.lines
+            .iter()
+            .any(|(_, line)| line.trim_start().starts_with("pub mod "))
+    });
+    let public: Vec<_> = public
+        .iter()
+        .map(|it| it.path.display().to_string())
+        .collect();
+    assert!(public.is_empty(), "{}", public.join("\n"));
+}
+
+#[test]
 fn users_of_the_library_do_not_compile_the_simulation() {
     let declaration = "#[cfg(feature = \"simulation\")]\npub mod simulation;";
     assert!(text_of("lib.rs").contains(declaration));

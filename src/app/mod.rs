@@ -7,9 +7,9 @@ pub mod run;
 // What a run leaves behind.
 pub mod report;
 // The commands.
-pub mod commands;
+mod commands;
 // Many runs.
-pub mod comparison;
+mod comparison;
 // The command line.
 pub mod cli;
 

@@ -60,6 +60,7 @@ impl Scene {
     }
 
     /// Memory of the hierarchies and the triangles [bytes].
+    #[cfg(test)]
     pub fn bytes(&self) -> usize {
         let top = size_of_val(&*self.top.bvh.nodes);
         let numbers = 0..self.top.numbers.len();

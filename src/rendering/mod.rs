@@ -10,7 +10,6 @@ pub(crate) mod gpu;
 mod order;
 pub(crate) mod selection;
 
-pub use crate::raycasting::{TileError, TileProblem};
 pub use backend::{Backend, RenderingMethod};
 
 pub(crate) use cpu::CpuRenderer;
@@ -18,6 +17,7 @@ pub(crate) use cpu::CpuRenderer;
 use crate::geometry::{Pose3, Rigid3f, Vec3};
 use crate::lidar::{Beam, LidarModel, RangeImage};
 use crate::memory::MemoryError;
+use crate::raycasting::TileError;
 
 /// Renders the map from many poses at once. Ranges are infinite where there is no surface.
 pub trait RangeRenderer: Send + Sync {

@@ -72,4 +72,4 @@ pub use collect::collect;
 pub use execute::Executor;
 pub use layout::Layout;
 pub use plan::{PlannedRun, planned_runs};
-pub use record::{Outcome, RunId, RunRecord};
+pub use record::{Outcome, RunId};
