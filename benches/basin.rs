@@ -19,8 +19,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use fpmcl::app::report::plotting::{LineChart, Panel, Series};
 use fpmcl::geometry::{Pose2, Pose3, Vec3, pose2_from_pose3};
+use fpmcl::internals::app::{LineChart, Panel, Series};
 use fpmcl::internals::{PERIOD_S, compare_timings};
 use fpmcl::lidar::{Beam, LidarModel, Rotation, Scan};
 use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start, StartSpread};

@@ -135,7 +135,9 @@ pub mod mapping;
 pub mod refinement;
 // Program.
 #[cfg(feature = "cli")]
-pub mod app;
+mod app;
+#[cfg(feature = "cli")]
+pub use app::{main, main_of_library};
 
 /// What the tests and benches of this repository use beyond the library's interface; it changes without notice.
 #[doc(hidden)]
@@ -153,6 +155,14 @@ pub mod internals {
     #[cfg(feature = "gpu")]
     pub use crate::rendering::gpu::{GpuRenderer, ImageMethod};
 
+    #[cfg(feature = "cli")]
+    pub mod app {
+        pub use crate::app::cli::{Cli, Command};
+        pub use crate::app::report::plotting::{Bitmap, LineChart, Panel, Series, color};
+        pub use crate::app::report::results::LocalizationResults;
+        pub use crate::app::settings;
+    }
+
     pub mod mesh_file {
         pub use crate::map::files::mesh_file::read;
     }
@@ -165,5 +175,3 @@ pub mod internals {
         pub use crate::recording::scan_files::{is_scan, read, read_stamped};
     }
 }
-#[cfg(feature = "cli")]
-pub use app::main_of_library;

@@ -3,5 +3,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    ExitCode::from(fpmcl::app::main(std::env::args_os()))
+    ExitCode::from(fpmcl::main(std::env::args_os()))
 }

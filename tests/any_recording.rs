@@ -8,8 +8,8 @@ use std::fs;
 use std::path::Path;
 
 use common::{Fpmcl, Output, fpmcl, json, real_recording, run, simulate_two_drives};
-use fpmcl::app::report::results::LocalizationResults;
 use fpmcl::geometry::{Pose3, StampedPose};
+use fpmcl::internals::app::LocalizationResults;
 use fpmcl::internals::ply;
 use fpmcl::recording::PoseTrack;
 use fpmcl::recording::{read_tum, write_tum};

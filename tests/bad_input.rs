@@ -7,7 +7,7 @@ mod common;
 
 use std::fs;
 
-use ::fpmcl::app::report::results::LocalizationResults;
+use ::fpmcl::internals::app::LocalizationResults;
 use common::{Recording, config_file, fpmcl};
 
 /// A recording with its map.

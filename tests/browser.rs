@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
-use fpmcl::app::report::plotting::Bitmap;
+use fpmcl::internals::app::Bitmap;
 
 /// Widths of the windows of a desktop and of a phone [px].
 const WIDTHS: [u32; 2] = [1280, 390];

@@ -9,7 +9,7 @@ use std::fmt::Write as _;
 use std::fs;
 
 use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, run, simulate_two_drives};
-use fpmcl::app::report::results::LocalizationResults;
+use fpmcl::internals::app::LocalizationResults;
 use nalgebra::Vector3;
 
 const SIMULATION: &str = "\

@@ -7,7 +7,7 @@ use std::fmt::Debug;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use fpmcl::app::settings::{
+use fpmcl::internals::app::settings::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GivenPosesConfig,
     GroundCommandConfig, Initialization, LocalizationConfig, MapInputConfig, OdometryCommandConfig,
     RecordingConfig, RefinementConfig,

@@ -22,7 +22,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 use common::{COMPARISON_OF_STREET, Recording};
-use fpmcl::app::report::results::LocalizationResults;
+use fpmcl::internals::app::LocalizationResults;
 use rand::RngExt as _;
 
 /// A command, and the call that prepares its inputs.

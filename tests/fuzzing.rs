@@ -19,15 +19,15 @@ use std::fs;
 use std::path::Path;
 
 use clap::Parser as _;
-use fpmcl::app::cli::{Cli, Command};
-use fpmcl::app::report::results::LocalizationResults;
-use fpmcl::app::settings::{
-    self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
-    LocalizationConfig, RefinementConfig,
-};
 use fpmcl::geometry::{Pose2, Pose3, TriangleMesh};
 use fpmcl::internals::CameraPoses;
 use fpmcl::internals::FARTHEST_M;
+use fpmcl::internals::app::LocalizationResults;
+use fpmcl::internals::app::settings::{
+    self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
+    LocalizationConfig, RefinementConfig,
+};
+use fpmcl::internals::app::{Cli, Command};
 use fpmcl::internals::ply;
 use fpmcl::internals::scan_files;
 use fpmcl::lidar::{Rotation, RotationDirection, Scan};

@@ -17,7 +17,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use common::Recording;
-use fpmcl::app::report::results::LocalizationResults;
+use fpmcl::internals::app::LocalizationResults;
 
 /// Time limit for a program that hangs.
 const TIMEOUT: Duration = Duration::from_secs(120);

@@ -10,8 +10,8 @@ mod common;
 use std::path::Path;
 
 use common::picture::Picture;
-use fpmcl::app::report::plotting::Bitmap;
-use fpmcl::app::report::plotting::color::{MCL, REFINED};
+use fpmcl::internals::app::Bitmap;
+use fpmcl::internals::app::color::{MCL, REFINED};
 
 #[test]
 fn the_pictures_of_finished_runs_show_the_paths() {

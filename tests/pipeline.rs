@@ -10,9 +10,9 @@ use std::path::Path;
 
 use common::picture::Picture;
 use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, Recording, SENSOR, json, run, simulate_two_drives};
-use fpmcl::app::report::plotting::color::{MCL, REFINED, TRUTH};
-use fpmcl::app::report::results::LocalizationResults;
 use fpmcl::internals::CameraPoses;
+use fpmcl::internals::app::LocalizationResults;
+use fpmcl::internals::app::color::{MCL, REFINED, TRUTH};
 use fpmcl::recording::Calibration;
 use fpmcl::recording::read_tum;
 use serde_json::Value;

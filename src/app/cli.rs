@@ -209,7 +209,6 @@ pub struct ConfigurationArgs {
 
 /// A command with a configuration file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-#[expect(missing_docs, reason = "they are named as the commands")]
 pub enum ConfiguredCommand {
     Odometry,
     BuildMap,

@@ -77,7 +77,7 @@ impl Features {
 
     /// Returns the inputs of a fuzzy system.
     #[inline]
-    pub(crate) fn to_array(&self) -> [f32; 5] {
+    pub(crate) fn to_array(self) -> [f32; 5] {
         [
             self.slope_deg,
             self.height_variance_m,

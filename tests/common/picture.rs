@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use fpmcl::app::report::plotting::Bitmap;
+use fpmcl::internals::app::Bitmap;
 
 /// Minimum width that is readable on a screen and on paper [px].
 const MIN_WIDTH: u32 = 1200;

@@ -3,7 +3,7 @@
 use std::sync::LazyLock;
 
 use arbtest::arbitrary::{Result, Unstructured};
-use fpmcl::app::settings::{
+use fpmcl::internals::app::settings::{
     BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
     LocalizationConfig, RefinementConfig, to_yaml,
 };
