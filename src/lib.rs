@@ -73,7 +73,7 @@
 //! | layer | modules |
 //! |---|---|
 //! | foundations | `files`, [`geometry`], [`memory`], `random`, `shared_bytes`, `simd`, `statistics`, [`validation`] |
-//! | texts, feature `configuration` | `configuration` |
+//! | configurations as texts, with a feature | `configuration` |
 //! | sensor and rays | [`lidar`], `raycasting` |
 //! | scans, points and meshes | [`ground`], [`meshing`], [`recording`], [`rendering`] |
 //! | motion | [`odometry`] |

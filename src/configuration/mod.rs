@@ -5,7 +5,7 @@
 //! settings  ->  keys with their full names  ->  replaced values, in order  ->  validation
 //! ```
 //!
-//! The full name of a key is the path of a field, such as `tracker.localizer.num_particles`. [`names`] accepts shorter
+//! The full name of a key is the path of a field, such as `tracker.localizer.num_particles`. `names` accepts shorter
 //! ones, and those of range-mcl. Nothing is ignored: an unknown key, a value of the wrong type and a contradiction are
 //! errors that name the place, the key and the value.
 

@@ -74,7 +74,7 @@ impl Scene {
 
 impl<E> Scene<E> {
     /// Builds a hierarchy per mesh and one over all, on all threads of the current pool.
-    /// [`Hit::triangle`](super::Hit::triangle) counts the triangles of all meshes one after the
+    /// `Hit::triangle` counts the triangles of all meshes one after the
     /// other.
     pub fn of_tiles(meshes: &[TriangleMesh]) -> Self {
         let mut triangles = 0;

@@ -40,7 +40,7 @@ impl CameraPoses {
         }
     }
 
-    /// The lidar poses in the frame of the first one; see [`MapFrame::map_from_lidar`].
+    /// The lidar poses in the frame of the first one; see `MapFrame::map_from_lidar`.
     pub fn map_from_lidar(&self, calibration: &Calibration) -> Vec<Pose3> {
         let frame = self.frame(calibration);
         self.world_from_cam0

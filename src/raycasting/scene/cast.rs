@@ -104,7 +104,7 @@ impl<E: Clone> Scene<E> {
 
     /// Casts single rays from one origin, which is faster than [`Scene::cast_packets`] if they
     /// diverge, and writes the range of the nearest hit of each: the same, bit by bit, with two
-    /// exceptions: of surfaces nearer than [`Reach::enough_m`] it may be another, and so it may be
+    /// exceptions: of surfaces nearer than `Reach::enough_m` it may be another, and so it may be
     /// of the triangles at an edge that the ray passes within rounding. Runs on the calling thread.
     ///
     /// # Errors
