@@ -6,7 +6,7 @@
 //! So `seed`, `range_image.width` and `numParticles` are names of keys wherever these are in a configuration.
 
 /// Other first parts of names: those of range-mcl, without units and blocks, and earlier ones of our own.
-const ALIASES: [(&str, &str); 20] = [
+const ALIASES: [(&str, &str); 21] = [
     // range-mcl
     ("crop_x", "crop_x_m"),
     ("crop_y", "crop_y_m"),
@@ -24,6 +24,7 @@ const ALIASES: [(&str, &str); 20] = [
     // Earlier names of our own.
     ("constant_velocity_noise", "constant_velocity"),
     ("ground_method", "ground.method"),
+    ("ground_method", "method"),
     ("odometry", "motion.odometry"),
     ("odometry_noise", "localizer.motion"),
     ("unknown_velocity_noise", "unknown_velocity"),
@@ -76,7 +77,7 @@ impl Names {
             return Meaning::Key(name.to_owned());
         }
         let first = name.split('.').next().unwrap_or(name);
-        if let Some((_, other)) = ALIASES.iter().find(|(alias, _)| *alias == first) {
+        for (_, other) in ALIASES.iter().filter(|(alias, _)| *alias == first) {
             let replaced = format!("{other}{}", &name[first.len()..]);
             match self.ending(&replaced) {
                 Meaning::Unknown => (),

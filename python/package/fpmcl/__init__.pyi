@@ -143,10 +143,11 @@ class Map:
         """Builds a map.
 
         ``scans``: a Recording, or an iterable of Scans and of arrays (N, 3) [m], which are taken as deskewed. ``poses``:
-        (N, 4, 4), one per scan, into the frame of the map; by default those of the recording. Scans with times are deskewed by
-        them. ``sensor``: by default inferred from the scans. Settings: ``fpmcl config build-map --full``.
+        (N, 4, 4), one per scan, into the frame of the map; by default those of the recording, and without these found from the
+        scans. Scans with times are deskewed by them. ``sensor``: by default inferred from the scans. Settings: fields of
+        ``map`` in ``fpmcl config build-map --full``.
 
-        Raises Error if there are no poses, or if poses and scans do not fit each other.
+        Raises Error if poses and scans, or scans and sensor, do not fit each other.
         """
 
     @property
@@ -178,8 +179,8 @@ class Localizer:
 
     ``start``: ``"anywhere"`` (the default in maps of up to 1 km²), ``"road"`` (anywhere along the mapping drive), or a pose
     nearby: (3,), x, y [m] and heading [rad], or (4, 4). ``sensor``: by default inferred from the first scan; better that of a
-    Recording. Settings: ``fpmcl config localize --full``, and ``odometry="none"`` for constant velocity where no motion is
-    given.
+    Recording. Settings: fields of ``tracker`` in ``fpmcl config localize --full``, and ``odometry=None`` for constant velocity
+    where no motion is given.
     """
 
     def __new__(
@@ -296,12 +297,27 @@ class RefinedTrajectory:
     def states(self) -> list[_State]:
         """State of each scan; ``"searching"`` where its place was not found."""
 
-def read_recording(path: _Path, poses: Optional[_Path] = None, **settings: Any) -> Recording:
+def read_recording(
+    path: _Path,
+    poses: Optional[_Path] = None,
+    *,
+    topic: Optional[str] = None,
+    calib_file: Optional[_Path] = None,
+    body_from_lidar: Optional[ArrayLike] = None,
+    start_idx: int = 0,
+    n_scans: int = -1,
+    frame_step: int = 1,
+    motion_compensation: Optional[str] = "auto",
+    elevation_bias_deg: float = 0.0,
+) -> Recording:
     """Opens a recording: a folder of scans (KITTI odometry, KITTI raw, .bin, .pcd, .ply, .npy) or a bag (MCAP, rosbag2, ROS 1).
 
     ``poses``: file of its poses (KITTI, TUM, a folder ``oxts``) or topic of its bag; by default those that the recording
-    contains, if there are any. Settings: ``start_idx``, ``n_scans``, ``frame_step``, ``topic``, ``calib_file``,
-    ``body_from_lidar``, ``motion_compensation``, ``elevation_bias_deg``, as in ``fpmcl config localize --full``.
+    contains, if there are any. ``calib_file``: calibration of the camera whose poses these are. ``body_from_lidar``: x, y, z
+    [m], roll, pitch, yaw [deg] of the lidar on the body whose poses these are. ``topic``: of the point clouds in a bag with
+    several. ``start_idx``, ``n_scans`` (-1: all), ``frame_step``: the frames that are used. ``motion_compensation``:
+    ``"auto"``, a rotation such as ``"clockwise"``, or None for compensated scans. ``elevation_bias_deg``: angle to add to the
+    elevations of all points [deg].
 
     Raises Error if something cannot be read, with the file, and what to do.
     """
@@ -315,8 +331,8 @@ def infer_sensor(scans: _Scans) -> Sensor:
 def odometry(scans: _Scans, **settings: Any) -> Trajectory:
     """Finds the poses of scans from the scans themselves.
 
-    ``scans``: a Recording, or an iterable of Scans and of arrays (N, 3) [m]. Settings: ``trajectory`` of
-    ``fpmcl config odometry --full``, such as ``trajectory={"loops": False}``.
+    ``scans``: a Recording, or an iterable of Scans and of arrays (N, 3) [m]. Settings: fields of
+    ``trajectory`` in ``fpmcl config odometry --full``, such as ``loops=False``.
 
     Raises Error if a scan cannot be read, or times do not ascend.
     """
@@ -328,13 +344,15 @@ def refine(
     motions: Optional[ArrayLike] = None,
     *,
     sensor: Optional[Sensor] = None,
+    uncertainty: ArrayLike = (1.0, 10.0),
+    seed: int = 0,
     **settings: Any,
 ) -> RefinedTrajectory:
     """Refines a trajectory in a map, scan by scan, and smooths it with the motions.
 
     ``scans``: as of ``Map.build``. ``estimates``: those of a Localizer, or the poses of a rough trajectory, (N, 4, 4) or
     (N, 3), with the standard deviations ``uncertainty=[m, deg]``. ``motions``: into each scan, (N, 4, 4) or (N, 3); without,
-    each scan by itself. Settings: ``fpmcl config refine --full``.
+    each scan by itself. Settings: fields of ``refiner`` in ``fpmcl config refine --full``.
 
     Raises Error if there are not as many estimates or motions as scans, or if a scan cannot be read.
     """
@@ -349,8 +367,8 @@ def cast_rays(map: Map, poses: ArrayLike, directions: ArrayLike) -> NDArray[np.f
 def classify_ground(points: ArrayLike, **settings: Any) -> NDArray[np.float32]:
     """Returns the confidence that each point of a scan is ground, (N,) float32, 0 to 1.
 
-    ``points``: (N, 3), one revolution in the frame of the lidar [m]. Settings: ``ground_method`` (``"fuzzy"``, ``"pca"``,
-    ``"ransac"``) and its keys, as in ``fpmcl config localize --full``. Raises Error if a setting is out of its range.
+    ``points``: (N, 3), one revolution in the frame of the lidar [m]. Settings: ``method`` (``"fuzzy"``, ``"pca"``,
+    ``"ransac"``) and the other fields of ``ground`` in ``fpmcl config ground --full``. Raises Error if a setting is out of its range.
     """
 
 def main() -> int:
