@@ -14,7 +14,7 @@ static BUDGET: AtomicU64 = AtomicU64::new(u64::MAX);
 /// A stage needs more memory than the budget.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 #[error(
-    "{what} would need {} of memory, more than the budget of {}; {remedy}, or raise the budget with --memory",
+    "{what} would need {} of memory, more than the budget of {}; {remedy}, or raise the budget",
     amount(*needed_bytes), amount(*budget_bytes)
 )]
 pub struct MemoryError {

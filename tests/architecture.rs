@@ -567,6 +567,24 @@ fn violations(sources: &[Source]) -> Vec<String> {
     violations
 }
 
+/// The lines of the library with a flag of the command line or a configuration file of the program.
+fn lines_of_the_program(sources: &[Source]) -> Vec<String> {
+    let is_flag = |line: &str| {
+        let mut after = line.match_indices("--").map(|(at, _)| &line[at + 2..]);
+        after.any(|rest| rest.starts_with(|c: char| c.is_ascii_alphabetic()))
+    };
+    let library = sources
+        .iter()
+        .filter(|it| !it.is_below(&["app", "main.rs"]));
+    let lines = library.flat_map(|source| source.lines.iter().map(move |line| (source, line)));
+    lines
+        .filter(|(_, (_, line))| is_flag(line) || line.contains(".yml"))
+        .map(|(source, (number, line))| {
+            format!("src/{}:{number}: {}", source.path.display(), line.trim())
+        })
+        .collect()
+}
+
 fn text_of(file: &str) -> String {
     fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("src").join(file)).unwrap()
 }
@@ -650,6 +668,21 @@ fn crates_and_operations_are_confined() {
 fn crate_of(files: &[(&str, &str)]) -> Crate {
     let sources = files.iter().map(|(path, text)| Source::new(path, text));
     Crate::new(&sources.collect::<Vec<_>>())
+}
+
+#[test]
+fn the_library_names_no_flag_and_no_configuration_file_of_the_program() {
+    let lines = lines_of_the_program(&sources());
+    assert!(lines.is_empty(), "{}", lines.join("\n"));
+    let found = |path: &str, text: &str| lines_of_the_program(&[Source::new(path, text)]).len();
+    let flag = "const REMEDY: &str = \"use --backend cpu\";";
+    assert_eq!(found("rendering/mod.rs", flag), 1);
+    assert_eq!(found("app/run/remedy.rs", flag), 0);
+    assert_eq!(found("map/mod.rs", "let text = \"a key of map.yml\";"), 1);
+    assert_eq!(
+        found("map/mod.rs", "// --backend\nlet text = \"-- or -1\";"),
+        0
+    );
 }
 
 #[test]

@@ -159,7 +159,7 @@ fn a_calibration_without_tr_is_reported() {
     recording.write("calib.txt", "P0: 1 0 0 0 0 1 0 0 0 0 1 0\n");
     recording
         .fpmcl("build-map")
-        .fails_with(&["calib.txt", "`Tr:`", "use the calib.txt"]);
+        .fails_with(&["calib.txt", "`Tr:`", "use the calibration"]);
 }
 
 #[test]

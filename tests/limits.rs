@@ -142,7 +142,7 @@ fn a_budget_of_memory_that_does_not_suffice_is_an_error_that_names_what_needs_it
     recording.fpmcl("build-map").succeeds();
     let localize = || recording.fpmcl("localize").with(TINY);
     let search = localize().set("initialization", "extent");
-    (search.set("grid_res", "0.05")).fails_with(&expected("the search grid", "grid_res"));
+    (search.set("grid_res", "0.05")).fails_with(&expected("the search grid", "panorama.cell_m"));
     let search = localize().set("initialization", "corridor");
     let search = search
         .set("grid_res", "0.05")

@@ -710,5 +710,5 @@ fn the_program_rasterizes_or_casts_whole_images_with_the_same_result() {
         let apart = std::iter::zip(&errors_m[0], other).map(|(a, b)| (a - b).abs());
         assert!(apart.fold(0.0, f64::max) < 1e-3, "{errors_m:?}");
     }
-    localize("cpu", "raster").fails_with(&["rendering.method is raster", "--backend gpu"]);
+    localize("cpu", "raster").fails_with(&["method is raster", "--backend gpu"]);
 }

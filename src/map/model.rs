@@ -36,7 +36,7 @@ const PLAUSIBLE_M: RangeInclusive<f32> = 2.0..=20_000.0;
 const DIVIDED_BYTES: f64 = 16.0;
 
 /// What to do about a map that needs too much memory.
-const SMALLER_MAP: &str = "build a smaller map with a larger simplify_resolution";
+const SMALLER_MAP: &str = "build a smaller map with a larger local_map.simplify_resolution_m";
 
 /// Memory per triangle while a map is prepared: mesh, ground, tiles and hierarchies [bytes].
 const TRIANGLE_BYTES: f64 = 150.0;

@@ -19,7 +19,7 @@ pub enum MeshingError {
     #[error("{weights} weights were given for {points} points; give one per point")]
     WeightsDoNotMatch { points: usize, weights: usize },
     #[error(
-        "the points extend over {extent_m:.0} m, so that the finest octree cells would be {cell_m:.2} m wide, more than {limit_m} m; raise depth, which is {depth}, or lower local_map_size, or check the poses"
+        "the points extend over {extent_m:.0} m, so that the finest octree cells would be {cell_m:.2} m wide, more than {limit_m} m; raise depth, which is {depth}, or mesh fewer points at a time, or check their poses"
     )]
     CellsTooLarge {
         extent_m: f32,

@@ -140,7 +140,7 @@ fn require_memory(tree: &Octree, samples: &Samples) -> Result<(), MemoryError> {
     memory::require(
         "the octree of the surface",
         nodes as f64 * NODE_BYTES + samples.len() as f64 * SAMPLE_BYTES,
-        "lower depth or local_map_size",
+        "lower depth, or mesh fewer points at a time",
     )
 }
 

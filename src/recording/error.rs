@@ -39,7 +39,7 @@ pub enum RecordingError {
         types: &'static str,
         known: String,
     },
-    #[error("{} has several topics of {types}; choose one by the key topic (of scans) or pose_file (of poses): {known}", path.display())]
+    #[error("{} has several topics of {types}; choose one of: {known}", path.display())]
     SeveralTopics {
         path: PathBuf,
         types: &'static str,
@@ -61,7 +61,7 @@ pub enum RecordingError {
     },
     #[error("{}, line {line}: the first three columns are not a rotation", path.display())]
     NotARotation { path: PathBuf, line: usize },
-    #[error("{} has no line `Tr:` (cam0_from_lidar, 12 numbers); use the calib.txt that belongs to the poses, or give the mounting with body_from_lidar", path.display())]
+    #[error("{} has no line `Tr:` (cam0_from_lidar, 12 numbers); use the calibration that belongs to the poses, or give the mounting with body_from_lidar", path.display())]
     NoTr { path: PathBuf },
     #[error("{} contains no poses", path.display())]
     NoPoses { path: PathBuf },
@@ -73,14 +73,14 @@ pub enum RecordingError {
         pose_file: PathBuf,
         poses: usize,
     },
-    #[error("{} has no poses (poses.txt, poses_tum.txt, poses.tum or oxts); name their file with --poses, or in pose_file", path.display())]
+    #[error("{} has no poses (poses.txt, poses_tum.txt, poses.tum or oxts); give their file", path.display())]
     NoPoseFile { path: PathBuf },
     #[error(
         "the poses of {topic} do not name the body that they are of; give its lidar's pose with body_from_lidar, [0, 0, 0, 0, 0, 0] if they are poses of the lidar"
     )]
     NoBody { topic: String },
     #[error(
-        "the poses of {topic} are those of {body}, and no static transform leads from it to {lidar}, the frame of the scans; record tf_static, or give the poses as a file with --poses and the mounting with body_from_lidar"
+        "the poses of {topic} are those of {body}, and no static transform leads from it to {lidar}, the frame of the scans; record tf_static, or give the poses as a file and the mounting with body_from_lidar"
     )]
     NoMounting {
         topic: String,

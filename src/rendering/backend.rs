@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// Requested rendering backend, `--backend`.
+/// Requested rendering backend.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Backend {
@@ -17,7 +17,7 @@ pub enum Backend {
     Gpu,
 }
 
-/// Requested method to render whole range images on a graphics adapter, `rendering.method`.
+/// Requested method to render whole range images on a graphics adapter.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "lowercase")]

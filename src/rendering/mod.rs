@@ -201,20 +201,22 @@ fn facing(normal: Vec3, direction: Vec3) -> Vec3 {
 #[derive(Debug, thiserror::Error)]
 #[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum RenderError {
-    #[error("there is no graphics adapter; use --backend cpu")]
+    #[error("backend is gpu, but there is no graphics adapter")]
     NoAdapter,
     #[error(
-        "rendering.method is raster, but the map is rendered on the CPU, because {reason}, which only casts rays; use --backend gpu, or set rendering.method to auto or cast"
+        "method is raster, but the map is rendered on the CPU, because {reason}, which only casts rays; set method to auto or cast"
     )]
     NothingToRasterize { reason: String },
-    #[error("the graphics device was lost ({reason}); run again, or use --backend cpu")]
+    #[error("the graphics device was lost ({reason}); render again, or on the CPU")]
     DeviceLost { reason: String },
-    #[error("the graphics device refused the work ({reason}); use --backend cpu")]
+    #[error("the graphics device refused the work ({reason}); render on the CPU")]
     DeviceRefused { reason: String },
     #[error(
-        "the map needs {needed} bytes on the graphics device, which binds at most {limit}; use --backend cpu"
+        "the map needs {needed} bytes on the graphics device, which binds at most {limit}; render on the CPU"
     )]
     MapTooLarge { needed: u64, limit: u64 },
+    #[error(transparent)]
+    DeviceMemory(MemoryError),
     #[error(transparent)]
     Memory(#[from] MemoryError),
     #[error(transparent)]

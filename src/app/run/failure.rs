@@ -3,10 +3,15 @@
 use std::io::Write as _;
 
 use super::interrupt::Interrupted;
+use super::remedy::remedies;
 
-/// Prints an error with its causes on standard error.
+/// Prints an error with its causes and remedies on standard error.
 pub fn report(error: &anyhow::Error) {
-    let text = format!("error: {}\n", format_error_chain(error));
+    let mut text = format!("error: {}", format_error_chain(error));
+    for remedy in remedies(error) {
+        text += &format!("; {remedy}");
+    }
+    text += "\n";
     // There is nowhere to report that standard error is closed.
     let _ = std::io::stderr().write_all(text.as_bytes());
 }

@@ -10,6 +10,7 @@ pub mod logging;
 pub mod machine;
 pub mod output;
 pub mod progress;
+mod remedy;
 pub mod version;
 
 pub use context::Context;

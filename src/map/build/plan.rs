@@ -139,7 +139,7 @@ impl Ownership {
         memory::require(
             "the plane around a local map",
             largest_m2 / OWNER_CELL_M.powi(2) * CELL_BYTES,
-            "lower local_map_size, crop_x and crop_y, or check the poses",
+            "lower local_map_size, local_map.crop_x_m or local_map.crop_y_m, or check the poses",
         )
     }
 

@@ -62,7 +62,7 @@ pub enum MeshFileProblem {
         "is neither a text STL, which begins with `solid` and has facets, nor a binary one; export it again"
     )]
     NotStl,
-    #[error("has no triangles; build the map again, or choose another map_file")]
+    #[error("has no triangles; build the map again, or choose another map")]
     NoTriangles,
     #[error(
         "has {0} vertices or triangles, more than the 4 billion that can be numbered; divide the map"

@@ -132,7 +132,11 @@ impl PanoramaRequest {
         let cells = (max.x - min.x) * (max.y - min.y) / self.config.cell_m.powi(2);
         match self.is_along(path) {
             true => Ok(()),
-            false => memory::require("the search grid", cells * CELL_BYTES, "raise grid_res"),
+            false => memory::require(
+                "the search grid",
+                cells * CELL_BYTES,
+                "raise panorama.cell_m",
+            ),
         }
     }
 
@@ -216,7 +220,7 @@ impl PanoramaIndex {
         memory::require(
             "the panoramas of the map",
             2.0 * model.len() as f64 * (places.len() + 3 * places.len().min(BATCH)) as f64,
-            "raise grid_res, or lower panorama.rows or panorama.columns",
+            "raise panorama.cell_m, or lower panorama.rows or panorama.columns",
         )?;
         let on_disk = match file {
             Some((path, request)) => Panoramas::write(path, request, &places, &model, render),

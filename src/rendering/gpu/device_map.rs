@@ -37,8 +37,9 @@ impl DeviceMap {
         memory::require(
             "the graphics device",
             3.0 * (sizes[0] + sizes[1]) as f64 + gpu.batch_sizes.bytes(),
-            "choose a smaller map, use --backend cpu",
-        )?;
+            "choose a smaller map, render on the CPU",
+        )
+        .map_err(RenderError::DeviceMemory)?;
         let map = Self {
             nodes: gpu.upload("nodes", &bvh.nodes, BufferUsages::STORAGE),
             triangles: gpu.upload("triangles", &bvh.triangles, BufferUsages::STORAGE),
@@ -90,7 +91,7 @@ mod tests {
             }
         ));
         let message = error.to_string();
-        for part in ["300 bytes", "at most 128", "--backend cpu"] {
+        for part in ["300 bytes", "at most 128", "CPU"] {
             assert!(message.contains(part), "{message}");
         }
     }

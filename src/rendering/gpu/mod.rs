@@ -9,7 +9,7 @@
 //!   Every triangle costs twelve vertices in every image.
 //!
 //! A range image has some 10⁴ to 10⁵ rays, the tiles around a car 10⁶ triangles. Which method is faster depends on the
-//! adapter: `rendering.method: auto` measures both with the first scan (images of 57,600 rays on a software adapter: as
+//! adapter: [`RenderingMethod::Auto`] measures both with the first scan (images of 57,600 rays on a software adapter: as
 //! fast with 20,000 triangles, casting 40 times faster with 1.6 million). Arbitrary beams can
 //! only be cast. Comparisons are
 //! added up on the device; one number per pose is read back.
@@ -236,7 +236,7 @@ impl GpuRenderer {
             false => (ImageMethod::Cast, "cast"),
         };
         tracing::info!(
-            "rendering.method is {name}: a range image of {height} x {width} pixels takes {cast_ms:.2} ms by casting rays and {raster_ms:.2} ms by rasterizing on {}",
+            "whole images are rendered by {name}: a range image of {height} x {width} pixels takes {cast_ms:.2} ms by casting rays and {raster_ms:.2} ms by rasterizing on {}",
             self.gpu.report
         );
         Ok(method)
@@ -253,8 +253,7 @@ fn reach_m(beam: &Beam, difference: &RangeDifference) -> f32 {
 
 fn cannot_rasterize() -> RenderError {
     RenderError::DeviceRefused {
-        reason: "its drawing stages read no storage buffers; set rendering.method to cast"
-            .to_owned(),
+        reason: "its drawing stages read no storage buffers; set method to cast".to_owned(),
     }
 }
 

@@ -338,8 +338,9 @@ impl<'a> Drawing<'a> {
         memory::require(
             "the range images on the graphics device",
             (IN_FLIGHT * atlas.pixels() * PIXEL_BYTES) as f64,
-            "set rendering.method to cast, use --backend cpu",
-        )?;
+            "set method to cast, render on the CPU",
+        )
+        .map_err(RenderError::DeviceMemory)?;
         let directions: Vec<[f32; 4]> = model
             .directions()
             .iter()

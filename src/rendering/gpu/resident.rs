@@ -83,8 +83,9 @@ impl ResidentMap {
         memory::require(
             "the graphics device",
             3.0 * all_bytes.min(budget_bytes) as f64 + gpu.batch_sizes.bytes(),
-            "choose a smaller map, use --backend cpu",
-        )?;
+            "choose a smaller map, render on the CPU",
+        )
+        .map_err(RenderError::DeviceMemory)?;
         let center = center_of(tiles.iter().map(|(bounds, _)| *bounds));
         let nothing = DeviceMap::of_hierarchy(gpu, TwoLevelBvh::over(center, &[]))?;
         let tiles = Tiles {
