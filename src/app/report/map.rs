@@ -1,4 +1,4 @@
-//! Report of a map build.
+//! What `build-map` leaves behind next to a map: its report and pictures.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -8,9 +8,13 @@ use anyhow::Result;
 use serde::Serialize;
 
 use super::odometry;
+use super::plotting::{MapPlot, SURFACES, VertexNumbers, muted};
+use super::run_output::MOST_TRIANGLES;
 use crate::app::run::output::Printed;
+use crate::evaluation::map_quality::ResidualSums;
 use crate::evaluation::{MapQuality, TruthAgreement};
-use crate::map::mesh_view::MeshView;
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
+use crate::map::mesh_view::{MeshView, Without, reduced};
 use crate::map::{LocalMapCounts, MappingPath};
 use crate::mapping::TrajectorySummary;
 use crate::sensor::Sensor;
@@ -55,24 +59,26 @@ pub struct BuildReport {
 }
 
 impl BuildReport {
-    /// The size of a written map, per length of its path, and the time since the build started.
-    pub fn of_map(
-        triangles: usize,
+    /// The report of a written map: its size, per length of its path, and the time since the build started.
+    pub fn new(
+        meshes: &[&dyn MeshView],
+        local_maps: Vec<LocalMapCounts>,
         path: &MappingPath,
         mesh_file: &Path,
         started: Instant,
     ) -> Self {
-        let positions = path
-            .map_from_lidar
-            .iter()
-            .map(|pose| pose.translation.vector);
+        let poses = path.map_from_lidar.iter();
+        let positions = poses.map(|pose| pose.translation.vector);
         let steps = positions.clone().zip(positions.skip(1));
         let path_m = steps.map(|(from, to)| (to - from).norm()).sum();
         let map_mb = std::fs::metadata(mesh_file).map_or(0.0, |file| file.len() as f64 / 1e6);
         let per_100m = |amount: f64| 100.0 * amount / f64::max(path_m, 1.0);
+        let triangles = meshes.iter().map(|mesh| mesh.triangles()).sum();
         Self {
             path_m,
             triangles,
+            octree_cell_m: (local_maps.iter()).fold(0.0, |largest, it| it.cell_m.max(largest)),
+            local_maps,
             map_mb,
             triangles_per_100m: per_100m(triangles as f64),
             mb_per_100m: per_100m(map_mb),
@@ -190,4 +196,75 @@ impl ChangesReport {
             ("added", area(self.added_m2, self.added_triangles)),
         ]
     }
+}
+
+/// Draws the map of some meshes with the path of the mapping drive, and its residuals where scans were held out.
+pub fn draw_map(
+    mesh_file: &Path,
+    meshes: &[&dyn MeshView],
+    path: &[Pose3],
+    residuals: &ResidualSums,
+) -> Result<()> {
+    /// Residual at the end of the colour bar [m].
+    const LIMIT_M: f64 = 0.2;
+    let in_own_colors: Vec<_> = meshes.iter().map(|mesh| (*mesh, None)).collect();
+    let mesh = &reduced(&in_own_colors, MOST_TRIANGLES);
+    let driven: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
+    let map = MapPlot {
+        title: "Map from above",
+        mesh: &muted(mesh),
+        path: Some(("mapping trajectory", &driven)),
+        keys: &SURFACES,
+        numbers: None,
+    };
+    save(&map, &mesh_file.with_extension("png"))?;
+    if residuals.quality().is_none() {
+        return Ok(());
+    }
+    let map = MapPlot {
+        title: "Distance of held-out beams to the surface that they hit",
+        mesh,
+        keys: &[],
+        numbers: Some(VertexNumbers {
+            values: &residuals.at_vertices(mesh),
+            name: "mean beam-plane distance [m]",
+            limit: LIMIT_M,
+        }),
+        ..map
+    };
+    save(&map, &mesh_file.with_extension("residuals.png"))
+}
+
+/// Draws what is left of an older map, with what is gone and what was added, and the path of its drive.
+pub fn draw_changes(
+    mesh_file: &Path,
+    (older, kept): (&dyn MeshView, &dyn MeshView),
+    gone: &[u32],
+    added: &[&dyn MeshView],
+    path: &[Pose3],
+) -> Result<()> {
+    const KEPT: [u8; 3] = [200, 200, 200];
+    const GONE: [u8; 3] = [214, 39, 40];
+    const ADDED: [u8; 3] = [44, 160, 44];
+    let is_kept = |triangle: &u32| gone.binary_search(triangle).is_err();
+    let others: Vec<u32> = (0..older.triangles() as u32).filter(is_kept).collect();
+    let lost = Without::new(older, &others);
+    let mut parts: Vec<(&dyn MeshView, _)> = vec![(kept, Some(KEPT))];
+    parts.extend(added.iter().map(|mesh| (*mesh, Some(ADDED))));
+    parts.push((&lost, Some(GONE)));
+    let path: Vec<Pose2> = path.iter().map(pose2_from_pose3).collect();
+    let changes = MapPlot {
+        title: "Changes of the map",
+        mesh: &reduced(&parts, MOST_TRIANGLES),
+        path: Some(("older mapping trajectory", &path)),
+        keys: &[("kept", KEPT), ("gone", GONE), ("added", ADDED)],
+        numbers: None,
+    };
+    save(&changes, &mesh_file.with_extension("changes.png"))
+}
+
+fn save(plot: &MapPlot, picture: &Path) -> Result<()> {
+    plot.save(picture)?;
+    tracing::info!("drew {}", picture.display());
+    Ok(())
 }

@@ -6,12 +6,12 @@ use std::time::Instant;
 
 use anyhow::{Result, ensure};
 
-use super::clock::StageClock;
-use super::files::{prepare, write_map};
-use super::pictures;
-use crate::app::report::map::BuildReport;
+use super::files::{self, prepare, write_map};
+use super::progress::BuildProgress;
+use crate::app::report::map::{BuildReport, draw_map};
 use crate::app::run::interrupt::Interrupted;
-use crate::app::run::{Context, input, output};
+use crate::app::run::progress::Progress;
+use crate::app::run::{Context, input};
 use crate::app::settings::BuildMapConfig;
 use crate::evaluation::map_quality::ResidualSums;
 use crate::geometry::Vec3;
@@ -34,28 +34,24 @@ pub fn run(config: &BuildMapConfig, cloud_file: &Path, context: &Context) -> Res
         cloud_file.display()
     );
     let mut claims = prepare(config, context)?;
-    let clock = StageClock::default();
-    let mut blocks = build_blocks(config, cloud_file, context, &clock)?;
+    // The task is that of the blocks, whose number is not known yet.
+    let stages = BuildProgress::new(Progress::Silent.task("build-map", 1), 0);
+    let mut blocks = build_blocks(config, cloud_file, context, &stages)?;
     for block in &mut blocks {
         block.mesh.compute_normals();
     }
     let meshes: Vec<&dyn MeshView> = blocks.iter().map(|block| &block.mesh as _).collect();
     let path = MappingPath::default();
     write_map(config, &meshes, &path, &mut claims)?;
-    let triangles = meshes.iter().map(|mesh| mesh.triangles()).sum();
     if config.output.plots {
-        pictures::draw(config, &meshes, &[], &ResidualSums::default())?;
+        draw_map(&config.mesh_file, &meshes, &[], &ResidualSums::default())?;
     }
-    let cells_m = blocks.iter().map(|block| block.counts.cell_m);
+    let counts = blocks.iter().map(|block| block.counts.clone()).collect();
     let report = BuildReport {
-        stage_seconds: clock.seconds(),
-        octree_cell_m: cells_m.fold(0.0, f32::max),
-        local_maps: blocks.into_iter().map(|block| block.counts).collect(),
-        ..BuildReport::of_map(triangles, &path, &config.mesh_file, started)
+        stage_seconds: stages.finish(),
+        ..BuildReport::new(&meshes, counts, &path, &config.mesh_file, started)
     };
-    output::write_json(&config.mesh_file.with_extension("report.json"), &report)?;
-    output::write_yaml(&config.mesh_file.with_extension("effective.yml"), config)?;
-    claims.finish(&config.mesh_file)?;
+    files::finish(config, &report, &mut claims)?;
     Ok(report)
 }
 
@@ -64,17 +60,17 @@ fn build_blocks(
     config: &BuildMapConfig,
     cloud_file: &Path,
     context: &Context,
-    clock: &StageClock,
+    stages: &BuildProgress,
 ) -> Result<Vec<LocalMap>> {
     let kept = "nothing is kept of an unfinished map of a cloud";
     context.interrupt.keeps(kept.to_owned());
-    let read = clock.time("read", || scan_files::read_cloud(cloud_file))?;
+    let read = stages.time("read", || scan_files::read_cloud(cloud_file))?;
     let normals = usable_normals(&read, cloud_file);
     let points = read.scan.points;
     let local_map = &config.map.local_map;
     let prepare = || {
         CloudPlan::new(&points, normals.as_deref(), &[], local_map, &|event| {
-            on_stage(event, context, clock)
+            on_stage(event, context, stages)
         })
     };
     let plan = prepare().map_err(|error| interrupted(error, kept))?;
@@ -87,11 +83,11 @@ fn build_blocks(
     let task = context.progress.task("build-map", plan.blocks());
     let mut blocks = Vec::with_capacity(plan.blocks());
     for number in 0..plan.blocks() {
-        let built = plan.build_block(number, &|event| on_stage(event, context, clock));
+        let built = plan.build_block(number, &|event| on_stage(event, context, stages));
         blocks.push(built.map_err(|error| interrupted(error, kept))?);
         task.advance(1);
     }
-    clock.end();
+    stages.end();
     Ok(blocks)
 }
 
@@ -118,9 +114,9 @@ fn usable_normals(cloud: &ReadCloud, path: &Path) -> Option<Vec<Vec3>> {
     }
 }
 
-fn on_stage(event: BuildEvent, context: &Context, clock: &StageClock) -> ControlFlow<()> {
+fn on_stage(event: BuildEvent, context: &Context, stages: &BuildProgress) -> ControlFlow<()> {
     if let BuildEvent::Stage(name) = event {
-        clock.begin(name);
+        stages.begin(name);
     }
     context.interrupt.flow()
 }

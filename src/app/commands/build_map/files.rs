@@ -3,8 +3,9 @@
 use anyhow::Result;
 
 use crate::app::commands::stages::RecordingInputs;
-use crate::app::run::Context;
+use crate::app::report::map::BuildReport;
 use crate::app::run::artefact::{Claims, Outputs, PLY};
+use crate::app::run::{Context, output};
 use crate::app::settings::BuildMapConfig;
 use crate::map::MappingPath;
 use crate::map::files::ply;
@@ -59,4 +60,11 @@ pub fn write_map(
     );
     claims.begin(&config.mesh_file)?;
     Ok(ply::write_joined(&config.mesh_file, meshes, Some(path))?)
+}
+
+/// Writes the report and the effective configuration of a map, which is finished then.
+pub fn finish(config: &BuildMapConfig, report: &BuildReport, claims: &mut Claims) -> Result<()> {
+    output::write_json(&config.mesh_file.with_extension("report.json"), report)?;
+    output::write_yaml(&config.mesh_file.with_extension("effective.yml"), config)?;
+    claims.finish(&config.mesh_file)
 }

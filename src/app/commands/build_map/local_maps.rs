@@ -1,123 +1,49 @@
 //! The local maps of a build: those that are not finished yet are built, and all are kept on disk.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use anyhow::{Context as _, Result, bail};
 
-use super::clock::StageClock;
 use super::opened::Opened;
 use super::parts::{Parts, Role};
+use super::progress::BuildProgress;
 use crate::app::run::Context;
 use crate::app::run::artefact::hash::{hash_of_scan, hash_of_scans, joint_hash};
 use crate::app::run::interrupt::Interrupted;
-use crate::app::run::progress::Task;
 use crate::map::build::plan::LocalMapPlan;
 use crate::map::build::scan_agreement;
 use crate::map::{BuildError, BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan};
 use crate::recording::Frame;
-
-/// Stages of a local map, and about the share of its time before each.
-const STAGES: [(&str, f64); 6] = [
-    ("scans", 0.0),
-    ("moving points", 0.4),
-    ("surface", 0.65),
-    ("false surfaces", 0.85),
-    ("changes", 0.95),
-    ("ground", 0.97),
-];
-
-/// Share of all work that is left when the local maps are finished.
-const JOINING: f64 = 0.03;
-
-/// Progress through the local maps, in scans.
-struct MapProgress {
-    task: Arc<Task>,
-    scans: usize,
-    /// Scans of the finished local maps, and of the current one.
-    state: Mutex<(usize, usize)>,
-}
-
-impl MapProgress {
-    /// Begins a local map after the ones before it.
-    fn begin(&self, scans: usize) {
-        let mut state = self.state();
-        *state = (state.0 + state.1, scans);
-        self.show(&state, 0.0);
-    }
-
-    /// Begins a stage; stages that come again do not move back.
-    fn begin_stage(&self, name: &str) {
-        self.task.note(name);
-        if let Some((_, share)) = STAGES.iter().find(|(stage, _)| *stage == name) {
-            self.show(&self.state(), *share);
-        }
-    }
-
-    fn end_scan(&self) {
-        self.task
-            .advance_share(STAGES[1].1 * (1.0 - JOINING) / self.scans.max(1) as f64);
-    }
-
-    fn show(&self, &(finished, current): &(usize, usize), share: f64) {
-        let done = finished as f64 + share * current as f64;
-        self.task
-            .set_share((1.0 - JOINING) * done / self.scans.max(1) as f64);
-    }
-
-    fn state(&self) -> MutexGuard<'_, (usize, usize)> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
 
 /// Builds the local maps that are not finished yet, which is an error where they are collected; returns the counts of
 /// all, and the progress, which is still open.
 pub fn build(
     opened: &Opened,
     role: Role,
-    clock: &Arc<StageClock>,
     context: &Context,
-) -> Result<(Vec<LocalMapCounts>, Arc<Task>)> {
-    let (frames, parts) = (&opened.mapped, &opened.parts);
+) -> Result<(Vec<LocalMapCounts>, Arc<BuildProgress>)> {
     let planned = opened.local_maps();
     // Scans in two local maps count once, in the one that owns them.
-    let task = context.progress.task("build-map", frames.len());
-    let progress = Arc::new(MapProgress {
-        task: task.clone(),
-        scans: planned.iter().map(|local_map| local_map.used.len()).sum(),
-        state: Mutex::default(),
-    });
-    let builder = builder(opened, context, &progress, clock);
+    let task = context.progress.task("build-map", opened.mapped.len());
+    let scans = planned.iter().map(|local_map| local_map.used.len()).sum();
+    let progress = Arc::new(BuildProgress::new(task, scans));
+    let builder = builder(opened, context, &progress);
     let plan = opened.plan(&builder)?;
-    let mut all = Vec::with_capacity(plan.local_maps.len());
-    context.interrupt.keeps(kept(0, &plan, parts));
+    let count = plan.local_maps.len();
+    let mut all = Vec::with_capacity(count);
     for local_map in &plan.local_maps {
-        let used = &frames[local_map.used.clone()];
-        progress.begin(used.len());
-        let counts = match parts.finished(local_map.number, || hash_of_scans(used)) {
-            Some(counts) => {
-                let (number, count) = (local_map.number + 1, plan.local_maps.len());
-                tracing::info!("local map {number} of {count} is finished already");
-                counts
-            }
-            None if role == Role::Collect => {
-                parts.discard(local_map.number)?;
-                bail!(
-                    "local map {} is damaged or of other scans, and was removed; list the jobs again with --list-jobs",
-                    local_map.number
-                )
-            }
-            None => {
-                let built = build_part(&plan, local_map, frames, parts);
-                clock.end();
-                built.map_err(|error| interrupted(error, all.len(), &plan, parts))?
-            }
-        };
-        all.push(counts);
-        context.interrupt.keeps(kept(all.len(), &plan, parts));
+        let kept = kept(all.len(), count, &opened.parts);
+        context.interrupt.keeps(kept.clone());
+        progress.begin_local_map(local_map.used.len());
+        let counts =
+            finish(opened, &plan, local_map, role).map_err(|error| interrupted(error, kept));
+        progress.end();
+        all.push(counts?);
     }
-    progress.begin(0);
-    Ok((all, task))
+    context.interrupt.keeps(kept(count, count, &opened.parts));
+    progress.begin_local_map(0);
+    Ok((all, progress))
 }
 
 /// Builds one of the local maps if it is not finished yet; returns its counts, and how many there are.
@@ -126,7 +52,6 @@ pub fn build_one(
     number: usize,
     context: &Context,
 ) -> Result<(LocalMapCounts, usize)> {
-    let (frames, parts) = (&opened.mapped, &opened.parts);
     let planned = opened.local_maps();
     let count = planned.len();
     let local_map = planned.get(number).with_context(|| {
@@ -134,52 +59,55 @@ pub fn build_one(
             "there is no local map {number}: --list-jobs lists the {count} that there are, from 0"
         )
     })?;
-    let used = &frames[local_map.used.clone()];
-    if let Some(counts) = parts.finished(number, || hash_of_scans(used)) {
-        return Ok((counts, count));
-    }
-    let progress = Arc::new(MapProgress {
-        task: context.progress.task("build-map", local_map.own.len()),
-        scans: used.len(),
-        state: Mutex::default(),
-    });
-    let builder = builder(opened, context, &progress, &Arc::default());
+    let task = context.progress.task("build-map", local_map.own.len());
+    let progress = Arc::new(BuildProgress::new(task, local_map.used.len()));
+    let builder = builder(opened, context, &progress);
     let plan = opened.plan(&builder)?;
     let nothing = "nothing is kept of an unfinished local map".to_owned();
     context.interrupt.keeps(nothing.clone());
-    progress.begin(used.len());
-    let counts = build_part(&plan, local_map, frames, parts).map_err(|error| {
-        match error.downcast_ref() {
-            Some(BuildError::Interrupted) => Interrupted { kept: nothing }.into(),
-            _ => error,
-        }
-    })?;
-    progress.task.set_share(1.0);
+    progress.begin_local_map(local_map.used.len());
+    let counts = finish(opened, &plan, local_map, Role::Job);
+    let counts = counts.map_err(|error| interrupted(error, nothing))?;
+    progress.finish();
     Ok((counts, count))
 }
 
 /// A builder that reports its progress, and stops when it is interrupted.
-fn builder(
-    opened: &Opened,
-    context: &Context,
-    progress: &Arc<MapProgress>,
-    clock: &Arc<StageClock>,
-) -> MapBuilder {
-    let (progress, clock) = (progress.clone(), clock.clone());
-    let interrupt = context.interrupt.clone();
+fn builder(opened: &Opened, context: &Context, progress: &Arc<BuildProgress>) -> MapBuilder {
+    let (progress, interrupt) = (progress.clone(), context.interrupt.clone());
     MapBuilder {
         on_event: Box::new(move |event| {
             match event {
-                BuildEvent::Stage(name) => {
-                    progress.begin_stage(name);
-                    clock.begin(name);
-                }
+                BuildEvent::Stage(name) => progress.begin(name),
                 BuildEvent::ScanPrepared => progress.end_scan(),
             }
             interrupt.flow()
         }),
         ..MapBuilder::new(opened.config.map.clone())
     }
+}
+
+/// The counts of a local map, which is built if it is not finished yet.
+fn finish(
+    opened: &Opened,
+    plan: &MapPlan,
+    local_map: &LocalMapPlan,
+    role: Role,
+) -> Result<LocalMapCounts> {
+    let (number, parts) = (local_map.number, &opened.parts);
+    let used = &opened.mapped[local_map.used.clone()];
+    if let Some(counts) = parts.finished(number, || hash_of_scans(used)) {
+        let (nth, count) = (number + 1, plan.local_maps.len());
+        tracing::info!("local map {nth} of {count} is finished already");
+        return Ok(counts);
+    }
+    if role == Role::Collect {
+        parts.discard(number)?;
+        bail!(
+            "local map {number} is damaged or of other scans, and was removed; list the jobs again with --list-jobs"
+        )
+    }
+    build_part(plan, local_map, &opened.mapped, parts)
 }
 
 /// Builds a local map and keeps it.
@@ -238,27 +166,18 @@ fn warn_of_doubtful_poses(built: &LocalMap, frames: &[Frame]) {
     }
 }
 
-/// Replaces an interruption by one that names the finished local maps.
-fn interrupted(
-    error: anyhow::Error,
-    finished: usize,
-    plan: &MapPlan,
-    parts: &Parts,
-) -> anyhow::Error {
+/// Replaces an interruption by one that names what is kept.
+fn interrupted(error: anyhow::Error, kept: String) -> anyhow::Error {
     match error.downcast_ref() {
-        Some(BuildError::Interrupted) => Interrupted {
-            kept: kept(finished, plan, parts),
-        }
-        .into(),
+        Some(BuildError::Interrupted) => Interrupted { kept }.into(),
         _ => error,
     }
 }
 
 /// What is kept of an interrupted build.
-fn kept(finished: usize, plan: &MapPlan, parts: &Parts) -> String {
+fn kept(finished: usize, count: usize, parts: &Parts) -> String {
     format!(
-        "{finished} of {} local maps are finished and kept in {}; run the same command again to continue",
-        plan.local_maps.len(),
+        "{finished} of {count} local maps are finished and kept in {}; run the same command again to continue",
         parts.folder().display()
     )
 }

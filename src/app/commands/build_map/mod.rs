@@ -1,37 +1,30 @@
 //! `build-map`: builds a triangle-mesh map from scans, whose poses are given or found first.
 
 mod arguments;
-mod clock;
 mod cloud;
 mod files;
 mod jobs;
+mod joined;
 mod local_maps;
-mod onto;
 mod opened;
 mod parts;
-mod pictures;
 mod pose_check;
 mod poses;
-mod prepared;
+mod progress;
 mod quality;
 
-use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Result, ensure};
 
 pub use self::arguments::{BuildMapArgs, BuildPart};
-use self::clock::StageClock;
-use self::files::write_map;
-use self::opened::open;
-use self::parts::{Joined, Role};
-use crate::app::report::map::{BuildReport, ChangesReport};
+use self::joined::JoinedMap;
+use self::parts::Role;
+use crate::app::report::map::{BuildReport, draw_changes, draw_map};
+use crate::app::run::Context;
 use crate::app::run::output::Printed;
-use crate::app::run::{Context, output};
 use crate::app::settings::BuildMapConfig;
-use crate::map::MappingPath;
-use crate::map::mesh_view::{MeshView, Without};
-use crate::mapping::poses_of;
+use crate::evaluation::map_quality::ResidualSums;
 
 /// Builds the map that a configuration describes.
 pub fn run(config: &BuildMapConfig, context: &Context) -> Result<BuildReport> {
@@ -57,70 +50,55 @@ pub fn run_part(config: &BuildMapConfig, part: BuildPart, context: &Context) -> 
 /// Builds the map of scans, or collects its local maps.
 fn run_with_scans(config: &BuildMapConfig, role: Role, context: &Context) -> Result<BuildReport> {
     let started = Instant::now();
-    let (opened, mut claims) = open(config, role, context)?;
-    let (config, older, mapped) = (&opened.config, opened.older.as_ref(), &opened.mapped);
-    let clock = Arc::new(StageClock::default());
-    if role == Role::Collect {
-        jobs::require_all(&opened)?;
-    }
-    let (local_maps, task) = local_maps::build(&opened, role, &clock, context)?;
+    let (opened, mut claims) = opened::open(config, role, context)?;
+    jobs::require_all(&opened, role)?;
+    let (local_maps, progress) = local_maps::build(&opened, role, context)?;
 
-    task.note("joining");
-    let Joined { meshes, gone } = clock.time("join", || opened.parts.joined(local_maps.len()))?;
-    let added: Vec<&dyn MeshView> = meshes.iter().map(|mesh| mesh as _).collect();
-    let kept = older.map(|older| Without::new(&*older.mesh, &gone));
-    let all: Vec<&dyn MeshView> = (kept.iter().map(|mesh| mesh as _))
-        .chain(added.iter().copied())
-        .collect();
-    let poses = poses_of(mapped);
-    let path = match older {
-        Some(older) => older.path.extended_by(&poses),
-        None => MappingPath {
-            world_from_map: opened.sequence.world().0,
-            map_from_lidar: poses,
-        },
-    };
-    clock.time("join", || write_map(config, &all, &path, &mut claims))?;
+    let joined = progress.time("join", || opened.parts.joined(local_maps.len()))?;
+    let map = JoinedMap::new(&opened, &joined);
+    let (config, meshes, path) = (&opened.config, map.meshes(), &map.path);
+    progress.time("join", || {
+        files::write_map(config, &meshes, path, &mut claims)
+    })?;
 
-    task.note("tiles");
-    let map = clock.time("tiles", || {
-        prepared::open_map(config, &opened.sensor, mapped.first())
-    })?;
-    let residuals = clock.time("quality", || {
-        quality::residuals(config, &opened.sensor, map.as_ref(), &opened.held_out)
-    })?;
-    let truth = clock.time("truth", || {
-        quality::agreement(config, &opened.sensor, &path)
-    })?;
-    task.note("pictures");
-    if config.output.plots {
-        clock.time("pictures", || {
-            pictures::draw(config, &all, &path.map_from_lidar, &residuals)
-        })?;
-        if let (Some(older), Some(kept)) = (older, &kept) {
-            let picture = config.mesh_file.with_extension("changes.png");
-            onto::draw(older, kept, &gone, &added, &picture)?;
-        }
-    }
-    let triangles = all.iter().map(|mesh| mesh.triangles()).sum();
+    let prepared = progress.time("tiles", || quality::prepared_map(&opened))?;
+    let residuals = progress.time("quality", || quality::residuals(&opened, prepared.as_ref()))?;
+    let truth = progress.time("truth", || quality::agreement(&opened, path))?;
+    progress.time("pictures", || draw(config, &map, &residuals))?;
+
     let report = BuildReport {
         frames: opened.sequence.frames.len(),
-        mapped_frames: mapped.len(),
+        mapped_frames: opened.mapped.len(),
         held_out_frames: opened.held_out.len(),
-        sensor: Some(opened.sensor),
-        trajectory: opened.trajectory,
-        changes: older.map(|it| ChangesReport::new(&it.file, &*it.mesh, &gone, &added)),
-        stage_seconds: clock.seconds(),
+        sensor: Some(opened.sensor.clone()),
+        trajectory: opened.trajectory.clone(),
+        changes: map.changes(),
+        stage_seconds: progress.finish(),
         quality: residuals.quality(),
         truth,
-        octree_cell_m: (local_maps.iter()).fold(0.0, |largest, counts| counts.cell_m.max(largest)),
-        local_maps,
-        ..BuildReport::of_map(triangles, &path, &config.mesh_file, started)
+        ..BuildReport::new(&meshes, local_maps, path, &config.mesh_file, started)
     };
-    output::write_json(&config.mesh_file.with_extension("report.json"), &report)?;
-    output::write_yaml(&config.mesh_file.with_extension("effective.yml"), config)?;
-    task.set_share(1.0);
-    claims.finish(&config.mesh_file)?;
+    files::finish(config, &report, &mut claims)?;
     opened.parts.remove()?;
     Ok(report)
+}
+
+/// Draws the map, and what has changed in an older one, where pictures are requested.
+fn draw(config: &BuildMapConfig, map: &JoinedMap, residuals: &ResidualSums) -> Result<()> {
+    if !config.output.plots {
+        return Ok(());
+    }
+    let file = &config.mesh_file;
+    draw_map(file, &map.meshes(), &map.path.map_from_lidar, residuals)?;
+    let Some((older, kept)) = &map.older else {
+        return Ok(());
+    };
+    let meshes = (&*older.mesh, kept as _);
+    draw_changes(
+        file,
+        meshes,
+        map.gone,
+        &map.added,
+        &older.path.map_from_lidar,
+    )
 }
