@@ -28,19 +28,16 @@ pub struct OdometryArgs {
     pub run: RunArgs,
 
     /// Folder to write; sets the key `output_folder`.
-    #[arg(long, value_name = "FOLDER")]
-    #[serde(rename = "output_folder")]
-    pub output: Option<PathBuf>,
+    #[arg(long = "output", value_name = "FOLDER")]
+    pub output_folder: Option<PathBuf>,
 
     /// Poses to polish, rows of KITTI or TUM, or a topic of the bag; sets the key `pose_file`.
-    #[arg(long, value_name = "FILE")]
-    #[serde(rename = "pose_file")]
-    pub poses: Option<PathBuf>,
+    #[arg(long = "poses", value_name = "FILE")]
+    pub pose_file: Option<PathBuf>,
 
     /// Calibration of the camera whose poses these are; sets the key `calib_file`.
-    #[arg(long, value_name = "FILE")]
-    #[serde(rename = "calib_file")]
-    pub calib: Option<PathBuf>,
+    #[arg(long = "calib", value_name = "FILE")]
+    pub calib_file: Option<PathBuf>,
 }
 
 /// Finds the poses of the recording that a configuration names; returns what to print.

@@ -47,33 +47,28 @@ pub struct RefineArgs {
     pub run: RunArgs,
 
     /// Recording; by default that of the localization. Sets the key `scan_folder`.
-    #[arg(long, value_name = "RECORDING")]
-    #[serde(rename = "scan_folder")]
-    pub recording: Option<PathBuf>,
+    #[arg(long = "recording", value_name = "RECORDING")]
+    pub scan_folder: Option<PathBuf>,
 
     /// Map; by default that of the localization. Sets the key `map_file`.
-    #[arg(long, value_name = "MAP")]
-    #[serde(rename = "map_file")]
-    pub map: Option<PathBuf>,
+    #[arg(long = "map", value_name = "MAP")]
+    pub map_file: Option<PathBuf>,
 
     /// Standard deviations of the poses of a trajectory [m, deg]; sets the key `uncertainty`.
     #[arg(long, value_name = "POSITION,HEADING", value_parser = uncertainty)]
     pub uncertainty: Option<[f64; 2]>,
 
     /// True poses of the recording for the report; sets the key `pose_file`.
-    #[arg(long, value_name = "FILE")]
-    #[serde(rename = "pose_file")]
-    pub truth: Option<PathBuf>,
+    #[arg(long = "truth", value_name = "FILE")]
+    pub pose_file: Option<PathBuf>,
 
     /// Calibration of the camera whose poses these, and those of a trajectory, are; sets the key `calib_file`.
-    #[arg(long, value_name = "FILE")]
-    #[serde(rename = "calib_file")]
-    pub calib: Option<PathBuf>,
+    #[arg(long = "calib", value_name = "FILE")]
+    pub calib_file: Option<PathBuf>,
 
     /// Result to write of a trajectory (.npz); sets the key `output_file`.
-    #[arg(long, value_name = "RESULT")]
-    #[serde(rename = "output_file")]
-    pub output: Option<PathBuf>,
+    #[arg(long = "output", value_name = "RESULT")]
+    pub output_file: Option<PathBuf>,
 }
 
 /// Parses the standard deviations of a position [m] and a heading [deg].

@@ -1,10 +1,14 @@
-//! `ground.json`, and the table on standard output.
+//! What `ground` leaves behind: `ground.json`, its table, membership functions, and scans from above.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
+use anyhow::Result;
 use serde::Serialize;
 
-use crate::evaluation::GroundMethodReport;
+use super::plotting::color::SERIES;
+use super::plotting::{GroundPlot, LineChart, Panel, Series};
+use crate::evaluation::{GroundMethodReport, GroundProtocol, LabelledPoints};
+use crate::ground::{Features, FuzzyConfig};
 
 /// The result of a run.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -60,4 +64,77 @@ impl GroundReport {
 
 fn scores_row([precision, recall, f1, iou]: [String; 4]) -> String {
     format!("  {precision:>9} {recall:>8} {f1:>8} {iou:>7}")
+}
+
+/// Samples of a membership function.
+const SAMPLES: u16 = 401;
+/// Distances ahead and to the sides up to which a scan is drawn [m].
+const REACH_M: (f64, f64) = (50.0, 35.0);
+
+/// Draws the membership functions of all fuzzy sets, one panel per linguistic variable.
+pub fn draw_memberships(config: &FuzzyConfig, path: &Path) -> Result<()> {
+    let mut panels = Vec::new();
+    for (variable, sets) in &config.variables {
+        let (from, to) = config.chart_range(variable);
+        let series = sets.iter().zip(SERIES.iter().cycle());
+        let series = series.map(|((set, function), &color)| {
+            let sample = |sample| {
+                let x = from + f32::from(sample) / f32::from(SAMPLES - 1) * (to - from);
+                (x.into(), function.degree(x).into())
+            };
+            Series::line(set, color, (0..SAMPLES).map(sample))
+        });
+        panels.push(Panel {
+            y_name: "membership".to_owned(),
+            own_x_name: Some(name_with_unit(variable)),
+            series: series.collect(),
+            ..Panel::default()
+        });
+    }
+    let chart = LineChart {
+        title: "Membership functions".to_owned(),
+        panels,
+        ..LineChart::default()
+    };
+    chart.save(path)
+}
+
+/// `height_variance` becomes `height variance [m]`; the output has no unit.
+fn name_with_unit(variable: &str) -> String {
+    let words = variable.replace('_', " ");
+    let mut units = Features::NAMES.iter().zip(Features::UNITS);
+    match units.find(|(name, _)| **name == variable) {
+        Some((_, unit)) => format!("{words} [{unit}]"),
+        None => words,
+    }
+}
+
+/// Name of the picture of a scan.
+pub fn file_name(name: &Path) -> String {
+    format!("scan_{}.png", name.display()).replace(['/', '\\'], "_")
+}
+
+/// Draws a scan from above.
+pub fn draw_scan(
+    folder: &Path,
+    name: &Path,
+    scan: &LabelledPoints,
+    (confidences, threshold): (&[f32], f32),
+) -> Result<()> {
+    let protocol = GroundProtocol::PatchworkPlusPlus;
+    let truth = scan.truth(protocol);
+    let mut title = format!("Ground of scan {}", name.display());
+    if !truth.is_empty() {
+        let f1 = scan.score(protocol, confidences, threshold, |_| true).f1();
+        title += &format!(", F1 {:.2} %", 100.0 * f1);
+    }
+    let called_ground: Vec<bool> = confidences.iter().map(|&c| c > threshold).collect();
+    GroundPlot {
+        title: &title,
+        points: &scan.points,
+        called_ground: &called_ground,
+        truth: &truth,
+        reach_m: REACH_M,
+    }
+    .save(&folder.join(file_name(name)))
 }

@@ -22,7 +22,7 @@ use crate::localization::ParticleSet;
 use crate::recording::poses::{write_kitti, write_tum};
 use crate::recording::{Frame, Recording};
 
-pub use pictures::{MOST_TRIANGLES, Movie, draw_run, map_around, time_axis};
+pub use pictures::{MOST_TRIANGLES, Movie, draw_range_images, draw_run, map_around, time_axis};
 
 /// Content of the interactive path, next to the pictures.
 pub const INTERACTIVE: &str = "path.json";

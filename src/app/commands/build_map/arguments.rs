@@ -17,19 +17,16 @@ pub struct BuildMapArgs {
     pub run: RunArgs,
 
     /// Map to write; sets the key `mesh_file`.
-    #[arg(long, value_name = "MAP")]
-    #[serde(rename = "mesh_file")]
-    pub output: Option<PathBuf>,
+    #[arg(long = "output", value_name = "MAP")]
+    pub mesh_file: Option<PathBuf>,
 
     /// Poses of the recording, rows of KITTI or TUM, or a topic of the bag; by default those that it contains, else from the scans. Sets the key `pose_file`.
-    #[arg(long, value_name = "FILE")]
-    #[serde(rename = "pose_file")]
-    pub poses: Option<PathBuf>,
+    #[arg(long = "poses", value_name = "FILE")]
+    pub pose_file: Option<PathBuf>,
 
     /// Calibration of the camera whose poses these are; sets the key `calib_file`.
-    #[arg(long, value_name = "FILE")]
-    #[serde(rename = "calib_file")]
-    pub calib: Option<PathBuf>,
+    #[arg(long = "calib", value_name = "FILE")]
+    pub calib_file: Option<PathBuf>,
 
     /// Map to which the recording is added: it is localized there, and what has changed is replaced. Sets the key `onto`.
     #[arg(long, value_name = "MAP")]

@@ -1,6 +1,7 @@
 //! The map that local maps make together, with what is left of an older one.
 
-use super::opened::{OlderMap, Opened};
+use super::older::OlderMap;
+use super::opened::Opened;
 use super::parts::Joined;
 use crate::app::report::map::ChangesReport;
 use crate::map::MappingPath;

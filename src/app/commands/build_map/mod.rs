@@ -6,6 +6,7 @@ mod files;
 mod jobs;
 mod joined;
 mod local_maps;
+mod older;
 mod opened;
 mod parts;
 mod pose_check;

@@ -2,22 +2,20 @@
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
-use std::sync::Arc;
 
 use anyhow::{Context as _, Result};
 
 use super::files::prepare;
+use super::older::{self, OlderMap};
 use super::parts::{Parts, Role};
 use super::{pose_check, poses};
 use crate::app::commands::stages::{RecordingInputs, complete};
 use crate::app::commands::trajectory::{self, file_beside};
 use crate::app::run::artefact::Claims;
-use crate::app::run::artefact::hash::hash_of_file;
 use crate::app::run::{Context, input, version};
-use crate::app::settings::{self, BuildMapConfig, MapInputConfig, OutputConfig};
+use crate::app::settings::{self, BuildMapConfig, OutputConfig};
 use crate::map::build::plan::{self, LocalMapPlan};
-use crate::map::mesh_view::MeshView;
-use crate::map::{Map, MapBuilder, MapOptions, MapPlan, MappingPath, PoseSource, surface_of};
+use crate::map::{MapBuilder, MapPlan, PoseSource};
 use crate::mapping::{TrajectorySummary, key_frames, poses_of};
 use crate::recording::{Frame, Recording};
 use crate::sensor::Sensor;
@@ -42,18 +40,6 @@ pub struct Opened {
     pub parts: Parts,
 }
 
-/// A map that is extended.
-pub struct OlderMap {
-    /// Its file.
-    pub file: PathBuf,
-    /// Hash of the file.
-    pub hash: String,
-    /// Its surface.
-    pub mesh: Arc<dyn MeshView>,
-    /// Its frame and path.
-    pub path: Arc<MappingPath>,
-}
-
 /// Opens the recording with its poses, or finds them, which only a build does, and completes the configuration by what the
 /// scans show about the sensor. The parts are locked before anything changes.
 pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(Opened, Claims)> {
@@ -69,7 +55,7 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
     if let Some(path) = &config.truth_mesh {
         input::require_file("truth_mesh", path)?;
     }
-    let (older, older_map) = open_older(&config, context)?.unzip();
+    let (older, older_map) = older::open(&config, context)?.unzip();
     let recording = poses::open(&config, older.as_ref())?;
     let (mut sequence, sensor) = complete(&mut config.map.sensor, recording)?;
     pose_check::check(&sequence, &config)
@@ -122,26 +108,6 @@ impl Opened {
         plan.older = self.older.as_ref().map(|older| &*older.mesh);
         Ok(plan)
     }
-}
-
-/// Reads the map of the key `onto`; `None` without one.
-fn open_older(config: &BuildMapConfig, context: &Context) -> Result<Option<(OlderMap, Map)>> {
-    let Some(file) = &config.onto else {
-        return Ok(None);
-    };
-    input::require_file("onto", file)?;
-    let input = MapInputConfig {
-        map_file: file.clone(),
-        ..MapInputConfig::default()
-    };
-    let map = input.load(MapOptions::default(), context)?;
-    let older = OlderMap {
-        file: file.clone(),
-        hash: hash_of_file(file)?,
-        mesh: surface_of(file)?,
-        path: map.path.clone(),
-    };
-    Ok(Some((older, map)))
 }
 
 /// The key scans that build the map, and those that are held out to evaluate it.

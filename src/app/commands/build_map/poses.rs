@@ -6,7 +6,7 @@ use std::path::Path;
 
 use anyhow::{Result, ensure};
 
-use super::opened::OlderMap;
+use super::older::OlderMap;
 use super::parts::{Role, not_listed};
 use crate::app::commands::stages::RecordingInputs;
 use crate::app::commands::trajectory;

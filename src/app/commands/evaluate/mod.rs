@@ -36,29 +36,24 @@ pub struct EvaluateArgs {
     pub run: RunArgs,
 
     /// True poses: rows of KITTI or TUM, a folder oxts, or a topic of the recording; by default those in the result. Sets the key `pose_file`.
-    #[arg(long, value_name = "FILE")]
-    #[serde(rename = "pose_file")]
-    pub truth: Option<PathBuf>,
+    #[arg(long = "truth", value_name = "FILE")]
+    pub pose_file: Option<PathBuf>,
 
     /// Calibration of the camera whose poses the truth has; sets the key `calib_file`.
-    #[arg(long, value_name = "FILE")]
-    #[serde(rename = "calib_file")]
-    pub calib: Option<PathBuf>,
+    #[arg(long = "calib", value_name = "FILE")]
+    pub calib_file: Option<PathBuf>,
 
     /// Recording whose poses are the truth; sets the key `scan_folder`.
-    #[arg(long, value_name = "RECORDING")]
-    #[serde(rename = "scan_folder")]
-    pub recording: Option<PathBuf>,
+    #[arg(long = "recording", value_name = "RECORDING")]
+    pub scan_folder: Option<PathBuf>,
 
     /// Alignment with the truth; by default none for a result in a map, and first for a trajectory. Sets the key `alignment`.
-    #[arg(long, value_name = "ALIGNMENT", value_parser = ["none", "first", "rigid"])]
-    #[serde(rename = "alignment")]
-    pub align: Option<String>,
+    #[arg(long = "align", value_name = "ALIGNMENT", value_parser = ["none", "first", "rigid"])]
+    pub alignment: Option<String>,
 
     /// Folder of the report; sets the key `output_folder`.
-    #[arg(long, value_name = "FOLDER")]
-    #[serde(rename = "output_folder")]
-    pub output: Option<PathBuf>,
+    #[arg(long = "output", value_name = "FOLDER")]
+    pub output_folder: Option<PathBuf>,
 }
 
 /// Compares a result of `localize`, `refine` or range-mcl, or any trajectory, with the ground truth.

@@ -11,9 +11,7 @@
 //! ground.json            the table on standard output; written last
 //! ```
 
-mod arguments;
 mod input;
-mod pictures;
 mod simulated;
 
 use std::fmt::Write as _;
@@ -21,9 +19,9 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result, bail, ensure};
 
-pub use self::arguments::GroundArgs;
+pub use self::input::GroundArgs;
 use self::input::LabelledScan;
-use crate::app::report::ground::GroundReport;
+use crate::app::report::ground::{self, GroundReport};
 use crate::app::report::plotting::color::Colormap;
 use crate::app::run::Context;
 use crate::app::run::artefact::{Claims, Outputs};
@@ -105,7 +103,7 @@ fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Resu
     let report_file = config.output_folder.join("ground.json");
     input::check_overwrite(config, &scans)?;
     let mut claims = prepare(config, context, &scans, &report_file)?;
-    pictures::draw_memberships(
+    ground::draw_memberships(
         &config.ground.fuzzy,
         &config.output_folder.join("memberships.png"),
     )?;
@@ -137,7 +135,8 @@ fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Resu
             .collect();
         write_scan(config, &files.name, &scan, &confidences[0])?;
         if config.plot_step > 0 && position % config.plot_step == 0 {
-            pictures::draw_scan(config, &files.name, &scan, &confidences[0])?;
+            let found = (confidences[0].as_slice(), config.ground_threshold);
+            ground::draw_scan(&config.output_folder, &files.name, &scan, found)?;
         }
         task.advance(1);
     }
@@ -173,7 +172,7 @@ fn prepare(
     names.extend(config.write_plys.then(|| "points".to_owned()));
     if config.plot_step > 0 {
         let drawn = scans.iter().step_by(config.plot_step);
-        names.extend(drawn.map(|scan| pictures::file_name(&scan.name)));
+        names.extend(drawn.map(|scan| ground::file_name(&scan.name)));
     }
     let outputs = Outputs {
         key: "output_folder",

@@ -16,9 +16,8 @@ pub struct LocalizeArgs {
     pub run: RunArgs,
 
     /// Map of `build-map` or range-mcl, or a mesh (.ply, .obj, .stl); sets the key `map_file`.
-    #[arg(long, value_name = "MAP")]
-    #[serde(rename = "map_file")]
-    pub map: Option<PathBuf>,
+    #[arg(long = "map", value_name = "MAP")]
+    pub map_file: Option<PathBuf>,
 
     /// Start in the map [m, deg], if it is known; sets the key `initial_pose`.
     #[arg(long, value_name = "X,Y,HEADING", value_parser = start, allow_hyphen_values = true)]
@@ -26,24 +25,20 @@ pub struct LocalizeArgs {
     pub start: Option<[f64; 3]>,
 
     /// Odometry, rows of KITTI or TUM, or a topic of the bag; by default the topic of odometry that a bag has, else the scans. Sets the key `odometry_file`.
-    #[arg(long, value_name = "FILE")]
-    #[serde(rename = "odometry_file")]
-    pub odometry: Option<PathBuf>,
+    #[arg(long = "odometry", value_name = "FILE")]
+    pub odometry_file: Option<PathBuf>,
 
     /// True poses of the recording for the report; sets the key `pose_file`.
-    #[arg(long, value_name = "FILE")]
-    #[serde(rename = "pose_file")]
-    pub truth: Option<PathBuf>,
+    #[arg(long = "truth", value_name = "FILE")]
+    pub pose_file: Option<PathBuf>,
 
     /// Calibration of the camera whose poses these are; sets the key `calib_file`.
-    #[arg(long, value_name = "FILE")]
-    #[serde(rename = "calib_file")]
-    pub calib: Option<PathBuf>,
+    #[arg(long = "calib", value_name = "FILE")]
+    pub calib_file: Option<PathBuf>,
 
     /// Result to write (.npz); sets the key `result_path`.
-    #[arg(long, value_name = "RESULT")]
-    #[serde(rename = "result_path")]
-    pub output: Option<PathBuf>,
+    #[arg(long = "output", value_name = "RESULT")]
+    pub result_path: Option<PathBuf>,
 
     /// Log to write afterwards, for Foxglove and rerun (.mcap), as `export` does.
     #[arg(long, value_name = "FILE")]

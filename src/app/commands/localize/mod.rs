@@ -1,7 +1,6 @@
 //! `localize`: localizes a recording in a map, scan by scan.
 
 mod arguments;
-mod pictures;
 mod recorder;
 
 use std::collections::BTreeMap;
@@ -12,7 +11,6 @@ use anyhow::Result;
 use nalgebra::Vector2;
 
 pub use self::arguments::LocalizeArgs;
-use self::pictures::draw_example;
 use self::recorder::Run;
 use super::motion_source;
 use super::motion_source::{FrameMotion, MotionSource};
@@ -244,9 +242,10 @@ fn write_results(
     }
     run.claims.begin(&files.result)?;
     run_output::write_results(files, &run.results)?;
-    run_output::write_trajectory(files, "mcl", sequence, &run.map_from_lidar)?;
+    run_output::write_trajectory(files, "mcl", sequence, run.estimates())?;
     if config.refine {
-        run_output::write_trajectory(files, "refined", sequence, &run.refined)?;
+        let refined = run.results.refined_in_space.as_deref();
+        run_output::write_trajectory(files, "refined", sequence, refined.unwrap_or_default())?;
     } else {
         run.claims.remove(&REFINEMENT_FILES)?;
     }
@@ -279,7 +278,10 @@ fn write_run(
     if config.output.plots {
         let mesh = run_output::map_around(map, results.estimates.iter().flatten())?;
         run_output::draw_run(files, Some(&mesh), results)?;
-        draw_example(config, files, map, sequence, &run.map_from_lidar)?;
+        let row = results.len() / 2;
+        let (frame, pose) = (&sequence.frames[row], &run.estimates()[row]);
+        let model = config.tracker.sensor.range_image.model();
+        run_output::draw_range_images(files, map, frame, pose, &model)?;
     }
     if config.save_result {
         run_page::write(files, &report)?;

@@ -22,10 +22,6 @@ pub struct Run {
     pub results: LocalizationResults,
     /// The claimed outputs.
     pub claims: Claims,
-    /// The estimates in space.
-    pub map_from_lidar: Vec<Pose3>,
-    /// The refined poses in space; the estimates where a frame was not refined.
-    pub refined: Vec<Pose3>,
     /// Pictures of the frames, if they were requested.
     pub movie: Option<Movie>,
     /// Number of frames without mapped ground below the estimate.
@@ -42,32 +38,34 @@ impl Run {
         selected: usize,
         claims: Claims,
     ) -> Result<Self> {
-        let empty = || Some(Vec::new());
+        /// An empty column, where it is filled.
+        fn column<T>(is_filled: bool) -> Option<Vec<T>> {
+            is_filled.then(Vec::new)
+        }
+        let (has_truth, is_refined) = (config.given_poses.pose_file.is_some(), config.refine);
         Ok(Self {
             results: LocalizationResults {
+                frames: Vec::new(),
                 particles: ParticleLog::new(config.tracker.localizer.num_particles),
-                estimates: empty(),
-                ground_truth: config.given_poses.pose_file.as_ref().map(|_| Vec::new()),
-                estimates_in_space: Some(Vec::new()),
-                refined_in_space: config.refine.then(Vec::new),
-                ground_truth_in_space: config.given_poses.pose_file.as_ref().map(|_| Vec::new()),
-                odometry: empty(),
-                covariances: Some(Vec::new()),
-                times_s: Some(Vec::new()),
-                runtimes_s: Some(Vec::new()),
-                agreements: Some(Vec::new()),
-                places: Some(Vec::new()),
-                states: Some(Vec::new()),
-                scan_outlines: Some(Vec::new()),
-                refined: config.refine.then(Vec::new),
-                refined_covariances: config.refine.then(Vec::new),
-                refine_runtimes_s: config.refine.then(Vec::new),
+                estimates: column(true),
+                refined: column(is_refined),
+                ground_truth: column(has_truth),
+                estimates_in_space: column(true),
+                refined_in_space: column(is_refined),
+                ground_truth_in_space: column(has_truth),
+                odometry: column(true),
+                covariances: column(true),
+                refined_covariances: column(is_refined),
+                times_s: column(true),
+                runtimes_s: column(true),
+                refine_runtimes_s: column(is_refined),
+                agreements: column(true),
+                places: column(true),
+                states: column(true),
+                scan_outlines: column(true),
                 selected: Some(selected),
-                ..LocalizationResults::default()
             },
             claims,
-            map_from_lidar: Vec::new(),
-            refined: Vec::new(),
             movie: match config.visualize {
                 true => Some(Movie::begin(files, map)?),
                 false => None,
@@ -113,7 +111,12 @@ impl Run {
         );
         push(&mut results.covariances, estimate.covariance);
         let motion = (results.times_s.as_ref().and_then(|all| all.last()))
-            .zip(self.map_from_lidar.last())
+            .zip(
+                results
+                    .estimates_in_space
+                    .as_ref()
+                    .and_then(|all| all.last()),
+            )
             .map(|(&before_s, before)| Motion {
                 previous_from_current: before.inverse() * estimate.map_from_lidar,
                 duration_s: frame.time_s - before_s,
@@ -137,12 +140,18 @@ impl Run {
         push(&mut results.refined, refined_pose);
         push(&mut results.refined_covariances, covariance);
         push(&mut results.refine_runtimes_s, refine_runtime.as_secs_f64());
-        self.refined.push(refined_in_space);
-        self.map_from_lidar.push(estimate.map_from_lidar);
         if let Some(movie) = &mut self.movie {
             movie.add(results, estimate)?;
         }
         Ok(())
+    }
+
+    /// The estimates in space.
+    pub fn estimates(&self) -> &[Pose3] {
+        self.results
+            .estimates_in_space
+            .as_deref()
+            .unwrap_or_default()
     }
 
     /// Completes the run after its last frame; an error where no frame was finished.

@@ -3,21 +3,23 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use anyhow::Result;
+use anyhow::{Context as _, Result};
 use glam::DVec3;
 
 use super::{INTERACTIVE, RunFiles};
 use crate::app::report::plotting::color::{MCL, REFINED, Rgb, STATES};
 use crate::app::report::plotting::{
     FRAME, InteractivePath, LineChart, LocalizationPicture, MapImage, MapPlot, Mark, Panel,
-    PathPlot, SURFACES, Series, drift_chart, error_chart, muted, save_animation,
+    PathPlot, RangeImageStrip, SURFACES, Series, drift_chart, error_chart, muted, save_animation,
 };
 use crate::app::report::results::LocalizationResults;
 use crate::evaluation::trust::Axes;
 use crate::evaluation::{ParticleRow, planar_errors};
-use crate::geometry::{Pose2, TriangleMesh, pose2_from_pose3};
+use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
+use crate::lidar::{LidarModel, RangeImage};
 use crate::localization::Estimate;
 use crate::map::Map;
+use crate::recording::Frame;
 
 /// Cells along the longer side of the map image in plots.
 const MAP_CELLS: usize = 1400;
@@ -61,6 +63,23 @@ pub fn map_around<'a>(
     let places = poses.into_iter().map(|pose| pose.translation.vector.into());
     let places: Vec<_> = places.collect();
     Ok(map.mesh_near(&places, RADIUS_M, DVec3::ZERO, most_triangles)?)
+}
+
+/// Draws the range image of a frame, that of the map from a pose, and their difference.
+pub fn draw_range_images(
+    files: &RunFiles,
+    map: &Map,
+    frame: &Frame,
+    map_from_lidar: &Pose3,
+    model: &LidarModel,
+) -> Result<()> {
+    let rendered = map.renderer.render(&[*map_from_lidar], model)?;
+    RangeImageStrip {
+        title: &format!("Frame {}: observed, rendered, difference", frame.number),
+        observed: &RangeImage::project(&frame.read()?.points, model),
+        rendered: rendered.first().context("one pose gives one image")?,
+    }
+    .save(&files.plot("range_images.png")?)
 }
 
 /// Name and values of the horizontal axis of charts over the frames of a run.
