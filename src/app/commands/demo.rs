@@ -6,18 +6,13 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 use clap::Args;
+use serde_json::{Value, json};
 
 use super::simulate::{self, Existing};
 use super::{build_map, localize, refine};
-use crate::app::run::Context;
-use crate::app::run::machine::MachineArgs;
-use crate::app::run::output::{Form, Printed};
-use crate::app::settings::{
-    BuildMapConfig, GivenPosesConfig, LocalizationConfig, MapInputConfig, MotionConfig,
-    OdometrySource, OutputConfig, RecordingConfig, RefinementConfig,
-};
-use crate::localization::TrackerConfig;
-use crate::map::MapConfig;
+use crate::app::run::{Context, Form, MachineArgs, Printed};
+use crate::app::settings::{self, BuildMapConfig, LocalizationConfig, RefinementConfig};
+use crate::configuration::Configuration;
 use crate::simulation::SimulationConfig;
 
 /// Arguments of `demo`.
@@ -63,11 +58,31 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Printed> {
     let (first, second) = (drive(1).drive_folder(), drive(2).drive_folder());
 
     tracing::info!("building the map from drive 1");
-    let map = build_map_config(&args.output, &first, seed);
+    let map_file = args.output.join("map.ply");
+    let map: BuildMapConfig = configured(
+        &first,
+        &[
+            ("mesh_file", path(&map_file)),
+            ("holdout_step", json!(10)),
+            ("map.seed", json!(seed)),
+            ("output.plots", json!(false)),
+        ],
+    )?;
     let build = build_map::run(&map, context).context("while building the map")?;
 
     tracing::info!("localizing drive 2 in the map");
-    let localization = localization_config(&args.output, &map, &second, seed);
+    let localization: LocalizationConfig = configured(
+        &second,
+        &[
+            ("map_input.map_file", path(&map_file)),
+            ("result_path", path(&args.output.join("localization.npz"))),
+            ("pose_tracking", json!(true)),
+            ("motion.odometry", json!("file")),
+            ("motion.odometry_file", path(&second.join("odometry.txt"))),
+            ("tracker.localizer.num_particles", json!(1000)),
+            ("tracker.seed", json!(seed)),
+        ],
+    )?;
     localize::run(&localization, context).context("while localizing")?;
 
     tracing::info!("refining the trajectory");
@@ -84,75 +99,28 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Printed> {
             page.display()
         ))
     };
-    Printed::parts(text(Form::Main, false)?, text(Form::All, true)?).with_json(&serde_json::json!({
+    Printed::parts(text(Form::Main, false)?, text(Form::All, true)?).with_json(&json!({
         "build_map": build,
         "localization": report,
         "seconds": seconds,
     }))
 }
 
-fn recording(drive: &Path) -> RecordingConfig {
-    RecordingConfig {
-        scan_folder: drive.join("velodyne"),
-        ..RecordingConfig::default()
-    }
+/// A configuration with the recording of a drive, its true poses, and further keys; existing output is replaced.
+fn configured<T: Configuration>(drive: &Path, keys: &[(&str, Value)]) -> Result<T> {
+    let keys_of_drive = [
+        ("recording.scan_folder", path(&drive.join("velodyne"))),
+        ("given_poses.pose_file", path(&drive.join("poses.txt"))),
+        ("given_poses.calib_file", path(&drive.join("calib.txt"))),
+        ("output.force", json!(true)),
+    ];
+    let keys = keys.iter().chain(&keys_of_drive);
+    // JSON is YAML.
+    let settings = keys.map(|(key, value)| ((*key).to_owned(), value.to_string()));
+    let settings: Vec<(String, String)> = settings.collect();
+    Ok(settings::with_settings(T::default(), &settings)?)
 }
 
-fn true_poses(drive: &Path) -> GivenPosesConfig {
-    GivenPosesConfig {
-        pose_file: Some(drive.join("poses.txt")),
-        calib_file: Some(drive.join("calib.txt")),
-        ..GivenPosesConfig::default()
-    }
-}
-
-fn build_map_config(output: &Path, drive: &Path, seed: u64) -> BuildMapConfig {
-    BuildMapConfig {
-        recording: recording(drive),
-        given_poses: true_poses(drive),
-        mesh_file: output.join("map.ply"),
-        holdout_step: 10,
-        map: MapConfig {
-            seed,
-            ..MapConfig::default()
-        },
-        output: OutputConfig {
-            plots: false,
-            force: true,
-        },
-        ..BuildMapConfig::default()
-    }
-}
-
-fn localization_config(
-    output: &Path,
-    map: &BuildMapConfig,
-    drive: &Path,
-    seed: u64,
-) -> LocalizationConfig {
-    let mut tracker = TrackerConfig {
-        seed,
-        ..TrackerConfig::default()
-    };
-    tracker.localizer.num_particles = 1000;
-    LocalizationConfig {
-        recording: recording(drive),
-        given_poses: true_poses(drive),
-        map_input: MapInputConfig {
-            map_file: map.mesh_file.clone(),
-            ..MapInputConfig::default()
-        },
-        result_path: output.join("localization.npz"),
-        pose_tracking: Some(true),
-        motion: MotionConfig {
-            odometry: OdometrySource::File,
-            odometry_file: Some(drive.join("odometry.txt")),
-        },
-        tracker,
-        output: OutputConfig {
-            force: true,
-            ..OutputConfig::default()
-        },
-        ..LocalizationConfig::default()
-    }
+fn path(path: &Path) -> Value {
+    json!(path.to_string_lossy())
 }
