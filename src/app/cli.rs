@@ -16,11 +16,9 @@ use crate::app::commands::odometry::{self, OdometryArgs};
 use crate::app::commands::refine::{self, RefineArgs};
 use crate::app::commands::simulate;
 use crate::app::comparison::compare::{self, CompareArgs};
-use crate::app::report::results::Report;
-use crate::app::run::Context;
-use crate::app::run::arguments::{RunArgs, configured, with_flags};
-use crate::app::run::machine::MachineArgs;
-use crate::app::run::output::{Form, Printed};
+use crate::app::report::Report;
+use crate::app::run::arguments::{configured, with_flags};
+use crate::app::run::{Context, Form, MachineArgs, Printed, RunArgs};
 use crate::app::settings::{
     self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
     LocalizationConfig, OdometryCommandConfig, RefinementConfig,

@@ -10,8 +10,7 @@ use anyhow::Result;
 use clap::Args;
 use nalgebra::Vector3;
 
-use crate::app::run::output::Printed;
-use crate::app::run::{Context, version};
+use crate::app::run::{Context, Printed, version};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::lidar::{Beam, LidarModel, RangeImage};
 use crate::localization::observation::ObservationConfig;

@@ -13,12 +13,8 @@ use super::stages::{RecordingInputs, complete};
 use crate::app::report::export::tiles::TILES_FOLDER;
 use crate::app::report::export::{Model, Ribbon, RunLog, write_mcap};
 use crate::app::report::plotting::color::{Colormap, TRUTH};
-use crate::app::report::results::LocalizationResults;
-use crate::app::report::run_output;
-use crate::app::run::artefact::{Claims, Outputs};
-use crate::app::run::interrupt::Interrupted;
-use crate::app::run::output::Printed;
-use crate::app::run::{Context, input, output};
+use crate::app::report::{LocalizationResults, run_output};
+use crate::app::run::{Claims, Context, Outputs, Printed, input, output};
 use crate::app::settings::RefinementConfig;
 use crate::evaluation::planar_errors;
 use crate::geometry::{Pose3, TriangleMesh, pose2_from_pose3};
@@ -147,17 +143,11 @@ fn export_result(args: &ExportArgs, context: &Context) -> Result<Vec<(&'static s
 
 fn write_log(path: &Path, run: &RunLog, context: &Context) -> Result<()> {
     let task = context.progress.task("export", run.results.len());
+    context.interrupt.keeps("nothing was written");
     output::write_file(path, |file| {
         write_mcap(run, file, || {
             task.advance(1);
-            if context.interrupt.requested() {
-                Err(Interrupted {
-                    kept: "nothing was written".to_owned(),
-                }
-                .into())
-            } else {
-                Ok(())
-            }
+            Ok(context.interrupt.check()?)
         })
     })
 }

@@ -1,13 +1,13 @@
 //! Source of the motion between frames, and its description in reports.
 
 use std::collections::VecDeque;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Result;
 use rand::Rng;
 
 use super::stages::RecordingInputs;
-use crate::app::settings::OdometrySource;
+use crate::app::settings::{MotionConfig, OdometrySource};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
 use crate::localization::odometry::{are_in_space, demonstration_noise, motions, with_noise};
 use crate::recording::layout::Layout;
@@ -27,13 +27,13 @@ impl MotionSource {
     /// Opens the configured source for the frames of a recording; returns also the file or, in a bag, the topic that
     /// is used.
     pub fn open(
-        source: OdometrySource,
-        file: Option<PathBuf>,
+        config: &MotionConfig,
         inputs: &RecordingInputs,
         recording: &Recording,
         rng: &mut impl Rng,
     ) -> Result<(Self, Option<PathBuf>)> {
-        let motion = match (source, &file) {
+        let file = config.odometry_file.clone();
+        let motion = match (config.odometry, &file) {
             (OdometrySource::None, _) => Self::Unknown,
             (OdometrySource::File | OdometrySource::Auto, Some(file)) => {
                 inputs.require_poses("odometry_file", file)?;
@@ -145,8 +145,8 @@ impl FrameMotion {
 }
 
 /// Description of the odometry for reports.
-pub fn description(source: OdometrySource, file: Option<&Path>) -> String {
-    match (source, file) {
+pub fn description(config: &MotionConfig) -> String {
+    match (config.odometry, &config.odometry_file) {
         (OdometrySource::None, _) => "none (constant velocity)".to_owned(),
         (OdometrySource::File | OdometrySource::Auto, Some(file)) => file.display().to_string(),
         (OdometrySource::GroundTruth, _) => {

@@ -8,12 +8,9 @@ use serde::Serialize;
 
 use super::stages::{RecordingInputs, complete};
 use super::trajectory;
+use crate::app::report::RunFiles;
 use crate::app::report::odometry::{self, OdometryReport};
-use crate::app::report::run_output::RunFiles;
-use crate::app::run::arguments::RunArgs;
-use crate::app::run::artefact::{Claims, Outputs};
-use crate::app::run::output::Printed;
-use crate::app::run::{Context, output};
+use crate::app::run::{Claims, Context, Outputs, Printed, RunArgs, output};
 use crate::app::settings::OdometryCommandConfig;
 use crate::mapping::find_poses;
 use crate::recording::Recording;

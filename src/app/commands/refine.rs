@@ -11,13 +11,10 @@ use serde::Serialize;
 use super::motion_source;
 use super::motion_source::MotionSource;
 use super::stages::{RecordingInputs, input_files};
-use crate::app::report::results::{LocalizationResults, Report};
-use crate::app::report::run_output::{self, REFINEMENT_FILES, REPORT_FILES, RunFiles};
-use crate::app::report::run_page;
-use crate::app::run::arguments::{RunArgs, numbers};
-use crate::app::run::artefact::{Claims, NPZ, Outputs};
-use crate::app::run::interrupt::Interrupted;
-use crate::app::run::{Context, input, output};
+use crate::app::report::run_output::{self, REFINEMENT_FILES, REPORT_FILES};
+use crate::app::report::{LocalizationResults, Report, RunFiles, run_page};
+use crate::app::run::arguments::numbers;
+use crate::app::run::{Claims, Context, NPZ, Outputs, RunArgs, input, output};
 use crate::app::settings::{
     self, LocalizationConfig, OdometrySource, OutputConfig, RefinementConfig,
 };
@@ -310,16 +307,15 @@ fn refine(
     starts: &[InitialEstimate],
     increments: &[Option<Pose2>],
 ) -> Result<(RefinedTrajectory, Vec<f64>)> {
-    let path = config.result_file.display();
-    let kept = format!("{path} is unchanged: a trajectory is refined as a whole");
-    context.interrupt.keeps(kept.clone());
+    context.interrupt.keeps(format!(
+        "{} is unchanged: a trajectory is refined as a whole",
+        config.result_file.display()
+    ));
     let mut refiner = TrajectoryRefiner::new(map, sensor, refiner_config(config), config.seed)?;
     let mut runtimes_s = Vec::with_capacity(starts.len());
     let task = context.progress.task("refine", starts.len());
     for (frame, start) in sequence.frames.iter().zip(starts) {
-        if context.interrupt.requested() {
-            return Err(Interrupted { kept }.into());
-        }
+        context.interrupt.check()?;
         let scan = frame.read()?;
         let started = Instant::now();
         refiner.add(&scan, start)?;
@@ -328,9 +324,7 @@ fn refine(
     }
     drop(task);
     refiner.place_backwards(starts, increments, |row| {
-        if context.interrupt.requested() {
-            return Err(Interrupted { kept: kept.clone() }.into());
-        }
+        context.interrupt.check()?;
         anyhow::Ok(sequence.frames[row].read()?)
     })?;
     let known: Option<Vec<Pose2>> = increments.iter().copied().collect();
@@ -400,8 +394,7 @@ fn increments(
         return Ok(recorded.iter().copied().map(Some).collect());
     }
     let (mut motion, _file) = MotionSource::open(
-        config.motion.odometry,
-        config.motion.odometry_file.clone(),
+        &config.motion,
         &RecordingInputs::new(&config.recording, &config.given_poses),
         sequence,
         &mut stream(config.seed, ODOMETRY_STREAM),
@@ -457,21 +450,11 @@ fn write_run(
         (OdometrySource::Auto, None) if sequence.files.layout == Layout::Bag => {
             "that of the localization".to_owned()
         }
-        (source, file) => motion_source::description(source, file.as_deref()),
+        _ => motion_source::description(&config.motion),
     };
-    let about = [
-        (
-            "recording",
-            config.recording.scan_folder.display().to_string(),
-        ),
-        ("map", config.map_input.map_file.display().to_string()),
-        ("odometry", odometry),
-        ("renderer", map.renderer.name()),
-        ("seed", config.seed.to_string()),
-    ]
-    .map(|(key, value)| (key.to_owned(), value));
-    let about = about.into_iter().chain(run_output::shortfall(results));
-    let report = run_output::evaluate(results, &RangeMclRules::default(), about.collect())?;
+    let inputs = (&config.recording, &config.map_input);
+    let about = run_output::about(results, inputs, map, odometry, config.seed);
+    let report = run_output::evaluate(results, &RangeMclRules::default(), about)?;
     run_output::write_report(files, results, &report)?;
     let path = config.result_file.display();
     context.interrupt.keeps(format!(

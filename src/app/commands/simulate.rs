@@ -19,12 +19,8 @@ use std::sync::{Arc, OnceLock};
 use anyhow::{Context as _, Result, bail};
 use rayon::prelude::*;
 
-use crate::app::run::artefact::Claims;
 use crate::app::run::artefact::hash::hash_of_texts;
-use crate::app::run::interrupt::{Interrupt, Interrupted};
-use crate::app::run::output::{self, Printed};
-use crate::app::run::progress::Task;
-use crate::app::run::{Context, version};
+use crate::app::run::{Claims, Context, Interrupt, Printed, Task, output, version};
 use crate::app::settings::to_yaml;
 use crate::files::remove_abandoned;
 use crate::geometry::Pose3;
@@ -253,11 +249,11 @@ fn write_scans(
     })?;
     let done = done.into_inner();
     if done < frames {
-        let kept = format!(
+        interrupt.keeps(format!(
             "{done} of {frames} scans are kept in {}; the same command continues from there",
             folder.display()
-        );
-        return Err(Interrupted { kept }.into());
+        ));
+        return Err(interrupt.error().into());
     }
     Ok(kept.into_inner())
 }

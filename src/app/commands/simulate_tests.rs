@@ -3,7 +3,7 @@
 use approx::assert_relative_eq;
 
 use super::*;
-use crate::app::run::artefact::CLAIMS_FILE;
+use crate::app::run::CLAIMS_FILE;
 use crate::recording::{Recording, velodyne};
 use crate::simulation::{PathSegment, ScannerConfig};
 

@@ -3,10 +3,9 @@
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Error, Result};
+use anyhow::{Context as _, Result};
 
 use crate::app::run::Context;
-use crate::app::run::interrupt::Interrupted;
 use crate::map::BuildEvent;
 use crate::mapping::{self, ADJUSTMENT, MappingError};
 use crate::odometry::Trajectory;
@@ -22,8 +21,8 @@ pub fn find(
 ) -> Result<Trajectory> {
     /// About the share of the work until all scans are read; the rest are loops and adjustment.
     const SHARE: f64 = 0.5;
-    let kept = "nothing is written: loops and adjustment need all scans";
-    context.interrupt.keeps(kept.to_owned());
+    let interrupt = &context.interrupt;
+    interrupt.keeps("nothing is written: loops and adjustment need all scans");
     let task = context.progress.task(name, scans);
     let found = find(&|event| {
         match event {
@@ -31,18 +30,10 @@ pub fn find(
             BuildEvent::Stage(ADJUSTMENT) => task.note(ADJUSTMENT),
             BuildEvent::Stage(_) => {}
         }
-        context.interrupt.flow()
+        interrupt.flow()
     });
     task.set_share(1.0);
-    found.map_err(|error| interrupted(error, kept))
-}
-
-/// The error, or the interruption of a process that keeps something.
-fn interrupted(error: MappingError, kept: &str) -> Error {
-    match error {
-        MappingError::Interrupted => Interrupted { kept: kept.into() }.into(),
-        error => error.into(),
-    }
+    found.map_err(|error| interrupt.explain(error))
 }
 
 /// Checks the poses of a recording against each other; `origin` says where they are from.

@@ -13,8 +13,7 @@ use super::record::RunRecord;
 use super::results::ComparisonResults;
 use super::{cases, keys, page, tables};
 use crate::app::comparison::table::Table;
-use crate::app::run::artefact::Outputs;
-use crate::app::run::{Context, output, version};
+use crate::app::run::{Context, Outputs, output, version};
 use crate::app::settings::ComparisonConfig;
 
 /// Page of the sequences that are described as hard cases.

@@ -5,8 +5,7 @@ use anyhow::{Context as _, Result, bail};
 use clap::Args;
 
 use super::{Executor, Layout, Outcome, PlannedRun, RunId, collect, planned_runs};
-use crate::app::run::arguments::ConfigArgs;
-use crate::app::run::{Context, output};
+use crate::app::run::{ConfigArgs, Context, output};
 use crate::app::settings::{self, CommandConfig as _, ComparisonConfig};
 
 /// Arguments of `compare`.

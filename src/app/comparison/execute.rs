@@ -13,14 +13,11 @@ use super::plan::PlannedRun;
 use super::record::{Outcome, RECORD_FILE, RunRecord};
 use crate::app::commands::simulate::{self, Existing};
 use crate::app::commands::{build_map, localize, refine};
-use crate::app::report::results::{LocalizationResults, Report, TrajectoryReport};
-use crate::app::report::run_output::{self, REFINEMENT_FILES, RunFiles};
+use crate::app::report::run_output::{self, REFINEMENT_FILES};
 use crate::app::report::run_page::RunPage;
-use crate::app::run::artefact::{
-    self, CLAIMS_FILE, Claims, FINISHED_FILE, Lock, Outputs, SharedResult,
-};
-use crate::app::run::interrupt::Interrupted;
-use crate::app::run::{Context, output, version};
+use crate::app::report::{LocalizationResults, Report, RunFiles, TrajectoryReport};
+use crate::app::run::artefact::{self, FINISHED_FILE, SharedResult};
+use crate::app::run::{CLAIMS_FILE, Claims, Context, Interrupted, Lock, Outputs, output, version};
 use crate::app::settings::{BuildMapConfig, LocalizationConfig, RefinementConfig};
 use crate::evaluation::trust::{Trust, TrustedRun};
 use crate::evaluation::{EvaluatedTrajectory, RangeMclRules};

@@ -9,7 +9,7 @@ use std::str::FromStr;
 use anyhow::{Context as _, Result};
 use serde::{Deserialize, Serialize};
 
-use crate::app::report::results::TrajectoryReport;
+use crate::app::report::TrajectoryReport;
 use crate::evaluation::TrajectoryMetrics;
 use crate::evaluation::trust::Trust;
 

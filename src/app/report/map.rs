@@ -10,7 +10,7 @@ use serde::Serialize;
 use super::odometry;
 use super::plotting::{MapPlot, SURFACES, VertexNumbers, muted};
 use super::run_output::MOST_TRIANGLES;
-use crate::app::run::output::Printed;
+use crate::app::run::Printed;
 use crate::evaluation::map_quality::ResidualSums;
 use crate::evaluation::{MapQuality, TruthAgreement};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};

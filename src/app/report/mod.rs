@@ -12,3 +12,6 @@ pub mod odometry;
 pub mod export;
 pub mod pages;
 pub mod plotting;
+
+pub use results::{LocalizationResults, Report, RunSummary, TrajectoryReport};
+pub use run_output::RunFiles;

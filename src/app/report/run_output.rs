@@ -10,8 +10,8 @@ use anyhow::{Result, bail};
 use crate::app::report::results::{
     LocalizationResults, Report, RunSummary, TrajectoryReport, write_frames_csv, write_poses_npy,
 };
-use crate::app::run::artefact::{Claims, Outputs};
-use crate::app::run::output;
+use crate::app::run::{Claims, Outputs, output};
+use crate::app::settings::{MapInputConfig, RecordingConfig};
 use crate::evaluation::{
     EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, SpatialMetrics,
     TrajectoryMetrics,
@@ -19,6 +19,7 @@ use crate::evaluation::{
 use crate::files::folder_of;
 use crate::geometry::{Pose2, Pose3, StampedPose};
 use crate::localization::ParticleSet;
+use crate::map::Map;
 use crate::recording::poses::{write_kitti, write_tum};
 use crate::recording::{Frame, Recording};
 
@@ -166,6 +167,27 @@ pub fn write_report(
     output::write_json(&files.file("report.json"), report)?;
     output::write_text(&files.file("report.md"), &report.to_markdown())?;
     write_frames_csv(&files.file("frames.csv"), results)
+}
+
+/// Inputs and settings of a run in a map, for its report.
+pub fn about(
+    results: &LocalizationResults,
+    (recording, map_input): (&RecordingConfig, &MapInputConfig),
+    map: &Map,
+    odometry: String,
+    seed: u64,
+) -> BTreeMap<String, String> {
+    [
+        ("recording", recording.scan_folder.display().to_string()),
+        ("map", map_input.map_file.display().to_string()),
+        ("odometry", odometry),
+        ("renderer", map.renderer.name()),
+        ("seed", seed.to_string()),
+    ]
+    .map(|(key, value)| (key.to_owned(), value))
+    .into_iter()
+    .chain(shortfall(results))
+    .collect()
 }
 
 /// The entry of a report about a result that is not complete.

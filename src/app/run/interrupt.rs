@@ -13,6 +13,8 @@ use std::thread;
 use std::time::Duration;
 
 use crate::files;
+use crate::map::BuildError;
+use crate::mapping::MappingError;
 
 /// Time from the request to stop until the process ends.
 const GRACE: Duration = Duration::from_millis(1500);
@@ -90,6 +92,34 @@ impl Interrupt {
         *lock(&self.shared.kept) = kept.into();
     }
 
+    /// The error of an interruption, which names what is kept.
+    pub fn error(&self) -> Interrupted {
+        let mut kept = lock(&self.shared.kept).clone();
+        if kept.is_empty() {
+            "every output file that exists is complete".clone_into(&mut kept);
+        }
+        Interrupted { kept }
+    }
+
+    /// An error once Ctrl-C was pressed.
+    pub fn check(&self) -> Result<(), Interrupted> {
+        if self.requested() {
+            return Err(self.error());
+        }
+        Ok(())
+    }
+
+    /// An error of the library; where it is an interruption, one that names what is kept.
+    pub fn explain(&self, error: impl Into<anyhow::Error>) -> anyhow::Error {
+        let error = error.into();
+        let is_build = matches!(error.downcast_ref(), Some(BuildError::Interrupted));
+        let is_mapping = matches!(error.downcast_ref(), Some(MappingError::Interrupted));
+        if is_build || is_mapping {
+            return self.error().into();
+        }
+        error
+    }
+
     /// Guard of files that belong together: the process does not end between them.
     pub fn saving(&self) -> MutexGuard<'_, ()> {
         lock(&self.shared.saving)
@@ -136,11 +166,7 @@ impl Interrupt {
     fn exit_after_saving(&self) -> ! {
         let _saving = self.saving();
         files::abandon_writes();
-        let mut kept = lock(&self.shared.kept).clone();
-        if kept.is_empty() {
-            "every output file that exists is complete".clone_into(&mut kept);
-        }
-        tracing::error!("{}", Interrupted { kept });
+        tracing::error!("{}", self.error());
         exit()
     }
 }

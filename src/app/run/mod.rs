@@ -13,4 +13,10 @@ pub mod progress;
 mod remedy;
 pub mod version;
 
+pub use arguments::{ConfigArgs, RunArgs};
+pub use artefact::{CLAIMS_FILE, Claims, Lock, NPZ, Outputs, PLY};
 pub use context::Context;
+pub use interrupt::{Interrupt, Interrupted};
+pub use machine::MachineArgs;
+pub use output::{Form, Printed};
+pub use progress::{Progress, Task};

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde::Serialize;
 
-use crate::app::run::arguments::RunArgs;
+use crate::app::run::RunArgs;
 use crate::recording::scan_files;
 
 /// Arguments of `build-map`.

@@ -9,14 +9,12 @@ use anyhow::{Result, ensure};
 use super::files::{self, prepare, write_map};
 use super::progress::BuildProgress;
 use crate::app::report::map::{BuildReport, draw_map};
-use crate::app::run::interrupt::Interrupted;
-use crate::app::run::progress::Progress;
-use crate::app::run::{Context, input};
+use crate::app::run::{Context, Progress, input};
 use crate::app::settings::BuildMapConfig;
 use crate::evaluation::map_quality::ResidualSums;
 use crate::geometry::Vec3;
 use crate::map::mesh_view::MeshView;
-use crate::map::{BuildError, BuildEvent, CloudPlan, LocalMap, MappingPath};
+use crate::map::{BuildEvent, CloudPlan, LocalMap, MappingPath};
 use crate::recording::scan_files::{self, ReadCloud};
 
 /// Meshes the cloud of a configuration.
@@ -62,8 +60,8 @@ fn build_blocks(
     context: &Context,
     stages: &BuildProgress,
 ) -> Result<Vec<LocalMap>> {
-    let kept = "nothing is kept of an unfinished map of a cloud";
-    context.interrupt.keeps(kept.to_owned());
+    let interrupt = &context.interrupt;
+    interrupt.keeps("nothing is kept of an unfinished map of a cloud");
     let read = stages.time("read", || scan_files::read_cloud(cloud_file))?;
     let normals = usable_normals(&read, cloud_file);
     let points = read.scan.points;
@@ -73,7 +71,7 @@ fn build_blocks(
             on_stage(event, context, stages)
         })
     };
-    let plan = prepare().map_err(|error| interrupted(error, kept))?;
+    let plan = prepare().map_err(|error| interrupt.explain(error))?;
     tracing::info!(
         "{} of {} points are kept, in {} blocks",
         plan.cloud.len(),
@@ -84,7 +82,7 @@ fn build_blocks(
     let mut blocks = Vec::with_capacity(plan.blocks());
     for number in 0..plan.blocks() {
         let built = plan.build_block(number, &|event| on_stage(event, context, stages));
-        blocks.push(built.map_err(|error| interrupted(error, kept))?);
+        blocks.push(built.map_err(|error| interrupt.explain(error))?);
         task.advance(1);
     }
     stages.end();
@@ -119,14 +117,4 @@ fn on_stage(event: BuildEvent, context: &Context, stages: &BuildProgress) -> Con
         stages.begin(name);
     }
     context.interrupt.flow()
-}
-
-fn interrupted(error: BuildError, kept: &str) -> anyhow::Error {
-    match error {
-        BuildError::Interrupted => Interrupted {
-            kept: kept.to_owned(),
-        }
-        .into(),
-        other => other.into(),
-    }
 }

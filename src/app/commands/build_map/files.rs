@@ -4,8 +4,7 @@ use anyhow::Result;
 
 use crate::app::commands::stages::RecordingInputs;
 use crate::app::report::map::BuildReport;
-use crate::app::run::artefact::{Claims, Outputs, PLY};
-use crate::app::run::{Context, output};
+use crate::app::run::{Claims, Context, Outputs, PLY, output};
 use crate::app::settings::BuildMapConfig;
 use crate::map::MappingPath;
 use crate::map::files::ply;

@@ -7,8 +7,7 @@ use anyhow::{Result, bail};
 use super::local_maps;
 use super::opened::{Opened, open};
 use super::parts::Role;
-use crate::app::run::Context;
-use crate::app::run::output::Printed;
+use crate::app::run::{Context, Printed};
 use crate::app::settings::BuildMapConfig;
 
 /// One shell command per local map that is not finished, for the current folder: the command line of this process with

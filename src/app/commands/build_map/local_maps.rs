@@ -10,10 +10,9 @@ use super::parts::{Parts, Role};
 use super::progress::BuildProgress;
 use crate::app::run::Context;
 use crate::app::run::artefact::hash::{hash_of_scan, hash_of_scans, joint_hash};
-use crate::app::run::interrupt::Interrupted;
 use crate::map::build::plan::LocalMapPlan;
 use crate::map::build::scan_agreement;
-use crate::map::{BuildError, BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan};
+use crate::map::{BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan};
 use crate::recording::Frame;
 
 /// Builds the local maps that are not finished yet, which is an error where they are collected; returns the counts of
@@ -33,11 +32,12 @@ pub fn build(
     let count = plan.local_maps.len();
     let mut all = Vec::with_capacity(count);
     for local_map in &plan.local_maps {
-        let kept = kept(all.len(), count, &opened.parts);
-        context.interrupt.keeps(kept.clone());
+        context
+            .interrupt
+            .keeps(kept(all.len(), count, &opened.parts));
         progress.begin_local_map(local_map.used.len());
-        let counts =
-            finish(opened, &plan, local_map, role).map_err(|error| interrupted(error, kept));
+        let counts = finish(opened, &plan, local_map, role);
+        let counts = counts.map_err(|error| context.interrupt.explain(error));
         progress.end();
         all.push(counts?);
     }
@@ -63,11 +63,10 @@ pub fn build_one(
     let progress = Arc::new(BuildProgress::new(task, local_map.used.len()));
     let builder = builder(opened, context, &progress);
     let plan = opened.plan(&builder)?;
-    let nothing = "nothing is kept of an unfinished local map".to_owned();
-    context.interrupt.keeps(nothing.clone());
+    (context.interrupt).keeps("nothing is kept of an unfinished local map");
     progress.begin_local_map(local_map.used.len());
     let counts = finish(opened, &plan, local_map, Role::Job);
-    let counts = counts.map_err(|error| interrupted(error, nothing))?;
+    let counts = counts.map_err(|error| context.interrupt.explain(error))?;
     progress.finish();
     Ok((counts, count))
 }
@@ -163,14 +162,6 @@ fn warn_of_doubtful_poses(built: &LocalMap, frames: &[Frame]) {
             "only {:.0} % of a scan's points are on the surfaces of the next one: the poses may be inaccurate, of another recording, or in another frame",
             100.0 * agreement
         );
-    }
-}
-
-/// Replaces an interruption by one that names what is kept.
-fn interrupted(error: anyhow::Error, kept: String) -> anyhow::Error {
-    match error.downcast_ref() {
-        Some(BuildError::Interrupted) => Interrupted { kept }.into(),
-        _ => error,
     }
 }
 

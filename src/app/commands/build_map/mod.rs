@@ -22,8 +22,7 @@ pub use self::arguments::{BuildMapArgs, BuildPart};
 use self::joined::JoinedMap;
 use self::parts::Role;
 use crate::app::report::map::{BuildReport, draw_changes, draw_map};
-use crate::app::run::Context;
-use crate::app::run::output::Printed;
+use crate::app::run::{Context, Printed};
 use crate::app::settings::BuildMapConfig;
 use crate::evaluation::map_quality::ResidualSums;
 

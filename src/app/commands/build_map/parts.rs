@@ -13,8 +13,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::app::run::artefact::hash::{hash_of_file, hash_of_texts};
-use crate::app::run::artefact::{CLAIMS_FILE, Claims, Lock};
-use crate::app::run::output;
+use crate::app::run::{CLAIMS_FILE, Claims, Lock, output};
 use crate::files::remove_abandoned;
 use crate::map::files::mapped_ply::MappedPly;
 use crate::map::files::ply;

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
-use crate::app::run::progress::Task;
+use crate::app::run::Task;
 
 /// Stages of a local map, and about the share of its time before each.
 const STAGES: [(&str, f64); 6] = [

@@ -12,12 +12,9 @@ use anyhow::{Context as _, Result, ensure};
 use clap::Args;
 use serde::Serialize;
 
-use crate::app::report::results::{LocalizationResults, Report};
-use crate::app::report::run_output::{self, REPORT_FILES, RunFiles};
-use crate::app::report::run_page;
-use crate::app::run::arguments::RunArgs;
-use crate::app::run::artefact::{Claims, NPZ, Outputs};
-use crate::app::run::{Context, input, output};
+use crate::app::report::run_output::{self, REPORT_FILES};
+use crate::app::report::{LocalizationResults, Report, RunFiles, run_page};
+use crate::app::run::{Claims, Context, NPZ, Outputs, RunArgs, input, output};
 use crate::app::settings::{self, EvaluationConfig, LocalizationConfig};
 use crate::evaluation::{Alignment, RangeMclRules};
 use crate::files::folder_of;

@@ -6,7 +6,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result};
 use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
-use crate::app::report::results::{LocalizationResults, Report, RunSummary};
+use crate::app::report::{LocalizationResults, Report, RunSummary};
 use crate::evaluation::{SpatialMetrics, aligned, distances_m};
 use crate::geometry::Pose3;
 use crate::recording::PoseTrack;

@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::{Context as _, Result, ensure};
 
 use crate::app::commands::stages::RecordingInputs;
-use crate::app::report::results::LocalizationResults;
+use crate::app::report::LocalizationResults;
 use crate::app::run::input;
 use crate::app::settings::{EvaluationConfig, LocalizationConfig, RecordingConfig};
 use crate::evaluation::{Alignment, aligned};

@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use crate::app::run::machine::{MachineArgs, gibibytes};
+use crate::app::run::MachineArgs;
+use crate::app::run::machine::gibibytes;
 
 /// Arguments of `export`.
 #[derive(Clone, Debug, Args)]

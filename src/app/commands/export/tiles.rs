@@ -11,9 +11,7 @@ use super::arguments::ExportArgs;
 use crate::app::report::export::tiles::{
     METADATA_FILE, TILES_FOLDER, Tile, is_tile, metadata, split,
 };
-use crate::app::run::artefact::Claims;
-use crate::app::run::interrupt::Interrupted;
-use crate::app::run::{Context, output};
+use crate::app::run::{Claims, Context, output};
 use crate::geometry::{TriangleMesh, Vec3, sample_surface, surface_area_m2, surface_samples};
 use crate::map::MappingPath;
 use crate::memory::{self, MemoryError};
@@ -100,15 +98,12 @@ fn remove_tiles(folder: &Path) -> Result<()> {
 fn write_tiles(tiles: &[Tile], folder: &Path, context: &Context) -> Result<()> {
     let task = context.progress.task("export", tiles.len());
     for (written, tile) in tiles.iter().enumerate() {
-        let kept = format!(
+        context.interrupt.keeps(format!(
             "{written} of {} tiles are in {}; run again for all of them",
             tiles.len(),
             folder.display()
-        );
-        context.interrupt.keeps(kept.clone());
-        if context.interrupt.requested() {
-            return Err(Interrupted { kept }.into());
-        }
+        ));
+        context.interrupt.check()?;
         output::write_file(&folder.join(tile.file_name()), |file| tile.write(file))?;
         task.advance(1);
     }

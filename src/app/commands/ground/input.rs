@@ -6,9 +6,9 @@ use anyhow::{Result, bail, ensure};
 use clap::Args;
 
 use crate::app::commands::stages::is_bag;
+use crate::app::run::MachineArgs;
 use crate::app::run::arguments::setting;
 use crate::app::run::input::require_folder;
-use crate::app::run::machine::MachineArgs;
 use crate::app::settings::{self, GroundCommandConfig};
 use crate::evaluation::LabelledPoints;
 use crate::recording::{Frame, Recording, ScanSource, scan_files, velodyne};

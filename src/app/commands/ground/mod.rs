@@ -23,10 +23,7 @@ pub use self::input::GroundArgs;
 use self::input::LabelledScan;
 use crate::app::report::ground::{self, GroundReport};
 use crate::app::report::plotting::color::Colormap;
-use crate::app::run::Context;
-use crate::app::run::artefact::{Claims, Outputs};
-use crate::app::run::interrupt::Interrupted;
-use crate::app::run::output::{self, Printed};
+use crate::app::run::{Claims, Context, Outputs, Printed, output};
 use crate::app::settings::{CommandConfig as _, GroundCommandConfig};
 use crate::evaluation::{GroundTally, LabelledPoints};
 use crate::files::folder_of;
@@ -116,15 +113,12 @@ fn segment(config: &GroundCommandConfig, path: &Path, context: &Context) -> Resu
     let (mut labelled_scans, mut points) = (0, 0);
     let task = context.progress.task("ground", scans.len());
     for (position, files) in scans.iter().enumerate() {
-        let kept = format!(
+        context.interrupt.keeps(format!(
             "{position} of {} scans are in {}; run again with --force for all of them",
             scans.len(),
             config.output_folder.display()
-        );
-        context.interrupt.keeps(kept.clone());
-        if context.interrupt.requested() {
-            return Err(Interrupted { kept }.into());
-        }
+        ));
+        context.interrupt.check()?;
         let scan = files.read()?;
         points += scan.points.len();
         labelled_scans += usize::from(scan.classes.is_some());

@@ -4,7 +4,6 @@ use anyhow::Result;
 use rayon::prelude::*;
 
 use crate::app::run::Context;
-use crate::app::run::interrupt::Interrupted;
 use crate::app::settings::GroundCommandConfig;
 use crate::evaluation::{GroundProtocol, GroundScore, LabelledPoints};
 use crate::simulation::ground_scenes;
@@ -26,11 +25,9 @@ pub fn run(config: &GroundCommandConfig, context: &Context) -> Result<String> {
         .collect();
     let header = format!("{:<24}{columns}\n", "scene");
     let mut tables = [header.clone(), header];
+    context.interrupt.keeps("nothing is written by --simulated");
     for (name, scans_of) in scenes {
-        if context.interrupt.requested() {
-            let kept = "nothing is written by --simulated".to_owned();
-            return Err(Interrupted { kept }.into());
-        }
+        context.interrupt.check()?;
         let scans = SEEDS.into_par_iter().map(&*scans_of);
         let scans: Vec<_> = scans.collect::<Result<_, _>>()?;
         let scans = scans.into_iter().flatten().map(|scan| LabelledPoints {

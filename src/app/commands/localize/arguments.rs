@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use crate::app::run::arguments::{RunArgs, numbers};
+use crate::app::run::RunArgs;
+use crate::app::run::arguments::numbers;
 
 /// Arguments of `localize`.
 #[derive(Clone, Debug, Args, Serialize)]

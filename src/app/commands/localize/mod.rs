@@ -3,7 +3,6 @@
 mod arguments;
 mod recorder;
 
-use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -15,14 +14,9 @@ use self::recorder::Run;
 use super::motion_source;
 use super::motion_source::{FrameMotion, MotionSource};
 use super::stages::{RecordingInputs, input_files};
-use crate::app::report::results::{LocalizationResults, Report};
-use crate::app::report::run_output::{
-    self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES, RunFiles,
-};
-use crate::app::report::run_page;
-use crate::app::run::artefact::{Claims, NPZ, Outputs};
-use crate::app::run::interrupt::Interrupted;
-use crate::app::run::{Context, input, output};
+use crate::app::report::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES};
+use crate::app::report::{LocalizationResults, Report, RunFiles, run_page};
+use crate::app::run::{Claims, Context, Interrupted, NPZ, Outputs, input, output};
 use crate::app::settings::{Initialization, LocalizationConfig, MotionModel};
 use crate::evaluation::RangeMclRules;
 use crate::geometry::Pose2;
@@ -49,8 +43,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     let (sequence, sensor) = RecordingInputs::new(&config.recording, &config.given_poses)
         .open_in_map(&map, &mut resolved.tracker.sensor)?;
     let (motion, odometry_file) = MotionSource::open(
-        config.motion.odometry,
-        config.motion.odometry_file.clone(),
+        &config.motion,
         &RecordingInputs::new(&config.recording, &config.given_poses),
         &sequence,
         &mut stream(config.tracker.seed, ODOMETRY_STREAM),
@@ -268,9 +261,22 @@ fn write_run(
 ) -> Result<Report> {
     let results = &run.results;
     warn_of_untracked_frames(results);
-    let mut about = about(config, context, map);
-    about.insert("states".to_owned(), states_in_words(results));
-    about.extend(run_output::shortfall(results));
+    let localizer = &config.tracker.localizer;
+    let [most, reduced] = [localizer.num_particles, localizer.num_reduced];
+    let (odometry, seed) = (
+        motion_source::description(&config.motion),
+        config.tracker.seed,
+    );
+    let inputs = (&config.recording, &config.map_input);
+    let mut about = run_output::about(results, inputs, map, odometry, seed);
+    about.extend([
+        ("threads".to_owned(), context.threads.to_string()),
+        (
+            "particles".to_owned(),
+            format!("{most} reduced to {reduced}"),
+        ),
+        ("states".to_owned(), states_in_words(results)),
+    ]);
     let report = run_output::evaluate(results, &RangeMclRules::default(), about)?;
     if config.save_result {
         run_output::write_report(files, results, &report)?;
@@ -324,32 +330,6 @@ fn warn_of_untracked_frames(results: &LocalizationResults) {
             }
         }
     }
-}
-
-/// Description of the run for the report.
-fn about(config: &LocalizationConfig, context: &Context, map: &Map) -> BTreeMap<String, String> {
-    let odometry = motion_source::description(
-        config.motion.odometry,
-        config.motion.odometry_file.as_deref(),
-    );
-    let particles = format!(
-        "{} reduced to {}",
-        config.tracker.localizer.num_particles, config.tracker.localizer.num_reduced
-    );
-    [
-        (
-            "recording",
-            config.recording.scan_folder.display().to_string(),
-        ),
-        ("map", config.map_input.map_file.display().to_string()),
-        ("odometry", odometry),
-        ("renderer", map.renderer.name()),
-        ("seed", config.tracker.seed.to_string()),
-        ("threads", context.threads.to_string()),
-        ("particles", particles),
-    ]
-    .map(|(key, value)| (key.to_owned(), value))
-    .into()
 }
 
 impl Run {

@@ -4,10 +4,10 @@ use std::time::Duration;
 
 use anyhow::Result;
 
-use crate::app::report::results::{LocalizationResults, ParticleLog, ScanOutline};
-use crate::app::report::run_output::{self, Movie, RunFiles};
-use crate::app::run::artefact::Claims;
-use crate::app::run::interrupt::Interrupted;
+use crate::app::report::results::{ParticleLog, ScanOutline};
+use crate::app::report::run_output::{self, Movie};
+use crate::app::report::{LocalizationResults, RunFiles};
+use crate::app::run::{Claims, Interrupted};
 use crate::app::settings::LocalizationConfig;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
