@@ -145,7 +145,7 @@ fn map_of_poses(
     if older.is_none() {
         map.path = Arc::new(MappingPath {
             world_from_map: recording.world().0,
-            map_from_lidar: map.path.map_from_lidar.clone(),
+            ..(*map.path).clone()
         });
     }
     Ok(map)

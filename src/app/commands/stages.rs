@@ -180,6 +180,7 @@ impl MapInputConfig {
         Ok(Some(MappingPath {
             world_from_map: track.world_from_map,
             map_from_lidar: track.map_from_lidar,
+            sensor: None,
         }))
     }
 

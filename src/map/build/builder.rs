@@ -393,6 +393,7 @@ impl MapPlan<'_> {
         let path = MappingPath {
             world_from_map: Pose3::identity(),
             map_from_lidar: self.map_from_lidar,
+            sensor: Some(self.scan.sensor),
         };
         Ok(Map::new(mesh, path, &self.builder.options)?)
     }
@@ -553,6 +554,7 @@ mod tests {
         map.path = MappingPath {
             world_from_map,
             map_from_lidar: vec![world_from_map.inverse(); 3],
+            sensor: None,
         }
         .into();
         let folder = tempfile::tempdir().unwrap();

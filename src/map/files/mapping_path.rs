@@ -1,9 +1,10 @@
-//! The path of the mapping drive and the frame of the map, stored with the map.
+//! The path and the sensor of the mapping drive, and the frame of the map, stored with the map.
 //!
-//! In the PLY file they are comments, which all mesh readers skip: one for the frame, one per pose,
-//! each a translation [m] and a unit quaternion with all digits, so that reading gives the same bits.
+//! In the PLY file they are comments, which all mesh readers skip: one for the sensor, as JSON, one for the frame, and one
+//! per pose, each a translation [m] and a unit quaternion with all digits, so that reading gives the same bits.
 //!
 //! ```text
+//! comment fpmcl sensor           {"range_image":{"height":64, ...
 //! comment fpmcl world_from_map   tx ty tz qx qy qz qw
 //! comment fpmcl map_from_lidar   tx ty tz qx qy qz qw
 //! ```
@@ -12,8 +13,10 @@ use glam::DVec3;
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
 use crate::geometry::{FARTHEST_M, Pose3};
+use crate::sensor::Sensor;
 
 const WORLD: &str = "fpmcl world_from_map";
+const SENSOR: &str = "fpmcl sensor ";
 const POSE: &str = "fpmcl map_from_lidar";
 
 /// Poses of the scans that a map was built from, and the pose of the map in the world.
@@ -24,6 +27,8 @@ pub struct MappingPath {
     pub world_from_map: Pose3,
     /// Poses of the key scans, `p_map = map_from_lidar * p_lidar`; empty for a mesh from elsewhere.
     pub map_from_lidar: Vec<Pose3>,
+    /// Sensor of these scans; `None` for a mesh from elsewhere.
+    pub sensor: Option<Sensor>,
 }
 
 /// A comment of a map that cannot be read.
@@ -35,11 +40,15 @@ impl MappingPath {
     /// Returns the comments of the PLY file.
     pub(crate) fn to_comments(&self) -> Vec<String> {
         let line = |key: &str, pose: &Pose3| {
-            let [x, y, z, i, j, k, w] = numbers_of_pose(pose);
-            format!("{key} {x} {y} {z} {i} {j} {k} {w}")
+            let (t, q) = (pose.translation, pose.rotation);
+            let (x, y, z) = (t.x, t.y, t.z);
+            format!("{key} {x} {y} {z} {} {} {} {}", q.i, q.j, q.k, q.w)
         };
+        let sensor = self.sensor.iter().flat_map(serde_json::to_string);
         let poses = self.map_from_lidar.iter().map(|pose| line(POSE, pose));
-        std::iter::once(line(WORLD, &self.world_from_map))
+        sensor
+            .map(|json| format!("{SENSOR}{json}"))
+            .chain(std::iter::once(line(WORLD, &self.world_from_map)))
             .chain(poses)
             .collect()
     }
@@ -71,6 +80,12 @@ impl MappingPath {
             } else if let Some(numbers) = comment.strip_prefix(POSE) {
                 let path = path.get_or_insert_default();
                 path.map_from_lidar.push(pose(numbers, comment)?);
+            } else if let Some(json) = comment.strip_prefix(SENSOR) {
+                let sensor = serde_json::from_str(json);
+                let sensor = sensor.inspect_err(|error| {
+                    tracing::warn!("the sensor of the map is not read: {error}");
+                });
+                path.get_or_insert_default().sensor = sensor.ok();
             }
         }
         Ok(path)
@@ -97,21 +112,9 @@ fn pose(numbers: &str, comment: &str) -> Result<Pose3, BadPathComment> {
     if !is_on_earth || (quaternion.norm() - 1.0).abs() > 1e-6 {
         return Err(bad());
     }
-    Ok(pose_of_numbers(&[x, y, z, i, j, k, w]))
-}
-
-/// A pose as numbers: translation [m], then the quaternion i, j, k, w.
-pub(crate) type PoseNumbers = [f64; 7];
-
-pub(crate) fn numbers_of_pose(pose: &Pose3) -> PoseNumbers {
-    let (t, q) = (pose.translation, pose.rotation);
-    [t.x, t.y, t.z, q.i, q.j, q.k, q.w]
-}
-
-/// The same bits again: the quaternion is not normalized.
-pub(crate) fn pose_of_numbers(&[x, y, z, i, j, k, w]: &PoseNumbers) -> Pose3 {
-    let rotation = UnitQuaternion::new_unchecked(Quaternion::new(w, i, j, k));
-    Pose3::from_parts(Translation3::new(x, y, z), rotation)
+    // The same bits again: the quaternion is not normalized.
+    let rotation = UnitQuaternion::new_unchecked(quaternion);
+    Ok(Pose3::from_parts(Translation3::new(x, y, z), rotation))
 }
 
 #[cfg(test)]
@@ -131,6 +134,7 @@ mod tests {
         MappingPath {
             world_from_map: pose(7),
             map_from_lidar: (0..5).map(pose).collect(),
+            sensor: Some(Sensor::vlp16()),
         }
     }
 

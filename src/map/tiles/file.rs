@@ -17,13 +17,13 @@ use glam::DVec3;
 
 use super::grid::TileIndex;
 use crate::geometry::{Aabb, TriangleMesh, Vec3};
-use crate::map::files::mapping_path::{MappingPath, PoseNumbers, numbers_of_pose, pose_of_numbers};
+use crate::map::files::mapping_path::MappingPath;
 use crate::map::ground::heights::Cell;
 use crate::raycasting::{Tile, TileProblem};
 use crate::shared_bytes::{SharedBytes, join};
 
 /// Version of both files.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 const TILE_MAGIC: [u8; 8] = *b"fpmcltil";
 const INDEX_MAGIC: [u8; 8] = *b"fpmclidx";
 
@@ -294,10 +294,10 @@ struct IndexHeader {
     version: u32,
     checksum: u32,
     source: Source,
-    has_path: u64,
-    poses: u64,
+    /// Length of the comments of the path; 0 without one [bytes].
+    path_bytes: u64,
     tiles: u64,
-    unused: [u8; 48],
+    unused: [u8; 56],
 }
 
 /// The tiles of a map.
@@ -311,24 +311,18 @@ pub(crate) struct TileFileIndex {
 
 impl TileFileIndex {
     pub fn encode(&self) -> Vec<u8> {
-        let poses: Vec<PoseNumbers> = self.path.as_ref().map_or_else(Vec::new, |path| {
-            let all = std::iter::once(&path.world_from_map).chain(&path.map_from_lidar);
-            all.map(numbers_of_pose).collect()
-        });
+        let path = self.path.as_ref().map(|path| path.to_comments().join("\n"));
+        let path = path.unwrap_or_default();
         let mut header = IndexHeader {
             magic: INDEX_MAGIC,
             version: VERSION,
             checksum: 0,
             source: self.source,
-            has_path: self.path.is_some().into(),
-            poses: poses.len() as u64,
+            path_bytes: path.len() as u64,
             tiles: self.tiles.len() as u64,
-            unused: [0; 48],
+            unused: [0; 56],
         };
-        let parts = [
-            bytemuck::cast_slice(&poses),
-            bytemuck::cast_slice(&self.tiles),
-        ];
+        let parts = [path.as_bytes(), bytemuck::cast_slice(&self.tiles)];
         header.checksum = checksum_of(parts);
         join(&[bytemuck::bytes_of(&header), parts[0], parts[1]])
     }
@@ -339,24 +333,18 @@ impl TileFileIndex {
         let header: IndexHeader = header.ok_or(TileProblem::Format)?;
         let sizes = [
             size_of::<IndexHeader>() as u64,
-            header.poses.saturating_mul(size_of::<PoseNumbers>() as u64),
+            header.path_bytes,
             header.tiles.saturating_mul(size_of::<TileEntry>() as u64),
         ];
-        let [_, poses, tiles] = file.parts(sizes).ok_or(TileProblem::Format)?;
-        if checksum_of([&poses, &tiles]) != header.checksum {
+        let [_, path, tiles] = file.parts(sizes).ok_or(TileProblem::Format)?;
+        if checksum_of([&path, &tiles]) != header.checksum {
             return Err(TileProblem::Checksum);
         }
-        let mut poses = bytemuck::cast_slice(&poses).iter().map(pose_of_numbers);
-        let path = match header.has_path {
-            0 => None,
-            _ => Some(MappingPath {
-                world_from_map: poses.next().ok_or(TileProblem::Format)?,
-                map_from_lidar: poses.collect(),
-            }),
-        };
+        let path = std::str::from_utf8(&path).ok();
+        let path = path.and_then(|text| MappingPath::from_comments(text.lines()).ok());
         Ok(Self {
             source: header.source,
-            path,
+            path: path.ok_or(TileProblem::Format)?,
             tiles: bytemuck::cast_slice(&tiles).to_vec(),
         })
     }

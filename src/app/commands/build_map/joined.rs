@@ -28,6 +28,7 @@ impl<'a> JoinedMap<'a> {
         let new = || MappingPath {
             world_from_map: opened.sequence.world().0,
             map_from_lidar: poses.clone(),
+            sensor: Some(opened.sensor.clone()),
         };
         Self {
             older: older.map(|it| (it, Without::new(&*it.mesh, &joined.gone))),
