@@ -285,6 +285,9 @@ impl GroundMap {
 
     /// Lifts a planar pose onto the (lowest) ground, `map_from_lidar = map_from_road ·
     /// road_from_lidar`, at the x and y of the planar pose; `None` where there is no ground.
+    ///
+    /// # Errors
+    /// A tile of the map cannot be read.
     pub fn lift(
         &self,
         planar: &Pose2,
@@ -327,6 +330,9 @@ impl GroundMap {
     ///
     /// The plane of the road in the scan and the patch of the map under the car are fitted to different
     /// stretches of a road that is not flat; this estimate uses one surface only.
+    ///
+    /// # Errors
+    /// A tile of the map cannot be read.
     pub fn attitude_at(
         &self,
         planar: &Pose2,
@@ -378,6 +384,9 @@ impl GroundMap {
 
     /// Returns the ground under a car at a planar pose; `None` where there is none. Of several
     /// levels it is the one at about `level_m` [m], else the lowest that most of the cells nearby have.
+    ///
+    /// # Errors
+    /// A tile of the map cannot be read.
     pub fn patch_under(
         &self,
         planar: &Pose2,
