@@ -3,7 +3,6 @@
 use std::path::PathBuf;
 
 use super::names::{Meaning, Names};
-use super::yaml::{FullText, is_within, keys};
 use crate::validation::InvalidValue;
 
 /// Longest key that is compared with the known ones [bytes].
@@ -49,20 +48,6 @@ pub enum ConfigError {
     Serialize(#[from] serde_yaml::SerializeError),
 }
 
-/// The error of a text, with the key and the value of its line.
-pub(super) fn in_text(name: &str, text: &FullText, source: serde_yaml::Error) -> ConfigError {
-    let Some(line) = source
-        .location()
-        .map(|location| (location.line() as usize).saturating_sub(1))
-    else {
-        return describe(name.to_owned(), None, source);
-    };
-    let key = keys(&text.text).into_iter().rfind(|key| key.line <= line);
-    let line = text.original_line(line);
-    let at_line = key.map(|key| (key.name, text.value(line)));
-    describe(place(name, Some(line)), at_line, source)
-}
-
 /// The error of a setting.
 pub(super) fn in_setting(
     place: String,
@@ -84,27 +69,6 @@ pub(super) fn unknown(place: String, key: &str, meaning: Meaning, names: &Names)
             key,
         },
     }
-}
-
-/// The error of an invalid value, at the place where it was given last; settings are keys with their places.
-pub(super) fn invalid(
-    name: &str,
-    text: &FullText,
-    settings: &[(String, String)],
-    invalid: InvalidValue,
-) -> ConfigError {
-    let set = settings
-        .iter()
-        .rfind(|(key, _)| is_within(&invalid.key, key) || is_within(key, &invalid.key));
-    let place = match set {
-        Some((_, place)) => place.clone(),
-        None => {
-            let keys = keys(&text.text);
-            let innermost = keys.iter().rfind(|key| is_within(&invalid.key, &key.name));
-            place(name, innermost.map(|key| text.original_line(key.line)))
-        }
-    };
-    ConfigError::InvalidValue { place, invalid }
 }
 
 /// A file and a line of it, from 0.
@@ -141,7 +105,8 @@ fn nearest<'a>(key: &str, known: impl Iterator<Item = &'a str>) -> Option<String
         .map(|(_, candidate)| candidate.to_owned())
 }
 
-fn describe(
+/// The error of the parser at a place, with the key and the value there.
+pub(super) fn describe(
     place: String,
     key_and_value: Option<(String, String)>,
     source: serde_yaml::Error,

@@ -33,7 +33,7 @@ pub fn parse<T: Configuration>(
     settings: Settings,
 ) -> Result<T, ConfigError> {
     let full = FullText::new(name, text, &names::<T>()?)?;
-    let config = yaml::parse(&full.text).map_err(|source| error::in_text(name, &full, source))?;
+    let config = yaml::parse(&full.text).map_err(|source| full.error(name, source))?;
     apply(name, &full, config, settings)
 }
 
@@ -84,6 +84,6 @@ fn apply<T: Configuration>(
     }
     config
         .validate()
-        .map_err(|invalid| error::invalid(name, text, &full_settings, invalid))?;
+        .map_err(|invalid| text.invalid(name, &full_settings, invalid))?;
     Ok(config)
 }

@@ -7,6 +7,7 @@ use serde::de::DeserializeOwned;
 
 use super::error::{self, ConfigError};
 use super::names::{Meaning, Names};
+use crate::validation::InvalidValue;
 
 /// Serializes a configuration in block style, each key on a line of its own.
 pub fn to_yaml<T: Serialize>(config: &T) -> Result<String, serde_yaml::SerializeError> {
@@ -125,6 +126,41 @@ impl FullText {
         let value = line.split_once(':').map_or(line, |(_, value)| value);
         let value = value.split(" #").next().unwrap_or_default();
         value.trim().to_owned()
+    }
+
+    /// The error of the parser, with the key and the value of its line.
+    pub(super) fn error(&self, name: &str, source: serde_yaml::Error) -> ConfigError {
+        let Some(line) = source
+            .location()
+            .map(|location| (location.line() as usize).saturating_sub(1))
+        else {
+            return error::describe(name.to_owned(), None, source);
+        };
+        let key = keys(&self.text).into_iter().rfind(|key| key.line <= line);
+        let line = self.original_line(line);
+        let at_line = key.map(|key| (key.name, self.value(line)));
+        error::describe(error::place(name, Some(line)), at_line, source)
+    }
+
+    /// The error of an invalid value, at the place where it was given last; settings are keys with their places.
+    pub(super) fn invalid(
+        &self,
+        name: &str,
+        settings: &[(String, String)],
+        invalid: InvalidValue,
+    ) -> ConfigError {
+        let set = settings
+            .iter()
+            .rfind(|(key, _)| is_within(&invalid.key, key) || is_within(key, &invalid.key));
+        let place = match set {
+            Some((_, place)) => place.clone(),
+            None => {
+                let keys = keys(&self.text);
+                let innermost = keys.iter().rfind(|key| is_within(&invalid.key, &key.name));
+                error::place(name, innermost.map(|key| self.original_line(key.line)))
+            }
+        };
+        ConfigError::InvalidValue { place, invalid }
     }
 }
 

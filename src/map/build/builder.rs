@@ -254,7 +254,7 @@ impl MapBuilder {
         require_memory_of_images(&sensor.range_image)?;
         Ok(MapPlan {
             builder: self,
-            scan: ScanPreparation::new(sensor, &config.local_map),
+            scan: config.local_map.scan_preparation(sensor),
             classifier: config.ground.classifier()?,
             older: None,
             ownership: Ownership::new(&map_from_lidar, &local_maps),

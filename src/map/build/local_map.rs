@@ -7,7 +7,7 @@ use smart_default::SmartDefault;
 use super::changes::{self, Changes};
 use super::confidence::{self, ConfidenceConfig};
 use super::plan::Domain;
-use super::scan_cloud::{PointCounts, ScanCloud};
+use super::scan_cloud::{PointCounts, ScanCloud, ScanPreparation};
 use super::seam;
 use super::vertex_ground;
 use super::visibility::{self, VisibilityConfig};
@@ -15,6 +15,7 @@ use crate::geometry::{PointCloud, TriangleMesh};
 use crate::lidar::{LidarModel, NormalConfig};
 use crate::map::mesh_view::MeshView;
 use crate::meshing::{self, MeshingError, PoissonConfig, Reconstruction};
+use crate::sensor::Sensor;
 use crate::validation::{InvalidValue, Validate, fraction, in_range, nested, require};
 
 /// Longest edge of the simplified ground in cells: vertices of neighbouring cells are less than two
@@ -77,8 +78,18 @@ const MAX_CROP_M: f32 = 500.0;
 
 impl LocalMapConfig {
     /// Half extent of the box around the sensor in which points are kept [m].
-    pub fn crop_m(&self) -> Vec3 {
+    pub(crate) fn crop_m(&self) -> Vec3 {
         Vec3::new(self.crop_x_m, self.crop_y_m, self.crop_z_m)
+    }
+
+    /// How scans of a sensor are prepared.
+    pub(super) fn scan_preparation(&self, sensor: &Sensor) -> ScanPreparation {
+        ScanPreparation {
+            sensor: sensor.clone(),
+            normals: self.normals,
+            voxel_size_m: self.voxel_size_m,
+            crop_m: self.crop_m(),
+        }
     }
 }
 

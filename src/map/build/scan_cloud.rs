@@ -4,7 +4,6 @@
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
-use super::local_map::LocalMapConfig;
 use crate::geometry::{PointCloud, Pose3, Rigid3f};
 use crate::ground::GroundClassifier;
 use crate::lidar::{NormalConfig, RangeImage, Scan, estimate_normals, estimate_spatial_normals};
@@ -21,17 +20,6 @@ pub(crate) struct ScanPreparation {
     pub voxel_size_m: f32,
     /// Half extent of the crop box around the sensor along x, y and z [m].
     pub crop_m: Vec3,
-}
-
-impl ScanPreparation {
-    pub fn new(sensor: &Sensor, config: &LocalMapConfig) -> Self {
-        Self {
-            sensor: sensor.clone(),
-            normals: config.normals,
-            voxel_size_m: config.voxel_size_m,
-            crop_m: config.crop_m(),
-        }
-    }
 }
 
 /// Number of points dropped in each step.
