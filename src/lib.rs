@@ -158,6 +158,7 @@ pub mod internals {
     #[cfg(feature = "cli")]
     pub mod app {
         pub use crate::app::cli::{Cli, Command};
+        pub use crate::app::comparison::ComparisonConfig;
         pub use crate::app::report::plotting::{Bitmap, LineChart, Panel, Series, color};
         pub use crate::app::report::results::LocalizationResults;
         pub use crate::app::settings;

@@ -7,10 +7,11 @@ use std::fmt::Debug;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use fpmcl::internals::app::ComparisonConfig;
 use fpmcl::internals::app::settings::{
-    self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GivenPosesConfig,
-    GroundCommandConfig, Initialization, LocalizationConfig, MapInputConfig, OdometryCommandConfig,
-    RecordingConfig, RefinementConfig,
+    self, BuildMapConfig, CommandConfig, EvaluationConfig, GivenPosesConfig, GroundCommandConfig,
+    Initialization, LocalizationConfig, MapInputConfig, OdometryCommandConfig, RecordingConfig,
+    RefinementConfig,
 };
 use fpmcl::lidar::LidarModel;
 use fpmcl::sensor::RangeImageConfig;

@@ -22,10 +22,11 @@ use clap::Parser as _;
 use fpmcl::geometry::{Pose2, Pose3, TriangleMesh};
 use fpmcl::internals::CameraPoses;
 use fpmcl::internals::FARTHEST_M;
+use fpmcl::internals::app::ComparisonConfig;
 use fpmcl::internals::app::LocalizationResults;
 use fpmcl::internals::app::settings::{
-    self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
-    LocalizationConfig, RefinementConfig,
+    self, BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, LocalizationConfig,
+    RefinementConfig,
 };
 use fpmcl::internals::app::{Cli, Command};
 use fpmcl::internals::ply;

@@ -15,13 +15,14 @@ use crate::app::commands::localize::{self, LocalizeArgs};
 use crate::app::commands::odometry::{self, OdometryArgs};
 use crate::app::commands::refine::{self, RefineArgs};
 use crate::app::commands::simulate;
+use crate::app::comparison::ComparisonConfig;
 use crate::app::comparison::compare::{self, CompareArgs};
 use crate::app::report::Report;
 use crate::app::run::arguments::{configured, with_flags};
 use crate::app::run::{Context, Form, MachineArgs, Printed, RunArgs};
 use crate::app::settings::{
-    self, BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
-    LocalizationConfig, OdometryCommandConfig, RefinementConfig,
+    self, BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, LocalizationConfig,
+    OdometryCommandConfig, RefinementConfig,
 };
 use crate::simulation::SimulationConfig;
 

@@ -9,7 +9,7 @@ pub mod report;
 // The commands.
 mod commands;
 // Many runs.
-mod comparison;
+pub mod comparison;
 // The command line.
 pub mod cli;
 

@@ -3,9 +3,10 @@
 use std::sync::LazyLock;
 
 use arbtest::arbitrary::{Result, Unstructured};
+use fpmcl::internals::app::ComparisonConfig;
 use fpmcl::internals::app::settings::{
-    BuildMapConfig, CommandConfig, ComparisonConfig, EvaluationConfig, GroundCommandConfig,
-    LocalizationConfig, RefinementConfig, to_yaml,
+    BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, LocalizationConfig,
+    RefinementConfig, to_yaml,
 };
 use fpmcl::simulation::SimulationConfig;
 

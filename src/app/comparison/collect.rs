@@ -12,9 +12,9 @@ use super::plan::PlannedRun;
 use super::record::RunRecord;
 use super::results::ComparisonResults;
 use super::{cases, keys, page, tables};
+use crate::app::comparison::config::ComparisonConfig;
 use crate::app::comparison::table::Table;
 use crate::app::run::{Context, Outputs, output, version};
-use crate::app::settings::ComparisonConfig;
 
 /// Page of the sequences that are described as hard cases.
 const CASES_FILE: &str = "cases.md";

@@ -5,8 +5,9 @@ use anyhow::{Context as _, Result, bail};
 use clap::Args;
 
 use super::{Executor, Layout, Outcome, PlannedRun, RunId, collect, planned_runs};
+use crate::app::comparison::config::ComparisonConfig;
 use crate::app::run::{ConfigArgs, Context, output};
-use crate::app::settings::{self, CommandConfig as _, ComparisonConfig};
+use crate::app::settings::{self, CommandConfig as _};
 
 /// Arguments of `compare`.
 #[derive(Clone, Debug, Args)]

@@ -48,6 +48,7 @@
 // The command.
 pub mod compare;
 // Runs and their execution.
+mod config;
 mod execute;
 mod keys;
 mod layout;
@@ -69,6 +70,7 @@ mod tables;
 mod table_tests;
 
 pub use collect::collect;
+pub use config::ComparisonConfig;
 pub use execute::Executor;
 pub use layout::Layout;
 pub use plan::{PlannedRun, planned_runs};

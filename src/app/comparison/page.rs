@@ -8,11 +8,12 @@ use super::plan::PlannedRun;
 use super::record::{Outcome, RunRecord};
 use super::results::ComparisonResults;
 use super::table::{Cell, Column, Table};
+use crate::app::comparison::config::{ComparisonConfig, Overrides, settings};
 use crate::app::report::pages::{Page, PageElement, Section};
 use crate::app::report::results::length;
 use crate::app::report::run_page::{PICTURES, TEXTS, collapsed, picture};
 use crate::app::run::version;
-use crate::app::settings::{self, ComparisonConfig, Overrides, settings};
+use crate::app::settings::{self};
 use crate::evaluation::Summary;
 
 /// Picture of a run that the comparison has for all configurations together.

@@ -3,9 +3,11 @@
 use anyhow::{Context as _, Result};
 
 use super::record::RunId;
+use crate::app::comparison::config::{
+    ComparisonConfig, Overrides, SequenceConfig, VariantConfig, settings,
+};
 use crate::app::settings::{
-    self, BuildMapConfig, ComparisonConfig, LocalizationConfig, OdometrySource, Overrides,
-    RefinementConfig, SequenceConfig, VariantConfig, settings,
+    self, BuildMapConfig, LocalizationConfig, OdometrySource, RefinementConfig,
 };
 use crate::configuration::Configuration;
 use crate::simulation::SimulationConfig;

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use super::measures::Measure;
 use super::record::RunRecord;
 use super::statistics;
+use crate::app::comparison::config::{ComparisonConfig, Contrast};
 use crate::app::comparison::table::SuccessRate;
-use crate::app::settings::{ComparisonConfig, Contrast};
 
 /// All available records of a comparison.
 #[derive(Clone, Debug)]

@@ -7,8 +7,8 @@ use super::measures::{Measure, SELECTED, TABLE_1, TABLE_2};
 use super::record::RunRecord;
 use super::results::{ComparisonResults, success_rate, value};
 use super::statistics::{mean_with_spread, paired_difference};
+use crate::app::comparison::config::{Contrast, VariantConfig};
 use crate::app::comparison::table::{Cell, Column, Table};
-use crate::app::settings::{Contrast, VariantConfig};
 
 const SPREAD: &str = "Mean over sequences ± standard deviation over seeds ± standard deviation over sequences; the first ten frames (half of the frames in runs shorter than twenty) are not evaluated.";
 

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use approx::assert_relative_eq;
 
 use super::*;
+use crate::app::comparison::config::ComparisonConfig;
 use crate::app::comparison::record::{Outcome, RunId};
 use crate::app::report::TrajectoryReport;
-use crate::app::settings::ComparisonConfig;
 use crate::evaluation::{EvaluatedTrajectory, MetricsConfig, RangeMclRules, TrajectoryMetrics};
 use crate::geometry::Pose2;
 

@@ -156,7 +156,7 @@ pub struct OutputConfig {
 }
 
 /// Requires a path that is not empty.
-pub(super) fn require_path(key: &str, value: &Path) -> Result<(), InvalidValue> {
+pub fn require_path(key: &str, value: &Path) -> Result<(), InvalidValue> {
     let is_given = !value.as_os_str().is_empty();
     require(is_given, key, "empty", "give a path")
 }

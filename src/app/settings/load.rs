@@ -3,7 +3,6 @@
 use std::path::Path;
 
 use super::build_map::BuildMapConfig;
-use super::comparison::ComparisonConfig;
 use super::evaluation::EvaluationConfig;
 use super::ground::GroundCommandConfig;
 use super::localization::LocalizationConfig;
@@ -38,7 +37,6 @@ command_configs!(
     EvaluationConfig: "evaluation",
     GroundCommandConfig: "ground",
     SimulationConfig: "simulation",
-    ComparisonConfig: "comparison",
 );
 
 /// Every key of a command with its default and its documentation, below the heading of the short text.

@@ -9,7 +9,6 @@
 
 // One file per command.
 mod build_map;
-mod comparison;
 mod evaluation;
 mod ground;
 mod localization;
@@ -24,12 +23,9 @@ mod tests;
 
 pub use blocks::{
     GivenPosesConfig, MapInputConfig, MotionConfig, OdometrySource, OutputConfig, RecordingConfig,
+    require_path,
 };
 pub use build_map::BuildMapConfig;
-pub use comparison::{
-    ComparisonConfig, Contrast, Overrides, ParticleSweep, SequenceConfig, StageOverrides,
-    VariantConfig, settings,
-};
 pub use evaluation::EvaluationConfig;
 pub use ground::GroundCommandConfig;
 pub use load::{CommandConfig, full_text, load, with_settings};

@@ -7,7 +7,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::blocks::require_path;
+use crate::app::settings::{CommandConfig, require_path};
 use crate::validation::{InvalidValue, Validate, at_least_one, require};
 
 /// Keys of the configuration of a stage with their values, dotted as in `--set`
@@ -36,6 +36,11 @@ pub struct ComparisonConfig {
     pub contrasts: Vec<Contrast>,
     /// Success rate against the number of particles.
     pub particles: Option<ParticleSweep>,
+}
+
+impl CommandConfig for ComparisonConfig {
+    const PATH: &'static str = "config/comparison.yml";
+    const SHORT: &'static str = include_str!("../../../config/comparison.yml");
 }
 
 /// Overrides of the defaults of the stages.
