@@ -83,7 +83,8 @@ const ODOMETRY_STREAM: u64 = u64::MAX;
 pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
     input::require_file("map_file", &config.map_input.map_file)?;
-    RecordingInputs::new(&config.recording, &config.given_poses).require()?;
+    let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
+    inputs.require()?;
     let files = RunFiles::new(&config.output());
     let (mut claims, main) = prepare(config, context, &files)?;
     let is_trajectory = config.is_trajectory();
@@ -100,8 +101,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     run_output::warn_of_shortfall(&results, &config.result_file);
     let map = config.map_input.load(MapOptions::default(), context)?;
     let mut resolved = config.clone();
-    let (sequence, sensor) = RecordingInputs::new(&config.recording, &config.given_poses)
-        .open_in_map(&map, &mut resolved.sensor)?;
+    let (sequence, sensor) = inputs.open_in_map(&map, &mut resolved.sensor)?;
     let config = &resolved;
     if is_trajectory {
         results = follow(config, &map, &sequence)?;
@@ -118,14 +118,9 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
         }
         false => initial_estimates(&results, &estimates, &increments),
     };
-    let (refined, runtimes_s) = refine(
-        config,
-        context,
-        (&map, &sensor),
-        &sequence,
-        &starts,
-        &increments,
-    )?;
+    let frames = &sequence.frames;
+    let place = (&map, &sensor);
+    let (refined, runtimes_s) = refine(config, context, place, frames, &starts, &increments)?;
     let truth = sequence.frames.iter().map(|frame| frame.map_from_lidar);
     let truth: Option<Vec<Pose3>> = truth.collect();
     let planar = |truth: &[Pose3]| truth.iter().map(pose2_from_pose3).collect();
@@ -303,7 +298,7 @@ fn refine(
     config: &RefinementConfig,
     context: &Context,
     (map, sensor): (&Map, &Sensor),
-    sequence: &Recording,
+    frames: &[Frame],
     starts: &[InitialEstimate],
     increments: &[Option<Pose2>],
 ) -> Result<(RefinedTrajectory, Vec<f64>)> {
@@ -314,7 +309,7 @@ fn refine(
     let mut refiner = TrajectoryRefiner::new(map, sensor, refiner_config(config), config.seed)?;
     let mut runtimes_s = Vec::with_capacity(starts.len());
     let task = context.progress.task("refine", starts.len());
-    for (frame, start) in sequence.frames.iter().zip(starts) {
+    for (frame, start) in frames.iter().zip(starts) {
         context.interrupt.check()?;
         let scan = frame.read()?;
         let started = Instant::now();
@@ -325,7 +320,7 @@ fn refine(
     drop(task);
     refiner.place_backwards(starts, increments, |row| {
         context.interrupt.check()?;
-        anyhow::Ok(sequence.frames[row].read()?)
+        anyhow::Ok(frames[row].read()?)
     })?;
     let known: Option<Vec<Pose2>> = increments.iter().copied().collect();
     let is_used = config.motion.odometry != OdometrySource::None;

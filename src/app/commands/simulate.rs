@@ -22,6 +22,7 @@ use rayon::prelude::*;
 use crate::app::run::artefact::hash::hash_of_texts;
 use crate::app::run::{Claims, Context, Interrupt, Printed, Task, output, version};
 use crate::app::settings::to_yaml;
+use crate::evaluation::distances_m;
 use crate::files::remove_abandoned;
 use crate::geometry::Pose3;
 use crate::map::files::ply;
@@ -116,7 +117,10 @@ fn write_drive(
         frames: simulation.frames(),
         kept,
         triangles: simulation.street.surface.mesh.triangles.len(),
-        driven_m: length_m(&simulation.poses()),
+        driven_m: distances_m(&simulation.poses())
+            .last()
+            .copied()
+            .unwrap_or_default(),
         folder,
     })
 }
@@ -256,13 +260,6 @@ fn write_scans(
         return Err(interrupt.error().into());
     }
     Ok(kept.into_inner())
-}
-
-fn length_m(poses: &[Pose3]) -> f64 {
-    poses
-        .windows(2)
-        .map(|pair| (pair[1].translation.vector - pair[0].translation.vector).norm())
-        .sum()
 }
 
 #[cfg(test)]

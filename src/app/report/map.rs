@@ -12,7 +12,7 @@ use super::plotting::{MapPlot, SURFACES, VertexNumbers, muted};
 use super::run_output::MOST_TRIANGLES;
 use crate::app::run::Printed;
 use crate::evaluation::map_quality::ResidualSums;
-use crate::evaluation::{MapQuality, TruthAgreement};
+use crate::evaluation::{MapQuality, TruthAgreement, distances_m};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::map::mesh_view::{MeshView, Without, reduced};
 use crate::map::{LocalMapCounts, MappingPath};
@@ -67,10 +67,10 @@ impl BuildReport {
         mesh_file: &Path,
         started: Instant,
     ) -> Self {
-        let poses = path.map_from_lidar.iter();
-        let positions = poses.map(|pose| pose.translation.vector);
-        let steps = positions.clone().zip(positions.skip(1));
-        let path_m = steps.map(|(from, to)| (to - from).norm()).sum();
+        let path_m = distances_m(&path.map_from_lidar)
+            .last()
+            .copied()
+            .unwrap_or_default();
         let map_mb = std::fs::metadata(mesh_file).map_or(0.0, |file| file.len() as f64 / 1e6);
         let per_100m = |amount: f64| 100.0 * amount / f64::max(path_m, 1.0);
         let triangles = meshes.iter().map(|mesh| mesh.triangles()).sum();

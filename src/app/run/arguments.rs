@@ -8,8 +8,7 @@ use clap::Args;
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::Context;
-use super::machine::MachineArgs;
+use super::context::{Context, MachineArgs};
 use crate::app::settings::{self, CommandConfig};
 
 /// Configuration and machine.
@@ -41,7 +40,7 @@ impl ConfigArgs {
 }
 
 /// Whether a path is that of a configuration.
-fn is_config(path: &Path) -> bool {
+pub fn is_config(path: &Path) -> bool {
     let extension = path.extension();
     extension.is_some_and(|it| it.eq_ignore_ascii_case("yml") || it.eq_ignore_ascii_case("yaml"))
 }

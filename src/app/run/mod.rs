@@ -7,7 +7,6 @@ pub mod failure;
 pub mod input;
 pub mod interrupt;
 pub mod logging;
-pub mod machine;
 pub mod output;
 pub mod progress;
 mod remedy;
@@ -15,8 +14,7 @@ pub mod version;
 
 pub use arguments::{ConfigArgs, RunArgs};
 pub use artefact::{CLAIMS_FILE, Claims, Lock, NPZ, Outputs, PLY};
-pub use context::Context;
+pub use context::{Context, MachineArgs, gibibytes};
 pub use interrupt::{Interrupt, Interrupted};
-pub use machine::MachineArgs;
 pub use output::{Form, Printed};
 pub use progress::{Progress, Task};

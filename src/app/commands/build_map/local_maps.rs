@@ -1,15 +1,18 @@
-//! The local maps of a build: those that are not finished yet are built, and all are kept on disk.
+//! The local maps of a build: those that are not finished yet are built, and all are kept on disk. They are built by one
+//! process, or as independent jobs on any number of machines that share the folder of the map.
 
 use std::collections::BTreeMap;
+use std::fmt::Write as _;
 use std::sync::{Arc, Mutex};
 
 use anyhow::{Context as _, Result, bail};
 
-use super::opened::Opened;
+use super::opened::{Opened, open};
 use super::parts::{Parts, Role};
 use super::progress::BuildProgress;
-use crate::app::run::Context;
 use crate::app::run::artefact::hash::{hash_of_scan, hash_of_scans, joint_hash};
+use crate::app::run::{Context, Printed};
+use crate::app::settings::BuildMapConfig;
 use crate::map::build::plan::LocalMapPlan;
 use crate::map::build::scan_agreement;
 use crate::map::{BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan};
@@ -46,12 +49,32 @@ pub fn build(
     Ok((all, progress))
 }
 
+/// One shell command per local map that is not finished, for the current folder: the command line of this process with
+/// `--job` instead of `--list-jobs`. The poses are found first.
+pub fn list_jobs(config: &BuildMapConfig, context: &Context) -> Result<Printed> {
+    let (opened, _claims) = open(config, Role::Build, context)?;
+    let words = std::env::args_os().map(|word| word.to_string_lossy().into_owned());
+    let command = shell_words::join(words.filter(|word| word != "--list-jobs"));
+    let mut commands = String::new();
+    for number in missing(&opened) {
+        writeln!(commands, "{command} --job {number}")?;
+    }
+    Ok(Printed::text(commands))
+}
+
+/// Builds a local map by its number.
+pub fn build_job(config: &BuildMapConfig, number: usize, context: &Context) -> Result<Printed> {
+    let (opened, _claims) = open(config, Role::Job, context)?;
+    let (counts, count) = build_one(&opened, number, context)?;
+    let triangles = counts.triangles;
+    Ok(Printed::text(format!(
+        "local map {number} (0 to {}): {triangles} triangles\n",
+        count - 1
+    )))
+}
+
 /// Builds one of the local maps if it is not finished yet; returns its counts, and how many there are.
-pub fn build_one(
-    opened: &Opened,
-    number: usize,
-    context: &Context,
-) -> Result<(LocalMapCounts, usize)> {
+fn build_one(opened: &Opened, number: usize, context: &Context) -> Result<(LocalMapCounts, usize)> {
     let planned = opened.local_maps();
     let count = planned.len();
     let local_map = planned.get(number).with_context(|| {
@@ -69,6 +92,28 @@ pub fn build_one(
     let counts = counts.map_err(|error| context.interrupt.explain(error))?;
     progress.finish();
     Ok((counts, count))
+}
+
+/// Requires that all local maps are finished where they are collected.
+pub fn require_all(opened: &Opened, role: Role) -> Result<()> {
+    let missing = missing(opened);
+    if role != Role::Collect || missing.is_empty() {
+        return Ok(());
+    }
+    let names: Vec<String> = missing.iter().map(usize::to_string).collect();
+    bail!(
+        "local maps {} are not finished: run their jobs (--list-jobs lists them), or leave out --collect to build them here",
+        names.join(", ")
+    )
+}
+
+/// Numbers of the local maps that are not finished.
+fn missing(opened: &Opened) -> Vec<usize> {
+    let planned = opened.local_maps();
+    let numbers = planned.iter().map(|local_map| local_map.number);
+    numbers
+        .filter(|&number| !opened.parts.has(number))
+        .collect()
 }
 
 /// A builder that reports its progress, and stops when it is interrupted.

@@ -3,13 +3,11 @@
 mod arguments;
 mod cloud;
 mod files;
-mod jobs;
 mod joined;
 mod local_maps;
 mod older;
 mod opened;
 mod parts;
-mod pose_check;
 mod poses;
 mod progress;
 mod quality;
@@ -41,8 +39,8 @@ pub fn run_part(config: &BuildMapConfig, part: BuildPart, context: &Context) -> 
         "cloud_file is meshed by one process: jobs are those of a recording; leave out --list-jobs, --job and --collect"
     );
     match part {
-        BuildPart::List => jobs::list(config, context),
-        BuildPart::LocalMap(number) => jobs::build(config, number, context),
+        BuildPart::List => local_maps::list_jobs(config, context),
+        BuildPart::LocalMap(number) => local_maps::build_job(config, number, context),
         BuildPart::Collect => run_with_scans(config, Role::Collect, context)?.printed(),
     }
 }
@@ -51,7 +49,7 @@ pub fn run_part(config: &BuildMapConfig, part: BuildPart, context: &Context) -> 
 fn run_with_scans(config: &BuildMapConfig, role: Role, context: &Context) -> Result<BuildReport> {
     let started = Instant::now();
     let (opened, mut claims) = opened::open(config, role, context)?;
-    jobs::require_all(&opened, role)?;
+    local_maps::require_all(&opened, role)?;
     let (local_maps, progress) = local_maps::build(&opened, role, context)?;
 
     let joined = progress.time("join", || opened.parts.joined(local_maps.len()))?;

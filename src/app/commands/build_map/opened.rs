@@ -8,7 +8,7 @@ use anyhow::{Context as _, Result};
 use super::files::prepare;
 use super::older::{self, OlderMap};
 use super::parts::{Parts, Role};
-use super::{pose_check, poses};
+use super::poses;
 use crate::app::commands::stages::{RecordingInputs, complete};
 use crate::app::commands::trajectory::{self, file_beside};
 use crate::app::run::{Claims, Context, input, version};
@@ -57,7 +57,7 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
     let (older, older_map) = older::open(&config, context)?.unzip();
     let recording = poses::open(&config, older.as_ref())?;
     let (mut sequence, sensor) = complete(&mut config.map.sensor, recording)?;
-    pose_check::check(&sequence, &config)
+    poses::check(&sequence, &config)
         .with_context(|| poses::origin(&sequence).unwrap_or_default())?;
     let mut trajectory = None;
     if sequence.track.is_none() || config.map.poses == PoseSource::Polished {

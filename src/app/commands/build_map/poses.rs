@@ -17,8 +17,10 @@ use crate::app::run::{Context, output, version};
 use crate::app::settings::BuildMapConfig;
 use crate::geometry::Pose3;
 use crate::map::{Map, PoseSource};
-use crate::mapping::{self, TrajectorySummary, find_poses, find_poses_in};
-use crate::odometry::TrajectoryConfig;
+use crate::mapping::{
+    self, MappingError, PoseReport, TrajectorySummary, find_poses, find_poses_in,
+};
+use crate::odometry::{PoseFit, PoseMeaning, TrajectoryConfig};
 use crate::recording::poses::write_tum;
 use crate::recording::{Frame, PoseTrack, Recording};
 use crate::sensor::Sensor;
@@ -150,4 +152,51 @@ fn inputs(frames: &[Frame], is_given: bool, localized_by: &str) -> Result<String
         ));
     }
     Ok(hash_of_texts(&parts))
+}
+
+/// Checks the poses of a recording whose scans are not compensated by them: an error where they are of another
+/// motion, a warning where they are doubtful or the map is not level.
+pub fn check(recording: &Recording, config: &BuildMapConfig) -> Result<()> {
+    if !config.map.check_poses || recording.track.is_none() {
+        return Ok(());
+    }
+    let report = PoseReport::new(recording)?;
+    report.require_fit().map_err(with_remedy)?;
+    match report.fit() {
+        PoseFit::Fits => tracing::debug!("the poses fit the scans: {report}"),
+        _ => tracing::warn!("the poses fit the scans badly: {report}{}", remedy(&report)),
+    }
+    match report.tilt {
+        Some(tilt) if tilt.is_uneven() => tracing::warn!(
+            "the direction up of the ground varies by {:.0} degrees along the drive: check the rotations in pose_file, calib_file and body_from_lidar",
+            tilt.spread_rad.to_degrees()
+        ),
+        Some(tilt) if tilt.is_steep() => tracing::warn!(
+            "the ground is tilted by {:.0} degrees in the map, whose frame is that of the lidar in the first row of the poses: turn scans and poses so that its z axis points up",
+            tilt.tilt_rad.to_degrees()
+        ),
+        _ => {}
+    }
+    Ok(())
+}
+
+fn with_remedy(error: MappingError) -> anyhow::Error {
+    match &error {
+        MappingError::PosesDoNotFit(report) => anyhow::anyhow!("{error}{}", remedy(report)),
+        _ => error.into(),
+    }
+}
+
+/// What to change in the configuration.
+fn remedy(report: &PoseReport) -> String {
+    match report.better() {
+        None | Some(PoseMeaning::Given) => "; check that pose_file belongs to this recording, and that calib_file or body_from_lidar describe the body whose poses it has".to_owned(),
+        Some(PoseMeaning::Camera) => ": give calib_file with the line Tr".to_owned(),
+        Some(PoseMeaning::Lidar) => ": remove calib_file and body_from_lidar".to_owned(),
+        Some(PoseMeaning::Inverse) => ": invert the rows of pose_file".to_owned(),
+        Some(PoseMeaning::Turned(rad)) => format!(
+            ": give body_from_lidar with a yaw of {:.0} degrees",
+            rad.to_degrees()
+        ),
+    }
 }

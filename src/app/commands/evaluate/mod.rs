@@ -202,11 +202,10 @@ fn read(config: &EvaluationConfig) -> Result<LocalizationResults> {
 
 /// Prepares the configured outputs; the effective configuration is the main one.
 fn prepare(config: &EvaluationConfig, context: &Context, main: &Path) -> Result<Claims> {
-    let reports = REPORT_FILES.iter();
-    let mut names: Vec<&str> = reports
-        .copied()
-        .filter(|_| config.save_evaluation_results)
-        .collect();
+    let mut names = Vec::new();
+    if config.save_evaluation_results {
+        names.extend(REPORT_FILES);
+    }
     names.extend(config.output.plots.then_some("plots"));
     if names.is_empty() {
         return Claims::read(folder_of(main));
@@ -239,11 +238,8 @@ fn about(config: &EvaluationConfig) -> Result<BTreeMap<String, String>> {
     } else {
         BTreeMap::new()
     };
-    let truth = config
-        .given_poses
-        .pose_file
-        .as_ref()
-        .or(config.scan_folder.as_ref());
+    let truth = config.given_poses.pose_file.as_ref();
+    let truth = truth.or(config.scan_folder.as_ref());
     for (name, path) in [("result", Some(&config.result_file)), ("truth", truth)] {
         about.remove(name);
         about.extend(path.map(|path| (name.to_owned(), path.display().to_string())));
@@ -254,48 +250,40 @@ fn about(config: &EvaluationConfig) -> Result<BTreeMap<String, String>> {
 /// The configuration of the localization next to a result, if there is one.
 fn localization_of(result: &Path) -> Result<Option<LocalizationConfig>> {
     let effective = RunFiles::new(result).file("effective_localization.yml");
-    if effective.exists() {
-        Ok(Some(settings::load(Some(&effective), &[])?))
-    } else {
-        Ok(None)
-    }
+    let load = || settings::load(Some(&effective), &[]);
+    Ok(effective.exists().then(load).transpose()?)
 }
 
 /// The map of a run for pictures, a large one coarser, and its path; `None` if its file does not exist.
 fn map_of(localized: &LocalizationConfig) -> Result<Option<(TriangleMesh, Option<MappingPath>)>> {
-    if !localized.map_input.map_file.exists() {
-        tracing::info!(
-            "{} does not exist any more",
-            localized.map_input.map_file.display()
-        );
+    let file = &localized.map_input.map_file;
+    if !file.exists() {
+        tracing::info!("{} does not exist any more", file.display());
         return Ok(None);
     }
-    Ok(Some(match MappedPly::open(&localized.map_input.map_file) {
+    Ok(Some(match MappedPly::open(file) {
         Some(mesh) => {
             let drawn = reduced(&[(&mesh, None)], run_output::MOST_TRIANGLES);
             (drawn, mesh.path)
         }
-        None => mesh_file::read(&localized.map_input.map_file)?,
+        None => mesh_file::read(file)?,
     }))
 }
 
 /// Converts positions in grid cells to metres.
 fn scale(results: &mut LocalizationResults, grid_resolution_m: f64) {
-    if grid_resolution_m == 1.0 {
-        return;
-    }
     let columns = [&mut results.estimates, &mut results.refined];
     for pose in columns.into_iter().flatten().flatten() {
         pose.translation.vector *= grid_resolution_m;
     }
-    results.particles.scale_positions(grid_resolution_m as f32);
-    let columns = [
+    let [estimates, refined] = [
         &mut results.estimates_in_space,
         &mut results.refined_in_space,
     ];
-    for pose in columns.into_iter().flatten().flatten() {
+    for pose in [estimates, refined].into_iter().flatten().flatten() {
         pose.translation.vector *= grid_resolution_m;
     }
+    results.particles.scale_positions(grid_resolution_m as f32);
 }
 
 /// The results of the frames that the configuration selects.
@@ -303,23 +291,20 @@ fn selected(
     results: LocalizationResults,
     config: &EvaluationConfig,
 ) -> Result<LocalizationResults> {
-    let window = usize::try_from(config.frames.n_scans).unwrap_or(usize::MAX);
-    let end = config.frames.start_idx.saturating_add(window);
+    let frames = &config.frames;
+    let window = usize::try_from(frames.n_scans).unwrap_or(usize::MAX);
+    let selected = frames.start_idx..frames.start_idx.saturating_add(window);
     let rows: Vec<usize> = (0..results.len())
-        .filter(|&row| {
-            let frame = results.frames[row];
-            (config.frames.start_idx..end).contains(&frame)
-        })
-        .step_by(config.frames.frame_step)
+        .filter(|&row| selected.contains(&results.frames[row]))
+        .step_by(frames.frame_step)
         .collect();
     ensure!(
         !rows.is_empty(),
         "no frame of {} is selected; check start_idx, n_scans and frame_step",
         config.result_file.display()
     );
-    Ok(if rows.len() == results.len() {
-        results
-    } else {
-        results.select(&rows)
-    })
+    if rows.len() == results.len() {
+        return Ok(results);
+    }
+    Ok(results.select(&rows))
 }

@@ -4,8 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use crate::app::run::MachineArgs;
-use crate::app::run::machine::gibibytes;
+use crate::app::run::{MachineArgs, gibibytes};
 
 /// Arguments of `export`.
 #[derive(Clone, Debug, Args)]

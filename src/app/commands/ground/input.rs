@@ -7,7 +7,7 @@ use clap::Args;
 
 use crate::app::commands::stages::is_bag;
 use crate::app::run::MachineArgs;
-use crate::app::run::arguments::setting;
+use crate::app::run::arguments::{is_config, setting};
 use crate::app::run::input::require_folder;
 use crate::app::settings::{self, GroundCommandConfig};
 use crate::evaluation::LabelledPoints;
@@ -69,8 +69,7 @@ pub fn load(args: &GroundArgs) -> Result<(GroundCommandConfig, PathBuf)> {
         settings.push(("force".to_owned(), "true".to_owned()));
     }
     let argument = args.input.as_deref();
-    let is_config = |path: &&Path| has_extension(path, "yml") || has_extension(path, "yaml");
-    let (config_path, input) = match argument.filter(is_config) {
+    let (config_path, input) = match argument.filter(|path| is_config(path)) {
         Some(_) if args.config.is_some() => bail!(
             "the first argument and --config both name a configuration; leave one of them out"
         ),
@@ -124,10 +123,6 @@ pub fn scans(path: &Path, config: &GroundCommandConfig) -> Result<Vec<LabelledSc
 /// Whether a path names one scan, not a folder of scans.
 pub fn is_scan(path: &Path) -> bool {
     scan_files::is_scan(path) && !path.is_dir()
-}
-
-fn has_extension(path: &Path, extension: &str) -> bool {
-    path.extension().is_some_and(|found| found == extension)
 }
 
 /// The existing label file of a scan: of the same name in `label_folder`, by default in `labels`

@@ -1,22 +1,24 @@
 //! `localize`: localizes a recording in a map, scan by scan.
 
-mod arguments;
 mod recorder;
 
+use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
+use clap::Args;
 use nalgebra::Vector2;
+use serde::Serialize;
 
-pub use self::arguments::LocalizeArgs;
 use self::recorder::Run;
 use super::motion_source;
 use super::motion_source::{FrameMotion, MotionSource};
 use super::stages::{RecordingInputs, input_files};
 use crate::app::report::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES};
 use crate::app::report::{LocalizationResults, Report, RunFiles, run_page};
-use crate::app::run::{Claims, Context, Interrupted, NPZ, Outputs, input, output};
+use crate::app::run::arguments::numbers;
+use crate::app::run::{Claims, Context, Interrupted, NPZ, Outputs, RunArgs, input, output};
 use crate::app::settings::{Initialization, LocalizationConfig, MotionModel};
 use crate::evaluation::RangeMclRules;
 use crate::geometry::Pose2;
@@ -28,38 +30,78 @@ use crate::recording::Recording;
 use crate::refinement::{InitialEstimate, TrajectoryRefiner};
 use crate::sensor::Sensor;
 
+/// Arguments of `localize`.
+#[derive(Clone, Debug, Args, Serialize)]
+pub struct LocalizeArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub run: RunArgs,
+
+    /// Map of `build-map` or range-mcl, or a mesh (.ply, .obj, .stl); sets the key `map_file`.
+    #[arg(long = "map", value_name = "MAP")]
+    pub map_file: Option<PathBuf>,
+
+    /// Start in the map [m, deg], if it is known; sets the key `initial_pose`.
+    #[arg(long, value_name = "X,Y,HEADING", value_parser = start_pose, allow_hyphen_values = true)]
+    #[serde(rename = "initial_pose")]
+    pub start: Option<[f64; 3]>,
+
+    /// Odometry, rows of KITTI or TUM, or a topic of the bag; by default the topic of odometry that a bag has, else the scans. Sets the key `odometry_file`.
+    #[arg(long = "odometry", value_name = "FILE")]
+    pub odometry_file: Option<PathBuf>,
+
+    /// True poses of the recording for the report; sets the key `pose_file`.
+    #[arg(long = "truth", value_name = "FILE")]
+    pub pose_file: Option<PathBuf>,
+
+    /// Calibration of the camera whose poses these are; sets the key `calib_file`.
+    #[arg(long = "calib", value_name = "FILE")]
+    pub calib_file: Option<PathBuf>,
+
+    /// Result to write (.npz); sets the key `result_path`.
+    #[arg(long = "output", value_name = "RESULT")]
+    pub result_path: Option<PathBuf>,
+
+    /// Log to write afterwards, for Foxglove and rerun (.mcap), as `export` does.
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    pub mcap: Option<PathBuf>,
+}
+
+/// Parses a start: x, y [m], heading [deg].
+fn start_pose(text: &str) -> Result<[f64; 3], &'static str> {
+    let help = "give x and y in the map in metres and the heading in degrees, such as 12.5,-3,90";
+    numbers(text, help)
+}
+
 /// Random stream of the noise on the odometry; the localizer has its own streams.
 const ODOMETRY_STREAM: u64 = 1;
 
 /// Localizes the selected frames of a recording.
 pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     input::require_file("map_file", &config.map_input.map_file)?;
-    RecordingInputs::new(&config.recording, &config.given_poses).require()?;
+    let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
+    inputs.require()?;
     let files = RunFiles::new(&config.result_path);
     context.interrupt.keeps("no frame was finished");
     let claims = prepare(config, context, &files)?;
     let map = config.map_input.load(config.map_options(), context)?;
     let mut resolved = config.clone();
-    let (sequence, sensor) = RecordingInputs::new(&config.recording, &config.given_poses)
-        .open_in_map(&map, &mut resolved.tracker.sensor)?;
+    let (sequence, sensor) = inputs.open_in_map(&map, &mut resolved.tracker.sensor)?;
     let (motion, odometry_file) = MotionSource::open(
         &config.motion,
-        &RecordingInputs::new(&config.recording, &config.given_poses),
+        &inputs,
         &sequence,
         &mut stream(config.tracker.seed, ODOMETRY_STREAM),
     )?;
     resolved.motion.odometry_file = odometry_file;
     let config = &resolved;
     let motion = Mutex::new(motion);
-    let run = Mutex::new(Run::new(
-        config,
-        &map,
-        &files,
-        sequence.frames.len(),
-        claims,
-    )?);
+    let frames = sequence.frames.len();
+    let run = Mutex::new(Run::new(config, &map, &files, frames, claims)?);
     let recorded = || run.lock().unwrap_or_else(PoisonError::into_inner);
-    let kept = |run: &Run| run.kept(config, sequence.frames.len());
+    let kept = |run: &Run| run.kept(config, frames);
     context.interrupt.supervise(
         || {
             localize(
@@ -79,7 +121,7 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
     )?;
     let mut run = run.into_inner().unwrap_or_else(PoisonError::into_inner);
     let report = write_run(config, context, &files, &map, &sequence, &mut run)?;
-    run.finish(config, sequence.frames.len())?;
+    run.finish(config, frames)?;
     Ok(report)
 }
 

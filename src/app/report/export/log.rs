@@ -28,7 +28,7 @@ use foxglove::{Encode, Schema};
 use mcap::records::MessageHeader;
 use mcap::{WriteOptions, Writer};
 use nalgebra::Matrix3;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::glb::Model;
 use crate::app::report::plotting::color::{MCL, REFINED, Rgb, TRUTH};
@@ -210,12 +210,7 @@ impl Trajectories {
         log.send_json("/numbers", stamp, &self.numbers(results, row, state(row)))
     }
 
-    fn numbers(
-        &self,
-        results: &LocalizationResults,
-        row: usize,
-        state: Option<&str>,
-    ) -> serde_json::Value {
+    fn numbers(&self, results: &LocalizationResults, row: usize, state: Option<&str>) -> Value {
         let errors = |poses: &[Pose3]| {
             let [pose, truth] = [&poses[row], &self.truth.as_ref()?[row]].map(pose2_from_pose3);
             planar_errors(&[pose], &[truth]).first().copied()
@@ -299,12 +294,7 @@ impl<W: Write + Seek> LogWriter<W> {
         self.write(topic, stamp, &schema, &M::get_message_encoding(), &data)
     }
 
-    fn send_json(
-        &mut self,
-        topic: &'static str,
-        stamp: u64,
-        message: &serde_json::Value,
-    ) -> Result<()> {
+    fn send_json(&mut self, topic: &'static str, stamp: u64, message: &Value) -> Result<()> {
         const SCHEMA: &str = include_str!("frame.schema.json");
         let schema = Schema::new("fpmcl.Frame", "jsonschema", SCHEMA.as_bytes());
         self.write(topic, stamp, &schema, "json", &serde_json::to_vec(message)?)

@@ -8,8 +8,7 @@ use glam::Vec3;
 use super::bitmap::Bitmap;
 use super::color::Rgb;
 use super::sheet::save_png;
-use super::top_view::{TopView, WIDTH};
-use super::view::{AxisRange, LegendEntry, Mark};
+use super::view::{AxisRange, LegendEntry, Mark, TopView, WIDTH};
 
 /// Color of points correctly classified as ground.
 const GROUND: Rgb = [0, 158, 115];

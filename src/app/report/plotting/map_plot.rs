@@ -8,8 +8,7 @@ use super::MapImage;
 use super::bitmap::Bitmap;
 use super::color::{Colormap, MISSING, Rgb, TRUTH, WHITE};
 use super::sheet::{save_png, stroke};
-use super::top_view::{TopView, WIDTH, positions};
-use super::view::{AxisRange, ColorBar, LegendEntry, Mark};
+use super::view::{AxisRange, ColorBar, LegendEntry, Mark, TopView, WIDTH, positions};
 use crate::geometry::{Pose2, TriangleMesh};
 
 /// Maximum number of columns and rows of the raster: the resolution of drawing.

@@ -11,14 +11,12 @@ mod view;
 // The pictures.
 mod animation;
 mod chart;
-mod drift;
 mod ground_plot;
 mod interactive;
 mod map_image;
 mod map_plot;
 mod particles;
 mod range_images;
-mod top_view;
 mod trajectory;
 
 #[cfg(test)]
@@ -27,12 +25,11 @@ mod tests;
 pub use animation::save_animation;
 pub use bitmap::Bitmap;
 pub use chart::{FRAME, LineChart, Panel, Series};
-pub use drift::drift_chart;
 pub use ground_plot::GroundPlot;
 pub use interactive::InteractivePath;
 pub use map_image::{MapImage, SURFACES, muted};
 pub use map_plot::{MapPlot, VertexNumbers};
 pub use particles::LocalizationPicture;
 pub use range_images::RangeImageStrip;
-pub use trajectory::{PathPlot, error_chart};
+pub use trajectory::{PathPlot, drift_chart, error_chart};
 pub use view::Mark;

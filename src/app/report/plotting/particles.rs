@@ -8,8 +8,7 @@ use super::MapImage;
 use super::bitmap::Bitmap;
 use super::color::{Colormap, MCL, Rgb, TRUTH, WHITE};
 use super::sheet::{Point, Sheet, save_png, stroke};
-use super::top_view::{TopView, WIDTH, positions};
-use super::view::{AxisRange, ColorBar, LegendEntry, Mark, View};
+use super::view::{AxisRange, ColorBar, LegendEntry, Mark, TopView, View, WIDTH, positions};
 use crate::evaluation::ParticleRow;
 use crate::geometry::Pose2;
 

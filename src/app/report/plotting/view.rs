@@ -2,10 +2,12 @@
 
 use anyhow::Result;
 
+use super::bitmap::Bitmap;
 use super::color::{Colormap, FRAME, GRID, INK, Rgb};
 use super::sheet::{
-    HPos, LABEL, Point, Rect, Sheet, TICK, VPos, stroke, text_style, text_width, upwards,
+    self, HPos, LABEL, Point, Rect, Sheet, TICK, VPos, stroke, text_style, text_width, upwards,
 };
+use crate::geometry::Pose2;
 
 /// Range of numbers along an axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -325,6 +327,64 @@ impl ColorBar<'_> {
         let center = (right + widest + 28.0, 0.5 * (rect.top + rect.bottom));
         sheet.text(self.name, center, &upwards(&style))
     }
+}
+
+/// Width of a picture [px].
+pub const WIDTH: f64 = 1400.0;
+
+/// Picture of the x-y plane without its content.
+pub struct TopView<'a> {
+    pub title: &'a str,
+    /// Width [px].
+    pub width: f64,
+    pub legend: Vec<LegendEntry>,
+    /// Visible range of x [m].
+    pub x: AxisRange,
+    /// Visible range of y [m].
+    pub y: AxisRange,
+    pub color_bar: Option<ColorBar<'a>>,
+}
+
+impl TopView<'_> {
+    /// Draws the picture; `content` draws over the grid and below the frame.
+    pub fn draw(&self, content: impl FnOnce(&Sheet, &View) -> Result<()>) -> Result<Bitmap> {
+        const LEFT: f64 = 118.0;
+        // The legend is in a line of its own.
+        let top = if self.legend.is_empty() { 66.0 } else { 96.0 };
+        let right = self.width
+            - if self.color_bar.is_some() {
+                150.0
+            } else {
+                30.0
+            };
+        let height = ((right - LEFT) * self.y.length() / self.x.length())
+            .clamp(0.27 * self.width, 0.82 * self.width);
+        let rect = Rect {
+            left: LEFT,
+            top,
+            right,
+            bottom: top + height.round(),
+        };
+        let view = View::equal(rect, self.x, self.y);
+        sheet::draw((self.width as u32, (rect.bottom + 74.0) as u32), |sheet| {
+            sheet.title(self.title, LEFT)?;
+            legend(sheet, &self.legend, (LEFT, 70.0), right)?;
+            view.grid(sheet, &view.x_ticks())?;
+            content(sheet, &view)?;
+            view.frame(sheet, &view.x_ticks(), ["x [m]", "y [m]"])?;
+            view.scale_bar(sheet)?;
+            match self.color_bar {
+                Some(bar) => bar.draw(sheet, &rect, [right + 22.0, right + 48.0]),
+                None => Ok(()),
+            }
+        })
+    }
+}
+
+/// Points on the sheet of the positions of poses.
+pub fn positions(poses: &[Pose2], view: &View) -> Vec<Point> {
+    let positions = poses.iter().map(|pose| pose.translation);
+    positions.map(|t| view.at(t.x, t.y)).collect()
 }
 
 #[cfg(test)]

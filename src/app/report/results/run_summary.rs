@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::localization_results::LocalizationResults;
 use super::rows::{MetricRow, length, metrics};
-use crate::evaluation::Summary;
+use crate::evaluation::{Summary, distances_m};
 use crate::geometry::Pose2;
 use crate::localization::State;
 use crate::localization::particles::long_axis_m;
@@ -45,10 +45,7 @@ impl RunSummary {
             Summary::new(&values)
         };
         let covariance = |row: usize| Some(results.covariances.as_ref()?[row]);
-        let steps = estimates.iter().zip(estimates.iter().skip(1));
-        let path_m = steps
-            .map(|(a, b)| (b.translation.vector - a.translation.vector).norm())
-            .sum();
+        let path_m = distances_m(estimates).last().copied().unwrap_or_default();
         let times_s = results.recorded_times().unwrap_or_default();
         let duration_s = times_s.first().zip(times_s.last()).map(|(a, b)| b - a);
         Self {

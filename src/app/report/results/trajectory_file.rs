@@ -20,16 +20,10 @@ pub fn write_trajectory_npz(
     steps: &[&OdometryEstimate],
 ) -> Result<()> {
     let count = frames.len();
-    let matrices = |poses: &mut dyn Iterator<Item = Pose3>| -> Vec<f64> {
-        // Columns of the transpose are rows of the matrix.
-        poses
-            .flat_map(|pose| pose.to_homogeneous().transpose().data.0.concat())
-            .collect()
-    };
-    let odometry = &mut steps.iter().map(|step| step.odom_from_lidar);
-    let covariances = steps
-        .iter()
-        .flat_map(|step| step.covariance.data.0.concat());
+    // Columns of the transpose are rows of the matrix.
+    let matrix = |pose: &Pose3| pose.to_homogeneous().transpose().data.0.concat();
+    let odometry = steps.iter().flat_map(|step| matrix(&step.odom_from_lidar));
+    let covariances = (steps.iter()).flat_map(|step| step.covariance.data.0.concat());
     let state = |step: &&OdometryEstimate| match step.state {
         StepState::First => 0_u8,
         StepState::Registered => 1,
@@ -38,18 +32,12 @@ pub fn write_trajectory_npz(
     };
     output::write_file(path, |file| {
         let mut npz = NpzWriter::new(file);
-        npz.add(
-            "frames",
-            &[count],
-            frames.iter().map(|frame| frame.number as u64),
-        )?;
+        let numbers = frames.iter().map(|frame| frame.number as u64);
+        npz.add("frames", &[count], numbers)?;
         npz.add("times_s", &[count], frames.iter().map(|frame| frame.time_s))?;
-        npz.add(
-            "map_from_lidar",
-            &[count, 4, 4],
-            matrices(&mut poses.iter().copied()),
-        )?;
-        npz.add("odom_from_lidar", &[count, 4, 4], matrices(odometry))?;
+        let poses = poses.iter().flat_map(matrix);
+        npz.add("map_from_lidar", &[count, 4, 4], poses)?;
+        npz.add("odom_from_lidar", &[count, 4, 4], odometry)?;
         npz.add("motion_covariances", &[count, 6, 6], covariances)?;
         npz.add("states", &[count], steps.iter().map(state))?;
         npz.finish()
