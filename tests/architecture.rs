@@ -654,6 +654,20 @@ fn users_of_the_library_do_not_compile_the_simulation() {
 }
 
 #[test]
+fn the_python_package_uses_the_library_and_no_module_of_the_program() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/src");
+    let files: Vec<PathBuf> = fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .collect();
+    assert!(files.len() > 5, "{files:?}");
+    for file in files {
+        let text = fs::read_to_string(&file).unwrap();
+        assert!(!text.contains("fpmcl::app"), "{}", file.display());
+    }
+}
+
+#[test]
 fn no_files_import_each_other() {
     let cycles = Crate::new(&sources()).cycles();
     assert!(cycles.is_empty(), "{}", cycles.join("\n"));
