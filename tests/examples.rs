@@ -38,6 +38,19 @@ fn a_drive_without_poses_is_mapped_along_the_path_that_it_has_driven() {
     }
 }
 
+#[test]
+fn a_drive_is_mapped_and_another_one_localized_in_it_without_a_word_about_the_sensor() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    simulate_two_drives(folder, SIMULATION);
+    let printed = example("pipeline", folder, &["street/drive_1", "street/drive_2"]);
+    let tracking = printed.lines().filter(|line| line.ends_with("tracking"));
+    assert!(
+        printed.lines().count() == 16 && tracking.count() >= 14,
+        "{printed}"
+    );
+}
+
 /// Runs an example in a folder and returns its output.
 #[track_caller]
 fn example(name: &str, folder: &Path, arguments: &[&str]) -> String {

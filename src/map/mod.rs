@@ -17,7 +17,6 @@ pub(crate) mod world_for_tests;
 
 pub use crate::raycasting::{TileError, TileProblem};
 pub use build::builder::{BuildError, BuildEvent, MapBuilder, MapPlan, ScanError};
-pub use build::confidence::ConfidenceConfig;
 pub use build::config::{MapConfig, MapOptions, PoseSource};
 pub use build::local_map::{LocalMap, LocalMapConfig, LocalMapCounts};
 pub use build::path_check::ImplausiblePath;

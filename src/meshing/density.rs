@@ -138,7 +138,7 @@ fn splat(samples: &Samples, level: &Level) -> Vec<OwnValues> {
             for (z, wz) in weights[2].iter().enumerate() {
                 for (y, wy) in weights[1].iter().enumerate() {
                     let row = local[0] + 6 * (local[1] + y) + 36 * (local[2] + z);
-                    let w = samples.weights[sample] * wy * wz;
+                    let w = wy * wz;
                     for (x, wx) in weights[0].iter().enumerate() {
                         padded[row + x] += w * wx;
                     }

@@ -16,8 +16,6 @@ pub enum MeshingError {
         given: usize,
         needed: usize,
     },
-    #[error("{weights} weights were given for {points} points; give one per point")]
-    WeightsDoNotMatch { points: usize, weights: usize },
     #[error(
         "the points extend over {extent_m:.0} m, so that the finest octree cells would be {cell_m:.2} m wide, more than {limit_m} m; raise depth, which is {depth}, or mesh fewer points at a time, or check their poses"
     )]

@@ -92,19 +92,17 @@ const KERNEL_LEVELS: u32 = 2;
 
 /// Reconstructs the surface of oriented points, in the frame of the points [m].
 ///
-/// `weights` are the numbers of points that each point represents; points with weight 0, or without a
-/// finite position and normal, are ignored. The result does not depend on the number of threads.
+/// Points without a finite position and normal are ignored. The result does not depend on the number of threads.
 ///
 /// # Errors
 /// If fewer than four points are usable, the finest cells are too large, the memory does not suffice, or
 /// a setting is out of its range.
 pub fn reconstruct(
     cloud: &PointCloud,
-    weights: Option<&[f32]>,
     config: &PoissonConfig,
 ) -> Result<Reconstruction, MeshingError> {
     config.validate()?;
-    let samples = Samples::new(cloud, weights, config.depth, config.scale)?;
+    let samples = Samples::new(cloud, config.depth, config.scale)?;
     let cell_m = samples.cell_m();
     if cell_m > MAX_CELL_M {
         return Err(MeshingError::CellsTooLarge {
@@ -158,7 +156,6 @@ fn solve(
         .collect();
     let weights = SampleWeights {
         depths: &depths,
-        weights: &samples.weights,
         samples_per_node: config.samples_per_node,
         point_weight: config.point_weight,
     };
@@ -181,23 +178,18 @@ fn solve(
     values
 }
 
-/// Σ w χ(s) / Σ w.
+/// Mean of χ(s).
 fn mean_at_samples(samples: &Samples, function: &NodalFunction<'_>) -> f32 {
     const CHUNK: usize = 4096;
-    let parts: Vec<(f64, f64)> = (samples.weights.par_chunks(CHUNK).enumerate())
-        .map(|(chunk, weights)| {
-            let samples_with_weights = (chunk * CHUNK..).zip(weights);
-            samples_with_weights.fold((0.0, 0.0), |(sum, total), (sample, &weight)| {
-                let weight = f64::from(weight);
-                let value = f64::from(value_at_sample(samples, function, sample));
-                (sum + weight * value, total + weight)
-            })
+    let value = |sample| f64::from(value_at_sample(samples, function, sample));
+    let parts: Vec<f64> = (samples.codes.par_chunks(CHUNK).enumerate())
+        .map(|(chunk, codes)| {
+            let samples = (chunk * CHUNK..).take(codes.len());
+            samples.fold(0.0, |sum, sample| sum + value(sample))
         })
         .collect();
-    let (sum, total) = parts
-        .iter()
-        .fold((0.0, 0.0), |(a, b), part| (a + part.0, b + part.1));
-    (sum / total) as f32
+    let sum: f64 = parts.iter().fold(0.0, |sum, part| sum + part);
+    (sum / samples.len() as f64) as f32
 }
 
 fn value_at_sample(samples: &Samples, function: &NodalFunction<'_>, sample: usize) -> f32 {

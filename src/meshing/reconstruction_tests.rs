@@ -15,7 +15,7 @@ fn at_depth(depth: u32) -> PoissonConfig {
 }
 
 fn reconstructed(cloud: &PointCloud, depth: u32) -> Reconstruction {
-    reconstruct(cloud, None, &at_depth(depth)).unwrap()
+    reconstruct(cloud, &at_depth(depth)).unwrap()
 }
 
 fn median(mut values: Vec<f32>) -> f32 {
@@ -152,19 +152,6 @@ fn the_result_does_not_depend_on_the_number_of_threads() {
 }
 
 #[test]
-fn a_weight_of_two_equals_a_duplicated_point() {
-    let once = sphere(2.0, 5_000);
-    let mut twice = once.clone();
-    twice.append(once.clone());
-    let heavy = reconstruct(&once, Some(&vec![2.0; once.len()]), &at_depth(6)).unwrap();
-    let double = reconstructed(&twice, 6);
-    assert_eq!(heavy.mesh.triangles.len(), double.mesh.triangles.len());
-    for (a, b) in heavy.mesh.vertices.iter().zip(&double.mesh.vertices) {
-        assert!((a - b).length() < 1e-4, "{a} {b}");
-    }
-}
-
-#[test]
 fn invalid_points_are_ignored_and_counted() {
     let clean = sphere(2.0, 5_000);
     let mut dirty = clean.clone();
@@ -179,7 +166,7 @@ fn invalid_points_are_ignored_and_counted() {
 
 #[test]
 fn too_few_points_and_invalid_settings_are_errors() {
-    let error = |cloud: &PointCloud, depth| reconstruct(cloud, None, &at_depth(depth)).unwrap_err();
+    let error = |cloud: &PointCloud, depth| reconstruct(cloud, &at_depth(depth)).unwrap_err();
     let nothing = error(&PointCloud::default(), 8).to_string();
     assert!(nothing.contains("only 0 of 0 points"), "{nothing}");
     let mut one_place = PointCloud::default();
@@ -196,10 +183,4 @@ fn too_few_points_and_invalid_settings_are_errors() {
             "{message}"
         );
     }
-    let short = reconstruct(&ball, Some(&[1.0]), &at_depth(6)).unwrap_err();
-    assert!(
-        short
-            .to_string()
-            .contains("1 weights were given for 100 points")
-    );
 }

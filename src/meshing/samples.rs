@@ -17,13 +17,11 @@ pub struct Samples {
     pub positions: Vec<[f32; 3]>,
     /// Unit normals.
     pub normals: Vec<[f32; 3]>,
-    /// Number of points that each sample represents.
-    pub weights: Vec<f32>,
     /// Lower corner of the cube in the frame of the cloud [m].
     origin: Vec3,
     /// Edge length of the cube [m].
     pub side_m: f32,
-    /// Number of points ignored: not finite, without a normal, or without weight.
+    /// Number of points ignored: not finite, or without a normal.
     pub dropped: usize,
 }
 
@@ -33,23 +31,9 @@ impl Samples {
 
     /// The usable points of a cloud; the edge of the cube is `scale` times the longest edge of their
     /// bounding box.
-    pub fn new(
-        cloud: &PointCloud,
-        weights: Option<&[f32]>,
-        depth: u32,
-        scale: f32,
-    ) -> Result<Self, MeshingError> {
-        if let Some(weights) = weights
-            && weights.len() != cloud.len()
-        {
-            return Err(MeshingError::WeightsDoNotMatch {
-                points: cloud.len(),
-                weights: weights.len(),
-            });
-        }
-        let weight = |index: usize| weights.map_or(1.0, |weights| weights[index]);
+    pub fn new(cloud: &PointCloud, depth: u32, scale: f32) -> Result<Self, MeshingError> {
         let usable: Vec<u32> = (0..cloud.len())
-            .filter(|&index| is_usable(cloud, index, weight(index)))
+            .filter(|&index| is_usable(cloud, index))
             .map(|index| index as u32)
             .collect();
         let at = |index: u32| cloud.positions[index as usize];
@@ -82,7 +66,6 @@ impl Samples {
             normals: indices()
                 .map(|index| cloud.normals[index as usize].normalize().to_array())
                 .collect(),
-            weights: indices().map(|index| weight(index as usize)).collect(),
             origin,
             side_m,
             dropped: cloud.len() - usable.len(),
@@ -114,11 +97,7 @@ impl Samples {
     }
 }
 
-fn is_usable(cloud: &PointCloud, index: usize, weight: f32) -> bool {
+fn is_usable(cloud: &PointCloud, index: usize) -> bool {
     let normal = cloud.normals[index];
-    cloud.positions[index].is_finite()
-        && normal.is_finite()
-        && normal.length_squared() > 1e-12
-        && weight.is_finite()
-        && weight > 0.0
+    cloud.positions[index].is_finite() && normal.is_finite() && normal.length_squared() > 1e-12
 }

@@ -43,7 +43,7 @@ fn noisy_street() -> (TriangleMesh, Vec<bool>) {
         depth: 8,
         ..PoissonConfig::default()
     };
-    let mesh = reconstruct(&street(100_000, 0.01, 5), None, &config)
+    let mesh = reconstruct(&street(100_000, 0.01, 5), &config)
         .unwrap()
         .mesh;
     let is_ground = (0..mesh.triangles.len())

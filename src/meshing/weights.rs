@@ -6,8 +6,6 @@ use super::stencil::{interpolate, trilinear};
 pub struct SampleWeights<'a> {
     /// Depth at which a cell face holds `samples_per_node` samples, per sample.
     pub depths: &'a [f32],
-    /// Number of points that each sample represents.
-    pub weights: &'a [f32],
     /// Number of samples per cell face at a sample's depth.
     pub samples_per_node: f32,
     /// Screening weight α.
@@ -18,15 +16,14 @@ impl SampleWeights<'_> {
     /// Surface area of a sample in cell faces of a depth.
     #[inline]
     pub fn area(&self, sample: usize, depth: u32) -> f32 {
-        self.weights[sample] * (2.0 * (depth as f32 - self.depths[sample])).exp2()
-            / self.samples_per_node
+        (2.0 * (depth as f32 - self.depths[sample])).exp2() / self.samples_per_node
     }
 
     /// Weight of a sample in the screening term; it does not increase below the sample's depth.
     #[inline]
     pub fn screening(&self, sample: usize, depth: u32) -> f32 {
         let finer = (depth as f32 - self.depths[sample]).min(0.0);
-        self.point_weight * self.weights[sample] * (2.0 * finer).exp2() / self.samples_per_node
+        self.point_weight * (2.0 * finer).exp2() / self.samples_per_node
     }
 
     /// Fraction of a sample's normal that is splatted at this depth or finer.

@@ -5,7 +5,6 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::changes::{self, Changes};
-use super::confidence::{self, ConfidenceConfig};
 use super::plan::Domain;
 use super::scan_cloud::{PointCounts, ScanCloud, ScanPreparation};
 use super::seam;
@@ -43,8 +42,6 @@ pub struct LocalMapConfig {
     /// Half height of that box [m].
     #[default(5.0)]
     pub crop_z_m: f32,
-    /// Confidence weights of points.
-    pub confidence: ConfidenceConfig,
     /// Surface reconstruction.
     pub poisson: PoissonConfig,
     /// Vertices below this quantile of density are removed (unitless).
@@ -109,7 +106,6 @@ impl Validate for LocalMapConfig {
         in_range("crop_x_m", self.crop_x_m, 0.001..=MAX_CROP_M)?;
         in_range("crop_y_m", self.crop_y_m, 0.001..=MAX_CROP_M)?;
         in_range("crop_z_m", self.crop_z_m, 0.001..=MAX_CROP_M)?;
-        nested("confidence", &self.confidence)?;
         nested("poisson", &self.poisson)?;
         require(
             (0.0..1.0).contains(&self.min_density),
@@ -220,10 +216,10 @@ pub(crate) fn build<E: From<MeshingError>>(
         counts.points.add(&scan.counts);
     }
     begin_stage("moving points")?;
-    let (cloud, weights) = static_cloud(&scans, model, config, &mut counts);
+    let cloud = static_cloud(&scans, model, config, &mut counts);
 
     begin_stage("surface")?;
-    let Some(mut mesh) = surface(&cloud, weights.as_deref(), config, &mut counts)? else {
+    let Some(mut mesh) = surface(&cloud, config, &mut counts)? else {
         return Ok(LocalMap {
             counts,
             ..LocalMap::default()
@@ -260,7 +256,7 @@ pub(crate) fn build_of_cloud<E: From<MeshingError>>(
 ) -> Result<LocalMap, E> {
     let mut counts = LocalMapCounts::default();
     begin_stage("surface")?;
-    let Some(mesh) = surface(cloud, None, config, &mut counts)? else {
+    let Some(mesh) = surface(cloud, config, &mut counts)? else {
         return Ok(LocalMap {
             counts,
             ..LocalMap::default()
@@ -273,7 +269,6 @@ pub(crate) fn build_of_cloud<E: From<MeshingError>>(
 /// Reconstructs and trims the surface; `None` where there are too few points.
 fn surface(
     cloud: &PointCloud,
-    weights: Option<&[f32]>,
     config: &LocalMapConfig,
     counts: &mut LocalMapCounts,
 ) -> Result<Option<TriangleMesh>, MeshingError> {
@@ -281,7 +276,7 @@ fn surface(
         mut mesh,
         densities,
         ..
-    }) = reconstruct(cloud, weights, config, counts)?
+    }) = reconstruct(cloud, config, counts)?
     else {
         return Ok(None);
     };
@@ -315,51 +310,37 @@ fn finish(
     }
 }
 
-/// Returns the static points of all scans with their weights.
+/// Returns the static points of all scans.
 fn static_cloud(
     scans: &[ScanCloud],
     model: &LidarModel,
     config: &LocalMapConfig,
     counts: &mut LocalMapCounts,
-) -> (PointCloud, Option<Vec<f32>>) {
+) -> PointCloud {
     let is_static = config
         .visibility
         .enabled
         .then(|| visibility::static_points(scans, model, &config.visibility));
     let mut all = PointCloud::default();
-    let mut weights: Option<Vec<f32>> = None;
     for (number, scan) in scans.iter().enumerate() {
         let mut cloud = scan.cloud.clone();
         let is_kept = |index: usize| is_static.as_ref().is_none_or(|all| all[number][index]);
-        if let Some(confidences) = config.confidence.of(scan) {
-            let kept = confidences
-                .into_iter()
-                .enumerate()
-                .filter(|(index, _)| is_kept(*index));
-            weights
-                .get_or_insert_default()
-                .extend(kept.map(|(_, confidence)| confidence));
-        }
         if is_static.is_some() {
             cloud.retain(is_kept);
             counts.dynamic_points += scan.cloud.len() - cloud.len();
         }
         all.append(cloud);
     }
-    if let Some(weights) = &mut weights {
-        confidence::normalize(weights);
-    }
-    (all, weights)
+    all
 }
 
 /// Reconstructs the surface; `None` where there are too few points, which leaves a hole in the map.
 fn reconstruct(
     cloud: &PointCloud,
-    weights: Option<&[f32]>,
     config: &LocalMapConfig,
     counts: &mut LocalMapCounts,
 ) -> Result<Option<Reconstruction>, MeshingError> {
-    match meshing::reconstruct(cloud, weights, &config.poisson) {
+    match meshing::reconstruct(cloud, &config.poisson) {
         Ok(surface) => {
             counts.unusable_points = surface.dropped_points;
             counts.cell_m = surface.cell_m;
@@ -434,7 +415,7 @@ mod tests {
             },
             ..LocalMapConfig::default()
         };
-        let surface = reconstruct(cloud, None, &settings, &mut counts).unwrap();
+        let surface = reconstruct(cloud, &settings, &mut counts).unwrap();
         assert_eq!(surface.is_none(), counts.is_empty);
         (counts.is_empty, counts.unusable_points)
     }
@@ -455,25 +436,12 @@ mod tests {
     }
 
     #[test]
-    fn weights_are_those_of_the_static_points() {
+    fn points_behind_free_space_are_left_out_and_counted() {
         let scans = [scan(), scan(), scan()];
-        let mut settings = LocalMapConfig::default();
         let mut counts = LocalMapCounts::default();
-        let (_, weights) = static_cloud(&scans, &LidarModel::default(), &settings, &mut counts);
-        assert_eq!(weights, None);
-
-        settings.confidence.half_range_m = Some(10.0);
-        counts.dynamic_points = 0;
-        let (cloud, weights) = static_cloud(&scans, &LidarModel::default(), &settings, &mut counts);
+        let config = LocalMapConfig::default();
+        let cloud = static_cloud(&scans, &LidarModel::default(), &config, &mut counts);
         assert_eq!((cloud.len(), counts.dynamic_points), (6, 3));
-        // 1/2 and 1/5 with a mean of 1.
-        let expected = [10.0 / 7.0, 4.0 / 7.0].repeat(3);
-        for (weight, expected) in weights.unwrap().into_iter().zip(&expected) {
-            assert!(
-                (weight - expected).abs() < 1e-5_f32,
-                "{weight} for {expected}"
-            );
-        }
     }
 
     #[test]

@@ -7,7 +7,6 @@
 
 pub(crate) mod builder;
 pub(crate) mod changes;
-pub(crate) mod confidence;
 pub(crate) mod config;
 pub(crate) mod local_map;
 pub(crate) mod path_check;
