@@ -26,7 +26,7 @@ pub fn write_atomically<T, E: From<io::Error>>(
 ) -> Result<T, E> {
     let (mut temporary, _unfinished) = {
         let mut unfinished = unfinished();
-        let temporary = temporary_beside(path)?;
+        let temporary = temporary_next_to(path)?;
         unfinished.push(temporary.path().to_owned());
         let entry = Unfinished(temporary.path().to_owned());
         (temporary, entry)
@@ -66,7 +66,7 @@ impl Drop for Unfinished {
 
 /// Creates the temporary file of `path` in its folder. Its permissions are those that the umask
 /// allows, as of other files.
-pub fn temporary_beside(path: &Path) -> io::Result<NamedTempFile> {
+pub fn temporary_next_to(path: &Path) -> io::Result<NamedTempFile> {
     let mut builder = Builder::new();
     #[cfg(unix)]
     {
@@ -184,7 +184,7 @@ mod tests {
         for name in others.iter().chain(&abandoned) {
             fs::write(path(name), "").unwrap();
         }
-        let in_use = temporary_beside(&path("a")).unwrap();
+        let in_use = temporary_next_to(&path("a")).unwrap();
         for name in ["a", "plots", "missing"] {
             remove_abandoned(&path(name)).unwrap();
         }

@@ -1,6 +1,6 @@
 //! Validation of configuration values.
 //!
-//! The configuration of each stage implements [`Validate`] beside the algorithm that uses it, so
+//! The configuration of each stage implements [`Validate`] next to the algorithm that uses it, so
 //! that the library's entry points and the program's configuration files have the same limits.
 
 use std::fmt::Display;

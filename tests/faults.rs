@@ -311,7 +311,7 @@ fn start(stage: &Stage, folder: &Path, more: &[&str]) -> Child {
         .unwrap()
 }
 
-/// The file for the messages of a command, beside its folder so that it is no output.
+/// The file for the messages of a command, next to its folder so that it is no output.
 fn stderr_file(folder: &Path, process: u32) -> PathBuf {
     folder.with_extension(format!("stderr{process}"))
 }
@@ -336,7 +336,7 @@ fn run(stage: &Stage, folder: &Path, more: &[&str]) -> Ended {
     end(start(stage, folder, more), folder)
 }
 
-/// A copy of a folder in a temporary folder, with space beside it.
+/// A copy of a folder in a temporary folder, with space next to it.
 struct Copy(tempfile::TempDir);
 
 impl Copy {

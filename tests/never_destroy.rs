@@ -182,7 +182,7 @@ fn odometry_keeps_files_of_the_user_and_its_inputs() {
     assert!(recording.bytes("out/poses_tum.txt") == before);
     odometry("poses.txt").fails_with(&["output_folder is poses.txt, and nothing can be written"]);
 
-    // The poses that build-map finds are an output beside the map.
+    // The poses that build-map finds are an output next to the map.
     recording.write("map.poses_tum.txt", "of the user");
     let build = || recording.fpmcl("build-map").set("poses", "odometry");
     let parts = ["was not written by fpmcl", "mesh_file"];

@@ -109,7 +109,7 @@ fn a_recording_is_enough_for_a_map_and_for_another_drive_in_it() {
     let of_map = poses(&folder.join("map.poses_tum.txt"));
     assert!(rmse_m(&of_map, &found) < 1e-4);
     let map = fs::read(folder.join("map.ply")).unwrap();
-    // The poses beside the map serve another build.
+    // The poses next to the map serve another build.
     let again = fpmcl("build-map").in_folder(folder).with("street/drive_1");
     let again = again
         .with("--output=map.ply")
@@ -202,7 +202,7 @@ fn a_second_drive_is_added_to_the_map_of_the_first_in_its_frame() {
     let apart_m = rmse_m(&far, &found);
     assert!(apart_m < 2e-4, "{apart_m}");
 
-    // The same drive again: the poses beside the map serve, and the map is the same.
+    // The same drive again: the poses next to the map serve, and the map is the same.
     let map = fs::read(folder.join("both.ply")).unwrap();
     let again = build(&onto).with("--force").with("--threads=1").succeeds();
     assert!(

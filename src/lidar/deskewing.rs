@@ -78,7 +78,7 @@ pub struct Motion {
 
 impl Motion {
     /// The motion around a row of a trajectory, from the row before to the row after; at an end, extrapolated from the
-    /// two steps beside it if these last about as long. `None` if there is only one row, or if its times do not ascend.
+    /// two steps next to it if these last about as long. `None` if there is only one row, or if its times do not ascend.
     pub fn along(map_from_lidar: &[Pose3], times_s: &[f64], row: usize) -> Option<Self> {
         let last = map_from_lidar.len() - 1;
         let between = |first: usize, second: usize| Self {

@@ -1,6 +1,6 @@
 //! Symmetric linear systems of 6 x 6 blocks, one row per pose.
 //!
-//! Conjugate gradients, preconditioned by the factorization of the blocks on the diagonal and next to it: the
+//! Conjugate gradients, preconditioned by the factorization of the diagonal and the neighbouring blocks: the
 //! system of a drive without loops is solved in one iteration, each loop adds a few.
 //!
 //! Nocedal and Wright, *Numerical Optimization* (2006), algorithm 5.3.

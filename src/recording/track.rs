@@ -36,7 +36,7 @@ pub struct PoseTrack {
 impl PoseTrack {
     /// Reads rows of KITTI (12 numbers: poses of the camera if there is a calibration, else of the lidar), rows of
     /// TUM (8 numbers: poses of the lidar), or a folder `oxts` of KITTI raw. Times are those of the rows, or
-    /// of `times.txt` beside the file.
+    /// of `times.txt` next to the file.
     ///
     /// # Errors
     /// The file cannot be read, or a row is no pose.
@@ -237,7 +237,7 @@ impl PoseTrack {
         let poses = &self.map_from_lidar;
         let Some(times_s) = self.times_s.as_ref().filter(|_| have_times) else {
             let pose = *poses.get(frame.number)?;
-            // Two rows to each side: at an end the motion follows from the two steps beside it.
+            // Two rows to each side: at an end the motion follows from the two steps next to it.
             let first = frame.number.saturating_sub(2);
             let around = first..(frame.number + 3).min(poses.len());
             let assumed_s = |row| PERIOD_S * row as f64;

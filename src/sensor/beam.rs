@@ -15,7 +15,7 @@ pub struct BeamReturns {
 }
 
 /// Elevation [deg] of a beam with returns at distances [m] and elevations [deg]: the median of the farther half. Lasers
-/// beside the origin of the lidar frame, and motion, change the elevations of near returns.
+/// next to the origin of the lidar frame, and motion, change the elevations of near returns.
 pub fn elevation_deg(returns: &mut [[f32; 2]]) -> f32 {
     returns.sort_by(|a, b| a[0].total_cmp(&b[0]));
     let far = &returns[returns.len() / 2..];

@@ -1,7 +1,7 @@
 //! The range image of a sensor, and its limits of range.
 //!
 //! With rows, each beam is a row, and there are as many columns as azimuth steps, up to the 2048 for which the
-//! neighbourhoods of normals are made; sensors with finer steps lose every second return, which is beside another.
+//! neighbourhoods of normals are made; sensors with finer steps lose every second return, which shares a pixel with another.
 //! Without rows, pixels are squares of half the mean angular distance of the points,
 //! of which few share a pixel,
 //!
@@ -20,7 +20,7 @@ use crate::lidar::{LidarModel, Scan};
 const MAX_COLUMNS: usize = 2048;
 const MIN_COLUMNS: usize = 90;
 
-/// Share of the points between and beside the rows above which beams keep no elevation (unitless).
+/// Share of the points between and next to the rows above which beams keep no elevation (unitless).
 const MAX_OUTSIDE: f64 = 0.05;
 
 /// The projection; that of KITTI's sensor for no points.
@@ -130,7 +130,7 @@ fn rowless(scans: &[Scan]) -> LidarModel {
 /// Least and greatest range of a return [m].
 ///
 /// The greatest is 50 m, as far as a map is rendered, or twice the range of nearly all returns in a building. The
-/// least is that of nearly all returns beside the own car, but between 0.3 m, where housings and hands are, and 2 m.
+/// least is that of nearly all returns apart from the own car, but between 0.3 m, where housings and hands are, and 2 m.
 fn range_limits(scans: &[Scan], [x_min, x_max, y_min, y_max]: [f32; 4]) -> (f32, f32) {
     const NEARLY_ALL: f64 = 0.99;
     let is_own = |x: f32, y: f32| x > x_min && x < x_max && y > y_min && y < y_max;

@@ -36,7 +36,7 @@ pub struct SimulationConfig {
     pub n_scans: i64,
     /// KITTI poses to drive along, instead of `path`.
     pub path_pose_file: Option<PathBuf>,
-    /// Calibration of those poses; null: `calib.txt` beside them.
+    /// Calibration of those poses; null: `calib.txt` next to them.
     pub path_calib_file: Option<PathBuf>,
     /// Segments of the path.
     #[default(vec![ PathSegment::new(45.0, 0.0, 0.0), PathSegment::new(25.0, 55.0, 0.0), PathSegment::new(35.0, -8.0, 7.0), PathSegment::new(20.0, 0.0, -6.0), PathSegment::new(25.0, -75.0, 0.0), PathSegment::new(60.0, 12.0, 0.0), PathSegment::new(20.0, -60.0, 1.0), PathSegment::new(30.0, 0.0, 1.0), ])]
@@ -49,7 +49,7 @@ pub struct SimulationConfig {
     pub traffic: TrafficConfig,
     /// The sensor.
     pub scanner: ScannerConfig,
-    /// The odometry written beside the true poses.
+    /// The odometry written next to the true poses.
     pub odometry: SimulatedOdometryConfig,
     /// Errors of the poses that the drive comes with, to build a map with; without errors they are the true ones.
     pub given_poses: GivenPosesConfig,

@@ -143,7 +143,7 @@ impl GroundField {
         lower.lerp(upper, v)
     }
 
-    /// Signed distance to the carriageway, positive beside it [m].
+    /// Signed distance to the carriageway, positive outside it [m].
     pub fn kerb_distance_m(&self, position: DVec2) -> f64 {
         f64::from(self.at(position).kerb_m)
     }
@@ -195,7 +195,7 @@ impl GroundField {
     }
 
     /// A frame on the ground, x along `forward`, whose x-y plane has the slope between the points
-    /// a metre before, behind and beside: `p_world = world_from_local * p_local`.
+    /// a metre before, behind and to the side: `p_world = world_from_local * p_local`.
     pub fn tangent_frame(&self, position: DVec2, forward: DVec2) -> Rigid3f {
         let height_m = |offset: DVec2| f64::from(self.at(position + offset).height_m);
         let tangent = |direction: DVec2| {

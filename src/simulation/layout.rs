@@ -29,7 +29,7 @@ pub struct Strip {
 pub struct StreetLayout {
     /// The main road first, then the side streets.
     pub roads: Vec<Strip>,
-    /// Rows of parking bays beside the main road.
+    /// Rows of parking bays next to the main road.
     pub bays: Vec<Strip>,
     /// The open square, its longer side along the main road.
     pub square: Option<Footprint>,

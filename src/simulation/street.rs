@@ -208,7 +208,7 @@ impl Site<'_> {
         }
     }
 
-    /// Parks a random vehicle if the position is free and beside the roads.
+    /// Parks a random vehicle if the position is free and next to the roads.
     fn park_car(&mut self, position: DVec2, forward: DVec2, rng: &mut ChaCha8Rng) {
         let vehicle = Vehicle::random(0.12, rng);
         let footprint = Footprint {

@@ -19,7 +19,7 @@ pub struct StreetConfig {
     /// Mean distance between side streets [m].
     #[default(75.0)]
     pub side_street_spacing_m: f64,
-    /// Whether there is an open square beside the road.
+    /// Whether there is an open square next to the road.
     #[default(true)]
     pub has_square: bool,
     /// Share of the frontage that is built on, 0 to 1.

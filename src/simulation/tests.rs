@@ -191,7 +191,7 @@ fn oncoming_cars_come_nearer_at_their_speed() {
     let shared = before.vertices.len().min(after.vertices.len());
     let mut moved = 0;
     for (a, b) in before.vertices[..shared].iter().zip(&after.vertices) {
-        // A metre in a tenth of a second; a little more or less beside the path in a bend.
+        // A metre in a tenth of a second; a little more or less off the path in a bend.
         if (a.distance(*b) - 1.0).abs() < 0.2 {
             moved += 1;
         }

@@ -42,6 +42,6 @@ pub fn check(recording: &Recording, max_step_m: f64, origin: &str) -> Result<()>
 }
 
 /// The file of the poses of a map that was built without given ones.
-pub fn file_beside(mesh_file: &Path) -> PathBuf {
+pub fn poses_next_to(mesh_file: &Path) -> PathBuf {
     mesh_file.with_extension("poses_tum.txt")
 }

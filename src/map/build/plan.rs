@@ -217,7 +217,7 @@ pub fn origin_near(position: DVec3) -> DVec3 {
 }
 
 impl Domain<'_> {
-    /// The cells that it owns within and beside a box in its coordinates.
+    /// The cells that it owns within and next to a box in its coordinates.
     pub fn region(&self, bounds: &Aabb) -> Region {
         let bounds = if bounds.is_empty() {
             Aabb::from_points([Vec3::ZERO])

@@ -23,7 +23,7 @@ fn ownership() -> Ownership {
     Ownership::new(&poses, &local_maps(&poses, 3, 1.0))
 }
 
-/// What a local map owns of the bumpy ground and beside it.
+/// What a local map owns of the bumpy ground and next to it.
 fn region(ownership: &Ownership, number: usize) -> Region {
     ownership.region(number, [-9.0, -9.0].into(), [9.0, 9.0].into())
 }

@@ -94,7 +94,7 @@ mod tests {
         for (x, confidence) in [(0.1, 0.9), (0.1, 0.9), (0.15, 0.3), (5.1, 0.2)] {
             cloud.push(Vec3::new(x, 0.1, 0.1), Vec3::Z, confidence);
         }
-        // In the cell of three points, in the cell of one, beside it, and far from all.
+        // In the cell of three points, in the cell of one, next to it, and far from all.
         let vertices = [0.05, 5.2, 5.45, 9.0].map(|x| Vec3::new(x, 0.1, 0.1));
         let means = mean_confidences(&vertices, &cloud, 0.25);
         for (mean, expected) in means.into_iter().zip([0.7, 0.2, 0.2, 0.0]) {

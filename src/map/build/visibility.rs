@@ -433,7 +433,7 @@ mod tests {
         let is_static = static_points(&scans, &model(), &VisibilityConfig::default());
         for (scan, is_static) in scans.iter().zip(&is_static) {
             for (position, &is_static) in scan.cloud.positions.iter().zip(is_static) {
-                // Pixels at the edges of the van see the wall beside it.
+                // Pixels at the edges of the van see the wall next to it.
                 let on_edge = position.y.abs() > 1.7 || position.z.abs() > 0.7;
                 if position.x > 19.0 {
                     assert!(is_static, "wall: {position}");

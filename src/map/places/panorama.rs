@@ -12,7 +12,7 @@
 //! map, the second the best of them with a subset of columns and headings, the last the best of these with all of
 //! them.
 //! A panorama has 2 · rows · columns bytes: with the defaults 2.2 kB, 6 MB for 700 m of road in cells of one
-//! metre, in a file beside the tiles of the map or in memory. Where roads cross above one another, a cell has one panorama
+//! metre, in a file next to the tiles of the map or in memory. Where roads cross above one another, a cell has one panorama
 //! per level.
 
 use std::collections::BTreeSet;

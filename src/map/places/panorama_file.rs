@@ -1,4 +1,4 @@
-//! Panoramas of places and their descriptors, in memory or in a file beside the tiles of a map.
+//! Panoramas of places and their descriptors, in memory or in a file next to the tiles of a map.
 //!
 //! ```text
 //! header, request, places, panoramas, checksums of the panoramas, descriptors, checksum of all but the panoramas

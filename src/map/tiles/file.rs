@@ -220,7 +220,7 @@ pub(crate) struct Source {
     pub modified_ns: u64,
     /// Checksum of its bytes.
     pub checksum: u32,
-    /// Whether a path was given beside the map.
+    /// Whether a path was given next to the map.
     pub has_given_path: u32,
     /// Side of a tile [m].
     pub side_m: f64,

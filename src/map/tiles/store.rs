@@ -570,7 +570,7 @@ mod tests {
     use crate::map::{Map, MapCache, MapError, MapOptions};
     use crate::rendering::{Backend, RenderError};
 
-    /// A road of 1.2 km along x, walls beside it, and a ramp.
+    /// A road of 1.2 km along x, walls next to it, and a ramp.
     fn street() -> TriangleMesh {
         let mut mesh = TriangleMesh::default();
         let mut quad = |corners: [Vec3; 4], color: [u8; 3]| {

@@ -7,7 +7,7 @@ use rusqlite::{Connection as Database, Error, OpenFlags};
 
 use super::index::{Connection, Index, Place, Serialization};
 
-/// Opens a database without writing beside it.
+/// Opens a database without writing next to it.
 pub fn open(path: &Path) -> Result<Database, String> {
     let mut log = path.as_os_str().to_owned();
     log.push("-wal");

@@ -10,7 +10,7 @@ use super::older::{self, OlderMap};
 use super::parts::{Parts, Role};
 use super::poses;
 use crate::app::commands::stages::{RecordingInputs, complete};
-use crate::app::commands::trajectory::{self, file_beside};
+use crate::app::commands::trajectory::{self, poses_next_to};
 use crate::app::run::{Claims, Context, input, version};
 use crate::app::settings::{self, BuildMapConfig, OutputConfig};
 use crate::map::build::plan::{self, LocalMapPlan};
@@ -69,10 +69,10 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
             role,
             context,
         )?;
-        let found = file_beside(&config.mesh_file);
+        let found = poses_next_to(&config.mesh_file);
         let origin = format!("the poses from the scans are in {}", found.display());
         trajectory::check(&sequence, config.map.max_step_m, &origin)?;
-    } else if let Some(name) = file_beside(&config.mesh_file).file_name()
+    } else if let Some(name) = poses_next_to(&config.mesh_file).file_name()
         && role == Role::Build
     {
         claims.remove(&[&name.to_string_lossy()])?;

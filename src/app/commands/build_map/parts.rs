@@ -1,6 +1,6 @@
 //! Finished local maps on disk, from which an interrupted build resumes.
 //!
-//! While a map is being built, the folder `<map>.parts` beside it holds per local map a mesh, and its
+//! While a map is being built, the folder `<map>.parts` next to it holds per local map a mesh, and its
 //! counts with the hashes of its scans and of the mesh; the claim of the map with the key of all other inputs; and a
 //! file that the build locks. Parts of other inputs are deleted, files of others never. A part is finished once its
 //! counts exist, which are written last.
@@ -22,7 +22,7 @@ use crate::recording::RecordingError;
 
 const LOCK_FILE: &str = "lock";
 
-/// A finished local map beside its mesh.
+/// A finished local map next to its mesh.
 #[derive(Serialize, Deserialize)]
 struct Part {
     /// Hash of the scans that it was made of.
@@ -53,7 +53,7 @@ pub enum Role {
     Build,
     /// What comes after the local maps, which jobs have built; alone.
     Collect,
-    /// One local map, beside other jobs.
+    /// One local map, next to other jobs.
     Job,
 }
 
@@ -79,7 +79,7 @@ impl Drop for Parts {
 }
 
 impl Parts {
-    /// Locks the folder beside `mesh_file`. A build makes it where it does not exist.
+    /// Locks the folder next to `mesh_file`. A build makes it where it does not exist.
     pub fn lock(mesh_file: &Path, role: Role) -> Result<Self> {
         let mut name = mesh_file.file_name().unwrap_or_default().to_owned();
         name.push(".parts");

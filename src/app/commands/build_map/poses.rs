@@ -64,7 +64,7 @@ pub fn origin(recording: &Recording) -> Option<String> {
 }
 
 /// The recording with poses from its scans, in an older map where there is one, or with its own ones polished, and what
-/// they show about themselves. Both are kept in a file beside the map, from which they are read where it belongs to the
+/// they show about themselves. Both are kept in a file next to the map, from which they are read where it belongs to the
 /// same scans; otherwise only a build finds them.
 pub fn find(
     mut recording: Recording,
@@ -74,7 +74,7 @@ pub fn find(
     role: Role,
     context: &Context,
 ) -> Result<(Recording, Option<TrajectorySummary>)> {
-    let path = trajectory::file_beside(&config.mesh_file);
+    let path = trajectory::poses_next_to(&config.mesh_file);
     let is_given = recording.track.is_some();
     let frames = match is_given {
         true => recording.frames.clone(),

@@ -20,7 +20,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result, bail, ensure};
 
 use crate::app::run::output;
-use crate::files::{folder_of, remove_abandoned, temporary_beside};
+use crate::files::{folder_of, remove_abandoned, temporary_next_to};
 
 /// File of the claims in each folder.
 pub const CLAIMS_FILE: &str = ".fpmcl";
@@ -66,7 +66,7 @@ impl Outputs<'_> {
             format!("{key} is {path}, and nothing can be written there; choose another {key}")
         };
         output::create_folder(folder).with_context(context)?;
-        temporary_beside(self.main).with_context(context)?;
+        temporary_next_to(self.main).with_context(context)?;
         for path in claims.paths(&self.names).chain([self.main.to_owned()]) {
             remove_abandoned(&path).with_context(context)?;
         }
