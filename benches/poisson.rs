@@ -33,6 +33,7 @@ use std::time::Instant;
 
 use fpmcl::geometry::{PointCloud, TriangleMesh};
 use fpmcl::internals::ply;
+use fpmcl::memory::MemoryBudget;
 use fpmcl::meshing::{PoissonConfig, reconstruct};
 use glam::Vec3;
 use rand::{RngExt, SeedableRng, rngs::StdRng};
@@ -69,13 +70,15 @@ fn depth_8(bencher: divan::Bencher<'_, '_>, count: usize) {
         depth: 8,
         ..PoissonConfig::default()
     };
-    bencher.bench_local(|| reconstruct(&cloud, &config).unwrap());
+    bencher.bench_local(|| reconstruct(&cloud, &config, MemoryBudget::default()).unwrap());
 }
 
 #[divan::bench(args = SIZES, sample_count = 3, sample_size = 1)]
 fn depth_9(bencher: divan::Bencher<'_, '_>, count: usize) {
     let cloud = noisy_street(count);
-    bencher.bench_local(|| reconstruct(&cloud, &PoissonConfig::default()).unwrap());
+    bencher.bench_local(|| {
+        reconstruct(&cloud, &PoissonConfig::default(), MemoryBudget::default()).unwrap()
+    });
 }
 
 /// A rectangle of the street: a corner and two edges.
@@ -188,7 +191,7 @@ fn run_once(count: usize, depth: u32) {
         ..PoissonConfig::default()
     };
     let (start, cpu) = (Instant::now(), cpu_s());
-    let surface = reconstruct(&cloud, &config).unwrap();
+    let surface = reconstruct(&cloud, &config, MemoryBudget::default()).unwrap();
     println!(
         "{count} points, depth {depth}: {:.2} s wall, {:.2} s CPU, peak {} MB, {} triangles",
         start.elapsed().as_secs_f64(),

@@ -1,15 +1,24 @@
-//! The memory that the process may use: stages check an estimate before they allocate.
+//! The memory that a stage may use: it checks an estimate against a budget before it allocates.
 //!
-//! Without [`set_budget`] there is no limit. Estimates stand at the calls of `require`; they are
-//! upper bounds of what grows with a configuration or an input, not of everything.
+//! Estimates stand at the calls of `require`; they are upper bounds of what grows with a configuration or an input, not
+//! of everything.
 
 use std::fs::File;
 use std::io::{self, Read as _};
 use std::path::Path;
-use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Largest amount that a stage may need [bytes].
-static BUDGET: AtomicU64 = AtomicU64::new(u64::MAX);
+/// Largest amount of memory that a stage may need; by default, there is no limit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct MemoryBudget {
+    /// Its size [bytes].
+    pub bytes: u64,
+}
+
+impl Default for MemoryBudget {
+    fn default() -> Self {
+        Self { bytes: u64::MAX }
+    }
+}
 
 /// A stage needs more memory than the budget.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
@@ -37,50 +46,46 @@ fn amount(bytes: f64) -> String {
     }
 }
 
-/// Sets the budget of the process [bytes].
-pub fn set_budget(bytes: u64) {
-    BUDGET.store(bytes, Ordering::Relaxed);
-}
-
-/// Requires that an estimate [bytes] is within the budget.
-pub(crate) fn require(
-    what: &'static str,
-    bytes: f64,
-    remedy: &'static str,
-) -> Result<(), MemoryError> {
-    let budget = BUDGET.load(Ordering::Relaxed) as f64;
-    if bytes <= budget {
-        return Ok(());
+impl MemoryBudget {
+    /// Requires that an estimate [bytes] is within the budget.
+    pub(crate) fn require(
+        self,
+        what: &'static str,
+        bytes: f64,
+        remedy: &'static str,
+    ) -> Result<(), MemoryError> {
+        let budget_bytes = self.bytes as f64;
+        if bytes <= budget_bytes {
+            return Ok(());
+        }
+        Err(MemoryError {
+            what,
+            needed_bytes: bytes,
+            budget_bytes,
+            remedy,
+        })
     }
-    Err(MemoryError {
-        what,
-        needed_bytes: bytes,
-        budget_bytes: budget,
-        remedy,
-    })
 }
 
-/// Reads a whole file within the budget, also one whose size is not known before, such as a pipe.
+/// Largest content of a file that does not know its size, such as a pipe [bytes].
+const LARGEST_STREAM: u64 = 256 << 20;
+
+/// Reads a whole file; of one that does not know its size, such as a pipe, at most [`LARGEST_STREAM`].
 pub(crate) fn read_file(path: &Path) -> io::Result<Vec<u8>> {
-    /// Memory for the content and what is made of it, in sizes of the file.
-    const COPIES: u64 = 2;
     let file = File::open(path)?;
-    let require = |bytes: u64| {
-        let needed = COPIES.saturating_mul(bytes) as f64;
-        require("the content of the file", needed, "give a smaller one")
-            .map_err(|error| io::Error::new(io::ErrorKind::FileTooLarge, error))
-    };
     let size = file.metadata()?.len();
-    require(size)?;
-    let limit = (BUDGET.load(Ordering::Relaxed) / COPIES).saturating_add(1);
     let mut bytes = Vec::new();
     bytes.try_reserve_exact(usize::try_from(size).unwrap_or(usize::MAX))?;
-    file.take(limit).read_to_end(&mut bytes)?;
-    require(bytes.len() as u64)?;
+    let largest = size.max(LARGEST_STREAM);
+    file.take(largest + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > largest {
+        let text = format!("it has no end within {}", amount(largest as f64));
+        return Err(io::Error::new(io::ErrorKind::FileTooLarge, text));
+    }
     Ok(bytes)
 }
 
-/// Reads a whole text file within the budget.
+/// Reads a whole text file.
 pub(crate) fn read_text(path: &Path) -> io::Result<String> {
     String::from_utf8(read_file(path)?)
         .map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error.utf8_error()))

@@ -16,7 +16,9 @@ use fpmcl::internals::{GpuRenderer, ImageMethod};
 use fpmcl::lidar::{Beam, LidarModel, RangeImage};
 use fpmcl::localization::ObservationConfig;
 use fpmcl::localization::ParticleSet;
-use fpmcl::rendering::{Backend, RangeDifference, RangeRenderer, RenderError, RenderingMethod};
+use fpmcl::rendering::{
+    Backend, RangeDifference, RangeRenderer, RenderError, RenderLimits, RenderingMethod,
+};
 
 use brute_force::{BruteForce, room, street};
 
@@ -25,7 +27,11 @@ const METHODS: [ImageMethod; 2] = [ImageMethod::Cast, ImageMethod::Raster];
 /// A renderer on any adapter; `None`, with a message, without one.
 #[expect(clippy::print_stderr, reason = "a skipped test reports it")]
 fn renderer(tiles: &[TriangleMesh]) -> Option<GpuRenderer> {
-    match GpuRenderer::new(tiles, (Backend::Gpu, RenderingMethod::Auto), None) {
+    match GpuRenderer::new(
+        tiles,
+        (Backend::Gpu, RenderingMethod::Auto),
+        RenderLimits::default(),
+    ) {
         Ok(renderer) => Some(renderer),
         Err(RenderError::NoAdapter) => {
             let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|value| value == "1");

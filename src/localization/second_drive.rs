@@ -46,9 +46,10 @@ impl SecondDrive {
     /// # Errors
     /// A field of the configuration is out of its range.
     pub fn new(tracker: Tracker, trajectory: TrajectoryConfig) -> Result<Self, InvalidValue> {
+        let builder = TrajectoryBuilder::new(trajectory)?;
         Ok(Self {
+            builder: builder.with_memory_budget(tracker.map().memory_budget),
             tracker,
-            builder: TrajectoryBuilder::new(trajectory)?,
             found: vec![],
         })
     }

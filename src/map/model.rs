@@ -25,9 +25,9 @@ use super::tiles::grid::{self, TileConfig, TileGrid, TileIndex};
 use super::tiles::store::TileStore;
 use crate::geometry::mesh::on_lattice;
 use crate::geometry::{Aabb, TriangleMesh};
-use crate::memory::{self, MemoryError};
+use crate::memory::{MemoryBudget, MemoryError};
 use crate::rendering::selection::{self, BackendChoice};
-use crate::rendering::{RangeRenderer, RenderError};
+use crate::rendering::{RangeRenderer, RenderError, RenderLimits};
 
 /// Extents between which a map in metres lies [m].
 const PLAUSIBLE_M: RangeInclusive<f32> = 2.0..=20_000.0;
@@ -56,6 +56,8 @@ pub struct Map {
     pub ground: Arc<GroundMap>,
     /// Renders the map from any pose.
     pub renderer: Arc<dyn RangeRenderer>,
+    /// Memory for panoramas, and of drives that are found in the map.
+    pub(crate) memory_budget: MemoryBudget,
     /// The panoramas of the last request.
     panoramas: Arc<Mutex<Option<CachedPanoramas>>>,
 }
@@ -108,7 +110,7 @@ impl Map {
         path: MappingPath,
         options: &MapOptions,
     ) -> Result<Self, MapError> {
-        let (chunks, _) = prepare(&mut mesh, &path)?;
+        let (chunks, _) = prepare(&mut mesh, &path, options.memory_budget)?;
         let choice = selection::choose(options.backend, options.method)?;
         Self::in_memory(mesh, path, chunks, options, &choice)
     }
@@ -124,9 +126,12 @@ impl Map {
             grid::cut(&mesh, options.tiles.side_m).into_iter().unzip();
         let boxes = std::iter::zip(indices, parts.iter().map(TriangleMesh::bounds));
         let tiles = grid_of(&path, boxes, &options.tiles);
-        let renderer = choice.renderer(&parts, options.max_poses)?;
+        let renderer = choice.renderer(&parts, limits_of(options))?;
         let ground = GroundMap::over(Arc::new(chunks), GROUND_CELL_M);
-        Ok(Self::from_parts(mesh, path, tiles, ground, renderer))
+        Ok(Self {
+            memory_budget: options.memory_budget,
+            ..Self::from_parts(mesh, path, tiles, ground, renderer)
+        })
     }
 
     /// Assembles a map from its parts.
@@ -143,6 +148,7 @@ impl Map {
             tiles: tiles.into(),
             ground: ground.into(),
             renderer,
+            memory_budget: MemoryBudget::default(),
             panoramas: Arc::default(),
         }
     }
@@ -188,7 +194,8 @@ impl Map {
             && has_red_ground(&mesh, mesh.has_path() || given.is_some())
         {
             let bytes = mesh.triangles() as f64 * DIVIDED_BYTES;
-            memory::require("the tiles of the map", bytes, SMALLER_MAP)?;
+            let budget = options.memory_budget;
+            budget.require("the tiles of the map", bytes, SMALLER_MAP)?;
             let is_ground = |triangle| mesh.is_red(triangle);
             let path = mesh.path.clone();
             match divided((mesh_file, folder), source, &mesh, &is_ground, path)? {
@@ -198,7 +205,7 @@ impl Map {
         }
         let (mut mesh, own) = mesh_file::read(mesh_file)?;
         let path = own.clone().or_else(|| given.clone()).unwrap_or_default();
-        let (chunks, is_ground) = prepare(&mut mesh, &path)?;
+        let (chunks, is_ground) = prepare(&mut mesh, &path, options.memory_budget)?;
         if let Some((folder, source)) = cache
             && let Some(store) = divided(
                 (mesh_file, folder),
@@ -222,7 +229,7 @@ impl Map {
         let path = store.path.clone().or(given).unwrap_or_default();
         let tiles = grid_of(&path, store.boxes(), &options.tiles);
         let store = Arc::new(store);
-        let renderer = choice.renderer_over(&store, options.max_poses)?;
+        let renderer = choice.renderer_over(&store, limits_of(options))?;
         Ok(Self {
             surface: Surface::Disk {
                 mesh_file: mesh_file.to_owned(),
@@ -232,6 +239,7 @@ impl Map {
             tiles: tiles.into(),
             ground: GroundMap::over(store, GROUND_CELL_M).into(),
             renderer,
+            memory_budget: options.memory_budget,
             panoramas: Arc::default(),
         })
     }
@@ -335,11 +343,19 @@ impl Map {
         {
             return Ok(PanoramaIndex::over(panoramas, request));
         }
-        request.require_memory(&self.path.map_from_lidar, &self.tiles)?;
+        let budget = self.memory_budget;
+        request.require_memory(&self.path.map_from_lidar, &self.tiles, budget)?;
         let cells = request.cells(&self.path.map_from_lidar, &self.tiles);
         let file = file.as_ref().map(|file| (&**file, &*words));
         let (renderer, ground) = (&*self.renderer, &self.ground);
-        PanoramaIndex::build(&cells, renderer, ground, &self.tiles, request, file)
+        PanoramaIndex::build(&cells, renderer, ground, &self.tiles, request, file, budget)
+    }
+}
+
+fn limits_of(options: &MapOptions) -> RenderLimits {
+    RenderLimits {
+        max_poses: options.max_poses,
+        memory_budget: options.memory_budget,
     }
 }
 
@@ -369,13 +385,17 @@ fn divided(
 
 /// Moves the vertices of a mesh to the lattice of maps and finds its ground: chunks of the elevation map, and which
 /// triangles are ground.
-fn prepare(mesh: &mut TriangleMesh, path: &MappingPath) -> Result<(Chunks, Vec<bool>), MapError> {
+fn prepare(
+    mesh: &mut TriangleMesh,
+    path: &MappingPath,
+    budget: MemoryBudget,
+) -> Result<(Chunks, Vec<bool>), MapError> {
     mesh.snap();
     let triangles = mesh.triangles.len();
     if (0..triangles).all(|triangle| mesh.scaled_normal(triangle) == Vec3::ZERO) {
         return Err(MapError::NoArea { triangles });
     }
-    memory::require("the map", triangles as f64 * TRIANGLE_BYTES, SMALLER_MAP)?;
+    budget.require("the map", triangles as f64 * TRIANGLE_BYTES, SMALLER_MAP)?;
     let is_ground = ground_of(mesh, !path.map_from_lidar.is_empty())?;
     let ground = (0..triangles).filter(|&triangle| is_ground[triangle]);
     let corners = ground.map(|triangle| MeshView::corners(mesh, triangle));
@@ -527,6 +547,21 @@ mod tests {
             area_m2(&|triangle| mesh.is_red(triangle)),
             area_m2(&|_| true),
         ]
+    }
+
+    #[test]
+    fn a_map_that_needs_more_than_its_budget_is_an_error_and_others_are_not_bounded() {
+        let prepared = |memory_budget| {
+            let options = MapOptions {
+                memory_budget,
+                ..MapOptions::default()
+            };
+            Map::new(street(), MappingPath::default(), &options)
+        };
+        let small = MemoryBudget { bytes: 1000 };
+        let message = prepared(small).err().unwrap().to_string();
+        assert!(message.starts_with("the map would need"), "{message}");
+        prepared(MemoryBudget::default()).unwrap();
     }
 
     #[test]

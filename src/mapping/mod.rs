@@ -126,6 +126,7 @@ fn found_poses(
             &frames,
             recording.track.is_some(),
             &config,
+            builder.options.memory_budget,
             &builder.on_event,
         )?,
     };

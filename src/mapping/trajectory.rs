@@ -8,6 +8,7 @@ use super::error::MappingError;
 use crate::lidar::Scan;
 use crate::localization::{LocalizerConfig, SecondDrive, SecondDriveError, Tracker, TrackerConfig};
 use crate::map::{BuildEvent, Map, MapConfig};
+use crate::memory::MemoryBudget;
 use crate::odometry::{
     ElevationBias, LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig,
 };
@@ -27,9 +28,11 @@ pub fn find_poses(
     frames: &[Frame],
     are_given: bool,
     config: &TrajectoryConfig,
+    memory_budget: MemoryBudget,
     on_event: OnEvent,
 ) -> Result<Trajectory, MappingError> {
-    let mut builder = TrajectoryBuilder::new(config.clone())?;
+    let builder = TrajectoryBuilder::new(config.clone())?;
+    let mut builder = builder.with_memory_budget(memory_budget);
     let name = if are_given { "polish" } else { "odometry" };
     each_scan(name, frames, on_event, |frame, scan| {
         match frame.map_from_lidar {

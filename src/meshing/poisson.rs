@@ -27,7 +27,7 @@ use super::solver;
 use super::stencil::{CORNER_OFFSETS, CornerValues, corner_index, interpolate, trilinear};
 use super::weights::SampleWeights;
 use crate::geometry::{PointCloud, TriangleMesh};
-use crate::memory::{self, MemoryError};
+use crate::memory::{MemoryBudget, MemoryError};
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Settings of the reconstruction.
@@ -100,6 +100,7 @@ const KERNEL_LEVELS: u32 = 2;
 pub fn reconstruct(
     cloud: &PointCloud,
     config: &PoissonConfig,
+    memory_budget: MemoryBudget,
 ) -> Result<Reconstruction, MeshingError> {
     config.validate()?;
     let samples = Samples::new(cloud, config.depth, config.scale)?;
@@ -118,7 +119,7 @@ pub fn reconstruct(
     let tree = Octree::build(&samples, config.depth, |sample, depth| {
         depths[sample] > (depth - 1) as f32
     });
-    require_memory(&tree, &samples)?;
+    require_memory(&tree, &samples, memory_budget)?;
     let values = solve(&samples, &depths, &tree, config);
     let function = NodalFunction {
         tree: &tree,
@@ -131,11 +132,15 @@ pub fn reconstruct(
 
 /// Requires the memory of the solver: per node its tables, the solution at 125 corners, the normal field
 /// and five vectors of the conjugate gradients at 64; per sample its constraint.
-fn require_memory(tree: &Octree, samples: &Samples) -> Result<(), MemoryError> {
+fn require_memory(
+    tree: &Octree,
+    samples: &Samples,
+    budget: MemoryBudget,
+) -> Result<(), MemoryError> {
     const NODE_BYTES: f64 = 4096.0;
     const SAMPLE_BYTES: f64 = 256.0;
     let nodes: usize = tree.levels.iter().map(Level::len).sum();
-    memory::require(
+    budget.require(
         "the octree of the surface",
         nodes as f64 * NODE_BYTES + samples.len() as f64 * SAMPLE_BYTES,
         "lower depth, or mesh fewer points at a time",

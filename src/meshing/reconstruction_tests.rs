@@ -6,6 +6,7 @@ use glam::{Quat, Vec3};
 use super::shapes_for_tests::{Topology, sphere, street};
 use super::*;
 use crate::geometry::PointCloud;
+use crate::memory::MemoryBudget;
 
 fn at_depth(depth: u32) -> PoissonConfig {
     PoissonConfig {
@@ -15,7 +16,7 @@ fn at_depth(depth: u32) -> PoissonConfig {
 }
 
 fn reconstructed(cloud: &PointCloud, depth: u32) -> Reconstruction {
-    reconstruct(cloud, &at_depth(depth)).unwrap()
+    reconstruct(cloud, &at_depth(depth), MemoryBudget::default()).unwrap()
 }
 
 fn median(mut values: Vec<f32>) -> f32 {
@@ -166,7 +167,9 @@ fn invalid_points_are_ignored_and_counted() {
 
 #[test]
 fn too_few_points_and_invalid_settings_are_errors() {
-    let error = |cloud: &PointCloud, depth| reconstruct(cloud, &at_depth(depth)).unwrap_err();
+    let error = |cloud: &PointCloud, depth| {
+        reconstruct(cloud, &at_depth(depth), MemoryBudget::default()).unwrap_err()
+    };
     let nothing = error(&PointCloud::default(), 8).to_string();
     assert!(nothing.contains("only 0 of 0 points"), "{nothing}");
     let mut one_place = PointCloud::default();

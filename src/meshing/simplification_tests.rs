@@ -7,6 +7,7 @@ use glam::Vec3;
 use super::shapes_for_tests::{Topology, street};
 use super::{PoissonConfig, reconstruct, simplify_ground};
 use crate::geometry::{Aabb, TriangleMesh};
+use crate::memory::MemoryBudget;
 
 /// A square of 20 m with heights `height` and a number of cells per side.
 fn square(cells: u32, height: impl Fn(f32, f32) -> f32) -> TriangleMesh {
@@ -43,7 +44,7 @@ fn noisy_street() -> (TriangleMesh, Vec<bool>) {
         depth: 8,
         ..PoissonConfig::default()
     };
-    let mesh = reconstruct(&street(100_000, 0.01, 5), &config)
+    let mesh = reconstruct(&street(100_000, 0.01, 5), &config, MemoryBudget::default())
         .unwrap()
         .mesh;
     let is_ground = (0..mesh.triangles.len())

@@ -28,7 +28,7 @@ use super::planes::{LidarFrame, Plane, ScanPoints, associate};
 use super::pose_graph::{Edge, information};
 use crate::geometry::Pose3;
 use crate::geometry::pose::{exponential, logarithm};
-use crate::memory::{self, MemoryError};
+use crate::memory::{MemoryBudget, MemoryError};
 use crate::validation::{InvalidValue, Validate, in_range, positive};
 
 /// Settings of the adjustment.
@@ -98,6 +98,7 @@ pub fn adjust(
     drive: &mut Drive,
     held: Held,
     config: &AdjustmentConfig,
+    budget: MemoryBudget,
 ) -> Result<Option<Adjusted>, MemoryError> {
     /// Factors of the first voxels of given poses, whose scans may be too far from each other for common planes.
     const COARSE: [f64; 4] = [4.0, 4.0, 2.0, 2.0];
@@ -122,7 +123,7 @@ pub fn adjust(
         let Some(residuals) = Residuals::new(&rows, &planes) else {
             break;
         };
-        require_memory(&rows, &planes)?;
+        require_memory(&rows, &planes, budget)?;
         let before_m = result.map_or(residuals.rms_m, |result| result.residuals_m[0]);
         let result = result.insert(Adjusted {
             residuals_m: [before_m, residuals.rms_m],
@@ -174,7 +175,11 @@ pub fn adjust(
 }
 
 /// Requires the memory of the equations: all scans of a car that stands see the same planes.
-fn require_memory(rows: &[ScanPoints], planes: &[Plane]) -> Result<(), MemoryError> {
+fn require_memory(
+    rows: &[ScanPoints],
+    planes: &[Plane],
+    budget: MemoryBudget,
+) -> Result<(), MemoryError> {
     /// Memory of the blocks of two scans that see a plane in common [bytes].
     const PAIR_BYTES: f64 = 2400.0;
     let later_scans = |(number, row): (usize, &ScanPoints)| {
@@ -189,7 +194,7 @@ fn require_memory(rows: &[ScanPoints], planes: &[Plane]) -> Result<(), MemoryErr
         is_seen.into_iter().filter(|&is_seen| is_seen).count()
     };
     let pairs: usize = rows.par_iter().enumerate().map(later_scans).sum();
-    memory::require(
+    budget.require(
         "the adjustment of scans that see the same surfaces",
         pairs as f64 * PAIR_BYTES,
         SHORTER,

@@ -14,7 +14,7 @@ use super::path_graph::{SUBMAP_LENGTH, move_along, odometry_edges};
 use super::pose_graph::{Edge, information, optimize};
 use super::voxel_map::{VoxelMap, pack};
 use crate::geometry::{Pose3, TriangleMesh};
-use crate::memory::{self, MemoryError};
+use crate::memory::{MemoryBudget, MemoryError};
 
 /// The drive was not found in the map.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -49,6 +49,7 @@ pub fn place(
     map_from_lidar: &[Option<Pose3>],
     odometry: &[OdometryEstimate],
     loops: &[Loop],
+    budget: MemoryBudget,
 ) -> Result<Placed, PlacementError> {
     /// Distance between points on the surfaces, in voxels.
     const SPACING: f64 = 0.25;
@@ -61,7 +62,7 @@ pub fn place(
         *pose = map_from_odom * *pose;
     }
     let maps = drive.submaps(SUBMAP_LENGTH * drive.range_m);
-    let surfaces = surface_points(mesh, drive, SPACING * drive.voxel_m)?;
+    let surfaces = surface_points(mesh, drive, SPACING * drive.voxel_m, budget)?;
     let mut voxels = VoxelMap::new(drive.voxel_m, f32::MAX);
     voxels.insert(&surfaces);
     let in_map: Vec<Edge> = map_edges(drive, &maps, &found)
@@ -180,6 +181,7 @@ fn surface_points(
     mesh: &TriangleMesh,
     drive: &Drive,
     spacing_m: f64,
+    budget: MemoryBudget,
 ) -> Result<Vec<DVec3>, MemoryError> {
     let cell_of = |point: DVec3| (point / drive.range_m).floor().as_ivec3();
     let mut near = HashSet::<u64>::default();
@@ -214,7 +216,7 @@ fn surface_points(
             .filter(|point| near.contains(&pack(cell_of(*point))))
             .filter(|point| occupied.insert(pack((point / spacing_m).floor().as_ivec3()))),
         );
-        memory::require(
+        budget.require(
             "the surfaces of the older map",
             points.len() as f64 * POINT_BYTES,
             SHORTER,

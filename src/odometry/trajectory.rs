@@ -15,7 +15,7 @@ use super::pose_graph::{Edge, optimize};
 use super::sampling::{Sample, sensor_range};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::lidar::{Scan, interval_s};
-use crate::memory::{self, MemoryError};
+use crate::memory::{MemoryBudget, MemoryError};
 use crate::validation::{InvalidValue, Validate, in_range, nested};
 
 /// Settings of the trajectory of a drive.
@@ -74,6 +74,7 @@ pub struct TrajectoryBuilder {
     time_s: Option<f64>,
     /// Number of points of all samples.
     points: usize,
+    memory_budget: MemoryBudget,
 }
 
 impl TrajectoryBuilder {
@@ -92,7 +93,17 @@ impl TrajectoryBuilder {
             given: vec![],
             time_s: None,
             points: 0,
+            memory_budget: MemoryBudget::default(),
         })
+    }
+
+    /// Bounds the memory of the samples and of the adjustment.
+    #[must_use]
+    pub fn with_memory_budget(self, memory_budget: MemoryBudget) -> Self {
+        Self {
+            memory_budget,
+            ..self
+        }
     }
 
     /// Registers the next scan, and keeps a sample of its points.
@@ -142,7 +153,7 @@ impl TrajectoryBuilder {
         self.samples.push(sample);
         self.ranges_m.extend(range_m.map(|range_m| range_m as f32));
         self.time_s = scan.time_s;
-        memory::require(
+        self.memory_budget.require(
             "the points of all scans",
             self.points as f64 * POINT_BYTES,
             SHORTER,
@@ -156,6 +167,7 @@ impl TrajectoryBuilder {
     pub fn finish(self) -> Result<Trajectory, MemoryError> {
         let given = self.given.clone();
         let is_given = !given.is_empty();
+        let budget = self.memory_budget;
         let (config, mut trajectory, drive) = self.into_drive();
         let Some(mut drive) = drive else {
             return Ok(trajectory);
@@ -169,7 +181,7 @@ impl TrajectoryBuilder {
             } else {
                 Held::First
             };
-            trajectory.adjusted = adjust(&mut drive, held, &config.adjustment)?;
+            trajectory.adjusted = adjust(&mut drive, held, &config.adjustment, budget)?;
         }
         trajectory.poses = drive.poses;
         Ok(trajectory)
@@ -182,6 +194,7 @@ impl TrajectoryBuilder {
         mesh: &TriangleMesh,
         map_from_lidar: &[Option<Pose3>],
     ) -> Result<Trajectory, PlacementError> {
+        let budget = self.memory_budget;
         let (config, mut trajectory, drive) = self.into_drive();
         let mut drive = drive.ok_or(NotInMap)?;
         if config.loops {
@@ -191,13 +204,13 @@ impl TrajectoryBuilder {
         let Placed {
             map_from_odom,
             surfaces,
-        } = anchors::place(&mut drive, mesh, map_from_lidar, odometry, loops)?;
+        } = anchors::place(&mut drive, mesh, map_from_lidar, odometry, loops, budget)?;
         for estimate in &mut trajectory.odometry {
             estimate.odom_from_lidar = map_from_odom * estimate.odom_from_lidar;
         }
         if config.adjust {
             let held = Held::Surfaces(&surfaces);
-            trajectory.adjusted = adjust(&mut drive, held, &config.adjustment)?;
+            trajectory.adjusted = adjust(&mut drive, held, &config.adjustment, budget)?;
         }
         trajectory.poses = drive.poses;
         Ok(trajectory)

@@ -6,7 +6,7 @@
 
 use std::sync::Arc;
 
-use super::backend::{AdapterReport, Backend, RenderingMethod, best_adapter};
+use super::backend::{AdapterReport, Backend, RenderLimits, RenderingMethod, best_adapter};
 #[cfg(feature = "gpu")]
 use super::gpu::GpuRenderer;
 use super::{CpuRenderer, RangeRenderer, RenderError};
@@ -37,22 +37,21 @@ impl BackendChoice {
 }
 
 impl BackendChoice {
-    /// Prepares the tiles of a map, in the map frame, for rendering at most `max_poses` poses at once (range-mcl's
-    /// `max_instance`), which bounds the memory. Reports the renderer and the reason to the log.
+    /// Prepares the tiles of a map, in the map frame, for rendering within limits. Reports the renderer and the reason to the log.
     ///
     /// # Errors
     /// Those of the graphics device.
     pub fn renderer(
         &self,
         tiles: &[TriangleMesh],
-        max_poses: Option<usize>,
+        limits: RenderLimits,
     ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
         self.report();
         #[cfg(feature = "gpu")]
         if self.adapter.is_some() {
-            return Ok(Arc::new(GpuRenderer::new(tiles, self.request, max_poses)?));
+            return Ok(Arc::new(GpuRenderer::new(tiles, self.request, limits)?));
         }
-        Ok(on_cpu(CpuRenderer::new(tiles), max_poses))
+        Ok(on_cpu(CpuRenderer::new(tiles), limits))
     }
 
     /// As [`renderer`](Self::renderer), with tiles that are read, and on a graphics adapter uploaded, when rays may reach
@@ -63,18 +62,14 @@ impl BackendChoice {
     pub fn renderer_over<S: SceneSource + TriangleSource + 'static>(
         &self,
         source: &Arc<S>,
-        max_poses: Option<usize>,
+        limits: RenderLimits,
     ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
         self.report();
         #[cfg(feature = "gpu")]
         if self.adapter.is_some() {
-            return Ok(Arc::new(GpuRenderer::over(
-                source,
-                self.request,
-                max_poses,
-            )?));
+            return Ok(Arc::new(GpuRenderer::over(source, self.request, limits)?));
         }
-        Ok(on_cpu(CpuRenderer::over(source.clone()), max_poses))
+        Ok(on_cpu(CpuRenderer::over(source.clone()), limits))
     }
 
     fn report(&self) {
@@ -82,8 +77,8 @@ impl BackendChoice {
     }
 }
 
-fn on_cpu(mut renderer: CpuRenderer, max_poses: Option<usize>) -> Arc<dyn RangeRenderer> {
-    renderer.max_poses = max_poses.unwrap_or(usize::MAX);
+fn on_cpu(mut renderer: CpuRenderer, limits: RenderLimits) -> Arc<dyn RangeRenderer> {
+    renderer.max_poses = limits.max_poses.unwrap_or(usize::MAX);
     Arc::new(renderer)
 }
 

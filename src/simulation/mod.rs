@@ -59,7 +59,7 @@ pub use structure::Structure;
 pub use traffic::TrafficConfig;
 
 use crate::geometry::{Pose3, Rigid3f, TriangleMesh};
-use crate::memory::{self, MemoryError};
+use crate::memory::{MemoryBudget, MemoryError};
 use crate::random::Generator;
 use crate::recording::Calibration;
 use crate::validation::Validate as _;
@@ -89,11 +89,12 @@ impl Simulation {
     pub fn new(
         config: &SimulationConfig,
         recorded: Option<&[Pose3]>,
+        memory_budget: MemoryBudget,
     ) -> Result<Self, SimulationError> {
         config.validate()?;
         let (path, stations_m) = driven_path(config, recorded)?;
         let length_m = path.length_m();
-        require_memory(&path, &config.street)?;
+        require_memory(&path, &config.street, memory_budget)?;
         let street = Street::new(&path, &config.street, config.seed);
         let motion_on = |drive| {
             let recorded_m = stations_m.as_deref();
@@ -268,10 +269,14 @@ const CELL_BYTES: f64 = 1000.0;
 
 /// Requires the memory of the ground: its samples in the rectangle around the path and side streets, and
 /// its triangles with their hierarchy within reach of the path; and that of the structures.
-fn require_memory(path: &Centreline, street: &StreetConfig) -> Result<(), MemoryError> {
+fn require_memory(
+    path: &Centreline,
+    street: &StreetConfig,
+    budget: MemoryBudget,
+) -> Result<(), MemoryError> {
     let ground = &street.ground;
     let area_m2: f64 = street.structures.iter().map(Structure::area_m2).sum();
-    memory::require(
+    budget.require(
         "the structures of the street",
         area_m2 * CELL_BYTES,
         "shorten those of street.structures",
@@ -285,7 +290,7 @@ fn require_memory(path: &Centreline, street: &StreetConfig) -> Result<(), Memory
     let margin_m = 2.0 * (ground.reach_m + layout::EXTENSION_M);
     let samples = (max.x - min.x + margin_m) * (max.y - min.y + margin_m);
     let cells = 2.0 * ground.reach_m * (length_m + margin_m);
-    memory::require(
+    budget.require(
         "the ground of the street",
         (samples * SAMPLE_BYTES + cells * CELL_BYTES) / ground.cell_m.powi(2),
         "raise street.ground.cell_m, or shorten path or street.ground.reach_m",

@@ -10,6 +10,7 @@ use super::scanner::{LabelledScan, ScanTarget, ScannerConfig, simulate_scan};
 use super::street::Street;
 use super::street_config::StreetConfig;
 use super::{Simulation, SimulationConfig, SimulationError};
+use crate::memory::MemoryBudget;
 
 /// A named scene: its scans with a seed.
 pub type GroundScene = (
@@ -65,7 +66,7 @@ fn drive(seed: u64, beams: usize) -> Result<Vec<LabelledScan>, SimulationError> 
         },
         ..SimulationConfig::default()
     };
-    let simulation = Simulation::new(&config, None)?;
+    let simulation = Simulation::new(&config, None, MemoryBudget::default())?;
     let frames = (0..simulation.frames()).into_par_iter().step_by(STEP);
     Ok(frames.map(|frame| simulation.scan(frame)).collect())
 }

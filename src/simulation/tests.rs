@@ -43,7 +43,7 @@ fn is_moving(class: u16) -> bool {
 }
 
 fn simulate(config: &SimulationConfig) -> Simulation {
-    Simulation::new(config, None).unwrap()
+    Simulation::new(config, None, MemoryBudget::default()).unwrap()
 }
 
 /// The poses of KITTI 07, if the recorded data is there.
@@ -252,7 +252,7 @@ fn a_kidnapped_vehicle_is_displaced_without_its_odometry_noticing() {
         ..kidnapped_at(Some(10))
     };
     assert_eq!(simulate(&short).odometry().len(), 8);
-    let beyond = Simulation::new(&kidnapped_at(Some(70)), None);
+    let beyond = Simulation::new(&kidnapped_at(Some(70)), None, MemoryBudget::default());
     assert!(matches!(
         beyond,
         Err(SimulationError::KidnappedBeyondPath { frame: 70, .. })
@@ -370,7 +370,7 @@ fn kitti_07_closes_its_loop() {
         },
         ..SimulationConfig::default()
     };
-    let simulation = Simulation::new(&config, Some(&recorded)).unwrap();
+    let simulation = Simulation::new(&config, Some(&recorded), MemoryBudget::default()).unwrap();
     assert_eq!(simulation.frames(), 1101);
     let poses = simulation.poses();
     for (simulated, recorded) in poses.iter().zip(&recorded) {
@@ -398,7 +398,7 @@ fn a_second_drive_along_a_recorded_path_varies_in_speed() {
         .collect();
     let drive = |drive| {
         let config = SimulationConfig { drive, ..small() };
-        Simulation::new(&config, Some(&recorded)).unwrap()
+        Simulation::new(&config, Some(&recorded), MemoryBudget::default()).unwrap()
     };
     let (first, second) = (drive(1), drive(2));
     assert_eq!(first.frames(), second.frames());
@@ -454,7 +454,10 @@ fn invalid_values_are_reported_with_their_key() {
     assert!(message.contains("path.2.length_m is -5"), "{message}");
     config = small();
     config.path.clear();
-    let message = Simulation::new(&config, None).err().unwrap().to_string();
+    let message = Simulation::new(&config, None, MemoryBudget::default())
+        .err()
+        .unwrap()
+        .to_string();
     assert!(message.contains("the path is"), "{message}");
 }
 

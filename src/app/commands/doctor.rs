@@ -10,6 +10,7 @@ use anyhow::Result;
 use clap::Args;
 use nalgebra::Vector3;
 
+use crate::app::run::memory;
 use crate::app::run::{Context, Printed, version};
 use crate::geometry::{Pose3, TriangleMesh};
 use crate::lidar::{Beam, LidarModel, RangeImage};
@@ -18,7 +19,8 @@ use crate::map::TileConfig;
 use crate::map::tiles::grid;
 use crate::rendering::backend::{AdapterReport, best_adapter};
 use crate::rendering::{
-    Backend, CpuRenderer, RangeDifference, RangeRenderer, RenderError, RenderingMethod, selection,
+    Backend, CpuRenderer, RangeDifference, RangeRenderer, RenderError, RenderLimits,
+    RenderingMethod, selection,
 };
 use crate::simulation::{Simulation, SimulationConfig};
 
@@ -130,7 +132,7 @@ struct Workload {
 
 impl Workload {
     fn new() -> Result<Self> {
-        let simulation = Simulation::new(&SimulationConfig::default(), None)?;
+        let simulation = Simulation::new(&SimulationConfig::default(), None, memory::budget())?;
         let mut street = simulation.street.surface.mesh.clone();
         street.snap();
         let tiles = grid::cut(&street, TileConfig::default().side_m);
@@ -161,7 +163,7 @@ impl Workload {
         backend: Backend,
         method: RenderingMethod,
     ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
-        selection::choose(backend, method)?.renderer(&self.tiles, None)
+        selection::choose(backend, method)?.renderer(&self.tiles, RenderLimits::default())
     }
 
     /// Speed with which whole images are compared.

@@ -10,6 +10,7 @@ use super::stages::{RecordingInputs, complete};
 use super::trajectory;
 use crate::app::report::RunFiles;
 use crate::app::report::odometry::{self, OdometryReport};
+use crate::app::run::memory;
 use crate::app::run::{Claims, Context, Outputs, Printed, RunArgs, output};
 use crate::app::settings::OdometryCommandConfig;
 use crate::mapping::find_poses;
@@ -48,7 +49,13 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
     let is_given = recording.track.is_some();
     let name = if is_given { "polish" } else { "odometry" };
     let found = trajectory::find(name, frames.len(), context, |on_event| {
-        find_poses(&frames, is_given, &config.trajectory, on_event)
+        find_poses(
+            &frames,
+            is_given,
+            &config.trajectory,
+            memory::budget(),
+            on_event,
+        )
     })?;
     let numbers: Vec<usize> = recording.frames.iter().map(|it| it.number).collect();
     let rows: Vec<usize> = (0..frames.len())

@@ -20,6 +20,7 @@ use anyhow::{Context as _, Result, bail};
 use rayon::prelude::*;
 
 use crate::app::run::artefact::hash::hash_of_texts;
+use crate::app::run::memory;
 use crate::app::run::{Claims, Context, Interrupt, Printed, Task, output, version};
 use crate::app::settings::to_yaml;
 use crate::evaluation::distances_m;
@@ -131,7 +132,11 @@ fn prepare(config: &SimulationConfig) -> Result<Simulation> {
         Some(pose_file) => Some(recorded_path(pose_file, config.path_calib_file.as_deref())?),
         None => None,
     };
-    Ok(Simulation::new(config, recorded.as_deref())?)
+    Ok(Simulation::new(
+        config,
+        recorded.as_deref(),
+        memory::budget(),
+    )?)
 }
 
 fn recorded_path(pose_file: &Path, calib_file: Option<&Path>) -> Result<Vec<Pose3>> {

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result};
 
+use crate::app::run::memory;
 use crate::app::run::{Context, input};
 use crate::app::settings::{GivenPosesConfig, MapInputConfig, MotionConfig, RecordingConfig};
 use crate::map::{Map, MapCache, MapOptions, MappingPath};
@@ -153,6 +154,7 @@ impl MapInputConfig {
         let options = MapOptions {
             backend: context.backend,
             cache: MapCache::NextToMap,
+            memory_budget: memory::budget(),
             ..options
         };
         let map = Map::load_with_path(&self.map_file, self.given_path()?, &options)

@@ -9,8 +9,9 @@ use tracing::level_filters::LevelFilter;
 use crate::app::run::artefact::CONFIGURATION_FILE;
 use crate::app::run::interrupt::Interrupt;
 use crate::app::run::logging::{self, RunLog};
+use crate::app::run::memory;
 use crate::app::run::progress::Progress;
-use crate::memory;
+use crate::memory::MemoryBudget;
 use crate::rendering::Backend;
 
 const GIB: f64 = (1_u64 << 30) as f64;
@@ -85,7 +86,9 @@ impl Context {
         let log = RunLog::default();
         logging::start(level, &progress, &log);
         let half_gib = 0.5 * machine_bytes() / GIB;
-        memory::set_budget((machine.memory.unwrap_or(half_gib) * GIB) as u64);
+        memory::set(MemoryBudget {
+            bytes: (machine.memory.unwrap_or(half_gib) * GIB) as u64,
+        });
         let threads = machine.threads.map_or(0, usize::from);
         rayon::ThreadPoolBuilder::new()
             .num_threads(threads)

@@ -30,7 +30,7 @@ use crate::lidar::{LidarModel, Scan};
 use crate::map::files::mapping_path::MappingPath;
 use crate::map::mesh_view::MeshView;
 use crate::map::model::{Map, MapError};
-use crate::memory::{self, MemoryError};
+use crate::memory::{MemoryBudget, MemoryError};
 use crate::meshing::MeshingError;
 use crate::sensor::{SENSOR_SCANS, Sensor, SensorError};
 use crate::validation::{InvalidValue, Validate as _};
@@ -250,8 +250,9 @@ impl MapBuilder {
         path_check::check(map_from_lidar.iter().enumerate(), config.max_step_m)?;
         let local_maps = plan::local_maps(&map_from_lidar, config.local_map_size, config.overlap_m);
         let reach_m = f64::from(config.local_map.crop_m().length());
-        Ownership::require_memory(&map_from_lidar, &local_maps, reach_m)?;
-        require_memory_of_images(&sensor.range_image)?;
+        let budget = self.options.memory_budget;
+        Ownership::require_memory(&map_from_lidar, &local_maps, reach_m, budget)?;
+        require_memory_of_images(&sensor.range_image, budget)?;
         Ok(MapPlan {
             builder: self,
             scan: config.local_map.scan_preparation(sensor),
@@ -265,9 +266,9 @@ impl MapBuilder {
 }
 
 /// Requires the memory of one range image per thread, with normals, free space and ground features.
-fn require_memory_of_images(model: &LidarModel) -> Result<(), MemoryError> {
+fn require_memory_of_images(model: &LidarModel, budget: MemoryBudget) -> Result<(), MemoryError> {
     const PIXEL_BYTES: usize = 128;
-    memory::require(
+    budget.require(
         "the range images of the scans",
         (model.len() * rayon::current_num_threads() * PIXEL_BYTES) as f64,
         "lower the height or width of the sensor's range_image, or the number of threads",
@@ -329,7 +330,7 @@ impl MapPlan<'_> {
             let pose = Translation3::from(-offset) * self.map_from_lidar[index];
             let prepared = ScanCloud::prepare(scan, &pose, &self.scan, &*self.classifier);
             let bytes = held_bytes.fetch_add(prepared.bytes(), Ordering::Relaxed);
-            memory::require(
+            self.builder.options.memory_budget.require(
                 "the scans of a local map",
                 bytes as f64,
                 "lower local_map_size or overlap_m, or raise local_map.voxel_size_m",
@@ -363,6 +364,7 @@ impl MapPlan<'_> {
             self.older,
             &self.scan.sensor.range_image,
             config,
+            self.builder.options.memory_budget,
             begin_stage,
         );
         let mut local_map = built.map_err(|error| match error {

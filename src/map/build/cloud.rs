@@ -19,7 +19,7 @@ use super::local_map::{self, LocalMap, LocalMapConfig};
 use super::plan::{Domain, LocalMapPlan, Ownership};
 use crate::geometry::{Aabb, KdTree, PointCloud, Pose3};
 use crate::map::ground::surface::GroundSurface;
-use crate::memory;
+use crate::memory::MemoryBudget;
 use crate::validation::Validate as _;
 
 /// Edge of a block [m].
@@ -42,6 +42,7 @@ pub struct CloudPlan {
     /// Points of all blocks, map frame.
     pub cloud: PointCloud,
     config: LocalMapConfig,
+    memory_budget: MemoryBudget,
     /// Centres of the blocks [m].
     centers: Vec<Point2<f32>>,
     ownership: Ownership,
@@ -57,19 +58,20 @@ impl CloudPlan {
         normals: Option<&[Vec3]>,
         sensor_positions: &[Vec3],
         config: &LocalMapConfig,
+        memory_budget: MemoryBudget,
         on_event: &dyn Fn(BuildEvent) -> ControlFlow<()>,
     ) -> Result<Self, BuildError> {
         config.validate()?;
         let begin_stage = |name| notify(on_event, name);
         begin_stage("voxels")?;
         let remedy = "raise local_map.voxel_size_m, or divide the cloud";
-        memory::require(
+        memory_budget.require(
             "the points of the cloud",
             points.len() as f64 * 60.0,
             remedy,
         )?;
         let mut cloud = voxels(points, normals, config.voxel_size_m)?;
-        memory::require(
+        memory_budget.require(
             "the neighbours in the cloud",
             cloud.len() as f64 * POINT_BYTES,
             remedy,
@@ -122,6 +124,7 @@ impl CloudPlan {
         Ok(Self {
             cloud,
             config: config.clone(),
+            memory_budget,
             centers,
             ownership: Ownership::new(&poses, &plans),
         })
@@ -152,7 +155,13 @@ impl CloudPlan {
             origin: DVec3::ZERO,
             ownership: &self.ownership,
         };
-        local_map::build_of_cloud(&cloud, domain, &self.config, begin_stage)
+        local_map::build_of_cloud(
+            &cloud,
+            domain,
+            &self.config,
+            self.memory_budget,
+            begin_stage,
+        )
     }
 }
 
@@ -255,7 +264,15 @@ mod tests {
 
     fn build(points: &[Vec3], sensor_positions: &[Vec3]) -> (CloudPlan, TriangleMesh) {
         let go_on = |_| ControlFlow::Continue(());
-        let plan = CloudPlan::new(points, None, sensor_positions, &config(), &go_on).unwrap();
+        let plan = CloudPlan::new(
+            points,
+            None,
+            sensor_positions,
+            &config(),
+            MemoryBudget::default(),
+            &go_on,
+        )
+        .unwrap();
         let mut mesh = TriangleMesh::default();
         for block in 0..plan.blocks() {
             mesh.append(&plan.build_block(block, &go_on).unwrap().mesh);
@@ -320,7 +337,15 @@ mod tests {
         let go_on = |_| ControlFlow::Continue(());
         // Estimated ones would be those of neither surface at the edges.
         for normals in [&given, &alternating] {
-            let plan = CloudPlan::new(&points, Some(normals), &[], &config, &go_on).unwrap();
+            let plan = CloudPlan::new(
+                &points,
+                Some(normals),
+                &[],
+                &config,
+                MemoryBudget::default(),
+                &go_on,
+            )
+            .unwrap();
             assert_eq!(plan.cloud.len(), points.len());
             for (index, (point, normal)) in points.iter().zip(&plan.cloud.normals).enumerate() {
                 assert!(normal.distance(given[index]) < 1e-5, "{point}: {normal}");
@@ -332,9 +357,16 @@ mod tests {
     fn unusable_clouds_are_errors() {
         let error_of = |points: &[Vec3]| {
             let go_on = |_| ControlFlow::Continue(());
-            CloudPlan::new(points, None, &[], &config(), &go_on)
-                .err()
-                .unwrap()
+            CloudPlan::new(
+                points,
+                None,
+                &[],
+                &config(),
+                MemoryBudget::default(),
+                &go_on,
+            )
+            .err()
+            .unwrap()
         };
         assert!(matches!(
             error_of(&[]),
@@ -343,7 +375,14 @@ mod tests {
         let far = [Vec3::new(448_000.0, 5_400_000.0, 0.0)];
         assert!(matches!(error_of(&far), BuildError::CloudTooFar { .. }));
         let stop = |_| ControlFlow::Break(());
-        let stopped = CloudPlan::new(&street(), None, &[], &config(), &stop);
+        let stopped = CloudPlan::new(
+            &street(),
+            None,
+            &[],
+            &config(),
+            MemoryBudget::default(),
+            &stop,
+        );
         assert!(matches!(stopped.err().unwrap(), BuildError::Interrupted));
     }
 }

@@ -7,6 +7,7 @@ use super::local_map::LocalMapConfig;
 use crate::ground::GroundConfig;
 use crate::map::tiles::cache::MapCache;
 use crate::map::tiles::grid::TileConfig;
+use crate::memory::MemoryBudget;
 use crate::rendering::{Backend, RenderingMethod};
 use crate::sensor::SensorConfig;
 use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative, positive};
@@ -86,4 +87,7 @@ pub struct MapOptions {
     pub tiles: TileConfig,
     /// Where the tiles of a map file are kept.
     pub cache: MapCache,
+    /// Memory of each stage that prepares the map, renders it, or builds it.
+    #[serde(skip)]
+    pub memory_budget: MemoryBudget,
 }

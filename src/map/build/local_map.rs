@@ -13,6 +13,7 @@ use super::visibility::{self, VisibilityConfig};
 use crate::geometry::{PointCloud, TriangleMesh};
 use crate::lidar::{LidarModel, NormalConfig};
 use crate::map::mesh_view::MeshView;
+use crate::memory::MemoryBudget;
 use crate::meshing::{self, MeshingError, PoissonConfig, Reconstruction};
 use crate::sensor::Sensor;
 use crate::validation::{InvalidValue, Validate, fraction, in_range, nested, require};
@@ -206,6 +207,7 @@ pub(crate) fn build<E: From<MeshingError>>(
     older: Option<&dyn MeshView>,
     model: &LidarModel,
     config: &LocalMapConfig,
+    budget: MemoryBudget,
     begin_stage: impl Fn(&'static str) -> Result<(), E>,
 ) -> Result<LocalMap, E> {
     let mut counts = LocalMapCounts {
@@ -219,7 +221,7 @@ pub(crate) fn build<E: From<MeshingError>>(
     let cloud = static_cloud(&scans, model, config, &mut counts);
 
     begin_stage("surface")?;
-    let Some(mut mesh) = surface(&cloud, config, &mut counts)? else {
+    let Some(mut mesh) = surface(&cloud, config, budget, &mut counts)? else {
         return Ok(LocalMap {
             counts,
             ..LocalMap::default()
@@ -252,11 +254,12 @@ pub(crate) fn build_of_cloud<E: From<MeshingError>>(
     cloud: &PointCloud,
     domain: Domain,
     config: &LocalMapConfig,
+    budget: MemoryBudget,
     begin_stage: impl Fn(&'static str) -> Result<(), E>,
 ) -> Result<LocalMap, E> {
     let mut counts = LocalMapCounts::default();
     begin_stage("surface")?;
-    let Some(mesh) = surface(cloud, config, &mut counts)? else {
+    let Some(mesh) = surface(cloud, config, budget, &mut counts)? else {
         return Ok(LocalMap {
             counts,
             ..LocalMap::default()
@@ -270,13 +273,14 @@ pub(crate) fn build_of_cloud<E: From<MeshingError>>(
 fn surface(
     cloud: &PointCloud,
     config: &LocalMapConfig,
+    budget: MemoryBudget,
     counts: &mut LocalMapCounts,
 ) -> Result<Option<TriangleMesh>, MeshingError> {
     let Some(Reconstruction {
         mut mesh,
         densities,
         ..
-    }) = reconstruct(cloud, config, counts)?
+    }) = reconstruct(cloud, config, budget, counts)?
     else {
         return Ok(None);
     };
@@ -338,9 +342,10 @@ fn static_cloud(
 fn reconstruct(
     cloud: &PointCloud,
     config: &LocalMapConfig,
+    budget: MemoryBudget,
     counts: &mut LocalMapCounts,
 ) -> Result<Option<Reconstruction>, MeshingError> {
-    match meshing::reconstruct(cloud, &config.poisson) {
+    match meshing::reconstruct(cloud, &config.poisson, budget) {
         Ok(surface) => {
             counts.unusable_points = surface.dropped_points;
             counts.cell_m = surface.cell_m;
@@ -415,7 +420,7 @@ mod tests {
             },
             ..LocalMapConfig::default()
         };
-        let surface = reconstruct(cloud, &settings, &mut counts).unwrap();
+        let surface = reconstruct(cloud, &settings, MemoryBudget::default(), &mut counts).unwrap();
         assert_eq!(surface.is_none(), counts.is_empty);
         (counts.is_empty, counts.unusable_points)
     }

@@ -12,7 +12,7 @@ use glam::{DVec3, Vec3};
 use nalgebra::Point2;
 
 use crate::geometry::{Aabb, Grid2, Pose3};
-use crate::memory::{self, MemoryError};
+use crate::memory::{MemoryBudget, MemoryError};
 
 /// Edge of the cells in which ownership is decided [m].
 const OWNER_CELL_M: f64 = 0.5;
@@ -124,6 +124,7 @@ impl Ownership {
         poses: &[Pose3],
         plans: &[LocalMapPlan],
         reach_m: f64,
+        budget: MemoryBudget,
     ) -> Result<(), MemoryError> {
         const CELL_BYTES: f64 = 10.0;
         let area_m2 = |plan: &LocalMapPlan| {
@@ -136,7 +137,7 @@ impl Ownership {
             extent_m(0) * extent_m(1)
         };
         let largest_m2 = plans.iter().map(area_m2).fold(0.0, f64::max);
-        memory::require(
+        budget.require(
             "the plane around a local map",
             largest_m2 / OWNER_CELL_M.powi(2) * CELL_BYTES,
             "lower local_map_size, local_map.crop_x_m or local_map.crop_y_m, or check the poses",

@@ -33,7 +33,7 @@ use crate::geometry::{Pose2, Pose3, pose2_from_pose3, wrap_angle};
 use crate::lidar::{LidarModel, RangeImage};
 use crate::map::ground::elevation::{GroundMap, SensorAttitude};
 use crate::map::tiles::grid::TileGrid;
-use crate::memory::{self, MemoryError};
+use crate::memory::{MemoryBudget, MemoryError};
 use crate::raycasting::TileError;
 use crate::rendering::{RangeRenderer, RenderError};
 use crate::validation::{InvalidValue, Validate, fraction, in_range, not_negative, positive};
@@ -126,13 +126,18 @@ impl PanoramaRequest {
     }
 
     /// Requires the memory of the centres of all cells in the extent of the map, for a search anywhere.
-    pub fn require_memory(&self, path: &[Pose3], tiles: &TileGrid) -> Result<(), MemoryError> {
+    pub fn require_memory(
+        &self,
+        path: &[Pose3],
+        tiles: &TileGrid,
+        budget: MemoryBudget,
+    ) -> Result<(), MemoryError> {
         const CELL_BYTES: f64 = 16.0;
         let (min, max) = tiles.extent();
         let cells = (max.x - min.x) * (max.y - min.y) / self.config.cell_m.powi(2);
         match self.is_along(path) {
             true => Ok(()),
-            false => memory::require(
+            false => budget.require(
                 "the search grid",
                 cells * CELL_BYTES,
                 "raise panorama.cell_m",
@@ -188,7 +193,7 @@ pub struct PanoramaSeed {
 
 impl PanoramaIndex {
     /// Renders the panoramas of all cells, given by their centres [m], with ground in valid tiles; into a file, or if
-    /// there is none, into memory.
+    /// there is none, into memory, within the budget.
     pub(crate) fn build(
         cells: &[Point2<f64>],
         renderer: &dyn RangeRenderer,
@@ -196,6 +201,7 @@ impl PanoramaIndex {
         tiles: &TileGrid,
         request: &PanoramaRequest,
         file: Option<(&Path, &str)>,
+        budget: MemoryBudget,
     ) -> Result<Self, RenderError> {
         let upright = request.attitude();
         let on_map = |center: &&Point2<f64>| {
@@ -217,7 +223,7 @@ impl PanoramaIndex {
         let model = panorama_model(&request.lidar, &request.config);
         let render = |places: Range<usize>| renderer.render(&poses[places], &model);
         // Also of those in a file, so that a fine grid does not fill the disk.
-        memory::require(
+        budget.require(
             "the panoramas of the map",
             2.0 * model.len() as f64 * (places.len() + 3 * places.len().min(BATCH)) as f64,
             "raise panorama.cell_m, or lower panorama.rows or panorama.columns",
@@ -466,6 +472,7 @@ mod tests {
             &world.tiles,
             &request(),
             None,
+            MemoryBudget::default(),
         )
         .unwrap();
         let scan = world.scan(&world.pose_at(0.0, 0.0, 0.0));
@@ -544,6 +551,7 @@ mod tests {
             &world.tiles,
             &request,
             Some((&file, "the street")),
+            MemoryBudget::default(),
         );
         assert!(!abandoned.exists());
         assert!(Panoramas::open(&file, "another street").is_none());

@@ -12,6 +12,7 @@ use bytemuck::{NoUninit, Pod};
 use wgpu::{Buffer, BufferUsages};
 
 use super::batch_sizes::BatchSizes;
+use crate::memory::MemoryBudget;
 use crate::rendering::RenderError;
 use crate::rendering::backend::{AdapterKind, AdapterReport, Backend, best_adapter};
 
@@ -107,6 +108,8 @@ pub(super) struct Gpu {
     pub report: AdapterReport,
     pub limits: wgpu::Limits,
     pub batch_sizes: BatchSizes,
+    /// Memory for what is on the device.
+    pub memory_budget: MemoryBudget,
     /// Whether vertex and fragment shaders can read the map.
     pub can_rasterize: bool,
     errors: Arc<DeviceErrors>,
@@ -142,6 +145,7 @@ impl Gpu {
             device,
             queue,
             batch_sizes: BatchSizes::of(report.kind),
+            memory_budget: MemoryBudget::default(),
             report,
             limits,
             can_rasterize: adapter.get_downlevel_capabilities().flags.contains(stages),

@@ -7,7 +7,6 @@ use super::device::Gpu;
 use super::layout::Pose;
 use super::two_level::{DeviceTile, TwoLevelBvh};
 use crate::geometry::{Pose3, TriangleMesh};
-use crate::memory;
 use crate::rendering::RenderError;
 
 /// Buffers of the map and their layout.
@@ -34,12 +33,13 @@ impl DeviceMap {
         ];
         check_sizes(&sizes, gpu.max_binding_bytes())?;
         // Here, on the way to the device, and on a device that shares the memory.
-        memory::require(
-            "the graphics device",
-            3.0 * (sizes[0] + sizes[1]) as f64 + gpu.batch_sizes.bytes(),
-            "choose a smaller map, render on the CPU",
-        )
-        .map_err(RenderError::DeviceMemory)?;
+        gpu.memory_budget
+            .require(
+                "the graphics device",
+                3.0 * (sizes[0] + sizes[1]) as f64 + gpu.batch_sizes.bytes(),
+                "choose a smaller map, render on the CPU",
+            )
+            .map_err(RenderError::DeviceMemory)?;
         let map = Self {
             nodes: gpu.upload("nodes", &bvh.nodes, BufferUsages::STORAGE),
             triangles: gpu.upload("triangles", &bvh.triangles, BufferUsages::STORAGE),

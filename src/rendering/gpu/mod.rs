@@ -32,7 +32,7 @@ mod two_level;
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
-use super::backend::{Backend, RenderingMethod};
+use super::backend::{Backend, RenderLimits, RenderingMethod};
 use super::{CpuRenderer, RangeDifference, RangeRenderer, RenderError};
 use crate::geometry::{Pose3, TriangleMesh, Vec3};
 use crate::lidar::{Beam, LidarModel, RangeImage};
@@ -65,7 +65,7 @@ pub struct GpuRenderer {
 
 impl GpuRenderer {
     /// Opens the best adapter that the backend allows and uploads the map; compares images by the requested method, and
-    /// renders at most `max_poses` poses at once.
+    /// renders within limits.
     ///
     /// # Errors
     /// [`RenderError::NoAdapter`] where there is none, [`RenderError::MapTooLarge`] where the
@@ -74,9 +74,9 @@ impl GpuRenderer {
     pub fn new(
         tiles: &[TriangleMesh],
         request: (Backend, RenderingMethod),
-        max_poses: Option<usize>,
+        limits: RenderLimits,
     ) -> Result<Self, RenderError> {
-        Self::with(request, max_poses, |gpu| ResidentMap::whole(gpu, tiles))
+        Self::with(request, limits, |gpu| ResidentMap::whole(gpu, tiles))
     }
 
     /// As [`new`](Self::new), but uploads the tiles of a source when rays may reach them, and drops those far away. The CPU
@@ -87,22 +87,23 @@ impl GpuRenderer {
     pub fn over<S: SceneSource + TriangleSource + 'static>(
         source: &Arc<S>,
         request: (Backend, RenderingMethod),
-        max_poses: Option<usize>,
+        limits: RenderLimits,
     ) -> Result<Self, RenderError> {
-        Self::with(request, max_poses, |gpu| {
+        Self::with(request, limits, |gpu| {
             let mut cpu = CpuRenderer::over(source.clone());
-            cpu.max_poses = max_poses.unwrap_or(usize::MAX);
+            cpu.max_poses = limits.max_poses.unwrap_or(usize::MAX);
             ResidentMap::over(gpu, source.clone(), cpu)
         })
     }
 
     fn with(
         (backend, method): (Backend, RenderingMethod),
-        max_poses: Option<usize>,
+        limits: RenderLimits,
         map: impl FnOnce(&Gpu) -> Result<ResidentMap, RenderError>,
     ) -> Result<Self, RenderError> {
         let mut gpu = Gpu::open(backend)?;
-        if let Some(max_poses) = max_poses {
+        gpu.memory_budget = limits.memory_budget;
+        if let Some(max_poses) = limits.max_poses {
             gpu.batch_sizes.poses = gpu.batch_sizes.poses.min(max_poses).max(1);
         }
         let map = map(&gpu)?;

@@ -16,7 +16,6 @@ use super::shaders;
 use super::sums::{PartialSums, Summation};
 use crate::geometry::Vec3;
 use crate::lidar::{LidarModel, RangeImage};
-use crate::memory;
 use crate::rendering::{RangeDifference, RenderError};
 
 /// Maximum number of pixels in an atlas, unless a single image has more: 16 MB of ranges.
@@ -335,12 +334,13 @@ impl<'a> Drawing<'a> {
                 reason: format!("images of {width}x{height} pixels, textures have {largest}"),
             }
         })?;
-        memory::require(
-            "the range images on the graphics device",
-            (IN_FLIGHT * atlas.pixels() * PIXEL_BYTES) as f64,
-            "set method to cast, render on the CPU",
-        )
-        .map_err(RenderError::DeviceMemory)?;
+        gpu.memory_budget
+            .require(
+                "the range images on the graphics device",
+                (IN_FLIGHT * atlas.pixels() * PIXEL_BYTES) as f64,
+                "set method to cast, render on the CPU",
+            )
+            .map_err(RenderError::DeviceMemory)?;
         let directions: Vec<[f32; 4]> = model
             .directions()
             .iter()

@@ -14,7 +14,6 @@ use super::device::Gpu;
 use super::device_map::DeviceMap;
 use super::two_level::{BottomLevel, TwoLevelBvh, center_of};
 use crate::geometry::{Aabb, Pose3, TriangleMesh};
-use crate::memory;
 use crate::raycasting::TriangleSource;
 use crate::rendering::order::poses_by_square;
 use crate::rendering::{CpuRenderer, RenderError};
@@ -80,12 +79,13 @@ impl ResidentMap {
         let tiles: Vec<(Aabb, u64)> = source.tiles().into_iter().map(counted).collect();
         let all_bytes = tiles.iter().map(|(_, bytes)| bytes).sum::<u64>();
         let budget_bytes = BUDGET_BYTES.min(gpu.max_binding_bytes());
-        memory::require(
-            "the graphics device",
-            3.0 * all_bytes.min(budget_bytes) as f64 + gpu.batch_sizes.bytes(),
-            "choose a smaller map, render on the CPU",
-        )
-        .map_err(RenderError::DeviceMemory)?;
+        gpu.memory_budget
+            .require(
+                "the graphics device",
+                3.0 * all_bytes.min(budget_bytes) as f64 + gpu.batch_sizes.bytes(),
+                "choose a smaller map, render on the CPU",
+            )
+            .map_err(RenderError::DeviceMemory)?;
         let center = center_of(tiles.iter().map(|(bounds, _)| *bounds));
         let nothing = DeviceMap::of_hierarchy(gpu, TwoLevelBvh::over(center, &[]))?;
         let tiles = Tiles {

@@ -9,6 +9,7 @@ use anyhow::{Result, ensure};
 use super::files::{self, prepare, write_map};
 use super::progress::BuildProgress;
 use crate::app::report::map::{BuildReport, draw_map};
+use crate::app::run::memory;
 use crate::app::run::{Context, Progress, input};
 use crate::app::settings::BuildMapConfig;
 use crate::evaluation::map_quality::ResidualSums;
@@ -67,9 +68,14 @@ fn build_blocks(
     let points = read.scan.points;
     let local_map = &config.map.local_map;
     let prepare = || {
-        CloudPlan::new(&points, normals.as_deref(), &[], local_map, &|event| {
-            on_stage(event, context, stages)
-        })
+        CloudPlan::new(
+            &points,
+            normals.as_deref(),
+            &[],
+            local_map,
+            memory::budget(),
+            &|event| on_stage(event, context, stages),
+        )
     };
     let plan = prepare().map_err(|error| interrupt.explain(error))?;
     tracing::info!(

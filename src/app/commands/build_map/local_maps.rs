@@ -11,11 +11,12 @@ use super::opened::{Opened, open};
 use super::parts::{Parts, Role};
 use super::progress::BuildProgress;
 use crate::app::run::artefact::hash::{hash_of_scan, hash_of_scans, joint_hash};
+use crate::app::run::memory;
 use crate::app::run::{Context, Printed};
 use crate::app::settings::BuildMapConfig;
 use crate::map::build::plan::LocalMapPlan;
 use crate::map::build::scan_agreement;
-use crate::map::{BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapPlan};
+use crate::map::{BuildEvent, LocalMap, LocalMapCounts, MapBuilder, MapOptions, MapPlan};
 use crate::recording::Frame;
 
 /// Builds the local maps that are not finished yet, which is an error where they are collected; returns the counts of
@@ -127,6 +128,10 @@ fn builder(opened: &Opened, context: &Context, progress: &Arc<BuildProgress>) ->
             }
             interrupt.flow()
         }),
+        options: MapOptions {
+            memory_budget: memory::budget(),
+            ..MapOptions::default()
+        },
         ..MapBuilder::new(opened.config.map.clone())
     }
 }

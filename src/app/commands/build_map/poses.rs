@@ -13,6 +13,7 @@ use crate::app::commands::trajectory;
 use crate::app::report::odometry;
 use crate::app::report::run_output::stamped;
 use crate::app::run::artefact::hash::hash_of_texts;
+use crate::app::run::memory;
 use crate::app::run::{Context, output, version};
 use crate::app::settings::BuildMapConfig;
 use crate::geometry::Pose3;
@@ -102,7 +103,7 @@ pub fn find(
         };
         let found = trajectory::find(name, frames.len(), context, |on_event| match older {
             Some((_, map)) => find_poses_in(map, &frames, sensor, &config.map, on_event),
-            None => find_poses(&frames, is_given, &settings, on_event),
+            None => find_poses(&frames, is_given, &settings, memory::budget(), on_event),
         })?;
         let found_now = TrajectorySummary::new(&found, recording.has_times);
         odometry::warn(&found_now);

@@ -5,6 +5,7 @@ use glam::DVec3;
 use nalgebra::{Point2, Translation3, Vector3};
 
 use super::opened::Opened;
+use crate::app::run::memory;
 use crate::evaluation::TruthAgreement;
 use crate::evaluation::map_quality::{self, ResidualSums};
 use crate::geometry::Pose3;
@@ -21,6 +22,7 @@ pub fn prepared_map(opened: &Opened) -> Result<Option<Map>> {
     let options = MapOptions {
         backend: Backend::Cpu,
         cache: MapCache::NextToMap,
+        memory_budget: memory::budget(),
         ..MapOptions::default()
     };
     let config = &opened.config;

@@ -11,10 +11,11 @@ use super::arguments::ExportArgs;
 use crate::app::report::export::tiles::{
     METADATA_FILE, TILES_FOLDER, Tile, is_tile, metadata, split,
 };
+use crate::app::run::memory;
 use crate::app::run::{Claims, Context, output};
 use crate::geometry::{TriangleMesh, Vec3, sample_surface, surface_area_m2, surface_samples};
 use crate::map::MappingPath;
-use crate::memory::{self, MemoryError};
+use crate::memory::MemoryError;
 
 /// Name and value of what is printed.
 type Row = (&'static str, String);
@@ -72,7 +73,7 @@ fn sample(mesh: &TriangleMesh, spacing_m: f64) -> Result<Vec<Vec3>> {
 fn require_memory(mesh: &TriangleMesh, points: f64) -> Result<(), MemoryError> {
     const POINT_BYTES: usize = 2 * size_of::<Vec3>();
     let triangles = mesh.triangles.len() * surface_samples::TRIANGLE_BYTES;
-    memory::require(
+    memory::budget().require(
         "the points of the tiles",
         POINT_BYTES as f64 * points + triangles as f64,
         "give a larger --spacing",

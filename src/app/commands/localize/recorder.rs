@@ -7,13 +7,13 @@ use anyhow::Result;
 use crate::app::report::results::{ParticleLog, ScanOutline};
 use crate::app::report::run_output::{self, Movie};
 use crate::app::report::{LocalizationResults, RunFiles};
+use crate::app::run::memory;
 use crate::app::run::{Claims, Interrupted};
 use crate::app::settings::LocalizationConfig;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
 use crate::localization::Estimate;
 use crate::map::Map;
-use crate::memory;
 use crate::recording::Frame;
 use crate::refinement::FrameResult;
 
@@ -92,7 +92,7 @@ impl Run {
         }
         let results = &mut self.results;
         let particles = run_output::particle_rows(&estimate.particles);
-        memory::require(
+        memory::budget().require(
             "the particles of all frames",
             (results.particles.bytes() + size_of_val(&*particles)) as f64,
             "lower numParticles or n_scans",

@@ -14,7 +14,7 @@ use zip::result::ZipError;
 use zip::write::SimpleFileOptions;
 use zip::{ZipArchive, ZipWriter};
 
-use crate::memory;
+use crate::app::run::memory;
 use crate::recording::scan_files::npy::read_header;
 
 /// Size of the buffer between decompression and numbers [bytes].
@@ -182,7 +182,7 @@ fn open_array<'a>(mut entry: io::Take<impl Read + 'a>) -> Result<(Vec<usize>, Nu
         "its shape {shape:?} needs {needed} bytes of numbers, but there are {found}"
     );
     // Numbers of single precision and rows of poses take about as much as in the file.
-    memory::require("the array", needed as f64, "give a smaller file")?;
+    memory::budget().require("the array", needed as f64, "give a smaller file")?;
     let shape = shape.into_iter().map(|extent| extent as usize).collect();
     Ok((shape, numbers))
 }
