@@ -4,16 +4,16 @@ use std::time::Duration;
 
 use anyhow::Result;
 
+use super::opened::Opened;
+
+use crate::app::report::LocalizationResults;
 use crate::app::report::results::{ParticleLog, ScanOutline};
 use crate::app::report::run_output::{self, Movie};
-use crate::app::report::{LocalizationResults, RunFiles};
 use crate::app::run::memory;
 use crate::app::run::{Claims, Interrupted};
-use crate::app::settings::LocalizationConfig;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
 use crate::localization::Estimate;
-use crate::map::Map;
 use crate::recording::Frame;
 use crate::refinement::FrameResult;
 
@@ -31,17 +31,12 @@ pub struct Run {
 }
 
 impl Run {
-    pub fn new(
-        config: &LocalizationConfig,
-        map: &Map,
-        files: &RunFiles,
-        selected: usize,
-        claims: Claims,
-    ) -> Result<Self> {
+    pub fn new(opened: &Opened, claims: Claims) -> Result<Self> {
         /// An empty column, where it is filled.
         fn column<T>(is_filled: bool) -> Option<Vec<T>> {
             is_filled.then(Vec::new)
         }
+        let config = &opened.config;
         let (has_truth, is_refined) = (config.given_poses.pose_file.is_some(), config.refine);
         Ok(Self {
             results: LocalizationResults {
@@ -63,11 +58,11 @@ impl Run {
                 places: column(true),
                 states: column(true),
                 scan_outlines: column(true),
-                selected: Some(selected),
+                selected: Some(opened.recording.frames.len()),
             },
             claims,
             movie: match config.visualize {
-                true => Some(Movie::begin(files, map)?),
+                true => Some(Movie::begin(&opened.files, &opened.map)?),
                 false => None,
             },
             off_ground: 0,
@@ -169,5 +164,41 @@ impl Run {
             );
         }
         Ok(())
+    }
+}
+
+impl Run {
+    /// What is kept of the run after an interruption.
+    pub fn kept(&self, opened: &Opened) -> String {
+        let (config, frames) = (&opened.config, opened.recording.frames.len());
+        let found = self.results.len();
+        if found == 0 {
+            "no frame was finished".to_owned()
+        } else if config.save_result {
+            let path = config.result_path.display();
+            format!("{found} of {frames} frames are localized and kept in {path}")
+        } else {
+            format!(
+                "{found} of {frames} frames were localized; nothing is kept: save_result is False"
+            )
+        }
+    }
+
+    /// Finishes the animation; an error where not all frames were localized, which names what is kept.
+    pub fn finish(self, opened: &Opened) -> Result<()> {
+        let kept = self.kept(opened);
+        let animation = self.movie.map_or(Ok(()), |movie| movie.finish());
+        let failure = self.failure.or(animation.err());
+        let found = self.results.len();
+        if found == opened.recording.frames.len() && failure.is_none() {
+            if !opened.config.save_result {
+                tracing::warn!("the result is not kept: save_result is False");
+            }
+            return Ok(());
+        }
+        Err(match failure {
+            Some(failure) => failure.context(kept),
+            None => Interrupted { kept }.into(),
+        })
     }
 }

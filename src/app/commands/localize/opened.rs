@@ -1,0 +1,90 @@
+//! The inputs of a localization, opened, and its outputs, claimed.
+
+use anyhow::Result;
+
+use super::super::motion_source::MotionSource;
+use super::super::stages::{RecordingInputs, input_files};
+use crate::app::report::RunFiles;
+use crate::app::report::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES};
+use crate::app::run::{Claims, Context, NPZ, Outputs, input};
+use crate::app::settings::LocalizationConfig;
+use crate::map::Map;
+use crate::random::stream;
+use crate::recording::Recording;
+use crate::sensor::Sensor;
+
+/// Random stream of the noise on the odometry; the localizer has its own streams.
+const ODOMETRY_STREAM: u64 = 1;
+
+/// What a localization works on.
+pub struct Opened {
+    /// The configuration, with what the scans show about the sensor.
+    pub config: LocalizationConfig,
+    /// The files of the result.
+    pub files: RunFiles,
+    /// The map.
+    pub map: Map,
+    /// The recording, with its true poses where they are given.
+    pub recording: Recording,
+    /// The sensor.
+    pub sensor: Sensor,
+}
+
+/// Opens map, recording and source of motion, after the outputs are claimed.
+pub fn open(
+    config: &LocalizationConfig,
+    context: &Context,
+) -> Result<(Opened, MotionSource, Claims)> {
+    input::require_file("map_file", &config.map_input.map_file)?;
+    let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
+    inputs.require()?;
+    let files = RunFiles::new(&config.result_path);
+    context.interrupt.keeps("no frame was finished");
+    let claims = prepare(config, context, &files)?;
+    let map = config.map_input.load(config.map_options(), context)?;
+    let mut resolved = config.clone();
+    let (recording, sensor) = inputs.open_in_map(&map, &mut resolved.tracker.sensor)?;
+    let mut rng = stream(config.tracker.seed, ODOMETRY_STREAM);
+    let (motion, odometry_file) =
+        MotionSource::open(&config.motion, &inputs, &recording, &mut rng)?;
+    resolved.motion.odometry_file = odometry_file;
+    let opened = Opened {
+        config: resolved,
+        files,
+        map,
+        recording,
+        sensor,
+    };
+    Ok((opened, motion, claims))
+}
+
+/// Prepares the configured outputs.
+fn prepare(config: &LocalizationConfig, context: &Context, files: &RunFiles) -> Result<Claims> {
+    let mut names = Vec::new();
+    if config.save_result {
+        names.extend(REPORT_FILES.iter().chain(&LOCALIZATION_FILES));
+        let is_refined = config.refine;
+        names.extend(REFINEMENT_FILES.iter().filter(|_| is_refined));
+    }
+    names.extend(config.output.plots.then_some("plots"));
+    if config.visualize {
+        names.extend(["loc_plots", "localization.gif"]);
+    }
+    if names.is_empty() {
+        return Claims::read(files.folder());
+    }
+    let outputs = Outputs {
+        key: "result_path",
+        main: &config.result_path,
+        magic: Some(NPZ),
+        names: names.into_iter().map(str::to_owned).collect(),
+        inputs: input_files(
+            RecordingInputs::new(&config.recording, &config.given_poses),
+            &config.map_input,
+            &config.motion,
+            context,
+        ),
+        force: config.output.force,
+    };
+    run_output::prepare(files, &outputs)
+}
