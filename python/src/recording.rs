@@ -323,7 +323,7 @@ pub fn infer_sensor(py: Python<'_>, scans: &Bound<'_, PyAny>) -> PyResult<Sensor
 
 /// Scans of an argument, which are read or converted when they are needed.
 pub enum Scans {
-    Recorded(recording::Recording, Sensor),
+    Recorded(Box<recording::Recording>, Sensor),
     Given(Vec<GivenScan>),
 }
 
@@ -339,7 +339,10 @@ impl Scans {
         if let Ok(recording) = scans.cast::<Recording>() {
             let recording = recording.get();
             let sensor = recording.sensor.clone();
-            return Ok(Self::Recorded(recording.recording.clone(), sensor));
+            return Ok(Self::Recorded(
+                Box::new(recording.recording.clone()),
+                sensor,
+            ));
         }
         let scans = scans.try_iter()?.map(|scan| {
             Ok(match scan?.cast_into::<Scan>() {
@@ -392,7 +395,7 @@ impl Scans {
     /// The recording, which scans of an iterable make.
     pub fn recording(&self) -> anyhow::Result<recording::Recording> {
         if let Self::Recorded(recording, _) = self {
-            return Ok(recording.clone());
+            return Ok((**recording).clone());
         }
         let scans = (0..self.len()).map(|row| Ok(self.read(row)?.into_owned()));
         let scans = scans.collect::<anyhow::Result<Vec<lidar::Scan>>>()?;

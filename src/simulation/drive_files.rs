@@ -45,6 +45,9 @@ pub fn scan_files(folder: &Path, frame: usize) -> [PathBuf; 2] {
     ]
 }
 
+/// Name of a file of poses, and how they follow.
+type PoseTable = (&'static str, fn(&Simulation) -> Vec<Pose3>);
+
 impl Simulation {
     /// Paths of all files of the drive in a folder.
     pub fn files_in(&self, folder: &Path) -> Vec<PathBuf> {
@@ -89,8 +92,8 @@ impl Simulation {
     }
 
     /// Names and poses of the files of poses, in the order in which they are written.
-    fn tables(&self) -> Vec<(&'static str, fn(&Self) -> Vec<Pose3>)> {
-        let mut tables: Vec<(_, fn(&Self) -> _)> = vec![("odometry.txt", Self::odometry)];
+    fn tables(&self) -> Vec<PoseTable> {
+        let mut tables: Vec<PoseTable> = vec![("odometry.txt", Self::odometry)];
         if self.config.given_poses.has_errors() {
             tables.push((GIVEN_POSES_FILE, Self::given_poses));
             tables.push((POSES_IN_MAP_FILE, Self::poses_in_map));
