@@ -66,6 +66,31 @@ pub fn aligned(truth_from_estimate: &Pose3, estimates: &[Pose3]) -> Vec<Pose3> {
         .collect()
 }
 
+/// Turns poses of a camera, whose truth moves along its z axis, so that x is ahead and z is up: heights, headings and
+/// pictures from above need such axes, distances and angles do not depend on them.
+pub fn level_camera_axes(estimates: &mut [Pose3], truth: &mut [Pose3]) {
+    if !moves_along_z(truth) {
+        return;
+    }
+    let lidar_from_camera = Matrix3::new(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0);
+    let rotation = Rotation3::from_matrix_unchecked(lidar_from_camera);
+    let turn = Pose3::from_parts(
+        Translation3::identity(),
+        UnitQuaternion::from_rotation_matrix(&rotation),
+    );
+    for pose in estimates.iter_mut().chain(truth) {
+        *pose = turn * *pose * turn.inverse();
+    }
+}
+
+/// Whether the sum of all steps, each in the frame of its pose, is mostly along z.
+fn moves_along_z(poses: &[Pose3]) -> bool {
+    let steps: Vector3<f64> = (poses.windows(2))
+        .map(|pair| (pair[0].inverse() * pair[1]).translation.vector)
+        .sum();
+    steps.z.abs() > steps.x.abs().max(steps.y.abs())
+}
+
 /// Mean of the positions; `None` without poses.
 fn centre(poses: &[Pose3]) -> Option<Vector3<f64>> {
     let sum: Vector3<f64> = poses.iter().map(|pose| pose.translation.vector).sum();

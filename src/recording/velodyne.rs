@@ -1,7 +1,7 @@
 //! Writing of scans (`.bin`: float32 x, y, z, intensity), and SemanticKITTI labels (`.label`: u32).
 
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::error::RecordingError;
 use crate::lidar::Scan;
@@ -64,6 +64,22 @@ fn records<'a, const SIZE: usize>(
             record_bytes: SIZE,
         })
     }
+}
+
+/// The existing label file of a scan: of the same name in `label_folder`, by default in `labels`
+/// next to the folder of the scans. That of nuScenes' `000000.pcd.bin` is `000000.label`.
+pub fn label_file(scan_path: &Path, name: &Path, label_folder: Option<&Path>) -> Option<PathBuf> {
+    let depth = name.components().count();
+    let above = |depth| Some(scan_path.ancestors().nth(depth + 1)?.join("labels"));
+    let stem = name.file_stem()?;
+    let candidates = match label_folder {
+        Some(folder) => [folder.join(name), folder.join(stem)],
+        None => [above(depth)?.join(name), above(1)?.join(stem)],
+    };
+    candidates
+        .map(|path| path.with_extension("label"))
+        .into_iter()
+        .find(|path| path.is_file())
 }
 
 #[cfg(test)]

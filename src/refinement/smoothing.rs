@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use crate::geometry::Pose2;
+use crate::localization::OdometryNoise;
 use crate::localization::particles::deviation;
 use crate::statistics::median;
 use crate::validation::{InvalidValue, Validate, in_range, positive};
@@ -42,6 +43,20 @@ pub struct SmoothingConfig {
     /// Largest number of iterations.
     #[default(20)]
     pub iterations: usize,
+}
+
+impl SmoothingConfig {
+    /// The configuration whose deviations of the odometry are at least those of a noise on it.
+    #[must_use]
+    pub fn with_noise(&self, noise: &OdometryNoise) -> Self {
+        let turn_rad = std::f64::consts::SQRT_2 * noise.turn_rad;
+        Self {
+            odometry_ahead_m: self.odometry_ahead_m.max(noise.drive_m),
+            odometry_aside_m: self.odometry_aside_m.max(noise.turn_rad),
+            odometry_turn_rad: self.odometry_turn_rad.max(turn_rad),
+            ..self.clone()
+        }
+    }
 }
 
 impl Validate for SmoothingConfig {

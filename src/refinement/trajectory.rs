@@ -105,6 +105,39 @@ impl InitialEstimate {
         poses.iter().enumerate().map(rough).collect()
     }
 
+    /// The estimates of a filter with their covariances and states, and the increments of the odometry
+    /// `previous_from_current`, of which the first is ignored. Where the times [s] are known, scans are deskewed by the
+    /// estimates around them, if these were tracked, else by the odometry.
+    pub fn from_filter(
+        estimates: &[Pose2],
+        covariances: Option<&[Matrix3<f64>]>,
+        states: &[State],
+        increments: &[Option<Pose2>],
+        times_s: Option<&[f64]>,
+    ) -> Vec<Self> {
+        let in_space = estimates.iter().map(|pose| pose3_from_pose2(pose, 0.0));
+        let in_space: Vec<Pose3> = in_space.collect();
+        let driven = Self::driven(increments);
+        let motion = |row: usize| {
+            let around = row.saturating_sub(1)..=(row + 1).min(estimates.len() - 1);
+            let is_known = states[around].iter().all(|it| *it == State::Tracking);
+            let poses = if is_known {
+                Some(&in_space)
+            } else {
+                driven.as_ref()
+            };
+            Motion::along(poses?, times_s?, row)
+        };
+        let initial = |(row, pose): (usize, &Pose2)| Self {
+            pose: *pose,
+            covariance: covariances.map(|all| all[row]),
+            state: states[row],
+            motion: motion(row),
+            increment: increments[row].filter(|_| row > 0),
+        };
+        estimates.iter().enumerate().map(initial).collect()
+    }
+
     /// Poses to which increments `previous_from_current` lead from the first one; the first increment is ignored. `None` if one is
     /// missing.
     pub(crate) fn driven(increments: &[Option<Pose2>]) -> Option<Vec<Pose3>> {

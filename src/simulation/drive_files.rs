@@ -10,7 +10,11 @@
 
 use std::fs::File;
 use std::io::{self, BufWriter};
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+
+use rayon::prelude::*;
 
 use super::{Simulation, calibration};
 use crate::files::write_atomically;
@@ -48,6 +52,18 @@ pub fn scan_files(folder: &Path, frame: usize) -> [PathBuf; 2] {
 /// Name of a file of poses, and how they follow.
 type PoseTable = (&'static str, fn(&Simulation) -> Vec<Pose3>);
 
+/// Files of scans in a folder, of any number of frames.
+pub fn all_scan_files(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut paths = Vec::new();
+    for (name, extension) in [("velodyne", "bin"), ("labels", "label")] {
+        for entry in folder.join(name).read_dir().into_iter().flatten() {
+            let path = entry?.path();
+            paths.extend(Some(path).filter(|it| it.extension().is_some_and(|it| it == extension)));
+        }
+    }
+    Ok(paths)
+}
+
 impl Simulation {
     /// Paths of all files of the drive in a folder.
     pub fn files_in(&self, folder: &Path) -> Vec<PathBuf> {
@@ -67,6 +83,31 @@ impl Simulation {
         write(&scan_path, |file| {
             velodyne::write_scan(file, &labelled.scan)
         })
+    }
+
+    /// Writes the scans that are missing until `written`, which is called after each, breaks; returns the number of
+    /// scans that are there, and of those that were.
+    pub fn write_missing_scans(
+        &self,
+        folder: &Path,
+        written: &(dyn Fn() -> ControlFlow<()> + Sync),
+    ) -> Result<[usize; 2], DriveFileError> {
+        let (done, kept) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        let is_ended = AtomicBool::new(false);
+        (0..self.frames()).into_par_iter().try_for_each(|frame| {
+            if is_ended.load(Ordering::Relaxed) {
+                return Ok(());
+            }
+            if scan_files(folder, frame).iter().all(|path| path.exists()) {
+                kept.fetch_add(1, Ordering::Relaxed);
+            } else {
+                self.write_scan(folder, frame)?;
+            }
+            done.fetch_add(1, Ordering::Relaxed);
+            is_ended.fetch_or(written().is_break(), Ordering::Relaxed);
+            Ok(())
+        })?;
+        Ok([done.into_inner(), kept.into_inner()])
     }
 
     /// Writes calibration, times, odometry and, last, the poses.

@@ -20,8 +20,7 @@ use crate::app::settings::{
 };
 use crate::evaluation::RangeMclRules;
 use crate::files::remove_abandoned;
-use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
-use crate::lidar::Motion;
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::localization::State;
 use crate::localization::odometry::demonstration_noise;
 use crate::map::{Map, MapOptions};
@@ -29,9 +28,7 @@ use crate::odometry::{Odometer, OdometryConfig};
 use crate::random::stream;
 use crate::recording::layout::Layout;
 use crate::recording::{Calibration, Frame, Recording};
-use crate::refinement::{
-    InitialEstimate, RefinedTrajectory, RefinerConfig, SmoothingConfig, TrajectoryRefiner,
-};
+use crate::refinement::{InitialEstimate, RefinedTrajectory, RefinerConfig, TrajectoryRefiner};
 use crate::sensor::Sensor;
 use crate::statistics::median;
 
@@ -263,34 +260,13 @@ fn initial_estimates(
     estimates: &[Pose2],
     increments: &[Option<Pose2>],
 ) -> Vec<InitialEstimate> {
-    let state = |row: usize| {
-        let number = results.states.as_ref().map(|states| states[row]);
-        number
-            .and_then(State::from_number)
-            .unwrap_or(State::Tracking)
-    };
-    let in_space: Vec<Pose3> = (estimates.iter())
-        .map(|pose| pose3_from_pose2(pose, 0.0))
+    let numbers = results.states.as_deref();
+    let state = |row: usize| State::from_number(numbers?[row]);
+    let states: Vec<State> = (0..estimates.len())
+        .map(|row| state(row).unwrap_or(State::Tracking))
         .collect();
-    let driven = InitialEstimate::driven(increments);
-    let motion = |row: usize| {
-        let around = row.saturating_sub(1)..=(row + 1).min(estimates.len() - 1);
-        let is_known = around.into_iter().all(|row| state(row) == State::Tracking);
-        let poses = if is_known {
-            Some(&in_space)
-        } else {
-            driven.as_ref()
-        };
-        Motion::along(poses?, results.times_s.as_ref()?, row)
-    };
-    let initial = |(row, pose): (usize, &Pose2)| InitialEstimate {
-        pose: *pose,
-        covariance: results.covariances.as_ref().map(|all| all[row]),
-        state: state(row),
-        motion: motion(row),
-        increment: increments[row].filter(|_| row > 0),
-    };
-    estimates.iter().enumerate().map(initial).collect()
+    let (covariances, times_s) = (results.covariances.as_deref(), results.times_s.as_deref());
+    InitialEstimate::from_filter(estimates, covariances, &states, increments, times_s)
 }
 
 /// Refines all frames and smooths them; also returns the runtime of each frame [s].
@@ -413,15 +389,8 @@ fn increments(
 fn refiner_config(config: &RefinementConfig) -> RefinerConfig {
     let mut refiner = config.refiner.clone();
     if config.motion.odometry == OdometrySource::GroundTruth {
-        let noise = demonstration_noise();
-        let turn_rad = std::f64::consts::SQRT_2 * noise.turn_rad;
-        let smoothing = refiner.refinement.smoothing.clone();
-        refiner.refinement.smoothing = SmoothingConfig {
-            odometry_ahead_m: smoothing.odometry_ahead_m.max(noise.drive_m),
-            odometry_aside_m: smoothing.odometry_aside_m.max(noise.turn_rad),
-            odometry_turn_rad: smoothing.odometry_turn_rad.max(turn_rad),
-            ..smoothing
-        };
+        let smoothing = &mut refiner.refinement.smoothing;
+        *smoothing = smoothing.with_noise(&demonstration_noise());
     }
     refiner
 }

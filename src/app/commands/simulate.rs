@@ -17,7 +17,6 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
 
 use anyhow::{Context as _, Result, bail};
-use rayon::prelude::*;
 
 use crate::app::run::artefact::hash::hash_of_texts;
 use crate::app::run::memory;
@@ -29,7 +28,7 @@ use crate::geometry::Pose3;
 use crate::map::files::ply;
 use crate::recording::Calibration;
 use crate::recording::poses::CameraPoses;
-use crate::simulation::drive_files::{POSES_FILE, scan_files};
+use crate::simulation::drive_files::{POSES_FILE, all_scan_files};
 use crate::simulation::{Simulation, SimulationConfig};
 
 /// Treatment of an existing drive.
@@ -204,20 +203,9 @@ fn is_complete(folder: &Path, claims: &Claims, simulation: &Simulation) -> bool 
 /// Removes the files of a drive and nothing else, `poses.txt` first. The claim is kept until the next one, so that a
 /// folder that is half removed is still recognized.
 fn remove_drive(folder: &Path) -> Result<()> {
-    let mut paths = [POSES_FILE, STREET_FILE]
-        .map(|name| folder.join(name))
-        .to_vec();
-    for (name, extension) in [("velodyne", "bin"), ("labels", "label")] {
-        for entry in fs::read_dir(folder.join(name)).into_iter().flatten() {
-            let path = entry?.path();
-            if path.extension().is_some_and(|found| found == extension) {
-                paths.push(path);
-            }
-        }
-    }
-    paths
-        .iter()
-        .try_for_each(|path| output::remove_if_exists(path))
+    let first = [POSES_FILE, STREET_FILE].map(|name| folder.join(name));
+    let scans = all_scan_files(folder)?;
+    (first.iter().chain(&scans)).try_for_each(|path| output::remove_if_exists(path))
 }
 
 /// Writes what does not depend on the scans: configuration and street.
@@ -241,22 +229,11 @@ fn write_scans(
     progress: &(dyn Fn(usize, usize) + Sync),
     interrupt: &Interrupt,
 ) -> Result<usize> {
-    let frames = simulation.frames();
-    let done = AtomicUsize::new(0);
-    let kept = AtomicUsize::new(0);
-    (0..frames).into_par_iter().try_for_each(|frame| {
-        if interrupt.requested() {
-            return Ok(());
-        }
-        if scan_files(folder, frame).iter().all(|path| path.exists()) {
-            kept.fetch_add(1, Ordering::Relaxed);
-        } else {
-            simulation.write_scan(folder, frame)?;
-        }
-        progress(done.fetch_add(1, Ordering::Relaxed) + 1, frames);
-        anyhow::Ok(())
+    let (frames, count) = (simulation.frames(), AtomicUsize::new(0));
+    let [done, kept] = simulation.write_missing_scans(folder, &|| {
+        progress(count.fetch_add(1, Ordering::Relaxed) + 1, frames);
+        interrupt.flow()
     })?;
-    let done = done.into_inner();
     if done < frames {
         interrupt.keeps(format!(
             "{done} of {frames} scans are kept in {}; the same command continues from there",
@@ -264,7 +241,7 @@ fn write_scans(
         ));
         return Err(interrupt.error().into());
     }
-    Ok(kept.into_inner())
+    Ok(kept)
 }
 
 #[cfg(test)]

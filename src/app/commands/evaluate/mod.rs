@@ -16,6 +16,7 @@ use crate::app::report::run_output::{self, REPORT_FILES};
 use crate::app::report::{LocalizationResults, Report, RunFiles, run_page};
 use crate::app::run::{Claims, Context, NPZ, Outputs, RunArgs, input, output};
 use crate::app::settings::{self, EvaluationConfig, LocalizationConfig};
+use crate::evaluation::alignment::level_camera_axes;
 use crate::evaluation::{Alignment, RangeMclRules};
 use crate::files::folder_of;
 use crate::geometry::TriangleMesh;
@@ -134,7 +135,14 @@ fn of_trajectory(
         results = truth::with_truth(results, times_s, &track, &config.result_file)?;
     }
     require_truth(&results, config)?;
-    trajectory::level_camera_axes(&mut results);
+    let columns = (
+        &mut results.estimates_in_space,
+        &mut results.ground_truth_in_space,
+    );
+    if let (Some(estimates), Some(truth)) = columns {
+        level_camera_axes(estimates, truth);
+    }
+
     let alignment = config.alignment.unwrap_or(Alignment::First);
     note(&mut about, alignment);
     truth::align(&mut results, alignment)?;

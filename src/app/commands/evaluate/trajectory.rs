@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context as _, Result};
-use nalgebra::{Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::Vector3;
 
 use crate::app::report::{LocalizationResults, Report, RunSummary};
 use crate::evaluation::{SpatialMetrics, aligned, distances_m};
@@ -36,39 +36,6 @@ pub fn in_world(track: &PoseTrack) -> Vec<Pose3> {
         track.world_from_map
     };
     aligned(&world_from_map, &track.map_from_lidar)
-}
-
-/// Turns poses of a camera, which moves along its z axis, so that x is ahead and z is up: heights, headings and
-/// pictures from above need such axes, distances and angles do not depend on them.
-pub fn level_camera_axes(results: &mut LocalizationResults) {
-    let is_camera = results
-        .ground_truth_in_space
-        .as_deref()
-        .is_some_and(moves_along_z);
-    if !is_camera {
-        return;
-    }
-    let lidar_from_camera = Matrix3::new(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0);
-    let rotation = Rotation3::from_matrix_unchecked(lidar_from_camera);
-    let turn = Pose3::from_parts(
-        Translation3::identity(),
-        UnitQuaternion::from_rotation_matrix(&rotation),
-    );
-    let columns = [
-        &mut results.estimates_in_space,
-        &mut results.ground_truth_in_space,
-    ];
-    for pose in columns.into_iter().flatten().flatten() {
-        *pose = turn * *pose * turn.inverse();
-    }
-}
-
-/// Whether the sum of all steps, each in the frame of its pose, is mostly along z.
-fn moves_along_z(poses: &[Pose3]) -> bool {
-    let steps: Vector3<f64> = (poses.windows(2))
-        .map(|pair| (pair[0].inverse() * pair[1]).translation.vector)
-        .sum();
-    steps.z.abs() > steps.x.abs().max(steps.y.abs())
 }
 
 /// Errors of a trajectory with its true poses.

@@ -11,6 +11,7 @@ use crate::app::run::arguments::{is_config, setting};
 use crate::app::run::input::require_folder;
 use crate::app::settings::{self, GroundCommandConfig};
 use crate::evaluation::LabelledPoints;
+use crate::recording::velodyne::label_file;
 use crate::recording::{Frame, Recording, ScanSource, scan_files, velodyne};
 
 /// Arguments of `ground`.
@@ -125,28 +126,12 @@ pub fn is_scan(path: &Path) -> bool {
     scan_files::is_scan(path) && !path.is_dir()
 }
 
-/// The existing label file of a scan: of the same name in `label_folder`, by default in `labels`
-/// next to the folder of the scans. That of nuScenes' `000000.pcd.bin` is `000000.label`.
-fn label_path(scan_path: &Path, name: &Path, label_folder: Option<&Path>) -> Option<PathBuf> {
-    let depth = name.components().count();
-    let above = |depth| Some(scan_path.ancestors().nth(depth + 1)?.join("labels"));
-    let stem = name.file_stem()?;
-    let candidates = match label_folder {
-        Some(folder) => [folder.join(name), folder.join(stem)],
-        None => [above(depth)?.join(name), above(1)?.join(stem)],
-    };
-    candidates
-        .map(|path| path.with_extension("label"))
-        .into_iter()
-        .find(|path| path.is_file())
-}
-
 impl LabelledScan {
     fn new(frame: Frame, folder: &Path, labels: Option<&Path>) -> Self {
         let (name, label_path) = match &frame.source {
             ScanSource::File { path, .. } => {
                 let name = path.strip_prefix(folder).unwrap_or(path);
-                (name.with_extension(""), label_path(path, name, labels))
+                (name.with_extension(""), label_file(path, name, labels))
             }
             _ => {
                 let name = PathBuf::from(format!("{:06}", frame.number));
@@ -215,11 +200,11 @@ mod tests {
         ] {
             let scan = folder.path().join(scans).join(name);
             for label_folder in [None, Some(labels.as_path())] {
-                let found = label_path(&scan, Path::new(name), label_folder);
+                let found = label_file(&scan, Path::new(name), label_folder);
                 assert_eq!(found.as_ref(), Some(&expected), "{name}");
             }
         }
         let other = folder.path().join("velodyne/000008.bin");
-        assert_eq!(label_path(&other, Path::new("000008.bin"), None), None);
+        assert_eq!(label_file(&other, Path::new("000008.bin"), None), None);
     }
 }
