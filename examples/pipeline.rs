@@ -6,17 +6,18 @@ use fpmcl::localization::{Tracker, TrackerConfig};
 use fpmcl::map::MapConfig;
 use fpmcl::mapping::build_map;
 use fpmcl::recording::Recording;
+use fpmcl::sensor::{Sensor, SensorConfig};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let drives: Vec<String> = std::env::args().skip(1).collect();
-    let [first, second] = &drives[..] else {
-        return Err("give two recordings".into());
-    };
-    let map = build_map(&Recording::open(first)?, &MapConfig::default())?;
-    let mut tracker = Tracker::new(&map, TrackerConfig::default())?;
-    for scan in Recording::open(second)?.scans() {
+    let drive = |number| std::env::args().nth(number).ok_or("give two recordings");
+    let map = build_map(&Recording::open(drive(1)?)?, &MapConfig::default())?;
+    let second = Recording::open(drive(2)?)?;
+    let sensor = Sensor::infer_recording(&second, &SensorConfig::default())?;
+    let mut tracker = Tracker::new(&map, TrackerConfig::default())?.with_sensor(sensor);
+    for scan in second.scans() {
         let estimate = tracker.step(&scan?)?;
-        println!("{} {}", estimate.pose, estimate.state.word());
+        let (t, state) = (estimate.map_from_lidar.translation, estimate.state.word());
+        println!("{:.9} {:.9} {:.9} {state}", t.x, t.y, t.z);
     }
     Ok(())
 }
