@@ -53,9 +53,10 @@ pub(crate) fn require(
     value: impl Display,
     remedy: impl Into<String>,
 ) -> Result<(), InvalidValue> {
-    match condition {
-        true => Ok(()),
-        false => Err(InvalidValue::new(key, value, remedy)),
+    if condition {
+        Ok(())
+    } else {
+        Err(InvalidValue::new(key, value, remedy))
     }
 }
 
@@ -72,12 +73,11 @@ pub(crate) fn positive<N: Into<f64> + Copy + Display>(
     let number: f64 = value.into();
     require(number > 0.0, key, value, "it must be greater than 0")?;
     // Values of single precision are rounded.
-    match (0.999 * SMALLEST..=LARGEST).contains(&number) {
-        true => Ok(()),
-        false => {
-            let remedy = format!("it must be between {SMALLEST} and {LARGEST}");
-            Err(InvalidValue::new(key, value, remedy))
-        }
+    if (0.999 * SMALLEST..=LARGEST).contains(&number) {
+        Ok(())
+    } else {
+        let remedy = format!("it must be between {SMALLEST} and {LARGEST}");
+        Err(InvalidValue::new(key, value, remedy))
     }
 }
 

@@ -117,12 +117,13 @@ fn column<T: numpy::Element + Copy>(
         Some(values) => values.as_array().iter().copied().collect(),
         None => return Ok(Vec::new()),
     };
-    match values.len() == count {
-        true => Ok(values),
-        false => Err(PyValueError::new_err(format!(
+    if values.len() == count {
+        Ok(values)
+    } else {
+        Err(PyValueError::new_err(format!(
             "{name} has {} values for {count} points; give one per point",
             values.len()
-        ))),
+        )))
     }
 }
 

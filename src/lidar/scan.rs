@@ -73,9 +73,10 @@ impl Scan {
             let horizontal_m = x.hypot(y);
             let raised_m = horizontal_m * cos - z * sin;
             // A point straight above or below has no azimuth.
-            let factor = match horizontal_m > 0.0 {
-                true => raised_m / horizontal_m,
-                false => 1.0,
+            let factor = if horizontal_m > 0.0 {
+                raised_m / horizontal_m
+            } else {
+                1.0
             };
             let z = horizontal_m * sin + z * cos;
             *point = [factor * x, factor * y, z].map(|m| m as f32).into();

@@ -46,9 +46,10 @@ impl Start {
     pub fn unknown(map: &Map) -> Self {
         const LARGE_M2: f64 = 1e6;
         let area_m2 = map.tiles.len() as f64 * map.tiles.side_m.powi(2);
-        match area_m2 > LARGE_M2 && !map.path.map_from_lidar.is_empty() {
-            true => Self::Road,
-            false => Self::Anywhere,
+        if area_m2 > LARGE_M2 && !map.path.map_from_lidar.is_empty() {
+            Self::Road
+        } else {
+            Self::Anywhere
         }
     }
 

@@ -90,9 +90,10 @@ impl SecondDrive {
         let first = positions.first().copied().unwrap_or_default();
         let origin = origin_near(DVec3::new(first.x, first.y, 0.0));
         let map_from_local = Pose3::translation(origin.x, origin.y, origin.z);
-        let mesh = match positions.is_empty() {
-            true => Arc::default(),
-            false => (self.tracker.map()).mesh_near(&positions, RADIUS_M, origin, u64::MAX)?,
+        let mesh = if positions.is_empty() {
+            Arc::default()
+        } else {
+            (self.tracker.map()).mesh_near(&positions, RADIUS_M, origin, u64::MAX)?
         };
         let found: Vec<Option<Pose3>> = (self.found.iter())
             .map(|pose| pose.map(|pose| map_from_local.inverse() * pose))

@@ -408,9 +408,10 @@ fn grid_of(
     boxes: impl IntoIterator<Item = (TileIndex, Aabb)>,
     config: &TileConfig,
 ) -> TileGrid {
-    match path.map_from_lidar.is_empty() {
-        true => TileGrid::of_boxes(boxes, config.side_m),
-        false => TileGrid::around(&path.map_from_lidar, config),
+    if path.map_from_lidar.is_empty() {
+        TileGrid::of_boxes(boxes, config.side_m)
+    } else {
+        TileGrid::around(&path.map_from_lidar, config)
     }
 }
 
@@ -506,9 +507,10 @@ fn turned_from_y_up(mesh: &TriangleMesh) -> TriangleMesh {
 
 /// What to do about a mesh that seems to have y up.
 fn hint(is_y_up: bool) -> &'static str {
-    match is_y_up {
-        true => " if its y axis pointed up: export it with z up, or turn it by 90 degrees about x",
-        false => "; the z axis of a map points up and its unit is the metre",
+    if is_y_up {
+        " if its y axis pointed up: export it with z up, or turn it by 90 degrees about x"
+    } else {
+        "; the z axis of a map points up and its unit is the metre"
     }
 }
 

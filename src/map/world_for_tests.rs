@@ -235,9 +235,12 @@ impl RangeRenderer for TestWorld {
         until_m: f32,
     ) -> Result<Vec<Vec<f32>>, RenderError> {
         use rayon::prelude::*;
-        let limited = |range_m: f32| match range_m < until_m {
-            true => range_m,
-            false => f32::INFINITY,
+        let limited = |range_m: f32| {
+            if range_m < until_m {
+                range_m
+            } else {
+                f32::INFINITY
+            }
         };
         let ranges = |pose| {
             let ranges = self.ranges(pose, directions);

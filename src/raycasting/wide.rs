@@ -44,9 +44,10 @@ impl WideNode {
     #[inline(always)]
     pub fn child(&self, place: usize) -> NodeRef {
         let inner = usize::from(self.inner);
-        match place < inner {
-            true => NodeRef::inner(self.first_inner as usize + place),
-            false => NodeRef::leaf(self.first_leaf as usize + place - inner),
+        if place < inner {
+            NodeRef::inner(self.first_inner as usize + place)
+        } else {
+            NodeRef::leaf(self.first_leaf as usize + place - inner)
         }
     }
 }
@@ -83,9 +84,10 @@ impl BoxGrid {
         const SLACK: f64 = 0.05;
         let axis = side % 3;
         let cells = (f64::from(bound) - f64::from(self.origin[axis])) / f64::from(self.cell[axis]);
-        match side < 3 {
-            true => (cells - SLACK).floor() as u16,
-            false => (cells + SLACK).ceil() as u16,
+        if side < 3 {
+            (cells - SLACK).floor() as u16
+        } else {
+            (cells + SLACK).ceil() as u16
         }
     }
 
@@ -117,9 +119,10 @@ impl WideBvh {
         };
         if let Some(root) = bvh.root {
             wide.nodes.push(WideNode::default());
-            let children = match root.is_leaf() {
-                true => vec![(bvh.bounds, root)],
-                false => descendants(bvh, root),
+            let children = if root.is_leaf() {
+                vec![(bvh.bounds, root)]
+            } else {
+                descendants(bvh, root)
             };
             wide.set(0, bvh, children, &mut leaves);
         }

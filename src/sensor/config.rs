@@ -101,9 +101,10 @@ impl fmt::Display for MotionCompensation {
             RotationDirection::Clockwise => "clockwise",
             RotationDirection::CounterClockwise => "counter_clockwise",
         })?;
-        match start_deg == BEHIND_DEG {
-            true => Ok(()),
-            false => write!(formatter, " from {start_deg}"),
+        if start_deg == BEHIND_DEG {
+            Ok(())
+        } else {
+            write!(formatter, " from {start_deg}")
         }
     }
 }
@@ -193,9 +194,10 @@ impl RangeImageConfig {
             fov_down: self.fov_down.unwrap_or(inferred.fov_down),
             max_range: self.max_range.unwrap_or(inferred.max_range),
             min_range: self.min_range.unwrap_or(inferred.min_range),
-            elevations: match has_rows {
-                true => self.elevations.clone(),
-                false => self.elevations.clone().or(inferred.elevations.clone()),
+            elevations: if has_rows {
+                self.elevations.clone()
+            } else {
+                self.elevations.clone().or(inferred.elevations.clone())
             },
         }
     }

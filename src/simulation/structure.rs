@@ -110,13 +110,15 @@ impl Structure {
 
     /// Stations of the ends of each piece [m].
     fn pieces(&self) -> impl Iterator<Item = [f64; 2]> {
-        let count = match self.spacing_m > 0.0 {
-            true => ((self.to_m - self.from_m) / self.spacing_m) as usize + 1,
-            false => 1,
+        let count = if self.spacing_m > 0.0 {
+            ((self.to_m - self.from_m) / self.spacing_m) as usize + 1
+        } else {
+            1
         };
-        let length_m = match self.spacing_m > 0.0 {
-            true => self.length_m,
-            false => self.to_m - self.from_m,
+        let length_m = if self.spacing_m > 0.0 {
+            self.length_m
+        } else {
+            self.to_m - self.from_m
         };
         (0..count).map(move |piece| {
             let from_m = self.from_m + piece as f64 * self.spacing_m;

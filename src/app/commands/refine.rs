@@ -85,9 +85,10 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let files = RunFiles::new(&config.output());
     let (mut claims, main) = prepare(config, context, &files)?;
     let is_trajectory = config.is_trajectory();
-    let mut results = match is_trajectory {
-        true => LocalizationResults::default(),
-        false => without_rounding_errors(LocalizationResults::read(&config.result_file)?),
+    let mut results = if is_trajectory {
+        LocalizationResults::default()
+    } else {
+        without_rounding_errors(LocalizationResults::read(&config.result_file)?)
     };
     let is_unfinished = claims.state(&main) == Some("unfinished");
     ensure!(
@@ -106,14 +107,13 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let sequence = frames_of(sequence, &results, config)?;
     let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
     let increments = increments(config, &sequence, &results)?;
-    let starts = match is_trajectory {
-        true => {
-            let [position_m, heading_deg] = config.uncertainty;
-            let deviations = [position_m, heading_deg.to_radians()];
-            let times_s = results.times_s.as_deref();
-            InitialEstimate::from_rough(&estimates, deviations, &increments, times_s)
-        }
-        false => initial_estimates(&results, &estimates, &increments),
+    let starts = if is_trajectory {
+        let [position_m, heading_deg] = config.uncertainty;
+        let deviations = [position_m, heading_deg.to_radians()];
+        let times_s = results.times_s.as_deref();
+        InitialEstimate::from_rough(&estimates, deviations, &increments, times_s)
+    } else {
+        initial_estimates(&results, &estimates, &increments)
     };
     let frames = &sequence.frames;
     let place = (&map, &sensor);
@@ -166,9 +166,10 @@ fn prepare(
     names.push("ground_truth_poses.npy");
     names.extend(config.output.plots.then_some("plots"));
     let is_trajectory = config.is_trajectory();
-    let (key, main) = match is_trajectory {
-        true => ("output_file", files.result.clone()),
-        false => ("result_file", files.file("effective_refinement.yml")),
+    let (key, main) = if is_trajectory {
+        ("output_file", files.result.clone())
+    } else {
+        ("result_file", files.file("effective_refinement.yml"))
     };
     ensure!(
         is_trajectory || fs::symlink_metadata(&config.result_file)?.is_file(),
@@ -204,9 +205,10 @@ fn follow(
     let track = RecordingInputs::new(&config.recording, &config.given_poses)
         .track(&config.result_file, sequence)?;
     // Poses of a lidar are in the frame of the map, those of a camera in the world of its drive.
-    let world_from_map = match track.calibration == Calibration::identity() {
-        true => Pose3::identity(),
-        false => map.path.world_from_map,
+    let world_from_map = if track.calibration == Calibration::identity() {
+        Pose3::identity()
+    } else {
+        map.path.world_from_map
     };
     let track = track.in_map(&world_from_map);
     let poses = track.matched(&sequence.frames, sequence.has_times)?;
@@ -307,14 +309,16 @@ fn refine(
 }
 
 fn report_unrefined(refined: &RefinedTrajectory, is_trajectory: bool) {
-    let smoothed = match refined.is_smoothed {
-        true => ", only smoothed",
-        false => "",
+    let smoothed = if refined.is_smoothed {
+        ", only smoothed"
+    } else {
+        ""
     };
     if is_trajectory && refined.untracked > 0 {
-        let moved = match refined.is_smoothed {
-            true => "follow from the others by the odometry",
-            false => "are unchanged",
+        let moved = if refined.is_smoothed {
+            "follow from the others by the odometry"
+        } else {
+            "are unchanged"
         };
         tracing::warn!(
             "{} of {} poses could not be placed in the map: they {moved}; their state is searching. If the trajectory may be farther off, give a larger --uncertainty",

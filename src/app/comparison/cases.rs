@@ -103,9 +103,10 @@ fn verdict(runs: &[&RunRecord]) -> String {
             runs.len()
         ));
     }
-    match parts.is_empty() {
-        true => HOLDS.to_owned(),
-        false => parts.join("; "),
+    if parts.is_empty() {
+        HOLDS.to_owned()
+    } else {
+        parts.join("; ")
     }
 }
 

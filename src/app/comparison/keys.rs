@@ -161,9 +161,12 @@ struct Stage<'a> {
 /// The stages of a run: map, localization, refinement.
 fn stages(run: &PlannedRun) -> Result<[Stage<'_>; 3]> {
     let (map, query, refinement) = (&run.build_map, &run.localization, &run.refinement);
-    let file = |recording: &Path, path| match is_bag(recording) && is_topic(path) {
-        true => Input::Topic(path),
-        false => Input::new(run, path, None),
+    let file = |recording: &Path, path| {
+        if is_bag(recording) && is_topic(path) {
+            Input::Topic(path)
+        } else {
+            Input::new(run, path, None)
+        }
     };
     let mut mapping = Stage {
         settings: settings(map)?,

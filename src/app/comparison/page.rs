@@ -96,12 +96,13 @@ fn verdict(results: &ComparisonResults) -> String {
     }
     configurations.sort_by(|a, b| a.0.total_cmp(&b.0));
     let texts: Vec<String> = configurations.into_iter().map(|(_, text)| text).collect();
-    match texts.is_empty() {
-        true => String::new(),
-        false => format!(
+    if texts.is_empty() {
+        String::new()
+    } else {
+        format!(
             "Position error (RMS, mean of all runs): {}.",
             texts.join("; ")
-        ),
+        )
     }
 }
 

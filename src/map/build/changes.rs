@@ -60,9 +60,10 @@ pub(crate) fn compare(
         .filter(overlaps)
         .collect();
     let mut near = part_on_lattice(older, &numbers, domain.origin);
-    let crossed = match config.enabled {
-        true => in_patches(&near, &visibility::crossed_triangles(&near, scans, config)),
-        false => vec![false; numbers.len()],
+    let crossed = if config.enabled {
+        in_patches(&near, &visibility::crossed_triangles(&near, scans, config))
+    } else {
+        vec![false; numbers.len()]
     };
     let is_owned = |triangle: u32| {
         let center = older.corners(triangle as usize).into_iter().sum::<DVec3>() / 3.0;

@@ -321,9 +321,12 @@ mod tests {
     fn given_normals_are_used_as_they_are_and_oriented_if_they_are_not() {
         let points = street();
         let slope = Vec3::new(-0.02, 0.0, 1.0).normalize();
-        let inwards = |point: &Vec3| match point.y.abs() < 5.9 || point.z < 0.02 * point.x + 0.05 {
-            true => slope,
-            false => Vec3::new(0.0, -point.y.signum(), 0.0),
+        let inwards = |point: &Vec3| {
+            if point.y.abs() < 5.9 || point.z < 0.02 * point.x + 0.05 {
+                slope
+            } else {
+                Vec3::new(0.0, -point.y.signum(), 0.0)
+            }
         };
         let given: Vec<Vec3> = points.iter().map(inwards).collect();
         let alternating = given.iter().enumerate();

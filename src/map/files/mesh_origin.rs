@@ -50,12 +50,13 @@ fn require_precision(farthest_m: f64, precision: Precision) -> Result<(), MeshFi
     const COARSEST_M: f64 = 0.02;
     let above = f32::from_bits((farthest_m as f32).to_bits() + 1);
     let resolution_m = f64::from(above) - f64::from(farthest_m as f32);
-    match precision == Precision::Single && resolution_m > COARSEST_M {
-        true => Err(MeshFileProblem::TooCoarse {
+    if precision == Precision::Single && resolution_m > COARSEST_M {
+        Err(MeshFileProblem::TooCoarse {
             farthest_m,
             resolution_cm: 100.0 * resolution_m,
-        }),
-        false => Ok(()),
+        })
+    } else {
+        Ok(())
     }
 }
 

@@ -226,9 +226,10 @@ fn precision_of(properties: &KeyMap<PropertyDef>) -> Precision {
         let found = properties.get(*name);
         found.is_some_and(|p| p.data_type == PropertyType::Scalar(ScalarType::Double))
     };
-    match ["x", "y", "X", "Y"].iter().any(is_double) {
-        true => Precision::Double,
-        false => Precision::Single,
+    if ["x", "y", "X", "Y"].iter().any(is_double) {
+        Precision::Double
+    } else {
+        Precision::Single
     }
 }
 

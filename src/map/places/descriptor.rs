@@ -57,9 +57,10 @@ impl ScanDescriptor {
         let of = |sector: usize| {
             let (sum, count, all) = sums[sector % SECTORS];
             let is_known = count >= LEAST * all && count > 0.0;
-            match is_known {
-                true => ((sum / count).round() as u8, u8::MAX),
-                false => (0, 0),
+            if is_known {
+                ((sum / count).round() as u8, u8::MAX)
+            } else {
+                (0, 0)
             }
         };
         let is_known: [u8; 2 * SECTORS] = std::array::from_fn(|sector| of(sector).1);
@@ -135,9 +136,12 @@ mod tests {
     /// The scan of a panorama after a turn by some columns to the left, without some returns.
     fn scan(panorama: &[u16], turn: usize, is_lost: impl Fn(usize) -> bool) -> ScanPanorama {
         let row = |row: &[u16]| {
-            let pixel = |column: usize| match is_lost(column) {
-                true => NOTHING,
-                false => row[(column + 180 - turn) % 180],
+            let pixel = |column: usize| {
+                if is_lost(column) {
+                    NOTHING
+                } else {
+                    row[(column + 180 - turn) % 180]
+                }
             };
             let pixels: Vec<u16> = (0..180).map(pixel).collect();
             pixels.repeat(2)

@@ -135,13 +135,14 @@ impl PanoramaRequest {
         const CELL_BYTES: f64 = 16.0;
         let (min, max) = tiles.extent();
         let cells = (max.x - min.x) * (max.y - min.y) / self.config.cell_m.powi(2);
-        match self.is_along(path) {
-            true => Ok(()),
-            false => budget.require(
+        if self.is_along(path) {
+            Ok(())
+        } else {
+            budget.require(
                 "the search grid",
                 cells * CELL_BYTES,
                 "raise panorama.cell_m",
-            ),
+            )
         }
     }
 

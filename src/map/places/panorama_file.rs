@@ -229,9 +229,10 @@ impl PanoramaReader<'_> {
                     .map_err(TileProblem::from)
                     .and_then(|()| {
                         let checksum = crc32fast::hash(bytemuck::cast_slice(&image));
-                        match checksum == self.of.checksums[place] {
-                            true => Ok(image.into()),
-                            false => Err(TileProblem::Checksum),
+                        if checksum == self.of.checksums[place] {
+                            Ok(image.into())
+                        } else {
+                            Err(TileProblem::Checksum)
                         }
                     })
                     .map_err(|problem| TileError::new(path.clone(), problem))
@@ -278,9 +279,12 @@ fn render_all<E: From<RenderError>>(
         descriptors: Vec::with_capacity(places),
         checksums: Vec::with_capacity(places),
     };
-    let steps = |&range_m: &f32| match range_m.is_finite() {
-        true => steps_of(range_m),
-        false => FAR,
+    let steps = |&range_m: &f32| {
+        if range_m.is_finite() {
+            steps_of(range_m)
+        } else {
+            FAR
+        }
     };
     for first in (0..places).step_by(BATCH) {
         let last = places.min(first + BATCH);

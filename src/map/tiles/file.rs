@@ -164,9 +164,10 @@ impl TileFile {
         if checksum_of([&self.scene, &self.is_ground]) != self.scene_checksum {
             return Err(TileProblem::Checksum);
         }
-        let tile = match self.scene.is_empty() {
-            true => None,
-            false => Some(Tile::from_bytes(self.scene.clone()).ok_or(TileProblem::Format)?),
+        let tile = if self.scene.is_empty() {
+            None
+        } else {
+            Some(Tile::from_bytes(self.scene.clone()).ok_or(TileProblem::Format)?)
         };
         Ok(TileScene {
             tile,

@@ -114,9 +114,10 @@ impl TileGrid {
                 corners[1][axis] = corners[1][axis].max(position[axis]);
             }
         }
-        let [min, max] = match counts.is_empty() {
-            true => [[0.0; 2]; 2],
-            false => corners,
+        let [min, max] = if counts.is_empty() {
+            [[0.0; 2]; 2]
+        } else {
+            corners
         };
         let first = |axis: usize| ((min[axis] - config.margin_m) / side_m + 0.5).floor() as i64;
         let last = |axis: usize| ((max[axis] + config.margin_m) / side_m - 0.5).ceil() as i64;

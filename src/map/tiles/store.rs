@@ -363,12 +363,13 @@ impl TileStore {
             .write()
             .unwrap_or_else(PoisonError::into_inner);
         let slots = resident.slots.iter().zip(&self.files.tiles);
-        let kept = slots.map(
-            |(slot, tile)| match is_near(&tile.bounds(), &bounds, KEPT_M) {
-                true => slot.clone(),
-                false => OnceLock::new(),
-            },
-        );
+        let kept = slots.map(|(slot, tile)| {
+            if is_near(&tile.bounds(), &bounds, KEPT_M) {
+                slot.clone()
+            } else {
+                OnceLock::new()
+            }
+        });
         *resident = Arc::new(Resident {
             slots: kept.collect(),
             files: self.files.clone(),

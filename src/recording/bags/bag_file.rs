@@ -71,9 +71,10 @@ impl BagFile {
     /// Opens a file and reads its index. One that is compressed whole is decompressed into the folder of
     /// temporary files.
     pub fn open(path: &Path, number: usize) -> Result<(Self, Index), String> {
-        let decompressed = match is_compressed(path) {
-            true => Some(decompress_file(path)?),
-            false => None,
+        let decompressed = if is_compressed(path) {
+            Some(decompress_file(path)?)
+        } else {
+            None
         };
         let file = Self {
             path: path.to_owned(),
@@ -117,9 +118,10 @@ impl BagFile {
 
 /// The extension of a bag, without that of compression.
 pub fn format_of(path: &Path) -> String {
-    let path = match is_compressed(path) {
-        true => &path.with_extension(""),
-        false => path,
+    let path = if is_compressed(path) {
+        &path.with_extension("")
+    } else {
+        path
     };
     let extension = path.extension().unwrap_or_default();
     extension.to_string_lossy().to_ascii_lowercase()

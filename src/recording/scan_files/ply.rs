@@ -28,9 +28,10 @@ pub fn parse(bytes: &[u8]) -> Result<Table<'_>, String> {
                 "has lists `{name}` among the numbers of its vertices; leave them out"
             ));
         };
-        let number_type = match is_text {
-            true => NumberType::F64,
-            false => number_type(scalar),
+        let number_type = if is_text {
+            NumberType::F64
+        } else {
+            number_type(scalar)
         };
         columns.push(Column {
             name: name.clone(),

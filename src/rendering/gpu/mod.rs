@@ -232,9 +232,10 @@ impl GpuRenderer {
             Ok::<_, RenderError>(1e3 * start.elapsed().as_secs_f64() / poses.len() as f64)
         };
         let (cast_ms, raster_ms) = (time_ms(ImageMethod::Cast)?, time_ms(ImageMethod::Raster)?);
-        let (method, name) = match raster_ms < cast_ms {
-            true => (ImageMethod::Raster, "raster"),
-            false => (ImageMethod::Cast, "cast"),
+        let (method, name) = if raster_ms < cast_ms {
+            (ImageMethod::Raster, "raster")
+        } else {
+            (ImageMethod::Cast, "cast")
         };
         tracing::info!(
             "whole images are rendered by {name}: a range image of {height} x {width} pixels takes {cast_ms:.2} ms by casting rays and {raster_ms:.2} ms by rasterizing on {}",
@@ -246,9 +247,10 @@ impl GpuRenderer {
 
 /// Range from which on surfaces do not change the cost of a beam [m]; see `cost_of` in `caster.wgsl`.
 fn reach_m(beam: &Beam, difference: &RangeDifference) -> f32 {
-    match beam.range_m.min(difference.no_surface_m) == difference.short_m {
-        true => beam.range_m + difference.short_m,
-        false => f32::INFINITY,
+    if beam.range_m.min(difference.no_surface_m) == difference.short_m {
+        beam.range_m + difference.short_m
+    } else {
+        f32::INFINITY
     }
 }
 

@@ -124,9 +124,10 @@ impl ResidentMap {
             return Ok(vec![all]);
         }
         let squares = poses_by_square(poses);
-        match squares.iter().all(|square| fits(square)) {
-            true => Ok(squares),
-            false => Err(&tiles.cpu),
+        if squares.iter().all(|square| fits(square)) {
+            Ok(squares)
+        } else {
+            Err(&tiles.cpu)
         }
     }
 
@@ -195,12 +196,11 @@ impl Tiles {
 
     fn distance_m(&self, tile: usize, around: &Aabb) -> f32 {
         let (bounds, _) = self.tiles[tile];
-        match bounds.is_empty() || around.is_empty() {
-            true => f32::INFINITY,
-            false => {
-                let apart = (bounds.min - around.max).max(around.min - bounds.max);
-                apart.max(Vec3::ZERO).length()
-            }
+        if bounds.is_empty() || around.is_empty() {
+            f32::INFINITY
+        } else {
+            let apart = (bounds.min - around.max).max(around.min - bounds.max);
+            apart.max(Vec3::ZERO).length()
         }
     }
 

@@ -77,9 +77,10 @@ pub fn find(
 ) -> Result<(Recording, Option<TrajectorySummary>)> {
     let path = trajectory::poses_next_to(&config.mesh_file);
     let is_given = recording.track.is_some();
-    let frames = match is_given {
-        true => recording.frames.clone(),
-        false => recording.dense_frames(),
+    let frames = if is_given {
+        recording.frames.clone()
+    } else {
+        recording.dense_frames()
     };
     let localized_by = match older {
         Some((older, _)) => format!("{}{sensor:?}{:?}", older.hash, config.map.ground),

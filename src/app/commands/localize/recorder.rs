@@ -61,9 +61,10 @@ impl Run {
                 selected: Some(opened.recording.frames.len()),
             },
             claims,
-            movie: match config.visualize {
-                true => Some(Movie::begin(&opened.files, &opened.map)?),
-                false => None,
+            movie: if config.visualize {
+                Some(Movie::begin(&opened.files, &opened.map)?)
+            } else {
+                None
             },
             off_ground: 0,
             failure: None,

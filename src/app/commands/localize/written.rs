@@ -33,9 +33,10 @@ pub fn write_results(opened: &Opened, run: &mut Run) -> Result<()> {
     }
     output::write_yaml(&files.file("effective_localization.yml"), config)?;
     // The frames of an interrupted run are kept; a whole run lacks its report and pictures still.
-    match run.results.len() < recording.frames.len() {
-        true => run.claims.finish(&files.result),
-        false => Ok(()),
+    if run.results.len() < recording.frames.len() {
+        run.claims.finish(&files.result)
+    } else {
+        Ok(())
     }
 }
 
