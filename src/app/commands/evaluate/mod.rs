@@ -311,8 +311,5 @@ fn selected(
         "no frame of {} is selected; check start_idx, n_scans and frame_step",
         config.result_file.display()
     );
-    if rows.len() == results.len() {
-        return Ok(results);
-    }
     Ok(results.select(&rows))
 }
