@@ -29,15 +29,55 @@ pub fn commented<T: Configuration>() -> Result<String, ConfigError> {
     Ok(commented)
 }
 
-/// The docs of a key in a schema.
+/// The docs of a key in a schema, with the words that it may be.
 fn description(schema: &Value, key: &str) -> Option<String> {
     let mut field = schema;
     for part in key.split('.') {
         field = &properties(schema, field)?[part];
     }
     let docs = field.get("description")?.as_str()?;
-    let docs = docs.replace("[`", "`").replace("`]", "`");
-    Some(docs.replace("`None`", "null"))
+    let mut docs = without_links(docs).replace("`None`", "null");
+    let words = words(schema, field);
+    if !words.is_empty() {
+        docs += &format!("\nOne of {}.", words.join(", "));
+    }
+    Some(docs)
+}
+
+/// Links of docs as their text: a bracketed name, with or without a target.
+fn without_links(docs: &str) -> String {
+    let mut text = String::new();
+    let mut rest = docs;
+    while let Some((before, link)) = rest.split_once("[`") {
+        let (name, after) = link.split_once("`]").unwrap_or((link, ""));
+        text += &format!("{before}`{name}`");
+        rest = match after.strip_prefix('(') {
+            Some(target) => target.split_once(')').map_or("", |(_, after)| after),
+            None => after,
+        };
+    }
+    text + rest
+}
+
+/// The words that a field may be, where it is a choice.
+fn words<'a>(schema: &'a Value, field: &'a Value) -> Vec<&'a str> {
+    if let Some(path) = field.get("$ref").and_then(Value::as_str) {
+        let target = path.strip_prefix('#').and_then(|path| schema.pointer(path));
+        return target.map_or_else(Vec::new, |target| words(schema, target));
+    }
+    let of = |key: &str| {
+        field
+            .get(key)
+            .and_then(Value::as_array)
+            .into_iter()
+            .flatten()
+    };
+    let nested = of("anyOf")
+        .chain(of("oneOf"))
+        .flat_map(|it| words(schema, it));
+    let constant = field.get("const").and_then(Value::as_str);
+    let listed = of("enum").filter_map(Value::as_str);
+    constant.into_iter().chain(listed).chain(nested).collect()
 }
 
 /// The fields of a block, which may be optional or defined elsewhere in the schema.
@@ -73,4 +113,27 @@ fn with_short_lists(text: &str) -> String {
         row += 1;
     }
     short
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::localization::TrackerConfig;
+
+    #[test]
+    fn a_key_stands_below_the_docs_of_its_field_and_the_words_that_it_may_be() {
+        let text = commented::<TrackerConfig>().unwrap();
+        assert!(text.contains(
+            "  # Largest number of particles while searching.\n  num_particles: 10000\n"
+        ));
+        assert!(text.contains("# One of fuzzy, pca, ransac.\n    method: fuzzy\n"));
+        assert!(text.contains("triangle: [12.0, 55.0, 65.0]"));
+        assert!(!text.contains("]("), "{text}");
+    }
+
+    #[test]
+    fn links_are_their_text() {
+        let docs = "What [`build`](Self::build) and [`Map`] do [m].";
+        assert_eq!(without_links(docs), "What `build` and `Map` do [m].");
+    }
 }

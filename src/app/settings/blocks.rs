@@ -103,7 +103,7 @@ impl Validate for MapInputConfig {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct MotionConfig {
-    /// Source: auto, scans, file, ground_truth or none.
+    /// Source of the motion.
     pub odometry: OdometrySource,
     /// Odometry poses in KITTI or TUM format, for `odometry: file`.
     pub odometry_file: Option<PathBuf>,

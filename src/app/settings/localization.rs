@@ -41,14 +41,14 @@ pub struct LocalizationConfig {
     pub pose_tracking: Option<bool>,
     /// Start: x, y in the map [m], heading [deg].
     pub initial_pose: Option<[f64; 3]>,
-    /// Initial distribution of the particles: tracking (around a known start), corridor (along the mapped road) or extent
-    /// (the whole map); `None`: it follows from `pose_tracking` and `initial_pose`.
+    /// Initial distribution of the particles: around a known start (tracking), along the mapped road (corridor), or over the
+    /// whole map (extent); `None`: it follows from `pose_tracking` and `initial_pose`.
     pub initialization: Option<Initialization>,
     /// Spread of the particles around a known start.
     pub start: StartSpread,
     /// Motion between frames.
     pub motion: MotionConfig,
-    /// Motion model of given motion: turn_drive_turn or velocity.
+    /// Motion model of given motion.
     pub motion_model: MotionModel,
     /// Sensor, odometry of the scans and particle filter.
     pub tracker: TrackerConfig,
