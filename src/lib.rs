@@ -28,6 +28,7 @@
 //! let map = Map::load(Path::new("results/map.ply"), &MapOptions::default())?;
 //! let second_drive = Recording::open("data/street/drive_2")?;
 //! let sensor = Sensor::infer_recording(&second_drive, &SensorConfig::default())?;
+//! // The refiner takes scans whose points have times; a tracker sees to this itself.
 //! let second_drive = sensor.applied_to(second_drive);
 //! let mut refiner = TrajectoryRefiner::new(&map, &sensor, RefinerConfig::default(), 0)?;
 //! // A robot gives its scans as they come, without `with_sensor`: the sensor is inferred from the first ones.

@@ -26,7 +26,7 @@ pub enum ConfigError {
         key: String,
         nearest: Option<String>,
     },
-    #[error("{place}: `{key}` may be {}; give more of its name", keys.join(" or "))]
+    #[error("{place}: `{key}` is ambiguous: {}; give more of its name", keys.join(" or "))]
     AmbiguousKey {
         place: String,
         key: String,
@@ -166,7 +166,7 @@ fn in_words(ty: &str) -> &str {
         "boolean" => "True or False",
         "mapping start" => "a block of keys",
         "sequence start" => "a list",
-        "string scalar" => "a text",
+        "string scalar" => "a string",
         "u8" | "u16" | "u32" | "u64" => "a whole number, not negative",
         "i8" | "i16" | "i32" | "i64" => "a whole number",
         _ => ty,

@@ -6,7 +6,7 @@
 //! ```
 //!
 //! The full name of a key is the path of a field, such as `tracker.localizer.num_particles`. `names` accepts shorter
-//! ones, and those of range-mcl. Nothing is ignored: an unknown key, a value of the wrong type and a contradiction are
+//! ones, and those of range-mcl. Nothing is ignored but two keys of range-mcl that have no effect: an unknown key, a value of the wrong type and a contradiction are
 //! errors that name the place, the key and the value.
 
 mod comments;

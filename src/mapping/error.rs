@@ -1,4 +1,4 @@
-//! Errors of the way from a recording to a map.
+//! Errors of mapping: the way from a recording to a map.
 
 use super::pose_report::PoseReport;
 use crate::localization::SecondDriveError;

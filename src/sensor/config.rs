@@ -38,7 +38,7 @@ impl Validate for SensorConfig {
     }
 }
 
-/// Times of points that the data do not have, for motion compensation.
+/// Source of the times of the points, for motion compensation.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(try_from = "String", into = "String")]
@@ -54,7 +54,7 @@ pub enum MotionCompensation {
     },
 }
 
-/// Azimuth at which a revolution starts that is not given: behind, as of KITTI [deg].
+/// Azimuth at which a revolution starts by default: backwards, as in KITTI [deg].
 const BEHIND_DEG: f64 = 180.0;
 
 impl MotionCompensation {
@@ -136,7 +136,7 @@ impl TryFrom<String> for MotionCompensation {
                 start_deg,
             }),
             _ => Err(format!(
-                "`{text}` is not one of auto, clockwise, counter_clockwise, or with the azimuth at which a revolution starts [deg] `clockwise from 90`"
+                "`{text}` is not auto, clockwise or counter_clockwise, the latter optionally followed by `from` and the azimuth at which a revolution starts, -360 to 360 [deg]"
             )),
         }
     }

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::lidar::{LidarModel, Projection, RangeImage, Scan};
 
-/// Number of points of a scan that a range image loses, by reason; kept and lost ones are all.
+/// Number of points of a scan that a range image loses, by reason; kept plus lost is the total.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]

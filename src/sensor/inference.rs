@@ -18,7 +18,7 @@ pub const SENSOR_SCANS: usize = 10;
 /// Number of consecutive scans that show the times of points.
 pub const TIMING_SCANS: usize = 16;
 
-/// Why a sensor cannot be inferred, or a scan is not of it.
+/// Why a sensor cannot be inferred, or a scan does not match it.
 #[derive(Debug, thiserror::Error)]
 #[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum SensorError {
@@ -27,7 +27,7 @@ pub enum SensorError {
     #[error(transparent)]
     Timing(#[from] TimingError),
     #[error(
-        "{:.0} % of the points of the scan are outside the field of view of the sensor ({sensor}); give the sensor of these scans, or none, so that it is inferred",
+        "{:.0} % of the points of the scan are outside the field of view of the sensor ({sensor}); give the sensor of these scans, or leave it unset, so that it is inferred",
         100.0 * share
     )]
     OtherSensor { sensor: Box<Sensor>, share: f64 },

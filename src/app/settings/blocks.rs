@@ -105,7 +105,7 @@ impl Validate for MapInputConfig {
 pub struct MotionConfig {
     /// Source of the motion.
     pub odometry: OdometrySource,
-    /// Odometry poses in KITTI or TUM format, for `odometry: file`.
+    /// Odometry poses in KITTI or TUM format, for `odometry: auto` and `file`.
     pub odometry_file: Option<PathBuf>,
 }
 

@@ -25,7 +25,7 @@ pub struct BuildMapConfig {
     pub onto: Option<PathBuf>,
     /// Point cloud in the map frame that is meshed instead of scans with poses, `.pcd`, `.ply` or `.npy`.
     pub cloud_file: Option<PathBuf>,
-    /// Step between counted scans that are excluded from the map and used to evaluate it; 0 for none.
+    /// Every n-th key scan is held out of the map and used to evaluate it; 0 for none.
     pub holdout_step: usize,
     /// Mesh of the true surface in the map frame, for accuracy and completeness; `street.ply` of a
     /// simulated drive is one.

@@ -36,8 +36,8 @@ pub struct LocalizationConfig {
     pub save_result: bool,
     /// Whether to draw a picture per frame and an animation.
     pub visualize: bool,
-    /// Whether the start is known: `initial_pose`, else the first true pose. `None`: it is if there is an
-    /// `initial_pose`. `initialization` takes precedence.
+    /// Whether the start is known: `initial_pose`, else the first true pose. `None`: known if `initial_pose` is
+    /// given. `initialization` takes precedence.
     pub pose_tracking: Option<bool>,
     /// Start: x, y in the map [m], heading [deg].
     pub initial_pose: Option<[f64; 3]>,
@@ -48,7 +48,7 @@ pub struct LocalizationConfig {
     pub start: StartSpread,
     /// Motion between frames.
     pub motion: MotionConfig,
-    /// Motion model of given motion.
+    /// Motion model for odometry that is not that of the scans.
     pub motion_model: MotionModel,
     /// Sensor, odometry of the scans and particle filter.
     pub tracker: TrackerConfig,
@@ -66,7 +66,7 @@ pub struct LocalizationConfig {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct RenderingConfig {
-    /// Method.
+    /// Rendering method.
     pub method: RenderingMethod,
 }
 

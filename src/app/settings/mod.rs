@@ -1,8 +1,8 @@
-//! Configuration of the commands: one struct per command, composed of those of the library and of blocks that commands
-//! share.
+//! Configuration of the commands, apart from `simulate` and `compare`, whose configurations are with what they configure: one
+//! struct per command, composed of those of the library and of blocks that commands share.
 //!
 //! ```text
-//! defaults  <-  YAML file  <-  --set key=value, in order  ->  validation  ->  effective configuration
+//! defaults  <-  YAML file  <-  --set key=value and flags, in order  ->  validation  ->  effective configuration
 //! ```
 //!
 //! [`configuration`](crate::configuration) reads and writes them, and knows range-mcl's names of the keys.

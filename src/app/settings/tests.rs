@@ -120,7 +120,7 @@ fn a_value_of_the_wrong_shape_is_quoted() {
     let message = message_of("range_image: [1]  # rows\n", &[]);
     assert_contains(&message, &["line 1", "`[1]`", "a block of keys"]);
     let message = message_of("seed: 1\nscan_folder: {a: b}\n", &[]);
-    assert_contains(&message, &["line 2", "`{a: b}`", "a text"]);
+    assert_contains(&message, &["line 2", "`{a: b}`", "a string"]);
     let message = message_of("start_idx:\n", &[]);
     assert_contains(
         &message,
@@ -203,7 +203,7 @@ fn an_invalid_setting_is_quoted() {
     assert_contains(
         &message,
         &[
-            "may be",
+            "is ambiguous",
             "tracking_loss.patience",
             "refinement.swarm.patience",
         ],

@@ -164,8 +164,13 @@ impl TileStore {
                 return Ok(None);
             }
         };
-        let Ok(index) = TileFileIndex::decode(&bytes) else {
-            return Ok(None);
+        let index = match TileFileIndex::decode(&bytes) {
+            Ok(index) => index,
+            Err(problem) => {
+                let folder = folder.display();
+                tracing::info!("the tiles in {folder} are made again: {problem}");
+                return Ok(None);
+            }
         };
         let mut now = source_of(mesh_file, index.source.checksum, has_given_path, side_m)?;
         if now.stamp() != index.source.stamp() {

@@ -45,7 +45,7 @@ pub struct LocalizeArgs {
     #[arg(long = "truth", value_name = "FILE")]
     pub pose_file: Option<PathBuf>,
 
-    /// Calibration of the camera whose poses these are; sets the key `calib_file`.
+    /// Calibration of the camera, if the true poses are those of a camera; sets the key `calib_file`.
     #[arg(long = "calib", value_name = "FILE")]
     pub calib_file: Option<PathBuf>,
 

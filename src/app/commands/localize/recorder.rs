@@ -32,7 +32,7 @@ pub struct Run {
 
 impl Run {
     pub fn new(opened: &Opened, claims: Claims) -> Result<Self> {
-        /// An empty column, where it is filled.
+        /// An empty column, if it will be filled.
         fn column<T>(is_filled: bool) -> Option<Vec<T>> {
             is_filled.then(Vec::new)
         }
