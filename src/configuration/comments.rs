@@ -128,7 +128,7 @@ mod tests {
         ));
         assert!(text.contains("# One of fuzzy, pca, ransac.\n    method: fuzzy\n"));
         assert!(text.contains("triangle: [12.0, 55.0, 65.0]"));
-        assert!(!text.contains("]("), "{text}");
+        assert!(!text.contains("](") && !text.contains("::"), "{text}");
     }
 
     #[test]

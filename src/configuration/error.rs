@@ -39,6 +39,10 @@ pub enum ConfigError {
     },
     #[error("{place}: key `{key}` is given twice; remove one of them")]
     DuplicateKey { place: String, key: String },
+    #[error(
+        "{place}: its keys are written in a way that is not supported; write one per line, without merge keys"
+    )]
+    Style { place: String },
     #[error("{place}: {source}")]
     Syntax {
         place: String,

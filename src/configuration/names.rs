@@ -71,6 +71,15 @@ impl Names {
         }
     }
 
+    /// Whether a name is that of a block of keys.
+    pub(super) fn is_block(&self, name: &str) -> bool {
+        let Meaning::Key(key) = self.meaning(name) else {
+            return false;
+        };
+        let inner = key + ".";
+        self.0.iter().any(|key| key.starts_with(&inner))
+    }
+
     /// The key of a name.
     fn key(&self, name: &str) -> Meaning {
         if self.0.iter().any(|key| key == name) {

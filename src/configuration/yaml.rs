@@ -31,23 +31,32 @@ pub(super) struct Key {
     items: usize,
 }
 
-/// Lists the keys and the items of a text in order; what is in braces is part of a value.
+/// Lists the keys and the items of a text in order; what is in brackets, quotes or a block of text is part of a value.
 pub(super) fn keys(text: &str) -> Vec<Key> {
     let mut keys: Vec<Key> = Vec::new();
     let mut open: Vec<usize> = Vec::new();
+    let mut value = Value::default();
     for (line, text) in text.lines().enumerate() {
         let content = text.trim_start();
-        let is_item = content == "-" || content.starts_with("- ");
-        let name = key_of(content);
-        if !is_item && name.is_none() {
+        let indentation = text.len() - content.len();
+        if value.continues_on(content, indentation) {
             continue;
         }
-        let depth = 2 * (text.len() - content.len()) + usize::from(is_item);
+        let is_item = content == "-" || content.starts_with("- ");
+        let key = key_of(content);
+        if !is_item && key.is_none() {
+            continue;
+        }
+        value = Value::begin(
+            key.as_ref().map_or(content, |(_, value)| value),
+            indentation,
+        );
+        let depth = 2 * indentation + usize::from(is_item);
         open.retain(|&parent| keys[parent].depth < depth);
         let parent = open.last().map(|&parent| &mut keys[parent]);
-        let name = match (name, parent) {
-            (Some(name), None) => name.to_owned(),
-            (Some(name), Some(parent)) => format!("{}.{name}", parent.name),
+        let name = match (key, parent) {
+            (Some((name, _)), None) => name,
+            (Some((name, _)), Some(parent)) => format!("{}.{name}", parent.name),
             (None, Some(list)) => {
                 list.items += 1;
                 format!("{}[{}]", list.name, list.items)
@@ -65,6 +74,62 @@ pub(super) fn keys(text: &str) -> Vec<Key> {
     keys
 }
 
+/// A value that may go on in the next lines.
+#[derive(Default)]
+struct Value {
+    /// Number of open brackets.
+    brackets: usize,
+    /// The open quote.
+    quote: Option<char>,
+    /// Indentation of the key of a block of text.
+    block_of: Option<usize>,
+}
+
+impl Value {
+    /// A value by its first line.
+    fn begin(line: &str, indentation: usize) -> Self {
+        let mut value = Self::default();
+        if line.trim_start().starts_with(['|', '>']) {
+            value.block_of = Some(indentation);
+        } else {
+            value.read(line);
+        }
+        value
+    }
+
+    /// Whether a line is part of it.
+    fn continues_on(&mut self, content: &str, indentation: usize) -> bool {
+        if let Some(key) = self.block_of {
+            if content.is_empty() || indentation > key {
+                return true;
+            }
+            self.block_of = None;
+        }
+        let is_open = self.brackets > 0 || self.quote.is_some();
+        if is_open {
+            self.read(content);
+        }
+        is_open
+    }
+
+    fn read(&mut self, line: &str) {
+        let mut before = ' ';
+        for c in line.chars() {
+            match (self.quote, c) {
+                (Some('"'), '"') if before == '\\' => (),
+                (Some(quote), c) if c == quote => self.quote = None,
+                (Some(_), _) => (),
+                (None, '"' | '\'') if " [{,:".contains(before) => self.quote = Some(c),
+                (None, '#') if before == ' ' => return,
+                (None, '[' | '{') if self.brackets > 0 || before == ' ' => self.brackets += 1,
+                (None, ']' | '}') => self.brackets = self.brackets.saturating_sub(1),
+                _ => (),
+            }
+            before = c;
+        }
+    }
+}
+
 /// A text whose keys have their full names, and the lines of the original text.
 #[derive(Debug, Default)]
 pub(super) struct FullText {
@@ -77,7 +142,9 @@ pub(super) struct FullText {
 impl FullText {
     /// Replaces the names of all keys by their full ones. A text without keys in block style stays as it is.
     pub(super) fn new(name: &str, text: &str, names: &Names) -> Result<Self, ConfigError> {
-        let original: Vec<String> = text.lines().map(str::to_owned).collect();
+        let text = text.trim_start_matches('\u{feff}');
+        let end = |line: &&str| *line != "...";
+        let original: Vec<String> = text.lines().take_while(end).map(str::to_owned).collect();
         let found = keys(text);
         let first = found.first().map_or(original.len(), |key| key.line);
         let is_code =
@@ -87,10 +154,18 @@ impl FullText {
             lines: (0..original.len()).collect(),
             original,
         };
-        if found.is_empty() || full.original[..first].iter().any(|line| is_code(&line)) {
+        // The parser reports what is no key.
+        let has_tabs = |line: &String| line[..line.len() - line.trim_start().len()].contains('\t');
+        let before = &full.original[..first];
+        if found.is_empty()
+            || before.iter().any(|line| is_code(&line))
+            || full.original.iter().any(has_tabs)
+        {
             return Ok(full);
         }
         let mut root = Node::default();
+        // Keys without effect, and empty blocks.
+        let mut ignored = 0;
         for (index, key) in found.iter().enumerate() {
             let is_inner =
                 |it: &&Key| it.name.len() > key.name.len() && is_within(&it.name, &key.name);
@@ -102,15 +177,29 @@ impl FullText {
             }
             let end = later.iter().find(|it| !is_inner(it));
             let end = end.map_or(full.original.len(), |next| next.line);
+            let is_empty = full.value(key.line).is_empty() && end == key.line + 1;
+            if is_empty && names.is_block(&key.name) {
+                ignored += 1;
+                continue;
+            }
             let place = error::place(name, Some(key.line));
             match names.meaning(&key.name) {
                 Meaning::Key(name) => root.insert(&name, key.line..end, place)?,
-                Meaning::Nothing => (),
+                Meaning::Nothing => ignored += 1,
                 meaning => return Err(error::unknown(place, &key.name, meaning, names)),
             }
         }
+        let given = leaves(&full.text);
         (full.text, full.lines) = (String::new(), Vec::new());
         root.write(0, &full.original, &mut full.text, &mut full.lines);
+        // Nothing is lost in a style that this module does not know.
+        if let (Some(given), Some(kept)) = (given, leaves(&full.text)) {
+            let is_same = kept.iter().all(|value| given.contains(value));
+            if !is_same || kept.len() + ignored != given.len() {
+                let place = name.to_owned();
+                return Err(ConfigError::Style { place });
+            }
+        }
         Ok(full)
     }
 
@@ -123,7 +212,8 @@ impl FullText {
     /// The value on a line of the original text, without its key and its comment.
     pub(super) fn value(&self, line: usize) -> String {
         let line = self.original.get(line).map_or("", String::as_str);
-        let value = line.split_once(':').map_or(line, |(_, value)| value);
+        let content = line.trim_start();
+        let value = key_of(content).map_or(content, |(_, value)| value);
         let value = value.split(" #").next().unwrap_or_default();
         value.trim().to_owned()
     }
@@ -162,6 +252,20 @@ impl FullText {
         };
         ConfigError::InvalidValue { place, invalid }
     }
+}
+
+/// The scalars of a text; `None` if it is no YAML.
+fn leaves(text: &str) -> Option<Vec<String>> {
+    fn collect(value: &serde_json::Value, leaves: &mut Vec<String>) {
+        match value {
+            serde_json::Value::Array(items) => items.iter().for_each(|it| collect(it, leaves)),
+            serde_json::Value::Object(keys) => keys.values().for_each(|it| collect(it, leaves)),
+            scalar => leaves.push(scalar.to_string()),
+        }
+    }
+    let mut leaves = Vec::new();
+    collect(&parse(text).ok()?, &mut leaves);
+    Some(leaves)
 }
 
 /// A key with its lines in the original text, or a block of keys.
@@ -213,7 +317,7 @@ impl Node {
     ) {
         for node in &self.inner {
             let start = &original[node.lines.start];
-            let value = start.split_once(':').map_or("", |(_, value)| value);
+            let value = key_of(start.trim_start()).map_or("", |(_, value)| value);
             let value = if node.inner.is_empty() { value } else { "" };
             *text += &format!("{:indentation$}{}:{value}\n", "", node.name);
             lines.push(node.first_line());
@@ -259,12 +363,16 @@ pub(super) fn is_within(key: &str, block: &str) -> bool {
     rest.is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', '[']))
 }
 
-/// The key that a line without its indentation starts with.
-fn key_of(content: &str) -> Option<&str> {
-    let (name, rest) = content.split_once(':')?;
-    let is_name = |c: char| c.is_alphanumeric() || c == '_' || c == '-';
-    let is_key = !name.is_empty() && name.chars().all(is_name);
-    (is_key && (rest.is_empty() || rest.starts_with(' '))).then_some(name)
+/// The key that a line without its indentation starts with, and the rest of the line.
+fn key_of(content: &str) -> Option<(String, &str)> {
+    let is_name = |c: char| c.is_alphanumeric() || "_-.".contains(c);
+    let (name, rest) = match content.chars().next()? {
+        quote @ ('"' | '\'') => content[1..].split_once(quote)?,
+        _ => content.split_at(content.find(|c| !is_name(c))?),
+    };
+    let value = rest.trim_start().strip_prefix(':')?;
+    let is_key = !name.is_empty() && (value.is_empty() || value.starts_with([' ', '\t']));
+    is_key.then(|| (name.to_owned(), value))
 }
 
 #[cfg(test)]

@@ -65,7 +65,7 @@ fn a_written_configuration_loads_to_an_equal_one() {
         "a\nb",
     ] {
         let mut config = LocalizationConfig {
-            motion: MotionConfig {
+            motion: MotionSourceConfig {
                 odometry: OdometrySource::File,
                 odometry_file: Some(PathBuf::from(name)),
             },
@@ -167,7 +167,7 @@ fn a_setting_replaces_one_key_and_the_last_one_wins() {
     )
     .unwrap();
     let mut expected = LocalizationConfig {
-        motion: MotionConfig {
+        motion: MotionSourceConfig {
             odometry: OdometrySource::File,
             odometry_file: Some("odometry.txt".into()),
         },
@@ -224,7 +224,7 @@ fn an_invalid_setting_is_quoted() {
 
 #[test]
 fn an_invalid_value_is_reported_with_key_value_and_remedy() {
-    let message = message_of("range_image:\n  min_range: 60\n", &[]);
+    let message = message_of("range_image:\n  min_range: 60\n  max_range: 50\n", &[]);
     assert_contains(
         &message,
         &[
@@ -235,7 +235,7 @@ fn an_invalid_value_is_reported_with_key_value_and_remedy() {
     );
     for (key, value) in [
         ("range_image.width", "0"),
-        ("range_image.fov_up", "-30"),
+        ("range_image.fov_up", "-91"),
         ("range_image.max_range", ".nan"),
         ("numParticles", "0"),
         ("num_reduced", "0"),
@@ -377,4 +377,35 @@ crop_x: 20
     assert_contains(&twice, &["line 10", "voxel_size_m", "twice"]);
     let block_and_value = message(&format!("{text}ground: null\n"));
     assert_contains(&block_and_value, &["line 10", "ground", "twice"]);
+}
+
+#[test]
+fn any_style_of_yaml_is_read_or_refused_and_nothing_is_lost() {
+    let scans = |text: &str| load_text::<LocalizationConfig>(text, &[]);
+    let mut expected = LocalizationConfig::default();
+    expected.recording.scan_folder = "/x: y".into();
+    expected.recording.topic = Some("foo # }".into());
+    expected.tracker.seed = 7;
+    for text in [
+        "recording: {scan_folder: '/x: y',\n  topic: 'foo # }'}\nseed: 7\n",
+        "recording: {\n  scan_folder: \"/x: y\",\n  topic: 'foo # }'\n  }\n\"seed\": 7\n",
+        "scan_folder: '/x: y'\n'topic': 'foo # }'\nseed : 7\n",
+        "\u{feff}scan_folder:\t'/x: y'\ntopic: >-\n  foo # }\nseed: 7\n...\n",
+        "recording:\nscan_folder: '/x: y'\ntopic: 'foo # }'\nseed: 7\r\n",
+        "{recording: {scan_folder: '/x: y', topic: 'foo # }'}, tracker: {seed: 7}}\n",
+        "---\n# a comment\nseed: 7\nrecording:\n    scan_folder: '/x: y'\n    topic: 'foo # }'\n",
+    ] {
+        assert_eq!(
+            scans(text).map_err(|error| error.to_string()),
+            Ok(expected.clone()),
+            "{text}"
+        );
+    }
+    for text in [
+        "base: &base {seed: 7}\n<<: *base\n",
+        "seed: 7\n<<: {topic: foo}\n",
+        "recording:\n\tscan_folder: /x\n",
+    ] {
+        assert!(scans(text).is_err(), "{text}");
+    }
 }
