@@ -80,7 +80,7 @@ fn main() -> Result<(), Failure> {
         .take(10)
         .map(|(scan, _)| scan.clone())
         .collect();
-    let sensor = Sensor::infer(&scans, &SensorConfig::default());
+    let sensor = Sensor::infer(&scans, &SensorConfig::default())?;
     println!("| method | start | back | time per frame | rays per frame |\n|---|---|---|---|---|");
     let mut curves = vec![];
     for (name, placer) in PLACERS {

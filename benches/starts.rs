@@ -58,7 +58,7 @@ fn main() -> Result<(), Failure> {
     let some = some
         .map(|(frame, _)| frame.read())
         .collect::<Result<Vec<_>, _>>()?;
-    let sensor = Sensor::infer(&some, &SensorConfig::default());
+    let sensor = Sensor::infer(&some, &SensorConfig::default())?;
     let config = LocalizerConfig {
         num_particles: 10_000,
         ..LocalizerConfig::default()

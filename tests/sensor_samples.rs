@@ -14,7 +14,7 @@ use fpmcl::lidar::{NormalConfig, RangeImage, Scan};
 use fpmcl::sensor::{BeamSource, DroppedPoints, Sensor, SensorConfig};
 
 fn infer(scans: &[Scan]) -> Sensor {
-    Sensor::infer(scans, &SensorConfig::default())
+    Sensor::infer(scans, &SensorConfig::default()).unwrap()
 }
 
 #[test]

@@ -414,10 +414,8 @@ impl Scans {
                 let scans: Vec<lidar::Scan> = scans
                     .map(|row| Ok(self.read(row)?.into_owned()))
                     .collect::<anyhow::Result<_>>()?;
-                anyhow::Ok(Sensor(sensor::Sensor::infer(
-                    &scans,
-                    &SensorConfig::default(),
-                )))
+                let sensor = sensor::Sensor::infer(&scans, &SensorConfig::default())?;
+                anyhow::Ok(Sensor(sensor))
             }),
         }
     }

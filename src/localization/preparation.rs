@@ -23,12 +23,14 @@ impl ScanPreparation {
         })
     }
 
-    /// Attitude to assume while no scan shows enough ground: level, at the given height, or at
-    /// that of KITTI's car.
+    /// Attitude to assume while no scan shows enough ground: level, at the given height, else at that of its mounting, else
+    /// at that of KITTI's car.
     pub fn assumed_attitude(&self) -> SensorAttitude {
         let assumed = SensorAttitude::default();
         SensorAttitude {
-            height_m: self.sensor.sensor_height_m.unwrap_or(assumed.height_m),
+            height_m: (self.sensor.sensor_height_m)
+                .or(self.sensor.mounting.as_ref().map(|it| it.height_m))
+                .unwrap_or(assumed.height_m),
             ..assumed
         }
     }

@@ -62,8 +62,6 @@ pub enum TrackerError {
     Odometry(#[from] OdometryError),
     #[error(transparent)]
     Localizer(#[from] LocalizerError),
-    #[error("the first scan has no points, which do not show the sensor; give the sensor")]
-    NoPoints,
 }
 
 /// Estimates the pose of a car in a map from its scans, one after the other. The same seed gives the same estimates.
@@ -184,18 +182,20 @@ impl Tracker {
             self.prepare(scan)?
         };
         self.is_measured = false;
-        self.previous_from_current = Pose3::identity();
         let localizer = match self.localizer.take() {
             Some(localizer) => localizer,
             None => self.begin()?,
         };
         let localizer = self.localizer.insert(localizer);
-        Ok(localizer.step(&scan, odometry)?)
+        let estimate = localizer.step(&scan, odometry)?;
+        // After an error the motion is still that since the last scan that was localized.
+        self.previous_from_current = Pose3::identity();
+        Ok(estimate)
     }
 
     /// The localizer before the first scan.
     fn begin(&self) -> Result<Localizer, TrackerError> {
-        let sensor = self.sensor.as_ref().ok_or(TrackerError::NoPoints)?;
+        let sensor = self.sensor.as_ref().ok_or(SensorError::NoPoints)?;
         let (config, start) = (self.config.localizer.clone(), self.start.clone());
         let localizer = Localizer::new(&self.map, sensor, config, start, self.config.seed);
         Ok(localizer?)
@@ -204,16 +204,19 @@ impl Tracker {
     /// Learns about the sensor from a scan; returns it with the times of its points.
     fn prepare<'a>(&mut self, scan: &'a Scan) -> Result<Cow<'a, Scan>, TrackerError> {
         let known = &self.config.sensor;
-        if self.sensor.is_none() && scan.is_empty() {
-            return Err(TrackerError::NoPoints);
-        }
-        let infer = || Sensor::infer(std::slice::from_ref(scan), known);
-        let sensor = self.sensor.get_or_insert_with(infer);
+        let sensor = match self.sensor.take() {
+            Some(sensor) => sensor,
+            None => Sensor::infer(std::slice::from_ref(scan), known)?,
+        };
+        let sensor = self.sensor.insert(sensor);
         if let Some(shown) = &mut self.shown {
             shown.push(scan.clone());
             if shown.len() == TIMING_SCANS {
-                let is_complete = sensor.complete(shown, known)?;
-                self.shown = (!is_complete).then(Vec::new);
+                // What cannot be learned from these scans may be learned from the next ones.
+                let shown = std::mem::take(shown);
+                if sensor.complete(&shown, known)? {
+                    self.shown = None;
+                }
                 if let Some(localizer) = &mut self.localizer {
                     localizer.set_own_car(sensor.own_car_m);
                 }

@@ -57,7 +57,7 @@ fn a_tracker_is_the_odometer_and_the_localizer() {
     let world = TestWorld::street();
     let drive = drive(&world);
     let start = near(&drive[0].0);
-    let sensor = Sensor::infer(&[drive[0].1.clone()], &SensorConfig::default());
+    let sensor = Sensor::infer(&[drive[0].1.clone()], &SensorConfig::default()).unwrap();
     let tracker = Tracker::new(&world.map(), config()).unwrap();
     let mut tracker = (tracker.with_sensor(sensor.clone())).with_start(start.clone());
     let mut odometer = Odometer::new(OdometryConfig::default()).unwrap();
@@ -81,5 +81,8 @@ fn a_tracker_is_the_odometer_and_the_localizer() {
 fn a_first_scan_without_points_is_an_error() {
     let mut tracker = Tracker::new(&TestWorld::street().map(), config()).unwrap();
     let result = tracker.step(&Scan::default());
-    assert!(matches!(result, Err(TrackerError::NoPoints)));
+    assert!(matches!(
+        result,
+        Err(TrackerError::Sensor(SensorError::NoPoints))
+    ));
 }

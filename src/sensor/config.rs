@@ -209,7 +209,22 @@ impl RangeImageConfig {
 }
 
 impl Validate for RangeImageConfig {
+    /// Checks the given values, and those with each other that depend on each other if both are given.
     fn validate(&self) -> Result<(), InvalidValue> {
-        self.model().validate()
+        let mut other = LidarModel::default();
+        // Limits of what is not given that contradict nothing.
+        if self.fov_up.is_none() || self.fov_down.is_none() {
+            (other.fov_up, other.fov_down) = (90.0, -90.0);
+        }
+        if self.min_range.is_none() || self.max_range.is_none() {
+            other.min_range = 0.0;
+            other.max_range = self
+                .min_range
+                .map_or(other.max_range, |min| 2.0 * min.max(1.0));
+        }
+        if let (None, Some(elevations)) = (self.height, &self.elevations) {
+            other.height = elevations.len();
+        }
+        self.model_over(&other).validate()
     }
 }

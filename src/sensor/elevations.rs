@@ -163,9 +163,9 @@ fn peaks(rays: &[Ray], window: usize) -> Vec<f32> {
     let heights: Vec<u32> = peaks.iter().map(|peak| peak.1).collect();
     let mut number = 0_usize;
     peaks.retain(|peak| {
-        let beside = [number.wrapping_sub(1), number + 1].map(|other| heights.get(other));
+        let neighbours = [number.wrapping_sub(1), number + 1].map(|other| heights.get(other));
         number += 1;
-        !matches!(beside, [Some(a), Some(b)] if peak.1 < a.min(b) / STRAY)
+        !matches!(neighbours, [Some(a), Some(b)] if peak.1 < a.min(b) / STRAY)
     });
     // The window ends with its last bin.
     let angle = |(end, _)| (end as f32 + 1.0 - 0.5 * window as f32) * BIN_DEG - 90.0;

@@ -26,6 +26,8 @@ pub enum SensorError {
     Recording(#[from] RecordingError),
     #[error(transparent)]
     Timing(#[from] TimingError),
+    #[error("the scans have no points that show the sensor; give the sensor, or other scans")]
+    NoPoints,
     #[error(
         "{:.0} % of the points of the scan are outside the field of view of the sensor ({sensor}); give the sensor of these scans, or leave it unset, so that it is inferred",
         100.0 * share
@@ -36,9 +38,15 @@ pub enum SensorError {
 impl Sensor {
     /// The sensor of some scans: one suffices for the beams, ten of a drive for the rest, better spread over some
     /// seconds than neighbours. What is known takes precedence.
-    pub fn infer(scans: &[Scan], known: &SensorConfig) -> Self {
+    ///
+    /// # Errors
+    /// No scan has a point with a direction.
+    pub fn infer(scans: &[Scan], known: &SensorConfig) -> Result<Self, SensorError> {
         let scans: Vec<Scan> = scans.iter().map(valid_points).collect();
         let scans: &[Scan] = &scans;
+        if scans.iter().all(Scan::is_empty) {
+            return Err(SensorError::NoPoints);
+        }
         let beams = beams::find(scans);
         let horizontal_fov_deg = columns::horizontal_fov_deg(scans);
         let columns = columns::count(&beams);
@@ -64,7 +72,7 @@ impl Sensor {
             motion_compensation: Some(MotionCompensation::Auto),
             scans: scans.len(),
         };
-        sensor.with_known(known)
+        Ok(sensor.with_known(known))
     }
 
     /// The sensor of a recording, from ten of its scans, and from consecutive ones of its middle for the times of the
@@ -88,7 +96,7 @@ impl Sensor {
         if known.motion_compensation.is_none() {
             scans.iter_mut().for_each(|scan| scan.times_s.clear());
         }
-        let mut sensor = Self::infer(&scans, known);
+        let mut sensor = Self::infer(&scans, known)?;
         tracing::info!("sensor: {sensor}");
         sensor.warn_of_dropped_points(&scans);
         if is_auto && scans.iter().all(|scan| scan.times_s.is_empty()) {
@@ -105,6 +113,7 @@ impl Sensor {
     /// The sensor of a configuration from which nothing about range images and own car is missing.
     pub(crate) fn configured(known: &SensorConfig) -> Option<Self> {
         let range_image = known.range_image.model();
+        known.range_image.has_rows?;
         let given = RangeImageConfig {
             has_rows: None,
             ..known.range_image.clone()

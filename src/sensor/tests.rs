@@ -12,7 +12,7 @@ use super::*;
 use crate::lidar::Scan;
 
 fn infer(scans: &[Scan]) -> Sensor {
-    Sensor::infer(scans, &SensorConfig::default())
+    Sensor::infer(scans, &SensorConfig::default()).unwrap()
 }
 
 /// A drawn spinning sensor at the origin in a yard: ground 1.8 m below, walls around at 8 to 30 m.
@@ -266,23 +266,21 @@ fn a_moving_sensor_sees_its_own_car_and_the_ground_below() {
 
 #[test]
 fn nothing_follows_from_no_points_and_damaged_ones() {
-    for points in [
-        vec![],
-        vec![Vec3::NAN; 50],
-        vec![Vec3::ZERO; 50],
-        vec![Vec3::X; 50],
-    ] {
-        let scan = Scan {
-            rings: vec![u16::MAX; points.len()],
-            times_s: vec![f32::NAN; points.len()],
-            points,
-            ..Scan::default()
-        };
-        let found = infer(&[scan.clone(), scan]);
-        assert!(!found.has_rows);
-        assert_eq!(found.mounting, None);
+    let infer = |scans: &[Scan]| Sensor::infer(scans, &SensorConfig::default());
+    let scan = |point: Option<Vec3>| Scan {
+        rings: vec![u16::MAX; 50],
+        times_s: vec![f32::NAN; 50],
+        points: point.map_or_else(Vec::new, |point| vec![point; 50]),
+        ..Scan::default()
+    };
+    for point in [None, Some(Vec3::NAN), Some(Vec3::ZERO)] {
+        let found = infer(&[scan(point), scan(point)]);
+        assert!(matches!(found, Err(SensorError::NoPoints)), "{found:?}");
     }
-    assert_eq!(infer(&[]).range_image, LidarModel::default());
+    let found = infer(&[scan(Some(Vec3::X)), scan(Some(Vec3::X))]).unwrap();
+    assert!(!found.has_rows);
+    assert_eq!(found.mounting, None);
+    assert!(matches!(infer(&[]), Err(SensorError::NoPoints)));
 }
 
 #[test]

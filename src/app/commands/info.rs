@@ -75,7 +75,7 @@ fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
     let (first, last) = (&frames[0], &frames[frames.len() - 1]);
     let scans = spread_scans(&recording)?;
     let points = scans.iter().map(Scan::len).sum::<usize>() / scans.len();
-    let sensor = Sensor::infer(&scans, &SensorConfig::default());
+    let sensor = Sensor::infer(&scans, &SensorConfig::default())?;
     let duration = if recording.has_times {
         format!("{:.1} s", last.time_s - first.time_s)
     } else {
@@ -188,7 +188,7 @@ fn cloud(path: &Path) -> Result<Printed> {
         ("normals", normals.to_owned()),
     ];
     if scan.len() <= MAX_SCAN {
-        let sensor = Sensor::infer(std::slice::from_ref(&scan), &SensorConfig::default());
+        let sensor = Sensor::infer(std::slice::from_ref(&scan), &SensorConfig::default())?;
         if sensor.has_rows {
             rows.extend(sensor_rows(&sensor));
         }

@@ -230,7 +230,7 @@ impl MapBuilder {
         }
         let step = count.div_ceil(SENSOR_SCANS).max(1);
         let scans: Result<Vec<Scan>, ScanError> = (0..count).step_by(step).map(read_scan).collect();
-        Ok(Sensor::infer(&scans.map_err(BuildError::Scan)?, known))
+        Ok(Sensor::infer(&scans.map_err(BuildError::Scan)?, known)?)
     }
 
     /// Plans the local maps along the poses of the key scans of a sensor.
