@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 
 use fpmcl::internals::app::ComparisonConfig;
 use fpmcl::internals::app::settings::{
-    self, BuildMapConfig, CommandConfig, EvaluationConfig, GivenPosesConfig, GroundCommandConfig,
-    Initialization, LocalizationConfig, MapInputConfig, OdometryCommandConfig, RecordingConfig,
+    self, BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, Initialization,
+    LocalizationConfig, MapInputConfig, OdometryCommandConfig, PoseInputConfig, RecordingConfig,
     RefinementConfig,
 };
 use fpmcl::lidar::LidarModel;
@@ -87,7 +87,11 @@ fn require_comments(name: &str, text: &str) {
             is_commented = is_comment || is_commented && !line.is_empty();
             continue;
         };
-        assert!(line.contains(" # ") || is_commented, "{name}: {key}");
+        let is_block = line.trim_end().ends_with(':');
+        assert!(
+            is_block || line.contains(" # ") || is_commented,
+            "{name}: {key}"
+        );
     }
 }
 
@@ -147,11 +151,11 @@ fn recording() -> RecordingConfig {
     }
 }
 
-fn poses() -> GivenPosesConfig {
-    GivenPosesConfig {
+fn poses() -> PoseInputConfig {
+    PoseInputConfig {
         pose_file: Some("../data/07/poses.txt".into()),
         calib_file: Some("../data/07/calib.txt".into()),
-        ..GivenPosesConfig::default()
+        ..PoseInputConfig::default()
     }
 }
 

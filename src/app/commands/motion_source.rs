@@ -7,7 +7,7 @@ use anyhow::Result;
 use rand::Rng;
 
 use super::stages::RecordingInputs;
-use crate::app::settings::{MotionConfig, OdometrySource};
+use crate::app::settings::{MotionSourceConfig, OdometrySource};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
 use crate::localization::odometry::{are_in_space, demonstration_noise, motions, with_noise};
 use crate::recording::layout::Layout;
@@ -27,7 +27,7 @@ impl MotionSource {
     /// Opens the configured source for the frames of a recording; returns also the file or, in a bag, the topic that
     /// is used.
     pub fn open(
-        config: &MotionConfig,
+        config: &MotionSourceConfig,
         inputs: &RecordingInputs,
         recording: &Recording,
         rng: &mut impl Rng,
@@ -145,7 +145,7 @@ impl FrameMotion {
 }
 
 /// Description of the odometry for reports.
-pub fn description(config: &MotionConfig) -> String {
+pub fn description(config: &MotionSourceConfig) -> String {
     match (config.odometry, &config.odometry_file) {
         (OdometrySource::None, _) => "none (constant velocity)".to_owned(),
         (OdometrySource::File | OdometrySource::Auto, Some(file)) => file.display().to_string(),

@@ -6,7 +6,7 @@ use anyhow::{Context as _, Result};
 
 use crate::app::run::memory;
 use crate::app::run::{Context, input};
-use crate::app::settings::{GivenPosesConfig, MapInputConfig, MotionConfig, RecordingConfig};
+use crate::app::settings::{MapInputConfig, MotionSourceConfig, PoseInputConfig, RecordingConfig};
 use crate::map::{Map, MapCache, MapOptions, MappingPath};
 use crate::recording::{PoseTrack, Recording, is_topic};
 use crate::sensor::{RangeImageConfig, Sensor, SensorConfig};
@@ -17,12 +17,12 @@ pub struct RecordingInputs<'a> {
     /// The folder or bag, and the frames.
     pub recording: &'a RecordingConfig,
     /// Poses of the recording.
-    pub poses: &'a GivenPosesConfig,
+    pub poses: &'a PoseInputConfig,
 }
 
 impl<'a> RecordingInputs<'a> {
     /// The inputs of a configuration.
-    pub fn new(recording: &'a RecordingConfig, poses: &'a GivenPosesConfig) -> Self {
+    pub fn new(recording: &'a RecordingConfig, poses: &'a PoseInputConfig) -> Self {
         Self { recording, poses }
     }
 
@@ -82,7 +82,7 @@ impl<'a> RecordingInputs<'a> {
     }
 }
 
-impl GivenPosesConfig {
+impl PoseInputConfig {
     /// Reads poses from a file or a folder `oxts`.
     pub fn track(&self, path: &Path) -> Result<PoseTrack> {
         Ok(match self.body_from_lidar() {
@@ -109,7 +109,7 @@ pub fn complete(known: &mut SensorConfig, recording: Recording) -> Result<(Recor
 pub fn input_files<'a>(
     inputs: RecordingInputs<'a>,
     map: &'a MapInputConfig,
-    motion: &'a MotionConfig,
+    motion: &'a MotionSourceConfig,
     context: &'a Context,
 ) -> Vec<(&'static str, &'a Path)> {
     let mut files = map.files();

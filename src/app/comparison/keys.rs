@@ -274,7 +274,7 @@ mod tests {
     use super::*;
     use crate::app::comparison::record::RunId;
     use crate::app::settings::{
-        BuildMapConfig, GivenPosesConfig, LocalizationConfig, MotionConfig, RecordingConfig,
+        BuildMapConfig, LocalizationConfig, MotionSourceConfig, PoseInputConfig, RecordingConfig,
         RefinementConfig,
     };
 
@@ -285,11 +285,11 @@ mod tests {
         }
     }
 
-    fn true_poses(drive: &Path) -> GivenPosesConfig {
-        GivenPosesConfig {
+    fn true_poses(drive: &Path) -> PoseInputConfig {
+        PoseInputConfig {
             pose_file: Some(drive.join("poses.txt")),
             calib_file: Some(drive.join("calib.txt")),
-            ..GivenPosesConfig::default()
+            ..PoseInputConfig::default()
         }
     }
 
@@ -319,9 +319,9 @@ mod tests {
             localization: LocalizationConfig {
                 recording: recording(second.join("velodyne")),
                 given_poses: true_poses(&second),
-                motion: MotionConfig {
+                motion: MotionSourceConfig {
                     odometry_file: Some(second.join("odometry.txt")),
-                    ..MotionConfig::default()
+                    ..MotionSourceConfig::default()
                 },
                 ..LocalizationConfig::default()
             },

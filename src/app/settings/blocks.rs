@@ -36,7 +36,7 @@ impl Validate for RecordingConfig {
 /// Poses that are given: those of a map, or the true ones of a recording.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct GivenPosesConfig {
+pub struct PoseInputConfig {
     /// Rows of KITTI or TUM, a folder `oxts`, or a topic of a bag; `None`: those that the recording contains, if any.
     pub pose_file: Option<PathBuf>,
     /// Calibration of the recording, with its line `Tr`; `None`: the poses in `pose_file` are those of the lidar.
@@ -46,14 +46,14 @@ pub struct GivenPosesConfig {
     pub body_from_lidar: Option<[f64; 6]>,
 }
 
-impl GivenPosesConfig {
+impl PoseInputConfig {
     /// `body_from_lidar` as a pose.
     pub fn body_from_lidar(&self) -> Option<Pose3> {
         self.body_from_lidar.map(pose_from_degrees)
     }
 }
 
-impl Validate for GivenPosesConfig {
+impl Validate for PoseInputConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         optional_path("pose_file", self.pose_file.as_deref())?;
         optional_path("calib_file", self.calib_file.as_deref())?;
@@ -102,16 +102,16 @@ impl Validate for MapInputConfig {
 /// Where the motion between frames comes from.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct MotionConfig {
+pub struct MotionSourceConfig {
     /// Source of the motion.
     pub odometry: OdometrySource,
     /// Odometry poses in KITTI or TUM format, for `odometry: auto` and `file`.
     pub odometry_file: Option<PathBuf>,
 }
 
-impl MotionConfig {
+impl MotionSourceConfig {
     /// Requires a file for [`OdometrySource::File`], and true poses for [`OdometrySource::GroundTruth`].
-    pub(super) fn validate(&self, truth: &GivenPosesConfig) -> Result<(), InvalidValue> {
+    pub(super) fn validate(&self, truth: &PoseInputConfig) -> Result<(), InvalidValue> {
         require(
             self.odometry != OdometrySource::GroundTruth || truth.pose_file.is_some(),
             "motion.odometry",

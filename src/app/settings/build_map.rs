@@ -6,7 +6,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::blocks::{GivenPosesConfig, OutputConfig, RecordingConfig, optional_path, require_path};
+use super::blocks::{OutputConfig, PoseInputConfig, RecordingConfig, optional_path, require_path};
 use crate::map::{MapConfig, PoseSource};
 use crate::validation::{InvalidValue, Validate, nested, require};
 
@@ -17,7 +17,7 @@ pub struct BuildMapConfig {
     /// The recording.
     pub recording: RecordingConfig,
     /// Its poses, where they are given.
-    pub given_poses: GivenPosesConfig,
+    pub given_poses: PoseInputConfig,
     /// Output path of the map.
     #[default("results/map.ply".into())]
     pub mesh_file: PathBuf,

@@ -6,7 +6,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::blocks::{GivenPosesConfig, OutputConfig, optional_path, require_path};
+use super::blocks::{OutputConfig, PoseInputConfig, optional_path, require_path};
 use crate::evaluation::Alignment;
 use crate::recording::Selection;
 use crate::validation::{InvalidValue, Validate, at_least_one, nested, positive, require};
@@ -23,7 +23,7 @@ pub struct EvaluationConfig {
     /// Calibration of the camera whose poses a trajectory has as rows of KITTI; `None`: they are those of the lidar.
     pub result_calib_file: Option<PathBuf>,
     /// The ground truth; without any, the poses in `scan_folder`, else those in the result.
-    pub given_poses: GivenPosesConfig,
+    pub given_poses: PoseInputConfig,
     /// The recording whose poses are the ground truth; `None`: for a topic, that of the localization.
     pub scan_folder: Option<PathBuf>,
     /// Topic of the point clouds in a bag with several.

@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::blocks::{
-    GivenPosesConfig, MapInputConfig, MotionConfig, OutputConfig, RecordingConfig, require_path,
+    MapInputConfig, MotionSourceConfig, OutputConfig, PoseInputConfig, RecordingConfig,
+    require_path,
 };
 use crate::geometry::FARTHEST_M;
 use crate::localization::TrackerConfig;
@@ -25,7 +26,7 @@ pub struct LocalizationConfig {
     /// The recording.
     pub recording: RecordingConfig,
     /// Its true poses, for the report.
-    pub given_poses: GivenPosesConfig,
+    pub given_poses: PoseInputConfig,
     /// The map.
     pub map_input: MapInputConfig,
     /// Output path of the result; all other output is written next to it.
@@ -47,7 +48,7 @@ pub struct LocalizationConfig {
     /// Spread of the particles around a known start.
     pub start: StartSpread,
     /// Motion between frames.
-    pub motion: MotionConfig,
+    pub motion: MotionSourceConfig,
     /// Motion model for odometry that is not that of the scans.
     pub motion_model: MotionModel,
     /// Sensor, odometry of the scans and particle filter.

@@ -22,8 +22,8 @@ mod load;
 mod tests;
 
 pub use blocks::{
-    GivenPosesConfig, MapInputConfig, MotionConfig, OdometrySource, OutputConfig, RecordingConfig,
-    require_path,
+    MapInputConfig, MotionSourceConfig, OdometrySource, OutputConfig, PoseInputConfig,
+    RecordingConfig, require_path,
 };
 pub use build_map::BuildMapConfig;
 pub use evaluation::EvaluationConfig;

@@ -6,7 +6,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use super::blocks::{GivenPosesConfig, OutputConfig, RecordingConfig, require_path};
+use super::blocks::{OutputConfig, PoseInputConfig, RecordingConfig, require_path};
 use crate::odometry::TrajectoryConfig;
 use crate::sensor::MotionCompensation;
 use crate::validation::{InvalidValue, Validate, nested, positive};
@@ -18,7 +18,7 @@ pub struct OdometryCommandConfig {
     /// The recording.
     pub recording: RecordingConfig,
     /// Poses to polish; without any, poses are found from the scans alone.
-    pub given_poses: GivenPosesConfig,
+    pub given_poses: PoseInputConfig,
     /// Folder of the poses, the report and the picture.
     #[default("results/odometry".into())]
     pub output_folder: PathBuf,

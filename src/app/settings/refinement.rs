@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::blocks::{
-    GivenPosesConfig, MapInputConfig, MotionConfig, OutputConfig, RecordingConfig, optional_path,
-    require_path,
+    MapInputConfig, MotionSourceConfig, OutputConfig, PoseInputConfig, RecordingConfig,
+    optional_path, require_path,
 };
 use super::localization::LocalizationConfig;
 use crate::refinement::RefinerConfig;
@@ -22,7 +22,7 @@ pub struct RefinementConfig {
     /// The recording.
     pub recording: RecordingConfig,
     /// Its true poses, for the report.
-    pub given_poses: GivenPosesConfig,
+    pub given_poses: PoseInputConfig,
     /// The map.
     pub map_input: MapInputConfig,
     /// Result of `localize`, to which the refined poses are added, or a trajectory in the frame of the map, rows of TUM
@@ -35,7 +35,7 @@ pub struct RefinementConfig {
     #[default([1.0, 10.0])]
     pub uncertainty: [f64; 2],
     /// Motion between frames, for smoothing.
-    pub motion: MotionConfig,
+    pub motion: MotionSourceConfig,
     /// What is known about the sensor; the rest is inferred from the scans.
     pub sensor: SensorConfig,
     /// Observation model, swarm, Gauss-Newton and smoothing.
@@ -84,12 +84,12 @@ impl RefinementConfig {
         if !self.is_trajectory() {
             return self.result_file.clone();
         }
-        let beside = || {
+        let next_to_it = || {
             let mut name = self.result_file.file_stem().unwrap_or_default().to_owned();
             name.push("_refined");
             self.result_file.with_file_name(name).join("refined.npz")
         };
-        self.output_file.clone().unwrap_or_else(beside)
+        self.output_file.clone().unwrap_or_else(next_to_it)
     }
 }
 
