@@ -35,8 +35,23 @@ fn flatten(
             Ok(block) => flatten(&format!("{key}."), block, rows)?,
             Err(_not_a_block) => {
                 let json = py.import("json")?;
-                let text = json.call_method("dumps", (value,), Some(&options))?;
-                rows.push((key, text.extract()?));
+                let value = match value.hasattr("__fspath__")? {
+                    true => value.call_method0("__fspath__")?,
+                    false => value,
+                };
+                let text: String = json
+                    .call_method("dumps", (value,), Some(&options))?
+                    .extract()?;
+                // YAML's numbers that JSON does not have.
+                rows.push((
+                    key,
+                    match text.as_str() {
+                        "Infinity" => ".inf".to_owned(),
+                        "-Infinity" => "-.inf".to_owned(),
+                        "NaN" => ".nan".to_owned(),
+                        _ => text,
+                    },
+                ));
             }
         }
     }

@@ -188,6 +188,7 @@ def test_wrong_settings_are_errors_that_name_them(square):
     with pytest.raises(fpmcl.Error, match="unknown key `result_path`"):
         fpmcl.Localizer(square, result_path="a.npz")
     fpmcl.Localizer(square, observation={"beams": np.int64(500)}, **{"kld.bin_m": 0.5})
+    fpmcl.Localizer(square, convergence={"max_spread_m": float("inf")}, odometry=None)
 
 
 def test_a_map_needs_no_poses(recording):

@@ -122,7 +122,10 @@ class Map:
     ) -> Map:
         """Reads a map, or a mesh from elsewhere (PLY, OBJ, STL).
 
-        ``backend``: what renders it. Raises Error if the file cannot be read, or is no mesh with ground.
+        ``backend``: what renders it. ``cache``: where tiles of the map are kept, so that only what is around the car is in
+        memory: True for next to the map, or a folder; None: all of the map is in memory, and nothing is written.
+
+        Raises Error if the file cannot be read, or is no mesh with ground.
         """
 
     def save(self, path: _Path) -> None:
