@@ -400,7 +400,7 @@ fn stable_bytes(path: &Path) -> Option<Vec<u8>> {
     }
     if name.ends_with(".yml") {
         let text = fs::read_to_string(path).unwrap();
-        let is_stable = |line: &&str| !line.starts_with("force:");
+        let is_stable = |line: &&str| !line.trim_start().starts_with("force:");
         return Some(
             text.lines()
                 .filter(is_stable)

@@ -27,13 +27,13 @@ fn refuses(command: &str, key: &str, value: &str, limit: &str) {
 #[test]
 fn maps_are_bounded() {
     for (key, value, limit) in [
-        ("crop_x", "10000", "500"),
-        ("crop_y", "1e30", "500"),
-        ("crop_z", ".inf", "500"),
-        ("voxel_size", "1e-9", "0.001"),
-        ("simplify_resolution", "1e-6", "0.01"),
+        ("crop_x_m", "10000", "500"),
+        ("crop_y_m", "1e30", "500"),
+        ("crop_z_m", ".inf", "500"),
+        ("voxel_size_m", "1e-9", "0.001"),
+        ("simplify_resolution_m", "1e-6", "0.01"),
         ("max_distance_m", "1e-9", "0.001"),
-        ("number_of_iterations", "1000000000", "1000"),
+        ("smoothing_iterations", "1000000000", "1000"),
         ("depth", "40", "12"),
         ("local_map_size", "1000000000", "10000"),
         ("num_iterations", "1000000000", "100000"),
@@ -56,11 +56,10 @@ fn maps_are_bounded() {
 #[test]
 fn localization_is_bounded() {
     for (key, value, limit) in [
-        ("numParticles", "1000000000000", "1000000"),
+        ("num_particles", "1000000000000", "1000000"),
         ("num_reduced", "1000000000000", "1000000"),
         ("range_image.height", "100000", "4096"),
-        ("range_image.max_instance", "1000000000000", "1000000"),
-        ("grid_res", "0.0001", "0.05"),
+        ("panorama.cell_m", "0.0001", "0.05"),
         ("panorama.columns", "65536", "3600"),
         ("panorama.rows", "100000", "256"),
         ("observation.beams", "1000000000000", "1000000"),
@@ -136,7 +135,8 @@ fn a_budget_of_memory_that_does_not_suffice_is_an_error_that_names_what_needs_it
     let expected = |what, key| [&parts[..], &[what, key]].concat();
     build().fails_with(&expected("the octree of the surface", "depth"));
     (build().set("range_image.height", "1024")).fails_with(&expected("range images", "width"));
-    (build().set("crop_x", "500")).fails_with(&expected("the plane around a local map", "crop_x"));
+    (build().set("crop_x_m", "500"))
+        .fails_with(&expected("the plane around a local map", "crop_x_m"));
     assert!(!recording.path("map.ply").exists());
 
     recording.fpmcl("build-map").succeeds();

@@ -84,7 +84,7 @@ fn a_drive_is_localized_and_refined_in_the_map_of_another_drive() {
         assert!(output.contains(row), "no `{row}` in: {output}");
     }
     let picture = |name: &str| Picture::read(&plots.join(name));
-    picture("path.png").shows(&[MCL, TRUTH]);
+    picture("path.png").shows(&[TRUTH]);
     picture("errors.png").shows_at_least(400, &[MCL, REFINED]);
     picture("runtime.png").shows(&[MCL, REFINED]);
     picture("particles.png").shows(&[MCL]);

@@ -140,7 +140,8 @@ fn a_map_whose_ground_is_tilted_is_warned_about() {
         let points = points.map(|[x, y, z]| [x, cos * y - sin * z, sin * y + cos * z]);
         tilted.write_scan(frame, &points.collect::<Vec<_>>());
     }
-    let stderr = checked_build(&tilted).succeeds().stderr;
+    let tilted = checked_build(&tilted).set("range_image.fov_up", "30");
+    let stderr = tilted.set("range_image.fov_down", "-50").succeeds().stderr;
     assert!(stderr.contains(warning), "{stderr}");
     let stderr = checked_build(&Recording::street(3)).succeeds().stderr;
     assert!(!stderr.contains("tilted"), "{stderr}");

@@ -4,6 +4,7 @@
 
 use fpmcl::geometry::{Pose3, TriangleMesh, Vec3};
 use fpmcl::ground::GroundClassifier;
+use fpmcl::lidar::LidarModel;
 use fpmcl::lidar::Scan;
 use fpmcl::map::{LocalMapCounts, MapBuilder, MapConfig};
 use fpmcl::sensor::Sensor;
@@ -44,10 +45,12 @@ fn map(small: f32, large: f32, ground_threshold: f32) -> (TriangleMesh, LocalMap
     config.local_map.poisson.depth = 6;
     (config.local_map.crop_x_m, config.local_map.crop_y_m) = (10.0, 10.0);
     config.local_map.visibility.enabled = false;
+    let sensor = Sensor {
+        range_image: LidarModel::default(),
+        ..Sensor::hdl64e()
+    };
     let builder = MapBuilder::new(config);
-    let mut plan = builder
-        .plan(&Sensor::hdl64e(), vec![Pose3::identity(); 2])
-        .unwrap();
+    let mut plan = builder.plan(&sensor, vec![Pose3::identity(); 2]).unwrap();
     plan.classifier = Box::new(ByScan {
         small,
         large,
