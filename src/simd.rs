@@ -309,7 +309,7 @@ pub(crate) mod avx2 {
             unsafe { run_compiled(task, self) }
         }
 
-        /// Of a CPU that has more.
+        /// The proof that a CPU with AVX-512 has AVX2.
         pub fn of(_: crate::simd::avx512::Avx512) -> Self {
             Self(())
         }

@@ -78,7 +78,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_fast_arcus_tangent_is_the_exact_one_to_its_accuracy() {
+    fn the_fast_arctangent_is_the_exact_one_to_its_accuracy() {
         for step in 0..100_000 {
             let angle = (f64::from(step) / 100_000.0 - 0.5) * TAU;
             let (y, x) = ((1e3 * angle.sin()) as f32, (1e3 * angle.cos()) as f32);

@@ -27,13 +27,13 @@ pub enum GroundMethod {
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct GroundConfig {
-    /// The method that [`classifier`](Self::classifier) builds.
+    /// Method.
     pub method: GroundMethod,
-    /// Parameters of [`GroundMethod::Fuzzy`].
+    /// Features, sets and rules of the fuzzy method.
     pub fuzzy: FuzzyConfig,
-    /// Parameters of [`GroundMethod::Pca`].
+    /// Parameters of principal components.
     pub pca: PcaGround,
-    /// Parameters of [`GroundMethod::Ransac`].
+    /// Parameters of the RANSAC plane.
     pub ransac: RansacGround,
 }
 

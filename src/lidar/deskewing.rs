@@ -104,8 +104,8 @@ impl Motion {
             return *self;
         }
         let share = self.duration_s / (self.duration_s + other.duration_s);
-        let [own, beside] = [self, other].map(|it| logarithm(&it.previous_from_current));
-        let twist = own * (1.0 + share) - beside * (share * ratio);
+        let [own, neighbour] = [self, other].map(|it| logarithm(&it.previous_from_current));
+        let twist = own * (1.0 + share) - neighbour * (share * ratio);
         Self {
             previous_from_current: exponential(&twist),
             ..*self

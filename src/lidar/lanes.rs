@@ -65,7 +65,7 @@ pub(super) struct PlanesOfLanes {
 const ENTRIES: [[usize; 2]; 6] = [[0, 0], [1, 1], [2, 2], [0, 1], [0, 2], [1, 2]];
 
 impl PlaneSumsOfLanes {
-    /// Of one point, the origin.
+    /// Sums of one point, the origin.
     #[inline(always)]
     pub fn of_origin() -> Self {
         Self {

@@ -22,7 +22,7 @@ pub struct Projection {
 }
 
 impl Projection {
-    /// Of an image.
+    /// The projection of an image.
     pub fn of(model: &LidarModel) -> Self {
         let rows = match &model.elevations {
             Some(elevations) => rows_of_beams(elevations, model),

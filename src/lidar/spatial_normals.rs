@@ -27,7 +27,7 @@ const MIN_SHARE: f32 = 0.6;
 
 /// Unit normals in the lidar frame, towards the sensor, one per point; `None` where there is no plane.
 ///
-/// Of the settings, the tolerances and the incidence apply.
+/// The tolerances and the incidence of the configuration apply.
 pub fn estimate_spatial_normals(points: &[Vec3], config: &NormalConfig) -> Vec<Option<Vec3>> {
     let grid = Grid::new(points);
     (points.par_iter())

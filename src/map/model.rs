@@ -359,7 +359,7 @@ fn limits_of(options: &MapOptions) -> RenderLimits {
     }
 }
 
-/// Divides the mesh of a file into tiles in a folder; `None` if they cannot be written, after a warning.
+/// Divides the mesh of a file into tiles in a folder; `None` if they cannot be written next to it, after a warning.
 fn divided(
     (mesh_file, folder): (&Path, &Path),
     source: Source,

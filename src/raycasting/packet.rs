@@ -147,7 +147,7 @@ fn largest(ranges_m: &[f32; RAYS]) -> f32 {
 pub(super) struct RelativePacket<L, R> {
     origin: R,
     grid: BoxGrid,
-    /// Of the ray that enters a box first, whichever it is, and of the one that leaves it last.
+    /// Slopes of the ray that enters a box first, whichever it is, and of the one that leaves it last.
     slopes: [Slope<L>; 2],
 }
 

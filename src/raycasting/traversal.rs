@@ -45,7 +45,7 @@ pub(super) struct Slope<L> {
 }
 
 impl<L: Lanes> Slope<L> {
-    /// Of an origin [steps of the lattice], and of the inverses of the coordinates of a direction [m per step].
+    /// The slope of an origin [steps of the lattice] and the inverses of the coordinates of a direction [m per step].
     #[inline(always)]
     pub fn new<S: Simd<F32x8 = L>>(
         simd: S,

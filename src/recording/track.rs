@@ -133,10 +133,10 @@ impl PoseTrack {
         times_s: Option<Vec<f64>>,
     ) -> Result<Self, RecordingError> {
         let map_from_lidar = camera.map_from_lidar(&calibration);
-        let beside = path.with_file_name("times.txt");
+        let times_file = path.with_file_name("times.txt");
         let (times_path, times_s) = match times_s {
             Some(times_s) => (path.to_owned(), Some(times_s)),
-            None if beside.exists() => (beside.clone(), Some(read_times(&beside)?)),
+            None if times_file.exists() => (times_file.clone(), Some(read_times(&times_file)?)),
             None => (path.to_owned(), None),
         };
         if let Some(times_s) = &times_s

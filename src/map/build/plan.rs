@@ -80,7 +80,7 @@ fn distance_m(a: &Pose3, b: &Pose3) -> f64 {
 /// around itself.
 #[derive(Clone, Debug)]
 pub struct Ownership {
-    /// Of the key scans, map frame [m].
+    /// Positions of the key scans, map frame [m].
     positions: Vec<Point2<f64>>,
     /// Number of the local map of each key scan.
     owners: Vec<u32>,

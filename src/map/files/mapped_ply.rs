@@ -48,7 +48,7 @@ struct RowLayout {
 }
 
 impl RowLayout {
-    /// Of the lines of properties; `None` where one is of a kind that is not read here.
+    /// The layout by the lines of properties; `None` where one is of a kind that is not read here.
     fn of<'a>(lines: impl Iterator<Item = &'a str>) -> Option<Self> {
         let mut places = Vec::new();
         let mut bytes = 0;

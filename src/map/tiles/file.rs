@@ -38,13 +38,13 @@ pub(crate) const ENDING: &str = ".tile";
 struct TileHeader {
     magic: [u8; 8],
     version: u32,
-    /// Of the scene and the bits.
+    /// Checksum of the scene and the bits.
     scene_checksum: u32,
     scene_bytes: u64,
     chunks: u64,
     chunk_bytes: u64,
     triangles: u64,
-    /// Of the table and the heights.
+    /// Checksum of the table and the heights.
     ground_checksum: u32,
     unused: [u8; 12],
 }

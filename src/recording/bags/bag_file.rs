@@ -172,8 +172,8 @@ pub fn paths(path: &Path) -> Result<Vec<PathBuf>, String> {
             // The name of old bags begins with that of the folder.
             let name = Path::new(unquoted(name));
             let inside = path.join(name);
-            let beside = name.file_name().map(|name| path.join(name));
-            paths.push(beside.filter(|_name| !inside.exists()).unwrap_or(inside));
+            let sibling = name.file_name().map(|name| path.join(name));
+            paths.push(sibling.filter(|_name| !inside.exists()).unwrap_or(inside));
         }
     }
     if paths.is_empty() {

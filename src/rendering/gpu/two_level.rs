@@ -152,7 +152,7 @@ pub(super) struct BottomLevel {
 }
 
 impl BottomLevel {
-    /// Of the corners of triangles and the centre of the map, both in its frame [m].
+    /// Builds the hierarchy of triangles by their corners, around the centre of the map, both in its frame [m].
     pub fn build(triangles: impl Iterator<Item = [DVec3; 3]>, center: DVec3) -> Self {
         let corners: Vec<[Vec3; 3]> = triangles
             .map(|corners| corners.map(|corner| (corner - center).as_vec3()))
