@@ -71,6 +71,14 @@ impl Names {
         }
     }
 
+    /// The known part of a full name, which may go on within a map.
+    pub(super) fn known<'a>(&self, full: &'a str) -> &'a str {
+        let dots = full.rmatch_indices('.').map(|(dot, _)| dot);
+        let mut parts = std::iter::once(full.len()).chain(dots);
+        let end = parts.find(|&end| self.0.iter().any(|key| *key == full[..end]));
+        &full[..end.unwrap_or(0)]
+    }
+
     /// Whether a name is that of a block of keys.
     pub(super) fn is_block(&self, name: &str) -> bool {
         let Meaning::Key(key) = self.meaning(name) else {

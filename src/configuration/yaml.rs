@@ -20,10 +20,15 @@ pub(super) fn parse<T: DeserializeOwned>(text: &str) -> Result<T, serde_yaml::Er
     serde_yaml::from_str_with_options(text, serde_yaml::options! { with_snippet: false })
 }
 
+/// Stands for a dot that is part of a key.
+const DOT: &str = "\u{1}";
+
 /// A key of a YAML text in block style, or an item of a list.
 pub(super) struct Key {
     /// Dotted (`range_image.width`); an item has its number, from 1 (`fuzzy.rules[2]`).
     pub(super) name: String,
+    /// The same, with [`DOT`] where a key itself contains a dot.
+    given: String,
     /// The line that it starts on, from 0.
     pub(super) line: usize,
     /// Twice the indentation, and one more for an item, which may stand below its list unindented.
@@ -54,18 +59,20 @@ pub(super) fn keys(text: &str) -> Vec<Key> {
         let depth = 2 * indentation + usize::from(is_item);
         open.retain(|&parent| keys[parent].depth < depth);
         let parent = open.last().map(|&parent| &mut keys[parent]);
-        let name = match (key, parent) {
-            (Some((name, _)), None) => name,
-            (Some((name, _)), Some(parent)) => format!("{}.{name}", parent.name),
+        let key = key.map(|(name, _)| name.replace('.', DOT));
+        let given = match (key, parent) {
+            (Some(name), None) => name,
+            (Some(name), Some(parent)) => format!("{}.{name}", parent.given),
             (None, Some(list)) => {
                 list.items += 1;
-                format!("{}[{}]", list.name, list.items)
+                format!("{}[{}]", list.given, list.items)
             }
             (None, None) => continue,
         };
         open.push(keys.len());
         keys.push(Key {
-            name,
+            name: given.replace(DOT, "."),
+            given,
             line,
             depth,
             items: 0,
@@ -184,7 +191,13 @@ impl FullText {
             }
             let place = error::place(name, Some(key.line));
             match names.meaning(&key.name) {
-                Meaning::Key(name) => root.insert(&name, key.line..end, place)?,
+                Meaning::Key(full) => {
+                    // A dot of a key within a map, whose keys are the user's, stays one.
+                    let within = full.len() - names.known(&full).len();
+                    let given = &key.given[key.given.len() - within..];
+                    let name = format!("{}{given}", names.known(&full));
+                    root.insert(&name, key.line..end, place)?;
+                }
                 Meaning::Nothing => ignored += 1,
                 meaning => return Err(error::unknown(place, &key.name, meaning, names)),
             }
@@ -319,7 +332,8 @@ impl Node {
             let start = &original[node.lines.start];
             let value = key_of(start.trim_start()).map_or("", |(_, value)| value);
             let value = if node.inner.is_empty() { value } else { "" };
-            *text += &format!("{:indentation$}{}:{value}\n", "", node.name);
+            let name = node.name.replace(DOT, ".");
+            *text += &format!("{:indentation$}{name}:{value}\n", "");
             lines.push(node.first_line());
             let old = start.len() - start.trim_start().len();
             for row in node.lines.clone().skip(1) {
