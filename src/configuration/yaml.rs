@@ -178,8 +178,13 @@ impl FullText {
                 |it: &&Key| it.name.len() > key.name.len() && is_within(&it.name, &key.name);
             let later = &found[index + 1..];
             let mut inner = later.iter().take_while(is_inner);
-            if key.name.contains('[') || inner.any(|it| !it.name[key.name.len()..].starts_with('['))
-            {
+            if key.name.contains('[') {
+                continue;
+            }
+            if inner.any(|it| !it.name[key.name.len()..].starts_with('[')) {
+                if let Meaning::Key(full) = names.meaning(&key.name) {
+                    root.at(&full).header = Some(key.line);
+                }
                 continue;
             }
             let end = later.iter().find(|it| !is_inner(it));
@@ -286,18 +291,19 @@ fn leaves(text: &str) -> Option<Vec<String>> {
 struct Node {
     name: String,
     lines: Range<usize>,
+    /// The line on which a block begins, if it was given as one.
+    header: Option<usize>,
     inner: Vec<Node>,
 }
 
 impl Node {
-    fn insert(
-        &mut self,
-        name: &str,
-        lines: Range<usize>,
-        place: String,
-    ) -> Result<(), ConfigError> {
+    /// The node with a name, which is made if there is none; else the value that is in its place.
+    fn at(&mut self, name: &str) -> &mut Self {
         let mut node = self;
         for part in name.split('.') {
+            if !node.lines.is_empty() {
+                break;
+            }
             let known = node.inner.iter().position(|it| it.name == part);
             let index = known.unwrap_or(node.inner.len());
             if known.is_none() {
@@ -307,11 +313,17 @@ impl Node {
                 });
             }
             node = &mut node.inner[index];
-            // A value where a block is wanted, or the other way round.
-            if !node.lines.is_empty() {
-                break;
-            }
         }
+        node
+    }
+
+    fn insert(
+        &mut self,
+        name: &str,
+        lines: Range<usize>,
+        place: String,
+    ) -> Result<(), ConfigError> {
+        let node = self.at(name);
         if !node.lines.is_empty() || !node.inner.is_empty() {
             let key = name.to_owned();
             return Err(ConfigError::DuplicateKey { place, key });
@@ -328,7 +340,8 @@ impl Node {
         text: &mut String,
         lines: &mut Vec<usize>,
     ) {
-        for node in &self.inner {
+        let is_given = |node: &&Node| !node.lines.is_empty() || !node.inner.is_empty();
+        for node in self.inner.iter().filter(is_given) {
             let start = &original[node.lines.start];
             let value = key_of(start.trim_start()).map_or("", |(_, value)| value);
             let value = if node.inner.is_empty() { value } else { "" };
@@ -347,9 +360,9 @@ impl Node {
     }
 
     fn first_line(&self) -> usize {
-        self.inner
-            .first()
-            .map_or(self.lines.start, Self::first_line)
+        let inner = self.inner.first();
+        self.header
+            .unwrap_or_else(|| inner.map_or(self.lines.start, Self::first_line))
     }
 }
 
