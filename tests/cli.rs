@@ -233,8 +233,8 @@ fn an_invalid_rule_is_reported_with_its_line_and_the_nearest_word() {
                 "expected IS, found `raised`",
             ),
             (
-                "trapezoid: [-0.45, -0.15,",
-                "trapezoid: [-0.1, -0.15,",
+                "level:\n          trapezoid: [-0.45, -0.15,",
+                "level: # corners\n          trapezoid: [-0.1, -0.15,",
                 "fuzzy.variables.height.level",
                 "{trapezoid: [-0.1, -0.15, 0.03, 0.11]}: its corners must be finite and ascend",
             ),
