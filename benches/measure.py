@@ -173,7 +173,9 @@ def odometry(work, _seeds):
             poses = folder / "odometry_tum.txt"
             fpmcl("evaluate", poses, *truth, "--recording", recording, "--align", "first", "--output", evaluated)
             found = json.loads((evaluated / "report.json").read_text())
-            segments = json.dumps(found["mcl"]["in_space"]["short_segments"])
+            found = found["trajectory"]["short_segments"]
+            turn = 100 * found["rotation_deg_per_m"]
+            segments = f"{found['translation_percent']:.2f} %, {turn:.2f} deg per 100 m"
         median_s, _p95_s = report["seconds_per_scan"]
         row(name, report["scans"], f"{report['path_m']:.0f} m", segments, f"{1e3 * median_s:.0f} ms")
 
@@ -189,7 +191,7 @@ def ground(work, _seeds):
 
 
 def demo(work, _seeds):
-    block(fpmcl("demo", "--output", work / "demo", "--force"))
+    block(fpmcl("demo", "--output", work / "demo"))
 
 
 def poisson(_work, _seeds):
