@@ -113,7 +113,6 @@ impl Sensor {
     /// The sensor of a configuration from which nothing about range images and own car is missing.
     pub(crate) fn configured(known: &SensorConfig) -> Option<Self> {
         let range_image = known.range_image.model();
-        known.range_image.has_rows?;
         let given = RangeImageConfig {
             has_rows: None,
             ..known.range_image.clone()
