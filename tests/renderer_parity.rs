@@ -16,9 +16,8 @@ use fpmcl::internals::{GpuRenderer, ImageMethod};
 use fpmcl::lidar::{Beam, LidarModel, RangeImage};
 use fpmcl::localization::ObservationConfig;
 use fpmcl::localization::ParticleSet;
-use fpmcl::rendering::{
-    Backend, RangeDifference, RangeRenderer, RenderError, RenderLimits, RenderingMethod,
-};
+use fpmcl::memory::MemoryBudget;
+use fpmcl::rendering::{Backend, RangeDifference, RangeRenderer, RenderError, RenderingMethod};
 
 use brute_force::{BruteForce, room, street};
 
@@ -30,7 +29,7 @@ fn renderer(tiles: &[TriangleMesh]) -> Option<GpuRenderer> {
     match GpuRenderer::new(
         tiles,
         (Backend::Gpu, RenderingMethod::Auto),
-        RenderLimits::default(),
+        MemoryBudget::default(),
     ) {
         Ok(renderer) => Some(renderer),
         Err(RenderError::NoAdapter) => {

@@ -27,7 +27,7 @@ use crate::geometry::mesh::on_lattice;
 use crate::geometry::{Aabb, TriangleMesh};
 use crate::memory::{MemoryBudget, MemoryError};
 use crate::rendering::selection::{self, BackendChoice};
-use crate::rendering::{RangeRenderer, RenderError, RenderLimits};
+use crate::rendering::{RangeRenderer, RenderError};
 
 /// Extents between which a map in metres lies [m].
 const PLAUSIBLE_M: RangeInclusive<f32> = 2.0..=20_000.0;
@@ -126,7 +126,7 @@ impl Map {
             grid::cut(&mesh, options.tiles.side_m).into_iter().unzip();
         let boxes = std::iter::zip(indices, parts.iter().map(TriangleMesh::bounds));
         let tiles = grid_of(&path, boxes, &options.tiles);
-        let renderer = choice.renderer(&parts, limits_of(options))?;
+        let renderer = choice.renderer(&parts, options.memory_budget)?;
         let ground = GroundMap::over(Arc::new(chunks), GROUND_CELL_M);
         Ok(Self {
             memory_budget: options.memory_budget,
@@ -229,7 +229,7 @@ impl Map {
         let path = store.path.clone().or(given).unwrap_or_default();
         let tiles = grid_of(&path, store.boxes(), &options.tiles);
         let store = Arc::new(store);
-        let renderer = choice.renderer_over(&store, limits_of(options))?;
+        let renderer = choice.renderer_over(&store, options.memory_budget)?;
         Ok(Self {
             surface: Surface::Disk {
                 mesh_file: mesh_file.to_owned(),
@@ -349,13 +349,6 @@ impl Map {
         let file = file.as_ref().map(|file| (&**file, &*words));
         let (renderer, ground) = (&*self.renderer, &self.ground);
         PanoramaIndex::build(&cells, renderer, ground, &self.tiles, request, file, budget)
-    }
-}
-
-fn limits_of(options: &MapOptions) -> RenderLimits {
-    RenderLimits {
-        max_poses: options.max_poses,
-        memory_budget: options.memory_budget,
     }
 }
 

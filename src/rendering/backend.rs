@@ -4,8 +4,6 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::memory::MemoryBudget;
-
 /// Requested rendering backend.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -31,15 +29,6 @@ pub enum RenderingMethod {
     Raster,
     /// Rays.
     Cast,
-}
-
-/// Bounds of the memory of a renderer.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct RenderLimits {
-    /// Largest number of poses rendered at once; `None` for no limit.
-    pub max_poses: Option<usize>,
-    /// Memory for the map and the images on a graphics device.
-    pub memory_budget: MemoryBudget,
 }
 
 /// Type of a graphics adapter, best first.

@@ -42,11 +42,14 @@ const BUNDLE_PER_PACKET: f64 = 0.5;
 /// Rounding of sums and differences of ranges.
 const ROUNDING: f32 = 1e-6;
 
+/// Number of poses rendered at once, which bounds the memory of their images.
+pub(super) const POSES_AT_ONCE: usize = 1024;
+
 /// Casts rays at the tiles of a map.
 #[derive(Clone, Debug)]
 pub struct CpuRenderer {
     scenes: Arc<dyn SceneSource>,
-    /// Maximum number of poses rendered at once, which bounds the memory.
+    /// Maximum number of poses rendered at once.
     pub max_poses: usize,
 }
 
@@ -60,7 +63,7 @@ impl CpuRenderer {
     pub fn over(scenes: Arc<dyn SceneSource>) -> Self {
         Self {
             scenes,
-            max_poses: usize::MAX,
+            max_poses: POSES_AT_ONCE,
         }
     }
 

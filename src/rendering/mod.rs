@@ -10,7 +10,7 @@ pub(crate) mod gpu;
 mod order;
 pub(crate) mod selection;
 
-pub use backend::{Backend, RenderLimits, RenderingMethod};
+pub use backend::{Backend, RenderingMethod};
 
 pub(crate) use cpu::CpuRenderer;
 

@@ -6,11 +6,12 @@
 
 use std::sync::Arc;
 
-use super::backend::{AdapterReport, Backend, RenderLimits, RenderingMethod, best_adapter};
+use super::backend::{AdapterReport, Backend, RenderingMethod, best_adapter};
 #[cfg(feature = "gpu")]
 use super::gpu::GpuRenderer;
 use super::{CpuRenderer, RangeRenderer, RenderError};
 use crate::geometry::TriangleMesh;
+use crate::memory::MemoryBudget;
 use crate::raycasting::{SceneSource, TriangleSource};
 
 /// Selected renderer, the adapters that were considered, and the reason.
@@ -37,21 +38,26 @@ impl BackendChoice {
 }
 
 impl BackendChoice {
-    /// Prepares the tiles of a map, in the map frame, for rendering within limits. Reports the renderer and the reason to the log.
+    /// Prepares the tiles of a map, in the map frame, for rendering; the budget is that of the map and the images on a
+    /// graphics device. Reports the renderer and the reason to the log.
     ///
     /// # Errors
     /// Those of the graphics device.
     pub fn renderer(
         &self,
         tiles: &[TriangleMesh],
-        limits: RenderLimits,
+        memory_budget: MemoryBudget,
     ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
         self.report();
         #[cfg(feature = "gpu")]
         if self.adapter.is_some() {
-            return Ok(Arc::new(GpuRenderer::new(tiles, self.request, limits)?));
+            return Ok(Arc::new(GpuRenderer::new(
+                tiles,
+                self.request,
+                memory_budget,
+            )?));
         }
-        Ok(on_cpu(CpuRenderer::new(tiles), limits))
+        Ok(Arc::new(CpuRenderer::new(tiles)))
     }
 
     /// As [`renderer`](Self::renderer), with tiles that are read, and on a graphics adapter uploaded, when rays may reach
@@ -62,24 +68,23 @@ impl BackendChoice {
     pub fn renderer_over<S: SceneSource + TriangleSource + 'static>(
         &self,
         source: &Arc<S>,
-        limits: RenderLimits,
+        memory_budget: MemoryBudget,
     ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
         self.report();
         #[cfg(feature = "gpu")]
         if self.adapter.is_some() {
-            return Ok(Arc::new(GpuRenderer::over(source, self.request, limits)?));
+            return Ok(Arc::new(GpuRenderer::over(
+                source,
+                self.request,
+                memory_budget,
+            )?));
         }
-        Ok(on_cpu(CpuRenderer::over(source.clone()), limits))
+        Ok(Arc::new(CpuRenderer::over(source.clone())))
     }
 
     fn report(&self) {
         tracing::info!("rendering on {} because {}", self.name(), self.reason);
     }
-}
-
-fn on_cpu(mut renderer: CpuRenderer, limits: RenderLimits) -> Arc<dyn RangeRenderer> {
-    renderer.max_poses = limits.max_poses.unwrap_or(usize::MAX);
-    Arc::new(renderer)
 }
 
 /// Selects one of the graphics adapters of this machine, or the CPU.

@@ -17,10 +17,10 @@ use crate::lidar::{Beam, LidarModel, RangeImage};
 use crate::localization::observation::ObservationConfig;
 use crate::map::TileConfig;
 use crate::map::tiles::grid;
+use crate::memory::MemoryBudget;
 use crate::rendering::backend::{AdapterReport, best_adapter};
 use crate::rendering::{
-    Backend, CpuRenderer, RangeDifference, RangeRenderer, RenderError, RenderLimits,
-    RenderingMethod, selection,
+    Backend, CpuRenderer, RangeDifference, RangeRenderer, RenderError, RenderingMethod, selection,
 };
 use crate::simulation::{Simulation, SimulationConfig};
 
@@ -163,7 +163,7 @@ impl Workload {
         backend: Backend,
         method: RenderingMethod,
     ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
-        selection::choose(backend, method)?.renderer(&self.tiles, RenderLimits::default())
+        selection::choose(backend, method)?.renderer(&self.tiles, MemoryBudget::default())
     }
 
     /// Speed with which whole images are compared.

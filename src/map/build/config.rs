@@ -81,8 +81,6 @@ pub struct MapOptions {
     pub backend: Backend,
     /// Method to render whole range images.
     pub method: RenderingMethod,
-    /// Largest number of poses rendered at once; `None` for no limit.
-    pub max_poses: Option<usize>,
     /// Division into tiles.
     pub tiles: TileConfig,
     /// Where the tiles of a map file are kept.

@@ -32,10 +32,12 @@ mod two_level;
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
-use super::backend::{Backend, RenderLimits, RenderingMethod};
+use super::backend::{Backend, RenderingMethod};
+use super::cpu::POSES_AT_ONCE;
 use super::{CpuRenderer, RangeDifference, RangeRenderer, RenderError};
 use crate::geometry::{Pose3, TriangleMesh, Vec3};
 use crate::lidar::{Beam, LidarModel, RangeImage};
+use crate::memory::MemoryBudget;
 use crate::raycasting::{SceneSource, TriangleSource};
 
 use device::Gpu;
@@ -65,7 +67,7 @@ pub struct GpuRenderer {
 
 impl GpuRenderer {
     /// Opens the best adapter that the backend allows and uploads the map; compares images by the requested method, and
-    /// renders within limits.
+    /// renders within a budget of memory.
     ///
     /// # Errors
     /// [`RenderError::NoAdapter`] where there is none, [`RenderError::MapTooLarge`] where the
@@ -74,9 +76,9 @@ impl GpuRenderer {
     pub fn new(
         tiles: &[TriangleMesh],
         request: (Backend, RenderingMethod),
-        limits: RenderLimits,
+        memory_budget: MemoryBudget,
     ) -> Result<Self, RenderError> {
-        Self::with(request, limits, |gpu| ResidentMap::whole(gpu, tiles))
+        Self::with(request, memory_budget, |gpu| ResidentMap::whole(gpu, tiles))
     }
 
     /// As [`new`](Self::new), but uploads the tiles of a source when rays may reach them, and drops those far away. The CPU
@@ -87,25 +89,22 @@ impl GpuRenderer {
     pub fn over<S: SceneSource + TriangleSource + 'static>(
         source: &Arc<S>,
         request: (Backend, RenderingMethod),
-        limits: RenderLimits,
+        memory_budget: MemoryBudget,
     ) -> Result<Self, RenderError> {
-        Self::with(request, limits, |gpu| {
-            let mut cpu = CpuRenderer::over(source.clone());
-            cpu.max_poses = limits.max_poses.unwrap_or(usize::MAX);
+        Self::with(request, memory_budget, |gpu| {
+            let cpu = CpuRenderer::over(source.clone());
             ResidentMap::over(gpu, source.clone(), cpu)
         })
     }
 
     fn with(
         (backend, method): (Backend, RenderingMethod),
-        limits: RenderLimits,
+        memory_budget: MemoryBudget,
         map: impl FnOnce(&Gpu) -> Result<ResidentMap, RenderError>,
     ) -> Result<Self, RenderError> {
         let mut gpu = Gpu::open(backend)?;
-        gpu.memory_budget = limits.memory_budget;
-        if let Some(max_poses) = limits.max_poses {
-            gpu.batch_sizes.poses = gpu.batch_sizes.poses.min(max_poses).max(1);
-        }
+        gpu.memory_budget = memory_budget;
+        gpu.batch_sizes.poses = gpu.batch_sizes.poses.min(POSES_AT_ONCE);
         let map = map(&gpu)?;
         let rasterizer = gpu.can_rasterize.then(|| Rasterizer::new(&gpu));
         gpu.check()?;

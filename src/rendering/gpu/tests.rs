@@ -37,7 +37,7 @@ fn renderer() -> Option<GpuRenderer> {
     match GpuRenderer::new(
         &[stairs()],
         (Backend::Gpu, RenderingMethod::Auto),
-        RenderLimits::default(),
+        MemoryBudget::default(),
     ) {
         Ok(renderer) => Some(renderer),
         Err(RenderError::NoAdapter) => {
@@ -316,8 +316,8 @@ fn tiles_come_and_go_with_the_poses_and_nothing_looks_different() {
     drop(renderer);
     let street = Arc::new(Street::new(20));
     let request = (Backend::Gpu, RenderingMethod::Auto);
-    let whole = GpuRenderer::new(&street.tiles, request, RenderLimits::default()).unwrap();
-    let mut part = GpuRenderer::over(&street, request, RenderLimits::default()).unwrap();
+    let whole = GpuRenderer::new(&street.tiles, request, MemoryBudget::default()).unwrap();
+    let mut part = GpuRenderer::over(&street, request, MemoryBudget::default()).unwrap();
     let tile_bytes = street.tiles[0].triangles.len() as u64 * resident::TRIANGLE_BYTES;
     part.map.set_budget(FEW_TILES * tile_bytes);
     let model = LidarModel {
