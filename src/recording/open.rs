@@ -208,10 +208,7 @@ impl Recording {
         if let (Some((bag, topic)), true) = (&self.bag, is_topic(path)) {
             return PoseTrack::read_topic(bag, path.to_str(), topic, self.body_from_lidar);
         }
-        match self.body_from_lidar {
-            Some(pose) => PoseTrack::read_of_body(path, pose),
-            None => PoseTrack::read(path, calib_file),
-        }
+        PoseTrack::read_mounted(path, calib_file, self.body_from_lidar)
     }
 
     /// The same recording with the poses that it contains, `map_from_lidar` in the frame of the first of them.

@@ -56,11 +56,16 @@ impl PoseTrack {
         Self::of(path, camera, calibration, times_s)
     }
 
-    /// Reads poses of a body on which the lidar is mounted, rows of KITTI or TUM.
-    ///
-    /// # Errors
-    /// The file cannot be read, or a row is no pose.
-    pub fn read_of_body(path: &Path, body_from_lidar: Pose3) -> Result<Self, RecordingError> {
+    /// Reads poses of a body on which the lidar is mounted, if its pose there is given, rows of KITTI or TUM; else as
+    /// [`read`](Self::read).
+    pub(crate) fn read_mounted(
+        path: &Path,
+        calib_file: Option<&Path>,
+        body_from_lidar: Option<Pose3>,
+    ) -> Result<Self, RecordingError> {
+        let Some(body_from_lidar) = body_from_lidar else {
+            return Self::read(path, calib_file);
+        };
         let (body, times_s) = read_rows_of_poses(path)?;
         let calibration = Calibration {
             cam0_from_lidar: body_from_lidar,

@@ -85,10 +85,12 @@ impl<'a> RecordingInputs<'a> {
 impl PoseInputConfig {
     /// Reads poses from a file or a folder `oxts`.
     pub fn track(&self, path: &Path) -> Result<PoseTrack> {
-        Ok(match self.body_from_lidar() {
-            Some(pose) => PoseTrack::read_of_body(path, pose)?,
-            None => PoseTrack::read(path, self.calib_file.as_deref())?,
-        })
+        let calibration = self.calib_file.as_deref();
+        Ok(PoseTrack::read_mounted(
+            path,
+            calibration,
+            self.body_from_lidar(),
+        )?)
     }
 }
 
