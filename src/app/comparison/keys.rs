@@ -23,6 +23,7 @@ use super::plan::PlannedRun;
 use crate::app::commands::stages::is_bag;
 use crate::app::run::artefact::hash::{hash_of_file, hash_of_scan, hash_of_texts};
 use crate::app::run::version;
+use crate::app::settings::{PoseInputConfig, RecordingConfig};
 use crate::recording::is_topic;
 use crate::recording::{Recording, Selection};
 use crate::simulation::SimulationConfig;
@@ -161,54 +162,20 @@ struct Stage<'a> {
 /// The stages of a run: map, localization, refinement.
 fn stages(run: &PlannedRun) -> Result<[Stage<'_>; 3]> {
     let (map, query, refinement) = (&run.build_map, &run.localization, &run.refinement);
-    let file = |recording: &Path, path| {
-        if is_bag(recording) && is_topic(path) {
-            Input::Topic(path)
-        } else {
-            Input::new(run, path, None)
-        }
-    };
-    let mut mapping = Stage {
+    let mapping = Stage {
         settings: settings(map)?,
-        inputs: vec![Input::new(
-            run,
-            &map.recording.scan_folder,
-            Some(map.recording.frames),
-        )],
+        inputs: Input::of_recording(run, &map.recording, &map.given_poses),
     };
-    let of_map = map
-        .given_poses
-        .pose_file
-        .iter()
-        .chain(&map.given_poses.calib_file);
-    mapping
-        .inputs
-        .extend(of_map.map(|path| file(&map.recording.scan_folder, path)));
     let mut localization = Stage {
         settings: settings(query)?,
-        inputs: vec![Input::new(
-            run,
-            &query.recording.scan_folder,
-            Some(query.recording.frames),
-        )],
+        inputs: Input::of_recording(run, &query.recording, &query.given_poses),
     };
-    let of_query = query
-        .given_poses
-        .pose_file
-        .iter()
-        .chain(&query.given_poses.calib_file);
-    localization
-        .inputs
-        .extend(of_query.map(|path| file(&query.recording.scan_folder, path)));
     let odometry = query.motion.odometry_file.iter();
-    localization
-        .inputs
-        .extend(odometry.map(|path| file(&query.recording.scan_folder, path)));
-    let odometry = (refinement.iter()).filter_map(|refined| {
-        Some(file(
-            &refined.recording.scan_folder,
-            refined.motion.odometry_file.as_ref()?,
-        ))
+    let odometry = odometry.map(|path| Input::of_file(run, &query.recording, path));
+    localization.inputs.extend(odometry);
+    let odometry = refinement.iter().filter_map(|refined| {
+        let path = refined.motion.odometry_file.as_ref()?;
+        Some(Input::of_file(run, &refined.recording, path))
     });
     let refinement = Stage {
         settings: settings(refinement)?,
@@ -230,6 +197,27 @@ enum Input<'a> {
 }
 
 impl<'a> Input<'a> {
+    /// The scans of a recording, and the files of its poses.
+    fn of_recording(
+        run: &'a PlannedRun,
+        recording: &'a RecordingConfig,
+        poses: &'a PoseInputConfig,
+    ) -> Vec<Self> {
+        let scans = Self::new(run, &recording.scan_folder, Some(recording.frames));
+        let files = poses.pose_file.iter().chain(&poses.calib_file);
+        let files = files.map(|path| Self::of_file(run, recording, path));
+        std::iter::once(scans).chain(files).collect()
+    }
+
+    /// A file that belongs to a recording, or a topic of it if it is a bag.
+    fn of_file(run: &'a PlannedRun, recording: &RecordingConfig, path: &'a Path) -> Self {
+        if is_bag(&recording.scan_folder) && is_topic(path) {
+            Self::Topic(path)
+        } else {
+            Self::new(run, path, None)
+        }
+    }
+
     fn new(run: &'a PlannedRun, path: &'a Path, selection: Option<Selection>) -> Self {
         let below = |drive: &SimulationConfig| path.strip_prefix(drive.drive_folder()).ok();
         let simulated = run
