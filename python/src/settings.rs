@@ -35,9 +35,10 @@ fn flatten(
             Ok(block) => flatten(&format!("{key}."), block, rows)?,
             Err(_not_a_block) => {
                 let json = py.import("json")?;
-                let value = match value.hasattr("__fspath__")? {
-                    true => value.call_method0("__fspath__")?,
-                    false => value,
+                let value = if value.hasattr("__fspath__")? {
+                    value.call_method0("__fspath__")?
+                } else {
+                    value
                 };
                 let text: String = json
                     .call_method("dumps", (value,), Some(&options))?

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::Configuration;
 use super::error::{self, ConfigError};
 use super::names::{Meaning, Names};
-use super::yaml::{self, FullText, keys, to_yaml};
+use super::yaml::{self, FullText, to_yaml};
 use crate::memory;
 
 /// Keys with values in YAML, applied in order.
@@ -53,9 +53,7 @@ pub fn has_key<T: Configuration>(name: &str) -> Result<bool, ConfigError> {
 
 /// The full names of all keys.
 fn names<T: Configuration>() -> Result<Names, ConfigError> {
-    let text = to_yaml(&T::default())?;
-    let names = keys(&text).into_iter().map(|key| key.name);
-    Ok(Names(names.filter(|name| !name.contains('[')).collect()))
+    Ok(yaml::names(&to_yaml(&T::default())?))
 }
 
 fn apply<T: Configuration>(
@@ -68,8 +66,7 @@ fn apply<T: Configuration>(
     for (key, value) in settings.pairs {
         let place = format!("{}{key}={value}", settings.before);
         let current = to_yaml(&config)?;
-        let names = keys(&current).into_iter().map(|key| key.name);
-        let names = Names(names.filter(|name| !name.contains('[')).collect());
+        let names = yaml::names(&current);
         let full = match names.meaning(key) {
             Meaning::Key(full) => full,
             Meaning::Nothing => continue,

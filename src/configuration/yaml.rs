@@ -81,6 +81,12 @@ pub(super) fn keys(text: &str) -> Vec<Key> {
     keys
 }
 
+/// The names of the keys of a text.
+pub(super) fn names(text: &str) -> Names {
+    let names = keys(text).into_iter().map(|key| key.name);
+    Names(names.filter(|name| !name.contains('[')).collect())
+}
+
 /// A value that may go on in the next lines.
 #[derive(Default)]
 struct Value {
@@ -150,9 +156,15 @@ impl FullText {
     /// Replaces the names of all keys by their full ones. A text without keys in block style stays as it is.
     pub(super) fn new(name: &str, text: &str, names: &Names) -> Result<Self, ConfigError> {
         let text = text.trim_start_matches('\u{feff}');
-        let end = |line: &&str| *line != "...";
-        let original: Vec<String> = text.lines().take_while(end).map(str::to_owned).collect();
-        let found = keys(text);
+        let mut rows = text.lines();
+        let is_content = |row: &&str| row.trim_end() != "...";
+        let original: Vec<String> = rows
+            .by_ref()
+            .take_while(is_content)
+            .map(str::to_owned)
+            .collect();
+        let has_second_document = rows.any(|row| !row.trim().is_empty());
+        let found = keys(&original.join("\n"));
         let first = found.first().map_or(original.len(), |key| key.line);
         let is_code =
             |line: &&String| !line.trim().is_empty() && !line.starts_with(['#', '-', '%']);
@@ -165,6 +177,7 @@ impl FullText {
         let has_tabs = |line: &String| line[..line.len() - line.trim_start().len()].contains('\t');
         let before = &full.original[..first];
         if found.is_empty()
+            || has_second_document
             || before.iter().any(|line| is_code(&line))
             || full.original.iter().any(has_tabs)
         {

@@ -136,7 +136,7 @@ impl TryFrom<String> for MotionCompensation {
                 start_deg,
             }),
             _ => Err(format!(
-                "`{text}` is not auto, clockwise or counter_clockwise, the latter optionally followed by `from` and the azimuth at which a revolution starts, -360 to 360 [deg]"
+                "`{text}` is not auto, or a rotation: clockwise or counter_clockwise, which may be followed by `from` and the azimuth at which a revolution starts, -360 to 360 [deg]"
             )),
         }
     }

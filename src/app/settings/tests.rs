@@ -404,6 +404,8 @@ fn any_style_of_yaml_is_read_or_refused_and_nothing_is_lost() {
     for text in [
         "base: &base {seed: 7}\n<<: *base\n",
         "seed: 7\n<<: {topic: foo}\n",
+        "...\nseed: 7\n",
+        "seed: 7\n...\ntopic: foo\n",
         "recording:\n\tscan_folder: /x\n",
     ] {
         assert!(scans(text).is_err(), "{text}");
