@@ -267,11 +267,11 @@ impl<'a> Drawing<'a> {
         let Some(&last) = moments.last() else {
             return Ok(());
         };
-        let rows = (1_u8..).zip(&moments);
-        let particles: Vec<ParticleRow> = rows
+        let steps = (moments.len() - 1).max(1) as f32;
+        let particles: Vec<ParticleRow> = (moments.iter().enumerate())
             .flat_map(|(moment, &row)| {
                 let particles = self.results.particles.frame(row).iter();
-                particles.map(move |&[x, y, heading, _]| [x, y, heading, moment.into()])
+                particles.map(move |&[x, y, heading, _]| [x, y, heading, moment as f32 / steps])
             })
             .collect();
         LocalizationPicture {
