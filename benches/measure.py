@@ -131,7 +131,13 @@ def kitti_07_drives(work):
     parent = work / "kitti_07"
     for drive in (1, 2):
         if not (parent / f"drive_{drive}").exists():
-            settings = [f"drive={drive}", f"output_folder={parent}", f"path_pose_file={poses}", f"path_calib_file={calib}"]
+            settings = [
+                f"drive={drive}",
+                f"output_folder={parent}",
+                f"path_pose_file={poses}",
+                f"path_calib_file={calib}",
+                "scanner.rolling_shutter=true",
+            ]
             chosen = [word for setting in settings for word in ("--set", setting)]
             fpmcl("simulate", "config/kitti_07/simulation.yml", *chosen)
     return work / "kitti_07/drive_1", work / "kitti_07/drive_2"
