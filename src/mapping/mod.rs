@@ -39,7 +39,7 @@ pub struct MappedRecording {
     pub trajectory: Option<Trajectory>,
 }
 
-/// Builds a map of a recording, whose poses, where it has any, are checked, and else found from the scans. Its frame is
+/// Builds a map of a recording. Its poses are checked; without any, they are found from the scans. The frame of the map is
 /// that of the lidar at the first pose.
 ///
 /// Scans are read when they are needed, more than once: memory is that of the scans of a local map, about 1.5 MB for each

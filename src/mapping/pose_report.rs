@@ -15,7 +15,7 @@ pub struct PoseReport {
     pub tilt: Option<Tilt>,
 }
 
-/// The direction up of the ground in the map.
+/// Normal of the ground in the map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tilt {
     /// Angle to the z axis [rad].
@@ -37,12 +37,12 @@ impl Tilt {
 }
 
 impl PoseReport {
-    /// Whether the poses fit the scans; motion that is not known contradicts none.
+    /// Whether the poses fit the scans; unknown motion counts as a fit.
     pub fn fit(&self) -> PoseFit {
         self.motion.as_ref().map_or(PoseFit::Fits, |it| it.fit)
     }
 
-    /// Another meaning of the poses with which they fit.
+    /// Another interpretation of the poses, with which they fit.
     pub fn better(&self) -> Option<PoseMeaning> {
         Some(self.motion.as_ref()?.better.as_ref()?.0)
     }
@@ -59,7 +59,7 @@ impl fmt::Display for PoseReport {
         };
         let [first, last] = self.frames;
         let Some(motion) = &self.motion else {
-            return formatter.write_str("the sensor stands, or its motion is uncertain");
+            return formatter.write_str("the sensor is stationary, or its motion is uncertain");
         };
         write!(
             formatter,

@@ -95,7 +95,7 @@ fn rectangle(cells: Vec<[i32; 3]>, reach_m: f32) -> [f32; 4] {
     const CONNECTED: i32 = 2;
     /// Cells at the edge of the reach are of something that continues.
     const EDGE_M: f32 = 3.0 * CELL_M;
-    /// The own car may stand out as far above the sensor [m].
+    /// Greatest height of the own car above the sensor [m].
     const ABOVE_M: f32 = 0.2;
     let mut rest: Vec<IVec3> = cells.into_iter().map(IVec3::from_array).collect();
     let (mut least, mut greatest) = (IVec2::MAX, IVec2::MIN);

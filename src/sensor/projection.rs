@@ -48,7 +48,7 @@ pub fn model(scans: &[Scan], beams: &Beams, columns: usize, own_car_m: [f32; 4])
     }
 }
 
-/// As many rows per angle, over all elevations: for beams whose elevations change along a revolution, because the
+/// Evenly spaced rows over all elevations, as many per angle: for beams whose elevations change along a revolution, because the
 /// points are in a frame that is inclined to the sensor's, or compensated for fast motion.
 fn evenly(scans: &[Scan], beams: LidarModel) -> LidarModel {
     let all = scans.iter().flat_map(|scan| &scan.points);

@@ -109,7 +109,7 @@ fn usable_normals(cloud: &ReadCloud, path: &Path) -> Option<Vec<Vec3>> {
         }
         bad => {
             tracing::warn!(
-                "{}: normals are estimated, because {bad} of {} that it contains are no unit vectors",
+                "{}: normals are estimated, because {bad} of {} in the file are not unit vectors",
                 path.display(),
                 normals.len()
             );

@@ -153,7 +153,7 @@ fn finish(
     if role == Role::Collect {
         parts.discard(number)?;
         bail!(
-            "local map {number} is damaged or of other scans, and was removed; list the jobs again with --list-jobs"
+            "local map {number} is damaged or was built from other scans, and was removed; list the jobs again with --list-jobs"
         )
     }
     build_part(plan, local_map, &opened.mapped, parts)
@@ -201,7 +201,7 @@ fn warn_of_doubtful_poses(built: &LocalMap, frames: &[Frame]) {
         .collect();
     if !numbers.is_empty() {
         tracing::warn!(
-            "the poses of these frames fit neither the scan before nor after, the map is worse there: {}",
+            "the poses of these frames fit neither the scan before nor after; the map is worse there: {}",
             numbers.join(", ")
         );
     }

@@ -170,7 +170,7 @@ pub fn check(recording: &Recording, config: &BuildMapConfig) -> Result<()> {
     }
     match report.tilt {
         Some(tilt) if tilt.is_uneven() => tracing::warn!(
-            "the direction up of the ground varies by {:.0} degrees along the drive: check the rotations in pose_file, calib_file and body_from_lidar",
+            "the normal of the ground varies by {:.0} degrees along the drive: check the rotations in pose_file, calib_file and body_from_lidar",
             tilt.spread_rad.to_degrees()
         ),
         Some(tilt) if tilt.is_steep() => tracing::warn!(

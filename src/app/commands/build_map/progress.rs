@@ -22,7 +22,7 @@ const JOINING: f64 = 0.03;
 /// Progress through the local maps, in scans, and wall time per stage.
 pub struct BuildProgress {
     task: Arc<Task>,
-    /// Scans of all local maps; one in two of them counts twice.
+    /// Scans of all local maps; a scan that is in two local maps counts twice.
     scans: usize,
     state: Mutex<State>,
 }
