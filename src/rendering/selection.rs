@@ -46,6 +46,13 @@ impl BackendChoice {
     pub fn renderer(
         &self,
         tiles: &[TriangleMesh],
+        #[cfg_attr(
+            not(feature = "gpu"),
+            expect(
+                unused_variables,
+                reason = "only a graphics device has memory of its own"
+            )
+        )]
         memory_budget: MemoryBudget,
     ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
         self.report();
@@ -68,6 +75,13 @@ impl BackendChoice {
     pub fn renderer_over<S: SceneSource + TriangleSource + 'static>(
         &self,
         source: &Arc<S>,
+        #[cfg_attr(
+            not(feature = "gpu"),
+            expect(
+                unused_variables,
+                reason = "only a graphics device has memory of its own"
+            )
+        )]
         memory_budget: MemoryBudget,
     ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
         self.report();
