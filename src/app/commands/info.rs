@@ -8,11 +8,11 @@ use clap::Args;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::stages::is_bag;
 use crate::app::report::results::Value;
 use crate::app::report::{LocalizationResults, RunSummary};
 use crate::app::run::Printed;
 use crate::app::run::arguments::setting;
+use crate::app::run::input::is_bag;
 use crate::app::settings;
 use crate::evaluation::RangeMclRules;
 use crate::geometry::Aabb;

@@ -36,7 +36,6 @@ impl MotionSource {
         let motion = match (config.odometry, &file) {
             (OdometrySource::None, _) => Self::Unknown,
             (OdometrySource::File | OdometrySource::Auto, Some(file)) => {
-                inputs.require_poses("odometry_file", file)?;
                 Self::of_track(&inputs.track(file, recording)?, recording)?
             }
             // A bag may have a topic of odometry.

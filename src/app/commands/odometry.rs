@@ -10,8 +10,7 @@ use super::stages::{RecordingInputs, complete};
 use super::trajectory;
 use crate::app::report::RunFiles;
 use crate::app::report::odometry::{self, OdometryReport};
-use crate::app::run::memory;
-use crate::app::run::{Claims, Context, Outputs, Printed, RunArgs, output};
+use crate::app::run::{Claims, Context, Outputs, Printed, RunArgs, input, memory, output};
 use crate::app::settings::OdometryCommandConfig;
 use crate::mapping::find_poses;
 use crate::recording::Recording;
@@ -40,7 +39,6 @@ pub struct OdometryArgs {
 
 /// Finds the poses of the recording that a configuration names; returns what to print.
 pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed> {
-    RecordingInputs::new(&config.recording, &config.given_poses).require()?;
     let folder = &config.output_folder;
     let mut claims = prepare(config, context)?;
     let mut resolved = config.clone();
@@ -92,6 +90,7 @@ fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> 
     ];
     names.extend(config.output.plots.then_some("path.png"));
     let mut inputs = RecordingInputs::new(&config.recording, &config.given_poses).files();
+    input::require(&inputs)?;
     inputs.extend(context.input());
     let outputs = Outputs {
         key: "output_folder",

@@ -79,11 +79,9 @@ const ODOMETRY_STREAM: u64 = u64::MAX;
 /// Refines the result that a configuration names, and adds the refined trajectory to it.
 pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     input::require_file("result_file", &config.result_file)?;
-    input::require_file("map_file", &config.map_input.map_file)?;
     let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
-    inputs.require()?;
     let files = RunFiles::new(&config.output());
-    let (mut claims, main) = prepare(config, context, &files)?;
+    let (mut claims, main) = prepare(config, inputs, context, &files)?;
     let is_trajectory = config.is_trajectory();
     let mut results = if is_trajectory {
         LocalizationResults::default()
@@ -159,6 +157,7 @@ pub fn base_config(result: Option<&Path>) -> RefinementConfig {
 /// configuration of a result, which exists already.
 fn prepare(
     config: &RefinementConfig,
+    inputs: RecordingInputs,
     context: &Context,
     files: &RunFiles,
 ) -> Result<(Claims, PathBuf)> {
@@ -176,12 +175,7 @@ fn prepare(
         "result_file is {}, which is not a regular file; refine replaces it: give the path of the file itself",
         config.result_file.display()
     );
-    let mut inputs = input_files(
-        RecordingInputs::new(&config.recording, &config.given_poses),
-        &config.map_input,
-        &config.motion,
-        context,
-    );
+    let mut inputs = input_files(inputs, &config.map_input, &config.motion, context)?;
     inputs.extend(is_trajectory.then_some(("result_file", config.result_file.as_path())));
     let outputs = Outputs {
         key,

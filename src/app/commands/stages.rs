@@ -4,8 +4,8 @@ use std::path::Path;
 
 use anyhow::{Context as _, Result};
 
-use crate::app::run::memory;
-use crate::app::run::{Context, input};
+use crate::app::run::input::is_bag;
+use crate::app::run::{Context, input, memory};
 use crate::app::settings::{MapInputConfig, MotionSourceConfig, PoseInputConfig, RecordingConfig};
 use crate::map::{Map, MapCache, MapOptions, MappingPath};
 use crate::recording::{PoseTrack, Recording, is_topic};
@@ -26,34 +26,16 @@ impl<'a> RecordingInputs<'a> {
         Self { recording, poses }
     }
 
-    /// Checks that the files exist, before any work is done.
-    pub fn require(&self) -> Result<()> {
-        if !is_bag(&self.recording.scan_folder) {
-            input::require_folder("scan_folder", &self.recording.scan_folder)?;
-        }
-        if let Some(path) = &self.poses.pose_file {
-            self.require_poses("pose_file", path)?;
-        }
-        input::require_optional_file("calib_file", self.poses.calib_file.as_deref())
-    }
-
-    /// Requires a file of poses, a folder `oxts`, or a topic if the recording is a bag.
-    pub fn require_poses(&self, key: &str, path: &Path) -> Result<()> {
-        if path.is_dir() || (is_bag(&self.recording.scan_folder) && is_topic(path)) {
-            return Ok(());
-        }
-        input::require_file(key, path)
-    }
-
-    /// The files and their keys.
+    /// The folder or bag and the files, which are not those that are topics of the bag, and their keys.
     pub fn files(&self) -> Vec<(&'static str, &'a Path)> {
-        let optional = [
-            ("pose_file", self.poses.pose_file.as_deref()),
-            ("calib_file", self.poses.calib_file.as_deref()),
-        ];
-        (optional.into_iter())
-            .filter_map(|(key, path)| Some((key, path?)))
-            .collect()
+        let folder = self.recording.scan_folder.as_path();
+        let mut files = vec![("scan_folder", folder)];
+        let poses = self.poses.pose_file.as_deref();
+        let poses = poses.filter(|path| !(is_topic(path) && is_bag(folder)));
+        files.extend(poses.map(|path| ("pose_file", path)));
+        let calibration = self.poses.calib_file.as_deref();
+        files.extend(calibration.map(|path| ("calib_file", path)));
+        files
     }
 
     /// Opens the selected frames of the recording.
@@ -107,30 +89,21 @@ pub fn complete(known: &mut SensorConfig, recording: Recording) -> Result<(Recor
     Ok((sensor.applied_to(recording), sensor))
 }
 
-/// All input files of a command that localizes, and their keys.
+/// All inputs of a command that localizes, which exist, and their keys.
 pub fn input_files<'a>(
     inputs: RecordingInputs<'a>,
     map: &'a MapInputConfig,
     motion: &'a MotionSourceConfig,
     context: &'a Context,
-) -> Vec<(&'static str, &'a Path)> {
+) -> Result<Vec<(&'static str, &'a Path)>> {
     let mut files = map.files();
     files.extend(inputs.files());
-    let odometry = motion.odometry_file.as_deref();
+    let is_file = |path: &&Path| !(is_topic(path) && is_bag(&inputs.recording.scan_folder));
+    let odometry = motion.odometry_file.as_deref().filter(is_file);
     files.extend(odometry.map(|path| ("odometry_file", path)));
+    input::require(&files)?;
     files.extend(context.input());
-    files
-}
-
-/// Whether a path is that of a bag.
-pub fn is_bag(path: &Path) -> bool {
-    #[cfg(feature = "bags")]
-    return crate::recording::bags::is_bag(path);
-    #[cfg(not(feature = "bags"))]
-    return {
-        let _ = path;
-        false
-    };
+    Ok(files)
 }
 
 impl MapInputConfig {
@@ -177,10 +150,7 @@ impl MapInputConfig {
         let Some(poses) = &self.map_pose_file else {
             return Ok(None);
         };
-        input::require_file("map_pose_file", poses)?;
-        let calibration = self.map_calib_file.as_deref();
-        input::require_optional_file("map_calib_file", calibration)?;
-        let track = PoseTrack::read(poses, calibration)?;
+        let track = PoseTrack::read(poses, self.map_calib_file.as_deref())?;
         Ok(Some(MappingPath {
             world_from_map: track.world_from_map,
             map_from_lidar: track.map_from_lidar,

@@ -20,8 +20,8 @@ use serde::Serialize;
 use serde_json::Value;
 
 use super::plan::PlannedRun;
-use crate::app::commands::stages::is_bag;
 use crate::app::run::artefact::hash::{hash_of_file, hash_of_scan, hash_of_texts};
+use crate::app::run::input::is_bag;
 use crate::app::run::version;
 use crate::app::settings::{PoseInputConfig, RecordingConfig};
 use crate::recording::is_topic;

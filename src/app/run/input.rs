@@ -4,6 +4,30 @@ use std::path::Path;
 
 use anyhow::{Result, ensure};
 
+/// Requires the inputs of a command, each with its configuration key: files, the folder or bag of a recording, and poses,
+/// which may be a folder `oxts`.
+pub fn require(inputs: &[(&str, &Path)]) -> Result<()> {
+    for &(key, path) in inputs {
+        match key {
+            "scan_folder" if !is_bag(path) => require_folder(key, path)?,
+            "pose_file" | "odometry_file" if path.is_dir() => {}
+            _ => require_file(key, path)?,
+        }
+    }
+    Ok(())
+}
+
+/// Whether a path is that of a bag.
+pub fn is_bag(path: &Path) -> bool {
+    #[cfg(feature = "bags")]
+    return crate::recording::bags::is_bag(path);
+    #[cfg(not(feature = "bags"))]
+    return {
+        let _ = path;
+        false
+    };
+}
+
 /// Requires a file at `path`, the value of the configuration key `key`.
 pub fn require_file(key: &str, path: &Path) -> Result<()> {
     ensure!(
@@ -17,11 +41,6 @@ pub fn require_file(key: &str, path: &Path) -> Result<()> {
         path.display()
     );
     Ok(())
-}
-
-/// Requires a file at `path`, if there is one; `key` is the configuration key.
-pub fn require_optional_file(key: &str, path: Option<&Path>) -> Result<()> {
-    path.map_or(Ok(()), |path| require_file(key, path))
 }
 
 /// Requires a folder at `path`, the value of the configuration key `key`.

@@ -10,7 +10,7 @@ use super::files::{self, prepare, write_map};
 use super::progress::BuildProgress;
 use crate::app::report::map::{BuildReport, draw_map};
 use crate::app::run::memory;
-use crate::app::run::{Context, Progress, input};
+use crate::app::run::{Context, Progress};
 use crate::app::settings::BuildMapConfig;
 use crate::evaluation::map_quality::ResidualSums;
 use crate::geometry::Vec3;
@@ -21,7 +21,6 @@ use crate::recording::scan_files::{self, ReadCloud};
 /// Meshes the cloud of a configuration.
 pub fn run(config: &BuildMapConfig, cloud_file: &Path, context: &Context) -> Result<BuildReport> {
     let started = Instant::now();
-    input::require_file("cloud_file", cloud_file)?;
     ensure!(
         scan_files::is_scan(cloud_file),
         "cloud_file is {}, which is not a point cloud; its name must end in .pcd, .ply, .npy or .bin",

@@ -4,7 +4,7 @@ use anyhow::Result;
 
 use crate::app::commands::stages::RecordingInputs;
 use crate::app::report::map::BuildReport;
-use crate::app::run::{Claims, Context, Outputs, PLY, output};
+use crate::app::run::{Claims, Context, Outputs, PLY, input, output};
 use crate::app::settings::BuildMapConfig;
 use crate::map::MappingPath;
 use crate::map::files::ply;
@@ -22,13 +22,17 @@ pub fn prepare(config: &BuildMapConfig, context: &Context) -> Result<Claims> {
         path.file_name()
             .map(|name| name.to_string_lossy().into_owned())
     };
-    let mut inputs = RecordingInputs::new(&config.recording, &config.given_poses).files();
+    let mut inputs = Vec::new();
+    if config.cloud_file.is_none() {
+        inputs.extend(RecordingInputs::new(&config.recording, &config.given_poses).files());
+    }
     let optional = [
         ("cloud_file", &config.cloud_file),
         ("truth_mesh", &config.truth_mesh),
         ("onto", &config.onto),
     ];
     inputs.extend((optional.iter()).filter_map(|(key, path)| Some((*key, path.as_deref()?))));
+    input::require(&inputs)?;
     inputs.extend(context.input());
     let outputs = Outputs {
         key: "mesh_file",

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use anyhow::Result;
 
+use crate::app::run::Context;
 use crate::app::run::artefact::hash::hash_of_file;
-use crate::app::run::{Context, input};
 use crate::app::settings::{BuildMapConfig, MapInputConfig};
 use crate::map::mesh_view::MeshView;
 use crate::map::{Map, MapOptions, MappingPath, surface_of};
@@ -28,7 +28,6 @@ pub fn open(config: &BuildMapConfig, context: &Context) -> Result<Option<(OlderM
     let Some(file) = &config.onto else {
         return Ok(None);
     };
-    input::require_file("onto", file)?;
     let input = MapInputConfig {
         map_file: file.clone(),
         ..MapInputConfig::default()

@@ -9,9 +9,9 @@ use super::files::prepare;
 use super::older::{self, OlderMap};
 use super::parts::{Parts, Role};
 use super::poses;
-use crate::app::commands::stages::{RecordingInputs, complete};
+use crate::app::commands::stages::complete;
 use crate::app::commands::trajectory::{self, poses_next_to};
-use crate::app::run::{Claims, Context, input, version};
+use crate::app::run::{Claims, Context, version};
 use crate::app::settings::{self, BuildMapConfig, OutputConfig};
 use crate::map::build::plan::{self, LocalMapPlan};
 use crate::map::{MapBuilder, MapPlan, PoseSource};
@@ -49,11 +49,6 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
     let mut claims = prepare(config, context)?;
     let parts = Parts::lock(&config.mesh_file, role)?;
     let mut config = config.clone();
-    let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
-    inputs.require()?;
-    if let Some(path) = &config.truth_mesh {
-        input::require_file("truth_mesh", path)?;
-    }
     let (older, older_map) = older::open(&config, context)?.unzip();
     let recording = poses::open(&config, older.as_ref())?;
     let (mut sequence, sensor) = complete(&mut config.map.sensor, recording)?;

@@ -198,11 +198,14 @@ fn output_files(config: &EvaluationConfig) -> Result<RunFiles> {
 /// Reads the result, in metres.
 fn read(config: &EvaluationConfig) -> Result<LocalizationResults> {
     let path = &config.result_file;
-    input::require_optional_file("result_calib_file", config.result_calib_file.as_deref())?;
+    let calibration = config.result_calib_file.as_deref();
+    if let Some(path) = calibration {
+        input::require_file("result_calib_file", path)?;
+    }
     let mut results = if is_archive(path)? {
         LocalizationResults::read(path)?
     } else {
-        trajectory::read(path, config.result_calib_file.as_deref())?
+        trajectory::read(path, calibration)?
     };
     scale(&mut results, config.grid_resolution);
     Ok(results)

@@ -35,11 +35,13 @@ pub fn read_track(
         ..RecordingConfig::default()
     };
     let inputs = RecordingInputs::new(&recording, &config.given_poses);
-    input::require_optional_file("calib_file", config.given_poses.calib_file.as_deref())?;
+    let mut files = inputs.files();
+    // Without poses of its own, the recording is not read.
+    files.retain(|&(key, _)| key != "scan_folder");
+    input::require(&files)?;
     let recording = || inputs.open();
     match &config.given_poses.pose_file {
         Some(path) => {
-            inputs.require_poses("pose_file", path)?;
             if is_topic(path) {
                 return inputs.track(path, &recording()?).map(Some);
             }

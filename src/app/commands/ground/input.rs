@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail, ensure};
 use clap::Args;
 
-use crate::app::commands::stages::is_bag;
 use crate::app::run::MachineArgs;
 use crate::app::run::arguments::{is_config, setting};
+use crate::app::run::input::is_bag;
 use crate::app::run::input::require_folder;
 use crate::app::settings::{self, GroundCommandConfig};
 use crate::evaluation::LabelledPoints;

@@ -6,7 +6,7 @@ use super::super::motion_source::MotionSource;
 use super::super::stages::{RecordingInputs, input_files};
 use crate::app::report::RunFiles;
 use crate::app::report::run_output::{self, LOCALIZATION_FILES, REFINEMENT_FILES, REPORT_FILES};
-use crate::app::run::{Claims, Context, NPZ, Outputs, input};
+use crate::app::run::{Claims, Context, NPZ, Outputs};
 use crate::app::settings::LocalizationConfig;
 use crate::map::Map;
 use crate::random::stream;
@@ -35,12 +35,10 @@ pub fn open(
     config: &LocalizationConfig,
     context: &Context,
 ) -> Result<(Opened, MotionSource, Claims)> {
-    input::require_file("map_file", &config.map_input.map_file)?;
     let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
-    inputs.require()?;
     let files = RunFiles::new(&config.result_path);
     context.interrupt.keeps("no frame was finished");
-    let claims = prepare(config, context, &files)?;
+    let claims = prepare(config, inputs, context, &files)?;
     let map = config.map_input.load(config.map_options(), context)?;
     let mut resolved = config.clone();
     let (recording, sensor) = inputs.open_in_map(&map, &mut resolved.tracker.sensor)?;
@@ -59,7 +57,13 @@ pub fn open(
 }
 
 /// Prepares the configured outputs.
-fn prepare(config: &LocalizationConfig, context: &Context, files: &RunFiles) -> Result<Claims> {
+fn prepare(
+    config: &LocalizationConfig,
+    inputs: RecordingInputs,
+    context: &Context,
+    files: &RunFiles,
+) -> Result<Claims> {
+    let inputs = input_files(inputs, &config.map_input, &config.motion, context)?;
     let mut names = Vec::new();
     if config.save_result {
         names.extend(REPORT_FILES.iter().chain(&LOCALIZATION_FILES));
@@ -78,12 +82,7 @@ fn prepare(config: &LocalizationConfig, context: &Context, files: &RunFiles) -> 
         main: &config.result_path,
         magic: Some(NPZ),
         names: names.into_iter().map(str::to_owned).collect(),
-        inputs: input_files(
-            RecordingInputs::new(&config.recording, &config.given_poses),
-            &config.map_input,
-            &config.motion,
-            context,
-        ),
+        inputs,
         force: config.output.force,
     };
     run_output::prepare(files, &outputs)
