@@ -7,8 +7,9 @@
 use foldhash::HashSet;
 use glam::{DVec3, IVec3};
 
+use super::config::LoopConfig;
 use super::drive::{Drive, POINT_BYTES, SHORTER, Submap};
-use super::loops::{Loop, LoopVerdict, MIN_COMMON, common_share};
+use super::loops::{Drift, Loop, LoopVerdict, common_share};
 use super::odometer::OdometryEstimate;
 use super::path_graph::{SUBMAP_LENGTH, move_along, odometry_edges};
 use super::pose_graph::{Edge, information, optimize};
@@ -49,6 +50,7 @@ pub fn place(
     map_from_lidar: &[Option<Pose3>],
     odometry: &[OdometryEstimate],
     loops: &[Loop],
+    config: &LoopConfig,
     budget: MemoryBudget,
 ) -> Result<Placed, PlacementError> {
     /// Distance between points on the surfaces, in voxels.
@@ -57,7 +59,7 @@ pub fn place(
     let found: Vec<(usize, Pose3)> = (rows.enumerate())
         .filter_map(|(row, pose)| Some((row, (*pose)?)))
         .collect();
-    let map_from_odom = common_transform(drive, &found).ok_or(NotInMap)?;
+    let map_from_odom = common_transform(drive, &found, config.drift_share).ok_or(NotInMap)?;
     for pose in &mut drive.poses {
         *pose = map_from_odom * *pose;
     }
@@ -69,7 +71,8 @@ pub fn place(
         .into_iter()
         .filter(|edge| {
             let points = drive.submap_points(&maps[edge.second - 1], 2.0 * drive.voxel_m);
-            common_share(&voxels, &points, &edge.first_from_second, drive) > MIN_COMMON
+            common_share(&voxels, &points, &edge.first_from_second, drive, config)
+                > config.min_common_share
         })
         .collect();
     if in_map.is_empty() {
@@ -96,19 +99,20 @@ pub fn place(
 }
 
 /// The transform from the frame of the odometry that agrees with the most scans.
-fn common_transform(drive: &Drive, found: &[(usize, Pose3)]) -> Option<Pose3> {
+fn common_transform(drive: &Drive, found: &[(usize, Pose3)], drift_share: f64) -> Option<Pose3> {
     /// Number of transforms that are compared.
     const CANDIDATES: usize = 200;
-    /// Difference of the positions of a scan that agrees: share of the path, and at least in voxels.
-    const DRIFT: f64 = 0.02;
-    const NEAR: f64 = 1.0;
+    let drift = Drift {
+        share: drift_share,
+        least_m: drive.voxel_m,
+    };
     let travelled_m = drive.travelled_m();
     let agreeing = |&(row, map_from_odom): &(usize, Pose3)| {
         let agrees = |(other, pose): &&(usize, Pose3)| {
             let moved = map_from_odom * drive.poses[*other];
             let path_m = (travelled_m[*other] - travelled_m[row]).abs();
             let distance_m = (moved.translation.vector - pose.translation.vector).norm();
-            distance_m < NEAR * drive.voxel_m + DRIFT * path_m
+            distance_m < drift.after_m(path_m)
         };
         found.iter().filter(agrees).count()
     };

@@ -1,4 +1,4 @@
-//! Settings of the odometry.
+//! Settings of the odometry and of its loops.
 
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
@@ -84,5 +84,90 @@ impl Validate for OdometryConfig {
         in_range("max_cost_increase", self.max_cost_increase, 0.0..=1.0)?;
         at_least_one("restart_after", self.restart_after)?;
         positive("period_s", self.period_s)
+    }
+}
+
+/// Which loops count. Lengths are shares of the sensor's range.
+///
+/// Defaults: our own values.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
+#[serde(default, deny_unknown_fields)]
+pub struct LoopConfig {
+    /// Least path between two visits of a place, as a share of the range (unitless): the local map of the odometry
+    /// reaches so far.
+    #[default(1.5)]
+    pub min_path_share: f64,
+    /// Largest distance between two visits in addition to the drift, as a share of the range (unitless).
+    #[default(0.3)]
+    pub max_distance_share: f64,
+    /// Drift of the odometry, as a share of the path (unitless).
+    #[default(0.02)]
+    pub drift_share: f64,
+    /// Drift that remains after loops are closed for the first time, as a share of the path (unitless).
+    #[default(0.005)]
+    pub remaining_drift_share: f64,
+    /// Radius of the surroundings by whose appearance places are recognized, as a share of the range (unitless).
+    #[default(0.6)]
+    pub context_radius_share: f64,
+    /// Least similarity of the appearance of a candidate, 0 to 1: one minus the distance of Scan Context (Kim and Kim,
+    /// IROS 2018, eq. 6).
+    #[default(0.5)]
+    pub min_similarity: f64,
+    /// Largest number of candidates by appearance for each submap.
+    #[default(2)]
+    pub similar_candidates: usize,
+    /// Radius around a candidate in which the pose is searched, as a share of the range (unitless).
+    #[default(0.2)]
+    pub search_radius_share: f64,
+    /// Radius in which the surfaces of two visits are compared, as a share of the range (unitless).
+    #[default(0.4)]
+    pub compared_radius_share: f64,
+    /// Largest distance of a point from a surface of the other visit that it shares, in voxels of the odometry.
+    #[default(0.25)]
+    pub surface_tolerance: f64,
+    /// Least share of common surfaces of two visits, without the ground (unitless).
+    #[default(0.4)]
+    pub min_common_share: f64,
+    /// Longest path between a loop and one that confirms it, in the mean of both visits, as a share of the range
+    /// (unitless).
+    #[default(3.0)]
+    pub max_confirmation_share: f64,
+    /// Least weight of an accepted loop in the pose graph, 0 to 1: others contradict the odometry and the other loops.
+    #[default(0.1)]
+    pub min_weight: f64,
+}
+
+impl Validate for LoopConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        in_range("min_path_share", self.min_path_share, 0.0..=1000.0)?;
+        in_range("max_distance_share", self.max_distance_share, 0.0..=10.0)?;
+        in_range("drift_share", self.drift_share, 0.0..=1.0)?;
+        in_range(
+            "remaining_drift_share",
+            self.remaining_drift_share,
+            0.0..=1.0,
+        )?;
+        in_range(
+            "context_radius_share",
+            self.context_radius_share,
+            0.01..=10.0,
+        )?;
+        in_range("min_similarity", self.min_similarity, 0.0..=1.0)?;
+        in_range("similar_candidates", self.similar_candidates, 0..=1000)?;
+        in_range("search_radius_share", self.search_radius_share, 0.001..=2.0)?;
+        in_range(
+            "compared_radius_share",
+            self.compared_radius_share,
+            0.01..=10.0,
+        )?;
+        in_range("surface_tolerance", self.surface_tolerance, 0.001..=10.0)?;
+        in_range("min_common_share", self.min_common_share, 0.0..=1.0)?;
+        in_range(
+            "max_confirmation_share",
+            self.max_confirmation_share,
+            0.0..=1000.0,
+        )?;
+        in_range("min_weight", self.min_weight, 0.0..=1.0)
     }
 }

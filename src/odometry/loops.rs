@@ -9,6 +9,7 @@ use nalgebra::{Matrix6, UnitQuaternion, Vector3, Vector6};
 use rayon::prelude::*;
 
 use super::alignment::Problem;
+use super::config::LoopConfig;
 use super::drive::{Drive, Submap};
 use super::pose_graph::Edge;
 use super::residuals::Observation;
@@ -76,15 +77,14 @@ impl Drift {
 }
 
 /// Finds loops between submaps.
-pub fn find(drive: &Drive, maps: &[Submap], drift: Drift) -> Vec<FoundLoop> {
-    /// Radius of the described surroundings, in ranges of the sensor.
-    const CONTEXT_RADIUS: f64 = 0.6;
+pub fn find(drive: &Drive, maps: &[Submap], drift: Drift, config: &LoopConfig) -> Vec<FoundLoop> {
+    let context_radius_m = config.context_radius_share * drive.range_m;
     let spacing_m = 2.0 * drive.voxel_m;
     let points: Vec<Vec<TimedPoint>> = (maps.par_iter())
         .map(|map| drive.submap_points(map, spacing_m))
         .collect();
     let contexts: Vec<ScanContext> = (points.par_iter())
-        .map(|points| ScanContext::new(points, CONTEXT_RADIUS * drive.range_m))
+        .map(|points| ScanContext::new(points, context_radius_m))
         .collect();
     let search = LoopSearch {
         drive,
@@ -92,6 +92,7 @@ pub fn find(drive: &Drive, maps: &[Submap], drift: Drift) -> Vec<FoundLoop> {
         points: &points,
         contexts: &contexts,
         drift,
+        config,
     };
     (0..maps.len())
         .into_par_iter()
@@ -105,6 +106,7 @@ struct LoopSearch<'a> {
     points: &'a [Vec<TimedPoint>],
     contexts: &'a [ScanContext],
     drift: Drift,
+    config: &'a LoopConfig,
 }
 
 impl LoopSearch<'_> {
@@ -112,26 +114,22 @@ impl LoopSearch<'_> {
     fn loop_to(&self, second: usize) -> Option<FoundLoop> {
         (self.candidates(second).into_iter())
             .filter_map(|(first, guess)| self.register(first, second, &guess))
-            .find(|found| found.common_share > MIN_COMMON)
+            .find(|found| found.common_share > self.config.min_common_share)
     }
 
     /// Earlier submaps and the pose of the later one in them: the nearest, then those that look most similar.
     fn candidates(&self, second: usize) -> Vec<(usize, Pose3)> {
-        /// Least path between the visits, in ranges: the local map of the odometry reaches so far.
-        const MIN_PATH: f64 = 1.5;
-        /// Distance of visits that share enough, in ranges.
-        const NEAR: f64 = 0.3;
-        const SIMILAR: usize = 2;
-        const MIN_SIMILARITY: f64 = 0.5;
-        let (drive, maps) = (self.drive, self.maps);
+        let (drive, maps, config) = (self.drive, self.maps, self.config);
         let poses = |map: usize| &drive.poses[maps[map].center];
         let path_m = |first: usize| maps[second].travelled_m - maps[first].travelled_m;
-        let earlier = (0..second).filter(|&first| path_m(first) > MIN_PATH * drive.range_m);
+        let earlier =
+            (0..second).filter(|&first| path_m(first) > config.min_path_share * drive.range_m);
         let by_poses = |first: usize| poses(first).inverse() * poses(second);
         let reachable: Vec<(usize, f64)> = earlier
             .map(|first| (first, by_poses(first).translation.vector.norm()))
             .filter(|&(first, distance_m)| {
-                distance_m < NEAR * drive.range_m + self.drift.after_m(path_m(first))
+                distance_m
+                    < config.max_distance_share * drive.range_m + self.drift.after_m(path_m(first))
             })
             .collect();
         let nearest = (reachable.iter().min_by(|a, b| a.1.total_cmp(&b.1)))
@@ -141,15 +139,15 @@ impl LoopSearch<'_> {
                 let (similarity, heading) = self.contexts[first].similarity(&self.contexts[second]);
                 (similarity, first, heading)
             })
-            .filter(|candidate| candidate.0 > MIN_SIMILARITY)
+            .filter(|candidate| candidate.0 > config.min_similarity)
             .collect();
         similar.sort_by(|a, b| b.0.total_cmp(&a.0));
         let turned = |heading: f64| {
             let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), heading);
             Pose3::from_parts(nalgebra::Translation3::identity(), turn)
         };
-        let similar =
-            (similar.into_iter().take(SIMILAR)).map(|(_, first, heading)| (first, turned(heading)));
+        let similar = (similar.into_iter().take(config.similar_candidates))
+            .map(|(_, first, heading)| (first, turned(heading)));
         nearest.into_iter().chain(similar).collect()
     }
 
@@ -157,15 +155,16 @@ impl LoopSearch<'_> {
     fn register(&self, first: usize, second: usize, guess: &Pose3) -> Option<FoundLoop> {
         /// Submaps on each side of the earlier one.
         const AROUND: usize = 2;
-        /// Reach of the search, in ranges, and its step in voxels.
-        const REACH: f64 = 0.2;
+        /// Step of the search, in voxels.
         const STEP: f64 = 4.0;
+        /// Standard deviation of the guessed turn.
         const TURN_RAD: f64 = 0.3;
+        const ITERATIONS: usize = 30;
         let (drive, maps) = (self.drive, self.maps);
         let around = first.saturating_sub(AROUND)..=(first + AROUND).min(second - 1);
         let surfaces = drive.surfaces(maps[first].center, maps[around].iter());
         let min_kernel_m = 0.1 * drive.voxel_m;
-        let reach_m = REACH * drive.range_m;
+        let reach_m = self.config.search_radius_share * drive.range_m;
         let (shift, turn) = (reach_m * reach_m, TURN_RAD * TURN_RAD);
         let problem = Problem {
             observation: Observation {
@@ -179,7 +178,7 @@ impl LoopSearch<'_> {
             predicted: *guess,
             prior: Vector6::new(shift, shift, shift, turn, turn, turn),
             min_kernel_m,
-            iterations: 30,
+            iterations: ITERATIONS,
         };
         let found = search(&problem, STEP * drive.voxel_m, reach_m)?;
         if !found.degenerate_directions.is_empty() {
@@ -190,13 +189,16 @@ impl LoopSearch<'_> {
             maps: [first, second],
             first_from_second,
             covariance: found.covariance,
-            common_share: common_share(&surfaces, &self.points[second], &first_from_second, drive),
+            common_share: common_share(
+                &surfaces,
+                &self.points[second],
+                &first_from_second,
+                drive,
+                self.config,
+            ),
         })
     }
 }
-
-/// Least share of common surfaces of two visits.
-pub const MIN_COMMON: f64 = 0.4;
 
 /// Share of the points near the sensor that lie on the surfaces of another visit, without those on the ground.
 pub fn common_share(
@@ -204,14 +206,11 @@ pub fn common_share(
     points: &[TimedPoint],
     first_from_second: &Pose3,
     drive: &Drive,
+    config: &LoopConfig,
 ) -> f64 {
-    /// Radius in which points are compared, in ranges.
-    const RADIUS: f64 = 0.4;
-    /// Largest distance from a surface, in voxels.
-    const ON_SURFACE: f64 = 0.25;
     /// Vertical component of the normal of the ground, at least.
     const LEVEL: f64 = 0.8;
-    let radius_m = (RADIUS * drive.range_m) as f32;
+    let radius_m = (config.compared_radius_share * drive.range_m) as f32;
     let (mut common, mut compared) = (0_usize, 0_usize);
     for point in points
         .iter()
@@ -233,7 +232,7 @@ pub fn common_share(
             }
         });
         let (distance_m, is_level) = distance_m.unwrap_or((f64::INFINITY, false));
-        let is_common = distance_m < ON_SURFACE * drive.voxel_m;
+        let is_common = distance_m < config.surface_tolerance * drive.voxel_m;
         if !is_level {
             compared += 1;
             common += usize::from(is_common);
@@ -244,9 +243,13 @@ pub fn common_share(
 
 /// Which loops another one confirms: its submaps are not the same nor next to them, and the ways from one loop to the other over the
 /// first visit and over the second end at the same place.
-pub fn confirmed(drive: &Drive, maps: &[Submap], loops: &[FoundLoop], drift: Drift) -> Vec<bool> {
-    /// Longest path from one loop to the other, in ranges.
-    const NEAR: f64 = 3.0;
+pub fn confirmed(
+    drive: &Drive,
+    maps: &[Submap],
+    loops: &[FoundLoop],
+    drift: Drift,
+    config: &LoopConfig,
+) -> Vec<bool> {
     /// Angle per distance of the drift [rad/m], of points at the range.
     const LEVER: f64 = 0.5;
     let pose = |map: usize| &drive.poses[maps[map].center];
@@ -255,7 +258,7 @@ pub fn confirmed(drive: &Drive, maps: &[Submap], loops: &[FoundLoop], drift: Dri
         let ([a, b], [c, d]) = (one.maps, other.maps);
         let ways_m = path_m(a, c) + path_m(b, d);
         let is_independent = b.abs_diff(d) >= 2 || a.abs_diff(c) >= 2 && b != d;
-        if !is_independent || ways_m > 2.0 * NEAR * drive.range_m {
+        if !is_independent || ways_m > 2.0 * config.max_confirmation_share * drive.range_m {
             return false;
         }
         let over_first = pose(a).inverse() * pose(c) * other.first_from_second;

@@ -50,7 +50,7 @@ mod voxel_map;
 
 pub use adjustment::{Adjusted, AdjustmentConfig};
 pub use anchors::{NotInMap, PlacementError};
-pub use config::OdometryConfig;
+pub use config::{LoopConfig, OdometryConfig};
 pub use elevation_bias::ElevationBias;
 pub use loops::{Loop, LoopVerdict};
 pub use odometer::{Odometer, OdometryError, OdometryEstimate, StepState};

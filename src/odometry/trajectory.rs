@@ -6,7 +6,7 @@ use smart_default::SmartDefault;
 use super::adjustment::{Adjusted, AdjustmentConfig, Held, adjust};
 use super::alignment::median;
 use super::anchors::{self, NotInMap, Placed, PlacementError};
-use super::config::OdometryConfig;
+use super::config::{LoopConfig, OdometryConfig};
 use super::drive::{Drive, POINT_BYTES, SHORTER, Submap};
 use super::loops::{self, Drift, FoundLoop, Loop, LoopVerdict};
 use super::odometer::{Odometer, OdometryError, OdometryEstimate, StepState};
@@ -33,6 +33,8 @@ pub struct TrajectoryConfig {
     /// Close loops.
     #[default(true)]
     pub loops: bool,
+    /// Which loops count.
+    pub loop_closure: LoopConfig,
     /// Adjust all poses to common surfaces.
     #[default(true)]
     pub adjust: bool,
@@ -44,6 +46,7 @@ impl Validate for TrajectoryConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         in_range("sample_spacing", self.sample_spacing, 0.1..=20.0)?;
         nested("odometry", &self.odometry)?;
+        nested("loop_closure", &self.loop_closure)?;
         nested("adjustment", &self.adjustment)
     }
 }
@@ -173,7 +176,7 @@ impl TrajectoryBuilder {
             return Ok(trajectory);
         };
         if config.loops && !is_given {
-            trajectory.loops = close_loops(&mut drive, &trajectory.odometry);
+            trajectory.loops = close_loops(&mut drive, &trajectory.odometry, &config.loop_closure);
         }
         if config.adjust {
             let held = if is_given {
@@ -198,13 +201,21 @@ impl TrajectoryBuilder {
         let (config, mut trajectory, drive) = self.into_drive();
         let mut drive = drive.ok_or(NotInMap)?;
         if config.loops {
-            trajectory.loops = close_loops(&mut drive, &trajectory.odometry);
+            trajectory.loops = close_loops(&mut drive, &trajectory.odometry, &config.loop_closure);
         }
         let (odometry, loops) = (&trajectory.odometry, &trajectory.loops);
         let Placed {
             map_from_odom,
             surfaces,
-        } = anchors::place(&mut drive, mesh, map_from_lidar, odometry, loops, budget)?;
+        } = anchors::place(
+            &mut drive,
+            mesh,
+            map_from_lidar,
+            odometry,
+            loops,
+            &config.loop_closure,
+            budget,
+        )?;
         for estimate in &mut trajectory.odometry {
             estimate.odom_from_lidar = map_from_odom * estimate.odom_from_lidar;
         }
@@ -252,25 +263,23 @@ fn times_s(estimates: &[OdometryEstimate]) -> Vec<f64> {
 }
 
 /// Closes loops, twice: with better poses more are found.
-fn close_loops(drive: &mut Drive, odometry: &[OdometryEstimate]) -> Vec<Loop> {
-    /// Drift of the odometry, as a share of the path, and what is left of it after the first round.
-    const DRIFT: [f64; 2] = [0.02, 0.005];
+fn close_loops(drive: &mut Drive, odometry: &[OdometryEstimate], config: &LoopConfig) -> Vec<Loop> {
     let maps = drive.submaps(SUBMAP_LENGTH * drive.range_m);
     let along_path = odometry_edges(drive, &maps, odometry);
     let odometry = drive.poses.clone();
     let mut result = vec![];
-    for share in DRIFT {
+    for share in [config.drift_share, config.remaining_drift_share] {
         let drift = Drift {
             share,
             least_m: drive.voxel_m,
         };
-        let found = loops::find(drive, &maps, drift);
+        let found = loops::find(drive, &maps, drift, config);
         let drift = Drift {
-            share: DRIFT[0],
+            share: config.drift_share,
             ..drift
         };
         drive.poses.clone_from(&odometry);
-        result = close(drive, &maps, &along_path, &found, drift);
+        result = close(drive, &maps, &along_path, &found, drift, config);
         if !result
             .iter()
             .any(|found| found.verdict == LoopVerdict::Accepted)
@@ -288,10 +297,9 @@ fn close(
     along_path: &[Edge],
     found: &[FoundLoop],
     drift: Drift,
+    config: &LoopConfig,
 ) -> Vec<Loop> {
-    /// Least weight of a loop in the pose graph.
-    const MIN_WEIGHT: f64 = 0.1;
-    let confirmed = loops::confirmed(drive, maps, found, drift);
+    let confirmed = loops::confirmed(drive, maps, found, drift, config);
     let used: Vec<Option<Edge>> = (found.iter().zip(&confirmed))
         .map(|(found, &is_confirmed)| found.edge(drive.voxel_m).filter(|_| is_confirmed))
         .collect();
@@ -307,7 +315,7 @@ fn close(
         .flat_map(|(_, weights)| &weights[along_path.len()..]);
     let mut verdict = |edge: &Option<Edge>| match edge.as_ref().and_then(|_| weights.next()) {
         None => LoopVerdict::Unconfirmed,
-        Some(&weight) if weight > MIN_WEIGHT => LoopVerdict::Accepted,
+        Some(&weight) if weight > config.min_weight => LoopVerdict::Accepted,
         Some(_) => LoopVerdict::Contradicted,
     };
     let result = (found.iter().zip(&used))

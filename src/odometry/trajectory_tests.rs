@@ -85,6 +85,9 @@ fn a_round_closes_its_loop_and_takes_the_drift_away() {
             ..OdometryEstimate::first(0.25)
         });
     }
+    let mut strict = builder.clone();
+    strict.config.loop_closure.min_common_share = 1.0;
+    assert!(strict.finish().unwrap().loops.is_empty());
     let found = builder.finish().unwrap();
     let error_m = |pose: &Pose3| distance_m(pose, &(truth[0].inverse() * truth[119]));
     let before = error_m(&drifted);
@@ -97,6 +100,14 @@ fn a_round_closes_its_loop_and_takes_the_drift_away() {
         let error_m = distance_m(&found.first_from_second, &true_transform);
         assert!(error_m < 0.1, "{found:?}");
     }
+}
+
+#[test]
+fn an_impossible_limit_of_loops_is_named() {
+    let mut config = TrajectoryConfig::default();
+    config.loop_closure.min_common_share = 1.5;
+    let error = TrajectoryBuilder::new(config).unwrap_err();
+    assert_eq!(error.key, "loop_closure.min_common_share");
 }
 
 /// The walls, ground and boxes that a drawn world consists of, as a mesh in the frame of the first of some scans.
