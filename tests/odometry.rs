@@ -11,8 +11,10 @@ use common::{fpmcl, json, real_recording, run, simulate_two_drives};
 use fpmcl::geometry::Pose3;
 use fpmcl::internals::MappedPly;
 use fpmcl::internals::ply;
-use fpmcl::recording::PoseTrack;
-use fpmcl::recording::read_tum;
+use fpmcl::map::{Map, MapBuilder, MapCache, MapConfig, MapOptions};
+use fpmcl::mapping::map_recording;
+use fpmcl::recording::{PoseTrack, Recording, read_tum};
+use fpmcl::rendering::Backend;
 use glam::DVec3;
 
 /// A street with a bend and traffic.
@@ -44,6 +46,23 @@ fn rmse_m(found: &[Pose3], truth: &[Pose3]) -> f64 {
         .zip(truth)
         .map(|(found, truth)| (found.translation.vector - truth.translation.vector).norm_squared());
     (squares.sum::<f64>() / found.len() as f64).sqrt()
+}
+
+/// Requires that a map that the program has written has the bytes of that of the library.
+#[track_caller]
+fn same_as_of_the_library(folder: &Path, drive: &str, older: Option<&str>, file: &str) {
+    let options = MapOptions {
+        backend: Backend::Cpu,
+        cache: MapCache::NextToMap,
+        ..MapOptions::default()
+    };
+    let older = older.map(|name| Map::load(&folder.join(name), &options).unwrap());
+    let recording = Recording::open(folder.join("street").join(drive)).unwrap();
+    let builder = MapBuilder::new(MapConfig::default());
+    let built = map_recording(&recording, older.as_ref(), builder).unwrap();
+    built.map.save(&folder.join("library.ply")).unwrap();
+    let read = |name: &str| fs::read(folder.join(name)).unwrap();
+    assert!(read(file) == read("library.ply"), "{file} differs");
 }
 
 #[test]
@@ -109,6 +128,7 @@ fn a_recording_is_enough_for_a_map_and_for_another_drive_in_it() {
     let of_map = poses(&folder.join("map.poses_tum.txt"));
     assert!(rmse_m(&of_map, &found) < 1e-4);
     let map = fs::read(folder.join("map.ply")).unwrap();
+    same_as_of_the_library(folder, "drive_1", None, "map.ply");
     // The poses next to the map serve another build.
     let again = fpmcl("build-map").in_folder(folder).with("street/drive_1");
     let again = again

@@ -5,11 +5,12 @@
 //! > the poses, become a mesh by [`MapBuilder`].
 //!
 //! [`build_map`] does all of it, [`map_recording`] also returns what the recording has shown. The program, which keeps
-//! results between the steps, takes them one by one: `with_given_poses`, `PoseReport::new`, `find_poses`, `key_frames`.
+//! results between the steps, takes them one by one: `with_given_poses`, `checked`, `PoseSearch`, `key_frames`.
 
 mod error;
 mod pose_check;
 mod pose_report;
+mod pose_search;
 mod poses;
 mod trajectory;
 
@@ -19,12 +20,13 @@ pub use error::MappingError;
 pub use pose_report::{PoseReport, Tilt};
 pub use trajectory::{LoopCounts, TrajectorySummary};
 
-pub(crate) use poses::{check_path, key_frames, poses_of, with_given_poses};
-pub(crate) use trajectory::{ADJUSTMENT, find_poses, find_poses_in};
+pub(crate) use pose_search::PoseSearch;
+pub(crate) use poses::{check_path, checked, key_frames, poses_of, with_given_poses};
+pub(crate) use trajectory::{ADJUSTMENT, find_poses};
 
-use crate::map::{BuildError, Map, MapBuilder, MapConfig, MappingPath, PoseSource};
-use crate::odometry::{Trajectory, TrajectoryConfig};
-use crate::recording::{Frame, Recording};
+use crate::map::{BuildError, Map, MapBuilder, MapConfig, MappingPath};
+use crate::odometry::Trajectory;
+use crate::recording::Recording;
 use crate::sensor::Sensor;
 
 /// A map, and what its recording has shown.
@@ -77,25 +79,14 @@ pub fn map_recording(
 ) -> Result<MappedRecording, MappingError> {
     let world = older.map(|map| map.path.world_from_map);
     let given = with_given_poses(recording.clone(), builder.config.poses, world.as_ref())?;
-    check_path(&given, builder.config.max_step_m)?;
-    let sensor = match &builder.sensor {
-        Some(sensor) => sensor.clone().with_known(&builder.config.sensor),
-        None => Sensor::infer_recording(&given, &builder.config.sensor)?,
-    };
+    let (mut recording, sensor, poses) = checked(given, builder.sensor.as_ref(), &builder.config)?;
     builder.sensor = Some(sensor.clone());
-    let mut recording = sensor.applied_to(given);
-    let mut poses = None;
-    if recording.track.is_some() && builder.config.check_poses {
-        let report = PoseReport::new(&recording)?;
-        report.require_fit()?;
-        poses = Some(report);
-    }
     let mut trajectory = None;
-    if recording.track.is_none() || builder.config.poses == PoseSource::Polished {
-        let (frames, found) = found_poses(&recording, older, &sensor, &builder)?;
-        let world_from_map = world.unwrap_or(recording.world().0);
-        recording = recording.with_poses_of(&frames, found.poses.clone(), world_from_map)?;
-        check_path(&recording, builder.config.max_step_m)?;
+    if PoseSearch::is_needed(&recording, &builder.config) {
+        let search = PoseSearch::new(recording, &sensor, older, &builder.config);
+        let found = search.find(builder.options.memory_budget, &builder.on_event)?;
+        let rows = search.rows(&found);
+        recording = search.into_recording(rows)?;
         trajectory = Some(found);
     }
     let recording = recording.compensated_by_poses();
@@ -105,32 +96,6 @@ pub fn map_recording(
         poses,
         trajectory,
     })
-}
-
-/// The poses of all frames, or those of the selected ones polished.
-fn found_poses(
-    recording: &Recording,
-    older: Option<&Map>,
-    sensor: &Sensor,
-    builder: &MapBuilder,
-) -> Result<(Vec<Frame>, Trajectory), MappingError> {
-    let config = TrajectoryConfig::default();
-    let frames = if recording.track.is_some() {
-        recording.frames.clone()
-    } else {
-        recording.dense_frames()
-    };
-    let found = match older {
-        Some(map) => find_poses_in(map, &frames, sensor, &builder.config, &builder.on_event)?,
-        None => find_poses(
-            &frames,
-            recording.track.is_some(),
-            &config,
-            builder.options.memory_budget,
-            &builder.on_event,
-        )?,
-    };
-    Ok((frames, found))
 }
 
 /// The map of a recording with poses, whose key scans are read when they are needed.

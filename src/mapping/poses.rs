@@ -1,10 +1,13 @@
 //! Poses of a recording on its way into a map.
 
+use super::error::MappingError;
+use super::pose_report::PoseReport;
 use crate::geometry::Pose3;
-use crate::map::PoseSource;
 use crate::map::build::path_check::{self, ImplausiblePath};
 use crate::map::build::plan::key_scans;
+use crate::map::{MapConfig, PoseSource};
 use crate::recording::{Frame, Recording, RecordingError};
+use crate::sensor::Sensor;
 
 /// The recording with the poses that were given to it, else its own ones; without poses where these are to be found from
 /// the scans. `older` is the pose `world_from_map` of the map to which the recording is added, in whose world its poses
@@ -32,6 +35,27 @@ pub fn with_given_poses(
         Some(world_from_map) => track.in_map(world_from_map),
         None => track,
     })
+}
+
+/// The recording as its sensor measures it, the sensor, which is inferred where it is not given, and what the scans say
+/// about the poses; an error where these contradict each other or the scans.
+pub fn checked(
+    recording: Recording,
+    sensor: Option<&Sensor>,
+    config: &MapConfig,
+) -> Result<(Recording, Sensor, Option<PoseReport>), MappingError> {
+    check_path(&recording, config.max_step_m)?;
+    let sensor = match sensor {
+        Some(sensor) => sensor.clone().with_known(&config.sensor),
+        None => Sensor::infer_recording(&recording, &config.sensor)?,
+    };
+    let recording = sensor.applied_to(recording);
+    if recording.track.is_none() || !config.check_poses {
+        return Ok((recording, sensor, None));
+    }
+    let report = PoseReport::new(&recording)?;
+    report.require_fit()?;
+    Ok((recording, sensor, Some(report)))
 }
 
 /// Checks the poses of a recording against each other; see [`path_check`].

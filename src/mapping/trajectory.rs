@@ -6,20 +6,18 @@ use serde::{Deserialize, Serialize};
 
 use super::error::MappingError;
 use crate::lidar::Scan;
-use crate::localization::{LocalizerConfig, SecondDrive, SecondDriveError, Tracker, TrackerConfig};
-use crate::map::{BuildEvent, Map, MapConfig};
+use crate::map::BuildEvent;
 use crate::memory::MemoryBudget;
 use crate::odometry::{
     ElevationBias, LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig,
 };
 use crate::recording::Frame;
-use crate::sensor::Sensor;
 
 /// The stage after the last scan.
 pub const ADJUSTMENT: &str = "loops and adjustment";
 
 /// Called for every event; the work ends soon after it returns `Break`.
-type OnEvent<'a> = &'a dyn Fn(BuildEvent) -> ControlFlow<()>;
+pub(super) type OnEvent<'a> = &'a dyn Fn(BuildEvent) -> ControlFlow<()>;
 
 /// Finds the poses of frames from their scans, or polishes those that are given.
 ///
@@ -44,43 +42,8 @@ pub fn find_poses(
     Ok(builder.finish()?)
 }
 
-/// Finds the poses of frames of a sensor in a map.
-///
-/// Its events are the stage `"localize"`, every scan, and the stage [`ADJUSTMENT`].
-pub fn find_poses_in(
-    map: &Map,
-    frames: &[Frame],
-    sensor: &Sensor,
-    config: &MapConfig,
-    on_event: OnEvent,
-) -> Result<Trajectory, MappingError> {
-    let settings = TrajectoryConfig::default();
-    let tracker = TrackerConfig {
-        localizer: LocalizerConfig {
-            ground: config.ground.clone(),
-            ..LocalizerConfig::default()
-        },
-        odometry: None,
-        seed: config.seed,
-        ..TrackerConfig::default()
-    };
-    let tracker = Tracker::new(map, tracker).map_err(SecondDriveError::from)?;
-    let drive = SecondDrive::new(tracker.with_sensor(sensor.clone()), settings);
-    let mut drive = drive.map_err(SecondDriveError::from)?;
-    each_scan("localize", frames, on_event, |_, scan| {
-        drive.add(scan)?;
-        Ok(())
-    })?;
-    tracing::info!(
-        "{} of {} scans are found in the older map",
-        drive.found(),
-        frames.len()
-    );
-    Ok(drive.finish()?)
-}
-
 /// Reads the scans in order and passes each to `step`, until an event is answered with `Break`.
-fn each_scan(
+pub(super) fn each_scan(
     name: &'static str,
     frames: &[Frame],
     on_event: OnEvent,

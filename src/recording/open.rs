@@ -241,23 +241,6 @@ impl Recording {
         Ok(self)
     }
 
-    /// The same recording with poses `map_from_lidar` of some frames, one per frame, of which its own are part.
-    pub(crate) fn with_poses_of(
-        mut self,
-        frames: &[Frame],
-        map_from_lidar: Vec<Pose3>,
-        world_from_map: Pose3,
-    ) -> Result<Self, RecordingError> {
-        // They have the times of the frames, also where these are assumed.
-        self.has_times = true;
-        let times_s = frames.iter().map(|frame| frame.time_s).collect();
-        self.with_poses(PoseTrack::from_poses(
-            map_from_lidar,
-            times_s,
-            world_from_map,
-        ))
-    }
-
     /// The same recording, whose frames have no poses.
     #[must_use]
     pub fn without_poses(mut self) -> Self {

@@ -126,11 +126,26 @@ pub fn write_tum(mut writer: impl Write, trajectory: &[StampedPose]) -> io::Resu
     })
 }
 
+/// Writes rows as [`write_tum`] with all digits: [`read_tum`] returns the same numbers, if the quaternions are normalized.
+pub fn write_exact_tum(mut writer: impl Write, trajectory: &[StampedPose]) -> io::Result<()> {
+    trajectory.iter().try_for_each(|pose| {
+        let t = pose.map_from_lidar.translation.vector;
+        let q = pose.map_from_lidar.rotation.coords;
+        writeln!(
+            writer,
+            "{:?} {:?} {:?} {:?} {:?} {:?} {:?} {:?}",
+            pose.time_s, t.x, t.y, t.z, q.x, q.y, q.z, q.w
+        )
+    })
+}
+
 /// Reads `time x y z qx qy qz qw` rows [s, m] of lidar poses (TUM); frames are numbered by row.
 ///
 /// # Errors
 /// The file cannot be read, or a row does not have eight numbers of a pose.
 pub fn read_tum(path: &Path) -> Result<Vec<StampedPose>, RecordingError> {
+    /// Difference to 1 of the norm of a quaternion that is normalized up to rounding.
+    const NORMALIZED: f64 = 1e-14;
     read_rows(path)?
         .iter()
         .enumerate()
@@ -139,19 +154,22 @@ pub fn read_tum(path: &Path) -> Result<Vec<StampedPose>, RecordingError> {
                 row_array(row, path, *line, "time x y z qx qy qz qw")?;
             check_time(time_s, path, *line)?;
             let quaternion = Quaternion::new(qw, qx, qy, qz);
-            if (quaternion.norm() - 1.0).abs() > 0.01 {
+            let excess = (quaternion.norm() - 1.0).abs();
+            if excess > 0.01 {
                 return Err(RecordingError::NotARotation {
                     path: path.to_owned(),
                     line: *line,
                 });
             }
+            let rotation = if excess < NORMALIZED {
+                UnitQuaternion::new_unchecked(quaternion)
+            } else {
+                UnitQuaternion::from_quaternion(quaternion)
+            };
             Ok(StampedPose {
                 frame,
                 time_s,
-                map_from_lidar: Pose3::from_parts(
-                    position(x, y, z, path, *line)?,
-                    UnitQuaternion::from_quaternion(quaternion),
-                ),
+                map_from_lidar: Pose3::from_parts(position(x, y, z, path, *line)?, rotation),
             })
         })
         .collect()
@@ -312,6 +330,35 @@ mod tests {
             assert_relative_eq!(a.map_from_lidar, b.map_from_lidar, epsilon = 1e-5);
             assert_relative_eq!(a.time_s, b.time_s, epsilon = 1e-6);
         }
+    }
+
+    #[test]
+    fn exact_rows_of_normalized_poses_read_back_identically() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tum.txt");
+        let pose = |frame: usize| {
+            let i = frame as f64;
+            let turn = Vector3::new(0.1 * i.sin(), 0.02 * i, 0.037 * i);
+            let mut map_from_lidar = Pose3::new(Vector3::new(i / 3.0, 1e5 / (i + 0.7), -0.0), turn);
+            map_from_lidar.rotation.renormalize();
+            StampedPose {
+                frame,
+                time_s: 1.7e9 + i / 7.0,
+                map_from_lidar,
+            }
+        };
+        let trajectory: Vec<StampedPose> = (0..1000).map(pose).collect();
+        write_exact_tum(fs::File::create(&path).unwrap(), &trajectory).unwrap();
+        let back = read_tum(&path).unwrap();
+        let bits = |rows: &[StampedPose]| -> Vec<[u64; 8]> {
+            let numbers = |row: &StampedPose| {
+                let t = row.map_from_lidar.translation.vector;
+                let q = row.map_from_lidar.rotation.coords;
+                [row.time_s, t.x, t.y, t.z, q.x, q.y, q.z, q.w].map(f64::to_bits)
+            };
+            rows.iter().map(numbers).collect()
+        };
+        assert!(bits(&back) == bits(&trajectory));
     }
 
     #[test]

@@ -9,7 +9,7 @@ use anyhow::{Context as _, Result, ensure};
 
 pub use self::arguments::ExportArgs;
 use super::refine;
-use super::stages::{RecordingInputs, complete};
+use super::stages::{RecordingInputs, infer};
 use crate::app::report::export::tiles::TILES_FOLDER;
 use crate::app::report::export::{Model, Ribbon, RunLog, write_mcap};
 use crate::app::report::plotting::color::{Colormap, TRUTH};
@@ -156,7 +156,7 @@ fn write_log(path: &Path, run: &RunLog, context: &Context) -> Result<()> {
 fn frames_of(config: &mut RefinementConfig, results: &LocalizationResults) -> Result<Vec<Frame>> {
     let recording = RecordingInputs::new(&config.recording, &config.given_poses).open();
     let recording = recording.context("the scans of the result cannot be read; give --recording RECORDING, or --points 0 for a log without scans")?;
-    let (recording, _) = complete(&mut config.sensor, recording)?;
+    let (recording, _) = infer(&mut config.sensor, recording)?;
     let mut frames = recording.frames;
     frames.retain(|frame| results.frames.binary_search(&frame.number).is_ok());
     ensure!(

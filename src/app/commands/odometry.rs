@@ -2,17 +2,17 @@
 
 use std::path::PathBuf;
 
-use anyhow::Result;
+use anyhow::{Context as _, Result};
 use clap::Args;
 use serde::Serialize;
 
-use super::stages::{RecordingInputs, complete};
+use super::stages::{RecordingInputs, infer};
 use super::trajectory;
 use crate::app::report::RunFiles;
 use crate::app::report::odometry::{self, OdometryReport};
 use crate::app::run::{Claims, Context, Outputs, Printed, RunArgs, input, memory, output};
 use crate::app::settings::OdometryCommandConfig;
-use crate::mapping::find_poses;
+use crate::mapping::{check_path, find_poses};
 use crate::recording::Recording;
 use crate::sensor::{Sensor, SensorConfig};
 
@@ -110,15 +110,15 @@ fn open(config: &mut OdometryCommandConfig) -> Result<(Recording, Sensor)> {
     if let Some(path) = &config.given_poses.pose_file {
         let track = inputs.track(path, &recording)?;
         recording = recording.with_poses(track)?;
-        let origin = format!("pose_file is {}", path.display());
-        trajectory::check(&recording, config.max_step_m, &origin)?;
+        check_path(&recording, config.max_step_m)
+            .with_context(|| format!("pose_file is {}", path.display()))?;
         recording.skipped.clear();
     }
     let mut known = SensorConfig {
         motion_compensation: config.motion_compensation,
         ..SensorConfig::default()
     };
-    let completed = complete(&mut known, recording)?;
+    let completed = infer(&mut known, recording)?;
     config.motion_compensation = known.motion_compensation;
     Ok(completed)
 }

@@ -55,7 +55,7 @@ impl<'a> RecordingInputs<'a> {
             let track = self.track(pose_file, &recording)?;
             recording = recording.with_poses(track.in_map(&map.path.world_from_map))?;
         }
-        complete(known, recording)
+        infer(known, recording)
     }
 
     /// Reads poses of the recording from a file, or from a topic of its bag.
@@ -78,15 +78,20 @@ impl PoseInputConfig {
 
 /// Completes what is known about the sensor by what the scans show; returns the recording, whose points have times if they
 /// are known.
-pub fn complete(known: &mut SensorConfig, recording: Recording) -> Result<(Recording, Sensor)> {
+pub fn infer(known: &mut SensorConfig, recording: Recording) -> Result<(Recording, Sensor)> {
     let sensor = Sensor::infer_recording(&recording, known)?;
+    complete(known, &sensor);
+    Ok((sensor.applied_to(recording), sensor))
+}
+
+/// Completes what is known about the sensor.
+pub fn complete(known: &mut SensorConfig, sensor: &Sensor) {
     known.range_image = RangeImageConfig {
         has_rows: Some(sensor.has_rows),
         ..RangeImageConfig::of(&sensor.range_image)
     };
     known.own_car_m = Some(sensor.own_car_m);
     known.motion_compensation = sensor.motion_compensation;
-    Ok((sensor.applied_to(recording), sensor))
 }
 
 /// All inputs of a command that localizes, which exist, and their keys.

@@ -1,15 +1,14 @@
-//! Poses of a recording from its scans, for `odometry` and `build-map`: progress and checks.
+//! Poses of a recording from its scans, for `odometry` and `build-map`, with progress.
 
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context as _, Result};
+use anyhow::Result;
 
 use crate::app::run::Context;
 use crate::map::BuildEvent;
-use crate::mapping::{self, ADJUSTMENT, MappingError};
+use crate::mapping::{ADJUSTMENT, MappingError};
 use crate::odometry::Trajectory;
-use crate::recording::Recording;
 
 /// Finds the trajectory of a number of scans by `find`, to which it gives the events; with progress, until an
 /// interruption.
@@ -34,11 +33,6 @@ pub fn find(
     });
     task.set_share(1.0);
     found.map_err(|error| interrupt.explain(error))
-}
-
-/// Checks the poses of a recording against each other; `origin` says where they are from.
-pub fn check(recording: &Recording, max_step_m: f64, origin: &str) -> Result<()> {
-    mapping::check_path(recording, max_step_m).with_context(|| origin.to_owned())
 }
 
 /// The file of the poses of a map that was built without given ones.

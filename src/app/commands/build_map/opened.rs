@@ -3,19 +3,18 @@
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
-use anyhow::{Context as _, Result};
+use anyhow::Result;
 
 use super::files::prepare;
 use super::older::{self, OlderMap};
 use super::parts::{Parts, Role};
 use super::poses;
-use crate::app::commands::stages::complete;
-use crate::app::commands::trajectory::{self, poses_next_to};
+use crate::app::commands::trajectory::poses_next_to;
 use crate::app::run::{Claims, Context, version};
 use crate::app::settings::{self, BuildMapConfig, OutputConfig};
 use crate::map::build::plan::{self, LocalMapPlan};
-use crate::map::{MapBuilder, MapPlan, PoseSource};
-use crate::mapping::{TrajectorySummary, key_frames, poses_of};
+use crate::map::{MapBuilder, MapPlan};
+use crate::mapping::{PoseSearch, TrajectorySummary, key_frames, poses_of};
 use crate::recording::{Frame, Recording};
 use crate::sensor::Sensor;
 
@@ -51,22 +50,17 @@ pub fn open(config: &BuildMapConfig, role: Role, context: &Context) -> Result<(O
     let mut config = config.clone();
     let (older, older_map) = older::open(&config, context)?.unzip();
     let recording = poses::open(&config, older.as_ref())?;
-    let (mut sequence, sensor) = complete(&mut config.map.sensor, recording)?;
-    poses::check(&sequence, &config)
-        .with_context(|| poses::origin(&sequence).unwrap_or_default())?;
+    let (mut sequence, sensor) = poses::check(recording, &mut config)?;
     let mut trajectory = None;
-    if sequence.track.is_none() || config.map.poses == PoseSource::Polished {
-        (sequence, trajectory) = poses::find(
-            sequence,
-            &sensor,
-            &config,
-            older.as_ref().zip(older_map.as_ref()),
-            role,
-            context,
-        )?;
-        let found = poses_next_to(&config.mesh_file);
-        let origin = format!("the poses from the scans are in {}", found.display());
-        trajectory::check(&sequence, config.map.max_step_m, &origin)?;
+    if PoseSearch::is_needed(&sequence, &config.map) {
+        let has_times = sequence.has_times;
+        let search = PoseSearch::new(sequence, &sensor, older_map.as_ref(), &config.map);
+        let localized_by = older.as_ref().map_or_else(String::new, |older| {
+            let map = &config.map;
+            format!("{}{sensor:?}{:?}{}", older.hash, map.ground, map.seed)
+        });
+        let found = poses::find(search, has_times, &config, &localized_by, role, context)?;
+        (sequence, trajectory) = (found.0, Some(found.1));
     } else if let Some(name) = poses_next_to(&config.mesh_file).file_name()
         && role == Role::Build
     {

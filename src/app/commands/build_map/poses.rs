@@ -4,26 +4,23 @@ use std::fs;
 use std::io::Write as _;
 use std::path::Path;
 
-use anyhow::{Result, ensure};
+use anyhow::{Context as _, Result, ensure};
 
 use super::older::OlderMap;
 use super::parts::{Role, not_listed};
-use crate::app::commands::stages::RecordingInputs;
-use crate::app::commands::trajectory;
+use crate::app::commands::stages::{RecordingInputs, complete};
+use crate::app::commands::trajectory::{self, poses_next_to};
 use crate::app::report::odometry;
-use crate::app::report::run_output::stamped;
 use crate::app::run::artefact::hash::hash_of_texts;
 use crate::app::run::memory;
 use crate::app::run::{Context, output, version};
 use crate::app::settings::BuildMapConfig;
-use crate::geometry::Pose3;
-use crate::map::{Map, PoseSource};
-use crate::mapping::{
-    self, MappingError, PoseReport, TrajectorySummary, find_poses, find_poses_in,
-};
-use crate::odometry::{PoseFit, PoseMeaning, TrajectoryConfig};
-use crate::recording::poses::write_tum;
-use crate::recording::{Frame, PoseTrack, Recording};
+use crate::geometry::StampedPose;
+use crate::map::PoseSource;
+use crate::mapping::{self, MappingError, PoseReport, PoseSearch, TrajectorySummary};
+use crate::odometry::{PoseFit, PoseMeaning};
+use crate::recording::poses::{read_tum, write_exact_tum};
+use crate::recording::{Frame, Recording};
 use crate::sensor::Sensor;
 
 /// Start of the line of a file of poses with their summary.
@@ -51,122 +48,101 @@ pub fn open(config: &BuildMapConfig, older: Option<&OlderMap>) -> Result<Recordi
         recording.track = Some(inputs.track(path, &recording)?);
     }
     let world = older.map(|older| older.path.world_from_map);
-    let recording = mapping::with_given_poses(recording, config.map.poses, world.as_ref())?;
-    if let Some(origin) = origin(&recording) {
-        trajectory::check(&recording, config.map.max_step_m, &origin)?;
+    Ok(mapping::with_given_poses(
+        recording,
+        config.map.poses,
+        world.as_ref(),
+    )?)
+}
+
+/// Checks the recording and its poses, warns of what is doubtful, and completes what is known about the sensor.
+pub fn check(recording: Recording, config: &mut BuildMapConfig) -> Result<(Recording, Sensor)> {
+    let track = recording.track.as_ref();
+    let origin = track.map(|track| format!("pose_file is {}", track.path.display()));
+    let checked = mapping::checked(recording, None, &config.map);
+    let (recording, sensor, report) = checked.map_err(|error| explained(error, origin))?;
+    if let Some(report) = report {
+        warn_of(&report);
     }
-    Ok(recording)
+    complete(&mut config.map.sensor, &sensor);
+    Ok((recording, sensor))
 }
 
-/// Where the poses of a recording are from.
-pub fn origin(recording: &Recording) -> Option<String> {
-    let track = recording.track.as_ref()?;
-    Some(format!("pose_file is {}", track.path.display()))
-}
-
-/// The recording with poses from its scans, in an older map where there is one, or with its own ones polished, and what
-/// they show about themselves. Both are kept in a file next to the map, from which they are read where it belongs to the
-/// same scans; otherwise only a build finds them.
+/// The recording with the poses of a search, and what they show about themselves. Both are kept in a file next to the map,
+/// from which they are read where it belongs to the same scans; otherwise only a build finds them.
 pub fn find(
-    mut recording: Recording,
-    sensor: &Sensor,
+    search: PoseSearch,
+    has_times: bool,
     config: &BuildMapConfig,
-    older: Option<(&OlderMap, &Map)>,
+    localized_by: &str,
     role: Role,
     context: &Context,
-) -> Result<(Recording, Option<TrajectorySummary>)> {
-    let path = trajectory::poses_next_to(&config.mesh_file);
-    let is_given = recording.track.is_some();
-    let frames = if is_given {
-        recording.frames.clone()
-    } else {
-        recording.dense_frames()
-    };
-    let localized_by = match older {
-        Some((older, _)) => format!("{}{sensor:?}{:?}", older.hash, config.map.ground),
-        None => String::new(),
-    };
-    let hash = inputs(&frames, is_given, &localized_by)?;
-    let heading = format!("# fpmcl poses {hash}\n");
-    let found = fs::read_to_string(&path).unwrap_or_default();
-    let found = found.strip_prefix(&heading).and_then(summary_in);
-    let world = older.map(|(_, map)| map.path.world_from_map);
-    let mut summary = found;
-    if summary.is_some() {
+) -> Result<(Recording, TrajectorySummary)> {
+    let path = poses_next_to(&config.mesh_file);
+    let hash = inputs(&search, localized_by)?;
+    let heading = format!("# fpmcl poses {hash}\n{SUMMARY}");
+    let (summary, rows) = if let Some(kept) = kept_in(&path, &heading, &search.frames) {
         tracing::info!("the poses in {} are finished already", path.display());
+        kept
     } else {
         ensure!(role == Role::Build, not_listed(&config.mesh_file));
-        let settings = TrajectoryConfig::default();
-        let name = match (older, is_given) {
-            (Some(_), _) => "localize",
-            (None, true) => "polish",
-            (None, false) => "odometry",
-        };
-        let found = trajectory::find(name, frames.len(), context, |on_event| match older {
-            Some((_, map)) => find_poses_in(map, &frames, sensor, &config.map, on_event),
-            None => find_poses(&frames, is_given, &settings, memory::budget(), on_event),
+        let (name, count) = (search.name(), search.frames.len());
+        let found = trajectory::find(name, count, context, |on_event| {
+            search.find(memory::budget(), on_event)
         })?;
-        let found_now = TrajectorySummary::new(&found, recording.has_times);
-        odometry::warn(&found_now);
-        let kept = serde_json::to_string(&found_now.without_times())?;
-        summary = Some(found_now);
-        // Rows of the lidar in the world of the given poses, or of the older map.
-        let world_from_map = world.unwrap_or(recording.world().0);
-        let poses: Vec<Pose3> = found
-            .poses
-            .iter()
-            .map(|pose| world_from_map * pose)
-            .collect();
-        let stamped = stamped(&frames, &poses);
+        let summary = TrajectorySummary::new(&found, has_times);
+        odometry::warn(&summary);
+        let summary_line = serde_json::to_string(&summary.without_times())?;
+        let rows = search.rows(&found);
         output::write_file(&path, |file| {
-            writeln!(file, "{heading}{SUMMARY}{kept}")?;
-            write_tum(file, &stamped)
+            writeln!(file, "{heading}{summary_line}")?;
+            write_exact_tum(file, &rows)
         })?;
-    }
+        (summary, rows)
+    };
     context.interrupt.keeps(format!(
         "the poses are kept in {}; run the same command again to continue",
         path.display()
     ));
-    // Its rows have the times of the frames, also where these are assumed.
-    recording.has_times = true;
-    let mut track = PoseTrack::read(&path, None)?;
-    if let Some(world_from_map) = world {
-        track = track.in_map(&world_from_map);
-    }
-    Ok((recording.with_poses(track)?, summary))
+    let recording = search.into_recording(rows);
+    let origin = || format!("the poses from the scans are in {}", path.display());
+    Ok((recording.with_context(origin)?, summary))
 }
 
-/// The summary of poses, after the heading of their file.
-fn summary_in(text: &str) -> Option<TrajectorySummary> {
-    serde_json::from_str(text.strip_prefix(SUMMARY)?.lines().next()?).ok()
+/// The summary and the rows of a file of poses with this heading and these frames.
+fn kept_in(
+    path: &Path,
+    heading: &str,
+    frames: &[Frame],
+) -> Option<(TrajectorySummary, Vec<StampedPose>)> {
+    let text = fs::read_to_string(path).ok()?;
+    let summary = text.strip_prefix(heading)?.lines().next()?;
+    let rows = read_tum(path).ok()?;
+    let is_same = |(row, frame): (&StampedPose, &Frame)| row.time_s == frame.time_s;
+    let are_same = rows.len() == frames.len() && rows.iter().zip(frames).all(is_same);
+    are_same.then_some((serde_json::from_str(summary).ok()?, rows))
 }
 
 /// Hash of what the poses depend on, also the older map and how scans are localized there; of a scan its place and size.
-fn inputs(frames: &[Frame], is_given: bool, localized_by: &str) -> Result<String> {
+fn inputs(search: &PoseSearch, localized_by: &str) -> Result<String> {
     let mut parts = vec![version::program()?, localized_by.to_owned()];
-    for frame in frames {
+    for frame in &search.frames {
         let source = frame.source.to_string();
         let bytes = fs::metadata(Path::new(&source)).map_or(0, |file| file.len());
-        let given = frame.map_from_lidar.filter(|_| is_given);
+        let given = frame.map_from_lidar.filter(|_| search.is_given());
         parts.push(format!(
-            "{source} {bytes} {} {:?} {} {given:?}",
-            frame.time_s, frame.rotation, frame.is_timed
+            "{source} {bytes} {} {:?} {} {} {given:?}",
+            frame.time_s, frame.rotation, frame.is_timed, frame.elevation_bias_rad
         ));
     }
     Ok(hash_of_texts(&parts))
 }
 
-/// Checks the poses of a recording whose scans are not compensated by them: an error where they are of another
-/// motion, a warning where they are doubtful or the map is not level.
-pub fn check(recording: &Recording, config: &BuildMapConfig) -> Result<()> {
-    if !config.map.check_poses || recording.track.is_none() {
-        return Ok(());
-    }
-    let report = PoseReport::new(recording)?;
-    report.require_fit().map_err(with_remedy)?;
+/// Warns where the poses are doubtful or the map is not level.
+fn warn_of(report: &PoseReport) {
     match report.fit() {
         PoseFit::Fits => tracing::debug!("the poses fit the scans: {report}"),
-        _ => tracing::warn!("the poses fit the scans badly: {report}{}", remedy(&report)),
+        _ => tracing::warn!("the poses fit the scans badly: {report}{}", remedy(report)),
     }
     match report.tilt {
         Some(tilt) if tilt.is_uneven() => tracing::warn!(
@@ -179,12 +155,16 @@ pub fn check(recording: &Recording, config: &BuildMapConfig) -> Result<()> {
         ),
         _ => {}
     }
-    Ok(())
 }
 
-fn with_remedy(error: MappingError) -> anyhow::Error {
+/// An error with what to do about it, and where the poses are from if it is about them.
+fn explained(error: MappingError, origin: Option<String>) -> anyhow::Error {
+    let origin = origin.unwrap_or_default();
     match &error {
-        MappingError::PosesDoNotFit(report) => anyhow::anyhow!("{error}{}", remedy(report)),
+        MappingError::PosesDoNotFit(report) => {
+            anyhow::anyhow!("{error}{}", remedy(report)).context(origin)
+        }
+        MappingError::Path(_) => anyhow::Error::from(error).context(origin),
         _ => error.into(),
     }
 }
