@@ -9,10 +9,11 @@ mod brute_force;
 mod common;
 
 use std::path::Path;
+use std::sync::Arc;
 
 use fpmcl::geometry::{Pose2, Pose3, TriangleMesh, Vec3};
 use fpmcl::internals::CpuRenderer;
-use fpmcl::internals::{GpuRenderer, ImageMethod};
+use fpmcl::internals::{GpuRenderer, ImageMethod, Scene};
 use fpmcl::lidar::{Beam, LidarModel, RangeImage};
 use fpmcl::localization::ObservationConfig;
 use fpmcl::localization::ParticleSet;
@@ -27,7 +28,7 @@ const METHODS: [ImageMethod; 2] = [ImageMethod::Cast, ImageMethod::Raster];
 #[expect(clippy::print_stderr, reason = "a skipped test reports it")]
 fn renderer(tiles: &[TriangleMesh]) -> Option<GpuRenderer> {
     match GpuRenderer::new(
-        tiles,
+        Arc::new(Scene::of_tiles(tiles)),
         (Backend::Gpu, RenderingMethod::Auto),
         MemoryBudget::default(),
     ) {

@@ -26,6 +26,7 @@ use super::tiles::store::TileStore;
 use crate::geometry::mesh::on_lattice;
 use crate::geometry::{Aabb, TriangleMesh};
 use crate::memory::{MemoryBudget, MemoryError};
+use crate::raycasting::Scene;
 use crate::rendering::selection::{self, BackendChoice};
 use crate::rendering::{RangeRenderer, RenderError};
 
@@ -126,7 +127,8 @@ impl Map {
             grid::cut(&mesh, options.tiles.side_m).into_iter().unzip();
         let boxes = std::iter::zip(indices, parts.iter().map(TriangleMesh::bounds));
         let tiles = grid_of(&path, boxes, &options.tiles);
-        let renderer = choice.renderer(&parts, options.memory_budget)?;
+        let scene = Arc::new(Scene::of_tiles(&parts));
+        let renderer = choice.renderer(scene, options.memory_budget)?;
         let ground = GroundMap::over(Arc::new(chunks), GROUND_CELL_M);
         Ok(Self {
             memory_budget: options.memory_budget,
@@ -229,7 +231,7 @@ impl Map {
         let path = store.path.clone().or(given).unwrap_or_default();
         let tiles = grid_of(&path, store.boxes(), &options.tiles);
         let store = Arc::new(store);
-        let renderer = choice.renderer_over(&store, options.memory_budget)?;
+        let renderer = choice.renderer(store.clone(), options.memory_budget)?;
         Ok(Self {
             surface: Surface::Disk {
                 mesh_file: mesh_file.to_owned(),

@@ -25,7 +25,7 @@ use crate::simd::WIDE;
 pub use error::{TileError, TileProblem};
 use place::Place;
 pub use scene::{Scene, TileSource};
-pub use source::{SceneSource, TriangleSource};
+pub use source::SceneSource;
 pub use tile::Tile;
 #[cfg(feature = "gpu")]
 pub(crate) use triangle::is_proper;

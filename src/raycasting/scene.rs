@@ -62,13 +62,8 @@ impl Scene {
     /// Memory of the hierarchies and the triangles [bytes].
     #[cfg(test)]
     pub fn bytes(&self) -> usize {
-        let top = size_of_val(&*self.top.bvh.nodes);
-        let numbers = 0..self.top.numbers.len();
-        let tiles = numbers.filter_map(|number| {
-            let tile = self.tiles.tile(number);
-            tile.unwrap_or_else(|never| match *never {})
-        });
-        top + tiles.map(|tile| tile.as_bytes().len()).sum::<usize>()
+        let tiles = self.all_tiles().map(|tile| tile.as_bytes().len());
+        size_of_val(&*self.top.bvh.nodes) + tiles.sum::<usize>()
     }
 }
 
@@ -138,6 +133,12 @@ impl<E> Scene<E> {
             top: self.top.clone(),
             tiles,
         }
+    }
+
+    /// Tiles that are in memory and have triangles.
+    pub(super) fn all_tiles(&self) -> impl Iterator<Item = &Tile> {
+        let numbers = 0..self.top.first_triangles.len();
+        numbers.filter_map(|number| self.tiles.tile(number).ok().flatten())
     }
 
     /// The unit normal of the triangle of a hit of this scene by the right-hand rule; `None` if there is none.

@@ -166,6 +166,13 @@ impl Tile {
         }
     }
 
+    /// Corners of all triangles in the frame of the scene [m].
+    pub fn corners(&self) -> Vec<[DVec3; 3]> {
+        let mut triangles = Vec::new();
+        self.for_each_triangle(|corners, _| triangles.push(corners));
+        triangles
+    }
+
     /// Origin of the coordinates of the tile in the frame of the scene [m].
     #[inline(always)]
     pub(super) fn middle(&self) -> DVec3 {

@@ -10,9 +10,8 @@ use super::backend::{AdapterReport, Backend, RenderingMethod, best_adapter};
 #[cfg(feature = "gpu")]
 use super::gpu::GpuRenderer;
 use super::{CpuRenderer, RangeRenderer, RenderError};
-use crate::geometry::TriangleMesh;
 use crate::memory::MemoryBudget;
-use crate::raycasting::{SceneSource, TriangleSource};
+use crate::raycasting::SceneSource;
 
 /// Selected renderer, the adapters that were considered, and the reason.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,17 +34,15 @@ impl BackendChoice {
             |index| self.adapters[index].to_string(),
         )
     }
-}
 
-impl BackendChoice {
-    /// Prepares the tiles of a map, in the map frame, for rendering; the budget is that of the map and the images on a
-    /// graphics device. Reports the renderer and the reason to the log.
+    /// Prepares a map for rendering; its tiles are read, and on a graphics adapter uploaded, when rays may reach them. The
+    /// budget is that of the map and the images on a graphics device. Reports the renderer and the reason to the log.
     ///
     /// # Errors
     /// Those of the graphics device.
     pub fn renderer(
         &self,
-        tiles: &[TriangleMesh],
+        source: Arc<dyn SceneSource>,
         #[cfg_attr(
             not(feature = "gpu"),
             expect(
@@ -55,49 +52,16 @@ impl BackendChoice {
         )]
         memory_budget: MemoryBudget,
     ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
-        self.report();
+        tracing::info!("rendering on {} because {}", self.name(), self.reason);
         #[cfg(feature = "gpu")]
         if self.adapter.is_some() {
             return Ok(Arc::new(GpuRenderer::new(
-                tiles,
-                self.request,
-                memory_budget,
-            )?));
-        }
-        Ok(Arc::new(CpuRenderer::new(tiles)))
-    }
-
-    /// As [`renderer`](Self::renderer), with tiles that are read, and on a graphics adapter uploaded, when rays may reach
-    /// them.
-    ///
-    /// # Errors
-    /// As [`renderer`](Self::renderer).
-    pub fn renderer_over<S: SceneSource + TriangleSource + 'static>(
-        &self,
-        source: &Arc<S>,
-        #[cfg_attr(
-            not(feature = "gpu"),
-            expect(
-                unused_variables,
-                reason = "only a graphics device has memory of its own"
-            )
-        )]
-        memory_budget: MemoryBudget,
-    ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
-        self.report();
-        #[cfg(feature = "gpu")]
-        if self.adapter.is_some() {
-            return Ok(Arc::new(GpuRenderer::over(
                 source,
                 self.request,
                 memory_budget,
             )?));
         }
-        Ok(Arc::new(CpuRenderer::over(source.clone())))
-    }
-
-    fn report(&self) {
-        tracing::info!("rendering on {} because {}", self.name(), self.reason);
+        Ok(Arc::new(CpuRenderer::over(source)))
     }
 }
 

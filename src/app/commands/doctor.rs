@@ -18,6 +18,7 @@ use crate::localization::observation::ObservationConfig;
 use crate::map::TileConfig;
 use crate::map::tiles::grid;
 use crate::memory::MemoryBudget;
+use crate::raycasting::{Scene, TileError};
 use crate::rendering::backend::{AdapterReport, best_adapter};
 use crate::rendering::{
     Backend, CpuRenderer, RangeDifference, RangeRenderer, RenderError, RenderingMethod, selection,
@@ -121,7 +122,7 @@ fn measurements(time: Duration, adapters: &[AdapterReport]) -> Result<Vec<Row>> 
 
 /// The simulated street, a scan of it, and particles around its pose.
 struct Workload {
-    tiles: Vec<TriangleMesh>,
+    scene: Arc<Scene<TileError>>,
     triangles: usize,
     scan: RangeImage,
     /// Every few pixels of it.
@@ -139,7 +140,9 @@ impl Workload {
         let tiles: Vec<TriangleMesh> = tiles.into_iter().map(|(_, tile)| tile).collect();
         let (poses, model) = (simulation.poses(), LidarModel::default());
         let pose = poses[poses.len() / 2];
-        let ranges = CpuRenderer::new(&tiles).render(&[pose], &model)?.concat();
+        let scene = Arc::new(Scene::of_tiles(&tiles));
+        let cpu = CpuRenderer::over(scene.clone());
+        let ranges = cpu.render(&[pose], &model)?.concat();
         let scan = RangeImage::from_ranges(ranges, &model);
         let every = (scan.beams().count() / BEAMS).max(1);
         // Evenly spread (Weyl sequences).
@@ -152,7 +155,7 @@ impl Workload {
             triangles: street.triangles.len(),
             beams: scan.beams().step_by(every).collect(),
             scan,
-            tiles,
+            scene,
             particles: (0..PARTICLES).map(particle).collect(),
             observation: ObservationConfig::default(),
         })
@@ -163,7 +166,8 @@ impl Workload {
         backend: Backend,
         method: RenderingMethod,
     ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
-        selection::choose(backend, method)?.renderer(&self.tiles, MemoryBudget::default())
+        let choice = selection::choose(backend, method)?;
+        choice.renderer(self.scene.clone(), MemoryBudget::default())
     }
 
     /// Speed with which whole images are compared.

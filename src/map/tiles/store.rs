@@ -26,7 +26,7 @@ use crate::map::ground::heights::{
     Cell, ChunkSource, GROUND_CELL_M, chunks_of_triangles, chunks_reached, middle_of_chunk,
 };
 use crate::map::mesh_view::{MeshView, part_on_lattice};
-use crate::raycasting::{Scene, SceneSource, Tile, TileError, TileSource, TriangleSource};
+use crate::raycasting::{Scene, SceneSource, Tile, TileError, TileSource};
 use crate::shared_bytes::SharedBytes;
 
 /// Memory of tiles above which those far from the rays are dropped [bytes].
@@ -434,9 +434,7 @@ impl SceneSource for TileStore {
         }
         self.scene.with_tiles(resident)
     }
-}
 
-impl TriangleSource for TileStore {
     fn tiles(&self) -> Vec<(Aabb, u64)> {
         let tiles = self.files.tiles.iter();
         tiles.map(|tile| (tile.bounds(), tile.triangles)).collect()
@@ -444,13 +442,10 @@ impl TriangleSource for TileStore {
 
     /// The tile is not kept in memory.
     fn triangles(&self, tile: usize) -> Result<Vec<[DVec3; 3]>, TileError> {
-        let mut triangles = Vec::new();
         let loaded = self.files.read(tile)?;
         let scene = loaded.scene.get_or_init(|| self.files.scene_of(&loaded));
-        if let Some(tile) = &scene.as_ref().map_err(TileError::clone)?.tile {
-            tile.for_each_triangle(|corners, _| triangles.push(corners));
-        }
-        Ok(triangles)
+        let tile = &scene.as_ref().map_err(TileError::clone)?.tile;
+        Ok(tile.as_ref().map_or_else(Vec::new, Tile::corners))
     }
 }
 

@@ -6,7 +6,7 @@ use wgpu::{Buffer, BufferUsages};
 use super::device::Gpu;
 use super::layout::Pose;
 use super::two_level::{DeviceTile, TwoLevelBvh};
-use crate::geometry::{Pose3, TriangleMesh};
+use crate::geometry::Pose3;
 use crate::rendering::RenderError;
 
 /// Buffers of the map and their layout.
@@ -20,13 +20,8 @@ pub(super) struct DeviceMap {
 }
 
 impl DeviceMap {
-    /// Builds the hierarchy over all tiles of a map and uploads it.
-    pub fn upload(gpu: &Gpu, tiles: &[TriangleMesh]) -> Result<Self, RenderError> {
-        Self::of_hierarchy(gpu, TwoLevelBvh::build(tiles))
-    }
-
     /// Uploads a hierarchy.
-    pub fn of_hierarchy(gpu: &Gpu, bvh: TwoLevelBvh) -> Result<Self, RenderError> {
+    pub fn upload(gpu: &Gpu, bvh: TwoLevelBvh) -> Result<Self, RenderError> {
         let sizes = [
             size_of_val(bvh.triangles.as_slice()) as u64,
             size_of_val(bvh.nodes.as_slice()) as u64,

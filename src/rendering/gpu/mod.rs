@@ -35,10 +35,10 @@ use std::time::Instant;
 use super::backend::{Backend, RenderingMethod};
 use super::cpu::POSES_AT_ONCE;
 use super::{CpuRenderer, RangeDifference, RangeRenderer, RenderError};
-use crate::geometry::{Pose3, TriangleMesh, Vec3};
+use crate::geometry::{Pose3, Vec3};
 use crate::lidar::{Beam, LidarModel, RangeImage};
 use crate::memory::MemoryBudget;
-use crate::raycasting::{SceneSource, TriangleSource};
+use crate::raycasting::SceneSource;
 
 use device::Gpu;
 use layout::{FAR, Pose};
@@ -66,46 +66,22 @@ pub struct GpuRenderer {
 }
 
 impl GpuRenderer {
-    /// Opens the best adapter that the backend allows and uploads the map; compares images by the requested method, and
-    /// renders within a budget of memory.
+    /// Opens the best adapter that the backend allows, uploads the tiles of a source when rays may reach them, and drops
+    /// those far away. The CPU renders what reaches more tiles than the device holds. Compares images by the requested
+    /// method, and renders within a budget of memory.
     ///
     /// # Errors
-    /// [`RenderError::NoAdapter`] where there is none, [`RenderError::MapTooLarge`] where the
-    /// map does not fit what the device binds, [`RenderError::DeviceRefused`] if it is requested to rasterize and cannot,
-    /// and the errors of the device.
+    /// [`RenderError::NoAdapter`] where there is none, [`RenderError::DeviceRefused`] if it is requested to rasterize and
+    /// cannot, and the errors of the device.
     pub fn new(
-        tiles: &[TriangleMesh],
-        request: (Backend, RenderingMethod),
-        memory_budget: MemoryBudget,
-    ) -> Result<Self, RenderError> {
-        Self::with(request, memory_budget, |gpu| ResidentMap::whole(gpu, tiles))
-    }
-
-    /// As [`new`](Self::new), but uploads the tiles of a source when rays may reach them, and drops those far away. The CPU
-    /// renders what reaches more tiles than the device holds.
-    ///
-    /// # Errors
-    /// Those of [`new`](Self::new), but for [`RenderError::MapTooLarge`].
-    pub fn over<S: SceneSource + TriangleSource + 'static>(
-        source: &Arc<S>,
-        request: (Backend, RenderingMethod),
-        memory_budget: MemoryBudget,
-    ) -> Result<Self, RenderError> {
-        Self::with(request, memory_budget, |gpu| {
-            let cpu = CpuRenderer::over(source.clone());
-            ResidentMap::over(gpu, source.clone(), cpu)
-        })
-    }
-
-    fn with(
+        source: Arc<dyn SceneSource>,
         (backend, method): (Backend, RenderingMethod),
         memory_budget: MemoryBudget,
-        map: impl FnOnce(&Gpu) -> Result<ResidentMap, RenderError>,
     ) -> Result<Self, RenderError> {
         let mut gpu = Gpu::open(backend)?;
         gpu.memory_budget = memory_budget;
         gpu.batch_sizes.poses = gpu.batch_sizes.poses.min(POSES_AT_ONCE);
-        let map = map(&gpu)?;
+        let map = ResidentMap::new(&gpu, source)?;
         let rasterizer = gpu.can_rasterize.then(|| Rasterizer::new(&gpu));
         gpu.check()?;
         let method = match (method, &rasterizer) {

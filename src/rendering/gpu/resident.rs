@@ -1,4 +1,4 @@
-//! The tiles of a map on the device: all of them, or those around the poses that are rendered.
+//! The tiles of a map on the device: those around the poses that are rendered.
 //!
 //! What a ray hits never depends on which tiles are there: those within reach of the rays are uploaded before these are
 //! cast. Tiles a little farther away come with them, so that a car that drives on finds them there; those farthest away are
@@ -13,8 +13,8 @@ use super::caster::Caster;
 use super::device::Gpu;
 use super::device_map::DeviceMap;
 use super::two_level::{BottomLevel, TwoLevelBvh, center_of};
-use crate::geometry::{Aabb, Pose3, TriangleMesh};
-use crate::raycasting::TriangleSource;
+use crate::geometry::{Aabb, Pose3};
+use crate::raycasting::SceneSource;
 use crate::rendering::order::poses_by_square;
 use crate::rendering::{CpuRenderer, RenderError};
 
@@ -43,8 +43,7 @@ impl Loaded {
 /// A map, all of it or in part on the device.
 pub(super) struct ResidentMap {
     resident: Mutex<Arc<Resident>>,
-    /// Where tiles come from; `None` for a map that is on the device as a whole.
-    tiles: Option<Tiles>,
+    tiles: Tiles,
 }
 
 struct Resident {
@@ -54,7 +53,7 @@ struct Resident {
 }
 
 struct Tiles {
-    source: Arc<dyn TriangleSource>,
+    source: Arc<dyn SceneSource>,
     /// Boxes and estimated memory [m, bytes].
     tiles: Vec<(Aabb, u64)>,
     center: DVec3,
@@ -64,17 +63,8 @@ struct Tiles {
 }
 
 impl ResidentMap {
-    /// Uploads all tiles of a map.
-    pub fn whole(gpu: &Gpu, tiles: &[TriangleMesh]) -> Result<Self, RenderError> {
-        Ok(Self::with(gpu, DeviceMap::upload(gpu, tiles)?, None))
-    }
-
-    /// Uploads tiles when rays may reach them; a renderer of the same tiles is left what reaches too many.
-    pub fn over(
-        gpu: &Gpu,
-        source: Arc<dyn TriangleSource>,
-        cpu: CpuRenderer,
-    ) -> Result<Self, RenderError> {
+    /// Uploads tiles when rays may reach them; what reaches too many is left to the CPU.
+    pub fn new(gpu: &Gpu, source: Arc<dyn SceneSource>) -> Result<Self, RenderError> {
         let counted = |(bounds, triangles)| (bounds, triangles * TRIANGLE_BYTES);
         let tiles: Vec<(Aabb, u64)> = source.tiles().into_iter().map(counted).collect();
         let all_bytes = tiles.iter().map(|(_, bytes)| bytes).sum::<u64>();
@@ -87,34 +77,27 @@ impl ResidentMap {
             )
             .map_err(RenderError::DeviceMemory)?;
         let center = center_of(tiles.iter().map(|(bounds, _)| *bounds));
-        let nothing = DeviceMap::of_hierarchy(gpu, TwoLevelBvh::over(center, &[]))?;
-        let tiles = Tiles {
-            source,
-            tiles,
-            center,
-            budget_bytes,
-            cpu,
-        };
-        Ok(Self::with(gpu, nothing, Some(tiles)))
-    }
-
-    fn with(gpu: &Gpu, map: DeviceMap, tiles: Option<Tiles>) -> Self {
+        let nothing = DeviceMap::upload(gpu, TwoLevelBvh::over(center, &[]))?;
         let resident = Resident {
-            loaded: Loaded::new(gpu, map, None).into(),
+            loaded: Loaded::new(gpu, nothing, None).into(),
             levels: BTreeMap::new(),
         };
-        Self {
+        Ok(Self {
             resident: Mutex::new(resident.into()),
-            tiles,
-        }
+            tiles: Tiles {
+                cpu: CpuRenderer::over(source.clone()),
+                source,
+                tiles,
+                center,
+                budget_bytes,
+            },
+        })
     }
 
     /// Poses that can be rendered at once, by their indices; the renderer to be left all if what is within reach of some of
     /// them takes more than the budget.
     pub fn groups(&self, poses: &[Pose3], reach_m: f32) -> Result<Vec<Vec<usize>>, &CpuRenderer> {
-        let Some(tiles) = &self.tiles else {
-            return Ok(vec![(0..poses.len()).collect()]);
-        };
+        let tiles = &self.tiles;
         let fits = |group: &[usize]| {
             let around = bounds_of(group.iter().map(|&pose| &poses[pose]));
             tiles.bytes(tiles.within(reach_m, &around)) <= tiles.budget_bytes
@@ -140,9 +123,7 @@ impl ResidentMap {
         reach_m: f32,
     ) -> Result<Arc<Loaded>, RenderError> {
         let resident = self.resident().clone();
-        let Some(tiles) = &self.tiles else {
-            return Ok(resident.loaded.clone());
-        };
+        let tiles = &self.tiles;
         let around = bounds_of(poses.iter());
         let is_there = |tile: usize| resident.levels.contains_key(&tile);
         if tiles.within(reach_m, &around).all(is_there) {
@@ -159,7 +140,7 @@ impl ResidentMap {
         }
         let in_order: Vec<_> = levels.values().cloned().collect();
         let hierarchy = TwoLevelBvh::over(tiles.center, &in_order);
-        let map = DeviceMap::of_hierarchy(gpu, hierarchy)?;
+        let map = DeviceMap::upload(gpu, hierarchy)?;
         let loaded = Arc::new(Loaded::new(gpu, map, Some(&resident.loaded)));
         gpu.check()?;
         *self.resident() = Arc::new(Resident {
@@ -171,7 +152,7 @@ impl ResidentMap {
 
     #[cfg(test)]
     pub fn set_budget(&mut self, budget_bytes: u64) {
-        self.tiles.as_mut().unwrap().budget_bytes = budget_bytes;
+        self.tiles.budget_bytes = budget_bytes;
     }
 
     /// Numbers of the tiles on the device.

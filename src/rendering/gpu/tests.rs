@@ -5,12 +5,11 @@
 
 use std::cell::RefCell;
 
-use glam::DVec3;
 use nalgebra::Vector3;
 
 use super::batch_sizes::BatchSizes;
 use super::*;
-use crate::geometry::Aabb;
+use crate::geometry::TriangleMesh;
 use crate::raycasting::{Scene, TileError};
 
 /// A floor of 30 m by 30 m with steps up.
@@ -35,7 +34,7 @@ fn stairs() -> TriangleMesh {
 
 fn renderer() -> Option<GpuRenderer> {
     match GpuRenderer::new(
-        &[stairs()],
+        Arc::new(Scene::of_tiles(&[stairs()])),
         (Backend::Gpu, RenderingMethod::Auto),
         MemoryBudget::default(),
     ) {
@@ -137,7 +136,8 @@ fn a_map_that_the_device_cannot_bind_is_an_error_that_says_how_large_it_is() {
         return;
     };
     renderer.gpu.limits.max_storage_buffer_binding_size = 1 << 16;
-    let error = device_map::DeviceMap::upload(&renderer.gpu, &[stairs()]).err();
+    let hierarchy = two_level::tests::build(&[stairs()]);
+    let error = device_map::DeviceMap::upload(&renderer.gpu, hierarchy).err();
     assert!(
         matches!(
             error,
@@ -263,46 +263,16 @@ fn images_are_compared_by_the_faster_method_also_where_they_fit_no_texture() {
 }
 
 /// A street of tiles that are 40 m apart.
-#[derive(Debug)]
-struct Street {
-    tiles: Vec<TriangleMesh>,
-    scene: Scene<TileError>,
-}
-
-impl Street {
-    fn new(count: u8) -> Self {
-        let tile = |number| {
-            let mut tile = stairs();
-            for vertex in &mut tile.vertices {
-                *vertex += Vec3::new(40.0 * f32::from(number), 0.0, 0.1 * f32::from(number));
-            }
-            tile
-        };
-        let tiles: Vec<TriangleMesh> = (0..count).map(tile).collect();
-        Self {
-            scene: Scene::of_tiles(&tiles),
-            tiles,
+fn street(count: u8) -> Scene<TileError> {
+    let tile = |number| {
+        let mut tile = stairs();
+        for vertex in &mut tile.vertices {
+            *vertex += Vec3::new(40.0 * f32::from(number), 0.0, 0.1 * f32::from(number));
         }
-    }
-}
-
-impl TriangleSource for Street {
-    fn tiles(&self) -> Vec<(Aabb, u64)> {
-        let of = |tile: &TriangleMesh| (tile.bounds(), tile.triangles.len() as u64);
-        self.tiles.iter().map(of).collect()
-    }
-
-    fn triangles(&self, tile: usize) -> Result<Vec<[DVec3; 3]>, TileError> {
-        let mesh = &self.tiles[tile];
-        let corners = |triangle| mesh.corners(triangle).map(|corner| corner.as_dvec3());
-        Ok((0..mesh.triangles.len()).map(corners).collect())
-    }
-}
-
-impl SceneSource for Street {
-    fn scene(&self, _: &[DVec3]) -> Scene<TileError> {
-        self.scene.clone()
-    }
+        tile
+    };
+    let tiles: Vec<TriangleMesh> = (0..count).map(tile).collect();
+    Scene::of_tiles(&tiles)
 }
 
 #[test]
@@ -314,11 +284,12 @@ fn tiles_come_and_go_with_the_poses_and_nothing_looks_different() {
         return;
     };
     drop(renderer);
-    let street = Arc::new(Street::new(20));
+    let street = Arc::new(street(20));
     let request = (Backend::Gpu, RenderingMethod::Auto);
-    let whole = GpuRenderer::new(&street.tiles, request, MemoryBudget::default()).unwrap();
-    let mut part = GpuRenderer::over(&street, request, MemoryBudget::default()).unwrap();
-    let tile_bytes = street.tiles[0].triangles.len() as u64 * resident::TRIANGLE_BYTES;
+    let open = || GpuRenderer::new(street.clone(), request, MemoryBudget::default()).unwrap();
+    let (mut whole, mut part) = (open(), open());
+    whole.map.set_budget(u64::MAX);
+    let tile_bytes = stairs().triangles.len() as u64 * resident::TRIANGLE_BYTES;
     part.map.set_budget(FEW_TILES * tile_bytes);
     let model = LidarModel {
         max_range: 50.0,

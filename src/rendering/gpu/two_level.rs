@@ -8,11 +8,10 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use glam::{DVec3, Vec3};
-use rayon::prelude::*;
 
 use super::layout::{self, Node, Triangle};
+use crate::geometry::Aabb;
 use crate::geometry::mesh::STEP_M;
-use crate::geometry::{Aabb, TriangleMesh};
 use crate::raycasting::bvh::{Bvh, Leaves, NodeRef, PrimRef};
 use crate::raycasting::is_proper;
 
@@ -50,18 +49,7 @@ pub(super) struct TwoLevelBvh {
 }
 
 impl TwoLevelBvh {
-    /// Builds the hierarchies; triangles that are degenerate or not finite are left out.
-    pub fn build(tiles: &[TriangleMesh]) -> Self {
-        let center = center_of(tiles.iter().map(TriangleMesh::bounds));
-        let level = |mesh: &TriangleMesh| {
-            let triangles = 0..mesh.triangles.len();
-            let corners = |triangle| mesh.corners(triangle).map(|corner| corner.as_dvec3());
-            BottomLevel::build(triangles.map(corners), center).into()
-        };
-        Self::over(center, &tiles.par_iter().map(level).collect::<Vec<_>>())
-    }
-
-    /// Builds the hierarchy over those of tiles.
+    /// Builds the hierarchy over those of tiles; triangles that are degenerate or not finite are left out of them.
     pub fn over(center: DVec3, bottom_levels: &[Arc<BottomLevel>]) -> Self {
         let mut hierarchy = Self {
             center,
@@ -196,8 +184,20 @@ fn node(bounds: [[f32; 6]; 2], children: [u32; 2]) -> Node {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
+    use crate::geometry::TriangleMesh;
+
+    /// The hierarchy over all triangles of meshes.
+    pub fn build(tiles: &[TriangleMesh]) -> TwoLevelBvh {
+        let center = center_of(tiles.iter().map(TriangleMesh::bounds));
+        let level = |mesh: &TriangleMesh| {
+            let triangles = 0..mesh.triangles.len();
+            let corners = |triangle| mesh.corners(triangle).map(|corner| corner.as_dvec3());
+            Arc::new(BottomLevel::build(triangles.map(corners), center))
+        };
+        TwoLevelBvh::over(center, &tiles.iter().map(level).collect::<Vec<_>>())
+    }
 
     fn square(at: Vec3) -> TriangleMesh {
         TriangleMesh {
@@ -214,7 +214,7 @@ mod tests {
         let tiles: Vec<TriangleMesh> = (0..50_u8)
             .map(|i| square(Vec3::new(f32::from(i % 7) * 3.0, f32::from(i) * 5.0, 0.0)))
             .collect();
-        let hierarchy = TwoLevelBvh::build(&tiles);
+        let hierarchy = build(&tiles);
         let mut seen = vec![0; hierarchy.triangles.len()];
         let mut pending = vec![(hierarchy.root, Vec3::NEG_INFINITY, Vec3::INFINITY)];
         while let Some((child, low, high)) = pending.pop() {
@@ -247,7 +247,7 @@ mod tests {
             TriangleMesh::default(),
             square(9.0 * Vec3::X),
         ];
-        let hierarchy = TwoLevelBvh::build(&tiles);
+        let hierarchy = build(&tiles);
         let ranges: Vec<_> = hierarchy
             .tiles
             .iter()
@@ -266,7 +266,7 @@ mod tests {
         let mut mesh = square(Vec3::ZERO);
         mesh.vertices.extend([Vec3::NAN, Vec3::new(0.5, 0.5, 0.0)]);
         mesh.triangles.extend([[0, 1, 4], [0, 2, 5], [3, 3, 1]]);
-        assert_eq!(TwoLevelBvh::build(&[mesh]).triangles.len(), 2);
-        assert!(TwoLevelBvh::build(&[]).triangles.is_empty());
+        assert_eq!(build(&[mesh]).triangles.len(), 2);
+        assert!(build(&[]).triangles.is_empty());
     }
 }
