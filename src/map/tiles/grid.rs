@@ -10,12 +10,13 @@
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 
+use glam::DVec3;
 use nalgebra::Point2;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use crate::geometry::{Aabb, Pose2, Pose3, TriangleMesh, Vec3};
-use crate::map::mesh_view::MeshView;
+use crate::map::mesh_view::{MeshView, part_on_lattice};
 
 /// Division of the map into tiles.
 ///
@@ -215,10 +216,9 @@ fn center(tile: TileIndex, side_m: f64) -> Point2<f64> {
 ///
 /// Each triangle is assigned to the tile of its centroid. The order of triangles and vertices is preserved.
 pub fn cut(mesh: &TriangleMesh, side_m: f64) -> Vec<(TileIndex, TriangleMesh)> {
-    let mut extractor = Extractor::of(mesh);
     triangles_of_tiles(mesh, side_m)
         .into_iter()
-        .map(|(tile, triangles)| (tile, extractor.extract(&triangles)))
+        .map(|(tile, triangles)| (tile, part_on_lattice(mesh, &triangles, DVec3::ZERO)))
         .collect()
 }
 
@@ -235,55 +235,6 @@ pub(crate) fn triangles_of_tiles(
         triangles_of.entry(tile).or_default().push(triangle as u32);
     }
     triangles_of
-}
-
-/// Extracts parts of a mesh.
-struct Extractor<'a> {
-    mesh: &'a TriangleMesh,
-    /// Index of each vertex in the part that is being extracted; `u32::MAX` for those that are not in it.
-    local_index: Vec<u32>,
-}
-
-impl<'a> Extractor<'a> {
-    fn of(mesh: &'a TriangleMesh) -> Self {
-        Self {
-            mesh,
-            local_index: vec![u32::MAX; mesh.vertices.len()],
-        }
-    }
-
-    /// The mesh of some triangles.
-    fn extract(&mut self, triangles: &[u32]) -> TriangleMesh {
-        let (mesh, local_index) = (self.mesh, &mut self.local_index);
-        let corners = |triangle: u32| mesh.triangles[triangle as usize];
-        let mut used: Vec<u32> = triangles.iter().flat_map(|&t| corners(t)).collect();
-        used.sort_unstable();
-        used.dedup();
-        for (local, &vertex) in used.iter().enumerate() {
-            local_index[vertex as usize] = local as u32;
-        }
-        let part = TriangleMesh {
-            vertices: pick(&mesh.vertices, &used),
-            normals: pick(&mesh.normals, &used),
-            colors: pick(&mesh.colors, &used),
-            triangles: triangles
-                .iter()
-                .map(|&triangle| corners(triangle).map(|v| local_index[v as usize]))
-                .collect(),
-        };
-        for &vertex in &used {
-            local_index[vertex as usize] = u32::MAX;
-        }
-        part
-    }
-}
-
-/// Returns the entries of a column at some rows; an empty column stays empty.
-fn pick<T: Copy>(column: &[T], rows: &[u32]) -> Vec<T> {
-    if column.is_empty() {
-        return Vec::new();
-    }
-    rows.iter().map(|&row| column[row as usize]).collect()
 }
 
 #[cfg(test)]
@@ -310,7 +261,6 @@ mod tests {
                 let first = mesh.vertices.len() as u32;
                 for offset in [Vec3::ZERO, Vec3::X, Vec3::Y] {
                     mesh.vertices.push(corner + 7.0 * offset);
-                    mesh.colors.push([row as u8, column as u8, 0]);
                 }
                 mesh.triangles.push([first, first + 1, first + 2]);
             }
@@ -364,24 +314,19 @@ mod tests {
     }
 
     #[test]
-    fn every_triangle_is_in_exactly_one_tile_with_its_corners_and_colors() {
+    fn every_triangle_is_in_exactly_one_tile() {
         let mesh = sheet();
         let parts = cut(&mesh, 100.0);
         assert_eq!(parts.len(), 15);
         let mut found: Vec<_> = parts
             .iter()
             .flat_map(|(_, part)| {
-                (0..part.triangles.len()).map(|triangle| {
-                    let color = part.colors[part.triangles[triangle][0] as usize];
-                    (color, part.corners(triangle).map(|c| c.to_array()))
-                })
+                (0..part.triangles.len())
+                    .map(|triangle| part.corners(triangle).map(|c| c.to_array()))
             })
             .collect();
         let mut expected: Vec<_> = (0..mesh.triangles.len())
-            .map(|triangle| {
-                let color = mesh.colors[mesh.triangles[triangle][0] as usize];
-                (color, mesh.corners(triangle).map(|c| c.to_array()))
-            })
+            .map(|triangle| mesh.corners(triangle).map(|c| c.to_array()))
             .collect();
         found.sort_by(|a, b| a.partial_cmp(b).unwrap());
         expected.sort_by(|a, b| a.partial_cmp(b).unwrap());
