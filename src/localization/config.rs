@@ -65,23 +65,6 @@ pub struct LocalizerConfig {
     pub panorama: PanoramaConfig,
 }
 
-#[cfg(test)]
-impl LocalizerConfig {
-    /// Small enough for a test, else the defaults.
-    pub fn of_test(num_particles: usize) -> Self {
-        Self {
-            num_particles,
-            observation: ObservationConfig {
-                beams: 600,
-                min_beams: 150,
-                ray_budget: 60_000,
-                ..ObservationConfig::default()
-            },
-            ..Self::default()
-        }
-    }
-}
-
 /// Largest number of particles.
 const MAX_PARTICLES: usize = 1_000_000;
 

@@ -9,10 +9,27 @@ use nalgebra::Vector2;
 use super::*;
 use crate::geometry::TriangleMesh;
 use crate::lidar::LidarModel;
+use crate::localization::ObservationConfig;
 use crate::localization::State;
 use crate::map::world_for_tests::TestWorld;
 use crate::map::{MapCache, MapOptions, MappingPath, TileConfig, TileGrid};
 use crate::rendering::Backend;
+
+impl LocalizerConfig {
+    /// Small enough for a test, else the defaults.
+    pub fn of_test(num_particles: usize) -> Self {
+        Self {
+            num_particles,
+            observation: ObservationConfig {
+                beams: 600,
+                min_beams: 150,
+                ray_budget: 60_000,
+                ..ObservationConfig::default()
+            },
+            ..Self::default()
+        }
+    }
+}
 
 /// A localizer runs on one thread at a time, a map is shared by several.
 const _: () = {

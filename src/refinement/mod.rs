@@ -22,18 +22,3 @@ pub use trajectory::{
     FrameResult, InitialEstimate, RefinedTrajectory, RefinerConfig, RefinerError, TrajectoryRefiner,
 };
 pub use wide_search::WideSearchConfig;
-
-#[cfg(test)]
-impl crate::map::world_for_tests::TestWorld {
-    /// The objective of a scan from the street.
-    fn objective<'a>(&'a self, beams: &'a [crate::lidar::Beam]) -> objective::FrameObjective<'a> {
-        objective::FrameObjective {
-            renderer: self,
-            ground: &self.ground,
-            beams,
-            level_m: None,
-            attitude: crate::map::SensorAttitude::default(),
-            difference: crate::rendering::RangeDifference::truncated(0.5),
-        }
-    }
-}

@@ -203,6 +203,20 @@ mod tests {
     use super::*;
     use crate::map::world_for_tests::TestWorld;
 
+    impl TestWorld {
+        /// The objective of a scan from the street.
+        pub fn objective<'a>(&'a self, beams: &'a [Beam]) -> FrameObjective<'a> {
+            FrameObjective {
+                renderer: self,
+                ground: &self.ground,
+                beams,
+                level_m: None,
+                attitude: SensorAttitude::default(),
+                difference: RangeDifference::truncated(0.5),
+            }
+        }
+    }
+
     #[test]
     fn second_differences_of_a_quadratic_are_its_matrix() {
         let matrix = Matrix3::new(4.0, 0.5, -0.2, 0.5, 2.0, 0.1, -0.2, 0.1, 1.0);

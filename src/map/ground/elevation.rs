@@ -128,34 +128,10 @@ pub struct GroundMap {
 }
 
 impl GroundMap {
-    /// Builds the elevation map of the triangles for which `is_ground` holds, in cells of `cell_m`.
-    #[cfg(test)]
-    pub(crate) fn from_mesh(
-        mesh: &crate::geometry::TriangleMesh,
-        is_ground: impl Fn(usize) -> bool,
-        cell_m: f64,
-    ) -> Self {
-        let ground = (0..mesh.triangles.len()).filter(|&triangle| is_ground(triangle));
-        Self {
-            heights: Heights::of_triangles(
-                ground.map(|triangle| mesh.corners(triangle).map(|corner| corner.as_dvec3())),
-                cell_m,
-            ),
-        }
-    }
-
     /// The elevation map whose chunks a source supplies, in cells of `cell_m`.
     pub(crate) fn over(chunks: Arc<dyn ChunkSource>, cell_m: f64) -> Self {
         Self {
             heights: Heights::over(chunks, cell_m),
-        }
-    }
-
-    /// Flat ground in a rectangle.
-    #[cfg(test)]
-    pub(crate) fn flat(min: Point2<f64>, max: Point2<f64>, height_m: f64) -> Self {
-        Self {
-            heights: Heights::flat(min, max, height_m, 1.0),
         }
     }
 

@@ -6,6 +6,30 @@ use super::*;
 use crate::geometry::TriangleMesh;
 use crate::geometry::pose2_from_pose3;
 
+impl GroundMap {
+    /// Builds the elevation map of the triangles for which `is_ground` holds, in cells of `cell_m`.
+    pub(crate) fn from_mesh(
+        mesh: &TriangleMesh,
+        is_ground: impl Fn(usize) -> bool,
+        cell_m: f64,
+    ) -> Self {
+        let ground = (0..mesh.triangles.len()).filter(|&triangle| is_ground(triangle));
+        Self {
+            heights: Heights::of_triangles(
+                ground.map(|triangle| mesh.corners(triangle).map(|corner| corner.as_dvec3())),
+                cell_m,
+            ),
+        }
+    }
+
+    /// Flat ground in a rectangle.
+    pub(crate) fn flat(min: Point2<f64>, max: Point2<f64>, height_m: f64) -> Self {
+        Self {
+            heights: Heights::flat(min, max, height_m, 1.0),
+        }
+    }
+}
+
 /// A square of 40 m with a slope along x.
 fn slope(grade: f32) -> TriangleMesh {
     let at = |x: f32, y: f32| Vec3::new(x, y, grade * x);

@@ -68,29 +68,9 @@ impl ChunkSource for Chunks {
 }
 
 impl Heights {
-    /// Averages the heights of triangles per cell and level: one sample in each cell whose centre a
-    /// triangle covers, and one at each of its corners.
-    #[cfg(test)]
-    pub fn of_triangles(corners: impl Iterator<Item = [DVec3; 3]>, cell_m: f64) -> Self {
-        Self::over(Arc::new(chunks_of_triangles(corners, cell_m)), cell_m)
-    }
-
     /// Heights that a source supplies.
     pub fn over(chunks: Arc<dyn ChunkSource>, cell_m: f64) -> Self {
         Self { cell_m, chunks }
-    }
-
-    /// One height for every cell of a rectangle.
-    #[cfg(test)]
-    pub fn flat(min: Point2<f64>, max: Point2<f64>, height_m: f64, cell_m: f64) -> Self {
-        let mut samples = HeightSamples::default();
-        let (first, last) = (cell_of(min, cell_m), cell_of(max, cell_m));
-        for row in first.1..=last.1 {
-            for column in first.0..=last.0 {
-                samples.add((column, row), height_m);
-            }
-        }
-        Self::over(Arc::new(samples.into_chunks()), cell_m)
     }
 
     /// Returns the cell of a position; `None` if a coordinate is not finite.
@@ -282,6 +262,26 @@ pub(crate) fn rasterize(corners: [DVec3; 3], cell_m: f64, add: &mut impl FnMut(C
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    impl Heights {
+        /// Averages the heights of triangles per cell and level: one sample in each cell whose centre a
+        /// triangle covers, and one at each of its corners.
+        pub fn of_triangles(corners: impl Iterator<Item = [DVec3; 3]>, cell_m: f64) -> Self {
+            Self::over(Arc::new(chunks_of_triangles(corners, cell_m)), cell_m)
+        }
+
+        /// One height for every cell of a rectangle.
+        pub fn flat(min: Point2<f64>, max: Point2<f64>, height_m: f64, cell_m: f64) -> Self {
+            let mut samples = HeightSamples::default();
+            let (first, last) = (cell_of(min, cell_m), cell_of(max, cell_m));
+            for row in first.1..=last.1 {
+                for column in first.0..=last.0 {
+                    samples.add((column, row), height_m);
+                }
+            }
+            Self::over(Arc::new(samples.into_chunks()), cell_m)
+        }
+    }
 
     #[test]
     fn the_center_of_a_cell_is_in_the_cell_on_both_sides_of_the_origin() {
