@@ -8,7 +8,7 @@ use glam::Vec3;
 use super::bitmap::Bitmap;
 use super::color::Rgb;
 use super::sheet::save_png;
-use super::view::{AxisRange, LegendEntry, Mark, TopView, WIDTH};
+use super::view::{AxisRange, LegendEntry, Mark, TopView};
 
 /// Color of points correctly classified as ground.
 const GROUND: Rgb = [0, 158, 115];
@@ -54,7 +54,6 @@ impl GroundPlot<'_> {
         let (x_m, y_m) = self.reach_m;
         let view = TopView {
             title: self.title,
-            width: WIDTH,
             legend,
             x: AxisRange::new(-x_m, x_m),
             y: AxisRange::new(-y_m, y_m),

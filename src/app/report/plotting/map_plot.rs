@@ -8,7 +8,7 @@ use super::MapImage;
 use super::bitmap::Bitmap;
 use super::color::{Colormap, MISSING, Rgb, TRUTH, WHITE};
 use super::sheet::{save_png, stroke};
-use super::view::{AxisRange, ColorBar, LegendEntry, Mark, TopView, WIDTH, positions};
+use super::view::{AxisRange, ColorBar, LegendEntry, Mark, TopView, positions};
 use crate::geometry::{Pose2, TriangleMesh};
 
 /// Maximum number of columns and rows of the raster: the resolution of drawing.
@@ -67,7 +67,6 @@ impl MapPlot<'_> {
         let driven = (self.path).map(|(name, _)| LegendEntry::new(name, TRUTH, Mark::Line));
         let view = TopView {
             title: self.title,
-            width: WIDTH,
             legend: colors.chain(driven).collect(),
             x: range(bounds.min.x, bounds.max.x),
             y: range(bounds.min.y, bounds.max.y),

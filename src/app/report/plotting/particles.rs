@@ -8,7 +8,7 @@ use super::MapImage;
 use super::bitmap::Bitmap;
 use super::color::{Colormap, MCL, Rgb, TRUTH, WHITE};
 use super::sheet::{Point, Sheet, save_png, stroke};
-use super::view::{AxisRange, ColorBar, LegendEntry, Mark, TopView, View, WIDTH, positions};
+use super::view::{AxisRange, ColorBar, LegendEntry, Mark, TopView, View, positions};
 use crate::evaluation::ParticleRow;
 use crate::geometry::Pose2;
 
@@ -49,7 +49,6 @@ impl LocalizationPicture<'_> {
         let entries = [particles, truth, estimate, driven].into_iter().flatten();
         let view = TopView {
             title: self.title,
-            width: WIDTH,
             legend: entries
                 .map(|(name, color, mark)| LegendEntry::new(name, color, mark))
                 .collect(),

@@ -9,7 +9,7 @@ use super::bitmap::Bitmap;
 use super::chart::{LineChart, Panel, Series};
 use super::color::{Colormap, Rgb, TRUTH, WHITE};
 use super::sheet::{HPos, Sheet, TICK, VPos, bold, save_png, stroke, text_style};
-use super::view::{AxisRange, ColorBar, LegendEntry, Mark, TopView, View, WIDTH, positions};
+use super::view::{AxisRange, ColorBar, LegendEntry, Mark, TopView, View, positions};
 use crate::evaluation::{
     DriftPoint, LengthErrors, PlanarError, SpatialMetrics, aligned, drift, rigid_alignment,
 };
@@ -50,7 +50,6 @@ impl PathPlot<'_> {
         let entries = plain.iter();
         let view = TopView {
             title: self.title,
-            width: WIDTH,
             legend: entries
                 .map(|&(name, color, _)| LegendEntry::new(name, color, Mark::Line))
                 .collect(),

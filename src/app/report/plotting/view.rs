@@ -329,14 +329,9 @@ impl ColorBar<'_> {
     }
 }
 
-/// Width of a picture [px].
-pub const WIDTH: f64 = 1400.0;
-
 /// Picture of the x-y plane without its content.
 pub struct TopView<'a> {
     pub title: &'a str,
-    /// Width [px].
-    pub width: f64,
     pub legend: Vec<LegendEntry>,
     /// Visible range of x [m].
     pub x: AxisRange,
@@ -348,17 +343,19 @@ pub struct TopView<'a> {
 impl TopView<'_> {
     /// Draws the picture; `content` draws over the grid and below the frame.
     pub fn draw(&self, content: impl FnOnce(&Sheet, &View) -> Result<()>) -> Result<Bitmap> {
+        /// Of the picture [px].
+        const WIDTH: f64 = 1400.0;
         const LEFT: f64 = 118.0;
         // The legend is in a line of its own.
         let top = if self.legend.is_empty() { 66.0 } else { 96.0 };
-        let right = self.width
-            - if self.color_bar.is_some() {
-                150.0
-            } else {
-                30.0
-            };
-        let height = ((right - LEFT) * self.y.length() / self.x.length())
-            .clamp(0.27 * self.width, 0.82 * self.width);
+        let margin = if self.color_bar.is_some() {
+            150.0
+        } else {
+            30.0
+        };
+        let right = WIDTH - margin;
+        let height =
+            ((right - LEFT) * self.y.length() / self.x.length()).clamp(0.27 * WIDTH, 0.82 * WIDTH);
         let rect = Rect {
             left: LEFT,
             top,
@@ -366,7 +363,7 @@ impl TopView<'_> {
             bottom: top + height.round(),
         };
         let view = View::equal(rect, self.x, self.y);
-        sheet::draw((self.width as u32, (rect.bottom + 74.0) as u32), |sheet| {
+        sheet::draw((WIDTH as u32, (rect.bottom + 74.0) as u32), |sheet| {
             sheet.title(self.title, LEFT)?;
             legend(sheet, &self.legend, (LEFT, 70.0), right)?;
             view.grid(sheet, &view.x_ticks())?;
