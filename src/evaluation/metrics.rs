@@ -8,14 +8,14 @@ use smart_default::SmartDefault;
 
 use super::convergence::{Convergence, StrictSuccess};
 use super::planar::{PlanarError, distances_m, planar_errors};
-use super::pose_error::{Pairs, SegmentErrors, kitti_segment_errors, relative_pose_error};
+use super::pose_error::{SegmentErrors, kitti_segment_errors, relative_pose_error};
 use super::smoothness::{jitter_m, log_dimensionless_jerk, mean_pose_change};
 use super::statistics::{Summary, mean, rms, slope};
 use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
 
 /// Parameters of the metrics.
 ///
-/// Defaults: ten frames to converge; relative errors from frame to frame.
+/// Default: ten frames to converge.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[serde(default, deny_unknown_fields)]
 pub struct MetricsConfig {
@@ -24,9 +24,6 @@ pub struct MetricsConfig {
     pub skip_frames: usize,
     /// Limits of the errors after convergence.
     pub success: StrictSuccess,
-    /// Pairs of poses that the relative pose error compares.
-    #[default(Pairs::Frames(1))]
-    pub rpe_pairs: Pairs,
 }
 
 /// A trajectory with its ground truth, one entry of each per frame.
@@ -153,7 +150,7 @@ impl TrajectoryMetrics {
             level_poses(counted.estimates),
             level_poses(counted.ground_truth),
         );
-        let relative = relative_pose_error(&estimates, &truth, config.rpe_pairs);
+        let relative = relative_pose_error(&estimates, &truth);
         Some(Self {
             frames: errors.len(),
             distance_m: *driven_m.last()?,

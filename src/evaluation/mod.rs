@@ -27,8 +27,7 @@ pub use metrics::{
 };
 pub use planar::PlanarError;
 pub use pose_error::{
-    Pairs, PoseErrors, SegmentErrors, absolute_pose_error, kitti_segment_errors,
-    relative_pose_error,
+    PoseErrors, SegmentErrors, absolute_pose_error, kitti_segment_errors, relative_pose_error,
 };
 pub use spatial::{LengthErrors, SpatialMetrics};
 pub use statistics::Summary;
