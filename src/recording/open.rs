@@ -104,15 +104,8 @@ impl Recording {
         }
         Ok(Self {
             path: path.to_owned(),
-            files,
-            scans: count,
-            has_times,
-            frames,
             skipped,
-            track: None,
-            body_from_lidar: None,
-            #[cfg(feature = "bags")]
-            bag: None,
+            ..Self::new(files, count, has_times, frames)
         })
     }
 
@@ -141,14 +134,9 @@ impl Recording {
         let (frames, skipped) = selection.of(frames, |frame: &Frame| frame.number, path)?;
         Ok(Self {
             path: path.to_owned(),
-            files: RecordingFiles::bag(path),
-            scans: times_s.len(),
-            has_times: true,
-            frames,
             skipped,
-            track: None,
-            body_from_lidar: None,
             bag: Some((bag, topic)),
+            ..Self::new(RecordingFiles::bag(path), times_s.len(), true, frames)
         })
     }
 
@@ -162,12 +150,18 @@ impl Recording {
             let time_s = scan.time_s.filter(|_| has_times).unwrap_or(assumed_s);
             Frame::new(number, ScanSource::Memory(scan), time_s)
         };
+        let count = scans.len();
+        let frames = scans.into_iter().enumerate().map(frame).collect();
+        Self::new(RecordingFiles::memory(), count, has_times, frames)
+    }
+
+    fn new(files: RecordingFiles, scans: usize, has_times: bool, frames: Vec<Frame>) -> Self {
         Self {
             path: PathBuf::new(),
-            files: RecordingFiles::memory(),
-            scans: scans.len(),
+            files,
+            scans,
             has_times,
-            frames: scans.into_iter().enumerate().map(frame).collect(),
+            frames,
             skipped: vec![],
             track: None,
             body_from_lidar: None,
