@@ -127,19 +127,13 @@ fn columns_of(fields: &[Field]) -> Result<Vec<Column>, String> {
 }
 
 fn number_type(plain: &TypeStr) -> Option<NumberType> {
-    Some(match (plain.type_char(), plain.size_field()) {
-        (TypeChar::Int, 1) => NumberType::I8,
-        (TypeChar::Int, 2) => NumberType::I16,
-        (TypeChar::Int, 4) => NumberType::I32,
-        (TypeChar::Int, 8) => NumberType::I64,
-        (TypeChar::Uint, 1) => NumberType::U8,
-        (TypeChar::Uint, 2) => NumberType::U16,
-        (TypeChar::Uint, 4) => NumberType::U32,
-        (TypeChar::Uint, 8) => NumberType::U64,
-        (TypeChar::Float, 4) => NumberType::F32,
-        (TypeChar::Float, 8) => NumberType::F64,
+    let kind = match plain.type_char() {
+        TypeChar::Int => "I",
+        TypeChar::Uint => "U",
+        TypeChar::Float => "F",
         _ => return None,
-    })
+    };
+    NumberType::of(kind, plain.size_field())
 }
 
 #[cfg(test)]

@@ -50,7 +50,8 @@ pub fn parse(bytes: &[u8]) -> Result<Table<'_>, String> {
             };
             Ok(Field {
                 name: names[index].clone(),
-                number_type: number_type(size, kind)
+                number_type: (size.parse().ok())
+                    .and_then(|bytes| NumberType::of(kind, bytes))
                     .ok_or_else(|| format!("has a field of type {kind} and size {size}"))?,
                 count: count.ok_or("is damaged: a COUNT is not a number")?,
             })
@@ -68,22 +69,6 @@ pub fn parse(bytes: &[u8]) -> Result<Table<'_>, String> {
             other.unwrap_or("")
         )),
     }
-}
-
-fn number_type(size: &str, kind: &str) -> Option<NumberType> {
-    Some(match (kind, size) {
-        ("I", "1") => NumberType::I8,
-        ("I", "2") => NumberType::I16,
-        ("I", "4") => NumberType::I32,
-        ("I", "8") => NumberType::I64,
-        ("U", "1") => NumberType::U8,
-        ("U", "2") => NumberType::U16,
-        ("U", "4") => NumberType::U32,
-        ("U", "8") => NumberType::U64,
-        ("F", "4") => NumberType::F32,
-        ("F", "8") => NumberType::F64,
-        _ => return None,
-    })
 }
 
 /// Places of the fields: point after point, or, with the number of points, field after field.

@@ -22,6 +22,23 @@ pub enum NumberType {
 }
 
 impl NumberType {
+    /// The type of a kind, `I` (signed), `U` (unsigned) or `F` (floating point), and a size in bytes.
+    pub fn of(kind: &str, bytes: u64) -> Option<Self> {
+        Some(match (kind, bytes) {
+            ("I", 1) => Self::I8,
+            ("I", 2) => Self::I16,
+            ("I", 4) => Self::I32,
+            ("I", 8) => Self::I64,
+            ("U", 1) => Self::U8,
+            ("U", 2) => Self::U16,
+            ("U", 4) => Self::U32,
+            ("U", 8) => Self::U64,
+            ("F", 4) => Self::F32,
+            ("F", 8) => Self::F64,
+            _ => return None,
+        })
+    }
+
     /// Size in bytes.
     pub fn size(self) -> usize {
         match self {
