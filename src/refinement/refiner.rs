@@ -270,7 +270,8 @@ fn search(
     config: &FrameRefinementConfig,
     rng: &mut impl Rng,
 ) -> Result<(), RenderError> {
-    let dimensions = search_space(&frame.pose, &frame.covariance, config);
+    let reach = config.reach(&frame.covariance);
+    let dimensions = Dimension::around(&frame.pose, reach, 0.5);
     let patch = objective
         .ground
         .patch_under(&frame.pose, objective.level_m)?;
@@ -296,23 +297,6 @@ fn search(
         frame.cost_after_m = cost_m;
     }
     Ok(())
-}
-
-/// Search space of x, y and heading around the estimate, as large as its uncertainty.
-fn search_space(
-    pose: &Pose2,
-    covariance: &Matrix3<f64>,
-    config: &FrameRefinementConfig,
-) -> [Dimension; 3] {
-    let reach = config.reach(covariance);
-    let t = pose.translation;
-    let start = [t.x, t.y, pose.rotation.angle()];
-    [0, 1, 2].map(|axis| Dimension {
-        start: start[axis],
-        spread: 0.5 * reach[axis],
-        reach: reach[axis],
-        is_circular: axis == 2,
-    })
 }
 
 fn pose_of(&[x, y, heading_rad]: &[f64; 3]) -> Pose2 {

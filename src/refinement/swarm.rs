@@ -15,7 +15,7 @@ use rand_distr::StandardNormal;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use crate::geometry::wrap_angle;
+use crate::geometry::{Pose2, wrap_angle};
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Parameters of the swarm.
@@ -80,6 +80,19 @@ pub struct Dimension {
 }
 
 impl Dimension {
+    /// x, y and heading around a pose, up to a reach of each, of which `spread` is the standard deviation of the initial
+    /// candidates.
+    pub fn around(pose: &Pose2, reach: [f64; 3], spread: f64) -> [Self; 3] {
+        let t = pose.translation;
+        let start = [t.x, t.y, pose.rotation.angle()];
+        [0, 1, 2].map(|axis| Self {
+            start: start[axis],
+            spread: spread * reach[axis],
+            reach: reach[axis],
+            is_circular: axis == 2,
+        })
+    }
+
     /// `a - b`, wrapped for angles.
     fn difference(&self, a: f64, b: f64) -> f64 {
         if self.is_circular {

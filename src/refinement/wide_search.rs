@@ -103,14 +103,7 @@ pub fn search(
             .sum();
         sum / returns.len() as f64
     };
-    let start = [center.x, center.y, estimate.rotation.angle()];
-    let dimension = |axis: usize| Dimension {
-        start: start[axis],
-        spread: 0.6 * reach[axis],
-        reach: reach[axis],
-        is_circular: axis == 2,
-    };
-    let dimensions = [0, 1, 2].map(dimension);
+    let dimensions = Dimension::around(estimate, reach, 0.6);
     // Each with a stream of its own, for the same result with any number of threads.
     let seeds: Vec<u64> = (0..config.swarms).map(|_| rng.random()).collect();
     let mut minima = (seeds.into_par_iter())
