@@ -30,6 +30,9 @@ pub struct PathPlot<'a> {
     pub map: Option<&'a MapImage>,
 }
 
+/// Width of the last line [pixels].
+const LINE_WIDTH: f64 = 3.0;
+
 impl PathPlot<'_> {
     /// Writes the picture.
     pub fn save(&self, path: &Path) -> Result<()> {
@@ -61,15 +64,17 @@ impl PathPlot<'_> {
             if let Some(map) = self.map {
                 map.draw(sheet, view, 0.5)?;
             }
-            for &(_, color, poses) in plain {
-                let width = if color == TRUTH { 6.0 } else { 2.5 };
-                sheet.polyline(&positions(poses, view), &view.rect, stroke(color, width))?;
+            // Where lines coincide, the rims of the earlier ones are visible.
+            let width = |row: usize| LINE_WIDTH * (all.len() - row).min(3) as f64;
+            for (row, &(_, color, poses)) in plain.iter().enumerate() {
+                let stroke = stroke(color, width(row));
+                sheet.polyline(&positions(poses, view), &view.rect, stroke)?;
             }
             if let (Some(bar), Some((_, numbers))) = (color_bar, self.numbers) {
                 let places = positions(colored[0].2, view);
                 for (pair, numbers) in places.windows(2).zip(numbers.windows(2)) {
                     let color = bar.color(0.5 * (numbers[0] + numbers[1]));
-                    sheet.polyline(pair, &view.rect, stroke(color, 4.5))?;
+                    sheet.polyline(pair, &view.rect, stroke(color, LINE_WIDTH))?;
                 }
             }
             draw_ends(sheet, view, all[0].2)
