@@ -4,7 +4,8 @@
 use divan::{Bencher, black_box};
 use fpmcl::geometry::Vec3;
 use fpmcl::ground::{
-    FuzzyConfig, FuzzyGround, GroundClassifier, Inference, PcaGround, RansacGround, road_plane,
+    FuzzyConfig, FuzzyGround, GroundClassifier, Inference, PcaGround, RansacGround, RoadConfig,
+    road_plane,
 };
 
 fn main() {
@@ -94,5 +95,5 @@ fn ransac(bencher: Bencher, columns: usize) {
 fn plane_of_the_road(bencher: Bencher, columns: usize) {
     let points = street(columns);
     let ground = fuzzy(FuzzyConfig::default()).ground_confidence(&points);
-    bencher.bench(|| road_plane(black_box(&points), &ground));
+    bencher.bench(|| road_plane(black_box(&points), &ground, &RoadConfig::default()));
 }

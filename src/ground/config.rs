@@ -6,6 +6,7 @@ use super::classifier::GroundClassifier;
 use super::fuzzy::{FuzzyConfig, FuzzyGround};
 use super::pca::{PcaGround, ReportRule};
 use super::ransac::RansacGround;
+use super::road::RoadConfig;
 use crate::validation::{InvalidValue, Validate, nested};
 
 /// Method of ground segmentation.
@@ -35,6 +36,8 @@ pub struct GroundConfig {
     pub pca: PcaGround,
     /// Parameters of the RANSAC plane.
     pub ransac: RansacGround,
+    /// Ground from which the plane of the road is computed, for the attitude of the sensor.
+    pub road: RoadConfig,
 }
 
 /// A classifier with its name for tables.
@@ -81,13 +84,24 @@ impl Validate for GroundConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         nested("fuzzy", &self.fuzzy)?;
         nested("pca", &self.pca)?;
-        nested("ransac", &self.ransac)
+        nested("ransac", &self.ransac)?;
+        nested("road", &self.road)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_impossible_limit_of_the_ground_is_named() {
+        let mut config = GroundConfig::default();
+        config.road.min_width_m2 = 0.0;
+        assert_eq!(config.validate().unwrap_err().key, "road.min_width_m2");
+        config.fuzzy.features.terrain.plane_share = 1.5;
+        let error = config.validate().unwrap_err();
+        assert_eq!(error.key, "fuzzy.features.terrain.plane_share");
+    }
 
     #[test]
     fn the_configured_method_comes_first_of_all() {

@@ -19,7 +19,7 @@ use super::polar_grid::PolarPosition;
 use super::surface::{BLOCK, MIN_POINTS_PER_TASK, ScanIndex, Shape};
 use super::terrain::{Terrain, TerrainConfig};
 use crate::simd::{Simd, SimdTask, dispatch};
-use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
+use crate::validation::{InvalidValue, Validate, in_range, nested, not_negative};
 
 /// Parameters of the features.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
@@ -40,14 +40,7 @@ impl Validate for FeatureConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         in_range("spacing_m", self.spacing_m, 0.001..=10.0)?;
         not_negative("min_distance_m", self.min_distance_m)?;
-        positive("terrain.step_m", self.terrain.step_m)?;
-        not_negative("terrain.max_slope", self.terrain.max_slope)?;
-        positive("terrain.max_jump_m", self.terrain.max_jump_m)?;
-        not_negative("terrain.max_fall_slope", self.terrain.max_fall_slope)?;
-        positive("terrain.max_fall_m", self.terrain.max_fall_m)?;
-        positive("terrain.clearance_m", self.terrain.clearance_m)?;
-        positive("terrain.start_radius_m", self.terrain.start_radius_m)?;
-        positive("terrain.max_low_slope_rad", self.terrain.max_low_slope_rad)
+        nested("terrain", &self.terrain)
     }
 }
 

@@ -37,6 +37,6 @@ pub use inference::Inference;
 pub use membership::{MembershipFunction, Operators};
 pub use pca::{PcaGround, ReportRule};
 pub use ransac::RansacGround;
-pub use road::{RoadPlane, road_plane};
+pub use road::{RoadConfig, RoadPlane, road_plane};
 pub use rules::Vocabulary;
 pub use terrain::TerrainConfig;

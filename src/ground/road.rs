@@ -2,6 +2,10 @@
 //! pitch above ground.
 
 use glam::{DMat3, DVec3, Vec3};
+use serde::{Deserialize, Serialize};
+use smart_default::SmartDefault;
+
+use crate::validation::{InvalidValue, Validate, fraction, in_range, positive};
 
 /// The plane of the ground around the sensor, in the lidar frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -12,11 +16,41 @@ pub struct RoadPlane {
     pub height_m: f64,
 }
 
-/// Radius around the sensor within which the road is taken as plane [m].
-const RADIUS_M: f32 = 12.0;
-/// Standard deviation of the weight over the distance, so that the road outweighs what lies
-/// next to it [m].
-const NEARNESS_M: f64 = 5.0;
+/// Ground from which the plane of the road is computed.
+///
+/// Defaults: our own values.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
+#[serde(default, deny_unknown_fields)]
+pub struct RoadConfig {
+    /// Radius around the sensor within which the road is taken as plane [m].
+    #[default(12.0)]
+    pub road_radius_m: f32,
+    /// Standard deviation of the weight over the distance, so that the road outweighs what lies next to it [m].
+    #[default(5.0)]
+    pub nearness_m: f64,
+    /// Least confidence of a point of the ground, 0 to 1.
+    #[default(0.5)]
+    pub min_confidence: f32,
+    /// Least number of cells of 0.5 m with ground; with fewer there is no plane.
+    #[default(30)]
+    pub min_ground_cells: usize,
+    /// Least variance of their positions in the narrowest direction: a strip on one side of the sensor determines no
+    /// tilt [m²].
+    #[default(0.5)]
+    pub min_width_m2: f64,
+}
+
+impl Validate for RoadConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        in_range("road_radius_m", self.road_radius_m, 1.0..=200.0)?;
+        positive("nearness_m", self.nearness_m)?;
+        fraction("min_confidence", self.min_confidence)?;
+        in_range("min_ground_cells", self.min_ground_cells, 3..=100_000)?;
+        positive("min_width_m2", self.min_width_m2)
+    }
+}
+
 /// Scales of Tukey's weights, from where the tilt is unknown down to where a kerb is an outlier [m].
 const SCALES_M: [f64; 12] = [
     0.3, 0.2, 0.13, 0.09, 0.06, 0.04, 0.03, 0.02, 0.02, 0.02, 0.02, 0.02,
@@ -24,18 +58,16 @@ const SCALES_M: [f64; 12] = [
 /// Edge of the cells in which points are averaged, so that dense rings near the car do not
 /// outweigh the rest [m].
 const CELL_M: f32 = 0.5;
-/// Minimum number of cells with ground.
-const MIN_CELLS: usize = 30;
-/// Minimum confidence of a ground point.
-const MIN_CONFIDENCE: f32 = 0.5;
+/// Number of points from which on a cell of more is not more certain.
+const MOST_COUNTED: f64 = 8.0;
 
 /// Fits the plane of the ground around the sensor: least squares with Tukey's weights over
-/// cells of 0.5 m within 12 m, weighted by the confidences of the points.
+/// cells of 0.5 m, weighted by the confidences of the points.
 ///
 /// `None` where there is too little ground, or only on one side of the sensor.
-pub fn road_plane(points: &[Vec3], confidences: &[f32]) -> Option<RoadPlane> {
-    let cells = ground_cells(points, confidences);
-    if cells.len() < MIN_CELLS {
+pub fn road_plane(points: &[Vec3], confidences: &[f32], config: &RoadConfig) -> Option<RoadPlane> {
+    let cells = ground_cells(points, confidences, config);
+    if cells.len() < config.min_ground_cells {
         return None;
     }
     let mut heights: Vec<f64> = cells.iter().map(|cell| cell.point.z).collect();
@@ -43,7 +75,7 @@ pub fn road_plane(points: &[Vec3], confidences: &[f32]) -> Option<RoadPlane> {
     // z = a + b x + c y
     let mut plane = DVec3::new(heights[heights.len() / 2], 0.0, 0.0);
     for scale_m in SCALES_M {
-        plane = weighted_fit(&cells, plane, scale_m)?;
+        plane = weighted_fit(&cells, plane, scale_m, config.min_width_m2)?;
     }
     let up = DVec3::new(-plane.y, -plane.z, 1.0).normalize();
     Some(RoadPlane {
@@ -58,16 +90,17 @@ struct GroundCell {
 }
 
 /// Computes mean position and weight of the ground per cell, in the order of the cells.
-fn ground_cells(points: &[Vec3], confidences: &[f32]) -> Vec<GroundCell> {
-    let across = (2.0 * RADIUS_M / CELL_M) as usize;
+fn ground_cells(points: &[Vec3], confidences: &[f32], config: &RoadConfig) -> Vec<GroundCell> {
+    let radius_m = config.road_radius_m;
+    let across = (2.0 * radius_m / CELL_M) as usize;
     let mut sums = vec![(DVec3::ZERO, 0.0, 0.0); across * across];
     for (&point, &confidence) in points.iter().zip(confidences) {
-        let near = point.x * point.x + point.y * point.y < RADIUS_M * RADIUS_M;
-        if !near || confidence < MIN_CONFIDENCE || !point.z.is_finite() {
+        let near = point.x * point.x + point.y * point.y < radius_m * radius_m;
+        if !near || confidence < config.min_confidence || !point.z.is_finite() {
             continue;
         }
-        let column = ((point.x + RADIUS_M) / CELL_M) as usize;
-        let row = ((point.y + RADIUS_M) / CELL_M) as usize;
+        let column = ((point.x + radius_m) / CELL_M) as usize;
+        let row = ((point.y + radius_m) / CELL_M) as usize;
         let sum = &mut sums[row.min(across - 1) * across + column.min(across - 1)];
         let weight = f64::from(confidence);
         sum.0 += weight * point.as_dvec3();
@@ -79,17 +112,25 @@ fn ground_cells(points: &[Vec3], confidences: &[f32]) -> Vec<GroundCell> {
         .map(|(sum, weight, count): (DVec3, f64, f64)| GroundCell {
             point: sum / weight,
             // A cell of many points is more certain, but not in proportion to their number.
-            weight: weight / count * count.min(8.0) * nearness(sum / weight),
+            weight: weight / count
+                * count.min(MOST_COUNTED)
+                * nearness(sum / weight, config.nearness_m),
         })
         .collect()
 }
 
-fn nearness(point: DVec3) -> f64 {
-    (-0.5 * point.truncate().length_squared() / (NEARNESS_M * NEARNESS_M)).exp()
+fn nearness(point: DVec3, nearness_m: f64) -> f64 {
+    (-0.5 * point.truncate().length_squared() / (nearness_m * nearness_m)).exp()
 }
 
 /// One step of iteratively reweighted least squares with Tukey's biweight.
-fn weighted_fit(cells: &[GroundCell], plane: DVec3, scale_m: f64) -> Option<DVec3> {
+fn weighted_fit(
+    cells: &[GroundCell],
+    plane: DVec3,
+    scale_m: f64,
+    min_width_m2: f64,
+) -> Option<DVec3> {
+    /// 95 % efficiency for normal residuals.
     const TUKEY: f64 = 4.685;
     let mut matrix = DMat3::ZERO;
     let mut right = DVec3::ZERO;
@@ -109,7 +150,7 @@ fn weighted_fit(cells: &[GroundCell], plane: DVec3, scale_m: f64) -> Option<DVec
         variance(matrix.x_axis.y, matrix.y_axis.y) + variance(matrix.x_axis.z, matrix.z_axis.z);
     // About the variance of the positions in their narrowest direction [m²].
     let narrowest = matrix.determinant() / weight.powi(3) / spread;
-    (narrowest > 0.5).then(|| matrix.inverse() * right)
+    (narrowest > min_width_m2).then(|| matrix.inverse() * right)
 }
 
 #[cfg(test)]
@@ -139,7 +180,8 @@ mod tests {
             (Vec3::new(0.05, -0.03, 1.0).normalize(), 2.1),
         ] {
             let points = road(tilt, height_m);
-            let plane = road_plane(&points, &vec![1.0; points.len()]).unwrap();
+            let plane =
+                road_plane(&points, &vec![1.0; points.len()], &RoadConfig::default()).unwrap();
             assert!(
                 plane.up.angle_between(tilt).to_degrees() < 0.05,
                 "{plane:?}"
@@ -162,7 +204,7 @@ mod tests {
                 point.z += 0.4;
             }
         }
-        let plane = road_plane(&points, &vec![0.9; points.len()]).unwrap();
+        let plane = road_plane(&points, &vec![0.9; points.len()], &RoadConfig::default()).unwrap();
         assert!(
             plane.up.angle_between(Vec3::Z).to_degrees() < 0.1,
             "{plane:?}"
@@ -173,14 +215,28 @@ mod tests {
     #[test]
     fn no_plane_without_ground_or_with_a_narrow_strip_of_it() {
         let points = road(Vec3::Z, 1.73);
-        assert_eq!(road_plane(&points, &vec![0.1; points.len()]), None);
-        assert_eq!(road_plane(&[], &[]), None);
+        assert_eq!(
+            road_plane(&points, &vec![0.1; points.len()], &RoadConfig::default()),
+            None
+        );
+        assert_eq!(road_plane(&[], &[], &RoadConfig::default()), None);
         let nan = vec![Vec3::NAN; 100];
-        assert_eq!(road_plane(&nan, &[1.0; 100]), None);
+        assert_eq!(road_plane(&nan, &[1.0; 100], &RoadConfig::default()), None);
         let strip: Vec<Vec3> = points
             .into_iter()
             .filter(|point| point.y.abs() < 0.5)
             .collect();
-        assert_eq!(road_plane(&strip, &vec![1.0; strip.len()]), None);
+        let plane = |config| road_plane(&strip, &vec![1.0; strip.len()], &config);
+        assert_eq!(plane(RoadConfig::default()), None);
+        let narrow = RoadConfig {
+            min_width_m2: 0.01,
+            ..RoadConfig::default()
+        };
+        assert!(plane(narrow).is_some());
+        let large = RoadConfig {
+            min_ground_cells: 10_000,
+            ..narrow
+        };
+        assert_eq!(plane(large), None);
     }
 }

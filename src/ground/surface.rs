@@ -26,6 +26,9 @@ const MAX_COLUMNS: f32 = 5.0;
 /// another surface, such as the crest of a road before a wall, unitless.
 const MAX_GAP_RATIO: f32 = 2.0;
 
+/// Distance of points that share their shape, in spacings of neighbours (unitless).
+const SHARED: f32 = 0.5;
+
 /// Slope and curvature of the surface at a point.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Shape {
@@ -109,7 +112,7 @@ impl<'a> ScanIndex<'a> {
                         continue;
                     };
                     let squared_gap = returns[index].point.distance_squared(point);
-                    if squared_gap < 0.25 * self.spacing_m * self.spacing_m {
+                    if squared_gap < SHARED * SHARED * self.spacing_m * self.spacing_m {
                         shapes[row] = shared[index];
                     } else {
                         far.push((row, index));
@@ -265,7 +268,10 @@ fn first_neighbour<'a>(
     point: Vec3,
     distance_m: f32,
 ) -> Option<Vec3> {
-    let gate_m = 0.3 + 0.02 * distance_m;
+    /// Largest difference of the distances of neighbours at the sides [m], and its increase with the distance.
+    const GATE_M: f32 = 0.3;
+    const GATE_PER_M: f32 = 0.02;
+    let gate_m = GATE_M + GATE_PER_M * distance_m;
     returns
         .find(|other| (other.distance_m - distance_m).abs() < gate_m)
         .map(|other| other.point - point)

@@ -17,6 +17,7 @@ use smart_default::SmartDefault;
 
 use super::polar_grid::{PolarGrid, PolarPosition, SECTORS};
 use super::surface::Shape;
+use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Limits of the change of ground height between cells.
 ///
@@ -44,17 +45,44 @@ pub struct TerrainConfig {
     /// Radius within which the ground is initialized as a plane [m].
     #[default(15.0)]
     pub start_radius_m: f32,
+    /// Share of this radius up to which the ground is predicted by the plane, and farther out by the cells inside
+    /// (unitless).
+    #[default(0.4)]
+    pub plane_share: f32,
+    /// Distance over which the slope of known ground is averaged [m].
+    #[default(2.5)]
+    pub slope_memory_m: f32,
+    /// Largest slope that is measured between cells of known ground (unitless).
+    #[default(0.3)]
+    pub max_measured_slope: f32,
     /// Points on steeper surfaces are no candidates for low points of the ground [rad].
     #[default(0.5)]
     pub max_low_slope_rad: f32,
+    /// The lowest point of a cell is a reflection from below the ground if the next one is higher by more [m].
+    #[default(0.3)]
+    pub isolated_m: f32,
     /// Points higher above the ground than this do not count for the relief of their cell: a car
     /// passes beneath [m].
     #[default(2.0)]
     pub clearance_m: f32,
 }
 
-/// Distance over which the slope of known ground is averaged [m].
-const SLOPE_MEMORY_M: f32 = 2.5;
+impl Validate for TerrainConfig {
+    fn validate(&self) -> Result<(), InvalidValue> {
+        positive("step_m", self.step_m)?;
+        not_negative("max_slope", self.max_slope)?;
+        positive("max_jump_m", self.max_jump_m)?;
+        not_negative("max_fall_slope", self.max_fall_slope)?;
+        positive("max_fall_m", self.max_fall_m)?;
+        positive("start_radius_m", self.start_radius_m)?;
+        in_range("plane_share", self.plane_share, 0.0..=1.0)?;
+        positive("slope_memory_m", self.slope_memory_m)?;
+        not_negative("max_measured_slope", self.max_measured_slope)?;
+        positive("max_low_slope_rad", self.max_low_slope_rad)?;
+        positive("isolated_m", self.isolated_m)?;
+        positive("clearance_m", self.clearance_m)
+    }
+}
 
 /// Ground heights and low points per cell of a polar grid, in the lidar frame [m].
 #[derive(Clone, Debug)]
@@ -91,7 +119,10 @@ impl Terrain {
                 gentle.add(position.z);
             }
         }
-        let supported = |[all, gentle]: &[Lowest; 2]| (all.supported(), gentle.supported());
+        let supported = |pair: &[Lowest; 2]| {
+            let [all, gentle] = pair.map(|low| low.supported(config.isolated_m));
+            (all, gentle)
+        };
         let (all_lows, lows): (Vec<f32>, Vec<f32>) = lowest.iter().map(supported).unzip();
         let mut terrain = Self {
             lows,
@@ -144,8 +175,11 @@ impl Terrain {
     /// Fits the plane z = a + b x + c y to the low points around the car: first level at the mode
     /// of their heights, then least squares over those near it.
     fn start_plane(&self, config: &TerrainConfig) -> Option<[f32; 3]> {
+        /// Height of a bin of the histogram, and number of bins, three quarters of them below the sensor [m].
         const BIN_M: f32 = 0.2;
         const BINS: usize = 60;
+        /// Distances from the plane within which low points count, one fit after the other [m].
+        const TOLERANCES_M: [f32; 4] = [0.6, 0.4, 0.2, 0.15];
         let is_near = |ring: &usize| self.grid.middle_m(*ring) <= config.start_radius_m;
         let rings = (0..self.grid.rings()).take_while(is_near).count();
         let lows: Vec<Vec3> = (0..rings * SECTORS)
@@ -169,7 +203,7 @@ impl Terrain {
         let fullest = (0..BINS - 1).rev().max_by_key(in_bins)?;
         let level = (fullest as f32 + 1.0 - 0.75 * BINS as f32) * BIN_M;
         let mut plane = [level, 0.0, 0.0];
-        for tolerance_m in [0.6, 0.4, 0.2, 0.15] {
+        for tolerance_m in TOLERANCES_M {
             plane = fit_plane(&lows, plane, tolerance_m).unwrap_or(plane);
         }
         Some(plane)
@@ -177,6 +211,12 @@ impl Terrain {
 
     /// Grows the ground outwards, ring by ring; see the module.
     fn grow(&mut self, config: &TerrainConfig, [a, b, c]: [f32; 3]) {
+        /// Weight of a cell inside that is known in the last ring or the one before.
+        const RECENT_WEIGHT: f32 = 4.0;
+        /// Largest weight of a new slope.
+        const MAX_GAIN: f32 = 0.7;
+        /// Share of the slope that remains from ring to ring where the ground is unknown.
+        const KEPT_SLOPE: f32 = 0.9;
         let start_slope: [f32; SECTORS] = std::array::from_fn(|sector| {
             let (sin, cos) = direction(sector);
             b * cos + c * sin
@@ -187,7 +227,7 @@ impl Terrain {
         let mut last_height = [a; SECTORS];
         for ring in 0..self.grid.rings() {
             let middle_m = self.grid.middle_m(ring);
-            let near = middle_m < 0.4 * config.start_radius_m;
+            let near = middle_m < config.plane_share * config.start_radius_m;
             let mut now_m = last_m;
             let mut new_slope = slope;
             for sector in 0..SECTORS {
@@ -201,7 +241,11 @@ impl Terrain {
                     let mut weights = 0.0;
                     for (other, share) in [(before, 1.0), (sector, 2.0), (after, 1.0)] {
                         let is_recent = last_m[other] > middle_m - 1.5 * width_m;
-                        let weight = if is_recent { 4.0 * share } else { share };
+                        let weight = if is_recent {
+                            RECENT_WEIGHT * share
+                        } else {
+                            share
+                        };
                         let inner = self.heights[(ring - 1) * SECTORS + other];
                         sum += weight * (inner + slope[other] * width_m);
                         weights += weight;
@@ -218,14 +262,16 @@ impl Terrain {
                     now_m[sector] = middle_m;
                     if !near {
                         let run_m = middle_m - last_m[sector];
-                        let measured = ((low - last_height[sector]) / run_m).clamp(-0.3, 0.3);
-                        let gain = (run_m / SLOPE_MEMORY_M).min(0.7);
+                        let measured = (low - last_height[sector]) / run_m;
+                        let steepest = config.max_measured_slope;
+                        let measured = measured.clamp(-steepest, steepest);
+                        let gain = (run_m / config.slope_memory_m).min(MAX_GAIN);
                         new_slope[sector] = slope[sector] + gain * (measured - slope[sector]);
                     }
                     last_height[sector] = low;
                 } else {
                     self.heights[cell] = predicted;
-                    new_slope[sector] = 0.9 * slope[sector];
+                    new_slope[sector] = KEPT_SLOPE * slope[sector];
                 }
             }
             for (sector, slope) in slope.iter_mut().enumerate() {
@@ -268,6 +314,7 @@ impl Terrain {
 
     /// Smooths unknown heights between their neighbours, in several passes.
     fn fill(&mut self) {
+        /// Passes over all unknown cells.
         const PASSES: usize = 6;
         // A pass may run this many cells behind the one before instead of after it: where it is,
         // the neighbours are done. Then the divisions of a pass do not wait for each other.
@@ -321,11 +368,10 @@ impl Lowest {
 
     /// The lowest height, or the second where it is far above: then the lowest is a reflection
     /// from below the ground. NaN without points.
-    fn supported(&self) -> f32 {
-        const ISOLATED_M: f32 = 0.3;
+    fn supported(&self, isolated_m: f32) -> f32 {
         if self.first == f32::INFINITY {
             f32::NAN
-        } else if self.second < f32::INFINITY && self.second - self.first > ISOLATED_M {
+        } else if self.second < f32::INFINITY && self.second - self.first > isolated_m {
             self.second
         } else {
             self.first
@@ -387,9 +433,10 @@ fn fit_plane(points: &[Vec3], [a, b, c]: [f32; 3], tolerance_m: f32) -> Option<[
             count += 1;
         }
     }
-    // Regularization: no tilt where the points do not determine it.
-    matrix.y_axis.y += 10.0;
-    matrix.z_axis.z += 10.0;
+    /// Regularization: no tilt where the points do not determine it [m²].
+    const LEVEL_M2: f32 = 10.0;
+    matrix.y_axis.y += LEVEL_M2;
+    matrix.z_axis.z += LEVEL_M2;
     (count >= 3).then(|| (matrix.inverse() * right).to_array())
 }
 
@@ -399,6 +446,16 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
+
+    #[test]
+    fn a_point_far_below_the_next_one_of_its_cell_is_a_reflection() {
+        let mut lowest = Lowest::NONE;
+        for z in [-1.0, -1.6, -2.0] {
+            lowest.add(z);
+        }
+        assert_eq!(lowest.supported(0.3), -1.6);
+        assert_eq!(lowest.supported(0.5), -2.0);
+    }
 
     #[test]
     fn interleaved_passes_fill_as_passes_one_after_the_other() {

@@ -1,6 +1,6 @@
 //! Preparation of scans: range images, and the attitude of the sensor above the ground.
 
-use crate::ground::{GroundClassifier, GroundConfig, road_plane};
+use crate::ground::{GroundClassifier, GroundConfig, RoadConfig, road_plane};
 use crate::lidar::{Motion, RangeImage, Scan};
 use crate::map::SensorAttitude;
 use crate::sensor::Sensor;
@@ -11,6 +11,7 @@ pub(crate) struct ScanPreparation {
     /// The sensor.
     pub sensor: Sensor,
     classifier: Box<dyn GroundClassifier>,
+    road: RoadConfig,
 }
 
 impl ScanPreparation {
@@ -20,6 +21,7 @@ impl ScanPreparation {
         Ok(Self {
             sensor: sensor.clone(),
             classifier: ground.classifier()?,
+            road: ground.road,
         })
     }
 
@@ -53,7 +55,7 @@ impl ScanPreparation {
             .map(|index| image.points[index])
             .collect();
         let ground = self.classifier.ground_confidence(&points);
-        let plane = road_plane(&points, &ground)?;
+        let plane = road_plane(&points, &ground, &self.road)?;
         let measured = SensorAttitude::from_plane(plane.up, plane.height_m);
         Some(SensorAttitude {
             height_m: self.sensor.sensor_height_m.unwrap_or(measured.height_m),

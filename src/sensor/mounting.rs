@@ -7,7 +7,7 @@ use glam::{Quat, Vec3};
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
-use crate::ground::{GroundClassifier, GroundConfig, RoadPlane, road_plane};
+use crate::ground::{GroundClassifier, GroundConfig, RoadConfig, RoadPlane, road_plane};
 use crate::lidar::Scan;
 
 /// Height and tilt of a sensor: medians over the scans, and their spread.
@@ -55,13 +55,14 @@ impl<'a> Surroundings<'a> {
 }
 
 fn ground(points: &[Vec3], classifier: &dyn GroundClassifier) -> Option<RoadPlane> {
-    let first = road_plane(points, &classifier.ground_confidence(points))?;
+    let road = RoadConfig::default();
+    let first = road_plane(points, &classifier.ground_confidence(points), &road)?;
     let level_from_lidar = Quat::from_rotation_arc(first.up, Vec3::Z);
     let level: Vec<Vec3> = points
         .iter()
         .map(|&point| level_from_lidar * point)
         .collect();
-    let second = road_plane(&level, &classifier.ground_confidence(&level))?;
+    let second = road_plane(&level, &classifier.ground_confidence(&level), &road)?;
     Some(RoadPlane {
         up: level_from_lidar.inverse() * second.up,
         ..second
