@@ -17,7 +17,7 @@ use smart_default::SmartDefault;
 
 use super::particles::Particle;
 use crate::geometry::Pose2;
-use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
+use crate::validation::{InvalidValue, Validate, fraction, in_range, not_negative, positive};
 
 /// Search among several places.
 ///
@@ -38,6 +38,15 @@ pub struct PlacesConfig {
     /// Scale s: a mean cost that is larger by s beyond that is e times less likely [m].
     #[default(0.005)]
     pub scale_m: f64,
+    /// Largest standard deviation of the position around a start that is one place: √(σ_x² + σ_y²) [m].
+    #[default(10.0)]
+    pub known_start_m: f64,
+    /// Weight from which on a place is counted as likely, 0 to 1.
+    #[default(0.01)]
+    pub likely_weight: f64,
+    /// Weight below which a place is given up, 0 to 1.
+    #[default(1e-6)]
+    pub given_up_weight: f64,
 }
 
 impl Validate for PlacesConfig {
@@ -45,15 +54,16 @@ impl Validate for PlacesConfig {
         in_range("most", self.most, 1..=1000)?;
         positive("radius_m", self.radius_m)?;
         not_negative("tolerance_m", self.tolerance_m)?;
-        positive("scale_m", self.scale_m)
+        positive("scale_m", self.scale_m)?;
+        positive("known_start_m", self.known_start_m)?;
+        fraction("likely_weight", self.likely_weight)?;
+        in_range("given_up_weight", self.given_up_weight, 0.0..=0.1)
     }
 }
 
-/// Weight below which a place is given up (unitless).
-const LEAST_WEIGHT: f64 = 1e-6;
-
 /// Whether two poses are in the same place.
 pub fn is_same(a: &Pose2, b: &Pose2, radius_m: f64) -> bool {
+    /// Largest difference of headings: a crossroads looks alike from its roads.
     const SAME_HEADING_RAD: f64 = std::f64::consts::FRAC_PI_4;
     let between = a.inverse() * b;
     between.translation.vector.norm() < radius_m
@@ -105,7 +115,7 @@ pub fn weights_after(before: &[f64], costs_m: &[f64], config: &PlacesConfig) -> 
     let mut weights: Vec<f64> = (before.iter().zip(costs_m))
         .map(|(weight, &cost_m)| weight * likelihood(cost_m))
         .collect();
-    for least in [0.0, LEAST_WEIGHT] {
+    for least in [0.0, config.given_up_weight] {
         let sum: f64 = weights.iter().sum();
         for weight in &mut weights {
             *weight = if *weight >= least * sum {

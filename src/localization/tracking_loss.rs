@@ -19,7 +19,9 @@
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use crate::validation::{InvalidValue, Validate, at_least_one, fraction, positive, require};
+use crate::validation::{
+    InvalidValue, Validate, at_least_one, bounded, fraction, positive, require,
+};
 
 /// State of the filter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -61,6 +63,9 @@ pub struct TrackingLossConfig {
     /// Largest difference of an agreeing beam [m].
     #[default(0.3)]
     pub tolerance_m: f32,
+    /// Beams that end up to this height above the road do not count: kerbs and low plants do not distinguish places [m].
+    #[default(0.5)]
+    pub low_height_m: f32,
     /// Weight of a new frame in the fast average, α_fast.
     #[default(0.4)]
     pub fast_rate: f64,
@@ -97,6 +102,7 @@ pub struct TrackingLossConfig {
 impl Validate for TrackingLossConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         positive("tolerance_m", self.tolerance_m)?;
+        bounded("low_height_m", self.low_height_m)?;
         fraction("fast_rate", self.fast_rate)?;
         fraction("slow_rate", self.slow_rate)?;
         require(

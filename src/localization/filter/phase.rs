@@ -15,7 +15,8 @@
 //! Lost       panoramas resemble the scan                     Searching  restart, within the same frame
 //! ```
 //!
-//! Thresholds: [`tracking_loss`](crate::localization::tracking_loss), [`convergence`](crate::localization::convergence).
+//! Thresholds: [`tracking_loss`](crate::localization::tracking_loss), [`convergence`](crate::localization::convergence),
+//! and for what is searched [`places`](crate::localization::places).
 //! Without panoramas the filter stays `Lost` until a pose is confirmed. What is reported, see [`Phase::reported`]:
 //!
 //! ```text
@@ -24,6 +25,7 @@
 //! ```
 
 use crate::localization::particles::{ParticleSet, spread};
+use crate::localization::places::PlacesConfig;
 use crate::localization::tracking_loss::State;
 
 /// What the filter does with a scan.
@@ -76,10 +78,8 @@ pub(super) struct Evidence {
 
 impl Search {
     /// The search of particles with which it starts.
-    pub fn from_particles(particles: &ParticleSet) -> Self {
-        /// Standard deviation of the position around a known start, at most [m].
-        const AROUND_M: f64 = 10.0;
-        if spread(&particles.covariance_about(&particles.mean())).0 > AROUND_M {
+    pub fn from_particles(particles: &ParticleSet, config: &PlacesConfig) -> Self {
+        if spread(&particles.covariance_about(&particles.mean())).0 > config.known_start_m {
             Self::Anywhere
         } else {
             Self::Around
@@ -89,9 +89,9 @@ impl Search {
 
 impl Phase {
     /// The phase of particles with which a search starts.
-    pub fn from_particles(particles: &ParticleSet) -> Self {
+    pub fn from_particles(particles: &ParticleSet, config: &PlacesConfig) -> Self {
         Self::Searching {
-            search: Search::from_particles(particles),
+            search: Search::from_particles(particles, config),
             updates: 0,
         }
     }
@@ -158,7 +158,10 @@ impl Phase {
 mod tests {
     use std::collections::BTreeSet;
 
+    use nalgebra::Vector2;
+
     use super::*;
+    use crate::geometry::Pose2;
 
     const PATIENCE: usize = 3;
 
@@ -210,6 +213,21 @@ mod tests {
                     .collect()
             })
             .collect()
+    }
+
+    #[test]
+    fn a_start_is_one_place_up_to_the_configured_spread() {
+        let poses = [-6.0, 6.0].map(|x| Pose2::new(Vector2::new(x, 0.0), 0.0));
+        let particles = ParticleSet::uniform(poses);
+        let search = |known_start_m| {
+            let config = PlacesConfig {
+                known_start_m,
+                ..PlacesConfig::default()
+            };
+            Search::from_particles(&particles, &config)
+        };
+        assert_eq!(search(10.0), Search::Around);
+        assert_eq!(search(5.0), Search::Anywhere);
     }
 
     #[test]

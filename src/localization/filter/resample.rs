@@ -57,7 +57,7 @@ impl ParticleFilter {
         let before = self.particles.particles();
         particles.extend(kept.into_iter().map(|index| before[index]));
         self.particles = ParticleSet::uniform(particles);
-        self.phase = Phase::from_particles(&self.particles);
+        self.phase = Phase::from_particles(&self.particles, &self.config.places);
         // Valid until the next update.
         self.updated = Updated::from_particles(&self.particles);
         self.last_motion = None;

@@ -58,8 +58,6 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Option<Update>, RenderError> {
-        /// Weight of a place that is likely (unitless).
-        const LIKELY: f64 = 0.01;
         let config = self.config.places.clone();
         let seeds = self.best_particles(scan, attitude, rng)?;
         let registered = self.registered_places(&seeds, scan, attitude, rng)?;
@@ -82,7 +80,10 @@ impl ParticleFilter {
         };
         let attitude = places[best].patch.attitude_of(&places[best].map_from_lidar);
         let costs_m = self.sample_places(&places, &weights, &costs_m, rng);
-        let likely = weights.iter().filter(|&&weight| weight >= LIKELY).count();
+        let likely = weights
+            .iter()
+            .filter(|&&weight| weight >= config.likely_weight)
+            .count();
         self.phase.set_search(Search::Places { likely });
         Ok(Some(Update {
             costs_m,
@@ -100,6 +101,7 @@ impl ParticleFilter {
         attitude: &SensorAttitude,
         rng: &mut impl Rng,
     ) -> Result<Vec<usize>, RenderError> {
+        /// Distance between optima [m].
         const APART_M: f64 = 1.0;
         let observation = &self.config.observation;
         let count = observation.beams_for(self.particles.len());
@@ -191,8 +193,10 @@ impl ParticleFilter {
         costs_m: &[f64],
         rng: &mut impl Rng,
     ) -> Vec<Option<f64>> {
+        /// An unlikely place keeps this part of the particles with which one pose is tracked.
+        const LEAST_DIVISOR: usize = 4;
         let most = self.config.num_reduced;
-        let least = most.div_ceil(4);
+        let least = most.div_ceil(LEAST_DIVISOR);
         let (mut particles, mut costs) = (Vec::new(), Vec::new());
         for ((place, &weight), &cost_m) in places.iter().zip(weights).zip(costs_m) {
             if weight == 0.0 {
@@ -213,7 +217,11 @@ impl ParticleFilter {
 
 /// Covariance of the pose in a place: that of its registration, if any, and at most as wide as the place.
 fn within_place(registered: Option<Matrix3<f64>>, radius_m: f64) -> Option<Matrix3<f64>> {
-    let place = Matrix3::from_diagonal(&Vector3::new(0.5 * radius_m, 0.5 * radius_m, 0.2))
+    /// Standard deviations: of the position in radii, and of the heading [rad].
+    const SHARE: f64 = 0.5;
+    const TURN_RAD: f64 = 0.2;
+    let shift_m = SHARE * radius_m;
+    let place = Matrix3::from_diagonal(&Vector3::new(shift_m, shift_m, TURN_RAD))
         .map(|sigma: f64| sigma.powi(2));
     let Some(registered) = registered else {
         return Some(place);

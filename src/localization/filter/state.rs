@@ -91,10 +91,10 @@ impl ParticleFilter {
         let level_m = particles.best().level_m;
         Ok(Self {
             patch: map.ground.patch_under(&updated.pose, level_m)?,
+            phase: Phase::from_particles(&particles, &config.places),
             config,
             map,
             restart,
-            phase: Phase::from_particles(&particles),
             particles,
             agreement: AgreementMonitor::default(),
             updated,

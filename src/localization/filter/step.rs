@@ -116,10 +116,9 @@ impl ParticleFilter {
         beams: &[Beam],
         attitude: &SensorAttitude,
     ) -> Result<Option<f64>, RenderError> {
-        /// Kerbs and low plants do not distinguish places [m].
-        const CLEARANCE_M: f32 = 0.5;
-        let beams = above_road(beams, attitude, CLEARANCE_M);
-        let tolerance_m = self.config.tracking_loss.tolerance_m;
+        let config = &self.config.tracking_loss;
+        let beams = above_road(beams, attitude, config.low_height_m);
+        let tolerance_m = config.tolerance_m;
         let rendered_m = ranges_along(&*self.map.renderer, map_from_lidar, &beams, tolerance_m)?;
         Ok(agreement(&beams, &rendered_m, tolerance_m))
     }
