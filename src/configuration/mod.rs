@@ -9,6 +9,7 @@
 //! ones, and those of range-mcl. Nothing is ignored but two keys of range-mcl that have no effect: an unknown key, a value of the wrong type and a contradiction are
 //! errors that name the place, the key and the value.
 
+mod braces;
 mod comments;
 mod error;
 mod load;

@@ -1,11 +1,12 @@
 //! Names of keys: full ones, their last parts, and those of range-mcl.
 //!
-//! > A name is the key with that full name; else, with its first part replaced by [`ALIASES`], and else as it is, the
+//! > A name is the key with that full name; else, with one of its parts replaced by [`ALIASES`], and else as it is, the
 //! > key whose full name ends with it. Of several, the one whose block contains the others.
 //!
-//! So `seed`, `range_image.width` and `numParticles` are names of keys wherever these are in a configuration.
+//! So `seed`, `range_image.width` and `numParticles` are names of keys wherever these are in a configuration, and
+//! `localizer.numParticles` as well.
 
-/// Other first parts of names: those of range-mcl, without units and blocks, and earlier ones of our own.
+/// Other parts of names: those of range-mcl, without units and blocks, and earlier ones of our own.
 const ALIASES: [(&str, &str); 21] = [
     // range-mcl
     ("crop_x", "crop_x_m"),
@@ -93,12 +94,16 @@ impl Names {
         if self.0.iter().any(|key| key == name) {
             return Meaning::Key(name.to_owned());
         }
-        let first = name.split('.').next().unwrap_or(name);
-        for (_, other) in ALIASES.iter().filter(|(alias, _)| *alias == first) {
-            let replaced = format!("{other}{}", &name[first.len()..]);
-            match self.ending(&replaced) {
-                Meaning::Unknown => (),
-                found => return found,
+        let dots = name.match_indices('.').map(|(dot, _)| dot + 1);
+        for start in std::iter::once(0).chain(dots) {
+            let (before, rest) = name.split_at(start);
+            let part = rest.split('.').next().unwrap_or(rest);
+            for (_, other) in ALIASES.iter().filter(|(alias, _)| *alias == part) {
+                let replaced = format!("{before}{other}{}", &rest[part.len()..]);
+                match self.ending(&replaced) {
+                    Meaning::Unknown => (),
+                    found => return found,
+                }
             }
         }
         self.ending(name)
@@ -176,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn aliases_replace_the_first_part() {
+    fn aliases_replace_a_part_wherever_it_is() {
         assert_eq!(
             meaning("numParticles"),
             key("tracker.localizer.num_particles")
@@ -184,6 +189,14 @@ mod tests {
         assert_eq!(
             meaning("vigilance.patience"),
             key("tracker.localizer.tracking_loss.patience")
+        );
+        assert_eq!(
+            meaning("tracker.localizer.vigilance.patience"),
+            key("tracker.localizer.tracking_loss.patience")
+        );
+        assert_eq!(
+            meaning("localizer.numParticles"),
+            key("tracker.localizer.num_particles")
         );
     }
 

@@ -5,6 +5,7 @@ use std::ops::Range;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
+use super::braces::Lines;
 use super::error::{self, ConfigError};
 use super::names::{Meaning, Names};
 use crate::validation::InvalidValue;
@@ -147,41 +148,44 @@ impl Value {
 #[derive(Debug, Default)]
 pub(super) struct FullText {
     pub(super) text: String,
-    /// For each line, that of the original, from 0.
+    /// For each line, its row in `original`, from 0.
     lines: Vec<usize>,
+    /// The given text, with the blocks in braces as lines.
     original: Vec<String>,
+    /// For each of these rows, the line in the given text, from 0.
+    numbers: Vec<usize>,
 }
 
 impl FullText {
-    /// Replaces the names of all keys by their full ones. A text without keys in block style stays as it is.
+    /// Replaces the names of all keys by their full ones. A text that is no block of keys stays as it is.
     pub(super) fn new(name: &str, text: &str, names: &Names) -> Result<Self, ConfigError> {
         let text = text.trim_start_matches('\u{feff}');
         let mut rows = text.lines();
         let is_content = |row: &&str| row.trim_end() != "...";
-        let original: Vec<String> = rows
-            .by_ref()
-            .take_while(is_content)
-            .map(str::to_owned)
-            .collect();
+        let given: Vec<&str> = rows.by_ref().take_while(is_content).collect();
         let has_second_document = rows.any(|row| !row.trim().is_empty());
-        let found = keys(&original.join("\n"));
-        let first = found.first().map_or(original.len(), |key| key.line);
-        let is_code =
-            |line: &&String| !line.trim().is_empty() && !line.starts_with(['#', '-', '%']);
         let mut full = Self {
             text: text.to_owned(),
-            lines: (0..original.len()).collect(),
-            original,
+            lines: (0..given.len()).collect(),
+            original: given.iter().map(|&line| line.to_owned()).collect(),
+            numbers: (0..given.len()).collect(),
         };
         // The parser reports what is no key.
-        let has_tabs = |line: &String| line[..line.len() - line.trim_start().len()].contains('\t');
-        let before = &full.original[..first];
-        if found.is_empty()
-            || has_second_document
-            || before.iter().any(|line| is_code(&line))
-            || full.original.iter().any(has_tabs)
-        {
+        let has_tabs = |line: &&str| line[..line.len() - line.trim_start().len()].contains('\t');
+        if has_second_document || given.iter().any(has_tabs) {
             return Ok(full);
+        }
+        let values = leaves(text);
+        let without_braces = (values.is_some()).then(|| Lines::without_braces(&given, names));
+        let rows = (without_braces.as_ref()).map_or(&full.original, |lines| &lines.texts);
+        let found = keys(&rows.join("\n"));
+        let first = found.first().map_or(rows.len(), |key| key.line);
+        let is_code = |line: &String| !line.trim().is_empty() && !line.starts_with(['#', '-', '%']);
+        if found.is_empty() || rows[..first].iter().any(is_code) {
+            return Ok(full);
+        }
+        if let Some(lines) = without_braces {
+            (full.original, full.numbers) = (lines.texts, lines.numbers);
         }
         let mut root = Node::default();
         // Keys without effect, and empty blocks.
@@ -207,7 +211,7 @@ impl FullText {
                 ignored += 1;
                 continue;
             }
-            let place = error::place(name, Some(key.line));
+            let place = error::place(name, Some(full.number(key.line)));
             match names.meaning(&key.name) {
                 Meaning::Key(full) => {
                     // A dot of a key within a map, whose keys are the user's, stays one.
@@ -220,11 +224,10 @@ impl FullText {
                 meaning => return Err(error::unknown(place, &key.name, meaning, names)),
             }
         }
-        let given = leaves(&full.text);
         (full.text, full.lines) = (String::new(), Vec::new());
         root.write(0, &full.original, &mut full.text, &mut full.lines);
         // Nothing is lost in a style that this module does not know.
-        if let (Some(given), Some(kept)) = (given, leaves(&full.text)) {
+        if let (Some(given), Some(kept)) = (values, leaves(&full.text)) {
             let is_same = kept.iter().all(|value| given.contains(value));
             if !is_same || kept.len() + ignored != given.len() {
                 let place = name.to_owned();
@@ -234,14 +237,19 @@ impl FullText {
         Ok(full)
     }
 
-    /// The line of the original text, from 0.
-    pub(super) fn original_line(&self, line: usize) -> usize {
+    /// The row of `original` of a line, from 0.
+    fn original_row(&self, line: usize) -> usize {
         let last = self.lines.last().copied().unwrap_or(line);
         self.lines.get(line).copied().unwrap_or(last)
     }
 
-    /// The value on a line of the original text, without its key and its comment.
-    pub(super) fn value(&self, line: usize) -> String {
+    /// The line in the given text of a row of `original`, from 0.
+    fn number(&self, row: usize) -> usize {
+        self.numbers.get(row).copied().unwrap_or(row)
+    }
+
+    /// The value in a row of `original`, without its key and its comment.
+    fn value(&self, line: usize) -> String {
         let line = self.original.get(line).map_or("", String::as_str);
         let content = line.trim_start();
         let value = key_of(content).map_or(content, |(_, value)| value);
@@ -258,9 +266,9 @@ impl FullText {
             return error::describe(name.to_owned(), None, source);
         };
         let key = keys(&self.text).into_iter().rfind(|key| key.line <= line);
-        let line = self.original_line(line);
-        let at_line = key.map(|key| (key.name, self.value(line)));
-        error::describe(error::place(name, Some(line)), at_line, source)
+        let row = self.original_row(line);
+        let at_line = key.map(|key| (key.name, self.value(row)));
+        error::describe(error::place(name, Some(self.number(row))), at_line, source)
     }
 
     /// The error of an invalid value, at the place where it was given last; settings are keys with their places.
@@ -278,7 +286,8 @@ impl FullText {
             None => {
                 let keys = keys(&self.text);
                 let innermost = keys.iter().rfind(|key| is_within(&invalid.key, &key.name));
-                error::place(name, innermost.map(|key| self.original_line(key.line)))
+                let line = innermost.map(|key| self.number(self.original_row(key.line)));
+                error::place(name, line)
             }
         };
         ConfigError::InvalidValue { place, invalid }
@@ -404,7 +413,7 @@ pub(super) fn is_within(key: &str, block: &str) -> bool {
 }
 
 /// The key that a line without its indentation starts with, and the rest of the line.
-fn key_of(content: &str) -> Option<(String, &str)> {
+pub(super) fn key_of(content: &str) -> Option<(String, &str)> {
     let is_name = |c: char| c.is_alphanumeric() || "_-.".contains(c);
     let (name, rest) = match content.chars().next()? {
         quote @ ('"' | '\'') => content[1..].split_once(quote)?,

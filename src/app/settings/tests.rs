@@ -401,6 +401,9 @@ fn any_style_of_yaml_is_read_or_refused_and_nothing_is_lost() {
             "{text}"
         );
     }
+    let text = "{recording: {frames: {start_idx: 1}},\nnumParticles: 5,\ntracker: {localizer:\n {vigilance: {patience: x}}}}";
+    let message = message_of(text, &[]);
+    assert_contains(&message, &["line 4", "tracking_loss.patience", "`x`"]);
     for text in [
         "base: &base {seed: 7}\n<<: *base\n",
         "seed: 7\n<<: {topic: foo}\n",
