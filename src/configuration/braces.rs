@@ -23,12 +23,12 @@ impl Lines {
         let first = original.iter().position(is_content);
         let whole = first.filter(|&first| original[first].starts_with('{'));
         let mut next = 0;
-        if let Some(first) = whole {
-            if let Some(entries) = entries(&characters(original, first, 0, original.len())) {
-                lines.push_original(original, 0, first);
-                lines.push_entries(&entries, "", 0, names);
-                return lines;
-            }
+        if let Some(first) = whole
+            && let Some(entries) = entries(&characters(original, first, 0, original.len()))
+        {
+            lines.push_original(original, 0, first);
+            lines.push_entries(&entries, "", 0, names);
+            return lines;
         }
         let keys = keys(&original.join("\n"));
         for (index, key) in keys.iter().enumerate() {

@@ -26,6 +26,8 @@ pub enum ConfigError {
         key: String,
         nearest: Option<String>,
     },
+    #[error("{place}: `{key}` is no key any more: its value is fixed; remove it")]
+    RemovedKey { place: String, key: String },
     #[error("{place}: `{key}` is ambiguous: {}; give more of its name", keys.join(" or "))]
     AmbiguousKey {
         place: String,
@@ -66,6 +68,7 @@ pub(super) fn in_setting(
 pub(super) fn unknown(place: String, key: &str, meaning: Meaning, names: &Names) -> ConfigError {
     let key = key.to_owned();
     match meaning {
+        Meaning::Removed => ConfigError::RemovedKey { place, key },
         Meaning::Ambiguous(keys) => ConfigError::AmbiguousKey { place, key, keys },
         _ => ConfigError::UnknownKey {
             nearest: nearest(&key, names.0.iter().map(String::as_str)),

@@ -36,6 +36,19 @@ const ALIASES: [(&str, &str); 21] = [
 /// Keys of range-mcl that bound the memory of its graphics card.
 const WITHOUT_EFFECT: [&str; 2] = ["range_image.max_instance", "range_image.render_instanced"];
 
+/// Last parts of earlier keys whose values are fixed now.
+const REMOVED: [&str; 9] = [
+    "basin_m",
+    "basin_rad",
+    "freedom",
+    "max_sigmas",
+    "min_incidence",
+    "minima",
+    "refined_share",
+    "tracking_rounds",
+    "widening",
+];
+
 /// What a name stands for.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Meaning {
@@ -43,6 +56,8 @@ pub(super) enum Meaning {
     Key(String),
     /// A key that has no effect.
     Nothing,
+    /// An earlier key, whose value is fixed now.
+    Removed,
     /// None of the keys.
     Unknown,
     /// Several keys equally well.
@@ -64,6 +79,13 @@ impl Names {
                 Meaning::Key(key) => return Meaning::Key(key + &name[end..]),
                 Meaning::Unknown => (),
                 other => return other,
+            }
+            if name
+                .rsplit('.')
+                .next()
+                .is_some_and(|last| REMOVED.contains(&last))
+            {
+                return Meaning::Removed;
             }
             match name[..end].rfind('.') {
                 Some(dot) => end = dot,
@@ -198,6 +220,13 @@ mod tests {
             meaning("localizer.numParticles"),
             key("tracker.localizer.num_particles")
         );
+    }
+
+    #[test]
+    fn an_earlier_key_whose_value_is_fixed_is_known_as_such() {
+        assert_eq!(meaning("minima"), Meaning::Removed);
+        assert_eq!(meaning("refinement.minima"), Meaning::Removed);
+        assert_eq!(meaning("minimum"), Meaning::Unknown);
     }
 
     #[test]

@@ -25,6 +25,10 @@ use crate::validation::{
     InvalidValue, Validate, fraction, in_range, not_negative, positive, require,
 };
 
+/// Minimum cosine between normal and beam (unitless): a plane at a more grazing incidence is the gap between two
+/// surfaces.
+pub(super) const MIN_INCIDENCE: f32 = 0.02;
+
 /// Settings of the normal estimation.
 ///
 /// Defaults: values for sensors with about 2 cm of noise.
@@ -50,10 +54,6 @@ pub struct NormalConfig {
     /// Minimum share of inliers among the neighbors, 0 to 1 (unitless).
     #[default(0.35)]
     pub min_share: f32,
-    /// Minimum cosine between normal and beam (unitless): a plane at a more grazing incidence is the
-    /// gap between two surfaces.
-    #[default(0.02)]
-    pub min_incidence: f32,
 }
 
 impl Validate for NormalConfig {
@@ -68,8 +68,7 @@ impl Validate for NormalConfig {
             self.min_support,
             "a plane needs a pixel and 2 inliers or more",
         )?;
-        fraction("min_share", self.min_share)?;
-        fraction("min_incidence", self.min_incidence)
+        fraction("min_share", self.min_share)
     }
 }
 
@@ -159,7 +158,7 @@ fn normals_of(
         let is_found = inliers.count[lane] - 1.0 >= least.max(config.min_support as f32)
             // The tilt of a strip hardly wider than the noise is undetermined.
             && planes.middle[lane] >= 4.0 * planes.smallest[lane]
-            && cosine.abs() >= config.min_incidence;
+            && cosine.abs() >= MIN_INCIDENCE;
         let sign = if is_found { cosine.signum() } else { f32::NAN };
         for axis in &mut normals {
             axis[lane] *= sign;

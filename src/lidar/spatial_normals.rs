@@ -109,7 +109,7 @@ fn normal_at(grid: &Grid, point: Vec3, config: &NormalConfig) -> Option<Vec3> {
         return None;
     }
     let cosine = -plane.normal.dot(point) / range_m;
-    (cosine.abs() >= config.min_incidence).then_some(plane.normal * cosine.signum())
+    (cosine.abs() >= super::normals::MIN_INCIDENCE).then_some(plane.normal * cosine.signum())
 }
 
 fn plane_of(points: &[Vec3], anchor: Vec3) -> Option<PlaneFit> {

@@ -25,7 +25,7 @@ use smart_default::SmartDefault;
 use super::particles::deviation;
 use crate::geometry::{Pose2, wrap_angle};
 use crate::registration::RegistrationConfig;
-use crate::validation::{InvalidValue, Validate, fraction, in_range, nested, positive};
+use crate::validation::{InvalidValue, Validate, fraction, in_range, nested};
 
 /// Proposal distribution while tracking.
 ///
@@ -51,13 +51,6 @@ pub struct ProposalConfig {
     /// step is so small that the estimate does not depend on whether there is one more.
     #[default(RegistrationConfig { map_error_m: 0.001, tolerance_m: 1e-4, ..RegistrationConfig::default() })]
     pub registration: RegistrationConfig,
-    /// Factor k of the standard deviations of the proposal, at least 1, so that its tails are heavier than
-    /// those of the target (unitless).
-    #[default(1.5)]
-    pub widening: f64,
-    /// Distance from the prior beyond which a registration is rejected (standard deviations).
-    #[default(6.0)]
-    pub max_sigmas: f64,
 }
 
 impl Validate for ProposalConfig {
@@ -65,9 +58,7 @@ impl Validate for ProposalConfig {
         in_range("beams", self.beams, 1..=1_000_000)?;
         fraction("road_share", self.road_share)?;
         in_range("weighed_beams", self.weighed_beams, 1..=1_000_000)?;
-        nested("registration", &self.registration)?;
-        in_range("widening", self.widening, 1.0..=1000.0)?;
-        positive("max_sigmas", self.max_sigmas)
+        nested("registration", &self.registration)
     }
 }
 

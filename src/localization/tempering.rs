@@ -28,19 +28,15 @@ pub struct TemperingConfig {
     /// unchanged, as range-mcl does.
     #[default(0.2)]
     pub min_effective_fraction: f64,
-    /// Rounds of reweighting and resampling per frame while searching.
+    /// Rounds of reweighting and resampling per frame while searching; while tracking there is one.
     #[default(4)]
     pub searching_rounds: usize,
-    /// Rounds of reweighting and resampling per frame while tracking.
-    #[default(1)]
-    pub tracking_rounds: usize,
 }
 
 impl Validate for TemperingConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         fraction("min_effective_fraction", self.min_effective_fraction)?;
-        in_range("searching_rounds", self.searching_rounds, 1..=100)?;
-        in_range("tracking_rounds", self.tracking_rounds, 1..=100)
+        in_range("searching_rounds", self.searching_rounds, 1..=100)
     }
 }
 

@@ -72,12 +72,6 @@ pub struct FrameRefinementConfig {
     /// Largest reach in heading [rad].
     #[default(1.0)]
     pub max_reach_rad: f64,
-    /// Reach in x and y within which Gauss-Newton needs no swarm [m].
-    #[default(0.3)]
-    pub basin_m: f64,
-    /// The same in heading [rad].
-    #[default(0.04)]
-    pub basin_rad: f64,
     /// The search from farther away.
     pub wide_search: WideSearchConfig,
     /// Increase of the mean cost that makes a pose e times less likely, for covariances [m].
@@ -91,8 +85,6 @@ impl Validate for FrameRefinementConfig {
         in_range("swarm_beams", self.swarm_beams, 1..=1_000_000)?;
         nested("gauss_newton", &self.gauss_newton)?;
         nested("wide_search", &self.wide_search)?;
-        not_negative("basin_m", self.basin_m)?;
-        not_negative("basin_rad", self.basin_rad)?;
         nested("smoothing", &self.smoothing)?;
         not_negative("reach_sigmas", self.reach_sigmas)?;
         positive("min_reach_m", self.min_reach_m)?;
@@ -125,8 +117,12 @@ impl FrameRefinementConfig {
 
     /// Whether an estimate may be outside the basin of Gauss-Newton, so that both steps are needed.
     pub(crate) fn is_wide(&self, covariance: &Matrix3<f64>) -> bool {
+        /// Reach in x and y within which Gauss-Newton needs no swarm [m].
+        const BASIN_M: f64 = 0.3;
+        /// The same in heading.
+        const BASIN_RAD: f64 = 0.04;
         let [x, y, heading] = self.reach(covariance);
-        self.method == Method::Both && (x.max(y) > self.basin_m || heading > self.basin_rad)
+        self.method == Method::Both && (x.max(y) > BASIN_M || heading > BASIN_RAD)
     }
 }
 

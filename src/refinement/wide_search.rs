@@ -57,9 +57,6 @@ pub struct WideSearchConfig {
     /// Scale of the robust kernel with which Gauss-Newton begins [m].
     #[default(0.5)]
     pub kernel_m: f64,
-    /// Minima that Gauss-Newton finishes.
-    #[default(4)]
-    pub minima: usize,
 }
 
 impl Validate for WideSearchConfig {
@@ -69,8 +66,7 @@ impl Validate for WideSearchConfig {
         in_range("returns", self.returns, 1..=100_000)?;
         in_range("range_m", self.range_m, 1.0..=200.0)?;
         in_range("limit_m", self.limit_m, 0.1..=50.0)?;
-        positive("kernel_m", self.kernel_m)?;
-        in_range("minima", self.minima, 1..=1000)
+        positive("kernel_m", self.kernel_m)
     }
 }
 
@@ -114,9 +110,11 @@ pub fn search(
             minimize(&dimensions, &config.swarm, batch, &mut stream(seed, 0))
         })
         .collect::<Result<Vec<_>, _>>()?;
+    /// Minima that Gauss-Newton finishes.
+    const FINISHED: usize = 4;
     minima.sort_by(|a, b| a.1.total_cmp(&b.1));
     let mut best: Option<(Pose3, f64)> = None;
-    for pose in distinct(&minima, config.minima) {
+    for pose in distinct(&minima, FINISHED) {
         let Some(found) = finish(objective, &pose, reach_m, gauss_newton, config)? else {
             continue;
         };

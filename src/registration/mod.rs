@@ -8,8 +8,7 @@
 //! ```
 //!
 //! Each iteration casts one ray per beam; the hit is the correspondence of the return (projective
-//! association), and the plane of its triangle gives the point-to-plane residual. Three degrees of
-//! freedom (x, y, heading) or six, which also estimate height, roll and pitch.
+//! association), and the plane of its triangle gives the point-to-plane residual.
 //!
 //! Neighboring returns hit the same surface and share its map error, so their residuals are
 //! correlated. The covariance is cluster-robust: gradients are summed per sector of the azimuth,
@@ -38,17 +37,6 @@ use crate::lidar::Beam;
 use crate::rendering::{RangeRenderer, RenderError, SurfaceHit};
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
-/// Components of the pose that registration estimates.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
-#[serde(rename_all = "snake_case")]
-pub enum DegreesOfFreedom {
-    /// x, y and heading, in the plane of the road.
-    Planar,
-    /// Also height, roll and pitch.
-    Spatial,
-}
-
 /// Settings of the registration.
 ///
 /// Defaults: our own values; from 1.5 degrees away it takes up to ten iterations.
@@ -56,10 +44,6 @@ pub enum DegreesOfFreedom {
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
 pub struct RegistrationConfig {
-    /// Estimated components of the pose.
-    #[serde(rename = "freedom")]
-    #[default(DegreesOfFreedom::Spatial)]
-    pub degrees_of_freedom: DegreesOfFreedom,
     /// Maximum number of Gauss-Newton iterations.
     #[default(12)]
     pub iterations: usize,
@@ -95,8 +79,7 @@ impl Validate for RegistrationConfig {
 pub(crate) struct RegistrationResult {
     /// `p_map = map_from_lidar * p_lidar`.
     pub map_from_lidar: Pose3,
-    /// Covariance of (x, y, z, roll, pitch, yaw) in the lidar frame [m, rad]; zero for components
-    /// that are not estimated.
+    /// Covariance of (x, y, z, roll, pitch, yaw) in the lidar frame [m, rad].
     pub covariance: Matrix6<f64>,
     /// Number of iterations, one ray per beam each.
     pub iterations: usize,
@@ -239,14 +222,11 @@ fn solve(
     residuals: &[Residual],
     config: &RegistrationConfig,
 ) -> Option<(Vector6<f64>, Matrix6<f64>)> {
+    /// Fewer residuals determine no pose.
     const MIN_RESIDUALS: usize = 30;
     if residuals.len() < MIN_RESIDUALS {
         return None;
     }
-    let estimated = Vector6::from(match config.degrees_of_freedom {
-        DegreesOfFreedom::Planar => [1.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        DegreesOfFreedom::Spatial => [1.0; 6],
-    });
     let mut information = Matrix6::zeros();
     let mut right_side = Vector6::zeros();
     let mut sector_gradients = vec![Vector6::zeros(); config.sectors];
@@ -255,7 +235,7 @@ fn solve(
         scale_m: config.kernel_m,
     };
     for residual in residuals {
-        let jacobian = residual.jacobian.component_mul(&estimated);
+        let jacobian = residual.jacobian;
         let weight = kernel.weight(residual.value_m);
         information += weight * jacobian * jacobian.transpose();
         let gradient = weight * residual.value_m * jacobian;
@@ -264,7 +244,6 @@ fn solve(
         squares += weight * residual.value_m.powi(2);
         weights += weight;
     }
-    information += Matrix6::from_diagonal(&estimated.map(|estimated| 1.0 - estimated));
     let cholesky = information.cholesky()?;
     let step = cholesky.solve(&right_side);
     let outer_products: Matrix6<f64> = sector_gradients.iter().map(|g| g * g.transpose()).sum();
@@ -274,9 +253,6 @@ fn solve(
     let mut covariance = inverse * (squares / weights) + inverse * outer_products * inverse;
     for axis in 0..3 {
         covariance[(axis, axis)] += config.map_error_m.powi(2);
-    }
-    for axis in 0..6 {
-        covariance[(axis, axis)] *= estimated[axis];
     }
     step.iter()
         .all(|value| value.is_finite())
@@ -360,23 +336,15 @@ mod tests {
         }
     }
 
-    fn planar_config() -> RegistrationConfig {
-        RegistrationConfig {
-            degrees_of_freedom: DegreesOfFreedom::Planar,
-            ..RegistrationConfig::default()
-        }
-    }
-
     #[test]
     fn registration_converges_from_ten_centimeters_and_half_a_degree() {
         let world = TestWorld::street();
         let truth = world.pose_at(5.0, 0.3, 0.1);
         let off = truth * Pose2::new(Vector2::new(0.1, -0.08), 0.009);
-        for config in [planar_config(), RegistrationConfig::default()] {
-            let found = register(&world, &beams(&world, &truth), &lift(&world, &off), &config);
-            let found = found.unwrap().unwrap().map_from_lidar;
-            assert_relative_eq!(found, lift(&world, &truth), epsilon = 3e-3);
-        }
+        let config = RegistrationConfig::default();
+        let found = register(&world, &beams(&world, &truth), &lift(&world, &off), &config);
+        let found = found.unwrap().unwrap().map_from_lidar;
+        assert_relative_eq!(found, lift(&world, &truth), epsilon = 3e-3);
     }
 
     #[test]
@@ -438,26 +406,6 @@ mod tests {
         let found = found.unwrap().unwrap();
         assert_relative_eq!(found.map_from_lidar, start, epsilon = 1e-3);
         assert_eq!(found.iterations, 1);
-    }
-
-    #[test]
-    fn planar_registration_keeps_height_roll_and_pitch() {
-        let world = TestWorld::street();
-        let truth = world.pose_at(5.0, 0.3, 0.1);
-        let start = lift(&world, &(truth * Pose2::translation(0.1, 0.05)));
-        let found = register(&world, &beams(&world, &truth), &start, &planar_config());
-        let found = found.unwrap().unwrap();
-        assert_relative_eq!(
-            found.map_from_lidar.translation.z,
-            start.translation.z,
-            epsilon = 1e-9
-        );
-        let (roll, pitch, _) = found.map_from_lidar.rotation.euler_angles();
-        assert!(roll.abs() < 1e-9 && pitch.abs() < 1e-9);
-        let axes: Vec<usize> = (0..6)
-            .filter(|&axis| found.covariance[(axis, axis)] > 0.0)
-            .collect();
-        assert_eq!(axes, [0, 1, 5]);
     }
 
     #[test]

@@ -343,6 +343,19 @@ fn keys_of_batches_have_no_effect() {
 }
 
 #[test]
+fn a_key_whose_value_is_fixed_now_is_refused_with_this_reason() {
+    let text = "seed: 1\nproposal: {registration: {iterations: 3, freedom: planar}}\n";
+    assert_contains(
+        &message_of(text, &[]),
+        &["line 2", "freedom` is no key any more", "remove it"],
+    );
+    assert_contains(
+        &message_of("", &[("widening", "2")]),
+        &["--set widening=2", "`widening` is no key"],
+    );
+}
+
+#[test]
 fn names_of_one_block_are_gathered_and_errors_keep_the_lines_of_the_file() {
     let text = "\
 depth: 8

@@ -15,6 +15,12 @@ use crate::map::SensorAttitude;
 use crate::registration::register;
 use crate::rendering::RenderError;
 
+/// Factor k of the standard deviations of the proposal, at least 1, so that its tails are heavier than those of the
+/// target (unitless).
+const WIDENING: f64 = 1.5;
+/// Distance from the prior beyond which a registration is rejected (standard deviations).
+const MAX_SIGMAS: f64 = 6.0;
+
 /// Proposal distribution of a frame, with what is needed to weight its samples.
 pub(super) struct Proposal {
     prior: Gaussian,
@@ -80,12 +86,12 @@ impl ParticleFilter {
         let (Some(prior), Some(measured)) = (prior, measured) else {
             return Ok(None);
         };
-        if prior.squared_distance(&measured.mean) > config.max_sigmas.powi(2) {
+        if prior.squared_distance(&measured.mean) > MAX_SIGMAS.powi(2) {
             return Ok(None);
         }
         let fused = prior.fused(&measured);
         Ok(fused
-            .and_then(|fused| fused.widened(config.widening))
+            .and_then(|fused| fused.widened(WIDENING))
             .map(|proposal| Proposal {
                 prior,
                 proposal,

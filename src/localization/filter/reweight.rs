@@ -49,7 +49,7 @@ impl ParticleFilter {
     ) -> Result<Update, RenderError> {
         let tempering = &self.config.tempering;
         let rounds = if self.phase.is_tracking() {
-            tempering.tracking_rounds
+            1
         } else {
             tempering.searching_rounds
         };

@@ -36,7 +36,7 @@ use crate::map::tiles::grid::TileGrid;
 use crate::memory::{MemoryBudget, MemoryError};
 use crate::raycasting::TileError;
 use crate::rendering::{RangeRenderer, RenderError};
-use crate::validation::{InvalidValue, Validate, fraction, in_range, not_negative, positive};
+use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive};
 
 /// Size of the panoramas and of the search.
 ///
@@ -63,9 +63,6 @@ pub struct PanoramaConfig {
     /// The first pass takes every n-th column and heading.
     #[default(2)]
     pub coarse_step: usize,
-    /// Share of the cells in the second pass (unitless).
-    #[default(0.1)]
-    pub refined_share: f64,
     /// Increase of the mean cost for which a cell gets e times fewer particles [m].
     #[default(0.03)]
     pub scale_m: f64,
@@ -87,7 +84,6 @@ impl Validate for PanoramaConfig {
         in_range("lowest_rad", self.lowest_rad, -1.5..=1.5)?;
         in_range("limit_m", self.limit_m, STEP_M..=MOST_LIMIT_M)?;
         in_range("coarse_step", self.coarse_step, 1..=self.columns)?;
-        fraction("refined_share", self.refined_share)?;
         positive("scale_m", self.scale_m)?;
         not_negative("yaw_sigma_deg", self.yaw_sigma_deg)
     }
@@ -271,7 +267,9 @@ impl PanoramaIndex {
             })
             .collect::<Result<_, TileError>>()?;
         coarse.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        let kept = (self.config.refined_share * coarse.len() as f64).ceil() as usize;
+        /// Share of the cells in the second pass (unitless).
+        const REFINED_SHARE: f64 = 0.1;
+        let kept = (REFINED_SHARE * coarse.len() as f64).ceil() as usize;
         self.keep_best_and_one_per_square(&mut coarse, kept.max(1));
         let places = self.panoramas.places();
         let mut seeds: Vec<PanoramaSeed> = coarse
