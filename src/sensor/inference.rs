@@ -6,7 +6,7 @@ use super::beams::{self, BeamSource};
 use super::config::{MotionCompensation, RangeImageConfig, SensorConfig};
 use super::dropped::DroppedPoints;
 use super::mounting::{self, Surroundings};
-use super::{ASSUMED_OWN_CAR_M, Sensor, columns, own_car, projection, rotation};
+use super::{Sensor, columns, own_car, projection, rotation};
 use crate::geometry::wrap_angle;
 use crate::lidar::{LidarModel, PERIOD_S, Rotation, Scan};
 use crate::odometry::{OdometryConfig, TimingComparison, TimingError, compare_timings};
@@ -53,7 +53,7 @@ impl Sensor {
         let surroundings = Surroundings::of(scans);
         let own_car = own_car::find(&surroundings);
         let sensor = Self {
-            range_image: projection::model(scans, &beams, columns, own_car.rectangle_m),
+            range_image: projection::model(scans, &beams, columns, own_car.near_m),
             has_rows: beams.source != BeamSource::None,
             beams: beams.nominal,
             beam_source: beams.source,
@@ -61,11 +61,7 @@ impl Sensor {
             horizontal_fov_deg,
             mounting: mounting::find(&surroundings),
             sensor_height_m: None,
-            own_car_m: if own_car.is_moving {
-                own_car.rectangle_m
-            } else {
-                ASSUMED_OWN_CAR_M
-            },
+            own_car_m: own_car.rectangle_m,
             is_moving: own_car.is_moving,
             period_s: rotation::period_s(scans, horizontal_fov_deg),
             rotation: rotation::direction(scans, horizontal_fov_deg),

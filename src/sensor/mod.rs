@@ -40,10 +40,6 @@ pub(crate) use inference::{SENSOR_SCANS, TIMING_SCANS, spread_scans};
 use crate::lidar::{LidarModel, RotationDirection};
 use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 
-/// Rectangle of a car of common size around its lidar, assumed until the scans show the own car: that of range-mcl's
-/// configuration, x_min, x_max, y_min, y_max [m].
-pub(crate) const ASSUMED_OWN_CAR_M: [f32; 4] = [-2.5, 2.7, -1.2, 1.2];
-
 /// What a sensor is, and how its scans are used.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -68,7 +64,7 @@ pub struct Sensor {
     /// Rectangle of the lidar frame with returns of the own car, which are dropped: x_min, x_max, y_min, y_max [m];
     /// all 0 if there are none.
     pub own_car_m: [f32; 4],
-    /// Whether the scans show that the sensor moves, without which the own car is unknown and assumed.
+    /// Whether the scans show that the sensor moves, without which they do not show its own car.
     pub is_moving: bool,
     /// Duration of a revolution or frame [s]; `None` if no times show it.
     pub period_s: Option<f64>,
@@ -81,7 +77,7 @@ pub struct Sensor {
 }
 
 impl Sensor {
-    /// A sensor of beams all around, with the own car assumed and the times of the data.
+    /// A sensor of beams all around, without an own car, with the times of the data.
     pub fn new(range_image: LidarModel) -> Self {
         Self {
             has_rows: true,
@@ -92,7 +88,7 @@ impl Sensor {
             range_image,
             mounting: None,
             sensor_height_m: None,
-            own_car_m: ASSUMED_OWN_CAR_M,
+            own_car_m: [0.0; 4],
             is_moving: false,
             period_s: None,
             rotation: None,

@@ -28,14 +28,17 @@ const CLEARANCE_M: f32 = 0.25;
 
 /// The own car in the lidar frame.
 pub struct OwnCar {
-    /// x_min, x_max, y_min, y_max [m]; all 0 if it has no returns.
+    /// x_min, x_max, y_min, y_max [m]; all 0 if it has no returns, or if the scans do not show motion.
     pub rectangle_m: [f32; 4],
+    /// Rectangle of the returns that do not count for the limits of range; without motion, of what stands out close
+    /// below the sensor.
+    pub near_m: [f32; 4],
     /// Whether the scans show that the sensor moves.
     pub is_moving: bool,
 }
 
-/// Finds the own car. If the sensor does not move, it is assumed to be what stands out above the ground below
-/// the sensor.
+/// Finds the own car. Where the scans do not show that the sensor moves, all that they show may be surroundings, and
+/// none is found.
 pub fn find(surroundings: &Surroundings) -> OwnCar {
     let returns: Vec<Vec<Vec3>> = surroundings.scans.iter().map(above_ground).collect();
     let around = counts(&returns, |p| {
@@ -49,13 +52,15 @@ pub fn find(surroundings: &Surroundings) -> OwnCar {
     let is_moving = returns.len() >= MIN_SCANS
         && share(&|scans| scans >= needed) < MAX_CONSTANT * share(&|_| true);
 
-    /// Distance within which a standing car's returns are its own [m].
+    /// Distance within which returns do not count for the limits of range without motion [m].
     const STANDING_REACH_M: f32 = 1.5;
     let reach_m = if is_moving { REACH_M } else { STANDING_REACH_M };
     let near = counts(&returns, |p| p.truncate().length() < reach_m);
     let constant = near.iter().filter(|(_, scans)| **scans >= needed);
+    let near_m = rectangle(constant.map(|(&cell, _)| cell).collect(), reach_m);
     OwnCar {
-        rectangle_m: rectangle(constant.map(|(&cell, _)| cell).collect(), reach_m),
+        rectangle_m: if is_moving { near_m } else { [0.0; 4] },
+        near_m,
         is_moving,
     }
 }
