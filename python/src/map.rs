@@ -294,7 +294,7 @@ pub fn classify_ground<'py>(
     let config = settings::apply(GroundConfig::default(), settings)?;
     let points = arrays::vectors("points", &points)?;
     let confidence = released(py, || {
-        let classifier = config.classifier()?;
+        let classifier = config.classifier(None)?;
         anyhow::Ok(classifier.ground_confidence(&points))
     })?;
     Ok(confidence.into_pyarray(py))

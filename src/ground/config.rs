@@ -44,15 +44,18 @@ pub struct GroundConfig {
 pub type NamedClassifier = (&'static str, Box<dyn GroundClassifier>);
 
 impl GroundConfig {
-    /// Builds the configured classifier.
+    /// Builds the configured classifier for a sensor at a height above the ground [m]; `None` where it is unknown.
     ///
     /// # Errors
     /// A field of the configured method is out of its range.
-    pub fn classifier(&self) -> Result<Box<dyn GroundClassifier>, InvalidValue> {
+    pub fn classifier(
+        &self,
+        height_m: Option<f64>,
+    ) -> Result<Box<dyn GroundClassifier>, InvalidValue> {
         self.validate()?;
         Ok(match self.method {
             GroundMethod::Fuzzy => Box::new(FuzzyGround::new(self.fuzzy.clone())?),
-            GroundMethod::Pca => Box::new(self.pca),
+            GroundMethod::Pca => Box::new(self.pca.mounted(height_m)),
             GroundMethod::Ransac => Box::new(self.ransac),
         })
     }

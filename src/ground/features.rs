@@ -185,3 +185,9 @@ pub(super) fn surface_normals(points: &[Vec3]) -> Vec<Option<Vec3>> {
     let config = FeatureConfig::default();
     ScanIndex::new(points, config.min_distance_m, config.spacing_m).normals()
 }
+
+/// Height of the ground below the sensor, in the lidar frame; NaN if the scan has no ground at all [m].
+pub(super) fn ground_height_m(points: &[Vec3]) -> f32 {
+    let features = ScanFeatures::new(points, &FeatureConfig::default());
+    features.terrain.height_below_m()
+}

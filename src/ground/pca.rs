@@ -5,16 +5,15 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::classifier::GroundClassifier;
-use super::features::surface_normals;
+use super::features::{ground_height_m, surface_normals};
 use crate::geometry::PlaneSums;
 use crate::validation::{InvalidValue, Validate, fraction, require};
 
 /// Ground by principal components: a point is ground if |n · k| is large, k being the eigenvector
-/// of the smallest eigenvalue of the covariance of the whole cloud, and it lies below a fixed
-/// height. After the PCA variant of range-mcl (Chen et al., ICRA 2021), with the eigenvalues in
-/// order.
+/// of the smallest eigenvalue of the covariance of the whole cloud, and it lies below a height.
+/// After the PCA variant of range-mcl (Chen et al., ICRA 2021), with the eigenvalues in order.
 ///
-/// Defaults: the values of range-mcl, for a sensor 1.73 m above the road.
+/// Defaults: the values of range-mcl; its maximum height, for a sensor 1.73 m above the road, is one above the ground.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
 #[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(default, deny_unknown_fields)]
@@ -22,18 +21,32 @@ pub struct PcaGround {
     /// Minimum |cosine| between the normal of a point and that of the cloud, unitless.
     #[default(0.8)]
     pub min_cosine: f32,
-    /// Maximum height of ground in the lidar frame [m].
-    #[default(-1.1)]
-    pub max_height_m: f32,
+    /// Maximum height of ground in the lidar frame [m]; `None`: 0.63 m above the ground below the sensor, by the height
+    /// of its mounting, else by the scan.
+    pub max_height_m: Option<f32>,
+}
+
+impl PcaGround {
+    /// Maximum height above the ground below the sensor: that of range-mcl, 1.73 m - 1.1 m [m].
+    const MAX_RISE_M: f32 = 0.63;
+
+    /// The same classifier for the scans of a sensor at a height above the ground [m], if that is known.
+    pub(super) fn mounted(self, height_m: Option<f64>) -> Self {
+        let known_m = height_m.map(|height_m| Self::MAX_RISE_M - height_m as f32);
+        Self {
+            max_height_m: self.max_height_m.or(known_m),
+            ..self
+        }
+    }
 }
 
 impl Validate for PcaGround {
     fn validate(&self) -> Result<(), InvalidValue> {
         fraction("min_cosine", self.min_cosine)?;
         require(
-            self.max_height_m.is_finite(),
+            self.max_height_m.is_none_or(f32::is_finite),
             "max_height_m",
-            self.max_height_m,
+            self.max_height_m.unwrap_or_default(),
             "it must be a height in the lidar frame, such as -1.1",
         )
     }
@@ -46,9 +59,11 @@ impl GroundClassifier for PcaGround {
             sums.add(point);
         }
         let vertical = sums.fit().map_or(Vec3::Z, |plane| plane.normal);
+        let max_height_m =
+            (self.max_height_m).unwrap_or_else(|| ground_height_m(points) + Self::MAX_RISE_M);
         classify_by_normal(points, |normal, z| {
             let is_level = normal.dot(vertical).abs() >= self.min_cosine;
-            f32::from(u8::from(is_level && z < self.max_height_m))
+            f32::from(u8::from(is_level && z < max_height_m))
         })
     }
 }

@@ -165,6 +165,11 @@ impl Terrain {
         inner + fr * (outer - inner)
     }
 
+    /// Mean height of the cells around the sensor; NaN if the scan has no ground at all [m].
+    pub(super) fn height_below_m(&self) -> f32 {
+        self.heights[..SECTORS].iter().sum::<f32>() / SECTORS as f32
+    }
+
     /// Height of the highest point around a point, below the clearance, above the ground [m].
     #[inline(always)]
     pub(super) fn top_m(&self, position: &PolarPosition) -> f32 {

@@ -132,6 +132,29 @@ fn fuzzy_rules_find_the_ground_of_a_slope_where_one_plane_does_not() {
 }
 
 #[test]
+fn principal_components_find_the_road_from_any_height() {
+    for height_m in [0.6, 1.2, 2.8] {
+        let sensor = Sensor {
+            height_m,
+            ..Sensor::SIXTY_FOUR
+        };
+        let roof_m = 0.9 - height_m;
+        let scene = [
+            sensor.ground(|_, _| 0.0),
+            cuboid(Vec3::new(6.0, 2.5, -height_m), Vec3::new(10.0, 9.0, roof_m)),
+        ];
+        let pca = PcaGround::default();
+        for classifier in [pca, pca.mounted(Some(f64::from(height_m)))] {
+            let road = share_of_ground(&classifier, &sensor, &scene, |hit, _| hit == 0);
+            let is_roof = |hit, point: Vec3| hit == 1 && point.z > roof_m - 0.1;
+            let roof = share_of_ground(&classifier, &sensor, &scene, is_roof);
+            assert!(road > 0.95, "{height_m}: {road}");
+            assert!(height_m < 1.0 || roof < 0.01, "{height_m}: {roof}");
+        }
+    }
+}
+
+#[test]
 fn empty_scans_and_points_that_are_not_finite_are_not_ground() {
     let classifiers: [&dyn GroundClassifier; 5] = [
         &fuzzy()[0],

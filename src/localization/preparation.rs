@@ -20,7 +20,7 @@ impl ScanPreparation {
         sensor.validate()?;
         Ok(Self {
             sensor: sensor.clone(),
-            classifier: ground.classifier()?,
+            classifier: ground.classifier(sensor.height_m())?,
             road: ground.road,
         })
     }
@@ -30,9 +30,7 @@ impl ScanPreparation {
     pub fn assumed_attitude(&self) -> SensorAttitude {
         let assumed = SensorAttitude::default();
         SensorAttitude {
-            height_m: (self.sensor.sensor_height_m)
-                .or(self.sensor.mounting.as_ref().map(|it| it.height_m))
-                .unwrap_or(assumed.height_m),
+            height_m: self.sensor.height_m().unwrap_or(assumed.height_m),
             ..assumed
         }
     }

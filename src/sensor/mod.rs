@@ -96,6 +96,11 @@ impl Sensor {
             scans: 0,
         }
     }
+
+    /// Height above the ground: given, else that of the mounting [m].
+    pub(crate) fn height_m(&self) -> Option<f64> {
+        (self.sensor_height_m).or(self.mounting.map(|mounting| mounting.height_m))
+    }
 }
 
 impl Validate for Sensor {

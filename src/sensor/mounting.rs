@@ -41,7 +41,7 @@ impl<'a> Surroundings<'a> {
     pub fn of(scans: &'a [Scan]) -> Self {
         let step = scans.len().div_ceil(Self::MAX_SCANS).max(1);
         let scans = scans.iter().step_by(step);
-        let Ok(classifier) = GroundConfig::default().classifier() else {
+        let Ok(classifier) = GroundConfig::default().classifier(None) else {
             return Self { scans: vec![] };
         };
         let with_ground = |scan: &'a Scan| {

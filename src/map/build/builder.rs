@@ -256,7 +256,7 @@ impl MapBuilder {
         Ok(MapPlan {
             builder: self,
             scan: config.local_map.scan_preparation(sensor),
-            classifier: config.ground.classifier()?,
+            classifier: config.ground.classifier(sensor.height_m())?,
             older: None,
             ownership: Ownership::new(&map_from_lidar, &local_maps),
             local_maps,
