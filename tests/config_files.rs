@@ -14,7 +14,7 @@ use fpmcl::internals::app::settings::{
     RefinementConfig,
 };
 use fpmcl::lidar::LidarModel;
-use fpmcl::sensor::RangeImageConfig;
+use fpmcl::sensor::{Sensor, SensorConfig};
 use fpmcl::simulation::SimulationConfig;
 
 fn root() -> &'static Path {
@@ -151,6 +151,11 @@ fn recording() -> RecordingConfig {
     }
 }
 
+/// The sensor that range-mcl's files describe.
+fn known() -> SensorConfig {
+    SensorConfig::from(&Sensor::new(LidarModel::default()))
+}
+
 fn poses() -> PoseInputConfig {
     PoseInputConfig {
         pose_file: Some("../data/07/poses.txt".into()),
@@ -168,7 +173,7 @@ fn the_build_map_file_of_range_mcl_loads_unchanged() {
         mesh_file: "../data/mesh_kitti_07.ply".into(),
         ..BuildMapConfig::default()
     };
-    expected.map.sensor.range_image = RangeImageConfig::of(&LidarModel::default());
+    expected.map.sensor.range_image = known().range_image;
     assert_eq!(config, expected);
 }
 
@@ -187,7 +192,7 @@ fn the_localization_file_of_range_mcl_loads_unchanged() {
         pose_tracking: Some(false),
         ..LocalizationConfig::default()
     };
-    expected.tracker.sensor.range_image = RangeImageConfig::of(&LidarModel::default());
+    expected.tracker.sensor.range_image = known().range_image;
     assert_eq!(config, expected);
     assert_eq!(config.initialization(), Initialization::Corridor);
 }

@@ -16,34 +16,106 @@ use std::sync::Arc;
 use crate::validation::{InvalidValue, Validate, in_range, not_negative, positive, require};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
-use smart_default::SmartDefault;
 
-/// Size, field of view and range limits of a range image.
-///
-/// Defaults: a Velodyne HDL-64E with the values of range-mcl.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, SmartDefault)]
-#[serde(default, deny_unknown_fields)]
-pub struct LidarModel {
-    /// Number of rows.
-    #[default(64)]
-    pub height: usize,
-    /// Number of columns over 360 degrees.
-    #[default(900)]
-    pub width: usize,
-    /// Upper limit of the vertical field of view, above the horizon [deg].
-    #[default(3.0)]
-    pub fov_up: f32,
-    /// Lower limit of the vertical field of view, below the horizon whatever its sign [deg].
-    #[default(-25.0)]
-    pub fov_down: f32,
-    /// Maximum range, exclusive [m].
-    #[default(50.0)]
-    pub max_range: f32,
-    /// Minimum range, exclusive [m].
-    #[default(2.0)]
-    pub min_range: f32,
-    /// Elevations of the rows, from the top [deg]; `None` if they are evenly spaced over the field of view.
+/// Size, field of view and range limits of a range image: all of them, or with options those that are known.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
+#[serde(deny_unknown_fields)]
+pub struct LidarModel<N = usize, F = f32> {
+    /// Rows.
+    pub height: N,
+    /// Columns over 360 degrees.
+    pub width: N,
+    /// Upper edge of the vertical field of view over the horizon [deg].
+    pub fov_up: F,
+    /// Lower edge of the vertical field of view; below the horizon whatever its sign [deg].
+    pub fov_down: F,
+    /// Range from which on returns are dropped [m].
+    pub max_range: F,
+    /// Range up to which returns are dropped [m].
+    pub min_range: F,
+    /// Elevations of the rows, from the top [deg]; without them, the rows of a field of view are evenly spaced.
     pub elevations: Option<Arc<[f32]>>,
+}
+
+impl Default for LidarModel {
+    /// A Velodyne HDL-64E with the values of range-mcl.
+    fn default() -> Self {
+        Self {
+            height: 64,
+            width: 900,
+            fov_up: 3.0,
+            fov_down: -25.0,
+            max_range: 50.0,
+            min_range: 2.0,
+            elevations: None,
+        }
+    }
+}
+
+impl LidarModel<Option<usize>, Option<f32>> {
+    /// Nothing is known.
+    pub(crate) const UNKNOWN: Self = Self {
+        height: None,
+        width: None,
+        fov_up: None,
+        fov_down: None,
+        max_range: None,
+        min_range: None,
+        elevations: None,
+    };
+
+    /// What is known, and the values of another model where nothing is.
+    pub(crate) fn or(&self, other: &LidarModel) -> LidarModel {
+        let has_rows = self.height.is_some() || self.fov_up.is_some() || self.fov_down.is_some();
+        let others = (other.elevations.as_ref()).filter(|_| !has_rows);
+        LidarModel {
+            height: (self.height)
+                .or(self.elevations.as_ref().map(|elevations| elevations.len()))
+                .unwrap_or(other.height),
+            width: self.width.unwrap_or(other.width),
+            fov_up: self.fov_up.unwrap_or(other.fov_up),
+            fov_down: self.fov_down.unwrap_or(other.fov_down),
+            max_range: self.max_range.unwrap_or(other.max_range),
+            min_range: self.min_range.unwrap_or(other.min_range),
+            elevations: self.elevations.as_ref().or(others).cloned(),
+        }
+    }
+}
+
+impl From<&LidarModel> for LidarModel<Option<usize>, Option<f32>> {
+    fn from(model: &LidarModel) -> Self {
+        Self {
+            height: Some(model.height),
+            width: Some(model.width),
+            fov_up: Some(model.fov_up),
+            fov_down: Some(model.fov_down),
+            max_range: Some(model.max_range),
+            min_range: Some(model.min_range),
+            elevations: model.elevations.clone(),
+        }
+    }
+}
+
+impl Validate for LidarModel<Option<usize>, Option<f32>> {
+    /// Checks the known values, and those with each other that depend on each other if both are known.
+    fn validate(&self) -> Result<(), InvalidValue> {
+        let mut other = LidarModel::default();
+        // Limits of what is unknown that contradict nothing.
+        if self.fov_up.is_none() || self.fov_down.is_none() {
+            (other.fov_up, other.fov_down) = (90.0, -90.0);
+        }
+        if self.min_range.is_none() || self.max_range.is_none() {
+            other.min_range = 0.0;
+            other.max_range = self
+                .min_range
+                .map_or(other.max_range, |min| 2.0 * min.max(1.0));
+        }
+        if let (None, Some(elevations)) = (self.height, &self.elevations) {
+            other.height = elevations.len();
+        }
+        self.or(&other).validate()
+    }
 }
 
 impl LidarModel {

@@ -1,7 +1,6 @@
 //! What a user knows about a sensor; the rest is inferred from the scans.
 
 use std::fmt;
-use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
@@ -15,7 +14,11 @@ use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 #[serde(default, deny_unknown_fields)]
 pub struct SensorConfig {
     /// Size and limits of the range images.
-    pub range_image: RangeImageConfig,
+    #[default(LidarModel::UNKNOWN)]
+    pub range_image: LidarModel<Option<usize>, Option<f32>>,
+    /// Whether each beam keeps its elevation, as those of spinning sensors do; otherwise `build-map` takes normals
+    /// from neighbours in space.
+    pub has_rows: Option<bool>,
     /// Rectangle of the own car in the lidar frame, whose points are dropped: x_min, x_max, y_min, y_max [m].
     pub own_car_m: Option<[f32; 4]>,
     /// Height of the sensor above the ground [m].
@@ -139,92 +142,5 @@ impl TryFrom<String> for MotionCompensation {
                 "`{text}` is not auto, or a rotation: clockwise or counter_clockwise, which may be followed by `from` and the azimuth at which a revolution starts, -360 to 360 [deg]"
             )),
         }
-    }
-}
-
-/// Size and limits of the range images; `None` is inferred from the scans.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
-#[serde(default, deny_unknown_fields)]
-pub struct RangeImageConfig {
-    /// Rows.
-    pub height: Option<usize>,
-    /// Columns over 360 degrees.
-    pub width: Option<usize>,
-    /// Upper edge of the vertical field of view over the horizon [deg].
-    pub fov_up: Option<f32>,
-    /// Lower edge of the vertical field of view; below the horizon whatever its sign [deg].
-    pub fov_down: Option<f32>,
-    /// Range from which on returns are dropped [m].
-    pub max_range: Option<f32>,
-    /// Range up to which returns are dropped [m].
-    pub min_range: Option<f32>,
-    /// Elevations of the rows, from the top [deg]; without them, rows of a given `height`, `fov_up` or
-    /// `fov_down` are evenly spaced.
-    pub elevations: Option<Arc<[f32]>>,
-    /// Whether each beam keeps its elevation, as those of spinning sensors do; otherwise `build-map` takes normals
-    /// from neighbours in space.
-    pub has_rows: Option<bool>,
-}
-
-impl RangeImageConfig {
-    /// The range images of a model.
-    pub fn of(model: &LidarModel) -> Self {
-        Self {
-            height: Some(model.height),
-            width: Some(model.width),
-            fov_up: Some(model.fov_up),
-            fov_down: Some(model.fov_down),
-            max_range: Some(model.max_range),
-            min_range: Some(model.min_range),
-            elevations: model.elevations.clone(),
-            ..Self::default()
-        }
-    }
-
-    /// The sensor model, with the values of another where none is given.
-    pub(crate) fn model_over(&self, inferred: &LidarModel) -> LidarModel {
-        let has_rows = self.height.is_some() || self.fov_up.is_some() || self.fov_down.is_some();
-        LidarModel {
-            height: (self.height)
-                .or(self.elevations.as_ref().map(|elevations| elevations.len()))
-                .unwrap_or(inferred.height),
-            width: self.width.unwrap_or(inferred.width),
-            fov_up: self.fov_up.unwrap_or(inferred.fov_up),
-            fov_down: self.fov_down.unwrap_or(inferred.fov_down),
-            max_range: self.max_range.unwrap_or(inferred.max_range),
-            min_range: self.min_range.unwrap_or(inferred.min_range),
-            elevations: if has_rows {
-                self.elevations.clone()
-            } else {
-                self.elevations.clone().or(inferred.elevations.clone())
-            },
-        }
-    }
-
-    /// The sensor model, with the values of an HDL-64E where none is given.
-    pub(crate) fn model(&self) -> LidarModel {
-        self.model_over(&LidarModel::default())
-    }
-}
-
-impl Validate for RangeImageConfig {
-    /// Checks the given values, and those with each other that depend on each other if both are given.
-    fn validate(&self) -> Result<(), InvalidValue> {
-        let mut other = LidarModel::default();
-        // Limits of what is not given that contradict nothing.
-        if self.fov_up.is_none() || self.fov_down.is_none() {
-            (other.fov_up, other.fov_down) = (90.0, -90.0);
-        }
-        if self.min_range.is_none() || self.max_range.is_none() {
-            other.min_range = 0.0;
-            other.max_range = self
-                .min_range
-                .map_or(other.max_range, |min| 2.0 * min.max(1.0));
-        }
-        if let (None, Some(elevations)) = (self.height, &self.elevations) {
-            other.height = elevations.len();
-        }
-        self.model_over(&other).validate()
     }
 }

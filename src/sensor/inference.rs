@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 
 use super::beams::{self, BeamSource};
-use super::config::{MotionCompensation, RangeImageConfig, SensorConfig};
+use super::config::{MotionCompensation, SensorConfig};
 use super::dropped::DroppedPoints;
 use super::mounting::{self, Surroundings};
 use super::{Sensor, columns, own_car, projection, rotation};
@@ -106,27 +106,18 @@ impl Sensor {
         Ok(sensor)
     }
 
-    /// The sensor of a configuration from which nothing about range images and own car is missing.
+    /// The sensor of a configuration from which nothing about range images, rows and own car is missing.
     pub(crate) fn configured(known: &SensorConfig) -> Option<Self> {
-        let range_image = known.range_image.model();
-        let given = RangeImageConfig {
-            has_rows: None,
-            ..known.range_image.clone()
-        };
-        let own_car_m = known.own_car_m?;
-        let is_complete = given == RangeImageConfig::of(&range_image);
-        is_complete.then(|| Self {
-            own_car_m,
-            motion_compensation: known.motion_compensation,
-            ..Self::new(range_image).with_known(known)
-        })
+        let sensor = Self::new(known.range_image.or(&LidarModel::default())).with_known(known);
+        (SensorConfig::from(&sensor) == *known).then_some(sensor)
     }
 
     /// The same sensor, with what is known.
     #[must_use]
     pub fn with_known(mut self, known: &SensorConfig) -> Self {
-        self.range_image = known.range_image.model_over(&self.range_image);
-        self.has_rows = known.range_image.has_rows.unwrap_or(self.has_rows);
+        self.range_image = known.range_image.or(&self.range_image);
+        self.has_rows = known.has_rows.unwrap_or(self.has_rows);
+        self.beams = self.beams.filter(|_| self.has_rows);
         self.own_car_m = known.own_car_m.unwrap_or(self.own_car_m);
         self.sensor_height_m = known.sensor_height_m.or(self.sensor_height_m);
         if known.motion_compensation != Some(MotionCompensation::Auto) {

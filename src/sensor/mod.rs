@@ -30,7 +30,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 pub use beams::BeamSource;
-pub use config::{MotionCompensation, RangeImageConfig, SensorConfig};
+pub use config::{MotionCompensation, SensorConfig};
 pub use dropped::{DropReason, DroppedPoints};
 pub use inference::SensorError;
 pub use mounting::Mounting;
@@ -100,6 +100,19 @@ impl Sensor {
     /// Height above the ground: given, else that of the mounting [m].
     pub(crate) fn height_m(&self) -> Option<f64> {
         (self.sensor_height_m).or(self.mounting.map(|mounting| mounting.height_m))
+    }
+}
+
+impl From<&Sensor> for SensorConfig {
+    /// All of a sensor that can be known.
+    fn from(sensor: &Sensor) -> Self {
+        Self {
+            range_image: (&sensor.range_image).into(),
+            has_rows: Some(sensor.has_rows),
+            own_car_m: Some(sensor.own_car_m),
+            sensor_height_m: sensor.sensor_height_m,
+            motion_compensation: sensor.motion_compensation,
+        }
     }
 }
 

@@ -278,6 +278,24 @@ fn a_moving_sensor_sees_its_own_car_and_the_ground_below() {
 }
 
 #[test]
+fn what_a_sensor_is_is_known_of_it_and_rows_that_are_not_given_are_inferred() {
+    let sensor = Sensor::hdl64e();
+    let mut known = SensorConfig::from(&sensor);
+    assert_eq!(Sensor::configured(&known), Some(sensor.clone()));
+    known.has_rows = None;
+    assert_eq!(Sensor::configured(&known), None);
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    let direction = |_| Vec3::from_array(std::array::from_fn(|_| rng.random_range(-1.0..1.0)));
+    let scattered = Scan {
+        points: (0..20_000).map(direction).map(|it| 9.0 * it).collect(),
+        ..Scan::default()
+    };
+    let found = Sensor::infer(&[scattered], &known).unwrap();
+    assert_eq!(found.range_image, sensor.range_image);
+    assert_eq!((found.has_rows, found.beams), (false, None));
+}
+
+#[test]
 fn nothing_follows_from_no_points_and_damaged_ones() {
     let infer = |scans: &[Scan]| Sensor::infer(scans, &SensorConfig::default());
     let scan = |point: Option<Vec3>| Scan {

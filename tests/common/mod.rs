@@ -165,6 +165,7 @@ sequences:
 /// Keys of the sensor of a simulated drive with 600 measurements of a beam per revolution.
 pub const SENSOR: &str = "\
 range_image: {height: 64, width: 600, fov_up: 3, fov_down: -25, max_range: 50, min_range: 2}
+has_rows: True
 own_car_m: [-2.5, 2.7, -1.2, 1.2]
 motion_compensation: null
 ";
@@ -289,6 +290,7 @@ voxel_size: 0.2
 simplify_resolution: 0.5
 displacement_threshold_m: 0
 check_poses: False
+has_rows: True
 own_car_m: [-2.5, 2.7, -1.2, 1.2]
 motion_compensation: null
 range_image: {height: 32, width: 360, fov_up: 3, fov_down: -25, max_range: 50, min_range: 1}
@@ -307,6 +309,7 @@ num_reduced: 20
 plot_loc_results: False
 pose_tracking: True
 odometry: ground_truth
+has_rows: True
 own_car_m: [-2.5, 2.7, -1.2, 1.2]
 motion_compensation: null
 range_image: {height: 32, width: 360, fov_up: 3, fov_down: -25, max_range: 50, min_range: 1}
@@ -323,6 +326,7 @@ result_file: results/localization.npz
 plot_loc_results: False
 refinement: {swarm: {iterations: 5}}
 odometry: ground_truth
+has_rows: True
 own_car_m: [-2.5, 2.7, -1.2, 1.2]
 motion_compensation: null
 range_image: {height: 32, width: 360, fov_up: 3, fov_down: -25, max_range: 50, min_range: 1}

@@ -9,7 +9,7 @@ use crate::app::run::{Context, input, memory};
 use crate::app::settings::{MapInputConfig, MotionSourceConfig, PoseInputConfig, RecordingConfig};
 use crate::map::{Map, MapCache, MapOptions, MappingPath};
 use crate::recording::{PoseTrack, Recording, is_topic};
-use crate::sensor::{RangeImageConfig, Sensor, SensorConfig};
+use crate::sensor::{Sensor, SensorConfig};
 
 /// A recording, and the poses that are given with it.
 #[derive(Clone, Copy)]
@@ -80,18 +80,8 @@ impl PoseInputConfig {
 /// are known.
 pub fn infer(known: &mut SensorConfig, recording: Recording) -> Result<(Recording, Sensor)> {
     let sensor = Sensor::infer_recording(&recording, known)?;
-    complete(known, &sensor);
+    *known = SensorConfig::from(&sensor);
     Ok((sensor.applied_to(recording), sensor))
-}
-
-/// Completes what is known about the sensor.
-pub fn complete(known: &mut SensorConfig, sensor: &Sensor) {
-    known.range_image = RangeImageConfig {
-        has_rows: Some(sensor.has_rows),
-        ..RangeImageConfig::of(&sensor.range_image)
-    };
-    known.own_car_m = Some(sensor.own_car_m);
-    known.motion_compensation = sensor.motion_compensation;
 }
 
 /// All inputs of a command that localizes, which exist, and their keys.

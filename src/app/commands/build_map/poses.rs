@@ -8,7 +8,7 @@ use anyhow::{Context as _, Result, ensure};
 
 use super::older::OlderMap;
 use super::parts::{Role, not_listed};
-use crate::app::commands::stages::{RecordingInputs, complete};
+use crate::app::commands::stages::RecordingInputs;
 use crate::app::commands::trajectory::{self, poses_next_to};
 use crate::app::report::odometry;
 use crate::app::run::artefact::hash::hash_of_texts;
@@ -21,7 +21,7 @@ use crate::mapping::{self, MappingError, PoseReport, PoseSearch, TrajectorySumma
 use crate::odometry::{PoseFit, PoseMeaning};
 use crate::recording::poses::{read_tum, write_exact_tum};
 use crate::recording::{Frame, Recording};
-use crate::sensor::Sensor;
+use crate::sensor::{Sensor, SensorConfig};
 
 /// Start of the line of a file of poses with their summary.
 const SUMMARY: &str = "# ";
@@ -64,7 +64,7 @@ pub fn check(recording: Recording, config: &mut BuildMapConfig) -> Result<(Recor
     if let Some(report) = report {
         warn_of(&report);
     }
-    complete(&mut config.map.sensor, &sensor);
+    config.map.sensor = SensorConfig::from(&sensor);
     Ok((recording, sensor))
 }
 

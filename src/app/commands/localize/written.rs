@@ -76,8 +76,8 @@ pub fn write_run(opened: &Opened, run: &mut Run, context: &Context) -> Result<Re
         run_output::draw_run(files, Some(&mesh), results)?;
         let row = results.len() / 2;
         let (frame, pose) = (&recording.frames[row], &run.estimates()[row]);
-        let model = config.tracker.sensor.range_image.model();
-        run_output::draw_range_images(files, map, frame, pose, &model)?;
+        let model = &opened.sensor.range_image;
+        run_output::draw_range_images(files, map, frame, pose, model)?;
     }
     if config.save_result {
         run_page::write(files, &report)?;
