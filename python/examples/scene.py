@@ -20,9 +20,9 @@ estimates = [localizer.step(scan) for scan in odd]
 refined = fpmcl.refine(scene, odd, estimates)
 
 truth = odd.poses_in(scene)[:, :2, 3]
-path = np.array([estimate.planar[:2] for estimate in estimates])
+path = np.array([estimate.pose[:2] for estimate in estimates])
 found = np.array([estimate.state == "tracking" for estimate in estimates])
-for name, xy in [("localized", path), ("refined", refined.planar[:, :2])]:
+for name, xy in [("localized", path), ("refined", refined.poses[:, :2])]:
     errors_cm = 100 * np.linalg.norm(xy - truth, axis=1)[found]
     print(f"{name}: {found.sum()} of {len(odd)} scans, RMSE {np.sqrt(np.mean(errors_cm**2)):.2f} cm")
 

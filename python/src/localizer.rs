@@ -147,12 +147,12 @@ fn start_of(start: Option<&Bound<'_, PyAny>>, map: &fpmcl::map::Map) -> PyResult
 #[pyclass(frozen, module = "fpmcl")]
 pub struct Estimate {
     pub estimate: localization::Estimate,
-    /// Pose in space, aligned to the ground of the map, (4, 4).
-    #[pyo3(get)]
-    pose: Py<PyArray2<f64>>,
     /// Pose seen from above: x, y [m], heading [rad], (3,).
     #[pyo3(get)]
-    planar: Py<PyArray1<f64>>,
+    pose: Py<PyArray1<f64>>,
+    /// Pose in space, ``p_map = map_from_lidar @ p_lidar``, aligned to the ground of the map, (4, 4).
+    #[pyo3(get)]
+    map_from_lidar: Py<PyArray2<f64>>,
     /// Covariance of x, y, heading in the axes of the map, (3, 3) [m², m rad, rad²].
     #[pyo3(get)]
     covariance: Py<PyArray2<f64>>,
@@ -170,7 +170,7 @@ pub struct Estimate {
     places: usize,
     /// Mean cost of the particles [m]; None where the scan was not used.
     #[pyo3(get)]
-    mean_cost: Option<f64>,
+    mean_cost_m: Option<f64>,
     /// Effective number of particles after the update, before resampling.
     #[pyo3(get)]
     effective_sample_size: f64,
@@ -180,27 +180,28 @@ pub struct Estimate {
     /// Whether there is mapped ground under the estimate.
     #[pyo3(get)]
     on_mapped_ground: bool,
-    /// The motion since the previous scan that was used, (4, 4); None if it is not known.
+    /// The motion since the previous scan that was used, ``p_previous = previous_from_current @ p``, (4, 4); None if it
+    /// is not known.
     #[pyo3(get)]
-    motion: Option<Py<PyArray2<f64>>>,
+    previous_from_current: Option<Py<PyArray2<f64>>>,
 }
 
 impl Estimate {
     fn new(py: Python<'_>, estimate: localization::Estimate, motion: Option<Pose3>) -> Self {
         let deviations = estimate.standard_deviations();
         Self {
-            pose: arrays::of_pose(py, &estimate.map_from_lidar).unbind(),
-            planar: arrays::of_planar(py, &estimate.pose).unbind(),
+            pose: arrays::of_planar(py, &estimate.pose).unbind(),
+            map_from_lidar: arrays::of_pose(py, &estimate.map_from_lidar).unbind(),
             covariance: arrays::of_matrix(py, &estimate.covariance).unbind(),
             standard_deviations: PyArray1::from_slice(py, &deviations).unbind(),
             state: estimate.state.word(),
             agreement: estimate.agreement,
             places: estimate.places,
-            mean_cost: estimate.mean_cost_m,
+            mean_cost_m: estimate.mean_cost_m,
             effective_sample_size: estimate.effective_sample_size,
             updated: estimate.updated,
             on_mapped_ground: estimate.on_mapped_ground,
-            motion: motion.map(|motion| arrays::of_pose(py, &motion).unbind()),
+            previous_from_current: motion.map(|motion| arrays::of_pose(py, &motion).unbind()),
             estimate,
         }
     }

@@ -61,10 +61,10 @@ pub fn odometry(
 /// Refined poses of a drive in a map.
 #[pyclass(frozen, get_all, module = "fpmcl")]
 pub struct RefinedTrajectory {
-    /// Pose of each scan in space, (N, 4, 4).
-    poses: Py<PyArray3<f64>>,
     /// Poses seen from above: x, y [m], heading [rad], (N, 3).
-    planar: Py<PyArray2<f64>>,
+    poses: Py<PyArray2<f64>>,
+    /// Pose of each scan in space, ``p_map = map_from_lidar @ p_lidar``, (N, 4, 4).
+    map_from_lidar: Py<PyArray3<f64>>,
     /// Covariances of x, y, heading in the axes of the map, (N, 3, 3) [m², m rad, rad²].
     covariances: Py<PyArray3<f64>>,
     /// State of each scan; ``"searching"`` where its place was not found.
@@ -123,8 +123,8 @@ pub fn refine(
         anyhow::Ok(refiner.finish(increments.as_deref())?)
     })?;
     Ok(RefinedTrajectory {
-        poses: arrays::of_poses(py, &refined.map_from_lidar).unbind(),
-        planar: arrays::of_all_planar(py, &refined.poses).unbind(),
+        poses: arrays::of_all_planar(py, &refined.poses).unbind(),
+        map_from_lidar: arrays::of_poses(py, &refined.map_from_lidar).unbind(),
         covariances: arrays::of_matrices(py, &refined.covariances).unbind(),
         states: refined.states.iter().map(|state| state.word()).collect(),
     })

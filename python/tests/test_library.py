@@ -158,8 +158,8 @@ def test_a_given_start_and_a_given_motion_are_used(folder, recording):
     motion = np.linalg.inv(truth[0]) @ truth[1]
     localizer.step(recording[0], np.eye(4))
     estimate = localizer.step(recording[1], motion)
-    np.testing.assert_allclose(estimate.motion, motion, atol=1e-9)
-    assert np.linalg.norm(estimate.pose[:3, 3] - truth[1, :3, 3]) < 0.2
+    np.testing.assert_allclose(estimate.previous_from_current, motion, atol=1e-9)
+    assert np.linalg.norm(estimate.map_from_lidar[:3, 3] - truth[1, :3, 3]) < 0.2
     assert np.linalg.norm(estimate.particles[:, 3].sum() - 1.0) < 1e-9
     far = fpmcl.Localizer(loaded, [5000.0, 0.0, 0.0], **settings)
     with pytest.raises(fpmcl.Error, match="outside the mapped area"):
@@ -174,7 +174,7 @@ def test_rough_poses_are_refined(folder, recording):
     rough = truth.copy()
     rough[:, :2, 3] += [0.3, -0.3]
     refined = fpmcl.refine(loaded, recording, rough, uncertainty=[0.5, 2])
-    errors = np.linalg.norm(refined.poses[:, :2, 3] - truth[:, :2, 3], axis=1)
+    errors = np.linalg.norm(refined.map_from_lidar[:, :2, 3] - truth[:, :2, 3], axis=1)
     assert np.median(errors) < 0.05
     with pytest.raises(fpmcl.Error, match="there are 3 estimates for 12 scans"):
         fpmcl.refine(loaded, recording, rough[:3])

@@ -39,8 +39,8 @@ def test_a_map_is_the_same_file(folder, recording, tmp_path):
 
 def test_estimates_have_the_same_bytes(localized, result):
     estimates = localized[1]
-    planar = np.array([estimate.planar for estimate in estimates])
-    assert planar.tobytes() == result["estimates"].tobytes()
+    poses = np.array([estimate.pose for estimate in estimates])
+    assert poses.tobytes() == result["estimates"].tobytes()
     covariances = np.array([estimate.covariance for estimate in estimates])
     assert covariances.tobytes() == result["covariances"].tobytes()
     last = estimates[-1].particles.astype(np.float32)
@@ -52,7 +52,7 @@ def test_estimates_have_the_same_bytes(localized, result):
 def test_refined_poses_have_the_same_bytes(localized, recording, result):
     fpmcl_map, estimates = localized
     refined = fpmcl.refine(fpmcl_map, recording, estimates, seed=3)
-    assert refined.planar.tobytes() == result["refined"].tobytes()
+    assert refined.poses.tobytes() == result["refined"].tobytes()
     assert refined.states == [estimate.state for estimate in estimates]
 
 
@@ -60,7 +60,7 @@ def test_the_car_is_found(localized, recording):
     fpmcl_map, estimates = localized
     assert estimates[-1].state == "tracking"
     errors = [
-        estimate.pose[:3, 3] - truth[:3, 3]
+        estimate.map_from_lidar[:3, 3] - truth[:3, 3]
         for estimate, truth in zip(estimates, recording.poses_in(fpmcl_map))
     ]
     assert np.linalg.norm(errors[-1]) < 0.1

@@ -125,7 +125,7 @@ class Map:
         ``backend``: what renders it. ``cache``: where tiles of the map are kept, so that only what is around the car is in
         memory: True for next to the map, or a folder; None: all of the map is in memory, and nothing is written.
 
-        Raises Error if the file cannot be read, or is no mesh with ground.
+        Raises Error if the file cannot be read, is no mesh with ground, or if the folder of ``cache`` cannot be written.
         """
 
     def save(self, path: _Path) -> None:
@@ -216,11 +216,11 @@ class Estimate:
 
     @property
     def pose(self) -> NDArray[np.float64]:
-        """Pose in space, ``p_map = pose @ p_lidar``, aligned to the ground of the map, (4, 4)."""
+        """Pose seen from above: x, y [m], heading [rad], (3,)."""
 
     @property
-    def planar(self) -> NDArray[np.float64]:
-        """Pose seen from above: x, y [m], heading [rad], (3,)."""
+    def map_from_lidar(self) -> NDArray[np.float64]:
+        """Pose in space, ``p_map = map_from_lidar @ p_lidar``, aligned to the ground of the map, (4, 4)."""
 
     @property
     def covariance(self) -> NDArray[np.float64]:
@@ -243,7 +243,7 @@ class Estimate:
         """Number of places where the car may be: 1 while the search does not compare several."""
 
     @property
-    def mean_cost(self) -> Optional[float]:
+    def mean_cost_m(self) -> Optional[float]:
         """Mean cost of the particles [m]; None where the scan was not used."""
 
     @property
@@ -259,8 +259,10 @@ class Estimate:
         """Whether there is mapped ground under the estimate."""
 
     @property
-    def motion(self) -> Optional[NDArray[np.float64]]:
-        """The motion since the previous scan that was used, (4, 4); None if it is not known."""
+    def previous_from_current(self) -> Optional[NDArray[np.float64]]:
+        """The motion since the previous scan that was used, ``p_previous = previous_from_current @ p``, (4, 4); None if
+        it is not known.
+        """
 
     @property
     def particles(self) -> NDArray[np.float64]:
@@ -286,11 +288,11 @@ class RefinedTrajectory:
 
     @property
     def poses(self) -> NDArray[np.float64]:
-        """Pose of each scan in space, ``p_map = pose @ p_lidar``, (N, 4, 4)."""
+        """Poses seen from above: x, y [m], heading [rad], (N, 3)."""
 
     @property
-    def planar(self) -> NDArray[np.float64]:
-        """Poses seen from above: x, y [m], heading [rad], (N, 3)."""
+    def map_from_lidar(self) -> NDArray[np.float64]:
+        """Pose of each scan in space, ``p_map = map_from_lidar @ p_lidar``, (N, 4, 4)."""
 
     @property
     def covariances(self) -> NDArray[np.float64]:
