@@ -25,7 +25,13 @@ pub fn with_given_poses(
         Some(track) => track,
         None => match recording.own_track() {
             Err(error) if is_auto && recording.files.poses.is_none() => {
-                tracing::info!("poses from the scans: {error}");
+                if error.is_absence() {
+                    tracing::info!("poses from the scans: {error}");
+                } else {
+                    tracing::warn!(
+                        "the poses of the recording are not used, but found from its scans: {error}"
+                    );
+                }
                 return Ok(recording);
             }
             track => track?,

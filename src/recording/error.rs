@@ -138,6 +138,11 @@ pub enum RecordingError {
 }
 
 impl RecordingError {
+    /// Whether the recording does not have what was searched for; otherwise it has it, and it cannot be used.
+    pub(crate) fn is_absence(&self) -> bool {
+        matches!(self, Self::NoTopic { .. } | Self::NoPoseFile { .. })
+    }
+
     /// Adds the file to an error of reading.
     pub(super) fn read(path: &Path) -> impl FnOnce(io::Error) -> Self {
         |source| Self::Read {
