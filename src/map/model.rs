@@ -20,6 +20,7 @@ use super::ground::surface::GroundSurface;
 use super::mesh_view::MeshView;
 use super::places::panorama::{PanoramaIndex, PanoramaRequest};
 use super::places::panorama_file::Panoramas;
+use super::tiles::cache::MapCache;
 use super::tiles::file::Source;
 use super::tiles::grid::{self, TileConfig, TileGrid, TileIndex};
 use super::tiles::store::TileStore;
@@ -159,11 +160,11 @@ impl Map {
     /// STL).
     ///
     /// With a [cache](MapOptions::cache), the mesh is divided into tiles on first use, and when it has changed; of
-    /// these, those around the car are kept in memory, and on a graphics card. Without one, and where it cannot be
-    /// written, all of the map is, and nothing is written.
+    /// these, those around the car are kept in memory, and on a graphics card. Without one, and where that next to the
+    /// map cannot be written, which is a warning, all of the map is, and nothing is written.
     ///
     /// # Errors
-    /// The file cannot be read; else as [`new`](Self::new).
+    /// The file cannot be read, or the folder that is given for the cache not written; else as [`new`](Self::new).
     pub fn load(mesh_file: &Path, options: &MapOptions) -> Result<Self, MapError> {
         Self::load_with_path(mesh_file, None, options)
     }
@@ -200,7 +201,8 @@ impl Map {
             budget.require("the tiles of the map", bytes, SMALLER_MAP)?;
             let is_ground = |triangle| mesh.is_red(triangle);
             let path = mesh.path.clone();
-            match divided((mesh_file, folder), source, &mesh, &is_ground, path)? {
+            let files = (mesh_file, &**folder, &options.cache);
+            match divided(files, source, &mesh, &is_ground, path)? {
                 Some(store) => return Self::on_disk((mesh_file, store), given, options, &choice),
                 None => cache = None,
             }
@@ -210,7 +212,7 @@ impl Map {
         let (chunks, is_ground) = prepare(&mut mesh, &path, options.memory_budget)?;
         if let Some((folder, source)) = cache
             && let Some(store) = divided(
-                (mesh_file, folder),
+                (mesh_file, folder, &options.cache),
                 source,
                 &mesh,
                 &|triangle| is_ground[triangle],
@@ -354,9 +356,10 @@ impl Map {
     }
 }
 
-/// Divides the mesh of a file into tiles in a folder; `None` if they cannot be written next to it, after a warning.
+/// Divides the mesh of a file into tiles in a folder of a cache; `None` if they cannot be written next to it, after a
+/// warning.
 fn divided(
-    (mesh_file, folder): (&Path, &Path),
+    (mesh_file, folder, cache): (&Path, &Path, &MapCache),
     source: Source,
     mesh: &dyn MeshView,
     is_ground: &dyn Fn(usize) -> bool,
@@ -367,6 +370,9 @@ fn divided(
         Ok(None) => Err(MapError::Changed {
             file: mesh_file.to_owned(),
         }),
+        Err(error) if matches!(cache, MapCache::Folder(_)) => {
+            Err(MeshFileProblem::Write(error).of(folder).into())
+        }
         Err(error) => {
             tracing::warn!(
                 "the tiles of {} cannot be written to {} ({error}): all of the map is kept in memory",

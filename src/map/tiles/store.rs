@@ -926,6 +926,11 @@ mod tests {
         fs::write(folder_of(&file), "in the way").unwrap();
         let map = Map::load(&file, &options()).unwrap();
         assert!(seen(&map) == seen(&Map::new(street(), path(), &options()).unwrap()));
+        // A folder that was asked for is not left out.
+        let cache = MapCache::Folder(folder_of(&file));
+        let loaded = Map::load(&file, &MapOptions { cache, ..options() });
+        let message = loaded.err().unwrap().to_string();
+        assert!(message.contains("cannot be written"), "{message}");
     }
 
     #[test]
