@@ -207,6 +207,8 @@ fn a_second_drive_is_added_to_the_map_of_the_first_in_its_frame() {
         - changes["gone_triangles"].as_u64().unwrap();
     assert_eq!(triangles("both.report.json"), joined);
 
+    same_as_of_the_library(folder, "drive_2", Some("map.ply"), "both.ply");
+
     // A thousand kilometres away, the poses in the world are the same.
     let mut older = MappedPly::open(&folder.join("map.ply")).unwrap();
     older.origin = DVec3::new(1_024_000.0, -1_024_000.0, 0.0);
