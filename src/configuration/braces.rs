@@ -1,7 +1,7 @@
 //! Blocks in braces, such as `range_image: {width: 900}`, as blocks of lines, whose keys may have any of their names.
 
+use super::keys::{key_of, keys};
 use super::names::Names;
-use super::yaml::{key_of, keys};
 
 /// A character and its line, from 0.
 type Char = (char, usize);

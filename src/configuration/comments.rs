@@ -3,7 +3,8 @@
 use schemars::schema_for;
 use serde_json::Value;
 
-use super::yaml::{keys, to_yaml};
+use super::keys::keys;
+use super::yaml::to_yaml;
 use super::{ConfigError, Configuration};
 
 /// Longest list of values in brackets [bytes].

@@ -12,6 +12,7 @@
 mod braces;
 mod comments;
 mod error;
+mod keys;
 mod load;
 mod names;
 mod yaml;
