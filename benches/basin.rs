@@ -22,7 +22,7 @@ use std::time::{Duration, Instant};
 use fpmcl::geometry::{Pose2, Pose3, Vec3, pose2_from_pose3};
 use fpmcl::internals::app::{LineChart, Panel, Series};
 use fpmcl::internals::{PERIOD_S, compare_timings};
-use fpmcl::lidar::{Beam, LidarModel, Rotation, Scan};
+use fpmcl::lidar::{Beam, LidarModel, RangeImage, Rotation, Scan};
 use fpmcl::localization::{Localizer, LocalizerConfig, Odometry, Start, StartSpread};
 use fpmcl::map::{Map, MapOptions};
 use fpmcl::odometry::OdometryConfig;
@@ -277,6 +277,16 @@ impl RangeRenderer for Counting {
     ) -> Result<Vec<f32>, RenderError> {
         self.count(poses.len() * beams.len());
         self.inner.compare(poses, beams, difference)
+    }
+
+    fn compare_images(
+        &self,
+        poses: &[Pose3],
+        measured: &RangeImage,
+        difference: &RangeDifference,
+    ) -> Result<Vec<f32>, RenderError> {
+        self.count(poses.len() * measured.ranges.len());
+        self.inner.compare_images(poses, measured, difference)
     }
 }
 

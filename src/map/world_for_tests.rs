@@ -249,6 +249,22 @@ impl RangeRenderer for TestWorld {
         Ok(poses.par_iter().map(ranges).collect())
     }
 
+    fn compare_images(
+        &self,
+        poses: &[Pose3],
+        measured: &RangeImage,
+        difference: &RangeDifference,
+    ) -> Result<Vec<f32>, RenderError> {
+        let returns = || (0..measured.ranges.len()).filter(|&pixel| measured.has_return(pixel));
+        let count = returns().count().max(1) as f64;
+        let mean_cost = |rendered: Vec<f32>| {
+            let cost = |pixel: usize| difference.cost(measured.ranges[pixel], rendered[pixel]);
+            (returns().map(cost).map(f64::from).sum::<f64>() / count) as f32
+        };
+        let images = self.render(poses, &measured.model)?;
+        Ok(images.into_iter().map(mean_cost).collect())
+    }
+
     fn compare(
         &self,
         poses: &[Pose3],

@@ -111,22 +111,7 @@ pub trait RangeRenderer: Send + Sync {
         map_from_lidar: &[Pose3],
         measured: &RangeImage,
         difference: &RangeDifference,
-    ) -> Result<Vec<f32>, RenderError> {
-        /// 15 MB of ranges at 64 x 900 pixels.
-        const IMAGES_AT_ONCE: usize = 64;
-        let returns = || (0..measured.ranges.len()).filter(|&pixel| measured.has_return(pixel));
-        let count = returns().count().max(1) as f64;
-        let mean_cost = |rendered: Vec<f32>| {
-            let cost = |pixel: usize| difference.cost(measured.ranges[pixel], rendered[pixel]);
-            (returns().map(cost).map(f64::from).sum::<f64>() / count) as f32
-        };
-        let mut costs = Vec::with_capacity(map_from_lidar.len());
-        for poses in map_from_lidar.chunks(IMAGES_AT_ONCE) {
-            let images = self.render(poses, &measured.model)?;
-            costs.extend(images.into_iter().map(mean_cost));
-        }
-        Ok(costs)
-    }
+    ) -> Result<Vec<f32>, RenderError>;
 }
 
 /// Surface of the map that a ray hits.

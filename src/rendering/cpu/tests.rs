@@ -224,6 +224,14 @@ fn normals_from_three_rays_are_those_of_the_triangles() {
         ) -> Result<Vec<f32>, RenderError> {
             self.0.compare(poses, beams, difference)
         }
+        fn compare_images(
+            &self,
+            poses: &[Pose3],
+            measured: &RangeImage,
+            difference: &RangeDifference,
+        ) -> Result<Vec<f32>, RenderError> {
+            self.0.compare_images(poses, measured, difference)
+        }
     }
     let corners = [(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)];
     let wall = TriangleMesh {
