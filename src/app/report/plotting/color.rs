@@ -49,35 +49,19 @@ pub enum Colormap {
     Diverging,
 }
 
-const VIRIDIS: [Rgb; 10] = [
-    [68, 1, 84],
-    [72, 40, 120],
-    [62, 74, 137],
-    [49, 104, 142],
-    [38, 130, 142],
-    [31, 158, 137],
-    [53, 183, 121],
-    [109, 205, 89],
-    [180, 222, 44],
-    [253, 231, 37],
+const VIRIDIS: [u32; 10] = [
+    0x440154, 0x482878, 0x3e4a89, 0x31688e, 0x26828e, 0x1f9e89, 0x35b779, 0x6dcd59, 0xb4de2c,
+    0xfde725,
 ];
 
-const DIVERGING: [Rgb; 9] = [
-    [33, 102, 172],
-    [67, 147, 195],
-    [146, 197, 222],
-    [209, 229, 240],
-    [247, 247, 247],
-    [253, 219, 199],
-    [244, 165, 130],
-    [214, 96, 77],
-    [178, 24, 43],
+const DIVERGING: [u32; 9] = [
+    0x2166ac, 0x4393c3, 0x92c5de, 0xd1e5f0, 0xf7f7f7, 0xfddbc7, 0xf4a582, 0xd6604d, 0xb2182b,
 ];
 
 impl Colormap {
     /// Color of a share, clamped to 0 to 1; [`MISSING`] for NaN.
     pub fn at(self, share: f64) -> Rgb {
-        let anchors: &[Rgb] = match self {
+        let anchors: &[u32] = match self {
             Self::Viridis => &VIRIDIS,
             Self::Diverging => &DIVERGING,
         };
@@ -87,7 +71,8 @@ impl Colormap {
         let last = anchors.len() - 1;
         let place = share.clamp(0.0, 1.0) * last as f64;
         let below = (place as usize).min(last - 1);
-        blend(anchors[below], anchors[below + 1], place - below as f64)
+        let [from, to] = [below, below + 1].map(|place| rgb(anchors[place]));
+        blend(from, to, place - below as f64)
     }
 
     /// Color of each confidence, 0 to 1.
@@ -95,6 +80,12 @@ impl Colormap {
         let color = |&confidence: &f32| self.at(f64::from(confidence));
         confidences.iter().map(color).collect()
     }
+}
+
+/// The color of a number 0xRRGGBB.
+fn rgb(number: u32) -> Rgb {
+    let [_, red, green, blue] = number.to_be_bytes();
+    [red, green, blue]
 }
 
 /// Linear interpolation between two colors.
@@ -137,7 +128,7 @@ mod tests {
     #[test]
     fn nan_has_the_color_of_missing_values() {
         assert_eq!(Colormap::Viridis.at(f64::NAN), MISSING);
-        assert_eq!(Colormap::Viridis.at(-3.0), VIRIDIS[0]);
-        assert_eq!(Colormap::Viridis.at(f64::INFINITY), VIRIDIS[9]);
+        assert_eq!(Colormap::Viridis.at(-3.0), rgb(VIRIDIS[0]));
+        assert_eq!(Colormap::Viridis.at(f64::INFINITY), rgb(VIRIDIS[9]));
     }
 }
