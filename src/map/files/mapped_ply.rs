@@ -9,10 +9,12 @@
 use std::path::Path;
 
 use glam::{DVec3, Vec3};
+use ply_rs::parser::{Parser, Reader};
+use ply_rs::ply::{DefaultElement, Encoding, KeyMap, PropertyDef, PropertyType, ScalarType};
 
 use super::mapping_path::MappingPath;
 use super::mesh_origin::PRECISE_M;
-use super::ply::START;
+use super::ply::size_of;
 use crate::geometry::FARTHEST_M;
 use crate::map::mesh_view::{MeshView, Vertex};
 use crate::shared_bytes::SharedBytes;
@@ -48,39 +50,34 @@ struct RowLayout {
 }
 
 impl RowLayout {
-    /// The layout by the lines of properties; `None` where one is of a kind that is not read here.
-    fn of<'a>(lines: impl Iterator<Item = &'a str>) -> Option<Self> {
+    /// The layout by the properties; `None` where one is a list.
+    fn of(properties: &KeyMap<PropertyDef>) -> Option<Self> {
         let mut places = Vec::new();
         let mut bytes = 0;
-        for line in lines {
-            let (kind, name) = line.strip_prefix("property ")?.split_once(' ')?;
-            places.push((kind, name, bytes));
-            bytes += match kind {
-                "char" | "uchar" | "int8" | "uint8" => 1,
-                "short" | "ushort" | "int16" | "uint16" => 2,
-                "int" | "uint" | "float" | "int32" | "uint32" | "float32" => 4,
-                "double" | "float64" => 8,
-                _ => return None,
+        for (name, property) in properties {
+            let PropertyType::Scalar(kind) = &property.data_type else {
+                return None;
             };
+            places.push((kind, name, bytes));
+            bytes += size_of(kind);
         }
-        let all_of = |names: [&str; 3], kinds: [&str; 2]| -> Option<[usize; 3]> {
+        let all_of = |names: [&str; 3], kind: ScalarType| -> Option<[usize; 3]> {
             let mut at = [0; 3];
             for (at, name) in at.iter_mut().zip(names) {
-                let found = places
-                    .iter()
-                    .find(|(kind, other, _)| *other == name && kinds.contains(kind));
-                *at = found?.2;
+                let is_it =
+                    |place: &&(&ScalarType, &String, usize)| *place.0 == kind && place.1 == name;
+                *at = places.iter().find(is_it)?.2;
             }
             Some(at)
         };
-        let single = all_of(["x", "y", "z"], ["float", "float32"]);
-        let double = || all_of(["x", "y", "z"], ["double", "float64"]);
+        let single = all_of(["x", "y", "z"], ScalarType::Float);
+        let double = || all_of(["x", "y", "z"], ScalarType::Double);
         Some(Self {
             bytes,
             coordinate: if single.is_some() { 4 } else { 8 },
             position: single.or_else(double)?,
-            normal: all_of(["nx", "ny", "nz"], ["float", "float32"]),
-            color: all_of(["red", "green", "blue"], ["uchar", "uint8"]),
+            normal: all_of(["nx", "ny", "nz"], ScalarType::Float),
+            color: all_of(["red", "green", "blue"], ScalarType::UChar),
         })
     }
 }
@@ -91,38 +88,31 @@ impl MappedPly {
     pub fn open(path: &Path) -> Option<Self> {
         let bytes = SharedBytes::of_file(path).ok()?;
         let end = find(&bytes, b"end_header\n")?;
-        let header = std::str::from_utf8(&bytes[..end]).ok()?;
-        let lines = header.strip_prefix(START)?.lines();
-        let comments = lines
-            .clone()
-            .filter_map(|line| line.strip_prefix("comment "));
-        let mut lines =
-            lines.filter(|line| !line.starts_with("comment") && !line.starts_with("obj_info"));
-        let vertices: usize = (lines.next()?.strip_prefix("element vertex ")?)
-            .parse()
-            .ok()?;
-        let properties: Vec<&str> = lines
-            .by_ref()
-            .take_while(|line| !line.starts_with("element face "))
-            .collect();
-        let face = header
-            .lines()
-            .find_map(|line| line.strip_prefix("element face "))?;
-        let triangles: usize = face.parse().ok()?;
-        let corners = lines.next()?.strip_prefix("property list ")?;
-        let is_known = matches!(
-            corners.split(' ').collect::<Vec<_>>()[..],
-            [
-                "uchar" | "uint8",
-                "int" | "uint" | "int32" | "uint32",
-                "vertex_indices" | "vertex_index"
-            ]
-        );
-        let is_last = lines.next().is_none();
-        let row = RowLayout::of(properties.into_iter())?;
         let begin = end + b"end_header\n".len();
+        let mut header = Reader::new(&bytes[..begin]);
+        let header = Parser::<DefaultElement>::new()
+            .read_header(&mut header)
+            .ok()?;
+        let mut elements = header.elements.iter();
+        let [vertex, face] = ["vertex", "face"].map(|known| {
+            let (name, element) = elements.next()?;
+            (name == known).then_some(element)
+        });
+        let (vertex, face) = (vertex?, face?);
+        let mut lists = face.properties.iter();
+        let (name, corners) = lists.next()?;
+        let is_known = header.encoding == Encoding::BinaryLittleEndian
+            && matches!(name.as_str(), "vertex_indices" | "vertex_index")
+            && matches!(
+                corners.data_type,
+                PropertyType::List(ScalarType::UChar, ScalarType::Int | ScalarType::UInt)
+            );
+        let is_last = lists.next().is_none() && elements.next().is_none();
+        let row = RowLayout::of(&vertex.properties)?;
+        let (vertices, triangles) = (vertex.count, face.count);
         let faces = begin.checked_add(vertices.checked_mul(row.bytes)?)?;
         let size = faces.checked_add(triangles.checked_mul(FACE_BYTES)?)?;
+        let comments = header.comments.iter().map(String::as_str);
         let path = MappingPath::from_comments(comments).ok()?;
         let mut mesh = Self {
             begin: [begin, faces],

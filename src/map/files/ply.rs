@@ -25,7 +25,7 @@ use crate::geometry::{PlyVertex, TriangleMesh};
 use crate::map::mesh_view::MeshView;
 
 /// What a file of this program begins with.
-pub(crate) const START: &str = "ply\nformat binary_little_endian 1.0\n";
+const START: &str = "ply\nformat binary_little_endian 1.0\n";
 const POSITION: &str = "property float x\nproperty float y\nproperty float z\n";
 const POSITION_F64: &str = "property double x\nproperty double y\nproperty double z\n";
 const NORMAL: &str = "property float nx\nproperty float ny\nproperty float nz\n";
@@ -324,7 +324,7 @@ fn check_header(header: &Header, bytes: u64) -> Result<(), MeshFileProblem> {
     Ok(())
 }
 
-fn size_of(kind: &ScalarType) -> usize {
+pub(super) fn size_of(kind: &ScalarType) -> usize {
     match kind {
         ScalarType::Char | ScalarType::UChar => 1,
         ScalarType::Short | ScalarType::UShort => 2,
