@@ -28,10 +28,16 @@ pub fn write_scan(mut writer: impl Write, scan: &Scan) -> io::Result<()> {
 /// The file cannot be read, or its size is not a multiple of four bytes.
 pub fn read_labels(path: &Path) -> Result<Vec<u16>, RecordingError> {
     let bytes = read_bytes(path)?;
-    Ok(records::<4>(path, &bytes)?
-        .iter()
-        .map(|&[low, high, ..]| u16::from_le_bytes([low, high]))
-        .collect())
+    let (records, rest) = bytes.as_chunks::<4>();
+    if !rest.is_empty() {
+        return Err(RecordingError::Truncated {
+            path: path.to_owned(),
+            bytes: bytes.len() as u64,
+            record_bytes: 4,
+        });
+    }
+    let class = |&[low, high, ..]: &[u8; 4]| u16::from_le_bytes([low, high]);
+    Ok(records.iter().map(class).collect())
 }
 
 /// Writes the semantic class of each point as a little-endian `u32`, with instance 0.
@@ -48,22 +54,6 @@ pub fn write_labels(mut writer: impl Write, classes: &[u16]) -> io::Result<()> {
 
 pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, RecordingError> {
     memory::read_file(path).map_err(RecordingError::read(path))
-}
-
-fn records<'a, const SIZE: usize>(
-    path: &Path,
-    bytes: &'a [u8],
-) -> Result<&'a [[u8; SIZE]], RecordingError> {
-    let (records, rest) = bytes.as_chunks::<SIZE>();
-    if rest.is_empty() {
-        Ok(records)
-    } else {
-        Err(RecordingError::Truncated {
-            path: path.to_owned(),
-            bytes: bytes.len() as u64,
-            record_bytes: SIZE,
-        })
-    }
 }
 
 /// The existing label file of a scan: of the same name in `label_folder`, by default in `labels`

@@ -61,18 +61,34 @@ pub fn read(path: &Path) -> Result<Scan, RecordingError> {
 /// its sweep if the points have times, else the stamp; points with times of another clock have the stamp in the
 /// middle.
 pub fn read_stamped(path: &Path, stamp_s: Option<f64>) -> Result<ReadScan, RecordingError> {
+    Ok(read_with_normals(path, stamp_s)?.0)
+}
+
+/// A scan, and the normals of its points if the file has them.
+fn read_with_normals(
+    path: &Path,
+    stamp_s: Option<f64>,
+) -> Result<(ReadScan, Option<Vec<Vec3>>), RecordingError> {
     let bytes = read_bytes(path)?;
     let read = match table(path, &bytes) {
-        Some(table) => table.and_then(|table| scan_of(&table, stamp_s)),
-        None => bin::parse(&bytes).map(|scan| ReadScan {
-            scan: Scan {
-                time_s: stamp_s,
-                ..scan
-            },
-            has_unknown_times: false,
+        Some(table) => table.and_then(|table| Ok((scan_of(&table, stamp_s)?, table.normals()))),
+        None => bin::parse(&bytes).map(|scan| {
+            let time_s = stamp_s;
+            let scan = Scan { time_s, ..scan };
+            let has_unknown_times = false;
+            (
+                ReadScan {
+                    scan,
+                    has_unknown_times,
+                },
+                None,
+            )
         }),
     };
-    read.map_err(bad_scan(path))
+    read.map_err(|problem| RecordingError::BadScan {
+        path: path.to_owned(),
+        problem,
+    })
 }
 
 fn scan_of(table: &Table, stamp_s: Option<f64>) -> Result<ReadScan, String> {
@@ -96,28 +112,8 @@ pub struct ReadCloud {
 
 /// Reads a point cloud with its normals, fields `nx` or `normal_x` and so on.
 pub fn read_cloud(path: &Path) -> Result<ReadCloud, RecordingError> {
-    let bytes = read_bytes(path)?;
-    let read = match table(path, &bytes) {
-        Some(table) => table.and_then(|table| {
-            Ok(ReadCloud {
-                scan: scan_of(&table, None)?.scan,
-                normals: table.normals(),
-            })
-        }),
-        None => bin::parse(&bytes).map(|scan| ReadCloud {
-            scan,
-            normals: None,
-        }),
-    };
-    read.map_err(bad_scan(path))
-}
-
-/// Adds the file to the problem of a scan.
-fn bad_scan(path: &Path) -> impl FnOnce(String) -> RecordingError {
-    |problem| RecordingError::BadScan {
-        path: path.to_owned(),
-        problem,
-    }
+    let (ReadScan { scan, .. }, normals) = read_with_normals(path, None)?;
+    Ok(ReadCloud { scan, normals })
 }
 
 /// The table of a file whose format is that of its extension; `None` for `.bin`.
