@@ -3,9 +3,6 @@
 use glam::{DVec3, Vec3};
 use ply_rs::ply::{Property, PropertyAccess, PropertyAccessResult};
 
-/// Names of the intensity, in any case.
-const INTENSITY: [&str; 4] = ["intensity", "scalar_intensity", "reflectance", "remission"];
-
 /// A row of the element `vertex`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PlyVertex {
@@ -15,8 +12,6 @@ pub struct PlyVertex {
     pub normal: Vec3,
     /// Properties red, green, blue, 0 to 255.
     pub color: [u8; 3],
-    /// Reflectance of a measured point, in the unit of the file.
-    pub intensity: f32,
 }
 
 impl PlyVertex {
@@ -32,9 +27,6 @@ impl PlyVertex {
             "red" => self.color[0] = value.round() as u8,
             "green" => self.color[1] = value.round() as u8,
             "blue" => self.color[2] = value.round() as u8,
-            name if INTENSITY.iter().any(|n| name.eq_ignore_ascii_case(n)) => {
-                self.intensity = value as f32;
-            }
             _ => return PropertyAccessResult::Ignored,
         }
         PropertyAccessResult::Set
