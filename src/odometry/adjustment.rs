@@ -249,12 +249,10 @@ impl Residuals {
         const KERNEL_SIGMAS: f64 = 3.0;
         let mut of_rows: Vec<Vec<f32>> = (rows.par_iter())
             .map(|row| {
-                let points = row.in_map.iter().zip(&row.planes);
-                let distance_m = |(position, &plane): (&DVec3, &u32)| {
-                    let plane = planes.get(plane as usize)?;
-                    Some(plane.normal.dot(*position - plane.center).abs() as f32)
+                let distance_m = |(position, _, plane): (DVec3, usize, &Plane)| {
+                    plane.normal.dot(position - plane.center).abs() as f32
                 };
-                points.filter_map(distance_m).collect()
+                row.on_planes(planes).map(distance_m).collect()
             })
             .collect();
         let mut all_m = of_rows.concat();
@@ -299,10 +297,7 @@ fn system(rows: &[ScanPoints], planes: &[Plane], scale: f64) -> BlockSystem {
 fn block_row(number: usize, row: &ScanPoints, planes: &[Plane], scale: f64) -> BlockRow {
     let lidar = LidarFrame::new(&row.pose);
     let mut sums = BlockRow::default();
-    for (&position, &plane) in row.in_map.iter().zip(&row.planes) {
-        let Some(plane) = planes.get(plane as usize) else {
-            continue;
-        };
+    for (position, _, plane) in row.on_planes(planes) {
         let at = plane.residual(position, row.kernel_m);
         let jacobian = lidar.jacobian(position, plane.normal);
         sums.diagonal += at.weight * jacobian * jacobian.transpose();

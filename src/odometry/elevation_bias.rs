@@ -82,12 +82,9 @@ fn couplings_of_planes(rows: &[ScanPoints], planes: &[Plane]) -> Vec<Vector3<f64
     let mut couplings = vec![Vector3::zeros(); planes.len()];
     for row in rows {
         let lidar = LidarFrame::new(&row.pose);
-        for (&position, &number) in row.in_map.iter().zip(&row.planes) {
-            let Some(plane) = planes.get(number as usize) else {
-                continue;
-            };
+        for (position, number, plane) in row.on_planes(planes) {
             let at = plane.residual(position, row.kernel_m);
-            couplings[number as usize] +=
+            couplings[number] +=
                 at.weight * lidar.by_elevation(position, plane.normal) * at.by_plane;
         }
     }
@@ -112,10 +109,7 @@ impl Sums {
             right_side: 0.0,
             coupling: Vector6::zeros(),
         };
-        for (&position, &plane) in row.in_map.iter().zip(&row.planes) {
-            let Some(plane) = planes.get(plane as usize) else {
-                continue;
-            };
+        for (position, _, plane) in row.on_planes(planes) {
             let at = plane.residual(position, row.kernel_m);
             let by_elevation = lidar.by_elevation(position, plane.normal);
             sums.information += at.weight * by_elevation * by_elevation;

@@ -42,6 +42,18 @@ pub struct ScanPoints {
 const NONE: u32 = u32::MAX;
 
 impl ScanPoints {
+    /// The points that lie on planes, with the numbers of these.
+    pub fn on_planes<'a>(
+        &'a self,
+        planes: &'a [Plane],
+    ) -> impl Iterator<Item = (DVec3, usize, &'a Plane)> {
+        let points = self.in_map.iter().zip(&self.planes);
+        points.filter_map(|(&position, &number)| {
+            let number = number as usize;
+            Some((position, number, planes.get(number)?))
+        })
+    }
+
     /// The planes of the scan, each once.
     pub fn planes_once(&self) -> Vec<u32> {
         let mut seen: Vec<u32> = (self.planes.iter().copied())
