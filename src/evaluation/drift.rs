@@ -7,8 +7,7 @@
 //!
 //! with the true poses Q and the estimates P, aligned as the caller chooses.
 
-use super::planar::distances_m;
-use crate::geometry::{Pose3, yaw};
+use crate::geometry::{Pose3, distances_m, yaw};
 
 /// Error of one estimate.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -7,11 +7,11 @@ use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
 use super::convergence::{Convergence, StrictSuccess};
-use super::planar::{PlanarError, distances_m, planar_errors};
+use super::planar::{PlanarError, planar_errors};
 use super::pose_error::{SegmentErrors, kitti_segment_errors, relative_pose_error};
 use super::smoothness::{jitter_m, log_dimensionless_jerk, mean_pose_change};
 use super::statistics::{Summary, mean, rms, slope};
-use crate::geometry::{Pose2, Pose3, pose3_from_pose2};
+use crate::geometry::{Pose2, Pose3, distances_m, pose3_from_pose2};
 
 /// Parameters of the metrics.
 ///

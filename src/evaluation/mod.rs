@@ -37,5 +37,5 @@ pub(crate) use drift::{DriftPoint, drift};
 pub(crate) use ground_score::{GroundMethodReport, GroundTally};
 pub(crate) use map_quality::MapQuality;
 pub(crate) use map_truth::TruthAgreement;
-pub(crate) use planar::{distances_m, planar_errors};
+pub(crate) use planar::planar_errors;
 pub(crate) use range_mcl::{ParticleRow, RangeMclErrors, RangeMclRules};

@@ -7,7 +7,7 @@
 //!
 //! Trajectories are not aligned: estimate and truth are both in the map frame.
 
-use nalgebra::{Isometry, Vector2};
+use nalgebra::Vector2;
 
 use crate::geometry::{Pose2, wrap_angle};
 
@@ -49,20 +49,6 @@ pub fn planar_errors(estimates: &[Pose2], ground_truth: &[Pose2]) -> Vec<PlanarE
         .iter()
         .zip(ground_truth)
         .map(|(estimate, truth)| PlanarError::between(estimate, truth))
-        .collect()
-}
-
-/// Distance driven up to each pose, starting at 0 [m].
-pub fn distances_m<R, const D: usize>(poses: &[Isometry<f64, R, D>]) -> Vec<f64> {
-    let steps_m = poses
-        .windows(2)
-        .map(|pair| (pair[1].translation.vector - pair[0].translation.vector).norm());
-    let mut driven_m = 0.0;
-    (poses.iter().take(1).map(|_| 0.0).chain(steps_m))
-        .map(|step_m| {
-            driven_m += step_m;
-            driven_m
-        })
         .collect()
 }
 

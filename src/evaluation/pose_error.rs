@@ -15,9 +15,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::planar::distances_m;
 use super::statistics::{Summary, mean};
-use crate::geometry::Pose3;
+use crate::geometry::{Pose3, distances_m};
 
 /// Errors of poses or of pairs of poses.
 #[derive(Clone, Debug, PartialEq)]

@@ -11,13 +11,12 @@
 use serde::{Deserialize, Serialize};
 
 use super::alignment::{aligned, rigid_alignment};
-use super::planar::distances_m;
 use super::pose_error::{
     KITTI_FRAME_STEP, KITTI_LENGTHS_M, SHORT_LENGTHS_M, SegmentErrors, absolute_pose_error,
     segments,
 };
 use super::statistics::{Summary, mean};
-use crate::geometry::Pose3;
+use crate::geometry::{Pose3, distances_m};
 
 /// Errors in space, in addition to those in the plane.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -32,5 +32,6 @@ pub(crate) use ply_vertex::PlyVertex;
 pub(crate) use pose::{FARTHEST_M, Rigid3f, yaw};
 pub(crate) use robust_kernel::RobustKernel;
 pub(crate) use surface_samples::{sample_surface, surface_area_m2};
+pub(crate) use trajectory::distances_m;
 
 pub use glam::Vec3;

@@ -14,7 +14,7 @@ use super::odometer::OdometryEstimate;
 use super::path_graph::{SUBMAP_LENGTH, move_along, odometry_edges};
 use super::pose_graph::{Edge, information, optimize};
 use super::voxel_map::{VoxelMap, pack};
-use crate::geometry::{Pose3, TriangleMesh};
+use crate::geometry::{Pose3, TriangleMesh, distances_m};
 use crate::memory::{MemoryBudget, MemoryError};
 
 /// The drive was not found in the map.
@@ -106,7 +106,7 @@ fn common_transform(drive: &Drive, found: &[(usize, Pose3)], drift_share: f64) -
         share: drift_share,
         least_m: drive.voxel_m,
     };
-    let travelled_m = drive.travelled_m();
+    let travelled_m = distances_m(&drive.poses);
     let agreeing = |&(row, map_from_odom): &(usize, Pose3)| {
         let agrees = |(other, pose): &&(usize, Pose3)| {
             let moved = map_from_odom * drive.poses[*other];

@@ -6,7 +6,7 @@ use glam::DVec3;
 
 use super::sampling::{Sample, TimedPoint, first_per_voxel};
 use super::voxel_map::VoxelMap;
-use crate::geometry::Pose3;
+use crate::geometry::{Pose3, distances_m};
 use crate::lidar::Motion;
 
 /// Remedy for a drive that exceeds the budget of memory.
@@ -53,19 +53,9 @@ impl Drive {
         self.samples[row].mapped(frame_from_lidar, motion.as_ref())
     }
 
-    /// Lengths of the path up to each scan [m].
-    pub fn travelled_m(&self) -> Vec<f64> {
-        let mut sum_m = 0.0;
-        let steps = self.poses.windows(2).map(|pair| {
-            sum_m += (pair[1].translation.vector - pair[0].translation.vector).norm();
-            sum_m
-        });
-        std::iter::once(0.0).chain(steps).collect()
-    }
-
     /// Submaps of about `length_m` of the path each.
     pub fn submaps(&self, length_m: f64) -> Vec<Submap> {
-        let travelled_m = self.travelled_m();
+        let travelled_m = distances_m(&self.poses);
         let mut maps = vec![];
         let mut first = 0;
         while first < travelled_m.len() {

@@ -7,8 +7,8 @@ use anyhow::{Context as _, Result};
 use nalgebra::Vector3;
 
 use crate::app::report::{LocalizationResults, Report, RunSummary};
-use crate::evaluation::{SpatialMetrics, aligned, distances_m};
-use crate::geometry::Pose3;
+use crate::evaluation::{SpatialMetrics, aligned};
+use crate::geometry::{Pose3, distances_m};
 use crate::recording::PoseTrack;
 
 /// Share of the distance above which the axes of estimate and truth are suspected to differ [%].

@@ -8,8 +8,8 @@ use nalgebra::Matrix3;
 use super::localization_results::LocalizationResults;
 use crate::app::run::output;
 use crate::evaluation::trust::Axes;
-use crate::evaluation::{PlanarError, distances_m, drift, planar_errors};
-use crate::geometry::{Pose2, Pose3};
+use crate::evaluation::{PlanarError, drift, planar_errors};
+use crate::geometry::{Pose2, Pose3, distances_m};
 
 /// Writes the table; of a trajectory without particles, that of its errors in space. Nothing without estimates.
 pub fn write_frames_csv(path: &Path, results: &LocalizationResults) -> Result<()> {

@@ -4,8 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use super::localization_results::LocalizationResults;
 use super::rows::{MetricRow, length, metrics};
-use crate::evaluation::{Summary, distances_m};
-use crate::geometry::Pose2;
+use crate::evaluation::Summary;
+use crate::geometry::{Pose2, distances_m};
 use crate::localization::State;
 use crate::localization::particles::long_axis_m;
 
