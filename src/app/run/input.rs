@@ -10,7 +10,8 @@ pub fn require(inputs: &[(&str, &Path)]) -> Result<()> {
     for &(key, path) in inputs {
         match key {
             "scan_folder" if !is_bag(path) => require_folder(key, path)?,
-            "pose_file" | "odometry_file" if path.is_dir() => {}
+            // A folder of a bag, and a folder `oxts`.
+            "scan_folder" | "pose_file" | "odometry_file" if path.is_dir() => {}
             _ => require_file(key, path)?,
         }
     }
@@ -75,5 +76,20 @@ mod tests {
             assert!(message.starts_with("a_key is "), "{message}");
             assert!(message.contains("; give the path of"), "{message}");
         }
+    }
+
+    #[cfg(feature = "bags")]
+    #[test]
+    fn a_recording_may_be_a_folder_of_scans_a_bag_or_the_folder_of_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let required = |path: &Path| require(&[("scan_folder", path)]);
+        required(folder.path()).unwrap();
+        let bag = folder.path().join("drive.mcap");
+        required(&bag).unwrap_err();
+        std::fs::write(&bag, "").unwrap();
+        required(&bag).unwrap();
+        std::fs::write(folder.path().join("metadata.yaml"), "").unwrap();
+        assert!(is_bag(folder.path()));
+        required(folder.path()).unwrap();
     }
 }
