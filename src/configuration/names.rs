@@ -37,13 +37,14 @@ const ALIASES: [(&str, &str); 21] = [
 const WITHOUT_EFFECT: [&str; 2] = ["range_image.max_instance", "range_image.render_instanced"];
 
 /// Last parts of earlier keys whose values are fixed now.
-const REMOVED: [&str; 9] = [
+const REMOVED: [&str; 10] = [
     "basin_m",
     "basin_rad",
     "freedom",
     "max_sigmas",
     "min_incidence",
     "minima",
+    "period_s",
     "refined_share",
     "tracking_rounds",
     "widening",

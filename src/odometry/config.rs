@@ -57,9 +57,6 @@ pub struct OdometryConfig {
     /// Number of scans in turn that do not fit, after which the local map restarts.
     #[default(10)]
     pub restart_after: usize,
-    /// Duration between scans that have no times [s].
-    #[default(0.1)]
-    pub period_s: f64,
 }
 
 impl Validate for OdometryConfig {
@@ -82,8 +79,7 @@ impl Validate for OdometryConfig {
         in_range("min_matched_share", self.min_matched_share, 0.0..=1.0)?;
         in_range("max_cost", self.max_cost, 0.0..=1.0)?;
         in_range("max_cost_increase", self.max_cost_increase, 0.0..=1.0)?;
-        at_least_one("restart_after", self.restart_after)?;
-        positive("period_s", self.period_s)
+        at_least_one("restart_after", self.restart_after)
     }
 }
 

@@ -7,7 +7,7 @@ use nalgebra::{Matrix6, Vector6};
 use super::config::OdometryConfig;
 use super::state::OdometerState;
 use crate::geometry::Pose3;
-use crate::lidar::{Scan, interval_s};
+use crate::lidar::{PERIOD_S, Scan, interval_s};
 use crate::memory::MemoryError;
 use crate::validation::{InvalidValue, Validate as _};
 
@@ -113,7 +113,7 @@ impl Odometer {
     /// Time since the previous scan [s].
     fn duration_until(&self, scan: &Scan) -> Result<f64, OdometryError> {
         let (Some(previous_s), Some(time_s)) = (self.time_s, scan.time_s) else {
-            return Ok(self.config.period_s);
+            return Ok(PERIOD_S);
         };
         let duration_s = interval_s(previous_s, time_s);
         if duration_s > 0.0 && duration_s.is_finite() {

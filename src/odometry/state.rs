@@ -9,7 +9,7 @@ use super::sampling::{Sample, sensor_range};
 use super::search::search;
 use super::voxel_map::VoxelMap;
 use crate::geometry::Pose3;
-use crate::lidar::{Motion, Scan};
+use crate::lidar::{Motion, PERIOD_S, Scan};
 
 /// OdometerState after a scan.
 #[derive(Clone, Debug)]
@@ -72,7 +72,7 @@ impl OdometerState {
         const FLOOR_RAD: f64 = 0.02;
         /// Standard deviation of the first motion [rad].
         const FIRST_RAD: f64 = 0.3;
-        let periods = (duration_s / config.period_s).max(1.0);
+        let periods = (duration_s / PERIOD_S).max(1.0);
         let floor_m = FLOOR * self.voxel_m(config) * periods;
         let [shift, turn] = match self.motion {
             Some(_) => {
@@ -195,8 +195,6 @@ impl OdometerState {
         duration_s: f64,
         config: &OdometryConfig,
     ) -> bool {
-        /// Period of the largest deviations [s].
-        const PERIOD_S: f64 = 0.1;
         let periods = (duration_s / PERIOD_S).max(1.0);
         let deviation = predicted.inverse() * found.odom_from_lidar;
         let is_smooth = self.motion.is_none()

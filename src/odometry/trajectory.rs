@@ -14,7 +14,7 @@ use super::path_graph::{SUBMAP_LENGTH, move_along, odometry_edges};
 use super::pose_graph::{Edge, optimize};
 use super::sampling::{Sample, sensor_range};
 use crate::geometry::{Pose3, TriangleMesh};
-use crate::lidar::{Scan, interval_s};
+use crate::lidar::{PERIOD_S, Scan, interval_s};
 use crate::memory::{MemoryBudget, MemoryError};
 use crate::validation::{InvalidValue, Validate, in_range, nested};
 
@@ -134,7 +134,7 @@ impl TrajectoryBuilder {
             state: StepState::Given,
             ..OdometryEstimate::first(match times_s {
                 Some((before_s, time_s)) if time_s > before_s => interval_s(before_s, time_s),
-                _ => self.config.odometry.period_s,
+                _ => PERIOD_S,
             })
         });
         self.given.push(map_from_lidar);
