@@ -256,6 +256,7 @@ impl Command {
             Self::Demo(args) => args.machine,
             Self::Ground(args) => args.machine,
             Self::Export(args) => args.machine(),
+            Self::Info(args) => args.machine(),
             _ => MachineArgs::default(),
         }
     }

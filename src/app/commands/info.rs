@@ -10,9 +10,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::app::report::results::Value;
 use crate::app::report::{LocalizationResults, RunSummary};
-use crate::app::run::Printed;
 use crate::app::run::arguments::setting;
 use crate::app::run::input::is_bag;
+use crate::app::run::{MachineArgs, Printed, gibibytes};
 use crate::app::settings;
 use crate::evaluation::RangeMclRules;
 use crate::geometry::Aabb;
@@ -31,6 +31,20 @@ pub struct InfoArgs {
     /// Set the key topic, the topic of the scans in a bag with several: topic=/NAME.
     #[arg(long = "set", value_name = "KEY=VALUE", value_parser = setting)]
     pub settings: Vec<(String, String)>,
+
+    /// Largest memory that a stage may plan for; by default half of the machine's.
+    #[arg(long, value_name = "GIB", value_parser = gibibytes)]
+    pub memory: Option<f64>,
+}
+
+impl InfoArgs {
+    /// The memory that may be planned for.
+    pub fn machine(&self) -> MachineArgs {
+        MachineArgs {
+            memory: self.memory,
+            ..MachineArgs::default()
+        }
+    }
 }
 
 /// Keys of `info`.
