@@ -131,6 +131,42 @@ fn poses_of_the_lidar_taken_for_those_of_a_camera_are_an_error_that_names_what_f
 }
 
 #[test]
+fn mirrored_poses_of_a_drive_with_a_bend_are_an_error_that_names_what_fits() {
+    let folder = tempfile::tempdir().unwrap();
+    let simulate = fpmcl("simulate").in_folder(folder.path());
+    (simulate.set("output_folder", "street"))
+        .set("n_scans", "40")
+        .set("path", "[{length_m: 25}, {length_m: 15, turn_deg: 60}]")
+        .set("scanner.azimuth_steps", "450")
+        .succeeds();
+    let path = folder.path().join("street/drive_1/poses.txt");
+    let text = fs::read_to_string(path).unwrap();
+    // Mirrored at the camera's x axis, which is the lidar's y axis.
+    let mirrored = |row: &str| {
+        let numbers = row.split_whitespace().enumerate();
+        let sign = |i: usize| {
+            if (i / 4 == 0) == (i % 4 == 0) {
+                1.0
+            } else {
+                -1.0
+            }
+        };
+        let numbers = numbers.map(|(i, word)| (sign(i) * word.parse::<f64>().unwrap()).to_string());
+        numbers.collect::<Vec<_>>().join(" ")
+    };
+    let rows: Vec<String> = text.lines().map(mirrored).collect();
+    fs::write(folder.path().join("mirrored.txt"), rows.join("\n")).unwrap();
+    let build = fpmcl("build-map").in_folder(folder.path());
+    (build.with("street/drive_1").with("--poses=mirrored.txt"))
+        .with("--calib=street/drive_1/calib.txt")
+        .with("--output=map.ply")
+        .fails_with(&[
+            "as poses of left-handed frames, mirrored at y they differ by 0.0",
+            "negate y, roll and yaw",
+        ]);
+}
+
+#[test]
 fn a_map_whose_ground_is_tilted_is_warned_about() {
     let warning = "the ground is tilted by 20 degrees";
     let tilted = Recording::street(3);

@@ -16,11 +16,23 @@ const SCANS: usize = 11;
 impl PoseReport {
     /// Checks the poses of a recording whose scans are not yet deskewed by them.
     pub(crate) fn new(recording: &Recording) -> Result<Self, MappingError> {
-        let run = moving_run(recording);
+        let known = known_poses(recording);
+        let mut runs = vec![moving_run(&known), turning_run(&known)];
+        runs.dedup_by_key(|run| run.as_ptr());
+        let mut checked = Vec::new();
+        for run in runs {
+            checked.push((run, check_motion(recording, run)?));
+        }
+        let fit = |motion: &Option<PoseCheck>| motion.as_ref().map(|it| it.fit);
+        let worst = checked
+            .into_iter()
+            .rev()
+            .max_by_key(|(_, motion)| fit(motion));
+        let (run, motion) = worst.unwrap_or_default();
         let ends = [run.first(), run.last()];
         Ok(Self {
             frames: ends.map(|end| end.map_or(0, |(frame, _)| frame.number)),
-            motion: check_motion(recording, &run)?,
+            motion,
             tilt: tilt(recording)?,
         })
     }
@@ -52,19 +64,23 @@ fn check_motion(
     Ok(checked.filter(|_| run.len() > 1))
 }
 
-/// Consecutive frames with poses in which the sensor moves, near the middle of the recording.
-fn moving_run(recording: &Recording) -> Vec<(&Frame, Pose3)> {
-    /// Path that suffices [m].
-    const PATH_M: f64 = 3.0;
+/// The frames that have poses, in order.
+fn known_poses(recording: &Recording) -> Vec<(&Frame, Pose3)> {
     let mut frames: Vec<&Frame> = recording.frames.iter().chain(&recording.skipped).collect();
     frames.sort_by_key(|frame| frame.number);
     let pose_of = |frame: &Frame| match &recording.track {
         Some(track) => track.pose_at(frame, recording.has_times),
         None => frame.map_from_lidar,
     };
-    let frames: Vec<_> = (frames.into_iter())
+    (frames.into_iter())
         .filter_map(|frame| Some((frame, pose_of(frame)?)))
-        .collect();
+        .collect()
+}
+
+/// Consecutive frames in which the sensor moves, near the middle of the recording.
+fn moving_run<'a, 'b>(frames: &'a [(&'b Frame, Pose3)]) -> &'a [(&'b Frame, Pose3)] {
+    /// Path that suffices [m].
+    const PATH_M: f64 = 3.0;
     let path_m = |run: &[(&Frame, Pose3)]| -> f64 {
         let steps = run.windows(2);
         let step_m = |pair: &[(&Frame, Pose3)]| (pair[0].1.inverse() * pair[1].1).translation;
@@ -77,7 +93,20 @@ fn moving_run(recording: &Recording) -> Vec<(&Frame, Pose3)> {
         a.total_cmp(&b)
             .then(j.abs_diff(middle).cmp(&i.abs_diff(middle)))
     });
-    best.map_or_else(Vec::new, |(_, run)| run.to_vec())
+    best.map_or(&[], |(_, run)| run)
+}
+
+/// Consecutive frames in which the sensor turns most: a straight path looks the same mirrored.
+fn turning_run<'a, 'b>(frames: &'a [(&'b Frame, Pose3)]) -> &'a [(&'b Frame, Pose3)] {
+    let turn_rad = |run: &[(&Frame, Pose3)]| {
+        let ends = run.first().zip(run.last());
+        ends.map_or(0.0, |(first, last)| {
+            first.1.rotation.angle_to(&last.1.rotation)
+        })
+    };
+    let runs = frames.windows(SCANS.min(frames.len()).max(1));
+    let best = runs.max_by(|a, b| turn_rad(a).total_cmp(&turn_rad(b)));
+    best.unwrap_or(&[])
 }
 
 /// Whether the ground is level in the map, and its direction up the same along the drive.

@@ -84,6 +84,7 @@ fn name(meaning: PoseMeaning) -> &'static str {
         PoseMeaning::Given => "given",
         PoseMeaning::Camera => "poses of a camera",
         PoseMeaning::Lidar => "poses of the lidar itself",
+        PoseMeaning::Mirrored => "poses of left-handed frames, mirrored at y",
         PoseMeaning::Inverse => "inverse poses (lidar_from_world)",
         PoseMeaning::Turned(_) => "poses of a body about whose z axis the lidar is turned",
     }

@@ -43,16 +43,19 @@ pub enum PoseMeaning {
     Lidar,
     /// Inverse poses, `body_from_world`.
     Inverse,
+    /// Poses of left-handed frames: those of the lidar with y axes that point to the other side.
+    Mirrored,
     /// Poses of a body about whose z axis the lidar is turned, in addition to the calibration [rad].
     Turned(f64),
 }
 
 impl PoseMeaning {
-    const ALL: [Self; 7] = [
+    const ALL: [Self; 8] = [
         Self::Given,
         Self::Camera,
         Self::Lidar,
         Self::Inverse,
+        Self::Mirrored,
         Self::Turned(FRAC_PI_2),
         Self::Turned(-FRAC_PI_2),
         Self::Turned(PI),
@@ -73,6 +76,7 @@ impl PoseMeaning {
                 let body = in_frame(world_from_map.inverse(), previous * current.inverse());
                 in_frame(given.body_from_lidar, body)
             }
+            Self::Mirrored => mirrored(&lidar),
             Self::Turned(rad) => in_frame(Pose3::rotation(Vector3::z() * rad), lidar),
         }
     }
@@ -86,6 +90,15 @@ fn camera_from_lidar() -> Pose3 {
         nalgebra::Translation3::identity(),
         UnitQuaternion::from_scaled_axis(axis * third),
     )
+}
+
+/// A motion in frames whose y axes point to the other side.
+fn mirrored(motion: &Pose3) -> Pose3 {
+    let mut t = motion.translation;
+    t.vector.y = -t.vector.y;
+    let turn = motion.rotation.scaled_axis();
+    let turn = Vector3::new(-turn.x, turn.y, -turn.z);
+    Pose3::from_parts(t, UnitQuaternion::from_scaled_axis(turn))
 }
 
 /// Translation and angle between two motions: medians over the scans.
@@ -117,13 +130,13 @@ impl MotionDifference {
 }
 
 /// Whether poses fit the scans.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum PoseFit {
     /// They do.
     Fits,
     /// They differ more than accurate poses do.
     Doubtful,
-    /// They are of another motion.
+    /// They are of another motion, or fit with another meaning.
     Wrong,
 }
 
@@ -195,7 +208,7 @@ fn compare(motions: &[Option<Pose3>], given: &GivenPoses) -> Option<PoseCheck> {
     }
     let as_given = difference(PoseMeaning::Given);
     let fits = |difference: &MotionDifference| difference.points_m <= 0.1 + 0.1 * largest_m;
-    let fit = match &as_given {
+    let mut fit = match &as_given {
         given if fits(given) => PoseFit::Fits,
         given if given.points_m <= WRONG_SHARE * largest_m => PoseFit::Doubtful,
         _ => PoseFit::Wrong,
@@ -207,11 +220,15 @@ fn compare(motions: &[Option<Pose3>], given: &GivenPoses) -> Option<PoseCheck> {
     let is_better = |(_, other): &(PoseMeaning, MotionDifference)| {
         fit != PoseFit::Fits && fits(other) && other.points_m < BETTER * as_given.points_m
     };
+    let better = better.filter(is_better);
+    if better.is_some() {
+        fit = PoseFit::Wrong;
+    }
     Some(PoseCheck {
         motion,
         given: as_given,
         fit,
-        better: better.filter(is_better),
+        better,
     })
 }
 

@@ -176,6 +176,7 @@ fn remedy(report: &PoseReport) -> String {
         Some(PoseMeaning::Camera) => ": give calib_file with the line Tr".to_owned(),
         Some(PoseMeaning::Lidar) => ": remove calib_file and body_from_lidar".to_owned(),
         Some(PoseMeaning::Inverse) => ": invert the rows of pose_file".to_owned(),
+        Some(PoseMeaning::Mirrored) => ": negate y, roll and yaw in the rows of pose_file".to_owned(),
         Some(PoseMeaning::Turned(rad)) => format!(
             ": give body_from_lidar with a yaw of {:.0} degrees",
             rad.to_degrees()
