@@ -8,7 +8,9 @@ mod bag_writers;
 
 use std::fs;
 use std::path::Path;
+use std::time::Duration;
 
+use assert_cmd::Command;
 use fpmcl::geometry::{Pose3, Vec3};
 use fpmcl::internals::scan_files;
 use fpmcl::lidar::Scan;
@@ -524,6 +526,101 @@ fn a_chunk_with_another_checksum_is_damaged() {
     file[at + 9 + 24] ^= 1;
     let message = read_all(&path, &file).unwrap_err();
     assert!(message.contains("checksum"), "{message}");
+}
+
+/// Describes a bag with the binary, within a time and an address space, and returns the error.
+#[cfg(unix)]
+#[track_caller]
+fn error_of_info(bag: &Path) -> String {
+    const MOST_KIB: u32 = 1 << 20;
+    let binary = assert_cmd::cargo::cargo_bin!("fpmcl");
+    let script = format!("ulimit -v {MOST_KIB}; exec \"$0\" info \"$1\"");
+    let mut call = Command::new("sh");
+    call.args(["-c", &script]).arg(binary).arg(bag);
+    // Less memory of the arenas of threads.
+    call.env("RAYON_NUM_THREADS", "2");
+    let output = call.timeout(Duration::from_secs(60)).output().unwrap();
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(1), "{error}");
+    error
+}
+
+#[test]
+#[cfg(unix)]
+fn views_virtual_tables_and_computed_columns_are_no_tables_of_a_bag() {
+    let endless = "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL \
+         SELECT i + 1 FROM n) SELECT i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n";
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("crafted.db3");
+    for (table, sql) in [
+        ("messages", &*format!("DROP TABLE messages; {endless}")),
+        (
+            "messages",
+            "ALTER TABLE messages RENAME TO stored; CREATE VIEW messages AS SELECT * FROM stored",
+        ),
+        (
+            "topics",
+            "ALTER TABLE topics RENAME TO stored; CREATE VIEW topics AS SELECT * FROM stored",
+        ),
+        (
+            "messages",
+            "DROP TABLE messages; CREATE VIRTUAL TABLE messages USING fts5(topic_id, timestamp, data)",
+        ),
+        (
+            "messages",
+            "ALTER TABLE messages RENAME COLUMN data TO stored; \
+             ALTER TABLE messages ADD COLUMN data AS (zeroblob(100000000))",
+        ),
+    ] {
+        db3(&path, &recording(Kind::CdrLittle));
+        let database = rusqlite::Connection::open(&path).unwrap();
+        database.execute_batch(sql).unwrap();
+        drop(database);
+        let error = error_of_info(&path);
+        let problem = format!("crafted.db3 is no bag of rosbag2: `{table}` is not a table");
+        assert!(error.contains(&problem), "{error}");
+    }
+}
+
+#[test]
+#[cfg(unix)]
+fn a_message_that_no_sensor_sends_is_refused_by_its_size() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("large.db3");
+    let database = rusqlite::Connection::open(&path).unwrap();
+    let sql = "PRAGMA page_size = 65536; PRAGMA synchronous = OFF; PRAGMA journal_mode = OFF;
+         CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
+         CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);
+         INSERT INTO topics VALUES (1, '/points', 'sensor_msgs/msg/PointCloud2', 'cdr');
+         INSERT INTO messages VALUES (1, 1, 5, zeroblob(900000000));";
+    database.execute_batch(sql).unwrap();
+    drop(database);
+    let error = error_of_info(&path);
+    let problem = "message 0 of /points is damaged: a record has 900000000 bytes";
+    assert!(error.contains(problem), "{error}");
+}
+
+#[test]
+fn pages_of_a_table_that_are_linked_twice_are_damaged() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("linked.db3");
+    let mut messages = recording(Kind::CdrLittle);
+    let short = messages.remove(0);
+    messages.extend(vec![short; 100]);
+    db3(&path, &messages);
+    let database = rusqlite::Connection::open(&path).unwrap();
+    let root = "SELECT rootpage FROM sqlite_master WHERE name = 'messages'";
+    let root: u16 = database.query_row(root, [], |row| row.get(0)).unwrap();
+    let root = usize::from(root);
+    drop(database);
+    let mut bytes = fs::read(&path).unwrap();
+    let page = &mut bytes[512 * (root - 1)..512 * root];
+    // An inner page: its kind, ..., at 8 its last page, at 12 the offset of a cell, which begins with the first page.
+    assert_eq!(page[0], 5);
+    let cell = usize::from(u16::from_be_bytes([page[12], page[13]]));
+    page.copy_within(cell..cell + 4, 8);
+    let message = read_all(&path, &bytes).err().unwrap();
+    assert!(message.contains("do not ascend"), "{message}");
 }
 
 #[test]

@@ -9,8 +9,9 @@ use ruzstd::decoding::StreamingDecoder;
 use tempfile::TempPath;
 
 use super::chunk_file::{ChunkFile, decompress_zstd};
+use super::database::Database;
 use super::index::{Index, Message, Place};
-use super::{database, mcap_file, ros1_file};
+use super::{mcap_file, ros1_file};
 
 /// Extensions of bags.
 pub const EXTENSIONS: [&str; 3] = ["mcap", "bag", "db3"];
@@ -33,7 +34,7 @@ pub struct BagFile {
 enum Reader {
     Mcap(ChunkFile),
     Ros1(ChunkFile),
-    Database(rusqlite::Connection),
+    Database(Database),
 }
 
 impl Reader {
@@ -41,7 +42,7 @@ impl Reader {
         match format {
             "mcap" => ChunkFile::open(path).map(Self::Mcap),
             "bag" => ChunkFile::open(path).map(Self::Ros1),
-            "db3" => database::open(path).map(Self::Database),
+            "db3" => Database::open(path).map(Self::Database),
             other => Err(format!(
                 "is not a bag: `{other}` is none of {}",
                 EXTENSIONS.join(", ")
@@ -53,7 +54,7 @@ impl Reader {
         match self {
             Self::Mcap(file) => mcap_file::index(file, number),
             Self::Ros1(file) => ros1_file::index(file, number),
-            Self::Database(database) => database::index(database, number),
+            Self::Database(database) => database.index(number),
         }
     }
 
@@ -61,7 +62,7 @@ impl Reader {
         match (self, place) {
             (Self::Mcap(file), place) => file.message(&mcap_file::FORMAT, place),
             (Self::Ros1(file), place) => file.message(&ros1_file::FORMAT, place),
-            (Self::Database(database), Place::Row(row)) => database::message(database, row),
+            (Self::Database(database), Place::Row(row)) => database.message(row),
             (Self::Database(_), _) => Err("has no such row".to_owned()),
         }
     }
