@@ -158,8 +158,18 @@ fn a_mesh_that_cannot_be_a_map_is_an_error_with_its_remedy() {
         "scan_folder: velodyne\npose_file: poses.txt\ncalib_file: null\n",
     );
     for (name, parts) in [
-        ("wall.obj", &["wall.obj", "no ground"][..]),
-        ("y_up.obj", &["y_up.obj", "no ground", "y axis"]),
+        (
+            "wall.obj",
+            &["wall.obj", "no ground", "the z axis of a map points up"][..],
+        ),
+        (
+            "y_up.obj",
+            &[
+                "y_up.obj",
+                "no ground",
+                "if its y axis pointed up, it would have 8",
+            ],
+        ),
         ("damaged.obj", &["damaged.obj", "line 1", "x, y and z"]),
         ("short.stl", &["short.stl", "no triangles"]),
         ("map.txt", &["map.txt", ".ply, .obj or .stl"]),

@@ -312,3 +312,78 @@ fn the_batches_of_a_graphics_device_are_within_the_budget() {
         assert!(stderr.contains(part), "{stderr}");
     }
 }
+
+/// Writes a mesh of squares of two triangles without colours, as other programs write them.
+fn write_squares(path: &Path, columns: u32, rows: u32, side_m: f32) {
+    let mut text = "ply\nformat binary_little_endian 1.0\n".to_owned();
+    for (element, count) in [
+        ("vertex", (columns + 1) * (rows + 1)),
+        ("face", 2 * columns * rows),
+    ] {
+        text += &format!("element {element} {count}\n");
+        text += match element {
+            "vertex" => "property float x\nproperty float y\nproperty float z\n",
+            _ => "property list uchar int vertex_indices\n",
+        };
+    }
+    let mut bytes = (text + "end_header\n").into_bytes();
+    for (row, column) in (0..=rows).flat_map(|row| (0..=columns).map(move |column| (row, column))) {
+        let position = [column as f32 * side_m, row as f32 * side_m, 0.0];
+        bytes.extend(position.iter().flat_map(|along| along.to_le_bytes()));
+    }
+    for (row, column) in (0..rows).flat_map(|row| (0..columns).map(move |column| (row, column))) {
+        let first = row * (columns + 1) + column;
+        let above = first + columns + 1;
+        for corners in [[first, first + 1, above + 1], [first, above + 1, above]] {
+            bytes.push(3);
+            bytes.extend(corners.iter().flat_map(|corner| corner.to_le_bytes()));
+        }
+    }
+    fs::write(path, bytes).unwrap();
+}
+
+#[cfg(unix)]
+#[test]
+fn maps_of_few_triangles_that_cover_much_ground_load_in_little_memory_and_time() {
+    const MOST_KIB: u32 = 1_500_000;
+    let recording = Recording::street(2);
+    for (name, columns, rows, side_m, is_doubted) in [
+        ("street.ply", 331, 114, 0.35, false),
+        ("millimetres.ply", 331, 114, 350.0, true),
+        ("terrain.ply", 40, 40, 100.0, false),
+        ("floor.ply", 1, 1, 800.0, false),
+        ("plain.ply", 1, 1, 3_000.0, false),
+    ] {
+        write_squares(&recording.path(name), columns, rows, side_m);
+        let binary = assert_cmd::cargo::cargo_bin!("fpmcl");
+        let script = format!(
+            "ulimit -v {MOST_KIB}; exec \"$0\" localize localization.yml --backend=cpu --memory=2 --force \
+             --set map_file={name} --set map_pose_file=null --set map_calib_file=null"
+        );
+        let mut call = assert_cmd::Command::new("sh");
+        call.args(["-c", &script])
+            .arg(binary)
+            .current_dir(recording.folder());
+        // Less memory of the arenas of threads.
+        call.env("RAYON_NUM_THREADS", "2")
+            .env("MALLOC_ARENA_MAX", "2");
+        let output = call
+            .timeout(std::time::Duration::from_secs(60))
+            .output()
+            .unwrap();
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        // In millimetres the car is lost, and all of the map is no place to search in.
+        let is_localized = output.status.code() == Some(0);
+        let is_lost =
+            output.status.code() == Some(1) && stderr.contains("the search grid would need");
+        assert!(is_localized || (is_lost && is_doubted), "{name}: {stderr}");
+        let doubt = "are the coordinates in millimetres?";
+        assert_eq!(stderr.contains(doubt), is_doubted, "{name}: {stderr}");
+        let info = run(recording.folder(), &["info", name]);
+        assert_eq!(info.contains(doubt), is_doubted, "{name}: {info}");
+        assert!(
+            recording.bytes("results/localization.npz").len() > 1000,
+            "{name}"
+        );
+    }
+}

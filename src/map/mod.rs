@@ -11,6 +11,7 @@ pub(crate) mod mesh_view;
 pub(crate) mod model;
 pub(crate) mod places;
 pub(crate) mod tiles;
+mod unit;
 
 #[cfg(test)]
 pub(crate) mod world_for_tests;
@@ -34,3 +35,4 @@ pub use tiles::grid::{TileConfig, TileGrid, TileIndex};
 pub(crate) use build::cloud::CloudPlan;
 pub(crate) use model::surface_of;
 pub(crate) use places::panorama::{PanoramaIndex, PanoramaRequest, PanoramaSeed};
+pub(crate) use unit::unit_doubt;

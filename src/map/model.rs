@@ -1,6 +1,6 @@
 //! The map that a car is localized in.
 
-use std::ops::RangeInclusive;
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
@@ -15,7 +15,7 @@ use super::files::mesh_error::{MeshFileError, MeshFileProblem};
 use super::files::mesh_file;
 use super::files::ply;
 use super::ground::elevation::GroundMap;
-use super::ground::heights::{Chunks, GROUND_CELL_M, chunks_of_triangles};
+use super::ground::heights::{GROUND_CELL_M, GroundTriangles};
 use super::ground::surface::GroundSurface;
 use super::mesh_view::MeshView;
 use super::places::panorama::{PanoramaIndex, PanoramaRequest};
@@ -24,6 +24,7 @@ use super::tiles::cache::MapCache;
 use super::tiles::file::Source;
 use super::tiles::grid::{self, TileConfig, TileGrid, TileIndex};
 use super::tiles::store::TileStore;
+use super::unit::unit_doubt;
 use crate::geometry::mesh::on_lattice;
 use crate::geometry::{Aabb, TriangleMesh};
 use crate::memory::{MemoryBudget, MemoryError};
@@ -31,14 +32,14 @@ use crate::raycasting::Scene;
 use crate::rendering::selection::{self, BackendChoice};
 use crate::rendering::{RangeRenderer, RenderError};
 
-/// Extents between which a map in metres lies [m].
-const PLAUSIBLE_M: RangeInclusive<f32> = 2.0..=20_000.0;
-
 /// Memory per triangle while a mapped file is divided into tiles: its index, as one of a tile and of the ground [bytes].
 const DIVIDED_BYTES: f64 = 16.0;
 
 /// What to do about a map that needs too much memory.
 const SMALLER_MAP: &str = "build a smaller map with a larger local_map.simplify_resolution_m";
+
+/// What to do about a mesh whose y axis points up.
+const TURN: &str = "export it with z up, or turn it by 90 degrees about x";
 
 /// Memory per triangle while a map is prepared: mesh, ground, tiles and hierarchies [bytes].
 const TRIANGLE_BYTES: f64 = 150.0;
@@ -88,9 +89,16 @@ pub enum MapError {
     )]
     NoArea { triangles: usize },
     #[error(
-        "the map has no ground: no near-horizontal surface of 4 m² or more lies below the others{}", hint(*.is_y_up)
+        "the map has no ground: no near-horizontal surface of {smallest_m2:.0} m² or more lies below the others; {}",
+        y_up_m2.map_or_else(
+            || "the z axis of a map points up and its unit is the metre".to_owned(),
+            |area_m2| format!("if its y axis pointed up, it would have {area_m2:.0} m²: {TURN}"),
+        )
     )]
-    NoGround { is_y_up: bool },
+    NoGround {
+        smallest_m2: f64,
+        y_up_m2: Option<f64>,
+    },
     #[error("the map {} has changed while it was read; load it again", file.display())]
     Changed { file: PathBuf },
     #[error(transparent)]
@@ -112,15 +120,15 @@ impl Map {
         path: MappingPath,
         options: &MapOptions,
     ) -> Result<Self, MapError> {
-        let (chunks, _) = prepare(&mut mesh, &path, options.memory_budget)?;
+        let is_ground = prepare(&mut mesh, &path, options.memory_budget)?;
         let choice = selection::choose(options.backend, options.method)?;
-        Self::in_memory(mesh, path, chunks, options, &choice)
+        Self::in_memory(mesh, path, &is_ground, options, &choice)
     }
 
     fn in_memory(
         mesh: TriangleMesh,
         path: MappingPath,
-        chunks: Chunks,
+        is_ground: &[bool],
         options: &MapOptions,
         choice: &BackendChoice,
     ) -> Result<Self, MapError> {
@@ -130,7 +138,10 @@ impl Map {
         let tiles = grid_of(&path, boxes, &options.tiles);
         let scene = Arc::new(Scene::of_tiles(&parts));
         let renderer = choice.renderer(scene, options.memory_budget)?;
-        let ground = GroundMap::over(Arc::new(chunks), GROUND_CELL_M);
+        let ground = (0..mesh.triangles.len()).filter(|&triangle| is_ground[triangle]);
+        let corners = ground.map(|triangle| MeshView::corners(&mesh, triangle));
+        let ground = GroundTriangles::new(corners.collect(), GROUND_CELL_M);
+        let ground = GroundMap::over(Arc::new(ground), GROUND_CELL_M);
         Ok(Self {
             memory_budget: options.memory_budget,
             ..Self::from_parts(mesh, path, tiles, ground, renderer)
@@ -161,7 +172,8 @@ impl Map {
     ///
     /// With a [cache](MapOptions::cache), the mesh is divided into tiles on first use, and when it has changed; of
     /// these, those around the car are kept in memory, and on a graphics card. Without one, and where that next to the
-    /// map cannot be written, which is a warning, all of the map is, and nothing is written.
+    /// map cannot be written, which is a warning, all of the map is, and nothing is written; nor is it of a few triangles
+    /// that cover so much ground that their tiles would be larger than they are.
     ///
     /// # Errors
     /// The file cannot be read, or the folder that is given for the cache not written; else as [`new`](Self::new).
@@ -209,7 +221,7 @@ impl Map {
         }
         let (mut mesh, own) = mesh_file::read(mesh_file)?;
         let path = own.clone().or_else(|| given.clone()).unwrap_or_default();
-        let (chunks, is_ground) = prepare(&mut mesh, &path, options.memory_budget)?;
+        let is_ground = prepare(&mut mesh, &path, options.memory_budget)?;
         if let Some((folder, source)) = cache
             && let Some(store) = divided(
                 (mesh_file, folder, &options.cache),
@@ -221,7 +233,7 @@ impl Map {
         {
             return Self::on_disk((mesh_file, store), given, options, &choice);
         }
-        Self::in_memory(mesh, path, chunks, options, &choice)
+        Self::in_memory(mesh, path, &is_ground, options, &choice)
     }
 
     fn on_disk(
@@ -357,7 +369,7 @@ impl Map {
 }
 
 /// Divides the mesh of a file into tiles in a folder of a cache; `None` if they cannot be written next to it, after a
-/// warning.
+/// warning, or would be larger than the mesh.
 fn divided(
     (mesh_file, folder, cache): (&Path, &Path, &MapCache),
     source: Source,
@@ -365,6 +377,10 @@ fn divided(
     is_ground: &dyn Fn(usize) -> bool,
     own_path: Option<MappingPath>,
 ) -> Result<Option<TileStore>, MapError> {
+    if is_sparse(mesh, is_ground, source.side_m) {
+        tracing::info!("all of the map is kept in memory: its tiles would be larger");
+        return Ok(None);
+    }
     match TileStore::make(mesh_file, folder, source, mesh, is_ground, own_path) {
         Ok(Some(store)) => Ok(Some(store)),
         Ok(None) => Err(MapError::Changed {
@@ -384,23 +400,45 @@ fn divided(
     }
 }
 
-/// Moves the vertices of a mesh to the lattice of maps and finds its ground: chunks of the elevation map, and which
-/// triangles are ground.
+/// Whether the tiles of a mesh would take much space, and more than the mesh takes in memory: those of a few triangles
+/// that are far apart or cover much ground.
+fn is_sparse(mesh: &dyn MeshView, is_ground: &dyn Fn(usize) -> bool, side_m: f64) -> bool {
+    /// Space that tiles may take in any case [bytes].
+    const SMALL_BYTES: f64 = (64_u64 << 20) as f64;
+    /// Space of a small file [bytes].
+    const FILE_BYTES: f64 = 4096.0;
+    const HEIGHT_BYTES: f64 = 4.0;
+    let mut tiles = HashSet::new();
+    let mut ground_m2 = 0.0;
+    for triangle in 0..mesh.triangles() {
+        let [a, b, c] = mesh.corners(triangle);
+        let middle = (a + b + c) / 3.0;
+        tiles.insert(TileIndex::of(middle.x, middle.y, side_m));
+        if is_ground(triangle) {
+            ground_m2 += 0.5 * (b - a).truncate().perp_dot((c - a).truncate()).abs();
+        }
+    }
+    let heights = ground_m2 / (GROUND_CELL_M * GROUND_CELL_M);
+    let bytes = FILE_BYTES * tiles.len() as f64 + HEIGHT_BYTES * heights;
+    bytes > SMALL_BYTES.max(TRIANGLE_BYTES * mesh.triangles() as f64)
+}
+
+/// Moves the vertices of a mesh to the lattice of maps and finds its ground: which triangles are ground.
 fn prepare(
     mesh: &mut TriangleMesh,
     path: &MappingPath,
     budget: MemoryBudget,
-) -> Result<(Chunks, Vec<bool>), MapError> {
+) -> Result<Vec<bool>, MapError> {
     mesh.snap();
     let triangles = mesh.triangles.len();
     if (0..triangles).all(|triangle| mesh.scaled_normal(triangle) == Vec3::ZERO) {
         return Err(MapError::NoArea { triangles });
     }
     budget.require("the map", triangles as f64 * TRIANGLE_BYTES, SMALLER_MAP)?;
-    let is_ground = ground_of(mesh, !path.map_from_lidar.is_empty())?;
-    let ground = (0..triangles).filter(|&triangle| is_ground[triangle]);
-    let corners = ground.map(|triangle| MeshView::corners(mesh, triangle));
-    Ok((chunks_of_triangles(corners, GROUND_CELL_M), is_ground))
+    if let Some(doubt) = unit_doubt(&mesh.bounds()) {
+        tracing::warn!("{doubt}");
+    }
+    ground_of(mesh, !path.map_from_lidar.is_empty(), budget)
 }
 
 /// The tiles around the path of the mapping drive; without one, those of the triangles.
@@ -428,7 +466,7 @@ pub fn surface_of(mesh_file: &Path) -> Result<Arc<dyn MeshView>, MapError> {
     let (mut mesh, path) = mesh_file::read(mesh_file)?;
     let has_path = path.is_some_and(|path| !path.map_from_lidar.is_empty());
     if !has_red_ground(&mesh, has_path) {
-        let is_ground = ground_of(&mesh, has_path)?;
+        let is_ground = ground_of(&mesh, has_path, MemoryBudget::default())?;
         mesh.colors = vec![REST; mesh.vertices.len()];
         for (corners, _) in std::iter::zip(&mesh.triangles, is_ground).filter(|(_, ground)| *ground)
         {
@@ -459,24 +497,29 @@ fn has_area(corners: [DVec3; 3]) -> bool {
 }
 
 /// Finds the ground: the red triangles; in a mesh without any, those that their shape tells.
-fn ground_of(mesh: &TriangleMesh, has_path: bool) -> Result<Vec<bool>, MapError> {
+fn ground_of(
+    mesh: &TriangleMesh,
+    has_path: bool,
+    budget: MemoryBudget,
+) -> Result<Vec<bool>, MapError> {
     if has_red_ground(mesh, has_path) {
         return Ok((0..mesh.triangles.len())
             .map(|triangle| mesh.is_red(triangle))
             .collect());
     }
-    warn_of_extent(mesh);
-    let ground = GroundSurface::of_mesh(mesh);
+    let ground = GroundSurface::of_mesh(mesh, budget)?;
     let area_m2 = ground.area_m2();
-    let y_up_area_m2 = GroundSurface::of_mesh(&turned_from_y_up(mesh)).area_m2();
-    let is_y_up = y_up_area_m2 > 2.0 * area_m2;
+    let y_up_m2 = GroundSurface::of_mesh(&turned_from_y_up(mesh), budget)?.area_m2();
+    let y_up_m2 = Some(y_up_m2).filter(|&y_up_m2| y_up_m2 > 2.0 * area_m2);
     if area_m2 == 0.0 {
-        return Err(MapError::NoGround { is_y_up });
+        return Err(MapError::NoGround {
+            smallest_m2: ground.smallest_m2(),
+            y_up_m2,
+        });
     }
-    if is_y_up {
+    if let Some(y_up_m2) = y_up_m2 {
         tracing::warn!(
-            "the map has {area_m2:.0} m² of ground, and would have {y_up_area_m2:.0} m²{}",
-            hint(true)
+            "the map has {area_m2:.0} m² of ground, and would have {y_up_m2:.0} m² if its y axis pointed up: {TURN}"
         );
     }
     tracing::info!("the map has no ground marked red: {area_m2:.0} m² were found by their shape");
@@ -486,16 +529,6 @@ fn ground_of(mesh: &TriangleMesh, has_path: bool) -> Result<Vec<bool>, MapError>
         .collect())
 }
 
-/// Warns of an extent that is not that of a map in metres.
-fn warn_of_extent(mesh: &TriangleMesh) {
-    let extent_m = mesh.bounds().size().max_element();
-    if !PLAUSIBLE_M.contains(&extent_m) {
-        tracing::warn!(
-            "the map is {extent_m:.2} m across: if its unit is not the metre, scale it before exporting (from millimetres by 0.001)"
-        );
-    }
-}
-
 /// A mesh whose y points up with z up.
 fn turned_from_y_up(mesh: &TriangleMesh) -> TriangleMesh {
     let turned = |&Vec3 { x, y, z }: &Vec3| Vec3::new(x, -z, y);
@@ -503,15 +536,6 @@ fn turned_from_y_up(mesh: &TriangleMesh) -> TriangleMesh {
         vertices: mesh.vertices.iter().map(turned).collect(),
         triangles: mesh.triangles.clone(),
         ..TriangleMesh::default()
-    }
-}
-
-/// What to do about a mesh that seems to have y up.
-fn hint(is_y_up: bool) -> &'static str {
-    if is_y_up {
-        " if its y axis pointed up: export it with z up, or turn it by 90 degrees about x"
-    } else {
-        "; the z axis of a map points up and its unit is the metre"
     }
 }
 

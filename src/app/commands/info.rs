@@ -18,6 +18,7 @@ use crate::evaluation::RangeMclRules;
 use crate::geometry::Aabb;
 use crate::lidar::Scan;
 use crate::map::files::ply;
+use crate::map::unit_doubt;
 use crate::recording::{PoseTrack, Recording, Selection, scan_files};
 use crate::sensor::{BeamSource, Sensor, SensorConfig, spread_scans};
 use crate::validation::{InvalidValue, Validate};
@@ -231,14 +232,14 @@ fn map(path: &Path) -> Result<Printed> {
         }
         _ => "none".to_owned(),
     };
-    Ok(Printed::rows(&[
+    let bounds = mesh.bounds();
+    let mut rows = vec![
         ("triangles", mesh.triangles.len().to_string()),
-        (
-            "extent",
-            extent(Aabb::from_points(mesh.vertices.iter().copied())),
-        ),
+        ("extent", extent(bounds)),
         ("path", path),
-    ]))
+    ];
+    rows.extend(unit_doubt(&bounds).map(|doubt| ("unit", doubt)));
+    Ok(Printed::rows(&rows))
 }
 
 fn result(path: &Path) -> Result<Printed> {

@@ -4,9 +4,8 @@
 //! cell (i, j) covers [i c, (i + 1) c) × [j c, (j + 1) c)      c = edge of a cell
 //! ```
 //!
-//! Cells are stored in square chunks, which are allocated with their first height: the memory is
-//! proportional to the mapped area, not to its bounding box, which one outlier could make as large
-//! as the Earth.
+//! Cells are stored in square chunks. Those of tiles are made with the tiles; those of a map in memory are made of its
+//! triangles when they are requested ([`GroundTriangles`]): a triangle may cover a square kilometre.
 //!
 //! A cell may have several levels, as where a bridge crosses a road (Triebel, Pfaff and Burgard,
 //! *Multi-Level Surface Maps for Outdoor Terrain Mapping and Loop Closing*, IROS 2006): the heights of
@@ -14,10 +13,10 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::fmt::Debug;
-use std::sync::Arc;
+use std::sync::{Arc, PoisonError, RwLock};
 
 use glam::DVec3;
-use nalgebra::{Point2, Vector3};
+use nalgebra::{Point2, Vector2, Vector3};
 
 use crate::raycasting::TileError;
 use crate::shared_bytes::SharedBytes;
@@ -25,8 +24,15 @@ use crate::shared_bytes::SharedBytes;
 /// Cells along the edge of a chunk.
 const CHUNK_CELLS: i64 = 64;
 
-/// Triangles with longer edges are artefacts, not the surface of a road [m].
-const MAX_EDGE_M: f64 = 500.0;
+/// Triangles with longer edges are large [m].
+const LARGE_EDGE_M: f64 = 500.0;
+
+/// A large triangle that is narrower than this part of its longest edge is an artefact, one with a lost vertex, not the
+/// surface of a road.
+const NARROW: f64 = 0.01;
+
+/// Largest number of chunks that a map in memory keeps, of about 16 kB each.
+const KEPT_CHUNKS: usize = 4096;
 
 /// Smallest distance of two levels, less than the clearance that any vehicle needs [m].
 pub(crate) const LEVEL_GAP_M: f64 = 2.0;
@@ -58,12 +64,83 @@ pub(crate) trait ChunkSource: Debug + Send + Sync {
     fn chunk(&self, chunk: Cell) -> Result<Option<SharedBytes>, TileError>;
 }
 
-/// Chunks in memory.
+/// Chunks by their columns and rows.
 pub(crate) type Chunks = BTreeMap<Cell, SharedBytes>;
 
-impl ChunkSource for Chunks {
+/// The first and the last cell of a rectangle.
+pub(crate) type Window = [Cell; 2];
+
+/// The window of all cells.
+pub(crate) const EVERYWHERE: Window = [(i64::MIN, i64::MIN), (i64::MAX, i64::MAX)];
+
+/// Triangles in memory, whose chunks are made when they are requested: the memory is proportional to the number of
+/// triangles, not to the area that they cover.
+#[derive(Debug)]
+pub(crate) struct GroundTriangles {
+    corners: Vec<[DVec3; 3]>,
+    cell_m: f64,
+    /// Triangles by the squares of `2^level` chunks along the edge that they reach; the level of a triangle is the
+    /// lowest at which it reaches at most two by two.
+    squares: BTreeMap<u32, HashMap<Cell, Vec<u32>>>,
+    made: RwLock<HashMap<Cell, Option<SharedBytes>>>,
+}
+
+impl GroundTriangles {
+    pub fn new(corners: Vec<[DVec3; 3]>, cell_m: f64) -> Self {
+        let mut squares: BTreeMap<u32, HashMap<Cell, Vec<u32>>> = BTreeMap::new();
+        for (corners, triangle) in corners.iter().zip(0..) {
+            let Some([first, last]) = chunks_around(*corners, cell_m) else {
+                continue;
+            };
+            let at = |(column, row): Cell, level: u32| (column >> level, row >> level);
+            let is_near = |level: &u32| {
+                let (first, last) = (at(first, *level), at(last, *level));
+                last.0.abs_diff(first.0).max(last.1.abs_diff(first.1)) <= 1
+            };
+            let level = (0..i64::BITS).find(is_near).unwrap_or(i64::BITS - 1);
+            let (first, last) = (at(first, level), at(last, level));
+            let squares = squares.entry(level).or_default();
+            for row in first.1..=last.1 {
+                for column in first.0..=last.0 {
+                    squares.entry((column, row)).or_default().push(triangle);
+                }
+            }
+        }
+        Self {
+            corners,
+            cell_m,
+            squares,
+            made: RwLock::default(),
+        }
+    }
+
+    fn make(&self, chunk: Cell) -> Option<SharedBytes> {
+        let reaching = self.squares.iter().filter_map(|(level, squares)| {
+            let square = (chunk.0 >> level, chunk.1 >> level);
+            squares.get(&square)
+        });
+        let mut triangles: Vec<u32> = reaching.flatten().copied().collect();
+        // The order of the heights of a cell decides their rounded mean.
+        triangles.sort_unstable();
+        let corners = (triangles.into_iter()).map(|triangle| self.corners[triangle as usize]);
+        chunks_of_triangles(corners, self.cell_m, window_of(chunk, chunk)).remove(&chunk)
+    }
+}
+
+impl ChunkSource for GroundTriangles {
     fn chunk(&self, chunk: Cell) -> Result<Option<SharedBytes>, TileError> {
-        Ok(self.get(&chunk).cloned())
+        let made = self.made.read().unwrap_or_else(PoisonError::into_inner);
+        if let Some(made) = made.get(&chunk) {
+            return Ok(made.clone());
+        }
+        drop(made);
+        let made = self.make(chunk);
+        let mut all = self.made.write().unwrap_or_else(PoisonError::into_inner);
+        if all.len() >= KEPT_CHUNKS {
+            all.clear();
+        }
+        all.insert(chunk, made.clone());
+        Ok(made)
     }
 }
 
@@ -92,14 +169,15 @@ impl Heights {
     }
 }
 
-/// The chunks of triangles, in any order.
+/// The chunks of triangles, in any order, with heights in a window.
 pub(crate) fn chunks_of_triangles(
     corners: impl Iterator<Item = [DVec3; 3]>,
     cell_m: f64,
+    window: Window,
 ) -> Chunks {
     let mut samples = HeightSamples::default();
     for corners in corners {
-        rasterize(corners, cell_m, &mut |cell, height_m| {
+        rasterize(corners, cell_m, window, &mut |cell, height_m| {
             samples.add(cell, height_m)
         });
     }
@@ -201,17 +279,45 @@ fn chunk_of((column, row): Cell) -> (Cell, usize) {
 }
 
 /// The chunks that a triangle may have heights in; none for an artefact.
-pub(crate) fn chunks_reached([a, b, c]: [DVec3; 3], cell_m: f64) -> impl Iterator<Item = Cell> {
-    let (min, max) = (a.min(b).min(c), a.max(b).max(c));
-    let chunk_at = |corner: DVec3| {
-        let (column, row) = cell_of(Point2::new(corner.x, corner.y), cell_m);
-        (column.div_euclid(CHUNK_CELLS), row.div_euclid(CHUNK_CELLS))
-    };
-    let is_small =
-        (b - a).truncate().length() <= MAX_EDGE_M && (c - a).truncate().length() <= MAX_EDGE_M;
-    let (first, last) = (chunk_at(min), chunk_at(max));
-    let last_row = if is_small { last.1 } else { first.1 - 1 };
-    (first.1..=last_row).flat_map(move |row| (first.0..=last.0).map(move |column| (column, row)))
+pub(crate) fn chunks_reached(corners: [DVec3; 3], cell_m: f64) -> impl Iterator<Item = Cell> {
+    let around = chunks_around(corners, cell_m).into_iter();
+    around.flat_map(|[first, last]| {
+        let columns = move |row| (first.0..=last.0).map(move |column| (column, row));
+        (first.1..=last.1).flat_map(columns)
+    })
+}
+
+/// The first and the last of the chunks around a triangle; `None` for an artefact.
+fn chunks_around(corners: [DVec3; 3], cell_m: f64) -> Option<[Cell; 2]> {
+    let [a, b, c] = corners;
+    let bounds = [a.min(b).min(c), a.max(b).max(c)];
+    (!is_artefact(corners)).then(|| bounds.map(|corner| chunk_at(corner, cell_m)))
+}
+
+/// The chunk of a position.
+pub(crate) fn chunk_at(position: DVec3, cell_m: f64) -> Cell {
+    chunk_of(cell_of(Point2::new(position.x, position.y), cell_m)).0
+}
+
+/// The cells from those of one chunk to those of another.
+pub(crate) fn window_of(first: Cell, last: Cell) -> Window {
+    let end = |chunk: i64| (chunk * CHUNK_CELLS).saturating_add(CHUNK_CELLS - 1);
+    [
+        (first.0 * CHUNK_CELLS, first.1 * CHUNK_CELLS),
+        (end(last.0), end(last.1)),
+    ]
+}
+
+/// Whether a triangle has an edge that few surfaces of roads have.
+pub(crate) fn is_large([a, b, c]: [DVec3; 3]) -> bool {
+    (b - a).truncate().length().max((c - a).truncate().length()) > LARGE_EDGE_M
+}
+
+/// Whether a triangle is large and narrow, seen from above.
+pub(crate) fn is_artefact(corners: [DVec3; 3]) -> bool {
+    let [a, b, c] = corners.map(DVec3::truncate);
+    let longest_m = (b - a).length().max((c - a).length()).max((c - b).length());
+    is_large(corners) && (b - a).perp_dot(c - a).abs() < NARROW * longest_m * longest_m
 }
 
 /// Middle of a chunk of cells of an edge.
@@ -230,15 +336,24 @@ fn center_of((column, row): Cell, cell_m: f64) -> Point2<f64> {
     Point2::new((column as f64 + 0.5) * cell_m, (row as f64 + 0.5) * cell_m)
 }
 
-/// Adds the heights of a triangle at the centres of cells that it covers, and those of its corners.
-pub(crate) fn rasterize(corners: [DVec3; 3], cell_m: f64, add: &mut impl FnMut(Cell, f64)) {
-    let [a, b, c] = corners.map(|corner| Vector3::from(corner.to_array()));
-    let (ab, ac) = (b - a, c - a);
-    if ab.xy().norm().max(ac.xy().norm()) > MAX_EDGE_M {
+/// Adds the heights of a triangle at the centres of cells that it covers, and those of its corners, in a window. An
+/// artefact has none.
+pub(crate) fn rasterize(
+    corners: [DVec3; 3],
+    cell_m: f64,
+    [low, high]: Window,
+    add: &mut impl FnMut(Cell, f64),
+) {
+    if is_artefact(corners) {
         return;
     }
+    let [a, b, c] = corners.map(|corner| Vector3::from(corner.to_array()));
+    let (ab, ac) = (b - a, c - a);
     for corner in [a, b, c] {
-        add(cell_of(corner.xy().into(), cell_m), corner.z);
+        let (column, row) = cell_of(corner.xy().into(), cell_m);
+        if (low.0..=high.0).contains(&column) && (low.1..=high.1).contains(&row) {
+            add((column, row), corner.z);
+        }
     }
     let area = ab.x * ac.y - ab.y * ac.x;
     if area.abs() <= 1e-12 {
@@ -246,10 +361,18 @@ pub(crate) fn rasterize(corners: [DVec3; 3], cell_m: f64, add: &mut impl FnMut(C
     }
     let first = cell_of(a.inf(&b).inf(&c).xy().into(), cell_m);
     let last = cell_of(a.sup(&b).sup(&c).xy().into(), cell_m);
+    let (first, last) = (
+        (first.0.max(low.0), first.1.max(low.1)),
+        (last.0.min(high.0), last.1.min(high.1)),
+    );
     for row in first.1..=last.1 {
-        for column in first.0..=last.0 {
-            let center = center_of((column, row), cell_m);
-            let (x, y) = (center.x - a.x, center.y - a.y);
+        let y = center_of((0, row), cell_m).y - a.y;
+        let (from, to) = row_part([ab.xy(), ac.xy()], area, y);
+        // Rounding moves an end by less than a cell.
+        let column_at = |x: f64| ((a.x + x) / cell_m).floor() as i64;
+        let (from, to) = (column_at(from - cell_m), column_at(to + cell_m));
+        for column in first.0.max(from)..=last.0.min(to) {
+            let x = center_of((column, row), cell_m).x - a.x;
             let u = (x * ac.y - y * ac.x) / area;
             let v = (ab.x * y - ab.y * x) / area;
             if u >= 0.0 && v >= 0.0 && u + v <= 1.0 {
@@ -259,15 +382,41 @@ pub(crate) fn rasterize(corners: [DVec3; 3], cell_m: f64, add: &mut impl FnMut(C
     }
 }
 
+/// Ends of the part of the line of a `y` that is in a triangle, from its first corner.
+fn row_part([ab, ac]: [Vector2<f64>; 2], area: f64, y: f64) -> (f64, f64) {
+    let (u, v) = ((ac.y, -y * ac.x), (-ab.y, ab.x * y));
+    let w = (-u.0 - v.0, area - u.1 - v.1);
+    let mut part = (f64::NEG_INFINITY, f64::INFINITY);
+    // Barycentric coordinates, times the area: slope · x + offset.
+    for (slope, offset) in [u, v, w] {
+        let zero = -offset / slope;
+        if slope != 0.0 && (slope > 0.0) == (area > 0.0) {
+            part.0 = part.0.max(zero);
+        } else if slope != 0.0 {
+            part.1 = part.1.min(zero);
+        }
+    }
+    part
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    impl ChunkSource for Chunks {
+        fn chunk(&self, chunk: Cell) -> Result<Option<SharedBytes>, TileError> {
+            Ok(self.get(&chunk).cloned())
+        }
+    }
 
     impl Heights {
         /// Averages the heights of triangles per cell and level: one sample in each cell whose centre a
         /// triangle covers, and one at each of its corners.
         pub fn of_triangles(corners: impl Iterator<Item = [DVec3; 3]>, cell_m: f64) -> Self {
-            Self::over(Arc::new(chunks_of_triangles(corners, cell_m)), cell_m)
+            Self::over(
+                Arc::new(GroundTriangles::new(corners.collect(), cell_m)),
+                cell_m,
+            )
         }
 
         /// One height for every cell of a rectangle.
@@ -298,7 +447,8 @@ mod tests {
         let far = near.map(|corner| corner + DVec3::new(1.0e9, -1.0e9, 0.0));
         let degenerate = [DVec3::ZERO, DVec3::X, DVec3::new(0.0, 1.0e30, 0.0)];
         let heights = Heights::of_triangles([near, far, degenerate].into_iter(), 0.25);
-        let chunks = chunks_of_triangles([near, far, degenerate].into_iter(), 0.25);
+        let triangles = [near, far, degenerate].into_iter();
+        let chunks = chunks_of_triangles(triangles, 0.25, EVERYWHERE);
         assert_eq!(chunks.len(), 2);
         assert_eq!(heights.reader().nearest_m((1, 1), 5.0).unwrap(), Some(0.0));
         assert_eq!(heights.reader().nearest_m((1000, 1), 0.0).unwrap(), None);
@@ -321,6 +471,36 @@ mod tests {
         assert_eq!(levels(&[12.0, 6.0, 0.0]), [0.0, 6.0, 12.0]);
         assert_eq!(levels(&[0.0, 3.0, 1.5]), [1.5]);
         assert_eq!(levels(&[1.5, 3.0, 0.0]), [1.5]);
+    }
+
+    #[test]
+    fn the_chunks_of_triangles_are_the_same_one_by_one_and_a_large_one_has_heights_everywhere() {
+        let mut corners = Vec::new();
+        for i in 0..300 {
+            let at = |k: i32| {
+                let [x, y] = [37, 101].map(|step| f64::from((i * step * (k + 3) + 17 * k) % 400));
+                DVec3::new(x - 200.0, y - 200.0, 0.1 * f64::from((i + k) % 7))
+            };
+            let size = [1.0, 0.02, 5.0][i as usize % 3];
+            let middle = at(0);
+            corners.push([1, 2, 3].map(|k| middle + size * (at(k) - middle)));
+        }
+        let all = chunks_of_triangles(corners.iter().copied(), 0.5, EVERYWHERE);
+        let one_by_one = GroundTriangles::new(corners, 0.5);
+        let chunks = (-90..90).flat_map(|column| (-90..90).map(move |row| (column, row)));
+        for chunk in chunks {
+            let made = one_by_one.chunk(chunk).unwrap();
+            assert_eq!(made.as_deref(), all.get(&chunk).map(|bytes| &**bytes));
+        }
+        let plane = [(0.0, 0.0), (1e7, 0.0), (0.0, 1e7)].map(|(x, y)| DVec3::new(x, y, 0.01 * x));
+        let heights = Heights::of_triangles([plane].into_iter(), 0.5);
+        let mut reader = heights.reader();
+        for x in [100.25, 1e6 + 0.25, 4e6 + 0.25] {
+            let cell = heights.cell_at(x, x).unwrap();
+            let height_m = reader.nearest_m(cell, 0.0).unwrap().unwrap();
+            assert!((height_m - 0.01 * x).abs() < 0.01, "{height_m}");
+        }
+        assert_eq!(reader.nearest_m((-1, -1), 0.0).unwrap(), None);
     }
 
     #[test]

@@ -2,24 +2,38 @@
 //!
 //! ```text
 //! near horizontal    |n_z| > cos 30°, on either side
-//! surfaces           per cell of 0.5 m, heights less than 0.3 m apart
+//! surfaces           per cell of c = 0.5 m, heights less than 0.3 m apart
 //! connected          heights of surfaces within 1 m differ by less than 0.15 m + 0.25 · distance
 //! ground             4 m² or more, and less than half of the rim has another surface below it
 //! ```
 //!
 //! The roof of a car or house, a table or a ceiling has another surface around or below its rim; a
 //! road, a bridge with its ramps, or the storeys of a car park are connected and end at walls.
+//!
+//! A few triangles can cover more cells than memory holds, such as those of a map in millimetres. Where they cover more
+//! than [`MOST_CELLS`], c is doubled until they do not, and all of the lengths above with it. Triangles longer than
+//! 500 m are clipped to the bounds of the others; those around them are compared with each other, in a second grid.
 
 use std::collections::HashMap;
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use nalgebra::Point2;
 
-use super::heights::{self, rasterize};
-use crate::geometry::TriangleMesh;
+use super::heights::{self, EVERYWHERE, Window, is_artefact, is_large, rasterize};
+use crate::geometry::{Aabb, TriangleMesh};
+use crate::memory::{MemoryBudget, MemoryError};
 
-/// Edge of a cell [m].
+/// Smallest edge of a cell [m], of which the other lengths are multiples.
 const CELL_M: f64 = 0.5;
+
+/// Largest number of cells that the near-horizontal triangles cover: 1 km² of the smallest.
+const MOST_CELLS: f64 = (1_u64 << 22) as f64;
+
+/// Largest number of rows of cells of all triangles, which are looked at one by one.
+const MOST_ROWS: f64 = (1_u64 << 28) as f64;
+
+/// Memory per cell and surface: samples, surfaces, hash table, components [bytes].
+const CELL_BYTES: f64 = 100.0;
 
 /// Cosine of the steepest slope of ground.
 const LEVEL_COSINE: f32 = 0.866;
@@ -35,7 +49,7 @@ const STEP_M: f32 = 0.15;
 const STEP_PER_M: f32 = 0.25;
 
 /// Smallest ground [cells], 4 m².
-const MIN_CELLS: usize = 16;
+const MIN_CELLS: u32 = 16;
 
 /// Radius around the rim in which another surface counts as below [cells].
 const RIM_CELLS: i32 = 3;
@@ -55,6 +69,10 @@ struct CellSurface {
 
 /// The ground of a mesh or a cloud.
 pub(crate) struct GroundSurface {
+    /// Edge of a cell [m].
+    cell_m: f64,
+    /// The ground of large triangles outside the bounds of the others.
+    outside: Option<Box<Self>>,
     /// All near-horizontal surfaces, ordered by cell and height.
     surfaces: Vec<CellSurface>,
     /// First surface of each cell and the number of its surfaces.
@@ -64,21 +82,65 @@ pub(crate) struct GroundSurface {
 
 impl GroundSurface {
     /// Detects the ground of a mesh.
-    pub fn of_mesh(mesh: &TriangleMesh) -> Self {
+    ///
+    /// # Errors
+    /// The cells would take more memory than the budget.
+    pub fn of_mesh(mesh: &TriangleMesh, budget: MemoryBudget) -> Result<Self, MemoryError> {
+        let triangles = 0..mesh.triangles.len();
+        let small = (triangles.clone())
+            .filter(|&triangle| !is_large(mesh.corners(triangle).map(Vec3::as_dvec3)));
+        let bounds = Aabb::from_points(small.flat_map(|triangle| mesh.corners(triangle)));
+        let is_outside = |triangle| {
+            let corners = mesh.corners(triangle);
+            is_large(corners.map(Vec3::as_dvec3)) && !is_within(&bounds, centroid(corners))
+        };
+        let level: Vec<usize> = triangles
+            .filter(|&triangle| is_level(mesh.scaled_normal(triangle)))
+            .collect();
+        let mut ground = Self::of_triangles(mesh, &level, bounds, budget)?;
+        if !bounds.is_empty() {
+            let outside: Vec<usize> = level.into_iter().filter(|&it| is_outside(it)).collect();
+            if !outside.is_empty() {
+                let outside = Self::of_triangles(mesh, &outside, Aabb::EMPTY, budget)?;
+                ground.outside = Some(Box::new(outside));
+            }
+        }
+        Ok(ground)
+    }
+
+    /// Detects the ground of near-horizontal triangles within bounds, everywhere if these are empty.
+    fn of_triangles(
+        mesh: &TriangleMesh,
+        triangles: &[usize],
+        bounds: Aabb,
+        budget: MemoryBudget,
+    ) -> Result<Self, MemoryError> {
+        let corners = |triangle: usize| mesh.corners(triangle).map(Vec3::as_dvec3);
+        let sizes = (triangles.iter()).map(|&triangle| size_within(corners(triangle), &bounds));
+        let (area_m2, length_m) = sizes.fold((0.0, 0.0), |sum, it| (sum.0 + it.0, sum.1 + it.1));
+        let mut cell_m = CELL_M;
+        while area_m2 > MOST_CELLS * cell_m * cell_m || length_m > MOST_ROWS * cell_m {
+            cell_m *= 2.0;
+        }
+        budget.require(
+            "the ground of the map",
+            CELL_BYTES * area_m2 / (cell_m * cell_m),
+            "cut the map into parts",
+        )?;
+        let window = window_of(&bounds, cell_m);
         let mut samples = Vec::new();
-        for triangle in 0..mesh.triangles.len() {
-            if is_level(mesh.scaled_normal(triangle)) {
-                let corners = mesh.corners(triangle);
-                let mut add = |(column, row): (i64, i64), height_m: f64| {
-                    samples.push((column as i32, row as i32, height_m as f32));
-                };
-                rasterize(corners.map(|corner| corner.as_dvec3()), CELL_M, &mut add);
-                let center = centroid(corners);
-                let (column, row) = cell_of(center);
+        for &triangle in triangles {
+            let mut add = |(column, row): (i64, i64), height_m: f64| {
+                samples.push((column as i32, row as i32, height_m as f32));
+            };
+            rasterize(corners(triangle), cell_m, window, &mut add);
+            let center = centroid(mesh.corners(triangle));
+            if !is_large(corners(triangle)) || bounds.is_empty() || is_within(&bounds, center) {
+                let (column, row) = cell_of(center, cell_m);
                 samples.push((column, row, center.z));
             }
         }
-        Self::of_samples(samples)
+        Ok(Self::of_samples(samples, cell_m))
     }
 
     /// Detects the ground of points with normals.
@@ -88,15 +150,18 @@ impl GroundSurface {
             .zip(normals)
             .filter(|(_, normal)| is_level(**normal));
         let sample = |(point, _): (&Vec3, _)| {
-            let (column, row) = cell_of(*point);
+            let (column, row) = cell_of(*point, CELL_M);
             (column, row, point.z)
         };
-        Self::of_samples(level.map(sample).collect())
+        Self::of_samples(level.map(sample).collect(), CELL_M)
     }
 
     /// Whether a triangle of the mesh is ground.
     pub fn has_triangle(&self, mesh: &TriangleMesh, triangle: usize) -> bool {
-        is_level(mesh.scaled_normal(triangle)) && self.contains(centroid(mesh.corners(triangle)))
+        let center = centroid(mesh.corners(triangle));
+        let is_in = |ground: &Self| ground.contains(center);
+        is_level(mesh.scaled_normal(triangle))
+            && (is_in(self) || self.outside.as_deref().is_some_and(is_in))
     }
 
     /// Whether a point with its normal is ground.
@@ -111,20 +176,26 @@ impl GroundSurface {
             .iter()
             .filter(|&&is_ground| is_ground)
             .count();
-        cells as f64 * CELL_M * CELL_M
+        let outside_m2 = self.outside.as_ref().map_or(0.0, |it| it.area_m2());
+        outside_m2.max(cells as f64 * self.cell_m * self.cell_m)
+    }
+
+    /// Area of the smallest ground that is found [m²].
+    pub fn smallest_m2(&self) -> f64 {
+        f64::from(MIN_CELLS) * self.cell_m * self.cell_m
     }
 
     /// Whether a position is on a surface of the ground.
     fn contains(&self, position: Vec3) -> bool {
-        let (column, row) = cell_of(position);
+        let (column, row) = cell_of(position, self.cell_m);
         self.in_cell(column, row).any(|index| {
             let surface = &self.surfaces[index];
             self.is_ground[index] && (surface.low_m..=surface.high_m).contains(&position.z)
         })
     }
 
-    fn of_samples(samples: Vec<(i32, i32, f32)>) -> Self {
-        let surfaces = surfaces_of(samples);
+    fn of_samples(samples: Vec<(i32, i32, f32)>, cell_m: f64) -> Self {
+        let surfaces = surfaces_of(samples, scale_of(cell_m) * GAP_M);
         let mut cells = HashMap::with_capacity(surfaces.len());
         for (index, surface) in surfaces.iter().enumerate() {
             cells
@@ -133,6 +204,8 @@ impl GroundSurface {
                 .1 += 1;
         }
         let mut ground = Self {
+            cell_m,
+            outside: None,
             is_ground: vec![false; surfaces.len()],
             surfaces,
             cells,
@@ -153,8 +226,9 @@ impl GroundSurface {
         let mut parents: Vec<u32> = (0..self.surfaces.len() as u32).collect();
         for (index, surface) in self.surfaces.iter().enumerate() {
             for (columns, rows) in cells_within(LINK_CELLS).filter(|&offset| offset > (0, 0)) {
-                let distance_m = CELL_M as f32 * ((columns * columns + rows * rows) as f32).sqrt();
-                let step_m = STEP_M + STEP_PER_M * distance_m;
+                let distance_m =
+                    self.cell_m as f32 * ((columns * columns + rows * rows) as f32).sqrt();
+                let step_m = scale_of(self.cell_m) * STEP_M + STEP_PER_M * distance_m;
                 for other in self.in_cell(surface.column + columns, surface.row + rows) {
                     let neighbour = &self.surfaces[other];
                     let apart_m =
@@ -176,7 +250,8 @@ impl GroundSurface {
 
     /// Whether the component of each surface is large enough and does not stand above others.
     fn lowest(&self, components: &[u32]) -> Vec<bool> {
-        let mut cells = vec![0_usize; components.len()];
+        let below_m = scale_of(self.cell_m) * BELOW_M;
+        let mut cells = vec![0_u32; components.len()];
         let (mut rim, mut above) = (cells.clone(), cells.clone());
         for &component in components {
             cells[component as usize] += 1;
@@ -196,11 +271,11 @@ impl GroundSurface {
                 others.any(|other| {
                     !is_own(other)
                         && cells[components[other] as usize] >= MIN_CELLS
-                        && self.surfaces[other].high_m < surface.low_m - BELOW_M
+                        && self.surfaces[other].high_m < surface.low_m - below_m
                 })
             };
             rim[own as usize] += 1;
-            above[own as usize] += usize::from(cells_within(RIM_CELLS).any(has_below));
+            above[own as usize] += u32::from(cells_within(RIM_CELLS).any(has_below));
         }
         let is_ground = |&component: &u32| {
             let component = component as usize;
@@ -211,13 +286,13 @@ impl GroundSurface {
 }
 
 /// Clusters samples (column, row, height) of each cell.
-fn surfaces_of(mut samples: Vec<(i32, i32, f32)>) -> Vec<CellSurface> {
+fn surfaces_of(mut samples: Vec<(i32, i32, f32)>, gap_m: f32) -> Vec<CellSurface> {
     samples.sort_unstable_by(|a, b| (a.0, a.1).cmp(&(b.0, b.1)).then(a.2.total_cmp(&b.2)));
     let mut surfaces: Vec<CellSurface> = Vec::new();
     for (column, row, height_m) in samples {
         match surfaces.last_mut() {
             Some(last)
-                if (last.column, last.row) == (column, row) && height_m - last.high_m < GAP_M =>
+                if (last.column, last.row) == (column, row) && height_m - last.high_m < gap_m =>
             {
                 last.high_m = height_m;
             }
@@ -247,10 +322,48 @@ pub(crate) fn root(parents: &mut [u32], mut index: u32) -> u32 {
     index
 }
 
-fn cell_of(position: Vec3) -> (i32, i32) {
+fn cell_of(position: Vec3, cell_m: f64) -> (i32, i32) {
     let [x, y, _] = position.to_array().map(f64::from);
-    let (column, row) = heights::cell_of(Point2::new(x, y), CELL_M);
+    let (column, row) = heights::cell_of(Point2::new(x, y), cell_m);
     (column as i32, row as i32)
+}
+
+/// The cells of bounds; all if these are empty.
+fn window_of(bounds: &Aabb, cell_m: f64) -> Window {
+    if bounds.is_empty() {
+        return EVERYWHERE;
+    }
+    [bounds.min, bounds.max].map(|corner| {
+        let [x, y, _] = corner.to_array().map(f64::from);
+        heights::cell_of(Point2::new(x, y), cell_m)
+    })
+}
+
+/// Upper bound of the area of a triangle within bounds seen from above [m²], and its extent along y there [m].
+fn size_within(corners: [DVec3; 3], bounds: &Aabb) -> (f64, f64) {
+    if is_artefact(corners) {
+        return (0.0, 0.0);
+    }
+    let [a, b, c] = corners;
+    let (mut min, mut max) = (a.min(b).min(c), a.max(b).max(c));
+    if !bounds.is_empty() {
+        min = min.max(bounds.min.as_dvec3());
+        max = max.min(bounds.max.as_dvec3());
+    }
+    let size = (max - min).truncate().max(glam::DVec2::ZERO);
+    let area_m2 = 0.5 * (b - a).truncate().perp_dot((c - a).truncate()).abs();
+    (area_m2.min(size.x * size.y), size.y)
+}
+
+/// Whether a position is within bounds, seen from above.
+fn is_within(bounds: &Aabb, position: Vec3) -> bool {
+    let is_inside = position.cmpge(bounds.min) & position.cmple(bounds.max);
+    is_inside.x && is_inside.y
+}
+
+/// The edge of cells as a multiple of the smallest.
+fn scale_of(cell_m: f64) -> f32 {
+    (cell_m / CELL_M) as f32
 }
 
 fn is_level(normal: Vec3) -> bool {
@@ -290,7 +403,7 @@ mod tests {
         for &(x, y, z) in sheets {
             sheet(&mut mesh, x, y, z);
         }
-        let ground = GroundSurface::of_mesh(&mesh);
+        let ground = GroundSurface::of_mesh(&mesh, MemoryBudget::default()).unwrap();
         let shares = (0..sheets.len()).map(|sheet| {
             let triangles = 16 * sheet..16 * (sheet + 1);
             let count = triangles.filter(|&t| ground.has_triangle(&mesh, t)).count();
@@ -320,6 +433,80 @@ mod tests {
         let down = ([10.0, 70.0], [-4.0, 4.0], [6.0, 0.0]);
         let cross = ([-70.0, 70.0], [4.0, 40.0], [0.0, 0.0]);
         assert_eq!(ground_of(&[below, up, deck, down, cross]), [true; 5]);
+    }
+
+    /// Whether each triangle of rectangles of two triangles, and boxes on z = 0, is ground.
+    fn ground_of_rectangles(rectangles: &[([f32; 4], f32)]) -> (Vec<bool>, GroundSurface) {
+        let mut mesh = TriangleMesh::default();
+        for &([x0, y0, x1, y1], z) in rectangles {
+            let first = mesh.vertices.len() as u32;
+            let corners = [[x0, y0], [x1, y0], [x1, y1], [x0, y1]];
+            (mesh.vertices).extend(corners.map(|[x, y]| Vec3::new(x, y, z)));
+            (mesh.triangles).extend([[0, 1, 2], [0, 2, 3]].map(|t| t.map(|v| first + v)));
+        }
+        let ground = GroundSurface::of_mesh(&mesh, MemoryBudget::default()).unwrap();
+        let triangles = 0..mesh.triangles.len();
+        let is_ground = triangles.map(|triangle| ground.has_triangle(&mesh, triangle));
+        (is_ground.collect(), ground)
+    }
+
+    #[test]
+    fn a_floor_of_two_large_triangles_is_ground_and_roofs_on_it_are_not() {
+        let roof = ([200.0, 200.0, 220.0, 210.0], 6.0);
+        for side in [600.0, 3e3, 1e5] {
+            let floor = ([-side, -side, side, side], 0.0);
+            let (alone, ground) = ground_of_rectangles(&[floor]);
+            assert_eq!(alone, [true; 2], "{side}");
+            let expected_m2 = 4.0 * f64::from(side).powi(2);
+            assert!((ground.area_m2() / expected_m2 - 1.0).abs() < 0.05);
+            let (found, ground) = ground_of_rectangles(&[floor, roof]);
+            assert_eq!(found, [true, true, false, false], "{side}");
+            assert_eq!(ground.cell_m, CELL_M);
+        }
+    }
+
+    #[test]
+    fn an_outlier_neither_is_ground_nor_makes_the_cells_of_the_others_larger() {
+        let mut mesh = TriangleMesh::default();
+        sheet(&mut mesh, [0.0, 40.0], [-5.0, 5.0], [0.0, 0.0]);
+        let (road, first) = (mesh.triangles.len(), mesh.vertices.len() as u32);
+        (mesh.vertices).extend([Vec3::ZERO, Vec3::X, Vec3::new(1e7, -1e7, 3.0)]);
+        mesh.triangles.push([first, first + 1, first + 2]);
+        let ground = GroundSurface::of_mesh(&mesh, MemoryBudget::default()).unwrap();
+        assert_eq!(ground.cell_m, CELL_M);
+        assert!((0..road).all(|triangle| ground.has_triangle(&mesh, triangle)));
+        assert!((ground.area_m2() - 400.0).abs() < 20.0);
+    }
+
+    #[test]
+    fn a_street_in_millimetres_has_the_ground_of_one_in_metres_within_a_budget() {
+        let sheets = [
+            ([0.0, 116.0], [-10.0, 10.0], [0.0, 0.0]),
+            ([10.0, 30.0], [-8.0, 8.0], [7.0, 7.0]),
+        ];
+        let scaled = |scale: f32| {
+            let mut mesh = TriangleMesh::default();
+            for (x, y, z) in sheets {
+                let [x, y, z] = [x, y, z].map(|ends| ends.map(|end| scale * end));
+                sheet(&mut mesh, x, y, z);
+            }
+            mesh
+        };
+        let budget = MemoryBudget { bytes: 500 << 20 };
+        for scale in [1.0, 1000.0] {
+            let mesh = scaled(scale);
+            let ground = GroundSurface::of_mesh(&mesh, budget).unwrap();
+            let triangles = 0..mesh.triangles.len();
+            let found: Vec<bool> = triangles.map(|it| ground.has_triangle(&mesh, it)).collect();
+            assert_eq!(found, [[true; 16], [false; 16]].concat(), "{scale}");
+            assert!(ground.surfaces.len() as f64 <= MOST_CELLS);
+        }
+        let error = GroundSurface::of_mesh(&scaled(1000.0), MemoryBudget { bytes: 10 << 20 });
+        let error = error.err().unwrap().to_string();
+        assert!(
+            error.starts_with("the ground of the map would need"),
+            "{error}"
+        );
     }
 
     #[test]

@@ -15,7 +15,7 @@ use nalgebra::Point2;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
-use crate::geometry::{Aabb, Pose2, Pose3, TriangleMesh, Vec3};
+use crate::geometry::{Aabb, Pose2, Pose3, TriangleMesh};
 use crate::map::mesh_view::{MeshView, part_on_lattice};
 
 /// Division of the map into tiles.
@@ -54,14 +54,6 @@ impl TileIndex {
         let columns =
             move |row| (first.column..=last.column).map(move |column| Self { column, row });
         (first.row..=last.row).flat_map(columns)
-    }
-
-    /// The tile `count` tiles farther along x and y.
-    fn plus(self, count: i64) -> Self {
-        Self {
-            column: self.column + count,
-            row: self.row + count,
-        }
     }
 
     fn min(self, other: Self) -> Self {
@@ -139,19 +131,38 @@ impl TileGrid {
     }
 
     /// Covers a mesh without a mapping drive, given by the boxes of the triangles of its tiles; the tiles that
-    /// these reach are valid.
+    /// these reach are valid. Where they reach very many, as in a map in millimetres, the tiles of the grid are larger.
     pub(crate) fn of_boxes(
         boxes: impl IntoIterator<Item = (TileIndex, Aabb)>,
         side_m: f64,
     ) -> Self {
         /// A triangle that reaches farther is an artefact [tiles].
-        const REACH: i64 = 50;
+        const REACH: f64 = 50.0;
+        const MOST_TILES: f64 = (1 << 22) as f64;
+        let clipped = |(tile, bounds): (TileIndex, Aabb)| {
+            let (middle, reach_m) = (center(tile, side_m), REACH * side_m);
+            [bounds.min, bounds.max].map(|corner| {
+                let clip = |along: f32, middle: f64| {
+                    f64::from(along).clamp(middle - reach_m, middle + reach_m)
+                };
+                [clip(corner.x, middle.x), clip(corner.y, middle.y)]
+            })
+        };
+        let boxes: Vec<_> = boxes.into_iter().map(clipped).collect();
+        let reached = |side_m: f64| {
+            let ends = boxes.iter().copied();
+            ends.map(move |ends| ends.map(|[x, y]| TileIndex::of(x, y, side_m)))
+        };
+        let count = |[first, last]: [TileIndex; 2]| {
+            (last.column - first.column + 1) as f64 * (last.row - first.row + 1) as f64
+        };
+        let mut side_m = side_m;
+        while reached(side_m).map(count).sum::<f64>() > MOST_TILES.max(4.0 * boxes.len() as f64) {
+            side_m *= 2.0;
+        }
         let mut valid = HashSet::new();
         let mut range: Option<[TileIndex; 2]> = None;
-        for (tile, bounds) in boxes {
-            let at = |corner: Vec3| TileIndex::of(corner.x.into(), corner.y.into(), side_m);
-            let first = at(bounds.min).max(tile.plus(-REACH));
-            let last = at(bounds.max).min(tile.plus(REACH));
+        for [first, last] in reached(side_m) {
             valid.extend(TileIndex::range(first, last));
             let [least, most] = range.unwrap_or([first, last]);
             range = Some([least.min(first), most.max(last)]);
@@ -240,6 +251,7 @@ pub(crate) fn triangles_of_tiles(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::Vec3;
 
     fn drive(positions: &[(f64, f64)]) -> Vec<Pose3> {
         positions
@@ -362,5 +374,24 @@ mod tests {
         let is_valid = |x: f64, y: f64| grid.valid_tile_of(&Pose2::translation(x, y)).is_some();
         assert!(is_valid(-130.0, 10.0) && is_valid(4900.0, 70.0));
         assert!(!is_valid(-160.0, 10.0) && !is_valid(0.0, -60.0) && !is_valid(1e6, 0.0));
+    }
+
+    #[test]
+    fn boxes_that_reach_very_many_tiles_have_larger_ones() {
+        let boxes = (0..2000).map(|i| {
+            let min = Vec3::new(10_000.0 * i as f32, 0.0, 0.0);
+            let max = min + Vec3::new(9_000.0, 9_000.0, 0.0);
+            let middle = 0.5 * (min + max);
+            let tile = TileIndex::of(middle.x.into(), middle.y.into(), 100.0);
+            (tile, Aabb { min, max })
+        });
+        let grid = TileGrid::of_boxes(boxes, 100.0);
+        assert!(
+            grid.side_m > 100.0 && grid.len() <= 1 << 22,
+            "{}",
+            grid.side_m
+        );
+        let is_valid = |x: f64, y: f64| grid.valid_tile_of(&Pose2::translation(x, y)).is_some();
+        assert!(is_valid(19_995_000.0, 8_000.0) && !is_valid(0.0, 20_000.0));
     }
 }

@@ -23,7 +23,8 @@ use crate::map::build::plan::origin_near;
 use crate::map::build::vertex_ground::{GROUND, REST};
 use crate::map::files::mapping_path::MappingPath;
 use crate::map::ground::heights::{
-    Cell, ChunkSource, GROUND_CELL_M, chunks_of_triangles, chunks_reached, middle_of_chunk,
+    Cell, ChunkSource, GROUND_CELL_M, chunk_at, chunks_of_triangles, chunks_reached,
+    middle_of_chunk, window_of,
 };
 use crate::map::mesh_view::{MeshView, part_on_lattice};
 use crate::raycasting::{Scene, SceneSource, Tile, TileError, TileSource};
@@ -222,8 +223,10 @@ impl TileStore {
             let part = part_on_lattice(mesh, triangles, origin);
             let ground = ground_of.get(tile).map_or(&[][..], Vec::as_slice).iter();
             let corners = ground.map(|&triangle| mesh.corners(triangle as usize).map(on_lattice));
-            let chunks: Vec<(Cell, SharedBytes)> = chunks_of_triangles(corners, GROUND_CELL_M)
-                .into_iter()
+            let ends = [-0.5, 0.5].map(|side| middle + DVec3::splat(side * side_m));
+            let [first, last] = ends.map(|end| chunk_at(end, GROUND_CELL_M));
+            let chunks = chunks_of_triangles(corners, GROUND_CELL_M, window_of(first, last));
+            let chunks: Vec<(Cell, SharedBytes)> = (chunks.into_iter())
                 .filter(|(chunk, _)| tile_of_chunk(*chunk, side_m) == *tile)
                 .collect();
             let of_part = |triangle: usize| is_ground(triangles[triangle] as usize);
