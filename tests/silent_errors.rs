@@ -145,7 +145,7 @@ fn mirrored_poses_of_a_drive_with_a_bend_are_an_error_that_names_what_fits() {
     let mirrored = |row: &str| {
         let numbers = row.split_whitespace().enumerate();
         let sign = |i: usize| {
-            if (i / 4 == 0) == (i % 4 == 0) {
+            if (i / 4 == 0) == i.is_multiple_of(4) {
                 1.0
             } else {
                 -1.0
