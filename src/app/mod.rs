@@ -19,12 +19,24 @@ use std::path::PathBuf;
 use clap::Parser as _;
 
 use cli::Cli;
-use run::{Context, failure, output};
+use run::{Context, arguments, failure, output};
 
 /// The program: parses a command line, whose first argument is the name of the program, starts logging, runs the
-/// command, and reports its error; returns the exit code. Wrong usage and requests for help end the process.
+/// command, and reports its error; returns the exit code. Requests for help end the process.
 pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
-    let cli = Cli::parse_from(arguments);
+    let arguments: Vec<OsString> = arguments.into_iter().collect();
+    if let Err(error) = arguments::require_text(&arguments) {
+        failure::report(&error);
+        return 1;
+    }
+    let cli = match Cli::try_parse_from(arguments) {
+        Ok(cli) => cli,
+        Err(error) if error.use_stderr() => {
+            failure::report_usage(&error);
+            return 2;
+        }
+        Err(help) => help.exit(),
+    };
     let run = || {
         let context = Context::new(cli.level(), cli.command.machine())?;
         output::print(&cli.command.run(&context)?.in_form(cli.form()))

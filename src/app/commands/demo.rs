@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 
 use super::simulate::{self, Existing};
 use super::{build_map, localize, refine};
+use crate::app::run::arguments::yaml;
 use crate::app::run::{Context, Form, MachineArgs, Printed};
 use crate::app::settings::{self, BuildMapConfig, LocalizationConfig, RefinementConfig};
 use crate::configuration::Configuration;
@@ -115,8 +116,7 @@ fn configured<T: Configuration>(drive: &Path, keys: &[(&str, Value)]) -> Result<
         ("output.force", json!(true)),
     ];
     let keys = keys.iter().chain(&keys_of_drive);
-    // JSON is YAML.
-    let settings = keys.map(|(key, value)| ((*key).to_owned(), value.to_string()));
+    let settings = keys.map(|(key, value)| ((*key).to_owned(), yaml(value)));
     let settings: Vec<(String, String)> = settings.collect();
     Ok(settings::with_settings(T::default(), &settings)?)
 }

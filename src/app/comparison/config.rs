@@ -7,6 +7,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
 
+use crate::app::run::arguments::yaml;
 use crate::app::settings::{CommandConfig, require_path};
 use crate::validation::{InvalidValue, Validate, at_least_one, require};
 
@@ -151,8 +152,7 @@ pub fn settings(overrides: &Overrides) -> Vec<(String, String)> {
                 .map(|(inner, value)| (format!("{key}.{inner}"), value.clone()));
             settings(&block.collect())
         }
-        // JSON is YAML.
-        value => vec![(key.clone(), value.to_string())],
+        value => vec![(key.clone(), yaml(value))],
     });
     pairs.collect()
 }

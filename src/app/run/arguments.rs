@@ -2,13 +2,16 @@
 //! field that serializes under the name of that key.
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
+use anyhow::ensure;
 use clap::Args;
 use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::context::{Context, MachineArgs};
+use super::visible::visible;
 use crate::app::settings::{self, CommandConfig};
 
 /// Configuration and machine.
@@ -92,11 +95,28 @@ pub fn with_flags<T: CommandConfig>(
     let mut settings = source.settings.clone();
     for (key, value) in flags {
         if settings::has_key::<T>(&key)? {
-            // JSON is YAML.
-            settings.push((key, value.to_string()));
+            settings.push((key, yaml(&value)));
         }
     }
     Ok(settings)
+}
+
+/// A value as YAML that reads back as the same, also where a name has control characters: JSON with escapes for them.
+pub fn yaml(value: &Value) -> String {
+    visible(&value.to_string()).into_owned()
+}
+
+/// Requires arguments that a configuration can hold: every run writes its own with the names that it was given.
+pub fn require_text(arguments: &[OsString]) -> anyhow::Result<()> {
+    /// What is no character, in Unicode and YAML.
+    const NONE: [char; 2] = ['\u{fffe}', '\u{ffff}'];
+    for argument in arguments.iter().skip(1) {
+        ensure!(
+            argument.to_str().is_some_and(|text| !text.contains(NONE)),
+            "the argument {argument:?} is not text in UTF-8, so no configuration of a run can hold it; rename the file or folder, or give a link to it that has such a name"
+        );
+    }
+    Ok(())
 }
 
 /// Parses finite numbers that are separated by commas.

@@ -4,6 +4,7 @@ use std::io::Write as _;
 
 use super::interrupt::Interrupted;
 use super::remedy::remedies;
+use super::visible::{visible, visible_in_line};
 
 /// Prints an error with its causes and remedies on standard error.
 pub fn report(error: &anyhow::Error) {
@@ -16,6 +17,13 @@ pub fn report(error: &anyhow::Error) {
     let _ = std::io::stderr().write_all(text.as_bytes());
 }
 
+/// Prints an error of usage on standard error; names in it are as the user gave them.
+pub fn report_usage(error: &clap::Error) {
+    let text = error.render().to_string();
+    // There is nowhere to report that standard error is closed.
+    let _ = std::io::stderr().write_all(visible(&text).as_bytes());
+}
+
 /// Exit code of a failed run: 130 if it was interrupted, as in shells, else 1; 2 is wrong usage.
 pub fn exit_code(error: &anyhow::Error) -> u8 {
     if error.is::<Interrupted>() { 130 } else { 1 }
@@ -26,7 +34,8 @@ pub fn format_error_chain(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
         let words = cause.to_string();
-        if text.contains(&words) {
+        let words = visible_in_line(&words);
+        if text.contains(&*words) {
             continue;
         }
         text += match (text.is_empty(), cause.is::<std::io::Error>()) {

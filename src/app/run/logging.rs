@@ -13,6 +13,7 @@ use tracing_subscriber::util::SubscriberInitExt as _;
 use tracing_subscriber::{Layer as _, fmt};
 
 use crate::app::run::progress::Progress;
+use crate::app::run::visible::visible_in_line;
 
 /// Starts logging; a second call in the same process has no effect.
 pub(crate) fn start(level: LevelFilter, progress: &Progress, log: &RunLog) {
@@ -20,6 +21,7 @@ pub(crate) fn start(level: LevelFilter, progress: &Progress, log: &RunLog) {
     let progress = progress.clone();
     let colored = progress.is_terminal();
     let shown = fmt::layer()
+        .fmt_fields(fmt::format::debug_fn(write_field))
         .with_target(detailed)
         .without_time()
         .with_ansi(colored)
@@ -27,6 +29,7 @@ pub(crate) fn start(level: LevelFilter, progress: &Progress, log: &RunLog) {
         .with_filter(filter(level));
     let log = log.clone();
     let written = fmt::layer()
+        .fmt_fields(fmt::format::debug_fn(write_field))
         .with_target(detailed)
         .without_time()
         .with_ansi(false)
@@ -38,6 +41,19 @@ pub(crate) fn start(level: LevelFilter, progress: &Progress, log: &RunLog) {
         .with(shown)
         .with(written)
         .try_init();
+}
+
+/// Writes the message of an event, or another of its fields, as a part of one line.
+fn write_field(
+    writer: &mut fmt::format::Writer<'_>,
+    field: &tracing::field::Field,
+    value: &dyn std::fmt::Debug,
+) -> std::fmt::Result {
+    let name = match field.name() {
+        "message" => String::new(),
+        name => format!(" {name}="),
+    };
+    write!(writer, "{name}{}", visible_in_line(&format!("{value:?}")))
 }
 
 /// Only errors of libraries: graphics libraries log much that is irrelevant here.

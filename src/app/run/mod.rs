@@ -12,6 +12,7 @@ pub mod output;
 pub mod progress;
 mod remedy;
 pub mod version;
+pub mod visible;
 
 pub use arguments::{ConfigArgs, RunArgs};
 pub use artefact::{CLAIMS_FILE, Claims, Lock, NPZ, Outputs, PLY};

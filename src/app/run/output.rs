@@ -8,6 +8,7 @@ use anyhow::Context as _;
 use serde::Serialize;
 use serde_json::Value;
 
+use super::visible::{visible, visible_in_line};
 use crate::app::settings::to_yaml;
 use crate::files::write_atomically;
 
@@ -68,6 +69,7 @@ impl Printed {
         const MAIN: usize = 12;
         let lines = |rows: &[(&str, String)]| -> String {
             let line = |(name, value): &(&str, String)| {
+                let value = visible_in_line(value);
                 if value.starts_with(char::is_alphabetic) {
                     format!("{name:<24} {value}\n")
                 } else {
@@ -140,11 +142,11 @@ pub fn remove_if_exists(path: &Path) -> anyhow::Result<()> {
     }
 }
 
-/// Prints a text to standard output; a closed pipe is not an error.
+/// Prints a text to standard output, with control characters as escapes; a closed pipe is not an error.
 pub fn print(text: &str) -> anyhow::Result<()> {
     let mut stdout = io::stdout().lock();
     match stdout
-        .write_all(text.as_bytes())
+        .write_all(visible(text).as_bytes())
         .and_then(|()| stdout.flush())
     {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {

@@ -9,6 +9,8 @@ use std::time::Duration;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle};
 use tracing::level_filters::LevelFilter;
 
+use super::visible::visible_in_line;
+
 /// Time between two lines without a terminal.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
 
@@ -53,16 +55,16 @@ impl Progress {
     /// Starts a task of `total` steps, which are counted by [`Task::advance`]; it ends when it is
     /// dropped.
     pub fn task(&self, name: &str, total: usize) -> Arc<Task> {
-        let total = Some(PARTS * total as u64);
+        let (name, total) = (visible_in_line(name), Some(PARTS * total as u64));
         let mut bar = ProgressBar::with_draw_target(total, ProgressDrawTarget::hidden());
         if let Self::Bars(bars) = self {
             bar = bars.add(bar);
             bar.set_style(style());
-            bar.set_prefix(name.to_owned());
+            bar.set_prefix(name.to_string());
             bar.enable_steady_tick(Duration::from_millis(200));
         }
         Arc::new(Task {
-            name: name.to_owned(),
+            name: name.into_owned(),
             bar,
             last_line_ms: matches!(self, Self::Lines).then(AtomicU64::default),
         })
@@ -107,7 +109,7 @@ impl Task {
 
     /// Shows a short text next to the bar, such as the current error.
     pub fn note(&self, text: &str) {
-        self.bar.set_message(text.to_owned());
+        self.bar.set_message(visible_in_line(text).into_owned());
     }
 
     /// Writes a line if enough time has passed since the last one; only one of many threads does.

@@ -63,6 +63,7 @@ fn a_written_configuration_loads_to_an_equal_one() {
         "- a: b # c",
         "it's \"q\"",
         "a\nb",
+        "\u{1b}]0;t\u{7}\r\u{7f}\u{9b}\u{85}",
     ] {
         let mut config = LocalizationConfig {
             motion: MotionSourceConfig {

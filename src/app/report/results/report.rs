@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::rows::{MetricRow, Value, length, metric_rows, metrics, spatial_rows};
 use super::run_summary::RunSummary;
+use crate::app::run::visible::visible_in_line;
 use crate::evaluation::{RangeMclErrors, SpatialMetrics, TrajectoryMetrics};
 
 /// The most important rows of every kind of report, of which each has at most twelve.
@@ -222,7 +223,7 @@ impl Report {
 
     fn about_lines(&self, prefix: &str) -> String {
         (self.about.iter())
-            .map(|(name, value)| format!("{prefix}{name}: {value}\n"))
+            .map(|(name, value)| format!("{prefix}{name}: {}\n", visible_in_line(value)))
             .collect()
     }
 }
