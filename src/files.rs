@@ -2,6 +2,9 @@
 //!
 //! The temporary file of `map.ply` is `.fpmcl-map.ply-XXXXXX.part` in the same folder. It is locked
 //! while it is written, so that one that a killed process left is known by being unlocked.
+//!
+//! Nothing is written below a claimed folder once its path leads elsewhere, such as through a link that
+//! replaced the folder while the program ran.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
@@ -12,6 +15,16 @@ use tempfile::{Builder, NamedTempFile};
 
 /// Temporary files of writes that are under way.
 static UNFINISHED: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
+
+/// Claimed folders and what they were when they were claimed.
+static CLAIMED: Mutex<Vec<(PathBuf, Identity)>> = Mutex::new(Vec::new());
+
+/// What tells a folder from another at the same path: device and inode.
+#[cfg(unix)]
+type Identity = (u64, u64);
+/// What tells a folder from another at the same path: the path without links.
+#[cfg(not(unix))]
+type Identity = PathBuf;
 
 const PREFIX: &str = ".fpmcl-";
 /// Random characters in the name of a temporary file.
@@ -24,19 +37,94 @@ pub fn write_atomically<T, E: From<io::Error>>(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<&mut File>) -> Result<T, E>,
 ) -> Result<T, E> {
-    let (mut temporary, _unfinished) = {
-        let mut unfinished = unfinished();
-        let temporary = temporary_next_to(path)?;
-        unfinished.push(temporary.path().to_owned());
-        let entry = Unfinished(temporary.path().to_owned());
-        (temporary, entry)
-    };
-    let mut writer = BufWriter::new(temporary.as_file_mut());
+    let mut file = AtomicFile::create(path)?;
+    let mut writer = BufWriter::new(file.temporary.as_file_mut());
     let outcome = write(&mut writer)?;
     writer.flush()?;
     drop(writer);
-    temporary.persist(path).map_err(|failed| failed.error)?;
+    file.persist()?;
     Ok(outcome)
+}
+
+/// A temporary file that becomes the file at a path once it is complete; dropped, it is removed.
+pub struct AtomicFile {
+    path: PathBuf,
+    temporary: NamedTempFile,
+    _unfinished: Unfinished,
+}
+
+impl AtomicFile {
+    /// Creates the temporary file in the folder of `path`, which must exist.
+    pub fn create(path: &Path) -> io::Result<Self> {
+        check_claimed(path)?;
+        let mut unfinished = unfinished();
+        let temporary = temporary_next_to(path)?;
+        unfinished.push(temporary.path().to_owned());
+        Ok(Self {
+            path: path.to_owned(),
+            _unfinished: Unfinished(temporary.path().to_owned()),
+            temporary,
+        })
+    }
+
+    /// The temporary file.
+    pub fn file(&self) -> &File {
+        self.temporary.as_file()
+    }
+
+    /// Renames the temporary file to the path.
+    pub fn persist(self) -> io::Result<()> {
+        check_claimed(&self.path)?;
+        let persisted = self.temporary.persist(&self.path);
+        persisted.map(drop).map_err(|failed| failed.error)
+    }
+}
+
+/// Remembers which folder a path is now; [`check_claimed`] compares.
+pub fn claim_folder(folder: &Path) -> io::Result<()> {
+    let found = identity(folder)?;
+    let mut claimed = lock(&CLAIMED);
+    claimed.retain(|(path, _)| path != folder);
+    claimed.push((folder.to_owned(), found));
+    Ok(())
+}
+
+/// An error if a claimed folder above `path` was replaced, or a folder between them is a link.
+pub fn check_claimed(path: &Path) -> io::Result<()> {
+    for (folder, found) in lock(&CLAIMED).iter() {
+        let Ok(below) = folder_of(path).strip_prefix(folder) else {
+            continue;
+        };
+        if identity(folder)? != *found {
+            return Err(replaced(folder));
+        }
+        for inner in below.ancestors().filter(|it| !it.as_os_str().is_empty()) {
+            let inner = folder.join(inner);
+            if fs::symlink_metadata(&inner).is_ok_and(|found| found.is_symlink()) {
+                return Err(replaced(&inner));
+            }
+        }
+    }
+    Ok(())
+}
+
+fn replaced(folder: &Path) -> io::Error {
+    io::Error::other(format!(
+        "the folder {} was replaced while the program ran; nothing is written there",
+        folder.display()
+    ))
+}
+
+#[cfg(unix)]
+fn identity(folder: &Path) -> io::Result<Identity> {
+    use std::os::unix::fs::MetadataExt as _;
+    let found = fs::metadata(folder)?;
+    Ok((found.dev(), found.ino()))
+}
+
+#[cfg(not(unix))]
+fn identity(folder: &Path) -> io::Result<Identity> {
+    folder.canonicalize()
 }
 
 /// Removes the temporary files of all writes that are under way, and lets none finish; for the moment
@@ -52,7 +140,11 @@ pub fn abandon_writes() {
 }
 
 fn unfinished() -> MutexGuard<'static, Vec<PathBuf>> {
-    UNFINISHED.lock().unwrap_or_else(PoisonError::into_inner)
+    lock(&UNFINISHED)
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Entry of a temporary file among the unfinished ones.
@@ -161,6 +253,41 @@ mod tests {
             write(&path, text).unwrap();
         }
         assert_eq!(fs::read_to_string(&path).unwrap(), "new");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn nothing_is_written_through_a_link_that_replaced_a_claimed_folder() {
+        use std::os::unix::fs::symlink;
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        for name in ["results/plots", "others/plots"] {
+            fs::create_dir_all(path(name)).unwrap();
+        }
+        fs::write(path("others/frames.csv"), "theirs").unwrap();
+        claim_folder(&path("results")).unwrap();
+        write(&path("results/plots/map.png"), "ours").unwrap();
+
+        fs::rename(path("results/plots"), path("results/moved")).unwrap();
+        symlink(path("others/plots"), path("results/plots")).unwrap();
+        let failed = write(&path("results/plots/map.png"), "ours").unwrap_err();
+        assert!(failed.to_string().contains("was replaced"), "{failed}");
+        assert!(!path("others/plots/map.png").exists());
+        write(&path("results/frames.csv"), "ours").unwrap();
+
+        // Replaced while the file is being written.
+        let replaced: io::Result<()> = write_atomically(&path("results/frames.csv"), |writer| {
+            fs::rename(path("results"), path("moved"))?;
+            symlink(path("others"), path("results"))?;
+            writer.write_all(b"new")
+        });
+        let failed = replaced.unwrap_err();
+        assert!(failed.to_string().contains("was replaced"), "{failed}");
+        let failed = write(&path("results/frames.csv"), "ours").unwrap_err();
+        assert!(failed.to_string().contains("was replaced"), "{failed}");
+        let read = |name: &str| fs::read_to_string(path(name)).unwrap();
+        assert_eq!(read("others/frames.csv"), "theirs");
+        assert_eq!(read("moved/frames.csv"), "ours");
     }
 
     #[test]

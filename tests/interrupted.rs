@@ -573,3 +573,25 @@ fn an_output_folder_that_vanishes_is_an_error() {
     assert!(stderr.contains("error: cannot write results/"), "{stderr}");
     assert!(!recording.path("results").exists());
 }
+
+#[test]
+fn a_link_that_replaces_the_folder_of_a_run_is_not_followed() {
+    let recording = Recording::street(8);
+    recording.fpmcl("build-map").succeeds();
+    let scan = PipedScan::new(&recording, 7);
+    let opened = scan.opened();
+    let mut child = start(&recording, LOCALIZE);
+    let mut pipe = wait(&opened, &mut child);
+    fs::create_dir(recording.path("others")).unwrap();
+    fs::write(recording.path("others/frames.csv"), "theirs").unwrap();
+    fs::rename(recording.path("results"), recording.path("moved")).unwrap();
+    std::os::unix::fs::symlink("others", recording.path("results")).unwrap();
+    pipe.write_all(&scan.bytes).unwrap();
+    drop(pipe);
+    let mut reader = BufReader::new(child.stderr.take().unwrap());
+    let stderr = read_until(&mut reader, None);
+    assert_eq!(child.wait().unwrap().code(), Some(1), "{stderr}");
+    assert!(stderr.contains("results was replaced"), "{stderr}");
+    assert_eq!(recording.bytes("others/frames.csv"), b"theirs");
+    assert_eq!(fs::read_dir(recording.path("others")).unwrap().count(), 1);
+}

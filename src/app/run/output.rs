@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use super::visible::{visible, visible_in_line};
 use crate::app::settings::to_yaml;
-use crate::files::write_atomically;
+use crate::files::{check_claimed, write_atomically};
 
 /// Writes a file atomically.
 pub fn write_file<E: Into<anyhow::Error>>(
@@ -124,7 +124,7 @@ pub fn create_folder(folder: &Path) -> anyhow::Result<()> {
 
 /// Creates a folder in one that must exist.
 pub fn create_subfolder(folder: &Path) -> anyhow::Result<()> {
-    match fs::create_dir(folder) {
+    match check_claimed(folder).and_then(|()| fs::create_dir(folder)) {
         Err(error) if !folder.is_dir() => {
             Err(error).with_context(|| format!("cannot create {}", folder.display()))
         }
@@ -134,7 +134,7 @@ pub fn create_subfolder(folder: &Path) -> anyhow::Result<()> {
 
 /// Removes a file, if it exists.
 pub fn remove_if_exists(path: &Path) -> anyhow::Result<()> {
-    match fs::remove_file(path) {
+    match check_claimed(path).and_then(|()| fs::remove_file(path)) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
             Err(error).with_context(|| format!("cannot remove {}", path.display()))
         }

@@ -20,7 +20,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context as _, Result, bail, ensure};
 
 use crate::app::run::output;
-use crate::files::{folder_of, remove_abandoned, temporary_next_to};
+use crate::files::{check_claimed, claim_folder, folder_of, remove_abandoned, temporary_next_to};
 
 /// File of the claims in each folder.
 pub const CLAIMS_FILE: &str = ".fpmcl";
@@ -66,6 +66,7 @@ impl Outputs<'_> {
             format!("{key} is {path}, and nothing can be written there; choose another {key}")
         };
         output::create_folder(folder).with_context(context)?;
+        claim_folder(folder).with_context(context)?;
         temporary_next_to(self.main).with_context(context)?;
         for path in claims.paths(&self.names).chain([self.main.to_owned()]) {
             remove_abandoned(&path).with_context(context)?;
@@ -244,7 +245,8 @@ impl Claims {
             return Ok(());
         }
         let path = self.folder.join(CLAIMS_FILE);
-        (File::options().append(true).create(true).open(&path))
+        check_claimed(&path)
+            .and_then(|()| File::options().append(true).create(true).open(&path))
             .and_then(|mut file| file.write_all(lines.as_bytes()))
             .with_context(|| format!("cannot write {}", path.display()))
     }
