@@ -375,7 +375,7 @@ fn check_results(results: &LocalizationResults) {
     assert!([0, rows].contains(&rows_with_particles));
     assert!(results.frames.windows(2).all(|pair| pair[0] < pair[1]));
     for row in 0..rows_with_particles {
-        let particles = results.particles.frame(row);
+        let particles = results.particles.frame(row).unwrap();
         assert!(particles.len() <= results.particles.capacity());
         assert!(particles.iter().flatten().all(|number| number.is_finite()));
     }

@@ -155,7 +155,7 @@ fn a_budget_of_memory_that_does_not_suffice_is_an_error_that_names_what_needs_it
 }
 
 #[test]
-fn particles_that_exceed_the_budget_end_a_run_that_keeps_its_frames() {
+fn the_particles_of_all_frames_may_exceed_the_budget() {
     let recording = Recording::street(12);
     recording.fpmcl("build-map").succeeds();
     // 16 bytes per particle and frame: 6.4 MB per frame of 10.7 MB.
@@ -165,11 +165,7 @@ fn particles_that_exceed_the_budget_end_a_run_that_keeps_its_frames() {
         .set("observation.min_beams", "1")
         .set("observation.ray_budget", "1")
         .set("proposal.weighed_beams", "1")
-        .fails_with(&[
-            "the particles of all frames",
-            "numParticles",
-            "of 12 frames are localized",
-        ]);
+        .succeeds();
 }
 
 #[test]

@@ -149,6 +149,11 @@ pub fn write_trajectory(
 /// Writes the `.npz` file, and poses as `.npy` files for other programs.
 pub fn write_results(files: &RunFiles, results: &LocalizationResults) -> Result<()> {
     results.write(&files.result)?;
+    write_poses(files, results)
+}
+
+/// Writes poses as `.npy` files for other programs.
+pub fn write_poses(files: &RunFiles, results: &LocalizationResults) -> Result<()> {
     if let Some(truth) = &results.ground_truth {
         write_poses_npy(&files.file("ground_truth_poses.npy"), truth)?;
     }

@@ -14,7 +14,7 @@ use serde::Serialize;
 
 use self::recorder::Run;
 use self::tracking::localize;
-use self::written::{write_results, write_run};
+use self::written::{write_results, write_run, write_trajectories};
 use crate::app::report::Report;
 use crate::app::run::arguments::numbers;
 use crate::app::run::{Context, RunArgs};
@@ -59,6 +59,10 @@ pub struct LocalizeArgs {
     pub mcap: Option<PathBuf>,
 }
 
+/// Largest number of frames whose trajectories are written, too, while a signal ends the process: that
+/// must not take long.
+const MOST_FRAMES_AT_EXIT: usize = 50_000;
+
 /// Parses a start: x, y [m], heading [deg].
 fn start_pose(text: &str) -> Result<[f64; 3], &'static str> {
     let help = "give x and y in the map in metres and the heading in degrees, such as 12.5,-3,90";
@@ -84,10 +88,14 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         || {
             let mut run = recorded();
             write_results(&opened, &mut run)?;
+            if run.results.len() <= MOST_FRAMES_AT_EXIT {
+                write_trajectories(&opened, &run)?;
+            }
             Ok(run.kept(&opened))
         },
     )?;
     let mut run = run.into_inner().unwrap_or_else(PoisonError::into_inner);
+    write_trajectories(&opened, &run)?;
     let report = write_run(&opened, &mut run, context)?;
     run.finish(&opened)?;
     Ok(report)

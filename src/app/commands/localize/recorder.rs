@@ -1,5 +1,6 @@
 //! Results of localize, collected frame by frame.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Result;
@@ -7,9 +8,8 @@ use anyhow::Result;
 use super::opened::Opened;
 
 use crate::app::report::LocalizationResults;
-use crate::app::report::results::{ParticleLog, ScanOutline};
+use crate::app::report::results::{ParticleLog, ResultWriter, RowLog, ScanOutline};
 use crate::app::report::run_output::{self, Movie};
-use crate::app::run::memory;
 use crate::app::run::{Claims, Interrupted};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
@@ -20,6 +20,11 @@ use crate::refinement::FrameResult;
 /// The localized frames.
 pub struct Run {
     pub results: LocalizationResults,
+    /// The result on its way into its file; `None` once it is there, and if it is not kept.
+    writer: Option<ResultWriter>,
+    /// Numbers of the frames to localize.
+    selected: Vec<usize>,
+    result_path: PathBuf,
     /// The claimed outputs.
     pub claims: Claims,
     /// Pictures of the frames, if they were requested.
@@ -38,10 +43,14 @@ impl Run {
         }
         let config = &opened.config;
         let (has_truth, is_refined) = (config.given_poses.pose_file.is_some(), config.refine);
-        Ok(Self {
+        let folder = opened.files.folder();
+        let selected: Vec<usize> = (opened.recording.frames.iter())
+            .map(|frame| frame.number)
+            .collect();
+        let mut run = Self {
             results: LocalizationResults {
                 frames: Vec::new(),
-                particles: ParticleLog::new(config.tracker.localizer.num_particles),
+                particles: ParticleLog::new(config.tracker.localizer.num_particles, folder),
                 estimates: column(true),
                 refined: column(is_refined),
                 ground_truth: column(has_truth),
@@ -57,9 +66,12 @@ impl Run {
                 agreements: column(true),
                 places: column(true),
                 states: column(true),
-                scan_outlines: column(true),
-                selected: Some(opened.recording.frames.len()),
+                scan_outlines: Some(RowLog::in_folder(folder)),
+                selected: Some(selected.len()),
             },
+            writer: None,
+            selected,
+            result_path: opened.files.result.clone(),
             claims,
             movie: if config.visualize {
                 Some(Movie::begin(&opened.files, &opened.map)?)
@@ -68,7 +80,24 @@ impl Run {
             },
             off_ground: 0,
             failure: None,
-        })
+        };
+        if config.save_result {
+            run.begin_result()?;
+        }
+        Ok(run)
+    }
+
+    /// Begins the file of the result with the frames so far.
+    fn begin_result(&mut self) -> Result<()> {
+        let writer = self.results.writer(&self.result_path, &self.selected)?;
+        self.writer = Some(writer);
+        Ok(())
+    }
+
+    /// Completes the file of the result, once.
+    pub fn finish_result(&mut self) -> Result<()> {
+        let finish = |writer: ResultWriter| writer.finish(&self.results);
+        self.writer.take().map_or(Ok(()), finish)
     }
 
     /// Adds a frame; `runtimes` are those of the filter and of the refinement.
@@ -88,13 +117,7 @@ impl Run {
         }
         let results = &mut self.results;
         let particles = run_output::particle_rows(&estimate.particles);
-        memory::budget().require(
-            "the particles of all frames",
-            (results.particles.bytes() + size_of_val(&*particles)) as f64,
-            "lower numParticles or n_scans",
-        )?;
-        results.frames.push(frame.number);
-        results.particles.push_frame(particles);
+        results.particles.push_frame(&particles)?;
         self.off_ground += usize::from(!estimate.on_mapped_ground);
         push(&mut results.estimates, estimate.pose);
         if let Some(truth) = &frame.map_from_lidar {
@@ -118,10 +141,10 @@ impl Run {
                 duration_s: frame.time_s - before_s,
             });
         let motion = motion.filter(|motion| motion.duration_s > 0.0);
-        push(
-            &mut results.scan_outlines,
-            ScanOutline::of(scan, motion.as_ref()),
-        );
+        if let Some(outlines) = &mut results.scan_outlines {
+            outlines.push(&ScanOutline::of(scan, motion.as_ref()).0)?;
+        }
+        results.frames.push(frame.number);
         push(&mut results.times_s, frame.time_s);
         push(&mut results.runtimes_s, runtime.as_secs_f64());
         push(&mut results.agreements, estimate.agreement.unwrap_or(-1.0));
@@ -136,8 +159,15 @@ impl Run {
         push(&mut results.refined, refined_pose);
         push(&mut results.refined_covariances, covariance);
         push(&mut results.refine_runtimes_s, refine_runtime.as_secs_f64());
+        if let Some(writer) = &mut self.writer {
+            if particles.len() > writer.capacity() {
+                self.begin_result()?;
+            } else {
+                writer.push(&self.results, self.results.len() - 1)?;
+            }
+        }
         if let Some(movie) = &mut self.movie {
-            movie.add(results, estimate)?;
+            movie.add(&self.results, estimate)?;
         }
         Ok(())
     }

@@ -11,7 +11,7 @@ use crate::app::run::{Context, output};
 use crate::evaluation::RangeMclRules;
 use crate::localization::State;
 
-/// Writes results and trajectories.
+/// Completes the result.
 pub fn write_results(opened: &Opened, run: &mut Run) -> Result<()> {
     let Opened {
         config,
@@ -23,21 +23,36 @@ pub fn write_results(opened: &Opened, run: &mut Run) -> Result<()> {
         return Ok(());
     }
     run.claims.begin(&files.result)?;
-    run_output::write_results(files, &run.results)?;
-    run_output::write_trajectory(files, "mcl", recording, run.estimates())?;
-    if config.refine {
-        let refined = run.results.refined_in_space.as_deref();
-        run_output::write_trajectory(files, "refined", recording, refined.unwrap_or_default())?;
-    } else {
+    if !config.refine {
         run.claims.remove(&REFINEMENT_FILES)?;
     }
-    output::write_yaml(&files.file("effective_localization.yml"), config)?;
+    run.finish_result()?;
     // The frames of an interrupted run are kept; a whole run lacks its report and pictures still.
     if run.results.len() < recording.frames.len() {
         run.claims.finish(&files.result)
     } else {
         Ok(())
     }
+}
+
+/// Writes trajectories and configuration.
+pub fn write_trajectories(opened: &Opened, run: &Run) -> Result<()> {
+    let Opened {
+        config,
+        files,
+        recording,
+        ..
+    } = opened;
+    if !config.save_result || run.results.is_empty() {
+        return Ok(());
+    }
+    run_output::write_poses(files, &run.results)?;
+    run_output::write_trajectory(files, "mcl", recording, run.estimates())?;
+    if config.refine {
+        let refined = run.results.refined_in_space.as_deref();
+        run_output::write_trajectory(files, "refined", recording, refined.unwrap_or_default())?;
+    }
+    output::write_yaml(&files.file("effective_localization.yml"), config)
 }
 
 /// Writes report, plots and page, and returns the report.

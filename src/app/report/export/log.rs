@@ -33,8 +33,8 @@ use serde_json::{Value, json};
 use super::glb::Model;
 use crate::app::report::plotting::color::{MCL, REFINED, Rgb, TRUTH};
 use crate::app::report::results::LocalizationResults;
-use crate::evaluation::planar_errors;
 use crate::evaluation::trust::Axes;
+use crate::evaluation::{ParticleRow, planar_errors};
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3, pose3_from_pose2};
 use crate::lidar::{Motion, Scan};
 use crate::localization::State;
@@ -87,7 +87,7 @@ pub fn write_mcap(
         poses.send(&mut log, results, row, stamp)?;
         if !results.particles.is_empty() {
             let height_m = poses.best()[row].translation.z;
-            let particles = particles(results, row, height_m, stamp);
+            let particles = particles(&results.particles.frame(row)?, height_m, stamp);
             log.send("/particles", stamp, &particles)?;
         }
         if let Some(frames) = run.frames {
@@ -224,7 +224,7 @@ impl Trajectories {
         json!({
             "frame": results.frames[row],
             "state": state,
-            "particles": (!results.particles.is_empty()).then(|| results.particles.frame(row).len()),
+            "particles": (!results.particles.is_empty()).then(|| results.particles.count(row)),
             "agreement": agreement.filter(|&share| share >= 0.0),
             "places": results.places.as_ref().map(|all| all[row] as u64),
             "sigma_long_m": axes.map(|axes| axes.long_m),
@@ -354,8 +354,8 @@ fn map_scene(mesh: &TriangleMesh, stamp: u64) -> Result<SceneUpdate> {
     })
 }
 
-fn particles(results: &LocalizationResults, row: usize, height_m: f64, stamp: u64) -> PosesInFrame {
-    let poses = results.particles.frame(row).iter();
+fn particles(particles: &[ParticleRow], height_m: f64, stamp: u64) -> PosesInFrame {
+    let poses = particles.iter();
     let poses = poses.map(|&[x, y, heading, _]| {
         let [x, y, heading] = [x, y, heading].map(f64::from);
         let planar = Pose2::new([x, y].into(), heading);

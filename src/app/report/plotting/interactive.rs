@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 
 use super::color::{Colormap, MCL, REFINED, Rgb, STATES, TRUTH};
 use super::map_image::MapImage;
-use crate::app::report::results::{LocalizationResults, ScanOutline};
+use crate::app::report::results::{LocalizationResults, RowLog};
 use crate::app::run::output;
 use crate::evaluation::trust::Axes;
 use crate::evaluation::{PlanarError, planar_errors};
@@ -27,6 +27,9 @@ pub struct InteractivePath<'a> {
     /// Map below the path.
     pub map: Option<&'a MapImage>,
 }
+
+/// Largest number of frames whose scans are in the page: 50 MB.
+const MOST_OUTLINES: usize = 50_000;
 
 impl InteractivePath<'_> {
     /// Writes the content as JSON.
@@ -76,7 +79,10 @@ impl InteractivePath<'_> {
             "states": states.map(|all| all.iter().map(word).collect::<Vec<_>>()),
             "state_colors": Value::Object(colors.into_iter().collect()),
             "colormap": (0..10).map(|k| css(Colormap::Viridis.at(f64::from(k) / 9.0))).collect::<Vec<_>>(),
-            "scans": results.scan_outlines.as_deref().map(encoded),
+            "scans": (results.scan_outlines.as_ref())
+                .filter(|outlines| outlines.len() <= MOST_OUTLINES)
+                .map(encoded)
+                .transpose()?,
         }))
     }
 }
@@ -102,14 +108,14 @@ fn flat(poses: &[Pose2]) -> Vec<f64> {
 }
 
 /// Number of points of each outline, and all of them as 16-bit integers, little-endian.
-fn encoded(outlines: &[ScanOutline]) -> Value {
-    let bytes: Vec<u8> = outlines
-        .iter()
-        .flat_map(|outline| outline.0.as_flattened())
-        .flat_map(|number| number.to_le_bytes())
-        .collect();
-    let counts: Vec<usize> = outlines.iter().map(|outline| outline.0.len()).collect();
-    json!({ "counts": counts, "points": STANDARD.encode(bytes) })
+fn encoded(outlines: &RowLog<[i16; 2]>) -> Result<Value> {
+    let (mut counts, mut bytes) = (Vec::new(), Vec::new());
+    for row in 0..outlines.len() {
+        let points = outlines.row(row)?;
+        counts.push(points.len());
+        bytes.extend((points.as_flattened().iter()).flat_map(|number| number.to_le_bytes()));
+    }
+    Ok(json!({ "counts": counts, "points": STANDARD.encode(bytes) }))
 }
 
 fn rounded(number: f64, per_unit: f64) -> f64 {
@@ -133,6 +139,10 @@ mod tests {
             .iter()
             .map(|pose| Pose2::translation(0.0, -0.02) * pose)
             .collect();
+        let mut outlines = RowLog::in_folder(Path::new("."));
+        for points in [&[[100, -200]][..], &[], &[[1, 2], [3, 4]]] {
+            outlines.push(points).unwrap();
+        }
         let results = LocalizationResults {
             frames: vec![4, 5, 6],
             ground_truth: Some(truth),
@@ -141,11 +151,7 @@ mod tests {
                 State::Tracking as u8,
                 State::Lost as u8,
             ]),
-            scan_outlines: Some(vec![
-                ScanOutline(vec![[100, -200]]),
-                ScanOutline(vec![]),
-                ScanOutline(vec![[1, 2], [3, 4]]),
-            ]),
+            scan_outlines: Some(outlines),
             ..LocalizationResults::default()
         };
         let content = InteractivePath {

@@ -3,7 +3,6 @@
 use nalgebra::{Matrix3, Quaternion, Translation3, UnitQuaternion, Vector2};
 use npyz::AutoSerialize;
 
-use super::localization_results::ScanOutline;
 use crate::geometry::{Pose2, Pose3};
 
 /// An item of a column, as a row of `N` numbers.
@@ -90,30 +89,5 @@ impl Row<9> for Matrix3<f64> {
 
     fn from_row(row: [f64; 9]) -> Option<Self> {
         Some(Self::from_row_slice(&row))
-    }
-}
-
-/// x, y of each point; zeros after the last that is not zero.
-impl Row<{ 2 * ScanOutline::MAX }> for ScanOutline {
-    type Number = i16;
-    const EMPTY: i16 = 0;
-
-    fn to_row(&self) -> [i16; 2 * Self::MAX] {
-        let mut row = [0; 2 * Self::MAX];
-        let numbers = self.0.as_flattened();
-        row[..numbers.len()].copy_from_slice(numbers);
-        row
-    }
-
-    fn from_row(row: [f64; 2 * Self::MAX]) -> Option<Self> {
-        let points = row.as_chunks().0.iter();
-        let mut points: Vec<_> = points.map(|it: &[f64; 2]| it.map(|it| it as i16)).collect();
-        points.truncate(
-            points
-                .iter()
-                .rposition(|it| *it != [0, 0])
-                .map_or(0, |last| last + 1),
-        );
-        Some(Self(points))
     }
 }

@@ -43,7 +43,7 @@ impl FrameTable {
         let refined = results.refined.as_deref();
         let driven_m = distances_m(truth.unwrap_or(estimates));
         let particles: Vec<usize> = (0..results.particles.len())
-            .map(|row| results.particles.frame(row).len())
+            .map(|row| results.particles.count(row))
             .collect();
         let particles = (!particles.is_empty()).then_some(particles);
         let mut table = Self::empty(results.len());
@@ -195,8 +195,8 @@ mod tests {
             .iter()
             .map(|pose| pose * Pose2::new([0.5, 0.25].into(), 0.1))
             .collect();
-        let mut particles = ParticleLog::new(10);
-        (0..3).for_each(|_| particles.push_frame([[1.0; 4]; 2]));
+        let mut particles = ParticleLog::new(10, Path::new("."));
+        (0..3).for_each(|_| particles.push_frame(&[[1.0; 4]; 2]).unwrap());
         let results = LocalizationResults {
             frames: vec![1, 3, 5],
             particles,

@@ -22,12 +22,15 @@
 //! All but the first three are optional, and so are `particles` where there are `frames`: a trajectory without a map.
 //! They are NaN in rows before `start_idx`.
 
+use std::io;
 use std::ops::RangeInclusive;
+use std::path::Path;
 
 use anyhow::{Context as _, Result, ensure};
 use glam::Vec3;
 use nalgebra::Matrix3;
 
+use super::row_log::RowLog;
 use crate::evaluation::{ParticleRow, RangeMclRules};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
@@ -37,55 +40,57 @@ use crate::lidar::{Motion, Scan};
 pub struct ParticleLog {
     /// Largest number of particles per frame: `numParticles`, the extent of the stored array.
     capacity: usize,
-    rows: Vec<ParticleRow>,
-    /// Index in `rows` after the last particle of each frame.
-    ends: Vec<usize>,
+    frames: RowLog<ParticleRow>,
+    /// Factor of the positions, if it is not one.
+    scale: Option<f32>,
 }
 
 impl ParticleLog {
-    /// An empty log of frames with up to `capacity` particles.
-    pub fn new(capacity: usize) -> Self {
+    /// An empty log of frames with up to `capacity` particles, whose file is in a folder.
+    pub fn new(capacity: usize, folder: &Path) -> Self {
         Self {
             capacity,
-            ..Self::default()
+            frames: RowLog::in_folder(folder),
+            scale: None,
         }
     }
 
     /// Appends the particles of the next frame; the capacity grows if they exceed it.
-    pub fn push_frame(&mut self, particles: impl IntoIterator<Item = ParticleRow>) {
-        let begin = self.rows.len();
-        self.rows.extend(particles);
-        self.ends.push(self.rows.len());
-        self.capacity = self.capacity.max(self.rows.len() - begin);
+    pub fn push_frame(&mut self, particles: &[ParticleRow]) -> io::Result<()> {
+        self.capacity = self.capacity.max(particles.len());
+        self.frames.push(particles)
     }
 
     /// The particles of a frame by its row.
-    pub fn frame(&self, row: usize) -> &[ParticleRow] {
-        let begin = if row == 0 { 0 } else { self.ends[row - 1] };
-        &self.rows[begin..self.ends[row]]
+    pub fn frame(&self, row: usize) -> io::Result<Vec<ParticleRow>> {
+        let mut particles = self.frames.row(row)?;
+        if let Some(factor) = self.scale {
+            for [x, y, ..] in &mut particles {
+                *x *= factor;
+                *y *= factor;
+            }
+        }
+        Ok(particles)
+    }
+
+    /// Number of particles of a frame by its row.
+    pub fn count(&self, row: usize) -> usize {
+        self.frames.row_len(row)
     }
 
     /// Multiplies the positions of all particles.
     pub fn scale_positions(&mut self, factor: f32) {
-        for [x, y, ..] in &mut self.rows {
-            *x *= factor;
-            *y *= factor;
-        }
-    }
-
-    /// Size in memory [bytes].
-    pub fn bytes(&self) -> usize {
-        size_of_val(&*self.rows)
+        self.scale = Some(self.scale.unwrap_or(1.0) * factor);
     }
 
     /// Number of frames.
     pub fn len(&self) -> usize {
-        self.ends.len()
+        self.frames.len()
     }
 
     /// Whether there are no frames.
     pub fn is_empty(&self) -> bool {
-        self.ends.is_empty()
+        self.len() == 0
     }
 
     /// Largest number of particles per frame.
@@ -129,6 +134,15 @@ impl ScanOutline {
             |point: &Vec3| [point.x, point.y].map(|metres| (100.0 * metres).round() as i16);
         Self(outline.points.iter().map(centimetres).collect())
     }
+
+    /// The outline of a stored row: zeros after the last point that is not zero.
+    pub fn from_row(row: &[f64; 2 * Self::MAX]) -> Self {
+        let points = row.as_chunks().0.iter();
+        let mut points: Vec<_> = points.map(|it: &[f64; 2]| it.map(|it| it as i16)).collect();
+        let is_point = |it: &[i16; 2]| *it != [0, 0];
+        points.truncate(points.iter().rposition(is_point).map_or(0, |last| last + 1));
+        Self(points)
+    }
 }
 
 /// Results of a run, one row per localized frame; `None` if not computed or not known.
@@ -169,7 +183,7 @@ pub struct LocalizationResults {
     /// State of the filter as a number.
     pub states: Option<Vec<u8>>,
     /// Outlines of the scans, for pictures.
-    pub scan_outlines: Option<Vec<ScanOutline>>,
+    pub scan_outlines: Option<RowLog<[i16; 2]>>,
     /// Number of frames to localize; a file has it only if the run ended before the last of them.
     pub selected: Option<usize>,
 }
@@ -192,8 +206,7 @@ macro_rules! columns {
             refine_runtimes_s,
             agreements,
             places,
-            states,
-            scan_outlines
+            states
         )
     };
 }
@@ -239,16 +252,15 @@ impl LocalizationResults {
             let column = column.as_ref()?;
             Some(rows.iter().map(|&row| column[row].clone()).collect())
         }
-        let mut particles = ParticleLog::new(self.particles.capacity());
-        if !self.particles.is_empty() {
-            for &row in rows {
-                particles.push_frame(self.particles.frame(row).iter().copied());
-            }
+        let mut particles = self.particles.clone();
+        if !particles.is_empty() {
+            particles.frames = particles.frames.select(rows);
         }
+        let scan_outlines = self.scan_outlines.as_ref().map(|all| all.select(rows));
         let frames = rows.iter().map(|&row| self.frames[row]).collect();
         macro_rules! select {
             ($($name:ident),*) => {
-                Self { frames, particles, selected: None, $($name: pick(&self.$name, rows)),* }
+                Self { frames, particles, scan_outlines, selected: None, $($name: pick(&self.$name, rows)),* }
             };
         }
         columns!(select)
@@ -270,7 +282,7 @@ impl LocalizationResults {
         let capacity = self.particles.capacity();
         (0..self.particles.len())
             .map(|row| {
-                let mean = rules.estimate(self.particles.frame(row), capacity);
+                let mean = rules.estimate(&self.particles.frame(row)?, capacity);
                 let frame = self.frames[row];
                 mean.with_context(|| {
                     format!(

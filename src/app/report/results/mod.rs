@@ -4,9 +4,11 @@
 mod columns;
 mod localization_results;
 mod npz;
+mod npz_writer;
 mod results_file;
 #[cfg(test)]
 mod results_file_tests;
+mod row_log;
 mod trajectory_file;
 // Tables and reports.
 mod frames;
@@ -20,7 +22,8 @@ pub(crate) mod kitti_07_tests;
 pub use frames::{FrameTable, write_frames_csv};
 pub use localization_results::{LocalizationResults, ParticleLog, ScanOutline};
 pub use report::{Report, TrajectoryReport};
-pub use results_file::write_poses_npy;
+pub use results_file::{ResultWriter, write_poses_npy};
+pub use row_log::RowLog;
 pub use rows::{MetricRow, Value, length};
 pub use run_summary::RunSummary;
 pub use trajectory_file::write_trajectory_npz;

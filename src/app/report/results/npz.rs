@@ -1,18 +1,16 @@
-//! Arrays of a `.npz` file, read as streams of numbers and written from iterators.
+//! Arrays of a `.npz` file, read as streams of numbers.
 //!
 //! Memory grows with the data that a file holds, not with what its headers claim.
 
 use std::fmt::Display;
 use std::fs::File;
-use std::io::{self, BufReader, BufWriter, Read, Seek, Write};
-use std::mem::ManuallyDrop;
+use std::io::{self, BufReader, BufWriter, Read, Write};
 use std::path::Path;
 
 use anyhow::{Context as _, Result, anyhow, ensure};
 use npyz::{AutoSerialize, DType, Deserialize, NpyFile, Order, TypeChar, WriterBuilder};
+use zip::ZipArchive;
 use zip::result::ZipError;
-use zip::write::SimpleFileOptions;
-use zip::{ZipArchive, ZipWriter};
 
 use crate::app::run::memory;
 use crate::recording::scan_files::npy::read_header;
@@ -20,8 +18,8 @@ use crate::recording::scan_files::npy::read_header;
 /// Size of the buffer between decompression and numbers [bytes].
 const BUFFER_BYTES: usize = 1 << 16;
 
-/// Largest array that is written without the 64-bit extensions of the zip format [bytes].
-const ZIP32_LIMIT: usize = u32::MAX as usize - BUFFER_BYTES;
+/// Arrays that are not kept in memory: a row of them counts.
+const READ_BY_ROWS: [&str; 2] = ["particles", "scan_outlines"];
 
 /// Largest magnitude of a number of a result: beyond any position, covariance, time and frame, and
 /// exact as an integer.
@@ -53,7 +51,8 @@ impl<'a> NpzReader<'a> {
         };
         let bytes = entry.size();
         let entry = BufReader::with_capacity(BUFFER_BYTES, entry).take(bytes);
-        let (shape, numbers) = open_array(entry).map_err(|e| bad_array(self.path, name, &e))?;
+        let (shape, numbers) = open_array(entry, READ_BY_ROWS.contains(&name))
+            .map_err(|e| bad_array(self.path, name, &e))?;
         Ok(Some(Array {
             path: self.path,
             name,
@@ -150,7 +149,10 @@ fn not_numbers(found: &DType) -> anyhow::Error {
 }
 
 /// Reads the header of an array and checks that the bytes after it are those that it claims.
-fn open_array<'a>(mut entry: io::Take<impl Read + 'a>) -> Result<(Vec<usize>, Numbers<'a>)> {
+fn open_array<'a>(
+    mut entry: io::Take<impl Read + 'a>,
+    is_read_by_rows: bool,
+) -> Result<(Vec<usize>, Numbers<'a>)> {
     let header =
         read_header(&mut entry).map_err(|problem| anyhow!("it cannot be read: it {problem}"))?;
     let DType::Plain(element) = header.dtype() else {
@@ -182,7 +184,13 @@ fn open_array<'a>(mut entry: io::Take<impl Read + 'a>) -> Result<(Vec<usize>, Nu
         "its shape {shape:?} needs {needed} bytes of numbers, but there are {found}"
     );
     // Numbers of single precision and rows of poses take about as much as in the file.
-    memory::budget().require("the array", needed as f64, "give a smaller file")?;
+    let rows = if is_read_by_rows {
+        shape.first().copied().unwrap_or(1).max(1)
+    } else {
+        1
+    };
+    let kept = needed as f64 / rows as f64;
+    memory::budget().require("the array", kept, "give a smaller file")?;
     let shape = shape.into_iter().map(|extent| extent as usize).collect();
     Ok((shape, numbers))
 }
@@ -194,41 +202,6 @@ fn numbers<'a, T: Deserialize + 'a>(
     let elements =
         (file.data::<T>()).map_err(|error| anyhow!(unreadable(&io::Error::other(error))))?;
     Ok(Box::new(elements.map(move |element| element.map(&convert))))
-}
-
-/// A compressed `.npz` file that is being written.
-pub struct NpzWriter<W: Write + Seek> {
-    /// Dropped, it would try to complete the file after an error, and print the next one.
-    archive: ManuallyDrop<ZipWriter<W>>,
-}
-
-impl<W: Write + Seek> NpzWriter<W> {
-    /// Starts a file.
-    pub fn new(writer: W) -> Self {
-        Self {
-            archive: ManuallyDrop::new(ZipWriter::new(writer)),
-        }
-    }
-
-    /// Adds an array of a shape with all its numbers in row-major order.
-    pub fn add<T: AutoSerialize>(
-        &mut self,
-        name: &str,
-        shape: &[usize],
-        numbers: impl IntoIterator<Item = T>,
-    ) -> io::Result<()> {
-        let options = SimpleFileOptions::default()
-            .compression_method(zip::CompressionMethod::Deflated)
-            .large_file(shape.iter().product::<usize>() * size_of::<T>() > ZIP32_LIMIT);
-        self.archive.start_file(format!("{name}.npy"), options)?;
-        write_npy(&mut *self.archive, shape, numbers)
-    }
-
-    /// Writes the directory of the file.
-    pub fn finish(self) -> io::Result<()> {
-        ManuallyDrop::into_inner(self.archive).finish()?;
-        Ok(())
-    }
 }
 
 /// Writes one array in NumPy's format.

@@ -2,15 +2,18 @@
 
 use std::io::{self, Seek, Write};
 use std::iter::repeat_n;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Result, ensure};
+use anyhow::{Context as _, Result, ensure};
 
 use super::columns::Row;
-use super::localization_results::{LocalizationResults, ParticleLog, columns};
-use super::npz::{Array, NpzReader, NpzWriter, not_valid, write_npy};
+use super::localization_results::{LocalizationResults, ParticleLog, ScanOutline, columns};
+use super::npz::{Array, NpzReader, not_valid, write_npy};
+use super::npz_writer::{ArrayStream, NpzWriter};
+use super::row_log::RowLog;
 use crate::app::run::output;
 use crate::evaluation::ParticleRow;
+use crate::files::{AtomicFile, folder_of};
 use crate::geometry::Pose2;
 
 /// Largest number of particles in empty rows, 4 GiB of zeros.
@@ -29,9 +32,10 @@ impl LocalizationResults {
             first,
         };
         let frames = file.frames()?;
+        let scan_outlines = file.outlines()?;
         macro_rules! read {
             ($($name:ident),*) => {
-                Self { frames, particles, selected, $($name: file.column(stringify!($name))?),* }
+                Self { frames, particles, scan_outlines, selected, $($name: file.column(stringify!($name))?),* }
             };
         }
         Ok(columns!(read))
@@ -42,61 +46,121 @@ impl LocalizationResults {
     /// Row k is frame k, as in range-mcl, if the frames are consecutive and the rows before the first
     /// are not too many; otherwise there is one row per localized frame.
     pub fn write(&self, path: &Path) -> Result<()> {
-        output::write_file(path, |file| self.write_to(file))
+        self.writer(path, &self.frames)?.finish(self)
     }
 
-    fn write_to(&self, file: impl Write + Seek) -> io::Result<()> {
-        let has_particles = !self.particles.is_empty();
-        debug_assert!(!has_particles || self.particles.len() == self.len());
-        let leading = self.leading_rows();
-        let rows = leading + self.len();
-        let capacity = self.particles.capacity();
-        let mut npz = NpzWriter::new(file);
-        if has_particles || self.is_empty() {
-            npz.add(
-                "particles",
-                &[rows, capacity, 4],
-                repeat_n([0.0; 4], leading * capacity)
-                    .chain((0..self.len()).flat_map(|row| self.padded_particles(row)))
-                    .flatten(),
-            )?;
+    /// A writer of the file that has the rows so far, of a run of these frames.
+    pub fn writer(&self, path: &Path, frames: &[usize]) -> Result<ResultWriter> {
+        let begin = || {
+            let has_particles = !self.particles.is_empty() || self.is_empty();
+            let capacity = self.particles.capacity();
+            let leading = leading_rows(frames, capacity);
+            let mut writer = ResultWriter {
+                file: AtomicFile::create(path)?,
+                path: path.to_owned(),
+                particles: None,
+                outlines: None,
+                leading,
+                capacity,
+            };
+            if has_particles {
+                let file = writer.file.file().try_clone()?;
+                let mut stream = ArrayStream::begin(file, "particles", "<f4", &[capacity, 4])?;
+                let empty = vec![[0.0_f32; 4]; capacity];
+                (0..leading).try_for_each(|_| stream.push(bytemuck::cast_slice(&empty)))?;
+                writer.particles = Some(stream);
+            }
+            if self.scan_outlines.is_some() {
+                let file = tempfile::tempfile_in(folder_of(path))?;
+                let row = [2 * ScanOutline::MAX];
+                let mut stream = ArrayStream::begin(file, "scan_outlines", "<i2", &row)?;
+                let empty = [[0_i16; 2]; ScanOutline::MAX];
+                (0..leading).try_for_each(|_| stream.push(bytemuck::cast_slice(&empty)))?;
+                writer.outlines = Some(stream);
+            }
+            (0..self.len()).try_for_each(|row| writer.push(self, row))?;
+            io::Result::Ok(writer)
+        };
+        begin().with_context(|| format!("cannot write {}", path.display()))
+    }
+}
+
+/// The number of empty rows before the first frame that make row k frame k; none where these
+/// would be a file of gigabytes.
+fn leading_rows(frames: &[usize], capacity: usize) -> usize {
+    let first = frames.first().copied().unwrap_or(0);
+    let is_consecutive = (first..).zip(frames).all(|(row, &frame)| frame == row);
+    let is_possible = first.saturating_mul(capacity.max(1)) <= MOST_EMPTY_PARTICLES;
+    if is_consecutive && is_possible {
+        first
+    } else {
+        0
+    }
+}
+
+/// A result that is being written: particles and outlines of the scans frame by frame, the rest at the end.
+pub struct ResultWriter {
+    file: AtomicFile,
+    path: PathBuf,
+    particles: Option<ArrayStream>,
+    /// In a file of its own, as the particles take up the other.
+    outlines: Option<ArrayStream>,
+    leading: usize,
+    capacity: usize,
+}
+
+impl ResultWriter {
+    /// Largest number of particles of a frame.
+    pub fn capacity(&self) -> usize {
+        self.capacity
+    }
+
+    /// Appends a row of the results.
+    pub fn push(&mut self, results: &LocalizationResults, row: usize) -> io::Result<()> {
+        if let Some(stream) = &mut self.particles {
+            let mut particles = results.particles.frame(row)?;
+            particles.resize(self.capacity, [0.0; 4]);
+            stream.push(bytemuck::cast_slice(&particles))?;
         }
+        if let (Some(stream), Some(outlines)) = (&mut self.outlines, &results.scan_outlines) {
+            let mut points = outlines.row(row)?;
+            points.resize(ScanOutline::MAX, [0; 2]);
+            stream.push(bytemuck::cast_slice(&points))?;
+        }
+        Ok(())
+    }
+
+    /// Completes the file, which then replaces an existing one.
+    pub fn finish(self, results: &LocalizationResults) -> Result<()> {
+        let path = self.path.clone();
+        self.complete(results)
+            .with_context(|| format!("cannot write {}", path.display()))
+    }
+
+    fn complete(self, results: &LocalizationResults) -> io::Result<()> {
+        let leading = self.leading;
+        let rows = leading + results.len();
+        let mut npz = match self.particles {
+            Some(stream) => NpzWriter::after(stream)?,
+            None => NpzWriter::new(self.file.file().try_clone()?),
+        };
         npz.add("start_idx", &[], [leading as i64])?;
-        npz.add("numParticles", &[], [capacity as i64])?;
-        let frames = (0..leading).chain(self.frames.iter().copied());
+        npz.add("numParticles", &[], [self.capacity as i64])?;
+        let frames = (0..leading).chain(results.frames.iter().copied());
         npz.add("frames", &[rows], frames.map(|frame| frame as i64))?;
-        if let Some(selected) = self.selected.filter(|&selected| self.len() < selected) {
+        if let Some(selected) = (results.selected).filter(|&selected| results.len() < selected) {
             npz.add("selected_frames", &[], [selected as i64])?;
         }
         let mut file = RowWriter { npz, leading };
         macro_rules! write {
-            ($($name:ident),*) => { $(file.column(stringify!($name), self.$name.as_deref())?;)* };
+            ($($name:ident),*) => { $(file.column(stringify!($name), results.$name.as_deref())?;)* };
         }
         columns!(write);
-        file.npz.finish()
-    }
-
-    /// The number of empty rows before the first frame that make row k frame k; none where these
-    /// would be a file of gigabytes.
-    fn leading_rows(&self) -> usize {
-        let first = self.frames.first().copied().unwrap_or(0);
-        let is_consecutive = (first..)
-            .zip(&self.frames)
-            .all(|(row, &frame)| frame == row);
-        let particles = first.saturating_mul(self.particles.capacity().max(1));
-        let is_possible = particles <= MOST_EMPTY_PARTICLES;
-        if is_consecutive && is_possible {
-            first
-        } else {
-            0
+        if let Some(stream) = self.outlines {
+            file.npz.add_stream(stream)?;
         }
-    }
-
-    /// The particles of a frame, padded with zeros to the capacity.
-    fn padded_particles(&self, row: usize) -> impl Iterator<Item = ParticleRow> {
-        let particles = self.particles.frame(row);
-        let padding = self.particles.capacity() - particles.len();
-        particles.iter().copied().chain(repeat_n([0.0; 4], padding))
+        file.npz.finish()?;
+        self.file.persist()
     }
 }
 
@@ -148,11 +212,11 @@ fn read_particles(path: &Path, npz: &mut NpzReader) -> Result<(usize, usize, Par
         array.expect_shape(&[Some(0), None, None], "(frames, N, 4) with N > 0")?;
     }
     let first = first_row(path, start_idx, rows)?;
-    let mut log = ParticleLog::new(capacity);
+    let mut log = ParticleLog::new(capacity, folder_of(path));
     for row in 0..rows {
         let particles = next_particles(&mut array, row, capacity)?;
         if row >= first {
-            log.push_frame(particles);
+            log.push_frame(&particles)?;
         }
     }
     Ok((rows, first, log))
@@ -227,6 +291,27 @@ impl RowReader<'_> {
         };
         let items: Result<_> = (self.first..self.rows).map(item).collect();
         items.map(Some)
+    }
+
+    /// Reads the outlines of the scans.
+    fn outlines(&mut self) -> Result<Option<RowLog<[i16; 2]>>> {
+        const NAME: &str = "scan_outlines";
+        const NUMBERS: usize = 2 * ScanOutline::MAX;
+        let Some(mut array) = self.npz.array(NAME)? else {
+            return Ok(None);
+        };
+        if array.shape.first() == Some(&0) && self.rows > 0 {
+            return Ok(None);
+        }
+        array.expect_shape(&[Some(self.rows), Some(NUMBERS)], "one row per frame")?;
+        let mut outlines = RowLog::in_folder(folder_of(self.path));
+        for row in 0..self.rows {
+            let numbers: [f64; NUMBERS] = array.next_finite_row(row)?;
+            if row >= self.first {
+                outlines.push(&ScanOutline::from_row(&numbers).0)?;
+            }
+        }
+        Ok(Some(outlines))
     }
 
     /// Reads the frame of each row: the row itself if the file does not contain `frames`.

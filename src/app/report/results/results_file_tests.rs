@@ -7,16 +7,17 @@ use nalgebra::Matrix3;
 use npyz::{DType, NpyFile, WriterBuilder as _};
 use zip::write::SimpleFileOptions;
 
-use super::npz::NpzWriter;
-use super::{LocalizationResults, ParticleLog, ScanOutline};
+use super::npz_writer::NpzWriter;
+use super::{LocalizationResults, ParticleLog, RowLog};
 use crate::geometry::{Pose2, Pose3};
 
 fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
     let frames: Vec<usize> = frames.collect();
-    let mut particles = ParticleLog::new(5);
+    let mut particles = ParticleLog::new(5, Path::new("."));
     for row in 0..frames.len() {
         // The second particle of each frame is at the origin and has no weight.
-        particles.push_frame([[row as f32, 1.0, 2.0, 0.5], [0.0; 4], [3.0, 4.0, 5.0, 0.5]]);
+        let frame = [[row as f32, 1.0, 2.0, 0.5], [0.0; 4], [3.0, 4.0, 5.0, 0.5]];
+        particles.push_frame(&frame).unwrap();
     }
     let poses = |offset: f64| {
         let pose = |&frame: &usize| Pose2::new([frame as f64, offset].into(), 3.0 - offset);
@@ -30,10 +31,11 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
     let numbers = |scale: f64| Some(frames.iter().map(|&f| scale * f as f64).collect());
     let matrix = |&frame: &usize| Matrix3::from_diagonal_element(1.0 + frame as f64);
     // Of 0 to 3 points.
-    let outline = |&frame: &usize| {
+    let mut outlines = RowLog::in_folder(Path::new("."));
+    for &frame in &frames {
         let points = (0..frame % 4).map(|k| [-100 * k as i16, frame as i16]);
-        ScanOutline(points.collect())
-    };
+        outlines.push(&points.collect::<Vec<_>>()).unwrap();
+    }
     LocalizationResults {
         particles,
         estimates: poses(0.1),
@@ -51,7 +53,7 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
         agreements: numbers(0.001),
         places: numbers(1.0),
         states: Some(frames.iter().map(|&frame| frame as u8 % 3).collect()),
-        scan_outlines: Some((frames.iter()).map(outline).collect()),
+        scan_outlines: Some(outlines),
         selected: Some(40),
         frames,
     }
@@ -153,7 +155,7 @@ fn a_file_of_range_mcl_alone_is_read() {
     npz.finish().unwrap();
     let results = LocalizationResults::read(&path).unwrap();
     assert_eq!(results.frames, [1, 2]);
-    assert_eq!(results.particles.frame(1), [[1.0; 4]]);
+    assert_eq!(results.particles.frame(1).unwrap(), [[1.0; 4]]);
     assert_eq!(results.estimates, None);
 }
 
@@ -205,7 +207,7 @@ fn stored_deflated_and_zip64_entries_of_any_number_type_are_read() {
             ] {
                 write_particles(&path, element, &[1, 1, 4], bytes, options);
                 let results = LocalizationResults::read(&path).unwrap();
-                assert_eq!(results.particles.frame(0), [[1.0; 4]]);
+                assert_eq!(results.particles.frame(0).unwrap(), [[1.0; 4]]);
             }
         }
     }
@@ -354,4 +356,48 @@ fn a_trajectory_without_particles_reads_back() {
         written.write(&path).unwrap();
         assert_same(&LocalizationResults::read(&path).unwrap(), &written);
     }
+}
+
+#[test]
+fn a_file_that_is_written_frame_by_frame_holds_them_before_the_end() {
+    const FRAMES: usize = 20_000;
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("results.npz");
+    let mut results = LocalizationResults {
+        particles: ParticleLog::new(50, folder.path()),
+        scan_outlines: Some(RowLog::in_folder(folder.path())),
+        ..LocalizationResults::default()
+    };
+    let mut writer = results.writer(&path, &[3]).unwrap();
+    let particle = |frame: usize, k: usize| {
+        [frame, k, frame * k, 1].map(|number| ((number * 7919) % 1_000_003) as f32)
+    };
+    for frame in 0..FRAMES {
+        let particles: Vec<_> = (0..40).map(|k| particle(frame, k)).collect();
+        results.frames.push(3 + frame);
+        results.particles.push_frame(&particles).unwrap();
+        let outlines = results.scan_outlines.as_mut().unwrap();
+        outlines.push(&[[frame as i16, 1]]).unwrap();
+        writer.push(&results, frame).unwrap();
+    }
+    // The unfinished file holds all but what the compressor buffers.
+    let length = || {
+        let file = fs::read_dir(folder.path()).unwrap().next().unwrap();
+        file.unwrap().metadata().unwrap().len()
+    };
+    let before = length();
+    writer.finish(&results).unwrap();
+    let (columns, outlines) = (8 * FRAMES as u64, 100 * FRAMES as u64);
+    assert!(length() - before < columns + outlines + 1_000_000);
+    assert!(before > 5_000_000, "{before}");
+
+    let read = LocalizationResults::read(&path).unwrap();
+    assert_eq!(read, results);
+    assert_eq!(
+        read.particles.frame(FRAMES - 1).unwrap()[39],
+        particle(FRAMES - 1, 39)
+    );
+    let at_once = folder.path().join("at_once.npz");
+    results.write(&at_once).unwrap();
+    assert!(fs::read(&path).unwrap() == fs::read(&at_once).unwrap());
 }

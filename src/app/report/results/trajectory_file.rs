@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::Result;
 
-use super::npz::NpzWriter;
+use super::npz_writer::NpzWriter;
 use crate::app::run::output;
 use crate::geometry::Pose3;
 use crate::odometry::{OdometryEstimate, StepState};

@@ -268,12 +268,12 @@ impl<'a> Drawing<'a> {
             return Ok(());
         };
         let steps = (moments.len() - 1).max(1) as f32;
-        let particles: Vec<ParticleRow> = (moments.iter().enumerate())
-            .flat_map(|(moment, &row)| {
-                let particles = self.results.particles.frame(row).iter();
-                particles.map(move |&[x, y, heading, _]| [x, y, heading, moment as f32 / steps])
-            })
-            .collect();
+        let mut particles: Vec<ParticleRow> = Vec::new();
+        for (moment, &row) in moments.iter().enumerate() {
+            let of_moment = self.results.particles.frame(row)?.into_iter();
+            let colored = |[x, y, heading, _]: ParticleRow| [x, y, heading, moment as f32 / steps];
+            particles.extend(of_moment.map(colored));
+        }
         LocalizationPicture {
             title: "Particles from the first frame to the last",
             map: self.map,
@@ -352,7 +352,7 @@ impl Movie {
         LocalizationPicture {
             title: &format!("Frame {number}: {}", estimate.state.word()),
             map: Some(&self.map),
-            particles: results.particles.frame(results.len() - 1),
+            particles: &results.particles.frame(results.len() - 1)?,
             color_name: "weight / largest",
             estimate: Some(estimate.pose),
             ground_truth: truth.last().copied(),
@@ -372,13 +372,15 @@ impl Movie {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
     use crate::app::report::results::ParticleLog;
 
     /// Two particles in each frame.
     fn results(frames: usize) -> LocalizationResults {
-        let mut particles = ParticleLog::new(2);
-        (0..frames).for_each(|_| particles.push_frame([[5.0, 0.0, 0.0, 0.5]; 2]));
+        let mut particles = ParticleLog::new(2, Path::new("."));
+        (0..frames).for_each(|_| particles.push_frame(&[[5.0, 0.0, 0.0, 0.5]; 2]).unwrap());
         LocalizationResults {
             frames: (0..frames).collect(),
             particles,
