@@ -75,7 +75,7 @@ fn unknown<T: CommandConfig>(settings: &[(String, String)]) -> Vec<String> {
         let setting = [(key.clone(), value.clone())];
         settings::with_settings(T::default(), &setting).is_err_and(|error| {
             let message = error.to_string();
-            ["unknown key", "no key any more", "is ambiguous"]
+            ["unknown key", "not a key any more", "is ambiguous"]
                 .iter()
                 .any(|it| message.contains(it))
         })

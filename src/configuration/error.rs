@@ -26,7 +26,7 @@ pub enum ConfigError {
         key: String,
         nearest: Option<String>,
     },
-    #[error("{place}: `{key}` is no key any more: its value is fixed; remove it")]
+    #[error("{place}: `{key}` is not a key any more: its value is fixed; remove it")]
     RemovedKey { place: String, key: String },
     #[error("{place}: `{key}` is ambiguous: {}; give more of its name", keys.join(" or "))]
     AmbiguousKey {

@@ -7,7 +7,7 @@
 //! `localizer.numParticles` as well.
 
 /// Other parts of names: those of range-mcl, without units and blocks, and earlier ones of our own.
-const ALIASES: [(&str, &str); 21] = [
+const ALIASES: [(&str, &str); 22] = [
     // range-mcl
     ("crop_x", "crop_x_m"),
     ("crop_y", "crop_y_m"),
@@ -28,6 +28,7 @@ const ALIASES: [(&str, &str); 21] = [
     ("ground_method", "method"),
     ("odometry", "motion.odometry"),
     ("odometry_noise", "localizer.motion"),
+    ("range_image.has_rows", "has_rows"),
     ("unknown_velocity_noise", "unknown_velocity"),
     ("velocity_noise", "localizer.velocity"),
     ("vigilance", "tracking_loss"),
@@ -74,25 +75,17 @@ impl Names {
         if WITHOUT_EFFECT.contains(&name) {
             return Meaning::Nothing;
         }
-        let mut end = name.len();
-        loop {
+        let last = name.rsplit('.').next().unwrap_or(name);
+        let dots = name.rmatch_indices('.').map(|(dot, _)| dot);
+        for end in std::iter::once(name.len()).chain(dots) {
             match self.key(&name[..end]) {
                 Meaning::Key(key) => return Meaning::Key(key + &name[end..]),
+                Meaning::Unknown if REMOVED.contains(&last) => return Meaning::Removed,
                 Meaning::Unknown => (),
                 other => return other,
             }
-            if name
-                .rsplit('.')
-                .next()
-                .is_some_and(|last| REMOVED.contains(&last))
-            {
-                return Meaning::Removed;
-            }
-            match name[..end].rfind('.') {
-                Some(dot) => end = dot,
-                None => return Meaning::Unknown,
-            }
         }
+        Meaning::Unknown
     }
 
     /// The known part of a full name, which may go on within a map.
@@ -120,9 +113,17 @@ impl Names {
         let dots = name.match_indices('.').map(|(dot, _)| dot + 1);
         for start in std::iter::once(0).chain(dots) {
             let (before, rest) = name.split_at(start);
-            let part = rest.split('.').next().unwrap_or(rest);
-            for (_, other) in ALIASES.iter().filter(|(alias, _)| *alias == part) {
-                let replaced = format!("{before}{other}{}", &rest[part.len()..]);
+            for (alias, other) in ALIASES {
+                let tail = rest.strip_prefix(alias);
+                let is_part = |tail: &&str| tail.is_empty() || tail.starts_with('.');
+                let Some(tail) = tail.filter(is_part) else {
+                    continue;
+                };
+                // A block of the key may be given before its other name.
+                let block = other.split_inclusive('.').next().unwrap_or(other);
+                let is_outer = |outer: &&str| outer.is_empty() || outer.ends_with('.');
+                let outer = before.strip_suffix(block).filter(is_outer);
+                let replaced = format!("{}{other}{tail}", outer.unwrap_or(before));
                 match self.ending(&replaced) {
                     Meaning::Unknown => (),
                     found => return found,
@@ -169,6 +170,9 @@ mod tests {
             "refinement.swarm",
             "refinement.wide_search.swarm",
             "tracker.sensor.range_image",
+            "tracker.sensor.has_rows",
+            "tracker.localizer.motion",
+            "tracker.localizer.panorama.cell_m",
         ];
         Names(keys.map(str::to_owned).into()).meaning(name)
     }
@@ -182,6 +186,20 @@ mod tests {
         assert_eq!(meaning("seed"), key("seed"));
         assert_eq!(meaning("tracker.seed"), key("tracker.seed"));
         assert_eq!(meaning("odometry"), key("odometry"));
+    }
+
+    #[test]
+    fn another_name_stands_for_its_key_with_and_without_the_block_of_the_key() {
+        let rows = key("tracker.sensor.has_rows");
+        assert_eq!(meaning("range_image.has_rows"), rows);
+        assert_eq!(meaning("tracker.sensor.range_image.has_rows"), rows);
+        let cell = key("tracker.localizer.panorama.cell_m");
+        assert_eq!(meaning("grid_res"), cell);
+        assert_eq!(meaning("panorama.grid_res"), cell);
+        let noise = key("tracker.localizer.motion");
+        assert_eq!(meaning("odometry_noise"), noise);
+        assert_eq!(meaning("localizer.odometry_noise"), noise);
+        assert_eq!(meaning("tracker.localizer.odometry_noise"), noise);
     }
 
     #[test]

@@ -348,11 +348,11 @@ fn a_key_whose_value_is_fixed_now_is_refused_with_this_reason() {
     let text = "seed: 1\nproposal: {registration: {iterations: 3, freedom: planar}}\n";
     assert_contains(
         &message_of(text, &[]),
-        &["line 2", "freedom` is no key any more", "remove it"],
+        &["line 2", "freedom` is not a key any more", "remove it"],
     );
     assert_contains(
         &message_of("", &[("widening", "2")]),
-        &["--set widening=2", "`widening` is no key"],
+        &["--set widening=2", "`widening` is not a key"],
     );
 }
 
