@@ -6,7 +6,9 @@ use anyhow::{Context as _, Result};
 
 use crate::app::run::input::is_bag;
 use crate::app::run::{Context, input, memory};
-use crate::app::settings::{MapInputConfig, MotionSourceConfig, PoseInputConfig, RecordingConfig};
+use crate::app::settings::{
+    MapInputConfig, MotionSourceConfig, OdometrySource, PoseInputConfig, RecordingConfig,
+};
 use crate::map::{Map, MapCache, MapOptions, MappingPath};
 use crate::recording::{PoseTrack, Recording, is_topic};
 use crate::sensor::{Sensor, SensorConfig};
@@ -93,8 +95,9 @@ pub fn input_files<'a>(
 ) -> Result<Vec<(&'static str, &'a Path)>> {
     let mut files = map.files();
     files.extend(inputs.files());
+    let is_used = matches!(motion.odometry, OdometrySource::File | OdometrySource::Auto);
     let is_file = |path: &&Path| !(is_topic(path) && is_bag(&inputs.recording.scan_folder));
-    let odometry = motion.odometry_file.as_deref().filter(is_file);
+    let odometry = (motion.odometry_file.as_deref()).filter(|path| is_used && is_file(path));
     files.extend(odometry.map(|path| ("odometry_file", path)));
     input::require(&files)?;
     files.extend(context.input());
