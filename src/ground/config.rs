@@ -36,7 +36,8 @@ pub struct GroundConfig {
     pub pca: PcaGround,
     /// Parameters of the RANSAC plane.
     pub ransac: RansacGround,
-    /// Ground from which the plane of the road is computed, for the attitude of the sensor.
+    /// Ground from which localization and refinement compute the plane of the road, for the attitude of the sensor; labels
+    /// do not depend on it.
     pub road: RoadConfig,
 }
 

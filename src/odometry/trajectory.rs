@@ -33,7 +33,7 @@ pub struct TrajectoryConfig {
     /// Close loops.
     #[default(true)]
     pub loops: bool,
-    /// Which loops count.
+    /// Which loops count. A map of a recording without poses is made with the defaults.
     pub loop_closure: LoopConfig,
     /// Adjust all poses to common surfaces.
     #[default(true)]
