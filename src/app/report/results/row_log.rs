@@ -1,5 +1,6 @@
 //! Rows of different lengths, of which only the last are in memory: the others are in an unnamed file.
 
+use std::fmt;
 use std::fs::File;
 use std::io::{self, Read as _, Seek as _, SeekFrom, Write as _};
 use std::ops::Range;
@@ -9,7 +10,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use bytemuck::Pod;
 
 /// Rows that are appended and read by their index.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Default)]
 pub struct RowLog<T> {
     /// Folder of the file; by default that of temporary files.
     folder: Option<PathBuf>,
@@ -107,6 +108,14 @@ impl<T: Pod> RowLog<T> {
             file.read_exact(bytemuck::cast_slice_mut(&mut items))?;
         }
         Ok(items)
+    }
+}
+
+impl<T: Pod + fmt::Debug> fmt::Debug for RowLog<T> {
+    /// The items, wherever they are.
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let rows = (0..self.len()).map(|row| self.row(row));
+        formatter.debug_list().entries(rows).finish()
     }
 }
 
