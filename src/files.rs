@@ -7,7 +7,7 @@
 //! replaced the folder while the program ran.
 
 use std::fs::{self, File};
-use std::io::{self, BufWriter, Write};
+use std::io::{self, BufWriter, Read as _, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -125,6 +125,33 @@ fn identity(folder: &Path) -> io::Result<Identity> {
 #[cfg(not(unix))]
 fn identity(folder: &Path) -> io::Result<Identity> {
     folder.canonicalize()
+}
+
+/// Requires that there is nothing at a path, or a file that is empty or begins with `magic`: what others put there, a link
+/// among it, is neither read nor replaced.
+pub fn require_own(path: &Path, magic: [u8; 8]) -> io::Result<()> {
+    let begins_with_magic = || {
+        let mut begin = [0; 8];
+        let read = File::open(path).and_then(|mut file| file.read_exact(&mut begin));
+        read.is_ok() && begin == magic
+    };
+    match fs::symlink_metadata(path) {
+        Ok(found) if found.is_file() && (found.len() == 0 || begins_with_magic()) => Ok(()),
+        Ok(_) => Err(io::Error::other(format!(
+            "{} is not a file that fpmcl wrote; move it elsewhere",
+            path.display()
+        ))),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        Err(error) => Err(error),
+    }
+}
+
+/// Requires that a folder is not a link to one elsewhere.
+pub fn require_no_link(folder: &Path) -> io::Result<()> {
+    if fs::symlink_metadata(folder).is_ok_and(|found| found.is_symlink()) {
+        return Err(io::Error::other("it is a link; remove it"));
+    }
+    Ok(())
 }
 
 /// Removes the temporary files of all writes that are under way, and lets none finish; for the moment

@@ -105,6 +105,7 @@ const RESTRICTIONS: [Restriction; 11] = [
             "recording",
             "map/files/ply.rs",
             "map/files/mesh_file.rs",
+            "map/tiles/contents.rs",
             "map/tiles/store.rs",
             "map/places/panorama_file.rs",
             "files.rs",

@@ -21,6 +21,7 @@ use super::mesh_view::MeshView;
 use super::places::panorama::{PanoramaIndex, PanoramaRequest};
 use super::places::panorama_file::Panoramas;
 use super::tiles::cache::MapCache;
+use super::tiles::contents::{mark_used, remove_unused};
 use super::tiles::file::Source;
 use super::tiles::grid::{self, TileConfig, TileGrid, TileIndex};
 use super::tiles::store::TileStore;
@@ -357,14 +358,30 @@ impl Map {
         if let Some(file) = &file
             && let Some(panoramas) = Panoramas::open(file, &words)
         {
+            mark_used(file);
             return Ok(PanoramaIndex::over(panoramas, request));
         }
         let budget = self.memory_budget;
         request.require_memory(&self.path.map_from_lidar, &self.tiles, budget)?;
         let cells = request.cells(&self.path.map_from_lidar, &self.tiles);
-        let file = file.as_ref().map(|file| (&**file, &*words));
         let (renderer, ground) = (&*self.renderer, &self.ground);
-        PanoramaIndex::build(&cells, renderer, ground, &self.tiles, request, file, budget)
+        let named = file.as_ref().map(|file| (&**file, &*words));
+        let built = PanoramaIndex::build(
+            &cells,
+            renderer,
+            ground,
+            &self.tiles,
+            request,
+            named,
+            budget,
+        )?;
+        if let Some(file) = &file
+            && let Err(error) = remove_unused(file)
+        {
+            let file = file.display();
+            tracing::warn!("old panoramas next to {file} cannot be removed: {error}");
+        }
+        Ok(built)
     }
 }
 

@@ -31,6 +31,8 @@ pub enum TileProblem {
     Read(#[from] std::io::Error),
     #[error("it is not a tile of this version of fpmcl, or it is incomplete")]
     Format,
+    #[error("it is another tile under this name")]
+    Name,
     #[error("its checksum is wrong")]
     Checksum,
 }

@@ -8,7 +8,7 @@
 
 use std::borrow::Cow;
 use std::fs::File;
-use std::io::{self, Read as _, Seek as _, SeekFrom, Write};
+use std::io::{self, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use bytemuck::{Pod, Zeroable};
 
 use super::descriptor::PlaceDescriptor;
 use super::scan_panorama::{FAR, steps_of};
-use crate::files::{remove_abandoned, write_atomically};
+use crate::files::{remove_abandoned, require_own, write_atomically};
 use crate::lidar::LidarModel;
 use crate::raycasting::{TileError, TileProblem};
 use crate::rendering::RenderError;
@@ -26,7 +26,7 @@ use crate::shared_bytes::{SharedBytes, pad, ranges_of, write_part};
 /// Panoramas rendered at a time.
 pub(crate) const BATCH: usize = 512;
 
-const MAGIC: [u8; 8] = *b"fpmclpan";
+pub(crate) const MAGIC: [u8; 8] = *b"fpmclpan";
 const VERSION: u32 = 1;
 
 /// A cell of the search on a level of the ground.
@@ -54,16 +54,12 @@ pub(crate) struct Panoramas {
 #[derive(Clone, Debug)]
 enum Source {
     Memory(Arc<[u16]>),
-    /// A file, and where in it the panoramas begin.
-    File(PathBuf, u64),
+    /// A file, where in it the panoramas begin, and the opened file: another process may remove it.
+    File(PathBuf, u64, Arc<File>),
 }
 
 /// Reads panoramas, one after the other.
-pub(crate) struct PanoramaReader<'a> {
-    of: &'a Panoramas,
-    /// Opened for the first one.
-    file: Option<File>,
-}
+pub(crate) struct PanoramaReader<'a>(&'a Panoramas);
 
 #[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
@@ -142,31 +138,36 @@ impl Panoramas {
         };
         // What cannot be removed is reported when the file cannot be written.
         let _ = remove_abandoned(path);
-        let written = write_atomically(path, |out| {
-            let mut hasher = crc32fast::Hasher::new();
-            let mut write = |out: &mut dyn Write, part: &[u8]| -> io::Result<()> {
-                hasher.update(part);
-                write_part(out, part)
-            };
-            write(out, bytemuck::bytes_of(&header))?;
-            write(out, request.as_bytes())?;
-            write(out, bytemuck::cast_slice(places))?;
-            let described = render_all(places.len(), model, &render, |image| {
-                Ok::<_, Failure>(out.write_all(bytemuck::cast_slice(image))?)
-            })?;
-            pad(out, images.len())?;
-            write(out, bytemuck::cast_slice(&described.checksums))?;
-            write(out, bytemuck::cast_slice(&described.descriptors))?;
-            write_part(out, &hasher.finalize().to_le_bytes())?;
-            Ok(described)
-        });
-        match written {
-            Ok(described) => Ok(Some(Self {
+        let own = require_own(path, MAGIC).map_err(Failure::Write);
+        let write = || {
+            write_atomically(path, |out| {
+                let mut hasher = crc32fast::Hasher::new();
+                let mut write = |out: &mut dyn Write, part: &[u8]| -> io::Result<()> {
+                    hasher.update(part);
+                    write_part(out, part)
+                };
+                write(out, bytemuck::bytes_of(&header))?;
+                write(out, request.as_bytes())?;
+                write(out, bytemuck::cast_slice(places))?;
+                let described = render_all(places.len(), model, &render, |image| {
+                    Ok::<_, Failure>(out.write_all(bytemuck::cast_slice(image))?)
+                })?;
+                pad(out, images.len())?;
+                write(out, bytemuck::cast_slice(&described.checksums))?;
+                write(out, bytemuck::cast_slice(&described.descriptors))?;
+                write_part(out, &hasher.finalize().to_le_bytes())?;
+                Ok(described)
+            })
+        };
+        let written = own.and_then(|()| write());
+        let opened = written.and_then(|described| Ok((described, File::open(path)?)));
+        match opened {
+            Ok((described, file)) => Ok(Some(Self {
                 places: places.to_vec(),
                 descriptors: described.descriptors,
                 checksums: described.checksums,
                 pixels: model.len(),
-                source: Source::File(path.to_owned(), images.start as u64),
+                source: Source::File(path.to_owned(), images.start as u64, file.into()),
             })),
             Err(Failure::Render(error)) => Err(error),
             Err(Failure::Write(error)) => {
@@ -181,6 +182,7 @@ impl Panoramas {
 
     /// Opens the panoramas of a request; `None` if the file does not have them.
     pub fn open(path: &Path, request: &str) -> Option<Self> {
+        require_own(path, MAGIC).ok()?;
         let file = SharedBytes::of_file(path).ok()?;
         let header: Header = file.header(MAGIC, VERSION)?;
         let images_begin = ranges_of(header.sizes())?[3].start as u64;
@@ -191,12 +193,13 @@ impl Panoramas {
             hasher.update(part);
         }
         let is_it = *of == *request.as_bytes() && *checksum == hasher.finalize().to_le_bytes();
-        is_it.then(|| Self {
+        let opened = File::open(path).ok().filter(|_| is_it)?;
+        Some(Self {
             places: bytemuck::cast_slice(&places).to_vec(),
             descriptors: bytemuck::cast_slice(&descriptors).to_vec(),
             checksums: bytemuck::cast_slice(&checksums).to_vec(),
             pixels: header.pixels as usize,
-            source: Source::File(path.to_owned(), images_begin),
+            source: Source::File(path.to_owned(), images_begin, opened.into()),
         })
     }
 
@@ -209,27 +212,24 @@ impl Panoramas {
     }
 
     pub fn reader(&self) -> PanoramaReader<'_> {
-        PanoramaReader {
-            of: self,
-            file: None,
-        }
+        PanoramaReader(self)
     }
 }
 
 impl PanoramaReader<'_> {
     /// The panorama of a place, row-major [steps].
-    pub fn read(&mut self, place: usize) -> Result<Cow<'_, [u16]>, TileError> {
-        let pixels = self.of.pixels;
-        match &self.of.source {
+    pub fn read(&self, place: usize) -> Result<Cow<'_, [u16]>, TileError> {
+        let pixels = self.0.pixels;
+        match &self.0.source {
             Source::Memory(images) => Ok(images[place * pixels..(place + 1) * pixels].into()),
-            Source::File(path, first) => {
+            Source::File(path, first, file) => {
                 let mut image = vec![0_u16; pixels];
                 let begin = first + 2 * (place * pixels) as u64;
-                self.read_at(path, begin, bytemuck::cast_slice_mut(&mut image))
+                read_at(file, path, begin, bytemuck::cast_slice_mut(&mut image))
                     .map_err(TileProblem::from)
                     .and_then(|()| {
                         let checksum = crc32fast::hash(bytemuck::cast_slice(&image));
-                        if checksum == self.of.checksums[place] {
+                        if checksum == self.0.checksums[place] {
                             Ok(image.into())
                         } else {
                             Err(TileProblem::Checksum)
@@ -239,15 +239,20 @@ impl PanoramaReader<'_> {
             }
         }
     }
+}
 
-    fn read_at(&mut self, path: &Path, begin: u64, bytes: &mut [u8]) -> io::Result<()> {
-        let file = match &mut self.file {
-            Some(file) => file,
-            none => none.insert(File::open(path)?),
-        };
-        file.seek(SeekFrom::Start(begin))?;
-        file.read_exact(bytes)
-    }
+#[cfg(unix)]
+fn read_at(file: &File, _path: &Path, begin: u64, bytes: &mut [u8]) -> io::Result<()> {
+    std::os::unix::fs::FileExt::read_exact_at(file, bytes, begin)
+}
+
+/// Elsewhere, a file that is open is not removed.
+#[cfg(not(unix))]
+fn read_at(_file: &File, path: &Path, begin: u64, bytes: &mut [u8]) -> io::Result<()> {
+    use std::io::{Read as _, Seek as _, SeekFrom};
+    let mut file = File::open(path)?;
+    file.seek(SeekFrom::Start(begin))?;
+    file.read_exact(bytes)
 }
 
 /// Why panoramas cannot be rendered into a file.

@@ -23,9 +23,9 @@ use crate::raycasting::{Tile, TileProblem};
 use crate::shared_bytes::{SharedBytes, join};
 
 /// Version of both files.
-const VERSION: u32 = 2;
-const TILE_MAGIC: [u8; 8] = *b"fpmcltil";
-const INDEX_MAGIC: [u8; 8] = *b"fpmclidx";
+const VERSION: u32 = 3;
+pub(crate) const TILE_MAGIC: [u8; 8] = *b"fpmcltil";
+pub(crate) const INDEX_MAGIC: [u8; 8] = *b"fpmclidx";
 
 /// Name of the index in its folder.
 pub(crate) const INDEX: &str = "index";
@@ -46,7 +46,24 @@ struct TileHeader {
     triangles: u64,
     /// Checksum of the table and the heights.
     ground_checksum: u32,
-    unused: [u8; 12],
+    /// Stamp of its name.
+    stamp: u32,
+    column: i64,
+    row: i64,
+    unused: [u8; 56],
+}
+
+impl TileHeader {
+    /// Sizes of the header and of all parts, in their order [bytes].
+    fn sizes(&self) -> [u64; 5] {
+        [
+            size_of::<Self>() as u64,
+            self.scene_bytes,
+            self.triangles.div_ceil(8),
+            (self.chunks).saturating_mul(size_of::<ChunkEntry>() as u64),
+            self.chunk_bytes,
+        ]
+    }
 }
 
 /// A chunk of the ground.
@@ -83,6 +100,7 @@ pub(crate) struct TileScene {
 /// The bytes of a tile: a part of the mesh of a map relative to `origin`, the chunks of the ground in it, and which
 /// triangles are ground.
 pub(crate) fn encode(
+    (index, stamp): (TileIndex, u32),
     part: &TriangleMesh,
     origin: DVec3,
     chunks: &[(Cell, SharedBytes)],
@@ -113,7 +131,10 @@ pub(crate) fn encode(
         chunk_bytes: heights.len() as u64,
         triangles: part.triangles.len() as u64,
         ground_checksum: 0,
-        unused: [0; 12],
+        stamp,
+        column: index.column,
+        row: index.row,
+        unused: [0; 56],
     };
     let parts: [&[u8]; 4] = [
         scene.as_ref().map_or(&[], Tile::as_bytes),
@@ -130,22 +151,27 @@ pub(crate) fn encode(
 }
 
 impl TileFile {
-    /// Maps a file into memory and checks it.
-    pub fn open(path: &Path) -> Result<Self, TileProblem> {
-        Self::decode(&SharedBytes::of_file(path)?)
+    /// Maps the file of a tile into memory and checks it.
+    pub fn open(path: &Path, index: TileIndex, stamp: u32) -> Result<Self, TileProblem> {
+        Self::decode(&SharedBytes::of_file(path)?, index, stamp)
     }
 
-    fn decode(file: &SharedBytes) -> Result<Self, TileProblem> {
+    /// Whether a file that the program wrote is as long as its header says.
+    pub fn is_whole(path: &Path) -> bool {
+        let file = SharedBytes::of_file(path);
+        file.is_ok_and(|file| {
+            let header: Option<TileHeader> = file.header(TILE_MAGIC, VERSION);
+            header.is_some_and(|header| file.parts(header.sizes()).is_some())
+        })
+    }
+
+    fn decode(file: &SharedBytes, index: TileIndex, stamp: u32) -> Result<Self, TileProblem> {
         let header = file.header(TILE_MAGIC, VERSION);
         let header: TileHeader = header.ok_or(TileProblem::Format)?;
-        let sizes = [
-            size_of::<TileHeader>() as u64,
-            header.scene_bytes,
-            header.triangles.div_ceil(8),
-            header.chunks.saturating_mul(size_of::<ChunkEntry>() as u64),
-            header.chunk_bytes,
-        ];
-        let parts = file.parts(sizes).ok_or(TileProblem::Format)?;
+        if (header.column, header.row, header.stamp) != (index.column, index.row, stamp) {
+            return Err(TileProblem::Name);
+        }
+        let parts = file.parts(header.sizes()).ok_or(TileProblem::Format)?;
         let [_, scene, is_ground, entries, heights] = parts;
         if checksum_of([&entries, &heights]) != header.ground_checksum {
             return Err(TileProblem::Checksum);

@@ -5,7 +5,7 @@
 //! than [`KEPT_BYTES`].
 
 use std::collections::{BTreeMap, HashMap};
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File};
 use std::io::{self, BufRead as _, BufReader, Write as _};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -14,9 +14,12 @@ use std::time::UNIX_EPOCH;
 
 use glam::{DVec3, Vec3};
 
-use super::file::{self, ENDING, INDEX, Source, TileEntry, TileFile, TileFileIndex, TileScene};
+use super::contents::{CacheFile, CacheKind, PANORAMAS, files_of, is_in_use};
+use super::file::{
+    self, INDEX, INDEX_MAGIC, Source, TILE_MAGIC, TileEntry, TileFile, TileFileIndex, TileScene,
+};
 use super::grid::{TileIndex, triangles_of_tiles};
-use crate::files::{remove_abandoned, write_atomically};
+use crate::files::{remove_abandoned, require_no_link, require_own, write_atomically};
 use crate::geometry::mesh::on_lattice;
 use crate::geometry::{Aabb, TriangleMesh};
 use crate::map::build::plan::origin_near;
@@ -32,8 +35,6 @@ use crate::shared_bytes::SharedBytes;
 
 /// Memory of tiles above which those far from the rays are dropped [bytes].
 const KEPT_BYTES: u64 = 96 << 20;
-/// Ending of the names of files of panoramas.
-const PANORAMAS: &str = ".panoramas";
 /// Tiles nearer to the origins of rays are not dropped [m].
 const KEPT_M: f64 = 120.0;
 /// Tiles nearer to the origins of rays are read ahead [m].
@@ -119,7 +120,9 @@ impl TileSource<TileError> for Resident {
 impl Files {
     fn read(&self, number: usize) -> Result<Arc<LoadedTile>, TileError> {
         let path = self.path(number);
-        let file = TileFile::open(&path).map_err(|problem| TileError::new(path, problem))?;
+        let index = self.tiles[number].index();
+        let file = TileFile::open(&path, index, self.stamp);
+        let file = file.map_err(|problem| TileError::new(path, problem))?;
         self.bytes
             .fetch_add(file.ground_bytes() as u64, Ordering::Relaxed);
         Ok(Arc::new(LoadedTile {
@@ -154,6 +157,10 @@ impl TileStore {
         has_given_path: bool,
         side_m: f64,
     ) -> io::Result<Option<Self>> {
+        // What others put there is reported when tiles are to be made.
+        if require_own_index(folder).is_err() {
+            return Ok(None);
+        }
         let in_use = in_use(folder);
         let bytes = match fs::read(folder.join(INDEX)) {
             Ok(bytes) => bytes,
@@ -185,7 +192,10 @@ impl TileStore {
             }
         }
         let stamp = now.stamp();
-        let is_there = |tile: &TileEntry| tile.file(folder, stamp).is_file();
+        let is_there = |tile: &TileEntry| {
+            let file = tile.file(folder, stamp);
+            require_own(&file, TILE_MAGIC).is_ok() && TileFile::is_whole(&file)
+        };
         let are_all_there = index.tiles.iter().all(is_there);
         Ok(are_all_there.then(|| Self::over(folder.to_owned(), in_use, index, KEPT_BYTES)))
     }
@@ -209,6 +219,7 @@ impl TileStore {
     ) -> io::Result<Option<Self>> {
         let side_m = source.side_m;
         let stamp = source.stamp();
+        require_own_index(folder)?;
         fs::create_dir_all(folder)?;
         remove_abandoned(folder)?;
         let mut triangles_of = triangles_of_tiles(mesh, side_m);
@@ -230,12 +241,14 @@ impl TileStore {
                 .filter(|(chunk, _)| tile_of_chunk(*chunk, side_m) == *tile)
                 .collect();
             let of_part = |triangle: usize| is_ground(triangles[triangle] as usize);
-            let (bytes, bounds) = file::encode(&part, origin, &chunks, of_part);
+            let (bytes, bounds) = file::encode((*tile, stamp), &part, origin, &chunks, of_part);
             if triangles.is_empty() && chunks.is_empty() {
                 continue;
             }
             let entry = TileEntry::new(*tile, bounds, triangles.len());
-            write_atomically(&entry.file(folder, stamp), |out| out.write_all(&bytes))?;
+            let file = entry.file(folder, stamp);
+            require_own(&file, TILE_MAGIC)?;
+            write_atomically(&file, |out| out.write_all(&bytes))?;
             tiles.push(entry);
         }
         let has_given_path = source.has_given_path != 0;
@@ -536,6 +549,12 @@ fn checksum_of(path: &Path) -> io::Result<u32> {
     }
 }
 
+/// Requires that a folder of tiles is no link and has no index that others wrote.
+fn require_own_index(folder: &Path) -> io::Result<()> {
+    require_no_link(folder)?;
+    require_own(&folder.join(INDEX), INDEX_MAGIC)
+}
+
 /// A folder of tiles, locked as one that is in use; `None` where there are no such locks.
 fn in_use(folder: &Path) -> Option<File> {
     let opened = File::open(folder).ok()?;
@@ -544,19 +563,16 @@ fn in_use(folder: &Path) -> Option<File> {
 
 /// Removes the tiles and panoramas with another stamp, unless a process may use them.
 fn remove_others(folder: &Path, stamp: u32) -> io::Result<()> {
-    let opened = File::open(folder);
-    if (opened.as_ref()).is_ok_and(|it| matches!(it.try_lock(), Err(TryLockError::WouldBlock))) {
+    if is_in_use(folder) {
         return Ok(());
     }
-    for entry in fs::read_dir(folder)? {
-        let entry = entry?;
-        let name = entry.file_name().to_string_lossy().into_owned();
-        let is_other = |ending: &str| {
-            name.ends_with(ending) && !name.ends_with(&format!(".{stamp:08x}{ending}"))
-        };
-        if is_other(ENDING) || is_other(PANORAMAS) {
-            fs::remove_file(entry.path())?;
-        }
+    let stamp = format!(".{stamp:08x}");
+    let is_other = |file: &CacheFile| {
+        let name = file.path.file_stem().unwrap_or_default();
+        file.kind != CacheKind::Index && !name.to_string_lossy().ends_with(&stamp)
+    };
+    for file in files_of(folder)?.iter().filter(|file| is_other(file)) {
+        fs::remove_file(&file.path)?;
     }
     Ok(())
 }
@@ -826,7 +842,7 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_tile_is_an_error_of_each_call_that_needs_it_and_a_damaged_index_is_made_again() {
+    fn a_damaged_tile_is_an_error_of_each_call_that_needs_it() {
         let (_folder, file) = saved();
         drop(Map::load(&file, &options()).unwrap());
         let store = open(&file).unwrap();
@@ -838,12 +854,22 @@ mod tests {
             bad[byte] ^= 1;
             bad
         };
+        let other_square = TileEntry::new(TileIndex::of(300.0, 0.0, 100.0), None, 0);
+        let of_other_square = fs::read(other_square.file(&folder, stamp)).unwrap();
+        let (_other_folder, other_map) = saved();
+        let mut less = street();
+        less.triangles.pop();
+        crate::map::files::ply::write(&other_map, &less, Some(&path())).unwrap();
+        drop(Map::load(&other_map, &options()).unwrap());
+        let other = open(&other_map).unwrap().files.clone();
+        let same_square = TileEntry::new(TileIndex::of(600.0, 0.0, 100.0), None, 0);
+        let of_other_map = fs::read(same_square.file(&other.folder, other.stamp)).unwrap();
         let pose = Pose3::translation(600.0, 0.0, 4.4);
         for (bytes, problem, has_ground) in [
             (&damaged(300)[..], "checksum", true),
             (&damaged(whole.len() - 1), "checksum", false),
-            (&whole[..300], "incomplete", false),
-            (&[], "tile", false),
+            (&of_other_square, "another tile", false),
+            (&of_other_map, "another tile", false),
         ] {
             // Replaced as a whole, as files that may be mapped have to be.
             fs::remove_file(&tile).unwrap();
@@ -883,13 +909,28 @@ mod tests {
             assert!(renderer.cast(&[elsewhere], &[Vec3::Y], 50.0).is_ok());
             assert!(ground.patch_at(300.0, 0.0, 2.0, None).unwrap().is_some());
         }
+    }
+
+    #[test]
+    fn tiles_that_were_cut_short_are_made_again_and_an_index_of_others_is_left_alone() {
+        let (_folder, file) = saved();
+        drop(Map::load(&file, &options()).unwrap());
+        let store = open(&file).unwrap();
+        let (folder, stamp) = (store.files.folder.clone(), store.files.stamp);
+        let tile = TileEntry::new(TileIndex::of(600.0, 0.0, 100.0), None, 0).file(&folder, stamp);
+        let whole = fs::read(&tile).unwrap();
+        let expected = seen(&Map::new(street(), path(), &options()).unwrap());
+        for length in [whole.len() - 1, 300, 0] {
+            // Replaced as a whole, as files that may be mapped have to be.
+            fs::remove_file(&tile).unwrap();
+            fs::write(&tile, &whole[..length]).unwrap();
+            let map = Map::load(&file, &options()).unwrap();
+            assert!(seen(&map) == expected);
+            assert_eq!(fs::read(&tile).unwrap(), whole, "{length}");
+        }
         fs::write(folder.join(INDEX), b"nothing").unwrap();
-        let map = Map::load(&file, &options()).unwrap();
-        assert!(
-            map.renderer
-                .cast(&[Pose3::translation(600.0, 0.0, 4.4)], &[Vec3::Y], 50.0)
-                .is_ok()
-        );
+        assert!(seen(&Map::load(&file, &options()).unwrap()) == expected);
+        assert_eq!(fs::read(folder.join(INDEX)).unwrap(), b"nothing");
     }
 
     #[test]
