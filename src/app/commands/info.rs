@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Result, bail, ensure};
+use anyhow::{Context as _, Result, bail, ensure};
 use clap::Args;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -17,7 +17,9 @@ use crate::app::settings;
 use crate::evaluation::RangeMclRules;
 use crate::geometry::Aabb;
 use crate::lidar::Scan;
+use crate::map::MapCache;
 use crate::map::files::ply;
+use crate::map::tiles::contents::{self, CacheKind};
 use crate::map::unit_doubt;
 use crate::recording::{PoseTrack, Recording, Selection, scan_files};
 use crate::sensor::{BeamSource, Sensor, SensorConfig, spread_scans};
@@ -36,6 +38,10 @@ pub struct InfoArgs {
     /// Largest memory that a stage may plan for; by default half of the machine's.
     #[arg(long, value_name = "GIB", value_parser = gibibytes)]
     pub memory: Option<f64>,
+
+    /// Remove the tiles and panoramas that are kept next to the map, before it is described.
+    #[arg(long)]
+    pub clear_cache: bool,
 }
 
 impl InfoArgs {
@@ -71,6 +77,9 @@ pub fn run(args: &InfoArgs) -> Result<Printed> {
         "{} does not exist; give a recording (a folder or a bag), a scan or point cloud, a map (.ply) or a result (.npz)",
         path.display()
     );
+    if args.clear_cache {
+        clear_cache(path)?;
+    }
     let extension = path.extension().and_then(|extension| extension.to_str());
     match extension {
         _ if path.is_dir() || is_bag(path) => recording(path, config.topic.as_deref()),
@@ -224,8 +233,39 @@ fn extent(bounds: Aabb) -> String {
     )
 }
 
-fn map(path: &Path) -> Result<Printed> {
-    let (mesh, mapping_path) = ply::read_map(path)?;
+/// Removes the cache of a map.
+fn clear_cache(map: &Path) -> Result<()> {
+    ensure!(
+        map.is_file() && scan_files::is_mesh(map),
+        "{} is not a map, which alone has a cache; leave out --clear-cache",
+        map.display()
+    );
+    let folder = MapCache::NextToMap.folder_of(map);
+    let cleared = folder.as_deref().map_or(Ok(()), contents::clear);
+    cleared.with_context(|| format!("the cache of {} cannot be removed", map.display()))
+}
+
+/// Number and size of the files of the cache of a map; `None` where there are none.
+fn cache_of(map: &Path) -> Option<String> {
+    let folder = MapCache::NextToMap.folder_of(map).unwrap_or_default();
+    // What cannot be read is not used either.
+    let files = contents::files_of(&folder).unwrap_or_default();
+    let count = |kind| files.iter().filter(|file| file.kind == kind).count();
+    let bytes: u64 = files.iter().map(|file| file.bytes).sum();
+    let described = || {
+        format!(
+            "{} tiles and {} panoramas, {:.1} MB in {}; --clear-cache removes them",
+            count(CacheKind::Tile),
+            count(CacheKind::Panoramas),
+            bytes as f64 / 1e6,
+            folder.display()
+        )
+    };
+    (!files.is_empty()).then(described)
+}
+
+fn map(file: &Path) -> Result<Printed> {
+    let (mesh, mapping_path) = ply::read_map(file)?;
     let path = match mapping_path {
         Some(path) if !path.map_from_lidar.is_empty() => {
             format!("{} poses of the mapping drive", path.map_from_lidar.len())
@@ -239,6 +279,7 @@ fn map(path: &Path) -> Result<Printed> {
         ("path", path),
     ];
     rows.extend(unit_doubt(&bounds).map(|doubt| ("unit", doubt)));
+    rows.extend(cache_of(file).map(|cache| ("cache", cache)));
     Ok(Printed::rows(&rows))
 }
 
