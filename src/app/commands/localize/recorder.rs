@@ -66,7 +66,8 @@ impl Run {
                 agreements: column(true),
                 places: column(true),
                 states: column(true),
-                scan_outlines: Some(RowLog::in_folder(folder)),
+                scan_outlines: (selected.len() <= ScanOutline::MOST_FRAMES)
+                    .then(|| RowLog::in_folder(folder)),
                 selected: Some(selected.len()),
             },
             writer: None,

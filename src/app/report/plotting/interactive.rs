@@ -28,9 +28,6 @@ pub struct InteractivePath<'a> {
     pub map: Option<&'a MapImage>,
 }
 
-/// Largest number of frames whose scans are in the page: 50 MB.
-const MOST_OUTLINES: usize = 50_000;
-
 impl InteractivePath<'_> {
     /// Writes the content as JSON.
     pub fn save(&self, path: &Path) -> Result<()> {
@@ -79,10 +76,7 @@ impl InteractivePath<'_> {
             "states": states.map(|all| all.iter().map(word).collect::<Vec<_>>()),
             "state_colors": Value::Object(colors.into_iter().collect()),
             "colormap": (0..10).map(|k| css(Colormap::Viridis.at(f64::from(k) / 9.0))).collect::<Vec<_>>(),
-            "scans": (results.scan_outlines.as_ref())
-                .filter(|outlines| outlines.len() <= MOST_OUTLINES)
-                .map(encoded)
-                .transpose()?,
+            "scans": results.scan_outlines.as_ref().map(encoded).transpose()?,
         }))
     }
 }

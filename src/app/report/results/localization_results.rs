@@ -106,6 +106,8 @@ pub struct ScanOutline(pub Vec<[i16; 2]>);
 impl ScanOutline {
     /// Largest number of points.
     pub const MAX: usize = 256;
+    /// Largest number of frames of a run that keeps the outlines of its scans: 50 MB in its page.
+    pub const MOST_FRAMES: usize = 50_000;
 
     /// Points at the height of the sensor, at even distances in the order of the scan, moved to the moment of its pose.
     pub fn of(scan: &Scan, motion: Option<&Motion>) -> Self {
