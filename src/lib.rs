@@ -162,6 +162,7 @@ pub mod internals {
         pub use crate::app::comparison::ComparisonConfig;
         pub use crate::app::report::plotting::{Bitmap, LineChart, Panel, Series, color};
         pub use crate::app::report::results::LocalizationResults;
+        pub use crate::app::schemas::schemas;
         pub use crate::app::settings;
     }
 

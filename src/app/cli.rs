@@ -261,8 +261,8 @@ impl Command {
         }
     }
 
-    /// Runs the command; returns what to print.
-    pub fn run(&self, context: &Context) -> anyhow::Result<Printed> {
+    /// Runs the command; returns what to print. `form` is that of what is printed in spite of an error.
+    pub fn run(&self, form: Form, context: &Context) -> anyhow::Result<Printed> {
         match self {
             Self::Info(args) => info::run(args),
             Self::BuildMap(args) => {
@@ -318,7 +318,7 @@ impl Command {
                 };
                 simulate::run(&config, existing, &context)
             }
-            Self::Compare(args) => Ok(Printed::text(compare::run(args, context)?)),
+            Self::Compare(args) => compare::run(args, form, context),
             Self::Demo(args) => demo::run(args, context),
             Self::Ground(args) => ground::run(args, context),
             Self::Config(args) => args.run(),

@@ -10,8 +10,9 @@ pub mod report;
 mod commands;
 // Many runs.
 pub mod comparison;
-// The command line.
+// The command line, and what it prints for programs.
 pub mod cli;
+pub mod schemas;
 
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -39,7 +40,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     };
     let run = || {
         let context = Context::new(cli.level(), cli.command.machine())?;
-        output::print(&cli.command.run(&context)?.in_form(cli.form()))
+        output::print(&cli.command.run(cli.form(), &context)?.in_form(cli.form()))
     };
     match run() {
         Ok(()) => 0,

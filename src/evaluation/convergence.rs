@@ -28,6 +28,7 @@ pub struct StrictSuccess {
 
 /// Convergence of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct Convergence {
     /// Row of the first frame after convergence.
     pub row: usize,

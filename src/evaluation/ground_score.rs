@@ -47,6 +47,7 @@ impl GroundProtocol {
 
 /// The confusion matrix of ground segmentation [points].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct GroundScore {
     /// Ground classified as ground.
     pub true_positives: u64,
@@ -155,6 +156,7 @@ pub struct GroundTally {
 
 /// The result of a classifier over several scans.
 #[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct GroundMethodReport {
     /// Name of the method.
     pub name: String,
@@ -170,11 +172,17 @@ pub struct GroundMethodReport {
 
 /// The scores of a confusion matrix, 0 to 1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct GroundScores {
+    /// Share of the points classified as ground that are ground.
     pub precision: f64,
+    /// Share of the ground that is classified as ground.
     pub recall: f64,
+    /// Harmonic mean of precision and recall.
     pub f1: f64,
+    /// Intersection over union.
     pub iou: f64,
+    /// Numbers of points.
     pub counts: GroundScore,
 }
 

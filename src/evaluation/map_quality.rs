@@ -38,6 +38,7 @@ const BEAM_STEP: usize = 7;
 
 /// Shares of all evaluated beams (unitless), and medians over those that hit [m].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct MapQuality {
     /// Number of evaluated beams.
     pub beams: usize,

@@ -27,6 +27,7 @@ const AREA_M2: f32 = 0.01;
 
 /// Agreement of a map with the true surface.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct TruthAgreement {
     /// Share of the map's area within 10 cm of the truth (unitless).
     pub accuracy: f64,

@@ -41,6 +41,7 @@ pub struct EvaluatedTrajectory<'a> {
 
 /// Error along and across the true heading [m].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct AxisError {
     /// Root mean square [m].
     pub rmse_m: f64,
@@ -50,6 +51,7 @@ pub struct AxisError {
 
 /// Smoothness of the estimate, and of the truth for comparison.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct Smoothness {
     /// RMS difference of consecutive planar error vectors [m].
     pub jitter_m: Option<f64>,
@@ -67,6 +69,7 @@ pub struct Smoothness {
 
 /// Metrics of one trajectory.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct TrajectoryMetrics {
     /// Number of evaluated frames.
     pub frames: usize,

@@ -82,6 +82,7 @@ pub struct Segment {
 
 /// Mean error per distance over segments.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct SegmentErrors {
     /// Translation error per distance driven [%].
     pub translation_percent: f64,

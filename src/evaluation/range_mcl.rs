@@ -40,6 +40,7 @@ pub struct RangeMclRules {
 
 /// Errors of a trajectory by range-mcl's rules.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct RangeMclErrors {
     /// Whether the position error was below the threshold at every checked row; absent if the run is too
     /// short for one.

@@ -20,6 +20,7 @@ use crate::geometry::{Pose3, distances_m};
 
 /// Errors in space, in addition to those in the plane.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct SpatialMetrics {
     /// Distance to the true position [m].
     pub position_m: Summary,
@@ -57,6 +58,7 @@ pub struct SpatialMetrics {
 
 /// Mean errors of the segments of one length.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct LengthErrors {
     /// Length [m].
     pub length_m: f64,

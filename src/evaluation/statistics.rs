@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 /// Statistics of the magnitudes of errors or times, all in their unit.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct Summary {
     /// Root mean square.
     pub rmse: f64,

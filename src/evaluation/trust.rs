@@ -35,6 +35,7 @@ pub struct TrustedRun<'a> {
 
 /// Errors of a run against its states and covariances.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct Trust {
     /// Number of frames.
     pub frames: usize,

@@ -32,6 +32,7 @@ pub const PERIOD_S: f64 = 0.1;
 
 /// Direction of rotation of a spinning sensor, seen from above.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum RotationDirection {
     /// From the left over the front to the right.

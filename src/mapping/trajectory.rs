@@ -63,6 +63,7 @@ pub(super) fn each_scan(
 
 /// What a trajectory shows about itself.
 #[derive(Clone, Debug, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct TrajectorySummary {
     /// Number of scans.
     pub scans: usize,
@@ -88,6 +89,7 @@ pub struct TrajectorySummary {
 
 /// Numbers of loops.
 #[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct LoopCounts {
     /// The poses follow them.
     pub accepted: usize,

@@ -20,6 +20,7 @@ use super::planes::{LidarFrame, Plane, ScanPoints};
 
 /// Angle to add to the elevations of all beams, so that surfaces fit themselves best.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct ElevationBias {
     /// The angle [deg].
     pub deg: f64,

@@ -32,7 +32,9 @@ pub enum RenderingMethod {
 }
 
 /// Type of a graphics adapter, best first.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
+#[serde(rename_all = "lowercase")]
 pub enum AdapterKind {
     Discrete,
     Integrated,
@@ -54,7 +56,8 @@ impl fmt::Display for AdapterKind {
 }
 
 /// A graphics adapter of this machine and its limits.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct AdapterReport {
     /// Name given by the driver.
     pub name: String,

@@ -19,6 +19,7 @@ use crate::lidar::Scan;
 
 /// What the beams of a sensor follow from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum BeamSource {
     /// The sensor has no rows.

@@ -42,6 +42,7 @@ use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 
 /// What a sensor is, and how its scans are used.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 #[serde(deny_unknown_fields)]
 pub struct Sensor {
     /// Projection: rows are the beams that returned, or pixels of about the spacing of the points if there

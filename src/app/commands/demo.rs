@@ -6,10 +6,14 @@ use std::time::Instant;
 
 use anyhow::{Context as _, Result};
 use clap::Args;
+use schemars::JsonSchema;
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::simulate::{self, Existing};
 use super::{build_map, localize, refine};
+use crate::app::report::Report;
+use crate::app::report::map::BuildReport;
 use crate::app::run::arguments::yaml;
 use crate::app::run::{Context, Form, MachineArgs, Printed};
 use crate::app::settings::{self, BuildMapConfig, LocalizationConfig, RefinementConfig};
@@ -34,6 +38,17 @@ pub struct DemoArgs {
     /// Renderer and threads.
     #[command(flatten)]
     pub machine: MachineArgs,
+}
+
+/// Reports of the map and of the second drive.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct DemoReport {
+    /// The map.
+    build_map: BuildReport,
+    /// The localized and refined drive.
+    localization: Report,
+    /// Time of all of it [s].
+    seconds: f64,
 }
 
 /// Default number of frames per drive.
@@ -100,11 +115,12 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Printed> {
             page.display()
         ))
     };
-    Printed::parts(text(Form::Main, false)?, text(Form::All, true)?).with_json(&json!({
-        "build_map": build,
-        "localization": report,
-        "seconds": seconds,
-    }))
+    let printed = Printed::parts(text(Form::Main, false)?, text(Form::All, true)?);
+    printed.with_json(&DemoReport {
+        build_map: build,
+        localization: report,
+        seconds,
+    })
 }
 
 /// A configuration with the recording of a drive, its true poses, and further keys; existing output is replaced.

@@ -1,7 +1,7 @@
 //! `doctor`: instruction sets, graphics adapters and rendering speed of this machine.
 
-use std::collections::BTreeMap;
 use std::env::consts::{ARCH, OS};
+use std::num::NonZeroUsize;
 use std::sync::Arc;
 use std::thread::available_parallelism;
 use std::time::{Duration, Instant};
@@ -9,6 +9,8 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use clap::Args;
 use nalgebra::Vector3;
+use schemars::JsonSchema;
+use serde::Serialize;
 
 use crate::app::run::memory;
 use crate::app::run::{Context, Printed, version};
@@ -39,44 +41,145 @@ const IMAGES: usize = 8;
 const PARTICLES: usize = 1000;
 const BEAMS: usize = 600;
 
-/// What and how much.
-type Row = (&'static str, String);
+/// What the program finds on a machine.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct MachineReport {
+    /// Version of the program.
+    fpmcl: &'static str,
+    /// Operating system.
+    system: &'static str,
+    /// Architecture of the processor.
+    architecture: &'static str,
+    /// Vector instructions that the ray caster can use.
+    instruction_sets: Vec<&'static str>,
+    /// Number of processors, if it is known.
+    processors: Option<usize>,
+    /// Number of threads in use.
+    threads: usize,
+    /// Whether support of graphics adapters is built in.
+    has_graphics_support: bool,
+    /// Graphics adapters, best first.
+    adapters: Vec<AdapterReport>,
+    /// The renderer that `--backend auto` selects.
+    backend_auto: String,
+    /// Why it is selected.
+    backend_reason: String,
+    /// Measured speeds; empty with `--measure 0`.
+    speeds: Vec<Speed>,
+    /// Difference of the weights of particles between graphics adapter and CPU.
+    weights: Option<WeightDifference>,
+}
+
+/// Speed of a renderer.
+#[derive(Debug, Serialize, JsonSchema)]
+struct Speed {
+    /// The renderer.
+    renderer: String,
+    /// What was rendered and how.
+    work: String,
+    /// Rays per second.
+    rays_per_second: f64,
+    /// Time of one image, or of the beams of all particles [ms].
+    ms: f64,
+    /// The same in words.
+    #[serde(skip)]
+    text: String,
+}
+
+/// How far apart the weights of particles are by two renderers.
+#[derive(Debug, Serialize, JsonSchema)]
+struct WeightDifference {
+    /// 99th percentile [%].
+    p99_percent: f64,
+    /// Maximum [%].
+    max_percent: f64,
+}
 
 /// The properties of this machine, one per line.
 pub fn run(args: &DoctorArgs, context: &Context) -> Result<Printed> {
     let choice = selection::choose(Backend::Auto, RenderingMethod::Auto)?;
-    let processors = available_parallelism().map_or("unknown".to_owned(), |n| n.to_string());
-    let graphics = if cfg!(feature = "gpu") {
-        "built in"
-    } else {
-        "not built in; build with the feature gpu"
+    let mut report = MachineReport {
+        fpmcl: version::VERSION,
+        system: OS,
+        architecture: ARCH,
+        instruction_sets: instruction_sets(),
+        processors: available_parallelism().ok().map(NonZeroUsize::get),
+        threads: context.threads,
+        has_graphics_support: cfg!(feature = "gpu"),
+        backend_auto: choice.name(),
+        backend_reason: choice.reason,
+        adapters: choice.adapters,
+        speeds: Vec::new(),
+        weights: None,
     };
-    let mut rows: Vec<Row> = vec![
-        ("fpmcl", version::VERSION.to_owned()),
-        ("system", format!("{OS} on {ARCH}")),
-        ("instruction sets", instruction_sets()),
-        ("processors", processors),
-        ("threads in use", context.threads.to_string()),
-        ("graphics support", graphics.to_owned()),
-    ];
-    rows.extend(choice.adapters.iter().map(|it| ("adapter", adapter(it))));
-    rows.push((
-        "backend auto",
-        format!("{}, because {}", choice.name(), choice.reason),
-    ));
     if args.measure > 0 {
-        let time = Duration::from_secs(args.measure);
-        rows.extend(measurements(time, &choice.adapters)?);
+        report.measure(Duration::from_secs(args.measure))?;
     }
-    let table = (rows.iter()).map(|(what, value)| format!("{what:<18}{value}\n"));
-    let json: BTreeMap<&str, Vec<&str>> =
-        rows.iter()
-            .fold(BTreeMap::new(), |mut json, (what, value)| {
-                // A machine may have several adapters.
-                json.entry(*what).or_default().push(value);
-                json
-            });
-    Printed::text(table.collect::<String>()).with_json(&json)
+    Printed::text(report.to_text()).with_json(&report)
+}
+
+impl MachineReport {
+    fn to_text(&self) -> String {
+        let processors = self.processors.map(|count| count.to_string());
+        let graphics = if self.has_graphics_support {
+            "built in"
+        } else {
+            "not built in; build with the feature gpu"
+        };
+        let instruction_sets = if self.instruction_sets.is_empty() {
+            "none that the ray caster uses".to_owned()
+        } else {
+            self.instruction_sets.join(", ")
+        };
+        let mut rows = vec![
+            ("fpmcl", self.fpmcl.to_owned()),
+            (
+                "system",
+                format!("{} on {}", self.system, self.architecture),
+            ),
+            ("instruction sets", instruction_sets),
+            ("processors", processors.unwrap_or("unknown".to_owned())),
+            ("threads in use", self.threads.to_string()),
+            ("graphics support", graphics.to_owned()),
+        ];
+        rows.extend(self.adapters.iter().map(|it| ("adapter", adapter(it))));
+        let backend = format!("{}, because {}", self.backend_auto, self.backend_reason);
+        rows.push(("backend auto", backend));
+        rows.extend(self.speeds.iter().map(|it| ("rays", it.text.clone())));
+        rows.extend(self.weights.iter().map(|it| {
+            let WeightDifference { p99_percent, max_percent } = it;
+            let text = format!("of 99 % of the particles within {p99_percent:.3} % of those of the CPU, of all within {max_percent:.3} %");
+            ("weights", text)
+        }));
+        (rows.iter())
+            .map(|(what, value)| format!("{what:<18}{value}\n"))
+            .collect()
+    }
+
+    /// Measures rays per second of the CPU and of the best graphics adapter, if there is one, and how far apart the
+    /// weights are that they give particles.
+    fn measure(&mut self, time: Duration) -> Result<()> {
+        let workload = Workload::new()?;
+        let cpu = workload.renderer(Backend::Cpu, RenderingMethod::Cast)?;
+        let has_adapter = best_adapter(&self.adapters, Backend::Gpu).is_some();
+        let time = time / if has_adapter { 5 } else { 2 };
+        self.speeds.push(workload.images("cast", time, &*cpu)?);
+        self.speeds.push(workload.beams(time, &*cpu)?);
+        if !has_adapter {
+            return Ok(());
+        }
+        let gpu = workload.renderer(Backend::Gpu, RenderingMethod::Cast)?;
+        self.speeds.push(workload.images("cast", time, &*gpu)?);
+        self.speeds.push(workload.beams(time, &*gpu)?);
+        match workload.renderer(Backend::Gpu, RenderingMethod::Raster) {
+            Ok(gpu) => self
+                .speeds
+                .push(workload.images("rasterized", time, &*gpu)?),
+            Err(error) => tracing::warn!("{error}"),
+        }
+        self.weights = Some(workload.weights(&*cpu, &*gpu)?);
+        Ok(())
+    }
 }
 
 /// An adapter, its driver, and the reason if it cannot be used.
@@ -94,30 +197,25 @@ fn adapter(report: &AdapterReport) -> String {
     )
 }
 
-/// Rays per second of the CPU and of the best graphics adapter, if there is one, and how far apart the weights are that they
-/// give particles.
-fn measurements(time: Duration, adapters: &[AdapterReport]) -> Result<Vec<Row>> {
-    let workload = Workload::new()?;
-    let cpu = workload.renderer(Backend::Cpu, RenderingMethod::Cast)?;
-    let has_adapter = best_adapter(adapters, Backend::Gpu).is_some();
-    let time = time / if has_adapter { 5 } else { 2 };
-    let mut rows = vec![
-        ("rays", workload.images("cast", time, &*cpu)?),
-        ("rays", workload.beams(time, &*cpu)?),
-    ];
-    if !has_adapter {
-        return Ok(rows);
+impl Speed {
+    /// The speed of a renderer, and the time of some of its rays.
+    fn new(
+        renderer: &dyn RangeRenderer,
+        work: String,
+        rays_per_second: f64,
+        rays: usize,
+        place: &str,
+    ) -> Self {
+        let ms = 1e3 * rays as f64 / rays_per_second;
+        let (renderer, millions) = (renderer.name(), 1e-6 * rays_per_second);
+        Self {
+            text: format!("{millions:.2} M per second, {work}, {ms:.2} ms{place} by {renderer}"),
+            renderer,
+            work,
+            rays_per_second,
+            ms,
+        }
     }
-    let gpu = workload.renderer(Backend::Gpu, RenderingMethod::Cast)?;
-    rows.push(("rays", workload.images("cast", time, &*gpu)?));
-    rows.push(("rays", workload.beams(time, &*gpu)?));
-    let rasterized = match workload.renderer(Backend::Gpu, RenderingMethod::Raster) {
-        Ok(gpu) => workload.images("rasterized", time, &*gpu)?,
-        Err(error) => error.to_string(),
-    };
-    rows.push(("rays", rasterized));
-    rows.push(("weights", workload.weights(&*cpu, &*gpu)?));
-    Ok(rows)
 }
 
 /// The simulated street, a scan of it, and particles around its pose.
@@ -171,42 +269,36 @@ impl Workload {
     }
 
     /// Speed with which whole images are compared.
-    fn images(&self, how: &str, time: Duration, renderer: &dyn RangeRenderer) -> Result<String> {
+    fn images(&self, how: &str, time: Duration, renderer: &dyn RangeRenderer) -> Result<Speed> {
         let (poses, unlimited) = (&self.particles[..IMAGES], RangeDifference::UNLIMITED);
         let pixels = self.scan.beams().count();
         let rays = rays_per_second(time, poses.len() * pixels, || {
             renderer.compare_images(poses, &self.scan, &unlimited)
         })?;
-        Ok(format!(
-            "{:.2} M per second, images of {} x {} {how}, {:.2} ms each, in a street of {} triangles by {}",
-            1e-6 * rays,
-            self.scan.model.height,
-            self.scan.model.width,
-            1e3 * pixels as f64 / rays,
-            self.triangles,
-            renderer.name()
-        ))
+        let LidarModel { height, width, .. } = self.scan.model;
+        let work = format!("images of {height} x {width} {how}");
+        let place = format!(" each, in a street of {} triangles", self.triangles);
+        Ok(Speed::new(renderer, work, rays, pixels, &place))
     }
 
     /// Speed with which beams are compared.
-    fn beams(&self, time: Duration, renderer: &dyn RangeRenderer) -> Result<String> {
+    fn beams(&self, time: Duration, renderer: &dyn RangeRenderer) -> Result<Speed> {
         let difference = self.observation.difference();
         let count = self.particles.len() * self.beams.len();
         let rays = rays_per_second(time, count, || {
             renderer.compare(&self.particles, &self.beams, &difference)
         })?;
-        Ok(format!(
-            "{:.2} M per second, {} beams of each of {} particles, {:.2} ms, by {}",
-            1e-6 * rays,
-            self.beams.len(),
-            self.particles.len(),
-            1e3 * count as f64 / rays,
-            renderer.name()
-        ))
+        let (beams, particles) = (self.beams.len(), self.particles.len());
+        let work = format!("{beams} beams of each of {particles} particles");
+        Ok(Speed::new(renderer, work, rays, count, ","))
     }
 
     /// How far apart the likelihoods of the particles are by two renderers.
-    fn weights(&self, cpu: &dyn RangeRenderer, gpu: &dyn RangeRenderer) -> Result<String> {
+    fn weights(
+        &self,
+        cpu: &dyn RangeRenderer,
+        gpu: &dyn RangeRenderer,
+    ) -> Result<WeightDifference> {
         let difference = self.observation.difference();
         let logs = |renderer: &dyn RangeRenderer| -> Result<Vec<f64>> {
             let costs_m = renderer.compare(&self.particles, &self.beams, &difference)?;
@@ -220,11 +312,10 @@ impl Workload {
         apart.sort_by(f64::total_cmp);
         // A beam that passes an edge within rounding may end on either side of it.
         let per_cent = |share: usize| 100.0 * apart[(apart.len() - 1) * share / 100].exp_m1();
-        Ok(format!(
-            "of 99 % of the particles within {:.3} % of those of the CPU, of all within {:.3} %",
-            per_cent(99),
-            per_cent(100)
-        ))
+        Ok(WeightDifference {
+            p99_percent: per_cent(99),
+            max_percent: per_cent(100),
+        })
     }
 }
 
@@ -245,7 +336,7 @@ fn rays_per_second<T>(
 }
 
 /// The vector instructions that the ray caster can use.
-fn instruction_sets() -> String {
+fn instruction_sets() -> Vec<&'static str> {
     #[cfg(target_arch = "x86_64")]
     let candidates = [
         ("sse4.2", is_x86_feature_detected!("sse4.2")),
@@ -258,12 +349,8 @@ fn instruction_sets() -> String {
     let candidates = [("neon", std::arch::is_aarch64_feature_detected!("neon"))];
     #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
     let candidates = [("", false); 0];
-    let found: Vec<&str> = candidates
+    candidates
         .into_iter()
         .filter_map(|(name, is_available)| is_available.then_some(name))
-        .collect();
-    if found.is_empty() {
-        return "none that the ray caster uses".to_owned();
-    }
-    found.join(", ")
+        .collect()
 }

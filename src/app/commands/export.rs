@@ -6,8 +6,11 @@ mod tiles;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
+use schemars::JsonSchema;
+use serde::Serialize;
 
 pub use self::arguments::ExportArgs;
+use self::tiles::TilesReport;
 use super::refine;
 use super::stages::{RecordingInputs, infer};
 use crate::app::report::export::tiles::TILES_FOLDER;
@@ -25,6 +28,24 @@ use crate::recording::{Frame, scan_files};
 const MCAP: &[u8] = b"\x89MCAP0\r\n";
 const GLB: &[u8] = b"glTF";
 
+/// What was written.
+#[derive(Debug, Default, Serialize, JsonSchema)]
+pub struct ExportReport {
+    /// Files; of tiles, that of their metadata.
+    files: Vec<WrittenFile>,
+    /// Point cloud tiles, with `--pcd`.
+    tiles: Option<TilesReport>,
+}
+
+/// A written file.
+#[derive(Debug, Serialize, JsonSchema)]
+struct WrittenFile {
+    /// Path.
+    path: PathBuf,
+    /// Size [MB].
+    megabytes: f64,
+}
+
 /// Writes the requested files.
 pub fn run(args: &ExportArgs, context: &Context) -> Result<Printed> {
     input::require_file("the input", &args.input)?;
@@ -38,14 +59,16 @@ pub fn run(args: &ExportArgs, context: &Context) -> Result<Printed> {
     } else {
         export_result(args, context)?
     };
-    let mut written = Vec::new();
+    let mut files = Vec::new();
     for (mut claims, path) in claims {
         claims.finish(&path)?;
         let megabytes = std::fs::metadata(&path).map_or(0.0, |file| file.len() as f64 / 1e6);
-        written.push(("written", format!("{}, {megabytes:.1} MB", path.display())));
+        files.push(WrittenFile { path, megabytes });
     }
-    written.extend(tiles);
-    Ok(Printed::rows(&written))
+    let row = |it: &WrittenFile| format!("{}, {:.1} MB", it.path.display(), it.megabytes);
+    let mut rows: Vec<_> = files.iter().map(|it| ("written", row(it))).collect();
+    rows.extend(tiles.iter().flat_map(TilesReport::rows));
+    Printed::rows(&rows, &ExportReport { files, tiles })
 }
 
 /// Checks and claims the files to write.
@@ -86,8 +109,8 @@ pub fn check(args: &ExportArgs, context: &Context) -> Result<Vec<(Claims, PathBu
         .collect()
 }
 
-/// Exports a map; returns what to print of its tiles.
-fn export_map(args: &ExportArgs, context: &Context) -> Result<Vec<(&'static str, String)>> {
+/// Exports a map; returns its tiles, if they are requested.
+fn export_map(args: &ExportArgs, context: &Context) -> Result<Option<TilesReport>> {
     let path = args.input.display();
     ensure!(
         scan_files::is_mesh(&args.input),
@@ -106,8 +129,8 @@ fn export_map(args: &ExportArgs, context: &Context) -> Result<Vec<(&'static str,
     tiles::write(args, &mesh, path.as_ref(), context)
 }
 
-/// Exports a result with its map; returns what to print of the tiles of the map.
-fn export_result(args: &ExportArgs, context: &Context) -> Result<Vec<(&'static str, String)>> {
+/// Exports a result with its map; returns the tiles of the map, if they are requested.
+fn export_result(args: &ExportArgs, context: &Context) -> Result<Option<TilesReport>> {
     let results = LocalizationResults::read(&args.input)?;
     run_output::warn_of_shortfall(&results, &args.input);
     let mut config = refine::base_config(Some(&args.input));

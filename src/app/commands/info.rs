@@ -1,6 +1,6 @@
 //! `info`: what a recording, a scan, a map or a result contains, and what is missing for which command.
 
-use std::fmt::Write as _;
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail, ensure};
@@ -93,58 +93,141 @@ pub fn run(args: &InfoArgs) -> Result<Printed> {
     }
 }
 
+/// What a recording contains.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct RecordingInfo {
+    /// Layout of its files.
+    layout: &'static str,
+    /// Number of scans.
+    scans: usize,
+    /// Number of the first scan.
+    first_scan: usize,
+    /// Number of the last scan.
+    last_scan: usize,
+    /// Time between the first and the last scan [s]; `None` without times.
+    duration_s: Option<f64>,
+    /// Mean number of points of a scan.
+    points_per_scan: usize,
+    /// Fields of the points: x, y and z, and those of intensity, ring and time that there are.
+    fields: Vec<&'static str>,
+    /// The sensor, as the scans show it.
+    sensor: Sensor,
+    /// Poses in the recording; `None` if there are none that can be read.
+    poses: Option<PosesInfo>,
+    /// Why the poses cannot be used, or that there are none; `None` if they can be.
+    poses_problem: Option<String>,
+}
+
+/// Poses in a recording.
+#[derive(Debug, Serialize, JsonSchema)]
+struct PosesInfo {
+    /// Their file, or their topic.
+    path: PathBuf,
+    /// Number of rows.
+    rows: usize,
+    /// Time of the first row [s]; `None` where rows or scans have no times.
+    first_s: Option<f64>,
+    /// Time of the last row [s].
+    last_s: Option<f64>,
+}
+
 fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
     let recording = Recording::open_with(path, topic, &Selection::default())?;
     let frames = &recording.frames;
     let (first, last) = (&frames[0], &frames[frames.len() - 1]);
     let scans = spread_scans(&recording)?;
     let points = scans.iter().map(Scan::len).sum::<usize>() / scans.len();
-    let sensor = Sensor::infer(&scans, &SensorConfig::default())?;
-    let duration = if recording.has_times {
-        format!("{:.1} s", last.time_s - first.time_s)
-    } else {
-        "unknown: there are no times, 10 scans per second are assumed".to_owned()
-    };
-    let mut rows = vec![
-        ("layout", recording.files.layout.name().to_owned()),
-        (
-            "scans",
-            format!("{}, {} to {}", frames.len(), first.number, last.number),
-        ),
-        ("duration", duration),
-        (
-            "points per scan",
-            format!("{points} ({})", fields(&scans[0])),
-        ),
-    ];
-    rows.extend(sensor_rows(&sensor));
+    let has_times = recording.has_times;
     let track = recording.own_track();
-    let poses = match &track {
-        Ok(track) => track_in_words(track, &recording),
-        Err(error) => error.to_string(),
+    let poses = track.as_ref().ok().map(|it| PosesInfo::new(it, has_times));
+    let problem = match &track {
+        Ok(track) => (track.matched(frames, has_times).err()).map(|it| it.to_string()),
+        Err(error) => Some(error.to_string()),
     };
-    let has_poses = track.is_ok_and(|track| track.matched(frames, recording.has_times).is_ok());
-    let build_map = if has_poses {
-        "ready".to_owned()
-    } else {
-        "ready; poses from the scans, or --poses FILE".to_owned()
+    let info = RecordingInfo {
+        layout: recording.files.layout.name(),
+        scans: frames.len(),
+        first_scan: first.number,
+        last_scan: last.number,
+        duration_s: has_times.then(|| last.time_s - first.time_s),
+        points_per_scan: points,
+        fields: fields(&scans[0]),
+        sensor: Sensor::infer(&scans, &SensorConfig::default())?,
+        poses,
+        poses_problem: problem,
     };
-    rows.extend([
-        ("poses", poses),
-        ("build-map", build_map),
-        ("localize", "ready; needs a map: --map MAP".to_owned()),
-    ]);
-    Ok(Printed::rows(&rows))
+    Printed::rows(&info.rows(), &info)
+}
+
+impl RecordingInfo {
+    fn rows(&self) -> Vec<(&'static str, String)> {
+        let duration = self.duration_s.map_or_else(
+            || "unknown: there are no times, 10 scans per second are assumed".to_owned(),
+            |duration_s| format!("{duration_s:.1} s"),
+        );
+        let scans = format!("{}, {} to {}", self.scans, self.first_scan, self.last_scan);
+        let points = format!("{} ({})", self.points_per_scan, in_words(&self.fields));
+        let mut rows = vec![
+            ("layout", self.layout.to_owned()),
+            ("scans", scans),
+            ("duration", duration),
+            ("points per scan", points),
+        ];
+        rows.extend(sensor_rows(&self.sensor));
+        let poses = self.poses.as_ref().map(PosesInfo::in_words);
+        let poses: Vec<String> = poses
+            .into_iter()
+            .chain(self.poses_problem.clone())
+            .collect();
+        let build_map = if self.poses_problem.is_none() {
+            "ready".to_owned()
+        } else {
+            "ready; poses from the scans, or --poses FILE".to_owned()
+        };
+        rows.extend([
+            ("poses", poses.join("; ")),
+            ("build-map", build_map),
+            ("localize", "ready; needs a map: --map MAP".to_owned()),
+        ]);
+        rows
+    }
+}
+
+impl PosesInfo {
+    fn new(track: &PoseTrack, has_times: bool) -> Self {
+        let times_s = track.times_s.as_deref().filter(|_| has_times);
+        Self {
+            path: track.path.clone(),
+            rows: track.map_from_lidar.len(),
+            first_s: times_s.and_then(|it| it.first()).copied(),
+            last_s: times_s.and_then(|it| it.last()).copied(),
+        }
+    }
+
+    fn in_words(&self) -> String {
+        let text = format!("{}: {} rows", self.path.display(), self.rows);
+        match (self.first_s, self.last_s) {
+            (Some(first_s), Some(last_s)) => format!("{text}, {first_s:.1} to {last_s:.1} s"),
+            _ => text,
+        }
+    }
 }
 
 /// The fields of the points.
-fn fields(scan: &Scan) -> String {
-    let mut fields = vec!["x y z"];
+fn fields(scan: &Scan) -> Vec<&'static str> {
+    let mut fields = vec!["x", "y", "z"];
     let has_intensity = scan.intensities.iter().any(|&value| value != 0.0);
     fields.extend(has_intensity.then_some("intensity"));
     fields.extend((!scan.rings.is_empty()).then_some("ring"));
     fields.extend((!scan.times_s.is_empty()).then_some("time"));
-    fields.join(", ")
+    fields
+}
+
+/// The fields in words: "x y z, intensity".
+fn in_words(fields: &[&str]) -> String {
+    [&[&*fields[..3].join(" ")], &fields[3..]]
+        .concat()
+        .join(", ")
 }
 
 fn sensor_rows(sensor: &Sensor) -> Vec<(&'static str, String)> {
@@ -184,53 +267,145 @@ fn sensor_rows(sensor: &Sensor) -> Vec<(&'static str, String)> {
     ]
 }
 
-fn track_in_words(track: &PoseTrack, recording: &Recording) -> String {
-    let (path, count) = (track.path.display(), track.map_from_lidar.len());
-    let mut text = format!("{path}: {count} rows");
-    if let (Some(times_s), true) = (&track.times_s, recording.has_times) {
-        let (first_s, last_s) = (times_s[0], times_s[times_s.len() - 1]);
-        let _ = write!(text, ", {first_s:.1} to {last_s:.1} s");
-    }
-    if let Err(error) = track.matched(&recording.frames, recording.has_times) {
-        let _ = write!(text, "; {error}");
-    }
-    text
+/// What a single scan or a point cloud contains.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct CloudInfo {
+    /// Number of points.
+    points: usize,
+    /// Fields of the points, as of a recording.
+    fields: Vec<&'static str>,
+    /// Size and heights.
+    #[serde(flatten)]
+    extent: Extent,
+    /// Whether the points have normals.
+    has_normals: bool,
+    /// The sensor; `None` of a cloud without the rows of a scan.
+    sensor: Option<Sensor>,
 }
 
-/// A single scan, or a point cloud.
+/// Size of a cloud or a map.
+#[derive(Debug, Serialize, JsonSchema)]
+struct Extent {
+    /// Size along x [m].
+    extent_x_m: f32,
+    /// Size along y [m].
+    extent_y_m: f32,
+    /// Lowest z [m].
+    lowest_m: f32,
+    /// Highest z [m].
+    highest_m: f32,
+}
+
+impl Extent {
+    fn of(bounds: Aabb) -> Self {
+        let size = bounds.max - bounds.min;
+        Self {
+            extent_x_m: size.x,
+            extent_y_m: size.y,
+            lowest_m: bounds.min.z,
+            highest_m: bounds.max.z,
+        }
+    }
+}
+
+impl fmt::Display for Extent {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (x, y, low, high) = (
+            self.extent_x_m,
+            self.extent_y_m,
+            self.lowest_m,
+            self.highest_m,
+        );
+        write!(f, "{x:.0} x {y:.0} m, heights {low:.1} to {high:.1} m")
+    }
+}
+
 fn cloud(path: &Path) -> Result<Printed> {
     /// Points of the largest scans; more are a cloud of many scans, which show no sensor.
     const MAX_SCAN: usize = 1_000_000;
     let cloud = scan_files::read_cloud(path)?;
-    let (scan, has_normals) = (cloud.scan, cloud.normals.is_some());
-    let normals = if has_normals { "yes" } else { "no" };
+    let scan = cloud.scan;
     let finite = scan.points.iter().filter(|point| point.is_finite());
-    let mut rows = vec![
-        ("layout", "a scan, or a point cloud".to_owned()),
-        ("points", format!("{} ({})", scan.len(), fields(&scan))),
-        ("extent", extent(Aabb::from_points(finite.copied()))),
-        ("normals", normals.to_owned()),
-    ];
+    let mut info = CloudInfo {
+        points: scan.len(),
+        fields: fields(&scan),
+        extent: Extent::of(Aabb::from_points(finite.copied())),
+        has_normals: cloud.normals.is_some(),
+        sensor: None,
+    };
     if scan.len() <= MAX_SCAN {
         let sensor = Sensor::infer(std::slice::from_ref(&scan), &SensorConfig::default())?;
-        if sensor.has_rows {
-            rows.extend(sensor_rows(&sensor));
-        }
+        info.sensor = Some(sensor).filter(|sensor| sensor.has_rows);
     }
+    let points = format!("{} ({})", info.points, in_words(&info.fields));
+    let mut rows = vec![
+        ("layout", "a scan, or a point cloud".to_owned()),
+        ("points", points),
+        ("extent", info.extent.to_string()),
+        ("normals", yes(info.has_normals)),
+    ];
+    rows.extend(info.sensor.iter().flat_map(sensor_rows));
     let needs = "needs the folder of several scans, and a map: --map MAP";
     rows.extend([
         ("build-map", "ready; as a point cloud".to_owned()),
         ("localize", needs.to_owned()),
     ]);
-    Ok(Printed::rows(&rows))
+    Printed::rows(&rows, &info)
 }
 
-fn extent(bounds: Aabb) -> String {
-    let size = bounds.max - bounds.min;
-    format!(
-        "{:.0} x {:.0} m, heights {:.1} to {:.1} m",
-        size.x, size.y, bounds.min.z, bounds.max.z
-    )
+/// What a map contains.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct MapInfo {
+    /// Number of triangles.
+    triangles: usize,
+    /// Size and heights.
+    #[serde(flatten)]
+    extent: Extent,
+    /// Number of poses of the mapping drive; 0 in a map from elsewhere.
+    path_poses: usize,
+    /// Why its unit may not be the metre; `None` if its size is that of a place.
+    unit_problem: Option<String>,
+    /// Files that are kept next to the map; `None` where there are none.
+    cache: Option<CacheInfo>,
+}
+
+/// Files that are kept next to a map, and made again where they are missing.
+#[derive(Debug, Serialize, JsonSchema)]
+struct CacheInfo {
+    /// Their folder.
+    folder: PathBuf,
+    /// Number of tiles.
+    tiles: usize,
+    /// Number of files of panoramas.
+    panoramas: usize,
+    /// Size of all of them [MB].
+    megabytes: f64,
+}
+
+impl CacheInfo {
+    fn of(map: &Path) -> Option<Self> {
+        let folder = MapCache::NextToMap.folder_of(map).unwrap_or_default();
+        // What cannot be read is not used either.
+        let files = contents::files_of(&folder).unwrap_or_default();
+        let count = |kind| files.iter().filter(|file| file.kind == kind).count();
+        let bytes: u64 = files.iter().map(|file| file.bytes).sum();
+        (!files.is_empty()).then(|| Self {
+            tiles: count(CacheKind::Tile),
+            panoramas: count(CacheKind::Panoramas),
+            megabytes: bytes as f64 / 1e6,
+            folder,
+        })
+    }
+
+    fn in_words(&self) -> String {
+        format!(
+            "{} tiles and {} panoramas, {:.1} MB in {}; --clear-cache removes them",
+            self.tiles,
+            self.panoramas,
+            self.megabytes,
+            self.folder.display()
+        )
+    }
 }
 
 /// Removes the cache of a map.
@@ -245,54 +420,59 @@ fn clear_cache(map: &Path) -> Result<()> {
     cleared.with_context(|| format!("the cache of {} cannot be removed", map.display()))
 }
 
-/// Number and size of the files of the cache of a map; `None` where there are none.
-fn cache_of(map: &Path) -> Option<String> {
-    let folder = MapCache::NextToMap.folder_of(map).unwrap_or_default();
-    // What cannot be read is not used either.
-    let files = contents::files_of(&folder).unwrap_or_default();
-    let count = |kind| files.iter().filter(|file| file.kind == kind).count();
-    let bytes: u64 = files.iter().map(|file| file.bytes).sum();
-    let described = || {
-        format!(
-            "{} tiles and {} panoramas, {:.1} MB in {}; --clear-cache removes them",
-            count(CacheKind::Tile),
-            count(CacheKind::Panoramas),
-            bytes as f64 / 1e6,
-            folder.display()
-        )
-    };
-    (!files.is_empty()).then(described)
-}
-
 fn map(file: &Path) -> Result<Printed> {
     let (mesh, mapping_path) = ply::read_map(file)?;
-    let path = match mapping_path {
-        Some(path) if !path.map_from_lidar.is_empty() => {
-            format!("{} poses of the mapping drive", path.map_from_lidar.len())
-        }
-        _ => "none".to_owned(),
-    };
     let bounds = mesh.bounds();
+    let info = MapInfo {
+        triangles: mesh.triangles.len(),
+        extent: Extent::of(bounds),
+        path_poses: mapping_path.map_or(0, |path| path.map_from_lidar.len()),
+        unit_problem: unit_doubt(&bounds),
+        cache: CacheInfo::of(file),
+    };
+    let path = match info.path_poses {
+        0 => "none".to_owned(),
+        count => format!("{count} poses of the mapping drive"),
+    };
     let mut rows = vec![
-        ("triangles", mesh.triangles.len().to_string()),
-        ("extent", extent(bounds)),
+        ("triangles", info.triangles.to_string()),
+        ("extent", info.extent.to_string()),
         ("path", path),
     ];
-    rows.extend(unit_doubt(&bounds).map(|doubt| ("unit", doubt)));
-    rows.extend(cache_of(file).map(|cache| ("cache", cache)));
-    Ok(Printed::rows(&rows))
+    rows.extend(info.unit_problem.iter().map(|it| ("unit", it.clone())));
+    rows.extend(info.cache.iter().map(|it| ("cache", it.in_words())));
+    Printed::rows(&rows, &info)
+}
+
+/// What a result contains.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct ResultInfo {
+    /// What the run shows about itself.
+    #[serde(flatten)]
+    summary: RunSummary,
+    /// Whether it has a refined trajectory.
+    is_refined: bool,
+    /// Whether it has the true poses.
+    has_true_poses: bool,
 }
 
 fn result(path: &Path) -> Result<Printed> {
     let results = LocalizationResults::read(path)?;
     let estimates = results.estimates_or_particle_means(&RangeMclRules::default())?;
-    let summary = RunSummary::of(&results, &estimates);
-    let yes = |is: bool| if is { "yes" } else { "no" }.to_owned();
-    let mut rows: Vec<(&str, String)> = (summary.rows().into_iter())
+    let info = ResultInfo {
+        summary: RunSummary::of(&results, &estimates),
+        is_refined: results.refined.is_some(),
+        has_true_poses: results.ground_truth.is_some(),
+    };
+    let mut rows: Vec<(&str, String)> = (info.summary.rows().into_iter())
         .filter(|row| row.value != Value::Absent)
         .map(|row| (row.name, format!("{} {}", row.value, row.unit)))
         .collect();
-    rows.push(("refined", yes(results.refined.is_some())));
-    rows.push(("true poses", yes(results.ground_truth.is_some())));
-    Ok(Printed::rows(&rows))
+    rows.push(("refined", yes(info.is_refined)));
+    rows.push(("true poses", yes(info.has_true_poses)));
+    Printed::rows(&rows, &info)
+}
+
+fn yes(is: bool) -> String {
+    if is { "yes" } else { "no" }.to_owned()
 }

@@ -76,7 +76,7 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
     output::write_json(&main, &report)?;
     claims.finish(&main)?;
     odometry::warn(&report.summary);
-    Printed::rows(&odometry::rows(&report.summary)).with_json(&report)
+    Printed::rows(&odometry::rows(&report.summary), &report)
 }
 
 fn prepare(config: &OdometryCommandConfig, context: &Context) -> Result<Claims> {

@@ -17,6 +17,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, OnceLock};
 
 use anyhow::{Context as _, Result, bail};
+use schemars::JsonSchema;
+use serde::Serialize;
 
 use crate::app::run::artefact::hash::hash_of_texts;
 use crate::app::run::memory;
@@ -49,7 +51,7 @@ const REMEDY: &str =
     "choose another output_folder, remove that folder, or overwrite it with simulate --force";
 
 /// Summary of a simulated drive.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct SimulationReport {
     /// Folder of the drive.
     pub folder: PathBuf,
@@ -79,7 +81,7 @@ pub fn run(config: &SimulationConfig, existing: Existing, context: &Context) -> 
         ("path", format!("{:.1} m", report.driven_m)),
         ("triangles of the street", report.triangles.to_string()),
     ];
-    Ok(Printed::rows(&rows))
+    Printed::rows(&rows, &report)
 }
 
 /// Simulates a drive and writes what is missing of it. `progress` gets the number of finished

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use anyhow::{Result, ensure};
+use schemars::JsonSchema;
 use serde::Serialize;
 
 use super::formats::{csv, markdown, text};
@@ -14,16 +15,19 @@ use super::results::ComparisonResults;
 use super::{cases, keys, page, tables};
 use crate::app::comparison::config::ComparisonConfig;
 use crate::app::comparison::table::Table;
-use crate::app::run::{Context, Outputs, output, version};
+use crate::app::run::{Context, Outputs, Printed, output, version};
 
 /// Page of the sequences that are described as hard cases.
 const CASES_FILE: &str = "cases.md";
 
 /// `comparison.json`.
-#[derive(Serialize)]
-struct ComparisonFile<'a> {
+#[derive(Serialize, JsonSchema)]
+pub struct ComparisonFile<'a> {
+    /// Program that collected the runs: version and executable.
     program: String,
+    /// The tables, as on the page.
     tables: &'a [Table],
+    /// The finished and the failed runs.
     runs: Vec<&'a RunRecord>,
 }
 
@@ -33,7 +37,7 @@ pub fn collect(
     runs: &[PlannedRun],
     layout: &Layout,
     context: &Context,
-) -> Result<String> {
+) -> Result<Printed> {
     let results = read_results(config, runs, layout)?;
     let found = results.all_records().count();
     ensure!(
@@ -67,7 +71,7 @@ pub fn collect(
     output::write_json(&layout.root.join("comparison.json"), &file)?;
     // The table of single runs is too wide for a terminal.
     let summaries = tables.iter().filter(|table| table.name != "runs");
-    Ok(summaries.map(text::table).collect::<Vec<_>>().join("\n"))
+    Printed::text(summaries.map(text::table).collect::<Vec<_>>().join("\n")).with_json(&file)
 }
 
 /// Reads the records of the planned runs; skips those of other settings.

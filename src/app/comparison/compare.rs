@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::{Executor, Layout, Outcome, PlannedRun, RunId, collect, planned_runs};
 use crate::app::comparison::config::ComparisonConfig;
-use crate::app::run::{ConfigArgs, Context, output};
+use crate::app::run::{ConfigArgs, Context, Form, Printed, output};
 use crate::app::settings::{self, CommandConfig as _};
 
 /// Arguments of `compare`.
@@ -33,9 +33,8 @@ pub struct CompareArgs {
     pub collect: bool,
 }
 
-/// Executes the missing runs, or the requested part of the work; returns the text for standard
-/// output.
-pub fn run(args: &CompareArgs, context: &Context) -> Result<String> {
+/// Executes the missing runs, or the requested part of the work; returns what to print.
+pub fn run(args: &CompareArgs, form: Form, context: &Context) -> Result<Printed> {
     let path = args.source.config.as_deref();
     let config: ComparisonConfig = settings::load(path, &args.source.settings)?;
     let context = &context.with_config_file(path, ComparisonConfig::PATH);
@@ -45,11 +44,11 @@ pub fn run(args: &CompareArgs, context: &Context) -> Result<String> {
     };
     let mut executor = Executor::new(&layout, context);
     if args.list_jobs {
-        Ok(job_commands(&runs))
+        Ok(Printed::text(job_commands(&runs)))
     } else if args.prepare {
-        prepare(&runs, &mut executor)
+        Ok(Printed::text(prepare(&runs, &mut executor)?))
     } else if let Some(id) = &args.job {
-        run_one(&runs, id, &mut executor)
+        Ok(Printed::text(run_one(&runs, id, &mut executor)?))
     } else if args.collect {
         collect(&config, &runs, &layout, context)
     } else {
@@ -58,7 +57,7 @@ pub fn run(args: &CompareArgs, context: &Context) -> Result<String> {
         if failed.is_empty() {
             return Ok(tables);
         }
-        output::print(&tables)?;
+        output::print(&tables.in_form(form))?;
         bail!(
             "{} of {} runs failed: {}; see log.txt in the folder of each; run the same command to try them again",
             failed.len(),

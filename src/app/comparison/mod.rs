@@ -69,7 +69,7 @@ mod tables;
 #[cfg(test)]
 mod table_tests;
 
-pub use collect::collect;
+pub use collect::{ComparisonFile, collect};
 pub use config::ComparisonConfig;
 pub use execute::Executor;
 pub use layout::Layout;

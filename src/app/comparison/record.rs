@@ -7,6 +7,7 @@ use std::path::Path;
 use std::str::FromStr;
 
 use anyhow::{Context as _, Result};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::app::report::TrajectoryReport;
@@ -17,7 +18,7 @@ use crate::evaluation::trust::Trust;
 pub const RECORD_FILE: &str = "run.json";
 
 /// Identity of a run: sequence, configuration and seed.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 pub struct RunId {
     /// Name of the sequence.
     pub sequence: String,
@@ -52,7 +53,7 @@ impl FromStr for RunId {
 }
 
 /// Outcome of a run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// Errors of the final trajectory: the refined one if the configuration refines, else the
@@ -63,7 +64,7 @@ pub enum Outcome {
 }
 
 /// Record of one run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct RunRecord {
     /// Identity of the run.
     pub id: RunId,

@@ -1,12 +1,13 @@
 //! The tables of a comparison as data: means with their spread, differences and rates.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::app::report::pages;
 use crate::app::report::results::Value;
 
 /// Rows of cells under named columns.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Table {
     /// Short name, suitable as a file name and as the target of a link: letters, digits and `_` (`table_1`).
     pub name: String,
@@ -21,7 +22,7 @@ pub struct Table {
 }
 
 /// Header of a column.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Column {
     /// Name of the quantity.
     pub name: String,
@@ -32,7 +33,7 @@ pub struct Column {
 }
 
 /// Content of a cell.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Cell {
     /// Text.
@@ -58,7 +59,7 @@ pub enum Cell {
 }
 
 /// Mean with standard deviations.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct MeanWithSpread {
     /// Mean of the means of the sequences.
     pub mean: f64,
@@ -71,7 +72,7 @@ pub struct MeanWithSpread {
 }
 
 /// Mean difference between two configurations.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct PairedDifference {
     /// Mean of the mean differences of the sequences.
     pub mean: f64,
@@ -82,7 +83,7 @@ pub struct PairedDifference {
 }
 
 /// Share of successful runs with its 95 % confidence interval.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct SuccessRate {
     /// Number of successful runs.
     pub successes: usize,

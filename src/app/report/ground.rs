@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
+use schemars::JsonSchema;
 use serde::Serialize;
 
 use super::plotting::color::SERIES;
@@ -11,7 +12,7 @@ use crate::evaluation::{GroundMethodReport, GroundProtocol, LabelledPoints};
 use crate::ground::{Features, FuzzyConfig};
 
 /// The result of a run.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct GroundReport {
     /// Folder of the scans, or the scan.
     pub scans_from: PathBuf,

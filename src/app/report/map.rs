@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Result;
+use schemars::JsonSchema;
 use serde::Serialize;
 
 use super::odometry;
@@ -20,7 +21,7 @@ use crate::mapping::TrajectorySummary;
 use crate::sensor::Sensor;
 
 /// Report of a map build.
-#[derive(Debug, Default, Serialize)]
+#[derive(Debug, Default, Serialize, JsonSchema)]
 pub struct BuildReport {
     /// Selected frames.
     pub frames: usize,
@@ -89,7 +90,7 @@ impl BuildReport {
 
     /// The table on standard output, most important rows first.
     pub fn printed(&self) -> Result<Printed> {
-        Printed::rows(&self.rows()).with_json(self)
+        Printed::rows(&self.rows(), self)
     }
 
     fn rows(&self) -> Vec<(&'static str, String)> {
@@ -157,7 +158,7 @@ impl BuildReport {
 }
 
 /// What a drive changed in an older map.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, JsonSchema)]
 pub struct ChangesReport {
     /// The older map.
     pub onto: PathBuf,

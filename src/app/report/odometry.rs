@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use anyhow::Result;
+use schemars::JsonSchema;
 use serde::Serialize;
 
 use super::plotting::PathPlot;
@@ -18,7 +19,7 @@ use crate::recording::{Frame, Recording};
 use crate::sensor::Sensor;
 
 /// Report of a run of `odometry`.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 pub struct OdometryReport {
     /// Length, speed, loops and residuals.
     #[serde(flatten)]
@@ -30,7 +31,7 @@ pub struct OdometryReport {
 }
 
 /// A loop in the report.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 struct LoopReport {
     /// Frame of the earlier visit.
     first: usize,

@@ -6,7 +6,6 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use serde::Serialize;
-use serde_json::Value;
 
 use super::visible::{visible, visible_in_line};
 use crate::app::settings::to_yaml;
@@ -43,7 +42,7 @@ pub fn write_yaml(path: &Path, config: &impl Serialize) -> anyhow::Result<()> {
 pub struct Printed {
     main: String,
     all: String,
-    json: Value,
+    json: String,
 }
 
 /// How much is printed, and in which form.
@@ -64,8 +63,8 @@ impl Printed {
         Self::parts(text.clone(), text)
     }
 
-    /// Rows of a name and a value, most important first; in JSON, an object.
-    pub fn rows(rows: &[(&str, String)]) -> Self {
+    /// Rows of a name and a value, most important first; in JSON, the value that they describe.
+    pub fn rows(rows: &[(&str, String)], described: &impl Serialize) -> anyhow::Result<Self> {
         const MAIN: usize = 12;
         let lines = |rows: &[(&str, String)]| -> String {
             let line = |(name, value): &(&str, String)| {
@@ -82,20 +81,13 @@ impl Printed {
         if rows.len() > MAIN {
             main += &format!("{} more rows: --all\n", rows.len() - MAIN);
         }
-        let entries = rows
-            .iter()
-            .map(|(name, value)| ((*name).to_owned(), Value::from(value.as_str())));
-        Self {
-            main,
-            all: lines(rows),
-            json: Value::Object(entries.collect()),
-        }
+        Self::parts(main, lines(rows)).with_json(described)
     }
 
     /// The main part and all of a text.
     pub fn parts(main: String, all: String) -> Self {
         Self {
-            json: Value::from(all.trim_end()),
+            json: serde_json::Value::from(all.trim_end()).to_string(),
             main,
             all,
         }
@@ -103,7 +95,7 @@ impl Printed {
 
     /// The same with another value for programs.
     pub fn with_json(self, value: &impl Serialize) -> anyhow::Result<Self> {
-        let json = serde_json::to_value(value).context("cannot serialize the output")?;
+        let json = serde_json::to_string_pretty(value).context("cannot serialize the output")?;
         Ok(Self { json, ..self })
     }
 
@@ -112,7 +104,7 @@ impl Printed {
         match form {
             Form::Main => self.main.clone(),
             Form::All => self.all.clone(),
-            Form::Json => format!("{:#}\n", self.json),
+            Form::Json => self.json.clone() + "\n",
         }
     }
 }

@@ -132,6 +132,7 @@ impl Validate for LocalMapConfig {
 
 /// Numbers of points and triangles at each step of a local map.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct LocalMapCounts {
     /// Scans meshed.
     pub scans: usize,

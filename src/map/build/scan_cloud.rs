@@ -24,6 +24,7 @@ pub(crate) struct ScanPreparation {
 
 /// Number of points dropped in each step.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "configuration", derive(schemars::JsonSchema))]
 pub struct PointCounts {
     /// Points of the scan.
     pub read: usize,

@@ -6,6 +6,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, ensure};
+use schemars::JsonSchema;
+use serde::Serialize;
 
 use super::arguments::ExportArgs;
 use crate::app::report::export::tiles::{
@@ -17,23 +19,45 @@ use crate::geometry::{TriangleMesh, Vec3, sample_surface, surface_area_m2, surfa
 use crate::map::MappingPath;
 use crate::memory::MemoryError;
 
-/// Name and value of what is printed.
-type Row = (&'static str, String);
+/// Written point cloud tiles.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct TilesReport {
+    /// Folder of the tiles.
+    folder: PathBuf,
+    /// Number of tiles.
+    tiles: usize,
+    /// Number of points.
+    points: usize,
+    /// Frame of the points, with the pose of the map in the world where it has one.
+    frame: String,
+}
+
+impl TilesReport {
+    /// Rows of the table on standard output.
+    pub fn rows(&self) -> [(&'static str, String); 3] {
+        let tiles = format!("{} in {}", self.tiles, self.folder.display());
+        [
+            ("tiles", tiles),
+            ("points", self.points.to_string()),
+            ("frame of the tiles", self.frame.clone()),
+        ]
+    }
+}
 
 /// Path of the metadata file, which is finished last.
 pub fn metadata_file(folder: &Path) -> PathBuf {
     folder.join(METADATA_FILE)
 }
 
-/// Writes tiles and metadata of a map where they are requested; returns what to print.
+/// Writes tiles and metadata of a map where they are requested.
 pub fn write(
     args: &ExportArgs,
     mesh: &TriangleMesh,
     path: Option<&MappingPath>,
     context: &Context,
-) -> Result<Vec<Row>> {
+) -> Result<Option<TilesReport>> {
     let Some(folder) = &args.pcd else {
-        return Ok(Vec::new());
+        return Ok(None);
     };
     let mut points = sample(mesh, args.spacing)?;
     let tiles = split(&mut points, args.tile_size);
@@ -47,14 +71,12 @@ pub fn write(
     write_tiles(&tiles, &tiles_folder, context)?;
     let metadata = metadata(&tiles, args.tile_size, &[format!("frame: {frame}")]);
     output::write_text(&metadata_file, &metadata)?;
-    Ok(vec![
-        (
-            "tiles",
-            format!("{} in {}", tiles.len(), tiles_folder.display()),
-        ),
-        ("points", points.len().to_string()),
-        ("frame of the tiles", frame),
-    ])
+    Ok(Some(TilesReport {
+        tiles: tiles.len(),
+        points: points.len(),
+        folder: tiles_folder,
+        frame,
+    }))
 }
 
 /// Samples the map within the budget of memory.

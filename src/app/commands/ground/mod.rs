@@ -12,7 +12,7 @@
 //! ```
 
 mod input;
-mod simulated;
+pub mod simulated;
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -42,7 +42,7 @@ const OTHER_CLASS: u16 = 99;
 pub fn run(args: &GroundArgs, context: &Context) -> Result<Printed> {
     let (config, path) = input::load(args)?;
     if args.simulated {
-        return Ok(Printed::text(simulated::run(&config, context)?));
+        return simulated::run(&config, context);
     }
     let path_of_config = args.config.as_deref().or(args.input.as_deref());
     let context = &context.with_config_file(path_of_config, GroundCommandConfig::PATH);

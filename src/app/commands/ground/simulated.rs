@@ -2,8 +2,10 @@
 
 use anyhow::Result;
 use rayon::prelude::*;
+use schemars::JsonSchema;
+use serde::Serialize;
 
-use crate::app::run::Context;
+use crate::app::run::{Context, Printed};
 use crate::app::settings::GroundCommandConfig;
 use crate::evaluation::{GroundProtocol, GroundScore, LabelledPoints};
 use crate::simulation::ground_scenes;
@@ -14,8 +16,21 @@ const SEEDS: [u64; 3] = [1, 2, 3];
 /// Points farther ahead lie on or behind the slope or crest of a scene [m].
 const AHEAD_M: f32 = 8.0;
 
-/// Returns the table for standard output.
-pub fn run(config: &GroundCommandConfig, context: &Context) -> Result<String> {
+/// Score of a method on a simulated scene.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct SceneScore {
+    /// Name of the scene.
+    scene: String,
+    /// Name of the method.
+    method: String,
+    /// F1 of whole scans by the protocol of Patchwork++, 0 to 1.
+    f1: f64,
+    /// F1 of the points more than 8 m ahead.
+    f1_ahead: f64,
+}
+
+/// Scores all methods on all scenes; returns what to print.
+pub fn run(config: &GroundCommandConfig, context: &Context) -> Result<Printed> {
     let methods = config.ground.all_classifiers()?;
     let scenes = ground_scenes();
     let task = context.progress.task("ground", scenes.len());
@@ -25,6 +40,7 @@ pub fn run(config: &GroundCommandConfig, context: &Context) -> Result<String> {
         .collect();
     let header = format!("{:<24}{columns}\n", "scene");
     let mut tables = [header.clone(), header];
+    let mut all_scores = Vec::new();
     context.interrupt.keeps("nothing is written by --simulated");
     for (name, scans_of) in scenes {
         context.interrupt.check()?;
@@ -38,7 +54,7 @@ pub fn run(config: &GroundCommandConfig, context: &Context) -> Result<String> {
         tables
             .iter_mut()
             .for_each(|table| *table += &format!("{name:<24}"));
-        for (_, classifier) in &methods {
+        for (method, classifier) in &methods {
             let mut scores = [GroundScore::default(); 2];
             for scan in &scans {
                 let confidences = classifier.ground_confidence(&scan.points);
@@ -51,17 +67,25 @@ pub fn run(config: &GroundCommandConfig, context: &Context) -> Result<String> {
                     ));
                 }
             }
-            for (table, score) in tables.iter_mut().zip(scores) {
-                *table += &format!(" {:>21.2}", 100.0 * score.f1());
+            let [f1, f1_ahead] = scores.map(|score| score.f1());
+            for (table, f1) in tables.iter_mut().zip([f1, f1_ahead]) {
+                *table += &format!(" {:>21.2}", 100.0 * f1);
             }
+            all_scores.push(SceneScore {
+                scene: name.clone(),
+                method: (*method).to_string(),
+                f1,
+                f1_ahead,
+            });
         }
         tables.iter_mut().for_each(|table| table.push('\n'));
         task.advance(1);
     }
     let [whole, ahead] = tables;
-    Ok(format!(
+    let text = format!(
         "F1 [%] on simulated streets, protocol of Patchwork++, {} seeds\n\n\
          whole scans\n{whole}\npoints more than {AHEAD_M} m ahead\n{ahead}",
         SEEDS.len()
-    ))
+    );
+    Printed::text(text).with_json(&all_scores)
 }

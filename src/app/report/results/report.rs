@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context as _, Result, anyhow};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::rows::{MetricRow, Value, length, metric_rows, metrics, spatial_rows};
@@ -42,7 +43,7 @@ const MAIN_ROWS: [&str; 23] = [
 ];
 
 /// Errors of one trajectory.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct TrajectoryReport {
     /// Errors as range-mcl's evaluation script computes them.
     pub range_mcl: RangeMclErrors,
@@ -68,7 +69,7 @@ impl TrajectoryReport {
 }
 
 /// Errors of a run: `report.json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Report {
     /// Inputs and settings by name: the recording, the map, the odometry and its source, the
     /// seed, the renderer.

@@ -1,5 +1,6 @@
 //! What a run shows about itself, without the true poses.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::localization_results::LocalizationResults;
@@ -10,7 +11,7 @@ use crate::localization::State;
 use crate::localization::particles::long_axis_m;
 
 /// States, uncertainty and agreement with the map over the frames of a run.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct RunSummary {
     /// Number of frames.
