@@ -304,7 +304,13 @@ fn outputs_of_maps_and_drives_have_the_documented_keys() {
         "--poses",
         "poses.txt",
     ];
-    printed("build-map", call(&recording, "build-map", &onto));
+    let both = printed("build-map", call(&recording, "build-map", &onto));
+    assert!(
+        both["changes"]["gone_m2"]
+            .as_f64()
+            .unwrap()
+            .is_sign_positive()
+    );
 
     printed("localize, refine, evaluate", recording.fpmcl("localize"));
     printed("localize, refine, evaluate", recording.fpmcl("refine"));

@@ -26,7 +26,9 @@ pub fn with_given_poses(
         None => match recording.own_track() {
             Err(error) if is_auto && recording.files.poses.is_none() => {
                 if error.is_absence() {
-                    tracing::info!("poses from the scans: {error}");
+                    tracing::info!(
+                        "the recording contains no poses: they are found from its scans"
+                    );
                 } else {
                     tracing::warn!(
                         "the poses of the recording are not used, but found from its scans: {error}"

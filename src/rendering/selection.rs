@@ -36,7 +36,8 @@ impl BackendChoice {
     }
 
     /// Prepares a map for rendering; its tiles are read, and on a graphics adapter uploaded, when rays may reach them. The
-    /// budget is that of the map and the images on a graphics device. Reports the renderer and the reason to the log.
+    /// budget is that of the map and the images on a graphics device. Reports a renderer that was selected, and the reason,
+    /// to the log.
     ///
     /// # Errors
     /// Those of the graphics device.
@@ -52,7 +53,10 @@ impl BackendChoice {
         )]
         memory_budget: MemoryBudget,
     ) -> Result<Arc<dyn RangeRenderer>, RenderError> {
-        tracing::info!("rendering on {} because {}", self.name(), self.reason);
+        // Stages that need the CPU ask for it by themselves.
+        if self.request.0 != Backend::Cpu {
+            tracing::info!("rendering on {} because {}", self.name(), self.reason);
+        }
         #[cfg(feature = "gpu")]
         if self.adapter.is_some() {
             return Ok(Arc::new(GpuRenderer::new(

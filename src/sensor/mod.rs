@@ -138,7 +138,16 @@ impl fmt::Display for Sensor {
         }
         let [highest, lowest] = match image.elevations.as_deref() {
             Some([highest, .., lowest]) => [*highest, *lowest],
-            _ => [image.fov_up, -image.fov_down.abs()],
+            _ => {
+                let [top, bottom] = [image.fov_up, -image.fov_down.abs()];
+                // Beams are in the middle of their rows.
+                let margin = if self.has_rows {
+                    0.5 * (top - bottom) / image.height as f32
+                } else {
+                    0.0
+                };
+                [top - margin, bottom + margin]
+            }
         };
         write!(
             formatter,

@@ -142,6 +142,7 @@ fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
     let poses = track.as_ref().ok().map(|it| PosesInfo::new(it, has_times));
     let problem = match &track {
         Ok(track) => (track.matched(frames, has_times).err()).map(|it| it.to_string()),
+        Err(error) if error.is_absence() => Some("none in the recording".to_owned()),
         Err(error) => Some(error.to_string()),
     };
     let info = RecordingInfo {

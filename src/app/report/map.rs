@@ -177,15 +177,15 @@ impl ChangesReport {
     pub fn new(onto: &Path, older: &dyn MeshView, gone: &[u32], added: &[&dyn MeshView]) -> Self {
         let of_mesh = |mesh: &dyn MeshView| -> f64 {
             let triangles = 0..mesh.triangles();
-            triangles.map(|triangle| mesh.area_m2(triangle)).sum()
+            // From zero: the sum of nothing is a negative one.
+            triangles.fold(0.0, |sum, triangle| sum + mesh.area_m2(triangle))
         };
-        let gone_m2 = gone.iter().map(|&it| older.area_m2(it as usize));
         Self {
             onto: onto.to_owned(),
             gone_triangles: gone.len(),
-            gone_m2: gone_m2.sum(),
+            gone_m2: (gone.iter()).fold(0.0, |sum, &it| sum + older.area_m2(it as usize)),
             added_triangles: added.iter().map(|mesh| mesh.triangles()).sum(),
-            added_m2: added.iter().map(|mesh| of_mesh(*mesh)).sum(),
+            added_m2: added.iter().fold(0.0, |sum, mesh| sum + of_mesh(*mesh)),
         }
     }
 

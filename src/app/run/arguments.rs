@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-use anyhow::ensure;
+use anyhow::{bail, ensure};
 use clap::Args;
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -80,7 +80,40 @@ pub fn configured<T: CommandConfig>(
         return Ok((settings::with_settings(base(), &settings)?, context.clone()));
     }
     let config = settings::load(path, &settings)?;
+    require_input(&config, path, input_key)?;
     Ok((config, context.with_config_file(path, T::PATH)))
+}
+
+/// Requires an input from the user where the one that is built in does not exist: no message may speak of a path that
+/// nobody gave.
+pub fn require_input<T: CommandConfig>(
+    config: &T,
+    path: Option<&Path>,
+    input_key: &str,
+) -> anyhow::Result<()> {
+    let value = |config: &T| anyhow::Ok(text_at(&serde_json::to_value(config)?, input_key));
+    if path.is_some() || Path::new(T::PATH).exists() {
+        return Ok(());
+    }
+    let built_in = value(&settings::load(None, &[])?)?;
+    match built_in.filter(|it| !Path::new(it).exists()) {
+        Some(built_in) if value(config)?.as_ref() == Some(&built_in) => bail!(
+            "no input was given, and there is no {built_in}, which {input_key} is by default; give {} or a configuration (.yml) as the first argument",
+            if input_key == "scan_folder" {
+                "a recording"
+            } else {
+                "a result"
+            }
+        ),
+        _ => Ok(()),
+    }
+}
+
+/// The text at a key in any block of a configuration.
+fn text_at(config: &Value, key: &str) -> Option<String> {
+    let blocks = config.as_object()?;
+    let found = blocks.get(key).and_then(Value::as_str).map(str::to_owned);
+    found.or_else(|| blocks.values().find_map(|block| text_at(block, key)))
 }
 
 /// The settings of a command; those of flags are the last, where the configuration has their keys.

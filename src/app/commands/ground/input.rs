@@ -6,7 +6,7 @@ use anyhow::{Result, bail, ensure};
 use clap::Args;
 
 use crate::app::run::MachineArgs;
-use crate::app::run::arguments::{is_config, setting};
+use crate::app::run::arguments::{is_config, require_input, setting};
 use crate::app::run::input::is_bag;
 use crate::app::run::input::require_folder;
 use crate::app::settings::{self, GroundCommandConfig};
@@ -79,6 +79,9 @@ pub fn load(args: &GroundArgs) -> Result<(GroundCommandConfig, PathBuf)> {
     };
     let mut config: GroundCommandConfig = settings::load(config_path, &settings)?;
     let Some(path) = input else {
+        if !args.simulated {
+            require_input(&config, config_path, "scan_folder")?;
+        }
         let folder = config.recording.scan_folder.clone();
         return Ok((config, folder));
     };
