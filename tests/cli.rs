@@ -98,9 +98,9 @@ fn a_missing_configuration_is_reported_with_its_path() {
 
 #[test]
 fn without_a_file_the_built_in_configuration_is_used() {
-    fpmcl("build-map").fails_with(&["scan_folder is data/kitti/velodyne"]);
+    fpmcl("build-map").fails_with(&["data/kitti/velodyne, which scan_folder is by default"]);
     fpmcl("ground").fails_with(&["data/kitti/velodyne"]);
-    fpmcl("evaluate").fails_with(&["result_file is results/localization.npz"]);
+    fpmcl("evaluate").fails_with(&["results/localization.npz, which result_file is by default"]);
     let runs = fpmcl("compare").with("--list-jobs").succeeds().stdout;
     assert!(runs.contains("town/Fuzzy-PSO-MCL/5"), "{runs}");
 }
