@@ -13,7 +13,7 @@ use pyo3::types::PyDict;
 
 use crate::arrays::{self, Numbers, Numbers1, Numbers2};
 use crate::errors::{raised, released};
-use crate::map::Map;
+use crate::map::{Map, map_of};
 use crate::recording::{Scan, Sensor};
 use crate::settings;
 
@@ -34,11 +34,12 @@ impl Localizer {
     #[new]
     #[pyo3(signature = (map, start=None, *, sensor=None, **settings))]
     fn new(
-        map: &Map,
+        #[pyo3(from_py_with = map_of)] map: Bound<'_, Map>,
         start: Option<&Bound<'_, PyAny>>,
         sensor: Option<Sensor>,
         settings: Option<&Bound<'_, PyDict>>,
     ) -> PyResult<Self> {
+        let map = map.get();
         let config = settings::apply(TrackerConfig::default(), settings)?;
         let tracker = Tracker::new(&map.map, config).map_err(raised)?;
         let tracker = tracker.with_start(start_of(start, &map.map)?);

@@ -15,7 +15,7 @@ use numpy::ndarray::Array2;
 use numpy::{
     IntoPyArray as _, PyArray1, PyArray2, PyArray3, PyArrayDyn, PyUntypedArrayMethods as _,
 };
-use pyo3::exceptions::PyValueError;
+use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -244,6 +244,16 @@ fn of_build(error: BuildError) -> anyhow::Error {
     }
 }
 
+/// The map that an argument is.
+pub fn map_of<'py>(argument: &Bound<'py, PyAny>) -> PyResult<Bound<'py, Map>> {
+    let map = argument.cast::<Map>().cloned();
+    map.map_err(|_error| {
+        let kind = argument.get_type();
+        let message = format!("map is a {kind}, not a fpmcl.Map; fpmcl.Map.load(path) reads one");
+        PyTypeError::new_err(message)
+    })
+}
+
 /// Casts rays at a map: ranges along directions from the origin of the lidar, infinite without a hit [m].
 ///
 /// ``poses``: (4, 4) or (P, 4, 4). ``directions``: (N, 3), unit vectors in the frame of the lidar; float32 without a copy
@@ -251,12 +261,13 @@ fn of_build(error: BuildError) -> anyhow::Error {
 #[pyfunction]
 pub fn cast_rays<'py>(
     py: Python<'py>,
-    map: &Map,
+    #[pyo3(from_py_with = map_of)] map: Bound<'py, Map>,
     poses: Numbers<'py, f64>,
     directions: Numbers2<'py, f32>,
 ) -> PyResult<Bound<'py, PyAny>> {
     /// Largest deviation of the length of a direction (unitless).
     const TOLERANCE: f32 = 1e-3;
+    let map = map.get();
     let map_from_lidar = arrays::poses("poses", &poses)?;
     let directions = arrays::vectors("directions", &directions)?;
     let is_unit = |direction: &glam::Vec3| (direction.length() - 1.0).abs() < TOLERANCE;

@@ -15,7 +15,7 @@ use pyo3::prelude::*;
 
 use crate::arrays::{self, Numbers1, Numbers2};
 use crate::errors::{raised, released};
-use crate::map::Map;
+use crate::map::{Map, map_of};
 
 /// Number of scans from which a sensor is inferred.
 const SENSOR_SCANS: usize = 10;
@@ -226,9 +226,13 @@ impl Recording {
     /// Returns the given poses in the frame of a map that was built in the same world, (N, 4, 4).
     ///
     /// Raises Error if there are no poses.
-    fn poses_in<'py>(&self, py: Python<'py>, map: &Map) -> PyResult<Bound<'py, PyArray3<f64>>> {
+    fn poses_in<'py>(
+        &self,
+        py: Python<'py>,
+        #[pyo3(from_py_with = map_of)] map: Bound<'py, Map>,
+    ) -> PyResult<Bound<'py, PyArray3<f64>>> {
         let given = self.given().ok_or_else(without_poses)?;
-        let world_from_map = map.map.path.world_from_map;
+        let world_from_map = map.get().map.path.world_from_map;
         let map_from_recording = world_from_map.inverse() * self.recording.world().0;
         let poses: Vec<Pose3> = given.iter().map(|pose| map_from_recording * pose).collect();
         Ok(arrays::of_poses(py, &poses))

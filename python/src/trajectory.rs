@@ -11,7 +11,7 @@ use pyo3::types::PyDict;
 use crate::arrays::{self, Numbers};
 use crate::errors::{raised, released};
 use crate::localizer::Estimate;
-use crate::map::Map;
+use crate::map::{Map, map_of};
 use crate::recording::{Scans, Sensor};
 use crate::settings;
 
@@ -81,7 +81,7 @@ pub struct RefinedTrajectory {
 #[pyo3(signature = (map, scans, estimates, motions=None, *, sensor=None, uncertainty=[1.0, 10.0], seed=0, **settings))]
 pub fn refine(
     py: Python<'_>,
-    map: &Map,
+    #[pyo3(from_py_with = map_of)] map: Bound<'_, Map>,
     scans: &Bound<'_, PyAny>,
     estimates: &Bound<'_, PyAny>,
     motions: Option<Numbers<'_, f64>>,
@@ -90,6 +90,7 @@ pub fn refine(
     seed: u64,
     settings: Option<&Bound<'_, PyDict>>,
 ) -> PyResult<RefinedTrajectory> {
+    let map = map.get();
     let config = settings::apply(RefinerConfig::default(), settings)?;
     let scans = Scans::of(scans)?;
     let sensor = scans.sensor(py, sensor)?;

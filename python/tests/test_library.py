@@ -183,8 +183,13 @@ def test_rough_poses_are_refined(folder, recording):
 def test_wrong_settings_are_errors_that_name_them(square):
     with pytest.raises(fpmcl.Error, match="unknown key `numParticle`.*num_particles"):
         fpmcl.Localizer(square, numParticle=5)
-    with pytest.raises(fpmcl.Error, match="numParticles"):
+    with pytest.raises(fpmcl.Error, match="numParticles") as error:
         fpmcl.Localizer(square, numParticles=0)
+    # In the words of Python, not of the command line.
+    assert "--" not in str(error.value)
+    for call in [fpmcl.Localizer, lambda map: fpmcl.refine(map, [], [])]:
+        with pytest.raises(TypeError, match="is a .*str.*, not a fpmcl.Map; fpmcl.Map.load"):
+            call("map.ply")
     with pytest.raises(fpmcl.Error, match="unknown key `result_path`"):
         fpmcl.Localizer(square, result_path="a.npz")
     fpmcl.Localizer(square, observation={"beams": np.int64(500)}, **{"kld.bin_m": 0.5})
