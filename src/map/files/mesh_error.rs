@@ -30,7 +30,7 @@ pub enum MeshFileProblem {
         "is not a mesh that can be read: the name of a PLY, OBJ or STL file ends in .ply, .obj or .stl"
     )]
     UnknownFormat,
-    #[error("is not a readable PLY file: {0}")]
+    #[error("is not a readable PLY file: {}", in_one_line(.0))]
     Malformed(#[from] ParseError),
     #[error("contains a damaged mapping path: {0}")]
     Path(#[from] BadPathComment),
@@ -103,5 +103,37 @@ impl MeshFileProblem {
             path: path.to_owned(),
             problem: self,
         }
+    }
+}
+
+/// What a parser found where, without the nested messages of its grammar.
+fn in_one_line(error: &ParseError) -> String {
+    let message = error.to_string();
+    let found = message.split("\n\tError").next().unwrap_or_default();
+    found.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::map::files::ply;
+
+    #[test]
+    fn a_vertex_that_is_no_number_is_reported_in_one_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("map.ply");
+        let vertices = "element vertex 3\nproperty float x\nproperty float y\nproperty float z\n";
+        let faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n";
+        let rows = "0 0 0\n1 0 a\n0 1 0\n3 0 1 2\n";
+        std::fs::write(
+            &file,
+            format!("ply\nformat ascii 1.0\n{vertices}{faces}{rows}"),
+        )
+        .unwrap();
+        let message = ply::read_map(&file).unwrap_err().to_string();
+        assert!(
+            !message.contains('\n') && message.contains("1 0 a"),
+            "{message}"
+        );
+        assert!(message.contains("ine 11"), "{message}");
     }
 }
