@@ -583,6 +583,37 @@ fn views_virtual_tables_and_computed_columns_are_no_tables_of_a_bag() {
 }
 
 #[test]
+fn names_of_topics_are_shown_without_being_obeyed() {
+    const NAME: &str = "/a\u{1b}]0;owned\u{7}\n INFO forged";
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("all.mcap");
+    let mut messages = recording(Kind::CdrLittle);
+    for message in &mut messages {
+        if message.topic == "/points" {
+            message.topic = NAME;
+        }
+    }
+    let options = mcap::WriteOptions::new().compression(None);
+    fs::write(&path, mcap(options, "cdr", &messages)).unwrap();
+    for (command, options) in [
+        ("info", &[][..]),
+        ("info", &["--json"]),
+        ("odometry", &["--set", "topic=/two"]),
+        ("build-map", &["--set", "topic=/two"]),
+    ] {
+        let mut call = Command::new(assert_cmd::cargo::cargo_bin!("fpmcl"));
+        call.current_dir(folder.path()).arg(command).arg(&path);
+        let output = call.args(options).output().unwrap();
+        let text = String::from_utf8([output.stdout, output.stderr].concat()).unwrap();
+        assert!(!text.contains(['\u{1b}', '\u{7}']), "{command}: {text:?}");
+        let forged = |line: &str| line.trim_start().starts_with("INFO forged");
+        assert!(!text.lines().any(forged), "{command}: {text}");
+        // `info` does not name the only topic of scans.
+        assert!(command == "info" || text.contains("]0;owned"), "{command}: {text}");
+    }
+}
+
+#[test]
 #[cfg(unix)]
 fn a_message_that_no_sensor_sends_is_refused_by_its_size() {
     let folder = tempfile::tempdir().unwrap();
