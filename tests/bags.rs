@@ -583,6 +583,37 @@ fn views_virtual_tables_and_computed_columns_are_no_tables_of_a_bag() {
 }
 
 #[test]
+fn a_topic_of_odometry_has_poses_only_where_it_is_named_and_motion_everywhere() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("all.mcap");
+    let options = mcap::WriteOptions::new().compression(None);
+    let messages = recording(Kind::CdrLittle);
+    fs::write(&path, mcap(options, "cdr", &messages)).unwrap();
+    let log = |options: &[&str]| {
+        let mut call = Command::new(assert_cmd::cargo::cargo_bin!("fpmcl"));
+        call.current_dir(folder.path()).args(options);
+        let output = call.output().unwrap();
+        String::from_utf8([output.stdout, output.stderr].concat()).unwrap()
+    };
+    let found =
+        "the poses are found from the scans: all.mcap has poses in /odom (nav_msgs/msg/Odometry)";
+    let unnamed = log(&["build-map", "all.mcap"]);
+    assert!(unnamed.contains(found), "{unnamed}");
+    let named = log(&["build-map", "all.mcap", "--poses", "/odom"]);
+    assert!(!named.contains("found from the scans"), "{named}");
+    let given = log(&["build-map", "all.mcap", "--set", "poses=given"]);
+    assert!(given.contains("name it with --poses"), "{given}");
+    let info = log(&["info", "all.mcap"]);
+    assert!(info.contains("only where it is named"), "{info}");
+    let recording = fpmcl::recording::Recording::open(&path).unwrap();
+    assert!(matches!(
+        recording.own_track(),
+        Err(RecordingError::TopicNotNamed { .. })
+    ));
+    assert!(recording.read_track(Path::new("/odom"), None).is_ok());
+}
+
+#[test]
 fn names_of_topics_are_shown_without_being_obeyed() {
     const NAME: &str = "/a\u{1b}]0;owned\u{7}\n INFO forged";
     let folder = tempfile::tempdir().unwrap();
@@ -609,7 +640,10 @@ fn names_of_topics_are_shown_without_being_obeyed() {
         let forged = |line: &str| line.trim_start().starts_with("INFO forged");
         assert!(!text.lines().any(forged), "{command}: {text}");
         // `info` does not name the only topic of scans.
-        assert!(command == "info" || text.contains("]0;owned"), "{command}: {text}");
+        assert!(
+            command == "info" || text.contains("]0;owned"),
+            "{command}: {text}"
+        );
     }
 }
 

@@ -25,7 +25,9 @@ pub fn with_given_poses(
         Some(track) => track,
         None => match recording.own_track() {
             Err(error) if is_auto && recording.files.poses.is_none() => {
-                if error.is_absence() {
+                if matches!(error, RecordingError::TopicNotNamed { .. }) {
+                    tracing::info!("the poses are found from the scans: {error}");
+                } else if error.is_absence() {
                     tracing::info!(
                         "the recording contains no poses: they are found from its scans"
                     );

@@ -45,6 +45,8 @@ pub enum RecordingError {
         types: &'static str,
         known: String,
     },
+    #[error("{} has poses in {known}; a topic is used for poses only where it is named, as it may be wheel odometry, which drifts", path.display())]
+    TopicNotNamed { path: PathBuf, known: String },
     #[error("{}, line {line}: `{word}` is not a finite number", path.display())]
     NotANumber {
         path: PathBuf,

@@ -170,15 +170,15 @@ impl Recording {
         }
     }
 
-    /// The poses that belong to the recording by their names and places; in a bag, of a body on which the lidar is
-    /// mounted by `body_from_lidar`, else by the static transforms.
+    /// The poses that belong to the recording by their names and places; those of a bag have to be named, by
+    /// [`read_track`](Self::read_track).
     ///
     /// # Errors
-    /// The recording has no poses, or they cannot be read.
+    /// The recording has no such poses, or they cannot be read.
     pub fn own_track(&self) -> Result<PoseTrack, RecordingError> {
         #[cfg(feature = "bags")]
-        if let Some((bag, topic)) = &self.bag {
-            return PoseTrack::read_topic(bag, None, topic, self.body_from_lidar);
+        if let Some((bag, _)) = &self.bag {
+            return Err(bag.topics_of_poses_not_named());
         }
         let Some(path) = &self.files.poses else {
             return Err(RecordingError::NoPoseFile {
@@ -186,6 +186,16 @@ impl Recording {
             });
         };
         PoseTrack::read(path, self.files.calibration.as_deref())
+    }
+
+    /// The poses of the only topic of a bag that has some, as odometry: what moves from one to the next is known, not where
+    /// they are.
+    #[cfg(feature = "bags")]
+    pub(crate) fn odometry_track(&self) -> Result<PoseTrack, RecordingError> {
+        match &self.bag {
+            Some((bag, topic)) => PoseTrack::read_topic(bag, None, topic, self.body_from_lidar),
+            None => self.own_track(),
+        }
     }
 
     /// Reads poses of this recording from a file, a folder `oxts`, or a topic of its bag; they are those of a body if its

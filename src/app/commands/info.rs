@@ -150,7 +150,7 @@ fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
         scans: frames.len(),
         first_scan: first.number,
         last_scan: last.number,
-        duration_s: has_times.then(|| last.time_s - first.time_s),
+        duration_s: has_times.then_some(last.time_s - first.time_s),
         points_per_scan: points,
         fields: fields(&scans[0]),
         sensor: Sensor::infer(&scans, &SensorConfig::default())?,

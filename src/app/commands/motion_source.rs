@@ -40,7 +40,7 @@ impl MotionSource {
             }
             // A bag may have a topic of odometry.
             (OdometrySource::Auto, None) if recording.files.layout == Layout::Bag => {
-                match recording.own_track() {
+                match recording.odometry_track() {
                     Ok(track) => {
                         return Ok((Self::of_track(&track, recording)?, Some(track.path)));
                     }

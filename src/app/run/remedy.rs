@@ -40,6 +40,7 @@ fn remedy(error: &(dyn Error + 'static)) -> Option<&'static str> {
         RecordingError::SeveralTopics { .. } => {
             Some("name it with the key topic (scans) or with --poses (poses)")
         }
+        RecordingError::TopicNotNamed { .. } => Some("name it with --poses, or in pose_file"),
         RecordingError::NoPoseFile { .. } => Some("name it with --poses, or in pose_file"),
         RecordingError::NoMounting { .. } => Some("--poses names a file of poses"),
         _ => None,

@@ -84,6 +84,12 @@ impl fmt::Debug for Bag {
     }
 }
 
+/// Names and types of topics.
+fn listed<'a>(topics: impl Iterator<Item = &'a Topic>) -> String {
+    let names = topics.map(|topic| format!("{} ({})", topic.name, topic.message_type));
+    names.collect::<Vec<_>>().join(", ")
+}
+
 impl Bag {
     /// Opens a bag by its index. An `.mcap` without one is read once, as a whole.
     ///
@@ -130,13 +136,9 @@ impl Bag {
     pub fn topic(&self, kind: TopicKind, name: Option<&str>) -> Result<&Topic, RecordingError> {
         let mut found = self.topics_of(kind);
         let (path, types) = (self.path.clone(), kind.types());
-        let list = |topics: &mut dyn Iterator<Item = &Topic>| {
-            let names = topics.map(|topic| format!("{} ({})", topic.name, topic.message_type));
-            names.collect::<Vec<_>>().join(", ")
-        };
-        let known = list(&mut self.topics_of(kind));
+        let known = listed(self.topics_of(kind));
         if known.is_empty() {
-            let found = list(&mut self.topics.iter());
+            let found = listed(self.topics.iter());
             return Err(RecordingError::NoTopic { path, types, found });
         }
         match name {
@@ -152,6 +154,17 @@ impl Bag {
             None => match (found.next(), found.next()) {
                 (Some(only), None) => Ok(only),
                 _ => Err(RecordingError::SeveralTopics { path, types, known }),
+            },
+        }
+    }
+
+    /// The error of poses for which no topic was named.
+    pub(super) fn topics_of_poses_not_named(&self) -> RecordingError {
+        match self.topic(TopicKind::Poses, None) {
+            Err(error @ RecordingError::NoTopic { .. }) => error,
+            _ => RecordingError::TopicNotNamed {
+                path: self.path.clone(),
+                known: listed(self.topics_of(TopicKind::Poses)),
             },
         }
     }
