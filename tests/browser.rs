@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use fpmcl::internals::app::Bitmap;
 
 /// Widths of the windows of a desktop and of a phone [px].
-const WIDTHS: [u32; 2] = [1280, 390];
+const WIDTHS: [u32; 2] = [1400, 390];
 
 /// Minimum width of a window of the browser [px].
 const MIN_WIDTH: u32 = 500;

@@ -86,8 +86,13 @@ fn verdict(results: &ComparisonResults) -> String {
             continue;
         };
         let successes = runs.iter().filter(|run| run.is_success()).count();
+        let wrong = runs.iter().filter_map(|run| run.trust.as_ref());
+        let wrong = match wrong.map(|trust| trust.wrong).sum() {
+            0 => String::new(),
+            count => format!(", with {count} frames of the filter wrong and tracking"),
+        };
         let text = format!(
-            "{} {}, {successes} of {} runs successful",
+            "{} {}, {successes} of {} runs successful{wrong}",
             variant.name,
             length(position.mean),
             runs.len()

@@ -37,7 +37,7 @@ pub const PICTURES: [(&str, &str, &str); 7] = [
     (
         "One scan",
         "range_images.png",
-        "Observed, rendered from the estimate, and their difference",
+        "Observed, rendered from the estimate, and their difference: blue is nearer than the map, such as another car, red farther",
     ),
     (
         "States",

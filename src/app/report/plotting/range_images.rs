@@ -50,8 +50,13 @@ impl RangeImageStrip<'_> {
     fn draw_on(&self, sheet: &Sheet) -> Result<()> {
         sheet.title(self.title, LEFT)?;
         let name = "no return, or no surface in the map";
-        let missing = LegendEntry::new(name, MISSING, Mark::Area);
-        legend(sheet, &[missing], (LEFT, 70.0), WIDTH - RIGHT)?;
+        let [nearer, farther] = [0.0, 1.0].map(|end| Colormap::Diverging.at(end));
+        let entries = [
+            LegendEntry::new(name, MISSING, Mark::Area),
+            LegendEntry::new("nearer than the map, such as a car", nearer, Mark::Area),
+            LegendEntry::new("farther than the map", farther, Mark::Area),
+        ];
+        legend(sheet, &entries, (LEFT, 70.0), WIDTH - RIGHT)?;
         let ranges = ColorBar {
             range: AxisRange::new(0.0, f64::from(self.observed.model.max_range)),
             colormap: Colormap::Viridis,

@@ -50,11 +50,17 @@ impl PathPlot<'_> {
         let color_bar = self.color_bar();
         // The last trajectory is only in the colors of its numbers.
         let (plain, colored) = all.split_at(all.len() - usize::from(color_bar.is_some()));
-        let entries = plain.iter();
+        let entries = plain
+            .iter()
+            .map(|&(name, color, _)| (name.to_owned(), color));
+        let colored_name = |&(name, ..): &(&str, _, _)| format!("{name}, colored");
+        let middle = Colormap::Viridis.at(0.6);
+        let entries = entries.chain(colored.iter().map(|it| (colored_name(it), middle)));
+        let entries: Vec<(String, Rgb)> = entries.collect();
         let view = TopView {
             title: self.title,
-            legend: entries
-                .map(|&(name, color, _)| LegendEntry::new(name, color, Mark::Line))
+            legend: (entries.iter())
+                .map(|(name, color)| LegendEntry::new(name, *color, Mark::Line))
                 .collect(),
             x: x.padded(margin),
             y: y.padded(margin),
@@ -96,19 +102,38 @@ impl PathPlot<'_> {
     }
 }
 
-/// Marks the first and the last pose.
+/// Marks the first and the last pose, each with its name where the path does not continue.
 fn draw_ends(sheet: &Sheet, view: &View, poses: &[Pose2]) -> Result<()> {
-    if let [first, .., last] = poses {
-        for (pose, label, side, aside) in [
-            (first, "start", HPos::Right, -12.0),
-            (last, "end", HPos::Left, 12.0),
-        ] {
-            let place = view.at(pose.translation.x, pose.translation.y);
-            sheet.dot(place, 9.0, WHITE, 1.0)?;
-            sheet.dot(place, 7.0, TRUTH, 1.0)?;
-            let style = bold(text_style(TICK, side, VPos::Bottom));
-            sheet.text(label, (place.0 + aside, place.1 - 10.0), &style)?;
-        }
+    /// Length of the path next to an end that its name leaves free, and distance of the name [pixels].
+    const NEAR: f64 = 40.0;
+    const ASIDE: f64 = 16.0;
+    let places = positions(poses, view);
+    let mut reversed = places.clone();
+    reversed.reverse();
+    for (places, label) in [(places, "start"), (reversed, "end")] {
+        let [place, .., far] = places[..] else {
+            return Ok(());
+        };
+        let from_end = |it: &(f64, f64)| (it.0 - place.0, it.1 - place.1);
+        let mut others = places.iter().map(from_end);
+        let (x, y) = others
+            .find(|it| it.0.hypot(it.1) > NEAR)
+            .unwrap_or(from_end(&far));
+        let side = match x {
+            _ if y.abs() > x.abs() => HPos::Center,
+            0.0.. => HPos::Right,
+            _ => HPos::Left,
+        };
+        let line = match y {
+            _ if y.abs() <= x.abs() => VPos::Center,
+            0.0.. => VPos::Bottom,
+            _ => VPos::Top,
+        };
+        let length = x.hypot(y).max(1.0);
+        let at = (place.0 - ASIDE * x / length, place.1 - ASIDE * y / length);
+        sheet.dot(place, 9.0, WHITE, 1.0)?;
+        sheet.dot(place, 7.0, TRUTH, 1.0)?;
+        sheet.text(label, at, &bold(text_style(TICK, side, line)))?;
     }
     Ok(())
 }
