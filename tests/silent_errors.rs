@@ -69,6 +69,35 @@ fn given_poses_that_jump_stop_the_odometry_and_are_named() {
     odometry().set("max_step_m", "100").succeeds();
 }
 
+/// A map of a street, and scans of which those from `first` on are of another place.
+fn half_elsewhere(frames: usize, first: usize) -> Recording {
+    let recording = mapped(frames);
+    for frame in first..frames {
+        let scan = recording.scan(frame);
+        let elsewhere = scan.iter().map(|point| point.map(|axis| 1.3 * axis));
+        recording.write_scan(frame, &elsewhere.collect::<Vec<_>>());
+    }
+    recording
+}
+
+#[test]
+fn a_run_that_is_not_localized_has_an_exit_code_of_its_own_and_its_result_is_kept() {
+    for (first, code, localized) in [(0, 3, false), (4, 3, false), (10, 0, true)] {
+        let recording = half_elsewhere(12, first);
+        for (command, name) in [("localize", "mcl_tum.txt"), ("refine", "refined_tum.txt")] {
+            let output = recording.fpmcl(command).with("--json").exits_with(code);
+            let report: serde_json::Value = serde_json::from_str(&output.stdout).unwrap();
+            assert_eq!(
+                report["summary"]["localized"], localized,
+                "{first} {command}"
+            );
+            assert!(!output.stderr.contains("error: "), "{}", output.stderr);
+            assert!(recording.path("results").join(name).exists());
+        }
+        assert!(recording.path("results/localization.npz").exists());
+    }
+}
+
 #[test]
 fn senseless_times_stop_the_odometry() {
     let recording = Recording::street(3);
@@ -357,7 +386,7 @@ fn a_run_that_is_lost_says_so_even_when_quiet() {
         recording.write_scan(frame, &points);
     }
     let call = recording.fpmcl("localize").with("-q").with("--all");
-    let output = call.succeeds();
+    let output = call.exits_with(3);
     assert!(
         output.stderr.contains("WARN tracking was lost"),
         "{}\n{}",

@@ -292,13 +292,13 @@ impl Command {
                 if let Some(log) = &log {
                     export::run(log, &context)?;
                 }
-                printed(&report)
+                run_printed(&report)
             }
             Self::Refine(args) => {
                 let base = || refine::base_config(args.run.source.input());
                 let source = &args.run.source;
                 let (config, context) = configured(args, source, "result_file", base, context)?;
-                printed(&refine::run(&config, &context)?)
+                run_printed(&refine::run(&config, &context)?)
             }
             Self::Evaluate(args) => {
                 let (source, base) = (&args.run.source, EvaluationConfig::default);
@@ -375,6 +375,11 @@ impl ConfigurationArgs {
 
 fn printed(report: &Report) -> anyhow::Result<Printed> {
     Printed::parts(report.to_text(false), report.to_text(true)).with_json(report)
+}
+
+/// The report of a run, whose exit code says whether it was localized.
+fn run_printed(report: &Report) -> anyhow::Result<Printed> {
+    Ok(printed(report)?.of_run(report.summary.is_localized()))
 }
 
 #[cfg(test)]

@@ -40,10 +40,12 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     };
     let run = || {
         let context = Context::new(cli.level(), cli.command.machine())?;
-        output::print(&cli.command.run(cli.form(), &context)?.in_form(cli.form()))
+        let printed = cli.command.run(cli.form(), &context)?;
+        output::print(&printed.in_form(cli.form()))?;
+        anyhow::Ok(printed.exit_code)
     };
     match run() {
-        Ok(()) => 0,
+        Ok(code) => code,
         Err(error) => {
             failure::report(&error);
             failure::exit_code(&error)

@@ -296,6 +296,7 @@ motion_compensation: null
 range_image: {height: 32, width: 360, fov_up: 3, fov_down: -25, max_range: 50, min_range: 1}
 ";
 
+/// Drives of few frames are localized in their first one.
 const LOCALIZATION: &str = "\
 scan_folder: velodyne
 map_file: map.ply
@@ -308,6 +309,8 @@ numParticles: 50
 num_reduced: 20
 plot_loc_results: False
 pose_tracking: True
+start: {position_m: 0.2, heading_rad: 0.02}
+tracking_loss: {confirming_updates: 1}
 odometry: ground_truth
 has_rows: True
 own_car_m: [-2.5, 2.7, -1.2, 1.2]

@@ -6,6 +6,9 @@ use super::interrupt::Interrupted;
 use super::remedy::remedies;
 use super::visible::{visible, visible_in_line};
 
+/// Exit code of a run whose result is kept, but of which less than half of the frames were localized.
+pub const NOT_LOCALIZED: u8 = 3;
+
 /// Prints an error with its causes and remedies on standard error.
 pub fn report(error: &anyhow::Error) {
     let mut text = format!("error: {}", format_error_chain(error));
@@ -24,7 +27,8 @@ pub fn report_usage(error: &clap::Error) {
     let _ = std::io::stderr().write_all(visible(&text).as_bytes());
 }
 
-/// Exit code of a failed run: 130 if it was interrupted, as in shells, else 1; 2 is wrong usage.
+/// Exit code of a failed run: 130 if it was interrupted, as in shells, else 1; 2 is wrong usage, and 3
+/// [`NOT_LOCALIZED`].
 pub fn exit_code(error: &anyhow::Error) -> u8 {
     if error.is::<Interrupted>() { 130 } else { 1 }
 }

@@ -7,6 +7,7 @@ use std::path::Path;
 use anyhow::Context as _;
 use serde::Serialize;
 
+use super::failure::NOT_LOCALIZED;
 use super::visible::{visible, visible_in_line};
 use crate::app::settings::to_yaml;
 use crate::files::{check_claimed, write_atomically};
@@ -43,6 +44,8 @@ pub struct Printed {
     main: String,
     all: String,
     json: String,
+    /// Exit code of the program.
+    pub exit_code: u8,
 }
 
 /// How much is printed, and in which form.
@@ -90,6 +93,7 @@ impl Printed {
             json: serde_json::Value::from(all.trim_end()).to_string(),
             main,
             all,
+            exit_code: 0,
         }
     }
 
@@ -97,6 +101,13 @@ impl Printed {
     pub fn with_json(self, value: &impl Serialize) -> anyhow::Result<Self> {
         let json = serde_json::to_string_pretty(value).context("cannot serialize the output")?;
         Ok(Self { json, ..self })
+    }
+
+    /// The same with the exit code of a run that was localized, or not: [`NOT_LOCALIZED`].
+    #[must_use]
+    pub fn of_run(self, is_localized: bool) -> Self {
+        let exit_code = if is_localized { 0 } else { NOT_LOCALIZED };
+        Self { exit_code, ..self }
     }
 
     /// The text in a form.

@@ -18,6 +18,8 @@ pub struct RunSummary {
     pub frames: usize,
     /// Number of frames in which the filter was tracking.
     pub tracking: Option<usize>,
+    /// Whether the filter was tracking in at least half of the frames.
+    pub localized: Option<bool>,
     /// Number of the first frame in which it was tracking.
     pub first_tracked: Option<usize>,
     /// Number of frames in which the car may have been in several places.
@@ -52,6 +54,7 @@ impl RunSummary {
         Self {
             frames: results.len(),
             tracking: states.map(|_| tracked.len()),
+            localized: states.map(|_| !tracked.is_empty() && 2 * tracked.len() >= results.len()),
             first_tracked: states.and_then(|_| Some(results.frames[*tracked.first()?])),
             ambiguous: (results.places.as_ref())
                 .map(|places| places.iter().filter(|&&places| places > 1.0).count()),
@@ -64,6 +67,11 @@ impl RunSummary {
                 (share >= 0.0).then_some(share)
             }),
         }
+    }
+
+    /// Whether the run found the car in at least half of the frames, as far as is known.
+    pub fn is_localized(&self) -> bool {
+        self.localized != Some(false)
     }
 
     /// Place and duration of the tracking, and how sure it is of itself, in a sentence.
