@@ -10,7 +10,10 @@ use std::path::Path;
 use std::sync::LazyLock;
 
 use common::{DRIVE_2_IN_MAP, MAP_OF_DRIVE_1, SENSOR, fpmcl, json, run, simulate_two_drives};
+use fpmcl::internals::app::LocalizationResults;
 use fpmcl::internals::ply;
+use fpmcl::localization::State;
+use fpmcl::recording::read_tum;
 use tempfile::TempDir;
 
 /// Frames of a drive; 0.8 m apart.
@@ -113,6 +116,36 @@ fn a_start_anywhere_is_found_on_the_road_and_in_the_map() {
         let outcome = localize(region, &[&format!("initialization={region}")]);
         assert!(outcome.worst_m < 0.2, "{region}: {} m", outcome.worst_m);
     }
+}
+
+#[test]
+fn frames_before_the_first_one_that_is_found_are_filled_back() {
+    let late = [
+        "initialization=tracking",
+        "tracking_loss.confirming_updates=8",
+    ];
+    let outcome = localize("filled", &late);
+    let summary = &outcome.report["summary"];
+    let (first, filled) = (&summary["first_tracked"], &summary["filled"]);
+    assert!(first.as_u64().unwrap() > 0 && first == filled, "{summary}");
+    let found = read_tum(&WORLD.path().join("filled/mcl_tum.txt")).unwrap();
+    assert_eq!(found.len(), FRAMES);
+    let result = LocalizationResults::read(&WORLD.path().join("filled/localization.npz")).unwrap();
+    let truth = result.ground_truth_in_space.unwrap();
+    for (row, (found, truth)) in found.iter().zip(&truth).enumerate() {
+        let off_m = (truth.inverse() * found.map_from_lidar)
+            .translation
+            .vector
+            .norm();
+        assert!(off_m < 0.2, "row {row}: {off_m} m");
+    }
+    // The filter's own estimates stay as they were at their time.
+    let states = result.states.unwrap();
+    assert_ne!(states[0], State::Tracking as u8);
+    assert_eq!(
+        result.trajectory_states.unwrap(),
+        [State::Tracking as u8; FRAMES]
+    );
 }
 
 #[test]

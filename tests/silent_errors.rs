@@ -69,13 +69,22 @@ fn given_poses_that_jump_stop_the_odometry_and_are_named() {
     odometry().set("max_step_m", "100").succeeds();
 }
 
+/// A scan of nothing that the map of a street has.
+fn round_place() -> Vec<[f32; 3]> {
+    (0..4000)
+        .map(|i| {
+            let azimuth = 0.0157 * f64::from(i % 400);
+            let z = -1.5 + 0.3 * f64::from(i / 400);
+            [30.0 * azimuth.cos(), 30.0 * azimuth.sin(), z].map(|m| m as f32)
+        })
+        .collect()
+}
+
 /// A map of a street, and scans of which those from `first` on are of another place.
 fn half_elsewhere(frames: usize, first: usize) -> Recording {
     let recording = mapped(frames);
     for frame in first..frames {
-        let scan = recording.scan(frame);
-        let elsewhere = scan.iter().map(|point| point.map(|axis| 1.3 * axis));
-        recording.write_scan(frame, &elsewhere.collect::<Vec<_>>());
+        recording.write_scan(frame, &round_place());
     }
     recording
 }
@@ -87,15 +96,143 @@ fn a_run_that_is_not_localized_has_an_exit_code_of_its_own_and_its_result_is_kep
         for (command, name) in [("localize", "mcl_tum.txt"), ("refine", "refined_tum.txt")] {
             let output = recording.fpmcl(command).with("--json").exits_with(code);
             let report: serde_json::Value = serde_json::from_str(&output.stdout).unwrap();
-            assert_eq!(
-                report["summary"]["localized"], localized,
-                "{first} {command}"
-            );
+            assert_eq!(report["localized"], localized, "{first} {command}");
             assert!(!output.stderr.contains("error: "), "{}", output.stderr);
             assert!(recording.path("results").join(name).exists());
         }
         assert!(recording.path("results/localization.npz").exists());
     }
+}
+
+/// A call for a recording of which no true poses are known.
+fn without_truth(recording: &Recording, command: &str) -> Fpmcl {
+    let call = recording.fpmcl(command).set("pose_file", "null");
+    let call = call.set("calib_file", "null").set("odometry", "scans");
+    if command == "localize" {
+        call.set("initial_pose", "[0, 0, 0]")
+    } else {
+        call
+    }
+}
+
+/// Rows of a trajectory, and the comments between them.
+fn rows(recording: &Recording, name: &str) -> (usize, Vec<String>) {
+    let text = String::from_utf8(recording.bytes(name)).unwrap();
+    let comments = text.lines().filter(|line| line.starts_with('#'));
+    let comments: Vec<String> = comments.map(str::to_owned).collect();
+    (text.lines().count() - comments.len(), comments)
+}
+
+#[test]
+fn frames_that_are_lost_are_no_part_of_the_trajectory_its_length_and_its_pictures() {
+    let recording = half_elsewhere(12, 8);
+    let plain = |command: &str| recording.fpmcl(command).set("plot_loc_results", "True");
+    for (command, name, column) in [
+        ("localize", "mcl", "state"),
+        ("refine", "refined", "refined_state"),
+    ] {
+        plain(command).exits_with(0);
+        let table = String::from_utf8(recording.bytes("results/frames.csv")).unwrap();
+        let column = table
+            .lines()
+            .next()
+            .unwrap()
+            .split(',')
+            .position(|it| it == column);
+        let states = table
+            .lines()
+            .skip(1)
+            .map(|row| row.split(',').nth(column.unwrap()).unwrap());
+        let states: Vec<&str> = states.collect();
+        let tracked = states.iter().filter(|state| **state == "tracking").count();
+        assert!((6..12).contains(&tracked), "{states:?}");
+        let kitti = format!("results/{name}_kitti.txt");
+        let tum = format!("results/{name}_tum.txt");
+        assert_eq!(rows(&recording, &tum), (tracked, vec![]), "{states:?}");
+        assert_eq!(rows(&recording, &kitti).0, tracked);
+        let report = json(&recording.path("results/report.json"));
+        let summary = if command == "localize" {
+            &report["summary"]
+        } else {
+            &report["refinement"]["trajectory"]
+        };
+        // Half a metre per frame, with what the filter of few particles is off.
+        let path_m = summary["path_m"].as_f64().unwrap();
+        assert!(
+            (path_m - 0.5 * (tracked - 1) as f64).abs() < 0.3,
+            "{path_m}"
+        );
+        let path = json(&recording.path("results/plots/path.json"));
+        let trusted = path["trusted"].as_array().unwrap().iter();
+        let trusted = trusted.map(|it| it.as_bool().unwrap());
+        assert!(trusted.eq(states.iter().map(|state| *state == "tracking")));
+
+        let all = plain(command).with("--force").set("all_poses", "True");
+        all.exits_with(0);
+        let (count, comments) = rows(&recording, &tum);
+        assert_eq!((count, comments[0].as_str()), (12, "# tracking"));
+        assert!(
+            comments.len() > 1 && comments[1] != "# tracking",
+            "{comments:?}"
+        );
+        // Comments are no rows for who reads the file.
+        assert_eq!(
+            fpmcl::recording::read_tum(&recording.path(&tum))
+                .unwrap()
+                .len(),
+            12
+        );
+    }
+}
+
+#[test]
+fn a_run_that_is_nowhere_localized_has_no_path() {
+    let recording = half_elsewhere(6, 0);
+    let drawn = |command: &str| without_truth(&recording, command).set("plot_loc_results", "True");
+    drawn("localize").exits_with(3);
+    drawn("refine").exits_with(3);
+    for name in ["mcl_tum.txt", "refined_kitti.txt"] {
+        assert!(
+            recording.bytes(&format!("results/{name}")).is_empty(),
+            "{name}"
+        );
+    }
+    let report = json(&recording.path("results/report.json"));
+    assert_eq!(report["summary"]["path_m"], 0.0);
+    assert!(!recording.path("results/plots/path.png").exists());
+    assert!(recording.path("results/report.html").exists());
+}
+
+#[test]
+fn refine_says_what_it_did_without_true_poses() {
+    let recording = half_elsewhere(12, 8);
+    without_truth(&recording, "localize").exits_with(0);
+    let refine = || without_truth(&recording, "refine").with("--force");
+    let text = refine().exits_with(0).stdout;
+    for row in [
+        "moved median",
+        "moved max",
+        "cost median",
+        "beams on the map median",
+        "refused frames",
+    ] {
+        assert!(text.contains(row), "no `{row}` in: {text}");
+    }
+    assert!(
+        text.contains("Refined ") && text.contains("moved by "),
+        "{text}"
+    );
+    let report: serde_json::Value =
+        serde_json::from_str(&refine().with("--json").exits_with(0).stdout).unwrap();
+    let refinement = &report["refinement"];
+    let number = |pointer: &str| refinement.pointer(pointer).unwrap().as_f64().unwrap();
+    assert!(number("/cost_m/1/median") <= number("/cost_m/0/median"));
+    assert!(number("/agreement/1/median") > 0.8);
+    assert!(number("/moved_m/median") > 0.0 && number("/moved_m/max") >= number("/moved_m/median"));
+    let refused = number("/refused");
+    assert!(refused > 0.0 && refused + number("/trajectory/tracking") == 12.0);
+    let page = String::from_utf8(recording.bytes("results/report.html")).unwrap();
+    assert!(page.contains("moved median") && page.contains("refused frames"));
 }
 
 #[test]
@@ -373,18 +510,7 @@ fn evaluate_uses_the_poses_that_it_is_given() {
 
 #[test]
 fn a_run_that_is_lost_says_so_even_when_quiet() {
-    let recording = mapped(20);
-    // The car is somewhere else: a scan of nothing that the map has.
-    for frame in 3..20 {
-        let points: Vec<[f32; 3]> = (0..4000)
-            .map(|i| {
-                let azimuth = 0.0157 * f64::from(i % 400);
-                let z = -1.5 + 0.3 * f64::from(i / 400);
-                [30.0 * azimuth.cos(), 30.0 * azimuth.sin(), z].map(|m| m as f32)
-            })
-            .collect();
-        recording.write_scan(frame, &points);
-    }
+    let recording = half_elsewhere(20, 3);
     let call = recording.fpmcl("localize").with("-q").with("--all");
     let output = call.exits_with(3);
     assert!(

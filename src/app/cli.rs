@@ -379,7 +379,7 @@ fn printed(report: &Report) -> anyhow::Result<Printed> {
 
 /// The report of a run, whose exit code says whether it was localized.
 fn run_printed(report: &Report) -> anyhow::Result<Printed> {
-    Ok(printed(report)?.of_run(report.summary.is_localized()))
+    Ok(printed(report)?.of_run(report.localized))
 }
 
 #[cfg(test)]

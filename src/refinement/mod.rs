@@ -19,6 +19,7 @@ pub use refiner::{FrameRefinementConfig, Method};
 pub use smoothing::SmoothingConfig;
 pub use swarm::SwarmConfig;
 pub use trajectory::{
-    FrameResult, InitialEstimate, RefinedTrajectory, RefinerConfig, RefinerError, TrajectoryRefiner,
+    FrameChange, FrameResult, InitialEstimate, RefinedTrajectory, RefinerConfig, RefinerError,
+    TrajectoryRefiner,
 };
 pub use wide_search::WideSearchConfig;

@@ -133,6 +133,8 @@ pub struct RefinedFrame {
     pub pose: Pose2,
     /// `map_from_lidar` in space.
     pub map_from_lidar: Pose3,
+    /// The estimate in space.
+    pub start_in_space: Pose3,
     /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
     /// Attitude of the sensor above the mapped ground.
@@ -197,6 +199,7 @@ pub fn refine_frame(
     let mut frame = RefinedFrame {
         pose: *estimate,
         map_from_lidar: lifted,
+        start_in_space: lifted,
         covariance: *covariance,
         attitude: objective.attitude,
         level_m: objective.level_m,

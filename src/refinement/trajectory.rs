@@ -180,11 +180,23 @@ pub struct FrameResult {
     pub map_from_lidar: Option<Pose3>,
     /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
-    /// State of the filter.
-    state: State,
+    /// State of the filter; `Tracking` where a frame was placed from its neighbours, and `Searching` where a tracked one was
+    /// refused.
+    pub state: State,
+    /// What the refinement changed; `None` where the frame was not refined.
+    pub change: Option<FrameChange>,
     attitude: SensorAttitude,
     /// Height of the ground below the sensor [m], if known.
     level_m: Option<f64>,
+}
+
+/// How well a frame fits the map before and after its refinement.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FrameChange {
+    /// Mean cost of the differences [m].
+    pub cost_m: [f64; 2],
+    /// Share of the compared beams that end on a surface of the map; `None` for too few beams.
+    pub agreement: [Option<f64>; 2],
 }
 
 /// A refined trajectory.
@@ -205,6 +217,8 @@ pub struct RefinedTrajectory {
     pub is_smoothed: bool,
     /// State of each frame: `Searching` where its estimate was uncertain and it could not be placed.
     pub states: Vec<State>,
+    /// What the refinement changed in each frame, before smoothing; `None` where the frame was not refined.
+    pub changes: Vec<Option<FrameChange>>,
 }
 
 /// Why a trajectory cannot be refined.
@@ -291,6 +305,7 @@ impl TrajectoryRefiner {
             map_from_lidar: None,
             covariance: estimate.covariance(),
             state: estimate.state,
+            change: None,
             attitude: self.initial_attitude(&image),
             level_m: previous
                 .filter(|_| estimate.state != State::Lost)
@@ -445,6 +460,16 @@ impl TrajectoryRefiner {
         else {
             return Ok(None);
         };
+        let agreement_at = |pose: &Pose3| {
+            let tolerance_m = TrackingLossConfig::default().tolerance_m;
+            let rendered_m = ranges_along(&*self.map.renderer, pose, &beams, tolerance_m)?;
+            Ok::<_, RefinerError>(agreement(&beams, &rendered_m, tolerance_m))
+        };
+        let poses = [&refined.start_in_space, &refined.map_from_lidar];
+        frame.change = Some(FrameChange {
+            cost_m: [refined.cost_before_m, refined.cost_after_m],
+            agreement: [agreement_at(poses[0])?, agreement_at(poses[1])?],
+        });
         frame.pose = refined.pose;
         frame.map_from_lidar = Some(refined.map_from_lidar);
         frame.covariance = refined.covariance;
@@ -529,6 +554,7 @@ impl TrajectoryRefiner {
             unmapped: frames.len() - untracked - refined,
             is_smoothed: increments.is_some() && is_measured,
             states: frames.iter().map(|frame| frame.state).collect(),
+            changes: frames.iter().map(|frame| frame.change).collect(),
         })
     }
 
@@ -655,6 +681,7 @@ mod tests {
                 } else {
                     State::Tracking
                 },
+                change: None,
                 attitude: SensorAttitude::default(),
                 level_m: None,
             });
@@ -744,6 +771,7 @@ mod tests {
                 map_from_lidar: Some(pose3_from_pose2(&pose, 0.0)),
                 covariance: Matrix3::from_diagonal(&Vector3::new(1e-4, 1e-4, 1e-6)),
                 state: State::Tracking,
+                change: None,
                 attitude: SensorAttitude::default(),
                 level_m: None,
             });

@@ -116,7 +116,7 @@ pub fn run(args: &DemoArgs, context: &Context) -> Result<Printed> {
         ))
     };
     let printed = Printed::parts(text(Form::Main, false)?, text(Form::All, true)?);
-    let printed = printed.of_run(report.summary.is_localized());
+    let printed = printed.of_run(report.localized);
     printed.with_json(&DemoReport {
         build_map: build,
         localization: report,

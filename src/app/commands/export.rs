@@ -16,6 +16,7 @@ use super::stages::{RecordingInputs, infer};
 use crate::app::report::export::tiles::TILES_FOLDER;
 use crate::app::report::export::{Model, Ribbon, RunLog, write_mcap};
 use crate::app::report::plotting::color::{Colormap, TRUTH};
+use crate::app::report::results::stretches;
 use crate::app::report::{LocalizationResults, run_output};
 use crate::app::run::{Claims, Context, Outputs, Printed, input, output};
 use crate::app::settings::RefinementConfig;
@@ -194,26 +195,32 @@ fn frames_of(config: &mut RefinementConfig, results: &LocalizationResults) -> Re
 
 /// The map with the path, colored by its error where there is a truth.
 fn model_of(mesh: &TriangleMesh, results: &LocalizationResults) -> Result<Model> {
-    let found = results
-        .refined_in_space
-        .as_ref()
-        .or(results.estimates_in_space.as_ref());
+    let (found, trusted) = match &results.refined_in_space {
+        Some(refined) => (Some(refined), results.refined_trusted()),
+        None => {
+            let trajectory = results.trajectory_in_space.as_ref();
+            let trajectory = trajectory.or(results.estimates_in_space.as_ref());
+            (trajectory, results.trusted())
+        }
+    };
     let found = found.context("the result holds no poses in space; run localize again")?;
     let mut model = Model::default();
     model.add_mesh("map", mesh);
     let truth = results.ground_truth_in_space.as_deref();
     let (name, colors) = match truth {
-        Some(truth) => colored_by_error(found, truth),
+        Some(truth) => colored_by_error(found, truth, &trusted),
         None => (
             "path".to_owned(),
             vec![Colormap::Viridis.at(0.0); found.len()],
         ),
     };
-    model.add_ribbon(&Ribbon {
-        name: &name,
-        path: found,
-        colors,
-    });
+    for rows in stretches(&trusted) {
+        model.add_ribbon(&Ribbon {
+            name: &name,
+            path: &found[rows.clone()],
+            colors: colors[rows].to_vec(),
+        });
+    }
     if let Some(truth) = truth {
         model.add_ribbon(&Ribbon {
             name: "true path",
@@ -225,13 +232,14 @@ fn model_of(mesh: &TriangleMesh, results: &LocalizationResults) -> Result<Model>
 }
 
 /// Name and colors of a path by its planar error; the largest error has the lightest color.
-fn colored_by_error(found: &[Pose3], truth: &[Pose3]) -> (String, Vec<[u8; 3]>) {
+fn colored_by_error(found: &[Pose3], truth: &[Pose3], trusted: &[bool]) -> (String, Vec<[u8; 3]>) {
     let [found, truth] =
         [found, truth].map(|poses| -> Vec<_> { poses.iter().map(pose2_from_pose3).collect() });
     let errors: Vec<f64> = (planar_errors(&found, &truth).iter())
         .map(|error| error.distance_m())
         .collect();
-    let largest_m = errors.iter().copied().fold(0.0, f64::max);
+    let known = errors.iter().zip(trusted).filter(|(_, trusted)| **trusted);
+    let largest_m = known.map(|(error_m, _)| *error_m).fold(0.0, f64::max);
     let color = |error_m: &f64| Colormap::Viridis.at(error_m / largest_m.max(1e-9));
     let name = format!("path, position error 0 to {:.1} cm", 100.0 * largest_m);
     (name, errors.iter().map(color).collect())

@@ -11,7 +11,7 @@ use serde::Serialize;
 use super::motion_source;
 use super::motion_source::MotionSource;
 use super::stages::{RecordingInputs, input_files};
-use crate::app::report::run_output::{self, REFINEMENT_FILES, REPORT_FILES};
+use crate::app::report::run_output::{self, REFINEMENT_FILES, REPORT_FILES, Trajectory};
 use crate::app::report::{LocalizationResults, Report, RunFiles, run_page};
 use crate::app::run::arguments::numbers;
 use crate::app::run::{Claims, Context, NPZ, Outputs, RunArgs, input, output};
@@ -123,8 +123,21 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     results.ground_truth_in_space = results.ground_truth_in_space.take().or(truth);
     if is_trajectory {
         warn_of_distance(config, &estimates, &refined);
-        let states = refined.states.iter();
-        results.states = Some(states.map(|state| *state as u8).collect());
+    }
+    let changed = refined
+        .changes
+        .iter()
+        .copied()
+        .map(run_output::before_and_after);
+    let (costs_m, agreements) = changed
+        .map(|[costs_m, agreements]| (costs_m, agreements))
+        .unzip();
+    results.refinement_costs_m = Some(costs_m);
+    results.refinement_agreements = Some(agreements);
+    let states = refined.states.iter().map(|state| *state as u8);
+    results.refined_states = Some(states.collect());
+    if is_trajectory {
+        results.states.clone_from(&results.refined_states);
     }
     results.estimates = Some(estimates);
     results.refined = Some(refined.poses.clone());
@@ -132,7 +145,7 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     results.refined_covariances = Some(refined.covariances.clone());
     results.refine_runtimes_s = Some(runtimes_s);
     claims.begin(&main)?;
-    let report = write_run(config, context, &files, &map, &sequence, &results, &refined)?;
+    let report = write_run(config, context, &files, &map, &sequence, &results)?;
     claims.finish(&main)?;
     Ok(report)
 }
@@ -315,7 +328,7 @@ fn report_unrefined(refined: &RefinedTrajectory, is_trajectory: bool) {
             "are unchanged"
         };
         tracing::warn!(
-            "{} of {} poses could not be placed in the map: they {moved}; their state is searching. If the trajectory may be farther off, give a larger --uncertainty",
+            "{} of {} poses could not be placed in the map: they {moved}; their state is searching, and the trajectory is without them. If the trajectory may be farther off, give a larger --uncertainty",
             refined.untracked,
             refined.poses.len()
         );
@@ -401,11 +414,11 @@ fn write_run(
     map: &Map,
     sequence: &Recording,
     results: &LocalizationResults,
-    refined: &RefinedTrajectory,
 ) -> Result<Report> {
     let saving = context.interrupt.saving();
     run_output::write_results(files, results)?;
-    run_output::write_trajectory(files, "refined", sequence, &refined.map_from_lidar)?;
+    let refined = Trajectory::refined(results, &sequence.frames);
+    refined.write(files, "refined", sequence, config.all_poses)?;
     output::write_yaml(&files.file("effective_refinement.yml"), config)?;
     let odometry = match (config.motion.odometry, &config.motion.odometry_file) {
         // It may be that of a topic.

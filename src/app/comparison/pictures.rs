@@ -10,6 +10,7 @@ use crate::app::report::LocalizationResults;
 use crate::app::report::pages::PageElement;
 use crate::app::report::plotting::color::{Rgb, SERIES};
 use crate::app::report::plotting::{LineChart, Mark, Panel, PathPlot, Series, error_chart};
+use crate::app::report::results::with_gaps;
 use crate::app::report::run_output::time_axis;
 use crate::app::report::run_page::picture;
 use crate::app::run::output;
@@ -108,7 +109,7 @@ pub fn trajectories(
     let seeds = seeds.collect::<Vec<String>>().join(", ");
     let paths = trajectories
         .iter()
-        .map(|it| (it.name.as_str(), it.color, it.poses.as_slice()));
+        .map(|it| (it.name.as_str(), it.color, it.path.as_slice()));
     let plot = plot_path(&format!("paths_{sequence}.png"), layout)?;
     PathPlot {
         title: &format!("{sequence}: paths against ground truth"),
@@ -146,6 +147,8 @@ struct Trajectory {
     time_name: &'static str,
     time: Vec<f64>,
     poses: Vec<Pose2>,
+    /// The same with gaps where they are not trusted.
+    path: Vec<Pose2>,
     truth: Vec<Pose2>,
 }
 
@@ -181,6 +184,13 @@ fn read_trajectory(record: &RunRecord, color: Rgb, layout: &Layout) -> Option<Tr
         seed: record.id.seed,
         time_name,
         time,
+        path: match (&results.refined, &results.estimates) {
+            (Some(refined), _) => with_gaps(refined, &results.refined_trusted()),
+            (None, estimates) => with_gaps(
+                &results.trajectory(estimates.as_deref()?),
+                &results.trusted(),
+            ),
+        },
         poses: results.refined.or(results.estimates)?,
         truth: results.ground_truth?,
     })

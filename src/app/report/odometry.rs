@@ -9,7 +9,7 @@ use serde::Serialize;
 use super::plotting::PathPlot;
 use super::plotting::color::{ODOMETRY, REFINED};
 use super::results::{FrameTable, write_trajectory_npz};
-use super::run_output::{RunFiles, stamped, write_trajectory};
+use super::run_output::{RunFiles, Trajectory as WrittenTrajectory, stamped};
 use crate::app::run::output;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::mapping::TrajectorySummary;
@@ -145,7 +145,12 @@ pub fn write(
     let poses: Vec<Pose3> = rows.iter().map(|&row| found.poses[row]).collect();
     let steps: Vec<&OdometryEstimate> = rows.iter().map(|&row| &found.odometry[row]).collect();
     let odometry: Vec<Pose3> = steps.iter().map(|step| step.odom_from_lidar).collect();
-    write_trajectory(files, "poses", recording, &poses)?;
+    let written = WrittenTrajectory {
+        frames: &recording.frames,
+        poses: &poses,
+        states: None,
+    };
+    written.write(files, "poses", recording, false)?;
     output::write_file(&files.file("odometry_tum.txt"), |file| {
         write_tum(file, &stamped(frames, &odometry))
     })?;

@@ -3,12 +3,14 @@
 mod pictures;
 
 use std::collections::BTreeMap;
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail};
 
 use crate::app::report::results::{
-    LocalizationResults, Report, RunSummary, TrajectoryReport, write_frames_csv, write_poses_npy,
+    LocalizationResults, RefinementSummary, Report, RunSummary, TrajectoryReport, write_frames_csv,
+    write_poses_npy,
 };
 use crate::app::run::{Claims, Outputs, output};
 use crate::app::settings::{MapInputConfig, RecordingConfig};
@@ -18,10 +20,11 @@ use crate::evaluation::{
 };
 use crate::files::folder_of;
 use crate::geometry::{Pose2, Pose3, StampedPose};
-use crate::localization::ParticleSet;
+use crate::localization::{ParticleSet, State};
 use crate::map::Map;
 use crate::recording::poses::{write_kitti, write_tum};
 use crate::recording::{Frame, Recording};
+use crate::refinement::FrameChange;
 
 pub use pictures::{MOST_TRIANGLES, Movie, draw_range_images, draw_run, map_around, time_axis};
 
@@ -128,21 +131,93 @@ pub fn stamped(frames: &[Frame], poses: &[Pose3]) -> Vec<StampedPose> {
         .collect()
 }
 
-/// Writes `<name>_tum.txt` (map frame, seconds) and `<name>_kitti.txt` (the convention of the
-/// recording's poses; without any, lidar poses in the map frame); the poses are those of the first frames.
-pub fn write_trajectory(
-    files: &RunFiles,
-    name: &str,
-    recording: &Recording,
-    map_from_lidar: &[Pose3],
-) -> Result<()> {
-    let trajectory = stamped(&recording.frames, map_from_lidar);
-    let (world_from_map, calibration) = recording.world();
-    output::write_file(&files.file(&format!("{name}_tum.txt")), |file| {
-        write_tum(file, &trajectory)
-    })?;
-    output::write_file(&files.file(&format!("{name}_kitti.txt")), |file| {
-        write_kitti(file, map_from_lidar, &world_from_map, &calibration)
+/// A trajectory with its frames.
+pub struct Trajectory<'a> {
+    /// The frames.
+    pub frames: &'a [Frame],
+    /// `map_from_lidar` of each frame.
+    pub poses: &'a [Pose3],
+    /// State of each pose as a number; all are trusted where they are not known.
+    pub states: Option<&'a [u8]>,
+}
+
+impl<'a> Trajectory<'a> {
+    /// The trajectory of the filter, in which the frames before the first tracked one are filled back.
+    pub fn of_filter(results: &'a LocalizationResults, frames: &'a [Frame]) -> Self {
+        let poses = results.trajectory_in_space.as_ref();
+        let poses = poses.or(results.estimates_in_space.as_ref());
+        let states = results.trajectory_states.as_ref();
+        Self {
+            frames,
+            poses: poses.map_or(&[], Vec::as_slice),
+            states: states.or(results.states.as_ref()).map(Vec::as_slice),
+        }
+    }
+
+    /// The refined trajectory.
+    pub fn refined(results: &'a LocalizationResults, frames: &'a [Frame]) -> Self {
+        Self {
+            frames,
+            poses: results.refined_in_space.as_deref().unwrap_or_default(),
+            states: results.refined_states.as_deref(),
+        }
+    }
+
+    /// Rows of the poses that are trusted.
+    fn trusted(&self) -> impl DoubleEndedIterator<Item = usize> {
+        (0..self.poses.len()).filter(|&row| self.state(row) == State::Tracking)
+    }
+
+    fn state(&self, row: usize) -> State {
+        let state = self.states.map(|states| State::from_number(states[row]));
+        state.map_or(State::Tracking, |state| state.unwrap_or(State::Searching))
+    }
+
+    /// The frame in the middle of those that are trusted, and its pose.
+    pub fn middle(&self) -> Option<(&'a Frame, &'a Pose3)> {
+        let rows: Vec<usize> = self.trusted().collect();
+        let &row = rows.get(rows.len() / 2)?;
+        Some((&self.frames[row], &self.poses[row]))
+    }
+
+    /// Writes `<name>_tum.txt` (map frame, seconds) and `<name>_kitti.txt` (the convention of the recording's poses; without
+    /// any, lidar poses in the map frame): the poses that are trusted, or all of them, with the states as comments.
+    pub fn write(
+        &self,
+        files: &RunFiles,
+        name: &str,
+        recording: &Recording,
+        all: bool,
+    ) -> Result<()> {
+        let rows: Vec<usize> = if all {
+            (0..self.poses.len()).collect()
+        } else {
+            self.trusted().collect()
+        };
+        let (world_from_map, calibration) = recording.world();
+        output::write_file(&files.file(&format!("{name}_tum.txt")), |file| {
+            for stretch in rows.chunk_by(|&a, &b| self.state(a) == self.state(b)) {
+                if all && self.states.is_some() {
+                    writeln!(file, "# {}", self.state(stretch[0]).word())?;
+                }
+                let poses = stretch
+                    .iter()
+                    .map(|&row| self.frames[row].stamped(self.poses[row]));
+                write_tum(&mut *file, &poses.collect::<Vec<_>>())?;
+            }
+            io::Result::Ok(())
+        })?;
+        let poses: Vec<Pose3> = rows.iter().map(|&row| self.poses[row]).collect();
+        output::write_file(&files.file(&format!("{name}_kitti.txt")), |file| {
+            write_kitti(file, &poses, &world_from_map, &calibration)
+        })
+    }
+}
+
+/// Costs [m] and agreements before and after the refinement of a frame, -1 where unknown.
+pub fn before_and_after(change: Option<FrameChange>) -> [[f64; 2]; 2] {
+    change.map_or([[-1.0; 2]; 2], |it| {
+        [it.cost_m, it.agreement.map(|share| share.unwrap_or(-1.0))]
     })
 }
 
@@ -233,9 +308,15 @@ pub fn evaluate(
     };
     let refined = (results.refined.as_ref())
         .map(|it| report(it, &results.refined_in_space, &results.refine_runtimes_s));
+    let summary = RunSummary::of(results, &estimates);
+    let refinement = RefinementSummary::of(results, &estimates);
     Ok(Report {
         about,
-        summary: RunSummary::of(results, &estimates),
+        localized: (refinement.as_ref())
+            .and_then(|it| it.trajectory.localized())
+            .or(summary.localized()),
+        summary,
+        refinement,
         mcl: report(&estimates, &results.estimates_in_space, &results.runtimes_s)?,
         refined: refined.transpose()?.flatten(),
         trajectory: None,

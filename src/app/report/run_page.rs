@@ -176,7 +176,7 @@ fn numbers(report: &Report) -> Vec<PageElement> {
 
 /// Metrics of both trajectories.
 fn metrics(report: &Report, is_shown: impl Fn(&MetricRow) -> bool) -> Table {
-    let has_refined = report.refined.is_some();
+    let has_refined = report.is_refined();
     let titles = ["metric", report.estimate_title(), "refined", "unit"];
     let cell = |value: Value| match value {
         Value::Number(number) => Cell::from(number),

@@ -103,10 +103,14 @@ impl Printed {
         Ok(Self { json, ..self })
     }
 
-    /// The same with the exit code of a run that was localized, or not: [`NOT_LOCALIZED`].
+    /// The same with the exit code of a run that was localized or, as far as is known, not: [`NOT_LOCALIZED`].
     #[must_use]
-    pub fn of_run(self, is_localized: bool) -> Self {
-        let exit_code = if is_localized { 0 } else { NOT_LOCALIZED };
+    pub fn of_run(self, localized: Option<bool>) -> Self {
+        let exit_code = if localized == Some(false) {
+            NOT_LOCALIZED
+        } else {
+            0
+        };
         Self { exit_code, ..self }
     }
 

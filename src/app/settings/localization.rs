@@ -35,6 +35,8 @@ pub struct LocalizationConfig {
     /// Whether to write the result.
     #[default(true)]
     pub save_result: bool,
+    /// Whether the trajectories also have the poses that are not trusted; comments in those of TUM are the states.
+    pub all_poses: bool,
     /// Whether to draw a picture per frame and an animation.
     pub visualize: bool,
     /// Whether the start is known: `initial_pose`, else the first true pose. `None`: known if `initial_pose` is

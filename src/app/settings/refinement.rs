@@ -31,6 +31,8 @@ pub struct RefinementConfig {
     pub result_file: PathBuf,
     /// Result to write of a trajectory; `None`: `refined.npz` in a folder that is named after it.
     pub output_file: Option<PathBuf>,
+    /// Whether the trajectories also have the poses that are not trusted; comments in those of TUM are the states.
+    pub all_poses: bool,
     /// Standard deviations of the poses of a trajectory: position [m] and heading [deg].
     #[default([1.0, 10.0])]
     pub uncertainty: [f64; 2],
@@ -56,6 +58,7 @@ impl RefinementConfig {
             given_poses: localization.given_poses,
             map_input: localization.map_input,
             result_file: localization.result_path,
+            all_poses: localization.all_poses,
             motion: localization.motion,
             sensor: tracker.sensor,
             refiner: RefinerConfig {

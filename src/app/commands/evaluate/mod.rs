@@ -287,11 +287,12 @@ fn scale(results: &mut LocalizationResults, grid_resolution_m: f64) {
     for pose in columns.into_iter().flatten().flatten() {
         pose.translation.vector *= grid_resolution_m;
     }
-    let [estimates, refined] = [
+    let columns = [
         &mut results.estimates_in_space,
         &mut results.refined_in_space,
+        &mut results.trajectory_in_space,
     ];
-    for pose in [estimates, refined].into_iter().flatten().flatten() {
+    for pose in columns.into_iter().flatten().flatten() {
         pose.translation.vector *= grid_resolution_m;
     }
     results.particles.scale_positions(grid_resolution_m as f32);

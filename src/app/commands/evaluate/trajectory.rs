@@ -52,6 +52,8 @@ pub fn evaluate(results: &LocalizationResults, about: BTreeMap<String, String>) 
     }
     Ok(Report {
         about,
+        localized: None,
+        refinement: None,
         summary: RunSummary {
             frames: results.len(),
             path_m: distances_m(estimates).last().copied().unwrap_or_default(),

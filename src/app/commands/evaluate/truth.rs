@@ -159,9 +159,13 @@ pub fn align(results: &mut LocalizationResults, alignment: Alignment) -> Result<
     }
     let truth = results.ground_truth.clone().unwrap_or_default();
     let truth_in_space = results.ground_truth_in_space.clone();
-    for (poses, in_space) in [
-        (&mut results.estimates, &mut results.estimates_in_space),
-        (&mut results.refined, &mut results.refined_in_space),
+    for (is_filter, poses, in_space) in [
+        (
+            true,
+            &mut results.estimates,
+            &mut results.estimates_in_space,
+        ),
+        (false, &mut results.refined, &mut results.refined_in_space),
     ] {
         let transform = match (&*in_space, &truth_in_space, &*poses) {
             (Some(estimates), Some(truth), _) => alignment.transform(estimates, truth),
@@ -171,6 +175,9 @@ pub fn align(results: &mut LocalizationResults, alignment: Alignment) -> Result<
         let transform = transform.context(
             "the positions are on a straight line, which determines no rigid alignment; set alignment to first",
         )?;
+        if let (true, Some(trajectory)) = (is_filter, &mut results.trajectory_in_space) {
+            *trajectory = aligned(&transform, trajectory);
+        }
         if let Some(poses) = poses {
             let moved = aligned(&transform, &level(poses));
             *poses = moved.iter().map(pose2_from_pose3).collect();

@@ -1,5 +1,6 @@
 //! `localize`: localizes a recording in a map, scan by scan.
 
+mod filled;
 mod opened;
 mod recorder;
 mod tracking;
@@ -12,6 +13,7 @@ use anyhow::Result;
 use clap::Args;
 use serde::Serialize;
 
+use self::filled::fill_back;
 use self::recorder::Run;
 use self::tracking::localize;
 use self::written::{write_results, write_run, write_trajectories};
@@ -79,7 +81,10 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         || {
             let mut motion = motion.lock().unwrap_or_else(PoisonError::into_inner);
             localize(&opened, &mut motion, &recorded, context)?;
+            let results = recorded().found();
+            let filled = fill_back(&opened, &results, context)?;
             let mut run = recorded();
+            run.fill(filled);
             run.complete()?;
             write_results(&opened, &mut run)?;
             context.interrupt.keeps(run.kept(&opened));

@@ -66,6 +66,11 @@ impl Run {
                 agreements: column(true),
                 places: column(true),
                 states: column(true),
+                trajectory_in_space: None,
+                trajectory_states: None,
+                refined_states: column(is_refined),
+                refinement_costs_m: column(is_refined),
+                refinement_agreements: column(is_refined),
                 scan_outlines: (selected.len() <= ScanOutline::MOST_FRAMES)
                     .then(|| RowLog::in_folder(folder)),
                 selected: Some(selected.len()),
@@ -159,6 +164,11 @@ impl Run {
         push(&mut results.refined_in_space, refined_in_space);
         push(&mut results.refined, refined_pose);
         push(&mut results.refined_covariances, covariance);
+        let state = refined.map_or(estimate.state, |refined| refined.state);
+        push(&mut results.refined_states, state as u8);
+        let changed = run_output::before_and_after(refined.and_then(|it| it.change));
+        push(&mut results.refinement_costs_m, changed[0]);
+        push(&mut results.refinement_agreements, changed[1]);
         push(&mut results.refine_runtimes_s, refine_runtime.as_secs_f64());
         if let Some(writer) = &mut self.writer {
             if particles.len() > writer.capacity() {
@@ -173,12 +183,39 @@ impl Run {
         Ok(())
     }
 
-    /// The estimates in space.
-    pub fn estimates(&self) -> &[Pose3] {
-        self.results
-            .estimates_in_space
-            .as_deref()
-            .unwrap_or_default()
+    /// What is known about the poses of the frames so far.
+    pub fn found(&self) -> LocalizationResults {
+        let results = &self.results;
+        LocalizationResults {
+            estimates: results.estimates.clone(),
+            estimates_in_space: results.estimates_in_space.clone(),
+            odometry: results.odometry.clone(),
+            covariances: results.covariances.clone(),
+            times_s: results.times_s.clone(),
+            states: results.states.clone(),
+            ..LocalizationResults::default()
+        }
+    }
+
+    /// Sets the trajectory with its states; refined frames that were not tracked get its poses.
+    pub fn fill(&mut self, trajectory: Option<(Vec<Pose3>, Vec<u8>)>) {
+        let Some((poses, states)) = trajectory else {
+            return;
+        };
+        let results = &mut self.results;
+        if let (Some(refined), Some(in_space), Some(refined_states), Some(known)) = (
+            &mut results.refined,
+            &mut results.refined_in_space,
+            &mut results.refined_states,
+            &results.states,
+        ) {
+            for row in (0..known.len()).filter(|&row| states[row] != known[row]) {
+                refined[row] = pose2_from_pose3(&poses[row]);
+                (in_space[row], refined_states[row]) = (poses[row], states[row]);
+            }
+        }
+        results.trajectory_in_space = Some(poses);
+        results.trajectory_states = Some(states);
     }
 
     /// Completes the run after its last frame; an error where no frame was finished.

@@ -5,7 +5,7 @@ use anyhow::Result;
 use super::super::motion_source;
 use super::opened::Opened;
 use super::recorder::Run;
-use crate::app::report::run_output::{self, REFINEMENT_FILES};
+use crate::app::report::run_output::{self, REFINEMENT_FILES, Trajectory};
 use crate::app::report::{LocalizationResults, Report, run_page};
 use crate::app::run::{Context, output};
 use crate::evaluation::RangeMclRules;
@@ -47,10 +47,13 @@ pub fn write_trajectories(opened: &Opened, run: &Run) -> Result<()> {
         return Ok(());
     }
     run_output::write_poses(files, &run.results)?;
-    run_output::write_trajectory(files, "mcl", recording, run.estimates())?;
+    let results = &run.results;
+    let frames = &recording.frames[..results.len()];
+    let mcl = Trajectory::of_filter(results, frames);
+    mcl.write(files, "mcl", recording, config.all_poses)?;
     if config.refine {
-        let refined = run.results.refined_in_space.as_deref();
-        run_output::write_trajectory(files, "refined", recording, refined.unwrap_or_default())?;
+        let refined = Trajectory::refined(results, frames);
+        refined.write(files, "refined", recording, config.all_poses)?;
     }
     output::write_yaml(&files.file("effective_localization.yml"), config)
 }
@@ -89,10 +92,11 @@ pub fn write_run(opened: &Opened, run: &mut Run, context: &Context) -> Result<Re
     if config.output.plots {
         let mesh = run_output::map_around(map, results.estimates.iter().flatten())?;
         run_output::draw_run(files, Some(&mesh), results)?;
-        let row = results.len() / 2;
-        let (frame, pose) = (&recording.frames[row], &run.estimates()[row]);
-        let model = &opened.sensor.range_image;
-        run_output::draw_range_images(files, map, frame, pose, model)?;
+        let mcl = Trajectory::of_filter(results, &recording.frames);
+        if let Some((frame, pose)) = mcl.middle() {
+            let model = &opened.sensor.range_image;
+            run_output::draw_range_images(files, map, frame, pose, model)?;
+        }
     }
     if config.save_result {
         run_page::write(files, &report)?;
@@ -127,9 +131,14 @@ fn warn_of_untracked_frames(results: &LocalizationResults) {
                     states_in_words(results)
                 );
             }
-            if 2 * first > states.len() {
+            let unfilled = results
+                .trusted()
+                .iter()
+                .take_while(|trusted| !**trusted)
+                .count();
+            if 2 * unfilled > states.len() {
                 tracing::warn!(
-                    "the first {first} of {} frames were not localized: frames.csv lists the state of each",
+                    "the first {unfilled} of {} frames were not localized: frames.csv lists the state of each",
                     states.len()
                 );
             }

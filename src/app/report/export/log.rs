@@ -32,7 +32,7 @@ use serde_json::{Value, json};
 
 use super::glb::Model;
 use crate::app::report::plotting::color::{MCL, REFINED, Rgb, TRUTH};
-use crate::app::report::results::LocalizationResults;
+use crate::app::report::results::{LocalizationResults, stretches};
 use crate::evaluation::trust::Axes;
 use crate::evaluation::{ParticleRow, planar_errors};
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3, pose3_from_pose2};
@@ -125,6 +125,8 @@ struct Trajectories {
     estimates: Vec<Pose3>,
     refined: Option<Vec<Pose3>>,
     truth: Option<Vec<Pose3>>,
+    /// Poses of the lines, and whether they are trusted.
+    lines: Vec<(&'static str, Rgb, Vec<Pose3>, Vec<bool>)>,
 }
 
 impl Trajectories {
@@ -135,10 +137,29 @@ impl Trajectories {
             in_space.clone().or(raised.map(Iterator::collect))
         };
         let estimates = raised(&results.estimates_in_space, &results.estimates);
+        let estimates = estimates.context("the result holds no estimates; run localize again")?;
+        let refined = raised(&results.refined_in_space, &results.refined);
+        let truth = raised(&results.ground_truth_in_space, &results.ground_truth);
+        let trajectory = results.trajectory_in_space.as_ref().unwrap_or(&estimates);
+        let all = vec![true; results.len()];
+        let lines = [
+            ("truth", TRUTH, truth.clone(), all),
+            ("estimate", MCL, Some(trajectory.clone()), results.trusted()),
+            (
+                "refined",
+                REFINED,
+                refined.clone(),
+                results.refined_trusted(),
+            ),
+        ];
+        let lines = lines.into_iter();
+        let lines =
+            lines.filter_map(|(name, color, poses, trusted)| Some((name, color, poses?, trusted)));
         Ok(Self {
-            estimates: estimates.context("the result holds no estimates; run localize again")?,
-            refined: raised(&results.refined_in_space, &results.refined),
-            truth: raised(&results.ground_truth_in_space, &results.ground_truth),
+            lines: lines.collect(),
+            estimates,
+            refined,
+            truth,
         })
     }
 
@@ -165,24 +186,33 @@ impl Trajectories {
         };
         log.send("/tf", stamp, &transform)?;
         let state = |row: usize| Some(State::from_number(results.states.as_ref()?[row])?.word());
-        let metadata = state(row).map(|state| KeyValuePair {
+        let in_state = |state: &str| KeyValuePair {
             key: "state".to_owned(),
             value: state.to_owned(),
-        });
-        let odometry = |poses: &[Pose3], covariances: &Option<Vec<Matrix3<f64>>>| Odometry {
+        };
+        let of_refined = |row: usize| {
+            let states = results
+                .refined_states
+                .as_ref()
+                .or(results.states.as_ref())?;
+            Some(State::from_number(states[row])?.word())
+        };
+        let odometry = |poses: &[Pose3],
+                        covariances: &Option<Vec<Matrix3<f64>>>,
+                        state: Option<&str>| Odometry {
             timestamp: timestamp(stamp),
             frame_id: MAP.to_owned(),
             body_frame_id: LIDAR.to_owned(),
             pose: Some(pose(&poses[row])),
             pose_covariance: in_space(covariances.as_ref().map(|all| all[row])),
             velocity_covariance: vec![0.0; 36],
-            metadata: metadata.iter().cloned().collect(),
+            metadata: state.into_iter().map(in_state).collect(),
             ..Odometry::default()
         };
-        let estimate = odometry(&self.estimates, &results.covariances);
+        let estimate = odometry(&self.estimates, &results.covariances, state(row));
         log.send("/estimate", stamp, &estimate)?;
         if let Some(refined) = &self.refined {
-            let refined = odometry(refined, &results.refined_covariances);
+            let refined = odometry(refined, &results.refined_covariances, of_refined(row));
             log.send("/refined", stamp, &refined)?;
         }
         if let Some(truth) = &self.truth {
@@ -238,28 +268,27 @@ impl Trajectories {
         })
     }
 
-    /// The trajectories as lines.
+    /// The trajectories as lines, with gaps where they are not trusted.
     fn scene(&self, stamp: u64) -> SceneUpdate {
-        let line = |name: &str, color: Rgb, poses: &[Pose3]| SceneEntity {
-            lines: vec![LinePrimitive {
-                r#type: line_primitive::Type::LineStrip.into(),
-                thickness: 3.0,
-                scale_invariant: true,
-                points: poses.iter().map(point).collect(),
-                color: Some(opaque(color)),
-                ..LinePrimitive::default()
-            }],
-            ..entity(name, stamp)
+        let line = |color: Rgb, poses: &[Pose3]| LinePrimitive {
+            r#type: line_primitive::Type::LineStrip.into(),
+            thickness: 3.0,
+            scale_invariant: true,
+            points: poses.iter().map(point).collect(),
+            color: Some(opaque(color)),
+            ..LinePrimitive::default()
         };
-        let all = [
-            ("truth", TRUTH, self.truth.as_deref()),
-            ("estimate", MCL, Some(self.estimates.as_slice())),
-            ("refined", REFINED, self.refined.as_deref()),
-        ];
+        let entities = self
+            .lines
+            .iter()
+            .map(|(name, color, poses, trusted)| SceneEntity {
+                lines: stretches(trusted)
+                    .map(|rows| line(*color, &poses[rows]))
+                    .collect(),
+                ..entity(name, stamp)
+            });
         SceneUpdate {
-            entities: (all.into_iter())
-                .filter_map(|(name, color, poses)| Some(line(name, color, poses?)))
-                .collect(),
+            entities: entities.collect(),
             ..SceneUpdate::default()
         }
     }

@@ -9,6 +9,7 @@ function interactive(figure) {
   const ink = canvas.getContext("2d");
   const count = run.frames.length;
   const at = (poses, k) => ({ x: poses[3 * k], y: poses[3 * k + 1], heading: poses[3 * k + 2] });
+  const isTrusted = (k) => !run.trusted || run.trusted[k];
   const starts = [];
   let points = new Int16Array();
   if (run.scans) {
@@ -28,7 +29,9 @@ function interactive(figure) {
 
   function fit() {
     let [left, right, low, high] = [Infinity, -Infinity, Infinity, -Infinity];
-    for (const poses of [run.poses, run.truth ?? []])
+    // Poses that are not trusted are no part of the path.
+    const trusted = run.poses.filter((_, k) => isTrusted(Math.floor(k / 3)));
+    for (const poses of trusted.length ? [trusted, run.truth ?? []] : [run.truth ?? run.poses])
       for (let k = 0; k < poses.length / 3; k++) {
         const { x, y } = at(poses, k);
         [left, right] = [Math.min(left, x), Math.max(right, x)];
@@ -42,9 +45,10 @@ function interactive(figure) {
     canvas.width / 2 + (x - view.x) * view.scale,
     canvas.height / 2 - (y - view.y) * view.scale,
   ];
-  function trace(poses, width, style) {
+  function trace(poses, width, style, isDrawn = () => true) {
     ink.lineWidth = width * devicePixelRatio;
     for (let k = 1; k < poses.length / 3; k++) {
+      if (!isDrawn(k - 1) || !isDrawn(k)) continue;
       ink.strokeStyle = style(k);
       ink.beginPath();
       ink.moveTo(...screen(at(poses, k - 1)));
@@ -62,7 +66,7 @@ function interactive(figure) {
     }
     ink.lineCap = "round";
     if (run.truth) trace(run.truth, 5, () => run.truth_color);
-    trace(run.poses, 3, color);
+    trace(run.poses, 3, color, isTrusted);
     const pose = at(run.poses, frame);
     const [sine, cosine] = [Math.sin(pose.heading), Math.cos(pose.heading)];
     ink.fillStyle = "#c8009c";

@@ -22,7 +22,7 @@ use crate::localization::State;
 pub struct InteractivePath<'a> {
     /// Results of the run.
     pub results: &'a LocalizationResults,
-    /// Estimates, one per frame.
+    /// Trajectory of the filter, a pose per frame.
     pub estimates: &'a [Pose2],
     /// Map below the path.
     pub map: Option<&'a MapImage>,
@@ -66,6 +66,7 @@ impl InteractivePath<'_> {
             "name": if results.refined.is_some() { "refined" } else { "MCL" },
             "color": css(if results.refined.is_some() { REFINED } else { MCL }),
             "poses": flat(best),
+            "trusted": if results.refined.is_some() { results.refined_trusted() } else { results.trusted() },
             "truth": results.ground_truth.as_deref().map(flat),
             "truth_color": css(TRUTH),
             "errors_cm": numbers(|error| 100.0 * error.distance_m(), 100.0),

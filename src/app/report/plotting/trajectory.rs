@@ -22,7 +22,7 @@ pub struct PathPlot<'a> {
     pub title: &'a str,
     /// Ground truth, if known.
     pub ground_truth: Option<&'a [Pose2]>,
-    /// Name, color and poses in the map frame of each trajectory, drawn in this order.
+    /// Name, color and poses in the map frame of each trajectory, drawn in this order. Poses that are not a number are gaps.
     pub paths: &'a [(&'a str, Rgb, &'a [Pose2])],
     /// Name with unit and number per pose of the last trajectory, which is colored by them.
     pub numbers: Option<(&'a str, &'a [f64])>,
@@ -107,7 +107,8 @@ fn draw_ends(sheet: &Sheet, view: &View, poses: &[Pose2]) -> Result<()> {
     /// Length of the path next to an end that its name leaves free, and distance of the name [pixels].
     const NEAR: f64 = 40.0;
     const ASIDE: f64 = 16.0;
-    let places = positions(poses, view);
+    let mut places = positions(poses, view);
+    places.retain(|place| place.0.is_finite());
     let mut reversed = places.clone();
     reversed.reverse();
     for (places, label) in [(places, "start"), (reversed, "end")] {

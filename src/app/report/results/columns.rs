@@ -32,6 +32,20 @@ impl Row<1> for f64 {
     }
 }
 
+/// Before and after.
+impl Row<2> for [f64; 2] {
+    type Number = f64;
+    const EMPTY: f64 = f64::NAN;
+
+    fn to_row(&self) -> Self {
+        *self
+    }
+
+    fn from_row(row: Self) -> Option<Self> {
+        Some(row)
+    }
+}
+
 impl Row<1> for u8 {
     type Number = Self;
     const EMPTY: Self = 0;

@@ -6,10 +6,12 @@ use anyhow::Result;
 use nalgebra::Matrix3;
 
 use super::localization_results::LocalizationResults;
+use super::trusted::{trusted_distances_m, with_gaps};
 use crate::app::run::output;
 use crate::evaluation::trust::Axes;
 use crate::evaluation::{PlanarError, drift, planar_errors};
 use crate::geometry::{Pose2, Pose3, distances_m};
+use crate::localization::State;
 
 /// Writes the table; of a trajectory without particles, that of its errors in space. Nothing without estimates.
 pub fn write_frames_csv(path: &Path, results: &LocalizationResults) -> Result<()> {
@@ -41,7 +43,13 @@ impl FrameTable {
     fn new(results: &LocalizationResults, estimates: &[Pose2]) -> Self {
         let truth = results.ground_truth.as_deref();
         let refined = results.refined.as_deref();
-        let driven_m = distances_m(truth.unwrap_or(estimates));
+        let (trajectory, trusted) = (results.trajectory(estimates), results.trusted());
+        let driven_m =
+            truth.map_or_else(|| trusted_distances_m(&trajectory, &trusted), distances_m);
+        let trajectory = with_gaps(&trajectory, &trusted);
+        let word = |&number: &u8| {
+            State::from_number(number).map_or_else(|| number.to_string(), |it| it.word().to_owned())
+        };
         let particles: Vec<usize> = (0..results.particles.len())
             .map(|row| results.particles.count(row))
             .collect();
@@ -61,7 +69,23 @@ impl FrameTable {
         table.add_numbers("agreement", agreements, |share| *share);
         let places = results.places.as_deref();
         table.add_numbers("places", places, |places| *places);
-        table.add("state", results.states.as_deref(), u8::to_string);
+        table.add("state", results.states.as_deref(), word);
+        table.add_poses("trajectory", Some(&trajectory));
+        table.add("refined_state", results.refined_states.as_deref(), word);
+        for (names, column) in [
+            (
+                ["cost_before_m", "cost_after_m"],
+                &results.refinement_costs_m,
+            ),
+            (
+                ["agreement_before", "agreement_after"],
+                &results.refinement_agreements,
+            ),
+        ] {
+            for (moment, name) in names.into_iter().enumerate() {
+                table.add_numbers(name, column.as_deref(), |pair| pair[moment]);
+            }
+        }
         table.add_numbers("runtime_ms", results.runtimes_s.as_deref(), |time_s| {
             1e3 * time_s
         });
@@ -119,7 +143,10 @@ impl FrameTable {
         items: Option<&[T]>,
         number: impl Fn(&T) -> f64,
     ) {
-        self.add(title, items, |item| format!("{:.4}", number(item)));
+        self.add(title, items, |item| match number(item) {
+            number if number.is_nan() => String::new(),
+            number => format!("{number:.4}"),
+        });
     }
 
     fn add_poses(&mut self, name: &str, poses: Option<&[Pose2]>) {

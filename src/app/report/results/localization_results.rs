@@ -184,6 +184,17 @@ pub struct LocalizationResults {
     pub places: Option<Vec<f64>>,
     /// State of the filter as a number.
     pub states: Option<Vec<u8>>,
+    /// The estimates in space and, before the first tracked frame, poses that follow from it by the odometry and agree
+    /// with the map; `None` where the estimates are the trajectory.
+    pub trajectory_in_space: Option<Vec<Pose3>>,
+    /// State of each pose of that trajectory as a number.
+    pub trajectory_states: Option<Vec<u8>>,
+    /// State of each refined pose as a number.
+    pub refined_states: Option<Vec<u8>>,
+    /// Mean cost of the differences to the map before and after the refinement of a frame [m]; −1 where it was not refined.
+    pub refinement_costs_m: Option<Vec<[f64; 2]>>,
+    /// Share of the compared beams that agree with the map before and after, −1 where unknown (unitless).
+    pub refinement_agreements: Option<Vec<[f64; 2]>>,
     /// Outlines of the scans, for pictures.
     pub scan_outlines: Option<RowLog<[i16; 2]>>,
     /// Number of frames to localize; a file has it only if the run ended before the last of them.
@@ -208,7 +219,12 @@ macro_rules! columns {
             refine_runtimes_s,
             agreements,
             places,
-            states
+            states,
+            trajectory_in_space,
+            trajectory_states,
+            refined_states,
+            refinement_costs_m,
+            refinement_agreements
         )
     };
 }

@@ -10,8 +10,10 @@ mod results_file;
 mod results_file_tests;
 mod row_log;
 mod trajectory_file;
+mod trusted;
 // Tables and reports.
 mod frames;
+mod refinement_summary;
 mod report;
 mod rows;
 mod run_summary;
@@ -21,9 +23,11 @@ pub(crate) mod kitti_07_tests;
 
 pub use frames::{FrameTable, write_frames_csv};
 pub use localization_results::{LocalizationResults, ParticleLog, ScanOutline};
+pub use refinement_summary::RefinementSummary;
 pub use report::{Report, TrajectoryReport};
 pub use results_file::{ResultWriter, write_poses_npy};
 pub use row_log::RowLog;
 pub use rows::{MetricRow, Value, length};
 pub use run_summary::RunSummary;
 pub use trajectory_file::write_trajectory_npz;
+pub use trusted::{stretches, with_gaps};

@@ -7,13 +7,14 @@ use anyhow::{Context as _, Result, anyhow};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::refinement_summary::RefinementSummary;
 use super::rows::{MetricRow, Value, length, metric_rows, metrics, spatial_rows};
 use super::run_summary::RunSummary;
 use crate::app::run::visible::visible_in_line;
 use crate::evaluation::{RangeMclErrors, SpatialMetrics, TrajectoryMetrics};
 
 /// The most important rows of every kind of report, of which each has at most twelve.
-const MAIN_ROWS: [&str; 23] = [
+const MAIN_ROWS: [&str; 28] = [
     // Of a run without true poses.
     "frames",
     "tracking",
@@ -21,6 +22,12 @@ const MAIN_ROWS: [&str; 23] = [
     "position sigma median",
     "heading sigma median",
     "agreement median",
+    // Of a refinement without true poses.
+    "refused frames",
+    "moved median",
+    "moved max",
+    "cost median",
+    "beams on the map median",
     // Against true poses in a map.
     "position RMSE",
     "position median",
@@ -74,9 +81,16 @@ pub struct Report {
     /// Inputs and settings by name: the recording, the map, the odometry and its source, the
     /// seed, the renderer.
     pub about: BTreeMap<String, String>,
+    /// Whether the car was found in at least half of the frames, of the refined trajectory if there is one; `None` where no
+    /// states are known.
+    #[serde(default)]
+    pub localized: Option<bool>,
     /// What the run shows without the true poses.
     #[serde(default)]
     pub summary: RunSummary,
+    /// What the refinement did, if there was one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub refinement: Option<RefinementSummary>,
     /// Errors of the filter's estimates; `None` without true poses.
     pub mcl: Option<TrajectoryReport>,
     /// Errors of the refined trajectory, if there is one.
@@ -115,7 +129,7 @@ impl Report {
             let line = format!("{name:width$}  {mcl:>10}  {refined:>10}  {unit}");
             line.trim_end().to_owned() + "\n"
         };
-        let refined_title = self.refined.as_ref().map_or("", |_| "refined");
+        let refined_title = if self.is_refined() { "refined" } else { "" };
         text += &line("", self.estimate_title(), refined_title, "unit");
         for (row, refined) in &rows {
             let refined = refined.map_or(String::new(), |value| value.to_string());
@@ -131,13 +145,14 @@ impl Report {
     pub fn is_main(&self, row: &MetricRow) -> bool {
         // In a map the planar errors are the main ones.
         let is_planar = self.mcl.is_some();
-        let is_spatial = MAIN_ROWS[12..].contains(&row.name);
-        MAIN_ROWS.contains(&row.name) && !(is_planar && is_spatial)
+        let is_other = MAIN_ROWS[6..11].contains(&row.name) || MAIN_ROWS[17..].contains(&row.name);
+        MAIN_ROWS.contains(&row.name) && !(is_planar && is_other)
     }
 
     /// What the run found, in one or two sentences.
     pub fn verdict(&self) -> String {
         let found = self.trajectory.is_none().then(|| self.summary.verdict());
+        let refined = self.refinement.as_ref().map(RefinementSummary::verdict);
         let accuracy = match (&self.mcl, &self.trajectory) {
             (Some(mcl), _) => accuracy(&mcl.metrics, self.refined.as_ref().map(|it| &it.metrics)),
             (None, Some(trajectory)) => {
@@ -154,26 +169,27 @@ impl Report {
             }
             (None, None) => "No true poses were given.".to_owned(),
         };
-        let parts: Vec<String> = found.into_iter().chain([accuracy]).collect();
+        let parts: Vec<String> = found.into_iter().chain(refined).chain([accuracy]).collect();
         parts.join(" ")
     }
 
     /// The same table in Markdown, with definitions.
     pub fn to_markdown(&self) -> String {
         let mut text = self.about_lines("- ");
-        let [title, rule] = match self.refined {
-            Some(_) => [" refined |", "---:|"],
-            None => ["", ""],
+        let [title, rule] = if self.is_refined() {
+            [" refined |", "---:|"]
+        } else {
+            ["", ""]
         };
         text += &format!(
             "\n| | {} |{title} unit | definition |\n|---|---:|{rule}---|---|\n",
             self.estimate_title()
         );
         for (row, refined) in self.joined_rows() {
-            let refined = match (&self.refined, refined) {
-                (None, _) => String::new(),
-                (Some(_), None) => " |".to_owned(),
-                (Some(_), Some(value)) => format!(" {value} |"),
+            let refined = match (self.is_refined(), refined) {
+                (false, _) => String::new(),
+                (true, None) => " |".to_owned(),
+                (true, Some(value)) => format!(" {value} |"),
             };
             let MetricRow {
                 name, value, unit, ..
@@ -192,11 +208,22 @@ impl Report {
         let errors = self.mcl.iter().flat_map(TrajectoryReport::rows);
         let errors = errors.chain(self.trajectory.iter().flat_map(spatial_rows));
         let errors = errors.map(|row| (row, refined.next().map(|row| row.value)));
-        let summary = self.summary.rows().into_iter().map(|row| (row, None));
+        let refinement = self.refinement.as_ref();
+        let mut of_refined = refinement.into_iter().flat_map(|it| it.trajectory.rows());
+        let summary = self.summary.rows().into_iter();
+        let summary = summary.map(|row| (row, of_refined.next().map(|row| row.value)));
+        let summary: Vec<_> = summary
+            .chain(refinement.iter().flat_map(|it| it.rows()))
+            .collect();
         let is_known = |(row, refined): &(MetricRow, Option<Value>)| {
             row.value != Value::Absent || refined.is_some_and(|value| value != Value::Absent)
         };
-        summary.chain(errors).filter(is_known).collect()
+        summary.into_iter().chain(errors).filter(is_known).collect()
+    }
+
+    /// Whether there is a refined trajectory.
+    pub fn is_refined(&self) -> bool {
+        self.refined.is_some() || self.refinement.is_some()
     }
 
     /// Title of the column of the errors.
@@ -269,7 +296,9 @@ mod tests {
     fn report() -> Report {
         Report {
             about: [("odometry".to_owned(), "from file".to_owned())].into(),
+            localized: None,
             summary: RunSummary::default(),
+            refinement: None,
             mcl: Some(trajectory(0.25)),
             refined: Some(trajectory(0.02)),
             trajectory: None,

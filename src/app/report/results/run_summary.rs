@@ -1,12 +1,14 @@
 //! What a run shows about itself, without the true poses.
 
+use nalgebra::Matrix3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::localization_results::LocalizationResults;
 use super::rows::{MetricRow, length, metrics};
+use super::trusted::trusted_distances_m;
 use crate::evaluation::Summary;
-use crate::geometry::{Pose2, distances_m};
+use crate::geometry::Pose2;
 use crate::localization::State;
 use crate::localization::particles::long_axis_m;
 
@@ -16,15 +18,15 @@ use crate::localization::particles::long_axis_m;
 pub struct RunSummary {
     /// Number of frames.
     pub frames: usize,
-    /// Number of frames in which the filter was tracking.
+    /// Number of frames in which the filter was tracking, or whose refined pose is in the map.
     pub tracking: Option<usize>,
-    /// Whether the filter was tracking in at least half of the frames.
-    pub localized: Option<bool>,
+    /// Number of frames before the first tracked one that were filled back from it.
+    pub filled: Option<usize>,
     /// Number of the first frame in which it was tracking.
     pub first_tracked: Option<usize>,
     /// Number of frames in which the car may have been in several places.
     pub ambiguous: Option<usize>,
-    /// Length of the found path [m].
+    /// Length of the path along the trusted poses, across gaps by the straight line [m].
     pub path_m: f64,
     /// Mean speed [m/s]; `None` without times, and if ten frames per second were assumed.
     pub speed_m_per_s: Option<f64>,
@@ -36,42 +38,90 @@ pub struct RunSummary {
     pub agreement: Option<Summary>,
 }
 
+/// What is known about each frame of one trajectory.
+struct Trajectory<'a> {
+    poses: &'a [Pose2],
+    /// Whether each pose is part of the trajectory.
+    trusted: Vec<bool>,
+    states: Option<&'a [u8]>,
+    covariances: Option<&'a [Matrix3<f64>]>,
+}
+
 impl RunSummary {
     /// The summary of results with their estimates. Uncertainty and agreement are those of the frames in
     /// which the filter was tracking.
     pub fn of(results: &LocalizationResults, estimates: &[Pose2]) -> Self {
-        let states = results.states.as_deref();
+        let trajectory = Trajectory {
+            poses: &results.trajectory(estimates),
+            trusted: results.trusted(),
+            states: results.states.as_deref(),
+            covariances: results.covariances.as_deref(),
+        };
+        let several = |places: &Vec<f64>| places.iter().filter(|&&it| it > 1.0).count();
+        Self {
+            ambiguous: results.places.as_ref().map(several),
+            ..Self::of_trajectory(results, &trajectory, |row| {
+                results.agreements.as_ref().map(|all| all[row])
+            })
+        }
+    }
+
+    /// The summary of the refined trajectory.
+    pub fn of_refined(results: &LocalizationResults) -> Option<Self> {
+        let trajectory = Trajectory {
+            poses: results.refined.as_deref()?,
+            trusted: results.refined_trusted(),
+            states: results.refined_states.as_deref(),
+            covariances: results.refined_covariances.as_deref(),
+        };
+        Some(Self::of_trajectory(results, &trajectory, |row| {
+            results
+                .refinement_agreements
+                .as_ref()
+                .map(|all| all[row][1])
+        }))
+    }
+
+    fn of_trajectory(
+        results: &LocalizationResults,
+        trajectory: &Trajectory,
+        agreement: impl Fn(usize) -> Option<f64>,
+    ) -> Self {
+        let (states, trusted) = (trajectory.states, &trajectory.trusted);
         let is_tracked = |row: usize| states.is_none_or(|s| s[row] == State::Tracking as u8);
         let tracked: Vec<usize> = (0..results.len()).filter(|&row| is_tracked(row)).collect();
         let over_tracked = |value: &dyn Fn(usize) -> Option<f64>| {
             let values: Vec<f64> = tracked.iter().filter_map(|&row| value(row)).collect();
             Summary::new(&values)
         };
-        let covariance = |row: usize| Some(results.covariances.as_ref()?[row]);
-        let path_m = distances_m(estimates).last().copied().unwrap_or_default();
-        let times_s = results.recorded_times().unwrap_or_default();
-        let duration_s = times_s.first().zip(times_s.last()).map(|(a, b)| b - a);
+        let covariance = |row: usize| Some(trajectory.covariances?[row]);
+        let path_m = trusted_distances_m(trajectory.poses, trusted)
+            .last()
+            .copied()
+            .unwrap_or_default();
+        let times_s = results.recorded_times().unwrap_or_default().iter();
+        let mut times_s = times_s.zip(trusted).filter(|(_, trusted)| **trusted);
+        let duration_s = times_s.next().zip(times_s.last());
+        let duration_s = duration_s.map(|((first_s, _), (last_s, _))| last_s - first_s);
+        let filled = (0..results.len()).filter(|&row| trusted[row] && !is_tracked(row));
         Self {
             frames: results.len(),
             tracking: states.map(|_| tracked.len()),
-            localized: states.map(|_| !tracked.is_empty() && 2 * tracked.len() >= results.len()),
+            filled: Some(filled.count()).filter(|&count| count > 0),
             first_tracked: states.and_then(|_| Some(results.frames[*tracked.first()?])),
-            ambiguous: (results.places.as_ref())
-                .map(|places| places.iter().filter(|&&places| places > 1.0).count()),
+            ambiguous: None,
             path_m,
             speed_m_per_s: duration_s.filter(|&s| s > 0.0).map(|s| path_m / s),
             position_sigma_m: over_tracked(&|row| Some(long_axis_m(&covariance(row)?))),
             heading_sigma_rad: over_tracked(&|row| Some(covariance(row)?[(2, 2)].max(0.0).sqrt())),
-            agreement: over_tracked(&|row| {
-                let share = results.agreements.as_ref()?[row];
-                (share >= 0.0).then_some(share)
-            }),
+            agreement: over_tracked(&|row| agreement(row).filter(|&share| share >= 0.0)),
         }
     }
 
-    /// Whether the run found the car in at least half of the frames, as far as is known.
-    pub fn is_localized(&self) -> bool {
-        self.localized != Some(false)
+    /// Whether at least half of the frames have a pose that is trusted; `None` where no states are known.
+    pub fn localized(&self) -> Option<bool> {
+        let trusted = self.tracking? + self.filled.unwrap_or_default();
+        Some(trusted > 0 && 2 * trusted >= self.frames)
     }
 
     /// Place and duration of the tracking, and how sure it is of itself, in a sentence.
@@ -90,9 +140,14 @@ impl RunSummary {
             }
             _ => String::new(),
         };
+        let filled = self.filled.map_or_else(String::new, |count| {
+            format!(
+                " {count} frames before it were filled back by the odometry and agree with the map."
+            )
+        });
         match (self.first_tracked, self.tracking) {
             (Some(first), Some(tracking)) => format!(
-                "Found in frame {first}, tracking in {tracking} of {} frames{sure}.{several}",
+                "Found in frame {first}, tracking in {tracking} of {} frames{sure}.{filled}{several}",
                 self.frames
             ),
             (None, Some(_)) => format!(
@@ -110,9 +165,10 @@ impl RunSummary {
         metrics! {
             "frames" [""] self.frames, "number of localized frames";
             "tracking" [""] self.tracking, "number of frames in which the filter was tracking";
+            "filled" [""] self.filled, "number of frames before the first tracked one whose poses follow from it by the odometry, and agree with the map";
             "first tracked frame" [""] self.first_tracked, "number of the first frame in which the filter was tracking";
             "ambiguous" [""] self.ambiguous.filter(|&count| count > 0), "number of frames in which the car may have been in several places";
-            "path" ["m"] self.path_m, "length of the found path";
+            "path" ["m"] self.path_m, "length of the path along the poses that are trusted, across gaps by the straight line";
             "speed" ["m/s"] self.speed_m_per_s, "length of the path over its duration";
             "position sigma median" ["m"] position.map(|it| it.median), "estimated standard deviation along its larger axis, tracked frames";
             "position sigma p95" ["m"] position.map(|it| it.p95), "its 95th percentile";

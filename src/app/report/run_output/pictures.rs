@@ -12,7 +12,8 @@ use crate::app::report::plotting::{
     FRAME, InteractivePath, LineChart, LocalizationPicture, MapImage, MapPlot, Mark, Panel,
     PathPlot, RangeImageStrip, SURFACES, Series, drift_chart, error_chart, muted, save_animation,
 };
-use crate::app::report::results::LocalizationResults;
+use crate::app::report::results::{LocalizationResults, with_gaps};
+use crate::app::run::output::remove_if_exists;
 use crate::evaluation::trust::Axes;
 use crate::evaluation::{ParticleRow, planar_errors};
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3};
@@ -104,6 +105,8 @@ struct Drawing<'a> {
     /// Name of the estimates: those of the filter, or of a trajectory from elsewhere.
     name: &'static str,
     estimates: Vec<Pose2>,
+    /// The trajectory of the filter, with gaps where it is not trusted.
+    trajectory: Vec<Pose2>,
     truth: Option<&'a [Pose2]>,
 }
 
@@ -116,12 +119,14 @@ impl<'a> Drawing<'a> {
         let is_given = results.particles.is_empty();
         let in_space = results.estimates_in_space.iter().flatten();
         let estimates = results.estimates.clone();
+        let estimates = estimates.unwrap_or_else(|| in_space.map(pose2_from_pose3).collect());
         Self {
             files,
             map,
             results,
             name: if is_given { "estimate" } else { "MCL" },
-            estimates: estimates.unwrap_or_else(|| in_space.map(pose2_from_pose3).collect()),
+            trajectory: with_gaps(&results.trajectory(&estimates), &results.trusted()),
+            estimates,
             truth: results.ground_truth.as_deref(),
         }
     }
@@ -143,9 +148,18 @@ impl<'a> Drawing<'a> {
         chart.save(&self.files.plot(name)?)
     }
 
-    /// Draws the best trajectory colored by its error, or without a truth by its standard deviation.
+    /// Draws the best trajectory colored by its error, or without a truth by its standard deviation; gaps are gaps. No
+    /// picture where nothing is trusted.
     fn path(&self) -> Result<()> {
-        let paths = self.found();
+        let refined = self.results.refined.as_deref();
+        let refined = refined.map(|poses| with_gaps(poses, &self.results.refined_trusted()));
+        let refined = refined.as_deref().map(|poses| ("refined", REFINED, poses));
+        let mut paths = vec![(self.name, MCL, self.trajectory.as_slice())];
+        paths.extend(refined);
+        paths.retain(|(_, _, poses)| poses.iter().any(|pose| pose.translation.x.is_finite()));
+        if paths.is_empty() && self.truth.is_none() {
+            return remove_if_exists(&self.files.file("plots").join("path.png"));
+        }
         let numbers = paths.last().and_then(|&(name, _, poses)| {
             if let Some(truth) = self.truth {
                 let errors = planar_errors(poses, truth).into_iter();
@@ -153,7 +167,14 @@ impl<'a> Drawing<'a> {
                 return Some((format!("position error, {name} [cm]"), errors_cm.collect()));
             }
             let covariances = self.results.best_covariances()?.iter();
-            let sigmas_cm = covariances.map(|it| 100.0 * (it.m11 + it.m22).sqrt());
+            let sigmas_cm = (covariances.zip(poses)).map(|(it, pose)| {
+                let is_gap = pose.translation.x.is_nan();
+                if is_gap {
+                    f64::NAN
+                } else {
+                    100.0 * (it.m11 + it.m22).sqrt()
+                }
+            });
             let name = format!("standard deviation of the position, {name} [cm]");
             Some((name, sigmas_cm.collect()))
         });
@@ -174,7 +195,7 @@ impl<'a> Drawing<'a> {
     fn interactive_path(&self) -> Result<()> {
         InteractivePath {
             results: self.results,
-            estimates: &self.estimates,
+            estimates: &self.results.trajectory(&self.estimates),
             map: self.map,
         }
         .save(&self.files.plot(INTERACTIVE)?)
@@ -281,7 +302,7 @@ impl<'a> Drawing<'a> {
             color_name: "from the first frame to the last",
             estimate: self.estimates.get(last).copied(),
             ground_truth: self.truth.and_then(|truth| truth.get(last).copied()),
-            driven: self.truth.unwrap_or(&self.estimates),
+            driven: self.truth.unwrap_or(&self.trajectory),
             window: None,
         }
         .save(&self.files.plot("particles.png")?)
@@ -293,7 +314,7 @@ impl<'a> Drawing<'a> {
             mesh,
             path: Some(match self.truth {
                 Some(truth) => ("true path", truth),
-                None => ("found path", &self.estimates),
+                None => ("found path", &self.trajectory),
             }),
             keys: &SURFACES,
             numbers: None,

@@ -1,0 +1,105 @@
+//! Which poses of a run are trusted: those of frames that are tracking.
+
+use std::ops::Range;
+
+use super::localization_results::LocalizationResults;
+use crate::geometry::{Pose2, pose2_from_pose3};
+use crate::localization::State;
+
+impl LocalizationResults {
+    /// Whether the pose of each frame of [`trajectory`](Self::trajectory) is trusted; all are where no states are known.
+    pub fn trusted(&self) -> Vec<bool> {
+        self.tracking(self.trajectory_states.as_ref().or(self.states.as_ref()))
+    }
+
+    /// Whether the refined pose of each frame is trusted.
+    pub fn refined_trusted(&self) -> Vec<bool> {
+        match &self.refined_states {
+            Some(states) => self.tracking(Some(states)),
+            None => self.trusted(),
+        }
+    }
+
+    fn tracking(&self, states: Option<&Vec<u8>>) -> Vec<bool> {
+        let is_tracking = |&state: &u8| state == State::Tracking as u8;
+        states.map_or_else(
+            || vec![true; self.len()],
+            |states| states.iter().map(is_tracking).collect(),
+        )
+    }
+
+    /// The estimates, where frames before the first tracked one were filled back with them.
+    pub fn trajectory(&self, estimates: &[Pose2]) -> Vec<Pose2> {
+        self.trajectory_in_space.as_ref().map_or_else(
+            || estimates.to_vec(),
+            |poses| poses.iter().map(pose2_from_pose3).collect(),
+        )
+    }
+}
+
+/// Poses of which those that are not trusted are gaps: not a number, which pictures leave out.
+pub fn with_gaps(poses: &[Pose2], trusted: &[bool]) -> Vec<Pose2> {
+    let gap = Pose2::translation(f64::NAN, f64::NAN);
+    (poses.iter().zip(trusted))
+        .map(|(pose, &is_trusted)| if is_trusted { *pose } else { gap })
+        .collect()
+}
+
+/// Rows of each stretch of trusted poses.
+pub fn stretches(trusted: &[bool]) -> impl Iterator<Item = Range<usize>> {
+    let rows: Vec<usize> = (0..trusted.len()).filter(|&row| trusted[row]).collect();
+    let all: Vec<Range<usize>> = (rows.chunk_by(|&a, &b| a + 1 == b))
+        .map(|rows| rows[0]..rows[0] + rows.len())
+        .collect();
+    all.into_iter()
+}
+
+/// Distance driven up to each pose [m]: along the trusted ones, and across gaps by the straight line.
+pub fn trusted_distances_m(poses: &[Pose2], trusted: &[bool]) -> Vec<f64> {
+    let mut previous: Option<&Pose2> = None;
+    let mut driven_m = 0.0;
+    (poses.iter().zip(trusted))
+        .map(|(pose, is_trusted)| {
+            if *is_trusted {
+                let step = |it: &Pose2| (pose.translation.vector - it.translation.vector).norm();
+                driven_m += previous.map_or(0.0, step);
+                previous = Some(pose);
+            }
+            driven_m
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gap_is_bridged_by_a_straight_line_and_what_is_before_the_first_trusted_pose_is_no_way() {
+        let poses = [100.0, 1.0, 2.0, -70.0, 5.0, 80.0].map(|x| Pose2::translation(x, 0.0));
+        let trusted = [false, true, true, false, true, false];
+        assert_eq!(
+            trusted_distances_m(&poses, &trusted),
+            [0.0, 0.0, 1.0, 1.0, 4.0, 4.0]
+        );
+        let is_gap = with_gaps(&poses, &trusted);
+        let is_gap = is_gap.iter().map(|pose| !pose.translation.x.is_nan());
+        assert!(is_gap.eq(trusted));
+    }
+
+    #[test]
+    fn the_states_of_a_trajectory_precede_those_of_the_filter() {
+        let [searching, tracking] = [State::Searching, State::Tracking].map(|it| it as u8);
+        let mut results = LocalizationResults {
+            frames: vec![3, 4],
+            ..LocalizationResults::default()
+        };
+        assert_eq!(results.trusted(), [true, true]);
+        results.states = Some(vec![searching, tracking]);
+        assert_eq!(results.refined_trusted(), [false, true]);
+        results.trajectory_states = Some(vec![tracking, tracking]);
+        assert_eq!(results.trusted(), [true, true]);
+        results.refined_states = Some(vec![tracking, searching]);
+        assert_eq!(results.refined_trusted(), [true, false]);
+    }
+}
