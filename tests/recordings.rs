@@ -6,7 +6,7 @@ mod common;
 
 use std::fs;
 
-use common::Recording;
+use common::{Recording, fpmcl};
 
 const FRAMES: usize = 6;
 
@@ -132,4 +132,57 @@ fn poses_of_the_lidar_need_no_calibration() {
             );
         }
     }
+}
+
+#[test]
+fn a_truth_is_compared_with_and_changes_no_estimate() {
+    let recording = Recording::street(FRAMES);
+    recording.fpmcl("build-map").succeeds();
+    // Times that are not those of the scans, for which ten per second are assumed.
+    let truth = |ahead_m: f64| -> String {
+        let row = |frame: usize| {
+            let x_m = ahead_m + 0.5 * frame as f64;
+            format!("{} {x_m} 0 0 0 0 0 1\n", 3 * frame)
+        };
+        (0..FRAMES).map(row).collect()
+    };
+    recording.write("right.txt", &truth(0.0));
+    recording.write("wrong.txt", &truth(25.0));
+    let estimates = ["null", "right.txt", "wrong.txt"].map(|truth| {
+        let call = recording.fpmcl("localize").with("--force");
+        let call = call.set("odometry", "auto").set("pose_file", truth);
+        let call = call.set("initial_pose", "[0, 0, 0]");
+        call.set("motion_compensation", "auto").succeeds();
+        let errors = String::from_utf8(recording.bytes("results/report.json")).unwrap();
+        (recording.bytes("results/mcl_tum.txt"), errors)
+    });
+    let [without, right, wrong] = estimates;
+    assert!(without.0 == right.0 && without.0 == wrong.0);
+    assert!(right.1 != wrong.1 && without.1 != right.1);
+}
+
+#[test]
+fn a_truth_that_ends_a_frame_early_is_evaluated_without_that_frame() {
+    let recording = Recording::street(FRAMES);
+    recording.fpmcl("build-map").succeeds();
+    recording.fpmcl("localize").succeeds();
+    let poses = String::from_utf8(recording.bytes("poses.txt")).unwrap();
+    let rows = |count: usize| -> String { poses.split_inclusive('\n').take(count).collect() };
+    let evaluate = || {
+        let call = fpmcl("evaluate").in_folder(recording.folder());
+        let call = call.with("results/localization.npz").with("--force");
+        call.with("--truth")
+            .with("short.txt")
+            .with("--calib")
+            .with("calib.txt")
+    };
+    recording.write("short.txt", &rows(FRAMES - 1));
+    let output = evaluate().succeeds();
+    assert!(
+        output.stderr.contains("the last 1 of 6 frames"),
+        "{}",
+        output.stderr
+    );
+    recording.write("short.txt", &rows(FRAMES - 2));
+    evaluate().fails_with(&["belong to different recordings"]);
 }

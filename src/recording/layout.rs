@@ -83,7 +83,7 @@ impl RecordingFiles {
         };
         let poses = || existing(base, &["poses.txt", "poses_tum.txt", "poses.tum"]);
         let calibration = existing(base, &["calib.txt"]);
-        let times = existing(base, &["times.txt"]);
+        let times = existing(base, &["times.txt", "../times.txt"]);
         if base.join("velodyne_points/data").is_dir() {
             return Self {
                 layout: Layout::KittiRaw,

@@ -10,7 +10,7 @@ use super::error::RecordingError;
 use super::frame::{Frame, ScanSource};
 use super::layout::{Layout, RecordingFiles};
 use super::oxts::read_timestamps;
-use super::poses::{ascending, read_times};
+use super::poses::{ascending, read_rows_of_poses, read_times};
 use super::scan_files;
 use super::scan_list::{self, ScanFile, Selection};
 use super::track::PoseTrack;
@@ -77,9 +77,13 @@ impl Recording {
         }
         #[cfg(not(feature = "bags"))]
         let _ = topic;
-        let files = RecordingFiles::find(path);
+        let mut files = RecordingFiles::find(path);
         let scans = scan_list::scan_files(&files.scans)?;
-        let recorded_s = recorded_times(&files)?;
+        let rows = scans.last().map_or(0, |last| last.number + 1);
+        let recorded_s = match scans[0].time_s {
+            Some(_) => None,
+            None => recorded_times(&mut files, rows)?,
+        };
         let has_times = recorded_s.is_some() || scans[0].time_s.is_some();
         let count = scans.len();
         let frame = |scan: ScanFile| {
@@ -224,7 +228,8 @@ impl Recording {
         self.with_poses(track)
     }
 
-    /// The same recording, whose frames have the poses of a track; frames without one are dropped.
+    /// The same recording, whose frames have the poses of a track, and its times where they have none; frames without a pose
+    /// are dropped.
     ///
     /// # Errors
     /// The track does not belong to these frames.
@@ -232,10 +237,23 @@ impl Recording {
         if !self.has_times
             && let Some(times_s) = &track.times_s
         {
+            tracing::info!(
+                "the times of the scans are those of {}",
+                track.path.display()
+            );
             for frame in self.frames.iter_mut().chain(&mut self.skipped) {
                 frame.time_s = times_s.get(frame.number).copied().unwrap_or(frame.time_s);
             }
         }
+        self.with_truth(track)
+    }
+
+    /// The same recording, whose frames have the poses of a track, with which estimates are compared: nothing else of the
+    /// track is used.
+    ///
+    /// # Errors
+    /// As [`with_poses`](Self::with_poses).
+    pub(crate) fn with_truth(mut self, track: PoseTrack) -> Result<Self, RecordingError> {
         let poses = track.matched(&self.frames, self.has_times)?;
         for (frame, pose) in self.frames.iter_mut().zip(poses) {
             frame.map_from_lidar = pose;
@@ -337,15 +355,38 @@ fn moment_after_stamp_s(source: &ScanSource) -> Result<f64, RecordingError> {
     Ok(later_s.map_or(0.0, |(moment_s, stamp_s)| moment_s - stamp_s))
 }
 
-/// The times in the files of a recording, which ascend [s].
-fn recorded_times(files: &RecordingFiles) -> Result<Option<Vec<f64>>, RecordingError> {
-    let Some(path) = &files.times else {
+/// The times of scans with these many rows of times or poses [s]: of the recording's file of times, else of its poses where
+/// these have a row per scan.
+fn recorded_times(
+    files: &mut RecordingFiles,
+    rows: usize,
+) -> Result<Option<Vec<f64>>, RecordingError> {
+    if let Some(path) = &files.times {
+        let times_s = match files.layout {
+            Layout::KittiRaw => read_timestamps(path)?,
+            _ => read_times(path)?,
+        };
+        // That of the folder above may belong to another recording.
+        let is_above = path.parent().is_some_and(|folder| folder.ends_with(".."));
+        if !is_above || times_s.len() == rows {
+            if is_above {
+                tracing::info!("the times of the scans are those of {}", path.display());
+            }
+            return ascending(path, times_s).map(Some);
+        }
+        files.times = None;
+    }
+    let Some(path) = files.poses.as_ref().filter(|path| path.is_file()) else {
         return Ok(None);
     };
-    let times_s = match files.layout {
-        Layout::KittiRaw => read_timestamps(path)?,
-        _ => read_times(path)?,
+    // Where these cannot be read, that is an error only to who needs poses.
+    let Ok((_, Some(times_s))) = read_rows_of_poses(path) else {
+        return Ok(None);
     };
+    if times_s.len() != rows {
+        return Ok(None);
+    }
+    tracing::info!("the times of the scans are those of {}", path.display());
     ascending(path, times_s).map(Some)
 }
 
@@ -408,6 +449,55 @@ mod tests {
             numbers(&open(folder.path(), &Selection::default()).unwrap()),
             [0, 1]
         );
+    }
+
+    #[test]
+    fn times_are_those_of_names_of_the_folder_above_or_of_a_row_of_poses_per_scan() {
+        let times_of = |folder: &tempfile::TempDir| {
+            let recording = Recording::open(folder.path().join("inner")).unwrap();
+            let times: Vec<f64> = recording.frames.iter().map(|it| it.time_s).collect();
+            (times, recording.has_times)
+        };
+        let scans = |names: &[&str]| {
+            let folder = tempfile::tempdir().unwrap();
+            fs::create_dir(folder.path().join("inner")).unwrap();
+            for name in names {
+                fs::write(folder.path().join("inner").join(name), []).unwrap();
+            }
+            folder
+        };
+        let named = scans(&[
+            "cloud_1317384506_5000000.bin",
+            "cloud_1317384506_40000000.bin",
+        ]);
+        assert_eq!(
+            times_of(&named),
+            (vec![1317384506.005, 1317384506.04], true)
+        );
+        let nuscenes = scans(&[
+            "n015-2018-07-24__LIDAR_TOP__1532402927647951.bin",
+            "n015-2018-07-24__LIDAR_TOP__1532402928147847.bin",
+        ]);
+        let expected = vec![1532402927.647951, 1532402928.147847];
+        assert_eq!(times_of(&nuscenes), (expected, true));
+        let numbered = scans(&["0.bin", "1.bin", "2.bin"]);
+        let write = |name: &str, text: &str| {
+            fs::write(numbered.path().join(name), text).unwrap();
+        };
+        let assumed = (vec![0.0, 0.1, 0.2], false);
+        assert_eq!(times_of(&numbered), assumed);
+        let row = |time_s: f64| format!("{time_s} 0 0 0 0 0 0 1\n");
+        write("inner/poses_tum.txt", &[7.0, 7.5].map(row).concat());
+        // Rows that are not one per scan are poses between the scans.
+        assert_eq!(times_of(&numbered), assumed);
+        write("inner/poses_tum.txt", &[7.0, 7.5, 9.0].map(row).concat());
+        assert_eq!(times_of(&numbered), (vec![7.0, 7.5, 9.0], true));
+        write("times.txt", "1\n2\n3\n4\n");
+        assert_eq!(times_of(&numbered), (vec![7.0, 7.5, 9.0], true));
+        write("times.txt", "1\n2\n4\n");
+        assert_eq!(times_of(&numbered), (vec![1.0, 2.0, 4.0], true));
+        write("inner/times.txt", "5\n6\n7\n");
+        assert_eq!(times_of(&numbered), (vec![5.0, 6.0, 7.0], true));
     }
 
     #[test]

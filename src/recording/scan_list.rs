@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::fs;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -115,13 +116,22 @@ pub fn scan_files(folder: &Path) -> Result<Vec<ScanFile>, RecordingError> {
     Ok(numbered(paths)?.into_iter().map(scan).collect())
 }
 
-/// The time in a name such as `1317384506.4.pcd`, or `1317384506400000000.bin` in nanoseconds [s]: since
-/// 1970, from 2001 on.
+/// The time in a name such as `1317384506.4.pcd`, or `1317384506400000000.bin` in nanoseconds, also after other words,
+/// as in `n015__LIDAR_TOP__1532402927647951.pcd.bin` (nuScenes), or with the nanoseconds apart, as in
+/// `cloud_1317384506_400000000.pcd` [s]: since 1970, from 2001 on.
 fn time_in_name(path: &Path) -> Option<f64> {
     let stem = path.file_stem()?.to_str()?;
     let stem = stem.strip_suffix(".pcd").unwrap_or(stem);
-    let number: f64 = stem.parse().ok()?;
-    let digits = stem.split('.').next()?.len();
+    let mut words = stem.rsplit('_');
+    let (last, before) = (words.next()?, words.next().unwrap_or_default());
+    let is_number = |word: &str, digits: RangeInclusive<usize>| {
+        digits.contains(&word.len()) && word.bytes().all(|byte| byte.is_ascii_digit())
+    };
+    if is_number(before, 10..=10) && is_number(last, 1..=9) {
+        return Some(before.parse::<f64>().ok()? + last.parse::<f64>().ok()? * 1e-9);
+    }
+    let number: f64 = last.parse().ok()?;
+    let digits = last.split('.').next()?.len();
     match digits {
         10 => Some(number),
         13 => Some(number * 1e-3),

@@ -55,7 +55,7 @@ impl<'a> RecordingInputs<'a> {
         let mut recording = self.open()?;
         if let Some(pose_file) = &self.poses.pose_file {
             let track = self.track(pose_file, &recording)?;
-            recording = recording.with_poses(track.in_map(&map.path.world_from_map))?;
+            recording = recording.with_truth(track.in_map(&map.path.world_from_map))?;
         }
         infer(known, recording)
     }

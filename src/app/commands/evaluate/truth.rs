@@ -133,12 +133,21 @@ fn poses_by_number(
 ) -> Result<Vec<Option<Pose3>>> {
     let poses = &track.map_from_lidar;
     let last = results.frames.last().copied().unwrap_or_default();
+    let missing = results.frames.iter().filter(|&&frame| frame >= poses.len());
+    let missing = missing.count();
     ensure!(
-        last < poses.len(),
+        missing <= 1 + results.len() / 100 && missing < results.len(),
         "{} has {} poses, but the result reaches frame {last}; pose_file and result_file belong to different recordings",
         track.path.display(),
         poses.len()
     );
+    if missing > 0 {
+        tracing::warn!(
+            "{} has no pose for the last {missing} of {} frames, which are left out",
+            track.path.display(),
+            results.len()
+        );
+    }
     if results.particles.is_empty() && last + 1 != poses.len() {
         tracing::warn!(
             "{} ends at row {last}, and the {} rows of {} are matched by number; give both times (TUM) if they do not begin at the same frame",
@@ -148,7 +157,7 @@ fn poses_by_number(
         );
     }
     Ok((results.frames.iter())
-        .map(|&frame| Some(poses[frame]))
+        .map(|&frame| poses.get(frame).copied())
         .collect())
 }
 
