@@ -30,7 +30,9 @@ mod _fpmcl {
     #[pymodule_export]
     use super::recording::{Recording, Scan, Sensor, infer_sensor, read_recording};
     #[pymodule_export]
-    use super::trajectory::{RefinedTrajectory, Trajectory, odometry, refine};
+    use super::trajectory::{
+        RefinedTrajectory, Trajectory, evaluate, odometry, refine, write_trajectory,
+    };
 
     #[pymodule_init]
     fn init(module: &pyo3::Bound<'_, pyo3::types::PyModule>) -> pyo3::PyResult<()> {

@@ -83,15 +83,19 @@ impl Map {
     /// ``scans``: a Recording, or an iterable of Scans and of arrays (N, 3) [m], which are taken as deskewed.
     /// ``poses``: (N, 4, 4), one per scan, into the frame of the map; by default those of the recording, which are checked,
     /// and without these found from the scans. Scans with times are deskewed by them. ``sensor``: by default inferred from
-    /// the scans. Settings: fields of ``map`` in ``fpmcl config build-map --full``, such as ``local_map_size``, ``depth``.
+    /// the scans. ``onto``: a map of the same place to which the scans are added: they are found in it, what their beams pass
+    /// through is removed, and what it does not have is added. Settings: fields of ``map`` in ``fpmcl config build-map
+    /// --full``, such as ``local_map_size``, ``depth``.
     ///
-    /// Raises Error if poses and scans, or scans and sensor, do not fit each other.
+    /// Raises Error if poses and scans, or scans and sensor, do not fit each other, or if the scans are not found in ``onto``.
     #[staticmethod]
-    #[pyo3(signature = (scans, poses=None, *, sensor=None, backend="auto", **settings))]
+    #[expect(clippy::too_many_arguments, reason = "they have names in Python")]
+    #[pyo3(signature = (scans, poses=None, *, onto=None, sensor=None, backend="auto", **settings))]
     fn build(
         py: Python<'_>,
         scans: &Bound<'_, PyAny>,
         poses: Option<Numbers<'_, f64>>,
+        onto: Option<&Bound<'_, PyAny>>,
         sensor: Option<Sensor>,
         backend: &str,
         settings: Option<&Bound<'_, PyDict>>,
@@ -100,6 +104,13 @@ impl Map {
         let scans = Scans::of(scans)?;
         let poses = poses.map(|poses| arrays::poses("poses", &poses));
         let poses = poses.transpose()?;
+        let onto = onto.map(map_of).transpose()?;
+        if onto.is_some() && poses.is_some() {
+            return Err(PyValueError::new_err(
+                "poses and onto are given; leave out poses: the scans are found in the map",
+            ));
+        }
+        let older = onto.as_ref().map(|map| &map.get().map);
         let sensor = scans.sensor(py, sensor)?;
         let raised_signal = Arc::new(Mutex::new(None));
         let signal = raised_signal.clone();
@@ -119,7 +130,7 @@ impl Map {
         };
         let built = released(py, || match &poses {
             Some(poses) => build_of_poses(&scans, poses, &builder),
-            None => build_of_recording(&scans, builder),
+            None => build_of_recording(&scans, older, builder),
         });
         let signal = raised_signal
             .lock()
@@ -227,10 +238,14 @@ fn build_of_poses(
     builder.build(posed).map_err(of_build)
 }
 
-/// A map of scans whose poses are those of their recording, or are found.
-fn build_of_recording(scans: &Scans, builder: MapBuilder) -> anyhow::Result<map::Map> {
+/// A map of scans whose poses are those of their recording, or are found, in an older map where there is one.
+fn build_of_recording(
+    scans: &Scans,
+    older: Option<&map::Map>,
+    builder: MapBuilder,
+) -> anyhow::Result<map::Map> {
     let recording = scans.recording()?;
-    match map_recording(&recording, None, builder) {
+    match map_recording(&recording, older, builder) {
         Ok(mapped) => Ok(mapped.map),
         Err(MappingError::Build(error)) => Err(of_build(error)),
         Err(error) => Err(error.into()),

@@ -105,6 +105,15 @@ impl Scan {
     fn __len__(&self) -> usize {
         self.scan.len()
     }
+
+    fn __repr__(&self) -> String {
+        let number = self.number.map_or(String::new(), |it| format!(" {it}"));
+        let time = self
+            .scan
+            .time_s
+            .map_or(String::new(), |it| format!(" at {it:.3} s"));
+        format!("<fpmcl.Scan{number}: {} points{time}>", self.scan.len())
+    }
 }
 
 /// A column of a scan, with a value per point; empty if it is not given.

@@ -1,14 +1,20 @@
 //! Trajectories of whole drives: odometry and refinement.
 
-use anyhow::anyhow;
-use fpmcl::geometry::{Pose2, Pose3};
-use fpmcl::odometry::{OdometryEstimate, TrajectoryBuilder, TrajectoryConfig};
-use fpmcl::refinement::{InitialEstimate, RefinerConfig, TrajectoryRefiner};
-use numpy::{PyArray2, PyArray3};
-use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use std::fs::File;
+use std::io::{BufWriter, Write as _};
+use std::path::PathBuf;
 
-use crate::arrays::{self, Numbers};
+use anyhow::{Context as _, anyhow};
+use fpmcl::evaluation::{SpatialMetrics, Summary};
+use fpmcl::geometry::{Pose2, Pose3, StampedPose};
+use fpmcl::odometry::{OdometryEstimate, TrajectoryBuilder, TrajectoryConfig};
+use fpmcl::recording::write_tum;
+use fpmcl::refinement::{InitialEstimate, RefinerConfig, TrajectoryRefiner};
+use numpy::{PyArray2, PyArray3, PyUntypedArrayMethods as _};
+use pyo3::prelude::*;
+use pyo3::types::{IntoPyDict as _, PyDict};
+
+use crate::arrays::{self, Numbers, Numbers1};
 use crate::errors::{raised, released};
 use crate::localizer::Estimate;
 use crate::map::{Map, map_of};
@@ -24,6 +30,16 @@ pub struct Trajectory {
     odometry: Py<PyArray3<f64>>,
     /// Motion into each scan of the odometry alone, ``p_previous = motion @ p``, (N, 4, 4).
     motions: Py<PyArray3<f64>>,
+}
+
+#[pymethods]
+impl Trajectory {
+    fn __repr__(&self, py: Python<'_>) -> String {
+        format!(
+            "<fpmcl.Trajectory: {} poses>",
+            self.poses.bind(py).shape()[0]
+        )
+    }
 }
 
 /// Finds the poses of scans from the scans themselves.
@@ -69,6 +85,15 @@ pub struct RefinedTrajectory {
     covariances: Py<PyArray3<f64>>,
     /// State of each scan; ``"searching"`` where its place was not found.
     states: Vec<&'static str>,
+}
+
+#[pymethods]
+impl RefinedTrajectory {
+    fn __repr__(&self) -> String {
+        let tracking = self.states.iter().filter(|&&state| state == "tracking");
+        let (tracking, count) = (tracking.count(), self.states.len());
+        format!("<fpmcl.RefinedTrajectory: {count} poses, {tracking} tracking>")
+    }
 }
 
 /// Refines a trajectory in a map, scan by scan, and smooths it with the motions.
@@ -156,4 +181,96 @@ fn starts(
         &increments,
         times_s.as_deref(),
     ))
+}
+
+/// Writes poses as rows ``time x y z qx qy qz qw`` [s, m] (TUM), which evo and ``fpmcl evaluate`` read.
+///
+/// ``poses``: (N, 4, 4). ``times``: (N,) [s]. An existing file is replaced.
+///
+/// Raises Error if the file cannot be written, or there is not one time per pose.
+#[pyfunction]
+pub fn write_trajectory(
+    py: Python<'_>,
+    path: PathBuf,
+    poses: Numbers<'_, f64>,
+    times: Numbers1<'_, f64>,
+) -> PyResult<()> {
+    let poses = arrays::poses("poses", &poses)?;
+    let times_s: Vec<f64> = times.as_array().iter().copied().collect();
+    released(py, || {
+        let (count, times) = (poses.len(), times_s.len());
+        anyhow::ensure!(
+            count == times,
+            "there are {times} times for {count} poses; give one per pose"
+        );
+        let rows = poses.iter().zip(&times_s).enumerate();
+        let rows: Vec<StampedPose> = rows
+            .map(|(frame, (&map_from_lidar, &time_s))| StampedPose {
+                frame,
+                time_s,
+                map_from_lidar,
+            })
+            .collect();
+        let write = || {
+            let mut file = BufWriter::new(File::create(&path)?);
+            write_tum(&mut file, &rows)?;
+            file.flush()
+        };
+        write().with_context(|| format!("cannot write {}", path.display()))
+    })
+}
+
+/// Errors of estimates against true poses: a dict of dicts with ``rmse``, ``mean``, ``median``, ``p95`` and ``max``.
+///
+/// ``estimates``, ``truth``: (N, 4, 4) in the same frame. ``skip``: number of first poses that are left out.
+/// ``position_m``: distance to the true position. ``height_m``: magnitude of the height error. ``rotation_rad``: angle of the
+/// rotation. ``aligned_position_m``, ``aligned_rotation_rad``: the same after rigid alignment; missing on a straight line.
+///
+/// Raises Error if there are not as many estimates as true poses, or none is left.
+#[pyfunction]
+#[pyo3(signature = (estimates, truth, *, skip=0))]
+pub fn evaluate<'py>(
+    py: Python<'py>,
+    estimates: Numbers<'py, f64>,
+    truth: Numbers<'py, f64>,
+    skip: usize,
+) -> PyResult<Bound<'py, PyDict>> {
+    let estimates = arrays::poses("estimates", &estimates)?;
+    let truth = arrays::poses("truth", &truth)?;
+    let errors = released(py, || {
+        SpatialMetrics::new(&estimates, &truth, skip).ok_or_else(|| {
+            anyhow!(
+                "there are {} estimates and {} true poses, of which {skip} are left out; give one true pose per estimate, and more than these",
+                estimates.len(),
+                truth.len()
+            )
+        })
+    })?;
+    let found = PyDict::new(py);
+    for (name, summary) in [
+        ("position_m", Some(errors.position_m)),
+        ("height_m", Some(errors.height_m)),
+        ("rotation_rad", Some(errors.rotation_rad)),
+        ("aligned_position_m", errors.aligned_position_m),
+        ("aligned_rotation_rad", errors.aligned_rotation_rad),
+    ] {
+        if let Some(Summary {
+            rmse,
+            mean,
+            median,
+            p95,
+            max,
+        }) = summary
+        {
+            let numbers = [
+                ("rmse", rmse),
+                ("mean", mean),
+                ("median", median),
+                ("p95", p95),
+                ("max", max),
+            ];
+            found.set_item(name, numbers.into_py_dict(py)?)?;
+        }
+    }
+    Ok(found)
 }

@@ -35,6 +35,11 @@ def recording(folder):
     return fpmcl.read_recording(folder / "drive_1")
 
 
+@pytest.fixture(scope="module")
+def world(folder):
+    return fpmcl.Map.load(folder / "map.ply", backend="cpu")
+
+
 def pose(x=0.0, y=0.0, z=0.0, heading=0.0):
     matrix = np.eye(4)
     matrix[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
@@ -204,6 +209,49 @@ def test_a_map_needs_no_poses(recording):
     assert found.path.shape == given.path.shape
     with pytest.raises(fpmcl.Error, match="1 poses for 2 scans"):
         fpmcl.Map.build([recording[0], recording[1]], np.eye(4))
+
+
+def test_a_second_drive_is_added_to_a_map(recording, world):
+    extended = fpmcl.Map.build(recording, onto=world, depth=8)
+    assert len(extended.vertices) > 0
+    np.testing.assert_allclose(extended.world_from_map, world.world_from_map)
+    with pytest.raises(ValueError, match="leave out poses"):
+        fpmcl.Map.build(recording, recording.poses, onto=world)
+    with pytest.raises(TypeError, match=r"fpmcl\.Map\.load"):
+        fpmcl.Map.build(recording, onto="map.ply")
+
+
+def test_errors_are_those_of_geometry():
+    truth = np.tile(np.eye(4), (5, 1, 1))
+    truth[:, 0, 3] = np.arange(5.0)
+    truth[2:, 1, 3] = 3.0
+    estimates = truth.copy()
+    estimates[:, :3, 3] += [0.3, 0.4, 0.0]
+    errors = fpmcl.evaluate(estimates, truth)
+    assert errors["position_m"]["rmse"] == pytest.approx(0.5)
+    assert errors["height_m"]["max"] == 0.0
+    assert errors["aligned_position_m"]["max"] == pytest.approx(0.0, abs=1e-9)
+    estimates[0, 0, 3] += 100.0
+    assert fpmcl.evaluate(estimates, truth, skip=1)["position_m"]["max"] == pytest.approx(0.5)
+    with pytest.raises(fpmcl.Error, match="4 estimates and 5 true poses"):
+        fpmcl.evaluate(estimates[:4], truth)
+
+
+def test_a_trajectory_is_written_for_other_programs(tmp_path, recording):
+    path = tmp_path / "poses.tum"
+    fpmcl.write_trajectory(path, recording.poses, recording.times)
+    rows = np.loadtxt(path)
+    np.testing.assert_allclose(rows[:, 0], recording.times, atol=1e-6)
+    np.testing.assert_allclose(rows[:, 1:4], recording.poses[:, :3, 3], atol=1e-6)
+    with pytest.raises(fpmcl.Error, match="one per pose"):
+        fpmcl.write_trajectory(path, recording.poses, recording.times[1:])
+
+
+def test_objects_say_what_they_are(recording, world):
+    assert repr(recording[3]).startswith("<fpmcl.Scan 3: ")
+    assert "triangles" in repr(world) and "12 scans" in repr(recording)
+    assert repr(fpmcl.odometry(recording)) == "<fpmcl.Trajectory: 12 poses>"
+    assert "beams" in repr(recording.sensor)
 
 
 def test_other_threads_run_meanwhile(recording):

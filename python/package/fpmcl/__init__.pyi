@@ -139,6 +139,7 @@ class Map:
         scans: _Scans,
         poses: Optional[ArrayLike] = None,
         *,
+        onto: Optional[Map] = None,
         sensor: Optional[Sensor] = None,
         backend: _Backend = "auto",
         **settings: Any,
@@ -147,10 +148,11 @@ class Map:
 
         ``scans``: a Recording, or an iterable of Scans and of arrays (N, 3) [m], which are taken as deskewed. ``poses``:
         (N, 4, 4), one per scan, into the frame of the map; by default those of the recording, and without these found from the
-        scans. Scans with times are deskewed by them. ``sensor``: by default inferred from the scans. Settings: fields of
-        ``map`` in ``fpmcl config build-map --full``.
+        scans. Scans with times are deskewed by them. ``onto``: a map of the same place to which the scans are added: they are
+        found in it, what their beams pass through is removed, and what it does not have is added. ``sensor``: by default
+        inferred from the scans. Settings: fields of ``map`` in ``fpmcl config build-map --full``.
 
-        Raises Error if poses and scans, or scans and sensor, do not fit each other.
+        Raises Error if poses and scans, or scans and sensor, do not fit each other, or if the scans are not found in ``onto``.
         """
 
     @property
@@ -360,6 +362,26 @@ def refine(
     each scan by itself. Settings: fields of ``refiner`` in ``fpmcl config refine --full``.
 
     Raises Error if there are not as many estimates or motions as scans, or if a scan cannot be read.
+    """
+
+def write_trajectory(path: _Path, poses: ArrayLike, times: ArrayLike) -> None:
+    """Writes poses as rows ``time x y z qx qy qz qw`` [s, m] (TUM), which evo and ``fpmcl evaluate`` read.
+
+    ``poses``: (N, 4, 4). ``times``: (N,) [s]. An existing file is replaced.
+
+    Raises Error if the file cannot be written, or there is not one time per pose.
+    """
+
+def evaluate(
+    estimates: ArrayLike, truth: ArrayLike, *, skip: int = 0
+) -> dict[str, dict[str, float]]:
+    """Errors of estimates against true poses: a dict of dicts with ``rmse``, ``mean``, ``median``, ``p95`` and ``max``.
+
+    ``estimates``, ``truth``: (N, 4, 4) in the same frame. ``skip``: number of first poses that are left out.
+    ``position_m``: distance to the true position. ``height_m``: magnitude of the height error. ``rotation_rad``: angle of the
+    rotation. ``aligned_position_m``, ``aligned_rotation_rad``: the same after rigid alignment; missing on a straight line.
+
+    Raises Error if there are not as many estimates as true poses, or none is left.
     """
 
 def cast_rays(map: Map, poses: ArrayLike, directions: ArrayLike) -> NDArray[np.float32]:
