@@ -89,7 +89,6 @@ impl Map {
     ///
     /// Raises Error if poses and scans, or scans and sensor, do not fit each other, or if the scans are not found in ``onto``.
     #[staticmethod]
-    #[expect(clippy::too_many_arguments, reason = "they have names in Python")]
     #[pyo3(signature = (scans, poses=None, *, onto=None, sensor=None, backend="auto", **settings))]
     fn build(
         py: Python<'_>,

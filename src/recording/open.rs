@@ -194,12 +194,12 @@ impl Recording {
 
     /// The poses of the only topic of a bag that has some, as odometry: what moves from one to the next is known, not where
     /// they are.
-    #[cfg(feature = "bags")]
     pub(crate) fn odometry_track(&self) -> Result<PoseTrack, RecordingError> {
-        match &self.bag {
-            Some((bag, topic)) => PoseTrack::read_topic(bag, None, topic, self.body_from_lidar),
-            None => self.own_track(),
+        #[cfg(feature = "bags")]
+        if let Some((bag, topic)) = &self.bag {
+            return PoseTrack::read_topic(bag, None, topic, self.body_from_lidar);
         }
+        self.own_track()
     }
 
     /// Reads poses of this recording from a file, a folder `oxts`, or a topic of its bag; they are those of a body if its

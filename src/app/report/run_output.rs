@@ -181,7 +181,8 @@ impl<'a> Trajectory<'a> {
     }
 
     /// Writes `<name>_tum.txt` (map frame, seconds) and `<name>_kitti.txt` (the convention of the recording's poses; without
-    /// any, lidar poses in the map frame): the poses that are trusted, or all of them, with the states as comments.
+    /// any, lidar poses in the map frame): the poses that are trusted, or all of them, with the states as comments. Rows of
+    /// KITTI have no times: that file is only written where every frame has one.
     pub fn write(
         &self,
         files: &RunFiles,
@@ -207,9 +208,15 @@ impl<'a> Trajectory<'a> {
             }
             io::Result::Ok(())
         })?;
-        let poses: Vec<Pose3> = rows.iter().map(|&row| self.poses[row]).collect();
-        output::write_file(&files.file(&format!("{name}_kitti.txt")), |file| {
-            write_kitti(file, &poses, &world_from_map, &calibration)
+        let kitti = files.file(&format!("{name}_kitti.txt"));
+        if rows.len() < self.poses.len() {
+            // Who reads it takes row k for frame k.
+            let kitti_file = kitti.display();
+            tracing::info!("{kitti_file} is not written, as not every frame has a trusted pose");
+            return output::remove_if_exists(&kitti);
+        }
+        output::write_file(&kitti, |file| {
+            write_kitti(file, self.poses, &world_from_map, &calibration)
         })
     }
 }

@@ -101,7 +101,7 @@ impl RunSummary {
             .unwrap_or_default();
         let times_s = results.recorded_times().unwrap_or_default().iter();
         let mut times_s = times_s.zip(trusted).filter(|(_, trusted)| **trusted);
-        let duration_s = times_s.next().zip(times_s.last());
+        let duration_s = times_s.next().zip(times_s.next_back());
         let duration_s = duration_s.map(|((first_s, _), (last_s, _))| last_s - first_s);
         let filled = (0..results.len()).filter(|&row| trusted[row] && !is_tracked(row));
         Self {
