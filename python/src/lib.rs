@@ -12,9 +12,6 @@ mod recording;
 mod settings;
 mod trajectory;
 
-use std::ffi::OsString;
-use std::path::PathBuf;
-
 use pyo3::prelude::*;
 
 #[pymodule]
@@ -23,6 +20,7 @@ mod _fpmcl {
     use super::errors::Error;
     #[pymodule_export]
     use super::localizer::{Estimate, Localizer};
+    #[cfg(feature = "program")]
     #[pymodule_export]
     use super::main;
     #[pymodule_export]
@@ -42,9 +40,11 @@ mod _fpmcl {
 }
 
 /// Runs the program with the arguments of the process; returns its exit code.
+#[cfg(feature = "program")]
 #[pyfunction]
 fn main(py: Python<'_>) -> PyResult<u8> {
-    let arguments: Vec<OsString> = py.import("sys")?.getattr("argv")?.extract()?;
-    let library: PathBuf = py.import("fpmcl._fpmcl")?.getattr("__file__")?.extract()?;
+    let arguments: Vec<std::ffi::OsString> = py.import("sys")?.getattr("argv")?.extract()?;
+    let library = py.import("fpmcl._fpmcl")?.getattr("__file__")?;
+    let library: std::path::PathBuf = library.extract()?;
     Ok(py.detach(|| fpmcl::main_of_library(arguments, library)))
 }
