@@ -174,7 +174,7 @@ fn a_run_is_reproduced_by_its_configuration(recording: &Recording) {
         .with("--backend=cpu")
         .set("result_path", "again/localization.npz");
     again.succeeds();
-    let name = "mcl_kitti.txt";
+    let name = "mcl_tum.txt";
     let whole = recording.bytes(&format!("{folder}/{name}"));
     assert!(whole == recording.bytes(&format!("again/{name}")));
     let log = String::from_utf8(recording.bytes(&format!("{folder}/log.txt"))).unwrap();
@@ -263,7 +263,7 @@ fn an_outdated_record_is_removed_before_its_run_is_executed_again() {
     let job = || compare(&recording).with("--job=street/Fuzzy-MCL/1");
     job().succeeds();
     assert_eq!(records(&recording).len(), 1);
-    let trajectory = "out/runs/street/Fuzzy-MCL/1/mcl_kitti.txt";
+    let trajectory = "out/runs/street/Fuzzy-MCL/1/mcl_tum.txt";
     let before = recording.bytes(trajectory);
 
     // With another scan, the run fails after everything but the record is written: there is a
