@@ -29,7 +29,7 @@ use crate::localization::observation::{ObservationConfig, agreement, choose_beam
 use crate::localization::{Estimate, ScanPreparation, State, TrackingLossConfig};
 use crate::map::{Map, MapError, SensorAttitude};
 use crate::random::{Generator, stream};
-use crate::rendering::RenderError;
+use crate::rendering::{RangeRenderer, RenderError};
 use crate::sensor::{Sensor, SensorError};
 use crate::validation::{InvalidValue, Validate, nested};
 
@@ -260,6 +260,50 @@ pub struct TrajectoryRefiner {
     correction: Option<Pose2>,
 }
 
+/// The beams of a scan, and how far the map is along them from a pose.
+struct Comparison {
+    beams: Vec<Beam>,
+    rendered_m: Vec<f32>,
+    config: TrackingLossConfig,
+}
+
+impl Comparison {
+    fn new(
+        renderer: &dyn RangeRenderer,
+        map_from_lidar: &Pose3,
+        beams: Vec<Beam>,
+    ) -> Result<Self, RefinerError> {
+        let config = TrackingLossConfig::default();
+        Ok(Self {
+            rendered_m: ranges_along(renderer, map_from_lidar, &beams, config.tolerance_m)?,
+            beams,
+            config,
+        })
+    }
+
+    /// Share of the compared beams that end on a surface of the map; `None` for too few beams.
+    fn agreement(&self) -> Option<f64> {
+        agreement(&self.beams, &self.rendered_m, self.config.tolerance_m)
+    }
+
+    /// Whether most of the beams end on the surfaces of the map, and few behind them.
+    fn agrees(&self) -> bool {
+        /// Least share of agreeing beams among all.
+        const MIN_SHARE: f64 = 0.4;
+        let is_hit = |(beam, rendered_m): &(&Beam, &f32)| {
+            (beam.range_m - **rendered_m).abs() <= self.config.tolerance_m
+        };
+        let hits = self
+            .beams
+            .iter()
+            .zip(&self.rendered_m)
+            .filter(is_hit)
+            .count();
+        let is_sure = |share: f64| share >= self.config.sure_agreement;
+        self.agreement().is_some_and(is_sure) && hits as f64 >= MIN_SHARE * self.beams.len() as f64
+    }
+}
+
 impl TrajectoryRefiner {
     /// Prepares the refinement of the scans of a sensor in a map. The same seed gives the same trajectory.
     ///
@@ -415,25 +459,23 @@ impl TrajectoryRefiner {
         rng: &mut Generator,
     ) -> Result<Option<FrameResult>, RefinerError> {
         for mut start in starts {
-            let beams = self.refine(image, &mut start, Distance::Near, rng)?;
-            if let (Some(beams), Some(pose)) = (beams, &start.map_from_lidar)
-                && self.agrees(&beams, pose)?
-            {
+            let compared = self.refine(image, &mut start, Distance::Near, rng)?;
+            if compared.is_some_and(|compared| compared.agrees()) {
                 return Ok(Some(start));
             }
         }
         Ok(None)
     }
 
-    /// Refines a frame that is `distance` off, or farther if its covariance says so; the beams that were compared, or
-    /// `None` where it cannot be refined.
+    /// Refines a frame that is `distance` off, or farther if its covariance says so; the comparison with the map at the
+    /// refined pose, or `None` where it cannot be refined.
     fn refine(
         &self,
         image: &RangeImage,
         frame: &mut FrameResult,
         distance: Distance<'_>,
         rng: &mut Generator,
-    ) -> Result<Option<Vec<Beam>>, RefinerError> {
+    ) -> Result<Option<Comparison>, RefinerError> {
         let observation = &self.config.observation;
         let (count, road_share) = (observation.beams, observation.road_share);
         let beams = choose_beams(image, count, road_share, &frame.attitude, rng);
@@ -460,22 +502,20 @@ impl TrajectoryRefiner {
         else {
             return Ok(None);
         };
-        let agreement_at = |pose: &Pose3| {
-            let tolerance_m = TrackingLossConfig::default().tolerance_m;
-            let rendered_m = ranges_along(&*self.map.renderer, pose, &beams, tolerance_m)?;
-            Ok::<_, RefinerError>(agreement(&beams, &rendered_m, tolerance_m))
-        };
-        let poses = [&refined.start_in_space, &refined.map_from_lidar];
+        let renderer = &*self.map.renderer;
+        let before = Comparison::new(renderer, &refined.start_in_space, beams)?;
+        let agreement_before = before.agreement();
+        let after = Comparison::new(renderer, &refined.map_from_lidar, before.beams)?;
         frame.change = Some(FrameChange {
             cost_m: [refined.cost_before_m, refined.cost_after_m],
-            agreement: [agreement_at(poses[0])?, agreement_at(poses[1])?],
+            agreement: [agreement_before, after.agreement()],
         });
         frame.pose = refined.pose;
         frame.map_from_lidar = Some(refined.map_from_lidar);
         frame.covariance = refined.covariance;
         frame.attitude = refined.attitude;
         frame.level_m = refined.level_m.or(frame.level_m);
-        Ok(Some(beams))
+        Ok(Some(after))
     }
 
     /// Upright surfaces of the map, at least as far from a pose as a wide search looks.
@@ -506,21 +546,6 @@ impl TrajectoryRefiner {
             surfaces: surfaces.clone(),
         });
         Ok(surfaces)
-    }
-
-    /// Whether most of the beams end on the surfaces of the map, and few behind them.
-    fn agrees(&self, beams: &[Beam], map_from_lidar: &Pose3) -> Result<bool, RefinerError> {
-        /// Least share of agreeing beams among all.
-        const MIN_SHARE: f64 = 0.4;
-        let config = TrackingLossConfig::default();
-        let renderer = &*self.map.renderer;
-        let rendered_m = ranges_along(renderer, map_from_lidar, beams, config.tolerance_m)?;
-        let hits = (beams.iter().zip(&rendered_m))
-            .filter(|(beam, rendered_m)| (beam.range_m - **rendered_m).abs() <= config.tolerance_m)
-            .count();
-        let share = agreement(beams, &rendered_m, config.tolerance_m);
-        Ok(share.is_some_and(|share| share >= config.sure_agreement)
-            && hits as f64 >= MIN_SHARE * beams.len() as f64)
     }
 
     /// Smooths the trajectory with the odometry `previous_from_current` into each frame (the first is
