@@ -127,8 +127,8 @@ fn identity(folder: &Path) -> io::Result<Identity> {
     folder.canonicalize()
 }
 
-/// Requires that there is nothing at a path, or a file that is empty or begins with `magic`: what others put there, a link
-/// among it, is neither read nor replaced.
+/// Requires that a file of this program can be written at a path: there is none, or one that is empty or begins with
+/// `magic`. A link, or a file of another program, is an error.
 pub fn require_own(path: &Path, magic: [u8; 8]) -> io::Result<()> {
     let begins_with_magic = || {
         let mut begin = [0; 8];

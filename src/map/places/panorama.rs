@@ -565,7 +565,7 @@ mod tests {
         let mut bytes = std::fs::read(&file).unwrap();
         let middle = bytes.len() / 2;
         bytes[middle] ^= 1;
-        // In place: a file that is replaced stays readable for who has opened it.
+        // In place: an open file stays readable when another one replaces it.
         std::fs::write(&file, &bytes).unwrap();
         let message = opened.search(&scan, &attitude).unwrap_err().to_string();
         assert!(

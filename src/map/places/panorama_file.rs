@@ -138,9 +138,9 @@ impl Panoramas {
         };
         // What cannot be removed is reported when the file cannot be written.
         let _ = remove_abandoned(path);
-        let own = require_own(path, MAGIC).map_err(Failure::Write);
         let write = || {
-            write_atomically(path, |out| {
+            require_own(path, MAGIC)?;
+            let described = write_atomically(path, |out| {
                 let mut hasher = crc32fast::Hasher::new();
                 let mut write = |out: &mut dyn Write, part: &[u8]| -> io::Result<()> {
                     hasher.update(part);
@@ -156,12 +156,11 @@ impl Panoramas {
                 write(out, bytemuck::cast_slice(&described.checksums))?;
                 write(out, bytemuck::cast_slice(&described.descriptors))?;
                 write_part(out, &hasher.finalize().to_le_bytes())?;
-                Ok(described)
-            })
+                Ok::<_, Failure>(described)
+            })?;
+            Ok((described, File::open(path)?))
         };
-        let written = own.and_then(|()| write());
-        let opened = written.and_then(|described| Ok((described, File::open(path)?)));
-        match opened {
+        match write() {
             Ok((described, file)) => Ok(Some(Self {
                 places: places.to_vec(),
                 descriptors: described.descriptors,
@@ -182,7 +181,9 @@ impl Panoramas {
 
     /// Opens the panoramas of a request; `None` if the file does not have them.
     pub fn open(path: &Path, request: &str) -> Option<Self> {
-        require_own(path, MAGIC).ok()?;
+        if path.is_symlink() {
+            return None;
+        }
         let file = SharedBytes::of_file(path).ok()?;
         let header: Header = file.header(MAGIC, VERSION)?;
         let images_begin = ranges_of(header.sizes())?[3].start as u64;
@@ -193,7 +194,11 @@ impl Panoramas {
             hasher.update(part);
         }
         let is_it = *of == *request.as_bytes() && *checksum == hasher.finalize().to_le_bytes();
-        let opened = File::open(path).ok().filter(|_| is_it)?;
+        let opened = if is_it {
+            File::open(path).ok()?
+        } else {
+            return None;
+        };
         Some(Self {
             places: bytemuck::cast_slice(&places).to_vec(),
             descriptors: bytemuck::cast_slice(&descriptors).to_vec(),

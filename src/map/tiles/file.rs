@@ -156,7 +156,7 @@ impl TileFile {
         Self::decode(&SharedBytes::of_file(path)?, index, stamp)
     }
 
-    /// Whether a file that the program wrote is as long as its header says.
+    /// Whether a file is a tile of this version, and as long as its header says.
     pub fn is_whole(path: &Path) -> bool {
         let file = SharedBytes::of_file(path);
         file.is_ok_and(|file| {

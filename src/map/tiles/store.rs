@@ -194,7 +194,7 @@ impl TileStore {
         let stamp = now.stamp();
         let is_there = |tile: &TileEntry| {
             let file = tile.file(folder, stamp);
-            require_own(&file, TILE_MAGIC).is_ok() && TileFile::is_whole(&file)
+            !file.is_symlink() && TileFile::is_whole(&file)
         };
         let are_all_there = index.tiles.iter().all(is_there);
         Ok(are_all_there.then(|| Self::over(folder.to_owned(), in_use, index, KEPT_BYTES)))
@@ -652,6 +652,13 @@ mod tests {
         (folder, file)
     }
 
+    /// Makes the tiles of a map; the file of the one at (x, 0).
+    fn tile_at(file: &Path, x_m: f64) -> PathBuf {
+        drop(Map::load(file, &options()).unwrap());
+        let files = open(file).unwrap().files.clone();
+        TileEntry::new(TileIndex::of(x_m, 0.0, 100.0), None, 0).file(&files.folder, files.stamp)
+    }
+
     fn path() -> MappingPath {
         MappingPath {
             map_from_lidar: (0..1200)
@@ -844,26 +851,19 @@ mod tests {
     #[test]
     fn a_damaged_tile_is_an_error_of_each_call_that_needs_it() {
         let (_folder, file) = saved();
-        drop(Map::load(&file, &options()).unwrap());
-        let store = open(&file).unwrap();
-        let (folder, stamp) = (store.files.folder.clone(), store.files.stamp);
-        let tile = TileEntry::new(TileIndex::of(600.0, 0.0, 100.0), None, 0).file(&folder, stamp);
+        let tile = tile_at(&file, 600.0);
         let whole = fs::read(&tile).unwrap();
         let damaged = |byte: usize| {
             let mut bad = whole.clone();
             bad[byte] ^= 1;
             bad
         };
-        let other_square = TileEntry::new(TileIndex::of(300.0, 0.0, 100.0), None, 0);
-        let of_other_square = fs::read(other_square.file(&folder, stamp)).unwrap();
+        let of_other_square = fs::read(tile_at(&file, 300.0)).unwrap();
         let (_other_folder, other_map) = saved();
         let mut less = street();
         less.triangles.pop();
         crate::map::files::ply::write(&other_map, &less, Some(&path())).unwrap();
-        drop(Map::load(&other_map, &options()).unwrap());
-        let other = open(&other_map).unwrap().files.clone();
-        let same_square = TileEntry::new(TileIndex::of(600.0, 0.0, 100.0), None, 0);
-        let of_other_map = fs::read(same_square.file(&other.folder, other.stamp)).unwrap();
+        let of_other_map = fs::read(tile_at(&other_map, 600.0)).unwrap();
         let pose = Pose3::translation(600.0, 0.0, 4.4);
         for (bytes, problem, has_ground) in [
             (&damaged(300)[..], "checksum", true),
@@ -914,10 +914,7 @@ mod tests {
     #[test]
     fn tiles_that_were_cut_short_are_made_again_and_an_index_of_others_is_left_alone() {
         let (_folder, file) = saved();
-        drop(Map::load(&file, &options()).unwrap());
-        let store = open(&file).unwrap();
-        let (folder, stamp) = (store.files.folder.clone(), store.files.stamp);
-        let tile = TileEntry::new(TileIndex::of(600.0, 0.0, 100.0), None, 0).file(&folder, stamp);
+        let tile = tile_at(&file, 600.0);
         let whole = fs::read(&tile).unwrap();
         let expected = seen(&Map::new(street(), path(), &options()).unwrap());
         for length in [whole.len() - 1, 300, 0] {
@@ -928,9 +925,10 @@ mod tests {
             assert!(seen(&map) == expected);
             assert_eq!(fs::read(&tile).unwrap(), whole, "{length}");
         }
-        fs::write(folder.join(INDEX), b"nothing").unwrap();
+        let index = folder_of(&file).join(INDEX);
+        fs::write(&index, b"nothing").unwrap();
         assert!(seen(&Map::load(&file, &options()).unwrap()) == expected);
-        assert_eq!(fs::read(folder.join(INDEX)).unwrap(), b"nothing");
+        assert_eq!(fs::read(&index).unwrap(), b"nothing");
     }
 
     #[test]
