@@ -39,6 +39,8 @@ pub struct RecordingFiles {
     pub scans: PathBuf,
     /// Times of the scans, one row per scan.
     pub times: Option<PathBuf>,
+    /// Times in the folder above, which may be those of another recording.
+    pub(super) times_above: Option<PathBuf>,
     /// Poses of the recording: a file, or KITTI's folder `oxts`.
     pub poses: Option<PathBuf>,
     /// Calibration of the recording.
@@ -61,6 +63,7 @@ impl RecordingFiles {
             layout: Layout::Memory,
             scans: PathBuf::new(),
             times: None,
+            times_above: None,
             poses: None,
             calibration: None,
         }
@@ -83,12 +86,14 @@ impl RecordingFiles {
         };
         let poses = || existing(base, &["poses.txt", "poses_tum.txt", "poses.tum"]);
         let calibration = existing(base, &["calib.txt"]);
-        let times = existing(base, &["times.txt", "../times.txt"]);
+        let times = existing(base, &["times.txt"]);
+        let times_above = existing(&base.join(".."), &["times.txt"]);
         if base.join("velodyne_points/data").is_dir() {
             return Self {
                 layout: Layout::KittiRaw,
                 scans: base.join("velodyne_points/data"),
                 times: existing(base, &["velodyne_points/timestamps.txt"]),
+                times_above: None,
                 poses: existing(base, &["oxts"]).or_else(poses),
                 calibration,
             };
@@ -98,6 +103,7 @@ impl RecordingFiles {
                 layout: Layout::KittiOdometry,
                 scans: base.join("velodyne"),
                 times,
+                times_above,
                 poses: poses(),
                 calibration,
             };
@@ -106,6 +112,7 @@ impl RecordingFiles {
             layout: Layout::Folder,
             scans: folder.to_owned(),
             times,
+            times_above,
             poses: poses(),
             calibration,
         }

@@ -77,12 +77,12 @@ impl Recording {
         }
         #[cfg(not(feature = "bags"))]
         let _ = topic;
-        let mut files = RecordingFiles::find(path);
+        let files = RecordingFiles::find(path);
         let scans = scan_list::scan_files(&files.scans)?;
         let rows = scans.last().map_or(0, |last| last.number + 1);
         let recorded_s = match scans[0].time_s {
             Some(_) => None,
-            None => recorded_times(&mut files, rows)?,
+            None => recorded_times(&files, rows)?,
         };
         let has_times = recorded_s.is_some() || scans[0].time_s.is_some();
         let count = scans.len();
@@ -192,8 +192,7 @@ impl Recording {
         PoseTrack::read(path, self.files.calibration.as_deref())
     }
 
-    /// The poses of the only topic of a bag that has some, as odometry: what moves from one to the next is known, not where
-    /// they are.
+    /// The poses of the only topic of poses in a bag, as odometry: only the motion between them is used.
     pub(crate) fn odometry_track(&self) -> Result<PoseTrack, RecordingError> {
         #[cfg(feature = "bags")]
         if let Some((bag, topic)) = &self.bag {
@@ -248,8 +247,8 @@ impl Recording {
         self.with_truth(track)
     }
 
-    /// The same recording, whose frames have the poses of a track, with which estimates are compared: nothing else of the
-    /// track is used.
+    /// The same recording, whose frames have the poses of a track as the truth that estimates are compared with: its times are
+    /// not used.
     ///
     /// # Errors
     /// As [`with_poses`](Self::with_poses).
@@ -355,37 +354,33 @@ fn moment_after_stamp_s(source: &ScanSource) -> Result<f64, RecordingError> {
     Ok(later_s.map_or(0.0, |(moment_s, stamp_s)| moment_s - stamp_s))
 }
 
-/// The times of scans with these many rows of times or poses [s]: of the recording's file of times, else of its poses where
-/// these have a row per scan.
-fn recorded_times(
-    files: &mut RecordingFiles,
-    rows: usize,
-) -> Result<Option<Vec<f64>>, RecordingError> {
+/// The times of scans [s]: of the recording's file of times, else of one in the folder above or of its poses, where these have
+/// as many rows as the scans need.
+fn recorded_times(files: &RecordingFiles, rows: usize) -> Result<Option<Vec<f64>>, RecordingError> {
     if let Some(path) = &files.times {
         let times_s = match files.layout {
             Layout::KittiRaw => read_timestamps(path)?,
             _ => read_times(path)?,
         };
-        // That of the folder above may belong to another recording.
-        let is_above = path.parent().is_some_and(|folder| folder.ends_with(".."));
-        if !is_above || times_s.len() == rows {
-            if is_above {
-                tracing::info!("the times of the scans are those of {}", path.display());
-            }
-            return ascending(path, times_s).map(Some);
-        }
-        files.times = None;
+        return ascending(path, times_s).map(Some);
     }
-    let Some(path) = files.poses.as_ref().filter(|path| path.is_file()) else {
+    let is_fitting = |times_s: &Vec<f64>| times_s.len() == rows;
+    let above = files
+        .times_above
+        .as_ref()
+        .map(|path| Ok((path, read_times(path)?)));
+    let above = above
+        .transpose()?
+        .filter(|(_, times_s)| is_fitting(times_s));
+    // Poses that cannot be read are an error where poses are needed.
+    let of_poses = || {
+        let path = files.poses.as_ref().filter(|path| path.is_file())?;
+        let (_, times_s) = read_rows_of_poses(path).ok()?;
+        Some((path, times_s.filter(is_fitting)?))
+    };
+    let Some((path, times_s)) = above.or_else(of_poses) else {
         return Ok(None);
     };
-    // Where these cannot be read, that is an error only to who needs poses.
-    let Ok((_, Some(times_s))) = read_rows_of_poses(path) else {
-        return Ok(None);
-    };
-    if times_s.len() != rows {
-        return Ok(None);
-    }
     tracing::info!("the times of the scans are those of {}", path.display());
     ascending(path, times_s).map(Some)
 }

@@ -33,6 +33,11 @@ pub struct PoseTrack {
     pub world_from_map: Pose3,
 }
 
+/// Whether so few frames have no pose that these can be left out: one and a hundredth of all, and not all.
+pub(crate) fn may_be_missing(missing: usize, frames: usize) -> bool {
+    missing <= 1 + frames / 100 && missing < frames
+}
+
 impl PoseTrack {
     /// Reads rows of KITTI (12 numbers: poses of the camera if there is a calibration, else of the lidar), rows of
     /// TUM (8 numbers: poses of the lidar), or a folder `oxts` of KITTI raw. Times are those of the rows, or
@@ -186,7 +191,7 @@ impl PoseTrack {
         let missing = || frames.iter().zip(&poses).filter(|(_, pose)| pose.is_none());
         let count = missing().count();
         if let Some((first, _)) = missing().next() {
-            if count > 1 + frames.len() / 100 || count == frames.len() {
+            if !may_be_missing(count, frames.len()) {
                 return Err(self.mismatch(frames, have_times, first, count));
             }
             let numbers: Vec<String> = missing()

@@ -158,7 +158,7 @@ impl Bag {
         }
     }
 
-    /// The error of poses for which no topic was named.
+    /// The error where poses are needed and no topic is named.
     pub(super) fn topics_of_poses_not_named(&self) -> RecordingError {
         match self.topic(TopicKind::Poses, None) {
             Err(error @ RecordingError::NoTopic { .. }) => error,

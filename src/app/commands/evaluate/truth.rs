@@ -10,6 +10,7 @@ use crate::app::run::input;
 use crate::app::settings::{EvaluationConfig, LocalizationConfig, RecordingConfig};
 use crate::evaluation::{Alignment, aligned};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3, pose3_from_pose2};
+use crate::recording::track::may_be_missing;
 use crate::recording::{Frame, PoseTrack, ScanSource, is_topic};
 
 /// Difference of times that are the same [s].
@@ -133,10 +134,10 @@ fn poses_by_number(
 ) -> Result<Vec<Option<Pose3>>> {
     let poses = &track.map_from_lidar;
     let last = results.frames.last().copied().unwrap_or_default();
-    let missing = results.frames.iter().filter(|&&frame| frame >= poses.len());
-    let missing = missing.count();
+    let is_missing = |frame: &&usize| **frame >= poses.len();
+    let missing = results.frames.iter().filter(is_missing).count();
     ensure!(
-        missing <= 1 + results.len() / 100 && missing < results.len(),
+        may_be_missing(missing, results.len()),
         "{} has {} poses, but the result reaches frame {last}; pose_file and result_file belong to different recordings",
         track.path.display(),
         poses.len()
@@ -168,13 +169,17 @@ pub fn align(results: &mut LocalizationResults, alignment: Alignment) -> Result<
     }
     let truth = results.ground_truth.clone().unwrap_or_default();
     let truth_in_space = results.ground_truth_in_space.clone();
-    for (is_filter, poses, in_space) in [
+    for (poses, in_space, trajectory) in [
         (
-            true,
             &mut results.estimates,
             &mut results.estimates_in_space,
+            &mut results.trajectory_in_space,
         ),
-        (false, &mut results.refined, &mut results.refined_in_space),
+        (
+            &mut results.refined,
+            &mut results.refined_in_space,
+            &mut None,
+        ),
     ] {
         let transform = match (&*in_space, &truth_in_space, &*poses) {
             (Some(estimates), Some(truth), _) => alignment.transform(estimates, truth),
@@ -184,7 +189,7 @@ pub fn align(results: &mut LocalizationResults, alignment: Alignment) -> Result<
         let transform = transform.context(
             "the positions are on a straight line, which determines no rigid alignment; set alignment to first",
         )?;
-        if let (true, Some(trajectory)) = (is_filter, &mut results.trajectory_in_space) {
+        if let Some(trajectory) = trajectory {
             *trajectory = aligned(&transform, trajectory);
         }
         if let Some(poses) = poses {
