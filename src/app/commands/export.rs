@@ -197,11 +197,7 @@ fn frames_of(config: &mut RefinementConfig, results: &LocalizationResults) -> Re
 fn model_of(mesh: &TriangleMesh, results: &LocalizationResults) -> Result<Model> {
     let (found, trusted) = match &results.refined_in_space {
         Some(refined) => (Some(refined), results.refined_trusted()),
-        None => {
-            let trajectory = results.trajectory_in_space.as_ref();
-            let trajectory = trajectory.or(results.estimates_in_space.as_ref());
-            (trajectory, results.trusted())
-        }
+        None => (results.trajectory_in_space(), results.trusted()),
     };
     let found = found.context("the result holds no poses in space; run localize again")?;
     let mut model = Model::default();

@@ -144,13 +144,10 @@ pub struct Trajectory<'a> {
 impl<'a> Trajectory<'a> {
     /// The trajectory of the filter, in which the frames before the first tracked one are filled back.
     pub fn of_filter(results: &'a LocalizationResults, frames: &'a [Frame]) -> Self {
-        let poses = results.trajectory_in_space.as_ref();
-        let poses = poses.or(results.estimates_in_space.as_ref());
-        let states = results.trajectory_states.as_ref();
         Self {
             frames,
-            poses: poses.map_or(&[], Vec::as_slice),
-            states: states.or(results.states.as_ref()).map(Vec::as_slice),
+            poses: results.trajectory_in_space().map_or(&[], Vec::as_slice),
+            states: results.trajectory_states().map(Vec::as_slice),
         }
     }
 
@@ -210,7 +207,7 @@ impl<'a> Trajectory<'a> {
         })?;
         let kitti = files.file(&format!("{name}_kitti.txt"));
         if rows.len() < self.poses.len() {
-            // Who reads it takes row k for frame k.
+            // Other programs take row k for frame k.
             let kitti_file = kitti.display();
             tracing::info!("{kitti_file} is not written, as not every frame has a trusted pose");
             return output::remove_if_exists(&kitti);

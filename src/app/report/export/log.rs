@@ -78,7 +78,7 @@ pub fn write_mcap(
     let nanoseconds = |time_s: &f64| ((time_s + shift_s) * 1e9).round() as u64;
     let stamps: Vec<u64> = times_s.iter().map(nanoseconds).collect();
     if let Some(&first) = stamps.first() {
-        log.send("/paths", first, &poses.scene(first))?;
+        log.send("/paths", first, &poses.scene(results, first))?;
         if let Some(mesh) = run.mesh {
             log.send("/map", first, &map_scene(mesh, first)?)?;
         }
@@ -125,8 +125,6 @@ struct Trajectories {
     estimates: Vec<Pose3>,
     refined: Option<Vec<Pose3>>,
     truth: Option<Vec<Pose3>>,
-    /// Poses of the lines, and whether they are trusted.
-    lines: Vec<(&'static str, Rgb, Vec<Pose3>, Vec<bool>)>,
 }
 
 impl Trajectories {
@@ -137,29 +135,10 @@ impl Trajectories {
             in_space.clone().or(raised.map(Iterator::collect))
         };
         let estimates = raised(&results.estimates_in_space, &results.estimates);
-        let estimates = estimates.context("the result holds no estimates; run localize again")?;
-        let refined = raised(&results.refined_in_space, &results.refined);
-        let truth = raised(&results.ground_truth_in_space, &results.ground_truth);
-        let trajectory = results.trajectory_in_space.as_ref().unwrap_or(&estimates);
-        let all = vec![true; results.len()];
-        let lines = [
-            ("truth", TRUTH, truth.clone(), all),
-            ("estimate", MCL, Some(trajectory.clone()), results.trusted()),
-            (
-                "refined",
-                REFINED,
-                refined.clone(),
-                results.refined_trusted(),
-            ),
-        ];
-        let lines = lines.into_iter();
-        let lines =
-            lines.filter_map(|(name, color, poses, trusted)| Some((name, color, poses?, trusted)));
         Ok(Self {
-            lines: lines.collect(),
-            estimates,
-            refined,
-            truth,
+            estimates: estimates.context("the result holds no estimates; run localize again")?,
+            refined: raised(&results.refined_in_space, &results.refined),
+            truth: raised(&results.ground_truth_in_space, &results.ground_truth),
         })
     }
 
@@ -269,7 +248,7 @@ impl Trajectories {
     }
 
     /// The trajectories as lines, with gaps where they are not trusted.
-    fn scene(&self, stamp: u64) -> SceneUpdate {
+    fn scene(&self, results: &LocalizationResults, stamp: u64) -> SceneUpdate {
         let line = |color: Rgb, poses: &[Pose3]| LinePrimitive {
             r#type: line_primitive::Type::LineStrip.into(),
             thickness: 3.0,
@@ -278,14 +257,27 @@ impl Trajectories {
             color: Some(opaque(color)),
             ..LinePrimitive::default()
         };
-        let entities = self
-            .lines
-            .iter()
-            .map(|(name, color, poses, trusted)| SceneEntity {
-                lines: stretches(trusted)
-                    .map(|rows| line(*color, &poses[rows]))
-                    .collect(),
-                ..entity(name, stamp)
+        let estimate = results.trajectory_in_space().unwrap_or(&self.estimates);
+        let all = vec![true; results.len()];
+        let lines = [
+            ("truth", TRUTH, self.truth.as_ref(), all),
+            ("estimate", MCL, Some(estimate), results.trusted()),
+            (
+                "refined",
+                REFINED,
+                self.refined.as_ref(),
+                results.refined_trusted(),
+            ),
+        ];
+        let entities = lines
+            .into_iter()
+            .filter_map(|(name, color, poses, trusted)| {
+                let poses = poses?;
+                let stretches = stretches(&trusted);
+                Some(SceneEntity {
+                    lines: stretches.map(|rows| line(color, &poses[rows])).collect(),
+                    ..entity(name, stamp)
+                })
             });
         SceneUpdate {
             entities: entities.collect(),

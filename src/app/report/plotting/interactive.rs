@@ -66,7 +66,7 @@ impl InteractivePath<'_> {
             "name": if results.refined.is_some() { "refined" } else { "MCL" },
             "color": css(if results.refined.is_some() { REFINED } else { MCL }),
             "poses": flat(best),
-            "trusted": if results.refined.is_some() { results.refined_trusted() } else { results.trusted() },
+            "trusted": results.best_trusted(),
             "truth": results.ground_truth.as_deref().map(flat),
             "truth_color": css(TRUTH),
             "errors_cm": numbers(|error| 100.0 * error.distance_m(), 100.0),

@@ -3,13 +3,32 @@
 use std::ops::Range;
 
 use super::localization_results::LocalizationResults;
-use crate::geometry::{Pose2, pose2_from_pose3};
+use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::localization::State;
 
 impl LocalizationResults {
     /// Whether the pose of each frame of [`trajectory`](Self::trajectory) is trusted; all are where no states are known.
     pub fn trusted(&self) -> Vec<bool> {
-        self.tracking(self.trajectory_states.as_ref().or(self.states.as_ref()))
+        self.tracking(self.trajectory_states())
+    }
+
+    /// States of the trajectory of the filter, where any are known.
+    pub fn trajectory_states(&self) -> Option<&Vec<u8>> {
+        self.trajectory_states.as_ref().or(self.states.as_ref())
+    }
+
+    /// The trajectory of the filter in space, where it is known.
+    pub fn trajectory_in_space(&self) -> Option<&Vec<Pose3>> {
+        let trajectory = self.trajectory_in_space.as_ref();
+        trajectory.or(self.estimates_in_space.as_ref())
+    }
+
+    /// Whether the pose of each frame of the best trajectory is trusted: the refined one, if there is one.
+    pub fn best_trusted(&self) -> Vec<bool> {
+        match &self.refined {
+            Some(_) => self.refined_trusted(),
+            None => self.trusted(),
+        }
     }
 
     /// Whether the refined pose of each frame is trusted.
