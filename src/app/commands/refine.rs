@@ -121,22 +121,14 @@ pub fn run(config: &RefinementConfig, context: &Context) -> Result<Report> {
     let planar = |truth: &[Pose3]| truth.iter().map(pose2_from_pose3).collect();
     results.ground_truth = (results.ground_truth.take()).or(truth.as_deref().map(planar));
     results.ground_truth_in_space = results.ground_truth_in_space.take().or(truth);
-    if is_trajectory {
-        warn_of_distance(config, &estimates, &refined);
-    }
-    let changed = refined
-        .changes
-        .iter()
-        .copied()
-        .map(run_output::before_and_after);
-    let (costs_m, agreements) = changed
-        .map(|[costs_m, agreements]| (costs_m, agreements))
-        .unzip();
+    let changes = refined.changes.iter();
+    let (costs_m, agreements) = changes.map(|&it| run_output::before_and_after(it)).unzip();
     results.refinement_costs_m = Some(costs_m);
     results.refinement_agreements = Some(agreements);
     let states = refined.states.iter().map(|state| *state as u8);
     results.refined_states = Some(states.collect());
     if is_trajectory {
+        warn_of_distance(config, &estimates, &refined);
         results.states.clone_from(&results.refined_states);
     }
     results.estimates = Some(estimates);

@@ -219,9 +219,9 @@ impl<'a> Trajectory<'a> {
 }
 
 /// Costs [m] and agreements before and after the refinement of a frame, -1 where unknown.
-pub fn before_and_after(change: Option<FrameChange>) -> [[f64; 2]; 2] {
-    change.map_or([[-1.0; 2]; 2], |it| {
-        [it.cost_m, it.agreement.map(|share| share.unwrap_or(-1.0))]
+pub fn before_and_after(change: Option<FrameChange>) -> ([f64; 2], [f64; 2]) {
+    change.map_or(([-1.0; 2], [-1.0; 2]), |it| {
+        (it.cost_m, it.agreement.map(|share| share.unwrap_or(-1.0)))
     })
 }
 

@@ -81,10 +81,14 @@ pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
         || {
             let mut motion = motion.lock().unwrap_or_else(PoisonError::into_inner);
             localize(&opened, &mut motion, &recorded, context)?;
-            let results = recorded().found();
-            let filled = fill_back(&opened, &results, context)?;
+            let searched = recorded().searched();
+            let filled = searched
+                .map(|it| fill_back(&opened, &it, context))
+                .transpose()?;
             let mut run = recorded();
-            run.fill(filled);
+            if let Some(filled) = filled.flatten() {
+                run.fill(&filled);
+            }
             run.complete()?;
             write_results(&opened, &mut run)?;
             context.interrupt.keeps(run.kept(&opened));

@@ -13,7 +13,7 @@ use crate::app::report::run_output::{self, Movie};
 use crate::app::run::{Claims, Interrupted};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
-use crate::localization::Estimate;
+use crate::localization::{Estimate, State};
 use crate::recording::Frame;
 use crate::refinement::FrameResult;
 
@@ -166,9 +166,10 @@ impl Run {
         push(&mut results.refined_covariances, covariance);
         let state = refined.map_or(estimate.state, |refined| refined.state);
         push(&mut results.refined_states, state as u8);
-        let changed = run_output::before_and_after(refined.and_then(|it| it.change));
-        push(&mut results.refinement_costs_m, changed[0]);
-        push(&mut results.refinement_agreements, changed[1]);
+        let change = refined.and_then(|it| it.change);
+        let (costs_m, agreements) = run_output::before_and_after(change);
+        push(&mut results.refinement_costs_m, costs_m);
+        push(&mut results.refinement_agreements, agreements);
         push(&mut results.refine_runtimes_s, refine_runtime.as_secs_f64());
         if let Some(writer) = &mut self.writer {
             if particles.len() > writer.capacity() {
@@ -183,39 +184,36 @@ impl Run {
         Ok(())
     }
 
-    /// What is known about the poses of the frames so far.
-    pub fn found(&self) -> LocalizationResults {
-        let results = &self.results;
-        LocalizationResults {
-            estimates: results.estimates.clone(),
-            estimates_in_space: results.estimates_in_space.clone(),
-            odometry: results.odometry.clone(),
-            covariances: results.covariances.clone(),
-            times_s: results.times_s.clone(),
-            states: results.states.clone(),
-            ..LocalizationResults::default()
-        }
+    /// The frames up to the first tracked one, if there are any before it.
+    pub fn searched(&self) -> Option<LocalizationResults> {
+        let mut states = self.results.states.as_ref()?.iter();
+        let first = states.position(|&state| state == State::Tracking as u8)?;
+        (first > 0).then(|| self.results.select(&(0..=first).collect::<Vec<_>>()))
     }
 
-    /// Sets the trajectory with its states; refined frames that were not tracked get its poses.
-    pub fn fill(&mut self, trajectory: Option<(Vec<Pose3>, Vec<u8>)>) {
-        let Some((poses, states)) = trajectory else {
-            return;
-        };
+    /// Makes poses of frames that were not tracked part of the trajectory, and of the refined one.
+    pub fn fill(&mut self, filled: &[(usize, Pose3)]) {
         let results = &mut self.results;
-        if let (Some(refined), Some(in_space), Some(refined_states), Some(known)) = (
-            &mut results.refined,
-            &mut results.refined_in_space,
-            &mut results.refined_states,
-            &results.states,
-        ) {
-            for row in (0..known.len()).filter(|&row| states[row] != known[row]) {
-                refined[row] = pose2_from_pose3(&poses[row]);
-                (in_space[row], refined_states[row]) = (poses[row], states[row]);
+        results
+            .trajectory_in_space
+            .clone_from(&results.estimates_in_space);
+        results.trajectory_states.clone_from(&results.states);
+        for &(row, pose) in filled {
+            for (poses, states) in [
+                (
+                    &mut results.trajectory_in_space,
+                    &mut results.trajectory_states,
+                ),
+                (&mut results.refined_in_space, &mut results.refined_states),
+            ] {
+                if let (Some(poses), Some(states)) = (poses, states) {
+                    (poses[row], states[row]) = (pose, State::Tracking as u8);
+                }
+            }
+            if let Some(refined) = &mut results.refined {
+                refined[row] = pose2_from_pose3(&pose);
             }
         }
-        results.trajectory_in_space = Some(poses);
-        results.trajectory_states = Some(states);
     }
 
     /// Completes the run after its last frame; an error where no frame was finished.
