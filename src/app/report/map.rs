@@ -177,15 +177,17 @@ impl ChangesReport {
     pub fn new(onto: &Path, older: &dyn MeshView, gone: &[u32], added: &[&dyn MeshView]) -> Self {
         let of_mesh = |mesh: &dyn MeshView| -> f64 {
             let triangles = 0..mesh.triangles();
-            // From zero: the sum of nothing is a negative one.
-            triangles.fold(0.0, |sum, triangle| sum + mesh.area_m2(triangle))
+            triangles.map(|triangle| mesh.area_m2(triangle)).sum()
         };
+        let gone_m2: f64 = gone.iter().map(|&it| older.area_m2(it as usize)).sum();
+        let added_m2: f64 = added.iter().map(|mesh| of_mesh(*mesh)).sum();
+        // An empty sum is -0.
         Self {
             onto: onto.to_owned(),
             gone_triangles: gone.len(),
-            gone_m2: (gone.iter()).fold(0.0, |sum, &it| sum + older.area_m2(it as usize)),
+            gone_m2: 0.0 + gone_m2,
             added_triangles: added.iter().map(|mesh| mesh.triangles()).sum(),
-            added_m2: added.iter().fold(0.0, |sum, mesh| sum + of_mesh(*mesh)),
+            added_m2: 0.0 + added_m2,
         }
     }
 

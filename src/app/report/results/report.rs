@@ -13,29 +13,34 @@ use super::run_summary::RunSummary;
 use crate::app::run::visible::visible_in_line;
 use crate::evaluation::{RangeMclErrors, SpatialMetrics, TrajectoryMetrics};
 
-/// The most important rows of every kind of report, of which each has at most twelve.
-const MAIN_ROWS: [&str; 28] = [
-    // Of a run without true poses.
+/// The most important rows of a run without true poses. A report of every kind has at most twelve such rows.
+const MAIN_OF_RUN: [&str; 6] = [
     "frames",
     "tracking",
     "path",
     "position sigma median",
     "heading sigma median",
     "agreement median",
-    // Of a refinement without true poses.
+];
+/// Those of a refinement without true poses.
+const MAIN_OF_REFINEMENT: [&str; 5] = [
     "refused frames",
     "moved median",
     "moved max",
     "cost median",
     "beams on the map median",
-    // Against true poses in a map.
+];
+/// Those of errors in a map.
+const MAIN_OF_ERRORS: [&str; 6] = [
     "position RMSE",
     "position median",
     "position max",
     "heading RMSE",
     "heading max",
     "runtime p50",
-    // Of a trajectory in space.
+];
+/// Those of errors of a trajectory in space.
+const MAIN_IN_SPACE: [&str; 11] = [
     "position in space RMSE",
     "position in space max",
     "height RMSE",
@@ -144,9 +149,11 @@ impl Report {
     /// Whether a row is among the most important ones of this report.
     pub fn is_main(&self, row: &MetricRow) -> bool {
         // In a map the planar errors are the main ones.
-        let is_planar = self.mcl.is_some();
-        let is_other = MAIN_ROWS[6..11].contains(&row.name) || MAIN_ROWS[17..].contains(&row.name);
-        MAIN_ROWS.contains(&row.name) && !(is_planar && is_other)
+        let has_errors = self.mcl.is_some();
+        let is_other = MAIN_OF_REFINEMENT.contains(&row.name) || MAIN_IN_SPACE.contains(&row.name);
+        MAIN_OF_RUN.contains(&row.name)
+            || MAIN_OF_ERRORS.contains(&row.name)
+            || (is_other && !has_errors)
     }
 
     /// What the run found, in one or two sentences.
