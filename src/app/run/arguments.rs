@@ -84,8 +84,8 @@ pub fn configured<T: CommandConfig>(
     Ok((config, context.with_config_file(path, T::PATH)))
 }
 
-/// Requires an input from the user where the one that is built in does not exist: no message may speak of a path that
-/// nobody gave.
+/// Requires an input from the user where the default one does not exist, so that no message is about a path that the user
+/// did not give.
 pub fn require_input<T: CommandConfig>(
     config: &T,
     path: Option<&Path>,
