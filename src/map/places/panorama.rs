@@ -205,8 +205,12 @@ impl PanoramaIndex {
             let pose = Pose2::from(center.coords);
             tiles.valid_tile_of(&pose).is_some()
         };
+        let model = panorama_model(&request.lidar, &request.config);
+        // Also of those in a file, so that a fine grid does not fill the disk.
+        let bytes =
+            |places: usize| 2.0 * model.len() as f64 * (places + 3 * places.min(BATCH)) as f64;
         let (mut places, mut poses) = (Vec::new(), Vec::new());
-        for center in cells.iter().filter(on_map) {
+        for (earlier, center) in (cells.iter().enumerate()).filter(|(_, center)| on_map(center)) {
             let pose = Pose2::from(center.coords);
             for patch in ground.levels_at(center.x, center.y)? {
                 places.push(Place {
@@ -216,15 +220,16 @@ impl PanoramaIndex {
                 });
                 poses.push(patch.lift(&pose, &upright));
             }
+            // Before the places of a large map fill the memory; the rest of it has as many per cell.
+            if bytes(places.len()) > budget.bytes as f64 {
+                budget.require(
+                    "the panoramas of the map",
+                    bytes(places.len()) * cells.len() as f64 / (earlier + 1) as f64,
+                    "raise panorama.cell_m, or lower panorama.rows or panorama.columns",
+                )?;
+            }
         }
-        let model = panorama_model(&request.lidar, &request.config);
         let render = |places: Range<usize>| renderer.render(&poses[places], &model);
-        // Also of those in a file, so that a fine grid does not fill the disk.
-        budget.require(
-            "the panoramas of the map",
-            2.0 * model.len() as f64 * (places.len() + 3 * places.len().min(BATCH)) as f64,
-            "raise panorama.cell_m, or lower panorama.rows or panorama.columns",
-        )?;
         let on_disk = match file {
             Some((path, request)) => Panoramas::write(path, request, &places, &model, render),
             None => Ok(None),
