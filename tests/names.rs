@@ -58,10 +58,13 @@ fn localize(recording: &Recording) -> Fpmcl {
     })
 }
 
+fn is_hidden(c: char) -> bool {
+    (c.is_control() && !"\n\t".contains(c)) || c == '\u{202e}'
+}
+
 #[track_caller]
 fn assert_plain_text(text: &str) {
-    let hidden = |c: char| (c.is_control() && !"\n\t".contains(c)) || c == '\u{202e}';
-    assert!(!text.contains(hidden), "{text:?}");
+    assert!(!text.contains(is_hidden), "{text:?}");
     assert!(
         !text
             .lines()
@@ -110,6 +113,11 @@ fn names_are_shown_in_output_errors_logs_and_reports_without_being_obeyed() {
     let report = fs::read_to_string(path).unwrap();
     assert_plain_text(&report);
     assert!(report.contains(SHOWN), "{report}");
+    let path = recording.path(&format!("{NAME}.out/report.html"));
+    let page = fs::read_to_string(path).unwrap();
+    // Lines mean nothing in a page.
+    assert!(!page.contains(is_hidden), "{page:?}");
+    assert!(page.contains(r"a\u001b]0;owned"), "{page}");
     // The second run is refused, and names what exists.
     let output = localize(&recording).exits_with(1);
     assert_plain(&output);

@@ -7,6 +7,7 @@ use base64::engine::general_purpose::STANDARD;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 use super::{Table, html};
+use crate::app::run::visible::visible;
 
 const STYLE: &str = include_str!("page.css");
 const SCRIPT: &str = include_str!("page.js");
@@ -111,7 +112,8 @@ impl Page {
                 }
             }
         };
-        page.into_string()
+        // Names from outside do not change the direction of the text or vanish in it.
+        visible(&page.into_string()).into_owned()
     }
 }
 
