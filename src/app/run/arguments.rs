@@ -139,14 +139,14 @@ pub fn yaml(value: &Value) -> String {
     visible(&value.to_string()).into_owned()
 }
 
-/// Requires arguments that a configuration can hold: every run writes its own with the names that it was given.
+/// Requires arguments that outputs can name: reports, JSON and configurations are text in UTF-8.
 pub fn require_text(arguments: &[OsString]) -> anyhow::Result<()> {
     /// What is no character, in Unicode and YAML.
     const NONE: [char; 2] = ['\u{fffe}', '\u{ffff}'];
     for argument in arguments.iter().skip(1) {
         ensure!(
             argument.to_str().is_some_and(|text| !text.contains(NONE)),
-            "the argument {argument:?} is not text in UTF-8, so no configuration of a run can hold it; rename the file or folder, or give a link to it that has such a name"
+            "the argument {argument:?} is not text in UTF-8, which reports, JSON and configurations are written in; rename the file or folder, or give a link to it that has such a name"
         );
     }
     Ok(())
