@@ -158,7 +158,11 @@ fn write_all_formats(folder: &Path) -> Vec<&'static str> {
     .unwrap();
     let rest = compress("zstd", &mcap(options(), "cdr", &little[4..]));
     fs::write(path("split_mcap/b.mcap.zstd"), rest).unwrap();
-    metadata(&path("split_mcap"), &["a.mcap", "'b.mcap.zstd'"]);
+    fs::write(
+        path("split_mcap/metadata.yaml"),
+        "rosbag2_bagfile_information:\n  relative_file_paths: [a.mcap, 'b.mcap.zstd']\n",
+    )
+    .unwrap();
     names.extend([
         "all.db3",
         "all 100%.db3.zstd",

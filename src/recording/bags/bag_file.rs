@@ -164,26 +164,30 @@ pub fn paths(path: &Path) -> Result<Vec<PathBuf>, String> {
             "is compressed by `{compression}`, not by zstd; convert it with `ros2 bag convert`"
         ));
     }
-    let mut paths = Vec::new();
-    if lines.any(|line| line == "relative_file_paths:") {
-        for line in lines {
-            let Some(name) = line.strip_prefix("- ") else {
-                break;
-            };
-            // The name of old bags begins with that of the folder.
-            let name = Path::new(unquoted(name));
-            let inside = path.join(name);
-            let sibling = name.file_name().map(|name| path.join(name));
-            paths.push(sibling.filter(|_name| !inside.exists()).unwrap_or(inside));
-        }
-    }
-    if paths.is_empty() {
+    let rest_of_line = lines.find_map(|line| line.strip_prefix("relative_file_paths:"));
+    let in_brackets =
+        rest_of_line.and_then(|rest| rest.trim().strip_prefix('[')?.strip_suffix(']'));
+    let names: Vec<&str> = match in_brackets {
+        Some(names) => names.split(',').map(unquoted).collect(),
+        None => lines
+            .map_while(|line| line.strip_prefix("- "))
+            .map(unquoted)
+            .collect(),
+    };
+    if names.is_empty() {
         return Err(
             "has a metadata.yaml without relative_file_paths; `ros2 bag reindex` writes it"
                 .to_owned(),
         );
     }
-    Ok(paths)
+    let file = |name| {
+        // The name of old bags begins with that of the folder.
+        let name = Path::new(name);
+        let inside = path.join(name);
+        let sibling = name.file_name().map(|name| path.join(name));
+        sibling.filter(|_name| !inside.exists()).unwrap_or(inside)
+    };
+    Ok(names.into_iter().map(file).collect())
 }
 
 /// A scalar of YAML without its quotes.
