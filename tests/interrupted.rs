@@ -367,7 +367,8 @@ fn a_busy_localization_ends_in_time_and_keeps_its_finished_frames() {
     let recording = Recording::street(12);
     recording.fpmcl("build-map").succeeds();
     let scan = PipedScan::new(&recording, 7);
-    for signal in ["-INT", "-TERM"] {
+    // Those of terminals, of service managers and batch systems, and of limits of time.
+    for signal in ["-INT", "-TERM", "-HUP", "-QUIT", "-USR1", "-ALRM", "-XCPU"] {
         let forced = [LOCALIZE, &["--force"]].concat();
         let stderr = overdue(signal, &recording, &forced, &scan);
         let kept = "interrupted; 7 of 12 frames are localized and kept in results/";
@@ -376,6 +377,34 @@ fn a_busy_localization_ends_in_time_and_keeps_its_finished_frames() {
         assert_eq!(results.unwrap().frames.len(), 7);
         assert_eq!(temporary_files(&recording, "results"), [""; 0]);
     }
+}
+
+#[test]
+fn a_signal_that_was_ignored_at_the_start_stays_ignored() {
+    let recording = Recording::street(6);
+    recording.fpmcl("build-map").succeeds();
+    let scan = PipedScan::new(&recording, 3);
+    let opened = scan.opened();
+    // As `nohup` does.
+    let mut child = Command::new("sh")
+        .args(["-c", "trap '' HUP; exec \"$0\" \"$@\""])
+        .arg(assert_cmd::cargo::cargo_bin!("fpmcl"))
+        .args(LOCALIZE)
+        .current_dir(recording.folder())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut pipe = wait(&opened, &mut child);
+    let id = child.id().to_string();
+    let kill = Command::new("kill").args(["-HUP", &id]).status().unwrap();
+    assert!(kill.success());
+    pipe.write_all(&scan.bytes).unwrap();
+    drop(pipe);
+    let mut reader = BufReader::new(child.stderr.take().unwrap());
+    let stderr = read_until(&mut reader, None);
+    assert_eq!(child.wait().unwrap().code(), Some(0), "{stderr}");
+    let results = LocalizationResults::read(&recording.path("results/localization.npz"));
+    assert_eq!(results.unwrap().frames.len(), 6);
 }
 
 #[test]

@@ -97,7 +97,7 @@ impl Context {
         Ok(Self {
             threads: rayon::current_num_threads(),
             backend: machine.backend.into(),
-            interrupt: Interrupt::install().context("listening for Ctrl-C")?,
+            interrupt: Interrupt::install().context("listening for signals")?,
             progress,
             log,
             config_file: None,

@@ -1,10 +1,12 @@
-//! Ctrl-C: the first stops a command at the next point without loss, at the latest after a second and
-//! a half; the second exits at once.
+//! Ctrl-C and every other signal that asks a process to end: the first stops a command at the next point
+//! without loss, at the latest after a second and a half; the second exits at once.
 //!
 //! Loops poll [`Interrupt::requested`]. For what lasts longer, the process ends while it runs: files
 //! are written atomically, so what is finished stays. A command whose finished work is still in memory
 //! saves it by [`Interrupt::supervise`].
 
+use std::fs;
+use std::io;
 use std::ops::ControlFlow;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, channel};
@@ -12,9 +14,20 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
 
+use signal_hook::consts::signal::{
+    SIGALRM, SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGUSR1, SIGUSR2, SIGXCPU,
+};
+use signal_hook::iterator::Signals;
+
 use crate::files;
 use crate::map::BuildError;
 use crate::mapping::MappingError;
+
+/// The signals that end a process by default, can be handled, and do not report a fault of the program: those of
+/// terminals, service managers, batch systems (`USR1`, `USR2`) and limits of time (`XCPU`, `ALRM`).
+const SIGNALS: [i32; 8] = [
+    SIGINT, SIGTERM, SIGHUP, SIGQUIT, SIGUSR1, SIGUSR2, SIGALRM, SIGXCPU,
+];
 
 /// Time from the request to stop until the process ends.
 const GRACE: Duration = Duration::from_millis(1500);
@@ -50,22 +63,25 @@ pub struct Interrupted {
 }
 
 impl Interrupt {
-    /// Installs the handler of Ctrl-C; only once per process.
-    pub fn install() -> Result<Self, ctrlc::Error> {
+    /// Listens for the signals; only once per process.
+    pub fn install() -> io::Result<Self> {
         let interrupt = Self::default();
         let handled = interrupt.clone();
-        ctrlc::set_handler(move || {
-            if handled.shared.requested.swap(true, Ordering::Relaxed) {
-                files::abandon_writes();
-                exit();
-            }
-            tracing::warn!(
-                "interrupted: keeping what is finished; press Ctrl-C again to stop at once"
-            );
-            let watched = handled.clone();
-            thread::spawn(move || watched.exit_when_overdue());
-        })?;
+        let ignored = ignored_signals();
+        let is_ignored = |signal: i32| ignored >> (signal - 1) & 1 == 1;
+        let mut signals = Signals::new(SIGNALS.into_iter().filter(|it| !is_ignored(*it)))?;
+        thread::spawn(move || signals.forever().for_each(|_signal| handled.signalled()));
         Ok(interrupt)
+    }
+
+    fn signalled(&self) {
+        if self.shared.requested.swap(true, Ordering::Relaxed) {
+            files::abandon_writes();
+            exit();
+        }
+        tracing::warn!("interrupted: keeping what is finished; press Ctrl-C again to stop at once");
+        let watched = self.clone();
+        thread::spawn(move || watched.exit_when_overdue());
     }
 
     /// Whether Ctrl-C was pressed.
@@ -169,6 +185,14 @@ impl Interrupt {
         tracing::error!("{}", self.error());
         exit()
     }
+}
+
+/// A bit for each signal that was ignored at the start, as `nohup` and shells ask for, the first for signal 1; none where
+/// the system does not say.
+fn ignored_signals() -> u64 {
+    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|it| it.strip_prefix("SigIgn:"));
+    mask.map_or(0, |mask| u64::from_str_radix(mask.trim(), 16).unwrap_or(0))
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
