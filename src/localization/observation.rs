@@ -351,6 +351,24 @@ mod tests {
     }
 
     #[test]
+    fn a_cost_that_is_larger_by_the_scale_is_e_times_less_likely() {
+        let robust = ObservationConfig {
+            scale_m: 0.003,
+            ..ObservationConfig::default()
+        };
+        let ratio = robust.log_likelihood(0.05) - robust.log_likelihood(0.053);
+        assert_relative_eq!(ratio, 1.0, epsilon = 1e-9);
+        // A Gaussian: one standard deviation is less likely than none by the factor exp(1/2), two by exp(2).
+        let reference = ObservationConfig {
+            reference_sigma_m: 1.5,
+            ..ObservationConfig::reference()
+        };
+        for (cost_m, expected) in [(0.0, 0.0), (1.5, -0.5), (3.0, -2.0)] {
+            assert_relative_eq!(reference.log_likelihood(cost_m), expected);
+        }
+    }
+
+    #[test]
     fn a_scan_with_few_returns_yields_all_of_them() {
         let model = LidarModel::default();
         let image = RangeImage::project(&[Vec3::new(8.0, 1.0, 0.0)], &model);

@@ -278,6 +278,18 @@ mod tests {
     }
 
     #[test]
+    fn resampled_particles_weigh_the_same_and_keep_the_mean() {
+        let mut set = ParticleSet::uniform((0..4).map(|i| pose(f64::from(i), 0.0, 0.0)));
+        set.reweight(&[0.1_f64, 0.2, 0.3, 0.4].map(f64::ln));
+        let mean_m = set.mean().translation.x;
+        assert_relative_eq!(mean_m, 2.0, epsilon = 1e-12);
+        // The copies that resampling draws for these weights.
+        let resampled = set.selected(&[0, 1, 1, 2, 2, 2, 3, 3, 3, 3]);
+        assert!(resampled.weights().iter().all(|&weight| weight == 0.1));
+        assert_relative_eq!(resampled.mean().translation.x, mean_m, epsilon = 1e-12);
+    }
+
+    #[test]
     fn only_likelihood_ratios_matter() {
         let start = ParticleSet::uniform((0..3).map(|i| pose(f64::from(i), 0.0, 0.0)));
         let (mut a, mut b) = (start.clone(), start);

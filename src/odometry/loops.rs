@@ -291,3 +291,129 @@ impl FoundLoop {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+    use glam::DVec3;
+
+    use super::super::sampling::TimedPoint;
+    use super::*;
+
+    const DRIFT: Drift = Drift {
+        share: 0.02,
+        least_m: 0.5,
+    };
+
+    /// Two rounds of eight submaps each, 10 m apart, without drift; sensor with a range of 50 m.
+    fn two_rounds() -> (Drive, Vec<Submap>) {
+        let poses: Vec<Pose3> = (0..16)
+            .map(|map| {
+                let turn = UnitQuaternion::from_axis_angle(
+                    &Vector3::z_axis(),
+                    std::f64::consts::FRAC_PI_4 * f64::from(map),
+                );
+                Pose3::from_parts((turn * Vector3::new(0.0, -13.0, 0.0)).into(), turn)
+            })
+            .collect();
+        let maps = (0..poses.len())
+            .map(|map| Submap {
+                rows: map..map + 1,
+                center: map,
+                travelled_m: 10.0 * map as f64,
+            })
+            .collect();
+        let drive = Drive {
+            samples: vec![],
+            times_s: vec![],
+            poses,
+            range_m: 50.0,
+            voxel_m: 0.5,
+        };
+        (drive, maps)
+    }
+
+    /// A loop between submaps that is off by a distance to the side.
+    fn found(drive: &Drive, maps: [usize; 2], off_m: f64) -> FoundLoop {
+        let first_from_second = drive.poses[maps[0]].inverse() * drive.poses[maps[1]];
+        FoundLoop {
+            maps,
+            first_from_second: first_from_second * Pose3::translation(0.0, off_m, 0.0),
+            covariance: Matrix6::identity() * 1e-4,
+            common_share: 0.8,
+        }
+    }
+
+    #[test]
+    fn a_loop_is_confirmed_by_one_of_other_submaps_by_which_the_drive_closes() {
+        let (drive, maps) = two_rounds();
+        let confirmed = |loops: &[([usize; 2], f64)], max_confirmation_share| {
+            let loops: Vec<FoundLoop> = (loops.iter())
+                .map(|&(maps, off_m)| found(&drive, maps, off_m))
+                .collect();
+            let config = LoopConfig {
+                max_confirmation_share,
+                ..LoopConfig::default()
+            };
+            super::confirmed(&drive, &maps, &loops, DRIFT, &config)
+        };
+        assert_eq!(confirmed(&[([0, 8], 0.0)], 3.0), [false]);
+        assert_eq!(confirmed(&[([0, 8], 0.0), ([2, 10], 0.0)], 3.0), [true; 2]);
+        // The next submap shares its surfaces.
+        assert_eq!(confirmed(&[([0, 8], 0.0), ([1, 9], 0.0)], 3.0), [false; 2]);
+        assert_eq!(confirmed(&[([0, 8], 0.0), ([2, 8], 0.0)], 3.0), [false; 2]);
+        // The ways of 20 m drift by 0.5 m + 2 % of 40 m, and submaps are exact to a voxel of 0.5 m.
+        assert_eq!(confirmed(&[([0, 8], 0.0), ([2, 10], 1.7)], 3.0), [true; 2]);
+        assert_eq!(confirmed(&[([0, 8], 0.0), ([2, 10], 1.9)], 3.0), [false; 2]);
+        // Two wrong loops do not confirm each other, and a right one does not confirm a wrong one.
+        let three = [([0, 8], 0.0), ([2, 10], 0.0), ([4, 12], 5.0)];
+        assert_eq!(confirmed(&three, 3.0), [true, true, false]);
+        // Too far from each other: 40 m over both visits, and a limit of 2 · 0.3 · 50 m.
+        assert_eq!(confirmed(&[([0, 8], 0.0), ([2, 10], 0.0)], 0.3), [false; 2]);
+    }
+
+    #[test]
+    fn the_common_share_is_that_of_the_points_on_the_surfaces_of_the_other_visit_without_the_ground()
+     {
+        let (drive, _) = two_rounds();
+        // A wall in the plane y = 4 and the ground, with points 10 cm apart.
+        let mut surfaces = VoxelMap::new(drive.voxel_m, 1000.0);
+        let grid = || {
+            (0..100_u8)
+                .flat_map(|a| (0..40_u8).map(move |b| (0.1 * f64::from(a), 0.1 * f64::from(b))))
+        };
+        let wall: Vec<DVec3> = grid().map(|(x, z)| DVec3::new(x, 4.0, z)).collect();
+        let ground: Vec<DVec3> = grid().map(|(x, y)| DVec3::new(x, y - 6.0, -1.7)).collect();
+        surfaces.insert(&wall);
+        surfaces.insert(&ground);
+        let config = LoopConfig::default();
+        // Seen from 2 m farther ahead.
+        let first_from_second = Pose3::translation(2.0, 0.0, 0.0);
+        let share = |points: &[(f64, DVec3)]| {
+            let points: Vec<TimedPoint> = (points.iter())
+                .flat_map(|&(count, point)| std::iter::repeat_n(point, count as usize))
+                .map(|point| TimedPoint {
+                    position: (point - 2.0 * DVec3::X).as_vec3(),
+                    time_s: 0.0,
+                })
+                .collect();
+            common_share(&surfaces, &points, &first_from_second, &drive, &config)
+        };
+        let on_wall = DVec3::new(5.0, 4.0, 2.0);
+        let off_wall = on_wall + 0.3 * DVec3::Y;
+        let on_ground = DVec3::new(5.0, -4.0, -1.7);
+        let nowhere = DVec3::new(5.0, 12.0, 2.0);
+        let beyond_radius = DVec3::new(5.0, 30.0, 2.0);
+        assert_eq!(share(&[(3.0, on_wall)]), 1.0);
+        assert_eq!(share(&[(3.0, off_wall)]), 0.0);
+        assert_eq!(share(&[(3.0, on_ground)]), 0.0);
+        let mixed = [
+            (3.0, on_wall),
+            (2.0, off_wall),
+            (9.0, on_ground),
+            (1.0, nowhere),
+            (7.0, beyond_radius),
+        ];
+        assert_relative_eq!(share(&mixed), 0.5);
+    }
+}

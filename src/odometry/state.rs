@@ -300,3 +300,115 @@ impl OdometerState {
         Sample::new(scan, self.range_m, config)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+    use nalgebra::{Matrix6, Vector3};
+
+    use super::*;
+
+    /// A state with a range of 50 m, a motion of 1 m per period, and a usual cost of 0.3.
+    fn moving() -> OdometerState {
+        OdometerState {
+            map: VoxelMap::new(0.5, 50.0),
+            range_m: 50.0,
+            mean_range_m: 50.0,
+            odom_from_lidar: Pose3::identity(),
+            motion: Some(Motion {
+                previous_from_current: Pose3::translation(1.0, 0.0, 0.0),
+                duration_s: PERIOD_S,
+            }),
+            first: None,
+            deviation: [0.0; 2],
+            cost: 0.3,
+            missed: 0,
+        }
+    }
+
+    fn config() -> OdometryConfig {
+        OdometryConfig {
+            max_deviation_share: 0.04,
+            max_deviation_deg: 20.0,
+            min_matched_share: 0.3,
+            max_cost: 0.85,
+            max_cost_increase: 0.2,
+            ..OdometryConfig::default()
+        }
+    }
+
+    #[test]
+    fn each_gate_refuses_what_exceeds_it() {
+        let is_possible = |state: &OdometerState, off: Pose3, cost, matched_share, periods: f64| {
+            let duration_s = periods * PERIOD_S;
+            let predicted = state.predicted(duration_s);
+            let found = Alignment {
+                odom_from_lidar: predicted * off,
+                covariance: Matrix6::identity(),
+                degenerate_directions: vec![],
+                residual_m: 0.02,
+                matched_share,
+                cost,
+            };
+            state.is_possible(&found, &predicted, duration_s, &config())
+        };
+        let aside = |shift_m| Pose3::translation(0.0, shift_m, 0.0);
+        let turned =
+            |turn_deg: f64| Pose3::new(Vector3::zeros(), Vector3::z() * turn_deg.to_radians());
+        let none = Pose3::identity();
+        let state = moving();
+        // 4 % of 50 m and 20 degrees, per period.
+        for (off, periods, expected) in [
+            (aside(1.9), 1.0, true),
+            (aside(2.1), 1.0, false),
+            (aside(3.9), 2.0, true),
+            (aside(4.1), 2.0, false),
+            (turned(19.0), 1.0, true),
+            (turned(-21.0), 1.0, false),
+            (turned(39.0), 2.0, true),
+            (turned(41.0), 2.0, false),
+        ] {
+            assert_eq!(
+                is_possible(&state, off, 0.3, 0.9, periods),
+                expected,
+                "{off}"
+            );
+        }
+        assert!(is_possible(&state, none, 0.49, 0.31, 1.0));
+        assert!(!is_possible(&state, none, 0.51, 0.31, 1.0));
+        assert!(!is_possible(&state, none, 0.49, 0.29, 1.0));
+        // Whatever is usual, a cost above 0.85 is none of a fit.
+        let usually_bad = OdometerState {
+            cost: 0.8,
+            ..moving()
+        };
+        assert!(is_possible(&usually_bad, none, 0.84, 0.9, 1.0));
+        assert!(!is_possible(&usually_bad, none, 0.86, 0.9, 1.0));
+        // The first motion is not predicted.
+        let first = OdometerState {
+            motion: None,
+            ..moving()
+        };
+        assert!(is_possible(
+            &first,
+            aside(9.0) * turned(50.0),
+            0.84,
+            0.9,
+            1.0
+        ));
+        assert!(!is_possible(&first, none, 0.86, 0.9, 1.0));
+    }
+
+    #[test]
+    fn the_prediction_and_its_standard_deviations_are_proportional_to_the_time() {
+        let state = moving();
+        for periods in [1.0, 2.0, 5.0] {
+            let predicted = state.predicted(periods * PERIOD_S);
+            assert_relative_eq!(predicted.translation.x, periods, epsilon = 1e-9);
+            // Without deviations so far: 0.3 voxels of 0.5 m, and 0.02 rad per period.
+            let prior = state.prior(periods * PERIOD_S, &config()).map(f64::sqrt);
+            assert_relative_eq!(prior.x, 0.15 * periods, epsilon = 1e-12);
+            assert_relative_eq!(prior[5], 0.02 * periods, epsilon = 1e-12);
+        }
+    }
+}

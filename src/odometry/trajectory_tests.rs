@@ -103,6 +103,44 @@ fn a_round_closes_its_loop_and_takes_the_drift_away() {
 }
 
 #[test]
+fn a_loop_that_no_other_confirms_does_not_move_the_poses() {
+    let poses: Vec<Pose3> = (0..12_u8)
+        .map(|row| Pose3::translation(10.0 * f64::from(row), 0.0, 0.0))
+        .collect();
+    let mut drive = Drive {
+        samples: vec![],
+        times_s: vec![],
+        poses: poses.clone(),
+        range_m: 50.0,
+        voxel_m: 0.5,
+    };
+    let maps = drive.submaps(5.0);
+    let edges = odometry_edges(&drive, &maps, &vec![OdometryEstimate::first(0.1); 12]);
+    let drift = Drift {
+        share: 0.02,
+        least_m: 0.5,
+    };
+    let found = |first: usize, second: usize, off_m: f64| FoundLoop {
+        maps: [first, second],
+        first_from_second: Pose3::translation(10.0 * (second - first) as f64, off_m, 0.0),
+        covariance: nalgebra::Matrix6::identity() * 1e-4,
+        common_share: 0.8,
+    };
+    let config = LoopConfig::default();
+    let mut close = |found: &[FoundLoop]| {
+        let loops = close(&mut drive, &maps, &edges, found, drift, &config);
+        let verdicts: Vec<LoopVerdict> = loops.iter().map(|it| it.verdict).collect();
+        (verdicts, drive.poses.clone())
+    };
+    let (verdicts, unmoved) = close(&[found(0, 9, 0.5)]);
+    assert_eq!(verdicts, [LoopVerdict::Unconfirmed]);
+    assert_eq!(unmoved, poses);
+    let (verdicts, moved) = close(&[found(0, 9, 0.5), found(2, 11, 0.5)]);
+    assert_eq!(verdicts, [LoopVerdict::Accepted; 2]);
+    assert!(moved[11].translation.y > 0.25, "{}", moved[11]);
+}
+
+#[test]
 fn an_impossible_limit_of_loops_is_named() {
     let mut config = TrajectoryConfig::default();
     config.loop_closure.min_common_share = 1.5;

@@ -329,7 +329,10 @@ mod tests {
     use rand::{SeedableRng, rngs::StdRng};
 
     use super::*;
+    use crate::geometry::Vec3;
+    use crate::lidar::{LidarModel, RangeImage};
     use crate::map::world_for_tests::TestWorld;
+    use crate::rendering::{RangeDifference, RangeRenderer, SurfaceHit};
 
     fn refine(method: Method, off: &Pose2, seed: u64) -> (RefinedFrame, Pose2) {
         let world = TestWorld::street();
@@ -387,6 +390,125 @@ mod tests {
             let (frame, truth) = refine(Method::Both, &Pose2::identity(), seed);
             assert!(frame.cost_after_m <= frame.cost_before_m);
             assert!(error(&frame, &truth) < 0.005);
+        }
+    }
+
+    /// A renderer whose surfaces contradict its ranges: Gauss-Newton is led astray.
+    struct Astray {
+        ranges: TestWorld,
+        surfaces: TestWorld,
+    }
+
+    impl RangeRenderer for Astray {
+        fn name(&self) -> String {
+            "astray".into()
+        }
+
+        fn render(
+            &self,
+            poses: &[Pose3],
+            model: &LidarModel,
+        ) -> Result<Vec<Vec<f32>>, RenderError> {
+            self.ranges.render(poses, model)
+        }
+
+        fn cast(
+            &self,
+            poses: &[Pose3],
+            directions: &[Vec3],
+            until_m: f32,
+        ) -> Result<Vec<Vec<f32>>, RenderError> {
+            self.ranges.cast(poses, directions, until_m)
+        }
+
+        fn surfaces(
+            &self,
+            pose: &Pose3,
+            directions: &[Vec3],
+            until_m: f32,
+        ) -> Result<Vec<Option<SurfaceHit>>, RenderError> {
+            self.surfaces.surfaces(pose, directions, until_m)
+        }
+
+        fn compare(
+            &self,
+            poses: &[Pose3],
+            beams: &[Beam],
+            difference: &RangeDifference,
+        ) -> Result<Vec<f32>, RenderError> {
+            self.ranges.compare(poses, beams, difference)
+        }
+
+        fn compare_images(
+            &self,
+            poses: &[Pose3],
+            measured: &RangeImage,
+            difference: &RangeDifference,
+        ) -> Result<Vec<f32>, RenderError> {
+            self.ranges.compare_images(poses, measured, difference)
+        }
+    }
+
+    #[test]
+    fn a_step_of_gauss_newton_that_raises_the_cost_is_rejected() {
+        let renderer = Astray {
+            ranges: TestWorld::street(),
+            surfaces: TestWorld::moved_street(Pose2::translation(0.08, 0.06)),
+        };
+        let world = &renderer.ranges;
+        let truth = world.pose_at(18.0, 0.2, 0.05);
+        let beams: Vec<Beam> = world.scan(&truth).beams().step_by(7).collect();
+        let objective = FrameObjective {
+            renderer: &renderer,
+            ..world.objective(&beams)
+        };
+        let lifted = objective.lift(&truth, None).unwrap().unwrap();
+        let config = FrameRefinementConfig::default();
+        let found = register(&renderer, &beams, &lifted, &config.gauss_newton).unwrap();
+        let led_m =
+            (found.unwrap().map_from_lidar.translation.vector - lifted.translation.vector).norm();
+        assert!(led_m > 0.05, "{led_m}");
+        for (method, distance) in [
+            (Method::GaussNewton, Distance::InBasin),
+            (Method::Both, Distance::Near),
+        ] {
+            let config = FrameRefinementConfig {
+                method,
+                ..config.clone()
+            };
+            let (covariance, mut rng) = (1e-4 * Matrix3::identity(), StdRng::seed_from_u64(1));
+            let frame = refine_frame(&objective, &truth, &covariance, distance, &config, &mut rng);
+            let frame = frame.unwrap().unwrap();
+            assert_eq!(frame.pose, truth);
+            assert_eq!(frame.cost_after_m, frame.cost_before_m);
+        }
+    }
+
+    #[test]
+    fn a_pose_that_the_swarm_finds_is_accepted_only_if_all_beams_fit_better() {
+        let world = TestWorld::street();
+        let truth = world.pose_at(18.0, 0.2, 0.05);
+        // The beams that the swarm compares are all too long.
+        let beams: Vec<Beam> = (world.scan(&truth).beams().step_by(7).enumerate())
+            .map(|(number, beam)| Beam {
+                range_m: beam.range_m + if number % 10 == 0 { 0.1 } else { 0.0 },
+                ..beam
+            })
+            .collect();
+        let config = FrameRefinementConfig {
+            method: Method::Swarm,
+            swarm_beams: beams.len().div_ceil(10),
+            ..FrameRefinementConfig::default()
+        };
+        let covariance = Matrix3::from_diagonal(&Vector3::new(0.0025, 0.0025, 1e-4));
+        for seed in 0..3 {
+            let objective = world.objective(&beams);
+            let mut rng = StdRng::seed_from_u64(seed);
+            let distance = Distance::InBasin;
+            let frame = refine_frame(&objective, &truth, &covariance, distance, &config, &mut rng);
+            let frame = frame.unwrap().unwrap();
+            assert!(frame.cost_after_m <= frame.cost_before_m);
+            assert!(error(&frame, &truth) < 0.01, "{}", error(&frame, &truth));
         }
     }
 

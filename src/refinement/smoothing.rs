@@ -597,6 +597,102 @@ mod tests {
     }
 
     #[test]
+    fn the_odometry_is_uncertain_ahead_and_aside_of_the_car_wherever_it_heads() {
+        let config = SmoothingConfig {
+            odometry_ahead_m: 0.3,
+            odometry_aside_m: 0.1,
+            odometry_turn_rad: 0.01,
+            ..SmoothingConfig::default()
+        };
+        let step = Pose2::translation(2.0, 0.0);
+        for heading in [0.0, 0.7, 2.5] {
+            let first = Pose2::new(Vector2::new(5.0, -3.0), heading);
+            let poses = [first, first * step, first * step * step];
+            let measured = Some(FramePrior {
+                pose: first,
+                covariance: Matrix3::identity() * 1e-12,
+            });
+            let found = covariances(&poses, &[measured, None, None], &[step; 3], &config).unwrap();
+            // Two steps add up in the axes of the car, and the turn of the first moves the second aside.
+            let aside_of_turn = 2.0 * 1e-4;
+            let in_car = Matrix3::new(
+                2.0 * 0.09,
+                0.0,
+                0.0,
+                0.0,
+                2.0 * 0.01 + 2.0 * aside_of_turn,
+                aside_of_turn,
+                0.0,
+                aside_of_turn,
+                2e-4,
+            );
+            let turn = rotation(heading);
+            let expected = turn * in_car * turn.transpose();
+            assert_relative_eq!(found[2], expected, epsilon = 1e-8);
+        }
+    }
+
+    #[test]
+    fn the_noise_of_the_odometry_is_observed_ahead_and_aside_of_the_car() {
+        let step = Pose2::translation(1.0, 0.0);
+        let mut pose = Pose2::new(Vector2::zeros(), 1.1);
+        let mut rng = StdRng::seed_from_u64(8);
+        let count = 4000;
+        let (mut priors, mut increments) = (Vec::new(), Vec::new());
+        let turn = rotation(1.1);
+        // Measured poses are uncertain aside of the car only, the odometry ahead only.
+        let in_car = Matrix3::from_diagonal(&Vector3::new(1e-8, 0.04, 1e-8));
+        let mut normal = |sigma: f64| -> f64 {
+            let deviate: f64 = StandardNormal.sample(&mut rng);
+            sigma * deviate
+        };
+        for _ in 0..count {
+            pose *= step;
+            priors.push(Some(FramePrior {
+                pose: pose * Pose2::translation(0.0, normal(0.2)),
+                covariance: turn * in_car * turn.transpose(),
+            }));
+            increments.push(Pose2::translation(1.0 + normal(0.3), 0.0));
+        }
+        let config = SmoothingConfig {
+            odometry_ahead_m: 0.02,
+            odometry_aside_m: 0.03,
+            ..SmoothingConfig::default()
+        };
+        let found = config.observed(&priors, &increments);
+        // A standard deviation by the median has a relative one of 1.17 / sqrt(n).
+        let error = 4.0 * 1.17 / f64::from(count).sqrt();
+        assert_relative_eq!(found.odometry_ahead_m, 0.3, max_relative = error);
+        // What the covariances of the poses explain is no noise of the odometry.
+        assert_eq!(found.odometry_aside_m, config.odometry_aside_m);
+        assert_eq!(found.odometry_turn_rad, config.odometry_turn_rad);
+        let noise = OdometryNoise::constant(0.04, 0.2, 0.0);
+        let with_noise = config.with_noise(&noise);
+        assert_eq!(with_noise.odometry_ahead_m, 0.2);
+        assert_eq!(with_noise.odometry_aside_m, 0.04);
+    }
+
+    #[test]
+    fn a_step_that_fits_worse_is_not_taken() {
+        let truth = corner();
+        let config = SmoothingConfig {
+            iterations: 1,
+            ..SmoothingConfig::default()
+        };
+        let mut is_refused = false;
+        for seed in 0..10 {
+            // So far off that a step of Gauss-Newton often leads farther away.
+            let start = disturbed(&truth, 3.0, 2.0, seed);
+            let (priors, increments) = (priors(&truth, 0.02, 0.002), increments(&truth));
+            let problem = Problem::new(&priors, &increments, &config);
+            let smooth = smooth(&start, &priors, &increments, &config);
+            assert!(problem.cost(&smooth) <= problem.cost(&start), "{seed}");
+            is_refused |= smooth == start;
+        }
+        assert!(is_refused);
+    }
+
+    #[test]
     fn without_measured_poses_the_covariance_is_undefined_or_large() {
         let truth = corner();
         let config = SmoothingConfig::default();

@@ -287,7 +287,7 @@ fn a_standing_car_is_not_updated_and_its_covariance_does_not_grow() {
 #[test]
 fn the_covariance_of_a_creeping_car_grows_by_the_noise_of_its_motion() {
     let world = TestWorld::street();
-    let truth = world.pose_at(0.0, 0.0, 0.0);
+    let truth = world.pose_at(0.0, 0.0, 0.7);
     let mut config = LocalizerConfig::of_test(3);
     config.velocity.speed_m_per_s = 4.0;
     // A hundredth of what makes an update due.
@@ -299,6 +299,7 @@ fn the_covariance_of_a_creeping_car_grows_by_the_noise_of_its_motion() {
     let of_velocity = config.velocity.covariance(&command);
     let motion = TurnDriveTurn::decompose(&command.compose());
     let of_motion = config.motion.covariance(&motion);
+    let map_from_car = truth.rotation.to_rotation_matrix().to_homogeneous();
     for (odometry, noise) in [
         (Odometry::Velocity(command), of_velocity),
         (Odometry::Increment(command.compose()), of_motion),
@@ -311,7 +312,8 @@ fn the_covariance_of_a_creeping_car_grows_by_the_noise_of_its_motion() {
         filter.step(odometry, &scan, &attitude, &mut rng).unwrap();
         let frame = filter.step(odometry, &scan, &attitude, &mut rng).unwrap();
         assert!(!frame.updated);
-        assert_relative_eq!(frame.covariance, 0.01 * noise, epsilon = 1e-9);
+        let expected = 0.01 * map_from_car * noise * map_from_car.transpose();
+        assert_relative_eq!(frame.covariance, expected, epsilon = 1e-9);
     }
 }
 

@@ -27,6 +27,8 @@ mod step;
 pub use state::ParticleFilter;
 
 #[cfg(test)]
+mod exact_tests;
+#[cfg(test)]
 mod filter_tests;
 #[cfg(test)]
 mod level_tests;

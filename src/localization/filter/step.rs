@@ -145,3 +145,68 @@ impl ParticleFilter {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use approx::assert_relative_eq;
+    use rand::{SeedableRng as _, rngs::StdRng};
+
+    use super::super::phase::Phase;
+    use super::super::state::LastMotion;
+    use super::*;
+    use crate::localization::motion::OdometryNoise;
+    use crate::localization::{LocalizerConfig, ParticleSet};
+    use crate::map::world_for_tests::TestWorld;
+
+    #[test]
+    fn motion_and_noise_of_the_prediction_without_odometry_are_proportional_to_the_time() {
+        const COUNT: usize = 10_000;
+        let world = TestWorld::street();
+        let start = world.pose_at(3.0, 1.0, 0.7);
+        // Of the constant velocity, then of an unknown one.
+        for (last_m, turn_rad, drive_m, side_m) in
+            [(Some(1.0), 0.02, 0.2, 0.1), (None, 0.05, 0.5, 0.3)]
+        {
+            let noise = OdometryNoise::constant(turn_rad, drive_m, side_m);
+            let config = LocalizerConfig {
+                constant_velocity: noise.clone(),
+                unknown_velocity: noise,
+                ..LocalizerConfig::of_test(COUNT)
+            };
+            for periods in [0.5, 1.0, 3.0] {
+                let particles = ParticleSet::uniform(vec![start; COUNT]);
+                let map = world.map();
+                let mut filter = ParticleFilter::new(config.clone(), map, None, particles).unwrap();
+                filter.phase = Phase::Tracking;
+                filter.pending = Some(Pending::default());
+                filter.last_motion = last_m.map(|last_m| LastMotion {
+                    increment: Pose2::translation(last_m, 0.0),
+                    duration_s: PERIOD_S,
+                });
+                filter.set_duration_s(periods * PERIOD_S);
+                filter.accumulate(Odometry::Unknown);
+                filter.propagate(Odometry::Unknown, &mut StdRng::seed_from_u64(2));
+                let moved = |pose: &Pose2| start.inverse() * pose;
+                let moved = ParticleSet::uniform(filter.particles.poses().map(moved));
+                let ahead_m = periods * last_m.unwrap_or(0.0);
+                let mean = Pose2::translation(ahead_m, 0.0);
+                let found = moved.covariance_about(&mean).diagonal();
+                let [turn_rad, drive_m, side_m] =
+                    [turn_rad, drive_m, side_m].map(|sigma| periods * sigma);
+                // The first turn moves the end of the way aside, and by its noise the way becomes shorter.
+                let expected = [
+                    drive_m.powi(2) + 0.75 * (ahead_m * turn_rad * turn_rad).powi(2),
+                    side_m.powi(2) + (ahead_m.powi(2) + drive_m.powi(2)) * turn_rad.powi(2),
+                    2.0 * turn_rad.powi(2),
+                ];
+                // Four standard errors of a variance.
+                let error = 4.0 * (2.0 / COUNT as f64).sqrt();
+                for (found, expected) in found.iter().zip(expected) {
+                    assert_relative_eq!(*found, expected, max_relative = error);
+                }
+                let shift_m = moved.mean().translation.x - ahead_m;
+                assert!(shift_m.abs() < 4.0 * drive_m / 100.0 + ahead_m * turn_rad.powi(2));
+            }
+        }
+    }
+}

@@ -444,6 +444,49 @@ mod tests {
         }
     }
 
+    /// Scans at one place of a panel in front of the wall, and scans after it was removed.
+    fn with_and_without_panel(with: usize, without: usize) -> Vec<ScanCloud> {
+        let mut world = wall();
+        world.append(&panel(10.0, [-2.0, 2.0], [-1.0, 1.0]));
+        let [with_panel, without_panel] = [&world, &wall()].map(|world| scan(world, Vec3::ZERO));
+        let with = std::iter::repeat_n(with_panel, with);
+        with.chain(std::iter::repeat_n(without_panel, without))
+            .collect()
+    }
+
+    #[test]
+    fn points_are_dynamic_by_the_majority_of_the_other_scans() {
+        // Two scans pass through the panel; of those that see it, the one that votes is not counted.
+        for (with, is_expected_static) in [(4, false), (5, true)] {
+            let scans = with_and_without_panel(with, 2);
+            let is_static = static_points(&scans, &model(), &VisibilityConfig::default());
+            let positions = &scans[0].cloud.positions;
+            let on_panel: Vec<bool> = (positions.iter().zip(&is_static[0]))
+                .filter(|(at, _)| at.x < 11.0 && at.y.abs() < 1.7 && at.z.abs() < 0.7)
+                .map(|(_, &is_static)| is_static)
+                .collect();
+            assert!(on_panel.len() > 50);
+            assert!(
+                on_panel
+                    .iter()
+                    .all(|&is_static| is_static == is_expected_static)
+            );
+        }
+    }
+
+    #[test]
+    fn triangles_are_removed_by_the_majority_of_the_beams() {
+        for (with, removed) in [(1, 64), (2, 0), (3, 0)] {
+            let mut mesh = panel(10.0, [-2.0, 2.0], [-1.0, 1.0]);
+            let scans = with_and_without_panel(with, 2);
+            let config = VisibilityConfig::default();
+            assert_eq!(
+                remove_crossed_triangles(&mut mesh, &scans, &config),
+                removed
+            );
+        }
+    }
+
     #[test]
     fn voting_scans_are_spread_over_all_scans() {
         assert_eq!(spread(100, 4), [12, 37, 62, 87]);

@@ -1,0 +1,166 @@
+//! Single decisions of the filter against exact answers.
+
+use approx::assert_relative_eq;
+use nalgebra::{Matrix3, Vector2, Vector3};
+use rand::{SeedableRng, rngs::StdRng};
+
+use super::ParticleFilter;
+use super::phase::{Phase, Search};
+use super::state::{Pending, Updated};
+use crate::geometry::Pose2;
+use crate::lidar::{LidarModel, RangeImage};
+use crate::localization::motion::OdometryNoise;
+use crate::localization::{LocalizerConfig, Odometry, ParticleSet, State};
+use crate::map::world_for_tests::TestWorld;
+use crate::map::{PanoramaConfig, PanoramaRequest, SearchRegion, SensorAttitude};
+
+/// A filter that has just tracked a pose with a covariance.
+fn tracking(config: LocalizerConfig, pose: Pose2, covariance: Matrix3<f64>) -> ParticleFilter {
+    let map = TestWorld::street().map();
+    let particles = ParticleSet::uniform([pose; 3]);
+    let mut filter = ParticleFilter::new(config, map, None, particles).unwrap();
+    filter.phase = Phase::Tracking;
+    filter.pending = Some(Pending::default());
+    filter.updated = Updated {
+        pose,
+        covariance,
+        is_narrow: true,
+    };
+    filter
+}
+
+fn empty_scan() -> RangeImage {
+    RangeImage::project(&[], &LidarModel::default())
+}
+
+#[test]
+fn a_pose_that_becomes_imprecise_between_updates_is_reported_as_searching() {
+    // A motion of 0.2 m is an update, with a variance of 1 m² along the car: 0.04 m² after 8 mm.
+    let config = LocalizerConfig {
+        motion: OdometryNoise::constant(1e-3, 1.0, 1e-3),
+        ..LocalizerConfig::of_test(3)
+    };
+    let start = TestWorld::street().pose_at(0.0, 0.0, 0.7);
+    let mut filter = tracking(config, start, Matrix3::zeros());
+    let mut rng = StdRng::seed_from_u64(1);
+    let creep = Odometry::Increment(Pose2::translation(3e-3, 0.0));
+    let states = [0; 4].map(|_| {
+        let attitude = SensorAttitude::default();
+        let frame = filter.step(creep, &empty_scan(), &attitude, &mut rng);
+        let frame = frame.unwrap();
+        assert!(!frame.updated);
+        frame.state
+    });
+    let [tracking, searching] = [State::Tracking, State::Searching];
+    assert_eq!(states, [tracking, tracking, searching, searching]);
+}
+
+#[test]
+fn the_uncertain_heading_of_a_creeping_car_makes_its_position_uncertain() {
+    let config = LocalizerConfig {
+        motion: OdometryNoise::constant(0.0, 0.0, 0.0),
+        ..LocalizerConfig::of_test(3)
+    };
+    let start = TestWorld::street().pose_at(0.0, 0.0, 0.7);
+    let of_heading = Matrix3::from_diagonal(&Vector3::new(0.0, 0.0, 0.01));
+    let mut filter = tracking(config, start, of_heading);
+    let mut rng = StdRng::seed_from_u64(1);
+    let creep = Odometry::Increment(Pose2::translation(0.1, 0.0));
+    let frame = filter.step(creep, &empty_scan(), &SensorAttitude::default(), &mut rng);
+    // Ten centimetres ahead, a turn by 1 rad moves the position by ten centimetres to the left.
+    let by_turn = Vector3::new(-0.1 * 0.7_f64.sin(), 0.1 * 0.7_f64.cos(), 1.0);
+    let expected = 0.01 * by_turn * by_turn.transpose();
+    assert_relative_eq!(frame.unwrap().covariance, expected, epsilon = 1e-12);
+}
+
+#[test]
+fn a_search_without_a_decision_is_lost_once_its_patience_is_over() {
+    let mut config = LocalizerConfig::of_test(100);
+    config.tracking_loss.patience = 3;
+    // Five metres from each other: nothing decides between them without returns.
+    let start = [0.0, 5.0].map(|x| Pose2::translation(x, 0.0));
+    let map = TestWorld::street().map();
+    let start = ParticleSet::uniform(start);
+    let mut filter = ParticleFilter::new(config, map, None, start).unwrap();
+    let mut rng = StdRng::seed_from_u64(1);
+    let step = Odometry::Increment(Pose2::translation(1.0, 0.0));
+    let states = [0; 5].map(|_| {
+        let frame = filter.step(step, &empty_scan(), &SensorAttitude::default(), &mut rng);
+        frame.unwrap().state
+    });
+    let [searching, lost] = [State::Searching, State::Lost];
+    assert_eq!(states, [searching, searching, searching, lost, lost]);
+}
+
+#[test]
+fn a_search_has_as_many_particles_as_kld_sampling_demands() {
+    let config = LocalizerConfig {
+        num_reduced: 100,
+        ..LocalizerConfig::of_test(2000)
+    };
+    // Forty bins of 0.5 m with particles that weigh, and 500 with particles that do not.
+    let in_bin = |bin: usize| {
+        let x = 0.5 * (bin % 100) as f64 + 0.25;
+        let y = 0.5 * (bin / 100) as f64 + 0.25;
+        Pose2::new(Vector2::new(x, y), 0.05)
+    };
+    let poses = (0..1500).map(|number| {
+        in_bin(if number < 1000 {
+            number % 40
+        } else {
+            number - 900
+        })
+    });
+    let map = TestWorld::street().map();
+    let mut start = ParticleSet::uniform(poses);
+    let logs: Vec<f64> = (0..1500)
+        .map(|number| if number < 1000 { 0.0 } else { -50.0 })
+        .collect();
+    start.reweight(&logs);
+    let mut filter = ParticleFilter::new(config, map, None, start).unwrap();
+    let mut rng = StdRng::seed_from_u64(1);
+    filter.resample(&mut rng);
+    // The 99 % quantile of χ² with 39 degrees of freedom is 62.43 (Fox 2003, eq. 5: by 2 ε = 0.1).
+    assert_relative_eq!(filter.particles.len() as f64, 624.3, max_relative = 0.01);
+    filter.phase = Phase::Tracking;
+    filter.resample(&mut rng);
+    assert_eq!(filter.particles.len(), 100);
+}
+
+#[test]
+fn a_restart_keeps_particles_where_the_car_was_because_the_alarm_may_be_false() {
+    let world = TestWorld::street();
+    let request = PanoramaRequest {
+        region: SearchRegion::Road,
+        lidar: LidarModel::default(),
+        sensor_height_m: SensorAttitude::default().height_m,
+        config: PanoramaConfig::default(),
+    };
+    let config = LocalizerConfig {
+        num_reduced: 80,
+        ..LocalizerConfig::of_test(500)
+    };
+    // On the pavement, where no panorama is; three quarters of the weight on the left one.
+    let [left, right] = [6.0, -6.0].map(|y| world.pose_at(-20.0, y, 0.0));
+    let mut start = ParticleSet::uniform([left, right]);
+    start.reweight(&[3.0_f64.ln(), 0.0]);
+    let mut filter = ParticleFilter::new(config, world.map(), Some(request), start).unwrap();
+    filter.phase = Phase::Lost {
+        search: Search::Around,
+    };
+    let scan = world.scan(&world.pose_at(40.0, 0.0, 0.0));
+    let mut rng = StdRng::seed_from_u64(1);
+    filter
+        .prepare_next(&scan, &SensorAttitude::default(), &mut rng)
+        .unwrap();
+    assert_eq!(filter.phase.reported(true), State::Searching);
+    let copies = |pose: Pose2| {
+        filter
+            .particles
+            .poses()
+            .filter(|other| **other == pose)
+            .count()
+    };
+    assert_eq!((copies(left), copies(right)), (60, 20));
+    assert!(filter.particles.len() > 80);
+}
