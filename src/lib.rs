@@ -134,6 +134,8 @@ pub mod localization;
 // Trajectories.
 pub mod mapping;
 pub mod refinement;
+#[cfg(test)]
+mod skips_for_tests;
 // Program.
 #[cfg(feature = "cli")]
 mod app;

@@ -2,9 +2,10 @@
 
 #![cfg(feature = "bags")]
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
-#![allow(clippy::print_stderr, reason = "tests that do not run say so")]
 
 mod bag_writers;
+#[path = "../src/skips_for_tests.rs"]
+mod skips;
 
 use std::fs;
 use std::path::Path;
@@ -761,10 +762,7 @@ fn bags_of_other_writers_have_the_points_of_the_drive() {
     let drive = shared.join("kitti-0926-drive-0005");
     let script = shared.join("../judge/make_bags.py");
     let Some(python) = std::env::var_os("FPMCL_PYTHON").filter(|_python| drive.exists()) else {
-        eprintln!(
-            "bags of other writers: skipped, FPMCL_PYTHON or {} is missing",
-            drive.display()
-        );
+        skips::skipped(format!("FPMCL_PYTHON or {} is missing", drive.display()));
         return;
     };
     let folder = tempfile::tempdir().unwrap();

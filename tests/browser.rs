@@ -5,7 +5,9 @@
 //! a message.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
-#![allow(clippy::print_stderr, reason = "a skipped test reports it")]
+
+#[path = "../src/skips_for_tests.rs"]
+mod skips;
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -14,6 +16,7 @@ use std::process::{Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 use fpmcl::internals::app::Bitmap;
+use skips::skipped;
 
 /// Widths of the windows of a desktop and of a phone [px].
 const WIDTHS: [u32; 2] = [1400, 390];
@@ -36,12 +39,13 @@ struct Browser {
 
 impl Browser {
     /// `None`, with a message, without pages or without a browser.
+    #[track_caller]
     fn open() -> Option<Self> {
         let (Ok(pages), Ok(screenshots)) = (
             std::env::var("FPMCL_PAGES"),
             std::env::var("FPMCL_SCREENSHOTS"),
         ) else {
-            eprintln!("not run: FPMCL_PAGES and FPMCL_SCREENSHOTS are not set");
+            skipped("FPMCL_PAGES and FPMCL_SCREENSHOTS are not set");
             return None;
         };
         let programs = ["chromium", "chromium-browser", "google-chrome"];
@@ -54,7 +58,7 @@ impl Browser {
             finished_within(TIMEOUT, &mut command).is_ok_and(|status| status.success())
         };
         let Some(program) = programs.into_iter().find(is_installed) else {
-            eprintln!("not run: there is no Chromium");
+            skipped("there is no Chromium");
             return None;
         };
         fs::create_dir_all(&screenshots).unwrap();

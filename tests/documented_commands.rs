@@ -2,6 +2,9 @@
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
+#[path = "../src/skips_for_tests.rs"]
+mod skips;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command as Process;
@@ -13,6 +16,7 @@ use fpmcl::internals::app::settings::{
 };
 use fpmcl::internals::app::{Cli, Command, ComparisonConfig};
 use fpmcl::simulation::SimulationConfig;
+use skips::skipped;
 
 /// Options of other programs: cargo, evo and Snakemake.
 const OF_OTHERS: [&str; 8] = [
@@ -176,7 +180,7 @@ fn commits_of_the_pages_are_in_the_history() {
     };
     let is_shallow = git(&["rev-parse", "--is-shallow-repository"]);
     if is_shallow.is_none_or(|output| output.stdout.starts_with(b"true")) {
-        eprintln!("skipped: this is no git checkout with its history");
+        skipped("this is no git checkout with its history");
         return;
     }
     let is_commit = |word: &&str| {

@@ -16,7 +16,7 @@ use fpmcl::internals::app::color::{MCL, REFINED};
 #[test]
 fn the_pictures_of_finished_runs_show_the_paths() {
     let Ok(runs) = std::env::var("FPMCL_RUNS") else {
-        eprintln!("not run: FPMCL_RUNS is not set");
+        common::skips::skipped("FPMCL_RUNS is not set");
         return;
     };
     for run in runs.split(':') {

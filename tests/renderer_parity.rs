@@ -25,7 +25,7 @@ use brute_force::{BruteForce, room, street};
 const METHODS: [ImageMethod; 2] = [ImageMethod::Cast, ImageMethod::Raster];
 
 /// A renderer on any adapter; `None`, with a message, without one.
-#[expect(clippy::print_stderr, reason = "a skipped test reports it")]
+#[track_caller]
 fn renderer(tiles: &[TriangleMesh]) -> Option<GpuRenderer> {
     match GpuRenderer::new(
         Arc::new(Scene::of_tiles(tiles)),
@@ -39,7 +39,7 @@ fn renderer(tiles: &[TriangleMesh]) -> Option<GpuRenderer> {
                 !required,
                 "FPMCL_REQUIRE_GPU=1, but there is no graphics adapter"
             );
-            eprintln!("not run: there is no graphics adapter");
+            common::skips::skipped("there is no graphics adapter");
             None
         }
         Err(error) => panic!("{error}"),

@@ -222,14 +222,13 @@ fn localize_refines_where_it_is_asked_to() {
 
 /// Where the variable `FPMCL_REQUIRE_GPU` is set, a missing adapter is an error.
 #[test]
-#[allow(clippy::print_stderr, reason = "a skipped test reports it")]
 fn the_graphics_card_finds_the_same_path() {
     let text = run(Path::new("."), &["doctor", "--measure=0"]);
     let has_adapter =
         (text.lines()).any(|line| line.starts_with("adapter ") && !line.contains("none"));
     let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|value| value == "1");
     if !has_adapter && !required {
-        eprintln!("not run: no graphics adapter");
+        common::skips::skipped("there is no graphics adapter");
         return;
     }
     let outcome = localize("gpu", &["--backend=gpu"]);

@@ -2,7 +2,6 @@
 
 #![cfg(feature = "bags")]
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
-#![allow(clippy::print_stderr, reason = "tests that do not run say so")]
 
 mod bag_writers;
 mod common;
@@ -103,7 +102,7 @@ fn python_with_evo() -> Option<PathBuf> {
 #[test]
 fn errors_of_all_alignments_and_segments_equal_those_of_evo() {
     let Some(python) = python_with_evo() else {
-        eprintln!("errors of evo: skipped, FPMCL_PYTHON names no interpreter with evo");
+        common::skips::skipped("FPMCL_PYTHON names no interpreter with evo");
         return;
     };
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));

@@ -56,7 +56,8 @@ fn kitti_07() -> Option<Vec<Pose3>> {
     match (poses, calibration) {
         (Ok(poses), Ok(calibration)) => Some(poses.map_from_lidar(&calibration)),
         _ => {
-            eprintln!("skipped: no KITTI 07 poses in {}", data.display());
+            let reason = format!("there are no poses of KITTI 07 in {}", data.display());
+            crate::skips_for_tests::skipped(reason);
             None
         }
     }

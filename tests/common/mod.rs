@@ -4,6 +4,8 @@
 #![allow(dead_code, reason = "each test file uses its own part")]
 
 pub mod picture;
+#[path = "../../src/skips_for_tests.rs"]
+pub mod skips;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -191,7 +193,7 @@ pub fn config_file(name: &str) -> PathBuf {
 }
 
 /// Folder of a real recording; `None`, with a message, where it is missing.
-#[allow(clippy::print_stderr, reason = "a skipped test reports it")]
+#[track_caller]
 pub fn real_recording(name: &str) -> Option<PathBuf> {
     let folder = std::env::var_os("FPMCL_DATA")
         .map_or_else(
@@ -200,7 +202,7 @@ pub fn real_recording(name: &str) -> Option<PathBuf> {
         )
         .join(name);
     if !folder.is_dir() {
-        eprintln!("not run: {} is missing", folder.display());
+        skips::skipped(format!("{} is missing", folder.display()));
         return None;
     }
     Some(folder)

@@ -753,7 +753,7 @@ mod tests {
             Err(error) => {
                 let required = std::env::var_os("FPMCL_REQUIRE_GPU").is_some_and(|it| it == "1");
                 assert!(!required, "FPMCL_REQUIRE_GPU=1, and {error}");
-                eprintln!("not run: {error}");
+                crate::skips_for_tests::skipped(error);
                 return;
             }
         };

@@ -45,7 +45,7 @@ fn renderer() -> Option<GpuRenderer> {
                 !required,
                 "FPMCL_REQUIRE_GPU=1, and there is no graphics adapter"
             );
-            eprintln!("not run: there is no graphics adapter");
+            crate::skips_for_tests::skipped("there is no graphics adapter");
             None
         }
         Err(error) => panic!("{error}"),

@@ -8,8 +8,10 @@ use super::LocalizationResults;
 use crate::evaluation::{EvaluatedTrajectory, MetricsConfig, RangeMclRules, TrajectoryMetrics};
 use crate::geometry::{Pose2, pose2_from_pose3};
 use crate::recording::{Calibration, poses::CameraPoses};
+use crate::skips_for_tests::skipped;
 
 /// The true lidar poses and the results of range-mcl; `None` with a message if they do not exist.
+#[track_caller]
 pub fn kitti_07() -> Option<(Vec<Pose2>, LocalizationResults)> {
     let data = std::env::var_os("FPMCL_DATA").map_or_else(
         || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
@@ -18,7 +20,11 @@ pub fn kitti_07() -> Option<(Vec<Pose2>, LocalizationResults)> {
     let poses = data.join("kitti-odometry-poses");
     let results = data.join("range-mcl/kitti07_demo_loc_results.npz");
     if !results.exists() || !poses.exists() {
-        eprintln!("skipped: {} does not exist", results.display());
+        skipped(format!(
+            "{} or {} is missing",
+            results.display(),
+            poses.display()
+        ));
         return None;
     }
     let calibration = Calibration::read(&poses.join("sequences/07/calib.txt")).unwrap();
