@@ -134,13 +134,14 @@ pub mod localization;
 // Trajectories.
 pub mod mapping;
 pub mod refinement;
-#[cfg(test)]
-mod skips_for_tests;
 // Program.
 #[cfg(feature = "cli")]
 mod app;
 #[cfg(feature = "cli")]
 pub use app::{main, main_of_library};
+
+#[cfg(test)]
+pub(crate) mod skips_for_tests;
 
 /// What the tests and benches of this repository use beyond the library's interface; it changes without notice.
 #[doc(hidden)]

@@ -1,5 +1,7 @@
 //! The last program of `cargo test`, by its name: lists the tests that were skipped.
 
+#![allow(clippy::print_stdout, reason = "the list")]
+
 #[allow(dead_code, reason = "no test is skipped here")]
 #[path = "../src/skips_for_tests.rs"]
 mod skips;
