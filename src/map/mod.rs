@@ -14,6 +14,8 @@ pub(crate) mod tiles;
 mod unit;
 
 #[cfg(test)]
+pub(crate) mod gaussian_for_tests;
+#[cfg(test)]
 pub(crate) mod world_for_tests;
 
 pub use crate::raycasting::{TileError, TileProblem};

@@ -201,6 +201,7 @@ mod tests {
     use approx::assert_relative_eq;
 
     use super::*;
+    use crate::map::gaussian_for_tests::GaussianWorld;
     use crate::map::world_for_tests::TestWorld;
 
     impl TestWorld {
@@ -225,6 +226,28 @@ mod tests {
             .map(|x| 0.5 * x.dot(&(matrix * x)) + 3.0)
             .collect();
         assert_relative_eq!(hessian(&values), matrix, epsilon = 1e-12);
+    }
+
+    #[test]
+    fn the_covariance_of_a_gaussian_is_its_own() {
+        let world = TestWorld::street();
+        let mean = world.pose_at(12.0, 0.1, 0.8);
+        let covariance = Matrix3::new(
+            25e-4, 9e-4, 4e-5, //
+            9e-4, 16e-4, 2e-5, //
+            4e-5, 2e-5, 16e-6,
+        );
+        let renderer = GaussianWorld {
+            mean,
+            information: covariance.try_inverse().unwrap(),
+            scale_m: 0.002,
+        };
+        let objective = FrameObjective {
+            renderer: &renderer,
+            ..world.objective(&[])
+        };
+        let found = objective.covariance(&mean, None, 0.002).unwrap();
+        assert_relative_eq!(found, covariance, max_relative = 1e-3);
     }
 
     #[test]

@@ -784,6 +784,32 @@ mod tests {
     }
 
     #[test]
+    fn an_uncertain_frame_whose_scan_fits_nowhere_is_no_longer_tracked_and_keeps_its_estimate() {
+        let world = TestWorld::street();
+        let mut config = RefinerConfig::default();
+        config.refinement.max_reach_m = 0.4;
+        config.refinement.wide_search.swarms = 1;
+        let estimate = InitialEstimate {
+            covariance: Some(Matrix3::from_diagonal(&Vector3::new(0.25, 0.25, 1e-4))),
+            ..InitialEstimate::tracked(world.pose_at(10.0, 0.0, 0.0))
+        };
+        for (scan_from_m, state) in [(10.0, State::Tracking), (47.0, State::Searching)] {
+            let points = world.scan(&world.pose_at(scan_from_m, 0.0, 0.0)).points;
+            let scan = Scan {
+                points,
+                ..Scan::default()
+            };
+            let mut refiner =
+                TrajectoryRefiner::new(&world.map(), &sensor(), config.clone(), 0).unwrap();
+            let frame = refiner.add(&scan, &estimate).unwrap();
+            assert_eq!(frame.state, state);
+            assert!(state == State::Tracking || frame.pose == estimate.pose);
+            let untracked = usize::from(state != State::Tracking);
+            assert_eq!(refiner.finish(None).unwrap().untracked, untracked);
+        }
+    }
+
+    #[test]
     fn an_odometry_that_contradicts_the_frames_does_not_bend_them() {
         let map = TestWorld::street().map();
         let mut refiner =

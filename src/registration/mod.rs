@@ -409,6 +409,31 @@ mod tests {
     }
 
     #[test]
+    fn the_planar_covariance_is_in_the_axes_of_the_map() {
+        // Two centimetres ahead, one aside and three up; 2, 3 and 4 mrad about these axes.
+        let variances = Vector6::new(4e-4, 1e-4, 9e-4, 4e-6, 9e-6, 16e-6);
+        let found = |axis: nalgebra::Vector3<f64>| {
+            let result = RegistrationResult {
+                map_from_lidar: Pose3::new(nalgebra::Vector3::zeros(), axis),
+                covariance: Matrix6::from_diagonal(&variances),
+                iterations: 1,
+            };
+            result.planar_covariance()
+        };
+        let quarter = std::f64::consts::FRAC_PI_2;
+        let heading_north = found(nalgebra::Vector3::z() * quarter);
+        let expected = Matrix3::from_diagonal(&nalgebra::Vector3::new(1e-4, 4e-4, 16e-6));
+        assert_relative_eq!(heading_north, expected, epsilon = 1e-12);
+        let half_way = found(nalgebra::Vector3::z() * 0.5 * quarter);
+        assert_relative_eq!(half_way[(0, 0)], 2.5e-4, epsilon = 1e-12);
+        assert_relative_eq!(half_way[(0, 1)], 1.5e-4, epsilon = 1e-12);
+        // Rolled by a quarter, the left axis points up: the turn about it is one of the heading.
+        let rolled = found(nalgebra::Vector3::x() * quarter);
+        let expected = Matrix3::from_diagonal(&nalgebra::Vector3::new(4e-4, 9e-4, 9e-6));
+        assert_relative_eq!(rolled, expected, epsilon = 1e-12);
+    }
+
+    #[test]
     fn planar_covariance_rotates_with_the_heading() {
         let straight = TestWorld::street();
         let turned = TestWorld::moved_street(Pose2::rotation(1.0));

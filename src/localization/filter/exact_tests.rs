@@ -1,5 +1,7 @@
 //! Single decisions of the filter against exact answers.
 
+use std::sync::Arc;
+
 use approx::assert_relative_eq;
 use nalgebra::{Matrix3, Vector2, Vector3};
 use rand::{SeedableRng, rngs::StdRng};
@@ -10,7 +12,10 @@ use super::state::{Pending, Updated};
 use crate::geometry::Pose2;
 use crate::lidar::{LidarModel, RangeImage};
 use crate::localization::motion::OdometryNoise;
+use crate::localization::particles::deviation;
+use crate::localization::proposal::Gaussian;
 use crate::localization::{LocalizerConfig, Odometry, ParticleSet, State};
+use crate::map::gaussian_for_tests::GaussianWorld;
 use crate::map::world_for_tests::TestWorld;
 use crate::map::{PanoramaConfig, PanoramaRequest, SearchRegion, SensorAttitude};
 
@@ -31,6 +36,61 @@ fn tracking(config: LocalizerConfig, pose: Pose2, covariance: Matrix3<f64>) -> P
 
 fn empty_scan() -> RangeImage {
     RangeImage::project(&[], &LidarModel::default())
+}
+
+#[test]
+fn the_estimate_of_an_update_and_its_covariance_are_those_of_the_posterior() {
+    const COUNT: usize = 20_000;
+    let street = TestWorld::street();
+    let start = street.pose_at(2.0, 0.5, 0.7);
+    // Prior and likelihood of (x, y, heading), of which the second one is off by a standard deviation or so.
+    let prior = Matrix3::new(0.04, 0.01, 0.0, 0.01, 0.09, 0.004, 0.0, 0.004, 0.01);
+    let likelihood = Matrix3::new(0.03, -0.02, 0.0, -0.02, 0.06, 0.0, 0.0, 0.0, 0.02);
+    let off = Vector3::new(0.2, -0.3, 0.1);
+    let [prior_information, information] = [prior, likelihood].map(|it| it.try_inverse().unwrap());
+    let posterior = (prior_information + information).try_inverse().unwrap();
+    let shift = posterior * information * off;
+
+    let mut config = LocalizerConfig::of_test(COUNT);
+    config.proposal.scan = false;
+    config.tempering.min_effective_fraction = 0.0;
+    let mut map = street.map();
+    map.renderer = Arc::new(GaussianWorld {
+        mean: Pose2::new(
+            start.translation.vector + off.xy(),
+            start.rotation.angle() + off.z,
+        ),
+        information,
+        scale_m: config.observation.scale_m,
+    });
+    let mut rng = StdRng::seed_from_u64(4);
+    let poses = Gaussian::new(start, prior).unwrap().sample(COUNT, &mut rng);
+    let mut filter = ParticleFilter::new(config, map, None, ParticleSet::uniform(poses)).unwrap();
+    filter.phase = Phase::Tracking;
+    let still = Odometry::Increment(Pose2::identity());
+    let frame = filter.step(still, &empty_scan(), &SensorAttitude::default(), &mut rng);
+    let frame = frame.unwrap();
+
+    let effective = frame.effective_sample_size;
+    assert!(effective > 5000.0, "{effective}");
+    // Four standard errors of a mean and of a variance.
+    let found = deviation(&frame.pose, &start);
+    for axis in 0..3 {
+        let sigma = posterior[(axis, axis)].sqrt();
+        assert_relative_eq!(
+            found[axis],
+            shift[axis],
+            epsilon = 4.0 * sigma / effective.sqrt()
+        );
+        for other in 0..3 {
+            let scale = sigma * posterior[(other, other)].sqrt();
+            assert_relative_eq!(
+                frame.covariance[(axis, other)],
+                posterior[(axis, other)],
+                epsilon = 4.0 * scale * (2.0 / effective).sqrt()
+            );
+        }
+    }
 }
 
 #[test]
@@ -163,4 +223,36 @@ fn a_restart_keeps_particles_where_the_car_was_because_the_alarm_may_be_false() 
     };
     assert_eq!((copies(left), copies(right)), (60, 20));
     assert!(filter.particles.len() > 80);
+}
+
+#[test]
+fn a_registration_beyond_six_standard_deviations_of_the_prediction_is_rejected() {
+    /// Standard deviations of the prediction.
+    const SIGMA_M: f64 = 0.01;
+    const SIGMA_RAD: f64 = 1e-3;
+    let world = TestWorld::street();
+    let truth = world.pose_at(5.0, 0.3, 0.1);
+    let is_proposed = |off_sigmas: f64| {
+        let predicted = truth * Pose2::translation(0.0, off_sigmas * SIGMA_M);
+        // Two particles per axis have the variances of a sixth of them each.
+        let spread = 3.0_f64.sqrt();
+        let particles = [-spread, spread].into_iter().flat_map(|k| {
+            [
+                Pose2::translation(k * SIGMA_M, 0.0),
+                Pose2::translation(0.0, k * SIGMA_M),
+                Pose2::rotation(k * SIGMA_RAD),
+            ]
+        });
+        let particles = ParticleSet::uniform(particles.map(|off| predicted * off));
+        let config = LocalizerConfig::of_test(6);
+        let mut filter = ParticleFilter::new(config, world.map(), None, particles).unwrap();
+        filter.phase = Phase::Tracking;
+        let mut rng = StdRng::seed_from_u64(1);
+        let attitude = SensorAttitude::default();
+        let proposal = filter.propose(&world.scan(&truth), &attitude, &mut rng);
+        proposal.unwrap().is_some()
+    };
+    // The registration is right to a few millimetres.
+    assert!(is_proposed(0.0) && is_proposed(5.0) && is_proposed(-5.0));
+    assert!(!is_proposed(7.0) && !is_proposed(-7.0));
 }
