@@ -15,8 +15,9 @@ use super::upright::UprightSurfaces;
 use super::wide_search::{self, WideSearchConfig};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::Beam;
+use crate::localization::particles::deviation;
 use crate::map::SensorAttitude;
-use crate::registration::{RegistrationConfig, RegistrationResult, register};
+use crate::registration::{RegistrationConfig, register};
 use crate::rendering::RenderError;
 use crate::validation::{
     InvalidValue, Validate, in_range, nested, not_negative, positive, require,
@@ -135,7 +136,8 @@ pub struct RefinedFrame {
     pub map_from_lidar: Pose3,
     /// The estimate in space.
     pub start_in_space: Pose3,
-    /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
+    /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²], without the error that the map has in all
+    /// frames.
     pub covariance: Matrix3<f64>,
     /// Attitude of the sensor above the mapped ground.
     pub attitude: SensorAttitude,
@@ -234,7 +236,7 @@ pub fn refine_frame(
     }
     if config.method != Method::None {
         frame.covariance = match finished {
-            Some(registered) => registered.planar_covariance(),
+            Some(covariance) => covariance,
             None => objective.covariance(&frame.pose, patch.as_ref(), config.scale_m)?,
         };
     }
@@ -302,25 +304,34 @@ fn pose_of(&[x, y, heading_rad]: &[f64; 3]) -> Pose2 {
     Pose2::new(nalgebra::Vector2::new(x, y), heading_rad)
 }
 
-/// Runs Gauss-Newton; `None` where it did not lower the objective.
+/// Runs Gauss-Newton, whose pose is taken where it does not raise the objective. Returns the covariance of the pose of
+/// the frame; `None` where the beams determine no pose.
+///
+/// ```text
+/// taken      Σ           that of the registration
+/// refused    Σ + δ δᵀ    δ: from the registered pose to the one that is kept, E[(x − x_true)²]
+/// ```
 fn finish(
     objective: &FrameObjective<'_>,
     frame: &mut RefinedFrame,
     config: &FrameRefinementConfig,
-) -> Result<Option<RegistrationResult>, RenderError> {
+) -> Result<Option<Matrix3<f64>>, RenderError> {
     let (renderer, beams) = (objective.renderer, objective.beams);
     let start = &frame.map_from_lidar;
     let Some(registered) = register(renderer, beams, start, &config.gauss_newton)? else {
         return Ok(None);
     };
     let cost_m = objective.costs_in_space(&[registered.map_from_lidar])?[0];
+    let covariance = registered.planar_covariance();
+    let pose = pose2_from_pose3(&registered.map_from_lidar);
     if cost_m > frame.cost_after_m {
-        return Ok(None);
+        let off = deviation(&frame.pose, &pose);
+        return Ok(Some(covariance + off * off.transpose()));
     }
     frame.map_from_lidar = registered.map_from_lidar;
-    frame.pose = pose2_from_pose3(&registered.map_from_lidar);
+    frame.pose = pose;
     frame.cost_after_m = cost_m;
-    Ok(Some(registered))
+    Ok(Some(covariance))
 }
 
 #[cfg(test)]
