@@ -126,7 +126,8 @@ impl ParticleSet {
             return;
         }
         for (particle, log) in self.particles.iter_mut().zip(log_likelihoods) {
-            particle.weight *= (log - highest).exp();
+            // Those above the highest have no weight; their exponentials must not overflow.
+            particle.weight *= (log - highest).min(0.0).exp();
         }
         let sum: f64 = self.particles.iter().map(|p| p.weight).sum();
         for particle in &mut self.particles {
@@ -287,6 +288,43 @@ mod tests {
         let resampled = set.selected(&[0, 1, 1, 2, 2, 2, 3, 3, 3, 3]);
         assert!(resampled.weights().iter().all(|&weight| weight == 0.1));
         assert_relative_eq!(resampled.mean().translation.x, mean_m, epsilon = 1e-12);
+    }
+
+    #[test]
+    fn given_weights_are_normalized_and_the_first_of_the_heaviest_is_the_best() {
+        let weights = [1.0, 3.0, 0.5, 3.0, 0.5];
+        let particles = weights.iter().enumerate().map(|(index, &weight)| Particle {
+            weight,
+            ..Particle::new(pose(index as f64, 0.0, 0.0), None)
+        });
+        let set = ParticleSet::weighted(particles.collect());
+        assert_eq!(set.weights(), weights.map(|weight| weight / 8.0));
+        assert_eq!(set.best().map_from_lidar.translation.x, 1.0);
+        assert!(set.len() == 5 && !set.is_empty());
+    }
+
+    #[test]
+    fn particles_are_moved_in_order_and_keep_the_level_where_there_is_no_ground() {
+        let mut set = ParticleSet::uniform([0.0, 1.0].map(|x| pose(x, 0.0, 0.0)));
+        set.propagate(|before| before * pose(0.0, 2.0, 0.0));
+        set.set_levels([Some(3.0), Some(4.0)]);
+        set.set_levels([None, Some(5.0)]);
+        let found: Vec<_> = (set.particles().iter())
+            .map(|it| (it.map_from_lidar, it.level_m))
+            .collect();
+        let expected = [
+            (pose(0.0, 2.0, 0.0), Some(3.0)),
+            (pose(1.0, 2.0, 0.0), Some(5.0)),
+        ];
+        assert_eq!(found, expected);
+    }
+
+    #[test]
+    fn a_likely_particle_without_weight_does_not_take_the_weight_of_the_others() {
+        let mut set = ParticleSet::uniform([0.0, 1.0].map(|x| pose(x, 0.0, 0.0)));
+        set.reweight(&[0.0, f64::NEG_INFINITY]);
+        set.reweight(&[-2000.0, 0.0]);
+        assert_eq!(set.weights(), [1.0, 0.0]);
     }
 
     #[test]

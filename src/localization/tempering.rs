@@ -83,7 +83,8 @@ fn effective(weights: &[f64], log_likelihoods: &[f64], beta: f64) -> f64 {
     let (sum, squares) = weights
         .iter()
         .zip(log_likelihoods)
-        .map(|(weight, log)| weight * (beta * (log - highest)).exp())
+        // Those above the highest have no weight; their exponentials must not overflow.
+        .map(|(weight, log)| weight * (beta * (log - highest).min(0.0)).exp())
         .fold((0.0, 0.0), |(sum, squares), w| (sum + w, squares + w * w));
     sum * sum / squares
 }
@@ -116,6 +117,12 @@ mod tests {
         let beta = exponent(&weights, &logs, 10.0, 1.0);
         let scaled_beta = exponent(&weights, &scaled, 10.0, 1.0);
         assert_relative_eq!(beta, 8.0 * scaled_beta, max_relative = 1e-3);
+    }
+
+    #[test]
+    fn a_likely_particle_without_weight_does_not_temper_the_others() {
+        let (weights, logs) = ([0.5, 0.5, 0.0], [-2000.0, -2000.0, 0.0]);
+        assert_eq!(exponent(&weights, &logs, 2.0, 1.0), 1.0);
     }
 
     #[test]
