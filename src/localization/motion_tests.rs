@@ -67,6 +67,34 @@ fn samples_have_the_configured_spread() {
 }
 
 #[test]
+fn the_covariance_of_a_motion_is_that_of_its_turns_and_ways_in_the_direction_of_the_drive() {
+    let noise = OdometryNoise::constant(0.1, 0.2, 0.3);
+    for first_turn_rad in [0.0, 0.4, -2.0] {
+        let motion = TurnDriveTurn {
+            first_turn_rad,
+            drive_m: 2.0,
+            second_turn_rad: 0.7,
+        };
+        // The first turn moves the end of the way aside.
+        let along_drive = Matrix3::new(
+            0.04,
+            0.0,
+            0.0, //
+            0.0,
+            0.09 + 0.04,
+            0.02, //
+            0.0,
+            0.02,
+            2.0 * 0.01,
+        );
+        let turn = Pose2::rotation(first_turn_rad).rotation;
+        let turn = turn.to_rotation_matrix().to_homogeneous();
+        let expected = turn * along_drive * turn.transpose();
+        assert_relative_eq!(noise.covariance(&motion), expected, epsilon = 1e-12);
+    }
+}
+
+#[test]
 fn a_velocity_command_is_an_arc_of_radius_v_over_omega() {
     let quarter = VelocityCommand {
         speed_m_per_s: 2.0,

@@ -234,7 +234,8 @@ mod tests {
             .map(|&bins| kld_sample_size(bins, &config))
             .collect();
         assert!(sizes.is_sorted(), "{sizes:?}");
-        // χ²₀.₉₉ with 99 degrees of freedom is 134.64 (Fox 2003, eq. 5).
+        // χ²₀.₉₉ with one degree of freedom is 6.63, with 99 it is 134.64 (Fox 2003, eq. 5).
+        assert_relative_eq!(sizes[0] as f64, 6.63 / 0.1, epsilon = 1.0);
         assert_relative_eq!(sizes[2] as f64, 134.64 / 0.1, epsilon = 10.0);
     }
 
@@ -256,7 +257,8 @@ mod tests {
             &mut StdRng::seed_from_u64(4),
         );
         let found = set.covariance_about(&Pose2::identity());
-        let expected = 0.2 * kernel_width(n);
+        // h = (4 / 5 n)^(1/7)
+        let expected = 0.2 * 4e-5_f64.powf(1.0 / 7.0);
         let error = 4.0 / (2.0 * n as f64).sqrt();
         assert_relative_eq!(found[(0, 0)].sqrt(), expected, epsilon = expected * error);
         assert_relative_eq!(found[(2, 2)].sqrt(), 0.05, epsilon = 0.05 * error);

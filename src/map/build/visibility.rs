@@ -417,7 +417,12 @@ mod tests {
             triangle_vote(30.0, 27.0, cosine, &config),
             Vote::Through
         ));
-        // At normal incidence it is another surface.
+        // At normal incidence it is neither on the surface nor far enough behind it.
+        assert!(matches!(
+            triangle_vote(30.0, 29.8, 1.0, &config),
+            Vote::Unknown
+        ));
+        // Farther away it is another surface.
         assert!(matches!(
             triangle_vote(30.0, 29.3, 1.0, &config),
             Vote::Through
