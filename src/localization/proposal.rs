@@ -8,13 +8,11 @@
 //! prior      N(m, P)       the predicted particles
 //! scan       N(s, S)       registration of the scan with the map, starting at m
 //! proposal   N(q, k² Q)    Q = (P⁻¹ + S⁻¹)⁻¹,   q = m + Q S⁻¹ (s − m)
-//! weight     w ∝ N(s; x, S)ᵝ N(x; m, P) / N(x; q, k² Q)        β: tempering
+//! weight     w ∝ p(scan | x, map)ᵝ N(x; m, P) / N(x; q, k² Q)        β: tempering
 //! ```
 //!
-//! The likelihood of the scan is that of its registration, whose covariance counts how far neighbouring beams are
-//! independent (Laplace's approximation: Tierney and Kadane, 1986); the likelihood along the beams takes all or none of
-//! them as independent. Only the likelihood is tempered. The ratio of the densities is the weight of importance
-//! sampling: to a power, it would leave a part of the proposal, in which the scan is already, in the distribution.
+//! Only the likelihood is tempered: the ratio of the densities is that of importance sampling, and raised to a power it
+//! would leave a part of the proposal, in which the scan is already, in the distribution.
 //!
 //! The registration also estimates height, roll and pitch, which all particles share.
 //! Grisetti, Stachniss and Burgard, *Improved Techniques for Grid Mapping with Rao-Blackwellized
@@ -48,6 +46,9 @@ pub struct ProposalConfig {
     /// Largest share of them that end on the road, which determines height, roll and pitch (unitless).
     #[default(0.4)]
     pub road_share: f64,
+    /// Number of beams that weight the particles.
+    #[default(600)]
+    pub weighed_beams: usize,
     /// Registration of the scan with the map. The last
     /// step is so small that the estimate does not depend on whether there is one more.
     #[default(RegistrationConfig { tolerance_m: 1e-4, ..RegistrationConfig::default() })]
@@ -58,6 +59,7 @@ impl Validate for ProposalConfig {
     fn validate(&self) -> Result<(), InvalidValue> {
         in_range("beams", self.beams, 1..=1_000_000)?;
         fraction("road_share", self.road_share)?;
+        in_range("weighed_beams", self.weighed_beams, 1..=1_000_000)?;
         nested("registration", &self.registration)
     }
 }

@@ -7,7 +7,7 @@ use super::reweight::Update;
 use super::state::ParticleFilter;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
-use crate::localization::observation::{choose_beams, costs};
+use crate::localization::observation::choose_beams;
 use crate::localization::odometry::Odometry;
 use crate::localization::particles::{Particle, ParticleSet};
 use crate::localization::proposal::{Gaussian, regular};
@@ -24,13 +24,11 @@ const MAX_SIGMAS: f64 = 6.0;
 /// Proposal distribution of a frame, with what is needed to weight its samples.
 pub(super) struct Proposal {
     prior: Gaussian,
-    /// Registration of the scan.
-    measured: Gaussian,
     /// Already widened.
     proposal: Gaussian,
     beams: Vec<Beam>,
-    /// Mean cost of the beams at the registered pose [m].
-    cost_m: Option<f64>,
+    /// Beams that weight the samples. Not every n-th of `beams`: one more or less there would change them all.
+    weighed_beams: Vec<Beam>,
     /// Height of the ground [m].
     level_m: f64,
     attitude: SensorAttitude,
@@ -75,7 +73,8 @@ impl ParticleFilter {
         let Some(patch) = self.patch_at(&mean)?.or(self.patch) else {
             return Ok(None);
         };
-        let beams = choose_beams(scan, config.beams, config.road_share, attitude, rng);
+        let mut choose = |count| choose_beams(scan, count, config.road_share, attitude, rng);
+        let (beams, weighed_beams) = (choose(config.beams), choose(config.weighed_beams));
         let start = patch.lift(&mean, attitude);
         let Some(found) = register(&*self.map.renderer, &beams, &start, &config.registration)?
         else {
@@ -90,32 +89,32 @@ impl ParticleFilter {
         if prior.squared_distance(&measured.mean) > MAX_SIGMAS.powi(2) {
             return Ok(None);
         }
-        let difference = self.config.observation.difference();
-        let poses = [Some(found.map_from_lidar)];
-        let cost_m = costs(&*self.map.renderer, &poses, &beams, &difference)?[0];
         let fused = prior.fused(&measured);
         Ok(fused
             .and_then(|fused| fused.widened(WIDENING))
             .map(|proposal| Proposal {
                 prior,
-                measured,
                 proposal,
                 beams,
-                cost_m,
+                weighed_beams,
                 level_m: patch.height_m,
                 attitude: patch.attitude_of(&found.map_from_lidar),
             }))
     }
 
     /// Samples the particles from a proposal and weights them by importance, the ratio of prediction to proposal, and
-    /// by the likelihood L of the scan. Only the likelihood is tempered: the samples represent `prior · Lᵝ`.
-    pub(super) fn sample_and_weight(&mut self, proposal: Proposal, rng: &mut impl Rng) -> Update {
+    /// by the likelihood of the scan. Only the likelihood is tempered: the samples represent `prior · Lᵝ`.
+    pub(super) fn sample_and_weight(
+        &mut self,
+        proposal: Proposal,
+        scan: &RangeImage,
+        rng: &mut impl Rng,
+    ) -> Result<Update, RenderError> {
         let Proposal {
             prior,
-            measured,
             proposal,
             beams,
-            cost_m,
+            weighed_beams,
             level_m,
             attitude,
         } = proposal;
@@ -125,98 +124,112 @@ impl ParticleFilter {
         let particle = |pose| Particle::new(pose, Some(level_m));
         self.particles = ParticleSet::uniform(poses.into_iter().map(particle));
         self.particles.reweight(&ratios);
-        let likelihood = |pose: &Pose2| measured.log_density(pose);
-        let logs: Vec<f64> = self.particles.poses().map(likelihood).collect();
+        let (logs, costs_m) = self.log_likelihoods((scan, &weighed_beams), &attitude)?;
         self.reweight(&logs, 1.0);
-        Update {
-            costs_m: vec![cost_m; self.particles.len()],
+        Ok(Update {
+            costs_m,
             beams,
             attitude,
             place: None,
-        }
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use approx::assert_relative_eq;
-    use nalgebra::{Matrix3, Vector2, Vector3};
+    use nalgebra::{Matrix3, Vector3};
     use rand::{SeedableRng as _, rngs::StdRng};
 
     use super::*;
     use crate::localization::LocalizerConfig;
     use crate::localization::particles::deviation;
+    use crate::map::gaussian_for_tests::GaussianWorld;
     use crate::map::world_for_tests::TestWorld;
 
     fn gaussian(mean: [f64; 3], deviations: [f64; 3], correlation: f64) -> Gaussian {
         let scale = Matrix3::from_diagonal(&Vector3::from(deviations));
         let mut shape = Matrix3::identity();
         (shape[(0, 1)], shape[(1, 0)]) = (correlation, correlation);
-        let mean = Pose2::new(Vector2::new(mean[0], mean[1]), mean[2]);
+        let mean = Pose2::new(nalgebra::Vector2::new(mean[0], mean[1]), mean[2]);
         Gaussian::new(mean, scale * shape * scale).unwrap()
     }
+
+    /// Likelihoods of a scan, from one that is used unchanged to one that is 100 times as peaked as the prior.
+    const PEAKED: [f64; 4] = [1.0, 4.0, 10.0, 100.0];
 
     #[test]
     fn samples_represent_the_prior_times_the_tempered_likelihood() {
         const COUNT: usize = 20_000;
-        let prior = gaussian([5.0, 0.3, 0.1], [0.04, 0.03, 0.004], 0.5);
-        let scan = gaussian([5.03, 0.28, 0.104], [0.02, 0.015, 0.002], -0.3);
-        let mut powers = Vec::new();
-        // The proposal leaves 57 % of the particles effective: less than the last two ask for.
-        for (seed, min_effective_fraction) in [0.0, 0.2, 0.7, 0.9].into_iter().enumerate() {
-            let mut config = LocalizerConfig {
+        let street = TestWorld::street();
+        for (seed, peaked) in PEAKED.into_iter().enumerate() {
+            let prior = gaussian([5.0, 0.3, 0.1], [0.04, 0.03, 0.004], 0.5);
+            let variance = 0.05_f64.powi(2) / peaked;
+            let deviations = [1.0, 0.6, 0.08].map(|ratio| ratio * variance.sqrt());
+            let likelihood = gaussian([5.03, 0.28, 0.104], deviations, -0.3);
+            // The proposal knows the likelihood of the scan approximately, as a registration does.
+            let registration = gaussian([5.025, 0.285, 0.103], [0.04, 0.03, 0.003], 0.0);
+            let proposal = prior.fused(&registration).unwrap();
+            let config = LocalizerConfig {
                 num_reduced: COUNT,
                 ..LocalizerConfig::default()
             };
-            config.tempering.min_effective_fraction = min_effective_fraction;
+            let mut map = street.map();
+            map.renderer = Arc::new(GaussianWorld {
+                mean: likelihood.mean,
+                information: likelihood.covariance.try_inverse().unwrap(),
+                scale_m: config.observation.scale_m,
+            });
             let start = ParticleSet::uniform([prior.mean]);
-            let map = TestWorld::street().map();
             let mut filter = ParticleFilter::new(config, map, None, start).unwrap();
-            let proposal = prior.fused(&scan).unwrap().widened(WIDENING).unwrap();
             let proposed = Proposal {
                 prior: prior.clone(),
-                measured: scan.clone(),
-                proposal: proposal.clone(),
+                proposal: proposal.widened(WIDENING).unwrap(),
                 beams: Vec::new(),
-                cost_m: None,
+                weighed_beams: Vec::new(),
                 level_m: -1.73,
                 attitude: SensorAttitude::default(),
             };
-            filter.sample_and_weight(proposed, &mut StdRng::seed_from_u64(seed as u64));
+            let density = proposed.proposal.clone();
+            let scan = street.scan(&prior.mean);
+            let mut rng = StdRng::seed_from_u64(seed as u64);
+            let importance = |pose: &Pose2| prior.log_density(pose) - density.log_density(pose);
+            filter.sample_and_weight(proposed, &scan, &mut rng).unwrap();
 
-            // The power of the likelihood, from the weights of the particles at which it is highest and lowest.
+            // The power of the likelihood, from the weights of the two most different particles.
             let particles = filter.particles.particles();
-            let log = |it: &Particle| scan.log_density(&it.map_from_lidar);
-            let tempered = |it: &Particle| {
-                let pose = &it.map_from_lidar;
-                it.weight.ln() - prior.log_density(pose) + proposal.log_density(pose)
-            };
+            let tempered = |it: &Particle| it.weight.ln() - importance(&it.map_from_lidar);
+            let log = |it: &Particle| likelihood.log_density(&it.map_from_lidar);
             let by_log = |a: &&Particle, b: &&Particle| log(a).total_cmp(&log(b));
             let highest = particles.iter().max_by(by_log).unwrap();
-            let lowest = particles.iter().min_by(by_log).unwrap();
+            let near = |it: &&Particle| it.weight > 1e-3 / COUNT as f64;
+            let lowest = particles.iter().filter(near).min_by(by_log).unwrap();
             let power = (tempered(highest) - tempered(lowest)) / (log(highest) - log(lowest));
-            powers.push(power);
+            assert_eq!(peaked > 5.0, power < 0.99, "{peaked}: {power}");
 
-            let powered = Gaussian::new(scan.mean, scan.covariance / power).unwrap();
+            let powered = Gaussian::new(likelihood.mean, likelihood.covariance / power).unwrap();
             let exact = prior.fused(&powered).unwrap();
             // Five standard errors of a mean and of a variance from so many effective particles.
-            let error = 5.0 / filter.particles.effective_sample_size().sqrt();
-            let mean = filter.particles.mean();
-            let covariance = filter.particles.covariance_about(&mean);
-            let off = deviation(&mean, &exact.mean);
-            let sigmas = exact.covariance.diagonal().map(f64::sqrt);
-            for row in 0..3 {
-                assert_relative_eq!(off[row] / sigmas[row], 0.0, epsilon = error);
-                for column in 0..3 {
-                    let scale = sigmas[row] * sigmas[column];
-                    let (found, exact) =
-                        (covariance[(row, column)], exact.covariance[(row, column)]);
-                    let error = 2.0_f64.sqrt() * error;
-                    assert_relative_eq!(found / scale, exact / scale, epsilon = error);
-                }
+            let effective = filter.particles.effective_sample_size();
+            let error = 5.0 / effective.sqrt();
+            let found = Gaussian::new(
+                filter.particles.mean(),
+                filter.particles.covariance_about(&filter.particles.mean()),
+            )
+            .unwrap();
+            let off = deviation(&found.mean, &exact.mean);
+            for axis in 0..3 {
+                let sigma = exact.covariance[(axis, axis)].sqrt();
+                assert_relative_eq!(off[axis] / sigma, 0.0, epsilon = error);
+                let ratio = found.covariance[(axis, axis)] / sigma.powi(2);
+                assert_relative_eq!(ratio, 1.0, epsilon = error * 2.0_f64.sqrt());
             }
+            let shape = |it: &Gaussian| {
+                it.covariance[(0, 1)] / (it.covariance[(0, 0)] * it.covariance[(1, 1)]).sqrt()
+            };
+            assert_relative_eq!(shape(&found), shape(&exact), epsilon = error);
         }
-        let is_tempered: Vec<bool> = powers.iter().map(|&power| power < 0.99).collect();
-        assert_eq!(is_tempered, [false, false, true, true], "{powers:?}");
     }
 }

@@ -32,7 +32,7 @@ impl ParticleFilter {
         }
         self.propagate(odometry, rng);
         let update = match self.propose(scan, attitude, rng)? {
-            Some(proposal) => self.sample_and_weight(proposal, rng),
+            Some(proposal) => self.sample_and_weight(proposal, scan, rng)?,
             None => self.reweight_widely(scan, attitude, rng)?,
         };
         let mut estimate = self.updated_estimate(&update)?;
