@@ -3,7 +3,7 @@
     cargo build --release
     python benches/measure.py [SUBJECT ...] [--seeds 1,2,3,4,5] [--work results/measure]
 
-Subjects: drive_0005, kitti_07, odometry, ground, demo, consistency, poisson, rays, basin, starts; all by default. A subject whose
+Subjects: drive_0005, kitti_07, odometry, ground, demo, poisson, rays, basin, starts; all by default. A subject whose
 recording, package or program is absent is skipped with a line that names it. Recordings are below the folder in
 `FPMCL_DATA`, by default `../shared/data`; the simulated drives are made in the folder of the work, where finished
 maps are kept for the next call. The numbers of one call belong to one commit and one machine, which head the output.
@@ -200,47 +200,6 @@ def demo(work, _seeds):
     block(fpmcl("demo", "--output", work / "demo"))
 
 
-def consistency(work, seeds):
-    work = work / "consistency"
-    table("recording", "stage", "frames", "squared error", "inside 95 %", "position RMSE")
-
-    def rows(name, arguments, refinement):
-        files = []
-        for seed in seeds:
-            file = work / f"{name}_{seed}/localization.npz"
-            options = ["--seed", seed, "--force", "--set", "plots=False"]
-            fpmcl("localize", *arguments, *options, "--output", file)
-            fpmcl("refine", file, *refinement, *options)
-            files.append(file)
-        for line in run(sys.executable, "benches/consistency.py", *files).splitlines():
-            stage, numbers = line.split(": ")
-            row(name, f"`{stage}`", *numbers.split(", "))
-
-    odd = ["--set", "start_idx=1", "--set", "frame_step=2"]
-    rows("drive 0005", [DRIVE_0005, "--map", map_0005(work), *odd, *TRUTH_0005], [])
-    nuscenes = require(DATA / "nuscenes-hdl32")
-    poses = nuscenes / "poses_tum.txt"
-    even = ["--poses", poses, "--set", "frame_step=2"]
-    file = map_of(nuscenes, work / "nuscenes/map.ply", *even)
-    rows("nuScenes", [nuscenes, "--map", file, *odd, "--truth", poses], [])
-    # The town of config/hard_cases.yml; the second time the car moves during a revolution, which nothing compensates.
-    for name, moves in (("town", "false"), ("town, uncompensated", "true")):
-        parent = work / name.replace(", ", "_")
-        keys = ["n_scans=150", "motion.speed_m_s=10", "scanner.azimuth_steps=600", f"scanner.rolling_shutter={moves}"]
-        chosen = [word for key in [*keys, f"output_folder={parent}"] for word in ("--set", key)]
-        first, second = parent / "drive_1", parent / "drive_2"
-        for drive in (first, second):
-            if not drive.exists():
-                fpmcl("simulate", *chosen, "--set", f"drive={drive.name[-1]}")
-        raw = moves == "true"
-        build = ["--set", "depth=8"] + ["--set", "motion_compensation=null"] * raw
-        file = map_of(first, parent / "map.ply", *given(first), *build)
-        truth = ["--truth", second / "poses.txt", "--calib", second / "calib.txt", "--odometry", second / "odometry.txt"]
-        localize = ["--set", "tracker.sensor.motion_compensation=null"] * raw
-        refine = ["--set", "sensor.motion_compensation=null"] * raw
-        rows(name, [second, "--map", file, *truth, *localize], refine)
-
-
 def poisson(_work, _seeds):
     for size in ("1000000,9", "1000000,8"):
         block(bench("poisson", FPMCL_POISSON=size, RAYON_NUM_THREADS="2"))
@@ -264,7 +223,7 @@ def starts(work, _seeds):
     block(bench("starts", file, second, FPMCL_STARTS="40"))
 
 
-SUBJECTS = [drive_0005, kitti_07, odometry, ground, demo, consistency, poisson, rays, basin, starts]
+SUBJECTS = [drive_0005, kitti_07, odometry, ground, demo, poisson, rays, basin, starts]
 
 
 def processor():

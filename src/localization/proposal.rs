@@ -8,11 +8,8 @@
 //! prior      N(m, P)       the predicted particles
 //! scan       N(s, S)       registration of the scan with the map, starting at m
 //! proposal   N(q, k² Q)    Q = (P⁻¹ + S⁻¹)⁻¹,   q = m + Q S⁻¹ (s − m)
-//! weight     w ∝ p(scan | x, map)ᵝ N(x; m, P) / N(x; q, k² Q)        β: tempering
+//! weight     w ∝ (p(scan | x, map) N(x; m, P) / N(x; q, k² Q))ᵝ        β: tempering
 //! ```
-//!
-//! Only the likelihood is tempered: the ratio of the densities is that of importance sampling, and raised to a power it
-//! would leave a part of the proposal, in which the scan is already, in the distribution.
 //!
 //! The registration also estimates height, roll and pitch, which all particles share.
 //! Grisetti, Stachniss and Burgard, *Improved Techniques for Grid Mapping with Rao-Blackwellized
@@ -49,9 +46,10 @@ pub struct ProposalConfig {
     /// Number of beams that weight the particles.
     #[default(600)]
     pub weighed_beams: usize,
-    /// Registration of the scan with the map. The last
+    /// Registration of the scan with the map. Sampling and weighting add variance, which covers the
+    /// rest of the map error: with a larger `map_error_m` the covariances of simulated drives are too large. The last
     /// step is so small that the estimate does not depend on whether there is one more.
-    #[default(RegistrationConfig { tolerance_m: 1e-4, ..RegistrationConfig::default() })]
+    #[default(RegistrationConfig { map_error_m: 0.001, tolerance_m: 1e-4, ..RegistrationConfig::default() })]
     pub registration: RegistrationConfig,
 }
 

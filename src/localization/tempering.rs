@@ -41,25 +41,20 @@ impl Validate for TemperingConfig {
 }
 
 /// Largest exponent β up to `largest` that leaves an effective sample size of `min_effective`, to 1e-4
-/// relative; where none does, the one that leaves most, which is 0 for equal weights.
-///
-/// Weights that are not equal, as those of importance, may be made more equal by the likelihood: the effective sample
-/// size need not fall with β.
+/// relative; 0 where the weights alone leave fewer.
 pub fn exponent(weights: &[f64], log_likelihoods: &[f64], min_effective: f64, largest: f64) -> f64 {
-    /// Halvings of β, whose scale is unknown.
-    const HALVINGS: i32 = 40;
-    let effective = |beta: f64| effective(weights, log_likelihoods, beta);
-    let is_enough = |beta: f64| effective(beta) >= min_effective;
+    let is_enough = |beta: f64| effective(weights, log_likelihoods, beta) >= min_effective;
     if is_enough(largest) {
         return largest;
     }
-    let halved = (1..=HALVINGS).map(|times| largest * 0.5_f64.powi(times));
-    let Some(mut low) = halved.clone().find(|&beta| is_enough(beta)) else {
-        let all = halved.chain([0.0]);
-        return all
-            .max_by(|&a, &b| effective(a).total_cmp(&effective(b)))
-            .unwrap_or(0.0);
-    };
+    if !is_enough(0.0) {
+        return 0.0;
+    }
+    // The scale of β is unknown: halve it until it leaves enough, then bisect above that.
+    let mut low = 0.5 * largest;
+    while !is_enough(low) && low > largest * 1e-12 {
+        low *= 0.5;
+    }
     let mut high = 2.0 * low;
     while high - low > 1e-4 * high {
         let middle = 0.5 * (low + high);

@@ -15,9 +15,8 @@ use super::upright::UprightSurfaces;
 use super::wide_search::{self, WideSearchConfig};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::Beam;
-use crate::localization::particles::deviation;
 use crate::map::SensorAttitude;
-use crate::registration::{RegistrationConfig, register};
+use crate::registration::{RegistrationConfig, RegistrationResult, register};
 use crate::rendering::RenderError;
 use crate::validation::{
     InvalidValue, Validate, in_range, nested, not_negative, positive, require,
@@ -136,8 +135,7 @@ pub struct RefinedFrame {
     pub map_from_lidar: Pose3,
     /// The estimate in space.
     pub start_in_space: Pose3,
-    /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²], without the error that the map has in all
-    /// frames.
+    /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
     /// Attitude of the sensor above the mapped ground.
     pub attitude: SensorAttitude,
@@ -236,7 +234,7 @@ pub fn refine_frame(
     }
     if config.method != Method::None {
         frame.covariance = match finished {
-            Some(covariance) => covariance,
+            Some(registered) => registered.planar_covariance(),
             None => objective.covariance(&frame.pose, patch.as_ref(), config.scale_m)?,
         };
     }
@@ -304,34 +302,25 @@ fn pose_of(&[x, y, heading_rad]: &[f64; 3]) -> Pose2 {
     Pose2::new(nalgebra::Vector2::new(x, y), heading_rad)
 }
 
-/// Runs Gauss-Newton, whose pose is taken where it does not raise the objective. Returns the covariance of the pose of
-/// the frame; `None` where the beams determine no pose.
-///
-/// ```text
-/// taken      Σ           that of the registration
-/// refused    Σ + δ δᵀ    δ: from the registered pose to the one that is kept, E[(x − x_true)²]
-/// ```
+/// Runs Gauss-Newton; `None` where it did not lower the objective.
 fn finish(
     objective: &FrameObjective<'_>,
     frame: &mut RefinedFrame,
     config: &FrameRefinementConfig,
-) -> Result<Option<Matrix3<f64>>, RenderError> {
+) -> Result<Option<RegistrationResult>, RenderError> {
     let (renderer, beams) = (objective.renderer, objective.beams);
     let start = &frame.map_from_lidar;
     let Some(registered) = register(renderer, beams, start, &config.gauss_newton)? else {
         return Ok(None);
     };
     let cost_m = objective.costs_in_space(&[registered.map_from_lidar])?[0];
-    let covariance = registered.planar_covariance();
-    let pose = pose2_from_pose3(&registered.map_from_lidar);
     if cost_m > frame.cost_after_m {
-        let off = deviation(&frame.pose, &pose);
-        return Ok(Some(covariance + off * off.transpose()));
+        return Ok(None);
     }
     frame.map_from_lidar = registered.map_from_lidar;
-    frame.pose = pose;
+    frame.pose = pose2_from_pose3(&registered.map_from_lidar);
     frame.cost_after_m = cost_m;
-    Ok(Some(covariance))
+    Ok(Some(registered))
 }
 
 #[cfg(test)]

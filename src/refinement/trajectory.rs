@@ -178,8 +178,7 @@ pub struct FrameResult {
     pub pose: Pose2,
     /// `map_from_lidar` in space; `None` where the frame was not refined.
     pub map_from_lidar: Option<Pose3>,
-    /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²], without the error that the map has in all
-    /// frames.
+    /// Covariance of (x, y, heading) in the axes of the map [m², m·rad, rad²].
     pub covariance: Matrix3<f64>,
     /// State of the filter; `Tracking` where a frame was placed from its neighbours, and `Searching` where a tracked one was
     /// refused.
@@ -570,13 +569,6 @@ impl TrajectoryRefiner {
                 self.smooth_stretch(rows, increments, &mut poses, &mut covariances);
             }
         }
-        // Smoothing cannot reduce the error that the map has in all frames.
-        let common = self.config.refinement.gauss_newton.common_covariance();
-        for (covariance, _) in
-            (covariances.iter_mut().zip(frames)).filter(|(_, it)| it.is_refined())
-        {
-            *covariance += common;
-        }
         let untracked = frames.iter().filter(|frame| !frame.is_tracked()).count();
         let refined = frames.iter().filter(|frame| frame.is_refined()).count();
         Ok(RefinedTrajectory {
@@ -631,7 +623,13 @@ impl TrajectoryRefiner {
         let increments = &increments[rows.clone()];
         let smoothed = smooth(&poses[rows.clone()], &priors, increments, &config.smoothing);
         let marginals = smoothing::covariances(&smoothed, &priors, increments, &config.smoothing);
-        if let Some(marginals) = marginals {
+        if let Some(mut marginals) = marginals {
+            // Smoothing cannot reduce the error that the map has in all frames.
+            let variance = config.gauss_newton.map_error_m.powi(2);
+            let of_map = Matrix3::from_diagonal(&Vector3::new(variance, variance, 0.0));
+            marginals
+                .iter_mut()
+                .for_each(|covariance| *covariance += of_map);
             covariances[rows.clone()].copy_from_slice(&marginals);
         }
         poses[rows].copy_from_slice(&smoothed);

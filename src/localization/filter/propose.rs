@@ -1,11 +1,11 @@
 //! Particles of a narrow distribution: sampled where odometry and scan agree
-//! ([`proposal`](crate::localization::proposal)), weighted by importance and by the tempered likelihood of the scan.
+//! ([`proposal`](crate::localization::proposal)) and weighted by importance.
 
 use rand::Rng;
 
 use super::reweight::Update;
 use super::state::ParticleFilter;
-use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
+use crate::geometry::{Pose3, pose2_from_pose3};
 use crate::lidar::{Beam, RangeImage};
 use crate::localization::observation::choose_beams;
 use crate::localization::odometry::Odometry;
@@ -102,8 +102,8 @@ impl ParticleFilter {
             }))
     }
 
-    /// Samples the particles from a proposal and weights them by importance, the ratio of prediction to proposal, and
-    /// by the likelihood of the scan. Only the likelihood is tempered: the samples represent `prior · Lᵝ`.
+    /// Samples the particles from a proposal and weights them by the likelihood of the scan and by the
+    /// ratio of prediction to proposal (importance sampling).
     pub(super) fn sample_and_weight(
         &mut self,
         proposal: Proposal,
@@ -119,12 +119,12 @@ impl ParticleFilter {
             attitude,
         } = proposal;
         let poses = proposal.sample(self.config.num_reduced, rng);
-        let importance = |pose: &Pose2| prior.log_density(pose) - proposal.log_density(pose);
-        let ratios: Vec<f64> = poses.iter().map(importance).collect();
         let particle = |pose| Particle::new(pose, Some(level_m));
         self.particles = ParticleSet::uniform(poses.into_iter().map(particle));
-        self.particles.reweight(&ratios);
-        let (logs, costs_m) = self.log_likelihoods((scan, &weighed_beams), &attitude)?;
+        let (mut logs, costs_m) = self.log_likelihoods((scan, &weighed_beams), &attitude)?;
+        for (log, pose) in logs.iter_mut().zip(self.particles.poses()) {
+            *log += prior.log_density(pose) - proposal.log_density(pose);
+        }
         self.reweight(&logs, 1.0);
         Ok(Update {
             costs_m,
@@ -132,104 +132,5 @@ impl ParticleFilter {
             attitude,
             place: None,
         })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::sync::Arc;
-
-    use approx::assert_relative_eq;
-    use nalgebra::{Matrix3, Vector3};
-    use rand::{SeedableRng as _, rngs::StdRng};
-
-    use super::*;
-    use crate::localization::LocalizerConfig;
-    use crate::localization::particles::deviation;
-    use crate::map::gaussian_for_tests::GaussianWorld;
-    use crate::map::world_for_tests::TestWorld;
-
-    fn gaussian(mean: [f64; 3], deviations: [f64; 3], correlation: f64) -> Gaussian {
-        let scale = Matrix3::from_diagonal(&Vector3::from(deviations));
-        let mut shape = Matrix3::identity();
-        (shape[(0, 1)], shape[(1, 0)]) = (correlation, correlation);
-        let mean = Pose2::new(nalgebra::Vector2::new(mean[0], mean[1]), mean[2]);
-        Gaussian::new(mean, scale * shape * scale).unwrap()
-    }
-
-    /// Likelihoods of a scan, from one that is used unchanged to one that is 100 times as peaked as the prior.
-    const PEAKED: [f64; 4] = [1.0, 4.0, 10.0, 100.0];
-
-    #[test]
-    fn samples_represent_the_prior_times_the_tempered_likelihood() {
-        const COUNT: usize = 20_000;
-        let street = TestWorld::street();
-        for (seed, peaked) in PEAKED.into_iter().enumerate() {
-            let prior = gaussian([5.0, 0.3, 0.1], [0.04, 0.03, 0.004], 0.5);
-            let variance = 0.05_f64.powi(2) / peaked;
-            let deviations = [1.0, 0.6, 0.08].map(|ratio| ratio * variance.sqrt());
-            let likelihood = gaussian([5.03, 0.28, 0.104], deviations, -0.3);
-            // The proposal knows the likelihood of the scan approximately, as a registration does.
-            let registration = gaussian([5.025, 0.285, 0.103], [0.04, 0.03, 0.003], 0.0);
-            let proposal = prior.fused(&registration).unwrap();
-            let config = LocalizerConfig {
-                num_reduced: COUNT,
-                ..LocalizerConfig::default()
-            };
-            let mut map = street.map();
-            map.renderer = Arc::new(GaussianWorld {
-                mean: likelihood.mean,
-                information: likelihood.covariance.try_inverse().unwrap(),
-                scale_m: config.observation.scale_m,
-            });
-            let start = ParticleSet::uniform([prior.mean]);
-            let mut filter = ParticleFilter::new(config, map, None, start).unwrap();
-            let proposed = Proposal {
-                prior: prior.clone(),
-                proposal: proposal.widened(WIDENING).unwrap(),
-                beams: Vec::new(),
-                weighed_beams: Vec::new(),
-                level_m: -1.73,
-                attitude: SensorAttitude::default(),
-            };
-            let density = proposed.proposal.clone();
-            let scan = street.scan(&prior.mean);
-            let mut rng = StdRng::seed_from_u64(seed as u64);
-            let importance = |pose: &Pose2| prior.log_density(pose) - density.log_density(pose);
-            filter.sample_and_weight(proposed, &scan, &mut rng).unwrap();
-
-            // The power of the likelihood, from the weights of the two most different particles.
-            let particles = filter.particles.particles();
-            let tempered = |it: &Particle| it.weight.ln() - importance(&it.map_from_lidar);
-            let log = |it: &Particle| likelihood.log_density(&it.map_from_lidar);
-            let by_log = |a: &&Particle, b: &&Particle| log(a).total_cmp(&log(b));
-            let highest = particles.iter().max_by(by_log).unwrap();
-            let near = |it: &&Particle| it.weight > 1e-3 / COUNT as f64;
-            let lowest = particles.iter().filter(near).min_by(by_log).unwrap();
-            let power = (tempered(highest) - tempered(lowest)) / (log(highest) - log(lowest));
-            assert_eq!(peaked > 5.0, power < 0.99, "{peaked}: {power}");
-
-            let powered = Gaussian::new(likelihood.mean, likelihood.covariance / power).unwrap();
-            let exact = prior.fused(&powered).unwrap();
-            // Five standard errors of a mean and of a variance from so many effective particles.
-            let effective = filter.particles.effective_sample_size();
-            let error = 5.0 / effective.sqrt();
-            let found = Gaussian::new(
-                filter.particles.mean(),
-                filter.particles.covariance_about(&filter.particles.mean()),
-            )
-            .unwrap();
-            let off = deviation(&found.mean, &exact.mean);
-            for axis in 0..3 {
-                let sigma = exact.covariance[(axis, axis)].sqrt();
-                assert_relative_eq!(off[axis] / sigma, 0.0, epsilon = error);
-                let ratio = found.covariance[(axis, axis)] / sigma.powi(2);
-                assert_relative_eq!(ratio, 1.0, epsilon = error * 2.0_f64.sqrt());
-            }
-            let shape = |it: &Gaussian| {
-                it.covariance[(0, 1)] / (it.covariance[(0, 0)] * it.covariance[(1, 1)]).sqrt()
-            };
-            assert_relative_eq!(shape(&found), shape(&exact), epsilon = error);
-        }
     }
 }

@@ -109,7 +109,7 @@ impl ParticleFilter {
         let covariance = match update.place {
             Some(_) => self.particles.covariance_about(&pose),
             None => self.particles.covariance_of_estimate(),
-        } + self.config.proposal.registration.common_covariance();
+        };
         let particles = self.particles.clone();
         let mut estimate = self.estimate_of(pose, particles, covariance, &update.attitude)?;
         estimate.updated = true;
