@@ -134,3 +134,82 @@ impl ParticleFilter {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use approx::assert_relative_eq;
+    use nalgebra::{Matrix3, Vector3};
+    use rand::{SeedableRng as _, rngs::StdRng};
+
+    use super::*;
+    use crate::geometry::Pose2;
+    use crate::localization::LocalizerConfig;
+    use crate::localization::particles::deviation;
+    use crate::map::gaussian_for_tests::GaussianWorld;
+    use crate::map::world_for_tests::TestWorld;
+
+    fn gaussian(mean: [f64; 3], deviations: [f64; 3], correlation: f64) -> Gaussian {
+        let scale = Matrix3::from_diagonal(&Vector3::from(deviations));
+        let mut shape = Matrix3::identity();
+        (shape[(0, 1)], shape[(1, 0)]) = (correlation, correlation);
+        let mean = Pose2::new(nalgebra::Vector2::new(mean[0], mean[1]), mean[2]);
+        Gaussian::new(mean, scale * shape * scale).unwrap()
+    }
+
+    #[test]
+    fn samples_represent_the_prior_times_the_likelihood() {
+        const COUNT: usize = 20_000;
+        let street = TestWorld::street();
+        let prior = gaussian([5.0, 0.3, 0.1], [0.04, 0.03, 0.004], 0.5);
+        let likelihood = gaussian([5.03, 0.28, 0.104], [0.05, 0.03, 0.004], -0.3);
+        // The proposal knows the likelihood of the scan approximately, as a registration does.
+        let registration = gaussian([5.025, 0.285, 0.103], [0.04, 0.03, 0.003], 0.0);
+        let proposal = prior.fused(&registration).unwrap();
+        let config = LocalizerConfig {
+            num_reduced: COUNT,
+            ..LocalizerConfig::default()
+        };
+        let mut map = street.map();
+        map.renderer = Arc::new(GaussianWorld {
+            mean: likelihood.mean,
+            information: likelihood.covariance.try_inverse().unwrap(),
+            scale_m: config.observation.scale_m,
+        });
+        let start = ParticleSet::uniform([prior.mean]);
+        let mut filter = ParticleFilter::new(config, map, None, start).unwrap();
+        let proposed = Proposal {
+            prior: prior.clone(),
+            proposal: proposal.widened(WIDENING).unwrap(),
+            beams: Vec::new(),
+            weighed_beams: Vec::new(),
+            level_m: -1.73,
+            attitude: SensorAttitude::default(),
+        };
+        let scan = street.scan(&prior.mean);
+        let mut rng = StdRng::seed_from_u64(1);
+        filter.sample_and_weight(proposed, &scan, &mut rng).unwrap();
+
+        let exact = prior.fused(&likelihood).unwrap();
+        // Five standard errors of a mean and of a variance from so many effective particles.
+        let effective = filter.particles.effective_sample_size();
+        let error = 5.0 / effective.sqrt();
+        let found = Gaussian::new(
+            filter.particles.mean(),
+            filter.particles.covariance_about(&filter.particles.mean()),
+        )
+        .unwrap();
+        let off = deviation(&found.mean, &exact.mean);
+        for axis in 0..3 {
+            let sigma = exact.covariance[(axis, axis)].sqrt();
+            assert_relative_eq!(off[axis] / sigma, 0.0, epsilon = error);
+            let ratio = found.covariance[(axis, axis)] / sigma.powi(2);
+            assert_relative_eq!(ratio, 1.0, epsilon = error * 2.0_f64.sqrt());
+        }
+        let shape = |it: &Gaussian| {
+            it.covariance[(0, 1)] / (it.covariance[(0, 0)] * it.covariance[(1, 1)]).sqrt()
+        };
+        assert_relative_eq!(shape(&found), shape(&exact), epsilon = error);
+    }
+}
