@@ -51,6 +51,9 @@ const REMOVED: [&str; 10] = [
     "widening",
 ];
 
+/// Longer names stand for nothing, also of what a user names within a block [bytes].
+const LONGEST_NAME: usize = 1000;
+
 /// What a name stands for.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Meaning {
@@ -74,6 +77,10 @@ impl Names {
     pub(super) fn meaning(&self, name: &str) -> Meaning {
         if WITHOUT_EFFECT.contains(&name) {
             return Meaning::Nothing;
+        }
+        // The time grows with the square of the length.
+        if name.len() > LONGEST_NAME {
+            return Meaning::Unknown;
         }
         let last = name.rsplit('.').next().unwrap_or(name);
         let dots = name.rmatch_indices('.').map(|(dot, _)| dot);
@@ -246,6 +253,14 @@ mod tests {
         assert_eq!(meaning("minima"), Meaning::Removed);
         assert_eq!(meaning("refinement.minima"), Meaning::Removed);
         assert_eq!(meaning("minimum"), Meaning::Unknown);
+    }
+
+    #[test]
+    fn a_name_of_a_thousand_characters_has_a_meaning_and_a_longer_one_none() {
+        let inner = |length: usize| format!("range_image.{}", "x".repeat(length - 12));
+        let full = format!("tracker.sensor.{}", inner(1000));
+        assert_eq!(meaning(&inner(1000)), key(&full));
+        assert_eq!(meaning(&inner(1001)), Meaning::Unknown);
     }
 
     #[test]
