@@ -71,13 +71,44 @@ impl PipedScan {
 }
 
 fn start(recording: &Recording, arguments: &[&str]) -> Child {
-    Command::new(assert_cmd::cargo::cargo_bin!("fpmcl"))
+    let program = assert_cmd::cargo::cargo_bin!("fpmcl");
+    start_by(Command::new(program), recording, arguments)
+}
+
+/// Starts the program by a command that takes its arguments.
+fn start_by(mut command: Command, recording: &Recording, arguments: &[&str]) -> Child {
+    command
         .args(arguments)
         .current_dir(recording.folder())
         .stdout(Stdio::null())
         .stderr(Stdio::piped())
         .spawn()
         .unwrap()
+}
+
+#[track_caller]
+fn send(signal: &str, child: &Child) {
+    let id = child.id().to_string();
+    let sent = Command::new("kill").args([signal, &id]).status().unwrap();
+    assert!(sent.success());
+}
+
+/// Gives the program the scan for which it waits; returns the exit code and the rest of standard error.
+fn resume(
+    mut child: Child,
+    mut pipe: File,
+    scan: &PipedScan,
+    mut reader: BufReader<ChildStderr>,
+) -> (Option<i32>, String) {
+    pipe.write_all(&scan.bytes).unwrap();
+    drop(pipe);
+    let stderr = read_until(&mut reader, None);
+    (child.wait().unwrap().code(), stderr)
+}
+
+/// Standard error of the program.
+fn stderr_of(child: &mut Child) -> BufReader<ChildStderr> {
+    BufReader::new(child.stderr.take().unwrap())
 }
 
 /// Waits until the program opens the scan.
@@ -122,18 +153,12 @@ fn signalled(
 ) -> (Option<i32>, String) {
     let opened = scan.opened();
     let mut child = start(recording, arguments);
-    let mut pipe = wait(&opened, &mut child);
-    let mut reader = BufReader::new(child.stderr.take().unwrap());
-    let sent = Command::new("kill")
-        .args([signal, &child.id().to_string()])
-        .status()
-        .unwrap();
-    assert!(sent.success());
-    let mut stderr = read_until(&mut reader, Some("press Ctrl-C again"));
-    pipe.write_all(&scan.bytes).unwrap();
-    drop(pipe);
-    stderr += &read_until(&mut reader, None);
-    (child.wait().unwrap().code(), stderr)
+    let pipe = wait(&opened, &mut child);
+    let mut reader = stderr_of(&mut child);
+    send(signal, &child);
+    let begin = read_until(&mut reader, Some("press Ctrl-C again"));
+    let (code, rest) = resume(child, pipe, scan, reader);
+    (code, begin + &rest)
 }
 
 /// Interrupts a command that is busy and does not look up: it waits for the scan and never gets it;
@@ -150,9 +175,7 @@ fn overdue(signal: &str, recording: &Recording, arguments: &[&str], scan: &Piped
 #[track_caller]
 fn stopped_in_time(signal: &str, mut child: Child) -> String {
     let sent = Instant::now();
-    let id = child.id().to_string();
-    let kill = Command::new("kill").args([signal, &id]).status().unwrap();
-    assert!(kill.success());
+    send(signal, &child);
     while child.try_wait().unwrap().is_none() {
         if sent.elapsed() > Duration::from_secs(3) {
             child.kill().unwrap();
@@ -160,8 +183,7 @@ fn stopped_in_time(signal: &str, mut child: Child) -> String {
         }
         thread::sleep(Duration::from_millis(10));
     }
-    let mut reader = BufReader::new(child.stderr.take().unwrap());
-    let stderr = read_until(&mut reader, None);
+    let stderr = read_until(&mut stderr_of(&mut child), None);
     assert_eq!(child.wait().unwrap().code(), Some(130), "{stderr}");
     stderr
 }
@@ -386,23 +408,16 @@ fn a_signal_that_was_ignored_at_the_start_stays_ignored() {
     let scan = PipedScan::new(&recording, 3);
     let opened = scan.opened();
     // As `nohup` does.
-    let mut child = Command::new("sh")
+    let mut shell = Command::new("sh");
+    shell
         .args(["-c", "trap '' HUP; exec \"$0\" \"$@\""])
-        .arg(assert_cmd::cargo::cargo_bin!("fpmcl"))
-        .args(LOCALIZE)
-        .current_dir(recording.folder())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let mut pipe = wait(&opened, &mut child);
-    let id = child.id().to_string();
-    let kill = Command::new("kill").args(["-HUP", &id]).status().unwrap();
-    assert!(kill.success());
-    pipe.write_all(&scan.bytes).unwrap();
-    drop(pipe);
-    let mut reader = BufReader::new(child.stderr.take().unwrap());
-    let stderr = read_until(&mut reader, None);
-    assert_eq!(child.wait().unwrap().code(), Some(0), "{stderr}");
+        .arg(assert_cmd::cargo::cargo_bin!("fpmcl"));
+    let mut child = start_by(shell, &recording, LOCALIZE);
+    let pipe = wait(&opened, &mut child);
+    send("-HUP", &child);
+    let reader = stderr_of(&mut child);
+    let (code, stderr) = resume(child, pipe, &scan, reader);
+    assert_eq!(code, Some(0), "{stderr}");
     let results = LocalizationResults::read(&recording.path("results/localization.npz"));
     assert_eq!(results.unwrap().frames.len(), 6);
 }
@@ -592,13 +607,11 @@ fn an_output_folder_that_vanishes_is_an_error() {
     let scan = PipedScan::new(&recording, 3);
     let opened = scan.opened();
     let mut child = start(&recording, LOCALIZE);
-    let mut pipe = wait(&opened, &mut child);
+    let pipe = wait(&opened, &mut child);
     fs::rename(recording.path("results"), recording.path("moved")).unwrap();
-    pipe.write_all(&scan.bytes).unwrap();
-    drop(pipe);
-    let mut reader = BufReader::new(child.stderr.take().unwrap());
-    let stderr = read_until(&mut reader, None);
-    assert_eq!(child.wait().unwrap().code(), Some(1), "{stderr}");
+    let reader = stderr_of(&mut child);
+    let (code, stderr) = resume(child, pipe, &scan, reader);
+    assert_eq!(code, Some(1), "{stderr}");
     assert!(stderr.contains("error: cannot write results/"), "{stderr}");
     assert!(!recording.path("results").exists());
 }
