@@ -80,7 +80,7 @@ pub struct Context {
 }
 
 impl Context {
-    /// Starts logging, the thread pool and the handling of Ctrl-C, once per process.
+    /// Starts logging, the thread pool and the handling of signals, once per process.
     pub fn new(level: LevelFilter, machine: MachineArgs) -> anyhow::Result<Self> {
         let progress = Progress::new(level);
         let log = RunLog::default();

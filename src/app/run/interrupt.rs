@@ -84,12 +84,12 @@ impl Interrupt {
         thread::spawn(move || watched.exit_when_overdue());
     }
 
-    /// Whether Ctrl-C was pressed.
+    /// Whether a signal has requested to stop.
     pub fn requested(&self) -> bool {
         self.shared.requested.load(Ordering::Relaxed)
     }
 
-    /// The answer to events of the library: `Break` once Ctrl-C was pressed.
+    /// The answer to events of the library: `Break` once it is requested to stop.
     pub fn flow(&self) -> ControlFlow<()> {
         if self.requested() {
             ControlFlow::Break(())
@@ -98,7 +98,7 @@ impl Interrupt {
         }
     }
 
-    /// Requests to stop, as Ctrl-C does.
+    /// Requests to stop, as a signal does.
     pub fn request(&self) {
         self.shared.requested.store(true, Ordering::Relaxed);
     }
@@ -117,7 +117,7 @@ impl Interrupt {
         Interrupted { kept }
     }
 
-    /// An error once Ctrl-C was pressed.
+    /// An error once it is requested to stop.
     pub fn check(&self) -> Result<(), Interrupted> {
         if self.requested() {
             return Err(self.error());
