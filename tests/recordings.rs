@@ -186,3 +186,73 @@ fn a_truth_that_ends_a_frame_early_is_evaluated_without_that_frame() {
     recording.write("short.txt", &rows(FRAMES - 2));
     evaluate().fails_with(&["belong to different recordings"]);
 }
+
+#[test]
+fn times_of_exactly_ten_scans_per_second_are_matched_where_they_were_recorded() {
+    const FRAMES: usize = 12;
+    let recording = Recording::street(FRAMES);
+    fs::remove_file(recording.path("calib.txt")).unwrap();
+    let times: String = (0..FRAMES)
+        .map(|k| format!("{:.1}\n", 0.1 * k as f64))
+        .collect();
+    let write_truth = |name: &str, later_s: f64, rows: usize| {
+        let row = |k: usize| {
+            let (time_s, ahead_m) = (later_s + 0.1 * k as f64, 0.5 * k as f64);
+            format!("{time_s:.1} {ahead_m} 0 0 0 0 0 1\n")
+        };
+        recording.write(name, &(0..rows).map(row).collect::<String>());
+    };
+    write_truth("poses.txt", 0.0, FRAMES);
+    let call = |command: &str| {
+        let call = recording.fpmcl(command).with("--force");
+        call.set("calib_file", "null").set("pose_file", "poses.txt")
+    };
+    call("build-map").succeeds();
+    // Moved, so that they are no times of the scans.
+    fs::rename(recording.path("poses.txt"), recording.path("truth.txt")).unwrap();
+    let localize = || {
+        let call = recording.fpmcl("localize").with("--force");
+        let call = call.set("calib_file", "null").set("pose_file", "null");
+        let call = call
+            .set("map_pose_file", "null")
+            .set("map_calib_file", "null");
+        let call = call
+            .set("odometry", "auto")
+            .set("initial_pose", "[0, 0, 0]");
+        call.succeeds();
+    };
+    let evaluate = |truth: &str| {
+        let call = fpmcl("evaluate").in_folder(recording.folder());
+        let call = call.with("results/localization.npz").with("--truth");
+        call.with(truth)
+    };
+    let rmse_m = || {
+        let errors = common::json(&recording.path("results/report.json"));
+        errors["mcl"]["metrics"]["position_m"]["rmse"]
+            .as_f64()
+            .unwrap()
+    };
+    write_truth("early.txt", 0.0, FRAMES - 2);
+    write_truth("late.txt", 0.5, FRAMES);
+
+    recording.write("times.txt", &times);
+    localize();
+    let said = evaluate("early.txt").succeeds().stderr;
+    assert!(said.contains("2 of 12 poses are left out"), "{said}");
+    assert!(rmse_m() < 0.2, "{}", rmse_m());
+    let said = evaluate("late.txt").succeeds().stderr;
+    assert!(said.contains("5 of 12 poses are left out"), "{said}");
+    assert!((rmse_m() - 2.5).abs() < 0.2, "{}", rmse_m());
+
+    // Assumed ones are none: row k is that of frame k.
+    fs::remove_file(recording.path("times.txt")).unwrap();
+    localize();
+    evaluate("late.txt").succeeds();
+    assert!(rmse_m() < 0.2, "{}", rmse_m());
+    evaluate("early.txt").fails_with(&[
+        "early.txt has 10 poses",
+        "reaches frame 11",
+        "matched by number",
+        "give times",
+    ]);
+}

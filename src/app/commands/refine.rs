@@ -218,6 +218,7 @@ fn follow(
         frames: known.iter().map(|(frame, _)| frame.number).collect(),
         estimates_in_space: Some(known.iter().map(|(_, pose)| *pose).collect()),
         times_s: Some(known.iter().map(|(frame, _)| frame.time_s).collect()),
+        times_are_assumed: !sequence.has_times,
         ..LocalizationResults::default()
     })
 }

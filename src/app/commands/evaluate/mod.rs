@@ -106,8 +106,7 @@ fn in_map(
         if let Some((_, Some(path))) = &map {
             track = track.in_map(&path.world_from_map);
         }
-        let times_s = results.recorded_times().map(<[f64]>::to_vec);
-        results = truth::with_truth(results, times_s, &track, &config.result_file)?;
+        results = truth::with_truth(results, &track, &config.result_file)?;
     }
     require_truth(&results, config)?;
     let rules = RangeMclRules {
@@ -131,8 +130,7 @@ fn of_trajectory(
 ) -> Result<Evaluated> {
     if let Some(mut track) = truth::read_track(config, None)? {
         track.map_from_lidar = trajectory::in_world(&track);
-        let times_s = results.times_s.clone();
-        results = truth::with_truth(results, times_s, &track, &config.result_file)?;
+        results = truth::with_truth(results, &track, &config.result_file)?;
     }
     require_truth(&results, config)?;
     let columns = (

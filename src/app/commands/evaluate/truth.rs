@@ -54,14 +54,14 @@ pub fn read_track(
 }
 
 /// The results with their true poses: by time where both have one, interpolated between two rows of the track, else by
-/// number. Results without a true pose are left out with a warning, if they are not more than half.
+/// number. Results without a true pose are left out with a warning: by time up to half of them, by number one and a hundredth
+/// of all.
 pub fn with_truth(
     mut results: LocalizationResults,
-    times_s: Option<Vec<f64>>,
     track: &PoseTrack,
     result_file: &Path,
 ) -> Result<LocalizationResults> {
-    let poses = match (&times_s, &track.times_s) {
+    let poses = match (results.recorded_times(), &track.times_s) {
         (Some(times_s), Some(true_times_s)) => {
             poses_by_time(&results, times_s, track, true_times_s, result_file)?
         }
@@ -138,7 +138,7 @@ fn poses_by_number(
     let missing = results.frames.iter().filter(is_missing).count();
     ensure!(
         may_be_missing(missing, results.len()),
-        "{} has {} poses, but the result reaches frame {last}; pose_file and result_file belong to different recordings",
+        "{} has {} poses, but the result reaches frame {last}, and without times of both they are matched by number: pose_file and result_file belong to different recordings; give the truth of this recording, or give times to both (times.txt of the scans; TUM)",
         track.path.display(),
         poses.len()
     );

@@ -74,6 +74,7 @@ impl Run {
                 scan_outlines: (selected.len() <= ScanOutline::MOST_FRAMES)
                     .then(|| RowLog::in_folder(folder)),
                 selected: Some(selected.len()),
+                times_are_assumed: !opened.recording.has_times,
             },
             writer: None,
             selected,

@@ -18,6 +18,7 @@
 //! | `states` | (rows) | uint8 | state of the filter |
 //! | `scan_outlines` | (rows, 512) | int16 | x, y of up to 256 points of the scan at the height of the sensor, in the lidar frame [cm]; zeros after the last |
 //! | `selected_frames` | () | int64 | number of frames to localize; only where not all were |
+//! | `times_are_assumed` | () | int64 | 1; only where `times_s` are not recorded: ten frames per second are assumed |
 //!
 //! All but the first three are optional, and so are `particles` where there are `frames`: a trajectory without a map.
 //! They are NaN in rows before `start_idx`.
@@ -199,6 +200,8 @@ pub struct LocalizationResults {
     pub scan_outlines: Option<RowLog<[i16; 2]>>,
     /// Number of frames to localize; a file has it only if the run ended before the last of them.
     pub selected: Option<usize>,
+    /// Whether the times were not recorded: ten frames per second are assumed.
+    pub times_are_assumed: bool,
 }
 
 /// Applies a macro to the names of all columns that may be missing, in the order of the file.
@@ -243,11 +246,7 @@ impl LocalizationResults {
 
     /// Times of the frames that were recorded [s]; `None` if ten frames per second were assumed.
     pub fn recorded_times(&self) -> Option<&[f64]> {
-        let times_s = self.times_s.as_deref()?;
-        let assumed =
-            |(frame, time_s): (&usize, &f64)| (*frame as f64 / 10.0 - time_s).abs() < 1e-9;
-        let are_assumed = self.frames.iter().zip(times_s).all(assumed);
-        (!are_assumed).then_some(times_s)
+        self.times_s.as_deref().filter(|_| !self.times_are_assumed)
     }
 
     /// Covariances of the refined poses, else of the estimates, in x, y [m], heading [rad].
@@ -276,9 +275,10 @@ impl LocalizationResults {
         }
         let scan_outlines = self.scan_outlines.as_ref().map(|all| all.select(rows));
         let frames = rows.iter().map(|&row| self.frames[row]).collect();
+        let times_are_assumed = self.times_are_assumed;
         macro_rules! select {
             ($($name:ident),*) => {
-                Self { frames, particles, scan_outlines, selected: None, $($name: pick(&self.$name, rows)),* }
+                Self { frames, particles, scan_outlines, selected: None, times_are_assumed, $($name: pick(&self.$name, rows)),* }
             };
         }
         columns!(select)

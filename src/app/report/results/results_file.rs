@@ -24,7 +24,9 @@ impl LocalizationResults {
     pub fn read(path: &Path) -> Result<Self> {
         let mut npz = NpzReader::open(path)?;
         let (rows, first, particles) = read_particles(path, &mut npz)?;
-        let selected = read_selected(&mut npz)?;
+        let selected = read_number(&mut npz, "selected_frames")?;
+        let times_are_assumed =
+            read_number(&mut npz, "times_are_assumed")?.is_some_and(|it| it != 0);
         let mut file = RowReader {
             path,
             npz,
@@ -35,7 +37,7 @@ impl LocalizationResults {
         let scan_outlines = file.outlines()?;
         macro_rules! read {
             ($($name:ident),*) => {
-                Self { frames, particles, scan_outlines, selected, $($name: file.column(stringify!($name))?),* }
+                Self { frames, particles, scan_outlines, selected, times_are_assumed, $($name: file.column(stringify!($name))?),* }
             };
         }
         Ok(columns!(read))
@@ -151,6 +153,9 @@ impl ResultWriter {
         if let Some(selected) = (results.selected).filter(|&selected| results.len() < selected) {
             npz.add("selected_frames", &[], [selected as i64])?;
         }
+        if results.times_are_assumed {
+            npz.add("times_are_assumed", &[], [1_i64])?;
+        }
         let mut file = RowWriter { npz, leading };
         macro_rules! write {
             ($($name:ident),*) => { $(file.column(stringify!($name), results.$name.as_deref())?;)* };
@@ -232,14 +237,14 @@ fn first_row(path: &Path, start_idx: f64, rows: usize) -> Result<usize> {
     Ok(start_idx as usize)
 }
 
-/// Reads the number of frames to localize, which only a run that ended early wrote.
-fn read_selected(npz: &mut NpzReader) -> Result<Option<usize>> {
-    let Some(mut array) = npz.array("selected_frames")? else {
+/// Reads a number that not every file has.
+fn read_number(npz: &mut NpzReader, name: &'static str) -> Result<Option<usize>> {
+    let Some(mut array) = npz.array(name)? else {
         return Ok(None);
     };
     array.expect_shape(&[], "one number ()")?;
-    let [selected] = array.next_finite_row(0)?;
-    Ok(Some(selected as usize))
+    let [number] = array.next_finite_row(0)?;
+    Ok(Some(number as usize))
 }
 
 /// Reads the particles of a frame without the padding after the last.

@@ -60,6 +60,7 @@ fn results(frames: impl Iterator<Item = usize>) -> LocalizationResults {
         refinement_agreements: Some(frames.iter().map(|&f| [0.5, f as f64]).collect()),
         scan_outlines: Some(outlines),
         selected: Some(40),
+        times_are_assumed: true,
         frames,
     }
 }

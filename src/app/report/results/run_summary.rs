@@ -187,16 +187,19 @@ mod tests {
         let estimates: Vec<Pose2> = (0..3)
             .map(|row| Pose2::translation(2.0 * f64::from(row), 0.0))
             .collect();
-        let speed = |times_s: [f64; 3]| {
+        let speed = |times_s: [f64; 3], times_are_assumed: bool| {
             let results = LocalizationResults {
                 frames: vec![1, 2, 3],
                 times_s: Some(times_s.to_vec()),
+                times_are_assumed,
                 ..LocalizationResults::default()
             };
             RunSummary::of(&results, &estimates).speed_m_per_s
         };
-        assert_eq!(speed([0.1, 0.2, 0.3]), None);
-        assert_eq!(speed([7.0, 7.5, 8.0]), Some(4.0));
+        assert_eq!(speed([0.1, 0.2, 0.3], true), None);
+        assert_eq!(speed([7.0, 7.5, 8.0], false), Some(4.0));
+        // Recorded ones may be ten per second, too.
+        assert!((speed([0.1, 0.2, 0.3], false).unwrap() - 20.0).abs() < 1e-9);
     }
 
     #[test]
