@@ -104,6 +104,32 @@ fn a_run_that_is_not_localized_has_an_exit_code_of_its_own_and_its_result_is_kep
     }
 }
 
+#[test]
+fn frames_that_are_filled_back_do_not_count_as_localized() {
+    let recording = half_elsewhere(12, 6);
+    // A start that is not known well, so that the first frame is searching.
+    let call = without_truth(&recording, "localize").with("--json");
+    let call = call.set("tracking_loss.confirming_updates", "2");
+    let call = call.set("start.position_m", "5").set("numParticles", "500");
+    let output = call.exits_with(3);
+    let report: serde_json::Value = serde_json::from_str(&output.stdout).unwrap();
+    let summary = &report["summary"];
+    assert_eq!(
+        (&summary["tracking"], &summary["filled"]),
+        (&5.into(), &1.into()),
+        "{report}"
+    );
+    assert_eq!(report["localized"], false);
+    let table = String::from_utf8(recording.bytes("results/report.md")).unwrap();
+    assert!(table.contains("| filled | 1 |"), "{table}");
+    let info = fpmcl("info")
+        .in_folder(recording.folder())
+        .with("results/localization.npz");
+    let info: serde_json::Value =
+        serde_json::from_str(&info.with("--json").succeeds().stdout).unwrap();
+    assert_eq!(info["filled"], 1);
+}
+
 /// A call for a recording of which no true poses are known.
 fn without_truth(recording: &Recording, command: &str) -> Fpmcl {
     let call = recording.fpmcl(command).set("pose_file", "null");
@@ -146,6 +172,15 @@ fn frames_that_are_lost_are_no_part_of_the_trajectory_its_length_and_its_picture
         let states: Vec<&str> = states.collect();
         let tracked = states.iter().filter(|state| **state == "tracking").count();
         assert!((6..12).contains(&tracked), "{states:?}");
+        // What is not known has an empty cell.
+        assert!(!table.contains(",-1.0000"), "{table}");
+        let titles: Vec<&str> = table.lines().next().unwrap().split(',').collect();
+        for (row, state) in table.lines().skip(1).zip(&states) {
+            let cells = titles.iter().zip(row.split(','));
+            let mut cells = cells.filter(|(title, _)| title.starts_with("trajectory_"));
+            let is_empty = command == "localize" && *state != "tracking";
+            assert!(!is_empty || cells.all(|(_, cell)| cell.is_empty()), "{row}");
+        }
         let kitti = format!("results/{name}_kitti.txt");
         let tum = format!("results/{name}_tum.txt");
         assert_eq!(rows(&recording, &tum), (tracked, vec![]), "{states:?}");
@@ -162,6 +197,25 @@ fn frames_that_are_lost_are_no_part_of_the_trajectory_its_length_and_its_picture
             (path_m - 0.5 * (tracked - 1) as f64).abs() < 0.3,
             "{path_m}"
         );
+        // Errors are those of the trusted frames, after the first half of a short run.
+        let of = if command == "localize" {
+            "mcl"
+        } else {
+            "refined"
+        };
+        let errors = &report[of]["metrics"];
+        let counts = ["skipped_frames", "frames", "untrusted_frames"];
+        assert_eq!(
+            counts.map(|it| errors[it].as_u64().unwrap() as usize),
+            [6, tracked - 6, 12 - tracked]
+        );
+        assert!(
+            errors["position_m"]["max"].as_f64().unwrap() < 0.5,
+            "{errors}"
+        );
+        let page = String::from_utf8(recording.bytes("results/report.html")).unwrap();
+        let title = "Errors without the first 6 frames; frames that are trusted: MCL ";
+        assert!(page.contains(title), "{command}");
         let path = json(&recording.path("results/plots/path.json"));
         let trusted = path["trusted"].as_array().unwrap().iter();
         let trusted = trusted.map(|it| it.as_bool().unwrap());

@@ -1,7 +1,7 @@
 //! Metrics of one trajectory against the ground truth.
 //!
 //! The first frames, in which the filter converges, are excluded from all metrics but
-//! convergence. Trajectories are not aligned.
+//! convergence, and so are frames whose pose is not trusted. Trajectories are not aligned.
 
 use serde::{Deserialize, Serialize};
 use smart_default::SmartDefault;
@@ -37,6 +37,8 @@ pub struct EvaluatedTrajectory<'a> {
     pub times_s: Option<&'a [f64]>,
     /// Computing time per frame [s].
     pub runtimes_s: Option<&'a [f64]>,
+    /// Whether each pose is trusted; `None`: all are.
+    pub trusted: Option<&'a [bool]>,
 }
 
 /// Error along and across the true heading [m].
@@ -73,7 +75,13 @@ pub struct Smoothness {
 pub struct TrajectoryMetrics {
     /// Number of evaluated frames.
     pub frames: usize,
-    /// Distance driven in them, along the ground truth [m].
+    /// Number of frames at the beginning that are excluded.
+    #[serde(default)]
+    pub skipped_frames: usize,
+    /// Number of frames after them that are excluded because their pose is not trusted.
+    #[serde(default)]
+    pub untrusted_frames: usize,
+    /// Distance driven in the evaluated ones, along the ground truth [m].
     pub distance_m: f64,
     /// Planar distance to the true position [m]: the absolute pose error in the plane.
     pub position_m: Summary,
@@ -101,7 +109,7 @@ pub struct TrajectoryMetrics {
     pub rpe_rotation_rad: Option<Summary>,
     /// KITTI's segment errors; absent for a path under 100 m.
     pub segments: Option<SegmentErrors>,
-    /// Computing time per frame [s]; absent if not measured.
+    /// Computing time per frame, trusted or not [s]; absent if not measured.
     pub runtime_s: Option<Summary>,
     /// Computing time of the first frame of the run [s].
     pub first_runtime_s: Option<f64>,
@@ -112,7 +120,7 @@ pub struct TrajectoryMetrics {
 #[expect(missing_docs, reason = "the messages are the documentation")]
 pub enum MetricsError {
     #[error(
-        "{frames} frames are too few: the first {skip_frames} (skip_frames) are excluded and one is needed after them"
+        "{frames} frames are too few: the first {skip_frames} (skip_frames) are excluded and one that is trusted is needed after them"
     )]
     TooFewFrames { frames: usize, skip_frames: usize },
     #[error("there are {found} {what} for {frames} frames; they belong to different runs")]
@@ -139,12 +147,14 @@ impl TrajectoryMetrics {
         })
     }
 
-    /// `None` if no frames are left after the skipped ones.
+    /// `None` if no trusted frames are left after the skipped ones.
     fn after_skipping(whole: &EvaluatedTrajectory, config: &MetricsConfig) -> Option<Self> {
-        let counted = whole.skip(config.skip_frames)?;
+        let rows = whole.trusted_after(config.skip_frames);
+        let columns = whole.columns(&rows);
+        let counted = columns.as_trajectory();
         let all_errors = planar_errors(whole.estimates, whole.ground_truth);
         let all_distances_m = distances_m(whole.ground_truth);
-        let errors = &all_errors[config.skip_frames..];
+        let errors = &pick(&all_errors, &rows);
         let driven_m = distances_m(counted.ground_truth);
         let column =
             |number: fn(&PlanarError) -> f64| -> Vec<f64> { errors.iter().map(number).collect() };
@@ -156,6 +166,8 @@ impl TrajectoryMetrics {
         let relative = relative_pose_error(&estimates, &truth);
         Some(Self {
             frames: errors.len(),
+            skipped_frames: config.skip_frames,
+            untrusted_frames: (config.skip_frames..whole.estimates.len()).len() - errors.len(),
             distance_m: *driven_m.last()?,
             position_m: Summary::new(&distance)?,
             x_rmse_m: rms(&column(|error| error.offset_in_map.x))?,
@@ -170,7 +182,8 @@ impl TrajectoryMetrics {
             rpe_translation_m: relative.translation(),
             rpe_rotation_rad: relative.rotation(),
             segments: kitti_segment_errors(&estimates, &truth),
-            runtime_s: counted.runtimes_s.and_then(Summary::new),
+            runtime_s: (whole.runtimes_s)
+                .and_then(|all| Summary::new(all.get(config.skip_frames..)?)),
             first_runtime_s: whole.runtimes_s.and_then(|all| all.first().copied()),
         })
     }
@@ -183,6 +196,7 @@ impl EvaluatedTrajectory<'_> {
             ("true poses", Some(self.ground_truth.len())),
             ("times", self.times_s.map(<[f64]>::len)),
             ("runtimes", self.runtimes_s.map(<[f64]>::len)),
+            ("states", self.trusted.map(<[bool]>::len)),
         ] {
             if let Some(found) = found.filter(|&found| found != frames) {
                 return Err(MetricsError::LengthMismatch {
@@ -195,15 +209,44 @@ impl EvaluatedTrajectory<'_> {
         Ok(())
     }
 
-    /// The trajectory without its first frames; `None` if it is shorter.
-    fn skip(&self, frames: usize) -> Option<Self> {
-        Some(Self {
-            estimates: self.estimates.get(frames..)?,
-            ground_truth: self.ground_truth.get(frames..)?,
-            times_s: self.times_s.map(|times| &times[frames..]),
-            runtimes_s: self.runtimes_s.map(|times| &times[frames..]),
-        })
+    /// Rows of the trusted poses without those of the first frames.
+    pub(crate) fn trusted_after(&self, frames: usize) -> Vec<usize> {
+        let is_trusted = |row: &usize| self.trusted.is_none_or(|trusted| trusted[*row]);
+        (frames..self.estimates.len()).filter(is_trusted).collect()
     }
+
+    /// Some rows of the trajectory.
+    fn columns(&self, rows: &[usize]) -> Columns {
+        Columns {
+            estimates: pick(self.estimates, rows),
+            ground_truth: pick(self.ground_truth, rows),
+            times_s: self.times_s.map(|times_s| pick(times_s, rows)),
+        }
+    }
+}
+
+/// The columns of some rows of a trajectory.
+struct Columns {
+    estimates: Vec<Pose2>,
+    ground_truth: Vec<Pose2>,
+    times_s: Option<Vec<f64>>,
+}
+
+impl Columns {
+    fn as_trajectory(&self) -> EvaluatedTrajectory<'_> {
+        EvaluatedTrajectory {
+            estimates: &self.estimates,
+            ground_truth: &self.ground_truth,
+            times_s: self.times_s.as_deref(),
+            runtimes_s: None,
+            trusted: None,
+        }
+    }
+}
+
+/// Some rows of a column.
+pub(crate) fn pick<T: Copy>(column: &[T], rows: &[usize]) -> Vec<T> {
+    rows.iter().map(|&row| column[row]).collect()
 }
 
 impl AxisError {
@@ -266,8 +309,38 @@ mod tests {
             ground_truth,
             times_s: None,
             runtimes_s: None,
+            trusted: None,
         };
         TrajectoryMetrics::new(&trajectory, &MetricsConfig::default()).unwrap()
+    }
+
+    #[test]
+    fn a_pose_that_is_not_trusted_has_no_error_and_is_counted() {
+        let truth = circle(40);
+        let trusted: Vec<bool> = (0..40).map(|frame| frame % 3 != 0).collect();
+        let estimates = in_the_car(&truth, |frame| {
+            Pose2::translation(if trusted[frame] { 0.1 } else { 30.0 }, 0.0)
+        });
+        let mut trajectory = EvaluatedTrajectory {
+            estimates: &estimates,
+            ground_truth: &truth,
+            times_s: None,
+            runtimes_s: None,
+            trusted: Some(&trusted),
+        };
+        let config = MetricsConfig::default();
+        let metrics = TrajectoryMetrics::new(&trajectory, &config).unwrap();
+        assert_relative_eq!(metrics.position_m.max, 0.1, epsilon = 1e-12);
+        assert_eq!(
+            (
+                metrics.skipped_frames,
+                metrics.frames,
+                metrics.untrusted_frames
+            ),
+            (10, 20, 10)
+        );
+        trajectory.trusted = Some(&[false; 40]);
+        assert!(TrajectoryMetrics::new(&trajectory, &config).is_err());
     }
 
     #[test]
@@ -337,12 +410,19 @@ mod tests {
             ground_truth: &truth,
             times_s: None,
             runtimes_s: None,
+            trusted: None,
         };
         let config = MetricsConfig::default();
         let message = TrajectoryMetrics::new(&trajectory, &config)
             .unwrap_err()
             .to_string();
         assert!(message.contains("10 frames are too few"), "{message}");
+        let shorter = EvaluatedTrajectory {
+            estimates: &truth[..5],
+            ground_truth: &truth[..5],
+            ..trajectory
+        };
+        assert!(TrajectoryMetrics::new(&shorter, &config).is_err());
         trajectory.ground_truth = &truth[1..];
         let message = TrajectoryMetrics::new(&trajectory, &config)
             .unwrap_err()

@@ -285,6 +285,7 @@ fn evaluate(result: &Path, is_refined: bool) -> Result<TrajectoryReport> {
         ground_truth: &truth,
         times_s: results.times_s.as_deref(),
         runtimes_s: runtimes_s.as_deref(),
+        trusted: None,
     };
     let in_space = in_space
         .as_deref()

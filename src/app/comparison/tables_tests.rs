@@ -25,6 +25,7 @@ fn run(sequence: &str, configuration: &str, seed: u64, error_m: f64) -> RunRecor
         ground_truth: &truth,
         times_s: None,
         runtimes_s: Some(&[0.1; 40]),
+        trusted: None,
     };
     let report = TrajectoryReport {
         range_mcl: RangeMclRules::default().evaluate(&estimates, &truth),

@@ -14,6 +14,7 @@ use crate::app::report::results::{
 };
 use crate::app::run::{Claims, Outputs, output};
 use crate::app::settings::{MapInputConfig, RecordingConfig};
+use crate::evaluation::metrics::pick;
 use crate::evaluation::{
     EvaluatedTrajectory, MetricsConfig, ParticleRow, RangeMclRules, SpatialMetrics,
     TrajectoryMetrics,
@@ -289,29 +290,43 @@ pub fn warn_of_shortfall(results: &LocalizationResults, path: &Path) {
     }
 }
 
-/// Summarizes a run, and compares the estimates and the refined trajectory with the ground truth, if there is one.
+/// Summarizes a run, and compares the estimates of the tracked frames and the trusted poses of the refined trajectory with
+/// the ground truth, if there is one.
 pub fn evaluate(
     results: &LocalizationResults,
     rules: &RangeMclRules,
     about: BTreeMap<String, String>,
 ) -> Result<Report> {
     let estimates = results.estimates_or_particle_means(rules)?;
-    let report = |estimates: &[Pose2], in_space: &Option<Vec<Pose3>>, times: &Option<Vec<f64>>| {
-        let Some(ground_truth) = results.ground_truth.as_deref() else {
+    let truth_in_space = results.ground_truth_in_space.as_deref();
+    let report = |trajectory: &EvaluatedTrajectory, in_space: &Option<Vec<Pose3>>| {
+        let in_space = in_space.as_deref().zip(truth_in_space);
+        if trajectory.trusted_after(skipped(trajectory)).is_empty() {
             return Ok(None);
-        };
-        let trajectory = EvaluatedTrajectory {
-            estimates,
+        }
+        evaluate_trajectory(trajectory, in_space, rules).map(Some)
+    };
+    let (mut mcl, mut refined) = (None, None);
+    if let Some(ground_truth) = results.ground_truth.as_deref() {
+        let tracked = results.tracked();
+        let of_filter = EvaluatedTrajectory {
+            estimates: &estimates,
             ground_truth,
             times_s: results.times_s.as_deref(),
-            runtimes_s: times.as_deref(),
+            runtimes_s: results.runtimes_s.as_deref(),
+            trusted: tracked.as_deref(),
         };
-        let truth_in_space = results.ground_truth_in_space.as_deref();
-        let in_space = in_space.as_deref().zip(truth_in_space);
-        evaluate_trajectory(&trajectory, in_space, rules).map(Some)
-    };
-    let refined = (results.refined.as_ref())
-        .map(|it| report(it, &results.refined_in_space, &results.refine_runtimes_s));
+        mcl = report(&of_filter, &results.estimates_in_space)?;
+        if let Some(poses) = &results.refined {
+            let of_refined = EvaluatedTrajectory {
+                estimates: poses,
+                runtimes_s: results.refine_runtimes_s.as_deref(),
+                trusted: Some(&results.refined_trusted()),
+                ..of_filter
+            };
+            refined = report(&of_refined, &results.refined_in_space)?;
+        }
+    }
     let summary = RunSummary::of(results, &estimates);
     let refinement = RefinementSummary::of(results, &estimates);
     Ok(Report {
@@ -321,8 +336,9 @@ pub fn evaluate(
             .or(summary.localized()),
         summary,
         refinement,
-        mcl: report(&estimates, &results.estimates_in_space, &results.runtimes_s)?,
-        refined: refined.transpose()?.flatten(),
+        has_true_poses: results.ground_truth.is_some(),
+        mcl,
+        refined,
         trajectory: None,
     })
 }
@@ -333,17 +349,22 @@ pub fn evaluate_trajectory(
     in_space: Option<(&[Pose3], &[Pose3])>,
     rules: &RangeMclRules,
 ) -> Result<TrajectoryReport> {
-    let defaults = MetricsConfig::default();
     let config = MetricsConfig {
-        // At least half of a short run is evaluated.
-        skip_frames: (defaults.skip_frames).min(trajectory.ground_truth.len() / 2),
-        ..defaults
+        skip_frames: skipped(trajectory),
+        ..MetricsConfig::default()
     };
+    let rows = trajectory.trusted_after(config.skip_frames);
     Ok(TrajectoryReport {
         range_mcl: rules.evaluate(trajectory.estimates, trajectory.ground_truth),
         metrics: TrajectoryMetrics::new(trajectory, &config)?,
         in_space: in_space.and_then(|(estimates, truth)| {
-            SpatialMetrics::new(estimates, truth, config.skip_frames)
+            SpatialMetrics::new(&pick(estimates, &rows), &pick(truth, &rows), 0)
         }),
     })
+}
+
+/// Number of frames at the beginning that are not evaluated: at least half of a short run is.
+fn skipped(trajectory: &EvaluatedTrajectory) -> usize {
+    let frames = trajectory.ground_truth.len();
+    MetricsConfig::default().skip_frames.min(frames / 2)
 }

@@ -11,7 +11,7 @@ use crate::app::report::plotting::Bitmap;
 use crate::app::report::results::{MetricRow, Report, Value};
 use crate::app::report::run_output::{INTERACTIVE, RunFiles};
 use crate::app::run::{output, version};
-use crate::evaluation::{LengthErrors, SpatialMetrics};
+use crate::evaluation::{LengthErrors, SpatialMetrics, TrajectoryMetrics};
 
 /// Content of the page, apart from the files of the run.
 pub struct RunPage<'a> {
@@ -192,10 +192,19 @@ fn metrics(report: &Report, is_shown: impl Fn(&MetricRow) -> bool) -> Table {
         cells
     };
     let alignment = report.about.get("alignment").map_or("none", String::as_str);
-    let title = match (&report.mcl, &report.trajectory) {
-        (Some(_), _) => format!("Errors from the tenth frame on; alignment: {alignment}"),
-        (None, Some(_)) => format!("Errors in six degrees of freedom; alignment: {alignment}"),
-        (None, None) => "No true poses were given: what the run shows itself".to_owned(),
+    let errors = [&report.mcl, &report.refined].map(|it| it.as_ref().map(|it| &it.metrics));
+    let title = match (errors, &report.trajectory) {
+        ([None, None], Some(_)) => {
+            format!("Errors in six degrees of freedom; alignment: {alignment}")
+        }
+        ([None, None], None) if report.has_true_poses => {
+            "No trusted pose can be compared with the true poses: what the run shows itself"
+                .to_owned()
+        }
+        ([None, None], None) => "No true poses were given: what the run shows itself".to_owned(),
+        ([mcl, refined], _) => {
+            format!("{}; alignment: {alignment}", evaluated(mcl, refined))
+        }
     };
     let rows = report.joined_rows().into_iter();
     Table {
@@ -209,6 +218,18 @@ fn metrics(report: &Report, is_shown: impl Fn(&MetricRow) -> bool) -> Table {
             .collect(),
         rows: rows.filter(|(row, _)| is_shown(row)).map(row).collect(),
     }
+}
+
+/// How many frames the errors of the filter and of the refined trajectory are of.
+fn evaluated(mcl: Option<&TrajectoryMetrics>, refined: Option<&TrajectoryMetrics>) -> String {
+    let skipped = mcl.or(refined).map_or(0, |it| it.skipped_frames);
+    let counts = [("MCL", mcl), ("refined", refined)];
+    let counts: Vec<String> = counts
+        .into_iter()
+        .filter_map(|(name, it)| Some(format!("{name} {}", it?.frames)))
+        .collect();
+    let counts = counts.join(", ");
+    format!("Errors without the first {skipped} frames; frames that are trusted: {counts}")
 }
 
 /// What each number is.

@@ -59,6 +59,7 @@ pub fn evaluate(results: &LocalizationResults, about: BTreeMap<String, String>) 
             path_m: distances_m(estimates).last().copied().unwrap_or_default(),
             ..RunSummary::default()
         },
+        has_true_poses: true,
         mcl: None,
         refined: None,
         trajectory: Some(metrics),

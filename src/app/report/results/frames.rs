@@ -25,6 +25,11 @@ pub fn write_frames_csv(path: &Path, results: &LocalizationResults) -> Result<()
     table.save(path)
 }
 
+/// A cost or an agreement, which are -1 in results where they are unknown, else not a number.
+fn known(value: f64) -> f64 {
+    if value < 0.0 { f64::NAN } else { value }
+}
+
 /// Columns with a title and one cell per frame.
 pub struct FrameTable {
     rows: usize,
@@ -66,7 +71,7 @@ impl FrameTable {
         table.add_errors("refined", refined, truth);
         table.add("particles", particles.as_deref(), usize::to_string);
         let agreements = results.agreements.as_deref();
-        table.add_numbers("agreement", agreements, |share| *share);
+        table.add_numbers("agreement", agreements, |share| known(*share));
         let places = results.places.as_deref();
         table.add_numbers("places", places, |places| *places);
         table.add("state", results.states.as_deref(), word);
@@ -83,7 +88,7 @@ impl FrameTable {
             ),
         ] {
             for (moment, name) in names.into_iter().enumerate() {
-                table.add_numbers(name, column.as_deref(), |pair| pair[moment]);
+                table.add_numbers(name, column.as_deref(), |pair| known(pair[moment]));
             }
         }
         table.add_numbers("runtime_ms", results.runtimes_s.as_deref(), |time_s| {

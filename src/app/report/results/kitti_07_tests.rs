@@ -70,6 +70,7 @@ fn metrics_on_kitti_07_equal_those_of_an_independent_script() {
         ground_truth: &truth,
         times_s: None,
         runtimes_s: None,
+        trusted: None,
     };
     let config = MetricsConfig {
         skip_frames: 20,

@@ -103,13 +103,7 @@ impl RefinementSummary {
             "turned median" ["deg"] turned.map(|it| it.median.to_degrees()), "magnitude of the turn from the estimate to the refined pose";
             "turned max" ["deg"] turned.map(|it| it.max.to_degrees()), "the frame that was turned most";
         };
-        let of_refined = of_refined.into_iter().map(|row| {
-            let empty = MetricRow {
-                value: Value::Absent,
-                ..row
-            };
-            (empty, Some(row.value))
-        });
+        let of_refined = of_refined.into_iter().map(MetricRow::of_refined);
         let of_both = before.into_iter().zip(after);
         let of_both = of_both.map(|(before, after)| (before, Some(after.value)));
         of_refined.chain(of_both).collect()

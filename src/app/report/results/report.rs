@@ -72,8 +72,8 @@ impl TrajectoryReport {
         let errors = &self.range_mcl;
         let range_mcl = metrics! {
             "range-mcl success" [""] errors.success.map_or(Value::NotChecked, Value::Flag), "position error under converge_thres at every convergence_interval-th row";
-            "range-mcl RMSE location" ["m"] errors.rmse_location_m, "position RMSE from row convergence_interval on, as range-mcl computes it";
-            "range-mcl RMSE yaw" ["deg"] errors.rmse_yaw_deg, "heading RMSE from row convergence_interval on, as range-mcl computes it";
+            "range-mcl RMSE location" ["m"] errors.rmse_location_m, "position RMSE from row convergence_interval on, as range-mcl computes it, over all frames";
+            "range-mcl RMSE yaw" ["deg"] errors.rmse_yaw_deg, "heading RMSE from row convergence_interval on, as range-mcl computes it, over all frames";
         };
         let in_space = self.in_space.as_ref().map_or_else(Vec::new, spatial_rows);
         [range_mcl, metric_rows(&self.metrics), in_space].concat()
@@ -86,8 +86,8 @@ pub struct Report {
     /// Inputs and settings by name: the recording, the map, the odometry and its source, the
     /// seed, the renderer.
     pub about: BTreeMap<String, String>,
-    /// Whether the car was found in at least half of the frames, of the refined trajectory if there is one; `None` where no
-    /// states are known.
+    /// Whether at least half of the frames were tracked by the filter, or, where there is a refined trajectory, tracked or
+    /// registered in the map by the refinement; frames that were filled back do not count. `None` where no states are known.
     #[serde(default)]
     pub localized: Option<bool>,
     /// What the run shows without the true poses.
@@ -96,9 +96,12 @@ pub struct Report {
     /// What the refinement did, if there was one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub refinement: Option<RefinementSummary>,
-    /// Errors of the filter's estimates; `None` without true poses.
+    /// Whether the true poses are known.
+    #[serde(default)]
+    pub has_true_poses: bool,
+    /// Errors of the filter's estimates in the frames in which it was tracking; `None` without true poses or such frames.
     pub mcl: Option<TrajectoryReport>,
-    /// Errors of the refined trajectory, if there is one.
+    /// Errors of the refined trajectory in the frames in which it is trusted, if there is one and they are any.
     pub refined: Option<TrajectoryReport>,
     /// Errors of a trajectory that is not a result in a map.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -149,7 +152,7 @@ impl Report {
     /// Whether a row is among the most important ones of this report.
     pub fn is_main(&self, row: &MetricRow) -> bool {
         // In a map the planar errors are the main ones.
-        let has_errors = self.mcl.is_some();
+        let has_errors = self.mcl.is_some() || self.refined.is_some();
         let is_other = MAIN_OF_REFINEMENT.contains(&row.name) || MAIN_IN_SPACE.contains(&row.name);
         MAIN_OF_RUN.contains(&row.name)
             || MAIN_OF_ERRORS.contains(&row.name)
@@ -160,8 +163,9 @@ impl Report {
     pub fn verdict(&self) -> String {
         let found = self.trajectory.is_none().then(|| self.summary.verdict());
         let refined = self.refinement.as_ref().map(RefinementSummary::verdict);
-        let accuracy = match (&self.mcl, &self.trajectory) {
-            (Some(mcl), _) => accuracy(&mcl.metrics, self.refined.as_ref().map(|it| &it.metrics)),
+        let errors = [&self.mcl, &self.refined].map(|it| it.as_ref().map(|it| &it.metrics));
+        let accuracy = match (accuracy(errors), &self.trajectory) {
+            (Some(accuracy), _) => accuracy,
             (None, Some(trajectory)) => {
                 let aligned = trajectory.aligned_position_m.as_ref();
                 let aligned =
@@ -173,6 +177,9 @@ impl Report {
                     trajectory.distance_m,
                     aligned.unwrap_or_default()
                 )
+            }
+            (None, None) if self.has_true_poses => {
+                "No trusted pose can be compared with the true poses.".to_owned()
             }
             (None, None) => "No true poses were given.".to_owned(),
         };
@@ -214,7 +221,10 @@ impl Report {
         let mut refined = self.refined.iter().flat_map(TrajectoryReport::rows);
         let errors = self.mcl.iter().flat_map(TrajectoryReport::rows);
         let errors = errors.chain(self.trajectory.iter().flat_map(spatial_rows));
-        let errors = errors.map(|row| (row, refined.next().map(|row| row.value)));
+        let mut errors: Vec<_> = errors
+            .map(|row| (row, refined.next().map(|row| row.value)))
+            .collect();
+        errors.extend(refined.map(MetricRow::of_refined));
         let refinement = self.refinement.as_ref();
         let mut of_refined = refinement.into_iter().flat_map(|it| it.trajectory.rows());
         let summary = self.summary.rows().into_iter();
@@ -263,16 +273,34 @@ impl Report {
     }
 }
 
-/// Errors against true poses in a sentence.
-fn accuracy(mcl: &TrajectoryMetrics, refined: Option<&TrajectoryMetrics>) -> String {
+/// Errors of the filter and of the refined trajectory against true poses in a sentence; `None` without any.
+fn accuracy([mcl, refined]: [Option<&TrajectoryMetrics>; 2]) -> Option<String> {
     let errors = |it: &TrajectoryMetrics, of: &str| {
         let [rmse, worst] = [it.position_m.rmse, it.position_m.max].map(length);
         let heading_deg = it.heading_rad.rmse.to_degrees();
-        format!("{rmse} and {heading_deg:.3} deg (RMS){of}, at most {worst}")
+        let frames = match it.untrusted_frames {
+            0 => String::new(),
+            untrusted => {
+                format!(
+                    " in the {} of {} frames that are trusted",
+                    it.frames,
+                    it.frames + untrusted
+                )
+            }
+        };
+        format!("{rmse} and {heading_deg:.3} deg (RMS){of}{frames}, at most {worst}")
     };
-    let refined = refined.map(|it| format!("; refined {}", errors(it, "")));
-    let mcl = errors(mcl, " from the true poses");
-    format!("{mcl}{}.", refined.unwrap_or_default())
+    const FROM: &str = " from the true poses";
+    match (mcl, refined) {
+        (Some(mcl), Some(refined)) => Some(format!(
+            "{}; refined {}.",
+            errors(mcl, FROM),
+            errors(refined, "")
+        )),
+        (Some(mcl), None) => Some(format!("{}.", errors(mcl, FROM))),
+        (None, Some(refined)) => Some(format!("Refined {}.", errors(refined, FROM))),
+        (None, None) => None,
+    }
 }
 
 #[cfg(test)]
@@ -292,6 +320,7 @@ mod tests {
             ground_truth: &truth,
             times_s: None,
             runtimes_s: Some(&[0.0125; 300]),
+            trusted: None,
         };
         TrajectoryReport {
             range_mcl: RangeMclRules::default().evaluate(&estimates, &truth),
@@ -306,6 +335,7 @@ mod tests {
             localized: None,
             summary: RunSummary::default(),
             refinement: None,
+            has_true_poses: true,
             mcl: Some(trajectory(0.25)),
             refined: Some(trajectory(0.02)),
             trajectory: None,

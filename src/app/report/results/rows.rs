@@ -83,6 +83,17 @@ pub struct MetricRow {
     pub definition: &'static str,
 }
 
+impl MetricRow {
+    /// A row of the refined trajectory alone: without a value of the estimates, and that of the refined trajectory.
+    pub fn of_refined(self) -> (Self, Option<Value>) {
+        let empty = Self {
+            value: Value::Absent,
+            ..self
+        };
+        (empty, Some(self.value))
+    }
+}
+
 /// A row per metric: name, unit, value and definition.
 macro_rules! metrics {
     ($($name:literal [$unit:literal] $value:expr, $definition:literal;)*) => {
@@ -169,6 +180,7 @@ fn position_rows(metrics: &TrajectoryMetrics) -> Vec<MetricRow> {
         "position median" ["m"] position.median, "half of the frames are nearer";
         "position p95" ["m"] position.p95, "95 % of the frames are nearer";
         "position max" ["m"] position.max, "the worst frame";
+        "evaluated frames" [""] metrics.frames, "number of frames that the errors are of: those after the first ten, or after the first half of a short run, in which the filter was tracking, or whose refined pose is trusted";
         "x RMSE" ["m"] metrics.x_rmse_m, "root mean square of the x difference in the map frame";
         "y RMSE" ["m"] metrics.y_rmse_m, "root mean square of the y difference in the map frame";
         "along RMSE" ["m"] along.rmse_m, "root mean square of the error along the true heading";

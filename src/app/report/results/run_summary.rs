@@ -9,7 +9,6 @@ use super::rows::{MetricRow, length, metrics};
 use super::trusted::trusted_distances_m;
 use crate::evaluation::Summary;
 use crate::geometry::Pose2;
-use crate::localization::State;
 use crate::localization::particles::long_axis_m;
 
 /// States, uncertainty and agreement with the map over the frames of a run.
@@ -18,9 +17,9 @@ use crate::localization::particles::long_axis_m;
 pub struct RunSummary {
     /// Number of frames.
     pub frames: usize,
-    /// Number of frames in which the filter was tracking, or whose refined pose is in the map.
+    /// Number of frames in which the filter was tracking, or that were registered in the map by the refinement.
     pub tracking: Option<usize>,
-    /// Number of frames before the first tracked one that were filled back from it.
+    /// Number of frames before the first tracked one that were filled back from it; `None` where no states are known.
     pub filled: Option<usize>,
     /// Number of the first frame in which it was tracking.
     pub first_tracked: Option<usize>,
@@ -43,7 +42,8 @@ struct Trajectory<'a> {
     poses: &'a [Pose2],
     /// Whether each pose is part of the trajectory.
     trusted: Vec<bool>,
-    states: Option<&'a [u8]>,
+    /// Whether each frame was tracked, or registered in the map; `None` where no states are known.
+    tracked: Option<Vec<bool>>,
     covariances: Option<&'a [Matrix3<f64>]>,
 }
 
@@ -54,7 +54,7 @@ impl RunSummary {
         let trajectory = Trajectory {
             poses: &results.trajectory(estimates),
             trusted: results.trusted(),
-            states: results.states.as_deref(),
+            tracked: results.tracked(),
             covariances: results.covariances.as_deref(),
         };
         let several = |places: &Vec<f64>| places.iter().filter(|&&it| it > 1.0).count();
@@ -71,7 +71,7 @@ impl RunSummary {
         let trajectory = Trajectory {
             poses: results.refined.as_deref()?,
             trusted: results.refined_trusted(),
-            states: results.refined_states.as_deref(),
+            tracked: results.refined_tracked(),
             covariances: results.refined_covariances.as_deref(),
         };
         Some(Self::of_trajectory(results, &trajectory, |row| {
@@ -87,8 +87,8 @@ impl RunSummary {
         trajectory: &Trajectory,
         agreement: impl Fn(usize) -> Option<f64>,
     ) -> Self {
-        let (states, trusted) = (trajectory.states, &trajectory.trusted);
-        let is_tracked = |row: usize| states.is_none_or(|s| s[row] == State::Tracking as u8);
+        let (states, trusted) = (trajectory.tracked.as_deref(), &trajectory.trusted);
+        let is_tracked = |row: usize| states.is_none_or(|tracked| tracked[row]);
         let tracked: Vec<usize> = (0..results.len()).filter(|&row| is_tracked(row)).collect();
         let over_tracked = |value: &dyn Fn(usize) -> Option<f64>| {
             let values: Vec<f64> = tracked.iter().filter_map(|&row| value(row)).collect();
@@ -107,7 +107,7 @@ impl RunSummary {
         Self {
             frames: results.len(),
             tracking: states.map(|_| tracked.len()),
-            filled: Some(filled.count()).filter(|&count| count > 0),
+            filled: states.map(|_| filled.count()),
             first_tracked: states.and_then(|_| Some(results.frames[*tracked.first()?])),
             ambiguous: None,
             path_m,
@@ -118,10 +118,10 @@ impl RunSummary {
         }
     }
 
-    /// Whether at least half of the frames have a pose that is trusted; `None` where no states are known.
+    /// Whether at least half of the frames were tracked, without those that were filled back; `None` where no states are known.
     pub fn localized(&self) -> Option<bool> {
-        let trusted = self.tracking? + self.filled.unwrap_or_default();
-        Some(trusted > 0 && 2 * trusted >= self.frames)
+        let tracked = self.tracking?;
+        Some(tracked > 0 && 2 * tracked >= self.frames)
     }
 
     /// Place and duration of the tracking, and how sure it is of itself, in a sentence.
@@ -135,16 +135,20 @@ impl RunSummary {
             _ => String::new(),
         };
         let several = match self.ambiguous {
-            Some(count @ 1..) => {
+            Some(1) => " In 1 frame the car may have been in several places.".to_owned(),
+            Some(count @ 2..) => {
                 format!(" In {count} frames the car may have been in several places.")
             }
             _ => String::new(),
         };
-        let filled = self.filled.map_or_else(String::new, |count| {
-            format!(
+        let filled = match self.filled.unwrap_or_default() {
+            0 => String::new(),
+            1 => " The frame before it was filled back by the odometry and agrees with the map."
+                .to_owned(),
+            count => format!(
                 " {count} frames before it were filled back by the odometry and agree with the map."
-            )
-        });
+            ),
+        };
         match (self.first_tracked, self.tracking) {
             (Some(first), Some(tracking)) => format!(
                 "Found in frame {first}, tracking in {tracking} of {} frames{sure}.{filled}{several}",
@@ -165,7 +169,7 @@ impl RunSummary {
         metrics! {
             "frames" [""] self.frames, "number of localized frames";
             "tracking" [""] self.tracking, "number of frames in which the filter was tracking";
-            "filled" [""] self.filled, "number of frames before the first tracked one whose poses follow from it by the odometry, and agree with the map";
+            "filled" [""] self.filled.filter(|&count| count > 0), "number of frames before the first tracked one whose poses follow from it by the odometry, and agree with the map";
             "first tracked frame" [""] self.first_tracked, "number of the first frame in which the filter was tracking";
             "ambiguous" [""] self.ambiguous.filter(|&count| count > 0), "number of frames in which the car may have been in several places";
             "path" ["m"] self.path_m, "length of the path along the poses that are trusted, across gaps by the straight line";
@@ -181,6 +185,7 @@ impl RunSummary {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::localization::State;
 
     #[test]
     fn a_speed_needs_times_that_were_recorded() {
@@ -200,6 +205,39 @@ mod tests {
         assert_eq!(speed([7.0, 7.5, 8.0], false), Some(4.0));
         // Recorded ones may be ten per second, too.
         assert!((speed([0.1, 0.2, 0.3], false).unwrap() - 20.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn less_than_half_tracked_is_not_localized_however_many_frames_are_filled_back() {
+        let states = |tracking: std::ops::Range<usize>| -> Vec<u8> {
+            let state = |row: usize| u8::from(tracking.contains(&row));
+            (0..30).map(state).collect()
+        };
+        let estimates = vec![Pose2::identity(); 30];
+        let mut results = LocalizationResults {
+            frames: (0..30).collect(),
+            states: Some(states(1..15)),
+            trajectory_states: Some(states(0..15)),
+            ..LocalizationResults::default()
+        };
+        let summary = RunSummary::of(&results, &estimates);
+        assert_eq!((summary.tracking, summary.filled), (Some(14), Some(1)));
+        assert_eq!(summary.localized(), Some(false));
+        // Also where the filled ones are part of a refined trajectory that has no scan of them.
+        results.refined = Some(estimates.clone());
+        results.refined_states = Some(states(0..15));
+        let mut costs_m = vec![[0.2, 0.1]; 30];
+        costs_m[0] = [-1.0; 2];
+        results.refinement_costs_m = Some(costs_m.clone());
+        let refined = |results: &_| RunSummary::of_refined(results).unwrap();
+        assert_eq!(refined(&results).filled, Some(1));
+        assert_eq!(refined(&results).localized(), Some(false));
+        costs_m[0] = [0.2, 0.1];
+        results.refinement_costs_m = Some(costs_m);
+        assert_eq!(refined(&results).localized(), Some(true));
+        results.states = Some(states(0..15));
+        assert_eq!(RunSummary::of(&results, &estimates).localized(), Some(true));
+        assert_eq!(State::Tracking as u8, 1);
     }
 
     #[test]

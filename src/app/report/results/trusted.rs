@@ -12,6 +12,22 @@ impl LocalizationResults {
         self.tracking(self.trajectory_states())
     }
 
+    /// Whether the filter was tracking in each frame, where its states are known.
+    pub fn tracked(&self) -> Option<Vec<bool>> {
+        (self.states.as_ref()).map(|states| self.tracking(Some(states)))
+    }
+
+    /// Whether the refined pose of each frame was tracked or registered in the map: all that are trusted but those that
+    /// the filter did not track and no refinement compared with the map, which were filled back.
+    pub fn refined_tracked(&self) -> Option<Vec<bool>> {
+        let mut tracked = self.tracking(Some(self.refined_states.as_ref()?));
+        let of_filter = self.tracking(self.states.as_ref());
+        for (row, [before_m, _]) in self.refinement_costs_m.iter().flatten().enumerate() {
+            tracked[row] &= of_filter[row] || *before_m >= 0.0;
+        }
+        Some(tracked)
+    }
+
     /// States of the trajectory of the filter, where any are known.
     pub fn trajectory_states(&self) -> Option<&Vec<u8>> {
         self.trajectory_states.as_ref().or(self.states.as_ref())
@@ -58,7 +74,7 @@ impl LocalizationResults {
 
 /// Poses of which those that are not trusted are gaps: not a number, which pictures leave out.
 pub fn with_gaps(poses: &[Pose2], trusted: &[bool]) -> Vec<Pose2> {
-    let gap = Pose2::translation(f64::NAN, f64::NAN);
+    let gap = Pose2::new([f64::NAN; 2].into(), f64::NAN);
     (poses.iter().zip(trusted))
         .map(|(pose, &is_trusted)| if is_trusted { *pose } else { gap })
         .collect()
@@ -101,9 +117,11 @@ mod tests {
             trusted_distances_m(&poses, &trusted),
             [0.0, 0.0, 1.0, 1.0, 4.0, 4.0]
         );
-        let is_gap = with_gaps(&poses, &trusted);
-        let is_gap = is_gap.iter().map(|pose| !pose.translation.x.is_nan());
-        assert!(is_gap.eq(trusted));
+        let with_gaps = with_gaps(&poses, &trusted);
+        for (pose, is_trusted) in with_gaps.iter().zip(trusted) {
+            let numbers = [pose.translation.x, pose.rotation.angle()];
+            assert_eq!(numbers.map(|it| !it.is_nan()), [is_trusted; 2]);
+        }
     }
 
     #[test]
