@@ -305,6 +305,15 @@ fn outputs_of_maps_and_drives_have_the_documented_keys() {
         "poses.txt",
     ];
     let both = printed("build-map", call(&recording, "build-map", &onto));
+    // Each drive has its length, without the jump between them.
+    let length_m = |report: &Value, key: &str| report[key].as_f64().unwrap();
+    let older_m = length_m(&build, "path_m");
+    assert!((5.5..6.6).contains(&older_m) && build["older_path_m"].is_null());
+    assert!(
+        (length_m(&both, "older_path_m") - older_m).abs() < 1e-3,
+        "{both}"
+    );
+    assert!((length_m(&both, "path_m") - 6.5).abs() < 0.1, "{both}");
     assert!(
         both["changes"]["gone_m2"]
             .as_f64()

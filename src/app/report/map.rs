@@ -15,8 +15,8 @@ use crate::app::run::Printed;
 use crate::evaluation::map_quality::ResidualSums;
 use crate::evaluation::{MapQuality, TruthAgreement};
 use crate::geometry::{Pose2, Pose3, distances_m, pose2_from_pose3};
+use crate::map::LocalMapCounts;
 use crate::map::mesh_view::{MeshView, Without, reduced};
-use crate::map::{LocalMapCounts, MappingPath};
 use crate::mapping::TrajectorySummary;
 use crate::sensor::Sensor;
 
@@ -35,15 +35,17 @@ pub struct BuildReport {
     pub trajectory: Option<TrajectorySummary>,
     /// What changed in the older map, where there is one.
     pub changes: Option<ChangesReport>,
-    /// Length of the path of the mapped scans [m].
+    /// Length of the path of the mapped scans of this drive [m].
     pub path_m: f64,
+    /// Length of the path in the older map, where there is one [m].
+    pub older_path_m: Option<f64>,
     /// Triangles of the map.
     pub triangles: usize,
     /// Size of the map's file [MB].
     pub map_mb: f64,
-    /// Triangles per 100 m of path.
+    /// Triangles per 100 m of path, that of the older map included.
     pub triangles_per_100m: f64,
-    /// Megabytes per 100 m of path.
+    /// Megabytes per 100 m of path, that of the older map included.
     pub mb_per_100m: f64,
     /// Edge of the finest octree cells, the largest of the local maps [m].
     pub octree_cell_m: f32,
@@ -60,23 +62,24 @@ pub struct BuildReport {
 }
 
 impl BuildReport {
-    /// The report of a written map: its size, per length of its path, and the time since the build started.
+    /// The report of a written map: its size, per length of the paths of this drive and of an older map, and the time since
+    /// the build started.
     pub fn new(
         meshes: &[&dyn MeshView],
         local_maps: Vec<LocalMapCounts>,
-        path: &MappingPath,
+        (path, older_path): (&[Pose3], Option<&[Pose3]>),
         mesh_file: &Path,
         started: Instant,
     ) -> Self {
-        let path_m = distances_m(&path.map_from_lidar)
-            .last()
-            .copied()
-            .unwrap_or_default();
+        let length_m = |path: &[Pose3]| distances_m(path).last().copied().unwrap_or_default();
+        let (path_m, older_path_m) = (length_m(path), older_path.map(length_m));
+        let all_m = path_m + older_path_m.unwrap_or_default();
         let map_mb = std::fs::metadata(mesh_file).map_or(0.0, |file| file.len() as f64 / 1e6);
-        let per_100m = |amount: f64| 100.0 * amount / f64::max(path_m, 1.0);
+        let per_100m = |amount: f64| 100.0 * amount / f64::max(all_m, 1.0);
         let triangles = meshes.iter().map(|mesh| mesh.triangles()).sum();
         Self {
             path_m,
+            older_path_m,
             triangles,
             octree_cell_m: (local_maps.iter()).fold(0.0, |largest, it| it.cell_m.max(largest)),
             local_maps,
@@ -107,6 +110,8 @@ impl BuildReport {
                 [("scans", scans), ("path", format!("{:.1} m", self.path_m))],
             );
             rows.insert(3, ("rate", format!("{rate:.1} scans/s")));
+            let older = self.older_path_m.map(|path_m| format!("{path_m:.1} m"));
+            rows.splice(2..2, older.map(|older| ("older path", older)));
         }
         rows.extend(self.changes.iter().flat_map(ChangesReport::rows));
         rows.extend(self.quality_rows());

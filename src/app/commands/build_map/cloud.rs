@@ -47,7 +47,7 @@ pub fn run(config: &BuildMapConfig, cloud_file: &Path, context: &Context) -> Res
     let counts = blocks.iter().map(|block| block.counts.clone()).collect();
     let report = BuildReport {
         stage_seconds: stages.finish(),
-        ..BuildReport::new(&meshes, counts, &path, &config.mesh_file, started)
+        ..BuildReport::new(&meshes, counts, (&[], None), &config.mesh_file, started)
     };
     files::finish(config, &report, &mut claims)?;
     Ok(report)

@@ -4,6 +4,7 @@ use super::older::OlderMap;
 use super::opened::Opened;
 use super::parts::Joined;
 use crate::app::report::map::ChangesReport;
+use crate::geometry::Pose3;
 use crate::map::MappingPath;
 use crate::map::mesh_view::{MeshView, Without};
 use crate::mapping::poses_of;
@@ -36,6 +37,13 @@ impl<'a> JoinedMap<'a> {
             added: joined.meshes.iter().map(|mesh| mesh as _).collect(),
             path: older.map_or_else(new, |older| older.path.extended_by(&poses)),
         }
+    }
+
+    /// The poses of the scans, and those of the older map, where there is one.
+    pub fn drives(&self) -> (&[Pose3], Option<&[Pose3]>) {
+        let older = self.older.as_ref().map(|(it, _)| &it.path.map_from_lidar);
+        let (before, scans) = (self.path.map_from_lidar).split_at(older.map_or(0, Vec::len));
+        (scans, older.map(|_| before))
     }
 
     /// All meshes of the map.

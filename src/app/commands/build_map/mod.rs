@@ -74,7 +74,13 @@ fn run_with_scans(config: &BuildMapConfig, role: Role, context: &Context) -> Res
         stage_seconds: progress.finish(),
         quality: residuals.quality(),
         truth,
-        ..BuildReport::new(&meshes, local_maps, path, &config.mesh_file, started)
+        ..BuildReport::new(
+            &meshes,
+            local_maps,
+            map.drives(),
+            &config.mesh_file,
+            started,
+        )
     };
     files::finish(config, &report, &mut claims)?;
     opened.parts.remove()?;
