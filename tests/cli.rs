@@ -68,6 +68,9 @@ fn wrong_usage_has_exit_code_2() {
         .with("-q")
         .with("-v")
         .rejects_usage_with(&["cannot be used with"]);
+    // An argument is no line of its own.
+    let output = fpmcl("localize").with("--threads=1\n2");
+    output.rejects_usage_with(&[r"1\n2"]);
 }
 
 #[test]

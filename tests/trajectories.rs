@@ -391,6 +391,13 @@ fn the_truth_may_be_a_body_on_which_the_lidar_is_mounted_or_a_topic_of_a_bag() {
     fs::write(folder.path("drive.mcap"), bag).unwrap();
     let call = folder.evaluate("lidar.txt", "/odom").with("--recording");
     assert!(largest_error(call.with("drive.mcap")) < 1e-4);
+    // The advice is an option that the command has.
+    let call = fpmcl("evaluate")
+        .in_folder(folder.0.path())
+        .with("lidar.txt");
+    let call = call.with("--recording").with("drive.mcap");
+    let output = call.fails_with(&["has poses in /odom", "name it with --truth"]);
+    assert!(!output.stderr.contains("--poses"), "{}", output.stderr);
 }
 
 #[test]

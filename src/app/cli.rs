@@ -19,7 +19,7 @@ use crate::app::comparison::ComparisonConfig;
 use crate::app::comparison::compare::{self, CompareArgs};
 use crate::app::report::Report;
 use crate::app::run::arguments::{configured, with_flags};
-use crate::app::run::{Context, Form, MachineArgs, Printed, RunArgs};
+use crate::app::run::{Context, Form, MachineArgs, Printed, RunArgs, failure};
 use crate::app::settings::{
     self, BuildMapConfig, CommandConfig, EvaluationConfig, GroundCommandConfig, LocalizationConfig,
     OdometryCommandConfig, RefinementConfig,
@@ -258,6 +258,16 @@ impl Command {
             Self::Export(args) => args.machine(),
             Self::Info(args) => args.machine(),
             _ => MachineArgs::default(),
+        }
+    }
+
+    /// The option that names poses, or a topic of them; of `refine` a key.
+    pub fn option_of_poses(&self) -> &'static str {
+        match self {
+            Self::Evaluate(_) => "--truth",
+            Self::Localize(_) => "--odometry",
+            Self::Refine(_) => "--set odometry_file=",
+            _ => failure::POSES,
         }
     }
 

@@ -20,6 +20,7 @@ use std::path::PathBuf;
 use clap::Parser as _;
 
 use cli::Cli;
+use run::visible::visible_in_line;
 use run::{Context, arguments, failure, output};
 
 /// The program: parses a command line, whose first argument is the name of the program, starts logging, runs the
@@ -27,13 +28,17 @@ use run::{Context, arguments, failure, output};
 pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     let arguments: Vec<OsString> = arguments.into_iter().collect();
     if let Err(error) = arguments::require_text(&arguments) {
-        failure::report(&error);
+        failure::report(&error, failure::POSES);
         return 1;
     }
-    let cli = match Cli::try_parse_from(arguments) {
+    let cli = match Cli::try_parse_from(&arguments) {
         Ok(cli) => cli,
         Err(error) if error.use_stderr() => {
-            failure::report_usage(&error);
+            // The same error, in which each argument is in one line.
+            let shown = arguments
+                .iter()
+                .map(|it| visible_in_line(&it.to_string_lossy()).into_owned());
+            failure::report_usage(&Cli::try_parse_from(shown).err().unwrap_or(error));
             return 2;
         }
         Err(help) => help.exit(),
@@ -47,7 +52,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     match run() {
         Ok(code) => code,
         Err(error) => {
-            failure::report(&error);
+            failure::report(&error, cli.command.option_of_poses());
             failure::exit_code(&error)
         }
     }

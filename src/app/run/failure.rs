@@ -3,16 +3,17 @@
 use std::io::Write as _;
 
 use super::interrupt::Interrupted;
+pub use super::remedy::POSES;
 use super::remedy::remedies;
 use super::visible::{visible, visible_in_line};
 
 /// Exit code of a run whose result is kept, but of which less than half of the frames were localized.
 pub const NOT_LOCALIZED: u8 = 3;
 
-/// Prints an error with its causes and remedies on standard error.
-pub fn report(error: &anyhow::Error) {
+/// Prints an error with its causes and remedies on standard error; `option` is that of the command that names poses.
+pub fn report(error: &anyhow::Error, option: &str) {
     let mut text = format!("error: {}", format_error_chain(error));
-    for remedy in remedies(error) {
+    for remedy in remedies(error, option) {
         text += &format!("; {remedy}");
     }
     text += "\n";

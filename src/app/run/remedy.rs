@@ -15,9 +15,13 @@ use crate::rendering::RenderError;
 use crate::sensor::SensorError;
 use crate::simulation::SimulationError;
 
-/// The remedies for an error and its causes, each once.
-pub fn remedies(error: &anyhow::Error) -> Vec<&'static str> {
-    let mut remedies: Vec<&str> = error.chain().filter_map(remedy).collect();
+/// The option of a command that names poses.
+pub const POSES: &str = "--poses";
+
+/// The remedies for an error and its causes, each once; `option` is that of the command that names poses.
+pub fn remedies(error: &anyhow::Error, option: &str) -> Vec<String> {
+    let remedies = error.chain().filter_map(remedy);
+    let mut remedies: Vec<String> = remedies.map(|it| it.replace(POSES, option)).collect();
     remedies.dedup();
     remedies
 }
@@ -40,8 +44,8 @@ fn remedy(error: &(dyn Error + 'static)) -> Option<&'static str> {
         RecordingError::SeveralTopics { .. } => {
             Some("name it with the key topic (scans) or with --poses (poses)")
         }
-        RecordingError::TopicNotNamed { .. } => Some("name it with --poses, or in pose_file"),
-        RecordingError::NoPoseFile { .. } => Some("name it with --poses, or in pose_file"),
+        RecordingError::TopicNotNamed { .. } => Some("name it with --poses"),
+        RecordingError::NoPoseFile { .. } => Some("name it with --poses"),
         RecordingError::NoMounting { .. } => Some("--poses names a file of poses"),
         _ => None,
     };
@@ -131,8 +135,8 @@ mod tests {
             (of_file.into(), "--memory sets the budget"),
         ] {
             let error = error.context("while localizing");
-            assert_eq!(remedies(&error), [expected]);
+            assert_eq!(remedies(&error, POSES), [expected]);
         }
-        assert!(remedies(&anyhow::anyhow!("else")).is_empty());
+        assert!(remedies(&anyhow::anyhow!("else"), POSES).is_empty());
     }
 }
