@@ -24,6 +24,7 @@ mod named;
 pub(crate) mod own_car;
 pub(crate) mod projection;
 pub(crate) mod rotation;
+mod units;
 
 use std::fmt;
 
@@ -47,6 +48,8 @@ use crate::validation::{InvalidValue, Validate, nested, positive, rectangle};
 pub struct Sensor {
     /// Projection: rows are the beams that returned, or pixels of about the spacing of the points if there
     /// are no rows.
+    #[serde(with = "units")]
+    #[cfg_attr(feature = "configuration", schemars(with = "units::RangeImageInUnits"))]
     pub range_image: LidarModel,
     /// Whether each beam keeps its elevation, as those of spinning sensors do.
     pub has_rows: bool,

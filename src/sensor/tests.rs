@@ -350,3 +350,27 @@ fn every_point_is_in_the_image_or_counted_with_its_reason() {
     counts.points += 3;
     assert_eq!(counts.above(0.2)[0].0, DropReason::OutsideImage);
 }
+
+#[test]
+fn keys_of_a_sensor_have_units_and_those_of_earlier_maps_are_read() {
+    let sensor = Sensor::new(LidarModel {
+        elevations: Some([3.0, -2.0].into()),
+        ..LidarModel::default()
+    });
+    let json = serde_json::to_string(&sensor).unwrap();
+    let mut earlier = json.clone();
+    for (key, unit) in [
+        ("fov_up", "deg"),
+        ("fov_down", "deg"),
+        ("max_range", "m"),
+        ("min_range", "m"),
+        ("elevations", "deg"),
+    ] {
+        let in_units = format!("\"{key}_{unit}\":");
+        assert!(json.contains(&in_units), "{json}");
+        earlier = earlier.replace(&in_units, &format!("\"{key}\":"));
+    }
+    for text in [json, earlier] {
+        assert_eq!(serde_json::from_str::<Sensor>(&text).unwrap(), sensor);
+    }
+}
