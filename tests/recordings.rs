@@ -256,3 +256,42 @@ fn times_of_exactly_ten_scans_per_second_are_matched_where_they_were_recorded() 
         "give times",
     ]);
 }
+
+#[test]
+fn info_has_the_period_of_the_sensor_and_where_the_times_are_from() {
+    // Of twenty scans, every second one is read.
+    const FRAMES: usize = 20;
+    let recording = Recording::street(FRAMES);
+    let info = |path: &str| {
+        let call = || fpmcl("info").in_folder(recording.folder()).with(path);
+        let output = call().with("--json").succeeds();
+        let found: serde_json::Value = serde_json::from_str(&output.stdout).unwrap();
+        (found, output.stderr, call().succeeds().stdout)
+    };
+    let (found, _, text) = info(".");
+    assert!(found["sensor"]["period_s"].is_null() && found["times_from"].is_null());
+    assert!(text.contains("there are no times"), "{text}");
+
+    let times = (0..FRAMES).map(|k| format!("{:.1}\n", 7.0 + 0.1 * k as f64));
+    recording.write("times.txt", &times.collect::<String>());
+    let (found, _, text) = info(".");
+    let period_s = |found: &serde_json::Value| found["sensor"]["period_s"].as_f64().unwrap();
+    assert!((period_s(&found) - 0.1).abs() < 1e-6, "{found}");
+    assert_eq!(found["times_from"], "./times.txt");
+    assert!(text.contains("in ./times.txt"), "{text}");
+
+    fs::create_dir(recording.path("named")).unwrap();
+    for frame in 0..FRAMES {
+        let name = format!("named/{:.2}.bin", 1_700_000_000.0 + 0.05 * frame as f64);
+        let scan = recording.path(&format!("velodyne/{frame:06}.bin"));
+        fs::rename(scan, recording.path(&name)).unwrap();
+    }
+    let (found, said, text) = info("named");
+    assert!((period_s(&found) - 0.05).abs() < 1e-6, "{found}");
+    assert_eq!(found["times_from"], "names");
+    assert!(
+        said.contains("the times of the scans are those in their names"),
+        "{said}"
+    );
+    assert!(text.contains("in the names of the scans"), "{text}");
+}

@@ -32,7 +32,7 @@ pub use calibration::Calibration;
 pub use error::RecordingError;
 pub use frame::{Frame, ScanSource};
 pub use layout::{Layout, RecordingFiles};
-pub use open::Recording;
+pub use open::{Recording, TimeSource};
 pub use poses::{read_times, read_tum, write_kitti, write_times, write_tum};
 pub use scan_files::read as read_scan;
 pub use scan_list::Selection;

@@ -1,5 +1,6 @@
 //! A recording: its selected scans with their times.
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -20,6 +21,27 @@ use crate::lidar::{Rotation, Scan};
 /// Revolutions per second of the sensor, for recordings without times.
 const SCANS_PER_SECOND: f64 = 10.0;
 
+/// Where the times of scans are from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum TimeSource {
+    /// The names of the files of the scans.
+    Names,
+    /// A file: of times, or of poses with a row per scan.
+    File(PathBuf),
+    /// The messages of a bag.
+    Messages,
+}
+
+impl fmt::Display for TimeSource {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Names => formatter.write_str("names"),
+            Self::File(path) => write!(formatter, "{}", path.display()),
+            Self::Messages => formatter.write_str("messages"),
+        }
+    }
+}
+
 /// A recording with its selected frames.
 #[derive(Clone, Debug)]
 pub struct Recording {
@@ -31,6 +53,8 @@ pub struct Recording {
     pub scans: usize,
     /// Whether the times were recorded; otherwise ten scans per second are assumed.
     pub has_times: bool,
+    /// Where recorded times are from; `None` if there are none, and of scans in memory.
+    pub time_source: Option<TimeSource>,
     /// The selected frames, ascending.
     pub frames: Vec<Frame>,
     /// The frames that are not selected between the first and the last of these, ascending.
@@ -80,11 +104,16 @@ impl Recording {
         let files = RecordingFiles::find(path);
         let scans = scan_list::scan_files(&files.scans)?;
         let rows = scans.last().map_or(0, |last| last.number + 1);
-        let recorded_s = match scans[0].time_s {
-            Some(_) => None,
-            None => recorded_times(&files, rows)?,
+        let (time_source, recorded_s) = if scans[0].time_s.is_some() {
+            tracing::info!("the times of the scans are those in their names");
+            (Some(TimeSource::Names), None)
+        } else {
+            let found = recorded_times(&files, rows)?;
+            found
+                .map(|(path, times_s)| (TimeSource::File(path), times_s))
+                .unzip()
         };
-        let has_times = recorded_s.is_some() || scans[0].time_s.is_some();
+        let has_times = time_source.is_some();
         let count = scans.len();
         let frame = |scan: ScanFile| {
             let row = || recorded_s.as_ref()?.get(scan.number).copied();
@@ -108,6 +137,7 @@ impl Recording {
         }
         Ok(Self {
             path: path.to_owned(),
+            time_source,
             skipped,
             ..Self::new(files, count, has_times, frames)
         })
@@ -138,6 +168,7 @@ impl Recording {
         let (frames, skipped) = selection.of(frames, |frame: &Frame| frame.number, path)?;
         Ok(Self {
             path: path.to_owned(),
+            time_source: Some(TimeSource::Messages),
             skipped,
             bag: Some((bag, topic)),
             ..Self::new(RecordingFiles::bag(path), times_s.len(), true, frames)
@@ -165,6 +196,7 @@ impl Recording {
             files,
             scans,
             has_times,
+            time_source: None,
             frames,
             skipped: vec![],
             track: None,
@@ -354,15 +386,19 @@ fn moment_after_stamp_s(source: &ScanSource) -> Result<f64, RecordingError> {
     Ok(later_s.map_or(0.0, |(moment_s, stamp_s)| moment_s - stamp_s))
 }
 
-/// The times of scans [s]: of the recording's file of times, else of one in the folder above or of its poses, where these have
-/// as many rows as the scans need.
-fn recorded_times(files: &RecordingFiles, rows: usize) -> Result<Option<Vec<f64>>, RecordingError> {
+/// The times of scans [s] and their file: of the recording's file of times, else of one in the folder above or of its poses,
+/// where these have as many rows as the scans need.
+fn recorded_times(
+    files: &RecordingFiles,
+    rows: usize,
+) -> Result<Option<(PathBuf, Vec<f64>)>, RecordingError> {
+    let ascending = |path: &Path, times_s| Ok(Some((path.to_owned(), ascending(path, times_s)?)));
     if let Some(path) = &files.times {
         let times_s = match files.layout {
             Layout::KittiRaw => read_timestamps(path)?,
             _ => read_times(path)?,
         };
-        return ascending(path, times_s).map(Some);
+        return ascending(path, times_s);
     }
     let is_fitting = |times_s: &Vec<f64>| times_s.len() == rows;
     let above = files
@@ -382,7 +418,7 @@ fn recorded_times(files: &RecordingFiles, rows: usize) -> Result<Option<Vec<f64>
         return Ok(None);
     };
     tracing::info!("the times of the scans are those of {}", path.display());
-    ascending(path, times_s).map(Some)
+    ascending(path, times_s)
 }
 
 #[cfg(test)]
@@ -465,6 +501,8 @@ mod tests {
             "cloud_1317384506_5000000.bin",
             "cloud_1317384506_40000000.bin",
         ]);
+        let opened = Recording::open(named.path().join("inner")).unwrap();
+        assert_eq!(opened.time_source, Some(TimeSource::Names));
         assert_eq!(
             times_of(&named),
             (vec![1317384506.005, 1317384506.04], true)

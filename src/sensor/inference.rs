@@ -92,7 +92,7 @@ impl Sensor {
         if known.motion_compensation.is_none() {
             scans.iter_mut().for_each(|scan| scan.times_s.clear());
         }
-        let mut sensor = Self::infer(&scans, known)?;
+        let mut sensor = Self::infer_spread(recording, &scans, known)?;
         tracing::info!("sensor: {sensor}");
         sensor.warn_of_dropped_points(&scans);
         if is_auto && scans.iter().all(|scan| scan.times_s.is_empty()) {
@@ -104,6 +104,19 @@ impl Sensor {
             sensor.motion_compensation = compared.as_ref().and_then(fitting_rotation);
         }
         Ok(sensor)
+    }
+
+    /// The sensor of [`spread_scans`] of a recording, whose times show the period where those of the points do not.
+    pub(crate) fn infer_spread(
+        recording: &Recording,
+        scans: &[Scan],
+        known: &SensorConfig,
+    ) -> Result<Self, SensorError> {
+        let sensor = Self::infer(scans, known)?;
+        Ok(Self {
+            period_s: sensor.period_s.or_else(|| period_s(recording)),
+            ..sensor
+        })
     }
 
     /// The sensor of a configuration from which nothing about range images, rows and own car is missing.
@@ -159,7 +172,7 @@ impl Sensor {
         let Some(compensation) = self.motion_compensation else {
             return recording.compensated();
         };
-        let rotation = compensation.rotation(period_s(&recording));
+        let rotation = compensation.rotation(period_s(&recording).unwrap_or(PERIOD_S));
         recording.rotating(rotation)
     }
 
@@ -244,17 +257,11 @@ pub fn spread_scans(recording: &Recording) -> Result<Vec<Scan>, RecordingError> 
     frames.map(Frame::read).collect()
 }
 
-/// Duration of a revolution: the time between scans with consecutive numbers, if that is plausible [s].
-fn period_s(recording: &Recording) -> f64 {
-    let [first, .., last] = recording.frames.as_slice() else {
-        return PERIOD_S;
-    };
-    let period_s = (last.time_s - first.time_s) / (last.number - first.number) as f64;
-    if recording.has_times && (0.03..0.3).contains(&period_s) {
-        period_s
-    } else {
-        PERIOD_S
-    }
+/// Duration of a revolution: the time between scans with consecutive numbers, if it was recorded and is plausible [s].
+fn period_s(recording: &Recording) -> Option<f64> {
+    let frames = recording.frames.iter();
+    let numbered: Vec<_> = frames.map(|frame| (frame.number, frame.time_s)).collect();
+    rotation::interval_s(&numbered).filter(|_| recording.has_times)
 }
 
 /// The rotation that makes consecutive scans fit best; `None` if they fit best as they are, or if nothing shows it.
@@ -323,7 +330,7 @@ fn timings_of_recording(recording: &Recording) -> Result<Option<TimingComparison
         return Ok(None);
     }
     let scans: Vec<Scan> = run.iter().map(Frame::read).collect::<Result<_, _>>()?;
-    timings_of(&scans, period_s(recording))
+    timings_of(&scans, period_s(recording).unwrap_or(PERIOD_S))
 }
 
 /// Compares the times of points by the distances between consecutive scans; `None` if the data have times, or if

@@ -9,22 +9,26 @@ use super::beam::angles;
 use crate::lidar::{RotationDirection, Scan};
 use crate::statistics::median;
 
-/// Frames per second of sensors, at least and at most [s].
+/// Shortest and longest period of sensors [s].
 const PERIODS_S: std::ops::RangeInclusive<f64> = 0.019..=0.22;
 
-/// Duration of a revolution or frame: the time in which the points of a scan were measured if they surround the
-/// sensor, else the interval of the scans.
+/// Duration of a revolution: the time in which the points of a scan were measured, if they surround the sensor.
 pub fn period_s(scans: &[Scan], horizontal_fov_deg: f32) -> Option<f64> {
     let sweeps = scans.iter().filter_map(|scan| {
         let (first, last) = bounds(scan)?;
         (horizontal_fov_deg == 360.0).then_some(last - first)
     });
-    let times: Vec<f64> = scans.iter().filter_map(|scan| scan.time_s).collect();
-    let intervals = times.windows(2).map(|pair| pair[1] - pair[0]);
-    [median(sweeps), median(intervals)]
-        .into_iter()
-        .flatten()
-        .find(|period_s| PERIODS_S.contains(period_s))
+    median(sweeps).filter(|period_s| PERIODS_S.contains(period_s))
+}
+
+/// Duration of a revolution or frame: the interval between scans with consecutive numbers, of scans with their numbers
+/// and times, ascending [s].
+pub fn interval_s(numbered: &[(usize, f64)]) -> Option<f64> {
+    let intervals = numbered.windows(2).map(|pair| {
+        let [(before, before_s), (number, time_s)] = [pair[0], pair[1]];
+        (time_s - before_s) / (number - before) as f64
+    });
+    median(intervals).filter(|period_s| PERIODS_S.contains(period_s))
 }
 
 /// Sense of rotation by the times of the points.

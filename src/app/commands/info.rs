@@ -21,7 +21,7 @@ use crate::map::MapCache;
 use crate::map::files::ply;
 use crate::map::tiles::contents::{self, CacheKind};
 use crate::map::unit_doubt;
-use crate::recording::{PoseTrack, Recording, Selection, scan_files};
+use crate::recording::{PoseTrack, Recording, Selection, TimeSource, scan_files};
 use crate::sensor::{BeamSource, Sensor, SensorConfig, spread_scans};
 use crate::validation::{InvalidValue, Validate};
 
@@ -106,6 +106,8 @@ pub struct RecordingInfo {
     last_scan: usize,
     /// Time between the first and the last scan [s]; `None` without times.
     duration_s: Option<f64>,
+    /// Where the times are from: `names` of the scans, `messages` of a bag, or a file; `None` without times.
+    times_from: Option<String>,
     /// Mean number of points of a scan.
     points_per_scan: usize,
     /// Fields of the points: x, y and z, and those of intensity, ring and time that there are.
@@ -151,9 +153,10 @@ fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
         first_scan: first.number,
         last_scan: last.number,
         duration_s: has_times.then_some(last.time_s - first.time_s),
+        times_from: recording.time_source.as_ref().map(TimeSource::to_string),
         points_per_scan: points,
         fields: fields(&scans[0]),
-        sensor: Sensor::infer(&scans, &SensorConfig::default())?,
+        sensor: Sensor::infer_spread(&recording, &scans, &SensorConfig::default())?,
         poses,
         poses_problem: problem,
     };
@@ -162,9 +165,14 @@ fn recording(path: &Path, topic: Option<&str>) -> Result<Printed> {
 
 impl RecordingInfo {
     fn rows(&self) -> Vec<(&'static str, String)> {
+        let times = match self.times_from.as_deref().unwrap_or_default() {
+            "names" => "the names of the scans",
+            "messages" => "the messages",
+            path => path,
+        };
         let duration = self.duration_s.map_or_else(
             || "unknown: there are no times, 10 scans per second are assumed".to_owned(),
-            |duration_s| format!("{duration_s:.1} s"),
+            |duration_s| format!("{duration_s:.1} s, by the times in {times}"),
         );
         let scans = format!("{}, {} to {}", self.scans, self.first_scan, self.last_scan);
         let points = format!("{} ({})", self.points_per_scan, in_words(&self.fields));
