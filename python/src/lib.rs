@@ -20,7 +20,6 @@ mod _fpmcl {
     use super::errors::Error;
     #[pymodule_export]
     use super::localizer::{Estimate, Localizer};
-    #[cfg(feature = "program")]
     #[pymodule_export]
     use super::main;
     #[pymodule_export]
@@ -47,4 +46,13 @@ fn main(py: Python<'_>) -> PyResult<u8> {
     let library = py.import("fpmcl._fpmcl")?.getattr("__file__")?;
     let library: std::path::PathBuf = library.extract()?;
     Ok(py.detach(|| fpmcl::main_of_library(arguments, library)))
+}
+
+/// Ends the process with the reason why it has no program: the script of the package exists in spite of it.
+#[cfg(not(feature = "program"))]
+#[pyfunction]
+fn main() -> PyResult<u8> {
+    Err(pyo3::exceptions::PySystemExit::new_err(
+        "error: this package was built without the program; `pip install ./python` builds it with it",
+    ))
 }
