@@ -91,7 +91,9 @@ impl Parts {
         }
         let is_early = |entry: &fs::DirEntry| {
             let name = entry.file_name();
-            name == LOCK_FILE || name.to_string_lossy().starts_with(".fpmcl-")
+            // A full disk may have kept the claim from being written.
+            [LOCK_FILE, CLAIMS_FILE].iter().any(|early| name == *early)
+                || name.to_string_lossy().starts_with(".fpmcl-")
         };
         ensure!(
             Claims::read(&folder)?.key(mesh_file).is_some()
@@ -380,6 +382,26 @@ mod tests {
         parts.save(0, &LocalMap::default(), "").unwrap();
         assert!(parts.finished(0, || Ok("".into())).is_some());
         assert!(parts.joined(1).unwrap().meshes.is_empty());
+    }
+
+    #[test]
+    fn a_folder_whose_claim_a_full_disk_cut_is_used_and_one_with_files_of_others_is_not() {
+        for cut in ["", "unfinished:01", "unfinished:0123 map.p"] {
+            let folder = tempfile::tempdir().unwrap();
+            let map = folder.path().join("map.ply");
+            let claims = folder.path().join("map.ply.parts").join(CLAIMS_FILE);
+            fs::create_dir(claims.parent().unwrap()).unwrap();
+            fs::write(&claims, cut).unwrap();
+            let parts = open(&map, INPUTS).unwrap();
+            parts.save(0, &local_map(0.5), "0123").unwrap();
+            drop(parts);
+            let again = open(&map, INPUTS).unwrap();
+            assert!(again.finished(0, || Ok("0123".into())).is_some(), "{cut}");
+            drop(again);
+            fs::write(&claims, cut).unwrap();
+            let refused = format!("{:#}", open(&map, INPUTS).err().unwrap());
+            assert!(refused.contains("fpmcl did not write"), "{refused}");
+        }
     }
 
     #[test]

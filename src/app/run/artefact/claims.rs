@@ -10,11 +10,12 @@
 //! removed refined_tum.txt       is not claimed any more
 //! ```
 //!
-//! Lines are only appended, so that processes may write to one folder at the same time.
+//! Lines are only appended, so that processes may write to one folder at the same time. A line that a full disk cut, with
+//! no end, counts for nothing.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::{ErrorKind, Read as _, Write as _};
+use std::io::{self, ErrorKind, Read as _, Seek as _, SeekFrom, Write as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context as _, Result, bail, ensure};
@@ -175,7 +176,9 @@ impl Claims {
             text => text.with_context(|| format!("cannot read {}", path.display()))?,
         };
         let mut states = BTreeMap::new();
-        for line in String::from_utf8_lossy(&text).lines() {
+        let text = String::from_utf8_lossy(&text);
+        let whole = text.rsplit_once('\n').map_or("", |(whole, _cut)| whole);
+        for line in whole.lines() {
             match line.split_once(' ') {
                 Some(("removed", name)) => drop(states.remove(name)),
                 Some((state, name)) => drop(states.insert(name.to_owned(), state.to_owned())),
@@ -246,10 +249,20 @@ impl Claims {
         }
         let path = self.folder.join(CLAIMS_FILE);
         check_claimed(&path)
-            .and_then(|()| File::options().append(true).create(true).open(&path))
-            .and_then(|mut file| file.write_all(lines.as_bytes()))
+            .and_then(|()| append(&path, &lines))
             .with_context(|| format!("cannot write {}", path.display()))
     }
+}
+
+/// Appends lines to a file, after the end of one that was cut.
+fn append(path: &Path, lines: &str) -> io::Result<()> {
+    let mut file = (File::options().read(true).append(true).create(true)).open(path)?;
+    let mut last = [b'\n'];
+    if file.seek(SeekFrom::End(-1)).is_ok() {
+        file.read_exact(&mut last)?;
+    }
+    let cut = if last == *b"\n" { "" } else { "\n" };
+    file.write_all(format!("{cut}{lines}").as_bytes())
 }
 
 fn name_of(path: &Path) -> std::borrow::Cow<'_, str> {
