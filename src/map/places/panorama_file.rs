@@ -25,6 +25,8 @@ use crate::shared_bytes::{SharedBytes, pad, ranges_of, write_part};
 
 /// Panoramas rendered at a time.
 pub(crate) const BATCH: usize = 512;
+/// From this number of places on, each tenth that is rendered is logged: about half a minute for all of them.
+const MANY_PLACES: usize = 20_000;
 
 pub(crate) const MAGIC: [u8; 8] = *b"fpmclpan";
 const VERSION: u32 = 1;
@@ -298,6 +300,11 @@ fn render_all<E: From<RenderError>>(
     };
     for first in (0..places).step_by(BATCH) {
         let last = places.min(first + BATCH);
+        let tenths = |count: usize| 10 * count / places;
+        if places >= MANY_PLACES && (first == 0 || tenths(first) > tenths(first - BATCH)) {
+            let percent = 10 * tenths(first);
+            tracing::info!(places, percent, "rendering panoramas of the map");
+        }
         for image in render(first..last)? {
             let image: Vec<u16> = image.iter().map(steps).collect();
             described
