@@ -1,4 +1,4 @@
-//! The pages of the documentation name commands, options, keys and commits that exist.
+//! The pages of the documentation name commands, options, keys, commits and tests that exist.
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
@@ -205,6 +205,34 @@ fn commits_of_the_pages_are_in_the_history() {
     }
     assert!(count > 0, "no page cites a commit");
     assert!(missing.is_empty(), "{}", missing.join("\n"));
+}
+
+#[test]
+fn tests_of_the_page_on_reliability_exist() {
+    let mut sources = String::new();
+    let mut folders = vec![root().join("src"), root().join("tests")];
+    while let Some(folder) = folders.pop() {
+        for path in fs::read_dir(folder).unwrap().map(|it| it.unwrap().path()) {
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|it| it == "rs") {
+                sources += &fs::read_to_string(path).unwrap();
+            }
+        }
+    }
+    let page = fs::read_to_string(root().join("docs/reliability.md")).unwrap();
+    let spans = page.split('`').skip(1).step_by(2);
+    // Names of tests are sentences, with or without their module.
+    let names = spans.filter_map(|span| span.rsplit("::").next());
+    let is_sentence = |name: &&str| {
+        name.matches('_').count() >= 3
+            && (name.bytes()).all(|byte| byte.is_ascii_lowercase() || byte == b'_')
+    };
+    let names: Vec<&str> = names.filter(is_sentence).collect();
+    let is_missing = |name: &&&str| !sources.contains(&format!("fn {name}("));
+    let missing: Vec<&&str> = names.iter().filter(is_missing).collect();
+    assert!(names.len() > 50, "{} tests", names.len());
+    assert!(missing.is_empty(), "{missing:?}");
 }
 
 #[test]
