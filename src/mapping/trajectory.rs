@@ -9,7 +9,7 @@ use crate::lidar::Scan;
 use crate::map::BuildEvent;
 use crate::memory::MemoryBudget;
 use crate::odometry::{
-    ElevationBias, LoopVerdict, StepState, Trajectory, TrajectoryBuilder, TrajectoryConfig,
+    ElevationBias, LoopVerdict, Trajectory, TrajectoryBuilder, TrajectoryConfig,
 };
 use crate::recording::Frame;
 
@@ -129,7 +129,7 @@ impl TrajectorySummary {
         Self {
             scans: steps.len(),
             predicted: (steps.iter())
-                .filter(|step| step.state == StepState::Predicted)
+                .filter(|step| step.state.is_predicted())
                 .count(),
             degenerate: (steps.iter())
                 .filter(|step| !step.degenerate_directions.is_empty())

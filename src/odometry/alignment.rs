@@ -45,8 +45,10 @@ pub struct Alignment {
     pub residual_m: f64,
     /// Share of the points within the gate.
     pub matched_share: f64,
-    /// Mean robust cost of all points, 0 to 1, plus that of the deviation from the prediction.
+    /// Mean robust cost of the points that are not on level surfaces, 0 to 1, plus that of the deviation from the prediction.
     pub cost: f64,
+    /// Share of the points near planes that lie on them, without level ones; `None` where there are too few.
+    pub common_share: Option<f64>,
 }
 
 impl Problem<'_> {
@@ -82,21 +84,27 @@ impl Problem<'_> {
             }
             kernel_m = (SHRINK * kernel_m).max(target_m).min(kernel_m);
         }
+        let (cost, common_share) =
+            self.judge(&pose, SCORE_KERNEL * self.min_kernel_m, &mut matches);
         Some(Alignment {
             odom_from_lidar: pose,
-            cost: self.cost(&pose, SCORE_KERNEL * self.min_kernel_m, &mut matches),
+            cost,
+            common_share,
             ..result?
         })
     }
 
-    /// Mean robust cost of all points at a pose, plus that of the deviation from the prediction.
-    pub fn cost(&self, pose: &Pose3, kernel_m: f64, matches: &mut [Match]) -> f64 {
+    /// Mean robust cost of the points that are not on level surfaces at a pose, plus that of the deviation from the
+    /// prediction; and the share of the points near planes that lie on them.
+    pub fn judge(&self, pose: &Pose3, kernel_m: f64, matches: &mut [Match]) -> (f64, Option<f64>) {
         let deviation = logarithm(&(self.predicted.inverse() * pose));
         let squares = deviation
             .component_mul(&deviation)
             .component_div(&self.prior);
-        let of_points = self.observation.linearize(pose, kernel_m, matches).cost;
-        (of_points + 0.5 * CORRELATED * squares.sum()) / self.observation.points.len().max(1) as f64
+        let equations = self.observation.linearize(pose, kernel_m, matches);
+        let (of_points, count) = equations.cost(self.observation.points.len());
+        let cost = (of_points + 0.5 * CORRELATED * squares.sum()) / count.max(1) as f64;
+        (cost, equations.common_share())
     }
 
     /// Root mean square of the ranges: what a rotation moves a point by [m].
@@ -151,6 +159,7 @@ impl Problem<'_> {
             residual_m: variance.sqrt(),
             matched_share: count as f64 / self.observation.points.len() as f64,
             cost: 1.0,
+            common_share: None,
         };
         (step.iter().all(|value| value.is_finite())).then_some((step, alignment))
     }

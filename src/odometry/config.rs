@@ -36,15 +36,20 @@ pub struct OdometryConfig {
     /// Smallest scale of the robust kernel, in voxels.
     #[default(0.1)]
     pub min_kernel: f64,
-    /// Largest first motion, as a share of the range (unitless).
+    /// Longest motion between two scans that a search finds, as a share of the range (unitless).
     #[default(0.2)]
     pub first_motion_share: f64,
-    /// Largest deviation of a step from the prediction, as a share of the range per 0.1 s (unitless).
-    #[default(0.04)]
-    pub max_deviation_share: f64,
-    /// Largest deviation of a turn from the prediction per 0.1 s [deg].
-    #[default(20.0)]
-    pub max_deviation_deg: f64,
+    /// Largest acceleration of the sensor [m/s²]: in the hand five times that of a fall. A motion that deviates more from
+    /// the prediction is refused once, and taken where the next scan fits as well.
+    #[default(50.0)]
+    pub max_acceleration_m_per_s2: f64,
+    /// The same of its turns [deg/s²]: 20 degrees within 0.1 s.
+    #[default(2000.0)]
+    pub max_turn_acceleration_deg_per_s2: f64,
+    /// Smallest share of the points near upright planes that lie on them, of a step that is accepted (unitless): 0.3 by
+    /// chance; and half of what is usual beyond that. 0: any.
+    #[default(0.4)]
+    pub min_common_share: f64,
     /// Smallest share of matched points of a step that is accepted (unitless).
     #[default(0.3)]
     pub min_matched_share: f64,
@@ -54,8 +59,8 @@ pub struct OdometryConfig {
     /// Largest increase of this cost above the mean of the last steps, 0 to 1 (unitless).
     #[default(0.2)]
     pub max_cost_increase: f64,
-    /// Number of scans in turn that do not fit, after which the local map restarts.
-    #[default(10)]
+    /// Number of scans in turn that do not fit, after which the local map restarts and the motion is unknown.
+    #[default(3)]
     pub restart_after: usize,
 }
 
@@ -74,8 +79,17 @@ impl Validate for OdometryConfig {
         in_range("iterations", self.iterations, 1..=1000)?;
         in_range("min_kernel", self.min_kernel, 0.001..=10.0)?;
         positive("first_motion_share", self.first_motion_share)?;
-        positive("max_deviation_share", self.max_deviation_share)?;
-        positive("max_deviation_deg", self.max_deviation_deg)?;
+        let accelerations = [
+            ("max_acceleration_m_per_s2", self.max_acceleration_m_per_s2),
+            (
+                "max_turn_acceleration_deg_per_s2",
+                self.max_turn_acceleration_deg_per_s2,
+            ),
+        ];
+        for (key, acceleration) in accelerations {
+            positive(key, acceleration)?;
+        }
+        in_range("min_common_share", self.min_common_share, 0.0..=1.0)?;
         in_range("min_matched_share", self.min_matched_share, 0.0..=1.0)?;
         in_range("max_cost", self.max_cost, 0.0..=1.0)?;
         in_range("max_cost_increase", self.max_cost_increase, 0.0..=1.0)?;

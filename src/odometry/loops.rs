@@ -12,7 +12,7 @@ use super::alignment::Problem;
 use super::config::LoopConfig;
 use super::drive::{Drive, Submap};
 use super::pose_graph::Edge;
-use super::residuals::Observation;
+use super::residuals::{LEVEL, Observation};
 use super::sampling::TimedPoint;
 use super::scan_context::ScanContext;
 use super::search::search;
@@ -208,8 +208,6 @@ pub fn common_share(
     drive: &Drive,
     config: &LoopConfig,
 ) -> f64 {
-    /// Vertical component of the normal of the ground, at least.
-    const LEVEL: f64 = 0.8;
     let radius_m = (config.compared_radius_share * drive.range_m) as f32;
     let (mut common, mut compared) = (0_usize, 0_usize);
     for point in points

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use nalgebra::{Matrix6, Vector6};
 
 use super::config::OdometryConfig;
-use super::state::OdometerState;
+use super::state::{OdometerState, Registered};
 use crate::geometry::Pose3;
 use crate::lidar::{PERIOD_S, Scan, interval_s};
 use crate::memory::MemoryError;
@@ -38,9 +38,25 @@ pub enum StepState {
     Given,
     /// Registered to the local map.
     Registered,
+    /// Registered to the local map, after a motion that was a surprise or that only a wide search found.
+    Doubtful,
     /// Predicted by constant velocity; the scan is not mapped. It has too few points, it does not fit the local
-    /// map, or the motion to where it fits is impossible. After several in turn the local map is started again.
+    /// map, or the motion to where it fits is impossible.
     Predicted,
+    /// The same; after several in turn the local map begins again with this scan, and the motion to it is unknown.
+    Lost,
+}
+
+impl StepState {
+    /// Whether the scan shows the motion to it.
+    pub fn is_measured(self) -> bool {
+        matches!(self, Self::Registered | Self::Doubtful)
+    }
+
+    /// Whether the motion is assumed.
+    pub fn is_predicted(self) -> bool {
+        matches!(self, Self::Predicted | Self::Lost)
+    }
 }
 
 /// The pose of a scan and the motion to it.
@@ -132,7 +148,6 @@ fn advance(
     config: &OdometryConfig,
 ) -> OdometryEstimate {
     let previous = state.odom_from_lidar;
-    let prior = state.prior(duration_s, config);
     let found = state.register(scan, duration_s, config);
     if found.is_none() {
         state.coast(scan, duration_s, config);
@@ -140,15 +155,23 @@ fn advance(
     let estimate = OdometryEstimate {
         odom_from_lidar: state.odom_from_lidar,
         previous_from_current: previous.inverse() * state.odom_from_lidar,
-        covariance: Matrix6::from_diagonal(&prior),
-        state: StepState::Predicted,
+        covariance: Matrix6::from_diagonal(&state.prior(0.0, config)),
+        state: if state.is_lost() {
+            StepState::Lost
+        } else {
+            StepState::Predicted
+        },
         ..OdometryEstimate::first(duration_s)
     };
     match found {
         None => estimate,
-        Some(found) => OdometryEstimate {
+        Some(Registered { found, is_doubtful }) => OdometryEstimate {
             covariance: found.covariance,
-            state: StepState::Registered,
+            state: if is_doubtful {
+                StepState::Doubtful
+            } else {
+                StepState::Registered
+            },
             degenerate_directions: found.degenerate_directions,
             residual_m: Some(found.residual_m),
             matched_share: found.matched_share,

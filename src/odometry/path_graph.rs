@@ -1,7 +1,7 @@
 //! The pose graph of a drive: its submaps, the motions between them, and the scans that move with them.
 
 use super::drive::{Drive, Submap};
-use super::odometer::{OdometryEstimate, StepState};
+use super::odometer::OdometryEstimate;
 use super::pose_graph::{Edge, information};
 use crate::geometry::Pose3;
 use crate::lidar::interpolate_motion;
@@ -24,8 +24,7 @@ pub fn odometry_edges(drive: &Drive, maps: &[Submap], odometry: &[OdometryEstima
             let [a, b] = [pair[0].center, pair[1].center];
             let first_from_second = drive.poses[a].inverse() * drive.poses[b];
             let path_m = pair[1].travelled_m - pair[0].travelled_m;
-            let is_predicted =
-                (odometry[a + 1..=b].iter()).any(|step| step.state == StepState::Predicted);
+            let is_predicted = (odometry[a + 1..=b].iter()).any(|step| step.state.is_predicted());
             let factor = if is_predicted { PREDICTED } else { 1.0 };
             let shift_m = factor * (SHARE * path_m + FLOOR * drive.voxel_m);
             let turn_rad = factor * (TURN_RAD_PER_M * path_m + TURN_FLOOR_RAD);

@@ -9,6 +9,8 @@
 //! A change of the pose also changes the motion, hence the factor 1 + f. Where the neighbours of a point form no plane,
 //! it has a residual to their mean, with the information σ² (Σ + σ²)⁻¹ of their covariance Σ and the noise σ: all of it
 //! across a thin pole, little along it, little in a bush.
+//!
+//! How well a pose fits is judged without level surfaces: the ground looks the same wherever the sensor is.
 
 use glam::{DMat3, DQuat, DVec3, IVec3};
 use nalgebra::{Matrix6, Vector6};
@@ -21,6 +23,12 @@ use crate::lidar::{Motion, Sweep};
 
 /// Azimuth sectors, the clusters of correlated residuals in the covariance.
 const SECTORS: usize = 24;
+/// Least vertical component of the normal of a level surface: up to 37 degrees of slope.
+pub const LEVEL: f64 = 0.8;
+/// Distance from a plane below which a point lies on it, in standard deviations of a measured point.
+const ON_PLANE: f64 = 2.5;
+/// Fewer points do not tell how well a pose fits.
+const MIN_UPRIGHT: usize = 30;
 
 /// A scan and the local map.
 #[derive(Clone, Copy)]
@@ -70,8 +78,13 @@ pub struct Equations {
     pub other: Sums,
     /// Σ w Jᵀ r of points on planes, per sector of the azimuth.
     pub gradients: [Vector6<f64>; SECTORS],
-    /// Sum of the robust costs, 0 to 1 each; points without a match cost 1.
-    pub cost: f64,
+    /// Sum of the robust costs of all points and of those that are not on level surfaces, 0 to 1 each; points without a
+    /// match cost 1.
+    costs: [f64; 2],
+    /// Number of points that are not on level surfaces.
+    upright: usize,
+    /// Number of points near planes that are not level, and of those on them.
+    near_planes: [usize; 2],
     /// Distances to planes [m].
     pub distances_m: Vec<f32>,
 }
@@ -144,7 +157,7 @@ impl Observation<'_> {
             };
         }
         let Some(surface) = &matched.surface else {
-            equations.cost += 1.0;
+            equations.add_cost(1.0, false);
             return;
         };
         let offset = in_odom - surface.center;
@@ -158,12 +171,18 @@ impl Observation<'_> {
             Shape::Plane(normal) => normal.dot(offset),
             Shape::Other(_) => offset.dot(information * offset).sqrt(),
         };
+        let is_level = matches!(surface.shape, Shape::Plane(normal) if normal.z.abs() > LEVEL);
+        if !is_level && matches!(surface.shape, Shape::Plane(_)) {
+            let is_on = distance_m.abs() < ON_PLANE * self.noise_m;
+            equations.near_planes[0] += 1;
+            equations.near_planes[1] += usize::from(is_on);
+        }
         if distance_m.abs() > GATE * at.kernel.scale_m {
-            equations.cost += 1.0;
+            equations.add_cost(1.0, is_level);
             return;
         }
         let weight = at.kernel.weight(distance_m);
-        equations.cost += at.kernel.cost(distance_m);
+        equations.add_cost(at.kernel.cost(distance_m), is_level);
         let factor = 1.0 + f64::from(point.time_s) / self.duration_s;
         if let Shape::Plane(normal) = surface.shape {
             equations.distances_m.push(distance_m.abs() as f32);
@@ -217,12 +236,38 @@ impl Sums {
 }
 
 impl Equations {
+    /// Sum of the robust costs, and the number of points that have them: those that are not on level surfaces, or all of
+    /// them where there is hardly anything else.
+    pub fn cost(&self, points: usize) -> (f64, usize) {
+        if self.upright < MIN_UPRIGHT {
+            (self.costs[0], points)
+        } else {
+            (self.costs[1], self.upright)
+        }
+    }
+
+    /// Share of the points near planes that lie on them, without level ones; `None` where there are too few.
+    pub fn common_share(&self) -> Option<f64> {
+        let [near, on] = self.near_planes;
+        (near >= MIN_UPRIGHT).then(|| on as f64 / near as f64)
+    }
+
+    fn add_cost(&mut self, cost: f64, is_level: bool) {
+        self.costs[0] += cost;
+        if !is_level {
+            self.costs[1] += cost;
+            self.upright += 1;
+        }
+    }
+
     fn new() -> Self {
         Self {
             planar: Sums::default(),
             other: Sums::default(),
             gradients: [Vector6::zeros(); SECTORS],
-            cost: 0.0,
+            costs: [0.0; 2],
+            upright: 0,
+            near_planes: [0; 2],
             distances_m: Vec::new(),
         }
     }
@@ -233,7 +278,67 @@ impl Equations {
         for (gradient, of_other) in self.gradients.iter_mut().zip(&other.gradients) {
             *gradient += of_other;
         }
-        self.cost += other.cost;
+        for (cost, of_other) in self.costs.iter_mut().zip(other.costs) {
+            *cost += of_other;
+        }
+        self.upright += other.upright;
+        for (count, of_other) in self.near_planes.iter_mut().zip(other.near_planes) {
+            *count += of_other;
+        }
         self.distances_m.extend_from_slice(&other.distances_m);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Ground at z = −2 and, with a wall, also the plane y = 5; points 0.2 m apart.
+    fn street(with_wall: bool) -> Vec<DVec3> {
+        let squares =
+            (-40..40).flat_map(|a| (0..25).map(move |b| (0.2 * f64::from(a), 0.2 * f64::from(b))));
+        squares
+            .flat_map(|(a, b)| {
+                let ground = DVec3::new(a, b, -2.0);
+                let wall = DVec3::new(a, 5.0, b - 1.9);
+                [Some(ground), with_wall.then_some(wall)]
+            })
+            .flatten()
+            .collect()
+    }
+
+    /// The mean cost and the common share of the street at a distance from where it was mapped.
+    fn judged(with_wall: bool, aside_m: f64) -> (f64, Option<f64>) {
+        let mut map = VoxelMap::new(0.5, 50.0);
+        map.insert(&street(with_wall));
+        let points: Vec<TimedPoint> = (street(with_wall).iter().step_by(3))
+            .map(|point| TimedPoint {
+                position: point.as_vec3(),
+                time_s: 0.0,
+            })
+            .collect();
+        let observation = Observation {
+            map: &map,
+            points: &points,
+            sweep: Sweep::spanning(std::iter::empty()),
+            odom_from_previous: Pose3::identity(),
+            duration_s: 0.1,
+            noise_m: 0.05,
+        };
+        let pose = Pose3::translation(0.0, aside_m, 0.0);
+        let equations = observation.linearize(&pose, 0.1, &mut observation.unmatched());
+        let (cost, count) = equations.cost(points.len());
+        (cost / count as f64, equations.common_share())
+    }
+
+    #[test]
+    fn a_pose_beside_the_right_one_does_not_fit_though_the_ground_does() {
+        let (cost, share) = judged(true, 0.0);
+        assert!(cost < 0.1 && share > Some(0.9), "{cost} {share:?}");
+        let (cost, share) = judged(true, 0.4);
+        assert!(cost > 0.9 && share < Some(0.1), "{cost} {share:?}");
+        // Where there is nothing but ground, it counts, and nothing is said of what is common.
+        let (cost, share) = judged(false, 0.4);
+        assert!(cost < 0.3 && share.is_none(), "{cost} {share:?}");
     }
 }

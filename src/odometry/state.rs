@@ -6,10 +6,13 @@ use super::alignment::{Alignment, Problem};
 use super::config::OdometryConfig;
 use super::residuals::Observation;
 use super::sampling::{Sample, sensor_range};
-use super::search::search;
+use super::search::{search, search_widely};
 use super::voxel_map::VoxelMap;
 use crate::geometry::Pose3;
 use crate::lidar::{Motion, PERIOD_S, Scan};
+
+/// Step of a search, in voxels.
+const STEP: f64 = 4.0;
 
 /// OdometerState after a scan.
 #[derive(Clone, Debug)]
@@ -19,18 +22,34 @@ pub struct OdometerState {
     range_m: f64,
     /// Mean range of the last scans [m].
     mean_range_m: f64,
-    /// `p_odom = odom_from_lidar * p_lidar`.
+    /// `p_odom = odom_from_lidar * p_lidar` of the last scan.
     pub odom_from_lidar: Pose3,
-    /// The last motion; `None` before the second scan.
-    pub motion: Option<Motion>,
-    /// The first scan, which is compensated once its motion is known.
+    /// The pose of the last scan in the local map.
+    mapped: Pose3,
+    /// Time since then [s].
+    waited_s: f64,
+    /// The last motion that was measured; `None` before the second scan.
+    motion: Option<Motion>,
+    /// The only scan of the local map, which is compensated once its motion is known.
     first: Option<Sample>,
     /// Mean square of the deviations from the predictions [m², rad²].
     deviation: [f64; 2],
     /// Mean cost of the registered scans.
     cost: f64,
+    /// Mean share of common surfaces of the registered scans, where it is known.
+    common_share: Option<f64>,
     /// Scans since the last that was registered.
     missed: usize,
+    /// Whether the last scan fits where it cannot be.
+    is_surprised: bool,
+}
+
+/// A scan that was registered.
+pub struct Registered {
+    /// Where.
+    pub found: Alignment,
+    /// Whether its motion was a surprise, or found by a wide search only.
+    pub is_doubtful: bool,
 }
 
 impl OdometerState {
@@ -42,24 +61,31 @@ impl OdometerState {
             range_m,
             mean_range_m: range_m,
             odom_from_lidar: Pose3::identity(),
+            mapped: Pose3::identity(),
+            waited_s: 0.0,
             motion: None,
             first: None,
             deviation: [0.0; 2],
             cost: 1.0,
+            common_share: None,
             missed: 0,
+            is_surprised: false,
         };
-        let sample = state.sample(scan, config);
-        state.map.insert(&sample.mapped(&Pose3::identity(), None));
-        state.first = Some(sample);
+        state.restart(scan, config);
         Some(state)
+    }
+
+    /// Whether the motion to the last scan is unknown: it is the only one of its local map.
+    pub fn is_lost(&self) -> bool {
+        self.first.is_some()
     }
 
     /// Pose after a time at constant velocity.
     pub fn predicted(&self, duration_s: f64) -> Pose3 {
-        let motion = self
-            .motion
-            .map_or(Pose3::identity(), |motion| motion.after(duration_s));
-        self.odom_from_lidar * motion
+        let motion = (self.motion).map_or(Pose3::identity(), |motion| {
+            motion.after(self.waited_s + duration_s)
+        });
+        self.mapped * motion
     }
 
     /// Variances of the prediction, (x, y, z, roll, pitch, yaw) in the lidar frame [m², rad²].
@@ -70,23 +96,22 @@ impl OdometerState {
         const FLOOR: f64 = 0.3;
         /// Least standard deviation per period [rad].
         const FLOOR_RAD: f64 = 0.02;
-        /// Standard deviation of the first motion [rad].
-        const FIRST_RAD: f64 = 0.3;
-        let periods = (duration_s / PERIOD_S).max(1.0);
+        if self.is_lost() {
+            return self.unknown_motion(config);
+        }
+        let periods = ((self.waited_s + duration_s) / PERIOD_S).max(1.0);
         let floor_m = FLOOR * self.voxel_m(config) * periods;
-        let [shift, turn] = match self.motion {
-            Some(_) => {
-                let [shift, turn] = self.deviation.map(|square| SIGMAS * SIGMAS * square);
-                [
-                    shift + floor_m.powi(2),
-                    turn + (FLOOR_RAD * periods).powi(2),
-                ]
-            }
-            None => [
-                (config.first_motion_share * self.range_m).powi(2),
-                FIRST_RAD.powi(2),
-            ],
-        };
+        let [shift, turn] = self.deviation.map(|square| SIGMAS * SIGMAS * square);
+        let shift = shift + floor_m.powi(2);
+        let turn = turn + (FLOOR_RAD * periods).powi(2);
+        Vector6::new(shift, shift, shift, turn, turn, turn)
+    }
+
+    /// Variances of a motion that nothing predicts [m², rad²].
+    fn unknown_motion(&self, config: &OdometryConfig) -> Vector6<f64> {
+        /// Standard deviation of the turn [rad].
+        const TURN_RAD: f64 = 0.3;
+        let (shift, turn) = (self.reach_m(config).powi(2), TURN_RAD.powi(2));
         Vector6::new(shift, shift, shift, turn, turn, turn)
     }
 
@@ -96,18 +121,19 @@ impl OdometerState {
         scan: &Scan,
         duration_s: f64,
         config: &OdometryConfig,
-    ) -> Option<Alignment> {
+    ) -> Option<Registered> {
         self.follow_range(sensor_range(scan)?, config);
         let sample = self.sample(scan, config);
         let sparse = sample.thinned(config.registration_spacing * self.voxel_m(config));
         let min_kernel_m = config.min_kernel * self.voxel_m(config);
+        let since_s = self.waited_s + duration_s;
         let problem = Problem {
             observation: Observation {
                 map: &self.map,
                 points: &sparse,
                 sweep: sample.sweep,
-                odom_from_previous: self.odom_from_lidar,
-                duration_s,
+                odom_from_previous: self.mapped,
+                duration_s: since_s,
                 noise_m: min_kernel_m,
             },
             predicted: self.predicted(duration_s),
@@ -115,65 +141,118 @@ impl OdometerState {
             min_kernel_m,
             iterations: config.iterations,
         };
-        let found = match &self.first {
+        let predicted = problem.predicted;
+        let (found, is_searched) = match &self.first {
             None => self.track(&problem, config),
-            Some(first) => self.first_motion(first, &problem, config),
-        }?;
-        if !self.is_possible(&found, &problem.predicted, duration_s, config) {
+            Some(first) => (self.first_motion(first, &problem, config), false),
+        };
+        let found = found.filter(|found| self.fits(found, config));
+        let was_surprised = std::mem::replace(&mut self.is_surprised, false);
+        let found = found?;
+        let is_smooth = self.is_smooth(&found, &predicted, since_s, config);
+        if !is_smooth && !was_surprised {
+            // Where the next scan fits as well, this is how the sensor moves.
+            self.is_surprised = true;
             return None;
         }
-        let predicted = problem.predicted;
-        self.update(&found, &predicted, &sample, duration_s, config);
-        Some(found)
+        self.update(&found, &predicted, &sample, since_s, config);
+        Some(Registered {
+            found,
+            is_doubtful: is_searched || !is_smooth,
+        })
     }
 
-    /// Registers a scan from the prediction; if the result is worse than usual, from several starts.
-    fn track(&self, problem: &Problem, config: &OdometryConfig) -> Option<Alignment> {
+    /// Registers a scan from the prediction; if the result is worse than usual or a surprise, from several starts around it, and
+    /// if none of them fits as a motion that is possible, from starts all around the last pose. Also returns whether it was
+    /// found there.
+    fn track(&self, problem: &Problem, config: &OdometryConfig) -> (Option<Alignment>, bool) {
         /// Increase of the cost that starts a search.
         const WORSE: f64 = 0.1;
+        /// Deviation from the prediction that does so: in root mean squares, at least one voxel and [rad]. Between panels of a
+        /// façade that are alike, a wrong pose has the usual cost.
+        const SURPRISE: f64 = 2.0;
+        const SURPRISE_RAD: f64 = 0.05;
         /// Limits of the initial kernel, in voxels.
         const KERNEL: [f64; 2] = [1.0, 4.0];
-        /// Step and reach of the search, in voxels.
-        const STEP: f64 = 4.0;
+        /// Reach of the search, in voxels.
         const REACH: f64 = 8.0;
         let voxel_m = self.voxel_m(config);
         let [shift, turn] = self.deviation.map(f64::sqrt);
         let kernel_m = 3.0 * (shift + 0.5 * self.range_m * turn);
         let kernel_m = kernel_m.clamp(KERNEL[0] * voxel_m, KERNEL[1] * voxel_m);
         let found = problem.align(&problem.predicted, kernel_m);
-        if found
-            .as_ref()
-            .is_some_and(|found| found.cost < self.cost + WORSE)
-        {
-            return found;
+        let is_expected = |found: &Alignment| {
+            let deviation = problem.predicted.inverse() * found.odom_from_lidar;
+            deviation.translation.vector.norm() <= (SURPRISE * shift).max(voxel_m)
+                && deviation.rotation.angle() <= (SURPRISE * turn).max(SURPRISE_RAD)
+        };
+        let is_usual = |found: &Alignment| {
+            found.cost < self.cost + WORSE && self.fits(found, config) && is_expected(found)
+        };
+        if found.as_ref().is_some_and(is_usual) {
+            return (found, false);
         }
         let searched = search(problem, STEP * voxel_m, REACH * voxel_m);
-        (found.into_iter().chain(searched)).min_by(|a, b| a.cost.total_cmp(&b.cost))
+        let found = best(found.into_iter().chain(searched));
+        let since_s = problem.observation.duration_s;
+        let holds = |found: &Alignment| {
+            self.fits(found, config) && self.is_smooth(found, &problem.predicted, since_s, config)
+        };
+        if found.as_ref().is_some_and(holds) {
+            return (found, false);
+        }
+        let from = found.as_ref().map(|found| found.odom_from_lidar);
+        let unpredicted = Problem {
+            prior: self.unknown_motion(config),
+            ..*problem
+        };
+        let searched = search_widely(&unpredicted, from, STEP * voxel_m, self.reach_m(config));
+        // Along a street without end every place looks alike.
+        let searched = searched.filter(|found| found.degenerate_directions.is_empty());
+        match searched {
+            Some(searched) if self.fits(&searched, config) => (Some(searched), true),
+            _ => (found, false),
+        }
     }
 
-    /// The motion from the first scan to the second, without a prediction. The first scan is compensated by it, and the
-    /// second is registered again.
+    /// The motion from the only scan of the local map to the next, without a prediction: the better of none and what a
+    /// search finds. The first scan is compensated by it, and the second is registered again.
     fn first_motion(
         &self,
         first: &Sample,
         problem: &Problem,
         config: &OdometryConfig,
     ) -> Option<Alignment> {
+        let (step_m, reach_m) = (STEP * self.voxel_m(config), self.reach_m(config));
+        let compensated =
+            |found: Option<Alignment>| self.with_first_compensated(first, problem, &found?, config);
+        let still = problem.align(&self.mapped, self.voxel_m(config));
+        let near = search(problem, step_m, reach_m);
+        let found = best([still, near].into_iter().filter_map(compensated));
+        if found.as_ref().is_some_and(|found| self.fits(found, config)) {
+            return found;
+        }
+        let wide = compensated(search_widely(problem, None, step_m, reach_m));
+        best(found.into_iter().chain(wide))
+    }
+
+    /// Registers a scan again, to the first one compensated by the motion between them.
+    fn with_first_compensated(
+        &self,
+        first: &Sample,
+        problem: &Problem,
+        found: &Alignment,
+        config: &OdometryConfig,
+    ) -> Option<Alignment> {
         const PASSES: usize = 3;
-        const STEP: f64 = 4.0;
-        let voxel_m = self.voxel_m(config);
-        let mut found = search(
-            problem,
-            STEP * voxel_m,
-            config.first_motion_share * self.range_m,
-        )?;
+        let mut found = found.clone();
         for _ in 0..PASSES {
             let motion = Motion {
-                previous_from_current: self.odom_from_lidar.inverse() * found.odom_from_lidar,
+                previous_from_current: self.mapped.inverse() * found.odom_from_lidar,
                 duration_s: problem.observation.duration_s,
             };
             let mut map = self.empty_map(config);
-            map.insert(&first.mapped(&self.odom_from_lidar, Some(&motion)));
+            map.insert(&first.mapped(&self.mapped, Some(&motion)));
             let observation = Observation {
                 map: &map,
                 ..problem.observation
@@ -182,32 +261,52 @@ impl OdometerState {
                 observation,
                 ..*problem
             };
-            found = problem.align(&found.odom_from_lidar, voxel_m)?;
+            found = problem.align(&found.odom_from_lidar, self.voxel_m(config))?;
         }
         Some(found)
     }
 
-    /// Whether a motion fits the local map, and deviates from the prediction by no more than a vehicle can accelerate.
-    fn is_possible(
+    /// Whether a scan fits the local map about as well as those before it.
+    fn fits(&self, found: &Alignment, config: &OdometryConfig) -> bool {
+        let usual_cost = match self.first {
+            None => self.cost + config.max_cost_increase,
+            Some(_) => config.max_cost,
+        };
+        found.cost <= usual_cost.min(config.max_cost)
+            && found.matched_share >= config.min_matched_share
+            && (found.common_share).is_none_or(|share| self.is_common(share, config))
+    }
+
+    /// Whether as many points lie on the planes near them as is usual: at least half of those beyond chance.
+    fn is_common(&self, share: f64, config: &OdometryConfig) -> bool {
+        /// Share of the points near a plane that lie on it at wrong poses.
+        const CHANCE: f64 = 0.3;
+        let usual = self
+            .common_share
+            .map_or(0.0, |usual| CHANCE + 0.5 * (usual - CHANCE));
+        share >= usual.min(1.0).max(config.min_common_share) || config.min_common_share == 0.0
+    }
+
+    /// Whether a motion deviates from the prediction by no more than a vehicle or a hand can accelerate, or than is usual.
+    fn is_smooth(
         &self,
         found: &Alignment,
         predicted: &Pose3,
-        duration_s: f64,
+        since_s: f64,
         config: &OdometryConfig,
     ) -> bool {
-        let periods = (duration_s / PERIOD_S).max(1.0);
+        /// Standard deviations of the usual deviation.
+        const SIGMAS: f64 = 3.0;
+        if self.is_lost() {
+            return true;
+        }
+        let square_s = since_s.max(PERIOD_S).powi(2);
         let deviation = predicted.inverse() * found.odom_from_lidar;
-        let is_smooth = self.motion.is_none()
-            || deviation.translation.vector.norm()
-                <= config.max_deviation_share * self.range_m * periods
-                && deviation.rotation.angle() <= config.max_deviation_deg.to_radians() * periods;
-        let usual_cost = match self.motion {
-            Some(_) => self.cost + config.max_cost_increase,
-            None => config.max_cost,
-        };
-        is_smooth
-            && found.cost <= usual_cost.min(config.max_cost)
-            && found.matched_share >= config.min_matched_share
+        let [shift_m, turn_rad] = self.deviation.map(|square| SIGMAS * square.sqrt());
+        let most_m = (config.max_acceleration_m_per_s2 * square_s).max(shift_m);
+        let most_rad =
+            (config.max_turn_acceleration_deg_per_s2.to_radians() * square_s).max(turn_rad);
+        deviation.translation.vector.norm() <= most_m && deviation.rotation.angle() <= most_rad
     }
 
     /// Takes over a registered scan.
@@ -216,21 +315,20 @@ impl OdometerState {
         found: &Alignment,
         predicted: &Pose3,
         sample: &Sample,
-        duration_s: f64,
+        since_s: f64,
         config: &OdometryConfig,
     ) {
         /// Weight of a scan in the mean deviation.
         const NEW_DEVIATION: f64 = 0.1;
-        /// Weight of a scan in the mean cost.
+        /// Weight of a scan in the mean cost and share.
         const NEW_COST: f64 = 0.2;
         let motion = Motion {
-            previous_from_current: self.odom_from_lidar.inverse() * found.odom_from_lidar,
-            duration_s,
+            previous_from_current: self.mapped.inverse() * found.odom_from_lidar,
+            duration_s: since_s,
         };
         if let Some(first) = self.first.take() {
             self.map = self.empty_map(config);
-            self.map
-                .insert(&first.mapped(&self.odom_from_lidar, Some(&motion)));
+            self.map.insert(&first.mapped(&self.mapped, Some(&motion)));
             self.cost = found.cost;
         } else {
             let deviation = predicted.inverse() * found.odom_from_lidar;
@@ -243,7 +341,13 @@ impl OdometerState {
             }
             self.cost += NEW_COST * (found.cost - self.cost);
         }
+        if let Some(share) = found.common_share {
+            let usual = self.common_share.unwrap_or(share);
+            self.common_share = Some(usual + NEW_COST * (share - usual));
+        }
         self.odom_from_lidar = found.odom_from_lidar;
+        self.mapped = found.odom_from_lidar;
+        self.waited_s = 0.0;
         self.motion = Some(motion);
         self.missed = 0;
         self.map
@@ -256,19 +360,23 @@ impl OdometerState {
     /// Moves by the prediction. After several scans in turn that do not fit, the local map restarts with this one.
     pub fn coast(&mut self, scan: &Scan, duration_s: f64, config: &OdometryConfig) {
         self.odom_from_lidar = self.predicted(duration_s);
+        self.waited_s += duration_s;
         self.missed += 1;
-        if self.motion.is_some() && self.missed < config.restart_after
-            || sensor_range(scan).is_none()
-        {
-            return;
+        if (self.is_lost() || self.missed >= config.restart_after) && sensor_range(scan).is_some() {
+            self.restart(scan, config);
         }
+    }
+
+    /// Begins a new local map with a scan at the last pose.
+    fn restart(&mut self, scan: &Scan, config: &OdometryConfig) {
         let sample = self.sample(scan, config);
+        self.mapped = self.odom_from_lidar;
+        self.waited_s = 0.0;
+        self.missed = 0;
         self.map = self.empty_map(config);
         self.map
-            .insert(&sample.mapped(&self.odom_from_lidar, self.motion.as_ref()));
-        self.first = self.motion.is_none().then_some(sample);
-        self.missed = 0;
-        self.cost = config.max_cost;
+            .insert(&sample.mapped(&self.mapped, self.motion.as_ref()));
+        self.first = Some(sample);
     }
 
     /// Changes all lengths where the range of the sensor has changed much, such as from a room to a street.
@@ -279,13 +387,18 @@ impl OdometerState {
         const CHANGE: f64 = 2.5;
         self.mean_range_m += NEW * (range_m - self.mean_range_m);
         let ratio = self.mean_range_m / self.range_m;
-        if (1.0 / CHANGE..=CHANGE).contains(&ratio) || self.motion.is_none() {
+        if (1.0 / CHANGE..=CHANGE).contains(&ratio) || self.is_lost() {
             return;
         }
         self.range_m = self.mean_range_m;
         let means = self.map.means();
         self.map = self.empty_map(config);
         self.map.insert(&means);
+    }
+
+    /// Longest motion that a search finds [m].
+    fn reach_m(&self, config: &OdometryConfig) -> f64 {
+        config.first_motion_share * self.range_m
     }
 
     fn voxel_m(&self, config: &OdometryConfig) -> f64 {
@@ -301,6 +414,11 @@ impl OdometerState {
     }
 }
 
+/// The alignment with the least cost.
+fn best(alignments: impl Iterator<Item = Alignment>) -> Option<Alignment> {
+    alignments.min_by(|a, b| a.cost.total_cmp(&b.cost))
+}
+
 #[cfg(test)]
 mod tests {
     use approx::assert_relative_eq;
@@ -308,13 +426,15 @@ mod tests {
 
     use super::*;
 
-    /// A state with a range of 50 m, a motion of 1 m per period, and a usual cost of 0.3.
+    /// A state with a range of 50 m, a motion of 1 m per period, and a usual cost of 0.3 and share of 0.9.
     fn moving() -> OdometerState {
         OdometerState {
             map: VoxelMap::new(0.5, 50.0),
             range_m: 50.0,
             mean_range_m: 50.0,
             odom_from_lidar: Pose3::identity(),
+            mapped: Pose3::identity(),
+            waited_s: 0.0,
             motion: Some(Motion {
                 previous_from_current: Pose3::translation(1.0, 0.0, 0.0),
                 duration_s: PERIOD_S,
@@ -322,14 +442,17 @@ mod tests {
             first: None,
             deviation: [0.0; 2],
             cost: 0.3,
+            common_share: Some(0.9),
             missed: 0,
+            is_surprised: false,
         }
     }
 
     fn config() -> OdometryConfig {
         OdometryConfig {
-            max_deviation_share: 0.04,
-            max_deviation_deg: 20.0,
+            max_acceleration_m_per_s2: 50.0,
+            max_turn_acceleration_deg_per_s2: 2000.0,
+            min_common_share: 0.4,
             min_matched_share: 0.3,
             max_cost: 0.85,
             max_cost_increase: 0.2,
@@ -337,66 +460,88 @@ mod tests {
         }
     }
 
+    fn found(cost: f64, matched_share: f64, common_share: f64) -> Alignment {
+        Alignment {
+            odom_from_lidar: Pose3::identity(),
+            covariance: Matrix6::identity(),
+            degenerate_directions: vec![],
+            residual_m: 0.02,
+            matched_share,
+            cost,
+            common_share: Some(common_share),
+        }
+    }
+
     #[test]
-    fn each_gate_refuses_what_exceeds_it() {
-        let is_possible = |state: &OdometerState, off: Pose3, cost, matched_share, periods: f64| {
-            let duration_s = periods * PERIOD_S;
-            let predicted = state.predicted(duration_s);
+    fn a_motion_is_possible_within_the_largest_acceleration() {
+        let state = moving();
+        let is_smooth = |off: Pose3, since_s: f64| {
+            let predicted = state.predicted(since_s);
             let found = Alignment {
                 odom_from_lidar: predicted * off,
-                covariance: Matrix6::identity(),
-                degenerate_directions: vec![],
-                residual_m: 0.02,
-                matched_share,
-                cost,
+                ..found(0.3, 0.9, 0.9)
             };
-            state.is_possible(&found, &predicted, duration_s, &config())
+            state.is_smooth(&found, &predicted, since_s, &config())
         };
         let aside = |shift_m| Pose3::translation(0.0, shift_m, 0.0);
         let turned =
             |turn_deg: f64| Pose3::new(Vector3::zeros(), Vector3::z() * turn_deg.to_radians());
-        let none = Pose3::identity();
-        let state = moving();
-        // 4 % of 50 m and 20 degrees, per period.
-        for (off, periods, expected) in [
-            (aside(1.9), 1.0, true),
-            (aside(2.1), 1.0, false),
-            (aside(3.9), 2.0, true),
-            (aside(4.1), 2.0, false),
-            (turned(19.0), 1.0, true),
-            (turned(-21.0), 1.0, false),
-            (turned(39.0), 2.0, true),
-            (turned(41.0), 2.0, false),
+        // 50 m/s² and 2000 deg/s², times the square of the time.
+        for (off, since_s, expected) in [
+            (aside(0.49), 0.1, true),
+            (aside(0.51), 0.1, false),
+            (aside(1.99), 0.2, true),
+            (aside(2.01), 0.2, false),
+            (turned(19.0), 0.1, true),
+            (turned(-21.0), 0.1, false),
+            (turned(79.0), 0.2, true),
+            (turned(81.0), 0.2, false),
         ] {
-            assert_eq!(
-                is_possible(&state, off, 0.3, 0.9, periods),
-                expected,
-                "{off}"
-            );
+            assert_eq!(is_smooth(off, since_s), expected, "{off}");
         }
-        assert!(is_possible(&state, none, 0.49, 0.31, 1.0));
-        assert!(!is_possible(&state, none, 0.51, 0.31, 1.0));
-        assert!(!is_possible(&state, none, 0.49, 0.29, 1.0));
-        // Whatever is usual, a cost above 0.85 is none of a fit.
+        // A motion that nothing predicts is none that surprises.
+        let lost = OdometerState {
+            first: Some(Sample::empty()),
+            ..moving()
+        };
+        let far = Alignment {
+            odom_from_lidar: aside(9.0) * turned(50.0),
+            ..found(0.3, 0.9, 0.9)
+        };
+        assert!(lost.is_smooth(&far, &Pose3::identity(), 0.1, &config()));
+    }
+
+    #[test]
+    fn each_measure_of_a_fit_refuses_what_is_worse() {
+        let fits = |state: &OdometerState, found: Alignment| state.fits(&found, &config());
+        let state = moving();
+        assert!(fits(&state, found(0.49, 0.31, 0.9)));
+        assert!(!fits(&state, found(0.51, 0.31, 0.9)));
+        assert!(!fits(&state, found(0.49, 0.29, 0.9)));
+        // Half of 0.9 beyond a chance of 0.3.
+        assert!(fits(&state, found(0.49, 0.31, 0.61)));
+        assert!(!fits(&state, found(0.49, 0.31, 0.59)));
+        let unknown = Alignment {
+            common_share: None,
+            ..found(0.49, 0.31, 0.0)
+        };
+        assert!(fits(&state, unknown));
+        // Whatever is usual, a cost above 0.85 or a share below 0.4 is none of a fit.
         let usually_bad = OdometerState {
             cost: 0.8,
+            common_share: Some(0.4),
             ..moving()
         };
-        assert!(is_possible(&usually_bad, none, 0.84, 0.9, 1.0));
-        assert!(!is_possible(&usually_bad, none, 0.86, 0.9, 1.0));
-        // The first motion is not predicted.
+        assert!(fits(&usually_bad, found(0.84, 0.9, 0.41)));
+        assert!(!fits(&usually_bad, found(0.86, 0.9, 0.41)));
+        assert!(!fits(&usually_bad, found(0.84, 0.9, 0.39)));
         let first = OdometerState {
-            motion: None,
+            first: Some(Sample::empty()),
+            common_share: None,
             ..moving()
         };
-        assert!(is_possible(
-            &first,
-            aside(9.0) * turned(50.0),
-            0.84,
-            0.9,
-            1.0
-        ));
-        assert!(!is_possible(&first, none, 0.86, 0.9, 1.0));
+        assert!(fits(&first, found(0.84, 0.9, 0.41)));
+        assert!(!fits(&first, found(0.86, 0.9, 0.41)));
     }
 
     #[test]

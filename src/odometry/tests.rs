@@ -337,6 +337,31 @@ fn an_impossible_step_is_predicted_and_not_mapped() {
 }
 
 #[test]
+fn a_leap_that_the_next_scan_confirms_is_found_and_doubtful() {
+    let world = World::crossing();
+    let mut scans = drive_scans(5, None);
+    // 5 m along and 20 degrees to the side within a tenth of a second.
+    let leap = Pose3::new(Vector3::new(5.0, 0.5, 0.0), Vector3::z() * 0.35);
+    for number in 5..9 {
+        let time_s = 0.1 * f64::from(number);
+        scans.push(Scan {
+            time_s: Some(time_s),
+            ..world.scan(|_| drive(time_s) * leap, None)
+        });
+    }
+    let estimates = run(&scans);
+    use StepState::{Doubtful, Predicted, Registered};
+    let states: Vec<StepState> = estimates[4..].iter().map(|it| it.state).collect();
+    assert_eq!(states[..3], [Registered, Predicted, Doubtful]);
+    for (number, estimate) in estimates.iter().enumerate().skip(6) {
+        let truth = drive(0.0).inverse() * drive(0.1 * number as f64) * leap;
+        let error = truth.inverse() * estimate.odom_from_lidar;
+        assert!(error.translation.vector.norm() < 0.05, "{number}: {error}");
+        assert!(estimate.state.is_measured(), "{number}");
+    }
+}
+
+#[test]
 fn a_sensor_that_was_carried_away_begins_a_new_local_map() {
     let mut scans = drive_scans(4, None);
     let world = World::corridor();
@@ -349,6 +374,7 @@ fn a_sensor_that_was_carried_away_begins_a_new_local_map() {
     }
     let estimates = run(&scans);
     assert_eq!(estimates[4].state, StepState::Predicted);
+    assert!(estimates[4..8].iter().any(|it| it.state == StepState::Lost));
     assert_eq!(estimates[19].state, StepState::Registered);
 }
 

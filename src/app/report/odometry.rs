@@ -193,7 +193,9 @@ fn in_words(state: StepState) -> &'static str {
     match state {
         StepState::First => "first",
         StepState::Registered => "registered",
+        StepState::Doubtful => "doubtful",
         StepState::Predicted => "predicted",
+        StepState::Lost => "lost",
         StepState::Given => "given",
     }
 }

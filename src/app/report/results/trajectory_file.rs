@@ -12,7 +12,8 @@ use crate::recording::Frame;
 
 /// Writes one row per frame: `frames`, `times_s`, `map_from_lidar` and `odom_from_lidar` (rows, 4, 4),
 /// `motion_covariances` (rows, 6, 6) of the motion since the scan before: x, y, z, roll, pitch, yaw in the lidar
-/// frame [m, rad], and `states`: 0 first, 1 registered, 2 predicted, 3 given.
+/// frame [m, rad], and `states`: 0 first, 1 registered, 2 predicted, 3 given, 4 doubtful,
+/// 5 lost.
 pub fn write_trajectory_npz(
     path: &Path,
     frames: &[Frame],
@@ -29,6 +30,8 @@ pub fn write_trajectory_npz(
         StepState::Registered => 1,
         StepState::Predicted => 2,
         StepState::Given => 3,
+        StepState::Doubtful => 4,
+        StepState::Lost => 5,
     };
     output::write_file(path, |file| {
         let mut npz = NpzWriter::new(file);
