@@ -282,3 +282,63 @@ fn poses_that_were_found_without_compensation_are_polished_to_a_centimetre() {
     let after_m = rmse_m(&read(&output.join("poses_kitti.txt")), &truth);
     assert!(before_m > 0.05 && after_m < 0.015, "{before_m} {after_m}");
 }
+
+/// Positions of rows of KITTI [m].
+fn positions(poses: &Path) -> Vec<DVec3> {
+    let text = fs::read_to_string(poses).unwrap();
+    let row = |line: &str| {
+        let values: Vec<f64> = line.split(' ').map(|it| it.parse().unwrap()).collect();
+        DVec3::new(values[3], values[7], values[11])
+    };
+    text.lines().map(row).collect()
+}
+
+#[test]
+fn thinned_recordings_are_followed_or_warned_about() {
+    for (name, scans, poses, strides) in [
+        ("os1-thinned", "velodyne", "slam_poses.txt", 2..=3),
+        ("livox-hku2", "scans", "optimized_poses.txt", 2..=2),
+    ] {
+        let Some(recording) = real_recording(name) else {
+            return;
+        };
+        let truth = positions(&recording.join(poses));
+        let times = fs::read_to_string(recording.join("times.txt")).unwrap();
+        let times: Vec<&str> = times.lines().collect();
+        let mut files: Vec<_> = fs::read_dir(recording.join(scans)).unwrap().collect();
+        files.sort_by_key(|file| file.as_ref().unwrap().file_name());
+        for stride in strides {
+            let folder = tempfile::tempdir().unwrap();
+            let thinned = folder.path().join("velodyne");
+            fs::create_dir(&thinned).unwrap();
+            let rows: Vec<usize> = (0..files.len()).step_by(stride).collect();
+            let mut kept_times = String::new();
+            for (number, &row) in rows.iter().enumerate() {
+                let scan = files[row].as_ref().unwrap().path();
+                fs::copy(scan, thinned.join(format!("{number:06}.pcd"))).unwrap();
+                kept_times += &format!("{}\n", times[row]);
+            }
+            fs::write(folder.path().join("times.txt"), kept_times).unwrap();
+            let odometry = fpmcl("odometry").in_folder(folder.path()).with("velodyne");
+            let output = odometry.with("--output=poses").succeeds();
+            let report = json(&folder.path().join("poses/report.json"));
+            let path_m = report["path_m"].as_f64().unwrap();
+            let steps = rows
+                .windows(2)
+                .map(|pair| truth[pair[0]].distance(truth[pair[1]]));
+            let true_m: f64 = steps.sum();
+            let error = (path_m / true_m - 1.0).abs();
+            let is_warned = output.stderr.contains("did not fit the scans before them");
+            assert!(
+                error < 0.02 || is_warned,
+                "{name} / {stride}: {path_m} of {true_m} m"
+            );
+            // At least two of three scans are followed where a third of the view is in common.
+            let predicted = report["predicted"].as_u64().unwrap() as usize;
+            assert!(
+                3 * predicted <= rows.len() || stride > 2,
+                "{name} / {stride}: {predicted}"
+            );
+        }
+    }
+}

@@ -1,6 +1,7 @@
 //! Errors of mapping: the way from a recording to a map.
 
 use super::pose_report::PoseReport;
+use super::trajectory::LostPath;
 use crate::localization::SecondDriveError;
 use crate::map::BuildError;
 use crate::map::build::path_check::ImplausiblePath;
@@ -22,6 +23,8 @@ pub enum MappingError {
     Path(#[from] ImplausiblePath),
     #[error("the poses do not fit the scans: {0}")]
     PosesDoNotFit(Box<PoseReport>),
+    #[error(transparent)]
+    Lost(#[from] LostPath),
     #[error(transparent)]
     Odometry(#[from] OdometryError),
     #[error(transparent)]

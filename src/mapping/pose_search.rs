@@ -2,7 +2,7 @@
 
 use super::error::MappingError;
 use super::poses::check_path;
-use super::trajectory::{OnEvent, each_scan, find_poses};
+use super::trajectory::{LostPath, OnEvent, each_scan, find_poses};
 use crate::geometry::{Pose3, StampedPose};
 use crate::localization::{LocalizerConfig, SecondDrive, SecondDriveError, Tracker, TrackerConfig};
 use crate::map::{Map, MapConfig, PoseSource};
@@ -72,13 +72,16 @@ impl<'a> PoseSearch<'a> {
         let settings = TrajectoryConfig::default();
         match self.older {
             Some(map) => self.find_in(map, settings, on_event),
-            None => find_poses(
-                &self.frames,
-                self.is_given(),
-                &settings,
-                memory_budget,
-                on_event,
-            ),
+            None => {
+                let found = find_poses(
+                    &self.frames,
+                    self.is_given(),
+                    &settings,
+                    memory_budget,
+                    on_event,
+                )?;
+                LostPath::of(&found, &self.frames).map_or(Ok(found), |lost| Err(lost.into()))
+            }
         }
     }
 

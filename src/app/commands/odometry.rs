@@ -12,7 +12,7 @@ use crate::app::report::RunFiles;
 use crate::app::report::odometry::{self, OdometryReport};
 use crate::app::run::{Claims, Context, Outputs, Printed, RunArgs, input, memory, output};
 use crate::app::settings::OdometryCommandConfig;
-use crate::mapping::{check_path, find_poses};
+use crate::mapping::{LostPath, check_path, find_poses};
 use crate::recording::Recording;
 use crate::sensor::{Sensor, SensorConfig};
 
@@ -75,6 +75,9 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
     output::write_yaml(&folder.join("effective_odometry.yml"), &resolved)?;
     output::write_json(&main, &report)?;
     claims.finish(&main)?;
+    if let Some(lost) = LostPath::of(&found, &frames) {
+        tracing::warn!("the path is not to be trusted: {lost}");
+    }
     odometry::warn(&report.summary);
     Printed::rows(&odometry::rows(&report.summary), &report)
 }

@@ -85,6 +85,7 @@ pub fn rows(summary: &TrajectorySummary) -> Vec<(&'static str, String)> {
             format!("{median_ms:.0} ms, 95 % within {p95_ms:.0} ms"),
         ));
         rows.push(("predicted scans", summary.predicted.to_string()));
+        rows.push(("doubtful scans", summary.doubtful.to_string()));
         rows.push(("degenerate scans", summary.degenerate.to_string()));
         let loops = &summary.loops;
         rows.push((
@@ -124,6 +125,13 @@ pub fn warn(summary: &TrajectorySummary) {
         tracing::warn!(
             "{} of {} scans did not fit the scans before them: their poses are predicted",
             summary.predicted,
+            summary.scans
+        );
+    }
+    if summary.doubtful > 0 {
+        tracing::warn!(
+            "{} of {} scans fit only after a motion that those before do not lead to expect",
+            summary.doubtful,
             summary.scans
         );
     }
