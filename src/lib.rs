@@ -81,7 +81,7 @@
 //! | inferred sensor | [`sensor`] |
 //! | map | [`map`], [`registration`], `simulation` (with its feature) |
 //! | poses | [`evaluation`], [`localization`] |
-//! | trajectories | [`mapping`], [`refinement`] |
+//! | trajectories | [`live`], [`mapping`], [`refinement`] |
 //! | program, feature `cli` | `app` |
 //!
 //! `docs/architecture.md` describes how a scan and a configuration key pass through them.
@@ -132,6 +132,7 @@ pub mod simulation;
 pub mod evaluation;
 pub mod localization;
 // Trajectories.
+pub mod live;
 pub mod mapping;
 pub mod refinement;
 // Program.

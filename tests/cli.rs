@@ -6,9 +6,10 @@ mod common;
 
 use common::{Recording, config_file, fpmcl};
 
-const COMMANDS: [&str; 10] = [
+const COMMANDS: [&str; 11] = [
     "build-map",
     "localize",
+    "live",
     "refine",
     "evaluate",
     "compare",

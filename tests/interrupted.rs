@@ -174,6 +174,17 @@ fn overdue(signal: &str, recording: &Recording, arguments: &[&str], scan: &Piped
 /// Sends a signal and requires the end within two seconds, and one for a machine under load.
 #[track_caller]
 fn stopped_in_time(signal: &str, mut child: Child) -> String {
+    let reader = stderr_of(&mut child);
+    stopped_in_time_with(signal, child, reader)
+}
+
+/// The same, with the rest of standard error.
+#[track_caller]
+fn stopped_in_time_with(
+    signal: &str,
+    mut child: Child,
+    mut reader: BufReader<ChildStderr>,
+) -> String {
     let sent = Instant::now();
     send(signal, &child);
     while child.try_wait().unwrap().is_none() {
@@ -183,7 +194,7 @@ fn stopped_in_time(signal: &str, mut child: Child) -> String {
         }
         thread::sleep(Duration::from_millis(10));
     }
-    let stderr = read_until(&mut stderr_of(&mut child), None);
+    let stderr = read_until(&mut reader, None);
     assert_eq!(child.wait().unwrap().code(), Some(130), "{stderr}");
     stderr
 }
@@ -397,6 +408,35 @@ fn a_busy_localization_ends_in_time_and_keeps_its_finished_frames() {
         assert!(stderr.contains(kept), "{stderr}");
         let results = LocalizationResults::read(&recording.path("results/localization.npz"));
         assert_eq!(results.unwrap().frames.len(), 7);
+        assert_eq!(temporary_files(&recording, "results"), [""; 0]);
+    }
+}
+
+#[test]
+fn a_drive_that_is_interrupted_keeps_its_frames_also_while_no_scan_arrives() {
+    let recording = Recording::street(12);
+    recording.fpmcl("build-map").succeeds();
+    let scan = PipedScan::new(&recording, 7);
+    let live = ["live", "localization.yml", "--backend=cpu", "--force"];
+    let live = [
+        &live[..],
+        &["--replay=velodyne", "--rate=1000", "--queue=100"],
+    ]
+    .concat();
+    for signal in ["-INT", "-TERM", "-HUP", "-QUIT", "-USR1", "-ALRM", "-XCPU"] {
+        let opened = scan.opened();
+        let mut child = start(&recording, &live);
+        let _pipe = wait(&opened, &mut child);
+        let mut reader = stderr_of(&mut child);
+        // After the first frame.
+        read_until(&mut reader, Some("the scan agrees with the map"));
+        let stderr = stopped_in_time_with(signal, child, reader);
+        let results = LocalizationResults::read(&recording.path("results/localization.npz"));
+        let frames = results.unwrap().frames.len();
+        // All that were received, or those that were computed in time.
+        assert!((1..=7).contains(&frames), "{frames}");
+        let kept = format!("interrupted; {frames} of 12 frames are localized and kept in results/");
+        assert!(stderr.contains(&kept), "{stderr}");
         assert_eq!(temporary_files(&recording, "results"), [""; 0]);
     }
 }

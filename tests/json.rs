@@ -321,8 +321,20 @@ fn outputs_of_maps_and_drives_have_the_documented_keys() {
             .is_sign_positive()
     );
 
-    printed("localize, refine, evaluate", recording.fpmcl("localize"));
-    printed("localize, refine, evaluate", recording.fpmcl("refine"));
+    printed(
+        "localize, live, refine, evaluate",
+        recording.fpmcl("localize"),
+    );
+    let live = fpmcl("live").in_folder(recording.folder());
+    let live = live.with("localization.yml").with("--backend=cpu");
+    let live = live.with("--replay=velodyne").with("--rate=1000");
+    let live = live.with("--queue=100").with("--force");
+    let live = printed("localize, live, refine, evaluate", live);
+    assert!(live["live"]["received"].as_u64() > Some(1));
+    printed(
+        "localize, live, refine, evaluate",
+        recording.fpmcl("refine"),
+    );
     let result = info("info of a result", "results/localization.npz");
     assert_eq!(
         (&result["frames"], &result["is_refined"]),
@@ -330,7 +342,7 @@ fn outputs_of_maps_and_drives_have_the_documented_keys() {
     );
     let arguments = ["results/refined_tum.txt", "--truth", "results/mcl_tum.txt"];
     printed(
-        "localize, refine, evaluate",
+        "localize, live, refine, evaluate",
         call(&recording, "evaluate", &arguments),
     );
     let export = ["map.ply", "--glb", "map.glb", "--pcd", "tiles"];

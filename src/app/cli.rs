@@ -11,6 +11,7 @@ use crate::app::commands::evaluate::{self, EvaluateArgs};
 use crate::app::commands::export::{self, ExportArgs};
 use crate::app::commands::ground::{self, GroundArgs};
 use crate::app::commands::info::{self, InfoArgs};
+use crate::app::commands::live::{self, LiveArgs};
 use crate::app::commands::localize::{self, LocalizeArgs};
 use crate::app::commands::odometry::{self, OdometryArgs};
 use crate::app::commands::refine::{self, RefineArgs};
@@ -97,6 +98,13 @@ Examples:
   fpmcl localize config/localization.yml
   fpmcl localize drive_2/ --map map.ply --set numParticles=1000 --seed 7")]
     Localize(LocalizeArgs),
+
+    /// Localize scans as they arrive, at their pace.
+    #[command(after_help = "\
+Examples:
+  fpmcl live --map map.ply --replay drive_2/  a recording at its own pace
+  fpmcl live --map map.ply --replay drive_2/ --rate 2 --start last --force")]
+    Live(LiveArgs),
 
     /// Refine the trajectory that `localize` found, or a rough one from anywhere.
     #[command(after_help = "\
@@ -249,6 +257,7 @@ impl Command {
             Self::Odometry(OdometryArgs { run, .. })
             | Self::BuildMap(BuildMapArgs { run, .. })
             | Self::Localize(LocalizeArgs { run, .. })
+            | Self::Live(LiveArgs { run, .. })
             | Self::Refine(RefineArgs { run, .. })
             | Self::Evaluate(EvaluateArgs { run, .. })
             | Self::Simulate(run) => run.source.machine,
@@ -303,6 +312,11 @@ impl Command {
                     export::run(log, &context)?;
                 }
                 run_printed(&report)
+            }
+            Self::Live(args) => {
+                let (source, base) = (&args.source()?, LocalizationConfig::default);
+                let (config, context) = configured(args, source, "scan_folder", base, context)?;
+                run_printed(&live::run(args, &config, &context)?)
             }
             Self::Refine(args) => {
                 let base = || refine::base_config(args.run.source.input());

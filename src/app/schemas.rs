@@ -24,7 +24,7 @@ pub fn schemas() -> Vec<(&'static str, Schema)> {
         ("info of a result", schema::<ResultInfo>()),
         ("odometry", schema::<OdometryReport>()),
         ("build-map", schema::<BuildReport>()),
-        ("localize, refine, evaluate", schema::<Report>()),
+        ("localize, live, refine, evaluate", schema::<Report>()),
         ("export", schema::<ExportReport>()),
         ("compare", schema::<ComparisonFile>()),
         ("simulate", schema::<SimulationReport>()),

@@ -135,6 +135,19 @@ impl Localizer {
         self.preparation.sensor.own_car_m = own_car_m;
     }
 
+    /// Renders the panoramas that the start needs, for the height of the sensor in a scan.
+    pub(super) fn prepare_start(&mut self, scan: &Scan) -> Result<(), LocalizerError> {
+        if let Start::Pose { .. } = self.start {
+            return Ok(());
+        }
+        let image = self.preparation.range_image(scan, None);
+        if let Some(attitude) = self.preparation.attitude(&image) {
+            self.attitude = attitude;
+        }
+        self.map.panoramas(&self.panorama_request())?;
+        Ok(())
+    }
+
     /// Estimates `map_from_lidar` at the moment of the next scan, given the motion since the previous one.
     ///
     /// # Errors

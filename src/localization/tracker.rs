@@ -120,6 +120,36 @@ impl Tracker {
         self
     }
 
+    /// Forgets all scans but what they showed about the sensor: the next one is the first, at a start.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub fn restart(&mut self, start: Start) -> Result<(), TrackerError> {
+        self.start = start;
+        self.odometer = (self.config.odometry.clone())
+            .map(Odometer::new)
+            .transpose()?;
+        self.previous_from_current = Pose3::identity();
+        self.is_measured = false;
+        self.localizer = None;
+        Ok(())
+    }
+
+    /// Does before the first scan what does not depend on where the car is, as the panoramas of the map for the height of the
+    /// sensor in a scan: it may take longer than the car waits. Estimates are the same without it.
+    ///
+    /// # Errors
+    /// As [`step`](Self::step).
+    pub fn prepare_start(&mut self, scan: &Scan) -> Result<(), TrackerError> {
+        let sensor = match &self.sensor {
+            Some(sensor) => sensor.clone(),
+            None => Sensor::infer(std::slice::from_ref(scan), &self.config.sensor)?,
+        };
+        let (config, start) = (self.config.localizer.clone(), self.start.clone());
+        let mut localizer = Localizer::new(&self.map, &sensor, config, start, self.config.seed)?;
+        Ok(localizer.prepare_start(&sensor.timed(scan))?)
+    }
+
     /// The map.
     pub fn map(&self) -> &Map {
         &self.map

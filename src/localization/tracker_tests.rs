@@ -86,3 +86,27 @@ fn a_first_scan_without_points_is_an_error() {
         Err(TrackerError::Sensor(SensorError::NoPoints))
     ));
 }
+
+#[test]
+fn a_restarted_tracker_is_a_new_one_with_its_sensor_and_preparing_the_start_changes_nothing() {
+    let world = TestWorld::street();
+    let drive = drive(&world);
+    let states = |tracker: &mut Tracker| {
+        let step = |(_, scan): &(Pose2, Scan)| tracker.step(scan).unwrap().particles;
+        drive[..3].iter().map(step).collect::<Vec<_>>()
+    };
+    let sensor = Sensor::infer(&[drive[0].1.clone()], &SensorConfig::default()).unwrap();
+    let tracker = || {
+        let tracker = Tracker::new(&world.map(), config()).unwrap();
+        tracker.with_sensor(sensor.clone())
+    };
+    for start in [near(&drive[0].0), Start::Anywhere] {
+        let expected = states(&mut tracker().with_start(start.clone()));
+        let mut restarted = tracker().with_start(start.clone());
+        restarted.prepare_start(&drive[3].1).unwrap();
+        assert_eq!(states(&mut restarted), expected);
+        // Times that begin again are those of new scans.
+        restarted.restart(start).unwrap();
+        assert_eq!(states(&mut restarted), expected);
+    }
+}

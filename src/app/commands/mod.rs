@@ -8,6 +8,7 @@ pub mod evaluate;
 pub mod export;
 pub mod ground;
 pub mod info;
+pub mod live;
 pub mod localize;
 pub mod odometry;
 pub mod refine;

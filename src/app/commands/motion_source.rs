@@ -1,6 +1,7 @@
 //! Source of the motion between frames, and its description in reports.
 
 use std::collections::VecDeque;
+use std::ops::Range;
 use std::path::PathBuf;
 
 use anyhow::Result;
@@ -106,10 +107,10 @@ impl MotionSource {
         )
     }
 
-    /// The known motion into the frame of a row.
-    pub fn given_to(&self, row: usize) -> Option<FrameMotion> {
+    /// The known motion over the steps into the frames of some rows.
+    pub fn given_over(&self, rows: Range<usize>) -> Option<FrameMotion> {
         match self {
-            Self::Given(motions) => motions.get(row).copied(),
+            Self::Given(motions) => (motions.get(rows)?.iter().copied()).reduce(FrameMotion::then),
             Self::Scans(_) | Self::Unknown => None,
         }
     }
@@ -139,6 +140,15 @@ impl FrameMotion {
         Self {
             increment: pose2_from_pose3(&motion),
             in_space: Some(motion),
+        }
+    }
+
+    /// This motion, followed by another one.
+    fn then(self, next: Self) -> Self {
+        let in_space = self.in_space.zip(next.in_space);
+        Self {
+            increment: self.increment * next.increment,
+            in_space: in_space.map(|(motion, next)| motion * next),
         }
     }
 }

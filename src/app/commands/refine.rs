@@ -377,7 +377,9 @@ fn increments(
     let mut odometer = Odometer::new(OdometryConfig::default())?;
     let into_frame = |(row, frame): (usize, &Frame)| {
         if !matches!(motion, MotionSource::Scans(_)) {
-            return Ok(motion.given_to(row).map(|motion| motion.increment));
+            return Ok(motion
+                .given_over(row..row + 1)
+                .map(|motion| motion.increment));
         }
         let mut increment = Pose3::identity();
         for scan in motion.frames_before(frame).iter().chain([frame]) {

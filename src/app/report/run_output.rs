@@ -335,6 +335,7 @@ pub fn evaluate(
             .and_then(|it| it.trajectory.localized())
             .or(summary.localized()),
         summary,
+        live: None,
         refinement,
         has_true_poses: results.ground_truth.is_some(),
         mcl,

@@ -53,6 +53,7 @@ pub fn evaluate(results: &LocalizationResults, about: BTreeMap<String, String>) 
     Ok(Report {
         about,
         localized: None,
+        live: None,
         refinement: None,
         summary: RunSummary {
             frames: results.len(),

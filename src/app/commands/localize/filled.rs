@@ -8,12 +8,14 @@ use crate::app::run::Context;
 use crate::app::settings::OdometrySource;
 use crate::geometry::{Pose2, Pose3};
 use crate::localization::State;
+use crate::recording::Frame;
 use crate::refinement::{InitialEstimate, TrajectoryRefiner};
 
 /// Rows and poses in space of the frames that can be placed in the map, of those up to the first tracked one; `None` without
-/// odometry.
+/// odometry. `frames` begin with these frames.
 pub fn fill_back(
     opened: &Opened,
+    frames: &[Frame],
     searched: &LocalizationResults,
     context: &Context,
 ) -> Result<Option<Vec<(usize, Pose3)>>> {
@@ -36,7 +38,6 @@ pub fn fill_back(
         &increments,
         searched.times_s.as_deref(),
     );
-    let frames = &opened.recording.frames;
     let seed = config.tracker.seed;
     let mut refiner = TrajectoryRefiner::new(&opened.map, &opened.sensor, config.refiner(), seed)?;
     for (frame, start) in frames.iter().zip(&starts) {

@@ -1,22 +1,25 @@
 //! `localize`: localizes a recording in a map, scan by scan.
 
 mod filled;
-mod opened;
-mod recorder;
-mod tracking;
+pub mod frame_tracker;
+pub mod opened;
+pub mod recorder;
+pub mod tracking;
 mod written;
 
 use std::path::PathBuf;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use anyhow::Result;
 use clap::Args;
 use serde::Serialize;
 
 use self::filled::fill_back;
+use self::opened::Opened;
 use self::recorder::Run;
 use self::tracking::localize;
 use self::written::{write_results, write_run, write_trajectories};
+use super::motion_source::MotionSource;
 use crate::app::report::Report;
 use crate::app::run::arguments::numbers;
 use crate::app::run::{Context, RunArgs};
@@ -66,24 +69,41 @@ pub struct LocalizeArgs {
 const MOST_FRAMES_AT_EXIT: usize = 50_000;
 
 /// Parses a start: x, y [m], heading [deg].
-fn start_pose(text: &str) -> Result<[f64; 3], &'static str> {
+pub fn start_pose(text: &str) -> Result<[f64; 3], &'static str> {
     let help = "give x and y in the map in metres and the heading in degrees, such as 12.5,-3,90";
     numbers(text, help)
 }
 
 /// Localizes the selected frames of a recording.
 pub fn run(config: &LocalizationConfig, context: &Context) -> Result<Report> {
-    let (opened, motion, claims) = opened::open(config, context)?;
-    let motion = Mutex::new(motion);
+    run_with(config, &[], context, |opened, motion, recorded| {
+        localize(opened, motion, recorded, context)
+    })
+}
+
+/// Access to the localized frames.
+pub type Recorded<'a, 'b> = &'a dyn Fn() -> MutexGuard<'b, Run>;
+
+/// Opens a recording in a map, has its frames localized and recorded, and writes the result; further files are written
+/// next to it.
+pub fn run_with(
+    config: &LocalizationConfig,
+    further_files: &[&'static str],
+    context: &Context,
+    localize: impl FnOnce(&Opened, &mut MotionSource, Recorded<'_, '_>) -> Result<()>,
+) -> Result<Report> {
+    let (opened, mut motion, claims) = opened::open(config, further_files, context)?;
     let run = Mutex::new(Run::new(&opened, claims)?);
     let recorded = || run.lock().unwrap_or_else(PoisonError::into_inner);
     context.interrupt.supervise(
         || {
-            let mut motion = motion.lock().unwrap_or_else(PoisonError::into_inner);
-            localize(&opened, &mut motion, &recorded, context)?;
-            let searched = recorded().searched();
+            localize(&opened, &mut motion, &recorded)?;
+            let (searched, frames) = {
+                let run = recorded();
+                (run.searched(), run.frames(&opened.recording))
+            };
             let filled = searched
-                .map(|it| fill_back(&opened, &it, context))
+                .map(|it| fill_back(&opened, &frames, &it, context))
                 .transpose()?;
             let mut run = recorded();
             if let Some(filled) = filled.flatten() {

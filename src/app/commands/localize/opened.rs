@@ -30,15 +30,16 @@ pub struct Opened {
     pub sensor: Sensor,
 }
 
-/// Opens map, recording and source of motion, after the outputs are claimed.
+/// Opens map, recording and source of motion, after the outputs are claimed, with further files next to the result.
 pub fn open(
     config: &LocalizationConfig,
+    further_files: &[&'static str],
     context: &Context,
 ) -> Result<(Opened, MotionSource, Claims)> {
     let inputs = RecordingInputs::new(&config.recording, &config.given_poses);
     let files = RunFiles::new(&config.result_path);
     context.interrupt.keeps("no frame was finished");
-    let claims = prepare(config, inputs, context, &files)?;
+    let claims = prepare(config, inputs, further_files, context, &files)?;
     let map = config.map_input.load(config.map_options(), context)?;
     let mut resolved = config.clone();
     let (recording, sensor) = inputs.open_in_map(&map, &mut resolved.tracker.sensor)?;
@@ -60,6 +61,7 @@ pub fn open(
 fn prepare(
     config: &LocalizationConfig,
     inputs: RecordingInputs,
+    further_files: &[&'static str],
     context: &Context,
     files: &RunFiles,
 ) -> Result<Claims> {
@@ -67,6 +69,7 @@ fn prepare(
     let mut names = Vec::new();
     if config.save_result {
         names.extend(REPORT_FILES.iter().chain(&LOCALIZATION_FILES));
+        names.extend(further_files);
         let is_refined = config.refine;
         names.extend(REFINEMENT_FILES.iter().filter(|_| is_refined));
     }

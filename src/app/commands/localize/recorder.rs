@@ -1,21 +1,20 @@
 //! Results of localize, collected frame by frame.
 
 use std::path::PathBuf;
-use std::time::Duration;
 
 use anyhow::Result;
 
+use super::frame_tracker::TrackedFrame;
 use super::opened::Opened;
 
 use crate::app::report::LocalizationResults;
-use crate::app::report::results::{ParticleLog, ResultWriter, RowLog, ScanOutline};
+use crate::app::report::results::{LiveSummary, ParticleLog, ResultWriter, RowLog, ScanOutline};
 use crate::app::report::run_output::{self, Movie};
 use crate::app::run::{Claims, Interrupted};
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
 use crate::lidar::{Motion, Scan};
-use crate::localization::{Estimate, State};
-use crate::recording::Frame;
-use crate::refinement::FrameResult;
+use crate::localization::State;
+use crate::recording::{Frame, Recording};
 
 /// The localized frames.
 pub struct Run {
@@ -31,6 +30,10 @@ pub struct Run {
     pub movie: Option<Movie>,
     /// Number of frames without mapped ground below the estimate.
     off_ground: usize,
+    /// Number of frames that were left out: of a recording that is replayed, those that nobody waited for.
+    pub missed: usize,
+    /// What a run at the pace of the recording showed.
+    pub live: Option<LiveSummary>,
     /// The error that ended the run before its last frame.
     pub failure: Option<anyhow::Error>,
 }
@@ -86,6 +89,8 @@ impl Run {
                 None
             },
             off_ground: 0,
+            missed: 0,
+            live: None,
             failure: None,
         };
         if config.save_result {
@@ -107,21 +112,20 @@ impl Run {
         self.writer.take().map_or(Ok(()), finish)
     }
 
-    /// Adds a frame; `runtimes` are those of the filter and of the refinement.
-    pub fn record(
-        &mut self,
-        frame: &Frame,
-        increment: Option<Pose2>,
-        scan: &Scan,
-        estimate: &Estimate,
-        refined: Option<&FrameResult>,
-        [runtime, refine_runtime]: [Duration; 2],
-    ) -> Result<()> {
+    /// Adds a frame.
+    pub fn record(&mut self, frame: &Frame, scan: &Scan, tracked: &TrackedFrame) -> Result<()> {
         fn push<T>(column: &mut Option<Vec<T>>, value: T) {
             if let Some(column) = column {
                 column.push(value);
             }
         }
+        let TrackedFrame {
+            motion,
+            estimate,
+            refined,
+            runtimes: [runtime, refine_runtime],
+        } = tracked;
+        let increment = motion.map(|motion| motion.increment);
         let results = &mut self.results;
         let particles = run_output::particle_rows(&estimate.particles);
         results.particles.push_frame(&particles)?;
@@ -183,6 +187,23 @@ impl Run {
             movie.add(&self.results, estimate)?;
         }
         Ok(())
+    }
+
+    /// The localized frames.
+    pub fn frames(&self, recording: &Recording) -> Vec<Frame> {
+        let is_localized =
+            |frame: &&Frame| self.results.frames.binary_search(&frame.number).is_ok();
+        recording
+            .frames
+            .iter()
+            .filter(is_localized)
+            .cloned()
+            .collect()
+    }
+
+    /// Whether no frame is left.
+    pub fn is_complete(&self, recording: &Recording) -> bool {
+        self.results.len() + self.missed == recording.frames.len()
     }
 
     /// The frames up to the first tracked one, if there are any before it.
@@ -255,10 +276,10 @@ impl Run {
     /// Finishes the animation; an error where not all frames were localized, which names what is kept.
     pub fn finish(self, opened: &Opened) -> Result<()> {
         let kept = self.kept(opened);
+        let is_complete = self.is_complete(&opened.recording);
         let animation = self.movie.map_or(Ok(()), |movie| movie.finish());
         let failure = self.failure.or(animation.err());
-        let found = self.results.len();
-        if found == opened.recording.frames.len() && failure.is_none() {
+        if is_complete && failure.is_none() {
             if !opened.config.save_result {
                 tracing::warn!("the result is not kept: save_result is False");
             }

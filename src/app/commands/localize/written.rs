@@ -28,10 +28,10 @@ pub fn write_results(opened: &Opened, run: &mut Run) -> Result<()> {
     }
     run.finish_result()?;
     // The frames of an interrupted run are kept; a whole run lacks its report and pictures still.
-    if run.results.len() < recording.frames.len() {
-        run.claims.finish(&files.result)
-    } else {
+    if run.is_complete(recording) {
         Ok(())
+    } else {
+        run.claims.finish(&files.result)
     }
 }
 
@@ -48,11 +48,11 @@ pub fn write_trajectories(opened: &Opened, run: &Run) -> Result<()> {
     }
     run_output::write_poses(files, &run.results)?;
     let results = &run.results;
-    let frames = &recording.frames[..results.len()];
-    let mcl = Trajectory::of_filter(results, frames);
+    let frames = run.frames(recording);
+    let mcl = Trajectory::of_filter(results, &frames);
     mcl.write(files, "mcl", recording, config.all_poses)?;
     if config.refine {
-        let refined = Trajectory::refined(results, frames);
+        let refined = Trajectory::refined(results, &frames);
         refined.write(files, "refined", recording, config.all_poses)?;
     }
     output::write_yaml(&files.file("effective_localization.yml"), config)
@@ -85,14 +85,18 @@ pub fn write_run(opened: &Opened, run: &mut Run, context: &Context) -> Result<Re
         ),
         ("states".to_owned(), states_in_words(results)),
     ]);
-    let report = run_output::evaluate(results, &RangeMclRules::default(), about)?;
+    let report = Report {
+        live: run.live.clone(),
+        ..run_output::evaluate(results, &RangeMclRules::default(), about)?
+    };
     if config.save_result {
         run_output::write_report(files, results, &report)?;
     }
     if config.output.plots {
         let mesh = run_output::map_around(map, results.estimates.iter().flatten())?;
         run_output::draw_run(files, Some(&mesh), results)?;
-        let mcl = Trajectory::of_filter(results, &recording.frames);
+        let frames = run.frames(recording);
+        let mcl = Trajectory::of_filter(results, &frames);
         if let Some((frame, pose)) = mcl.middle() {
             let model = &opened.sensor.range_image;
             run_output::draw_range_images(files, map, frame, pose, model)?;

@@ -13,6 +13,7 @@ mod trajectory_file;
 mod trusted;
 // Tables and reports.
 mod frames;
+mod live_summary;
 mod refinement_summary;
 mod report;
 mod rows;
@@ -22,6 +23,7 @@ mod run_summary;
 pub(crate) mod kitti_07_tests;
 
 pub use frames::{FrameTable, write_frames_csv};
+pub use live_summary::{LatencySummary, LiveSummary};
 pub use localization_results::{LocalizationResults, ParticleLog, ScanOutline};
 pub use refinement_summary::RefinementSummary;
 pub use report::{Report, TrajectoryReport};

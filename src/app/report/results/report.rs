@@ -7,6 +7,7 @@ use anyhow::{Context as _, Result, anyhow};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::live_summary::LiveSummary;
 use super::refinement_summary::RefinementSummary;
 use super::rows::{MetricRow, Value, length, metric_rows, metrics, spatial_rows};
 use super::run_summary::RunSummary;
@@ -93,6 +94,9 @@ pub struct Report {
     /// What the run shows without the true poses.
     #[serde(default)]
     pub summary: RunSummary,
+    /// Scans, latencies and states of a run of `live`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub live: Option<LiveSummary>,
     /// What the refinement did, if there was one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub refinement: Option<RefinementSummary>,
@@ -162,6 +166,7 @@ impl Report {
     /// What the run found, in one or two sentences.
     pub fn verdict(&self) -> String {
         let found = self.trajectory.is_none().then(|| self.summary.verdict());
+        let live = self.live.as_ref().map(LiveSummary::verdict);
         let refined = self.refinement.as_ref().map(RefinementSummary::verdict);
         let errors = [&self.mcl, &self.refined].map(|it| it.as_ref().map(|it| &it.metrics));
         let accuracy = match (accuracy(errors), &self.trajectory) {
@@ -183,8 +188,8 @@ impl Report {
             }
             (None, None) => "No true poses were given.".to_owned(),
         };
-        let parts: Vec<String> = found.into_iter().chain(refined).chain([accuracy]).collect();
-        parts.join(" ")
+        let parts = found.into_iter().chain(live).chain(refined);
+        parts.chain([accuracy]).collect::<Vec<_>>().join(" ")
     }
 
     /// The same table in Markdown, with definitions.
@@ -231,6 +236,12 @@ impl Report {
         let summary = summary.map(|row| (row, of_refined.next().map(|row| row.value)));
         let summary: Vec<_> = summary
             .chain(refinement.iter().flat_map(|it| it.rows()))
+            .chain(
+                self.live
+                    .iter()
+                    .flat_map(LiveSummary::rows)
+                    .map(|row| (row, None)),
+            )
             .collect();
         let is_known = |(row, refined): &(MetricRow, Option<Value>)| {
             row.value != Value::Absent || refined.is_some_and(|value| value != Value::Absent)
@@ -334,6 +345,7 @@ mod tests {
             about: [("odometry".to_owned(), "from file".to_owned())].into(),
             localized: None,
             summary: RunSummary::default(),
+            live: None,
             refinement: None,
             has_true_poses: true,
             mcl: Some(trajectory(0.25)),

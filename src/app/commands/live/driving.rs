@@ -1,0 +1,261 @@
+//! The loop over the scans that arrive.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+
+use super::super::localize::Recorded;
+use super::super::localize::frame_tracker::FrameTracker;
+use super::super::localize::opened::Opened;
+use super::super::motion_source::{FrameMotion, MotionSource};
+use super::last_pose::LastPoseWriter;
+use super::replay::{ReplayedFrame, replay};
+use crate::app::report::results::{LatencySummary, LiveSummary};
+use crate::app::run::Context;
+use crate::geometry::{Pose3, pose3_from_pose2};
+use crate::lidar::Scan;
+use crate::live::{
+    Arrival, Inbox, Latencies, LiveState, Monitor, Reason, Received, StampClock, Tick,
+};
+use crate::localization::{LocalizerError, Start, TrackerError};
+
+/// Longest wait for a scan before the state is looked at.
+const WAIT: Duration = Duration::from_millis(50);
+
+/// A drive through a recording at its own pace.
+pub struct Drive<'a, 'b> {
+    /// Map, recording and configuration.
+    pub opened: &'a Opened,
+    /// Takes the localized frames.
+    pub recorded: Recorded<'a, 'b>,
+    /// How many times faster than it was recorded.
+    pub rate: f64,
+    /// Number of scans that may wait.
+    pub queue: usize,
+    /// Interruption and progress.
+    pub context: &'a Context,
+}
+
+impl Drive<'_, '_> {
+    /// Receives scans in one thread and localizes them in this one, until the last or an interruption.
+    pub fn run(&self, motion: &mut MotionSource, start: Start) -> Result<()> {
+        // A known start is that of the first scan, which is not dropped.
+        let is_prepared = matches!(start, Start::Pose { .. });
+        let tracker = FrameTracker::new(self.opened, motion, start)?;
+        let inbox = Inbox::new(self.queue);
+        let unreadable = AtomicU64::new(0);
+        let interrupt = &self.context.interrupt;
+        let (frames, rate) = (&self.opened.recording.frames, self.rate);
+        let summary = thread::scope(|scope| {
+            scope.spawn(|| replay(frames, rate, &inbox, &unreadable, interrupt));
+            let mut driver = Driver::new(self, tracker, is_prepared);
+            let outcome = driver.follow(&inbox);
+            // Nobody takes what the other thread would still send.
+            inbox.close();
+            outcome.map(|()| driver.summary())
+        })?;
+        let rejected = summary.rejected + unreadable.load(Ordering::Relaxed);
+        let mut run = (self.recorded)();
+        let dropped = inbox.dropped();
+        run.missed = (dropped + rejected) as usize;
+        run.live = Some(LiveSummary {
+            received: inbox.received(),
+            dropped,
+            rejected,
+            ..summary
+        });
+        Ok(())
+    }
+}
+
+/// The thread that computes.
+struct Driver<'a, 'b> {
+    drive: &'a Drive<'a, 'b>,
+    tracker: FrameTracker<'a>,
+    monitor: Monitor,
+    clock: StampClock,
+    latencies: Latencies,
+    last_pose: Option<LastPoseWriter>,
+    summary: LiveSummary,
+    /// Whether the map is prepared for the start.
+    is_prepared: bool,
+    /// When the last scan arrived, and the time since the one before.
+    last_arrival: Option<Instant>,
+    period: Option<Duration>,
+}
+
+impl<'a, 'b> Driver<'a, 'b> {
+    fn new(drive: &'a Drive<'a, 'b>, tracker: FrameTracker<'a>, is_prepared: bool) -> Self {
+        let config = &drive.opened.config;
+        Self {
+            drive,
+            tracker,
+            monitor: Monitor::new(&config.tracker.localizer),
+            clock: StampClock::new(drive.rate),
+            latencies: Latencies::default(),
+            last_pose: LastPoseWriter::new(config),
+            summary: LiveSummary::default(),
+            is_prepared,
+            last_arrival: None,
+            period: None,
+        }
+    }
+
+    /// Takes scans until the last.
+    fn follow(&mut self, inbox: &Inbox<ReplayedFrame>) -> Result<()> {
+        let context = self.drive.context;
+        let task = context
+            .progress
+            .task("live", self.drive.opened.recording.frames.len());
+        while !context.interrupt.requested() {
+            match inbox.take(WAIT) {
+                Received::End => break,
+                Received::Nothing => self.wait(),
+                Received::Scan(arrival) if !self.is_prepared => {
+                    self.prepare(&arrival.scan.1)?;
+                    inbox.put_back(arrival);
+                }
+                Received::Scan(arrival) => {
+                    self.take(&arrival)?;
+                    let count = inbox.dropped() + self.summary.rejected + self.latencies.count();
+                    task.set_share(count as f64 / self.drive.opened.recording.frames.len() as f64);
+                }
+            }
+        }
+        if let Some(last_pose) = &mut self.last_pose {
+            last_pose.write();
+        }
+        Ok(())
+    }
+
+    /// What was seen.
+    fn summary(mut self) -> LiveSummary {
+        self.summary.latency = LatencySummary::new(&self.latencies);
+        self.summary
+    }
+
+    /// Prepares the map for the sensor of the first scan.
+    fn prepare(&mut self, scan: &Scan) -> Result<()> {
+        self.note(Reason::Preparing);
+        self.is_prepared = true;
+        match self.tracker.prepare_start(scan) {
+            // What is wrong with this scan may be right with the next.
+            Err(error) if is_about_scan(&error) => Ok(()),
+            prepared => Ok(prepared?),
+        }
+    }
+
+    /// Localizes a scan.
+    fn take(&mut self, arrival: &Arrival<ReplayedFrame>) -> Result<()> {
+        let Arrival {
+            scan: (row, scan),
+            arrived,
+        } = arrival;
+        let frame = &self.drive.opened.recording.frames[*row];
+        self.period = self.last_arrival.map(|last| arrived.duration_since(last));
+        self.last_arrival = Some(*arrived);
+        let stamp_s = scan.time_s.unwrap_or(frame.time_s);
+        match self.clock.tick(stamp_s, *arrived) {
+            Tick::Later => {}
+            Tick::Repeated => {
+                self.reject(&format!(
+                    "its time {stamp_s} s is not later than the last one"
+                ));
+                return Ok(());
+            }
+            Tick::Jumped => self.restart(stamp_s)?,
+        }
+        let tracked = match self.tracker.step(*row, scan) {
+            Err(error) if error.downcast_ref().is_some_and(is_about_scan) => {
+                self.reject(&error.to_string());
+                return Ok(());
+            }
+            tracked => tracked?,
+        };
+        let before = self.monitor.reason();
+        self.monitor
+            .update(&tracked.estimate, &in_space(tracked.motion));
+        self.latencies.add(arrived.elapsed());
+        let state = self.monitor.state();
+        if let (LiveState::Tracking, Some(last_pose)) = (state, &mut self.last_pose) {
+            last_pose.update(frame.time_s, &tracked.estimate.map_from_lidar);
+        }
+        (self.drive.recorded)().record(frame, scan, &tracked)?;
+        *self.summary.states.entry(state).or_default() += 1;
+        self.note_change(before);
+        Ok(())
+    }
+
+    /// Looks at the state while no scan arrives.
+    fn wait(&mut self) {
+        let (Some(last), Some(period)) = (self.last_arrival, self.period) else {
+            return;
+        };
+        let before = self.monitor.reason();
+        self.monitor.wait(last.elapsed(), period, None);
+        self.note_change(before);
+    }
+
+    /// Begins again after the clock of the scans was set, around the pose that was believed.
+    fn restart(&mut self, stamp_s: f64) -> Result<()> {
+        tracing::warn!(
+            "the clock of the scans jumped to {stamp_s} s: the localization begins again"
+        );
+        let opened = self.drive.opened;
+        let last = self.monitor.pose_after(&Pose3::identity());
+        let start = last.map_or_else(
+            || Start::unknown(&opened.map),
+            |last| Start::near(&last.map_from_lidar, opened.config.start.clone()),
+        );
+        self.tracker.restart(start)?;
+        self.note(Reason::ClockJumped);
+        Ok(())
+    }
+
+    fn reject(&mut self, why: &str) {
+        if self.summary.rejected == 0 {
+            tracing::warn!("a scan is left out: {why}");
+        }
+        self.summary.rejected += 1;
+    }
+
+    /// Sets a reason that is not that of an estimate.
+    fn note(&mut self, reason: Reason) {
+        let before = self.monitor.reason();
+        self.monitor.set(reason);
+        self.note_change(before);
+    }
+
+    /// Reports a change of the state.
+    fn note_change(&mut self, before: Reason) {
+        let (state, reason) = (self.monitor.state(), self.monitor.reason());
+        if state == before.state() {
+            return;
+        }
+        self.summary.changes += 1;
+        let (state, reason) = (state.word(), reason.words());
+        tracing::info!("{state}: {reason}");
+    }
+}
+
+/// The motion in space; none where it is unknown.
+fn in_space(motion: Option<FrameMotion>) -> Pose3 {
+    motion.map_or_else(Pose3::identity, |motion| {
+        let in_plane = || pose3_from_pose2(&motion.increment, 0.0);
+        motion.in_space.unwrap_or_else(in_plane)
+    })
+}
+
+/// Whether an error is about one scan, after which the next may be localized.
+fn is_about_scan(error: &TrackerError) -> bool {
+    matches!(
+        error,
+        TrackerError::Sensor(_)
+            | TrackerError::Odometry(_)
+            | TrackerError::Localizer(
+                LocalizerError::Sensor(_) | LocalizerError::ImpossibleOdometry(_)
+            )
+    )
+}

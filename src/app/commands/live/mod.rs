@@ -1,0 +1,159 @@
+//! `live`: localizes while scans arrive, at their pace.
+
+mod driving;
+mod last_pose;
+mod replay;
+
+use std::path::PathBuf;
+
+use anyhow::{Result, bail};
+use clap::Args;
+use serde::{Serialize, Serializer};
+use serde_json::json;
+
+use self::driving::Drive;
+use self::last_pose::LastPose;
+use super::localize::tracking::start;
+use super::localize::{run_with, start_pose};
+use crate::app::report::Report;
+use crate::app::run::arguments::yaml;
+use crate::app::run::{ConfigArgs, Context, RunArgs};
+use crate::app::settings::LocalizationConfig;
+
+/// Arguments of `live`.
+#[derive(Clone, Debug, Args, Serialize)]
+#[command(group = clap::ArgGroup::new("source").required(true))]
+pub struct LiveArgs {
+    /// Configuration and machine.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub run: RunArgs,
+
+    /// Map of `build-map` or range-mcl, or a mesh (.ply, .obj, .stl); sets the key `map_file`.
+    #[arg(long = "map", value_name = "MAP")]
+    pub map_file: Option<PathBuf>,
+
+    /// Recording whose scans arrive at their own pace; sets the key `scan_folder`.
+    #[arg(long, value_name = "RECORDING", group = "source")]
+    #[serde(skip)]
+    pub replay: Option<PathBuf>,
+
+    /// How many times faster than it was recorded.
+    #[arg(long, value_name = "R", default_value_t = 1.0, value_parser = rate)]
+    #[serde(skip)]
+    pub rate: f64,
+
+    /// Start in the map [m, deg], or the last pose of a run with this output, which the scans must confirm.
+    #[arg(long, value_name = "X,Y,HEADING | last", value_parser = live_start, allow_hyphen_values = true)]
+    #[serde(rename = "initial_pose", serialize_with = "pose_of_start")]
+    pub start: Option<LiveStart>,
+
+    /// Odometry, rows of KITTI or TUM, or a topic of the bag; by default the topic of odometry that a bag has, else the scans. Sets the key `odometry_file`.
+    #[arg(long = "odometry", value_name = "FILE")]
+    pub odometry_file: Option<PathBuf>,
+
+    /// True poses of the recording for the report; sets the key `pose_file`.
+    #[arg(long = "truth", value_name = "FILE")]
+    pub pose_file: Option<PathBuf>,
+
+    /// Calibration of the camera, if the true poses are those of a camera; sets the key `calib_file`.
+    #[arg(long = "calib", value_name = "FILE")]
+    pub calib_file: Option<PathBuf>,
+
+    /// Result to write (.npz); sets the key `result_path`.
+    #[arg(long = "output", value_name = "RESULT")]
+    pub result_path: Option<PathBuf>,
+
+    /// Scans that may wait while another one is computed; the oldest is dropped for a newer one.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=1000))]
+    #[serde(skip)]
+    pub queue: u16,
+}
+
+/// Where the car starts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum LiveStart {
+    /// At x, y [m], heading [deg].
+    Pose([f64; 3]),
+    /// Where the last run ended.
+    Last,
+}
+
+fn live_start(text: &str) -> Result<LiveStart, &'static str> {
+    if text == "last" {
+        return Ok(LiveStart::Last);
+    }
+    start_pose(text).map(LiveStart::Pose)
+}
+
+/// The key `initial_pose`; null where the flag is no pose.
+fn pose_of_start<S: Serializer>(
+    start: &Option<LiveStart>,
+    serializer: S,
+) -> Result<S::Ok, S::Error> {
+    match start {
+        Some(LiveStart::Pose(pose)) => pose.serialize(serializer),
+        Some(LiveStart::Last) | None => serializer.serialize_none(),
+    }
+}
+
+fn rate(text: &str) -> Result<f64, &'static str> {
+    match text.parse::<f64>() {
+        Ok(number) if (0.001..=1000.0).contains(&number) => Ok(number),
+        _ => Err("give a number from 0.001 to 1000, such as 2"),
+    }
+}
+
+impl LiveArgs {
+    /// The configuration: a file, in which the recording is a setting, else the recording, as the argument of `localize`.
+    pub fn source(&self) -> Result<ConfigArgs> {
+        if let Some(input) = self.run.source.input() {
+            bail!(
+                "{} is no configuration (.yml); give a recording by --replay {}",
+                input.display(),
+                input.display()
+            );
+        }
+        let mut source = self.run.source.clone();
+        match (&source.config, &self.replay) {
+            (Some(_), Some(replay)) => {
+                let setting = ("scan_folder".to_owned(), yaml(&json!(replay)));
+                source.settings.push(setting);
+            }
+            _ => source.config.clone_from(&self.replay),
+        }
+        Ok(source)
+    }
+}
+
+/// Localizes the scans of a recording as they arrive.
+pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> Result<Report> {
+    if config.refine {
+        bail!(
+            "refine is True, but a pose that is refined is not known while the car drives; set refine to False, and run fpmcl refine with the result"
+        );
+    }
+    let last = match args.start {
+        Some(LiveStart::Last) => LastPose::read(config)?,
+        _ => None,
+    };
+    run_with(
+        config,
+        &[last_pose::FILE],
+        context,
+        |opened, motion, recorded| {
+            let start = last.as_ref().map_or_else(
+                || start(config, &opened.map, &opened.recording),
+                |last| last.start(&config.start),
+            );
+            let drive = Drive {
+                opened,
+                recorded,
+                rate: args.rate,
+                queue: usize::from(args.queue),
+                context,
+            };
+            drive.run(motion, start)
+        },
+    )
+}

@@ -1,0 +1,215 @@
+//! `live`: scans of recordings that arrive at their own pace.
+
+#![allow(clippy::unwrap_used, reason = "a failing test may panic")]
+
+mod common;
+
+use std::fs;
+
+use common::{Fpmcl, Output, Recording};
+use fpmcl::internals::app::LocalizationResults;
+use serde_json::{Value, json};
+
+const RESULT: &str = "results/localization.npz";
+
+/// A street with its map.
+fn street(frames: usize) -> Recording {
+    let recording = Recording::street(frames);
+    recording.fpmcl("build-map").succeeds();
+    recording
+}
+
+/// A replay, as fast as scans can be read.
+fn live(recording: &Recording) -> Fpmcl {
+    let call = common::fpmcl("live").in_folder(recording.folder());
+    let call = call.with("localization.yml").with("--backend=cpu");
+    call.with("--replay=velodyne").with("--rate=1000")
+}
+
+/// A replay in which every scan may wait.
+fn patient(recording: &Recording) -> Fpmcl {
+    live(recording).with("--queue=1000")
+}
+
+fn report(output: &Output) -> Value {
+    serde_json::from_str(&output.stdout).unwrap()
+}
+
+/// The results of a recording, without times of computation.
+fn results(recording: &Recording) -> LocalizationResults {
+    LocalizationResults {
+        runtimes_s: None,
+        ..LocalizationResults::read(&recording.path(RESULT)).unwrap()
+    }
+}
+
+#[test]
+fn where_no_scan_is_dropped_the_results_are_those_of_localize() {
+    let recording = street(12);
+    for odometry in ["ground_truth", "scans", "none"] {
+        let calls = [recording.fpmcl("localize"), patient(&recording)];
+        let [localized, live] = calls.map(|call| {
+            let call = call
+                .set("odometry", odometry)
+                .with("--force")
+                .with("--json");
+            let report = report(&call.succeeds());
+            let names = ["mcl_tum.txt", "effective_localization.yml"];
+            let files = names.map(|name| recording.bytes(&format!("results/{name}")));
+            (results(&recording), files, report)
+        });
+        assert!(live.0 == localized.0 && live.1 == localized.1, "{odometry}");
+        assert_eq!(live.2["summary"], localized.2["summary"]);
+        let counts = ["received", "dropped", "rejected"].map(|key| &live.2["live"][key]);
+        assert_eq!(counts, [12, 0, 0].map(Value::from).each_ref());
+        assert_eq!(localized.2.get("live"), None);
+    }
+    assert!(recording.path("results/report.html").exists());
+}
+
+#[test]
+fn scans_that_come_too_fast_are_dropped_and_counted_and_their_motion_is_bridged() {
+    let recording = street(40);
+    // Odometry without the noise of a demonstration.
+    let call = live(&recording).set("odometry", "file");
+    let call = call.set("odometry_file", "poses.txt").with("--json");
+    let report = report(&call.succeeds());
+    let [received, dropped, rejected] =
+        ["received", "dropped", "rejected"].map(|key| report["live"][key].as_u64().unwrap());
+    let results = results(&recording);
+    assert_eq!((received, rejected), (40, 0));
+    assert!(
+        dropped > 0 && dropped + results.frames.len() as u64 == received,
+        "{report}"
+    );
+    // The last one is always understood.
+    assert_eq!(results.frames.last(), Some(&39));
+    let worst_m = report["mcl"]["metrics"]["position_m"]["max"]
+        .as_f64()
+        .unwrap();
+    assert!(worst_m < 0.2, "{report}");
+    let [p50, p99, max] =
+        ["p50_ms", "p99_ms", "max_ms"].map(|key| report["live"]["latency"][key].as_f64().unwrap());
+    assert!(0.0 < p50 && p50 <= p99 && p99 <= max, "{report}");
+    let states = report["live"]["states"].as_object().unwrap();
+    let counted: u64 = states.values().map(|it| it.as_u64().unwrap()).sum();
+    assert_eq!(counted, results.frames.len() as u64);
+}
+
+#[test]
+fn a_damaged_scan_is_counted_and_the_others_are_localized() {
+    let recording = street(12);
+    fs::write(recording.path("velodyne/000005.bin"), [0; 17]).unwrap();
+    let output = patient(&recording).with("--json").succeeds();
+    assert_eq!(report(&output)["live"]["rejected"], 1);
+    assert!(output.stderr.contains("000005.bin"), "{}", output.stderr);
+    assert!(
+        results(&recording)
+            .frames
+            .iter()
+            .copied()
+            .eq((0..12).filter(|&it| it != 5))
+    );
+}
+
+#[test]
+fn a_run_begins_where_the_last_one_ended_if_the_scans_confirm_it() {
+    let recording = street(12);
+    let first = patient(&recording).with("--start=last").succeeds();
+    let missing = "results/last_pose.json does not exist: the start is searched";
+    assert!(first.stderr.contains(missing), "{}", first.stderr);
+    let before = results(&recording).estimates_in_space.unwrap();
+    let last = common::json(&recording.path("results/last_pose.json"));
+    let at = |pose: &Value| pose["map_from_lidar"][0].as_f64().unwrap();
+    assert!((at(&last) - before[11].translation.x).abs() < 1e-12);
+
+    // The car did not move since then.
+    fs::create_dir(recording.path("parked")).unwrap();
+    for copy in 0..4 {
+        let parked = recording.path(&format!("parked/{copy:06}.bin"));
+        fs::copy(recording.path("velodyne/000011.bin"), parked).unwrap();
+    }
+    let again = || {
+        let call = common::fpmcl("live").in_folder(recording.folder());
+        let call = call.with("localization.yml").with("--backend=cpu");
+        let call = call.set("pose_file", "null").set("pose_tracking", "False");
+        let call = call
+            .set("odometry", "scans")
+            .with("--queue=100")
+            .with("--rate=1000");
+        call.with("--replay=parked")
+            .with("--start=last")
+            .with("--force")
+            .with("--json")
+    };
+    let state = |output: &Output| report(output)["live"]["states"].clone();
+    assert_eq!(state(&again().succeeds()), json!({"tracking": 4}));
+    let found = results(&recording).estimates_in_space.unwrap();
+    assert!((found[3].translation.vector - before[11].translation.vector).norm() < 0.05);
+
+    // A pose that the scans do not confirm: across the street.
+    let mut wrong = last.clone();
+    wrong["map_from_lidar"] = json!([
+        at(&last),
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.5_f64.sqrt(),
+        0.5_f64.sqrt()
+    ]);
+    recording.write("results/last_pose.json", &wrong.to_string());
+    let output = again().exits_with(3);
+    assert_eq!(state(&output).get("tracking"), None, "{}", output.stderr);
+}
+
+#[test]
+fn a_last_pose_of_another_map_or_of_no_place_on_earth_is_an_error() {
+    let recording = street(3);
+    patient(&recording).succeeds();
+    let last = common::json(&recording.path("results/last_pose.json"));
+    let fails = |key: &str, value: Value, parts: &[&str]| {
+        let mut changed = last.clone();
+        changed[key] = value;
+        recording.write("results/last_pose.json", &changed.to_string());
+        let call = patient(&recording).with("--start=last").with("--force");
+        call.fails_with(parts);
+    };
+    fails(
+        "map_bytes",
+        json!(7),
+        &["results/last_pose.json is a pose in the map map.ply"],
+    );
+    fails(
+        "map_from_lidar",
+        json!([1e300, 0, 0, 0, 0, 0, 1]),
+        &["no pose on Earth"],
+    );
+    fails(
+        "map_from_lidar",
+        json!("here"),
+        &["is no last pose of fpmcl; remove it"],
+    );
+}
+
+#[test]
+fn what_live_cannot_do_is_an_error_before_any_work() {
+    let recording = Recording::street(1);
+    let live = || common::fpmcl("live").in_folder(recording.folder());
+    live().rejects_usage_with(&["--replay <RECORDING>"]);
+    let message = ["drive/ is no configuration (.yml); give a recording by --replay drive/"];
+    live()
+        .with("drive/")
+        .with("--replay=velodyne")
+        .fails_with(&message);
+    let message = ["refine is True, but", "set refine to False"];
+    patient(&recording)
+        .set("refine", "True")
+        .fails_with(&message);
+    for (flag, part) in [("--rate=0", "0.001 to 1000"), ("--queue=0", "1..=1000")] {
+        live()
+            .with("--replay=velodyne")
+            .with(flag)
+            .rejects_usage_with(&[part]);
+    }
+}
