@@ -36,6 +36,16 @@ fn a_drive_without_poses_is_mapped_along_the_path_that_it_has_driven() {
         let error_m = distance_m(&frame.map_from_lidar.unwrap(), pose);
         assert!(error_m < 0.1, "frame {}: {error_m} m", frame.number);
     }
+    // Most scans come too fast for an unoptimized program.
+    let printed = example("live", folder, &["street/drive_1", "map.ply"]);
+    assert!(
+        printed.lines().last().unwrap().starts_with("16 scans, "),
+        "{printed}"
+    );
+    assert!(
+        printed.contains("the scan agrees with the map"),
+        "{printed}"
+    );
 }
 
 #[test]
