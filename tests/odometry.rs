@@ -342,3 +342,24 @@ fn thinned_recordings_are_followed_or_warned_about() {
         }
     }
 }
+
+#[test]
+fn an_adjustment_that_moves_a_drive_farther_than_odometry_drifts_is_left_out() {
+    let Some(recording) = real_recording("vlp16-raw") else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let odometry = fpmcl("odometry").in_folder(folder.path());
+    let odometry = odometry
+        .with(recording.join("velodyne"))
+        .with("--output=poses");
+    let output = odometry.set("n_scans", "20").succeeds();
+    let [found, odometry] = ["poses_tum.txt", "odometry_tum.txt"].map(|name| {
+        poses(&folder.path().join("poses").join(name))
+            .pop()
+            .unwrap()
+    });
+    let apart_m = (found.translation.vector - odometry.translation.vector).norm();
+    // 6 m of path, and a voxel.
+    assert!(apart_m < 0.06 * 7.0 + 0.5, "{apart_m}: {}", output.stderr);
+}

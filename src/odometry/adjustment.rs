@@ -93,8 +93,55 @@ pub struct Adjusted {
     pub elevation_bias: Option<ElevationBias>,
 }
 
-/// Adjusts the poses of a drive; `None` where no surfaces are in common.
+/// Adjusts the poses of a drive; `None` where no surfaces are in common, or where those that seem to be move the poses
+/// farther than the odometry can drift.
 pub fn adjust(
+    drive: &mut Drive,
+    held: Held,
+    config: &AdjustmentConfig,
+    budget: MemoryBudget,
+) -> Result<Option<Adjusted>, MemoryError> {
+    let before = drive.poses.clone();
+    let adjusted = adjust_unchecked(drive, held, config, budget)?;
+    let least_m = match held {
+        Held::First => drive.voxel_m,
+        Held::Given(_) => drive.voxel_m.max(SIGMAS * config.given_m),
+        Held::Surfaces(_) => return Ok(adjusted),
+    };
+    let Some((row, change_m)) = impossible_change(&before, &drive.poses, least_m) else {
+        return Ok(adjusted);
+    };
+    tracing::warn!(
+        "the poses are not adjusted to common surfaces: scan {row} would move by {change_m:.1} m, which is more than odometry drifts"
+    );
+    drive.poses = before;
+    Ok(None)
+}
+
+/// Standard deviations beyond which a change is impossible.
+const SIGMAS: f64 = 3.0;
+
+/// The first row whose position an adjustment changes by more than `least_m` and what odometry drifts until there; with the
+/// change [m].
+fn impossible_change(before: &[Pose3], after: &[Pose3], least_m: f64) -> Option<(usize, f64)> {
+    /// Drift of odometry, as a share of the path: that of `LoopConfig::drift_share`.
+    const DRIFT: f64 = 0.02;
+    let position = |pose: &Pose3| pose.translation.vector;
+    let mut path_m = 0.0;
+    before
+        .iter()
+        .zip(after)
+        .enumerate()
+        .find_map(|(row, (old, new))| {
+            path_m += row
+                .checked_sub(1)
+                .map_or(0.0, |last| (position(old) - position(&before[last])).norm());
+            let change_m = (position(new) - position(old)).norm();
+            (change_m > least_m + SIGMAS * DRIFT * path_m).then_some((row, change_m))
+        })
+}
+
+fn adjust_unchecked(
     drive: &mut Drive,
     held: Held,
     config: &AdjustmentConfig,
@@ -332,5 +379,26 @@ fn block_row(number: usize, row: &ScanPoints, planes: &[Plane], scale: f64) -> B
         off_diagonal: blocks
             .filter_map(|(index, block)| Some((number + index, block? * scale)))
             .collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_change_is_impossible_beyond_what_odometry_drifts_along_the_path() {
+        let straight = |step_m: f64| -> Vec<Pose3> {
+            (0..21)
+                .map(|row| Pose3::translation(step_m * f64::from(row), 0.0, 0.0))
+                .collect()
+        };
+        let change = |step_m| impossible_change(&straight(1.0), &straight(step_m), 0.25);
+        assert_eq!(change(1.0), None);
+        // 3 times 2 % of 20 m, and 0.25 m.
+        assert_eq!(change(1.07), None);
+        let (row, change_m) = change(0.9).unwrap();
+        assert_eq!(row, 7);
+        assert!((change_m - 0.7).abs() < 1e-9);
     }
 }
