@@ -1,7 +1,7 @@
 //! Errors of mapping: the way from a recording to a map.
 
+use super::lost_path::LostPath;
 use super::pose_report::PoseReport;
-use super::trajectory::LostPath;
 use crate::localization::SecondDriveError;
 use crate::map::BuildError;
 use crate::map::build::path_check::ImplausiblePath;

@@ -8,6 +8,7 @@
 //! results between the steps, takes them one by one: `with_given_poses`, `checked`, `PoseSearch`, `key_frames`.
 
 mod error;
+mod lost_path;
 mod pose_check;
 mod pose_report;
 mod pose_search;
@@ -17,8 +18,9 @@ mod trajectory;
 use std::sync::Arc;
 
 pub use error::MappingError;
+pub use lost_path::LostPath;
 pub use pose_report::{PoseReport, Tilt};
-pub use trajectory::{LoopCounts, LostPath, TrajectorySummary};
+pub use trajectory::{LoopCounts, TrajectorySummary};
 
 pub(crate) use pose_search::PoseSearch;
 pub(crate) use poses::{check_path, checked, key_frames, poses_of, with_given_poses};

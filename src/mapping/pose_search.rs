@@ -1,8 +1,9 @@
 //! The search for the poses of a recording that has none, or whose poses are polished.
 
 use super::error::MappingError;
+use super::lost_path::LostPath;
 use super::poses::check_path;
-use super::trajectory::{LostPath, OnEvent, each_scan, find_poses};
+use super::trajectory::{OnEvent, each_scan, find_poses};
 use crate::geometry::{Pose3, StampedPose};
 use crate::localization::{LocalizerConfig, SecondDrive, SecondDriveError, Tracker, TrackerConfig};
 use crate::map::{Map, MapConfig, PoseSource};
