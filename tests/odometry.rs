@@ -283,16 +283,6 @@ fn poses_that_were_found_without_compensation_are_polished_to_a_centimetre() {
     assert!(before_m > 0.05 && after_m < 0.015, "{before_m} {after_m}");
 }
 
-/// Positions of rows of KITTI [m].
-fn positions(poses: &Path) -> Vec<DVec3> {
-    let text = fs::read_to_string(poses).unwrap();
-    let row = |line: &str| {
-        let values: Vec<f64> = line.split(' ').map(|it| it.parse().unwrap()).collect();
-        DVec3::new(values[3], values[7], values[11])
-    };
-    text.lines().map(row).collect()
-}
-
 #[test]
 fn thinned_recordings_are_followed_or_warned_about() {
     for (name, scans, poses, strides) in [
@@ -302,7 +292,8 @@ fn thinned_recordings_are_followed_or_warned_about() {
         let Some(recording) = real_recording(name) else {
             return;
         };
-        let truth = positions(&recording.join(poses));
+        let truth = PoseTrack::read(&recording.join(poses), None).unwrap();
+        let position = |row: usize| truth.map_from_lidar[row].translation.vector;
         let times = fs::read_to_string(recording.join("times.txt")).unwrap();
         let times: Vec<&str> = times.lines().collect();
         let mut files: Vec<_> = fs::read_dir(recording.join(scans)).unwrap().collect();
@@ -325,7 +316,7 @@ fn thinned_recordings_are_followed_or_warned_about() {
             let path_m = report["path_m"].as_f64().unwrap();
             let steps = rows
                 .windows(2)
-                .map(|pair| truth[pair[0]].distance(truth[pair[1]]));
+                .map(|pair| (position(pair[1]) - position(pair[0])).norm());
             let true_m: f64 = steps.sum();
             let error = (path_m / true_m - 1.0).abs();
             let is_warned = output.stderr.contains("did not fit the scans before them");

@@ -24,10 +24,11 @@ use super::alignment::median;
 use super::block_system::{BlockRow, BlockSystem};
 use super::drive::{Drive, SHORTER};
 use super::elevation_bias::{ElevationBias, elevation_bias};
+use super::loops::Drift;
 use super::planes::{LidarFrame, Plane, ScanPoints, associate};
 use super::pose_graph::{Edge, information};
-use crate::geometry::Pose3;
 use crate::geometry::pose::{exponential, logarithm};
+use crate::geometry::{Pose3, distances_m};
 use crate::memory::{MemoryBudget, MemoryError};
 use crate::validation::{InvalidValue, Validate, in_range, positive};
 
@@ -124,23 +125,20 @@ const SIGMAS: f64 = 3.0;
 /// The first row whose position an adjustment changes by more than `least_m` and what odometry drifts until there; with the
 /// change [m].
 fn impossible_change(before: &[Pose3], after: &[Pose3], least_m: f64) -> Option<(usize, f64)> {
-    /// Drift of odometry, as a share of the path: that of `LoopConfig::drift_share`.
+    /// Drift of odometry, as a share of the path: the default of `LoopConfig::drift_share`.
     const DRIFT: f64 = 0.02;
-    let position = |pose: &Pose3| pose.translation.vector;
-    let mut path_m = 0.0;
-    before
-        .iter()
-        .zip(after)
-        .enumerate()
-        .find_map(|(row, (old, new))| {
-            path_m += row
-                .checked_sub(1)
-                .map_or(0.0, |last| (position(old) - position(&before[last])).norm());
-            let change_m = (position(new) - position(old)).norm();
-            (change_m > least_m + SIGMAS * DRIFT * path_m).then_some((row, change_m))
-        })
+    let drift = Drift {
+        share: SIGMAS * DRIFT,
+        least_m,
+    };
+    let changes_m = (before.iter().zip(after))
+        .map(|(old, new)| (new.translation.vector - old.translation.vector).norm());
+    (changes_m.zip(distances_m(before)).enumerate())
+        .find(|(_, (change_m, path_m))| *change_m > drift.after_m(*path_m))
+        .map(|(row, (change_m, _))| (row, change_m))
 }
 
+/// Adjusts the poses of a drive, however far they move.
 fn adjust_unchecked(
     drive: &mut Drive,
     held: Held,

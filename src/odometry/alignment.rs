@@ -102,7 +102,7 @@ impl Problem<'_> {
             .component_mul(&deviation)
             .component_div(&self.prior);
         let equations = self.observation.linearize(pose, kernel_m, matches);
-        let (of_points, count) = equations.cost(self.observation.points.len());
+        let (of_points, count) = equations.cost();
         let cost = (of_points + 0.5 * CORRELATED * squares.sum()) / count.max(1) as f64;
         (cost, equations.common_share())
     }
@@ -163,6 +163,11 @@ impl Problem<'_> {
         };
         (step.iter().all(|value| value.is_finite())).then_some((step, alignment))
     }
+}
+
+/// The alignment with the least cost.
+pub fn best(alignments: impl IntoIterator<Item = Alignment>) -> Option<Alignment> {
+    (alignments.into_iter()).min_by(|a, b| a.cost.total_cmp(&b.cost))
 }
 
 /// The median, the upper one of an even number; `None` without values.

@@ -39,8 +39,8 @@ pub struct OdometryConfig {
     /// Longest motion between two scans that a search finds, as a share of the range (unitless).
     #[default(0.2)]
     pub first_motion_share: f64,
-    /// Largest acceleration of the sensor [m/s²]: in the hand five times that of a fall. A motion that deviates more from
-    /// the prediction is refused once, and taken where the next scan fits as well.
+    /// Largest acceleration of the sensor [m/s²]: five times that of gravity, for a sensor in the hand. A motion that deviates
+    /// more from the prediction is refused once, and taken where the next scan fits as well.
     #[default(50.0)]
     pub max_acceleration_m_per_s2: f64,
     /// The same of its turns [deg/s²]: 20 degrees within 0.1 s.

@@ -78,11 +78,9 @@ pub struct Equations {
     pub other: Sums,
     /// Σ w Jᵀ r of points on planes, per sector of the azimuth.
     pub gradients: [Vector6<f64>; SECTORS],
-    /// Sum of the robust costs of all points and of those that are not on level surfaces, 0 to 1 each; points without a
-    /// match cost 1.
-    costs: [f64; 2],
-    /// Number of points that are not on level surfaces.
-    upright: usize,
+    /// Sums of the robust costs of all points and of those that are not on level surfaces, 0 to 1 each, with their numbers;
+    /// points without a match cost 1.
+    costs: [(f64, usize); 2],
     /// Number of points near planes that are not level, and of those on them.
     near_planes: [usize; 2],
     /// Distances to planes [m].
@@ -238,11 +236,12 @@ impl Sums {
 impl Equations {
     /// Sum of the robust costs, and the number of points that have them: those that are not on level surfaces, or all of
     /// them where there is hardly anything else.
-    pub fn cost(&self, points: usize) -> (f64, usize) {
-        if self.upright < MIN_UPRIGHT {
-            (self.costs[0], points)
+    pub fn cost(&self) -> (f64, usize) {
+        let [all, upright] = self.costs;
+        if upright.1 < MIN_UPRIGHT {
+            all
         } else {
-            (self.costs[1], self.upright)
+            upright
         }
     }
 
@@ -253,10 +252,9 @@ impl Equations {
     }
 
     fn add_cost(&mut self, cost: f64, is_level: bool) {
-        self.costs[0] += cost;
-        if !is_level {
-            self.costs[1] += cost;
-            self.upright += 1;
+        for (sum, count) in &mut self.costs[..if is_level { 1 } else { 2 }] {
+            *sum += cost;
+            *count += 1;
         }
     }
 
@@ -265,8 +263,7 @@ impl Equations {
             planar: Sums::default(),
             other: Sums::default(),
             gradients: [Vector6::zeros(); SECTORS],
-            costs: [0.0; 2],
-            upright: 0,
+            costs: [(0.0, 0); 2],
             near_planes: [0; 2],
             distances_m: Vec::new(),
         }
@@ -278,10 +275,10 @@ impl Equations {
         for (gradient, of_other) in self.gradients.iter_mut().zip(&other.gradients) {
             *gradient += of_other;
         }
-        for (cost, of_other) in self.costs.iter_mut().zip(other.costs) {
-            *cost += of_other;
+        for ((sum, count), of_other) in self.costs.iter_mut().zip(other.costs) {
+            *sum += of_other.0;
+            *count += of_other.1;
         }
-        self.upright += other.upright;
         for (count, of_other) in self.near_planes.iter_mut().zip(other.near_planes) {
             *count += of_other;
         }
@@ -327,7 +324,7 @@ mod tests {
         };
         let pose = Pose3::translation(0.0, aside_m, 0.0);
         let equations = observation.linearize(&pose, 0.1, &mut observation.unmatched());
-        let (cost, count) = equations.cost(points.len());
+        let (cost, count) = equations.cost();
         (cost / count as f64, equations.common_share())
     }
 

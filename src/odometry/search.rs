@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use super::alignment::{Alignment, Problem};
+use super::alignment::{Alignment, Problem, best};
 use super::residuals::Observation;
 use crate::geometry::Pose3;
 
@@ -30,7 +30,7 @@ pub fn search_widely(
     best_of(problem, starts, step_m, ALIGNED)
 }
 
-/// The alignment with the least cost from the best of some starts.
+/// The alignment with the least cost from those of some starts that cost least.
 fn best_of(
     problem: &Problem,
     starts: Vec<Pose3>,
@@ -60,11 +60,10 @@ fn best_of(
     let aligned: Vec<Alignment> = (starts.par_iter())
         .filter_map(|(_, start)| coarse.align(start, step_m))
         .collect();
-    let best = (aligned.iter()).min_by(|a, b| a.cost.total_cmp(&b.cost))?;
-    problem.align(&best.odom_from_lidar, step_m / 4.0)
+    problem.align(&best(aligned)?.odom_from_lidar, step_m / 4.0)
 }
 
-/// Least turn between starts [rad].
+/// Turn between starts [rad].
 const TURN: f64 = 0.12;
 /// Most steps of a search.
 const MAX_STEPS: usize = 20;
@@ -85,6 +84,7 @@ fn wide_starts(problem: &Problem, step_m: f64, reach_m: f64) -> Vec<Pose3> {
         .collect()
 }
 
+/// Number of steps up to the reach.
 fn steps(step_m: f64, reach_m: f64) -> i32 {
     ((reach_m / step_m).ceil() as usize).clamp(1, MAX_STEPS) as i32
 }

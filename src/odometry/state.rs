@@ -2,7 +2,7 @@
 
 use nalgebra::Vector6;
 
-use super::alignment::{Alignment, Problem};
+use super::alignment::{Alignment, Problem, best};
 use super::config::OdometryConfig;
 use super::residuals::Observation;
 use super::sampling::{Sample, sensor_range};
@@ -13,6 +13,8 @@ use crate::lidar::{Motion, PERIOD_S, Scan};
 
 /// Step of a search, in voxels.
 const STEP: f64 = 4.0;
+/// Deviations from the prediction that are possible, in usual ones.
+const SIGMAS: f64 = 3.0;
 
 /// OdometerState after a scan.
 #[derive(Clone, Debug)]
@@ -90,8 +92,6 @@ impl OdometerState {
 
     /// Variances of the prediction, (x, y, z, roll, pitch, yaw) in the lidar frame [m², rad²].
     pub fn prior(&self, duration_s: f64, config: &OdometryConfig) -> Vector6<f64> {
-        /// Standard deviations of the mean deviation.
-        const SIGMAS: f64 = 3.0;
         /// Least standard deviation per period, in voxels.
         const FLOOR: f64 = 0.3;
         /// Least standard deviation per period [rad].
@@ -178,7 +178,7 @@ impl OdometerState {
         const REACH: f64 = 8.0;
         let voxel_m = self.voxel_m(config);
         let [shift, turn] = self.deviation.map(f64::sqrt);
-        let kernel_m = 3.0 * (shift + 0.5 * self.range_m * turn);
+        let kernel_m = SIGMAS * (shift + 0.5 * self.range_m * turn);
         let kernel_m = kernel_m.clamp(KERNEL[0] * voxel_m, KERNEL[1] * voxel_m);
         let found = problem.align(&problem.predicted, kernel_m);
         let is_expected = |found: &Alignment| {
@@ -281,10 +281,8 @@ impl OdometerState {
     fn is_common(&self, share: f64, config: &OdometryConfig) -> bool {
         /// Share of the points near a plane that lie on it at wrong poses.
         const CHANCE: f64 = 0.3;
-        let usual = self
-            .common_share
-            .map_or(0.0, |usual| CHANCE + 0.5 * (usual - CHANCE));
-        share >= usual.min(1.0).max(config.min_common_share) || config.min_common_share == 0.0
+        let least = (self.common_share).map_or(0.0, |usual| CHANCE + 0.5 * (usual - CHANCE));
+        config.min_common_share == 0.0 || share >= least.max(config.min_common_share)
     }
 
     /// Whether a motion deviates from the prediction by no more than a vehicle or a hand can accelerate, or than is usual.
@@ -295,8 +293,6 @@ impl OdometerState {
         since_s: f64,
         config: &OdometryConfig,
     ) -> bool {
-        /// Standard deviations of the usual deviation.
-        const SIGMAS: f64 = 3.0;
         if self.is_lost() {
             return true;
         }
@@ -412,11 +408,6 @@ impl OdometerState {
     fn sample(&self, scan: &Scan, config: &OdometryConfig) -> Sample {
         Sample::new(scan, self.range_m, config)
     }
-}
-
-/// The alignment with the least cost.
-fn best(alignments: impl Iterator<Item = Alignment>) -> Option<Alignment> {
-    alignments.min_by(|a, b| a.cost.total_cmp(&b.cost))
 }
 
 #[cfg(test)]
