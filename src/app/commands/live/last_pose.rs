@@ -12,7 +12,6 @@ use crate::app::run::output;
 use crate::app::settings::LocalizationConfig;
 use crate::files::folder_of;
 use crate::geometry::{FARTHEST_M, Pose3};
-use crate::localization::{Start, StartSpread};
 
 /// Name of the file.
 pub const FILE: &str = "last_pose.json";
@@ -25,7 +24,7 @@ const INTERVAL: Duration = Duration::from_secs(1);
 
 /// A confirmed pose.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct LastPose {
+struct LastPose {
     /// The map that it is in.
     map_file: PathBuf,
     /// Size of the file of the map [bytes].
@@ -36,45 +35,39 @@ pub struct LastPose {
     map_from_lidar: [f64; 7],
 }
 
-impl LastPose {
-    /// Reads the pose next to the result of a configuration; `None`, with a warning, where there is none yet.
-    pub fn read(config: &LocalizationConfig) -> Result<Option<Self>> {
-        let path = path(config);
-        if !path.exists() {
-            tracing::warn!(
-                "{} does not exist: the start is searched as without --start",
-                path.display()
-            );
-            return Ok(None);
-        }
-        let read = || {
-            let bytes = fs::metadata(&path)?.len();
-            ensure!(bytes <= MOST_BYTES, "it has {bytes} bytes");
-            let last: Self = serde_json::from_str(&fs::read_to_string(&path)?)?;
-            last.pose().context("it has no pose on Earth")?;
-            Ok(last)
-        };
-        let last = read().with_context(|| {
-            let path = path.display();
-            format!("{path} is no last pose of fpmcl; remove it, or start without --start last")
-        })?;
-        let map_file = &config.map_input.map_file;
-        ensure!(
-            last.map_bytes == bytes_of(map_file),
-            "{} is a pose in the map {}, and {} is another one; start without --start last",
-            path.display(),
-            last.map_file.display(),
-            map_file.display()
+/// Reads the pose in the map next to the result of a configuration; `None`, with a warning, where there is none yet.
+pub fn read(config: &LocalizationConfig) -> Result<Option<Pose3>> {
+    let path = path(config);
+    if !path.exists() {
+        tracing::warn!(
+            "{} does not exist: the start is searched as without --start",
+            path.display()
         );
-        Ok(Some(last))
+        return Ok(None);
     }
+    let read = || {
+        let bytes = fs::metadata(&path)?.len();
+        ensure!(bytes <= MOST_BYTES, "it has {bytes} bytes");
+        let last: LastPose = serde_json::from_str(&fs::read_to_string(&path)?)?;
+        let pose = last.pose().context("it has no pose on Earth")?;
+        Ok((last, pose))
+    };
+    let (last, pose) = read().with_context(|| {
+        let path = path.display();
+        format!("{path} is no last pose of fpmcl; remove it, or start without --start last")
+    })?;
+    let map_file = &config.map_input.map_file;
+    ensure!(
+        last.map_bytes == bytes_of(map_file),
+        "{} is a pose in the map {}, and {} is another one; start without --start last",
+        path.display(),
+        last.map_file.display(),
+        map_file.display()
+    );
+    Ok(Some(pose))
+}
 
-    /// The start there, which the scans must confirm.
-    pub fn start(&self, spread: &StartSpread) -> Start {
-        let pose = self.pose().unwrap_or_else(Pose3::identity);
-        Start::near(&pose, spread.clone())
-    }
-
+impl LastPose {
     fn pose(&self) -> Option<Pose3> {
         let [x, y, z, i, j, k, w] = self.map_from_lidar;
         let quaternion = Quaternion::new(w, i, j, k);

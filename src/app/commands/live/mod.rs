@@ -12,13 +12,13 @@ use serde::{Serialize, Serializer};
 use serde_json::json;
 
 use self::driving::Drive;
-use self::last_pose::LastPose;
 use super::localize::tracking::start;
-use super::localize::{run_with, start_pose};
+use super::localize::{DriveArgs, run_with, start_pose};
 use crate::app::report::Report;
 use crate::app::run::arguments::yaml;
 use crate::app::run::{ConfigArgs, Context, RunArgs};
 use crate::app::settings::LocalizationConfig;
+use crate::localization::Start;
 
 /// Arguments of `live`.
 #[derive(Clone, Debug, Args, Serialize)]
@@ -48,21 +48,10 @@ pub struct LiveArgs {
     #[serde(rename = "initial_pose", serialize_with = "pose_of_start")]
     pub start: Option<LiveStart>,
 
-    /// Odometry, rows of KITTI or TUM, or a topic of the bag; by default the topic of odometry that a bag has, else the scans. Sets the key `odometry_file`.
-    #[arg(long = "odometry", value_name = "FILE")]
-    pub odometry_file: Option<PathBuf>,
-
-    /// True poses of the recording for the report; sets the key `pose_file`.
-    #[arg(long = "truth", value_name = "FILE")]
-    pub pose_file: Option<PathBuf>,
-
-    /// Calibration of the camera, if the true poses are those of a camera; sets the key `calib_file`.
-    #[arg(long = "calib", value_name = "FILE")]
-    pub calib_file: Option<PathBuf>,
-
-    /// Result to write (.npz); sets the key `result_path`.
-    #[arg(long = "output", value_name = "RESULT")]
-    pub result_path: Option<PathBuf>,
+    /// Odometry, true poses and result.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub files: DriveArgs,
 
     /// Scans that may wait while another one is computed; the oldest is dropped for a newer one.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=1000))]
@@ -134,7 +123,7 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
         );
     }
     let last = match args.start {
-        Some(LiveStart::Last) => LastPose::read(config)?,
+        Some(LiveStart::Last) => last_pose::read(config)?,
         _ => None,
     };
     run_with(
@@ -144,7 +133,7 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
         |opened, motion, recorded| {
             let start = last.as_ref().map_or_else(
                 || start(config, &opened.map, &opened.recording),
-                |last| last.start(&config.start),
+                |last| Start::near(last, config.start.clone()),
             );
             let drive = Drive {
                 opened,

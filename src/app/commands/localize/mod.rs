@@ -25,6 +25,26 @@ use crate::app::run::arguments::numbers;
 use crate::app::run::{Context, RunArgs};
 use crate::app::settings::LocalizationConfig;
 
+/// Files beside the scans and the map, of `localize` and `live`.
+#[derive(Clone, Debug, Args, Serialize)]
+pub struct DriveArgs {
+    /// Odometry, rows of KITTI or TUM, or a topic of the bag; by default the topic of odometry that a bag has, else the scans. Sets the key `odometry_file`.
+    #[arg(long = "odometry", value_name = "FILE")]
+    pub odometry_file: Option<PathBuf>,
+
+    /// True poses of the recording for the report; sets the key `pose_file`.
+    #[arg(long = "truth", value_name = "FILE")]
+    pub pose_file: Option<PathBuf>,
+
+    /// Calibration of the camera, if the true poses are those of a camera; sets the key `calib_file`.
+    #[arg(long = "calib", value_name = "FILE")]
+    pub calib_file: Option<PathBuf>,
+
+    /// Result to write (.npz); sets the key `result_path`.
+    #[arg(long = "output", value_name = "RESULT")]
+    pub result_path: Option<PathBuf>,
+}
+
 /// Arguments of `localize`.
 #[derive(Clone, Debug, Args, Serialize)]
 pub struct LocalizeArgs {
@@ -42,21 +62,10 @@ pub struct LocalizeArgs {
     #[serde(rename = "initial_pose")]
     pub start: Option<[f64; 3]>,
 
-    /// Odometry, rows of KITTI or TUM, or a topic of the bag; by default the topic of odometry that a bag has, else the scans. Sets the key `odometry_file`.
-    #[arg(long = "odometry", value_name = "FILE")]
-    pub odometry_file: Option<PathBuf>,
-
-    /// True poses of the recording for the report; sets the key `pose_file`.
-    #[arg(long = "truth", value_name = "FILE")]
-    pub pose_file: Option<PathBuf>,
-
-    /// Calibration of the camera, if the true poses are those of a camera; sets the key `calib_file`.
-    #[arg(long = "calib", value_name = "FILE")]
-    pub calib_file: Option<PathBuf>,
-
-    /// Result to write (.npz); sets the key `result_path`.
-    #[arg(long = "output", value_name = "RESULT")]
-    pub result_path: Option<PathBuf>,
+    /// Odometry, true poses and result.
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub files: DriveArgs,
 
     /// Log to write afterwards, for Foxglove and rerun (.mcap), as `export` does.
     #[arg(long, value_name = "FILE")]
@@ -98,12 +107,12 @@ pub fn run_with(
     context.interrupt.supervise(
         || {
             localize(&opened, &mut motion, &recorded)?;
-            let (searched, frames) = {
+            let searched = {
                 let run = recorded();
-                (run.searched(), run.frames(&opened.recording))
+                (run.searched()).map(|searched| (searched, run.frames(&opened.recording)))
             };
             let filled = searched
-                .map(|it| fill_back(&opened, &frames, &it, context))
+                .map(|(searched, frames)| fill_back(&opened, &frames, &searched, context))
                 .transpose()?;
             let mut run = recorded();
             if let Some(filled) = filled.flatten() {
