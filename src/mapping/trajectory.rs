@@ -69,7 +69,7 @@ pub struct TrajectorySummary {
     pub scans: usize,
     /// Scans whose pose was predicted, because they did not fit.
     pub predicted: usize,
-    /// Scans that fit where no motion before would lead.
+    /// Scans that fit only after an unexpected motion.
     pub doubtful: usize,
     /// Scans that do not determine all of their motion.
     pub degenerate: usize,

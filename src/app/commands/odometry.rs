@@ -75,10 +75,7 @@ pub fn run(config: &OdometryCommandConfig, context: &Context) -> Result<Printed>
     output::write_yaml(&folder.join("effective_odometry.yml"), &resolved)?;
     output::write_json(&main, &report)?;
     claims.finish(&main)?;
-    if let Some(lost) = LostPath::of(&found, &frames) {
-        tracing::warn!("the path is not to be trusted: {lost}");
-    }
-    odometry::warn(&report.summary);
+    odometry::warn(&report.summary, LostPath::of(&found, &frames).as_ref());
     Printed::rows(&odometry::rows(&report.summary), &report)
 }
 

@@ -12,7 +12,7 @@ use super::results::{FrameTable, write_trajectory_npz};
 use super::run_output::{RunFiles, Trajectory as WrittenTrajectory, stamped};
 use crate::app::run::output;
 use crate::geometry::{Pose2, Pose3, pose2_from_pose3};
-use crate::mapping::TrajectorySummary;
+use crate::mapping::{LostPath, TrajectorySummary};
 use crate::odometry::{ElevationBias, Loop, OdometryEstimate, StepState, Trajectory};
 use crate::recording::poses::write_tum;
 use crate::recording::{Frame, Recording};
@@ -119,18 +119,20 @@ pub fn rows(summary: &TrajectorySummary) -> Vec<(&'static str, String)> {
     rows
 }
 
-/// Warns of scans that could not be registered, and says what may be wrong with the elevations.
-pub fn warn(summary: &TrajectorySummary) {
-    if summary.predicted > 0 {
-        tracing::warn!(
+/// Warns of scans that could not be registered, or of a path that is lost by them, and says what may be wrong with the elevations.
+pub fn warn(summary: &TrajectorySummary, lost: Option<&LostPath>) {
+    match lost {
+        Some(lost) => tracing::warn!("the path is not to be trusted: {lost}"),
+        None if summary.predicted > 0 => tracing::warn!(
             "{} of {} scans did not fit the scans before them: their poses are predicted",
             summary.predicted,
             summary.scans
-        );
+        ),
+        None => {}
     }
     if summary.doubtful > 0 {
         tracing::warn!(
-            "{} of {} scans fit only after a motion that those before do not lead to expect",
+            "{} of {} scans fit only after an unexpected motion",
             summary.doubtful,
             summary.scans
         );

@@ -25,7 +25,7 @@ use crate::shared_bytes::{SharedBytes, pad, ranges_of, write_part};
 
 /// Panoramas rendered at a time.
 pub(crate) const BATCH: usize = 512;
-/// From this number of places on, each tenth that is rendered is logged: about half a minute for all of them.
+/// From this number of places on, each tenth that is rendered is logged: they take about five seconds.
 const MANY_PLACES: usize = 20_000;
 
 pub(crate) const MAGIC: [u8; 8] = *b"fpmclpan";

@@ -91,7 +91,7 @@ pub fn find(
             search.find(memory::budget(), on_event)
         })?;
         let summary = TrajectorySummary::new(&found, has_times);
-        odometry::warn(&summary);
+        odometry::warn(&summary, None);
         let summary_line = serde_json::to_string(&summary.without_times())?;
         let rows = search.rows(&found);
         output::write_file(&path, |file| {
