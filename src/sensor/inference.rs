@@ -139,7 +139,7 @@ impl Sensor {
         self
     }
 
-    /// Completes a sensor that was inferred from its first scans by more of them, consecutive ones: the own car and the
+    /// Completes a sensor that was inferred from its first scans by more of them, consecutive ones: own car, period and
     /// times of the points, where they are not known. Returns whether the scans show them, which needs motion.
     pub(crate) fn complete(
         &mut self,
@@ -153,6 +153,11 @@ impl Sensor {
         }
         self.is_moving = true;
         self.own_car_m = known.own_car_m.unwrap_or(own_car.rectangle_m);
+        self.period_s = self.period_s.or_else(|| {
+            let times = (scans.iter().enumerate())
+                .filter_map(|(number, scan)| Some((number, scan.time_s?)));
+            rotation::interval_s(&times.collect::<Vec<_>>())
+        });
         if self.motion_compensation == Some(MotionCompensation::Auto)
             && scans.iter().all(|scan| scan.times_s.is_empty())
         {

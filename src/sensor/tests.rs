@@ -274,7 +274,15 @@ fn a_moving_sensor_sees_its_own_car_and_the_ground_below() {
     let known = SensorConfig::default();
     assert!(!first.complete(&standing, &known).unwrap());
     assert!(first.complete(&scans, &known).unwrap());
-    assert_eq!(first.own_car_m, found.own_car_m);
+    assert_eq!((first.own_car_m, first.period_s), (found.own_car_m, None));
+
+    // Consecutive scans with times show the period, also where one has none.
+    let mut timed = scans;
+    for (number, scan) in timed.iter_mut().enumerate() {
+        scan.time_s = (number != 4).then_some(5.0 + 0.05 * number as f64);
+    }
+    assert!(first.complete(&timed, &known).unwrap());
+    assert!((first.period_s.unwrap() - 0.05).abs() < 1e-9);
 }
 
 #[test]
