@@ -40,9 +40,9 @@ pub struct Run {
 
 impl Run {
     pub fn new(opened: &Opened, claims: Claims) -> Result<Self> {
-        /// An empty column, if it will be filled.
-        fn column<T>(is_filled: bool) -> Option<Vec<T>> {
-            is_filled.then(Vec::new)
+        /// An empty column, if it will be filled. It is allocated for all frames at once: a drive does not stop to copy it.
+        fn column<T>(is_filled: bool, rows: usize) -> Option<Vec<T>> {
+            is_filled.then(|| Vec::with_capacity(rows))
         }
         let config = &opened.config;
         let (has_truth, is_refined) = (config.given_poses.pose_file.is_some(), config.refine);
@@ -50,33 +50,34 @@ impl Run {
         let selected: Vec<usize> = (opened.recording.frames.iter())
             .map(|frame| frame.number)
             .collect();
+        let rows = selected.len();
         let mut run = Self {
             results: LocalizationResults {
-                frames: Vec::new(),
+                frames: Vec::with_capacity(rows),
                 particles: ParticleLog::new(config.tracker.localizer.num_particles, folder),
-                estimates: column(true),
-                refined: column(is_refined),
-                ground_truth: column(has_truth),
-                estimates_in_space: column(true),
-                refined_in_space: column(is_refined),
-                ground_truth_in_space: column(has_truth),
-                odometry: column(true),
-                covariances: column(true),
-                refined_covariances: column(is_refined),
-                times_s: column(true),
-                runtimes_s: column(true),
-                refine_runtimes_s: column(is_refined),
-                agreements: column(true),
-                places: column(true),
-                states: column(true),
+                estimates: column(true, rows),
+                refined: column(is_refined, rows),
+                ground_truth: column(has_truth, rows),
+                estimates_in_space: column(true, rows),
+                refined_in_space: column(is_refined, rows),
+                ground_truth_in_space: column(has_truth, rows),
+                odometry: column(true, rows),
+                covariances: column(true, rows),
+                refined_covariances: column(is_refined, rows),
+                times_s: column(true, rows),
+                runtimes_s: column(true, rows),
+                refine_runtimes_s: column(is_refined, rows),
+                agreements: column(true, rows),
+                places: column(true, rows),
+                states: column(true, rows),
                 trajectory_in_space: None,
                 trajectory_states: None,
-                refined_states: column(is_refined),
-                refinement_costs_m: column(is_refined),
-                refinement_agreements: column(is_refined),
-                scan_outlines: (selected.len() <= ScanOutline::MOST_FRAMES)
+                refined_states: column(is_refined, rows),
+                refinement_costs_m: column(is_refined, rows),
+                refinement_agreements: column(is_refined, rows),
+                scan_outlines: (rows <= ScanOutline::MOST_FRAMES)
                     .then(|| RowLog::in_folder(folder)),
-                selected: Some(selected.len()),
+                selected: Some(rows),
                 times_are_assumed: !opened.recording.has_times,
             },
             writer: None,
