@@ -4,9 +4,12 @@
 
 mod common;
 
+use std::collections::BTreeMap;
 use std::fs;
 
 use common::{Fpmcl, Output, Recording};
+use foxglove::Decode as _;
+use foxglove::messages::Odometry;
 use fpmcl::internals::app::LocalizationResults;
 use serde_json::{Value, json};
 
@@ -192,6 +195,67 @@ fn a_last_pose_of_another_map_or_of_no_place_on_earth_is_an_error() {
     );
 }
 
+/// Contents of the messages of each topic.
+fn messages(recording: &Recording, log: &str) -> BTreeMap<String, Vec<Vec<u8>>> {
+    let log = recording.bytes(log);
+    let mut topics = BTreeMap::<String, Vec<_>>::new();
+    for message in mcap::MessageStream::new(&log).unwrap() {
+        let message = message.unwrap();
+        let topic = topics.entry(message.channel.topic.clone()).or_default();
+        topic.push(message.data.into_owned());
+    }
+    topics
+}
+
+#[test]
+fn a_log_that_is_written_on_the_way_has_the_messages_that_export_writes_of_the_result() {
+    let recording = street(12);
+    let call = patient(&recording).with("--record=run.mcap");
+    let report = report(&call.with("--json").succeeds());
+    assert_eq!(report["live"]["states"], json!({"tracking": 12}));
+    let call = common::fpmcl("export").in_folder(recording.folder());
+    call.with(RESULT).with("--mcap=exported.mcap").succeeds();
+    let [live, exported] = ["run.mcap", "exported.mcap"].map(|log| messages(&recording, log));
+    for topic in ["/map", "/particles"] {
+        assert!(live[topic] == exported[topic], "{topic}");
+    }
+    // Quaternions are normalized when a result is read.
+    let without_rotation = |message: &Vec<u8>| {
+        let mut estimate = Odometry::decode(message.as_slice()).unwrap();
+        estimate.pose.as_mut().unwrap().orientation = None;
+        estimate
+    };
+    for (live, exported) in live["/estimate"].iter().zip(&exported["/estimate"]) {
+        assert_eq!(without_rotation(live), without_rotation(exported));
+    }
+    assert_eq!(live["/tf"].len(), 12);
+    assert_eq!(live["/scan"].len(), 12);
+    let text = |topic: &str| -> Vec<String> {
+        let texts = live[topic].iter();
+        texts
+            .map(|it| String::from_utf8_lossy(it).into_owned())
+            .collect()
+    };
+    let [starting, tracking] = text("/state").try_into().unwrap();
+    assert!(
+        starting.contains("starting: no scan has arrived"),
+        "{starting}"
+    );
+    assert!(
+        tracking.contains("tracking: the scan agrees with the map"),
+        "{tracking}"
+    );
+    for (frame, numbers) in text("/numbers").iter().enumerate() {
+        let numbers: Value = serde_json::from_str(numbers).unwrap();
+        assert_eq!(numbers["frame"], frame);
+        assert_eq!(numbers["reason"], "the scan agrees with the map");
+        assert!(numbers["latency_ms"].as_f64() > Some(0.0) && numbers["dropped"] == 0);
+    }
+    let again = patient(&recording).with("--record=run.mcap");
+    let again = again.set("result_path", "others/localization.npz");
+    again.fails_with(&["run.mcap exists; add --force"]);
+}
+
 #[test]
 fn what_live_cannot_do_is_an_error_before_any_work() {
     let recording = Recording::street(1);
@@ -206,7 +270,10 @@ fn what_live_cannot_do_is_an_error_before_any_work() {
     patient(&recording)
         .set("refine", "True")
         .fails_with(&message);
-    for (flag, part) in [("--rate=0", "0.001 to 1000"), ("--queue=0", "1..=1000")] {
+    for (flag, part) in [
+        ("--rate=0", "0.001 to 1000"),
+        ("--queue=0", "1..=1000"),
+    ] {
         live()
             .with("--replay=velodyne")
             .with(flag)

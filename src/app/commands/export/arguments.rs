@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
+use crate::app::report::export::MOST_POINTS;
 use crate::app::run::{MachineArgs, gibibytes};
 
 /// Arguments of `export`.
@@ -43,7 +44,7 @@ pub struct ExportArgs {
     pub map: Option<PathBuf>,
 
     /// Largest number of points per scan in a log; 0 for a log without scans.
-    #[arg(long, value_name = "N", default_value_t = Self::POINTS)]
+    #[arg(long, value_name = "N", default_value_t = MOST_POINTS)]
     pub points: usize,
 
     /// Largest memory that a stage may plan for; by default half of the machine's.
@@ -56,8 +57,6 @@ pub struct ExportArgs {
 }
 
 impl ExportArgs {
-    /// Default of `points`.
-    const POINTS: usize = 30_000;
     /// Default of `spacing` [m].
     const SPACING_M: f64 = 0.2;
     /// Default of `tile_size` [m]: that of Autoware.
@@ -82,7 +81,7 @@ impl ExportArgs {
             tile_size: Self::TILE_SIZE_M,
             recording: None,
             map: Some(map.to_owned()),
-            points: Self::POINTS,
+            points: MOST_POINTS,
             memory: None,
             force,
         }

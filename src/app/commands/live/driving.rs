@@ -1,5 +1,6 @@
 //! The loop over the scans that arrive.
 
+use std::iter;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -12,7 +13,9 @@ use super::super::localize::opened::Opened;
 use super::super::motion_source::{FrameMotion, MotionSource};
 use super::last_pose::LastPoseWriter;
 use super::replay::{ReplayedFrame, replay};
+use crate::app::report::export::{LiveFrame, LiveLog, Sinks, live_log};
 use crate::app::report::results::{LatencySummary, LiveSummary};
+use crate::app::report::run_output;
 use crate::app::run::Context;
 use crate::geometry::{Pose3, pose3_from_pose2};
 use crate::lidar::Scan;
@@ -40,7 +43,7 @@ pub struct Drive<'a, 'b> {
 
 impl Drive<'_, '_> {
     /// Receives scans in one thread and localizes them in this one, until the last or an interruption.
-    pub fn run(&self, motion: &mut MotionSource, start: Start) -> Result<()> {
+    pub fn run(&self, motion: &mut MotionSource, start: Start, sinks: Sinks) -> Result<()> {
         // A known start is that of the first scan, which is not dropped.
         let is_prepared = matches!(start, Start::Pose { .. });
         let tracker = FrameTracker::new(self.opened, motion, start)?;
@@ -48,9 +51,18 @@ impl Drive<'_, '_> {
         let unreadable = AtomicU64::new(0);
         let interrupt = &self.context.interrupt;
         let (frames, rate) = (&self.opened.recording.frames, self.rate);
+        let mesh = (!sinks.is_empty())
+            .then(|| run_output::map_around(&self.opened.map, iter::empty()))
+            .transpose()?;
         let summary = thread::scope(|scope| {
             scope.spawn(|| replay(frames, rate, &inbox, &unreadable, interrupt));
-            let mut driver = Driver::new(self, tracker, is_prepared);
+            let log = mesh.map(|mesh| {
+                let (log, writer) = live_log(sinks);
+                let first_s = frames.first().map_or(0.0, |frame| frame.time_s);
+                scope.spawn(move || writer.run(&mesh, first_s));
+                log
+            });
+            let mut driver = Driver::new(self, tracker, is_prepared, log);
             let outcome = driver.follow(&inbox);
             // Nobody takes what the other thread would still send.
             inbox.close();
@@ -78,16 +90,23 @@ struct Driver<'a, 'b> {
     clock: StampClock,
     latencies: Latencies,
     last_pose: Option<LastPoseWriter>,
+    log: Option<LiveLog>,
     summary: LiveSummary,
     /// Whether the map is prepared for the start.
     is_prepared: bool,
-    /// When the last scan arrived, and the time since the one before.
+    /// Time of the last scan [s], when it arrived, and the time since the one before.
+    last_s: f64,
     last_arrival: Option<Instant>,
     period: Option<Duration>,
 }
 
 impl<'a, 'b> Driver<'a, 'b> {
-    fn new(drive: &'a Drive<'a, 'b>, tracker: FrameTracker<'a>, is_prepared: bool) -> Self {
+    fn new(
+        drive: &'a Drive<'a, 'b>,
+        tracker: FrameTracker<'a>,
+        is_prepared: bool,
+        log: Option<LiveLog>,
+    ) -> Self {
         let config = &drive.opened.config;
         Self {
             drive,
@@ -96,8 +115,10 @@ impl<'a, 'b> Driver<'a, 'b> {
             clock: StampClock::new(drive.rate),
             latencies: Latencies::default(),
             last_pose: LastPoseWriter::new(config),
+            log,
             summary: LiveSummary::default(),
             is_prepared,
+            last_s: 0.0,
             last_arrival: None,
             period: None,
         }
@@ -118,7 +139,7 @@ impl<'a, 'b> Driver<'a, 'b> {
                     inbox.put_back(arrival);
                 }
                 Received::Scan(arrival) => {
-                    self.take(&arrival)?;
+                    self.take(arrival, inbox.dropped())?;
                     let count = inbox.dropped() + self.summary.rejected + self.latencies.count();
                     task.set_share(count as f64 / self.drive.opened.recording.frames.len() as f64);
                 }
@@ -148,16 +169,16 @@ impl<'a, 'b> Driver<'a, 'b> {
     }
 
     /// Localizes a scan.
-    fn take(&mut self, arrival: &Arrival<ReplayedFrame>) -> Result<()> {
+    fn take(&mut self, arrival: Arrival<ReplayedFrame>, dropped: u64) -> Result<()> {
         let Arrival {
             scan: (row, scan),
             arrived,
         } = arrival;
-        let frame = &self.drive.opened.recording.frames[*row];
+        let frame = &self.drive.opened.recording.frames[row];
         self.period = self.last_arrival.map(|last| arrived.duration_since(last));
-        self.last_arrival = Some(*arrived);
+        (self.last_arrival, self.last_s) = (Some(arrived), frame.time_s);
         let stamp_s = scan.time_s.unwrap_or(frame.time_s);
-        match self.clock.tick(stamp_s, *arrived) {
+        match self.clock.tick(stamp_s, arrived) {
             Tick::Later => {}
             Tick::Repeated => {
                 self.reject(&format!(
@@ -167,7 +188,7 @@ impl<'a, 'b> Driver<'a, 'b> {
             }
             Tick::Jumped => self.restart(stamp_s)?,
         }
-        let tracked = match self.tracker.step(*row, scan) {
+        let tracked = match self.tracker.step(row, &scan) {
             Err(error) if error.downcast_ref().is_some_and(is_about_scan) => {
                 self.reject(&error.to_string());
                 return Ok(());
@@ -177,14 +198,27 @@ impl<'a, 'b> Driver<'a, 'b> {
         let before = self.monitor.reason();
         self.monitor
             .update(&tracked.estimate, &in_space(tracked.motion));
-        self.latencies.add(arrived.elapsed());
+        let latency = arrived.elapsed();
+        self.latencies.add(latency);
         let state = self.monitor.state();
         if let (LiveState::Tracking, Some(last_pose)) = (state, &mut self.last_pose) {
             last_pose.update(frame.time_s, &tracked.estimate.map_from_lidar);
         }
-        (self.drive.recorded)().record(frame, scan, &tracked)?;
+        (self.drive.recorded)().record(frame, &scan, &tracked)?;
         *self.summary.states.entry(state).or_default() += 1;
-        self.note_change(before);
+        let estimate = tracked.estimate;
+        if let Some(log) = &mut self.log {
+            log.frame(LiveFrame {
+                number: frame.number,
+                time_s: frame.time_s,
+                scan,
+                estimate,
+                reason: self.monitor.reason(),
+                latency,
+                dropped,
+            });
+        }
+        self.note_change(before, Duration::ZERO);
         Ok(())
     }
 
@@ -193,9 +227,9 @@ impl<'a, 'b> Driver<'a, 'b> {
         let (Some(last), Some(period)) = (self.last_arrival, self.period) else {
             return;
         };
-        let before = self.monitor.reason();
-        self.monitor.wait(last.elapsed(), period, None);
-        self.note_change(before);
+        let (before, waited) = (self.monitor.reason(), last.elapsed());
+        self.monitor.wait(waited, period, None);
+        self.note_change(before, waited);
     }
 
     /// Begins again after the clock of the scans was set, around the pose that was believed.
@@ -225,18 +259,21 @@ impl<'a, 'b> Driver<'a, 'b> {
     fn note(&mut self, reason: Reason) {
         let before = self.monitor.reason();
         self.monitor.set(reason);
-        self.note_change(before);
+        self.note_change(before, Duration::ZERO);
     }
 
-    /// Reports a change of the state.
-    fn note_change(&mut self, before: Reason) {
+    /// Reports a change of the state, some time after the last scan.
+    fn note_change(&mut self, before: Reason, waited: Duration) {
         let (state, reason) = (self.monitor.state(), self.monitor.reason());
         if state == before.state() {
             return;
         }
         self.summary.changes += 1;
-        let (state, reason) = (state.word(), reason.words());
-        tracing::info!("{state}: {reason}");
+        tracing::info!("{}: {}", state.word(), reason.words());
+        if let Some(log) = &mut self.log {
+            let time_s = self.last_s + self.drive.rate * waited.as_secs_f64();
+            log.state(time_s, reason);
+        }
     }
 }
 

@@ -12,9 +12,11 @@ use serde::{Serialize, Serializer};
 use serde_json::json;
 
 use self::driving::Drive;
+use super::export::{self, ExportArgs};
 use super::localize::tracking::start;
 use super::localize::{DriveArgs, run_with, start_pose};
 use crate::app::report::Report;
+use crate::app::report::export::{McapFile, Sinks};
 use crate::app::run::arguments::yaml;
 use crate::app::run::{ConfigArgs, Context, RunArgs};
 use crate::app::settings::LocalizationConfig;
@@ -52,6 +54,11 @@ pub struct LiveArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub files: DriveArgs,
+
+    /// Log to write on the way, for Foxglove and rerun (.mcap): map, scans, poses, particles, and states with their reasons.
+    #[arg(long, value_name = "FILE")]
+    #[serde(skip)]
+    pub record: Option<PathBuf>,
 
     /// Scans that may wait while another one is computed; the oldest is dropped for a newer one.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=1000))]
@@ -126,7 +133,13 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
         Some(LiveStart::Last) => last_pose::read(config)?,
         _ => None,
     };
-    run_with(
+    let log = args.record.as_deref().map(|path| {
+        let map = &config.map_input.map_file;
+        ExportArgs::log_of(&config.result_path, map, path, config.output.force)
+    });
+    let claimed = log.map(|log| export::check(&log, context)).transpose()?;
+    let sinks = sinks(args)?;
+    let report = run_with(
         config,
         &[last_pose::FILE],
         context,
@@ -142,7 +155,23 @@ pub fn run(args: &LiveArgs, config: &LocalizationConfig, context: &Context) -> R
                 queue: usize::from(args.queue),
                 context,
             };
-            drive.run(motion, start)
+            drive.run(motion, start, sinks)
         },
-    )
+    );
+    for (mut claims, path) in claimed.into_iter().flatten() {
+        if path.exists() {
+            claims.finish(&path)?;
+        }
+    }
+    report
+}
+
+/// Where it is sent what is known while the car drives.
+fn sinks(args: &LiveArgs) -> Result<Sinks> {
+    let mut sinks = Sinks::default();
+    if let Some(path) = &args.record {
+        let name = format!("the log {}", path.display());
+        sinks.add(name, McapFile::create(path)?);
+    }
+    Ok(sinks)
 }

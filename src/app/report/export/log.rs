@@ -14,35 +14,30 @@
 //!
 //! Times before zero, of recordings without a date, are shifted to zero.
 
-use std::collections::BTreeMap;
 use std::io::{Seek, Write};
 
 use anyhow::{Context as _, Result};
 use foxglove::messages::{
-    Color, FrameTransform, LinePrimitive, Log, ModelPrimitive, Odometry, PackedElementField,
-    PointCloud, Pose, PoseInFrame, PosesInFrame, Quaternion, SceneEntity, SceneUpdate, Vector3,
-    line_primitive, log, packed_element_field,
+    LinePrimitive, PointCloud, PoseInFrame, SceneEntity, SceneUpdate, line_primitive,
 };
-use foxglove::messages::{KeyValuePair, Point3, Timestamp};
-use foxglove::{Encode, Schema};
-use mcap::records::MessageHeader;
-use mcap::{WriteOptions, Writer};
-use nalgebra::Matrix3;
 use serde_json::{Value, json};
 
-use super::glb::Model;
+use super::messages::{
+    MAP, cloud, entity, map_scene, nanoseconds, odometry, opaque, particles, point, pose,
+    state_change, timestamp, transform,
+};
+use super::sinks::{McapSink, MessageSink};
 use crate::app::report::plotting::color::{MCL, REFINED, Rgb, TRUTH};
 use crate::app::report::results::{LocalizationResults, stretches};
+use crate::evaluation::planar_errors;
 use crate::evaluation::trust::Axes;
-use crate::evaluation::{ParticleRow, planar_errors};
 use crate::geometry::{Pose2, Pose3, TriangleMesh, pose2_from_pose3, pose3_from_pose2};
-use crate::lidar::{Motion, Scan};
+use crate::lidar::Motion;
 use crate::localization::State;
 use crate::recording::{Frame, RecordingError};
 
-/// Frames of reference.
-const MAP: &str = "map";
-const LIDAR: &str = "lidar";
+/// Largest number of points of a scan by default.
+pub const MOST_POINTS: usize = 30_000;
 
 /// A run to write.
 pub struct RunLog<'a> {
@@ -64,7 +59,8 @@ pub fn write_mcap(
 ) -> Result<()> {
     let results = run.results;
     let poses = Trajectories::of(results)?;
-    let mut log = LogWriter::new(writer)?;
+    let mut log = McapSink::new(writer)?;
+    let log: &mut dyn MessageSink = &mut log;
     let assumed = || {
         results
             .frames
@@ -75,8 +71,8 @@ pub fn write_mcap(
     let times_s: Vec<f64> = results.times_s.clone().unwrap_or_else(assumed);
     let first_s = times_s.iter().copied().reduce(f64::min).unwrap_or(0.0);
     let shift_s = (-first_s).max(0.0);
-    let nanoseconds = |time_s: &f64| ((time_s + shift_s) * 1e9).round() as u64;
-    let stamps: Vec<u64> = times_s.iter().map(nanoseconds).collect();
+    let stamps = times_s.iter().map(|time_s| nanoseconds(time_s + shift_s));
+    let stamps: Vec<u64> = stamps.collect();
     if let Some(&first) = stamps.first() {
         log.send("/paths", first, &poses.scene(results, first))?;
         if let Some(mesh) = run.mesh {
@@ -84,7 +80,7 @@ pub fn write_mcap(
         }
     }
     for (row, &stamp) in stamps.iter().enumerate() {
-        poses.send(&mut log, results, row, stamp)?;
+        poses.send(log, results, row, stamp)?;
         if !results.particles.is_empty() {
             let height_m = poses.best()[row].translation.z;
             let particles = particles(&results.particles.frame(row)?, height_m, stamp);
@@ -97,8 +93,7 @@ pub fn write_mcap(
         }
         written()?;
     }
-    log.writer.finish().context("cannot finish the log")?;
-    Ok(())
+    log.finish()
 }
 
 impl RunLog<'_> {
@@ -148,27 +143,15 @@ impl Trajectories {
     }
 
     /// Sends the poses, the state and the numbers of a frame.
-    fn send<W: Write + Seek>(
+    fn send(
         &self,
-        log: &mut LogWriter<W>,
+        log: &mut dyn MessageSink,
         results: &LocalizationResults,
         row: usize,
         stamp: u64,
     ) -> Result<()> {
-        let best = pose(&self.best()[row]);
-        let transform = FrameTransform {
-            timestamp: timestamp(stamp),
-            parent_frame_id: MAP.to_owned(),
-            child_frame_id: LIDAR.to_owned(),
-            translation: best.position,
-            rotation: best.orientation,
-        };
-        log.send("/tf", stamp, &transform)?;
+        log.send("/tf", stamp, &transform(&self.best()[row], stamp))?;
         let state = |row: usize| Some(State::from_number(results.states.as_ref()?[row])?.word());
-        let in_state = |state: &str| KeyValuePair {
-            key: "state".to_owned(),
-            value: state.to_owned(),
-        };
         let of_refined = |row: usize| {
             let states = results
                 .refined_states
@@ -176,22 +159,13 @@ impl Trajectories {
                 .or(results.states.as_ref())?;
             Some(State::from_number(states[row])?.word())
         };
-        let odometry = |poses: &[Pose3],
-                        covariances: &Option<Vec<Matrix3<f64>>>,
-                        state: Option<&str>| Odometry {
-            timestamp: timestamp(stamp),
-            frame_id: MAP.to_owned(),
-            body_frame_id: LIDAR.to_owned(),
-            pose: Some(pose(&poses[row])),
-            pose_covariance: in_space(covariances.as_ref().map(|all| all[row])),
-            velocity_covariance: vec![0.0; 36],
-            metadata: state.into_iter().map(in_state).collect(),
-            ..Odometry::default()
-        };
-        let estimate = odometry(&self.estimates, &results.covariances, state(row));
+        let covariance = |all: &Option<Vec<_>>| all.as_ref().map(|all| all[row]);
+        let of_estimate = covariance(&results.covariances);
+        let estimate = odometry(&self.estimates[row], of_estimate, state(row), stamp);
         log.send("/estimate", stamp, &estimate)?;
         if let Some(refined) = &self.refined {
-            let refined = odometry(refined, &results.refined_covariances, of_refined(row));
+            let covariance = covariance(&results.refined_covariances);
+            let refined = odometry(&refined[row], covariance, of_refined(row), stamp);
             log.send("/refined", stamp, &refined)?;
         }
         if let Some(truth) = &self.truth {
@@ -206,14 +180,8 @@ impl Trajectories {
             && (row == 0 || state(row - 1) != Some(now))
         {
             let is_tracking = now == State::Tracking.word();
-            let levels = [log::Level::Warning, log::Level::Info];
-            let change = Log {
-                timestamp: timestamp(stamp),
-                level: levels[usize::from(is_tracking)].into(),
-                message: format!("frame {}: {now}", results.frames[row]),
-                name: "fpmcl".to_owned(),
-                ..Log::default()
-            };
+            let message = format!("frame {}: {now}", results.frames[row]);
+            let change = state_change(message, is_tracking, stamp);
             log.send("/state", stamp, &change)?;
         }
         log.send_json("/numbers", stamp, &self.numbers(results, row, state(row)))
@@ -284,181 +252,4 @@ impl Trajectories {
             ..SceneUpdate::default()
         }
     }
-}
-
-/// Channels by topic, made when they are first used.
-struct LogWriter<W: Write + Seek> {
-    writer: Writer<W>,
-    channels: BTreeMap<&'static str, u16>,
-    sequence: u32,
-}
-
-impl<W: Write + Seek> LogWriter<W> {
-    fn new(writer: W) -> Result<Self> {
-        let options = WriteOptions::new()
-            .compression(None)
-            .library(concat!("fpmcl ", env!("CARGO_PKG_VERSION")));
-        Ok(Self {
-            writer: options.create(writer)?,
-            channels: BTreeMap::new(),
-            sequence: 0,
-        })
-    }
-
-    fn send<M: Encode>(&mut self, topic: &'static str, stamp: u64, message: &M) -> Result<()>
-    where
-        M::Error: Send + Sync + 'static,
-    {
-        let schema = M::get_schema().context("the message has no schema")?;
-        let mut data = Vec::with_capacity(message.encoded_len().unwrap_or(0));
-        message.encode(&mut data)?;
-        self.write(topic, stamp, &schema, &M::get_message_encoding(), &data)
-    }
-
-    fn send_json(&mut self, topic: &'static str, stamp: u64, message: &Value) -> Result<()> {
-        const SCHEMA: &str = include_str!("frame.schema.json");
-        let schema = Schema::new("fpmcl.Frame", "jsonschema", SCHEMA.as_bytes());
-        self.write(topic, stamp, &schema, "json", &serde_json::to_vec(message)?)
-    }
-
-    fn write(
-        &mut self,
-        topic: &'static str,
-        stamp: u64,
-        schema: &Schema,
-        encoding: &str,
-        data: &[u8],
-    ) -> Result<()> {
-        let channel_id = match self.channels.get(topic) {
-            Some(&channel) => channel,
-            None => {
-                let writer = &mut self.writer;
-                let schema = writer.add_schema(&schema.name, &schema.encoding, &schema.data)?;
-                let channel = writer.add_channel(schema, topic, encoding, &BTreeMap::new())?;
-                self.channels.insert(topic, channel);
-                channel
-            }
-        };
-        let header = MessageHeader {
-            channel_id,
-            sequence: self.sequence,
-            log_time: stamp,
-            publish_time: stamp,
-        };
-        self.sequence += 1;
-        Ok(self.writer.write_to_known_channel(&header, data)?)
-    }
-}
-
-fn map_scene(mesh: &TriangleMesh, stamp: u64) -> Result<SceneUpdate> {
-    let mut model = Model::default();
-    model.add_mesh(MAP, mesh);
-    let mut data = Vec::new();
-    model.write(&mut data)?;
-    let one = Vector3 {
-        x: 1.0,
-        y: 1.0,
-        z: 1.0,
-    };
-    Ok(SceneUpdate {
-        entities: vec![SceneEntity {
-            models: vec![ModelPrimitive {
-                pose: Some(pose(&Pose3::identity())),
-                scale: Some(one),
-                media_type: "model/gltf-binary".to_owned(),
-                data: data.into(),
-                ..ModelPrimitive::default()
-            }],
-            ..entity("mesh", stamp)
-        }],
-        ..SceneUpdate::default()
-    })
-}
-
-fn particles(particles: &[ParticleRow], height_m: f64, stamp: u64) -> PosesInFrame {
-    let poses = particles.iter();
-    let poses = poses.map(|&[x, y, heading, _]| {
-        let [x, y, heading] = [x, y, heading].map(f64::from);
-        let planar = Pose2::new([x, y].into(), heading);
-        pose(&pose3_from_pose2(&planar, height_m))
-    });
-    PosesInFrame {
-        timestamp: timestamp(stamp),
-        frame_id: MAP.to_owned(),
-        poses: poses.collect(),
-    }
-}
-
-/// A scan as x, y, z in the map and intensity, of 32 bits each.
-fn cloud(scan: &Scan, map_from_lidar: &Pose3, stamp: u64) -> PointCloud {
-    let mut data: Vec<f32> = Vec::with_capacity(4 * scan.len());
-    for (k, point) in scan.points.iter().enumerate() {
-        let point = map_from_lidar * nalgebra::Point3::from(point.as_dvec3().to_array());
-        data.extend(point.coords.iter().map(|&coordinate| coordinate as f32));
-        data.push(scan.intensities.get(k).copied().unwrap_or(0.0));
-    }
-    let names = ["x", "y", "z", "intensity"].into_iter().zip(0..);
-    let fields = names.map(|(name, k)| PackedElementField {
-        name: name.to_owned(),
-        offset: 4 * k,
-        r#type: packed_element_field::NumericType::Float32.into(),
-    });
-    PointCloud {
-        timestamp: timestamp(stamp),
-        frame_id: MAP.to_owned(),
-        pose: Some(pose(&Pose3::identity())),
-        point_stride: 16,
-        fields: fields.collect(),
-        data: bytemuck::cast_slice::<f32, u8>(&data).to_vec().into(),
-    }
-}
-
-/// The covariance of a pose in space, row-major; zero where nothing is estimated.
-fn in_space(planar: Option<Matrix3<f64>>) -> Vec<f64> {
-    /// Rows of x, y and heading.
-    const ROWS: [usize; 3] = [0, 1, 5];
-    let mut covariance = vec![0.0; 36];
-    for (i, row) in ROWS.into_iter().enumerate() {
-        for (j, column) in ROWS.into_iter().enumerate() {
-            covariance[6 * row + column] = planar.map_or(0.0, |planar| planar[(i, j)]);
-        }
-    }
-    covariance
-}
-
-fn entity(name: &str, stamp: u64) -> SceneEntity {
-    SceneEntity {
-        timestamp: timestamp(stamp),
-        frame_id: MAP.to_owned(),
-        id: name.to_owned(),
-        ..SceneEntity::default()
-    }
-}
-
-fn pose(pose: &Pose3) -> Pose {
-    let [x, y, z] = pose.translation.vector.into();
-    let position = Some(Vector3 { x, y, z });
-    let [x, y, z, w] = pose.rotation.coords.into();
-    let orientation = Some(Quaternion { x, y, z, w });
-    Pose {
-        position,
-        orientation,
-    }
-}
-
-fn point(pose: &Pose3) -> Point3 {
-    let [x, y, z] = pose.translation.vector.into();
-    Point3 { x, y, z }
-}
-
-fn opaque(color: Rgb) -> Color {
-    let [r, g, b] = color.map(|channel| f64::from(channel) / 255.0);
-    Color { r, g, b, a: 1.0 }
-}
-
-fn timestamp(nanoseconds: u64) -> Option<Timestamp> {
-    Some(Timestamp::new(
-        (nanoseconds / 1_000_000_000) as u32,
-        (nanoseconds % 1_000_000_000) as u32,
-    ))
 }
