@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a failing test may panic")]
 
+#[cfg(feature = "bags")]
+mod bag_writers;
 mod common;
 
 use std::collections::BTreeMap;
@@ -254,6 +256,104 @@ fn a_log_that_is_written_on_the_way_has_the_messages_that_export_writes_of_the_r
     let again = patient(&recording).with("--record=run.mcap");
     let again = again.set("result_path", "others/localization.npz");
     again.fails_with(&["run.mcap exists; add --force"]);
+}
+
+/// The messages of a log about the states, among bytes of their fields.
+fn states(recording: &Recording, log: &str) -> Vec<String> {
+    let states = &messages(recording, log)["/state"];
+    let texts = states.iter().map(|it| String::from_utf8_lossy(it));
+    texts.map(|text| text.into_owned()).collect()
+}
+
+#[test]
+fn a_sensor_that_stalls_is_reported_and_the_run_goes_on_when_it_sends_again() {
+    let recording = street(12);
+    let time_s = |frame: usize| 0.1 * frame as f64 + if frame < 6 { 0.0 } else { 3.0 };
+    let times: String = (0..12).map(|it| format!("{}\n", time_s(it))).collect();
+    recording.write("times.txt", &times);
+    let call = common::fpmcl("live").in_folder(recording.folder());
+    let call = call.with("localization.yml").with("--backend=cpu");
+    let call = call.with("--replay=velodyne").with("--queue=100");
+    let output = call.with("--record=run.mcap").with("--json").succeeds();
+    assert_eq!(report(&output)["live"]["states"], json!({"tracking": 12}));
+    let states = states(&recording, "run.mcap");
+    let mut left = states.iter();
+    for expected in [
+        "tracking: the scan agrees with the map",
+        "lost: no scan arrived for too long",
+        "tracking: the scan agrees with the map",
+    ] {
+        assert!(left.any(|it| it.contains(expected)), "{states:?}");
+    }
+}
+
+#[cfg(feature = "bags")]
+#[test]
+fn after_a_jump_of_the_clock_the_car_is_found_around_its_last_pose() {
+    use bag_writers::{Cloud, Kind, Recorded, mcap, point_cloud2};
+    const START_NS: u64 = 1_700_000_000_000_000_000;
+
+    let recording = street(12);
+    let messages = |jump_ns: i64| -> Vec<Recorded> {
+        let message = |frame: usize| {
+            let points = recording.scan(frame);
+            let numbers = points.iter().flatten();
+            let cloud = Cloud {
+                fields: [("x", 0), ("y", 4), ("z", 8)]
+                    .map(|(name, at)| (name, at, 7))
+                    .into(),
+                width: points.len() as u32,
+                height: 1,
+                point_step: 12,
+                row_step: 12 * points.len() as u32,
+                data: numbers.flat_map(|it| it.to_le_bytes()).collect(),
+                ..Cloud::default()
+            };
+            let time_ns = START_NS + 100_000_000 * frame as u64;
+            let stamp_ns = time_ns.wrapping_add_signed(if frame < 6 { 0 } else { jump_ns });
+            Recorded {
+                topic: "/points",
+                message_type: "sensor_msgs/msg/PointCloud2",
+                time_ns,
+                data: point_cloud2(Kind::CdrLittle, stamp_ns, "lidar", &cloud),
+            }
+        };
+        (0..12).map(message).collect()
+    };
+    for (name, jump_s) in [("back", -3600), ("ahead", 3600), ("never", 0)] {
+        let bag = mcap(
+            ::mcap::WriteOptions::new().compression(None),
+            "cdr",
+            &messages(jump_s * 1_000_000_000),
+        );
+        fs::write(recording.path(&format!("{name}.mcap")), bag).unwrap();
+        let call = common::fpmcl("live").in_folder(recording.folder());
+        let call = call.with("localization.yml").with("--backend=cpu");
+        let call = call.set("pose_file", "null").set("pose_tracking", "False");
+        let call = call.set("odometry", "scans").with("--start=0,0,0");
+        let call = call
+            .with(format!("--replay={name}.mcap"))
+            .with("--rate=1000");
+        let call = call.with("--queue=100").with("--force").with("--json");
+        let log = format!("{name}_log.mcap");
+        let output = call.with(format!("--record={log}")).succeeds();
+        let report = report(&output);
+        let has_jumped = jump_s != 0;
+        let warning = "the clock of the scans jumped to";
+        assert_eq!(
+            output.stderr.contains(warning),
+            has_jumped,
+            "{}",
+            output.stderr
+        );
+        let states = states(&recording, &log);
+        let is_jump = |it: &String| it.contains("searching: the clock of the scans was set");
+        assert_eq!(states.iter().any(is_jump), has_jumped, "{states:?}");
+        assert_eq!(report["live"]["rejected"], 0, "{name} {report}");
+        let found = results(&recording).estimates_in_space.unwrap();
+        let error_m = (found[11].translation.x - 5.5).hypot(found[11].translation.y);
+        assert!(found.len() == 12 && error_m < 0.1, "{name} {error_m}");
+    }
 }
 
 #[test]
