@@ -373,6 +373,7 @@ fn what_live_cannot_do_is_an_error_before_any_work() {
     for (flag, part) in [
         ("--rate=0", "0.001 to 1000"),
         ("--queue=0", "1..=1000"),
+        ("--foxglove=here", "such as 127.0.0.1:8765"),
     ] {
         live()
             .with("--replay=velodyne")

@@ -86,22 +86,9 @@ fn number(errors: &Value, path: &[&str]) -> f64 {
         .unwrap_or_else(|| panic!("{path:?}: {found}"))
 }
 
-/// An interpreter with evo: that of `FPMCL_PYTHON`, of `.ci/run`, or of the system.
-fn python_with_evo() -> Option<PathBuf> {
-    let of_ci = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/ci/python/bin/python");
-    let given = std::env::var_os("FPMCL_PYTHON").map(PathBuf::from);
-    let found = [given, Some(of_ci), Some("python3".into())];
-    let has_evo = |python: &PathBuf| {
-        let mut command = Command::new(python);
-        let output = command.args(["-c", "import evo.core.metrics"]).output();
-        output.is_ok_and(|output| output.status.success())
-    };
-    found.into_iter().flatten().find(has_evo)
-}
-
 #[test]
 fn errors_of_all_alignments_and_segments_equal_those_of_evo() {
-    let Some(python) = python_with_evo() else {
+    let Some(python) = common::python_with("evo.core.metrics", "python") else {
         common::skips::skipped("FPMCL_PYTHON names no interpreter with evo");
         return;
     };

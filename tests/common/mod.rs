@@ -214,6 +214,20 @@ pub fn json(path: &Path) -> serde_json::Value {
     serde_json::from_slice(&fs::read(path).unwrap()).unwrap()
 }
 
+/// An interpreter of Python with modules: that of `FPMCL_PYTHON`, of an environment of `.ci/run`, or of the system.
+pub fn python_with(modules: &str, environment: &str) -> Option<PathBuf> {
+    let of_ci = format!("target/ci/{environment}/bin/python");
+    let of_ci = Path::new(env!("CARGO_MANIFEST_DIR")).join(of_ci);
+    let given = std::env::var_os("FPMCL_PYTHON").map(PathBuf::from);
+    let found = [given, Some(of_ci), Some("python3".into())];
+    let has_modules = |python: &PathBuf| {
+        let mut command = std::process::Command::new(python);
+        let output = command.arg("-c").arg(format!("import {modules}")).output();
+        output.is_ok_and(|output| output.status.success())
+    };
+    found.into_iter().flatten().find(has_modules)
+}
+
 /// A recording in KITTI layout in a temporary folder, with configurations.
 ///
 /// A street 16 m wide and 60 m long between walls, with boxes as houses and cars, scanned with

@@ -4,6 +4,7 @@ mod driving;
 mod last_pose;
 mod replay;
 
+use std::net::{IpAddr, SocketAddr};
 use std::path::PathBuf;
 
 use anyhow::{Result, bail};
@@ -16,6 +17,8 @@ use super::export::{self, ExportArgs};
 use super::localize::tracking::start;
 use super::localize::{DriveArgs, run_with, start_pose};
 use crate::app::report::Report;
+#[cfg(feature = "viewer")]
+use crate::app::report::export::Viewer;
 use crate::app::report::export::{McapFile, Sinks};
 use crate::app::run::arguments::yaml;
 use crate::app::run::{ConfigArgs, Context, RunArgs};
@@ -60,6 +63,11 @@ pub struct LiveArgs {
     #[serde(skip)]
     pub record: Option<PathBuf>,
 
+    /// Serve the same to Foxglove and other viewers; by default at 127.0.0.1:8765, which only this machine reaches.
+    #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = "127.0.0.1", value_parser = address)]
+    #[serde(skip)]
+    pub foxglove: Option<SocketAddr>,
+
     /// Scans that may wait while another one is computed; the oldest is dropped for a newer one.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=1000))]
     #[serde(skip)]
@@ -90,6 +98,17 @@ fn pose_of_start<S: Serializer>(
     match start {
         Some(LiveStart::Pose(pose)) => pose.serialize(serializer),
         Some(LiveStart::Last) | None => serializer.serialize_none(),
+    }
+}
+
+/// Port of Foxglove.
+const PORT: u16 = 8765;
+
+fn address(text: &str) -> Result<SocketAddr, &'static str> {
+    match (text.parse(), text.parse::<IpAddr>()) {
+        (Ok(address), _) => Ok(address),
+        (_, Ok(ip)) => Ok(SocketAddr::new(ip, PORT)),
+        _ => Err("give an address of this machine, with or without a port, such as 127.0.0.1:8765"),
     }
 }
 
@@ -173,5 +192,27 @@ fn sinks(args: &LiveArgs) -> Result<Sinks> {
         let name = format!("the log {}", path.display());
         sinks.add(name, McapFile::create(path)?);
     }
+    if let Some(address) = args.foxglove {
+        serve(&mut sinks, address)?;
+    }
     Ok(sinks)
+}
+
+#[cfg(feature = "viewer")]
+fn serve(sinks: &mut Sinks, address: SocketAddr) -> Result<()> {
+    let viewer = Viewer::listen(address)?;
+    let address = viewer.address;
+    tracing::info!("Foxglove: open the connection ws://{address}");
+    if !address.ip().is_loopback() {
+        tracing::warn!("whoever reaches {address} sees the map, the scans and the poses");
+    }
+    sinks.add(format!("the server at {address}"), viewer);
+    Ok(())
+}
+
+#[cfg(not(feature = "viewer"))]
+fn serve(_sinks: &mut Sinks, address: SocketAddr) -> Result<()> {
+    bail!(
+        "--foxglove {address}: this program was built without the server; build it with --features viewer, or write a log with --record FILE"
+    );
 }

@@ -5,6 +5,8 @@ mod live_log;
 mod log;
 mod messages;
 mod sinks;
+#[cfg(feature = "viewer")]
+mod viewer;
 // Models and tiles.
 mod glb;
 pub mod tiles;
@@ -13,3 +15,5 @@ pub use glb::{Model, Ribbon};
 pub use live_log::{LiveFrame, LiveLog, live_log};
 pub use log::{MOST_POINTS, RunLog, write_mcap};
 pub use sinks::{McapFile, Sinks};
+#[cfg(feature = "viewer")]
+pub use viewer::Viewer;
